@@ -27,6 +27,7 @@ ROOT: Final = Path(__file__).parent
 LONGER: Final = (
     "FOGNAV_FLAPS", "FOGNAV_FUZZ_INPUTS", "FOGNAV_GAP_SEEDS", "FOGNAV_HISTORIES", "FOGNAV_KILLS",
     "FOGNAV_PERMUTED_READINGS", "FOGNAV_RIDE_SEEDS", "FOGNAV_STORE_EXAMPLES", "FOGNAV_TEST_STOP_FIELD_SEEDS",
+    "FOGNAV_WRITES",
 )  # fmt: skip
 """Variables that set how much some tests try, which may take hours then (CONTRIBUTING.md)."""
 REACTION, COMPUTING, SYSTEM, LIVE, COMPOSE = range(5)

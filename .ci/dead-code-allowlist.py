@@ -20,6 +20,7 @@ _.no_echo_us
 _.board
 _.area_entered  # the demo's report and lockstep's result
 _.area_clearance_m
+_.barrier_at_m  # records of drives with a real robot
 _.operator_commands  # lockstep: fields of its result
 _.hazard_at_m
 _.pose_error_m

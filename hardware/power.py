@@ -49,14 +49,40 @@ class Mode:
 MODES: Final = (Mode("heartbeat (default)", 1.0, 8.0), Mode("every reading (the thesis's)", 8.0, 8.0))
 
 
+def terms(mode: Mode) -> list[tuple[str, float]]:
+    """Return the parts of the mean current, each with its arithmetic and its value (mA); their sum is `current_ma`."""
+    period, beacon = BEACON_S
+    awake = min(1.0, mode.messages * AWAKE_S + beacon / period)
+    sending = min(1.0, mode.messages * ON_AIR_S)
+    measuring = mode.readings * ECHO_S
+    return [
+        (f"processor {CPU_MA:g}", CPU_MA),
+        (f"board {BOARD_MA:g}", BOARD_MA),
+        (
+            (
+                f"radio awake ({LISTENING_MA:g} - {CPU_MA:g}) * min(1, {mode.messages:g}/s * {AWAKE_S:g} s + "
+                f"{beacon:g} s / {period:g} s)"
+            ),
+            (LISTENING_MA - CPU_MA) * awake,
+        ),
+        (
+            f"radio sending ({SENDING_MA:g} - {LISTENING_MA:g}) * {mode.messages:g}/s * {ON_AIR_S:g} s",
+            (SENDING_MA - LISTENING_MA) * sending,
+        ),
+        # One reading is one measurement by each of two sonars.
+        (
+            (
+                f"two sonars 2 * ({SONAR_IDLE_MA:g} + ({SONAR_MEASURING_MA:g} - {SONAR_IDLE_MA:g}) * "
+                f"{mode.readings:g}/s * {ECHO_S:g} s)"
+            ),
+            2 * (SONAR_IDLE_MA + (SONAR_MEASURING_MA - SONAR_IDLE_MA) * measuring),
+        ),
+    ]
+
+
 def current_ma(mode: Mode) -> float:
     """Return the mean current (mA) at 5 V."""
-    awake = min(1.0, mode.messages * AWAKE_S + BEACON_S[1] / BEACON_S[0])
-    sending = min(1.0, mode.messages * ON_AIR_S)
-    radio = (LISTENING_MA - CPU_MA) * awake + (SENDING_MA - LISTENING_MA) * sending
-    # One reading is one measurement by each of two sonars.
-    sonars = 2 * (SONAR_IDLE_MA + (SONAR_MEASURING_MA - SONAR_IDLE_MA) * mode.readings * ECHO_S)
-    return CPU_MA + BOARD_MA + radio + sonars
+    return sum(value for _, value in terms(mode))
 
 
 def bank_hours(mode: Mode) -> float:
@@ -75,5 +101,22 @@ def table() -> str:
     return "\n".join([*head, *rows])
 
 
+def arithmetic() -> str:
+    """Return the terms of each mode's current (mA), and of the life of a power bank, as Markdown."""
+    return "\n".join(["```text", *(line for mode in MODES for line in _lines(mode)), "```"])
+
+
+def _lines(mode: Mode) -> list[str]:
+    return [
+        f"{mode.name}, in mA:",
+        *(f"  {value:5.1f}  {text}" for text, value in terms(mode)),
+        f"  {current_ma(mode):5.1f}  together",
+        (
+            f"  {BANK_MAH:,} mAh * {CELL_V:g} V / {SUPPLY_V:g} V * {CONVERTER:g} / {current_ma(mode):.1f} mA = "
+            f"{bank_hours(mode):.0f} h"
+        ),
+    ]
+
+
 if __name__ == "__main__":
-    print(table())
+    print(f"{table()}\n\n{arithmetic()}")

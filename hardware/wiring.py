@@ -110,6 +110,7 @@ def node(profile: str) -> str:
     drawing.wire("ground", (210, at["G"]), (232, at["G"]), (232, 460), (590, 460), (590, 215), (620, 215))
     drawing.wire("ground", (590, 435), (620, 435))
     drawing.joint("ground", 590, 435)
+    drawing.joint("ground", 440, 460)
     drawing.text(40, 30, f"Sensor node, pin profile “{profile}”", bold=True)
     drawing.text(
         40,

@@ -212,8 +212,8 @@ class Proxy:
             writer.close()
 
     async def close(self) -> None:
-        assert self._server is not None
-        self._server.close()
+        if self._server is not None:
+            self._server.close()
         while self._tasks:
             task = self._tasks.pop()
             task.cancel()
@@ -268,11 +268,23 @@ def tokens_fixture() -> dict[str, dict[str, str]]:
 
 
 @pytest.fixture
-async def proxy(fog: Fog) -> AsyncIterator[Proxy]:
-    """Yield a proxy in front of Redis; it listens once its test starts it."""
-    made = Proxy(fog.redis.port)
-    yield made
-    await made.close()
+async def proxy_of() -> AsyncIterator[Callable[[Server], Proxy]]:
+    """Yield a function that makes a proxy in front of a server; it listens once its test starts it."""
+    made: list[Proxy] = []
+
+    def make(server: Server) -> Proxy:
+        made.append(Proxy(server.port))
+        return made[-1]
+
+    yield make
+    for proxy in made:
+        await proxy.close()
+
+
+@pytest.fixture
+def proxy(fog: Fog, proxy_of: Callable[[Server], Proxy]) -> Proxy:
+    """Return a proxy in front of Redis; it listens once its test starts it."""
+    return proxy_of(fog.redis)
 
 
 @pytest.fixture

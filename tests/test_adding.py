@@ -28,7 +28,7 @@ SOURCES = sorted({*ROOT.glob("*/src/*/__init__.py"), *ROOT.glob("*/*/src/*/__ini
 COMPILED = "libs/fog-kernels"
 """The kernels stay where they are: their compiled code is found by their path."""
 
-MESSAGES = "libs/fog-contracts/src/fog_contracts/messages.py"
+MESSAGES = "libs/fog-contracts/src/fog_contracts/messages"
 CHANNELS = "libs/fog-contracts/src/fog_contracts/channels.py"
 SHAPES = "libs/fog-contracts/src/fog_contracts/shapes.py"
 MAKE_POLYGONS = {
@@ -70,13 +70,15 @@ class Edit:
 
 
 MESSAGE = (
-    Edit(MESSAGES, r"^class Trace\(", before='''\
+    Edit(f"{MESSAGES}/nodes.py", r"^class NodeUpdate\(", before='''\
 class NodeBattery(Message, frozen=True, kw_only=True):
     """Voltage of a node's battery."""
 
     volts: Annotated[float, Meta(ge=0.0, le=30.0, extra={"unit": "V"})]
 
 
+'''),
+    Edit(f"{MESSAGES}/robots.py", r"^class CommandReply\(", before='''\
 class RobotApproach(Message, frozen=True, kw_only=True):
     """A node that a robot is about to pass, and why."""
 
@@ -149,7 +151,7 @@ class Extension(Message, frozen=True, kw_only=True):
 )  # fmt: skip
 
 SHAPE = (
-    Edit(MESSAGES, r"^Shape = ", before='''\
+    Edit(f"{MESSAGES}/zones.py", r"^Shape = ", before='''\
 class RingShape(Message, frozen=True, kw_only=True, tag="ring", tag_field="type"):
     """Everything between two circles around one centre."""
 
@@ -272,7 +274,7 @@ def test_only_messages_shapes_and_the_commands_that_draw_them_distinguish_kinds_
     asking = re.compile(rf"\b({'|'.join(names)})\b|\btype\b\W+({'|'.join(tags)})\b")
     files = [file for source in SOURCES for suffix in ("py", "js") for file in source.parent.rglob(f"*.{suffix}")]
     found = {str(file.relative_to(ROOT)) for file in files if asking.search(file.read_text("utf-8"))}
-    assert found == {MESSAGES, SHAPES, *DRAWING_COMMANDS, *MAKE_POLYGONS}
+    assert found == {f"{MESSAGES}/zones.py", SHAPES, *DRAWING_COMMANDS, *MAKE_POLYGONS}
 
 
 # --- The document ---------------------------------------------------------------------------------------------------

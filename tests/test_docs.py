@@ -45,6 +45,15 @@ def test_operations_names_every_metric_and_none_that_nobody_exports() -> None:
     assert defined <= named, f"docs/operations.md lacks {sorted(defined - named)}: say what each is for"
 
 
+def test_contributing_names_every_variable_that_makes_tests_longer() -> None:
+    longer = re.search(r"^LONGER.*?^\)", (ROOT / "conftest.py").read_text("utf-8"), re.DOTALL | re.MULTILINE)
+    assert longer
+    variables = set(re.findall(r'"(FOGNAV_\w+)"', longer[0]))
+    assert variables
+    named = set(re.findall(r"`(FOGNAV_\w+)", (ROOT / "CONTRIBUTING.md").read_text("utf-8")))
+    assert variables - named == set()
+
+
 @pytest.mark.parametrize("record", sorted((ROOT / "docs" / "adr").glob("0*.md")), ids=lambda path: path.stem)
 def test_decision_records_have_a_number_and_a_dated_status(record: Path) -> None:
     title, empty, status, *_ = record.read_text("utf-8").splitlines()

@@ -3,6 +3,7 @@
 import json
 from pathlib import Path
 
+import numpy as np
 import pytest
 from PIL import Image
 from typer.testing import CliRunner
@@ -70,6 +71,23 @@ def test_table_in_the_documentation_is_what_its_command_gives(data_dir, monkeypa
     rows = comparison.measure(sonar_recording.recordings_in(data_dir / "hcsr04"), 500, 5.0, 1, lambda _: None)
     written = (Path(__file__).parents[2] / "docs" / "benchmarks.md").read_text("utf-8").splitlines()
     assert [line for line in written if line.startswith(f"| {rule} |")] == comparison.table(rows)[2:]
+
+
+@pytest.mark.data
+def test_calibrated_sonar_with_false_echoes_raises_no_more_alarms_than_one_that_was_not(data_dir):
+    found = sonar_recording.recordings_in(data_dir / "hcsr04")
+    alarms = {
+        name: comparison.false_alarms_per_hour(
+            found,
+            comparison.RULES[name],
+            5.0,
+            comparison.STRESS_RATE,
+            np.random.default_rng(7),
+            calibrated=name == comparison.CALIBRATED,
+        )
+        for name in (comparison.CALIBRATED, "evidence")
+    }
+    assert alarms[comparison.CALIBRATED] <= alarms["evidence"]
 
 
 @pytest.mark.data

@@ -3,14 +3,19 @@
 from __future__ import annotations
 
 import asyncio
+import json
+import re
 from typing import TYPE_CHECKING
 
 import pytest
+from typer.testing import CliRunner
 
-from fognav.bench.reactions import page
+from fognav import checkout, kernels
+from fognav.bench.reactions import page, trials
 from fognav.bench.reactions.body import Commanded, slower_after
 from fognav.bench.reactions.faults import FAULTS
 from fognav.bench.reactions.trials import due, measure, percentile, read_log, row
+from fognav.commands import bench
 from fognav.output import WrongUseError
 
 if TYPE_CHECKING:
@@ -75,10 +80,50 @@ def test_page_has_a_table_for_each_kind_of_fault_with_its_limit() -> None:
     assert "| cliff | 2 | 2 | 0.025 | 0.03 | 0.03 | 0.05 | 0 | one sensor frame: 0.05 |" in text
     assert "| watchdog and guardian killed | 2 | 2 | 0.025 | 0.03 | 0.03 | none | 0 | none: needs hardware |" in text
     assert "## Operator" not in text
+    assert f"Measured at commit {checkout.revision()} on: a machine, 2 robots at once, at a niceness of " in text
+
+
+def test_page_that_is_written_again_keeps_its_remarks(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    async def nothing(*_: object) -> dict[str, list[float | None]]:
+        return {}
+
+    monkeypatch.setattr(trials, "measure", nothing)
+    monkeypatch.setattr(kernels, "warm_cache", lambda _tell: None)
+    log, written = tmp_path / "log", tmp_path / "page.md"
+    for seconds in (0.021, 0.023):
+        log.write_text(json.dumps({"fault": "cliff", "seconds": seconds}) + "\n")
+        arguments = ["reactions", "--trials", "1", "--log", str(log), "--write", str(written)]
+        result = CliRunner().invoke(bench.bench_app, arguments, catch_exceptions=False)
+        assert result.exit_code == 0, result.output
+        if seconds == 0.021:
+            written.write_text(written.read_text("utf-8") + "\nA fourth robot ran beside.\n", "utf-8")
+    text = written.read_text("utf-8")
+    assert "| 0.023 |" in text
+    assert "| 0.021 |" not in text
+    assert text.endswith("-->\n\nA fourth robot ran beside.\n")
+    assert page.remarks((checkout.root() / "docs" / "reaction-times.md").read_text("utf-8"))
+
+
+def test_documented_limits_are_those_that_are_judged_by() -> None:
+    text = (checkout.root() / "docs" / "reaction-times.md").read_text("utf-8")
+    for fault in FAULTS:
+        (cells,) = [line.split(" | ") for line in text.splitlines() if line.startswith(f"| {fault.name} |")]
+        limit = "none" if fault.limit_s is None else str(round(fault.limit_s, 3))
+        assert (cells[6], cells[8]) == (limit, f"{fault.design} |"), fault.name
+
+
+def test_silence_counts_from_when_the_agent_has_looked_for_the_last_message() -> None:
+    for name in ("map silent, slow", "map silent, stop", "planner silent, slow", "network gone, slow",
+                 "network gone, stop", "change of the map lost"):  # fmt: skip
+        assert "poll 0.05 + " in BY_NAME[name].design
+    assert BY_NAME["lidar falls silent"].limit_s == pytest.approx(0.45)
 
 
 def test_every_limit_is_the_sum_of_the_parts_that_its_row_names() -> None:
     for fault in FAULTS:
+        turns = re.match(r"3 turns of 0.19", fault.design)
+        parts = sum(float(part) for part in re.findall(r"\d+\.\d+", fault.design)) + (2 * 0.19 if turns else 0.0)
+        assert fault.limit_s is None or fault.limit_s == pytest.approx(parts), fault.name
         assert (fault.limit_s is None) == fault.design.startswith("none")
         assert fault.limit_s is None or fault.limit_s < fault.observed_s, fault.name
     assert len(BY_NAME) == len(FAULTS)

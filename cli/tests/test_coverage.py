@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from fog_contracts.cones import SONAR_HALF_CONE
 from fog_contracts.messages import SimObstacle
 from fog_contracts.site import Place, Site
 from fog_runtime.configuration.maps import save_map
@@ -15,7 +16,7 @@ from fog_runtime.configuration.site import LoadedSite, load_site
 from fognav.coverage import OBSTACLE_RADIUS_M, Coverage, coverage
 from fognav_sim.floor import Floor
 from fognav_sim.node import classify, default_config
-from fognav_sim.sensors import SONAR_HALF_CONE, Noise, Robot, measure_sonar
+from fognav_sim.sensors import Noise, Robot, Sonars
 
 ROOT = Path(__file__).parents[2]
 ESTIG = ROOT / "sites" / "estig"
@@ -42,7 +43,7 @@ def state_with_a_person(estig: LoadedSite, node, x: float, y: float) -> str:
     ]
     floor.place(SimObstacle(id="person", polygon=ring, height=1.7))
     generator = np.random.default_rng(0)
-    ranges = [measure_sonar(floor, NOWHERE, node, sonar, SILENT_WORLD, generator) for sonar in range(len(node.sonars))]
+    ranges = [Sonars(floor).measure(NOWHERE, node, sonar, SILENT_WORLD, generator) for sonar in range(len(node.sonars))]
     return classify(ranges, default_config(node))
 
 

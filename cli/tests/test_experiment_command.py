@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import re
+
 import pytest
 from typer.testing import CliRunner
 
+from fognav import hardware_drive
 from fognav.commands import experiment
 
 OUT = ["--out", "unused"]
@@ -36,3 +39,14 @@ def test_a_sweep_of_one_plane_drives_no_other_and_its_page_names_that_command(tm
     assert command == (
         "fognav experiment sensitivity --readings 2,5,20 --pause 50,500 --areas none --routes 1 --seed 1 --out DIR"
     )
+
+
+def test_a_drive_that_was_skipped_is_named_and_is_no_success(tmp_path, monkeypatch):
+    monkeypatch.setattr(experiment, "find_fog", lambda _address: None)
+    monkeypatch.setattr(hardware_drive, "drive_hardware", lambda *_: None)  # each drive is skipped
+    arguments = ["--hardware", "--only", "1", "--setups", "fog", "--out", str(tmp_path / "drives")]
+    result = CliRunner().invoke(experiment.experiment_app, arguments, catch_exceptions=False)
+    assert result.exit_code == 1, result.output
+    told = " ".join(result.output.split())
+    assert re.search(r"no record of 0001-\w+-fog, .*: repeat the command to drive them", told)
+    assert re.search(r"\b0 of [1-9]\d* drives succeeded", told)

@@ -7,6 +7,7 @@ import shutil
 import signal
 import socket
 import stat
+import subprocess
 import time
 from collections.abc import Callable
 from dataclasses import replace
@@ -134,6 +135,20 @@ def node(tmp_path: Path) -> LocalNode:
     folder = NodeFolder(tmp_path / "data")
     sites, locks = hosted_sites([ESTIG], folder.locks, ["localhost", "127.0.0.1"])
     return LocalNode(NodeConfig(folder=folder, sites=sites, locks=locks, address="127.0.0.2"), lambda _: None)
+
+
+@pytest.mark.skipif(shutil.which("systemd-analyze") is None, reason="needs systemd-analyze")
+def test_systemd_accepts_the_unit(tmp_path, monkeypatch):
+    monkeypatch.setenv("FOGNAV_MAP_PORT", "8102")
+    monkeypatch.setenv("XDG_CONFIG_HOME", str(tmp_path))
+    file = unit.write_unit(["up", "--site", "/srv/100% $ite"])
+    command = ["systemd-analyze", "--user", "verify", "--man=no", "--recursive-errors=no", str(file)]
+    known = {"PATH": os.environ["PATH"], "HOME": str(tmp_path), "XDG_RUNTIME_DIR": str(tmp_path)}
+    done = subprocess.run(command, env=known, capture_output=True, text=True, timeout=60, check=False)
+    assert (done.returncode, done.stdout, done.stderr) == (0, "", "")
+    file.write_text(file.read_text().replace("Type=notify", "Type=nosuch"))
+    done = subprocess.run(command, env=known, capture_output=True, text=True, timeout=60, check=False)
+    assert "nosuch" in done.stderr
 
 
 async def test_bookkeeping_that_fails_is_told_once_and_ends_nothing(node, tmp_path, monkeypatch):
@@ -283,8 +298,8 @@ async def test_older_backup_of_one_floor_locks_nobody_out_who_was_added_since(tm
     SiteLocks.open(folder.locks).add_robot("r7")
     SiteLocks.open(folder.locks).remove("sold")
     before = SiteLocks.open(folder.locks).users()
-    made, refused = await backups.restore(tmp_path / "older.tar.gz", folder, estig, replace=True)
-    assert (sorted(made.folders), refused) == (["secrets", "site"], ["sold"])
+    made, refused, _ = await backups.restore(tmp_path / "older.tar.gz", folder, estig, replace=True)
+    assert (sorted(made.folders), refused) == (["recordings", "secrets", "site"], ["sold"])
     assert SiteLocks.open(folder.locks).users() == before
     service = Credentials.read(SiteLocks.open(folder.locks).credentials("upstairs.map-service"))
     async with backups.redis_of(folder, "estig", estig) as place:
@@ -315,7 +330,7 @@ async def test_locks_of_another_authority_are_replaced_by_those_of_the_backup(tm
         settings.remember(folder.path, settings.settings_of({"estig": estig}, "127.0.0.1", [], simulate=False))
     original = NodeFolder(tmp_path / "data")
     await backups.create(tmp_path / "older.tar.gz", original, estig)
-    made, _ = await backups.restore(tmp_path / "older.tar.gz", folder, estig, replace=True)
+    made, *_ = await backups.restore(tmp_path / "older.tar.gz", folder, estig, replace=True)
     assert backups.LOCKS in made.folders
     assert (folder.locks / "authority.pem").read_bytes() == (original.locks / "authority.pem").read_bytes()
 

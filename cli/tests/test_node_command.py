@@ -9,6 +9,7 @@ import subprocess
 import sys
 import tomllib
 from pathlib import Path
+from types import SimpleNamespace
 
 import msgspec
 import paho.mqtt.client as paho
@@ -22,10 +23,13 @@ from fog_contracts.messages import NodeCalibration
 from fog_contracts.site import NodeSite, Sonar
 from fog_runtime.configuration.site import load_site
 from fog_supervisor.servers import start_mosquitto
+from fognav.commands import node as node_command
 from fognav.commands.node import node_app
 from fognav.nodes import on_broker, provisioning, site_file
+from fognav.operate.systems import AGGREGATOR
 from fognav.output import FailedError, WrongUseError
 from fognav_sim.firmware import Core, FirmwareError, build_library, find_compiler
+from hazard_aggregator.debounce.evidence import Options, learned_rates
 
 ROOT = Path(__file__).parents[2]
 WALL_BELOW_Z4 = "33.20,38.15,1.5708"
@@ -67,6 +71,43 @@ def test_added_node_is_in_the_site_and_its_board_accepts_its_settings(floor: Pat
     problem, text = core["fognav_settings_problem"], written.read_bytes()
     problem.restype = ctypes.c_char_p
     assert problem(text, ctypes.c_uint32(len(text))) is None
+
+
+@pytest.mark.parametrize(("options", "every"), [({}, False), ({"every-reading": ""}, True)])
+def test_publishing_of_a_node_is_in_the_site_and_in_its_boards_settings(floor: Path, options, every) -> None:
+    words = [f"--{name}" for name in options]
+    done = run(
+        "add", "n8", "--pose", WALL_BELOW_Z4, "--area", "z4", "--wifi", "Lab", "--out", str(floor / "board"),
+        "--site", str(floor), *words,
+    )  # fmt: skip
+    assert done.returncode == 0, done.stderr
+    assert load_site(floor).site.nodes[-1].every_reading is every
+    assert json.loads((floor / "board" / "node.json").read_bytes())["every_reading"] is every
+
+
+def test_list_tells_of_each_node_what_it_says_why_and_since_when(monkeypatch) -> None:
+    views = [
+        {"id": "n1", "area": "z1", "state": "clear", "reason": "", "age_s": 0.42, "received": 17},
+        {"id": "n2", "area": "z2", "state": "unknown", "reason": "silent", "age_s": 71.0, "received": 3},
+        {"id": "n3", "area": "z2", "state": "unknown", "reason": "", "age_s": None, "received": 0},
+    ]
+    for found, lines in (
+        (
+            views,
+            [
+                "n1: area z1, clear, 0.4 s ago, 17 readings",
+                "n2: area z2, unknown (silent), 71.0 s ago, 3 readings",
+                "n3: area z2, unknown, never heard, 0 readings",
+            ],
+        ),
+        ([], ["no nodes"]),
+    ):
+        fog = SimpleNamespace(
+            get=lambda service, path, found=found: {AGGREGATOR: {"/api/v1/nodes": found}}[service][path]
+        )
+        monkeypatch.setattr(node_command, "find_fog", lambda _, fog=fog: fog)
+        assert CliRunner().invoke(node_app, ["list"]).output.splitlines() == lines
+        assert json.loads(CliRunner().invoke(node_app, ["list", "--json"]).stdout)["nodes"] == found
 
 
 def test_node_whose_password_the_broker_cannot_get_is_not_added(floor: Path, tmp_path: Path) -> None:
@@ -166,6 +207,59 @@ def test_password_file_of_another_user_is_left_to_him(tmp_path: Path, monkeypatc
     with pytest.raises(WrongUseError, match="belongs to another user"):
         provisioning.set_password(file, "n2", "second")
     assert file.read_bytes() == before
+
+
+LEARNED = NodeCalibration(
+    boot=1,
+    config_version=1,
+    result=["done", "done"],
+    range_limit_m=[1.5, 1.6],
+    no_echo_is_clear=[False, False],
+    no_echo_us=[0, 0],
+    samples=[256, 256],
+    false_echoes=[0, 2],
+    no_echoes=[0, 5],
+)
+
+
+def test_calibration_writes_limits_and_how_likely_false_echoes_are_into_the_site(monkeypatch, floor: Path) -> None:
+    answers = [LEARNED]
+
+    async def learn(*_: object) -> NodeCalibration:
+        return answers[-1]
+
+    monkeypatch.setattr(on_broker, "learn", learn)
+    words = ["calibrate", "n1", "--site", str(floor), "--broker", "mqtt://127.0.0.1:1"]
+    done = CliRunner().invoke(node_app, words)
+    assert done.exit_code == 0, done.stderr
+    assert "blocked below 1.60 m; of 256 samples 2 echoed from nearer, 5 not at all" in done.stderr
+
+    def stored() -> list[tuple[float, float | None]]:
+        (node,) = [node for node in load_site(floor).site.nodes if node.id == "n1"]
+        return [(sonar.range_limit, sonar.false_echo_rate) for sonar in node.sonars]
+
+    shares = [pytest.approx(2 / 260, abs=1e-4), pytest.approx(4 / 260, abs=1e-4)]
+    assert "warning" not in done.stderr
+    assert stored() == [(1.5, shares[0]), (1.6, shares[1])]
+    # A firmware that does not count them leaves what is known.
+    answers.append(
+        msgspec.structs.replace(LEARNED, range_limit_m=[1.4, 1.4], samples=[], false_echoes=[], no_echoes=[])
+    )
+    assert CliRunner().invoke(node_app, words).exit_code == 0
+    assert stored() == [(1.4, shares[0]), (1.4, shares[1])]
+
+
+def test_calibration_warns_of_a_sonar_that_hears_more_than_the_rule_takes_into_account(monkeypatch) -> None:
+    async def learn(*_: object) -> NodeCalibration:
+        return msgspec.structs.replace(LEARNED, false_echoes=[7, 24])
+
+    monkeypatch.setattr(on_broker, "learn", learn)
+    done = CliRunner().invoke(node_app, ["calibrate", "n1", "--site-id", "estig", "--broker", "mqtt://127.0.0.1:1"])
+    assert done.exit_code == 0, done.stderr
+    said = " ".join(done.stderr.split())
+    assert "warning: sonar 2 hears something in 10 % of the readings" in said
+    assert "warning: sonar 1" not in said
+    assert pytest.approx(learned_rates(Options())[1], abs=5e-4) == node_command.LIKELIEST_FALSE_ECHOES
 
 
 def test_board_with_another_number_of_sonars_is_told_and_not_written(monkeypatch, floor: Path) -> None:

@@ -23,7 +23,7 @@ from fognav_sim.barrier import barrier_across
 from fognav_sim.drive.hazard import draw_hazard
 from fognav_sim.floor import Floor
 from fognav_sim.node import classify, default_config
-from fognav_sim.sensors import Noise, Robot, measure_sonar
+from fognav_sim.sensors import Noise, Robot, Sonars
 
 RESOLUTION = 0.05
 
@@ -138,7 +138,7 @@ def states(site: Site, cells: NDArray[np.uint8], geometry: GridGeometry) -> list
     robot, noise = Robot(x=-1e3, y=-1e3, radius=0.17, height=0.1), Noise(sonar_spike=0.0)
     return [
         classify(
-            [measure_sonar(floor, robot, node, index, noise, generator) for index in range(len(node.sonars))],
+            [Sonars(floor).measure(robot, node, index, noise, generator) for index in range(len(node.sonars))],
             default_config(node),
         )
         for node in site.nodes

@@ -6,6 +6,7 @@ import subprocess
 from collections.abc import Callable
 from pathlib import Path
 
+import psutil
 import pytest
 
 from fognav.hosting import local_nodes, settings, unit, upgrading
@@ -189,6 +190,8 @@ def test_nothing_is_upgraded_under_a_demo_of_the_same_checkout(add_version, fold
             for name, each in (("demo", running), ("elsewhere", other))
         ]
         monkeypatch.setattr(local_nodes, "registered", lambda: systems)
+        while not all(psutil.Process(each.pid).cmdline() for each in (running, other)):
+            pass  # a program that has just been started has no arguments for a moment
         try:
             with pytest.raises(FailedError, match=r"^demo would run on with parts of both versions"):
                 Upgrade(folder, Versions(root), lambda _: None).run(old)

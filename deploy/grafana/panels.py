@@ -6,6 +6,8 @@
 from dataclasses import dataclass
 from typing import Final, Literal
 
+from fog_contracts.channels import AGGREGATOR_HEARTBEAT
+
 Kind = Literal["lines", "stacked", "states", "number"]
 
 
@@ -72,16 +74,23 @@ ROBOTS: Final = Dashboard(
                 ),
                 Panel(
                     "CPU by robot",
-                    "All of Fognav's processes on a robot, in cores. The fog plans, so this stays small.",
-                    ((f"robot:cpu:rate1m{_R}", "{{robot}}"),),
+                    "All of Fognav's processes on a robot, in cores, beside the means of recorded drives by real"
+                    " processes on the processor that the legend names.",
+                    (
+                        (f"robot:cpu:rate1m{_R}", "{{robot}} now"),
+                        ("sum by (setup, machine) (baseline:process_cpu:mean)", "recorded {{setup}} ({{machine}})"),
+                    ),
                     unit="percentunit",
                 ),
                 Panel(
                     "CPU by process",
-                    "The agent localizes and follows; guardian and watchdog only pass commands on and watch.",
-                    ((f"robot_process:cpu:rate1m{_R}", "{{robot}} {{process}}"),),
-                    "stacked",
-                    "percentunit",
+                    "The agent localizes and follows; guardian and watchdog only pass commands on and watch. Beside"
+                    " them the same processes in recorded drives.",
+                    (
+                        (f"robot_process:cpu:rate1m{_R}", "{{robot}} {{process}}"),
+                        ("baseline:process_cpu:mean", "recorded {{setup}} {{process}}"),
+                    ),
+                    unit="percentunit",
                 ),
                 Panel(
                     "CPU by thread",
@@ -349,7 +358,7 @@ SENSORS: Final = Dashboard(
                 ),
                 Panel(
                     "Silence of each node",
-                    "Time since its last reading. They come 8 to 10 times a second.",
+                    "Time since its last reading. Ten come within a second or so after a change, then one a second.",
                     (("fognav_node_silence_seconds", "{{node}} of {{area}}"),),
                     unit="s",
                 ),
@@ -375,7 +384,7 @@ SENSORS: Final = Dashboard(
                 ),
                 Panel(
                     "Age of the aggregator's word",
-                    "Above 1.5 s no area counts as clear.",
+                    f"Above {AGGREGATOR_HEARTBEAT.max_age_s:g} s no area counts as clear.",
                     (("fognav_aggregator_heartbeat_age_seconds", "age"),),
                     unit="s",
                 ),

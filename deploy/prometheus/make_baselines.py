@@ -1,7 +1,8 @@
 """Writes the recorded CPU of robots in the setups `default`, `full` and `fog` as Prometheus's recording rules.
 
 The figures come from the report of an experiment (`fognav experiment report`): from its `drives.csv`, and the machine
-from its `README.md`. Dashboards show them beside what robots take now.
+from its `README.md`, which also says what the robot's processes took in drives by real processes (`fognav experiment
+--live`). Dashboards show them beside what robots take now.
 
 Run: python deploy/prometheus/make_baselines.py [FOLDER] [--check]. FOLDER is the report's (docs/results/estig); one of
 your own says more of your robots' computers. With --check nothing is written, and the exit code is 1 if the file is out
@@ -21,6 +22,7 @@ FILE: Final = Path(__file__).parent / "rules" / "baselines.yml"
 SETUPS: Final = ("default", "full", "fog")
 _COLUMN: Final = "cpu_move_base_percent"
 """Planning, layers and local planning: what one program did on the thesis's robot, and its figures 6.5 and 6.9 show."""
+_PROCESSES: Final = ("agent", "guardian", "watchdog")
 _MACHINE: Final = re.compile(r"^\| machine processor \| ([^|\"{}]+?) \|$", re.MULTILINE)
 
 
@@ -39,19 +41,49 @@ def compared(drives: Sequence[Mapping[str, str]]) -> dict[str, list[float]]:
     return {setup: [found[setup] for found in complete] for setup in SETUPS}
 
 
+def processes(readme: str) -> dict[tuple[str, str], tuple[float, str]]:
+    """Return CPU (cores) and number of drives of each setup's processes, of real ones without a quota at speed 1.
+
+    Nothing, if the report has none. Raises `SystemExit` if its table has other columns, or two such rows of a setup.
+    """
+    table = readme.partition("## What the robot's processes cost")[2].partition("\n## ")[0]
+    lines = [line.strip("| ").split(" | ") for line in table.splitlines() if line.startswith("|")]
+    if not lines:
+        return {}
+    head, _, *rows = lines
+    try:
+        named = [dict(zip(head, row, strict=True)) for row in rows]
+        taken = [row for row in named if (row["quota"], row["speed"]) == ("none", "1") and row["setup"] in SETUPS]
+        setups = [row["setup"] for row in taken]
+        if len(set(setups)) < len(setups):
+            raise SystemExit(
+                "the report has several rows of one setup without a quota at speed 1, of different commits: repeat the "
+                "drives with one commit"
+            )
+        return {
+            (row["setup"], process): (float(row[f"{process}, %"]) / 100.0, row["drives"])
+            for row in taken
+            for process in _PROCESSES
+        }
+    except (KeyError, ValueError) as error:
+        raise SystemExit(f"the report's table of processes can't be read: {error!r}") from error
+
+
 def rules(folder: Path) -> str:
     """Return the file of rules for a report's folder; raises `SystemExit` if that is no report."""
     try:
         with (folder / "drives.csv").open(encoding="utf-8", newline="") as file:
             drives = compared(list(csv.DictReader(file)))
-        machine = _MACHINE.search((folder / "README.md").read_text("utf-8"))
+        readme = (folder / "README.md").read_text("utf-8")
     except (OSError, KeyError, ValueError) as error:
         raise SystemExit(f"{folder} is no report ({error}): `fognav experiment report` writes one") from error
+    machine = _MACHINE.search(readme)
     if machine is None:
         raise SystemExit(f"{folder / 'README.md'} names no `machine processor`: `fognav experiment report` writes it")
     lines = [
         "# Made by deploy/prometheus/make_baselines.py from the report of an experiment: do not edit.",
-        "# CPU in cores of planning, layers and local planning, the mean of recorded drives in each setup.",
+        "# CPU in cores of planning, layers and local planning, the mean of recorded drives in each setup; and of the",
+        "# robot's processes in drives by real ones.",
         "groups:",
         "  - name: baselines",
         "    rules:",
@@ -61,6 +93,13 @@ def rules(folder: Path) -> str:
             "      - record: baseline:planning_cpu:mean",
             f"        expr: vector({fmean(cores):.5f})",
             f'        labels: {{setup: {setup}, machine: "{machine[1]}", drives: "{len(cores)}"}}',
+        ]
+    for (setup, process), (taken, count) in sorted(processes(readme).items()):
+        labels = f'setup: {setup}, process: {process}, machine: "{machine[1]}", drives: "{count}"'
+        lines += [
+            "      - record: baseline:process_cpu:mean",
+            f"        expr: vector({taken:.5f})",
+            f"        labels: {{{labels}}}",
         ]
     return "\n".join(lines) + "\n"
 

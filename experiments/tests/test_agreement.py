@@ -124,3 +124,12 @@ def test_drives_with_and_without_a_quota_stand_beside_one_another(tmp_path):
     (tmp_path / "live" / "0003-ab-fog.json").write_text("{}")
     with pytest.raises(FolderError, match=r"0003-ab-fog\.json can't be read"):
         files.read()
+
+
+def test_drives_of_a_real_robot_are_compared_apart_from_those_of_real_processes():
+    live, lockstep = (msgspec.structs.replace(drive, commit="2ba7f76") for drive in (LIVE, LOCKSTEP))
+    real = msgspec.structs.replace(live, kind="hardware", cpu_percent={}, peak_mb={})
+    text = to_markdown(agreement([live, real], [lockstep]))
+    by_processes, by_robot = "by real processes: brokers", "by a real robot: as the thesis's figures 6.11 and 6.12"
+    assert 0 < text.index(by_processes) < text.index(by_robot)
+    assert "by a real robot" not in to_markdown(agreement([live], [lockstep]))

@@ -1,11 +1,12 @@
 """Scenarios: every file can be played on its site, and what deviates from its expectation is found.
 
-FOGNAV_SCENARIOS=all plays all of them (about 10 minutes), otherwise three short ones.
+FOGNAV_SCENARIOS=all plays all of them (about 10 minutes), otherwise some short ones.
 """
 
 from __future__ import annotations
 
 import os
+from functools import partial
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -15,12 +16,15 @@ import pytest
 from fog_runtime.configuration.site import load_site
 from fognav_experiments.lockstep import DriveEvent
 from fognav_experiments.scenarios.description import Expected, FaultyNode, Scenario, SilentNode, deviations
+from fognav_experiments.scenarios.fleet_stage import FleetResult
 from fognav_experiments.scenarios.stage import Played, ScenarioError, _Stage, markdown_page, play, read_scenario
 
 ROOT = Path(__file__).parents[2]
 FILES = {file.stem: file for file in sorted((ROOT / "experiments" / "scenarios").glob("*.toml"))}
 PLAYED = (
-    sorted(FILES) if os.environ.get("FOGNAV_SCENARIOS") == "all" else ["map-restarts", "no-way-left", "wifi-gap-5s"]
+    sorted(FILES)
+    if os.environ.get("FOGNAV_SCENARIOS") == "all"
+    else ["map-restarts", "no-way-left", "robots-2", "wifi-gap-5s"]
 )
 
 
@@ -29,7 +33,8 @@ def test_every_scenario_is_about_its_site(name):
     scenario = read_scenario(FILES[name])
     site = load_site(ROOT / "sites" / scenario.site)
     assert scenario.title
-    for x, y in (scenario.start[:2], scenario.goal):
+    others = [point for other in scenario.others for point in (other.start[:2], other.goal)]
+    for x, y in (scenario.start[:2], scenario.goal, *others):
         column, row = site.map.geometry.cell(x, y)
         assert site.map.cells[row, column] == 0
     nodes = {node.id for node in site.site.nodes}
@@ -39,7 +44,7 @@ def test_every_scenario_is_about_its_site(name):
 @pytest.mark.parametrize("name", PLAYED)
 def test_a_scenario_ends_as_expected(name):
     played = play(read_scenario(FILES[name]), ROOT / "sites")
-    assert played.deviations == [], [event.description for event in played.result.events]
+    assert played.deviations == [], played.result
 
 
 def test_a_file_with_an_unknown_event_is_refused(tmp_path):
@@ -47,6 +52,48 @@ def test_a_file_with_an_unknown_event_is_refused(tmp_path):
     file.write_text('title = "t"\nstart = [0, 0, 0]\ngoal = [1, 1]\n[[events]]\nkind = "flood"\n[expected]\n')
     with pytest.raises(ScenarioError, match=r"flood\.toml: Invalid value 'flood'"):
         read_scenario(file)
+
+
+def test_several_robots_and_an_event_do_not_go_together(tmp_path):
+    file = tmp_path / "both.toml"
+    file.write_text(
+        'title = "t"\nstart = [0, 0, 0]\ngoal = [1, 1]\n[[others]]\nstart = [5, 5, 0]\ngoal = [6, 6]\n'
+        '[[events]]\nkind = "silent-node"\nnode = "n1"\n[expected]\n'
+    )
+    with pytest.raises(ScenarioError, match="a scenario with others has no events"):
+        read_scenario(file)
+
+
+def test_what_nobody_records_of_several_robots_cannot_be_expected_of_them(tmp_path):
+    file, two = tmp_path / "two.toml", FILES["robots-2"].read_text("utf-8")
+    for line in ('never = ["PROTECTIVE_STOP"]', 'modes = ["NORMAL"]', 'reason = "lost"'):
+        file.write_text(f"{two}{line}\n")
+        with pytest.raises(ScenarioError, match=r"two\.toml: .*has no modes, never or reason"):
+            read_scenario(file)
+
+
+def test_the_paths_of_one_robot_are_not_counted(tmp_path):
+    file = tmp_path / "one.toml"
+    file.write_text('title = "t"\nstart = [0, 0, 0]\ngoal = [1, 1]\n[expected]\nplans = 3\n')
+    with pytest.raises(ScenarioError, match="without others expects has no plans"):
+        read_scenario(file)
+
+
+def test_several_robots_that_have_not_ended_are_driving_as_one_is():
+    two = read_scenario(FILES["robots-2"])
+    short = msgspec.structs.replace(two, seconds=0.5, expected=Expected(outcome="driving"))
+    played = play(short, ROOT / "sites")
+    assert (played.outcome, played.deviations) == ("driving", [])
+    assert "robot r1 is at (30." in played.result.reason
+
+
+def test_the_table_says_how_many_robots_arrived_and_what_they_cost_the_planner():
+    scenario = read_scenario(FILES["robots-2"])
+    result = FleetResult(
+        contacts=0, reason="", distance_m=28.7, time_s=51.6, arrived=1, gap_m=0.063, plans=2, planner_percent=0.46
+    )
+    page = markdown_page({"robots-2": Played(scenario, result, "reached", [])}, {"commit": "c"})
+    assert "| reached | 28.7 | 52 | yes; 1 of 2 arrived, nearest 0.06 m, 2 paths, planner 0.5 % of a core |" in page
 
 
 class Result(msgspec.Struct):
@@ -82,7 +129,11 @@ def test_scenarios_can_be_told_from_one_another():
 
 
 def test_nodes_that_fail_at_the_same_time_come_back_each_at_its_own_end():
-    nodes = [SimpleNamespace(node=SimpleNamespace(id=name)) for name in ("n1", "n2", "n3")]
+    again = []
+    nodes = [
+        SimpleNamespace(node=SimpleNamespace(id=name), on_connected=partial(again.append, name))
+        for name in ("n1", "n2", "n3")
+    ]
     fog = SimpleNamespace(nodes=nodes)
     drive = SimpleNamespace(now=0.0, driven=0.0, system=SimpleNamespace(fog=fog), log_event=lambda _text: None)
     events = [SilentNode(node="n1", seconds=10.0), SilentNode(node="n2", seconds=20.0)]
@@ -94,6 +145,7 @@ def test_nodes_that_fail_at_the_same_time_come_back_each_at_its_own_end():
         return sorted(node.node.id for node in fog.nodes)
 
     assert [heard(now) for now in (0.0, 10.0, 20.0)] == [["n3"], ["n1", "n3"], ["n1", "n2", "n3"]]
+    assert again == ["n1", "n2"], "their connection has come back"
 
 
 def test_the_page_of_scenarios_says_on_what_they_were_played():

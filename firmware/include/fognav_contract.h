@@ -109,7 +109,7 @@
 #define FOGNAV_NODE_COMMAND_CALIBRATE "calibrate"
 #define FOGNAV_NODE_COMMAND_LEARN_NO_ECHO "learn-no-echo"
 
-/* node_calibration, published by a node: What a node has learned on command; it holds until a configuration with another version comes. Per sonar: how it ended, the settings that count now, and the pulse (us, 0: none) by which its board says "no echo". */
+/* node_calibration, published by a node: What a node has learned on command; it holds until a configuration with another version comes. Per sonar: how it ended, the settings that count now, and the pulse (us, 0: none) by which its board says "no echo". Of so many `samples` of free space after its limit was learned (0: none was), as the node's filter lets them through, so many were `false_echoes`, from nearer than that limit, and so many had no echo. */
 #define FOGNAV_NODE_CALIBRATION_TOPIC "fog/v1/%s/nodes/%s/calibration" /* site, node */
 #define FOGNAV_NODE_CALIBRATION_TOPIC_SIZE 91
 #define FOGNAV_NODE_CALIBRATION_LIMIT 1024 /* bytes */
@@ -142,6 +142,18 @@
 #define FOGNAV_NODE_CALIBRATION_NO_ECHO_US_ITEMS_MAX 8
 #define FOGNAV_NODE_CALIBRATION_NO_ECHO_US_MIN 0
 #define FOGNAV_NODE_CALIBRATION_NO_ECHO_US_MAX 80000L
+#define FOGNAV_NODE_CALIBRATION_SAMPLES_FIELD "samples"
+#define FOGNAV_NODE_CALIBRATION_SAMPLES_ITEMS_MAX 8
+#define FOGNAV_NODE_CALIBRATION_SAMPLES_MIN 0
+#define FOGNAV_NODE_CALIBRATION_SAMPLES_MAX 65535L
+#define FOGNAV_NODE_CALIBRATION_FALSE_ECHOES_FIELD "false_echoes"
+#define FOGNAV_NODE_CALIBRATION_FALSE_ECHOES_ITEMS_MAX 8
+#define FOGNAV_NODE_CALIBRATION_FALSE_ECHOES_MIN 0
+#define FOGNAV_NODE_CALIBRATION_FALSE_ECHOES_MAX 65535L
+#define FOGNAV_NODE_CALIBRATION_NO_ECHOES_FIELD "no_echoes"
+#define FOGNAV_NODE_CALIBRATION_NO_ECHOES_ITEMS_MAX 8
+#define FOGNAV_NODE_CALIBRATION_NO_ECHOES_MIN 0
+#define FOGNAV_NODE_CALIBRATION_NO_ECHOES_MAX 65535L
 
 /* node_update, subscribed by a node: A node's next firmware: where it is, and its maker's signature (ECDSA P-256) of number, board, size, SHA-256. */
 #define FOGNAV_NODE_UPDATE_TOPIC "fog/v1/%s/nodes/%s/update" /* site, node */

@@ -3,6 +3,7 @@
 import os
 from pathlib import Path
 
+import msgspec
 import pytest
 
 from fog_contracts.site import NodeSite, Sonar
@@ -10,6 +11,10 @@ from fognav_sim.firmware import FLAGS, Core, FirmwareError, build_library, find_
 from fognav_sim.firmware_node import FirmwareNode
 
 SITE = NodeSite(id="n1", area="z1", x=0.0, y=0.0, theta=0.0, sonars=[Sonar(range_limit=2.0), Sonar(range_limit=2.5)])
+
+UNDEFINED = ("-g", "-fsanitize=undefined", "-fno-sanitize-recover=all")
+"""What the core's tests are compiled with: undefined behaviour ends them. Of its memory the whole firmware's tests and
+the fuzzer tell: the address sanitizer needs a program of its own."""
 
 
 class Ranges:
@@ -39,8 +44,8 @@ def built(tmp_path_factory):
 
 @pytest.fixture(scope="session")
 def library(compiler, built):
-    folder, options = built
-    return build_library(folder, (*FLAGS, *options))
+    folder, counted = built
+    return build_library(folder, (*FLAGS, *(counted or UNDEFINED)))
 
 
 @pytest.fixture(scope="session")
@@ -50,10 +55,10 @@ def core(library):
 
 @pytest.fixture(scope="session")
 def make_node(core):
-    """Make a node with two sonars that begins at 100 s."""
+    """Make a node with two sonars that begins at 100 s; members of the site's node can be given."""
 
-    def make(**options):
-        return FirmwareNode(core, SITE, 7, 100.0, **options)
+    def make(**members):
+        return FirmwareNode(core, msgspec.structs.replace(SITE, **members), 7, 100.0)
 
     return make
 

@@ -238,7 +238,7 @@ def test_calibration_on_command_is_stored_reported_and_outlives_a_restart(switch
     board.measures(1000, -1)
     board.run(5)
     board.send(ch.NODE_COMMAND, ch.CALIBRATE)
-    lines = board.run(15)
+    lines = board.run(45)
     assert "write /calibration.json" in lines
     (report,) = published(lines, ch.NODE_CALIBRATION, NodeCalibration)
     assert (report.result, report.no_echo_is_clear) == (["done", "done"], [False, True])

@@ -39,7 +39,7 @@ id = "gate"
 polygon = [[0.2, 4.5], [0.6, 4.5], [0.6, 4.9]]
 """
 PROGRESS_S = 60.0
-CLEAR_S = ch.AGGREGATOR_HEARTBEAT.max_age_s + 0.5
+CLEAR_S = 1.5 + 0.5
 """How long the map may call an area clear that was blocked meanwhile, while it has lost the broker, and a busy tick."""
 
 

@@ -218,3 +218,26 @@ def test_sonar_outliers_are_single_samples_at_their_rate():
     outliers = np.abs(measured - 3.55) > 0.05
     assert outliers.mean() == pytest.approx(0.05, abs=0.02)
     assert measured[~outliers].std() == pytest.approx(0.004, rel=0.2)
+
+
+@settings(deadline=None)
+@given(
+    x=st.floats(0.5, 5.0), y=st.floats(0.5, 3.0), width=st.floats(0.05, 0.9), height=st.floats(0.05, 0.9),
+    reach=st.floats(0.1, 4.0), direction=st.floats(-3.1, 3.1),
+)  # fmt: skip
+def test_an_obstacle_that_a_ray_meets_within_a_sensor_s_reach_is_never_left_out(x, y, width, height, reach, direction):
+    floor = Floor(GridGeometry(120, 80, 0.05, 0.0, 0.0), np.zeros((80, 120), np.uint8))
+    floor.place(box(x, y, x + width, y + height))
+    rays = direction + np.linspace(-0.5, 0.5, 16)
+    everything = [ranges for _, ranges, _ in floor.obstacle_ranges(2.0, 2.0, rays, 1e3)]
+    within = [ranges for _, ranges, _ in floor.obstacle_ranges(2.0, 2.0, rays, reach)]
+    if np.any(everything[0] <= reach):
+        assert np.array_equal(within[0], everything[0])
+
+
+def test_an_obstacle_that_was_taken_away_is_measured_no_more():
+    world = hall(1.0, 1.0)
+    world.place(box(2.8, 1.0, 3.2, 1.2))
+    assert world.sonar(node(), 0) == pytest.approx(0.75, abs=0.01)
+    assert world.remove("box")
+    assert world.sonar(node(), 0) == pytest.approx(3.55, abs=0.01)

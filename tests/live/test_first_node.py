@@ -1,5 +1,6 @@
-"""The page about the first node, run as it is written: the real aggregator, and a node of the firmware's code."""
+"""The page about the first node, run as written: real aggregator and map-service, a node of the firmware's code."""
 
+import io
 import os
 import re
 import shlex
@@ -11,23 +12,29 @@ import time
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
+from urllib.request import urlopen
 
+import numpy as np
 import programs
 import pytest
+from PIL import Image
 
+from fog_contracts.costs import LETHAL
 from fog_runtime.configuration.site import load_site
 from fog_supervisor import net
 from fog_supervisor.servers import start_mosquitto, start_redis, start_router
 
 pytestmark = [
     pytest.mark.live,
-    pytest.mark.timeout(600),
+    pytest.mark.timeout(900),
     pytest.mark.skipif(shutil.which("g++") is None, reason="the firmware's code needs a C++ compiler (g++)"),
 ]
 
 ROOT = Path(__file__).parents[2]
 WAIT_S = 120.0
 """For any wait, which ends with what it waits for: a busy machine may be ten times slower."""
+COMMAND_S = 600.0
+"""For a command: some load every member and count the floor's cells."""
 
 
 def commands() -> list[str]:
@@ -36,7 +43,7 @@ def commands() -> list[str]:
 
 
 class Lab:
-    """A fog node's broker, stores and aggregator, and a shell whose folders are those of the test."""
+    """A fog node's broker, stores, aggregator and map-service, and a shell whose folders are those of the test."""
 
     def __init__(self, folder: Path) -> None:
         self.folder = folder
@@ -46,14 +53,14 @@ class Lab:
             start_router(folder / "zenoh"),
         ]
         broker, redis, router = self.servers
-        self.port = net.free_port()
+        self.port, self.map_port = net.free_port(), net.free_port()
         runtime = folder / "runtime"
         runtime.mkdir(mode=0o700)
         self.environment = {
             **os.environ,
             "XDG_RUNTIME_DIR": str(runtime),
             "FOGNAV_AGGREGATOR_PORT": str(self.port),
-            "FOGNAV_MAP_PORT": "1",
+            "FOGNAV_MAP_PORT": str(self.map_port),
             "FOGNAV_PLANNER_PORT": "1",
             "FOGNAV_MQTT_PORT": str(broker.port),
             "FOGNAV_FOG": "fog-node",
@@ -65,14 +72,24 @@ class Lab:
             "FOGNAV_MQTT_URL": broker.url,
             "FOGNAV_REDIS_URL": redis.url,
             "FOGNAV_ZENOH_CONNECT": router.endpoint,
-            "FOGNAV_HTTP_PORT": str(self.port),
         }
-        self.aggregator: programs.Program | None = None
+        self.programs: list[programs.Program] = []
         self.node: subprocess.Popen[bytes] | None = None
 
-    def start_aggregator(self) -> None:
-        self.aggregator = programs.start("hazard_aggregator", self.services, self.folder / "aggregator.log")
+    def start_services(self) -> None:
+        for module, port in (("hazard_aggregator", self.port), ("map_service", self.map_port)):
+            settings = {**self.services, "FOGNAV_HTTP_PORT": str(port)}
+            self.programs.append(programs.start(module, settings, self.folder / f"{module}.log"))
         self.wait(lambda: "n8" in self.listed("nodes"), "the aggregator knows the node")
+        self.wait(lambda: self.hazard("z4") is not None, "the map knows the area")
+
+    def hazard(self, area: str) -> dict[str, Any] | None:
+        """What the map-service says of an area; None while it is starting."""
+        try:
+            body = net.request("GET", self.map_port, "/api/v1/hazards").body
+        except ConnectionRefusedError:
+            return None
+        return next((view for view in body if view["hazard"]["area"] == area), None) if isinstance(body, list) else None
 
     def words(self, command: str) -> list[str]:
         """The command with the page's folders in the test's, run by this interpreter."""
@@ -81,11 +98,9 @@ class Lab:
         return [sys.executable, "-m", "fognav", *words[1:]] if words[0] == "./fognav" else words
 
     def run(self, command: str) -> str:
-        # A site's id is not the aggregator's to tell, and the map-service does not run here.
-        extra = ["--site-id", "estig"] if " watch " in command else []
         done = subprocess.run(
-            [*self.words(command), *extra], cwd=ROOT, env=self.environment, capture_output=True, text=True,
-            timeout=WAIT_S, check=False,
+            self.words(command), cwd=ROOT, env=self.environment, capture_output=True, text=True,
+            timeout=COMMAND_S, check=False,
         )  # fmt: skip
         assert done.returncode == 0, f"{command}\n{done.stdout}{done.stderr}"
         return done.stdout + done.stderr
@@ -111,6 +126,14 @@ class Lab:
             assert time.monotonic() < deadline, what
             time.sleep(0.05)
 
+    def cost_at(self, x: float, y: float) -> int:
+        """The cost of a place (m) in the picture of the map that everybody can look at."""
+        geometry = load_site(self.folder / "floor").map.geometry
+        url = f"http://127.0.0.1:{self.map_port}/api/v1/costmap.png"
+        with urlopen(url, timeout=WAIT_S) as answer, Image.open(io.BytesIO(answer.read())) as picture:
+            column, row = geometry.cell(x, y)
+            return int(np.asarray(picture)[geometry.height - 1 - row, column])
+
     def end_node(self) -> None:
         if self.node is not None:
             self.node.send_signal(signal.SIGINT)
@@ -121,9 +144,9 @@ class Lab:
         if self.node is not None:
             self.node.kill()
             self.node.wait()
-        if self.aggregator is not None:
-            self.aggregator.kill()
-            self.aggregator.wait()
+        for program in self.programs:
+            program.kill()
+            program.wait()
         for server in self.servers:
             server.stop()
 
@@ -141,10 +164,13 @@ def test_page_leads_from_a_site_to_a_hazard(lab: Lab) -> None:
     printed: dict[str, str] = {}
     for command in commands():
         if " node sim " in command:
-            if lab.aggregator is None:
-                lab.start_aggregator()
+            if not lab.programs:
+                lab.start_services()
             lab.simulate(command)
         else:
+            if command == "./fognav area list":
+                # The page's reader looks again until it has come; the map has it soon after the aggregator.
+                lab.wait(lambda: (found := lab.hazard("z4")) and found["hazard"]["state"] == "blocked", "z4 is blocked")
             printed[command] = lab.run(command)
             if " node add " in command:
                 limits = [sonar.range_limit for sonar in load_site(lab.folder / "floor").site.nodes[-1].sonars]
@@ -156,6 +182,11 @@ def test_page_leads_from_a_site_to_a_hazard(lab: Lab) -> None:
                 assert [sonar.range_limit for sonar in node.sonars] != limits
     watched = printed["./fognav node watch n8 --count 12"]
     assert watched.splitlines()[-1].split()[1] == "blocked"
-    lab.wait(lambda: re.search(r"^z4.*blocked", lab.run("./fognav area list"), re.MULTILINE), "the area is blocked")
+    assert re.search(r"^z4.*blocked", printed["./fognav area list"], re.MULTILINE)
+    told = next(line for line in printed["./fognav map hazards"].splitlines() if line.startswith("z4: "))
+    assert re.fullmatch(
+        r"z4: blocked, impassable \(node n8: sonar [01]: something at [01]\.\d+ m, nearer than 2\.\d+ m\)", told
+    )
+    assert lab.cost_at(33.2, 39.4) == LETHAL
     assert (lab.folder / "coverage.png").stat().st_size > 1000
     assert oct((lab.folder / "board" / "node.json").stat().st_mode)[-3:] == "600"

@@ -22,6 +22,19 @@ def script():
     return module
 
 
+PROCESSES = """
+## What the robot's processes cost
+
+| setup | quota | speed | drives | agent, % | guardian, % | watchdog, % |
+| --- | --- | --- | --- | --- | --- | --- |
+| default | none | 1 | 3 | 8.00 | 2.00 | 0.20 |
+| full | 0.2 of a core | 1 | 2 | 4.00 | 1.00 | 0.10 |
+
+## Another table
+| setup |
+"""
+
+
 def report(folder: Path, *drives: tuple[int, str, float, str], readme: str = README) -> Path:
     """Write a report with drives of one route: run, setup, CPU in percent, and whether it succeeded."""
     with (folder / "drives.csv").open("w", newline="") as file:
@@ -57,6 +70,38 @@ def test_baseline_is_the_mean_of_the_routes_that_were_driven_in_every_setup(scri
         "full": ("vector(0.02250)", "Cortex-A72", "2"),
         "fog": ("vector(0.01250)", "Cortex-A72", "2"),
     }
+
+
+def test_baselines_of_the_robot_s_processes_are_those_of_real_ones_without_a_quota(script, tmp_path):
+    drives = [(1, setup, 1.0, "True") for setup in ("default", "full", "fog")]
+    text = script.rules(report(tmp_path, *drives, readme=README + PROCESSES))
+    (group,) = yaml.safe_load(text)["groups"]
+    found = {
+        (rule["labels"]["setup"], rule["labels"]["process"]): (rule["expr"], rule["labels"]["drives"])
+        for rule in group["rules"]
+        if rule["record"] == "baseline:process_cpu:mean"
+    }
+    assert found == {
+        ("default", "agent"): ("vector(0.08000)", "3"),
+        ("default", "guardian"): ("vector(0.02000)", "3"),
+        ("default", "watchdog"): ("vector(0.00200)", "3"),
+    }
+    with pytest.raises(SystemExit, match="table of processes can't be read"):
+        script.rules(report(tmp_path, *drives, readme=README + PROCESSES.replace("agent, %", "agent")))
+
+
+def test_baselines_are_of_drives_at_speed_1_and_of_one_commit(script):
+    row = "| default | none | 1 | 3 | 8.00 | 2.00 | 0.20 |\n"
+    faster = row.replace("| 1 |", "| 4 |").replace("8.00", "2.00")
+    assert script.processes(PROCESSES.replace(row, row + faster))["default", "agent"] == (0.08, "3")
+    with pytest.raises(SystemExit, match="several rows of one setup"):
+        script.processes(PROCESSES.replace(row, row + row.replace("8.00", "9.00")))
+
+
+def test_published_baselines_have_the_whole_robot_in_the_setups_of_the_thesis():
+    (group,) = yaml.safe_load((SCRIPT.parent / "rules" / "baselines.yml").read_text("utf-8"))["groups"]
+    found = {(rule["labels"]["setup"], rule["labels"].get("process", "planning")) for rule in group["rules"]}
+    assert found >= {(s, p) for s in ("default", "full") for p in ("planning", "agent", "guardian", "watchdog")}
 
 
 def test_folder_without_a_report_a_complete_route_or_a_machine_is_refused_with_the_remedy(script, tmp_path):

@@ -253,7 +253,7 @@ def transitions(hazards: list[AreaHazard]) -> list[tuple[str, int, str]]:
 
 def test_recording_contains_all_kinds_of_inputs(recorded):
     assert {"blocked", "clear", "unknown"} == {hazard.state for hazard in recorded.of(ch.AREA_HAZARD)}
-    assert len(recorded.of(ch.NODE_READING)) > 500
+    assert len(recorded.of(ch.NODE_READING)) > 100
     assert len({path.plan_id for path in recorded.of(ch.ROBOT_PATH)}) >= 2
     assert any(zones.zones for zones in recorded.of(ch.ZONES))
     assert any(seen.points for seen in recorded.of(ch.ROBOT_OBSTACLES))

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import ast
 from pathlib import Path
-from typing import TYPE_CHECKING, Final, NamedTuple
+from typing import TYPE_CHECKING, Final, NamedTuple, TypeVar
 
 from fog_contracts import channels as ch
 
@@ -17,8 +17,10 @@ if TYPE_CHECKING:
     from fog_contracts.channels import Channel, Role
 
 ROOT: Final = Path(__file__).parents[2]
+N = TypeVar("N", ast.Attribute, ast.Call)
+
 SIDES: Final = {
-    "subscribe": "subscribers", "latest": "subscribers", "on": "subscribers",
+    "subscribe": "subscribers", "subscribe_polled": "subscribers", "latest": "subscribers", "on": "subscribers",
     "query": "subscribers", "_query": "subscribers", "on_message": "subscribers",
     "decode": "subscribers", "decode_text": "subscribers", "encode_text": "publishers",
     "publish": "publishers", "publish_nowait": "publishers", "Will": "publishers", "serve": "publishers",
@@ -64,8 +66,8 @@ def liveliness_declared(folder: str) -> set[str]:
 
 
 def liveliness_read(folder: str) -> list[str]:
-    """Return where the sources below a folder ask who is present."""
-    return [place for place, call in _calls(folder) if _name(call) == "present"]
+    """Return where the sources below a folder ask who is present, be it only to learn whether their router answers."""
+    return [place for place, node in _nodes(folder, ast.Attribute) if node.attr in {"present", "router_answers"}]
 
 
 def session_roles(folder: str) -> dict[str, str]:
@@ -80,7 +82,12 @@ def session_roles(folder: str) -> dict[str, str]:
 
 
 def _calls(folder: str) -> Iterator[tuple[str, ast.Call]]:
-    """Yield every call below a folder, or in a file, with its file and the function around it (`file.py:function`)."""
+    """Yield every call below a folder, or in a file, with its place."""
+    return _nodes(folder, ast.Call)
+
+
+def _nodes(folder: str, kind: type[N]) -> Iterator[tuple[str, N]]:
+    """Yield every node of a kind below a folder, or in a file, with its file and function (`file.py:function`)."""
     path = ROOT / folder
     for file in [path] if path.is_file() else sorted(path.rglob("*.py")):
         if "bench" in file.parts:  # it measures, and is no part of the system
@@ -88,7 +95,7 @@ def _calls(folder: str) -> Iterator[tuple[str, ast.Call]]:
         tree = ast.parse(file.read_text(encoding="utf-8"))
         functions = [n for n in ast.walk(tree) if isinstance(n, ast.FunctionDef | ast.AsyncFunctionDef)]
         for node in ast.walk(tree):
-            if isinstance(node, ast.Call):
+            if isinstance(node, kind):
                 around = [f for f in functions if f.lineno <= node.lineno <= (f.end_lineno or 0)]
                 name = max(around, key=lambda f: f.lineno).name if around else ""
                 yield f"{file.relative_to(ROOT)}:{name}", node

@@ -119,6 +119,11 @@ class BusEdge:
         assert channel.message is kind
         self._subscribe(channel, handler, ids)
 
+    subscribe_polled = subscribe  # the bus delivers at once
+
+    def poll(self) -> None:
+        """Do nothing: nothing waits."""
+
     def _subscribe(self, channel: Channel, handler: Any, ids: dict[str, str]) -> None:
         assert self._role in channel.subscribers, channel.name
         self._live.subscribed.add((self._role, channel))

@@ -375,9 +375,10 @@ def test_live_services_reply_refuse_and_drive_as_in_lockstep(lockstep, live):
 def table_pairs(live: Any, kind: str, side: str) -> set[Any]:
     """Return the table's pairs of role and channel on one side, for the roles that run here.
 
-    Here each service runs once and always leads: without `fog_runtime.leases.leadership`, which announces the leader.
+    Here each service runs once and always leads: without `fog_runtime.leases.leadership`, which announces the leader
+    and asks who is present.
     """
-    rows = [row for row in ch.CHANNELS.values() if row.kind == kind and row is not ch.LEADER]
+    rows = [row for row in ch.CHANNELS.values() if row.kind == kind and row not in {ch.LEADER, ch.LIVE}]
     return {(role, row) for row in rows for role in getattr(row, side) if role in live.edges} - usage.NOT_YET
 
 

@@ -12,7 +12,7 @@ import typer
 from rich.table import Table
 
 from fog_runtime.configuration import parts
-from fognav import __version__, checkout, doctor, kernels, system
+from fognav import __version__, checkout, doctor, kernels, node_code, system
 from fognav.commands.alert import alert_app
 from fognav.commands.area import area_app
 from fognav.commands.backup import backup_command, restore_command
@@ -41,6 +41,7 @@ from fognav.output import (
     WrongUseError,
     check_writable,
     console,
+    exit_codes,
     fail,
     print_json,
     print_line,
@@ -254,6 +255,7 @@ def demo_command(  # noqa: PLR0913  # each option is an argument
         fail(str(error), WRONG_USE)
     try:
         packages = embedded_servers(forced=embedded, yes=yes, print_line=print_line)
+        node_code.prepare(print_line, yes=yes)
         kernels.warm_cache(print_line)
     except (system.MissingToolsError, kernels.KernelsError) as error:
         fail(str(error))
@@ -393,6 +395,37 @@ def site_check(
     else:
         fail(str(found["problem"]))
     raise typer.Exit(OK if found["ok"] else NOT_TRUE)
+
+
+@site_app.command(
+    "compose", epilog="Example: fognav site compose sites/upstairs && docker compose up -d --remove-orphans"
+)
+def site_compose(
+    folders: Annotated[
+        list[Path] | None, typer.Argument(metavar="[DIR]...", help="Every floor but the first; none: no further ones.")
+    ] = None,
+    *,
+    out: Annotated[
+        Path | None, typer.Option("--out", metavar="FILE", help="Default: docker-compose.override.yml here.")
+    ] = None,
+    json: JsonOption = False,
+) -> None:
+    """Let the fog node in containers serve further floors.
+
+    It writes the file that compose reads besides docker-compose.yml, at its next `docker compose up`. Name all floors
+    each time, in the same order, which gives them their ports; and again after an upgrade.
+    """
+    from fognav.commands.site import compose_floors  # noqa: PLC0415  # keeps the other commands fast
+    from fognav.hosting.compose_floors import OVERRIDE  # noqa: PLC0415  # same
+
+    with exit_codes():
+        root = checkout.root()
+        sites = [checkout.site_folder(folder) for folder in folders or []]
+        made = compose_floors(sites, root, out or root / OVERRIDE)
+    if json:
+        print_json(made)
+    else:
+        print_line(f"{made['file']} has {len(sites)} further floors: docker compose up -d --remove-orphans")
 
 
 def main() -> None:

@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
+from fog_contracts.cones import sonar_cone
 from fog_contracts.costs import DEFAULT_INFLATION, FREE, LETHAL
 from fog_contracts.geometry import lengths_along
 from fog_contracts.raster import rasterize
@@ -20,7 +21,7 @@ from fog_kernels.astar import Planner, nearest_traversable
 from fog_kernels.distance import squared_distance_capped
 from fog_kernels.inflation import inflate, inflation_table
 from fog_kernels.raycast import cast
-from fognav_sim.sensors import LIDAR_MAX_M, SONAR_HALF_CONE
+from fognav_sim.sensors import LIDAR_MAX_M
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -34,7 +35,6 @@ if TYPE_CHECKING:
 OBSTACLE_RADIUS_M: Final = 0.25
 """Half the width of a person, or of a box that is worth a detour."""
 SPEED_M_S: Final = 0.3
-_RAYS: Final = 33
 _PLACE_REACH_M: Final = 0.5
 _SIGHT_STEP_M: Final = 0.25
 
@@ -130,16 +130,6 @@ def coverage(site: Site, static: StaticMap) -> Coverage:
     return Coverage(areas, routes, unreachable)
 
 
-def cone(node: NodeSite, sonar: int, static: StaticMap, walls: NDArray[np.uint8]) -> list[Point]:
-    """Return the outline of what a sonar sees (m, frame `map`): from the node to its limit or the first wall."""
-    middle, limit = node.theta + node.sonars[sonar].angle, node.sonars[sonar].range_limit
-    angles = np.linspace(middle - SONAR_HALF_CONE, middle + SONAR_HALF_CONE, _RAYS)
-    g = static.geometry
-    ranges = np.minimum(cast(walls, g.resolution, g.origin_x, g.origin_y, node.x, node.y, angles, limit), limit)
-    ends = [(node.x + r * math.cos(a), node.y + r * math.sin(a)) for a, r in zip(angles, ranges, strict=True)]
-    return [(node.x, node.y), *ends]
-
-
 def _seen(cones: Sequence[list[Point]], static: StaticMap) -> NDArray[np.bool_]:
     """Return the cells in which something as wide as a person touches a cone."""
     inside = np.zeros(static.geometry.shape, dtype=np.uint8)
@@ -151,7 +141,7 @@ def _seen(cones: Sequence[list[Point]], static: StaticMap) -> NDArray[np.bool_]:
 
 
 def _area(area: AreaSite, nodes: list[NodeSite], static: StaticMap, walls: NDArray[np.uint8]) -> AreaCoverage:
-    cones = [cone(node, sonar, static, walls) for node in nodes for sonar in range(len(node.sonars))]
+    cones = [sonar_cone(node, sonar, static) for node in nodes for sonar in range(len(node.sonars))]
     window, mask = rasterize(area.polygon, static.geometry)
     floor = mask & (walls[window.rows, window.columns] == 0)
     seen = _seen(cones, static)[window.rows, window.columns] & floor

@@ -26,7 +26,8 @@ from fognav.demo.options import Options
 from fognav.demo.run import Demo
 from fognav.output import FailedError
 from fognav_experiments.comparison.draws import RouteDraw
-from fognav_experiments.comparison.measured import MeasuredDrive, drive_name
+from fognav_experiments.comparison.driven import drive_name, facts
+from fognav_experiments.comparison.measured import MeasuredDrive
 from fognav_experiments.comparison.records import DriveFiles
 from fognav_experiments.comparison.runner import Task
 from fognav_sim.drive.hazard import HazardRequest
@@ -161,25 +162,8 @@ def _record(
 ) -> MeasuredDrive:
     summary, processes, speed = demo.attempt.summary(), report["processes"], demo.scene.speed
     return MeasuredDrive(
+        **facts(MeasuredDrive, drawn, setup, summary),
         kind="live",
-        setup=setup,
-        run=drawn.run,
-        route=drawn.route.name,
-        seed=drawn.seed,
-        area=drawn.area,
-        moment=drawn.moment,
-        trigger_m=drawn.trigger_m,
-        outcome=summary.outcome,
-        reason=summary.reason,
-        success=summary.success,
-        distance_m=summary.distance_m,
-        time_s=summary.time_s,
-        plans=summary.plans,
-        paths=summary.paths,
-        modes=summary.modes,
-        stops=summary.stops,
-        route_areas=summary.route_areas,
-        min_clearance_m=summary.min_clearance_m,
         cpu_percent={name: round(used["cpu_percent"] / speed, 2) for name, used in processes.items()},
         peak_mb={name: used["rss_mb"] for name, used in processes.items()},
         cpu_quota=options.cpu_quota,

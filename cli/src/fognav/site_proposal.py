@@ -13,6 +13,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
+from fog_contracts.cones import SONAR_HALF_CONE
 from fog_contracts.costs import DEFAULT_INFLATION, FREE, LETHAL
 from fog_contracts.geometry import Point
 from fog_contracts.grid import GridGeometry, StaticMap
@@ -26,7 +27,7 @@ from fog_kernels.raycast import cast
 from fognav_sim.barrier import BarrierError, barrier_across
 from fognav_sim.floor import Floor
 from fognav_sim.node import classify, default_config
-from fognav_sim.sensors import Noise, Robot, measure_sonar
+from fognav_sim.sensors import Noise, Robot, Sonars
 
 PLACE_CLEARANCE_M: Final = 0.45
 DRIVE_M: Final = (15.0, 60.0)
@@ -36,7 +37,6 @@ _ENDS_M: Final = (8.0, 3.0)
 _CORRIDOR_M: Final = (0.9, 4.2)
 _AREA_LENGTH_M: Final = 2.4
 _SONAR_ANGLES: Final = (-0.13, 0.13)
-_HALF_CONE: Final = math.radians(7.5)
 _SONAR_MAX_M: Final = 3.8
 """A little less than the sonar's specified range (4 m): the opposite wall must echo reliably."""
 _WALL_MARGIN_M: Final = 0.35
@@ -220,7 +220,7 @@ def _area_at(floor: _Floor, spot: Point, number: int) -> tuple[AreaSite, NodeSit
     mount = (spot[0] - dx * (near - _MOUNT_GAP_M), spot[1] - dy * (near - _MOUNT_GAP_M))
     sonars = []
     for angle in _SONAR_ANGLES:
-        cone = across + angle + np.linspace(-_HALF_CONE, _HALF_CONE, 7)
+        cone = across + angle + np.linspace(-SONAR_HALF_CONE, SONAR_HALF_CONE, 7)
         echo = float(floor.ranges(mount, cone, _SONAR_MAX_M + 1.0).min())
         limit = min(echo, _SONAR_MAX_M) - _WALL_MARGIN_M
         if limit < _CORRIDOR_M[0] / 2:
@@ -272,9 +272,8 @@ def _is_sensed(floor: _Floor, area: AreaSite, node: NodeSite) -> bool:
 def _state_of(floor: _Floor, node: NodeSite) -> AreaState:
     """Return what a node reports on the floor without a robot, measured without noise."""
     generator = np.random.default_rng(0)
-    ranges = [
-        measure_sonar(floor.echoing, _NO_ROBOT, node, index, _NO_NOISE, generator) for index in range(len(node.sonars))
-    ]
+    sonars = Sonars(floor.echoing)
+    ranges = [sonars.measure(_NO_ROBOT, node, index, _NO_NOISE, generator) for index in range(len(node.sonars))]
     return classify(ranges, default_config(node))
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
@@ -19,14 +20,15 @@ def to_toml(site: Site) -> str:
         "# Metres, radians; map frame: x right, y up. After a change run: fognav site check DIR",
         "",
         f'id = "{site.id}"',
-        f'name = "{site.name}"',
+        f"name = {_quoted(site.name)}",
         "# map_server YAML, relative to this folder or absolute.",
         f"map = {_quoted(site.map)}",
         "",
     )
     about_areas = (
         "# A watched area: `number` is its number in the topics of the thesis's nodes. Optional tables:",
-        "# `debounce` (default: the rule `evidence`) and `unknown` (cost while its nodes are silent).",
+        "# `debounce` (default: the rule `evidence`) and `unknown` (cost while its nodes are silent). Instead of a",
+        "# polygon, `cone_of` may name one of its nodes: then the area is what that node's sonars see.",
     )
     about_nodes = (
         "# A sensor node on a wall: `range_limit` is the calibrated distance below which an echo means an",
@@ -48,7 +50,7 @@ def to_toml(site: Site) -> str:
 def _place_lines(identifier: str, place: Place) -> list[str]:
     return [
         f"[places.{identifier}]",
-        f'label = "{place.label}"',
+        f"label = {_quoted(place.label)}",
         f"x = {_number(place.x)}",
         f"y = {_number(place.y)}",
         "# theta = 0.0   # without it any heading is accepted",
@@ -58,12 +60,13 @@ def _place_lines(identifier: str, place: Place) -> list[str]:
 
 def _area_lines(area: AreaSite) -> list[str]:
     corners = ", ".join(f"[{_number(x)}, {_number(y)}]" for x, y in area.polygon)
+    place = f"polygon = [{corners}]" if area.cone_of is None else f'cone_of = "{area.cone_of}"'
     return [
         "[[areas]]",
         f'id = "{area.id}"',
-        f'label = "{area.label}"',
-        f"number = {area.number}",
-        f"polygon = [{corners}]",
+        f"label = {_quoted(area.label)}",
+        *([] if area.number is None else [f"number = {area.number}"]),
+        place,
         "",
     ]
 
@@ -72,7 +75,9 @@ def node_lines(node: NodeSite) -> list[str]:
     """Return a node as a table of `site.toml`, with an empty line at its end."""
     sonars = (
         f"    {{ angle = {_number(s.angle)}, range_limit = {_number(s.range_limit)}, "
-        f"no_echo_is_clear = {str(s.no_echo_is_clear).lower()} }},"
+        f"no_echo_is_clear = {str(s.no_echo_is_clear).lower()}"
+        + ("" if s.false_echo_rate is None else f", false_echo_rate = {_number(s.false_echo_rate)}")
+        + " },"
         for s in node.sonars
     )
     return [
@@ -87,6 +92,7 @@ def node_lines(node: NodeSite) -> list[str]:
         *sonars,
         "]",
         *([] if node.penalty is None else [f"penalty = {node.penalty}"]),
+        *(["every_reading = true"] if node.every_reading else []),
         "",
     ]
 
@@ -116,5 +122,5 @@ def _demo_lines(demo: DemoPlan) -> list[str]:
 
 
 def _quoted(text: str) -> str:
-    escaped = text.replace("\\", "\\\\").replace('"', '\\"')
-    return f'"{escaped}"'
+    """Return a text as a TOML string, whose escapes are those of JSON; TOML takes no DEL as it is."""
+    return json.dumps(text, ensure_ascii=False).replace("\x7f", "\\u007f")

@@ -49,6 +49,10 @@ class MissingToolsError(RuntimeError):
     """Programs are missing and were not installed; the message names them and how to install them."""
 
 
+class NoAttemptError(MissingToolsError):
+    """Nobody tried to install the missing programs: there is no consent, or no way to install them."""
+
+
 class Provider(Protocol):
     """A way to install missing programs; tried in the order of `PROVIDERS`."""
 
@@ -156,16 +160,17 @@ def ensure(
 ) -> dict[str, Path]:
     """Return the path of each program, after installing the missing ones with the first available provider.
 
-    Raises `MissingToolsError` with the missing programs and the command to install them, without consent or provider.
+    Raises `NoAttemptError` with the missing programs and the command to install them, without consent or provider, and
+    `MissingToolsError` if their installation fails.
     """
     missing = [tool for tool in tools if find(tool) is None]
     if missing:
         names = " and ".join(tool.name for tool in missing)
         provider = next((p for p in (PROVIDERS if providers is None else providers) if p.available()), None)
         if provider is None:
-            raise MissingToolsError(f"missing: {names}. Install with: sudo {install_command(missing)}")
+            raise NoAttemptError(f"missing: {names}. Install with: sudo {install_command(missing)}")
         if not (has_consent(yes) or ask(f"Missing: {names}. Run '{provider.command(missing)}' now?")):
-            raise MissingToolsError(
+            raise NoAttemptError(
                 f"missing: {names}. Install with: {provider.command(missing)}  (or run again with --yes)"
             )
         print_line(f"installing {names} ({provider.name})")

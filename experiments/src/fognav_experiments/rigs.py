@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Final, Literal
 from fog_contracts import channels as ch
 from fog_contracts.bus import Bus
 from fog_contracts.commands import signed_command
+from fog_contracts.cones import node_cones
 from fog_contracts.handlers import Moment, Publication
 from fog_contracts.messages import CommandReply, NodeConfig
 from fog_runtime.configuration.default_parts import DEFAULT_BASE, DEFAULT_LIDAR
@@ -46,9 +47,9 @@ from robot_agent.hardware import DockingDriver
 from robot_agent.registry import make_base, make_lidar
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterable
+    from collections.abc import Callable, Iterable, Mapping
 
-    from fog_contracts.messages import CommandKind, Zone
+    from fog_contracts.messages import CommandKind, Pose, Zone
     from fog_contracts.site import RobotSite
     from fog_runtime.configuration.site import LoadedSite
     from fognav_sim.emulators import BaseEmulator
@@ -227,8 +228,8 @@ class RobotRig:
                 self.agent.on_scan(scan, now)
         self._to_lidar += received.data + self._lidar_driver.tick(now)
 
-    def command(self, kind: CommandKind) -> CommandReply:
-        """Send an operator's signed command; return the reply."""
+    def command(self, kind: CommandKind, pose: Pose | None = None) -> CommandReply:
+        """Send an operator's signed command, `initial_pose` with a pose; return the reply."""
         self._nonce += 1
         command = signed_command(
             kind,
@@ -238,6 +239,7 @@ class RobotRig:
             boot=BOOT,
             issued_at=self.now,
             key=OPERATOR_KEY,
+            pose=pose,
         )
         reply = self._bus.query(ch.ROBOT_COMMAND, command, CommandReply, moment(self.now), robot=self.id)
         assert reply is not None
@@ -246,7 +248,8 @@ class RobotRig:
 
 def make_aggregator(site: LoadedSite, epoch: int) -> Aggregator:
     """Return the aggregator of a site, as it starts."""
-    return Aggregator(AreaFusion(site.site.definitions(), site.site.nodes, epoch=epoch, registry=find_rule))
+    nodes, cones = site.site.nodes, node_cones(site.site.nodes, site.map)
+    return Aggregator(AreaFusion(site.site.definitions(), nodes, epoch=epoch, registry=find_rule, cones=cones))
 
 
 def make_map(site: LoadedSite, epoch: int) -> MapCore:
@@ -277,6 +280,14 @@ class FogRig(Fog):
         # The nodes were switched on at different times.
         self.nodes = make_nodes(site.site.nodes, seed, start, apart=0.013)
         self.start(moment(start))
+        # From here on: what is retained at the start was there when the nodes were switched on.
+        bus.subscribe({ch.NODE_CONFIG: self._on_node_config})
+
+    def _on_node_config(self, ids: Mapping[str, str], config: NodeConfig, _at: Moment) -> tuple[()]:
+        for node in self.nodes:
+            if node.node.id == ids["node"]:
+                node.configure(config)
+        return ()
 
     def put_zone(self, zone: Zone, at: Moment) -> None:
         """Add or replace an operator's zone, and store it."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import heapq
+from itertools import product
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -56,6 +57,25 @@ def costmaps(draw: st.DrawFn) -> NDArray[np.uint8]:
     share = draw(st.sampled_from([0.0, 0.1, 0.35, 0.5]))
     walls = rng.random((height, width)) < share
     costmap[walls] = rng.choice(np.array([253, 254, 255], np.uint8), int(walls.sum()))
+    return costmap
+
+
+@st.composite
+def floors(draw: st.DrawFn) -> NDArray[np.uint8]:
+    """Rooms of several sizes behind doors, or anything."""
+    if draw(st.integers(0, 3)) == 0:
+        return draw(costmaps())
+    size = draw(st.integers(3, 8))
+    rng = np.random.default_rng(draw(st.integers(0, 2**32 - 1)))
+    costmap = np.full((3 * size + 1, 3 * size + 1), 254, np.uint8)
+    costs = np.array(draw(st.sampled_from([[0], [0, 0, 0, 90], [0, 100, 252]])), np.uint8)
+    for x, y in product(range(1, 3 * size, size), repeat=2):
+        costmap[y : y + size - 1, x : x + size - 1] = rng.choice(costs, (size - 1, size - 1))
+        along, wide = rng.integers(0, size - 1), rng.integers(1, 3)
+        if x > 1 and rng.random() < 0.6:
+            costmap[y + along : min(y + along + wide, y + size - 1), x - 1] = rng.choice(costs)
+        if y > 1 and rng.random() < 0.6:
+            costmap[y - 1, x + along : min(x + along + wide, x + size - 1)] = rng.choice(costs)
     return costmap
 
 

@@ -20,7 +20,7 @@ from fog_kernels.amcl import (
     rng_state,
     score_poses,
 )
-from fog_kernels.likelihood import likelihood_field
+from fog_kernels.distance import likelihood_field
 from fog_kernels.raycast import cast
 
 if TYPE_CHECKING:

@@ -18,8 +18,8 @@ import numpy as np
 from fog_contracts.costs import DEFAULT_INFLATION
 from fog_kernels import warm
 warm.warm()
-from fog_kernels import amcl, astar, body, clearance, components, distance, dwa, dwa_settings, inflation, likelihood
-from fog_kernels import lines, raycast, tiles
+from fog_kernels import amcl, astar, body, clearance, components, distance, dwa, dwa_settings, inflation
+from fog_kernels import lidar, lines, raycast, tiles
 raw = np.zeros((60, 60), np.uint8)
 raw[0] = 254
 shut = raw.copy()
@@ -29,7 +29,7 @@ for source in (raw, shut):
     cost = inflation.inflate(source, table)
     inflation.inflate_window(source, table, 3, 3, 4, 4, cost)
     distance.squared_distance_capped(source, 5)
-    field = likelihood.likelihood_field(source == 254, 0.05)
+    field = distance.likelihood_field(source == 254, 0.05)
     planner = astar.Planner(60, 60)
     patterns = tiles.TilePatterns(10**6)
     guide = planner.goal_field(cost, (50, 50), patterns)
@@ -41,6 +41,9 @@ for source in (raw, shut):
     found = components.Components(cost)
     found.nearest(found.of(20, 20), (0, 0)), found.labels(0, 0, 5, 5)
     lines.line_cost(cost, 20, 20, 30, 30), lines.polyline_cost(cost, np.full((2, 2), 20.0))
+    lines.nearest_on(np.zeros((2, 2)), np.zeros(2), 0, 1, 1.0, 1.0)
+    nodes = lidar.decode_nodes(bytes(5) if source is raw else bytes((1, 1, 0, 0, 0)))
+    lidar.batch(*lidar.in_metres(nodes.angle_q6, nodes.distance_q2), 0.0, 1.0)
     lines.leaves(np.zeros((2, 2)), np.ones((2, 2)), 0.5, 0.1)
     limits = dwa.DwaLimits(axle=0.235, wheel_max=0.5)
     shape, how = body.cover([(0.2, -0.1), (0.2, 0.1), (-0.2, 0.1), (-0.2, -0.1)]), dwa_settings.DEFAULT_SETTINGS
@@ -91,10 +94,11 @@ for module in sys.argv[1:]:
 
 def test_importing_a_module_loads_no_unneeded_kernels() -> None:
     unneeded = {
-        "dwa": {"astar", "inflation", "amcl", "raycast", "likelihood", "distance"},
+        "dwa": {"astar", "inflation", "amcl", "raycast", "lidar", "distance"},
         "amcl": {"astar", "inflation", "dwa", "raycast", "distance"},
-        "likelihood": {"astar", "inflation", "dwa", "raycast", "amcl"},
-        "astar": {"inflation", "dwa", "raycast", "amcl", "likelihood", "distance"},
+        "distance": {"astar", "inflation", "dwa", "raycast", "amcl"},
+        "lidar": {"astar", "inflation", "dwa", "raycast", "amcl", "distance", "lines"},
+        "astar": {"inflation", "dwa", "raycast", "amcl", "lidar", "distance"},
     }
     lines = [line.split() for line in python("-c", IMPORT_EACH, *unneeded).splitlines()]
     loaded = {module: set(names) for module, *names in lines}

@@ -29,10 +29,15 @@ class Mqtt:
 class Zenoh:
     def __init__(self) -> None:
         self.handlers, self.only, self.served, self.sent = {}, {}, {}, []
+        self.polled = {}
 
     def subscribe(self, channel, kind, handler, **ids):
         assert kind is channel.message
         self.handlers[channel], self.only[channel] = handler, ids
+
+    def subscribe_polled(self, channel, kind, handler, **ids):
+        assert kind is channel.message
+        self.polled[channel], self.only[channel] = handler, ids
 
     def serve(self, channel, handler, **ids):
         self.served.setdefault(channel, []).append((handler, ids))
@@ -67,6 +72,22 @@ def test_each_channel_is_subscribed_on_its_transport_and_results_are_published()
     assert zenoh.sent == [(ch.ROBOT_GOAL, GOAL, {"robot": "r1"})] * 2
     assert mqtt.sent == [(ch.THESIS_WSN, "7,1,2", {})] * 2
     assert mqtt.numbers[ch.THESIS_AREA] == [7]
+
+
+def test_polled_channels_are_only_those_that_are_named():
+    clock, zenoh, received = ManualClock(5.0), Zenoh(), []
+    edges = Edges(clock, zenoh=zenoh)
+
+    def handler(ids, message, at):
+        received.append((dict(ids), message, at))
+        return ()
+
+    handlers = {ch.ROBOT_POSE: handler, ch.ROBOT_GOAL: handler}
+    edges.subscribe(handlers, lambda _: None, only={"robot": "r1"}, polled=[ch.ROBOT_POSE])
+    assert (zenoh.polled.keys(), zenoh.handlers.keys()) == ({ch.ROBOT_POSE}, {ch.ROBOT_GOAL})
+    assert zenoh.only[ch.ROBOT_POSE] == {"robot": "r1"}
+    zenoh.polled[ch.ROBOT_POSE]({"robot": "r1"}, POSE)
+    assert received == [({"robot": "r1"}, POSE, Moment(5.0, 5.0))]
 
 
 def test_channel_without_a_connected_transport_raises():

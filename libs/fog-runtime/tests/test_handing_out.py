@@ -163,15 +163,64 @@ def test_administrator_reads_a_file_of_the_locks_and_nothing_else(node):
     assert "they have: " in node.refused("show", "../out/planner/operator.key").lower()
 
 
-def test_locks_of_another_site_are_refused(node, tmp_path, monkeypatch):
-    other = tmp_path / "site"
-    other.mkdir()
+def renamed(folder: Path, site: str) -> Path:
+    """A copy of the floor estig with an id of its own."""
+    folder.mkdir(parents=True)
     for file in SITE.iterdir():
         if file.is_file():
-            (other / file.name).write_bytes(file.read_bytes())
-    text = (other / "site.toml").read_text("utf-8")
-    (other / "site.toml").write_text(text.replace('id = "estig"', 'id = "annex"', 1), "utf-8")
-    monkeypatch.setenv("FOGNAV_SITE_DIR", str(other))
+            (folder / file.name).write_bytes(file.read_bytes())
+    text = (folder / "site.toml").read_text("utf-8")
+    (folder / "site.toml").write_text(text.replace('id = "estig"', f'id = "{site}"', 1), "utf-8")
+    return folder
+
+
+@pytest.fixture
+def upstairs(node, tmp_path, monkeypatch):
+    """What is handed out to a further floor, of the same robots and nodes."""
+    renamed(tmp_path / "floors" / "upstairs", "upstairs")
+    monkeypatch.setenv("FOGNAV_FLOORS_DIR", str(tmp_path / "floors"))
+    out = node.out / "floors" / "upstairs"
+    for program in (*SERVICES, SIMULATION):
+        (out / program).mkdir(parents=True)
+    node.run()
+    return out
+
+
+def test_further_floor_has_users_tokens_and_key_of_its_own(node, upstairs):
+    assert {each.name for each in (upstairs / "planner").iterdir()} == {"credentials.toml", TOKENS, OPERATOR_KEY}
+    assert Credentials.read(upstairs / "map-service" / "credentials.toml").user == "upstairs.map-service"
+    assert Credentials.read(upstairs / SIMULATION / "credentials" / "r1.toml").user == "upstairs.r1"
+    for name in (OPERATOR_KEY, TOKENS):
+        assert (upstairs / "planner" / name).read_text() != (node.out / "planner" / name).read_text()
+    lists = [node.out / "mosquitto" / "users", node.out / "zenoh" / "users", node.out / "redis" / "users"]
+    assert all("upstairs.hazard-aggregator" in file.read_text() for file in lists)
+    assert "upstairs.r1:" in (node.out / "zenoh" / "users").read_text()
+    token = node.run("--floor", "upstairs", "token", "create", "ann", "operator").strip()
+    assert token_hash(token) in (upstairs / "planner" / TOKENS).read_text()
+    assert token_hash(token) not in (node.out / "planner" / TOKENS).read_text()
+
+
+def test_robot_of_a_further_floor_is_let_in_and_removed_by_its_id_there(node, upstairs):
+    assert 'user = "upstairs.r9"' in node.run("--floor", "upstairs", "robot", "r9")
+    assert "upstairs.r9:" in (node.out / "zenoh" / "users").read_text()
+    node.run("--floor", "upstairs", "remove", "r9")
+    assert "r9:" not in (node.out / "zenoh" / "users").read_text()
+    assert "There are: upstairs" in node.refused("--floor", "attic", "robot", "r9")
+
+
+def test_second_start_with_a_further_floor_changes_nothing(node, upstairs):
+    before = {path: path.stat().st_mtime_ns for path in node.out.rglob("*")}
+    node.run("make")
+    assert {path: path.stat().st_mtime_ns for path in node.out.rglob("*")} == before
+
+
+def test_two_floors_of_the_same_id_are_refused(node, upstairs, tmp_path):
+    renamed(tmp_path / "floors" / "attic", "upstairs")
+    assert "two floors have the same id 'upstairs'" in node.refused()
+
+
+def test_locks_of_another_site_are_refused(node, tmp_path, monkeypatch):
+    monkeypatch.setenv("FOGNAV_SITE_DIR", str(renamed(tmp_path / "site", "annex")))
     assert "has the locks of site estig, not of annex" in node.refused()
 
 

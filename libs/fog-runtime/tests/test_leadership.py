@@ -60,6 +60,8 @@ class Process:
         self.isolated_at = -100.0
         """When it was last cut off from the store, or slow."""
         self.loadable = True
+        self.answered = world.answered
+        """Whether the broker answers it; nothing passes there."""
         self.epoch = 0
         """The epoch of its core; 0 on standby."""
         self.handler = None
@@ -72,7 +74,13 @@ class Process:
         self.edges = Edges(ManualClock(), zenoh=self, gate=self.leadership)
         self.edges.serve({ch.ZONES: lambda _ids, _request, _at: self.zones()})
         self.leadership.subscribe()
-        self.tasks = [self.loop.create_task(each) for each in (self.leadership.run(self), self.publish_loop())]
+        self.tasks = [
+            self.loop.create_task(each)
+            for each in (self.leadership.run(self, {"network": self.answers}), self.publish_loop())
+        ]
+
+    async def answers(self) -> bool:
+        return self.network_reachable and self.answered
 
     async def publish_loop(self) -> None:
         while True:
@@ -138,6 +146,8 @@ class World:
     def __init__(self) -> None:
         self.now = 1000.0
         self.records = LeaseModel()
+        self.answered = True
+        """Whether the broker answers processes that start."""
         self.receiver = Fence()
         self.received: list[tuple[float, str, int]] = []
         self.owners: dict[int, str] = {}
@@ -281,6 +291,23 @@ def test_process_that_ends_gives_the_lease_back(world):
     world.run(0.9)
     (new,) = world.leaders()
     assert new != old
+
+
+def test_process_that_starts_while_the_broker_answers_nobody_leaves_the_lease_where_it_is(world):
+    world.run(2.0)
+    (leader,) = world.leaders()
+    standby = next(name for name in NAMES if name != leader)
+    epoch = world.processes[leader].epoch
+    world.answered = False
+    for process in world.processes.values():
+        process.answered = False
+    world.run(3.0)
+    world.processes[standby].close()
+    world.processes[standby] = Process(standby, world)
+    world.run(4.0)
+    assert world.leaders() == [leader]
+    assert world.processes[leader].epoch == epoch
+    assert "no answer of network" in world.processes[standby].health.report()["parts"]["lease"]["detail"]
 
 
 class Copies(RuleBasedStateMachine):

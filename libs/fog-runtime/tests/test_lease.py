@@ -15,9 +15,9 @@ from lease_model import LEASE_S, LeaseModel
 
 from fog_contracts.fencing import HEARD_LIMIT, MOST_AHEAD, Fence
 from fog_contracts.handlers import RefusedMessageError
-from fog_runtime.leases.lease import Granted, Held, Lease
+from fog_runtime.leases.lease import CUT_OFF_S, Granted, Held, Lease, LeftToOther
 
-ATTEMPT_S, STEP_S = 0.4, 0.05
+ATTEMPT_S, STEP_S, PROBE_S = 0.4, 0.05, 0.2
 TAKEOVER_S = 2.0
 
 
@@ -152,6 +152,44 @@ def test_standby_asks_again_when_the_lease_of_the_other_is_about_to_end():
     assert lease.request(0.16) is not None
 
 
+def test_leader_without_answers_asks_redis_at_once_whether_another_is_ready_and_leaves_it_the_lease():
+    lease = leading(5, at=100.0)
+    for at, cut_off in ((100.3, False), (100.6, False), (100.9, False)):
+        lease.on_answer(100.0)
+        request = lease.request(at)
+        assert (request.ready, request.cut_off) == (at < 100.35, cut_off)
+        lease.on_reply(request, Granted(5), at + 0.01)
+    assert lease.request(100.99) is None
+    request = lease.request(101.05)
+    assert (request.ready, request.cut_off) == (False, True)
+    lease.on_reply(request, LeftToOther(), 101.06)
+    assert lease.permission(101.06) == "refused"
+    assert lease.request(101.1) is None, "the other one comes first"
+
+
+def test_process_that_has_just_started_is_neither_ready_nor_cut_off_before_the_first_answer():
+    lease = Lease("a", 100.0)
+    for at, answered_at, outcome in (
+        (100.0, -math.inf, (False, False)),
+        (101.0, -math.inf, (False, False)),
+        (101.3, -math.inf, (False, True)),
+        (101.6, 101.5, (True, False)),
+    ):
+        lease.on_answer(answered_at)
+        request = lease.request(at)
+        assert (request.ready, request.cut_off) == outcome
+        lease.on_reply(request, Held(5, "b", 0.1), at + 0.01)
+
+
+def test_leader_without_answers_goes_on_while_nobody_else_is_ready():
+    lease = leading(5, at=100.0)
+    lease.on_answer(100.0)
+    for step in range(20):
+        now = 101.1 + 0.3 * step
+        lease.on_reply(lease.request(now), Granted(5), now + 0.01)
+        assert (lease.epoch, lease.permission(now + 0.02)) == (5, "granted")
+
+
 def without_redis(lease: Lease, begin: float, end: float, *, connected: bool = True, proposal: int = 1000) -> None:
     """Let a process run without an answer from Redis."""
     for step in range(round((end - begin) / 0.1)):
@@ -241,8 +279,8 @@ class Process:
     def __init__(self, name: str, now: float, rate: float) -> None:
         self.name, self.rate, self.offset = name, rate, 1000.0 * (ord(name[0]) - 96) - now * rate
         self.lease = Lease(name, self.clock(now))
-        self.stopped_until = -1.0
-        self.redis_cut = self.network_cut = False
+        self.stopped_until = self.answered_at = -1.0
+        self.redis_cut = self.network_cut = self.needs_cut = False
         self.pending = None
         """The request on its way: (request, when it reaches Redis or None, reply, when the reply is here)."""
         self.inbox: list[tuple[int, str]] = []
@@ -278,9 +316,10 @@ class Cluster(RuleBasedStateMachine):
     def stop(self, which, seconds):
         self.processes[which].stopped_until = self.now + seconds
 
-    @rule(which=st.integers(0, 2))
-    def crash(self, which):
+    @rule(which=st.integers(0, 2), needs_cut=st.booleans())
+    def crash(self, which, needs_cut):
         self.processes[which] = self.process(which)
+        self.processes[which].needs_cut = needs_cut
 
     @rule(which=st.integers(0, 2), cut=st.booleans())
     def cut_from_redis(self, which, cut):
@@ -289,6 +328,10 @@ class Cluster(RuleBasedStateMachine):
     @rule(which=st.integers(0, 2), cut=st.booleans())
     def cut_from_network(self, which, cut):
         self.processes[which].network_cut = cut
+
+    @rule(which=st.integers(0, 2), cut=st.booleans())
+    def cut_from_needs(self, which, cut):
+        self.processes[which].needs_cut = cut
 
     @rule(up=st.booleans(), lost=st.booleans())
     def redis_restarts(self, up, lost):
@@ -311,7 +354,7 @@ class Cluster(RuleBasedStateMachine):
         """Without disturbances, one leads within 2 s, and only one."""
         self.redis_up, self.delay = True, 0.0
         for process in self.processes:
-            process.redis_cut = process.network_cut = False
+            process.redis_cut = process.network_cut = process.needs_cut = False
             process.stopped_until = -1.0
         for _ in range(round(2 * TAKEOVER_S / STEP_S)):
             self.step()
@@ -321,7 +364,7 @@ class Cluster(RuleBasedStateMachine):
         assert leaders[0].lease.confirmed
         assert self.accepted[-1][0] > self.now - 2 * STEP_S
 
-    @rule(death=st.sampled_from(["crash", "stop", "cut"]), steps=st.integers(0, 7), awake=st.booleans())
+    @rule(death=st.sampled_from(["crash", "stop", "cut", "needs"]), steps=st.integers(0, 7), awake=st.booleans())
     def takeover(self, death, steps, awake):
         """After the leader's death, hang or partition another one's messages are accepted within 2 s."""
         self.heal()
@@ -333,6 +376,8 @@ class Cluster(RuleBasedStateMachine):
             self.processes.remove(leader)
         elif death == "stop":
             leader.stopped_until = self.now + 10.0
+        elif death == "needs":
+            leader.needs_cut = True
         else:
             leader.redis_cut = leader.network_cut = True
         while self.highest == old:
@@ -342,6 +387,24 @@ class Cluster(RuleBasedStateMachine):
             self.processes.insert("abc".index(leader.name[0]), self.process("abc".index(leader.name[0])))
         elif awake:
             self.heal()
+
+    @rule(steps=st.integers(0, 7), starts_at=st.none() | st.integers(0, round(3 * CUT_OFF_S / STEP_S) - 1))
+    def needs_fail_for_all(self, steps, starts_at):
+        """A leader goes on if what it needs answers nobody else either, nor who starts meanwhile."""
+        self.heal()
+        for _ in range(steps):
+            self.step()
+        old = self.highest
+        for process in self.processes:
+            process.needs_cut = True
+        for step in range(round(3 * CUT_OFF_S / STEP_S)):
+            if step == starts_at:
+                standby = next(index for index, process in enumerate(self.processes) if not process.lease.epoch)
+                self.crash(standby, needs_cut=True)
+            self.step()
+        assert self.highest == old
+        assert self.accepted[-1][0] > self.now - 2 * STEP_S
+        self.heal()
 
     # --- The world ---
 
@@ -380,6 +443,9 @@ class Cluster(RuleBasedStateMachine):
                 lease.on_leader(epoch, holder, clock)
             lease.on_epoch(self.highest)  # the robots' states tell it
         process.inbox.clear()
+        if not process.needs_cut and self.now >= process.answered_at + PROBE_S:
+            process.answered_at = self.now
+            lease.on_answer(clock)
         lease.tick(clock, self.wall_clock() + ord(process.name[0]), connected=not process.network_cut)
         if process.pending is None and (request := lease.request(clock)) is not None:
             process.pending = request, self.now + self.delay / 2, None, 0.0

@@ -1,6 +1,7 @@
 """The lease in a real Redis: the same decisions as the model of the state machine's tests, and one holder of many."""
 
 import asyncio
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -8,7 +9,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from lease_model import LeaseModel
 
-from fog_runtime.leases.lease import ATTEMPT_S, Granted, Held, Request
+from fog_runtime.leases.lease import ATTEMPT_S, Granted, Held, LeftToOther, Request
 from fog_runtime.leases.lease_store import LeaseStore
 from fog_supervisor.servers import Server, start_redis
 
@@ -24,9 +25,11 @@ def redis(tmp_path_factory: pytest.TempPathFactory):
 NEW = Request(epoch=0, floor=0, confirmed=False, sent_at=0.0)
 STEPS = st.lists(
     st.tuples(
-        st.sampled_from(["a", "b", "expire", "forget"]),
+        st.sampled_from(["a", "b", "expire", "unready", "forget"]),
         st.integers(0, 6),
         st.integers(0, 8),
+        st.booleans(),
+        st.booleans(),
         st.booleans(),
     ),
     max_size=12,
@@ -44,18 +47,23 @@ async def compare(redis: Server, steps) -> None:
     expected = LeaseModel()
     async with LeaseStore(redis.url, "test", "planner") as store:
         await store._redis.write(("FLUSHALL",))
-        for who, epoch, floor, confirmed in steps:
+        for who, epoch, floor, confirmed, ready, cut_off in steps:
             if who == "expire":
                 await store._redis.write(("DEL", "fog:test:planner:lease"))
                 expected.lease = None
+            elif who == "unready":
+                await store._redis.write(("DEL", "fog:test:planner:ready"))
+                expected.ready = None
             elif who == "forget":
                 await store._redis.write(("FLUSHALL",))
-                expected.lease, expected.stored, expected.floor = None, 0, 0
+                expected.lease, expected.stored, expected.floor, expected.ready = None, 0, 0, None
             else:
-                request = Request(epoch, floor, confirmed, 0.0)
+                request = Request(epoch, floor, confirmed, 0.0, ready=ready, cut_off=cut_off)
                 reply, wanted = await store.acquire(who, request), expected.acquire(who, request, 0.0, clock=3)
                 assert type(reply) is type(wanted)
                 assert reply is not None
+                if isinstance(reply, LeftToOther):
+                    continue
                 assert reply.epoch == wanted.epoch
                 if isinstance(reply, Held):
                     assert reply.holder == wanted.holder
@@ -86,6 +94,27 @@ async def test_leader_learns_at_its_renewal_of_a_higher_epoch_that_somebody_else
         renewed = await store.acquire("a", Request(leader.epoch, leader.epoch - 1, confirmed=True, sent_at=0.0))
         assert isinstance(renewed, Granted)
         assert renewed.epoch > higher
+
+
+async def test_lease_of_a_leader_that_is_cut_off_goes_to_a_copy_that_says_it_is_ready_and_for_a_moment_only(
+    redis: Server,
+):
+    async with LeaseStore(redis.url, "ready", "planner") as store:
+        first = await store.acquire("a", NEW)
+        assert isinstance(first, Granted)
+        lost = Request(first.epoch, 0, confirmed=True, sent_at=0.0, ready=False, cut_off=True)
+        unready = Request(0, 0, confirmed=False, sent_at=0.0, ready=False, cut_off=False)
+        assert isinstance(await store.acquire("b", unready), Held)
+        assert await store.acquire("a", lost) == first, "nobody else is ready"
+        assert isinstance(await store.acquire("b", NEW), Held)
+        assert await store.acquire("a", lost) == LeftToOther()
+        assert await store.acquire("a", lost) == LeftToOther(), "it does not come between"
+        taken = await store.acquire("b", NEW)
+        assert isinstance(taken, Granted)
+        assert taken.epoch > first.epoch
+        assert isinstance(await store.acquire("a", NEW), Held)
+        await asyncio.sleep(0.5)
+        assert await store.acquire("b", replace(lost, epoch=taken.epoch)) == taken
 
 
 async def test_released_lease_is_free_at_once_and_nobody_releases_that_of_another(redis: Server):

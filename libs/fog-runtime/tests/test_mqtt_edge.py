@@ -3,6 +3,8 @@
 import asyncio
 import contextlib
 import json
+import os
+import signal
 import subprocess
 import time
 
@@ -393,3 +395,21 @@ async def test_loss_of_either_connection_is_told_and_only_that_of_the_inputs_to_
             assert lost == expected
         await edge.publish(ch.NODE_READING, reading(1), node="n1")
         await until(lambda: readings, "no reading after the reconnect")
+
+
+async def test_broker_that_hangs_answers_no_more_on_a_connection_that_is_up_and_again_when_it_goes_on(broker):
+    edge = make_edge(broker, "a")
+    assert not await edge.broker_answers()
+    both = MqttEdgeWithInputs(broker.url, "b", SystemClock(), site="lab", inputs=[ch.NODE_READING])
+    async with running(edge, both):
+        assert await edge.broker_answers(60.0)
+        assert await both.broker_answers(60.0)
+        os.kill(broker.pid, signal.SIGSTOP)
+        try:
+            assert not await edge.broker_answers(0.2)
+            assert not await both.broker_answers(0.2)
+            assert edge.connected
+        finally:
+            os.kill(broker.pid, signal.SIGCONT)
+        assert await edge.broker_answers(60.0)
+        assert await both.broker_answers(60.0)

@@ -1,6 +1,6 @@
 """A store on a replicated Redis behind Sentinels: no acknowledged write is lost when primaries die.
 
-`FOGNAV_KILLS=200` kills that many primaries instead of one.
+`FOGNAV_KILLS=200` kills that many primaries instead of one; `FOGNAV_WRITES=50000` writes so often meanwhile.
 """
 
 import asyncio
@@ -27,6 +27,7 @@ from fog_supervisor.servers import Server, ServerProgram, find_program, start_re
 
 pytestmark = pytest.mark.live
 KILLS = int(os.environ.get("FOGNAV_KILLS", "1"))
+WRITES = int(os.environ.get("FOGNAV_WRITES", "50"))
 THINGS = Table("things", "zone")
 AUDIT = Audit(1.0, "anna", "create")
 REPLICATION = "min-replicas-to-write 1\nmin-replicas-max-lag 2\n"
@@ -105,7 +106,7 @@ def cluster(tmp_path: Path):
         yield Cluster(tmp_path, stack)
 
 
-@pytest.mark.timeout(180 + 60 * KILLS)
+@pytest.mark.timeout(180 + 60 * KILLS + WRITES // 20)
 async def test_no_acknowledged_write_is_lost_when_primaries_are_killed_under_load(cluster: Cluster):
     chance = random.Random(1)
     acknowledged: set[str] = set()
@@ -132,12 +133,13 @@ async def test_no_acknowledged_write_is_lost_when_primaries_are_killed_under_loa
             port = await cluster.primary()
             await asyncio.sleep(chance.uniform(0.0, 0.3))
             cluster.servers[port].kill()
-            async with asyncio.timeout(60):
-                while len(acknowledged) < before + 50 or await cluster.names(port):  # noqa: ASYNC110  # other processes
+            async with asyncio.timeout(60 + WRITES // 20):
+                while len(acknowledged) < before + max(50, WRITES // KILLS) or await cluster.names(port):  # noqa: ASYNC110  # other processes
                     await asyncio.sleep(0.05)
             await asyncio.to_thread(cluster.servers[port].start)
         stopped.set()
         await asyncio.gather(*writers)
+    async with RedisStore(cluster.url, "test", timeout_s=60.0) as store:  # reading so many takes long
         stored = set(await store._readable_records("things", Thing))
     lost = acknowledged - stored
     sys.stdout.write(f"{KILLS} kills: {len(acknowledged)} acknowledged, {len(lost)} lost\n")

@@ -3,7 +3,9 @@ import re
 import numpy as np
 import pytest
 
+from fog_contracts.geometry import contains_point
 from fog_contracts.grid import GridGeometry, StaticMap
+from fog_contracts.messages import AREAS_MAX
 from fog_runtime.configuration.maps import save_map
 from fog_runtime.configuration.site import SiteError, load_site
 
@@ -44,6 +46,10 @@ areas = ["a1"]
 """
 
 
+POLYGON = "polygon = [[1.5, 1.5], [1.5, 0.5], [2.5, 0.5], [2.5, 1.5]]"
+OF_ANOTHER_AREA = f'cone_of = "n1"\n[[areas]]\nid = "a2"\n{POLYGON}'
+
+
 @pytest.fixture
 def folder(tmp_path):
     cells = np.zeros((20, 40), dtype=np.uint8)
@@ -76,6 +82,16 @@ def test_site_loads_with_its_map_and_counter_clockwise_areas(folder):
         ("y = 1.95", "y = 2.95", "nodes[0] (n1)", "off the map"),
         ("[2.5, 0.5]", "[2.5, -0.5]", "areas[0].polygon (a1), vertex", "off the map"),
         ("[2.5, 0.5], [2.5, 1.5]", "[2.5, 1.5], [2.5, 0.5]", "areas[0].polygon (a1)", "crosses itself"),
+        (f"{POLYGON}\n", "", "areas[0] (a1)", "Add `polygon`, or `cone_of`"),
+        (POLYGON, f'{POLYGON}\ncone_of = "n1"', "areas[0].cone_of (a1)", "Leave out one"),
+        (POLYGON, 'cone_of = "n7"', "areas[0].cone_of (a1): there is no node 'n7'", "one of the area's nodes: n1"),
+        (
+            POLYGON,
+            'cone_of = "n1"',
+            "areas[0].cone_of (a1): node n1 at (2, 1.95) sees nothing",
+            "give the area a polygon",
+        ),
+        (POLYGON, OF_ANOTHER_AREA, "areas[0].cone_of (a1): node 'n1' watches area 'a2'", "(none defined)"),
         ("number = 1", "nummber = 1", "areas[0].nummber", "spelling"),
         ("angle = 0.2", "angel = 0.2", "nodes[0].sonars[1].angel", "spelling"),
         ('goal = "desk"', 'goal = "roof"', "demo.goal", "one of: desk, door"),
@@ -88,12 +104,38 @@ def test_site_loads_with_its_map_and_counter_clockwise_areas(folder):
 )
 def test_invalid_site_is_refused_by_file_and_field_with_a_remedy(folder, old, new, field, remedy):
     assert SITE.count(old) >= 1
-    (folder / "site.toml").write_text(SITE.replace(old, new, 1))
+    changed = SITE.replace(old, new, 1)
+    if new == OF_ANOTHER_AREA:
+        changed = changed.replace('area = "a1"', 'area = "a2"')
+    (folder / "site.toml").write_text(changed)
     with pytest.raises(SiteError) as refused:
         load_site(folder)
     text = str(refused.value)
     assert text.startswith(f"{folder / 'site.toml'}: {field}"), text
     assert remedy in text, text
+
+
+def test_area_that_is_the_cone_of_a_node_has_the_place_that_the_node_sees(folder):
+    text = SITE.replace(POLYGON, 'cone_of = "n1"').replace("y = 1.95", "y = 1.85")
+    (folder / "site.toml").write_text(text)
+    loaded = load_site(folder)
+    (area,) = loaded.site.areas
+    assert contains_point(area.polygon, 2.1, 0.7)
+    assert min(y for _, y in area.polygon) == pytest.approx(1.85 - 1.5, abs=0.02)
+    assert loaded.site.definitions()[0].cone_of == "n1"
+    assert loaded.site.definitions()[0].polygon == area.polygon
+    (folder / "site.toml").write_text(text.replace("x = 2.0", "x = 1.5"))
+    moved = load_site(folder).site.areas[0]
+    assert np.mean(moved.polygon, axis=0) == pytest.approx(np.mean(area.polygon, axis=0) - (0.5, 0.0), abs=0.02)
+
+
+def test_site_may_have_as_many_areas_as_fit_into_a_heartbeat_and_no_more(folder):
+    def with_areas(count: int) -> str:
+        return SITE + "".join(f'[[areas]]\nid = "more{number}"\n{POLYGON}\n' for number in range(count - 1))
+
+    assert len(load_site(folder, with_areas(AREAS_MAX)).site.areas) == AREAS_MAX
+    with pytest.raises(SiteError, match=rf"site\.toml: areas: there are {AREAS_MAX + 1} areas, .*Remove some, or make"):
+        load_site(folder, with_areas(AREAS_MAX + 1))
 
 
 def test_invalid_toml_is_refused_with_its_line(folder):

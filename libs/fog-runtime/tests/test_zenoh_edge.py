@@ -4,10 +4,13 @@ import asyncio
 import contextlib
 import itertools
 import json
+import os
+import signal
 import threading
 import time
 from collections import Counter
 
+import numpy as np
 import pytest
 import zenoh
 from prometheus_client import REGISTRY
@@ -15,8 +18,12 @@ from prometheus_client import REGISTRY
 from fog_contracts import channels as ch
 from fog_contracts import messages as m
 from fog_contracts.codec import ContractError, encode
+from fog_contracts.follower import MapFollower
+from fog_contracts.grid import GridGeometry, Window
 from fog_contracts.handlers import RefusedMessageError
+from fog_contracts.replica import MasterMap
 from fog_runtime.clock import SystemClock
+from fog_runtime.transports.edges import Edges
 from fog_runtime.transports.reply_parts import PART_BYTES, decode_announcement
 from fog_runtime.transports.zenoh_edge import ASKER, ZenohEdge, session_config
 from fog_supervisor.net import free_port
@@ -57,6 +64,12 @@ def delta(seq, size=10):
     return m.MapDelta(
         epoch=1, seq=seq, part=0, parts=1, layer="cost", x=0, y=0, w=size, h=1, packing="raw", cells=bytes(size), hash=0
     )
+
+
+def master():
+    geometry = GridGeometry(8, 8, 0.05, 0.0, 0.0)
+    cells = np.zeros(geometry.shape, dtype=np.uint8)
+    return MasterMap("lab", geometry, cells, cells, 1)
 
 
 def zones(seq):
@@ -128,6 +141,92 @@ async def test_busy_loop_gets_only_the_newest_pose_but_every_delta(router):
         await until(lambda: deltas == list(range(101)), "deltas are missing or out of order")
         await until(lambda: poses and poses[-1] == 100.0, "the newest pose was not delivered")
     assert len(poses) < 20
+
+
+async def test_polled_messages_wait_for_the_next_look_and_the_newest_are_kept(router):
+    polled, pushed = [], []
+    async with edge(router.endpoint, "a") as a, edge(router.endpoint, "b") as b:
+        b.subscribe_polled(ch.ROBOT_POSE, m.RobotPose, lambda ids, message: polled.append((ids, message.x)))
+        b.subscribe(ch.ROBOT_POSE, m.RobotPose, lambda _, message: pushed.append(message.x))
+        await publish_until(a, ch.ROBOT_POSE, lambda _: pose(-1.0), lambda: pushed, "no pose", robot="r1")
+        for n in range(1, 101):
+            a.publish(ch.ROBOT_POSE, pose(float(n)), robot="r1")
+        await until(lambda: pushed[-1] == 100.0, "the last pose did not come")
+        assert polled == []
+        b.poll()
+        assert polled[-1] == ({"robot": "r1"}, 100.0)
+        assert 1 <= len(polled) <= 16
+        count = len(polled)
+        b.poll()
+        assert len(polled) == count
+        a.publish(ch.ROBOT_POSE, pose(101.0), robot="r1")
+        await until(lambda: pushed[-1] == 101.0, "the next pose did not come")
+        b.poll()
+        assert [x for _, x in polled[count:]] == [101.0]
+
+
+async def test_messages_that_wait_to_be_polled_are_handled_before_those_that_were_sent_after_them(router):
+    handled, fetches = [], []
+    writer, follower = master(), MapFollower()
+    follower.on_snapshot(writer.snapshot(), 0.0)
+
+    def on_heartbeat(_ids, message, at):
+        handled.append(("heartbeat", message.seq))
+        follower.on_heartbeat(message, at.now)
+        return []
+
+    def on_delta(_ids, message, at):
+        handled.append(("delta", message.seq))
+        follower.on_delta(message, at.now)
+        fetches.append(follower.wants_snapshot(at.now))
+        return []
+
+    async with edge(router.endpoint, "a") as a, edge(router.endpoint, "b") as b:
+        Edges(SystemClock(), zenoh=b).subscribe(
+            {ch.MAP_DELTA: on_delta, ch.MAP_HEARTBEAT: on_heartbeat}, lambda _: None, polled=[ch.MAP_HEARTBEAT]
+        )
+
+        def connected():
+            b.poll()
+            return handled
+
+        await publish_until(a, ch.MAP_HEARTBEAT, lambda _: writer.heartbeat(0.0), connected, "no heartbeat")
+        handled.clear()
+        writer.set_epoch(writer.version.epoch + 1)  # another map-service takes over
+        a.publish(ch.MAP_HEARTBEAT, writer.heartbeat(1.0))
+        (change,) = writer.write([("cost", Window(0, 0, 1, 1), np.full((1, 1), 254, dtype=np.uint8))], [], [])
+        a.publish(ch.MAP_DELTA, change)
+        await until(lambda: ("delta", change.seq) in handled, "the change did not come")
+    assert handled[-2:] == [("heartbeat", change.seq - 1), ("delta", change.seq)]
+    assert fetches == [False]
+    assert follower.version == writer.version
+
+
+async def test_polled_messages_are_checked_and_come_to_a_session_that_opened_late(tmp_path):
+    polled, port = [], free_port()
+    endpoint, channel = f"tcp/127.0.0.1:{port}", ch.ROBOT_POSE
+    before = counter("fognav_refused_messages_total", channel)
+    async with edge(endpoint, "b") as b:
+        b.subscribe_polled(channel, m.RobotPose, lambda _, message: polled.append(message.x))
+        b.poll()
+        with pytest.raises(ValueError, match="must not be lost"):
+            b.subscribe_polled(ch.MAP_DELTA, m.MapDelta, lambda _ids, _message: None)
+
+        def come():
+            b.poll()
+            return polled
+
+        def refused():
+            b.poll()
+            return counter("fognav_refused_messages_total", channel) == before + 2
+
+        with start_router(tmp_path, port):
+            async with edge(endpoint, "a") as a:
+                await publish_until(a, channel, lambda n: pose(float(n)), come, "no pose", robot="r1")
+                with raw_session(endpoint) as raw:
+                    raw.put("fog/lab/robots/r3/pose", b"\xc1 not msgpack")
+                    raw.put("fog/lab/robots/r4/pose", b"x" * (channel.limit + 1))
+                    await until(refused, "not all were refused")
 
 
 async def test_late_subscriber_gets_the_latest_zones_and_recent_deltas(router):
@@ -506,3 +605,21 @@ async def test_bytes_of_messages_requests_and_replies_are_counted_by_channel_and
             (ch.PLANNER_PLAN, "sent"): both,
             (ch.PLANNER_PLAN, "received"): both,
         }
+
+
+@pytest.mark.parametrize("declared", [False, True], ids=["absent", "present"])
+async def test_router_that_hangs_answers_no_more_in_a_session_that_is_up_and_again_when_it_goes_on(router, declared):
+    async with edge(router.endpoint, "p1") as asking:
+        if declared:
+            asking.declare_liveliness("test", "p1")
+        assert await asking.router_answers(60.0)
+        os.kill(router.pid, signal.SIGSTOP)
+        try:
+            assert not await asking.router_answers(0.2)
+            assert asking.connected
+        finally:
+            os.kill(router.pid, signal.SIGCONT)
+        assert await asking.router_answers(60.0)
+        router.kill()
+        await until(lambda: not asking.connected, "the session notices the end of its router")
+        assert not await asking.router_answers(0.2)

@@ -180,7 +180,7 @@ def test_points_beside_the_way_and_of_the_dock_itself_do_not_matter():
     wish = docking(points=[(1.8, 1.23), (1.8, 0.77), (2.13, 1.0), (1.0, 1.0)])
     assert wish.problem(replica(), 5.0, running=False) is None
     seen = np.array([(0.82, 0.0), (0.83, 0.29), (0.81, 0.0), (0.83, 0.31)])
-    assert len(wish.without_dock(seen, FRONT)) == 2
+    assert wish.without_dock(seen, FRONT) == pytest.approx(seen[2:])
     assert len(wish.without_dock(np.zeros((0, 2)), FRONT)) == 0
     none = docking(replace(CONFIG, dock=None, staging=None))
     assert none.without_dock(seen, FRONT) is seen
@@ -192,6 +192,47 @@ def test_robot_that_seeks_may_be_anywhere_near_its_dock_but_not_off_the_map_or_f
     assert "moved away" in docking(pose=Pose2(0.79, 1.0, 0.0)).problem(replica(), 5.0, running=True)
     unknown = SimpleNamespace(geometry=None)
     assert "is blocked" in docking().problem(unknown, 5.0, running=True)
+
+
+def test_limits_of_the_place_in_front_of_the_dock_and_of_the_way_to_it():
+    for given, words in (
+        ({"pose": Pose2(1.101, 1.0, 0.0)}, None),
+        ({"pose": Pose2(1.3, 1.0, 0.345)}, None),
+        ({"pose": Pose2(1.3, 1.0, 0.36)}, "not in front"),
+        ({"points": [(1.8, 1.218)]}, "something between"),
+        ({"points": [(1.8, 1.222)]}, None),
+        ({"points": [(2.117, 1.0)]}, "something between"),
+        ({"points": [(2.123, 1.0)]}, None),
+        ({"points": [(1.29, 1.0)]}, None),
+    ):
+        found = docking(**given).problem(replica(), 5.0, running=False)
+        assert found is None if words is None else words in str(found)
+    for away, problem in ((1.19, False), (1.21, True)):
+        assert bool(docking(pose=Pose2(2.0 - away, 1.0, 0.0)).problem(replica(), 5.0, running=True)) == problem
+
+
+def test_goal_is_the_one_in_front_of_the_dock_within_a_centimetre():
+    for off, ours in ((0.0095, True), (0.0105, False)):
+        wish = docking()
+        wish.order(ENABLED, Mission(), docked=False, now=5.0)
+        wish.is_due(ENABLED, mission(Pose(x=1.3 + off, y=1.0, theta=0.0)), 6.0, at_rest=True)
+        assert wish.ordered == ours
+
+
+def test_order_resumes_the_mission_to_the_front_of_the_dock_and_no_other():
+    for pose, resumed in ((STAGING, True), (Pose(x=9.0, y=9.0, theta=0.0), False)):
+        held = mission(pose)
+        held.cancel()
+        assert docking().order(ENABLED, held, docked=False, now=5.0) is None
+        assert held.active == resumed
+
+
+def test_robot_waits_for_its_goal_for_ten_seconds():
+    wish = docking()
+    assert wish.given_up == ""
+    wish.order(ENABLED, Mission(), docked=False, now=5.0)
+    wish.is_due(ENABLED, Mission(), 15.0, at_rest=True)
+    assert wish.ordered
 
 
 # --- the pose that the contacts tell ---

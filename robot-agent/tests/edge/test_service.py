@@ -30,10 +30,18 @@ class Fog:
         self.answers = asyncio.Queue()
         self.requests = 0
         self.handlers = {}
+        self.polled = set()
         self.served = {}
 
     def subscribe(self, channel, _kind, handler, **_ids):
         self.handlers[channel] = handler
+
+    def subscribe_polled(self, channel, _kind, handler, **_ids):
+        self.handlers[channel] = handler
+        self.polled.add(channel)
+
+    def poll(self):
+        pass
 
     def serve(self, channel, handler, **ids):
         self.served[channel] = (handler, ids)
@@ -156,13 +164,19 @@ async def test_a_scan_is_localized_after_the_command_of_its_tick(rig, monkeypatc
     guardian, lidar = FakeGuardian(), FakeLidar()
     lidar.scans = ("a scan",)
     monkeypatch.setattr(guardian, "receive", lambda: order.append("feedback"))
+    monkeypatch.setattr(rig.fog, "poll", lambda: order.append("fog"))
     monkeypatch.setattr(guardian, "send", lambda _command: order.append("command"))
     monkeypatch.setattr(rig.core, "on_scan", lambda scan, _now: order.append(scan))
     task = asyncio.create_task(rig.service.stream_loop(guardian, lidar))
-    await rig.until(lambda: len(order) >= 6)
+    await rig.until(lambda: len(order) >= 8)
     task.cancel()
     await asyncio.gather(task, return_exceptions=True)
-    assert order[:6] == ["feedback", "command", "a scan"] * 2
+    assert order[:8] == ["feedback", "fog", "command", "a scan"] * 2
+
+
+async def test_what_comes_steadily_wakes_nobody_and_all_else_comes_at_once(rig):
+    assert rig.fog.polled == {ch.MAP_HEARTBEAT, ch.ROBOT_RELEASE}
+    assert rig.fog.handlers.keys() == rig.core.handlers().keys()
 
 
 async def test_storage_that_hangs_does_not_make_the_service_manager_restart_the_agent(rig, monkeypatch):

@@ -53,6 +53,15 @@ def test_pose_is_extrapolated_by_015_s_and_no_further():
     assert buffer.pose(9.0).x == buffer.pose(1.15).x == pytest.approx(0.345)
 
 
+def test_a_new_reading_changes_pose_and_twist_of_a_moment_that_was_asked_for_before():
+    buffer = driven(0.3, 0.0)
+    assert buffer.pose(1.1).x == pytest.approx(0.33)
+    assert buffer.twist() == pytest.approx((0.3, 0.0))
+    buffer.add(1.1, 0.3, 0.0, 0.0)
+    assert buffer.pose(1.1).x == pytest.approx(0.3)
+    assert buffer.twist()[0] < 0.25
+
+
 def test_history_ends_after_three_seconds():
     buffer = driven(0.3, 0.0, until=8.0)
     assert buffer.reaches_back_to(5.1)

@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from robot_agent.config import VisibilityConfig
 from robot_agent.hardware import DriveTrain, RepeatCounter, Twist
 from robot_agent.safety.gate import SafetyOutputs
-from robot_agent.safety.visibility import Visibility, sector_angles, sector_of
+from robot_agent.safety.visibility import SECTOR_ANGLES, Visibility, sector_of
 from robot_agent.safety.wheel_limits import limit_wheels
 
 AROUND = np.radians(np.arange(-179.5, 180.0, 1.0))
@@ -134,7 +134,7 @@ def test_sector_counts_by_half_of_its_samples_and_by_one_of_two_scans():
     def after(*returned):
         visibility = Visibility(VisibilityConfig())
         for share in returned:
-            angles = np.repeat(sector_angles(), 4)
+            angles = np.repeat(SECTOR_ANGLES, 4)
             visibility.update(angles, np.tile(np.arange(4) < share, 72), WALLS)
         return zone(visibility)
 
@@ -143,7 +143,7 @@ def test_sector_counts_by_half_of_its_samples_and_by_one_of_two_scans():
 
 
 def test_sector_with_one_sample_is_measured():
-    angles = sector_angles()
+    angles = SECTOR_ANGLES
     visibility = Visibility(VisibilityConfig())
     for _ in range(2):
         visibility.update(angles, np.ones(72, np.bool_), OPEN)
@@ -160,11 +160,24 @@ def test_sector_with_one_sample_is_measured():
     assert visibility.limit((0.05, 0.05), Twist(0.05, 0.0)).wheels == (0.0, 0.0)
 
 
+@given(st.lists(st.booleans(), min_size=72, max_size=72), st.floats(-5.0, 5.0), st.sampled_from([0.3, -0.3]))
+def test_blind_sectors_count_whose_middle_is_within_the_half_width_of_the_direction_of_travel(seen, turning, v):
+    config, visibility = VisibilityConfig(), Visibility(VisibilityConfig())
+    for _ in range(2):
+        visibility.update(SECTOR_ANGLES[np.array(seen)], np.ones(sum(seen), np.bool_), OPEN)
+    lead = min(max(0.25 * turning, -math.pi / 4), math.pi / 4)
+    heading = lead if v > 0.0 else math.pi - lead
+    off = np.abs([math.remainder(angle - heading, math.tau) for angle in SECTOR_ANGLES])
+    share = 1.0 - np.mean(np.array(seen)[off <= config.half_width])
+    expected = "stop" if share >= config.blind_refused else "slow" if share >= config.blind_slow else "free"
+    assert zone(visibility, Twist(v, turning)) == expected
+
+
 @given(st.floats(-20.0, 20.0))
 def test_every_direction_has_a_sector_whose_middle_is_near(angle):
     sector = int(sector_of(np.array([angle]))[0])
     assert 0 <= sector < 72
-    off = math.remainder(sector_angles()[sector] - angle, math.tau)
+    off = math.remainder(SECTOR_ANGLES[sector] - angle, math.tau)
     assert abs(off) <= math.radians(2.5) + 1e-9
 
 
@@ -183,3 +196,16 @@ def test_genuine_noise_never_counts_and_a_scan_of_long_ago_is_forgotten():
     counter.count(first)
     assert {counter.count(rng.normal(size=360)) for _ in range(64)} == {1}
     assert counter.count(first) == 1
+
+
+@pytest.mark.parametrize(("samples", "returned", "zone_"), [(1, 1, "free"), (3, 1, "stop"), (3, 2, "free")])
+def test_few_samples_of_a_sector_count_by_half_of_them_too(samples, returned, zone_):
+    visibility = Visibility(VisibilityConfig())
+    for _ in range(2):
+        visibility.update(np.repeat(SECTOR_ANGLES, samples), np.tile(np.arange(samples) < returned, 72), WALLS)
+    assert zone(visibility) == zone_
+
+
+def test_angles_of_the_sectors_can_not_be_changed():
+    with pytest.raises(ValueError, match="read-only"):
+        SECTOR_ANGLES[0] = 0.0

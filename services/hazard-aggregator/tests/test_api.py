@@ -102,6 +102,10 @@ async def test_invalid_areas_are_refused_naming_the_field_and_a_dead_store_is_re
         ({"polygon": POLYGON, "unknown": {"penalty": 255}}, "body.unknown.penalty"),
         ({"polygon": POLYGON, "debounce": {"rule": "majority"}}, "body.debounce.rule"),
         ({"polygon": POLYGON, "debounce": {"to_clear": 0}}, "body.debounce.to_clear"),
+        ({"nodes": ["n1"]}, "body.polygon"),
+        ({"polygon": POLYGON, "nodes": ["n1"], "cone_of": "n1"}, "body.cone_of"),
+        ({"cone_of": "n9"}, "body.cone_of"),
+        ({"cone_of": "n1"}, "body.cone_of"),
     ):
         answer = await client.put("/api/v1/areas/hall", json=body, headers=tokens["operator"])
         assert answer.status_code == 422
@@ -111,6 +115,30 @@ async def test_invalid_areas_are_refused_naming_the_field_and_a_dead_store_is_re
     answer = await client.put("/api/v1/areas/hall", json={"polygon": POLYGON}, headers=tokens["operator"])
     assert answer.status_code == 503
     assert (await client.get("/api/v1/areas/hall")).json()["definition"]["version"] == 0
+
+
+async def test_area_that_is_the_cone_of_a_node_follows_it_and_is_unusable_without_it(fog, client, tokens):
+    body = {"nodes": ["n1"], "cone_of": "n1"}
+    put = await client.put("/api/v1/areas/hall", json=body, headers=tokens["operator"])
+    assert put.status_code == 200, put.text
+    lowest = min(y for _, y in put.json()["polygon"])
+    assert lowest == pytest.approx(3.0, abs=0.02), "n1 looks down from 4.5 m, 1.5 m far"
+    text = (fog.site / "site.toml").read_text()
+
+    async def after_restart(text: str) -> tuple[dict, dict]:
+        fog.kill("hazard_aggregator")
+        (fog.site / "site.toml").write_text(text)
+        fog.start("hazard_aggregator")
+        async with httpx.AsyncClient(base_url=await fog.ready("hazard_aggregator")) as again:
+            area = (await again.get("/api/v1/areas/hall")).json()
+            return area["definition"], (await again.get("/readyz")).json()["parts"].get("areas", {})
+
+    moved, _ = await after_restart(text.replace("y = 4.5", "y = 5.0"))
+    assert min(y for _, y in moved["polygon"]) == pytest.approx(3.5, abs=0.02)
+    assert (moved["cone_of"], moved["version"]) == ("n1", 1)
+    left, readiness = await after_restart(text.replace('id = "n1"', 'id = "n2"'))
+    assert (left["nodes"], left["polygon"]) == ([], put.json()["polygon"])
+    assert "the site has no node n1: name one of the area's nodes" in readiness["detail"]
 
 
 async def test_nodes_report_their_health(client):

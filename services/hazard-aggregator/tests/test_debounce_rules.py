@@ -6,6 +6,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from fog_contracts.site import learned_share
 from hazard_aggregator.debounce import DebounceError, Observation, SonarSample, make_rule
 from hazard_aggregator.registry import find_rule
 
@@ -33,6 +34,83 @@ def free_rule(*sonars: SonarSample):
     rule = make_rule("hall", {}, find_rule)
     assert run([seen(*(sonars or (FREE,)))] * 8, rule=rule)[-1] == "clear"
     return rule
+
+
+RATES = st.floats(1e-6, 0.999)
+SEQUENCES = st.lists(
+    st.one_of(
+        st.tuples(st.just("blocked"), st.floats(0.1, 2.6)),
+        st.tuples(st.sampled_from(["clear", "unknown"]), st.none()),
+    ),
+    min_size=1,
+    max_size=40,
+)
+
+
+def first_blocked(sequence, rate: float | None, **options) -> float:
+    """Return the number of the first reading that confirms `blocked`, or infinity."""
+    samples = [SonarSample(state, at, LIMIT, false_echo_rate=rate) for state, at in sequence]
+    confirmed = run([seen(sample) for sample in samples], **options)
+    return confirmed.index("blocked") if "blocked" in confirmed else math.inf
+
+
+@given(SEQUENCES, RATES, RATES, st.floats(0.1, 0.95))
+def test_sonar_with_more_false_echoes_never_confirms_an_obstacle_sooner(sequence, one, other, echo_rate):
+    few, many = sorted((one, other))
+    options = {"echo_rate": echo_rate, "false_echo_rate": 0.05}
+    assert first_blocked(sequence, few, **options) <= first_blocked(sequence, many, **options)
+
+
+@given(RATES, st.floats(0.1, 0.95), st.floats(1e-9, 0.5))
+def test_whatever_a_calibration_has_shown_three_agreeing_echoes_confirm_and_one_never_does(
+    rate, echo_rate, false_alarm
+):
+    steady = [("blocked", 0.80 + 0.004 * (i % 2)) for i in range(4)]
+    found = first_blocked(steady, rate, echo_rate=echo_rate, false_echo_rate=0.05, false_alarm=false_alarm)
+    assert 1 <= found <= 2
+
+
+@given(st.lists(st.booleans(), min_size=12, max_size=12).filter(lambda echoed: sum(echoed) >= 7))
+def test_sonar_that_counted_many_false_echoes_still_sees_what_swallows_a_part_of_them(echoed):
+    readings = [("blocked", 0.80 + 0.004 * (i % 2)) if each else ("clear", None) for i, each in enumerate(echoed)]
+    assert first_blocked(readings, 0.5) < 12
+
+
+def test_calibrated_sonar_without_false_echoes_confirms_as_soon_as_one_that_was_not_calibrated():
+    walking = [("blocked", 1.60 - 0.1 * i) for i in range(6)]
+    assert first_blocked(walking, learned_share(0, 256)) == first_blocked(walking, None) == 1
+
+
+def test_probabilities_of_error_that_decide_nothing_are_refused():
+    with pytest.raises(DebounceError, match="must sum to less than 1"):
+        run([], false_alarm=0.6, missed=0.5)
+
+
+@pytest.mark.parametrize("limit", [1.2, 2.0, 2.5])
+@pytest.mark.parametrize(
+    ("false_echoes", "standing", "walking"), [(None, 2, 2), (0, 2, 2), (2, 2, 3)], ids=["uncalibrated", "clean", "two"]
+)
+def test_sonar_that_heard_two_false_echoes_at_its_calibration_wants_a_third_echo_of_what_walks(
+    limit, false_echoes, standing, walking
+):
+    """Of 256 samples; the second echo is verified 50 ms after the first, and a person walks at 1 m/s."""
+    rate = None if false_echoes is None else learned_share(false_echoes, 256)
+    moments = [0.0, 0.05, *(0.05 + i * PERIOD for i in range(1, 8))]
+    for needed, speed in ((standing, 0.0), (walking, 1.0)):
+        rule = make_rule("hall", {}, find_rule)
+        ranges = [limit - 0.2 - speed * at - 0.001 * (i % 2) for i, at in enumerate(moments)]
+        confirmed = [
+            rule.update(seen(SonarSample("blocked", measured, limit, false_echo_rate=rate)), at)
+            for measured, at in zip(ranges, moments, strict=True)
+        ]
+        assert confirmed.index("blocked") + 1 == needed
+
+
+def test_learned_rate_of_a_sonar_counts_before_the_option_of_its_area():
+    walking = [("blocked", 1.60 - 0.1 * i) for i in range(6)]
+    assert first_blocked(walking, None) < first_blocked(walking, 0.03)
+    assert first_blocked(walking, None, false_echo_rate=0.03) == first_blocked(walking, 0.03)
+    assert first_blocked(walking, 0.01, false_echo_rate=0.03) == first_blocked(walking, 0.01)
 
 
 def test_two_agreeing_echoes_block_and_one_does_not():

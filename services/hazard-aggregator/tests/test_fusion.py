@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from fog_contracts.messages import AreaDefinition, AreaHazard, NodeReading, RobotPose
+from fog_contracts.messages import AreaDefinition, AreaHazard, NodeReading, RobotPose, SonarStatus, UnknownPolicy
 from fog_contracts.site import NodeSite, Sonar
 from hazard_aggregator.debounce import DebounceError, Observation, RuleFactory
 from hazard_aggregator.fusion import AreaFusion
@@ -61,7 +61,14 @@ class Rig:
         self.changes: list[AreaHazard] = []
         self.wait(0.0)
 
-    def read(self, *ranges: float | None, state: str | None = None, node: str = "n1", times: int = 1) -> None:
+    def read(
+        self,
+        *ranges: float | None,
+        state: str | None = None,
+        node: str = "n1",
+        times: int = 1,
+        status: list[SonarStatus] | None = None,
+    ) -> None:
         for _ in range(times):
             self.now += PERIOD
             self.seq += 1
@@ -71,7 +78,7 @@ class Rig:
                 boot=1,
                 uptime_ms=round(1000 * self.now),
                 range_m=list(ranges),
-                status=["no_echo" if r is None else "ok" for r in ranges],
+                status=status or ["no_echo" if r is None else "ok" for r in ranges],
                 state=reported,
             )
             self.changes += self.core.on_reading(node, reading, self.now, self.now + 1e6)
@@ -92,6 +99,35 @@ class Rig:
 def test_area_starts_as_unknown_with_the_penalty_of_its_policy():
     rig = Rig(site("n1"))
     assert (rig.hazard.state, rig.hazard.penalty, rig.hazard.seq, rig.hazard.epoch) == ("unknown", 200, 1, 1)
+
+
+@pytest.mark.parametrize("other", [3.0, None])
+def test_sonar_that_is_stuck_makes_its_area_unknown_with_the_reason_and_it_comes_back_by_itself(other):
+    rig = Rig(site("n1"))
+    rig.read(3.0, 3.0, times=5)
+    assert rig.hazard.state == "clear"
+    beside: SonarStatus = "no_echo" if other is None else "ok"
+    rig.read(other, None, status=[beside, "stuck"], state="unknown", times=5)
+    assert (rig.hazard.state, rig.hazard.penalty) == ("unknown", 200)
+    assert "stuck" in rig.hazard.cause or other is None
+    rig.read(3.0, 3.0, times=5)
+    assert rig.hazard.state == "clear"
+
+
+def test_stuck_sonar_never_clears_a_blocked_area_and_the_other_one_still_blocks():
+    rig = Rig(site("n1"))
+    rig.read(0.8, 3.0, times=5)
+    rig.read(3.0, None, status=["ok", "stuck"], state="unknown", times=20)
+    assert (rig.hazard.state, rig.hazard.penalty) == ("unknown", 254)
+    rig.read(0.8, None, status=["ok", "stuck"], state="blocked", times=5)
+    assert rig.hazard.state == "blocked"
+
+
+def test_node_that_reports_clear_with_a_stuck_sonar_contradicts_itself():
+    rig = Rig(site("n1"))
+    rig.read(3.0, None, status=["ok", "stuck"], state="clear", times=5)
+    assert rig.hazard.state == "unknown"
+    assert "the node reports clear, but sonar 1 shows: the echo line is stuck" in rig.hazard.cause
 
 
 def test_fifth_consecutive_blocked_reading_blocks_the_area_and_begins_a_trace():
@@ -256,6 +292,31 @@ def test_silent_node_makes_its_area_unknown_and_a_blocked_area_stays_impassable(
     assert "silent" in rig.hazard.cause
     rig.wait(3600.0 / 100)
     assert rig.hazard.state == "unknown"
+
+
+@pytest.mark.parametrize("limits", [(1.0, 3.0), (3.0, 1.0)])
+def test_each_area_is_unknown_after_the_silence_that_its_own_policy_allows(limits):
+    """The node is the same: what one area takes for a silence is none in the other."""
+    areas = [
+        AreaDefinition(
+            id=f"a{limit:g}", polygon=SQUARE, nodes=["n1"], number=i, unknown=UnknownPolicy(silent_after_s=limit)
+        )
+        for i, limit in enumerate(limits, 1)
+    ]
+    core = AreaFusion(areas, [site("n1")], 1, registry=find_rule, default_rule="consecutive")
+    for i in range(5):
+        core.on_reading("n1", measured(i, uptime_ms=100 * i), 100.0 + i / 10, 0.0)
+    last, unknown = 100.4, {}
+    for tick in range(1, 40):
+        now = last + tick / 10
+        for hazard in core.tick(now, now):
+            if tick > 1:  # the first call evaluates
+                unknown[hazard.area] = (hazard.state, now - last, hazard.cause)
+    assert {area: state for area, (state, _, _) in unknown.items()} == {"a1": "unknown", "a3": "unknown"}
+    assert unknown["a1"][1] == pytest.approx(1.0, abs=0.11)
+    assert unknown["a3"][1] == pytest.approx(3.0, abs=0.11)
+    assert "silent for more than 1 s" in unknown["a1"][2]
+    assert "silent for more than 3 s" in unknown["a3"][2]
 
 
 def test_only_consecutive_clear_readings_clear_an_area_that_silence_kept_impassable():

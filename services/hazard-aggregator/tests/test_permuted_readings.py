@@ -1,6 +1,6 @@
 """Many readings that are delayed, repeated, reordered and lost, against a model that looks at all of them each time.
 
-FOGNAV_PERMUTED_READINGS scales it: 1,000,000 before a release.
+FOGNAV_PERMUTED_READINGS scales it, for each debounce rule: 1,000,000 before a release.
 """
 
 import os
@@ -11,6 +11,7 @@ import pytest
 
 from fog_contracts.messages import AreaDefinition, NodeReading
 from fog_contracts.site import NodeSite, Sonar
+from hazard_aggregator.debounce import DEFAULT_RULE
 from hazard_aggregator.fusion import AreaFusion
 from hazard_aggregator.registry import find_rule
 from hazard_aggregator.sensors.reading_order import FORGOTTEN_S, MIN_PERIOD_S, SILENT_S
@@ -41,7 +42,7 @@ class SimulatedNode:
             seq=self.seq,
             boot=self.boot,
             uptime_ms=round(1000 * (now - self.booted_at)),
-            range_m=[0.8 if self.blocked else 3.0],
+            range_m=[round((0.8 if self.blocked else 3.0) + self.random.uniform(-0.01, 0.01), 3)],
             status=["ok"],
             state="blocked" if self.blocked else "clear",
         )
@@ -102,13 +103,32 @@ class Model:
         self.accepted.append((now, reading))
 
 
+def five_in_a_row(state: str, counted: list[str]) -> bool:
+    return counted[-5:] == [state] * 5
+
+
+def evidence(state: str, counted: list[str]) -> bool:
+    """Whether as many readings show the state as the likelihoods of the rule's defaults ask for at the least.
+
+    Eight without an echo clear. Two echoes block; no more than four readings without one lie between them.
+    """
+    if state == "clear":
+        return counted[-8:] == ["clear"] * 8
+    return counted[-1] == "blocked" and counted[-6:].count("blocked") >= 2
+
+
+RULES = {"consecutive": five_in_a_row, DEFAULT_RULE: evidence}
+
+
+@pytest.mark.parametrize("rule", RULES)
 @pytest.mark.parametrize("seed", range(4))
-def test_readings_count_once_in_order_and_while_fresh_however_they_arrive(seed):
+def test_readings_count_once_in_order_and_while_fresh_however_they_arrive(seed, rule):
     chance = random.Random(seed)
     node, network, model = SimulatedNode(chance), Network(chance), Model()
-    definition = AreaDefinition(id="hall", polygon=SQUARE, nodes=["n1"], debounce={"rule": "consecutive"})
+    definition = AreaDefinition(id="hall", polygon=SQUARE, nodes=["n1"], debounce={"rule": rule})
     fusion = AreaFusion([definition], [NODE], 1, registry=find_rule)
     now, received, state, seqs = 0.0, 0, "unknown", [0]
+    confirmed: set[str] = set()
     taken: dict[tuple[int, int], float] = {}
     fastest: dict[int, float] = {}
     while received < READINGS // 4:
@@ -134,7 +154,9 @@ def test_readings_count_once_in_order_and_while_fresh_however_they_arrive(seed):
             for hazard in changed:
                 seqs.append(hazard.seq)
                 if hazard.state in ("blocked", "clear") and hazard.state != state:
-                    assert [one.state for _, one in model.counted[-5:]] == [hazard.state] * 5
+                    assert accepted, "only a reading that counts confirms a state"
+                    assert RULES[rule](hazard.state, [one.state for _, one in model.counted[-8:]])
+                    confirmed.add(hazard.state)
                 state = hazard.state
         for hazard in fusion.tick(now, now):
             seqs.append(hazard.seq)
@@ -144,5 +166,6 @@ def test_readings_count_once_in_order_and_while_fresh_however_they_arrive(seed):
             at, _ = model.accepted[-1]
             assert now - at <= SILENT_S + 0.2
     assert seqs == sorted(set(seqs))
+    assert confirmed == {"blocked", "clear"}
     assert len(model.boots) > 1
     assert 0.2 * received < len(model.accepted) < received

@@ -7,12 +7,13 @@ import msgspec
 import pytest
 from redis.asyncio import Redis
 
+from fog_contracts.handlers import Moment
 from fog_contracts.messages import AreaDefinition, AreaHazard
 from fog_runtime.health import Health
 from fog_runtime.stores.audit import CursorError
 from fog_supervisor.servers import Server, start_redis
-from hazard_aggregator.areas.area_history import period_of
-from hazard_aggregator.debounce import make_rule
+from hazard_aggregator.areas.area_history import Period, period_of
+from hazard_aggregator.areas.members import Members
 from hazard_aggregator.registry import find_rule
 from hazard_aggregator.store import Audit, Store, StoreError
 from hazard_aggregator.writers.unusable_areas import UnusableAreas
@@ -50,6 +51,36 @@ async def test_stored_hazards_and_areas_survive_kills_of_redis(redis: Server):
             await store.save_hazards([hazard(9)])
 
 
+def at(stamp: float, uptime: float | None = None, clock: int = 1) -> Moment:
+    """Return a moment by the time of day, and by the clock that nobody sets."""
+    return Moment(stamp if uptime is None else uptime, stamp, clock=clock)
+
+
+@pytest.mark.parametrize("step", [-3600.0, 3600.0])
+async def test_steps_of_the_clock_change_no_duration_in_an_areas_history(redis: Server, step: float):
+    blocked, clear = hazard(1), msgspec.structs.replace(hazard(2), state="clear", penalty=0)
+    last = hazard(3)
+    async with Store(redis.url, f"steps{int(step) % 7}", timeout_s=5.0) as store:
+        await store.begin_period(blocked, period_of(blocked, at(9000.0, 100.0)))
+        await store.begin_period(clear, period_of(clear, at(9030.0 + step, 130.0)))
+        after_a_boot = at(9070.0 + step, 5.0, clock=2)
+        await store.begin_period(last, period_of(last, after_a_boot))
+        page = await store.history("hall", cursor=None, limit=9, at=at(9080.0, 15.0, clock=2))
+        views = [(view.period.began, view.ended, view.lasted_s) for view in page.periods]
+        assert views == [
+            (9070.0 + step, None, 10.0), (9030.0 + step, 9070.0 + step, 40.0), (9000.0, 9030.0, 30.0),
+        ]  # fmt: skip
+        assert set(Period.__struct_fields__) == set(msgspec.to_builtins(page.periods[0].period))
+
+
+async def test_period_whose_state_began_in_an_earlier_run_is_counted_by_the_time_of_day(redis: Server):
+    old = hazard(1)
+    async with Store(redis.url, "earlier", timeout_s=5.0) as store:
+        await store.begin_period(old, period_of(old, None))
+        page = await store.history("hall", cursor=None, limit=1, at=at(old.since + 25.0, 7.0))
+        assert [view.lasted_s for view in page.periods] == [25.0]
+
+
 async def test_period_of_an_area_is_written_once_continues_over_restarts_and_is_forgotten_after_90_days(redis: Server):
     day = 86_400.0
     blocked, clear = hazard(1), msgspec.structs.replace(hazard(2), state="clear", penalty=0)
@@ -58,25 +89,25 @@ async def test_period_of_an_area_is_written_once_continues_over_restarts_and_is_
     written = [(blocked, 0.0), (clear, 10.0), (blocked, 10.0), (clear, 11.0), (again, 20.0)]
     async with Store(redis.url, "test", timeout_s=5.0) as store:
         for announced, stamp in written:
-            await store.begin_period(announced, period_of(announced, stamp))
+            await store.begin_period(announced, period_of(announced, at(stamp)))
     async with Store(redis.url, "test", timeout_s=5.0) as store:
         restarted = msgspec.structs.replace(again, epoch=3)
-        await store.begin_period(restarted, period_of(restarted, 50.0))
-        first = await store.history("hall", cursor=None, limit=2, now=60.0)
-        rest = await store.history("hall", cursor=first.next, limit=2, now=60.0)
+        await store.begin_period(restarted, period_of(restarted, at(50.0)))
+        first = await store.history("hall", cursor=None, limit=2, at=at(60.0))
+        rest = await store.history("hall", cursor=first.next, limit=2, at=at(60.0))
         assert [(v.period.state, v.period.began, v.ended, v.lasted_s) for v in [*first.periods, *rest.periods]] == [
             ("blocked", 20.0, None, 40.0), ("clear", 10.0, 20.0, 10.0), ("blocked", 0.0, 10.0, 10.0),
         ]  # fmt: skip
         assert rest.next is None
         for announced, stamp in ((relief, 80 * day), (last, 100 * day)):
             later = msgspec.structs.replace(announced, epoch=4)
-            await store.begin_period(later, period_of(later, stamp))
-        kept = await store.history("hall", cursor=None, limit=9, now=101 * day)
+            await store.begin_period(later, period_of(later, at(stamp)))
+        kept = await store.history("hall", cursor=None, limit=9, at=at(101 * day))
         assert [v.period.began for v in kept.periods] == [100 * day, 80 * day, 20.0], "the third ended 20 days ago"
-        gone = await store.history("hall", cursor=first.next, limit=9, now=101 * day)
+        gone = await store.history("hall", cursor=first.next, limit=9, at=at(101 * day))
         assert gone.periods == []
         with pytest.raises(CursorError):
-            await store.history("hall", cursor="1", limit=9, now=0.0)
+            await store.history("hall", cursor="1", limit=9, at=at(0.0))
 
 
 async def test_unreadable_record_is_left_out_and_the_others_are_loaded(redis: Server):
@@ -94,7 +125,7 @@ def test_stored_area_with_an_unknown_rule_stays_on_the_map_unwatched_and_is_name
         AreaDefinition(id="gone", polygon=polygon, debounce={"rule": "of-a-removed-package"}, removed=True),
     ]
     health = Health()
-    unusable = UnusableAreas(lambda area: make_rule(area.id, area.debounce, find_rule), health)
+    unusable = UnusableAreas(Members({}, find_rule, "consecutive").checked, health)
     usable = unusable.made_usable(areas, {})
     assert usable == [AreaDefinition(id="hall", polygon=polygon, version=3), *areas[1:]]
     (record,) = [record for record in caplog.records if record.message == "stored_area_unusable"]
@@ -102,6 +133,18 @@ def test_stored_area_with_an_unknown_rule_stays_on_the_map_unwatched_and_is_name
     assert "hall (area hall: debounce" in health.report()["parts"]["areas"]["detail"]
     assert unusable.made_usable(areas[1:], {}) == areas[1:]
     assert health.report()["parts"]["areas"] == {"ok": True, "detail": ""}
+
+
+def test_area_that_this_version_cannot_use_is_restored_as_it_was_stored_until_it_is_put_again():
+    polygon = [(0, 0), (1, 0), (1, 1)]
+    debounce = {"rule": "of-a-removed-package"}
+    stored = AreaDefinition(id="hall", polygon=polygon, nodes=["n1"], cone_of="n1", debounce=debounce, version=3)
+    unusable = UnusableAreas(Members({}, find_rule, "consecutive").checked, Health())
+    (usable,) = unusable.made_usable([stored], {})
+    assert usable.nodes == []
+    assert unusable.as_stored(usable) == stored
+    again = AreaDefinition(id="hall", polygon=polygon, version=4)
+    assert unusable.as_stored(again) == again
 
 
 async def test_area_whose_record_can_be_read_in_part_only_keeps_its_place(redis: Server):

@@ -2,6 +2,7 @@
 
 import asyncio
 import contextlib
+import re
 import signal
 import time
 
@@ -10,6 +11,7 @@ import pytest
 
 from fog_contracts import channels as ch
 from fog_contracts.messages import AreaHazard, MapHeartbeat, NodeReading
+from fog_runtime.leases.lease import CUT_OFF_S
 
 pytestmark = pytest.mark.live
 
@@ -79,6 +81,24 @@ async def waits(fog, name: str, begins: str) -> None:
         await asyncio.sleep(0.05)
 
 
+async def answers(fog, name: str) -> None:
+    """Wait until broker and router answer a process."""
+    deadline = time.monotonic() + 60.0
+    async with httpx.AsyncClient() as client:
+        while True:
+            text = (await client.get(f"{await fog.url(name)}/metrics")).text
+            ages = re.findall(r"^fognav_answer_age_seconds{.*} (\S+)$", text, re.MULTILINE)
+            if ages and max(map(float, ages)) < CUT_OFF_S / 2:
+                return
+            assert time.monotonic() < deadline, (ages, fog.log(name)[-3000:])
+            await asyncio.sleep(0.05)
+
+
+async def hazards_on_the_map(fog, name: str) -> list:
+    async with httpx.AsyncClient() as client:
+        return (await client.get(f"{await fog.ready(name)}/api/v1/hazards")).json()
+
+
 @pytest.mark.parametrize("service", COPIES)
 async def test_second_copy_takes_over_after_death_hang_and_partition(fog, proxy, until, service):
     module = COPIES[service]
@@ -124,6 +144,47 @@ async def test_second_copy_takes_over_after_death_hang_and_partition(fog, proxy,
 
         begun = next(i for i, (_, m) in enumerate(heard.received["aggregator"]) if m.state == "blocked")
         assert {m.penalty for _, m in heard.received["aggregator"][begun:]} == {254}, "no takeover clears an area"
-        async with httpx.AsyncClient() as client:
-            shown = (await client.get(f"{await fog.ready('map_service')}/api/v1/hazards")).json()
+        shown = await hazards_on_the_map(fog, "map_service")
+        assert [area["hazard"]["penalty"] for area in shown] == [254]
+
+
+@pytest.mark.parametrize(("service", "transport"), [("aggregator", "mqtt"), ("map", "mqtt"), ("map", "zenoh")])
+async def test_copy_that_reaches_broker_and_router_takes_over_from_one_that_does_not(
+    fog, proxy_of, until, service, transport
+):
+    module = COPIES[service]
+    first, second = module, f"{module}-2"
+    proxy = proxy_of({"mqtt": fog.mosquitto, "zenoh": fog.router}[transport])
+    port = await proxy.start()
+    address = {"FOGNAV_MQTT_URL": f"mqtts://127.0.0.1:{port}"}
+    if transport == "zenoh":
+        address = {"FOGNAV_ZENOH_CONNECT": f"tls/127.0.0.1:{port}"}
+    async with receiver(fog) as heard:
+        fog.start(module, first, **address)
+        await waits(fog, first, "leads with epoch")
+        for needed in COPIES.values():
+            if needed != module:
+                fog.start(needed)
+        fog.start(module, second)
+        await until(lambda: heard.received["map"], "the map")
+        await until(lambda: any(m.state == "blocked" for _, m in heard.received["aggregator"]), "the hazard")
+        await waits(fog, second, "this process stands by: ")
+        await answers(fog, first)
+        await answers(fog, second)
+
+        old, cut = heard.epochs(service)[-1], time.monotonic()
+        proxy.cut()
+        await until(lambda: heard.epochs(service)[-1] > old, "the second copy")
+        assert time.monotonic() - cut <= TAKEOVER_S + BUSY_S, fog.log(second)
+        await waits(fog, first, "this process stands by: ")
+        assert f"no answer of {transport}" in await lease(fog, first)
+        taken = heard.epochs(service)[-1]
+
+        healed = time.monotonic()
+        proxy.heal()
+        await answers(fog, first)
+        assert (await lease(fog, first)).startswith("this process stands by: "), "it does not take the lease back"
+        # Hazards of the old one may come late: receivers refuse them, and the leader publishes its own again.
+        assert {m.epoch for m in heard.since("map", healed)} == {taken if service == "map" else heard.epochs("map")[0]}
+        shown = await hazards_on_the_map(fog, second if service == "map" else "map_service")
         assert [area["hazard"]["penalty"] for area in shown] == [254]

@@ -4,24 +4,31 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any, cast
 
+import httpx
 import pytest
+from msgspec import structs
 
+from fog_contracts.grid import GridGeometry
 from fog_contracts.handlers import Moment
 from fog_contracts.messages import AreaDefinition
+from fog_runtime.access.token_file import TokenEntry
 from fog_runtime.clock import ManualClock
 from fog_runtime.health import Health
+from fog_runtime.http import Tokens, token_hash
 from fog_runtime.stores.idempotency import Attempt
 from fog_supervisor.servers import start_redis
+from hazard_aggregator import area_size
 from hazard_aggregator.areas.area_override import AreaOverride
 from hazard_aggregator.core import Aggregator
 from hazard_aggregator.fusion import AreaFusion
 from hazard_aggregator.registry import find_rule
+from hazard_aggregator.rest.api import make_api
 from hazard_aggregator.service import Service
 from hazard_aggregator.store import Audit, Store, StoreError
 from hazard_aggregator.writers.area_writer import ConflictError
 
 if TYPE_CHECKING:
-    from collections.abc import AsyncIterator
+    from collections.abc import AsyncIterator, Iterable
     from pathlib import Path
 
     from fog_runtime.stores.redis_store import Outcome
@@ -63,8 +70,8 @@ def override(reason: str, version: int) -> AreaOverride:
     )  # fmt: skip
 
 
-async def running(store: Store, clock: ManualClock | None = None) -> Service:
-    core = Aggregator(AreaFusion([HALL], [], 1, registry=find_rule), complete=False)
+async def running(store: Store, clock: ManualClock | None = None, areas: Iterable[AreaDefinition] = (HALL,)) -> Service:
+    core = Aggregator(AreaFusion(areas, [], 1, registry=find_rule), complete=False)
     core.tick(Moment(0.9, 0.9))
     edge = cast("Any", Connection())
     service = Service(core, store, edge, edge, clock or ManualClock(1.0), Health(), boot="this-boot")
@@ -123,3 +130,33 @@ async def test_unconditional_area_replaces_a_stored_one_that_this_process_does_n
         done = await service.areas.put_area(HALL, "ann")
         assert (done.label, done.version) == ("", 2)
         assert (service.core.definitions(), await store.areas()) == ([done], ([done], {}))
+
+
+async def test_area_beyond_the_most_is_refused_until_one_is_removed_while_others_can_be_changed(
+    redis_url: str, monkeypatch: pytest.MonkeyPatch
+):
+    monkeypatch.setattr(area_size, "AREAS_MAX", 3)
+    areas = [structs.replace(HALL, id=f"a{number}") for number in range(2)]
+    tokens = Tokens([TokenEntry(name="ann", role="operator", sha256=token_hash("secret"))])
+    async with Store(redis_url, "test", timeout_s=5.0) as store:
+        service = await running(store, areas=areas)
+        app = make_api(service, GridGeometry(100, 100, 0.05, 0.0, 0.0), ManualClock(1.0), Health(), tokens)
+        async with httpx.AsyncClient(
+            transport=httpx.ASGITransport(app), base_url="http://fog", headers={"Authorization": "Bearer secret"}
+        ) as client:
+
+            async def put(area: str, **fields: object) -> httpx.Response:
+                return await client.put(f"/api/v1/areas/{area}", json={"polygon": HALL.polygon, **fields})
+
+            assert (await put("last")).status_code == 201
+            refused = await put("extra")
+            assert refused.status_code == 422
+            (error,) = refused.json()["errors"]
+            assert error["field"] == "path"
+            assert "the site has 3 areas, and 3 is the limit" in error["problem"]
+            assert "remove one first" in error["problem"]
+            assert [(await put(area, label="new")).status_code for area in ("a0", "last")] == [200, 200]
+            assert (await put("a0", removed=True)).status_code == 200
+            assert (await put("extra")).status_code == 201
+            assert (await put("a0")).status_code == 422, "it was removed, and would be one too many again"
+        assert len((await store.areas())[0]) == 3

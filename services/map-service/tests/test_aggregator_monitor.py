@@ -3,20 +3,23 @@
 import contextlib
 from collections.abc import Sequence
 
+import numpy as np
 import pytest
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 from msgspec import structs
 
 from fog_contracts import channels as ch
-from fog_contracts.grid import GridGeometry
+from fog_contracts.grid import GridGeometry, StaticMap
 from fog_contracts.handlers import Moment, Publication, RefusedMessageError
 from fog_contracts.hazards import digest
 from fog_contracts.messages import AggregatorHeartbeat, AreaDefinition, AreaHazard, HazardOverride
 from map_service.aggregator_monitor import IN_FLIGHT_S, TRUSTED_AFTER_S
+from map_service.core import MapCore
 from map_service.layers.hazards import HazardsLayer
+from map_service.registry import make_layers
 
-MAX_AGE_S = 1.5
+MAX_AGE_S = 1.3
 PERIOD_S = 0.2
 GEOMETRY = GridGeometry(80, 60, 0.05, 0.0, 0.0)
 
@@ -112,6 +115,34 @@ def test_clear_area_is_unknown_1500_ms_after_the_last_heartbeat_and_a_blocked_on
     assert fog.layer.tick(fog.at) == []
     fog.run(TRUSTED_AFTER_S + 2 * PERIOD_S, CLEAR, GATE)
     assert fog.state() == ("clear", 0)
+
+
+@pytest.mark.parametrize("phase", [0.0, 0.001, 0.05, 0.099])
+def test_area_costs_something_on_the_map_1500_ms_after_the_last_heartbeat_whatever_the_tick_s_phase(phase):
+    plan = StaticMap(GEOMETRY, np.zeros(GEOMETRY.shape, dtype=np.uint8))
+    core = MapCore("test", plan, layers=make_layers(plan), definitions=[definition("hall")])
+    column, row = GEOMETRY.cell(1.2, 0.8)
+    core.load_zones([], Moment(0.0, 0.0))
+
+    def tick(number: int) -> None:
+        at = number * ch.MAP_HEARTBEAT.period_s + phase
+        core.tick(Moment(at, at))
+
+    def beat(now: float) -> None:
+        message = AggregatorHeartbeat(
+            epoch=5, areas={"hall": 3}, complete=True, digest=digest([CLEAR]), uptime=now + 5000.0, stamp=0.0
+        )
+        core.handlers()[ch.AGGREGATOR_HEARTBEAT]({}, message, Moment(now, now))
+
+    core.handlers()[ch.AREA_HAZARD]({"area": "hall"}, CLEAR, Moment(0.0, 0.0))
+    for number in range(11):  # the last heartbeat comes after 1 s
+        if number % 2 == 0:
+            beat(number * ch.MAP_HEARTBEAT.period_s)
+        tick(number)
+    assert core.costmap.cost[row, column] == 0
+    for number in range(11, 25):  # the last tick comes less than 2.5 s after the start
+        tick(number)
+    assert core.costmap.cost[row, column] != 0
 
 
 def test_released_queue_of_heartbeats_makes_no_area_clear():

@@ -6,16 +6,24 @@ import math
 
 import numpy as np
 import pytest
-from ring_map import RingMap, goal, pose
+from ring_map import Box, RingMap, goal, pose
 
 from fog_contracts import channels as ch
 from fog_contracts.handlers import Moment
+from fog_kernels.steps import SEALED
 from planner.config import PlannerConfig
 from planner.core import PlannerCore
+from planner.search.detours import DeadEndsJob, Detours
+from planner.search.goal_fields import GoalFields
 from planner.search.path_search import PathSearch
 
 WALLS = ((2.0, 2.0, 18.0, 5.0), (2.0, 7.0, 18.0, 10.0))
 """Leave three corridors from left to right."""
+ROOM_WALLS = (
+    WALLS[0], (2.0, 7.0, 7.0, 10.0), (13.0, 7.0, 18.0, 10.0), (7.0, 9.7, 13.0, 10.0), (7.0, 7.0, 9.3, 7.3),
+    (10.3, 7.0, 13.0, 7.3),
+)  # fmt: skip
+"""The same, with a room in the upper wall, whose door leads to the middle corridor."""
 MIDDLE = (14.0, 5.0, 15.0, 7.0)
 AT = Moment(1.0, 1.0)
 
@@ -23,8 +31,8 @@ AT = Moment(1.0, 1.0)
 class Fleet:
     """Robots in the middle corridor, with goals on the right."""
 
-    def __init__(self, robots: int, detour_searches: int = 3) -> None:
-        self.map = RingMap(walls=WALLS)
+    def __init__(self, robots: int, detour_searches: int = 3, walls: tuple[Box, ...] = WALLS) -> None:
+        self.map = RingMap(walls=walls)
         self.core = PlannerCore(1, PlannerConfig(quick_expansions=200, detour_searches=detour_searches))
         self.core.load(self.map.master.snapshot(), 0.0)
         for number in range(robots):
@@ -32,7 +40,8 @@ class Fleet:
             self.core.handlers()[ch.ROBOT_POSE]({"robot": robot}, pose(4.0 + 1.2 * number, 6.0), AT)
             self.core.set_goal(robot, goal(19.0, 4.0 + 0.5 * number, f"g{number}"))
         self.core.handlers()[ch.MAP_HEARTBEAT]({}, self.map.master.heartbeat(0.0), AT)
-        for job in self.core.jobs(AT):
+        self.first_jobs = self.core.jobs(AT)
+        for job in self.first_jobs:
             job.run()
             self.core.add(job, AT.now)
         self.core.tick(AT)
@@ -73,6 +82,45 @@ def test_bound_is_forgotten_when_a_cost_falls() -> None:
     assert fleet.core.replanner.detours.guide(*trip) is None
 
 
+def test_bound_leaves_out_rooms_and_is_forgotten_when_one_of_their_doors_is_raised() -> None:
+    fleet = Fleet(6, walls=ROOM_WALLS)
+    fleet.change(blocked=True)
+    geometry, detours = fleet.map.geometry, fleet.core.replanner.detours
+    trip = geometry.cell(10.0, 6.0), geometry.cell(19.0, 5.0)
+    known = detours.guide(*trip)
+    assert known is not None
+    column, row = geometry.cell(11.0, 9.3)
+    assert known.costs[row, column] == SEALED
+    assert detours.guide((column, row), trip[1]) is None
+    for place, is_known in (((11.0, 8.5, 11.2, 8.7), True), ((9.4, 7.1, 9.6, 7.3), False)):
+        for delta in fleet.map.put("small", place):
+            fleet.core.handlers()[ch.MAP_DELTA]({}, delta, AT)
+        assert (detours.guide(*trip) is known) == is_known
+
+
+def test_dead_ends_of_outdated_costs_are_not_used() -> None:
+    fields = GoalFields(10**6)
+    costs = RingMap(walls=ROOM_WALLS).cost()
+    fields.set_bounds(costs, costs)
+    detours = Detours(fields)
+    (outdated,) = detours.jobs()
+    assert detours.jobs() == []
+    fields.set_bounds(costs, costs.copy())
+    (current,) = detours.jobs()
+    for job in (current, outdated):
+        job.run()
+        detours.add(job)
+    assert detours.dead_ends is current.found
+    fields.set_bounds(costs, costs.copy())
+    assert detours.dead_ends is None
+
+
+def test_few_robots_have_no_dead_ends_searched() -> None:
+    fleet = Fleet(3)
+    assert not any(isinstance(job, DeadEndsJob) for job in fleet.first_jobs)
+    assert any(isinstance(job, DeadEndsJob) for job in Fleet(4).first_jobs)
+
+
 def test_robot_nearest_to_the_danger_is_searched_first_and_refused_ones_last() -> None:
     fleet = Fleet(3)
     for delta in fleet.map.put("goal", (18.5, 3.5, 19.5, 4.2)):  # around the goal of the first robot
@@ -88,7 +136,7 @@ def test_robot_nearest_to_the_danger_is_searched_first_and_refused_ones_last() -
 @pytest.mark.parametrize("seed", range(8))
 def test_paths_guided_by_a_shared_bound_are_as_short_as_those_of_a_full_search(seed: int) -> None:
     rng = np.random.default_rng(seed)
-    fleet = Fleet(6)
+    fleet = Fleet(6, walls=ROOM_WALLS if seed % 2 else WALLS)
     x, y = rng.uniform(3.0, 16.0), rng.uniform(1.0, 9.0)
     for delta in fleet.map.put("any", (x, y, x + rng.uniform(0.5, 3.0), y + rng.uniform(0.5, 3.0))):
         fleet.core.handlers()[ch.MAP_DELTA]({}, delta, AT)

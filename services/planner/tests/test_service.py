@@ -12,6 +12,7 @@ import pytest
 from prometheus_client import REGISTRY
 from ring_map import LEFT, RIGHT, RingMap, goal, pose
 
+import planner.keepers.path_record
 import planner.service
 from fog_contracts import channels as ch
 from fog_contracts.handlers import Moment, Publication, RefusedMessageError
@@ -259,7 +260,7 @@ class EndlessCore(PlannerCore):
 async def test_paths_are_recorded_after_half_a_second_although_searches_are_left(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    monkeypatch.setattr(planner.service, "MOST_UNRECORDED", 10**9)
+    monkeypatch.setattr(planner.keepers.path_record, "MOST_UNRECORDED", 10**9)
     core = EndlessCore(epoch=1)
     rig = Rig(core)
     core.clock = rig.clock
@@ -272,12 +273,12 @@ async def test_paths_are_recorded_after_half_a_second_although_searches_are_left
     rig.service._wake.set()
     try:
         async with asyncio.timeout(10.0):
-            while "r0" not in rig.service._paths:  # noqa: ASYNC110  # set by the loop of plans
+            while "r0" not in rig.service._record.paths:  # noqa: ASYNC110  # set by the loop of plans
                 await asyncio.sleep(0.001)
     finally:
         planning.cancel()
         rig.service.close()
-    assert rig.service._paths["r0"].points
+    assert rig.service._record.paths["r0"].points
 
 
 class WaitingCore(PlannerCore):

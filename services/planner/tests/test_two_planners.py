@@ -214,6 +214,30 @@ async def test_leader_that_is_cut_off_from_redis_gives_way_to_the_other(fog, pro
             assert robot.goal_ids == {goal_id}
 
 
+async def test_leader_that_is_cut_off_from_its_router_gives_the_lease_to_one_that_is_not(fog, proxy_of, until, tokens):
+    fog.start("map_service")
+    router = proxy_of(fog.router)
+    async with robot_on_the_floor(fog) as robot:
+        fog.start("planner", "planner", FOGNAV_ZENOH_CONNECT=f"tls/127.0.0.1:{await router.start()}")
+        await fog.ready("planner")
+        async with two_planners_joining(fog) as planners:
+            assert await planners.roles() == ("planner", "planner-2")
+            goal_id = await sent(planners, tokens, "planner")
+            await until(lambda: robot.last(RobotPath), "a path")
+            old, cut = robot.epochs[-1], time.monotonic()
+            router.cut()
+            await until(lambda: robot.epochs[-1] > old, "the other's goal")
+            assert time.monotonic() - cut <= TAKEOVER_S + BUSY_S, fog.log("planner-2")
+            refused = await planners.call("DELETE", tokens, "planner")
+            assert refused.status_code == 503, "neither of them loses a mission"
+            healed = time.monotonic()
+            router.heal()
+            assert await planners.roles() == ("planner-2", "planner")
+            assert not [m for at, m in robot.accepted if at > healed and m.planner_epoch == old]
+            assert robot.epochs == sorted(robot.epochs)
+            assert robot.goal_ids == {goal_id}
+
+
 @contextlib.asynccontextmanager
 async def two_planners_joining(fog):
     """Start the second planner beside the first."""

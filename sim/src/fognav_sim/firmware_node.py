@@ -37,14 +37,14 @@ _US: Final = 1_000_000
 class FirmwareNode:
     """One sensor node of the site; the same interface as `SonarNode`, the model in Python."""
 
-    def __init__(self, core: Core, node: NodeSite, boot: int, start: float, *, every_reading: bool = True) -> None:
+    def __init__(self, core: Core, node: NodeSite, boot: int, start: float) -> None:
         self.node = node
         self.config = default_config(node)
         limits = zip(self.config.range_limit_m, self.config.no_echo_is_clear, strict=True)
         sonars = [Sonar(round(limit * 1000), int(silent)) for limit, silent in limits]
         self._core = core
         self._node = core.new(
-            (Sonar * len(sonars))(*sonars), len(sonars), boot, self.config.pause_ms, int(every_reading), FIRMWARE
+            (Sonar * len(sonars))(*sonars), len(sonars), boot, self.config.pause_ms, int(node.every_reading), FIRMWARE
         )
         core.rssi(self._node, _RSSI_DBM)
         self._start = start
@@ -62,6 +62,10 @@ class FirmwareNode:
             return False
         self.config = config
         return True
+
+    def on_connected(self) -> None:
+        """Publish as after a change: the connection has come back."""
+        self._core.connected(self._node)
 
     def command(self, text: str) -> str | None:
         """Begin what a command asks for, as learning the limits anew; return None, or why not."""

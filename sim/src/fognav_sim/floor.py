@@ -27,6 +27,8 @@ if TYPE_CHECKING:
 MAX_CLEARANCE_M: Final = 2.0
 _EXACT_CLEARANCE_M: Final = 0.6
 """Below this distance to a wall the distance is computed exactly, above it to half a cell."""
+_REACH_MARGIN_M: Final = 1.0
+"""Obstacles this much beyond a sensor's reach can't be measured, whatever its noise."""
 
 
 class Floor:
@@ -43,6 +45,7 @@ class Floor:
         self._obstacles: dict[str, SimObstacle] = {}
         self._outlines: dict[str, list[Point]] = {}
         self._edges: dict[str, NDArray[np.float64]] = {}
+        self._circles: dict[str, tuple[float, float, float]] = {}
 
     @property
     def obstacles(self) -> list[SimObstacle]:
@@ -56,11 +59,13 @@ class Floor:
         self._obstacles[obstacle.id] = obstacle
         self._outlines[obstacle.id] = outline
         self._edges[obstacle.id] = np.hstack((points, np.roll(points, -1, axis=0)))
+        self._circles[obstacle.id] = _circle_around(points)
 
     def remove(self, obstacle_id: str) -> bool:
         """Remove an obstacle; return False if there is none with this id."""
         self._outlines.pop(obstacle_id, None)
         self._edges.pop(obstacle_id, None)
+        self._circles.pop(obstacle_id, None)
         return self._obstacles.pop(obstacle_id, None) is not None
 
     def nearest(self, x: float, y: float) -> tuple[float, float]:
@@ -102,11 +107,22 @@ class Floor:
         return cast(self._occupied, g.resolution, g.origin_x, g.origin_y, x, y, directions, reach)
 
     def obstacle_ranges(
-        self, x: float, y: float, directions: NDArray[np.float64]
+        self, x: float, y: float, directions: NDArray[np.float64], reach: float
     ) -> Iterator[tuple[SimObstacle, NDArray[np.float64], NDArray[np.float64]]]:
-        """Yield each obstacle with the range (m; infinite for none) and the incidence (rad) of each ray on it."""
+        """Yield each obstacle with the range (m; infinite for none) and the incidence (rad) of each ray on it.
+
+        Those that a sensor of this `reach` (m) can't measure are left out.
+        """
         for name, obstacle in self._obstacles.items():
-            yield obstacle, *_edge_ranges(self._edges[name], x, y, directions)
+            middle_x, middle_y, radius = self._circles[name]
+            if math.hypot(middle_x - x, middle_y - y) - radius <= reach + _REACH_MARGIN_M:
+                yield obstacle, *_edge_ranges(self._edges[name], x, y, directions)
+
+
+def _circle_around(points: NDArray[np.float64]) -> tuple[float, float, float]:
+    """Return centre and radius (m) of a circle that holds all points."""
+    x, y = (float(value) for value in np.mean(points, axis=0))
+    return x, y, float(np.max(np.hypot(points[:, 0] - x, points[:, 1] - y)))
 
 
 def _edge_ranges(

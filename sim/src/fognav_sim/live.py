@@ -207,6 +207,7 @@ class VirtualNode:
         self._mqtt.on(ch.NODE_CONFIG, self._on_config, NodeConfig)
         self._mqtt.on(ch.NODE_COMMAND, self._on_command)
         self._problem: str | None = None
+        self._heard = False
         self._mqtt.on_connect(self._announce)
 
     async def connect(self) -> None:
@@ -226,9 +227,13 @@ class VirtualNode:
 
     async def measure(self) -> None:
         """Publish the readings that are due."""
+        # A node that is not connected, or silenced by a scenario, measures but does not publish.
+        heard = self._mqtt.connected and self._id not in self._world.silent_nodes
+        if heard and not self._heard:
+            self._sonars.on_connected()
+        self._heard = heard
         for reading in self._sonars.poll(self._world.world, self._world.now):
-            # A node that is not connected, or silenced by a scenario, measures but does not publish.
-            if self._mqtt.connected and self._id not in self._world.silent_nodes:
+            if heard:
                 await self._mqtt.publish(ch.NODE_READING, reading, node=self._id)
         if (calibration := self._sonars.take_calibration()) is not None:
             await self._mqtt.publish(ch.NODE_CALIBRATION, calibration, node=self._id)

@@ -2,7 +2,8 @@
 
 The sonars measure one after the other, each for its time of flight (36 ms without an echo) but at least until its
 echoes have decayed; then the reading is published and the firmware pauses. This gives about 9 readings a second with
-echoes, about 8 without. Source of the timing: HC-SR04 data sheet; the pause is the thesis's (section 3.3).
+echoes, about 8 without. Source of the timing: HC-SR04 data sheet; the pause is the thesis's (section 3.3). Which
+readings are published, `publishing` decides.
 """
 
 from __future__ import annotations
@@ -10,6 +11,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Final
 
 from fog_contracts.messages import AreaState, NodeConfig, NodeReading, SonarStatus
+from fognav_sim.publishing import PublishPolicy
 from fognav_sim.sensors import SOUND_M_S
 
 if TYPE_CHECKING:
@@ -33,13 +35,21 @@ def default_config(node: NodeSite) -> NodeConfig:
     )
 
 
+def classify_sonars(ranges: list[float | None], config: NodeConfig) -> list[AreaState]:
+    """Classify the range (m; None for no echo) of each sonar, without the firmware's hysteresis."""
+    states: list[AreaState] = []
+    for measured, limit, silent in zip(ranges, config.range_limit_m, config.no_echo_is_clear, strict=True):
+        if measured is None:
+            states.append("clear" if silent else "unknown")
+        else:
+            states.append("blocked" if measured < limit else "clear")
+    return states
+
+
 def classify(ranges: list[float | None], config: NodeConfig) -> AreaState:
     """Classify ranges (m) as the firmware does: one near echo means blocked; clear takes every sonar."""
-    limits = zip(ranges, config.range_limit_m, strict=True)
-    if any(measured is not None and measured < limit for measured, limit in limits):
-        return "blocked"
-    silences = zip(ranges, config.no_echo_is_clear, strict=True)
-    return "clear" if all(measured is not None or clear for measured, clear in silences) else "unknown"
+    states = classify_sonars(ranges, config)
+    return "blocked" if "blocked" in states else "unknown" if "unknown" in states else "clear"
 
 
 class SonarNode:
@@ -47,6 +57,7 @@ class SonarNode:
 
     def __init__(self, node: NodeSite, boot: int, start: float) -> None:
         self.node = node
+        self._publish = PublishPolicy(every_reading=node.every_reading)
         self.config = default_config(node)
         self._boot = boot
         self._seq = 0
@@ -61,7 +72,12 @@ class SonarNode:
         if len(config.range_limit_m) != count or len(config.no_echo_is_clear) != count:
             return False
         self.config = config
+        self._publish.restart()
         return True
+
+    def on_connected(self) -> None:
+        """Publish as after a change: the connection has come back."""
+        self._publish.restart()
 
     def command(self, _text: str) -> str | None:
         """Return why no command is obeyed."""
@@ -72,7 +88,7 @@ class SonarNode:
         return None
 
     def poll(self, world: World, now: float) -> list[NodeReading]:
-        """Measure up to `now` (s); return the readings that were due, oldest first."""
+        """Measure up to `now` (s); return the readings that it publishes, oldest first."""
         readings: list[NodeReading] = []
         if now - self._due > 1.0:
             # The simulation paused: a node does not catch up on readings that it missed.
@@ -85,7 +101,8 @@ class SonarNode:
                 self._index += 1
                 self._due += max(flight, ECHO_DECAY_S)
                 continue
-            readings.append(self._reading())
+            if self._publish.update(classify_sonars(self._ranges, self.config), self._ranges, self._due):
+                readings.append(self._reading())
             self._index, self._ranges = 0, []
             self._due += PUBLISH_S + self.config.pause_ms / 1000
         return readings

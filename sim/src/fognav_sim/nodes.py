@@ -11,6 +11,7 @@ from fognav_sim.node import SonarNode
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
+    from pathlib import Path
 
     from fog_contracts.messages import NodeCalibration, NodeConfig, NodeReading
     from fog_contracts.site import NodeSite
@@ -30,6 +31,9 @@ class SensorNode(Protocol):
     def configure(self, config: NodeConfig) -> bool:
         """Apply a configuration; return False if it is for another number of sonars, and ignore it."""
 
+    def on_connected(self) -> None:
+        """Publish as after a change: the connection has come back."""
+
     def command(self, text: str) -> str | None:
         """Begin what a command asks for, as learning the limits anew; return None, or why not."""
 
@@ -38,6 +42,15 @@ class SensorNode(Protocol):
 
     def poll(self, world: World, now: float) -> list[NodeReading]:
         """Run the node up to `now` (s); return the readings that it publishes, oldest first."""
+
+
+def why_model() -> str | None:
+    """Return why simulated nodes run a model, or None where they run the firmware, which is then compiled."""
+    try:
+        _firmware()
+    except (FirmwareError, OSError) as error:
+        return str(error)
+    return None
 
 
 def make_nodes(
@@ -54,7 +67,7 @@ def make_nodes(
     """
     if kind != "model":
         try:
-            core = Core(build_library(find_firmware().parent / CACHE))
+            core = Core(_firmware())
         except (FirmwareError, OSError) as error:
             if kind == "firmware":
                 raise
@@ -63,3 +76,7 @@ def make_nodes(
             _log.info("nodes_run_the_firmware")
             return [FirmwareNode(core, node, boot + i, start + apart * (i % 8)) for i, node in enumerate(nodes)]
     return [SonarNode(node, boot + i, start + apart * (i % 8)) for i, node in enumerate(nodes)]
+
+
+def _firmware() -> Path:
+    return build_library(find_firmware().parent / CACHE)

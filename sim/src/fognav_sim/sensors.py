@@ -7,9 +7,11 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Final
+from typing import TYPE_CHECKING, Final, NamedTuple
 
 import numpy as np
+
+from fog_contracts.cones import SONAR_HALF_CONE
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -19,7 +21,6 @@ if TYPE_CHECKING:
 
 SOUND_M_S: Final = 343.0
 """Speed of sound in air at 20 degrees Celsius."""
-SONAR_HALF_CONE: Final = math.radians(7.5)
 SONAR_MIN_M: Final = 0.02
 SONAR_MAX_M: Final = 4.0
 SONAR_RAYS: Final = 16
@@ -88,7 +89,7 @@ def measure_lidar(
     x, y, theta = pose
     directions = np.ascontiguousarray(angles + theta)
     ranges = floor.wall_ranges(x, y, directions, LIDAR_MAX_M)
-    for obstacle, seen, _ in floor.obstacle_ranges(x, y, directions):
+    for obstacle, seen, _ in floor.obstacle_ranges(x, y, directions, LIDAR_MAX_M):
         if obstacle.height >= LIDAR_HEIGHT_M:
             ranges = np.minimum(ranges, seen)
     sigma = noise.range_sigma + noise.range_share * np.where(np.isfinite(ranges), ranges, 0.0)
@@ -98,33 +99,72 @@ def measure_lidar(
     return np.where(valid, ranges, np.nan)
 
 
-def measure_sonar(
-    floor: Floor, robot: Robot, node: NodeSite, index: int, noise: Noise, generator: np.random.Generator
-) -> float | None:
-    """Measure with one sonar of a node: range of the nearest echo (m), None without an echo.
+class _Fan(NamedTuple):
+    """The rays of a sonar's cone from (x, y), the walls that they meet, and the nearest wall (m) that echoes."""
 
-    The cone is a fan of rays. Walls and boxes echo only below a maximum angle of incidence; an obstacle that is lower
-    than the cone at its range is not seen.
+    x: float
+    y: float
+    directions: NDArray[np.float64]
+    walls: NDArray[np.float64]
+    nearest_wall: float
+
+
+class Sonars:
+    """The sonars of a floor's nodes.
+
+    A sonar's cone is a fan of rays. Walls and boxes echo only below a maximum angle of incidence; an obstacle that is
+    lower than the cone at its range is not seen. Nodes and walls do not move, so what the walls echo is computed once.
     """
-    directions = node.theta + node.sonars[index].angle + np.linspace(-SONAR_HALF_CONE, SONAR_HALF_CONE, SONAR_RAYS)
-    if generator.random() < noise.sonar_spike:
-        return float(generator.uniform(0.1, SONAR_MAX_M))
-    # A node is mounted on a wall, and its own cell may be occupied: measure from one cell in front of it.
-    ahead = floor.geometry.resolution
-    x, y = node.x + ahead * math.cos(node.theta), node.y + ahead * math.sin(node.theta)
-    walls = floor.wall_ranges(x, y, directions, SONAR_MAX_M)
-    # A wall hides everything behind it, whether it echoes or not.
-    echoes = [_echo_ranges(walls, directions)]
-    for obstacle, ranges, incidence in floor.obstacle_ranges(x, y, directions):
-        seen = (ranges < walls) & (incidence <= SONAR_MAX_INCIDENCE) & _in_cone(obstacle.height, node.height, ranges)
-        echoes.append(np.where(seen, ranges, np.inf))
-    ranges = _circle_ranges(robot.x, robot.y, robot.radius, x, y, directions)
-    seen = (ranges < walls) & _in_cone(robot.height, node.height, ranges)
-    echoes.append(np.where(seen, ranges, np.inf))
-    nearest = float(np.min(echoes)) + ahead
-    if not SONAR_MIN_M <= nearest <= SONAR_MAX_M:
-        return None
-    return max(SONAR_MIN_M, nearest + noise.sonar_sigma * float(generator.standard_normal()))
+
+    def __init__(self, floor: Floor) -> None:
+        self._floor = floor
+        self._fans: dict[tuple[float, float, float, float], _Fan] = {}
+
+    def measure(
+        self, robot: Robot, node: NodeSite, index: int, noise: Noise, generator: np.random.Generator
+    ) -> float | None:
+        """Measure with one sonar of a node: range of the nearest echo (m), None without an echo."""
+        if generator.random() < noise.sonar_spike:
+            return float(generator.uniform(0.1, SONAR_MAX_M))
+        fan = self._fan(node, index)
+        nearest = min(fan.nearest_wall, self._nearest_obstacle(fan, node), _nearest_of_robot(fan, robot, node))
+        nearest += self._ahead_m
+        if not SONAR_MIN_M <= nearest <= SONAR_MAX_M:
+            return None
+        return max(SONAR_MIN_M, nearest + noise.sonar_sigma * float(generator.standard_normal()))
+
+    @property
+    def _ahead_m(self) -> float:
+        """How far in front of its node a sonar begins: the node's own cell may be part of its wall."""
+        return self._floor.geometry.resolution
+
+    def _fan(self, node: NodeSite, index: int) -> _Fan:
+        key = (node.x, node.y, node.theta, node.sonars[index].angle)
+        if key not in self._fans:
+            directions = node.theta + key[-1] + np.linspace(-SONAR_HALF_CONE, SONAR_HALF_CONE, SONAR_RAYS)
+            x, y = node.x + self._ahead_m * math.cos(node.theta), node.y + self._ahead_m * math.sin(node.theta)
+            walls = self._floor.wall_ranges(x, y, directions, SONAR_MAX_M)
+            self._fans[key] = _Fan(x, y, directions, walls, float(np.min(_echo_ranges(walls, directions))))
+        return self._fans[key]
+
+    def _nearest_obstacle(self, fan: _Fan, node: NodeSite) -> float:
+        """Return the range (m) of the nearest obstacle that echoes, infinite for none."""
+        nearest = math.inf
+        for obstacle, ranges, incidence in self._floor.obstacle_ranges(fan.x, fan.y, fan.directions, SONAR_MAX_M):
+            # A wall hides everything behind it, whether it echoes or not.
+            seen = (ranges < fan.walls) & (incidence <= SONAR_MAX_INCIDENCE)
+            seen &= _in_cone(obstacle.height, node.height, ranges)
+            nearest = min(nearest, float(np.min(np.where(seen, ranges, np.inf))))
+        return nearest
+
+
+def _nearest_of_robot(fan: _Fan, robot: Robot, node: NodeSite) -> float:
+    """Return the range (m) at which a robot echoes, infinite if it does not."""
+    if math.hypot(robot.x - fan.x, robot.y - fan.y) - robot.radius > SONAR_MAX_M:
+        return math.inf
+    ranges = _circle_ranges(robot.x, robot.y, robot.radius, fan.x, fan.y, fan.directions)
+    seen = (ranges < fan.walls) & _in_cone(robot.height, node.height, ranges)
+    return float(np.min(np.where(seen, ranges, np.inf)))
 
 
 def _in_cone(top: float, node_height: float, ranges: NDArray[np.float64]) -> NDArray[np.bool_]:

@@ -15,7 +15,7 @@ import numpy as np
 from fog_contracts.geometry import distance_to_polygon, normalized_polygon
 from fog_contracts.messages import SimObstacle, SimTruth
 from fognav_sim.floor import MAX_CLEARANCE_M
-from fognav_sim.sensors import LidarPlace, Noise, Robot, measure_lidar, measure_sonar
+from fognav_sim.sensors import LidarPlace, Noise, Robot, Sonars, measure_lidar
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -58,6 +58,7 @@ class World:
     ) -> None:
         """Put the robot at its start; `axle_m` is the distance between the wheels of its base."""
         self._floor = floor
+        self._sonars = Sonars(floor)
         self.robot = robot
         self.noise = noise or Noise()
         self._axle_m = axle_m
@@ -207,7 +208,7 @@ class World:
     def sonar(self, node: NodeSite, index: int) -> float | None:
         """Measure with one sonar of a node: range of the nearest echo (m), None without an echo."""
         robot = Robot(x=self._body.x, y=self._body.y, radius=self.robot.radius, height=self.robot.height)
-        return measure_sonar(self._floor, robot, node, index, self.noise, self._rng)
+        return self._sonars.measure(robot, node, index, self.noise, self._rng)
 
     def truth(self, stamp: float, sustained_speed: float = 1.0) -> SimTruth:
         """Return the ground truth."""

@@ -110,14 +110,16 @@ def _create_of_node(file: Path, up: Path, site: Path | None) -> Backup:
 
 
 def _restore_into_node(file: Path, up: Path, site: Path, *, replace: bool) -> Backup:
-    from fognav.hosting.backups import LOCKS, restore  # noqa: PLC0415  # keeps the other commands fast
+    from fognav.hosting.backups import LOCKS, restore  # noqa: PLC0415  # same
     from fognav.hosting.folders import NodeFolder  # noqa: PLC0415  # same
 
-    made, refused = asyncio.run(restore(file, NodeFolder(up), _named(site) or site, replace=replace))
+    made, refused, gone = asyncio.run(restore(file, NodeFolder(up), _named(site) or site, replace=replace))
     if LOCKS not in made.folders:
         print_line(f"the locks in {up} stay: they have the same authority, and what was added since")
     if refused:
         print_line(f"they do not admit {', '.join(refused)}, whom the backup has: add them again, if they shall be")
+    if gone:
+        print_line(f"recordings that are not in {up / 'recordings'}: {', '.join(gone)}")
     return made
 
 

@@ -402,7 +402,8 @@ def reactions_command(
         Path | None, typer.Option("--log", metavar="FILE", help="Keep each trial there, and continue the ones there.")
     ] = None,
     write: Annotated[
-        Path | None, typer.Option("--write", metavar="FILE", help="Write the tables to a Markdown file.")
+        Path | None,
+        typer.Option("--write", metavar="FILE", help="Write the tables to a Markdown file; its remarks stay."),
     ] = None,
     json: Annotated[bool, typer.Option("--json", help="Write one JSON object to standard output.")] = False,
 ) -> None:
@@ -428,7 +429,8 @@ def reactions_command(
     rows = [row(fault, every) for fault in FAULTS if (every := times.get(fault.name, []) + found.get(fault.name, []))]
     if write is not None:
         command = f"fognav bench reactions --trials {trials} --others {other} --robots {robots} --log FILE --write PAGE"
-        write.write_text(page.markdown(rows, command, machine.sentence(), robots), "utf-8")
+        kept = page.remarks(write.read_text("utf-8")) if write.exists() else ""
+        write.write_text(page.markdown(rows, command, machine.sentence(), robots, kept), "utf-8")
     if json:
         print_json({"bench": "reactions", "trials": trials, "others": other, "rows": rows, **machine.describe()})
     else:
@@ -455,7 +457,7 @@ def mutation_command(
 ) -> None:
     """Test the tests of what stops the robot.
 
-    Changes one operator, number or statement of safety gate, guardian or recoveries at a time, and runs their tests,
+    Changes one operator, number or statement of safety gate, guardian, recoveries or maneuvers, and runs their tests,
     which must notice it; prints each change that none does. Exit code 1: a line or branch that no test reaches, or
     fewer than 90 percent of the changes noticed.
     """

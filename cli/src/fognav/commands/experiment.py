@@ -9,8 +9,9 @@ from typing import TYPE_CHECKING, Annotated, Final, TypeVar
 import typer
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
-from fognav import checkout, kernels
-from fognav.operate.options import JsonOption  # noqa: TC001  # Typer reads annotations at run time
+from fognav import checkout, kernels, node_code
+from fognav.operate.fog import find_fog
+from fognav.operate.options import FogOption, JsonOption, RobotOption  # noqa: TC001  # Typer reads annotations at run time
 from fognav.output import NOT_TRUE, FailedError, WrongUseError, console, exit_codes, print_json, print_line
 
 if TYPE_CHECKING:
@@ -18,9 +19,11 @@ if TYPE_CHECKING:
 
     from fog_contracts.messages import ProfileName
     from fog_runtime.configuration.site import LoadedSite
+    from fognav.live_drive import LiveOptions
     from fognav_experiments.comparison.draws import RouteDraw
     from fognav_experiments.comparison.measured import MeasuredDrive
     from fognav_experiments.comparison.records import DriveFiles, Folder, Record
+    from fognav_experiments.comparison.runner import Task
     from fognav_experiments.scenarios.stage import Played
     from fognav_experiments.sensitivity.planes import Plane, SweptDrive
 
@@ -52,25 +55,32 @@ def experiment_command(  # noqa: PLR0913  # each option is an argument
         float | None,
         typer.Option("--cpu-quota", metavar="SHARE", min=0.01, max=4.0, help="Of --live: the robot's share of a core."),
     ] = None,
+    hardware: Annotated[
+        bool, typer.Option("--hardware", help="Drive a real robot; asks a person to place it and each barrier.")
+    ] = False,
+    robot: RobotOption = None,
+    fog: FogOption = None,
 ) -> None:
-    """Repeat the thesis's experiment in lockstep, or by real processes: one drive per run, route and setup.
+    """Repeat the thesis's experiment, one drive per run, route and setup: in lockstep, live, or with a real robot.
 
     A run is the routes of the site's experiment.toml. On each a drawn watched area is blocked at a drawn moment, the
     same for all setups. Each drive is one file, so a run that was killed goes on where it was when the command is
-    repeated. CPU times are worth comparing when nothing runs beside: --jobs 1. Drives of --live stand beside those in
-    lockstep, and the report compares them. The exit code is 1 if a drive failed.
+    repeated. CPU times are worth comparing when nothing runs beside: --jobs 1. Drives of --live and --hardware stand
+    beside those in lockstep, and the report compares them. The exit code is 1 if a drive failed or was skipped.
     """
     if context.invoked_subcommand is not None:
         return
     from fog_runtime.configuration.site import SiteError, load_site  # noqa: PLC0415  # keeps the other commands fast
     from fognav.bench import machine  # noqa: PLC0415  # same
-    from fognav.live_drive import LiveOptions, live_drives  # noqa: PLC0415  # same
+    from fognav.live_drive import LiveOptions  # noqa: PLC0415  # same
     from fognav_experiments.comparison import runner  # noqa: PLC0415  # same
     from fognav_experiments.comparison.records import Folder, FolderError  # noqa: PLC0415  # same
 
     with exit_codes():
         if out is None:
             raise WrongUseError("name a folder for the records: --out DIR")
+        if hardware and live:
+            raise WrongUseError("--hardware and --live exclude each other: leave one of them out")
         if cpu_quota is not None and speed != 1.0:
             raise WrongUseError(f"--cpu-quota {cpu_quota:g} is a share of real time: leave --speed {speed:g} out")
         place = checkout.site_folder(site)
@@ -83,18 +93,41 @@ def experiment_command(  # noqa: PLR0913  # each option is an argument
             folder.begin(runner.new(loaded, place, seed), {"commit": commit, **machine.describe()})
         except (SiteError, runner.SpecError, FolderError) as error:
             raise WrongUseError(str(error)) from error
-        kernels.warm_cache(print_line)
-        if live:
-            options = LiveOptions(speed=speed, cpu_quota=cpu_quota, commit=commit)
-            files = folder.measured("live")
-            failed = _show(
-                [options.name(task) for task in asked], files, live_drives(loaded, asked, files, options, print_line)
-            )
+        if hardware:
+            failed = _drive_real_robot(loaded, asked, folder, fog, robot)
+        elif live:
+            failed = _drive_live(loaded, asked, folder, LiveOptions(speed=speed, cpu_quota=cpu_quota, commit=commit))
         else:
+            _prepare()
             failed = _show([task.name for task in asked], folder.drives, runner.run(place, asked, folder, jobs, commit))
     print_line(f"{len(asked) - failed} of {len(asked)} drives succeeded; records in {out}")
     if failed:
         raise typer.Exit(NOT_TRUE)
+
+
+def _prepare() -> None:
+    node_code.prepare(print_line)
+    kernels.warm_cache(print_line)
+
+
+def _drive_live(site: LoadedSite, asked: Sequence[Task], folder: Folder, options: LiveOptions) -> int:
+    """Drive by real processes; return how many drives failed."""
+    from fognav.live_drive import live_drives  # noqa: PLC0415  # keeps the other commands fast
+
+    _prepare()
+    files, names = folder.measured("live"), [options.name(task) for task in asked]
+    return _show(names, files, live_drives(site, asked, files, options, print_line))
+
+
+def _drive_real_robot(
+    site: LoadedSite, asked: Sequence[Task], folder: Folder, address: str | None, robot: str | None
+) -> int:
+    """Drive a robot of a fog node, with a person at this terminal; return how many drives failed."""
+    from fognav.hardware_drive import drive_hardware  # noqa: PLC0415  # zenoh: keeps the other commands fast
+
+    files = folder.measured("hardware")
+    drive_hardware(site, asked, files, find_fog(address), robot, checkout.revision(), print_line)
+    return _failed([task.name for task in asked], files)
 
 
 @experiment_app.command("report", epilog="Example: fognav experiment report results --out docs/results/estig")
@@ -144,6 +177,7 @@ def scenarios_command(
             scenarios = {file.stem: read_scenario(file) for file in files}
         except ScenarioError as error:
             raise WrongUseError(str(error)) from error
+        node_code.prepare(print_line)
         kernels.warm_cache(print_line)
         drives = {}
         for name, scenario in scenarios.items():
@@ -289,6 +323,7 @@ def _sweep(  # noqa: PLR0913  # what is driven, where and how
     from fognav_experiments.comparison.records import DriveFiles  # noqa: PLC0415  # keeps the other commands fast
     from fognav_experiments.sensitivity import planes, publish, sweep  # noqa: PLC0415  # same
 
+    node_code.prepare(print_line)
     kernels.warm_cache(print_line)
     asked, files = planes.sweep_tasks(swept, drawn), DriveFiles(folder.path / "sweep", planes.SweptDrive)
     names = [task.name for task in asked]
@@ -332,4 +367,12 @@ def _show(names: Sequence[str], files: DriveFiles[D], records: Iterator[D]) -> i
             progress.advance(task)
             time_s = "" if record.time_s is None else f"{record.time_s:6.1f} s"
             print_line(f"{record.name:20} {record.outcome:8} {record.distance_m:6.1f} m {time_s}  {record.area}")
-    return sum(not record.success for record in files.read() if record.name in names)
+    return _failed(names, files)
+
+
+def _failed(names: Sequence[str], files: DriveFiles[D]) -> int:
+    """Name the drives without a record; return how many of those asked for did not succeed."""
+    succeeded = {record.name for record in files.read() if record.success}
+    if missing := [name for name in names if not files.has(name)]:
+        print_line(f"no record of {', '.join(missing)}: repeat the command to drive them")
+    return sum(name not in succeeded for name in names)

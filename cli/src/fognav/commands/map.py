@@ -1,26 +1,53 @@
-"""`fognav map`: maps of buildings."""
+"""`fognav map`: maps of buildings, and what is on the fog's map now."""
 
 from __future__ import annotations
 
 from pathlib import Path  # noqa: TC003  # Typer reads annotations at run time
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from fog_contracts.costs import INSCRIBED
 from fognav.localization.logs import read_log
 from fognav.localization.options import LogFormat, RangeMax, Scans  # noqa: TC001  # Typer reads annotations at run time
-from fognav.operate.options import JsonOption  # noqa: TC001  # same
+from fognav.operate.fog import find_fog
+from fognav.operate.options import FogOption, JsonOption  # noqa: TC001  # same
+from fognav.operate.systems import MAP_SERVICE
 from fognav.output import WrongUseError, exit_codes, print_json, print_line
 
 if TYPE_CHECKING:
+    from collections.abc import Mapping
+
     from fog_contracts.grid import StaticMap
 
-map_app = typer.Typer(help="Make maps of buildings.", no_args_is_help=True)
+map_app = typer.Typer(help="Make maps of buildings; show the hazards on the fog's map.", no_args_is_help=True)
 
 
-@map_app.callback()
-def _map() -> None:
-    """Keep `from-log` a command of its own while it is the only one."""
+@map_app.command("hazards", epilog="Example: fognav map hazards --json")
+def map_hazards(*, fog: FogOption = None, json: JsonOption = False) -> None:
+    """List the watched areas as the map has them: robots plan around those that are impassable.
+
+    The map's own picture is /api/v1/costmap.png of the map-service.
+    """
+    with exit_codes():
+        hazards = find_fog(fog).get(MAP_SERVICE, "/api/v1/hazards")
+        if json:
+            print_json({"hazards": hazards})
+            return
+        for view in sorted(hazards, key=lambda view: str(view["hazard"]["area"])):
+            print_line(_line(view))
+        if not hazards:
+            print_line("no watched areas")
+
+
+def _line(view: Mapping[str, Any]) -> str:
+    """Return a hazard of the map-service as a line."""
+    hazard = view["hazard"]
+    cost = hazard["penalty"]
+    costly = f"cost {cost}" if 0 < cost < INSCRIBED else "impassable" if cost else "passable"
+    cause = f" ({hazard['cause']})" if hazard["cause"] else ""
+    doubt = "" if view["confirmed"] else ", not confirmed: the hazard-aggregator is silent"
+    return f"{hazard['area']}: {hazard['state']}, {costly}{cause}{doubt}"
 
 
 @map_app.command("from-log", epilog="Example: fognav map from-log drive.log.gz --out floor --scans odd")

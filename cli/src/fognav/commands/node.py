@@ -13,10 +13,10 @@ import typer
 
 from fog_contracts import channels as ch
 from fog_contracts.messages import Id, NodeCalibration, NodeReading, NodeUpdate
-from fog_contracts.site import NodeSite
+from fog_contracts.site import NodeSite, Sonar, learned_share
 from fog_runtime.access.credentials import Credentials
 from fog_runtime.configuration.site import LoadedSite
-from fognav import checkout, kernels
+from fognav import checkout, kernels, node_code
 from fognav.locking import own_credentials
 from fognav.nodes import on_broker, provisioning, site_file, updating
 from fognav.nodes.board_options import SITE, BoardOptions, SiteOption, with_board_options
@@ -28,6 +28,8 @@ from fognav.output import FailedError, WrongUseError, exit_codes, print_json, pr
 node_app = typer.Typer(help="Add, watch, calibrate and simulate sensor nodes.", no_args_is_help=True)
 
 T = TypeVar("T")
+LIKELIEST_FALSE_ECHOES: Final = 0.035
+"""A rate of false echoes counts as no more by the default options of the rule `evidence`, as a test compares."""
 
 NameArgument = Annotated[str, typer.Argument(metavar="NODE", help="The node's id: a to z, 0 to 9 and -.")]
 BrokerOption = Annotated[
@@ -48,6 +50,12 @@ def node_add(
     area: Annotated[str, typer.Option("--area", metavar="Z", help="The area that it watches.")],
     pose: Annotated[str, typer.Option("--pose", metavar="X,Y,THETA", help="Metres, radians; frame of the map.")],
     height: Annotated[float, typer.Option("--height", metavar="M", help="Above the floor.")] = 0.5,
+    every_reading: Annotated[
+        bool,
+        typer.Option(
+            "--every-reading/--saving-air", help="Publish every reading, as the thesis; else changes, and one a second."
+        ),
+    ] = False,
     board: BoardOptions,
 ) -> None:
     """Add a node to a site, and write what its board needs to know.
@@ -65,7 +73,7 @@ def node_add(
                 f"the site has a node {name} already: fognav node replace {name} makes a new board of it"
             )
         _compiled()
-        node = _placed(loaded, name, area, _pose(pose), height)
+        node = msgspec.structs.replace(_placed(loaded, name, area, _pose(pose), height), every_reading=every_reading)
         text = site_file.with_node(loaded, node)
         board.provision(loaded, node)
         site_file.write(loaded, text)
@@ -137,13 +145,15 @@ def node_calibrate(  # noqa: PLR0913  # each option is an argument
 ) -> None:
     """Let a node measure the free corridor, and take its range limits from that. Nobody may stand in its way.
 
-    With --site the limits are written into site.toml; without, the aggregator's next configuration replaces them.
+    With --site the limits, and how likely false echoes are, are written into site.toml; without, the aggregator's next
+    configuration replaces them.
     """
     with exit_codes():
         loaded = None if folder is None else site_file.load(checkout.site_folder(folder))
         node = None if loaded is None else site_file.node_of(loaded, name)
         url, site_id, own = _on(fog, broker, site if loaded is None else loaded.site.id)
         command = ch.LEARN_NO_ECHO if no_echo else ch.CALIBRATE
+        print_line(f"node {name} measures for about {'10' if no_echo else '40'} s: keep the way in front of it free")
         learned = _run(on_broker.learn(url, site_id, _checked(name), command, own))
         failed = [
             f"sonar {index + 1} {_RESULTS[result]}" for index, result in enumerate(learned.result) if result != "done"
@@ -155,7 +165,13 @@ def node_calibrate(  # noqa: PLR0913  # each option is an argument
         else:
             for index, limit in enumerate(learned.range_limit_m):
                 silent = ", no echo is clear" if learned.no_echo_is_clear[index] else ""
-                print_line(f"sonar {index + 1}: {_RESULTS[learned.result[index]]}; blocked below {limit:.2f} m{silent}")
+                print_line(
+                    f"sonar {index + 1}: {_RESULTS[learned.result[index]]}; blocked below {limit:.2f} m{silent}"
+                    f"{_free_space(learned, index)}"
+                )
+        for index in range(len(learned.samples)):
+            if warning := _hears_too_much(learned, index):
+                print_line(warning)
         if failed:
             raise FailedError(f"node {name} keeps its old limits: {', '.join(failed)}")
 
@@ -220,7 +236,7 @@ def node_update(  # noqa: PLR0913  # each option is an argument
     context_settings=NUMBERS,
     epilog="Example: fognav node sim n1 --site estig --broker mqtt://localhost --person 40.0,28.4",
 )
-def node_sim(
+def node_sim(  # noqa: PLR0913  # each option is an argument
     name: NameArgument,
     *,
     person: Annotated[
@@ -228,6 +244,10 @@ def node_sim(
     ] = None,
     seconds: Annotated[
         float | None, typer.Option("--seconds", metavar="S", min=0.1, help="End after this time.")
+    ] = None,
+    every_reading: Annotated[
+        bool | None,
+        typer.Option("--every-reading/--saving-air", help="What it publishes; default: as the site's file says."),
     ] = None,
     site: SiteOption = SITE,
     broker: BrokerOption = None,
@@ -239,9 +259,12 @@ def node_sim(
     with exit_codes():
         loaded = site_file.load(checkout.site_folder(site))
         node = site_file.node_of(loaded, name)
+        if every_reading is not None:
+            node = msgspec.structs.replace(node, every_reading=every_reading)
         persons = [_numbers("--person", text, 2) for text in person or ()]
         url, _, _ = _on(fog, broker, loaded.site.id)
         _compiled()
+        node_code.prepare(print_line)
         _run(_bounded(simulated.run(loaded, node, url, [(x, y) for x, y in persons]), seconds))
 
 
@@ -357,11 +380,44 @@ def _with_limits(node: NodeSite, learned: NodeCalibration) -> NodeSite:
             f"node {node.id} has learned {len(learned.range_limit_m)} limits, and has {len(node.sonars)} sonars in the "
             "site: make site.toml and the board's settings agree"
         )
-    sonars = [
-        msgspec.structs.replace(sonar, range_limit=min(4.0, limit), no_echo_is_clear=silent)
-        for sonar, limit, silent in zip(node.sonars, learned.range_limit_m, learned.no_echo_is_clear, strict=True)
-    ]
+    sonars = [_calibrated(sonar, learned, index) for index, sonar in enumerate(node.sonars)]
     return msgspec.structs.replace(node, sonars=sonars)
+
+
+def _calibrated(sonar: Sonar, learned: NodeCalibration, index: int) -> Sonar:
+    """Return a sonar with what its node has learned of it; an older firmware does not count false echoes."""
+    counted = index < min(len(learned.samples), len(learned.false_echoes)) and learned.samples[index] > 0
+    rate = sonar.false_echo_rate
+    if counted:
+        rate = round(learned_share(learned.false_echoes[index], learned.samples[index]), 4)
+    return msgspec.structs.replace(
+        sonar,
+        range_limit=min(4.0, learned.range_limit_m[index]),
+        no_echo_is_clear=learned.no_echo_is_clear[index],
+        false_echo_rate=rate,
+    )
+
+
+def _free_space(learned: NodeCalibration, index: int) -> str:
+    """Return what a calibration says of the samples of free space, if anything."""
+    if index >= min(len(learned.samples), len(learned.false_echoes), len(learned.no_echoes)):
+        return ""
+    near, none, samples = learned.false_echoes[index], learned.no_echoes[index], learned.samples[index]
+    return f"; of {samples} samples {near} echoed from nearer, {none} not at all" if samples else ""
+
+
+def _hears_too_much(learned: NodeCalibration, index: int) -> str:
+    """Return a warning of a sonar with more false echoes than the rule `evidence` takes into account, if it has."""
+    if not learned.samples[index] or index >= len(learned.false_echoes):
+        return ""
+    rate = learned_share(learned.false_echoes[index], learned.samples[index])
+    if rate <= LIKELIEST_FALSE_ECHOES:
+        return ""
+    return (
+        f"warning: sonar {index + 1} hears something in {100 * rate:.0f} % of the readings of its free area, and "
+        f"false alarms are likely from {100 * LIKELIEST_FALSE_ECHOES:.1f} % on: turn it away from what it hears (an "
+        "edge, the floor, another sonar) and calibrate it again"
+    )
 
 
 def _line(node: dict[str, Any]) -> str:

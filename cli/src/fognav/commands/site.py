@@ -1,6 +1,7 @@
 """`fognav site`: reads and writes the files of a proposed or checked site."""
 
 import re
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Final
 
@@ -66,6 +67,22 @@ def new_site(map_file: Path, out: Path, seed: int) -> dict[str, object]:
         "areas": len(site.areas),
         "places": {name: [place.x, place.y] for name, place in site.places.items()},
     }
+
+
+def compose_floors(folders: Sequence[Path], root: Path, out: Path) -> dict[str, object]:
+    """Write the override of a checkout's compose file for further floors; without folders, remove it.
+
+    Raises `WrongUseError` as `override`, and for a file that this command has not written.
+    """
+    from fognav.hosting.compose_floors import BASE, HEADER, override  # noqa: PLC0415  # keeps the other commands fast
+
+    if out.exists() and not out.read_text("utf-8").startswith(HEADER):
+        raise WrongUseError(f"{out} is not by this command: move it, or name another file with --out")
+    if folders:
+        atomic_write(out, override(folders, (root / BASE).read_text("utf-8")).encode(), mode=SHARED)
+    else:
+        out.unlink(missing_ok=True)
+    return {"file": str(out), "sites": [str(folder) for folder in folders]}
 
 
 def check_site(folder: Path) -> dict[str, object]:

@@ -170,5 +170,6 @@ def _area(fog: Fog, area: str) -> AreaDefinition:
 def _put(fog: Fog, old: AreaDefinition, sources: list[Source]) -> None:
     """Store the area with these sources, unless somebody else has changed it meanwhile."""
     whole = msgspec.to_builtins(msgspec.structs.replace(old, sources=sources))
-    body = {name: whole[name] for name in _SET}
+    # The place of an area that is the cone of a node follows from the node.
+    body = {name: whole[name] for name in _SET if name != "polygon" or old.cone_of is None}
     fog.send("PUT", AGGREGATOR, f"/api/v1/areas/{old.id}", body, {"If-Match": f'"{old.version}"'})

@@ -9,7 +9,7 @@ import time
 from collections.abc import AsyncIterator, Sequence
 from contextlib import asynccontextmanager
 from pathlib import Path
-from typing import Final
+from typing import Final, NamedTuple
 
 from fog_runtime import backup
 from fog_runtime.access.credentials import Credentials
@@ -20,6 +20,7 @@ from fog_runtime.locks.site_locks import AUTHORITY, SiteLocks
 from fog_runtime.locks.users import REDIS_ADMINISTRATOR, on_floor
 from fog_supervisor import net, servers
 from fog_supervisor.supervisor import Event, Supervisor
+from fognav.hosting import recordings
 from fognav.hosting.folders import LOCKS_FILE, NodeFolder
 from fognav.hosting.settings import REDIS_PORT, recall
 from fognav.output import WrongUseError
@@ -27,6 +28,18 @@ from fognav.programs import MAP_SERVICE, REDIS, ProgramSet
 
 LOCKS: Final = "locks"
 _READY_S: Final = 60.0
+
+
+class Restored(NamedTuple):
+    """What a restore has done.
+
+    `refused` are those whom the backup's locks would have admitted besides, and `missing` the recordings of the
+    backup's index that are not there.
+    """
+
+    backup: Backup
+    refused: Sequence[str]
+    missing: Sequence[str]
 
 
 def site_of(folder: NodeFolder, directory: Path | None) -> tuple[str, Path]:
@@ -47,16 +60,16 @@ def site_of(folder: NodeFolder, directory: Path | None) -> tuple[str, Path]:
 async def create(file: Path, folder: NodeFolder, directory: Path | None) -> Backup:
     """Back up a site of a node, which may be running; raises as `site_of`, `redis_of` and `backup.create`."""
     site, path = site_of(folder, directory)
+    await asyncio.to_thread(recordings.write_index, folder.path)
     async with _redis(folder, site, path) as place:
         return await backup.create(file, place, time.time())
 
 
-async def restore(file: Path, folder: NodeFolder, directory: Path, *, replace: bool) -> tuple[Backup, Sequence[str]]:
+async def restore(file: Path, folder: NodeFolder, directory: Path, *, replace: bool) -> Restored:
     """Restore a backup of one site, whose folder is to be `directory`, while the node is down.
 
-    With `replace`, locks of the same authority stay: they are those of all sites, and newer. Returns what was restored,
-    and whom the backup's locks would have admitted besides. Raises `FailedError` while the node runs, `BackupError`,
-    and as `redis_of`.
+    With `replace`, locks of the same authority stay: they are those of all sites, and newer. Raises `FailedError` while
+    the node runs, `BackupError`, and as `redis_of`.
     """
     with folder.in_use():
         archive = await asyncio.to_thread(read_archive, file)
@@ -66,8 +79,12 @@ async def restore(file: Path, folder: NodeFolder, directory: Path, *, replace: b
                 atomic_write(folder.locks / name, content.data, mode=content.mode)
         stay = replace and _same_authority(archive, folder.locks)
         refused = sorted(_users(archive) - SiteLocks.open(folder.locks).users()) if stay else []
+        # Another floor's backup has brought one of another moment: it stays, and the next backup writes a new one.
+        indexed = not replace and recordings.index_folder(folder.path).exists()
+        keep = ({LOCKS} if stay else set()) | ({recordings.FOLDER} if indexed else set())
         async with redis_of(folder, archive.site, directory) as place:
-            return await backup.restore(file, place, replace=replace, keep={LOCKS} if stay else ()), refused
+            made = await backup.restore(file, place, replace=replace, keep=keep)
+        return Restored(made, refused, recordings.missing(folder.path, archive.folders.get(recordings.FOLDER, {})))
 
 
 def _same_authority(archive: Backup, locks: Path) -> bool:
@@ -120,7 +137,12 @@ async def redis_of(folder: NodeFolder, site: str, directory: Path) -> AsyncItera
 def _place(folder: NodeFolder, site: str, directory: Path, redis: str) -> backup.Place:
     locks = SiteLocks.open(folder.locks)
     credentials = Credentials.read(locks.credentials(REDIS_ADMINISTRATOR))
-    folders = {backup.SITE: directory, backup.SECRETS: folder.path / "keys" / site, LOCKS: folder.locks}
+    folders = {
+        backup.SITE: directory,
+        backup.SECRETS: folder.path / "keys" / site,
+        LOCKS: folder.locks,
+        recordings.FOLDER: recordings.index_folder(folder.path),
+    }
     service = MAP_SERVICE if site == locks.sites[0] else on_floor(site, MAP_SERVICE)
     return backup.Place(redis, site, folders, folder.data(service), credentials)
 

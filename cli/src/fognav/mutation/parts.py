@@ -83,7 +83,14 @@ PARTS: Final = (
             ),
             Equivalent(
                 "visibility",
-                "return np.array([(sector + 0.5) * math.tau / SECTORS - math.pi for sector in range(SECTORS)])",
+                "sectors: NDArray[np.int64] = np.floor((turns - np.floor(turns)) * SECTORS).astype(np.int64) % SECTORS",
+                "turns - np.floor(turns) -> turns + np.floor(turns)",
+                "whole turns more are whole circles of sectors, which the remainder takes off",
+            ),
+            Equivalent(
+                "visibility",
+                "SECTOR_ANGLES: Final = np.array("
+                "[(sector + 0.5) * math.tau / SECTORS - math.pi for sector in range(SECTORS)])",
                 "(sector + 0.5) * math.tau / SECTORS - math.pi -> (sector + 0.5) * math.tau / SECTORS + math.pi",
                 "directions that differ by whole turns are the same",
             ),
@@ -140,7 +147,47 @@ PARTS: Final = (
     Part(
         "recoveries",
         ("motion.recovery", "motion.recovery_moves", "motion.trail", "agent.path.recoveries", "agent.power"),
-        ("motion/test_recovery.py", "motion/test_recovery_limits.py", "agent/test_power.py"),
+        (
+            "motion/test_recovery.py",
+            "motion/test_recovery_boundaries.py",
+            "motion/test_recovery_limits.py",
+            "agent/test_power.py",
+        ),
         ("numpy", "hypothesis.strategies", "fog_kernels.clearance", "robot_agent.config", "robot_agent.motion.band"),
+        (
+            Equivalent(
+                "recovery", "since: float = 0.0", "0.0 -> 1.0", "only a move that runs has a begin, and it sets its own"
+            ),
+            *(
+                Equivalent(
+                    "recovery_moves",
+                    "known = _known(around, centre_x[..., None] + rim_x, centre_y[..., None] + rim_y).all(axis=2)",
+                    f"centre_{axis}[..., None] + rim_{axis} -> centre_{axis}[..., None] - rim_{axis}",
+                    "the points of the rim lie opposite one another",
+                )
+                for axis in "xy"
+            ),
+            Equivalent(
+                "recovery_moves",
+                "_STEPS: Final = 10",
+                "10 -> 11",
+                "poses of the arc a centimetre apart: one more changes less than the rounding",
+            ),
+            *(
+                Equivalent(
+                    "recovery_moves",
+                    "times = np.linspace(0.0, reach, _STEPS + 1)",
+                    change,
+                    "poses of the arc about a centimetre apart: one more or less changes less than the rounding",
+                )
+                for change in ("_STEPS + 1 -> _STEPS - 1", "1 -> 2")
+            ),
+        ),
+    ),
+    Part(
+        "maneuvers",
+        ("agent.maneuvering",),
+        ("agent/test_docking.py", "agent/test_maneuvers.py", "agent/test_maneuvering.py"),
+        ("numpy", "hypothesis.strategies", "robot_agent.localization.localizer", "robot_agent.config"),
     ),
 )

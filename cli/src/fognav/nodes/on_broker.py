@@ -22,8 +22,9 @@ if TYPE_CHECKING:
     from fog_contracts.channels import Channel
     from fog_contracts.messages import NodeUpdate
 
-CALIBRATION_S: Final = 60.0
-"""A node measures some seconds per sonar; without an answer after this it is not there, or its firmware is too old."""
+CALIBRATION_S: Final = 180.0
+"""A node with two sonars measures for some 40 s, one with eight for two minutes; without an answer after this it is not
+there, or its firmware is too old."""
 
 
 @asynccontextmanager
@@ -65,7 +66,7 @@ async def readings(
 async def learn(url: str, site: str, node: str, command: str, credentials: Credentials = NOBODY) -> NodeCalibration:
     """Let a node learn its limits (`CALIBRATE`) or its board's "no echo" (`LEARN_NO_ECHO`), and return what it learned.
 
-    Raises `FailedError` with the node's own words if it refused, or if it does not answer within 60 s.
+    Raises `FailedError` with the node's own words if it refused, or if it does not answer within `CALIBRATION_S`.
     """
     keys = {channel: channel.key(site=site, node=node) for channel in (ch.NODE_CALIBRATION, ch.NODE_PROBLEM)}
     try:

@@ -7,12 +7,12 @@ from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
+from fog_contracts.cones import SONAR_HALF_CONE, sonar_cone
 from fog_contracts.costs import FREE
 from fog_contracts.raster import rasterize
 from fog_contracts.site import NodeSite, Sonar
 from fog_kernels.raycast import cast
-from fognav.coverage import cone
-from fognav_sim.sensors import SONAR_HALF_CONE, SONAR_MAX_M
+from fognav_sim.sensors import SONAR_MAX_M
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -65,12 +65,11 @@ def sonar_limits(static: StaticMap, pose: tuple[float, float, float], angles: Se
 
 def check_sees(node: NodeSite, area: AreaSite, static: StaticMap) -> None:
     """Raise `PlacingError` unless a cone of the node reaches its area."""
-    walls = (static.cells != FREE).astype(np.uint8)
     window, mask = rasterize(area.polygon, static.geometry)
     inside = np.zeros(static.geometry.shape, dtype=np.bool_)
     inside[window.rows, window.columns] = mask
     for sonar in range(len(node.sonars)):
-        seen, cells = rasterize(cone(node, sonar, static, walls), static.geometry)
+        seen, cells = rasterize(sonar_cone(node, sonar, static), static.geometry)
         if (inside[seen.rows, seen.columns] & cells).any():
             return
     raise PlacingError(f"the node would see nothing of area {area.id}: check its pose, above all the direction")

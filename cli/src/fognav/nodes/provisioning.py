@@ -55,6 +55,7 @@ def settings(site: str, node: NodeSite, access: Access, password: str, profile: 
         "user": node.id,
         "password": password,
         "profile": profile,
+        "every_reading": node.every_reading,
         "sonars": [
             {"range_limit_m": sonar.range_limit, "no_echo_is_clear": sonar.no_echo_is_clear} for sonar in node.sonars
         ],

@@ -2,6 +2,7 @@
 
 import asyncio
 import getpass
+from collections import deque
 from collections.abc import AsyncIterator, Mapping
 from contextlib import asynccontextmanager
 from typing import Final
@@ -9,7 +10,7 @@ from typing import Final
 from fog_contracts import channels as ch
 from fog_contracts.codec import ContractError
 from fog_contracts.commands import STOPS
-from fog_contracts.messages import CommandKind, Pose, RobotPose, RobotState
+from fog_contracts.messages import CommandKind, Pose, RobotPath, RobotPose, RobotState
 from fog_runtime.clock import SystemClock
 from fog_runtime.robot_commands import REPLY_TIMEOUT_S, RobotCommands
 from fog_runtime.transports.zenoh_edge import ZenohEdge
@@ -19,21 +20,24 @@ from fognav.output import FailedError
 
 STATE_TIMEOUT_S: Final = 3.0
 """Real seconds to wait for a robot's state: it is published once a second of the robot's clock, and on change."""
+_PATHS: Final = 64
 
 
 class Robot:
-    """A robot of a running system: its latest state and pose, and commands to it."""
+    """A robot of a running system: its latest state, pose and paths, and commands to it."""
 
     def __init__(self, edge: ZenohEdge, fog: Fog, robot: str, clock: SystemClock) -> None:
         self._edge = edge
         self._fog = fog
-        self._clock = clock
+        self.clock = clock
         self.id = robot
+        self._paths: deque[RobotPath] = deque(maxlen=_PATHS)
         self.state: RobotState | None = None
         self.pose: RobotPose | None = None
         self._changed = asyncio.Event()
         edge.subscribe(ch.ROBOT_STATE, RobotState, self._on_state, robot=robot)
         edge.subscribe(ch.ROBOT_POSE, RobotPose, self._on_pose, robot=robot)
+        edge.subscribe(ch.ROBOT_PATH, RobotPath, self._on_path, robot=robot)
 
     def _on_state(self, _ids: Mapping[str, str], state: RobotState) -> None:
         self.state = state
@@ -41,6 +45,15 @@ class Robot:
 
     def _on_pose(self, _ids: Mapping[str, str], pose: RobotPose) -> None:
         self.pose = pose
+
+    def _on_path(self, _ids: Mapping[str, str], path: RobotPath) -> None:
+        self._paths.append(path)
+
+    def take_paths(self) -> list[RobotPath]:
+        """Return the paths and refusals that the planner published since the last call, as far as they were kept."""
+        taken = list(self._paths)
+        self._paths.clear()
+        return taken
 
     async def next_state(self) -> RobotState | None:
         """Return the next state that the robot publishes, or None when none comes in time."""
@@ -66,7 +79,7 @@ class Robot:
         commands = RobotCommands(self._edge, operator=getpass.getuser(), key=key)
         try:
             # The timeout is in the clock's seconds, of which more pass in a fast simulation.
-            timeout_s = REPLY_TIMEOUT_S * max(1.0, self._clock.speed)
+            timeout_s = REPLY_TIMEOUT_S * max(1.0, self.clock.speed)
             reply = await commands.send(kind, self.id, state, pose, timeout_s)
         except ContractError as error:
             raise FailedError(f"robot {self.id} gave an invalid reply: {error}. Check that versions match") from error

@@ -9,13 +9,13 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Final, NamedTuple
 
 from fognav_experiments.comparison.document import Block, Heading, Paragraph, Table
-from fognav_experiments.comparison.measured import ROBOTS_PROCESSES
+from fognav_experiments.comparison.measured import KINDS, ROBOTS_PROCESSES
 from fognav_experiments.comparison.statistics import estimate
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from fognav_experiments.comparison.measured import MeasuredDrive
+    from fognav_experiments.comparison.measured import Kind, MeasuredDrive
     from fognav_experiments.comparison.records import Record
 
 DISTANCE_M: Final = 1.5
@@ -25,6 +25,12 @@ TIME_SHARE: Final = 0.05
 PATHS: Final = 1
 STOPPING_MODES: Final = frozenset({"PROTECTIVE_STOP", "FAULT", "EGRESS"})
 """Modes that a drive has not by chance: a robot slows down here and there, and holds for a moment at its goal."""
+
+_BY: Final[dict[Kind, tuple[str, str]]] = {
+    "live": ("real processes", "brokers, sockets, threads and serial lines"),
+    "hardware": ("a real robot", "as the thesis's figures 6.11 and 6.12 compare simulation and reality"),
+}
+"""By whom drives of a kind were repeated, and what that means."""
 
 
 class Compared(NamedTuple):
@@ -63,11 +69,16 @@ def compared(live: Sequence[MeasuredDrive], lockstep: Sequence[Record]) -> list[
     return [compare_drives(drive, record) for drive, record in found if record is not None]
 
 
-def agreement(live: Sequence[MeasuredDrive], lockstep: Sequence[Record], begun_with: str = "") -> list[Block]:
-    """Return the comparison as a part of the report, with its heading; nothing without live drives.
+def agreement(drives: Sequence[MeasuredDrive], lockstep: Sequence[Record], begun_with: str = "") -> list[Block]:
+    """Return the comparison as parts of the report, each with its heading: one per kind of drives, none without any.
 
     `begun_with`: the commit of the records in lockstep that name none.
     """
+    by_kind = ([drive for drive in drives if drive.kind == kind] for kind in KINDS)
+    return [block for found in by_kind for block in _agreement(found, lockstep, begun_with)]
+
+
+def _agreement(live: Sequence[MeasuredDrive], lockstep: Sequence[Record], begun_with: str) -> list[Block]:
     pairs = compared(live, lockstep)
     if not pairs:
         return []
@@ -86,10 +97,11 @@ def agreement(live: Sequence[MeasuredDrive], lockstep: Sequence[Record], begun_w
     speeds = sorted({pair.live.speed for pair in pairs})
     subject = f"{len(pairs)} of the drives" if same else f"The routes and seeds of {len(pairs)} drives"
     version = "" if same else f" and {'in part ' if any(equal) else ''}another version of the program"
+    by, how = _BY[pairs[0].live.kind]
     return [
-        Heading(f"The same {'drives' if same else 'routes and seeds'} by real processes"),
+        Heading(f"The same {'drives' if same else 'routes and seeds'} by {by}"),
         Paragraph(
-            f"{subject} were repeated by real processes{version}: brokers, sockets, threads and serial lines, "
+            f"{subject} were repeated by {by}{version}: {how}, "
             f"at {', '.join(f'{speed:g}' for speed in speeds)} times real time. {agreed} of them agree with lockstep "
             f"in outcome, in distance within {DISTANCE_M} m or {100 * DISTANCE_SHARE:.0f} %, in time within "
             f"{TIME_S:.0f} s or {100 * TIME_SHARE:.0f} %, in the number of paths within {PATHS}, in the watched areas "

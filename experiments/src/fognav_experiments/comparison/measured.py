@@ -6,7 +6,7 @@ from typing import Final, Literal
 
 import msgspec
 
-from fog_contracts.messages import ProfileName  # read at run time, when a file is decoded
+from fognav_experiments.comparison.driven import ComparedDrive, drive_name
 
 Kind = Literal["live", "hardware"]
 KINDS: Final[tuple[Kind, ...]] = ("live", "hardware")
@@ -14,44 +14,26 @@ ROBOTS_PROCESSES: Final = ("robot-agent", "robot-guardian", "robot-watchdog")
 """The processes that run on the robot."""
 
 
-class MeasuredDrive(msgspec.Struct, frozen=True, kw_only=True):
-    """One drive; lengths in m, times in s of the system's clock, which runs `speed` times as fast as real time.
+class MeasuredDrive(ComparedDrive, frozen=True, kw_only=True):
+    """One drive by real processes, whose clock runs `speed` times as fast as real time.
 
     Distance and areas are those of the simulator's ground truth, with a real robot those of its own poses.
     `cpu_percent`: mean share (%) of one core that each process took, per second of the system's clock. `peak_mb`: its
     largest resident memory (MB), sampled once a second. `cpu_quota`: share of one core that the robot's processes had
     together; None without a limit. `asked_speed`: that of the command, from which `speed` differs where the machine
-    could not sustain it. `restarts`: processes that died. `load`: the machine's load average at the end.
+    could not sustain it. `restarts`: processes that died. `barrier_at_m`: distance (m) driven when a person said that
+    the barrier stands.
     """
 
     kind: Kind
-    setup: ProfileName
-    run: int
-    route: str
-    seed: int
-    area: str
-    moment: str
-    trigger_m: float
-    outcome: str
-    reason: str
-    success: bool
-    distance_m: float
-    time_s: float | None
     plans: int
-    paths: int
-    modes: dict[str, int]
-    stops: list[str]
-    route_areas: list[str]
-    min_clearance_m: float | None = None
-    cpu_percent: dict[str, float] = {}
-    peak_mb: dict[str, float] = {}
+    cpu_percent: dict[str, float] = msgspec.field(default_factory=dict)
+    peak_mb: dict[str, float] = msgspec.field(default_factory=dict)
     cpu_quota: float | None = None
     speed: float = 1.0
     asked_speed: float = 1.0
     restarts: int = 0
-    load: float = 0.0
-    version: str = ""
-    commit: str = ""
+    barrier_at_m: float | None = None
 
     @property
     def name(self) -> str:
@@ -66,9 +48,3 @@ class MeasuredDrive(msgspec.Struct, frozen=True, kw_only=True):
     def robots_peak_mb(self) -> float | None:
         """Return the sum (MB) of the largest memories of the robot's processes; None if they were not measured."""
         return sum(self.peak_mb.get(name, 0.0) for name in ROBOTS_PROCESSES) if self.peak_mb else None
-
-
-def drive_name(run: int, route: str, setup: str, cpu_quota: float | None = None, speed: float = 1.0) -> str:
-    """Return the name of a drive's record; without a quota and in real time the same as that in lockstep."""
-    quota = "" if cpu_quota is None else f"-quota{cpu_quota:g}"
-    return f"{run:04}-{route}-{setup}{quota}" + ("" if speed == 1.0 else f"-speed{speed:g}")

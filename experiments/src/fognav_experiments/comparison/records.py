@@ -7,15 +7,16 @@ from typing import TYPE_CHECKING, Any, Final, Generic, Protocol, TypeVar
 
 import msgspec
 
-from fog_contracts.messages import ProfileName  # read at run time, when a file is decoded
 from fog_runtime.files import SHARED, atomic_write
-from fognav_experiments.comparison.measured import MeasuredDrive, drive_name
+from fognav_experiments.comparison.driven import ComparedDrive, drive_name
+from fognav_experiments.comparison.measured import MeasuredDrive
 from fognav_experiments.comparison.timeline import Timeline  # read at run time, when a file is decoded
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Sequence
     from pathlib import Path
 
+    from fog_contracts.messages import ProfileName
     from fognav_experiments.comparison.measured import Kind
 
 MOVE_BASE: Final = ("global planning", "layers", "local planning")
@@ -32,46 +33,25 @@ OF_FOG: Final[dict[ProfileName, tuple[str, ...]]] = {
 """What a setup uses of the fog: in lockstep the rest runs too, and is no part of the setup."""
 
 
-class Record(msgspec.Struct, frozen=True, kw_only=True):
-    """One drive; lengths in m, times in s of the simulated clock, `cpu_s` in s of CPU time by component.
+class Record(ComparedDrive, frozen=True, kw_only=True):
+    """One drive in lockstep: times are those of the simulated clock, `cpu_s` is CPU time (s) by component.
 
     `barrier_distance_m`: smallest distance between the obstacle and the robot's rim. `reaction_s`: from the obstacle's
     first reading to the first wheel command on a new path, where there was one. `jobs`: drives that this machine ran at
-    the same time; `load`: its load average at the end. `paths`: paths that the robot followed. `commit`: the
-    program's revision, empty if it is the one that the folder was begun with. `timeline`: what a film shows.
+    the same time. `timeline`: what a film shows.
     """
 
-    setup: ProfileName
-    run: int
-    route: str
-    seed: int
-    area: str
-    moment: str
-    trigger_m: float
-    outcome: str
-    reason: str
-    success: bool
-    distance_m: float
-    time_s: float | None
     planned_m: float
-    paths: int
     contacts: int
-    stops: list[str]
-    min_clearance_m: float | None
     barrier_distance_m: float | None
     pose_error_m: float
     reaction_s: float | None
     received_bytes: int
     operator_commands: int
-    route_areas: list[str]
     cpu_s: dict[str, float]
     jobs: int
-    load: float
     wall_s: float
-    version: str
-    commit: str = ""
-    track: list[tuple[float, float]] = []
-    modes: dict[str, int] = {}
+    track: list[tuple[float, float]] = msgspec.field(default_factory=list)
     timeline: Timeline | None = None
 
     @property

@@ -219,7 +219,7 @@ def _beside_thesis(
             "The thesis draws one of two or three corridors to be blocked, so that often the blocked one is "
             f"not on the robot's way. The obstacle met a robot that did not know of it in {len(met)} of "
             f"{len(pairs)} drives here. The floor is another one, made in the manner of the thesis's. Its "
-            "figures 6.11 and 6.12 compare simulation and reality, for which there is no robot here."
+            f"figures 6.11 and 6.12 compare simulation and reality, {_reality(measured)}."
         ),
         Paragraph(
             "The time from an echo to a wheel command is not comparable with the thesis's 3 s: lockstep has the "
@@ -228,6 +228,11 @@ def _beside_thesis(
             "processes."
         ),
     ]
+
+
+def _reality(measured: Sequence[MeasuredDrive]) -> str:
+    driven = sum(drive.kind == "hardware" for drive in measured)
+    return f"as do {driven} drives of a real robot, further below" if driven else "for which there is no robot here"
 
 
 def _memory(measured: Sequence[MeasuredDrive]) -> str:

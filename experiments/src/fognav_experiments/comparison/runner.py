@@ -15,8 +15,8 @@ import msgspec
 
 from fog_runtime.configuration.site import load_site
 from fognav_experiments.comparison.draws import ExperimentSpec, draw
+from fognav_experiments.comparison.driven import drive_name
 from fognav_experiments.comparison.geometry import RouteGeometry
-from fognav_experiments.comparison.measured import drive_name
 from fognav_experiments.comparison.records import Asked, Folder, FolderError
 from fognav_experiments.comparison.trial import drive
 from fognav_experiments.lockstep import release_drives

@@ -12,6 +12,7 @@ import msgspec
 from fog_contracts.bus import Bus
 from fog_contracts.messages import Pose
 from fog_contracts.stages import TOTAL
+from fognav_experiments.comparison.driven import facts
 from fognav_experiments.comparison.records import Record
 from fognav_experiments.comparison.timeline import TimelineRecorder
 from fognav_experiments.cpu import CpuMeter
@@ -49,18 +50,9 @@ def drive(site: LoadedSite, drawn: RouteDraw, setup: ProfileName, jobs: int = 1,
     )
     appears = (event.time_s for event in result.events if event.description.startswith("barrier appears"))
     total = result.stages_ms.get(TOTAL)
-    shared = {
-        name: getattr(result, name) for name in Record.__struct_fields__ if name in type(result).__struct_fields__
-    }
     return msgspec.convert(
-        shared
+        facts(Record, drawn, setup, result)
         | {
-            "setup": setup,
-            "run": drawn.run,
-            "route": drawn.route.name,
-            "area": drawn.area,
-            "moment": drawn.moment,
-            "trigger_m": drawn.trigger_m,
             "reaction_s": None if total is None else total / 1000.0,
             "cpu_s": {name: round(seconds, 4) for name, seconds in sorted(cpu.seconds.items())},
             "jobs": jobs,

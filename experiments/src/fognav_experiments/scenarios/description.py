@@ -5,7 +5,7 @@ Lengths in m, frame `map`; angles in rad; times in s of the simulated clock, fro
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, Literal, Protocol
 
 import msgspec
 from msgspec import Meta
@@ -15,7 +15,7 @@ from fog_contracts.messages import Id, Mode, PointXY, ProfileName, Ring
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from fognav_experiments.lockstep import DriveEvent, LockstepResult
+    from fognav_experiments.lockstep import DriveEvent
 
 Metres = Annotated[float, Meta(ge=0.0)]
 Seconds = Annotated[float, Meta(ge=0.0)]
@@ -104,7 +104,9 @@ class Expected(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=
     """What must be true of the drive, besides that the robot touches nothing.
 
     `outcome`: how it ends; `driving` if it had not ended after the scenario's time. `modes`: modes that the robot must
-    have entered, `never`: those that it must not have. `reason`: text in one of the reasons of its modes.
+    have entered, `never`: those that it must not have. `reason`: text in one of the reasons of its modes. Of several
+    robots all must arrive; their distances are added up, and there are at most `plans` paths for all of them together.
+    `plans` is only for several robots; `modes`, `never` and `reason` are only for one.
     """
 
     outcome: str = "reached"
@@ -113,10 +115,21 @@ class Expected(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=
     modes: list[Mode] = []
     never: list[Mode] = []
     reason: str = ""
+    plans: int | None = None
+
+
+class OtherRobot(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """Another robot, which drives from `start` (x, y, theta) to `goal` at the same time."""
+
+    start: tuple[float, float, float]
+    goal: PointXY
 
 
 class Scenario(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """A drive from `start` (x, y, theta) to `goal` of the site's first robot; it is ended after `seconds`."""
+    """A drive from `start` (x, y, theta) to `goal` of the site's first robot; it is ended after `seconds`.
+
+    With `others` nothing else happens: no events, and all are led by the fog.
+    """
 
     title: str
     start: tuple[float, float, float]
@@ -127,9 +140,40 @@ class Scenario(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=
     profile: ProfileName = "fog"
     seconds: Seconds = 300.0
     seed: int = 1
+    others: list[OtherRobot] = []
+
+    def __post_init__(self) -> None:
+        """Raise `ValueError` for what can't be played."""
+        if self.others and (self.events or self.profile != "fog"):
+            raise ValueError("a scenario with others has no events, and no other profile than fog")
+        expected = self.expected
+        if self.others and (expected.modes or expected.never or expected.reason):
+            raise ValueError("what a scenario with others expects has no modes, never or reason: nobody records these")
+        if not self.others and expected.plans is not None:
+            raise ValueError("what a scenario without others expects has no plans: nobody counts these")
 
 
-def deviations(expected: Expected, result: LockstepResult, outcome: str, events: Sequence[DriveEvent]) -> list[str]:
+class Ended(Protocol):
+    """How a drive went, or several together."""
+
+    @property
+    def contacts(self) -> int:
+        """Contacts with walls, obstacles and one another."""
+
+    @property
+    def reason(self) -> str:
+        """Why it ended."""
+
+    @property
+    def distance_m(self) -> float:
+        """Distance driven."""
+
+    @property
+    def time_s(self) -> float | None:
+        """Time until the end, None if it was broken off."""
+
+
+def deviations(expected: Expected, result: Ended, outcome: str, events: Sequence[DriveEvent]) -> list[str]:
     """Return what differs from what was expected; `outcome` may be `driving`, `events` are those since the goal."""
     entered = [event.description for event in events if event.description.startswith("robot: ")]
     modes = {description.split()[1] for description in entered}

@@ -25,10 +25,15 @@ class FaultyNodeSim:
         self.node = healthy.node
         self._healthy = healthy
         self._fault: Fault = fault
+        self._shown: AreaState | None = None
 
     def configure(self, config: NodeConfig) -> bool:
         """Apply a configuration."""
         return self._healthy.configure(config)
+
+    def on_connected(self) -> None:
+        """Publish as after a change."""
+        self._healthy.on_connected()
 
     def command(self, text: str) -> str | None:
         """Begin what a command asks for; return None, or why not."""
@@ -40,15 +45,30 @@ class FaultyNodeSim:
 
     def poll(self, world: World, now: float) -> list[NodeReading]:
         """Run the node up to `now` (s); return what it reports."""
+        if (state := self._state(now)) != self._shown:
+            self._shown = state
+            self._healthy.on_connected()  # a change of what it reports goes out as one of what it measures would
         return [self._report(reading, now) for reading in self._healthy.poll(world, now)]
+
+    def _state(self, now: float) -> AreaState:
+        match self._fault:
+            case "stuck":
+                return "unknown"
+            case "flapping":
+                return "blocked" if int(now / FLAP_S) % 2 == 0 else "clear"
+            case "lies-blocked":
+                return "blocked"
+            case "lies-clear":
+                return "clear"
 
     def _report(self, reading: NodeReading, now: float) -> NodeReading:
         sonars = self.node.sonars
+        state = self._state(now)
         if self._fault == "stuck":
             none: list[float | None] = [None] * len(sonars)
-            return msgspec.structs.replace(reading, range_m=none, status=["stuck"] * len(sonars), state="unknown")
-        blocked = int(now / FLAP_S) % 2 == 0 if self._fault == "flapping" else self._fault == "lies-blocked"
+            return msgspec.structs.replace(reading, range_m=none, status=["stuck"] * len(sonars), state=state)
         # The wall across the corridor is a little farther away than the limit.
-        ranges: list[float | None] = [_NEAR_M if blocked else sonar.range_limit + _MARGIN_M for sonar in sonars]
-        state: AreaState = "blocked" if blocked else "clear"
+        ranges: list[float | None] = [
+            _NEAR_M if state == "blocked" else sonar.range_limit + _MARGIN_M for sonar in sonars
+        ]
         return msgspec.structs.replace(reading, range_m=ranges, status=["ok"] * len(sonars), state=state)

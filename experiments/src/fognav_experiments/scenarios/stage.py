@@ -25,6 +25,7 @@ from fognav_experiments.scenarios.description import (
     SlowLink,
     deviations,
 )
+from fognav_experiments.scenarios.fleet_stage import FleetResult, play_fleet
 from fognav_experiments.scenarios.node_faults import FaultyNodeSim
 from fognav_sim.drive.evaluation import DriveOutcome
 
@@ -47,7 +48,7 @@ class Played(NamedTuple):
     """A scenario that was played: its result, how it ended, and what differs from what was expected."""
 
     scenario: Scenario
-    result: LockstepResult
+    result: LockstepResult | FleetResult
     outcome: str
     deviations: list[str]
 
@@ -63,6 +64,21 @@ def read_scenario(file: Path) -> Scenario:
 def play(scenario: Scenario, sites: Path) -> Played:
     """Drive a scenario on its site, one of the folder `sites`."""
     site = _site(sites / scenario.site)
+    played = _play_others(scenario, site) if scenario.others else _play_alone(scenario, site)
+    release_drives()
+    return played
+
+
+def _play_others(scenario: Scenario, site: LoadedSite) -> Played:
+    result, outcome = play_fleet(scenario, site)
+    found = deviations(scenario.expected, result, outcome, ())
+    most = scenario.expected.plans
+    if most is not None and result.plans > most:
+        found.append(f"{result.plans} paths, more than {most}")
+    return Played(scenario, result, outcome, found)
+
+
+def _play_alone(scenario: Scenario, site: LoadedSite) -> Played:
     x, y, theta = scenario.start
     goal = RobotGoal(goal_id="scenario", pose=Pose(x=scenario.goal[0], y=scenario.goal[1], theta=0.0))
     run = LockstepDrive(
@@ -90,8 +106,6 @@ def play(scenario: Scenario, sites: Path) -> Played:
     ended = outcome or DriveOutcome("stopped", f"ended after {scenario.seconds:.0f} s")
     result = run.result(drive, ended)
     name = "driving" if outcome is None else outcome.kind
-    del drive, run, stage
-    release_drives()
     return Played(scenario, result, name, deviations(scenario.expected, result, name, result.events[before:]))
 
 
@@ -117,12 +131,23 @@ def markdown_page(drives: Mapping[str, Played], measured_on: Mapping[str, object
     rows = [
         f"| [{name}](../../experiments/scenarios/{name}.toml) | {played.scenario.title} | {played.outcome} | "
         f"{played.result.distance_m:.1f} | {played.result.time_s or played.scenario.seconds:.0f} | "
-        f"{'; '.join(played.deviations) or 'yes'} |"
+        f"{'; '.join(played.deviations) or 'yes'}{_of_fleet(played)} |"
         for name, played in drives.items()
     ]
     header = ["| scenario | what happens | outcome | m | s | as expected |", "| --- | --- | --- | --- | --- | --- |"]
     facts = ", ".join(f"{name} {value}" for name, value in measured_on.items())
     return "\n".join([_PAGE.format(count=len(drives), facts=facts), *header, *rows]) + "\n"
+
+
+def _of_fleet(played: Played) -> str:
+    """Return in words what several robots did to one another and to the planner."""
+    result = played.result
+    if not isinstance(result, FleetResult):
+        return ""
+    return (
+        f"; {result.arrived} of {1 + len(played.scenario.others)} arrived, nearest {result.gap_m:.2f} m, "
+        f"{result.plans} paths, planner {result.planner_percent:.1f} % of a core"
+    )
 
 
 class _Stage:
@@ -195,6 +220,8 @@ class _Stage:
     def _restore_node(self, name: Id, before: list[SensorNode]) -> None:
         fog = self._run.system.fog
         fog.nodes = [*(node for node in fog.nodes if node.node.id != name), *before]
+        for node in before:
+            node.on_connected()
 
     def _start_again(self, process: FogProcessName) -> None:
         self._run.system.fog.start_again(process, moment(self._run.now))

@@ -10,12 +10,13 @@ from typing import TYPE_CHECKING, Final, Literal, NamedTuple
 
 import msgspec
 
-from fog_contracts.messages import ProfileName  # read at run time, when a file is decoded
+from fognav_experiments.comparison.driven import DrivenRoute
 from fognav_experiments.comparison.statistics import Estimate, estimate
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Sequence
 
+    from fog_contracts.messages import ProfileName
     from fog_contracts.site import Site
     from fognav_experiments.comparison.draws import RouteDraw
 
@@ -74,24 +75,13 @@ class Plane(NamedTuple):
         return [self.at(x, y) for y in self.y.values for x in self.x.values]
 
 
-class SweptDrive(msgspec.Struct, frozen=True, kw_only=True):
-    """One drive of a sweep: lengths in m, times in s of the simulated clock.
+class SweptDrive(DrivenRoute, frozen=True, kw_only=True):
+    """One drive of a sweep in lockstep.
 
-    version, sources: of the program on the machine that drove it, the latter as a digest; `commit`: its revision.
+    `sources`: digest of the program on the machine that drove it.
     """
 
     variation: Variation
-    setup: ProfileName
-    run: int
-    route: str
-    seed: int
-    area: str
-    success: bool
-    outcome: str
-    distance_m: float
-    time_s: float | None
-    commit: str = ""
-    version: str = ""
     sources: str = ""
 
     @property

@@ -24,10 +24,14 @@ const char* describe(CalibrationResult result) {
     return "";
 }
 
-void Calibration::update(const Sample& sample, uint32_t pulse_us) {
+void Calibration::update(const Sample& sample, const Sample& counts, uint32_t pulse_us) {
     if (result() != CalibrationResult::running) return;
     if (sample.status == Status::stuck) {
         ++stuck_;
+        return;
+    }
+    if (learned() == CalibrationResult::done) {
+        count(counts);
         return;
     }
     if (sample.status == Status::no_echo) {
@@ -40,8 +44,21 @@ void Calibration::update(const Sample& sample, uint32_t pulse_us) {
     echoes_seen_[at] = value;
 }
 
+void Calibration::count(const Sample& counts) {
+    if (counts.status == Status::stuck) return;  // held by the filter: it says nothing of free space
+    ++free_.samples;
+    if (counts.status == Status::no_echo) ++free_.no_echoes;
+    if (counts.status == Status::ok && counts.range_mm < limit_mm()) ++free_.false_echoes;
+}
+
 CalibrationResult Calibration::result() const {
-    if (stuck_ >= kCalibrationSamples / 4) return CalibrationResult::stuck;
+    if (stuck_ >= (kCalibrationSamples + free_.samples) / 4) return CalibrationResult::stuck;
+    const CalibrationResult found = learned();
+    const bool counts = goal_ == CalibrationGoal::free_distance && found == CalibrationResult::done;
+    return counts && free_.samples < kFreeSamples ? CalibrationResult::running : found;
+}
+
+CalibrationResult Calibration::learned() const {
     if (echoes_ + silent_ < kCalibrationSamples) return CalibrationResult::running;
     if (goal_ == CalibrationGoal::free_distance) return free_distance();
     const bool alike = silent() || (heard() && spread() <= kMaxPulseSpreadUs);
@@ -61,6 +78,10 @@ void Calibration::apply(SonarLimit& limit) const {
     }
     limit.limit_mm = limit_mm();
     limit.no_echo_is_clear = silent();
+}
+
+FreeSamples Calibration::free_samples() const {
+    return result() == CalibrationResult::done ? free_ : FreeSamples();
 }
 
 int32_t Calibration::quartile(int which) const { return echoes_seen_[(echoes_ - 1) * which / 4]; }

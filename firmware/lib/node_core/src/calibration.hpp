@@ -7,7 +7,8 @@
 
 namespace fognav {
 
-constexpr int kCalibrationSamples = 64;
+constexpr int kCalibrationSamples = 64;  // from these the limit is learned
+constexpr int kFreeSamples = 256;        // and in these, after them, false echoes are counted
 constexpr int32_t kMarginMm = 200;       // the limit is at least so much nearer than the free distance
 constexpr int32_t kMinLimitMm = 300;     // nearer, a free distance guards nothing
 constexpr int32_t kMaxSpreadMm = 150;    // between the quartiles; more means that something moved
@@ -20,20 +21,34 @@ enum class CalibrationResult : uint8_t { running, done, stuck, unsteady, too_nea
 // In words, with the remedy.
 const char* describe(CalibrationResult result);
 
+// What free space was like to a sensor that learned its limit: of so many samples, as the spike filter lets them through,
+// how many were echoes from nearer than that limit, and how many had none. All zero if it learned no limit.
+struct FreeSamples {
+    uint16_t samples = 0;
+    uint16_t false_echoes = 0;
+    uint16_t no_echoes = 0;
+};
+
 class Calibration {
 public:
     explicit Calibration(CalibrationGoal goal = CalibrationGoal::free_distance) : goal_(goal) {}
 
-    // Take a sample as measured, not filtered, and the width of its pulse. No more are taken once it has ended.
-    void update(const Sample& sample, uint32_t pulse_us);
+    // Take a sample as measured, what counts by the spike filter since then, and the width of the pulse. The limit comes
+    // from what was measured, the share of false echoes from what counts, as in readings. No more are taken once it has
+    // ended.
+    void update(const Sample& sample, const Sample& counts, uint32_t pulse_us);
 
     CalibrationResult result() const;
 
     // Put what was learned into the sensor's limit, and leave the rest of it alone; the result must be `done`.
     void apply(SonarLimit& limit) const;
 
+    FreeSamples free_samples() const;
+
 private:
+    CalibrationResult learned() const;
     CalibrationResult free_distance() const;
+    void count(const Sample& counts);
 
     // Where free space is silent, the limit is the range of the module, or lies before the nearest of the rare echoes.
     int32_t limit_mm() const;
@@ -47,6 +62,7 @@ private:
     uint8_t echoes_ = 0;
     uint8_t silent_ = 0;
     uint8_t stuck_ = 0;
+    FreeSamples free_;
 };
 
 }  // namespace fognav

@@ -110,6 +110,18 @@ size_t write_calibration(const CalibrationReport& report, char* buffer, size_t s
     json.begin_array();
     for (int i = 0; i < config.sonars; ++i) json.value(static_cast<uint64_t>(config.limits[i].no_echo_us));
     json.end_array();
+    json.key(FOGNAV_NODE_CALIBRATION_SAMPLES_FIELD);
+    json.begin_array();
+    for (int i = 0; i < config.sonars; ++i) json.value(static_cast<uint64_t>(report.free[i].samples));
+    json.end_array();
+    json.key(FOGNAV_NODE_CALIBRATION_FALSE_ECHOES_FIELD);
+    json.begin_array();
+    for (int i = 0; i < config.sonars; ++i) json.value(static_cast<uint64_t>(report.free[i].false_echoes));
+    json.end_array();
+    json.key(FOGNAV_NODE_CALIBRATION_NO_ECHOES_FIELD);
+    json.begin_array();
+    for (int i = 0; i < config.sonars; ++i) json.value(static_cast<uint64_t>(report.free[i].no_echoes));
+    json.end_array();
     json.end_object();
     return json.finish();
 }

@@ -33,6 +33,7 @@ struct NodeConfig {
 struct CalibrationReport {
     uint32_t boot = 0;
     CalibrationResult results[kMaxSonars] = {};
+    FreeSamples free[kMaxSonars] = {};
     NodeConfig config;
 };
 

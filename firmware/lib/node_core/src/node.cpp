@@ -43,8 +43,8 @@ Node::Event Node::step(uint32_t now_us) {
 
 void Node::take(const Sample& sample) {
     const int sonar = cycle_.current();
-    if (calibrating_) calibrations_[sonar].update(sample, sonars_[sonar].pulse_us());
     const Sample counts = filters_[sonar].update(sample);
+    if (calibrating_) calibrations_[sonar].update(sample, counts, sonars_[sonar].pulse_us());
     reading_.samples[sonar] = counts;
     states_[sonar] = classify(counts, config_.limits[sonar], states_[sonar]);
     cycle_.measured();
@@ -56,7 +56,7 @@ Node::Event Node::finish() {
     if (calibrating_ && calibration_ended()) return report_calibration();
     reading_.uptime_ms = uptime_us_ / 1000;
     reading_.state = calibrating_ ? State::unknown : fuse(states_, reading_.sonars);
-    if (!publish_.update(reading_.state, reading_.uptime_ms)) return Event::none;
+    if (!publish_.update(reading_, states_)) return Event::none;
     length_ = write_reading(reading_, message_, sizeof message_);
     ++reading_.seq;
     return Event::publish;
@@ -133,6 +133,7 @@ Node::Event Node::report_calibration() {
     calibrated_ = true;
     for (int i = 0; i < config_.sonars; ++i) {
         report.results[i] = calibrations_[i].result();
+        report.free[i] = calibrations_[i].free_samples();
         if (report.results[i] == CalibrationResult::done) calibrations_[i].apply(config_.limits[i]);
     }
     apply_limits();

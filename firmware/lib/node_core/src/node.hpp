@@ -12,7 +12,7 @@
 
 namespace fognav {
 
-// A reading of eight sonars with the longest name of a firmware has 380 characters, a calibration 430.
+// A reading of eight sonars with the longest name of a firmware has 380 characters, a calibration 450.
 constexpr size_t kMessageSize = 512;
 
 struct NodeSettings {

@@ -179,7 +179,7 @@ NODE_AVAILABILITY = _text( "node_availability", V1 + "nodes/{node}/availability"
     values=(ONLINE, OFFLINE), about="whether a node is connected; `offline` is its last will")
 NODE_READING      = _mqtt( "node_reading",      V1 + "nodes/{node}/reading",          m.NodeReading,    limit=KIB,
     publishers=(NODE,),          subscribers=(AGGREGATOR, CONSOLE), durability=VOLATILE, qos=0, rate_hz=10,
-    max_age_s=m.UnknownPolicy().silent_after_s)
+    idle_hz=1, max_age_s=m.UnknownPolicy().silent_after_s)
 NODE_VALUE        = _mqtt( "node_value",        V1 + "nodes/{node}/value",            m.NodeValue,      limit=KIB,
     publishers=(NODE,),          subscribers=(AGGREGATOR,),       durability=VOLATILE, qos=0)
 NODE_CONFIG       = _mqtt( "node_config",       V1 + "nodes/{node}/config",           m.NodeConfig,     limit=KIB,
@@ -194,7 +194,7 @@ NODE_UPDATE       = _mqtt( "node_update",       V1 + "nodes/{node}/update",     
 NODE_PROBLEM      = _text( "node_problem",      V1 + "nodes/{node}/problem",                            limit=256,
     publishers=(NODE,),          subscribers=(CONSOLE,),          durability=LATEST,   qos=1,
     about="why a node refused its latest configuration, command or update, in words; empty: nothing refused")
-AREA_HAZARD       = _mqtt( "area_hazard",       V1 + "areas/{area}/hazard",           m.AreaHazard,     limit=8 * KIB,
+AREA_HAZARD       = _mqtt( "area_hazard",       V1 + "areas/{area}/hazard",           m.AreaHazard,     limit=16 * KIB,
     publishers=(AGGREGATOR,),    subscribers=(AGGREGATOR, MAP, "home-assistant"), durability=LATEST, qos=1,
     epoch="epoch")
 AREA_DEFINITION   = _mqtt( "area_definition",   V1 + "areas/{area}/definition",       m.AreaDefinition, limit=32 * KIB,
@@ -202,7 +202,7 @@ AREA_DEFINITION   = _mqtt( "area_definition",   V1 + "areas/{area}/definition", 
 AGGREGATOR_HEARTBEAT = _mqtt("aggregator_heartbeat", V1 + "aggregator/heartbeat", m.AggregatorHeartbeat,
     limit=64 * KIB,
     publishers=(AGGREGATOR,),    subscribers=(AGGREGATOR, MAP),   durability=VOLATILE, qos=0, rate_hz=5,
-    max_age_s=1.5, epoch="epoch")
+    max_age_s=1.3, epoch="epoch")
 AGGREGATOR_AVAILABILITY = _text("aggregator_availability", V1 + "aggregator/availability",              limit=16,
     publishers=(AGGREGATOR,),    subscribers=(AGGREGATOR, "home-assistant"), durability=LATEST, qos=1,
     values=(ONLINE, OFFLINE), about="whether the aggregator is connected; `offline` is its last will")
@@ -261,7 +261,7 @@ LEADER            = _pub(  "leader",            FOG + "leaders/{role}", m.Leader
     publishers=(AGGREGATOR, MAP, PLANNER), subscribers=(AGGREGATOR, MAP, PLANNER), durability=VOLATILE, rate_hz=4,
     max_age_s=1.5)
 LIVE              = _live( "live",              FOG + "live/{role}/{id}", about="presence, no safety signal",
-    publishers=(AGGREGATOR, MAP, PLANNER, ROBOT), subscribers=(CONSOLE,))
+    publishers=(AGGREGATOR, MAP, PLANNER, ROBOT), subscribers=(MAP, PLANNER, CONSOLE))
 
 # The simulated world: zenoh, msgpack
 SIM_TRUTH         = _pub(  "sim_truth",         FOG + "sim/{robot}/truth",   m.SimTruth,   limit=256 * KIB,

@@ -26,6 +26,15 @@ STAGING_M: Final = 0.7
 """A robot looks for its dock from this far in front of its pose on the dock."""
 
 
+def learned_share(seen: int, samples: int) -> float:
+    """Return the share of what was seen in so many of some samples: the middle of its 95 % interval.
+
+    Two more of either kind make that (Agresti and Coull 1998): none of 256 is 0.8 %, not 0. So a rare share is rather
+    taken for too high than for too low, by which what was rare in a short time would count as impossible.
+    """
+    return (seen + 2) / (samples + 4)
+
+
 class Place(Message, frozen=True, kw_only=True):
     """A named pose; without `theta` any heading is accepted."""
 
@@ -40,17 +49,21 @@ class Sonar(Message, frozen=True, kw_only=True):
 
     An echo nearer than `range_limit` means `blocked`. `no_echo_is_clear` is true only where calibration recorded
     that nothing is in range; elsewhere the opposite wall normally echoes, and a missing echo means `unknown`.
+    `false_echo_rate`: the share of readings of the free area with an echo nearer than the limit, as its calibration
+    showed it.
     """
 
     angle: Radians = 0.0
     range_limit: Annotated[float, Meta(gt=0.02, le=4.0)]
     no_echo_is_clear: bool = False
+    false_echo_rate: Annotated[float, Meta(gt=0.0, lt=1.0)] | None = None
 
 
 class NodeSite(Message, frozen=True, kw_only=True):
     """A sensor node: position, direction (frame `map`), height above the floor, and the area that it watches.
 
-    With a `penalty` it makes the area costly instead of impassable.
+    With a `penalty` it makes the area costly instead of impassable. `every_reading`: its board publishes every
+    reading, as the thesis's; else ten after each change and then one a second. Simulated nodes do the same.
     """
 
     id: Id
@@ -61,14 +74,20 @@ class NodeSite(Message, frozen=True, kw_only=True):
     height: Annotated[float, Meta(gt=0.0, le=5.0)] = 0.3
     sonars: Annotated[list[Sonar], Meta(min_length=1, max_length=8)]
     penalty: Penalty | None = None
+    every_reading: bool = False
 
 
 class AreaSite(Message, frozen=True, kw_only=True):
-    """A watched area: polygon, debounce (the name `rule` and that rule's options), number on the thesis's topics."""
+    """A watched area: where it is, debounce (the name `rule` and that rule's options), number on the thesis's topics.
+
+    It is a polygon, or what the sonars of one of its nodes see: then `cone_of` names the node, the file has no polygon,
+    and loading the site fills it in.
+    """
 
     id: Id
     label: str = ""
-    polygon: Ring
+    polygon: Ring = field(default_factory=list)
+    cone_of: Id | None = None
     number: Annotated[int, Meta(ge=0, le=9999)] | None = None
     debounce: dict[str, Any] = field(default_factory=dict)
     fusion: FusionPolicy = FusionPolicy()
@@ -147,6 +166,7 @@ class Site(Message, frozen=True, kw_only=True):
                 id=area.id,
                 label=area.label,
                 polygon=area.polygon,
+                cone_of=area.cone_of,
                 nodes=[node.id for node in self.nodes if node.area == area.id],
                 sources=[source.source for source in self.sources if source.area == area.id],
                 number=area.number,

@@ -24,7 +24,7 @@ from fog_kernels import _arrays
 from fog_kernels.flood import descend, fill_field
 from fog_kernels.guides import TILE, TILE_BITS, GoalField
 from fog_kernels.lines import shortcut
-from fog_kernels.steps import DIAGONAL, FOUND, NOT_FOUND, OVERFLOW, QUEUE_FULL, STRAIGHT, TIMED_OUT, weights_of
+from fog_kernels.steps import DIAGONAL, FOUND, NOT_FOUND, OVERFLOW, QUEUE_FULL, SEALED, STRAIGHT, TIMED_OUT, weights_of
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -260,6 +260,8 @@ def _search(
                     remaining += rise
                 if use_detour:
                     bound = np.int64(detour[np.uint64(neighbour)])
+                    if bound == SEALED:
+                        continue
                     if bound > 0:
                         remaining = max(remaining, min(bound, detour_highest) + detour_offset)
             else:

@@ -2,8 +2,8 @@
 
 The map is kept as runs (the maximal sequences of traversable cells in a row), which are joined with those of the row
 below by union-find (Rosenfeld and Pfaltz 1966; runs as in He, Chao and Suzuki 2008). A diagonal step needs both
-orthogonal cells, so 4-connectivity decides what can be reached. An office of 2000 x 1200 cells takes about 1 ms
-and 0.3 MB; every question afterwards costs microseconds.
+orthogonal cells, so 4-connectivity decides what can be reached. An office of 2000 x 1200 cells takes about 1 ms and
+0.3 MB; every question afterwards costs microseconds.
 """
 
 # Kernels take arrays and scalars, typed by their compiled signatures.
@@ -23,8 +23,11 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
 
+_U8_OUT = types.Array(types.uint8, 1, "C")
+
+
 @njit(
-    int64(_arrays.U8_GRID, _arrays.I32_OUT, _arrays.I32_OUT, _arrays.I32_OUT, types.Array(types.uint8, 1, "C")),
+    int64(_arrays.U8_GRID, _arrays.I32_OUT, _arrays.I32_OUT, _arrays.I32_OUT, _U8_OUT),
     cache=True,
     nogil=True,
 )
@@ -59,6 +62,27 @@ def _find_runs(costmap: Any, offsets: Any, first: Any, last: Any, edges: Any) ->
                 inside = not inside
     offsets[height] = count
     return count
+
+
+@njit(
+    void(_arrays.I32_FLAT, _arrays.I32_FLAT, _arrays.I32_FLAT, int64, _arrays.I32_FLAT, _U8_OUT),
+    cache=True,
+    nogil=True,
+)
+def _flag_runs(offsets: Any, first: Any, last: Any, width: int, cells: Any, flags: Any) -> None:
+    for i in range(cells.size):
+        row = cells[i] // width
+        column = cells[i] - row * width
+        low, high = offsets[row], offsets[row + 1]
+        end = high
+        while low < high:
+            middle = (low + high) >> 1
+            if last[middle] < column:
+                low = middle + 1
+            else:
+                high = middle
+        if low < end and first[low] <= column:
+            flags[low] = 1
 
 
 @njit(void(_arrays.I32_FLAT, _arrays.I32_FLAT, _arrays.I32_FLAT, _arrays.I32_OUT), cache=True, nogil=True)
@@ -132,29 +156,59 @@ def _paint(offsets: Any, first: Any, last: Any, label: Any, left: int, bottom: i
                 row[x - left] = label[i]
 
 
+class Runs:
+    """The runs of one costmap, row by row from the lowest, numbered from 0."""
+
+    def __init__(self, costmap: NDArray[np.uint8]) -> None:
+        """Find the runs of a uint8 (h, w) costmap; raises TypeError or ValueError for another type or shape."""
+        costmap = _arrays.grid(costmap, "costmap")
+        self.height, self.width = costmap.shape
+        self.offsets = np.empty(self.height + 1, np.int32)
+        """The runs of row y are offsets[y]..offsets[y + 1] - 1."""
+        # np.empty only reserves memory: no page is used before a run is written to it.
+        most = self.height * ((self.width + 1) // 2)
+        first, last = np.empty(most, np.int32), np.empty(most, np.int32)
+        count = int(_find_runs(costmap, self.offsets, first, last, np.zeros(8 * (self.width // 8 + 1), np.uint8)))
+        self.first = first[:count].copy()
+        """Each run's first column."""
+        self.last = last[:count].copy()
+        """Each run's last column."""
+
+    def __len__(self) -> int:
+        return len(self.first)
+
+    def at(self, column: int, row: int) -> int:
+        """Return the run of a cell, which may lie outside the grid; -1 where it is not traversable."""
+        if not (0 <= column < self.width and 0 <= row < self.height):
+            return -1
+        begin, end = int(self.offsets[row]), int(self.offsets[row + 1])
+        index = begin + int(np.searchsorted(self.last[begin:end], column))
+        return index if index < end and self.first[index] <= column else -1
+
+    def with_cells(self, cells: NDArray[np.int32]) -> NDArray[np.uint8]:
+        """Return for each run whether it has one of the cells, given by their flat indexes: 1 or 0."""
+        flags = np.zeros(len(self), np.uint8)
+        _flag_runs(self.offsets, self.first, self.last, self.width, cells, flags)
+        return flags
+
+    def row(self, run: int) -> int:
+        """Return the row of a run."""
+        return int(np.searchsorted(self.offsets, run, side="right")) - 1
+
+
 class Components:
     """The components of one costmap; each is named by a number >= 0."""
 
     def __init__(self, costmap: NDArray[np.uint8]) -> None:
         """Find the components of a uint8 (h, w) costmap; raises TypeError or ValueError for another type or shape."""
-        costmap = _arrays.grid(costmap, "costmap")
-        self._height, self._width = costmap.shape
-        self._offsets = np.empty(self._height + 1, np.int32)
-        # np.empty only reserves memory: no page is used before a run is written to it.
-        most = self._height * ((self._width + 1) // 2)
-        first, last = np.empty(most, np.int32), np.empty(most, np.int32)
-        count = int(_find_runs(costmap, self._offsets, first, last, np.zeros(8 * (self._width // 8 + 1), np.uint8)))
-        self._first, self._last = first[:count].copy(), last[:count].copy()
-        self._label = np.empty(count, np.int32)
-        _join_runs(self._offsets, self._first, self._last, self._label)
+        self._runs = Runs(costmap)
+        self._label = np.empty(len(self._runs), np.int32)
+        _join_runs(self._runs.offsets, self._runs.first, self._runs.last, self._label)
 
     def of(self, column: int, row: int) -> int:
         """Return the component of a cell, which may lie outside the grid; -1 where it is not traversable."""
-        if not (0 <= column < self._width and 0 <= row < self._height):
-            return -1
-        begin, end = int(self._offsets[row]), int(self._offsets[row + 1])
-        index = begin + int(np.searchsorted(self._last[begin:end], column))
-        return int(self._label[index]) if index < end and self._first[index] <= column else -1
+        run = self._runs.at(column, row)
+        return int(self._label[run]) if run >= 0 else -1
 
     def connected(self, a: tuple[int, int], b: tuple[int, int]) -> bool:
         """Whether there is a path between two cells (column, row)."""
@@ -169,17 +223,18 @@ class Components:
         if not (0 <= component < len(self._label) and self._label[component] == component):
             raise ValueError(f"there is no component {component}")
         column, row = int(cell[0]), int(cell[1])
-        run = int(_nearest_run(self._offsets, self._first, self._last, self._label, component, column, row))
-        found = min(max(column, int(self._first[run])), int(self._last[run]))
-        return found, int(np.searchsorted(self._offsets, run, side="right")) - 1
+        runs = self._runs
+        run = int(_nearest_run(runs.offsets, runs.first, runs.last, self._label, component, column, row))
+        return min(max(column, int(runs.first[run])), int(runs.last[run])), runs.row(run)
 
     def labels(self, x: int, y: int, width: int, height: int) -> NDArray[np.int32]:
         """Return the components of a window's cells, int32 (height, width), -1 where a cell is not traversable.
 
         Raises ValueError for a window that leaves the grid.
         """
-        if min(x, y) < 0 or x + width > self._width or y + height > self._height:
-            raise ValueError(f"the window {x, y, width, height} leaves the {self._width} x {self._height} grid")
+        runs = self._runs
+        if min(x, y) < 0 or x + width > runs.width or y + height > runs.height:
+            raise ValueError(f"the window {x, y, width, height} leaves the {runs.width} x {runs.height} grid")
         out = np.empty((height, width), np.int32)
-        _paint(self._offsets, self._first, self._last, self._label, x, y, out)
+        _paint(runs.offsets, runs.first, runs.last, self._label, x, y, out)
         return out

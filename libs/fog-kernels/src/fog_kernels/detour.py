@@ -25,8 +25,9 @@ import numpy as np
 from numba import int64, njit, types
 
 from fog_kernels import _arrays
+from fog_kernels.dead_ends import NEAR_GATE
 from fog_kernels.guides import NO_PATH, TILE, TILE_BITS, Detour
-from fog_kernels.steps import DIAGONAL, STRAIGHT
+from fog_kernels.steps import DIAGONAL, SEALED, STRAIGHT
 
 if TYPE_CHECKING:
     from collections.abc import Iterable
@@ -34,6 +35,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from fog_kernels.astar import Planner
+    from fog_kernels.dead_ends import DeadEnds, SealedEnds
     from fog_kernels.guides import GoalField
 
 _SHADOW = 1 << 30
@@ -97,6 +99,9 @@ def _mark_shadow(
 ) -> tuple[int, int]:  # fmt: skip
     """Label the cells that have a cheapest path over `bound` through raised cells; return their number.
 
+    So are all cells beside them that are labelled `NEAR_GATE`: they are no way out, whatever their costs promise. Cells
+    that are labelled `SEALED` stay so.
+
     They are found from the raised cells, against the direction of the paths, in no special order; `found` receives
     them, `beside` the cells next to them, whose number is returned, too. Cells that a step on `costmap` joins get the
     same group, as `_root` tells it. `goal` is never labelled.
@@ -108,7 +113,7 @@ def _mark_shadow(
     n_groups: Any = np.int64(0)
     for i in range(raised.size):
         cell: Any = np.int64(raised[i])
-        if cell == goal:
+        if cell == goal or label[np.uint64(cell)] == SEALED:
             continue
         if label[np.uint64(cell)] < _SHADOW:
             label[np.uint64(cell)] = _SHADOW + n_groups
@@ -124,7 +129,7 @@ def _mark_shadow(
             if not (0 <= x + columns[k] < width and 0 <= y + rows[k] < height):
                 continue
             other = cell + steps[k]
-            if label[np.uint64(other)] < _SHADOW and other != goal:
+            if label[np.uint64(other)] < _SHADOW and label[np.uint64(other)] != SEALED and other != goal:
                 label[np.uint64(other)] = _SHADOW + n_groups
                 groups[np.uint64(n_groups)] = n_groups
                 n_groups += 1
@@ -148,7 +153,7 @@ def _mark_shadow(
                 continue
             other = cell + steps[k]
             known = np.int64(label[np.uint64(other)])
-            if known == own_label:
+            if known in (own_label, SEALED):
                 continue
             if known >= _SHADOW:
                 if not passable or weight[costmap[np.uint64(other)]] == 0:
@@ -160,11 +165,10 @@ def _mark_shadow(
             there = _cost_to_goal(lowest, tile_columns, slots, patterns, x + columns[k], y + rows[k])
             if there < 0 <= cost:
                 continue  # no step leads there
-            if there > cost >= 0:
+            if there > cost >= 0 or known == NEAR_GATE:
                 there_weight = np.int64(weight[bound[np.uint64(other)]])
-                if there == cost + lengths[k] * (own + there_weight) and _may_step(
-                    bound, weight, cell, columns[k], steps[k]
-                ):
+                follows = known == NEAR_GATE or there == cost + lengths[k] * (own + there_weight)
+                if follows and there_weight > 0 and _may_step(bound, weight, cell, columns[k], steps[k]):
                     if passable and _may_step(costmap, weight, cell, columns[k], steps[k]):
                         label[np.uint64(other)] = own_label
                     else:
@@ -174,7 +178,7 @@ def _mark_shadow(
                     found[np.uint64(count)] = other
                     count += 1
                     continue
-            if known != _CANDIDATE:
+            if known == 0:
                 label[np.uint64(other)] = _CANDIDATE
                 beside[np.uint64(n_beside)] = other
                 n_beside += 1
@@ -295,7 +299,7 @@ def _fill(
             other = cell + steps[k]
             reached = here + lengths[k] * (own + there)
             if reached >= label[np.uint64(other)]:
-                continue  # no better; or outside, where labels are 0
+                continue  # no better; or outside, where labels are not above 0
             slot = reached >> shift
             if slot >= heads.size:
                 return -1
@@ -326,9 +330,12 @@ class Shadow:
         field: GoalField,
         starts: Iterable[tuple[int, int]],
         planner: Planner,
+        dead_ends: DeadEnds | None = None,
+        goals: Iterable[tuple[int, int]] = (),
     ) -> None:
         """Find it on a uint8 (h, w) costmap; `field` is an exact one over the costmap `bound`.
 
+        The `dead_ends`, which were found on `bound`, are left out, but for those with a start or one of the `goals`.
         Takes some 15 ns for each of its cells, in the planner's memory. Raises ValueError for a field that is not
         exact.
         """
@@ -340,7 +347,13 @@ class Shadow:
         raised = np.flatnonzero((costmap > bound).ravel()).astype(np.int32)
         flat, width, weight = costmap.ravel(), planner.width, planner.weight
         goal = field.goal[1] * width + field.goal[0]
+        first = np.unique(np.array([row * width + column for column, row in starts], np.int32))
         self._label = np.zeros(costmap.size, np.int32)
+        self._sealed: SealedEnds | None = None
+        if dead_ends is not None:
+            last = np.array([row * width + column for column, row in (field.goal, *goals)], np.int32)
+            self._sealed = dead_ends.seal(costmap, raised, np.concatenate((first, last)))
+            self._sealed.paint(self._label)
         found, beside = planner.scratch
         groups = np.empty(min(costmap.size, _MOST_GROUPS * (len(raised) + 1)), np.int32)
         count, candidates = _mark_shadow(
@@ -348,7 +361,6 @@ class Shadow:
             field.lowest.shape[1], field.slots.ravel(), field.patterns.ravel(), raised, self._label, found, beside,
             groups,
         )  # fmt: skip
-        first = np.unique(np.array([row * width + column for column, row in starts], np.int32))
         border = np.empty(candidates, np.int32)
         leaving = int(
             _enclose(flat, width, weight, first, found[:count], beside[:candidates], self._label, groups, border)
@@ -380,4 +392,6 @@ class Shadow:
                 queue_cell, queue_next, heads, planner.bucket_shift,
             )
         )  # fmt: skip
-        return None if highest < 0 else Detour(label.reshape(self._costmap.shape), highest, self.border, levels)
+        if highest < 0:
+            return None
+        return Detour(label.reshape(self._costmap.shape), highest, self.border, levels, self._sealed)

@@ -16,6 +16,8 @@ from fog_kernels import _arrays
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
+    from fog_kernels.dead_ends import SealedEnds
+
 TILE_BITS: Final = 4
 """An exact field is made of tiles of 16 x 16 cells."""
 TILE: Final = 1 << TILE_BITS
@@ -115,7 +117,7 @@ class Detour:
     """A lower bound of the cost from a part of the floor, the same for all goals outside it but for an offset.
 
     `costs` is int32 (h, w), 0 outside the part; costs above `highest` count as that. It holds on the costmap that it
-    was computed on, and on any whose costs are higher.
+    was computed on, and on any whose costs are higher, as long as `holds` says so.
     """
 
     costs: NDArray[np.int32]
@@ -124,14 +126,23 @@ class Detour:
     """The flat indexes of the cells through which every path leaves the part."""
     levels: NDArray[np.int64]
     """What the bound begins with at each of them."""
+    sealed: SealedEnds | None = None
+    """The dead ends that are left out, where `costs` is `SEALED`."""
 
     def covers(self, cell: tuple[int, int]) -> bool:
-        """Whether the bound is the full one of a cell (column, row)."""
-        return bool(0 < self.costs[cell[1], cell[0]] < self.highest)
+        """Whether the bound is the full one of a cell (column, row), and holds for a search from there."""
+        return bool(0 < self.costs[cell[1], cell[0]] < self.highest) and not self._seals(cell)
 
     def outside(self, cell: tuple[int, int]) -> bool:
-        """Whether a cell (column, row) lies outside the part."""
-        return bool(self.costs[cell[1], cell[0]] == 0)
+        """Whether a cell (column, row) lies outside the part, so that the bound holds for a search to it."""
+        return bool(self.costs[cell[1], cell[0]] == 0) and not self._seals(cell)
+
+    def _seals(self, cell: tuple[int, int]) -> bool:
+        return self.sealed is not None and self.sealed.contains(cell)
+
+    def holds(self, costmap: NDArray[np.uint8]) -> bool:
+        """Whether it holds on a uint8 (h, w) costmap none of whose costs is lower than in its own."""
+        return self.sealed is None or self.sealed.hold(costmap)
 
     def offset(self, field: GoalField) -> int | None:
         """Return what is to be added for a goal outside the part; None where its field gives no border cell a cost."""

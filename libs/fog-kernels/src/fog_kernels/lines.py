@@ -1,4 +1,4 @@
-"""Costs along straight lines, and paths made of them: integrals of the weight, shortcuts, and how far lines part.
+"""Straight lines and paths made of them: integrals of the weight, shortcuts, how far lines part, nearest places.
 
 Costs are integrated along lines of sight cell by cell (Amanatides and Woo 1987).
 """
@@ -12,7 +12,7 @@ import math
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numba import boolean, float64, int64, njit
+from numba import boolean, float64, int64, njit, void
 
 from fog_contracts.costs import COST_WEIGHT, NEUTRAL_WEIGHT
 from fog_kernels import _arrays
@@ -210,6 +210,30 @@ def _leaves(line: Any, other: Any, reach: float, spacing: float) -> bool:
     return False
 
 
+@njit(void(_arrays.F64_GRID, _arrays.F64_FLAT, int64, int64, float64, float64, _arrays.F64_OUT), cache=True, nogil=True)
+def _nearest(points: Any, along: Any, first: int, last: int, x: float, y: float, found: Any) -> None:
+    """Find where along the segments `first` to `last` (exclusive) the nearest place is, and its squared distance."""
+    best = math.inf
+    where = 0.0
+    for i in range(first, last):
+        delta_x = points[i + 1, 0] - points[i, 0]
+        delta_y = points[i + 1, 1] - points[i, 1]
+        square = delta_x * delta_x + delta_y * delta_y
+        if not square > 0.0:
+            continue  # a step of no length is no part of the line
+        behind_x = x - points[i, 0]
+        behind_y = y - points[i, 1]
+        part = min(max((behind_x * delta_x + behind_y * delta_y) / square, 0.0), 1.0)
+        gap_x = behind_x - part * delta_x
+        gap_y = behind_y - part * delta_y
+        gap = gap_x * gap_x + gap_y * gap_y
+        if gap < best:
+            best = gap
+            where = along[i] + part * math.sqrt(square)
+    found[0] = where
+    found[1] = best
+
+
 def _cells_array(cells: NDArray[np.int32]) -> NDArray[np.int32]:
     _arrays.exact(cells, np.int32, 2, "cells")
     if cells.shape[0] == 0 or cells.shape[1] != 2:
@@ -288,3 +312,23 @@ def leaves(line: NDArray[np.float64], other: NDArray[np.float64], reach: float, 
         if len(points) == 0 or points.shape[1] != 2:
             raise ValueError(f"{name} must have shape (n, 2) with n >= 1, not {points.shape}")
     return bool(_leaves(line, other, reach, _arrays.positive(spacing, "spacing")))
+
+
+def nearest_on(
+    points: NDArray[np.float64], along: NDArray[np.float64], first: int, last: int, x: float, y: float
+) -> tuple[float, float]:
+    """Return how far along a polyline (m) its nearest place to (x, y) is, and its distance (m; inf: there is none).
+
+    points: float64 (n, 2), m. along: float64 (n,), m from the first point along the line. Only the segments from
+    `first` up to `last`, without it, are looked at; the first of several places counts. Raises TypeError or ValueError
+    for other types or shapes, or segments that the line does not have.
+    """
+    _arrays.exact(points, np.float64, 2, "points")
+    _arrays.exact(along, np.float64, 1, "along")
+    if points.shape != (along.size, 2):
+        raise ValueError(f"points must have shape ({along.size}, 2), one for each entry of along, not {points.shape}")
+    if not 0 <= first <= last <= max(along.size - 1, 0):
+        raise ValueError(f"segments {first} to {last} are not among the {along.size - 1} of the line")
+    found = np.empty(2)
+    _nearest(points, along, first, last, float(x), float(y), found)
+    return float(found[0]), math.sqrt(found[1])

@@ -27,6 +27,8 @@ TIMED_OUT: Final = 2
 OVERFLOW: Final = 3
 """A cost exceeds the type of the array of costs."""
 QUEUE_FULL: Final = 4
+SEALED: Final = -1
+"""In a bound of the way round: the cell lies in a dead end (`dead_ends`), and searches leave it out."""
 
 
 def _weights(neutral: int, factor: float) -> NDArray[np.int32]:

@@ -62,6 +62,7 @@ class SystemClock(MachineClock):
         super().__init__(speed)
         self._boot = boot_id() or str(random.SystemRandom().getrandbits(64))
         self._suspended = 0
+        self._id = self._made_id()
 
     @property
     def id(self) -> int:
@@ -70,6 +71,10 @@ class SystemClock(MachineClock):
         suspended = time.clock_gettime(time.CLOCK_BOOTTIME) - time.monotonic() if _COUNTS_SUSPENSION else 0.0
         if abs(suspended - self._suspended) > _SUSPENSION_S:
             self._suspended = round(suspended)
+            self._id = self._made_id()
+        return self._id
+
+    def _made_id(self) -> int:
         return zlib.crc32(f"{self._boot} {self._suspended} {self.speed}".encode())
 
     async def sleep(self, seconds: float) -> None:

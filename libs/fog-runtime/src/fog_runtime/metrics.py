@@ -79,6 +79,28 @@ def count_bytes(channel: str, direction: Literal["sent", "received"], size: int)
     BYTES.labels(channel, direction).inc(size)
 
 
+class Traffic:
+    """The messages and bytes of one channel in one direction, counted by one call: `labels` costs as much as `inc`."""
+
+    def __init__(self, channel: str, direction: Literal["sent", "received"]) -> None:
+        """Export both counters of the channel from now on."""
+        self._bytes = BYTES.labels(channel, direction)
+        self._messages = (PUBLISHED if direction == "sent" else RECEIVED).labels(channel)
+
+    def count(self, size: int) -> None:
+        """Count a message of `size` bytes that was sent."""
+        self._messages.inc()
+        self._bytes.inc(size)
+
+    def count_size(self, size: int) -> None:
+        """Count the bytes of a message that came, whatever it turns out to be."""
+        self._bytes.inc(size)
+
+    def count_message(self) -> None:
+        """Count a message that came, once it was decoded."""
+        self._messages.inc()
+
+
 def watch_disk(folder: Path) -> None:
     """Export size and free space of the disk that holds the folder, as they are when Prometheus asks."""
     DISK_FREE.labels(str(folder)).set_function(lambda: _disk(folder)[1])

@@ -46,6 +46,8 @@ CONTROL_AFTER_S: Final = 0.02
 """Decisions begin this long after a tick of the stream: at the same moment, their thread and the loop's would take the
 interpreter from one another some hundred times a second. They end before the next tick, which sends their speeds."""
 PUBLISH_S: Final = 0.1
+POLLED: Final = (ch.MAP_HEARTBEAT, ch.ROBOT_RELEASE)
+"""What comes steadily is read with the stream, which uses it: ages of a second and more are not judged by 0.1 s."""
 HOUSEKEEPING_S: Final = 1.0
 EGRESS_TIMEOUT_S: Final = 3.0
 """Timeout of a query for the way out of a blocked area."""
@@ -195,6 +197,7 @@ class Service:
                 _log.warning("computer_was_suspended", seconds=round(seconds, 1))
                 self._core.on_suspension(seconds)
             guardian.receive()
+            self._zenoh.poll()
             scans = lidar.poll(now, on=self._core.lidar_on)
             guardian.send(self._core.stream(now, self._clock.stamp()))
             # After the command, which localization must not delay.
@@ -229,7 +232,7 @@ class Service:
 
     def subscribe(self) -> None:
         """Register subscriptions and queries."""
-        self._edges.subscribe(self._core.handlers(), self._publish, only={"robot": self._robot})
+        self._edges.subscribe(self._core.handlers(), self._publish, only={"robot": self._robot}, polled=POLLED)
         self._edges.serve(self._core.query_handlers(), only={"robot": self._robot}, on_reply=self._log_command)
 
     def _log_command(self, _channel: ch.Channel, request: Message | None, reply: Message) -> None:

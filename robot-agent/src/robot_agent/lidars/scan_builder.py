@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING, Final, NamedTuple
 
 import numpy as np
 
+from fog_kernels.lidar import Batch, batch
 from robot_agent.hardware import LaserScan, LidarSamples, RepeatCounter
 
 if TYPE_CHECKING:
@@ -42,7 +43,7 @@ class ScanBuilder:
         self._pieces: list[Samples] = []
         self._times: list[NDArray[np.float64]] = []
         self._count = 0
-        self._newest: list[tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]] = []
+        self._newest: list[Batch] = []
         self._started = False
         self._last_arrival: float | None = None
         self._repeats = RepeatCounter()
@@ -54,8 +55,9 @@ class ScanBuilder:
         `boundaries` are the indices, in order, of the samples with which a new scan begins.
         """
         count = len(samples.ranges_m)
-        times = self._arrival_times(count, now)
-        self._newest.append((samples.clockwise_rad, samples.ranges_m, times))
+        newest = batch(samples.clockwise_rad, samples.ranges_m, self._arrived_before(now), now)
+        times = newest.times
+        self._newest.append(newest)
         scans: list[LaserScan] = []
         begin = 0
         for boundary in boundaries:
@@ -69,15 +71,15 @@ class ScanBuilder:
     def take_samples(self) -> LidarSamples | None:
         """Return all samples since the last call, be their scan whole or not; None without any."""
         newest, self._newest = self._newest, []
-        if not any(len(times) for _, _, times in newest):
+        if not any(part.times.size for part in newest):
             return None
         if len(newest) == 1:
-            clockwise, ranges, times = newest[0]
+            times, angles, ranges = newest[0]
         else:
-            clockwise, ranges, times = (np.concatenate(fields) for fields in zip(*newest, strict=True))
+            times, angles, ranges = (np.concatenate(fields) for fields in zip(*newest, strict=True))
         return LidarSamples(
-            angles_rad=_counter_clockwise(clockwise).astype(np.float32),
-            ranges_m=ranges.astype(np.float32),
+            angles_rad=angles,
+            ranges_m=ranges,
             started_at=float(times[0]),
             ended_at=float(times[-1]),
         )
@@ -89,12 +91,10 @@ class ScanBuilder:
         self._started = False
         self._last_arrival = None
 
-    def _arrival_times(self, count: int, now: float) -> NDArray[np.float64]:
-        before = self._last_arrival
-        self._last_arrival = now
-        if before is None or not 0.0 <= now - before <= _ARRIVAL_GAP_S:
-            return np.full(count, now)
-        return before + (now - before) * np.arange(1, count + 1) / max(count, 1)
+    def _arrived_before(self, now: float) -> float:
+        """Return when the batch before this one arrived; after a gap all of this one count as arrived `now`."""
+        before, self._last_arrival = self._last_arrival, now
+        return before if before is not None and 0.0 <= now - before <= _ARRIVAL_GAP_S else now
 
     def _append(self, samples: Samples, times: NDArray[np.float64], begin: int, end: int) -> None:
         if not self._started or begin == end:

@@ -13,8 +13,7 @@ import numpy as np
 
 from fog_contracts.costs import FREE, LETHAL
 from fog_kernels import amcl
-from fog_kernels.distance import squared_distance_capped
-from fog_kernels.likelihood import likelihood_field
+from fog_kernels.distance import likelihood_field, squared_distance_capped
 from fog_kernels.raycast import cast
 
 if TYPE_CHECKING:

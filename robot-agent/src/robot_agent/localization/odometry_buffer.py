@@ -24,12 +24,17 @@ class OdometryBuffer:
 
     def __init__(self) -> None:
         self._history: deque[tuple[float, float, float, float]] = deque()
+        self._twist: tuple[float, float] | None = None
+        """The twist by this history; None until somebody asks for it."""
+        self._asked: tuple[float, Pose2 | None] = (math.nan, None)
+        """The time that was asked for last, and the pose then: a tick of the agent asks for the same moment often."""
 
     def add(self, timestamp: float, x: float, y: float, theta: float) -> None:
         """Append a pose; one that is not newer than the last is ignored."""
         if self._history and timestamp <= self._history[-1][0]:
             return
         self._history.append((timestamp, x, y, theta))
+        self._twist, self._asked = None, (math.nan, None)
         while self._history[0][0] < timestamp - _HISTORY_S:
             self._history.popleft()
 
@@ -43,6 +48,11 @@ class OdometryBuffer:
 
     def pose(self, timestamp: float) -> Pose2 | None:
         """Return the pose at a time (s), interpolated; extrapolated by at most 0.15 s. None before the first."""
+        if timestamp != self._asked[0]:
+            self._asked = timestamp, self._pose(timestamp)
+        return self._asked[1]
+
+    def _pose(self, timestamp: float) -> Pose2 | None:
         if not self._history:
             return None
         last = self._history[-1]
@@ -90,6 +100,11 @@ class OdometryBuffer:
         Delayed readings arrive together with almost no time between them, so the interval must not begin within such a
         burst.
         """
+        if self._twist is None:
+            self._twist = self._measured_twist()
+        return self._twist
+
+    def _measured_twist(self) -> tuple[float, float]:
         if len(self._history) < 2:
             return 0.0, 0.0
         timestamp, x, y, theta = self._history[-1]

@@ -80,7 +80,11 @@ class ParticleFilter:
         self.jumped = False
         """Whether the last update moved the estimate to another place."""
         self.covariance: NDArray[np.float64] = np.zeros((3, 3))
-        """Over (x, y, theta) in `map` (m, rad), as of the last update."""
+        """Over (x, y, theta) in `map` (m, rad), as of the last update; replaced, and never changed in place."""
+        self._last_pose: tuple[Pose2, Pose2, Pose2, Pose2] | None = None
+        """The last result of `pose`, after what it was made of: odometry, estimate, anchor."""
+        self._last_uncertainty: tuple[NDArray[np.float64], Uncertainty] | None = None
+        """The last result of `uncertainty`, after the covariance that it is of."""
 
     @property
     def size(self) -> int:
@@ -95,11 +99,20 @@ class ParticleFilter:
     @property
     def uncertainty(self) -> Uncertainty:
         """Standard deviations of the pose as of the last update."""
-        return uncertainty(self.covariance)
+        last = self._last_uncertainty
+        if last is None or last[0] is not self.covariance:
+            last = self._last_uncertainty = (self.covariance, uncertainty(self.covariance))
+        return last[1]
 
     def pose(self, odom: Pose2) -> Pose2 | None:
         """Return the pose in `map` when the odometry says `odom`; None without an estimate."""
-        return None if self._estimate is None else self._estimate.compose(odom.relative_to(self._anchor))
+        estimate, anchor, last = self._estimate, self._anchor, self._last_pose
+        if estimate is None:
+            return None
+        # Asked for about the same moment several times in a row.
+        if last is None or last[0] is not odom or last[1] is not estimate or last[2] is not anchor:
+            last = self._last_pose = (odom, estimate, anchor, estimate.compose(odom.relative_to(anchor)))
+        return last[3]
 
     def start(self, pose: Pose2, odom: Pose2, sigma_xy: float, sigma_theta: float) -> None:
         """Start at a pose in `map` with these standard deviations (m, rad), which the next scan narrows."""

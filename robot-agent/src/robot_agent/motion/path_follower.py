@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Final
 import numpy as np
 
 from fog_contracts.costs import INSCRIBED, LETHAL, UNKNOWN
+from fog_kernels.lines import nearest_on
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -26,10 +27,9 @@ class PathFollower:
     """Progress of the robot along a path. It is searched near the last progress only, so a path may cross itself."""
 
     def __init__(self, points: NDArray[np.float64], released_length: float) -> None:
-        self.points = points
-        self._deltas = points[1:] - points[:-1]
-        self._squares = (self._deltas**2).sum(axis=1)
-        self.along = np.concatenate(([0.0], np.cumsum(np.sqrt(self._squares))))
+        self.points = np.ascontiguousarray(points, np.float64)
+        deltas = self.points[1:] - self.points[:-1]
+        self.along = np.concatenate(([0.0], np.cumsum(np.sqrt((deltas**2).sum(axis=1)))))
         """Metres from the path's start to each point."""
         self.released = 0.0
         self.release(released_length)
@@ -102,18 +102,9 @@ class PathFollower:
         if len(self.points) == 1:
             return 0.0, math.hypot(self.points[0, 0] - x, self.points[0, 1] - y)
         first = max(int(self.along.searchsorted(low)) - 1, 0)
-        last = min(int(self.along.searchsorted(high, "right")), len(self._deltas))
-        delta, square = self._deltas[first:last], self._squares[first:last]
-        behind = np.array((x, y)) - self.points[first:last]
-        with np.errstate(invalid="ignore"):  # a step of no length is nan: it is no part of the path
-            part = np.clip((behind * delta).sum(axis=1) / square, 0.0, 1.0)
-        gaps = behind - part[:, None] * delta
-        squares = (gaps * gaps).sum(axis=1)
-        if np.isnan(squares).all():
-            return self.progress, math.inf
-        best = int(np.nanargmin(squares))
-        progress = self.along[first + best] + part[best] * math.sqrt(square[best])
-        return float(progress), math.sqrt(squares[best])
+        last = min(int(self.along.searchsorted(high, "right")), len(self.points) - 1)
+        progress, distance = nearest_on(self.points, self.along, first, last, x, y)
+        return (self.progress if math.isinf(distance) else progress), distance
 
 
 def first_blocked(

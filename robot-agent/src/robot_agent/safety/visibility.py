@@ -39,9 +39,14 @@ def sector_of(angles: NDArray[np.float64]) -> NDArray[np.int64]:
     return sectors
 
 
-def sector_angles() -> NDArray[np.float64]:
-    """Return the middle (rad, in `base`) of each sector."""
-    return np.array([(sector + 0.5) * math.tau / SECTORS - math.pi for sector in range(SECTORS)])
+SECTOR_ANGLES: Final = np.array([(sector + 0.5) * math.tau / SECTORS - math.pi for sector in range(SECTORS)])
+"""The middle (rad, in `base`) of each sector."""
+SECTOR_ANGLES.setflags(write=False)
+
+
+def _running_counts(sectors: NDArray[np.bool_]) -> list[int]:
+    """Return how many of the first n sectors are True, for n from 0 to twice their number: the circle, twice around."""
+    return [0, *np.cumsum(np.concatenate((sectors, sectors))).tolist()]
 
 
 class Visibility:
@@ -49,9 +54,7 @@ class Visibility:
 
     def __init__(self, config: VisibilityConfig) -> None:
         self._config = config
-        self._blind = np.zeros(SECTORS, np.bool_)
-        self._missing = np.zeros(SECTORS, np.bool_)
-        self._expected = np.zeros(SECTORS, np.bool_)
+        self._blind = self._missing = self._expected = _running_counts(np.zeros(SECTORS, np.bool_))
         self._returned_before = np.ones(SECTORS, np.bool_)
         self._measured_before = np.ones(SECTORS, np.bool_)
         self._sight: _Sight = "clear"
@@ -66,9 +69,11 @@ class Visibility:
         measured = np.bincount(sectors, minlength=SECTORS)
         returns = np.bincount(sectors[returned], minlength=SECTORS)
         has_returns = (measured > 0) & (2 * returns >= measured)
-        self._blind = ~((measured > 0) | self._measured_before)
-        self._expected = expected & ~self._blind
-        self._missing = self._expected & ~(has_returns | self._returned_before)
+        seen = (measured > 0) | self._measured_before
+        expected = expected & seen
+        # The direction of travel is asked for at each command, many times for each scan.
+        self._blind, self._expected = _running_counts(~seen), _running_counts(expected)
+        self._missing = _running_counts(expected & ~(has_returns | self._returned_before))
         self._returned_before, self._measured_before = has_returns, measured > 0
 
     def limit(self, wheels: Wheels, twist: Twist) -> Limited:
@@ -94,12 +99,15 @@ class Visibility:
         return Limited(wheels)
 
     def _sight_towards(self, heading: float) -> _Sight:
-        offset = (sector_angles() - heading + math.pi) % math.tau - math.pi
-        ahead = np.abs(offset) <= self._config.half_width
-        blind = float(np.count_nonzero(self._blind & ahead) / np.count_nonzero(ahead))
-        expected = int(np.count_nonzero(self._expected & ahead))
-        missing = np.count_nonzero(self._missing & ahead) / expected if expected >= _EXPECTED_MIN else 0.0
         config = self._config
+        # Sectors whose middle is within `half_width` of the heading: those from `first` up to `end`, without it.
+        middle, half = (heading / math.tau + 0.5) * SECTORS - 0.5, config.half_width / math.tau * SECTORS
+        first = math.ceil(middle - half)
+        begin = first % SECTORS
+        end = begin + math.floor(middle + half) + 1 - first
+        blind = (self._blind[end] - self._blind[begin]) / (end - begin)
+        expected = self._expected[end] - self._expected[begin]
+        missing = (self._missing[end] - self._missing[begin]) / expected if expected >= _EXPECTED_MIN else 0.0
         # A limit that applies is lifted only well below the share at which it began.
         refuse = config.lift if self._sight == "blind" else 1.0
         slow = 1.0 if self._sight == "clear" else config.lift

@@ -7,6 +7,7 @@ import os
 from typing import Final
 
 from fog_contracts import channels as ch
+from fog_contracts.cones import node_cones
 from fog_contracts.handlers import Moment
 from fog_runtime import logs, process
 from fog_runtime.clock import SystemClock, boot_id
@@ -61,12 +62,13 @@ async def main() -> None:
     ):
         stored, loaded_from_store = await load_at_start(store)
         nodes = {node.id: node for node in loaded.site.nodes}
-        unusable = UnusableAreas(Members(nodes, find_rule, settings.debounce).check, health)
+        cones = node_cones(loaded.site.nodes, loaded.map)
+        unusable = UnusableAreas(Members(nodes, find_rule, settings.debounce, cones).checked, health)
         usable = unusable.made_usable(stored.definitions, stored.unreadable)
         definitions = {d.id: d for d in [*loaded.site.definitions(), *usable]}
         fusion = AreaFusion(
             definitions.values(), loaded.site.nodes, 0, stored.hazards,
-            registry=find_rule, default_rule=settings.debounce,
+            registry=find_rule, default_rule=settings.debounce, cones=cones,
         )  # fmt: skip
         mqtt = MqttEdgeWithInputs(
             settings.mqtt_url, process_id("hazard-aggregator"), clock, site=site, inputs=SENSORS, will=LAST_WILL,
@@ -92,7 +94,7 @@ async def main() -> None:
             zenoh.declare_liveliness("hazard-aggregator", site)
             app = make_api(service, loaded.map.geometry, clock, health, tokens, leadership.standby_reason)
             async with asyncio.TaskGroup() as tasks:
-                tasks.create_task(leadership.run(service), name="lease")
+                tasks.create_task(leadership.run(service, {"mqtt": mqtt.broker_answers}), name="lease")
                 tasks.create_task(mqtt.run(), name="mqtt")
                 tasks.create_task(service.tick_loop(), name="tick")
                 tasks.create_task(service.write_loop(), name="write")

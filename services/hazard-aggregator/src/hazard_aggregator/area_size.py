@@ -1,12 +1,15 @@
-"""Checks that an area's messages fit their channels before it is stored. Pure."""
+"""Checks that the messages about areas fit their channels before an area is stored. Pure."""
 
 from __future__ import annotations
 
-from typing import Final
+from typing import TYPE_CHECKING, Final
 
 from fog_contracts import channels as ch
 from fog_contracts.codec import ContractError, encode
-from fog_contracts.messages import SENTENCE_MAX, AreaDefinition, AreaHazard, HazardOverride, Trace
+from fog_contracts.messages import AREAS_MAX, SENTENCE_MAX, AreaDefinition, AreaHazard, HazardOverride, Trace
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable
 
 _LARGEST: Final = 2**53
 _LATEST: Final = 9_999_999_999.999999
@@ -21,6 +24,22 @@ class AreaError(ValueError):
         super().__init__(f"area {area}: {field}: {problem}")
         self.field = field
         self.problem = problem
+
+
+class TooManyAreasError(AreaError):
+    """There are as many areas as the aggregator's heartbeat, which lists all of them, can always hold."""
+
+
+def check_count(definition: AreaDefinition, known: Iterable[AreaDefinition]) -> None:
+    """Raise `TooManyAreasError` when an area would be one more than `AREAS_MAX` with the `known` ones."""
+    present = {other.id for other in known if not other.removed}
+    if definition.removed or definition.id in present or len(present) < AREAS_MAX:
+        return
+    problem = (
+        f"the site has {len(present)} areas, and {AREAS_MAX} is the limit: remove one first (PUT it with `removed`),"
+        " or make a part of the floor a site of its own"
+    )
+    raise TooManyAreasError(definition.id, "id", problem)
 
 
 def check_size(definition: AreaDefinition) -> None:

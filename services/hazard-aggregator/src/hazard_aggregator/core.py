@@ -20,9 +20,10 @@ from hazard_aggregator.own_messages import OwnMessages
 from hazard_aggregator.publications import definition_publication, deletions, hazard_publications, node_publication
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable, Mapping, Sequence
+    from collections.abc import Collection, Iterable, Mapping, Sequence
 
     from fog_contracts.channels import Channel
+    from fog_contracts.geometry import Point
     from fog_contracts.handlers import Handler, Ids, Moment, QueryHandler
     from fog_contracts.messages import AreaDefinition, AreaHazard, NodeReading, NodeValue, RobotPose
     from hazard_aggregator.areas.area_override import AreaOverride
@@ -91,9 +92,13 @@ class Aggregator:
         """Return the health of every node of every area."""
         return self._fusion.node_reports(now)
 
-    def check(self, definition: AreaDefinition) -> None:
-        """Raise `AreaError` when an area's debounce settings, sources or fusion are invalid."""
-        self._fusion.check(definition)
+    def checked(self, definition: AreaDefinition) -> AreaDefinition:
+        """Return an area as it counts, with the polygon of its node's cone if it is one; raises `AreaError`."""
+        return self._fusion.checked(definition)
+
+    def cone(self, area: str, node: str, nodes: Collection[str]) -> list[Point]:
+        """Return what the sonars of a node see as the polygon of an area with these nodes; raises `AreaError`."""
+        return self._fusion.cone(area, node, nodes)
 
     def pop_foreign(self) -> list[ForeignMessage]:
         """Return the messages of others on this aggregator's topics since the last call, for logs and metrics."""

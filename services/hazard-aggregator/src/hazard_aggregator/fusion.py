@@ -21,9 +21,10 @@ from hazard_aggregator.sensors.robot_poses import RobotPoses
 from hazard_aggregator.sources import Sources
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable
+    from collections.abc import Collection, Iterable, Mapping
     from typing import Final
 
+    from fog_contracts.geometry import Point
     from fog_contracts.messages import AreaDefinition, AreaHazard, AreaState, NodeReading, NodeValue, RobotPose
     from fog_contracts.site import NodeSite
     from hazard_aggregator.areas.area_override import AreaOverride
@@ -45,11 +46,11 @@ class AreaFusion:
 
     `restored` are the hazards that were stored last: a blocked area stays blocked until readings or silence change it.
     All others start as unknown, because only readings of this run can show that an area is clear. `registry` finds
-    debounce rules by name, `default_rule` is the one of areas that name none; raises `DebounceError` for an area whose
-    debounce settings are invalid.
+    debounce rules by name, `default_rule` is the one of areas that name none, `cones` are the outlines of what nodes
+    see (`Members`); raises `AreaError` for an invalid area.
     """
 
-    def __init__(
+    def __init__(  # noqa: PLR0913  # what is known at the start
         self,
         definitions: Iterable[AreaDefinition],
         nodes: Iterable[NodeSite],
@@ -58,10 +59,11 @@ class AreaFusion:
         *,
         registry: Registry,
         default_rule: str = DEFAULT_RULE,
+        cones: Mapping[str, list[Point]] | None = None,
     ) -> None:
         self.epoch = epoch
         self.nodes = {node.id: node for node in nodes}
-        self._members = Members(self.nodes, registry, default_rule)
+        self._members = Members(self.nodes, registry, default_rule, cones or {})
         self._sources = Sources()
         self._areas: dict[str, WatchedArea] = {}
         self._overrides: dict[str, AreaOverride] = {}
@@ -240,14 +242,18 @@ class AreaFusion:
         rejections, self._rejections = self._rejections, []
         return rejections
 
-    def check(self, definition: AreaDefinition) -> None:
-        """Raise `AreaError` when an area's debounce settings, sources or fusion are invalid."""
-        self._members.check(definition)
+    def checked(self, definition: AreaDefinition) -> AreaDefinition:
+        """Return an area as it counts, with the polygon of its node's cone if it is one; raises `AreaError`."""
+        return self._members.checked(definition)
+
+    def cone(self, area: str, node: str, nodes: Collection[str]) -> list[Point]:
+        """Return what the sonars of a node see as the polygon of an area with these nodes; raises `AreaError`."""
+        return self._members.cone(area, node, nodes)
 
     # --- Inside -----------------------------------------------------------------------------------------------------
 
     def _define(self, definition: AreaDefinition) -> None:
-        self.check(definition)
+        definition = self.checked(definition)
         old = self._areas.get(definition.id)
         if definition.removed:
             self._areas.pop(definition.id, None)

@@ -11,6 +11,7 @@ from hazard_aggregator.areas.area_history import period_of
 from hazard_aggregator.store import StoreError
 
 if TYPE_CHECKING:
+    from fog_contracts.handlers import Moment
     from fog_contracts.messages import AreaHazard
     from hazard_aggregator.areas.area_history import HistoryPage
     from hazard_aggregator.core import Aggregator
@@ -30,11 +31,11 @@ class HistoryKeeper:
         self._core = core
         self._store = store
         self._leading = leading
-        self._queue: deque[tuple[AreaHazard, float]] = deque(maxlen=_QUEUE)
+        self._queue: deque[tuple[AreaHazard, Moment | None]] = deque(maxlen=_QUEUE)
         self._newest: dict[str, tuple[int, int]] = {}
 
-    def add(self, hazard: AreaHazard, stamp: float) -> None:
-        """Queue a hazard that is published at `stamp` (s since the epoch), unless it was queued before.
+    def add(self, hazard: AreaHazard, at: Moment) -> None:
+        """Queue a hazard that is published at this moment, unless it was queued before.
 
         The first of an epoch begins its period when its state began: the earlier run may have been killed before it
         wrote that.
@@ -42,11 +43,11 @@ class HistoryKeeper:
         epoch, seq = self._newest.get(hazard.area, (0, 0))
         if (epoch, seq) != (hazard.epoch, hazard.seq):
             self._newest[hazard.area] = (hazard.epoch, hazard.seq)
-            self._queue.append((hazard, stamp if epoch == hazard.epoch else hazard.since))
+            self._queue.append((hazard, at if epoch == hazard.epoch else None))
 
-    async def page(self, area: str, cursor: str | None, limit: int, now: float) -> HistoryPage:
-        """Return a page of an area's history at `now` (s since the epoch); raises `CursorError` and `StoreError`."""
-        return await self._store.history(area, cursor=cursor, limit=limit, now=now)
+    async def page(self, area: str, cursor: str | None, limit: int, at: Moment) -> HistoryPage:
+        """Return a page of an area's history at this moment; raises `CursorError` and `StoreError`."""
+        return await self._store.history(area, cursor=cursor, limit=limit, at=at)
 
     async def run(self) -> None:
         """Write what is queued, while this process leads."""
@@ -65,8 +66,8 @@ class HistoryKeeper:
         What was decided under an earlier epoch, while another copy led, is that copy's to write.
         """
         while self._queue:
-            hazard, stamp = self._queue[0]
+            hazard, at = self._queue[0]
             if hazard.epoch == self._core.epoch:
-                await self._store.begin_period(hazard, period_of(hazard, stamp))
+                await self._store.begin_period(hazard, period_of(hazard, at))
             if self._queue and self._queue[0][0] is hazard:
                 self._queue.popleft()

@@ -66,7 +66,7 @@ class Publisher:
             if publication.channel is ch.AREA_DEFINITION and self._site:
                 self._edges.publish(discovery_publication(self._site, publication))
             if isinstance(hazard := publication.message, AreaHazard):
-                self._history.add(hazard, self._edges.now().stamp)
+                self._history.add(hazard, self._edges.now())
         WITHHELD.set(len(self._core.withheld()))
         UNSTORED.set(len(self._core.to_store()))
         if self._core.to_store():

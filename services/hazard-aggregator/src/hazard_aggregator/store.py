@@ -27,6 +27,7 @@ from hazard_aggregator.areas.area_override import AreaOverride, Rest
 if TYPE_CHECKING:
     from collections.abc import Iterable
 
+    from fog_contracts.handlers import Moment
     from fog_contracts.messages import Alert
     from fog_runtime.stores.idempotency import Attempt
     from hazard_aggregator.areas.alerts import AlertEvent
@@ -163,14 +164,14 @@ class Store(RedisStore):
         }
         await self._run(store_scripts.PERIOD, keys, _HISTORY, arguments, msgspec.json.encode(period))
 
-    async def history(self, area: str, *, cursor: str | None, limit: int, now: float) -> HistoryPage:
-        """Return a page of an area's history at `now` (s since the epoch); raises `CursorError` and `StoreError`."""
+    async def history(self, area: str, *, cursor: str | None, limit: int, at: Moment) -> HistoryPage:
+        """Return a page of an area's history at this moment; raises `CursorError` and `StoreError`."""
         if cursor is not None and _CURSOR.fullmatch(cursor) is None:
             raise CursorError(f"{cursor!r} is no cursor: take the address of the next page from the Link header")
         key = self._key(f"{_HISTORY}:{area}")
         reply = await self._redis.read("XREVRANGE", key, cursor or "+", "-", "COUNT", limit + 2)
         found = [(entry_id.decode(), fields) for entry_id, fields in reply]
-        return page_of([(name, _data(fields)) for name, fields in found], cursor=cursor, limit=limit, now=now)
+        return page_of([(name, _data(fields)) for name, fields in found], cursor=cursor, limit=limit, at=at)
 
     async def alerts(self) -> list[Alert]:
         """Return the stored alerts."""

@@ -77,7 +77,8 @@ async def main() -> None:
             app = make_api(service, loaded.site, clock, health, tokens, leadership.standby_reason)
             async with asyncio.TaskGroup() as tasks:
                 tasks.create_task(mqtt.run(), name="mqtt")
-                tasks.create_task(leadership.run(service), name="lease")
+                needs = {"mqtt": mqtt.broker_answers, "zenoh": zenoh.router_answers, "map": service.serves}
+                tasks.create_task(leadership.run(service, needs), name="lease")
                 tasks.create_task(service.store_loop(), name="store")
                 tasks.create_task(service.tick_loop(), name="tick")
                 tasks.create_task(service.publisher.commit_loop(), name="commit")

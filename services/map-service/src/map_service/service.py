@@ -136,6 +136,10 @@ class Service:
         self._leading = False
         self._store.epoch = 0
 
+    async def serves(self) -> bool:
+        """Return whether the map is complete; a copy whose map is not leaves the lease to one whose map is."""
+        return self.core.serving
+
     # --- The store --------------------------------------------------------------------------------------------------
 
     async def audit(self, kinds: Sequence[str], cursor: str | None, limit: int) -> AuditPage:

@@ -61,7 +61,8 @@ async def main() -> None:
         app = make_api(service, loaded.site, health, tokens, leadership.standby_reason)
         try:
             async with asyncio.TaskGroup() as tasks:
-                tasks.create_task(leadership.run(service), name="lease")
+                needs = {"zenoh": zenoh.router_answers, "planning": service.core_answers, "map": service.has_map}
+                tasks.create_task(leadership.run(service, needs), name="lease")
                 tasks.create_task(service.store_loop(), name="store")
                 tasks.create_task(service.operator.record_loop(), name="stops")
                 tasks.create_task(service.snapshot_loop(), name="snapshot")

@@ -27,6 +27,7 @@ from planner.reasons.refusals import goal_out_of_reach
 from planner.replanning.missions import Missions
 from planner.replanning.path_monitor import effect_of_change, reason_from_pose
 from planner.replanning.replanner import Replanner
+from planner.search.detours import DeadEndsJob
 from planner.search.goal_fields import FieldJob, GoalFields
 
 if TYPE_CHECKING:
@@ -49,7 +50,7 @@ if TYPE_CHECKING:
     from planner.maps.planning_map import CostChange, PlanningMap
     from planner.replanning.mission import Mission
 
-    Job = FieldJob | ExplainJob
+    Job = DeadEndsJob | FieldJob | ExplainJob
 
 
 class PlannerCore:
@@ -103,6 +104,7 @@ class PlannerCore:
         self._fields.set_bounds(planning_map.lower_bound, planning_map.standing)
         if any(change.any_decreased for change in changes):
             self.replanner.detours.clear()
+        self.replanner.detours.revise(planning_map.cost)
         for change in changes:
             for _, mission in self.missions.active():
                 self._apply_change(mission, change, planning_map)
@@ -244,7 +246,8 @@ class PlannerCore:
         if planning_map is None:
             return []
         self._fields.set_bounds(planning_map.lower_bound, planning_map.standing)
-        jobs: list[Job] = [*self._fields.jobs(self.missions.goal_cells(planning_map.geometry))]
+        goals = list(self.missions.goal_cells(planning_map.geometry))
+        jobs: list[Job] = [*self.replanner.jobs(len(goals)), *self._fields.jobs(goals)]
         if self._explaining is None and (explain := self._explain_job(at, planning_map)) is not None:
             self._explaining = explain
             jobs.append(explain)
@@ -252,6 +255,9 @@ class PlannerCore:
 
     def add(self, job: Job, now: float) -> bool:
         """Use the result of a job that has run; return whether it calls for an immediate `tick`."""
+        if isinstance(job, DeadEndsJob):
+            self.replanner.detours.add(job)
+            return False
         if isinstance(job, FieldJob):
             self._fields.add(job)
             if self._map.current is not None and self._fields.guide(job.goal) is not None:
@@ -263,17 +269,8 @@ class PlannerCore:
 
     def _explain_job(self, at: Moment, planning_map: PlanningMap) -> ExplainJob | None:
         """Return the job that explains the refusals whose reasons are unknown or may have changed."""
-        version, revision = planning_map.version, self._regions.revision
-        questions = {}
-        for robot, mission in self.missions.active():
-            plan = mission.plan
-            if plan is None or plan.question is None:
-                continue
-            known = plan.explained_for
-            new_regions = known is None or known[1] != revision
-            new_map = known is not None and known[0] != version
-            if new_regions or (new_map and at.now - plan.explained_at >= self.config.explain_period_s):
-                questions[robot] = plan, plan.question
+        known = planning_map.version, self._regions.revision
+        questions = self.missions.unexplained(known, at.now, self.config)
         view = self.view() if questions else None
         return None if view is None else ExplainJob(view, questions, self.answerer)
 

@@ -14,8 +14,8 @@ from types import MappingProxyType
 from typing import TYPE_CHECKING, Final
 
 from fog_contracts import channels as ch
-from fog_contracts.messages import PlanReply, RobotPath, RobotPose, RobotRelease, RobotState
-from fog_runtime import logs, metrics
+from fog_contracts.messages import PlanReply, RobotPath, RobotPose, RobotState
+from fog_runtime import logs
 from fog_runtime.clock import ticker
 from fog_runtime.transports.edges import Edges
 from fog_runtime.transports.zenoh_edge import ASKER
@@ -23,6 +23,7 @@ from planner.cycle import Cycle
 from planner.keepers.dock_keeper import DockKeeper
 from planner.keepers.map_keeper import MapKeeper
 from planner.keepers.mission_keeper import MissionKeeper
+from planner.keepers.path_record import PathRecord
 from planner.keepers.plan_metrics import PlanMetrics
 from planner.query_queue import BusyError, QueryQueue
 from planner.reasons.refusals import busy
@@ -44,9 +45,6 @@ if TYPE_CHECKING:
 
 TICK_S: Final = 0.1
 BUSY_PAUSE_S: Final = 0.25
-MOST_UNRECORDED: Final = 1000
-UNRECORDED_S: Final = 0.5
-"""After so many publications, or so long, they are recorded although searches are left."""
 
 _log = logs.get("planner")
 
@@ -88,11 +86,7 @@ class Service:
         self._metrics = PlanMetrics()
         self.poses: dict[str, RobotPose] = {}
         self.states: dict[str, RobotState] = {}
-        self._paths: dict[str, RobotPath] = {}
-        self._sent: list[Publication] = []
-        """What was published and is not recorded yet ..."""
-        self._unrecorded_since = 0.0
-        """... and when the first of it was."""
+        self._record = PathRecord()
 
     # --- For the API ------------------------------------------------------------------------------------------------
 
@@ -103,7 +97,7 @@ class Service:
 
     def path(self, robot: str) -> RobotPath | None:
         """Return the last published path or refusal for the robot's current goal, as last released."""
-        path, stored = self._paths.get(robot), self.goals.get(robot)
+        path, stored = self._record.paths.get(robot), self.goals.get(robot)
         return path if path and stored and path.goal_id == stored.goal.goal_id else None
 
     async def send(self, order: Order) -> StoredGoal | Refusal:
@@ -195,6 +189,15 @@ class Service:
         """Follow all inputs, without missions."""
         self.missions.stand_by()
 
+    async def core_answers(self) -> bool:
+        """Return True once the core's thread has ended what it does now; a thread that hangs never does."""
+        await self._threads.run("core", lambda: None)
+        return True
+
+    async def has_map(self) -> bool:
+        """Return whether a map was ever loaded; a copy without one leaves the lease to one that has it."""
+        return self._map.loaded
+
     # --- Loops ------------------------------------------------------------------------------------------------------
 
     async def store_loop(self) -> None:
@@ -222,8 +225,8 @@ class Service:
             result = await self._threads.run("core", lambda: self._cycle.run(self._edges.now, self._publish))
             if result.unfinished:
                 self._wake.set()
-            if not result.unfinished or self._must_record():
-                self._record()
+            if not result.unfinished or self._record.is_due(self._clock.now()):
+                self._record.take_over()
             for robot, goal_id in result.reached:
                 self.missions.end(robot, goal_id)
             for job in result.jobs:
@@ -262,43 +265,7 @@ class Service:
         """Publish on the calling thread."""
         for publication in publications:
             self._edges.publish(publication)
-        if publications and not self._sent:
-            self._unrecorded_since = self._clock.now()
-        self._sent += publications
-
-    def _must_record(self) -> bool:
-        """Whether what was published is recorded although searches are left: it is much, or a while ago."""
-        late = bool(self._sent) and self._clock.now() - self._unrecorded_since >= UNRECORDED_S
-        return late or len(self._sent) >= MOST_UNRECORDED
-
-    def _record(self) -> None:
-        """Record what was published since the last call, for logs, metrics and the API."""
-        sent, self._sent = self._sent, []
-        for publication in sent:
-            message = publication.message
-            if isinstance(message, RobotPath):
-                self._record_path(publication.ids["robot"], message)
-            elif isinstance(message, RobotRelease):
-                self._record_release(publication.ids["robot"], message)
-
-    def _record_path(self, robot: str, path: RobotPath) -> None:
-        """Record what the API shows, and report a plan when it is first published, a refusal when it changes."""
-        before = self._paths.get(robot)
-        self._paths[robot] = path
-        if before is not None and (before.plan_id, before.refusal) == (path.plan_id, path.refusal):
-            return
-        if before is None or before.plan_id != path.plan_id:
-            for trace in path.traces:
-                metrics.observe_trace(trace, ["plan"])
-        if path.refusal is not None:
-            _log.warning("plan_refused", robot=robot, plan=path.plan_id, reason=path.refusal.reason)
-        else:
-            _log.info("plan_published", robot=robot, plan=path.plan_id, corners=len(path.points), map_seq=path.map_seq,
-                      hazards=[trace.area for trace in path.traces])  # fmt: skip
-
-    def _record_release(self, robot: str, release: RobotRelease) -> None:
-        if (path := self._paths.get(robot)) is not None:
-            self._paths[robot] = path.after(release)
+        self._record.add(publications, self._clock.now())
 
     def close(self) -> None:
         """Shut the threads down once their current work is done."""

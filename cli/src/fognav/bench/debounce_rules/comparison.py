@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any, Final, NamedTuple
 
 import numpy as np
 
+from fog_contracts.site import learned_share
 from fognav.bench.debounce_rules.sonar_recording import SpikeFilter, filtered
 from hazard_aggregator.debounce import Observation, SonarSample, make_rule
 from hazard_aggregator.registry import find_rule
@@ -19,17 +20,21 @@ from hazard_aggregator.registry import find_rule
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping, Sequence
 
+    from fog_contracts.messages import AreaState
     from fognav.bench.debounce_rules.sonar_recording import Recording
-    from hazard_aggregator.debounce import Rule
 
 STRESS_RATE: Final = 0.02
 """Share of false echoes at random ranges in the second figure of false alarms: more than any recording has."""
+CALIBRATED: Final = "evidence, calibrated"
+"""The rule with a sonar whose calibration has counted its false echoes."""
+CALIBRATION_SAMPLES: Final = 256
+"""As in the firmware: `kFreeSamples`."""
 RULES: Final[Mapping[str, Mapping[str, Any]]] = {
     "consecutive": {"rule": "consecutive"},
     "n-of-m": {"rule": "n-of-m"},
     "duration": {"rule": "duration"},
     "evidence": {"rule": "evidence"},
-    "evidence, learned on false echoes": {"rule": "evidence", "false_echo_rate": STRESS_RATE},
+    CALIBRATED: {"rule": "evidence"},
 }
 ECHO_RATES: Final = (0.5, 0.6, 0.7, 0.8, 0.9, 1.0)
 DEADLINE_S: Final = 2.0
@@ -61,11 +66,14 @@ def measure(
     for name, choice in RULES.items():
         on_rule(name)
         rng = np.random.default_rng(seed)
-        quiet = false_alarms_per_hour(recordings, choice, hours, 0.0, rng)
-        stressed = false_alarms_per_hour(recordings, choice, hours, STRESS_RATE, rng)
+        calibrated = name == CALIBRATED
+        quiet = false_alarms_per_hour(recordings, choice, hours, 0.0, rng, calibrated=calibrated)
+        stressed = false_alarms_per_hour(recordings, choice, hours, STRESS_RATE, rng, calibrated=calibrated)
+        learned = [calibrate(recording, 0.0, rng) if calibrated else None for recording in recordings]
         for echo_rate in ECHO_RATES:
             rng = np.random.default_rng(seed)
-            done = [run_trial(recordings[i % len(recordings)], choice, echo_rate, rng) for i in range(trials)]
+            pairs = list(zip(recordings, learned, strict=True))
+            done = [run_trial(*pairs[i % len(pairs)], choice, echo_rate, rng) for i in range(trials)]
             rows.append(
                 {"rule": name, "echo_rate": echo_rate, **_figures(done)}
                 | {"false_alarms_per_h": quiet, "false_alarms_stressed_per_h": stressed}
@@ -81,8 +89,26 @@ def table(rows: Sequence[Mapping[str, Any]]) -> list[str]:
     return [f"| {' | '.join(line)} |" for line in lines]
 
 
-def run_trial(recording: Recording, choice: Mapping[str, Any], echo_rate: float, rng: np.random.Generator) -> Trial:
-    """Return the figures of one obstacle that comes, stays for 4 s and goes."""
+def calibrate(recording: Recording, rate: float, rng: np.random.Generator) -> float:
+    """Return the rate of false echoes that a node's calibration would learn on the background, with such a share."""
+    measured = _stretch(recording.background, CALIBRATION_SAMPLES, rng)
+    false = rng.random(CALIBRATION_SAMPLES) < rate
+    near = rng.uniform(0.02, recording.limit, CALIBRATION_SAMPLES)
+    samples = filtered(np.where(false, near, measured).tolist())
+    return learned_share(sum(each < recording.limit for each in samples), len(samples))
+
+
+def run_trial(
+    recording: Recording,
+    false_echo_rate: float | None,
+    choice: Mapping[str, Any],
+    echo_rate: float,
+    rng: np.random.Generator,
+) -> Trial:
+    """Return the figures of one obstacle that comes, stays for 4 s and goes.
+
+    `false_echo_rate` is the one that the sonar's calibration has shown; None: it is not calibrated.
+    """
     count = round(_AFTER_S / recording.period_s)
     before = _stretch(recording.background, _BEFORE, rng)
     hidden = _stretch(recording.background, count, rng)
@@ -91,7 +117,9 @@ def run_trial(recording: Recording, choice: Mapping[str, Any], echo_rate: float,
     present = [near if echo else far for near, far, echo in zip(seen, hidden, echoes, strict=True)]
     ranges = filtered([*before, *present, *_stretch(recording.background, count, rng)])
     leaves = _BEFORE + count
-    confirmed = _confirmed(make_rule("", choice, find_rule), recording, ranges)
+    rule = make_rule("", choice, find_rule)
+    observed = [_observation(recording, each, false_echo_rate) for each in ranges]
+    confirmed = [rule.update(each, i * recording.period_s) for i, each in enumerate(observed)]
     first = next((i for i in range(_BEFORE, leaves) if confirmed[i] == "blocked"), None)
     deadline = _BEFORE + DEADLINE_S / recording.period_s
     detected = first if first is not None and first <= deadline else None
@@ -114,17 +142,31 @@ def run_trial(recording: Recording, choice: Mapping[str, Any], echo_rate: float,
 
 
 def false_alarms_per_hour(
-    recordings: Sequence[Recording], choice: Mapping[str, Any], hours: float, rate: float, rng: np.random.Generator
+    recordings: Sequence[Recording],
+    choice: Mapping[str, Any],
+    hours: float,
+    rate: float,
+    rng: np.random.Generator,
+    *,
+    calibrated: bool = False,
 ) -> float:
-    """Return how often a rule finds the recorded background blocked, with so many false echoes at random ranges."""
+    """Return how often a rule finds the recorded background blocked, with so many false echoes at random ranges.
+
+    A `calibrated` sonar learns its rate of false echoes anew for each short stretch: calibrations differ by chance, of
+    their own, so that all rules have the same noise.
+    """
+    calibrations = np.random.default_rng(CALIBRATION_SAMPLES)
     alarms = 0
     for recording in recordings:
         rule, spikes, state = make_rule("", choice, find_rule), SpikeFilter(), "clear"
         for start in range(0, round(hours * 3600 / recording.period_s / len(recordings)), _BLOCK):
+            learned = calibrate(recording, rate, calibrations) if calibrated else None
             for offset, measured in enumerate(_stretch(recording.background, _BLOCK, rng)):
                 false = rng.random() < rate
                 counted = spikes.update(rng.uniform(0.02, recording.limit) if false else measured)
-                confirmed = rule.update(_observation(recording, counted), (start + offset) * recording.period_s)
+                confirmed = rule.update(
+                    _observation(recording, counted, learned), (start + offset) * recording.period_s
+                )
                 alarms += confirmed == "blocked" and state != "blocked"
                 state = confirmed or state
     return round(alarms / hours, 3)
@@ -149,13 +191,9 @@ def _ms(times: Sequence[float], percentile: float) -> int | None:
     return round(1000 * float(np.percentile(times, percentile))) if times else None
 
 
-def _confirmed(rule: Rule, recording: Recording, ranges: Sequence[float]) -> list[str | None]:
-    return [rule.update(_observation(recording, r), i * recording.period_s) for i, r in enumerate(ranges)]
-
-
-def _observation(recording: Recording, measured: float) -> Observation:
-    state = "blocked" if measured < recording.limit else "clear"
-    return Observation(state, (SonarSample(state, measured, recording.limit),))  # type: ignore[arg-type]  # a literal
+def _observation(recording: Recording, measured: float, false_echo_rate: float | None) -> Observation:
+    state: AreaState = "blocked" if measured < recording.limit else "clear"
+    return Observation(state, (SonarSample(state, measured, recording.limit, false_echo_rate=false_echo_rate),))
 
 
 def _stretch(ranges: Sequence[float], count: int, rng: np.random.Generator) -> list[float]:

@@ -25,7 +25,13 @@ _SLOW_M_S: Final = 0.15
 """Faster than this a robot could not rest 0.02 m before a box that is 0.06 m away."""
 _CYCLE_S: Final = 0.1
 """Steps of gate, guardian and line, 0.05 and 0.02 s, and the emulated device's 0.01 s, after a limit has passed."""
+_POLL_S: Final = 0.05
+"""How long a heartbeat or release may wait until the agent of a driving robot looks for it: it counts from then on."""
+_READ_S: Final = 0.05
+"""How long the lidar's last bytes may wait until the agent reads them: its silence counts from then on."""
 _RAMP_S: Final = 0.5
+_SLOWING_S: Final = 0.15
+"""From 0.30 to 0.15 m/s at the 1 m/s2 that a robot accelerates and brakes with where nothing is dangerous."""
 _FRAME_S: Final = 0.05
 """A frame of the base's sensors, 0.015 s, and the guardian's answer on the line."""
 _TURN_S: Final = 0.19
@@ -190,8 +196,8 @@ FAULTS: Final = (
     Fault(
         "lidar falls silent",
         "device",
-        0.3 + _CYCLE_S,
-        "0.3 + 0.1",
+        _READ_S + 0.3 + _CYCLE_S,
+        "read 0.05 + 0.3 + 0.1",
         partial(_lidar, fault="stalled", on=True),
         partial(_lidar, fault="stalled", on=False),
     ),
@@ -229,14 +235,34 @@ FAULTS: Final = (
         _no_box,
         _SLOW_M_S,
     ),
-    _silent("map silent, slow", "map_silent", 1.0 + _CYCLE_S, "1.0 + 0.1", speed=_DEGRADED_M_S, observed_s=1.8),
-    _silent("map silent, stop", "map_silent", 3.0 + _RAMP_S + _CYCLE_S, "3.0 + ramp 0.5 + 0.1", observed_s=4.5),
-    _silent("planner silent, slow", "planner_silent", 1.5 + _CYCLE_S, "1.5 + 0.1", speed=_DEGRADED_M_S, observed_s=2.3),
+    _silent(
+        "map silent, slow",
+        "map_silent",
+        _POLL_S + 1.0 + _SLOWING_S + _CYCLE_S,
+        "poll 0.05 + 1.0 + braking 0.15 + 0.1",
+        speed=_DEGRADED_M_S,
+        observed_s=1.8,
+    ),
+    _silent(
+        "map silent, stop",
+        "map_silent",
+        _POLL_S + 3.0 + _RAMP_S + _CYCLE_S,
+        "poll 0.05 + 3.0 + ramp 0.5 + 0.1",
+        observed_s=4.5,
+    ),
+    _silent(
+        "planner silent, slow",
+        "planner_silent",
+        _POLL_S + 1.5 + _SLOWING_S + _CYCLE_S,
+        "poll 0.05 + 1.5 + braking 0.15 + 0.1",
+        speed=_DEGRADED_M_S,
+        observed_s=2.3,
+    ),
     Fault(
         "network gone, slow",
         "fog",
-        1.0 + _CYCLE_S,
-        "1.0 + 0.1",
+        _POLL_S + 1.0 + _SLOWING_S + _CYCLE_S,
+        "poll 0.05 + 1.0 + braking 0.15 + 0.1",
         partial(_signals, names=(ROUTER,), number=HANG),
         _nothing,
         _DEGRADED_M_S,
@@ -245,8 +271,8 @@ FAULTS: Final = (
     Fault(
         "network gone, stop",
         "fog",
-        3.0 + _RAMP_S + _CYCLE_S,
-        "3.0 + ramp 0.5 + 0.1",
+        _POLL_S + 3.0 + _RAMP_S + _CYCLE_S,
+        "poll 0.05 + 3.0 + ramp 0.5 + 0.1",
         partial(_signals, names=(ROUTER,), number=HANG),
         _nothing,
         0.0,
@@ -255,8 +281,8 @@ FAULTS: Final = (
     Fault(
         "change of the map lost",
         "fog",
-        1.0 + _CYCLE_S + _RAMP_S + _CYCLE_S,
-        "next heartbeat 0.1 + 1.0 + ramp 0.5 + 0.1",
+        _CYCLE_S + _POLL_S + 1.0 + _RAMP_S + _CYCLE_S,
+        "next heartbeat 0.1 + poll 0.05 + 1.0 + ramp 0.5 + 0.1",
         partial(_zone, ahead_m=6.0, lost=True),
         _no_zone,
         0.0,

@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import os
 from typing import TYPE_CHECKING, Final
+
+from fognav import checkout
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -26,10 +29,13 @@ When guardian and watchdog die or hang in the same moment, nothing on the robot'
 watchdog is started again or goes on: see the limits in the [README](../README.md). The same holds for the cable of the
 base. A watchdog that hangs alone is no fault: the wheels keep obeying guardian and agent.
 
-Measured on: {machine}, {robots} robots at once.
+Measured at commit {commit} on: {machine}, {robots} robots at once, at a niceness of {niceness}.
 Robots, emulated devices and whatever else ran shared its cores: a load above their
 number means that all of them waited for a processor, and the times beyond a limit include that.
+
+{mark}
 """
+_MARK: Final = "<!-- Remarks: what stands below this line is kept when the command writes the page again. -->"
 _HEAD: Final = """| fault | trials | stopped | median, s | p99, s | longest, s | limit, s | beyond | its parts, s |
 |---|---|---|---|---|---|---|---|---|
 """
@@ -41,14 +47,28 @@ _TITLES: Final = {
 }
 
 
-def markdown(rows: Sequence[dict[str, object]], command: str, machine: str, robots: int) -> str:
-    """Return the page."""
+def remarks(page: str) -> str:
+    """Return what people wrote below the mark of a page, "" for one without."""
+    return page.partition(_MARK)[2].strip()
+
+
+def markdown(rows: Sequence[dict[str, object]], command: str, machine: str, robots: int, kept: str = "") -> str:
+    """Return the page, of this process and the checkout that it runs from, with the remarks `kept` at its end."""
     tables = []
     for kind, title in _TITLES.items():
         lines = [_line(each) for each in rows if each["kind"] == kind]
         if lines:
             tables.append(f"## {title}\n\n{_HEAD}" + "\n".join(lines))
-    return _PAGE.format(tables="\n\n".join(tables), command=command, machine=machine, robots=robots)
+    page = _PAGE.format(
+        mark=_MARK,
+        tables="\n\n".join(tables),
+        command=command,
+        machine=machine,
+        robots=robots,
+        commit=checkout.revision() or "unknown",
+        niceness=os.getpriority(os.PRIO_PROCESS, 0),
+    )
+    return f"{page}\n{kept}\n" if kept else page
 
 
 def _line(each: dict[str, object]) -> str:

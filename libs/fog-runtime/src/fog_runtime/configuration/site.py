@@ -10,10 +10,12 @@ from typing import Any, Final
 import msgspec
 
 from fog_contracts.channels import ROLES
+from fog_contracts.cones import ConeError, node_cone
 from fog_contracts.costs import is_traversable
 from fog_contracts.geometry import GeometryError, normalized_polygon
 from fog_contracts.grid import StaticMap
-from fog_contracts.site import AreaSite, Place, Site
+from fog_contracts.messages import AREAS_MAX
+from fog_contracts.site import AreaSite, NodeSite, Place, Site
 from fog_runtime.configuration.maps import MapFileError, load_map
 
 SITE_FILE: Final = "site.toml"
@@ -56,9 +58,9 @@ def load_site(directory: Path, text: str | None = None) -> LoadedSite:
         static = load_map(directory / site.map)
     except MapFileError as error:
         raise SiteError(file, "map", str(error), f"`map` is {site.map!r}, relative to {directory}") from error
-    areas = [_checked_area(file, area, f"areas[{n}]", static) for n, area in enumerate(site.areas)]
     for index, node in enumerate(site.nodes):
         _check_on_map(file, f"nodes[{index}] ({node.id})", node.x, node.y, static)
+    areas = [_checked_area(file, site, index, static) for index in range(len(site.areas))]
     for name, place in site.places.items():
         _check_free(file, f"places.{name}", place.x, place.y, static)
     for index, robot in enumerate(site.robots):
@@ -129,6 +131,9 @@ def _check_known(file: Path, field: str, name: str, known: Iterable[str]) -> Non
 
 
 def _check_ids(file: Path, site: Site) -> None:
+    if len(site.areas) > AREAS_MAX:
+        problem = f"there are {len(site.areas)} areas, and {AREAS_MAX} is the limit"
+        raise SiteError(file, "areas", problem, "Remove some, or make a part of the floor a site of its own")
     _check_unique(file, "areas.id", (area.id for area in site.areas))
     _check_unique(file, "areas.number", (area.number for area in site.areas if area.number is not None))
     _check_unique(file, "nodes.id", (node.id for node in site.nodes))
@@ -150,14 +155,40 @@ def _check_ids(file: Path, site: Site) -> None:
             _check_known(file, f"demo.areas[{index}]", area, areas)
 
 
-def _checked_area(file: Path, area: AreaSite, field: str, static: StaticMap) -> AreaSite:
+def _checked_area(file: Path, site: Site, index: int, static: StaticMap) -> AreaSite:
+    """Return an area with its polygon, the given one or that of the node whose cone it is."""
+    area, field = site.areas[index], f"areas[{index}]"
+    if area.cone_of is not None:
+        node = _node_of_cone(file, site, area, f"{field}.cone_of ({area.id})")
+        try:
+            return msgspec.structs.replace(area, polygon=node_cone(node, static))
+        except ConeError as error:
+            raise SiteError(file, f"{field}.cone_of ({area.id})", str(error), "Or give the area a polygon") from error
+    if not area.polygon:
+        remedy = "Add `polygon`, or `cone_of` with one of the area's nodes"
+        raise SiteError(file, f"{field} ({area.id})", "has neither a polygon nor a node whose cone it is", remedy)
     try:
         ring = normalized_polygon(area.polygon)
     except GeometryError as error:
         raise SiteError(file, f"{field}.polygon ({area.id})", str(error), "Correct the vertices") from error
-    for index, (x, y) in enumerate(ring):
-        _check_on_map(file, f"{field}.polygon ({area.id}), vertex {index}", x, y, static)
+    for vertex, (x, y) in enumerate(ring):
+        _check_on_map(file, f"{field}.polygon ({area.id}), vertex {vertex}", x, y, static)
     return msgspec.structs.replace(area, polygon=ring)
+
+
+def _node_of_cone(file: Path, site: Site, area: AreaSite, field: str) -> NodeSite:
+    """Return the node whose cone an area is, one of its own; raises `SiteError`."""
+    if area.polygon:
+        raise SiteError(file, field, "the area has a polygon, too", "Leave out one of them")
+    known = {node.id: node for node in site.nodes}
+    own = ", ".join(node.id for node in site.nodes if node.area == area.id) or "(none defined)"
+    remedy = f"Use one of the area's nodes: {own}; or give the area a polygon"
+    node = known.get(area.cone_of or "")
+    if node is None:
+        raise SiteError(file, field, f"there is no node {area.cone_of!r}", remedy)
+    if node.area != area.id:
+        raise SiteError(file, field, f"node {node.id!r} watches area {node.area!r}", remedy)
+    return node
 
 
 def _check_on_map(file: Path, field: str, x: float, y: float, static: StaticMap) -> None:

@@ -22,11 +22,12 @@ from fog_contracts import channels as ch
 from fog_contracts.fencing import epoch_in
 from fog_contracts.messages import Leader
 from fog_runtime import logs
-from fog_runtime.leases.lease import ANNOUNCE_S, Lease
+from fog_runtime.leases.lease import ANNOUNCE_S, CUT_OFF_S, Lease
+from fog_runtime.leases.probes import Probes
 from fog_runtime.stores.redis_connection import StoreError
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Mapping
+    from collections.abc import Awaitable, Callable, Mapping
 
     from fog_contracts.channels import Channel, Role
     from fog_runtime.health import Health
@@ -115,6 +116,7 @@ class Leadership:
         """Held while messages are sent or held back, so that they leave in their order."""
         self._takeover: asyncio.Task[None] | None = None
         self._announced_at = 0.0
+        self._probes = Probes({})
         health.set("lease", ok=False, detail="waiting for the lease")
 
     # --- For the edges ----------------------------------------------------------------------------------------------
@@ -172,13 +174,19 @@ class Leadership:
 
     # --- Running ----------------------------------------------------------------------------------------------------
 
-    async def run(self, member: Member) -> None:
-        """Take the lease when it is free, renew it, and let the service lead or stand by; until cancelled."""
+    async def run(self, member: Member, needs: Mapping[str, Callable[[], Awaitable[bool]]]) -> None:
+        """Take the lease when it is free, renew it, and let the service lead or stand by; until cancelled.
+
+        needs: by name, what asks a transport or thread without which this process leaves the lease to another one.
+        """
         member.stand_by()
+        self._probes = Probes(needs)
         try:
             async with asyncio.TaskGroup() as tasks:
+                self._probes.start(tasks)
                 tasks.create_task(self._request_loop(), name="lease requests")
                 while True:
+                    self._lease.on_answer(self._probes.answered_at())
                     self._lease.tick(time.monotonic(), _proposal(), connected=self._connected())
                     self._apply(member, tasks)
                     self._announce()
@@ -223,14 +231,20 @@ class Leadership:
     def _report(self) -> None:
         """Set the health: standing by is healthy as long as somebody leads."""
         epoch, confirmed = self._term
+        lacking = self._lacking()
         if not epoch:
-            self._health.set("lease", ok=self._lease.leader is not None, detail=self.standby_reason())
+            self._health.set("lease", ok=self._lease.leader is not None, detail=self.standby_reason() + lacking)
         elif self._serving != epoch:
             self._health.set("lease", ok=False, detail=f"taking over with epoch {epoch}")
         else:
             provisional = "" if confirmed else ", which is provisional until Redis answers"
             silent = "; Redis does not answer, so nobody else can take over" if self._lease.redis_silent else ""
-            self._health.set("lease", ok=True, detail=f"leads with epoch {epoch}{provisional}{silent}")
+            self._health.set("lease", ok=True, detail=f"leads with epoch {epoch}{provisional}{silent}{lacking}")
+
+    def _lacking(self) -> str:
+        """Return what this process needs to lead and has no answer of; empty if it has all."""
+        silent = ", ".join(self._probes.silent(CUT_OFF_S))
+        return f"; no answer of {silent}, so a copy that gets one takes over" if silent else ""
 
     async def _take_over(self, member: Member, epoch: int, confirmed: bool) -> None:  # noqa: FBT001  # a term's parts
         while True:

@@ -17,6 +17,10 @@ Whoever hears an epoch above its own stops acting at once and asks Redis. If it 
 is an old one, or was made without Redis: it continues with one above. A forged epoch leaves room for that, because a
 leader counts no further than receivers follow it (`within_reach`). Without Redis it gives way to a leader that is
 alive, and else makes a provisional epoch above all that it heard, which Redis confirms or corrects later.
+
+Redis also leads from a leader that can't do its work to a process that can: one whose transports or threads do not
+answer gives the lease back, if a standby whose own do has left word in Redis that it is ready. If none has, it goes on:
+what it still does is better than nothing.
 """
 
 from __future__ import annotations
@@ -37,6 +41,15 @@ ANNOUNCE_S: Final = 0.25
 """Period of the leader's announcements."""
 LEADER_LOST_S: Final = 1.5
 """Without Redis: how long no leader must have been heard until a process leads with a provisional epoch."""
+CUT_OFF_S: Final = 1.0
+"""A process is cut off when what it needs to lead has not answered for so long."""
+READY_S: Final = 0.35
+"""A standby is ready to take over from a leader that is cut off while all that it needs has answered within this time.
+
+It says so for `READY_SAID_S` more. Together they are shorter than `CUT_OFF_S` by a question's period: if a broker fails
+for all, no standby is ready any more when the leader knows that it is cut off, and the lease stays where it is.
+"""
+READY_SAID_S: Final = 0.45
 _LISTEN_S: Final = 2 * ANNOUNCE_S + 0.1
 """Without Redis: how long a leader listens, after it did not run or could not hear, until it acts again."""
 _RATE_MARGIN: Final = 0.9
@@ -56,13 +69,16 @@ Permission = Literal["granted", "pending", "refused"]
 class Request:
     """What to ask of Redis: the lease, with this epoch if it is still the highest (0: a new one), above `floor`.
 
-    `confirmed`: Redis has granted the epoch before. `sent_at` is the time just before the request is sent.
+    `confirmed`: Redis has granted the epoch before. `sent_at` is the time just before the request is sent. `ready`:
+    this process would take over from one that is `cut_off` from what it needs.
     """
 
     epoch: int
     floor: int
     confirmed: bool
     sent_at: float
+    ready: bool = True
+    cut_off: bool = False
 
 
 @dataclass(frozen=True)
@@ -81,7 +97,12 @@ class Held:
     remaining_s: float
 
 
-Reply = Granted | Held | None
+@dataclass(frozen=True)
+class LeftToOther:
+    """This process is cut off, and another one is ready: it takes the lease, which is free now."""
+
+
+Reply = Granted | Held | LeftToOther | None
 """The answer of Redis; None when there was none."""
 
 
@@ -111,6 +132,10 @@ class Lease:
         self._silent_since: float | None = None
         self._listening_since = now
         self._ticked_at = now
+        self._started_at = now
+        self._answered_at = -math.inf
+        """A process that starts is not ready before it has an answer; for `cut_off` it has `CUT_OFF_S` to get one."""
+        self._said_cut_off = False
 
     # --- State out --------------------------------------------------------------------------------------------------
 
@@ -125,6 +150,10 @@ class Lease:
         """Whether Redis did not answer the last request."""
         return self._silent_since is not None
 
+    def cut_off(self, now: float) -> bool:
+        """Whether what this process needs to lead has not answered for too long."""
+        return now - max(self._started_at, self._answered_at) > CUT_OFF_S
+
     @property
     def _contested(self) -> bool:
         """Whether an epoch was heard that is not below ours."""
@@ -134,10 +163,14 @@ class Lease:
 
     def request(self, now: float) -> Request | None:
         """Return the request that is due, if any; its outcome must come before the next call (`on_reply`)."""
-        if now < self._request_due and not (self.epoch and self._contested):
+        cut_off = self.cut_off(now)
+        urgent = self._contested or (cut_off and not self._said_cut_off)
+        if now < self._request_due and not (self.epoch and urgent):
             return None
         self._request_due = now + RENEW_S
-        return Request(self.epoch, self._floor, self.confirmed, now)
+        self._said_cut_off = cut_off
+        ready = now - self._answered_at <= READY_S
+        return Request(self.epoch, self._floor, self.confirmed, now, ready=ready, cut_off=cut_off)
 
     def on_reply(self, request: Request, reply: Reply, now: float) -> None:
         """Apply the outcome of a request."""
@@ -147,6 +180,9 @@ class Lease:
         self._silent_since = None
         if isinstance(reply, Granted):
             self._lead(reply.epoch, request.sent_at, confirmed=True)
+            return
+        if isinstance(reply, LeftToOther):
+            self._stand_by(None)
             return
         self._request_due = min(self._request_due, now + max(_RETRY_S, reply.remaining_s))
         self._stand_by(Leader(reply.epoch, reply.holder, now))
@@ -166,6 +202,13 @@ class Lease:
 
     def _extend(self, sent_at: float) -> None:
         self._deadline = max(self._deadline, sent_at + LEASE_S * _RATE_MARGIN)
+
+    def on_answer(self, asked_at: float) -> None:
+        """Handle that all that this process needs to lead has answered a question that was asked then, or later.
+
+        -inf: something has answered none yet.
+        """
+        self._answered_at = asked_at
 
     # --- Epochs heard -----------------------------------------------------------------------------------------------
 

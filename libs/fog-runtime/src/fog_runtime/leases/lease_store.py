@@ -7,7 +7,7 @@ import time
 from typing import TYPE_CHECKING, Any, Final, Self
 
 from fog_runtime.access.credentials import NOBODY
-from fog_runtime.leases.lease import ATTEMPT_S, LEASE_S, Granted, Held, Reply, Request
+from fog_runtime.leases.lease import ATTEMPT_S, LEASE_S, READY_SAID_S, Granted, Held, LeftToOther, Reply, Request
 from fog_runtime.stores.redis_connection import RedisConnection, StoreError
 
 if TYPE_CHECKING:
@@ -19,6 +19,8 @@ if TYPE_CHECKING:
 # Whoever asks in vain, but knows of a higher epoch than the leader's, leaves that in Redis (the floor), and the leader
 # draws one above it at its next renewal. Else nobody might tell it of a provisional epoch that receivers heard, and
 # they would refuse it for ever.
+# A standby that has what it needs to lead leaves its name for a moment (ready). A leader that is cut off from what it
+# needs finds it, and gives the lease back.
 # The clock (ms) only keeps epochs growing that Redis and all who could know have forgotten.
 _ACQUIRE: Final = """
 local holder, epoch, floor, confirmed = ARGV[1], tonumber(ARGV[2]), tonumber(ARGV[3]), ARGV[4] == '1'
@@ -27,9 +29,16 @@ local lease = redis.call('GET', KEYS[1])
 local held_epoch, held_by
 if lease then held_epoch, held_by = string.match(lease, '^(%d+) (.*)$') end
 local left = tonumber(redis.call('GET', KEYS[3]) or '0')
+local ready, cut_off = ARGV[7] == '1', ARGV[8] == '1'
 if held_by and held_by ~= holder then
+  if ready then redis.call('SET', KEYS[4], holder, 'PX', ARGV[9]) end
   if floor > math.max(left, tonumber(held_epoch)) then redis.call('SET', KEYS[3], string.format('%.0f', floor)) end
   return {0, held_epoch, held_by, redis.call('PTTL', KEYS[1])}
+end
+local successor = redis.call('GET', KEYS[4])
+if cut_off and successor and successor ~= holder then
+  redis.call('DEL', KEYS[1])
+  return {2}
 end
 floor = math.max(floor, left)
 if epoch == 0 and held_by then epoch, confirmed = tonumber(held_epoch), true end
@@ -41,6 +50,7 @@ if epoch ~= stored then redis.call('SET', KEYS[2], text) end
 redis.call('SET', KEYS[1], text .. ' ' .. holder, 'PX', ARGV[6])
 return {1, text}
 """
+_GRANTED, _LEFT_TO_OTHER = 1, 2
 _RELEASE: Final = """
 local lease = redis.call('GET', KEYS[1])
 if lease and string.match(lease, '^%d+ (.*)$') == ARGV[1] then return redis.call('DEL', KEYS[1]) end
@@ -53,7 +63,7 @@ class LeaseStore:
 
     def __init__(self, url: str, site: str, service: str, *, credentials: Credentials = NOBODY) -> None:
         self._redis = RedisConnection(url, timeout_s=ATTEMPT_S, credentials=credentials)
-        self._lease, self._epoch, self._floor = (f"fog:{site}:{service}:{name}" for name in ("lease", "epoch", "floor"))
+        self._keys = tuple(f"fog:{site}:{service}:{name}" for name in ("lease", "epoch", "floor", "ready"))
 
     async def __aenter__(self) -> Self:
         """Return the store; it connects with the first command."""
@@ -65,18 +75,25 @@ class LeaseStore:
 
     async def acquire(self, holder: str, request: Request) -> Reply:
         """Take or renew the lease; None when Redis did not answer in time: it may have done it all the same."""
-        arguments = (holder, request.epoch, request.floor, int(request.confirmed), _now_ms(), round(LEASE_S * 1000))
-        reply = await self._attempt(("EVAL", _ACQUIRE, 3, self._lease, self._epoch, self._floor, *arguments))
-        if reply is None:
-            return None
-        granted, epoch, *held = reply
-        if granted:
-            return Granted(int(epoch))
-        return Held(int(epoch), held[0].decode("utf-8", "replace"), max(0, held[1]) / 1000)
+        arguments = (
+            holder, request.epoch, request.floor, int(request.confirmed), _now_ms(), round(LEASE_S * 1000),
+            int(request.ready), int(request.cut_off), round(READY_SAID_S * 1000),
+        )  # fmt: skip
+        reply = await self._attempt(("EVAL", _ACQUIRE, len(self._keys), *self._keys, *arguments))
+        match reply:
+            case None:
+                return None
+            case [outcome] if outcome == _LEFT_TO_OTHER:
+                return LeftToOther()
+            case [outcome, epoch] if outcome == _GRANTED:
+                return Granted(int(epoch))
+            case [_, epoch, other, remaining_ms]:
+                return Held(int(epoch), other.decode("utf-8", "replace"), max(0, remaining_ms) / 1000)
+        raise AssertionError(f"the script returned {reply!r}")
 
     async def release(self, holder: str) -> None:
         """Give the lease back, if this process holds it, so that another takes over at once; else it expires."""
-        await self._attempt(("EVAL", _RELEASE, 1, self._lease, holder))
+        await self._attempt(("EVAL", _RELEASE, 1, self._keys[0], holder))
 
     async def _attempt(self, command: Command) -> Any:  # noqa: ANN401  # redis does not type its replies
         """Execute a command once, in at most `ATTEMPT_S`; None when Redis did not answer, or refused it."""

@@ -1,8 +1,9 @@
 """The locks of a fog node in containers: `python -m fog_runtime.locks [make | COMMAND …]`.
 
 `make` creates what is missing, and hands out to each program what is its own (`handing_out`); every other command does
-so afterwards. Where the command `fognav` is installed, `fognav ca`, `robot add`, `node add` and `token` do the same in
-the folder of the locks.
+so afterwards. With `FOGNAV_FLOORS_DIR`, a folder with one of each further floor's site, these get theirs, too; `--floor
+SITE` names one in the other commands. Where the command `fognav` is installed, `fognav ca`, `robot add`, `node add`
+and `token` do the same in the folder of the locks.
 """
 
 from __future__ import annotations
@@ -23,9 +24,10 @@ from fog_runtime.configuration.settings import SettingsError, load
 from fog_runtime.configuration.site import SiteError, load_site
 from fog_runtime.keys import TOKENS, make_keys
 from fog_runtime.locks.authority import AuthorityError
-from fog_runtime.locks.handing_out import hand_out
+from fog_runtime.locks.handing_out import hand_out, hand_out_on_floor, keys_of
 from fog_runtime.locks.members import LocksError
 from fog_runtime.locks.site_locks import SiteLocks
+from fog_runtime.locks.users import on_floor
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -44,9 +46,17 @@ class Settings(msgspec.Struct, frozen=True, kw_only=True):
     handed_out_dir: Path
     hosts: str = ""
     """Names and addresses by which robots, nodes and people reach the fog node, comma separated."""
+    floors_dir: Path | None = None
+    """A folder with the folders of further floors; None: there are none."""
 
 
-def _make(settings: Settings, site: Site) -> SiteLocks:
+def _floors(settings: Settings) -> list[Site]:
+    """Return the further floors, in the order of their folders' names; raises `SiteError`."""
+    folders = [] if settings.floors_dir is None else sorted(settings.floors_dir.iterdir())
+    return [load_site(folder).site for folder in folders]
+
+
+def _make(settings: Settings, site: Site, floors: Sequence[Site]) -> SiteLocks:
     """Create what is missing."""
     locks = SiteLocks(settings.locks_dir, site.id)
     hosts = [host for host in (part.strip() for part in settings.hosts.split(",")) if host]
@@ -54,6 +64,13 @@ def _make(settings: Settings, site: Site) -> SiteLocks:
         [*_SERVERS, *hosts], robots=[robot.id for robot in site.robots], nodes=[node.id for node in site.nodes]
     )  # fmt: skip
     make_keys(settings.locks_dir)
+    for index, floor in enumerate(floors):
+        if floor.id in {site.id, *(each.id for each in floors[:index])}:
+            raise LocksError(f"two floors have the same id {floor.id!r}: give one of them another in its site.toml")
+        locks.add_floor(
+            floor.id, robots=[robot.id for robot in floor.robots], nodes=[node.id for node in floor.nodes]
+        )  # fmt: skip
+        make_keys(keys_of(settings.locks_dir, floor.id))
     return locks
 
 
@@ -63,24 +80,30 @@ def _carry_out(options: argparse.Namespace, locks: SiteLocks) -> str:
         case "robot" | "node" | "device":
             return _added(options, locks).read_text("utf-8")
         case "remove":
-            if not locks.remove(options.id):
+            if not locks.remove(_named(options)):
                 raise LocksError(f"{options.id} is unknown. Known are: {', '.join(sorted(locks.users()))}")
         case "certificate":
             return locks.authority.trusted
         case "show":
             return _shown(locks, options.file)
         case "token":
-            return _change_tokens(options, locks.directory / TOKENS)
+            return _change_tokens(options, keys_of(locks.directory, options.floor) / TOKENS)
         case "rotate":
             _rotate(locks, finish=options.finish)
     return ""
 
 
 def _added(options: argparse.Namespace, locks: SiteLocks) -> Path:
-    name = _id(options.id)
+    _id(options.id)
+    name = _named(options)
     if options.command == "device":
         return locks.add_device(name, options.topic)
     return locks.add_robot(name) if options.command == "robot" else locks.add_node(name)
+
+
+def _named(options: argparse.Namespace) -> str:
+    """Return how the servers call the robot, node or device that is named."""
+    return on_floor(options.floor, options.id) if options.floor else str(options.id)
 
 
 def _change_tokens(options: argparse.Namespace, file: Path) -> str:
@@ -101,9 +124,15 @@ def _rotate(locks: SiteLocks, *, finish: bool) -> None:
     locks.renew(only_due=False)
 
 
-def _id(text: str) -> str:
+def _require_floor(floor: str, locks: SiteLocks) -> None:
+    _, *known = locks.sites
+    if floor and floor not in known:
+        raise LocksError(f"{floor} is no further floor of this fog node. There are: {', '.join(known) or 'none'}")
+
+
+def _id(text: str) -> None:
     try:
-        return msgspec.convert(text, Id)
+        msgspec.convert(text, Id)
     except msgspec.ValidationError as error:
         raise LocksError(f"{text} is no id: use only a to z, 0 to 9 and -, at most 32") from error
 
@@ -127,6 +156,7 @@ def _keep_owner(folder: Path) -> None:
 
 def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(prog="locks", description="The locks of a fog node in containers.")
+    parser.add_argument("--floor", metavar="SITE", default="", help="the floor that is meant; default: the first one")
     commands = parser.add_subparsers(dest="command", metavar="COMMAND")
     commands.add_parser("make", help="create what is missing, and hand it out (default)")
     commands.add_parser("certificate", help="print the authority's certificate, for browsers and curl")
@@ -155,8 +185,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
     options = _parser().parse_args(arguments)
     try:
         settings = load(Settings, environ=os.environ)
-        site = load_site(settings.site_dir).site
-        locks = _make(settings, site)
+        site, floors = load_site(settings.site_dir).site, _floors(settings)
+        locks = _make(settings, site, floors)
+        _require_floor(options.floor, locks)
         # At once: what is printed only once must not be lost when handing out fails.
         sys.stdout.write(_carry_out(options, locks))
         _keep_owner(settings.locks_dir)
@@ -166,6 +197,14 @@ def main(arguments: Sequence[str] | None = None) -> int:
             robots=[robot.id for robot in site.robots],
             nodes=[node.id for node in site.nodes],
         )
+        for floor in floors:
+            changed += hand_out_on_floor(
+                locks,
+                settings.handed_out_dir,
+                floor.id,
+                robots=[robot.id for robot in floor.robots],
+                nodes=[node.id for node in floor.nodes],
+            )
     except (AuthorityError, CredentialsError, LocksError, SettingsError, SiteError, TokensError, OSError) as error:
         sys.stderr.write(f"{error}\n")
         return 1

@@ -6,12 +6,14 @@
     gateway/    server.pem server.key
     hazard-aggregator/, map-service/, planner/    credentials.toml tokens.toml, the planner also operator.key
     simulation/ operator.key token credentials/NAME.toml                           of a simulated robot and its nodes
+    floors/SITE/    the services' and simulation's of each further floor
 
 A folder that does not exist is left out: containers get one each, as a volume.
 """
 
 from __future__ import annotations
 
+from functools import partial
 from typing import TYPE_CHECKING, Final
 
 from fog_runtime.access.credentials import Credentials, to_toml
@@ -28,6 +30,8 @@ if TYPE_CHECKING:
     from fog_runtime.locks.site_locks import SiteLocks
 
 SIMULATION: Final = "simulation"
+FLOORS: Final = "floors"
+"""The folder of what further floors have of their own, among the locks and among what is handed out."""
 TOKEN: Final = "token"  # noqa: S105  # a file's name
 _FOGNAV_UID: Final = 10001
 """The user of our images (deploy/images)."""
@@ -56,10 +60,57 @@ def hand_out(
     The locks' folder also has the site's keys (`fog_runtime.keys`); `seen_as` is a folder's path in its container.
     Raises `OSError`, and `CredentialsError` or `TokensError` for files that can't be used.
     """
+    return _write(out, _servers(locks, seen_as)) + _hand_out_keys(locks, out, "", robots, nodes)
+
+
+def hand_out_on_floor(
+    locks: SiteLocks, out: Path, floor: str, *, robots: Sequence[str], nodes: Sequence[str]
+) -> list[Path]:
+    """Do the same for what a further floor has of its own, in `out/floors/SITE`; its keys are in `keys_of`."""
+    return _hand_out_keys(locks, out / FLOORS / floor, floor, robots, nodes)
+
+
+def keys_of(locks: Path, floor: str) -> Path:
+    """Return the folder of a site's tokens and operators' key; without `floor`, the first site's."""
+    return locks / FLOORS / floor if floor else locks
+
+
+def _hand_out_keys(locks: SiteLocks, out: Path, floor: str, robots: Sequence[str], nodes: Sequence[str]) -> list[Path]:
+    """Write what each site has for itself: its services' files, and those of a simulated robot."""
+    keys = keys_of(locks.directory, floor)
     if (out / SIMULATION).is_dir():
-        _make_token(locks.directory / TOKENS, out / SIMULATION / TOKEN)
+        _make_token(keys / TOKENS, out / SIMULATION / TOKEN)
+    named = partial(users.on_floor, floor) if floor else str
+    tokens, key = (keys / TOKENS).read_bytes(), (keys / OPERATOR_KEY).read_bytes()
+    found = {
+        service: {"credentials.toml": locks.credentials(named(service)).read_bytes(), TOKENS: tokens}
+        for service in users.SERVICES
+    }
+    found["planner"][OPERATOR_KEY] = key
+    # Those of robots and nodes may have been handed out already, and removed here.
+    known = (locks.credentials(named(user)) for user in ("console", "sim", *robots, *nodes))
+    simulated = {f"{CREDENTIALS}/{file.name}": file.read_bytes() for file in known if file.exists()}
+    return _write(out, {**found, SIMULATION: {OPERATOR_KEY: key, **simulated}})
+
+
+def _servers(locks: SiteLocks, seen_as: str) -> dict[str, dict[str, bytes]]:
+    """Return the files of what all sites share, by their names."""
+    trusted = locks.authority.trusted.encode()
+    health = Credentials.read(locks.credentials(users.HEALTH)).passwords
+    check = _BROKER_CHECK.format(folder=seen_as, user=users.HEALTH, password=health["mqtt"])
+    router_check = to_toml(users.HEALTH, authority=trusted.decode(), passwords={"zenoh": health["zenoh"]})
+    return {
+        "mosquitto": {**_folder(locks, "mosquitto"), "authority.pem": trusted, "mosquitto_sub": check.encode()},
+        "redis": {**_folder(locks, "redis"), "authority.pem": trusted, "health": health["redis"].encode()},
+        "zenoh": {**_folder(locks, "zenoh"), "health.toml": router_check.encode()},
+        "gateway": _folder(locks, "http"),
+    }
+
+
+def _write(out: Path, contents: Mapping[str, Mapping[str, bytes]]) -> list[Path]:
+    """Write the files that differ, each with its program's owner; return them."""
     changed = []
-    for program, files in _contents(locks, robots, nodes, seen_as).items():
+    for program, files in contents.items():
         folder = out / program
         if not folder.is_dir():
             continue
@@ -68,31 +119,6 @@ def hand_out(
                 atomic_write(folder / name, data, owner=OWNERS[program])
                 changed.append(folder / name)
     return changed
-
-
-def _contents(
-    locks: SiteLocks, robots: Sequence[str], nodes: Sequence[str], seen_as: str
-) -> dict[str, dict[str, bytes]]:
-    """Return each program's files by their names."""
-    trusted = locks.authority.trusted.encode()
-    health = Credentials.read(locks.credentials(users.HEALTH)).passwords
-    check = _BROKER_CHECK.format(folder=seen_as, user=users.HEALTH, password=health["mqtt"])
-    tokens = (locks.directory / TOKENS).read_bytes()
-    key = (locks.directory / OPERATOR_KEY).read_bytes()
-    router_check = to_toml(users.HEALTH, authority=trusted.decode(), passwords={"zenoh": health["zenoh"]})
-    found = {
-        "mosquitto": {**_folder(locks, "mosquitto"), "authority.pem": trusted, "mosquitto_sub": check.encode()},
-        "redis": {**_folder(locks, "redis"), "authority.pem": trusted, "health": health["redis"].encode()},
-        "zenoh": {**_folder(locks, "zenoh"), "health.toml": router_check.encode()},
-        "gateway": _folder(locks, "http"),
-    }
-    for service in users.SERVICES:
-        found[service] = {"credentials.toml": locks.credentials(service).read_bytes(), TOKENS: tokens}
-    found["planner"][OPERATOR_KEY] = key
-    # Those of robots and nodes may have been handed out already, and removed here.
-    simulated = [file for user in ("console", "sim", *robots, *nodes) if (file := locks.credentials(user)).exists()]
-    found[SIMULATION] = {OPERATOR_KEY: key, **{f"{CREDENTIALS}/{file.name}": file.read_bytes() for file in simulated}}
-    return found
 
 
 def _folder(locks: SiteLocks, program: str) -> dict[str, bytes]:

@@ -12,7 +12,7 @@ from fog_contracts.messages import Message
 from fog_runtime import logs, metrics
 
 if TYPE_CHECKING:
-    from collections.abc import Awaitable, Callable, Mapping, Sequence
+    from collections.abc import Awaitable, Callable, Collection, Mapping, Sequence
 
     from fog_contracts.channels import Channel
     from fog_contracts.handlers import Handler, Ids, Publication, QueryHandler
@@ -73,15 +73,23 @@ class Edges:
         *,
         numbers: Sequence[str | int] = (),
         only: Ids | None = None,
+        polled: Collection[Channel] = (),
     ) -> None:
         """Subscribe each handler to its channel; what it returns is passed to `publish`.
 
         Call it before the MQTT connection runs. `numbers` lists the areas of the thesis's topics, for which MQTT has
         no wildcard; `only` restricts zenoh channels with these ids to these values: a robot subscribes to its own.
+        Messages of `polled` channels, on zenoh, are handled whenever the session is polled (`ZenohEdge.poll`), and at
+        the latest before a message of another zenoh channel, so that nothing overtakes what was sent before it.
         Raises `ValueError` for a channel whose transport this process does not have.
         """
         for channel, handler in handlers.items():
-            self._subscribe(channel, self._delivery(channel, handler, publish), numbers, only or {})
+            delivery = self._delivery(channel, handler, publish)
+            if channel in polled and self._zenoh is not None and channel.message is not None:
+                self._zenoh.subscribe_polled(channel, channel.message, delivery, **_ids_of(channel, only or {}))
+            else:
+                ordered = self._after_polled(delivery) if polled and channel.transport == "zenoh" else delivery
+                self._subscribe(channel, ordered, numbers, only or {})
 
     def serve(
         self,
@@ -156,6 +164,16 @@ class Edges:
             publish(handler(ids, message, self.now()))
 
         return deliver
+
+    def _after_polled(self, deliver: Callable[[dict[str, str], Any], None]) -> Callable[[dict[str, str], Any], None]:
+        """Return a delivery before which what waits to be polled is handled."""
+
+        def ordered(ids: dict[str, str], message: object) -> None:
+            if self._zenoh is not None:
+                self._zenoh.poll()
+            deliver(ids, message)
+
+        return ordered
 
     def _reply(self, channel: Channel, query_handler: QueryHandler, on_reply: OnReply | None) -> Reply:
         def replied(request: Any, message: Message) -> Message | None:  # noqa: ANN401  # of the channel's type

@@ -28,6 +28,8 @@ from fog_runtime.transports.mqtt_subscriptions import ForeignHandler, Ids, Subsc
 M = TypeVar("M", bound=Message)
 T = TypeVar("T")
 
+NOT_SUBSCRIBED: Final = "fog/nobody-subscribes"
+"""A topic to which nobody subscribes: a broker answers who ends such a subscription, too, and changes nothing."""
 BACKOFF_S: Final = (0.2, 2.0)
 """Real seconds between attempts to connect: initial and maximum."""
 
@@ -41,6 +43,10 @@ class Will:
     channel: Channel
     message: Message | str
     ids: Ids = field(default_factory=dict)
+
+    def on(self, topic: str) -> aiomqtt.Will:
+        """Return it as it is given to a broker."""
+        return aiomqtt.Will(topic, _encoded(self.channel, self.message), self.channel.qos, self.channel.retained)
 
 
 def _encoded(channel: Channel, message: Message | str | None) -> bytes:
@@ -97,6 +103,20 @@ class MqttEdge:
     def connected(self) -> bool:
         """Whether the connection is up and all subscriptions are made."""
         return self._client is not None
+
+    async def broker_answers(self, timeout_s: float = 1.0) -> bool:
+        """Ask the broker something (to end a subscription that nobody has); return whether it answers in real seconds.
+
+        `connected` notices a broker that hangs, or a connection on which nothing passes any more, after 15 s only.
+        """
+        if (client := self._client) is None:
+            return False
+        try:
+            await client.unsubscribe(NOT_SUBSCRIBED, timeout=timeout_s)
+        except aiomqtt.MqttError:
+            raise_if_cancelled()
+            return False
+        return client is self._client
 
     @property
     def pending(self) -> int:
@@ -238,12 +258,8 @@ class MqttEdge:
         return channel.key(**({**ids, "site": self._site} if "site" in channel.fields else ids))
 
     def _mqtt_will(self) -> aiomqtt.Will | None:
-        if (will := self._will) is None:
-            return None
-        channel = will.channel
-        return aiomqtt.Will(
-            self._topic(channel, will.ids), _encoded(channel, will.message), channel.qos, channel.retained
-        )
+        will = self._will
+        return None if will is None else will.on(self._topic(will.channel, will.ids))
 
     async def _publish_will(self, client: aiomqtt.Client) -> None:
         """Publish the last will before an orderly end, at which a broker forgets it."""

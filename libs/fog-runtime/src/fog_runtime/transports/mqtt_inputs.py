@@ -51,6 +51,10 @@ class MqttEdgeWithInputs(MqttEdge):
         """Whether both connections are up and all subscriptions are made."""
         return super().connected and self._inputs.connected
 
+    async def broker_answers(self, timeout_s: float = 1.0) -> bool:
+        """Return whether the broker answers on both connections within real seconds."""
+        return all(await asyncio.gather(super().broker_answers(timeout_s), self._inputs.broker_answers(timeout_s)))
+
     async def wait_connected(self) -> None:
         """Wait until both connections are up."""
         await super().wait_connected()

@@ -7,7 +7,6 @@ session can't be opened while no router is up; what was declared before is decla
 
 import asyncio
 import base64
-import contextlib
 import inspect
 import json
 import os
@@ -34,6 +33,7 @@ from fog_runtime.access.credentials import NOBODY, Credentials
 from fog_runtime.clock import Clock
 from fog_runtime.slots import Slot
 from fog_runtime.transports.reply_parts import GONE, PART, PART_BYTES, REPLY, LargeReplies
+from fog_runtime.transports.zenoh_presence import ask_who_is_present
 from fog_runtime.transports.zenoh_query import ask
 
 M = TypeVar("M", bound=Message)
@@ -47,11 +47,13 @@ _CACHE_DEPTH: Final[Mapping[Durability, int]] = {"volatile": 0, "latest": 1, "re
 """How many messages of a key its publisher caches for recovery."""
 _QUEUE: Final = 4096
 """Messages of a recovered channel that may wait for the loop; further ones are dropped, which their versions show."""
+_KEYS: Final = 256
+"""Keys that are remembered, and not checked and put together again for each message."""
+_RING: Final = 16
+"""Messages of a polled channel that may wait for the next look; the newest stay."""
 _PENDING_QUERIES: Final = 64
 _PENDING_OF_ONE: Final = 16
 """How many queries on one key may wait for their answers: of all askers, and of one session."""
-PRESENCE_GRACE_S: Final = 0.5
-"""How much longer than asked for a question for the present processes may take (real seconds)."""
 ASKER: Final[ContextVar[str]] = ContextVar("asker", default="")
 """The session that asks, by its id, in the handler of a query; empty if it did not say."""
 _RETRY_S: Final = (0.2, 1.0)
@@ -130,6 +132,7 @@ class _Publisher:
         self._lock = threading.Lock()
         self._pending: deque[bytes] = deque(maxlen=self._depth)
         self._put: Callable[[bytes], object] | None = None
+        self._traffic = metrics.Traffic(channel.name, "sent")
 
     def declare(self, session: zenoh.Session) -> None:
         drop = zenoh.CongestionControl.DROP
@@ -162,8 +165,7 @@ class _Publisher:
 
     def _send(self, put: Callable[[bytes], object], data: bytes) -> None:
         put(data)
-        metrics.PUBLISHED.labels(self._channel.name).inc()
-        metrics.count_bytes(self._channel.name, "sent", len(data))
+        self._traffic.count(len(data))
 
 
 class _Publishers:
@@ -207,6 +209,7 @@ class _Subscription(Generic[M]):
         self._queue: deque[tuple[str, bytes]] = deque()
         self._newest: dict[str, bytes] = {}
         self._drain_scheduled = False
+        self._traffic = metrics.Traffic(channel.name, "received")
 
     def declare(self, session: zenoh.Session) -> object:
         depth = _CACHE_DEPTH[self._channel.durability]
@@ -222,15 +225,9 @@ class _Subscription(Generic[M]):
 
     def _on_sample(self, sample: zenoh.Sample) -> None:
         """Queue a sample; runs on one of zenoh's threads and must be short."""
-        if sample.kind != zenoh.SampleKind.PUT:
+        if (admitted := self._admitted(sample)) is None:
             return
-        key = str(sample.key_expr)
-        size = len(sample.payload)
-        metrics.count_bytes(self._channel.name, "received", size)
-        if size > self._channel.limit:
-            self._edge.refuse(self._channel, key, f"{size} bytes are over the limit of {self._channel.limit}")
-            return
-        data = sample.payload.to_bytes()
+        key, data = admitted
         with self._lock:
             if self._channel.durability == "recovered":
                 if len(self._queue) >= _QUEUE:
@@ -245,6 +242,17 @@ class _Subscription(Generic[M]):
             self._drain_scheduled = True
         if schedule:
             self._edge.call(self._drain)
+
+    def _admitted(self, sample: zenoh.Sample) -> tuple[str, bytes] | None:
+        """Return key and payload of a sample; None for one that is not to be delivered."""
+        if sample.kind != zenoh.SampleKind.PUT:
+            return None
+        key, size = str(sample.key_expr), len(sample.payload)
+        self._traffic.count_size(size)
+        if size > self._channel.limit:
+            self._edge.refuse(self._channel, key, f"{size} bytes are over the limit of {self._channel.limit}")
+            return None
+        return key, sample.payload.to_bytes()
 
     def _drain(self) -> None:
         with self._lock:
@@ -265,7 +273,7 @@ class _Subscription(Generic[M]):
         except ContractError as error:
             self._edge.refuse(self._channel, key, error.reason)
             return
-        metrics.RECEIVED.labels(self._channel.name).inc()
+        self._traffic.count_message()
         try:
             self._handler(ids, message)
         except RefusedMessageError as error:
@@ -273,6 +281,28 @@ class _Subscription(Generic[M]):
         except Exception as error:  # noqa: BLE001  # one message must not end the process; the bug is logged
             metrics.HANDLER_ERRORS.labels(self._channel.name).inc()
             _log.error("handler_failed", error=error, channel=self._channel.name, key=key)
+
+
+class _PolledSubscription(_Subscription[M]):
+    """Keeps the newest samples inside zenoh until somebody looks: neither a thread nor the loop is woken for each."""
+
+    _subscriber: zenoh.Subscriber[zenoh.handlers.Handler[zenoh.Sample]] | None = None
+
+    def declare(self, session: zenoh.Session) -> object:
+        ring: zenoh.handlers.RingChannel[zenoh.Sample] = zenoh.handlers.RingChannel(_RING)
+        self._subscriber = session.declare_subscriber(self._pattern, ring)
+        return self._subscriber
+
+    def poll(self) -> None:
+        """Deliver what has arrived; on the loop's thread."""
+        if (subscriber := self._subscriber) is None:
+            return
+        # At most as many as the ring holds: a flood must not keep the caller.
+        for _ in range(_RING):
+            if (sample := subscriber.try_recv()) is None:
+                return
+            if (admitted := self._admitted(sample)) is not None:
+                self._deliver(*admitted)
 
 
 Answer = Message | None | Awaitable[Message | None]
@@ -394,6 +424,7 @@ class ZenohEdge:
         self._clock = clock
         self._site = site
         self._client_name = f"{role}/{name}"
+        self._own_presence = LIVE.key(site=site, role=role, id=name)
         self._loop = asyncio.get_running_loop()
         self._session: zenoh.Session | None = None
         self._closed = False
@@ -401,6 +432,10 @@ class ZenohEdge:
         self._lock = threading.Lock()
         """Held while the session begins to take declarations."""
         self._declared: list[object] = []
+        self._polled: list[_PolledSubscription[Any]] = []
+        self._keys: dict[tuple[object, ...], str] = {}
+        """Keys by channel and ids, which are the same ones again and again."""
+        self._ids_of_keys: dict[tuple[str, str], Ids] = {}
         self._undeclared: list[Callable[[zenoh.Session], object]] = []
         self._tasks: set[asyncio.Task[None]] = set()
         self._limited = logs.RateLimited(_log)
@@ -472,6 +507,26 @@ class ZenohEdge:
         pattern = channel.pattern(**self._with_site(channel, ids))
         self._declare(_Subscription(self, channel, kind, handler, pattern).declare)
 
+    def subscribe_polled(
+        self, channel: Channel, kind: type[M], handler: Callable[[Ids, M], object], **ids: str
+    ) -> None:
+        """Subscribe as `subscribe` does, but deliver only when `poll` is called, the newest messages.
+
+        For a process that looks often anyhow: it is not woken for each message. The channel must be volatile.
+        """
+        self._check(channel, ids)
+        if _CACHE_DEPTH[channel.durability]:
+            raise ValueError(f"messages of channel {channel.name} must not be lost: it can't be polled")
+        pattern = channel.pattern(**self._with_site(channel, ids))
+        polled = _PolledSubscription(self, channel, kind, handler, pattern)
+        self._polled.append(polled)
+        self._declare(polled.declare)
+
+    def poll(self) -> None:
+        """Deliver what has arrived on the polled channels."""
+        for subscription in self._polled:
+            subscription.poll()
+
     def latest(self, channel: Channel, kind: type[M], **ids: str) -> Slot[M]:
         """Return a slot that holds the newest message of one key."""
         self._key(channel, ids)
@@ -509,34 +564,25 @@ class ZenohEdge:
     async def present(self, timeout_s: float = 2.0) -> set[tuple[str, str]]:
         """Return role and id of each process whose session is open now, as far as its router knows it.
 
-        Empty while this process has no router. Waits for answers of other routers for `timeout_s` (real seconds), and
-        for nothing longer than `PRESENCE_GRACE_S` more: on a congested link, even asking may block.
+        Empty while this process has no router. Waits for answers of other routers for `timeout_s` (real seconds).
         """
         session = self._session
         if session is None:
             return set()
-        found: set[tuple[str, str]] = set()
-        done = asyncio.Event()
+        presence = await ask_who_is_present(self, session, LIVE.pattern(site=self._site), timeout_s)
+        found = [LIVE.match(key) for key in presence.keys]
+        return {(ids["role"], ids["id"]) for ids in found if ids is not None}
 
-        def add(key: str) -> None:
-            if (ids := LIVE.match(key)) is not None:
-                found.add((ids["role"], ids["id"]))
+    async def router_answers(self, timeout_s: float = 1.0) -> bool:
+        """Ask the router something (whether this process is present); return whether it answers within real seconds.
 
-        def on_reply(reply: zenoh.Reply) -> None:
-            if reply.ok is not None:
-                self.call(add, str(reply.ok.key_expr))
-
-        get = partial(
-            session.liveliness().get,
-            LIVE.pattern(site=self._site),
-            zenoh.handlers.Callback(on_reply, lambda: self.call(done.set)),
-            timeout=timeout_s,
-        )
-        with contextlib.suppress(TimeoutError):
-            async with asyncio.timeout(timeout_s + PRESENCE_GRACE_S):
-                await self.in_thread(get)
-                await done.wait()
-        return found
+        `connected` notices a router that hangs, or a connection on which nothing passes any more, after 10 s only.
+        """
+        session = self._session
+        if session is None or not self.connected:
+            return False
+        presence = await ask_who_is_present(self, session, self._own_presence, timeout_s)
+        return presence.complete and self.connected
 
     # --- For the other classes of this module -----------------------------------------------------------------------
 
@@ -559,10 +605,14 @@ class ZenohEdge:
 
     def ids(self, channel: Channel, key: str) -> Ids | None:
         """Return the ids in a key of the channel, without the site; None when it is malformed."""
-        found = channel.match(key)
-        if found is not None:
-            found.pop("site", None)
-        return found
+        known = self._ids_of_keys.get((channel.name, key))
+        if known is None:
+            if (known := channel.match(key)) is None:
+                return None
+            known.pop("site", None)
+            if len(self._ids_of_keys) < _KEYS:
+                self._ids_of_keys[channel.name, key] = known
+        return dict(known)
 
     def refuse(self, channel: Channel, key: str, reason: str) -> None:
         """Count and log (rate-limited) a message that violates its contract; from any thread."""
@@ -581,8 +631,13 @@ class ZenohEdge:
         return {**ids, "site": self._site} if "site" in channel.fields else ids
 
     def _key(self, channel: Channel, ids: Ids) -> str:
-        self._check(channel, ids)
-        return channel.key(**self._with_site(channel, ids))
+        name = (channel.name, *ids.items())
+        if (key := self._keys.get(name)) is None:
+            self._check(channel, ids)
+            key = channel.key(**self._with_site(channel, ids))
+            if len(self._keys) < _KEYS:
+                self._keys[name] = key
+        return key
 
     def _declare(self, declare: Callable[[zenoh.Session], object]) -> None:
         with self._lock:

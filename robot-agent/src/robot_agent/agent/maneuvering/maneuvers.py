@@ -123,7 +123,7 @@ class Maneuvers:
                 return 0.0, 0.0
             case "turn":
                 return self._turning.wheels(self._localizer.odom_at(now))
-            case "undock" | "back_off" | "advance":
+            case _:
                 return self._straight[kind].wheels
 
     def _dock_problem(self, replica: Replica, now: float, *, running: bool) -> str | None:

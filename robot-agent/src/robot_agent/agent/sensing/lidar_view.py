@@ -8,7 +8,7 @@ import numpy as np
 
 from fog_contracts.costs import LETHAL
 from fog_kernels.raycast import cast
-from robot_agent.safety.visibility import SECTORS, Visibility, sector_angles
+from robot_agent.safety.visibility import SECTOR_ANGLES, SECTORS, Visibility
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -48,7 +48,7 @@ class LidarView:
             geometry.origin_y,
             pose.x,
             pose.y,
-            sector_angles() + pose.theta,
+            SECTOR_ANGLES + pose.theta,
             self._range,
         )
         return np.isfinite(ranges)

@@ -1,7 +1,7 @@
 """RPLidar A1: commands as bytes, the answer stream as typed events, nodes as whole scans.
 
 Nothing here touches a port or a clock: bytes and arrival times go in, values come out. Nodes are decoded in bulk by
-numpy, so that thousands of them a second cost a small computer little.
+compiled code, so that thousands of them a second cost a small computer little.
 Source: Slamtec, RPLIDAR interface protocol and application notes, A1 (protocol version 1.0, revision 2.x).
 """
 
@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Final, NamedTuple, Protocol
 
 import numpy as np
 
+from fog_kernels.lidar import FULL_CIRCLE_Q6, NODE_BYTES, decode_nodes, in_metres
 from robot_agent.lidars.scan_builder import Samples, ScanBuilder
 
 if TYPE_CHECKING:
@@ -25,7 +26,6 @@ if TYPE_CHECKING:
 BAUD: Final = 115200
 RANGE_MIN_M: Final = 0.15
 RANGE_MAX_M: Final = 12.0
-_FULL_CIRCLE_Q6: Final = 360 * 64
 
 
 # --- commands ---------------------------------------------------------------------------------------------------------
@@ -272,9 +272,6 @@ def _health_status(value: int) -> HealthStatus | int:
         return value
 
 
-_NODE: Final = np.dtype([("first", "u1"), ("angle", "<u2"), ("distance", "<u2")])
-"""Lowest bit of `first`: start flag, the next one: its inverse; lowest bit of `angle`: always 1."""
-_NODE_SIZE: Final = _NODE.itemsize
 # To find the node boundary again, this many nodes in a row must have right check bits and angles that advance like a
 # rotating head's. Check bits alone are not enough: without returns, the zeros and the even steps of the angle look like
 # nodes two bytes aside for whole seconds.
@@ -304,20 +301,14 @@ class _NodeDecoder:
 
     def _decode_nodes(self, events: list[Event]) -> bool:
         """Decode all whole nodes up to the first invalid one. True if there is one."""
-        count = len(self._buffer) // _NODE_SIZE
+        count = len(self._buffer) // NODE_BYTES
         if not count:
             return False
-        nodes = np.frombuffer(self._buffer, _NODE, count)
-        first, second = nodes["first"], nodes["angle"]
-        angle = second >> np.uint16(1)
-        valid = ((first ^ (first >> 1)) & second & 1).astype(np.bool_) & (angle < _FULL_CIRCLE_Q6)
-        good = count if valid.all() else int(valid.argmin())
+        nodes = decode_nodes(self._buffer)
+        good = nodes.start.size
         if good:
-            first = first[:good]
-            events.append(
-                Nodes((first & 1).view(np.bool_), first >> np.uint8(2), angle[:good], nodes["distance"][:good])
-            )
-        self._buffer = self._buffer[good * _NODE_SIZE :]
+            events.append(Nodes(*nodes))
+        self._buffer = self._buffer[good * NODE_BYTES :]
         if good == count:
             return False
         self._parser.resyncs += 1
@@ -326,19 +317,19 @@ class _NodeDecoder:
 
     def _find_boundary(self) -> bool:
         """Drop bytes up to the next place where nodes begin. True if it was found."""
-        span = (_RESYNC_NODES - 1) * _NODE_SIZE
+        span = (_RESYNC_NODES - 1) * NODE_BYTES
         raw = np.frombuffer(self._buffer, np.uint8)
-        places = raw.size - span - _NODE_SIZE + 1
+        places = raw.size - span - NODE_BYTES + 1
         if places <= 0:
             return False
         angle = _angles_q6(raw[1:-3], raw[2:-2])
         single = _is_node(raw[:-4], raw[1:-3], angle)
         run = np.ones(places, np.bool_)
         for node in range(_RESYNC_NODES):
-            run &= single[node * _NODE_SIZE : node * _NODE_SIZE + places]
+            run &= single[node * NODE_BYTES : node * NODE_BYTES + places]
         drop = places
         for place in np.flatnonzero(run):
-            if _is_rotating(angle[place : place + span + 1 : _NODE_SIZE]):
+            if _is_rotating(angle[place : place + span + 1 : NODE_BYTES]):
                 drop = int(place)
                 self._synced = True
                 break
@@ -358,12 +349,12 @@ def _u16(values: NDArray[np.uint8]) -> NDArray[np.uint16]:
 def _is_node(first: NDArray[np.uint8], second: NDArray[np.uint8], angle: NDArray[np.uint16]) -> NDArray[np.bool_]:
     one = np.uint8(1)
     bits = (first ^ (first >> one)) & second & one
-    return bits.astype(np.bool_) & (angle < _FULL_CIRCLE_Q6)
+    return bits.astype(np.bool_) & (angle < FULL_CIRCLE_Q6)
 
 
 def _is_rotating(angles: NDArray[np.uint16]) -> bool:
     rotation = angles.astype(np.int32)
-    steps = (rotation[1:] - rotation[:-1] + _FULL_CIRCLE_Q6 // 2) % _FULL_CIRCLE_Q6 - _FULL_CIRCLE_Q6 // 2
+    steps = (rotation[1:] - rotation[:-1] + FULL_CIRCLE_Q6 // 2) % FULL_CIRCLE_Q6 - FULL_CIRCLE_Q6 // 2
     least, most = _RESYNC_TOTAL_Q6
     return bool(
         (steps >= -_RESYNC_BACK_Q6).all() and (steps <= _RESYNC_FORWARD_Q6).all() and least <= int(steps.sum()) <= most
@@ -440,7 +431,7 @@ def decode_capsule(capsule: bytes, next_start: int) -> Nodes:
     that line passes 360 degrees. Source: Slamtec interface protocol, express scan, legacy capsules.
     """
     begin = _start_angle(capsule) & ~_NEW_SCAN
-    span_q6 = ((next_start & ~_NEW_SCAN) - begin) % _FULL_CIRCLE_Q6
+    span_q6 = ((next_start & ~_NEW_SCAN) - begin) % FULL_CIRCLE_Q6
     cabins = np.frombuffer(capsule, np.uint8, offset=4).reshape(16, 5).astype(np.int32)
     fields = np.empty((16, 2), np.int32)
     fields[:, 0] = cabins[:, 0] | cabins[:, 1] << 8
@@ -451,8 +442,8 @@ def decode_capsule(capsule: bytes, next_start: int) -> Nodes:
     distance = (fields & 0xFFFC).reshape(-1).astype(np.uint16)
     # In degrees / 2048, so that the thirty-seconds of the span stay whole.
     line = begin * 32 + span_q6 * np.arange(_CAPSULE_NODES)
-    angle = ((line - (correction_q3.reshape(-1) << 8)) >> 5) % _FULL_CIRCLE_Q6
-    start = (line + span_q6) % (_FULL_CIRCLE_Q6 * 32) < span_q6
+    angle = ((line - (correction_q3.reshape(-1) << 8)) >> 5) % FULL_CIRCLE_Q6
+    start = (line + span_q6) % (FULL_CIRCLE_Q6 * 32) < span_q6
     quality = np.where(distance > 0, _RETURN_QUALITY, 0).astype(np.uint8)
     return Nodes(start, quality, angle.astype(np.uint16), distance)
 
@@ -464,12 +455,8 @@ def decode_capsule(capsule: bytes, next_start: int) -> Nodes:
 _START_WINDOW_Q6: Final = 45 * 64
 
 
-_RAD_PER_Q6: Final = np.float64(np.pi / (180.0 * 64.0))
-_M_PER_Q2: Final = np.float64(0.00025)
-
-
 def _is_near_zero(angle_q6: int) -> bool:
-    return angle_q6 < _START_WINDOW_Q6 or angle_q6 >= _FULL_CIRCLE_Q6 - _START_WINDOW_Q6
+    return angle_q6 < _START_WINDOW_Q6 or angle_q6 >= FULL_CIRCLE_Q6 - _START_WINDOW_Q6
 
 
 class ScanAssembler:
@@ -487,9 +474,7 @@ class ScanAssembler:
         """Add a batch that arrived at `now` (s, monotonic); return the scans that it completes."""
         angle = nodes.angle_q6
         boundaries = [index for index in nodes.start.nonzero()[0].tolist() if _is_near_zero(int(angle[index]))]
-        clockwise = angle * _RAD_PER_Q6
-        ranges = nodes.distance_q2 * _M_PER_Q2
-        ranges[nodes.distance_q2 == 0] = np.nan
+        clockwise, ranges = in_metres(angle, nodes.distance_q2)
         return self._builder.feed(Samples(clockwise, ranges, nodes.quality), boundaries, now)
 
     def take_samples(self) -> LidarSamples | None:

@@ -12,6 +12,7 @@ from fog_contracts.messages import AreaState, Message
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
+    from fog_contracts.handlers import Moment
     from fog_contracts.messages import AreaHazard
 
 RETENTION_S: Final = 90 * 86_400.0
@@ -33,8 +34,27 @@ class Period(Message, frozen=True, kw_only=True):
     overridden: bool
 
 
+class StoredPeriod(Period, frozen=True, kw_only=True):
+    """A period as it is stored: with when it began by a clock that nobody sets (`Moment.now`), and by which one.
+
+    Without `uptime` it is known by the time of day only.
+    """
+
+    clock: int = 0
+    uptime: float | None = None
+
+    @property
+    def shown(self) -> Period:
+        """The period as people read it."""
+        return Period(**{name: getattr(self, name) for name in Period.__struct_fields__})
+
+
 class PeriodView(Message, frozen=True, kw_only=True):
-    """A period with its end (s since the epoch; null: it is the present one) and how long (s) it has lasted."""
+    """A period with its end (s since the epoch; null: it is the present one) and how long (s) it has lasted.
+
+    Steps of the clock change no duration as long as the computer was not restarted meanwhile: a period ends when its
+    duration is over after its beginning, whatever the clock said then.
+    """
 
     period: Period
     ended: float | None
@@ -48,10 +68,12 @@ class HistoryPage(NamedTuple):
     next: str | None
 
 
-def period_of(hazard: AreaHazard, stamp: float) -> Period:
-    """Return the period that a hazard begins at `stamp` (s since the epoch)."""
-    return Period(
-        began=stamp,
+def period_of(hazard: AreaHazard, at: Moment | None) -> StoredPeriod:
+    """Return the period that a hazard begins at this moment; None: when its state began, in an earlier run."""
+    return StoredPeriod(
+        began=hazard.since if at is None else at.stamp,
+        clock=0 if at is None else at.clock,
+        uptime=None if at is None else at.now,
         state=hazard.state,
         penalty=hazard.penalty,
         cause=hazard.cause,
@@ -64,22 +86,32 @@ def sameness(period: Period) -> str:
     return f"{period.state} {period.penalty} {period.overridden}"
 
 
-def page_of(found: Sequence[tuple[str, bytes]], *, cursor: str | None, limit: int, now: float) -> HistoryPage:
-    """Return a page of `limit` periods at `now` (s since the epoch).
+def page_of(found: Sequence[tuple[str, bytes]], *, cursor: str | None, limit: int, at: Moment) -> HistoryPage:
+    """Return a page of `limit` periods at this moment.
 
     `found` are ids and records, newest first, from the last period of the page before (`cursor`) on: it tells when the
     next one ended. One more than a page has tells that there is another.
     """
     if cursor is not None and (not found or found[0][0] != cursor):
         return HistoryPage([], None)  # forgotten meanwhile, with all that was older
-    periods = [msgspec.json.decode(data, type=Period) for _, data in found]
-    views = [] if cursor is not None or not periods else [_view(periods[0], None, now)]
-    views += [_view(older, newer.began, now) for newer, older in pairwise(periods)]
+    periods = [msgspec.json.decode(data, type=StoredPeriod) for _, data in found]
+    now = StoredPeriod(
+        began=at.stamp, state="unknown", penalty=0, cause="", overridden=False, clock=at.clock, uptime=at.now
+    )
+    views = [] if cursor is not None or not periods else [_view(periods[0], now, ended=False)]
+    views += [_view(older, newer, ended=True) for newer, older in pairwise(periods)]
     last = limit - 1 if cursor is None else limit
     return HistoryPage(views[:limit], found[last][0] if len(views) > limit else None)
 
 
-def _view(period: Period, ended: float | None, now: float) -> PeriodView:
-    """Return a period as people read it; the clock may have been set back meanwhile."""
-    lasted_s = max(0.0, (now if ended is None else ended) - period.began)
-    return PeriodView(period=period, ended=ended if ended is None else period.began + lasted_s, lasted_s=lasted_s)
+def _view(period: StoredPeriod, until: StoredPeriod, *, ended: bool) -> PeriodView:
+    """Return a period as people read it, which lasted until another one began, or `until` is now."""
+    lasted_s = max(0.0, _seconds_between(period, until))
+    return PeriodView(period=period.shown, ended=period.began + lasted_s if ended else None, lasted_s=lasted_s)
+
+
+def _seconds_between(begin: StoredPeriod, end: StoredPeriod) -> float:
+    """Return the time between two beginnings: of the clock that nobody sets, if it ran on between them."""
+    if begin.uptime is not None and end.uptime is not None and begin.clock == end.clock:
+        return end.uptime - begin.uptime
+    return end.began - begin.began

@@ -4,6 +4,9 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any, Final
 
+from msgspec import structs
+
+from hazard_aggregator.area_size import AreaError
 from hazard_aggregator.areas.voting import check_fusion
 from hazard_aggregator.debounce import make_rule
 from hazard_aggregator.sensors.flapping import FlapDetector
@@ -12,8 +15,9 @@ from hazard_aggregator.sensors.source_profiles import SourceError, resolve
 from hazard_aggregator.sensors.source_reader import SourceReader
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping
+    from collections.abc import Collection, Mapping
 
+    from fog_contracts.geometry import Point
     from fog_contracts.messages import AreaDefinition, Source
     from fog_contracts.site import NodeSite
     from hazard_aggregator.areas.watched_area import WatchedArea
@@ -21,20 +25,54 @@ if TYPE_CHECKING:
 
 THESIS_NODE: Final = "thesis-area-{number}"
 """The id of a thesis node, which has none of its own, within its area."""
+_NO_CONES: Final[Mapping[str, list[Point]]] = {}
 _EACH_MESSAGE: Final[Mapping[str, Any]] = {"rule": "consecutive", "to_blocked": 1, "to_clear": 1}
 """A source's messages are its sensor's own decisions."""
 
 
 class Members:
-    """Makes nodes, sources and their debounce rules; `registry` finds rules by name, nodes use the `default_rule`."""
+    """Makes nodes, sources and their debounce rules; `registry` finds rules by name, nodes use the `default_rule`.
 
-    def __init__(self, sites: Mapping[str, NodeSite], registry: Registry, default_rule: str) -> None:
+    `cones` are the outlines of what the sonars of each node see (`fog_contracts.cones`), for areas that are one.
+    """
+
+    def __init__(
+        self,
+        sites: Mapping[str, NodeSite],
+        registry: Registry,
+        default_rule: str,
+        cones: Mapping[str, list[Point]] = _NO_CONES,
+    ) -> None:
         self._sites = sites
+        self._cones = cones
         self._registry = registry
         self._default_rule = default_rule
 
-    def check(self, definition: AreaDefinition) -> None:
-        """Raise `AreaError` when debounce, sources or fusion of an area are invalid, even if it has no node."""
+    def checked(self, definition: AreaDefinition) -> AreaDefinition:
+        """Return an area as it counts: one that is the cone of a node has the polygon of that node's cone now.
+
+        Raises `AreaError` when its node, debounce, sources or fusion are invalid.
+        """
+        self._check(definition)
+        if definition.cone_of is None or definition.removed:
+            return definition
+        polygon = self.cone(definition.id, definition.cone_of, definition.nodes)
+        return structs.replace(definition, polygon=polygon)
+
+    def cone(self, area: str, node: str, nodes: Collection[str]) -> list[Point]:
+        """Return what the sonars of a node see as the polygon of an area with these nodes; raises `AreaError`."""
+        remedy = "name one of the area's nodes, or give the area a polygon"
+        if node not in self._sites:
+            problem = f"the site has no node {node}: {remedy}"
+        elif node not in nodes:
+            problem = f"node {node} is none of the area's nodes: {remedy}"
+        elif node not in self._cones:
+            problem = f"node {node} stands in a wall of the map, or looks at one: move or turn it, or {remedy}"
+        else:
+            return self._cones[node]
+        raise AreaError(area, "cone_of", problem)
+
+    def _check(self, definition: AreaDefinition) -> None:
         self.new_rule(definition)
         names = [*definition.nodes, *(source.id for source in definition.sources)]
         for source in definition.sources:

@@ -28,12 +28,16 @@ _RULE: Final = "rule"
 
 
 class SonarSample(NamedTuple):
-    """What one sonar of a reading shows; range and limit in m. `explained`: a robot causes its echo."""
+    """What one sonar of a reading shows; range and limit in m. `explained`: a robot causes its echo.
+
+    `false_echo_rate`: the share of its readings of a free area with an echo within the limit; None: it is not known.
+    """
 
     state: AreaState
     range_m: float | None = None
     limit_m: float | None = None
     explained: bool = False
+    false_echo_rate: float | None = None
 
 
 class Observation(NamedTuple):

@@ -35,6 +35,11 @@ DOUBTFUL_SHARE: Final = 0.1
 """Share of readings of a free area with an echo just within the limit: the calibrated distance is no sharp edge."""
 _LEAST: Final = 0.1
 """False echoes within a range that could hold none of them, at least."""
+_FEWEST: Final = 1.5
+_MOST: Final = 3.0
+"""A learned rate of false echoes counts as no less and no more than lets so many clear echoes suffice to block: never
+one, and always three in a row that agree. With the default options that is 0.002 and 0.035; beyond, the rule would
+miss obstacles that swallow a part of the echoes (at 0.22 half of those that echo in 60 % of the readings)."""
 REPEATS: Final = 2
 """So many times in a row a node's filter may report an old range again (the firmware's `kMaxHeld`)."""
 
@@ -43,7 +48,8 @@ class Options(Struct, frozen=True, kw_only=True):
     """How likely echoes are, and how often a decision may be wrong.
 
     `echo_rate`: share of readings in which a sonar hears an obstacle; `false_echo_rate`: share in which it hears
-    something in a free area. `fognav bench debounce` learns both from a recording. `false_alarm` and `missed`: the
+    something in a free area, unless its calibration has shown that. `fognav bench debounce` learns both from a
+    recording. `false_alarm` and `missed`: the
     allowed probabilities to find a free area blocked and a blocked one clear, per decision. An echo less than
     `doubtful_m` (m) nearer than the limit is doubtful. `to_unknown` unknown readings in a row confirm `unknown`.
     """
@@ -61,6 +67,22 @@ class Options(Struct, frozen=True, kw_only=True):
                 f"echo_rate {self.echo_rate} must exceed false_echo_rate {self.false_echo_rate}: echoes would show that"
                 " nothing is there"
             )
+        if self.false_alarm + self.missed >= 1.0:
+            raise ValueError(
+                f"false_alarm {self.false_alarm} and missed {self.missed} must sum to less than 1: each reading would"
+                " decide at once"
+            )
+
+
+def learned_rates(options: Options) -> tuple[float, float]:
+    """Return what a learned rate of false echoes counts as, at least and at most."""
+    to_blocked = _to_blocked(options)
+    rarest, likeliest = (options.echo_rate * math.exp(-to_blocked / echoes) for echoes in (_FEWEST, _MOST))
+    return rarest, likeliest
+
+
+def _to_blocked(options: Options) -> float:
+    return math.log((1.0 - options.missed) / options.false_alarm)
 
 
 class _SonarTest:
@@ -72,7 +94,8 @@ class _SonarTest:
         self._evidence = 0.0
         self._echo: tuple[float, float] | None = None  # range (m) and time (s) of the latest echo within the limit
         self._repeats = 0
-        self._to_blocked = math.log((1.0 - options.missed) / options.false_alarm)
+        self._to_blocked = _to_blocked(options)
+        self._rarest, self._likeliest = learned_rates(options)
         self._to_clear = math.log(options.missed / (1.0 - options.false_alarm))
         self._silence = math.log((1.0 - options.echo_rate) / (1.0 - options.false_echo_rate))
 
@@ -95,26 +118,36 @@ class _SonarTest:
         elif self._evidence <= self._to_clear:
             self.decision, self._evidence = "clear", 0.0
 
+    def _false_echo_rate(self, sample: SonarSample) -> float:
+        """Return how often a sonar hears something in a free area: as it was calibrated, or else by the option.
+
+        What a missing echo says does not follow it: one may not make the area blocked sooner for being unreliable.
+        """
+        learned, options = sample.false_echo_rate, self._options
+        if learned is None:
+            return options.false_echo_rate
+        return min(max(learned, self._rarest), self._likeliest)
+
     def _echo_evidence(self, sample: SonarSample, now: float) -> float:
         """Return the evidence of an echo within the limit.
 
         Echoes of one thing agree in range, false ones agree by chance. A range that is repeated to the millimetre may
         be an old one that the node's filter reports again: it counts when it comes too often for that.
         """
-        options, before = self._options, self._echo
+        options, before, false_echo_rate = self._options, self._echo, self._false_echo_rate(sample)
+        odds = options.echo_rate / false_echo_rate
         if sample.range_m is None or sample.limit_m is None:
-            return math.log(options.echo_rate / options.false_echo_rate)
+            return math.log(odds)
         self._echo = sample.range_m, now
         if sample.limit_m - sample.range_m < options.doubtful_m:
-            return max(0.0, math.log(options.echo_rate / max(options.false_echo_rate, DOUBTFUL_SHARE)))
+            return max(0.0, math.log(options.echo_rate / max(false_echo_rate, DOUBTFUL_SHARE)))
         if before is None:
             self._repeats = 0
-            return math.log(options.echo_rate / options.false_echo_rate)
+            return math.log(odds)
         if sample.range_m == before[0] and self._repeats < REPEATS:
             self._repeats += 1
             return 0.0
         self._repeats = 0
-        odds = options.echo_rate / options.false_echo_rate
         return max(0.0, math.log(odds * _agreement(sample.range_m - before[0], now - before[1], sample.limit_m)))
 
 

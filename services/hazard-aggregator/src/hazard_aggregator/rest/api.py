@@ -6,7 +6,7 @@ from typing import Annotated, Any
 import msgspec
 from fastapi import FastAPI
 
-from fog_contracts.geometry import GeometryError, normalized_polygon
+from fog_contracts.geometry import GeometryError, Point, normalized_polygon
 from fog_contracts.grid import GridGeometry
 from fog_contracts.messages import (
     AlertPolicy,
@@ -42,7 +42,7 @@ from fog_runtime.http import (
     must_be_new,
 )
 from fog_runtime.stores.idempotency import IdempotencyError
-from hazard_aggregator.area_size import AreaError, check_size
+from hazard_aggregator.area_size import AreaError, TooManyAreasError, check_size
 from hazard_aggregator.rest.alert_api import add_alerts
 from hazard_aggregator.rest.history_api import add_history
 from hazard_aggregator.rest.override_api import OverrideView, add_overrides, no_such_area, override_view
@@ -52,10 +52,14 @@ from hazard_aggregator.writers.area_writer import ConflictError
 
 
 class AreaBody(Message, frozen=True, kw_only=True):
-    """The part of an area that an operator sets; polygon in m, frame `map`."""
+    """The part of an area that an operator sets: its polygon (m, frame `map`), or the node whose cone it is.
+
+    With `cone_of`, one of `nodes`, the polygon is what that node's sonars see, and must not be given.
+    """
 
     label: Annotated[str, msgspec.Meta(max_length=100)] = ""
-    polygon: Ring
+    polygon: Ring | None = None
+    cone_of: Id | None = None
     nodes: list[Id] = msgspec.field(default_factory=list)
     sources: Annotated[list[Source], msgspec.Meta(max_length=50)] = msgspec.field(default_factory=list)
     number: Annotated[int, msgspec.Meta(ge=0, le=9999)] | None = None
@@ -123,6 +127,11 @@ def _add_areas(routes: Routes, service: Service, geometry: GridGeometry, clock: 
         {412: "Somebody else changed the area"},
         lambda error: ProblemError(412, str(error)),
     )
+    routes.raises(
+        TooManyAreasError,
+        {422: "The area is invalid, or one too many"},
+        lambda error: ProblemError(422, error.problem, field="path"),
+    )
 
     def area_views() -> dict[str, AreaView]:
         announced, withheld, now = service.core.announced(), service.core.withheld(), clock.now()
@@ -150,7 +159,11 @@ def _add_areas(routes: Routes, service: Service, geometry: GridGeometry, clock: 
             raise no_such_area(area_id)
         return Answer(view, etag(view.definition.version))
 
-    @routes.put("/api/v1/areas/{area_id}", status=(200, 201), raises=[ConflictError, IdempotencyError, StoreError])
+    @routes.put(
+        "/api/v1/areas/{area_id}",
+        status=(200, 201),
+        raises=[ConflictError, IdempotencyError, StoreError, TooManyAreasError],
+    )
     async def put_area(
         area_id: str,
         body: Body[AreaBody],
@@ -196,6 +209,34 @@ def _add_nodes(routes: Routes, service: Service, clock: Clock) -> None:
 
 
 def _validated(area_id: str, body: AreaBody, service: Service, geometry: GridGeometry) -> AreaDefinition:
+    for index, node in enumerate(body.nodes):
+        if node not in service.core.nodes:
+            detail = f"the site has no node {node}: add it to site.toml first, with its position and range limits"
+            raise ProblemError(422, detail, field=f"body.nodes.{index}")
+    try:
+        polygon = _polygon(area_id, body, service, geometry)
+        fields = {**msgspec.to_builtins(body), "id": area_id, "polygon": polygon}
+        definition = service.core.checked(msgspec.convert(fields, AreaDefinition))
+        check_size(definition)
+    except msgspec.ValidationError as error:  # the id comes from the path
+        raise ProblemError(
+            422, f"{area_id!r} is no valid id: use a to z, 0 to 9 and -, at most 32", field="path"
+        ) from error
+    except AreaError as error:
+        raise ProblemError(422, error.problem, field=f"body.{error.field}") from error
+    return definition
+
+
+def _polygon(area_id: str, body: AreaBody, service: Service, geometry: GridGeometry) -> list[Point]:
+    """Return where an area is: its polygon, or what the sonars of the node see whose cone it is."""
+    if body.cone_of is not None:
+        if body.polygon is not None:
+            detail = f"the area has a polygon, too, and is the cone of {body.cone_of}: leave out one of them"
+            raise ProblemError(422, detail, field="body.cone_of")
+        return service.core.cone(area_id, body.cone_of, body.nodes)
+    if body.polygon is None:
+        detail = "an area needs a place: draw a polygon, or name one of its nodes in cone_of"
+        raise ProblemError(422, detail, field="body.polygon")
     try:
         polygon = normalized_polygon(body.polygon)
     except GeometryError as error:
@@ -205,19 +246,4 @@ def _validated(area_id: str, body: AreaBody, service: Service, geometry: GridGeo
             left, bottom, right, top = geometry.bounds
             reach = f"the map reaches from ({left:.2f}, {bottom:.2f}) to ({right:.2f}, {top:.2f}) m"
             raise ProblemError(422, f"({x:.2f}, {y:.2f}) lies off the map: {reach}", field=f"body.polygon.{index}")
-    for index, node in enumerate(body.nodes):
-        if node not in service.core.nodes:
-            detail = f"the site has no node {node}: add it to site.toml first, with its position and range limits"
-            raise ProblemError(422, detail, field=f"body.nodes.{index}")
-    try:
-        definition = msgspec.convert({**msgspec.to_builtins(body), "id": area_id, "polygon": polygon}, AreaDefinition)
-    except msgspec.ValidationError as error:  # the id comes from the path
-        raise ProblemError(
-            422, f"{area_id!r} is no valid id: use a to z, 0 to 9 and -, at most 32", field="path"
-        ) from error
-    try:
-        check_size(definition)
-        service.core.check(definition)
-    except AreaError as error:
-        raise ProblemError(422, error.problem, field=f"body.{error.field}") from error
-    return definition
+    return polygon

@@ -1,5 +1,6 @@
 """REST: the history of areas, `/api/v1/areas/{area_id}/history`."""
 
+from fog_contracts.handlers import Moment
 from fog_runtime.clock import Clock
 from fog_runtime.http import Answer, PageSize, ProblemError, Routes, next_page
 from fog_runtime.stores.audit import CursorError
@@ -24,5 +25,5 @@ def add_history(routes: Routes, service: Service, clock: Clock) -> None:
         """
         if not any(known.id == area_id for known in service.core.definitions()):
             raise ProblemError(404, f"there is no area {area_id}")
-        page = await service.history.page(area_id, cursor, limit, clock.stamp())
+        page = await service.history.page(area_id, cursor, limit, Moment(clock.now(), clock.stamp(), clock=clock.id))
         return Answer(page.periods, next_page(f"/api/v1/areas/{area_id}/history", page.next, limit))

@@ -8,6 +8,7 @@ from __future__ import annotations
 import math
 from typing import TYPE_CHECKING, NamedTuple
 
+from fog_contracts.cones import SONAR_HALF_CONE
 from hazard_aggregator.debounce import Observation, SonarSample
 
 if TYPE_CHECKING:
@@ -17,8 +18,6 @@ if TYPE_CHECKING:
     from fog_contracts.messages import AreaState, NodeReading, RobotPose
     from fog_contracts.site import NodeSite, Sonar
 
-CONE_HALF_ANGLE: Final = math.radians(7.5)
-"""Half of the beam's width: the HC-SR04's cone is 15 degrees wide (Mendes 2022, section 3.3)."""
 EXPLAIN_TOLERANCE: Final = 0.3
 """How far (m) a measured range may differ from the expected range of a robot's rim to be explained by that robot."""
 POSE_SIGMAS: Final = 2.0
@@ -87,7 +86,7 @@ def expected_range(site: NodeSite, sonar: Sonar, pose: RobotPose) -> float | Non
         return 0.0
     off_axis = abs(math.remainder(math.atan2(dy, dx) - site.theta - sonar.angle, math.tau))
     reach = pose.radius + _pose_margin(pose, -dy / distance, dx / distance)
-    if off_axis - math.asin(min(1.0, reach / distance)) > CONE_HALF_ANGLE:
+    if off_axis - math.asin(min(1.0, reach / distance)) > SONAR_HALF_CONE:
         return None
     return distance - pose.radius
 
@@ -156,7 +155,7 @@ def _samples(
     explained: Container[int] = (),
 ) -> tuple[SonarSample, ...]:
     return tuple(
-        SonarSample(state, measured, sonar.range_limit, index in explained)
+        SonarSample(state, measured, sonar.range_limit, index in explained, sonar.false_echo_rate)
         for index, (sonar, measured, (state, _)) in enumerate(
             zip(site.sonars, reading.range_m, classified, strict=True)
         )

@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING, Final, NamedTuple
 
 from msgspec import structs
 
+from hazard_aggregator.area_size import check_count
 from hazard_aggregator.store import Audit
 
 if TYPE_CHECKING:
@@ -62,7 +63,7 @@ class AreaWriter:
 
         Without, it replaces whatever is stored. With `must_be_new`, only if there is none (a removed one counts as
         none). An `attempt` that succeeded before returns its area again. Raises `ConflictError`, `IdempotencyError`,
-        and `StoreError`: then the area may be stored or not.
+        `TooManyAreasError`, and `StoreError`: then the area may be stored or not.
         """
         async with self._records.lock:
             for _ in range(ATTEMPTS):
@@ -74,6 +75,7 @@ class AreaWriter:
                     raise ConflictError(definition.id, "exists already: PUT it with If-Match, or choose another id")
                 if expected is not None and (old is None or old.version != expected):
                     raise ConflictError(definition.id)
+                check_count(definition, self._core.definitions())
                 stored = structs.replace(definition, version=1 if old is None else old.version + 1)
                 if await self._is_stored(stored, old, Audit(self._clock.stamp(), who, "put", attempt)):
                     self._publisher.announce(self._core.put_area(stored, self._edges.now()))

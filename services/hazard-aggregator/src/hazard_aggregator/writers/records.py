@@ -54,7 +54,7 @@ class Records:
         self._clock = clock
         self._health = health
         self._boot = boot
-        self._unusable = UnusableAreas(core.check, health)
+        self._unusable = UnusableAreas(core.checked, health)
         self._reload_due = False
 
     def mark_loaded(self) -> None:
@@ -158,7 +158,7 @@ class Records:
         """Return what of the records in force is stored."""
         overrides = self._core.overrides
         return Stored(
-            [definition for definition in self._core.definitions() if definition.version > 0],
+            [self._unusable.as_stored(each) for each in self._core.definitions() if each.version > 0],
             list(self._core.announced().values()),
             overrides.all(),
             overrides.rests(self._boot, self._clock.now()),

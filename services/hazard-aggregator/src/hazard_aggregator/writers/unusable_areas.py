@@ -23,32 +23,45 @@ _log = logs.get("aggregator")
 
 
 class UnusableAreas:
-    """Why each of them is unusable, by id; `check` raises `AreaError` for an area with invalid settings."""
+    """Why each of them is unusable, by id; `checked` returns an area as it counts, or raises `AreaError`."""
 
-    def __init__(self, check: Callable[[AreaDefinition], object], health: Health) -> None:
-        self._check = check
+    def __init__(self, checked: Callable[[AreaDefinition], AreaDefinition], health: Health) -> None:
+        self._checked = checked
         self._health = health
         self.reasons: dict[str, str] = {}
+        self._records: dict[str, AreaDefinition] = {}
 
     def made_usable(self, definitions: Iterable[AreaDefinition], unreadable: Mapping[str, str]) -> list[AreaDefinition]:
         """Return stored areas such that each is usable: without nodes and sources those that are not, or were not read.
 
-        A rule may have gone with the package that provided it. The area stays on the map, unknown, until somebody PUTs
-        it again: left out, it would count as clear. `unreadable` tells why records could not be read.
+        A rule may have gone with the package that provided it, or the node whose cone the area is. The area stays on
+        the map where its record has it, unknown, until somebody PUTs it again: left out, it would count as clear.
+        `unreadable` tells why records could not be read.
         """
-        reasons, usable = dict(unreadable), []
+        reasons, usable, records = dict(unreadable), [], {}
         for definition in definitions:
             try:
-                if not definition.removed:
-                    check_size(definition)
-                    self._check(definition)
+                usable.append(self._usable(definition))
             except AreaError as error:
                 reasons[definition.id] = str(error)
-                usable.append(structs.replace(definition, nodes=[], sources=[], debounce={}, fusion=FusionPolicy()))
-            else:
-                usable.append(definition)
+                records[definition.id] = definition
+                rest = structs.replace(definition, nodes=[], sources=[], debounce={}, fusion=FusionPolicy())
+                usable.append(structs.replace(rest, cone_of=None))
+        self._records = records
         self._report(reasons)
         return usable
+
+    def as_stored(self, definition: AreaDefinition) -> AreaDefinition:
+        """Return the record of an area in force: whole, where it was made usable and was not PUT again since then."""
+        record = self._records.get(definition.id)
+        return definition if record is None or record.version != definition.version else record
+
+    def _usable(self, definition: AreaDefinition) -> AreaDefinition:
+        if definition.removed:
+            return definition
+        counts = self._checked(definition)
+        check_size(counts)
+        return counts
 
     def _report(self, reasons: dict[str, str]) -> None:
         for area, reason in reasons.items():

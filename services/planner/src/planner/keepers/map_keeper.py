@@ -51,6 +51,8 @@ class MapKeeper:
         self._health = health
         self._queue = queue
         self._on_loaded = on_loaded
+        self.loaded = False
+        """Whether the core has a map, though perhaps not the newest."""
         self._needed = asyncio.Event()
         self._needed.set()
 
@@ -84,6 +86,7 @@ class MapKeeper:
         prepared = await self._queue.run("map", "", partial(self._queue.threads.run, "query", prepare))
         await self._queue.threads.run("core", lambda: self._core.load(prepared, self._clock.now()))
         self._needed.clear()
+        self.loaded = True
         self._on_loaded()
         SNAPSHOTS.labels("loaded").inc()
         self._health.set("map", ok=True)

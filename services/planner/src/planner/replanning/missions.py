@@ -14,6 +14,7 @@ if TYPE_CHECKING:
     from planner.config import PlannerConfig
     from planner.maps.planning_map import Cell
     from planner.replanning.mission import Explained, Plan, ReplanReason
+    from planner.search.path_search import Question
 
 _URGENCY: Final[dict[ReplanReason, int]] = {
     "map": 0, "off_path": 1, "epoch": 2, "goal": 3, "clearing": 4, "refused": 5,
@@ -92,6 +93,24 @@ class Missions:
             if robot in located and (reason := mission.replan_due(now, config)) is not None
         ]
         return sorted(due, key=lambda entry: (_URGENCY[entry[2]], entry[1].danger))
+
+    def unexplained(self, now_known: Explained, now: float, config: PlannerConfig) -> dict[str, tuple[Plan, Question]]:
+        """Return the refused plans whose reasons are unknown or may have changed, by robot, each with what is open.
+
+        `now_known`: the newest versions of map and regions. While the map changes, reasons are not asked for all the
+        time.
+        """
+        found = {}
+        for robot, mission in self.active():
+            plan = mission.plan
+            if plan is None or plan.question is None:
+                continue
+            known = plan.explained_for
+            new_regions = known is None or known[1] != now_known[1]
+            new_map = known is not None and known[0] != now_known[0]
+            if new_regions or (new_map and now - plan.explained_at >= config.explain_period_s):
+                found[robot] = plan, plan.question
+        return found
 
     def explain(
         self, plans: Mapping[str, Plan], answers: Mapping[str, Refusal], explained_for: Explained, now: float

@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from planner.config import PlannerConfig
     from planner.maps.planning_map import Cell, PlanningMap
     from planner.replanning.mission import Mission, ReplanReason
-    from planner.search.detours import Trip
+    from planner.search.detours import DeadEndsJob, Trip
     from planner.search.goal_fields import GoalFields
     from planner.search.path_search import Covers, SearchResult
 
@@ -47,6 +47,10 @@ class Replanner:
     def count_avoided(self, reason: AvoidReason) -> None:
         """Count a search that was not needed."""
         self.avoided[reason] = self.avoided.get(reason, 0) + 1
+
+    def jobs(self, robots: int) -> list[DeadEndsJob]:
+        """Return the background work for so many robots with a goal: few of them have nothing to share."""
+        return self.detours.jobs() if robots > self._config.detour_searches else []
 
     def replan(
         self,

@@ -1,0 +1,142 @@
+"""Further floors of a fog node in containers: an override of docker-compose.yml, made from it.
+
+The floors share broker, Redis, router and the container that hands out locks. Each has its own services, gateway,
+Prometheus and Grafana, which are those of the compose file with the floor's id in their names. Its networks are its
+own, too, and there its containers answer to the usual names (`planner`, `gateway`): so their settings and
+configuration files are the same on every floor. Two floors share nothing else but what the gateways have in common:
+the network of their way out, and their certificate.
+"""
+
+import copy
+import re
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any, Final
+
+import yaml  # type: ignore[import-untyped]  # PyYAML ships no types
+
+from fog_runtime.configuration.site import SiteError, load_site
+from fognav.hosting.floors import PORT_STEP
+from fognav.output import WrongUseError
+
+BASE: Final = "docker-compose.yml"
+OVERRIDE: Final = "docker-compose.override.yml"
+"""What compose reads besides, without being told."""
+HEADER: Final = "# Written by `fognav site compose`"
+_SHARED: Final = frozenset({"locks", "sim-locks", "kernels", "mosquitto", "redis", "zenoh"})
+_OUTSIDE: Final = "outside"
+"""The gateways' way out, which has no names that could be mixed up."""
+_SITE: Final = re.compile(r"^\$\{FOGNAV_SITE:-[^}]*\}:/site")
+_PORT: Final = re.compile(r"\$\{(FOGNAV_\w+_PORT):-(\d+)\}")
+_OUT: Final = "/out/floors"
+
+_Part = dict[str, Any]
+
+
+def override(folders: Sequence[Path], compose: str) -> str:
+    """Return the override for these sites, in the order of their ports; `compose` is the text of the compose file.
+
+    Raises `WrongUseError` for a folder without a usable site, or two sites of one id.
+    """
+    base = yaml.safe_load(compose)
+    services: _Part = {name: {"networks": {}} for name in ("mosquitto", "redis", "zenoh")}
+    services["locks"] = {"environment": {"FOGNAV_FLOORS_DIR": "/floors"}, "volumes": []}
+    services["sim-locks"] = copy.deepcopy(services["locks"])
+    made: _Part = {"services": services, "networks": {}, "volumes": {}}
+    for index, (site, folder) in enumerate(_sites(folders).items(), start=1):
+        _add(made, base, _Floor(site, folder, index))
+    written = yaml.safe_dump(made, sort_keys=False)
+    words = " ".join(f"--site {folder}" for folder in folders)
+    return f"{HEADER} {words}: run that again after an upgrade.\n{written}"
+
+
+def _sites(folders: Sequence[Path]) -> dict[str, Path]:
+    found: dict[str, Path] = {}
+    for folder in folders:
+        try:
+            site = load_site(folder).site.id
+        except SiteError as error:
+            raise WrongUseError(str(error)) from error
+        if site in found:
+            raise WrongUseError(
+                f"{folder} and {found[site]} have the same id {site!r}: give one another in {folder / 'site.toml'}"
+            )
+        found[site] = folder
+    return found
+
+
+class _Floor:
+    """One further floor: how its parts are named, and where they listen."""
+
+    def __init__(self, site: str, folder: Path, index: int) -> None:
+        self.site = site
+        self.folder = folder
+        self._index = index
+
+    def name(self, part: str) -> str:
+        return f"{part}-{self.site}"
+
+    def volume(self, text: str) -> str:
+        """Return a mount of the compose file as it is on this floor."""
+        source, colon, rest = _SITE.sub(f"{self.folder}:/site", text).partition(":")
+        # Every volume with a name is the floor's own, but for kernels, which all compile alike, and what all share.
+        shared = source.startswith((".", "/", "$")) or source in {"kernels", "gateway-locks"}
+        return (source if shared else self.name(source)) + colon + rest
+
+    def port(self, text: str) -> str:
+        """Return a published port: each floor's are ten above those of the one before."""
+        suffix = self.site.upper().replace("-", "_")
+        return _PORT.sub(lambda found: f"${{{found[1]}_{suffix}:-{int(found[2]) + PORT_STEP * self._index}}}", text)
+
+
+def _add(made: _Part, base: Mapping[str, Any], floor: _Floor) -> None:
+    services: _Part = made["services"]
+    own = [name for name in base["services"] if name not in _SHARED]
+    for name in own:
+        services[floor.name(name)] = _service(base["services"][name], name, own, floor)
+    for network, settings in base["networks"].items():
+        if network != _OUTSIDE:
+            made["networks"][floor.name(network)] = settings
+    for server in ("mosquitto", "redis", "zenoh"):
+        for network in base["services"][server]["networks"]:
+            services[server]["networks"][floor.name(network)] = None
+    mounted = {text.partition(":")[0] for name in own for text in services[floor.name(name)].get("volumes", [])}
+    made["volumes"] |= {name: None for name in sorted(map(floor.name, base["volumes"])) if name in mounted}
+    _add_locks(services, floor)
+
+
+def _service(base: Mapping[str, Any], name: str, own: Sequence[str], floor: _Floor) -> _Part:
+    """Return a service of the compose file as it is on a floor."""
+    service = copy.deepcopy(dict(base))
+    if "volumes" in service:
+        service["volumes"] = [floor.volume(text) for text in service["volumes"]]
+    if "ports" in service:
+        service["ports"] = [floor.port(text) for text in service["ports"]]
+    if "networks" in service:
+        service["networks"] = {
+            network if network == _OUTSIDE else floor.name(network): None
+            if network == _OUTSIDE
+            else {"aliases": [name]}
+            for network in service["networks"]
+        }
+    if "depends_on" in service:
+        service["depends_on"] = {
+            floor.name(other) if other in own else other: condition
+            for other, condition in service["depends_on"].items()
+        }
+    environment: _Part = service.get("environment", {})
+    if "FOGNAV_TOKENS_FILE" in environment and name == "backup":
+        # The first floor's backup has all locks; this one has what the floor has of its own.
+        environment["FOGNAV_TOKENS_FILE"] = f"/locks/floors/{floor.site}/tokens.toml"
+    return service
+
+
+def _add_locks(services: _Part, floor: _Floor) -> None:
+    """Let the containers that hand out locks know the floor, and give them a place for each of its programs."""
+    places = {service: f"{service}-locks-{floor.site}" for service in ("hazard-aggregator", "map-service", "planner")}
+    for name in ("locks", "sim-locks"):
+        own = places | ({"simulation": f"sim-locks-{floor.site}"} if name == "sim-locks" else {})
+        services[name]["volumes"] += [
+            f"{floor.folder}:/floors/{floor.site}:ro",
+            *(f"{volume}:{_OUT}/{floor.site}/{program}" for program, volume in own.items()),
+        ]

@@ -1,0 +1,192 @@
+"""Several robots in the same corridors, on an emulated clock: one fog node, and each robot in its own world.
+
+A world holds one robot. The others stand in it as obstacles that move, for its lidar, its bumper and the sonars.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import itertools
+import math
+from typing import TYPE_CHECKING, Final, NamedTuple
+
+import msgspec
+
+from fog_contracts import channels as ch
+from fog_contracts.bus import Bus
+from fog_contracts.messages import Pose, RobotGoal, SimObstacle
+from fog_runtime.configuration.default_parts import DEFAULT_BASE
+from fognav_experiments.rigs import STAMP, TICK_STEPS, FogRig, RobotRig, moment
+from fognav_sim import devices
+from fognav_sim.drive.drive import Drive
+from fognav_sim.drive.operator import OperatorPolicy
+from fognav_sim.floor import Floor
+from fognav_sim.world import World
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from fog_contracts.handlers import Ids, Moment, Publication
+    from fog_contracts.messages import RobotPath, RobotState
+    from fog_contracts.site import RobotSite
+    from fog_runtime.configuration.site import LoadedSite
+    from fognav_experiments.cpu import CpuMeter
+    from fognav_sim.drive.evaluation import DriveOutcome
+
+READY_S: Final = 20.0
+_OPERATOR_STEPS: Final = 50
+_CORNERS: Final = 8
+
+
+class Mission(NamedTuple):
+    """A robot, which stands at its start, and its goal (x, y; m)."""
+
+    robot: RobotSite
+    goal: tuple[float, float]
+
+
+class Vehicle:
+    """One robot of the fleet: its world, its processes, its operator and its drive."""
+
+    def __init__(self, site: LoadedSite, mission: Mission, bus: Bus, seed: int, cpu: CpuMeter) -> None:
+        emulator = devices.make_base(DEFAULT_BASE)
+        floor = Floor(site.map.geometry, site.map.cells)
+        self.goal = mission.goal
+        self.world = World(floor, mission.robot, seed, axle_m=emulator.axle_m)
+        self.rig = RobotRig(site, mission.robot, self.world, emulator, bus, seed, 0.0, measure=cpu.measure)
+        self.operator = OperatorPolicy(0.0)
+        self.state: RobotState | None = None
+        self.drive: Drive | None = None
+        self.outcome: DriveOutcome | None = None
+        self._begun_m = 0.0
+        own = {"robot": mission.robot.id}
+        bus.subscribe({ch.ROBOT_STATE: self._on_state, ch.ROBOT_PATH: self._on_path}, only=own)
+
+    @property
+    def id(self) -> str:
+        """The robot's id."""
+        return self.rig.id
+
+    @property
+    def driven_m(self) -> float:
+        """Distance driven since the goal was given, m."""
+        return self.world.distance - self._begun_m
+
+    def start(self, goal_id: str) -> None:
+        """Begin the drive to the goal, which the planner has got."""
+        truth = self.world.truth(STAMP + self.rig.now)
+        self._begun_m = self.world.distance
+        self.drive = Drive(goal=self.goal, goal_id=goal_id, areas=(), truth=truth, now=self.rig.now, hazard=None)
+
+    def evaluate(self) -> None:
+        """Evaluate the ground truth, until the drive has its outcome."""
+        if self.drive is not None and self.outcome is None:
+            self.drive.on_truth(self.world.truth(STAMP + self.rig.now))
+            self.outcome = self.drive.outcome(self.rig.now)
+
+    def operate(self) -> None:
+        """Let the operator give the command that is due, if one is."""
+        command = self.operator.command_due(self.rig.now)
+        if command is not None:
+            self.rig.command(command)
+
+    def body(self) -> SimObstacle:
+        """Return the robot as an obstacle to others: a polygon around its circle."""
+        x, y, _ = self.world.pose
+        robot = self.world.robot
+        reach = robot.radius / math.cos(math.pi / _CORNERS)
+        turns = (math.tau * corner / _CORNERS for corner in range(_CORNERS))
+        ring = [(x + reach * math.cos(turn), y + reach * math.sin(turn)) for turn in turns]
+        return SimObstacle(id=self.id, polygon=ring, height=robot.height)
+
+    def _on_state(self, ids: Ids, state: RobotState, at: Moment) -> Sequence[Publication]:
+        del ids
+        self.state = state
+        self.operator.on_state(state, at.now)
+        if self.drive is not None:
+            self.drive.on_state(state, at.now)
+        return ()
+
+    def _on_path(self, ids: Ids, path: RobotPath, at: Moment) -> Sequence[Publication]:
+        del ids
+        if self.drive is not None:
+            self.drive.on_path(path, at.now)
+        return ()
+
+
+class Fleet:
+    """A site with its fog node, its sensor nodes, and several robots."""
+
+    def __init__(self, site: LoadedSite, missions: Sequence[Mission], seed: int, cpu: CpuMeter) -> None:
+        """Assemble the system; `cpu` measures its components."""
+        robots = [mission.robot for mission in missions]
+        site = dataclasses.replace(site, site=msgspec.structs.replace(site.site, robots=robots))
+        self.bus = Bus(site.site.id)
+        self.vehicles = [
+            Vehicle(site, mission, self.bus, seed + number, cpu) for number, mission in enumerate(missions)
+        ]
+        self.fog = FogRig(site, self.vehicles[0].world, self.bus, seed, 0.0, measure=cpu.measure)
+        self.least_gap_m = math.inf
+        """The smallest distance between the rims of two robots so far."""
+        self._steps = 0
+
+    @property
+    def now(self) -> float:
+        """The emulated time, s."""
+        return self.vehicles[0].rig.now
+
+    def step(self) -> None:
+        """Simulate 10 ms."""
+        for vehicle in self.vehicles:
+            vehicle.rig.sense()
+        tick = self._steps % TICK_STEPS == 0
+        if tick:
+            self._move_bodies()
+        at = moment(self.now)
+        self.fog.measure(at.now)
+        self.fog.deliver(at)
+        for vehicle in self.vehicles:
+            vehicle.rig.act()
+        if tick:
+            self.fog.tick(at)
+            for vehicle in self.vehicles:
+                vehicle.rig.process.tick(at)
+            self.fog.deliver(at)
+        self._steps += 1
+        self._supervise(evaluate=tick)
+
+    def warm_up(self) -> str | None:
+        """Run until all robots are ready; return None, or which are not."""
+        waiting = self.vehicles
+        while self.now < READY_S:
+            self.step()
+            waiting = [v for v in self.vehicles if v.state is None or v.state.mode != "NORMAL"]
+            if not waiting:
+                return None
+        return f"not ready after {READY_S:.0f} s: {', '.join(vehicle.id for vehicle in waiting)}"
+
+    def start(self) -> None:
+        """Give all robots their goals."""
+        for vehicle in self.vehicles:
+            goal = RobotGoal(goal_id=f"to-{vehicle.id}", pose=Pose(x=vehicle.goal[0], y=vehicle.goal[1], theta=0.0))
+            vehicle.start(goal.goal_id)
+            self.fog.planner.set_goal(vehicle.id, goal, any_heading=True)
+
+    def _move_bodies(self) -> None:
+        """Let the robots stand where they are in one another's worlds."""
+        for one, other in itertools.permutations(self.vehicles, 2):
+            radii = one.world.robot.radius + other.world.robot.radius
+            gap = math.dist(one.world.pose[:2], other.world.pose[:2]) - radii
+            self.least_gap_m = min(self.least_gap_m, gap)
+            # A body that overlaps the robot stays where it was, 3 cm away: driving on is a contact.
+            if gap > 0.1 * radii:
+                one.world.place(other.body())
+
+    def _supervise(self, *, evaluate: bool) -> None:
+        if refused := self.bus.refused:
+            raise RuntimeError(f"the system refused messages of its own: {'; '.join(refused)}")
+        for vehicle in self.vehicles:
+            if evaluate:
+                vehicle.evaluate()
+            if self._steps % _OPERATOR_STEPS == 0:
+                vehicle.operate()

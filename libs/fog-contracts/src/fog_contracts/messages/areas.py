@@ -1,0 +1,131 @@
+"""Definitions of areas: the sensors that watch them, and their policies (MQTT, JSON)."""
+
+from typing import Annotated, Any, Literal
+
+from msgspec import Meta, field
+
+from fog_contracts.messages.basics import Count, Finite, Id, Message, Ring, Seconds
+
+
+class UnknownPolicy(Message, frozen=True, kw_only=True):
+    """When an area's nodes and sources are unknown, and the cost of an unknown area that was clear before.
+
+    One is unknown when it is silent for `silent_after_s` (a source with a period of its own: three of these), and when
+    it flaps: when it changes between blocked and clear more than `max_changes` times within a minute, until it keeps
+    one state for 5 s.
+    """
+
+    silent_after_s: Annotated[float, Meta(ge=0.5, le=3600.0)] = 3.0
+    penalty: Annotated[int, Meta(ge=0, le=254)] = 200
+    max_changes: Annotated[int, Meta(ge=1, le=1000)] = 30
+
+
+class AlertPolicy(Message, frozen=True, kw_only=True):
+    """After how long (s) people are told that an area is unknown or blocked, or a node or source unknown; 0: never."""
+
+    unknown_after_s: Seconds = 300.0
+    blocked_after_s: Seconds = 3600.0
+    node_after_s: Seconds = 120.0
+
+
+Topic = Annotated[str, Meta(min_length=1, max_length=200)]
+Pointer = Annotated[str, Meta(max_length=200, pattern=r"^(/([^/~]|~[01])*)*$(?!\n)")]
+"""A JSON pointer (RFC 6901); the empty one is the whole document."""
+Meaning = Annotated[list[str | bool | float], Meta(max_length=20)]
+"""Values that mean the same; texts are compared without regard to upper and lower case."""
+
+
+class Limits(Message, frozen=True, kw_only=True):
+    """What a number means: blocked above `above` or below `below`, clear when it is back by `hysteresis`.
+
+    Outside of `minimum` to `maximum` it is implausible. All in the sensor's own unit.
+    """
+
+    above: Finite | None = None
+    below: Finite | None = None
+    hysteresis: Annotated[float, Meta(ge=0.0, le=1e12)] = 0.0
+    minimum: Finite | None = None
+    maximum: Finite | None = None
+
+
+class Availability(Message, frozen=True, kw_only=True):
+    """A topic that says whether a sensor is connected; without `pointer` its payload is plain text."""
+
+    topic: Topic
+    pointer: Pointer | None = None
+    online: Meaning = field(default_factory=lambda: ["online"])
+    offline: Meaning = field(default_factory=lambda: ["offline"])
+
+
+Penalty = Annotated[int, Meta(ge=1, le=253)]
+"""The cost of an area that a blocked sensor makes costly instead of impassable."""
+
+
+class Quantity(Message, frozen=True, kw_only=True):
+    """What a node of Fognav measures besides ranges: its id, and the `kind` of its `NodeValue`, such as temperature."""
+
+    node: Id
+    kind: Id
+
+
+class Source(Message, frozen=True, kw_only=True):
+    """Any sensor that speaks MQTT, or a quantity that a node measures, as evidence for an area.
+
+    `topic` may contain wildcards. `pointer` is where its payload, a JSON document, has the value (None: the payload is
+    plain text); `blocked` and `clear` are what it means, or `number` for a number. A `profile` gives all that is not
+    given here, with `device` for the name in its topics. `period_s` is the time between two messages; without one the
+    sensor publishes on change, and needs an `availability`. With a `penalty`, a blocked sensor makes the area costly
+    instead of impassable. `debounce` as in an area; without it each message counts. A `quantity` has no topic, but the
+    limits of its `number`.
+    """
+
+    id: Id
+    profile: Id | None = None
+    device: Annotated[str, Meta(max_length=100)] = ""
+    topic: Topic | None = None
+    pointer: Pointer | None = None
+    blocked: Meaning = []
+    clear: Meaning = []
+    number: Limits | None = None
+    availability: Availability | None = None
+    period_s: Annotated[float, Meta(gt=0.0, le=86_400.0, extra={"unit": "s"})] | None = None
+    penalty: Penalty | None = None
+    debounce: dict[str, Any] = {}
+    quantity: Quantity | None = None
+
+
+class FusionPolicy(Message, frozen=True, kw_only=True):
+    """When an area's nodes and sources together mean blocked: `any`, `all`, or those whose weights reach `at_least`.
+
+    `quorum` counts them; `weighted` adds their `weights` (1 for one that is not named). The area is clear once those
+    that are unknown could not make it blocked.
+    """
+
+    rule: Literal["any", "all", "quorum", "weighted"] = "any"
+    at_least: Annotated[float, Meta(gt=0.0, le=1000.0)] = 1.0
+    weights: dict[Id, Annotated[float, Meta(ge=0.0, le=1000.0)]] = {}
+
+
+class AreaDefinition(Message, frozen=True, kw_only=True):
+    """An area: its polygon, the nodes and sources that watch it, and how their readings are debounced and fused.
+
+    With `cone_of` the polygon is what the sonars of that node see. `number` identifies it on the thesis's topics.
+    `debounce` holds the rule's name (`rule`) and its options. With a `penalty`, nodes and sources make it costly
+    instead of impassable. `epoch` is that of the aggregator that publishes it.
+    """
+
+    id: Id
+    label: Annotated[str, Meta(max_length=100)] = ""
+    polygon: Ring
+    cone_of: Id | None = None
+    nodes: list[Id] = []
+    sources: list[Source] = []
+    number: Annotated[int, Meta(ge=0, le=9999)] | None = None
+    debounce: dict[str, Any] = {}
+    fusion: FusionPolicy = FusionPolicy()
+    unknown: UnknownPolicy = UnknownPolicy()
+    alerts: AlertPolicy = AlertPolicy()
+    penalty: Penalty | None = None
+    version: Count = 0
+    removed: bool = False
+    epoch: Count = 0

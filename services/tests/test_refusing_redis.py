@@ -87,9 +87,15 @@ async def operator(fog, tokens):
         yield made
 
 
+BY_THE_SERVICES = ("lease", "epoch", "floor", "ready", "hazards", "history", "override_rests", "alerts", "alert")
+"""Words in keys of what the services write by themselves, at their own times, whatever an operator does: leases, what has
+become of an area, its alerts, and the time that is left of an override."""
+
+
 async def records(raw) -> dict[bytes, bytes]:
-    """Return all that is stored, without leases, which are renewed all the time, and what a hazard has become."""
-    keys = [key for key in await raw.keys("*") if not key.endswith((b":lease", b":epoch", b":hazards", b":history"))]
+    """Return all that is stored for operators."""
+    keys = [key for key in await raw.keys("*") if not set(key.decode().split(":")) & set(BY_THE_SERVICES)]
+    assert keys
     return {key: await raw.dump(key) for key in sorted(keys)}
 
 

@@ -88,8 +88,8 @@ async def operator(fog, tokens):
 
 
 BY_THE_SERVICES = ("lease", "epoch", "floor", "ready", "hazards", "history", "override_rests", "alerts", "alert")
-"""Words in keys of what the services write by themselves, at their own times, whatever an operator does: leases, what has
-become of an area, its alerts, and the time that is left of an override."""
+"""Words in keys of what the services write by themselves, at their own times, whatever an operator does: leases, what
+has become of an area, its alerts, and the time that is left of an override."""
 
 
 async def records(raw) -> dict[bytes, bytes]:

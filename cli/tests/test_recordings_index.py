@@ -112,6 +112,27 @@ def test_backup_is_restored_on_an_empty_machine_and_tells_which_recordings_are_g
     assert [each["path"] for each in json.loads(index.read_bytes())] == ["cut.mcap", "morning/drive.mcap"]
 
 
+def test_index_that_can_not_be_written_is_told_and_the_rest_is_backed_up(data, tmp_path):
+    folder, site = NodeFolder(data), shutil.copytree(ESTIG, tmp_path / "site")
+    hosted_sites([site], folder.locks, ["localhost", "127.0.0.1"])
+    token = (folder.keys("estig") / "admin.token").read_bytes()
+    settings.remember(folder.path, settings.settings_of({"estig": site}, "127.0.0.1", [], simulate=False))
+    recordings.index_folder(folder.path).write_text("a file in the place of the folder")
+    file = tmp_path / "fog.tar.gz"
+    done = subprocess.run(
+        [sys.executable, "-m", "fognav", "backup", str(file), "--up", str(data)],
+        capture_output=True, text=True, timeout=120, check=False,
+    )  # fmt: skip
+    assert done.returncode == 1, done.stderr
+    assert "backed up site estig" in done.stderr
+    assert f"{file} is complete but for the index of the recordings" in done.stderr.replace("\n", " ")
+    assert f"{data / 'recordings' / 'index'} (File exists)" in done.stderr.replace("\n", " ")
+    other = NodeFolder(tmp_path / "other")
+    made = asyncio.run(backups.restore(file, other, tmp_path / "restored", replace=False))
+    assert (other.path / "keys" / "estig" / "admin.token").read_bytes() == token
+    assert (made.missing, recordings.FOLDER in made.backup.folders) == ([], False)
+
+
 def test_recordings_of_a_later_backup_are_named_though_another_floor_s_index_is_there(data, tmp_path):
     folder, site = NodeFolder(data), shutil.copytree(ESTIG, tmp_path / "site")
     hosted_sites([site], folder.locks, ["localhost", "127.0.0.1"])

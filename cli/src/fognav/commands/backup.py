@@ -5,7 +5,7 @@ import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
@@ -16,6 +16,9 @@ from fog_runtime.configuration.site import SiteError, load_site
 from fognav import checkout
 from fognav.locking import locks_errors, own_credentials
 from fognav.output import FailedError, WrongUseError, check_writable, exit_codes, print_line
+
+if TYPE_CHECKING:
+    from fognav.hosting.backups import Created
 
 FileArgument = Annotated[Path, typer.Argument(metavar="FILE", help="The backup, a tar.gz that only you can read.")]
 RedisOption = Annotated[str, typer.Option("--redis", envvar="FOGNAV_REDIS_URL", help="Redis of the fog node.")]
@@ -46,13 +49,16 @@ def backup_command(
     """Back up a fog node into one file, while it runs."""
     with exit_codes(), backup_errors():
         check_writable(file)
+        no_index = None
         if up is not None:
-            made = _create_of_node(file, up, site)
+            made, no_index = _create_of_node(file, up, site)
         else:
             folder = _required(site, "--site")
             place = _place(redis, load_site(folder).site.id, folder, secrets, _required(data, "--data"))
             made = asyncio.run(backup.create(file, place, time.time()))
         _report("backed up", made, file)
+        if no_index is not None:
+            raise FailedError(f"{file} is complete but for the index of the recordings: {no_index}. Then repeat it")
 
 
 def restore_command(  # noqa: PLR0913  # each option is an argument
@@ -102,7 +108,7 @@ def _named(site: Path | None) -> Path | None:
         return site
 
 
-def _create_of_node(file: Path, up: Path, site: Path | None) -> Backup:
+def _create_of_node(file: Path, up: Path, site: Path | None) -> "Created":
     from fognav.hosting.backups import create  # noqa: PLC0415  # keeps the other commands fast
     from fognav.hosting.folders import NodeFolder  # noqa: PLC0415  # same
 

@@ -30,6 +30,13 @@ LOCKS: Final = "locks"
 _READY_S: Final = 60.0
 
 
+class Created(NamedTuple):
+    """What a backup has; `no_index` says why it lacks the index of the recordings, if it does."""
+
+    backup: Backup
+    no_index: str | None
+
+
 class Restored(NamedTuple):
     """What a restore has done.
 
@@ -57,12 +64,24 @@ def site_of(folder: NodeFolder, directory: Path | None) -> tuple[str, Path]:
     return next(iter(found.items()))
 
 
-async def create(file: Path, folder: NodeFolder, directory: Path | None) -> Backup:
-    """Back up a site of a node, which may be running; raises as `site_of`, `redis_of` and `backup.create`."""
+async def create(file: Path, folder: NodeFolder, directory: Path | None) -> Created:
+    """Back up a site of a node, which may be running; raises as `site_of`, `redis_of` and `backup.create`.
+
+    An index of the recordings that can't be written is left out: what people decided, and the keys, matter more.
+    """
     site, path = site_of(folder, directory)
-    await asyncio.to_thread(recordings.write_index, folder.path)
+    no_index = None
+    try:
+        await asyncio.to_thread(recordings.write_index, folder.path)
+    except OSError as error:
+        no_index = (
+            f"the index of {folder.path / recordings.FOLDER} can't be written to "
+            f"{recordings.index_folder(folder.path)} ({error.strerror or error}): make room there, or grant access"
+        )
     async with _redis(folder, site, path) as place:
-        return await backup.create(file, place, time.time())
+        if no_index is not None:  # an older index would name as missing what was deleted since
+            del place.folders[recordings.FOLDER]
+        return Created(await backup.create(file, place, time.time()), no_index)
 
 
 async def restore(file: Path, folder: NodeFolder, directory: Path, *, replace: bool) -> Restored:

@@ -97,7 +97,9 @@ class Upgrade:
         files = []
         for site, directory in self._settings.sites.items():
             files.append(folder / f"{stamp}-{site}.tar.gz")
-            asyncio.run(backups.create(files[-1], self._folder, Path(directory)))
+            made = asyncio.run(backups.create(files[-1], self._folder, Path(directory)))
+            if made.no_index is not None:  # its data is copied aside, too
+                self._print_line(f"{files[-1]} lacks the index of the recordings: {made.no_index}")
         return files
 
     def _try_start(self) -> None:

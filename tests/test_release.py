@@ -92,3 +92,35 @@ def test_upgrade_finds_the_newest_of_the_releases(checkout):
         log.write_text(log.read_text().replace("## [Unreleased]\n", "## [Unreleased]\n- More.\n", 1))
     assert Versions(checkout).newest() == git(checkout, "rev-parse", "v0.10.0^{commit}")
     assert git(checkout, "show", "v0.10.0:VERSION") == "0.10.0"
+
+
+def test_without_tags_the_releases_of_the_history_are_found_by_what_they_wrote(checkout):
+    log, versions = checkout / "CHANGELOG.md", Versions(checkout)
+    git(checkout, "init", "--quiet", "--initial-branch", "main")
+
+    def commit(subject: str) -> str:
+        git(checkout, "add", "-A")
+        git(checkout, "commit", "--quiet", "-m", subject)
+        return git(checkout, "rev-parse", "HEAD")
+
+    log.write_text("# Changelog\n\n## [Unreleased]\n- One.\n")
+    commit("Keep the version in a file, which releases nothing yet")
+    assert versions.releases() == []
+    releases = []
+    for version in ("0.9.0", "0.10.0"):
+        assert release(checkout, version).returncode == 0
+        releases.insert(0, (version, commit(f"Release {version}")))
+        log.write_text(log.read_text().replace("## [Unreleased]\n", "## [Unreleased]\n- More.\n", 1))
+        commit("Something else")
+    log.write_text(log.read_text().replace("2027-01-31", "2027-02-01"))
+    commit("Correct the dates of the releases")
+    assert versions.releases() == releases
+
+    # A clone fetches them with its branch; what is not released yet is none of its upgrade's business.
+    clone = checkout / "clone"
+    git(checkout, "clone", "--quiet", str(checkout), str(clone))
+    git(clone, "reset", "--quiet", "--hard", releases[1][1])
+    assert Versions(clone).newest() == releases[0][1]
+    assert Versions(clone).releases() == releases[1:]
+    git(clone, "merge", "--quiet", "--ff-only", "origin/main")
+    assert Versions(clone).contains(Versions(clone).newest())

@@ -17,6 +17,8 @@ import psutil
 import pytest
 
 from fog_supervisor import net
+from fognav.hosting.versions import Versions
+from fognav.output import FailedError, WrongUseError
 
 pytestmark = [pytest.mark.live, pytest.mark.timeout(300)]
 
@@ -213,27 +215,43 @@ def test_two_floors_on_one_node_have_a_robot_each_and_share_no_hazard(tmp_path):
         node.end()
 
 
-def older_release() -> str | None:
-    """Return the version to upgrade from: FOGNAV_UPGRADE_FROM, or the newest release before this one that git has."""
+def older_release() -> str:
+    """Return the version to upgrade from: FOGNAV_UPGRADE_FROM, or the newest release before this commit.
+
+    Raises `FailedError` and `WrongUseError` where git does not know it.
+    """
     if chosen := os.environ.get("FOGNAV_UPGRADE_FROM"):
         return chosen
-    if shutil.which("git") is None:
-        return None
-    command = ["git", "-C", str(ROOT), "tag", "--list", "v*", "--sort=-version:refname", "--merged", "HEAD"]
-    done = subprocess.run([*command, "--no-contains", "HEAD"], capture_output=True, text=True, check=False)
-    return next(iter(done.stdout.split()), None)
+    versions = Versions(ROOT)
+    current, releases = versions.current(), versions.releases()
+    if not releases:
+        raise FailedError("this history has no release: fetch it whole, or set FOGNAV_UPGRADE_FROM")
+    # Before the first release, the version before it is known by its last commit only.
+    return next((release.commit for release in releases if release.commit != current), f"{current}^")
 
 
-OLDER = older_release()
+def git(*arguments: str) -> subprocess.CompletedProcess[bytes]:
+    return subprocess.run(["git", "-C", str(ROOT), *arguments], capture_output=True, check=False)
+
+
+def no_older_release() -> str | None:
+    """Return why there is no older release to upgrade from, or None."""
+    try:
+        found = git("cat-file", "-e", f"{older_release()}^{{tree}}")
+    except (FailedError, WrongUseError) as error:
+        return str(error)
+    return None if found.returncode == 0 else f"git lacks the older release: {found.stderr.decode().strip()}"
+
+
+NO_OLDER_RELEASE = no_older_release()
 
 
 @pytest.mark.timeout(1800)  # each version compiles its kernels once
-@pytest.mark.skipif(OLDER is None, reason="git has no tag of an older release: fetch them, or set FOGNAV_UPGRADE_FROM")
+@pytest.mark.skipif(NO_OLDER_RELEASE is not None, reason=NO_OLDER_RELEASE or "")
 def test_data_of_an_older_version_is_used_by_this_one(node, tmp_path):
     node.source = tmp_path / "older"
     node.source.mkdir()
-    packed = subprocess.run(["git", "-C", str(ROOT), "archive", str(OLDER)], capture_output=True, check=True).stdout
-    subprocess.run(["tar", "-x", "-C", str(node.source)], input=packed, check=True)
+    subprocess.run(["tar", "-x", "-C", str(node.source)], input=git("archive", older_release()).stdout, check=True)
     node.options = ("--site", str(node.source / "sites" / "estig"))
     node.up()
     node.run("zone", "add", "--circle", "90,20,1", "--reason", "wet floor")

@@ -36,6 +36,12 @@ def upgrade_command(
         if to == current:
             print_line(f"this is {current[:12]} already: nothing to upgrade")
             return
+        if revision is None and versions.contains(to):
+            print_line(
+                f"{current[:12]} has the newest release, {to[:12]}, and more: nothing to upgrade. Name a branch to "
+                "follow what is not released yet (fognav upgrade main)"
+            )
+            return
         changes = versions.changes(to)
         print_line(f"from {current[:12]} to {to[:12]}: {len(changes)} changes (CHANGELOG.md tells what they mean)")
         for subject in changes[:_SHOWN]:

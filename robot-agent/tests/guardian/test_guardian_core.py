@@ -44,6 +44,7 @@ class Rig:
     latched: str | None = None
     damage: int | None = None
     silent: bool = False
+    moved: bool = False
     not_receiving: bool = False
     feedback: list = field(default_factory=list)
 
@@ -52,11 +53,15 @@ class Rig:
         for opcode, argument in commands(output.data):
             if opcode == 131:
                 assert self.resetting or self.latched is None, "woken although a fault is latched"
+            if opcode == 128:
+                assert self.resetting or not self.moved, "woken without a reset although it has moved"
+                self.moved = False
             if opcode in {128, 131}:
                 self.wheels, self.wheels_at = (0.0, 0.0), self.now
             if opcode == 145:
                 right, left = (speed / 1000 for speed in struct.unpack(">hh", argument))
                 self.check_speeds(left, right)
+                self.moved |= (left, right) != (0.0, 0.0)
                 self.wheels, self.wheels_at = (left, right), self.now
         if output.data and not self.not_receiving:
             self.base.receive(output.data, self.now)
@@ -286,6 +291,23 @@ def test_silent_base_is_a_fault_that_is_reported_repeatedly():
     rig.command(0.0, 0.0, reset=True)
     rig.run(0.3)
     rig.drive(0.3)
+    assert rig.base.wheel_speeds_m_s == (0.3, 0.3)
+
+
+def test_base_that_falls_silent_before_it_moved_is_woken_without_a_reset_and_drives_when_it_is_back():
+    rig = ready_rig()
+    rig.silent = True
+    for _ in range(40):
+        waiting = bool(rig.feedback[-1].fault)
+        rig.command(*((0.3, 0.3) if waiting else (0.0, 0.0)))
+        rig.run(0.05)
+        assert rig.wheels == (0.0, 0.0)
+    assert rig.core.latched is None
+    assert "no valid frame" in rig.feedback[-1].fault
+    rig.silent = False
+    rig.run(1.5)
+    assert rig.feedback[-1].fault is None
+    rig.drive(0.5)
     assert rig.base.wheel_speeds_m_s == (0.3, 0.3)
 
 

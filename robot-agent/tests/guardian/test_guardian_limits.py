@@ -62,7 +62,7 @@ def test_no_wheel_is_faster_than_the_limit_or_its_base(limits, top_speed) -> Non
 @pytest.mark.parametrize(("silent_s", "faulty"), [(0.299, False), (0.301, True)])
 def test_base_may_be_silent_for_its_timeout_of_0_3_s(silent_s, faulty) -> None:
     rig = Rig()
-    rig.frame(1.0)
+    rig.drive(0.1, 1.0)
     rig.core.tick(1.0 + silent_s)
     assert (rig.core.latched is not None) == faulty
     if faulty:

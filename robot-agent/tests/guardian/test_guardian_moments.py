@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import msgspec
 import pytest
-from plain_base import PlainBase, Rig
+from plain_base import DockingBase, PlainBase, Rig
 
 from robot_agent.guardian import link
 from robot_agent.guardian.core import GuardianCore
@@ -121,8 +121,8 @@ def test_charging_base_that_is_awake_stands_and_says_why() -> None:
 
 
 def test_base_is_silent_after_0_3_s_and_not_at_it() -> None:
-    rig = Rig(begin=-0.2, awake=False)
-    rig.frame(0.0)
+    rig = Rig(begin=-1.0)
+    rig.drive(-0.9, 0.0)
     rig.core.tick(0.3)
     assert rig.core.latched is None
     rig.core.tick(0.3001)
@@ -131,16 +131,87 @@ def test_base_is_silent_after_0_3_s_and_not_at_it() -> None:
 
 def test_silent_base_is_stopped_at_once_then_every_0_05_s_and_reported_every_0_045_s() -> None:
     rig = Rig(begin=-1.0)
-    rig.frame(-0.5)
+    rig.drive(-0.9, -0.5)
     outputs = {now: rig.core.tick(now) for now in (0.0, 0.02, 0.0449, 0.045, 0.0499, 0.05, 0.07)}
     assert [now for now, output in outputs.items() if output.data] == [0.0, 0.05]
     assert [now for now, output in outputs.items() if output.feedback] == [0.0, 0.045]
     assert outputs[0.0].feedback[0].fault == rig.core.latched
     late = Rig(begin=99.0)
-    late.frame(99.2)
+    late.drive(99.1, 99.2)
     outputs = {now: late.core.tick(now) for now in (100.0, 100.01)}
     assert (outputs[100.0].data, outputs[100.01].data) == (STAND, b"")
     assert outputs[100.01].feedback == ()
+
+
+SILENCE = "the base has sent no valid frame for 0.3 s: check cable and power"
+
+
+def test_base_that_has_not_moved_is_woken_again_when_it_falls_silent_and_its_fault_ends_with_its_silence() -> None:
+    rig = Rig(begin=-0.2)
+    rig.frame(0.0)
+    rig.command(0.25, 0.0, 0.0)
+    assert b"wake" not in rig.core.tick(0.3).data
+    silent = rig.core.tick(0.3001)
+    assert silent.data == b"wake;"
+    (told,) = silent.feedback
+    assert (told.fault, told.stopped, told.bumped) == (SILENCE, "the base is not ready to drive yet", False)
+    assert rig.core.latched is None
+    assert rig.command(0.32, 0.3, 0.3).data == b""
+    assert rig.core.tick(0.35).feedback[0].fault == SILENCE
+    assert not rig.core.moving
+    assert rig.frame(0.36).feedback[-1].fault is None
+    assert rig.command(0.37, 0.3, 0.3).data == b"", "a frame from before the wake-up makes no base awake"
+    rig.frame(0.41)
+    assert rig.drive(0.43, 0.6, 0.1, 0.1) == (0.1, 0.1)
+    rig.core.tick(0.9001)
+    assert rig.core.latched == SILENCE
+
+
+def test_silent_base_that_has_not_moved_is_woken_every_second_and_its_revival_is_tried() -> None:
+    rig = Rig(begin=-0.2, base=PlainBase(awakening=Awakening(bauds=(115_200,), line=RTS)))
+    rig.frame(0.0)
+    outputs = {now: rig.core.tick(now) for now in (round(0.02 * step, 2) for step in range(1, 1000))}
+    woken = [now for now, output in outputs.items() if b"wake" in output.data]
+    assert woken[:4] == [0.32, 1.34, 2.36, 3.38]
+    assert next(output.attempt.line for output in outputs.values() if output.attempt is not None) == RTS
+    assert rig.core.unanswered == "the base does not answer at 115200 baud: check its cable and power"
+    assert rig.core.latched is None
+
+
+@pytest.mark.parametrize("wheels", [(0.01, 0.0), (0.0, 0.01), (-0.01, 0.0)])
+def test_silence_is_latched_once_either_wheel_was_told_to_turn_even_long_ago(wheels) -> None:
+    rig = Rig(begin=-1.0)
+    rig.drive(-0.9, -0.5, *wheels)
+    rig.drive(-0.48, 5.0, 0.0, 0.0)
+    rig.core.tick(5.3001)
+    assert rig.core.latched == SILENCE
+
+
+def test_base_that_a_reset_has_woken_counts_as_not_moved() -> None:
+    rig = Rig(begin=-1.0)
+    rig.drive(-0.9, 0.0)
+    rig.core.tick(0.3001)
+    assert rig.command(0.4, 0.0, 0.0, reset=True).data == b"wake;"
+    rig.frame(0.6)
+    rig.core.tick(1.0)
+    assert rig.core.latched is None
+
+
+def test_latched_fault_of_a_base_that_has_not_moved_outlasts_its_silence() -> None:
+    rig = Rig(begin=-0.2)
+    rig.frame(0.0, bumper_left=True)
+    assert rig.core.tick(0.301).data == STAND
+    assert rig.core.latched == "the bumper is pressed (left)"
+    assert rig.frame(0.4).feedback[-1].fault == "the bumper is pressed (left)"
+
+
+def test_silence_on_the_way_off_the_dock_is_latched() -> None:
+    leaving = Rig(base=DockingBase())
+    leaving.frame(1.0, docked=True, charging=True)
+    assert b"full;" in leaving.command(1.0, -0.1, -0.1, maneuver="leave_dock").data
+    leaving.command(1.25, -0.1, -0.1, maneuver="leave_dock")
+    leaving.core.tick(1.3001)
+    assert leaving.core.latched == SILENCE
 
 
 def test_first_fault_is_answered_with_a_stop_even_if_zero_was_sent_a_moment_ago() -> None:

@@ -3,7 +3,8 @@
 The guardian trusts no other process. A command of the agent moves the wheels only while it is fresh; bumper, cliff,
 wheel drop, a base that leaves its driving mode or falls silent stop them with their sensor frame, latched until the
 agent passes on an operator's reset. A base may keep its last velocity when the host is silent, so "stop" is always a
-command, repeated.
+command, repeated. Only the silence of a base that has not moved since it was woken is a fault no longer than it lasts:
+such a base is woken again.
 
 The agent latches a fault too as soon as it receives the guardian's, so the fault survives the end of either process.
 When both end, the robot starts in INIT, and an operator must enable it as after any boot.
@@ -70,6 +71,10 @@ class _Base:
     overcurrent_since: float | None = None
     restrained: bool = False
     """Whether it drove by itself, or without its own protection, and has not reported its driving mode since."""
+    moved: bool = False
+    """Whether a wheel was told to turn, or might turn by itself, since it was woken."""
+    silence: str | None = None
+    """The fault of a base that fell silent before it moved, until its next frame."""
 
     def blocked_for(self, now: float) -> float:
         """Return for how long (s) a wheel motor has been drawing too much current."""
@@ -133,7 +138,7 @@ class GuardianCore:
         stop = b""
         while (reading := self.driver.next_event()) is not None:
             self.frames += 1
-            self._base.reading, self._base.reading_at = reading, now
+            self._base.reading, self._base.reading_at, self._base.silence = reading, now, None
             self._revival.on_answer()
             stop += self._check(reading.status, now)
             state = (self._latched, self._base.awake, self._maneuvers.running, self._maneuvers.problem)
@@ -187,8 +192,12 @@ class GuardianCore:
             return Output(self._restrain(now) if repeat else b"", self._reminder(now))
         silent = now - base.reading_at
         if silent > timing.frame_timeout:
-            data = self._latch(f"the base has sent no valid frame for {silent:.1f} s: check cable and power", now)
-            return Output(data, self._reminder(now))
+            reason = f"the base has sent no valid frame for {silent:.1f} s: check cable and power"
+            if not base.moved and self._latched is None:
+                # Nothing that must be stopped has begun, so it is waited for as at its start (ADR 34).
+                base.awake, base.silence = False, reason
+                return Output(self._wake(now), self._reminder(now))
+            return Output(self._latch(reason, now), self._reminder(now))
         return self._drive(now)
 
     def stop_command(self) -> bytes:
@@ -213,7 +222,7 @@ class GuardianCore:
         return fresh and self._base.reading is not None and self._base.reading.status.charging
 
     def _wake(self, now: float) -> bytes:
-        self._base.woken_at, self._base.restrained = now, False
+        self._base.woken_at, self._base.restrained, self._base.moved = now, False, False
         self._wheels, self._sent, self._sent_at = (0.0, 0.0), (0.0, 0.0), now
         return self.driver.wake()
 
@@ -282,6 +291,7 @@ class GuardianCore:
 
     def _drive(self, now: float) -> Output:
         begun = self._maneuver(now)
+        self._base.moved |= self._maneuvers.running is not None
         if not self._base.awake or self._maneuvers.is_running("seek_dock"):
             return Output(begun)
         elapsed = 0.0 if self._stepped_at is None else max(0.0, min(now - self._stepped_at, STEP_S))
@@ -306,6 +316,7 @@ class GuardianCore:
 
     def _send(self, wheels: tuple[float, float], now: float) -> bytes:
         self._sent, self._sent_at = wheels, now
+        self._base.moved |= wheels != (0.0, 0.0)
         return self.driver.drive(*wheels)
 
     def _reminder(self, now: float) -> tuple[BaseFeedback, ...]:
@@ -318,7 +329,7 @@ class GuardianCore:
             seq=self._feedback.on_report(reading, now),
             status=reading.status,
             odometry=reading.odometry,
-            fault=self._latched,
+            fault=self._latched or self._base.silence,
             stopped=self._stopped(now),
             corrupted=self.corrupted,
             bumped=self._bumped,

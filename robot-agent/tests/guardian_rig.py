@@ -15,6 +15,7 @@ from contextlib import ExitStack
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from fog_supervisor import child
 from fognav_sim.pty_port import PtyPort
 from robot_agent.bases.roomba600.emulator import RoombaEmulator
 from robot_agent.guardian.link import WheelCommand, decode_reply, encode
@@ -142,8 +143,9 @@ class Watchdog:
     def start(self) -> None:
         with self.log_file.open("ab") as log:
             self.process = subprocess.Popen(
-                [sys.executable, "-m", "robot_agent.guardian.watchdog"], env=self.environment, stderr=log, stdout=log
-            )
+                child.command(sys.executable, "-m", "robot_agent.guardian.watchdog"), env=self.environment, stderr=log,
+                stdout=log,
+            )  # fmt: skip
 
     def __exit__(self, *_):
         if self.process.poll() is None:

@@ -25,6 +25,7 @@ from fog_runtime.access.credentials import Credentials
 from fog_runtime.clock import SystemClock
 from fog_runtime.record import read
 from fog_runtime.transports.zenoh_edge import ZenohEdge
+from fog_supervisor import child
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
@@ -70,7 +71,7 @@ class Command:
         command = [sys.executable, "-m", "fognav", "demo", "--headless", "--report", str(self.report), *options]
         with self._output.open("wb") as output:
             self.process = subprocess.Popen(
-                command, stdin=subprocess.DEVNULL, stdout=output, stderr=output, process_group=0
+                child.command(*command), stdin=subprocess.DEVNULL, stdout=output, stderr=output, process_group=0
             )
 
     @property

@@ -21,7 +21,7 @@ from PIL import Image
 
 from fog_contracts.costs import LETHAL
 from fog_runtime.configuration.site import load_site
-from fog_supervisor import net
+from fog_supervisor import child, net
 from fog_supervisor.servers import start_mosquitto, start_redis, start_router
 
 pytestmark = [
@@ -108,7 +108,9 @@ class Lab:
     def simulate(self, command: str) -> None:
         self.end_node()
         with (self.folder / "node.log").open("wb") as log:
-            self.node = subprocess.Popen(self.words(command), cwd=ROOT, env=self.environment, stdout=log, stderr=log)
+            self.node = subprocess.Popen(
+                child.command(*self.words(command)), cwd=ROOT, env=self.environment, stdout=log, stderr=log
+            )
         self.wait(lambda: self.listed("nodes")["n8"]["age_s"] is not None, "the node is heard")
 
     def listed(self, what: str) -> dict[str, Any]:

@@ -21,7 +21,7 @@ import yaml
 from driver import LiveSystem
 
 from fog_contracts.messages import SimCommand, SimObstacle
-from fog_supervisor import net
+from fog_supervisor import child, net
 from fognav.programs import AGENT, MAP_SERVICE, SERVICES
 
 if TYPE_CHECKING:
@@ -67,8 +67,10 @@ class Prometheus:
         self.log = folder / "prometheus.log"
         with self.log.open("wb") as log:
             self.process = subprocess.Popen(
-                ["prometheus", f"--config.file={file}", f"--storage.tsdb.path={folder / 'data'}",
-                 f"--web.listen-address=127.0.0.1:{self.port}"], stdout=log, stderr=log,
+                child.command(
+                    "prometheus", f"--config.file={file}", f"--storage.tsdb.path={folder / 'data'}",
+                    f"--web.listen-address=127.0.0.1:{self.port}",
+                ), stdout=log, stderr=log,
             )  # fmt: skip
 
     def wait_ready(self) -> None:

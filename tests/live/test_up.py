@@ -16,7 +16,7 @@ from typing import Any
 import psutil
 import pytest
 
-from fog_supervisor import net
+from fog_supervisor import child, net
 from fognav.hosting.versions import Versions
 from fognav.output import FailedError, WrongUseError
 
@@ -52,8 +52,9 @@ class Node:
         environment = {**self.environment, "PYTHONPATH": os.pathsep.join(map(str, found))}
         with self.printed.open("wb") as output:
             self.process = subprocess.Popen(
-                [*command, *self.options], env=environment, stdin=subprocess.DEVNULL, stdout=output, stderr=output
-            )
+                child.command(*command, *self.options), env=environment, stdin=subprocess.DEVNULL, stdout=output,
+                stderr=output,
+            )  # fmt: skip
         self.wait(lambda: "is up:" in self.printed.read_text(), "it is up")
 
     def run(self, *arguments: str) -> str:

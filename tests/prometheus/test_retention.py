@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 import yaml
 
-from fog_supervisor import net
+from fog_supervisor import child, net
 
 pytestmark = [
     pytest.mark.live,
@@ -40,7 +40,7 @@ def test_prometheus_keeps_samples_for_the_time_and_the_size_of_the_settings(tmp_
     address = f"127.0.0.1:{port}"
     command = ["prometheus", f"--config.file={file}", f"--storage.tsdb.path={tmp_path / 'data'}", *flags(chosen)]
     with (tmp_path / "log").open("wb") as log:
-        server = subprocess.Popen([*command, f"--web.listen-address={address}"], stdout=log, stderr=log)
+        server = subprocess.Popen(child.command(*command, f"--web.listen-address={address}"), stdout=log, stderr=log)
     try:
         deadline = time.monotonic() + 60.0
         while True:

@@ -12,7 +12,8 @@ import pytest
 from fog_supervisor.supervisor import Event, NotReadyError, Program, Supervisor, log_tail
 
 pytestmark = pytest.mark.live
-DEADLINE_S = 10.0
+DEADLINE_S = 60.0
+"""For any wait, which ends with what it waits for."""
 
 
 async def until(condition: Callable[[], bool], what: str) -> None:

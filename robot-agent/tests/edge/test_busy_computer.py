@@ -16,6 +16,7 @@ import pytest
 from agent_rig import ROBOT, SITE, Robot, until
 from locked_servers import locked_router
 
+from fog_supervisor import child
 from robot_agent.guardian.protection import run_in_real_time
 
 BURST_S = float(os.environ.get("FOGNAV_BURST_S", "4"))
@@ -37,7 +38,7 @@ def busy_cores():
     """Run an endless loop per core; yield its processes."""
     # Who may not give the devices priority over the loops must take it from the loops.
     nice = 0 if run_in_real_time(_DEVICES).startswith("SCHED_RR") else 10
-    loops = [subprocess.Popen([sys.executable, "-c", _LOOP.format(nice)]) for _ in os.sched_getaffinity(0)]
+    loops = [subprocess.Popen(child.command(sys.executable, "-c", _LOOP.format(nice))) for _ in os.sched_getaffinity(0)]
     try:
         yield loops
     finally:

@@ -2,6 +2,8 @@
 
 A separate program, because code between fork and exec may hang in a process with threads (zenoh has some). It imports
 little, because it delays every start.
+
+To the kernel the parent is the thread that started the program: start it from one that lives as long as the process.
 """
 
 import ctypes
@@ -10,6 +12,11 @@ import signal
 import sys
 
 _PR_SET_PDEATHSIG = 1
+
+
+def command(*arguments: str) -> list[str]:
+    """Return the command line of a program that ends with this process, even when that is killed."""
+    return [sys.executable, "-I", "-S", __file__, str(os.getpid()), *arguments]
 
 
 def main(arguments: list[str]) -> None:
@@ -22,7 +29,7 @@ def main(arguments: list[str]) -> None:
     if os.getppid() != parent:
         # The parent died before the request: the kernel will not send the signal.
         raise SystemExit(1)
-    os.execv(arguments[1], arguments[1:])  # noqa: S606  # executing the given program is the purpose
+    os.execvp(arguments[1], arguments[1:])  # noqa: S606  # executing the given program is the purpose
 
 
 if __name__ == "__main__":

@@ -12,11 +12,12 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
 from typing import IO, Final, Self
 
-from fog_supervisor import configurations
+from fog_supervisor import child, configurations
 from fog_supervisor.embedded import STORE, valkey_server
 from fog_supervisor.net import LOOPBACK, free_port, reachable, unverified
 
@@ -27,6 +28,8 @@ _ATTEMPTS: Final = 5
 """Ports to try: another process may take one between its choice and its use."""
 _SERVER_FOLDERS: Final = ("/usr/sbin", "/usr/local/sbin", "/opt/homebrew/sbin", "/opt/homebrew/bin")
 """Debian keeps servers in /usr/sbin, which is not on every user's path."""
+_STARTING: Final = ThreadPoolExecutor(1, "starts servers")
+"""The thread that starts them, which lives as long as the process: a server ends with the thread that started it."""
 
 
 class ServerError(RuntimeError):
@@ -163,7 +166,10 @@ def _text(path: Path | None) -> str | None:
 
 
 class Server:
-    """A running server process; a context manager that stops it. For use from one thread."""
+    """A running server process; a context manager that stops it. For use from one thread at a time.
+
+    On Linux it ends with this process, even when that is killed.
+    """
 
     def __init__(self, program: ServerProgram, folder: Path) -> None:
         """Start it at once, in `folder`, and wait until it is ready; raises `ServerError`."""
@@ -213,7 +219,7 @@ class Server:
         if self.running():
             return
         with self.log.open("ab") as log:
-            self._process = self._spawn(log)
+            self._process = _STARTING.submit(self._spawn, log).result()
         deadline = time.monotonic() + _READY_S
         while not self.program.ready():
             if self._process.poll() is not None or time.monotonic() > deadline:
@@ -225,7 +231,7 @@ class Server:
     def _spawn(self, log: IO[bytes]) -> subprocess.Popen[bytes]:
         # Its own session, so that Ctrl-C reaches only the process that started it, which stops it in the right order.
         return subprocess.Popen(  # noqa: S603  # a fixed command, no shell
-            self.program.command,
+            child.command(*self.program.command),
             stdin=subprocess.DEVNULL,
             stdout=log,
             stderr=log,

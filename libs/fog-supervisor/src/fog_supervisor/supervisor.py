@@ -4,7 +4,6 @@ import asyncio
 import contextlib
 import os
 import signal
-import sys
 import time
 from collections.abc import Awaitable, Callable, Iterable, Mapping
 from dataclasses import dataclass, field
@@ -12,7 +11,8 @@ from pathlib import Path
 from types import TracebackType
 from typing import Final, Literal, Self
 
-_CHILD: Final = Path(__file__).with_name("child.py")
+from fog_supervisor import child
+
 BACKOFF_MIN_S: Final = 0.2
 BACKOFF_MAX_S: Final = 5.0
 STABLE_S: Final = 10.0
@@ -248,12 +248,7 @@ class Supervisor:
         program.before()
         with program.log.open("ab") as log:
             process = await asyncio.create_subprocess_exec(
-                sys.executable,
-                "-I",
-                "-S",
-                str(_CHILD),
-                str(os.getpid()),
-                *program.arguments,
+                *child.command(*program.arguments),
                 stdin=asyncio.subprocess.DEVNULL,
                 stdout=log,
                 stderr=log,

@@ -19,7 +19,8 @@ from fognav.operate.outcome import Outcome
 from fognav.output import FailedError
 
 STATE_TIMEOUT_S: Final = 3.0
-"""Real seconds to wait for a robot's state: it is published once a second of the robot's clock, and on change."""
+"""Real seconds to wait for a robot's state, which comes once a second of its clock, and on change; at a simulated speed
+below 1 as much longer."""
 _PATHS: Final = 64
 
 
@@ -59,7 +60,7 @@ class Robot:
         """Return the next state that the robot publishes, or None when none comes in time."""
         self._changed.clear()
         try:
-            async with asyncio.timeout(STATE_TIMEOUT_S):
+            async with asyncio.timeout(STATE_TIMEOUT_S / min(1.0, self.clock.speed)):
                 await self._changed.wait()
         except TimeoutError:
             return None

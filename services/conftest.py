@@ -13,6 +13,7 @@ import httpx
 import numpy as np
 import programs
 import pytest
+from lateness import Lateness
 from redis.asyncio import Redis
 
 from fog_contracts.grid import GridGeometry, StaticMap
@@ -128,6 +129,16 @@ class Fog:
         process = self.processes.pop(module)
         process.kill()
         process.wait()
+
+    def lateness(self) -> Lateness:
+        """Return what tells how late a busy machine makes the processes from now on, this one among them."""
+        servers = (self.mosquitto, self.redis, self.router)
+
+        def pids() -> list[int]:
+            running = [server.pid for server in servers if server.running()]
+            return [os.getpid(), *running, *(process.pid for process in self.processes.values())]
+
+        return Lateness(pids)
 
     def log(self, module: str) -> str:
         """Return everything that a process printed."""

@@ -9,7 +9,8 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from lease_model import LeaseModel
 
-from fog_runtime.leases.lease import ATTEMPT_S, Granted, Held, LeftToOther, Request
+from fog_runtime.leases import lease_store
+from fog_runtime.leases.lease import ATTEMPT_S, LEASE_S, READY_SAID_S, Granted, Held, LeftToOther, Request
 from fog_runtime.leases.lease_store import LeaseStore
 from fog_supervisor.servers import Server, start_redis
 
@@ -20,6 +21,23 @@ pytestmark = pytest.mark.live
 def redis(tmp_path_factory: pytest.TempPathFactory):
     with start_redis(tmp_path_factory.mktemp("redis")) as server:
         yield server
+
+
+SLOWER = 500.0
+
+
+@pytest.fixture(autouse=True)
+def no_haste(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Let nothing end while a test runs, however slowly: what has to end, the test ends itself (`expire`)."""
+    for name, seconds in (("ATTEMPT_S", ATTEMPT_S), ("LEASE_S", LEASE_S), ("READY_SAID_S", READY_SAID_S)):
+        monkeypatch.setattr(lease_store, name, SLOWER * seconds)
+
+
+async def expire(store: LeaseStore, key: str, after_s: float) -> None:
+    """Let a key end now that would have ended after some time (s)."""
+    (left_ms,) = await store._redis.write(("PTTL", key))
+    assert 0 < left_ms <= 1000 * after_s
+    await store._redis.write(("DEL", key))
 
 
 NEW = Request(epoch=0, floor=0, confirmed=False, sent_at=0.0)
@@ -67,7 +85,7 @@ async def compare(redis: Server, steps) -> None:
                 assert reply.epoch == wanted.epoch
                 if isinstance(reply, Held):
                     assert reply.holder == wanted.holder
-                    assert 0.0 < reply.remaining_s <= 1.2
+                    assert 0.0 < reply.remaining_s <= SLOWER * LEASE_S
         stored = await store._redis.read("GET", "fog:test:planner:epoch")
         assert int(stored or 0) == expected.stored
 
@@ -78,7 +96,7 @@ async def test_one_of_many_is_granted_the_lease_and_its_epoch_outlives_it(redis:
         granted = [reply for reply in replies if isinstance(reply, Granted)]
         assert len(granted) == 1
         assert {reply.epoch for reply in replies} == {granted[0].epoch}
-        await asyncio.sleep(1.25)
+        await expire(store, "fog:many:map-service:lease", SLOWER * LEASE_S)
         later = await store.acquire("late", NEW)
         assert isinstance(later, Granted)
         assert later.epoch > granted[0].epoch
@@ -113,7 +131,7 @@ async def test_lease_of_a_leader_that_is_cut_off_goes_to_a_copy_that_says_it_is_
         assert isinstance(taken, Granted)
         assert taken.epoch > first.epoch
         assert isinstance(await store.acquire("a", NEW), Held)
-        await asyncio.sleep(0.5)
+        await expire(store, "fog:ready:planner:ready", SLOWER * READY_SAID_S)
         assert await store.acquire("b", replace(lost, epoch=taken.epoch)) == taken
 
 
@@ -126,11 +144,12 @@ async def test_released_lease_is_free_at_once_and_nobody_releases_that_of_anothe
         assert isinstance(await store.acquire("b", NEW), Granted)
 
 
-async def test_redis_that_hangs_or_is_away_gives_no_reply_in_time(tmp_path: Path):
+async def test_redis_that_hangs_or_is_away_gives_no_reply_in_time(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     with start_redis(tmp_path) as server:
         async with LeaseStore(server.url, "away", "planner") as store:
             assert await store.acquire("a", NEW) is not None
-            await store._redis.write(("CLIENT", "PAUSE", 1000))
+            await store._redis.write(("CLIENT", "PAUSE", 600_000))
+            monkeypatch.setattr(lease_store, "ATTEMPT_S", ATTEMPT_S)
             began = asyncio.get_running_loop().time()
             assert await store.acquire("a", NEW) is None
             assert asyncio.get_running_loop().time() - began >= ATTEMPT_S * 0.9

@@ -16,8 +16,8 @@ from fog_runtime.leases.lease import CUT_OFF_S
 pytestmark = pytest.mark.live
 
 TAKEOVER_S = 2.0
-BUSY_S = 0.5
-"""How much later everything may come on a busy machine."""
+SLACK_S = 0.5
+"""How much later everything may come; on a busy machine, as much more as it let the processes wait."""
 COPIES = {"aggregator": "hazard_aggregator", "map": "map_service"}
 
 
@@ -114,33 +114,34 @@ async def test_second_copy_takes_over_after_death_hang_and_partition(fog, proxy,
         await waits(fog, second, "this process stands by: ")
         assert len({m.epoch for _, m in heard.received[service]}) == 1, "two that run, one that speaks"
 
-        old, killed = heard.epochs(service)[-1], time.monotonic()
+        old, killed, late = heard.epochs(service)[-1], time.monotonic(), fog.lateness()
         fog.kill(first)
         await until(lambda: heard.epochs(service)[-1] > old, "the second copy")
-        assert time.monotonic() - killed <= TAKEOVER_S + BUSY_S, fog.log(second)
+        assert time.monotonic() - killed <= TAKEOVER_S + SLACK_S + late.seconds(), fog.log(second)
 
         fog.start(module, first)
         await waits(fog, first, "this process stands by: ")
-        old, stopped = heard.epochs(service)[-1], time.monotonic()
+        old, stopped, late = heard.epochs(service)[-1], time.monotonic(), fog.lateness()
         fog.processes[second].send_signal(signal.SIGSTOP)
         await until(lambda: heard.epochs(service)[-1] > old, "the first copy")
-        assert time.monotonic() - stopped <= TAKEOVER_S + BUSY_S, fog.log(first)
-        woken = time.monotonic()
+        assert time.monotonic() - stopped <= TAKEOVER_S + SLACK_S + late.seconds(), fog.log(first)
+        woken, late = time.monotonic(), fog.lateness()
         fog.processes[second].send_signal(signal.SIGCONT)
         await waits(fog, second, "this process stands by: ")
-        assert not [m for m in heard.since(service, woken + 0.05) if m.epoch == old], "it says nothing when it wakes up"
+        awake = woken + 0.05 + late.seconds()
+        assert not [m for m in heard.since(service, awake) if m.epoch == old], "it says nothing when it wakes up"
 
         fog.kill(first)
         await waits(fog, second, "leads with epoch")
         fog.start(module, first)
         await waits(fog, first, "this process stands by: ")
-        old, cut = heard.epochs(service)[-1], time.monotonic()
+        old, cut, late = heard.epochs(service)[-1], time.monotonic(), fog.lateness()
         proxy.cut()
         await until(lambda: heard.epochs(service)[-1] > old, "the first copy")
-        assert time.monotonic() - cut <= TAKEOVER_S + BUSY_S, fog.log(first)
-        taken = time.monotonic()
+        assert time.monotonic() - cut <= TAKEOVER_S + SLACK_S + late.seconds(), fog.log(first)
+        taken, late = time.monotonic(), fog.lateness()
         await waits(fog, second, "this process stands by: ")
-        assert not [m for m in heard.since(service, taken + 1.0) if m.epoch == old]
+        assert not [m for m in heard.since(service, taken + 1.0 + late.seconds()) if m.epoch == old]
 
         begun = next(i for i, (_, m) in enumerate(heard.received["aggregator"]) if m.state == "blocked")
         assert {m.penalty for _, m in heard.received["aggregator"][begun:]} == {254}, "no takeover clears an area"
@@ -172,10 +173,10 @@ async def test_copy_that_reaches_broker_and_router_takes_over_from_one_that_does
         await answers(fog, first)
         await answers(fog, second)
 
-        old, cut = heard.epochs(service)[-1], time.monotonic()
+        old, cut, late = heard.epochs(service)[-1], time.monotonic(), fog.lateness()
         proxy.cut()
         await until(lambda: heard.epochs(service)[-1] > old, "the second copy")
-        assert time.monotonic() - cut <= TAKEOVER_S + BUSY_S, fog.log(second)
+        assert time.monotonic() - cut <= TAKEOVER_S + SLACK_S + late.seconds(), fog.log(second)
         await waits(fog, first, "this process stands by: ")
         assert f"no answer of {transport}" in await lease(fog, first)
         taken = heard.epochs(service)[-1]

@@ -1,10 +1,12 @@
 """A planner whose core's thread hangs, while its event loop goes on, leaves the lease to one that can plan."""
 
 import asyncio
+import os
 import threading
 import time
 
 import pytest
+from lateness import Lateness
 
 from fog_contracts import channels as ch
 from fog_contracts.handlers import Publication
@@ -19,7 +21,8 @@ from planner.service import Service
 
 pytestmark = pytest.mark.live
 TAKEOVER_S = 2.0
-BUSY_S = 0.5
+SLACK_S = 0.5
+"""How much later everything may come; on a busy machine, as much more as it let the processes wait."""
 
 
 class Copy:
@@ -76,9 +79,9 @@ async def test_hanging_core_costs_the_lease_and_says_nothing_when_it_goes_on(lea
         hanging.plan()
         assert len(hanging.published) == 1
         tasks.append(asyncio.ensure_future(hanging.service._threads.run("core", end.wait)))
-        hung = time.monotonic()
+        hung, late = time.monotonic(), Lateness(lambda: [os.getpid()])
         await until(lambda: other.epoch > hanging.epoch, "the second leads")
-        assert time.monotonic() - hung <= TAKEOVER_S + BUSY_S
+        assert time.monotonic() - hung <= TAKEOVER_S + SLACK_S + late.seconds()
         assert hanging.leadership.standby_reason(), "it has given the lease back"
         assert "no answer of planning" in hanging.lease
         hanging.plan()

@@ -18,8 +18,8 @@ from fog_runtime.clock import SystemClock, ticker
 pytestmark = pytest.mark.live
 
 TAKEOVER_S = 2.0
-BUSY_S = 0.5
-"""How much later everything may come on a busy machine."""
+SLACK_S = 0.5
+"""How much later everything may come; on a busy machine, as much more as it let the processes wait."""
 FromPlanner = RobotGoal | RobotPath | RobotRelease
 PLANNERS = ("planner", "planner-2")
 GOAL = {"pose": {"x": 6.0, "y": 4.0}}
@@ -146,10 +146,11 @@ async def test_mission_survives_the_leaders_death_and_its_hang_and_is_never_doub
         await until(lambda: robot.last(RobotPath), "a path")
         old = robot.epochs[-1]
 
+        late = fog.lateness()
         fog.kill(leader)
         killed = time.monotonic()
         await until(lambda: robot.epochs[-1] > old and robot.last(RobotPath).planner_epoch > old, "a path of the other")
-        assert silence_before_takeover(robot, old) <= TAKEOVER_S + BUSY_S, fog.log(standby)
+        assert silence_before_takeover(robot, old) <= TAKEOVER_S + SLACK_S + late.seconds(), fog.log(standby)
         assert robot.accepted[-1][0] > killed
         assert robot.goal_ids == {goal_id}, "neither doubled nor lost"
 
@@ -157,21 +158,22 @@ async def test_mission_survives_the_leaders_death_and_its_hang_and_is_never_doub
         planners.clients[leader] = httpx.AsyncClient(base_url=await fog.url(leader), timeout=5.0)
         hung, other = await planners.roles()
         assert (hung, other) == (standby, leader)
-        old = robot.epochs[-1]
+        old, late = robot.epochs[-1], fog.lateness()
         fog.processes[hung].send_signal(signal.SIGSTOP)
         await until(lambda: robot.epochs[-1] > old, "the other's goal")
-        assert silence_before_takeover(robot, old) <= TAKEOVER_S + BUSY_S, fog.log(other)
+        assert silence_before_takeover(robot, old) <= TAKEOVER_S + SLACK_S + late.seconds(), fog.log(other)
         await until(lambda: robot.last(RobotPath).planner_epoch > old, "the other's path")
         assert (await planners.call("DELETE", tokens, other)).status_code == 204
         await until(lambda: robot.last(RobotGoal).pose is None, "the robot hears that its mission has ended")
 
         before = len(robot.accepted)
-        woken = time.monotonic()
+        woken, late = time.monotonic(), fog.lateness()
         fog.processes[hung].send_signal(signal.SIGCONT)
         await until(lambda: len(robot.accepted) > before + 2, "more messages")
         assert await planners.roles() == (other, hung)
-        late = [message for at, message in robot.received if at > woken + 0.05 and message.planner_epoch == old]
-        assert late == [], "the planner that woke up says nothing more"
+        awake = woken + 0.05 + late.seconds()
+        more = [message for at, message in robot.received if at > awake and message.planner_epoch == old]
+        assert more == [], "the planner that woke up says nothing more"
         assert robot.epochs == sorted(robot.epochs)
         assert not [m for at, m in robot.accepted if at > woken and (m.planner_epoch == old or not ended(m))]
         assert robot.goal_ids == {goal_id}
@@ -200,14 +202,14 @@ async def test_leader_that_is_cut_off_from_redis_gives_way_to_the_other(fog, pro
             assert await planners.roles() == ("planner", "planner-2")
             goal_id = await sent(planners, tokens, "planner")
             await until(lambda: robot.last(RobotPath), "a path")
-            old = robot.epochs[-1]
+            old, late = robot.epochs[-1], fog.lateness()
             proxy.cut()
             await until(lambda: robot.epochs[-1] > old, "the other's goal")
-            assert silence_before_takeover(robot, old) <= TAKEOVER_S + BUSY_S, fog.log("planner-2")
+            assert silence_before_takeover(robot, old) <= TAKEOVER_S + SLACK_S + late.seconds(), fog.log("planner-2")
             taken = next(at for at, message in robot.received if message.planner_epoch > old)
             refused = await planners.call("DELETE", tokens, "planner")
             assert refused.status_code == 503, "neither of them loses a mission"
-            assert not [m for at, m in robot.received if at > taken + 1.0 and m.planner_epoch == old]
+            assert not [m for at, m in robot.received if at > taken + 1.0 + late.seconds() and m.planner_epoch == old]
             proxy.heal()
             assert await planners.roles() == ("planner-2", "planner")
             assert robot.epochs == sorted(robot.epochs)
@@ -224,10 +226,10 @@ async def test_leader_that_is_cut_off_from_its_router_gives_the_lease_to_one_tha
             assert await planners.roles() == ("planner", "planner-2")
             goal_id = await sent(planners, tokens, "planner")
             await until(lambda: robot.last(RobotPath), "a path")
-            old, cut = robot.epochs[-1], time.monotonic()
+            old, cut, late = robot.epochs[-1], time.monotonic(), fog.lateness()
             router.cut()
             await until(lambda: robot.epochs[-1] > old, "the other's goal")
-            assert time.monotonic() - cut <= TAKEOVER_S + BUSY_S, fog.log("planner-2")
+            assert time.monotonic() - cut <= TAKEOVER_S + SLACK_S + late.seconds(), fog.log("planner-2")
             refused = await planners.call("DELETE", tokens, "planner")
             assert refused.status_code == 503, "neither of them loses a mission"
             healed = time.monotonic()

@@ -1,0 +1,38 @@
+"""How late a busy machine made processes: the time for which they were ready to run, and the kernel let them wait.
+
+A test whose subject is a limit of real processes adds this to the limit. So a busy machine does not fail it, while an
+idle one, where nothing waits, measures as exactly as before.
+"""
+
+from __future__ import annotations
+
+import contextlib
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Iterable
+
+
+class Lateness:
+    """How long the processes that `pids` returns, and their threads, have waited for a core since this was made.
+
+    It is the sum of all threads: each may have waited for the one before it. Without the kernel's statistics it is 0.
+    """
+
+    def __init__(self, pids: Callable[[], Iterable[int]]) -> None:
+        self._pids = pids
+        self._before = self._waited()
+
+    def seconds(self) -> float:
+        """Return the time (s) until now; what has ended meanwhile does not count."""
+        return sum(max(0.0, waited - self._before.get(thread, 0.0)) for thread, waited in self._waited().items())
+
+    def _waited(self) -> dict[Path, float]:
+        found: dict[Path, float] = {}
+        for pid in self._pids():
+            for thread in Path(f"/proc/{pid}/task").glob("*"):
+                # The second figure of sched(5)'s statistics: ns on a run queue. The thread may just have ended.
+                with contextlib.suppress(OSError, IndexError):
+                    found[thread] = int((thread / "schedstat").read_text("ascii").split()[1]) / 1e9
+        return found

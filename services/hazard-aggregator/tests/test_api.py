@@ -7,7 +7,7 @@ import httpx
 import msgspec
 import pytest
 
-from fog_contracts.messages import AreaDefinition
+from fog_contracts.messages import AREAS_MAX, AreaDefinition
 
 pytestmark = pytest.mark.live
 POLYGON = [[1.0, 1.0], [2.0, 1.0], [2.0, 2.0], [1.0, 2.0]]
@@ -16,7 +16,7 @@ POLYGON = [[1.0, 1.0], [2.0, 1.0], [2.0, 2.0], [1.0, 2.0]]
 @pytest.fixture
 async def client(fog):
     fog.start("hazard_aggregator")
-    async with httpx.AsyncClient(base_url=await fog.ready("hazard_aggregator"), timeout=15) as client:
+    async with httpx.AsyncClient(base_url=await fog.ready("hazard_aggregator"), timeout=60) as client:
         yield client
 
 
@@ -31,7 +31,7 @@ async def test_areas_are_changed_by_version_and_survive_a_kill(fog, client, toke
     assert stale.status_code == 412
     fog.kill("hazard_aggregator")
     fog.start("hazard_aggregator")
-    async with httpx.AsyncClient(base_url=await fog.ready("hazard_aggregator")) as again:
+    async with httpx.AsyncClient(base_url=await fog.ready("hazard_aggregator"), timeout=60) as again:
         kept = (await again.get("/api/v1/areas/hall")).json()["definition"]
     assert (kept["polygon"], kept["debounce"]["to_blocked"], kept["version"]) == (POLYGON, 3, 1)
 
@@ -54,7 +54,7 @@ async def test_history_continues_over_a_kill(fog, client, tokens):
     assert [view["period"]["state"] for view in older.json()] == ["blocked", "unknown"]
     fog.kill("hazard_aggregator")
     fog.start("hazard_aggregator")
-    async with httpx.AsyncClient(base_url=await fog.ready("hazard_aggregator")) as again:
+    async with httpx.AsyncClient(base_url=await fog.ready("hazard_aggregator"), timeout=60) as again:
         after = await blocked(again)
         assert (await again.get("/api/v1/areas/nowhere/history")).status_code == 404
         assert (await again.get("/api/v1/areas/hall/history?cursor=x")).status_code == 422
@@ -129,16 +129,33 @@ async def test_area_that_is_the_cone_of_a_node_follows_it_and_is_unusable_withou
         fog.kill("hazard_aggregator")
         (fog.site / "site.toml").write_text(text)
         fog.start("hazard_aggregator")
-        async with httpx.AsyncClient(base_url=await fog.ready("hazard_aggregator")) as again:
+        async with httpx.AsyncClient(base_url=await fog.ready("hazard_aggregator"), timeout=60) as again:
             area = (await again.get("/api/v1/areas/hall")).json()
             return area["definition"], (await again.get("/readyz")).json()["parts"].get("areas", {})
 
     moved, _ = await after_restart(text.replace("y = 4.5", "y = 5.0"))
     assert min(y for _, y in moved["polygon"]) == pytest.approx(3.5, abs=0.02)
     assert (moved["cone_of"], moved["version"]) == ("n1", 1)
+    async with fog.raw_redis() as raw, asyncio.timeout(60):
+        while json.loads(await raw.hget("fog:test:areas", "hall"))["polygon"] != moved["polygon"]:  # noqa: ASYNC110  # another process changes it
+            await asyncio.sleep(0.05)
     left, readiness = await after_restart(text.replace('id = "n1"', 'id = "n2"'))
-    assert (left["nodes"], left["polygon"]) == ([], put.json()["polygon"])
+    assert (left["nodes"], left["polygon"]) == ([], moved["polygon"]), "it stays where its node was last"
     assert "the site has no node n1: name one of the area's nodes" in readiness["detail"]
+
+
+async def test_more_areas_of_site_and_store_than_a_heartbeat_lists_end_the_start_with_the_remedy(fog, client, tokens):
+    put = await client.put("/api/v1/areas/stored", json={"polygon": POLYGON}, headers=tokens["operator"])
+    assert put.status_code == 201, put.text
+    fog.kill("hazard_aggregator")
+    more = "".join(f'\n[[areas]]\nid = "more-{number}"\npolygon = {POLYGON}\n' for number in range(AREAS_MAX - 1))
+    with (fog.site / "site.toml").open("a") as site:
+        site.write(more)
+    fog.start("hazard_aggregator")
+    assert await asyncio.to_thread(fog.processes["hazard_aggregator"].wait, 60.0) == 1
+    ended = fog.log("hazard_aggregator").splitlines()[-1]
+    assert f"the site's file and the store have {AREAS_MAX + 1} areas together, and {AREAS_MAX} is the limit" in ended
+    assert "remove 1 of the 1000 that only the site's file has (hall, more-0, " in ended
 
 
 async def test_nodes_report_their_health(client):
@@ -183,7 +200,7 @@ async def test_change_of_an_area_before_the_stored_areas_are_loaded_is_refused_w
     fog.redis.kill()
     fog.kill("hazard_aggregator")
     fog.start("hazard_aggregator")
-    async with httpx.AsyncClient(base_url=await fog.url("hazard_aggregator"), timeout=15) as restarted:
+    async with httpx.AsyncClient(base_url=await fog.url("hazard_aggregator"), timeout=60) as restarted:
         headers = {**tokens["operator"], "If-Match": put.headers["etag"]}
         # At first it waits for a leader that might be alive, then it leads without the stored areas.
         detail = ""
@@ -206,7 +223,7 @@ async def test_override_counts_at_once_survives_a_kill_and_ends_with_an_entry_in
     assert again.headers["etag"] == '"1"', "the same attempt"
     fog.kill("hazard_aggregator")
     fog.start("hazard_aggregator")
-    async with httpx.AsyncClient(base_url=await fog.ready("hazard_aggregator"), timeout=15) as restarted:
+    async with httpx.AsyncClient(base_url=await fog.ready("hazard_aggregator"), timeout=60) as restarted:
         area = (await restarted.get("/api/v1/areas/hall")).json()
         assert (area["hazard"]["state"], area["hazard"]["override"]["author"]) == ("blocked", "anna")
         assert 3600 - 180 < area["override"]["rest_s"] < 3600

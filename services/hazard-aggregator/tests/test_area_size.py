@@ -9,7 +9,7 @@ from fog_contracts.codec import decode, encode
 from fog_contracts.messages import AREAS_MAX, AggregatorHeartbeat, AreaDefinition, AreaHazard
 from fog_contracts.messages.basics import Count, Hash, Stamp
 from fog_runtime.health import Health
-from hazard_aggregator.area_size import AreaError, check_size
+from hazard_aggregator.area_size import AreaError, UnlistedAreasError, all_areas, check_size
 from hazard_aggregator.writers.unusable_areas import UnusableAreas
 
 POLYGON = [(0.0, 0.0), (1.0, 0.0), (1.0, 1.0)]
@@ -47,6 +47,20 @@ def test_hazard_of_an_accepted_area_fits_whatever_its_cause_says():
         area="hall", state="blocked", severity=3, penalty=254, since=1.0, seq=1, epoch=1, cause="ö" * 500, nodes=states
     )
     assert len(encode(ch.AREA_HAZARD, hazard)) <= ch.AREA_HAZARD.limit
+
+
+def named(*ids: str, **fields: object) -> list[AreaDefinition]:
+    return [AreaDefinition(id=name, polygon=POLYGON, **fields) for name in ids]
+
+
+def test_stored_areas_count_instead_of_the_site_s_and_removed_ones_need_no_room():
+    site = named(*(f"a{number}" for number in range(AREAS_MAX)))
+    stored = named("a0", version=2) + named("gone", version=3, removed=True)
+    areas = {area.id: area for area in all_areas(site, stored)}
+    assert len(areas) == AREAS_MAX + 1
+    assert (areas["a0"].version, areas["a1"].version, areas["gone"].removed) == (2, 0, True)
+    with pytest.raises(UnlistedAreasError, match="remove 2 of the 999 that only the site's file has"):
+        all_areas(site, stored + named("more", "again", version=1))
 
 
 def most(kind: object) -> int:

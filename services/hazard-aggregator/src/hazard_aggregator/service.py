@@ -162,6 +162,7 @@ class Service:
             self.records.mark_loaded()
         if self._leading.is_set():
             await self.records.reload()
+            await self.records.keep_places()
             await self.overrides.keep()
         await self._store.check()
         self._health.set("store", ok=True)

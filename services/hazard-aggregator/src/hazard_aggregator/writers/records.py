@@ -8,13 +8,14 @@ from typing import TYPE_CHECKING
 
 from fog_contracts import channels as ch
 from fog_runtime.stores.redis_connection import StoreRefusedError
+from hazard_aggregator.area_size import UnlistedAreasError, all_areas
 from hazard_aggregator.overrides import StoredOverrides
 from hazard_aggregator.store import Audit, RecoveryError, Stored, StoreError
 from hazard_aggregator.writers.unusable_areas import UnusableAreas
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
-    from typing import Literal
+    from typing import Final, Literal
 
     from fog_contracts.handlers import Publication
     from fog_runtime.clock import Clock
@@ -25,6 +26,9 @@ if TYPE_CHECKING:
     from hazard_aggregator.core import Aggregator
     from hazard_aggregator.publisher import Publisher
     from hazard_aggregator.store import Store
+
+_ITSELF: Final = "hazard-aggregator"
+"""Who changed an area without an operator's request, in the audit trail."""
 
 
 class Records:
@@ -84,6 +88,10 @@ class Records:
         async with self.lock:
             stored = await self._store.load()
             usable = self._unusable.made_usable(stored.definitions, stored.unreadable)
+            try:
+                all_areas(self._core.definitions(), usable)
+            except UnlistedAreasError as error:
+                raise StoreRefusedError(str(error)) from error
             overrides = StoredOverrides(stored.overrides, stored.rests, self._boot)
             changed = self._core.load_overrides(overrides, self._edges.now())
             publications = [*changed, *self._core.restore(usable, stored.hazards, self._edges.now())]
@@ -109,6 +117,20 @@ class Records:
         overrides = StoredOverrides(*await self._store.overrides(), self._boot)
         self._publisher.announce(self._core.load_overrides(overrides, self._edges.now()))
         self._reload_due = False
+
+    async def keep_places(self) -> None:
+        """Store where areas are now that are the cones of nodes which have moved; raises `StoreError`.
+
+        That is where such an area stays if its node leaves the site.
+        """
+        async with self.lock:
+            while self._unusable.moved:
+                definition = self._unusable.moved[-1]
+                audit = Audit(self._clock.stamp(), _ITSELF, "follow")
+                with self.uncertain_write():
+                    # Of another version, it was PUT since then, with the place of that time.
+                    await self._store.put_area(definition, expected=definition.version, audit=audit)
+                self._unusable.moved.pop()
 
     async def load_again(self) -> None:
         """Put the stored records into force whether or not they may differ, for a caller that holds `lock`."""

@@ -30,6 +30,8 @@ class UnusableAreas:
         self._health = health
         self.reasons: dict[str, str] = {}
         self._records: dict[str, AreaDefinition] = {}
+        self.moved: list[AreaDefinition] = []
+        """Areas of the last call that are the cones of nodes, and are elsewhere now than their records have them."""
 
     def made_usable(self, definitions: Iterable[AreaDefinition], unreadable: Mapping[str, str]) -> list[AreaDefinition]:
         """Return stored areas such that each is usable: without nodes and sources those that are not, or were not read.
@@ -39,9 +41,12 @@ class UnusableAreas:
         `unreadable` tells why records could not be read.
         """
         reasons, usable, records = dict(unreadable), [], {}
+        self.moved = []
         for definition in definitions:
             try:
                 usable.append(self._usable(definition))
+                if usable[-1].polygon != definition.polygon:
+                    self.moved.append(usable[-1])
             except AreaError as error:
                 reasons[definition.id] = str(error)
                 records[definition.id] = definition

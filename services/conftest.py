@@ -158,7 +158,7 @@ class Fog:
     async def ready(self, module: str) -> str:
         """Return the URL of a process's REST API once it is ready."""
         url = await self.url(module)
-        async with httpx.AsyncClient() as client:
+        async with httpx.AsyncClient(timeout=DEADLINE_S) as client:
             deadline = time.monotonic() + DEADLINE_S
             while (answer := await client.get(f"{url}/readyz")).status_code != 200:
                 assert time.monotonic() < deadline, (answer.text, self.log(module))

@@ -123,7 +123,7 @@ def test_unit_runs_the_same_command_with_this_shell_s_settings(monkeypatch):
 
 
 async def until(condition: Callable[[], object]) -> None:
-    deadline = time.monotonic() + 20.0
+    deadline = time.monotonic() + 60.0
     while not condition():
         assert time.monotonic() < deadline
         await asyncio.sleep(0.01)

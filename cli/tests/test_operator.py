@@ -17,7 +17,7 @@ from fognav.programs import ROUTER
 from fognav.stack import Stack, StackConfig
 
 pytestmark = pytest.mark.live
-TIMEOUT_S = 15.0
+TIMEOUT_S = 60.0
 SPEED = 10.0
 """The operator's clock runs ten times as fast."""
 WAITING = "waiting for an operator to enable"

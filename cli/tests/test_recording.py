@@ -14,7 +14,7 @@ from fognav.programs import BROKER, ROUTER
 from fognav.stack import Stack, StackConfig
 
 pytestmark = pytest.mark.live
-TIMEOUT_S = 15.0
+TIMEOUT_S = 60.0
 
 HAZARD = AreaHazard(area="z1", state="clear", severity=0, penalty=0, since=1.0, seq=1, epoch=1, cause="test")
 POSE = RobotPose(x=1.0, y=2.0, theta=0.5, covariance=[0.0] * 9, v=0.1, w=0.0, radius=0.17, height=0.35, stamp=1.0)
@@ -37,7 +37,7 @@ async def record_some(file: Path, mqtt: MqttEdge, zenoh: ZenohEdge, mqtt_url: st
 async def test_messages_of_both_transports_are_recorded_and_replayed(tmp_path: Path) -> None:
     file = tmp_path / "run.mcap"
     clock = SystemClock()
-    async with Stack(StackConfig(site_dir=tmp_path, robot="r1")) as stack, asyncio.timeout(3 * TIMEOUT_S):
+    async with Stack(StackConfig(site_dir=tmp_path, robot="r1")) as stack, asyncio.timeout(2 * TIMEOUT_S):
         for name in (BROKER, ROUTER):
             stack.supervisor.start(name)
         await stack.supervisor.wait_ready([BROKER, ROUTER], TIMEOUT_S)

@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from fog_supervisor.supervisor import Event
 
 pytestmark = pytest.mark.live
-TIMEOUT_S = 20.0
+TIMEOUT_S = 60.0
 
 
 @pytest.fixture

@@ -132,7 +132,7 @@ class Board:
         self.tell(f"message {channel.key(site='lab', node='n1')} {text}")
 
     def close(self):
-        self._process.communicate(timeout=10)  # the end of its input ends it
+        self._process.communicate(timeout=60)  # the end of its input ends it
 
 
 @pytest.fixture
@@ -464,7 +464,7 @@ class Bridge(Thread):
 
     def _deliver(self, text):
         if text:
-            with urlopen(json.loads(text)["url"], timeout=10) as answer:
+            with urlopen(json.loads(text)["url"], timeout=60) as answer:
                 (self._folder / "served").write_bytes(answer.read())
         self.boards[-1].send(ch.NODE_UPDATE, text)
 

@@ -23,7 +23,7 @@ from robot_agent.guardian.link import WheelCommand, decode_reply, encode
 if TYPE_CHECKING:
     import signal
 
-DEADLINE_S = 45.0
+DEADLINE_S = 60.0
 STOP_S = 0.3
 """Longest time that the robot's design allows for stopping the wheels."""
 

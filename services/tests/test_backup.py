@@ -37,7 +37,7 @@ async def test_fog_node_comes_back_on_an_empty_machine(fog, tokens, tmp_path, mo
     fog.start("map_service")
     url = await fog.ready("map_service")
     file = tmp_path / "fog.tar.gz"
-    async with httpx.AsyncClient(timeout=15) as client:
+    async with httpx.AsyncClient(timeout=60) as client:
         await put(client, url, {**tokens["operator"], "If-None-Match": "*"}, ZONE)
         await put(client, url, tokens["operator"], {**ZONE, "reason": "still wet"})
         before = (await client.get(f"{url}/api/v1/zones")).json()["zones"]

@@ -22,7 +22,9 @@ async def test_services_work_over_https_with_their_own_credentials(fog):
     }
     for module in SERVICES:
         fog.start(module, **certificate)
-    async with httpx.AsyncClient(verify=Credentials.read(fog.locks.credentials("console")).tls_context()) as client:
+    async with httpx.AsyncClient(
+        verify=Credentials.read(fog.locks.credentials("console")).tls_context(), timeout=60
+    ) as client:
         for module, user in SERVICES.items():
             url = (await fog.url(module)).replace("http:", "https:")
             async with asyncio.timeout(READY_S):
@@ -39,7 +41,7 @@ async def test_services_work_over_https_with_their_own_credentials(fog):
 async def test_service_without_credentials_gets_in_nowhere(fog, until):
     fog.start("map_service", FOGNAV_CREDENTIALS_FILE="")
     url = await fog.url("map_service")
-    async with httpx.AsyncClient() as client:
+    async with httpx.AsyncClient(timeout=60) as client:
         report = (await client.get(f"{url}/readyz")).json()
     assert {"store", "mqtt"} <= set(report["missing"])
     await until(lambda: "router_unreachable" in fog.log("map_service"), "it says that the router refuses it")
@@ -52,6 +54,6 @@ async def test_service_whose_certificate_is_unusable_says_which_file(fog):
     other.make(["127.0.0.1"])
     certificate = other.folder("http") / "server.pem"
     fog.start("planner", FOGNAV_HTTP_CERTIFICATE_FILE=str(certificate), FOGNAV_HTTP_KEY_FILE=str(key))
-    fog.processes["planner"].wait(30)
+    fog.processes["planner"].wait(60)
     assert f"with the key {key} can't be used" in fog.log("planner")
     assert "fognav ca issue" in fog.log("planner")

@@ -80,7 +80,7 @@ async def operator(fog, tokens):
     for module in WRITES:
         fog.start(module)
     urls = {module: await fog.ready(module) for module in WRITES}
-    async with httpx.AsyncClient(timeout=15.0) as client:
+    async with httpx.AsyncClient(timeout=60.0) as client:
         made = Operator(client, urls, tokens["operator"])
         for answer in (await made.write_all(0)).values():
             assert answer.status_code in (200, 201), answer.text

@@ -30,7 +30,7 @@ async def test_lost_records_are_shown_and_restored_or_given_up_by_command(fog, t
         monkeypatch.setenv(f"FOGNAV_{name}_PORT", urls[module].rpartition(":")[2])
     monkeypatch.setenv("FOGNAV_FOG", "127.0.0.1")
     monkeypatch.setenv("FOGNAV_TOKEN", "admin-token")
-    async with httpx.AsyncClient(timeout=15) as client, fog.raw_redis() as raw:
+    async with httpx.AsyncClient(timeout=60) as client, fog.raw_redis() as raw:
         override = {"state": "blocked", "reason": "wet", "ttl_s": 3600}
         for url, body in (
             (f"{urls['map_service']}/api/v1/zones/z1", ZONE),

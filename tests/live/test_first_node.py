@@ -139,7 +139,7 @@ class Lab:
     def end_node(self) -> None:
         if self.node is not None:
             self.node.send_signal(signal.SIGINT)
-            assert self.node.wait(30) == 0, (self.folder / "node.log").read_text()
+            assert self.node.wait(60) == 0, (self.folder / "node.log").read_text()
             self.node = None
 
     def stop(self) -> None:

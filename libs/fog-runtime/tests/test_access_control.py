@@ -24,7 +24,7 @@ from fog_supervisor.servers import start_mosquitto
 
 pytestmark = pytest.mark.live
 
-WAIT_S = 45.0
+WAIT_S = 60.0
 
 # --- MQTT -----------------------------------------------------------------------------------------------------------
 

@@ -387,7 +387,7 @@ def test_messages_of_another_thread_are_sent_behind_those_that_were_held_back(mo
     assert sent == []
     other = threading.Thread(target=member.admit, args=(ch.MAP_HEARTBEAT, message, lambda: sent.append("second")))
     other.start()
-    assert sending.wait(10.0)
+    assert sending.wait(60.0)
     member.admit(ch.MAP_HEARTBEAT, message, lambda: sent.append("third"))
     other.join()
     assert sent == ["held back", "second", "third"]

@@ -55,7 +55,7 @@ async def test_memory_is_released_as_soon_as_the_process_is_ready(monkeypatch: p
     await asyncio.sleep(0.01)
     assert released == []
     ready.append("map")
-    await asyncio.wait_for(waiting, 10.0)
+    await asyncio.wait_for(waiting, 60.0)
     assert released == [0]
 
 

@@ -38,7 +38,7 @@ def test_signal_cancels_main_and_exits_with_status_zero(number):
     with start() as child:
         assert child.stdout.readline() == "up\n"
         child.send_signal(number)
-        out, err = child.communicate(timeout=20)
+        out, err = child.communicate(timeout=60)
     assert (out, child.returncode) == ("cleaned\n", 0)
     assert [json.loads(line)["event"] for line in err.splitlines()] == ["stopping", "stopped"]
 
@@ -60,7 +60,7 @@ def test_process_that_does_not_end_after_a_signal_shows_where_it_hangs_and_exits
 def test_crash_is_logged_once_and_exits_with_status_one():
     body = "raise ExceptionGroup('many', [ValueError('the reason')])"
     with start(body, seconds=0.0) as child:
-        out, err = child.communicate(timeout=20)
+        out, err = child.communicate(timeout=60)
     (line,) = err.splitlines()
     assert (out, child.returncode) == ("up\ncleaned\n", 1)
     assert json.loads(line)["reason"] == "ValueError: the reason"
@@ -77,7 +77,7 @@ def test_hang_up_ends_no_process_that_nohup_started():
         assert child.stdout.readline() == "up\n"
         child.send_signal(signal.SIGHUP)
         child.send_signal(signal.SIGTERM)
-        _, err = child.communicate(timeout=20)
+        _, err = child.communicate(timeout=60)
     assert [json.loads(line).get("signal") for line in err.splitlines() if "stopping" in line] == ["SIGTERM"]
 
 
@@ -88,5 +88,5 @@ def test_second_hang_up_does_not_cut_the_orderly_end_short():
         child.send_signal(signal.SIGHUP)
         assert "stopping" in child.stderr.readline()
         child.send_signal(signal.SIGHUP)
-        out, _ = child.communicate(timeout=20)
+        out, _ = child.communicate(timeout=60)
     assert (out, child.returncode) == ("cleaned\n", 0)

@@ -146,7 +146,7 @@ async def test_record_all_records_both_transports_at_any_clock_speed(tmp_path, s
             with Recorder(tmp_path / "r.mcap") as recorder:
                 record_all(mqtt, zenoh, recorder, clock, numbers=[1])
                 task = asyncio.create_task(mqtt.run())
-                await asyncio.wait_for(mqtt.wait_connected(), 10)
+                await asyncio.wait_for(mqtt.wait_connected(), 60)
                 zenoh.publish(ch.MAP_DELTA, delta(1))
                 await mqtt.publish(ch.NODE_READING, reading(1), node="n1")
                 await mqtt.publish(ch.THESIS_AREA, "blocked", number="1")

@@ -26,7 +26,7 @@ from fog_supervisor.servers import (
     mosquitto_program,
 )
 
-WAIT_S = 20.0
+WAIT_S = 60.0
 
 
 @pytest.mark.parametrize(

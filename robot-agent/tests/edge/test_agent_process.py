@@ -119,7 +119,7 @@ async def test_stop_signals_of_a_terminal_do_not_freeze_a_driving_agent_and_a_ha
     await until(lambda: robot.body.pose[0] > reached + 0.2, "it drives on")
     robot.agent.process.send_signal(signal.SIGHUP)
     assert robot.body.stopped_within(time.monotonic()) < STOP_S
-    assert robot.agent.process.wait(10.0) == 0
+    assert robot.agent.process.wait(60.0) == 0
     await until(lambda: not robot.body.scanner.scanning, "the lidar stands")
 
 
@@ -198,7 +198,7 @@ async def test_robot_without_a_fog_starts_from_its_files_and_holds(robot):
     kept = msgspec.json.decode(robot.agent.data.joinpath("pose.json").read_bytes(), type=SavedPose)
     assert (kept.site, kept.x) == ("lab", pytest.approx(2.0, abs=0.15))
     os.kill(robot.agent.process.pid, signal.SIGTERM)
-    assert robot.agent.process.wait(10.0) == 0
+    assert robot.agent.process.wait(60.0) == 0
     robot.fog.serves, requested = False, robot.fog.snapshots
     robot.fog.states.clear()
     robot.agent.start()
@@ -220,7 +220,7 @@ async def test_log_of_a_live_agent_replays_to_the_same_commands_and_publications
     assert reply.accepted, reply
     await until(lambda: robot.fog.state.mode == "INIT", "the robot is disabled")
     robot.agent.process.send_signal(signal.SIGTERM)
-    assert robot.agent.process.wait(10.0) == 0
+    assert robot.agent.process.wait(60.0) == 0
     result = await asyncio.to_thread(replay, robot.agent.input_log)
     assert result.differences == []
     assert {"SnapshotLoaded", "PoseRestored", "LoopHealthReceived"} <= set(result.inputs)

@@ -153,7 +153,7 @@ async def test_alert_is_published_acknowledged_kept_over_a_kill_and_in_the_audit
     fog.start("hazard_aggregator")
     url = await fog.ready("hazard_aggregator")
     heard: list[AlertList] = []
-    async with fog.edges() as (mqtt, _, connect), httpx.AsyncClient(timeout=15) as client:
+    async with fog.edges() as (mqtt, _, connect), httpx.AsyncClient(timeout=60) as client:
         mqtt.on(ch.AGGREGATOR_ALERTS, lambda _, message: heard.append(message), AlertList)
         connect()
         await mqtt.wait_connected()

@@ -70,7 +70,7 @@ async def test_areas_are_discovered_and_the_aggregators_end_is_told_also_by_a_co
     url = await fog.ready("hazard_aggregator")
     areas: dict[str, str] = {}
     available: list[str] = []
-    async with fog.edges() as (mqtt, _, connect), httpx.AsyncClient(timeout=15) as client:
+    async with fog.edges() as (mqtt, _, connect), httpx.AsyncClient(timeout=60) as client:
         mqtt.on(ch.HOME_ASSISTANT_AREA, lambda ids, text: areas.__setitem__(ids["area"], text))
         mqtt.on(ch.AGGREGATOR_AVAILABILITY, lambda _, text: available.append(text))
         connect()

@@ -103,7 +103,7 @@ async def test_blocked_period_lasts_from_its_first_announcement_whenever_the_agg
         url = await fog.ready("hazard_aggregator")
         await until(lambda: node.state == "unknown", "unknown because its node is silent")
         ended = node.hazards[-1].since
-        async with httpx.AsyncClient() as client, asyncio.timeout(60):
+        async with httpx.AsyncClient(timeout=60) as client, asyncio.timeout(60):
             blocked = []
             while not blocked or blocked[0]["ended"] is None:
                 views = (await client.get(f"{url}/api/v1/areas/hall/history")).json()
@@ -132,7 +132,7 @@ async def test_broker_that_lost_its_data_gets_everything_again(fog, until):
 async def test_without_redis_danger_is_announced_and_relief_waits(fog, until):
     fog.start("hazard_aggregator")
     url = await fog.ready("hazard_aggregator")
-    async with connected_node(fog) as (node, _), httpx.AsyncClient() as client:
+    async with connected_node(fog) as (node, _), httpx.AsyncClient(timeout=60) as client:
         await until(lambda: node.hazards, "first hazard")
         fog.redis.kill()
         await node.read(0.8, 5)
@@ -194,7 +194,7 @@ async def test_robot_in_the_cone_does_not_block_the_area(fog, until):
 async def test_thesis_node_of_an_area_added_at_run_time_is_subscribed_without_a_restart(fog, until, tokens):
     fog.start("hazard_aggregator")
     url = await fog.ready("hazard_aggregator")
-    async with connected_node(fog) as (node, _), httpx.AsyncClient() as client:
+    async with connected_node(fog) as (node, _), httpx.AsyncClient(timeout=60) as client:
         body = {"polygon": [[1.0, 1.0], [2.0, 1.0], [2.0, 2.0]], "number": 8}
         put = await client.put(f"{url}/api/v1/areas/gate", json=body, headers=tokens["operator"])
         assert put.status_code == 201, put.text
@@ -210,7 +210,7 @@ async def test_thesis_node_of_an_area_added_at_run_time_is_subscribed_without_a_
 async def test_malformed_messages_are_refused_and_the_aggregator_goes_on(fog, until):
     fog.start("hazard_aggregator")
     url = await fog.ready("hazard_aggregator")
-    async with connected_node(fog) as (node, _), httpx.AsyncClient() as client:
+    async with connected_node(fog) as (node, _), httpx.AsyncClient(timeout=60) as client:
         raw = node.mqtt._client
         topic = ch.NODE_READING.key(site="test", node="n1")
         for payload in (b"x" * 200_000, b"{", b'{"seq":-1}', b"\xff\xfe"):
@@ -232,7 +232,7 @@ async def test_messages_and_metrics_of_an_area_that_nobody_lists_are_deleted(fog
         assert await node.mqtt.publish(ch.AREA_DEFINITION, definition, wait=True, area="gone")
     fog.start("hazard_aggregator")
     url = await fog.ready("hazard_aggregator")
-    async with connected_node(fog) as (node, _), httpx.AsyncClient() as client:
+    async with connected_node(fog) as (node, _), httpx.AsyncClient(timeout=60) as client:
         await until(lambda: node.heartbeats, "a heartbeat", lambda: fog.log("hazard_aggregator"))
         assert (list(node.heartbeats[-1].areas), node.heartbeats[-1].complete) == (["hall"], True)
         await until(lambda: "hall" in {hazard.area for hazard in node.hazards}, "the hazard")

@@ -42,7 +42,7 @@ async def test_sources_of_the_site_and_over_rest_decide_their_areas_and_survive_
     file.write_text(file.read_text().split("[[nodes]]")[0] + SITE_SOURCE)
     fog.start("hazard_aggregator")
     url = await fog.ready("hazard_aggregator")
-    async with httpx.AsyncClient(base_url=url, timeout=15) as client, broker(fog) as mqtt:
+    async with httpx.AsyncClient(base_url=url, timeout=60) as client, broker(fog) as mqtt:
         await mqtt.publish("gate/binary_sensor/beam/state", "OFF")
         await wait_for(client, "hall", lambda hazard: hazard["state"] == "clear")
         await mqtt.publish("gate/status", "offline")
@@ -59,7 +59,7 @@ async def test_sources_of_the_site_and_over_rest_decide_their_areas_and_survive_
     fog.kill("hazard_aggregator")
     fog.start("hazard_aggregator")
     url = await fog.ready("hazard_aggregator")
-    async with httpx.AsyncClient(base_url=url, timeout=15) as client, broker(fog) as mqtt:
+    async with httpx.AsyncClient(base_url=url, timeout=60) as client, broker(fog) as mqtt:
         kept = await wait_for(client, "yard", lambda hazard: hazard["penalty"] == 254)
         assert kept["state"] == "blocked"
         await mqtt.publish("zigbee2mqtt/fire_door", '{"contact": false}')
@@ -70,7 +70,7 @@ async def test_changed_source_is_given_what_the_broker_retains_and_a_long_messag
     fog.start("hazard_aggregator")
     url = await fog.ready("hazard_aggregator")
     door = {"id": "door", "profile": "esphome-binary", "device": "gate/binary_sensor/beam"}
-    async with httpx.AsyncClient(base_url=url, timeout=15) as client, broker(fog) as mqtt:
+    async with httpx.AsyncClient(base_url=url, timeout=60) as client, broker(fog) as mqtt:
         await mqtt.publish("gate/status", "online", retain=True, qos=1)
         await mqtt.publish("gate/binary_sensor/beam/state", "OFF", retain=True, qos=1)
 
@@ -89,7 +89,7 @@ async def test_changed_source_is_given_what_the_broker_retains_and_a_long_messag
 
 async def test_invalid_source_is_refused_with_the_field(fog, tokens):
     fog.start("hazard_aggregator")
-    async with httpx.AsyncClient(base_url=await fog.ready("hazard_aggregator"), timeout=15) as client:
+    async with httpx.AsyncClient(base_url=await fog.ready("hazard_aggregator"), timeout=60) as client:
         body = {"polygon": POLYGON, "sources": [{"id": "s1", "profile": "knx"}]}
         answer = await client.put("/api/v1/areas/yard", json=body, headers=tokens["operator"])
     assert answer.status_code == 422

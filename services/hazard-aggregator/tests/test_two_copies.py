@@ -70,7 +70,7 @@ async def receiver(fog):
 
 async def lease(fog, name: str) -> str:
     """Return what a process says about its lease."""
-    async with httpx.AsyncClient() as client:
+    async with httpx.AsyncClient(timeout=60) as client:
         return (await client.get(f"{await fog.url(name)}/readyz")).json()["parts"]["lease"]["detail"]
 
 
@@ -84,7 +84,7 @@ async def waits(fog, name: str, begins: str) -> None:
 async def answers(fog, name: str) -> None:
     """Wait until broker and router answer a process."""
     deadline = time.monotonic() + 60.0
-    async with httpx.AsyncClient() as client:
+    async with httpx.AsyncClient(timeout=60) as client:
         while True:
             text = (await client.get(f"{await fog.url(name)}/metrics")).text
             ages = re.findall(r"^fognav_answer_age_seconds{.*} (\S+)$", text, re.MULTILINE)
@@ -95,7 +95,7 @@ async def answers(fog, name: str) -> None:
 
 
 async def hazards_on_the_map(fog, name: str) -> list:
-    async with httpx.AsyncClient() as client:
+    async with httpx.AsyncClient(timeout=60) as client:
         return (await client.get(f"{await fog.ready(name)}/api/v1/hazards")).json()
 
 

@@ -291,7 +291,7 @@ async def test_foreign_clear_of_a_blocked_area(system: System, ahead: int) -> No
     assert costs == {254}
     assert "foreign_message" in system.log()
     port = (system.fog.folder / "aggregator.port").read_text().strip()
-    async with httpx.AsyncClient() as client:
+    async with httpx.AsyncClient(timeout=60) as client:
         metrics = (await client.get(f"http://127.0.0.1:{port}/metrics")).text
     assert 'fognav_foreign_messages_total{kind="hazard"}' in metrics
     system.distance = 3.0

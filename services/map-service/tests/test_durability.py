@@ -16,7 +16,7 @@ RECOVERY = "/api/v1/store/recovery"
 @pytest.fixture
 async def client(fog):
     fog.start("map_service")
-    async with httpx.AsyncClient(base_url=await fog.ready("map_service"), timeout=15) as client:
+    async with httpx.AsyncClient(base_url=await fog.ready("map_service"), timeout=60) as client:
         yield client
 
 
@@ -32,7 +32,7 @@ async def ids(client) -> list[str]:
 
 async def unready(client, text: str) -> None:
     """Wait until /readyz says this of the store."""
-    async with asyncio.timeout(15):
+    async with asyncio.timeout(60):
         while text not in (report := (await client.get("/readyz")).json())["parts"]["store"]["detail"]:  # noqa: ASYNC110  # another process changes it
             await asyncio.sleep(0.05)
     assert not report["ready"]
@@ -40,7 +40,7 @@ async def unready(client, text: str) -> None:
 
 async def post_until_it_leads(client, body, headers) -> httpx.Response:
     """Post a zone; a process that was just started stands by until its predecessor's lease ends."""
-    async with asyncio.timeout(15):
+    async with asyncio.timeout(60):
         while (answer := await client.post("/api/v1/zones", json=body, headers=headers)).status_code == 503:  # noqa: ASYNC110  # another process
             await asyncio.sleep(0.05)
     return answer
@@ -58,7 +58,7 @@ async def test_repeated_request_returns_the_first_zone_also_after_a_restart(fog,
     assert invalid.status_code == 422
     fog.kill("map_service")
     fog.start("map_service")
-    async with httpx.AsyncClient(base_url=await fog.ready("map_service")) as restarted:
+    async with httpx.AsyncClient(base_url=await fog.ready("map_service"), timeout=60) as restarted:
         again = await post_until_it_leads(restarted, CIRCLE, headers)
         assert again.json() == first.json()
         assert await ids(restarted) == [first.json()["id"]]
@@ -129,7 +129,7 @@ async def test_emptied_redis_is_noticed_and_the_zones_are_restored_from_memory(f
     ).status_code == 201
     fog.kill("map_service")
     fog.start("map_service")
-    async with httpx.AsyncClient(base_url=await fog.ready("map_service")) as restarted:
+    async with httpx.AsyncClient(base_url=await fog.ready("map_service"), timeout=60) as restarted:
         assert await ids(restarted) == ["dry", "wet"]
         (entry,) = (await restarted.get("/api/v1/audit", params={"kind": "store"}, headers=tokens["admin"])).json()
     assert (entry["who"], entry["action"], entry["id"]) == ("ada", "restore", "map-service")
@@ -140,7 +140,7 @@ async def test_start_on_an_emptied_redis_serves_no_map_until_an_administrator_ac
     fog.kill("map_service")
     await raw.flushall()
     fog.start("map_service")
-    async with httpx.AsyncClient(base_url=await fog.url("map_service")) as restarted:
+    async with httpx.AsyncClient(base_url=await fog.url("map_service"), timeout=60) as restarted:
         await unready(restarted, "Redis was emptied")
         assert (await restarted.get("/api/v1/zones")).status_code == 503
         nothing = await restarted.post(RECOVERY, json={"action": "restore"}, headers=tokens["admin"])
@@ -224,7 +224,7 @@ async def test_start_with_a_zone_list_too_large_for_robots_says_so_and_goes_on(f
     stored = {f"z{number}": json.dumps({**zone, "id": f"z{number}"}) for number in range(2050)}
     await raw.hset("fog:test:zones", mapping=stored)
     fog.start("map_service")
-    async with httpx.AsyncClient(base_url=await fog.ready("map_service"), timeout=15) as client:
+    async with httpx.AsyncClient(base_url=await fog.ready("map_service"), timeout=60) as client:
         report = (await client.get("/readyz")).json()
         assert "too large for robots" in report["parts"]["zones"]["detail"]
         assert 'fognav_unpublishable_messages_total{channel="zones"}' in (await client.get("/metrics")).text

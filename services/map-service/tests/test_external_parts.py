@@ -75,7 +75,7 @@ async def test_debounce_rule_and_cost_layer_of_an_external_package_work_in_the_r
         fog.start(module)
     url = await fog.ready("hazard_aggregator")
     await fog.ready("map_service")
-    async with httpx.AsyncClient(base_url=url) as client:
+    async with httpx.AsyncClient(base_url=url, timeout=60) as client:
         (area,) = (await client.get("/api/v1/areas")).json()
         assert area["definition"]["debounce"] == {"rule": "sustained", "seconds": SECONDS}
     async with fog.edges() as (mqtt, zenoh, connect):

@@ -241,7 +241,7 @@ async def test_without_redis_zones_stay_writes_fail_and_a_restart_serves_no_map_
         fog.kill("map_service")
         fog.start("map_service")
         url = await fog.url("map_service")
-        async with httpx.AsyncClient(base_url=url) as restarted:
+        async with httpx.AsyncClient(base_url=url, timeout=60) as restarted:
             report = (await restarted.get("/readyz")).json()
             assert {"store", "zones", "map"} <= set(report["missing"])
             assert (await restarted.get("/api/v1/zones")).status_code == 503
@@ -345,7 +345,7 @@ async def test_steps_of_the_wall_clock_end_no_zone_and_a_boot_without_a_clock_pu
         "limited": {"ttl_s": 1800.0},
         "later": {"starts_at": now + 7 * 86_400.0},
     }
-    async with httpx.AsyncClient(base_url=await fog.ready("map_service"), timeout=15) as client:
+    async with httpx.AsyncClient(base_url=await fog.ready("map_service"), timeout=60) as client:
         for name, fields in times.items():
             body = {**CIRCLE, "id": name, **fields}
             answer = await client.post("/api/v1/zones", json=body, headers=tokens["operator"])
@@ -360,7 +360,7 @@ async def test_steps_of_the_wall_clock_end_no_zone_and_a_boot_without_a_clock_pu
     fog.kill("map_service")
     replace_text(error, str(60.0 - now))
     await asyncio.to_thread(start)
-    async with httpx.AsyncClient(base_url=await fog.ready("map_service"), timeout=15) as client:
+    async with httpx.AsyncClient(base_url=await fog.ready("map_service"), timeout=60) as client:
         assert "time of day" in (await client.get("/readyz")).json()["parts"]["clock"]["detail"]
         assert await zones(client) == {"started": True, "limited": True, "later": True}
         replace_text(error, "0.0")

@@ -19,7 +19,7 @@ async def test_map_service_starts_without_its_unusable_zones_and_names_them_unti
     async with fog.raw_redis() as raw:
         await raw.hset("fog:test:zones", mapping={name: json.dumps(zone) for name, zone in stored.items()})
     fog.start("map_service")
-    async with httpx.AsyncClient(base_url=await fog.ready("map_service"), timeout=15) as client:
+    async with httpx.AsyncClient(base_url=await fog.ready("map_service"), timeout=60) as client:
         assert [zone["id"] for zone in (await client.get("/api/v1/zones")).json()["zones"]] == ["good"]
         left_out = {zone["id"]: zone["reason"] for zone in (await client.get("/api/v1/unusable-zones")).json()}
         assert left_out.keys() == {"too-costly", "bow-tie"}

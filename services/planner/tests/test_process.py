@@ -145,7 +145,9 @@ class Environment:
     async def ready(self) -> AsyncIterator[httpx.AsyncClient]:
         port_file = self.folder / "port"
         await self.until(port_file.exists)
-        async with httpx.AsyncClient(base_url=f"http://127.0.0.1:{port_file.read_text().strip()}") as client:
+        async with httpx.AsyncClient(
+            base_url=f"http://127.0.0.1:{port_file.read_text().strip()}", timeout=60
+        ) as client:
             deadline = time.monotonic() + DEADLINE_S
             while (answer := await client.get("/readyz")).status_code != 200:
                 assert time.monotonic() < deadline, answer.text

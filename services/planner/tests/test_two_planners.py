@@ -117,7 +117,7 @@ async def two_planners(fog, **environment):
         fog.start("planner", name, **environment.get(name.replace("-", "_"), {}))
     async with contextlib.AsyncExitStack() as stack:
         clients = {
-            name: await stack.enter_async_context(httpx.AsyncClient(base_url=await fog.url(name), timeout=5.0))
+            name: await stack.enter_async_context(httpx.AsyncClient(base_url=await fog.url(name), timeout=60.0))
             for name in PLANNERS
         }
         yield Planners(fog, clients)
@@ -155,7 +155,7 @@ async def test_mission_survives_the_leaders_death_and_its_hang_and_is_never_doub
         assert robot.goal_ids == {goal_id}, "neither doubled nor lost"
 
         fog.start("planner", leader)
-        planners.clients[leader] = httpx.AsyncClient(base_url=await fog.url(leader), timeout=5.0)
+        planners.clients[leader] = httpx.AsyncClient(base_url=await fog.url(leader), timeout=60.0)
         hung, other = await planners.roles()
         assert (hung, other) == (standby, leader)
         old, late = robot.epochs[-1], fog.lateness()
@@ -246,7 +246,7 @@ async def two_planners_joining(fog):
     fog.start("planner", "planner-2")
     async with contextlib.AsyncExitStack() as stack:
         clients = {
-            name: await stack.enter_async_context(httpx.AsyncClient(base_url=await fog.url(name), timeout=5.0))
+            name: await stack.enter_async_context(httpx.AsyncClient(base_url=await fog.url(name), timeout=60.0))
             for name in PLANNERS
         }
         yield Planners(fog, clients)

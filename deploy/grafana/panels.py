@@ -106,6 +106,24 @@ ROBOTS: Final = Dashboard(
                     "percentunit",
                 ),
                 Panel(
+                    "CPU by thread, beside recorded drives",
+                    "The threads that calculate, beside what their components took in recorded drives in lockstep:"
+                    " there without sockets, event loop and waking up, so a real thread takes more. Compare how they"
+                    " differ from setup to setup.",
+                    (
+                        (
+                            _rate(
+                                'fognav_thread_cpu_seconds_total{robot=~"$robot", thread=~"decide|python",'
+                                ' process!="watchdog"}',
+                                "robot", "process", "thread",
+                            ),
+                            "{{robot}} {{process}}/{{thread}} now",
+                        ),
+                        ("baseline:thread_cpu:mean", "recorded {{setup}} {{process}}/{{thread}}"),
+                    ),
+                    unit="percentunit",
+                ),
+                Panel(
                     "Memory",
                     "What each process keeps resident. It must not grow for hours.",
                     ((f"fognav_process_resident_bytes{_R}", "{{robot}} {{process}}"),),

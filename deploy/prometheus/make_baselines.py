@@ -4,6 +4,9 @@ The figures come from the report of an experiment (`fognav experiment report`): 
 from its `README.md`, which also says what the robot's processes took in drives by real processes (`fognav experiment
 --live`). Dashboards show them beside what robots take now.
 
+What each thread took is known by component, from drives in lockstep: the calculations of a thread, without the sockets,
+the event loop and the waking up that a real one has besides.
+
 Run: python deploy/prometheus/make_baselines.py [FOLDER] [--check]. FOLDER is the report's (docs/results/estig); one of
 your own says more of your robots' computers. With --check nothing is written, and the exit code is 1 if the file is out
 of date.
@@ -22,23 +25,44 @@ FILE: Final = Path(__file__).parent / "rules" / "baselines.yml"
 SETUPS: Final = ("default", "full", "fog")
 _COLUMN: Final = "cpu_move_base_percent"
 """Planning, layers and local planning: what one program did on the thesis's robot, and its figures 6.5 and 6.9 show."""
+_THREADS: Final = {
+    ("agent", "decide"): ("cpu_global_planning_s", "cpu_local_planning_s"),
+    ("agent", "python"): (
+        "cpu_layers_s", "cpu_localization_s", "cpu_safety_and_wheels_s", "cpu_messages_s", "cpu_lidar_driver_s",
+    ),
+    ("guardian", "python"): ("cpu_guardian_s",),
+}  # fmt: skip
+"""Which components run on which thread of a real robot, by process and thread."""
 _PROCESSES: Final = ("agent", "guardian", "watchdog")
 _MACHINE: Final = re.compile(r"^\| machine processor \| ([^|\"{}]+?) \|$", re.MULTILINE)
 
 
-def compared(drives: Sequence[Mapping[str, str]]) -> dict[str, list[float]]:
-    """Return the CPU (cores) of each drive, by setup: of those routes that succeeded in all setups.
+def compared(drives: Sequence[Mapping[str, str]]) -> dict[str, list[Mapping[str, str]]]:
+    """Return the drives of each setup: on those routes that succeeded in all setups.
 
     Raises `SystemExit` if there are none.
     """
-    routes: dict[tuple[str, str], dict[str, float]] = {}
+    routes: dict[tuple[str, str], dict[str, Mapping[str, str]]] = {}
     for drive in drives:
         if drive["success"] == "True":
-            routes.setdefault((drive["run"], drive["route"]), {})[drive["setup"]] = float(drive[_COLUMN]) / 100.0
+            routes.setdefault((drive["run"], drive["route"]), {})[drive["setup"]] = drive
     complete = [found for found in routes.values() if set(SETUPS) <= found.keys()]
     if not complete:
         raise SystemExit(f"no route was driven in all of {', '.join(SETUPS)}: let `fognav experiment` go on")
     return {setup: [found[setup] for found in complete] for setup in SETUPS}
+
+
+def planning(drives: Sequence[Mapping[str, str]]) -> float:
+    """Return what planning took on average, in cores."""
+    return fmean(float(drive[_COLUMN]) / 100.0 for drive in drives)
+
+
+def threads(drives: Sequence[Mapping[str, str]]) -> dict[tuple[str, str], float]:
+    """Return what the components of each thread took on average, in cores, by process and thread."""
+    return {
+        thread: fmean(sum(float(drive[column]) for column in columns) / float(drive["time_s"]) for drive in drives)
+        for thread, columns in _THREADS.items()
+    }
 
 
 def processes(readme: str) -> dict[tuple[str, str], tuple[float, str]]:
@@ -83,17 +107,24 @@ def rules(folder: Path) -> str:
     lines = [
         "# Made by deploy/prometheus/make_baselines.py from the report of an experiment: do not edit.",
         "# CPU in cores of planning, layers and local planning, the mean of recorded drives in each setup; and of the",
-        "# robot's processes in drives by real ones.",
+        "# robot's processes in drives by real ones; and of the calculations of each thread in lockstep.",
         "groups:",
         "  - name: baselines",
         "    rules:",
     ]
-    for setup, cores in drives.items():
+    for setup, made in drives.items():
+        labels = f'machine: "{machine[1]}", drives: "{len(made)}"'
         lines += [
             "      - record: baseline:planning_cpu:mean",
-            f"        expr: vector({fmean(cores):.5f})",
-            f'        labels: {{setup: {setup}, machine: "{machine[1]}", drives: "{len(cores)}"}}',
+            f"        expr: vector({planning(made):.5f})",
+            f"        labels: {{setup: {setup}, {labels}}}",
         ]
+        for (process, thread), cores in threads(made).items():
+            lines += [
+                "      - record: baseline:thread_cpu:mean",
+                f"        expr: vector({cores:.5f})",
+                f"        labels: {{setup: {setup}, process: {process}, thread: {thread}, {labels}}}",
+            ]
     for (setup, process), (taken, count) in sorted(processes(readme).items()):
         labels = f'setup: {setup}, process: {process}, machine: "{machine[1]}", drives: "{count}"'
         lines += [

@@ -34,13 +34,23 @@ PROCESSES = """
 | setup |
 """
 
+COMPONENTS = [
+    f"cpu_{name}_s"
+    for name in (
+        "global_planning", "layers", "local_planning", "localization", "safety_and_wheels", "messages", "lidar_driver",
+        "guardian",
+    )
+]  # fmt: skip
+
 
 def report(folder: Path, *drives: tuple[int, str, float, str], readme: str = README) -> Path:
     """Write a report with drives of one route: run, setup, CPU in percent, and whether it succeeded."""
     with (folder / "drives.csv").open("w", newline="") as file:
         rows = csv.writer(file)
-        rows.writerow(["setup", "run", "route", "success", "cpu_move_base_percent"])
-        rows.writerows([setup, run, "ab", success, percent] for run, setup, percent, success in drives)
+        rows.writerow(["setup", "run", "route", "success", "time_s", "cpu_move_base_percent", *COMPONENTS])
+        # A tenth of a second of each component more than of the one before, in 100 s.
+        seconds = [0.1 * number for number, _ in enumerate(COMPONENTS)]
+        rows.writerows([setup, run, "ab", success, 100, percent, *seconds] for run, setup, percent, success in drives)
     (folder / "README.md").write_text(readme)
     return folder
 
@@ -50,6 +60,7 @@ def recorded(text: str) -> dict[str, tuple[str, str, str]]:
     return {
         rule["labels"]["setup"]: (rule["expr"], rule["labels"]["machine"], rule["labels"]["drives"])
         for rule in group["rules"]
+        if rule["record"] == "baseline:planning_cpu:mean"
     }
 
 
@@ -90,6 +101,19 @@ def test_baselines_of_the_robot_s_processes_are_those_of_real_ones_without_a_quo
         script.rules(report(tmp_path, *drives, readme=README + PROCESSES.replace("agent, %", "agent")))
 
 
+def test_baselines_of_threads_are_the_components_that_run_on_them(script, tmp_path):
+    drives = [(1, setup, 1.0, "True") for setup in ("default", "full", "fog")]
+    (group,) = yaml.safe_load(script.rules(report(tmp_path, *drives)))["groups"]
+    rules = [rule for rule in group["rules"] if rule["record"] == "baseline:thread_cpu:mean"]
+    found = {(rule["labels"]["process"], rule["labels"]["thread"]): rule["expr"] for rule in rules}
+    assert found == {
+        ("agent", "decide"): "vector(0.00200)",  # 0 and 0.2 s
+        ("agent", "python"): "vector(0.01900)",  # 0.1, 0.3, 0.4, 0.5 and 0.6 s
+        ("guardian", "python"): "vector(0.00700)",
+    }
+    assert {rule["labels"]["setup"] for rule in rules} == {"default", "full", "fog"}
+
+
 def test_baselines_are_of_drives_at_speed_1_and_of_one_commit(script):
     row = "| default | none | 1 | 3 | 8.00 | 2.00 | 0.20 |\n"
     faster = row.replace("| 1 |", "| 4 |").replace("8.00", "2.00")
@@ -102,6 +126,10 @@ def test_published_baselines_have_the_whole_robot_in_the_setups_of_the_thesis():
     (group,) = yaml.safe_load((SCRIPT.parent / "rules" / "baselines.yml").read_text("utf-8"))["groups"]
     found = {(rule["labels"]["setup"], rule["labels"].get("process", "planning")) for rule in group["rules"]}
     assert found >= {(s, p) for s in ("default", "full") for p in ("planning", "agent", "guardian", "watchdog")}
+    threads = {
+        (rule["labels"]["setup"], rule["labels"]["thread"]) for rule in group["rules"] if "thread" in rule["labels"]
+    }
+    assert threads >= {(setup, thread) for setup in ("default", "full") for thread in ("decide", "python")}
 
 
 def test_folder_without_a_report_a_complete_route_or_a_machine_is_refused_with_the_remedy(script, tmp_path):

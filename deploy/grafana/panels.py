@@ -115,7 +115,9 @@ ROBOTS: Final = Dashboard(
                             _rate(
                                 'fognav_thread_cpu_seconds_total{robot=~"$robot", thread=~"decide|python",'
                                 ' process!="watchdog"}',
-                                "robot", "process", "thread",
+                                "robot",
+                                "process",
+                                "thread",
                             ),
                             "{{robot}} {{process}}/{{thread}} now",
                         ),

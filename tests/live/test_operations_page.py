@@ -52,7 +52,10 @@ class Machine:
         self._program(programs / "systemctl", f'exec "{sys.executable}" "{manager}" "{self._unit}" "$@"')
         for name in ("sudo", "loginctl"):
             self._program(programs / name, f'echo {name} "$@" >>"{self.asked}"')
-        self._program(programs / "git", f'echo git "$@" >>"{self.asked}"; [ "$1" != clone ] || mkdir -p "$3"')
+        git = shutil.which("git")
+        assert git is not None, "git is not installed"
+        cloning = f'[ "$1" != clone ] || {{ echo git "$@" >>"{self.asked}"; mkdir -p "$3"; exit; }}'
+        self._program(programs / "git", f'{cloning}\nexec "{git}" "$@"')
         taken: set[int] = set()
         inherited = {
             name: value for name, value in os.environ.items() if not name.startswith(("FOGNAV_", "XDG_"))
@@ -81,10 +84,11 @@ class Machine:
         yaml = self.checkout / "MAP.yaml"
         yaml.write_text(yaml.read_text("utf-8").replace("map.pgm", "MAP.pgm"), "utf-8")
 
-    def type(self, commands: str, *, where: Path | None = None) -> str:
-        """Run lines as somebody types them, and return what they print."""
+    def type(self, commands: str, *, where: Path | None = None, git_folder: Path | None = None) -> str:
+        """Run lines as somebody types them, and return what they print; `git_folder`: what git takes for its own."""
+        environment = self._environment | ({} if git_folder is None else {"GIT_DIR": str(git_folder)})
         done = subprocess.run(
-            ["bash", "-euo", "pipefail", "-c", commands], cwd=where or self.checkout, env=self._environment,
+            ["bash", "-euo", "pipefail", "-c", commands], cwd=where or self.checkout, env=environment,
             stdin=subprocess.DEVNULL, capture_output=True, text=True, timeout=600, check=False,
         )  # fmt: skip
         log = self._unit / "log"
@@ -110,6 +114,23 @@ def machine(tmp_path: Path) -> Iterator[Machine]:
     made.clone()
     yield made
     made.type("systemctl --user stop fognav.service")
+
+
+def history_with_a_newer_release(folder: Path) -> Path:
+    """Return git's folder of a clone whose remote has released a version since."""
+    identity = ("-c", "user.name=t", "-c", "user.email=t@example.org", "-c", "commit.gpgsign=false")
+
+    def git(root: Path, *arguments: str) -> None:
+        subprocess.run(["git", "-C", str(root), *identity, *arguments], check=True, capture_output=True)
+
+    remote, clone = folder / "remote", folder / "clone"
+    remote.mkdir()
+    git(remote, "init", "--quiet")
+    git(remote, "commit", "--quiet", "--allow-empty", "--message", "What is installed")
+    git(folder, "clone", "--quiet", str(remote), str(clone))
+    git(remote, "commit", "--quiet", "--allow-empty", "--message", "Find a way through the new door")
+    git(remote, "tag", "--annotate", "v0.2.0", "--message", "A release")
+    return clone / ".git"
 
 
 def test_fog_node_is_installed_extended_backed_up_and_restored_as_the_page_says(machine, tmp_path):
@@ -145,6 +166,11 @@ def test_fog_node_is_installed_extended_backed_up_and_restored_as_the_page_says(
     machine.type("./fognav ca rotate --locks ~/.local/share/fognav/locks")
     machine.wait_printed("changed: mosquitto uses", after=before)
     assert "wet floor" in machine.type("./fognav zone list --fog fog-office")
+
+    (checking,) = set(re.findall(r"`(\./fognav upgrade --check)`", PAGE))
+    said = machine.type(checking, git_folder=history_with_a_newer_release(tmp_path))
+    assert ": 1 changes" in said
+    assert "Find a way through the new door" in said
 
     machine.type("systemctl --user stop fognav.service && rm -r ~/.local/share/fognav")
     restored = machine.type(block("./fognav restore fog.tar.gz"))

@@ -16,12 +16,14 @@ ALERTS = [
     for group in yaml.safe_load((DEPLOYED / "rules" / "alerts.yml").read_text("utf-8"))["groups"]
     for rule in group["rules"]
 ]
+LIMIT_S = 900
+"""Ten seconds of a processor, of which a busy machine has little to give."""
 
 needs_promtool = pytest.mark.skipif(shutil.which("promtool") is None, reason="promtool is not installed")
 
 
 def promtool(*arguments: str) -> str:
-    done = subprocess.run(["promtool", *arguments], capture_output=True, text=True, timeout=60, check=False)
+    done = subprocess.run(["promtool", *arguments], capture_output=True, text=True, timeout=LIMIT_S, check=False)
     assert done.returncode == 0, done.stdout + done.stderr
     return done.stdout
 
@@ -32,6 +34,7 @@ def test_configuration_is_valid_and_names_files_that_exist() -> None:
 
 
 @needs_promtool
+@pytest.mark.timeout(LIMIT_S + 60)
 def test_each_alert_fires_when_it_must_and_not_before() -> None:
     assert promtool("test", "rules", *map(str, TESTS)).count("SUCCESS") == len(TESTS) == 2
 

@@ -145,6 +145,22 @@ def test_epoch_heard_while_the_grant_was_on_its_way_is_answered_with_a_further_r
     assert lease.request(0.1).floor == 50
 
 
+def test_grant_that_comes_after_the_process_led_without_it_does_not_lower_its_epoch():
+    lease = Lease("a", 100.0)
+    lost = lease.request(100.0)
+    lease.on_reply(lost, None, 100.4)
+    late = lease.request(100.5)
+    for step in range(20):  # the process runs slowly: the answer waits to be read
+        lease.tick(100.5 + 0.1 * step, 2000, connected=True)
+    assert (lease.epoch, lease.confirmed) == (2000, False)
+    lease.on_reply(late, Granted(1500), 102.45)
+    assert (lease.epoch, lease.confirmed, lease.permission(102.46)) == (2000, False, "granted")
+    again = lease.request(102.46)
+    assert (again.epoch, again.confirmed) == (2000, False)
+    lease.on_reply(again, Granted(2000), 102.47)
+    assert (lease.epoch, lease.confirmed) == (2000, True)
+
+
 def test_standby_asks_again_when_the_lease_of_the_other_is_about_to_end():
     lease = Lease("a", 0.0)
     lease.on_reply(lease.request(0.0), Held(3, "b", 0.1), 0.05)

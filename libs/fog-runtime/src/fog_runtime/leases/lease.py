@@ -179,6 +179,11 @@ class Lease:
             return
         self._silent_since = None
         if isinstance(reply, Granted):
+            if reply.epoch < self.epoch:
+                # It comes so late that this process leads by now, with a provisional epoch, which receivers may know:
+                # they would refuse a lower one. Redis confirms that epoch with the next request.
+                self._request_due = now
+                return
             self._lead(reply.epoch, request.sent_at, confirmed=True)
             return
         if isinstance(reply, LeftToOther):

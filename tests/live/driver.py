@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import json
 import math
+import os
 import re
 import shutil
 import time
@@ -12,6 +13,9 @@ from contextlib import AsyncExitStack
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Self
+
+import psutil
+from lateness import Lateness
 
 from fog_contracts import channels as ch
 from fog_contracts.messages import NodeReading, SimCommand
@@ -226,6 +230,10 @@ class LiveSystem:
         assert lines[-1].stopped, "the wheels still turn"
         last = max((line.at for line in lines if not line.stopped), default=moment)
         return last - moment
+
+    def lateness(self) -> Lateness:
+        """Return what tells how late a busy machine makes this process and its programs from now on."""
+        return Lateness(lambda: [os.getpid(), *(child.pid for child in psutil.Process().children(recursive=True))])
 
     # --- waiting ---
 

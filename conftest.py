@@ -1,6 +1,7 @@
 """Shared by all tests: hypothesis profiles, the folder of recordings, and which tests may run in parallel."""
 
 import os
+import re
 import signal
 from functools import cache
 from pathlib import Path
@@ -84,8 +85,21 @@ def pytest_xdist_make_scheduler(config: pytest.Config, log: object) -> "LoadScop
     return GroupScheduling(config, log)
 
 
+@cache
+def claims() -> frozenset[str]:
+    """Return the tests that docs/security.md names, by their ids."""
+    text = (ROOT / "docs" / "security.md").read_text("utf-8")
+    return frozenset(re.findall(r"`([\w/-]+/test_\w+\.py::test_\w+)`", text))
+
+
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Start with the tests that take longest, if several workers share them; no test that was made longer times out."""
+    """Start with the tests that take longest, if several workers share them; no test that was made longer times out.
+
+    The tests that show a claim of docs/security.md are marked: `./fognav test -m claim`.
+    """
+    for item in items:
+        if item.nodeid.partition("[")[0] in claims():
+            item.add_marker(pytest.mark.claim)
     if any(os.environ.get(name) for name in LONGER):
         for item in items:
             if item.get_closest_marker("timeout") is None:

@@ -187,6 +187,36 @@ def test_robot_that_is_suddenly_surrounded_is_weak_but_never_lost_and_good_again
     assert localizer.status == "good"
 
 
+def carried(localizer, now, place, *, scans):
+    """Let the robot stand at another place than its odometry says; return (pose, status, searching) after each scan."""
+    seen = []
+    for _ in range(scans):
+        _, now = standing(place, localizer=localizer, start=now, scans=1)
+        seen.append((localizer.pose(now), localizer.status, localizer.searching))
+    return seen
+
+
+def test_lost_robot_is_found_near_its_last_pose_before_the_whole_map_is_searched():
+    place = PLACES[1]
+    localizer, now = standing(place, prepare=lambda one: one.initial_pose(*place))
+    pushed = Pose2(place.x - 0.3, place.y + 0.3, place.theta + 0.3)
+    seen = carried(localizer, now, pushed, scans=30)
+    lost = [status for _, status, _ in seen].index("lost")
+    found = next(n for n, (pose, _, _) in enumerate(seen) if math.dist(pose[:2], pushed[:2]) < 0.1)
+    assert lost < found <= lost + 2
+    assert not any(searching for _, _, searching in seen[lost : found + 1])
+
+
+def test_lost_robot_keeps_its_estimate_while_the_whole_map_is_searched():
+    place = PLACES[0]
+    localizer, now = standing(place, prepare=lambda one: one.initial_pose(*place))
+    seen = carried(localizer, now, PLACES[1], scans=40)
+    searching = [pose for pose, _, searches in seen if searches]
+    assert searching, "the whole map was never searched"
+    assert all(pose is not None and math.dist(pose[:2], place[:2]) < 3.0 for pose in searching)
+    assert math.dist(seen[-1][0][:2], PLACES[1][:2]) < 0.1
+
+
 def test_saved_pose_is_restored_if_it_fits_else_the_map_is_searched():
     saved = SavedPose(site="s", x=5.2, y=1.9, theta=1.1, sigma_xy=0.1, sigma_theta=0.05)
     localizer, now = standing(PLACES[0], prepare=lambda one: one.restore(saved), scans=4)

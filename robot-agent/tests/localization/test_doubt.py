@@ -42,6 +42,17 @@ def test_lower_agreement_is_usual_after_a_drive():
     assert doubt_after(0.98, 0.98, *[0.7] * 7).reason == ""
 
 
+def test_share_that_verifies_no_pose_is_in_doubt_after_the_drive_on_which_it_would_become_usual():
+    """A robot that was carried along a corridor sees half of its beams agree, and none pass through a wall."""
+    doubt = doubt_after(0.98, 0.98, *[0.52] * 6)
+    assert doubt.to_verify
+    assert "other places may look like this one" in doubt.reason
+    doubt.verify()
+    assert doubt.reason == ""
+    assert doubt_after(0.98, 0.98, *[0.52] * 100).to_verify, "half of a scan verifies nothing, however far it is driven"
+    assert not doubt_after(0.98, 0.98, *[0.52] * 6, *[0.75] * 12).to_verify
+
+
 def test_lower_agreement_is_usual_after_a_drive_in_a_small_room():
     doubt = doubt_after(0.98, 0.98)
     suspect = []

@@ -219,3 +219,28 @@ def test_absolute_observation_is_fused_by_its_covariance_or_replaces_what_it_con
     assert one.covariance[0, 0] == pytest.approx(0.045)
     assert not one.observe(Pose2(9.0, 2.0, 0.0), sure, ORIGIN)
     assert one.pose(ORIGIN).x == pytest.approx(9.0)
+
+
+def at_two_places(share_of_other: float, rng: np.random.Generator) -> ParticleFilter:
+    """A filter whose estimate is at one of two clouds, 3 m apart; the other cloud has this share of the weight."""
+    one = ParticleFilter(CONFIG, 1)
+    one.start(START, ORIGIN, 0.1, 0.05)
+    poses = np.array(START) + rng.standard_normal((1000, 3)) * (0.05, 0.05, 0.02)
+    poses[500:, 0] += 3.0
+    one._set_particles(poses)
+    one._weights = np.repeat((1.0 - share_of_other, share_of_other), 500) / 500.0
+    return one
+
+
+def test_estimate_stays_with_its_place_while_another_one_weighs_about_as_much():
+    rng = np.random.default_rng(1)
+    shares = rng.uniform(0.42, 0.58, 20)
+    assert np.count_nonzero(np.diff(shares > 0.5)) > 5, "the heaviest place must change again and again"
+    for share in shares:
+        assert at_two_places(share, rng)._cluster(one_cloud=False).x == pytest.approx(START.x, abs=0.05)
+
+
+@pytest.mark.parametrize(("share", "place"), [(0.59, START.x), (0.61, START.x + 3.0)])
+def test_estimate_moves_to_another_place_that_weighs_one_and_a_half_times_as_much(share, place):
+    one = at_two_places(share, np.random.default_rng(2))
+    assert one._cluster(one_cloud=False).x == pytest.approx(place, abs=0.05)

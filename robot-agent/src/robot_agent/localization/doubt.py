@@ -21,7 +21,8 @@ to a place like its own sees walls where the map has none. A person who steps be
 _LEVEL_GAIN: Final = 0.3
 """Weight of the newest scan in that level."""
 _ACCEPTED_AFTER_M: Final = 2.0
-"""After so long a drive a lower share is the level: the place is crowded, or was changed."""
+"""After so long a drive a lower share is the level: the place is crowded, or was changed. If that share verifies no
+pose, the pose is in doubt from then on: a robot that was carried away sees as much at the wrong place."""
 
 
 class Doubt:
@@ -72,10 +73,12 @@ class Doubt:
             self._since = odom
         elif self._since is not None and _driven(self._since, odom) > _VERIFIED_AFTER_M:
             self._since = None
-        self._follow_level(fit.agree, 0.0 if self._last is None else _driven(self._last, odom))
+        if self._follow_level(fit.agree, 0.0 if self._last is None else _driven(self._last, odom)):
+            self._since = odom
         self._last = odom
 
-    def _follow_level(self, agree: float, step_m: float) -> None:
+    def _follow_level(self, agree: float, step_m: float) -> bool:
+        """Follow the level by the newest scan's share; return whether the level that is new now verifies no pose."""
         if self._level is None:
             self._level = agree
         elif agree >= self._level - _SUDDEN_DROP:
@@ -85,8 +88,10 @@ class Doubt:
             self._suspect_for_m = 0.0
         elif (further := self._suspect_for_m + step_m) > _ACCEPTED_AFTER_M:
             self._level, self._suspect_for_m = agree, None
+            return agree < _VERIFIED_AGREEMENT
         else:
             self._suspect_for_m = further
+        return False
 
 
 def _driven(since: Pose2, odom: Pose2) -> float:

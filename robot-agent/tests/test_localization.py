@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -142,6 +143,25 @@ def test_global_localization_fails_when_places_look_alike():
     assert localizer.status == "lost"
     assert "look like this one" in localizer.detail
     assert len(localizer.hypotheses) > 1
+
+
+def test_start_that_fits_no_place_is_tried_again_from_the_next_spot_without_a_pause():
+    """Among the visitors of a recorded museum, starts failed since ten seconds and several scans passed."""
+    localizer = Localizer(seed=1)
+    localizer.load_map(localizer.fields_of(STATIC, GEOMETRY))
+    crowd = np.random.default_rng(1).uniform(0.5, 9.0, 360)
+    localizer.on_odometry(0.0, 0.0, 0.0, 0.0)
+    seen = measure_scan(lambda _: PLACES[0], 0.0, 0.0)
+    localizer.on_scan(replace(seen, ranges_m=crowd), 0.0)
+    assert localizer.global_localization()
+    while localizer.searching:
+        localizer.continue_search(0.0)
+    assert "fits no place" in localizer.detail
+    for at, turned in ((1.0, 0.3), (2.0, 0.6)):
+        localizer.on_odometry(at, 0.0, 0.0, turned)
+        place = PLACES[0].compose(Pose2(0.0, 0.0, turned))
+        localizer.on_scan(measure_scan(lambda _, place=place: place, at, at), at)
+        assert localizer.searching == (turned > 0.5)
 
 
 def people_around(place, angles):

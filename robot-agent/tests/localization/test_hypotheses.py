@@ -94,7 +94,7 @@ def test_single_place_that_the_last_scan_contradicts_is_not_called_several_that_
     assert "fognav robot turn" in outcome.detail
 
 
-def test_search_without_any_place_may_begin_again_after_ten_seconds_only():
+def test_search_without_any_place_may_begin_again_after_ten_seconds_or_from_another_spot():
     one = Relocalization(CONFIG)
     rng = np.random.default_rng(1)
     angles, ranges = rng.uniform(-math.pi, math.pi, 100), rng.uniform(5.0, 9.0, 100)
@@ -109,3 +109,6 @@ def test_search_without_any_place_may_begin_again_after_ten_seconds_only():
     assert not one.active
     assert not one.may_begin(14.9)
     assert one.may_begin(15.0)
+    assert not one.may_begin(5.1, Pose2(0.45, 0.0, 0.45))
+    assert one.may_begin(5.1, Pose2(0.4, -0.4, 0.0))
+    assert one.may_begin(5.1, Pose2(0.0, 0.0, -0.55))

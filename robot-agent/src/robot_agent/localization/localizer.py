@@ -135,7 +135,7 @@ class Localizer:
         if self._relocalization.active:
             self._relocalization.on_scan(self.scan, self._fields)
             self._settle(self.scan, self._fields, now)
-        elif not self._filter.has_pose and self._may_search(now):
+        elif not self._filter.has_pose and self._may_search(self.scan, now):
             self.global_localization()
 
     def initial_pose(self, x: float, y: float, theta: float, sigma_xy: float = 0.5, sigma_theta: float = 0.35) -> None:
@@ -279,16 +279,16 @@ class Localizer:
             self._filter.widen(scan.odom, *_LOCAL_SIGMAS)
             self._monitor.restart()
             self._doubt.begin(scan.odom)
-        elif self._local_scans > _LOCAL_SCANS and not self._relocalization.active and self._may_search(now):
+        elif self._local_scans > _LOCAL_SCANS and not self._relocalization.active and self._may_search(scan, now):
             self.global_localization()
 
     def _may_verify(self, now: float) -> bool:
         """Whether the last search of the whole map for places that look like that of the pose is long enough ago."""
         return not self._relocalization.active and self._relocalization.may_begin(now) and now >= self._verify_again_at
 
-    def _may_search(self, now: float) -> bool:
-        """Whether the pose is lost and the last search is long enough ago."""
-        return self._monitor.status == "lost" and self._relocalization.may_begin(now)
+    def _may_search(self, scan: DeskewedScan, now: float) -> bool:
+        """Whether the pose is lost, and the last search is long enough ago or was made elsewhere."""
+        return self._monitor.status == "lost" and self._relocalization.may_begin(now, scan.odom)
 
     def _settle(self, scan: DeskewedScan, fields: MapFields, now: float) -> None:
         """Start at the place that the relocalization has decided for, if it has."""

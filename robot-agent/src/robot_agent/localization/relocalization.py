@@ -16,7 +16,10 @@ if TYPE_CHECKING:
 
 _POINTS_MIN: Final = 10
 _SEARCH_EVERY_S: Final = 10.0
-"""Least time between the end of a search without any place and the next one."""
+"""Least time between the end of a search without any place and the next one, ..."""
+_SEARCH_EVERY_M: Final = 0.5
+_SEARCH_EVERY_RAD: Final = 0.5
+"""... unless the robot has moved this far since: somebody may stand in its view no more."""
 
 
 class Outcome(NamedTuple):
@@ -35,6 +38,8 @@ class Relocalization:
         self._search: GlobalSearch | None = None
         self._hypotheses: Hypotheses | None = None
         self._again_at = -math.inf
+        self._failed_at: Pose2 | None = None
+        """Odometry at which the last search ended without any place."""
 
     @property
     def active(self) -> bool:
@@ -51,9 +56,14 @@ class Relocalization:
         """The places between which the scans do not decide, best first."""
         return self._hypotheses.contenders if self._hypotheses is not None else []
 
-    def may_begin(self, now: float) -> bool:
-        """Whether the last search without success is long enough ago."""
-        return now >= self._again_at
+    def may_begin(self, now: float, odom: Pose2 | None = None) -> bool:
+        """Whether the last search without success is long enough ago, or the robot at `odom` has moved since."""
+        if now >= self._again_at:
+            return True
+        if odom is None or self._failed_at is None:
+            return False
+        step = odom.relative_to(self._failed_at)
+        return math.hypot(step.x, step.y) >= _SEARCH_EVERY_M or abs(step.theta) >= _SEARCH_EVERY_RAD
 
     def cancel(self) -> None:
         """End the search and forget all places."""
@@ -87,7 +97,7 @@ class Relocalization:
         if hypotheses is None:
             return None
         if not hypotheses.places:
-            self._again_at = now + _SEARCH_EVERY_S
+            self._again_at, self._failed_at = now + _SEARCH_EVERY_S, hypotheses.odom
             self.cancel()
             return Outcome(None, hypotheses.odom, "the scan fits no place of the map: give the initial pose")
         found = hypotheses.decided

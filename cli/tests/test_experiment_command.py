@@ -7,7 +7,7 @@ import re
 import pytest
 from typer.testing import CliRunner
 
-from fognav import hardware_drive
+from fognav import checkout, hardware_drive
 from fognav.commands import experiment
 
 OUT = ["--out", "unused"]
@@ -50,3 +50,20 @@ def test_a_drive_that_was_skipped_is_named_and_is_no_success(tmp_path, monkeypat
     told = " ".join(result.output.split())
     assert re.search(r"no record of 0001-\w+-fog, .*: repeat the command to drive them", told)
     assert re.search(r"\b0 of [1-9]\d* drives succeeded", told)
+
+
+def test_a_report_of_an_archive_needs_a_folder_of_its_own(tmp_path):
+    (tmp_path / "drives.jsonl.xz").write_bytes(b"")
+    result = CliRunner().invoke(experiment.experiment_app, ["report", str(tmp_path / "drives.jsonl.xz")])
+    assert result.exit_code == 2
+    assert "name a folder for the report with --out DIR" in " ".join(result.output.split())
+
+
+def test_the_committed_results_are_small_and_can_be_reported_again(tmp_path):
+    packed = checkout.root() / "docs" / "results" / "estig" / "drives.jsonl.xz"
+    assert packed.stat().st_size < 3_000_000
+    arguments = ["report", str(packed), "--out", str(tmp_path)]
+    result = CliRunner().invoke(experiment.experiment_app, arguments, catch_exceptions=False)
+    assert result.exit_code == 0, result.output
+    assert (tmp_path / "drives.csv").read_bytes() == (packed.parent / "drives.csv").read_bytes()
+    assert {file.name for file in packed.parent.iterdir()} == {file.name for file in tmp_path.iterdir()}

@@ -2,7 +2,8 @@
 
 The figures come from the report of an experiment (`fognav experiment report`): from its `drives.csv`, and the machine
 from its `README.md`, which also says what the robot's processes took in drives by real processes (`fognav experiment
---live`). Dashboards show them beside what robots take now.
+--live`), or from the page `live.md` beside the report's folder, where drives whose records are lost keep their table.
+Dashboards show them beside what robots take now.
 
 What each thread took is known by component, from drives in lockstep: the calculations of a thread, without the sockets,
 the event loop and the waking up that a real one has besides.
@@ -99,6 +100,8 @@ def rules(folder: Path) -> str:
         with (folder / "drives.csv").open(encoding="utf-8", newline="") as file:
             drives = compared(list(csv.DictReader(file)))
         readme = (folder / "README.md").read_text("utf-8")
+        live = folder.resolve().parent / "live.md"
+        kept = live.read_text("utf-8") if live.is_file() else ""
     except (OSError, KeyError, ValueError) as error:
         raise SystemExit(f"{folder} is no report ({error}): `fognav experiment report` writes one") from error
     machine = _MACHINE.search(readme)
@@ -125,7 +128,7 @@ def rules(folder: Path) -> str:
                 f"        expr: vector({cores:.5f})",
                 f"        labels: {{setup: {setup}, process: {process}, thread: {thread}, {labels}}}",
             ]
-    for (setup, process), (taken, count) in sorted(processes(readme).items()):
+    for (setup, process), (taken, count) in sorted((processes(readme) or processes(kept)).items()):
         labels = f'setup: {setup}, process: {process}, machine: "{machine[1]}", drives: "{count}"'
         lines += [
             "      - record: baseline:process_cpu:mean",

@@ -101,6 +101,17 @@ def test_baselines_of_the_robot_s_processes_are_those_of_real_ones_without_a_quo
         script.rules(report(tmp_path, *drives, readme=README + PROCESSES.replace("agent, %", "agent")))
 
 
+def test_processes_of_a_report_without_real_ones_are_those_of_the_page_beside_its_folder(script, tmp_path):
+    drives = [(1, setup, 1.0, "True") for setup in ("default", "full", "fog")]
+    (tmp_path / "estig").mkdir()
+    (tmp_path / "live.md").write_text(PROCESSES, "utf-8")
+    beside = script.rules(report(tmp_path / "estig", *drives, readme=README))
+    assert "process_cpu" in beside
+    assert beside == script.rules(report(tmp_path / "estig", *drives, readme=README + PROCESSES))
+    own = script.rules(report(tmp_path / "estig", *drives, readme=README + PROCESSES.replace("8.00", "9.00")))
+    assert "vector(0.09000)" in own
+
+
 def test_baselines_of_threads_are_the_components_that_run_on_them(script, tmp_path):
     drives = [(1, setup, 1.0, "True") for setup in ("default", "full", "fog")]
     (group,) = yaml.safe_load(script.rules(report(tmp_path, *drives)))["groups"]

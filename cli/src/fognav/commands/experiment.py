@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import os
-from pathlib import Path  # noqa: TC003  # Typer reads annotations at run time
+from contextlib import contextmanager
+from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING, Annotated, Final, TypeVar
 
 import typer
@@ -55,6 +57,9 @@ def experiment_command(  # noqa: PLR0913  # each option is an argument
         float | None,
         typer.Option("--cpu-quota", metavar="SHARE", min=0.01, max=4.0, help="Of --live: the robot's share of a core."),
     ] = None,
+    source: Annotated[
+        Path | None, typer.Option("--from", metavar="FILE", help="Archive whose drives are not driven again.")
+    ] = None,
     hardware: Annotated[
         bool, typer.Option("--hardware", help="Drive a real robot; asks a person to place it and each barrier.")
     ] = False,
@@ -65,15 +70,16 @@ def experiment_command(  # noqa: PLR0913  # each option is an argument
 
     A run is the routes of the site's experiment.toml. On each a drawn watched area is blocked at a drawn moment, the
     same for all setups. Each drive is one file, so a run that was killed goes on where it was when the command is
-    repeated. CPU times are worth comparing when nothing runs beside: --jobs 1. Drives of --live and --hardware stand
-    beside those in lockstep, and the report compares them. The exit code is 1 if a drive failed or was skipped.
+    repeated; --from goes on with the archive of a report, drives.jsonl.xz, on another day or machine. CPU times are
+    worth comparing when nothing runs beside: --jobs 1. Drives of --live and --hardware stand beside those in lockstep,
+    and the report compares them. The exit code is 1 if a drive failed or was skipped.
     """
     if context.invoked_subcommand is not None:
         return
     from fog_runtime.configuration.site import SiteError, load_site  # noqa: PLC0415  # keeps the other commands fast
     from fognav.bench import machine  # noqa: PLC0415  # same
     from fognav.live_drive import LiveOptions  # noqa: PLC0415  # same
-    from fognav_experiments.comparison import runner  # noqa: PLC0415  # same
+    from fognav_experiments.comparison import archive, runner  # noqa: PLC0415  # same
     from fognav_experiments.comparison.records import Folder, FolderError  # noqa: PLC0415  # same
 
     with exit_codes():
@@ -90,7 +96,10 @@ def experiment_command(  # noqa: PLR0913  # each option is an argument
                 runner.read_spec(loaded, place), seed, [only] if only else range(1, runs + 1), _chosen(setups)
             )
             folder, commit = Folder(out), checkout.revision()
-            folder.begin(runner.new(loaded, place, seed), {"commit": commit, **machine.describe()})
+            begun = runner.new(loaded, place, seed)
+            if source is not None:
+                print_line(f"{archive.unpack(source, folder, begun)} drives of {source} added to {out}")
+            folder.begin(begun, {"commit": commit, **machine.describe()})
         except (SiteError, runner.SpecError, FolderError) as error:
             raise WrongUseError(str(error)) from error
         if hardware:
@@ -132,27 +141,46 @@ def _drive_real_robot(
 
 @experiment_app.command("report", epilog="Example: fognav experiment report results --out docs/results/estig")
 def report_command(
-    folder: Annotated[Path, typer.Argument(metavar="DIR", help="Folder of the records.")],
+    source: Annotated[Path, typer.Argument(metavar="DIR|FILE", help="Folder of the records, or their archive.")],
     *,
     out: Annotated[Path | None, typer.Option("--out", metavar="DIR", help="Folder of the report.")] = None,
     site: Annotated[Path | None, typer.Option("--site", metavar="DIR", help="Site of the drives.")] = None,
 ) -> None:
-    """Write the report of an experiment: Markdown, one HTML file, figures and CSV.
+    """Write the report of an experiment: Markdown, one HTML file, figures, CSV and an archive of all records.
 
     It shows the thesis's figures with ours beside them, paired differences with their tests, and where CPU time went.
+    From the archive, drives.jsonl.xz, the report is made again, and the experiment goes on (--from).
     """
     from fog_runtime.configuration.site import SiteError  # noqa: PLC0415  # keeps the other commands fast
     from fognav_experiments.comparison.publish import publish  # noqa: PLC0415  # keeps the other commands fast
-    from fognav_experiments.comparison.records import Folder, FolderError  # noqa: PLC0415  # same
+    from fognav_experiments.comparison.records import FolderError  # noqa: PLC0415  # same
     from fognav_experiments.comparison.runner import SpecError  # noqa: PLC0415  # same
 
     with exit_codes():
+        if out is None and source.is_file():
+            raise WrongUseError(f"{source} is an archive: name a folder for the report with --out DIR")
         try:
-            written = publish(Folder(folder), out or folder, checkout.site_folder(site))
+            with _records_of(source) as folder:
+                written = publish(folder, out or source, checkout.site_folder(site))
         except (FolderError, SiteError, SpecError, OSError) as error:
             raise WrongUseError(str(error)) from error
     for file in written:
         print_line(str(file))
+
+
+@contextmanager
+def _records_of(source: Path) -> Iterator[Folder]:
+    """Provide a folder of records; that of an archive for as long as it is needed. Raises `FolderError`."""
+    from fognav_experiments.comparison import archive  # noqa: PLC0415  # keeps the other commands fast
+    from fognav_experiments.comparison.records import Folder  # noqa: PLC0415  # same
+
+    if not source.is_file():
+        yield Folder(source)
+        return
+    with TemporaryDirectory(prefix="fognav-records-") as temporary:
+        folder = Folder(Path(temporary))
+        archive.unpack(source, folder)
+        yield folder
 
 
 @experiment_app.command("scenarios", epilog="Example: fognav experiment scenarios wifi-gap-5s kidnapped")
@@ -211,7 +239,9 @@ def _print_played(name: str, played: Played) -> None:
 def film_command(
     out: Annotated[Path, typer.Argument(metavar="FILE.gif", help="File of the film.")],
     *,
-    source: Annotated[Path, typer.Option("--from", metavar="DIR", help="Folder of the records.")],
+    source: Annotated[
+        Path, typer.Option("--from", metavar="DIR|FILE", help="Folder of the records, or their archive.")
+    ],
     run: Annotated[int, typer.Option("--run", metavar="N", min=1, help="Run of the experiment.")] = 2,
     route: Annotated[str | None, typer.Option("--route", metavar="R", help="Its route, as ab; default: first.")] = None,
     setups: Annotated[str, typer.Option("--setups", metavar="A,B", help="default, full, fog.")] = "default,fog",
@@ -224,16 +254,17 @@ def film_command(
     from fog_runtime.configuration.site import SiteError, load_site  # noqa: PLC0415  # keeps the other commands fast
     from fognav.film import Film, UnfilmedDriveError  # noqa: PLC0415  # same
     from fognav_experiments.comparison import runner  # noqa: PLC0415  # same
-    from fognav_experiments.comparison.records import Folder, FolderError  # noqa: PLC0415  # same
+    from fognav_experiments.comparison.records import FolderError  # noqa: PLC0415  # same
 
     with exit_codes():
         if out.suffix != ".gif":
             raise WrongUseError(f"{out} is no GIF: name a file that ends in .gif")
         place = checkout.site_folder(site)
         try:
-            loaded, folder = load_site(place), Folder(source)
-            drawn = runner.recorded_draw(folder, loaded, place, run, route)
-            records = folder.read_drives(run, drawn.route.name, _chosen(setups))
+            loaded = load_site(place)
+            with _records_of(source) as folder:
+                drawn = runner.recorded_draw(folder, loaded, place, run, route)
+                records = folder.read_drives(run, drawn.route.name, _chosen(setups))
             size = Film(loaded, drawn, records).write(out)
         except (SiteError, runner.SpecError, FolderError, UnfilmedDriveError) as error:
             raise WrongUseError(str(error)) from error

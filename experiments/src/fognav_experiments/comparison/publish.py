@@ -1,4 +1,4 @@
-"""Writes the report of a folder: Markdown with its figures, one HTML file, and CSV of all drives and of the means."""
+"""Writes the report of a folder: Markdown with its figures, one HTML file, CSV of drives and means, and the archive."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 from fog_runtime.configuration.site import load_site
 from fog_runtime.files import SHARED, atomic_write
-from fognav_experiments.comparison import runner
+from fognav_experiments.comparison import archive, runner
 from fognav_experiments.comparison.document import Figure, to_html, to_markdown
 from fognav_experiments.comparison.draws import draw
 from fognav_experiments.comparison.geometry import RouteGeometry
@@ -45,7 +45,8 @@ def publish(folder: Folder, target: Path, site: Path | None = None) -> list[Path
     for name, text in texts.items():
         atomic_write(target / name, text.encode(), mode=SHARED)
     write_csv(target / "drives.csv", records)
-    return [target / name for name in (*texts, "drives.csv")]
+    archive.write(folder, target / archive.NAME)
+    return [target / name for name in (*texts, "drives.csv", archive.NAME)]
 
 
 def _savings(records: Sequence[Record], asked: dict[str, Any], place: Path | None) -> dict[tuple[int, str], Saving]:

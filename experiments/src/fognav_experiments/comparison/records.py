@@ -13,12 +13,14 @@ from fognav_experiments.comparison.measured import MeasuredDrive
 from fognav_experiments.comparison.timeline import Timeline  # read at run time, when a file is decoded
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable, Sequence
+    from collections.abc import Iterable, Mapping, Sequence
     from pathlib import Path
 
     from fog_contracts.messages import ProfileName
     from fognav_experiments.comparison.measured import Kind
 
+LOCKSTEP: Final = "drives"
+"""Folder of the records in lockstep."""
 MOVE_BASE: Final = ("global planning", "layers", "local planning")
 """Components of a robot whose work the process `move_base` of the ROS navigation stack holds."""
 ON_ROBOT: Final = (*MOVE_BASE, "localization", "safety and wheels", "messages", "lidar driver", "guardian")
@@ -77,6 +79,28 @@ class FolderError(ValueError):
     """The folder can't be used; the message names the remedy."""
 
 
+def machines(experiment: Mapping[str, Any]) -> list[dict[str, Any]]:
+    """Return what an experiment's drives were measured on: the first machine, and those that went on with it."""
+    return [experiment["measured_on"], *experiment.get("also_on", [])]
+
+
+def _with_machines(experiment: dict[str, Any], others: Sequence[dict[str, Any]]) -> dict[str, Any]:
+    """Return an experiment's description with the machines of `others` that it does not name yet."""
+    known = [_lasting(machine) for machine in machines(experiment)]
+    new = []
+    for machine in others:
+        if (lasting := _lasting(machine)) not in known:
+            known.append(lasting)
+            new.append(machine)
+    return experiment | {"also_on": [*experiment.get("also_on", []), *new]} if new else experiment
+
+
+def _lasting(measured_on: Mapping[str, Any]) -> dict[str, Any]:
+    """Return what does not change from one start of the command to the next: each drive has load and commit itself."""
+    machine = {name: value for name, value in measured_on.get("machine", {}).items() if name != "load"}
+    return {"machine": machine, "versions": measured_on.get("versions", {})}
+
+
 class _Named(Protocol):
     @property
     def name(self) -> str: ...
@@ -123,24 +147,34 @@ class Folder:
 
     def __init__(self, path: Path) -> None:
         self.path = path
-        self.drives = DriveFiles(path / "drives", Record)
+        self.drives = DriveFiles(path / LOCKSTEP, Record)
         """Those in lockstep."""
 
     def begin(self, asked: Asked, machine: dict[str, Any]) -> None:
-        """Create the folder, or verify that it is about the same experiment; raises `FolderError`."""
+        """Create the folder, or verify that it is about the same experiment; raises `FolderError`.
+
+        `machine`: what the drives that follow are measured on and with; the folder lists every one that differs.
+        """
+        self.adopt({"asked": msgspec.to_builtins(asked), "measured_on": machine})
+
+    def adopt(self, experiment: dict[str, Any]) -> None:
+        """Create the folder as one of an `experiment` that another folder describes, or add its machines to it.
+
+        Raises `FolderError` if the folder is about another experiment.
+        """
         file = self.path / "experiment.json"
         try:
             self.path.mkdir(parents=True, exist_ok=True)
             known = msgspec.json.decode(file.read_bytes()) if file.exists() else None
         except (OSError, msgspec.DecodeError) as error:
             raise FolderError(f"{self.path} can't be used: {error}. Name another folder") from error
-        wanted = msgspec.to_builtins(asked)
-        if known is not None and known["asked"] != wanted:
+        if known is not None and known["asked"] != experiment["asked"]:
             raise FolderError(
-                f"{self.path} holds drives of another experiment ({known['asked']}, not {wanted}): name another folder"
+                f"{self.path} holds drives of another experiment ({known['asked']}, not {experiment['asked']}): name "
+                "another folder"
             )
-        if known is None:
-            document = {"asked": wanted, "measured_on": machine}
+        document = experiment if known is None else _with_machines(known, machines(experiment))
+        if document != known:
             atomic_write(file, msgspec.json.format(msgspec.json.encode(document)), mode=SHARED)
 
     def description(self) -> dict[str, Any]:

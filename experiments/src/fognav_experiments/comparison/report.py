@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any, Final, NamedTuple
 
 from fognav_experiments.comparison import agreement, figures, limits
 from fognav_experiments.comparison.document import Block, Code, Figure, Heading, Paragraph, Table, flat
-from fognav_experiments.comparison.records import ALIKE, MOVE_BASE, OF_FOG, ON_FOG, ON_ROBOT
+from fognav_experiments.comparison.records import ALIKE, MOVE_BASE, OF_FOG, ON_FOG, ON_ROBOT, machines
 from fognav_experiments.comparison.statistics import Estimate, compare, estimate
 from fognav_experiments.comparison.thesis import REPORTED
 
@@ -128,6 +128,8 @@ def _introduction(records: Sequence[Record], pairs: Sequence[Drives], experiment
     runs = max((record.run for record in records), default=0)
     command = f"fognav experiment --setups {setups} --runs {runs} --seed {asked['seed']} --out DIR"
     rows = [[name, str(value)] for name, value in flat(measured)]
+    for machine in machines(experiment)[1:]:
+        rows += [[f"later {name}", str(value)] for name, value in flat(machine) if name != "commit"]
     jobs = sorted({record.jobs for record in records})
     speed = sum(record.time_s or 0.0 for record in records) / max(sum(record.wall_s for record in records), 1e-9)
     rows.append(["lockstep", f"{speed:.1f} times as fast as real time"])

@@ -8,8 +8,8 @@ from typing import Final
 from panels import Panel
 from PIL import Image, ImageDraw
 
-_WIDTH, _HEIGHT, _COLUMNS = 620, 250, 2
-_LEFT, _TOP, _RIGHT, _BOTTOM = 70, 30, 210, 24
+_WIDTH, _HEIGHT, _COLUMNS = 660, 250, 2
+_LEFT, _TOP, _RIGHT, _BOTTOM = 70, 30, 250, 24
 """Margins of a panel's plot (pixels); the legend is on the right."""
 _PAGE_TITLE: Final = 30
 _COLOURS: Final = ("#1f77b4", "#d62728", "#2ca02c", "#9467bd", "#ff7f0e", "#17becf", "#8c564b", "#e377c2", "#7f7f7f")
@@ -17,7 +17,7 @@ _INK, _GRID, _NOTHING = "#222222", "#dddddd", "#b00020"
 _LEGENDS: Final = 14
 _SHOWN: Final = {"percentunit": ("%", 100.0)}
 """Grafana's units that are read more easily in another one: its name and what to multiply by."""
-_LEGEND_CHARACTERS: Final = 33
+_LEGEND_CHARACTERS: Final = 40
 
 
 @dataclass(frozen=True)

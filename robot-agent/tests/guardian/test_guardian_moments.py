@@ -109,6 +109,15 @@ def test_charging_base_is_held_at_zero_from_the_first_tick_and_woken_when_it_fal
     assert rig.core.tick(0.301).data == b"wake;"
 
 
+def test_docking_base_that_charges_from_the_start_is_held_by_zero_speeds_and_its_mode_left_alone() -> None:
+    base = DockingBase()
+    rig = Rig.__new__(Rig)
+    rig.base, rig.core = base, GuardianCore(base)
+    rig.frame(0.0, charging=True)
+    assert rig.core.tick(0.01).data == STAND
+    assert rig.core.stop_command() == STAND
+
+
 def test_charging_base_that_is_awake_stands_and_says_why() -> None:
     rig = Rig()
     rig.drive(0.1, 1.0)

@@ -457,9 +457,9 @@ def mutation_command(
 ) -> None:
     """Test the tests of what stops the robot.
 
-    Changes one operator, number or statement of safety gate, guardian, recoveries or maneuvers, and runs their tests,
-    which must notice it; prints each change that none does. Exit code 1: a line or branch that no test reaches, or
-    fewer than 90 percent of the changes noticed.
+    Changes one operator, number or statement of safety gate, guardian, watchdog, recoveries or maneuvers, and runs
+    their tests, which must notice it; prints each change that none does. Exit code 1: a line or branch that no test
+    reaches, or fewer than 90 percent of the changes noticed.
     """
     from fognav import checkout  # noqa: PLC0415  # keeps the other commands fast
     from fognav.mutation import report  # noqa: PLC0415  # same

@@ -126,6 +126,12 @@ PARTS: Final = (
             ),
             Equivalent(
                 "core",
+                "moved: bool = False",
+                "False -> True",
+                "a base is awake only after it was woken, which sets it",
+            ),
+            Equivalent(
+                "core",
                 "if current * target < 0:",
                 "current * target < 0 -> current * target <= 0",
                 "with either of them zero, the current speed or the target is zero, and the result the same",
@@ -152,11 +158,18 @@ PARTS: Final = (
             "motion/test_recovery_boundaries.py",
             "motion/test_recovery_limits.py",
             "agent/test_power.py",
+            "agent/test_recoveries.py",
         ),
         ("numpy", "hypothesis.strategies", "fog_kernels.clearance", "robot_agent.config", "robot_agent.motion.band"),
         (
             Equivalent(
                 "recovery", "since: float = 0.0", "0.0 -> 1.0", "only a move that runs has a begin, and it sets its own"
+            ),
+            Equivalent(
+                "recoveries",
+                "self._refused = False",
+                "False -> True",
+                "only a move that runs can be refused, and the call that begins one forgets what was before",
             ),
             *(
                 Equivalent(
@@ -189,5 +202,11 @@ PARTS: Final = (
         ("agent.maneuvering",),
         ("agent/test_docking.py", "agent/test_maneuvers.py", "agent/test_maneuvering.py"),
         ("numpy", "hypothesis.strategies", "robot_agent.localization.localizer", "robot_agent.config"),
+    ),
+    Part(
+        "watchdog",
+        ("guardian.watchdog",),
+        ("guardian/test_watchdog.py",),
+        ("robot_agent.serial_port", "fog_runtime.configuration.parts", "fog_runtime.machine.service_manager"),
     ),
 )

@@ -10,6 +10,7 @@ import pytest
 from little_world import L_PATH, LittleWorld
 
 from fog_contracts import channels as ch
+from fog_contracts.handlers import Moment
 from fog_contracts.messages import AreaHazard, HazardArea, PolygonShape, Zone, ZoneSet
 from robot_agent.profiles import PROFILES
 
@@ -133,6 +134,33 @@ def test_a_profile_is_switched_at_rest_only():
     assert not reply.accepted
     assert "disable it first" in reply.reason
     assert world.state().profile == "fog"
+
+
+def test_path_that_another_profile_has_searched_is_dropped_when_it_is_found_after_the_switch():
+    world = ring("default")
+    send_goal(world, (8.0, 1.7))
+    world.run(1.0)
+    world.command("disable")
+    world.run(0.6)
+    search = world.agent.search(world.now + 0.2)
+    assert search is not None
+    world.send(ch.HAZARD, hazard("blocked", 254))
+    assert world.command("profile_full").accepted
+    world.agent.on_found(search.run(), Moment(world.now, world.now))
+    assert world.state().plan_id is None
+
+
+def test_paths_of_the_robots_own_are_numbered_on_from_profile_to_profile():
+    world = ring("full")
+    send_goal(world, (8.0, 1.7))
+    seen = []
+    for profile in ("default", "fog", "full", "default"):
+        assert world.run(3.0, lambda w: w.state().plan_id)
+        seen.append((world.state().planner_epoch, world.state().plan_id))
+        switched(world, profile)
+    own = [plan for epoch, plan in seen if epoch == 0]
+    assert len(own) == 3
+    assert own == sorted(set(own))
 
 
 def test_a_robot_that_returns_to_the_fog_waits_for_the_newest_map_and_drives_by_it():

@@ -49,6 +49,8 @@ class Navigation:
         self._driving = driving
         self._localizer = localizer
         self._onboard: OnboardNavigator | None = None
+        self._own_plans = 0
+        """Number of the robot's own last plan: no other path gets it, of whatever profile."""
         self._fog_heard_at = 0.0
         self.profile: Profile = FOG
         """How the robot navigates."""
@@ -119,9 +121,12 @@ class Navigation:
         return onboard.search(goal, pose, mission.follower, now)
 
     def on_found(self, found: Found, at: Moment) -> None:
-        """Follow the path that a search found, unless the present one is as good; one to another goal is dropped."""
+        """Follow the path that a search found, unless the present one is as good.
+
+        One to another goal is dropped, and one that was searched by another profile.
+        """
         onboard, mission = self._onboard, self._driving.mission
-        if onboard is None or found.goal != mission.goal or not mission.active:
+        if onboard is None or not onboard.searched(found) or found.goal != mission.goal or not mission.active:
             return
         path = onboard.path(found, mission.follower, at)
         if path is not None:
@@ -168,6 +173,8 @@ class Navigation:
             return "the robot is driving: disable it first"
         self.profile = PROFILES[name]
         self._driving.configure(self.profile.motion(self._config.motion))
+        if self._onboard is not None:
+            self._own_plans = self._onboard.plans
         self._onboard = None
         self._begin_onboard()
         return None
@@ -179,4 +186,4 @@ class Navigation:
         from robot_agent.onboard.navigator import OnboardNavigator  # noqa: PLC0415  # see above
 
         radius = self._config.footprint.inscribed_radius
-        self._onboard = OnboardNavigator(self.profile, self._fog.replica, radius)
+        self._onboard = OnboardNavigator(self.profile, self._fog.replica, radius, self._own_plans)

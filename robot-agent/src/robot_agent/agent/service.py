@@ -217,11 +217,9 @@ class Service:
         try:
             async for now in self._control:
                 self._control.period = self._core.profile.control_period
-                profile = self._core.profile
                 if (search := self._core.search(now)) is not None:
                     found = await loop.run_in_executor(thread, search.run)
-                    if self._core.profile is profile:  # else it was searched with what the other one knows
-                        self._core.on_found(found, self._edges.now())
+                    self._core.on_found(found, self._edges.now())
                 job = self._core.control_job(now)
                 if job is not None:
                     self._core.accept(await loop.run_in_executor(thread, decide, job))

@@ -37,9 +37,12 @@ _EARLY_S: Final = 1e-6
 
 
 class OnboardNavigator:
-    """Keeps the robot's own costmap up to date and says when to search. Times are s of the robot's monotonic clock."""
+    """Keeps the robot's own costmap up to date and says when to search. Times are s of the robot's monotonic clock.
 
-    def __init__(self, profile: Profile, floor: Replica, inscribed_radius: float) -> None:
+    `plans`: number of the plan that the robot made last, by this navigator or one before.
+    """
+
+    def __init__(self, profile: Profile, floor: Replica, inscribed_radius: float, plans: int = 0) -> None:
         self._profile = profile
         self._costmap = OnboardCostmap(floor, inscribed_radius)
         geometry = self._costmap.geometry
@@ -48,7 +51,7 @@ class OnboardNavigator:
         self._searched_at = -math.inf
         self._searched_goal: RobotGoal | None = None
         self._refused = False
-        self._plan_id = 0
+        self.plans = plans
 
     @property
     def replica(self) -> Replica:
@@ -84,6 +87,10 @@ class OnboardNavigator:
             goal=goal,
         )
 
+    def searched(self, found: Found) -> bool:
+        """Return whether it was found on this costmap, not on that of a profile before."""
+        return found.planner is self._planner
+
     def path(self, found: Found, follower: PathFollower | None, at: Moment) -> RobotPath | None:
         """Return the path to follow from now on, or the refusal; None if the present path is kept."""
         self._refused = found.refusal is not None
@@ -92,9 +99,9 @@ class OnboardNavigator:
         assert found.goal.pose is not None
         if follower is not None and found.refusal is None and self._is_as_good(follower, found):
             return None
-        self._plan_id += 1
+        self.plans += 1
         return RobotPath(
-            plan_id=self._plan_id,
+            plan_id=self.plans,
             planner_epoch=0,
             goal_id=found.goal.goal_id,
             points=found.points,

@@ -27,8 +27,9 @@ _ESCAPE_M: Final = 0.5
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Found:
-    """The result of a search: corner points (m, frame `map`), or why there is no path."""
+    """The result of a search by `planner`: corner points (m, frame `map`), or why there is no path."""
 
+    planner: Planner
     goal: RobotGoal
     points: list[PointXY]
     refusal: Refusal | None = None
@@ -66,7 +67,7 @@ class Search:
         found = self.planner.plan(self.cost, free, last)
         if not found.found:
             return self._refused(208, "no path leads to the goal on the robot's own map")
-        return Found(goal=self.goal, points=self._points(found.cells, goal))
+        return Found(planner=self.planner, goal=self.goal, points=self._points(found.cells, goal))
 
     def _points(self, cells: NDArray[np.int32], goal: PointXY) -> list[PointXY]:
         """Return the corners of a path by cells, from the robot to the goal exactly where the lines are free."""
@@ -81,4 +82,4 @@ class Search:
         return [(float(x), float(y)) for x, y in points]
 
     def _refused(self, code: PlanCode, reason: str) -> Found:
-        return Found(goal=self.goal, points=[], refusal=Refusal(code=code, reason=reason))
+        return Found(planner=self.planner, goal=self.goal, points=[], refusal=Refusal(code=code, reason=reason))

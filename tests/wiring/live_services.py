@@ -288,7 +288,9 @@ class LiveServices:
             MemoryStore(), edges["map-service"], edges["map-service"], clock, Health(),
         )  # fmt: skip
         self.planner_core = PlannerCore(1)
-        self.planner = PlannerService(self.planner_core, MemoryStore(), edges["planner"], clock, Health())
+        self.planner = PlannerService(
+            self.planner_core, MemoryStore(), edges["planner"], clock, Health(), staging=loaded.site.staging
+        )
         self.agent_core = AgentCore(config, seed)
         store = MemoryStore()
         self.agent = AgentService(self.agent_core, edges["robot-agent"], store, clock, Health())

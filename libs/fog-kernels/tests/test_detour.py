@@ -107,6 +107,29 @@ def test_what_earlier_searches_left_in_memory_changes_nothing(bound: NDArray[np.
     assert all(other == found[0] for other in found)
 
 
+def test_least_rise_is_the_lowest_difference_at_the_cells_with_a_path_to_the_goal() -> None:
+    bound = np.zeros((6, 20), np.uint8)
+    bound[:, 10] = 254
+    field = Planner(20, 6).goal_field(bound, (15, 3), TilePatterns(10**6))
+    cells, levels = np.array([12, 5, 59], np.int32), np.array([7, -(10**9), 900], np.int64)
+    for each in (field, field.coarser()):
+        costs = each.costs(cells)
+        assert each.least_rise(cells, levels) == min(costs[0] - 7, costs[2] - 900)
+    assert field.least_rise(cells[1:2], levels[1:2]) is None  # it is behind the wall
+    with pytest.raises(ValueError, match="each of the 3 cells, not 2"):
+        field.least_rise(cells, levels[:2])
+
+
+def test_labels_of_another_type_or_size_are_refused() -> None:
+    bound = np.zeros((6, 20), np.uint8)
+    planner = Planner(20, 6)
+    field = planner.goal_field(bound, (15, 3), TilePatterns(10**6))
+    with pytest.raises(ValueError, match="each of the 120 cells, not 119"):
+        Shadow(bound, bound, field, [(2, 2)], planner, label=np.zeros(119, np.int32))
+    with pytest.raises(TypeError, match="label must be int32"):
+        Shadow(bound, bound, field, [(2, 2)], planner, label=np.zeros(120, np.int64))
+
+
 def test_room_whose_corners_are_left_through_what_is_sealed_is_no_way_out() -> None:
     bound = np.full((54, 60), 254, np.uint8)
     bound[1:12, 1:58] = 0

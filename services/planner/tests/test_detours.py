@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from typing import TYPE_CHECKING
 
 import numpy as np
 import pytest
@@ -10,12 +11,16 @@ from ring_map import Box, RingMap, goal, pose
 
 from fog_contracts import channels as ch
 from fog_contracts.handlers import Moment
+from fog_kernels.astar import Planner
 from fog_kernels.steps import SEALED
 from planner.config import PlannerConfig
 from planner.core import PlannerCore
 from planner.search.detours import DeadEndsJob, Detours
 from planner.search.goal_fields import GoalFields
 from planner.search.path_search import PathSearch
+
+if TYPE_CHECKING:
+    from fog_kernels.guides import Detour
 
 WALLS = ((2.0, 2.0, 18.0, 5.0), (2.0, 7.0, 18.0, 10.0))
 """Leave three corridors from left to right."""
@@ -41,8 +46,12 @@ class Fleet:
             self.core.set_goal(robot, goal(19.0, 4.0 + 0.5 * number, f"g{number}"))
         self.core.handlers()[ch.MAP_HEARTBEAT]({}, self.map.master.heartbeat(0.0), AT)
         self.first_jobs = self.core.jobs(AT)
+        self.memory = np.empty(0, np.int32)
+        """What was made for the first bound, when its dead ends were searched."""
         for job in self.first_jobs:
             job.run()
+            if isinstance(job, DeadEndsJob) and job.memory is not None:
+                self.memory = job.memory
             self.core.add(job, AT.now)
         self.core.tick(AT)
 
@@ -113,6 +122,50 @@ def test_dead_ends_of_outdated_costs_are_not_used() -> None:
     assert detours.dead_ends is current.found
     fields.set_bounds(costs, costs.copy())
     assert detours.dead_ends is None
+
+
+def compute(fleet: Fleet) -> Detour:
+    """Return a new bound for the fleet's robots."""
+    geometry, detours, view = fleet.map.geometry, fleet.core.replanner.detours, fleet.core.view()
+    assert view is not None
+    trips = [(geometry.cell(4.0 + 1.2 * number, 6.0), geometry.cell(19.0, 4.0 + 0.5 * number)) for number in range(6)]
+    detours.compute(view.planning_map, Planner(geometry.width, geometry.height), trips)
+    found = detours.guide(*trips[0])
+    assert found is not None
+    return found
+
+
+def test_first_bound_takes_the_memory_that_was_made_with_the_dead_ends() -> None:
+    fleet = Fleet(6)
+    assert fleet.memory.size == fleet.map.cost().size
+    fleet.change(blocked=True)
+    geometry = fleet.map.geometry
+    known = fleet.core.replanner.detours.guide(geometry.cell(10.0, 6.0), geometry.cell(19.0, 5.0))
+    assert known is not None
+    assert np.shares_memory(known.costs, fleet.memory)
+
+
+def test_bound_in_the_memory_of_a_forgotten_one_has_nothing_left_of_it() -> None:
+    fleet = Fleet(6, detour_searches=100)
+    fleet.change(blocked=True)
+    forgotten = compute(fleet)
+    expected = forgotten.costs.copy()
+    forgotten.costs[:] += 1  # where it is not cleaned, it would be another bound
+    fleet.core.replanner.detours.clear()
+    found = compute(fleet)
+    assert np.shares_memory(found.costs, forgotten.costs)
+    assert np.array_equal(found.costs, expected)
+
+
+def test_bounds_that_hold_share_no_memory() -> None:
+    fleet = Fleet(6, detour_searches=100)
+    fleet.change(blocked=True)
+    first = compute(fleet)
+    expected = first.costs.copy()
+    second = compute(fleet)
+    assert second is not first
+    assert not np.shares_memory(first.costs, second.costs)
+    assert np.array_equal(first.costs, expected)
 
 
 def test_few_robots_have_no_dead_ends_searched() -> None:

@@ -415,9 +415,9 @@ class Planner:
         self._queue_next = np.empty(self._capacity, np.int32)
 
     @property
-    def scratch(self) -> tuple[NDArray[np.int32], NDArray[np.int32]]:
-        """Two arrays of at least width x height numbers, for other kernels to use between two searches."""
-        return self._queue_cell, self._queue_next
+    def scratch(self) -> tuple[NDArray[np.int32], NDArray[np.int32], NDArray[np.int32]]:
+        """Three arrays of at least width x height numbers, for other kernels to use between two searches."""
+        return self._queue_cell, self._queue_next, self._reached_cells
 
     def _grid(self, costmap: NDArray[np.uint8]) -> NDArray[np.uint8]:
         costmap = _arrays.grid(costmap, "costmap")

@@ -19,7 +19,7 @@ Nothing here has to be exact for a search to stay optimal: any set A gives a val
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 from numba import int64, njit, types
@@ -44,6 +44,8 @@ _CANDIDATE = 1
 """The label of a cell beside the shadow."""
 _MOST_GROUPS = 24
 """How many groups one raised cell can begin at most: it, its 8 neighbours, and steps that it cuts off."""
+_COMPARED: Final = 512
+"""How many cells of two costmaps are compared at once: most of a closed floor is as it was."""
 
 _I64_FLAT = types.Array(types.int64, 1, "C", readonly=True)
 
@@ -84,6 +86,24 @@ def _root(groups: Any, number: Any) -> Any:
         groups[np.uint64(number)] = groups[np.uint64(above)]
         number = above
     return number
+
+
+@njit(int64(_arrays.U8_FLAT, _arrays.U8_FLAT, _arrays.I32_OUT), cache=True, nogil=True, error_model="numpy")
+def _find_raised(costmap: Any, bound: Any, found: Any) -> int:
+    """Write the cells whose cost is above the bound, in their order; return their number."""
+    count: Any = np.int64(0)
+    for begin in range(0, costmap.size, _COMPARED):
+        costs, least = costmap[begin : begin + _COMPARED], bound[begin : begin + _COMPARED]
+        differs = False
+        for i in range(costs.size):
+            differs |= costs[i] > least[i]
+        if not differs:
+            continue
+        for i in range(costs.size):
+            if costs[i] > least[i]:
+                found[np.uint64(count)] = begin + i
+                count += 1
+    return int(count)
 
 
 _mark_signature = types.UniTuple(int64, 2)(  # type: ignore[no-untyped-call]  # numba has no types
@@ -332,30 +352,35 @@ class Shadow:
         planner: Planner,
         dead_ends: DeadEnds | None = None,
         goals: Iterable[tuple[int, int]] = (),
+        label: NDArray[np.int32] | None = None,
     ) -> None:
         """Find it on a uint8 (h, w) costmap; `field` is an exact one over the costmap `bound`.
 
         The `dead_ends`, which were found on `bound`, are left out, but for those with a start or one of the `goals`.
-        Takes some 15 ns for each of its cells, in the planner's memory. Raises ValueError for a field that is not
-        exact.
+        Takes some 15 ns for each of its cells, in the planner's memory. `label`: zeros, int32 (height * width,), which
+        the shadow takes over; fresh memory can cost more time than all the rest. Raises ValueError for a field that is
+        not exact, and TypeError or ValueError for labels of another type or shape.
         """
         if not field.exact:
             raise ValueError(f"the field of goal {field.goal} has one cost for several cells: pass an exact one")
         self._costmap = _arrays.grid(costmap, "costmap")
         self._planner = planner
         bound = _arrays.grid(bound, "bound")
-        raised = np.flatnonzero((costmap > bound).ravel()).astype(np.int32)
         flat, width, weight = costmap.ravel(), planner.width, planner.weight
+        found, beside, groups = planner.scratch
+        raised = beside[: int(_find_raised(flat, bound.ravel(), beside))].copy()
         goal = field.goal[1] * width + field.goal[0]
         first = np.unique(np.array([row * width + column for column, row in starts], np.int32))
-        self._label = np.zeros(costmap.size, np.int32)
+        self._label = np.zeros(costmap.size, np.int32) if label is None else label
+        _arrays.exact(self._label, np.int32, 1, "label")
+        if self._label.size != costmap.size:
+            raise ValueError(f"label must have one number for each of the {costmap.size} cells, not {self._label.size}")
         self._sealed: SealedEnds | None = None
         if dead_ends is not None:
             last = np.array([row * width + column for column, row in (field.goal, *goals)], np.int32)
             self._sealed = dead_ends.seal(costmap, raised, np.concatenate((first, last)))
             self._sealed.paint(self._label)
-        found, beside = planner.scratch
-        groups = np.empty(min(costmap.size, _MOST_GROUPS * (len(raised) + 1)), np.int32)
+        groups = groups[: min(costmap.size, _MOST_GROUPS * (len(raised) + 1))]
         count, candidates = _mark_shadow(
             flat, bound.ravel(), width, goal if weight[flat[goal]] > 0 else -1, weight, field.lowest.ravel(),
             field.lowest.shape[1], field.slots.ravel(), field.patterns.ravel(), raised, self._label, found, beside,
@@ -384,7 +409,7 @@ class Shadow:
             return None
         planner, label = self._planner, self._label
         levels = levels - levels.min()
-        queue_cell, queue_next = planner.scratch
+        queue_cell, queue_next, _ = planner.scratch
         heads = np.empty(_SHADOW >> planner.bucket_shift, np.int32)
         highest = int(
             _fill(

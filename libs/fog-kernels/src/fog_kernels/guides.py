@@ -9,7 +9,7 @@ from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
-from numba import int64, njit, void
+from numba import int64, njit, types, void
 
 from fog_kernels import _arrays
 
@@ -18,13 +18,35 @@ if TYPE_CHECKING:
 
     from fog_kernels.dead_ends import SealedEnds
 
+    _Cells = NDArray[np.int32]
+    _Arguments = tuple[_Cells, int, int, int, _Cells, _Cells, int]
+
 TILE_BITS: Final = 4
 """An exact field is made of tiles of 16 x 16 cells."""
 TILE: Final = 1 << TILE_BITS
 NO_PATH: Final = -1
 """In a field: no path leads from here to the goal."""
+_NONE: Final = int(np.iinfo(np.int64).max)
 _NO_SLOTS: Final[NDArray[np.int32]] = np.empty((0, 0), np.int32)
 _NO_PATTERNS: Final[NDArray[np.int32]] = np.empty((0, TILE * TILE), np.int32)
+
+
+_I64_FLAT: Final = types.Array(types.int64, 1, "C", readonly=True)
+
+
+@njit(inline="always")
+def _cost(lowest: Any, columns: int, bits: int, unit: int, slots: Any, patterns: Any, width: int, cell: Any) -> Any:
+    """Return the cost of a cell, given by its flat index, in a field (see `GoalField`); -1 without a path."""
+    last = TILE - 1
+    y = cell // width
+    x = cell - y * width
+    block = np.uint64((y >> bits) * columns + (x >> bits))
+    least = np.int64(lowest[block])
+    rise = np.int64(0)
+    if slots.size > 0 and least >= 0:
+        place = (np.int64(slots[block]) << (2 * TILE_BITS)) + ((y & last) << TILE_BITS) + (x & last)
+        rise = np.int64(patterns[np.uint64(place)])
+    return least * unit + rise if least >= 0 and rise >= 0 else np.int64(NO_PATH)
 
 
 @njit(
@@ -37,21 +59,27 @@ _NO_PATTERNS: Final[NDArray[np.int32]] = np.empty((0, TILE * TILE), np.int32)
 def _write_costs(
     lowest: Any, columns: int, bits: int, unit: int, slots: Any, patterns: Any, width: int, cells: Any, costs: Any
 ) -> None:
-    """Write the cost of each cell, given by its flat index, in a field (see `GoalField`); -1 without a path."""
-    last = TILE - 1
+    """Write the cost of each cell."""
     for i in range(cells.size):
-        y = cells[i] // width
-        x = cells[i] - y * width
-        block = np.uint64((y >> bits) * columns + (x >> bits))
-        costs[i] = NO_PATH
-        if lowest[block] < 0:
-            continue
-        rise = np.int64(0)
-        if slots.size > 0:
-            place = (np.int64(slots[block]) << (2 * TILE_BITS)) + ((y & last) << TILE_BITS) + (x & last)
-            rise = np.int64(patterns[np.uint64(place)])
-        if rise >= 0:
-            costs[i] = np.int64(lowest[block]) * unit + rise
+        costs[i] = _cost(lowest, columns, bits, unit, slots, patterns, width, np.int64(cells[i]))
+
+
+@njit(
+    int64(
+        _arrays.I32_FLAT, int64, int64, int64, _arrays.I32_FLAT, _arrays.I32_FLAT, int64, _arrays.I32_FLAT, _I64_FLAT
+    ),
+    cache=True, nogil=True, error_model="numpy",
+)  # fmt: skip
+def _least_rise(
+    lowest: Any, columns: int, bits: int, unit: int, slots: Any, patterns: Any, width: int, cells: Any, levels: Any
+) -> int:
+    """Return by how much the costs of the cells are above their levels, at least; `_NONE` if none has a cost."""
+    least = np.int64(_NONE)
+    for i in range(cells.size):
+        cost = _cost(lowest, columns, bits, unit, slots, patterns, width, np.int64(cells[i]))
+        if cost >= 0:
+            least = min(least, cost - levels[i])
+    return int(least)
 
 
 @dataclass(frozen=True, slots=True)
@@ -105,11 +133,28 @@ class GoalField:
         """Return the costs at cells given by flat indexes, int64 of their shape; -1 where no path leads to the goal."""
         flat = np.ascontiguousarray(cells, np.int32)
         costs = np.empty(flat.shape, np.int64)
-        _write_costs(
-            self.lowest.ravel(), self.lowest.shape[1], self.bits, self.unit, self.slots.ravel(),
-            self.patterns.ravel(), self.width, flat.ravel(), costs.ravel(),
-        )  # fmt: skip
+        _write_costs(*self._arguments, flat.ravel(), costs.ravel())
         return costs
+
+    def least_rise(self, cells: NDArray[np.int32], levels: NDArray[np.int64]) -> int | None:
+        """Return the lowest difference of cost and level, both (n,), at cells given by flat indexes.
+
+        None where no path leads to the goal from any of them. Raises TypeError or ValueError for other arrays.
+        """
+        _arrays.exact(cells, np.int32, 1, "cells")
+        _arrays.exact(levels, np.int64, 1, "levels")
+        if cells.size != levels.size:
+            raise ValueError(f"levels must be one for each of the {cells.size} cells, not {levels.size}")
+        least = int(_least_rise(*self._arguments, cells, levels))
+        return least if least != _NONE else None
+
+    @property
+    def _arguments(self) -> _Arguments:
+        """What kernels read of it."""
+        return (
+            self.lowest.ravel(), self.lowest.shape[1], self.bits, self.unit, self.slots.ravel(),
+            self.patterns.ravel(), self.width,
+        )  # fmt: skip
 
 
 @dataclass(frozen=True, slots=True)
@@ -146,6 +191,4 @@ class Detour:
 
     def offset(self, field: GoalField) -> int | None:
         """Return what is to be added for a goal outside the part; None where its field gives no border cell a cost."""
-        costs = field.costs(self.border)
-        known = costs >= 0
-        return int((costs - self.levels)[known].min()) if known.any() else None
+        return field.least_rise(self.border, self.levels)

@@ -27,12 +27,16 @@ if TYPE_CHECKING:
     from planner.maps.planning_map import Cell, Grid, PlanningMap
     from planner.search.goal_fields import GoalFields
 
+    Labels = NDArray[np.int32]
+
 _KEPT: Final = 2
 """How many bounds are kept: each takes up to 4 bytes for every cell of the map."""
 _ATTEMPTS: Final = 2
 """How many are computed at most for one version of the map, because each takes as long as a few searches."""
 _CANDIDATES: Final = 64
 """Among the border costs of so many goals those that fit the others best are chosen."""
+_SPARE_CELLS: Final = 4_000_000
+"""On larger maps no memory is kept for the next bound: 4 bytes for each cell."""
 _WORTHWHILE: Final = 2 * STRAIGHT * NEUTRAL_WEIGHT
 """By how much each bound must gain, on average, to begin anew with another goal's costs: a step over a free cell."""
 
@@ -41,18 +45,57 @@ Trip = tuple["Cell", "Cell"]
 
 
 class DeadEndsJob:
-    """The search for the dead ends of the costs `bound`."""
+    """The search for the dead ends of the costs `bound`, and with `makes_memory` the memory for a first bound."""
 
     thread = "field"
 
-    def __init__(self, bound: Grid) -> None:
+    def __init__(self, bound: Grid, *, makes_memory: bool = False) -> None:
         self.bound = bound
         self.found: DeadEnds | None = None
         """None until `run` returns."""
+        self.memory: Labels | None = None
+        self._makes_memory = makes_memory
 
     def run(self) -> None:
         """Find them, without the GIL (some 10 ms on 2000 x 1200 cells)."""
         self.found = DeadEnds(self.bound, DEFAULT_WEIGHTS)
+        if self._makes_memory:
+            self.memory = np.full(self.bound.size, 0, np.int32)  # np.zeros would leave the work to the first closure
+
+
+class _Memory:
+    """Labels for one more shadow, used again and again.
+
+    The system fetches and zeroes fresh memory when it is first used, which can take longer than the search itself.
+    """
+
+    def __init__(self) -> None:
+        self._spare: Labels | None = None
+        self._is_clean = True
+
+    @property
+    def is_missing(self) -> bool:
+        return self._spare is None
+
+    def take(self, size: int) -> Labels:
+        """Return zeros."""
+        spare, self._spare = self._spare, None
+        if spare is None or spare.size != size:
+            return np.zeros(size, np.int32)
+        if not self._is_clean:
+            spare.fill(0)
+        return spare
+
+    def give(self, labels: Labels, *, is_clean: bool = False) -> None:
+        """Take labels back that nothing refers to any more."""
+        if labels.size <= _SPARE_CELLS:
+            self._spare, self._is_clean = labels, is_clean
+
+    def clean(self) -> None:
+        """Do now what would cost the next closure time."""
+        if self._spare is not None and not self._is_clean:
+            self._spare.fill(0)
+            self._is_clean = True
 
 
 class Detours:
@@ -64,6 +107,7 @@ class Detours:
         self._asked: Grid | None = None
         """The costs whose dead ends were last searched."""
         self._known: list[Detour] = []
+        self._memory = _Memory()
         self._version: Version | None = None
         self._attempts = 0
         self._reference_goal: Cell | None = None
@@ -72,11 +116,18 @@ class Detours:
 
     def clear(self) -> None:
         """Forget all bounds, because a cost fell or the map is another one."""
-        self._known.clear()
+        self._keep([])
+        self._memory.clean()  # paths that get shorter are less urgent than the next closure
 
     def revise(self, costmap: Grid) -> None:
         """Forget what does not hold any more on a costmap whose costs have only risen."""
-        self._known = [known for known in self._known if known.holds(costmap)]
+        self._keep([known for known in self._known if known.holds(costmap)])
+
+    def _keep(self, kept: list[Detour]) -> None:
+        for known in self._known:
+            if not any(known is other for other in kept):
+                self._memory.give(known.costs.reshape(-1))
+        self._known = kept
 
     def jobs(self) -> list[DeadEndsJob]:
         """Return the search for the dead ends of another bound, once; pass it to `add` when it has run."""
@@ -84,10 +135,14 @@ class Detours:
         if bound is self._asked:
             return []
         self._asked = bound
-        return [DeadEndsJob(bound)]
+        makes_memory = self._memory.is_missing and not self._known and bound.size <= _SPARE_CELLS
+        return [DeadEndsJob(bound, makes_memory=makes_memory)]
 
     def add(self, job: DeadEndsJob) -> None:
         """Use the dead ends from now on; those of an outdated bound are dropped."""
+        if job.memory is not None:
+            self._memory.give(job.memory, is_clean=True)
+            job.memory = None
         if job.bound is self._fields.bound:
             self._found = job
 
@@ -119,24 +174,28 @@ class Detours:
         if not self.may_add(planning_map) or reference is None:
             return
         self._attempts += 1
-        shadow = self._shadow(planning_map, planner, reference, trips)
+        labels = self._memory.take(planning_map.cost.size)
+        shadow = self._shadow(planning_map, planner, reference, trips, labels)
         goals = [goal for start, goal in trips if shadow.contains(start) and not shadow.contains(goal)]
         better = _better([reference, *(exact[goal] for goal in (first, *goals) if goal in exact)], shadow.border)
         if better is not None:
             reference = better
-            shadow = self._shadow(planning_map, planner, reference, trips)
+            labels.fill(0)
+            shadow = self._shadow(planning_map, planner, reference, trips, labels)
         detour = shadow.detour(np.maximum(reference.costs(shadow.border), 0))
-        if detour is not None:
-            self._reference_goal = reference.goal
-            self._known = [detour, *self._known][:_KEPT]
-            self.computed += 1
+        if detour is None:
+            self._memory.give(labels)
+            return
+        self._reference_goal = reference.goal
+        self._keep([detour, *self._known][:_KEPT])
+        self.computed += 1
 
     def _shadow(
-        self, planning_map: PlanningMap, planner: Planner, reference: GoalField, trips: Sequence[Trip]
+        self, planning_map: PlanningMap, planner: Planner, reference: GoalField, trips: Sequence[Trip], labels: Labels
     ) -> Shadow:
         bound = self._fields.bound
         starts, goals = zip(*trips, strict=True)
-        return Shadow(planning_map.cost, bound, reference, starts, planner, self.dead_ends, goals)
+        return Shadow(planning_map.cost, bound, reference, starts, planner, self.dead_ends, goals, labels)
 
 
 def _better(fields: Sequence[GoalField], border: NDArray[np.int32]) -> GoalField | None:

@@ -85,6 +85,21 @@ def change(box: Box, *, decreased: bool = False) -> CostChange:
     return CostChange(window, cells, cells & decreased, [TRACE])
 
 
+# --- A route ---
+
+
+def test_robot_is_looked_for_near_its_progress_and_on_the_whole_route_where_it_has_no_such_part() -> None:
+    route = Route(np.array(((0.0, 0.0), (10.0, 0.0), (10.0, 1.0), (0.0, 1.0))), 0.1)
+    assert route.nearest(3.0, 0.9) == pytest.approx((18.0, 0.1))
+    assert route.nearest(3.0, 0.9, after=2.0, window=5.0) == pytest.approx((3.0, 0.9))
+    assert route.nearest(3.0, 0.9, after=4.0, window=5.0) == pytest.approx((3.5, math.hypot(0.5, 0.9)))
+    assert route.nearest(3.0, 0.0, after=30.0, window=5.0) == pytest.approx((3.0, 0.0))
+
+
+def test_route_without_length_is_as_near_as_its_only_point() -> None:
+    assert Route(np.array(((1.0, 2.0), (1.0, 2.0))), 0.1).nearest(4.0, 6.0) == (0.0, 5.0)
+
+
 # --- The map ---
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import threading
+from itertools import accumulate
 from types import SimpleNamespace
 from typing import TYPE_CHECKING, Any, cast
 
@@ -22,7 +23,6 @@ from fog_runtime.health import Health
 from fog_runtime.http import Tokens
 from fog_runtime.transports.zenoh_edge import ASKER
 from planner.core import PlannerCore
-from planner.cycle import MOST_SEARCHING_S, CycleResult
 from planner.query_queue import BusyError
 from planner.rest.api import make_api
 from planner.service import Service
@@ -31,6 +31,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Mapping, Sequence
 
     from fog_contracts.handlers import Handler, Ids
+    from planner.cycle import CycleResult
 
 
 class Session:
@@ -211,7 +212,10 @@ class SlowCore(PlannerCore):
             yield robot
 
 
-def test_paths_are_published_one_by_one_and_a_long_cycle_leaves_the_rest_for_the_next() -> None:
+@pytest.mark.parametrize(("urgent", "searches"), [(False, [4, 1]), (True, [2, 2, 1])])
+def test_paths_are_published_one_by_one_and_a_long_cycle_leaves_the_rest_for_the_next_sooner_if_a_delta_waits(
+    *, urgent: bool, searches: list[int]
+) -> None:
     clock: list[ManualClock] = []
     core = SlowCore(clock)
     rig = Rig(core)
@@ -229,18 +233,18 @@ def test_paths_are_published_one_by_one_and_a_long_cycle_leaves_the_rest_for_the
     def emit(publications: Sequence[Publication]) -> None:
         with_path.append([p.ids["robot"] for p in publications if isinstance(p.message, RobotPath)])
         searched.append(len(core.searched))
+        if urgent:
+            rig.service._cycle.queue_message(ch.MAP_DELTA, lambda *_: (), {}, None, rig.service._edges.now())
 
-    result = rig.service._cycle.run(rig.service._edges.now, emit)
-    assert result.unfinished
-    assert MOST_SEARCHING_S < 0.06
-    # Each path was published before the next search began.
-    assert [(robots_, count) for robots_, count in zip(with_path, searched, strict=True) if robots_] == [
-        (["r0"], 1),
-        (["r1"], 2),
-    ]
-    assert rig.service._cycle.run(rig.service._edges.now, emit).unfinished
-    assert not rig.service._cycle.run(rig.service._edges.now, emit).unfinished
-    assert core.searched == robots
+    for count, done in zip(searches, accumulate(searches), strict=True):
+        result = rig.service._cycle.run(rig.service._edges.now, emit)
+        assert result.unfinished == (done < len(robots))
+        assert core.searched == robots[:done]
+        # Each path was published before the next search began.
+        published = [(found, number) for found, number in zip(with_path, searched, strict=True) if found]
+        assert published == [([robot], number + 1) for number, robot in enumerate(robots[:done])][-count:]
+        with_path.clear()
+        searched.clear()
 
 
 class EndlessCore(PlannerCore):

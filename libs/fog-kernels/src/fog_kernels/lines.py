@@ -234,11 +234,87 @@ def _nearest(points: Any, along: Any, first: int, last: int, x: float, y: float,
     found[1] = best
 
 
+# It keeps the GIL: it takes some microseconds, and another thread may keep the GIL for longer before it gives it back.
+@njit(
+    void(_arrays.F64_GRID, _arrays.F64_FLAT, float64, float64, float64, float64, _arrays.F64_OUT),
+    cache=True, error_model="numpy",
+)  # fmt: skip
+def _nearest_between(points: Any, along: Any, low: float, high: float, x: float, y: float, found: Any) -> None:
+    """Find where the nearest place is among those from `low` to `high` along the line, and its squared distance."""
+    found[0] = 0.0
+    found[1] = math.inf
+    for i in range(points.shape[0] - 1):
+        length = along[i + 1] - along[i]
+        first = max(low - along[i], 0.0)
+        last = min(high - along[i], length)
+        if not length > 0.0 or first > last:
+            continue
+        unit_x = (points[i + 1, 0] - points[i, 0]) / length
+        unit_y = (points[i + 1, 1] - points[i, 1]) / length
+        behind_x = x - points[i, 0]
+        behind_y = y - points[i, 1]
+        part = min(max(behind_x * unit_x + behind_y * unit_y, first), last)
+        gap_x = behind_x - part * unit_x
+        gap_y = behind_y - part * unit_y
+        gap = gap_x * gap_x + gap_y * gap_y
+        if gap < found[1]:
+            found[0] = along[i] + part
+            found[1] = gap
+
+
+@njit(
+    float64(
+        _arrays.F64_GRID, _arrays.F64_FLAT, float64, float64, float64, float64, float64, int64, int64, _arrays.U8_GRID
+    ),
+    cache=True, error_model="numpy",
+)  # fmt: skip
+def _first_inside(
+    points: Any, along: Any, spacing: float, begin: float, left: float, bottom: float, resolution: float,
+    column: int, row: int, mask: Any,
+) -> float:  # fmt: skip
+    """Return how far along the first sample from `begin` on is whose cell the mask has; infinite without one."""
+    height, width = mask.shape
+    for i in range(max(points.shape[0] - 1, 1)):
+        end = min(i + 1, points.shape[0] - 1)
+        if along[end] < begin:
+            continue
+        dx = points[end, 0] - points[i, 0]
+        dy = points[end, 1] - points[i, 1]
+        # A cell of margin: samples are rounded.
+        if (
+            max(points[i, 0], points[end, 0]) < left + (column - 1) * resolution
+            or min(points[i, 0], points[end, 0]) > left + (column + width + 1) * resolution
+            or max(points[i, 1], points[end, 1]) < bottom + (row - 1) * resolution
+            or min(points[i, 1], points[end, 1]) > bottom + (row + height + 1) * resolution
+        ):
+            continue
+        count = max(1, math.ceil(math.hypot(dx, dy) / spacing))
+        for k in range(0 if i == 0 else 1, count + 1):
+            share = k / count
+            where = along[i] + share * (along[end] - along[i])
+            if where < begin:
+                continue
+            x = points[end, 0] if k == count else points[i, 0] + share * dx
+            y = points[end, 1] if k == count else points[i, 1] + share * dy
+            to_right = math.floor((x - left) / resolution) - column
+            up = math.floor((y - bottom) / resolution) - row
+            if 0 <= to_right < width and 0 <= up < height and mask[up, to_right]:
+                return float(where)
+    return math.inf
+
+
 def _cells_array(cells: NDArray[np.int32]) -> NDArray[np.int32]:
     _arrays.exact(cells, np.int32, 2, "cells")
     if cells.shape[0] == 0 or cells.shape[1] != 2:
         raise ValueError(f"cells must have shape (n, 2) with n >= 1, not {cells.shape}")
     return cells
+
+
+def _check_line(points: NDArray[np.float64], along: NDArray[np.float64]) -> None:
+    _arrays.exact(points, np.float64, 2, "points")
+    _arrays.exact(along, np.float64, 1, "along")
+    if points.shape != (along.size, 2):
+        raise ValueError(f"points must have shape ({along.size}, 2), one for each entry of along, not {points.shape}")
 
 
 def line_cost(
@@ -314,6 +390,46 @@ def leaves(line: NDArray[np.float64], other: NDArray[np.float64], reach: float, 
     return bool(_leaves(line, other, reach, _arrays.positive(spacing, "spacing")))
 
 
+def first_inside(
+    points: NDArray[np.float64],
+    along: NDArray[np.float64],
+    spacing: float,
+    begin: float,
+    grid: tuple[float, float, float],
+    place: tuple[int, int],
+    mask: NDArray[np.bool_],
+) -> float:
+    """Return how far along a polyline (m) its first sample lies in a cell of a mask; infinity if none does.
+
+    points: float64 (n, 2), m, n >= 1. along: float64 (n,), m from the first point along the line. Samples are at most
+    `spacing` (m) apart, as `fog_contracts.geometry.sampled` makes them; those before `begin` (m) are left out. `grid`:
+    x and y (m) of its lower left corner, and its resolution (m). `place`: the column and row where the mask (h, w)
+    begins. Raises TypeError or ValueError for other types or shapes.
+    """
+    _check_line(points, along)
+    if along.size == 0:
+        raise ValueError("the line has no point")
+    left, bottom, resolution = grid
+    cells = _arrays.grid(mask, "mask")
+    spacing = _arrays.positive(spacing, "spacing")
+    return float(
+        _first_inside(points, along, spacing, float(begin), left, bottom, resolution, place[0], place[1], cells)
+    )
+
+
+def nearest_between(
+    points: NDArray[np.float64], along: NDArray[np.float64], low: float, high: float, x: float, y: float
+) -> tuple[float, float]:
+    """Return how far along a polyline (m) its nearest place to (x, y) is, and its distance (m; inf: there is none).
+
+    As `nearest_on`, but only places from `low` to `high` (m) along the line are looked at.
+    """
+    _check_line(points, along)
+    found = np.empty(2)
+    _nearest_between(points, along, float(low), float(high), float(x), float(y), found)
+    return float(found[0]), math.sqrt(found[1])
+
+
 def nearest_on(
     points: NDArray[np.float64], along: NDArray[np.float64], first: int, last: int, x: float, y: float
 ) -> tuple[float, float]:
@@ -323,10 +439,7 @@ def nearest_on(
     `first` up to `last`, without it, are looked at; the first of several places counts. Raises TypeError or ValueError
     for other types or shapes, or segments that the line does not have.
     """
-    _arrays.exact(points, np.float64, 2, "points")
-    _arrays.exact(along, np.float64, 1, "along")
-    if points.shape != (along.size, 2):
-        raise ValueError(f"points must have shape ({along.size}, 2), one for each entry of along, not {points.shape}")
+    _check_line(points, along)
     if not 0 <= first <= last <= max(along.size - 1, 0):
         raise ValueError(f"segments {first} to {last} are not among the {along.size - 1} of the line")
     found = np.empty(2)

@@ -27,7 +27,9 @@ if TYPE_CHECKING:
 T = TypeVar("T")
 
 MOST_SEARCHING_S: Final = 0.05
-"""After so long the searches that are left wait for the next cycle, which handles newer messages first."""
+"""After so long the searches that are left wait for the next cycle, if an urgent message has come meanwhile ..."""
+LONGEST_SEARCHING_S: Final = 0.1
+"""... and after so long in any case. The next cycle handles newer messages first, which holds the searches up."""
 
 _BUCKETS: Final = (0.0005, 0.001, 0.0025, 0.005, 0.01, 0.025, 0.05, 0.1, 0.25, 0.5, 1.0)
 CYCLE_SECONDS = Histogram(
@@ -63,10 +65,13 @@ class Cycle:
         self._zenoh = zenoh
         self._inputs: deque[Callable[[], Sequence[Publication]]] = deque()
         self._goal_changes: deque[Callable[[], object]] = deque()
+        self._urgent_waits = False
 
     def queue_message(self, channel: Channel, handler: Handler, ids: Ids, message: object, at: Moment) -> None:
         """Queue a message, with its time of arrival, for the next cycle."""
         self._inputs.append(partial(self._handle, channel, handler, ids, message, at))
+        if channel in self._core.URGENT:
+            self._urgent_waits = True
 
     def queue_job(self, job: Job, now: float) -> None:
         """Queue the result of a job for the next cycle."""
@@ -85,6 +90,7 @@ class Cycle:
         """Run one cycle on the core's thread; `emit` is called with publications as soon as they are ready."""
         with CYCLE_SECONDS.time():
             core = self._core
+            self._urgent_waits = False  # before they are handled, so that none that comes meanwhile is missed
             with _timed("messages"):
                 for publications in _run_all(self._inputs):
                     emit(publications)
@@ -106,7 +112,7 @@ class Cycle:
             _run_all(self._goal_changes)
             at = now()
             emit(self._core.publish_for(robot, at))
-            if at.now - begun.now >= MOST_SEARCHING_S:
+            if at.now - begun.now >= (MOST_SEARCHING_S if self._urgent_waits else LONGEST_SEARCHING_S):
                 return True
         return False
 

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from fog_contracts.geometry import lengths_along, sampled
 from fog_contracts.grid import GridGeometry, Window
 from fog_contracts.messages import PointXY
-from fog_kernels.lines import leaves, polyline_cost
+from fog_kernels.lines import first_inside, leaves, nearest_between, polyline_cost
 
 Floats = NDArray[np.float64]
 Grid = NDArray[np.uint8]
@@ -34,11 +34,6 @@ class Route:
         """The corners as they are published; whoever samples them at the same spacing gets `points`, bit for bit."""
         return [(x, y) for x, y in self.corners.tolist()]
 
-    @cached_property
-    def along(self) -> Floats:
-        """Distance (m) along the line of every point."""
-        return lengths_along(self.points)
-
     @property
     def length(self) -> float:
         """Length in m."""
@@ -50,12 +45,13 @@ class Route:
         Only `after - 0.5 .. after + window` along is searched, so that a route that passes a place twice is not cut
         short.
         """
-        chosen = np.flatnonzero((self.along >= after - 0.5) & (self.along <= after + window))
-        if len(chosen) == 0:
-            chosen = np.arange(len(self.points))
-        distances = np.hypot(self.points[chosen, 0] - x, self.points[chosen, 1] - y)
-        best = int(np.argmin(distances))
-        return float(self.along[chosen[best]]), float(distances[best])
+        lengths = self._corner_along
+        found = nearest_between(self.corners, lengths, after - 0.5, after + window, x, y)
+        if math.isinf(found[1]):
+            found = nearest_between(self.corners, lengths, -math.inf, math.inf, x, y)
+        if math.isinf(found[1]):  # all corners are one point
+            return 0.0, math.hypot(self.corners[0, 0] - x, self.corners[0, 1] - y)
+        return found
 
     @cached_property
     def _corner_along(self) -> Floats:
@@ -81,22 +77,10 @@ class Route:
 
     def distance_to(self, mask: NDArray[np.bool_], window: Window, geometry: GridGeometry, along: float) -> float:
         """Return how far (m) beyond `along` the route first enters the cells of a mask over a window; else infinity."""
-        begin = int(np.searchsorted(self.along, along - geometry.resolution))
-        columns, rows = self._point_cells(geometry)[begin:].T
-        inside = (columns >= window.x) & (columns < window.x + window.width)
-        inside &= (rows >= window.y) & (rows < window.y + window.height)
-        if not inside.any():
-            return math.inf
-        inside[inside] = mask[rows[inside] - window.y, columns[inside] - window.x]
-        first = int(np.argmax(inside))
-        return max(0.0, float(self.along[begin + first]) - along) if inside[first] else math.inf
-
-    def _point_cells(self, geometry: GridGeometry) -> NDArray[np.int64]:
-        """Return the cells of all points, computed once: a route stays on one map."""
-        cells: NDArray[np.int64] | None = self.__dict__.get("_cells")
-        if cells is None:
-            cells = self.__dict__["_cells"] = geometry.cells(self.points)[0]
-        return cells
+        grid = geometry.origin_x, geometry.origin_y, geometry.resolution
+        begin = along - geometry.resolution
+        first = first_inside(self.corners, self._corner_along, self.spacing, begin, grid, (window.x, window.y), mask)
+        return max(0.0, first - along)
 
     def differs_from(self, other: "Route", along: float, reach: float) -> bool:
         """Whether this route leaves the rest of another, from `along` (m) on, by more than `reach` (m) somewhere."""

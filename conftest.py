@@ -16,7 +16,9 @@ if TYPE_CHECKING:
     from xdist.scheduler import LoadScopeScheduling
 
 # In CI the examples are the same in every run; on a developer's machine each run tries new ones.
-settings.register_profile("default", suppress_health_check=[HealthCheck.too_slow])  # a busy machine is no defect
+settings.register_profile(
+    "default", deadline=None, suppress_health_check=[HealthCheck.too_slow]
+)  # a busy machine is no defect
 settings.register_profile("repeatable", parent=settings.get_profile("default"), derandomize=True)
 settings.load_profile("default")
 if os.environ.get("CI", "").lower() in {"1", "true"}:

@@ -1,14 +1,23 @@
 """`fognav bench warning`: an obstacle's way from a node's echo to a robot's path, through the whole fog."""
 
+import shutil
 from pathlib import Path
+from typing import Any, cast
 
 import pytest
 
 from fog_contracts.messages import RobotPath, Trace
+from fog_contracts.site import NodeSite, Sonar
 from fog_runtime.configuration.site import load_site
 from fognav import checkout
-from fognav.bench import warning
+from fognav.bench import false_echoes, warning
+from fognav.bench.false_echoes import Asked, FalseEchoes, calibrated
 from fognav.bench.standing_robot import Arrived
+from fognav.output import FailedError
+
+needs_compiler = pytest.mark.skipif(
+    shutil.which("g++") is None, reason="the firmware's code needs a C++ compiler (g++)"
+)
 
 
 def test_figures_name_each_stretch_and_count_what_never_arrived():
@@ -43,6 +52,52 @@ def test_path_without_a_trace_of_this_obstacle_is_no_warning():
     earlier, elsewhere = (Trace(area=a, epoch=1, seq=7, first_reading=t) for a, t in (("a1", 9.9), ("a2", 10.1)))
     deltas = {("a1", 1, 7): 10.3, ("a2", 1, 7): 10.3}
     assert warning.first_warning([path(10.4), path(10.5, earlier, elsewhere)], "a1", 10.0, 10.05, deltas) is None
+
+
+NODE = NodeSite(
+    id="n1", area="a1", x=0.0, y=0.0, theta=0.0, sonars=[Sonar(range_limit=2.0), Sonar(angle=0.2, range_limit=1.5)]
+)
+
+
+class Corridor:
+    """Whose other wall is 3 m away, for sonars with false echoes."""
+
+    def __init__(self, share: float) -> None:
+        self.false_echoes = FalseEchoes(share, 1)
+
+    def sonar(self, node: NodeSite, index: int) -> float | None:
+        return self.false_echoes.heard(3.0, node.sonars[index])
+
+
+def test_false_echoes_are_nearer_than_the_limit_and_as_many_as_wanted():
+    corridor = Corridor(0.05)
+    measured = [corridor.sonar(NODE, 1) for _ in range(20_000)]
+    false = [each for each in measured if each != 3.0]
+    assert 0.04 < len(false) / len(measured) < 0.06
+    assert all(0.02 <= each <= 1.5 for each in false)
+    assert {Corridor(0.0).sonar(NODE, 0) for _ in range(100)} == {3.0}
+
+
+@needs_compiler
+def test_nodes_learn_by_their_own_calibration_how_many_false_echoes_pass_their_filter():
+    quiet, noisy = (calibrated(NODE, cast("Any", Corridor(share))) for share in (0.0, 0.08))
+    few, many = ([sonar.false_echo_rate for sonar in node.sonars] for node in (quiet, noisy))
+    assert few == [pytest.approx(2 / 260, abs=1e-4)] * 2
+    assert all(a is not None and b is not None and a <= b < 0.08 for a, b in zip(few, many, strict=True))
+    assert [sonar.range_limit for sonar in noisy.sonars] == [2.0, 1.5]
+    with pytest.raises(FailedError, match=r"sonar 1 of node n1 can't be calibrated .*choose fewer --false-echoes"):
+        calibrated(NODE, cast("Any", Corridor(0.6)))
+
+
+@needs_compiler
+def test_warnings_and_false_alarms_are_measured_in_simulated_time_and_repeatable():
+    loaded = load_site(checkout.site_folder(Path("estig")))
+    few, many = (false_echoes.measure(loaded, "consecutive", Asked(share, 0.05, 3, 1)) for share in (0.0, 0.15))
+    assert (few["false_alarms"], few["missed"], few["learned_percent_max"]) == (0, 0, 0.77)
+    assert 300 < few["echo_to_confirmed_p50_ms"] < 1000, "five readings in a row"
+    assert many["false_alarms"] > few["false_alarms"]
+    assert many["false_alarms_per_h"] == pytest.approx(many["false_alarms"] / 0.05)
+    assert few == false_echoes.measure(loaded, "consecutive", Asked(0.0, 0.05, 3, 1))
 
 
 @pytest.mark.live

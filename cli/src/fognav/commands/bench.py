@@ -308,13 +308,20 @@ def pipeline_command(
 
 
 @bench_app.command("warning", epilog="Example: fognav bench warning --warnings 50 --json")
-def warning_command(
+def warning_command(  # noqa: PLR0913  # the options of the command
     *,
     warnings: Annotated[int, typer.Option("--warnings", metavar="N", min=1, help="Obstacles for each rule.")] = 50,
     rule: Annotated[
         list[str] | None, typer.Option("--rule", metavar="R", help="A debounce rule; may be repeated. Default: two.")
     ] = None,
     site: Annotated[Path, typer.Option("--site", metavar="D", help="Folder of the site.")] = Path("estig"),
+    false_echoes: Annotated[
+        float | None,
+        typer.Option("--false-echoes", metavar="N", min=0.0, max=50.0, help="Invent echoes in N % of measurements."),
+    ] = None,
+    hours: Annotated[
+        float, typer.Option("--hours", metavar="H", min=0.01, help="Simulated hours with nothing but false echoes.")
+    ] = 2.0,
     seed: Annotated[int, typer.Option("--seed", metavar="N", min=0, help="Seed of the obstacles.")] = 1,
     json: Annotated[bool, typer.Option("--json", help="Write one JSON object to standard output.")] = False,
 ) -> None:
@@ -322,8 +329,12 @@ def warning_command(
 
     The whole fog runs as real processes behind locks, the nodes run the firmware's code, with an MQTT connection each,
     and the robot is a stand-in with a goal. Obstacles close an area on its way, one after another. Times are in ms.
+
+    With --false-echoes the nodes and the aggregator's core run in simulated time instead, whatever the machine's load:
+    all sonars hear what is not there, their nodes are calibrated in that, and false alarms are counted, too.
     """
     from fognav import checkout  # noqa: PLC0415  # keeps the other commands fast
+    from fognav.bench import false_echoes as noise  # noqa: PLC0415  # same
     from fognav.bench import machine, warning  # noqa: PLC0415  # same
     from fognav.nodes import site_file  # noqa: PLC0415  # same
 
@@ -334,6 +345,10 @@ def warning_command(
         for each in rule or ["evidence", "consecutive"]:
             task = progress.add_task(each, total=warnings)
             advance = partial(progress.advance, task)
+            if false_echoes is not None:
+                rows.append(noise.measure(loaded, each, noise.Asked(false_echoes / 100.0, hours, warnings, seed)))
+                progress.update(task, completed=warnings)
+                continue
             rows.append(asyncio.run(warning.measure(loaded, each, warnings, seed, advance)))
     if json:
         print_json({"bench": "warning", "warnings": warnings, "seed": seed, "rows": rows, **machine.describe()})

@@ -1,0 +1,156 @@
+"""People walk about a robot and stand in its way: it touches none by its own motion, and arrives or says why not.
+
+FOGNAV_CROWD_SEEDS sets the number of drives.
+"""
+
+import importlib.util
+import math
+import os
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from fog_contracts import channels as ch
+from fog_contracts.messages import Pose, RobotGoal, SimObstacle
+from fognav_experiments.rigs import System
+
+_spec = importlib.util.spec_from_file_location("ring_site", Path(__file__).parent / "ring_site.py")
+ring = importlib.util.module_from_spec(_spec)
+_spec.loader.exec_module(ring)
+
+pytestmark = pytest.mark.timeout(900)
+SEEDS = int(os.environ.get("FOGNAV_CROWD_SEEDS", "2"))
+PEOPLE = 4
+RADIUS_M = 0.18
+"""Of a person, whom the lidar sees as one round thing."""
+POLITE_M = 0.12
+"""Nobody walks nearer than this to the robot: what comes nearer, the robot brought about."""
+AROUND_M = (0.7, 2.5)
+"""How far from the robot people are headed for."""
+STEP_S = 0.1
+CROWDED_S = 30.0
+QUIET_S = 15.0
+"""A robot that did not move for so long has a reason that it tells."""
+
+
+class Person:
+    """Walks from place to place near the robot, at a speed of its own; stops before walls, people and the robot."""
+
+    def __init__(self, number, rng):
+        self.id, self._rng = f"person-{number}", rng
+        self.speed = rng.uniform(0.3, 1.2)
+        self.place, self._target, self._waits = None, None, 0.0
+
+    def _target_near(self, robot):
+        away, angle = self._rng.uniform(*AROUND_M), self._rng.uniform(-math.pi, math.pi)
+        return robot[0] + away * math.cos(angle), robot[1] + away * math.sin(angle)
+
+    def walk(self, floor, robot, robot_radius, others):
+        """Walk for a step; return whether the person has moved."""
+        if self._waits > 0.0:
+            self._waits -= STEP_S
+            return False
+        if self._target is None or self.place is None:
+            self._target = self._target_near(robot)
+        if self.place is None:
+            step = self._target
+        else:
+            dx, dy = self._target[0] - self.place[0], self._target[1] - self.place[1]
+            share = min(1.0, self.speed * STEP_S / max(math.hypot(dx, dy), 1e-9))
+            step = self.place[0] + share * dx, self.place[1] + share * dy
+        free = floor._nearest_wall(*step)[0] > RADIUS_M + 0.05
+        apart = all(math.dist(step, other) > 2.0 * RADIUS_M for other in others)
+        from_robot = math.dist(step, robot) - robot_radius - RADIUS_M
+        if not (free and apart and from_robot > POLITE_M + self.speed * STEP_S) or step == self.place:
+            self._target, self._waits = None, self._rng.uniform(0.0, 3.0)
+            return False
+        self.place = step
+        return True
+
+    def outline(self):
+        """The person as an obstacle."""
+        corners = [turn * math.tau / 12 for turn in range(12)]
+        x, y = self.place
+        points = [(x + RADIUS_M * math.cos(turn), y + RADIUS_M * math.sin(turn)) for turn in corners]
+        return SimObstacle(id=self.id, polygon=points)
+
+
+class Crowd:
+    """The people around one robot."""
+
+    def __init__(self, world, seed):
+        rng = np.random.default_rng(seed)
+        self.world, self.people = world, [Person(number, rng) for number in range(PEOPLE)]
+        self.nearest = math.inf
+
+    def walk(self):
+        robot = self.world.pose[:2]
+        for person in self.people:
+            others = [other.place for other in self.people if other is not person and other.place is not None]
+            if person.walk(self.world._floor, robot, self.world.robot.radius, others):
+                self.world.place(person.outline())
+            if person.place is not None:
+                away = math.dist(person.place, robot) - RADIUS_M - self.world.robot.radius
+                self.nearest = min(self.nearest, away)
+
+    def leave(self):
+        for person in self.people:
+            self.world.remove(person.id)
+
+
+class Run:
+    """The whole system with a robot on its way to the east."""
+
+    def __init__(self, seed):
+        site = ring.ring_site()
+        self.system = System(site, site.site.robots[0], seed)
+        self.states = []
+        self.system.bus.subscribe({ch.ROBOT_STATE: self._on_state})
+        self.until(lambda: self.states and self.state.reasons == ["waiting for an operator to enable"], 12.0)
+        assert self.system.robot.command("enable").accepted
+        pose = Pose(x=ring.GOAL.x, y=ring.GOAL.y, theta=0.0)
+        self.system.fog.planner.set_goal("r1", RobotGoal(goal_id="g1", pose=pose), any_heading=True)
+        self.until(lambda: self.system.world.distance > 0.5, 20.0)
+
+    def _on_state(self, _ids, state, _at):
+        self.states.append(state)
+        return ()
+
+    @property
+    def state(self):
+        return self.states[-1]
+
+    def until(self, condition, seconds):
+        end = self.system.now + seconds
+        while not condition():
+            assert self.system.now < end, self.states[-1:]
+            self.system.step()
+
+
+@pytest.mark.parametrize("seed", range(SEEDS))
+def test_robot_among_walking_people_touches_none_and_arrives_or_says_why_it_stands(seed):
+    run = Run(seed)
+    world = run.system.world
+    crowd = Crowd(world, seed)
+    stood, before = 0.0, world.distance
+    end = run.system.now + CROWDED_S
+    while run.system.now < end and not run.state.goal_reached:
+        crowd.walk()
+        for _ in range(round(STEP_S / 0.01)):
+            run.system.step()
+        stood = 0.0 if world.distance > before + 0.002 else stood + STEP_S
+        before = world.distance
+        if stood > QUIET_S:
+            assert run.state.reasons, run.state
+        assert world.contacts == 0, run.state
+    assert crowd.nearest < 0.6, "somebody came near"
+    crowd.leave()
+    # What it reported as an obstacle while people stood there is forgotten after two minutes.
+    left = run.system.now + 240.0
+    while run.system.now < left and not run.state.goal_reached:
+        run.system.step()
+        if run.state.mode == "HOLD" and any("an operator must enable" in reason for reason in run.state.reasons):
+            assert run.system.robot.command("enable").accepted
+    assert run.state.goal_reached, run.state
+    assert world.contacts == 0

@@ -208,5 +208,13 @@ PARTS: Final = (
         ("guardian.watchdog",),
         ("guardian/test_watchdog.py",),
         ("robot_agent.serial_port", "fog_runtime.configuration.parts", "fog_runtime.machine.service_manager"),
+        (
+            Equivalent(
+                "watchdog",
+                "if not os.read(heartbeat_read, 4096):",
+                "4096 -> 4097",
+                "only whether anything was read matters",
+            ),
+        ),
     ),
 )

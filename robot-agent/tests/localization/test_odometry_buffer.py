@@ -9,7 +9,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from fog_kernels.scans import Mounting, placed
 from robot_agent.localization.odometry_buffer import OdometryBuffer
+from robot_agent.localization.pose import Pose2
 
 
 def driven(v: float, w: float, *, until: float = 1.0) -> OdometryBuffer:
@@ -32,14 +34,15 @@ def test_pose_between_two_readings_lies_on_the_arc(v, w, at):
     asked=st.lists(st.floats(-1.0, 4.0), min_size=1, max_size=10),
     seed=st.integers(0, 99),
 )
-def test_single_pose_is_that_of_many(times, asked, seed):
+def test_what_the_lidar_sees_is_placed_by_the_pose_of_its_time(times, asked, seed):
     rng = np.random.default_rng(seed)
     buffer = OdometryBuffer()
     for at in sorted(times):
         buffer.add(at, *rng.normal(size=3))
-    poses = np.array(buffer.poses(np.array(asked)))
-    for column, at in enumerate(asked):
-        assert buffer.pose(at) == pytest.approx(poses[:, column], abs=1e-9)
+    ahead = Pose2(1.0, 0.0, 0.0)
+    for at in asked:
+        seen = placed(np.zeros(1), np.ones(1), at, at, buffer.track(at), Mounting(0.0, 0.0, 0.0), 0.0, 2.0)
+        assert seen.points[0] == pytest.approx(buffer.pose(at).compose(ahead)[:2], abs=1e-9)
 
 
 def test_twist_is_that_of_the_last_readings():

@@ -110,7 +110,9 @@ class GridGeometry(msgspec.Struct, frozen=True):
             np.asarray(points, dtype=np.float64).reshape(-1, 2) - (self.origin_x, self.origin_y)
         ) / self.resolution
         cells = np.floor(scaled).astype(np.int64)
-        inside: NDArray[np.bool_] = np.all((cells >= 0) & (cells < (self.width, self.height)), axis=1)
+        columns, rows = cells[:, 0], cells[:, 1]
+        # One column after the other: numpy takes several times as long for the same along rows of two.
+        inside: NDArray[np.bool_] = (columns >= 0) & (columns < self.width) & (rows >= 0) & (rows < self.height)
         return cells, inside
 
     def grid_coordinates(self, points: NDArray[np.float64]) -> NDArray[np.float64]:

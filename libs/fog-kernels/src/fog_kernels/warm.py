@@ -35,6 +35,7 @@ PROFILES: dict[str, tuple[str, ...]] = {
         "lidar",
         "lines",
         "raycast",
+        "scans",
         "sweep",
     ),
     "planner": (
@@ -66,6 +67,7 @@ PROFILES: dict[str, tuple[str, ...]] = {
         "lidar",
         "lines",
         "raycast",
+        "scans",
         "spans",
         "sweep",
         "tiles",

@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
+
+from fog_kernels import scans
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -38,7 +39,7 @@ def spread(points: NDArray[np.float64], count: int) -> NDArray[np.float64]:
     """Return at most `count` of the points (n, 2), evenly spread over them."""
     if len(points) <= count:
         return points
-    return points[np.linspace(0, len(points) - 1, count).astype(np.int64)]
+    return points[np.arange(count) * (len(points) - 1) // max(count - 1, 1)]
 
 
 def deskew(scan: LaserScan, odometry: OdometryBuffer, config: LocalizationConfig) -> DeskewedScan | None:
@@ -49,16 +50,14 @@ def deskew(scan: LaserScan, odometry: OdometryBuffer, config: LocalizationConfig
     end = odometry.pose(scan.ended_at)
     if end is None or not odometry.reaches_back_to(scan.ended_at):
         return None
-    ranges = np.asarray(scan.ranges_m, dtype=np.float64)
-    valid = np.isfinite(ranges) & (ranges >= config.range_min) & (ranges <= config.range_max)
-    count = len(ranges)
-    times = scan.started_at + (scan.ended_at - scan.started_at) * np.arange(count) / max(count - 1, 1)
-    directions = np.asarray(scan.angles_rad)[valid] + config.lidar_yaw
-    base_x = config.lidar_x + ranges[valid] * np.cos(directions)
-    base_y = config.lidar_y + ranges[valid] * np.sin(directions)
-    x, y, theta = odometry.poses(times[valid])
-    odom_x = x + np.cos(theta) * base_x - np.sin(theta) * base_y - end.x
-    odom_y = y + np.sin(theta) * base_x + np.cos(theta) * base_y - end.y
-    cos, sin = math.cos(end.theta), math.sin(end.theta)
-    points = np.column_stack((cos * odom_x + sin * odom_y, -sin * odom_x + cos * odom_y))
-    return DeskewedScan(points, end, scan.ended_at)
+    seen = scans.placed(
+        scan.angles_rad,
+        scan.ranges_m,
+        scan.started_at,
+        scan.ended_at,
+        odometry.track(scan.started_at),
+        scans.Mounting(config.lidar_x, config.lidar_y, config.lidar_yaw),
+        config.range_min,
+        config.range_max,
+    )
+    return DeskewedScan(end.inverse_transform(seen.points), end, scan.ended_at)

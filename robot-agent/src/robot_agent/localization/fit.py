@@ -6,9 +6,10 @@ from collections import deque
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final
 
-import numpy as np
+from fog_kernels.scans import Tolerances
 
 if TYPE_CHECKING:
+    import numpy as np
     from numpy.typing import NDArray
 
     from robot_agent.localization.map_fields import MapFields
@@ -22,6 +23,7 @@ _RANGE_TOLERANCE_M: Final = 0.40
 """Range difference from which a beam counts as short or long."""
 _ON_WALL_M: Final = 0.12
 """An agreeing beam of a right pose ends this near to the wall: farther ones are blurred."""
+_TOLERANCES: Final = Tolerances(_NEAR_M, _ON_WALL_M, _RANGE_TOLERANCE_M)
 _CONTRADICTION_LIMIT: Final = 0.2
 """Share of contradicting beams above which a pose is wrong, or the map."""
 _CONTRADICTION_CLEAR: Final = 0.04
@@ -70,24 +72,14 @@ def evaluate_fit(fields: MapFields, pose: Pose2, points: NDArray[np.float64], ra
 
     `range_max`: m, the lidar's rated range.
     """
-    ends = pose.transform(points)
-    distances = fields.wall_distances(ends)
-    near = distances <= _NEAR_M
-    offset_x, offset_y = ends[:, 0] - pose.x, ends[:, 1] - pose.y
-    ranges = np.hypot(offset_x, offset_y)
-    expected = fields.ranges(pose.x, pose.y, np.arctan2(offset_y, offset_x), range_max + 1.0)
-    agree = near & (np.abs(ranges - expected) < 3.0 * _RANGE_TOLERANCE_M)
-    # Grazing beams end near a wall yet far from where the ray first meets one: they are not informative.
-    long = ~near & (ranges > expected + _RANGE_TOLERANCE_M)
-    short = ~near & (ranges < expected - _RANGE_TOLERANCE_M)
-    n_agree, n_long, n_short = int(agree.sum()), int(long.sum()), int(short.sum())
-    informative = n_agree + n_long
+    beams = fields.compared(pose, points, range_max + 1.0, _TOLERANCES)
+    informative = beams.agree + beams.long
     return Fit(
-        agree=n_agree / max(informative + n_short, 1),
-        explained=n_agree / max(len(points), 1),
-        contradict=n_long / informative if informative else 1.0,
+        agree=beams.agree / max(informative + beams.short, 1),
+        explained=beams.agree / max(len(points), 1),
+        contradict=beams.long / informative if informative else 1.0,
         informative=informative,
-        blurred=float((distances[agree] > _ON_WALL_M).mean()) if n_agree else 0.0,
+        blurred=beams.beside / beams.agree if beams.agree else 0.0,
     )
 
 

@@ -30,6 +30,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from fog_contracts.grid import GridGeometry
+    from fog_kernels.scans import Track
     from robot_agent.hardware import LaserScan
     from robot_agent.localization.absolute import AbsoluteObservation
     from robot_agent.localization.hypotheses import Hypothesis
@@ -197,11 +198,9 @@ class Localizer:
         """Pose in `odom` at a time (s), interpolated; extrapolated by at most 0.15 s. None before the first."""
         return self._odometry.pose(timestamp)
 
-    def odom_poses(
-        self, times: NDArray[np.float64]
-    ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
-        """Return x, y (m) and theta (rad) in `odom` at times (n; s), as `odom_at` does; there must be a pose."""
-        return self._odometry.poses(times)
+    def odom_track(self, since: float) -> Track:
+        """Return where the robot was in `odom` from a time (s) on, as `odom_at` does; there must be a pose."""
+        return self._odometry.track(since)
 
     def pose(self, timestamp: float) -> Pose2 | None:
         """Pose in `map` at a time (s) not older than 3 s; None while it is unknown."""

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Final
 import numpy as np
 
 from fog_contracts.costs import FREE, LETHAL
-from fog_kernels import amcl
+from fog_kernels import amcl, scans
 from fog_kernels.distance import likelihood_field, squared_distance_capped
 from fog_kernels.raycast import cast
 
@@ -21,6 +21,7 @@ if TYPE_CHECKING:
 
     from fog_contracts.grid import GridGeometry
     from robot_agent.config import LocalizationConfig
+    from robot_agent.localization.pose import Pose2
 
 _WALL_DISTANCE_MAX_M: Final = 1.0
 """Wall distances are exact up to here."""
@@ -59,6 +60,23 @@ class MapFields:
         """Return the ranges (n; m) to the first wall from (x, y) in `map` along angles (n; rad), inf beyond `reach`."""
         g = self.geometry
         return cast(self.occupied, g.resolution, g.origin_x, g.origin_y, x, y, angles, reach)
+
+    def compared(
+        self, pose: Pose2, points: NDArray[np.float64], reach: float, tolerances: scans.Tolerances
+    ) -> scans.Compared:
+        """Compare points (n, 2; m), measured at a pose in `map`, with the ranges to walls there, up to `reach` m."""
+        g = self.geometry
+        return scans.compared(
+            points,
+            pose,
+            self.occupied,
+            self.wall_distance,
+            g.resolution,
+            (g.origin_x, g.origin_y),
+            _WALL_DISTANCE_MAX_M,
+            reach,
+            tolerances,
+        )
 
     def scores(
         self, poses: NDArray[np.float64], points: NDArray[np.float64], field: NDArray[np.float32]

@@ -4,14 +4,12 @@ from __future__ import annotations
 
 import math
 from collections import deque
-from typing import TYPE_CHECKING, Final
+from typing import Final
 
 import numpy as np
 
+from fog_kernels.scans import Track
 from robot_agent.localization.pose import Pose2
-
-if TYPE_CHECKING:
-    from numpy.typing import NDArray
 
 _HISTORY_S: Final = 3.0
 _EXTRAPOLATION_S: Final = 0.15
@@ -66,16 +64,9 @@ class OdometryBuffer:
             after = before
         return Pose2(*after[1:])
 
-    def poses(self, times: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
-        """Return x, y (m) and theta (rad) at times (n; s), as `pose` does; there must be a pose."""
-        known = np.array(self._since(float(times.min(initial=math.inf))))
-        x, y, theta = (np.interp(times, known[:, 0], known[:, i]) for i in (1, 2, 3))
-        late = np.clip(times - known[-1, 0], 0.0, _EXTRAPOLATION_S)
-        if late.any():
-            v, w = self.twist()
-            heading = known[-1, 3] + 0.5 * w * late
-            x, y, theta = x + v * late * np.cos(heading), y + v * late * np.sin(heading), theta + w * late
-        return x, y, theta
+    def track(self, since: float) -> Track:
+        """Return the poses that tell where the robot was from a time (s) on, as `pose` does; there must be one."""
+        return Track(np.array(self._since(since)), *self.twist(), _EXTRAPOLATION_S)
 
     def _since(self, timestamp: float) -> list[tuple[float, float, float, float]]:
         """Return the poses from the last one at or before this time (s) on; of times before the first, all."""

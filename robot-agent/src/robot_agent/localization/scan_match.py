@@ -11,11 +11,10 @@ from typing import TYPE_CHECKING, Final, NamedTuple
 
 import numpy as np
 
+from fog_kernels.scans import climb
 from robot_agent.localization.pose import Pose2, wrap
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
-
     from numpy.typing import NDArray
 
     from robot_agent.localization.map_fields import MapFields
@@ -26,8 +25,8 @@ not independent: their errors come from the same wall, map cell and moment."""
 _STEPS: Final = np.array([(0.05, 0.05, 0.02), (0.025, 0.025, 0.01), (0.012, 0.012, 0.005), (0.006, 0.006, 0.0025)])
 _CLIMBS_MAX: Final = 12
 """Moves with each size of step."""
-_BOUND: Final = (0.3, 0.15)
-"""A match moves no estimate farther (m, rad): what lies beyond may be another place."""
+_BOUND: Final = np.array((0.3, 0.3, 0.15))
+"""A match moves no estimate farther (m, m, rad): what lies beyond may be another place."""
 _CURVATURE_STEP: Final = (0.06, 0.06, 0.025)
 _LEAST_SIGMAS: Final = (0.02, 0.02, 0.007)
 """No pose is more certain than this (m, m, rad): half a cell of the map, and what the map's own errors allow."""
@@ -51,33 +50,23 @@ def match_scan(fields: MapFields, pose: Pose2, covariance: NDArray[np.float64], 
     prior = covariance + np.diag(np.square(_LEAST_SIGMAS))
     information = np.linalg.inv(prior)
 
-    def log_posterior(offsets: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return the logarithm of the posterior at offsets (n, 3) from the estimate."""
-        fit = fields.scores(np.array(pose) + offsets, points, fields.sharp)
-        prior_part = np.einsum("ni,ij,nj->n", offsets, information, offsets)
-        return np.asarray(_INFORMATION * fit - 0.5 * prior_part)
-
-    best = _climb(log_posterior)
+    g = fields.geometry
+    best = climb(
+        points,
+        pose,
+        information,
+        fields.sharp,
+        g.resolution,
+        (g.origin_x, g.origin_y),
+        _INFORMATION,
+        _STEPS,
+        _BOUND,
+        _CLIMBS_MAX,
+    )
     x, y, theta = (float(value) for value in np.array(pose) + best)
     matched = Pose2(x, y, wrap(theta))
     fit = fields.scores(np.array(matched) + _SHIFTS * _CURVATURE_STEP, points, fields.sharp)
     return Match(matched, _posterior_covariance(_INFORMATION * fit, information))
-
-
-def _climb(log_posterior: Callable[[NDArray[np.float64]], NDArray[np.float64]]) -> NDArray[np.float64]:
-    """Return the offset (3,) of the maximum that is reached uphill from 0 within the bound."""
-    bound = np.array((_BOUND[0], _BOUND[0], _BOUND[1]))
-    best = np.zeros(3)
-    for step in _STEPS:
-        for _ in range(_CLIMBS_MAX):
-            tried = best + _SHIFTS * step
-            values = log_posterior(tried)
-            values[(np.abs(tried) > bound).any(axis=1)] = -np.inf
-            highest = int(np.argmax(values))
-            if values[highest] <= values[len(_SHIFTS) // 2] + 1e-9:
-                break
-            best = tried[highest]
-    return best
 
 
 def _posterior_covariance(values: NDArray[np.float64], prior: NDArray[np.float64]) -> NDArray[np.float64]:

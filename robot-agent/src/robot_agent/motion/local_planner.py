@@ -230,7 +230,9 @@ def make_job(  # noqa: PLR0913  # a job holds all that a decision rests on
     path, ends_here = follower.released_ahead(_AHEAD_M)
     limit = _speed_limit(speed_limits, geometry, pose, config)
     part = geometry.part(window)
-    near = np.abs(lidar_points - (pose.x, pose.y)).max(axis=1, initial=0.0) <= half + config.inflation.inflation_radius
+    reach = half + config.inflation.inflation_radius
+    # One column after the other: numpy takes ten times as long for the same along rows of two.
+    near = (np.abs(lidar_points[:, 0] - pose.x) <= reach) & (np.abs(lidar_points[:, 1] - pose.y) <= reach)
     return Job(
         plan_id=plan_id,
         planner_epoch=planner_epoch,

@@ -4,9 +4,10 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Final
 
-import numpy as np
+from fog_kernels import scans
 
 if TYPE_CHECKING:
+    import numpy as np
     from numpy.typing import NDArray
 
 _SURFACE_M: Final = 0.06
@@ -22,12 +23,4 @@ def smoothed(points: NDArray[np.float64]) -> NDArray[np.float64]:
     deviations too near. But neighbours may also be a thin leg and the wall close behind it, or the two sides of an
     edge, so a point moves by `SHIFT_MAX_M` at most: whatever is measured to a point, it grows by no more than that.
     """
-    following = np.roll(points, -1, axis=0) - points
-    joined = np.hypot(following[:, 0], following[:, 1]) < _SURFACE_M
-    towards_next = np.where(joined[:, None], following, 0.0)
-    shift = towards_next - np.roll(towards_next, 1, axis=0)
-    count = 1.0 + joined + np.roll(joined, 1)
-    shift /= count[:, None]
-    farthest = np.maximum(np.hypot(shift[:, 0], shift[:, 1]) / SHIFT_MAX_M, 1.0)
-    nearer: NDArray[np.float64] = points + shift / farthest[:, None]
-    return nearer
+    return scans.smoothed(points, _SURFACE_M, SHIFT_MAX_M)

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import math
 from collections import deque
-from typing import TYPE_CHECKING, Final, NamedTuple
+from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
+from fog_kernels.scans import Mounting, Placed, placed
 from robot_agent.motion.surfaces import smoothed
 
 if TYPE_CHECKING:
@@ -20,22 +22,15 @@ _PENDING_MAX: Final = 64
 """Batches that may wait for the next call of `seen_from`: more than arrive while samples are remembered."""
 
 
-class _Batch(NamedTuple):
-    """Points (n, 2; m, frame `odom`) and their times (n; s)."""
-
-    points: NDArray[np.float64]
-    times: NDArray[np.float64]
-
-
 class NearPoints:
     """The returns of the last `memory` s within `reach` m of the lidar, be their scan whole or not."""
 
     def __init__(self, lidar: LocalizationConfig, reach: float, memory: float) -> None:
-        self._lidar = lidar
+        self._mounting = Mounting(lidar.lidar_x, lidar.lidar_y, lidar.lidar_yaw)
         self._reach = reach
         self._memory = memory
         self._pending: deque[LidarSamples] = deque(maxlen=_PENDING_MAX)
-        self._batches: deque[_Batch] = deque()
+        self._batches: deque[Placed] = deque()
 
     def add(self, samples: LidarSamples) -> None:
         """Add the newest samples."""
@@ -61,16 +56,15 @@ class NearPoints:
 
     def _place(self, samples: LidarSamples, localizer: Localizer) -> None:
         """Move a batch into `odom`, each sample by the odometry at its own time."""
-        near = (samples.ranges_m <= self._reach).nonzero()[0]  # False for nan
-        if not len(near):
-            return
-        ranges = samples.ranges_m[near].astype(np.float64)
-        angles = samples.angles_rad[near].astype(np.float64) + self._lidar.lidar_yaw
-        period = (samples.ended_at - samples.started_at) / max(len(samples.ranges_m) - 1, 1)
-        times = samples.started_at + np.float64(period) * near
-        x, y, theta = localizer.odom_poses(times)
-        cos, sin = np.cos(theta), np.sin(theta)
-        base_x = self._lidar.lidar_x + ranges * np.cos(angles)
-        base_y = self._lidar.lidar_y + ranges * np.sin(angles)
-        points = np.column_stack((x + cos * base_x - sin * base_y, y + sin * base_x + cos * base_y))
-        self._batches.append(_Batch(smoothed(points), times))
+        seen = placed(
+            samples.angles_rad,
+            samples.ranges_m,
+            samples.started_at,
+            samples.ended_at,
+            localizer.odom_track(samples.started_at),
+            self._mounting,
+            -math.inf,
+            self._reach,
+        )
+        if len(seen.times):
+            self._batches.append(Placed(smoothed(seen.points), seen.times))

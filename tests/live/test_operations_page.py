@@ -66,6 +66,7 @@ class Machine:
             "FOGNAV_BIND": "127.0.0.1",
             "HOME": str(self.home),
             "USER": "pi",
+            "UNIT_MANAGER_FOR": str(os.getpid()),
             "PATH": f"{programs}:{inherited['PATH']}",
             "XDG_RUNTIME_DIR": str(self._runtime),
         }

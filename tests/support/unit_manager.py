@@ -3,9 +3,11 @@
     python unit_manager.py FOLDER show|daemon-reload|enable|start|restart|stop [WORDS…]     FOLDER has what runs
 
 It runs the unit's command with its environment, and returns when that has said that it is ready, as systemctl does.
+What it started ends with the process that UNIT_MANAGER_FOR names, if that is set: a test's, which may be killed.
 """
 
 import os
+import select
 import shlex
 import signal
 import socket
@@ -58,6 +60,11 @@ def start(folder: Path) -> None:
             stdout=log, stderr=log, start_new_session=True,
         )  # fmt: skip
         (folder / "pid").write_text(str(started.pid))
+        if tests := os.environ.get("UNIT_MANAGER_FOR"):
+            keeping = [sys.executable, "-S", __file__, str(folder), "keep", tests, str(started.pid)]
+            subprocess.Popen(
+                keeping, stdin=subprocess.DEVNULL, stdout=subprocess.DEVNULL, stderr=log, start_new_session=True
+            )
         deadline = time.monotonic() + READY_S
         while time.monotonic() < deadline:
             try:
@@ -71,9 +78,23 @@ def start(folder: Path) -> None:
     raise SystemExit(f"the unit did not become ready: {(folder / 'log').read_text()}")
 
 
+def keep(tests: int, unit: int) -> None:
+    """End a unit with the process of its tests."""
+    with os.fdopen(os.pidfd_open(unit)) as ended:
+        try:
+            with os.fdopen(os.pidfd_open(tests)) as killed:
+                ready, _, _ = select.select([ended, killed], [], [])
+        except ProcessLookupError:  # it is gone already
+            ready = []
+        if ended not in ready:
+            os.kill(unit, signal.SIGTERM)
+
+
 def main() -> None:
     """Carry out what systemctl is told."""
     folder, words = Path(sys.argv[1]), [word for word in sys.argv[2:] if not word.startswith("-")]
+    if words[:1] == ["keep"]:
+        keep(int(words[1]), int(words[2]))
     if words[:1] == ["show"]:
         file = folder / "pid"
         sys.stdout.write(file.read_text() if file.exists() else "0")

@@ -80,6 +80,28 @@ def test_wheels_stop_when_the_agent_falls_silent(rig):
     rig.drive()
 
 
+def test_base_that_falls_silent_before_it_has_moved_is_waited_for_and_afterwards_its_silence_is_latched(rig):
+    speaks = rig.base.robot.outgoing
+
+    def fall_silent():
+        rig.base.robot.outgoing = lambda now: speaks(now)[:0]
+        wait_for(lambda: "no valid frame" in (rig.agent.feedback.fault or ""), "the silence is a fault")
+
+    wait_for(lambda: rig.agent.feedback and rig.agent.feedback.stopped is None, "the base is ready")
+    fall_silent()
+    rig.base.robot.outgoing = speaks
+    wait_for(lambda: rig.agent.feedback.fault is None and rig.agent.feedback.stopped is None, "the base is ready again")
+    assert rig.watchdog.count("fault_latched") == 0
+    rig.drive()
+    fall_silent()
+    assert rig.base.stopped_within(time.monotonic()) < STOP_S
+    before = rig.agent.feedback.seq
+    rig.base.robot.outgoing = speaks
+    wait_for(lambda: rig.agent.feedback.seq > before + 20, "the base sends frames again")
+    assert "no valid frame" in rig.agent.feedback.fault
+    assert rig.watchdog.count("fault_latched") == 1
+
+
 def wakeups(pid: int) -> int:
     """How often a process has waited and was woken: its voluntary context switches."""
     status = Path(f"/proc/{pid}/status").read_text()

@@ -215,6 +215,7 @@ PARTS: Final = (
                 "4096 -> 4097",
                 "only whether anything was read matters",
             ),
+            Equivalent("watchdog", "speed = -1.0", "1.0 -> 1.1", "any negative number is refused"),
         ),
     ),
 )

@@ -34,8 +34,8 @@ def give_way(path: NDArray[np.float64], around: Clearance, keep: float) -> NDArr
     points, along = PathFollower(path, math.inf).ahead(_SPACING_M)
     size = len(around.distance) * around.resolution
     corner = np.array((around.origin_x, around.origin_y))
-    inside = np.all((points > corner + _REACH_M) & (points < corner + size - _REACH_M), axis=1)
-    inside &= (along > 0.0) & (along < along[-1])
+    within = (points > corner + _REACH_M) & (points < corner + size - _REACH_M)
+    inside = within[:, 0] & within[:, 1] & (along > 0.0) & (along < along[-1])
     if not (distances(around, points[inside]) < keep).any():
         return path
     # What the window's border cuts off must not become a step in the path.

@@ -29,7 +29,8 @@ class PathFollower:
     def __init__(self, points: NDArray[np.float64], released_length: float) -> None:
         self.points = np.ascontiguousarray(points, np.float64)
         deltas = self.points[1:] - self.points[:-1]
-        self.along = np.concatenate(([0.0], np.cumsum(np.sqrt((deltas**2).sum(axis=1)))))
+        lengths = np.sqrt(deltas[:, 0] ** 2 + deltas[:, 1] ** 2)
+        self.along = np.concatenate(([0.0], np.cumsum(lengths)))
         """Metres from the path's start to each point."""
         self.released = 0.0
         self.release(released_length)
@@ -84,19 +85,29 @@ class PathFollower:
         """Return the next `limit` metres of the released path (n, 2), and whether its last point is the path's end."""
         end = min(self.progress + limit, self.released)
         end = max(end, self.progress)
-        inner = self.points[(self.along > self.progress) & (self.along < end)]
-        points = np.vstack((self._point(self.progress), inner, self._point(end)))
+        first, last = int(self.along.searchsorted(self.progress, "right")), int(self.along.searchsorted(end))
+        points = np.empty((max(last - first, 0) + 2, 2))
+        points[0], points[1:-1], points[-1] = self._point(self.progress), self.points[first:last], self._point(end)
         return points, end >= self.length - 1e-6
 
     def ahead(self, spacing: float) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Return points (n, 2) every `spacing` metres of the rest of the path, and their distances ahead (m)."""
         count = max(2, math.ceil(self.remaining / spacing) + 1)
-        distances = np.linspace(self.progress, self.length, count)
+        step = (self.length - self.progress) / (count - 1)
+        distances = np.arange(count, dtype=np.float64) * step + self.progress
+        distances[-1] = self.length
         xs, ys = (np.interp(distances, self.along, self.points[:, i]) for i in (0, 1))
         return np.column_stack((xs, ys)), distances - self.progress
 
-    def _point(self, along: float) -> NDArray[np.float64]:
-        return np.array([np.interp(along, self.along, self.points[:, i]) for i in (0, 1)])
+    def _point(self, along: float) -> tuple[float, float]:
+        """Return the point so many metres along the path; its first or last one before its begin and beyond its end."""
+        after = int(self.along.searchsorted(along, "right"))
+        if after == 0 or after == len(self.along):
+            x, y = self.points[min(after, len(self.points) - 1)].tolist()
+            return x, y
+        (x, y), (next_x, next_y) = self.points[after - 1 : after + 1].tolist()
+        begin, end = self.along[after - 1 : after + 1].tolist()
+        return (next_x - x) / (end - begin) * (along - begin) + x, (next_y - y) / (end - begin) * (along - begin) + y
 
     def _nearest(self, x: float, y: float, low: float, high: float) -> tuple[float, float]:
         if len(self.points) == 1:

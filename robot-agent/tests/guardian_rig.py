@@ -40,6 +40,11 @@ def wait_for(condition, expected: str, deadline_s: float = DEADLINE_S):
     raise AssertionError(f"not within {deadline_s} s: {expected}")
 
 
+def lateness() -> Lateness:
+    """Return what tells how late a busy machine makes this process and its programs from now on."""
+    return Lateness(lambda: [os.getpid(), *(child.pid for child in psutil.Process().children(recursive=True))])
+
+
 BAUDS = {getattr(termios, name): int(name[1:]) for name in dir(termios) if re.fullmatch(r"B\d+", name)}
 
 
@@ -99,7 +104,7 @@ class Base:
 
         What a busy machine let this process and its programs wait meanwhile does not count.
         """
-        late = Lateness(lambda: [os.getpid(), *(child.pid for child in psutil.Process().children(recursive=True))])
+        late = lateness()
         stopped = wait_for(lambda: self.stopped_at, "the wheels stop")
         return stopped - begun - late.seconds()
 

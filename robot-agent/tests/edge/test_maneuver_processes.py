@@ -7,7 +7,7 @@ import math
 import numpy as np
 import pytest
 from agent_rig import ROBOT, SITE, Robot, until
-from guardian_rig import STOP_S
+from guardian_rig import STOP_S, lateness
 from little_world import grid_of
 from locked_servers import locked_router
 
@@ -51,16 +51,16 @@ async def test_bumped_robot_backs_off_ten_centimetres_at_most_and_slowly_and_kee
         await until(lambda: robot.fog.state.mode == "FAULT" and not robot.body.moving, "it has stopped")
         refused = await robot.fog.command("reset")
         assert "the cause is still there" in refused.reason
-        rolled = Rolled(robot.body.robot)
+        rolled, late = Rolled(robot.body.robot), lateness()
         before = len(robot.fog.states)
         assert (await robot.fog.command("back_off")).accepted
         await until(lambda: rolled.left < -0.03, "it backs off")
         robot.body.robot.world.bump_left = False
         await until(lambda: any(state.mode == "EGRESS" for state in robot.fog.states[before:]), "it says so")
         await until(lambda: robot.fog.state.mode == "FAULT" and not robot.body.moving, "it has backed off")
-        # On a busy machine the stop may come as late as the robot's design allows.
+        # The stop may come as late as the robot's design allows, and on a busy machine later.
         for travel in (rolled.left, rolled.right):
-            assert -0.10 - 0.05 * STOP_S <= travel < -0.07
+            assert -0.10 - 0.05 * (STOP_S + late.seconds()) <= travel < -0.07
         assert all(-0.051 <= speed <= 0.0 for speeds in rolled.speeds for speed in speeds), rolled.speeds
         assert any("bumper" in reason for reason in robot.fog.state.reasons)
         assert (await robot.fog.command("reset")).accepted

@@ -16,8 +16,9 @@ from fog_contracts.grid import GridGeometry, StaticMap
 from fog_kernels.raycast import cast
 from fog_runtime.configuration.maps import load_map, save_map
 from fognav.__main__ import app
-from fognav.localization.evaluation import track
+from fognav.localization.evaluation import is_falsely_good, track, with_noise
 from fognav.localization.logs import read_log
+from fognav.localization.trials import _kidnapped
 from fognav.output import WrongUseError
 from robot_agent.config import LocalizationConfig
 from robot_agent.localization.map_fields import map_fields
@@ -286,3 +287,22 @@ def test_robot_carried_between_places_that_look_alike_is_not_good_where_suddenly
     assert samples[len(before) - 1].status == "good"
     assert not [sample for sample in samples if sample.status == "good" and sample.position_error > 0.5]
     assert samples[-1].status == "good"
+
+
+@pytest.mark.data
+def test_robot_carried_to_where_half_of_its_beams_agree_is_not_good_there_after_a_drive_either(data_dir, tmp_path):
+    """The two of 100 kidnappings on a recorded floor that were falsely good 2 m after the robot had been put down."""
+    log = data_dir / "lidar_logs" / "seattle-corrected.log.gz"
+    if not log.is_file():
+        pytest.skip(f"{log} does not exist")
+    run("map", "from-log", log, "--out", tmp_path / "floor", "--scans", "odd")
+    floor, config = load_map(tmp_path / "floor.yaml"), LocalizationConfig(range_max=30.0)
+    fields = map_fields(floor.cells, floor.geometry, config)
+    seed, rng = 1, np.random.default_rng(1)
+    scans_of_log = with_noise(read_log(log).select("even"), seed)
+    excerpts = [_kidnapped(scans_of_log, rng) for _ in range(78)]
+    for trial in (0, 77):
+        excerpt, landed = excerpts[trial]
+        samples = track(fields, excerpt, config, seed=seed + trial, search=False)[landed:]
+        assert not [sample for sample in samples if is_falsely_good(sample)]
+        assert samples[6].status == "good"

@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 from pathlib import Path
 from typing import Final
 
@@ -12,11 +13,18 @@ _WIDTH, _HEIGHT, _COLUMNS = 660, 250, 2
 _LEFT, _TOP, _RIGHT, _BOTTOM = 70, 30, 250, 24
 """Margins of a panel's plot (pixels); the legend is on the right."""
 _PAGE_TITLE: Final = 30
-_COLOURS: Final = ("#1f77b4", "#d62728", "#2ca02c", "#9467bd", "#ff7f0e", "#17becf", "#8c564b", "#e377c2", "#7f7f7f")
+_COLOURS: Final = (
+    "#1f77b4", "#d62728", "#2ca02c", "#9467bd", "#ff7f0e", "#17becf", "#8c564b", "#e377c2", "#7f7f7f", "#bcbd22",
+    "#393b79", "#637939", "#e7ba52", "#843c39",
+)  # fmt: skip
+"""As many as the legend has names."""
 _INK, _GRID, _NOTHING = "#222222", "#dddddd", "#b00020"
 _LEGENDS: Final = 14
-_SHOWN: Final = {"percentunit": ("%", 100.0)}
-"""Grafana's units that are read more easily in another one: its name and what to multiply by."""
+_SHOWN: Final = {
+    "percentunit": ("%", 100.0), "short": ("", 1.0), "lengthm": ("m", 1.0), "hertz": ("Hz", 1.0), "volt": ("V", 1.0),
+    "celsius": ("degrees Celsius", 1.0), "bytes": ("MB", 1e-6), "Bps": ("kB/s", 1e-3),
+}  # fmt: skip
+"""What Grafana's names of units mean: a unit that is read easily, and what to multiply by."""
 _LEGEND_CHARACTERS: Final = 40
 
 
@@ -52,13 +60,16 @@ class _Plot:
     def draw(self, panel: Panel, series: list[Series]) -> None:
         """Draw frame, series and legend, or that there are none."""
         unit, factor = _SHOWN.get(panel.unit, (panel.unit, 1.0))
-        series = [Series(each.name, [(at, factor * value) for at, value in each.points]) for each in series]
-        self._pen.text((self._x + _LEFT, self._y + 8), f"{panel.title} [{unit}]", fill=_INK, font_size=13)
+        series = [
+            Series(each.name, [(at, factor * value) for at, value in each.points]) for each in series if each.points
+        ]
+        title = f"{panel.title} [{unit}]" if unit else panel.title
+        self._pen.text((self._x + _LEFT, self._y + 8), title, fill=_INK, font_size=13)
         left, top = self._x + _LEFT, self._y + _TOP
         self._pen.rectangle((left, top, left + self._inner_width, top + self._inner_height), outline=_GRID)
         self._pen.text((left, top + self._inner_height + 5), f"-{self._seconds:g} s", fill=_INK)
         self._pen.text((left + self._inner_width - 20, top + self._inner_height + 5), "now", fill=_INK)
-        if not any(each.points for each in series):
+        if not series:
             text = f"no data: needs {panel.needs}" if panel.needs else "NO DATA"
             self._pen.text((left + 8, top + 8), text, fill=_INK if panel.needs else _NOTHING)
             return
@@ -80,24 +91,28 @@ class _Plot:
             y = bottom - share * self._inner_height
             self._pen.line((self._x + _LEFT, y, self._x + _LEFT + self._inner_width, y), fill=_GRID)
             self._pen.text((self._x + 6, y - 6), f"{low + share * (high - low):.3g}", fill=_INK)
+        gap = 1.5 * _period(series, self._seconds)
         for number, each in enumerate(series):
-            line = [(self._at(at), bottom - (value - low) / (high - low) * self._inner_height)
-                    for at, value in each.points]  # fmt: skip
             colour = _COLOURS[number % len(_COLOURS)]
-            if len(line) > 1:
-                self._pen.line(line, fill=colour, width=2)
-            elif line:
-                self._pen.circle(line[0], 2, fill=colour)
+            for points in _unbroken(each, gap):
+                line = [(self._at(at), bottom - (value - low) / (high - low) * self._inner_height)
+                        for at, value in points]  # fmt: skip
+                if len(line) > 1:
+                    self._pen.line(line, fill=colour, width=2)
+                else:
+                    self._pen.circle(line[0], 2, fill=colour)
 
     def _bands(self, series: list[Series]) -> None:
         """Draw a band for each series, filled where its value is not 0."""
         height = self._inner_height / len(series)
-        step = 2 * self._inner_width / max(2, *(len(each.points) for each in series))
+        step = _period(series, self._seconds) / self._seconds * self._inner_width
+        right = self._x + _LEFT + self._inner_width
         for number, each in enumerate(series):
             top = self._y + _TOP + number * height
             for at, value in each.points:
                 if value:
-                    box = (self._at(at), top + 1, self._at(at) + step, top + max(2.0, height - 1))
+                    left = min(right, self._at(at))  # rounding may put the last sample behind it
+                    box = (left, top + 1, min(right, left + step), top + max(2.0, height - 1))
                     self._pen.rectangle(box, fill=_COLOURS[number % len(_COLOURS)])
 
     def _legend(self, series: list[Series]) -> None:
@@ -109,6 +124,23 @@ class _Plot:
             self._pen.text((x + 11, y), each.name[: _LEGEND_CHARACTERS - len(last)] + last, fill=_INK)
         if len(series) > _LEGENDS:
             self._pen.text((x, self._y + _TOP + _LEGENDS * 14), f"and {len(series) - _LEGENDS} more", fill=_INK)
+
+
+def _period(series: list[Series], seconds: float) -> float:
+    """Return the time (s) between two samples: the shortest there is, or little of `seconds` for single ones."""
+    gaps = [after[0] - before[0] for each in series for before, after in pairwise(each.points)]
+    return min(gaps, default=seconds / 100)
+
+
+def _unbroken(series: Series, gap: float) -> list[list[tuple[float, float]]]:
+    """Return a series' points in pieces, between which there was nothing for longer than `gap` (s)."""
+    pieces: list[list[tuple[float, float]]] = []
+    for point in series.points:
+        if pieces and point[0] - pieces[-1][-1][0] <= gap:
+            pieces[-1].append(point)
+        else:
+            pieces.append([point])
+    return pieces
 
 
 def _stacked(series: list[Series]) -> list[Series]:

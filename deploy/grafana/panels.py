@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from typing import Final, Literal
 
 from fog_contracts.channels import AGGREGATOR_HEARTBEAT
+from fog_contracts.messages import PLAN_CODES
 
 Kind = Literal["lines", "stacked", "states", "number"]
 
@@ -316,7 +317,9 @@ PIPELINE: Final = Dashboard(
                 ),
                 Panel(
                     "Refusals",
-                    "Goals that can't be reached, by their code.",
+                    "Goals that can't be reached, in ten minutes, by their code: "
+                    + ", ".join(f"{code} {name}" for code, name in PLAN_CODES.items() if code)
+                    + ".",
                     (("sum by (code) (increase(fognav_plan_refusals_total[10m]))", "{{code}}"),),
                     needs="a goal that can't be reached",
                 ),

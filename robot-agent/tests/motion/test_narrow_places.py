@@ -10,7 +10,7 @@ from fog_kernels.dwa import DwaLimits, DwaSettings
 from robot_agent.footprint import Footprint
 from robot_agent.localization.deskew import DeskewedScan
 from robot_agent.localization.pose import Pose2
-from robot_agent.motion.band import distances, give_way
+from robot_agent.motion.band import course, distances, give_way
 from robot_agent.motion.recent_scans import RecentScans
 
 BODY = cover(Footprint.circle(0.17).polygon)
@@ -30,7 +30,7 @@ def walls(*heights):
 
 def test_path_beside_one_wall_moves_away_until_there_is_room():
     field = around(walls(0.78))
-    pushed = give_way(PATH, field, 0.30)
+    pushed = give_way(course(PATH, field), field, 0.30).path
     middle = pushed[(pushed[:, 0] > 1.3) & (pushed[:, 0] < 1.9)]
     assert middle[:, 1] == pytest.approx(np.full(len(middle), 1.08), abs=0.02)
     assert pushed[0] == pytest.approx(PATH[0])
@@ -39,14 +39,15 @@ def test_path_beside_one_wall_moves_away_until_there_is_room():
 
 def test_path_between_two_walls_moves_to_the_middle_and_stays_there():
     field = around(walls(0.82, 1.26))
-    pushed = give_way(PATH, field, 0.30)
+    pushed = give_way(course(PATH, field), field, 0.30).path
     middle = pushed[(pushed[:, 0] > 1.3) & (pushed[:, 0] < 1.9)]
     assert middle[:, 1] == pytest.approx(np.full(len(middle), 1.04), abs=0.015)
     assert distances(field, middle).min() > 0.2
 
 
 def test_path_with_room_on_both_sides_is_left_alone():
-    assert give_way(PATH, around(walls(0.5, 1.5)), 0.30) is PATH
+    field = around(walls(0.5, 1.5))
+    assert give_way(course(PATH, field), field, 0.30).path is PATH
 
 
 def test_points_of_earlier_scans_are_placed_by_odometry_and_forgotten_after_a_second():

@@ -7,7 +7,7 @@ force that pushes points out of narrow places; the planner's path gives the rest
 from __future__ import annotations
 
 import math
-from typing import TYPE_CHECKING, Final
+from typing import TYPE_CHECKING, Final, NamedTuple
 
 import numpy as np
 
@@ -26,18 +26,34 @@ _REACH_M: Final = 0.05
 """Half the distance over which the slope of the distances is measured: noise of the lidar is no slope."""
 
 
-def give_way(path: NDArray[np.float64], around: Clearance, keep: float) -> NDArray[np.float64]:
-    """Return the path (n, 2; m), its points near things pushed away until they are `keep` m off or in the middle.
+class Course(NamedTuple):
+    """A path (n, 2; m) with points (m, 2) every 5 cm, `along` it (m), and how far from everything they are (m)."""
 
-    Begin and end stay where they are, and so does everything beyond the window of `around`.
-    """
+    path: NDArray[np.float64]
+    points: NDArray[np.float64]
+    along: NDArray[np.float64]
+    free: NDArray[np.float64]
+
+
+def course(path: NDArray[np.float64], around: Clearance) -> Course:
+    """Return a path (n, 2; m) with the distances from the nearest thing along it."""
     points, along = PathFollower(path, math.inf).ahead(_SPACING_M)
+    return Course(path, points, along, distances(around, points))
+
+
+def give_way(original: Course, around: Clearance, keep: float) -> Course:
+    """Return the path, its points near things pushed away until they are `keep` m off or in the middle.
+
+    Begin and end stay where they are, and so does everything beyond the window of `around`. It is the `original` one
+    if no point is near anything.
+    """
+    _, points, along, found = original
     size = len(around.distance) * around.resolution
     corner = np.array((around.origin_x, around.origin_y))
     within = (points > corner + _REACH_M) & (points < corner + size - _REACH_M)
     inside = within[:, 0] & within[:, 1] & (along > 0.0) & (along < along[-1])
-    if not (distances(around, points[inside]) < keep).any():
-        return path
+    if not (found[inside] < keep).any():
+        return original
     # What the window's border cuts off must not become a step in the path.
     moved, free = points[inside], np.minimum(along[-1] - along[inside], along[inside]) / (2.0 * _SPACING_M)
     for _ in range(_STEPS):
@@ -49,8 +65,9 @@ def give_way(path: NDArray[np.float64], around: Clearance, keep: float) -> NDArr
         ) / (2.0 * _REACH_M)
         lacking = np.clip(keep - distances(around, moved), 0.0, _STEP_M)
         moved = moved + slope * (lacking * np.clip(free, 0.0, 1.0))[:, None]
-    points[inside] = moved
-    return points
+    bent = points.copy()
+    bent[inside] = moved
+    return course(bent, around)
 
 
 def distances(around: Clearance, points: NDArray[np.float64]) -> NDArray[np.float64]:

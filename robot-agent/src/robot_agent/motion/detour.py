@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
+from functools import lru_cache
 from typing import TYPE_CHECKING, Final
 
 import numpy as np
@@ -19,6 +20,7 @@ if TYPE_CHECKING:
     from fog_contracts.costs import Inflation
     from fog_contracts.grid import GridGeometry
     from fog_kernels.clearance import Clearance
+    from fog_kernels.inflation import InflationTable
     from robot_agent.localization.pose import Pose2
 
 _REJOIN_M: Final = 0.2
@@ -39,8 +41,7 @@ def local_costs(
     Cells round a gap's width to multiples of theirs. Where `around` knows exact distances, a cell is inscribed when
     nowhere in it `narrowest` (m) are free; beyond, only when no rounding could free it.
     """
-    certain = max(narrowest - window.resolution * math.sqrt(0.5), 0.0)
-    table = inflation_table(window.resolution, replace(inflation, inscribed_radius=certain))
+    table = _lidar_table(window.resolution, inflation, narrowest)
     marks = np.zeros(cost.shape, np.uint8)
     cells, inside = window.cells(lidar_points)
     marks[cells[inside, 1], cells[inside, 0]] = LETHAL
@@ -56,6 +57,13 @@ def local_costs(
     seen = np.where(free[bottom:top, left:right] < narrowest, INSCRIBED, np.minimum(costs[exact], PENALTY_MAX))
     costs[exact] = np.maximum(cost[exact], seen)
     return costs
+
+
+@lru_cache(maxsize=8)
+def _lidar_table(resolution: float, inflation: Inflation, narrowest: float) -> InflationTable:
+    """Return the table by which lidar points are inflated: the same in every decision, and dear to make."""
+    certain = max(narrowest - resolution * math.sqrt(0.5), 0.0)
+    return inflation_table(resolution, replace(inflation, inscribed_radius=certain))
 
 
 def _largest(field: NDArray[np.float32], finer: int) -> NDArray[np.float32]:

@@ -18,17 +18,20 @@ from fog_kernels.body import Body, cover
 from fog_kernels.clearance import Clearance, clearance
 from fog_kernels.dwa import dwa
 from robot_agent.localization.pose import Pose2, wrap
-from robot_agent.motion.band import distances, give_way
+from robot_agent.motion.band import course, give_way
 from robot_agent.motion.detour import detour, local_costs
-from robot_agent.motion.path_follower import PathFollower
 from robot_agent.motion.recovery_moves import recovery_speeds
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
+    from fog_contracts.costs import Inflation
     from fog_contracts.grid import GridGeometry
+    from fog_kernels.dwa_settings import DwaLimits, DwaSettings
     from robot_agent.config import MotionConfig
     from robot_agent.footprint import Footprint
+    from robot_agent.motion.band import Course
+    from robot_agent.motion.path_follower import PathFollower
     from robot_agent.motion.recovery_moves import RecoveryMove
 
 _AHEAD_M: Final = 2.5
@@ -103,7 +106,7 @@ def decide(job: Job) -> Decision:
     """Choose the speeds for the next period; pure, a millisecond of work, releases the GIL inside its kernels."""
     config, body = job.config, body_of(job.footprint)
     window = job.window
-    limits = replace(config.limits, v_max=max(0.0, min(job.cap, config.limits.v_max)))
+    limits = _slower(config.limits, max(0.0, min(job.cap, config.limits.v_max)))
     around = clearance(
         job.cost,
         window.resolution,
@@ -113,7 +116,7 @@ def decide(job: Job) -> Decision:
         job.pose.x,
         job.pose.y,
         body,
-        replace(config.inflation, inscribed_radius=body.inscribed),
+        _around_body(config.inflation, body.inscribed),
         limits,
         config.arcs,
         at_least=_LOOK_M,
@@ -123,8 +126,9 @@ def decide(job: Job) -> Decision:
     costs = local_costs(
         job.cost, window, job.lidar_points, config.inflation, around, body.inscribed + config.arcs.padding
     )
-    path = give_way(detour(job.path, costs, window, job.pose), around, body.inscribed + config.slow_within)
-    room = room_beside(around, path, body.inscribed, config.slow_within)
+    way = course(detour(job.path, costs, window, job.pose), around)
+    way = give_way(way, around, body.inscribed + config.slow_within)
+    room = room_beside(way, body.inscribed, config.slow_within)
     end = job.path[-1]
     goal_theta = job.goal_theta if job.ends_here else None
     tolerance = config.arrived_within if job.arrived else config.arcs.goal_tolerance
@@ -133,19 +137,13 @@ def decide(job: Job) -> Decision:
         job.w,
         *job.pose,
         around,
-        path,
+        way.path,
         float(end[0]),
         float(end[1]),
         goal_theta,
         body,
-        replace(limits, v_max=min(limits.v_max, config.speed_narrow + (limits.v_max - config.speed_narrow) * room)),
-        # In a narrow curve an arc that aims far ahead cuts the corner.
-        replace(
-            config.arcs,
-            lookahead=config.arcs.lookahead * max(room, config.lookahead_narrow),
-            w_path=config.arcs.w_path * (config.path_narrow + (1.0 - config.path_narrow) * room),
-            goal_tolerance=tolerance,
-        ),
+        _slower(limits, min(limits.v_max, config.speed_narrow + (limits.v_max - config.speed_narrow) * room)),
+        _narrower(config, room, tolerance),
     )
     arrived = math.hypot(end[0] - job.pose.x, end[1] - job.pose.y) <= tolerance
     at_heading = goal_theta is None or abs(wrap(goal_theta - job.pose.theta)) <= config.arcs.heading_tolerance
@@ -190,13 +188,40 @@ def body_of(footprint: Footprint) -> Body:
     return cover(footprint.polygon)
 
 
-def room_beside(around: Clearance, path: NDArray[np.float64], inscribed: float, enough: float) -> float:
-    """Return how wide the narrowest place of the path (n, 2; m) just ahead is.
+# Most decisions are made with the same speeds and room: making and checking new settings costs more than looking
+# them up.
+
+
+@lru_cache(maxsize=32)
+def _slower(limits: DwaLimits, v_max: float) -> DwaLimits:
+    """Return the limits of the base with another highest speed (m/s)."""
+    return replace(limits, v_max=v_max)
+
+
+@lru_cache(maxsize=8)
+def _around_body(inflation: Inflation, inscribed: float) -> Inflation:
+    """Return the inflation around a body with this inscribed radius (m)."""
+    return replace(inflation, inscribed_radius=inscribed)
+
+
+@lru_cache(maxsize=32)
+def _narrower(config: MotionConfig, room: float, tolerance: float) -> DwaSettings:
+    """Return how arcs are scored with so much room (0..1): in a curve one that aims far ahead cuts the corner."""
+    arcs = config.arcs
+    return replace(
+        arcs,
+        lookahead=arcs.lookahead * max(room, config.lookahead_narrow),
+        w_path=arcs.w_path * (config.path_narrow + (1.0 - config.path_narrow) * room),
+        goal_tolerance=tolerance,
+    )
+
+
+def room_beside(way: Course, inscribed: float, enough: float) -> float:
+    """Return how wide the narrowest place of the path just ahead is.
 
     0 when the body only just fits, 1 when there are `enough` m or more beside it.
     """
-    points, along = PathFollower(path, math.inf).ahead(2.0 * around.resolution)
-    free = float(distances(around, points[along <= _NEAR_AHEAD_M]).min()) - inscribed
+    free = float(way.free[way.along <= _NEAR_AHEAD_M].min()) - inscribed
     return min(max(free / enough, 0.0), 1.0)
 
 

@@ -82,14 +82,28 @@ def _round_up(value: float) -> float:
     return next(step * factor for factor in (1, 2, 2.5, 5, 10) if step * factor >= value)
 
 
-def tracks(paths: Mapping[str, Sequence[tuple[float, float]]]) -> str:
-    """Return the true tracks (m) of several setups, seen from above, with the scale of 10 m."""
-    points = [point for path in paths.values() for point in path]
+def tracks(
+    paths: Mapping[str, Sequence[tuple[float, float]]],
+    blocked: Sequence[tuple[float, float]] = (),
+    stops: Mapping[str, tuple[float, float]] | None = None,
+) -> str:
+    """Return the true tracks (m) of several setups, seen from above, with the scale of 10 m.
+
+    `blocked`: corners of the area that was blocked; `stops`: names and positions of the route's ends.
+    """
+    stops = stops or {}
+    points = [point for path in paths.values() for point in path] + [*blocked, *stops.values()]
     left, bottom = min(x for x, _ in points) - 2.0, min(y for _, y in points) - 2.0
     right, top = max(x for x, _ in points) + 2.0, max(y for _, y in points) + 2.0
     scale = (_WIDTH - 20) / max(right - left, 1.0)
     height = (top - bottom) * scale + _TOP
     parts = _legend(list(paths))
+    if blocked:
+        corners = [((x - left) * scale + 10, height - (y - bottom) * scale) for x, y in blocked]
+        places = " ".join(f"{x:.1f},{y:.1f}" for x, y in corners)
+        parts.append(f'<polygon points="{places}" fill="#e9b4b4" stroke="#b03030"/>')
+        middle, lowest = sum(x for x, _ in corners) / len(corners), max(y for _, y in corners)
+        parts.append(_text(middle, lowest + 15, "blocked", anchor="middle"))
     for number, (setup, path) in enumerate(paths.items()):
         # A little apart, so that tracks on the same way are all seen.
         places = " ".join(
@@ -97,8 +111,10 @@ def tracks(paths: Mapping[str, Sequence[tuple[float, float]]]) -> str:
             for x, y in path
         )
         parts.append(f'<polyline points="{places}" fill="none" stroke="{COLOURS[setup]}" stroke-width="2"/>')
-    x, y = points[0]
-    parts.append(f'<circle cx="{(x - left) * scale + 10:.1f}" cy="{height - (y - bottom) * scale:.1f}" r="5"/>')
+    for name, (x, y) in (stops or {"": points[0]}).items():
+        column, row = (x - left) * scale + 10, height - (y - bottom) * scale
+        parts.append(f'<circle cx="{column:.1f}" cy="{row:.1f}" r="5"/>')
+        parts.append(_text(column + 9, row - 7, name, weight="bold"))
     parts.append(f'<line x1="10" x2="{10 + 10 * scale:.1f}" y1="30" y2="30" stroke="#222" stroke-width="2"/>')
     parts.append(_text(10, 24, "10 m"))
     return _svg(height, parts)

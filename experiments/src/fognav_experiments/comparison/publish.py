@@ -20,6 +20,7 @@ if TYPE_CHECKING:
     from collections.abc import Sequence
     from pathlib import Path
 
+    from fog_runtime.configuration.site import LoadedSite
     from fognav_experiments.comparison.geometry import Saving
     from fognav_experiments.comparison.records import Folder, Record
 
@@ -33,7 +34,10 @@ def publish(folder: Folder, target: Path, site: Path | None = None) -> list[Path
     measured = [drive for kind in KINDS for drive in folder.measured(kind).read()]
     if not records:
         raise FolderError(f"{folder.path} holds no drives yet: run `fognav experiment --out {folder.path}` first")
-    blocks = build(records, experiment, _savings(records, experiment["asked"], site), measured)
+    known = site is not None and runner.site_digest(site) == experiment["asked"]["site_digest"]
+    loaded = load_site(site) if known and site is not None else None
+    savings = {} if site is None or loaded is None else _savings(records, experiment["asked"], site, loaded)
+    blocks = build(records, experiment, savings, measured, None if loaded is None else loaded.site)
     summary = io.StringIO()
     csv.writer(summary, lineterminator="\n").writerows(summary_rows(records))
     texts = {
@@ -49,11 +53,10 @@ def publish(folder: Folder, target: Path, site: Path | None = None) -> list[Path
     return [target / name for name in (*texts, "drives.csv", archive.NAME)]
 
 
-def _savings(records: Sequence[Record], asked: dict[str, Any], place: Path | None) -> dict[tuple[int, str], Saving]:
-    """Return, by run and route, what the map allows to save; nothing for another floor than that of the drives."""
-    if place is None or runner.site_digest(place) != asked["site_digest"]:
-        return {}
-    site = load_site(place)
+def _savings(
+    records: Sequence[Record], asked: dict[str, Any], place: Path, site: LoadedSite
+) -> dict[tuple[int, str], Saving]:
+    """Return, by run and route, what the map of the drives allows to save."""
     spec, geometry = runner.read_spec(site, place), RouteGeometry(site)
     drawn = [route for run in {record.run for record in records} for route in draw(spec, asked["seed"], run)]
     found = {(route.run, route.route.name): geometry.saving(route) for route in drawn}

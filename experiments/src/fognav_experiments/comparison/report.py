@@ -9,12 +9,13 @@ from fognav_experiments.comparison import agreement, figures, limits
 from fognav_experiments.comparison.document import Block, Code, Figure, Heading, Paragraph, Table, flat
 from fognav_experiments.comparison.records import ALIKE, MOVE_BASE, OF_FOG, ON_FOG, ON_ROBOT, machines
 from fognav_experiments.comparison.statistics import Estimate, compare, estimate
-from fognav_experiments.comparison.thesis import REPORTED
+from fognav_experiments.comparison.thesis import MEMORY_UNKNOWN, PLACES, REALITY_UNKNOWN, REPORTED
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping, Sequence
 
     from fog_contracts.messages import ProfileName
+    from fog_contracts.site import Site
     from fognav_experiments.comparison.geometry import Saving
     from fognav_experiments.comparison.measured import MeasuredDrive
     from fognav_experiments.comparison.records import Record
@@ -86,11 +87,12 @@ def build(
     experiment: Mapping[str, Any],
     savings: Mapping[tuple[int, str], Saving] | None = None,
     measured: Sequence[MeasuredDrive] = (),
+    site: Site | None = None,
 ) -> list[Block]:
     """Return the report of these records, measured on what `experiment` says.
 
     `savings`: by run and route, what the map alone says of them, as far as that is known. `measured`: drives by real
-    processes.
+    processes. `site`: that of the drives, if it is at hand.
     """
     savings = savings or {}
     pairs = paired(records)
@@ -106,6 +108,8 @@ def build(
         *blocks,
         Heading("Beside the thesis"),
         *_beside_thesis(pairs, met, setups, measured),
+        Heading("Each figure of the thesis, and where it is here"),
+        *_places(measured),
         Heading("Distance, time and computation per route"),
         *_routes(pairs, setups),
         Heading("Paired differences"),
@@ -116,7 +120,7 @@ def build(
         *agreement.agreement(measured, records, str(experiment["measured_on"].get("commit", ""))),
         *_cost(measured),
         Heading("One drive, seen from above"),
-        *_tracks(pairs, setups),
+        *_tracks(pairs, setups, site),
         Heading("Drives that failed, and contacts"),
         *_failures(records, measured),
     ]
@@ -346,14 +350,39 @@ def _share(pairs: Sequence[Drives], setup: ProfileName, components: Sequence[str
     return estimate([drives[setup].cpu_percent(components) for drives in pairs]).mean
 
 
-def _tracks(pairs: Sequence[Drives], setups: Sequence[ProfileName]) -> list[Block]:
+def _tracks(pairs: Sequence[Drives], setups: Sequence[ProfileName], site: Site | None) -> list[Block]:
     first, last = setups[0], setups[-1]
     drives = max(pairs, key=lambda drives: drives[first].distance_m - drives[last].distance_m)
     record = drives[first]
-    svg = figures.tracks({setup: drives[setup].track for setup in setups})
+    blocked, stops = _ends(record, site) if site is not None else ((), {})
+    svg = figures.tracks({setup: drives[setup].track for setup in setups}, blocked, stops)
     lengths = ", ".join(f"{setup} {drives[setup].distance_m:.0f} m" for setup in setups)
     caption = f"As figures 6.1 and 6.2: run {record.run}, {_route(record.route)}, {record.area} is blocked: {lengths}."
     return [Figure("tracks.svg", svg, caption)]
+
+
+def _ends(record: Record, site: Site) -> tuple[Sequence[tuple[float, float]], dict[str, tuple[float, float]]]:
+    """Return the corners (m) of the area that was blocked, and the two stops of the route."""
+    blocked = next((area.polygon for area in site.definitions() if area.id == record.area), ())
+    names = [name for name in site.places if record.route.startswith(name) or record.route.endswith(name)]
+    stops = {name.upper(): (site.places[name].x, site.places[name].y) for name in names}
+    return [(x, y) for x, y in blocked], stops
+
+
+def _places(measured: Sequence[MeasuredDrive]) -> list[Block]:
+    """Return where a reader of the thesis finds its figures again."""
+    real = any(drive.kind == "hardware" for drive in measured)
+    known = {
+        "memory": "the table of what the robot's processes cost" if measured else MEMORY_UNKNOWN,
+        "reality": "the table of the same routes by real processes" if measured else REALITY_UNKNOWN,
+    }
+    rows = [[figure, shows, place.format(**known)] for figure, shows, place in PLACES]
+    words = "Its chapter 6 has no tables. Figures of its real runs (6.7 to 6.12) are those of a robot; " + (
+        "drives of a real one are among those by real processes."
+        if real
+        else "here all robots are simulated, until `fognav experiment --hardware` drives one."
+    )
+    return [Table(["figure", "shows", "here"], rows), Paragraph(words)]
 
 
 def _failures(records: Sequence[Record], measured: Sequence[MeasuredDrive]) -> list[Block]:

@@ -46,3 +46,21 @@ REPORTED: Final = (
         "around 3 s",
     ),
 )
+
+PLACES: Final = (
+    ("6.1", "default: the path leads into the blocked zone", "tracks.svg, orange: one drive, seen from above"),
+    ("6.2", "full: the path avoids it", "tracks.svg, blue (full) and green (fog)"),
+    ("6.3", "distance per route, simulated", "distance.svg, and the table below it"),
+    ("6.4", "time per route, simulated", "time.svg, and the table below it"),
+    ("6.5", "CPU of move_base, simulated", "cpu-move-base.svg, and the table below it"),
+    ("6.6", "memory of move_base, simulated", "{memory}"),
+    ("6.7", "distance per route, real", "distance.svg, as 6.3"),
+    ("6.8", "time per route, real", "time.svg, as 6.4"),
+    ("6.9", "CPU of move_base, real", "cpu-move-base.svg, as 6.5"),
+    ("6.10", "memory of move_base, real", "{memory}"),
+    ("6.11", "distance, simulated and real", "{reality}"),
+    ("6.12", "time, simulated and real", "{reality}"),
+)
+"""The thesis's figures of chapter 6: what each shows, and where a report has the same."""
+MEMORY_UNKNOWN: Final = "only by real processes (fognav experiment --live): lockstep runs all setups in one"
+REALITY_UNKNOWN: Final = "only by real processes (fognav experiment --live or --hardware)"

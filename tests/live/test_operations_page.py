@@ -15,9 +15,9 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
+from floor_ports import floor_ports
 
 from fog_runtime.configuration.site import load_site
-from fog_supervisor import net
 
 pytestmark = [pytest.mark.live, pytest.mark.timeout(900)]
 
@@ -56,13 +56,12 @@ class Machine:
         assert git is not None, "git is not installed"
         cloning = f'[ "$1" != clone ] || {{ echo git "$@" >>"{self.asked}"; mkdir -p "$3"; exit; }}'
         self._program(programs / "git", f'{cloning}\nexec "{git}" "$@"')
-        taken: set[int] = set()
         inherited = {
             name: value for name, value in os.environ.items() if not name.startswith(("FOGNAV_", "XDG_"))
         }  # fmt: skip
         self._environment = {
             **inherited,
-            **{f"FOGNAV_{name}_PORT": str(net.free_port(taken)) for name in PORTS},
+            **floor_ports(PORTS),
             "FOGNAV_BIND": "127.0.0.1",
             "HOME": str(self.home),
             "USER": "pi",

@@ -15,6 +15,7 @@ from typing import Any
 
 import psutil
 import pytest
+from floor_ports import floor_ports
 
 from fog_supervisor import child, net
 from fognav.hosting.versions import Versions
@@ -39,11 +40,8 @@ class Node:
         """The checkout of another version, which runs instead of this one."""
         (folder / "runtime").mkdir(mode=0o700)
         self.printed = folder / "up.txt"
-        taken: set[int] = set()
-        # Further floors use the ports above.
-        ports = {f"FOGNAV_{name}_PORT": str(net.free_port(taken)) for name in PORTS}
         inherited = {key: value for key, value in os.environ.items() if not key.startswith("FOGNAV_")}
-        self.environment = {**inherited, **ports, "XDG_RUNTIME_DIR": str(folder / "runtime")}
+        self.environment = {**inherited, **floor_ports(PORTS), "XDG_RUNTIME_DIR": str(folder / "runtime")}
         self.process: subprocess.Popen[bytes] | None = None
 
     def up(self) -> None:

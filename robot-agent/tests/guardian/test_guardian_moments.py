@@ -223,6 +223,22 @@ def test_silence_on_the_way_off_the_dock_is_latched() -> None:
     assert leaving.core.latched == SILENCE
 
 
+def test_core_counts_the_frames_of_its_base() -> None:
+    rig = Rig(awake=False)
+    assert rig.core.frames == 0
+    rig.frame(0.05)
+    rig.frame(0.1)
+    assert rig.core.frames == 2
+
+
+def test_bump_that_was_reset_is_told_no_more() -> None:
+    rig = Rig()
+    assert rig.frame(0.2, bumper_left=True).feedback[-1].bumped
+    rig.command(0.3, 0.0, 0.0, reset=True)
+    told = rig.frame(0.5).feedback[-1]
+    assert (told.fault, told.bumped) == (None, False)
+
+
 def test_first_fault_is_answered_with_a_stop_even_if_zero_was_sent_a_moment_ago() -> None:
     rig = Rig()
     rig.drive(0.1, 1.0, 0.0, 0.0)

@@ -16,9 +16,10 @@ from hypothesis import strategies as st
 from shortest_paths import Cell, cell_of, costmaps, dijkstra
 
 from fog_contracts.costs import DEFAULT_INFLATION
+from fog_contracts.geometry import lengths_along
 from fog_kernels.astar import Planner, nearest_traversable
 from fog_kernels.inflation import inflate, inflation_table
-from fog_kernels.lines import line_cost, polyline_cost, shortcut
+from fog_kernels.lines import cost_from, line_cost, shortcut
 from fog_kernels.steps import DIAGONAL, STRAIGHT
 from fog_kernels.tiles import TilePatterns
 
@@ -237,11 +238,18 @@ def test_polyline_costs_what_its_lines_cost_and_nothing_crosses_a_wall() -> None
     costmap = rng.integers(0, 253, (30, 30)).astype(np.uint8)
     points = rng.uniform(0, 29, (6, 2))
     lines = [line_cost(costmap, *a, *b) for a, b in itertools.pairwise(points.tolist())]
-    assert polyline_cost(costmap, points) == sum(lines)
-    assert polyline_cost(costmap, points[:1]) == 0.0
-    assert polyline_cost(costmap, np.array([[0.0, 0.0], [3.0, 3.0], [50.0, 3.0]])) == math.inf
+
+    def cost(line: NDArray[np.float64], begin: float = 0.0) -> float:
+        return cost_from(costmap, line, lengths_along(line), begin, (-0.5, -0.5, 1.0))
+
+    assert cost(points) == pytest.approx(sum(lines))
+    assert cost(points, begin=lengths_along(points)[2]) == pytest.approx(sum(lines[2:]))
+    assert cost(points[:1]) == cost(points, begin=1000.0) == 0.0
+    assert cost(np.array([[0.0, 0.0], [3.0, 3.0], [50.0, 3.0]])) == math.inf
     with pytest.raises(ValueError, match="points"):
-        polyline_cost(costmap, np.zeros((2, 3)))
+        cost_from(costmap, np.zeros((2, 3)), np.zeros(2), 0.0, (0.0, 0.0, 1.0))
+    with pytest.raises(ValueError, match="no point"):
+        cost_from(costmap, np.zeros((0, 2)), np.zeros(0), 0.0, (0.0, 0.0, 1.0))
 
 
 def test_line_between_two_diagonal_obstacles_is_blocked() -> None:

@@ -2,6 +2,7 @@
 
 import math
 from functools import partial
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
@@ -13,6 +14,7 @@ from ring_map import LEFT, LOWER, RIGHT, UPPER, Box, RingMap, goal, pose
 
 from fog_contracts import channels as ch
 from fog_contracts.costs import DEFAULT_INFLATION, INSCRIBED
+from fog_contracts.geometry import lengths_along
 from fog_contracts.grid import GridGeometry
 from fog_contracts.handlers import Moment
 from fog_contracts.messages import (
@@ -33,6 +35,7 @@ from fog_contracts.replica import MapError, Version
 from fog_contracts.shapes import rasterize_shape
 from fog_kernels.astar import Planner
 from fog_kernels.inflation import inflate, inflation_table
+from fog_kernels.lines import line_cost
 from planner.config import PlannerConfig
 from planner.maps.planning_map import CostChange, MapTracker, PlanningMap
 from planner.reasons.blocked_regions import BlockedRegions, cover
@@ -94,6 +97,25 @@ def test_robot_is_looked_for_near_its_progress_and_on_the_whole_route_where_it_h
     assert route.nearest(3.0, 0.9, after=2.0, window=5.0) == pytest.approx((3.0, 0.9))
     assert route.nearest(3.0, 0.9, after=4.0, window=5.0) == pytest.approx((3.5, math.hypot(0.5, 0.9)))
     assert route.nearest(3.0, 0.0, after=30.0, window=5.0) == pytest.approx((3.0, 0.0))
+
+
+@settings(deadline=None)
+@given(
+    st.lists(st.tuples(*2 * [st.floats(-0.9, 2.9).map(lambda value: round(value, 2))]), min_size=2, max_size=6),
+    st.floats(-1.0, 15.0), st.integers(0, 1), st.integers(0, 2**16),
+)  # fmt: skip
+def test_cost_of_a_route_is_that_of_the_lines_that_remain(
+    corners: list[PointXY], along: float, escape_lines: int, seed: int
+) -> None:
+    geometry = GridGeometry(40, 40, 0.1, -1.0, -1.0)
+    costmap = np.random.default_rng(seed).choice(
+        np.array((0, 30, 252, 254), np.uint8), (40, 40), p=(0.6, 0.2, 0.19, 0.01)
+    )
+    route = Route(np.array(corners), 0.1, escape_lines)
+    begin = max(along, float(lengths_along(route.corners)[escape_lines]))
+    places = geometry.grid_coordinates(route.remaining(begin)).tolist()
+    expected = sum(line_cost(costmap, *first, *second) for first, second in pairwise(places))
+    assert route.cost(costmap, geometry, along) == expected
 
 
 def test_route_without_length_is_as_near_as_its_only_point() -> None:

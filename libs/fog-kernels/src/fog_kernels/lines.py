@@ -81,12 +81,30 @@ def _line_cost(costmap: Any, weight: Any, x0: float, y0: float, x1: float, y1: f
             return math.inf
 
 
-@njit(float64(_arrays.U8_GRID, _arrays.I32_FLAT, _arrays.F64_GRID), cache=True, nogil=True)
-def _polyline_cost(costmap: Any, weight: Any, points: Any) -> float:
-    """Integrate the weight along the lines between points; infinite if one is blocked."""
+@njit(
+    float64(
+        _arrays.U8_GRID, _arrays.I32_FLAT, _arrays.F64_GRID, _arrays.F64_FLAT, float64, float64, float64, float64
+    ),
+    cache=True, error_model="numpy",
+)  # fmt: skip
+def _cost_from(
+    costmap: Any, weight: Any, points: Any, along: Any, begin: float, left: float, bottom: float, resolution: float
+) -> float:
+    """Integrate the weight along a line in metres from `begin` on; infinite if it is blocked."""
+    after: Any = np.searchsorted(along, begin, side="right")
+    if 0 < after < along.size:
+        share = (begin - along[after - 1]) / (along[after] - along[after - 1])
+        x = points[after - 1, 0] + share * (points[after, 0] - points[after - 1, 0])
+        y = points[after - 1, 1] + share * (points[after, 1] - points[after - 1, 1])
+    else:
+        after = max(after, 1)
+        x, y = points[after - 1, 0], points[after - 1, 1]
+    x0, y0 = (x - left) / resolution - 0.5, (y - bottom) / resolution - 0.5
     total = 0.0
-    for i in range(points.shape[0] - 1):
-        total += _line_cost(costmap, weight, points[i, 0], points[i, 1], points[i + 1, 0], points[i + 1, 1], math.inf)
+    for i in range(after, along.size):
+        x1, y1 = (points[i, 0] - left) / resolution - 0.5, (points[i, 1] - bottom) / resolution - 0.5
+        total += _line_cost(costmap, weight, x0, y0, x1, y1, math.inf)
+        x0, y0 = x1, y1
     return total
 
 
@@ -337,16 +355,24 @@ def line_cost(
     return float(_line_cost(costmap, weight, float(x0), float(y0), float(x1), float(y1), math.inf))
 
 
-def polyline_cost(costmap: NDArray[np.uint8], points: NDArray[np.float64]) -> float:
-    """Return the sum of `line_cost`, with the weights of the default, over the lines between points (float64 (n, 2)).
+def cost_from(
+    costmap: NDArray[np.uint8],
+    points: NDArray[np.float64],
+    along: NDArray[np.float64],
+    begin: float,
+    grid: tuple[float, float, float],
+) -> float:
+    """Return the sum of `line_cost`, with the weights of the default, over a polyline's lines from `begin` (m) on.
 
-    Raises TypeError or ValueError for arrays of another type or shape.
+    points: float64 (n, 2), m, n >= 1. along: float64 (n,), m from the first point along the line. `grid`: x and y (m)
+    of the costmap's lower left corner, and its resolution (m). Raises TypeError or ValueError for other arrays.
     """
     costmap = _arrays.grid(costmap, "costmap")
-    _arrays.exact(points, np.float64, 2, "points")
-    if points.shape[1] != 2:
-        raise ValueError(f"points must have shape (n, 2), not {points.shape}")
-    return float(_polyline_cost(costmap, DEFAULT_WEIGHTS, points))
+    _check_line(points, along)
+    if along.size == 0:
+        raise ValueError("the line has no point")
+    left, bottom, resolution = grid
+    return float(_cost_from(costmap, DEFAULT_WEIGHTS, points, along, float(begin), left, bottom, resolution))
 
 
 def shortcut(

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from fog_contracts.geometry import lengths_along, sampled
 from fog_contracts.grid import GridGeometry, Window
 from fog_contracts.messages import PointXY
-from fog_kernels.lines import first_inside, leaves, nearest_between, polyline_cost
+from fog_kernels.lines import cost_from, first_inside, leaves, nearest_between
 
 Floats = NDArray[np.float64]
 Grid = NDArray[np.uint8]
@@ -72,8 +72,10 @@ class Route:
 
         Escape lines are left out, because they lead through impassable cells on purpose.
         """
-        points = self.remaining(max(along, float(self._corner_along[self.escape_lines])))
-        return polyline_cost(costmap, geometry.grid_coordinates(points))
+        lengths = self._corner_along
+        begin = max(along, float(lengths[self.escape_lines]))
+        grid = geometry.origin_x, geometry.origin_y, geometry.resolution
+        return cost_from(costmap, self.corners, lengths, begin, grid)
 
     def distance_to(self, mask: NDArray[np.bool_], window: Window, geometry: GridGeometry, along: float) -> float:
         """Return how far (m) beyond `along` the route first enters the cells of a mask over a window; else infinity."""

@@ -9,6 +9,8 @@ from typer.testing import CliRunner
 
 from fognav import checkout, hardware_drive
 from fognav.commands import experiment
+from fognav_experiments.scenarios import stage
+from fognav_experiments.scenarios.fleet_stage import FleetResult
 
 OUT = ["--out", "unused"]
 
@@ -67,3 +69,24 @@ def test_the_committed_results_are_small_and_can_be_reported_again(tmp_path):
     assert result.exit_code == 0, result.output
     assert (tmp_path / "drives.csv").read_bytes() == (packed.parent / "drives.csv").read_bytes()
     assert {file.name for file in packed.parent.iterdir()} == {file.name for file in tmp_path.iterdir()}
+
+
+def test_scenarios_that_are_ended_early_leave_the_table_of_those_that_were_played(tmp_path, monkeypatch):
+    def play(scenario, _sites):
+        if scenario.title.startswith("No Wi-Fi for 5 s"):
+            raise KeyboardInterrupt
+        result = FleetResult(
+            contacts=0, reason="", distance_m=9.9, time_s=37.0, arrived=1, gap_m=1.0, plans=1, planner_percent=0.1
+        )
+        return stage.Played(scenario, result, "reached", [])
+
+    monkeypatch.setattr(stage, "play", play)
+    monkeypatch.setattr(experiment.node_code, "prepare", lambda _inform: None)
+    monkeypatch.setattr(experiment.kernels, "warm_cache", lambda _inform: None)
+    table = tmp_path / "table.md"
+    arguments = ["scenarios", "wifi-gap-1s", "wifi-gap-5s", "--table", str(table)]
+    result = CliRunner().invoke(experiment.experiment_app, arguments)
+    assert result.exit_code != 0
+    page = table.read_text("utf-8")
+    assert "| reached | 9.9 | 37 | yes" in page
+    assert "wifi-gap-5s" not in page

@@ -212,8 +212,9 @@ def scenarios_command(
             drives[name] = play(scenario, checkout.root() / "sites")
             if not json:
                 _print_played(name, drives[name])
-        if table is not None:
-            atomic_write(table, markdown_page(drives, dict(flat(_measured_on()))).encode(), mode=SHARED)
+            # Each time: a command that is ended after half an hour leaves what it has found.
+            if table is not None:
+                atomic_write(table, markdown_page(drives, dict(flat(_measured_on()))).encode(), mode=SHARED)
     if json:
         print_json({"scenarios": [_played_row(name, played) for name, played in drives.items()]})
     if any(played.deviations for played in drives.values()):

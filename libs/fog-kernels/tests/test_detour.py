@@ -130,6 +130,17 @@ def test_labels_of_another_type_or_size_are_refused() -> None:
         Shadow(bound, bound, field, [(2, 2)], planner, label=np.zeros(120, np.int64))
 
 
+@pytest.mark.parametrize("other", [(7, 20), (5, 20), (20, 6)])
+def test_costmap_or_bound_of_another_shape_than_the_planners_is_refused(other: tuple[int, int]) -> None:
+    bound, wrong = np.zeros((6, 20), np.uint8), np.zeros(other, np.uint8)
+    planner = Planner(20, 6)
+    field = planner.goal_field(bound, (15, 3), TilePatterns(10**6))
+    for costmap, least in ((wrong, bound), (bound, wrong), (wrong, wrong)):
+        with pytest.raises(ValueError, match="planner's shape") as refused:
+            Shadow(costmap, least, field, [(2, 2)], planner)
+        assert str(refused.value).endswith(f"(6, 20), not {costmap.shape} and {least.shape}")
+
+
 def test_room_whose_corners_are_left_through_what_is_sealed_is_no_way_out() -> None:
     bound = np.full((54, 60), 254, np.uint8)
     bound[1:12, 1:58] = 0

@@ -359,13 +359,18 @@ class Shadow:
         The `dead_ends`, which were found on `bound`, are left out, but for those with a start or one of the `goals`.
         Takes some 15 ns for each of its cells, in the planner's memory. `label`: zeros, int32 (height * width,), which
         the shadow takes over; fresh memory can cost more time than all the rest. Raises ValueError for a field that is
-        not exact, and TypeError or ValueError for labels of another type or shape.
+        not exact, and TypeError or ValueError for a costmap, bound or labels of another type or shape.
         """
         if not field.exact:
             raise ValueError(f"the field of goal {field.goal} has one cost for several cells: pass an exact one")
         self._costmap = _arrays.grid(costmap, "costmap")
         self._planner = planner
         bound = _arrays.grid(bound, "bound")
+        if not costmap.shape == bound.shape == (planner.height, planner.width):
+            expected = (planner.height, planner.width)
+            raise ValueError(
+                f"costmap and bound must have the planner's shape {expected}, not {costmap.shape} and {bound.shape}"
+            )
         flat, width, weight = costmap.ravel(), planner.width, planner.weight
         found, beside, groups = planner.scratch
         raised = beside[: int(_find_raised(flat, bound.ravel(), beside))].copy()

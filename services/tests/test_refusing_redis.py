@@ -87,9 +87,11 @@ async def operator(fog, tokens):
         yield made
 
 
-BY_THE_SERVICES = ("lease", "epoch", "floor", "ready", "hazards", "history", "override_rests", "alerts", "alert")
+BY_THE_SERVICES = (
+    "lease", "epoch", "floor", "ready", "hazards", "history", "override_rests", "alerts", "alert", "writes",
+)  # fmt: skip
 """Words in keys of what the services write by themselves, at their own times, whatever an operator does: leases, what
-has become of an area, its alerts, and the time that is left of an override."""
+has become of an area, its alerts, the time that is left of an override, and how much was written of each."""
 
 
 async def records(raw) -> dict[bytes, bytes]:

@@ -58,7 +58,7 @@ class Node:
     def run(self, *arguments: str) -> str:
         done = subprocess.run(
             [sys.executable, "-m", "fognav", *arguments],
-            cwd=ROOT, env=self.environment, capture_output=True, text=True, timeout=60, check=False,
+            cwd=ROOT, env=self.environment, capture_output=True, text=True, timeout=START_S, check=False,
         )  # fmt: skip
         assert done.returncode == 0, f"{arguments}: {done.stdout}{done.stderr}\n{self.printed.read_text()}"
         return done.stdout + done.stderr

@@ -6,6 +6,7 @@ It runs the unit's command with its environment, and returns when that has said 
 What it started ends with the process that UNIT_MANAGER_FOR names, if that is set: a test's, which may be killed.
 """
 
+import contextlib
 import os
 import select
 import shlex
@@ -80,14 +81,19 @@ def start(folder: Path) -> None:
 
 def keep(tests: int, unit: int) -> None:
     """End a unit with the process of its tests."""
-    with os.fdopen(os.pidfd_open(unit)) as ended:
+    try:
+        unit_ended = os.pidfd_open(unit)
+    except ProcessLookupError:  # it has ended already
+        return
+    with os.fdopen(unit_ended) as ended:
         try:
             with os.fdopen(os.pidfd_open(tests)) as killed:
                 ready, _, _ = select.select([ended, killed], [], [])
-        except ProcessLookupError:  # it is gone already
+        except ProcessLookupError:  # they are gone already
             ready = []
         if ended not in ready:
-            os.kill(unit, signal.SIGTERM)
+            with contextlib.suppress(ProcessLookupError):  # it has just ended
+                signal.pidfd_send_signal(unit_ended, signal.SIGTERM)
 
 
 def main() -> None:

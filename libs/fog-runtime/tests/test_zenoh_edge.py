@@ -167,6 +167,9 @@ async def test_polled_messages_wait_for_the_next_look_and_the_newest_are_kept(ro
         a.publish(ch.ROBOT_POSE, pose(101.0), robot="r1")
         await until(lambda: has_polled(101.0), "the next pose did not come")
         assert [x for _, x in polled[count:]] == [101.0]
+        count = len(polled)
+    b.poll()
+    assert len(polled) == count, "nothing arrives on a closed session"
 
 
 async def test_messages_that_wait_to_be_polled_are_handled_before_those_that_were_sent_after_them(router):

@@ -138,17 +138,6 @@ async def test_unconditional_area_replaces_a_stored_one_that_this_process_does_n
         assert (service.core.definitions(), await store.areas()) == ([done], ([done], {}))
 
 
-async def test_store_with_more_areas_than_fit_is_not_led_with_and_says_what_to_remove(
-    redis_url: str, monkeypatch: pytest.MonkeyPatch
-):
-    async with Store(redis_url, "full", timeout_s=5.0) as store:
-        first = await running(store)
-        await first.areas.put_area(structs.replace(HALL, id="stored"), "ann")
-        monkeypatch.setattr(area_size, "AREAS_MAX", 2)
-        with pytest.raises(StoreError, match=r"have 3 areas together, and 2 is the limit: remove 1 of the 2 that only"):
-            await running(store, areas=[HALL, structs.replace(HALL, id="new")], confirmed=True)
-
-
 async def test_area_beyond_the_most_is_refused_until_one_is_removed_while_others_can_be_changed(
     redis_url: str, monkeypatch: pytest.MonkeyPatch
 ):

@@ -68,6 +68,37 @@ async def leases(tmp_path):
             yield store
 
 
+async def test_core_that_searches_for_one_robot_after_the_other_answers_between_them(leases, until):
+    copy = Copy(leases)
+    first, second = threading.Event(), threading.Event()
+    searching = threading.Event()
+
+    def plan(_at):
+        searching.set()
+        first.wait(60.0)
+        yield "r1"
+        second.wait(60.0)
+        yield "r2"
+
+    copy.service._core.plan = plan
+    cycle, now = copy.service._cycle, copy.service._edges.now
+    planning = asyncio.ensure_future(copy.service._threads.run("core", lambda: cycle.run(now, copy.service._publish)))
+    try:
+        await until(searching.is_set, "it searches")
+        answer = asyncio.ensure_future(copy.service.core_answers())
+        await asyncio.wait((answer,), timeout=0.3)
+        assert not answer.done(), "nothing was found since it was asked"
+        first.set()
+        async with asyncio.timeout(60):
+            assert await answer
+        assert not planning.done()
+    finally:
+        first.set()
+        second.set()
+        await planning
+        copy.service.close()
+
+
 async def test_hanging_core_costs_the_lease_and_says_nothing_when_it_goes_on(leases, until):
     hanging, other = Copy(leases), Copy(leases)
     end = threading.Event()

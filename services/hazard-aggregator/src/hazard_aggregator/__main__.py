@@ -20,7 +20,6 @@ from fog_runtime.leases.lease_store import LeaseStore
 from fog_runtime.machine.memory import release_startup_memory
 from fog_runtime.transports.mqtt_inputs import MqttEdgeWithInputs
 from fog_runtime.transports.zenoh_edge import ZenohEdge
-from hazard_aggregator.area_size import all_areas
 from hazard_aggregator.areas.members import Members
 from hazard_aggregator.availability import LAST_WILL
 from hazard_aggregator.core import Aggregator
@@ -66,8 +65,9 @@ async def main() -> None:
         cones = node_cones(loaded.site.nodes, loaded.map)
         unusable = UnusableAreas(Members(nodes, find_rule, settings.debounce, cones).checked, health)
         usable = unusable.made_usable(stored.definitions, stored.unreadable)
+        definitions = {d.id: d for d in [*loaded.site.definitions(), *usable]}
         fusion = AreaFusion(
-            all_areas(loaded.site.definitions(), usable), loaded.site.nodes, 0, stored.hazards,
+            definitions.values(), loaded.site.nodes, 0, stored.hazards,
             registry=find_rule, default_rule=settings.debounce, cones=cones,
         )  # fmt: skip
         mqtt = MqttEdgeWithInputs(

@@ -30,31 +30,20 @@ class TooManyAreasError(AreaError):
     """There are as many areas as the aggregator's heartbeat, which lists all of them, can always hold."""
 
 
-class UnlistedAreasError(ValueError):
-    """The site's file and the store have more areas together than one heartbeat can list; the message says what to do.
+def excess(areas: Iterable[AreaDefinition]) -> str:
+    """Return why there are too many areas for one heartbeat, and what to do; empty where there are not.
 
-    Without a heartbeat that lists all areas the map takes every one for unknown.
+    Further ones are refused (`check_count`), but the site's file and the store can have more together. Without a
+    heartbeat that lists all areas the map takes every one for unknown.
     """
-
-
-def all_areas(known: Iterable[AreaDefinition], stored: Iterable[AreaDefinition]) -> list[AreaDefinition]:
-    """Return the `known` areas, such as those of the site's file, with the `stored` ones, which count instead of them.
-
-    Raises `UnlistedAreasError` when there are more than `AREAS_MAX`.
-    """
-    areas = {definition.id: definition for definition in known}
-    changed = {definition.id: definition for definition in stored}
-    only_known = areas.keys() - changed.keys()
-    areas |= changed
-    present = sum(not definition.removed for definition in areas.values())
-    if present > AREAS_MAX:
-        named = ", ".join(sorted(only_known)[:5])
-        raise UnlistedAreasError(
-            f"the site's file and the store have {present} areas together, and {AREAS_MAX} is the limit: remove"
-            f" {present - AREAS_MAX} of the {len(only_known)} that only the site's file has ({named}, ...), or make a"
-            " part of the floor a site of its own"
-        )
-    return list(areas.values())
+    present = sum(not definition.removed for definition in areas)
+    if present <= AREAS_MAX:
+        return ""
+    return (
+        f"the site's file and the store have {present} areas together, and {AREAS_MAX} is the limit, above which all"
+        f" may be unknown: remove {present - AREAS_MAX} (PUT them with `removed`), or make a part of the floor a site"
+        " of its own"
+    )
 
 
 def check_count(definition: AreaDefinition, known: Iterable[AreaDefinition]) -> None:

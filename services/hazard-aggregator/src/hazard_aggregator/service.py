@@ -11,6 +11,7 @@ from fog_runtime import logs
 from fog_runtime.clock import ticker
 from fog_runtime.transports.edges import Edges
 from hazard_aggregator.alert_keeper import AlertKeeper
+from hazard_aggregator.area_size import excess
 from hazard_aggregator.availability import Availability
 from hazard_aggregator.history_keeper import HistoryKeeper
 from hazard_aggregator.publisher import Publisher
@@ -149,6 +150,8 @@ class Service:
         """Monitor Redis; load its records as soon as it answers, before any write."""
         while True:
             await asyncio.sleep(STORE_RETRY_S)
+            problem = excess(self.core.definitions())
+            self._health.set("area_count", ok=not problem, detail=problem)
             try:
                 await self._use_store()
             except StoreError as error:

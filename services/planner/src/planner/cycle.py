@@ -66,6 +66,8 @@ class Cycle:
         self._inputs: deque[Callable[[], Sequence[Publication]]] = deque()
         self._goal_changes: deque[Callable[[], object]] = deque()
         self._urgent_waits = False
+        self.steps = 0
+        """How many searches, and rounds of messages, have ended: while it grows, the thread does not hang."""
 
     def queue_message(self, channel: Channel, handler: Handler, ids: Ids, message: object, at: Moment) -> None:
         """Queue a message, with its time of arrival, for the next cycle."""
@@ -94,6 +96,7 @@ class Cycle:
             with _timed("messages"):
                 for publications in _run_all(self._inputs):
                     emit(publications)
+                self.steps += 1
                 _run_all(self._goal_changes)
             with _timed("searches"):
                 unfinished = self._search(now, emit)
@@ -112,6 +115,7 @@ class Cycle:
             _run_all(self._goal_changes)
             at = now()
             emit(self._core.publish_for(robot, at))
+            self.steps += 1
             if at.now - begun.now >= (MOST_SEARCHING_S if self._urgent_waits else LONGEST_SEARCHING_S):
                 return True
         return False

@@ -190,8 +190,14 @@ class Service:
         self.missions.stand_by()
 
     async def core_answers(self) -> bool:
-        """Return True once the core's thread has ended what it does now; a thread that hangs never does."""
-        await self._threads.run("core", lambda: None)
+        """Return True once the core's thread has ended a search, or all that it does; one that hangs never does.
+
+        Searches of many robots, one after the other, may take longer than a thread may be silent.
+        """
+        steps = self._cycle.steps
+        idle = asyncio.ensure_future(self._threads.run("core", lambda: None))
+        while not idle.done() and self._cycle.steps == steps:
+            await asyncio.wait((idle,), timeout=TICK_S)
         return True
 
     async def has_map(self) -> bool:

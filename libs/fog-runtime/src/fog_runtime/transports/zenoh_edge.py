@@ -294,12 +294,18 @@ class _PolledSubscription(_Subscription[M]):
         return self._subscriber
 
     def poll(self) -> None:
-        """Deliver what has arrived; on the loop's thread."""
+        """Deliver what has arrived; on the loop's thread. Nothing arrives on a session that is closed."""
         if (subscriber := self._subscriber) is None:
             return
         # At most as many as the ring holds: a flood must not keep the caller.
         for _ in range(_RING):
-            if (sample := subscriber.try_recv()) is None:
+            try:
+                sample = subscriber.try_recv()
+            except zenoh.ZError:
+                if not self._edge.closed:
+                    raise
+                return
+            if sample is None:
                 return
             if (admitted := self._admitted(sample)) is not None:
                 self._deliver(*admitted)
@@ -475,6 +481,11 @@ class ZenohEdge:
     def site(self) -> str:
         """The site that is filled into every key."""
         return self._site
+
+    @property
+    def closed(self) -> bool:
+        """Whether its session is closed, or about to be."""
+        return self._closed
 
     @property
     def connected(self) -> bool:

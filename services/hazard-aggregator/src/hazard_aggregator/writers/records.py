@@ -8,7 +8,6 @@ from typing import TYPE_CHECKING
 
 from fog_contracts import channels as ch
 from fog_runtime.stores.redis_connection import StoreRefusedError
-from hazard_aggregator.area_size import UnlistedAreasError, all_areas
 from hazard_aggregator.overrides import StoredOverrides
 from hazard_aggregator.store import Audit, RecoveryError, Stored, StoreError
 from hazard_aggregator.writers.unusable_areas import UnusableAreas
@@ -88,10 +87,6 @@ class Records:
         async with self.lock:
             stored = await self._store.load()
             usable = self._unusable.made_usable(stored.definitions, stored.unreadable)
-            try:
-                all_areas(self._core.definitions(), usable)
-            except UnlistedAreasError as error:
-                raise StoreRefusedError(str(error)) from error
             overrides = StoredOverrides(stored.overrides, stored.rests, self._boot)
             changed = self._core.load_overrides(overrides, self._edges.now())
             publications = [*changed, *self._core.restore(usable, stored.hazards, self._edges.now())]

@@ -163,6 +163,35 @@ def test_paths_of_the_robots_own_are_numbered_on_from_profile_to_profile():
     assert own == sorted(set(own))
 
 
+def test_snapshot_that_arrives_after_the_switch_leaves_the_robots_own_map_and_its_plans_alone():
+    world = LittleWorld(rooms=RING, size=(10.0, 8.0), pose=(2.0, 1.7, 0.0)).ready()
+    late = world.master.snapshot()
+    switched(world, "default")
+    world.block(*ACROSS, solid=True, publish=False)
+    send_goal(world, (8.0, 1.7))
+    turned = world.run(40.0, lambda w: (w.state().plan_id or 0) >= 2 and w.state().mode == "NORMAL")
+    assert turned, "it has seen the closure and searched another way"
+    own, version, plan = world.agent.replica, world.agent.replica.version, world.state().plan_id
+    world.agent.load(late, world.now)
+    assert world.agent.replica is own
+    assert own.version == version
+    goal = msgspec.structs.replace(world.goal.pose, x=6.2, y=6.5)
+    world.goal = msgspec.structs.replace(world.goal, goal_id="h", pose=goal)
+    world.send(ch.ROBOT_GOAL, world.goal)
+    seen = []
+
+    def reached(world):
+        seen.append(world.state())
+        return seen[-1].goal_id == "h" and seen[-1].goal_reached
+
+    assert world.run(90.0, reached), world.state().reasons
+    assert {state.mode for state in seen} == {"NORMAL"}
+    plans = [state.plan_id for state in seen if state.plan_id is not None]
+    assert plans == sorted(plans)
+    assert plans[-1] > plan
+    assert not world.collided
+
+
 def test_a_robot_that_returns_to_the_fog_waits_for_the_newest_map_and_drives_by_it():
     world = ring("default")
     world.block(*ACROSS, publish=True)

@@ -80,8 +80,12 @@ class Navigation:
         return self._fog.wants_snapshot(now) if not self.profile.onboard else self._fog.version is None
 
     def on_map_loaded(self, now: float) -> None:
-        """Take over a snapshot that the follower of the fog's map has loaded."""
-        self._begin_onboard()
+        """Take over a snapshot that the follower of the fog's map has loaded.
+
+        A robot with a costmap of its own keeps it: the snapshot was asked for before it switched to its profile.
+        """
+        if self._onboard is None:
+            self._begin_onboard()
         self._driving.check_path(self.replica, now)
 
     def on_delta(self, delta: MapDelta, now: float) -> None:
@@ -173,13 +177,14 @@ class Navigation:
             return "the robot is driving: disable it first"
         self.profile = PROFILES[name]
         self._driving.configure(self.profile.motion(self._config.motion))
-        if self._onboard is not None:
-            self._own_plans = self._onboard.plans
-        self._onboard = None
         self._begin_onboard()
         return None
 
     def _begin_onboard(self) -> None:
+        """Begin anew with a costmap and a planner of the robot's own, or with none: as its profile says."""
+        if self._onboard is not None:
+            self._own_plans = self._onboard.plans
+        self._onboard = None
         if not self.profile.onboard or self._fog.version is None:
             return
         # Only now: a robot that drives by the fog's map has no planner of its own in its memory.

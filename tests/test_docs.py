@@ -64,6 +64,11 @@ def test_decision_records_have_a_number_and_a_dated_status(record: Path) -> None
     )
 
 
+def test_no_two_decision_records_have_one_number() -> None:
+    numbers = [record.stem[:4] for record in (ROOT / "docs" / "adr").glob("0*.md")]
+    assert sorted(numbers) == sorted(set(numbers))
+
+
 def test_all_members_have_the_same_version() -> None:
     version = (ROOT / "VERSION").read_text("utf-8").strip()
     members = [ROOT / line for line in ("robot-agent", "sim", "experiments", "cli")]

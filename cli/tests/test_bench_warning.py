@@ -1,10 +1,12 @@
 """`fognav bench warning`: an obstacle's way from a node's echo to a robot's path, through the whole fog."""
 
+import dataclasses
 import shutil
 from pathlib import Path
 from typing import Any, cast
 
 import pytest
+from msgspec import structs
 
 from fog_contracts.messages import RobotPath, Trace
 from fog_contracts.site import NodeSite, Sonar
@@ -13,7 +15,7 @@ from fognav import checkout
 from fognav.bench import false_echoes, warning
 from fognav.bench.false_echoes import Asked, FalseEchoes, calibrated
 from fognav.bench.standing_robot import Arrived
-from fognav.output import FailedError
+from fognav.output import FailedError, WrongUseError
 
 needs_compiler = pytest.mark.skipif(
     shutil.which("g++") is None, reason="the firmware's code needs a C++ compiler (g++)"
@@ -52,6 +54,16 @@ def test_path_without_a_trace_of_this_obstacle_is_no_warning():
     earlier, elsewhere = (Trace(area=a, epoch=1, seq=7, first_reading=t) for a, t in (("a1", 9.9), ("a2", 10.1)))
     deltas = {("a1", 1, 7): 10.3, ("a2", 1, 7): 10.3}
     assert warning.first_warning([path(10.4), path(10.5, earlier, elsewhere)], "a1", 10.0, 10.05, deltas) is None
+
+
+def test_unknown_rule_and_a_site_without_nodes_are_told_before_anything_is_simulated():
+    loaded = load_site(checkout.site_folder(Path("estig")))
+    asked = Asked(0.01, 100_000.0, 1, 1)
+    with pytest.raises(WrongUseError, match=r"--rule nonsense: .*evidence"):
+        false_echoes.measure(loaded, "nonsense", asked)
+    empty = dataclasses.replace(loaded, site=structs.replace(loaded.site, nodes=[]))
+    with pytest.raises(FailedError, match="site estig has no nodes: add one"):
+        false_echoes.measure(empty, "evidence", asked)
 
 
 NODE = NodeSite(

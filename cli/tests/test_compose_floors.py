@@ -1,5 +1,6 @@
 """The override by which one fog node in containers serves further floors, without an engine (tests/compose has one)."""
 
+import shlex
 import shutil
 from pathlib import Path
 from typing import Any
@@ -27,6 +28,18 @@ def floor(folder: Path, site: str) -> Path:
 @pytest.fixture
 def made(tmp_path: Path) -> dict[str, Any]:
     return yaml.safe_load(override([floor(tmp_path, "attic"), floor(tmp_path, "first-floor")], COMPOSE))
+
+
+def test_written_file_names_the_command_that_writes_it_again(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    folders = [floor(tmp_path / "with space", "attic"), floor(tmp_path, "first-floor")]
+    out = tmp_path / "override.yml"
+    assert CliRunner().invoke(app, ["site", "compose", *map(str, folders), "--out", str(out)]).exit_code == 0
+    first, written = out.read_text("utf-8").split("\n", 1)
+    named = first.split("`")[1]
+    out.unlink()
+    assert CliRunner().invoke(app, [*shlex.split(named)[1:], "--out", str(out)]).exit_code == 0
+    assert out.read_text("utf-8").split("\n", 1)[1] == written
 
 
 def test_each_floor_has_every_container_but_the_shared_ones(made):

@@ -142,10 +142,11 @@ async def test_wheels_stop_when_the_guardian_is_killed(system: LiveSystem) -> No
     killed, late = time.monotonic(), system.lateness()
     os.kill(guardian, signal.SIGKILL)
     await system.until(lambda: system.state.mode == "PROTECTIVE_STOP", WAIT_S, "the robot stops")
+    limit = STOPPED_WITHIN_S + late.seconds()
     await system.until(lambda: system.guardian not in {None, guardian}, WAIT_S, "a new guardian runs")
     stopping_time = next(line.at for line in system.log_lines(killed) if line.stopped) - killed
     _log.info("wheels_zero_ms: %s", round(1000 * stopping_time))
-    assert stopping_time < STOPPED_WITHIN_S + late.seconds()
+    assert stopping_time < limit
     await system.wait_driving()
     resumed = next(line.at for line in system.log_lines(killed + STOPPED_WITHIN_S) if not line.stopped)
     _log.info("resumed_s: %s", round(resumed - killed, 1))

@@ -15,8 +15,9 @@ from msgspec import structs
 from fog_contracts import channels as ch
 from fog_contracts.site import learned_share
 from fog_runtime.clock import SystemClock
+from fog_runtime.configuration.parts import PartError
 from fognav.nodes.simulated import StillFloor
-from fognav.output import FailedError
+from fognav.output import FailedError, WrongUseError
 from fognav_sim.barrier import BarrierError, barrier_across
 from fognav_sim.nodes import make_nodes
 from fognav_sim.world import World
@@ -160,7 +161,16 @@ class _Fog:
 
 
 def measure(loaded: LoadedSite, rule: str, asked: Asked) -> dict[str, Any]:
-    """Return the warning times (ms) and false alarms of a debounce rule; raises `FailedError`."""
+    """Return the warning times (ms) and false alarms of a debounce rule.
+
+    Raises `WrongUseError` for an unknown rule, and `FailedError`.
+    """
+    if not loaded.site.nodes:
+        raise FailedError(f"site {loaded.site.id} has no nodes: add one (fognav node add)")
+    try:
+        find_rule(rule)
+    except PartError as error:
+        raise WrongUseError(f"--rule {rule}: {error}") from error
     world = StillFloor(loaded, (), SystemClock(), world=_NoisyWorld).world
     assert isinstance(world, _NoisyWorld)
     world.false_echoes = FalseEchoes(asked.share, asked.seed)

@@ -9,6 +9,7 @@ the network of their way out, and their certificate.
 
 import copy
 import re
+import shlex
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, Final
@@ -22,7 +23,7 @@ from fognav.output import WrongUseError
 BASE: Final = "docker-compose.yml"
 OVERRIDE: Final = "docker-compose.override.yml"
 """What compose reads besides, without being told."""
-HEADER: Final = "# Written by `fognav site compose`"
+HEADER: Final = "# Written by `fognav site compose"
 _SHARED: Final = frozenset({"locks", "sim-locks", "kernels", "mosquitto", "redis", "zenoh"})
 _OUTSIDE: Final = "outside"
 """The gateways' way out, which has no names that could be mixed up."""
@@ -46,8 +47,8 @@ def override(folders: Sequence[Path], compose: str) -> str:
     for index, (site, folder) in enumerate(_sites(folders).items(), start=1):
         _add(made, base, _Floor(site, folder, index))
     written = yaml.safe_dump(made, sort_keys=False)
-    words = " ".join(f"--site {folder}" for folder in folders)
-    return f"{HEADER} {words}: run that again after an upgrade.\n{written}"
+    words = shlex.join(str(folder) for folder in folders)
+    return f"{HEADER} {words}`: run that again after an upgrade.\n{written}"
 
 
 def _sites(folders: Sequence[Path]) -> dict[str, Path]:

@@ -161,6 +161,38 @@ def test_a_drive_that_is_skipped_or_ended_leaves_no_record_and_a_robot_at_rest(t
     assert not robot.state.enabled
 
 
+class UnreadyRobot(LockstepRobot):
+    """It lets itself be enabled, and holds until somebody mended it."""
+
+    def __init__(self):
+        super().__init__()
+        self.mended = False
+
+    async def wait(self):
+        await super().wait()
+        if not self.mended and self.state is not None:
+            self.state = msgspec.structs.replace(self.state, mode="HOLD", reasons=["its wheels are blocked"])
+
+
+def test_a_robot_that_is_enabled_but_not_ready_is_disabled_before_a_person_is_asked_to_mend_it(tmp_path):
+    robot, files, commands = UnreadyRobot(), Folder(tmp_path).measured("hardware"), []
+
+    def does(question):
+        if question == "Mend that":
+            commands.extend(robot.commands)
+            assert not robot.state.enabled
+            robot.mended = True
+
+    person = Person({"Put robot": "", "Mend that": "", "Now block": "e", "Did the robot touch": "n"}, does)
+    guide(robot, person, files, Task(DRAWN, "fog"))
+    assert commands[-3:] == ["profile_fog", "enable", "disable"]
+    assert "is not ready in setup fog: " in person.read
+    assert "its wheels are blocked" in person.read
+    assert person.read.count("Mend that") == 1
+    (record,) = files.read()  # it was enabled again for the drive
+    assert record.reason == "a person ended the drive"
+
+
 class DeafRobot(LockstepRobot):
     """It stops answering operators, or the planner does, as soon as it is on its way."""
 

@@ -208,8 +208,8 @@ class HardwareRun:
             state = self._robot.state
             reasons = "; ".join(state.reasons) if state is not None else "it publishes no state"
             self._terminal.say(f"Robot {self._robot.id} is not ready in setup {setup}: {outcome.reason}; {reasons}.")
+            await self._halt()  # enabled, it would move beside the person as soon as it is ready
             await self._ask("Mend that, to try again.")
-            await self._halt()
 
     def _is_ready(self) -> bool:
         state = self._robot.state

@@ -112,3 +112,4 @@ _.reveal  # the way to the value of a secret setting
 _.get_code  # Python's import calls it
 _.authenticate  # amqtt calls its plugins
 _.topic_filtering
+_.also_on  # verified when an archive is read; the folder keeps the description as it is

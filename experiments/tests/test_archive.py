@@ -131,7 +131,13 @@ def packed(*lines):
     return lzma.compress(b"".join(msgspec.json.encode(line) + b"\n" for line in lines))
 
 
-HEAD = {"format": 1, "experiment": {"asked": msgspec.to_builtins(ASKED), "measured_on": {}}}
+EXPERIMENT = {"asked": msgspec.to_builtins(ASKED), "measured_on": {}}
+HEAD = {"format": 1, "experiment": EXPERIMENT}
+
+
+def headed(**experiment):
+    """Return an archive without drives that says this of its experiment."""
+    return packed({"format": 1, "experiment": experiment})
 
 
 @pytest.mark.parametrize(
@@ -142,6 +148,10 @@ HEAD = {"format": 1, "experiment": {"asked": msgspec.to_builtins(ASKED), "measur
         (lambda _data: b"PK", "damaged"),
         (lambda _data: lzma.compress(b""), "damaged"),
         (lambda _data: packed(HEAD | {"format": 2}), "format 2: read it with a newer version"),
+        (lambda _data: headed(measured_on={}), "damaged: .*`asked`"),
+        (lambda _data: headed(asked=EXPERIMENT["asked"]), "damaged: .*`measured_on`"),
+        (lambda _data: headed(**EXPERIMENT | {"measured_on": {"machine": 2}}), r"damaged: .*measured_on\.machine"),
+        (lambda _data: headed(**EXPERIMENT, also_on=[None]), r"damaged: .*also_on\[0\]"),
         (lambda _data: packed(HEAD, {"folder": "elsewhere", "record": {}}), "line 2 is of a folder 'elsewhere'"),
         (lambda _data: packed(HEAD, {"folder": "drives", "record": {}}), "damaged: .*missing required field"),
     ],

@@ -34,6 +34,21 @@ class _Head(msgspec.Struct, frozen=True, kw_only=True):
     experiment: dict[str, Any]
 
 
+class _Machine(msgspec.Struct, frozen=True, kw_only=True):
+    """What drives were measured on, as far as a folder compares it."""
+
+    machine: dict[str, Any] = msgspec.field(default_factory=dict)
+    versions: dict[str, Any] = msgspec.field(default_factory=dict)
+
+
+class _Experiment(msgspec.Struct, frozen=True, kw_only=True):
+    """What a folder needs of its `experiment.json`: without it nothing could be read there any more."""
+
+    asked: Asked
+    measured_on: _Machine
+    also_on: list[_Machine] = msgspec.field(default_factory=list)
+
+
 class _Line(msgspec.Struct, frozen=True, kw_only=True):
     folder: str
     record: msgspec.Raw
@@ -67,8 +82,8 @@ def unpack(file: Path, folder: Folder, wanted: Asked | None = None) -> int:
     """
     experiment, records = _read(file)
     try:
-        asked = msgspec.convert(experiment["asked"], Asked)
-    except (KeyError, msgspec.ValidationError) as error:
+        asked = msgspec.convert(experiment, _Experiment).asked
+    except msgspec.ValidationError as error:
         raise _damaged(file, error) from error
     if wanted is not None and asked != wanted:
         raise FolderError(f"{file} holds drives of another experiment ({asked}, not {wanted}): leave --from out")

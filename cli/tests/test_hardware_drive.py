@@ -269,8 +269,31 @@ def test_what_a_person_saw_decides_whether_the_robot_touched_something(tmp_path)
     assert (record.outcome, record.success, record.barrier_at_m) == ("contact", False, None)
 
 
+@pytest.mark.parametrize("typed", ["s", "q"])
+def test_a_drive_that_is_over_is_neither_skipped_nor_ended_but_recorded(tmp_path, typed):
+    robot, files = LockstepRobot(), Folder(tmp_path).measured("hardware")
+    answers = {"Put robot": "", "Now block": "e", "Did the robot touch": typed}
+
+    def does(question):
+        if question == "Did the robot touch":
+            answers[question] = "y"  # to the question when it is asked again
+
+    guide(robot, Person(answers, does), files, Task(DRAWN, "fog"))
+    (record,) = files.read()
+    assert (record.outcome, record.success) == ("contact", False)
+
+
+def test_nobody_is_asked_for_ever_at_a_terminal_that_was_closed():
+    terminal = Script("q")
+    terminal.closed = True
+    with pytest.raises(FailedError, match="the terminal was closed"):
+        asyncio.run(HardwareRun(SITE, None, terminal)._ask_whether("Did the robot touch anything?"))
+
+
 class Script:
     """A terminal at which these lines are typed, one after each question."""
+
+    closed = False
 
     def __init__(self, *lines):
         self.said, self._lines = [], list(lines)

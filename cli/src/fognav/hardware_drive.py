@@ -108,6 +108,11 @@ class Terminal:
         self._text = rest
         return line.decode(errors="replace").strip().lower()
 
+    @property
+    def closed(self) -> bool:
+        """Whether nobody can type any more."""
+        return self._closed
+
     def forget(self) -> None:
         """Forget what was typed before a question."""
         self._text = b""
@@ -141,8 +146,8 @@ class HardwareRun:
         """Drive those that have no record yet; raises `FailedError` when the person ends it."""
         due = [task for task in asked if not files.has(task.name)]
         self._terminal.say(
-            f"{len(due)} drives to go. At each question: Enter goes on, {_SKIP} skips the drive, {_QUIT} ends the "
-            f"command; while the robot drives, {_END} ends the drive. Ctrl-C stops the robot at any time."
+            f"{len(due)} drives to go. At each question before a drive: Enter goes on, {_SKIP} skips the drive, "
+            f"{_QUIT} ends the command; while the robot drives, {_END} ends the drive. Ctrl-C stops the robot always."
         )
         for number, task in enumerate(due, start=1):
             self._terminal.say(f"Drive {number} of {len(due)}: {task.name}")
@@ -259,10 +264,7 @@ class HardwareRun:
 
     async def _ask(self, request: str) -> str:
         """Ask, and return the answer; raises `_SkippedError`, and `FailedError` if the person ends it."""
-        self._terminal.forget()
-        self._terminal.say(f"{request} Then press Enter.")
-        while (answer := self._terminal.typed()) is None:
-            await self._robot.wait()
+        answer = await self._answer(request)
         if answer == _QUIT:
             raise FailedError(_ENDED)
         if answer == _SKIP:
@@ -270,10 +272,22 @@ class HardwareRun:
         return answer
 
     async def _ask_whether(self, question: str) -> bool:
-        """Ask until the answer is yes or no; raises as `_ask` does."""
-        while (answer := await self._ask(f"{question} y: yes, n or nothing: no.")) not in (*_YES, *_NO):
-            self._terminal.say(f"{answer!r} is neither yes nor no.")
+        """Ask until the answer is yes or no, also of who wants to skip or end: the drive that it is about is over.
+
+        Raises `FailedError` if the terminal is closed.
+        """
+        while (answer := await self._answer(f"{question} y: yes, n or nothing: no.")) not in (*_YES, *_NO):
+            if self._terminal.closed:
+                raise FailedError(f"the terminal was closed, and nobody answered {question!r} Repeat this drive")
+            self._terminal.say(f"{answer!r} is neither yes nor no, and the drive is recorded only with one of them.")
         return answer in _YES
+
+    async def _answer(self, request: str) -> str:
+        self._terminal.forget()
+        self._terminal.say(f"{request} Then press Enter.")
+        while (answer := self._terminal.typed()) is None:
+            await self._robot.wait()
+        return answer
 
     async def _until(self, condition: Callable[[], bool]) -> bool:
         """Wait until a condition holds; return False if it does not within `READY_S`."""

@@ -205,7 +205,16 @@ def checkout(tmp_path_factory: pytest.TempPathFactory) -> Path:
     shutil.copytree(ROOT / "sites" / "estig", folder / "sites" / "estig", ignore=without)
     (folder / "requirements").mkdir()
     (folder / "tests" / "support").mkdir(parents=True)
-    for name in ("fognav", "pyproject.toml", "conftest.py", "services/conftest.py", "tests/support/programs.py"):
+    (folder / "docs").mkdir(exist_ok=True)
+    for name in (
+        "fognav",
+        "pyproject.toml",
+        "conftest.py",
+        "services/conftest.py",
+        "tests/support/lateness.py",
+        "tests/support/programs.py",
+        "docs/security.md",
+    ):
         shutil.copy(ROOT / name, folder / name)
     for edit in (*MESSAGE, *ROUTE, *SHAPE):
         edit.make(folder)
@@ -234,7 +243,8 @@ def try_to_run(folder: Path, *arguments: str | Path) -> subprocess.CompletedProc
 def checked(checkout: Path) -> str:
     """Run the checks of all additions beside the services' tests, in one process; return what pytest printed."""
     targets = [Path(shutil.copy(file, checkout / "services")) for file in sorted(CHECKS.glob("check_*.py"))]
-    return try_to_run(checkout, "-m", "pytest", "-v", "-p", "no:cacheprovider", *targets).stdout
+    done = try_to_run(checkout, "-m", "pytest", "-v", "-p", "no:cacheprovider", *targets)
+    return done.stdout + done.stderr
 
 
 def assert_passed(name: str, checked: str) -> None:

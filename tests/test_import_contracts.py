@@ -26,7 +26,7 @@ SOURCES = sorted({path.parent for path in ROOT.glob("*/src/*/__init__.py")} | {
 EDGES = {
     "fog_runtime",
     "fog_supervisor",
-    "fognav_experiments.comparison.agreement",
+    "fognav_experiments.comparison.agreement", "fognav_experiments.comparison.archive",
     "fognav_experiments.comparison.publish", "fognav_experiments.comparison.records",
     "fognav_experiments.comparison.report", "fognav_experiments.comparison.runner",
     "fognav_experiments.comparison.trial", "fognav_experiments.cpu", "fognav_experiments.gaps",
@@ -47,7 +47,7 @@ EDGES = {
     "fognav.nodes.board_options", "fognav.nodes.on_broker", "fognav.nodes.provisioning", "fognav.nodes.simulated",
     "fognav.nodes.site_file", "fognav.nodes.updating", "fognav.stack", "fognav.stack_doors", "fognav.system",
     "fognav.testing",
-    "fog_kernels.kernel_cache", "fog_kernels.kernel_sources", "fog_kernels.warm",
+    "fog_kernels.cache", "fog_kernels.warm",
     "hazard_aggregator.__main__", "hazard_aggregator.rest", "hazard_aggregator.registry", "hazard_aggregator.service",
     "hazard_aggregator.settings", "hazard_aggregator.store", "hazard_aggregator.writers", "hazard_aggregator.publisher",
     "hazard_aggregator.history_keeper", "hazard_aggregator.alert_keeper", "hazard_aggregator.availability",

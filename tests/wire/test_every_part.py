@@ -141,6 +141,7 @@ def test_bumper_and_cliff_stop_the_base_and_latch(name, sensors):
 @every_base
 def test_a_silent_base_is_a_fault(name):
     wire = Wire(name).ready()
+    wire.run(0.5, (0.3, 0.3))  # before it has moved it is only waited for
     for _ in range(round(wire.driver.timing.frame_timeout / STEP) + 2):
         wire.now += STEP
         wire.handle(wire.core.tick(wire.now))

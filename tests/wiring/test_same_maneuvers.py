@@ -10,7 +10,7 @@ import importlib.util
 import sys
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import msgspec
 import pytest
@@ -21,9 +21,6 @@ from fog_runtime.configuration.site import LoadedSite
 from fognav_experiments.rigs import OPERATOR_KEY, System, moment
 from planner.keepers.mission_keeper import Order
 from robot_agent.agent.recording import input_log as log
-
-if TYPE_CHECKING:
-    from collections.abc import Callable
 
 
 def module(path: Path) -> Any:
@@ -64,7 +61,10 @@ def goal(stamp: float) -> RobotGoal:
 def drive_in_lockstep() -> Any:
     site, entries = site_with_dock(), []
     bus = same.RecordingBus(site.site.id)
-    logged: Callable[..., Any] = lambda config, seed: log.LoggedAgent(config, seed, entries.append)  # noqa: E731
+
+    def logged(config: Any, seed: int) -> Any:  # as the system's own maker of agents
+        return log.LoggedAgent(config, seed, entries.append)
+
     system = System(site, site.site.robots[0], SEED, bus=bus, make_agent=logged)
     run = same.Run(bus, replace(entries[0].config, operator_key=OPERATOR_KEY))
     for step in range(1, STEPS + 1):

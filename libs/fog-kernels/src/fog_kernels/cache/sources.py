@@ -17,13 +17,14 @@ _IMPORT: Final = re.compile(
 )
 """An import that is not indented: those below `if TYPE_CHECKING:` are compiled into nothing."""
 _NAME: Final = re.compile(r"\w+")
+_KERNELS: Final = "fog_kernels"
 
 
 @cache
 def sources_of(file: Path) -> frozenset[Path]:
     """Return a module's file, and those of the modules of Fognav that it imports, directly or by way of others.
 
-    Modules of this package are looked for beside the file. Imports nothing but the packages of those modules.
+    Modules of `fog_kernels` are looked for beside the file. Imports nothing but the packages of those modules.
     """
     found: set[Path] = set()
     pending = [file]
@@ -54,7 +55,7 @@ def _imported_by(file: Path) -> Iterator[Path]:
 def _source_of(name: str, folder: Path) -> Path | None:
     """Return the file of a module; None for what is no module, and for a module without a source."""
     package, _, module = name.rpartition(".")
-    if package == __package__:
+    if package == _KERNELS:
         source = folder / f"{module}.py"
         return source if source.exists() else None
     parent = importlib.util.find_spec(package) if package else None

@@ -15,12 +15,12 @@ from typing import TYPE_CHECKING, Any, Final, Protocol
 
 from numba.core import caching
 
-from fog_kernels.kernel_sources import digest_of
+from fog_kernels.cache.sources import digest_of
 
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-_PACKAGE: Final = Path(__file__).parent
+_PACKAGE: Final = Path(__file__).parents[1]
 _CHOICES: Final[tuple[Any, ...]] = (
     caching.UserProvidedCacheLocator,
     caching.InTreeCacheLocator,

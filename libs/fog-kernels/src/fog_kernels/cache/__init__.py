@@ -1,0 +1,1 @@
+"""Where compiled kernels are kept, and which sources they come from."""

@@ -24,9 +24,10 @@ settings.load_profile("default")
 if os.environ.get("CI", "").lower() in {"1", "true"}:
     settings.load_profile("repeatable")
 
-if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
-    # A script's shell lets its background jobs ignore Ctrl-C; so would all programs that tests start and interrupt.
-    signal.signal(signal.SIGINT, signal.default_int_handler)
+# A script's shell lets its background jobs ignore what the keyboard sends; so would all programs that tests start.
+for number, action in ((signal.SIGINT, signal.default_int_handler), (signal.SIGQUIT, signal.SIG_DFL)):
+    if signal.getsignal(number) is signal.SIG_IGN:
+        signal.signal(number, action)
 
 WORKER: Final = os.environ.get("PYTEST_XDIST_WORKER", "gw0").removeprefix("gw")
 WORKERS: Final = int(os.environ.get("PYTEST_XDIST_WORKER_COUNT", "1"))

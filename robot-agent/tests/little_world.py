@@ -29,9 +29,9 @@ from robot_agent.hardware import (
     LaserScan,
     LidarSamples,
     LidarTraits,
-    RepeatCounter,
     WheelOdometry,
 )
+from robot_agent.lidars.repeated_scans import RepeatCounter
 
 KEY = b"k" * 32
 TICK_M = math.pi * 0.072 / 508.8

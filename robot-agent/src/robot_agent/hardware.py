@@ -8,9 +8,7 @@ Units are m, rad, s; `now` is the caller's monotonic clock.
 
 from __future__ import annotations
 
-import hashlib
 import math
-from collections import deque
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Annotated, Final, Generic, Literal, NamedTuple, Protocol, TypeVar, runtime_checkable
 
@@ -26,8 +24,6 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from robot_agent.stop_command import StopCommand
-
-_REMEMBERED_SCANS: Final = 64
 
 NO_FRESH_COMMAND: Final = "no fresh command from the agent"
 """Why the guardian keeps the wheels at zero when the agent is silent or late."""
@@ -183,26 +179,6 @@ class LidarSamples:
     ranges_m: NDArray[np.float32]
     started_at: float
     ended_at: float
-
-
-class RepeatCounter:
-    """Counts how many scans in a row repeat earlier ones, from the raw fields that a driver decoded.
-
-    The last 64 scans are remembered by their digests: noise never repeats a scan, a replayed buffer of up to 64 does.
-    """
-
-    def __init__(self) -> None:
-        self._digests: deque[bytes] = deque(maxlen=_REMEMBERED_SCANS)
-        self._repeats = 1
-
-    def count(self, *fields: NDArray[np.generic]) -> int:
-        """Return 1 for a new scan; for one that equals an earlier one, 1 more than for the scan before it."""
-        digest = hashlib.blake2b(digest_size=16)
-        for field in fields:
-            digest.update(field.tobytes())
-        self._repeats = self._repeats + 1 if digest.digest() in self._digests else 1
-        self._digests.append(digest.digest())
-        return self._repeats
 
 
 # --- drivers ----------------------------------------------------------------------------------------------------------

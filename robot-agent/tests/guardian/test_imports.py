@@ -13,7 +13,7 @@ CODE = "import importlib, sys; importlib.import_module(sys.argv[1]); print(*sys.
     [
         (
             "robot_agent.guardian.__main__",
-            {"numpy", "numba", "zenoh", "fastapi", "prometheus_client", "asyncio", "ssl"},
+            {"numpy", "numba", "zenoh", "fastapi", "prometheus_client", "asyncio", "ssl", "hashlib"},
         ),
         ("robot_agent.guardian.watchdog", {"numpy", "msgspec", "asyncio", "dataclasses", "fog_contracts"}),
     ],

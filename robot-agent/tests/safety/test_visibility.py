@@ -10,7 +10,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from robot_agent.config import VisibilityConfig
-from robot_agent.hardware import DriveTrain, RepeatCounter, Twist
+from robot_agent.hardware import DriveTrain, Twist
+from robot_agent.lidars.repeated_scans import RepeatCounter
 from robot_agent.safety.gate import SafetyOutputs
 from robot_agent.safety.visibility import SECTOR_ANGLES, Visibility, sector_of
 from robot_agent.safety.wheel_limits import limit_wheels

@@ -7,7 +7,8 @@ from typing import TYPE_CHECKING, Final, NamedTuple
 import numpy as np
 
 from fog_kernels.lidar import Batch, batch
-from robot_agent.hardware import LaserScan, LidarSamples, RepeatCounter
+from robot_agent.hardware import LaserScan, LidarSamples
+from robot_agent.lidars.repeated_scans import RepeatCounter
 
 if TYPE_CHECKING:
     from collections.abc import Iterable

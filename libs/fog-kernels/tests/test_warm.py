@@ -19,7 +19,7 @@ from fog_contracts.costs import DEFAULT_INFLATION
 from fog_kernels import warm
 warm.warm()
 from fog_kernels import amcl, astar, body, clearance, components, distance, dwa, dwa_settings, inflation
-from fog_kernels import lidar, lines, raycast, tiles
+from fog_kernels import emulation, lidar, lines, raycast, tiles
 raw = np.zeros((60, 60), np.uint8)
 raw[0] = 254
 shut = raw.copy()
@@ -47,6 +47,11 @@ for source in (raw, shut):
     lines.nearest_on(np.zeros((2, 2)), np.zeros(2), 0, 1, 1.0, 1.0)
     nodes = lidar.decode_nodes(bytes(5) if source is raw else bytes((1, 1, 0, 0, 0)))
     lidar.batch(*lidar.in_metres(nodes.angle_q6, nodes.distance_q2), 0.0, 1.0)
+    angles = emulation.node_angles(0.5, 0.1, 5)
+    emulation.encode_nodes(angles.angle_q6, angles.start, np.ones(5), 0.1, 9.0)
+    emulation.disturb(np.ones(5), np.ones(5), np.ones(5), sigma=0.1, share=0.0, dropout=0.0, low=0.0, high=9.0)
+    emulation.edge_ranges(np.ones((3, 4)), np.ones(3), 0.0, 0.0, np.ones(5), np.zeros(5))
+    emulation.nearest_occupied(source, (3, 3), 2, 0.05, (0.0, 0.0), (0.2, 0.2))
     lines.leaves(np.zeros((2, 2)), np.ones((2, 2)), 0.5, 0.1)
     limits = dwa.DwaLimits(axle=0.235, wheel_max=0.5)
     shape, how = body.cover([(0.2, -0.1), (0.2, 0.1), (-0.2, 0.1), (-0.2, -0.1)]), dwa_settings.DEFAULT_SETTINGS

@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Final, NamedTuple
 import numpy as np
 
 from fog_contracts.cones import SONAR_HALF_CONE
+from fog_kernels.emulation import disturb
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -92,11 +93,21 @@ def measure_lidar(
     for obstacle, seen, _ in floor.obstacle_ranges(x, y, directions, LIDAR_MAX_M):
         if obstacle.height >= LIDAR_HEIGHT_M:
             ranges = np.minimum(ranges, seen)
-    sigma = noise.range_sigma + noise.range_share * np.where(np.isfinite(ranges), ranges, 0.0)
-    ranges = ranges + sigma * generator.standard_normal(ranges.size)
-    lost = generator.random(ranges.size) < noise.lidar_dropout
-    valid = (ranges >= LIDAR_MIN_M) & (ranges <= LIDAR_MAX_M) & ~lost
-    return np.where(valid, ranges, np.nan)
+    disturb(
+        ranges,
+        generator.standard_normal(ranges.size),
+        generator.random(ranges.size),
+        sigma=noise.range_sigma,
+        share=noise.range_share,
+        dropout=noise.lidar_dropout,
+        low=LIDAR_MIN_M,
+        high=LIDAR_MAX_M,
+    )
+    return ranges
+
+
+_Beam = tuple[float, float, float, float]
+"""A sonar's node (x, y, theta) and its own angle on it: m and rad."""
 
 
 class _Fan(NamedTuple):
@@ -113,12 +124,15 @@ class Sonars:
     """The sonars of a floor's nodes.
 
     A sonar's cone is a fan of rays. Walls and boxes echo only below a maximum angle of incidence; an obstacle that is
-    lower than the cone at its range is not seen. Nodes and walls do not move, so what the walls echo is computed once.
+    lower than the cone at its range is not seen. Nodes and walls do not move, so what the walls echo is computed once,
+    and what the obstacles do whenever one of them has changed.
     """
 
     def __init__(self, floor: Floor) -> None:
         self._floor = floor
-        self._fans: dict[tuple[float, float, float, float], _Fan] = {}
+        self._fans: dict[_Beam, _Fan] = {}
+        self._obstacles: dict[tuple[_Beam, float], float] = {}
+        self._as_of = floor.changes
 
     def measure(
         self, robot: Robot, node: NodeSite, index: int, noise: Noise, generator: np.random.Generator
@@ -126,8 +140,10 @@ class Sonars:
         """Measure with one sonar of a node: range of the nearest echo (m), None without an echo."""
         if generator.random() < noise.sonar_spike:
             return float(generator.uniform(0.1, SONAR_MAX_M))
-        fan = self._fan(node, index)
-        nearest = min(fan.nearest_wall, self._nearest_obstacle(fan, node), _nearest_of_robot(fan, robot, node))
+        beam = (node.x, node.y, node.theta, node.sonars[index].angle)
+        fan = self._fan(beam)
+        obstacle = self._nearest_obstacle(beam, fan, node.height)
+        nearest = min(fan.nearest_wall, obstacle, _nearest_of_robot(fan, robot, node))
         nearest += self._ahead_m
         if not SONAR_MIN_M <= nearest <= SONAR_MAX_M:
             return None
@@ -138,22 +154,30 @@ class Sonars:
         """How far in front of its node a sonar begins: the node's own cell may be part of its wall."""
         return self._floor.geometry.resolution
 
-    def _fan(self, node: NodeSite, index: int) -> _Fan:
-        key = (node.x, node.y, node.theta, node.sonars[index].angle)
-        if key not in self._fans:
-            directions = node.theta + key[-1] + np.linspace(-SONAR_HALF_CONE, SONAR_HALF_CONE, SONAR_RAYS)
-            x, y = node.x + self._ahead_m * math.cos(node.theta), node.y + self._ahead_m * math.sin(node.theta)
+    def _fan(self, beam: _Beam) -> _Fan:
+        if beam not in self._fans:
+            node_x, node_y, theta, angle = beam
+            directions = theta + angle + np.linspace(-SONAR_HALF_CONE, SONAR_HALF_CONE, SONAR_RAYS)
+            x, y = node_x + self._ahead_m * math.cos(theta), node_y + self._ahead_m * math.sin(theta)
             walls = self._floor.wall_ranges(x, y, directions, SONAR_MAX_M)
-            self._fans[key] = _Fan(x, y, directions, walls, float(np.min(_echo_ranges(walls, directions))))
-        return self._fans[key]
+            self._fans[beam] = _Fan(x, y, directions, walls, float(np.min(_echo_ranges(walls, directions))))
+        return self._fans[beam]
 
-    def _nearest_obstacle(self, fan: _Fan, node: NodeSite) -> float:
+    def _nearest_obstacle(self, beam: _Beam, fan: _Fan, height: float) -> float:
         """Return the range (m) of the nearest obstacle that echoes, infinite for none."""
+        if self._as_of != self._floor.changes:
+            self._as_of = self._floor.changes
+            self._obstacles.clear()
+        if (beam, height) not in self._obstacles:
+            self._obstacles[beam, height] = self._search_obstacles(fan, height)
+        return self._obstacles[beam, height]
+
+    def _search_obstacles(self, fan: _Fan, height: float) -> float:
         nearest = math.inf
         for obstacle, ranges, incidence in self._floor.obstacle_ranges(fan.x, fan.y, fan.directions, SONAR_MAX_M):
             # A wall hides everything behind it, whether it echoes or not.
             seen = (ranges < fan.walls) & (incidence <= SONAR_MAX_INCIDENCE)
-            seen &= _in_cone(obstacle.height, node.height, ranges)
+            seen &= _in_cone(obstacle.height, height, ranges)
             nearest = min(nearest, float(np.min(np.where(seen, ranges, np.inf))))
         return nearest
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -71,6 +72,6 @@ def vector(values: ArrayLike, name: str) -> NDArray[np.float64]:
 def positive(value: float, name: str) -> float:
     """Return the value as float; raise ValueError unless it is finite and above zero."""
     number = float(value)
-    if not (np.isfinite(number) and number > 0.0):
+    if not (math.isfinite(number) and number > 0.0):
         raise ValueError(f"{name} must be above zero, not {value}")
     return number

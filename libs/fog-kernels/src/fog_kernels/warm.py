@@ -51,7 +51,7 @@ PROFILES: dict[str, tuple[str, ...]] = {
         "tiles",
     ),
     "map": ("distance", "inflation", "spans"),
-    "sim": ("distance", "raycast"),
+    "sim": ("distance", "emulation", "raycast"),
     "all": (
         "amcl",
         "astar",
@@ -61,6 +61,7 @@ PROFILES: dict[str, tuple[str, ...]] = {
         "detour",
         "distance",
         "dwa",
+        "emulation",
         "flood",
         "guides",
         "inflation",

@@ -16,6 +16,8 @@ from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
+from fog_kernels.emulation import FULL_CIRCLE_Q6, encode_nodes, node_angles
+
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
@@ -28,7 +30,6 @@ SCANS_PER_S: Final = 5.5
 RANGE_MIN_M: Final = 0.15
 RANGE_MAX_M: Final = 12.0
 BOOT_TEXT: Final = b"RP LIDAR System.\r\nFirmware Ver 1.29 - RP, HW Ver 7\r\nModel: 18\r\n"
-_FULL_CIRCLE_Q6: Final = 360 * 64
 # Nodes per call of the measuring function: 16 ms of a standard scan.
 _CHUNK: Final = 32
 # After a pause of the simulation, missed nodes are not sent in a burst.
@@ -185,19 +186,9 @@ class RplidarEmulator:
                 self._nodes(count, self._due_since, rate)
 
     def _nodes(self, count: int, now: float, rate: float) -> None:
-        rotation = self._position + np.arange(1, count + 1) * (self._scans_per_s / rate)
-        angle = np.floor(rotation % 1.0 * _FULL_CIRCLE_Q6).astype(np.int64) % _FULL_CIRCLE_Q6
-        before = np.concatenate(((self._position,), rotation[:-1]))
-        start = np.floor(rotation) > np.floor(before)
-        self._position = float(rotation[-1])
-        distance = self._distances(angle / 64.0, now)
-        quality = _quality(distance)
-        raw = np.empty((count, 5), np.uint8)
-        raw[:, 0] = quality << 2 | np.where(start, 1, 2)
-        raw[:, 1] = (angle << 1 | 1) & 0xFF
-        raw[:, 2] = angle >> 7
-        raw[:, 3] = distance & 0xFF
-        raw[:, 4] = distance >> 8
+        self._position, angle, start = node_angles(self._position, self._scans_per_s / rate, count)
+        ranges = np.ascontiguousarray(self._measure(_ANGLES[angle], now), np.float64)
+        raw = encode_nodes(angle, start, ranges, RANGE_MIN_M, RANGE_MAX_M)
         if self.blind_sector_rad is not None:
             low, high = self.blind_sector_rad
             turned = (-np.radians(angle / 64.0) - low) % math.tau
@@ -221,12 +212,12 @@ class RplidarEmulator:
 
     def _capsule(self, now: float, rate: float) -> None:
         step = self._scans_per_s / rate
-        begin = math.floor(self._position % 1.0 * _FULL_CIRCLE_Q6) % _FULL_CIRCLE_Q6
+        begin = math.floor(self._position % 1.0 * FULL_CIRCLE_Q6) % FULL_CIRCLE_Q6
         # The host interpolates the nodes between this start angle and the next capsule's: measure at those angles.
         self._position += 32 * step
-        following = math.floor(self._position % 1.0 * _FULL_CIRCLE_Q6) % _FULL_CIRCLE_Q6
-        angles = begin + (following - begin) % _FULL_CIRCLE_Q6 * np.arange(32) / 32.0
-        distance = self._distances(angles % _FULL_CIRCLE_Q6 / 64.0, now) & ~3
+        following = math.floor(self._position % 1.0 * FULL_CIRCLE_Q6) % FULL_CIRCLE_Q6
+        angles = begin + (following - begin) % FULL_CIRCLE_Q6 * np.arange(32) / 32.0
+        distance = self._distances(angles % FULL_CIRCLE_Q6 / 64.0, now) & ~3
         cabins = np.zeros((16, 5), np.uint8)
         for place in (0, 1):
             cabins[:, 2 * place] = distance[place::2] & 0xFF
@@ -238,14 +229,16 @@ class RplidarEmulator:
 
     def _distances(self, clockwise_deg: NDArray[np.float64], now: float) -> NDArray[np.int64]:
         """Return distances in quarters of a millimetre, 0 without a return within the rated range."""
-        angles = -np.deg2rad(clockwise_deg)
-        ranges = np.asarray(self._measure((angles + math.pi) % math.tau - math.pi, now), np.float64)
+        ranges = np.asarray(self._measure(_counter_clockwise(clockwise_deg), now), np.float64)
         returned = np.isfinite(ranges) & (ranges >= RANGE_MIN_M) & (ranges <= RANGE_MAX_M)
         return np.where(returned, np.rint(np.where(returned, ranges, 0.0) * 4000.0), 0.0).astype(np.int64)
 
 
-def _quality(distance_q2: NDArray[np.int64]) -> NDArray[np.int64]:
-    """Strength of the return, 0..15: full up to 6 m, falling to 5 at 12 m, 0 for none."""
-    metres = distance_q2 / 4000.0
-    strength = np.clip(np.rint(15.0 - (metres - 6.0) * 10.0 / 6.0), 0.0, 15.0)
-    return np.where(distance_q2 > 0, strength, 0.0).astype(np.int64)
+def _counter_clockwise(clockwise_deg: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return angles in radians, -pi to pi."""
+    angles: NDArray[np.float64] = (-np.deg2rad(clockwise_deg) + math.pi) % math.tau - math.pi
+    return angles
+
+
+_ANGLES: Final = _counter_clockwise(np.arange(FULL_CIRCLE_Q6) / 64.0)
+"""The angles at which a standard node measures, by their 64ths of a degree."""

@@ -128,3 +128,17 @@ def test_digest_does_not_depend_on_the_folder(package: Path, tmp_path: Path) -> 
     shutil.copytree(package, moved)
     assert digest_of(moved / "calling.py") == digest_of(package / "calling.py")
     assert digest_of(moved / "called.py") != digest_of(package / "calling.py")
+
+
+@compiled_only
+def test_kernel_that_is_kept_is_loaded_without_what_only_its_compilation_needs(package: Path) -> None:
+    modules = "import sys\nprint('numba.np.npyimpl' in sys.modules)"
+    assert python(package, RUN + "\n" + modules).stdout.split() == ["20", "2", "True"]
+    assert python(package, RUN + "\n" + modules).stdout.split() == ["20", "0", "False"]
+
+
+@compiled_only
+def test_kernel_is_compiled_beside_one_that_was_loaded(package: Path) -> None:
+    assert run(package) == (20, 2)
+    (package / "calling.py").write_text(CALLING.replace("TIMES *", "2 * TIMES *"))
+    assert run(package) == (40, 1)

@@ -31,15 +31,15 @@ async def main() -> None:
     logs.configure("planner", settings.log_level, settings.log_format)
     _log.info("settings_loaded", **describe(settings))
     release_startup_memory()
-    loaded = load_site(settings.site_dir)
-    site = settings.site or loaded.site.id
+    described = load_site(settings.site_dir).site  # without the map, which comes from the map-service
+    site = settings.site or described.id
     clock = SystemClock(settings.speed)
     health = Health("store", "goals", "map", "zenoh")
     tokens = load_tokens(settings.tokens_file)
     key = read_key(settings.operator_key_file)
     own = settings.credentials()
     front = Front.fork(
-        lambda: make_api(unused(), loaded.site, health, tokens),
+        lambda: make_api(unused(), described, health, tokens),
         settings.http_host, settings.http_port, settings.http_certificate(), settings.http_gateway,
     )  # fmt: skip
     config = PlannerConfig(inflation=settings.inflation, release_length=settings.release_m)
@@ -54,11 +54,11 @@ async def main() -> None:
         leadership = Leadership(
             "planner", keeper, zenoh, health, connected=lambda: zenoh.connected, epochs=lambda: core.fence.epochs
         )
-        service = Service(core, store, zenoh, clock, health, leadership, key=key, staging=loaded.site.staging)
+        service = Service(core, store, zenoh, clock, health, leadership, key=key, staging=described.staging)
         service.subscribe()
         leadership.subscribe()
         zenoh.declare_liveliness("planner", site)
-        app = make_api(service, loaded.site, health, tokens, leadership.standby_reason)
+        app = make_api(service, described, health, tokens, leadership.standby_reason)
         try:
             async with asyncio.TaskGroup() as tasks:
                 needs = {"zenoh": zenoh.router_answers, "planning": service.core_answers, "map": service.has_map}

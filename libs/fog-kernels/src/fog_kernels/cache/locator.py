@@ -2,7 +2,7 @@
 
 numba compiles a kernel anew when its own module has changed. But a kernel holds what it calls and the constants that it
 uses, whichever module they come from: here, a change of any module that the kernel's module imports makes it compile
-anew, too. numba finds this module by the name that `_arrays` gives it.
+anew, too. numba finds this module by the name that `_arrays` gives it, before it looks for the first kernel.
 
 The names of a kernel's files tell the sources, too. numba writes an index with their stamp first, then the code: under
 one name for all sources, older code would count as up to date after a process that was killed in between.
@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Any, Final, Protocol
 
 from numba.core import caching
 
+from fog_kernels.cache.loading import load_without_compiler
 from fog_kernels.cache.sources import digest_of
 
 if TYPE_CHECKING:
@@ -84,3 +85,6 @@ def remove_outdated(file: Path, folder: Path) -> None:
 
 def _sources_tag(file: Path) -> str:
     return digest_of(file).hex()[:12]
+
+
+load_without_compiler()

@@ -4,11 +4,6 @@ from __future__ import annotations
 
 import time
 from collections import defaultdict
-from contextlib import contextmanager
-from typing import TYPE_CHECKING
-
-if TYPE_CHECKING:
-    from collections.abc import Iterator
 
 
 class CpuMeter:
@@ -22,22 +17,41 @@ class CpuMeter:
         self.seconds: dict[str, float] = defaultdict(float)
         self._running: list[str] = []
         self._since = 0
+        self._components: dict[str, _Component] = {}
 
-    @contextmanager
-    def measure(self, component: str) -> Iterator[None]:
-        """Measure what runs inside as this component's."""
-        self._switch(component)
-        try:
-            yield
-        finally:
-            self._switch(None)
+    def measure(self, component: str) -> _Component:
+        """Return what measures the work inside a `with` as this component's; a component may enter itself again."""
+        found = self._components.get(component)
+        if found is None:
+            found = self._components[component] = _Component(self, component)
+        return found
 
-    def _switch(self, entered: str | None) -> None:
+    def enter(self, component: str) -> None:
+        """Count the time from now on for this component."""
         now = time.thread_time_ns()
         if self._running:
             self.seconds[self._running[-1]] += (now - self._since) / 1e9
-        if entered is None:
-            self._running.pop()
-        else:
-            self._running.append(entered)
+        self._running.append(component)
         self._since = now
+
+    def leave(self) -> None:
+        """Count the time from now on for the component that entered this one, if any."""
+        now = time.thread_time_ns()
+        self.seconds[self._running.pop()] += (now - self._since) / 1e9
+        self._since = now
+
+
+class _Component:
+    """Enters and leaves a component; one object for all its work, because there is much of it in a second."""
+
+    __slots__ = ("_meter", "_name")
+
+    def __init__(self, meter: CpuMeter, name: str) -> None:
+        self._meter = meter
+        self._name = name
+
+    def __enter__(self) -> None:
+        self._meter.enter(self._name)
+
+    def __exit__(self, *_: object) -> None:
+        self._meter.leave()

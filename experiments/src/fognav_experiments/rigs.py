@@ -203,9 +203,10 @@ class RobotRig:
                 output = self.guardian.tick(now)
                 received += output.feedback
                 self._to_base += output.data
-        with self._measure("localization"):
-            for feedback in received:
-                self.agent.on_base(link.decode_feedback(link.encode(feedback)), now)
+        if received:
+            with self._measure("localization"):
+                for feedback in received:
+                    self.agent.on_base(link.decode_feedback(link.encode(feedback)), now)
 
     def _run_lidar(self, data: bytes, now: float) -> None:
         self._from_lidar += data
@@ -223,9 +224,10 @@ class RobotRig:
         if received.samples is not None:
             with self._measure("safety and wheels"):
                 self.agent.on_lidar_samples(received.samples, now)
-        with self._measure("localization"):
-            for scan in received.scans:
-                self.agent.on_scan(scan, now)
+        if received.scans:
+            with self._measure("localization"):
+                for scan in received.scans:
+                    self.agent.on_scan(scan, now)
         self._to_lidar += received.data + self._lidar_driver.tick(now)
 
     def command(self, kind: CommandKind, pose: Pose | None = None) -> CommandReply:
@@ -329,8 +331,10 @@ class FogRig(Fog):
     def measure(self, now: float) -> None:
         """Let the nodes publish the readings that are due."""
         for node in self.nodes:
-            ids = {"node": node.node.id}
-            self._bus.publish(Publication(ch.NODE_READING, reading, ids) for reading in node.poll(self._world, now))
+            readings = node.poll(self._world, now)
+            if readings:
+                ids = {"node": node.node.id}
+                self._bus.publish(Publication(ch.NODE_READING, reading, ids) for reading in readings)
 
 
 class System:

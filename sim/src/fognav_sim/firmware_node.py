@@ -48,7 +48,8 @@ class FirmwareNode:
         )
         core.rssi(self._node, _RSSI_DBM)
         self._start = start
-        self._now_us = 0
+        self._now = ctypes.c_uint64(0)
+        self._now_by_reference = ctypes.byref(self._now)
         self._edges: list[tuple[int, int, int]] = []
         self._calibration: NodeCalibration | None = None
 
@@ -85,29 +86,24 @@ class FirmwareNode:
     def poll(self, world: World, now: float) -> list[NodeReading]:
         """Run the firmware up to `now` (s); return the readings that it published, oldest first."""
         until = round((now - self._start) * _US)
-        if until - self._now_us > _US:
+        core, node, clock = self._core, self._node, self._now
+        if until - clock.value > _US:
             # The simulation paused: a node does not catch up on readings that it missed.
-            self._now_us = until
+            clock.value = until
         readings: list[NodeReading] = []
-        while self._now_us <= until:
-            while self._edges and self._edges[0][0] <= self._now_us:
+        while clock.value <= until:
+            while self._edges and self._edges[0][0] <= clock.value:
                 at, sonar, high = self._edges.pop(0)
-                self._core.edge(self._node, sonar, high, ctypes.c_uint32(at))
-            event = self._run(min(until, self._edges[0][0] - 1) if self._edges else until)
+                core.edge(node, sonar, high, ctypes.c_uint32(at))
+            end = min(until, self._edges[0][0] - 1) if self._edges else until
+            event = core.run(node, self._now_by_reference, end, STEP_US)
             if event == _TRIGGER:
-                self._trigger(world, self._now_us - STEP_US)
+                self._trigger(world, clock.value - STEP_US)
             elif event == _PUBLISH:
-                readings.append(msgspec.json.decode(self._core.message(self._node), type=NodeReading))
+                readings.append(msgspec.json.decode(core.message(node), type=NodeReading))
             elif event == _CALIBRATED:
-                self._calibration = msgspec.json.decode(self._core.message(self._node), type=NodeCalibration)
+                self._calibration = msgspec.json.decode(core.message(node), type=NodeCalibration)
         return readings
-
-    def _run(self, until: int) -> int:
-        """Step up to and with `until` (us), or to the first event, which is returned."""
-        now = ctypes.c_uint64(self._now_us)
-        event = self._core.run(self._node, ctypes.byref(now), until, STEP_US)
-        self._now_us = now.value
-        return int(event)
 
     def _trigger(self, world: World, at_us: int) -> None:
         sonar = self._core.sonar(self._node)

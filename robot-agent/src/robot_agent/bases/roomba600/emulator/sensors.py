@@ -21,6 +21,8 @@ _GROUPS: Final = {
     6: range(7, 43), 100: range(7, 59), 101: range(43, 59), 106: range(46, 52), 107: range(54, 59),
 }  # fmt: skip
 
+_BYTES: Final = tuple(bytes((number,)) for number in range(256))
+
 Packet = Callable[[int], bytes]
 """Returns the bytes of a packet by its id."""
 
@@ -62,7 +64,7 @@ class Stream:
         frames = b""
         while self._next_frame <= now:
             self._next_frame += STREAM_PERIOD_S
-            body = b"".join(bytes((packet_id,)) + packet(packet_id) for packet_id in self.ids)
+            body = b"".join(_BYTES[packet_id] + packet(packet_id) for packet_id in self.ids)
             if len(body) <= 0xFF:
                 frame = bytes((19, len(body))) + body
                 frames += line(frame + bytes((-sum(frame) & 0xFF,)), now)
@@ -79,6 +81,7 @@ class Sensors:
         self._wheels = wheels
         self._stream = stream
         self._mode = mode
+        self._readers = self._values()
 
     def packet(self, packet_id: int) -> bytes:
         """Return a packet or a group of packets; nothing for an unknown id."""
@@ -86,69 +89,61 @@ class Sensors:
             return b"".join(self.packet(single) for single in _GROUPS[packet_id])
         if not 7 <= packet_id <= 58:
             return b""
-        value = self._value(packet_id)
+        read = self._readers.get(packet_id)
+        value = read() if read is not None else 0
         return (value & 0xFFFF).to_bytes(2, "big") if packet_id in _WIDE else bytes((value & 0xFF,))
 
-    def _value(self, packet_id: int) -> int:  # noqa: C901, PLR0911, PLR0912  # one case per packet of the specification
-        world = self._world
-        left, right = self._wheels.left_mm_s, self._wheels.right_mm_s
-        match packet_id:
-            case 7:
-                return _bits(world.bump_right, world.bump_left, world.wheel_drop_right, world.wheel_drop_left)
-            case 9 | 10 | 11 | 12:
-                return int(world.cliffs[packet_id - 9])
-            case 13:
-                return int(world.virtual_wall)
-            case 14:
-                return _bits(world.overcurrent_right, world.overcurrent_left) << 3
-            case 19:
-                return self._wheels.take_distance()
-            case 20:
-                return self._wheels.take_angle()
-            case 21:
-                return self._charging_state()
-            case 22:
-                return self._battery.voltage_mv
-            case 23:
-                return round(self._battery.current_ma)
-            case 24:
-                return world.temperature_c
-            case 25:
-                return round(self._battery.charge_mah)
-            case 26:
-                return round(self._battery.capacity_mah)
-            case 28 | 29 | 30 | 31:
-                return 4 if world.cliffs[packet_id - 28] else 2700
-            case 34:
-                return _bits(world.charger, world.home_base)
-            case 35:
-                return self._mode()
-            case 38:
-                return len(self._stream.ids)
-            case 39 | 40:
-                return self._wheels.requested[packet_id - 39]
-            case 41:
-                return right
-            case 42:
-                return left
-            case 43 | 44:
-                return self._wheels.encoders[packet_id - 43]
-            case 45:
-                return _bits(*(signal > 300 for signal in world.light_signals))
-            case 46 | 47 | 48 | 49 | 50 | 51:
-                return world.light_signals[packet_id - 46]
-            case 54 | 55:
-                speed = (left, right)[packet_id - 54]
-                return round(WHEEL_MA_PER_M_S * abs(speed) / 1000.0)
-            case 58:
-                return int(left > 0 and right > 0)
-            case _:
-                return 0
+    def _values(self) -> dict[int, Callable[[], int]]:
+        """Return how each packet's value is read; all others are zero."""
+        world, battery, wheels = self._world, self._battery, self._wheels
+
+        def cliff(place: int) -> Callable[[], int]:
+            return lambda: int(world.cliffs[place])
+
+        def floor_signal(place: int) -> Callable[[], int]:
+            return lambda: 4 if world.cliffs[place] else 2700
+
+        def light(place: int) -> Callable[[], int]:
+            return lambda: world.light_signals[place]
+
+        return {
+            7: lambda: _bits(world.bump_right, world.bump_left, world.wheel_drop_right, world.wheel_drop_left),
+            **{9 + place: cliff(place) for place in range(4)},
+            13: lambda: int(world.virtual_wall),
+            14: lambda: _bits(world.overcurrent_right, world.overcurrent_left) << 3,
+            19: wheels.take_distance,
+            20: wheels.take_angle,
+            21: self._charging_state,
+            22: lambda: battery.voltage_mv,
+            23: lambda: round(battery.current_ma),
+            24: lambda: world.temperature_c,
+            25: lambda: round(battery.charge_mah),
+            26: lambda: round(battery.capacity_mah),
+            **{28 + place: floor_signal(place) for place in range(4)},
+            34: lambda: _bits(world.charger, world.home_base),
+            35: self._mode,
+            38: lambda: len(self._stream.ids),
+            39: lambda: wheels.requested[0],
+            40: lambda: wheels.requested[1],
+            41: lambda: wheels.right_mm_s,
+            42: lambda: wheels.left_mm_s,
+            43: lambda: wheels.encoders[0],
+            44: lambda: wheels.encoders[1],
+            45: lambda: _bits(*(signal > 300 for signal in world.light_signals)),
+            **{46 + place: light(place) for place in range(6)},
+            54: lambda: _motor_ma(wheels.left_mm_s),
+            55: lambda: _motor_ma(wheels.right_mm_s),
+            58: lambda: int(wheels.left_mm_s > 0 and wheels.right_mm_s > 0),
+        }
 
     def _charging_state(self) -> int:
         if not self._world.powered:
             return 0
         return 3 if self._battery.full else 2
+
+
+def _motor_ma(speed_mm_s: int) -> int:
+    return round(WHEEL_MA_PER_M_S * abs(speed_mm_s) / 1000.0)
 
 
 def _bits(*flags: bool) -> int:

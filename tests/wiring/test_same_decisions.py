@@ -275,6 +275,19 @@ def feed(live: Any, entries: list[log.Entry]) -> None:
                 live.agent.on_scan(entry.scan(), entry.now)
 
 
+async def replay(live: Any, bus: RecordingBus, recorded: Run, step: int) -> None:
+    """Give the live services what came from outside at a step of a recorded drive, at its time."""
+    bus.step = step
+    live.clock.time = recorded.times[step - 1]
+    feed(live, recorded.hardware[step - 1])
+    bus.publish(recorded.external(step))
+    await live.run_until_idle()
+    if step == 1:
+        await live.begin_loops()
+    else:
+        await live.clock.wake(live.run_until_idle)
+
+
 async def drive_live(recorded: Run) -> tuple[Run, Any]:
     asyncio.get_running_loop().set_default_executor(live_services.InlineExecutor())
     site = site_with_two_areas()
@@ -283,15 +296,7 @@ async def drive_live(recorded: Run) -> tuple[Run, Any]:
     live = live_services.LiveServices(site, recorded.config, SEED, bus)
     await live.start()
     for step, now in enumerate(recorded.times, 1):
-        bus.step = step
-        live.clock.time = now
-        feed(live, recorded.hardware[step - 1])
-        bus.publish(recorded.external(step))
-        await live.run_until_idle()
-        if step == 1:
-            await live.begin_loops()
-        else:
-            await live.clock.wake(live.run_until_idle)
+        await replay(live, bus, recorded, step)
         if step in COMMANDS:
             command = signed(COMMANDS[step], now)
             run.replies.append(await live.run(live.query(ch.ROBOT_COMMAND, command, CommandReply, robot="r1")))

@@ -93,15 +93,7 @@ async def drive_live(recorded: Any) -> Any:
     live = live_services.LiveServices(site, recorded.config, SEED, bus)
     await live.start()
     for step, now in enumerate(recorded.times, 1):
-        bus.step = step
-        live.clock.time = now
-        same.feed(live, recorded.hardware[step - 1])
-        bus.publish(recorded.external(step))
-        await live.run_until_idle()
-        if step == 1:
-            await live.begin_loops()
-        else:
-            await live.clock.wake(live.run_until_idle)
+        await same.replay(live, bus, recorded, step)
         if step in COMMANDS:
             command = same.signed(COMMANDS[step], now)
             command = same.sign(msgspec.structs.replace(command, nonce=f"{step:016d}"), OPERATOR_KEY)

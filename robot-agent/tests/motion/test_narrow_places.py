@@ -6,11 +6,12 @@ import pytest
 from fog_contracts.costs import DEFAULT_INFLATION
 from fog_kernels.body import cover
 from fog_kernels.clearance import clearance
+from fog_kernels.course import distances
 from fog_kernels.dwa import DwaLimits, DwaSettings
 from robot_agent.footprint import Footprint
 from robot_agent.localization.deskew import DeskewedScan
 from robot_agent.localization.pose import Pose2
-from robot_agent.motion.band import course, distances, give_way
+from robot_agent.motion.band import course, give_way
 from robot_agent.motion.recent_scans import RecentScans
 
 BODY = cover(Footprint.circle(0.17).polygon)

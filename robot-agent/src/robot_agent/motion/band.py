@@ -6,12 +6,11 @@ force that pushes points out of narrow places; the planner's path gives the rest
 
 from __future__ import annotations
 
-import math
 from typing import TYPE_CHECKING, Final, NamedTuple
 
 import numpy as np
 
-from robot_agent.motion.path_follower import PathFollower
+from fog_kernels.course import beside, distances
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -37,8 +36,7 @@ class Course(NamedTuple):
 
 def course(path: NDArray[np.float64], around: Clearance) -> Course:
     """Return a path (n, 2; m) with the distances from the nearest thing along it."""
-    points, along = PathFollower(path, math.inf).ahead(_SPACING_M)
-    return Course(path, points, along, distances(around, points))
+    return Course(path, *beside(path, _SPACING_M, around))
 
 
 def give_way(original: Course, around: Clearance, keep: float) -> Course:
@@ -48,6 +46,8 @@ def give_way(original: Course, around: Clearance, keep: float) -> Course:
     if no point is near anything.
     """
     _, points, along, found = original
+    if not (found < keep).any():
+        return original
     size = len(around.distance) * around.resolution
     corner = np.array((around.origin_x, around.origin_y))
     within = (points > corner + _REACH_M) & (points < corner + size - _REACH_M)
@@ -68,16 +68,3 @@ def give_way(original: Course, around: Clearance, keep: float) -> Course:
     bent = points.copy()
     bent[inside] = moved
     return course(bent, around)
-
-
-def distances(around: Clearance, points: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the distances (m) at points (n, 2; m) from the nearest thing, interpolated between cells."""
-    last = len(around.distance) - 1
-    cells = ((points - (around.origin_x, around.origin_y)) / around.resolution - 0.5).clip(0.0, last)
-    low = np.minimum(cells.astype(np.int64), last - 1)
-    (c, r), (i, j) = (cells - low).T, low.T
-    field = around.distance
-    below = (1.0 - c) * field[j, i] + c * field[j, i + 1]
-    above = (1.0 - c) * field[j + 1, i] + c * field[j + 1, i + 1]
-    result: NDArray[np.float64] = (1.0 - r) * below + r * above
-    return result

@@ -11,6 +11,7 @@ import numpy as np
 
 from fog_contracts.costs import INSCRIBED, LETHAL, PENALTY_MAX, UNKNOWN
 from fog_kernels.astar import Planner
+from fog_kernels.course import Cells, is_blocked
 from fog_kernels.inflation import inflate, inflation_table
 from robot_agent.motion.path_follower import PathFollower
 
@@ -25,6 +26,30 @@ if TYPE_CHECKING:
 
 _REJOIN_M: Final = 0.2
 """A detour rejoins the path this far behind its last blocked point."""
+_SPACING_CELLS: Final = 0.5
+"""The path is looked up in the costs so many cells apart."""
+
+
+def free_path(  # noqa: PLR0913  # all that may block a path
+    path: NDArray[np.float64],
+    cost: NDArray[np.uint8],
+    window: GridGeometry,
+    lidar_points: NDArray[np.float64],
+    inflation: Inflation,
+    around: Clearance,
+    narrowest: float,
+    pose: Pose2,
+) -> NDArray[np.float64]:
+    """Return the path (n, 2; m) with a detour around what blocks it; arguments as for `local_costs` and `detour`.
+
+    Nearly always nothing does: then the costs beside the path, which take longer than all else here, are not needed.
+    """
+    cells = Cells(cost, window.resolution, window.origin_x, window.origin_y)
+    square = _inscribed_square(_lidar_table(window.resolution, inflation, narrowest))
+    spacing = _SPACING_CELLS * window.resolution
+    if not is_blocked(pose.x, pose.y, path, spacing, cells, lidar_points, square, around, narrowest):
+        return path
+    return detour(path, local_costs(cost, window, lidar_points, inflation, around, narrowest), window, pose)
 
 
 def local_costs(
@@ -66,6 +91,11 @@ def _lidar_table(resolution: float, inflation: Inflation, narrowest: float) -> I
     return inflation_table(resolution, replace(inflation, inscribed_radius=certain))
 
 
+def _inscribed_square(table: InflationTable) -> int:
+    """Return the largest squared distance (in cells) from a lidar point at which a cell is inscribed."""
+    return len(table.cost) - int((table.cost[::-1] >= INSCRIBED).argmax()) - 1
+
+
 def _largest(field: NDArray[np.float32], finer: int) -> NDArray[np.float32]:
     """Return the largest values of squares of `finer` cells; along one axis of whole rows at a time, which is quick."""
     rows = field[::finer]
@@ -87,7 +117,7 @@ def detour(
     the robot and its path blocks it too: beside an obstacle the path may lead through what no beam can see.
     """
     route = PathFollower(np.vstack(((pose.x, pose.y), path)), math.inf)
-    points, ahead = route.ahead(0.5 * window.resolution)
+    points, ahead = route.ahead(_SPACING_CELLS * window.resolution)
     cells = window.sample(costs, points, UNKNOWN)
     bad = np.flatnonzero((cells >= INSCRIBED) & (cells != UNKNOWN))
     start = window.cell(pose.x, pose.y)

@@ -19,7 +19,7 @@ from fog_kernels.clearance import Clearance, clearance
 from fog_kernels.dwa import dwa
 from robot_agent.localization.pose import Pose2, wrap
 from robot_agent.motion.band import course, give_way
-from robot_agent.motion.detour import detour, local_costs
+from robot_agent.motion.detour import free_path
 from robot_agent.motion.recovery_moves import recovery_speeds
 
 if TYPE_CHECKING:
@@ -123,10 +123,9 @@ def decide(job: Job) -> Decision:
     )
     if job.recovery is not None:
         return _recover(job, job.recovery, around, body)
-    costs = local_costs(
-        job.cost, window, job.lidar_points, config.inflation, around, body.inscribed + config.arcs.padding
-    )
-    way = course(detour(job.path, costs, window, job.pose), around)
+    narrowest = body.inscribed + config.arcs.padding
+    path = free_path(job.path, job.cost, window, job.lidar_points, config.inflation, around, narrowest, job.pose)
+    way = course(path, around)
     way = give_way(way, around, body.inscribed + config.slow_within)
     room = room_beside(way, body.inscribed, config.slow_within)
     end = job.path[-1]
@@ -221,7 +220,7 @@ def room_beside(way: Course, inscribed: float, enough: float) -> float:
 
     0 when the body only just fits, 1 when there are `enough` m or more beside it.
     """
-    free = float(way.free[way.along <= _NEAR_AHEAD_M].min()) - inscribed
+    free = float(way.free[: way.along.searchsorted(_NEAR_AHEAD_M, "right")].min()) - inscribed
     return min(max(free / enough, 0.0), 1.0)
 
 

@@ -11,8 +11,8 @@ from typing import TYPE_CHECKING, Final, NamedTuple
 import numpy as np
 
 from fog_contracts.costs import UNKNOWN
+from fog_kernels.course import distances
 from robot_agent.localization.pose import wrap
-from robot_agent.motion.band import distances
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray

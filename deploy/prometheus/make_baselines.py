@@ -2,8 +2,8 @@
 
 The figures come from the report of an experiment (`fognav experiment report`): from its `drives.csv`, and the machine
 from its `README.md`, which also says what the robot's processes took in drives by real processes (`fognav experiment
---live`), or from the page `live.md` beside the report's folder, where drives whose records are lost keep their table.
-Dashboards show them beside what robots take now.
+--live`), or from the page `live.md` beside the report's folder, where drives whose records are lost keep their table,
+if that names the same processor. Dashboards show them beside what robots take now.
 
 What each thread took is known by component, from drives in lockstep: the calculations of a thread, without the sockets,
 the event loop and the waking up that a real one has besides.
@@ -16,6 +16,7 @@ of date.
 import argparse
 import csv
 import re
+import sys
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from statistics import fmean
@@ -94,8 +95,20 @@ def processes(readme: str) -> dict[tuple[str, str], tuple[float, str]]:
         raise SystemExit(f"the report's table of processes can't be read: {error!r}") from error
 
 
+def processor(page: Path, text: str) -> str:
+    """Return on which processor a page's figures were measured; raises `SystemExit` if it does not say that."""
+    found = _MACHINE.search(text)
+    if found is None:
+        raise SystemExit(f"{page} names no `machine processor`: `fognav experiment report` writes it")
+    return found[1]
+
+
 def rules(folder: Path) -> str:
-    """Return the file of rules for a report's folder; raises `SystemExit` if that is no report."""
+    """Return the file of rules for a report's folder; raises `SystemExit` if that is no report.
+
+    The page beside the folder is left out, with a word to the error output, if its processor is another: a share of a
+    core says nothing beside one of another core.
+    """
     try:
         with (folder / "drives.csv").open(encoding="utf-8", newline="") as file:
             drives = compared(list(csv.DictReader(file)))
@@ -104,9 +117,13 @@ def rules(folder: Path) -> str:
         kept = live.read_text("utf-8") if live.is_file() else ""
     except (OSError, KeyError, ValueError) as error:
         raise SystemExit(f"{folder} is no report ({error}): `fognav experiment report` writes one") from error
-    machine = _MACHINE.search(readme)
-    if machine is None:
-        raise SystemExit(f"{folder / 'README.md'} names no `machine processor`: `fognav experiment report` writes it")
+    machine = processor(folder / "README.md", readme)
+    real = processes(readme)
+    if not real and kept:
+        if (other := processor(live, kept)) == machine:
+            real = processes(kept)
+        else:
+            print(f"{live} was measured on {other}, the report on {machine}: left out", file=sys.stderr)
     lines = [
         "# Made by deploy/prometheus/make_baselines.py from the report of an experiment: do not edit.",
         "# CPU in cores of planning, layers and local planning, the mean of recorded drives in each setup; and of the",
@@ -116,7 +133,7 @@ def rules(folder: Path) -> str:
         "    rules:",
     ]
     for setup, made in drives.items():
-        labels = f'machine: "{machine[1]}", drives: "{len(made)}"'
+        labels = f'machine: "{machine}", drives: "{len(made)}"'
         lines += [
             "      - record: baseline:planning_cpu:mean",
             f"        expr: vector({planning(made):.5f})",
@@ -128,8 +145,8 @@ def rules(folder: Path) -> str:
                 f"        expr: vector({cores:.5f})",
                 f"        labels: {{setup: {setup}, process: {process}, thread: {thread}, {labels}}}",
             ]
-    for (setup, process), (taken, count) in sorted((processes(readme) or processes(kept)).items()):
-        labels = f'setup: {setup}, process: {process}, machine: "{machine[1]}", drives: "{count}"'
+    for (setup, process), (taken, count) in sorted(real.items()):
+        labels = f'setup: {setup}, process: {process}, machine: "{machine}", drives: "{count}"'
         lines += [
             "      - record: baseline:process_cpu:mean",
             f"        expr: vector({taken:.5f})",

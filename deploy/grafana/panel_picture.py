@@ -103,17 +103,18 @@ class _Plot:
                     self._pen.circle(line[0], 2, fill=colour)
 
     def _bands(self, series: list[Series]) -> None:
-        """Draw a band for each series, filled where its value is not 0."""
+        """Draw a band for each series, filled where its value is not 0, and a thin line where it is 0."""
         height = self._inner_height / len(series)
         step = _period(series, self._seconds) / self._seconds * self._inner_width
         right = self._x + _LEFT + self._inner_width
         for number, each in enumerate(series):
             top = self._y + _TOP + number * height
             for at, value in each.points:
-                if value:
-                    left = min(right, self._at(at))  # rounding may put the last sample behind it
-                    box = (left, top + 1, min(right, left + step), top + max(2.0, height - 1))
-                    self._pen.rectangle(box, fill=_COLOURS[number % len(_COLOURS)])
+                left = min(right, self._at(at))  # rounding may put the last sample behind it
+                middle = top + height / 2
+                span = (top + 1, top + max(2.0, height - 1)) if value else (middle, middle)
+                box = (left, span[0], min(right, left + step), span[1])
+                self._pen.rectangle(box, fill=_COLOURS[number % len(_COLOURS)])
 
     def _legend(self, series: list[Series]) -> None:
         x = self._x + _WIDTH - _RIGHT + 8

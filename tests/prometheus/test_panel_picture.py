@@ -42,3 +42,9 @@ def test_state_ends_at_the_plot_s_border(drawn, points):
     found = drawn("states", points)
     assert min(found) == pytest.approx(points[0][0], abs=1)
     assert max(found) <= 0
+
+
+def test_state_that_is_not_so_is_told_from_one_of_which_there_is_no_data(drawn):
+    found = drawn("states", [(-90.0, 0.0), (-80.0, 0.0), (-40.0, 1.0), (-30.0, 1.0)])
+    assert {-85, -35} <= found
+    assert found.isdisjoint(range(-67, -43))

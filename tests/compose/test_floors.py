@@ -8,17 +8,18 @@ from typing import TYPE_CHECKING, Final
 
 import pytest
 from compose_project import (
+    BUILD_S,
     FOG,
-    HEALTHY_S,
     ROOT,
     SERVICES,
     Project,
-    health,
     leftovers,
     skip_reason,
     token,
     wait,
+    wait_health,
     watching,
+    wrong_targets,
 )
 
 from fog_contracts import channels as ch
@@ -30,7 +31,7 @@ if TYPE_CHECKING:
 SKIP_REASON: Final = skip_reason()
 pytestmark = [
     pytest.mark.compose,
-    pytest.mark.timeout(1800),
+    pytest.mark.timeout(2 * BUILD_S + 1800),
     pytest.mark.skipif(SKIP_REASON is not None, reason=SKIP_REASON or ""),
 ]
 SHARED: Final = {"zenoh", "mosquitto", "redis"}
@@ -48,9 +49,9 @@ def building(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Project]:
     text = (site / "site.toml").read_text("utf-8")
     (site / "site.toml").write_text(text.replace('id = "estig"', f'id = "{UPSTAIRS}"', 1), "utf-8")
     project = Project(folder, [site])
-    project("build", timeout_s=1500)
+    project("build", timeout_s=BUILD_S)
     try:
-        project("up", "--detach", "--no-build", timeout_s=1200)
+        project("up", "--detach", "--no-build", timeout_s=BUILD_S)
         project.wait_healthy({*FOG, *OWN})
         yield project
     finally:
@@ -77,9 +78,7 @@ def test_floors_share_broker_store_and_router_and_the_gateways_way_out_alone(bui
 @pytest.mark.parametrize("floor", ["", UPSTAIRS])
 async def test_robot_drives_on_each_floor(building: Project, floor: str) -> None:
     robot = f"sim-robot-{floor}" if floor else "sim-robot"
-    await asyncio.to_thread(
-        wait, lambda: None if health(building, robot) == "healthy" else "the robot is not healthy", HEALTHY_S
-    )
+    await asyncio.to_thread(wait_health, building, robot, "healthy")
     async with watching(building, floor) as edge:
         states_of = edge.latest(ch.ROBOT_STATE, RobotState, robot="r1")
 
@@ -110,9 +109,4 @@ def test_token_of_a_floor_is_worth_nothing_on_another(building: Project) -> None
 
 @pytest.mark.parametrize("floor", ["", UPSTAIRS])
 def test_prometheus_of_each_floor_sees_its_services_and_its_robot(building: Project, floor: str) -> None:
-    def missing() -> str | None:
-        answer = building.get("/prometheus/api/v1/query", params={"query": "up == 1"}, floor=floor).json()
-        up = {sample["metric"].get("process") or sample["metric"]["robot"] for sample in answer["data"]["result"]}
-        return None if up >= {*SERVICES, "r1"} else f"up: {up}"
-
-    wait(missing, 60)
+    wait(lambda: wrong_targets(building, *SERVICES, "r1", floor=floor), 60)

@@ -6,6 +6,7 @@ replaced by those of `tests/compose/stand_ins.sh`.
 
 from __future__ import annotations
 
+import contextlib
 import json
 import os
 import re
@@ -19,6 +20,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
 import httpx
+from lateness import Lateness
 
 from fog_runtime.access.credentials import Credentials
 from fog_runtime.clock import SystemClock
@@ -45,6 +47,13 @@ PORTS: Final = {
 }
 HEALTHY_S: Final = 180.0
 """On a busy machine of two cores; an idle one needs 20 s, most of it for compiling the kernels."""
+BUILD_S: Final = 2400.0
+"""Commands that install packages: a limit for what hangs, not for a slow machine."""
+COMMAND_S: Final = 300.0
+"""All other commands, and an answer of the gateway: the same."""
+ENGINE: Final = {"dockerd", "containerd", "containerd-shim", "docker-proxy"}
+MEGABYTES: Final = {"planner": 600, "map-service": 600, "sim-robot": 600, "hazard-aggregator": 300, "zenoh": 300}
+"""How large our images may be: those with numba, and those without."""
 FAKETIME: Final = sorted(Path("/usr/lib").glob("*/faketime/libfaketime.so.1"))
 CAP_SYS_RESOURCE: Final = 1 << 24
 
@@ -93,7 +102,7 @@ def run(command: list[str], timeout_s: float, env: dict[str, str] | None = None)
     return done.stdout
 
 
-def docker(*arguments: str, timeout_s: float = 60.0) -> str:
+def docker(*arguments: str, timeout_s: float = COMMAND_S) -> str:
     return run(["docker", *arguments], timeout_s)
 
 
@@ -104,14 +113,16 @@ def has(kind: str, name: str) -> bool:
 def available(image: str) -> bool:
     """Return whether the engine has an image, pulled if necessary."""
     pull = ["docker", "pull", "--quiet", image]
-    return has("image", image) or subprocess.run(pull, capture_output=True, timeout=600, check=False).returncode == 0
+    return (
+        has("image", image) or subprocess.run(pull, capture_output=True, timeout=BUILD_S, check=False).returncode == 0
+    )
 
 
 def third_party(image: str) -> str:
     """Return the name of the image, or that of its stand-in."""
     if available(image):
         return image
-    run([str(STAND_INS)], 600)
+    run([str(STAND_INS)], BUILD_S)
     return f"fognav-stand-in/{image.rpartition('/')[2].partition(':')[0].removeprefix('eclipse-')}"
 
 
@@ -158,7 +169,7 @@ class Project:
         file.write_text(json.dumps({"services": override}), "utf-8")
         self._command += ["--file", str(file)]
 
-    def __call__(self, *arguments: str, profile: str = "sim", timeout_s: float = 120.0) -> str:
+    def __call__(self, *arguments: str, profile: str = "sim", timeout_s: float = COMMAND_S) -> str:
         """Run compose, by default with the profile `sim`, so that its container is always included."""
         return run([*self._command, "--profile", profile, *arguments], timeout_s, self._env)
 
@@ -191,7 +202,7 @@ class Project:
             self._recreate_services()
 
     def _recreate_services(self) -> None:
-        self("up", "--detach", "--no-build", "--no-deps", *SERVICES, timeout_s=300)
+        self("up", "--detach", "--no-build", "--no-deps", *SERVICES)
         self.wait_healthy(FOG, {name: container["RestartCount"] for name, container in self.containers().items()})
 
     def containers(self) -> dict[str, dict[str, Any]]:
@@ -212,7 +223,7 @@ class Project:
 
     def request(self, method: str, path: str, *, floor: str = "", **options: Any) -> httpx.Response:
         url = f"https://{self.address('FOGNAV_HTTPS_PORT', floor)}{path}"
-        with httpx.Client(verify=self.credentials("console").tls_context()) as client:
+        with httpx.Client(verify=self.credentials("console").tls_context(), timeout=COMMAND_S) as client:
             return client.request(method, url, **options)
 
     def locks(self, *arguments: str) -> str:
@@ -255,12 +266,28 @@ class Project:
             raise AssertionError(f"{error}\n{self('ps', '--all')}\n{log}") from error
 
 
+def engine_pids() -> Iterator[int]:
+    """Yield the processes of the engine and in its containers, and this one, which asks them."""
+    yield os.getpid()
+    for process in Path("/proc").glob("[0-9]*"):
+        with contextlib.suppress(OSError):  # it has just ended
+            if (
+                re.search("docker[/-][0-9a-f]{64}", (process / "cgroup").read_text("utf-8"))
+                or (process / "comm").read_text("utf-8").strip() in ENGINE
+            ):
+                yield int(process.name)
+
+
 def wait(missing: Callable[[], str | None], timeout_s: float) -> None:
-    """Wait until `missing` returns None, checking twice a second; raises TimeoutError with what is still missing."""
-    deadline = time.monotonic() + timeout_s
+    """Wait until `missing` returns None, checking twice a second; raises TimeoutError with what is still missing.
+
+    The limit is longer by the time for which the kernel let the containers' processes wait for a core.
+    """
+    late, waited, started = Lateness(engine_pids), 0.0, time.monotonic()
     while (problem := missing()) is not None:
-        if time.monotonic() > deadline:
-            raise TimeoutError(f"after {timeout_s:.0f} s: {problem}")
+        waited = max(waited, late.seconds())
+        if (passed := time.monotonic() - started) > timeout_s + waited:
+            raise TimeoutError(f"after {passed:.0f} s (limit {timeout_s:.0f} s, late by {waited:.0f} s): {problem}")
         time.sleep(0.5)
 
 
@@ -275,6 +302,26 @@ def leftovers(project: str) -> list[str]:
 
 def health(project: Project, service: str) -> str:
     return str(project.containers()[service]["State"]["Health"]["Status"])
+
+
+def wait_health(project: Project, service: str, expected: str, timeout_s: float = HEALTHY_S) -> None:
+    """Wait until a service's container calls itself `healthy` or `unhealthy`."""
+
+    def other() -> str | None:
+        found = health(project, service)
+        return None if found == expected else f"{service} is {found}, not {expected}"
+
+    wait(other, timeout_s)
+
+
+def wrong_targets(fog: Project, *expected: str, floor: str = "") -> str | None:
+    """Return what a floor's Prometheus asks, unless it is just these processes and robots, and each of them answers."""
+    answer = fog.get("/prometheus/api/v1/query", params={"query": "up"}, floor=floor).json()
+    up = [
+        (each["metric"].get("process") or each["metric"]["robot"], each["value"][1])
+        for each in answer["data"]["result"]
+    ]
+    return None if sorted(up) == sorted((name, "1") for name in expected) else f"up: {up}"
 
 
 @asynccontextmanager

@@ -18,6 +18,13 @@ HEARD_MAX: Final = 4096
 """Newest bytes that are examined."""
 
 
+class SerialSettings(NamedTuple):
+    """A serial line, always 8N1. `dtr`: the state of the DTR line in which the device runs; None: either."""
+
+    baud: int
+    dtr: bool | None = None
+
+
 def _never(_data: bytes) -> bool:
     return False
 
@@ -28,11 +35,13 @@ class Signature(NamedTuple):
     recognizes: whether bytes from a line, beginning anywhere, can only come from such a device.
     question: bytes that make a silent one answer, and that no other device obeys; empty: it is never silent.
     answered: whether the bytes that followed the question are the answer.
+    line: its serial line, for who opens the port before its driver is loaded (`agent.edges.lidar_start`); None: nobody.
     """
 
     recognizes: Callable[[bytes], bool]
     question: bytes = b""
     answered: Callable[[bytes], bool] = _never
+    line: SerialSettings | None = None
 
 
 def foreign(own: str, heard: bytes, signatures: Mapping[str, Signature]) -> str | None:

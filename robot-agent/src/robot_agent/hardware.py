@@ -23,6 +23,7 @@ if TYPE_CHECKING:
     import numpy as np
     from numpy.typing import NDArray
 
+    from robot_agent.device_signature import SerialSettings
     from robot_agent.stop_command import StopCommand
 
 NO_FRESH_COMMAND: Final = "no fresh command from the agent"
@@ -257,13 +258,6 @@ class BaseFactory(Generic[Options]):
     options: type[Options]
     make: Callable[[Options], BaseDriver]
     stop: StopCommand
-
-
-class SerialSettings(NamedTuple):
-    """A serial line, always 8N1. `dtr`: the state of the DTR line in which the device runs; None: either."""
-
-    baud: int
-    dtr: bool | None = None
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

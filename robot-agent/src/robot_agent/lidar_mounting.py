@@ -13,7 +13,8 @@ from robot_agent.hardware import LidarSamples
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-    from robot_agent.hardware import LaserScan, LidarDriver, LidarEvents, LidarTraits, SerialSettings
+    from robot_agent.device_signature import SerialSettings
+    from robot_agent.hardware import LaserScan, LidarDriver, LidarEvents, LidarTraits
 
 
 Real = TypeVar("Real", np.float32, np.float64)

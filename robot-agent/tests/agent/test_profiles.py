@@ -206,6 +206,6 @@ def test_a_robot_that_returns_to_the_fog_waits_for_the_newest_map_and_drives_by_
 
 
 def test_a_robot_that_drives_by_the_fog_loads_no_planner_of_its_own():
-    program = "import sys, robot_agent.__main__; print([name for name in sys.modules if 'onboard' in name])"
+    program = "import sys, robot_agent.agent.process; print([name for name in sys.modules if 'onboard' in name])"
     done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True)
     assert done.stdout.strip() == "[]"

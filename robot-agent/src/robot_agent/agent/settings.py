@@ -16,11 +16,11 @@ from fog_runtime.access.operator_key import OperatorKeyError
 from fog_runtime.access.operator_key import read_operator_key as read_key
 from fog_runtime.configuration.robot_file import VARIABLES
 from fog_runtime.configuration.settings import CommonSettings, SettingsError
-from robot_agent.footprint import Footprint, FootprintError
 
 if TYPE_CHECKING:
     from fog_contracts.site import RobotSite
     from fog_runtime.configuration.robot_file import RobotFile
+    from robot_agent.footprint import Footprint
 
 SITE_FILE: Final = "site.toml"
 
@@ -74,6 +74,8 @@ def read_footprint(robot: RobotFile) -> Footprint | None:
     """Return the footprint of the robot's settings, None for the site's circle; raises `SettingsError`."""
     if not robot.settings.body.footprint:
         return None
+    from robot_agent.footprint import Footprint, FootprintError  # noqa: PLC0415  # numpy: settings are read before it
+
     try:
         return Footprint(tuple(robot.settings.body.footprint))
     except FootprintError as error:

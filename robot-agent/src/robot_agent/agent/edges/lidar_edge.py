@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Final
 
 from fog_runtime import logs
 from fog_runtime.configuration.settings import SettingsError
-from robot_agent.device_signature import LISTEN_S
+from robot_agent.agent.edges.lidar_start import set_motor, wrong_device
 from robot_agent.port_names import PortNameError
 from robot_agent.serial_port import Port, PortLost, open_port, refuse_speed
 
@@ -20,13 +20,11 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
 
     from fog_runtime.clock import Clock
+    from robot_agent.agent.edges.lidar_start import LidarStart
     from robot_agent.device_signature import LineCheck
     from robot_agent.hardware import LaserScan, LidarDriver, LidarSamples
 
-_LISTEN_PERIOD_S: Final = 0.02
 REOPEN_S: Final = 1.0
-ANSWER_S: Final = 0.1
-"""A device that is asked what it is has answered within this time."""
 
 _log = logs.get("lidar")
 
@@ -42,13 +40,18 @@ class LidarEdge:
         on_samples: Callable[[LidarSamples, float], object],
         *,
         check: Callable[[], LineCheck] | None = None,
+        start: LidarStart | None = None,
     ) -> None:
-        """`on_samples` is called with the newest samples by `poll`; `check` makes a fresh check for each opening."""
+        """`on_samples` is called with the newest samples by `poll`; `check` makes a fresh check for each opening.
+
+        `start`: the scan that was begun with this driver while the agent was loaded.
+        """
         self._path = path
         self._driver = driver
         self._clock = clock
         self._on_samples = on_samples
         self._check = check
+        self._start = start
         self._last_logged = ""
         self._resting = False
         self._port: Port | None = None
@@ -62,28 +65,35 @@ class LidarEdge:
             SettingsError: when the port's name is refused, or the clock's speed is a simulation's and the port real.
 
         """
+        begun = None if self._start is None else await asyncio.to_thread(self._start.take)
         while True:
             try:
-                with open_port(self._path, self._driver.serial.baud) as port:
+                with begun or open_port(self._path, self._driver.serial.baud) as port:
                     if (refusal := refuse_speed(self._clock.speed, port.device)) is not None:
                         raise SettingsError(refusal)
                     _log.info("port_open", path=self._path)
-                    await self._scan(port)
+                    if begun is not None or await self._begin(port):
+                        await self._scan(port)
             except PortLost as error:
                 self._report(str(error))
             except PortNameError as error:
                 raise SettingsError(f"lidar.port: {error}") from error
+            begun = None
             await self._clock.sleep(REOPEN_S)
 
-    async def _scan(self, port: Port) -> None:
-        """Let `poll` use an open port until it is lost; raises `PortLost`."""
-        driver = self._driver
-        self._set_motor(port, on=True)
+    async def _begin(self, port: Port) -> bool:
+        """Begin a scan on an open port; False for another device on it. Raises `PortLost`."""
+        set_motor(port, self._driver.serial, on=True)
         port.discard_input()
-        if (problem := await self._wrong_device(port)) is not None:
+        if self._check is not None and (problem := await wrong_device(port, self._check(), self._clock)) is not None:
             self._report(problem)
-            return
-        port.write(driver.begin(self._clock.now()))
+            return False
+        port.write(self._driver.begin(self._clock.now()))
+        return True
+
+    async def _scan(self, port: Port) -> None:
+        """Let `poll` use a port, on which a scan has begun, until it is lost; raises `PortLost`."""
+        driver = self._driver
         self._resting = False
         self._port, self._lost = port, asyncio.get_running_loop().create_future()
         try:
@@ -94,31 +104,7 @@ class LidarEdge:
             # its state when the port is closed.
             with suppress(PortLost):
                 port.write(driver.stop_command)
-                self._set_motor(port, on=False)
-
-    def _set_motor(self, port: Port, *, on: bool) -> None:
-        """Let the motor turn, or stand still, as far as the device has a line for it."""
-        running = self._driver.serial.dtr
-        if running is not None:
-            port.set_line("dtr", on=running is on)
-
-    async def _wrong_device(self, port: Port) -> str | None:
-        """Listen before anything is written; return the sentence for another device on this port."""
-        if self._check is None:
-            return None
-        check = self._check()
-        until = self._clock.now() + LISTEN_S
-        while not check.settled and self._clock.now() < until:
-            await self._clock.sleep(_LISTEN_PERIOD_S)
-            check.feed(port.read_available())
-        if not check.silent:
-            return check.problem
-        for name, other in check.questions:
-            port.write(other.question)
-            await self._clock.sleep(ANSWER_S)
-            if (problem := check.answer(name, port.read_available())) is not None:
-                return problem
-        return None
+                set_motor(port, driver.serial, on=False)
 
     @property
     def corrupted(self) -> int:
@@ -157,7 +143,7 @@ class LidarEdge:
         self._resting = not on
         if not on:
             port.write(self._driver.stop_command)
-        self._set_motor(port, on=on)
+        set_motor(port, self._driver.serial, on=on)
         if on:
             port.discard_input()
             port.write(self._driver.begin(now))

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import asyncio
 import random
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import Future, ThreadPoolExecutor
 from typing import TYPE_CHECKING, Final
 
 from fog_contracts import channels as ch
@@ -26,6 +26,7 @@ if TYPE_CHECKING:
     from fog_runtime.transports.zenoh_edge import ZenohEdge
     from robot_agent.agent.core import AgentCore
     from robot_agent.agent.edges.store import Store
+    from robot_agent.agent.prepared_map import PreparedMap
 
 CHECK_S: Final = 0.1
 FIRST_CHECK_S: Final = 0.05
@@ -49,6 +50,11 @@ class MapLoader:
         self._site = site
         self._phase = phase
         self._thread = ThreadPoolExecutor(1, thread_name_prefix="map", initializer=name_thread, initargs=("map",))
+        self._stored: Future[PreparedMap | None] | None = None
+
+    def begin(self) -> None:
+        """Begin to read the stored map, on a thread; `run` loads it. What else the process does goes on meanwhile."""
+        self._stored = self._thread.submit(self._read)
 
     async def run(self, body: RobotSite | None) -> None:
         """Restore the stored state, then keep the map up to date until cancelled."""
@@ -60,10 +66,13 @@ class MapLoader:
 
     async def restore(self, body: RobotSite | None) -> None:
         """Load the stored map and pose; without a stored pose, start at the site's start pose."""
-        snapshot = await asyncio.to_thread(self._store.snapshot, self._site)
-        if snapshot is not None:
+        if self._stored is None:
+            self.begin()
+        assert self._stored is not None
+        stored = await asyncio.wrap_future(self._stored)
+        if stored is not None:
             try:
-                await self._load(snapshot)
+                self._core.load(stored, self._clock.now())
             except MapError as error:
                 _log.warning("stored_map_refused", reason=str(error))
         saved = self._store.pose(self._site)
@@ -71,7 +80,18 @@ class MapLoader:
             saved = start_pose(self._site, body)
         if saved is not None:
             self._core.restore(saved)
-        _log.info("state_restored", map=snapshot is not None, x=saved and saved.x, y=saved and saved.y)
+        _log.info("state_restored", map=stored is not None, x=saved and saved.x, y=saved and saved.y)
+
+    def _read(self) -> PreparedMap | None:
+        """Return the stored map, None without a valid one."""
+        snapshot = self._store.snapshot(self._site)
+        if snapshot is None:
+            return None
+        try:
+            return self._core.prepare_map(snapshot)
+        except MapError as error:
+            _log.warning("stored_map_refused", reason=str(error))
+            return None
 
     async def snapshot_loop(self) -> None:
         """Request a snapshot whenever the core wants one, with a growing delay after each failure."""

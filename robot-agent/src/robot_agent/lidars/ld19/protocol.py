@@ -20,7 +20,6 @@ if TYPE_CHECKING:
 
     from robot_agent.hardware import LaserScan, LidarSamples
 
-BAUD: Final = 230_400
 PACKET_BYTES: Final = 47
 SAMPLES: Final = 12
 SAMPLES_PER_S: Final = 4500

@@ -23,7 +23,6 @@ if TYPE_CHECKING:
 
     from robot_agent.hardware import LaserScan, LidarSamples
 
-BAUD: Final = 115200
 RANGE_MIN_M: Final = 0.15
 RANGE_MAX_M: Final = 12.0
 

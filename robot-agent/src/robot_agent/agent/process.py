@@ -1,0 +1,91 @@
+"""The agent as a process: connects, restores the stored state, wires core and edges, and runs them."""
+
+from __future__ import annotations
+
+import asyncio
+import secrets
+from functools import partial
+from typing import TYPE_CHECKING
+
+from prometheus_client import REGISTRY
+
+from fog_runtime import logs
+from fog_runtime.configuration.robot_file import describe_robot
+from fog_runtime.health import Health, serve_health
+from fog_runtime.machine.memory import release_startup_memory
+from fog_runtime.machine.own_address import reachable_address
+from fog_runtime.transports.zenoh_edge import ZenohEdge, use_one_thread
+from robot_agent import registry
+from robot_agent.agent.edges.guardian_client import GuardianClient
+from robot_agent.agent.edges.lidar_edge import LidarEdge
+from robot_agent.agent.edges.map_loader import MapLoader
+from robot_agent.agent.edges.store import Store
+from robot_agent.agent.recording.input_writer import open_core
+from robot_agent.agent.service import Service
+from robot_agent.agent.settings import read_footprint, read_operator_key, read_site
+from robot_agent.config import agent_config
+from robot_agent.guardian.protection import run_in_real_time
+from robot_agent.hardware import DockingDriver
+
+if TYPE_CHECKING:
+    from fog_runtime.clock import SystemClock
+    from fog_runtime.configuration.robot_file import RobotFile
+    from robot_agent.agent.edges.lidar_start import Lidar
+    from robot_agent.agent.settings import Settings
+
+_log = logs.get("agent")
+
+
+async def run(settings: Settings, robot: RobotFile, clock: SystemClock, lidar: Lidar) -> None:
+    """Localize, follow paths and gate the wheels until cancelled."""
+    site, body = read_site(settings)
+    key = read_operator_key(settings.operator_key_file)
+    base = registry.make_base(robot)
+    _log.info("robot_settings", **describe_robot(robot, *registry.options(robot)))
+    config = agent_config(
+        settings.robot,
+        key,
+        base.drive_train,
+        lidar.driver.traits,
+        body,
+        boot=secrets.token_hex(8),
+        obstacle_ttl=settings.obstacle_memory_s,
+        footprint=read_footprint(robot),
+        settings=robot.settings,
+        finds_dock=isinstance(base, DockingDriver),
+    )
+    use_one_thread()
+    health = Health("map", "pose", "lidar", "base")
+    async with ZenohEdge.open(
+        connect=settings.zenoh_endpoints, clock=clock, role="robot-agent", id=settings.robot, site=site,
+        credentials=settings.credentials(),
+    ) as zenoh:  # fmt: skip
+        with (
+            open_core(config, settings.seed, settings.input_log) as core,
+            serve_health(health, settings.http_host, settings.http_port, settings.port_file) as server,
+        ):
+            store = Store(settings.data_dir)
+            address = partial(reachable_address, settings.http_host, server.port, settings.zenoh_endpoints)
+            agent = Service(core, zenoh, store, clock, health, address)
+            map_loader = MapLoader(core, zenoh, store, clock, site=site, phase=agent.phase)
+            map_loader.begin()
+            guardian = GuardianClient(settings.guardian_socket, clock, agent.on_feedback, agent.on_base_lost)
+            lidar_edge = LidarEdge(
+                lidar.port, lidar.driver, clock, core.on_lidar_samples, check=lidar.check, start=lidar.start
+            )
+            agent.subscribe()
+            REGISTRY.register(agent.collector)
+            zenoh.declare_liveliness("robot-agent", settings.robot)
+            # What the start has made stays: no later collection of garbage looks at it, and delays a wheel command.
+            release_startup_memory()
+            # After the start, which takes all the time that it gets.
+            priority = settings.agent_realtime_priority if settings.speed == 1.0 else 0
+            _log.info("started", priority=run_in_real_time(priority))
+            async with asyncio.TaskGroup() as tasks:
+                tasks.create_task(guardian.run(), name="base")
+                tasks.create_task(lidar_edge.run(), name="lidar")
+                tasks.create_task(agent.stream_loop(guardian, lidar_edge), name="stream")
+                tasks.create_task(agent.control_loop(), name="control")
+                tasks.create_task(map_loader.run(body), name="map")
+                tasks.create_task(agent.publish_loop(), name="publish")
+                tasks.create_task(agent.housekeeping_loop(lidar_edge, guardian), name="housekeeping")

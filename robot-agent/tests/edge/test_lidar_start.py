@@ -1,0 +1,170 @@
+"""The lidar's scan that begins while the agent is being loaded, and who goes on with it."""
+
+from __future__ import annotations
+
+import asyncio
+import time
+from functools import partial
+
+import numpy as np
+import pytest
+from guardian_rig import DEADLINE_S
+
+from fog_runtime.clock import SystemClock
+from fog_runtime.configuration import parts
+from fog_runtime.configuration.robot_file import default_robot
+from fognav_sim.pty_port import PtyPort
+from robot_agent.agent.edges.lidar_edge import LidarEdge
+from robot_agent.agent.edges.lidar_start import LidarStart
+from robot_agent.bases.roomba600.emulator import RoombaEmulator
+from robot_agent.device_signature import LineCheck, SerialSettings
+from robot_agent.lidars.rplidar_a1 import protocol as rplidar
+from robot_agent.lidars.rplidar_a1.driver import RplidarA1Driver
+from robot_agent.lidars.rplidar_a1.emulator import RplidarEmulator
+from robot_agent.registry import LIDARS, make_base, make_lidar, signatures
+from robot_agent.serial_port import Port, PortLost
+
+LINE = signatures()["rplidar-a1"].line
+QUESTIONS = bytes((128, 142, 35))
+"""For a Roomba that might be on a silent line."""
+pytestmark = pytest.mark.live
+
+
+def room(angles, _at):
+    return 2.0 + 0.5 * np.cos(3 * np.asarray(angles))
+
+
+@pytest.fixture
+def port(tmp_path):
+    with PtyPort(tmp_path / "lidar") as opened:
+        yield opened
+
+
+@pytest.fixture
+def motor(monkeypatch):
+    """What was done to the DTR line, which a pty does not have."""
+    lines = []
+    monkeypatch.setattr(Port, "set_line", lambda _port, name, *, on: lines.append((name, on)))
+    return lines
+
+
+class Device:
+    """A lidar, or another device, at the other end of a port; it notes what it receives."""
+
+    def __init__(self, port, emulator=None):
+        self.emulator = emulator or RplidarEmulator(room)
+        self.received = b""
+        self._port = port
+
+    def step(self):
+        data, now = self._port.read(), time.monotonic()
+        self.received += data
+        self.emulator.receive(data, now)
+        if isinstance(self.emulator, RoombaEmulator):
+            self.emulator.tick(now, 0.01)
+        self._port.write(self.emulator.outgoing(now))
+
+    async def until(self, condition):
+        end = time.monotonic() + DEADLINE_S
+        while not condition():
+            assert time.monotonic() < end
+            await asyncio.sleep(0.005)
+            self.step()
+
+
+def start_on(port, clock=None):
+    check = partial(LineCheck, str(port.path), "rplidar-a1", signatures())
+    return LidarStart(str(port.path), LINE, check, clock or SystemClock())
+
+
+class Seen(RplidarA1Driver):
+    """A driver that notes the whole scans that it has returned."""
+
+    def __init__(self):
+        super().__init__()
+        self.scans = 0
+
+    def receive(self, data, now):
+        events = super().receive(data, now)
+        self.scans += len(events.scans)
+        return events
+
+
+async def test_edge_goes_on_with_the_scan_that_was_begun_for_it(port, motor):
+    device, driver, scans = Device(port), Seen(), []
+    with start_on(port) as start:
+        start.begin(driver)
+        await device.until(lambda: driver.scans)
+        edge = LidarEdge(str(port.path), driver, SystemClock(), lambda *_: None, start=start)
+        task = asyncio.create_task(edge.run())
+        await device.until(lambda: scans.extend(edge.poll(time.monotonic())) or scans)
+        assert motor == [("dtr", False)]
+        task.cancel()
+        await asyncio.gather(task, return_exceptions=True)
+    device.step()
+    assert motor == [("dtr", False), ("dtr", True)]
+    assert device.received == QUESTIONS + rplidar.stop() + rplidar.get_health() + rplidar.scan() + rplidar.stop()
+
+
+async def test_nothing_is_sent_before_the_driver_is_loaded_and_the_line_was_listened_to(port):
+    device = Device(port)
+    with start_on(port) as start:
+        await device.until(lambda: device.received == QUESTIONS)
+        start.begin(RplidarA1Driver())
+        await device.until(lambda: device.received.startswith(QUESTIONS + rplidar.stop()))
+
+
+async def test_scan_that_nobody_takes_over_ends_with_its_motor(port, motor):
+    device, driver = Device(port), Seen()
+    with start_on(port) as start:
+        start.begin(driver)
+        await device.until(lambda: driver.scans)
+    assert port.read() == rplidar.stop()
+    assert motor == [("dtr", False), ("dtr", True)]
+    with pytest.raises(PortLost, match="Bad file descriptor"):
+        start.take().read_available()
+
+
+async def test_end_before_the_driver_is_loaded_stops_the_motor(port, motor):
+    device = Device(port)
+    with start_on(port):
+        await device.until(lambda: motor)
+    assert motor == [("dtr", False), ("dtr", True)]
+
+
+@pytest.mark.parametrize("streams", [False, True])
+async def test_another_device_gets_no_command_and_the_edge_says_what_it_is(port, streams):
+    device = Device(port, RoombaEmulator())
+    if streams:
+        device.emulator.receive(make_base(default_robot()).wake(), time.monotonic())
+    check, driver = partial(LineCheck, str(port.path), "rplidar-a1", signatures()), RplidarA1Driver()
+    clock = SystemClock(0.25)  # so that a busy machine does not delay the answer for too long
+    with start_on(port, clock) as start:
+        start.begin(driver)
+        edge = LidarEdge(str(port.path), driver, clock, lambda *_: None, check=check, start=start)
+        task = asyncio.create_task(edge.run())
+        await device.until(lambda: "a roomba600 speaks on this port, not a rplidar-a1" in edge.problem)
+        task.cancel()
+        await asyncio.gather(task, return_exceptions=True)
+    assert 0xA5 not in device.received
+
+
+async def test_edge_opens_a_port_that_was_missing_at_the_start(tmp_path):
+    link, driver, scans = tmp_path / "lidar", RplidarA1Driver(), []
+    start = LidarStart(str(link), LINE, partial(LineCheck, str(link), "rplidar-a1", signatures()), SystemClock())
+    with start:
+        start.begin(driver)
+        assert await asyncio.to_thread(start.take) is None
+        edge = LidarEdge(str(link), driver, SystemClock(), lambda *_: None, start=start)
+        task = asyncio.create_task(edge.run())
+        with PtyPort(link) as port:
+            await Device(port).until(lambda: scans.extend(edge.poll(time.monotonic())) or scans)
+            task.cancel()
+            await asyncio.gather(task, return_exceptions=True)
+
+
+@pytest.mark.parametrize("name", parts.names(LIDARS))
+def test_line_that_is_known_before_a_driver_is_loaded_is_the_drivers_own(name):
+    line = signatures()[name].line
+    assert line is None or line == make_lidar(default_robot(lidar=name)).serial
+    assert line is None or isinstance(line, SerialSettings)

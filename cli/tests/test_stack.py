@@ -99,11 +99,13 @@ async def test_settings_of_the_shell_do_not_reach_the_processes(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setenv("FOGNAV_HTTP_PORT", "80")
+    monkeypatch.setenv("PYTHONDONTWRITEBYTECODE", "1")
     async with Stack(StackConfig(site_dir=tmp_path, robot="r1")) as stack:
         stack.supervisor.start(ROUTER)
         await stack.supervisor.wait_ready([ROUTER], TIMEOUT_S)
         environment = psutil.Process(stack.pids()[ROUTER]).environ()
     assert "FOGNAV_HTTP_PORT" not in environment
+    assert not environment["PYTHONDONTWRITEBYTECODE"], "each start would compile all modules: empty counts as unset"
     assert os.environ["FOGNAV_HTTP_PORT"] == "80"
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import gc
 import subprocess
 import sys
 from functools import cache
@@ -44,6 +45,19 @@ def test_compiler_is_released_after_the_start_and_still_works() -> None:
 def test_collector_of_garbage_passes_over_what_the_start_has_made() -> None:
     _, _, looked_at = _run()
     assert looked_at < 1_000, "modules alone are more than 100,000 objects, which take 90 ms"
+
+
+def test_what_is_loaded_without_collections_is_passed_over_by_later_ones() -> None:
+    assert gc.isenabled()
+    try:
+        with memory.loading():
+            assert not gc.isenabled()
+            made = [[number] for number in range(100)]
+        assert gc.isenabled()
+        looked_at = {id(found) for found in gc.get_objects()}
+        assert not looked_at & {id(item) for item in made}
+    finally:
+        gc.unfreeze()
 
 
 async def test_memory_is_released_as_soon_as_the_process_is_ready(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -17,7 +17,7 @@ from fog_runtime.clock import SystemClock
 from fog_runtime.configuration.robot_file import load_robot
 from fog_runtime.configuration.settings import describe, load
 from fog_runtime.machine import signals
-from fog_runtime.machine.memory import collecting_later
+from fog_runtime.machine.memory import loading
 from robot_agent import registry
 from robot_agent.agent.edges.lidar_start import Lidar, lidar_start
 from robot_agent.agent.settings import Settings, read_port
@@ -36,7 +36,7 @@ async def main() -> None:
     line = signatures[name].line if name in signatures else None
     check = partial(LineCheck, port, name, signatures)
     with lidar_start(port, line, check, clock) as start:
-        with collecting_later():
+        with loading():
             driver = registry.make_lidar(robot)
             if start is not None:
                 start.begin(driver)

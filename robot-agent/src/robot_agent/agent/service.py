@@ -41,7 +41,7 @@ if TYPE_CHECKING:
 
 STREAM_S: Final = 0.05
 IDLE_STREAM_S: Final = 0.1
-"""A robot that stands and has nothing to do needs every other tick only."""
+"""A robot that stands and has nothing to do needs every other tick only, once it is ready."""
 CONTROL_AFTER_S: Final = 0.02
 """Decisions begin this long after a tick of the stream: at the same moment, their thread and the loop's would take the
 interpreter from one another some hundred times a second. They end before the next tick, which sends their speeds."""
@@ -108,10 +108,10 @@ class Service:
         """Once a second: store the pose if it changed, and report the health; more often until the robot is ready."""
         due = -math.inf
         self._manager.ready()
-        ticker = self._ticker(PUBLISH_S)
+        ticker = self._ticker(STREAM_S)
         async for now in ticker:
             if now >= due:
-                due = now + HOUSEKEEPING_S - PUBLISH_S / 2
+                due = now + HOUSEKEEPING_S - STREAM_S / 2
                 self._core.on_loop_health(self._loop_health())
                 await self._store_pose(now)
                 await self._announce_metrics()
@@ -119,7 +119,7 @@ class Service:
                 self._observe(self._clock.now(), lidar, guardian)
             else:
                 self._report_health(now, lidar)
-            ticker.period = HOUSEKEEPING_S if self._health.ready else PUBLISH_S
+            ticker.period = HOUSEKEEPING_S if self._health.ready else STREAM_S
 
     async def _store_pose(self, now: float) -> None:
         pose = self._core.pose_to_store(now)
@@ -206,7 +206,7 @@ class Service:
             # Here, because the housekeeping waits for the storage, which may hang while the robot drives well.
             missing = self._health.missing
             self._manager.alive(f"waiting for {', '.join(missing)}" if missing else "ready")
-            self._stream.period = IDLE_STREAM_S if self._core.idle else STREAM_S
+            self._stream.period = IDLE_STREAM_S if self._core.idle and not missing else STREAM_S
 
         await self._stream.call(stream)
 

@@ -19,6 +19,7 @@ from fog_runtime.configuration.settings import describe, load
 from fog_runtime.machine import signals
 from fog_runtime.machine.memory import loading
 from robot_agent import registry
+from robot_agent.agent.edges.guardian_client import connect_early
 from robot_agent.agent.edges.lidar_start import Lidar, lidar_start
 from robot_agent.agent.settings import Settings, read_port
 from robot_agent.device_signature import LineCheck
@@ -40,8 +41,9 @@ async def main() -> None:
             driver = registry.make_lidar(robot)
             if start is not None:
                 start.begin(driver)
+            link = connect_early(settings.guardian_socket)
             from robot_agent.agent.process import run  # noqa: PLC0415  # loads the kernels, while the lidar starts
-        await run(settings, robot, clock, Lidar(port, driver, check, start))
+        await run(settings, robot, clock, Lidar(port, driver, check, start), link)
 
 
 if __name__ == "__main__":

@@ -9,7 +9,7 @@ import pytest
 from guardian_rig import DEADLINE_S
 
 from fog_runtime.clock import SystemClock
-from robot_agent.agent.edges.guardian_client import FEEDBACK_TIMEOUT_S, RESET_VALID_S, GuardianClient
+from robot_agent.agent.edges.guardian_client import FEEDBACK_TIMEOUT_S, RESET_VALID_S, GuardianClient, connect_early
 from robot_agent.guardian.link import BaseFeedback, WheelCommand, decode_command, encode
 from robot_agent.hardware import BaseStatus, WheelOdometry
 from robot_agent.localization.odometry_buffer import OdometryBuffer
@@ -57,7 +57,7 @@ class Guardian:
 
 
 class Rig:
-    def __init__(self, path):
+    def __init__(self, path, link=None):
         self.path = path
         self.clock = SkippingClock()
         self.feedback = []
@@ -68,6 +68,7 @@ class Rig:
             self.clock,
             lambda feedback, at: (self.feedback.append(feedback), self.times.append(at)),
             lambda _, reason: self.losses.append(reason),
+            link,
         )
 
     async def until(self, condition):
@@ -95,6 +96,37 @@ async def rig(tmp_path):
     for task in tasks:
         task.cancel()
     await asyncio.gather(*tasks, return_exceptions=True)
+
+
+async def test_what_the_guardian_sent_on_an_early_link_is_passed_on_with_its_times(tmp_path):
+    guardian = Guardian(tmp_path / "guardian.sock")
+    link = connect_early(guardian.path)
+    await guardian.accept()
+    begun = time.monotonic()
+    sent = [msgspec.structs.replace(FEEDBACK, seq=number, at=begun - 1.0 + 0.1 * number) for number in range(5)]
+    for feedback in sent:
+        guardian.link.send(encode(feedback))
+    rig = Rig(guardian.path, link)
+    tasks = [asyncio.create_task(loop) for loop in (rig.client.run(), rig.stream())]
+    try:
+        await rig.until(lambda: len(rig.feedback) == len(sent))
+        assert rig.feedback == sent
+        assert rig.times == [feedback.at for feedback in sent]
+        assert rig.client.send(command(seq=7))
+        assert (await guardian.receive()).seq == 7
+        guardian.link.close()
+        await guardian.accept()  # the next link is the client's own
+        guardian.link.send(encode(FEEDBACK))
+        await rig.until(lambda: rig.feedback[-1] == FEEDBACK)
+    finally:
+        for task in tasks:
+            task.cancel()
+        await asyncio.gather(*tasks, return_exceptions=True)
+        guardian.close()
+
+
+def test_without_a_guardian_there_is_no_early_link(tmp_path):
+    assert connect_early(tmp_path / "guardian.sock") is None
 
 
 async def test_missing_guardian_is_reported_and_connected_when_it_starts(rig):

@@ -28,6 +28,8 @@ from robot_agent.guardian.protection import run_in_real_time
 from robot_agent.hardware import DockingDriver
 
 if TYPE_CHECKING:
+    import socket
+
     from fog_runtime.clock import SystemClock
     from fog_runtime.configuration.robot_file import RobotFile
     from robot_agent.agent.edges.lidar_start import Lidar
@@ -36,8 +38,10 @@ if TYPE_CHECKING:
 _log = logs.get("agent")
 
 
-async def run(settings: Settings, robot: RobotFile, clock: SystemClock, lidar: Lidar) -> None:
-    """Localize, follow paths and gate the wheels until cancelled."""
+async def run(
+    settings: Settings, robot: RobotFile, clock: SystemClock, lidar: Lidar, link: socket.socket | None
+) -> None:
+    """Localize, follow paths and gate the wheels until cancelled; `link`: to the guardian, if it was made already."""
     site, body = read_site(settings)
     key = read_operator_key(settings.operator_key_file)
     base = registry.make_base(robot)
@@ -69,7 +73,7 @@ async def run(settings: Settings, robot: RobotFile, clock: SystemClock, lidar: L
             agent = Service(core, zenoh, store, clock, health, address)
             map_loader = MapLoader(core, zenoh, store, clock, site=site, phase=agent.phase)
             map_loader.begin()
-            guardian = GuardianClient(settings.guardian_socket, clock, agent.on_feedback, agent.on_base_lost)
+            guardian = GuardianClient(settings.guardian_socket, clock, agent.on_feedback, agent.on_base_lost, link)
             lidar_edge = LidarEdge(
                 lidar.port, lidar.driver, clock, core.on_lidar_samples, check=lidar.check, start=lidar.start
             )

@@ -37,6 +37,21 @@ _PACKETS_AT_ONCE: Final = 64
 _log = logs.get("base")
 
 
+def connect_early(path: Path) -> socket.socket | None:
+    """Connect to the guardian without waiting, while the agent is being loaded; None if there is none that answers.
+
+    What it sends meanwhile waits in the socket, with its times: the first scan finds the odometry of its whole turn.
+    """
+    link = socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+    link.settimeout(0)
+    try:
+        link.connect(str(path))
+    except OSError:  # `GuardianClient.run` connects, and says why it can't
+        link.close()
+        return None
+    return link
+
+
 class GuardianClient:
     """One connection to the guardian at a time; `receive` calls `on_feedback` with the time at which it was sent.
 
@@ -49,8 +64,11 @@ class GuardianClient:
         clock: Clock,
         on_feedback: Callable[[BaseFeedback, float], object],
         on_lost: Callable[[float, str], object],
+        link: socket.socket | None = None,
     ) -> None:
+        """`link`: the first connection, if it was made before; it belongs to this object."""
         self._path = path
+        self._early = link
         self._clock = clock
         self._on_feedback = on_feedback
         self._on_lost = on_lost
@@ -96,9 +114,11 @@ class GuardianClient:
         """Stay connected until cancelled."""
         while True:
             try:
-                with socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET) as link:
+                early, self._early = self._early, None
+                with early or socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET) as link:
                     link.settimeout(0)
-                    await asyncio.get_running_loop().sock_connect(link, str(self._path))
+                    if early is None:
+                        await asyncio.get_running_loop().sock_connect(link, str(self._path))
                     self._socket, self._feedback_at = link, self._clock.now()
                     self.pid = _peer(link)
                     reason = await self._read(link)

@@ -28,6 +28,7 @@ EDGES = {
     "fog_supervisor",
     "fognav_experiments.comparison.agreement", "fognav_experiments.comparison.archive",
     "fognav_experiments.comparison.publish", "fognav_experiments.comparison.records",
+    "fognav_experiments.comparison.repeated",
     "fognav_experiments.comparison.report", "fognav_experiments.comparison.runner",
     "fognav_experiments.comparison.trial", "fognav_experiments.cpu", "fognav_experiments.gaps",
     "fognav_experiments.fleet", "fognav_experiments.scenarios.description", "fognav_experiments.scenarios.fleet_stage",

@@ -9,6 +9,10 @@ from typer.testing import CliRunner
 
 from fognav import checkout, hardware_drive
 from fognav.commands import experiment
+from fognav_experiments.comparison import archive
+from fognav_experiments.comparison.driven import ComparedDrive
+from fognav_experiments.comparison.measured import MeasuredDrive
+from fognav_experiments.comparison.records import Folder
 from fognav_experiments.scenarios import stage
 from fognav_experiments.scenarios.fleet_stage import FleetResult
 
@@ -69,6 +73,37 @@ def test_the_committed_results_are_small_and_can_be_reported_again(tmp_path):
     assert result.exit_code == 0, result.output
     assert (tmp_path / "drives.csv").read_bytes() == (packed.parent / "drives.csv").read_bytes()
     assert {file.name for file in packed.parent.iterdir()} == {file.name for file in tmp_path.iterdir()}
+
+
+def test_a_report_shows_the_live_drives_of_another_folder_and_its_archive_keeps_them(tmp_path):
+    """Its own folder stays as it was; another experiment's drives are refused."""
+    packed = checkout.root() / "docs" / "results" / "estig" / "drives.jsonl.xz"
+    driven, lockstep, live = (Folder(tmp_path / name) for name in ("driven", "lockstep", "live"))
+    archive.unpack(packed, driven)
+    for folder in (lockstep, live):
+        folder.adopt(driven.description())
+    asked = [record for record in driven.drives.read() if record.run == 1]
+    for record in asked:
+        lockstep.drives.write(record)
+        shared = {name: getattr(record, name) for name in ComparedDrive.__struct_fields__}
+        live.measured("live").write(MeasuredDrive(kind="live", plans=1, peak_mb={"robot-agent": 200.0}, **shared))
+    before = sorted((tmp_path / "lockstep").rglob("*"))
+    report = ["report", str(tmp_path / "lockstep"), "--out", str(tmp_path / "report"), "--with-live"]
+    result = CliRunner().invoke(experiment.experiment_app, [*report, str(tmp_path / "live")], catch_exceptions=False)
+    assert result.exit_code == 0, result.output
+    assert sorted((tmp_path / "lockstep").rglob("*")) == before
+    for name in ("memory.svg", "live-distance.svg", "live-time.svg"):
+        assert (tmp_path / "report" / name).is_file()
+    again = Folder(tmp_path / "again")
+    archive.unpack(tmp_path / "report" / archive.NAME, again)
+    assert len(again.measured("live").read()) == len(asked) > 0
+    description = live.description()
+    description["asked"]["seed"] += 1
+    other = Folder(tmp_path / "other")
+    other.adopt(description)
+    refused = CliRunner().invoke(experiment.experiment_app, [*report, str(tmp_path / "other")])
+    assert refused.exit_code == 2
+    assert "holds drives of another experiment" in " ".join(refused.output.split())
 
 
 def test_scenarios_that_are_ended_early_leave_the_table_of_those_that_were_played(tmp_path, monkeypatch):

@@ -9,6 +9,7 @@ from fognav_experiments.comparison.agreement import agreement, compare_drives, c
 from fognav_experiments.comparison.document import to_markdown
 from fognav_experiments.comparison.measured import MeasuredDrive
 from fognav_experiments.comparison.records import Folder, FolderError, Record
+from fognav_experiments.comparison.repeated import beside_lockstep, memory
 from fognav_experiments.comparison.report import build
 
 SHARED = {
@@ -133,3 +134,86 @@ def test_drives_of_a_real_robot_are_compared_apart_from_those_of_real_processes(
     by_processes, by_robot = "by real processes: brokers", "by a real robot: as the thesis's figures 6.11 and 6.12"
     assert 0 < text.index(by_processes) < text.index(by_robot)
     assert "by a real robot" not in to_markdown(agreement([live], [lockstep]))
+
+
+EXPERIMENT = {"asked": {"site": "estig", "site_digest": "0", "seed": 1}, "measured_on": {"commit": "7217190"}}
+
+
+def in_each_setup(drive, **changes):
+    return [msgspec.structs.replace(drive, setup=setup, **changes) for setup in ("default", "full", "fog")]
+
+
+def test_memory_is_drawn_by_route_and_setup_from_what_each_drive_took():
+    drives = [
+        LIVE,
+        msgspec.structs.replace(LIVE, run=3, peak_mb={"robot-agent": 210.0, "robot-guardian": 30.0}),
+        msgspec.structs.replace(LIVE, setup="default", peak_mb={"robot-agent": 260.0, "robot-guardian": 40.0}),
+        msgspec.structs.replace(LIVE, setup="default", route="cd", peak_mb={"robot-agent": 400.0}),
+    ]
+    figure, table = memory(drives)
+    assert figure.file == "memory.svg"
+    assert "mean of 4 drives" in figure.caption
+    assert figure.svg.count("<rect") == 1 + 2 + 3  # ground, legend, and no bar of fog on the route that it lacks
+    assert [row[:2] for row in table.rows] == [["A to B", "300.0"], ["C to D", "400.0"]]
+    assert table.rows[0][2].startswith("235.0 ± ")
+    assert table.rows[1][2] == "-"
+
+
+def test_memory_of_drives_under_a_quota_or_of_a_real_robot_is_no_figure():
+    assert memory([msgspec.structs.replace(LIVE, cpu_quota=0.2)]) == []
+    assert memory([msgspec.structs.replace(LIVE, kind="hardware", peak_mb={})]) == []
+
+
+def test_distance_and_time_stand_beside_lockstep_for_drives_that_reached_their_goal_in_both():
+    drives = [
+        msgspec.structs.replace(LIVE, distance_m=71.0, time_s=244.0),
+        msgspec.structs.replace(LIVE, run=3, distance_m=73.0, time_s=246.0),
+        msgspec.structs.replace(LIVE, run=4, success=False, outcome="timeout", distance_m=500.0, time_s=None),
+        msgspec.structs.replace(LIVE, run=5, distance_m=500.0),  # not driven in lockstep
+        msgspec.structs.replace(LIVE, run=2, cpu_quota=0.2, distance_m=500.0),
+    ]
+    records = [msgspec.structs.replace(LOCKSTEP, run=run) for run in (2, 3, 4)]
+    heading, words, distance, time, table = beside_lockstep(drives, records)
+    assert heading.text == "Lockstep beside real processes"
+    assert words.text.startswith("2 drives that reached their goal")
+    assert (distance.file, time.file) == ("live-distance.svg", "live-time.svg")
+    assert "As figure 6.11" in distance.caption
+    assert "As figure 6.12" in time.caption
+    (row,) = table.rows
+    assert row[:4] == ["A to B", "fog", "2", "70.0 ± 0.0"]
+    assert row[4].startswith("72.0 ± ")
+    assert row[5].startswith("2.00 ± ")
+    assert row[8].startswith("5.00 ± ")
+    assert beside_lockstep(drives[2:], records) == []
+
+
+def test_the_report_says_where_the_figures_of_memory_and_reality_are():
+    record = msgspec.structs.replace(
+        LOCKSTEP, track=[(0.0, 0.0), (1.0, 1.0)], cpu_s={"local planning": 2.4, "localization": 2.4, "guardian": 2.4}
+    )
+    records = in_each_setup(record)
+    lockstep_only = to_markdown(build(records, EXPERIMENT))
+    assert "| 6.6 | memory of move_base, simulated | only by real processes" in lockstep_only
+    assert "| 6.11 | distance, simulated and real | only by real processes" in lockstep_only
+    assert "for which there is no robot here." in lockstep_only
+    live = to_markdown(build(records, EXPERIMENT, measured=in_each_setup(LIVE)))
+    assert "| 6.10 | memory of move_base, real | memory.svg, and the table below it |" in live
+    assert "| 6.11 | distance, simulated and real | live-distance.svg, and the table below |" in live
+    assert "| 6.12 | time, simulated and real | live-time.svg, and the table below |" in live
+    for figure in ("memory.svg", "live-distance.svg", "live-time.svg"):
+        assert f"]({figure})" in live
+    assert "3 drives by real processes on a simulated one are compared with lockstep" in live
+    real = in_each_setup(LIVE, kind="hardware", peak_mb={}, cpu_percent={})
+    both = to_markdown(build(records, EXPERIMENT, measured=[*in_each_setup(LIVE), *real]))
+    assert "| live-time.svg and hardware-time.svg, and the table below |" in both
+    assert "## Lockstep beside a real robot" in both
+
+
+def test_the_report_says_how_many_drives_ran_at_a_time_and_at_which_load():
+    record = msgspec.structs.replace(
+        LOCKSTEP, track=[(0.0, 0.0), (1.0, 1.0)], cpu_s={"local planning": 2.4, "localization": 2.4, "guardian": 2.4}
+    )
+    pairs = [*in_each_setup(record), *in_each_setup(record, run=3, jobs=2, load=4.0)]
+    text = to_markdown(build(pairs, EXPERIMENT))
+    assert "| 1 at a time | 3 of the drives, at a load average of 1.0 to 1.0 |" in text
+    assert "| 2 at a time | 3 of the drives, at a load average of 4.0 to 4.0 |" in text

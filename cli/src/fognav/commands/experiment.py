@@ -145,11 +145,17 @@ def report_command(
     *,
     out: Annotated[Path | None, typer.Option("--out", metavar="DIR", help="Folder of the report.")] = None,
     site: Annotated[Path | None, typer.Option("--site", metavar="DIR", help="Site of the drives.")] = None,
+    with_live: Annotated[
+        list[Path] | None,
+        typer.Option("--with-live", metavar="DIR|FILE", help="Adds the drives of --live and --hardware from here."),
+    ] = None,
 ) -> None:
     """Write the report of an experiment: Markdown, one HTML file, figures, CSV and an archive of all records.
 
     It shows the thesis's figures with ours beside them, paired differences with their tests, and where CPU time went.
-    From the archive, drives.jsonl.xz, the report is made again, and the experiment goes on (--from).
+    From the archive, drives.jsonl.xz, the report is made again, and the experiment goes on (--from). Memory, and what
+    lockstep says beside real processes, it shows where DIR, or a folder or archive named by --with-live, has such
+    drives.
     """
     from fog_runtime.configuration.site import SiteError  # noqa: PLC0415  # keeps the other commands fast
     from fognav_experiments.comparison.publish import publish  # noqa: PLC0415  # keeps the other commands fast
@@ -160,7 +166,7 @@ def report_command(
         if out is None and source.is_file():
             raise WrongUseError(f"{source} is an archive: name a folder for the report with --out DIR")
         try:
-            with _records_of(source) as folder:
+            with _records_of(source, with_live or []) as folder:
                 written = publish(folder, out or source, checkout.site_folder(site))
         except (FolderError, SiteError, SpecError, OSError) as error:
             raise WrongUseError(str(error)) from error
@@ -169,17 +175,27 @@ def report_command(
 
 
 @contextmanager
-def _records_of(source: Path) -> Iterator[Folder]:
-    """Provide a folder of records; that of an archive for as long as it is needed. Raises `FolderError`."""
+def _records_of(source: Path, with_live: Sequence[Path] = ()) -> Iterator[Folder]:
+    """Provide a folder of records; that of an archive for as long as it is needed. Raises `FolderError`.
+
+    `with_live`: folders and archives whose drives by real processes are added, in a folder that lasts as long.
+    """
     from fognav_experiments.comparison import archive  # noqa: PLC0415  # keeps the other commands fast
     from fognav_experiments.comparison.records import Folder  # noqa: PLC0415  # same
 
-    if not source.is_file():
+    if not source.is_file() and not with_live:
         yield Folder(source)
         return
     with TemporaryDirectory(prefix="fognav-records-") as temporary:
         folder = Folder(Path(temporary))
-        archive.unpack(source, folder)
+        if source.is_file():
+            archive.unpack(source, folder)
+        else:
+            folder.add(Folder(source))
+        for other in with_live:
+            with _records_of(other) as live:
+                if not folder.add(live, only_measured=True):
+                    print_line(f"{other} holds no drives by real processes that {source} lacks")
         yield folder
 
 

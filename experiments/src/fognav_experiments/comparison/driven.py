@@ -59,6 +59,12 @@ def facts(kind: type[ComparedDrive], drawn: RouteDraw, setup: ProfileName, summa
     return told | of_draw | {"route": drawn.route.name, "setup": setup}
 
 
+def route_ends(name: str) -> str:
+    """Return a route's two ends in words, by its name, which is both in one."""
+    half = len(name) // 2
+    return f"{name[:half].upper()} to {name[half:].upper()}"
+
+
 def drive_name(run: int, route: str, setup: str, cpu_quota: float | None = None, speed: float = 1.0) -> str:
     """Return the name of a drive's record; without a quota and in real time the same as that in lockstep."""
     quota = "" if cpu_quota is None else f"-quota{cpu_quota:g}"

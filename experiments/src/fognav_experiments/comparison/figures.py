@@ -10,8 +10,11 @@ if TYPE_CHECKING:
 
     from fognav_experiments.comparison.statistics import Estimate
 
-COLOURS: Final = {"default": "#d9822b", "full": "#3b7dd8", "fog": "#2a9d5c"}
-"""Colours of the setups; those of the first two are the thesis's."""
+COLOURS: Final = {
+    "default": "#d9822b", "full": "#3b7dd8", "fog": "#2a9d5c", "lockstep": "#9a9a9a", "live": "#7a4fb5",
+    "hardware": "#444444",
+}  # fmt: skip
+"""Colours of the setups, of which those of the first two are the thesis's, and of how a drive was made."""
 _WIDTH: Final = 640
 _HEIGHT: Final = 320
 _LEFT: Final = 60
@@ -20,12 +23,14 @@ _TOP: Final = 44
 _TICKS: Final = 5
 
 
-def bars(title: str, unit: str, groups: Sequence[str], series: Mapping[str, Sequence[Estimate]]) -> str:
+def bars(title: str, unit: str, groups: Sequence[str], series: Mapping[str, Sequence[Estimate | None]]) -> str:
     """Return a chart with one group of bars per route: the mean of each setup, with its 95 % confidence interval.
 
-    `series`: for each setup an estimate per group.
+    `groups`: their names, each of one or two lines. `series`: for each setup, or whatever else has a colour, an
+    estimate per group, None without one.
     """
-    tops = [found.mean + (found.half or 0.0) for values in series.values() for found in values]
+    known = [found for values in series.values() for found in values if found is not None]
+    tops = [found.mean + (found.half or 0.0) for found in known]
     top = _round_up(max([*tops, 1e-9]))
     plot_h, plot_w = _HEIGHT - _TOP - _BOTTOM, _WIDTH - _LEFT - 16
     parts = [_text(_LEFT, 18, f"{title} ({unit})", weight="bold"), *_legend(list(series))]
@@ -38,9 +43,11 @@ def bars(title: str, unit: str, groups: Sequence[str], series: Mapping[str, Sequ
     bar_w = 0.7 * group_w / max(len(series), 1)
     for number, group in enumerate(groups):
         left = _LEFT + group_w * number + 0.15 * group_w
-        parts.append(_text(left + 0.35 * group_w, _HEIGHT - 16, group, anchor="middle"))
+        for line, words in enumerate(group.split("\n")):
+            parts.append(_text(left + 0.35 * group_w, _HEIGHT - 22 + 14 * line, words, anchor="middle"))
         for place, (setup, values) in enumerate(series.items()):
-            parts += _bar(left + bar_w * place, bar_w, values[number], plot_h / top, COLOURS[setup])
+            if (found := values[number]) is not None:
+                parts += _bar(left + bar_w * place, bar_w, found, plot_h / top, COLOURS[setup])
     return _svg(_HEIGHT, parts)
 
 

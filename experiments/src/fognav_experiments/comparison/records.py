@@ -9,7 +9,7 @@ import msgspec
 
 from fog_runtime.files import SHARED, atomic_write
 from fognav_experiments.comparison.driven import ComparedDrive, drive_name
-from fognav_experiments.comparison.measured import MeasuredDrive
+from fognav_experiments.comparison.measured import KINDS, MeasuredDrive
 from fognav_experiments.comparison.timeline import Timeline  # read at run time, when a file is decoded
 
 if TYPE_CHECKING:
@@ -189,6 +189,15 @@ class Folder:
         """Return the records of drives by real processes."""
         return DriveFiles(self.path / kind, MeasuredDrive)
 
+    def add(self, other: Folder, *, only_measured: bool = False) -> int:
+        """Add the records of another folder that this one does not have; return how many these are.
+
+        `only_measured`: only those by real processes. Raises `FolderError` if it is about another experiment.
+        """
+        self.adopt(other.description())
+        added = 0 if only_measured else _add(self.drives, other.drives)
+        return added + sum(_add(self.measured(kind), other.measured(kind)) for kind in KINDS)
+
     def read_drives(self, run: int, route: str, setups: Iterable[str]) -> list[Record]:
         """Return the records of a run's route in these setups; raises `FolderError` if one is missing."""
         known = {record.name: record for record in self.drives.read()}
@@ -199,6 +208,13 @@ class Folder:
                 f"{self.path}` first"
             )
         return [known[name] for name in wanted]
+
+
+def _add(files: DriveFiles[N], others: DriveFiles[N]) -> int:
+    new = [record for record in others.read() if not files.has(record.name)]
+    for record in new:
+        files.write(record)
+    return len(new)
 
 
 def write_csv(path: Path, records: Sequence[Record]) -> None:

@@ -5,11 +5,13 @@ from __future__ import annotations
 from collections import defaultdict
 from typing import TYPE_CHECKING, Any, Final, NamedTuple
 
-from fognav_experiments.comparison import agreement, figures, limits
+from fognav_experiments.comparison import agreement, figures, limits, repeated
 from fognav_experiments.comparison.document import Block, Code, Figure, Heading, Paragraph, Table, flat
+from fognav_experiments.comparison.driven import route_ends
 from fognav_experiments.comparison.records import ALIKE, MOVE_BASE, OF_FOG, ON_FOG, ON_ROBOT, machines
+from fognav_experiments.comparison.repeated import SETUPS
 from fognav_experiments.comparison.statistics import Estimate, compare, estimate
-from fognav_experiments.comparison.thesis import MEMORY_UNKNOWN, PLACES, REALITY_UNKNOWN, REPORTED
+from fognav_experiments.comparison.thesis import PLACES, REPORTED
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping, Sequence
@@ -21,7 +23,6 @@ if TYPE_CHECKING:
     from fognav_experiments.comparison.records import Record
 
 TITLE: Final = "What the fog saves a robot: the thesis's experiment, repeated"
-SETUPS: Final[tuple[ProfileName, ...]] = ("default", "full", "fog")
 PAIRS: Final[tuple[tuple[ProfileName, ProfileName], ...]] = (("default", "full"), ("default", "fog"), ("full", "fog"))
 
 Drives = dict["ProfileName", "Record"]
@@ -107,9 +108,9 @@ def build(
     return [
         *blocks,
         Heading("Beside the thesis"),
-        *_beside_thesis(pairs, met, setups, measured),
+        *_beside_thesis(pairs, met, setups, measured, records),
         Heading("Each figure of the thesis, and where it is here"),
-        *_places(measured),
+        *_places(measured, records),
         Heading("Distance, time and computation per route"),
         *_routes(pairs, setups),
         Heading("Paired differences"),
@@ -118,6 +119,7 @@ def build(
         Heading("Where the computation goes"),
         *_components(pairs, setups),
         *agreement.agreement(measured, records, str(experiment["measured_on"].get("commit", ""))),
+        *repeated.beside_lockstep(measured, records),
         *_cost(measured),
         Heading("One drive, seen from above"),
         *_tracks(pairs, setups, site),
@@ -140,6 +142,10 @@ def _introduction(records: Sequence[Record], pairs: Sequence[Drives], experiment
     for commit in sorted({record.commit for record in records} - {""}):
         count = sum(record.commit == commit for record in records)
         rows.append(["commit", f"{commit}: {count} of the drives"])
+    for count in jobs:
+        beside = [record.load for record in records if record.jobs == count]
+        words = f"{len(beside)} of the drives, at a load average of {min(beside):.1f} to {max(beside):.1f}"
+        rows.append([f"{count} at a time", words])
     loads = [record.load for record in records]
     return [
         Paragraph(
@@ -193,12 +199,16 @@ def _bounds(pairs: Sequence[Drives], savings: Mapping[tuple[int, str], Saving]) 
 
 
 def _cost(measured: Sequence[MeasuredDrive]) -> list[Block]:
-    cost = agreement.resources(measured)
+    cost = [*agreement.resources(measured), *repeated.memory(measured)]
     return [Heading("What the robot's processes cost"), *cost] if cost else []
 
 
 def _beside_thesis(
-    pairs: Sequence[Drives], met: Sequence[Drives], setups: Sequence[ProfileName], measured: Sequence[MeasuredDrive]
+    pairs: Sequence[Drives],
+    met: Sequence[Drives],
+    setups: Sequence[ProfileName],
+    measured: Sequence[MeasuredDrive],
+    records: Sequence[Record],
 ) -> list[Block]:
     ours = {"6.3, 6.7": _saved(pairs, met, QUANTITIES[0]), "6.4, 6.8": _saved(pairs, met, QUANTITIES[1])}
     shares = {setup: _mean(pairs, setup, QUANTITIES[2]) for setup in setups}
@@ -225,7 +235,7 @@ def _beside_thesis(
             "The thesis draws one of two or three corridors to be blocked, so that often the blocked one is "
             f"not on the robot's way. The obstacle met a robot that did not know of it in {len(met)} of "
             f"{len(pairs)} drives here. The floor is another one, made in the manner of the thesis's. Its "
-            f"figures 6.11 and 6.12 compare simulation and reality, {_reality(measured)}."
+            f"figures 6.11 and 6.12 compare simulation and reality, {_reality(measured, records)}."
         ),
         Paragraph(
             "The time from an echo to a wheel command is not comparable with the thesis's 3 s: lockstep has the "
@@ -236,9 +246,16 @@ def _beside_thesis(
     ]
 
 
-def _reality(measured: Sequence[MeasuredDrive]) -> str:
+def _reality(measured: Sequence[MeasuredDrive], records: Sequence[Record]) -> str:
     driven = sum(drive.kind == "hardware" for drive in measured)
-    return f"as do {driven} drives of a real robot, further below" if driven else "for which there is no robot here"
+    if driven:
+        return f"as do {driven} drives of a real robot, further below"
+    live = len(agreement.compared(measured, records))
+    return "for which there is no robot here" + (
+        f": {live} drives by real processes on a simulated one are compared with lockstep, further below"
+        if live
+        else ""
+    )
 
 
 def _memory(measured: Sequence[MeasuredDrive]) -> str:
@@ -276,10 +293,10 @@ def _routes(pairs: Sequence[Drives], setups: Sequence[ProfileName]) -> list[Bloc
             for setup in setups
         }
         rows = [
-            [_route(route), *(limits.text(series[setup][number]) for setup in setups)]
+            [route_ends(route), *(limits.text(series[setup][number]) for setup in setups)]
             for number, route in enumerate(routes)
         ]
-        groups = [_route(route) for route in routes]
+        groups = [route_ends(route) for route in routes]
         svg = figures.bars(quantity.title, quantity.unit, groups, series)
         blocks.append(Figure(f"{quantity.file}.svg", svg, quantity.caption))
         blocks.append(Table([f"{quantity.title}, {quantity.unit}", *setups], rows))
@@ -357,7 +374,9 @@ def _tracks(pairs: Sequence[Drives], setups: Sequence[ProfileName], site: Site |
     blocked, stops = _ends(record, site) if site is not None else ((), {})
     svg = figures.tracks({setup: drives[setup].track for setup in setups}, blocked, stops)
     lengths = ", ".join(f"{setup} {drives[setup].distance_m:.0f} m" for setup in setups)
-    caption = f"As figures 6.1 and 6.2: run {record.run}, {_route(record.route)}, {record.area} is blocked: {lengths}."
+    caption = (
+        f"As figures 6.1 and 6.2: run {record.run}, {route_ends(record.route)}, {record.area} is blocked: {lengths}."
+    )
     return [Figure("tracks.svg", svg, caption)]
 
 
@@ -369,13 +388,10 @@ def _ends(record: Record, site: Site) -> tuple[Sequence[tuple[float, float]], di
     return [(x, y) for x, y in blocked], stops
 
 
-def _places(measured: Sequence[MeasuredDrive]) -> list[Block]:
+def _places(measured: Sequence[MeasuredDrive], records: Sequence[Record]) -> list[Block]:
     """Return where a reader of the thesis finds its figures again."""
     real = any(drive.kind == "hardware" for drive in measured)
-    known = {
-        "memory": "the table of what the robot's processes cost" if measured else MEMORY_UNKNOWN,
-        "reality": "the table of the same routes by real processes" if measured else REALITY_UNKNOWN,
-    }
+    known = repeated.places(measured, records)
     rows = [[figure, shows, place.format(**known)] for figure, shows, place in PLACES]
     words = "Its chapter 6 has no tables. Figures of its real runs (6.7 to 6.12) are those of a robot; " + (
         "drives of a real one are among those by real processes."
@@ -430,11 +446,6 @@ def summary_rows(records: Sequence[Record]) -> list[list[str]]:
 
 def _mean(pairs: Sequence[Drives], setup: ProfileName, quantity: Quantity) -> Estimate:
     return estimate([quantity.value(drives[setup]) for drives in pairs])
-
-
-def _route(name: str) -> str:
-    half = len(name) // 2
-    return f"{name[:half].upper()} to {name[half:].upper()}"
 
 
 def _probability(p: float | None) -> str:

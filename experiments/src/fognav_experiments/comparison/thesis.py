@@ -58,8 +58,8 @@ PLACES: Final = (
     ("6.8", "time per route, real", "time.svg, as 6.4"),
     ("6.9", "CPU of move_base, real", "cpu-move-base.svg, as 6.5"),
     ("6.10", "memory of move_base, real", "{memory}"),
-    ("6.11", "distance, simulated and real", "{reality}"),
-    ("6.12", "time, simulated and real", "{reality}"),
+    ("6.11", "distance, simulated and real", "{distance}"),
+    ("6.12", "time, simulated and real", "{time}"),
 )
 """The thesis's figures of chapter 6: what each shows, and where a report has the same."""
 MEMORY_UNKNOWN: Final = "only by real processes (fognav experiment --live): lockstep runs all setups in one"

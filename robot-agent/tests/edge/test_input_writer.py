@@ -1,14 +1,16 @@
 from __future__ import annotations
 
+import subprocess
+import sys
 import threading
 from pathlib import Path
 
 from guardian_rig import DEADLINE_S
 from little_world import AGENT, LittleWorld
 
+from fog_runtime import record
 from fog_runtime.record import Recorder, read_entries
 from robot_agent.agent.core import AgentCore
-from robot_agent.agent.recording import input_writer
 from robot_agent.agent.recording.input_log import TOPIC_OF_ENTRY, BaseLost, EntriesLost, LoggedAgent
 from robot_agent.agent.recording.input_writer import LOST, InputWriter, open_core
 from robot_agent.agent.recording.replay import replay
@@ -37,6 +39,12 @@ def test_input_log_is_complete_at_the_end_and_can_be_replayed(tmp_path):
 def test_an_agent_without_a_log_is_a_plain_core():
     with open_core(AGENT, 4, None) as core:
         assert type(core) is AgentCore
+
+
+def test_an_agent_without_a_log_loads_no_library_for_one():
+    program = "import sys, robot_agent.agent.process; print('mcap' in sys.modules)"
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True)
+    assert done.stdout.strip() == "False"
 
 
 def test_log_of_the_previous_run_is_kept(tmp_path):
@@ -76,7 +84,7 @@ def test_slow_disk_leaves_an_entry_where_entries_are_missing(tmp_path, monkeypat
             super().write_entry(topic, entry, log_time_ns)
             written.release()
 
-    monkeypatch.setattr(input_writer, "Recorder", SlowRecorder)
+    monkeypatch.setattr(record, "Recorder", SlowRecorder)
     path, entry, before = tmp_path / "inputs.mcap", BaseLost(reason="x", now=1.0), lost()
     with InputWriter(path, queue_limit=2) as writer:
         writer.write(entry)

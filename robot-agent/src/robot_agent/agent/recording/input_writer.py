@@ -11,7 +11,6 @@ from typing import TYPE_CHECKING, Final, Self
 from prometheus_client import Counter
 
 from fog_runtime import logs
-from fog_runtime.record import Recorder
 from robot_agent.agent.core import AgentCore
 from robot_agent.agent.recording.input_log import TOPIC_OF_ENTRY, EntriesLost, LoggedAgent
 
@@ -19,6 +18,7 @@ if TYPE_CHECKING:
     from collections.abc import Iterator
     from pathlib import Path
 
+    from fog_runtime.record import Recorder
     from robot_agent.agent.recording.input_log import Entry
     from robot_agent.config import AgentConfig
 
@@ -38,6 +38,8 @@ class InputWriter:
 
     def __init__(self, path: Path, *, queue_limit: int = _QUEUE_LIMIT) -> None:
         """Begin a new log at `path`; one of an earlier run is kept as `NAME.previous.SUFFIX`. Raises `OSError`."""
+        from fog_runtime.record import Recorder  # noqa: PLC0415  # most robots keep no log, and start without its library
+
         if path.is_file():
             path.replace(path.with_suffix(f".previous{path.suffix}"))
         self._path = path

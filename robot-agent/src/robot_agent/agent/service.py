@@ -41,7 +41,7 @@ if TYPE_CHECKING:
 
 STREAM_S: Final = 0.05
 IDLE_STREAM_S: Final = 0.1
-"""A robot that stands and has nothing to do needs every other tick only, once it is ready."""
+"""A robot that stands and has nothing to do needs every other tick only."""
 CONTROL_AFTER_S: Final = 0.02
 """Decisions begin this long after a tick of the stream: at the same moment, their thread and the loop's would take the
 interpreter from one another some hundred times a second. They end before the next tick, which sends their speeds."""
@@ -206,7 +206,7 @@ class Service:
             # Here, because the housekeeping waits for the storage, which may hang while the robot drives well.
             missing = self._health.missing
             self._manager.alive(f"waiting for {', '.join(missing)}" if missing else "ready")
-            self._stream.period = IDLE_STREAM_S if self._core.idle and not missing else STREAM_S
+            self._stream.period = IDLE_STREAM_S if self._core.idle else STREAM_S
 
         await self._stream.call(stream)
 

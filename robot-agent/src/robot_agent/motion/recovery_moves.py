@@ -17,8 +17,8 @@ from robot_agent.localization.pose import wrap
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-    from fog_kernels.body import Body
     from fog_kernels.clearance import Clearance
+    from fog_kernels.robot.body import Body
     from robot_agent.localization.pose import Pose2
 
 BACK_M_S: Final = 0.08

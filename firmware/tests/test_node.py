@@ -37,7 +37,7 @@ def test_readings_have_consecutive_numbers_and_true_uptimes_and_fit_the_channel(
 def test_uptime_goes_on_when_the_clock_of_32_bits_wraps(make_node, run):
     node = make_node()
     run(node, (3.0, 3.0), 1.0)
-    node._now_us += 2**32 - 3_000_000  # the board's clock is about to wrap, and nobody was asked to measure until now
+    node._now.value += 2**32 - 3_000_000  # the board's clock is about to wrap, and nobody was asked until now
     node._start -= (2**32 - 3_000_000) / 1e6
     uptimes = [reading.uptime_ms for reading in run(node, (3.0, 3.0), 6.0)]
     assert uptimes[-1] - uptimes[0] == pytest.approx(6000, abs=1100)

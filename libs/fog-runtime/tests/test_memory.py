@@ -6,11 +6,19 @@ import asyncio
 import gc
 import subprocess
 import sys
+import weakref
 from functools import cache
 
 import pytest
 
 from fog_runtime.machine import memory
+
+
+class Cycle:
+    """Garbage that only a collection frees."""
+
+    itself: Cycle
+
 
 CODE = """
 import gc
@@ -50,7 +58,7 @@ def test_collector_of_garbage_passes_over_what_the_start_has_made() -> None:
 def test_what_is_loaded_without_collections_is_passed_over_by_later_ones() -> None:
     assert gc.isenabled()
     try:
-        with memory.loading():
+        with memory.loading(lambda: False):
             assert not gc.isenabled()
             made = [[number] for number in range(100)]
         assert gc.isenabled()
@@ -58,6 +66,19 @@ def test_what_is_loaded_without_collections_is_passed_over_by_later_ones() -> No
         assert not looked_at & {id(item) for item in made}
     finally:
         gc.unfreeze()
+
+
+@pytest.mark.parametrize("made_garbage", [True, False])
+def test_garbage_is_collected_when_much_was_made_while_loading(*, made_garbage: bool) -> None:
+    try:
+        with memory.loading(lambda: made_garbage):
+            cycle = Cycle()
+            cycle.itself, gone = cycle, weakref.ref(cycle)
+            del cycle
+        assert (gone() is None) == made_garbage
+    finally:
+        gc.unfreeze()
+        gc.collect()
 
 
 async def test_memory_is_released_as_soon_as_the_process_is_ready(monkeypatch: pytest.MonkeyPatch) -> None:

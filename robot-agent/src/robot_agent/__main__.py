@@ -10,6 +10,7 @@ this module imports little and begins the scan; then it loads `robot_agent.agent
 from __future__ import annotations
 
 import os
+from contextlib import nullcontext
 from functools import partial
 
 from fog_runtime import logs, process
@@ -20,7 +21,7 @@ from fog_runtime.machine import signals
 from fog_runtime.machine.memory import loading
 from robot_agent import registry
 from robot_agent.agent.edges.guardian_client import connect_early
-from robot_agent.agent.edges.lidar_start import Lidar, lidar_start
+from robot_agent.agent.edges.lidar_start import LidarParts, lidar_start
 from robot_agent.agent.settings import Settings, read_port
 from robot_agent.device_signature import LineCheck
 
@@ -37,13 +38,21 @@ async def main() -> None:
     line = signatures[name].line if name in signatures else None
     check = partial(LineCheck, port, name, signatures)
     with lidar_start(port, line, check, clock) as start:
-        with loading():
+        with loading(_has_compiled):
             driver = registry.make_lidar(robot)
             if start is not None:
                 start.begin(driver)
             link = connect_early(settings.guardian_socket)
             from robot_agent.agent.process import run  # noqa: PLC0415  # loads the kernels, while the lidar starts
-        await run(settings, robot, clock, Lidar(port, driver, check, start), link)
+        with link.socket if link else nullcontext():
+            await run(settings, robot, clock, LidarParts(port, driver, check, start), link)
+
+
+def _has_compiled() -> bool:
+    """Whether kernels were compiled, which leaves 100 MB of garbage, instead of loaded."""
+    from fog_kernels.warm import cache_misses  # noqa: PLC0415  # loads numba
+
+    return cache_misses() > 0
 
 
 if __name__ == "__main__":

@@ -125,6 +125,28 @@ async def test_what_the_guardian_sent_on_an_early_link_is_passed_on_with_its_tim
         guardian.close()
 
 
+async def test_early_link_that_has_waited_for_long_is_closed_and_made_anew(tmp_path):
+    """Its socket may be full, and the guardian keeps what is newest to itself."""
+    guardian = Guardian(tmp_path / "guardian.sock")
+    early = connect_early(guardian.path)
+    await guardian.accept()
+    guardian.link.send(encode(msgspec.structs.replace(FEEDBACK, at=time.monotonic() - 40.0)))
+    rig = Rig(guardian.path, early._replace(made=time.monotonic() - 40.0))
+    tasks = [asyncio.create_task(loop) for loop in (rig.client.run(), rig.stream())]
+    try:
+        with guardian.link:
+            await guardian.accept()
+        sent = msgspec.structs.replace(FEEDBACK, seq=9, at=time.monotonic() - 0.2)
+        guardian.link.send(encode(sent))
+        await rig.until(lambda: rig.feedback)
+        assert (rig.feedback, rig.times) == ([sent], [sent.at])
+    finally:
+        for task in tasks:
+            task.cancel()
+        await asyncio.gather(*tasks, return_exceptions=True)
+        guardian.close()
+
+
 def test_without_a_guardian_there_is_no_early_link(tmp_path):
     assert connect_early(tmp_path / "guardian.sock") is None
 

@@ -17,7 +17,7 @@ from fognav_sim.pty_port import PtyPort
 from robot_agent.agent.edges.lidar_edge import LidarEdge
 from robot_agent.agent.edges.lidar_start import LidarStart
 from robot_agent.bases.roomba600.emulator import RoombaEmulator
-from robot_agent.device_signature import LineCheck, SerialSettings
+from robot_agent.device_signature import LISTEN_S, LineCheck, SerialSettings
 from robot_agent.lidars.rplidar_a1 import protocol as rplidar
 from robot_agent.lidars.rplidar_a1.driver import RplidarA1Driver
 from robot_agent.lidars.rplidar_a1.emulator import RplidarEmulator
@@ -92,10 +92,11 @@ class Seen(RplidarA1Driver):
 
 async def test_edge_goes_on_with_the_scan_that_was_begun_for_it(port, motor):
     device, driver, scans = Device(port), Seen(), []
-    with start_on(port) as start:
+    clock = SystemClock(0.25)  # so that on a busy machine nothing is asked again
+    with start_on(port, clock) as start:
         start.begin(driver)
         await device.until(lambda: driver.scans)
-        edge = LidarEdge(str(port.path), driver, SystemClock(), lambda *_: None, start=start)
+        edge = LidarEdge(str(port.path), driver, clock, lambda *_: None, start=start)
         task = asyncio.create_task(edge.run())
         await device.until(lambda: scans.extend(edge.poll(time.monotonic())) or scans)
         assert motor == [("dtr", False)]
@@ -106,7 +107,27 @@ async def test_edge_goes_on_with_the_scan_that_was_begun_for_it(port, motor):
     assert device.received == QUESTIONS + rplidar.stop() + rplidar.get_health() + rplidar.scan() + rplidar.stop()
 
 
-async def test_nothing_is_sent_before_the_driver_is_loaded_and_the_line_was_listened_to(port):
+async def test_nothing_is_sent_before_the_line_was_listened_to(port):
+    device, began = Device(port), time.monotonic()
+    with start_on(port) as start:
+        start.begin(RplidarA1Driver())
+        await device.until(lambda: device.received)
+    assert time.monotonic() - began >= LISTEN_S
+
+
+async def test_driver_that_wants_another_line_than_its_signature_says_is_left_to_the_edge(port, motor):
+    class Slow(RplidarA1Driver):
+        serial = SerialSettings(baud=9600)
+
+    device = Device(port)
+    with start_on(port) as start:
+        start.begin(Slow())
+        assert await asyncio.to_thread(start.take) is None
+    device.step()
+    assert rplidar.scan() not in device.received
+
+
+async def test_commands_are_sent_only_when_the_driver_is_loaded(port):
     device = Device(port)
     with start_on(port) as start:
         await device.until(lambda: device.received == QUESTIONS)

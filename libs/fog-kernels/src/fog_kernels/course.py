@@ -196,9 +196,14 @@ def _is_blocked(
 
 
 def distances(around: Clearance, points: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the distances (m) at points (n, 2; m) from the nearest thing, interpolated between cells."""
+    """Return the distances (m) at points (n, 2; m) from the nearest thing, interpolated between cells.
+
+    Raises ValueError for points that are not finite.
+    """
     found = np.empty(len(points))
     places = np.ascontiguousarray(points, np.float64)
+    if not np.isfinite(places).all():
+        raise ValueError("points must be finite")
     _distances(places, around.distance, around.resolution, around.origin_x, around.origin_y, found)
     return found
 
@@ -241,9 +246,9 @@ def is_blocked(
     column = math.floor((around.origin_x + 0.5 * around.resolution - cells.left) / cells.resolution)
     row = math.floor((around.origin_y + 0.5 * around.resolution - cells.bottom) / cells.resolution)
     blocked: bool = _is_blocked(
-        x, y, _line(path), spacing, cells.cost, cells.resolution, cells.left, cells.bottom,
-        np.ascontiguousarray(lidar_points, np.float64), math.isqrt(square), square, around.distance, finer, column, row,
-        narrowest,
+        x, y, _line(path), spacing, _arrays.grid(cells.cost, "cost"), cells.resolution, cells.left, cells.bottom,
+        np.ascontiguousarray(lidar_points, np.float64).reshape(-1, 2), math.isqrt(square), square, around.distance,
+        finer, column, row, narrowest,
     )  # fmt: skip
     return blocked
 

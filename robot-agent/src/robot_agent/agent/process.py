@@ -28,18 +28,17 @@ from robot_agent.guardian.protection import run_in_real_time
 from robot_agent.hardware import DockingDriver
 
 if TYPE_CHECKING:
-    import socket
-
     from fog_runtime.clock import SystemClock
     from fog_runtime.configuration.robot_file import RobotFile
-    from robot_agent.agent.edges.lidar_start import Lidar
+    from robot_agent.agent.edges.guardian_client import EarlyLink
+    from robot_agent.agent.edges.lidar_start import LidarParts
     from robot_agent.agent.settings import Settings
 
 _log = logs.get("agent")
 
 
 async def run(
-    settings: Settings, robot: RobotFile, clock: SystemClock, lidar: Lidar, link: socket.socket | None
+    settings: Settings, robot: RobotFile, clock: SystemClock, lidar: LidarParts, link: EarlyLink | None
 ) -> None:
     """Localize, follow paths and gate the wheels until cancelled; `link`: to the guardian, if it was made already."""
     site, body = read_site(settings)

@@ -25,14 +25,17 @@ _MAPPING: Final = re.compile(r"^([0-9a-f]+)-([0-9a-f]+) (\S+) \S+ \S+ \S+ *(.*)$
 
 
 @contextmanager
-def loading() -> Iterator[None]:
+def loading(made_garbage: Callable[[], bool]) -> Iterator[None]:
     """Load modules without collecting garbage: to look at all of them again and again takes a tenth of the time.
 
-    What was made meanwhile is passed over by the collector from then on, as by `release_startup_memory`.
+    What was made meanwhile is passed over by the collector from then on, as by `release_startup_memory`. Where
+    `made_garbage` says at the end that there is some worth it, it is collected before.
     """
     gc.disable()
     try:
         yield
+        if made_garbage():
+            gc.collect()
     finally:
         gc.freeze()
         gc.enable()

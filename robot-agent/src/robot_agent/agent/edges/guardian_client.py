@@ -11,7 +11,8 @@ import math
 import select
 import socket
 import struct
-from typing import TYPE_CHECKING, Final
+import time
+from typing import TYPE_CHECKING, Final, NamedTuple
 
 import msgspec
 
@@ -31,13 +32,22 @@ RESET_VALID_S: Final = 1.0
 """An operator's reset that could not be passed on within this time expires: it must not clear a later fault."""
 _SENT_WITHIN_S: Final = 30.0
 """The first feedback of a link that is older than this, by the time that it says, says that of another clock."""
+_EARLY_S: Final = 5.0
+"""Later than this (of the system's clock) an early link may be full, and the guardian keeps the newest to itself."""
 _PACKETS_AT_ONCE: Final = 64
 """A flood of packets must not block the stream."""
 
 _log = logs.get("base")
 
 
-def connect_early(path: Path) -> socket.socket | None:
+class EarlyLink(NamedTuple):
+    """A link to the guardian, and when it was made (s of `time.monotonic`)."""
+
+    socket: socket.socket
+    made: float
+
+
+def connect_early(path: Path) -> EarlyLink | None:
     """Connect to the guardian without waiting, while the agent is being loaded; None if there is none that answers.
 
     What it sends meanwhile waits in the socket, with its times: the first scan finds the odometry of its whole turn.
@@ -49,7 +59,7 @@ def connect_early(path: Path) -> socket.socket | None:
     except OSError:  # `GuardianClient.run` connects, and says why it can't
         link.close()
         return None
-    return link
+    return EarlyLink(link, time.monotonic())
 
 
 class GuardianClient:
@@ -64,9 +74,9 @@ class GuardianClient:
         clock: Clock,
         on_feedback: Callable[[BaseFeedback, float], object],
         on_lost: Callable[[float, str], object],
-        link: socket.socket | None = None,
+        link: EarlyLink | None = None,
     ) -> None:
-        """`link`: the first connection, if it was made before; it belongs to this object."""
+        """`link`: the first connection, if it was made before; it belongs to this object, which closes an old one."""
         self._path = path
         self._early = link
         self._clock = clock
@@ -114,7 +124,7 @@ class GuardianClient:
         """Stay connected until cancelled."""
         while True:
             try:
-                early, self._early = self._early, None
+                early = self._take_early()
                 with early or socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET) as link:
                     link.settimeout(0)
                     if early is None:
@@ -128,6 +138,14 @@ class GuardianClient:
                 self._socket = self.pid = None
             self._lost(reason)
             await self._clock.sleep(RETRY_S)
+
+    def _take_early(self) -> socket.socket | None:
+        """Return the early link, once; closed, and None, if kernels were compiled or the computer slept since."""
+        early, self._early = self._early, None
+        if early is None or time.monotonic() - early.made <= _EARLY_S:
+            return early and early.socket
+        early.socket.close()
+        return None
 
     async def _read(self, link: socket.socket) -> str:
         """Let `receive` pass feedback on until the link breaks; return the reason."""

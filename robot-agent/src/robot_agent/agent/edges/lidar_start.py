@@ -12,6 +12,7 @@ from concurrent.futures import Future
 from contextlib import AbstractContextManager, ExitStack, nullcontext, suppress
 from typing import TYPE_CHECKING, Final, NamedTuple, Self
 
+from fog_runtime import logs
 from robot_agent.device_signature import LISTEN_S
 from robot_agent.port_names import PortNameError
 from robot_agent.serial_port import Port, PortLost, open_port, refuse_speed
@@ -22,6 +23,8 @@ if TYPE_CHECKING:
     from fog_runtime.clock import Clock
     from robot_agent.device_signature import LineCheck, SerialSettings
     from robot_agent.hardware import LidarDriver
+
+_log = logs.get("lidar")
 
 _PERIOD_S: Final = 0.02
 ANSWER_S: Final = 0.1
@@ -68,12 +71,19 @@ class LidarStart:
         self._thread = threading.Thread(target=self._run, name="lidar start", daemon=True)
 
     def begin(self, driver: LidarDriver) -> None:
-        """Let the scan begin as soon as the port was listened to; the driver belongs to this object until `take`."""
-        self._driver.set_result(driver)
+        """Let the scan begin as soon as the port was listened to; the driver belongs to this object until `take`.
+
+        A driver whose options want another line than its signature says gets no scan: the edge opens the port for it.
+        """
+        if driver.serial == self._line:
+            self._driver.set_result(driver)
+        else:
+            self._driver.cancel()
 
     def take(self) -> Port | None:
-        """Return the port, on which the driver's scan has begun; None if it has not. Blocks for 0.3 s at most.
+        """Return the port, on which the driver's scan has begun; None if it has not.
 
+        Call it after `begin`; it blocks for 0.3 s of the clock at most, and for what the port needs to write.
         Whoever takes it closes it, and ends the scan before.
         """
         self._taken.set()
@@ -95,8 +105,11 @@ class LidarStart:
             set_motor(port, self._line, on=False)
 
     def _run(self) -> None:
-        with suppress(PortLost, PortNameError, asyncio.CancelledError):
-            asyncio.run(self._scan())
+        try:
+            with suppress(PortLost, PortNameError, asyncio.CancelledError):
+                asyncio.run(self._scan())
+        except Exception as error:  # noqa: BLE001  # the edge begins anew, and fails where this is no accident
+            _log.error("lidar_start_failed", error=error, port=self._path)
 
     async def _scan(self) -> None:
         with ExitStack() as contexts:
@@ -130,7 +143,7 @@ def lidar_start(
     return nullcontext() if line is None else LidarStart(path, line, check, clock)
 
 
-class Lidar(NamedTuple):
+class LidarParts(NamedTuple):
     """The robot's lidar: its port, its driver, the check of what is on the port, and its scan's start, if any."""
 
     port: str

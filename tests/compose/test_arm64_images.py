@@ -39,8 +39,8 @@ pytestmark = [
 
 
 @pytest.fixture(scope="module")
-def image(request: pytest.FixtureRequest) -> str:
-    """Return the name of one of our images, built for ARM."""
+def image(request: pytest.FixtureRequest) -> Iterator[str]:
+    """Yield the name of one of our images, built for ARM, and remove it; the builder's cache keeps its layers."""
     name, build = f"fognav-arm64-test/{request.param}", IMAGES[request.param]
     arguments = [
         part for key, value in build["args"].items() if key != "REVISION" for part in ("--build-arg", f"{key}={value}")
@@ -50,7 +50,8 @@ def image(request: pytest.FixtureRequest) -> str:
         "build", "--quiet", "--platform", PLATFORM, *network, "--file", str(ROOT / build["dockerfile"]), "--tag", name,
         "--build-arg", f"BASE={BASE}", *arguments, str(ROOT), timeout_s=EMULATED * BUILD_S,
     )  # fmt: skip
-    return name
+    yield name
+    docker("image", "rm", name)
 
 
 def python(image: str, *arguments: str) -> str:

@@ -304,10 +304,11 @@ def has_bumped(state: RobotState | None) -> bool:
     return state is not None and state.mode == "FAULT" and any("bumper" in each for each in state.reasons)
 
 
-def send_far(sim: Project, pose: RobotPose, admin: dict[str, str]) -> None:
-    """Give the robot the farther one of two goals."""
+def send_far(sim: Project, pose: RobotPose, admin: dict[str, str]) -> str:
+    """Give the robot the farther one of two goals; return the answer."""
     x, y = max((GOAL, FAR), key=lambda place: math.dist(place, (pose.x, pose.y)))
-    sim.request("PUT", "/api/v1/robots/r1/goal", json={"pose": {"x": x, "y": y}}, headers=admin)
+    answer = sim.request("PUT", "/api/v1/robots/r1/goal", json={"pose": {"x": x, "y": y}}, headers=admin)
+    return f"{answer.status_code} {answer.text}"
 
 
 def box_before(pose: RobotPose) -> SimObstacle:
@@ -329,18 +330,18 @@ async def test_container_of_a_robot_in_fault_is_unhealthy_until_the_fault_is_res
             assert reply is not None
             return reply.accepted
 
-        admin, sent_at = token(sim), -math.inf
+        admin, sent_at, answer = token(sim), -math.inf, "not asked"
 
         async def step_in_front() -> str | None:
             """Put a box before the driving robot, too near for it to stop, and say what came of it."""
-            nonlocal sent_at
+            nonlocal sent_at, answer
             pose = poses.get()
             if pose is None or pose.v < 0.2:
                 # A robot that a busy machine has stopped may wait for another goal.
                 if pose is not None and time.monotonic() > sent_at + GOAL_AGAIN_S:
-                    await asyncio.to_thread(send_far, sim, pose, admin)
+                    answer = await asyncio.to_thread(send_far, sim, pose, admin)
                     sent_at = time.monotonic()
-                return f"the robot does not drive: {pose}, {states.get()}"
+                return f"the robot does not drive: {pose}, {states.get()}; its last goal: {answer}"
             if not await simulate(SimCommand(place=[box_before(pose)])):
                 return "the robot is already where the box would stand"
             for _ in range(40):
@@ -362,10 +363,11 @@ async def test_container_of_a_robot_in_fault_is_unhealthy_until_the_fault_is_res
         body = {"kind": "back_off"}
 
         def unhealthy() -> str | None:
+            answer = ""
             if has_bumped(states.get()):  # the unit resets the fault, and it does not back off by itself
-                sim.request("POST", "/api/v1/robots/r1/commands", json=body, headers=admin)
+                answer = sim.request("POST", "/api/v1/robots/r1/commands", json=body, headers=admin).text
             found = health(sim, "sim-robot")
-            return None if found == "healthy" else f"{found}: {states.get()}"
+            return None if found == "healthy" else f"{found}: {states.get()} {answer}"
 
         await asyncio.to_thread(wait, unhealthy, HEALTHY_S)
 

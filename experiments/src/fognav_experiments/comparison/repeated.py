@@ -62,8 +62,8 @@ def memory(measured: Sequence[MeasuredDrive]) -> list[Block]:
     titles = [route_ends(route) for route in routes]
     title = "Memory of the robot's processes"
     caption = (
-        "As figures 6.6 and 6.10 of the thesis: the largest resident memory of agent, guardian and watchdog together, "
-        f"mean of {len(drives)} drives by real processes, with 95 % confidence intervals."
+        "As figures 6.6 and 6.10 of the thesis: the largest resident memory of agent, guardian and watchdog, added up, "
+        f"mean of {len(drives)} drives by real processes that reached their goal, with 95 % confidence intervals."
     )
     rows = [[name, *(_text(series[setup][number]) for setup in setups)] for number, name in enumerate(titles)]
     return [
@@ -83,12 +83,12 @@ def beside_lockstep(measured: Sequence[MeasuredDrive], records: Sequence[Record]
 
 
 def _charts(kind: Kind, pairs: Sequence[Compared]) -> list[Block]:
-    kinds = sorted({(pair.live.route, SETUPS.index(pair.live.setup)) for pair in pairs})
+    bars_of = sorted({(pair.live.route, SETUPS.index(pair.live.setup)) for pair in pairs})
     chosen = [
         [pair for pair in pairs if (pair.live.route, pair.live.setup) == (route, SETUPS[place])]
-        for route, place in kinds
+        for route, place in bars_of
     ]
-    groups = [f"{route_ends(route)}\n{SETUPS[place]}" for route, place in kinds]
+    groups = [f"{route_ends(route)}\n{SETUPS[place]}" for route, place in bars_of]
     blocks: list[Block] = [
         Paragraph(
             f"{len(pairs)} drives that reached their goal both in lockstep and by {_BY[kind]}, none under a quota: the "
@@ -127,7 +127,7 @@ def _both(kind: Kind, measured: Sequence[MeasuredDrive], records: Sequence[Recor
 
 
 def _with_memory(measured: Sequence[MeasuredDrive]) -> list[MeasuredDrive]:
-    return [drive for drive in measured if drive.cpu_quota is None and drive.robots_peak_mb() is not None]
+    return [d for d in measured if d.success and d.cpu_quota is None and d.robots_peak_mb() is not None]
 
 
 def _peaks(drives: Sequence[MeasuredDrive]) -> Estimate | None:

@@ -62,12 +62,13 @@ def computation(default: Mapping[str, float], fog: Mapping[str, float], robot: t
     before, after = sum(default.values()), sum(fog.values())
     local, planning = fog["local planning"], default["global planning"] + default["layers"]
     needed = THESIS_RATIO * after - default["local planning"]
+    enough = "have" if needed > planning else "only have"
     return Paragraph(
-        f"Why {before / after:.1f} times and not the thesis's {THESIS_RATIO}: `default` spends "
+        f"Why {before / after:.1f} times, where the thesis has {THESIS_RATIO}: `default` spends "
         f"{default['global planning']:.2f} % on searching paths, {default['layers']:.2f} % on layers and "
         f"{default['local planning']:.2f} % on local planning. `fog` keeps the last of these, at half the rate of "
         f"control: {local:.2f} %, {100.0 * local / after:.0f} % of all that is left. That a robot must do itself, so "
-        f"it bounds the ratio. For {THESIS_RATIO} times, searches and layers of `default` would have to take "
+        f"it bounds the ratio. For {THESIS_RATIO} times, searches and layers of `default` would {enough} to take "
         f"{needed:.2f} % instead of {planning:.2f} %: the faster they are, the less is saved by not doing them, and "
         "here they run on compiled kernels, and layers compute only what has changed. A stack whose search is "
         "slower, or that computes its layers as a whole, has a larger ratio. The whole robot, which must also locate "

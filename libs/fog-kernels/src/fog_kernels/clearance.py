@@ -164,8 +164,11 @@ def _clearance(
     bottom = origin_y + first_row * resolution
     across = np.empty(size, np.float32)
     distance[:, :] = np.float32(reach * reach)
+    beyond = size * fine + reach
     for i in range(points.shape[0]):
-        _mark(distance, across, points[i, 0] - left, points[i, 1] - bottom, 0.0, reach, fine)
+        x, y = points[i, 0] - left, points[i, 1] - bottom
+        if -reach <= x <= beyond and -reach <= y <= beyond:
+            _mark(distance, across, x, y, 0.0, reach, fine)
     around = math.ceil(reach / resolution)
     side = size // _FINER
     for r in range(max(first_row - around, 0), min(first_row + side + around, height)):
@@ -243,9 +246,8 @@ def clearance(
     size = _FINER * (2 * cells + 1)
     cost = np.empty((size, size), np.uint8)
     distance = np.empty((size, size), np.float32)
-    near = np.abs(seen - (x, y)).max(axis=1, initial=0.0) <= (cells + 1) * resolution + reach
     _clearance(
-        costmap, resolution, origin_x, origin_y, np.ascontiguousarray(seen[near]), first_column, first_row, reach,
+        costmap, resolution, origin_x, origin_y, seen, first_column, first_row, reach,
         blocked, free, _cost_table(inflation, body.inscribed, reach), cost, distance,
     )  # fmt: skip
     return Clearance(cost, distance, fine, origin_x + first_column * resolution, origin_y + first_row * resolution)

@@ -16,6 +16,7 @@ The tests contain a plain reference implementation, with which a property test c
 from __future__ import annotations
 
 import math
+from functools import lru_cache
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
@@ -587,9 +588,17 @@ def _choose(
     return DwaResult(best_v, best_w, -least, admissible)
 
 
-def _parameters(body: Body, cell: float, limits: DwaLimits, settings: DwaSettings) -> DwaParameters:
-    """Return body, limits and settings as the kernel reads them; `cell`: m per cell of the field."""
-    near = body.smallest_disc + settings.padding
+@lru_cache(maxsize=32)
+def _parameters(
+    radii: tuple[float, float, float], slack: float, cell: float, limits: DwaLimits, settings: DwaSettings
+) -> DwaParameters:
+    """Return body, limits and settings as the kernel reads them: most decisions are made with the same ones.
+
+    `radii`: the body's inscribed and circumscribed radius, and that of its smallest disc (m). `slack`: how much nearer
+    (m) than where it is looked up the body may come. `cell`: m per cell of the field.
+    """
+    inscribed, circumscribed, smallest = radii
+    near = smallest + settings.padding
     return DwaParameters(
         v_max=float(limits.v_max),
         w_max=float(limits.w_max),
@@ -613,9 +622,9 @@ def _parameters(body: Body, cell: float, limits: DwaLimits, settings: DwaSetting
         heading_tolerance=float(settings.heading_tolerance),
         escape_v=float(settings.escape_v),
         padding=float(settings.padding),
-        inscribed=float(body.inscribed),
-        circumscribed=float(body.circumscribed),
-        slack=sampling_slack(body, cell, limits, settings),
+        inscribed=float(inscribed),
+        circumscribed=float(circumscribed),
+        slack=slack,
         disc_slack=_SWEEP_STEP**2 / (8.0 * near) + cell**2 / (4.0 * near),
         n_v=settings.n_v,
         n_w=settings.n_w,
@@ -665,6 +674,12 @@ def dwa(
         points,
         *aims[:2],
         math.nan if goal_theta is None else aims[2],
-        _parameters(body, around.resolution, limits, settings),
+        _parameters(
+            (body.inscribed, body.circumscribed, body.smallest_disc),
+            sampling_slack(body, around.resolution, limits, settings),
+            around.resolution,
+            limits,
+            settings,
+        ),
     )
     return chosen

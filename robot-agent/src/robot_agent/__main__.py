@@ -35,9 +35,9 @@ async def main() -> None:
     _log.info("settings_loaded", **describe(settings))
     robot, clock = load_robot(os.environ), SystemClock(settings.speed)
     port, name, signatures = read_port(robot), robot.settings.lidar.driver, registry.signatures()
-    line = signatures[name].line if name in signatures else None
+    serial = signatures[name].serial if name in signatures else None
     check = partial(LineCheck, port, name, signatures)
-    with lidar_start(port, line, check, clock) as start:
+    with lidar_start(port, serial, check, clock) as start:
         with loading(_has_compiled):
             driver = registry.make_lidar(robot)
             if start is not None:

@@ -24,7 +24,7 @@ from robot_agent.lidars.rplidar_a1.emulator import RplidarEmulator
 from robot_agent.registry import LIDARS, make_base, make_lidar, signatures
 from robot_agent.serial_port import Port, PortLost
 
-LINE = signatures()["rplidar-a1"].line
+SERIAL = signatures()["rplidar-a1"].serial
 QUESTIONS = bytes((128, 142, 35))
 """For a Roomba that might be on a silent line."""
 pytestmark = pytest.mark.live
@@ -74,7 +74,7 @@ class Device:
 
 def start_on(port, clock=None):
     check = partial(LineCheck, str(port.path), "rplidar-a1", signatures())
-    return LidarStart(str(port.path), LINE, check, clock or SystemClock())
+    return LidarStart(str(port.path), SERIAL, check, clock or SystemClock())
 
 
 class Seen(RplidarA1Driver):
@@ -115,7 +115,7 @@ async def test_nothing_is_sent_before_the_line_was_listened_to(port):
     assert time.monotonic() - began >= LISTEN_S
 
 
-async def test_driver_that_wants_another_line_than_its_signature_says_is_left_to_the_edge(port, motor):
+async def test_driver_that_wants_other_serial_settings_than_its_signature_says_is_left_to_the_edge(port, motor):
     class Slow(RplidarA1Driver):
         serial = SerialSettings(baud=9600)
 
@@ -172,7 +172,7 @@ async def test_another_device_gets_no_command_and_the_edge_says_what_it_is(port,
 
 async def test_edge_opens_a_port_that_was_missing_at_the_start(tmp_path):
     link, driver, scans = tmp_path / "lidar", RplidarA1Driver(), []
-    start = LidarStart(str(link), LINE, partial(LineCheck, str(link), "rplidar-a1", signatures()), SystemClock())
+    start = LidarStart(str(link), SERIAL, partial(LineCheck, str(link), "rplidar-a1", signatures()), SystemClock())
     with start:
         start.begin(driver)
         assert await asyncio.to_thread(start.take) is None
@@ -185,7 +185,7 @@ async def test_edge_opens_a_port_that_was_missing_at_the_start(tmp_path):
 
 
 @pytest.mark.parametrize("name", parts.names(LIDARS))
-def test_line_that_is_known_before_a_driver_is_loaded_is_the_drivers_own(name):
-    line = signatures()[name].line
-    assert line is None or line == make_lidar(default_robot(lidar=name)).serial
-    assert line is None or isinstance(line, SerialSettings)
+def test_serial_settings_that_are_known_before_a_driver_is_loaded_are_the_drivers_own(name):
+    serial = signatures()[name].serial
+    assert serial is None or serial == make_lidar(default_robot(lidar=name)).serial
+    assert serial is None or isinstance(serial, SerialSettings)

@@ -31,10 +31,10 @@ ANSWER_S: Final = 0.1
 """A device that is asked what it is has answered within this time."""
 
 
-def set_motor(port: Port, line: SerialSettings, *, on: bool) -> None:
+def set_motor(port: Port, serial: SerialSettings, *, on: bool) -> None:
     """Let the lidar's motor turn, or stand still, as far as it has a line for that; raises `PortLost`."""
-    if line.dtr is not None:
-        port.set_line("dtr", on=line.dtr is on)
+    if serial.dtr is not None:
+        port.set_line("dtr", on=serial.dtr is on)
 
 
 async def wrong_device(port: Port, check: LineCheck, clock: Clock) -> str | None:
@@ -59,10 +59,10 @@ class LidarStart:
     Until then the thread reads the port as the stream of wheel commands does later, and nobody gets the scans.
     """
 
-    def __init__(self, path: str, line: SerialSettings, check: Callable[[], LineCheck], clock: Clock) -> None:
-        """`line` and `check` as the lidar's edge has them of the driver, which uses the same clock."""
+    def __init__(self, path: str, serial: SerialSettings, check: Callable[[], LineCheck], clock: Clock) -> None:
+        """Take over `serial` and `check` as the lidar's edge has them of the driver, which uses the same clock."""
         self._path = path
-        self._line = line
+        self._serial = serial
         self._check = check
         self._clock = clock
         self._driver: Future[LidarDriver] = Future()
@@ -73,9 +73,9 @@ class LidarStart:
     def begin(self, driver: LidarDriver) -> None:
         """Let the scan begin as soon as the port was listened to; the driver belongs to this object until `take`.
 
-        A driver whose options want another line than its signature says gets no scan: the edge opens the port for it.
+        A driver whose options want other serial settings than its signature's gets no scan: the edge opens the port.
         """
-        if driver.serial == self._line:
+        if driver.serial == self._serial:
             self._driver.set_result(driver)
         else:
             self._driver.cancel()
@@ -102,7 +102,7 @@ class LidarStart:
             return
         with port, suppress(PortLost):
             port.write(self._driver.result().stop_command)
-            set_motor(port, self._line, on=False)
+            set_motor(port, self._serial, on=False)
 
     def _run(self) -> None:
         try:
@@ -113,10 +113,10 @@ class LidarStart:
 
     async def _scan(self) -> None:
         with ExitStack() as contexts:
-            port = contexts.enter_context(open_port(self._path, self._line.baud))
+            port = contexts.enter_context(open_port(self._path, self._serial.baud))
             if refuse_speed(self._clock.speed, port.device) is not None:
                 return
-            set_motor(port, self._line, on=True)
+            set_motor(port, self._serial, on=True)
             contexts.callback(self._stop_motor, port)
             port.discard_input()
             if await wrong_device(port, self._check(), self._clock) is not None:
@@ -133,14 +133,14 @@ class LidarStart:
 
     def _stop_motor(self, port: Port) -> None:
         with suppress(PortLost):
-            set_motor(port, self._line, on=False)
+            set_motor(port, self._serial, on=False)
 
 
 def lidar_start(
-    path: str, line: SerialSettings | None, check: Callable[[], LineCheck], clock: Clock
+    path: str, serial: SerialSettings | None, check: Callable[[], LineCheck], clock: Clock
 ) -> AbstractContextManager[LidarStart | None]:
-    """Return the start of a lidar's scan; of None where its line is not known before its driver is loaded."""
-    return nullcontext() if line is None else LidarStart(path, line, check, clock)
+    """Return the start of a lidar's scan; of None where its driver must be loaded to know the serial settings."""
+    return nullcontext() if serial is None else LidarStart(path, serial, check, clock)
 
 
 class LidarParts(NamedTuple):

@@ -6,7 +6,7 @@ from typing import Final
 
 from robot_agent.device_signature import SerialSettings, Signature
 
-LINE: Final = SerialSettings(230400)
+SERIAL: Final = SerialSettings(230400)
 
 _HEADER: Final = b"\x54\x2c"
 _PACKET: Final = 47
@@ -33,4 +33,4 @@ def _crc(data: bytes) -> int:
     return crc
 
 
-SIGNATURE: Final = Signature(recognizes=_recognizes, line=LINE)
+SIGNATURE: Final = Signature(recognizes=_recognizes, serial=SERIAL)

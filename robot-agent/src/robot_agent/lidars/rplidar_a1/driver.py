@@ -9,7 +9,7 @@ from msgspec import Meta
 
 from robot_agent.hardware import LaserScan, LidarEvents, LidarFactory, LidarTraits
 from robot_agent.lidars.rplidar_a1 import protocol as rplidar
-from robot_agent.lidars.rplidar_a1.signature import LINE
+from robot_agent.lidars.rplidar_a1.signature import SERIAL
 
 STOP_S: Final = 0.1
 """Time between a stop and the next request; the device needs 1 ms, and its last bytes must arrive."""
@@ -34,7 +34,7 @@ class RplidarA1Options(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown
 class RplidarA1Driver:
     """Protocol of one lidar; see `robot_agent.hardware.LidarDriver`."""
 
-    serial = LINE
+    serial = SERIAL
     stop_command = rplidar.stop()
 
     def __init__(self, options: RplidarA1Options | None = None) -> None:

@@ -8,7 +8,7 @@ from typing import Final
 from robot_agent.device_signature import SerialSettings, Signature
 
 # The motor of an A1 runs while DTR is cleared.
-LINE: Final = SerialSettings(115200, dtr=False)
+SERIAL: Final = SerialSettings(115200, dtr=False)
 
 _TEXT: Final = re.compile(rb"RP ?LIDAR System")
 _DESCRIPTOR: Final = re.compile(
@@ -52,4 +52,4 @@ def _capsules_at(data: bytes, begin: int) -> bool:
 
 
 # A silent one is not asked: whoever asks it in its own protocol presses the buttons of a Roomba.
-SIGNATURE: Final = Signature(recognizes=_recognizes, line=LINE)
+SIGNATURE: Final = Signature(recognizes=_recognizes, serial=SERIAL)

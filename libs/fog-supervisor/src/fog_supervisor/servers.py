@@ -14,6 +14,7 @@ import time
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import IO, Final, Self
 
@@ -28,12 +29,29 @@ _ATTEMPTS: Final = 5
 """Ports to try: another process may take one between its choice and its use."""
 _SERVER_FOLDERS: Final = ("/usr/sbin", "/usr/local/sbin", "/opt/homebrew/sbin", "/opt/homebrew/bin")
 """Debian keeps servers in /usr/sbin, which is not on every user's path."""
-_STARTING: Final = ThreadPoolExecutor(1, "starts servers")
-"""The thread that starts them, which lives as long as the process: a server ends with the thread that started it."""
 
 
 class ServerError(RuntimeError):
     """A server is not installed or does not start; the message names the remedy or contains the end of its log."""
+
+
+class _Starter:
+    """The thread that starts servers, which lives as long as the process: a server ends with the thread that did."""
+
+    def __init__(self) -> None:
+        self._begin()
+        # A forked process has this object, but not its thread, and would wait for it for ever.
+        os.register_at_fork(after_in_child=self._begin)
+
+    def _begin(self) -> None:
+        self._executor = ThreadPoolExecutor(1, "starts servers")
+
+    def run(self, start: Callable[[], subprocess.Popen[bytes]]) -> subprocess.Popen[bytes]:
+        """Call `start` on the thread; return what it returns, or raise what it raises."""
+        return self._executor.submit(start).result()
+
+
+_STARTER: Final = _Starter()
 
 
 def find_program(*names: str) -> Path | None:
@@ -219,7 +237,7 @@ class Server:
         if self.running():
             return
         with self.log.open("ab") as log:
-            self._process = _STARTING.submit(self._spawn, log).result()
+            self._process = _STARTER.run(partial(self._spawn, log))
         deadline = time.monotonic() + _READY_S
         while not self.program.ready():
             if self._process.poll() is not None or time.monotonic() > deadline:

@@ -194,8 +194,10 @@ def _set_up(fd: int, path: str, baud: int) -> None:
     try:
         # Advisory, and shared with processes that inherit the descriptor.
         fcntl.flock(fd, fcntl.LOCK_EX | fcntl.LOCK_NB)
-    except OSError as error:
+    except BlockingIOError as error:
         raise PortLost(path, "another process has locked it") from error
+    except OSError as error:
+        raise PortLost(path, f"it can't be locked for this process alone ({_reason(error)})") from error
     try:
         if not _is_pty(os.ttyname(fd)):
             # Refuses later openers that know no lock. A pty keeps it for ever: its other end holds it open.

@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import errno
 import os
 import pty
 import select
@@ -97,9 +98,20 @@ def test_missing_device_and_plain_file_are_refused(tmp_path):
 
 def test_a_port_in_use_is_refused_and_free_after_close(line):
     _, path = line
-    with open_port(path, 115200), pytest.raises(PortLost, match="locked"):
+    with open_port(path, 115200), pytest.raises(PortLost, match="another process has locked it"):
         open_port(path, 115200)
     open_port(path, 115200).close()
+
+
+@pytest.mark.parametrize("number", [errno.EACCES, errno.ENOLCK, errno.EOPNOTSUPP])
+def test_a_lock_that_no_other_process_holds_but_the_system_refuses_is_named(line, monkeypatch, number):
+    def refused(_fd, _operation):
+        raise OSError(number, os.strerror(number))
+
+    monkeypatch.setattr(serial_port.fcntl, "flock", refused)
+    with pytest.raises(PortLost, match=rf"can't be locked for this process alone \({os.strerror(number)}\)") as raised:
+        open_port(line[1], 115200)
+    assert "another process has locked it" not in str(raised.value)
 
 
 def test_write_to_a_device_that_accepts_nothing_raises_port_lost(line):

@@ -90,3 +90,42 @@ def test_second_hang_up_does_not_cut_the_orderly_end_short():
         child.send_signal(signal.SIGHUP)
         out, _ = child.communicate(timeout=60)
     assert (out, child.returncode) == ("cleaned\n", 0)
+
+
+ASIDE = """
+import asyncio, threading
+from fog_runtime import logs, process
+logs.configure("p")
+def load():
+    {load}
+async def main():
+    try:
+        print(await process.load_aside(load), flush=True)
+    finally:
+        print("cleaned", flush=True)
+process.run(main)
+"""
+
+
+def start_loading(load):
+    command = [sys.executable, "-c", ASIDE.format(load=load)]
+    return subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+
+
+def test_signal_ends_a_process_in_order_that_loads_something_for_ever():
+    with start_loading("print('up', flush=True); threading.Event().wait()") as child:
+        assert child.stdout.readline() == "up\n"
+        child.send_signal(signal.SIGTERM)
+        out, err = child.communicate(timeout=60)
+    assert (out, child.returncode) == ("cleaned\n", 0)
+    assert [json.loads(line)["event"] for line in err.splitlines()] == ["stopping", "stopped"]
+
+
+def test_what_was_loaded_aside_is_returned_and_its_error_is_logged_with_status_one():
+    with start_loading("return 'loaded on ' + threading.current_thread().name") as child:
+        out, _ = child.communicate(timeout=60)
+    assert (out, child.returncode) == ("loaded on loading\ncleaned\n", 0)
+    with start_loading("raise ImportError('no such kernel')") as child:
+        out, err = child.communicate(timeout=60)
+    assert (out, child.returncode) == ("cleaned\n", 1)
+    assert json.loads(err)["reason"] == "ImportError: no such kernel"

@@ -4,14 +4,16 @@ It drives through the guardian, which stops the wheels when the agent is gone. T
 (`robot_agent.guardian.watchdog`) starts the guardian.
 
 Loading the agent takes about a second, numba and the kernels most of it, and so does the lidar until its first scan. So
-this module imports little and begins the scan; then it loads `robot_agent.agent.process`, which connects and wires.
+this module imports little, reads all settings and begins the scan; then it loads `robot_agent.agent.process`, which
+connects and wires. It is loaded on a thread: where kernels are compiled for minutes, a signal ends the process as soon.
 """
 
 from __future__ import annotations
 
 import os
-from contextlib import nullcontext
+from contextlib import ExitStack
 from functools import partial
+from typing import TYPE_CHECKING
 
 from fog_runtime import logs, process
 from fog_runtime.clock import SystemClock
@@ -22,8 +24,17 @@ from fog_runtime.machine.memory import loading
 from robot_agent import registry
 from robot_agent.agent.edges.guardian_client import connect_early
 from robot_agent.agent.edges.lidar_start import LidarParts, lidar_start
-from robot_agent.agent.settings import Settings, read_port
+from robot_agent.agent.settings import Settings, read_given, read_port
 from robot_agent.device_signature import LineCheck
+
+if TYPE_CHECKING:
+    from collections.abc import Awaitable, Callable
+
+    from fog_runtime.configuration.robot_file import RobotFile
+    from robot_agent.agent.edges.guardian_client import EarlyLink
+    from robot_agent.agent.settings import Given
+
+    Run = Callable[[Settings, RobotFile, Given, SystemClock, LidarParts, EarlyLink | None], Awaitable[None]]
 
 _log = logs.get("agent")
 
@@ -36,16 +47,24 @@ async def main() -> None:
     robot, clock = load_robot(os.environ), SystemClock(settings.speed)
     port, name, signatures = read_port(robot), robot.settings.lidar.driver, registry.signatures()
     serial = signatures[name].serial if name in signatures else None
+    given = read_given(settings, robot)
     check = partial(LineCheck, port, name, signatures)
-    with lidar_start(port, serial, check, clock) as start:
+    with lidar_start(port, serial, check, clock) as start, ExitStack() as links:
         with loading(_has_compiled):
-            driver = registry.make_lidar(robot)
+            driver = await process.load_aside(partial(registry.make_lidar, robot))
             if start is not None:
                 start.begin(driver)
-            link = connect_early(settings.guardian_socket)
-            from robot_agent.agent.process import run  # noqa: PLC0415  # loads the kernels, while the lidar starts
-        with link.socket if link else nullcontext():
-            await run(settings, robot, clock, LidarParts(port, driver, check, start), link)
+            if (link := connect_early(settings.guardian_socket)) is not None:
+                links.enter_context(link.socket)
+            run = await process.load_aside(_load_agent)
+        await run(settings, robot, given, clock, LidarParts(port, driver, check, start), link)
+
+
+def _load_agent() -> Run:
+    """Load the kernels, while the lidar starts."""
+    from robot_agent.agent.process import run  # noqa: PLC0415  # as said above
+
+    return run
 
 
 def _has_compiled() -> bool:

@@ -7,9 +7,8 @@ from dataclasses import dataclass
 from itertools import pairwise
 from typing import TYPE_CHECKING, Final
 
-import numpy as np
-
 if TYPE_CHECKING:
+    import numpy as np
     from numpy.typing import NDArray
 
 Vertex = tuple[float, float]
@@ -88,6 +87,8 @@ class Footprint:
     @property
     def polygon(self) -> NDArray[np.float64]:
         """The vertices as an array, float64 (n, 2)."""
+        import numpy as np  # noqa: PLC0415  # settings are checked before it is loaded
+
         return np.array(self.vertices, dtype=np.float64)
 
     @property

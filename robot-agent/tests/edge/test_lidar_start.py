@@ -3,17 +3,25 @@
 from __future__ import annotations
 
 import asyncio
+import json
+import os
+import signal
+import sys
 import time
 from functools import partial
 
 import numpy as np
 import pytest
 from guardian_rig import DEADLINE_S
+from little_world import KEY
 
+from fog_runtime.access.credentials import CredentialsError
 from fog_runtime.clock import SystemClock
 from fog_runtime.configuration import parts
 from fog_runtime.configuration.robot_file import default_robot
+from fog_runtime.configuration.settings import SettingsError
 from fognav_sim.pty_port import PtyPort
+from robot_agent import __main__ as program
 from robot_agent.agent.edges.lidar_edge import LidarEdge
 from robot_agent.agent.edges.lidar_start import LidarStart
 from robot_agent.bases.roomba600.emulator import RoombaEmulator
@@ -27,6 +35,17 @@ from robot_agent.serial_port import Port, PortLost
 SERIAL = signatures()["rplidar-a1"].serial
 QUESTIONS = bytes((128, 142, 35))
 """For a Roomba that might be on a silent line."""
+STARTED_WITHIN_S = 300.0
+"""A busy machine needs a minute to load a lidar's driver with numba."""
+LOADING_FOR_EVER = """
+import runpy, sys, time
+class Endless:
+    def find_spec(self, name, path, target=None):
+        if name == "robot_agent.agent.process":
+            time.sleep(1e6)  # as in a compiler, no code of Python runs on this thread meanwhile
+sys.meta_path.insert(0, Endless())
+runpy.run_module("robot_agent", run_name="__main__", alter_sys=True)
+"""
 pytestmark = pytest.mark.live
 
 
@@ -48,6 +67,19 @@ def motor(monkeypatch):
     return lines
 
 
+def environment(folder, port):
+    key = folder / "operator.key"
+    key.write_text(KEY.hex())
+    return {
+        "FOGNAV_ROBOT": "r1",
+        "FOGNAV_SITE": "lab",
+        "FOGNAV_DATA_DIR": str(folder),
+        "FOGNAV_GUARDIAN_SOCKET": str(folder / "guardian"),
+        "FOGNAV_OPERATOR_KEY_FILE": str(key),
+        "FOGNAV_LIDAR_PORT": str(port.path),
+    }
+
+
 class Device:
     """A lidar, or another device, at the other end of a port; it notes what it receives."""
 
@@ -64,8 +96,8 @@ class Device:
             self.emulator.tick(now, 0.01)
         self._port.write(self.emulator.outgoing(now))
 
-    async def until(self, condition):
-        end = time.monotonic() + DEADLINE_S
+    async def until(self, condition, deadline_s=DEADLINE_S):
+        end = time.monotonic() + deadline_s
         while not condition():
             assert time.monotonic() < end
             await asyncio.sleep(0.005)
@@ -146,11 +178,12 @@ async def test_scan_that_nobody_takes_over_ends_with_its_motor(port, motor):
         start.take().read_available()
 
 
-async def test_end_before_the_driver_is_loaded_stops_the_motor(port, motor):
+async def test_motor_stands_still_until_the_driver_is_loaded(port, motor):
     device = Device(port)
     with start_on(port):
-        await device.until(lambda: motor)
-    assert motor == [("dtr", False), ("dtr", True)]
+        await device.until(lambda: device.received == QUESTIONS)
+    assert motor == []
+    assert port.read() == b""
 
 
 @pytest.mark.parametrize("streams", [False, True])
@@ -189,3 +222,47 @@ def test_serial_settings_that_are_known_before_a_driver_is_loaded_are_the_driver
     serial = signatures()[name].serial
     assert serial is None or serial == make_lidar(default_robot(lidar=name)).serial
     assert serial is None or isinstance(serial, SerialSettings)
+
+
+@pytest.mark.parametrize(
+    ("setting", "words"),
+    [
+        (("FOGNAV_SITE", ""), "the site is not known"),
+        (("FOGNAV_OPERATOR_KEY_FILE", "/nowhere/key"), "/nowhere/key"),
+        (("FOGNAV_CREDENTIALS_FILE", "/nowhere/credentials"), "/nowhere/credentials"),
+        (("FOGNAV_BASE", "hovercraft"), "hovercraft"),
+        (("FOGNAV_BASE_OPTIONS", '{"axle": 0.2}'), "FOGNAV_BASE_OPTIONS.axle"),
+        (("FOGNAV_FOOTPRINT", "[[0.2, 0.1], [0.2, -0.1], [-0.1, 0.0]]"), "FOGNAV_FOOTPRINT"),
+        (("FOGNAV_LIDAR_OPTIONS", '{"range": 6.0}'), "FOGNAV_LIDAR_OPTIONS.range"),
+    ],
+)
+async def test_wrong_setting_ends_the_start_before_the_motor_turns(tmp_path, port, motor, monkeypatch, setting, words):
+    monkeypatch.setattr(program.logs, "configure", lambda *_: None)
+    for name, text in (*environment(tmp_path, port).items(), setting):
+        monkeypatch.setenv(name, text)
+    with pytest.raises((SettingsError, CredentialsError), match=words):
+        await program.main()
+    assert motor == []
+    assert port.read() in (b"", QUESTIONS)  # all that is written to a line that is listened to
+
+
+@pytest.mark.timeout(STARTED_WITHIN_S + 2.0 * DEADLINE_S)
+async def test_signal_ends_an_agent_that_is_still_being_loaded_and_its_lidars_scan(tmp_path, port):
+    device, log = Device(port), tmp_path / "log"
+    with log.open("wb") as stderr:
+        agent = await asyncio.create_subprocess_exec(
+            sys.executable, "-c", LOADING_FOR_EVER, env={**os.environ, **environment(tmp_path, port)}, stderr=stderr
+        )
+    try:
+        await device.until(lambda: device.emulator.scanning, STARTED_WITHIN_S)
+        agent.send_signal(signal.SIGTERM)
+        await device.until(lambda: agent.returncode is not None)
+    finally:
+        if agent.returncode is None:
+            agent.kill()
+            await agent.wait()
+    device.step()
+    assert agent.returncode == 0
+    assert not device.emulator.scanning
+    events = [json.loads(line)["event"] for line in log.read_text().splitlines()]
+    assert events == ["settings_loaded", "stopping", "stopped"]

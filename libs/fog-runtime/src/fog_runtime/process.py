@@ -4,8 +4,11 @@ import asyncio
 import faulthandler
 import os
 import signal
+import sys
+import threading
 from collections.abc import Awaitable, Callable
-from typing import Final
+from concurrent.futures import Future
+from typing import Final, TypeVar
 
 from fog_runtime import logs
 from fog_runtime.machine import signals
@@ -14,6 +17,36 @@ ENDING_S: Final = 9.0
 """How long an orderly end may take: less than container engines and service managers wait before they kill."""
 
 _log = logs.get("process")
+
+T = TypeVar("T")
+
+_loading: Final[set[threading.Thread]] = set()
+
+
+async def load_aside(load: Callable[[], T]) -> T:
+    """Return what `load` returns, on a thread of its own: meanwhile the loop goes on, and a signal ends the process.
+
+    For what can't be interrupted and may take minutes, such as compiling kernels. A process that ends before does not
+    wait for it: call it within `run`, and let `load` write nothing that must be whole.
+    """
+    result: Future[T] = Future()
+
+    def work() -> None:
+        result.set_running_or_notify_cancel()
+        try:
+            result.set_result(load())
+        except BaseException as error:  # noqa: BLE001  # raised to who awaits it
+            result.set_exception(error)
+
+    thread = threading.Thread(target=work, name="loading", daemon=True)
+    _loading.add(thread)
+    thread.start()
+    try:
+        return await asyncio.wrap_future(result)
+    finally:
+        if result.done():
+            thread.join()
+            _loading.remove(thread)
 
 
 async def _supervise(main: Callable[[], Awaitable[None]]) -> None:
@@ -58,8 +91,18 @@ def run(main: Callable[[], Awaitable[None]]) -> None:
     except Exception as error:  # noqa: BLE001  # the last place that can log why the process ends
         causes = _leaves(error)
         _log.error("crashed", error=error, reason="; ".join(f"{type(c).__name__}: {c}" for c in causes))
+        _leave(1)
         raise SystemExit(1) from None
     _log.info("stopped")
+    _leave(0)
+
+
+def _leave(status: int) -> None:
+    """End at once if something is still being loaded: the interpreter's own end would pull it from under the thread."""
+    if _loading:
+        sys.stdout.flush()
+        sys.stderr.flush()
+        os._exit(status)
 
 
 def _leaves(error: BaseException) -> list[BaseException]:

@@ -22,7 +22,6 @@ from robot_agent.agent.edges.map_loader import MapLoader
 from robot_agent.agent.edges.store import Store
 from robot_agent.agent.recording.input_writer import open_core
 from robot_agent.agent.service import Service
-from robot_agent.agent.settings import read_footprint, read_operator_key, read_site
 from robot_agent.config import agent_config
 from robot_agent.guardian.protection import run_in_real_time
 from robot_agent.hardware import DockingDriver
@@ -32,36 +31,39 @@ if TYPE_CHECKING:
     from fog_runtime.configuration.robot_file import RobotFile
     from robot_agent.agent.edges.guardian_client import EarlyLink
     from robot_agent.agent.edges.lidar_start import LidarParts
-    from robot_agent.agent.settings import Settings
+    from robot_agent.agent.settings import Given, Settings
 
 _log = logs.get("agent")
 
 
 async def run(
-    settings: Settings, robot: RobotFile, clock: SystemClock, lidar: LidarParts, link: EarlyLink | None
+    settings: Settings,
+    robot: RobotFile,
+    given: Given,
+    clock: SystemClock,
+    lidar: LidarParts,
+    link: EarlyLink | None,
 ) -> None:
     """Localize, follow paths and gate the wheels until cancelled; `link`: to the guardian, if it was made already."""
-    site, body = read_site(settings)
-    key = read_operator_key(settings.operator_key_file)
-    base = registry.make_base(robot)
+    site, body = given.site, given.body
     _log.info("robot_settings", **describe_robot(robot, *registry.options(robot)))
     config = agent_config(
         settings.robot,
-        key,
-        base.drive_train,
+        given.operator_key,
+        given.base.drive_train,
         lidar.driver.traits,
         body,
         boot=secrets.token_hex(8),
         obstacle_ttl=settings.obstacle_memory_s,
-        footprint=read_footprint(robot),
+        footprint=given.footprint,
         settings=robot.settings,
-        finds_dock=isinstance(base, DockingDriver),
+        finds_dock=isinstance(given.base, DockingDriver),
     )
     use_one_thread()
     health = Health("map", "pose", "lidar", "base")
     async with ZenohEdge.open(
         connect=settings.zenoh_endpoints, clock=clock, role="robot-agent", id=settings.robot, site=site,
-        credentials=settings.credentials(),
+        credentials=given.credentials,
     ) as zenoh:  # fmt: skip
         with (
             open_core(config, settings.seed, settings.input_log) as core,

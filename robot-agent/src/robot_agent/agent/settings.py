@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import tomllib
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Final
+from typing import TYPE_CHECKING, Annotated, Final, NamedTuple
 
 import msgspec
 from msgspec import Meta
@@ -16,11 +16,14 @@ from fog_runtime.access.operator_key import OperatorKeyError
 from fog_runtime.access.operator_key import read_operator_key as read_key
 from fog_runtime.configuration.robot_file import VARIABLES
 from fog_runtime.configuration.settings import CommonSettings, SettingsError
+from robot_agent import registry
+from robot_agent.footprint import Footprint, FootprintError
 
 if TYPE_CHECKING:
     from fog_contracts.site import RobotSite
+    from fog_runtime.access.credentials import Credentials
     from fog_runtime.configuration.robot_file import RobotFile
-    from robot_agent.footprint import Footprint
+    from robot_agent.hardware import BaseDriver
 
 SITE_FILE: Final = "site.toml"
 
@@ -45,6 +48,36 @@ class Settings(CommonSettings, frozen=True, kw_only=True):
     input_log: Path | None = None
     obstacle_memory_s: Annotated[float, Meta(gt=0.0, le=600.0)] = 600.0
     agent_realtime_priority: Annotated[int, Meta(ge=0, le=9)] = 5
+
+
+class Given(NamedTuple):
+    """What the files say that the settings and the robot's file name, and the driver of the base."""
+
+    site: str
+    body: RobotSite | None
+    operator_key: bytes
+    credentials: Credentials
+    footprint: Footprint | None
+    base: BaseDriver
+
+
+def read_given(settings: Settings, robot: RobotFile) -> Given:
+    """Read all of it, before any device moves and anything slow is loaded.
+
+    Raises:
+        SettingsError: for a wrong setting or file.
+        CredentialsError: for wrong credentials.
+
+    """
+    site, body = read_site(settings)
+    return Given(
+        site=site,
+        body=body,
+        operator_key=read_operator_key(settings.operator_key_file),
+        credentials=settings.credentials(),
+        footprint=read_footprint(robot),
+        base=registry.make_base(robot),
+    )
 
 
 def read_site(settings: Settings) -> tuple[str, RobotSite | None]:
@@ -74,8 +107,6 @@ def read_footprint(robot: RobotFile) -> Footprint | None:
     """Return the footprint of the robot's settings, None for the site's circle; raises `SettingsError`."""
     if not robot.settings.body.footprint:
         return None
-    from robot_agent.footprint import Footprint, FootprintError  # noqa: PLC0415  # numpy: settings are read before it
-
     try:
         return Footprint(tuple(robot.settings.body.footprint))
     except FootprintError as error:

@@ -1,7 +1,8 @@
 """Begins the lidar's scan while the rest of the agent is still being loaded, which takes about a second.
 
 A lidar takes as long: its port is listened to before anything is written, its motor starts, and its first whole scan
-needs two turns of the head. Whatever fails here is left to the lidar's edge, which opens the port again, and says why.
+needs two turns of the head. The motor waits for the driver, the last that may refuse a setting. Whatever fails here is
+left to the lidar's edge, which opens the port again, and says why.
 """
 
 from __future__ import annotations
@@ -116,12 +117,12 @@ class LidarStart:
             port = contexts.enter_context(open_port(self._path, self._serial.baud))
             if refuse_speed(self._clock.speed, port.device) is not None:
                 return
-            set_motor(port, self._serial, on=True)
-            contexts.callback(self._stop_motor, port)
             port.discard_input()
             if await wrong_device(port, self._check(), self._clock) is not None:
                 return
             driver = await asyncio.wrap_future(self._driver)
+            set_motor(port, self._serial, on=True)
+            contexts.callback(self._stop_motor, port)
             port.write(driver.begin(self._clock.now()))
             while not self._taken.is_set():
                 await self._clock.sleep(_PERIOD_S)

@@ -1,6 +1,7 @@
 """`fognav bench warning`: an obstacle's way from a node's echo to a robot's path, through the whole fog."""
 
 import dataclasses
+import random
 import shutil
 from pathlib import Path
 from typing import Any, cast
@@ -10,11 +11,13 @@ from msgspec import structs
 
 from fog_contracts.messages import RobotPath, Trace
 from fog_contracts.site import NodeSite, Sonar
+from fog_runtime.clock import SystemClock
 from fog_runtime.configuration.site import load_site
 from fognav import checkout
 from fognav.bench import false_echoes, warning
 from fognav.bench.false_echoes import Asked, FalseEchoes, calibrated
 from fognav.bench.standing_robot import Arrived
+from fognav.nodes.simulated import StillFloor
 from fognav.output import FailedError, WrongUseError
 
 needs_compiler = pytest.mark.skipif(
@@ -110,6 +113,34 @@ def test_warnings_and_false_alarms_are_measured_in_simulated_time_and_repeatable
     assert many["false_alarms"] > few["false_alarms"]
     assert many["false_alarms_per_h"] == pytest.approx(many["false_alarms"] / 0.05)
     assert few == false_echoes.measure(loaded, "consecutive", Asked(0.0, 0.05, 3, 1))
+
+
+class Alarmed(false_echoes._Fog):
+    """A fog in which false echoes block an area just before the first two obstacles come."""
+
+    alarms_left = 2
+
+    def run(self, seconds: float) -> None:
+        if self.alarms_left:
+            self.alarms_left -= 1
+            self.world.false_echoes = FalseEchoes(1.0, 1)
+            assert self.run_until(lambda: self.states["z1"] == "blocked", 60.0)
+            self.world.false_echoes = FalseEchoes(0.0, 1)
+        super().run(seconds)
+
+
+@needs_compiler
+def test_obstacle_comes_again_where_a_false_alarm_had_blocked_its_area_before() -> None:
+    loaded = load_site(checkout.site_folder(Path("estig")))
+    world = StillFloor(loaded, (), SystemClock(), world=false_echoes._NoisyWorld).world
+    assert isinstance(world, false_echoes._NoisyWorld)
+    fog = Alarmed(loaded, world, loaded.site.nodes, "consecutive")
+    placed = false_echoes._barrier(loaded, ["z1"], 0, 1)
+    warned = false_echoes._warning(fog, ["z1"], placed, random.Random(1))
+    assert fog.alarms_left == 0
+    assert warned is not None
+    assert 0.3 < warned < 1.0, "five readings in a row"
+    assert world.obstacles == []
 
 
 @pytest.mark.live

@@ -38,6 +38,8 @@ _CALIBRATED_AFTER_S: Final = 600.0
 """Simulated seconds; a node with eight sonars needs less than 150."""
 _CLEAR_AFTER_S: Final = 600.0
 _MISSED_AFTER_S: Final = 10.0
+_TRIES: Final = 20
+"""So many obstacles in a row may come just when their area is blocked by false echoes."""
 _PHASE_S: Final = 0.3
 """Obstacles come at any moment of the nodes' cycle, which is shorter than this."""
 
@@ -214,16 +216,31 @@ def _barrier(loaded: LoadedSite, watched: Sequence[str], number: int, seed: int)
 
 
 def _warning(fog: _Fog, watched: Sequence[str], placed: tuple[str, SimObstacle], chance: random.Random) -> float | None:
-    """Return the time (s) from an obstacle's first echo until its area is blocked; None if that is missed."""
+    """Return the time (s) from an obstacle's first echo until its area is blocked; None if that is missed.
+
+    An area that a false alarm has blocked before that echo warns of nothing: then the obstacle is placed again.
+    Raises `FailedError` if that goes on.
+    """
     area, barrier = placed
-    _await_clear(fog, watched)
-    fog.run(chance.uniform(0.0, _PHASE_S))
     world = fog.world
-    world.forget()
-    world.place(barrier)
-    found = fog.run_until(lambda: world.echo is not None and fog.states[area] == "blocked", _MISSED_AFTER_S)
-    world.remove(barrier.id)
-    return fog.now - world.echo if found and world.echo is not None else None
+
+    def blocked() -> bool:
+        return fog.states[area] == "blocked"
+
+    for _ in range(_TRIES):
+        _await_clear(fog, watched)
+        fog.run(chance.uniform(0.0, _PHASE_S))
+        world.forget()
+        world.place(barrier)
+        happened = fog.run_until(lambda: world.echo is not None or blocked(), _MISSED_AFTER_S)
+        echo = world.echo
+        confirmed = echo is not None and fog.run_until(blocked, _MISSED_AFTER_S)
+        world.remove(barrier.id)
+        if echo is not None:
+            return fog.now - echo if confirmed else None
+        if not happened:
+            return None
+    raise FailedError(f"area {area} was blocked by a false alarm before each of {_TRIES}: choose fewer --false-echoes")
 
 
 def _await_clear(fog: _Fog, watched: Sequence[str]) -> None:

@@ -359,7 +359,7 @@ def test_frame_that_was_on_its_way_when_the_base_fell_asleep_makes_no_fault_of_i
     rig.frame(1.02, **late)
     for step in range(1, 60):
         assert rig.core.on_command(resting, 1.0 + 0.1 * step).data == b""
-        rig.core.tick(1.0 + 0.1 * step)
+        assert rig.core.tick(1.0 + 0.1 * step).data == b"", "bytes might wake it"
     assert rig.core.latched is None
     assert rig.core.on_command(WheelCommand(seq=2, left=0.0, right=0.0), 7.0).attempt.line == RTS
     rig.frame(7.005, **late)
@@ -367,6 +367,14 @@ def test_frame_that_was_on_its_way_when_the_base_fell_asleep_makes_no_fault_of_i
     assert rig.core.latched is None
     rig.frame(7.2)
     assert rig.wheels(rig.command(7.21))[0] > 0.0
+
+
+def test_base_that_sleeps_is_left_alone_when_the_link_to_the_agent_is_lost() -> None:
+    rig = Rig(base=SleepingBase())
+    rig.drive(0.2, 1.0, 0.0, 0.0)
+    assert rig.core.on_command(WheelCommand(seq=1, left=0.0, right=0.0, rest=True), 1.01).data == b"sleep;"
+    assert rig.core.on_agent_lost(1.5).data == b""
+    assert rig.core.tick(2.5).data == b""
 
 
 def test_base_that_no_line_wakes_is_not_put_to_sleep() -> None:

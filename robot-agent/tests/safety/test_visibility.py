@@ -39,6 +39,25 @@ def zone(visibility, twist=FORWARD):
     return visibility.limit((0.3, 0.3), twist).zone
 
 
+MIDDLES = np.degrees(SECTOR_ANGLES)
+AHEAD = MIDDLES[np.abs(MIDDLES) < 40.0].tolist()
+"""The sectors of travel straight ahead: 16 of them, since 0.70 rad are 40.1 degrees."""
+
+
+def scanned(*, blind=(), missing=(), walls=WALLS, config=None):
+    """A lidar that takes one sample of each sector but of those whose middles (degrees) are `blind`."""
+    seen, returned = (~np.isclose(MIDDLES[:, None], np.reshape(some, (1, -1))).any(axis=1) for some in (blind, missing))
+    visibility = Visibility(config or VisibilityConfig())
+    for _ in range(2):
+        visibility.update(SECTOR_ANGLES[seen], returned[seen], walls)
+    return visibility
+
+
+def heading(degrees, v=0.3):
+    """The arc of a robot that will head there (degrees from straight ahead or back) after half of 0.5 s."""
+    return Twist(v, math.radians(degrees) / 0.25)
+
+
 def test_lidar_that_sees_all_around_limits_nothing():
     visibility = seeing()
     assert [zone(visibility, twist) for twist in (FORWARD, BACKWARD, TURNING)] == ["free"] * 3
@@ -210,3 +229,65 @@ def test_few_samples_of_a_sector_count_by_half_of_them_too(samples, returned, zo
 def test_angles_of_the_sectors_can_not_be_changed():
     with pytest.raises(ValueError, match="read-only"):
         SECTOR_ANGLES[0] = 0.0
+
+
+# --- the limits themselves, by whole sectors ---
+
+
+def test_standing_robot_is_not_limited_and_needs_no_reason():
+    assert seeing(missing=180.0).limit((0.0, 0.0), Twist(0.0, 0.0)) == ((0.0, 0.0), "free", None)
+
+
+@pytest.mark.parametrize(
+    ("blind", "expected"),
+    [((37.5, 42.5), "slow"), ((42.5, 47.5), "free"), ((-32.5, -37.5), "slow"), ((-37.5, -42.5), "free")],
+)
+def test_sectors_of_travel_end_at_0_70_rad_to_each_side_of_the_heading(blind, expected):
+    # Towards 2.5 degrees these are 17 sectors, from -37.5 to 42.5: two blind ones of them are more than a tenth.
+    assert zone(scanned(blind=blind, walls=OPEN), heading(2.5)) == expected
+
+
+def test_sectors_of_travel_may_begin_straight_behind():
+    turning_back = heading(-40.0, v=-0.3)
+    assert zone(scanned(blind=(-177.5, -172.5), walls=OPEN), turning_back) == "slow"
+    assert zone(scanned(blind=(177.5, 172.5), walls=OPEN), turning_back) == "free"
+
+
+@pytest.mark.parametrize(("count", "expected"), [(7, "free"), (8, "slow"), (14, "slow"), (15, "stop")])
+def test_half_of_the_expected_returns_slows_and_nine_tenths_stop_a_robot_that_was_free(count, expected):
+    assert zone(scanned(missing=AHEAD[:count])) == expected
+
+
+def test_nine_of_ten_expected_returns_are_nine_tenths():
+    ten = np.isin(MIDDLES, AHEAD[:10])
+    assert zone(scanned(missing=AHEAD[:9], walls=ten)) == "stop"
+
+
+@pytest.mark.parametrize(("count", "expected"), [(1, "free"), (2, "slow"), (7, "slow"), (8, "stop")])
+def test_a_tenth_of_unmeasured_directions_slows_and_half_of_them_stop_a_robot_that_was_free(count, expected):
+    assert zone(scanned(blind=AHEAD[:count], walls=OPEN)) == expected
+
+
+def test_share_of_unmeasured_directions_that_is_exactly_the_limit_slows():
+    assert zone(scanned(blind=AHEAD[:2], walls=OPEN, config=VisibilityConfig(blind_slow=2 / 16))) == "slow"
+
+
+def test_missing_return_is_suspicious_only_where_the_map_expects_one():
+    walls = np.isin(MIDDLES, AHEAD[:8])
+    assert zone(scanned(missing=AHEAD[8:], walls=walls)) == "free"
+    assert zone(scanned(missing=AHEAD[:8], walls=walls)) == "stop"
+
+
+def test_direction_that_is_not_measured_counts_as_one_without_a_return():
+    visibility = Visibility(VisibilityConfig())
+    visibility.update(SECTOR_ANGLES, np.zeros(72, np.bool_), WALLS)
+    assert zone(visibility) == "free", "one scan alone changes nothing"
+    visibility.update(SECTOR_ANGLES[:0], np.zeros(0, np.bool_), WALLS)
+    assert zone(visibility) == "stop"
+
+
+def test_blind_direction_is_seen_again_with_its_next_sample():
+    visibility = scanned(blind=MIDDLES, walls=OPEN)
+    assert zone(visibility) == "stop"
+    visibility.update(SECTOR_ANGLES, np.ones(72, np.bool_), OPEN)
+    assert zone(visibility) == "free"

@@ -94,6 +94,15 @@ PARTS: Final = (
                 "(sector + 0.5) * math.tau / SECTORS - math.pi -> (sector + 0.5) * math.tau / SECTORS + math.pi",
                 "directions that differ by whole turns are the same",
             ),
+            *(
+                Equivalent(
+                    "visibility", code, "twist.v > 0.0 -> twist.v >= 0.0", "a robot that does not advance is let pass"
+                )
+                for code in (
+                    "heading = lead if twist.v > 0.0 else math.pi - lead",
+                    'side = "ahead" if twist.v > 0.0 else "behind"',
+                )
+            ),
         ),
     ),
     Part(

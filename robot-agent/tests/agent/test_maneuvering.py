@@ -184,6 +184,9 @@ class Localizer:
     def odom_at(self, _now):
         return self.odom
 
+    def latest_odom(self):
+        return self.odom
+
     def pose(self, _now):
         return self.place
 

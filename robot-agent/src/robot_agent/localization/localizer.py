@@ -198,6 +198,10 @@ class Localizer:
         """Pose in `odom` at a time (s), interpolated; extrapolated by at most 0.15 s. None before the first."""
         return self._odometry.pose(timestamp)
 
+    def latest_odom(self) -> Pose2 | None:
+        """Pose in `odom` by the newest reading of the wheels, however old it is; None before the first."""
+        return self._odometry.latest()
+
     def odom_track(self, since: float) -> Track:
         """Return where the robot was in `odom` from a time (s) on, as `odom_at` does; there must be a pose."""
         return self._odometry.track(since)

@@ -83,9 +83,12 @@ class Maneuvers:
         odom = self._localizer.odom_at(now)
         if kind != self._kind:
             self._kind = kind
-            self._turning.begin(odom)
+            # The robot stands, or nearly. Just after a stop the twist is still that of its drive, and a pose that is
+            # extrapolated by it up to 2 cm too far ahead: a way back from there would be too short by that.
+            begun_at = self._localizer.latest_odom()
+            self._turning.begin(begun_at)
             for straight in self._straight.values():
-                straight.begin(odom)
+                straight.begin(begun_at)
         if kind in self._straight:
             return ManeuverInputs(self._straight[kind].remaining(odom), self._guard.reason)
         if kind == "turn":

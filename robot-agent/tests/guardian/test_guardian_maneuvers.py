@@ -309,6 +309,46 @@ def test_reset_ends_backing_off():
     assert not rig.core.moving
 
 
+# --- an agent that falls silent ---
+
+
+def backing_off() -> Docking:
+    rig = bumped()
+    rig.steps(0.2, "back_off", -0.05)
+    return rig
+
+
+@pytest.mark.parametrize(
+    ("begin", "name"),
+    [(seeking, "the base's search for its dock"), (leaving, "leaving the dock"), (backing_off, "backing off")],
+)
+@pytest.mark.parametrize("gone", [False, True])
+def test_maneuver_that_the_agents_silence_has_ended_says_so_and_begins_again_by_a_new_order_only(begin, name, gone):
+    rig = begin()
+    assert rig.core.moving
+    rig.now += 0.22
+    rig.frame(rig.now, **rig.status)
+    rig.core.on_agent_lost(rig.now) if gone else rig.core.tick(rig.now)
+    assert not rig.core.moving
+    rig.steps(0.5)
+    assert not rig.core.moving
+    assert rig.feedback.stopped == (
+        f"{name} was ended because the agent sent no fresh command: find in the agent's log why it was late or gone, "
+        "then order it again"
+    )
+    asked = rig.asked
+    rig.steps(0.2, None)
+    assert "was ended" not in (rig.feedback.stopped or "")
+    rig.steps(0.1, asked)
+    assert rig.core.moving
+
+
+def test_maneuver_that_the_agent_has_ended_leaves_no_problem():
+    rig = backing_off()
+    rig.steps(0.2, None, 0.0)
+    assert rig.feedback.stopped is None
+
+
 # --- with the emulated Roomba ---
 
 

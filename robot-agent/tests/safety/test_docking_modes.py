@@ -305,6 +305,20 @@ def test_back_off_ends_after_five_seconds():
     assert gate.run(0.2, maneuver_remaining=0.09, **BUMPED).mode == "FAULT"
 
 
+@pytest.mark.parametrize(("problem", "told"), [(None, "backing off was ended"), ("a chair", "a chair")])
+def test_back_off_that_takes_too_long_tells_what_stops_it_or_why_the_guardian_ended_it(problem, told):
+    gate = backing_off()
+    gate.run(5.1, maneuver_remaining=0.09, maneuver_problem=problem, base_stopped="backing off was ended", **BUMPED)
+    assert gate.run(request="reset", base_fault="the bumper is pressed (left)").mode == "INIT"
+    assert f"the back-off ended: it took longer than 5 s: {told}" in gate.out.reasons
+
+
+def test_undocking_that_the_guardian_has_ended_tells_why_when_it_ends():
+    gate = undocking()
+    out = gate.run(10.1, maneuver_remaining=0.3, base_stopped="leaving the dock was ended")
+    assert "no nearer to its end for 10 s: leaving the dock was ended" in "; ".join(out.reasons)
+
+
 @pytest.mark.parametrize("kind", ["turn", "advance"])
 @pytest.mark.parametrize("changes", STOPS[:3] + STOPS[7:] + [(fault, "") for fault in FAULTS])
 def test_base_and_lidar_refuse_looking_around_and_end_it(kind, changes):

@@ -260,15 +260,15 @@ class GuardianCore:
     def _maneuver(self, now: float) -> bytes:
         """Begin or end the maneuver that the agent asks for, or no longer does; return the bytes for it."""
         base, maneuvers, command = self._base, self._maneuvers, self._fresh_command(now)
-        asked = None if command is None else command.maneuver
         if base.reading is None:
             return b""
         if maneuvers.running is not None:
-            return self._end_maneuver(now) if maneuvers.is_over(asked, base.reading, now) else b""
+            return self._end_maneuver(now) if maneuvers.is_over(command, base.reading, now) else b""
+        if command is None:
+            return b""
         moving = self._wheels != (0.0, 0.0)
-        data = maneuvers.begin(
-            asked, base.reading, Situation(base.awake, moving, self._latched is not None, self._bumped), now
-        )
+        situation = Situation(base.awake, moving, self._latched is not None, self._bumped)
+        data = maneuvers.begin(command.maneuver, base.reading, situation, now)
         if maneuvers.is_running("leave_dock"):
             # Its own protection is off from now on, so every frame counts.
             base.awake, base.overcurrent_since, self._stepped_at = True, None, now

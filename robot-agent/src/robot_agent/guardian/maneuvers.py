@@ -5,7 +5,7 @@
 - `back_off`: straight back from what presses the bumper, although that fault is latched.
 
 One goes on only as long as the agent asks for it by fresh commands. One that has ended can't begin again before the
-agent has stopped asking.
+agent has stopped asking, by a command without it: when the agent is silent, it has not.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from robot_agent.hardware import DockingDriver
 if TYPE_CHECKING:
     from collections.abc import Mapping
 
-    from robot_agent.guardian.link import Maneuver
+    from robot_agent.guardian.link import Maneuver, WheelCommand
     from robot_agent.hardware import BaseDriver, BaseReading, BaseStatus, WheelOdometry
 
 
@@ -65,7 +65,7 @@ class Maneuvers:
         self._wrap = driver.drive_train.travel_wrap_m
         self.running: Maneuver | None = None
         self.problem: str | None = None
-        """Why the last one was ended although the agent still asks for it."""
+        """Why the last one was ended although the agent did not stop asking for it."""
         self._ended: Maneuver | None = None
         self._since = 0.0
         self._begun_at: WheelOdometry | None = None
@@ -95,11 +95,20 @@ class Maneuvers:
         """Return whether this one is under way."""
         return self.running == kind
 
-    def is_over(self, asked: Maneuver | None, reading: BaseReading, now: float) -> bool:
-        """Return whether the one that runs has to end: nobody asks for it, it is done, or a limit is reached."""
+    def is_over(self, command: WheelCommand | None, reading: BaseReading, now: float) -> bool:
+        """Return whether the one that runs has to end: nobody asks for it, it is done, or a limit is reached.
+
+        command: the agent's, None without a fresh one.
+        """
         running = self.running
         assert running is not None
-        if asked != running or (running == "leave_dock" and not reading.status.charging):
+        if command is None:
+            self.problem = (
+                f"{_NAMES[running]} was ended because the agent sent no fresh command: find in the agent's log why it "
+                "was late or gone, then order it again"
+            )
+            return True
+        if command.maneuver != running or (running == "leave_dock" and not reading.status.charging):
             return True
         limit = LIMITS[running]
         if now - self._since > limit.seconds:

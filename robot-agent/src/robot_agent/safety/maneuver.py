@@ -74,7 +74,7 @@ def proceed(
         return End(*end)
     longest = rules.longest(config)
     if now - maneuver.since >= longest:
-        return End(f"it took longer than {longest:.0f} s")
+        return End(f"it took longer than {longest:.0f} s{_because(inputs)}")
     return _progress(maneuver, inputs, now, config)
 
 
@@ -87,6 +87,11 @@ def _progress(maneuver: Maneuver, inputs: SafetyInputs, now: float, config: Safe
     if remaining < maneuver.best - config.egress_step:
         return replace(maneuver, best=remaining, shrank_at=now)
     if now - maneuver.shrank_at >= config.egress_stall:
-        problem = f": {inputs.maneuver_problem}" if inputs.maneuver_problem else ""
-        return End(f"the robot came no nearer to its end for {config.egress_stall:.0f} s{problem}")
+        return End(f"the robot came no nearer to its end for {config.egress_stall:.0f} s{_because(inputs)}")
     return maneuver
+
+
+def _because(inputs: SafetyInputs) -> str:
+    """Return the end of a sentence: what keeps the robot from getting there, or why the guardian holds its wheels."""
+    problem = inputs.maneuver_problem or inputs.base_stopped
+    return f": {problem}" if problem else ""

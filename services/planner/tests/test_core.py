@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from msgspec import structs
 from numpy.typing import NDArray
 from ring_map import LEFT, LOWER, RES, RIGHT, UPPER, Grid, RingMap, goal, pose, via
 
@@ -25,6 +26,7 @@ from fog_contracts.messages import (
     PlanReply,
     PlanRequest,
     Pose,
+    ProfileName,
     RobotGoal,
     RobotPath,
     RobotRelease,
@@ -120,11 +122,12 @@ class Drive:
             elif isinstance(publication.message, RobotGoal):
                 self.goals.append(publication.message)
 
-    def follow(self, path: RobotPath | None) -> None:
+    def follow(self, path: RobotPath | None, profile: ProfileName = "fog") -> None:
         """Let the robot's state name this path and its goal."""
         state = RobotState(
             mode="NORMAL", reasons=[], enabled=True, battery=None, goal_id=path and path.goal_id, map_epoch=1,
             map_seq=0, plan_id=path and path.plan_id, planner_epoch=path and path.planner_epoch,
+            profile=profile,
         )  # fmt: skip
         self.deliver(ch.ROBOT_STATE, state, robot="r1")
 
@@ -278,6 +281,25 @@ def test_path_is_published_again_once_a_second_until_the_robots_state_names_it()
     assert len(drive.paths) == count + 3, "the robot still names the path before"
     released = [release.plan_id for release in drive.releases]
     assert released == sorted(released), "a path that was replaced is not released any more"
+
+
+def test_path_is_not_repeated_to_a_robot_that_plans_for_itself_until_it_drives_by_the_fogs_paths_again() -> None:
+    drive = Drive(start=LEFT)
+    first = drive.go(*RIGHT)
+    own = structs.replace(first, plan_id=31, planner_epoch=0)
+    drive.follow(own, "default")
+    count = len(drive.paths)
+    drive.step(5.0)
+    assert len(drive.paths) == count
+    drive.send(drive.map.put("z1", UPPER))
+    drive.step()
+    second = drive.paths[-1]
+    assert (len(drive.paths), second.plan_id > first.plan_id) == (count + 1, True), "consoles get each new path once"
+    drive.step(5.0)
+    assert len(drive.paths) == count + 1
+    drive.follow(None)
+    drive.step()
+    assert (len(drive.paths), drive.paths[-1].plan_id) == (count + 2, second.plan_id)
 
 
 def test_goal_is_published_once_a_second_until_the_robots_state_agrees_and_then_seldom() -> None:

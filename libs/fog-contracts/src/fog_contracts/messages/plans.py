@@ -90,9 +90,9 @@ class RobotRelease(Message, frozen=True, kw_only=True):
 class RobotPath(Message, frozen=True, kw_only=True):
     """The path to the goal, or why there is none; published once per plan, and again until the robot names its plan.
 
-    `points` are the corners, joined by straight lines (`fog_contracts.geometry.sampled` puts points between them). The
-    robot may drive the first `released_length` metres without hearing from the planner again; `RobotRelease` extends
-    that while all is well.
+    To a robot whose `profile` lets it plan for itself it is not repeated. `points` are the corners, joined by straight
+    lines (`fog_contracts.geometry.sampled` puts points between them). The robot may drive the first `released_length`
+    metres without hearing from the planner again; `RobotRelease` extends that while all is well.
     """
 
     plan_id: Count

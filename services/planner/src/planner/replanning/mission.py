@@ -82,6 +82,8 @@ class Mission:
     """The goal that the robot has, by its last state ..."""
     heard: bool = False
     """... if there was one."""
+    plans_itself: bool = False
+    """Whether the robot does not drive by this planner's paths, by its last state: it never names one."""
 
     @property
     def target(self) -> Pose | None:
@@ -154,6 +156,7 @@ class Mission:
         """Note what the robot has received."""
         self.received = received_path(state)
         self.robots_goal, self.heard = state.goal_id, True
+        self.plans_itself = state.profile != "fog"
 
     def end_unknown(self, goal_id: str) -> None:
         """End a goal that the robot has and nobody stored any more: it was cancelled, or replaced, unheard by it."""
@@ -185,12 +188,13 @@ class Mission:
     def due_path(self, at: Moment, config: PlannerConfig, epoch: int, version: Version) -> RobotPath | None:
         """Return the path or refusal when it is new, has changed, or its robot has not received it for a while.
 
-        The first publication stamps the plan's traces; later ones leave them unchanged. `version` is the map's.
+        Nothing is repeated to a robot that plans for itself. The first publication stamps the plan's traces; later ones
+        leave them unchanged. `version` is the map's.
         """
         goal, plan, target = self.goal, self.plan, self.target
         if goal is None or plan is None or target is None or at.now < plan.path_due:
             return None
-        if not math.isinf(plan.path_due) and self.received == (epoch, plan.plan_id):
+        if not math.isinf(plan.path_due) and (self.plans_itself or self.received == (epoch, plan.plan_id)):
             return None
         plan.path_due = at.now + config.path_retry_s
         self.release_due = at.now + config.release_period_s

@@ -12,6 +12,7 @@ import importlib.util
 import json
 import math
 import os
+import resource
 import signal
 import sys
 import tempfile
@@ -35,6 +36,8 @@ _INI: Final = "[pytest]\nfilterwarnings = ignore\nmarkers =\n  live: x\n  reacti
 
 
 _PATIENCE_S: Final = 120
+_CPU_S: Final = 20
+"""Processor time of a mutant besides thrice what its tests take while their coverage is measured, which slows them."""
 
 
 class Coverage(NamedTuple):
@@ -111,8 +114,10 @@ def start_mutant(part: Part, root: Path, module: str, tree: ast.Module, seconds:
     """Start the tests on a changed module; return the child's id. It exits with 0 if no test fails."""
     child = os.fork()
     if child == 0:
-        # A mutant may loop for ever.
-        signal.alarm(_PATIENCE_S + 10 * int(sum(seconds.values())))
+        # A mutant may loop for ever, which its processor time shows soon however busy the machine is, or wait for ever.
+        took = int(sum(seconds.values()))
+        resource.setrlimit(resource.RLIMIT_CPU, (_CPU_S + 3 * took, resource.RLIM_INFINITY))
+        signal.alarm(_PATIENCE_S + 10 * took)
 
         def run() -> int:
             sys.meta_path.insert(0, _Finder(module, tree))

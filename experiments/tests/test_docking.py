@@ -278,6 +278,30 @@ def test_robot_backs_off_from_a_bump_by_ten_centimetres_at_most_and_keeps_its_fa
     run.until(lambda: run.state.mode == "INIT", 0.5)
 
 
+@pytest.mark.parametrize(("later_s", "ordered_after_s"), [(0.0, 0.06), (0.04, 0.0)])
+def test_robot_that_drove_into_something_a_moment_ago_backs_off_by_nine_to_ten_centimetres(later_s, ordered_after_s):
+    # In the first case it stands, and its last frame is old; in the second it still rolls on.
+    run = Run(site=site_with_dock(Pose(x=1.5, y=2.6, theta=-math.pi / 2)))
+    goal = RobotGoal(goal_id="g", pose=Pose(x=1.5, y=1.5, theta=0.0), stamp=0.0)
+    run.system.fog.planner.set_goal("r1", goal, any_heading=True)
+    run.until(lambda: min(run.wheels) > 0.28, 20.0)
+    run.run(later_s)
+    heading = run.system.world.pose[2]
+    bump(run)
+    run.until(lambda: run.state.mode == "FAULT", 1.0)
+    run.run(ordered_after_s)
+    assert run.system.robot.command("back_off").accepted
+    along = []
+    for _ in range(300):
+        run.system.step()
+        x, y, _ = run.system.world.pose
+        along.append(x * math.cos(heading) + y * math.sin(heading))
+        if along[-1] < max(along) - 0.03:
+            run.base.world.bump_left = False
+    assert run.state.mode == "FAULT"
+    assert 0.09 <= max(along) - along[-1] <= 0.10
+
+
 def test_robot_does_not_back_off_into_what_its_lidar_sees_behind_it():
     run = Run()
     x, y, _ = run.system.world.pose

@@ -93,6 +93,32 @@ def test_straight_way_ahead_ends_where_its_length_is_driven():
     assert way.remaining(ORIGIN) == math.inf
 
 
+def ahead(x: float) -> Pose2:
+    return Pose2(x, 0.0, 0.0)
+
+
+def test_way_back_of_a_robot_that_still_rolls_ahead_counts_from_where_it_turns_round():
+    way = Straight(-0.09, 0.05)
+    way.advance(ORIGIN)
+    assert way.remaining(ORIGIN) == math.inf, "it has not begun"
+    way.begin(ORIGIN)
+    for x, left in ((0.02, 0.09), (0.03, 0.09), (0.02, 0.08), (-0.05, 0.01)):
+        way.advance(ahead(x))
+        way.advance(None)
+        assert way.remaining(ahead(x)) == pytest.approx(left)
+
+
+def test_robot_that_is_moved_the_other_way_by_more_than_5_cm_has_all_of_that_to_go_back():
+    way = Straight(0.4, 0.1)
+    for _ in range(2):
+        way.begin(ORIGIN)
+        way.advance(ahead(-0.03))
+        way.advance(ahead(-0.05))
+        assert way.remaining(ahead(-0.05)) == pytest.approx(0.4)
+        way.advance(ahead(-0.06))
+        assert way.remaining(ahead(-0.06)) == pytest.approx(0.41)
+
+
 # --- the way out ---
 
 

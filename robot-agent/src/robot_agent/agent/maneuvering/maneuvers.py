@@ -80,16 +80,16 @@ class Maneuvers:
     def inputs(self, state: SafetyState, replica: Replica, trusted: Pose2 | None, now: float) -> ManeuverInputs:
         """Return how the maneuver goes; `trusted`: the robot's pose if that is good enough."""
         kind = None if state.maneuver is None else state.maneuver.kind
-        odom = self._localizer.odom_at(now)
+        # Just after a stop the twist still is that of the drive, and a pose that is extrapolated by it up to 2 cm too
+        # far ahead: a way back from there would be too short by that. So maneuvers begin at a measured pose.
+        odom, measured = self._localizer.odom_at(now), self._localizer.latest_odom()
         if kind != self._kind:
             self._kind = kind
-            # The robot stands, or nearly. Just after a stop the twist is still that of its drive, and a pose that is
-            # extrapolated by it up to 2 cm too far ahead: a way back from there would be too short by that.
-            begun_at = self._localizer.latest_odom()
-            self._turning.begin(begun_at)
+            self._turning.begin(measured)
             for straight in self._straight.values():
-                straight.begin(begun_at)
+                straight.begin(measured)
         if kind in self._straight:
+            self._straight[kind].advance(measured)
             return ManeuverInputs(self._straight[kind].remaining(odom), self._guard.reason)
         if kind == "turn":
             self._turning.advance(odom)

@@ -39,3 +39,10 @@ def test_processes_that_share_a_core_wait_and_stopped_or_ended_ones_do_not():
         time.sleep(0.05)
         assert stopped.seconds() == 0.0
     assert both.seconds() == 0.0, "they have ended"
+
+
+def test_process_that_ends_between_two_looks_counts_for_nothing() -> None:
+    """Engines start and end helpers all the time: one that is gone when it is read must not fail a test."""
+    with subprocess.Popen([sys.executable, "-c", ""]) as gone:
+        gone.wait(60.0)
+    assert Lateness(lambda: [gone.pid]).seconds() == 0.0

@@ -31,8 +31,16 @@ class Lateness:
     def _waited(self) -> dict[Path, float]:
         found: dict[Path, float] = {}
         for pid in self._pids():
-            for thread in Path(f"/proc/{pid}/task").glob("*"):
+            for thread in _threads(pid):
                 # The second figure of sched(5)'s statistics: ns on a run queue. The thread may just have ended.
                 with contextlib.suppress(OSError, IndexError):
                     found[thread] = int((thread / "schedstat").read_text("ascii").split()[1]) / 1e9
         return found
+
+
+def _threads(pid: int) -> list[Path]:
+    """Return the folders of a process's threads: none of a process that has just ended."""
+    try:
+        return list(Path(f"/proc/{pid}/task").iterdir())
+    except (FileNotFoundError, ProcessLookupError):
+        return []

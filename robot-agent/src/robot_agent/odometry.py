@@ -3,15 +3,13 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Final
+from typing import TYPE_CHECKING, Final, NamedTuple
 
 if TYPE_CHECKING:
     from robot_agent.hardware import DriveTrain, WheelOdometry
 
 
-@dataclass(frozen=True, slots=True)
-class Reading:
+class Reading(NamedTuple):
     """Counters of both wheels (m), and their time of arrival (s, the caller's monotonic clock)."""
 
     left_m: float
@@ -19,8 +17,7 @@ class Reading:
     timestamp: float
 
 
-@dataclass(frozen=True, slots=True)
-class EncoderFault:
+class EncoderFault(NamedTuple):
     """A step that no wheel can make. It does not change the pose."""
 
     left_m: float
@@ -35,8 +32,7 @@ class EncoderFault:
         )
 
 
-@dataclass(frozen=True, slots=True)
-class Motion:
+class Motion(NamedTuple):
     """A plausible step: travel of the wheels in metres, and the pose (x, y in metres, theta in radians) after it.
 
     `skipped`: the jump before this step, if the readings since agree with it. It is not part of the pose: the base
@@ -51,8 +47,7 @@ class Motion:
     skipped: EncoderFault | None = None
 
 
-@dataclass(frozen=True, slots=True)
-class OdometryState:
+class OdometryState(NamedTuple):
     """Pose in the odometry frame (metres, radians, theta not wrapped) and the readings that it is based on."""
 
     x: float = 0.0
@@ -95,17 +90,17 @@ def advance(state: OdometryState, reading: Reading, drive: DriveTrain) -> tuple[
     trusted, and the jump itself never counts as motion.
     """
     if state.trusted is None:
-        return replace(state, trusted=reading), Motion(0.0, 0.0, state.x, state.y, state.theta)
+        return state._replace(trusted=reading), Motion(0.0, 0.0, state.x, state.y, state.theta)
     left_m, right_m, possible_m = _step(state.trusted, reading, drive)
     skipped = None
     if max(abs(left_m), abs(right_m)) > possible_m:
         fault = EncoderFault(left_m, right_m, possible_m, reading.timestamp - state.trusted.timestamp)
         skipped = fault
         if state.suspect is None:
-            return replace(state, suspect=reading), fault
+            return state._replace(suspect=reading), fault
         left_m, right_m, possible_m = _step(state.suspect, reading, drive)
         if max(abs(left_m), abs(right_m)) > possible_m:
-            return replace(state, suspect=reading), fault
+            return state._replace(suspect=reading), fault
     x, y, theta = integrate(state.x, state.y, state.theta, left_m, right_m, drive.axle_m)
     return OdometryState(x, y, theta, trusted=reading), Motion(left_m, right_m, x, y, theta, skipped)
 

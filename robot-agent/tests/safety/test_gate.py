@@ -10,6 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from robot_agent.config import SafetyConfig
+from robot_agent.safety import gate as gate_module
 from robot_agent.safety.conditions import Level, SafetyInputs, collect_findings
 from robot_agent.safety.gate import SafetyOutputs, SafetyState, step
 from robot_agent.safety.wheel_limits import limit_wheels, ramp_down
@@ -317,6 +318,26 @@ EPISODE = st.tuples(
     st.sampled_from([1, 2, 10, 41]),
     st.tuples(st.floats(-0.5, 0.5), st.floats(-0.5, 0.5)),
 )
+
+
+@settings(max_examples=100, deadline=None)
+@given(st.lists(st.tuples(EPISODE, st.sampled_from([None, None, 0.0, 5.0])), max_size=10), st.floats(0.9, 1.1))
+def test_step_that_changes_nothing_but_the_time_is_that_of_the_whole_gate(episodes, pace):
+    whole, short, now, shortened = SafetyState(), SafetyState(), 100.0, 0
+    healthy = ({}, "enable", 50, None), None
+    for (changes, request, ticks, _), docked_for in [healthy, *episodes, healthy]:
+        for tick in range(ticks):
+            now += pace * DT
+            given_inputs = inputs(**{**changes, "request": None if tick else request, "docked_for": docked_for})
+            shortened += gate_module._goes_on(short, given_inputs, now, CONFIG) and not collect_findings(
+                given_inputs, CONFIG
+            )
+            short, short_out = step(short, given_inputs, now)
+            with pytest.MonkeyPatch.context() as patch:
+                patch.setattr(gate_module, "_goes_on", lambda *_: False)
+                whole, whole_out = step(whole, given_inputs, now)
+            assert (short, short_out) == (whole, whole_out)
+    assert shortened
 
 
 @settings(max_examples=200, deadline=None)

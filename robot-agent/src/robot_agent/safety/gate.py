@@ -95,6 +95,10 @@ def step(
     """
     config, before = config or SafetyConfig(), state.mode
     findings = collect_findings(_relevant(state, inputs), config)
+    if not findings and _goes_on(state, inputs, now, config):
+        # Nearly all steps of a robot that drives: all but the time stays as it is.
+        new = replace(state, last_demanded=(now, *state.last_demanded[1:]))
+        return new, _outputs(new, before, None, config)
     map_held_at = state.map_held_at
     if any(finding.about_map for finding in findings):
         map_held_at = now
@@ -128,6 +132,17 @@ def step(
         new = _advance(state, findings, demanded, now, config)
     new = replace(new, reasons=_reasons(new, findings))
     return new, _outputs(new, before, refusal, config)
+
+
+def _goes_on(state: SafetyState, inputs: SafetyInputs, now: float, config: SafetyConfig) -> bool:
+    """Return whether a step without findings changes nothing: the robot is in NORMAL, and nothing is still to end."""
+    if state.mode != "NORMAL" or not state.enabled or state.maneuver is not None or inputs.request is not None:
+        return False
+    if state.latched or state.stops or state.reasons or state.stopped_since != math.inf:
+        return False
+    if inputs.docked_for is not None or (inputs.mission and now - inputs.plan_age <= state.map_held_at):
+        return False
+    return not any(now - last < config.relax_after for last in state.last_demanded[1:])
 
 
 def _relevant(state: SafetyState, inputs: SafetyInputs) -> SafetyInputs:

@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 from fog_kernels.amcl import score_poses
 from fog_kernels.distance import likelihood_field, squared_distance_capped
 from fog_kernels.raycast import cast
-from fog_kernels.scans import Mounting, Tolerances, Track, climb, compared, placed, smoothed
+from fog_kernels.scans import Mounting, Tolerances, Track, climb, compared, into_frame, out_of_frame, placed, smoothed
 
 RESOLUTION = 0.05
 ORIGIN = (-1.0, 0.5)
@@ -89,6 +89,22 @@ def test_smoothed_points_are_the_means_with_their_near_neighbours_within_the_lim
     shift = (towards_next - np.roll(towards_next, 1, axis=0)) / (1.0 + joined + np.roll(joined, 1))[:, None]
     shift /= np.maximum(np.hypot(shift[:, 0], shift[:, 1]) / 0.01, 1.0)[:, None]
     assert smoothed(ring, 0.06, 0.01) == pytest.approx(ring + shift, abs=1e-12)
+
+
+@settings(max_examples=examples(100))
+@given(
+    st.lists(st.tuples(st.floats(-9.0, 9.0), st.floats(-9.0, 9.0)), max_size=20),
+    st.tuples(st.floats(-50.0, 50.0), st.floats(-50.0, 50.0), st.floats(-7.0, 7.0)),
+)
+def test_points_in_a_frame_and_out_of_it_are_numpys_to_the_bit(points, pose):
+    given_points = np.array(points).reshape(-1, 2)
+    x, y, cos, sin = pose[0], pose[1], math.cos(pose[2]), math.sin(pose[2])
+    px, py = given_points.T
+    out = np.column_stack((x + cos * px - sin * py, y + sin * px + cos * py))
+    assert np.array_equal(out_of_frame(given_points, *pose), out)
+    dx, dy = px - x, py - y
+    assert np.array_equal(into_frame(given_points, *pose), np.column_stack((cos * dx + sin * dy, -sin * dx + cos * dy)))
+    assert into_frame(out, *pose) == pytest.approx(given_points, abs=1e-9)
 
 
 @settings(max_examples=examples(60))
@@ -177,6 +193,9 @@ def test_wrong_arrays_are_refused_by_name():
         placed(np.zeros(2), np.ones(2), 0.0, 0.1, Track(np.zeros((0, 4)), 0.0, 0.0, 0.15), LIDAR, 0.1, 5.0)
     with pytest.raises(ValueError, match=r"points must have shape \(n, 2\)"):
         smoothed(np.zeros((4, 3)), 0.06, 0.01)
+    for change in (into_frame, out_of_frame):
+        with pytest.raises(ValueError, match=r"points must have shape \(n, 2\)"):
+            change(np.zeros((4, 3)), 0.0, 0.0, 0.0)
     points = points_at(PLACE)
     with pytest.raises(ValueError, match="one shape"):
         compared(points, PLACE, ROOM, WALL_DISTANCE[1:], RESOLUTION, ORIGIN, 1.0, 13.0, TOLERANCES)

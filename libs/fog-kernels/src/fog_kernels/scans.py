@@ -154,6 +154,21 @@ def _smoothed(points: Any, surface: float, farthest: float, out: Any) -> None:
         out[i, 1] = y + shift_y / excess
 
 
+@njit(void(_arrays.F64_GRID, float64, float64, float64, float64, _F64_GRID_OUT), cache=True, nogil=True)
+def _out_of_frame(points: Any, x: float, y: float, cos: float, sin: float, out: Any) -> None:
+    for i in range(points.shape[0]):
+        out[i, 0] = x + cos * points[i, 0] - sin * points[i, 1]
+        out[i, 1] = y + sin * points[i, 0] + cos * points[i, 1]
+
+
+@njit(void(_arrays.F64_GRID, float64, float64, float64, float64, _F64_GRID_OUT), cache=True, nogil=True)
+def _into_frame(points: Any, x: float, y: float, cos: float, sin: float, out: Any) -> None:
+    for i in range(points.shape[0]):
+        dx, dy = points[i, 0] - x, points[i, 1] - y
+        out[i, 0] = cos * dx + sin * dy
+        out[i, 1] = -sin * dx + cos * dy
+
+
 @njit(
     void(
         _arrays.F64_GRID, float64, float64, float64, _arrays.U8_GRID, _arrays.F32_GRID, float64, float64, float64,
@@ -322,6 +337,25 @@ def smoothed(points: NDArray[np.float64], surface: float, farthest: float) -> ND
     return out
 
 
+def out_of_frame(points: NDArray[np.float64], x: float, y: float, theta: float) -> NDArray[np.float64]:
+    """Return points (n, 2; m), given in a frame at a pose (m, rad), in the frame that this pose is in.
+
+    Raises ValueError for other shapes.
+    """
+    given = _of_pairs(points)
+    out = np.empty_like(given)
+    _out_of_frame(given, x, y, math.cos(theta), math.sin(theta), out)
+    return out
+
+
+def into_frame(points: NDArray[np.float64], x: float, y: float, theta: float) -> NDArray[np.float64]:
+    """Undo `out_of_frame`: return points (n, 2; m) as seen from a pose (m, rad). Raises ValueError for other shapes."""
+    given = _of_pairs(points)
+    out = np.empty_like(given)
+    _into_frame(given, x, y, math.cos(theta), math.sin(theta), out)
+    return out
+
+
 def compared(
     points: NDArray[np.float64],
     pose: tuple[float, float, float],
@@ -386,6 +420,12 @@ def climb(
             _arrays.vector(bound, "bound"), climbs, best,
         )  # fmt: skip
     return best
+
+
+def _of_pairs(points: NDArray[np.float64]) -> NDArray[np.float64]:
+    given = np.ascontiguousarray(points, np.float64)
+    _check_points(given)
+    return given
 
 
 def _check_points(points: NDArray[np.float64]) -> None:

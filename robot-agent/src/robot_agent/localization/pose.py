@@ -5,9 +5,10 @@ from __future__ import annotations
 import math
 from typing import TYPE_CHECKING, NamedTuple
 
-import numpy as np
+from fog_kernels.scans import into_frame, out_of_frame
 
 if TYPE_CHECKING:
+    import numpy as np
     from numpy.typing import NDArray
 
 
@@ -38,13 +39,8 @@ class Pose2(NamedTuple):
 
     def transform(self, points: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return points (n, 2; m) that are given in the frame of this pose in the frame that the pose itself is in."""
-        cos, sin = math.cos(self.theta), math.sin(self.theta)
-        return np.column_stack(
-            (self.x + cos * points[:, 0] - sin * points[:, 1], self.y + sin * points[:, 0] + cos * points[:, 1])
-        )
+        return out_of_frame(points, *self)
 
     def inverse_transform(self, points: NDArray[np.float64]) -> NDArray[np.float64]:
         """Undo `transform`: return points (n, 2; m) of the frame that this pose is in as seen from it."""
-        dx, dy = points[:, 0] - self.x, points[:, 1] - self.y
-        cos, sin = math.cos(self.theta), math.sin(self.theta)
-        return np.column_stack((cos * dx + sin * dy, -sin * dx + cos * dy))
+        return into_frame(points, *self)

@@ -75,6 +75,8 @@ class _Base:
     """Whether a wheel was told to turn, or might turn by itself, since it was woken."""
     silence: str | None = None
     """The fault of a base that fell silent before it moved, until its next frame."""
+    harmless: BaseStatus | None = None
+    """The status that was checked last, if it is no fault, whatever the time: of an awake base without a maneuver."""
 
     def blocked_for(self, now: float) -> float:
         """Return for how long (s) a wheel motor has been drawing too much current."""
@@ -134,17 +136,22 @@ class GuardianCore:
     def on_bytes(self, data: bytes, now: float) -> Output:
         """Handle bytes of the base; a frame that demands a stop returns the stop immediately."""
         self.driver.receive_data(data, now)
+        base, stop = self._base, b""
         feedbacks: list[BaseFeedback] = []
-        stop = b""
-        while (reading := self.driver.next_event()) is not None:
+        reading = self.driver.next_event()
+        while reading is not None:
             self.frames += 1
-            self._base.reading, self._base.reading_at, self._base.silence = reading, now, None
+            base.reading, base.reading_at, base.silence = reading, now, None
             self._revival.on_answer()
             stop += self._check(reading.status, now)
-            state = (self._latched, self._base.awake, self._maneuvers.running, self._maneuvers.problem)
-            if self._feedback.is_due(reading, state, now, moving=self._wheels != (0.0, 0.0)):
-                feedbacks.append(self._report(reading, now))
-        if not self._base.awake:
+            following = self.driver.next_event()
+            # Of several that came together and say the same, the newest is reported.
+            if following is None or following.status is not reading.status:
+                state = (self._latched, base.awake, self._maneuvers.running, self._maneuvers.problem)
+                if self._feedback.is_due(reading, state, now, moving=self._wheels != (0.0, 0.0)):
+                    feedbacks.append(self._report(reading, now))
+            reading = following
+        if not base.awake:
             stop += self.driver.respond()
         return Output(stop, tuple(feedbacks))
 
@@ -228,6 +235,9 @@ class GuardianCore:
 
     def _check(self, status: BaseStatus, now: float) -> bytes:
         base = self._base
+        if status is base.harmless and base.awake and self._maneuvers.running is None:
+            return b""
+        base.harmless = None
         if self._sleep.asleep:
             return b""  # it was on its way when the base was put to sleep
         if not base.awake:
@@ -240,6 +250,8 @@ class GuardianCore:
             return b""
         fault = fault_of(status, base.blocked_for(now), bumper=not self._maneuvers.expects_bumper(status))
         if fault is None:
+            # Only the current of a motor is a fault by its duration.
+            base.harmless = None if status.overcurrent or self._maneuvers.running is not None else status
             return b""
         if backing:
             self._latched = None  # the new fault is no bump

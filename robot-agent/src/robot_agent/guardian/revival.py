@@ -32,6 +32,8 @@ class Revival:
 
     def on_answer(self) -> None:
         """Keep the rate at which the base has answered, and start over when it falls silent."""
+        if self._due_at is None and not self._attempts and len(self._bauds) == 1:
+            return  # it has answered before, and nothing was tried since
         self._due_at = self.problem = None
         self._bauds = (self.baud,)
         self._attempts = 0

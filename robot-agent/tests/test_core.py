@@ -630,3 +630,59 @@ def test_published_messages_survive_encoding_and_decoding(driving):
     ]:
         assert msgspec.msgpack.decode(msgspec.msgpack.encode(message), type=type(message)) == message
     assert report.points
+
+
+def test_a_robot_that_stands_by_commands_each_time_and_evaluates_its_inputs_five_times_a_second(world):
+    world.run(1.0)
+    agent, evaluated, sent = world.agent, [], []
+    step, stream = agent._safety.evaluate, agent.stream
+    agent._safety.evaluate = lambda inputs, now, *request: evaluated.append(now) or step(inputs, now, *request)
+    agent.stream = lambda now, stamp: sent.append(stream(now, stamp)) or sent[-1]
+    assert agent.standing_by
+    world.run(2.0)
+    assert len(sent) == 40
+    assert [command.seq - sent[0].seq for command in sent] == list(range(40))
+    assert not any(command.left or command.right or command.reset or command.rest for command in sent)
+    assert np.diff(evaluated) == pytest.approx(0.15)
+    assert world.state().mode == "NORMAL"
+    assert not world.state().loop.late_stops
+
+
+@pytest.mark.parametrize("event", ["goal", "command"])
+def test_a_robot_that_stands_by_evaluates_its_inputs_at_once_when_there_is_something_to_do(world, event):
+    agent = world.agent
+    for offset in range(1, 5):
+        world.run(1.0 + 0.05 * offset)
+        agent.stream(world.now, world.stamp)
+        assert agent.repeats(world.now)
+        if event == "goal":
+            world.drive_to(L_PATH, goal_id=f"g{offset}")
+        else:
+            assert world.command("disable").accepted
+        assert not agent.repeats(world.now)
+        assert agent.cancel_goal() or world.command("enable").accepted
+
+
+def test_what_an_operator_changes_on_a_robot_that_stands_by_is_published_with_the_next_tick(world):
+    world.run(1.0)
+    agent = world.agent
+    while not agent.standing_by or agent.tick(world.moment):
+        world.run(0.01)
+    assert world.command("disable").accepted
+    world.published = agent.tick(world.moment)
+    assert [state.mode for state in world.published_on(ch.ROBOT_STATE)] == ["INIT"]
+
+
+def test_a_robot_on_a_mission_or_of_unknown_pose_never_stands_by(world):
+    assert world.agent.standing_by
+    world.drive_to(L_PATH)
+    assert not world.agent.standing_by
+    assert not LittleWorld().agent.standing_by
+
+
+@pytest.mark.parametrize(("lost", "reason"), [("lidar_on", "the lidar has been silent"), ("base_on", "the guardian")])
+def test_a_robot_that_stands_by_stops_for_lidar_and_guardian_within_a_fifth_of_a_second_more(world, lost, reason):
+    world.run(1.0)
+    setattr(world, lost, False)
+    assert world.run(0.5, lambda w: w.state().mode == "PROTECTIVE_STOP")
+    assert any(reason in text for text in world.state().reasons)

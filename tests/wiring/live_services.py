@@ -250,6 +250,9 @@ class Link:
     def receive(self) -> None:
         """The guardian is silent."""
 
+    def fetch(self) -> None:
+        """The lidar is silent."""
+
     def poll(self, now: float, *, on: bool) -> tuple[()]:
         """The lidar is silent."""
         del now, on

@@ -48,6 +48,22 @@ async def test_missed_ticks_are_skipped_and_counted():
     assert loop_ticker.ticks == 3
 
 
+async def test_a_loop_that_has_waited_on_purpose_goes_on_with_the_next_tick_and_missed_none():
+    clock = ManualClock()
+    loop_ticker = ticker(clock, 0.25)
+    times = []
+    async for now in loop_ticker:
+        times.append(now)
+        if len(times) == 4:
+            break
+        if len(times) == 1:
+            clock.advance(0.875)
+            loop_ticker.rejoin()
+        asyncio.get_running_loop().call_soon(clock.advance, 1.0 - 0.875 if len(times) == 1 else 0.25)
+    assert times == [0.0, 1.0, 1.25, 1.5]
+    assert loop_ticker.late == 0
+
+
 async def test_loops_of_one_phase_share_their_ticks_whenever_they_begin():
     clock, phase = ManualClock(50.0), Phase()
     assert phase.next_tick(50.0, 0.1) == 50.0

@@ -19,7 +19,7 @@ from robot_agent.lidars.rplidar_a1 import protocol as rplidar
 from robot_agent.lidars.rplidar_a1.driver import ANSWER_TIMEOUT_S, RESET_S, SAMPLES_TIMEOUT_S, STOP_S, RplidarA1Driver
 from robot_agent.lidars.rplidar_a1.emulator import RplidarEmulator
 from robot_agent.registry import make_base, signatures
-from robot_agent.serial_port import Port
+from robot_agent.serial_port import Port, PortLost
 
 STEP = 0.02
 
@@ -300,6 +300,35 @@ async def test_resting_lidar_is_stopped_with_its_motor_and_started_anew():
     edge.poll(90.0, on=True)
     edge.poll(90.1 + STOP_S, on=True)
     assert port.done == [("dtr", False), "discarded", rplidar.stop(), rplidar.get_health()]
+
+
+async def test_fetched_bytes_come_first_in_the_next_poll_and_a_port_lost_meanwhile_is_opened_again(monkeypatch):
+    driver = RplidarA1Driver()
+    edge = LidarEdge("/dev/none", driver, SystemClock(), lambda *_: None)
+    port, received, arriving = Motor(), [], [b"a", b"b", b"c", b"d", b""]
+    monkeypatch.setattr(port, "read_available", lambda: arriving.pop(0))
+    receive = driver.receive
+    monkeypatch.setattr(driver, "receive", lambda data, now: received.append((data, now)) or receive(b"", now))
+    edge.fetch()
+    edge._port, edge._lost = port, asyncio.get_running_loop().create_future()
+    edge.fetch()
+    edge.fetch()
+    edge.poll(5.0)
+    edge.poll(5.1)
+    assert received == [(b"abc", 5.0), (b"d", 5.1)]
+    edge.poll(5.2, on=False)
+    edge.fetch()  # a resting lidar is not read
+
+    def lose():
+        raise PortLost("/dev/none", "unplugged")
+
+    edge.poll(6.0)
+    monkeypatch.setattr(port, "read_available", lose)
+    edge.fetch()
+    assert edge._port is None
+    with pytest.raises(PortLost, match="unplugged"):
+        edge._lost.result()
+    assert edge.poll(6.1) == ()
 
 
 @pytest.mark.live

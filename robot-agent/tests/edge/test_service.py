@@ -66,6 +66,10 @@ class FakeGuardian:
 class FakeLidar:
     def __init__(self):
         self.polled = []
+        self.fetched = 0
+
+    def fetch(self):
+        self.fetched += 1
 
     def poll(self, now, *, on):
         assert on
@@ -157,6 +161,64 @@ async def test_the_stream_runs_at_half_its_rate_while_the_robot_has_nothing_to_d
     task.cancel()
     await asyncio.gather(task, return_exceptions=True)
     assert len(guardian.sent) == len(lidar.polled)
+
+
+async def test_a_robot_that_stands_by_sends_each_command_and_looks_at_its_inputs_at_every_second_one(rig, monkeypatch):
+    monkeypatch.setattr(AgentCore, "standing_by", True)
+    order, guardian, lidar = [], FakeGuardian(), FakeLidar()
+    lidar.scans = ("a scan",)
+    monkeypatch.setattr(guardian, "receive", lambda: order.append("feedback"))
+    monkeypatch.setattr(rig.fog, "poll", lambda: order.append("fog"))
+    monkeypatch.setattr(lidar, "fetch", lambda: order.append("bytes"))
+    monkeypatch.setattr(rig.core, "on_scan", lambda scan, _now: order.append(scan))
+    # Both processes may be late, but a look is not skipped for that.
+    times = iter([100.0, 100.1, 100.23, 100.3, 100.4])
+
+    async def call(_ticker, body):
+        for now in times:
+            body(now)
+            order.append(f"command {guardian.sent[-1][1].seq}")
+
+    monkeypatch.setattr(service_module.Ticker, "call", call)
+    await rig.service.stream_loop(guardian, lidar)
+    look = ["feedback", "fog", "a scan"]
+    expected = [*look, "command 1", "bytes", "command 2", *look, "command 3", "bytes", "command 4", *look, "command 5"]
+    assert order == expected
+
+
+async def test_an_operator_of_a_robot_that_stands_by_is_answered_by_its_newest_inputs(rig, monkeypatch):
+    guardian, lidar, standing = FakeGuardian(), FakeLidar(), False
+    monkeypatch.setattr(AgentCore, "standing_by", property(lambda _core: standing))
+    task = asyncio.create_task(rig.service.stream_loop(guardian, lidar))
+    await rig.until(lambda: guardian.sent)
+    task.cancel()
+    await asyncio.gather(task, return_exceptions=True)
+    handler, _ = rig.fog.served[ch.ROBOT_COMMAND]
+    command = RobotCommand(kind="enable", robot=AGENT.robot, operator="ann", nonce="n" * 16)
+    before = len(lidar.polled)
+    handler({"robot": AGENT.robot}, command)
+    assert len(lidar.polled) == before
+    standing = True
+    handler({"robot": AGENT.robot}, command)
+    assert len(lidar.polled) == before + 1
+
+
+async def test_a_robot_that_stands_by_decides_nothing_until_there_may_be_something_again(rig, monkeypatch):
+    standing, asked = True, []
+    monkeypatch.setattr(AgentCore, "standing_by", property(lambda _core: standing))
+    monkeypatch.setattr(rig.core, "control_job", asked.append)
+    guardian = FakeGuardian()
+    loops = [rig.service.control_loop(), rig.service.stream_loop(guardian, FakeLidar())]
+    tasks = [asyncio.create_task(loop) for loop in loops]
+    try:
+        await rig.until(lambda: len(guardian.sent) >= 8)
+        assert len(asked) == 1
+        standing = False
+        await rig.until(lambda: len(asked) >= 3)
+    finally:
+        for task in tasks:
+            task.cancel()
+        await asyncio.gather(*tasks, return_exceptions=True)
 
 
 async def test_a_scan_is_localized_after_the_command_of_its_tick(rig, monkeypatch):

@@ -204,6 +204,7 @@ class Ticker:
         self._phase = phase or Phase()
         self._offset = offset
         self._due_by = period
+        self._rejoins = False
         self.ticks = 0
         self.late = 0
         """Ticks that were skipped, or came more than half a period after they were due."""
@@ -273,7 +274,12 @@ class Ticker:
             if timer is not None:
                 timer.cancel()
 
+    def rejoin(self) -> None:
+        """Go on with the phase's next tick: the body has waited on purpose, and missed none of those before it."""
+        self._rejoins = True
+
     def _first(self) -> float:
+        self._rejoins = False
         self._due_by = self.period
         return self._phase.next_tick(self.clock.now(), self.period, self._offset)
 
@@ -287,6 +293,8 @@ class Ticker:
 
     def _following(self, due: float) -> float:
         """Return when the next tick after the one of `due` is due, and count those that were missed."""
+        if self._rejoins:
+            return self._first()
         if self.period == self._due_by:
             due += self.period
         else:

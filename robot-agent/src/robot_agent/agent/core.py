@@ -3,9 +3,11 @@
 Values and times go in, values come out. `now` is the robot's own monotonic clock (s), by which every age is measured;
 `stamp` is the wall clock (s) and only dates messages and traces. Whoever runs the core
 - passes it every message of `handlers()`, every query of `query_handlers()`, and the input from base and lidar;
-- calls `stream` 20 times a second and sends the wheel command to the guardian;
+- calls `stream` 20 times a second, 10 times while `idle`, and sends the wheel command to the guardian; base and lidar
+  need not be read before a call that `repeats`;
 - runs `search(now).run()`, if there is a search, on any thread, and passes the result to `on_found`; then
-  `decide(control_job(now))`, on any thread, and passes the decision to `accept`; every `profile.control_period`;
+  `decide(control_job(now))`, on any thread, and passes the decision to `accept`; every `profile.control_period`,
+  unless the robot is `standing_by` and there was no job;
 - calls `tick` 10 times a second and publishes what it returns;
 - sends the query of `egress_request` to the planner, and passes the reply to `on_egress_reply`;
 - lets the lidar's motor turn while `lidar_on`;
@@ -74,6 +76,9 @@ if TYPE_CHECKING:
 
 POSSIBLE_WHILE_SUSPENDED: Final = (0.5, 0.5)
 """How far (m, rad) a robot is expected to be moved by others while its computer is suspended."""
+STANDBY_S: Final = 0.14
+"""A robot that stands by looks at its inputs at the first call after this time: at every second one. They age by 0.2 s
+more at most, and it stands; the gate's limits begin at 0.3 s."""
 
 __all__ = ["AgentCore", "Decision", "Job", "SavedPose", "decide"]
 
@@ -103,6 +108,8 @@ class AgentCore:
         self._commands = OperatorCommands(config, self)
         self._publishing = PublishingPolicy(config.robot)
         self._loop_health = LoopHealth()
+        self._looked_at = self._ticked_at = -math.inf
+        """When `stream` last evaluated its inputs, and `tick` last looked for what to publish."""
 
     @property
     def robot(self) -> str:
@@ -120,6 +127,7 @@ class AgentCore:
         return {ch.ROBOT_COMMAND: self._on_command}
 
     def _on_command(self, _ids: Ids, command: RobotCommand, at: Moment) -> CommandReply:
+        self._looked_at = self._ticked_at = -math.inf  # what it changes shows at once
         return self._commands.answer(command, at)
 
     # --- the map ---
@@ -199,7 +207,11 @@ class AgentCore:
     # --- driving ---
 
     def stream(self, now: float, stamp: float) -> WheelCommand:
-        """Evaluate safety and return the wheel speeds to send now; call it 20 times a second."""
+        """Evaluate safety and return the wheel speeds to send now; call it 20 times a second, 10 times while `idle`."""
+        if self.repeats(now):
+            self._safety.pass_over(now)
+            return self._rested(self._driving.wheels.repeat(now))
+        self._looked_at = now
         goal_id = self._driving.mission.goal_id
         self._rest.update(busy=not self.idle, goal_id=goal_id, now=now, base_ready=self._base.ready)
         safety = self._evaluate_safety(now)
@@ -207,7 +219,10 @@ class AgentCore:
             safety = self._evaluate_safety(now, "dock")
             self._maneuvers.docking.on_begun(safety.refusal)
         maneuver = self._maneuvers.command(self._safety.state, safety, self._driving, now)
-        command = maneuver or self._driving.command(safety, self._guard.limit, now, stamp)
+        return self._rested(maneuver or self._driving.command(safety, self._guard.limit, now, stamp))
+
+    def _rested(self, command: WheelCommand) -> WheelCommand:
+        """Return the command, by which the base may sleep while the robot rests."""
         rest = self._config.rest_base and not self._rest.lidar_on
         return replace(command, rest=True) if rest else command
 
@@ -297,6 +312,9 @@ class AgentCore:
 
     def tick(self, at: Moment) -> Sequence[Publication]:
         """Advance time, at least ten times a second; return what to publish now."""
+        if at.now - self._ticked_at < STANDBY_S and self.standing_by:
+            return ()
+        self._ticked_at = at.now
         self._pose_keeper.search(self.safety.mode, at.now, at_rest=self._driving.wheels.at_rest)
         return self._publishing.due(
             partial(self.pose, at),
@@ -362,6 +380,17 @@ class AgentCore:
     def idle(self) -> bool:
         """Whether the robot stands, and nothing is to be done: then half the calls of `stream` are enough."""
         return not (self._localizer.searching or self._driving.busy(self._safety.state, self.safety))
+
+    @property
+    def standing_by(self) -> bool:
+        """Whether an idle robot knows where it is and has no goal: then it looks at its inputs 5 times a second."""
+        if self._localizer.status != "good" or self._driving.mission.active or self.profile.onboard:
+            return False
+        return self.idle and self._safety.state.maneuver is None
+
+    def repeats(self, now: float) -> bool:
+        """Return whether `stream` at `now` would send the same command again without a look at any input."""
+        return now - self._looked_at < STANDBY_S and self.standing_by
 
     @property
     def lidar_on(self) -> bool:

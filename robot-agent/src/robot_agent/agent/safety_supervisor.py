@@ -38,18 +38,22 @@ class SafetySupervisor:
         self._config = config
         self.state = SafetyState()
         self.outputs = step(self.state, SafetyInputs(), 0.0, config)[1]
-        self._evaluated_at = math.inf
+        self._ran_at = math.inf
         self._late_at, self._late_by = -math.inf, 0.0
 
     def evaluate(self, inputs: SafetyInputs, now: float, request: Request | None = None) -> SafetyOutputs:
         """Step the gate at `now` (s, monotonic): steadily, and with each operator's request."""
-        pause = now - self._evaluated_at
-        self._evaluated_at = now
-        if pause > self._config.late:
-            self._late_at, self._late_by = now, pause
+        self.pass_over(now)
         inputs = replace(inputs, request=request, late_age=now - self._late_at, late_by=self._late_by)
         self.state, self.outputs = step(self.state, inputs, now, self._config)
         return self.outputs
+
+    def pass_over(self, now: float) -> None:
+        """Record that the agent runs at `now`, with a step of the gate or without one: steadily, if it is on time."""
+        pause = now - self._ran_at
+        self._ran_at = now
+        if pause > self._config.late:
+            self._late_at, self._late_by = now, pause
 
 
 def safety_inputs(  # noqa: PLR0913  # the gate weighs every source of the agent

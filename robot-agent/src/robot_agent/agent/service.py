@@ -7,6 +7,7 @@ import math
 import os
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
+from functools import partial
 from typing import TYPE_CHECKING, Final
 
 from msgspec import structs
@@ -27,7 +28,7 @@ from robot_agent.agent.edges.exporter import Observed, RobotCollector, parent
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
 
-    from fog_contracts.handlers import Publication
+    from fog_contracts.handlers import Ids, Later, Moment, Publication, QueryHandler
     from fog_contracts.messages import EgressRequest, Message
     from fog_runtime.clock import Clock
     from fog_runtime.health import Health
@@ -41,7 +42,8 @@ if TYPE_CHECKING:
 
 STREAM_S: Final = 0.05
 IDLE_STREAM_S: Final = 0.1
-"""A robot that stands and has nothing to do needs every other tick only."""
+"""A robot that stands and has nothing to do needs every other tick only, and of these every other one looks at its
+inputs while it stands by (`AgentCore.standing_by`)."""
 CONTROL_AFTER_S: Final = 0.02
 """Decisions begin this long after a tick of the stream: at the same moment, their thread and the loop's would take the
 interpreter from one another some hundred times a second. They end before the next tick, which sends their speeds."""
@@ -85,6 +87,9 @@ class Service:
         """The common phase of all loops: the process sleeps between their ticks."""
         self._stream = self._ticker(STREAM_S)
         self._control = self._ticker(core.profile.control_period, CONTROL_AFTER_S)
+        self._wanted = asyncio.Event()
+        """Whether there may be something to decide."""
+        self._look: Callable[[float], object] = lambda _now: None
         self.collector = RobotCollector()
         self._state: RobotState | None = None
         self._corrupted: dict[str, int] = {}
@@ -188,26 +193,44 @@ class Service:
         self._core.on_scan(scan, now)
 
     async def stream_loop(self, guardian: GuardianClient, lidar: LidarEdge) -> None:
-        """Stream wheel commands at 20 Hz, at rest at 10 Hz, each on the newest of base and lidar."""
+        """Stream wheel commands at 20 Hz, at rest at 10 Hz, each on the newest of base and lidar unless it repeats."""
         suspension = SuspensionMonitor()
 
-        def stream(now: float) -> None:
+        def look(now: float) -> Sequence[LaserScan]:
             if seconds := suspension.suspended():
                 SUSPENSIONS.inc()
                 _log.warning("computer_was_suspended", seconds=round(seconds, 1))
                 self._core.on_suspension(seconds)
             guardian.receive()
             self._zenoh.poll()
-            scans = lidar.poll(now, on=self._core.lidar_on)
-            guardian.send(self._core.stream(now, self._clock.stamp()))
-            # After the command, which localization must not delay.
+            return lidar.poll(now, on=self._core.lidar_on)
+
+        def localize(scans: Sequence[LaserScan], now: float) -> None:
             for scan in scans:
                 self.on_scan(scan, now)
+
+        def stream(now: float) -> None:
+            if self._core.repeats(now):
+                # The guardian wants a command. All else waits where it is for the next tick, but for the lidar's bytes.
+                lidar.fetch()
+                guardian.send(self._core.stream(now, self._clock.stamp()))
+                return
+            scans = look(now)
+            if self._core.standing_by:
+                # Its last command is a tick ago. Scans are as rare as its looks: these must know of the newest one.
+                localize(scans, now)
+                scans = ()
+            guardian.send(self._core.stream(now, self._clock.stamp()))
+            # After the command, which localization must not delay.
+            localize(scans, now)
             # Here, because the housekeeping waits for the storage, which may hang while the robot drives well.
             missing = self._health.missing
             self._manager.alive(f"waiting for {', '.join(missing)}" if missing else "ready")
             self._stream.period = IDLE_STREAM_S if self._core.idle else STREAM_S
+            if not self._core.standing_by:
+                self._wanted.set()
 
+        self._look = lambda now: localize(look(now), now)
         await self._stream.call(stream)
 
     async def control_loop(self) -> None:
@@ -223,6 +246,11 @@ class Service:
                 job = self._core.control_job(now)
                 if job is not None:
                     self._core.accept(await loop.run_in_executor(thread, decide, job))
+                elif self._core.standing_by:
+                    # Not woken to find that there is nothing to decide: the stream tells when there may be again.
+                    self._wanted.clear()
+                    await self._wanted.wait()
+                    self._control.rejoin()
         finally:
             thread.shutdown(wait=False, cancel_futures=True)
 
@@ -231,7 +259,14 @@ class Service:
     def subscribe(self) -> None:
         """Register subscriptions and queries."""
         self._edges.subscribe(self._core.handlers(), self._publish, only={"robot": self._robot}, polled=POLLED)
-        self._edges.serve(self._core.query_handlers(), only={"robot": self._robot}, on_reply=self._log_command)
+        queries = {channel: partial(self._answer, handler) for channel, handler in self._core.query_handlers().items()}
+        self._edges.serve(queries, only={"robot": self._robot}, on_reply=self._log_command)
+
+    def _answer(self, handler: QueryHandler, ids: Ids, request: Message | None, at: Moment) -> Message | Later[Message]:
+        """Answer by the newest of base and lidar: a robot that stands by looks at them seldom."""
+        if self._core.standing_by:
+            self._look(at.now)
+        return handler(ids, request, at)
 
     def _log_command(self, _channel: ch.Channel, request: Message | None, reply: Message) -> None:
         if isinstance(request, RobotCommand) and isinstance(reply, CommandReply):

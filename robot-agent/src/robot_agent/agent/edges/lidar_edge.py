@@ -56,6 +56,7 @@ class LidarEdge:
         self._resting = False
         self._port: Port | None = None
         self._lost: asyncio.Future[None] | None = None
+        self._fetched = b""
         self.problem = "the lidar's port was not opened yet"
 
     async def run(self) -> None:
@@ -94,7 +95,7 @@ class LidarEdge:
     async def _scan(self, port: Port) -> None:
         """Let `poll` use a port, on which a scan has begun, until it is lost; raises `PortLost`."""
         driver = self._driver
-        self._resting = False
+        self._resting, self._fetched = False, b""
         self._port, self._lost = port, asyncio.get_running_loop().create_future()
         try:
             await self._lost
@@ -111,36 +112,50 @@ class LidarEdge:
         """Number of damaged packets of the lidar."""
         return self._driver.corrupted
 
+    def fetch(self) -> None:
+        """Keep what has arrived for the next `poll`: the system's own buffer holds that of a fifth of a second only."""
+        if self._port is not None and not self._resting:
+            try:
+                self._fetched += self._port.read_available()
+            except PortLost as error:
+                self._end(error)
+
     def poll(self, now: float, *, on: bool = True) -> Sequence[LaserScan]:
         """Read what has arrived, and return the whole scans; none while the port is closed.
 
-        Call it 20 times a second, and use the scans only after what must not be delayed. Without `on` the lidar rests:
-        its scan and motor are stopped, and started again when it is on.
+        Call it 20 times a second, or `fetch` in its place while nothing depends on what the lidar sees; use the scans
+        only after what must not be delayed. Without `on` the lidar rests: its scan and motor are stopped, and started
+        again when it is on.
         """
-        port, driver, lost = self._port, self._driver, self._lost
+        port, driver = self._port, self._driver
         scans: Sequence[LaserScan] = ()
-        if port is None or lost is None:
+        if port is None:
             return scans
         try:
             if on is self._resting:
                 self._switch(port, now, on=on)
             if self._resting:
                 return scans
-            events = driver.receive(port.read_available(), now)
+            data, self._fetched = self._fetched + port.read_available(), b""
+            events = driver.receive(data, now)
             scans = events.scans
             if events.samples is not None:
                 self._on_samples(events.samples, now)
             if reply := events.data + driver.tick(now):
                 port.write(reply)
         except PortLost as error:
-            self._port = None
-            if not lost.done():
-                lost.set_exception(error)
+            self._end(error)
         self._report(driver.problem)
         return scans
 
+    def _end(self, error: PortLost) -> None:
+        """Leave it to `run` to open the port again."""
+        self._port = None
+        if self._lost is not None and not self._lost.done():
+            self._lost.set_exception(error)
+
     def _switch(self, port: Port, now: float, *, on: bool) -> None:
-        self._resting = not on
+        self._resting, self._fetched = not on, b""
         if not on:
             port.write(self._driver.stop_command)
         set_motor(port, self._driver.serial, on=on)

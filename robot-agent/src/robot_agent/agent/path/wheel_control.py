@@ -78,6 +78,14 @@ class WheelControl:
         if math.dist(self.speeds, wanted) > _SAME_M_S:
             self._rates = (0.0, 0.0)  # who was slowed down starts gently again
         self.following = decision is not None and outputs.stop == "none"
+        return self._next()
+
+    def repeat(self, now: float) -> WheelCommand:
+        """Return the last wheel speeds again, to be sent at `now` (s, monotonic); of wheels at rest only."""
+        self._streamed_at = now
+        return self._next()
+
+    def _next(self) -> WheelCommand:
         self._seq += 1
         reset, self._reset_pending = self._reset_pending, False
         return WheelCommand(seq=self._seq, left=self.speeds[0], right=self.speeds[1], reset=reset)

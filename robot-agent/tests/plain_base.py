@@ -62,6 +62,8 @@ class DockingBase(PlainBase):
 class Rig:
     """A guardian on a plain base that is woken at `begin`, and awake since 0.1 s later."""
 
+    _reported = BaseStatus()
+
     def __init__(
         self,
         limits: Limits | None = None,
@@ -79,7 +81,10 @@ class Rig:
 
     def frame(self, now: float, travel: float = 0.0, **status: object):
         odometry = WheelOdometry(left_m=travel, right_m=travel)
-        self.base.frames.append(BaseReading(msgspec.convert(status, BaseStatus), odometry))
+        # As of a real driver: the same object for as long as the base reports the same.
+        if (reported := msgspec.convert(status, BaseStatus)) != self._reported:
+            self._reported = reported
+        self.base.frames.append(BaseReading(self._reported, odometry))
         return self.core.on_bytes(b"", now)
 
     def command(self, now: float, left: float = 0.1, right: float = 0.1, *, reset: bool = False, maneuver=None):

@@ -13,7 +13,7 @@ from plain_base import DockingBase, PlainBase, Rig
 from robot_agent.guardian import link
 from robot_agent.guardian.core import GuardianCore
 from robot_agent.guardian.link import WheelCommand
-from robot_agent.hardware import Awakening, WakeLine
+from robot_agent.hardware import Awakening, BaseReading, BaseStatus, WakeLine, WheelOdometry
 
 STAND = b"0.0000,0.0000;"
 RTS = WakeLine(name="rts", seconds=1.1)
@@ -229,6 +229,19 @@ def test_core_counts_the_frames_of_its_base() -> None:
     rig.frame(0.05)
     rig.frame(0.1)
     assert rig.core.frames == 2
+
+
+def test_of_frames_that_came_together_the_newest_is_told_and_each_that_says_something_else() -> None:
+    rig = Rig()
+    free, pressed = BaseStatus(), BaseStatus(bumper_left=True)
+    told = []
+    for now, statuses in ((1.0, [free, free, free]), (2.0, [free, free, pressed, pressed, free])):
+        for number, status in enumerate(statuses):
+            rig.base.frames.append(BaseReading(status, WheelOdometry(left_m=number, right_m=number)))
+        told.append([feedback.odometry.left_m for feedback in rig.core.on_bytes(b"", now).feedback])
+    assert told == [[2.0], [1.0, 3.0, 4.0]]
+    assert rig.core.latched == "the bumper is pressed (left)"
+    assert rig.core.frames == 1 + 3 + 5
 
 
 def test_bump_that_was_reset_is_told_no_more() -> None:

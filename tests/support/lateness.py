@@ -17,7 +17,10 @@ if TYPE_CHECKING:
 class Lateness:
     """How long the processes that `pids` returns, and their threads, have waited for a core since this was made.
 
-    It is the sum of all threads: each may have waited for the one before it. Without the kernel's statistics it is 0.
+    It is the sum of all threads, and no chain of them can be later. A message passes through threads of zenoh, the loop
+    and threads that compute, in several processes. Each may have waited for the one before it, so that the longest wait
+    of one thread would be too little. Waits at the same time count twice: on a busy machine a limit is longer than it
+    need be, and only on an idle one as exact as it is written. Without the kernel's statistics it is 0.
     """
 
     def __init__(self, pids: Callable[[], Iterable[int]]) -> None:

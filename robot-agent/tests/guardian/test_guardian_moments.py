@@ -118,6 +118,20 @@ def test_docking_base_that_charges_from_the_start_is_held_by_zero_speeds_and_its
     assert rig.core.stop_command() == STAND
 
 
+def test_mode_of_a_docking_base_that_is_awake_is_left_alone_when_the_guardian_ends() -> None:
+    rig = Rig(base=DockingBase())
+    rig.drive(0.1, 1.0)
+    assert rig.core.stop_command() == STAND
+    rig.command(1.02, 0.0, 0.0)
+    rig.command(1.04, 0.0, 0.0, maneuver="seek_dock")
+    rig.frame(1.05)
+    assert rig.core.moving
+    rig.command(1.06, 0.0, 0.0)
+    assert rig.core.stop_command() == b"take;"
+    rig.frame(1.3)
+    assert rig.core.stop_command() == STAND, "it drives by wheel speeds again"
+
+
 def test_charging_base_that_is_awake_stands_and_says_why() -> None:
     rig = Rig()
     rig.drive(0.1, 1.0)
@@ -369,7 +383,7 @@ def test_frame_that_was_on_its_way_when_the_base_fell_asleep_makes_no_fault_of_i
     rig.drive(0.2, 1.0, 0.0, 0.0)
     resting = WheelCommand(seq=1, left=0.0, right=0.0, rest=True)
     assert rig.core.on_command(resting, 1.01).data == b"sleep;"
-    rig.frame(1.02, **late)
+    assert rig.frame(1.02, **late).data == b""
     for step in range(1, 60):
         assert rig.core.on_command(resting, 1.0 + 0.1 * step).data == b""
         assert rig.core.tick(1.0 + 0.1 * step).data == b"", "bytes might wake it"

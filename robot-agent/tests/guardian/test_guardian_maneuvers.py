@@ -217,6 +217,27 @@ def test_each_fault_ends_leaving_within_its_frame_although_the_base_protects_its
     assert rig.core.latched is not None
 
 
+def test_fault_counts_from_the_first_frame_off_the_dock_although_the_base_has_not_reported_its_mode_yet():
+    passive = {"charging": True, "docked": True, "mode_problem": "Passive"}
+    rig = Rig(base=DockingBase(), awake=False)
+    rig.frame(0.2, **passive)
+    assert rig.command(0.21, -0.1, -0.1, maneuver="leave_dock").data.startswith(b"full;")
+    assert rig.frame(0.22, **passive, cliff=True).data == b"start;"
+    assert rig.core.latched == "a cliff sensor sees no floor"
+
+
+def test_base_that_was_told_to_stand_is_told_again_after_0_05_s_and_not_before():
+    rig = seeking()
+    assert rig.step(None) == b"take;"
+    ended = rig.now
+    assert rig.core.tick(ended + 0.04).data == b""
+    assert rig.core.tick(ended + 0.06).data == b"take;"
+    assert rig.core.tick(ended + 0.1).data == b""
+    assert rig.core.tick(ended + 0.12).data == b"take;"
+    rig.frame(ended + 0.13)
+    assert rig.command(ended + 0.14, 0.0, 0.0).data == b"", "it stands since a moment ago"
+
+
 def test_dock_that_presses_the_bumper_does_not_keep_the_base():
     rig = leaving()
     rig.steps(0.5, bumper_left=True)
@@ -257,6 +278,14 @@ def test_bumped_robot_backs_off_slowly_and_its_fault_stays():
     assert rig.core.latched == BUMP
     rig.step(None)
     assert not rig.core.moving
+
+
+def test_back_off_ends_with_zero_speed_and_the_base_stays_in_its_mode():
+    rig = bumped()
+    rig.steps(0.5, "back_off", -0.05)
+    assert rig.step(None, 0.0) == b"0.0000,0.0000;"
+    assert rig.feedback.stopped is None
+    assert rig.core.stop_command() == b"0.0000,0.0000;"
 
 
 def test_robot_backs_off_for_four_seconds_once():

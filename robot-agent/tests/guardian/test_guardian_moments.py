@@ -386,7 +386,9 @@ def test_frame_that_was_on_its_way_when_the_base_fell_asleep_makes_no_fault_of_i
     assert rig.frame(1.02, **late).data == b""
     for step in range(1, 60):
         assert rig.core.on_command(resting, 1.0 + 0.1 * step).data == b""
-        assert rig.core.tick(1.0 + 0.1 * step).data == b"", "bytes might wake it"
+        told = rig.core.tick(1.0 + 0.1 * step)
+        assert told.data == b"", "bytes might wake it"
+        assert [feedback.stopped for feedback in told.feedback] == ["the base is asleep to save power"]
     assert rig.core.latched is None
     assert rig.core.on_command(WheelCommand(seq=2, left=0.0, right=0.0), 7.0).attempt.line == RTS
     rig.frame(7.005, **late)

@@ -75,9 +75,35 @@ def test_labels_of_a_window_are_those_of_its_cells(costmap: NDArray[np.uint8], d
     assert components.labels(x, y, w, h).tolist() == expected
 
 
+@settings(max_examples=examples(100), deadline=None)
+@given(costmaps(), st.data())
+def test_window_has_both_components_when_its_cells_belong_to_them(
+    costmap: NDArray[np.uint8], data: st.DataObject
+) -> None:
+    height, width = costmap.shape
+    components = Components(costmap)
+    columns, rows = st.integers(0, width - 1), st.integers(0, height - 1)
+    first, second = (components.of(data.draw(columns), data.draw(rows)) for _ in range(2))
+    windows = []
+    for _ in range(data.draw(st.integers(0, 5))):
+        x, y = data.draw(columns), data.draw(rows)
+        windows.append((x, y, data.draw(st.integers(0, width - x)), data.draw(st.integers(0, height - y))))
+    found = components.both_in(np.array(windows, np.int32).reshape(-1, 4), first, second)
+    expected = [
+        first >= 0 <= second and {first, second} <= set(components.labels(*window).ravel().tolist())
+        for window in windows
+    ]
+    assert found.tolist() == expected
+
+
 def test_unknown_component_and_window_off_the_grid_are_refused() -> None:
     components = Components(np.zeros((4, 5), np.uint8))
     with pytest.raises(ValueError, match="component 3"):
         components.nearest(3, (0, 0))
     with pytest.raises(ValueError, match="window"):
         components.labels(2, 0, 4, 1)
+    for window in ((2, 0, 4, 1), (0, 3, 1, 2), (-1, 0, 1, 1), (0, 0, 2**31 - 1, 1)):
+        with pytest.raises(ValueError, match=r"window .* leaves the 5 x 4 grid"):
+            components.both_in(np.array([(0, 0, 1, 1), window], np.int32), 0, 0)
+    with pytest.raises(ValueError, match=r"shape \(n, 4\)"):
+        components.both_in(np.zeros((1, 2), np.int32), 0, 0)

@@ -40,7 +40,7 @@ for source in (raw, shut):
     planner.shortcut(cost, cells)
     planner.exit_path(cost, cost, (20, 20)), astar.nearest_traversable(cost, (0, 0), 20)
     found = components.Components(cost)
-    found.nearest(found.of(20, 20), (0, 0)), found.labels(0, 0, 5, 5)
+    found.nearest(found.of(20, 20), (0, 0)), found.labels(0, 0, 5, 5), found.both_in(np.ones((2, 4), np.int32), 0, 0)
     lines.line_cost(cost, 20, 20, 30, 30)
     lines.cost_from(cost, np.full((2, 2), 20.0), np.zeros(2), 0.0, (0.0, 0.0, 1.0))
     lines.first_inside(np.zeros((2, 2)), np.zeros(2), 0.1, 0.0, (0.0, 0.0, 1.0), (0, 0), np.ones((2, 2), np.bool_))

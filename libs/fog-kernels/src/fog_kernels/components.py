@@ -156,6 +156,38 @@ def _paint(offsets: Any, first: Any, last: Any, label: Any, left: int, bottom: i
                 row[x - left] = label[i]
 
 
+@njit(
+    void(
+        _arrays.I32_FLAT, _arrays.I32_FLAT, _arrays.I32_FLAT, _arrays.I32_FLAT, _arrays.I32_PAIRS, int64, int64, _U8_OUT
+    ),
+    cache=True,
+    nogil=True,
+)  # fmt: skip
+def _find_both(offsets: Any, first: Any, last: Any, label: Any, windows: Any, a: int, b: int, found: Any) -> None:
+    """Write 1 for each window (x, y, width, height) that has cells of both components, 0 for the others."""
+    for i in range(windows.shape[0]):
+        left = windows[i, 0]
+        right = left + windows[i, 2]
+        has_a = False
+        has_b = False
+        for y in range(windows[i, 1], windows[i, 1] + windows[i, 3]):
+            low, high = offsets[y], offsets[y + 1]
+            end = high
+            while low < high:
+                middle = (low + high) >> 1
+                if last[middle] < left:
+                    low = middle + 1
+                else:
+                    high = middle
+            while low < end and left < right and first[low] < right:
+                has_a |= label[low] == a
+                has_b |= label[low] == b
+                low += 1
+            if has_a and has_b:
+                break
+        found[i] = has_a and has_b
+
+
 class Runs:
     """The runs of one costmap, row by row from the lowest, numbered from 0."""
 
@@ -238,3 +270,21 @@ class Components:
         out = np.empty((height, width), np.int32)
         _paint(runs.offsets, runs.first, runs.last, self._label, x, y, out)
         return out
+
+    def both_in(self, windows: NDArray[np.int32], a: int, b: int) -> NDArray[np.bool_]:
+        """Return for each window whether it has cells of both components; windows are int32 (n, 4).
+
+        Each is x, y, width and height. Raises TypeError or ValueError for other arrays, or a window that leaves the
+        grid.
+        """
+        _arrays.exact(windows, np.int32, 2, "windows")
+        if windows.shape[1] != 4:
+            raise ValueError(f"windows must have shape (n, 4), not {windows.shape}")
+        runs, wide = self._runs, windows.astype(np.int64)
+        leaves = (wide < 0).any(axis=1) | (wide[:, :2] + wide[:, 2:] > (runs.width, runs.height)).any(axis=1)
+        if leaves.any():
+            window = tuple(wide[int(np.argmax(leaves))].tolist())
+            raise ValueError(f"the window {window} leaves the {runs.width} x {runs.height} grid")
+        found = np.empty(len(windows), np.uint8)
+        _find_both(runs.offsets, runs.first, runs.last, self._label, windows, int(a), int(b), found)
+        return found.view(np.bool_)

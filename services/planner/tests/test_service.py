@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any, cast
 import httpx
 import pytest
 from prometheus_client import REGISTRY
-from ring_map import LEFT, RIGHT, RingMap, goal, pose
+from ring_map import LEFT, LOWER, RIGHT, UPPER, RingMap, goal, pose
 
 import planner.keepers.path_record
 import planner.service
@@ -23,6 +23,7 @@ from fog_runtime.health import Health
 from fog_runtime.http import Tokens
 from fog_runtime.transports.zenoh_edge import ASKER
 from planner.core import PlannerCore
+from planner.keepers.path_record import PathRecord
 from planner.query_queue import BusyError
 from planner.rest.api import make_api
 from planner.service import Service
@@ -283,6 +284,62 @@ async def test_paths_are_recorded_after_half_a_second_although_searches_are_left
         planning.cancel()
         rig.service.close()
     assert rig.service._record.paths["r0"].points
+
+
+class NotingQueue:
+    """Notes how many robots' paths were recorded when work came, and does none."""
+
+    def __init__(self, record: PathRecord) -> None:
+        self.recorded: list[int] = []
+        self._record = record
+
+    async def run(self, _kind: str, _asker: str, _work: object) -> None:
+        self.recorded.append(len(self._record.paths))
+
+    def close(self) -> None:
+        """There is nothing to end."""
+
+
+async def test_reasons_of_refusals_are_looked_for_before_all_refusals_are_recorded(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(planner.service, "RECORDED_AT_ONCE", 1)
+    core, ring_map = PlannerCore(epoch=1), RingMap()
+    rig = Rig(core)
+    queue = NotingQueue(rig.service._record)
+    monkeypatch.setattr(rig.service, "_queue", queue)
+    for name, box in (("z1", UPPER), ("z2", LOWER)):
+        ring_map.put(name, box)
+    core.load(ring_map.master.snapshot(), 10.0)
+    core.handlers()[ch.MAP_HEARTBEAT]({}, ring_map.master.heartbeat(0.0), Moment(10.0, 10.0))
+    robots = [f"r{number}" for number in range(12)]
+    for robot in robots:
+        core.handlers()[ch.ROBOT_POSE]({"robot": robot}, pose(*LEFT), Moment(10.0, 10.0))
+        core.set_goal(robot, goal(*RIGHT, robot))
+    planning = asyncio.create_task(rig.service.plan_loop())
+    rig.service._wake.set()
+    async with asyncio.timeout(60.0):
+        while len(rig.service._record.paths) < len(robots):  # noqa: ASYNC110  # filled by the loop of plans
+            await asyncio.sleep(0.001)
+    planning.cancel()
+    rig.service.close()
+    assert queue.recorded[0] < len(robots)
+
+
+def test_what_was_published_is_recorded_a_part_at_a_time_and_oldest_first() -> None:
+    record = PathRecord()
+    path = RobotPath(
+        plan_id=1, planner_epoch=1, goal_id="g", points=[(0.0, 0.0), (1.0, 0.0)], map_epoch=1, map_seq=1,
+        released_length=1.0, goal_theta=None, refusal=None, traces=[],
+    )  # fmt: skip
+    record.add([Publication(ch.ROBOT_PATH, path, {"robot": f"r{number}"}) for number in range(5)], 1.0)
+    parts = []
+    while record.take_over(2):
+        parts.append(sorted(record.paths))
+        if len(parts) == 1:  # what comes meanwhile is recorded after it
+            record.add([Publication(ch.ROBOT_PATH, path, {"robot": "r5"})], 2.0)
+    assert parts == [["r0", "r1"], ["r0", "r1", "r2", "r3"]]
+    assert sorted(record.paths) == ["r0", "r1", "r2", "r3", "r4", "r5"]
 
 
 class WaitingCore(PlannerCore):

@@ -45,6 +45,8 @@ if TYPE_CHECKING:
 
 TICK_S: Final = 0.1
 BUSY_PAUSE_S: Final = 0.25
+RECORDED_AT_ONCE: Final = 8
+"""Of so many publications the record is made without a pause for jobs, messages and the next cycle."""
 
 _log = logs.get("planner")
 
@@ -231,18 +233,25 @@ class Service:
             result = await self._threads.run("core", lambda: self._cycle.run(self._edges.now, self._publish))
             if result.unfinished:
                 self._wake.set()
-            if not result.unfinished or self._record.is_due(self._clock.now()):
-                self._record.take_over()
-            for robot, goal_id in result.reached:
-                self.missions.end(robot, goal_id)
             for job in result.jobs:
                 self._start(job)
+            for robot, goal_id in result.reached:
+                self.missions.end(robot, goal_id)
             if result.wants_snapshot:
                 self._map.request()
             connected = self._zenoh.connected
             self._health.set("zenoh", ok=connected, detail="" if connected else "not connected to the router")
             self._health.set("robots", ok=True, detail=self.operator.doubled_detail())
             self._metrics.update(self._core, len(self.goals))
+            if not result.unfinished or self._record.is_due(self._clock.now()):
+                await self._record_sent()
+
+    async def _record_sent(self) -> None:
+        """Record what was published, until the next cycle is due: what is left then is recorded after it."""
+        while self._record.take_over(RECORDED_AT_ONCE):
+            await asyncio.sleep(0)
+            if self._wake.is_set() and not self._record.is_due(self._clock.now()):
+                return
 
     def _change_goal(self, change: Callable[[], object]) -> None:
         self._cycle.change_goal(change)

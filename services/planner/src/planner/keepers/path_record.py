@@ -41,15 +41,16 @@ class PathRecord:
         late = bool(self._sent) and now - self._unrecorded_since >= UNRECORDED_S
         return late or len(self._sent) >= MOST_UNRECORDED
 
-    def take_over(self) -> None:
-        """Record what was added since the last call."""
-        sent, self._sent = self._sent, []
+    def take_over(self, most: int) -> bool:
+        """Record the oldest of what was added, `most` publications at most; return whether others are left."""
+        sent, self._sent = self._sent[:most], self._sent[most:]
         for publication in sent:
             message = publication.message
             if isinstance(message, RobotPath):
                 self._record_path(publication.ids["robot"], message)
             elif isinstance(message, RobotRelease):
                 self._record_release(publication.ids["robot"], message)
+        return bool(self._sent)
 
     def _record_path(self, robot: str, path: RobotPath) -> None:
         """Record what the API shows, and report a plan when it is first published, a refusal when it changes."""

@@ -147,6 +147,8 @@ class MapTracker:
             return None
         if self._copy is None or self._copy.version != current.version or self._copy.static is not current.static:
             self._copy = replace(current, cost=current.cost.copy())
+            if current.has_components:
+                self._copy.__dict__["components"] = current.components  # of the same cells
         return self._copy
 
     def wants_snapshot(self, now: float) -> bool:

@@ -101,7 +101,7 @@ def _rasterized(source: Source, geometry: GridGeometry) -> ShapeMask:
 
 
 class Regions:
-    """The regions of one map that are on, made of the newest hazards and zones.
+    """The regions of one map, made of the newest hazards and zones.
 
     A shape is rasterized when it is new, not again when others change. One thread may use it.
     """
@@ -116,14 +116,17 @@ class Regions:
 
         A source may be newer or older than the map: a region counts only while the map shows its cells.
         """
-        if self._geometry != planning_map.geometry:
-            self._geometry, self._known = planning_map.geometry, []
+        return [region for region in self.of(planning_map.geometry, sources) if region.is_on(planning_map)]
+
+    def of(self, geometry: GridGeometry, sources: Sequence[Source]) -> list[Region]:
+        """Return the regions of all sources that have cells, in their order, whether they are on or not."""
+        if self._geometry != geometry:
+            self._geometry, self._known = geometry, []
         known = {id(source): (source, region) for source, region in self._known}
         self._known = [
-            known.get(id(source)) or (source, region_of(source, planning_map.geometry, self._inflation))
-            for source in sources
+            known.get(id(source)) or (source, region_of(source, geometry, self._inflation)) for source in sources
         ]
-        return [region for _, region in self._known if region is not None and region.is_on(planning_map)]
+        return [region for _, region in self._known if region is not None]
 
 
 Slices = tuple[slice, slice]

@@ -18,6 +18,7 @@ import csv
 import re
 import sys
 from collections.abc import Mapping, Sequence
+from itertools import dropwhile, takewhile
 from pathlib import Path
 from statistics import fmean
 from typing import Final
@@ -67,13 +68,19 @@ def threads(drives: Sequence[Mapping[str, str]]) -> dict[tuple[str, str], float]
     }
 
 
+def _in_table(line: str) -> bool:
+    return line.startswith("|")
+
+
 def processes(readme: str) -> dict[tuple[str, str], tuple[float, str]]:
     """Return CPU (cores) and number of drives of each setup's processes, of real ones without a quota at speed 1.
 
     Nothing, if the report has none. Raises `SystemExit` if its table has other columns, or two such rows of a setup.
     """
-    table = readme.partition("## What the robot's processes cost")[2].partition("\n## ")[0]
-    lines = [line.strip("| ").split(" | ") for line in table.splitlines() if line.startswith("|")]
+    section = readme.partition("## What the robot's processes cost")[2].partition("\n## ")[0]
+    # Only the first table: that of memory by route may follow it.
+    table = takewhile(_in_table, dropwhile(lambda line: not _in_table(line), section.splitlines()))
+    lines = [line.strip("| ").split(" | ") for line in table]
     if not lines:
         return {}
     head, _, *rows = lines

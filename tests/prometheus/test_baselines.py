@@ -30,6 +30,10 @@ PROCESSES = """
 | default | none | 1 | 3 | 8.00 | 2.00 | 0.20 |
 | full | 0.2 of a core | 1 | 2 | 4.00 | 1.00 | 0.10 |
 
+| Memory of the robot's processes, MB | default | full |
+| --- | --- | --- |
+| A to B | 233.4 ± 1.9 | 206.4 ± 0.0 |
+
 ## Another table
 | setup |
 """

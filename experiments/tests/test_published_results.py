@@ -13,6 +13,7 @@ from fognav_experiments.comparison.publish import publish
 from fognav_experiments.comparison.records import Folder
 from fognav_experiments.comparison.runner import site_digest
 
+pytestmark = pytest.mark.timeout(900)
 ROOT = Path(__file__).parents[2]
 ARCHIVES = sorted((ROOT / "docs" / "results").glob(f"*/{archive.NAME}"))
 WITH_FLOOR = {"README.md", "report.html"}

@@ -141,6 +141,18 @@ PARTS: Final = (
             ),
             Equivalent(
                 "core",
+                "if status is base.harmless and base.awake and self._maneuvers.running is None:",
+                "self._maneuvers.running is None -> self._maneuvers.running is not None",
+                "a status that is no fault without a maneuver is none during one: it is only asked again",
+            ),
+            Equivalent(
+                "core",
+                "base.harmless = None if status.overcurrent or self._maneuvers.running is not None else status",
+                "base.harmless = None if status.overcurrent or self._maneuvers.running is not None else status -> pass",
+                "it saves asking a status again that is no fault, and changes no answer",
+            ),
+            Equivalent(
+                "core",
                 "if current * target < 0:",
                 "current * target < 0 -> current * target <= 0",
                 "with either of them zero, the current speed or the target is zero, and the result the same",

@@ -1,6 +1,6 @@
 """Several robots in the same corridors, on an emulated clock: one fog node, and each robot in its own world.
 
-A world holds one robot. The others stand in it as obstacles that move, for its lidar, its bumper and the sonars.
+A world holds one robot. The others are in its way wherever they are, and its lidar and the sonars see them.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ import msgspec
 
 from fog_contracts import channels as ch
 from fog_contracts.bus import Bus
-from fog_contracts.messages import Pose, RobotGoal, SimObstacle
+from fog_contracts.messages import Pose, RobotGoal
 from fog_runtime.configuration.default_parts import DEFAULT_BASE
 from fognav_experiments.rigs import STAMP, TICK_STEPS, FogRig, RobotRig, moment
 from fognav_sim import devices
@@ -35,7 +35,6 @@ if TYPE_CHECKING:
 
 READY_S: Final = 20.0
 _OPERATOR_STEPS: Final = 50
-_CORNERS: Final = 8
 
 
 class Mission(NamedTuple):
@@ -90,15 +89,6 @@ class Vehicle:
         if command is not None:
             self.rig.command(command)
 
-    def body(self) -> SimObstacle:
-        """Return the robot as an obstacle to others: a polygon around its circle."""
-        x, y, _ = self.world.pose
-        robot = self.world.robot
-        reach = robot.radius / math.cos(math.pi / _CORNERS)
-        turns = (math.tau * corner / _CORNERS for corner in range(_CORNERS))
-        ring = [(x + reach * math.cos(turn), y + reach * math.sin(turn)) for turn in turns]
-        return SimObstacle(id=self.id, polygon=ring, height=robot.height)
-
     def _on_state(self, ids: Ids, state: RobotState, at: Moment) -> Sequence[Publication]:
         del ids
         self.state = state
@@ -125,6 +115,8 @@ class Fleet:
         self.vehicles = [
             Vehicle(site, mission, self.bus, seed + number, cpu) for number, mission in enumerate(missions)
         ]
+        for vehicle in self.vehicles:
+            vehicle.world.share_with(other.world for other in self.vehicles if other is not vehicle)
         self.fog = FogRig(site, self.vehicles[0].world, self.bus, seed, 0.0, measure=cpu.measure)
         self.least_gap_m = math.inf
         """The smallest distance between the rims of two robots so far."""
@@ -139,9 +131,11 @@ class Fleet:
         """Simulate 10 ms."""
         for vehicle in self.vehicles:
             vehicle.rig.sense()
+        self._note_gap()
         tick = self._steps % TICK_STEPS == 0
         if tick:
-            self._move_bodies()
+            for vehicle in self.vehicles:
+                vehicle.world.see_others()
         at = moment(self.now)
         self.fog.measure(at.now)
         self.fog.deliver(at)
@@ -172,15 +166,10 @@ class Fleet:
             vehicle.start(goal.goal_id)
             self.fog.planner.set_goal(vehicle.id, goal, any_heading=True)
 
-    def _move_bodies(self) -> None:
-        """Let the robots stand where they are in one another's worlds."""
-        for one, other in itertools.permutations(self.vehicles, 2):
-            radii = one.world.robot.radius + other.world.robot.radius
-            gap = math.dist(one.world.pose[:2], other.world.pose[:2]) - radii
+    def _note_gap(self) -> None:
+        for one, other in itertools.combinations((vehicle.world for vehicle in self.vehicles), 2):
+            gap = math.dist(one.pose[:2], other.pose[:2]) - one.robot.radius - other.robot.radius
             self.least_gap_m = min(self.least_gap_m, gap)
-            # A body that overlaps the robot stays where it was, 3 cm away: driving on is a contact.
-            if gap > 0.1 * radii:
-                one.world.place(other.body())
 
     def _supervise(self, *, evaluate: bool) -> None:
         if refused := self.bus.refused:

@@ -56,14 +56,20 @@ class Floor:
         """The obstacles on the floor; walls are in the map."""
         return list(self._obstacles.values())
 
-    def place(self, obstacle: SimObstacle) -> None:
-        """Place an obstacle, replacing one with the same id; raises `GeometryError` for an invalid outline."""
+    def place(self, obstacle: SimObstacle, *, solid: bool = True) -> None:
+        """Place an obstacle, replacing one with the same id; raises `GeometryError` for an invalid outline.
+
+        One that is not `solid` is seen by sensors only: `nearest` passes over it.
+        """
         outline = normalized_polygon(obstacle.polygon)
         points = np.array(outline)
         edges = np.hstack((points, np.roll(points, -1, axis=0)))
         self.changes += 1
         self._obstacles[obstacle.id] = obstacle
-        self._outlines[obstacle.id] = outline
+        if solid:
+            self._outlines[obstacle.id] = outline
+        else:
+            self._outlines.pop(obstacle.id, None)
         self._edges[obstacle.id] = edges, np.hypot(edges[:, 2] - edges[:, 0], edges[:, 3] - edges[:, 1])
         self._circles[obstacle.id] = _circle_around(points)
 
@@ -76,7 +82,7 @@ class Floor:
         return self._obstacles.pop(obstacle_id, None) is not None
 
     def nearest(self, x: float, y: float) -> tuple[float, float]:
-        """Return the distance (m) from (x, y) to the nearest wall or obstacle and the direction (rad) to it."""
+        """Return the distance (m) from (x, y) to the nearest wall or solid obstacle and the direction (rad) to it."""
         nearest, direction = self._nearest_wall(x, y)
         for name, outline in self._outlines.items():
             middle_x, middle_y, radius = self._circles[name]

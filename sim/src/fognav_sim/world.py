@@ -18,6 +18,8 @@ from fognav_sim.floor import MAX_CLEARANCE_M
 from fognav_sim.sensors import LidarPlace, Noise, Robot, Sonars, measure_lidar
 
 if TYPE_CHECKING:
+    from collections.abc import Iterable
+
     from numpy.typing import NDArray
 
     from fog_contracts.messages import Pose
@@ -26,6 +28,8 @@ if TYPE_CHECKING:
 
 _CONTACT_RELEASE_M: Final = 0.01
 """A contact has ended when the clearance exceeds this."""
+_BODY_CORNERS: Final = 8
+"""Of the polygon around a robot's circle that the sensors of others measure."""
 
 
 @dataclass
@@ -44,7 +48,7 @@ class _Body:
 
 
 class World:
-    """A floor (grid and obstacles) with one robot."""
+    """A floor (grid and obstacles) with one robot; other robots may drive there, each in a world of its own."""
 
     def __init__(
         self,
@@ -68,6 +72,7 @@ class World:
         self._wheel_commands = (0.0, 0.0)
         self.no_return_rad: tuple[float, float] | None = None
         """Sector of the lidar (from, to; rad, counter-clockwise) in which nothing returns its beams."""
+        self._others: tuple[World, ...] = ()
         start = robot.start
         self._body = _Body(start.x, start.y, start.theta)
         clearance = self.clearance()
@@ -99,7 +104,29 @@ class World:
         """Remove an obstacle; return False if there is none with this id."""
         return self._floor.remove(obstacle_id)
 
+    def share_with(self, others: Iterable[World]) -> None:
+        """Let the robots of other worlds be in the way of this one, exactly where they are at each moment.
+
+        This world's sensors find them where they were at the last `see_others`. Raises `ValueError` if robots overlap.
+        """
+        self._others = tuple(others)
+        if self.clearance() < 0:
+            raise ValueError(f"robot {self.robot.id} stands in another one: move its start")
+        self.see_others()
+
+    def see_others(self) -> None:
+        """Let the sensors find the other robots where they are now."""
+        for other in self._others:
+            self._floor.place(other.outline(), solid=False)
+
     # --- the robot ---------------------------------------------------------------------------------------------------
+
+    def outline(self) -> SimObstacle:
+        """Return the robot as an obstacle to the sensors of others: a polygon around its circle."""
+        reach = self.robot.radius / math.cos(math.pi / _BODY_CORNERS)
+        turns = (math.tau * corner / _BODY_CORNERS for corner in range(_BODY_CORNERS))
+        ring = [(self._body.x + reach * math.cos(turn), self._body.y + reach * math.sin(turn)) for turn in turns]
+        return SimObstacle(id=self.robot.id, polygon=ring, height=self.robot.height)
 
     @property
     def pose(self) -> tuple[float, float, float]:
@@ -113,7 +140,7 @@ class World:
 
     @property
     def contacts(self) -> int:
-        """Number of contacts with walls and obstacles so far."""
+        """Number of contacts with walls, obstacles and other robots so far, as far as this one drove into them."""
         return self._body.contacts
 
     @property
@@ -178,12 +205,16 @@ class World:
             self._body.bump_right = side < math.radians(10.0)
 
     def clearance(self) -> float:
-        """Distance (m) from the robot's rim to the nearest wall or obstacle, negative inside it; at most about 2."""
+        """Distance (m) from its rim to the nearest wall, obstacle or other robot, negative inside; at most about 2."""
         return self._nearest(self._body.x, self._body.y)[0]
 
     def _nearest(self, x: float, y: float) -> tuple[float, float]:
-        """Return the clearance (m) at (x, y) and the direction (rad) to the nearest wall or obstacle."""
+        """Return the clearance (m) at (x, y) and the direction (rad) to the nearest wall, obstacle or other robot."""
         distance, direction = self._floor.nearest(x, y)
+        for other in self._others:
+            there_x, there_y, _ = other.pose
+            if (apart := math.hypot(there_x - x, there_y - y) - other.robot.radius) < distance:
+                distance, direction = apart, math.atan2(there_y - y, there_x - x)
         return distance - self.robot.radius, direction
 
     # --- sensors ------------------------------------------------------------------------------------------------------

@@ -372,6 +372,22 @@ def test_maneuver_that_the_agents_silence_has_ended_says_so_and_begins_again_by_
     assert rig.core.moving
 
 
+@pytest.mark.parametrize("gone", [False, True])
+def test_base_that_has_left_its_charger_while_the_agent_was_silent_is_done_and_drives_on(gone):
+    rig = leaving()
+    rig.now += 0.22
+    rig.status.update(charging=False, docked=False)
+    parted = rig.frame(rig.now, **rig.status)
+    ended = rig.core.on_agent_lost(rig.now) if gone else rig.core.tick(rig.now)
+    assert (parted.data + ended.data).endswith(b"take;")
+    assert not rig.core.moving
+    for _ in range(25):
+        rig.step()
+        assert "was ended" not in (rig.feedback.stopped or "")
+    assert rig.feedback.stopped is None
+    assert rig.core.moving, "the rest of the way is ordinary driving"
+
+
 def test_maneuver_that_the_agent_has_ended_leaves_no_problem():
     rig = backing_off()
     rig.steps(0.2, None, 0.0)

@@ -102,13 +102,15 @@ class Maneuvers:
         """
         running = self.running
         assert running is not None
+        if running == "leave_dock" and not reading.status.charging:
+            return True  # it is done: a silence at that moment has ended nothing
         if command is None:
             self.problem = (
                 f"{_NAMES[running]} was ended because the agent sent no fresh command: find in the agent's log why it "
                 "was late or gone, then order it again"
             )
             return True
-        if command.maneuver != running or (running == "leave_dock" and not reading.status.charging):
+        if command.maneuver != running:
             return True
         limit = LIMITS[running]
         if now - self._since > limit.seconds:

@@ -129,3 +129,32 @@ def test_what_was_loaded_aside_is_returned_and_its_error_is_logged_with_status_o
         out, err = child.communicate(timeout=60)
     assert (out, child.returncode) == ("cleaned\n", 1)
     assert json.loads(err)["reason"] == "ImportError: no such kernel"
+
+
+HELD = """
+import threading
+class Held(threading.Thread):
+    def __init__(self, *arguments, **options):
+        super().__init__(*arguments, **options)
+        self.joined = threading.Event()
+    def run(self):
+        print("held", flush=True)
+        self.joined.wait()
+        super().run()
+    def join(self, timeout=None):
+        self.joined.set()
+        super().join(timeout)
+threading.Thread = Held
+"""
+
+
+def test_what_a_signal_cancels_before_its_thread_begins_is_not_loaded_and_does_not_delay_the_end():
+    """The thread gets to its first line when the loop waits for it, which is after the cancellation."""
+    load = "print('loading', flush=True); threading.Event().wait()"
+    command = [sys.executable, "-c", HELD + ASIDE.format(load=load)]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as child:
+        assert child.stdout.readline() == "held\n"
+        child.send_signal(signal.SIGTERM)
+        out, err = child.communicate(timeout=60)
+    assert (out, child.returncode) == ("cleaned\n", 0)
+    assert [json.loads(line)["event"] for line in err.splitlines()] == ["stopping", "stopped"]

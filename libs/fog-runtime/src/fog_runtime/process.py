@@ -32,7 +32,8 @@ async def load_aside(load: Callable[[], T]) -> T:
     result: Future[T] = Future()
 
     def work() -> None:
-        result.set_running_or_notify_cancel()
+        if not result.set_running_or_notify_cancel():
+            return  # cancelled before this thread's first line; the loop waits for its end
         try:
             result.set_result(load())
         except BaseException as error:  # noqa: BLE001  # raised to who awaits it

@@ -285,6 +285,11 @@ async def until(condition, expected: str, deadline_s: float = DEADLINE_S):
     raise AssertionError(f"not within {deadline_s} s: {expected}")
 
 
+def is_by_delay(reason: str) -> bool:
+    """Return whether a robot's reason for the end of a maneuver is that its computer was late."""
+    return "the agent sent no fresh command" in reason or "; this computer was " in reason
+
+
 class Robot:
     """The whole robot, started; `fog` is None until `async with`."""
 

@@ -4,15 +4,19 @@ from __future__ import annotations
 
 import asyncio
 import math
+import time
 
 import numpy as np
 import pytest
-from agent_rig import ROBOT, SITE, Robot, until
-from guardian_rig import STOP_S, lateness
+from agent_rig import ROBOT, SITE, Robot, is_by_delay, until
+from guardian_rig import DEADLINE_S, STOP_S, lateness
 from little_world import grid_of
 from locked_servers import locked_router
 
 pytestmark = [pytest.mark.live, pytest.mark.reaction, pytest.mark.timeout(180)]
+
+TRIES = 5
+"""So often a robot is told to back off at most, when its computer's delay ends it."""
 
 ALIKE = [(1, 1, 4.5, 4), (6, 1, 9.5, 4), (7.6, 4, 8.4, 4.3)]
 """Two rooms, the second with a niche that is so shallow that one scan does not tell them apart.
@@ -42,38 +46,53 @@ class Rolled:
         self._add(left, right)
 
 
+async def back_off(robot) -> tuple[float, str]:
+    """Let a bumped robot back off and reset it; return how far it got (m) and why it ended.
+
+    The stop may come as late as the robot's design allows, and on a busy machine later.
+    """
+    fog, world = robot.fog, robot.body.robot.world
+    rolled, late, before = Rolled(robot.body.robot), lateness(), len(fog.states)
+    reply = await fog.command("back_off")
+    assert reply.accepted, reply
+    await until(lambda: any(state.mode == "EGRESS" for state in fog.states[before:]), "it says so")
+    await until(lambda: rolled.left < -0.03 or fog.state.mode == "FAULT", "it backs off, or stops")
+    world.bump_left = False
+    await until(lambda: fog.state.mode == "FAULT" and not robot.body.moving, "it has backed off")
+    for travel in (rolled.left, rolled.right):
+        assert -0.10 - 0.05 * (STOP_S + late.seconds()) <= travel <= 0.0
+    assert all(-0.051 <= speed <= 0.0 for speeds in rolled.speeds for speed in speeds), rolled.speeds
+    assert any("bumper" in reason for reason in fog.state.reasons)
+    end = time.monotonic() + DEADLINE_S
+    while not (reply := await fog.command("reset")).accepted:
+        assert "the cause is still there" in reply.reason
+        assert time.monotonic() < end, f"the bumper is free, but no reset is accepted: {reply}"
+        await asyncio.sleep(0.05)
+    waits = "waiting for an operator to enable"
+    await until(lambda: fog.state.mode == "INIT" and fog.state.reasons[1:] == [waits], "only an enable is missing")
+    ended = fog.state.reasons[0]
+    assert ended.startswith("the back-off ended: ")
+    return -rolled.left, ended
+
+
 async def test_bumped_robot_backs_off_ten_centimetres_at_most_and_slowly_and_keeps_its_fault(tmp_path, router):
     async with Robot(tmp_path, router) as robot:
         await robot.localized()
-        assert (await robot.fog.command("enable")).accepted
         robot.fog.send_robot_to_the_corner()
-        await until(lambda: robot.body.pose[0] > 2.5, "it is on its way")
-        robot.body.robot.world.bump_left = True
-        await until(lambda: robot.fog.state.mode == "FAULT" and not robot.body.moving, "it has stopped")
-        refused = await robot.fog.command("reset")
-        assert "the cause is still there" in refused.reason
-        rolled, late = Rolled(robot.body.robot), lateness()
-        before, begun = len(robot.fog.states), (0.0, 0.0)
-        assert (await robot.fog.command("back_off")).accepted
-        while rolled.left - begun[0] >= -0.03:
-            # An agent that is late for 0.2 s, on a busy machine, ends its way early: then it is ordered again.
-            if robot.fog.state.mode == "FAULT" and not robot.body.moving:
-                begun = rolled.left, rolled.right
-                await robot.fog.command("back_off")
-            await asyncio.sleep(0.05)
-        robot.body.robot.world.bump_left = False
-        await until(lambda: any(state.mode == "EGRESS" for state in robot.fog.states[before:]), "it says so")
-        await until(lambda: robot.fog.state.mode == "FAULT" and not robot.body.moving, "it has backed off")
-        # The stop may come as late as the robot's design allows, and on a busy machine later. It gets 0.09 m far in
-        # lockstep; how far at least is left open here, because an agent that is late for 0.2 s ends its way early.
-        for travel in (rolled.left - begun[0], rolled.right - begun[1]):
-            assert -0.10 - 0.05 * (STOP_S + late.seconds()) <= travel < -0.03
-        assert all(-0.051 <= speed <= 0.0 for speeds in rolled.speeds for speed in speeds), rolled.speeds
-        assert any("bumper" in reason for reason in robot.fog.state.reasons)
-        assert (await robot.fog.command("reset")).accepted
-        waits = "waiting for an operator to enable"
-        await until(lambda: robot.fog.state.mode == "INIT" and waits in robot.fog.state.reasons, "it waits in INIT")
-        assert any(reason.startswith("the back-off ended: ") for reason in robot.fog.state.reasons)
+        far = 0.0
+        for _ in range(TRIES):
+            assert (await robot.fog.command("enable")).accepted
+            await until(lambda: robot.body.pose[0] > 2.5 and robot.body.moving, "it is on its way")
+            robot.body.robot.world.bump_left = True
+            await until(lambda: robot.fog.state.mode == "FAULT" and not robot.body.moving, "it has stopped")
+            refused = await robot.fog.command("reset")
+            assert "the cause is still there" in refused.reason
+            far, reason = await back_off(robot)
+            # It gets 0.09 m far in lockstep. An agent that is late, on a busy machine, ends its way early.
+            if far > 0.03:
+                break
+            assert is_by_delay(reason), reason
+        assert far > 0.03, f"each of {TRIES} ended early, the last one because {reason}"
         assert robot.error() < 0.15
 
 

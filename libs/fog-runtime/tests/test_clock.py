@@ -64,6 +64,22 @@ async def test_a_loop_that_has_waited_on_purpose_goes_on_with_the_next_tick_and_
     assert loop_ticker.late == 0
 
 
+async def test_a_loop_that_waits_on_purpose_is_not_late_and_forgets_what_was_late_before():
+    clock = ManualClock()
+    loop_ticker = ticker(clock, 0.25)
+    async for _ in loop_ticker:
+        if loop_ticker.ticks == 1:
+            clock.advance(0.375)
+        elif loop_ticker.ticks == 2:
+            assert loop_ticker.p99_s == 0.125
+            loop_ticker.rejoin()
+            assert loop_ticker.p99_s == 0.0
+            clock.advance(60.125)
+        else:
+            break
+    assert loop_ticker.p99_s == 0.0
+
+
 async def test_loops_of_one_phase_share_their_ticks_whenever_they_begin():
     clock, phase = ManualClock(50.0), Phase()
     assert phase.next_tick(50.0, 0.1) == 50.0

@@ -203,16 +203,19 @@ async def test_an_operator_of_a_robot_that_stands_by_is_answered_by_its_newest_i
     assert len(lidar.polled) == before + 1
 
 
-async def test_a_robot_that_stands_by_decides_nothing_until_there_may_be_something_again(rig, monkeypatch):
+async def test_a_robot_that_stands_by_decides_nothing_and_is_not_late_until_there_may_be_something_again(rig, monkeypatch):
     standing, asked = True, []
     monkeypatch.setattr(AgentCore, "standing_by", property(lambda _core: standing))
     monkeypatch.setattr(rig.core, "control_job", asked.append)
     guardian = FakeGuardian()
+    rig.service._control._record(now=10.0, due=0.0)
+    assert rig.service._loop_health().control_p99_s == 10.0
     loops = [rig.service.control_loop(), rig.service.stream_loop(guardian, FakeLidar())]
     tasks = [asyncio.create_task(loop) for loop in loops]
     try:
         await rig.until(lambda: len(guardian.sent) >= 8)
         assert len(asked) == 1
+        assert rig.service._loop_health().control_p99_s == 0.0, "what was late before is over"
         standing = False
         await rig.until(lambda: len(asked) >= 3)
     finally:

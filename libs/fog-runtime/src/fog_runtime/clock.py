@@ -212,7 +212,7 @@ class Ticker:
 
     @property
     def p99_s(self) -> float:
-        """99th percentile of the lateness (s of the clock) of the last 1000 ticks; 0 before the first."""
+        """99th percentile of the lateness (s of the clock) of the last 1000 ticks since the loop last waited; 0 without any."""
         if not self._lateness:
             return 0.0
         ordered = sorted(self._lateness)
@@ -275,8 +275,12 @@ class Ticker:
                 timer.cancel()
 
     def rejoin(self) -> None:
-        """Go on with the phase's next tick: the body has waited on purpose, and missed none of those before it."""
+        """Go on with the phase's next tick after this one's body, which waits on purpose and misses none until then.
+
+        Call it when the wait begins: from then on nothing is late, and what was late before is forgotten.
+        """
         self._rejoins = True
+        self._lateness.clear()
 
     def _first(self) -> float:
         self._rejoins = False

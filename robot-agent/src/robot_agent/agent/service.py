@@ -248,9 +248,10 @@ class Service:
                     self._core.accept(await loop.run_in_executor(thread, decide, job))
                 elif self._core.standing_by:
                     # Not woken to find that there is nothing to decide: the stream tells when there may be again.
+                    # What was late before must not be reported for as long as the robot stands.
+                    self._control.rejoin()
                     self._wanted.clear()
                     await self._wanted.wait()
-                    self._control.rejoin()
         finally:
             thread.shutdown(wait=False, cancel_futures=True)
 

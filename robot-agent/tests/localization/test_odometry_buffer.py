@@ -56,6 +56,14 @@ def test_pose_is_extrapolated_by_015_s_and_no_further():
     assert buffer.pose(9.0).x == buffer.pose(1.15).x == pytest.approx(0.345)
 
 
+def test_the_newest_pose_is_that_of_the_last_reading_and_does_not_forget_the_pose_that_was_asked_for():
+    buffer = driven(0.3, 0.5)
+    asked = buffer.pose(1.1)
+    assert buffer.latest() == driven(0.3, 0.5).pose(1.0)
+    assert buffer.pose(1.1) is asked
+    assert OdometryBuffer().latest() is None
+
+
 def test_a_new_reading_changes_pose_and_twist_of_a_moment_that_was_asked_for_before():
     buffer = driven(0.3, 0.0)
     assert buffer.pose(1.1).x == pytest.approx(0.33)

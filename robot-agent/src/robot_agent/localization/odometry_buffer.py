@@ -42,7 +42,7 @@ class OdometryBuffer:
 
     def latest(self) -> Pose2 | None:
         """Return the newest pose; None before the first."""
-        return self.pose(self._history[-1][0]) if self._history else None
+        return Pose2(*self._history[-1][1:]) if self._history else None
 
     def pose(self, timestamp: float) -> Pose2 | None:
         """Return the pose at a time (s), interpolated; extrapolated by at most 0.15 s. None before the first."""

@@ -1,7 +1,8 @@
 """A world that is just large enough to close the loop: a grid, a unicycle with encoders, a lidar by ray casting.
 
 It feeds an `AgentCore` as its edge would: feedback at 22 Hz, lidar scans at 5.5 Hz whose beams are taken one after
-another while the robot moves, decisions at 5 Hz, wheel commands at 20 Hz. Everything runs on emulated time.
+another while the robot moves, decisions at 5 Hz, wheel commands at 20 Hz, at 10 Hz while it is idle. Everything runs on
+emulated time.
 """
 
 from __future__ import annotations
@@ -81,6 +82,7 @@ class LittleWorld:
         self.agent = self.start_agent(AGENT, self.seed)
         self.now = START
         self.steps = 0
+        self.stream_steps = 5
         self.x, self.y, self.theta = self.pose
         self.wheels = (0.0, 0.0)
         self.ticks = [60_000.0, 10.0]
@@ -239,8 +241,9 @@ class LittleWorld:
             self._publish_as_planner()
         if self.decide_on and self.steps % round(self.agent.profile.control_period / DT) == 0:
             self._control()
-        if self.steps % 5 == 0:
+        if self.steps % self.stream_steps == 0:
             command = self.agent.stream(self.now, self.stamp)
+            self.stream_steps = 10 if self.agent.idle else 5
             self.resets += command.reset
             self.resting = command.rest
             if command.reset:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import msgspec
 import numpy as np
@@ -28,7 +29,7 @@ from fog_contracts.messages import (
     ZoneSet,
 )
 from fog_contracts.replica import MapError
-from robot_agent.agent.core import decide
+from robot_agent.agent.core import AgentCore, decide
 
 
 @pytest.fixture
@@ -640,10 +641,10 @@ def test_a_robot_that_stands_by_commands_each_time_and_evaluates_its_inputs_five
     agent.stream = lambda now, stamp: sent.append(stream(now, stamp)) or sent[-1]
     assert agent.standing_by
     world.run(2.0)
-    assert len(sent) == 40
-    assert [command.seq - sent[0].seq for command in sent] == list(range(40))
+    assert len(sent) == 20
+    assert [command.seq - sent[0].seq for command in sent] == list(range(20))
     assert not any(command.left or command.right or command.reset or command.rest for command in sent)
-    assert np.diff(evaluated) == pytest.approx(0.15)
+    assert np.diff(evaluated) == pytest.approx(0.2)
     assert world.state().mode == "NORMAL"
     assert not world.state().loop.late_stops
 
@@ -671,6 +672,34 @@ def test_what_an_operator_changes_on_a_robot_that_stands_by_is_published_with_th
     assert world.command("disable").accepted
     world.published = agent.tick(world.moment)
     assert [state.mode for state in world.published_on(ch.ROBOT_STATE)] == ["INIT"]
+
+
+def test_a_mode_that_a_robot_standing_by_finds_is_published_with_the_next_tick(world):
+    world.run(1.0)
+    agent = world.agent
+    while agent.repeats(world.now):
+        world.run(0.01)
+    agent.tick(world.moment)
+    world.bumper = True
+    world.run(0.04)
+    assert agent.safety.mode == "NORMAL", "it has not looked yet"
+    assert agent.tick(world.moment) == ()
+    agent.stream(world.now, world.stamp)
+    assert agent.standing_by
+    world.published = agent.tick(world.moment)
+    assert [state.mode for state in world.published_on(ch.ROBOT_STATE)] == ["FAULT"]
+
+
+def test_a_robot_that_was_sent_to_its_dock_stands_by_only_when_it_has_given_up():
+    dock, staging = Pose(x=3.9, y=2.0, theta=0.0), Pose(x=3.2, y=2.0, theta=0.0)
+    config = {"dock": dock, "staging": staging, "finds_dock": True}
+    world = LittleWorld(start_agent=lambda agent, seed: AgentCore(replace(agent, **config), seed)).ready()
+    assert world.agent.standing_by
+    assert world.command("dock").accepted
+    assert world.state().goal_id is None
+    assert not world.agent.standing_by
+    assert world.run(11.0, lambda w: w.agent.standing_by), "no planner gives it a goal: it gives up after 10 s"
+    assert any("no goal in front of its dock" in warning for warning in world.state().reasons)
 
 
 def test_a_robot_on_a_mission_or_of_unknown_pose_never_stands_by(world):

@@ -270,6 +270,8 @@ class AgentCore:
             now=now,
         )
         outputs = self._safety.evaluate(inputs, now, request)
+        if outputs.changed:
+            self._ticked_at = -math.inf  # whoever watches a robot that stands by learns of it with the next tick
         self._driving.obey(outputs)
         return outputs
 
@@ -383,10 +385,10 @@ class AgentCore:
 
     @property
     def standing_by(self) -> bool:
-        """Whether an idle robot knows where it is and has no goal: then it looks at its inputs 5 times a second."""
+        """Whether an idle robot knows where it is, and wants nothing: then it looks at its inputs 5 times a second."""
         if self._localizer.status != "good" or self._driving.mission.active or self.profile.onboard:
             return False
-        return self.idle and self._safety.state.maneuver is None
+        return self.idle and self._safety.state.maneuver is None and not self._maneuvers.docking.ordered
 
     def repeats(self, now: float) -> bool:
         """Return whether `stream` at `now` would send the same command again without a look at any input."""

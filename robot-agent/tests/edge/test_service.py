@@ -203,7 +203,9 @@ async def test_an_operator_of_a_robot_that_stands_by_is_answered_by_its_newest_i
     assert len(lidar.polled) == before + 1
 
 
-async def test_a_robot_that_stands_by_decides_nothing_and_is_not_late_until_there_may_be_something_again(rig, monkeypatch):
+async def test_a_robot_that_stands_by_decides_nothing_and_is_not_late_until_there_may_be_something_again(
+    rig, monkeypatch
+):
     standing, asked = True, []
     monkeypatch.setattr(AgentCore, "standing_by", property(lambda _core: standing))
     monkeypatch.setattr(rig.core, "control_job", asked.append)

@@ -212,7 +212,7 @@ class Ticker:
 
     @property
     def p99_s(self) -> float:
-        """99th percentile of the lateness (s of the clock) of the last 1000 ticks since the loop last waited; 0 without any."""
+        """99th percentile of the lateness (s of the clock) of the last 1000 ticks since a `rejoin`; 0 without any."""
         if not self._lateness:
             return 0.0
         ordered = sorted(self._lateness)

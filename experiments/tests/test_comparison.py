@@ -17,7 +17,9 @@ from hypothesis import strategies as st
 from fog_runtime.configuration.site import load_site
 from fognav_experiments.comparison import runner
 from fognav_experiments.comparison.draws import ExperimentSpec, RouteSpec, draw
-from fognav_experiments.comparison.geometry import RouteGeometry
+from fognav_experiments.comparison.document import Table
+from fognav_experiments.comparison.geometry import RouteGeometry, Saving
+from fognav_experiments.comparison.limits import geometry
 from fognav_experiments.comparison.publish import publish
 from fognav_experiments.comparison.records import MOVE_BASE, Asked, Folder, FolderError
 from fognav_experiments.comparison.report import paired
@@ -97,6 +99,14 @@ def test_a_warning_saves_only_where_the_obstacle_bars_the_way_and_at_most_the_wa
 
 
 # --- statistics ---
+
+
+@pytest.mark.parametrize(("allowed_m", "share"), [(20.0, "50 %"), (1e-5, "-"), (0.0, "-")])
+def test_what_was_saved_is_no_share_of_what_a_map_allows_by_rounding_alone(allowed_m, share):
+    """On a recorded floor the report said that 2,590,647 % of what the map allows had been saved."""
+    _, table = geometry([(Saving(50.0 + allowed_m, 50.0, met=True), 10.0, 40.0)] * 2)
+    assert isinstance(table, Table)
+    assert [row[table.header.index("share")] for row in table.rows] == [share, share]
 
 
 @pytest.mark.parametrize(("freedom", "quantile"), [(1, 12.706), (4, 2.776), (9, 2.262), (49, 2.0096), (1000, 1.9623)])

@@ -16,6 +16,8 @@ SPEED_M_S: Final = 0.30
 """The robot's highest speed: no drive saves its metres faster."""
 THESIS_RATIO: Final = 5.5
 """CPU of move_base on the thesis's robot: 110 % in `default`, 20 % in `full`."""
+_NOTHING_M: Final = 0.05
+"""What a map allows to save below one of its cells is rounding: no share of it means anything."""
 
 
 def geometry(drives: Sequence[tuple[Saving, float, float]]) -> list[Block]:
@@ -31,7 +33,7 @@ def geometry(drives: Sequence[tuple[Saving, float, float]]) -> list[Block]:
             continue
         allowed = estimate([saving.saved_m for saving, _, _ in chosen])
         metres, seconds = estimate([m for _, m, _ in chosen]), estimate([s for _, _, s in chosen])
-        share = f"{100.0 * metres.mean / allowed.mean:.0f} %" if allowed.mean > 0.0 else "-"
+        share = f"{100.0 * metres.mean / allowed.mean:.0f} %" if allowed.mean >= _NOTHING_M else "-"
         rows.append([
             subject, str(len(chosen)), text(allowed), text(metres), share,
             f"{allowed.mean / SPEED_M_S:.1f}", text(seconds),

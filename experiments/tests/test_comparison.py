@@ -16,8 +16,8 @@ from hypothesis import strategies as st
 
 from fog_runtime.configuration.site import load_site
 from fognav_experiments.comparison import runner
-from fognav_experiments.comparison.draws import ExperimentSpec, RouteSpec, draw
 from fognav_experiments.comparison.document import Table
+from fognav_experiments.comparison.draws import ExperimentSpec, RouteSpec, draw
 from fognav_experiments.comparison.geometry import RouteGeometry, Saving
 from fognav_experiments.comparison.limits import geometry
 from fognav_experiments.comparison.publish import publish

@@ -33,7 +33,8 @@ def test_input_log_is_complete_at_the_end_and_can_be_replayed(tmp_path):
         world.run(1.0)
     result = replay(path)
     assert result.differences == []
-    assert result.outputs["WheelsCommanded"] == len(world.commands) == 20
+    assert result.outputs["WheelsCommanded"] == len(world.commands)
+    assert len(world.commands) >= 10  # as often as a robot that stands gets them, or as one that drives
 
 
 def test_an_agent_without_a_log_is_a_plain_core():
@@ -62,7 +63,10 @@ def test_full_disk_is_counted_and_does_not_stop_the_agent(caplog):
         world = LittleWorld(seed=4, start_agent=lambda _config, _seed: core)
         world.agent.load(world.master.snapshot(), world.now)
         world.run(2.0)
-        assert len(world.commands) == 40
+    without_log = LittleWorld(seed=4)
+    without_log.agent.load(without_log.master.snapshot(), without_log.now)
+    without_log.run(2.0)
+    assert world.commands == without_log.commands != []
     assert lost() > before
     assert caplog.messages.count("input_log_ended") == 1
 

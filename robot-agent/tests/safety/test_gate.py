@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import itertools
 import math
+from dataclasses import replace
 
 import pytest
 from hypothesis import given, settings
@@ -148,6 +149,18 @@ def test_hold_for_a_stale_map_ends_only_with_a_newer_plan():
         assert out.mode == "HOLD"
         assert "waiting for a plan on the fresh map" in out.reasons
     assert gate.run(2.2, **{**driving, "plan_age": 0.0}).mode == "NORMAL"
+
+
+def test_plan_from_before_a_missing_map_holds_the_robot_however_long_a_plan_may_be_silent():
+    config, state, modes = replace(CONFIG, plan_late=60.0), Gate().enabled().state, []
+    old, new = inputs(mission=True, plan_age=4.0), inputs(mission=True, plan_age=0.1)
+    for tick, given_inputs in enumerate([inputs(map_age=4.0), *[inputs()] * 50, old, *[new] * 50], 4000):
+        state, out = step(state, given_inputs, tick * DT, config)
+        modes.append((out.mode, given_inputs))
+    assert modes[0][0] == "HOLD"
+    assert modes[50] == ("NORMAL", inputs())
+    assert modes[51] == ("HOLD", old)
+    assert modes[-1] == ("NORMAL", new)
 
 
 def test_short_hold_ends_by_itself_and_long_hold_needs_an_operator():

@@ -3,6 +3,7 @@
 import os
 import shutil
 import subprocess
+import time
 from collections.abc import Callable
 from pathlib import Path
 
@@ -190,9 +191,11 @@ def test_nothing_is_upgraded_under_a_demo_of_the_same_checkout(add_version, fold
             for name, each in (("demo", running), ("elsewhere", other))
         ]
         monkeypatch.setattr(local_nodes, "registered", lambda: systems)
-        while not all(psutil.Process(each.pid).cmdline() for each in (running, other)):
-            pass  # a program that has just been started has no arguments for a moment
         try:
+            deadline = time.monotonic() + 60.0
+            # A program that has just been started has no arguments for a moment.
+            while not all(psutil.Process(each.pid).cmdline() for each in (running, other)):
+                assert time.monotonic() < deadline, "a program that was started has no arguments after a minute"
             with pytest.raises(FailedError, match=r"^demo would run on with parts of both versions"):
                 Upgrade(folder, Versions(root), lambda _: None).run(old)
         finally:

@@ -62,6 +62,7 @@ def test_robot_that_stops_two_centimetres_before_another_has_none(monkeypatch):
     fleet = facing()
     drive_whatever_is_commanded(monkeypatch, fleet.vehicles[0], 0.1)
     while gap_of(fleet) > 0.02:
+        assert fleet.now < 60.0, f"the two robots have come no nearer than {gap_of(fleet):.3f} m in a minute"
         fleet.step()
     World.set_wheels(fleet.vehicles[0].world, 0.0, 0.0)
     for _ in range(100):
@@ -74,6 +75,7 @@ def test_lidar_sees_another_robot_where_it_has_come_nearer_than_three_centimetre
     fleet = facing()
     drive_whatever_is_commanded(monkeypatch, fleet.vehicles[1], 0.1)
     while gap_of(fleet) > 0.02:
+        assert fleet.now < 60.0, f"the two robots have come no nearer than {gap_of(fleet):.3f} m in a minute"
         fleet.step()
     seen = fleet.vehicles[0].world.lidar(np.array([0.0]), fleet.now)[0]
     assert seen == pytest.approx(0.17 + gap_of(fleet), abs=0.03)

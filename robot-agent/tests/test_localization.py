@@ -19,6 +19,8 @@ from robot_agent.localization.pose import Pose2, wrap
 
 STATIC, GEOMETRY = grid_of(L_ROOMS, 15.0, 12.0)
 SOLID = (STATIC == 254).astype(np.uint8)
+MOST_STEPS = 10_000
+"""A search that takes more steps than this has no end."""
 PLACES = [Pose2(5.0, 2.0, 1.0), Pose2(12.0, 8.0, -2.0), Pose2(3.5, 3.5, 0.3), Pose2(9.0, 1.5, 3.0)]
 
 
@@ -138,8 +140,11 @@ def test_global_localization_fails_when_places_look_alike():
     )  # fmt: skip
     localizer.on_scan(scan, 0.0)
     assert localizer.global_localization()
-    while localizer.searching:
+    for _ in range(MOST_STEPS):
+        if not localizer.searching:
+            break
         localizer.on_scan(scan, 0.1)
+    assert not localizer.searching, f"the search has no end: {localizer.detail}"
     assert localizer.status == "lost"
     assert "look like this one" in localizer.detail
     assert len(localizer.hypotheses) > 1
@@ -154,8 +159,11 @@ def test_start_that_fits_no_place_is_tried_again_from_the_next_spot_without_a_pa
     seen = measure_scan(lambda _: PLACES[0], 0.0, 0.0)
     localizer.on_scan(replace(seen, ranges_m=crowd), 0.0)
     assert localizer.global_localization()
-    while localizer.searching:
+    for _ in range(MOST_STEPS):
+        if not localizer.searching:
+            break
         localizer.continue_search(0.0)
+    assert not localizer.searching, f"the search has no end: {localizer.detail}"
     assert "fits no place" in localizer.detail
     for at, turned in ((1.0, 0.3), (2.0, 0.6)):
         localizer.on_odometry(at, 0.0, 0.0, turned)

@@ -2,6 +2,7 @@
 
 import asyncio
 import shutil
+import time
 
 import httpx
 import pytest
@@ -23,8 +24,9 @@ async def run(*arguments: str) -> str:
 
 
 async def put(client: httpx.AsyncClient, url: str, token: dict[str, str], body: dict) -> httpx.Response:
+    deadline = time.monotonic() + 60.0
     while (answer := await client.put(f"{url}/api/v1/zones/z1", json=body, headers=token)).status_code == 503:
-        pass  # it does not lead yet
+        assert time.monotonic() < deadline, f"it has not led for a minute: {answer.text}"
     assert answer.status_code in (200, 201), answer.text
     return answer
 

@@ -19,10 +19,12 @@ async def run_ticker(clock: ManualClock, bodies: list[float], period: float = 0.
 
     loop_ticker = ticker(clock, period)
     task = asyncio.create_task(loop())
+    end = clock.now() + 2.0 * (len(bodies) + 1) * period + 2.0 * sum(bodies)
     while not task.done():
         for _ in range(5):
             await asyncio.sleep(0)
         if not task.done():
+            assert clock.now() < end, f"the ticker has ticked {len(times)} times, {len(bodies) + 1} were due"
             clock.advance(0.005)
     await task
     return times
@@ -115,6 +117,7 @@ async def test_a_loop_with_an_offset_ticks_that_much_after_those_of_its_phase(fi
     for due in (begin + 0.225, begin + 0.425):
         tick = asyncio.ensure_future(anext(ticks))
         while not tick.done():
+            assert clock.now() < due + 1.0, f"no tick at {due} s"
             clock.advance(0.01)
             await asyncio.sleep(0)
             await asyncio.sleep(0)

@@ -130,6 +130,7 @@ async def test_replay_keeps_the_recorded_intervals(tmp_path):
     while not task.done():
         for _ in range(3):
             await asyncio.sleep(0)
+        assert clock.now() < 110.0, f"the replay of 1.5 s has not ended after 10: {sent}"
         clock.advance(0.25)
     assert await task == 4
     assert [time_s for time_s, *_ in sent] == [100.0, 100.5, 101.5, 101.5]

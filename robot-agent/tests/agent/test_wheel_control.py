@@ -70,8 +70,8 @@ def test_hold_and_stale_decision_ramp_the_wheels_to_rest(driving, stale, stop):
     assert not driving.following
     while not driving.at_rest:
         now += DT
+        assert now <= 20 * DT + CONFIG.safety.ramp, f"the wheels have not come to rest: {driving.speeds}"
         driving.command(outputs(stop), free, now)
-    assert now <= 20 * DT + CONFIG.safety.ramp
 
 
 @pytest.mark.parametrize("wrong", [math.nan, math.inf, -math.inf])

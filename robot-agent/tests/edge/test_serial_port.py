@@ -30,7 +30,7 @@ def line():
 
 
 def read_some(port: Port) -> bytes:
-    assert select.select([port], [], [], 5.0)[0]
+    assert select.select([port], [], [], 60.0)[0], "nothing was received for a minute"
     return port.read_available()
 
 

@@ -86,7 +86,9 @@ def test_error_along_a_corridor_is_as_large_as_its_covariance_says_and_vanishes_
         assert drive.sigma < 1.4 * STEP_SIGMA_M * math.sqrt(blind / STEP_M) + 0.15
         squares.append((drive.error / drive.sigma) ** 2)
         while drive.true.x < length - 1.0:
+            before = drive.true.x
             drive.advance()
+            assert drive.true.x > before, f"the drive has stopped at {before:.1f} m, seed {seed}"
         assert abs(drive.error) < 0.1
         assert drive.sigma < 0.15
     assert sum(squares) < chi_squared_limit(RUNS), f"normalized squared errors: {np.round(squares, 2)}"

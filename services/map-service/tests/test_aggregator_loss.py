@@ -182,8 +182,9 @@ async def system(shared_open_fog, until) -> AsyncIterator[System]:
         await running.proxy.start()
         connect()
         await mqtt.wait_connected()
-        snapshot = None
+        snapshot, deadline = None, time.monotonic() + 60.0
         while snapshot is None:
+            assert time.monotonic() < deadline, "the map-service has answered no query for the map in a minute"
             snapshot = await zenoh.query(ch.MAP_SNAPSHOT, None, MapSnapshot, 1.0)
         running.replica.load(snapshot)
         node = asyncio.create_task(running.measure())

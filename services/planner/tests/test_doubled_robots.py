@@ -16,7 +16,7 @@ def test_two_agents_of_one_id_are_found_until_one_is_switched_off():
     while robots.is_doubled("r1", now):
         robots.on_state("r1", "a", now)
         now += 1.0
-    assert now <= 5.0 + REMEMBERED_S + 1.0
+        assert now <= 5.0 + REMEMBERED_S + 1.0, "the agent that was switched off is not forgotten"
     robots.on_state("r1", "b", now)
     assert not robots.is_doubled("r1", now), "the other one came back, alone"
 

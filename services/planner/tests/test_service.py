@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import threading
+import time
 from itertools import accumulate
 from types import SimpleNamespace
 from typing import TYPE_CHECKING, Any, cast
@@ -336,6 +337,7 @@ def test_what_was_published_is_recorded_a_part_at_a_time_and_oldest_first() -> N
     parts = []
     while record.take_over(2):
         parts.append(sorted(record.paths))
+        assert len(parts) <= 3, f"there is no end of six paths, two at a time: {parts}"
         if len(parts) == 1:  # what comes meanwhile is recorded after it
             record.add([Publication(ch.ROBOT_PATH, path, {"robot": "r5"})], 2.0)
     assert parts == [["r0", "r1"], ["r0", "r1", "r2", "r3"]]
@@ -378,11 +380,12 @@ async def test_path_is_published_while_the_event_loop_is_busy_and_others_are_sea
     )
     planning = asyncio.create_task(rig.service.plan_loop())
     rig.service._wake.set()
-    while not core.searching.is_set():  # noqa: ASYNC110  # set on another thread
-        await asyncio.sleep(0.001)
+    assert await asyncio.to_thread(core.searching.wait, 60.0), "no search has begun in a minute"
     core.may_end.set()
     assert published.wait(60.0)  # keeps the event loop busy meanwhile
-    while len(core.waited_for_path) < 1:  # noqa: ASYNC110  # as above
+    deadline = time.monotonic() + 60.0
+    while len(core.waited_for_path) < 1:
+        assert time.monotonic() < deadline, "no second search has begun in a minute"
         await asyncio.sleep(0.001)
     planning.cancel()
     rig.service.close()

@@ -308,6 +308,21 @@ def test_a_pressed_bumper_is_a_fault_until_an_operator_resets_it(driving):
     assert driving.state().mode == "NORMAL"
 
 
+def test_a_bumper_pressed_while_the_robot_is_not_enabled_is_a_fault_until_a_reset(world):
+    assert world.command("disable").accepted
+    assert world.run(5.0, lambda w: w.state().reasons == ["waiting for an operator to enable"])
+    world.bumper, world.fault = True, "the bumper is pressed (left)"
+    assert world.run(0.5, lambda w: w.state().mode == "FAULT"), "a robot that stands by looks 5 times a second"
+    world.bumper = False
+    world.run(10.0)
+    assert world.state().mode == "FAULT"
+    assert "reset it first" in world.command("enable").reason
+    assert world.command("reset").accepted
+    world.run(5.0)
+    assert (world.resets, world.fault, world.state().mode) == (1, None, "INIT")
+    assert world.command("enable").accepted
+
+
 def test_reset_is_passed_on_to_the_guardian_and_clears_its_fault(driving):
     driving.fault = "the base left Safe mode by itself (now PASSIVE)"
     driving.run(0.1)
@@ -667,7 +682,9 @@ def test_a_robot_that_stands_by_evaluates_its_inputs_at_once_when_there_is_somet
 def test_what_an_operator_changes_on_a_robot_that_stands_by_is_published_with_the_next_tick(world):
     world.run(1.0)
     agent = world.agent
+    end = world.now + 10.0
     while not agent.standing_by or agent.tick(world.moment):
+        assert world.now < end, f"the robot has not stood by without a word: {world.state()}"
         world.run(0.01)
     assert world.command("disable").accepted
     world.published = agent.tick(world.moment)
@@ -677,7 +694,9 @@ def test_what_an_operator_changes_on_a_robot_that_stands_by_is_published_with_th
 def test_a_mode_that_a_robot_standing_by_finds_is_published_with_the_next_tick(world):
     world.run(1.0)
     agent = world.agent
+    end = world.now + 10.0
     while agent.repeats(world.now):
+        assert world.now < end, f"the robot looks at nothing: {world.state()}"
         world.run(0.01)
     agent.tick(world.moment)
     world.bumper = True

@@ -170,15 +170,32 @@ async def test_a_bumper_needs_an_authenticated_reset_that_reaches_the_guardian(r
     refused = await robot.fog.command("reset")
     assert "the cause is still there" in refused.reason
     robot.body.robot.world.bump_right = False
-    for _ in range(100):  # until the core has received that the bumper is free
-        reply = await robot.fog.command("reset")
-        if reply.accepted:
-            break
-    assert reply.accepted, reply
+    end = time.monotonic() + DEADLINE_S
+    while not (reply := await robot.fog.command("reset")).accepted:  # until it has received that the bumper is free
+        assert "the cause is still there" in reply.reason
+        assert time.monotonic() < end, f"the bumper is free, but no reset is accepted: {reply}"
     await until(lambda: robot.watchdog.count("fault_reset") == 1, "the guardian is reset")
     assert not robot.body.moving
     await enabled(robot)
     await until(lambda: robot.body.moving, "it drives again")
+
+
+async def test_a_bumper_held_pressed_before_the_first_enable_is_a_fault_until_a_reset(robot):
+    await robot.localized()
+    robot.body.robot.world.bump_left = True
+    await until(lambda: robot.fog.state.mode == "FAULT", "the fault is reported")
+    refused = await robot.fog.command("enable")
+    assert "reset it first" in refused.reason
+    refused = await robot.fog.command("reset")
+    assert "the cause is still there" in refused.reason
+    robot.body.robot.world.bump_left = False
+    end = time.monotonic() + DEADLINE_S
+    while not (reply := await robot.fog.command("reset")).accepted:
+        assert "the cause is still there" in reply.reason
+        assert time.monotonic() < end, f"the bumper is free, but no reset is accepted: {reply}"
+    await until(lambda: robot.watchdog.count("fault_reset") == 1, "the guardian is reset")
+    assert "NORMAL" not in {state.mode for state in robot.fog.states}
+    await enabled(robot)
 
 
 async def test_changes_of_the_map_are_applied_and_lost_ones_are_fetched(robot):
@@ -248,9 +265,11 @@ async def test_robot_leaves_a_blocked_area_by_the_planners_way_on_a_signed_singl
     ended = "the egress ended: the robot is out"
     await until(lambda: robot.fog.state.mode == "EGRESS" or ended in robot.fog.state.reasons, "it begins")
     await until(lambda: robot.fog.state.mode != "EGRESS", "it ends")
+    end = time.monotonic() + DEADLINE_S
     while ended not in robot.fog.state.reasons:
         # Whatever stops a robot ends an egress, a late scan on a busy machine too: then it is commanded again.
-        await robot.fog.command("egress")
+        assert time.monotonic() < end, f"it is still in the blocked area: {robot.fog.state}; its last answer: {reply}"
+        reply = await robot.fog.command("egress")
         await until(lambda: robot.fog.state.mode != "EGRESS", "it ends")
     assert robot.fog.state.mode == "INIT"
     assert 2.6 < robot.body.pose[0] < 2.8

@@ -159,6 +159,7 @@ def test_silent_base_is_stopped_at_once_then_every_0_05_s_and_reported_every_0_0
     assert [now for now, output in outputs.items() if output.data] == [0.0, 0.05]
     assert [now for now, output in outputs.items() if output.feedback] == [0.0, 0.045]
     assert outputs[0.0].feedback[0].fault == rig.core.latched
+    assert not outputs[0.0].feedback[0].passing
     late = Rig(begin=99.0)
     late.drive(99.1, 99.2)
     outputs = {now: late.core.tick(now) for now in (100.0, 100.01)}
@@ -178,11 +179,13 @@ def test_base_that_has_not_moved_is_woken_again_when_it_falls_silent_and_its_fau
     assert silent.data == b"wake;"
     (told,) = silent.feedback
     assert (told.fault, told.stopped, told.bumped) == (SILENCE, "the base is not ready to drive yet", False)
+    assert told.passing
     assert rig.core.latched is None
     assert rig.command(0.32, 0.3, 0.3).data == b""
     assert rig.core.tick(0.35).feedback[0].fault == SILENCE
     assert not rig.core.moving
-    assert rig.frame(0.36).feedback[-1].fault is None
+    back = rig.frame(0.36).feedback[-1]
+    assert (back.fault, back.passing) == (None, False)
     assert rig.command(0.37, 0.3, 0.3).data == b"", "a frame from before the wake-up makes no base awake"
     rig.frame(0.41)
     assert rig.drive(0.43, 0.6, 0.1, 0.1) == (0.1, 0.1)

@@ -76,7 +76,7 @@ def test_enable_is_refused_with_the_cause_while_an_input_is_missing(missing, wor
     out = gate.run(request="enable", **missing)
     assert out.refusal is not None
     assert word in out.refusal
-    assert gate.run(5.0).mode == "INIT"
+    assert gate.run(5.0).mode == ("FAULT" if word == "bumper" else "INIT")
 
 
 def test_enable_is_accepted_when_all_inputs_are_healthy():
@@ -288,6 +288,7 @@ def test_fault_latched_by_the_guardian_while_disabled_can_be_reset():
     gate = Gate()
     fault = {"base_fault": "the bumper is pressed (left)"}
     assert gate.run(request="enable", **fault).refusal is not None
+    assert gate.run(**fault).mode == "FAULT"
     assert gate.run(request="reset", **fault, bumper=True).refusal is not None
     assert gate.run(request="reset", **fault).refusal is None
     gate.enabled()
@@ -397,7 +398,9 @@ def test_invariants_of_every_reachable_state(episodes):  # noqa: C901  # one bra
                 assert not (given_inputs.cliff)
                 assert not (given_inputs.wheel_drop)
                 assert out.mode == "INIT"
-            if before == "INIT" and out.mode != "INIT":
+            if before == "INIT" and out.mode == "FAULT":
+                assert level == Level.FAULT
+            elif before == "INIT" and out.mode != "INIT":
                 assert current_request == "enable"
                 assert not was_enabled
                 assert level < Level.PROTECTIVE_STOP

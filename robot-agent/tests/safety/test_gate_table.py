@@ -222,7 +222,7 @@ def test_mode_after_a_condition_begins_and_after_it_ends(before, row):
     holds, mode, operator, words = row.holds, row.mode, row.left == "operator", row.words
     gate = Gate(before)
     out = gate.run(**holds)
-    stays = before in {"INIT", "FAULT"} or RANK[before] > RANK[mode]
+    stays = before == "FAULT" or (before == "INIT" and mode != "FAULT") or RANK.get(before, 0) > RANK[mode]
     after = before if stays else mode
     assert out.mode == after
     assert out.changed == (after != before)
@@ -231,10 +231,11 @@ def test_mode_after_a_condition_begins_and_after_it_ends(before, row):
     # The condition ends: the mode relaxes after 2 s, unless an operator must act.
     assert gate.run(1.9).mode == after
     relaxed = gate.run(0.3).mode
-    if before == "INIT":
-        assert relaxed == "INIT"
-    elif after == "FAULT" or before == "FAULT":
+    if after == "FAULT":
         assert relaxed == "FAULT"
+        assert gate.run(request="reset").mode == "INIT"
+    elif before == "INIT":
+        assert relaxed == "INIT"
     elif operator:
         assert relaxed == "PROTECTIVE_STOP"
         assert any(reason.endswith("(an operator must enable again)") for reason in gate.out.reasons)
@@ -256,7 +257,7 @@ def test_enable_is_refused_by_conditions_that_stop_at_once_and_by_no_other(row):
     gate = Gate("INIT")
     out = gate.run(request="enable", **row.holds)
     if RANK[row.mode] >= 3:
-        assert out.mode == "INIT"
+        assert out.mode == ("FAULT" if row.mode == "FAULT" else "INIT")
         assert out.refusal.startswith("the cause is still there: ")
         assert row.words in out.refusal
     else:
@@ -317,6 +318,53 @@ def test_reset_of_a_fault_needs_its_cause_gone_and_leads_to_init():
     accepted = gate.run(request="reset", base_fault="the bumper is pressed (left)")
     assert (accepted.mode, accepted.refusal) == ("INIT", None)
     assert gate.run(5.0).reasons == ("waiting for an operator to enable",)
+
+
+@pytest.mark.parametrize("fault", [{"bumper": True}, {"cliff": True}, {"wheel_drop": True}, {"base_fault": "x"}])
+def test_fault_before_the_first_enable_is_latched_and_an_enable_says_that_it_needs_a_reset(fault):
+    gate = Gate("INIT")
+    assert gate.run(**fault).mode == "FAULT"
+    assert gate.run(60.0, **fault).mode == "FAULT"
+    assert gate.run(60.0).mode == "FAULT"
+    assert gate.run(request="enable").refusal.startswith("a fault is latched, reset it first: ")
+    assert gate.run(request="disable").mode == "FAULT"
+    accepted = gate.run(request="reset")
+    assert (accepted.mode, accepted.refusal) == ("INIT", None)
+    assert gate.run(60.0).mode == "INIT"
+    assert gate.run(request="enable").refusal is None
+
+
+def test_fault_whose_reset_the_guardian_has_not_carried_out_yet_is_not_latched_anew():
+    gate = Gate("INIT")
+    assert gate.run(base_fault="blocked").mode == "FAULT"
+    assert gate.run(request="reset", base_fault="blocked").mode == "INIT"
+    out = gate.run(5.0, base_fault="blocked")
+    assert (out.mode, out.reasons) == ("INIT", ("base: blocked", "waiting for an operator to enable"))
+    assert gate.run(request="enable", base_fault="blocked").refusal == "the cause is still there: base: blocked"
+    assert gate.run().mode == "INIT"
+    assert gate.run(base_fault="blocked").mode == "FAULT", "the guardian has latched it again after the reset"
+
+
+def test_other_fault_after_a_reset_is_latched_even_before_the_guardian_has_carried_it_out():
+    for later in ({"base_fault": "silent"}, {"base_fault": "blocked", "cliff": True}):
+        gate = Gate("FAULT")
+        assert gate.run(request="reset", base_fault="blocked").mode == "INIT"
+        assert gate.run(**later).mode == "FAULT"
+
+
+def test_silence_of_a_base_that_has_not_moved_is_no_fault_of_a_robot_that_is_not_enabled():
+    silent = {"base_fault": "silent", "base_fault_passing": True}
+    gate = Gate("INIT")
+    assert gate.run(5.0, **silent).mode == "INIT"
+    assert gate.run(request="enable", **silent).refusal == "the cause is still there: base: silent"
+    assert gate.run(cliff=True, **silent).mode == "FAULT"
+    assert gate.state.latched == (Finding(Level.FAULT, "a cliff sensor sees no floor"),)
+    assert Gate("NORMAL").run(**silent).mode == "FAULT"
+
+
+def test_bumper_that_the_dock_presses_is_no_fault():
+    assert Gate("INIT").run(5.0, bumper=True, docked_for=0.0).mode == "INIT"
+    assert Gate("NORMAL").run(5.0, bumper=True, docked_for=0.0, mission=False).mode == "HOLD"
 
 
 def test_enabled_again_after_a_reset_the_old_fault_counts_no_more():

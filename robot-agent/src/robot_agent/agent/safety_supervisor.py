@@ -85,6 +85,7 @@ def safety_inputs(  # noqa: PLR0913  # the gate weighs every source of the agent
         base_age=base.age(now),
         guardian_lost=base.lost,
         base_fault=feedback.fault if feedback else None,
+        base_fault_passing=feedback is not None and feedback.passing,
         base_stopped=feedback.stopped if feedback else None,
         bumped=feedback is not None and feedback.bumped,
         docked_for=base.docked_for(now),

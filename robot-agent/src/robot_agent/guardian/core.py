@@ -345,6 +345,7 @@ class GuardianCore:
             stopped=self._stopped(now),
             corrupted=self.corrupted,
             bumped=self._bumped,
+            passing=self._latched is None and self._base.silence is not None,
             at=now,
         )
 

@@ -44,8 +44,9 @@ class BaseFeedback(Struct, frozen=True, kw_only=True):
 
     `fault`: the guardian's latched fault, or the silence of a base that has not moved yet (None: none). `stopped`: why
     the guardian keeps the wheels at zero whatever the agent requests (None: it does not). `corrupted`: damaged frames
-    of the base so far. `bumped`: the fault is a pressed bumper, from which the robot may back off. `at`: when it was
-    sent, s of the monotonic clock that agent and guardian share (None: unknown).
+    of the base so far. `bumped`: the fault is a pressed bumper, from which the robot may back off. `passing`: it is the
+    silence of a base that has not moved yet, and ends with it. `at`: when it was sent, s of the monotonic clock that
+    agent and guardian share (None: unknown).
     """
 
     seq: Count
@@ -55,6 +56,7 @@ class BaseFeedback(Struct, frozen=True, kw_only=True):
     stopped: Sentence | None
     corrupted: Count = 0
     bumped: bool = False
+    passing: bool = False
     at: float | None = None
 
 

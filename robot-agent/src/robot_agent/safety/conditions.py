@@ -42,6 +42,7 @@ class SafetyInputs(msgspec.Struct, frozen=True, kw_only=True):
     good or weak. maneuver_remaining: m to the end of the maneuver that runs, rad of a turn, infinite while not known.
     maneuver_problem: what keeps the robot from getting there. dock_problem: why the base must not drive into its dock
     by itself. caution: a reason to drive slowly here. guardian_lost: why there is no link to the guardian.
+    base_fault: the guardian's fault, latched there unless it is `base_fault_passing`, which ends with its cause.
     base_stopped: why the guardian keeps the wheels at zero. bumped: the fault that it has latched is a bump.
     docked_for: s for which the robot has been on its dock, None off it. late_age: since this computer last ran the
     agent too late, by `late_by`. resting: why the lidar stands still on purpose, or is being started.
@@ -58,6 +59,7 @@ class SafetyInputs(msgspec.Struct, frozen=True, kw_only=True):
     base_age: float = math.inf
     guardian_lost: str | None = None
     base_fault: str | None = None
+    base_fault_passing: bool = False
     base_stopped: str | None = None
     bumped: bool = False
     docked_for: float | None = None
@@ -149,7 +151,8 @@ def _rests_on_dock(inputs: SafetyInputs) -> bool:
 CONDITIONS: Final[tuple[Condition, ...]] = (
     # --- base and guardian ---
     Condition(Level.FAULT, lambda i, _: i.base_fault is not None, lambda i: f"base: {i.base_fault}"),
-    Condition(Level.FAULT, lambda i, _: i.bumper, lambda _: "the bumper is pressed"),
+    # The dock itself may press it (ADR 35), and no word but "undock" moves the robot there.
+    Condition(Level.FAULT, lambda i, _: i.bumper and i.docked_for is None, lambda _: "the bumper is pressed"),
     Condition(Level.FAULT, lambda i, _: i.cliff, lambda _: "a cliff sensor sees no floor"),
     Condition(Level.FAULT, lambda i, _: i.wheel_drop, lambda _: "a wheel has dropped"),
     Condition(

@@ -51,6 +51,8 @@ class SafetyState(msgspec.Struct, frozen=True):
     stopped_since: float = math.inf
     stops: tuple[float, ...] = ()
     """When protective stops began that count towards a fault."""
+    answered: str | None = None
+    """The base's fault that a reset has answered, until the guardian has carried the reset out."""
     late_stops: int = 0
     """Number of protective stops that a delay of the robot's computer explains: they count towards nothing."""
     excused: bool = False
@@ -99,6 +101,8 @@ def step(
         # Nearly all steps of a robot that drives: all but the time stays as it is.
         new = replace(state, last_demanded=(now, *state.last_demanded[1:]))
         return new, _outputs(new, before, None, config)
+    if state.answered is not None and inputs.base_fault != state.answered:
+        state = replace(state, answered=None)
     map_held_at = state.map_held_at
     if any(finding.about_map for finding in findings):
         map_held_at = now
@@ -118,11 +122,12 @@ def step(
         new = _maneuver(state, state.maneuver, inputs, now, config)
     elif not state.enabled:
         worst = tuple(finding.reason for finding in findings if finding.level == demanded)
+        faults = _lasting_faults(state, inputs, findings, config)
         new = replace(
             state,
-            mode="INIT",
+            mode="FAULT" if faults else "INIT",
             stops=(),
-            latched=(),
+            latched=faults,
             stopped_since=math.inf,
             last_reasons=worst or state.last_reasons,
         )
@@ -143,6 +148,18 @@ def _goes_on(state: SafetyState, inputs: SafetyInputs, now: float, config: Safet
     if inputs.docked_for is not None or (inputs.mission and now - inputs.plan_age <= state.map_held_at):
         return False
     return not any(now - last < config.relax_after for last in state.last_demanded[1:])
+
+
+def _lasting_faults(
+    state: SafetyState, inputs: SafetyInputs, findings: list[Finding], config: SafetyConfig
+) -> tuple[Finding, ...]:
+    """Return the faults that a robot latches while it is not enabled, so that people see them, and what they must do.
+
+    The base's fault does not count that ends by itself, nor one whose reset is on its way to the guardian.
+    """
+    if inputs.base_fault is not None and (inputs.base_fault_passing or inputs.base_fault == state.answered):
+        findings = collect_findings(replace(inputs, base_fault=None), config)
+    return tuple(finding for finding in findings if finding.level == Level.FAULT)
 
 
 def _relevant(state: SafetyState, inputs: SafetyInputs) -> SafetyInputs:
@@ -187,7 +204,7 @@ def _reset(state: SafetyState, inputs: SafetyInputs, config: SafetyConfig) -> tu
     present = [finding.reason for finding in causes if finding.level == Level.FAULT]
     if present:
         return state, f"the cause is still there: {'; '.join(present)}"
-    reset = replace(state, mode="INIT", enabled=False, latched=(), stops=(), maneuver=None)
+    reset = replace(state, mode="INIT", enabled=False, latched=(), stops=(), maneuver=None, answered=inputs.base_fault)
     if state.maneuver is not None:
         name = RULES[state.maneuver.kind].name
         reset = replace(reset, maneuver_end=f"{name} ended: base: {inputs.base_fault}")

@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 import re
+import shutil
+import tomllib
 
 import pytest
 from typer.testing import CliRunner
 
 from fognav import checkout, hardware_drive
 from fognav.commands import experiment
-from fognav_experiments.comparison import archive
+from fognav_experiments.comparison import archive, runner
 from fognav_experiments.comparison.driven import ComparedDrive
 from fognav_experiments.comparison.measured import MeasuredDrive
 from fognav_experiments.comparison.records import Folder
@@ -32,6 +34,26 @@ def test_options_that_exclude_each_other_are_refused(tmp_path, monkeypatch, argu
     assert result.exit_code == 2
     assert words in " ".join(result.output.split())
     assert list(tmp_path.iterdir()) == []
+
+
+def test_area_that_no_barrier_closes_is_named_before_the_first_drive(tmp_path, monkeypatch):
+    place = tmp_path / "site"
+    shutil.copytree(checkout.site_folder(None), place)
+    text = (place / "site.toml").read_text("utf-8")
+    spec = tomllib.loads((place / "experiment.toml").read_text("utf-8"))
+    for area in tomllib.loads(text)["areas"]:
+        (x, y), *_ = area["polygon"]
+        corner = [[x, y], [x + 0.1, y], [x + 0.1, y + 0.1], [x, y + 0.1]]  # smaller than any barrier
+        text = re.sub(rf'(id = "{area["id"]}"\n(?:.+\n)*?polygon = )\[\[.*\]\]', rf"\g<1>{corner}", text)
+    (place / "site.toml").write_text(text, "utf-8")
+    monkeypatch.setattr(runner, "run", lambda *_: pytest.fail("a drive was begun"))
+    arguments = ["--site", str(place), "--runs", "3", "--out", str(tmp_path / "drives")]
+    result = CliRunner().invoke(experiment.experiment_app, arguments)
+    assert result.exit_code == 2
+    first = spec["routes"][0]
+    told = " ".join(result.output.split())
+    assert f"experiment.toml: run 1, route {first['start']}{first['goal']}: area " in told
+    assert "no barrier fits" in told
 
 
 def test_a_sweep_of_one_plane_drives_no_other_and_its_page_names_that_command(tmp_path, monkeypatch):

@@ -82,6 +82,15 @@ def test_same_seed_places_the_same_barrier():
     assert first != other
 
 
+def test_barrier_is_found_by_every_seed_where_few_drawn_places_fit():
+    """Between deep recesses the wall is 0.5 m wide: the barrier must be thin, and stand nearly before the node."""
+    static, floor = corridor(2.4, door=0.6), site(2.4)
+    columns = np.arange(108, 130)
+    static.cells[68:80, columns[np.abs((columns + 0.5) * RES - 6.0) < 0.25]] = 254
+    for seed in range(40):
+        assert not can_pass(static, barrier_across(floor.areas[0], floor, static, seed))
+
+
 def test_area_without_room_for_a_barrier_is_named_in_the_error():
     static, floor = corridor(2.4, door=1.5), site(2.4)
     with pytest.raises(BarrierError, match="area z1: no barrier fits"):

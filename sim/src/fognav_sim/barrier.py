@@ -32,7 +32,8 @@ _THICKNESS_M: Final = (0.4, 0.8)
 _MAX_SHIFT_M: Final = 0.1
 _EDGE_TOLERANCE_M: Final = 0.4
 _MAX_RAY_M: Final = 20.0
-_ATTEMPTS: Final = 40
+_ATTEMPTS: Final = 400
+"""In a recorded corridor with uneven walls, one of ten drawn places may fit."""
 
 
 class BarrierError(ValueError):

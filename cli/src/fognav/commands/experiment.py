@@ -92,9 +92,9 @@ def experiment_command(  # noqa: PLR0913  # each option is an argument
         place = checkout.site_folder(site)
         try:
             loaded = load_site(place)
-            asked = runner.tasks(
-                runner.read_spec(loaded, place), seed, [only] if only else range(1, runs + 1), _chosen(setups)
-            )
+            spec, numbers = runner.read_spec(loaded, place), [only] if only else range(1, runs + 1)
+            asked = runner.tasks(spec, seed, numbers, _chosen(setups))
+            runner.check_barriers(loaded, [] if hardware else asked)  # a person finds a place
             folder, commit = Folder(out), checkout.revision()
             begun = runner.new(loaded, place, seed)
             if source is not None:

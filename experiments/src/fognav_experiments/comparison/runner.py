@@ -20,6 +20,7 @@ from fognav_experiments.comparison.geometry import RouteGeometry
 from fognav_experiments.comparison.records import Asked, Folder, FolderError
 from fognav_experiments.comparison.trial import drive
 from fognav_experiments.lockstep import release_drives
+from fognav_sim.barrier import BarrierError, barrier_across
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
@@ -76,6 +77,17 @@ def site_digest(folder: Path) -> str:
 def tasks(spec: ExperimentSpec, seed: int, runs: Sequence[int], setups: Sequence[ProfileName]) -> list[Task]:
     """Return the drives of these runs, all setups of a route one after another: what is there is always comparable."""
     return [Task(drawn, setup) for run in runs for drawn in draw(spec, seed, run) for setup in setups]
+
+
+def check_barriers(site: LoadedSite, asked: Sequence[Task]) -> None:
+    """Raise `SpecError` for a drawn area that no barrier closes, before the first of many drives is begun."""
+    for drawn in {(task.drawn.run, task.drawn.route.name): task.drawn for task in asked}.values():
+        area = next(area for area in site.site.areas if area.id == drawn.area)
+        try:
+            barrier_across(area, site.site, site.map, drawn.seed)
+        except BarrierError as error:
+            name = f"{SPEC_FILE}: run {drawn.run}, route {drawn.route.name}"
+            raise SpecError(f"{name}: {error}, or change its polygon in site.toml") from error
 
 
 def run(site_folder: Path, asked: list[Task], folder: Folder, jobs: int = 1, commit: str = "") -> Iterator[Record]:

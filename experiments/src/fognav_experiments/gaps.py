@@ -54,7 +54,8 @@ _SCAN: Final = 18
 """Steps between two wheel commands, decisions and scans of the lidar."""
 _BEAMS: Final = 360
 _RANGE_M: Final = (0.15, 6.0)
-_TIME_S: Final = 45.0
+_TIME_S: Final = 60.0
+"""Longer than a drive that makes every move of a recovery and then passes."""
 _GRID: Final = GridGeometry(120, 100, 0.05, -1.0, -2.5)
 _END_X: Final = 3.6
 _DRIVE: Final = DriveTrain(axle_m=0.235, wheel_speed_max_m_s=0.5)

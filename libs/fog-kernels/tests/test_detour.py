@@ -15,7 +15,7 @@ from shortest_paths import cell_of, costmaps, dijkstra, floors
 from fog_contracts.costs import INSCRIBED
 from fog_kernels.astar import Planner
 from fog_kernels.dead_ends import DeadEnds
-from fog_kernels.detour import Shadow
+from fog_kernels.detour import Shadow, compare_levels
 from fog_kernels.steps import SEALED, STRAIGHT
 from fog_kernels.tiles import TilePatterns
 
@@ -243,3 +243,29 @@ def test_shadow_of_a_coarse_field_is_refused() -> None:
     field = planner.goal_field(bound, (1, 1), TilePatterns(10**6))
     with pytest.raises(ValueError, match="exact"):
         Shadow(bound, bound, field.coarser(), [(6, 6)], planner)
+
+
+def test_levels_are_compared_as_their_bounds_are_in_sum_however_goals_and_border_lie() -> None:
+    rng = np.random.default_rng(7)
+    for goals, cells in ((1, 1), (2, 5), (5, 2), (17, 40)):
+        costs = rng.integers(0, 2**40, (goals, cells))
+        own = int(rng.integers(goals))
+        expected = [
+            sum(int((row - levels).min()) for row in costs) + goals * int((levels - costs[own]).min())
+            for levels in costs
+        ]
+
+        assert compare_levels(costs, own).tolist() == expected
+
+
+@pytest.mark.parametrize(
+    ("costs", "own", "error"),
+    [
+        (np.zeros((2, 3), np.int32), 0, "costs must be int64"),
+        (np.zeros((2, 0), np.int64), 0, "costs must have cells"),
+        (np.zeros((2, 3), np.int64), 2, "row 2"),
+    ],
+)
+def test_levels_that_cannot_be_compared_are_refused(costs: NDArray[np.integer], own: int, error: str) -> None:
+    with pytest.raises((TypeError, ValueError), match=error):
+        compare_levels(costs, own)  # type: ignore[arg-type]  # other types are what is tested

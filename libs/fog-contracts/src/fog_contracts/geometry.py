@@ -37,7 +37,9 @@ def lengths_along(line: _Floats) -> _Floats:
     """Return how far (m) each point of a polyline (n, 2) is from its first one, along the line."""
     if len(line) < 2:
         return np.zeros(len(line))
-    along: _Floats = np.concatenate(([0.0], np.cumsum(np.hypot(*np.diff(line, axis=0).T))))
+    steps = line[1:] - line[:-1]
+    along = np.zeros(len(line))
+    np.cumsum(np.hypot(steps[:, 0], steps[:, 1]), out=along[1:])
     return along
 
 

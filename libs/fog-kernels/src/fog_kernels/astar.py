@@ -17,7 +17,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numba import int64, njit, types
+from numba import int64, njit, types, void
 
 from fog_contracts.costs import COST_WEIGHT, INSCRIBED, NEUTRAL_WEIGHT
 from fog_kernels import _arrays
@@ -342,6 +342,18 @@ def _search(
         g[reached_cells[i]] = unset
 
 
+# It keeps the GIL: it takes some microseconds, and another thread may keep the GIL for longer before it gives it back.
+@njit(void(_arrays.I32_FLAT, int64, _arrays.I32_GRID_OUT), cache=True, error_model="numpy")
+def _write_path(flat: Any, width: int, cells: Any) -> None:
+    """Write the columns and rows of a path whose cells are given by flat indexes, the last one first."""
+    last = cells.shape[0] - 1
+    for i in range(cells.shape[0]):
+        cell = np.uint32(flat[last - i])
+        row = cell // np.uint32(width)
+        cells[i, 0] = cell - row * np.uint32(width)
+        cells[i, 1] = row
+
+
 @njit(int64(_arrays.U8_GRID, int64, int64, int64), cache=True, nogil=True)
 def _nearest_traversable(costmap: Any, col: int, row: int, reach: int) -> int:
     height, width = costmap.shape
@@ -485,10 +497,8 @@ class Planner:
                 expansions=expansions,
                 timed_out=status == TIMED_OUT,
             )
-        flat = self._queue_cell[length - 1 :: -1] if length == self._capacity else self._queue_cell[:length][::-1]
         cells = np.empty((length, 2), np.int32)
-        np.floor_divide(flat, self.width, out=cells[:, 1])
-        np.subtract(flat, cells[:, 1] * self.width, out=cells[:, 0])
+        _write_path(self._queue_cell, self.width, cells)
         return PlanResult(found=True, cost=cost / (2.0 * STRAIGHT), cells=cells, expansions=expansions)
 
     def _guides(self, goal: tuple[int, int], field: GoalField | None, detour: Detour | None) -> _Guides:

@@ -262,8 +262,8 @@ class _SealedSide:
         self._inside, self._sealed = inside, sealed
         self.gates = side.cells_of(gates)
 
-    def paint_inside(self, label: Cells) -> None:
-        self._side.paint(self._inside, NEAR_GATE, label)
+    def paint_near_gates(self, label: Cells) -> None:
+        self._side.paint(self._inside & ~self._sealed, NEAR_GATE, label)
 
     def paint_sealed(self, label: Cells) -> None:
         self._side.paint(self._sealed, SEALED, label)
@@ -289,7 +289,7 @@ class SealedEnds:
         `label` is int32 (height * width,).
         """
         for side in self._sides:
-            side.paint_inside(label)
+            side.paint_near_gates(label)
         for side in self._sides:
             side.paint_sealed(label)
 

@@ -22,7 +22,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
-from numba import int64, njit, types
+from numba import int64, njit, types, void
 
 from fog_kernels import _arrays
 from fog_kernels.dead_ends import NEAR_GATE
@@ -106,7 +106,7 @@ def _find_raised(costmap: Any, bound: Any, found: Any) -> int:
     return int(count)
 
 
-_mark_signature = types.UniTuple(int64, 2)(  # type: ignore[no-untyped-call]  # numba has no types
+_mark_signature = types.UniTuple(int64, 3)(  # type: ignore[no-untyped-call]  # numba has no types
     _arrays.U8_FLAT, _arrays.U8_FLAT, int64, int64, _arrays.I32_FLAT, _arrays.I32_FLAT, int64, _arrays.I32_FLAT,
     _arrays.I32_FLAT, _arrays.I32_FLAT, _arrays.I32_OUT, _arrays.I32_OUT, _arrays.I32_OUT, _arrays.I32_OUT,
 )  # fmt: skip
@@ -116,15 +116,15 @@ _mark_signature = types.UniTuple(int64, 2)(  # type: ignore[no-untyped-call]  # 
 def _mark_shadow(
     costmap: Any, bound: Any, width: int, goal: int, weight: Any, lowest: Any, tile_columns: int, slots: Any,
     patterns: Any, raised: Any, label: Any, found: Any, beside: Any, groups: Any,
-) -> tuple[int, int]:  # fmt: skip
+) -> tuple[int, int, int]:  # fmt: skip
     """Label the cells that have a cheapest path over `bound` through raised cells; return their number.
 
     So are all cells beside them that are labelled `NEAR_GATE`: they are no way out, whatever their costs promise. Cells
     that are labelled `SEALED` stay so.
 
     They are found from the raised cells, against the direction of the paths, in no special order; `found` receives
-    them, `beside` the cells next to them, whose number is returned, too. Cells that a step on `costmap` joins get the
-    same group, as `_root` tells it. `goal` is never labelled.
+    them, `beside` the cells next to them, whose number is returned, too, and then that of the groups. Cells that a step
+    on `costmap` joins get the same group, as `_root` tells it. `goal` is never labelled.
     """
     height = costmap.size // width
     columns, rows, steps, lengths = _steps(width)
@@ -202,7 +202,7 @@ def _mark_shadow(
                 label[np.uint64(other)] = _CANDIDATE
                 beside[np.uint64(n_beside)] = other
                 n_beside += 1
-    return count, n_beside
+    return count, n_beside, n_groups
 
 
 @njit(
@@ -223,9 +223,11 @@ def _enclose(
         known = np.int64(label[np.uint64(starts[i])])
         if known >= _SHADOW and weight[costmap[np.uint64(starts[i])]] > 0:
             behind[np.uint64(_root(groups, known - _SHADOW))] = True
+    for i in range(groups.size):
+        behind[i] = behind[np.uint64(_root(groups, np.int64(i)))]
     for i in range(found.size):
         cell: Any = np.uint64(found[i])
-        if not behind[np.uint64(_root(groups, np.int64(label[cell]) - _SHADOW))]:
+        if not behind[np.uint64(np.int64(label[cell]) - _SHADOW)]:
             label[cell] = 0
     leaving = 0
     for i in range(beside.size):
@@ -337,6 +339,44 @@ def _fill(
             heads[np.uint64(slot)] = entry
 
 
+@njit(void(types.Array(types.int64, 2, "C", readonly=True), int64, _arrays.I64_OUT), cache=True, nogil=True)
+def _compare_levels(costs: Any, own: int, gains: Any) -> None:
+    """Write what `compare_levels` returns."""
+    for i in range(costs.shape[0]):
+        levels = costs[i]
+        total = np.int64(0)
+        for j in range(costs.shape[0]):
+            goal = costs[j]
+            least = goal[0] - levels[0]
+            for k in range(levels.size):
+                least = min(least, goal[k] - levels[k])
+            total += least
+        first = costs[own]
+        least = levels[0] - first[0]
+        for k in range(levels.size):
+            least = min(least, levels[k] - first[k])
+        gains[i] = total + costs.shape[0] * least
+
+
+def compare_levels(costs: NDArray[np.int64], own: int) -> NDArray[np.int64]:
+    """Return how high the bounds of all goals are in sum, at least, if they begin with the levels of each goal in turn.
+
+    `costs` is int64 (goals, cells), each goal's cost at the cells of a border, `own` the row of the goal whose cheapest
+    way out is known. A cell's way to the border is not below that row's cheapest one minus its cost there, so the sum
+    for the levels of row r is, but for the same number in all,
+
+        sum over rows i of (min over cells of costs[i] - costs[r]) + rows * (min over cells of costs[r] - costs[own]).
+
+    Raises TypeError or ValueError for another array, or one without a cell, or a row that it does not have.
+    """
+    _arrays.exact(costs, np.int64, 2, "costs")
+    if costs.size == 0 or not 0 <= own < len(costs):
+        raise ValueError(f"costs must have cells and row {own}, not shape {costs.shape}")
+    gains = np.empty(len(costs), np.int64)
+    _compare_levels(costs, own, gains)
+    return gains
+
+
 class Shadow:
     """The part of the floor around the starts from which a cheapest path to a goal led through raised cells.
 
@@ -386,14 +426,16 @@ class Shadow:
             self._sealed = dead_ends.seal(costmap, raised, np.concatenate((first, last)))
             self._sealed.paint(self._label)
         groups = groups[: min(costmap.size, _MOST_GROUPS * (len(raised) + 1))]
-        count, candidates = _mark_shadow(
+        count, candidates, n_groups = _mark_shadow(
             flat, bound.ravel(), width, goal if weight[flat[goal]] > 0 else -1, weight, field.lowest.ravel(),
             field.lowest.shape[1], field.slots.ravel(), field.patterns.ravel(), raised, self._label, found, beside,
             groups,
         )  # fmt: skip
         border = np.empty(candidates, np.int32)
         leaving = int(
-            _enclose(flat, width, weight, first, found[:count], beside[:candidates], self._label, groups, border)
+            _enclose(
+                flat, width, weight, first, found[:count], beside[:candidates], self._label, groups[:n_groups], border
+            )
         )
         self._starts = first[(self._label[first] >= _SHADOW) & (weight[flat[first]] > 0)]
         self.border = border[:leaving].copy()

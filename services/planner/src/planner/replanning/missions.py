@@ -31,7 +31,10 @@ class Missions:
 
     def of(self, robot: str) -> Mission:
         """Return a robot's mission, which may have no goal."""
-        return self._missions.setdefault(robot, Mission())
+        mission = self._missions.get(robot)
+        if mission is None:
+            mission = self._missions[robot] = Mission()
+        return mission
 
     def items(self) -> list[tuple[str, Mission]]:
         """Return all robots with their missions."""

@@ -13,7 +13,7 @@ import numpy as np
 
 from fog_contracts.costs import NEUTRAL_WEIGHT
 from fog_kernels.dead_ends import DeadEnds
-from fog_kernels.detour import Shadow
+from fog_kernels.detour import Shadow, compare_levels
 from fog_kernels.steps import DEFAULT_WEIGHTS, STRAIGHT
 
 if TYPE_CHECKING:
@@ -212,9 +212,9 @@ def _better(fields: Sequence[GoalField], border: NDArray[np.int32]) -> GoalField
         return None
     fields = [*fields[:2], *fields[2 :: (len(fields) - 2) // _CANDIDATES + 1]]
     costs: NDArray[np.int64] = np.stack([field.costs(border) for field in fields])
-    costs = costs[:, np.all(costs >= 0, axis=0)]
+    costs = np.ascontiguousarray(costs[:, np.all(costs >= 0, axis=0)])
     if costs.size == 0:
         return None
-    gains = np.array([(costs - own).min(axis=1).sum() + len(fields) * (own - costs[1]).min() for own in costs])
+    gains = compare_levels(costs, own=1)
     best = int(np.argmax(gains))
     return fields[best] if gains[best] - gains[0] > _WORTHWHILE * len(fields) else None

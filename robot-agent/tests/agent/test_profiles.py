@@ -73,6 +73,17 @@ def test_default_drives_up_to_what_its_lidar_sees_and_turns_back():
     assert not world.collided
 
 
+@pytest.mark.parametrize("profile", ["default", "full"])
+def test_a_robot_that_plans_for_itself_takes_another_way_round_a_place_that_it_does_not_fit_through(profile):
+    # Seven cells of 5 cm: the middle one is free on the costmap, where a body of 0.34 m has not its padding.
+    necked = [(1, 1, 5, 2.4), (5, 1.5, 5.2, 1.85), (5.2, 1, 9, 2.4), *RING[1:]]
+    world = switched(LittleWorld(rooms=necked, size=(10.0, 8.0), pose=(2.0, 1.7, 0.0)).ready(), profile)
+    send_goal(world, (8.0, 1.7))
+    assert world.run(120.0, lambda w: w.state().goal_reached), world.state().reasons
+    assert world.travelled > 12.0
+    assert not world.collided
+
+
 def test_full_avoids_a_hazard_that_only_the_fog_knows_and_default_does_not():
     lengths = {}
     for profile in ("default", "full"):

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 
 import numpy as np
+import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -80,8 +81,14 @@ def test_costs_are_those_of_a_costmap_inflated_from_scratch(steps):
         for spans in costmap._closed.values():
             window, mask = spans.to_mask()
             raw[window.rows, window.columns][mask] = LETHAL
-        raw[costmap._marked[:, 1], costmap._marked[:, 0]] = LETHAL
-        assert np.array_equal(costmap.replica.cost, inflate(raw, TABLE))
+        marked = costmap._marks.cells
+        raw[marked[:, 1], marked[:, 0]] = LETHAL
+        expected = inflate(raw, TABLE)
+        # What is marked may be anywhere in its cell, up to half a diagonal from the centre.
+        rows, columns = np.mgrid[: GEOMETRY.height, : GEOMETRY.width]
+        for column, row in marked:
+            expected[(np.hypot(columns - column, rows - row) * 0.05 <= 0.17 + 0.0354) & (expected < 253)] = 253
+        assert np.array_equal(costmap.replica.cost, expected)
         assert (costmap.replica.version != before) >= (not np.array_equal(cost, costmap.replica.cost))
 
 
@@ -94,6 +101,83 @@ def test_an_obstacle_is_marked_when_it_is_seen_and_freed_when_it_is_seen_to_be_g
     hidden = Pose2(4.5, 2.25, 0.0)
     costmap.observe(hidden, *scan(with_obstacle((3.0, 0.5, 3.2, 4.5)), hidden))
     assert costmap.replica.cost[middle] >= 253
+    costmap.observe(pose, *scan(floor().static, pose))
+    assert costmap.replica.cost[middle] == 0
+
+
+def edge_of_a_box(costmap):
+    """Return how many cells beside the box of the tests below are closed, upwards from its upper edge at 2.9 m."""
+    column = costmap.replica.cost[:, GEOMETRY.cell(2.6, 1.0)[0]]
+    return int((column[58:90] >= 253).sum())
+
+
+def turned(points, pose, angle):
+    """Return points (n, 2) as a robot at this pose takes them to be whose heading is wrong by an angle."""
+    cos, sin = math.cos(angle), math.sin(angle)
+    return (points - pose[:2]) @ np.array(((cos, sin), (-sin, cos))) + pose[:2]
+
+
+def test_an_obstacle_s_edge_stays_where_it_was_seen_while_the_robot_sees_the_obstacle_from_farther_away():
+    box = with_obstacle((2.5, 1.0, 2.8, 2.9))
+    costmap, near = OnboardCostmap(floor(), 0.17), Pose2(1.6, 2.5, 0.0)
+    for error in (0.0, 0.06):
+        points, unexplained = scan(box, near)
+        costmap.observe(near, turned(points, near, error), unexplained)
+    closed = edge_of_a_box(costmap)
+    for x in (1.4, 1.2, 1.0, 0.8):
+        for error in (-0.05, 0.0, 0.05):
+            pose = Pose2(x, 2.5, 0.0)
+            points, unexplained = scan(box, pose)
+            costmap.observe(pose, turned(points, pose, error), unexplained)
+            assert edge_of_a_box(costmap) >= closed
+
+
+def test_an_obstacle_s_edge_is_corrected_by_what_the_robot_sees_from_clearly_nearer():
+    box = with_obstacle((2.5, 1.0, 2.8, 2.9))
+    costmap, far = OnboardCostmap(floor(), 0.17), Pose2(0.6, 2.7, 0.0)
+    points, unexplained = scan(box, far)
+    costmap.observe(far, turned(points, far, 0.08), unexplained)
+    smeared = edge_of_a_box(costmap)
+    near = Pose2(1.6, 2.7, 0.0)
+    costmap.observe(near, *scan(box, near))
+    assert edge_of_a_box(costmap) < smeared
+
+
+def test_an_obstacle_that_is_gone_as_a_whole_is_freed_from_farther_away_too():
+    costmap, near = OnboardCostmap(floor(), 0.17), Pose2(1.6, 2.0, 0.0)
+    costmap.observe(near, *scan(with_obstacle((2.5, 1.8, 2.8, 2.2), (2.4, 4.0, 2.8, 4.4)), near))
+    assert costmap.replica.cost[GEOMETRY.cell(2.52, 2.0)[::-1]] == LETHAL
+    far = Pose2(0.5, 2.0, 0.0)
+    costmap.observe(far, *scan(with_obstacle((2.4, 4.0, 2.8, 4.4)), far))
+    assert costmap.replica.cost[GEOMETRY.cell(2.52, 2.0)[::-1]] == 0
+    assert costmap.replica.cost[GEOMETRY.cell(2.42, 4.1)[::-1]] >= 253
+
+
+@pytest.mark.parametrize(("cells", "open_"), [(3, False), (4, False), (5, True)])
+def test_a_gap_between_two_obstacles_on_a_coarse_grid_is_open_only_if_the_body_fits_wherever_in_their_cells_they_are(
+    cells, open_
+):
+    geometry = GridGeometry(40, 40, 0.1, 0.0, 0.0)
+    replica = Replica()
+    empty = np.zeros(geometry.shape, np.uint8)
+    replica.load(MasterMap("hall", geometry, empty, empty, epoch=3).snapshot())
+    costmap = OnboardCostmap(replica, 0.17)
+    rows = [*range(10), *range(10 + cells, 40)]
+    points = np.array([(2.05, 0.1 * row + 0.05) for row in rows])
+    costmap.observe(Pose2(0.5, 1.0, 0.0), points, np.ones(len(points), np.bool_))
+    assert bool((costmap.replica.cost[:, 20] < 253).any()) == open_
+
+
+def test_a_place_that_the_robot_could_not_pass_is_closed_as_long_as_it_is_reported_and_until_it_is_seen_to_be_free():
+    costmap, pose = OnboardCostmap(floor(), 0.17), Pose2(1.0, 1.2, 0.0)
+    bar = np.column_stack((np.full(5, 2.6), np.linspace(1.0, 1.4, 5)))
+    middle = GEOMETRY.cell(2.6, 1.2)[::-1]
+    for _ in range(3):
+        costmap.observe(pose, *scan(floor().static, pose), bar)
+        assert costmap.replica.cost[middle] == LETHAL
+    hidden = Pose2(4.5, 2.25, 0.0)
+    costmap.observe(hidden, *scan(with_obstacle((3.0, 0.5, 3.2, 4.5)), hidden))
+    assert costmap.replica.cost[middle] == LETHAL
     costmap.observe(pose, *scan(floor().static, pose))
     assert costmap.replica.cost[middle] == 0
 

@@ -116,7 +116,8 @@ class Navigation:
         onboard, mission = self._onboard, self._driving.mission
         if onboard is None:
             return None
-        if onboard.update(self._localizer, self._closed(onboard.replica), now):
+        impassable = self._driving.impassable(now)
+        if onboard.update(self._localizer, self._closed(onboard.replica), impassable, now):
             self._driving.check_path(onboard.replica, now)
         pose, goal = self._localizer.pose(now), mission.goal
         mission.confirm(now)

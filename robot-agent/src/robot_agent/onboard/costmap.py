@@ -11,11 +11,12 @@ from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
-from fog_contracts.costs import DEFAULT_INFLATION, FREE, LETHAL, Inflation
+from fog_contracts.costs import DEFAULT_INFLATION, FREE, INSCRIBED, LETHAL, Inflation
 from fog_contracts.grid import Window
 from fog_contracts.replica import Replica, Version
 from fog_kernels.inflation import inflate, inflate_window, inflation_table
 from fog_kernels.spans import raise_costs
+from robot_agent.onboard.marks import Marks
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -28,10 +29,8 @@ if TYPE_CHECKING:
 
     Cells = NDArray[np.int64]
 
-_SECTORS: Final = 360
-_SEEN_BEYOND_M: Final = 0.2
-"""A cell is seen to be free when the lidar sees this much farther in its direction."""
 _NOWHERE: Final = Window(0, 0, 0, 0)
+_NO_POINTS: Final = np.zeros((0, 2))
 
 
 class OnboardCostmap:
@@ -53,8 +52,8 @@ class OnboardCostmap:
         self._table = inflation_table(self.geometry.resolution, inflation)
         self._static = floor.static
         self._raw = floor.static.copy()
-        self._marked: Cells = np.zeros((0, 2), np.int64)
-        """Cells (n, 2; column, row) in which the lidar saw an obstacle that the floor plan does not have."""
+        self._marks = Marks(self.geometry)
+        self._touching = _touching(self.geometry.resolution, inscribed_radius)
         self._closed: dict[str, Spans] = {}
         self.replica = Replica()
         self.replica.site, self.replica.geometry, self.replica.static = floor.site, floor.geometry, floor.static
@@ -76,21 +75,23 @@ class OnboardCostmap:
         part = self._static[changed.rows, changed.columns].copy()
         raise_costs([(spans, LETHAL) for spans in places.values()], changed.x, changed.y, part)
         self._raw[changed.rows, changed.columns] = part
-        self._raw[self._marked[:, 1], self._marked[:, 0]] = LETHAL
+        self._raw[self._marks.cells[:, 1], self._marks.cells[:, 0]] = LETHAL
         self._inflate(changed)
 
-    def observe(self, seen_from: Pose2, points: NDArray[np.float64], unexplained: NDArray[np.bool_]) -> None:
-        """Mark what a scan shows and the floor plan does not explain; free the marked cells beyond which it sees.
+    def observe(
+        self,
+        seen_from: Pose2,
+        points: NDArray[np.float64],
+        unexplained: NDArray[np.bool_],
+        impassable: NDArray[np.float64] = _NO_POINTS,
+    ) -> None:
+        """Mark what a scan shows and the floor plan does not explain; free the marked cells that it sees to be free.
 
         points: (n, 2) m, frame `map`, of all beams that returned, from the pose `seen_from`. unexplained: (n,).
+        impassable: (n, 2) m, a place that the robot could not pass although the scan may show nothing there.
         """
-        marks = self._cells(points[unexplained])
-        gone = self._marked[self._is_free(self._marked, seen_from, points)]
-        width = self.geometry.width
-        # What the same scan marks is there, whatever its other beams pass by.
-        freed = gone[~_contains(marks, gone, width)]
-        fresh = marks[~_contains(self._marked, marks, width)]
-        self._marked = np.concatenate((self._marked[~_contains(freed, self._marked, width)], fresh))
+        occupied = self._cells(np.concatenate((points[unexplained], impassable)))
+        fresh, freed = self._marks.observe(seen_from, points, occupied)
         changed = np.concatenate((fresh, freed))
         if not len(changed):
             return
@@ -109,33 +110,30 @@ class OnboardCostmap:
         cells = cells[inside]
         return np.unique(cells[self._static[cells[:, 1], cells[:, 0]] == FREE], axis=0)
 
-    def _is_free(self, cells: Cells, seen_from: Pose2, points: NDArray[np.float64]) -> NDArray[np.bool_]:
-        """Return beyond which of the cells (n, 2) the scan sees: by its nearest return of each direction."""
-        dx, dy = points[:, 0] - seen_from.x, points[:, 1] - seen_from.y
-        reach = np.full(_SECTORS, np.inf)
-        np.minimum.at(reach, _sectors(dx, dy), np.hypot(dx, dy))
-        reach[np.isinf(reach)] = 0.0
-        # A beam that only just passes an obstacle's edge says nothing of the cell beside it.
-        reach = np.minimum(reach, np.minimum(np.roll(reach, 1), np.roll(reach, -1)))
-        centres = self.geometry.centres(cells)
-        cx, cy = centres[:, 0] - seen_from.x, centres[:, 1] - seen_from.y
-        free: NDArray[np.bool_] = np.hypot(cx, cy) + _SEEN_BEYOND_M < reach[_sectors(cx, cy)]
-        return free
-
     def _inflate(self, window: Window) -> None:
         """Inflate a window in which cells changed, and count a version."""
         cost, version = self.replica.cost, self.replica.version
         assert version is not None
         inflate_window(self._raw, self._table, window.x, window.y, window.width, window.height, cost)
+        self._keep_clear_of_marks(cost)
         self.replica.version = Version(version.epoch, version.seq + 1, 0)
 
+    def _keep_clear_of_marks(self, cost: NDArray[np.uint8]) -> None:
+        """Keep the robot's centre off the cells where its body might reach what a mark stands for."""
+        around = (self._marks.cells[:, np.newaxis] + self._touching).reshape(-1, 2)
+        around = around[((around >= 0) & (around < (self.geometry.width, self.geometry.height))).all(axis=1)]
+        columns, rows = around.T
+        cost[rows, columns] = np.maximum(cost[rows, columns], INSCRIBED)
 
-def _sectors(dx: NDArray[np.float64], dy: NDArray[np.float64]) -> NDArray[np.int64]:
-    """Return the sector of each direction, counted counter-clockwise from the map's x axis."""
-    return np.floor(np.arctan2(dy, dx) % math.tau * (_SECTORS / math.tau)).astype(np.int64) % _SECTORS
 
+def _touching(resolution: float, inscribed_radius: float) -> Cells:
+    """Return the cells (n, 2; column, row) around one in which something was seen that the body might touch there.
 
-def _contains(cells: Cells, wanted: Cells, width: int) -> NDArray[np.bool_]:
-    """Return which of the wanted cells (n, 2) are among the cells (m, 2) of a grid of this width."""
-    found: NDArray[np.bool_] = np.isin(wanted[:, 1] * width + wanted[:, 0], cells[:, 1] * width + cells[:, 0])
-    return found
+    It may be anywhere in its cell. On a grid of 0.1 m a gap of three cells between two marks would else be open for a
+    body that is wider than that.
+    """
+    radius = inscribed_radius + math.sqrt(0.5) * resolution
+    reach = math.floor(radius / resolution)
+    rows, columns = np.mgrid[-reach : reach + 1, -reach : reach + 1]
+    near = np.hypot(rows, columns) * resolution <= radius
+    return np.column_stack((columns[near], rows[near])).astype(np.int64)

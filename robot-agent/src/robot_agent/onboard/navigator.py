@@ -14,6 +14,9 @@ from robot_agent.onboard.search import Search
 if TYPE_CHECKING:
     from collections.abc import Mapping
 
+    import numpy as np
+    from numpy.typing import NDArray
+
     from fog_contracts.handlers import Moment
     from fog_contracts.messages import RobotGoal
     from fog_contracts.raster import Spans
@@ -62,8 +65,14 @@ class OnboardNavigator:
         """Return the time (s) since the costmap was last up to date."""
         return now - self._updated_at
 
-    def update(self, localizer: Localizer, closed: Mapping[str, Spans], now: float) -> bool:
-        """Update the layers if that is due; return whether it was. `closed`: the places that the fog closes."""
+    def update(
+        self, localizer: Localizer, closed: Mapping[str, Spans], impassable: NDArray[np.float64], now: float
+    ) -> bool:
+        """Update the layers if that is due; return whether it was.
+
+        closed: the places that the fog closes. impassable: (n, 2) m, frame `map`: a place that the robot could not
+        pass. No planner of the fog is told of it here, and the costmap may show it as open.
+        """
         if now - self._updated_at < self._profile.layers_period - _EARLY_S:
             return False
         self._updated_at = now
@@ -71,7 +80,7 @@ class OnboardNavigator:
         points, seen_from = localizer.points_in_map(), localizer.scan_pose()
         trusted = localizer.status == "good" and abs(localizer.twist()[1]) <= _TURN_RATE
         if points is not None and seen_from is not None and trusted:
-            self._costmap.observe(seen_from, points, localizer.wall_distance(points) > _EXPLAINED_M)
+            self._costmap.observe(seen_from, points, localizer.wall_distance(points) > _EXPLAINED_M, impassable)
         return True
 
     def search(self, goal: RobotGoal, pose: Pose2, follower: PathFollower | None, now: float) -> Search | None:

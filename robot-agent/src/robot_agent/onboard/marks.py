@@ -1,0 +1,112 @@
+"""What the robot's lidar saw and the floor plan does not have, and when it is believed to be gone.
+
+A scan errs more the farther it sees: by the error of the robot's heading times the distance, and by the space between
+two beams. At an obstacle's edge one scan therefore hits a cell that the next one sees past. Were the last one believed,
+a gap that is about as wide as the robot would open and close with each scan, and a robot that has turned back from it
+would turn round again, and again.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import TYPE_CHECKING, Final
+
+import numpy as np
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    from fog_contracts.grid import GridGeometry
+    from robot_agent.localization.pose import Pose2
+
+    Cells = NDArray[np.int64]
+
+_SECTORS: Final = 360
+_SEEN_BEYOND_M: Final = 0.2
+"""A cell is seen to be free when the lidar sees this much farther in its direction."""
+_PIECE_M: Final = 0.3
+"""Marked cells this near to each other may be pieces of one obstacle."""
+_NEARER_M: Final = 0.5
+"""A view from this much nearer than the nearest that showed an obstacle is the better one."""
+
+
+class Marks:
+    """The marked cells of a grid."""
+
+    def __init__(self, geometry: GridGeometry) -> None:
+        self._geometry = geometry
+        self._piece = math.ceil(_PIECE_M / geometry.resolution - 1e-9)
+        self.cells: Cells = np.zeros((0, 2), np.int64)
+        """(n, 2); column, row."""
+        self._seen_from: NDArray[np.float64] = np.zeros(0)
+        """(n,) m: how far away the robot was when it saw something in each cell, the nearest time."""
+
+    def observe(self, seen_from: Pose2, points: NDArray[np.float64], occupied: Cells) -> tuple[Cells, Cells]:
+        """Take a scan into account; return the cells (n, 2) that are marked now and were not, and those no longer.
+
+        points: (n, 2) m, frame `map`, of all beams that returned, from the pose `seen_from`. occupied: (n, 2) the cells
+        that the scan shows to be occupied, each once.
+
+        A marked cell is freed when the scan sees beyond it, and either nothing near it stays marked (the obstacle as a
+        whole is gone), or the robot is clearly nearer than it was whenever it saw something there.
+        """
+        away = self._away(self.cells, seen_from)
+        # What the same scan shows is there, whatever its other beams pass by.
+        seen = self._contains(occupied, self.cells)
+        self._seen_from[seen] = np.minimum(self._seen_from[seen], away[seen])
+        gone = ~seen & self._is_free(seen_from, points, away)
+        if gone.any():
+            better = away <= self._seen_from - _NEARER_M
+            staying = np.concatenate((self.cells[~gone], occupied))
+            gone[gone] = better[gone] | ~self._is_beside(self.cells[gone], staying)
+        freed = self.cells[gone]
+        fresh = occupied[~self._contains(self.cells, occupied)]
+        self.cells = np.concatenate((self.cells[~gone], fresh))
+        self._seen_from = np.concatenate((self._seen_from[~gone], self._away(fresh, seen_from)))
+        return fresh, freed
+
+    def _away(self, cells: Cells, pose: Pose2) -> NDArray[np.float64]:
+        """Return how far (m) the centres of cells (n, 2) are from a pose."""
+        away: NDArray[np.float64] = np.hypot(*(self._geometry.centres(cells) - (pose.x, pose.y)).T)
+        return away
+
+    def _is_free(self, seen_from: Pose2, points: NDArray[np.float64], away: NDArray[np.float64]) -> NDArray[np.bool_]:
+        """Return beyond which of the marked cells the scan sees: by its nearest return of each direction."""
+        dx, dy = points[:, 0] - seen_from.x, points[:, 1] - seen_from.y
+        reach = np.full(_SECTORS, np.inf)
+        np.minimum.at(reach, _sectors(dx, dy), np.hypot(dx, dy))
+        reach[np.isinf(reach)] = 0.0
+        # A beam that only just passes an obstacle's edge says nothing of the cell beside it.
+        reach = np.minimum(reach, np.minimum(np.roll(reach, 1), np.roll(reach, -1)))
+        centres = self._geometry.centres(self.cells)
+        free: NDArray[np.bool_] = (
+            away + _SEEN_BEYOND_M < reach[_sectors(centres[:, 0] - seen_from.x, centres[:, 1] - seen_from.y)]
+        )
+        return free
+
+    def _is_beside(self, cells: Cells, others: Cells) -> NDArray[np.bool_]:
+        """Return which of the cells (n, 2) are so near to one of the others (m, 2) that both may be one obstacle."""
+        margin = self._piece
+        low, high = cells.min(axis=0) - margin, cells.max(axis=0) + margin + 1
+        near = others[((others >= low) & (others < high)).all(axis=1)] - low
+        columns, rows = (high - low).tolist()
+        there = np.zeros((rows, columns), np.bool_)
+        there[near[:, 1], near[:, 0]] = True
+        # Summed over the square around each cell.
+        sums = np.zeros((rows + 1, columns + 1), np.int64)
+        sums[1:, 1:] = there.cumsum(axis=0).cumsum(axis=1)
+        x, y = (cells - low).T
+        left, right, bottom, top = x - margin, x + margin + 1, y - margin, y + margin + 1
+        found: NDArray[np.bool_] = sums[top, right] - sums[bottom, right] - sums[top, left] + sums[bottom, left] > 0
+        return found
+
+    def _contains(self, cells: Cells, wanted: Cells) -> NDArray[np.bool_]:
+        """Return which of the wanted cells (n, 2) are among the cells (m, 2)."""
+        width = self._geometry.width
+        found: NDArray[np.bool_] = np.isin(wanted[:, 1] * width + wanted[:, 0], cells[:, 1] * width + cells[:, 0])
+        return found
+
+
+def _sectors(dx: NDArray[np.float64], dy: NDArray[np.float64]) -> NDArray[np.int64]:
+    """Return the sector of each direction, counted counter-clockwise from the map's x axis."""
+    return np.floor(np.arctan2(dy, dx) % math.tau * (_SECTORS / math.tau)).astype(np.int64) % _SECTORS

@@ -34,7 +34,7 @@ EDGES = {
     "fognav_experiments.fleet", "fognav_experiments.scenarios.description", "fognav_experiments.scenarios.fleet_stage",
     "fognav_experiments.scenarios.node_faults", "fognav_experiments.scenarios.stage",
     "fognav_experiments.sensitivity.publish", "fognav_experiments.sensitivity.sources",
-    "fognav_experiments.sensitivity.sweep",
+    "fognav_experiments.sensitivity.sweep", "fognav_experiments.worker_pool",
     "fognav_experiments.lockstep", "fognav_experiments.rigs", "fognav_experiments.smoothness",
     "fognav.__main__", "fognav.bench", "fognav.commands", "fognav.checkout", "fognav.checks", "fognav.demo.attempt",
     "fognav.demo.background", "fognav.demo.operator", "fognav.demo.options", "fognav.demo.placement",

@@ -3,17 +3,15 @@
 from __future__ import annotations
 
 import hashlib
-import multiprocessing
-import os
-import signal
 import tomllib
-from concurrent.futures import FIRST_COMPLETED, ProcessPoolExecutor, wait
+from concurrent.futures import FIRST_COMPLETED, wait
 from functools import cache
 from typing import TYPE_CHECKING, NamedTuple
 
 import msgspec
 
 from fog_runtime.configuration.site import load_site
+from fognav_experiments import worker_pool
 from fognav_experiments.comparison.draws import ExperimentSpec, draw
 from fognav_experiments.comparison.driven import drive_name
 from fognav_experiments.comparison.geometry import RouteGeometry
@@ -99,8 +97,7 @@ def run(site_folder: Path, asked: list[Task], folder: Folder, jobs: int = 1, com
             folder.drives.write(record)
             yield record
         return
-    context = multiprocessing.get_context("spawn")
-    with ProcessPoolExecutor(jobs, mp_context=context, initializer=_ignore_interrupts) as pool:
+    with worker_pool.open_pool(jobs) as pool:
         waiting = {pool.submit(_drive, site_folder, task, jobs, commit) for task in due}
         try:
             while waiting:
@@ -154,9 +151,3 @@ def _drive(site_folder: Path, task: Task, jobs: int, commit: str) -> Record:
 @cache
 def _site(folder: Path) -> LoadedSite:
     return load_site(folder)
-
-
-def _ignore_interrupts() -> None:
-    """Leave Ctrl-C to the parent, and yield to whatever else the machine does."""
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
-    os.nice(5)

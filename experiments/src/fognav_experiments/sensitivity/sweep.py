@@ -3,16 +3,14 @@
 from __future__ import annotations
 
 import contextlib
-import multiprocessing
-import os
-import signal
 import socket
-from concurrent.futures import FIRST_COMPLETED, Executor, ProcessPoolExecutor, wait
+from concurrent.futures import FIRST_COMPLETED, Executor, wait
 from importlib.metadata import version
 from importlib.util import find_spec
 from typing import TYPE_CHECKING, Final
 
 from fog_contracts.messages import Pose
+from fognav_experiments import worker_pool
 from fognav_experiments.lockstep import release_drives, run_lockstep
 from fognav_experiments.rigs import Tuning
 from fognav_experiments.sensitivity.planes import SweptDrive, varied_site
@@ -41,8 +39,7 @@ def workers(jobs: int, cluster: str | None) -> Iterator[Executor]:
     Raises `ClusterError` without Dask, or if nobody answers at the address.
     """
     if cluster is None:
-        context = multiprocessing.get_context("spawn")
-        with ProcessPoolExecutor(jobs, mp_context=context, initializer=_be_modest) as pool:
+        with worker_pool.open_pool(jobs) as pool:
             yield pool
         return
     if find_spec("distributed") is None:
@@ -117,9 +114,3 @@ def swept_drive(site: LoadedSite, task: SweepTask, commit: str, sources: str) ->
         version=version("fognav-experiments"),
         sources=own,
     )
-
-
-def _be_modest() -> None:
-    """Leave Ctrl-C to the parent, and yield to whatever else the machine does."""
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
-    os.nice(5)

@@ -2,8 +2,7 @@
 
 The figures come from the report of an experiment (`fognav experiment report`): from its `drives.csv`, and the machine
 from its `README.md`, which also says what the robot's processes took in drives by real processes (`fognav experiment
---live`), or from the page `live.md` beside the report's folder, where drives whose records are lost keep their table,
-if that names the same processor. Dashboards show them beside what robots take now.
+--live`). Dashboards show them beside what robots take now.
 
 What each thread took is known by component, from drives in lockstep: the calculations of a thread, without the sockets,
 the event loop and the waking up that a real one has besides.
@@ -16,7 +15,6 @@ of date.
 import argparse
 import csv
 import re
-import sys
 from collections.abc import Mapping, Sequence
 from itertools import dropwhile, takewhile
 from pathlib import Path
@@ -111,26 +109,15 @@ def processor(page: Path, text: str) -> str:
 
 
 def rules(folder: Path) -> str:
-    """Return the file of rules for a report's folder; raises `SystemExit` if that is no report.
-
-    The page beside the folder is left out, with a word to the error output, if its processor is another: a share of a
-    core says nothing beside one of another core.
-    """
+    """Return the file of rules for a report's folder; raises `SystemExit` if that is no report."""
     try:
         with (folder / "drives.csv").open(encoding="utf-8", newline="") as file:
             drives = compared(list(csv.DictReader(file)))
         readme = (folder / "README.md").read_text("utf-8")
-        live = folder.resolve().parent / "live.md"
-        kept = live.read_text("utf-8") if live.is_file() else ""
     except (OSError, KeyError, ValueError) as error:
         raise SystemExit(f"{folder} is no report ({error}): `fognav experiment report` writes one") from error
     machine = processor(folder / "README.md", readme)
     real = processes(readme)
-    if not real and kept:
-        if (other := processor(live, kept)) == machine:
-            real = processes(kept)
-        else:
-            print(f"{live} was measured on {other}, the report on {machine}: left out", file=sys.stderr)
     lines = [
         "# Made by deploy/prometheus/make_baselines.py from the report of an experiment: do not edit.",
         "# CPU in cores of planning, layers and local planning, the mean of recorded drives in each setup; and of the",

@@ -105,30 +105,10 @@ def test_baselines_of_the_robot_s_processes_are_those_of_real_ones_without_a_quo
         script.rules(report(tmp_path, *drives, readme=README + PROCESSES.replace("agent, %", "agent")))
 
 
-def test_processes_of_a_report_without_real_ones_are_those_of_the_page_beside_its_folder(script, tmp_path):
+def test_report_that_names_no_processor_is_none(script, tmp_path):
     drives = [(1, setup, 1.0, "True") for setup in ("default", "full", "fog")]
-    (tmp_path / "estig").mkdir()
-    (tmp_path / "live.md").write_text(README + PROCESSES, "utf-8")
-    beside = script.rules(report(tmp_path / "estig", *drives, readme=README))
-    assert "process_cpu" in beside
-    assert beside == script.rules(report(tmp_path / "estig", *drives, readme=README + PROCESSES))
-    own = script.rules(report(tmp_path / "estig", *drives, readme=README + PROCESSES.replace("8.00", "9.00")))
-    assert "vector(0.09000)" in own
-
-
-def test_processes_on_another_processor_are_no_baseline_of_the_report_s(script, tmp_path, capsys):
-    drives = [(1, setup, 1.0, "True") for setup in ("default", "full", "fog")]
-    (tmp_path / "estig").mkdir()
-    folder = report(tmp_path / "estig", *drives)
-    page = tmp_path / "live.md"
-    page.write_text(README.replace("Cortex-A72", "AMD EPYC") + PROCESSES, "utf-8")
-    text = script.rules(folder)
-    assert "process_cpu" not in text
-    assert "AMD EPYC" not in text
-    assert f"{page} was measured on AMD EPYC, the report on Cortex-A72" in capsys.readouterr().err
-    page.write_text(PROCESSES, "utf-8")
-    with pytest.raises(SystemExit, match=r"live\.md names no `machine processor`"):
-        script.rules(folder)
+    with pytest.raises(SystemExit, match=r"README\.md names no `machine processor`"):
+        script.rules(report(tmp_path, *drives, readme=PROCESSES))
 
 
 def test_baselines_of_threads_are_the_components_that_run_on_them(script, tmp_path):

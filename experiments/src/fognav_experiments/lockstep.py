@@ -60,7 +60,7 @@ if TYPE_CHECKING:
     from fognav_experiments.rigs import Tuning
     from fognav_sim.sensors import Noise
 
-WARM_UP_S: Final = 12.0
+WARM_UP_S: Final = 30.0
 """Time within which all areas must be known, the robot localized and enabled."""
 TRACK_M: Final = 0.25
 """Spacing of the recorded track."""

@@ -34,9 +34,11 @@ def test_workers_of_a_killed_experiment_end(tmp_path):
     program = tmp_path / "parent.py"
     program.write_text(PARENT)
     with subprocess.Popen([sys.executable, str(program)], stdout=subprocess.PIPE, text=True) as parent:
-        workers = [int(parent.stdout.readline()) for _ in range(2)]
-        assert all(is_alive(pid) for pid in workers)
-        parent.kill()
+        try:
+            workers = [int(parent.stdout.readline()) for _ in range(2)]
+            assert all(is_alive(pid) for pid in workers)
+        finally:
+            parent.kill()
     end = time.monotonic() + DEADLINE_S
     while any(is_alive(pid) for pid in workers):
         assert time.monotonic() < end, f"workers {workers} outlive the process that started them"

@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+import signal
 import subprocess
 import sys
 import time
 from pathlib import Path
+
+import pytest
 
 DEADLINE_S = 60.0
 PARENT = """
@@ -30,16 +33,19 @@ def is_alive(pid):
         return False
 
 
-def test_workers_of_a_killed_experiment_end(tmp_path):
+@pytest.mark.parametrize("end", [signal.SIGKILL, signal.SIGINT], ids=["killed", "interrupted"])
+def test_workers_of_an_experiment_that_ends_early_end_in_the_middle_of_their_drives(tmp_path, end):
     program = tmp_path / "parent.py"
     program.write_text(PARENT)
     with subprocess.Popen([sys.executable, str(program)], stdout=subprocess.PIPE, text=True) as parent:
         try:
             workers = [int(parent.stdout.readline()) for _ in range(2)]
             assert all(is_alive(pid) for pid in workers)
+            parent.send_signal(end)
+            parent.wait(DEADLINE_S)
         finally:
             parent.kill()
-    end = time.monotonic() + DEADLINE_S
+    deadline = time.monotonic() + DEADLINE_S
     while any(is_alive(pid) for pid in workers):
-        assert time.monotonic() < end, f"workers {workers} outlive the process that started them"
+        assert time.monotonic() < deadline, f"workers {workers} outlive the process that started them"
         time.sleep(0.05)

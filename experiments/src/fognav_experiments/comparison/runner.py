@@ -99,15 +99,11 @@ def run(site_folder: Path, asked: list[Task], folder: Folder, jobs: int = 1, com
         return
     with worker_pool.open_pool(jobs) as pool:
         waiting = {pool.submit(_drive, site_folder, task, jobs, commit) for task in due}
-        try:
-            while waiting:
-                done, waiting = wait(waiting, return_when=FIRST_COMPLETED)
-                for future in done:
-                    folder.drives.write(future.result())
-                    yield future.result()
-        except BaseException:
-            pool.shutdown(wait=False, cancel_futures=True)
-            raise
+        while waiting:
+            done, waiting = wait(waiting, return_when=FIRST_COMPLETED)
+            for future in done:
+                folder.drives.write(future.result())
+                yield future.result()
 
 
 def new(site: LoadedSite, site_folder: Path, seed: int) -> Asked:

@@ -46,6 +46,16 @@ def test_path_between_two_walls_moves_to_the_middle_and_stays_there():
     assert distances(field, middle).min() > 0.2
 
 
+@pytest.mark.parametrize("beside", [-0.03, 0.01, 0.03])
+@pytest.mark.parametrize("leaf", [0.0, 0.5, 1.0])
+def test_path_beside_the_middle_of_a_gap_is_bent_onto_its_middle(leaf, beside):
+    # A post, or the edge of a door of which the leaf leads away at an angle, 21 cm from the middle; a post opposite.
+    edge = [(1.5 + 0.5 * t * leaf, 1.21 + t) for t in (np.arange(0.0, 0.8, 0.01) if leaf else (0.0,))]
+    field = around([*edge, (1.5, 0.79)])
+    bent = give_way(course(PATH + np.array((0.0, beside)), field), field, 0.29).path
+    assert np.interp(1.5, *bent.T) == pytest.approx(1.0, abs=0.0005)
+
+
 def test_path_with_room_on_both_sides_is_left_alone():
     field = around(walls(0.5, 1.5))
     assert give_way(course(PATH, field), field, 0.30).path is PATH

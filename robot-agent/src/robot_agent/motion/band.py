@@ -21,8 +21,10 @@ _SPACING_M: Final = 0.05
 _STEPS: Final = 6
 _STEP_M: Final = 0.02
 """Points are pushed in so many steps of at most this length: by 12 cm in all."""
-_REACH_M: Final = 0.05
-"""Half the distance over which the slope of the distances is measured: noise of the lidar is no slope."""
+_REACH_M: Final = _STEP_M
+"""Half the distance over which the slope of the distances is measured: as far as a step leads. So a step from beside
+the middle of a narrow place ends on it. Measured over more, the slope fades before the middle, and the steps end
+beside it; over less, they lead across it and back."""
 
 
 class Course(NamedTuple):

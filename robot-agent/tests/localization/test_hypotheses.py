@@ -86,6 +86,7 @@ def test_twin_rooms_are_kept_as_hypotheses_by_a_search_until_the_drive_decides()
     for _ in range(8):
         true, odom = true.compose(step), odom.compose(step)
         one.on_scan(scan_at(true, odom), FIELDS)
+        search(one)
         outcome = one.outcome(1.0)
         if outcome.pose is not None:
             break

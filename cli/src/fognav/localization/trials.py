@@ -34,10 +34,13 @@ def random_starts(
 ) -> dict[str, object]:
     """Start at random scans of a log without a pose; return how often the pose was right, and how often wrong.
 
-    A start counts by the first of its scans at which there is a pose to rely on.
+    A start counts by the first of its scans at which there is a pose to rely on; it is deceived if any of its scans is
+    falsely good.
     """
     rng = np.random.default_rng(seed)
     found = {"right": 0, "wrong": 0}
+    falsely_good = 0
+    deceived: list[int] = []
     for trial in range(trials):
         first = int(rng.integers(0, max(1, len(scans) - START_SCANS)))
         excerpt = scans[first : first + START_SCANS]
@@ -45,6 +48,10 @@ def random_starts(
         relied = next((sample for sample in samples if sample.status in {"good", "weak"}), None)
         if relied is not None:
             found["right" if is_right(relied) else "wrong"] += 1
+        deceiving = sum(map(is_falsely_good, samples))
+        falsely_good += deceiving
+        if deceiving:
+            deceived.append(trial)
         on_trial(trial)
     return {
         "starts": trials,
@@ -52,6 +59,8 @@ def random_starts(
         "right_share": round(found["right"] / trials, 4),
         "wrong": found["wrong"],
         "undecided": trials - sum(found.values()),
+        "falsely_good_scans": falsely_good,
+        "deceived": deceived,
     }
 
 

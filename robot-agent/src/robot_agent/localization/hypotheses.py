@@ -15,14 +15,12 @@ from robot_agent.localization.scan_match import match_scan
 if TYPE_CHECKING:
     from collections.abc import Iterable
 
-    from numpy.typing import NDArray
-
     from robot_agent.localization.deskew import DeskewedScan
     from robot_agent.localization.map_fields import MapFields
 
 _AMBIGUOUS: Final = 0.85
 """A second place that explains the scans this well, as a share of the best, leaves the search ambiguous."""
-_AMBIGUOUS_LATER: Final = 0.6
+AMBIGUOUS_LATER: Final = 0.6
 """The same after more than one scan, for the product over all scans."""
 _HOPELESS: Final = math.log(1e-3)
 """A place that explains the scans so much worse than the best one is dropped."""
@@ -62,6 +60,16 @@ def apart(pose: Pose2, other: Pose2) -> bool:
     return far or abs(wrap(pose.theta - other.theta)) > _APART_RAD
 
 
+def weighed(place: Hypothesis, pose: Pose2, scan: DeskewedScan, fields: MapFields, range_max: float) -> Hypothesis:
+    """Return a place weighed by one scan more, at which the robot was at about `pose`; it is matched to the scan."""
+    points = scan.beams(_BEAMS)
+    matched = match_scan(fields, pose, _MATCH_COVARIANCE, points).pose
+    fit = evaluate_fit(fields, matched, points, range_max)
+    score = float(fields.agreements(np.array([matched]), points, fields.fine)[0])
+    log_quality = place.log_quality + math.log(max(quality(score, fit), 1e-3))
+    return Hypothesis(matched, log_quality, 0 if fits(fit) else place.misfits + 1)
+
+
 class Hypotheses:
     """The places that are left, each tied to the odometry of the last scan that counted."""
 
@@ -72,6 +80,11 @@ class Hypotheses:
         """Pose in `odom` to which the poses belong."""
 
     @property
+    def best(self) -> Hypothesis:
+        """The best place; there must be one."""
+        return self._places[0]
+
+    @property
     def places(self) -> list[Hypothesis]:
         """The places, best first."""
         return list(self._places)
@@ -79,7 +92,7 @@ class Hypotheses:
     @property
     def contenders(self) -> list[Hypothesis]:
         """The best place, and those that explain the scans nearly as well; best first."""
-        limit = math.log(_AMBIGUOUS if self._scans == 1 else _AMBIGUOUS_LATER)
+        limit = math.log(_AMBIGUOUS if self._scans == 1 else AMBIGUOUS_LATER)
         return [place for place in self._places if place.log_quality > self._places[0].log_quality + limit]
 
     @property
@@ -88,13 +101,12 @@ class Hypotheses:
         contenders = self.contenders
         return contenders[0].pose if len(contenders) == 1 and contenders[0].misfits == 0 else None
 
-    def add(self, scan: DeskewedScan, fields: MapFields, range_max: float) -> None:
-        """Weigh the places by a scan, if the robot has moved since the last one that counted."""
+    def add(self, scan: DeskewedScan, fields: MapFields, range_max: float) -> bool:
+        """Weigh the places by a scan; False: it does not count, since the robot has not moved since the last one."""
         step = scan.odom.relative_to(self.odom)
         if math.hypot(step.x, step.y) < _NEWS_M and abs(step.theta) < _NEWS_RAD:
-            return
-        points = scan.beams(_BEAMS)
-        moved = (self._weighed(place, place.pose.compose(step), points, fields, range_max) for place in self._places)
+            return False
+        moved = (weighed(place, place.pose.compose(step), scan, fields, range_max) for place in self._places)
         left: list[Hypothesis] = []
         for place in sorted(moved, key=lambda one: -one.log_quality):
             possible = place.misfits < _MISFITS_MAX and self._is_possible(place, left)
@@ -102,16 +114,13 @@ class Hypotheses:
                 left.append(place)
         self._places, self.odom = left, scan.odom
         self._scans += 1
+        return True
+
+    def join(self, places: Iterable[Hypothesis]) -> None:
+        """Add places, weighed by the same scans, that belong to the odometry of the last one."""
+        new = [place for place in places if all(apart(place.pose, known.pose) for known in self._places)]
+        self._places = sorted((*self._places, *new), key=lambda place: -place.log_quality)
 
     @staticmethod
     def _is_possible(place: Hypothesis, better: list[Hypothesis]) -> bool:
         return not better or place.log_quality > better[0].log_quality + _HOPELESS
-
-    def _weighed(
-        self, place: Hypothesis, pose: Pose2, points: NDArray[np.float64], fields: MapFields, range_max: float
-    ) -> Hypothesis:
-        matched = match_scan(fields, pose, _MATCH_COVARIANCE, points).pose
-        fit = evaluate_fit(fields, matched, points, range_max)
-        score = float(fields.agreements(np.array([matched]), points, fields.fine)[0])
-        log_quality = place.log_quality + math.log(max(quality(score, fit), 1e-3))
-        return Hypothesis(matched, log_quality, 0 if fits(fit) else place.misfits + 1)

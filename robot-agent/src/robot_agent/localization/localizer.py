@@ -4,7 +4,7 @@ Frames: `odom` is the frame of the wheels' odometry since start, `map` is the si
 corrections the pose follows the odometry, so it is smooth and never older than the last feedback.
 Pure: times are arguments, randomness comes from the seed. The parts are modules of their own: `odometry_buffer`,
 `deskew`, `map_fields`, `particle_filter`, `scan_match`, `fit` (how a scan fits the map, and the status), and
-`relocalization` with `global_search` and `hypotheses` for a robot that does not know where it is.
+`relocalization` with `global_search`, `hypotheses` and `rivals` for a robot that does not know where it is.
 """
 
 from __future__ import annotations

@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import math
+from collections import deque
 from typing import TYPE_CHECKING, Final, NamedTuple
 
 from robot_agent.localization.global_search import GlobalSearch
 from robot_agent.localization.pose import Pose2  # noqa: TC001  # a named tuple's fields are read at run time
+from robot_agent.localization.rivals import Rivals
 
 if TYPE_CHECKING:
     from robot_agent.config import LocalizationConfig
@@ -15,11 +17,15 @@ if TYPE_CHECKING:
     from robot_agent.localization.map_fields import MapFields
 
 _POINTS_MIN: Final = 10
+_SCANS_MAX: Final = 12
+"""Scans that are kept, to weigh by them what a second search finds."""
 _SEARCH_EVERY_S: Final = 10.0
 """Least time between the end of a search without any place and the next one, ..."""
 _SEARCH_EVERY_M: Final = 0.5
 _SEARCH_EVERY_RAD: Final = 0.5
 """... unless the robot has moved this far since: somebody may stand in its view no more."""
+
+_CHECKING: Final = "one place is left: the whole map is searched for others that fit as well"
 
 
 class Outcome(NamedTuple):
@@ -37,6 +43,9 @@ class Relocalization:
         self._config = config
         self._search: GlobalSearch | None = None
         self._hypotheses: Hypotheses | None = None
+        self._scans: deque[DeskewedScan] = deque(maxlen=_SCANS_MAX)
+        """The scans by which the hypotheses are weighed."""
+        self._rivals: Rivals | None = None
         self._again_at = -math.inf
         self._failed_at: Pose2 | None = None
         """Odometry at which the last search ended without any place."""
@@ -48,8 +57,8 @@ class Relocalization:
 
     @property
     def searching(self) -> bool:
-        """Whether a search is in progress."""
-        return self._search is not None
+        """Whether a search is in progress, or what it found is being compared."""
+        return self._search is not None or self._rivals is not None
 
     @property
     def places(self) -> list[Hypothesis]:
@@ -67,32 +76,49 @@ class Relocalization:
 
     def cancel(self) -> None:
         """End the search and forget all places."""
-        self._search = self._hypotheses = None
+        self._search = self._hypotheses = self._rivals = None
 
     def begin(self, scan: DeskewedScan, fields: MapFields) -> bool:
         """Begin a search with a scan; False if the map has no free place, or the scan too few points."""
         if not len(fields.free_places) or len(scan.points) < _POINTS_MIN:
             return False
-        self._hypotheses = None
-        self._search = GlobalSearch(fields, scan.beams(self._config.beams), scan.odom, self._config.range_max)
+        self.cancel()
+        self._scans.clear()
+        self._scans.append(scan)
+        self._search_with(scan, fields)
         return True
 
     def advance(self, fields: MapFields) -> None:
-        """Do one share of the search."""
-        assert self._search is not None
-        self._hypotheses = self._search.advance(fields)
-        if self._hypotheses is not None:
+        """Do one share of the search, or of the comparison of what it found."""
+        if self._search is not None:
+            found = self._search.advance(fields)
+            if found is None:
+                return
             self._search = None
+            if self._hypotheses is None:
+                self._hypotheses = found
+            else:
+                self._rivals = Rivals(self._hypotheses.best, found.places, self._scans, self._config.range_max)
+        elif self._rivals is not None and self._hypotheses is not None:
+            rivals = self._rivals.advance(fields)
+            if rivals is not None:
+                self._rivals = None
+                self._hypotheses.join(rivals)
 
     def on_scan(self, scan: DeskewedScan, fields: MapFields) -> None:
         """Do one share of the search, or weigh the places by the scan."""
-        if self._search is not None:
+        if self.searching:
             self.advance(fields)
-        elif self._hypotheses is not None:
-            self._hypotheses.add(scan, fields, self._config.range_max)
+        elif self._hypotheses is not None and self._hypotheses.add(scan, fields, self._config.range_max):
+            self._scans.append(scan)
+            if self._hypotheses.decided is not None:
+                self._search_with(scan, fields)
+
+    def _search_with(self, scan: DeskewedScan, fields: MapFields) -> None:
+        self._search = GlobalSearch(fields, scan.beams(self._config.beams), scan.odom, self._config.range_max)
 
     def outcome(self, now: float) -> Outcome | None:
-        """Return what is known now; None while a search is in progress or nothing was searched."""
+        """Return what is known now; None while the first search is in progress or nothing was searched."""
         hypotheses = self._hypotheses
         if hypotheses is None:
             return None
@@ -100,6 +126,8 @@ class Relocalization:
             self._again_at, self._failed_at = now + _SEARCH_EVERY_S, hypotheses.odom
             self.cancel()
             return Outcome(None, hypotheses.odom, "the scan fits no place of the map: give the initial pose")
+        if self.searching:
+            return Outcome(None, hypotheses.odom, _CHECKING)
         found = hypotheses.decided
         if found is None:
             return Outcome(None, hypotheses.odom, _undecided(len(hypotheses.contenders)))

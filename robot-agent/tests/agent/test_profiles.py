@@ -84,6 +84,55 @@ def test_a_robot_that_plans_for_itself_takes_another_way_round_a_place_that_it_d
     assert not world.collided
 
 
+FAR = [(1, 1, 16, 3), (3, 3, 4, 4.4), (6.5, 3, 8.5, 3.6), (11, 3, 11.8, 4.0)]
+"""A corridor of 15 m with niches: from its one end the lidar, which reaches 12 m, does not see the other."""
+FAR_GOAL = (13.6, 2.0)
+ON_FAR_GOAL = (13.5, 1.8, 13.7, 2.2)
+
+
+def towards_an_occupied_goal(profile):
+    """Return a robot on its way to a goal 11.6 m away on which its lidar has seen something."""
+    world = switched(LittleWorld(rooms=FAR, size=(17.0, 6.0), pose=(2.0, 2.0, 0.0)).ready(), profile)
+    world.path_on = False
+    send_goal(world, FAR_GOAL)
+    empty = world.solid.copy()
+    world.block(*ON_FAR_GOAL, solid=True, publish=False)
+    world.run(1.5)
+    return world, empty
+
+
+@pytest.mark.parametrize("profile", ["default", "full"])
+def test_a_robot_goes_and_looks_at_a_goal_that_it_saw_occupied_only_from_far_away(profile):
+    # Nothing is seen beyond the goal from there: no later scan tells that the place is free again.
+    world, empty = towards_an_occupied_goal(profile)
+    world.solid[:] = empty
+    assert world.run(60.0, lambda w: w.state().goal_reached), world.state().reasons
+    assert not world.collided
+
+
+@pytest.mark.parametrize("profile", ["default", "full"])
+def test_a_robot_holds_before_a_goal_that_it_sees_occupied_from_near(profile):
+    world, _ = towards_an_occupied_goal(profile)
+    assert world.run(60.0, lambda w: w.state().mode == "HOLD")
+    world.run(5.0)
+    assert any("the goal is occupied" in reason for reason in world.state().reasons)
+    assert 1.5 < FAR_GOAL[0] - world.x < 4.0
+    assert not world.collided
+
+
+def test_a_robot_with_no_way_left_looks_at_what_it_saw_only_from_far_away_and_holds():
+    world = ring("default")
+    world.block(*ACROSS, solid=True, publish=False)
+    world.block(5.0, 5.0, 5.4, 6.4, solid=True, publish=False)
+    send_goal(world, (8.0, 1.7))
+    assert world.run(120.0, lambda w: any("no path leads" in reason for reason in w.state().reasons))
+    travelled = world.travelled
+    world.run(20.0)
+    assert world.state().mode == "HOLD"
+    assert world.travelled - travelled < 1.0
+    assert not world.collided
+
+
 def test_full_avoids_a_hazard_that_only_the_fog_knows_and_default_does_not():
     lengths = {}
     for profile in ("default", "full"):

@@ -182,6 +182,87 @@ def test_a_place_that_the_robot_could_not_pass_is_closed_as_long_as_it_is_report
     assert costmap.replica.cost[middle] == 0
 
 
+BOX = (1.8, 1.0, 2.1, 1.4)
+OTHER_BOX = (3.0, 4.4, 3.4, 4.7)
+IN_BOX = (1.9, 1.2)
+
+
+def seen_from_far(*boxes):
+    """Return a costmap on which boxes are marked that were seen from more than 3 m, and from where."""
+    costmap, far = OnboardCostmap(floor(), 0.17), Pose2(5.7, 0.4, math.pi)
+    costmap.observe(far, *scan(with_obstacle(*boxes), far))
+    return costmap, far
+
+
+def boxes_marked(costmap):
+    cost = costmap.replica.cost
+    return [name for name, box in (("box", BOX), ("other", OTHER_BOX)) if closed_inside(cost, box)]
+
+
+def closed_inside(cost, box):
+    left, bottom, right, top = (round(edge / 0.05) for edge in box)
+    return bool((cost[bottom:top, left:right] == LETHAL).any())
+
+
+def test_what_was_seen_only_from_far_away_is_forgotten_when_it_is_doubted_and_marked_again_from_near_only():
+    costmap, far = seen_from_far(BOX)
+    assert boxes_marked(costmap) == ["box"]
+    version = costmap.replica.version
+    assert costmap.doubt()
+    assert boxes_marked(costmap) == []
+    assert costmap.replica.version != version
+    assert not costmap.doubt()
+    costmap.observe(far, *scan(with_obstacle(BOX), far))
+    assert boxes_marked(costmap) == []
+    near = Pose2(4.0, 1.2, math.pi)
+    costmap.observe(near, *scan(with_obstacle(BOX), near))
+    assert boxes_marked(costmap) == ["box"]
+    assert not costmap.doubt()
+    assert boxes_marked(costmap) == ["box"]
+
+
+def test_what_was_seen_from_near_once_is_not_doubted_from_far_away():
+    costmap, near = OnboardCostmap(floor(), 0.17), Pose2(4.0, 1.2, math.pi)
+    costmap.observe(near, *scan(with_obstacle(BOX), near))
+    far = Pose2(5.7, 0.4, math.pi)
+    costmap.observe(far, *scan(with_obstacle(BOX), far))
+    cost = costmap.replica.cost.copy()
+    costmap.doubt()
+    assert boxes_marked(costmap) == ["box"]
+    assert (costmap.replica.cost <= cost).all()
+
+
+def test_only_what_is_near_a_place_is_doubted_there_and_marked_as_before_elsewhere():
+    costmap, far = seen_from_far(BOX, OTHER_BOX)
+    assert boxes_marked(costmap) == ["box", "other"]
+    assert costmap.doubt(around=IN_BOX)
+    assert boxes_marked(costmap) == ["other"]
+    assert not costmap.doubt(around=IN_BOX)
+    for boxes in ((), (BOX, OTHER_BOX)):
+        costmap.observe(far, *scan(with_obstacle(*boxes), far))
+    assert boxes_marked(costmap) == ["other"]
+    assert costmap.doubt()
+    costmap.observe(far, *scan(with_obstacle(BOX, OTHER_BOX), far))
+    assert boxes_marked(costmap) == []
+
+
+def test_a_doubt_without_a_cause_changes_nothing():
+    costmap, far = seen_from_far()
+    version = costmap.replica.version
+    assert not costmap.doubt()
+    assert costmap.replica.version == version
+    costmap.observe(far, *scan(with_obstacle(BOX), far))
+    assert boxes_marked(costmap) == ["box"]
+
+
+def test_what_is_seen_from_far_away_is_marked_again_once_it_is_believed():
+    costmap, far = seen_from_far(BOX)
+    assert costmap.doubt()
+    costmap.believe()
+    costmap.observe(far, *scan(with_obstacle(BOX), far))
+    assert boxes_marked(costmap) == ["box"]
+
+
 def test_the_fog_s_own_copy_of_the_map_is_left_alone():
     fog = floor()
     costmap, pose = OnboardCostmap(fog, 0.17), Pose2(1.0, 1.2, 0.0)

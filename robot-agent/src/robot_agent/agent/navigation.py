@@ -134,7 +134,10 @@ class Navigation:
         if onboard is None or not onboard.searched(found) or found.goal != mission.goal or not mission.active:
             return
         path = onboard.path(found, mission.follower, at)
-        if path is not None:
+        if path is None:
+            # What was forgotten may have been what blocked the present path.
+            self._driving.check_path(self.replica, at.now)
+        else:
             self._driving.on_path(path, self._localizer.pose(at.now), self.replica, at)
 
     def _closed(self, replica: Replica) -> dict[str, Spans]:

@@ -24,6 +24,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from fog_contracts.grid import GridGeometry
+    from fog_contracts.messages import PointXY
     from fog_contracts.raster import Spans
     from robot_agent.localization.pose import Pose2
 
@@ -91,7 +92,23 @@ class OnboardCostmap:
         impassable: (n, 2) m, a place that the robot could not pass although the scan may show nothing there.
         """
         occupied = self._cells(np.concatenate((points[unexplained], impassable)))
-        fresh, freed = self._marks.observe(seen_from, points, occupied)
+        self._update(*self._marks.observe(seen_from, points, occupied))
+
+    def doubt(self, around: PointXY | None = None) -> bool:
+        """Forget what was only seen from far away, all or near a place (m); return whether there was any.
+
+        If so, only what is seen from near is marked there from then on until `believe`.
+        """
+        forgotten = self._marks.doubt(around)
+        self._update(self._marks.cells[:0], forgotten)
+        return len(forgotten) > 0
+
+    def believe(self) -> None:
+        """Mark everywhere again what is seen from as far as the lidar sees."""
+        self._marks.believe()
+
+    def _update(self, fresh: Cells, freed: Cells) -> None:
+        """Write cells (n, 2) that are marked now and were not, and those that no longer are."""
         changed = np.concatenate((fresh, freed))
         if not len(changed):
             return

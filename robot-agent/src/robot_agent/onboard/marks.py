@@ -3,7 +3,8 @@
 A scan errs more the farther it sees: by the error of the robot's heading times the distance, and by the space between
 two beams. At an obstacle's edge one scan therefore hits a cell that the next one sees past. Were the last one believed,
 a gap that is about as wide as the robot would open and close with each scan, and a robot that has turned back from it
-would turn round again, and again.
+would turn round again, and again. By the same error one beam of 10 m may mark the floor before a wall; where the lidar
+sees nothing beyond, no later scan from there corrects it, and the robot must go nearer (`doubt`).
 """
 
 from __future__ import annotations
@@ -17,6 +18,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from fog_contracts.grid import GridGeometry
+    from fog_contracts.messages import PointXY
     from robot_agent.localization.pose import Pose2
 
     Cells = NDArray[np.int64]
@@ -28,6 +30,8 @@ _PIECE_M: Final = 0.3
 """Marked cells this near to each other may be pieces of one obstacle."""
 _NEARER_M: Final = 0.5
 """A view from this much nearer than the nearest that showed an obstacle is the better one."""
+_SURE_M: Final = 3.0
+"""What is seen from this near is there: the robot's heading errs by less than what a wall explains."""
 
 
 class Marks:
@@ -40,6 +44,28 @@ class Marks:
         """(n, 2); column, row."""
         self._seen_from: NDArray[np.float64] = np.zeros(0)
         """(n,) m: how far away the robot was when it saw something in each cell, the nearest time."""
+        self._doubted_at: PointXY = (0.0, 0.0)
+        self._doubted_within = -math.inf
+        """So near (m) to that place only what is seen from near is newly marked."""
+
+    def doubt(self, around: PointXY | None = None) -> Cells:
+        """Forget the cells that were never seen from near, all or those near a place (m); return them (n, 2).
+
+        If there were any, nothing is marked there from farther away any more, until `believe`: else the robot would
+        turn back from what it sees again at once, having forgotten what it had turned back from before, and never come
+        near either.
+        """
+        place, within = ((0.0, 0.0), math.inf) if around is None else (around, _SURE_M)
+        doubtful = (self._seen_from > _SURE_M) & (self._away(self.cells, place) <= within)
+        if doubtful.any() and within > self._doubted_within:
+            self._doubted_at, self._doubted_within = place, within
+        forgotten = self.cells[doubtful]
+        self.cells, self._seen_from = self.cells[~doubtful], self._seen_from[~doubtful]
+        return forgotten
+
+    def believe(self) -> None:
+        """Mark everywhere again what is seen from as far as the lidar sees."""
+        self._doubted_within = -math.inf
 
     def observe(self, seen_from: Pose2, points: NDArray[np.float64], occupied: Cells) -> tuple[Cells, Cells]:
         """Take a scan into account; return the cells (n, 2) that are marked now and were not, and those no longer.
@@ -50,7 +76,8 @@ class Marks:
         A marked cell is freed when the scan sees beyond it, and either nothing near it stays marked (the obstacle as a
         whole is gone), or the robot is clearly nearer than it was whenever it saw something there.
         """
-        away = self._away(self.cells, seen_from)
+        robot = (seen_from.x, seen_from.y)
+        away = self._away(self.cells, robot)
         # What the same scan shows is there, whatever its other beams pass by.
         seen = self._contains(occupied, self.cells)
         self._seen_from[seen] = np.minimum(self._seen_from[seen], away[seen])
@@ -61,13 +88,15 @@ class Marks:
             gone[gone] = better[gone] | ~self._is_beside(self.cells[gone], staying)
         freed = self.cells[gone]
         fresh = occupied[~self._contains(self.cells, occupied)]
+        believed = (self._away(fresh, robot) <= _SURE_M) | (self._away(fresh, self._doubted_at) > self._doubted_within)
+        fresh = fresh[believed]
         self.cells = np.concatenate((self.cells[~gone], fresh))
-        self._seen_from = np.concatenate((self._seen_from[~gone], self._away(fresh, seen_from)))
+        self._seen_from = np.concatenate((self._seen_from[~gone], self._away(fresh, robot)))
         return fresh, freed
 
-    def _away(self, cells: Cells, pose: Pose2) -> NDArray[np.float64]:
-        """Return how far (m) the centres of cells (n, 2) are from a pose."""
-        away: NDArray[np.float64] = np.hypot(*(self._geometry.centres(cells) - (pose.x, pose.y)).T)
+    def _away(self, cells: Cells, place: PointXY) -> NDArray[np.float64]:
+        """Return how far (m) the centres of cells (n, 2) are from a place."""
+        away: NDArray[np.float64] = np.hypot(*(self._geometry.centres(cells) - place).T)
         return away
 
     def _is_free(self, seen_from: Pose2, points: NDArray[np.float64], away: NDArray[np.float64]) -> NDArray[np.bool_]:

@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from fog_contracts.handlers import Moment
-    from fog_contracts.messages import RobotGoal
+    from fog_contracts.messages import Refusal, RobotGoal
     from fog_contracts.raster import Spans
     from fog_contracts.replica import Replica
     from robot_agent.localization.localizer import Localizer
@@ -35,6 +35,9 @@ _SHORTER_M: Final = 0.3
 """A free path is kept unless a new one is this much shorter, so that the robot does not waver between equal ones."""
 _REFUSED_RETRY_S: Final = 1.0
 """A search that found no path is repeated after this long, although nothing has changed."""
+_GOAL_OCCUPIED: Final = 206
+_BY_OBSTACLES: Final = frozenset({205, _GOAL_OCCUPIED, 208})
+"""Refusals that obstacles may be the cause of: around the robot, at the goal, and on all ways to it."""
 _EARLY_S: Final = 1e-6
 """Rounding of a clock must not put off what is due."""
 
@@ -87,6 +90,8 @@ class OnboardNavigator:
         """Return the search for a path from the robot's pose to its goal if one is due, else None."""
         if not self._is_due(goal, follower, now):
             return None
+        if self._is_other(goal):
+            self._costmap.believe()
         self._searched_at, self._searched_goal = now, goal
         return Search(
             planner=self._planner,
@@ -101,7 +106,14 @@ class OnboardNavigator:
         return found.planner is self._planner
 
     def path(self, found: Found, follower: PathFollower | None, at: Moment) -> RobotPath | None:
-        """Return the path to follow from now on, or the refusal; None if the present path is kept."""
+        """Return the path to follow from now on, or the refusal; None if the present path is kept.
+
+        It is kept, too, when a refusal rests on what was only seen from far away. That is forgotten, and the next
+        search, which is due at once where there is no free path to follow, tells whether there is a way to go nearer.
+        """
+        if found.refusal is not None and self._is_doubtful(found.refusal, found.goal):
+            self._refused = False
+            return None
         self._refused = found.refusal is not None
         version = self.replica.version
         assert version is not None
@@ -128,8 +140,20 @@ class OnboardNavigator:
             return now - self._searched_at >= period - _EARLY_S
         if self._refused:
             return now - self._searched_at >= _REFUSED_RETRY_S
-        other_goal = self._searched_goal is None or self._searched_goal.goal_id != goal.goal_id
-        return other_goal or follower is None or self._is_blocked(follower)
+        return self._is_other(goal) or follower is None or self._is_blocked(follower)
+
+    def _is_other(self, goal: RobotGoal) -> bool:
+        return self._searched_goal is None or self._searched_goal.goal_id != goal.goal_id
+
+    def _is_doubtful(self, refusal: Refusal, goal: RobotGoal) -> bool:
+        """Forget what was only seen from far away and may be why there is no path; return whether there was any.
+
+        Of a goal that is occupied only what is near it: a closed corridor elsewhere is not to be driven to again.
+        """
+        if refusal.code not in _BY_OBSTACLES:
+            return False
+        assert goal.pose is not None
+        return self._costmap.doubt((goal.pose.x, goal.pose.y) if refusal.code == _GOAL_OCCUPIED else None)
 
     def _is_as_good(self, follower: PathFollower, found: Found) -> bool:
         return follower.remaining <= found.length + _SHORTER_M and not self._is_blocked(follower)

@@ -99,7 +99,7 @@ def test_single_place_that_the_last_scan_contradicts_is_not_called_several_that_
     monkeypatch.setattr(one, "_hypotheses", Hypotheses([Hypothesis(TRUE, -0.1, misfits=1)], ORIGIN))
     outcome = one.outcome(0.0)
     assert outcome.pose is None
-    assert "the last scan does not fit the only place of the map that is left" in outcome.detail
+    assert "the last scan does not confirm the only place of the map that is left" in outcome.detail
     assert "fognav robot turn" in outcome.detail
 
 

@@ -14,7 +14,7 @@ from little_world import grid_of
 
 from robot_agent.config import LocalizationConfig
 from robot_agent.localization.deskew import DeskewedScan
-from robot_agent.localization.hypotheses import Hypothesis, apart
+from robot_agent.localization.hypotheses import Hypotheses, Hypothesis, apart
 from robot_agent.localization.map_fields import MapFields, map_fields
 from robot_agent.localization.pose import Pose2
 from robot_agent.localization.relocalization import Relocalization
@@ -103,8 +103,9 @@ def scans_of(way: list[Pose2]) -> tuple[Pose2, list[DeskewedScan]]:
     return pose, scans
 
 
-def compared(left: Hypothesis, found: list[Pose2], scans: list[DeskewedScan]) -> list[Hypothesis]:
-    rivals = Rivals(left, [Hypothesis(pose, -0.1) for pose in found], scans, RANGE_M)
+def compared(left: Hypothesis, found: list[Pose2], scans: list[DeskewedScan], searched: int = -1) -> list[Hypothesis]:
+    places = Hypotheses([Hypothesis(pose, -0.1) for pose in found], scans[searched].odom)
+    rivals = Rivals(left, places, scans, RANGE_M)
     for _ in range(len(found) + 1):
         result = rivals.advance(FIELDS)
         if result is not None:
@@ -121,6 +122,15 @@ def moved(start: Pose2, way: list[Pose2]) -> Pose2:
 def test_place_that_explains_all_scans_better_than_the_one_that_is_left_is_a_better_rival():
     pose, scans = scans_of(STEPS)
     rivals = compared(Hypothesis(moved(SIMILAR, STEPS), -1.5), [moved(OTHER, STEPS), pose], scans)
+    assert [math.dist(rival.pose[:2], pose[:2]) < 0.1 for rival in rivals] == [True]
+    assert rivals[0].log_quality > -1.5
+
+
+@pytest.mark.parametrize("searched", [1, 9])
+def test_place_that_an_earlier_scan_was_searched_for_is_weighed_by_those_after_it_too(searched):
+    pose, scans = scans_of(STEPS)
+    left, found = Hypothesis(moved(SIMILAR, STEPS), -1.5), [moved(one, STEPS[:searched]) for one in (OTHER, TRUE)]
+    rivals = compared(left, found, scans, searched)
     assert [math.dist(rival.pose[:2], pose[:2]) < 0.1 for rival in rivals] == [True]
     assert rivals[0].log_quality > -1.5
 
@@ -147,12 +157,37 @@ def test_while_the_map_is_searched_again_the_place_that_is_left_is_no_pose_yet()
     for step in STEPS:
         pose, odom = pose.compose(step), odom.compose(step)
         one.on_scan(scan_at(FIELDS, pose, odom), FIELDS)
-        if one.searching:
+        outcome = one.outcome(0.0)
+        assert outcome.pose is None
+        if "the whole map is searched" in outcome.detail:
             break
+        finished(one, FIELDS)
+    assert "one place is left: the whole map is searched" in outcome.detail
     assert one.searching
-    outcome = one.outcome(0.0)
-    assert outcome.pose is None
-    assert "the whole map is searched" in outcome.detail
     one.cancel()
     assert not one.active
     assert one.outcome(0.0) is None
+
+
+def test_map_is_searched_again_before_anything_is_left_over_only_where_a_search_had_to_leave_places_out():
+    one, first = Relocalization(CONFIG), scan_at(FIELDS, TRUE, ODOM)
+    for complete in (False, True):
+        assert one.begin(first, FIELDS)
+        finished(one, FIELDS)
+        assert not one._hypotheses.complete
+        one._hypotheses.complete = complete
+        step = STEPS[0]
+        one.on_scan(scan_at(FIELDS, TRUE.compose(step), ODOM.compose(step)), FIELDS)
+        assert "places of the map look like this one" in one.outcome(0.0).detail
+        assert one.searching is not complete
+
+
+def test_place_that_a_further_search_brings_in_is_no_pose_before_another_one_confirms_it(monkeypatch):
+    one = Relocalization(CONFIG)
+    known = Hypotheses([Hypothesis(SIMILAR, -3.0)], ODOM)
+    monkeypatch.setattr(one, "_hypotheses", known)
+    one._join(known, [Hypothesis(TRUE, -0.5)])
+    assert one.outcome(0.0).pose is None
+    assert "the last scan does not confirm the only place of the map that is left" in one.outcome(0.0).detail
+    one._join(known, [])
+    assert one.outcome(0.0).pose == TRUE

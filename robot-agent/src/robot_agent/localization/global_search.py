@@ -77,7 +77,7 @@ class GlobalSearch:
             if fits(fit):
                 value = quality(score / fields.best_likelihood, fit)
                 places.append(Hypothesis(pose, math.log(max(value, 1e-3))))
-        return Hypotheses(places, self.odom)
+        return Hypotheses(places, self.odom, complete=len(places) < _PLACES)
 
 
 def _spaced(places: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -31,6 +31,7 @@ _MISFITS_MAX: Final = 2
 _NEWS_M: Final = 0.2
 _NEWS_RAD: Final = 0.2
 """Scans count as independent when the robot has moved this far between them."""
+_PLACES_MAX: Final = 48
 _MATCH_COVARIANCE: Final = np.diag(np.square((0.2, 0.2, 0.1)))
 _BEAMS: Final = 180
 
@@ -73,7 +74,9 @@ def weighed(place: Hypothesis, pose: Pose2, scan: DeskewedScan, fields: MapField
 class Hypotheses:
     """The places that are left, each tied to the odometry of the last scan that counted."""
 
-    def __init__(self, places: Iterable[Hypothesis], odom: Pose2) -> None:
+    def __init__(self, places: Iterable[Hypothesis], odom: Pose2, *, complete: bool = True) -> None:
+        """`complete`: whether no place that fits was left out because there are too many."""
+        self.complete = complete
         self._places = sorted(places, key=lambda place: -place.log_quality)
         self._scans = 1
         self.odom = odom
@@ -119,7 +122,7 @@ class Hypotheses:
     def join(self, places: Iterable[Hypothesis]) -> None:
         """Add places, weighed by the same scans, that belong to the odometry of the last one."""
         new = [place for place in places if all(apart(place.pose, known.pose) for known in self._places)]
-        self._places = sorted((*self._places, *new), key=lambda place: -place.log_quality)
+        self._places = sorted((*self._places, *new), key=lambda place: -place.log_quality)[:_PLACES_MAX]
 
     @staticmethod
     def _is_possible(place: Hypothesis, better: list[Hypothesis]) -> bool:

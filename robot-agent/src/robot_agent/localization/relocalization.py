@@ -7,6 +7,7 @@ from collections import deque
 from typing import TYPE_CHECKING, Final, NamedTuple
 
 from robot_agent.localization.global_search import GlobalSearch
+from robot_agent.localization.hypotheses import apart
 from robot_agent.localization.pose import Pose2  # noqa: TC001  # a named tuple's fields are read at run time
 from robot_agent.localization.rivals import Rivals
 
@@ -46,6 +47,8 @@ class Relocalization:
         self._scans: deque[DeskewedScan] = deque(maxlen=_SCANS_MAX)
         """The scans by which the hypotheses are weighed."""
         self._rivals: Rivals | None = None
+        self._confirmed = False
+        """Whether what the hypotheses decided for was compared with what a further search found."""
         self._again_at = -math.inf
         self._failed_at: Pose2 | None = None
         """Odometry at which the last search ended without any place."""
@@ -92,30 +95,44 @@ class Relocalization:
         """Do one share of the search, or of the comparison of what it found."""
         if self._search is not None:
             found = self._search.advance(fields)
-            if found is None:
-                return
-            self._search = None
-            if self._hypotheses is None:
-                self._hypotheses = found
-            else:
-                self._rivals = Rivals(self._hypotheses.best, found.places, self._scans, self._config.range_max)
+            if found is not None:
+                self._search = None
+                self._on_found(found)
         elif self._rivals is not None and self._hypotheses is not None:
             rivals = self._rivals.advance(fields)
             if rivals is not None:
                 self._rivals = None
-                self._hypotheses.join(rivals)
+                self._join(self._hypotheses, rivals)
 
     def on_scan(self, scan: DeskewedScan, fields: MapFields) -> None:
-        """Do one share of the search, or weigh the places by the scan."""
+        """Do one share of the search, and weigh the places by the scan."""
+        hypotheses = self._hypotheses
         if self.searching:
             self.advance(fields)
-        elif self._hypotheses is not None and self._hypotheses.add(scan, fields, self._config.range_max):
-            self._scans.append(scan)
-            if self._hypotheses.decided is not None:
-                self._search_with(scan, fields)
+        if hypotheses is None or self._rivals is not None or not hypotheses.add(scan, fields, self._config.range_max):
+            return
+        self._scans.append(scan)
+        self._confirmed = False
+        if not self.searching and hypotheses.places and (hypotheses.decided is not None or not hypotheses.complete):
+            self._search_with(scan, fields)
 
     def _search_with(self, scan: DeskewedScan, fields: MapFields) -> None:
         self._search = GlobalSearch(fields, scan.beams(self._config.beams), scan.odom, self._config.range_max)
+
+    def _on_found(self, found: Hypotheses) -> None:
+        known = self._hypotheses
+        if known is None:
+            self._hypotheses, self._confirmed = found, True
+        elif known.places and any(scan.odom == found.odom for scan in self._scans):
+            known.complete |= found.complete
+            self._rivals = Rivals(known.best, found, self._scans, self._config.range_max)
+
+    def _join(self, known: Hypotheses, rivals: list[Hypothesis]) -> None:
+        """Add what a further search found. One that has decided is to be confirmed by the next, with another scan."""
+        before = known.decided
+        known.join(rivals)
+        after = known.decided
+        self._confirmed = before is not None and after is not None and not apart(before, after)
 
     def outcome(self, now: float) -> Outcome | None:
         """Return what is known now; None while the first search is in progress or nothing was searched."""
@@ -126,17 +143,17 @@ class Relocalization:
             self._again_at, self._failed_at = now + _SEARCH_EVERY_S, hypotheses.odom
             self.cancel()
             return Outcome(None, hypotheses.odom, "the scan fits no place of the map: give the initial pose")
-        if self.searching:
-            return Outcome(None, hypotheses.odom, _CHECKING)
         found = hypotheses.decided
         if found is None:
             return Outcome(None, hypotheses.odom, _undecided(len(hypotheses.contenders)))
+        if not self._confirmed:
+            return Outcome(None, hypotheses.odom, _CHECKING if self.searching else _undecided(1))
         self.cancel()
         return Outcome(found, hypotheses.odom)
 
 
 def _undecided(contenders: int) -> str:
-    """Return why the scans do not decide; a single place that is left has just been contradicted by one."""
+    """Return why the scans do not decide; a single place has just been found, or been contradicted by one."""
     alike = f"{contenders} places of the map look like this one"
-    why = alike if contenders > 1 else "the last scan does not fit the only place of the map that is left"
+    why = alike if contenders > 1 else "the last scan does not confirm the only place of the map that is left"
     return f"{why}: let the robot turn or advance (`fognav robot turn`), or give the initial pose"

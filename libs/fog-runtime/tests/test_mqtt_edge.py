@@ -148,6 +148,26 @@ async def test_retained_state_reaches_late_subscribers_until_it_is_cleared(broke
     assert third == ["mark"]
 
 
+async def test_what_is_retained_is_delivered_before_anything_is_said_on_the_connection(broker):
+    areas = [f"before{n}" for n in range(90)]  # a broker sends no more than 20 that are not acknowledged
+    heard, known = [], []
+    a, b = make_edge(broker, "a"), make_edge(broker, "b")
+
+    async def say():
+        known.extend(heard)
+
+    b.on(ch.AREA_HAZARD, lambda ids, _: heard.append(ids["area"]), m.AreaHazard)
+    b.on_connect(say)
+    async with running(a):
+        for area in areas:
+            await a.publish(ch.AREA_HAZARD, hazard(1, area), wait=True, area=area)
+        async with running(b):
+            await until(lambda: set(heard) >= set(areas), f"of {len(areas)} retained messages came {len(heard)}")
+        for area in areas:
+            await a.clear(ch.AREA_HAZARD, wait=True, area=area)
+    assert set(known) >= set(areas)
+
+
 async def test_subscriptions_and_publishing_resume_after_a_restart_of_the_broker(broker):
     seen, on_connect_results = [], []
     a, b = make_edge(broker, "a"), make_edge(broker, "b")

@@ -26,6 +26,8 @@ class Inbox(asyncio.Queue[aiomqtt.Message]):
         super().__init__(_QUEUE)
         self._deliver = deliver
         self._opened = False
+        self.retained = 0
+        """How many of the messages so far the broker had kept from before the subscription."""
 
     def open(self) -> None:
         """Deliver what has arrived, and from now on each message at once."""
@@ -35,6 +37,7 @@ class Inbox(asyncio.Queue[aiomqtt.Message]):
 
     def put_nowait(self, item: aiomqtt.Message) -> None:
         """Deliver a message, or keep it; raises `asyncio.QueueFull`."""
+        self.retained += item.retain
         if self._opened:
             self._deliver(item)
         else:

@@ -57,6 +57,19 @@ def _encoded(channel: Channel, message: Message | str | None) -> bytes:
     return encode(channel, message) if isinstance(message, Message) else encode_text(channel, message)
 
 
+async def _receive_retained(client: aiomqtt.Client, inbox: Inbox) -> None:
+    """Wait until the inbox has what the broker retains of the topics that were subscribed to.
+
+    Otherwise a restarted process would replace what the one before it had left by its own ignorance, and nobody would
+    know it any more if it died then. A broker sends only so many messages that are not acknowledged, but each
+    acknowledgement is on its way before the next question.
+    """
+    received = -1
+    while received != inbox.retained:
+        received = inbox.retained
+        await client.unsubscribe(NOT_SUBSCRIBED)
+
+
 async def _subscribe(client: aiomqtt.Client, qos_by_topic: Mapping[str, int]) -> None:
     codes = await client.subscribe(list(qos_by_topic.items()))
     for topic, code in zip(qos_by_topic, codes, strict=True):
@@ -270,14 +283,15 @@ class MqttEdge:
     async def _serve(self, client: aiomqtt.Client, broker: Broker, inbox: Inbox) -> None:
         if topics := self.subscriptions.qos_by_topic():
             await _subscribe(client, topics)
+            await _receive_retained(client, inbox)
         self._client = client
         self._changed.set()
         metrics.CONNECTED.labels(self._transport).set(1)
         metrics.CONNECTIONS.labels(self._transport).inc()
         _log.info("broker_connected", broker=str(broker), client=self._client_id)
+        inbox.open()
         for callback in self._on_connect:
             self._spawn(callback(), "on_connect")
-        inbox.open()
         async for _ in client.messages:  # until the connection ends: the inbox delivers
             pass
 

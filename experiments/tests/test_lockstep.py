@@ -90,9 +90,10 @@ def test_robot_without_nodes_meets_the_barrier_once_and_remembers_it():
     barrier = next(area.polygon for area in site.site.areas if area.id == "z4")
     distances = [math.dist(point, barrier[0]) for point in met.track]
     nearest = distances.index(min(distances))
-    assert min(distances) < 8.0, "the robot must come near enough to see the barrier"
-    assert min(distances[nearest + 60 :]) > 8.0, "the robot must not come back to the barrier"
-    assert met.distance_m < 115.0
+    assert 9.0 < min(distances) < 12.5, "the robot must turn as soon as it is sure, and not before it sees the barrier"
+    assert min(distances[nearest + 60 :]) > 9.0, "the robot must not come back to the barrier"
+    assert met.plans == 2, "all of the barrier must be known at once"
+    assert met.distance_m < 90.0
 
 
 def test_same_seed_repeats_the_drive_exactly_and_another_seed_changes_it(warned, free):

@@ -22,6 +22,7 @@ from fog_contracts.messages import (
 from robot_agent.agent.blocked_places import BlockedPlaces
 from robot_agent.agent.sensing.obstacle_reporter import ObstacleReporter, view
 from robot_agent.localization.localizer import Pose2
+from robot_agent.localization.uncertainty import Uncertainty
 
 GEOMETRY = GridGeometry(100, 100, 0.1, 0.0, 0.0)
 HERE = Pose2(5.0, 5.0, 0.0)
@@ -32,7 +33,8 @@ class FakeLocalizer:
         self.points = np.array(points, dtype=np.float64).reshape(-1, 2)
         self.status = "good"
         self.turning = 0.0
-        self.scan = SimpleNamespace(points=self.points - (HERE.x, HERE.y))
+        self.scan = SimpleNamespace(points=self.points - (HERE.x, HERE.y), timestamp=0.0)
+        self.uncertainty = Uncertainty(0.02, 0.02, 0.013)
 
     def points_in_map(self):
         return self.points
@@ -60,7 +62,7 @@ def report(points, *, copy=None, reporter=None, scan_age=0.1, now=0.0, **changes
     localizer = FakeLocalizer(points)
     for name, value in changes.items():
         setattr(localizer, name, value)
-    reporter = reporter or ObstacleReporter(600.0, 3)
+    reporter = reporter or ObstacleReporter(600.0, 3, 0.17)
     return reporter.report(localizer, copy or replica(), scan_age, Moment(now, 1_000.0 + now))
 
 
@@ -92,7 +94,7 @@ def test_no_report_while_the_pose_or_scan_is_not_good_enough(change):
 
 
 def test_place_that_the_robot_could_not_pass_is_reported_although_the_lidar_sees_nothing_there():
-    localizer, reporter = FakeLocalizer(TWO), ObstacleReporter(600.0, 1)
+    localizer, reporter = FakeLocalizer(TWO), ObstacleReporter(600.0, 1, 0.17)
     bar = np.array([(5.45, 4.81), (5.45, 4.9), (5.45, 5.0)])
     reported = reporter.report(localizer, replica(), 0.1, Moment(0.0, 1_000.0), bar)
     assert reported.points == [pytest.approx(p) for p in ((6.05, 5.05), (5.45, 4.85), (5.45, 4.95), (5.45, 5.05))]
@@ -100,7 +102,7 @@ def test_place_that_the_robot_could_not_pass_is_reported_although_the_lidar_sees
 
 
 def test_obstacles_of_others_are_left_out_and_own_ones_repeated_until_forgotten():
-    reporter, blocked = ObstacleReporter(10.0, 3), replica()
+    reporter, blocked = ObstacleReporter(10.0, 3, 0.17), replica()
     blocked.cost[45:56, 55:66] = 254
     assert report(TWO, copy=blocked).points == []
     assert len(report(TWO, reporter=reporter).points) == 1
@@ -158,7 +160,7 @@ SQUARE = [(4.0, 4.0), (6.0, 4.0), (6.0, 6.0), (4.0, 6.0)]
 )
 def test_a_zone_of_any_shape_is_named_only_by_a_robot_inside_it(shape, inside):
     zone = Zone(id="wet", kind="BLOCKED", shape=shape, reason="mopped")
-    description = places(zones=[zone]).containing(HERE, lethal(), ObstacleReporter(10.0, 3), 0.0)
+    description = places(zones=[zone]).containing(HERE, lethal(), ObstacleReporter(10.0, 3, 0.17), 0.0)
     assert description == ("the no-go zone wet (mopped)" if inside else "a blocked part of the map")
 
 
@@ -166,7 +168,8 @@ def test_a_zone_of_any_shape_is_named_only_by_a_robot_inside_it(shape, inside):
 def test_only_zones_that_block_are_named(changes):
     zone = Zone(**{"id": "wet", "kind": "BLOCKED", "shape": CircleShape(centre=(5.0, 5.0), radius=1.0), **changes})
     assert (
-        places(zones=[zone]).containing(HERE, lethal(), ObstacleReporter(10.0, 3), 0.0) == "a blocked part of the map"
+        places(zones=[zone]).containing(HERE, lethal(), ObstacleReporter(10.0, 3, 0.17), 0.0)
+        == "a blocked part of the map"
     )
 
 
@@ -176,7 +179,7 @@ def test_only_zones_that_block_are_named(changes):
 )
 def test_an_area_is_named_by_its_label_unless_it_is_clear(state, description, caution):
     found = places(hazards=[(state, SQUARE)])
-    assert found.containing(HERE, lethal(), ObstacleReporter(10.0, 3), 0.0) == (
+    assert found.containing(HERE, lethal(), ObstacleReporter(10.0, 3, 0.17), 0.0) == (
         description or "a blocked part of the map"
     )
     assert (found.caution(HERE) is not None) == caution
@@ -184,7 +187,7 @@ def test_an_area_is_named_by_its_label_unless_it_is_clear(state, description, ca
 
 
 def test_only_the_map_decides_whether_a_place_is_blocked():
-    found, reporter = places(hazards=[("blocked", SQUARE)]), ObstacleReporter(10.0, 3)
+    found, reporter = places(hazards=[("blocked", SQUARE)]), ObstacleReporter(10.0, 3, 0.17)
     assert found.containing(HERE, replica(), reporter, 0.0) is None
     beside_a_wall = lethal()
     beside_a_wall.static[50, 50] = 254
@@ -193,14 +196,14 @@ def test_only_the_map_decides_whether_a_place_is_blocked():
 
 
 def test_robot_does_not_stop_for_an_obstacle_that_it_reported_under_itself():
-    reporter = ObstacleReporter(10.0, 3)
+    reporter = ObstacleReporter(10.0, 3, 0.17)
     assert report([(5.02, 5.02), (5.04, 5.04)], reporter=reporter).points
     assert places().containing(HERE, lethal(), reporter, 0.0) is None
     assert places().containing(HERE, lethal(), reporter, 13.0) == "a blocked part of the map"
 
 
 def test_zone_that_is_not_in_force_is_no_reason_to_stop_for_an_own_obstacle():
-    reporter = ObstacleReporter(10.0, 3)
+    reporter = ObstacleReporter(10.0, 3, 0.17)
     assert report([(5.02, 5.02), (5.04, 5.04)], reporter=reporter).points
     zone = Zone(id="nights", kind="BLOCKED", shape=CircleShape(centre=(5.0, 5.0), radius=1.0))
     assert places(zones=[zone]).containing(HERE, lethal(), reporter, 0.0) == "the no-go zone nights"

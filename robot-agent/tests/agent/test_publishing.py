@@ -35,6 +35,14 @@ def test_pose_is_published_at_10_hz_and_state_and_obstacles_at_1_hz(step):
     assert len(times[ch.ROBOT_STATE]) == len(times[ch.ROBOT_OBSTACLES]) == pytest.approx(3, abs=1)
 
 
+def test_obstacle_that_bars_the_way_is_published_at_once_and_the_next_report_a_second_later():
+    policy, times = PublishingPolicy("r1"), []
+    for number in range(30):
+        published = policy.due(lambda: POSE, STATE, lambda: REPORT, 100.0 + 0.1 * number, barred=number == 4)
+        times += [number for publication in published if publication.channel is ch.ROBOT_OBSTACLES]
+    assert times == [0, 4, 14, 24]
+
+
 def test_a_robot_that_stands_publishes_its_pose_less_often_and_at_once_when_it_moves():
     times = run(3.0, standing=lambda now: now < 101.65)[ch.ROBOT_POSE]
     standing = [at for at in times if at < 1.65]

@@ -614,6 +614,17 @@ def test_points_on_a_robot_are_no_obstacles():
     assert np.array_equal(rig.cost, initial)
 
 
+@pytest.mark.parametrize(("seen_from", "is_robot"), [(6.0, False), (1.0, True)], ids=["4 m away", "9 m away"])
+def test_what_is_near_a_robot_is_told_from_it_less_well_from_far_away(seen_from, is_robot):
+    rig = make_rig(floor_plan(600, 300))
+    rig.on_pose("r2", pose(10.0, 5.0), 0.0)
+    # 0.45 m from its centre: 0.28 m from its rim.
+    rig.on_obstacles(
+        "r1", obstacles((10.0, 5.45), view=view_from(seen_from, 5.0, 12.0, towards=0.1, width=0.1)), 0.1, 0.1
+    )
+    assert (cost_and_speed(rig, 10.0, 5.45)[0] < LETHAL) == is_robot
+
+
 def test_obstacle_is_cleared_by_two_consecutive_views_beyond_it():
     rig = make_rig()
     initial = rig.cost.copy()

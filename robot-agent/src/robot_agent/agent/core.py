@@ -40,6 +40,7 @@ from robot_agent.agent.publishing import PublishingPolicy
 from robot_agent.agent.reports import hindrances, robot_pose, robot_state
 from robot_agent.agent.rest_policy import IdleScans, RestPolicy
 from robot_agent.agent.safety_supervisor import SafetySupervisor, safety_inputs
+from robot_agent.agent.sensing.barred_way import WAY_M
 from robot_agent.agent.sensing.obstacle_reporter import ObstacleReporter
 from robot_agent.agent.sensing.pose_keeper import PoseKeeper
 from robot_agent.agent.sensing.sensors import BaseSource, LidarSource
@@ -104,7 +105,7 @@ class AgentCore:
         self._safety = SafetySupervisor(config.safety)
         self._rest = RestPolicy(config.rest_after)
         self._idle_scans = IdleScans()
-        self._reporter = ObstacleReporter(config.obstacle_ttl, config.obstacle_limit)
+        self._reporter = ObstacleReporter(config.obstacle_ttl, config.obstacle_limit, config.radius)
         self._commands = OperatorCommands(config, self)
         self._publishing = PublishingPolicy(config.robot)
         self._loop_health = LoopHealth()
@@ -323,6 +324,7 @@ class AgentCore:
             self.state(at),
             partial(self._report_obstacles, at),
             at.now,
+            barred=self._way_is_barred(at.now),
             standing=self.idle and self._localizer.status == "good" and self._localizer.twist() == (0.0, 0.0),
         )
 
@@ -330,7 +332,14 @@ class AgentCore:
         if self.profile.onboard:
             return None  # such a robot keeps what it sees on its own costmap
         scan_age, impassable = self._lidar.scan_age(at.now), self._driving.impassable(at.now)
-        return self._reporter.report(self._localizer, self.replica, scan_age, at, impassable)
+        way = self._driving.way(WAY_M)
+        return self._reporter.report(self._localizer, self.replica, scan_age, at, impassable, way)
+
+    def _way_is_barred(self, now: float) -> bool:
+        """Look at the path ahead; return whether something on it must be reported at once."""
+        if self.profile.onboard or not self._reporter.wants_look(now):
+            return False
+        return self._reporter.look(self._localizer, self.replica, self._lidar.scan_age(now), self._driving.way(WAY_M))
 
     def pose(self, at: Moment) -> RobotPose | None:
         """Return the pose; None while it is unknown."""

@@ -1,4 +1,7 @@
-"""When the robot publishes: pose at 10 Hz, standing at 2.5 Hz, state on change and at 1 Hz, obstacles at 1 Hz."""
+"""When the robot publishes: pose at 10 Hz, standing at 2.5 Hz, state on change and at 1 Hz, obstacles at 1 Hz.
+
+An obstacle that bars its way is published at once.
+"""
 
 from __future__ import annotations
 
@@ -40,12 +43,14 @@ class PublishingPolicy:
         obstacles: Callable[[], RobotObstacles | None],
         now: float,
         *,
+        barred: bool = False,
         standing: bool = False,
     ) -> list[Publication]:
         """Return the publications that are due; `pose` and `obstacles` are called only when they are due.
 
-        `standing`: the robot knows where it is, and neither moves nor is about to. Its pose is published at once when
-        it begins to move, and with each change of its state: it may just have found out that it is elsewhere.
+        `barred`: an obstacle on the path ahead must be reported at once. `standing`: the robot knows where it is, and
+        neither moves nor is about to. Its pose is published at once when it begins to move, and with each change of its
+        state: it may just have found out that it is elsewhere.
         """
         messages: list[tuple[ch.Channel, Message]] = []
         content = _content(state)
@@ -61,7 +66,7 @@ class PublishingPolicy:
         if changed or now - self._state_at >= STATE_S - _SLACK_S:
             self._content, self._state_at = content, now
             messages.append((ch.ROBOT_STATE, state))
-        if now - self._obstacles_at >= OBSTACLES_S - _SLACK_S:
+        if barred or now - self._obstacles_at >= OBSTACLES_S - _SLACK_S:
             self._obstacles_at = now
             report = obstacles()
             if report is not None:

@@ -90,6 +90,11 @@ class PathFollower:
         points[0], points[1:-1], points[-1] = self._point(self.progress), self.points[first:last], self._point(end)
         return points, end >= self.length - 1e-6
 
+    def next_points(self, limit: float) -> NDArray[np.float64]:
+        """Return those of the path's points (n, 2) that lie on the next `limit` metres of it, released or not."""
+        first, last = self.along.searchsorted((self.progress, self.progress + limit))
+        return self.points[first:last]
+
     def ahead(self, spacing: float) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Return points (n, 2) every `spacing` metres of the rest of the path, and their distances ahead (m)."""
         count = max(2, math.ceil(self.remaining / spacing) + 1)

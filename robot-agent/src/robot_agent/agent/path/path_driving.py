@@ -103,6 +103,11 @@ class PathDriving:
         """Return the points (n, 2; m, frame `map`) of a place that the robot could not pass, for some time."""
         return self._progress.impassable(now)
 
+    def way(self, limit: float) -> NDArray[np.float64]:
+        """Return the points (n, 2; m, frame `map`) of the next `limit` m of the path to the goal; none without one."""
+        follower = self.mission.follower if self.mission.active else None
+        return np.zeros((0, 2)) if follower is None else follower.next_points(limit)
+
     def cancel_goal(self) -> str | None:
         """Cancel the goal; return its id, None without one."""
         cancelled = self.mission.cancel()

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import math
-from typing import TYPE_CHECKING, Final
+from typing import TYPE_CHECKING, Final, NamedTuple
 
 import numpy as np
 
 from fog_contracts.costs import FREE, INSCRIBED, UNKNOWN
 from fog_contracts.messages import REACH_UNIT_M, VIEW_SECTORS, RobotObstacles, View
+from robot_agent.agent.sensing.barred_way import CELL_M, BarredWay, Look, distances
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -21,10 +22,15 @@ if TYPE_CHECKING:
 
 _EXPLAINED_M: Final = 0.25
 """A lidar point this near to a wall of the map is explained by it."""
-_CELL_M: Final = 0.1
 _RANGE_M: Final = 6.0
+"""Up to here one scan is enough; what is farther away is reported only if it bars the robot's way."""
 _TURN_RATE: Final = 0.5
 """Above this turning rate (rad/s) no obstacle is reported: the residual skew would smear it."""
+_FAR_TURN_RATE: Final = 0.25
+_FAR_HEADING_RAD: Final = _EXPLAINED_M / _RANGE_M
+"""Above this rate, or with a less certain heading (standard deviation), nothing is looked for on the way ahead."""
+_SAME_M: Final = 0.5
+"""What is this near to an obstacle that was found on the way is more of it, also near a wall."""
 _SCAN_AGE_S: Final = 0.5
 _MEMORY_MARGIN_S: Final = 2.0
 """A cell counts as reported by this robot for this much longer than its report is valid: messages take time."""
@@ -36,17 +42,41 @@ _NOWHERE: Final = np.zeros((0, 2))
 Cell = tuple[int, int]
 
 
+class _Seen(NamedTuple):
+    """What a scan shows; of what the map does not explain, how far (m) its next wall is, and how far away it is."""
+
+    look: Look
+    distance: NDArray[np.float64]
+    away: NDArray[np.float64]
+
+
 class ObstacleReporter:
     """Turns scans into reports, and remembers which cells it reported itself.
 
-    ttl: how long (s) a report is valid. limit: most points in a report; the nearest are kept.
+    ttl: how long (s) a report is valid. limit: most points in a report; the nearest are kept. radius: the body's, m.
     """
 
-    def __init__(self, ttl: float, limit: int) -> None:
+    def __init__(self, ttl: float, limit: int, radius: float) -> None:
         self._ttl = ttl
         self._limit = limit
+        self._barred_way = BarredWay(radius)
+        self._barring = _NOWHERE
+        """Points (n, 2; m, frame `map`) of the obstacle that was found last on the path ahead, ..."""
+        self._news = False
+        """... and whether it has yet to be reported."""
         self._reported: dict[Cell, float] = {}
         """Until when each cell counts as reported by this robot."""
+
+    def wants_look(self, now: float) -> bool:
+        """Whether something seems to be on the path ahead, so that `look` is due before the next report."""
+        return self._barred_way.wants_look(now)
+
+    def look(self, localizer: Localizer, replica: Replica, scan_age: float, way: NDArray[np.float64]) -> bool:
+        """Look at the path ahead, as `report` does; return whether an obstacle on it must be reported now."""
+        seen = _seen(localizer, replica, scan_age)
+        if seen is not None:
+            self._look_ahead(seen, localizer, replica, way)
+        return self._news
 
     def report(
         self,
@@ -55,43 +85,65 @@ class ObstacleReporter:
         scan_age: float,
         at: Moment,
         impassable: NDArray[np.float64] = _NOWHERE,
+        way: NDArray[np.float64] = _NOWHERE,
     ) -> RobotObstacles | None:
         """Return lidar points that the map does not explain; None while pose or scan is not good enough.
 
         Obstacles that others put on the map are left out; this robot's own are reported for as long as it sees them.
-        impassable: (n, 2) m, frame `map`: a place that it could not pass although nothing is seen there.
+        impassable: (n, 2) m, frame `map`: a place that it could not pass although nothing is seen there. way: (m, 2) m,
+        the path ahead: an obstacle on it is reported once, as a whole, from as far as the lidar sees.
         """
-        points, scan, pose = localizer.points_in_map(), localizer.scan, localizer.pose(at.now)
-        if localizer.status != "good" or replica.geometry is None or points is None or scan is None or pose is None:
+        seen, pose = _seen(localizer, replica, scan_age), localizer.pose(at.now)
+        if seen is None or pose is None or replica.geometry is None:
             return None
-        if scan_age > _SCAN_AGE_S or abs(localizer.twist()[1]) > _TURN_RATE:
-            return None
-        near = np.hypot(*scan.points.T) <= _RANGE_M
-        unexplained = points[near & (localizer.wall_distance(points) > _EXPLAINED_M)]
-        unexplained = unexplained[self._is_reportable(unexplained, replica, replica.geometry, at.now)]
-        cells = self._choose(unexplained, pose)
-        cells += [(cx, cy) for cx, cy in np.floor(impassable / _CELL_M).astype(np.int64).tolist()]
+        near = seen.look.unexplained[seen.away <= _RANGE_M]
+        if len(near):
+            near = near[self._is_reportable(near, replica, replica.geometry, at.now)]
+        cells = self._choose(near, pose) if len(near) else []
+        cells += [(cx, cy) for cx, cy in np.floor(impassable / CELL_M).astype(np.int64).tolist()]
+        self._look_ahead(seen, localizer, replica, way)
+        if self._news:
+            cells += [(cx, cy) for cx, cy in np.floor(self._barring / CELL_M).astype(np.int64).tolist()]
+            self._news = False
         self._remember(cells, at.now)
         return RobotObstacles(
-            points=[((cx + 0.5) * _CELL_M, (cy + 0.5) * _CELL_M) for cx, cy in cells],
+            points=[((cx + 0.5) * CELL_M, (cy + 0.5) * CELL_M) for cx, cy in dict.fromkeys(cells)],
             stamp=at.stamp,
             ttl=self._ttl,
-            view=view(localizer.scan_pose(), points, replica.geometry),
+            view=view(seen.look.seen_from, seen.look.points, replica.geometry),
         )
 
     def is_self_reported(self, points: NDArray[np.float64], now: float) -> NDArray[np.bool_]:
         """Return which points (n, 2; m, frame `map`) lie in a cell that this robot reported, or beside one."""
         reported = {cell for cell, until in self._reported.items() if until >= now}
         around = [(dx, dy) for dx in (-1, 0, 1) for dy in (-1, 0, 1)]
-        cells = np.floor(points / _CELL_M).astype(np.int64).tolist()
+        cells = np.floor(points / CELL_M).astype(np.int64).tolist()
         return np.array([any((cx + dx, cy + dy) in reported for dx, dy in around) for cx, cy in cells], dtype=np.bool_)
+
+    def _look_ahead(self, seen: _Seen, localizer: Localizer, replica: Replica, way: NDArray[np.float64]) -> None:
+        """Look at the path ahead; keep the cells of an obstacle on it for the next report, if the map lacks them."""
+        if abs(localizer.twist()[1]) > _FAR_TURN_RATE or localizer.uncertainty.heading > _FAR_HEADING_RAD:
+            return
+        look = seen.look
+        if not len(look.unexplained):
+            self._barred_way.look(look, np.zeros(0, np.bool_), _NOWHERE)
+            return
+        # A wall may seem to be as much farther off as it is farther away.
+        begins = seen.distance > _EXPLAINED_M * np.maximum(1.0, seen.away / _RANGE_M)
+        if len(self._barring):
+            begins |= distances(look.unexplained, self._barring) <= _SAME_M
+        begins &= _is_free(look.unexplained, replica)
+        found = self._barred_way.look(look, begins, way)
+        found = found[_is_free(found, replica)][: self._limit]
+        if len(found):
+            self._barring, self._news = found, True
 
     def _choose(self, points: NDArray[np.float64], pose: Pose2) -> list[Cell]:
         """Return the cells with enough of the points (n, 2); beyond the limit, those nearest to the robot."""
-        cells, counts = np.unique(np.floor(points / _CELL_M).astype(np.int64), axis=0, return_counts=True)
+        cells, counts = np.unique(np.floor(points / CELL_M).astype(np.int64), axis=0, return_counts=True)
         chosen = cells[counts >= _POINTS_MIN]
         if len(chosen) > self._limit:
-            offset = (chosen + 0.5) * _CELL_M - (pose.x, pose.y)
+            offset = (chosen + 0.5) * CELL_M - (pose.x, pose.y)
             chosen = chosen[np.argsort(np.hypot(*offset.T), kind="stable")[: self._limit]]
         return [(cx, cy) for cx, cy in chosen.tolist()]
 
@@ -104,10 +156,30 @@ class ObstacleReporter:
     ) -> NDArray[np.bool_]:
         """Return which points (n, 2) lie on floor that is free but for this robot's own reports."""
         _, inside = geometry.cells(points)
-        known_floor = geometry.sample(replica.static, points, UNKNOWN) == FREE
-        free = known_floor & (geometry.sample(replica.cost, points, UNKNOWN) < INSCRIBED)
-        reportable: NDArray[np.bool_] = free | (self.is_self_reported(points, now) & inside)
+        reportable: NDArray[np.bool_] = _is_free(points, replica) | (self.is_self_reported(points, now) & inside)
         return reportable
+
+
+def _seen(localizer: Localizer, replica: Replica, scan_age: float) -> _Seen | None:
+    """Return what the newest scan shows; None while pose or scan is not good enough."""
+    pose, points, scan = localizer.scan_pose(), localizer.points_in_map(), localizer.scan
+    if localizer.status != "good" or replica.geometry is None or pose is None or points is None or scan is None:
+        return None
+    if scan_age > _SCAN_AGE_S or abs(localizer.twist()[1]) > _TURN_RATE:
+        return None
+    distance = localizer.wall_distance(points)
+    strange = distance > _EXPLAINED_M
+    look = Look(scan.timestamp, pose, points, points[strange])
+    return _Seen(look, distance[strange], np.hypot(*scan.points[strange].T))
+
+
+def _is_free(points: NDArray[np.float64], replica: Replica) -> NDArray[np.bool_]:
+    """Return which points (n, 2; m, frame `map`) lie on known floor that the map shows as free."""
+    geometry = replica.geometry
+    assert geometry is not None
+    known_floor = geometry.sample(replica.static, points, UNKNOWN) == FREE
+    free: NDArray[np.bool_] = known_floor & (geometry.sample(replica.cost, points, UNKNOWN) < INSCRIBED)
+    return free
 
 
 def view(pose: Pose2 | None, points: NDArray[np.float64], geometry: GridGeometry) -> View | None:

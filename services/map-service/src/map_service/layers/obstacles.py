@@ -40,7 +40,10 @@ if TYPE_CHECKING:
 DISC_RADIUS: Final = 0.05
 """Radius (m) of the disc that a point becomes."""
 ROBOT_MARGIN: Final = 0.22
-"""Points this close (m) to a robot's rim belong to the robot: its inscribed radius plus the localization error."""
+"""Points this close (m) to a robot's rim belong to the robot: its inscribed radius plus the localization error.
+
+Of points that were seen from farther away than `RANGE_M` it grows with the distance, as the heading's error does.
+"""
 MAX_CELLS: Final = 20_000
 """Most cells that are held; a broken lidar must not fill the memory."""
 MAX_OF_ROBOT: Final = 10_000
@@ -90,7 +93,7 @@ class ObstaclesLayer(CostLayer):
         self._views.flat[numbers[known]] = 1
         for number in numbers[known].tolist():
             self._seen[number] = self._seen[number]._replace(expiry=max(self._seen[number].expiry, seen_until.expiry))
-        added = np.unique(numbers[~known & ~self._near_robots(points, at.now)])
+        added = np.unique(numbers[~known & ~self._near_robots(points, seen.view, at.now)])
         room = min(MAX_CELLS - len(self._seen), MAX_OF_ROBOT - self._held[robot])
         self.refused += max(0, len(added) - room)
         self._add(added[:room], seen_until)
@@ -162,12 +165,14 @@ class ObstaclesLayer(CostLayer):
         rows, columns = np.nonzero(self._views[window.rows, window.columns])
         return np.stack([columns + window.x, rows + window.y], axis=1).astype(np.int64)
 
-    def _near_robots(self, points: NDArray[np.float64], now: float) -> NDArray[np.bool_]:
-        """Return which points ((n, 2), m) are on or near a robot."""
+    def _near_robots(self, points: NDArray[np.float64], view: View | None, now: float) -> NDArray[np.bool_]:
+        """Return which points ((n, 2), m) of a report are on or near a robot; `view`: where they were seen from."""
         near = np.zeros(len(points), dtype=np.bool_)
+        away = np.zeros(len(points)) if view is None else np.hypot(*(points - (view.x, view.y)).T)
+        margin = ROBOT_MARGIN * np.maximum(1.0, away / RANGE_M)
         for received, pose in self._poses.values():
             if now - received <= ch.ROBOT_POSE.max_age_s:
-                near |= np.hypot(*(points - (pose.x, pose.y)).T) <= pose.radius + ROBOT_MARGIN
+                near |= np.hypot(*(points - (pose.x, pose.y)).T) <= pose.radius + margin
         return near
 
     def _remove(self, numbers: NDArray[np.int64], cause: Cause) -> None:

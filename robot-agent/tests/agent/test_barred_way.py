@@ -154,13 +154,16 @@ def test_barrier_beside_the_path_is_not_reported_from_afar():
     assert Corridor().drive(2.0, 20.0, [BARRIER], NORTHWARDS[:20]) is None, "the path ends before it"
 
 
-@pytest.mark.parametrize(("speed", "reported"), [(0.0, True), (0.7, False), (1.5, False), (-0.7, False), (-1.0, False)])
-def test_somebody_who_walks_along_the_path_is_not_reported_from_afar_and_who_stands_there_is(speed, reported):
-    def walker(now):
+@pytest.mark.parametrize(
+    ("speed", "width", "reported"),
+    [(0.0, 1.2, True), (0.0, 0.5, False), (0.7, 1.2, False), (1.5, 1.2, False), (-0.7, 1.2, False), (-1.0, 1.2, False)],
+)
+def test_only_what_is_wide_and_stands_is_reported_from_afar(speed, width, reported):
+    def group(now):
         x = 13.5 + speed * now
-        return [(x, 1.9, x + 0.4, 2.5)]
+        return [(x, 2.2 - width / 2, x + 0.4, 2.2 + width / 2)]
 
-    assert (Corridor().drive(2.5, 4.0, walker) is not None) == reported
+    assert (Corridor().drive(2.5, 4.0, group) is not None) == reported
 
 
 @pytest.mark.parametrize("seed", range(3))

@@ -42,6 +42,8 @@ _BEGIN_MIN: Final = 2
 """Fewest points of an obstacle on the way: a single beam may be a mixed echo off an edge."""
 _HALF: Final = 40
 """Half the width, in cells, of the square around what is on the way to which an obstacle is followed."""
+_WIDE_M: Final = 0.6
+"""What is narrower bars no way by itself, and is often a person or a robot: it is not reported from afar."""
 _BEHIND_M: Final = 0.3
 """A beam that comes back from this much behind an obstacle has passed it."""
 _SPARE_M: Final = 0.1
@@ -101,9 +103,11 @@ class BarredWay:
             return _NOTHING
         self._unsure = False  # the next report tells whether the map has it
         whole = _connected(begin, votes >= _EXTENT_LOOKS, math.ceil(self._gap / CELL_M))
-        shapes = [self._closed(past.unexplained[_is_in(past.unexplained, whole, corner)], past) for past in looks]
+        parts = [past.unexplained[_is_in(past.unexplained, whole, corner)] for past in looks]
+        shapes = [(_width(part, past), self._closed(part, past)) for part, past in zip(parts, looks, strict=True)]
         # Of two looks that differ the narrower one lacks a beam. A gap is one in either.
-        return max(shapes, key=lambda shape: _width(shape, look))
+        width, shape = max(shapes, key=lambda shape: shape[0])
+        return shape if width >= _WIDE_M else _NOTHING
 
     def _closed(self, obstacle: Points, look: Look) -> Points:
         """Return the points (n, 2) of an obstacle, and more where the body does not fit: between them and at its ends.
@@ -138,9 +142,11 @@ def distances(points: Points, others: Points) -> Points:
 
 
 def _width(points: Points, look: Look) -> float:
-    """Return how wide (rad) the points (n, 2) are as seen from where a look was made."""
-    bearing, _ = _polar(points, look)
-    return float(np.ptp(np.unwrap(bearing))) if len(points) else 0.0
+    """Return how wide (m) an obstacle of these points (n, 2) is, across the view of a look."""
+    if not len(points):
+        return 0.0
+    bearing, away = _polar(points, look)
+    return float(np.ptp(np.unwrap(bearing)) * away.min())
 
 
 def _polar(points: Points, look: Look) -> tuple[Points, Points]:

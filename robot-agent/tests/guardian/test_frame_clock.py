@@ -26,6 +26,10 @@ class Base:
         chance = random.Random(seed)
         numbers = [number for number in range(int(END_S / period)) if number not in damaged]
         self.whole = [phase + number * period + chance.uniform(0.0, jitter) for number in numbers]
+        self.restart()
+
+    def restart(self):
+        """Let no frame have been read yet."""
         self._waiting = list(self.whole)
 
     def read(self, until):
@@ -76,6 +80,30 @@ def test_each_frame_is_looked_at_soon_whatever_its_phase_and_exact_rate(phase, d
     assert len(looks) / looks[-1] < 1.4 / (FRAMES * FRAME_S)
 
 
+@given(
+    slower=st.floats(1.01, 1.4), phase=st.floats(0.0, FRAME_S), jitter=st.floats(0.0, 0.001), seed=st.integers(0, 99)
+)
+def test_frames_that_come_more_slowly_than_the_base_says_are_looked_at_no_more_often(slower, phase, jitter, seed):
+    base = Base(phase, FRAME_S * slower, jitter, seed)
+    looks = looks_at(base, seed=seed)
+    late = [look for look in looks if look > END_S / 2.0]
+    assert len(late) / (late[-1] - late[0]) < 1.4 / (FRAMES * FRAME_S * slower)
+    assert max(delays(base, looks)) < LATE_S + FRAME_S * (slower - 1.0)
+
+
+@pytest.mark.parametrize("slower", [1.05, 1.15, 1.33, 1.45])
+def test_frames_that_come_faster_again_wait_long_for_a_moment_only(slower):
+    base = Base(period=slower * FRAME_S)
+    slow = [at for at in base.whole if at < END_S / 2.0]
+    base = Base(phase=slow[-1] + FRAME_S)
+    base.whole = slow + [at for at in base.whole if at < END_S]
+    base.restart()
+    waits = delays(base, looks_at(base))
+    again = waits[len(slow) :]
+    assert max(again) < 3.0 * FRAME_S
+    assert max(again[100:]) < LATE_S
+
+
 @pytest.mark.parametrize("damaged", [{200}, {201}, {200, 201}, {200, 202, 203}])
 def test_damaged_frames_delay_others_for_moments_only(damaged):
     base = Base(damaged=damaged)
@@ -84,10 +112,20 @@ def test_damaged_frames_delay_others_for_moments_only(damaged):
     assert max(waits) < 2.0 * FRAME_S
 
 
-def test_silent_base_is_looked_at_no_more_seldom_than_one_that_sends():
+def test_silent_base_is_looked_at_as_often_as_one_whose_rate_is_not_known():
     looks = looks_at(Base(phase=END_S))
-    assert len(looks) / looks[-1] < 250.0
+    assert len(looks) / looks[-1] < 75.0
     assert max(after - before for before, after in itertools.pairwise(looks)) < UNKNOWN_S + 2.0 * WAKING_S
+
+
+@pytest.mark.parametrize("kept_back_s", [0.05, 0.1, 0.3])
+def test_frames_that_a_busy_computer_keeps_back_cause_no_storm_of_looks(kept_back_s):
+    base = Base()
+    base.whole = [math.ceil(at / kept_back_s) * kept_back_s for at in base.whole]
+    base.restart()
+    looks = looks_at(base)
+    assert len(looks) / looks[-1] < 2.0 / UNKNOWN_S
+    assert max(delays(base, looks)) < 2.0 * FRAME_S + WAKING_S
 
 
 def test_base_whose_rate_is_not_known_is_looked_at_by_the_clock():

@@ -3,6 +3,10 @@
 Waiting for bytes would wake the process for each piece of a frame, which some adapters pass on every millisecond; a
 look at each frame costs twice as much as one at two. A look at any other time than just after the second frame would
 let a frame wait for longer: so each look comes a little earlier than the last one, until one comes too early.
+
+Frames may come more slowly than the base's driver says, by a clock of the base's own or a busy line. Then nearly every
+look would come too early and be repeated, so looks that do make the period longer, by half at most, and others
+bring it back.
 """
 
 from __future__ import annotations
@@ -18,22 +22,30 @@ EARLIER_S: Final = 0.0003
 """Each look comes so much earlier."""
 LATER_S: Final = 0.002
 """After a look that came too early, another one follows so much later."""
+LONGER_S: Final = 0.0001
+SHORTER_S: Final = 0.00002
+"""The period grows by the one for each look that came too early, and shrinks by the other with one that did not: in
+balance one of six comes too early, as where the period is right."""
 TRIES: Final = 4
-"""So often, at most: the frame may be damaged, or the base silent."""
+"""So often, at most: the frame may be damaged, or the base silent. Once a base is, one look each `UNKNOWN_S` is enough
+until it sends again: a busy computer, or line, keeps frames back for many times as long as all tries take."""
 
 
 class FrameClock:
     """The looks at one base; `now` is s of the guardian's clock, `frame_s` s between two frames (0: not known)."""
 
     def __init__(self, frame_s: float) -> None:
-        self._period = FRAMES * frame_s
+        self._shortest = FRAMES * frame_s
+        self._period = self._shortest
         self._missing = FRAMES
         self._tries = 0
+        self._silent = False
         self._due = 0.0
 
     def begin(self, now: float) -> None:
         """Begin: a wheel turns."""
         self._due = now
+        self._silent = False
         self._expect()
 
     def wait(self, now: float) -> float:
@@ -48,15 +60,26 @@ class FrameClock:
         if not self._period:
             self._due = now + UNKNOWN_S
         elif self._missing <= 0:
+            self._learn()
+            self._silent = False
             # After a pause of the machine there is nothing to catch up with.
             self._due = max(self._due + self._period, now + 0.5 * self._period) - EARLIER_S
             self._expect()
-        elif self._tries < TRIES:
+        elif self._tries < TRIES and not (self._silent and self._missing == FRAMES):
             self._tries += 1
             self._due = now + LATER_S
         else:
             self._due = now + UNKNOWN_S
+            self._silent = self._missing == FRAMES
             self._expect()
+
+    def _learn(self) -> None:
+        """Adapt the period to when both frames had come; a third one shows that it is too long."""
+        if self._missing < 0:
+            self._period = self._shortest
+        else:
+            change = self._tries * LONGER_S if self._tries else -SHORTER_S
+            self._period = min(max(self._period + change, self._shortest), 1.5 * self._shortest)
 
     def _expect(self) -> None:
         self._missing, self._tries = FRAMES, 0

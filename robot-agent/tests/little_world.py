@@ -90,7 +90,7 @@ class LittleWorld:
         self.scan_started = self.now
         self.lidar_on = self.heartbeats_on = self.base_on = True
         self.link_delay = self.link_delay_growth = 0.0  # of heartbeats: s, and s per s
-        self.bumper = False
+        self.bumper = self.wheel_drop = False
         self.fault = None
         self.stopped = None
         self.resting = False
@@ -226,7 +226,7 @@ class LittleWorld:
             self.agent.on_base(
                 BaseFeedback(
                     seq=self.steps,
-                    status=BaseStatus(bumper_left=self.bumper, battery=0.8),
+                    status=BaseStatus(bumper_left=self.bumper, wheel_drop=self.wheel_drop, battery=0.8),
                     odometry=WheelOdometry(left_m=left, right_m=right),
                     fault=self.fault,
                     stopped=self.stopped,

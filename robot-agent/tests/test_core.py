@@ -323,6 +323,31 @@ def test_a_bumper_pressed_while_the_robot_is_not_enabled_is_a_fault_until_a_rese
     assert world.command("enable").accepted
 
 
+def test_robot_started_with_its_bumper_pressed_finds_its_place_before_it_is_reset():
+    world = LittleWorld()
+    world.bumper = True
+    world.agent.load(world.master.snapshot(), world.now)
+    assert world.run(20.0, lambda one: one.agent.localizer.status == "good"), world.state().reasons
+    assert world.error()[0] < 0.1
+    assert world.state().mode == "FAULT"
+    world.bumper = False
+    world.run(0.5)
+    assert world.command("reset").accepted
+    world.run(0.2)
+    assert world.command("enable").accepted
+
+
+def test_robot_that_is_lifted_looks_for_its_place_only_when_it_stands_again():
+    world = LittleWorld()
+    world.wheel_drop = True
+    world.agent.load(world.master.snapshot(), world.now)
+    world.run(20.0)
+    assert (world.state().mode, world.agent.localizer.status) == ("FAULT", "none")
+    world.wheel_drop = False
+    assert world.run(20.0, lambda one: one.agent.localizer.status == "good"), world.state().reasons
+    assert world.state().mode == "FAULT"
+
+
 def test_reset_is_passed_on_to_the_guardian_and_clears_its_fault(driving):
     driving.fault = "the base left Safe mode by itself (now PASSIVE)"
     driving.run(0.1)

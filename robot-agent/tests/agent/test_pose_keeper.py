@@ -76,7 +76,11 @@ def test_no_search_begins_while_there_is_a_pose_or_a_search(keeper, localizer, c
     assert not keeper.search("INIT", 0.0, at_rest=True)
 
 
-@pytest.mark.parametrize(("mode", "at_rest"), [("NORMAL", True), ("HOLD", True), ("INIT", False)])
+def test_search_begins_while_the_robot_has_a_fault(keeper):
+    assert keeper.search("FAULT", 0.0, at_rest=True)
+
+
+@pytest.mark.parametrize(("mode", "at_rest"), [("NORMAL", True), ("HOLD", True), ("INIT", False), ("FAULT", False)])
 def test_no_search_begins_while_the_robot_is_enabled_or_moves(keeper, mode, at_rest):
     assert not keeper.search(mode, 0.0, at_rest=at_rest)
 

@@ -318,7 +318,10 @@ class AgentCore:
         if at.now - self._ticked_at < STANDBY_S and self.standing_by:
             return ()
         self._ticked_at = at.now
-        self._pose_keeper.search(self.safety.mode, at.now, at_rest=self._driving.wheels.at_rest)
+        feedback = self._base.feedback
+        # A wheel that has dropped: somebody may carry the robot.
+        lifted = feedback is not None and feedback.status.wheel_drop
+        self._pose_keeper.search(self.safety.mode, at.now, at_rest=self._driving.wheels.at_rest and not lifted)
         return self._publishing.due(
             partial(self.pose, at),
             self.state(at),

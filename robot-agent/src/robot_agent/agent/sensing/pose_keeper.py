@@ -51,11 +51,15 @@ class PoseKeeper:
             self._localizer.restore(pending)
 
     def search(self, mode: Mode, now: float, *, at_rest: bool) -> bool:
-        """Begin a global search when there is no pose, at rest and in INIT only; return whether one began."""
+        """Begin a global search when there is no pose; return whether one began.
+
+        Only a robot searches that stays where it is: at rest, and not enabled. One with a fault knows its place by the
+        time it is reset.
+        """
         localizer = self._localizer
         if localizer.status != "none" or localizer.searching or localizer.pose(now) is not None:
             return False
-        if mode != "INIT" or not at_rest or now - self._searched_at <= SEARCH_AGAIN_S:
+        if mode not in ("INIT", "FAULT") or not at_rest or now - self._searched_at <= SEARCH_AGAIN_S:
             return False
         if not localizer.global_localization():
             return False

@@ -322,3 +322,24 @@ def test_robot_whose_place_is_not_among_those_that_a_search_keeps_is_not_good_at
     samples = track(fields, start, config, seed=9, search=True)
     assert not [sample for sample in samples if is_falsely_good(sample)]
     assert samples[-1].status == "good"
+
+
+@pytest.mark.data
+def test_robot_at_rest_among_people_is_at_no_place_that_its_scan_does_not_confirm(data_dir, tmp_path):
+    """Three scans in a museum that a wrong place explained much better than the robot's own: it was weak there."""
+    log = data_dir / "lidar_logs" / "fhw-corrected.log.gz"
+    if not log.is_file():
+        pytest.skip(f"{log} does not exist")
+    run("map", "from-log", log, "--out", tmp_path / "floor", "--scans", "odd")
+    floor, config = load_map(tmp_path / "floor.yaml"), LocalizationConfig(range_max=30.0)
+    fields = map_fields(floor.cells, floor.geometry, config)
+    seen = read_log(log).select("even")
+    for number in (28, 32, 37):
+        at_rest = [replace(seen[number], stamp=0.2 * repeat) for repeat in range(6)]
+        samples = track(fields, at_rest, config, seed=1, search=True)
+        assert {sample.status for sample in samples} == {"lost"}
+        start = with_noise(seen[number : number + 15], 1)
+        samples = track(fields, start, config, seed=1, search=True)
+        relied = [sample for sample in samples if sample.status in {"good", "weak"}]
+        assert relied
+        assert max(sample.position_error for sample in relied) < 0.5

@@ -204,6 +204,11 @@ def _weakness(fit: Fit, *, proven: bool) -> str:
     return ""
 
 
+def confirms(fit: Fit) -> bool:
+    """Whether a scan by itself confirms a pose, as one does that may be good."""
+    return not _weakness(fit, proven=False)
+
+
 def casts_doubt(fit: Fit) -> bool:
     """Whether a scan shows that the robot may be elsewhere; a right pose hardly ever has such a fit.
 

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
-from robot_agent.localization.fit import evaluate_fit
+from robot_agent.localization.fit import confirms, evaluate_fit
 from robot_agent.localization.hypotheses import Hypotheses, Hypothesis, apart, fits, quality
 from robot_agent.localization.pose import Pose2, wrap
 
@@ -70,13 +70,17 @@ class GlobalSearch:
         return poses, scores
 
     def _conclude(self, fields: MapFields, poses: NDArray[np.float64], scores: NDArray[np.float64]) -> Hypotheses:
-        """Return the places that explain the scan, with how well they do."""
+        """Return the places that explain the scan, with how well they do.
+
+        One scan decides for no place that it does not confirm: where people hide the walls, a wrong place may explain
+        it clearly better than the robot's own.
+        """
         places: list[Hypothesis] = []
         for score, pose in _places(poses, scores):
             fit = evaluate_fit(fields, pose, self._points, self._range_max)
             if fits(fit):
                 value = quality(score / fields.best_likelihood, fit)
-                places.append(Hypothesis(pose, math.log(max(value, 1e-3))))
+                places.append(Hypothesis(pose, math.log(max(value, 1e-3)), 0 if confirms(fit) else 1))
         return Hypotheses(places, self.odom, complete=len(places) < _PLACES)
 
 

@@ -1,6 +1,8 @@
 """The running aggregator with a real broker, Redis and router, each of them killed and restarted."""
 
 import asyncio
+import os
+import signal
 from contextlib import asynccontextmanager
 
 import httpx
@@ -90,11 +92,14 @@ async def test_restarted_aggregator_restores_the_blocked_area(fog, until):
 
 async def test_blocked_period_lasts_from_its_first_announcement_whenever_the_aggregator_is_killed(fog, until):
     fog.start("hazard_aggregator")
-    await fog.ready("hazard_aggregator")
+    url = await fog.ready("hazard_aggregator")
     async with connected_node(fog) as (node, _):
         await node.read(0.8, 5)
         await until(lambda: node.state == "blocked", "blocked")
         since = node.hazards[-1].since
+        async with httpx.AsyncClient(timeout=60) as client, asyncio.timeout(60):
+            while "fognav_hazards_unstored 0.0" not in (await client.get(f"{url}/metrics")).text:  # noqa: ASYNC110  # no event tells
+                await asyncio.sleep(0.01)
         for _ in range(2):  # the first time before Redis has the period
             epoch = node.hazards[-1].epoch
             fog.kill("hazard_aggregator")
@@ -112,6 +117,25 @@ async def test_blocked_period_lasts_from_its_first_announcement_whenever_the_agg
     assert len(blocked) == 1
     assert blocked[0]["period"]["began"] == pytest.approx(since, abs=0.2)
     assert blocked[0]["lasted_s"] == pytest.approx(ended - since, abs=0.4)
+
+
+async def test_danger_that_redis_never_had_survives_an_aggregator_that_is_killed_twice(fog, until):
+    fog.start("hazard_aggregator")
+    await fog.ready("hazard_aggregator")
+    async with connected_node(fog) as (node, _):
+        await until(lambda: node.hazards, "first hazard")
+        os.kill(fog.redis.pid, signal.SIGSTOP)
+        await node.read(0.8, 5)
+        await until(lambda: node.state == "blocked", "blocked without the store")
+        blocked = len(node.hazards) - 1
+        for _ in range(2):  # the second time as soon as it has said anything
+            epoch = node.hazards[-1].epoch
+            fog.kill("hazard_aggregator")
+            os.kill(fog.redis.pid, signal.SIGCONT)
+            fog.start("hazard_aggregator")
+            await until(lambda epoch=epoch: node.hazards[-1].epoch > epoch, "restarted")
+        await until(lambda: "silent" in node.hazards[-1].cause, "unknown because its node is silent")
+    assert {hazard.penalty for hazard in node.hazards[blocked:]} == {254}
 
 
 async def test_broker_that_lost_its_data_gets_everything_again(fog, until):

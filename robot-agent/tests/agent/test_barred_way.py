@@ -141,6 +141,18 @@ def test_gap_that_the_body_fits_through_is_not_closed_by_what_is_seen_from_afar(
     assert is_passable(corridor, found[2])
 
 
+def test_end_of_a_barrier_that_was_not_seen_at_first_is_reported_while_it_is_still_far():
+    corridor = Corridor()
+    _, x, points = corridor.drive(2.0, 20.0, [BARRIER])
+    assert is_passable(corridor, [point for point in points if point[1] < 2.9]), "some 0.4 m beside the wall"
+    corridor.now = 100.0
+    beside = [(x, 3.15) for x, _ in STRAIGHT]
+    found = corridor.drive(x, 10.0, [BARRIER], beside)
+    assert found is not None
+    assert BARRIER[0] - found[1] > 9.5
+    assert not is_passable(corridor, found[2])
+
+
 def test_what_the_map_has_is_not_told_again():
     corridor = Corridor()
     _, x, points = corridor.drive(2.0, 20.0, [BARRIER])

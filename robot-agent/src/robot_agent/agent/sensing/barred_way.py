@@ -42,6 +42,8 @@ _BEGIN_MIN: Final = 2
 """Fewest points of an obstacle on the way: a single beam may be a mixed echo off an edge."""
 _HALF: Final = 40
 """Half the width, in cells, of the square around what is on the way to which an obstacle is followed."""
+_NEAREST_M: Final = 3.0
+"""What is nearer is seen by two beams in each cell, and past its ends at such an angle that gaps look closed."""
 _WIDE_M: Final = 0.6
 """What is narrower bars no way by itself, and is often a person or a robot: it is not reported from afar."""
 _BEHIND_M: Final = 0.3
@@ -94,7 +96,10 @@ class BarredWay:
         looks = [past for past in self._looks if look.at - past.at <= _LOOKS_WITHIN_S]
         if not self._unsure or len(looks) < _LOOKS:
             return _NOTHING
-        nearest = first[np.argmin(np.hypot(*(first - way[0]).T))]
+        away = np.hypot(*(first - way[0]).T)
+        nearest = first[np.argmin(away)]
+        if away.min() < _NEAREST_M:
+            return _NOTHING
         corner = np.floor(nearest / CELL_M).astype(np.int64) - _HALF
         rasters = [_raster(past.unexplained, corner) for past in looks]
         votes = np.logical_or.reduce(rasters) * np.sum([_grown(raster, _NEAR) for raster in rasters], axis=0)
@@ -104,10 +109,11 @@ class BarredWay:
         self._unsure = False  # the next report tells whether the map has it
         whole = _connected(begin, votes >= _EXTENT_LOOKS, math.ceil(self._gap / CELL_M))
         parts = [past.unexplained[_is_in(past.unexplained, whole, corner)] for past in looks]
-        shapes = [(_width(part, past), self._closed(part, past)) for part, past in zip(parts, looks, strict=True)]
+        if max(_width(part, look) for part in parts) < _WIDE_M:
+            return _NOTHING
         # Of two looks that differ the narrower one lacks a beam. A gap is one in either.
-        width, shape = max(shapes, key=lambda shape: shape[0])
-        return shape if width >= _WIDE_M else _NOTHING
+        shapes = [self._closed(part, past) for part, past in zip(parts, looks, strict=True)]
+        return max(shapes, key=lambda shape: _width(shape, look))
 
     def _closed(self, obstacle: Points, look: Look) -> Points:
         """Return the points (n, 2) of an obstacle, and more where the body does not fit: between them and at its ends.

@@ -30,7 +30,8 @@ _FAR_TURN_RATE: Final = 0.25
 _FAR_HEADING_RAD: Final = _EXPLAINED_M / _RANGE_M
 """Above this rate, or with a less certain heading (standard deviation), nothing is looked for on the way ahead."""
 _SAME_M: Final = 0.5
-"""What is this near to an obstacle that was found on the way is more of it, also near a wall."""
+"""What is this near to an obstacle that was found on the way is more of it, be it near a wall or on the map already:
+if the path still leads there, there is a gap beside it, or seemed to be."""
 _SCAN_AGE_S: Final = 0.5
 _MEMORY_MARGIN_S: Final = 2.0
 """A cell counts as reported by this robot for this much longer than its report is valid: messages take time."""
@@ -130,9 +131,9 @@ class ObstacleReporter:
             return
         # A wall may seem to be as much farther off as it is farther away.
         begins = seen.distance > _EXPLAINED_M * np.maximum(1.0, seen.away / _RANGE_M)
+        begins &= _is_free(look.unexplained, replica)
         if len(self._barring):
             begins |= distances(look.unexplained, self._barring) <= _SAME_M
-        begins &= _is_free(look.unexplained, replica)
         found = self._barred_way.look(look, begins, way)
         found = found[_is_free(found, replica)][: self._limit]
         if len(found):

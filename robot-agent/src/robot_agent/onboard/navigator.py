@@ -57,6 +57,8 @@ class OnboardNavigator:
         self._searched_at = -math.inf
         self._searched_goal: RobotGoal | None = None
         self._refused = False
+        self._doubted = False
+        """Whether the present path may lead round something that has been forgotten since it was searched."""
         self.plans = plans
 
     @property
@@ -92,7 +94,7 @@ class OnboardNavigator:
             return None
         if self._is_other(goal):
             self._costmap.believe()
-        self._searched_at, self._searched_goal = now, goal
+        self._searched_at, self._searched_goal, self._doubted = now, goal, False
         return Search(
             planner=self._planner,
             cost=self.replica.cost,
@@ -109,10 +111,10 @@ class OnboardNavigator:
         """Return the path to follow from now on, or the refusal; None if the present path is kept.
 
         It is kept, too, when a refusal rests on what was only seen from far away. That is forgotten, and the next
-        search, which is due at once where there is no free path to follow, tells whether there is a way to go nearer.
+        search, which is due at once, tells whether there is a way to go nearer.
         """
         if found.refusal is not None and self._is_doubtful(found.refusal, found.goal):
-            self._refused = False
+            self._refused, self._doubted = False, True
             return None
         self._refused = found.refusal is not None
         version = self.replica.version
@@ -140,7 +142,7 @@ class OnboardNavigator:
             return now - self._searched_at >= period - _EARLY_S
         if self._refused:
             return now - self._searched_at >= _REFUSED_RETRY_S
-        return self._is_other(goal) or follower is None or self._is_blocked(follower)
+        return self._doubted or self._is_other(goal) or follower is None or self._is_blocked(follower)
 
     def _is_other(self, goal: RobotGoal) -> bool:
         return self._searched_goal is None or self._searched_goal.goal_id != goal.goal_id

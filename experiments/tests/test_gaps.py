@@ -33,6 +33,13 @@ def test_robot_whose_way_goes_on_round_the_jamb_keeps_to_the_middle_of_a_door_aj
     assert outcome.clearance_m > 0.02
 
 
+@pytest.mark.parametrize("beside", [0.28, 0.30, 0.32])
+def test_robot_that_cuts_a_corner_that_its_path_passes_with_room_stays_clear_of_it(beside):
+    row = series("corner", 2.0 * beside, SEEDS, stop_field=True)
+    assert row.passed == row.drives
+    assert row.clearance_min_m > 0.045
+
+
 @pytest.mark.parametrize(("kind", "gap"), [("doorway", 0.20), ("doorway", 0.32), ("door ajar", 0.36)])
 def test_robot_does_not_touch_what_it_does_not_fit_through(kind, gap):
     row = series(kind, gap, SEEDS, seconds=15.0)

@@ -15,6 +15,7 @@ import numpy as np
 
 from fog_contracts.costs import NO_SPEED_LIMIT
 from fog_kernels.clearance import Clearance, clearance
+from fog_kernels.course import distances
 from fog_kernels.dwa import dwa
 from fog_kernels.robot.body import Body, cover
 from robot_agent.localization.pose import Pose2, wrap
@@ -127,7 +128,7 @@ def decide(job: Job) -> Decision:
     path = free_path(job.path, job.cost, window, job.lidar_points, config.inflation, around, narrowest, job.pose)
     way = course(path, around)
     way = give_way(way, around, body.inscribed + config.slow_within)
-    room = room_beside(way, body.inscribed, config.slow_within)
+    room = room_beside(way, job.pose, around, body.inscribed, config.slow_within)
     end = job.path[-1]
     goal_theta = job.goal_theta if job.ends_here else None
     tolerance = config.arrived_within if job.arrived else config.arcs.goal_tolerance
@@ -215,13 +216,15 @@ def _narrower(config: MotionConfig, room: float, tolerance: float) -> DwaSetting
     )
 
 
-def room_beside(way: Course, inscribed: float, enough: float) -> float:
-    """Return how wide the narrowest place of the path just ahead is.
+def room_beside(way: Course, pose: Pose2, around: Clearance, inscribed: float, enough: float) -> float:
+    """Return how much room there is beside the robot, and at the narrowest place of the path just ahead.
 
-    0 when the body only just fits, 1 when there are `enough` m or more beside it.
+    0 when the body only just fits, 1 when there are `enough` m or more beside it. The robot's own place counts because
+    it need not be on the path: one that cuts a corner, which the path passes at a distance, would be quick there.
     """
-    free = float(way.free[: way.along.searchsorted(_NEAR_AHEAD_M, "right")].min()) - inscribed
-    return min(max(free / enough, 0.0), 1.0)
+    here = float(distances(around, np.array([(pose.x, pose.y)]))[0])
+    ahead = float(way.free[: way.along.searchsorted(_NEAR_AHEAD_M, "right")].min())
+    return min(max((min(here, ahead) - inscribed) / enough, 0.0), 1.0)
 
 
 def make_job(  # noqa: PLR0913  # a job holds all that a decision rests on

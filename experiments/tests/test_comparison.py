@@ -27,6 +27,8 @@ from fognav_experiments.comparison.statistics import compare, estimate, t_cdf, t
 from fognav_experiments.cpu import CpuMeter
 from fognav_experiments.rigs import System
 
+pytestmark = pytest.mark.timeout(900)
+
 ESTIG = Path(__file__).parents[2] / "sites" / "estig"
 _spec = importlib.util.spec_from_file_location("ring_site", Path(__file__).parent / "ring_site.py")
 ring = importlib.util.module_from_spec(_spec)

@@ -13,6 +13,8 @@ from robot_agent.agent.path.recoveries import Recoveries
 
 SEEDS = int(os.environ.get("FOGNAV_GAP_SEEDS", "2"))
 
+pytestmark = pytest.mark.timeout(900)
+
 
 @pytest.mark.parametrize("stop_field", [False, True])
 @pytest.mark.parametrize(

@@ -24,6 +24,8 @@ _spec = importlib.util.spec_from_file_location("ring_site", Path(__file__).paren
 ring = importlib.util.module_from_spec(_spec)
 _spec.loader.exec_module(ring)
 
+pytestmark = pytest.mark.timeout(900)
+
 
 BLOCKED = HazardRequest(area="z1", trigger_m=0.5)
 

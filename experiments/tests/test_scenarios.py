@@ -27,6 +27,8 @@ PLAYED = (
     else ["map-restarts", "no-way-left", "robots-2", "wifi-gap-5s"]
 )
 
+pytestmark = pytest.mark.timeout(900)
+
 
 @pytest.mark.parametrize("name", FILES)
 def test_every_scenario_is_about_its_site(name):

@@ -35,6 +35,8 @@ _spec = importlib.util.spec_from_file_location("ring_site", Path(__file__).paren
 ring = importlib.util.module_from_spec(_spec)
 _spec.loader.exec_module(ring)
 
+pytestmark = pytest.mark.timeout(900)
+
 DEBOUNCE = Plane(Axis("readings", [2, 20]), Axis("pause_ms", [50, 500]))
 SPEED = Plane(Axis("areas", [1, 0]), Axis("speed_m_s", [0.2, 0.3]))
 RING = ExperimentSpec(routes=[RouteSpec(start="west", goal="east", areas=["z1"])])

@@ -76,7 +76,8 @@ async def test_robot_in_a_watched_area_does_not_block_it(system: LiveSystem) -> 
     while system.truth.x < Z1[1][0] + 0.3:
         states.add(system.hazard("z1"))
         await system.until(lambda before=system.truth.x: system.truth.x > before + 0.05, WAIT_S, "the robot drives on")
-    assert states == {"clear"}
+    # While the robot is in the beam the node confirms nothing: if a busy machine keeps it there, the area gets unknown.
+    assert states <= {"clear", "unknown"}
     # The node itself saw the robot, and for longer than the five readings that confirm a hazard.
     assert sum(reading.state == "blocked" for reading in system.readings) > 10
     assert system.truth.contacts == 0

@@ -9,6 +9,7 @@ import signal
 import threading
 import time
 from collections import Counter
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -47,6 +48,12 @@ def router(shared_router):
 
 def edge(endpoint, name="e1", site="lab"):
     return ZenohEdge.open(connect=[endpoint], clock=SystemClock(), role="test", id=name, site=site)
+
+
+def is_stopped(pid):
+    """Return whether all threads of a process have stopped: on a busy machine they do so later than the signal."""
+    threads = Path(f"/proc/{pid}/task").iterdir()
+    return all((thread / "stat").read_text("utf-8").rpartition(")")[2].split()[0] == "T" for thread in threads)
 
 
 async def until(condition, failure, seconds=60.0):
@@ -622,6 +629,7 @@ async def test_router_that_hangs_answers_no_more_in_a_session_that_is_up_and_aga
         assert await asking.router_answers(60.0)
         os.kill(router.pid, signal.SIGSTOP)
         try:
+            await until(lambda: is_stopped(router.pid), "the router's threads run on")
             assert not await asking.router_answers(0.2)
             assert asking.connected
         finally:

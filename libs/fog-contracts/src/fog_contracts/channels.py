@@ -40,9 +40,14 @@ ROLES: Final[Mapping[Role, str]] = {
 DURABILITIES: Final[Mapping[Durability, str]] = {
     "volatile": "a late subscriber waits for the next message; a lost one stays lost",
     "latest": "a late subscriber is given the latest message of each key at once; older ones may be lost",
-    "recovered": "a late subscriber is given the recent messages, lost ones are sent again, all arrive in order",
+    "recovered": "a late subscriber is given the recent messages; from the first one that arrives, lost ones are sent "
+    "again and all arrive in order",
 }
-"""How messages reach a subscriber that missed them. MQTT: `latest` is retained, `recovered` does not exist."""
+"""How messages reach a subscriber that missed them. MQTT: `latest` is retained, `recovered` does not exist.
+
+Zenoh passes over what is recent if a newer message overtakes it while publisher and subscriber get to know each other:
+messages of a recovered channel carry a version by which this is noticed.
+"""
 
 ID_MAX: Final = 32
 """Characters of the longest id."""

@@ -496,8 +496,8 @@ class ZenohEdge:
         """Publish without waiting, from any thread; raises `ContractError` for a message that violates its contract.
 
         Without a connection the message is lost, except on channels of durability `recovered` and, for the latest
-        message, `latest`: these messages reach their subscribers as soon as there is a connection. One that zenoh
-        fails to send is lost, logged and counted.
+        message, `latest`: these messages reach their subscribers as soon as there is a connection, but for those that
+        a newer one overtakes meanwhile. One that zenoh fails to send is lost, logged and counted.
         """
         key = self._key(channel, ids)
         data = encode(channel, message)
@@ -511,8 +511,8 @@ class ZenohEdge:
     def subscribe(self, channel: Channel, kind: type[M], handler: Callable[[Ids, M], object], **ids: str) -> None:
         """Call `handler(ids, message)` for each message, with every value of the ids that are not given.
 
-        When the loop is behind, only the newest message of each key is delivered, except on recovered channels: their
-        messages are all delivered, in order.
+        When the loop is behind, only the newest message of each key is delivered, except on recovered channels: all
+        messages since the first are delivered, in the publisher's order.
         """
         self._check(channel, ids)
         pattern = channel.pattern(**self._with_site(channel, ids))

@@ -322,6 +322,27 @@ def test_other_fault_ends_backing_off_and_is_latched_instead(status):
     assert not rig.core.moving
 
 
+@pytest.mark.parametrize("status", [{}, {"cliff": True}])
+def test_robot_that_ends_backing_off_stands_at_once(status):
+    rig = bumped()
+    rig.steps(0.5, "back_off", -0.05)
+    ended = rig.step(None, 0.0, **status) + rig.steps(0.2)
+    assert set(ended.decode().split(";")) <= {"0.0000,0.0000", ""}
+    assert b"0.0000,0.0000;" in ended
+
+
+def test_bumper_that_stays_pressed_while_backing_off_is_a_fault_after_the_reset_too():
+    rig = bumped()
+    rig.steps(0.5, "back_off", -0.05)
+    rig.steps(0.2, None, 0.0)
+    rig.command(rig.now + 0.02, 0.0, 0.0, reset=True)
+    assert rig.core.latched is None
+    rig.now = round(rig.now + 0.2, 3)
+    rig.step(None, 0.1)
+    assert rig.core.latched == BUMP
+    assert not rig.core.moving
+
+
 def test_robot_backs_off_from_nothing_but_a_bump():
     for status in ({}, {"cliff": True}):
         rig = Docking()

@@ -31,6 +31,9 @@ obstacle really is and may pass it closely, whereas the map's costs keep whole p
 
 _LOST_AFTER_REVOLUTIONS: Final = 2.4
 """Without a whole scan for so many revolutions the scan counts as lost."""
+_REMEMBERED_REVOLUTIONS: Final = 2.5
+"""For so many revolutions, at least, the stop field remembers what a lidar saw: half of one would be half of what is
+there."""
 _WHEEL_SPEED_MAX: Final = 0.5
 """No wheel turns faster (m/s), whatever the base can do."""
 
@@ -92,7 +95,8 @@ class StopFieldConfig:
     slowest: float = 0.01
     """A slower wheel is a standing one."""
     memory: float = 0.5
-    """How long a lidar point counts: two turns and a half, because thin and dark things are not seen in each."""
+    """How long a lidar point counts: two turns and a half, because thin and dark things are not seen in each; longer
+    for a lidar that turns more slowly than 5 times a second or whose samples arrive late."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -244,6 +248,7 @@ def agent_config(  # noqa: PLR0913  # what the process knows about its robot
         motion=MotionConfig(limits=limits),
         localization=LocalizationConfig(range_min=lidar.range_min_m, range_max=lidar.range_max_m),
         safety=SafetyConfig(scan_lost=scan_lost),
+        stop_field=StopFieldConfig(memory=max(StopFieldConfig().memory, _REMEMBERED_REVOLUTIONS * lidar.scan_period_s)),
     )
     if obstacle_ttl is not None:
         config = replace(config, obstacle_ttl=obstacle_ttl)
@@ -280,7 +285,7 @@ def _with_motion(config: AgentConfig, motion: MotionSettings) -> AgentConfig:
 
 
 def _with_settings(config: AgentConfig, settings: RobotSettings, *, can_rest: bool) -> AgentConfig:
-    """Return the configuration with the lidar's pose, the odometry's noise and the battery of the robot's settings."""
+    """Return the configuration with the robot's lidar, odometry's noise and battery as in its settings."""
     rest_after = settings.power.rest_after_s if can_rest else 0.0
     lidar = settings.lidar
     localization = replace(
@@ -290,9 +295,12 @@ def _with_settings(config: AgentConfig, settings: RobotSettings, *, can_rest: bo
         lidar_y=lidar.y_m,
         lidar_yaw=lidar.yaw_rad,
     )
+    # A point is as old as its measurement: one that arrives late must not count for less time than others.
+    stop_field = replace(config.stop_field, memory=config.stop_field.memory + lidar.latency_s)
     return replace(
         config,
         localization=localization,
+        stop_field=stop_field,
         battery_low=settings.power.low_fraction,
         dock_below=settings.power.dock_below,
         rest_after=rest_after,

@@ -84,6 +84,14 @@ def test_every_setting_of_the_robot_file_reaches_the_configuration():
     assert limits_of(settings.motion, 0.3) == Limits(linear=0.21, acceleration=0.76)
 
 
+def test_stop_field_remembers_two_turns_and_a_half_of_a_slow_or_late_lidar():
+    late = RobotSettings(base=BaseSettings(driver="b"), lidar=LidarSettings(driver="l", latency_s=0.3))
+    slow = replace(LIDAR, scan_period_s=0.4)
+    assert agent_config("r1", KEY, BASE, replace(LIDAR, scan_period_s=0.1), boot="b1").stop_field.memory == 0.5
+    assert agent_config("r1", KEY, BASE, slow, boot="b1").stop_field.memory == pytest.approx(1.0)
+    assert agent_config("r1", KEY, BASE, slow, boot="b1", settings=late).stop_field.memory == pytest.approx(1.3)
+
+
 def test_default_settings_are_the_defaults_of_agent_and_guardian():
     settings = default_robot().settings
     assert agent_config("r1", KEY, BASE, LIDAR, BODY, boot="b1", settings=settings) == agent_config(

@@ -7,12 +7,14 @@ from __future__ import annotations
 
 import math
 import os
+from collections import deque
 
 import numpy as np
 import pytest
 
 from fog_contracts.grid import GridGeometry
 from fog_contracts.messages import Pose, SimObstacle
+from fog_contracts.robot import BaseSettings, LidarSettings, RobotSettings
 from fog_contracts.site import RobotSite
 from fognav_sim.floor import Floor
 from fognav_sim.sensors import Noise
@@ -25,18 +27,25 @@ from robot_agent.odometry import integrate
 
 SEEDS = int(os.environ.get("FOGNAV_TEST_STOP_FIELD_SEEDS", "20"))
 AXLE = 0.235
-CONFIG = agent_config(
-    "r1", b"", DriveTrain(axle_m=AXLE, wheel_speed_max_m_s=0.5),
-    LidarTraits(range_min_m=0.15, range_max_m=12.0, scan_period_s=0.18), boot="b",
-)  # fmt: skip
+
+
+def config_of(turns_per_s=5.5, latency_s=0.0):
+    """Return the configuration of a robot whose lidar turns so often, and is so late."""
+    return agent_config(
+        "r1", b"", DriveTrain(axle_m=AXLE, wheel_speed_max_m_s=0.5),
+        LidarTraits(range_min_m=0.15, range_max_m=12.0, scan_period_s=1 / turns_per_s), boot="b",
+        settings=RobotSettings(base=BaseSettings(driver="b"), lidar=LidarSettings(driver="l", latency_s=latency_s)),
+    )  # fmt: skip
+
+
 STEP_S = 0.01
 NOISE = Noise(range_sigma=0.01, range_share=0.0, lidar_dropout=0.02, wheel_diameter=0.0)
 
 
 class Driven:
-    """A simulated body with a lidar of 2000 samples/s at 5.5 turns/s, whose wheels obey a guard's commands."""
+    """A simulated body with a lidar of 2000 samples/s, 5.5 turns/s by default; its wheels obey a guard."""
 
-    def __init__(self, obstacles, seed, pose=(1.5, 2.0, 0.0)):
+    def __init__(self, obstacles, seed, pose=(1.5, 2.0, 0.0), turns_per_s=5.5, latency_s=0.0):
         geometry = GridGeometry(100, 80, 0.05, 0.0, 0.0)
         cells = np.zeros(geometry.shape, np.uint8)
         x, y, theta = pose
@@ -45,11 +54,14 @@ class Driven:
         for number, polygon in enumerate(obstacles):
             self.world.place(SimObstacle(id=f"o{number}", polygon=polygon, height=1.0))
         self.localizer = Localizer()
-        self.guard = MotionGuard(CONFIG, self.localizer)
+        self.guard = MotionGuard(config_of(turns_per_s, latency_s), self.localizer)
         self.now = 10.0
         self.odom = (0.0, 0.0, 0.0)
         self.wheels = (0.0, 0.0)
         self._head = 0.0
+        self._step_rad = math.tau * turns_per_s / 2000.0
+        self._latency_s = latency_s
+        self._on_their_way = deque()
         self._steps = 0
 
     def drive(self, seconds, command):
@@ -69,13 +81,15 @@ class Driven:
                 self.world.set_wheels(*self.wheels)
 
     def _measure(self, count):
-        clockwise = self._head + np.arange(1, count + 1) * (math.tau * 5.5 / 2000.0)
+        clockwise = self._head + np.arange(1, count + 1) * self._step_rad
         self._head = float(clockwise[-1])
         angles = (-clockwise + math.pi) % math.tau - math.pi
         ranges = self.world.lidar(angles, self.now)
-        self.guard.on_samples(
+        self._on_their_way.append(
             LidarSamples(angles.astype(np.float32), ranges.astype(np.float32), self.now - 2 * STEP_S, self.now)
         )
+        while self._on_their_way and self._on_their_way[0].ended_at <= self.now - self._latency_s:
+            self.guard.on_samples(self._on_their_way.popleft())
 
 
 def rectangle(left, bottom, right, top):
@@ -105,6 +119,18 @@ def test_gap_of_any_width_is_driven_at_without_contact(seed):
     if width < 0.34:
         assert driven.world.pose[0] < 2.5
         assert driven.wheels[0] + driven.wheels[1] < 0.05
+
+
+@pytest.mark.parametrize(
+    ("turns_per_s", "latency_s"), [(5.5, 0.3), (5.5, 0.5), (1.5, 0.0), (1.5, 0.4)], ids=lambda value: f"{value:g}"
+)
+def test_wall_is_not_touched_by_a_robot_whose_lidar_turns_slowly_or_is_late(turns_per_s, latency_s):
+    driven = Driven(wall_with_gap(0.0), 3, (1.5, 2.0, 0.0), turns_per_s, latency_s)
+    driven.drive(2.0, lambda _: (0.0, 0.0))
+    driven.drive(8.0, lambda _: (0.3, 0.3))
+    assert driven.world.contacts == 0
+    assert driven.guard.reason is not None
+    assert driven.wheels == (0.0, 0.0)
 
 
 @pytest.mark.parametrize("seed", range(SEEDS))

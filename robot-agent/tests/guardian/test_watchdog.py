@@ -419,7 +419,7 @@ def opens(monkeypatch, *results):
     return asked
 
 
-def test_lost_port_is_opened_again_each_second_and_its_reason_told_once(watch, monkeypatch):
+def test_lost_port_is_tried_every_tenth_of_a_second_and_its_reason_told_once(watch, monkeypatch):
     lost = PortLost("base", "unplugged")
     asked = opens(monkeypatch, lost, lost, watch.line, lost, PortLost("base", "busy"), watch.line)
     lives(watch, ["beat", 3], ["beat", 78])
@@ -427,7 +427,7 @@ def test_lost_port_is_opened_again_each_second_and_its_reason_told_once(watch, m
     assert asked == [("/dev/serial/by-id/base", 57_600)] * 6
     told = [event["reason"].split(";")[0] for event in watch.events if event["event"] == "port_lost"]
     assert told == ["base: unplugged", "base: unplugged", "base: busy"]
-    assert watch.clock.slept == [1.0] * 5
+    assert watch.clock.slept == [0.1] * 5
     told = [entry for entry in watch.manager.told if entry != ("alive", "")]
     assert [status.split(";")[0] for _, status in told] == [
         "base: unplugged", "base: unplugged", "base: unplugged", "base: busy"
@@ -435,11 +435,27 @@ def test_lost_port_is_opened_again_each_second_and_its_reason_told_once(watch, m
     assert [data for _, data in watch.line.written].count(b"closed") == 2
 
 
-def test_port_is_opened_again_after_a_second_of_the_clock(watch, monkeypatch):
+def test_port_is_tried_again_after_a_tenth_of_a_second_of_the_clock(watch, monkeypatch):
     opens(monkeypatch, PortLost("base", "unplugged"), watch.line)
     lives(watch, ["beat", 78])
     watchdog._guard_always(settings(speed=4.0))
-    assert watch.clock.slept == [0.25]
+    assert watch.clock.slept == [0.025]
+
+
+def test_base_that_rolls_is_stopped_within_a_tenth_of_a_second_of_the_return_of_its_port(watch, monkeypatch):
+    returns_at = watch.clock.now + 0.45
+
+    def open_port(_path, _baud):
+        if watch.clock.now < returns_at:
+            raise PortLost("base", "no such device")
+        return watch.line
+
+    monkeypatch.setattr(watchdog, "open_port", open_port)
+    lives(watch, ["beat", 78])
+    watchdog._guard_always(settings())
+    at, data = watch.line.written[0]
+    assert data == b"stop"
+    assert returns_at <= at < returns_at + 0.1
 
 
 def test_name_of_a_port_that_may_change_is_refused(watch, monkeypatch):

@@ -41,7 +41,9 @@ STARTUP_S: Final = 15.0
 """Real seconds until a guardian without any heartbeat is killed as hung; the wheels are at rest meanwhile."""
 REPEAT_S: Final = 0.1
 RESTART_S: Final = 0.3
-REOPEN_S: Final = 1.0
+REOPEN_S: Final = 0.1
+"""A base whose adapter is lost for a moment rolls on until its port is open again: an adapter that the bus has reset is
+back within half a second."""
 TERMINATE_S: Final = 1.0
 REALTIME_PRIORITY: Final = 15
 """Above the guardian's 10 and the agent's 5: each must be able to act when the next one takes all the time."""

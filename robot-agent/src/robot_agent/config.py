@@ -274,11 +274,15 @@ def _with_motion(config: AgentConfig, motion: MotionSettings) -> AgentConfig:
         acc_v=motion.acceleration_m_s2,
         acc_w=motion.turn_acceleration_rad_s2,
     )
+    creep = min(config.safety.speed_egress, motion.degraded_speed_m_s)
+    longer = config.safety.speed_egress / creep
     safety = replace(
         config.safety,
         speed_normal=motion.speed_m_s,
         speed_degraded=motion.degraded_speed_m_s,
-        speed_egress=min(config.safety.speed_egress, motion.degraded_speed_m_s),
+        speed_egress=creep,
+        undock_max=config.safety.undock_max * longer,
+        advance_max=config.safety.advance_max * longer,
     )
     moving = replace(config.motion, limits=limits, jerk_v=motion.jerk_m_s3, jerk_w=motion.turn_jerk_rad_s3)
     return replace(config, motion=moving, safety=safety)

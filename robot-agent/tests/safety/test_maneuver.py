@@ -7,6 +7,10 @@ import math
 import pytest
 from msgspec.structs import replace
 
+from fog_contracts.robot import BaseSettings, LidarSettings, MotionSettings, RobotSettings
+from robot_agent.agent.maneuvering.maneuvers import ADVANCE_M, UNDOCK_M
+from robot_agent.config import agent_config
+from robot_agent.hardware import DriveTrain, LidarTraits
 from robot_agent.safety.conditions import SafetyInputs
 from robot_agent.safety.gate import SafetyState, step
 from robot_agent.safety.maneuver import Maneuver
@@ -176,3 +180,25 @@ def test_egress_ends_after_sixty_seconds():
 @pytest.mark.parametrize("remaining", [math.nan, -math.inf])
 def test_impossible_distance_ends_an_egress(remaining):
     assert Gate().leaving().run(maneuver_remaining=remaining).mode == "INIT"
+
+
+@pytest.mark.parametrize("degraded_m_s", [0.15, 0.05, 0.02])
+@pytest.mark.parametrize(("kind", "way"), [("undock", UNDOCK_M), ("advance", ADVANCE_M)])
+def test_robot_that_may_only_creep_comes_to_the_end_of_a_straight_way(kind, way, degraded_m_s):
+    parts = {"base": BaseSettings(driver="b"), "lidar": LidarSettings(driver="l")}
+    settings = RobotSettings(**parts, motion=MotionSettings(degraded_speed_m_s=degraded_m_s))
+    base, lidar = (
+        DriveTrain(axle_m=0.2, wheel_speed_max_m_s=0.5),
+        LidarTraits(range_min_m=0.1, range_max_m=8.0, scan_period_s=0.2),
+    )
+    config = agent_config("r1", b"", base, lidar, boot="b", settings=settings).safety
+    where = {"docked_for": 9.0} if kind == "undock" else {"localization": "weak"}
+    state, out = step(SafetyState(), SafetyInputs(**HEALTHY | where, request=kind), 100.0, config)
+    assert out.refusal is None
+    # Half a second to get going, and the stop field slows it down by a fifth.
+    now, left = 100.5, way
+    while state.maneuver is not None:
+        now, left = now + DT, left - 0.8 * out.cap * DT
+        state, out = step(state, SafetyInputs(**HEALTHY | where, maneuver_remaining=left), now, config)
+    assert left <= 0.0, state.maneuver_end
+    assert "longer than" not in state.maneuver_end

@@ -4,7 +4,7 @@ import json
 import math
 
 import pytest
-from hypothesis import given
+from hypothesis import example, given
 from hypothesis import strategies as st
 
 from robot_agent.bases.roomba600.emulator import BOOT_TEXT, FULL, OFF, PASSIVE, SAFE, Battery, RoombaEmulator
@@ -240,6 +240,7 @@ def test_an_empty_battery_switches_the_robot_off():
 
 
 @given(st.binary(max_size=300), st.lists(st.integers(1, 40), max_size=12))
+@example(b"\x85\xad", [1])  # Power, then Stop, which a sleeping robot does not hear
 def test_any_bytes_in_any_pieces_have_the_same_effect_and_never_raise(data, sizes):
     whole, cut = awake(), awake()
     whole.receive(data, 0.0)

@@ -31,6 +31,10 @@ class CommandParser:
     def __init__(self) -> None:
         self._incoming = bytearray()
 
+    def forget(self) -> None:
+        """Discard what is not parsed yet."""
+        self._incoming.clear()
+
     def parse(self, data: bytes) -> Iterator[tuple[int, bytes]]:
         """Add bytes; yield the opcode and the data bytes of each whole command."""
         self._incoming += data
@@ -180,6 +184,7 @@ class RoombaEmulator:
         elif opcode == 133:
             self._leave(PASSIVE)
             self.asleep = True
+            self._commands.forget()
         elif opcode in {130, 131, 132}:
             self._stop_search()
             self.mode = FULL if opcode == 132 else SAFE

@@ -7,6 +7,7 @@ from plain_base import DockingBase, PlainBase, Rig
 
 from robot_agent.bases.roomba600.driver import Roomba600Driver, Roomba600Options
 from robot_agent.bases.roomba600.emulator import FULL, PASSIVE, SAFE, Quirks, RoombaEmulator
+from robot_agent.bases.roomba600.stop import STOP
 from robot_agent.guardian.core import GuardianCore
 from robot_agent.guardian.link import WheelCommand
 
@@ -476,6 +477,27 @@ def test_roomba_drives_into_its_dock_charges_there_and_leaves_it(quirks):
     assert roomba.core.latched is None
     assert roomba.robot.mode == SAFE
     assert 0.0 < roomba.full_s < 1.0
+
+
+@pytest.mark.parametrize("quirks", [*QUIRKS, {"stays_safe_on_dock": True}])
+def test_roomba_on_its_dock_charges_on_after_a_restart_of_the_guardian_and_leaves_it(quirks):
+    roomba = Roomba(0.7, **quirks)
+    roomba.asked = "seek_dock"
+    assert roomba.run(15.0, lambda r: r.feedback.status.docked)
+    roomba.asked = None
+    roomba.run(1.0)
+    roomba.robot.receive(STOP.stop, roomba.now)  # the watchdog's, which brings some into Safe mode on the dock, too
+    for _ in range(10):  # it sends on while the next guardian starts
+        roomba.now += 0.01
+        roomba.robot.tick(roomba.now, 0.01)
+    roomba.core = GuardianCore(Roomba600Driver(Roomba600Options()))
+    roomba.run(3.0)
+    assert roomba.robot.mode == PASSIVE
+    assert roomba.robot.battery.current_ma > 0
+    before = roomba.ahead
+    roomba.asked, roomba.speed = "leave_dock", -0.1
+    assert roomba.run(5.0, lambda r: r.ahead - before > 0.25), roomba.feedback.stopped
+    assert (roomba.core.latched, roomba.robot.mode) == (None, SAFE)
 
 
 def test_roomba_that_is_stopped_on_its_way_to_the_dock_is_in_safe_mode_within_0_1_s():

@@ -192,7 +192,7 @@ class GuardianCore:
         if not base.awake:
             due = base.woken_at is None or now - base.woken_at > timing.wake_timeout
             # A base that does not drive on its charger is left alone there: waking it would only disturb the charging.
-            if due and not self._charging(now):
+            if due and (not self._charging(now) or self._is_unknown()):
                 return Output(self._wake(now), self._reminder(now), self._attempt(now))
             # The wake command may have been lost, and the base may still roll at an old speed.
             repeat = now - self._sent_at >= REPEAT_S
@@ -223,6 +223,14 @@ class GuardianCore:
             self.driver.use_baud(attempt.baud)
             self._base.woken_at = None
         return attempt
+
+    def _is_unknown(self) -> bool:
+        """Return whether a base that finds its dock was never woken: one that sends since before may be in any mode.
+
+        In its driving mode it would not charge, and could not leave its dock. On its charger it is only brought out of
+        that mode when it is woken.
+        """
+        return self._base.woken_at is None and isinstance(self.driver, DockingDriver)
 
     def _charging(self, now: float) -> bool:
         fresh = now - self._base.reading_at <= self.driver.timing.frame_timeout

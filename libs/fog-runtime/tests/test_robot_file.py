@@ -55,7 +55,18 @@ def test_a_file_sets_what_it_names_and_the_rest_keeps_its_default():
 @pytest.mark.parametrize(
     ("old", "new", "message"),
     [
-        ("speed_m_s = 0.2", "speed_m_s = 3", r"robot.toml:19: motion.speed_m_s: Expected `float` <= 0.3"),
+        (
+            "speed_m_s = 0.2",
+            "speed_m_s = 3",
+            r"robot.toml:19: motion.speed_m_s: Expected `float` <= 0.3. It has 3, and takes 0.05 to 0.3$",
+        ),
+        ("x_m = 0.1", 'x_m = "0.1"', r'robot.toml:16: lidar.x_m: .* It has "0.1", and takes -1 to 1$'),
+        ("x_m = 0.1", "mirrored = 1", r"robot.toml:16: lidar.mirrored: .* It has 1, and takes true or false$"),
+        ("[2.0, 2.5]", "[90, 95]", r"robot.toml:12: lidar.masks: .* takes list of \[2 numbers, -6.284 to 6.284\]$"),
+        ('"tank"', '"My tank"', r'robot.toml:3: base.driver: .* "My tank", and takes a name of letters, digits'),
+        ("[motion]", "[[motion]]", r"robot.toml:18: motion: .* takes a table, \[motion\]$"),
+        ("[motion]", "[lidar.options]\n[motion]\noptions = 1979-05-27", r"robot.toml:20: motion.options: there is no"),
+        ("x_m = 0.1", "x_m = 1979-05-27", r"robot.toml:16: lidar.x_m: .* It has 1979-05-27, and takes -1 to 1$"),
         ("x_m = 0.1", "x = 0.1", r"robot.toml:16: lidar.x: there is no such setting. .* driver, port, x_m"),
         ("x_m = 0.1", "x_m = nan", r"robot.toml:16: lidar.x_m: "),
         ("[2.0, 2.5]", "[2.0]", r"robot.toml:12: lidar.masks: "),
@@ -71,8 +82,23 @@ def test_a_mistake_is_named_with_its_line_and_remedy(old, new, message):
 
 
 def test_a_wrong_option_of_a_driver_is_named_with_its_line():
-    with pytest.raises(SettingsError, match=r"robot.toml:7: base.options.axle_m: .* Its options: axle_m, colour"):
+    with pytest.raises(SettingsError, match=r"robot.toml:7: base.options.axle_m: .* It has true, and takes a number$"):
         parse(TEXT.replace("axle_m = 0.25", "axle_m = true")).options("base", TankOptions)
+    with pytest.raises(
+        SettingsError, match=r"robot.toml:8: base.options.colour: .* It has 3, and takes a text in quotes$"
+    ):
+        parse(TEXT.replace('"red # [not a table]"', "3")).options("base", TankOptions)
+    with pytest.raises(SettingsError, match=r"robot.toml:7: base.options.axle: .* Its options: axle_m, colour$"):
+        parse(TEXT.replace("axle_m = 0.25", "axle = 0.25")).options("base", TankOptions)
+
+
+def test_a_byte_order_mark_is_no_mistake_and_another_encoding_is_named(tmp_path):
+    file = tmp_path / "robot.toml"
+    file.write_bytes(b"\xef\xbb\xbf" + TEXT.encode())
+    assert load_robot({ROBOT_FILE: str(file)}).settings == parse().settings
+    file.write_bytes("# Größe\n".encode("latin-1") + TEXT.encode())
+    with pytest.raises(SettingsError, match=r"robot.toml can't be read: it is no text in UTF-8 .* Save it as UTF-8"):
+        load_robot({ROBOT_FILE: str(file)})
 
 
 def test_variables_override_single_settings():

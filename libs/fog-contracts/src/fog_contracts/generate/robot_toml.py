@@ -68,6 +68,28 @@ def tables(settings: msgspec.Struct, options: Mapping[str, msgspec.Struct], pref
         yield from tables(struct, options, f"{name}.")
 
 
+def accepted_values(kind: type[msgspec.Struct], name: str) -> str:
+    """Return which values a setting of a table takes, in words; empty if it has no such setting, or takes any text."""
+    table = inspect.type_info(kind)
+    assert isinstance(table, inspect.StructType)
+    types = {field.encode_name: field.type for field in table.fields}
+    if name not in types:
+        return ""
+    inner = types[name]
+    while isinstance(inner, inspect.Metadata):
+        inner = inner.type
+    if isinstance(inner, inspect.StructType | inspect.DictType):
+        return f"a table, [{name}]"
+    if isinstance(inner, inspect.StrType):
+        return "a name of letters, digits, ., _ and -, in quotes" if inner.pattern else "a text in quotes"
+    return _values(inner)
+
+
+def setting_text(value: object) -> str:
+    """Return a value of any kind that a TOML file can have, as it has it there."""
+    return _toml(value)
+
+
 def robot_settings_markdown(settings: RobotSettings, drivers: Iterable[tuple[str, msgspec.Struct]]) -> str:
     """Return the document of all settings; `drivers` are the options of each driver, by the table's title."""
     lines = [
@@ -152,4 +174,4 @@ def _toml(value: object) -> str:
         return f"[{', '.join(_toml(item) for item in value)}]"
     if isinstance(value, str):
         return msgspec.json.encode(value).decode()
-    return repr(value)
+    return str(value)

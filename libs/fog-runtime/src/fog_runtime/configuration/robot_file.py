@@ -55,7 +55,8 @@ class RobotFile:
         except msgspec.ValidationError as error:
             key, problem = _explain(error)
             known = ", ".join(item.encode_name for item in msgspec.structs.fields(kind)) or "none"
-            raise self.error(f"{part}.options{'.' if key else ''}{key}", problem, f"Its options: {known}") from error
+            remedy = _values_remedy(kind, key, given) or f"Its options: {known}"
+            raise self.error(f"{part}.options{'.' if key else ''}{key}", problem, remedy) from error
 
 
 def default_robot(base: str = DEFAULT_BASE, lidar: str = DEFAULT_LIDAR) -> RobotFile:
@@ -80,7 +81,7 @@ def parse_robot(text: str | None, path: Path | None, environ: Mapping[str, str])
     except msgspec.ValidationError as error:
         key, problem = _explain(error)
         place = _place(key, path, lines, variables)
-        raise SettingsError(f"{place}: {problem}. {_remedy(key, path)}") from error
+        raise SettingsError(f"{place}: {problem}. {_remedy(key, path, tree)}") from error
     return RobotFile(settings=settings, path=path, lines=lines, variables=variables)
 
 
@@ -104,11 +105,15 @@ def _flat(tree: Mapping[str, Any], prefix: str = "") -> dict[str, object]:
 
 def _text(path: Path) -> str:
     try:
-        return path.read_text("utf-8")
-    except (OSError, UnicodeDecodeError) as error:
-        reason = error.strerror if isinstance(error, OSError) else error
+        return path.read_text("utf-8-sig")  # some editors begin a file with a mark that TOML does not know
+    except OSError as error:
         raise SettingsError(
-            f"{ROBOT_FILE}: {path} can't be read: {reason}. Name a file that `fognav robot new` wrote"
+            f"{ROBOT_FILE}: {path} can't be read: {error.strerror}. Name a file that `fognav robot new` wrote"
+        ) from error
+    except UnicodeDecodeError as error:
+        raise SettingsError(
+            f"{ROBOT_FILE}: {path} can't be read: it is no text in UTF-8 ({error}). Save it as UTF-8, or name a file "
+            "that `fognav robot new` wrote"
         ) from error
 
 
@@ -154,15 +159,32 @@ def _explain(error: msgspec.ValidationError) -> tuple[str, str]:
     return key, problem
 
 
-def _remedy(key: str, path: Path | None) -> str:
+def _remedy(key: str, path: Path | None, tree: Mapping[str, Any]) -> str:
     kind: Any = RobotSettings
-    for name in key.split(".")[:-1]:
+    table: object = tree
+    *tables, name = key.split(".")
+    for inner in tables:
         fields = {item.encode_name: item.type for item in msgspec.structs.fields(kind)}
-        if name not in fields or not isinstance(fields[name], type):
+        if inner not in fields or not isinstance(fields[inner], type):
             break
-        kind = fields[name]
+        kind = fields[inner]
+        table = table.get(inner) if isinstance(table, Mapping) else None
+    if isinstance(table, Mapping) and (remedy := _values_remedy(kind, name, table)):
+        return remedy
     known = ", ".join(item.encode_name for item in msgspec.structs.fields(kind))
     return f"Correct it{' there' if path else ''}; settings at this place: {known}"
+
+
+def _values_remedy(kind: type[msgspec.Struct], name: str, table: Mapping[str, Any]) -> str:
+    """Return what a setting with a wrong value has and what it takes; empty if it is missing, unknown or a table."""
+    # Only who has made a mistake waits for it: the watchdog reads this file, too, and needs none of it.
+    from fog_contracts.generate.robot_toml import accepted_values, setting_text  # noqa: PLC0415  # see above
+
+    values = accepted_values(kind, name)
+    given = table.get(name)
+    if not values or given is None or isinstance(given, Mapping):
+        return ""
+    return f"It has {setting_text(given)}, and takes {values}"
 
 
 def _place(key: str, path: Path | None, lines: dict[str, int], variables: Mapping[str, str]) -> str:

@@ -65,6 +65,38 @@ def test_check_prints_the_effective_settings_or_the_line_of_a_mistake(tmp_path):
     assert "robot.toml:61: body.footprint: " in problem
 
 
+@pytest.mark.parametrize(
+    ("base", "lidar", "place", "problem"),
+    [
+        ("/dev/ttyUSB0", "", "11: base.port", "/dev/ttyUSB0 is no name to rely on"),
+        ("", "/dev/ttyACM7", "35: lidar.port", "/dev/ttyACM7 is no name to rely on"),
+        ("/dev/serial/by-id/a", "/dev/serial/by-id/a", "35: lidar.port", "the port of the base, too"),
+    ],
+)
+def test_check_refuses_the_ports_that_no_process_would_open(tmp_path, base, lidar, place, problem):
+    file = tmp_path / "robot.toml"
+    first, second, third = robot_text(default_robot()).split('port = ""')
+    file.write_text(f'{first}port = "{base}"{second}port = "{lidar}"{third}')
+    result = run(app, ["robot", "check", str(file), "--json"])
+    assert result.exit_code == 1
+    assert f"robot.toml:{place}: " in json.loads(result.stdout)["problem"]
+    assert problem in json.loads(result.stdout)["problem"]
+
+
+def test_check_prints_what_a_file_may_say_and_names_the_ports_that_are_not_set(tmp_path):
+    file = tmp_path / "robot.toml"
+    file.write_text(robot_text(default_robot()).replace('port = ""', 'port = "/dev/serial/by-id/a"', 1))
+    result = run(app, ["robot", "check", str(file)])
+    assert result.exit_code == 0
+    printed = result.output.splitlines()
+    assert 'base.driver = "roomba600"' in printed
+    assert "lidar.mirrored = false" in printed
+    assert "odometry.alphas = [0.05, 0.05, 0.05, 0.05]" in printed
+    assert [line for line in printed if "is not set" in line] == [
+        "lidar.port is not set: a robot needs it, a demo does not"
+    ]
+
+
 def test_new_overwrites_nothing_and_knows_its_parts(tmp_path):
     file = tmp_path / "robot.toml"
     file.write_text("mine")

@@ -83,7 +83,9 @@ def robot_check(
     FOGNAV_ variables that override single settings count, as they do for the robot's processes.
     """
     try:
-        values = effective(load_robot({**os.environ, ROBOT_FILE: str(file)}))
+        robot = load_robot({**os.environ, ROBOT_FILE: str(file)})
+        values = effective(robot)
+        unset = check_ports(robot)
     except SettingsError as error:
         if json:
             print_json({"ok": False, "problem": str(error)})
@@ -92,8 +94,27 @@ def robot_check(
     if json:
         print_json({"ok": True, **values})
         return
+    from fog_contracts.generate.robot_toml import setting_text  # noqa: PLC0415  # keeps the other commands fast
+
     for name, value in values.items():
-        print_line(f"{name} = {value}")
+        print_line(f"{name} = {setting_text(value)}")
+    for name in unset:
+        print_line(f"{name} is not set: a robot needs it, a demo does not")
+
+
+def check_ports(robot: RobotFile) -> list[str]:
+    """Return the settings of ports that are empty; raises `SettingsError` for a port that no process would open."""
+    from robot_agent.port_names import PortNameError, check_port_name  # noqa: PLC0415  # as the drivers
+
+    ports = {"base.port": robot.settings.base.port, "lidar.port": robot.settings.lidar.port}
+    for name, port in ports.items():
+        try:
+            check_port_name(port)
+        except PortNameError as error:
+            raise robot.error(name, str(error), "On the robot: ls -l /dev/serial/by-id /dev/serial/by-path") from error
+    if ports["base.port"] and ports["base.port"] == ports["lidar.port"]:
+        raise robot.error("lidar.port", "this is the port of the base, too", "Give each device its own")
+    return [name for name, port in ports.items() if not port]
 
 
 def robot_text(robot: RobotFile) -> str:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import pty
 import select
+import signal
 import socket
 import time
 import tty
@@ -20,6 +21,7 @@ from robot_agent.guardian.core import GuardianCore
 from robot_agent.guardian.heartbeat import LONGEST_S
 from robot_agent.guardian.link import WheelCommand, encode
 from robot_agent.guardian.process import Guardian, GuardianSettings
+from robot_agent.hardware import Awakening, WakeLine
 from robot_agent.registry import make_base, signatures
 from robot_agent.serial_port import Port, open_port
 
@@ -137,3 +139,13 @@ def test_commands_wake_a_guardian_at_rest_and_frames_one_whose_wheels_turn(rig):
     rig.cycle(LONG_S)  # which the end of the link ends
     assert time.monotonic() - begun < LONGEST_S + 1.0 + late.seconds()
     assert rig.guardian._agent is None
+
+
+@pytest.mark.parametrize(("line", "released"), [(WakeLine("rts", 1.2), [("rts", False)] * 2), (None, [])])
+def test_line_that_wakes_the_base_is_free_after_the_begin_and_the_end_of_a_guardian(rig, monkeypatch, line, released):
+    lines = []
+    monkeypatch.setattr(Port, "set_line", lambda _port, name, *, on: lines.append((name, on)))
+    rig.core.driver.awakening = Awakening(bauds=(115200,), line=line)
+    rig.guardian.end(signal.SIGTERM, None)
+    assert rig.guardian.run() == 0
+    assert lines == released

@@ -98,6 +98,8 @@ class Guardian:
         self._wakeups.watch(self._settings.watchdog_fd, self._on_watchdog_lost)
         self._wakeups.watch(self._listener.fileno(), self._accept)
         try:
+            # Linux sets a port's control lines when it is opened: the base would see no edge of the first pulse.
+            self._release_line()
             # Bytes that arrived before this process started are stale.
             self._port.discard_input()
             if (problem := self._wrong_device()) is not None:
@@ -106,6 +108,7 @@ class Guardian:
                 self._wait(self._frames.wait(self._clock.now()) if self._moving else RESTING_S)
                 self._cycle()
             self._port.write(self._core.stop_command())
+            self._release_line()  # in the middle of a pulse, too
         except PortLost as error:
             self._log.error("port_lost", reason=str(error))
             return PORT_LOST
@@ -279,6 +282,11 @@ class Guardian:
         if attempt.line is not None:
             self._port.set_line(attempt.line.name, on=True)
             self._pulse = (attempt.line.name, self._clock.now() + attempt.line.seconds)
+
+    def _release_line(self) -> None:
+        """Clear the line that wakes the base, if one is wired."""
+        if (line := self._core.driver.awakening.line) is not None:
+            self._port.set_line(line.name, on=False)
 
     def _end_pulse(self) -> None:
         if self._pulse is not None and self._clock.now() >= self._pulse[1]:

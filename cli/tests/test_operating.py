@@ -428,6 +428,26 @@ def test_goal_is_a_place_or_a_position(demo: Service, command: list[str], goal: 
     assert demo.requests[0][2] == body
 
 
+@pytest.mark.parametrize("goal", ["5.0", "Meeting room", ""])
+def test_goal_that_is_neither_a_place_nor_a_position_is_wrong_use(demo: Service, goal: str) -> None:
+    assert "is neither a place" in run("robot", "goal", goal, code=2)
+    assert demo.requests == []
+
+
+@pytest.mark.parametrize(
+    ("mode", "said"),
+    [
+        ("NORMAL", "robot r1 goes to b"),
+        ("INIT", "robot r1 goes to b; it waits to be enabled (fognav robot enable)"),
+        ("FAULT", "robot r1 goes to b; it waits to be reset and enabled (fognav robot reset, fognav robot enable)"),
+    ],
+)
+def test_accepted_goal_says_what_a_robot_that_stands_waits_for(demo: Service, mode: str, said: str) -> None:
+    demo.answers["PUT", "/api/v1/robots/r1/goal"] = (200, {})
+    demo.answers["GET", "/api/v1/robots"] = (200, [{**ROBOT, "state": {**ROBOT["state"], "mode": mode}}])
+    assert json.loads(run("robot", "goal", "b", "--json"))["reason"] == said
+
+
 def test_refused_goal_is_reported_with_its_reason_and_exit_code_1(demo: Service) -> None:
     demo.answers["PUT", "/api/v1/robots/r1/goal"] = (422, {"detail": "the goal is in a wall"})
     demo.answers["GET", "/api/v1/robots"] = (200, [ROBOT])

@@ -6,13 +6,13 @@ import math
 import sys
 import time
 from collections.abc import Mapping
-from typing import Annotated, Any
+from typing import Annotated, Any, Final
 
 import msgspec
 import typer
 
 from fog_contracts.commands import PROFILE_OF, STOPS
-from fog_contracts.messages import CommandKind, Pose, ProfileName
+from fog_contracts.messages import CommandKind, Id, Mode, Pose, ProfileName
 from fog_runtime import logs
 from fognav.operate import rest_commands
 from fognav.operate.fog import Fog, RefusedError, find_fog
@@ -22,6 +22,12 @@ from fognav.operate.systems import MAP_SERVICE, PLANNER
 from fognav.output import NOT_TRUE, FailedError, WrongUseError, envelope, exit_codes, print_json, print_line
 
 robot_app = typer.Typer(help="Enable, stop and send robots, and watch them.", no_args_is_help=True)
+
+_WAITS_FOR: Final[Mapping[Mode | None, str]] = {
+    "INIT": "; it waits to be enabled (fognav robot enable)",
+    "FAULT": "; it waits to be reset and enabled (fognav robot reset, fognav robot enable)",
+}
+"""What keeps a robot from a goal that was accepted, until its operator does it."""
 
 Target = Annotated[str, typer.Argument(metavar="PLACE|X,Y[,THETA]", help="A place of the site, or metres and radians.")]
 Start = Annotated[str, typer.Argument(metavar="PLACE|X,Y,THETA", help="A place of the site, or metres and radians.")]
@@ -167,7 +173,7 @@ def robot_goal(goal: Target, *, robot: RobotOption = None, fog: FogOption = None
         except RefusedError as error:
             _report(Outcome(accepted=False, reason=str(error), mode=_view(found, chosen)[1]), json=json)
         mode = _view(found, chosen)[1]
-        waits = "; it waits to be enabled (fognav robot enable)" if mode == "INIT" else ""
+        waits = _WAITS_FOR.get(mode, "")
         _report(Outcome(accepted=True, reason=f"robot {chosen} goes to {goal}{waits}", mode=mode), json=json)
 
 
@@ -293,7 +299,13 @@ def _place(fog: Fog, text: str) -> Mapping[str, Any] | None:
 
 def _goal(text: str) -> dict[str, object]:
     if "," not in text:
-        return {"place": text}
+        try:
+            return {"place": msgspec.convert(text, Id)}
+        except msgspec.ValidationError as error:
+            raise WrongUseError(
+                f"{text!r} is neither a place, which has only a to z, 0 to 9 and -, nor X,Y[,THETA], such as "
+                "12.5,3,1.57; metres, separated by commas"
+            ) from error
     x, y, *theta = numbers(text, (2, 3), "X,Y[,THETA]")
     return {"pose": {"x": x, "y": y, **({"theta": theta[0]} if theta else {})}}
 

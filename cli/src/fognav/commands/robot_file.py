@@ -104,7 +104,7 @@ def robot_check(
 
 def check_ports(robot: RobotFile) -> list[str]:
     """Return the settings of ports that are empty; raises `SettingsError` for a port that no process would open."""
-    from robot_agent.port_names import PortNameError, check_port_name  # noqa: PLC0415  # as the drivers
+    from robot_agent.port_names import PortNameError, check_port_name  # noqa: PLC0415  # keeps the others fast
 
     ports = {"base.port": robot.settings.base.port, "lidar.port": robot.settings.lidar.port}
     for name, port in ports.items():

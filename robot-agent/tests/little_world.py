@@ -254,8 +254,8 @@ class LittleWorld:
                 self.worst_error = tuple(max(pair) for pair in zip(self.worst_error, self.error(), strict=True))
         if self.steps % 10 == 0:
             self.published.extend(self.agent.tick(self.moment))
-            if self.agent.egress_request(self.now) is not None:
-                self.agent.on_egress_reply(PlanReply(points=self.way_out), self.now)
+            if (request := self.agent.egress_request(self.now)) is not None:
+                self.agent.on_egress_reply(request, PlanReply(points=self.way_out), self.now)
 
     def _control(self):
         if (search := self.agent.search(self.now)) is not None:

@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 
     from fog_contracts.bus import Bus
     from fog_contracts.handlers import Handler, Ids, Moment, Publication, QueryHandler
-    from fog_contracts.messages import Pose, ProfileName, Zone
+    from fog_contracts.messages import EgressRequest, Pose, ProfileName, Zone
     from hazard_aggregator.core import Aggregator
     from map_service.core import MapCore
     from planner.core import PlannerCore
@@ -216,7 +216,8 @@ class AgentProcess:
         self.received_bytes = 0
         """Bytes of the messages that were received and are of use in the robot's profile."""
         self._map_due = 0.0
-        self._way_out_until: float | None = None
+        self._way_out: tuple[EgressRequest, float] | None = None
+        """The newest request for a way out without a reply, and when its query times out."""
         handlers = {channel: self._measured(channel, handler) for channel, handler in core.handlers().items()}
         bus.subscribe(handlers, only={"robot": robot})
         bus.serve(core.query_handlers(), only={"robot": robot})
@@ -284,21 +285,21 @@ class AgentProcess:
         self._ask_for_way_out(at)
 
     def _ask_for_way_out(self, at: Moment) -> None:
-        if self._way_out_until is not None and at.now >= self._way_out_until:
-            self._on_way_out(self._way_out_until, None, at)
+        if self._way_out is not None and at.now >= self._way_out[1]:
+            self._on_way_out(self._way_out, None, at)
         if (request := self.core.egress_request(at.now)) is not None:
-            until = self._way_out_until = at.now + QUERY_TIMEOUT_S if self.link.whole else at.now
+            asked = self._way_out = (request, at.now + QUERY_TIMEOUT_S if self.link.whole else at.now)
             self.link.ask(
                 lambda when: self._bus.query(ch.PLANNER_EGRESS, request, PlanReply, when),
-                lambda reply, when: self._on_way_out(until, reply, when),
+                lambda reply, when: self._on_way_out(asked, reply, when),
                 at,
             )
 
-    def _on_way_out(self, asked: float, reply: PlanReply | None, at: Moment) -> None:
-        """Pass on the reply to the query that times out at `asked`; one that comes later is nobody's."""
-        if asked == self._way_out_until:
-            self._way_out_until = None
-            self.core.on_egress_reply(reply, at.now)
+    def _on_way_out(self, asked: tuple[EgressRequest, float], reply: PlanReply | None, at: Moment) -> None:
+        """Pass on the reply to the newest query; one that comes after its time is nobody's."""
+        if asked is self._way_out:
+            self._way_out = None
+            self.core.on_egress_reply(asked[0], reply, at.now)
 
 
 class Fog:

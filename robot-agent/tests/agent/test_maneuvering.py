@@ -129,6 +129,11 @@ def outputs(mode="EGRESS") -> SafetyOutputs:
 WAY_OUT = PlanReply(points=[(0.0, 0.0), (1.0, 0.0)])
 
 
+def ask_and_reply(egress, reply, pose, now):
+    """Let the planner answer at once."""
+    egress.on_reply(egress.request(ORIGIN, outputs(), now), reply, pose, now)
+
+
 def test_planner_is_asked_once_a_second_until_it_gives_a_way_out():
     egress = Egress(AGENT)
     assert egress.request(ORIGIN, outputs("INIT"), 5.0) is None
@@ -139,8 +144,9 @@ def test_planner_is_asked_once_a_second_until_it_gives_a_way_out():
     assert egress.request(ORIGIN, outputs(), 5.99) is None
     assert egress.request(ORIGIN, outputs(), 6.0) is not None
     egress.begin()
-    assert egress.request(ORIGIN, outputs(), 6.1) is not None, "a new egress asks at once"
-    egress.on_reply(WAY_OUT, ORIGIN, 6.2)
+    newest = egress.request(ORIGIN, outputs(), 6.1)
+    assert newest is not None, "a new egress asks at once"
+    egress.on_reply(newest, WAY_OUT, ORIGIN, 6.2)
     assert egress.request(ORIGIN, outputs(), 60.0) is None
 
 
@@ -148,18 +154,48 @@ def test_what_keeps_the_robot_from_a_way_out_is_told_until_there_is_one():
     egress = Egress(AGENT)
     assert egress.problem(None) is None
     assert egress.problem("a chair") == "a chair"
-    egress.on_reply(None, ORIGIN, 1.0)
+    ask_and_reply(egress, None, ORIGIN, 1.0)
     assert egress.problem("a chair") == "the planner does not answer"
-    egress.on_reply(PlanReply(refusal=Refusal(code=208, reason="walled in")), ORIGIN, 2.0)
+    ask_and_reply(egress, PlanReply(refusal=Refusal(code=208, reason="walled in")), ORIGIN, 2.0)
     assert egress.problem(None) == "walled in"
-    egress.on_reply(PlanReply(points=[(0.0, 0.0)]), ORIGIN, 3.0)
+    ask_and_reply(egress, PlanReply(points=[(0.0, 0.0)]), ORIGIN, 3.0)
     assert egress.remaining == math.inf, "one point is no way"
-    egress.on_reply(WAY_OUT, None, 4.0)
+    ask_and_reply(egress, WAY_OUT, None, 4.0)
+    assert egress.remaining == math.inf, "it can't tell whether the way begins here"
+    assert egress.problem(None) == "the robot does not know where it is"
+    earlier = egress.request(Pose2(0.1, 0.0, 0.0), outputs(), 5.0)
+    ask_and_reply(egress, WAY_OUT, ORIGIN, 6.0)
     assert egress.problem(None) is None
-    egress.on_reply(None, ORIGIN, 5.0)
+    egress.on_reply(earlier, None, ORIGIN, 7.0)
     assert egress.problem(None) is None, "a later reply changes nothing"
-    egress.on_reply(None, ORIGIN, 5.0)
     egress.begin()
+    assert (egress.remaining, egress.problem(None)) == (math.inf, None)
+
+
+@pytest.mark.parametrize(("moved_m", "followed"), [(0.2, True), (0.3, False), (2.0, False)])
+def test_way_out_that_was_asked_for_elsewhere_is_not_followed_and_asked_for_anew(moved_m, followed):
+    egress = Egress(AGENT)
+    request = egress.request(ORIGIN, outputs(), 1.0)
+    here = Pose2(0.6 * moved_m, -0.8 * moved_m, 2.0)
+    egress.on_reply(request, WAY_OUT, here, 3.9)
+    assert math.isfinite(egress.remaining) == followed
+    if not followed:
+        assert f"the robot is {moved_m:.1f} m from where it asked" in egress.problem(None)
+        assert egress.wheels(here) == (0.0, 0.0)
+        again = egress.request(here, outputs(), 4.0)
+        assert (again.pose.x, again.pose.y) == (here.x, here.y)
+        egress.on_reply(again, PlanReply(points=[(here.x, here.y), (here.x + 1.0, here.y)]), here, 4.5)
+        assert egress.remaining == pytest.approx(1.0)
+        assert egress.problem(None) is None
+
+
+@pytest.mark.parametrize("reply", [WAY_OUT, None, PlanReply(refusal=Refusal(code=208, reason="walled in"))])
+def test_reply_to_what_an_earlier_egress_asked_is_nobodys(reply):
+    egress = Egress(AGENT)
+    request = egress.request(ORIGIN, outputs(), 1.0)
+    egress.begin()
+    egress.request(Pose2(0.1, 0.0, 0.0), outputs(), 1.5)
+    egress.on_reply(request, reply, ORIGIN, 2.0)
     assert (egress.remaining, egress.problem(None)) == (math.inf, None)
 
 
@@ -167,10 +203,10 @@ def test_way_that_remains_is_counted_by_way_of_its_nearest_point():
     egress = Egress(AGENT)
     egress.advance(ORIGIN, 1.0)
     assert egress.remaining == math.inf
-    egress.on_reply(WAY_OUT, Pose2(0.25, 0.1, 0.0), 2.0)
-    assert egress.remaining == pytest.approx(0.75 + 0.1)
+    ask_and_reply(egress, WAY_OUT, Pose2(0.15, 0.1, 0.0), 2.0)
+    assert egress.remaining == pytest.approx(0.85 + 0.1)
     egress.advance(None, 3.0)
-    assert egress.remaining == pytest.approx(0.75 + 0.1)
+    assert egress.remaining == pytest.approx(0.85 + 0.1)
     egress.advance(Pose2(0.5, 0.0, 0.0), 3.0)
     assert egress.remaining == pytest.approx(0.5)
 
@@ -178,7 +214,7 @@ def test_way_that_remains_is_counted_by_way_of_its_nearest_point():
 def test_robot_follows_its_way_out_at_the_speed_of_an_egress():
     egress = Egress(AGENT)
     assert egress.wheels(ORIGIN) == (0.0, 0.0)
-    egress.on_reply(WAY_OUT, ORIGIN, 1.0)
+    ask_and_reply(egress, WAY_OUT, ORIGIN, 1.0)
     assert egress.wheels(None) == (0.0, 0.0)
     assert egress.wheels(ORIGIN) == pytest.approx((0.1, 0.1))
     left, right = egress.wheels(facing(math.pi / 2)._replace(x=0.0, y=0.0))
@@ -257,7 +293,7 @@ def test_gate_is_told_how_far_a_turn_has_to_go_and_what_stops_it(maneuvers, loca
 
 def test_gate_is_told_what_stops_an_egress_and_nothing_without_a_maneuver(maneuvers):
     assert maneuvers.inputs(state(), None, ORIGIN, 1.0) == type(maneuvers.inputs(state(), None, ORIGIN, 1.0))()
-    maneuvers.egress.on_reply(WAY_OUT, ORIGIN, 1.0)
+    ask_and_reply(maneuvers.egress, WAY_OUT, ORIGIN, 1.0)
     running = maneuvers.inputs(state("egress"), None, Pose2(0.25, 0.0, 0.0), 1.0)
     assert (running.remaining, running.problem) == (pytest.approx(0.75), "a chair")
 
@@ -288,7 +324,7 @@ def test_only_an_advance_has_a_way_ahead(maneuvers, localizer):
     ],
 )
 def test_command_of_a_maneuver_has_its_speeds_and_the_guardians_name_of_it(maneuvers, kind, wheels, by_guardian):
-    maneuvers.egress.on_reply(WAY_OUT, ORIGIN, 1.0)
+    ask_and_reply(maneuvers.egress, WAY_OUT, ORIGIN, 1.0)
     maneuvers.inputs(state(kind), None, ORIGIN, 1.0)
     driving, mode = PathDriving(AGENT), "EGRESS" if kind != "dock" else "DOCK"
     command = None
@@ -310,8 +346,8 @@ def test_wish_for_the_dock_ends_with_every_other_order(maneuvers, request_):
 
 
 def test_only_a_new_egress_forgets_the_way_out(maneuvers):
+    ask_and_reply(maneuvers.egress, WAY_OUT, ORIGIN, 1.0)
     for request_, running, kept in (("turn", None, True), ("egress", "egress", True), ("egress", None, False)):
-        maneuvers.egress.on_reply(WAY_OUT, ORIGIN, 1.0)
         maneuvers.on_request(request_, state(running))
         assert math.isfinite(maneuvers.egress.remaining) == kept
 

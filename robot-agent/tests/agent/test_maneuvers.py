@@ -12,7 +12,7 @@ from fog_contracts.messages import PlanReply
 from robot_agent.agent.maneuvering.maneuvers import Maneuvers
 from robot_agent.localization.localizer import Localizer
 from robot_agent.localization.pose import Pose2
-from robot_agent.safety.gate import SafetyState
+from robot_agent.safety.gate import SafetyOutputs, SafetyState
 from robot_agent.safety.maneuver import Maneuver
 
 END = Pose2(1.0, 0.0, 0.0)
@@ -27,8 +27,11 @@ def at_the_end_of_a_way_out():
     """Maneuvers of a robot that has just arrived at the end of its way out of a blocked area."""
     maneuvers = Maneuvers(AGENT, Localizer(), SimpleNamespace(reason=None))
     maneuvers.egress.begin()
-    reply = PlanReply(points=[(0.0, 0.0), (1.0, 0.0)])
-    maneuvers.egress.on_reply(reply, Pose2(0.0, 0.0, 0.0), 0.0)
+    begun = Pose2(0.0, 0.0, 0.0)
+    request = maneuvers.egress.request(
+        begun, SafetyOutputs("EGRESS", (), 0.1, "none", changed=False, refusal=None), 0.0
+    )
+    maneuvers.egress.on_reply(request, PlanReply(points=[(0.0, 0.0), (1.0, 0.0)]), begun, 0.0)
     assert maneuvers.inputs(state("egress"), None, Pose2(0.5, 0.0, 0.0), 1.0).remaining == pytest.approx(0.5)
     assert maneuvers.inputs(state("egress"), None, END, 5.0).remaining == pytest.approx(0.0, abs=0.01)
     return maneuvers

@@ -231,9 +231,9 @@ class AgentCore:
         """Return the query for a way out of a blocked area that is due; pass its reply to `on_egress_reply`."""
         return self._maneuvers.egress.request(self._localizer.pose(now), self.safety, now)
 
-    def on_egress_reply(self, reply: PlanReply | None, now: float) -> None:
+    def on_egress_reply(self, request: EgressRequest, reply: PlanReply | None, now: float) -> None:
         """Handle the planner's reply to an `egress_request`; None when it did not answer."""
-        self._maneuvers.egress.on_reply(reply, self._localizer.pose(now), now)
+        self._maneuvers.egress.on_reply(request, reply, self._localizer.pose(now), now)
 
     def search(self, now: float) -> Search | None:
         """Return the search for a path that is due; None in the profile `fog`. Call it before each `control_job`."""

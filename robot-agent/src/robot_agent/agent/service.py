@@ -300,7 +300,7 @@ class Service:
         except ContractError as error:
             _log.warning("egress_refused", reason=str(error))
             reply = None
-        self._core.on_egress_reply(reply, self._clock.now())
+        self._core.on_egress_reply(request, reply, self._clock.now())
 
     def _publish(self, publications: Sequence[Publication]) -> None:
         for publication in publications:

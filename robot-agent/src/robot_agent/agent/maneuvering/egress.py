@@ -25,6 +25,9 @@ if TYPE_CHECKING:
 
 _ASK_AGAIN_S: Final = 1.0
 """Pause before the planner is asked again, after it gave no way out or did not answer."""
+_FROM_HERE_M: Final = 0.25
+"""A way out that was asked for within so much of where the robot is begins here: farther than its pose's noise and what
+it still rolls, no farther than it looks ahead on the way."""
 
 
 class Egress:
@@ -35,33 +38,44 @@ class Egress:
         self._follower: PathFollower | None = None
         self._problem: str | None = None
         self._ask_at = -math.inf
+        self._asked: list[EgressRequest] = []
 
     def begin(self) -> None:
-        """Forget the way out of an earlier egress."""
+        """Forget the way out of an earlier egress, and what was asked for it: replies to that may still come."""
         self._follower = self._problem = None
         self._ask_at = -math.inf
+        self._asked.clear()
 
     def request(self, pose: Pose2 | None, safety: SafetyOutputs, now: float) -> EgressRequest | None:
         """Return the query to send to the planner now; None when none is due."""
         if safety.mode != "EGRESS" or self._follower is not None or pose is None or now < self._ask_at:
             return None
         self._ask_at = now + _ASK_AGAIN_S
-        return EgressRequest(robot=self._config.robot, pose=Pose(x=pose.x, y=pose.y, theta=pose.theta))
+        request = EgressRequest(robot=self._config.robot, pose=Pose(x=pose.x, y=pose.y, theta=pose.theta))
+        self._asked.append(request)
+        return request
 
-    def on_reply(self, reply: PlanReply | None, pose: Pose2 | None, now: float) -> None:
-        """Handle the planner's reply; None when it did not answer."""
-        if self._follower is not None:
+    def on_reply(self, request: EgressRequest, reply: PlanReply | None, pose: Pose2 | None, now: float) -> None:
+        """Handle the planner's reply to a request; None when it did not answer.
+
+        It may take seconds, in which the robot is moved, ends this egress and begins another. A way out that does not
+        begin where the robot is now is not followed; the next request asks for one that does.
+        """
+        if self._follower is not None or request not in self._asked:
             return
         if reply is None:
             self._problem = "the planner does not answer"
+        elif pose is None:
+            self._problem = "the robot does not know where it is"
+        elif (moved := math.hypot(pose.x - request.pose.x, pose.y - request.pose.y)) > _FROM_HERE_M:
+            self._problem = f"the robot is {moved:.1f} m from where it asked the planner for a way out, and asks again"
         elif reply.refusal is not None:
             self._problem = reply.refusal.reason
         elif len(reply.points) > 1:
             self._problem = None
             corners = np.array(reply.points, dtype=np.float64)
             self._follower = PathFollower(sampled(corners, PATH_SPACING_M), math.inf)
-            if pose is not None:
-                self._follower.advance(pose.x, pose.y, now)
+            self._follower.advance(pose.x, pose.y, now)
 
     def advance(self, pose: Pose2 | None, now: float) -> None:
         """Update the robot's place on the way out."""

@@ -21,7 +21,7 @@ import numpy as np
 from fog_contracts import channels as ch
 from fog_contracts.commands import sign
 from fog_contracts.handlers import completed
-from fog_contracts.messages import LoopHealth, MapSnapshot, Mode, PlanReply, RobotCommand
+from fog_contracts.messages import EgressRequest, LoopHealth, MapSnapshot, Mode, PlanReply, RobotCommand
 from robot_agent.agent.core import AgentCore
 from robot_agent.agent.prepared_map import PreparedMap
 from robot_agent.config import AgentConfig
@@ -195,9 +195,16 @@ class ScanReceived(Input, frozen=True, kw_only=True):
         )
 
 
+class EgressAsked(Input, frozen=True, kw_only=True):
+    """The robot asked the planner for a way out of a blocked area: only a reply to what it asked counts."""
+
+    now: float
+
+
 class EgressReplied(Input, frozen=True, kw_only=True):
     """The planner's reply to the query for a way out of a blocked area; None when it did not answer."""
 
+    request: EgressRequest
     reply: PlanReply | None
     now: float
 
@@ -289,8 +296,8 @@ class EntriesLost(Entry, frozen=True, kw_only=True):
 _KINDS: Final[tuple[type[Entry], ...]] = (
     Started, PoseRestored, SnapshotLoaded, MessageReceived, QueryReceived, BaseReceived, BaseLost, SuspensionNoticed,
     PoseObserved, LidarSamplesReceived, ScanReceived, LoopHealthReceived, SearchCycle, SearchEnded, ControlCycle,
-    DecisionMade, StreamCycle, Tick, StorageCheck, EgressReplied, WheelsCommanded, Published, Answered, PoseStored,
-    EntriesLost,
+    DecisionMade, StreamCycle, Tick, StorageCheck, EgressAsked, EgressReplied, WheelsCommanded, Published, Answered,
+    PoseStored, EntriesLost,
 )  # fmt: skip
 ENTRY_OF_TOPIC: Final[Mapping[str, type[Entry]]] = {f"agent/{kind.__name__}": kind for kind in _KINDS}
 TOPIC_OF_ENTRY: Final[Mapping[type[Entry], str]] = {kind: topic for topic, kind in ENTRY_OF_TOPIC.items()}
@@ -379,10 +386,17 @@ class LoggedAgent(AgentCore):
         self._write(ScanReceived.of(scan, now))
         super().on_scan(scan, now)
 
-    def on_egress_reply(self, reply: PlanReply | None, now: float) -> None:
+    def egress_request(self, now: float) -> EgressRequest | None:
+        """Return the query for a way out that is due, and log that it was asked."""
+        request = super().egress_request(now)
+        if request is not None:
+            self._write(EgressAsked(now=now))
+        return request
+
+    def on_egress_reply(self, request: EgressRequest, reply: PlanReply | None, now: float) -> None:
         """Log the reply and handle it."""
-        self._write(EgressReplied(reply=reply, now=now))
-        super().on_egress_reply(reply, now)
+        self._write(EgressReplied(request=request, reply=reply, now=now))
+        super().on_egress_reply(request, reply, now)
 
     def on_loop_health(self, health: LoopHealth) -> None:
         """Log the loops' health and record it."""

@@ -155,7 +155,7 @@ class _Run:
                 self._agent.on_suspension(entry.seconds)
             case log.PoseObserved():
                 self._agent.on_absolute_observation(entry.observation())
-            case log.EgressReplied() | log.LoopHealthReceived():
+            case log.EgressAsked() | log.EgressReplied() | log.LoopHealthReceived():
                 self._from_process(entry)
             case log.SearchCycle() | log.SearchEnded():
                 self._search(entry)
@@ -172,11 +172,14 @@ class _Run:
             request = None if channel.message is None else msgspec.convert(entry.request, channel.message)
             self._agent.query_handlers()[channel](entry.ids, request, at)
 
-    def _from_process(self, entry: log.EgressReplied | log.LoopHealthReceived) -> None:
-        if isinstance(entry, log.EgressReplied):
-            self._agent.on_egress_reply(entry.reply, entry.now)
-        else:
-            self._agent.on_loop_health(entry.health)
+    def _from_process(self, entry: log.EgressAsked | log.EgressReplied | log.LoopHealthReceived) -> None:
+        match entry:
+            case log.EgressAsked():
+                self._agent.egress_request(entry.now)
+            case log.EgressReplied():
+                self._agent.on_egress_reply(entry.request, entry.reply, entry.now)
+            case log.LoopHealthReceived():
+                self._agent.on_loop_health(entry.health)
 
     def _load(self, entry: log.SnapshotLoaded | log.PoseRestored) -> None:
         if isinstance(entry, log.PoseRestored):

@@ -48,6 +48,55 @@ def test_mode_commands_lead_to_their_mode_and_only_driving_modes_keep_the_wheels
     assert roomba.seeking_dock == (opcode == 143)
 
 
+def test_button_clean_wakes_a_sleeping_roomba_then_lets_it_drive_until_it_is_pressed_again():
+    roomba = awake()
+    roomba.receive(bytes((POWER,)), 0.0)
+    driven = []
+    for _ in range(3):
+        roomba.press_clean()
+        roomba.tick(1.0, 0.01)
+        driven.append((roomba.asleep, roomba.cleaning, roomba.wheel_speeds_m_s))
+    assert driven == [(False, False, (0.0, 0.0)), (False, True, (0.3, 0.3)), (False, False, (0.0, 0.0))]
+
+
+def test_schedule_wakes_a_sleeping_roomba_and_lets_it_drive():
+    roomba = awake()
+    roomba.receive(bytes((POWER,)), 0.0)
+    roomba.clean()
+    roomba.tick(1.0, 0.01)
+    assert (roomba.asleep, roomba.wheel_speeds_m_s) == (False, (0.3, 0.3))
+
+
+@pytest.mark.parametrize("mode", [SAFE, FULL])
+def test_button_clean_does_nothing_while_the_host_has_control(mode):
+    roomba = awake(mode)
+    roomba.press_clean()
+    roomba.tick(1.0, 0.01)
+    assert (roomba.mode, roomba.wheel_speeds_m_s) == (mode, (0.0, 0.0))
+
+
+@pytest.mark.parametrize("opcode", [134, 135, 136])
+def test_commanded_cleaning_leaves_the_dock_backwards_and_drives_in_passive_mode(opcode):
+    roomba = awake()
+    roomba.set_dock(0.0, 0.0, 0.0)
+    roomba.receive(bytes((opcode,)), 0.0)
+    roomba.tick(1.0, 0.01)
+    assert (roomba.mode, roomba.wheel_speeds_m_s) == (PASSIVE, (-0.1, -0.1))
+    roomba.set_dock(-0.05, 0.0, 0.0)
+    roomba.tick(1.01, 0.01)
+    assert roomba.wheel_speeds_m_s == (0.3, 0.3)
+
+
+@pytest.mark.parametrize("ends", [bytes((128,)), bytes((131,)), DRIVE_300, "wheel_drop_left", "cliff_left"])
+def test_cleaning_ends_by_start_or_safe_and_by_what_the_firmware_sees_but_not_by_wheel_speeds(ends):
+    roomba = awake(PASSIVE)
+    roomba.press_clean()
+    roomba.tick(1.0, 0.01)
+    setattr(roomba.world, ends, True) if isinstance(ends, str) else roomba.receive(ends, 1.0)
+    roomba.tick(1.01, 0.01)
+    assert roomba.wheel_speeds_m_s == ((0.3, 0.3) if ends == DRIVE_300 else (0.0, 0.0))
+
+
 def test_passive_does_not_drive():
     roomba = awake(PASSIVE)
     roomba.receive(DRIVE_300, 0.0)

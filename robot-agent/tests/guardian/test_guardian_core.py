@@ -46,15 +46,18 @@ class Rig:
     silent: bool = False
     moved: bool = False
     not_receiving: bool = False
+    away_at: float = -1e9
     feedback: list = field(default_factory=list)
 
     def handle(self, output) -> None:
         self.feedback.extend(output.feedback)
         for opcode, argument in commands(output.data):
+            latched = self.latched is not None or self.core.latched is not None
             if opcode == 131:
-                assert self.resetting or self.latched is None, "woken although a fault is latched"
+                retaken = self.now - self.away_at <= IGNORED_AFTER_WAKE_S + 0.06
+                assert self.resetting or not latched or retaken, "disturbed although it stands in Safe mode"
             if opcode == 128:
-                assert self.resetting or not self.moved, "woken without a reset although it has moved"
+                assert self.resetting or not self.moved or latched, "woken although it has moved and has no fault"
                 self.moved = False
             if opcode in {128, 131}:
                 self.wheels, self.wheels_at = (0.0, 0.0), self.now
@@ -98,6 +101,7 @@ class Rig:
             corrupted[self.damage % len(corrupted)] ^= 0x10 | (self.damage & 0xFF)
             data, self.damage = bytes(corrupted), None
         if data and not self.silent:
+            self.away_at = self.now if self.base.mode != SAFE else self.away_at
             self.handle(self.core.on_bytes(data, self.now))
         self.handle(self.core.tick(self.now))
         if self.now - self.command_at > COMMAND_FRESH_S or self.core.latched is not None:
@@ -247,12 +251,14 @@ def test_a_reset_while_the_cause_persists_latches_again_before_a_wheel_turns():
 
 
 @pytest.mark.parametrize("mode", [OFF, PASSIVE, FULL])
-def test_base_that_leaves_safe_mode_is_not_woken_before_a_reset(mode):
+def test_base_that_leaves_safe_mode_is_brought_back_and_stands_there_until_a_reset(mode):
     rig = ready_rig()
     rig.drive(0.3)
     change_mode(rig.base, mode)
+    rig.drive(0.1)
+    assert rig.base.mode == SAFE
     rig.drive(5.0)
-    assert rig.base.mode == mode
+    assert rig.base.mode == SAFE
     assert "left its driving mode" in rig.core.latched
     assert rig.wheels == (0.0, 0.0)
     rig.command(0.0, 0.0, reset=True)

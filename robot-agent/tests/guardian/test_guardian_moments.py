@@ -6,6 +6,8 @@ longer must be told apart from one that ends a moment before.
 
 from __future__ import annotations
 
+from itertools import pairwise
+
 import msgspec
 import pytest
 from plain_base import DockingBase, PlainBase, Rig
@@ -391,12 +393,16 @@ def test_frame_that_was_on_its_way_when_the_base_fell_asleep_makes_no_fault_of_i
     resting = WheelCommand(seq=1, left=0.0, right=0.0, rest=True)
     assert rig.core.on_command(resting, 1.01).data == b"sleep;"
     assert rig.frame(1.02, **late).data == b""
+    asked = []
     for step in range(1, 60):
         assert rig.core.on_command(resting, 1.0 + 0.1 * step).data == b""
         told = rig.core.tick(1.0 + 0.1 * step)
-        assert told.data == b"", "bytes might wake it"
+        assert told.data in {b"", b"wake;"}
+        asked += [step] * bool(told.data)
         assert [feedback.stopped for feedback in told.feedback] == ["the base is asleep to save power"]
     assert rig.core.latched is None
+    assert asked[0] >= 15, "the base falls asleep first"
+    assert {later - before for before, later in pairwise(asked)} == {5}, "as somebody else may have woken it"
     assert rig.core.on_command(WheelCommand(seq=2, left=0.0, right=0.0), 7.0).attempt.line == RTS
     rig.frame(7.005, **late)
     assert rig.core.tick(7.01).data == b"wake;"

@@ -18,7 +18,7 @@ from guardian_rig import STOP_S, wait_for
 
 from fog_runtime.machine.signals import ENDING, TERMINAL_STOPS
 from robot_agent.bases.diffdrive.emulator import DiffDriveEmulator
-from robot_agent.bases.roomba600.emulator import RoombaEmulator
+from robot_agent.bases.roomba600.emulator import SAFE, RoombaEmulator
 from robot_agent.lidars.rplidar_a1.emulator import RplidarEmulator
 
 pytestmark = [pytest.mark.live, pytest.mark.reaction, pytest.mark.timeout(120)]
@@ -309,6 +309,19 @@ def test_bumper_fault_survives_a_new_agent_until_a_reset(rig):
         assert not rig.base.moving
         rig.agent.reset = True
         wait_for(lambda: rig.base.moving, "the reset lets it drive")
+
+
+def test_roomba_that_its_button_starts_under_a_latched_fault_is_stopped_and_kept_from_it(rig):
+    robot = rig.base.robot
+    rig.drive()
+    robot.world.wheel_drop_left = True
+    wait_for(lambda: "a wheel has dropped" in (rig.agent.feedback.fault or ""), "the fault is latched")
+    robot.world.wheel_drop_left = False
+    robot.clean()
+    wait_for(lambda: not robot.cleaning and robot.mode == SAFE, "the guardian has it under control again")
+    robot.press_clean()
+    assert not robot.cleaning, "its buttons are without effect in Safe mode"
+    assert "a wheel has dropped" in rig.agent.feedback.fault
 
 
 def test_second_agent_is_refused_while_the_first_lives_and_takes_over_when_it_hangs(rig):

@@ -151,7 +151,7 @@ class GuardianCore:
                 if self._feedback.is_due(reading, state, now, moving=self._wheels != (0.0, 0.0)):
                     feedbacks.append(self._report(reading, now))
             reading = following
-        if not base.awake:
+        if not base.awake and not self._sleep.asleep:
             stop += self.driver.respond()
         return Output(stop, tuple(feedbacks))
 
@@ -174,7 +174,7 @@ class GuardianCore:
                 return Output()
             self._base.awake, self._base.woken_at = False, None
             return Output(attempt=self._sleep.end())
-        if self.moving or self._latched is not None or self._charging(now) or not (data := self._sleep.begin()):
+        if self.moving or self._latched is not None or self._charging(now) or not (data := self._sleep.begin(now)):
             return self._drive(now)
         self._base.awake = False
         return Output(data)
@@ -188,12 +188,17 @@ class GuardianCore:
         """Advance time (50 Hz while `moving`, else 15 Hz or more): stale commands, a silent base, repeated stops."""
         base, timing = self._base, self.driver.timing
         if self._sleep.asleep:
-            return Output(b"", self._reminder(now))
+            # One that its button or its schedule has woken is stopped by this, and answers; others hear nothing.
+            return Output(self._wake(now) if self._sleep.ask(now) else b"", self._reminder(now))
         if not base.awake:
             due = base.woken_at is None or now - base.woken_at > timing.wake_timeout
+            if due and self._charging(now):
+                base.restrained = False  # on its charger it has been told often enough
             # A base that does not drive on its charger is left alone there: waking it would only disturb the charging.
             if due and (not self._charging(now) or self._is_unknown()):
-                return Output(self._wake(now), self._reminder(now), self._attempt(now))
+                # With a fault latched it is woken to be stopped; what else may revive it waits for the reset.
+                wake = self._wake(now)
+                return Output(wake, self._reminder(now), self._attempt(now) if self._latched is None else None)
             # The wake command may have been lost, and the base may still roll at an old speed.
             repeat = now - self._sent_at >= REPEAT_S
             return Output(self._restrain(now) if repeat else b"", self._reminder(now))
@@ -204,7 +209,12 @@ class GuardianCore:
                 # Nothing that must be stopped has begun, so it is waited for as at its start (ADR 34).
                 base.awake, base.silence = False, reason
                 return Output(self._wake(now), self._reminder(now))
-            return Output(self._latch(reason, now), self._reminder(now))
+            stop = self._latch(reason, now)
+            if silent > timing.wake_timeout:
+                # It may have left its driving mode: from now on it is told in the way that stops it anyway.
+                base.awake = False
+                stop += self._wake(now)
+            return Output(stop, self._reminder(now))
         return self._drive(now)
 
     def stop_command(self) -> bytes:
@@ -247,7 +257,8 @@ class GuardianCore:
             return b""
         base.harmless = None
         if self._sleep.asleep:
-            return b""  # it was on its way when the base was put to sleep
+            # What arrives at first was on its way when the base was put to sleep.
+            return self._wake(now) if self._sleep.on_frame(now) else b""
         if not base.awake:
             current = base.woken_at is not None and now - base.woken_at >= self.driver.timing.ignored_after_wake
             if not current or status.mode_problem is not None:
@@ -255,7 +266,7 @@ class GuardianCore:
             base.awake, base.restrained, base.overcurrent_since, self._stepped_at = True, False, None, now
         backing = self._maneuvers.is_running("back_off")
         if self._latched is not None and not backing:
-            return b""
+            return self._retake(status, now)
         fault = fault_of(status, base.blocked_for(now), bumper=not self._maneuvers.expects_bumper(status))
         if fault is None:
             # Only the current of a motor is a fault by its duration.
@@ -264,6 +275,16 @@ class GuardianCore:
         if backing:
             self._latched = None  # the new fault is no bump
         return self._latch(fault, now)
+
+    def _retake(self, status: BaseStatus, now: float) -> bytes:
+        """Take control again of a base that has left its driving mode under a latched fault; return the bytes for it.
+
+        In a mode of its own it ignores zero speeds, and its button or its schedule would let it drive off.
+        """
+        if status.mode_problem is None or not isinstance(self.driver, DockingDriver):
+            return b""
+        self._base.awake, self._base.woken_at, self._base.restrained = False, now, True
+        return self._restrain(now)
 
     def _latch(self, reason: str, now: float) -> bytes:
         first = self._latched is None

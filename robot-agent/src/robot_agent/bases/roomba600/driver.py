@@ -37,6 +37,8 @@ if TYPE_CHECKING:
 _COUNTS: Final = 1 << 16
 BRC_PULSE_S: Final = 1.2
 """The robot wakes by one low pulse of a second; three shorter ones would change its baud rate."""
+SAFE_AGAIN_S: Final = 0.25
+"""Period of asking for a Safe mode that does not hold yet; until it does, the robot's CLEAN button lets it drive."""
 _STREAMS: Final = {115200: oi.GUARDIAN_STREAM, 19200: oi.SLOW_STREAM}
 _REMEDY: Final = (
     "it may be asleep, and its BRC pin is not wired (`brc` in [base.options]): press its CLEAN button, then check "
@@ -93,7 +95,7 @@ class Roomba600Driver:
         self._parser = oi.StreamParser(self._stream)
         self._corrupted_before = 0
         self._mode = ModeMonitor()
-        self._safe_sent = False
+        self._safe_sent_at = -math.inf
         self._modes = _DRIVING
         self._on_charger = False
         self._received_at = 0.0
@@ -138,15 +140,19 @@ class Roomba600Driver:
         # Start puts the OI into Passive mode, which stops the wheels by itself. A base whose receiver was in the middle
         # of a wheel command takes up to four bytes as the missing ones.
         self._mode.restart()
-        self._safe_sent = False
+        self._safe_sent_at = -math.inf
         self._modes = _DRIVING
         return 5 * oi.start() + oi.stream(self._stream)
 
     def respond(self) -> bytes:
-        """Return Safe and zero speed, once the offset of the mode is known; a charging robot stays in Passive mode."""
-        if self._mode.offset is None or self._safe_sent or self._on_charger:
+        """Return Safe and zero speed, once the offset of the mode is known; a charging robot stays in Passive mode.
+
+        While a wheel hangs or a cliff is seen, Safe mode ends at once: it is sent again until it holds.
+        """
+        sent_lately = self._received_at - self._safe_sent_at < SAFE_AGAIN_S
+        if self._mode.offset is None or sent_lately or self._on_charger:
             return b""
-        self._safe_sent = True
+        self._safe_sent_at = self._received_at
         return oi.safe() + 2 * oi.drive_direct(0, 0)
 
     def seek_dock(self) -> bytes:
@@ -164,7 +170,7 @@ class Roomba600Driver:
     def take_control(self, *, charging: bool) -> bytes:
         """Return Start, which stops the wheels; and without a charger Safe and zero speed; each twice."""
         self._modes = _DRIVING
-        self._safe_sent = not charging
+        self._safe_sent_at = -math.inf if charging else self._received_at
         return 2 * oi.start() if charging else 2 * (oi.start() + oi.safe() + oi.drive_direct(0, 0))
 
     def sleep(self) -> bytes:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Final
 
 from robot_agent.bases.roomba600.emulator.body import AXLE_MM, Battery, Wheels, World
+from robot_agent.bases.roomba600.emulator.cleaning import Cleaning
 from robot_agent.bases.roomba600.emulator.docking import Dock, Search
 from robot_agent.bases.roomba600.emulator.quirks import LineNoise, Quirks
 from robot_agent.bases.roomba600.emulator.sensors import Sensors, Stream
@@ -77,7 +78,7 @@ class RoombaEmulator:
         self.world = World()
         self.battery = battery or Battery()
         self.mode = OFF
-        self._search: Search | None = None
+        self._program: Search | Cleaning | None = None
         self._dock: Dock | None = None
         self._wheels = Wheels(left_encoder, right_encoder)
         self._commands = CommandParser()
@@ -88,7 +89,12 @@ class RoombaEmulator:
     @property
     def seeking_dock(self) -> bool:
         """Whether its firmware drives it to its dock."""
-        return self._search is not None
+        return isinstance(self._program, Search)
+
+    @property
+    def cleaning(self) -> bool:
+        """Whether its firmware drives it about to clean."""
+        return isinstance(self._program, Cleaning)
 
     @property
     def baud(self) -> int:
@@ -100,6 +106,22 @@ class RoombaEmulator:
         if self.asleep and seconds >= 1.0:
             self.asleep = False
             self._leave(OFF)
+
+    def press_clean(self) -> None:
+        """Press CLEAN: it wakes a sleeping robot; else it begins or ends cleaning, unless the host has control."""
+        if self.asleep:
+            self.asleep = False
+            self._leave(OFF)
+        elif self.cleaning:
+            self._stop_program()
+        else:
+            self.clean()
+
+    def clean(self) -> None:
+        """Begin to clean, as by its schedule, which wakes it; nothing while the host has control."""
+        if self.mode not in {SAFE, FULL}:
+            self.asleep = False
+            self._program = Cleaning()
 
     @property
     def axle_m(self) -> float:
@@ -136,7 +158,7 @@ class RoombaEmulator:
     def tick(self, now: float, dt: float) -> None:
         """Advance time by dt (s) to `now`: protection, battery and the stream."""
         self._protect()
-        self._drive_to_dock(dt)
+        self._drive_by_itself(dt)
         moving = sum(abs(speed) for speed in self.wheel_speeds_m_s)
         # Safe and Full mode end the charging.
         self.battery.tick(dt, powered=self.world.powered and self.mode in {OFF, PASSIVE}, wheels_m_s=moving)
@@ -146,6 +168,9 @@ class RoombaEmulator:
 
     def receive(self, data: bytes, now: float) -> None:
         """Receive bytes from the host; whole commands take effect immediately."""
+        if self.asleep and self.quirks.bytes_wake and data:
+            self.asleep = False
+            self._leave(OFF)
         if self.asleep:
             return
         for opcode, arguments in self._commands.parse(data):
@@ -186,12 +211,12 @@ class RoombaEmulator:
             self.asleep = True
             self._commands.forget()
         elif opcode in {130, 131, 132}:
-            self._stop_search()
+            self._stop_program()
             self.mode = FULL if opcode == 132 else SAFE
             self._protect()
         elif opcode in {134, 135, 136, 143}:
             self._leave(PASSIVE, keep_stream=True)
-            self._search = Search() if opcode == 143 else None
+            self._program = Search() if opcode == 143 else Cleaning()
         elif opcode in {142, 148, 149, 150}:
             self._report(opcode, arguments, now)
         elif opcode in {137, 145, 146} and self.mode in {SAFE, FULL}:
@@ -216,24 +241,29 @@ class RoombaEmulator:
         """Stop the motors and enter a mode in which the host does not drive."""
         self.mode = mode
         self._wheels.stop()
-        self._search = None
+        self._program = None
         if not keep_stream:
             self._stream.pause()
 
-    def _drive_to_dock(self, dt: float) -> None:
+    def _drive_by_itself(self, dt: float) -> None:
         """Let the firmware drive: blind to everything but the dock's beams, wheel drop and cliff."""
-        if self._search is None:
+        if self._program is None:
             return
-        wheels = None if self.world.wheel_drop or self.world.cliff else self._search.wheels(self._dock, dt)
+        wheels = None if self.world.wheel_drop or self.world.cliff else self._next_wheels(self._program, dt)
         if wheels is None:
-            self._stop_search()
+            self._stop_program()
         else:
             left, right = wheels
             self._wheels.drive_direct(right, left)
 
-    def _stop_search(self) -> None:
-        if self._search is not None:
-            self._search = None
+    def _next_wheels(self, program: Search | Cleaning, dt: float) -> tuple[int, int] | None:
+        if isinstance(program, Search):
+            return program.wheels(self._dock, dt)
+        return program.wheels(on_dock=self.world.home_base)
+
+    def _stop_program(self) -> None:
+        if self._program is not None:
+            self._program = None
             self._wheels.stop()
 
     def _protect(self) -> None:

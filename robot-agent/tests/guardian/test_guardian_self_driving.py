@@ -1,0 +1,234 @@
+"""A base that drives off by itself, by its CLEAN button or its schedule, is stopped whatever state the guardian is in.
+
+In its own Passive mode a Roomba ignores wheel speeds, zero too: only Start or Safe stop it there.
+"""
+
+from __future__ import annotations
+
+import pytest
+from plain_base import DockingBase, PlainBase, Rig
+
+from robot_agent.bases.roomba600.driver import Roomba600Driver, Roomba600Options
+from robot_agent.bases.roomba600.emulator import OFF, PASSIVE, SAFE, Quirks, RoombaEmulator
+from robot_agent.guardian.core import GuardianCore
+from robot_agent.guardian.link import WheelCommand
+
+STEP_S = 0.01
+
+
+class Roomba:
+    """Guardian and emulated Roomba on the floor; the agent asks for zero speeds; `rolled` is how far it went (m)."""
+
+    def __init__(self, **quirks) -> None:
+        self.robot = RoombaEmulator(quirks=Quirks(**quirks))
+        self.core = GuardianCore(Roomba600Driver(Roomba600Options(brc="rts")))
+        self.now, self.rolled, self.rest, self.reset, self.feedback = 10.0, 0.0, False, False, None
+        self.mute = self.deaf = False
+        self.run(1.5)
+        assert self.robot.mode == SAFE
+
+    def run(self, seconds: float) -> None:
+        for step in range(round(seconds / STEP_S)):
+            self.now += STEP_S
+            left, right = self.robot.wheel_speeds_m_s
+            self.rolled += abs(left + right) / 2 * STEP_S
+            self.robot.add_wheel_travel(left * STEP_S, right * STEP_S)
+            self.robot.tick(self.now, STEP_S)
+            sent = self.robot.outgoing(self.now)
+            self._apply(self.core.on_bytes(b"" if self.mute else sent, self.now))
+            self._apply(self.core.tick(self.now))
+            if step % 5 == 0:
+                command = WheelCommand(seq=step, left=0.0, right=0.0, rest=self.rest, reset=self.reset)
+                self._apply(self.core.on_command(command, self.now))
+
+    def _apply(self, output) -> None:
+        if output.attempt is not None and output.attempt.line is not None:
+            self.robot.pulse_wake_line(output.attempt.line.seconds)
+        self.robot.receive(b"" if self.deaf else output.data, self.now)
+        self.feedback = output.feedback[-1] if output.feedback else self.feedback
+
+    def drop_wheel(self, seconds: float = 2.0) -> None:
+        """Lift the robot for so long, and put it down again."""
+        self.robot.world.wheel_drop_left = True
+        self.run(seconds)
+        assert self.core.latched.startswith("a wheel has dropped")
+        self.robot.world.wheel_drop_left = False
+
+
+@pytest.fixture(params=[{}, {"mode_offset": 1}, {"damaged": 9, "text_period_s": 0.5}])
+def roomba(request) -> Roomba:
+    return Roomba(**request.param)
+
+
+@pytest.mark.parametrize("lifted_s", [0.05, 0.4, 3.0])
+def test_roomba_that_was_put_down_with_its_fault_latched_does_not_clean(roomba, lifted_s):
+    roomba.drop_wheel(lifted_s)
+    roomba.run(0.02)
+    roomba.robot.press_clean()
+    roomba.run(5.0)
+    assert roomba.rolled < 0.09, "0.3 m/s for 0.3 s at most"
+    assert (roomba.robot.cleaning, roomba.robot.mode) == (False, SAFE), "where its buttons are without effect"
+    assert roomba.core.latched is not None, "only an operator resets it"
+
+
+def test_roomba_with_a_latched_fault_is_in_safe_mode_soon_after_it_was_put_down(roomba):
+    roomba.drop_wheel()
+    roomba.run(0.3)
+    roomba.robot.press_clean()
+    roomba.run(2.0)
+    assert (roomba.rolled, roomba.robot.mode) == (0.0, SAFE)
+
+
+def test_roomba_whose_fault_was_not_its_own_is_kept_out_of_passive_mode_too(roomba):
+    roomba.robot.world.bump_left = True
+    roomba.run(0.2)
+    assert roomba.core.latched.startswith("the bumper is pressed")
+    roomba.robot.world.wheel_drop_left = True
+    roomba.run(0.5)
+    assert roomba.robot.mode == PASSIVE
+    roomba.robot.world.wheel_drop_left = False
+    roomba.run(0.02)
+    roomba.robot.clean()
+    roomba.run(3.0)
+    assert roomba.rolled < 0.09
+    assert roomba.robot.mode == SAFE
+
+
+def test_roomba_that_is_being_woken_while_a_wheel_hangs_does_not_clean_when_it_is_put_down(roomba):
+    roomba.drop_wheel()
+    roomba.robot.world.wheel_drop_left = True
+    roomba.reset = True
+    roomba.run(0.06)
+    roomba.reset = False
+    roomba.run(2.0)
+    assert roomba.core.latched is None
+    roomba.robot.world.wheel_drop_left = False
+    roomba.robot.clean()
+    roomba.run(3.0)
+    assert roomba.rolled < 0.09
+    assert roomba.robot.mode == SAFE
+
+
+def test_roomba_that_went_off_under_a_latched_fault_is_stopped_when_it_drives(roomba):
+    roomba.drop_wheel()
+    roomba.run(1.0)
+    roomba.robot.receive(bytes((7,)), roomba.now)  # as when its battery is seated anew: its stream is off
+    assert roomba.robot.mode == OFF
+    roomba.run(3.0)
+    roomba.robot.clean()
+    roomba.run(3.0)
+    assert roomba.robot.wheel_speeds_m_s == (0.0, 0.0)
+    assert roomba.core.latched.startswith("a wheel has dropped")
+
+
+def test_roomba_that_cannot_be_heard_under_a_latched_fault_is_stopped_when_it_drives(roomba):
+    roomba.drop_wheel(0.3)
+    roomba.mute = True
+    roomba.run(3.0)
+    roomba.robot.clean()
+    roomba.run(3.0)
+    assert roomba.rolled < 0.35, "0.3 m/s for a second, and what its frames were late"
+
+
+def test_docked_roomba_with_a_latched_fault_charges_and_is_stopped_when_it_leaves(roomba):
+    roomba.drop_wheel()
+    roomba.robot.world.wheel_drop_left = True
+    roomba.run(0.5)
+    roomba.robot.set_dock(0.0, 0.0, 0.0)
+    roomba.robot.world.wheel_drop_left = False
+    roomba.run(3.0)
+    assert roomba.robot.mode == PASSIVE
+    assert roomba.robot.battery.current_ma > 0
+    roomba.robot.press_clean()
+    roomba.run(0.3)
+    roomba.robot.set_dock(-0.03, 0.0, 0.0)
+    roomba.run(2.0)
+    assert roomba.rolled < 0.1
+    assert roomba.robot.mode == SAFE
+    assert roomba.core.latched is not None
+
+
+def test_docked_roomba_is_told_to_stop_no_more_than_a_second_and_then_left_to_charge():
+    rig = Rig(base=DockingBase())
+    rig.frame(0.2, cliff=True)
+    on_dock = {"mode_problem": "Passive", "charging": True, "docked": True}
+    told = b"".join(rig.frame(0.2 + n * 0.1, **on_dock).data + rig.core.tick(0.2 + n * 0.1).data for n in range(1, 30))
+    assert 1 <= told.count(b"start;") <= 11
+    assert b"wake;" not in told
+    assert b"start;" not in rig.frame(3.3, **on_dock).data + rig.core.tick(3.3).data
+
+
+def test_base_of_another_kind_that_leaves_its_driving_mode_is_told_to_stand():
+    rig = Rig(base=PlainBase())
+    rig.frame(0.2, mode_problem="emergency stop pressed")
+    assert rig.core.tick(0.26).data == b"0.0000,0.0000;"
+    assert rig.frame(0.27, mode_problem="emergency stop pressed").data == b""
+
+
+# --- asleep ---
+
+
+def sleeping(**quirks) -> Roomba:
+    roomba = Roomba(**quirks)
+    roomba.rest = True
+    roomba.run(2.0)
+    assert roomba.robot.asleep
+    return roomba
+
+
+def test_sleeping_roomba_stays_asleep():
+    roomba = sleeping()
+    roomba.run(30.0)
+    assert roomba.robot.asleep
+    assert roomba.feedback.stopped == "the base is asleep to save power"
+
+
+def test_roomba_that_its_schedule_wakes_is_stopped_and_sleeps_again():
+    roomba = sleeping()
+    roomba.robot.clean()
+    roomba.run(3.0)
+    assert roomba.rolled < 0.16, "0.3 m/s for half a second"
+    assert roomba.robot.mode == SAFE
+    roomba.run(62.0)
+    assert roomba.robot.asleep
+    roomba.run(10.0)
+    assert roomba.robot.asleep
+
+
+def test_roomba_that_its_button_wakes_sleeps_again():
+    roomba = sleeping()
+    for _ in range(2):
+        roomba.robot.press_clean()
+        roomba.run(0.1)
+    roomba.run(65.0)
+    assert roomba.rolled < 0.16
+    assert roomba.robot.asleep
+
+
+def test_roomba_that_the_question_itself_wakes_is_asked_once():
+    roomba = Roomba(bytes_wake=True)
+    roomba.rest = True
+    roomba.run(1.0)
+    assert roomba.robot.asleep
+    roomba.run(3.0)
+    assert roomba.robot.mode == SAFE
+    roomba.run(62.0)
+    assert roomba.robot.asleep
+    roomba.run(120.0)
+    assert roomba.robot.asleep
+
+
+def test_roomba_that_did_not_hear_that_it_shall_sleep_is_told_again():
+    roomba = Roomba()
+    roomba.deaf = roomba.rest = True
+    roomba.run(0.2)
+    roomba.deaf = False
+    roomba.run(65.0)
+    assert roomba.robot.asleep
+
+
+def test_sleeping_roomba_wakes_when_it_is_needed():
+    roomba = sleeping()
+    roomba.rest = False
+    roomba.run(4.0)
+    assert (roomba.robot.asleep, roomba.robot.mode, roomba.core.latched) == (False, SAFE, None)

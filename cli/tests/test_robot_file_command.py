@@ -97,6 +97,40 @@ def test_check_prints_what_a_file_may_say_and_names_the_ports_that_are_not_set(t
     ]
 
 
+@pytest.mark.parametrize(
+    ("before", "after", "problem"),
+    [
+        ("masks = []", "masks = [[-3.142, 3.142]]", "mask 1, [-3.142, 3.142], ends where it begins"),
+        ("masks = []", "masks = [[0.1, 3.2], [3.1, 0.2]]", "the masks hide 100 %"),
+        ("rest_base = false", "rest_base = true", "Set `brc` of [base.options]"),
+        (
+            "footprint = []",
+            "footprint = [[0.1, 0.1], [-0.3, 0.1], [-0.3, -0.1], [0.1, -0.1]]",
+            "outside of the robot's",
+        ),
+    ],
+)
+def test_check_refuses_what_is_valid_alone_and_senseless_together_by_its_line(tmp_path, before, after, problem):
+    file, text = tmp_path / "robot.toml", robot_text(default_robot()).replace("x_m = 0.0", "x_m = 0.15")
+    file.write_text(text.replace(before, after))
+    result = run(app, ["robot", "check", str(file), "--json"])
+    assert result.exit_code == 1
+    told = json.loads(result.stdout)["problem"]
+    wrong = "x_m = 0.15" if before == "footprint = []" else before
+    assert f"robot.toml:{text.splitlines().index(wrong) + 1}: " in told
+    assert problem in told
+
+
+def test_check_remarks_what_the_sites_radius_decides(tmp_path):
+    file = tmp_path / "robot.toml"
+    file.write_text(robot_text(default_robot()).replace("x_m = 0.0", "x_m = 0.2"))
+    result = run(app, ["robot", "check", str(file)])
+    assert result.exit_code == 0
+    assert "unless the site gives this robot a larger `radius` than 0.17 m: " in result.output
+    *_, told = json.loads(run(app, ["robot", "check", str(file), "--json"]).stdout)["remarks"]
+    assert "robot.toml:37: lidar.x_m: the lidar's axis (0.2, 0) is 0.030 m outside" in told
+
+
 def test_new_overwrites_nothing_and_knows_its_parts(tmp_path):
     file = tmp_path / "robot.toml"
     file.write_text("mine")

@@ -16,6 +16,7 @@ from fog_contracts.robot import MotionSettings
 from fog_kernels.dwa import DwaLimits, DwaSettings
 from robot_agent.footprint import Footprint
 from robot_agent.hardware import DriveTrain  # noqa: TC001  # read at run time, when a configuration is decoded
+from robot_agent.sight import BLIND_SHARE, TRAVEL_HALF_RAD
 
 if TYPE_CHECKING:
     from fog_contracts.robot import RobotSettings
@@ -103,8 +104,7 @@ class StopFieldConfig:
 class VisibilityConfig:
     """When missing returns of the lidar in the direction of travel slow or stop the robot; m, rad, m/s, shares."""
 
-    half_width: float = 0.70
-    """Directions this near to the heading are those of travel: a body of 0.17 m needs 40 degrees 0.26 m ahead."""
+    half_width: float = TRAVEL_HALF_RAD
     range_share: float = 0.75
     range_max: float = 6.0
     """A return is expected of walls within this range, and within `range_share` of the lidar's rated range."""
@@ -112,7 +112,7 @@ class VisibilityConfig:
     missing_slow: float = 0.5
     missing_refused: float = 0.9
     blind_slow: float = 0.1
-    blind_refused: float = 0.5
+    blind_refused: float = BLIND_SHARE
     """Shares of the sectors of travel without an expected return, and without any sample."""
     lift: float = 0.7
     """A limit ends below this part of the share at which it began."""

@@ -102,6 +102,13 @@ class Footprint:
         """Radius (m) of the smallest circle around the axle's centre that contains the footprint."""
         return max(math.hypot(x, y) for x, y in self.vertices)
 
+    def outside_by(self, x: float, y: float) -> float:
+        """Return how far (m) the point is beyond the side that it is farthest beyond; inside it is negative."""
+        ring = (*self.vertices, self.vertices[0])
+        return max(
+            ((x - a[0]) * (b[1] - a[1]) - (y - a[1]) * (b[0] - a[0])) / math.dist(a, b) for a, b in pairwise(ring)
+        )
+
     def padded(self, distance: float) -> Footprint:
         """Return the footprint with each side moved outwards by `distance` (m, not negative); corners stay sharp.
 

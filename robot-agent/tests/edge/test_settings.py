@@ -4,7 +4,7 @@ import pytest
 
 from fog_runtime.configuration.robot_file import load_robot
 from fog_runtime.configuration.settings import SettingsError, load
-from robot_agent.agent.settings import Settings, read_footprint, read_operator_key, read_site
+from robot_agent.agent.settings import Settings, read_footprint, read_given, read_operator_key, read_site
 
 SITE = """
 id = "lab"
@@ -71,6 +71,22 @@ def test_the_operators_key_is_hexadecimal_and_long_enough(tmp_path):
     for missing in (None, tmp_path / "nowhere"):
         with pytest.raises(SettingsError, match="openssl rand"):
             read_operator_key(missing)
+
+
+@pytest.mark.parametrize(("x_m", "taken"), [(0.19, True), (0.21, False)])
+def test_agent_refuses_a_lidar_outside_of_the_body_that_its_site_gives(tmp_path, x_m, taken):
+    (tmp_path / "site.toml").write_text(SITE)
+    (tmp_path / "key").write_text("ab" * 32)
+    (tmp_path / "robot.toml").write_text(f'[base]\ndriver = "roomba600"\n[lidar]\ndriver = "ld19"\nx_m = {x_m}\n')
+    robot = load_robot({"FOGNAV_ROBOT_FILE": str(tmp_path / "robot.toml")})
+    given = settings(tmp_path, site_dir=tmp_path, operator_key_file=tmp_path / "key")
+    if taken:
+        assert read_given(given, robot).body.radius == 0.2
+        return
+    with pytest.raises(
+        SettingsError, match=r"robot.toml:5: lidar.x_m: the lidar's axis \(0.21, 0\) is 0.010 m outside"
+    ):
+        read_given(given, robot)
 
 
 def test_footprint_is_a_polygon_in_metres_and_a_wrong_one_is_named():

@@ -85,21 +85,22 @@ def robot_check(
     try:
         robot = load_robot({**os.environ, ROBOT_FILE: str(file)})
         values = effective(robot)
-        unset = check_ports(robot)
+        remarks = [f"{name} is not set: a robot needs it, a demo does not" for name in check_ports(robot)]
+        remarks += contradictions(robot)
     except SettingsError as error:
         if json:
             print_json({"ok": False, "problem": str(error)})
             raise typer.Exit(NOT_TRUE) from error
         fail(str(error))
     if json:
-        print_json({"ok": True, **values})
+        print_json({"ok": True, "remarks": remarks, **values})
         return
     from fog_contracts.generate.robot_toml import setting_text  # noqa: PLC0415  # keeps the other commands fast
 
     for name, value in values.items():
         print_line(f"{name} = {setting_text(value)}")
-    for name in unset:
-        print_line(f"{name} is not set: a robot needs it, a demo does not")
+    for remark in remarks:
+        print_line(remark)
 
 
 def check_ports(robot: RobotFile) -> list[str]:
@@ -115,6 +116,28 @@ def check_ports(robot: RobotFile) -> list[str]:
     if ports["base.port"] and ports["base.port"] == ports["lidar.port"]:
         raise robot.error("lidar.port", "this is the port of the base, too", "Give each device its own")
     return [name for name, port in ports.items() if not port]
+
+
+def contradictions(robot: RobotFile) -> list[str]:
+    """Return what a person may not expect of the settings; raises `SettingsError` for those that contradict others."""
+    from fog_contracts.costs import ROBOT_RADIUS  # noqa: PLC0415  # keeps the other commands fast
+    from robot_agent import registry  # noqa: PLC0415  # same
+    from robot_agent.agent.settings import read_footprint  # noqa: PLC0415  # same
+    from robot_agent.contradictions import refuse_body, refuse_contradictions, remarks  # noqa: PLC0415  # same
+    from robot_agent.footprint import Footprint  # noqa: PLC0415  # same
+
+    base, footprint = registry.make_base(robot), read_footprint(robot)
+    refuse_contradictions(robot, base)
+    told = remarks(robot, registry.make_lidar(robot).traits)
+    if footprint is not None:
+        refuse_body(robot, base, footprint)
+        return told
+    try:
+        refuse_body(robot, base, Footprint.circle(ROBOT_RADIUS))
+    except SettingsError as error:
+        # The site's folder need not be at hand: on the robot this is judged by its `radius`.
+        told.append(f"unless the site gives this robot a larger `radius` than {ROBOT_RADIUS} m: {error}")
+    return told
 
 
 def robot_text(robot: RobotFile) -> str:

@@ -10,6 +10,7 @@ import msgspec
 from msgspec import Meta
 
 from fog_contracts.commands import KEY_BYTES
+from fog_contracts.costs import ROBOT_RADIUS
 from fog_contracts.messages import Id
 from fog_contracts.site import Site
 from fog_runtime.access.operator_key import OperatorKeyError
@@ -17,6 +18,7 @@ from fog_runtime.access.operator_key import read_operator_key as read_key
 from fog_runtime.configuration.robot_file import VARIABLES
 from fog_runtime.configuration.settings import CommonSettings, SettingsError
 from robot_agent import registry
+from robot_agent.contradictions import refuse_body, refuse_contradictions
 from robot_agent.footprint import Footprint, FootprintError
 
 if TYPE_CHECKING:
@@ -70,13 +72,16 @@ def read_given(settings: Settings, robot: RobotFile) -> Given:
 
     """
     site, body = read_site(settings)
+    footprint, base = read_footprint(robot), registry.make_base(robot)
+    refuse_contradictions(robot, base)
+    refuse_body(robot, base, footprint or Footprint.circle(ROBOT_RADIUS if body is None else body.radius))
     return Given(
         site=site,
         body=body,
         operator_key=read_operator_key(settings.operator_key_file),
         credentials=settings.credentials(),
-        footprint=read_footprint(robot),
-        base=registry.make_base(robot),
+        footprint=footprint,
+        base=base,
     )
 
 

@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Final, Literal
 import numpy as np
 
 from robot_agent.safety.stop_field import Limited, turn_in_place
+from robot_agent.sight import SECTORS
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -21,8 +22,6 @@ if TYPE_CHECKING:
     from robot_agent.hardware import Twist
     from robot_agent.safety.stop_field import Wheels
 
-SECTORS: Final = 72
-"""Directions of the lidar, each 5 degrees wide, counter-clockwise from straight behind in `base`."""
 _EXPECTED_MIN: Final = 4
 """With fewer sectors in which a return is expected, their share says nothing."""
 _LEAD_MAX_RAD: Final = math.radians(45.0)

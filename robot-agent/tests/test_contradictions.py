@@ -1,0 +1,154 @@
+"""Settings that are valid one by one and make no sense together are refused, with their line, value and remedy."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from fog_runtime.configuration.robot_file import parse_robot
+from fog_runtime.configuration.settings import SettingsError
+from robot_agent import registry
+from robot_agent.agent.settings import read_footprint
+from robot_agent.config import VisibilityConfig
+from robot_agent.contradictions import refuse_body, refuse_contradictions, remarks
+from robot_agent.footprint import Footprint
+from robot_agent.hardware import LidarTraits, Twist
+from robot_agent.lidar_mounting import Mounting
+from robot_agent.safety.visibility import Visibility
+from robot_agent.sight import SECTORS
+
+FILE = """[base]
+driver = "{base}"
+options = {{ {options} }}
+[lidar]
+driver = "{lidar}"
+{mounting}
+[{table}]
+{more}
+"""
+BOX = "footprint = [[0.3, 0.2], [-0.1, 0.2], [-0.1, -0.2], [0.3, -0.2]]"
+POSTS = "masks = [[2.0, 2.2], [2.1, 2.4], [-2.2, -2.0], [3.0, -3.0]]"
+
+
+def robot(mounting="", table="power", more="", base="roomba600", options="", lidar="rplidar-a1"):
+    text = FILE.format(base=base, options=options, lidar=lidar, mounting=mounting, table=table, more=more)
+    return parse_robot(text, Path("robot.toml"), {})
+
+
+def checked(given, radius=0.17):
+    base = registry.make_base(given)
+    refuse_contradictions(given, base)
+    refuse_body(given, base, read_footprint(given) or Footprint.circle(radius))
+
+
+@pytest.mark.parametrize(
+    "given",
+    [
+        {},
+        {"base": "diffdrive", "lidar": "ld19"},
+        {"mounting": POSTS},
+        {"mounting": "x_m = -0.1\ny_m = 0.13"},
+        {"mounting": "x_m = 0.25", "table": "body", "more": BOX},
+        {"more": "rest_base = true", "options": 'brc = "rts"'},
+        {"more": "dock_below = 0.3"},
+        {"base": "diffdrive", "options": "wheel_speed_max_m_s = 0.25", "table": "motion", "more": "speed_m_s = 0.25"},
+    ],
+)
+def test_settings_that_go_together_are_taken(given):
+    checked(robot(**given))
+
+
+def refused(place, words, **given):
+    with pytest.raises(SettingsError, match=words) as error:
+        checked(robot(**given))
+    assert str(error.value).startswith(f"robot.toml:{place}: ")
+
+
+@pytest.mark.parametrize(
+    ("masks", "words"),
+    [
+        ("[1.0, 1.2], [1.5, 1.5]", r"mask 2, \[1\.5, 1\.5\], ends where it begins"),
+        ("[-3.142, 3.142]", r"mask 1, \[-3\.142, 3\.142\], ends where it begins"),
+        ("[0.0, 6.2831]", "no direction, or all of them. Give the directions"),
+        ("[0.1, 3.2], [3.1, 0.2]", "hide 100 % of the directions .* never drives"),
+        ("[2.4, 2.0]", "hide 100 % .* counter-clockwise from its first"),
+        ("[-0.4, 0.4]", "or mount the lidar where it sees what is ahead"),
+    ],
+)
+def test_masks_of_no_direction_of_all_or_of_what_is_ahead_are_refused(masks, words):
+    refused("6: lidar.masks", words, mounting=f"masks = [{masks}]")
+
+
+def test_lidar_outside_of_the_body_is_refused():
+    refused(
+        "6: lidar.x_m", r"axis \(0\.2, 0\) is 0\.030 m outside .* Correct x_m and y_m, or let", mounting="x_m = 0.2"
+    )
+    refused("7: lidar.y_m", r"axis \(0\.1, -0\.18\) is 0\.0\d\d m outside", mounting="x_m = 0.1\ny_m = -0.18")
+    refused("6: lidar.x_m", "0.050 m outside .* let `footprint`", mounting="x_m = 0.35", table="body", more=BOX)
+
+
+def test_wheels_outside_of_the_body_are_refused():
+    wide = {"base": "diffdrive", "options": "axle_m = 0.6"}
+    refused(" body.footprint", "not include the wheels, 0.300 m to the left", **wide)
+    refused("8: body.footprint", "`axle_m` of .base.options.", **wide, table="body", more=BOX)
+
+
+def test_speed_that_the_wheels_do_not_reach_is_refused():
+    slow = {"base": "diffdrive", "options": "wheel_speed_max_m_s = 0.2"}
+    words = "0.25 m/s is more than the base's wheels can do, 0.2 m/s. Set it to 0.2 or less"
+    refused("8: motion.speed_m_s", words, **slow, table="motion", more="speed_m_s = 0.25")
+    refused(" motion.speed_m_s", "0.3 m/s is more", **slow)
+
+
+def test_power_settings_that_the_base_can_not_follow_are_refused():
+    words = "no control line could wake .* Set `brc` of .base.options."
+    refused("8: power.rest_base", words, more="rest_base = true")
+    refused("8: power.rest_base", "a diffdrive can't be put to sleep", base="diffdrive", more="rest_base = true")
+    never = "rest_base = true\nrest_after_s = 0"
+    refused("8: power.rest_base", "rest_after_s = 0 the robot never rests", more=never, options='brc = "dtr"')
+    words = "0.3, but a diffdrive does not drive into a dock by itself"
+    refused("8: power.dock_below", words, base="diffdrive", more="dock_below = 0.3")
+
+
+def test_a_larger_body_may_carry_its_lidar_farther_out():
+    with pytest.raises(SettingsError, match="outside of the robot's body"):
+        checked(robot(mounting="x_m = 0.22"))
+    checked(robot(mounting="x_m = 0.22"), radius=0.25)
+
+
+@pytest.mark.parametrize("middle", [0.0, 0.3, -0.5, 1.0])
+def test_masks_are_refused_just_where_the_robot_would_never_drive_ahead(middle):
+    outcomes = []
+    angles = np.linspace(-math.pi, math.pi, 1440, endpoint=False) + 0.001
+    for width in np.arange(0.05, 3.5, 0.05).tolist():
+        mask = (middle - 0.5 * width, middle + 0.5 * width)
+        sight = Visibility(VisibilityConfig())
+        seen = angles[~Mounting(masks=(mask,)).masked(angles)]
+        for _ in range(2):
+            sight.update(seen, np.ones(len(seen), np.bool_), np.zeros(SECTORS, np.bool_))
+        stopped = sight.limit((0.1, 0.1), Twist(0.1, 0.0)).zone == "stop"
+        try:
+            checked(robot(mounting=f"masks = [[{mask[0]}, {mask[1]}]]"))
+            outcomes.append("drives")
+        except SettingsError:
+            outcomes.append("refused")
+        assert (outcomes[-1] == "refused") == stopped, mask
+    assert set(outcomes) == {"drives", "refused"}
+
+
+def test_what_may_surprise_is_remarked():
+    behind = robot(mounting="masks = [[2.4, -2.4]]", more="rest_base = true", options='brc = "rts"', lidar="ld19")
+    checked(behind)
+    told = remarks(behind, registry.make_lidar(behind).traits)
+    assert ["never drives backwards" in told[0], "rest_base has no effect" in told[1]] == [True, True]
+    can_rest = LidarTraits(range_min_m=0.1, range_max_m=8.0, scan_period_s=0.2, can_rest=True)
+    assert remarks(robot(mounting=POSTS, more="rest_base = true"), can_rest) == []
+
+
+def test_distance_beyond_a_footprint_is_that_to_its_side():
+    box = Footprint(((0.2, 0.15), (-0.1, 0.15), (-0.1, -0.15), (0.2, -0.15)))
+    for x, y, beyond in ((0.25, 0.0, 0.05), (0.0, -0.2, 0.05), (-0.3, 0.1, 0.2), (0.0, 0.0, -0.1), (0.2, 0.15, 0.0)):
+        assert box.outside_by(x, y) == pytest.approx(beyond, abs=1e-12)

@@ -62,7 +62,7 @@ EDGES = {
     "planner.threads",
     "robot_agent.__main__", "robot_agent.agent.edges", "robot_agent.agent.recording.input_writer",
     "robot_agent.agent.process", "robot_agent.agent.recording.replay", "robot_agent.agent.service",
-    "robot_agent.agent.settings",
+    "robot_agent.agent.settings", "robot_agent.contradictions",
     "robot_agent.guardian.__main__", "robot_agent.guardian.process", "robot_agent.guardian.protection",
     "robot_agent.guardian.stop_base", "robot_agent.guardian.wakeups", "robot_agent.guardian.watchdog",
     "robot_agent.port_names", "robot_agent.registry",

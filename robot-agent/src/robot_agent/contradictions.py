@@ -1,6 +1,6 @@
 """Settings of a robot that are valid one by one and make no sense together: they are refused before anything moves.
 
-Pure, and without numpy: the agent looks at them before it loads that.
+Without numpy: the agent looks at them before it loads that.
 """
 
 from __future__ import annotations

@@ -8,10 +8,12 @@ import pytest
 from little_world import LittleWorld
 
 from fog_contracts.messages import Pose, RobotCommand
+from robot_agent.localization.localizer import SavedPose
 
 ALIKE = {"rooms": [(1, 1, 4.5, 4), (6, 1, 9.5, 4)], "size": (11.0, 6.0)}
-# The second room has a niche that is so shallow that one scan does not tell the rooms apart.
-NICHE = {"rooms": [*ALIKE["rooms"], (7.6, 4, 8.4, 4.3)], "size": (11.0, 6.0)}
+# The second room has a niche that is so shallow that one scan does not tell the rooms apart: six more do, and a turn
+# in place has nine or more that count.
+NICHE = {"rooms": [*ALIKE["rooms"], (7.4, 4, 8.6, 4.3)], "size": (11.0, 6.0)}
 
 
 def started(pose, **world):
@@ -50,6 +52,33 @@ def test_turn_in_place_decides_between_places_and_the_robot_may_be_enabled():
     assert world.state().places == []
     assert world.travelled < 0.1
     assert world.command("enable").accepted
+
+
+@pytest.mark.parametrize("seed", range(6))
+def test_robot_that_was_put_down_elsewhere_knows_its_place_during_one_turn_and_never_blames_its_former_pose(seed):
+    """Between the scan that finds the place and those that prove it, the reason was how badly the former pose fits."""
+    world = LittleWorld(**NICHE, pose=(7.5, 2.3, 1.5), seed=seed)
+    world.agent.load(world.master.snapshot(), world.now)
+    world.agent.restore(SavedPose(site="lab", x=2.0, y=2.0, theta=0.0, sigma_xy=0.25, sigma_theta=0.15))
+    assert world.run(12.0, lambda one: one.state().places), world.state().reasons
+    world.run(0.1 * seed)  # the turn begins at another moment of a scan
+    assert world.command("turn").accepted
+    found = set()
+
+    def knows_its_place(one):
+        if not one.state().places and one.agent.localizer.status != "good":
+            found.add(one.agent.localizer.detail)
+        return one.state().mode == "INIT"
+
+    world.run(0.3)
+    assert world.run(20.0, knows_its_place), world.state()
+    assert "the turn ended: the robot knows where it is" in world.state().reasons
+    assert found
+    assert found <= {
+        "the robot's place was found: the next scans have to prove it",
+        "the robot was found elsewhere on the map: it was carried, or its pose was wrong",
+    }
+    assert world.error()[0] < 0.1
 
 
 def test_turn_in_rooms_that_are_the_same_leaves_the_places_and_the_robot_where_it_is():

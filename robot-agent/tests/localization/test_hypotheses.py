@@ -94,6 +94,30 @@ def test_twin_rooms_are_kept_as_hypotheses_by_a_search_until_the_drive_decides()
     assert not one.active
 
 
+@pytest.mark.parametrize("step", [0.07, 0.11, 0.21, 0.25])
+def test_robot_that_turns_on_is_found_by_the_search_that_confirms_its_place(step):
+    """Each scan does one share of the search. One that both ended it and counted let it begin anew, again and again."""
+    one, true, odom = Relocalization(CONFIG), TRUE, ORIGIN
+    assert one.begin(scan_at(true, odom), FIELDS)
+    search(one)
+    for _ in range(8):
+        true, odom = true.compose(Pose2(0.3, 0.0, 0.05)), odom.compose(Pose2(0.3, 0.0, 0.05))
+        one.on_scan(scan_at(true, odom), FIELDS)
+        if one.searching:
+            break
+    assert "one place is left" in one.outcome(0.0).detail
+    for _ in range(6):
+        true, odom = true.compose(Pose2(0.0, 0.0, step)), odom.compose(Pose2(0.0, 0.0, step))
+        one.on_scan(scan_at(true, odom), FIELDS)
+        outcome = one.outcome(0.0)
+        if outcome.pose is not None:
+            break
+    assert outcome.pose is not None
+    found = outcome.pose.compose(odom.relative_to(outcome.odom))
+    assert math.dist(found[:2], true[:2]) < 0.1
+    assert math.remainder(found.theta - true.theta, math.tau) == pytest.approx(0.0, abs=0.05)
+
+
 def test_single_place_that_the_last_scan_contradicts_is_not_called_several_that_look_alike(monkeypatch):
     one = Relocalization(CONFIG)
     monkeypatch.setattr(one, "_hypotheses", Hypotheses([Hypothesis(TRUE, -0.1, misfits=1)], ORIGIN))

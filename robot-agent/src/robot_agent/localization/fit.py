@@ -118,6 +118,11 @@ class FitMonitor:
         if self.status != "lost":
             self.status = "none"
 
+    def begin_found(self) -> None:
+        """Begin at the place that a search has found; the status stays until scans prove the place."""
+        self.restart()
+        self.detail = "the robot's place was found: the next scans have to prove it"
+
     def lose(self, detail: str) -> None:
         """Set the status to lost, with its reason."""
         self.status, self.detail = "lost", detail

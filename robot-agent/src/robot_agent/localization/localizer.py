@@ -310,7 +310,9 @@ class Localizer:
             return
         if verifying:
             self._monitor.lose("the robot was found elsewhere on the map: it was carried, or its pose was wrong")
-        self._monitor.restart()
+            self._monitor.restart()
+        else:
+            self._monitor.begin_found()
         self._doubt.restart()
         self._local_scans = 1
         self._filter.start(outcome.pose, outcome.odom, *_FOUND_SIGMAS)

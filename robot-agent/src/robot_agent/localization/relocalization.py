@@ -109,7 +109,13 @@ class Relocalization:
         hypotheses = self._hypotheses
         if self.searching:
             self.advance(fields)
-        if hypotheses is None or self._rivals is not None or not hypotheses.add(scan, fields, self._config.range_max):
+        if hypotheses is None or self._rivals is not None:
+            return
+        if self._confirmed and hypotheses.decided is not None:
+            # This share has confirmed a place, which the outcome tells now. Weighed by one scan more, it would have to
+            # be confirmed anew, and a robot that moves on would be found only once it stands still.
+            return
+        if not hypotheses.add(scan, fields, self._config.range_max):
             return
         self._scans.append(scan)
         self._confirmed = False

@@ -57,6 +57,7 @@ type_cells  # numba: a name that compiled signatures close over
 _.FACTORY  # bases, lidars, debounce rules and cost layers are found by their entry points
 _.SIGNATURE
 _.press_clean  # the emulated Roomba: tests press its button
+_.switch_on  # same, held while it is switched on
 _.pulse_wake_line  # the emulated Roomba: a pty has no control line, so tests pulse its pin themselves
 _.RULE
 _.LAYER

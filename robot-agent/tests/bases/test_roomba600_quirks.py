@@ -14,7 +14,7 @@ from robot_agent.bases.roomba600.mode_monitor import ModeMonitor
 from robot_agent.bases.roomba600.open_interface import SLOW_STREAM, Mode, stream_frame_size
 from robot_agent.guardian.core import GuardianCore
 from robot_agent.guardian.link import WheelCommand
-from robot_agent.guardian.revival import ATTEMPT_S, Attempt
+from robot_agent.guardian.revival import ATTEMPT_S, OTHERS_AFTER, Attempt
 
 STEP = 0.01
 QUIRKS = {
@@ -158,13 +158,76 @@ def test_a_sleeping_robot_without_that_wire_is_named_with_what_to_do():
 @pytest.mark.parametrize("configured", [115200, 19200])
 def test_a_robot_at_the_other_rate_is_found_and_driven_there(brc, configured):
     other = 19200 if configured == 115200 else 115200
-    line = Line(RoombaEmulator(quirks=Quirks(baud=other)), brc=brc, baud=configured)
+    line = Line(RoombaEmulator(quirks=Quirks(baud=other, keeps_baud=True)), brc=brc, baud=configured)
     line.wheels = (0.3, 0.25)
     line.run(2 * ATTEMPT_S + 2.5)
     assert (line.baud, line.drives, line.core.latched) == (other, True, None)
     attempts = len(line.attempts)
     line.run(10.0)
     assert len(line.attempts) == attempts
+
+
+@pytest.mark.parametrize("brc", ["none", "rts"])
+@pytest.mark.parametrize("configured", [115200, 19200])
+def test_a_robot_at_the_other_rate_is_brought_to_the_configured_one_and_driven_there(brc, configured):
+    line = Line(RoombaEmulator(quirks=Quirks(baud=134400 - configured)), brc=brc, baud=configured)
+    line.wheels = (0.3, 0.25)
+    unanswered = []
+    for _ in range(round((5 * ATTEMPT_S if brc == "rts" else 3 * ATTEMPT_S) / 0.1)):
+        line.run(0.1)
+        unanswered.append(line.core.unanswered)
+    assert (line.base.baud, line.baud, line.drives, line.core.latched) == (configured, configured, True, None)
+    assert set(unanswered) == {None}, "no agent was told that there is no base"
+    attempts = len(line.attempts)
+    line.run(10.0)
+    assert len(line.attempts) == attempts
+
+
+@pytest.mark.parametrize("configured", [115200, 19200])
+@pytest.mark.parametrize("keeps_baud", [False, True])
+def test_a_robot_that_changed_its_rate_after_it_had_answered_is_found_again(configured, keeps_baud):
+    line = Line(RoombaEmulator(quirks=Quirks(keeps_baud=keeps_baud)), baud=configured)
+    line.run(4 * ATTEMPT_S)
+    assert line.feedback[-1].status.mode_problem is None
+    line.base.switch_on(held=True)
+    line.run(4 * ATTEMPT_S)
+    line.wheels = (0.3, 0.25)
+    line.run(1.5)
+    assert (line.base.baud, line.drives, line.core.latched) == (19200 if keeps_baud else configured, True, None)
+
+
+def test_a_robot_that_changes_its_rate_on_its_way_is_a_fault_and_found_again_after_the_reset():
+    line = Line()
+    line.wheels = (0.3, 0.25)
+    line.run(1.5)
+    line.base.switch_on(held=True)
+    line.run(20.0)
+    assert "has sent no valid frame" in line.core.latched
+    assert line.base.wheel_speeds_m_s == (0.0, 0.0)
+    line.handle(line.core.on_command(WheelCommand(seq=10**6, left=0.0, right=0.0, reset=True), line.now))
+    line.seq = 10**6
+    line.run(4 * ATTEMPT_S)
+    assert (line.base.baud, line.drives, line.core.latched) == (115200, True, None)
+
+
+def test_a_sleeping_robot_at_the_other_rate_is_found_after_somebody_has_pressed_clean_minutes_later():
+    line = Line(RoombaEmulator(quirks=Quirks(baud=19200)))
+    line.base.asleep = True
+    line.run(200.0)
+    assert "press its CLEAN button" in line.core.unanswered
+    line.base.press_clean()
+    line.wheels = (0.3, 0.25)
+    line.run((OTHERS_AFTER + 3) * ATTEMPT_S)
+    assert (line.base.baud, line.core.unanswered, line.drives) == (115200, None, True)
+
+
+@pytest.mark.parametrize("configured", [115200, 19200])
+def test_a_robot_that_answers_at_the_configured_rate_is_told_no_other(configured):
+    driver = Roomba600Driver(Roomba600Options(baud=configured))
+    for rate in (configured, 134400 - configured, configured):
+        driver.use_baud(rate)
+        code = {115200: 11, 19200: 7}[configured]
+        assert driver.wake().endswith(bytes((129, code))) == (rate != configured)
 
 
 # --- sleeping while the robot rests ---
@@ -289,8 +352,8 @@ def test_a_robot_on_its_dock_is_left_in_passive_mode_and_comes_up_when_it_is_tak
 @pytest.mark.live
 @pytest.mark.parametrize(
     "quirks",
-    [QUIRKS["all at once"], Quirks(baud=19200)],
-    ids=["all quirks of the stream at once", "19200 baud"],
+    [QUIRKS["all at once"], Quirks(baud=19200), Quirks(baud=19200, keeps_baud=True)],
+    ids=["all quirks of the stream at once", "19200 baud", "19200 baud for good"],
 )
 def test_the_processes_drive_a_robot_with_quirks(tmp_path, quirks):
     with rigs.Rig(tmp_path, robot=RoombaEmulator(quirks=quirks)) as rig:

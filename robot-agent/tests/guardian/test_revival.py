@@ -43,29 +43,37 @@ def test_line_is_pulsed_twice_before_a_base_of_one_rate_is_given_up_and_on() -> 
     assert tried.problem == ONE_RATE
 
 
-def test_each_rate_is_tried_once_and_then_the_first_for_good() -> None:
+def test_each_rate_is_tried_once_and_then_the_first_nine_times_for_each_time_of_another() -> None:
     tried = revival(115_200, 19_200)
     assert tried.baud == 115_200
     assert attempts(tried, 1) == [Attempt(baud=19_200)]
     assert (tried.baud, tried.problem) == (19_200, None)
     assert attempts(tried, 1, 13.0) == [Attempt(baud=115_200)]
+    assert (tried.baud, tried.problem) == (115_200, None)
+    assert attempts(tried, 1, 16.0) == [None]
     assert (tried.baud, tried.problem) == (115_200, TWO_RATES)
-    assert attempts(tried, 5, 16.0) == [None] * 5
-    assert tried.baud == 115_200
+    again = [None] * 7 + [Attempt(baud=19_200), Attempt(baud=115_200)] + [None] * 8 + [Attempt(baud=19_200)]
+    assert attempts(tried, 18, 19.0) == again
+
+
+def test_three_rates_take_turns() -> None:
+    tried = revival(115_200, 57_600, 19_200)
+    bauds = [115_200, *(attempt.baud for attempt in attempts(tried, 24) if attempt is not None)]
+    assert bauds == 3 * [115_200, 57_600, 19_200]
 
 
 def test_line_is_pulsed_at_each_rate() -> None:
     tried = revival(115_200, 19_200, line=RTS)
     pulse = Attempt(line=RTS)
     expected = [pulse, Attempt(baud=19_200), pulse, Attempt(baud=115_200), pulse, pulse]
-    assert attempts(tried, 3) == expected[:3]
+    assert attempts(tried, 5) == expected[:5]
     assert tried.problem is None
-    assert attempts(tried, 3, 19.0) == expected[3:]
+    assert attempts(tried, 1, 25.0) == expected[5:]
     assert tried.problem == TWO_RATES
 
 
 @pytest.mark.parametrize("count", [1, 2])
-def test_rate_at_which_the_base_answered_is_kept_and_all_begins_anew(count: int) -> None:
+def test_rate_at_which_the_base_answered_is_the_first_one_when_all_begins_anew(count: int) -> None:
     tried = revival(115_200, 19_200)
     attempts(tried, count)
     answered = tried.baud
@@ -73,7 +81,9 @@ def test_rate_at_which_the_base_answered_is_kept_and_all_begins_anew(count: int)
     assert (tried.baud, tried.problem) == (answered, None)
     assert tried.attempt(100.0) is None
     assert tried.attempt(102.9) is None
-    assert tried.attempt(103.0) is None, "there is no other rate"
+    other = 134_400 - answered
+    assert tried.attempt(103.0) == Attempt(baud=other), "it may have been switched on at another one"
+    assert attempts(tried, 2, 103.0) == [Attempt(baud=answered), None]
     assert (tried.baud, tried.problem) == (answered, TWO_RATES)
 
 

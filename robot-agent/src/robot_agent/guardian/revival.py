@@ -10,6 +10,9 @@ if TYPE_CHECKING:
 ATTEMPT_S: Final = 3.0
 """Time between two attempts: longer than a pulse and the base's answer to it, and so long that pulses are never taken
 for a series, by which some bases change their baud rate."""
+OTHERS_AFTER: Final = 9
+"""Once every rate was tried, the first one is tried so many times before each of the others: who switches the base on
+may do so later, and at any of them."""
 
 
 class Attempt(NamedTuple):
@@ -20,7 +23,7 @@ class Attempt(NamedTuple):
 
 
 class Revival:
-    """The attempts on one base, in turn: each rate once, then the first one for good; a pulse at each."""
+    """The attempts on one base, in turn: each rate once, then mostly the first one; a pulse at each."""
 
     def __init__(self, awakening: Awakening) -> None:
         self._awakening = awakening
@@ -28,21 +31,28 @@ class Revival:
         self._due_at: float | None = None
         self._attempts = 0
         self.problem: str | None = None
-        """Why there is no base, once every rate was tried."""
+        """Why there is no base, once every rate was tried, and the first one again."""
 
     def on_answer(self) -> None:
-        """Keep the rate at which the base has answered, and start over when it falls silent."""
-        if self._due_at is None and not self._attempts and len(self._bauds) == 1:
+        """Keep the rate at which the base has answered, and start over with it when the base falls silent."""
+        if self._due_at is None and not self._attempts:
             return  # it has answered before, and nothing was tried since
+        answered = self.baud
         self._due_at = self.problem = None
-        self._bauds = (self.baud,)
+        self._bauds = (answered, *(baud for baud in self._bauds if baud != answered))
         self._attempts = 0
 
     @property
     def baud(self) -> int:
         """The rate that is tried now."""
-        cycle = (*self._bauds, self._bauds[0])
-        return cycle[min(self._attempts // self._per_baud, len(cycle) - 1)]
+        first, *others = self._bauds
+        tried = self._attempts // self._per_baud
+        if not others:
+            return first
+        if tried < len(self._bauds):
+            return self._bauds[tried]
+        turn = (tried - len(self._bauds)) % (OTHERS_AFTER + len(others))
+        return first if turn < OTHERS_AFTER else others[turn - OTHERS_AFTER]
 
     @property
     def _per_baud(self) -> int:
@@ -57,7 +67,9 @@ class Revival:
         self._due_at = now + ATTEMPT_S
         before = self.baud
         self._attempts += 1
-        if self._attempts >= self._per_baud * len(self._bauds):
+        # Some bases are told to speak at the first rate, while another one is tried.
+        rates = len(self._bauds) if len(self._bauds) == 1 else len(self._bauds) + 1
+        if self._attempts >= self._per_baud * rates:
             self.problem = self._sentence()
         if self.baud != before:
             return Attempt(baud=self.baud)

@@ -77,7 +77,10 @@ class Roomba600Options(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown
     ] = 0.235
     baud: Annotated[
         Literal[115200, 19200],
-        Meta(description="rate of the serial line; the guardian tries the other one when the robot is silent"),
+        Meta(
+            description="rate of the serial line; a robot that is silent at it is looked for at the other one, "
+            "and told to speak at this one"
+        ),
     ] = 115200
     brc: Annotated[
         Literal["none", "rts", "dtr"],
@@ -91,6 +94,8 @@ class Roomba600Driver:
     timing = BaseTiming(frame_timeout=0.3, wake_timeout=1.0, ignored_after_wake=0.1, frame_s=0.015)
 
     def __init__(self, options: Roomba600Options) -> None:
+        self._configured = options.baud
+        self._baud: int = options.baud
         self._stream = _STREAMS[options.baud]
         self._parser = oi.StreamParser(self._stream)
         self._corrupted_before = 0
@@ -136,13 +141,18 @@ class Roomba600Driver:
         return BaseReading(self._status(frame), self._odometry(frame))
 
     def wake(self) -> bytes:
-        """Return Start and the request for the stream; Safe follows when the robot reports its Passive mode."""
+        """Return Start and the request for the stream; Safe follows when the robot reports its Passive mode.
+
+        One that is found at another rate than the configured one is told to speak at that: watchdog and service manager
+        stop it at no other. It then falls silent here, and is heard when the configured rate is tried again.
+        """
         # Start puts the OI into Passive mode, which stops the wheels by itself. A base whose receiver was in the middle
         # of a wheel command takes up to four bytes as the missing ones.
         self._mode.restart()
         self._safe_sent_at = -math.inf
         self._modes = _DRIVING
-        return 5 * oi.start() + oi.stream(self._stream)
+        told = oi.baud(self._configured) if self._baud != self._configured else b""
+        return 5 * oi.start() + oi.stream(self._stream) + told
 
     def respond(self) -> bytes:
         """Return Safe and zero speed, once the offset of the mode is known; a charging robot stays in Passive mode.
@@ -179,6 +189,7 @@ class Roomba600Driver:
 
     def use_baud(self, baud: int) -> None:
         """Ask for the stream that fits into this rate."""
+        self._baud = baud
         self._stream = _STREAMS[baud]
         self._corrupted_before += self._parser.corrupted
         self._parser = oi.StreamParser(self._stream)

@@ -138,6 +138,8 @@ commanded, the encoders and the light bumper. 70 bytes a frame, of 172 possible.
 
 SLOW_STREAM: Final = (7, 9, 10, 11, 12, 14, 34, 35, 43, 44)
 """What fits into 15 ms at 19200 baud, 28 bytes: the safety sensors and the encoders, without the battery."""
+BAUD_CODES: Final = {19200: 7, 115200: 11}
+"""Rates of the serial line by which the robot is spoken to, and what Baud (129) calls them."""
 
 
 def expand(ids: Iterable[int]) -> tuple[int, ...]:
@@ -199,6 +201,14 @@ def reset() -> bytes:
 def start() -> bytes:
     """Start the interface (128): Off -> Passive."""
     return b"\x80"
+
+
+def baud(rate: int) -> bytes:
+    """Change the rate of the serial line (129); at the new one the robot wants nothing for 0.1 s.
+
+    It keeps that rate until it loses its battery, or is switched on with its button held (19200).
+    """
+    return bytes((129, BAUD_CODES[rate]))
 
 
 def safe() -> bytes:

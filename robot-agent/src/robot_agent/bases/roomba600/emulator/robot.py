@@ -26,6 +26,10 @@ _ARGUMENTS: Final = {
 }  # fmt: skip
 
 
+_BAUDS: Final = {7: 19200, 8: 28800, 9: 38400, 10: 57600, 11: 115200}
+"""Rates by the codes of Baud (129), without those that no host uses."""
+
+
 class CommandParser:
     """Splits received bytes into commands."""
 
@@ -72,6 +76,8 @@ class RoombaEmulator:
     ) -> None:
         """Wake up in mode Off, with the encoders at these readings."""
         self.quirks = quirks or Quirks()
+        self.baud = self.quirks.baud
+        """Speed of the serial line."""
         self.asleep = False
         """It neither hears nor sends anything until it is woken."""
         self._noise = LineNoise(self.quirks)
@@ -96,11 +102,6 @@ class RoombaEmulator:
         """Whether its firmware drives it about to clean."""
         return isinstance(self._program, Cleaning)
 
-    @property
-    def baud(self) -> int:
-        """Speed of the serial line."""
-        return self.quirks.baud
-
     def pulse_wake_line(self, seconds: float) -> None:
         """Pull the BRC pin low for so long: a second wakes the robot."""
         if self.asleep and seconds >= 1.0:
@@ -116,6 +117,13 @@ class RoombaEmulator:
             self._stop_program()
         else:
             self.clean()
+
+    def switch_on(self, *, held: bool) -> None:
+        """Switch it off and on again by its button; one that is held meanwhile makes it speak at 19200 baud."""
+        self.baud = 19200 if held else self.baud
+        self.asleep = False
+        self._commands.forget()
+        self._leave(OFF)
 
     def clean(self) -> None:
         """Begin to clean, as by its schedule, which wakes it; nothing while the host has control."""
@@ -174,7 +182,10 @@ class RoombaEmulator:
         if self.asleep:
             return
         for opcode, arguments in self._commands.parse(data):
-            self._act(opcode, arguments, now)
+            if opcode == 129:
+                self._change_baud(arguments[0])
+            else:
+                self._act(opcode, arguments, now)
 
     def outgoing(self, now: float) -> bytes:
         """Return what the robot has sent up to `now`, once."""
@@ -223,6 +234,10 @@ class RoombaEmulator:
             move = {137: self._wheels.drive, 145: self._wheels.drive_direct, 146: self._wheels.drive_pwm}[opcode]
             move(_signed(arguments[:2]), _signed(arguments[2:]))
             self._protect()
+
+    def _change_baud(self, code: int) -> None:
+        if self.mode != OFF and not self.quirks.keeps_baud:
+            self.baud = _BAUDS.get(code, self.baud)
 
     def _report(self, opcode: int, arguments: bytes, now: float) -> None:
         """Send packets once (opcodes 142, 149), or begin, resume or pause their stream (148, 150)."""

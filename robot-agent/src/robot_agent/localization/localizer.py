@@ -264,6 +264,7 @@ class Localizer:
         self._doubt.add(fit, scan.odom, jumped=self._filter.jumped)
         self._monitor.add(fit, self._filter.uncertainty, doubt=self._doubt.reason)
         if self._monitor.status == "lost":
+            self._relocalization.verifies = False
             self._look_nearby(scan, now)
             return
         self._local_scans = 0
@@ -273,7 +274,7 @@ class Localizer:
             if not self._doubt.to_verify:
                 self._relocalization.cancel()
             elif self._may_verify(now):
-                self._relocalization.begin(scan, fields)
+                self._relocalization.begin(scan, fields, verifies=True)
 
     def _look_nearby(self, scan: DeskewedScan, now: float) -> None:
         """Look for a lost robot near its last pose, since most slipped or were pushed; then on the whole map."""
@@ -298,17 +299,19 @@ class Localizer:
         outcome = self._relocalization.outcome(now)
         if outcome is None:
             return
-        verifying = self._doubt.to_verify and self._monitor.status == "weak"
+        fits_again = self._doubt.to_verify and self._monitor.status == "weak"
         if outcome.pose is None:
-            if not verifying:
+            # The particles of a lost robot may slide to one of several places alike: that decides for none of them.
+            undecided = self._relocalization.active and not self._relocalization.verifies
+            if undecided or not fits_again:
                 self._monitor.lose(outcome.detail)
             return
         self._doubt.verify()
         pose = self._filter.pose(outcome.odom)
-        if verifying and pose is not None and not apart(pose, outcome.pose):
+        if fits_again and pose is not None and not apart(pose, outcome.pose):
             self._verify_again_at = now + _VERIFY_EVERY_S
             return
-        if verifying:
+        if fits_again:
             self._monitor.lose("the robot was found elsewhere on the map: it was carried, or its pose was wrong")
             self._monitor.restart()
         else:

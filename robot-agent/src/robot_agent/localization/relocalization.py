@@ -52,6 +52,8 @@ class Relocalization:
         self._again_at = -math.inf
         self._failed_at: Pose2 | None = None
         """Odometry at which the last search ended without any place."""
+        self.verifies = False
+        """Whether this only looks for places like that of a pose that fits; else the robot is lost until it ends."""
 
     @property
     def active(self) -> bool:
@@ -81,11 +83,12 @@ class Relocalization:
         """End the search and forget all places."""
         self._search = self._hypotheses = self._rivals = None
 
-    def begin(self, scan: DeskewedScan, fields: MapFields) -> bool:
+    def begin(self, scan: DeskewedScan, fields: MapFields, *, verifies: bool = False) -> bool:
         """Begin a search with a scan; False if the map has no free place, or the scan too few points."""
         if not len(fields.free_places) or len(scan.points) < _POINTS_MIN:
             return False
         self.cancel()
+        self.verifies = verifies
         self._scans.clear()
         self._scans.append(scan)
         self._search_with(scan, fields)

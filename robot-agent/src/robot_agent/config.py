@@ -5,6 +5,7 @@ Lengths in m, angles in rad, times in s.
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, field, replace
 from functools import partial
 from typing import TYPE_CHECKING, Final
@@ -37,6 +38,8 @@ _REMEMBERED_REVOLUTIONS: Final = 2.5
 there."""
 _WHEEL_SPEED_MAX: Final = 0.5
 """No wheel turns faster (m/s), whatever the base can do."""
+_TURNED_BACK_S: Final = 4.0
+"""A robot whose turning rate is not limited has turned round so soon on its way out of a blocked area."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -281,6 +284,8 @@ def _with_motion(config: AgentConfig, motion: MotionSettings) -> AgentConfig:
         speed_normal=motion.speed_m_s,
         speed_degraded=motion.degraded_speed_m_s,
         speed_egress=creep,
+        # What is left of the way does not shrink while it turns.
+        egress_stall=config.safety.egress_stall + max(0.0, math.pi / motion.turn_rad_s - _TURNED_BACK_S),
         undock_max=config.safety.undock_max * longer,
         advance_max=config.safety.advance_max * longer,
     )

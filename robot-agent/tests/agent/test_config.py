@@ -84,6 +84,14 @@ def test_every_setting_of_the_robot_file_reaches_the_configuration():
     assert limits_of(settings.motion, 0.3) == Limits(linear=0.21, acceleration=0.76)
 
 
+@pytest.mark.parametrize(("turn_rad_s", "stall"), [(2.75, 10.0), (0.8, 10.0), (0.5, 12.28), (0.2, 21.71)])
+def test_robot_that_turns_slowly_has_the_time_to_turn_to_its_way_out(turn_rad_s, stall):
+    parts = {"base": BaseSettings(driver="b"), "lidar": LidarSettings(driver="l")}
+    settings = RobotSettings(**parts, motion=MotionSettings(turn_rad_s=turn_rad_s))
+    found = agent_config("r1", KEY, BASE, LIDAR, boot="b1", settings=settings).safety.egress_stall
+    assert found == pytest.approx(stall, abs=0.01)
+
+
 def test_stop_field_remembers_two_turns_and_a_half_of_a_slow_or_late_lidar():
     late = RobotSettings(base=BaseSettings(driver="b"), lidar=LidarSettings(driver="l", latency_s=0.3))
     slow = replace(LIDAR, scan_period_s=0.4)

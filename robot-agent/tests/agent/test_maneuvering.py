@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 from types import SimpleNamespace
 
 import pytest
@@ -31,7 +32,7 @@ def facing(theta: float) -> Pose2:
 
 
 def turning(first: float = 0.0) -> Turning:
-    made = Turning(0.2)
+    made = Turning(0.2, 2.75)
     made.begin(facing(first))
     return made
 
@@ -68,8 +69,26 @@ def test_turn_slows_down_before_its_heading_but_not_to_rest(lacking, rate):
     assert (left, right) == pytest.approx((-rate * 0.1, rate * 0.1))
 
 
+@pytest.mark.parametrize("rate", [0.2, 0.3])
+def test_no_maneuver_turns_faster_than_the_robot_may(rate):
+    slow = replace(AGENT, motion=replace(AGENT.motion, limits=replace(AGENT.motion.limits, w_max=rate)))
+    turn = Turning(0.2, rate)
+    turn.begin(ORIGIN)
+    assert turn.wheels(ORIGIN) == pytest.approx((-0.1 * rate, 0.1 * rate))
+    egress = Egress(slow)
+    ask_and_reply(egress, WAY_OUT, ORIGIN, 1.0)
+    for heading in (-3.0, -0.3, -0.1, 0.2, 1.5):
+        left, right = egress.wheels(Pose2(0.0, 0.0, heading))
+        v, w = 0.5 * (left + right), (right - left) / (2 * HALF_AXLE_M)
+        assert abs(w) == pytest.approx(min(rate, 2.0 * abs(heading)))
+        assert (v > 0.0) == (abs(heading) < 0.35)
+    maneuvers = Maneuvers(slow, Localizer(), Guard())
+    maneuvers.inputs(state("turn"), None, ORIGIN, 1.0)
+    assert maneuvers._wheels("turn", 1.0) == pytest.approx((-rate * HALF_AXLE_M, rate * HALF_AXLE_M))
+
+
 def test_turn_without_odometry_neither_moves_nor_ends():
-    turn = Turning(0.2)
+    turn = Turning(0.2, 2.75)
     assert turn.remaining(ORIGIN) == math.inf
     assert turn.wheels(ORIGIN) == (0.0, 0.0)
     turn.begin(None)

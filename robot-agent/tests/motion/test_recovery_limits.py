@@ -3,15 +3,18 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
+from little_world import AGENT
 from open_floor import LONG, PADDING, ROUND, around
 
 from fog_contracts.costs import UNKNOWN
+from fog_contracts.grid import GridGeometry
 from robot_agent.agent.path.recoveries import Recoveries
 from robot_agent.localization.pose import Pose2
-from robot_agent.motion.local_planner import Decision
+from robot_agent.motion.local_planner import Decision, Job, decide
 from robot_agent.motion.path_follower import PathFollower
 from robot_agent.motion.recovery import Attempt, Recovery, Situation, step
 from robot_agent.motion.recovery_moves import RecoveryMove, clearances, recovery_speeds
@@ -20,6 +23,30 @@ from robot_agent.motion.trail import Trail
 HERE = Pose2(1.5, 1.5, 0.0)
 STUCK = Situation(place=(0.0, 0.0), stuck_for=4.0, error=0.5, trail=0.5)
 ALONG = STUCK._replace(error=0.0)
+
+
+# --- the turning rate ---
+
+
+@pytest.mark.parametrize("rate", [0.2, 0.5, 2.75])
+@pytest.mark.parametrize(
+    "move", [RecoveryMove(heading=2.0), RecoveryMove(heading=-2.0), RecoveryMove(trail=np.array([[1.36, 1.54]]))]
+)
+def test_recovery_turns_no_faster_than_the_robot_may_and_keeps_its_arc(rate, move):
+    window = GridGeometry(width=60, height=60, resolution=0.05, origin_x=0.0, origin_y=0.0)
+    motion = replace(AGENT.motion, limits=replace(AGENT.motion.limits, w_max=rate))
+    made = decide(
+        Job(
+            plan_id=1, planner_epoch=1, made_at=0.0, pose=HERE, v=0.0, w=0.0, path=np.array([[1.5, 1.5], [2.5, 1.5]]),
+            ends_here=False, goal_theta=None, arrived=False, cap=0.3, cost=np.zeros(window.shape, np.uint8),
+            window=window, lidar_points=np.zeros((0, 2)), footprint=AGENT.footprint, config=motion, recovery=move,
+        )
+    )  # fmt: skip
+    v, w = recovery_speeds(move, HERE, around([]), ROUND, PADDING, 0.3)
+    assert abs(w) > 0.2
+    share = min(1.0, rate / abs(w))
+    assert (made.v, made.w) == pytest.approx((v * share, w * share))
+    assert (made.right - made.left) / motion.limits.axle == pytest.approx(w * share)
 
 
 # --- the machine ---

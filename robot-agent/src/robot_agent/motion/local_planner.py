@@ -103,6 +103,12 @@ def twist(left: float, right: float, axle: float) -> tuple[float, float]:
     return 0.5 * (left + right), (right - left) / axle
 
 
+def turning_at_most(v: float, w: float, rate: float) -> tuple[float, float]:
+    """Return v (m/s) and w (rad/s) slowed down to this turning rate (rad/s), on the same arc."""
+    share = min(1.0, rate / abs(w)) if w else 1.0
+    return v * share, w * share
+
+
 def decide(job: Job) -> Decision:
     """Choose the speeds for the next period; pure, a millisecond of work, releases the GIL inside its kernels."""
     config, body = job.config, body_of(job.footprint)
@@ -168,7 +174,7 @@ def decide(job: Job) -> Decision:
 def _recover(job: Job, move: RecoveryMove, around: Clearance, body: Body) -> Decision:
     """Return the speeds of a recovery's move."""
     chosen = recovery_speeds(move, job.pose, around, body, job.config.arcs.padding, job.cap)
-    v, w = chosen or (0.0, 0.0)
+    v, w = turning_at_most(*(chosen or (0.0, 0.0)), job.config.limits.w_max)
     left, right = wheels(v, w, job.config.limits.axle)
     return Decision(
         plan_id=job.plan_id,

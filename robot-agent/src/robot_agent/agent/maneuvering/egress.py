@@ -12,7 +12,7 @@ import numpy as np
 
 from fog_contracts.geometry import PATH_SPACING_M, sampled
 from fog_contracts.messages import EgressRequest, Pose
-from robot_agent.motion.local_planner import wheels
+from robot_agent.motion.local_planner import turning_at_most, wheels
 from robot_agent.motion.path_follower import PathFollower
 from robot_agent.motion.slow_follower import follow_slowly
 
@@ -97,4 +97,5 @@ class Egress:
         if self._follower is None or pose is None:
             return 0.0, 0.0
         motion = follow_slowly(self._follower, pose, self._config.safety.speed_egress)
-        return wheels(motion.v, motion.w, self._config.drive_train.axle_m)
+        v, w = turning_at_most(motion.v, motion.w, self._config.motion.limits.w_max)
+        return wheels(v, w, self._config.drive_train.axle_m)

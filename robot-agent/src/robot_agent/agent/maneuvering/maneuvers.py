@@ -54,7 +54,7 @@ class Maneuvers:
         self._drive = config.drive_train
         self.egress = Egress(config)
         self.docking = Docking(config, localizer)
-        self._turning = Turning(config.drive_train.axle_m)
+        self._turning = Turning(config.drive_train.axle_m, config.motion.limits.w_max)
         self._straight: dict[ManeuverKind, Straight] = {
             "undock": Straight(-UNDOCK_M, config.safety.speed_egress),
             "back_off": Straight(-BACK_OFF_M, config.safety.speed_back_off),

@@ -24,10 +24,11 @@ _GAIN_PER_S: Final = 2.0
 
 
 class Turning:
-    """One such movement of a robot whose wheels are so far apart (m)."""
+    """One such movement of a robot whose wheels are so far apart (m), and that may turn so fast (rad/s)."""
 
-    def __init__(self, axle_m: float) -> None:
+    def __init__(self, axle_m: float, rate_max: float) -> None:
         self._half = 0.5 * axle_m
+        self._rate = min(_RATE_RAD_S, rate_max)
         self._first: float | None = None
         self._left: list[float] = []
 
@@ -53,7 +54,7 @@ class Turning:
         error = self._error(odom)
         if error == 0.0:
             return 0.0, 0.0
-        rate = math.copysign(min(_RATE_RAD_S, max(_SLOWEST_RAD_S, _GAIN_PER_S * abs(error))), error)
+        rate = math.copysign(min(self._rate, max(_SLOWEST_RAD_S, _GAIN_PER_S * abs(error))), error)
         return -rate * self._half, rate * self._half
 
     def _error(self, odom: Pose2 | None) -> float:

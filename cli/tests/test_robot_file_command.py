@@ -62,24 +62,32 @@ def test_check_prints_the_effective_settings_or_the_line_of_a_mistake(tmp_path):
     assert f"robot.toml:{line}: base.options.axle_m" in json.loads(result.stdout)["problem"]
     file.write_text(text.replace("footprint = []", "footprint = [[1, 1], [0.5, 1], [1, 2]]"))
     problem = json.loads(run(app, ["robot", "check", str(file), "--json"]).stdout)["problem"]
-    assert "robot.toml:61: body.footprint: " in problem
+    assert f"robot.toml:{line_of(file, '[body]', 'footprint = ')}: body.footprint: " in problem
+
+
+def line_of(file, table, begin):
+    """Return the number of the line in a table of a file that begins so."""
+    lines = file.read_text().splitlines()
+    first = lines.index(table)
+    return next(number for number, line in enumerate(lines[first:], first + 1) if line.startswith(begin))
 
 
 @pytest.mark.parametrize(
-    ("base", "lidar", "place", "problem"),
+    ("base", "lidar", "key", "problem"),
     [
-        ("/dev/ttyUSB0", "", "11: base.port", "/dev/ttyUSB0 is no name to rely on"),
-        ("", "/dev/ttyACM7", "35: lidar.port", "/dev/ttyACM7 is no name to rely on"),
-        ("/dev/serial/by-id/a", "/dev/serial/by-id/a", "35: lidar.port", "the port of the base, too"),
+        ("/dev/ttyUSB0", "", "base.port", "/dev/ttyUSB0 is no name to rely on"),
+        ("", "/dev/ttyACM7", "lidar.port", "/dev/ttyACM7 is no name to rely on"),
+        ("/dev/serial/by-id/a", "/dev/serial/by-id/a", "lidar.port", "the port of the base, too"),
     ],
 )
-def test_check_refuses_the_ports_that_no_process_would_open(tmp_path, base, lidar, place, problem):
+def test_check_refuses_the_ports_that_no_process_would_open(tmp_path, base, lidar, key, problem):
     file = tmp_path / "robot.toml"
     first, second, third = robot_text(default_robot()).split('port = ""')
     file.write_text(f'{first}port = "{base}"{second}port = "{lidar}"{third}')
     result = run(app, ["robot", "check", str(file), "--json"])
     assert result.exit_code == 1
-    assert f"robot.toml:{place}: " in json.loads(result.stdout)["problem"]
+    place = line_of(file, "[lidar]" if key == "lidar.port" else "[base]", "port = ")
+    assert f"robot.toml:{place}: {key}: " in json.loads(result.stdout)["problem"]
     assert problem in json.loads(result.stdout)["problem"]
 
 
@@ -128,7 +136,8 @@ def test_check_remarks_what_the_sites_radius_decides(tmp_path):
     assert result.exit_code == 0
     assert "unless the site gives this robot a larger `radius` than 0.17 m: " in result.output
     *_, told = json.loads(run(app, ["robot", "check", str(file), "--json"]).stdout)["remarks"]
-    assert "robot.toml:37: lidar.x_m: the lidar's axis (0.2, 0) is 0.030 m outside" in told
+    place = line_of(file, "[lidar]", "x_m = ")
+    assert f"robot.toml:{place}: lidar.x_m: the lidar's axis (0.2, 0) is 0.030 m outside" in told
 
 
 def test_new_overwrites_nothing_and_knows_its_parts(tmp_path):

@@ -245,3 +245,13 @@ async def test_fast_clock_scales_time_and_timeouts():
 def test_speed_out_of_range_is_refused(speed):
     with pytest.raises(ValueError, match="speed"):
         SystemClock(speed)
+
+
+async def test_a_tick_that_was_held_up_counts_as_late_by_as_much():
+    loop_ticker = ticker(SystemClock(), period=0.2)
+    loop_ticker._record(now=10.0, due=10.0)
+    loop_ticker.held_up(0.09)
+    assert (loop_ticker.p99_s, loop_ticker.late) == (pytest.approx(0.09), 0)
+    loop_ticker._record(now=10.2, due=10.2)
+    loop_ticker.held_up(0.11)
+    assert (loop_ticker.p99_s, loop_ticker.late) == (pytest.approx(0.11), 1)

@@ -3,6 +3,7 @@ from __future__ import annotations
 import asyncio
 import threading
 import time
+from concurrent.futures import Future
 
 import msgspec
 import numpy as np
@@ -356,3 +357,83 @@ async def test_hanging_decision_does_not_block_the_stream(rig, monkeypatch):
             task.cancel()
         await asyncio.gather(*tasks, return_exceptions=True)
         release.set()
+
+
+class Decisions:
+    """Decides when the test lets it, and records which decisions have begun and which were accepted."""
+
+    def __init__(self, rig, monkeypatch):
+        self.events = []
+        self.may_end = threading.Event()
+        self.failure = None
+        self.guardian = FakeGuardian()
+        monkeypatch.setattr(service_module, "decide", self._decide)
+        monkeypatch.setattr(rig.core, "control_job", lambda now: now)
+        monkeypatch.setattr(rig.core, "accept", lambda job: self.events.append(("accepted", job)))
+
+    def _decide(self, job):
+        self.events.append(("begun", job))
+        assert self.may_end.wait(DEADLINE_S)
+        if self.failure is not None:
+            raise self.failure
+        return job
+
+    def seen(self, kind):
+        return [job for event, job in self.events if event == kind]
+
+
+@pytest.fixture
+def decisions(rig, monkeypatch):
+    return Decisions(rig, monkeypatch)
+
+
+async def test_the_stream_collects_a_decision_once_it_is_made_before_its_look_and_command(rig, monkeypatch):
+    order, guardian, decision = [], FakeGuardian(), Future()
+    monkeypatch.setattr(guardian, "receive", lambda: order.append("look"))
+    monkeypatch.setattr(rig.core, "accept", order.append)
+
+    async def call(_ticker, body):
+        rig.service._decision = decision
+        for now in (100.0, 100.05, 100.1):
+            body(now)
+            order.append(f"command {guardian.sent[-1][1].seq}")
+            if now == 100.0:
+                decision.set_result("a decision")
+
+    monkeypatch.setattr(service_module.Ticker, "call", call)
+    await rig.service.stream_loop(guardian, FakeLidar())
+    assert order == ["look", "command 1", "a decision", "look", "command 2", "look", "command 3"]
+
+
+async def test_no_decision_begins_beside_one_that_is_slower_than_its_period_and_the_next_counts_as_late(rig, decisions):
+    loops = rig.service.control_loop(), rig.service.stream_loop(decisions.guardian, FakeLidar())
+    tasks = [asyncio.create_task(loop) for loop in loops]
+    try:
+        await rig.until(lambda: decisions.seen("begun"))
+        before = len(decisions.guardian.sent)
+        # At twice the rate of decisions or more, these are more than two periods.
+        await rig.until(lambda: len(decisions.guardian.sent) >= before + 12)
+        assert len(decisions.seen("begun")) == 1
+        decisions.may_end.set()
+        await rig.until(lambda: len(decisions.seen("accepted")) >= 2)
+    finally:
+        decisions.may_end.set()
+        for task in tasks:
+            task.cancel()
+        await asyncio.gather(*tasks, return_exceptions=True)
+    first, second = decisions.seen("begun")[:2]
+    period = rig.core.profile.control_period
+    assert second - first >= 2 * period, "the time of its inputs is that at which it begins"
+    assert rig.service._loop_health().control_p99_s >= period / 2
+
+
+async def test_an_error_in_a_decision_ends_a_loop_of_the_agent(rig, decisions):
+    decisions.failure = ZeroDivisionError("in a decision")
+    decisions.may_end.set()
+    loops = rig.service.control_loop(), rig.service.stream_loop(decisions.guardian, FakeLidar())
+    tasks = [asyncio.create_task(loop) for loop in loops]
+    done, others = await asyncio.wait(tasks, timeout=DEADLINE_S, return_when=asyncio.FIRST_EXCEPTION)
+    for task in others:
+        task.cancel()
+    await asyncio.gather(*others, return_exceptions=True)
+    assert [task.exception() for task in done] == [decisions.failure]

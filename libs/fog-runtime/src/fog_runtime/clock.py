@@ -274,6 +274,12 @@ class Ticker:
             if timer is not None:
                 timer.cancel()
 
+    def held_up(self, seconds: float) -> None:
+        """Count the tick that is under way as `seconds` later than it was: what it needs has come no earlier."""
+        self._lateness[-1] += seconds
+        if seconds > self.period / 2:
+            self.late += 1
+
     def rejoin(self) -> None:
         """Go on with the phase's next tick after this one's body, which waits on purpose and misses none until then.
 

@@ -27,6 +27,7 @@ from robot_agent.agent.edges.exporter import Observed, RobotCollector, parent
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
+    from concurrent.futures import Future
 
     from fog_contracts.handlers import Ids, Later, Moment, Publication, QueryHandler
     from fog_contracts.messages import EgressRequest, Message
@@ -39,6 +40,7 @@ if TYPE_CHECKING:
     from robot_agent.agent.edges.store import Store
     from robot_agent.guardian.link import BaseFeedback
     from robot_agent.hardware import LaserScan
+    from robot_agent.motion.local_planner import Decision
 
 STREAM_S: Final = 0.05
 IDLE_STREAM_S: Final = 0.1
@@ -89,6 +91,8 @@ class Service:
         self._control = self._ticker(core.profile.control_period, CONTROL_AFTER_S)
         self._wanted = asyncio.Event()
         """Whether there may be something to decide."""
+        self._decision: Future[Decision] | None = None
+        """The decision that is under way, until the stream collects it."""
         self._look: Callable[[float], object] = lambda _now: None
         self.collector = RobotCollector()
         self._state: RobotState | None = None
@@ -210,6 +214,7 @@ class Service:
                 self.on_scan(scan, now)
 
         def stream(now: float) -> None:
+            self._collect()
             if self._core.repeats(now):
                 # The guardian wants a command. All else waits where it is for the next tick, but for the lidar's bytes.
                 lidar.fetch()
@@ -238,14 +243,22 @@ class Service:
         loop = asyncio.get_running_loop()
         thread = ThreadPoolExecutor(1, thread_name_prefix="decide", initializer=name_thread, initargs=("decide",))
         try:
-            async for now in self._control:
+            async for tick in self._control:
+                now = tick
                 self._control.period = self._core.profile.control_period
+                if self._decision is not None:
+                    # Slower than its period: the next one must not begin beside it.
+                    await asyncio.wrap_future(self._decision)
+                    self._collect()
+                    now = self._clock.now()
+                    self._control.held_up(now - tick)
                 if (search := self._core.search(now)) is not None:
                     found = await loop.run_in_executor(thread, search.run)
                     self._core.on_found(found, self._edges.now())
                 job = self._core.control_job(now)
                 if job is not None:
-                    self._core.accept(await loop.run_in_executor(thread, decide, job))
+                    # The stream collects it: a future of asyncio would wake the loop, whose next tick is soon enough.
+                    self._decision = thread.submit(decide, job)
                 elif self._core.standing_by:
                     # Not woken to find that there is nothing to decide: the stream tells when there may be again.
                     # What was late before must not be reported for as long as the robot stands.
@@ -253,7 +266,14 @@ class Service:
                     self._wanted.clear()
                     await self._wanted.wait()
         finally:
+            self._decision = None
             thread.shutdown(wait=False, cancel_futures=True)
+
+    def _collect(self) -> None:
+        """Drive by the decision that is under way, once it is made."""
+        if self._decision is not None and self._decision.done():
+            decision, self._decision = self._decision.result(), None
+            self._core.accept(decision)
 
     # --- Subscriptions ----------------------------------------------------------------------------------------------
 

@@ -19,11 +19,11 @@ IGNORED_AFTER_WAKE_S = Roomba600Driver.timing.ignored_after_wake
 
 
 def commands(data: bytes) -> list[tuple[int, bytes]]:
-    """The guardian's bytes, cut into the four commands that it knows."""
+    """The guardian's bytes, cut into the commands that it knows."""
     cut = []
     while data:
-        size = {128: 1, 131: 1, 145: 5}.get(data[0]) or 2 + data[1]
-        assert data[0] in {128, 131, 145, 148}
+        size = {128: 1, 129: 2, 131: 1, 145: 5}.get(data[0]) or 2 + data[1]
+        assert data[0] in {128, 129, 131, 145, 148}
         cut.append((data[0], data[1:size]))
         data = data[size:]
     return cut
@@ -47,6 +47,7 @@ class Rig:
     moved: bool = False
     not_receiving: bool = False
     away_at: float = -1e9
+    heard_at: float = -1e9
     feedback: list = field(default_factory=list)
 
     def handle(self, output) -> None:
@@ -54,7 +55,7 @@ class Rig:
         for opcode, argument in commands(output.data):
             latched = self.latched is not None or self.core.latched is not None
             if opcode == 131:
-                retaken = self.now - self.away_at <= IGNORED_AFTER_WAKE_S + 0.06
+                retaken = self.now - self.away_at <= 0.3 or self.now - self.heard_at > 0.3
                 assert self.resetting or not latched or retaken, "disturbed although it stands in Safe mode"
             if opcode == 128:
                 assert self.resetting or not self.moved or latched, "woken although it has moved and has no fault"
@@ -96,6 +97,7 @@ class Rig:
         self.now += STEP
         self.base.tick(self.now, STEP)
         data = self.base.outgoing(self.now)
+        self.heard_at = self.now if data and not self.silent and self.damage is None else self.heard_at
         if self.damage is not None and data:
             corrupted = bytearray(data)
             corrupted[self.damage % len(corrupted)] ^= 0x10 | (self.damage & 0xFF)

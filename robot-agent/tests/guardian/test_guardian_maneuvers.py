@@ -38,6 +38,9 @@ class Docking(Rig):
         self.feedback = frame.feedback[-1] if frame.feedback else self.feedback
         return frame.data + command.data
 
+    def feedback_of(self, now: float) -> str | None:
+        return self.core._stopped(now)
+
     def steps(self, seconds: float, asked="", speed=None, **status) -> bytes:
         return b"".join(self.step(asked, speed, **status) for _ in range(round(seconds / 0.02)))
 
@@ -61,13 +64,37 @@ def test_base_seeks_its_dock_as_long_as_it_is_asked_for_without_any_wheel_comman
     assert rig.step("seek_dock") == b""
 
 
-def test_base_that_stays_silent_about_its_mode_is_told_to_stop_every_0_05_s():
+def told(rig: Docking, *, heard: bool) -> list[int]:
+    """Return the hundredths of the next second in which the base is told to stop."""
+    begin, at = rig.now, []
+    for n in range(1, 100):
+        frame = rig.frame(begin + n * 0.01, mode_problem="Full").data if heard else b""
+        if (frame + rig.core.tick(begin + n * 0.01).data) == b"take;":
+            at.append(n)
+    return at
+
+
+@pytest.mark.parametrize("heard", [True, False])
+def test_base_that_does_not_report_its_driving_mode_is_told_to_stop_twice_every_0_3_s(heard):
     rig = seeking()
     assert rig.step(mode_problem="Full") == b"take;"
-    told = rig.core.tick(rig.now + 0.06).data + rig.core.tick(rig.now + 0.12).data
-    assert told == b"take;take;"
-    # And woken from the start when that does not help.
+    at = told(rig, heard=heard)
+    assert len(at) == 5
+    assert all(earliest <= n <= earliest + 4 for n, earliest in zip(at, (5, 34, 39, 69, 74), strict=True))
+
+
+def test_base_that_stays_in_a_mode_of_its_own_is_woken_from_the_start_after_a_second():
+    rig = seeking()
+    rig.step(mode_problem="Full")
+    told(rig, heard=True)
     assert rig.core.tick(rig.now + 1.1).data == b"wake;"
+
+
+def test_base_that_is_silent_in_a_mode_of_its_own_is_told_to_stop_on_and_on():
+    rig = seeking()
+    rig.step(mode_problem="Full")
+    rig.now += 10.0
+    assert len(told(rig, heard=False)) >= 5
 
 
 def test_seeking_ends_when_no_command_is_fresh():
@@ -227,16 +254,18 @@ def test_fault_counts_from_the_first_frame_off_the_dock_although_the_base_has_no
     assert rig.core.latched == "a cliff sensor sees no floor"
 
 
-def test_base_that_was_told_to_stand_is_told_again_after_0_05_s_and_not_before():
+def test_base_that_was_told_to_stand_is_told_again_after_0_05_s_and_then_has_time_to_change_its_modes():
     rig = seeking()
     assert rig.step(None) == b"take;"
     ended = rig.now
     assert rig.core.tick(ended + 0.04).data == b""
     assert rig.core.tick(ended + 0.06).data == b"take;"
-    assert rig.core.tick(ended + 0.1).data == b""
-    assert rig.core.tick(ended + 0.12).data == b"take;"
-    rig.frame(ended + 0.13)
-    assert rig.command(ended + 0.14, 0.0, 0.0).data == b"", "it stands since a moment ago"
+    assert rig.core.tick(ended + 0.12).data == b""
+    rig.frame(ended + 0.25)
+    assert rig.feedback_of(ended + 0.25) == "the base is not ready to drive yet", "it may be between its modes"
+    rig.frame(ended + 0.27)
+    assert rig.feedback_of(ended + 0.27) == "no fresh command from the agent"
+    assert rig.command(ended + 0.28, 0.0, 0.0).data == b"0.0000,0.0000;"
 
 
 def test_dock_that_presses_the_bumper_does_not_keep_the_base():

@@ -9,7 +9,7 @@ import pytest
 from plain_base import DockingBase, PlainBase, Rig
 
 from robot_agent.bases.roomba600.driver import Roomba600Driver, Roomba600Options
-from robot_agent.bases.roomba600.emulator import OFF, PASSIVE, SAFE, Quirks, RoombaEmulator
+from robot_agent.bases.roomba600.emulator import FULL, OFF, PASSIVE, SAFE, Quirks, RoombaEmulator
 from robot_agent.guardian.core import GuardianCore
 from robot_agent.guardian.link import WheelCommand
 
@@ -23,7 +23,7 @@ class Roomba:
         self.robot = RoombaEmulator(quirks=Quirks(**quirks))
         self.core = GuardianCore(Roomba600Driver(Roomba600Options(brc="rts")))
         self.now, self.rolled, self.rest, self.reset, self.feedback = 10.0, 0.0, False, False, None
-        self.mute = self.deaf = False
+        self.mute = self.deaf = self.back_off = False
         self.run(1.5)
         assert self.robot.mode == SAFE
 
@@ -38,7 +38,10 @@ class Roomba:
             self._apply(self.core.on_bytes(b"" if self.mute else sent, self.now))
             self._apply(self.core.tick(self.now))
             if step % 5 == 0:
-                command = WheelCommand(seq=step, left=0.0, right=0.0, rest=self.rest, reset=self.reset)
+                speed, maneuver = (-0.05, "back_off") if self.back_off else (0.0, None)
+                command = WheelCommand(
+                    seq=step, left=speed, right=speed, rest=self.rest, reset=self.reset, maneuver=maneuver
+                )
                 self._apply(self.core.on_command(command, self.now))
 
     def _apply(self, output) -> None:
@@ -121,13 +124,60 @@ def test_roomba_that_went_off_under_a_latched_fault_is_stopped_when_it_drives(ro
     assert roomba.core.latched.startswith("a wheel has dropped")
 
 
-def test_roomba_that_cannot_be_heard_under_a_latched_fault_is_stopped_when_it_drives(roomba):
+@pytest.mark.parametrize("mute_after_s", [0.0, 0.5, 2.0])
+def test_roomba_that_cannot_be_heard_under_a_latched_fault_is_kept_in_safe_mode(roomba, mute_after_s):
     roomba.drop_wheel(0.3)
+    roomba.robot.world.wheel_drop_left = True
+    roomba.run(mute_after_s)
     roomba.mute = True
+    roomba.robot.world.wheel_drop_left = False
+    roomba.run(2.0)
+    for _ in range(20):
+        roomba.run(0.17)
+        assert roomba.robot.mode == SAFE
+        roomba.robot.clean()
+    assert roomba.rolled == 0.0
+
+
+def test_robot_that_is_heard_again_is_reset_as_ever(roomba):
+    roomba.robot.world.bump_left = True
+    roomba.run(0.2)
+    roomba.robot.world.bump_left = False
+    roomba.mute = True
+    roomba.run(5.0)
+    roomba.mute = False
+    roomba.reset = True
+    roomba.run(0.06)
+    roomba.reset = False
+    roomba.run(1.0)
+    assert (roomba.core.latched, roomba.robot.mode, roomba.feedback.stopped) == (None, SAFE, None)
+
+
+def test_lifted_robot_backs_off_no_more_from_what_it_bumped_into_elsewhere(roomba):
+    roomba.robot.world.bump_left = True
+    roomba.run(0.2)
+    assert roomba.feedback.bumped
+    roomba.robot.world.bump_left = False
+    roomba.robot.world.wheel_drop_left = True
+    roomba.run(1.0)
+    roomba.robot.world.wheel_drop_left = False
+    roomba.run(1.0)
+    assert not roomba.feedback.bumped
+    roomba.back_off = True
     roomba.run(3.0)
-    roomba.robot.clean()
-    roomba.run(3.0)
-    assert roomba.rolled < 0.35, "0.3 m/s for a second, and what its frames were late"
+    assert roomba.rolled == 0.0
+    assert roomba.core.latched.startswith("the bumper is pressed")
+
+
+@pytest.mark.parametrize("mode_s", [0.0, 0.01, 0.02])
+def test_roomba_that_needs_time_for_each_change_of_its_mode_comes_to_rest_in_safe_mode(mode_s):
+    roomba = Roomba(mode_change_s=mode_s)
+    roomba.drop_wheel(0.5)
+    roomba.run(1.0)
+    for _ in range(50):
+        roomba.run(0.1)
+        assert roomba.robot.mode == SAFE
+        assert roomba.feedback.stopped is None
 
 
 def test_docked_roomba_with_a_latched_fault_charges_and_is_stopped_when_it_leaves(roomba):
@@ -148,12 +198,36 @@ def test_docked_roomba_with_a_latched_fault_charges_and_is_stopped_when_it_leave
     assert roomba.core.latched is not None
 
 
+def test_roomba_that_would_stay_in_safe_mode_on_its_dock_charges_there_although_its_fault_is_latched():
+    roomba = Roomba(stays_safe_on_dock=True)
+    roomba.drop_wheel()
+    roomba.run(1.0)
+    roomba.robot.set_dock(0.0, 0.0, 0.0)
+    roomba.run(3.0)
+    assert roomba.robot.mode == PASSIVE
+    assert roomba.robot.battery.current_ma > 0
+
+
+def test_roomba_that_did_not_hear_the_end_of_its_undocking_charges_on():
+    roomba = Roomba()
+    roomba.robot.set_dock(0.0, 0.0, 0.0)
+    roomba.run(1.0)
+    roomba.reset = True
+    roomba.run(0.06)
+    roomba.reset = False
+    roomba.run(2.0)
+    roomba.robot.mode = FULL  # as if nothing that ended it had been heard for a second
+    roomba.run(3.0)
+    assert roomba.robot.mode == PASSIVE
+    assert roomba.robot.battery.current_ma > 0
+
+
 def test_docked_roomba_is_told_to_stop_no_more_than_a_second_and_then_left_to_charge():
     rig = Rig(base=DockingBase())
     rig.frame(0.2, cliff=True)
     on_dock = {"mode_problem": "Passive", "charging": True, "docked": True}
     told = b"".join(rig.frame(0.2 + n * 0.1, **on_dock).data + rig.core.tick(0.2 + n * 0.1).data for n in range(1, 30))
-    assert 1 <= told.count(b"start;") <= 11
+    assert 2 <= told.count(b"start;") <= 8
     assert b"wake;" not in told
     assert b"start;" not in rig.frame(3.3, **on_dock).data + rig.core.tick(3.3).data
 
@@ -205,17 +279,33 @@ def test_roomba_that_its_button_wakes_sleeps_again():
     assert roomba.robot.asleep
 
 
-def test_roomba_that_the_question_itself_wakes_is_asked_once():
+def test_roomba_that_questions_wake_is_asked_no_more_after_two_sleeps():
     roomba = Roomba(bytes_wake=True)
     roomba.rest = True
-    roomba.run(1.0)
-    assert roomba.robot.asleep
-    roomba.run(3.0)
-    assert roomba.robot.mode == SAFE
-    roomba.run(62.0)
+    roomba.run(0.5)
+    for _ in range(2):
+        assert roomba.robot.asleep
+        roomba.run(3.0)
+        assert roomba.robot.mode == SAFE
+        roomba.run(58.0)
     assert roomba.robot.asleep
     roomba.run(120.0)
     assert roomba.robot.asleep
+
+
+@pytest.mark.parametrize("after_s", [0.3, 0.9, 1.2, 1.6])
+def test_button_that_wakes_a_roomba_as_soon_as_it_sleeps_is_not_taken_for_the_question(after_s):
+    roomba = Roomba()
+    roomba.rest = True
+    roomba.run(0.3)
+    assert roomba.robot.asleep
+    roomba.run(after_s)
+    roomba.robot.press_clean()
+    roomba.run(70.0)
+    assert roomba.robot.asleep
+    roomba.robot.clean()
+    roomba.run(5.0)
+    assert roomba.rolled < 0.16
 
 
 def test_roomba_that_did_not_hear_that_it_shall_sleep_is_told_again():

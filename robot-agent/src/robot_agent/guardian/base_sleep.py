@@ -17,6 +17,10 @@ ASK_S: Final = 0.5
 """Period of asking a sleeping base: its button or its schedule may have woken it, and let it drive."""
 AGAIN_S: Final = 60.0
 """One that did not stay asleep is left awake for so long."""
+_FIRST_QUESTIONS: Final = 4
+"""One that is woken by questions may lose the first ones while it starts."""
+_SLEEPS: Final = 2
+"""So many sleeps in a row must end by first questions: one may have ended by a button just then."""
 
 
 class BaseSleep:
@@ -27,8 +31,8 @@ class BaseSleep:
         self.asleep = False
         self._begun_at = self._awake_until = -math.inf
         self._asked = 0
-        self._asking_wakes = False
-        """Whether it answered the first question, right after it fell asleep: then questions wake it."""
+        self._ended_at_once = 0
+        """How many sleeps in a row have ended by one of the first questions."""
 
     def begin(self, now: float) -> bytes:
         """Put it to sleep, if it can be woken again by a line; return the bytes for it."""
@@ -45,8 +49,11 @@ class BaseSleep:
         return Attempt(line=self._driver.awakening.line)
 
     def ask(self, now: float) -> bool:
-        """Return whether to wake it as if it heard, which stops it and lets it answer if it does."""
-        if self._asking_wakes or now < self._begun_at + SETTLE_S + (self._asked + 1) * ASK_S:
+        """Return whether to wake it as if it heard, which stops it and lets it answer if it does.
+
+        One that seems to be woken by the questions is asked no more.
+        """
+        if self._ended_at_once >= _SLEEPS or now < self._begun_at + SETTLE_S + self._asked * ASK_S:
             return False
         self._asked += 1
         return True
@@ -55,6 +62,7 @@ class BaseSleep:
         """Note that it has sent a frame; return whether it is awake: by button, schedule or question, or all along."""
         if now < self._begun_at + SETTLE_S:
             return False
-        self._asking_wakes |= self._asked == 1
+        if self._ended_at_once < _SLEEPS:
+            self._ended_at_once = self._ended_at_once + 1 if 1 <= self._asked <= _FIRST_QUESTIONS else 0
         self.asleep, self._awake_until = False, now + AGAIN_S
         return True

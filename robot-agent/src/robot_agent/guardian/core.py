@@ -32,6 +32,11 @@ COMMAND_FRESH_S: Final = 0.2
 """A command older than this does not move a wheel."""
 REPEAT_S: Final = 0.05
 """Period of repeating an unchanged wheel command: a byte may have been lost."""
+RETAKE_S: Final = 0.3
+"""Period of taking control again, twice each time. A base needs some 20 ms for each change of its mode: one that is
+told all the time is never seen in its driving mode for long."""
+SETTLED_S: Final = 0.2
+"""What a base reports counts so long after control was taken: it changes its modes, and frames are read late."""
 _NEVER: Final = -math.inf
 STEP_S: Final = 0.06
 """Longest time step of acceleration: after a pause the guardian must not catch up in one step."""
@@ -70,7 +75,9 @@ class _Base:
     woken_at: float | None = None
     overcurrent_since: float | None = None
     restrained: bool = False
-    """Whether it drove by itself, or without its own protection, and has not reported its driving mode since."""
+    """Whether it may drive by itself, or without its own protection: it has not reported its driving mode since."""
+    takes: int = 0
+    """How often control was taken since."""
     moved: bool = False
     """Whether a wheel was told to turn, or might turn by itself, since it was woken."""
     silence: str | None = None
@@ -194,14 +201,16 @@ class GuardianCore:
             due = base.woken_at is None or now - base.woken_at > timing.wake_timeout
             if due and self._charging(now):
                 base.restrained = False  # on its charger it has been told often enough
+            if unheard := self._is_unheard(now):
+                base.restrained = True
             # A base that does not drive on its charger is left alone there: waking it would only disturb the charging.
-            if due and (not self._charging(now) or self._is_unknown()):
+            if due and (not self._charging(now) or self._is_unknown()) and not unheard:
                 # With a fault latched it is woken to be stopped; what else may revive it waits for the reset.
                 wake = self._wake(now)
                 return Output(wake, self._reminder(now), self._attempt(now) if self._latched is None else None)
-            # The wake command may have been lost, and the base may still roll at an old speed.
-            repeat = now - self._sent_at >= REPEAT_S
-            return Output(self._restrain(now) if repeat else b"", self._reminder(now))
+            # The last command may have been lost, and the base may still roll at an old speed.
+            pause = RETAKE_S if base.restrained and base.takes % 2 == 0 else REPEAT_S
+            return Output(self._restrain(now) if now - self._sent_at >= pause else b"", self._reminder(now))
         silent = now - base.reading_at
         if silent > timing.frame_timeout:
             reason = f"the base has sent no valid frame for {silent:.1f} s: check cable and power"
@@ -210,10 +219,8 @@ class GuardianCore:
                 base.awake, base.silence = False, reason
                 return Output(self._wake(now), self._reminder(now))
             stop = self._latch(reason, now)
-            if silent > timing.wake_timeout:
-                # It may have left its driving mode: from now on it is told in the way that stops it anyway.
-                base.awake = False
-                stop += self._wake(now)
+            if self._is_unheard(now):
+                stop += self._take_back(now)  # it may have left its driving mode
             return Output(stop, self._reminder(now))
         return self._drive(now)
 
@@ -233,6 +240,14 @@ class GuardianCore:
             self.driver.use_baud(attempt.baud)
             self._base.woken_at = None
         return attempt
+
+    def _is_unheard(self, now: float) -> bool:
+        """Return whether a base is silent under a latched fault: it is brought into its driving mode again and again.
+
+        Waking would leave it in another one, waiting for frames that do not come. It is woken by the reset.
+        """
+        silent = now - self._base.reading_at > self.driver.timing.wake_timeout
+        return self._latched is not None and silent and isinstance(self.driver, DockingDriver)
 
     def _is_unknown(self) -> bool:
         """Return whether a base that finds its dock was never woken: one that sends since before may be in any mode.
@@ -259,14 +274,20 @@ class GuardianCore:
         if self._sleep.asleep:
             # What arrives at first was on its way when the base was put to sleep.
             return self._wake(now) if self._sleep.on_frame(now) else b""
+        if self._bumped and (status.cliff or status.wheel_drop) and not self._maneuvers.is_running("back_off"):
+            self._bumped = False  # it was lifted, or stands at an edge: what it bumped into is no longer before it
         if not base.awake:
             current = base.woken_at is not None and now - base.woken_at >= self.driver.timing.ignored_after_wake
+            if base.restrained:
+                current = now - self._sent_at >= SETTLED_S
             if not current or status.mode_problem is not None:
                 return b""
             base.awake, base.restrained, base.overcurrent_since, self._stepped_at = True, False, None, now
         backing = self._maneuvers.is_running("back_off")
         if self._latched is not None and not backing:
-            return self._retake(status, now)
+            # Some stay in their driving mode on their charger, too, and do not charge in it.
+            left = status.mode_problem is not None or status.charging
+            return self._take_back(now) if left and isinstance(self.driver, DockingDriver) else b""
         fault = fault_of(status, base.blocked_for(now), bumper=not self._maneuvers.expects_bumper(status))
         if fault is None:
             # Only the current of a motor is a fault by its duration.
@@ -276,14 +297,13 @@ class GuardianCore:
             self._latched = None  # the new fault is no bump
         return self._latch(fault, now)
 
-    def _retake(self, status: BaseStatus, now: float) -> bytes:
-        """Take control again of a base that has left its driving mode under a latched fault; return the bytes for it.
+    def _take_back(self, now: float) -> bytes:
+        """Return the bytes that bring a base into its driving mode, wheels at rest; on its charger, to charge.
 
         In a mode of its own it ignores zero speeds, and its button or its schedule would let it drive off.
         """
-        if status.mode_problem is None or not isinstance(self.driver, DockingDriver):
-            return b""
-        self._base.awake, self._base.woken_at, self._base.restrained = False, now, True
+        base = self._base
+        base.awake, base.woken_at, base.restrained, base.takes = False, now, True, 0
         return self._restrain(now)
 
     def _latch(self, reason: str, now: float) -> bytes:
@@ -317,18 +337,19 @@ class GuardianCore:
 
     def _end_maneuver(self, now: float) -> bytes:
         """End the maneuver with the wheels at rest."""
-        if not self._maneuvers.is_running("back_off"):
-            self._base.awake, self._base.woken_at, self._base.restrained = False, now, True
+        by_wheels = self._maneuvers.is_running("back_off")
         self._maneuvers.end()
         self._wheels, self._stepped_at = (0.0, 0.0), now
-        return self._restrain(now)
+        return self._send(self._wheels, now) if by_wheels else self._take_back(now)
 
     def _restrain(self, now: float) -> bytes:
         """Return the bytes that keep the wheels at rest of a base that is not in its driving mode yet."""
         if not (self._base.restrained and isinstance(self.driver, DockingDriver)):
             return self._send((0.0, 0.0), now)
         self._sent, self._sent_at = (0.0, 0.0), now
-        return self.driver.take_control(charging=self._charging(now))
+        self._base.takes += 1
+        reading = self._base.reading
+        return self.driver.take_control(charging=reading is not None and reading.status.charging)
 
     def _drive(self, now: float) -> Output:
         begun = self._maneuver(now)

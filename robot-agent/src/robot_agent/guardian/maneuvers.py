@@ -31,12 +31,13 @@ class Limit(NamedTuple):
 
 
 LIMITS: Final[Mapping[Maneuver, Limit]] = {
-    "seek_dock": Limit(60.0, math.inf, 0.0),
+    "seek_dock": Limit(60.0, 5.0, 0.0),
     "leave_dock": Limit(3.0, 0.4, 0.10),
     "back_off": Limit(4.0, 0.095, 0.05),
 }
 """The wheels need a few millimetres to come to rest: a robot backs off by 0.10 m at most.
 
+The search for the dock begins within 1 m of it; a base that goes far has something else in mind, a cleaning, say.
 Leaving the dock ends here as soon as the charger's contacts part, after some centimetres; the rest of the agent's
 0.3 m is ordinary driving. These bounds are for contacts that stick, or a dock that comes along.
 """

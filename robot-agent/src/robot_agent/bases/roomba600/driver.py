@@ -155,14 +155,17 @@ class Roomba600Driver:
         return 5 * oi.start() + oi.stream(self._stream) + told
 
     def respond(self) -> bytes:
-        """Return Safe and zero speed, once the offset of the mode is known; a charging robot stays in Passive mode.
+        """Return Safe and zero speed, once the offset of the mode is known; on its charger Start, unless it is Passive.
 
         While a wheel hangs or a cliff is seen, Safe mode ends at once: it is sent again until it holds.
         """
         sent_lately = self._received_at - self._safe_sent_at < SAFE_AGAIN_S
-        if self._mode.offset is None or sent_lately or self._on_charger:
+        charging = self._on_charger and self._mode.mode not in {oi.Mode.SAFE, oi.Mode.FULL}
+        if self._mode.offset is None or sent_lately or charging:
             return b""
         self._safe_sent_at = self._received_at
+        if self._on_charger:
+            return oi.start()  # it would not charge
         return oi.safe() + 2 * oi.drive_direct(0, 0)
 
     def seek_dock(self) -> bytes:

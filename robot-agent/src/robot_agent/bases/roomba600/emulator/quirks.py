@@ -15,7 +15,8 @@ class Quirks:
     mode_offset: added to the mode in the stream. mode_noise: every so many frames the stream's mode is 32 (0: never).
     text_period_s: it prints a text into the stream so often (0: never). damaged: every so many frames one has a wrong
     byte (0: never). bytes_wake: what it receives wakes it. stays_safe_on_dock: Safe mode holds on the dock, but the
-    wheels do not move there. baud: its rate. keeps_baud: it stays at its rate, whatever it is told.
+    wheels do not move there. mode_change_s: each change of its mode takes so long, and what follows waits. baud: its
+    rate. keeps_baud: it stays at its rate, whatever it is told.
     """
 
     mode_offset: int = 0
@@ -24,6 +25,7 @@ class Quirks:
     damaged: int = 0
     bytes_wake: bool = False
     stays_safe_on_dock: bool = False
+    mode_change_s: float = 0.0
     baud: int = 115200
     keeps_baud: bool = False
 

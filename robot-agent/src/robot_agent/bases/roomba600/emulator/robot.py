@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+from collections import deque
 from typing import TYPE_CHECKING, Final
 
 from robot_agent.bases.roomba600.emulator.body import AXLE_MM, Battery, Wheels, World
@@ -14,6 +16,7 @@ if TYPE_CHECKING:
     from collections.abc import Iterator
 
 OFF, PASSIVE, SAFE, FULL = range(4)
+_MODE_COMMANDS: Final = frozenset({128, 130, 131, 132, 143, 173})
 
 BOOT_TEXT: Final = b"bl-start\r\nSTR730\r\nbootloader id: #x47186549 82ECCFFF\r\nbootloader info rev: #xF000\r\n"
 """Text that a robot of the 600 series prints when it resets."""
@@ -88,6 +91,8 @@ class RoombaEmulator:
         self._dock: Dock | None = None
         self._wheels = Wheels(left_encoder, right_encoder)
         self._commands = CommandParser()
+        self._received: deque[tuple[int, bytes, float]] = deque()
+        self._busy_until = -math.inf
         self._stream = Stream()
         self._sensors = Sensors(self.world, self.battery, self._wheels, self._stream, lambda: self.mode)
         self._outgoing = bytearray()
@@ -123,6 +128,7 @@ class RoombaEmulator:
         self.baud = 19200 if held else self.baud
         self.asleep = False
         self._commands.forget()
+        self._received.clear()
         self._leave(OFF)
 
     def clean(self) -> None:
@@ -165,6 +171,7 @@ class RoombaEmulator:
 
     def tick(self, now: float, dt: float) -> None:
         """Advance time by dt (s) to `now`: protection, battery and the stream."""
+        self._obey(now)
         self._protect()
         self._drive_by_itself(dt)
         moving = sum(abs(speed) for speed in self.wheel_speeds_m_s)
@@ -175,13 +182,26 @@ class RoombaEmulator:
         self._send_stream(now)
 
     def receive(self, data: bytes, now: float) -> None:
-        """Receive bytes from the host; whole commands take effect immediately."""
+        """Receive bytes from the host; whole commands take effect immediately, unless modes take their time."""
         if self.asleep and self.quirks.bytes_wake and data:
             self.asleep = False
             self._leave(OFF)
         if self.asleep:
             return
-        for opcode, arguments in self._commands.parse(data):
+        self._received.extend((opcode, arguments, now) for opcode, arguments in self._commands.parse(data))
+        self._obey(now)
+
+    def _obey(self, now: float) -> None:
+        """Let the commands take effect that are due by now."""
+        while self._received and not self.asleep:
+            opcode, arguments, received_at = self._received[0]
+            effective_at = max(received_at, self._busy_until)
+            if opcode in _MODE_COMMANDS:
+                effective_at += self.quirks.mode_change_s
+            if effective_at > now:
+                return
+            self._busy_until = effective_at
+            self._received.popleft()
             if opcode == 129:
                 self._change_baud(arguments[0])
             else:
@@ -221,6 +241,7 @@ class RoombaEmulator:
             self._leave(PASSIVE)
             self.asleep = True
             self._commands.forget()
+            self._received.clear()
         elif opcode in {130, 131, 132}:
             self._stop_program()
             self.mode = FULL if opcode == 132 else SAFE

@@ -119,7 +119,7 @@ def test_docking_base_that_charges_from_the_start_is_woken_once_and_its_mode_lef
     assert rig.core.tick(0.01).data == b"wake;", "it may be in any mode"
     for step in range(1, 400):
         now = 0.01 + 0.02 * step
-        rig.frame(now, charging=True)
+        rig.frame(now, charging=True, mode_problem="Passive")
         assert rig.core.tick(now).data in {STAND, b""}
     assert rig.core.stop_command() == STAND
 

@@ -122,6 +122,7 @@ def test_roomba_that_went_off_under_a_latched_fault_is_stopped_when_it_drives(ro
     roomba.run(3.0)
     assert roomba.robot.wheel_speeds_m_s == (0.0, 0.0)
     assert roomba.core.latched.startswith("a wheel has dropped")
+    assert (roomba.robot.mode, roomba.feedback.stopped) == (SAFE, None), "it is heard again"
 
 
 @pytest.mark.parametrize("mute_after_s", [0.0, 0.5, 2.0])
@@ -198,14 +199,27 @@ def test_docked_roomba_with_a_latched_fault_charges_and_is_stopped_when_it_leave
     assert roomba.core.latched is not None
 
 
-def test_roomba_that_would_stay_in_safe_mode_on_its_dock_charges_there_although_its_fault_is_latched():
+@pytest.mark.parametrize("fault", [False, True])
+def test_roomba_that_would_stay_in_safe_mode_charges_where_it_was_pushed_onto_its_dock(fault):
     roomba = Roomba(stays_safe_on_dock=True)
-    roomba.drop_wheel()
-    roomba.run(1.0)
+    if fault:
+        roomba.drop_wheel()
+        roomba.run(1.0)
     roomba.robot.set_dock(0.0, 0.0, 0.0)
     roomba.run(3.0)
     assert roomba.robot.mode == PASSIVE
     assert roomba.robot.battery.current_ma > 0
+
+
+def test_charger_that_is_touched_for_a_moment_changes_nothing():
+    roomba = Roomba(stays_safe_on_dock=True)
+    roomba.robot.set_dock(0.0, 0.0, 0.0)
+    roomba.run(0.4)
+    roomba.robot.set_dock(-0.1, 0.0, 0.0)
+    for _ in range(50):
+        roomba.run(0.02)
+        assert roomba.robot.mode == SAFE
+    assert roomba.core.latched is None
 
 
 def test_roomba_that_did_not_hear_the_end_of_its_undocking_charges_on():

@@ -37,6 +37,8 @@ RETAKE_S: Final = 0.3
 told all the time is never seen in its driving mode for long."""
 SETTLED_S: Final = 0.2
 """What a base reports counts so long after control was taken: it changes its modes, and frames are read late."""
+CONTACT_S: Final = 0.5
+"""A charger's contacts that touch for a moment do not count."""
 _NEVER: Final = -math.inf
 STEP_S: Final = 0.06
 """Longest time step of acceleration: after a pause the guardian must not catch up in one step."""
@@ -74,6 +76,7 @@ class _Base:
     awake: bool = False
     woken_at: float | None = None
     overcurrent_since: float | None = None
+    charging_since: float | None = None
     restrained: bool = False
     """Whether it may drive by itself, or without its own protection: it has not reported its driving mode since."""
     takes: int = 0
@@ -198,19 +201,7 @@ class GuardianCore:
             # One that its button or its schedule has woken is stopped by this, and answers; others hear nothing.
             return Output(self._wake(now) if self._sleep.ask(now) else b"", self._reminder(now))
         if not base.awake:
-            due = base.woken_at is None or now - base.woken_at > timing.wake_timeout
-            if due and self._charging(now):
-                base.restrained = False  # on its charger it has been told often enough
-            if unheard := self._is_unheard(now):
-                base.restrained = True
-            # A base that does not drive on its charger is left alone there: waking it would only disturb the charging.
-            if due and (not self._charging(now) or self._is_unknown()) and not unheard:
-                # With a fault latched it is woken to be stopped; what else may revive it waits for the reset.
-                wake = self._wake(now)
-                return Output(wake, self._reminder(now), self._attempt(now) if self._latched is None else None)
-            # The last command may have been lost, and the base may still roll at an old speed.
-            pause = RETAKE_S if base.restrained and base.takes % 2 == 0 else REPEAT_S
-            return Output(self._restrain(now) if now - self._sent_at >= pause else b"", self._reminder(now))
+            return self._bring_up(now)
         silent = now - base.reading_at
         if silent > timing.frame_timeout:
             reason = f"the base has sent no valid frame for {silent:.1f} s: check cable and power"
@@ -223,6 +214,24 @@ class GuardianCore:
                 stop += self._take_back(now)  # it may have left its driving mode
             return Output(stop, self._reminder(now))
         return self._drive(now)
+
+    def _bring_up(self, now: float) -> Output:
+        """Bring a base into its driving mode that is not, or may not be, in it; keep it at rest meanwhile."""
+        base = self._base
+        due = base.woken_at is None or now - base.woken_at > self.driver.timing.wake_timeout
+        if due and self._charging(now):
+            base.restrained = False  # on its charger it has been told often enough
+        if self._is_unheard(now):
+            base.restrained = True
+            if due:  # its stream may be off
+                base.woken_at = now
+                return Output(self.driver.wake() + self._restrain(now), self._reminder(now))
+        # A base that does not drive on its charger is left alone there: waking it would only disturb the charging.
+        if due and (not self._charging(now) or self._is_unknown()):
+            return Output(self._wake(now), self._reminder(now), self._attempt(now))
+        # The last command may have been lost, and the base may still roll at an old speed.
+        pause = RETAKE_S if base.restrained and base.takes % 2 == 0 else REPEAT_S
+        return Output(self._restrain(now) if now - self._sent_at >= pause else b"", self._reminder(now))
 
     def stop_command(self) -> bytes:
         """Return the bytes that stop the wheels at an orderly end of the guardian; the base stays awake."""
@@ -244,7 +253,7 @@ class GuardianCore:
     def _is_unheard(self, now: float) -> bool:
         """Return whether a base is silent under a latched fault: it is brought into its driving mode again and again.
 
-        Waking would leave it in another one, waiting for frames that do not come. It is woken by the reset.
+        Waking alone would leave it in another one, waiting for frames that do not come.
         """
         silent = now - self._base.reading_at > self.driver.timing.wake_timeout
         return self._latched is not None and silent and isinstance(self.driver, DockingDriver)
@@ -290,12 +299,23 @@ class GuardianCore:
             return self._take_back(now) if left and isinstance(self.driver, DockingDriver) else b""
         fault = fault_of(status, base.blocked_for(now), bumper=not self._maneuvers.expects_bumper(status))
         if fault is None:
-            # Only the current of a motor is a fault by its duration.
-            base.harmless = None if status.overcurrent or self._maneuvers.running is not None else status
-            return b""
+            # The current of a motor is a fault by its duration, and a charger calls for another mode by its.
+            lasting = status.overcurrent or status.charging or self._maneuvers.running is not None
+            base.harmless = None if lasting else status
+            return self._take_back(now) if self._stays_on_charger(status, now) else b""
         if backing:
             self._latched = None  # the new fault is no bump
         return self._latch(fault, now)
+
+    def _stays_on_charger(self, status: BaseStatus, now: float) -> bool:
+        """Return whether an awake base has come to a charger and stays in its driving mode: it does not charge so."""
+        base = self._base
+        if not status.charging or self._maneuvers.running is not None:
+            base.charging_since = None
+        elif base.charging_since is None:
+            base.charging_since = now
+        since = base.charging_since
+        return since is not None and now - since >= CONTACT_S and isinstance(self.driver, DockingDriver)
 
     def _take_back(self, now: float) -> bytes:
         """Return the bytes that bring a base into its driving mode, wheels at rest; on its charger, to charge.
@@ -332,7 +352,7 @@ class GuardianCore:
         data = maneuvers.begin(command.maneuver, base.reading, situation, now)
         if maneuvers.is_running("leave_dock"):
             # Its own protection is off from now on, so every frame counts.
-            base.awake, base.overcurrent_since, self._stepped_at = True, None, now
+            base.awake, base.restrained, base.overcurrent_since, self._stepped_at = True, False, None, now
         return data
 
     def _end_maneuver(self, now: float) -> bytes:

@@ -120,6 +120,17 @@ def test_seeking_ends_after_sixty_seconds_and_says_so_until_the_agent_stops_aski
     assert rig.step("seek_dock") == b"seek;"
 
 
+@pytest.mark.parametrize("sign", [1.0, -1.0])
+def test_seeking_ends_after_five_metres_for_it_may_have_become_a_cleaning(sign):
+    rig = seeking()
+    rig.travel = sign * 4.99
+    assert rig.step() == b""
+    rig.travel = sign * 5.0
+    assert rig.step() == b"take;"
+    rig.steps(0.5)
+    assert rig.feedback.stopped == "the base's search for its dock has reached its limit of 5.00 m"
+
+
 @pytest.mark.parametrize(
     ("status", "fault"),
     [

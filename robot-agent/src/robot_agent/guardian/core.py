@@ -283,7 +283,7 @@ class GuardianCore:
         if self._sleep.asleep:
             # What arrives at first was on its way when the base was put to sleep.
             return self._wake(now) if self._sleep.on_frame(now) else b""
-        if self._bumped and (status.cliff or status.wheel_drop) and not self._maneuvers.is_running("back_off"):
+        if self._bumped and (status.cliff or status.wheel_drop):
             self._bumped = False  # it was lifted, or stands at an edge: what it bumped into is no longer before it
         if not base.awake:
             current = base.woken_at is not None and now - base.woken_at >= self.driver.timing.ignored_after_wake

@@ -11,7 +11,7 @@ import sys
 import termios
 import threading
 import time
-from contextlib import ExitStack
+from contextlib import ExitStack, suppress
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -217,7 +217,9 @@ class Agent:
                             reset, self.reset = self.reset, False
                             left, right = self.wheels
                             command = WheelCommand(seq=seq, left=left, right=right, reset=reset, maneuver=self.maneuver)
-                            link.send(encode(command))
+                            # One that is refused finds the link closed, and the reason in it.
+                            with suppress(BrokenPipeError):
+                                link.send(encode(command))
                         try:
                             data = link.recv(4096)
                         except TimeoutError:

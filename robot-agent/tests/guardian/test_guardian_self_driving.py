@@ -57,6 +57,13 @@ class Roomba:
         assert self.core.latched.startswith("a wheel has dropped")
         self.robot.world.wheel_drop_left = False
 
+    def assert_stops_cleaning(self) -> None:
+        """Let its schedule begin a cleaning, which ends at once, in the mode in which none can begin."""
+        self.robot.clean()
+        self.run(3.0)
+        assert self.rolled < 0.09, "0.3 m/s for 0.3 s at most"
+        assert self.robot.mode == SAFE
+
 
 @pytest.fixture(params=[{}, {"mode_offset": 1}, {"damaged": 9, "text_period_s": 0.5}])
 def roomba(request) -> Roomba:
@@ -91,10 +98,7 @@ def test_roomba_whose_fault_was_not_its_own_is_kept_out_of_passive_mode_too(room
     assert roomba.robot.mode == PASSIVE
     roomba.robot.world.wheel_drop_left = False
     roomba.run(0.02)
-    roomba.robot.clean()
-    roomba.run(3.0)
-    assert roomba.rolled < 0.09
-    assert roomba.robot.mode == SAFE
+    roomba.assert_stops_cleaning()
 
 
 def test_roomba_that_is_being_woken_while_a_wheel_hangs_does_not_clean_when_it_is_put_down(roomba):
@@ -106,10 +110,7 @@ def test_roomba_that_is_being_woken_while_a_wheel_hangs_does_not_clean_when_it_i
     roomba.run(2.0)
     assert roomba.core.latched is None
     roomba.robot.world.wheel_drop_left = False
-    roomba.robot.clean()
-    roomba.run(3.0)
-    assert roomba.rolled < 0.09
-    assert roomba.robot.mode == SAFE
+    roomba.assert_stops_cleaning()
 
 
 def test_roomba_that_went_off_under_a_latched_fault_is_stopped_when_it_drives(roomba):

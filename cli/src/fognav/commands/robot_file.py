@@ -120,11 +120,11 @@ def check_ports(robot: RobotFile) -> list[str]:
 
 def contradictions(robot: RobotFile) -> list[str]:
     """Return what a person may not expect of the settings; raises `SettingsError` for those that contradict others."""
-    from fog_contracts.costs import ROBOT_RADIUS  # noqa: PLC0415  # keeps the other commands fast
-    from robot_agent import registry  # noqa: PLC0415  # same
-    from robot_agent.agent.settings import read_footprint  # noqa: PLC0415  # same
-    from robot_agent.contradictions import refuse_body, refuse_contradictions, remarks  # noqa: PLC0415  # same
-    from robot_agent.footprint import Footprint  # noqa: PLC0415  # same
+    from fog_contracts.costs import ROBOT_RADIUS  # noqa: PLC0415  # keeps the others fast
+    from robot_agent import registry  # noqa: PLC0415  # keeps the others fast
+    from robot_agent.agent.settings import read_footprint  # noqa: PLC0415  # keeps the others fast
+    from robot_agent.contradictions import refuse_body, refuse_contradictions, remarks  # noqa: PLC0415  # keeps the others fast
+    from robot_agent.footprint import Footprint  # noqa: PLC0415  # keeps the others fast
 
     base, footprint = registry.make_base(robot), read_footprint(robot)
     refuse_contradictions(robot, base)
@@ -144,7 +144,7 @@ def robot_text(robot: RobotFile) -> str:
     """Return a commented robot file with these settings; raises `SettingsError` for unknown hardware."""
     # Drivers need numpy: only this command waits for it.
     from fog_contracts.generate.robot_toml import robot_toml  # noqa: PLC0415  # see above
-    from robot_agent import registry  # noqa: PLC0415  # same
+    from robot_agent import registry  # noqa: PLC0415  # keeps the others fast
 
     return robot_toml(robot.settings, *registry.options(robot))
 
@@ -152,7 +152,7 @@ def robot_text(robot: RobotFile) -> str:
 def effective(robot: RobotFile) -> dict[str, object]:
     """Return all effective settings by their dotted names; raises `SettingsError` for what no process would accept."""
     from robot_agent import registry  # noqa: PLC0415  # drivers need numpy: the other commands don't wait for it
-    from robot_agent.agent.settings import read_footprint  # noqa: PLC0415  # same
+    from robot_agent.agent.settings import read_footprint  # noqa: PLC0415  # keeps the others fast
 
     registry.make_base(robot)
     registry.make_lidar(robot)

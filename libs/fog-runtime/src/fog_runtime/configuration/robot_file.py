@@ -178,7 +178,7 @@ def _remedy(key: str, path: Path | None, tree: Mapping[str, Any]) -> str:
 def _values_remedy(kind: type[msgspec.Struct], name: str, table: Mapping[str, Any]) -> str:
     """Return what a setting with a wrong value has and what it takes; empty if it is missing, unknown or a table."""
     # Only who has made a mistake waits for it: the watchdog reads this file, too, and needs none of it.
-    from fog_contracts.generate.robot_toml import accepted_values, setting_text  # noqa: PLC0415  # for speed
+    from fog_contracts.generate.robot_toml import accepted_values, setting_text  # noqa: PLC0415  # errors alone need it
 
     values = accepted_values(kind, name)
     given = table.get(name)

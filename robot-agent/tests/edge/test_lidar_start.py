@@ -75,9 +75,10 @@ def motor(monkeypatch):
 def environment(folder, port):
     key = folder / "operator.key"
     key.write_text(KEY.hex())
+    (folder / "site.toml").write_text('id = "lab"\n[[robots]]\nid = "r1"\nstart = { x = 1.0, y = 1.0, theta = 0.0 }\n')
     return {
         "FOGNAV_ROBOT": "r1",
-        "FOGNAV_SITE": "lab",
+        "FOGNAV_SITE_DIR": str(folder),
         "FOGNAV_DATA_DIR": str(folder),
         "FOGNAV_GUARDIAN_SOCKET": str(folder / "guardian"),
         "FOGNAV_OPERATOR_KEY_FILE": str(key),
@@ -232,7 +233,7 @@ def test_serial_settings_that_are_known_before_a_driver_is_loaded_are_the_driver
 @pytest.mark.parametrize(
     ("setting", "words"),
     [
-        (("FOGNAV_SITE", ""), "the site is not known"),
+        (("FOGNAV_SITE_DIR", ""), "this robot's body, start and dock are not known"),
         (("FOGNAV_OPERATOR_KEY_FILE", "/nowhere/key"), "/nowhere/key"),
         (("FOGNAV_CREDENTIALS_FILE", "/nowhere/credentials"), "/nowhere/credentials"),
         (("FOGNAV_BASE", "hovercraft"), "hovercraft"),

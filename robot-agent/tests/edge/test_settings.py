@@ -29,14 +29,15 @@ def test_site_folder_gives_id_start_pose_and_radius(tmp_path):
     (tmp_path / "site.toml").write_text(SITE)
     site, body = read_site(settings(tmp_path, site_dir=tmp_path))
     assert (site, body.start.x, body.radius) == ("lab", 1.0, 0.2)
-    site, _ = read_site(settings(tmp_path, site_dir=tmp_path, site="other"))
-    assert site == "other"
+    with pytest.raises(
+        SettingsError, match=r"FOGNAV_SITE is 'other', but .*site.toml describes 'lab'.* remove FOGNAV_"
+    ):
+        read_site(settings(tmp_path, site_dir=tmp_path, site="other"))
 
 
-def test_robot_without_the_folder_needs_only_the_site_id(tmp_path):
-    assert read_site(settings(tmp_path, site="lab")) == ("lab", None)
-    with pytest.raises(SettingsError, match="FOGNAV_SITE "):
-        read_site(settings(tmp_path))
+def test_robot_whose_body_nobody_gives_is_refused_with_the_remedy(tmp_path):
+    with pytest.raises(SettingsError, match=r"FOGNAV_SITE_DIR is not set, so this robot's body.*install --site site"):
+        read_site(settings(tmp_path, site="lab"))
 
 
 @pytest.mark.parametrize(

@@ -1,4 +1,4 @@
-"""The files of `deploy/robot`: systemd accepts the units, and what they start and run afterwards stops the wheels."""
+"""The files of `deploy/robot`: what the robot knows by them, and that its units guard the wheels."""
 
 from __future__ import annotations
 
@@ -14,9 +14,12 @@ import guardian_rig as rigs
 import pytest
 from guardian_rig import wait_for
 
-from fog_runtime.configuration.robot_file import ROBOT_FILE, load_robot
-from fog_runtime.configuration.settings import load
-from robot_agent.agent.settings import Settings
+from fog_contracts.messages import Pose
+from fog_runtime.configuration.robot_file import load_robot
+from fog_runtime.configuration.settings import SettingsError, load
+from robot_agent.agent.settings import Settings, read_given
+from robot_agent.config import agent_config
+from robot_agent.registry import make_lidar
 
 DEPLOY = Path(__file__).parents[3] / "deploy/robot"
 UNITS = ["fognav-watchdog.service", "fognav-agent.service"]
@@ -40,6 +43,24 @@ except PermissionError:
 """
 
 
+SITE = """
+id = "lab"
+[[robots]]
+id = "r1"
+start = { x = 3.0, y = 4.0, theta = 0.5 }
+dock = { x = 1.0, y = 4.0, theta = 3.1 }
+radius = 0.30
+height = 0.9
+"""
+
+
+@pytest.fixture(autouse=True)
+def site_file(tmp_path):
+    """The fog node's file, which the installer is given."""
+    (tmp_path / "fog-node-site.toml").write_text(SITE)
+    return tmp_path / "fog-node-site.toml"
+
+
 @pytest.fixture
 def installed(tmp_path):
     """The files as the installer writes them, below a folder."""
@@ -52,7 +73,8 @@ def installed(tmp_path):
 
 
 def install(root, *more):
-    command = [DEPLOY / "install", "--robot", "r1", "--site", "lab", "--fog", "fog.local", "--root", str(root), *more]
+    site = root.parent / "fog-node-site.toml"
+    command = [DEPLOY / "install", "--robot", "r1", "--site", site, "--fog", "fog.local", "--root", str(root), *more]
     return subprocess.run(command, check=True, capture_output=True, text=True)
 
 
@@ -65,9 +87,32 @@ def environment(root):
     return dict(line.split("=", 1) for line in lines if line and not line.startswith("#"))
 
 
+def environment_below(root):
+    """The variables of an installation below a folder: what they name lies there."""
+    return {name: f"{root}{text}" if text.startswith("/etc/") else text for name, text in environment(root).items()}
+
+
+def configured(root):
+    """The agent's configuration, as its process makes it of the installed files and nothing else."""
+    environ = environment_below(root)
+    settings, robot = load(Settings, environ=environ), load_robot(environ)
+    given = read_given(settings, robot)
+    config = agent_config(
+        settings.robot,
+        given.operator_key,
+        given.base.drive_train,
+        make_lidar(robot).traits,
+        given.body,
+        boot="1",
+        footprint=given.footprint,
+        settings=robot.settings,
+    )
+    return given, config
+
+
 def test_installed_files_have_no_placeholder_left_and_are_not_writable_by_others(installed):
     files = [path for path in installed.rglob("*") if path.is_file()]
-    assert len(files) == 10
+    assert len(files) == 11
     for path in files:
         assert not re.search(r"@[A-Z]+@", path.read_text()), path
         assert not path.stat().st_mode & 0o022
@@ -119,7 +164,7 @@ class Update:
         for name, answer in answers.items():
             self._command(commands / name, answer)
         self._command(home / "opt/fognav/venv/bin/python", f"exit {int(pip_fails)}")
-        arguments = ["--robot", "r1", "--site", "lab", "--fog", "f", "--wheels", str(self.wheels)]
+        arguments = ["--robot", "r1", "--site", home / "fog-node-site.toml", "--fog", "f", "--wheels", str(self.wheels)]
         environ = {**os.environ, "PATH": f"{commands}:{os.environ['PATH']}"}
         self.done = subprocess.run([script, *arguments], check=False, capture_output=True, text=True, env=environ)
 
@@ -160,7 +205,14 @@ def test_wheels_replace_packages_of_the_same_version(tmp_path):
 
 
 @pytest.mark.parametrize(
-    "arguments", [[], ["--robot"], ["--robot", "r 1", "--site", "s", "--fog", "f"], ["--what", "x"]]
+    "arguments",
+    [
+        [],
+        ["--robot"],
+        ["--robot", "r 1", "--site", "s", "--fog", "f"],
+        ["--what", "x"],
+        ["--robot", "r1", "--site", "lab", "--fog", "f"],
+    ],
 )
 def test_the_installer_refuses_wrong_arguments(arguments):
     done = subprocess.run([DEPLOY / "install", *arguments], check=False, capture_output=True, text=True)
@@ -169,11 +221,45 @@ def test_the_installer_refuses_wrong_arguments(arguments):
 
 
 def test_the_variables_are_settings_that_the_processes_accept(installed):
-    environ = environment(installed)
-    settings = load(Settings, environ={**environ, "FOGNAV_SITE_DIR": "/none"})
-    assert (settings.robot, settings.site, settings.zenoh_endpoints) == ("r1", "lab", ["tcp/fog.local:7447"])
-    environ[ROBOT_FILE] = str(installed) + environ[ROBOT_FILE]
+    environ = environment_below(installed)
+    settings = load(Settings, environ=environ)
+    assert (settings.robot, settings.zenoh_endpoints) == ("r1", ["tcp/fog.local:7447"])
     assert load_robot(environ).settings.lidar.port == "/dev/pts/7"
+
+
+def test_installed_robot_knows_its_body_start_and_dock_from_the_sites_file(installed):
+    given, config = configured(installed)
+    assert (given.site, given.body.start) == ("lab", Pose(x=3.0, y=4.0, theta=0.5))
+    assert (config.radius, config.height) == (0.30, 0.9)
+    assert config.footprint.inscribed_radius == pytest.approx(0.30)
+    assert config.motion.inflation.inscribed_radius == 0.30
+    assert config.dock == Pose(x=1.0, y=4.0, theta=3.1)
+
+
+def test_another_installation_brings_the_site_of_today_to_a_robot_that_had_none(installed, site_file):
+    env, site = installed / "etc/fognav/robot.env", installed / "etc/fognav/site/site.toml"
+    env.write_text(env.read_text().replace("FOGNAV_SITE_DIR=/etc/fognav/site", "FOGNAV_SITE=lab"))
+    site.unlink()
+    with pytest.raises(SettingsError, match="FOGNAV_SITE_DIR is not set, so this robot's body"):
+        configured(installed)
+    site_file.write_text(SITE.replace("0.30", "0.25"))
+    install(installed)
+    assert configured(installed)[1].radius == 0.25
+    assert environment(installed)["FOGNAV_SITE"] == "lab"
+
+
+def test_installed_agent_does_not_start_without_its_body(installed):
+    (installed / "etc/fognav/site/site.toml").unlink()
+    done = subprocess.run(
+        [sys.executable, "-m", "robot_agent"],
+        env={**os.environ, **environment_below(installed)},
+        check=False,
+        capture_output=True,
+        text=True,
+        timeout=60,
+    )
+    assert done.returncode == 1
+    assert "site/site.toml can't be read: No such file or directory. Copy the fog node's site.toml there" in done.stderr
 
 
 @pytest.mark.skipif(shutil.which("systemd-analyze") is None, reason="needs systemd-analyze")
@@ -238,8 +324,7 @@ def test_the_units_commands_guard_a_base_and_stop_it_after_the_watchdog_is_kille
     unit = installed / "etc/systemd/system/fognav-watchdog.service"
     (start,), (afterwards,) = entries(unit, "ExecStart"), entries(unit, "ExecStopPost")
     with rigs.Base(tmp_path / "base") as base:
-        environ = {**os.environ, **environment(installed), "FOGNAV_BASE_PORT": str(base.link)}
-        environ[ROBOT_FILE] = str(installed) + environ[ROBOT_FILE]
+        environ = {**os.environ, **environment_below(installed), "FOGNAV_BASE_PORT": str(base.link)}
         environ["FOGNAV_GUARDIAN_SOCKET"] = str(tmp_path / "guardian.sock")
         with (tmp_path / "log").open("wb") as log:
             watchdog = subprocess.Popen(start.replace(PYTHON, sys.executable).split(), env=environ, stderr=log)

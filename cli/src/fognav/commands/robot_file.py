@@ -132,6 +132,10 @@ def contradictions(robot: RobotFile) -> list[str]:
     if footprint is not None:
         refuse_body(robot, base, footprint)
         return told
+    if robot.settings.base.driver != DEFAULT_BASE:
+        told.append(
+            f"body.footprint is not set: the body is a circle of the site's `radius`, {ROBOT_RADIUS} m by default"
+        )
     try:
         refuse_body(robot, base, Footprint.circle(ROBOT_RADIUS))
     except SettingsError as error:

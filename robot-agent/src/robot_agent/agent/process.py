@@ -7,6 +7,7 @@ import secrets
 from functools import partial
 from typing import TYPE_CHECKING
 
+from msgspec import to_builtins
 from prometheus_client import REGISTRY
 
 from fog_runtime import logs
@@ -59,6 +60,10 @@ async def run(
         settings=robot.settings,
         finds_dock=isinstance(given.base, DockingDriver),
     )
+    source = "radius of site.toml" if given.footprint is None else "footprint of robot.toml"
+    inscribed = round(config.footprint.inscribed_radius, 3)
+    sizes = {"radius": config.radius, "inscribed_radius": inscribed}
+    _log.info("robot_body", source=source, **sizes, site=site, entry=to_builtins(body))
     use_one_thread()
     health = Health("map", "pose", "lidar", "base")
     async with ZenohEdge.open(

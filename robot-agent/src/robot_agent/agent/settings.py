@@ -10,7 +10,6 @@ import msgspec
 from msgspec import Meta
 
 from fog_contracts.commands import KEY_BYTES
-from fog_contracts.costs import ROBOT_RADIUS
 from fog_contracts.messages import Id
 from fog_contracts.site import Site
 from fog_runtime.access.operator_key import OperatorKeyError
@@ -38,7 +37,8 @@ class Settings(CommonSettings, frozen=True, kw_only=True):
 
     `obstacle_memory_s`: how long (s) a reported obstacle counts while no lidar looks there again.
 
-    `site_dir` is optional here: a robot without the site's folder needs `site`, and an initial pose or a global search.
+    `site_dir` has the `site.toml` that the fog node has: this robot's entry says how large it is, where it starts, and
+    where its dock is. The map itself comes from the map-service.
 
     `agent_realtime_priority`: of all its threads, below the guardian's; 0 for none. On a clock of another speed: none.
     """
@@ -56,7 +56,7 @@ class Given(NamedTuple):
     """What the files say that the settings and the robot's file name, and the driver of the base."""
 
     site: str
-    body: RobotSite | None
+    body: RobotSite
     operator_key: bytes
     credentials: Credentials
     footprint: Footprint | None
@@ -71,10 +71,10 @@ def read_given(settings: Settings, robot: RobotFile) -> Given:
         CredentialsError: for wrong credentials.
 
     """
-    site, body = read_site(settings)
     footprint, base = read_footprint(robot), registry.make_base(robot)
+    site, body = read_site(settings)
     refuse_contradictions(robot, base)
-    refuse_body(robot, base, footprint or Footprint.circle(ROBOT_RADIUS if body is None else body.radius))
+    refuse_body(robot, base, footprint or Footprint.circle(body.radius))
     return Given(
         site=site,
         body=body,
@@ -85,25 +85,30 @@ def read_given(settings: Settings, robot: RobotFile) -> Given:
     )
 
 
-def read_site(settings: Settings) -> tuple[str, RobotSite | None]:
-    """Return the site's id and, if the site's folder exists, its entry of this robot; raises `SettingsError`.
-
-    The map itself comes from the map-service, not from the site's folder.
-    """
+def read_site(settings: Settings) -> tuple[str, RobotSite]:
+    """Return the site's id and its entry of this robot, without which the body is not known; raises `SettingsError`."""
     file = settings.site_dir / SITE_FILE
     if settings.site_dir == Path() and not file.is_file():
-        if not settings.site:
-            raise SettingsError("the site is not known. Set FOGNAV_SITE to its id, or FOGNAV_SITE_DIR to its folder")
-        return settings.site, None
+        raise SettingsError(
+            "FOGNAV_SITE_DIR is not set, so this robot's body, start and dock are not known. Set it to a folder with "
+            f"the fog node's {SITE_FILE} (deploy/robot/install --site {SITE_FILE} copies it and sets it)"
+        )
     try:
         site = msgspec.convert(tomllib.loads(file.read_text("utf-8")), Site)
     except OSError as error:
-        raise SettingsError(f"{file} can't be read: {error.strerror}. Correct FOGNAV_SITE_DIR") from error
+        raise SettingsError(
+            f"{file} can't be read: {error.strerror}. Copy the fog node's {SITE_FILE} there, or correct FOGNAV_SITE_DIR"
+        ) from error
     except (tomllib.TOMLDecodeError, UnicodeDecodeError, msgspec.ValidationError) as error:
         raise SettingsError(f"{file}: {error}. Correct the field that it names") from error
+    if settings.site not in {"", site.id}:
+        raise SettingsError(
+            f"FOGNAV_SITE is {settings.site!r}, but {file} describes {site.id!r}, whose start and dock are on another "
+            f"map. Copy the {SITE_FILE} of {settings.site!r} there, or remove FOGNAV_SITE"
+        )
     for robot in site.robots:
         if robot.id == settings.robot:
-            return settings.site or site.id, robot
+            return site.id, robot
     known = ", ".join(robot.id for robot in site.robots) or "none"
     raise SettingsError(f"{file}: robots: there is no {settings.robot!r} (known: {known}). Add it, or set FOGNAV_ROBOT")
 

@@ -56,7 +56,7 @@ class MapLoader:
         """Begin to read the stored map, on a thread; `run` loads it. What else the process does goes on meanwhile."""
         self._stored = self._thread.submit(self._read)
 
-    async def run(self, body: RobotSite | None) -> None:
+    async def run(self, body: RobotSite) -> None:
         """Restore the stored state, then keep the map up to date until cancelled."""
         try:
             await self.restore(body)
@@ -64,7 +64,7 @@ class MapLoader:
         finally:
             self._thread.shutdown(wait=False, cancel_futures=True)
 
-    async def restore(self, body: RobotSite | None) -> None:
+    async def restore(self, body: RobotSite) -> None:
         """Load the stored map and pose; without a stored pose, start at the site's start pose."""
         if self._stored is None:
             self.begin()
@@ -76,11 +76,10 @@ class MapLoader:
             except MapError as error:
                 _log.warning("stored_map_refused", reason=str(error))
         saved = self._store.pose(self._site)
-        if saved is None and body is not None:
+        if saved is None:
             saved = start_pose(self._site, body)
-        if saved is not None:
-            self._core.restore(saved)
-        _log.info("state_restored", map=stored is not None, x=saved and saved.x, y=saved and saved.y)
+        self._core.restore(saved)
+        _log.info("state_restored", map=stored is not None, x=saved.x, y=saved.y)
 
     def _read(self) -> PreparedMap | None:
         """Return the stored map, None without a valid one."""

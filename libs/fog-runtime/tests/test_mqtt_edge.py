@@ -266,6 +266,29 @@ async def test_retained_reading_is_refused(broker):
     assert seen == ["new"]
 
 
+@pytest.mark.parametrize("stored", [True, False], ids=["known at the start", "added later"])
+async def test_topic_at_which_the_broker_ends_the_connection_is_left_out_and_no_other(broker, stored, caplog):
+    """Mosquitto closes the connection of whoever subscribes to a topic with a control character."""
+    seen, foreign = [], []
+    topics = ["doors/a", "doors/\u0001", "doors/b"]
+
+    def on_foreign(topic, payload, _retained):
+        foreign.append((topic, payload))
+
+    edge = make_edge(broker, "poisoned")
+    edge.on(ch.NODE_READING, lambda ids, _: seen.append(ids["node"]), m.NodeReading)
+    if stored:
+        await edge.listen_to_foreign(topics, on_foreign)
+    async with running(edge), raw_client(broker) as client:
+        await edge.listen_to_foreign(topics, on_foreign)
+        await until(lambda: "topic_left_out" in caplog.text and edge.connected, "the topic is still tried")
+        for topic in ("doors/a", "doors/b"):
+            await client.publish(topic, b"1", qos=1)
+        await edge.publish(ch.NODE_READING, reading(1), wait=True, node="n1")
+        await until(lambda: len(foreign) == 2 and seen, "not everything else is received")
+    assert sorted(foreign) == [("doors/a", b"1"), ("doors/b", b"1")]
+
+
 async def test_messages_are_delivered_after_a_handler_raised(broker):
     seen = []
 

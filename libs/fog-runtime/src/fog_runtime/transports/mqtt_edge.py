@@ -7,7 +7,7 @@ subscribes again: state that must survive is retained, or published again by `on
 import asyncio
 import random
 from collections import deque
-from collections.abc import Awaitable, Callable, Iterable, Mapping, Sequence
+from collections.abc import Awaitable, Callable, Collection, Iterable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field
 from typing import Any, Final, TypeVar, overload
@@ -32,6 +32,9 @@ NOT_SUBSCRIBED: Final = "fog/nobody-subscribes"
 """A topic to which nobody subscribes: a broker answers who ends such a subscription, too, and changes nothing."""
 BACKOFF_S: Final = (0.2, 2.0)
 """Real seconds between attempts to connect: initial and maximum."""
+
+FOREIGN_LOSSES: Final = 3
+"""Connections that may end while a topic of others is subscribed to, until it is left out."""
 
 _log = logs.get("mqtt_edge")
 
@@ -110,6 +113,9 @@ class MqttEdge:
         self._client: aiomqtt.Client | None = None
         self._changed = asyncio.Event()
         self._tasks: set[asyncio.Future[Any]] = set()
+        # Topics that are no channel's, by how many connections in a row ended while they were subscribed to.
+        self._losses: dict[str, int] = {}
+        self._trying: set[str] = set()
         self._limited = logs.RateLimited(_log)
 
     @property
@@ -193,19 +199,43 @@ class MqttEdge:
         """Call `handler(topic, payload, retained)` for each message of these topics, which are no channel's.
 
         They replace those of the call before, now and after every connection. The broker delivers the retained messages
-        of those in `again` once more, though they were subscribed to before.
+        of those in `again` once more, though they were subscribed to before. Topics at which a broker ends the
+        connection are left out, so that all others are received.
         """
         added, dropped = self.subscriptions.set_foreign(topics, handler, again)
+        self._losses = {topic: self._losses[topic] for topic in self._losses.keys() - {*added, *dropped}}
         client = self._client
         if client is None:
             return
         try:
-            if added:
-                await _subscribe(client, dict.fromkeys(added, 1))
+            await self._subscribe_foreign(client, added)
             if dropped:
                 await client.unsubscribe(dropped)
         except aiomqtt.MqttError as error:
             self._limited.warning("subscription_failed", "foreign", self._clock.now(), topic=added, reason=str(error))
+
+    async def _subscribe_foreign(self, client: aiomqtt.Client, topics: Collection[str]) -> None:
+        if topics:
+            self._trying |= {*topics}
+            await _subscribe(client, dict.fromkeys(topics, 1))
+            self._trying -= {*topics}
+            for topic in topics:
+                self._losses.pop(topic, None)
+
+    async def _subscribe_suspects(self, client: aiomqtt.Client) -> None:
+        """Subscribe to the topics at which the connection ended before, each alone: it may be only one of them."""
+        for topic, losses in sorted(self._losses.items()):
+            if losses < FOREIGN_LOSSES:
+                await self._subscribe_foreign(client, [topic])
+
+    def _count_losses(self) -> None:
+        """Suspect the topics that were being subscribed to when the connection ended."""
+        trying, self._trying = self._trying & {*self.subscriptions.foreign}, set()
+        for topic in trying:
+            self._losses[topic] = self._losses.get(topic, 0) + 1
+            if self._losses[topic] == FOREIGN_LOSSES:
+                remedy = "its source stays unknown: change its topic to one that the broker accepts"
+                _log.error("topic_left_out", topic=topic, reason="the broker ends the connection at it", remedy=remedy)
 
     def on_connect(self, callback: Callable[[], Awaitable[None]]) -> None:
         """Run `callback` after every connection, once all subscriptions are made."""
@@ -281,8 +311,12 @@ class MqttEdge:
                 await client.publish(will.topic, will.payload, will.qos, will.retain)
 
     async def _serve(self, client: aiomqtt.Client, broker: Broker, inbox: Inbox) -> None:
-        if topics := self.subscriptions.qos_by_topic():
-            await _subscribe(client, topics)
+        own = self.subscriptions.qos_by_topic()
+        foreign = self.subscriptions.foreign - own.keys()
+        if own:
+            await _subscribe(client, own)
+        await self._subscribe_foreign(client, sorted(foreign - self._losses.keys()))
+        if own or foreign:
             await _receive_retained(client, inbox)
         self._client = client
         self._changed.set()
@@ -292,6 +326,8 @@ class MqttEdge:
         inbox.open()
         for callback in self._on_connect:
             self._spawn(callback(), "on_connect")
+        if self._losses:
+            self._spawn(self._subscribe_suspects(client), "suspects")
         async for _ in client.messages:  # until the connection ends: the inbox delivers
             pass
 
@@ -300,6 +336,7 @@ class MqttEdge:
         metrics.CONNECTED.labels(self._transport).set(0)
         for task in list(self._tasks):
             task.cancel()
+        self._count_losses()
         for callback in self._on_connection_lost if was_connected else ():
             callback()
 

@@ -1,6 +1,7 @@
 """The subscriptions of one MQTT connection: their topics, and the delivery of messages to their handlers."""
 
 from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Set as AbstractSet
 from dataclasses import dataclass
 from typing import Any, Final, NamedTuple
 
@@ -90,14 +91,18 @@ class Subscriptions:
         """
         old, self._foreign = self._foreign, dict.fromkeys(topics, handler)
         self._routes.clear()
-        kept = self.qos_by_topic().keys()
+        kept = self.qos_by_topic().keys() | self.foreign
         added = self._foreign.keys() - (old.keys() - set(again))
         return sorted(added), sorted(old.keys() - kept)
 
+    @property
+    def foreign(self) -> AbstractSet[str]:
+        """The topics that are no channel's."""
+        return self._foreign.keys()
+
     def qos_by_topic(self) -> dict[str, int]:
-        """Return every topic to subscribe to, with its quality of service."""
-        foreign = dict.fromkeys(self._foreign, 1)
-        return foreign | {topic: one.channel.qos for one in self._subscriptions for topic in one.topics}
+        """Return the topics of all channels, with their quality of service."""
+        return {topic: one.channel.qos for one in self._subscriptions for topic in one.topics}
 
     def deliver(self, message: aiomqtt.Message) -> None:
         """Pass a message to the handlers of its channel; count and log it when it breaks the channel's contract."""

@@ -314,17 +314,61 @@ def test_source_with_a_penalty_makes_a_clear_area_costly_and_never_impassable():
     assert alone.send("t", "20") == "clear"
 
 
-def test_topic_with_wildcards_and_one_message_for_two_sources():
-    any_door = Source(id="any", topic="doors/+/state", blocked=["1"], clear=["0"], period_s=10.0)
-    below = Source(id="below", topic="doors/#", blocked=["1"], clear=["0"], period_s=10.0)
-    rig = Rig(any_door, below)
-    assert rig.fusion.source_topics() == {"doors/+/state", "doors/#"}
-    assert rig.send("doors/a/state", "1") == "blocked"
-    assert rig.states == {"any": "blocked", "below": "blocked"}
-    rig.send("doors", "0")
-    assert rig.states == {"any": "blocked", "below": "clear"}
-    rig.send("doors/a/b/state", "1")
-    assert rig.states == {"any": "blocked", "below": "blocked"}
+def test_one_message_for_two_sources():
+    front = Source(id="front", topic="lobby", pointer="/front", blocked=["1"], clear=["0"], period_s=10.0)
+    back = Source(id="back", topic="lobby", pointer="/back", blocked=["1"], clear=["0"], period_s=10.0)
+    rig = Rig(front, back)
+    assert rig.fusion.source_topics() == {"lobby"}
+    assert rig.send("lobby", {"front": "1", "back": "0"}) == "blocked"
+    assert rig.states == {"front": "blocked", "back": "clear"}
+
+
+@pytest.mark.parametrize("field", ["topic", "availability"])
+@pytest.mark.parametrize(
+    ("topic", "problem"),
+    [
+        ("a\u0000b", "U\\+0000, which brokers refuse"),
+        ("a\u0001b", "U\\+0001, which brokers refuse"),
+        ("a\u007f", "U\\+007F, which brokers refuse"),
+        ("a\u0085", "U\\+0085, which brokers refuse"),
+        ("\ufffe", "U\\+FFFE, which brokers refuse"),
+        ("\U0001ffff", "U\\+1FFFF, which brokers refuse"),
+        ("\ufdd0", "U\\+FDD0, which brokers refuse"),
+        ("$share/group/door", "the broker's own, or a shared subscription"),
+        ("$SYS/broker/uptime", "the broker's own, or a shared subscription"),
+        ("doors/+/state", "has a wildcard .* give each sensor a source of its own"),
+        ("doors/#", "has a wildcard .* give each sensor a source of its own"),
+        ("a/b+/c", "has a wildcard"),
+        ("{device}", "it is empty"),
+    ],
+)
+def test_topic_that_no_single_sensor_has_is_refused(field, topic, problem):
+    topics = {"topic": "door", "availability": Availability(topic="status")}
+    topics[field] = topic if field == "topic" else Availability(topic=topic)
+    with pytest.raises(AreaError, match=f"area hall: sources\\.s1\\.{field}.*{problem}"):
+        Rig(Source(id="s1", blocked=["1"], clear=["0"], **topics))
+
+
+@pytest.mark.parametrize("profile", PROFILES)
+@pytest.mark.parametrize("device", ["a\u0001", "+", "a/#"])
+def test_device_that_spoils_its_topic_is_refused(profile, device):
+    with pytest.raises(AreaError, match=r"area hall: sources\.s1\."):
+        Rig(Source(id="s1", profile=profile, device=device, number=LIMITS.get(profile)))
+
+
+@pytest.mark.parametrize("device", ["gate/binary_sensor/beam", "building/gate/binary_sensor/beam"])
+def test_device_of_esphome_goes_offline_on_all_of_its_prefix(device):
+    prefix = device.removesuffix("/binary_sensor/beam")
+    rig = Rig(Source(id="s1", profile="esphome-binary", device=device))
+    rig.send(f"{prefix}/status", "online")
+    assert rig.send(f"{device}/state", "OFF") == "clear"
+    assert rig.send(f"{prefix}/status", "offline") == "unknown"
+
+
+@pytest.mark.parametrize("device", ["gate", "binary_sensor/beam", "gate/beam", "gate/binary_sensor/"])
+def test_device_of_esphome_without_its_prefix_is_refused(device):
+    with pytest.raises(AreaError, match=r"sources\.s1\.device: .* is no PREFIX/binary_sensor/NAME"):
+        Rig(Source(id="s1", profile="esphome-binary", device=device))
 
 
 def test_changed_area_keeps_the_states_of_sources_that_did_not_change():
@@ -353,12 +397,6 @@ BAD = Source(id="s1", topic="t", blocked=["1"], clear=["0"], period_s=1.0)
         (Source(id="s1", topic="t", period_s=1.0), "neither which values mean blocked and clear"),
         (Source(id="s1", topic="t", period_s=1.0, number=Limits()), "it needs `above` or `below`"),
         (Source(id="s1", topic="t", blocked=["1"], clear=["0"]), "nobody would notice that it is dead"),
-        (Source(id="s1", topic="a/b+/c", blocked=["1"], clear=["0"], period_s=1.0), "stand for whole levels"),
-        (Source(id="s1", topic="a/#/c", blocked=["1"], clear=["0"], period_s=1.0), "stand for whole levels"),
-        (
-            Source(id="s1", topic="t", blocked=["1"], clear=["0"], availability=Availability(topic="x#")),
-            "stand for whole levels",
-        ),
         (Source(id="s1", topic="t", blocked=["1"], clear=["0"], period_s=1.0, debounce={"rule": "x"}), "debounce.rule"),
     ],
 )

@@ -1,6 +1,7 @@
 """Sources in the running aggregator: from the site file and over REST, through a real broker, kept across a kill."""
 
 import asyncio
+import json
 import secrets
 
 import aiomqtt
@@ -37,11 +38,16 @@ def broker(fog) -> aiomqtt.Client:
     return Broker.of(fog.mosquitto.url, fog.test_credentials).client(f"device-{secrets.token_hex(4)}", None)
 
 
-async def test_sources_of_the_site_and_over_rest_decide_their_areas_and_survive_a_kill(fog, tokens):
+async def start_with_gate(fog) -> str:
+    """Start an aggregator whose site has the gate alone; return its address."""
     file = fog.site / "site.toml"
     file.write_text(file.read_text().split("[[nodes]]")[0] + SITE_SOURCE)
     fog.start("hazard_aggregator")
-    url = await fog.ready("hazard_aggregator")
+    return await fog.ready("hazard_aggregator")
+
+
+async def test_sources_of_the_site_and_over_rest_decide_their_areas_and_survive_a_kill(fog, tokens):
+    url = await start_with_gate(fog)
     async with httpx.AsyncClient(base_url=url, timeout=60) as client, broker(fog) as mqtt:
         await mqtt.publish("gate/binary_sensor/beam/state", "OFF")
         await wait_for(client, "hall", lambda hazard: hazard["state"] == "clear")
@@ -85,6 +91,39 @@ async def test_changed_source_is_given_what_the_broker_retains_and_a_long_messag
         await mqtt.publish("gate/binary_sensor/beam/state", b" " * 20_000 + b"OFF")
         unknown = await wait_for(client, "yard", lambda hazard: hazard["state"] == "unknown")
         assert "its message is too long" in unknown["cause"]
+
+
+async def test_topic_that_ends_the_brokers_connection_is_refused_and_stored_by_an_earlier_version_harms_its_area_only(
+    fog, tokens
+):
+    """Mosquitto closes the connection of whoever subscribes to a topic with a control character."""
+    url = await start_with_gate(fog)
+    bell = {"id": "bell", "topic": "yard/bell", "blocked": ["1"], "clear": ["0"], "period_s": 60.0}
+    async with httpx.AsyncClient(base_url=url, timeout=60) as client, broker(fog) as mqtt:
+        body = {"polygon": POLYGON, "sources": [bell]}
+        put = await client.put("/api/v1/areas/yard", json=body, headers=tokens["operator"])
+        assert put.status_code == 201, put.text
+        bad = {"polygon": POLYGON, "sources": [bell | {"topic": "yard/\u0001bell"}]}
+        put = await client.put("/api/v1/areas/yard", json=bad, headers=tokens["operator"])
+        assert put.status_code == 422
+        assert put.json()["errors"][0]["field"] == "body.sources.bell.topic"
+        assert "U+0001, which brokers refuse" in put.json()["detail"]
+    fog.kill("hazard_aggregator")
+    async with fog.raw_redis() as raw:
+        record = json.loads(await raw.hget("fog:test:areas", "yard"))
+        record["sources"][0]["topic"] = "yard/\u0001bell"
+        await raw.hset("fog:test:areas", "yard", json.dumps(record))
+    fog.start("hazard_aggregator")
+    async with (
+        httpx.AsyncClient(base_url=await fog.ready("hazard_aggregator"), timeout=60) as client,
+        broker(fog) as mqtt,
+    ):
+        await mqtt.publish("gate/status", "online", retain=True)
+        await mqtt.publish("gate/binary_sensor/beam/state", "OFF")
+        await wait_for(client, "hall", lambda hazard: hazard["state"] == "clear")
+        assert (await wait_for(client, "yard", lambda _: True))["state"] == "unknown"
+        areas = (await client.get("/readyz")).json()
+        assert "U+0001" in json.dumps(areas)
 
 
 async def test_invalid_source_is_refused_with_the_field(fog, tokens):

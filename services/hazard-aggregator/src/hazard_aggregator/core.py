@@ -21,6 +21,7 @@ from hazard_aggregator.publications import definition_publication, deletions, ha
 
 if TYPE_CHECKING:
     from collections.abc import Collection, Iterable, Mapping, Sequence
+    from collections.abc import Set as AbstractSet
 
     from fog_contracts.channels import Channel
     from fog_contracts.geometry import Point
@@ -80,8 +81,8 @@ class Aggregator:
         """Return the area numbers under which the thesis's nodes may report."""
         return sorted({d.number for d in self.definitions() if d.number is not None and not d.removed})
 
-    def source_topics(self) -> set[str]:
-        """Return the topics of all areas' sources, which may contain wildcards."""
+    def source_topics(self) -> AbstractSet[str]:
+        """Return the topics of all areas' sources."""
         return self._fusion.source_topics()
 
     def pop_new_source_topics(self) -> set[str]:

@@ -22,6 +22,7 @@ from hazard_aggregator.sources import Sources
 
 if TYPE_CHECKING:
     from collections.abc import Collection, Iterable, Mapping
+    from collections.abc import Set as AbstractSet
     from typing import Final
 
     from fog_contracts.geometry import Point
@@ -96,8 +97,8 @@ class AreaFusion:
         found = self._areas.get(area)
         return found.definition if found is not None else None
 
-    def source_topics(self) -> set[str]:
-        """Return the topics of all sources, which may contain wildcards."""
+    def source_topics(self) -> AbstractSet[str]:
+        """Return the topics of all sources."""
         return self._sources.topics
 
     def pop_new_source_topics(self) -> set[str]:

@@ -1,9 +1,8 @@
-"""Passes messages to the sources that they concern, whatever wildcards these have in their topics. Pure."""
+"""Passes messages to the sources that they concern. Pure."""
 
 from __future__ import annotations
 
 import math
-import re
 from itertools import chain
 from typing import TYPE_CHECKING, Final, NamedTuple
 
@@ -12,6 +11,7 @@ from hazard_aggregator.sensors.source_reader import is_online
 
 if TYPE_CHECKING:
     from collections.abc import Iterable
+    from collections.abc import Set as AbstractSet
 
     from fog_contracts.messages import NodeValue
     from hazard_aggregator.areas.watched_area import WatchedArea
@@ -40,9 +40,7 @@ class Sources:
     """The sources of all areas by their topics; build a new one when an area changes."""
 
     def __init__(self, areas: Iterable[WatchedArea] = ()) -> None:
-        self._exact: dict[str, list[_Listener]] = {}
-        self._wildcards: list[tuple[re.Pattern[str], _Listener]] = []
-        self.topics: set[str] = set()
+        self._by_topic: dict[str, list[_Listener]] = {}
         self._members: list[SourceState] = []
         self._quantities: dict[str, list[tuple[WatchedArea, SourceState]]] = {}
         for area in areas:
@@ -55,18 +53,22 @@ class Sources:
                     if member.source.availability is not None:
                         self._add(member.source.availability.topic, _Listener(area, member, availability=True))
 
+    @property
+    def topics(self) -> AbstractSet[str]:
+        """The topics to subscribe to."""
+        return self._by_topic.keys()
+
     def apply(self, topic: str, payload: bytes | None, now: float, stamp: float, *, retained: bool) -> list[Applied]:
         """Apply a message (None: one that is too long) to the sources that it concerns, and return them.
 
         A `retained` one has an unknown age: it counts only for a source that publishes on change, and once its sensor
         is known to be connected.
         """
-        found = [*self._exact.get(topic, ()), *(one for pattern, one in self._wildcards if pattern.fullmatch(topic))]
         return [
             Applied(area, source, _apply_availability(source, payload, now, stamp))
             if availability
             else Applied(area, source, _apply_value(area, source, payload, now, stamp, retained=retained))
-            for area, source, availability in found
+            for area, source, availability in self._by_topic.get(topic, ())
         ]
 
     def apply_value(self, node: str, value: NodeValue, now: float, stamp: float) -> list[Applied]:
@@ -98,7 +100,7 @@ class Sources:
         Their changes are lost while there is no connection, and a message that the broker kept comes again.
         """
         areas = set()
-        for area, source, _ in [*chain.from_iterable(self._exact.values()), *(one for _, one in self._wildcards)]:
+        for area, source, _ in chain.from_iterable(self._by_topic.values()):
             if source.silent_after(area.definition.unknown) == math.inf:
                 source.pending = None
                 if source.source is not None and source.source.availability is not None:
@@ -118,24 +120,13 @@ class Sources:
         return {topic for topic in topics if topic is not None}
 
     def _add(self, topic: str | None, listener: _Listener) -> None:
-        if topic is None:
-            return
-        self.topics.add(topic)
-        if "+" in topic or "#" in topic:
-            self._wildcards.append((_pattern(topic), listener))
-        else:
-            self._exact.setdefault(topic, []).append(listener)
+        if topic is not None:
+            self._by_topic.setdefault(topic, []).append(listener)
 
 
 def _is_newer(value: NodeValue, boot: int, seq: int) -> bool:
     """Whether a value came after that one; the count of a node has 32 bits and wraps."""
     return value.boot != boot or 0 < (value.seq - seq) % _WRAP < _WRAP // 2
-
-
-def _pattern(topic: str) -> re.Pattern[str]:
-    """Return the topics that a subscription matches: + is one level, # any further ones, also none."""
-    levels = [{"+": "[^/]*", "#": ".*"}.get(level, re.escape(level)) for level in topic.split("/")]
-    return re.compile("/".join(levels).replace("/.*", "(/.*)?"))
 
 
 def _apply_value(

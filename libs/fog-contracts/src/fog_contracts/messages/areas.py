@@ -71,12 +71,12 @@ class Quantity(Message, frozen=True, kw_only=True):
 class Source(Message, frozen=True, kw_only=True):
     """Any sensor that speaks MQTT, or a quantity that a node measures, as evidence for an area.
 
-    `topic` may contain wildcards. `pointer` is where its payload, a JSON document, has the value (None: the payload is
-    plain text); `blocked` and `clear` are what it means, or `number` for a number. A `profile` gives all that is not
-    given here, with `device` for the name in its topics. `period_s` is the time between two messages; without one the
-    sensor publishes on change, and needs an `availability`. With a `penalty`, a blocked sensor makes the area costly
-    instead of impassable. `debounce` as in an area; without it each message counts. A `quantity` has no topic, but the
-    limits of its `number`.
+    `topic` is one sensor's, without wildcards. `pointer` is where its payload, a JSON document, has the value
+    (None: the payload is plain text); `blocked` and `clear` are what it means, or `number` for a number. A
+    `profile` gives all that is not given here, with `device` for the name in its topics. `period_s` is the time
+    between two messages; without one the sensor publishes on change, and needs an `availability`. With a `penalty`,
+    a blocked sensor makes the area costly instead of impassable. `debounce` as in an area; without it each message
+    counts. A `quantity` has no topic, but the limits of its `number`.
     """
 
     id: Id

@@ -7,6 +7,8 @@ Home Assistant (MQTT statestream).
 
 from __future__ import annotations
 
+import re
+import unicodedata
 from typing import TYPE_CHECKING, Final
 
 from msgspec import structs
@@ -57,8 +59,9 @@ PROFILES: Final[Mapping[str, Source]] = {
         availability=Availability(topic="homeassistant/status"),
     ),
 }  # fmt: skip
-"""What a source of each profile does not say itself; `{device}` is its `device`, `{prefix}` the first level of that."""
+"""What a source of each profile does not say itself; `{device}` is its `device`, `{prefix}` the beginning of that."""
 
+_ENTITY: Final = re.compile(r"/(binary_sensor|sensor)/[^/]+$")
 
 _VALUE_PERIOD_S: Final = 2.0
 """A node with several quantities takes turns."""
@@ -83,7 +86,7 @@ def resolve(area: str, source: Source) -> Source:
         default = Source(id=source.id)
         own = {name for name, value in structs.asdict(source).items() if value != getattr(default, name)}
         source = structs.replace(profile, **{name: getattr(source, name) for name in own | {"id"}})
-    source = _filled_in(source)
+    source = _filled_in(area, source)
     _check(area, source)
     return source
 
@@ -106,34 +109,60 @@ def _check_number(area: str, source: Source) -> None:
         raise SourceError(area, f"sources.{source.id}.number", "it needs `above` or `below`")
 
 
-def _filled_in(source: Source) -> Source:
-    device = source.device
-    names = {"{device}": device, "{prefix}": device.split("/", maxsplit=1)[0]}
+def _filled_in(area: str, source: Source) -> Source:
+    """Return a source with its topics filled in; `{prefix}` is all before the kind of an ESPHome device's entity."""
+    device, where = source.device, f"sources.{source.id}"
 
     def filled(topic: str) -> str:
-        for placeholder, name in names.items():
-            topic = topic.replace(placeholder, name)
-        return topic
+        if "{prefix}" in topic:
+            prefix = _ENTITY.sub("", device)
+            if prefix in {"", device}:
+                problem = f"{device!r} is no PREFIX/binary_sensor/NAME or PREFIX/sensor/NAME, as its MQTT log names it"
+                raise SourceError(area, f"{where}.device", problem)
+            topic = topic.replace("{prefix}", prefix)
+        return topic.replace("{device}", device)
 
-    if source.topic is not None:
-        source = structs.replace(source, topic=filled(source.topic))
+    if source.topic is None:
+        raise SourceError(area, f"{where}.topic", "it has none: give a topic, or a profile")
+    source = structs.replace(source, topic=_checked(area, f"{where}.topic", filled(source.topic)))
     if source.availability is not None:
-        topic = filled(source.availability.topic)
+        topic = _checked(area, f"{where}.availability.topic", filled(source.availability.topic))
         source = structs.replace(source, availability=structs.replace(source.availability, topic=topic))
     return source
 
 
+def _checked(area: str, where: str, topic: str) -> str:
+    """Return a topic to which a broker lets one subscribe, and at which one sensor speaks; else raises `SourceError`.
+
+    Mosquitto closes the connection of whoever subscribes to one with a control character, again after each connect.
+    """
+    problem = ""
+    if not topic:
+        problem = "it is empty: name the sensor's topic"
+    elif bad := next((each for each in topic if not _is_allowed(each)), None):
+        problem = f"{topic!r} has the character U+{ord(bad):04X}, which brokers refuse: name the topic without it"
+    elif topic.startswith("$"):
+        problem = f"{topic!r} is the broker's own, or a shared subscription ($): name the sensor's topic"
+    elif "+" in topic or "#" in topic:
+        problem = (
+            f"{topic!r} has a wildcard (+ or #), and one sensor could clear what another blocks: "
+            "give each sensor a source of its own"
+        )
+    if problem:
+        raise SourceError(area, where, problem)
+    return topic
+
+
+def _is_allowed(character: str) -> bool:
+    """Whether a topic may contain a character: no control character and no noncharacter (MQTT 3.1.1, 1.5.3)."""
+    code = ord(character)
+    return (
+        unicodedata.category(character) not in {"Cc", "Cs"} and code & 0xFFFE != 0xFFFE and not 0xFDD0 <= code <= 0xFDEF
+    )
+
+
 def _check(area: str, source: Source) -> None:
     where = f"sources.{source.id}"
-    if source.topic is None:
-        raise SourceError(area, f"{where}.topic", "it has none: give a topic, or a profile")
-    topics = [source.topic, *([source.availability.topic] if source.availability is not None else ())]
-    for topic in topics:
-        levels = topic.split("/")
-        if any(("+" in level and level != "+") or ("#" in level and level != "#") for level in levels) or (
-            "#" in levels[:-1]
-        ):
-            raise SourceError(area, f"{where}.topic", f"{topic!r}: + and # stand for whole levels, # for the last ones")
     if source.number is None and not (source.blocked and source.clear):
         problem = "it says neither which values mean blocked and clear, nor the limits of a `number`"
         raise SourceError(area, where, problem)

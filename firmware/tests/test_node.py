@@ -1,6 +1,7 @@
 """The firmware's node measures, classifies and publishes as the contract says, and as the model in Python does."""
 
 import itertools
+from types import SimpleNamespace
 
 import msgspec
 import pytest
@@ -177,6 +178,19 @@ def test_edge_that_comes_after_the_loop_read_its_clock_is_no_missing_echo(core):
     node._trigger = trigger
     published = [reading for step in range(300) for reading in node.poll(None, step * 0.01)]
     assert {tuple(reading.status) for reading in published} == {("ok", "ok")}
+
+
+def test_what_was_measured_before_a_long_wait_is_not_fresh_after_it(make_node, run):
+    """A board waits for seconds while it connects; the echoes of before came from a corridor that was free."""
+    for stopped in range(0, 130, 10):  # ms: anywhere in the cycle
+        node = make_node()
+        assert run(node, (3.0, 3.0), 2)[-1].state == "clear"
+        waits = 102.0 + stopped / 1000
+        node.poll(SimpleNamespace(sonar=lambda _node, _index: 3.0), waits)
+        blocked = SimpleNamespace(sonar=lambda _node, _index: 1.0)
+        after = [reading for step in range(100) for reading in node.poll(blocked, waits + 5.0 + step * 0.01)]
+        assert after[0].state == "blocked", stopped
+        assert after[0].range_m == [pytest.approx(1.0, abs=0.01)] * 2
 
 
 @pytest.mark.parametrize(("tenths", "metres"), [(-200, 2.787), (0, 2.894), (200, 3.0), (400, 3.106)])

@@ -36,6 +36,8 @@ def ranger_sample(core, model, millimetres, code):
         ("vl53l1x", 1350, 2, (NO_ECHO, 0)),
         ("vl53l1x", 1350, 7, (NO_ECHO, 0)),
         ("vl53l1x", 1350, 5, (STUCK, 0)),
+        ("vl53l1x", 0, 12, (STUCK, 0)),  # a target, too weak to range
+        ("vl53l1x", 0, 13, (STUCK, 0)),  # a target nearer than it can range
         ("vl53l1x", 0, 0, (STUCK, 0)),
     ],
 )

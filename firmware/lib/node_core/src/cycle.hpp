@@ -33,6 +33,12 @@ public:
     // After `finished`: leave the pause out, or most of it, this time.
     void hurry();
 
+    // Forget what has been measured in this cycle: begin it anew.
+    void restart() {
+        phase_ = Phase::pause;
+        current_ = 0;
+    }
+
     int current() const { return current_; }
 
 private:

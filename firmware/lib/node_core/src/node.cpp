@@ -21,7 +21,10 @@ Node::Node(const NodeSettings& settings)
 }
 
 Node::Event Node::step(uint32_t now_us) {
-    if (started_) uptime_us_ += now_us - seen_us_;
+    if (started_) {
+        uptime_us_ += now_us - seen_us_;
+        if (now_us - seen_us_ > kGapUs) forget();
+    }
     started_ = true;
     seen_us_ = now_us;
     switch (cycle_.step(now_us)) {
@@ -39,6 +42,11 @@ Node::Event Node::step(uint32_t now_us) {
             break;
     }
     return Event::none;
+}
+
+void Node::forget() {
+    cycle_.restart();
+    for (SpikeFilter& filter : filters_) filter = SpikeFilter();
 }
 
 void Node::take(const Sample& sample) {

@@ -15,6 +15,9 @@ namespace fognav {
 // A reading of eight sonars with the longest name of a firmware has 380 characters, a calibration 450.
 constexpr size_t kMessageSize = 512;
 
+// After so long without a step what was measured before is not fresh: a board waits for seconds while it connects.
+constexpr uint32_t kGapUs = 250000;
+
 struct NodeSettings {
     NodeConfig config;
     uint32_t boot = 0;  // random, new at each boot; 0 also switches the jitter of the pause off
@@ -76,6 +79,7 @@ public:
 
 private:
     void take(const Sample& sample);
+    void forget();
     Event finish();
     bool doubtful() const;
     void calibrate(CalibrationGoal goal);

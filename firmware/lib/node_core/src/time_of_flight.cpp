@@ -28,11 +28,13 @@ Sample vl53l1x_sample(uint16_t millimetres, uint8_t code) {
         case 3:  // valid, at the near end of its range
         case 6:  // valid, the first one: not checked for a target beyond its range
             return range(millimetres);
-        case 5:  // hardware
-        case 255:
-            return {Status::stuck, 0};
-        default:  // too weak, too noisy, wrapped round: nothing that could be trusted is there
+        case 1:  // too noisy
+        case 2:  // too weak
+        case 4:  // nothing in range
+        case 7:  // wrapped round: beyond its range
             return {Status::no_echo, 0};
+        default:  // no measurement; with 11 to 13 something is there: two targets in one, too weak to range, or too near
+            return {Status::stuck, 0};
     }
 }
 

@@ -251,7 +251,10 @@ class RobotRig:
 def make_aggregator(site: LoadedSite, epoch: int) -> Aggregator:
     """Return the aggregator of a site, as it starts."""
     nodes, cones = site.site.nodes, node_cones(site.site.nodes, site.map)
-    return Aggregator(AreaFusion(site.site.definitions(), nodes, epoch=epoch, registry=find_rule, cones=cones))
+    fusion = AreaFusion(
+        site.site.definitions(), nodes, epoch=epoch, registry=find_rule, cones=cones, robots=site.site.robots
+    )
+    return Aggregator(fusion)
 
 
 def make_map(site: LoadedSite, epoch: int) -> MapCore:

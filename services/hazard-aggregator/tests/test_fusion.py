@@ -2,14 +2,15 @@
 
 import itertools
 import math
+from collections.abc import Sequence
 
 import msgspec
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from fog_contracts.messages import AreaDefinition, AreaHazard, NodeReading, RobotPose, SonarStatus, UnknownPolicy
-from fog_contracts.site import NodeSite, Sonar
+from fog_contracts.messages import AreaDefinition, AreaHazard, NodeReading, Pose, RobotPose, SonarStatus, UnknownPolicy
+from fog_contracts.site import NodeSite, RobotSite, Sonar
 from hazard_aggregator.debounce import DebounceError, Observation, RuleFactory
 from hazard_aggregator.fusion import AreaFusion
 from hazard_aggregator.registry import find_rule
@@ -17,6 +18,7 @@ from hazard_aggregator.sensors.reading_order import FORGOTTEN_S, ReadingOrder
 
 SQUARE = [(0.0, 0.0), (2.0, 0.0), (2.0, 1.0), (0.0, 1.0)]
 LIMIT = 1.2
+START = Pose(x=0.0, y=0.0, theta=0.0)
 PERIOD = 0.1
 
 
@@ -47,7 +49,9 @@ def pose(x: float, y: float, *, height: float = 0.35, localized: bool = True) ->
 class Rig:
     """A fusion with a clock that moves one node period per reading."""
 
-    def __init__(self, *nodes: NodeSite, restored: list[AreaHazard] | None = None, **fields) -> None:
+    def __init__(
+        self, *nodes: NodeSite, restored: list[AreaHazard] | None = None, robots: Sequence[RobotSite] = (), **fields
+    ) -> None:
         self.core = AreaFusion(
             [area(*(n.id for n in nodes), **fields)],
             nodes,
@@ -55,6 +59,7 @@ class Rig:
             restored or [],
             registry=find_rule,
             default_rule="consecutive",
+            robots=robots,
         )
         self.now = 100.0
         self.seq = 0
@@ -457,7 +462,6 @@ def test_echo_of_a_robot_in_the_cone_does_not_clear_a_blocked_area():
     [
         (pose(1.0, 0.5), (0.45, 3.0)),  # a person in front of the robot
         (pose(1.0, 1.3), (0.83, 3.0)),  # the robot beside the cone
-        (pose(1.0, 0.5, height=0.2), (0.83, 3.0)),  # a robot lower than the node
         (pose(1.0, 0.5, localized=False), (0.83, 3.0)),  # a robot that is not localized
         (pose(-1.0, 0.5), (0.83, 3.0)),  # a robot behind the node
     ],
@@ -468,12 +472,112 @@ def test_echo_that_no_robot_explains_blocks(robot, ranges):
     assert rig.hazard.state == "blocked"
 
 
-def test_pose_older_than_a_second_explains_no_echo():
+def test_pose_older_than_three_seconds_explains_no_echo():
     rig = Rig(site("n1"))
     rig.core.on_pose("r1", pose(1.0, 0.5), rig.now)
-    rig.now += 1.01
+    rig.now += 3.01
     rig.read(0.83, 3.0, times=5)
     assert rig.hazard.state == "blocked"
+
+
+@pytest.mark.parametrize(
+    ("robot", "of_the_site"),
+    [
+        (pose(1.0, 0.5, height=0.35), RobotSite(id="r1", start=START, height=0.2)),  # lower than the node
+        (msgspec.structs.replace(pose(1.0, 0.5), radius=0.9), RobotSite(id="r1", start=START)),
+    ],
+)
+def test_echo_is_explained_by_a_robots_body_of_the_site_not_by_the_one_that_it_claims(robot, of_the_site):
+    rig = Rig(site("n1"), robots=[of_the_site])
+    rig.read(3.0, 3.0, times=5)
+    read_beside_robot(rig, robot, (robot.x - robot.radius, 3.0), times=5)
+    assert rig.hazard.state == "blocked"
+
+
+@pytest.mark.parametrize("heard", [1.0, 0.5])
+def test_robot_that_says_that_it_stands_where_an_echo_comes_from_keeps_an_area_clear_for_seconds_only(heard):
+    rig = Rig(site("n1"))
+    rig.read(3.0, 3.0, times=5)
+    clear = 0
+    for turn in range(250):
+        # Something stands there from now on that swallows a part of the echoes.
+        read_beside_robot(rig, pose(1.0, 0.5), (0.83, 3.0) if heard == 1.0 or turn % 2 == 0 else (3.0, 3.0), times=1)
+        clear += rig.hazard.state == "clear"
+    assert clear * PERIOD <= 10.0
+    assert rig.hazard.state == "unknown"
+    report = rig.core.node_reports(rig.now)[0]
+    assert report.state == "unknown"  # which is an alert after a while
+    assert report.reason == "robot r1 has stood before it for more than 7 s, by its pose: it sees nothing else"
+    read_beside_robot(rig, pose(-3.0, 0.5), (0.83, 3.0), times=5)
+    assert rig.hazard.state == "blocked"
+
+
+def drive_by(rig: Rig, delay: float, *, box: bool = False, since: float = -1.0) -> list[str]:
+    """Drive across the beam at 0.3 m/s; each pose takes `delay` (s) from y = `since` (m) on. Return the states."""
+    on_the_way: list[tuple[float, RobotPose]] = []
+    first = rig.now
+    for _ in range(100):
+        y = -1.0 + 0.3 * (rig.now - first)
+        moving = msgspec.structs.replace(pose(1.0, y), theta=math.pi / 2, v=0.3, clock=rig.now + 5000.0)
+        on_the_way.append((rig.now + (delay if y >= since else 0.0), moving))
+        while on_the_way and on_the_way[0][0] <= rig.now:
+            rig.core.on_pose("r1", on_the_way.pop(0)[1], rig.now)
+        seen = 0.83 if abs(y - 0.5) < 0.3 else 0.9 if box else 3.0
+        rig.read(seen, 3.0)
+        rig.wait(0.0)
+    return [hazard.state for hazard in rig.changes]
+
+
+@pytest.mark.parametrize("delay", [0.3, 0.5, 0.7, 1.0, 1.5, 2.0])
+@pytest.mark.parametrize("since", [-0.9, 0.0, 0.25, 0.5])
+def test_robot_whose_poses_come_late_does_not_block_the_corridor_that_it_passes(delay, since):
+    rig = Rig(site("n1"))
+    rig.read(3.0, 3.0, times=5)
+    with_and_without_explanation = ["clear", "clear", "clear"]
+    assert drive_by(rig, delay, since=since) == ["unknown", *with_and_without_explanation]
+
+
+def test_block_of_which_late_poses_explain_all_is_taken_back():
+    rig = Rig(site("n1"))
+    rig.read(3.0, 3.0, times=5)
+    before = msgspec.structs.replace(pose(1.0, -2.0), clock=rig.now + 5000.0)
+    rig.core.on_pose("r1", before, rig.now)
+    rig.wait(3.5)  # the network holds back what the robot says
+    began = rig.now
+    rig.read(0.83, 3.0, times=5)
+    assert (rig.hazard.state, rig.hazard.penalty) == ("blocked", 254)
+    rig.wait(0.1)
+    for moment in (began - 0.1, began + 0.2, began + 0.4, rig.now):
+        rig.core.on_pose("r1", msgspec.structs.replace(pose(1.0, 0.5), clock=moment + 5000.0), rig.now)
+    rig.wait(0.1)
+    assert (rig.hazard.state, rig.hazard.penalty) == ("unknown", 200)
+    assert rig.hazard.cause == "node n1: it saw the robot r1, whose pose came late"
+    rig.read(3.0, 3.0, times=5)
+    assert rig.hazard.state == "clear"
+
+
+def test_block_that_late_poses_explain_in_part_stays():
+    rig = Rig(site("n1"))
+    rig.read(3.0, 3.0, times=5)
+    rig.core.on_pose("r1", msgspec.structs.replace(pose(1.0, -2.0), clock=rig.now + 5000.0), rig.now)
+    rig.wait(3.5)
+    rig.read(0.4, 3.0)  # somebody before the robot, once
+    began = rig.now
+    rig.read(0.83, 3.0, times=5)
+    rig.wait(0.1)
+    for moment in (began - 0.2, began, rig.now):
+        rig.core.on_pose("r1", msgspec.structs.replace(pose(1.0, 0.5), clock=moment + 5000.0), rig.now)
+    rig.wait(0.5)
+    assert (rig.hazard.state, rig.hazard.penalty) == ("blocked", 254)
+
+
+@pytest.mark.parametrize("delay", [0.0, 0.7, 2.0])
+def test_box_in_a_corridor_stays_blocked_while_a_robot_passes_it(delay):
+    rig = Rig(site("n1"))
+    rig.read(0.9, 3.0, times=5)
+    rig.changes.clear()
+    assert "clear" not in drive_by(rig, delay, box=True)
+    assert (rig.hazard.state, rig.hazard.penalty) == ("blocked", 254)
 
 
 def test_unexplained_echo_of_one_sonar_blocks_although_a_robot_explains_the_other():

@@ -49,6 +49,7 @@ def robot_pose(localizer: Localizer, config: AgentConfig, at: Moment) -> RobotPo
         height=config.height,
         stamp=at.stamp,
         localized=localizer.status in {"good", "weak"},
+        clock=at.now,
     )
 
 

@@ -68,7 +68,7 @@ async def main() -> None:
         definitions = {d.id: d for d in [*loaded.site.definitions(), *usable]}
         fusion = AreaFusion(
             definitions.values(), loaded.site.nodes, 0, stored.hazards,
-            registry=find_rule, default_rule=settings.debounce, cones=cones,
+            registry=find_rule, default_rule=settings.debounce, cones=cones, robots=loaded.site.robots,
         )  # fmt: skip
         mqtt = MqttEdgeWithInputs(
             settings.mqtt_url, process_id("hazard-aggregator"), clock, site=site, inputs=SENSORS, will=LAST_WILL,

@@ -27,7 +27,7 @@ if TYPE_CHECKING:
 
     from fog_contracts.geometry import Point
     from fog_contracts.messages import AreaDefinition, AreaHazard, AreaState, NodeReading, NodeValue, RobotPose
-    from fog_contracts.site import NodeSite
+    from fog_contracts.site import NodeSite, RobotSite
     from hazard_aggregator.areas.area_override import AreaOverride
     from hazard_aggregator.areas.node_report import NodeReport
     from hazard_aggregator.debounce import Registry
@@ -48,7 +48,7 @@ class AreaFusion:
     `restored` are the hazards that were stored last: a blocked area stays blocked until readings or silence change it.
     All others start as unknown, because only readings of this run can show that an area is clear. `registry` finds
     debounce rules by name, `default_rule` is the one of areas that name none, `cones` are the outlines of what nodes
-    see (`Members`); raises `AreaError` for an invalid area.
+    see (`Members`), `robots` have the bodies that echoes may come from; raises `AreaError` for an invalid area.
     """
 
     def __init__(  # noqa: PLR0913  # what is known at the start
@@ -61,6 +61,7 @@ class AreaFusion:
         registry: Registry,
         default_rule: str = DEFAULT_RULE,
         cones: Mapping[str, list[Point]] | None = None,
+        robots: Iterable[RobotSite] = (),
     ) -> None:
         self.epoch = epoch
         self.nodes = {node.id: node for node in nodes}
@@ -69,7 +70,7 @@ class AreaFusion:
         self._areas: dict[str, WatchedArea] = {}
         self._overrides: dict[str, AreaOverride] = {}
         self._tombstones: dict[str, AreaDefinition] = {}
-        self._poses = RobotPoses()
+        self._poses = RobotPoses(robots)
         self._seqs: dict[str, int] = {}
         self._by_node: dict[str, list[tuple[WatchedArea, NodeState]]] = {}
         self._orders: dict[str, ReadingOrder] = {}
@@ -128,13 +129,13 @@ class AreaFusion:
             return []
         if not taken.counts:
             self._reject(node_id, "too_soon")
-        classification = _classified(self.nodes.get(node_id), reading, self._poses, now)
+        classification = _classified(self.nodes.get(node_id), reading, self._poses, taken.at)
         if classification.state == "unknown":
             self._reject(node_id, "implausible")
         changed: list[AreaHazard] = []
         for area, node in watched:
             before = node.outcome
-            node.apply(classification, taken.at, stamp, counts=taken.counts)
+            node.apply(classification, taken.at, stamp, counts=taken.counts, reading=reading)
             if node.outcome != before:  # an area may have a hundred nodes, and nearly no reading changes anything
                 changed += self._evaluate(area, stamp)
         return changed
@@ -185,7 +186,7 @@ class AreaFusion:
         return changed
 
     def on_pose(self, robot: str, pose: RobotPose, now: float) -> list[AreaHazard]:
-        """Record a robot's pose, which may explain later readings."""
+        """Record a robot's pose, which may explain later readings, and earlier ones if it comes late."""
         self._poses.add(robot, pose, now)
         return []
 
@@ -201,6 +202,7 @@ class AreaFusion:
             return []
         changed: list[AreaHazard] = []
         for area in self._areas.values():
+            self._take_back(area)
             for name, node in list(area.nodes.items()):
                 if _is_undefined(area, name) and node.silent_for(now) > THESIS_EXPIRY_S:
                     del area.nodes[name]
@@ -273,6 +275,19 @@ class AreaFusion:
                     self._by_node.setdefault(node.id, []).append((area, node))
         self._sources = Sources(self._areas.values())
 
+    def _take_back(self, area: WatchedArea) -> None:
+        """Take back what blocked an area if poses that came late show that it was a robot, all of it."""
+        for node in area.nodes.values():
+            if node.state != "blocked" or node.site is None:
+                continue
+            robots = [
+                classify_reading(node.site, reading, self._poses.at(taken_at, settled=True)).explained_by
+                for taken_at, reading in node.unexplained
+            ]
+            if robots and None not in robots:
+                node.invalidate(f"it saw the robot {robots[-1]}, whose pose came late")
+                area.take_back()
+
     def _after(self, applied: Iterable[Applied], stamp: float) -> list[AreaHazard]:
         """Return the hazards that change with what sources said."""
         changed: list[AreaHazard] = []
@@ -301,7 +316,7 @@ def _is_undefined(area: WatchedArea, node: str) -> bool:
     return node == THESIS_NODE.format(number=area.definition.number) and node not in area.definition.nodes
 
 
-def _classified(site: NodeSite | None, reading: NodeReading, poses: RobotPoses, now: float) -> Classification:
+def _classified(site: NodeSite | None, reading: NodeReading, poses: RobotPoses, taken_at: float) -> Classification:
     if site is None:
         return Classification(reading.state, f"the node reports {reading.state} (the site does not define it)")
-    return classify_reading(site, reading, poses.fresh(now))
+    return classify_reading(site, reading, poses.at(taken_at))

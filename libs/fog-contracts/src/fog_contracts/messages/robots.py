@@ -25,7 +25,10 @@ from fog_contracts.messages.basics import (
 
 
 class RobotPose(Message, frozen=True, kw_only=True):
-    """A robot's estimated pose and twist; `covariance` is row-major 3 x 3 over (x, y, theta)."""
+    """A robot's estimated pose and twist; `covariance` is row-major 3 x 3 over (x, y, theta).
+
+    `clock` is the agent's own monotonic clock, which tells how late a pose is; 0: it does not say.
+    """
 
     x: Metres
     y: Metres
@@ -37,6 +40,7 @@ class RobotPose(Message, frozen=True, kw_only=True):
     height: Annotated[float, Meta(gt=0.0, le=3.0, extra={"unit": "m"})]
     stamp: Stamp
     localized: bool = True
+    clock: Seconds = 0.0
 
 
 Mode = Literal["INIT", "NORMAL", "DEGRADED", "HOLD", "PROTECTIVE_STOP", "FAULT", "EGRESS", "DOCK"]

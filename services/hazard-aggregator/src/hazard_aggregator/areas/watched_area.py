@@ -42,6 +42,8 @@ class WatchedArea:
         self.nodes = nodes
         self.hazard: AreaHazard | None = None
         self._last_known_blocked = False  # then unknown costs as much as blocked
+        self._known_before = False  # the same, before the area became blocked
+        self._measured: AreaState = "unknown"
         self._confirmed = False  # whether readings of this run have confirmed a state
         self._restored: AreaHazard | None = None
         self._states: set[AreaState] = set()  # all that it had in this run
@@ -69,6 +71,10 @@ class WatchedArea:
             self._restored = hazard
         if not self._confirmed and is_impassable(hazard):
             self._last_known_blocked = True
+
+    def take_back(self) -> None:
+        """Handle that what blocked the area was none: an unknown area is impassable only if it was so before."""
+        self._last_known_blocked = self._known_before
 
     def set_epoch(self, epoch: int) -> None:
         """Give the current hazard another epoch."""
@@ -116,6 +122,9 @@ class WatchedArea:
         """Return the state of the nodes, and remember whether the area was blocked when it was last known."""
         state, deciding = self._fuse()
         caution = self._caution() if state == "clear" else None
+        if state == "blocked" and self._measured != "blocked":
+            self._known_before = self._last_known_blocked
+        self._measured = state
         if state != "unknown":
             self._last_known_blocked = state == "blocked"
             self._confirmed = self._confirmed or (deciding is not None and deciding.ever_received)

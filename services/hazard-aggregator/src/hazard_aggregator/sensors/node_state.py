@@ -10,12 +10,17 @@ from fog_contracts.messages import UnknownPolicy
 from hazard_aggregator.sensors.flapping import FlapDetector
 
 if TYPE_CHECKING:
-    from fog_contracts.messages import AreaState, Source
+    from fog_contracts.messages import AreaState, NodeReading, Source
     from fog_contracts.site import NodeSite
     from hazard_aggregator.debounce import Rule
     from hazard_aggregator.sensors.plausibility import Classification
     from hazard_aggregator.sensors.source_reader import SourceReader
 
+EXPLAINED_S: Final = 7.0
+"""Robots may explain a node's echoes for so long (s), which crossing its cone takes; then nothing is known any more."""
+_EXPLAINED_PAUSE_S: Final = 3.0
+"""After so long without an explained echo the robot is gone, and the time begins anew."""
+_UNEXPLAINED_MAX: Final = 300
 _PERIODS: Final = 3
 """A source is silent after so many of its periods."""
 
@@ -35,6 +40,10 @@ class NodeState:
     ever_received: bool = False
     unconfirmed: bool = True  # no state was confirmed since the last invalidation
     explained_by: str | None = None
+    explained_since: float = -math.inf
+    explained_at: float = -math.inf
+    unexplained: list[tuple[float, NodeReading]] = field(default_factory=list)
+    """The readings with echoes that no robot explained, since one confirmed that the area is clear."""
     run_state: AreaState | None = None
     run_began: float = 0.0
     received: int = 0
@@ -70,6 +79,7 @@ class NodeState:
         self.unconfirmed = True
         self.explained_by = None
         self.run_state = None
+        self.unexplained.clear()
         self.rule.reset()
 
     def flap(self) -> None:
@@ -101,19 +111,27 @@ class NodeState:
         self.ever_received = True
         self.online = True
 
-    def apply(self, classification: Classification, taken_at: float, stamp: float, *, counts: bool = True) -> None:
+    def apply(
+        self,
+        classification: Classification,
+        taken_at: float,
+        stamp: float,
+        *,
+        counts: bool = True,
+        reading: NodeReading | None = None,
+    ) -> None:
         """Apply one classified reading, taken at `taken_at` (s, the receiver's clock).
 
         One that does not count is a sign of life, but no measurement of its own.
         """
         self.receive(taken_at)
         if classification.explained_by is not None:
-            # Counts neither way: the debounce rule does not see it, and the timer that detects flapping restarts.
-            self.explained_by = classification.explained_by
-            self.last_confirmed = taken_at
+            self._apply_explained(classification.explained_by, taken_at)
             return
-        if not counts:
+        if not counts or (classification.state == "clear" and self._explained_too_long(taken_at)):
             return
+        if classification.state == "blocked" and reading is not None and len(self.unexplained) < _UNEXPLAINED_MAX:
+            self.unexplained.append((taken_at, reading))
         if classification.state != self.run_state and not (classification.state == "unknown" and self.run_state):
             self.run_state = classification.state
             self.run_began = stamp
@@ -124,12 +142,34 @@ class NodeState:
         self.explained_by = None
         if confirmed == "unknown":
             self.run_state = None
-        elif self.flaps.update(confirmed, taken_at):
+        elif confirmed == "clear":
+            self.unexplained.clear()
+        if confirmed != "unknown" and self.flaps.update(confirmed, taken_at):
             self.flap()
             return
         if confirmed != self.state or self.unconfirmed:
             # Later readings of the same state leave the reason: the hazard would change with every centimetre.
             self.state, self.reason, self.unconfirmed = confirmed, classification.reason, False
+
+    def _apply_explained(self, robot: str, taken_at: float) -> None:
+        """Apply a reading whose echoes are a robot's.
+
+        It counts neither way: the debounce rule does not see it, and the timer that detects flapping restarts. But
+        what stands behind or beside the robot is not seen either, and the robot may be wrong about its place.
+        """
+        if taken_at - self.explained_at > _EXPLAINED_PAUSE_S:
+            self.explained_since = taken_at
+        self.explained_at = taken_at
+        if not self._explained_too_long(taken_at):
+            self.explained_by = robot
+            self.last_confirmed = taken_at
+            return
+        reason = f"robot {robot} has stood before it for more than {EXPLAINED_S:g} s, by its pose: it sees nothing else"
+        if self.reason != reason or self.state != "unknown":
+            self.invalidate(reason)
+
+    def _explained_too_long(self, taken_at: float) -> bool:
+        return taken_at - self.explained_at <= _EXPLAINED_PAUSE_S and taken_at - self.explained_since > EXPLAINED_S
 
 
 @dataclass

@@ -1,6 +1,6 @@
 """Classifies one reading of a node: compares its sonars with their calibration, and echoes with robots in the cone.
 
-Pure: the caller passes the fresh poses of robots.
+Pure: the caller passes where the robots were.
 """
 
 from __future__ import annotations
@@ -17,6 +17,7 @@ if TYPE_CHECKING:
 
     from fog_contracts.messages import AreaState, NodeReading, RobotPose
     from fog_contracts.site import NodeSite, Sonar
+    from hazard_aggregator.sensors.robot_poses import Whereabouts
 
 EXPLAIN_TOLERANCE: Final = 0.3
 """How far (m) a measured range may differ from the expected range of a robot's rim to be explained by that robot."""
@@ -71,12 +72,12 @@ def _classify_no_echo(sonar: Sonar, measured: float | None) -> tuple[AreaState, 
     return "unknown", "no echo where the opposite wall should echo"
 
 
-def expected_range(site: NodeSite, sonar: Sonar, pose: RobotPose) -> float | None:
+def expected_range(site: NodeSite, sonar: Sonar, pose: RobotPose, away: float = 0.0) -> float | None:
     """Return the range (m) at which this sonar should measure the robot's rim, or None when it is outside the cone.
 
     The footprint is a circle; it is in the cone when any part of it may be within half the beam's width of the axis,
-    given the uncertainty of its pose across the beam: along a bare corridor that can be decimetres. A robot that is
-    lower than the node's mounting height is not seen.
+    given the uncertainty of its pose across the beam: along a bare corridor that can be decimetres; and given how far
+    `away` (m) from it the robot may be. A robot that is lower than the node's mounting height is not seen.
     """
     if site.height >= pose.height:
         return None
@@ -85,7 +86,7 @@ def expected_range(site: NodeSite, sonar: Sonar, pose: RobotPose) -> float | Non
     if distance <= pose.radius:
         return 0.0
     off_axis = abs(math.remainder(math.atan2(dy, dx) - site.theta - sonar.angle, math.tau))
-    reach = pose.radius + _pose_margin(pose, -dy / distance, dx / distance)
+    reach = pose.radius + away + _pose_margin(pose, -dy / distance, dx / distance)
     if off_axis - math.asin(min(1.0, reach / distance)) > SONAR_HALF_CONE:
         return None
     return distance - pose.radius
@@ -98,18 +99,16 @@ def _pose_margin(pose: RobotPose, nx: float, ny: float) -> float:
     return min(MAX_POSE_MARGIN, POSE_SIGMAS * math.sqrt(max(0.0, variance)))
 
 
-def explaining_robot(
-    site: NodeSite, sonar: Sonar, measured: float, poses: Iterable[tuple[str, RobotPose]]
-) -> str | None:
-    """Return the robot in the sonar's cone whose rim is within 0.3 m of the measured range, or None."""
-    for robot, pose in poses:
-        expected = expected_range(site, sonar, pose)
-        if expected is not None and abs(expected - measured) <= EXPLAIN_TOLERANCE:
+def explaining_robot(site: NodeSite, sonar: Sonar, measured: float, robots: Iterable[Whereabouts]) -> str | None:
+    """Return the robot in the sonar's cone whose rim may be within 0.3 m of the measured range, or None."""
+    for robot, pose, away in robots:
+        expected = expected_range(site, sonar, pose, away)
+        if expected is not None and abs(expected - measured) <= EXPLAIN_TOLERANCE + away:
             return robot
     return None
 
 
-def classify_reading(site: NodeSite, reading: NodeReading, poses: Iterable[tuple[str, RobotPose]]) -> Classification:
+def classify_reading(site: NodeSite, reading: NodeReading, robots: Iterable[Whereabouts]) -> Classification:
     """Return what a reading shows about the area.
 
     The sonars are fused as the node does it: blocked if one is, clear if all are, unknown otherwise. A reading whose
@@ -128,17 +127,17 @@ def classify_reading(site: NodeSite, reading: NodeReading, poses: Iterable[tuple
         else:
             return _contradiction(reading, classified, fused)
     if fused == "blocked":
-        return _classify_blocked(site, reading, classified, list(poses))
+        return _classify_blocked(site, reading, classified, list(robots))
     index = next(i for i, (state, _) in enumerate(classified) if state == fused)
     return Classification(fused, f"sonar {index}: {classified[index][1]}", sonars=_samples(site, reading, classified))
 
 
 def _classify_blocked(
-    site: NodeSite, reading: NodeReading, classified: list[tuple[AreaState, str]], poses: list[tuple[str, RobotPose]]
+    site: NodeSite, reading: NodeReading, classified: list[tuple[AreaState, str]], known: list[Whereabouts]
 ) -> Classification:
     """Return what a reading with blocking echoes shows: it is explained if robots explain all of them."""
     blocking = [i for i, (state, _) in enumerate(classified) if state == "blocked"]
-    robots = {i: explaining_robot(site, site.sonars[i], reading.range_m[i] or 0.0, poses) for i in blocking}
+    robots = {i: explaining_robot(site, site.sonars[i], reading.range_m[i] or 0.0, known) for i in blocking}
     explained = {i for i, robot in robots.items() if robot is not None}
     samples = _samples(site, reading, classified, explained)
     for index in blocking:

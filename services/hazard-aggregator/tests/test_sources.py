@@ -31,6 +31,8 @@ ABOVE_40 = Limits(above=40.0, hysteresis=2.0, minimum=-40.0, maximum=120.0)
 
 
 def text(value: object) -> bytes:
+    if isinstance(value, bytes):
+        return value
     return value.encode() if isinstance(value, str) else json.dumps(value).encode()
 
 
@@ -66,7 +68,9 @@ class Rig:
         return self.fusion.hazards()[0]
 
 
-# Device, topic and payloads that mean blocked and clear, as the projects' documentation describes them.
+# Device, topic and payloads that mean blocked and clear, as the projects' sources write them: Zigbee2MQTT 2.12
+# (lib/controller.ts), ESPHome 2024.11 (mqtt_binary_sensor.cpp, mqtt_sensor.cpp), Tasmota 14 (xsns_22_sr04.ino), Home
+# Assistant 2026 (mqtt_statestream); of Shelly's devices, as the documentation does.
 DOCUMENTED = {
     "zigbee2mqtt-occupancy": (
         "hall_motion",
@@ -90,8 +94,8 @@ DOCUMENTED = {
     "tasmota-distance": (
         "corridor",
         "tele/corridor/SENSOR",
-        {"Time": "2026-11-21T10:00:00", "SR04": {"Distance": 62.4}},
-        {"Time": "2026-11-21T10:00:10", "SR04": {"Distance": 231.0}},
+        {"Time": "2026-11-21T10:00:00", "SR04-1": {"Distance": 62.4}},
+        {"Time": "2026-11-21T10:00:10", "SR04-1": {"Distance": 231.0}},
     ),
     "shelly-door-gen1": ("shellydw2-A1B2C3", "shellies/shellydw2-A1B2C3/sensor/state", "close", "open"),
     "shelly-door-gen2": (
@@ -100,51 +104,213 @@ DOCUMENTED = {
         {"id": 0, "state": True},
         {"id": 0, "state": False},
     ),
-    "home-assistant": ("ha/binary_sensor/lift_door", "ha/binary_sensor/lift_door/state", "on", "off"),
+    "home-assistant": (
+        "homeassistant/binary_sensor/lift_door", "homeassistant/binary_sensor/lift_door/state", "on", "off",
+    ),
+}  # fmt: skip
+# What says that a sensor is connected, and that it is not.
+STATE = ({"state": "online"}, {"state": "offline"})
+AVAILABILITY = {
+    "zigbee2mqtt-occupancy": {"zigbee2mqtt/bridge/state": STATE, "zigbee2mqtt/hall_motion/availability": STATE},
+    "zigbee2mqtt-contact": {"zigbee2mqtt/bridge/state": STATE, "zigbee2mqtt/fire door/availability": STATE},
+    "esphome-distance": {},
+    "esphome-binary": {"gate/status": ("online", "offline")},
+    "tasmota-distance": {"tele/corridor/LWT": ("Online", "Offline")},
+    "shelly-door-gen1": {},
+    "shelly-door-gen2": {"shellyplusi4-a0a3b3c4d5e6/online": ("true", "false")},
+    "home-assistant": {"homeassistant/status": ("online", "offline")},
 }
 LIMITS = {"esphome-distance": Limits(below=1.2, hysteresis=0.1), "tasmota-distance": Limits(below=120.0)}
+EACH_AVAILABILITY = [(profile, topic) for profile, topics in AVAILABILITY.items() for topic in topics]
+
+
+def of_profile(profile: str) -> tuple[Rig, str, object, object]:
+    """Return a rig with a source of a profile, its topic, and what means blocked and clear."""
+    device, topic, blocked, clear = DOCUMENTED[profile]
+    rig = Rig(Source(id="s1", profile=profile, device=device, number=LIMITS.get(profile)))
+    return rig, topic, blocked, clear
+
+
+def connected(profile: str) -> tuple[Rig, str, object, object]:
+    """Return the same with a sensor that is connected, as the broker retains it."""
+    found = of_profile(profile)
+    for availability, (online, _) in AVAILABILITY[profile].items():
+        found[0].send(availability, online, retained=True)
+    return found
 
 
 def test_every_profile_is_tested_on_documented_payloads():
-    assert DOCUMENTED.keys() == PROFILES.keys()
+    assert DOCUMENTED.keys() == AVAILABILITY.keys() == PROFILES.keys()
 
 
 @pytest.mark.parametrize("profile", DOCUMENTED)
 def test_profile_understands_the_documented_payloads(profile):
-    device, topic, blocked, clear = DOCUMENTED[profile]
-    rig = Rig(Source(id="s1", profile=profile, device=device, number=LIMITS.get(profile)))
-    assert topic in rig.fusion.source_topics()
+    rig, topic, blocked, clear = connected(profile)
+    assert rig.fusion.source_topics() == {topic, *AVAILABILITY[profile]}
     assert rig.hazard.state == "unknown"
     assert rig.send(topic, blocked) == "blocked"
     assert rig.send(topic, clear) == "clear"
     assert rig.hazard.nodes == {"s1": "clear"}
 
 
-@pytest.mark.parametrize(
-    ("profile", "availability", "offline", "online"),
-    [
-        ("zigbee2mqtt-occupancy", "zigbee2mqtt/hall_motion/availability", {"state": "offline"}, {"state": "online"}),
-        ("esphome-binary", "gate/status", "offline", "online"),
-        ("tasmota-distance", "tele/corridor/LWT", "Offline", "Online"),
-        ("shelly-door-gen2", "shellyplusi4-a0a3b3c4d5e6/online", "false", "true"),
-        ("home-assistant", "homeassistant/status", "offline", "online"),
-    ],
-)
-def test_disconnected_sensor_is_unknown_until_its_next_message(profile, availability, offline, online):
-    device, topic, _, clear = DOCUMENTED[profile]
-    rig = Rig(Source(id="s1", profile=profile, device=device, number=LIMITS.get(profile)))
-    rig.send(topic, clear)
-    assert rig.send(availability, offline) == "unknown"
-    assert "offline" in rig.hazard.cause
-    assert rig.send(availability, online) == "unknown"
+def is_periodic(profile: str) -> bool:
+    return PROFILES[profile].period_s is not None
+
+
+@pytest.mark.parametrize(("profile", "silent"), EACH_AVAILABILITY)
+def test_nothing_is_clear_while_anything_that_should_has_not_said_that_the_sensor_is_connected(profile, silent):
+    rig, topic, blocked, clear = of_profile(profile)
+    for availability, (online, _) in AVAILABILITY[profile].items():
+        if availability != silent:
+            rig.send(availability, online, retained=True)
+    assert rig.send(topic, clear) == "unknown"
+    assert f"source s1: it reports clear, but {silent} must say first that it is connected" in rig.hazard.cause
+    assert rig.send(topic, blocked) == "blocked"
+    assert rig.send(topic, clear) == "unknown"
+    assert rig.hazard.penalty == 254
+    connected_now = rig.send(silent, AVAILABILITY[profile][silent][0], retained=True)
+    assert connected_now == ("unknown" if is_periodic(profile) else "clear")
     assert rig.send(topic, clear) == "clear"
+
+
+@pytest.mark.parametrize("after", ["gone", b"", "sleeping", {"status": "online"}, TOO_LONG])
+@pytest.mark.parametrize(("profile", "availability"), EACH_AVAILABILITY)
+def test_disconnected_sensor_is_unknown_until_it_is_connected_and_has_said_something(profile, availability, after):
+    rig, topic, _, clear = connected(profile)
+    assert rig.send(topic, clear) == "clear"
+    online, offline = AVAILABILITY[profile][availability]
+    assert rig.send(availability, offline if after == "gone" else after) == "unknown"
+    reason = "offline" if after == "gone" else f"{availability} says neither online nor offline"
+    assert reason in rig.hazard.cause
+    assert rig.send(topic, clear, retained=True) == "unknown"
+    assert rig.send(availability, online, retained=True) == "unknown"
+    assert rig.send(topic, clear) == "clear"
+
+
+@pytest.mark.parametrize("profile", ["esphome-binary", "home-assistant", "shelly-door-gen2"])
+def test_value_that_comes_shortly_before_the_word_that_its_sensor_is_connected_waits_for_it(profile):
+    """Home Assistant publishes states while it starts, and that it runs once it has started."""
+    rig, topic, _, clear = of_profile(profile)
+    ((availability, (online, offline)),) = AVAILABILITY[profile].items()
+    rig.send(availability, offline)
+    assert rig.send(topic, clear) == "unknown"
+    assert rig.send(availability, online) == "clear"
+
+
+@pytest.mark.parametrize("told", ["before", "while"])
+def test_value_from_before_an_outage_clears_nothing_afterwards(told):
+    rig = Rig(Source(id="s1", profile="esphome-binary", device="gate/binary_sensor/beam"))
+    if told == "before":
+        rig.send("gate/binary_sensor/beam/state", "OFF", retained=True)
+    rig.send("gate/status", "offline", retained=True)
+    if told == "while":
+        rig.send("gate/binary_sensor/beam/state", "OFF", retained=True)
+    assert rig.send("gate/status", "online") == "unknown"
+    assert rig.send("gate/binary_sensor/beam/state", "OFF") == "clear"
+
+
+OCCUPANCY = "zigbee2mqtt-occupancy"
+HALL = "zigbee2mqtt/hall_motion"
+
+
+@pytest.mark.parametrize("asleep", [False, True], ids=["device seen lately", "device gone"])
+def test_zigbee2mqtt_that_starts_again_clears_nothing_by_what_it_knew_before(asleep):
+    """Controller.start of Zigbee2MQTT 2.12: bridge/state, then each availability, then each state from its cache."""
+    rig, topic, blocked, clear = connected(OCCUPANCY)
+    assert rig.send(topic, clear) == "clear"
+    assert rig.send("zigbee2mqtt/bridge/state", {"state": "offline"}) == "unknown"
+    rig.send("zigbee2mqtt/bridge/state", {"state": "online"})
+    rig.send(f"{HALL}/availability", {"state": "offline" if asleep else "online"})
+    assert rig.send(topic, clear) == "unknown"
+    if asleep:
+        assert f"{HALL}/availability must say first" in rig.hazard.cause
+        assert rig.send(f"{HALL}/availability", {"state": "online"}) == "unknown"
+    else:
+        assert "may repeat what it knew before" in rig.hazard.cause
+    assert rig.send(topic, clear) == "clear"
+    assert rig.send(topic, blocked) == "blocked"
+
+
+def test_zigbee2mqtt_that_starts_again_blocks_by_what_it_knew_before():
+    rig, topic, blocked, clear = connected(OCCUPANCY)
+    rig.send("zigbee2mqtt/bridge/state", {"state": "offline"})
+    rig.send("zigbee2mqtt/bridge/state", {"state": "online"})
+    assert rig.send(topic, blocked) == "blocked"
+    assert rig.send(topic, clear) == "clear"
+
+
+def test_renamed_zigbee_device_is_unknown():
+    """Bridge.renameEntity and Availability of Zigbee2MQTT 2.12 empty what is retained under the old name."""
+    rig, topic, _, clear = connected(OCCUPANCY)
+    assert rig.send(topic, clear) == "clear"
+    assert rig.send(topic, b"", retained=False) == "unknown"
+    rig.send(f"{HALL}/availability", b"")
+    assert rig.wait(60.0) == "unknown"
+
+
+def test_availability_is_understood_as_text_where_json_is_expected():
+    """Zigbee2MQTT 1 could be set to send text, and the state of its bridge was one."""
+    rig = of_profile(OCCUPANCY)[0]
+    rig.send("zigbee2mqtt/bridge/state", "online", retained=True)
+    rig.send(f"{HALL}/availability", "online", retained=True)
+    assert rig.send(HALL, {"occupancy": False}) == "clear"
+    assert rig.send(f"{HALL}/availability", "offline") == "unknown"
+
+
+def test_message_of_a_sensor_is_no_word_that_it_is_connected():
+    rig, topic, _, clear = of_profile(OCCUPANCY)
+    rig.send(topic, clear)
+    (report,) = rig.fusion.node_reports(rig.now)
+    assert report.online is None
+    rig.send(f"{HALL}/availability", {"state": "offline"})
+    rig.send(topic, clear)
+    (report,) = rig.fusion.node_reports(rig.now)
+    assert report.online is False
+
+
+# --- Distance sensors without an echo: Sr04Show of Tasmota leaves out the key, and sensors of ESPHome publish `nan`, or
+# `None` with `publish_nan_as_none`.
+NO_ECHO = {
+    "tasmota-distance": [{"Time": "2026-11-21T10:00:10"}],
+    "esphome-distance": ["nan", "None"],
+}
+
+
+@pytest.mark.parametrize("key", ["SR04", "SR04-1", "SR04_1"])
+def test_distance_is_found_under_each_name_that_tasmota_gives_to_its_sensor(key):
+    rig, topic, _, _ = connected("tasmota-distance")
+    assert rig.send(topic, {"Time": "2026-11-21T10:00:00", key: {"Distance": 62.4}}) == "blocked"
+    assert rig.send(topic, {"Time": "2026-11-21T10:00:10", key: {"Distance": 231.0}}) == "clear"
+
+
+@pytest.mark.parametrize(("profile", "nothing"), [(name, each) for name, them in NO_ECHO.items() for each in them])
+@pytest.mark.parametrize("meaning", ["unknown", "clear", "blocked"])
+def test_message_without_an_echo_means_what_the_source_says(profile, nothing, meaning):
+    device, topic, blocked, _ = DOCUMENTED[profile]
+    rig = Rig(Source(id="s1", profile=profile, device=device, number=LIMITS[profile], no_value=meaning))
+    for availability, (online, _) in AVAILABILITY[profile].items():
+        rig.send(availability, online, retained=True)
+    assert rig.send(topic, nothing) == ("blocked" if meaning == "blocked" else "unknown")
+    assert rig.send(topic, blocked) == "blocked"
+    assert rig.send(topic, nothing) == meaning
+    assert "it measures nothing: " in rig.hazard.cause or meaning == "clear"
+    rig.wait(200.0)
+    assert rig.hazard.state == "unknown"
+    assert rig.send(topic, nothing) == ("blocked" if meaning == "blocked" else "unknown"), "it may be gone since then"
+
+
+def test_text_that_is_no_number_is_no_missing_echo():
+    rig = Rig(Source(id="s1", topic="t", number=ABOVE_40, period_s=10.0, no_value="clear"))
+    assert rig.send("t", "20") == "clear"
+    assert rig.send("t", "n/a") == "unknown"
+    assert rig.send("t", "") == "unknown"
 
 
 @pytest.mark.parametrize("state", ["unavailable", "unknown", ""])
 def test_state_that_means_nothing_is_unknown_with_what_it_said(state):
-    rig = Rig(Source(id="s1", profile="home-assistant", device="ha/binary_sensor/d"))
-    rig.send("ha/binary_sensor/d/state", "off")
-    assert rig.send("ha/binary_sensor/d/state", state) == "unknown"
+    rig, topic, _, clear = connected("home-assistant")
+    assert rig.send(topic, clear) == "clear"
+    assert rig.send(topic, state) == "unknown"
     assert f"{state!r} means neither blocked nor clear" in rig.hazard.cause
 
 
@@ -160,12 +326,12 @@ def test_state_that_means_nothing_is_unknown_with_what_it_said(state):
     ],
 )
 def test_changed_format_is_unknown_with_the_reason_and_back_with_the_old_format(payload, reason):
-    rig = Rig(Source(id="s1", profile="zigbee2mqtt-occupancy", device="m"))
-    rig.send("zigbee2mqtt/m", {"occupancy": False})
-    assert rig.send("zigbee2mqtt/m", payload) == "unknown"
+    rig, topic, _, clear = connected(OCCUPANCY)
+    assert rig.send(topic, clear) == "clear"
+    assert rig.send(topic, payload) == "unknown"
     assert reason in rig.hazard.cause
     assert rig.fusion.pop_rejections() == [("s1", "implausible")]
-    assert rig.send("zigbee2mqtt/m", {"occupancy": False}) == "clear"
+    assert rig.send(topic, clear) == "clear"
 
 
 @pytest.mark.parametrize("retained", [False, True])
@@ -175,7 +341,6 @@ def test_message_that_is_too_long_makes_its_source_unknown_at_once(retained):
     assert rig.send("d/status/input:0", {"state": False}) == "clear"
     assert rig.send("d/status/input:0", TOO_LONG, retained=retained) == "unknown"
     assert "its message is too long" in rig.hazard.cause
-    rig.send("d/online", TOO_LONG)
     assert rig.send("d/status/input:0", {"state": False}) == "clear"
 
 

@@ -49,9 +49,10 @@ async def start_with_gate(fog) -> str:
 async def test_sources_of_the_site_and_over_rest_decide_their_areas_and_survive_a_kill(fog, tokens):
     url = await start_with_gate(fog)
     async with httpx.AsyncClient(base_url=url, timeout=60) as client, broker(fog) as mqtt:
+        await mqtt.publish("gate/status", "online", retain=True)
         await mqtt.publish("gate/binary_sensor/beam/state", "OFF")
         await wait_for(client, "hall", lambda hazard: hazard["state"] == "clear")
-        await mqtt.publish("gate/status", "offline")
+        await mqtt.publish("gate/status", "offline", retain=True)
         offline = await wait_for(client, "hall", lambda hazard: hazard["state"] == "unknown")
         assert offline["cause"] == "source gate: it went offline"
         body = {"polygon": POLYGON, "sources": [DOOR]}
@@ -68,6 +69,12 @@ async def test_sources_of_the_site_and_over_rest_decide_their_areas_and_survive_
     async with httpx.AsyncClient(base_url=url, timeout=60) as client, broker(fog) as mqtt:
         kept = await wait_for(client, "yard", lambda hazard: hazard["penalty"] == 254)
         assert kept["state"] == "blocked"
+        await mqtt.publish("zigbee2mqtt/fire_door", '{"contact": false}')
+        doubted = await wait_for(client, "yard", lambda hazard: "must say first" in hazard["cause"])
+        assert doubted["state"] == "unknown"
+        for topic in ("zigbee2mqtt/bridge/state", "zigbee2mqtt/fire_door/availability"):
+            await mqtt.publish(topic, '{"state":"online"}', retain=True, qos=1)
+        await mqtt.publish("zigbee2mqtt/fire_door", '{"contact": false}')  # the first one may be from before
         await mqtt.publish("zigbee2mqtt/fire_door", '{"contact": false}')
         await wait_for(client, "yard", lambda hazard: hazard["state"] == "clear")
 

@@ -2,20 +2,19 @@
 
 from __future__ import annotations
 
-import math
 from itertools import chain
 from typing import TYPE_CHECKING, Final, NamedTuple
 
 from hazard_aggregator.sensors.node_state import SourceState
+from hazard_aggregator.sensors.plausibility import Classification
 from hazard_aggregator.sensors.source_reader import is_online
 
 if TYPE_CHECKING:
     from collections.abc import Iterable
     from collections.abc import Set as AbstractSet
 
-    from fog_contracts.messages import NodeValue
+    from fog_contracts.messages import Availability, NodeValue
     from hazard_aggregator.areas.watched_area import WatchedArea
-    from hazard_aggregator.sensors.plausibility import Classification
 
 _WRAP: Final = 2**32
 
@@ -29,11 +28,11 @@ class Applied(NamedTuple):
 
 
 class _Listener(NamedTuple):
-    """A source that a message concerns; `availability`: the message says whether its sensor is connected."""
+    """A source that a message concerns; with an `availability` it says whether the source's sensor is connected."""
 
     area: WatchedArea
     source: SourceState
-    availability: bool
+    availability: Availability | None = None
 
 
 class Sources:
@@ -49,9 +48,9 @@ class Sources:
                     self._members.append(member)
                     if (quantity := member.source.quantity) is not None:
                         self._quantities.setdefault(quantity.node, []).append((area, member))
-                    self._add(member.source.topic, _Listener(area, member, availability=False))
-                    if member.source.availability is not None:
-                        self._add(member.source.availability.topic, _Listener(area, member, availability=True))
+                    self._add(member.source.topic, _Listener(area, member))
+                    for availability in member.source.availabilities:
+                        self._add(availability.topic, _Listener(area, member, availability))
 
     @property
     def topics(self) -> AbstractSet[str]:
@@ -62,12 +61,12 @@ class Sources:
         """Apply a message (None: one that is too long) to the sources that it concerns, and return them.
 
         A `retained` one has an unknown age: it counts only for a source that publishes on change, and once its sensor
-        is known to be connected.
+        is known to be connected. One from before an outage never counts.
         """
         return [
-            Applied(area, source, _apply_availability(source, payload, now, stamp))
+            Applied(area, source, _apply_availability(source, availability, payload, now, stamp, retained=retained))
             if availability
-            else Applied(area, source, _apply_value(area, source, payload, now, stamp, retained=retained))
+            else Applied(area, source, _apply_value(source, payload, now, stamp, retained=retained))
             for area, source, availability in self._by_topic.get(topic, ())
         ]
 
@@ -101,10 +100,8 @@ class Sources:
         """
         areas = set()
         for area, source, _ in chain.from_iterable(self._by_topic.values()):
-            if source.silent_after(area.definition.unknown) == math.inf:
-                source.pending = None
-                if source.source is not None and source.source.availability is not None:
-                    source.online = None
+            if source.publishes_on_change:
+                source.forget()
                 source.invalidate("the connection to the broker was lost, and it tells only changes")
                 areas.add(area.definition.id)
         return areas
@@ -115,8 +112,7 @@ class Sources:
         for member in self._members:
             if member.new and member.source is not None:
                 member.new = False
-                availability = member.source.availability
-                topics |= {member.source.topic, None if availability is None else availability.topic}
+                topics |= {member.source.topic, *(each.topic for each in member.source.availabilities)}
         return {topic for topic in topics if topic is not None}
 
     def _add(self, topic: str | None, listener: _Listener) -> None:
@@ -129,38 +125,53 @@ def _is_newer(value: NodeValue, boot: int, seq: int) -> bool:
     return value.boot != boot or 0 < (value.seq - seq) % _WRAP < _WRAP // 2
 
 
-def _apply_value(
-    area: WatchedArea, source: SourceState, payload: bytes | None, now: float, stamp: float, *, retained: bool
-) -> bool:
+def _apply_value(source: SourceState, payload: bytes | None, now: float, stamp: float, *, retained: bool) -> bool:
     if not retained:
         source.pending = None
         return _read(source, payload, now, stamp)
-    if source.silent_after(area.definition.unknown) == math.inf:
+    if source.publishes_on_change:
         if source.online or payload is None:
             return _read(source, payload, now, stamp)
-        source.pending = payload
+        source.pending = payload if source.online is None else None
     return True
 
 
-def _apply_availability(source: SourceState, payload: bytes | None, now: float, stamp: float) -> bool:
-    availability = None if source.source is None else source.source.availability
-    online = None if availability is None else is_online(availability, payload)
-    if online is None:
-        return False
-    pending, source.pending = source.pending, None
-    source.online = online
+def _apply_availability(
+    source: SourceState, availability: Availability, payload: bytes | None, now: float, stamp: float, *, retained: bool
+) -> bool:
+    """Apply what says whether a source's sensor is connected; return whether it was understood."""
+    was_online, online = source.online, is_online(availability, payload)
+    source.say(availability.topic, online=online is True)
     if not online:
-        source.invalidate("it went offline")
-    elif pending is not None:
-        return _read(source, pending, now, stamp)
-    return True
+        source.pending, source.recalled = None, False
+        reason = "it went offline" if online is False else f"{availability.topic} says neither online nor offline"
+        if source.state != "unknown" or was_online:
+            source.invalidate(reason)
+    elif source.online and not was_online:
+        pending, source.pending = source.pending, None
+        if availability.recalls and not retained:
+            source.recalled = True
+        elif pending is not None:
+            return _read(source, pending, now, stamp)
+    return online is not None
 
 
 def _read(source: SourceState, payload: bytes | None, now: float, stamp: float) -> bool:
-    """Apply a value; one that is not understood makes the source unknown at once. Return whether it was."""
+    """Apply a value; one that is not understood makes the source unknown at once. Return whether it was.
+
+    What clears counts only while nothing makes it doubtful: a sensor that nobody watches would keep an area clear.
+    """
     if source.reader is None:
         return False
-    return _apply(source, source.reader.classify(payload), now, stamp)
+    classification, doubt = source.reader.classify(payload), source.doubt
+    source.recalled = False
+    if classification.state != "clear" or doubt is None:
+        return _apply(source, classification, now, stamp)
+    recalls = source.online is False and any(each.recalls for each in source.availabilities)
+    if not source.online and not recalls and source.publishes_on_change:
+        source.pending = payload
+    _apply(source, Classification("unknown", doubt), now, stamp)
+    return True
 
 
 def _apply(source: SourceState, classification: Classification, now: float, stamp: float) -> bool:

@@ -4,7 +4,7 @@ from typing import Annotated, Any, Literal
 
 from msgspec import Meta, field
 
-from fog_contracts.messages.basics import Count, Finite, Id, Message, Ring, Seconds
+from fog_contracts.messages.basics import AreaState, Count, Finite, Id, Message, Ring, Seconds
 
 
 class UnknownPolicy(Message, frozen=True, kw_only=True):
@@ -49,12 +49,16 @@ class Limits(Message, frozen=True, kw_only=True):
 
 
 class Availability(Message, frozen=True, kw_only=True):
-    """A topic that says whether a sensor is connected; without `pointer` its payload is plain text."""
+    """A topic that says whether a sensor is connected, as plain text or, with `pointer`, in a JSON document.
+
+    `recalls`: it is a gateway's, which repeats what its sensors said before it went offline once it is online again.
+    """
 
     topic: Topic
     pointer: Pointer | None = None
     online: Meaning = field(default_factory=lambda: ["online"])
     offline: Meaning = field(default_factory=lambda: ["offline"])
+    recalls: bool = False
 
 
 Penalty = Annotated[int, Meta(ge=1, le=253)]
@@ -71,11 +75,13 @@ class Quantity(Message, frozen=True, kw_only=True):
 class Source(Message, frozen=True, kw_only=True):
     """Any sensor that speaks MQTT, or a quantity that a node measures, as evidence for an area.
 
-    `topic` is one sensor's, without wildcards. `pointer` is where its payload, a JSON document, has the value
-    (None: the payload is plain text); `blocked` and `clear` are what it means, or `number` for a number. A
-    `profile` gives all that is not given here, with `device` for the name in its topics. `period_s` is the time
-    between two messages; without one the sensor publishes on change, and needs an `availability`. With a `penalty`,
-    a blocked sensor makes the area costly instead of impassable. `debounce` as in an area; without it each message
+    `topic` is one sensor's, without wildcards. `pointer` is where its payload, a JSON document, has the value (None:
+    the payload is plain text; of several, the first that leads to one); `blocked` and `clear` are what it means, or
+    `number` for a number, and `no_value` what a message without a number means: `clear` counts only once it has
+    measured something since it was unknown. A `profile` gives all that is not given here, with `device` for the name in
+    its topics. `period_s` is the time between two messages; without one the sensor publishes on change, and needs an
+    `availability`. While not all of these have said that it is connected, it clears nothing. With a `penalty`, a
+    blocked sensor makes the area costly instead of impassable. `debounce` as in an area; without it each message
     counts. A `quantity` has no topic, but the limits of its `number`.
     """
 
@@ -83,15 +89,27 @@ class Source(Message, frozen=True, kw_only=True):
     profile: Id | None = None
     device: Annotated[str, Meta(max_length=100)] = ""
     topic: Topic | None = None
-    pointer: Pointer | None = None
+    pointer: Pointer | Annotated[list[Pointer], Meta(min_length=1, max_length=5)] | None = None
     blocked: Meaning = []
     clear: Meaning = []
     number: Limits | None = None
-    availability: Availability | None = None
+    no_value: AreaState = "unknown"
+    availability: Availability | Annotated[list[Availability], Meta(max_length=5)] | None = None
     period_s: Annotated[float, Meta(gt=0.0, le=86_400.0, extra={"unit": "s"})] | None = None
     penalty: Penalty | None = None
     debounce: dict[str, Any] = {}
     quantity: Quantity | None = None
+
+    @property
+    def pointers(self) -> list[str | None]:
+        """Where the value may be, in the order in which to look; None: the payload is the value."""
+        return [*self.pointer] if isinstance(self.pointer, list) else [self.pointer]
+
+    @property
+    def availabilities(self) -> list[Availability]:
+        """What says whether its sensor is connected; all must."""
+        found = self.availability
+        return found if isinstance(found, list) else [] if found is None else [found]
 
 
 class FusionPolicy(Message, frozen=True, kw_only=True):

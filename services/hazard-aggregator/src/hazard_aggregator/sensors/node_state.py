@@ -10,7 +10,7 @@ from fog_contracts.messages import UnknownPolicy
 from hazard_aggregator.sensors.flapping import FlapDetector
 
 if TYPE_CHECKING:
-    from fog_contracts.messages import AreaState, NodeReading, Source
+    from fog_contracts.messages import AreaState, Availability, NodeReading, Source
     from fog_contracts.site import NodeSite
     from hazard_aggregator.debounce import Rule
     from hazard_aggregator.sensors.plausibility import Classification
@@ -174,10 +174,11 @@ class NodeState:
 
 @dataclass
 class SourceState(NodeState):
-    """One source of one area, with its profile filled in; `pending` is a retained message of unknown age.
+    """One source of one area, with its profile filled in; `pending` is a value that waits for its sensor's connection.
 
     `misread`: its last message was not understood. `new`: its topics are not subscribed to yet, for this source.
-    `value_at`: boot and seq of a node's last value.
+    `value_at`: boot and seq of a node's last value. `said`: whether each of its availability topics says that it is
+    connected. `recalled`: its next value may be what its gateway knew before an outage.
     """
 
     source: Source | None = None
@@ -186,6 +187,8 @@ class SourceState(NodeState):
     misread: bool = False
     new: bool = True
     value_at: tuple[int, int] | None = None
+    said: dict[str, bool] = field(default_factory=dict)
+    recalled: bool = False
 
     @property
     def penalty(self) -> int | None:
@@ -193,9 +196,46 @@ class SourceState(NodeState):
         own = None if self.source is None else self.source.penalty
         return self.area_penalty if own is None else own
 
+    @property
+    def availabilities(self) -> list[Availability]:
+        """What says whether its sensor is connected; all must."""
+        return [] if self.source is None else self.source.availabilities
+
+    @property
+    def publishes_on_change(self) -> bool:
+        """Whether its silence means nothing."""
+        return self.source is None or self.source.period_s is None
+
+    @property
+    def doubt(self) -> str | None:
+        """Why it may clear nothing now; None: its sensor is connected, or is known to be by its period alone."""
+        if self.availabilities and not self.online:
+            named = [each.topic for each in self.availabilities if not self.said.get(each.topic)]
+            return f"it reports clear, but {' and '.join(named)} must say first that it is connected"
+        return "its gateway has just started, and may repeat what it knew before" if self.recalled else None
+
+    def say(self, topic: str, *, online: bool) -> None:
+        """Record whether an availability topic says that its sensor is connected."""
+        self.said[topic] = online
+        known = [self.said.get(each.topic) for each in self.availabilities]
+        self.online = False if False in known else None if None in known else True
+
+    def forget(self) -> None:
+        """Forget whether its sensor is connected, and what waits for that."""
+        self.said.clear()
+        self.pending, self.online, self.recalled = None, None, False
+
+    def receive(self, taken_at: float) -> None:
+        """Record a sign of life (s, the receiver's clock), which a gateway may give for a sensor that is gone."""
+        online = self.online
+        super().receive(taken_at)
+        if self.availabilities:
+            self.online = online
+
     def silent_after(self, policy: UnknownPolicy) -> float:  # noqa: ARG002  # a source has its own period
         """Return after how long a silence (s) the state is unknown: never, if the source publishes on change."""
-        return math.inf if self.source is None or self.source.period_s is None else _PERIODS * self.source.period_s
+        period = None if self.source is None else self.source.period_s
+        return math.inf if period is None else _PERIODS * period
 
     def invalidate(self, reason: str) -> None:
         """Set the state to unknown until messages confirm another one."""

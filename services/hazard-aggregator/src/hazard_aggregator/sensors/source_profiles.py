@@ -19,7 +19,12 @@ from hazard_aggregator.area_size import AreaError
 if TYPE_CHECKING:
     from collections.abc import Mapping
 
-_Z2M: Final = Availability(topic="zigbee2mqtt/{device}/availability", pointer="/state")
+# The gateway's own state; its device's, which it publishes if its `availability` is enabled. Once it has started it
+# publishes what it knows of each device from before, unless its `cache_state_send_on_startup` is off.
+_Z2M: Final = [
+    Availability(topic="zigbee2mqtt/bridge/state", pointer="/state", recalls=True),
+    Availability(topic="zigbee2mqtt/{device}/availability", pointer="/state"),
+]
 _TASMOTA: Final = Availability(topic="tele/{device}/LWT", online=["Online"], offline=["Offline"])
 _SHELLY: Final = Availability(topic="{device}/online", online=["true"], offline=["false"])
 
@@ -39,9 +44,11 @@ PROFILES: Final[Mapping[str, Source]] = {
         id="profile", topic="{device}/state", blocked=["ON"], clear=["OFF"],
         availability=Availability(topic="{prefix}/status"),
     ),
-    # In cm; Tasmota publishes at its TelePeriod, which is 300 s unless it is set: 10 s is the least.
+    # In cm; Tasmota publishes at its TelePeriod, which is 300 s unless it is set: 10 s is the least. It numbers its
+    # sensors, with a separator that its SetOption64 chooses; older versions did not number a single one.
     "tasmota-distance": Source(
-        id="profile", topic="tele/{device}/SENSOR", pointer="/SR04/Distance", period_s=10.0, availability=_TASMOTA,
+        id="profile", topic="tele/{device}/SENSOR", period_s=10.0, availability=_TASMOTA,
+        pointer=["/SR04-1/Distance", "/SR04_1/Distance", "/SR04/Distance"],
     ),
     # These sleep between two messages, and are not connected then; they wake up at least every 12 hours.
     "shelly-door-gen1": Source(
@@ -124,11 +131,14 @@ def _filled_in(area: str, source: Source) -> Source:
 
     if source.topic is None:
         raise SourceError(area, f"{where}.topic", "it has none: give a topic, or a profile")
-    source = structs.replace(source, topic=_checked(area, f"{where}.topic", filled(source.topic)))
-    if source.availability is not None:
-        topic = _checked(area, f"{where}.availability.topic", filled(source.availability.topic))
-        source = structs.replace(source, availability=structs.replace(source.availability, topic=topic))
-    return source
+    return structs.replace(
+        source,
+        topic=_checked(area, f"{where}.topic", filled(source.topic)),
+        availability=[
+            structs.replace(each, topic=_checked(area, f"{where}.availability.topic", filled(each.topic)))
+            for each in source.availabilities
+        ],
+    )
 
 
 def _checked(area: str, where: str, topic: str) -> str:
@@ -168,6 +178,6 @@ def _check(area: str, source: Source) -> None:
         raise SourceError(area, where, problem)
     if source.number is not None:
         _check_number(area, source)
-    if source.period_s is None and source.availability is None:
+    if source.period_s is None and not source.availabilities:
         problem = "it has no `period_s` and no `availability`: nobody would notice that it is dead"
         raise SourceError(area, where, problem)

@@ -9,40 +9,57 @@ import msgspec
 from hazard_aggregator.sensors.plausibility import Classification
 
 if TYPE_CHECKING:
+    from collections.abc import Sequence
+
     from fog_contracts.messages import Availability, Limits, Source
 
 _SHOWN: Final = 40
 """Characters of a payload that a reason quotes."""
 
 
+_NOTHING: Final = frozenset({"nan", "none", "null"})
+"""What is sent instead of a number that was not measured; ESPHome sends `nan`, or `None` if so configured."""
+
+
 class _FormatError(ValueError):
     """A payload is not what its source says; the text is the reason."""
 
 
+class _NoValueError(_FormatError):
+    """A payload has no value where it should be; a distance sensor without an echo sends such ones."""
+
+
 class SourceReader:
-    """Reads the messages of one source, whose profile is filled in; remembers on which side of its limits it was."""
+    """Reads the messages of one source, whose profile is filled in.
+
+    It remembers on which side of its limits the number was, and whether it measured anything.
+    """
 
     def __init__(self, source: Source) -> None:
         self._source = source
         self._exceeded: bool | None = None
+        self._measured = False
 
     def reset(self) -> None:
-        """Forget on which side of its limits the number was."""
+        """Forget on which side of its limits the number was, and that there was any."""
         self._exceeded = None
+        self._measured = False
 
     def classify(self, payload: bytes | None) -> Classification:
         """Return what a message says; one that is too long, or not in its format, is `unknown`."""
         source = self._source
-        if payload is None:
-            return Classification("unknown", "its message is too long")
         try:
-            value = _value(payload, source.pointer)
+            value = _value(payload, source.pointers)
             if source.number is not None:
-                return self._classify_number(_number(value), source.number)
+                number = _number(value)
+                self._measured = True
+                return self._classify_number(number, source.number)
             for state, meaning in (("blocked", source.blocked), ("clear", source.clear)):
                 if _is_one_of(value, meaning):
                     return Classification(state, f"it reports {_quoted(value)}")  # type: ignore[arg-type]  # a literal
         except _FormatError as error:
+            if source.number is not None and isinstance(error, _NoValueError):
+                return self._without_value(str(error))
             return Classification("unknown", f"its format has changed: {error}")
         return Classification("unknown", f"{_quoted(value)} means neither blocked nor clear")
 
@@ -50,6 +67,14 @@ class SourceReader:
         """Return what a number means that came as such, from a node of Fognav."""
         limits = self._source.number
         return Classification("unknown", "it has no limits") if limits is None else self._classify_number(value, limits)
+
+    def _without_value(self, problem: str) -> Classification:
+        """Return what it means that nothing was measured; a sensor that never did may be one that is not there."""
+        meaning = self._source.no_value
+        if meaning == "clear" and not self._measured:
+            return Classification("unknown", f"it has measured nothing yet: {problem}")
+        self._exceeded = None if meaning == "unknown" else meaning == "blocked"
+        return Classification(meaning, f"it measures nothing: {problem}")
 
     def _classify_number(self, value: float, limits: Limits) -> Classification:
         if not _within(value, limits.minimum, limits.maximum):
@@ -70,25 +95,39 @@ class SourceReader:
 
 def is_online(availability: Availability, payload: bytes | None) -> bool | None:
     """Return whether a source's sensor is connected; None if the message does not say so."""
+    for pointer in dict.fromkeys((availability.pointer, None)):  # some versions of a gateway send JSON, others text
+        try:
+            value = _value(payload, [pointer])
+        except _FormatError:
+            continue
+        if _is_one_of(value, availability.offline):
+            return False
+        if _is_one_of(value, availability.online):
+            return True
+    return None
+
+
+def _value(payload: bytes | None, pointers: Sequence[str | None]) -> Any:  # noqa: ANN401  # any JSON value
+    """Return the value in a payload, by the first JSON pointer (RFC 6901) to one; None: the payload as text."""
     if payload is None:
-        return None
+        raise _FormatError("its message is too long")
     try:
-        value = _value(payload, availability.pointer)
-    except _FormatError:
-        return None
-    if _is_one_of(value, availability.offline):
-        return False
-    return True if _is_one_of(value, availability.online) else None
-
-
-def _value(payload: bytes, pointer: str | None) -> Any:  # noqa: ANN401  # any JSON value
-    """Return the value in a payload, by a JSON pointer (RFC 6901); None: the payload as text."""
-    try:
-        if pointer is None:
+        if None in pointers:
             return payload.decode("utf-8").strip()
-        found = msgspec.json.decode(payload)
+        document = msgspec.json.decode(payload)
     except (UnicodeDecodeError, msgspec.DecodeError, RecursionError) as error:
         raise _FormatError(f"{_quoted(payload.decode('utf-8', 'replace'))} is not JSON text") from error
+    for pointer in pointers:
+        try:
+            return _at(document, pointer or "")
+        except LookupError:
+            continue
+    raise _NoValueError(f"there is no {' and no '.join(str(pointer) for pointer in pointers)} in it")
+
+
+def _at(document: Any, pointer: str) -> Any:  # noqa: ANN401  # any JSON value
+    """Return the value to which a JSON pointer leads; raises `LookupError`."""
+    found = document
     for part in pointer.split("/")[1:]:
         key = part.replace("~1", "/").replace("~0", "~")
         if isinstance(found, dict) and key in found:
@@ -96,11 +135,13 @@ def _value(payload: bytes, pointer: str | None) -> Any:  # noqa: ANN401  # any J
         elif isinstance(found, list) and key.isdecimal() and int(key) < len(found):
             found = found[int(key)]
         else:
-            raise _FormatError(f"there is no {pointer} in it")
+            raise LookupError(pointer)
     return found
 
 
 def _number(value: Any) -> float:  # noqa: ANN401  # any JSON value
+    if value is None or (isinstance(value, str) and value.casefold() in _NOTHING):
+        raise _NoValueError(f"{_quoted(value)} is no number")
     try:
         number = float(value) if isinstance(value, str | int | float) and not isinstance(value, bool) else None
     except (ValueError, OverflowError):

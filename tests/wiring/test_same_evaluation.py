@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import importlib.util
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from types import SimpleNamespace
 from typing import TYPE_CHECKING, Any, cast
@@ -148,6 +148,20 @@ async def test_demo_and_lockstep_evaluate_the_same_messages_alike(*, strays: boo
     expected = {name: getattr(result, name) for name in DriveSummary.__struct_fields__}
     assert msgspec.structs.asdict(attempt.summary()) == expected
     assert (result.outcome, result.area, result.success, result.area_entered) == ("reached", "z1", not strays, strays)
+    assert ("this is no success: it drove into the blocked area" in attempt.scene.events[-1][1]) is strays
     assert attempt.drive is not None
     assert round(attempt.drive.blocked_at_m or 0.0, 2) == result.hazard_at_m
     assert [obstacle.id for command in edge.sim_commands for obstacle in command.place] == ["barrier"]
+
+
+async def test_the_last_line_of_a_demo_without_a_hazard_says_so() -> None:
+    site: LoadedSite = ring.ring_site()
+    result, observations = drive_in_lockstep(site, strays=False)
+    assert result.time_s is not None
+    assert site.site.demo is not None
+    nothing = msgspec.structs.replace(site.site.demo, areas=[])
+    bare = replace(site, site=msgspec.structs.replace(site.site, demo=nothing))
+    attempt, edge = await evaluate_in_demo(bare, observations, round(observations[-1].now - result.time_s, 2))
+    assert attempt.summary().outcome == "reached"
+    assert not edge.sim_commands
+    assert attempt.scene.events[-1][1].endswith("site.toml lists no areas")

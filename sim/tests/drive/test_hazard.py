@@ -7,7 +7,14 @@ from hypothesis import strategies as st
 from fog_contracts.messages import SimObstacle
 from fog_contracts.site import AreaSite, DemoPlan, NodeSite, Site, Sonar
 from fognav_sim.barrier import KEEP_AWAY_M, BarrierError
-from fognav_sim.drive.hazard import HazardSchedule, draw_hazard, draw_trigger, entry_distance, is_clear_of_robot
+from fognav_sim.drive.hazard import (
+    HazardSchedule,
+    draw_hazard,
+    draw_trigger,
+    entry_distance,
+    is_clear_of_robot,
+    remaining,
+)
 
 PATH = [(0.0, 0.0), (10.0, 0.0), (30.0, 0.0)]
 
@@ -94,3 +101,37 @@ def test_robot_with_a_new_path_gets_a_hazard_on_that_path() -> None:
     assert due is not None
     assert due.area.id == "z2"
     assert schedule.planned == due
+
+
+def there_and_back(x: float) -> list[tuple[float, float]]:
+    """A path that passes an area around (x, 0) at 2 m, goes on, and enters it on its way back."""
+    return [(0.0, 2.0), (40.0, 2.0), (40.0, 0.0), (x, 0.0)]
+
+
+@given(seed=st.integers(0, 10_000))
+def test_barrier_appears_before_the_last_place_that_is_away_from_its_area(seed: int) -> None:
+    plan = site(("z1", 6.0))
+    drawn = draw_hazard(plan, there_and_back(0.0), seed, fill_area)
+    place = remaining(there_and_back(0.0), drawn.trigger_m)[0]
+    assert is_clear_of_robot(drawn, place)
+    assert entry_distance(remaining(there_and_back(0.0), drawn.trigger_m), drawn.area.polygon) is not None
+
+
+def test_path_that_is_near_its_area_from_the_start_is_refused_with_the_reason() -> None:
+    with pytest.raises(BarrierError, match="never is far enough"):
+        draw_hazard(site(("z1", 6.0)), [(5.0, -3.5), (5.0, -2.0), (7.0, -2.0), (7.0, 0.0)], 1, fill_area)
+
+
+def test_what_is_left_of_a_path_begins_after_what_was_driven() -> None:
+    assert remaining(PATH, 4.0) == [(4.0, 0.0), (10.0, 0.0), (30.0, 0.0)]
+    assert remaining(PATH, 12.0) == [(12.0, 0.0), (30.0, 0.0)]
+    assert remaining(PATH, 40.0) == [(30.0, 0.0)]
+
+
+def test_area_behind_the_robot_is_not_blocked() -> None:
+    schedule = HazardSchedule(site(("z1", 12.0)), 1, fill_area)
+    planned = schedule.draw(PATH)
+    behind = remaining(PATH, 20.0)
+    assert is_clear_of_robot(planned, (20.0, 0.0))
+    with pytest.raises(BarrierError, match="does not cross z1"):
+        schedule.due(behind, 20.0, (20.0, 0.0))

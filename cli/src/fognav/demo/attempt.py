@@ -248,7 +248,19 @@ class Attempt:
         """Record and show the outcome."""
         self.scene.outcome = outcome
         self.scene.phase = outcome.kind
-        self.scene.log_event(f"{outcome.kind}: {outcome.reason}")
+        self.scene.log_event(f"{outcome.kind}: {outcome.reason}{self._of_its_barrier(outcome)}")
+
+    def _of_its_barrier(self, outcome: DriveOutcome) -> str:
+        """Return what else must be said of a drive that reached its goal, "" if nothing."""
+        if outcome.kind != "reached" or self.drive is None:
+            return ""
+        if not self.drive.hazard_met:
+            return "; but this is no success: no barrier was placed on the way ahead of it"
+        if self.drive.evaluation.entered_blocked:
+            return "; but this is no success: it drove into the blocked area"
+        if self.plan.options.hazard and not self.plan.hazard:
+            return f"; but nothing was in its way: [demo] of {self.plan.site.directory}/site.toml lists no areas"
+        return ""
 
     def summary(self) -> DriveSummary:
         """Summarize the drive, as far as it came."""

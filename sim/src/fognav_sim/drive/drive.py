@@ -5,12 +5,16 @@ The demonstration and lockstep runs hand it the same messages, so the same facts
 
 from __future__ import annotations
 
+import contextlib
+import itertools
 import math
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Final
 
 import msgspec
 
+from fognav_sim.barrier import BarrierError
 from fognav_sim.drive.evaluation import DriveEvaluation, DriveOutcome, OutcomeKind, drive_timeout_s
+from fognav_sim.drive.hazard import remaining
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -19,6 +23,9 @@ if TYPE_CHECKING:
     from fog_contracts.messages import RobotPath, RobotState, SimTruth
     from fog_contracts.site import AreaSite
     from fognav_sim.drive.hazard import HazardSchedule, PlannedHazard
+
+_PROGRESS_M: Final = 1.0
+"""How much farther along its path than it has driven the robot may be found: it cuts corners."""
 
 
 class DriveSummary(msgspec.Struct, frozen=True, kw_only=True):
@@ -72,18 +79,29 @@ class Drive:
         """Distance (m) driven when the barrier was placed; None before."""
         self.ended_at: float | None = None
         """Time (s) at which the drive had its outcome; None before."""
+        self.barrier_was_ahead = False
+        """Whether the robot's path led into the hazard's area when the barrier was placed."""
         self._truth = truth
         self._path: Sequence[Point] = ()
+        self._along_m = 0.0
+        """How far along its path the robot is."""
+        self._path_is_new = False
         self.evaluation.on_truth(truth)
 
     @property
     def hazard_met(self) -> bool:
-        """Whether the barrier was placed, if this drive is to have one."""
-        return self.hazard is None or self.blocked_at_m is not None
+        """Whether the barrier was placed, and ahead of the robot on its path, if this drive is to have one.
+
+        An area that was asked for may lie anywhere.
+        """
+        return self.hazard is None or (self.blocked_at_m is not None and self.barrier_was_ahead)
 
     def on_truth(self, truth: SimTruth) -> None:
         """Evaluate the simulator's ground truth."""
+        reach = abs(truth.distance - self._truth.distance) + _PROGRESS_M
         self._truth = truth
+        if self.hazard is not None and self.blocked_at_m is None and self._path:
+            self._along_m = _nearest(self._path, (truth.x, truth.y), self._along_m, self._along_m + reach)
         self.evaluation.on_truth(truth)
 
     def on_state(self, state: RobotState, now: float) -> None:
@@ -92,19 +110,26 @@ class Drive:
 
     def on_path(self, path: RobotPath, now: float) -> None:
         """Evaluate a path or refusal from the planner."""
-        if path.goal_id == self.evaluation.goal_id:
-            self._path = path.points
+        if path.goal_id == self.evaluation.goal_id and path.points != self._path:
+            self._path, self._along_m, self._path_is_new = path.points, 0.0, True
         self.evaluation.on_path(path, now)
 
     def hazard_due(self) -> PlannedHazard | None:
         """Return the hazard whose barrier is to be placed now, or None; raises `BarrierError` if no area qualifies."""
         if self.hazard is None or self.blocked_at_m is not None or not self._path:
             return None
-        return self.hazard.due(self._path, self.evaluation.distance_m, (self._truth.x, self._truth.y))
+        left = remaining(self._path, self._along_m)
+        if self._path_is_new and self.hazard.planned is not None:
+            with contextlib.suppress(BarrierError):  # raised by `due` if it is still so when the barrier is due
+                self.hazard.draw(left, self.evaluation.distance_m)
+        self._path_is_new = False
+        return self.hazard.due(left, self.evaluation.distance_m, (self._truth.x, self._truth.y))
 
     def on_barrier_placed(self, hazard: PlannedHazard) -> None:
         """Record that the barrier stands: from now on the robot must not enter the hazard's area."""
         self.blocked_at_m = self.evaluation.distance_m
+        left = remaining(self._path, self._along_m)
+        self.barrier_was_ahead = self.hazard is not None and self.hazard.is_ahead(hazard, left)
         self.evaluation.block(hazard.area)
 
     def outcome(self, now: float) -> DriveOutcome | None:
@@ -137,6 +162,23 @@ class Drive:
             modes=dict(evaluation.modes),
             stops=list(evaluation.stops),
         )
+
+
+def _nearest(path: Sequence[Point], at: Point, since_m: float, until_m: float) -> float:
+    """Return the distance (m) along a polyline of its point nearest to `at`, from `since_m` to `until_m` along it."""
+    best_m, least, along = since_m, math.inf, 0.0
+    for (x0, y0), (x1, y1) in itertools.pairwise(path):
+        length = math.hypot(x1 - x0, y1 - y0)
+        if length > 0.0 and along + length >= since_m:
+            t = ((at[0] - x0) * (x1 - x0) + (at[1] - y0) * (y1 - y0)) / length
+            t = min(max(t, since_m - along, 0.0), until_m - along, length)
+            away = math.hypot(x0 + t / length * (x1 - x0) - at[0], y0 + t / length * (y1 - y0) - at[1])
+            if away < least:
+                best_m, least = along + t, away
+        along += length
+        if along >= until_m:
+            break
+    return best_m
 
 
 def _finite(value: float) -> float | None:

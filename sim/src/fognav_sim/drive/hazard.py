@@ -9,7 +9,9 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final, Protocol
 
-from fog_contracts.geometry import contains_point, distance_to_polygon
+import numpy as np
+
+from fog_contracts.geometry import contains_point, distance_to_polygon, lengths_along, sampled
 from fog_contracts.messages import SimObstacle
 from fog_contracts.site import AreaSite
 from fognav_sim.barrier import KEEP_AWAY_M, BarrierError, barrier_across
@@ -23,7 +25,10 @@ if TYPE_CHECKING:
 
 TRIGGER_M: Final = (3.0, 8.0)
 """Range of the travelled distance at which the path becomes blocked."""
-BRAKING_ROOM_M: Final = 1.0
+BRAKING_ROOM_M: Final = 0.75
+"""A barrier is to appear at least this much of the path before the last place that is far enough away from it."""
+_MARGIN_M: Final = 0.25
+"""How much farther away than `KEEP_AWAY_M` the path must be: the robot drives beside it."""
 _STEP_M: Final = 0.05
 
 MakeBarrier = Callable[[AreaSite], SimObstacle]
@@ -83,20 +88,39 @@ def draw_trigger(seed: int) -> float:
     return random.Random(seed).uniform(*TRIGGER_M)  # noqa: S311  # repeatable, not a secret
 
 
-def draw_hazard(
-    site: Site, path: Sequence[Point], seed: int, make_barrier: MakeBarrier, *, trigger_m: float | None = None
+def remaining(path: Sequence[Point], driven_m: float) -> list[Point]:
+    """Return what is left of a polyline after its first `driven_m` metres, beginning where these end."""
+    for index, (a, b) in enumerate(itertools.pairwise(path)):
+        length = math.dist(a, b)
+        if driven_m < length:
+            t = max(0.0, driven_m) / length
+            return [(a[0] + t * (b[0] - a[0]), a[1] + t * (b[1] - a[1])), *path[index + 1 :]]
+        driven_m -= length
+    return list(path[-1:])
+
+
+def draw_hazard(  # noqa: PLR0913  # what is drawn, on what, and what is known of it already
+    site: Site,
+    path: Sequence[Point],
+    seed: int,
+    make_barrier: MakeBarrier,
+    *,
+    trigger_m: float | None = None,
+    travelled_m: float = 0.0,
+    keep: str | None = None,
 ) -> PlannedHazard:
     """Draw the area that becomes blocked, among the demo's areas that the path crosses, and when.
 
-    The barrier appears early enough that the robot is still away from the area, after `trigger_m` metres at the latest
-    if that is given. Raises `BarrierError` if no area qualifies; the message gives the reason for each.
+    `path` begins where the robot is after `travelled_m` metres. The barrier appears while the robot is still away from
+    the area that it drives to, as near to `trigger_m` metres of its drive (drawn if not given) as the path allows. The
+    area `keep` is taken again if it qualifies. Raises `BarrierError` if none does; the message gives each one's reason.
     """
     wanted = site.demo.areas if site.demo else []
     known = {area.id: area for area in site.areas}
     generator = random.Random(seed)  # noqa: S311  # repeatable, not a secret
     drawn = generator.uniform(*TRIGGER_M)  # as draw_trigger; the area is drawn next
     trigger = drawn if trigger_m is None else trigger_m
-    candidates: list[PlannedHazard] = []
+    candidates: dict[str, PlannedHazard] = {}
     reasons: list[str] = []
     for identifier in wanted:
         area = known[identifier]
@@ -104,23 +128,55 @@ def draw_hazard(
         if entry is None:
             reasons.append(f"the path does not cross {identifier}")
             continue
-        latest = entry - KEEP_AWAY_M - BRAKING_ROOM_M
-        if latest < 0:
-            reasons.append(f"the path enters {identifier} after only {entry:.1f} m")
-            continue
         try:
-            candidates.append(PlannedHazard(area, make_barrier(area), min(trigger, latest)))
+            barrier = make_barrier(area)
         except BarrierError as error:
             reasons.append(str(error))
+            continue
+        place = _appears_at(path, entry, (area.polygon, barrier.polygon), trigger - travelled_m)
+        if place is None:
+            reasons.append(
+                f"the path enters {identifier} after {entry:.1f} m and never is far enough from it before for a "
+                f"barrier {KEEP_AWAY_M:g} m away"
+            )
+            continue
+        candidates[identifier] = PlannedHazard(area, barrier, travelled_m + place)
     if not candidates:
         reason = "; ".join(reasons) or "[demo] of site.toml lists no areas"
         raise BarrierError(f"no area can be blocked on this path: {reason}. Choose other areas, or use --no-hazard")
-    return generator.choice(candidates)
+    return candidates[keep] if keep in candidates else generator.choice(list(candidates.values()))
+
+
+def _appears_at(
+    path: Sequence[Point], entry_m: float, polygons: Sequence[Sequence[Point]], wanted_m: float
+) -> float | None:
+    """Return the distance (m) along the path at which a barrier is to appear: where the path is away from it.
+
+    That is `wanted_m` if possible, else the nearest place before it, else the first one after it; None if there is none
+    up to `BRAKING_ROOM_M` before the last place that is far enough away.
+    """
+    line = sampled(np.array(path, dtype=np.float64), _STEP_M)
+    away = [
+        along
+        for along, (x, y) in zip(lengths_along(line).tolist(), line.tolist(), strict=True)
+        if along < entry_m and _distance(polygons, (x, y)) >= KEEP_AWAY_M + _MARGIN_M
+    ]
+    if not away:
+        return None
+    usable = [place for place in away if place <= away[-1] - BRAKING_ROOM_M]
+    before = [place for place in usable if place <= wanted_m]
+    if not before:
+        return min(usable, default=None)
+    return wanted_m if wanted_m - before[-1] < _STEP_M else before[-1]
+
+
+def _distance(polygons: Sequence[Sequence[Point]], point: Point) -> float:
+    return min(distance_to_polygon(polygon, *point) for polygon in polygons)
 
 
 def is_clear_of_robot(hazard: PlannedHazard, robot: Point) -> bool:
     """Whether the robot is far enough away for the barrier to appear."""
-    return min(distance_to_polygon(p, *robot) for p in (hazard.area.polygon, hazard.barrier.polygon)) >= KEEP_AWAY_M
+    return _distance((hazard.area.polygon, hazard.barrier.polygon), robot) >= KEEP_AWAY_M
 
 
 class HazardSchedule:
@@ -146,29 +202,41 @@ class HazardSchedule:
         """Return the schedule of a drive on a site, with barriers from wall to wall."""
         return cls(site.site, seed, lambda area: barrier_across(area, site.site, site.map, seed), request)
 
-    def draw(self, path: Sequence[Point]) -> PlannedHazard:
-        """Draw the hazard for a path, replacing any earlier one; raises `BarrierError`."""
+    def draw(self, left: Sequence[Point], travelled_m: float = 0.0) -> PlannedHazard:
+        """Draw the hazard for what is left of the path after `travelled_m` metres of the drive; raises `BarrierError`.
+
+        It replaces an earlier one, in the same area if that still qualifies.
+        """
         self.planned = self._fixed or draw_hazard(
-            self._site, path, self._seed, self._make_barrier, trigger_m=self._request.trigger_m
+            self._site,
+            left,
+            self._seed,
+            self._make_barrier,
+            trigger_m=self._request.trigger_m,
+            travelled_m=travelled_m,
+            keep=self.planned.area.id if self.planned is not None else None,
         )
         return self.planned
 
-    def due(self, path: Sequence[Point], travelled_m: float, robot: Point) -> PlannedHazard | None:
+    def due(self, left: Sequence[Point], travelled_m: float, robot: Point) -> PlannedHazard | None:
         """Return the hazard whose barrier is to be placed now, or None while it is too early; raises `BarrierError`.
 
-        `path` is the robot's path from here on, `travelled_m` the distance that it has driven, `robot` its true
+        `left` is the robot's path from here on, `travelled_m` the distance that it has driven, `robot` its true
         position (m).
         """
-        planned = self.planned or self.draw(path)
+        planned = self.planned or self.draw(left, travelled_m)
         if travelled_m < planned.trigger_m:
             return None
-        left = self._fixed is None and entry_distance(path, planned.area.polygon) is None
-        if left or not is_clear_of_robot(planned, robot):
-            # The path has changed (an obstacle, a service that was down): choose an area on the new one.
-            planned = self.draw(path)
+        if not is_clear_of_robot(planned, robot) or not self.is_ahead(planned, left):
+            # The path has changed (an obstacle, a service that was down): choose an area on what is left of it.
+            planned = self.draw(left, travelled_m)
             if travelled_m < planned.trigger_m or not is_clear_of_robot(planned, robot):
                 return None
         return planned
+
+    def is_ahead(self, planned: PlannedHazard, left: Sequence[Point]) -> bool:
+        """Whether what is left of a path enters the hazard's area; true of an area that was asked for."""
+        return self._fixed is not None or entry_distance(left, planned.area.polygon) is not None
 
     def _requested(self, area_id: str) -> PlannedHazard:
         trigger = self._request.trigger_m

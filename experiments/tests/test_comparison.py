@@ -100,6 +100,18 @@ def test_a_warning_saves_only_where_the_obstacle_bars_the_way_and_at_most_the_wa
             assert late.saved_m < saving.saved_m
 
 
+def test_an_obstacle_that_appears_behind_the_robot_has_not_met_it():
+    """Reports counted it as met, on two recorded floors in a third of the drives: the whole way was looked at."""
+    site = load_site(ESTIG)
+    route = next(route for route in draw(runner.read_spec(site, ESTIG), 1, 1) if route.route.name == "ab")
+    barred = msgspec.structs.replace(route, area="z4", moment="under way", trigger_m=10.0)
+    geometry = RouteGeometry(site)
+    assert geometry.saving(barred).met
+    behind = geometry.saving(msgspec.structs.replace(barred, trigger_m=50.0))
+    assert not behind.met
+    assert behind.saved_m == pytest.approx(0.0, abs=0.01)
+
+
 # --- statistics ---
 
 

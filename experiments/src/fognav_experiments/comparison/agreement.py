@@ -152,6 +152,20 @@ def resources(drives: Sequence[MeasuredDrive]) -> list[Block]:
     ]  # fmt: skip
 
 
+def of_processes(drives: Sequence[MeasuredDrive]) -> tuple[float, float] | None:
+    """Return what the robot's processes took in `default` and in `fog`, % of a core; None unless both were measured.
+
+    Of drives at the pace of real time and without a quota.
+    """
+    plain = [drive for drive in drives if drive.cpu_percent and drive.cpu_quota is None and drive.speed == 1.0]
+    shares = {setup: [_of_robot(drive) for drive in plain if drive.setup == setup] for setup in ("default", "fog")}
+    return (_mean(shares["default"]), _mean(shares["fog"])) if all(shares.values()) else None
+
+
+def _of_robot(drive: MeasuredDrive) -> float:
+    return sum(drive.cpu_percent.get(name, 0.0) for name in ROBOTS_PROCESSES)
+
+
 def _circumstances(drive: MeasuredDrive) -> tuple[str, float | None, float, str]:
     """Return what a drive's cost depends on, its route apart."""
     return drive.setup, drive.cpu_quota, drive.speed, drive.commit

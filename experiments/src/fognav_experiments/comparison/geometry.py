@@ -19,6 +19,7 @@ from fog_kernels.inflation import inflate, inflation_table
 from fog_kernels.raycast import cast
 from fog_kernels.spans import raise_costs
 from fognav_sim.barrier import barrier_across
+from fognav_sim.drive.hazard import PlannedHazard, is_clear_of_robot, remaining
 from robot_agent.onboard.search import Search
 
 if TYPE_CHECKING:
@@ -38,7 +39,10 @@ _TOLERANCE_M: Final = 0.1
 
 
 class Saving(NamedTuple):
-    """Distances (m) of a robot that nobody warns, and of one that is; `met`: whether the obstacle barred the way."""
+    """Distances (m) of a robot that nobody warns, and of one that is.
+
+    `met`: whether the obstacle barred what was left of the way when it appeared.
+    """
 
     unwarned_m: float
     warned_m: float
@@ -70,26 +74,29 @@ class RouteGeometry:
         """Return what a warning saves on a drawn route; None if the obstacle leaves no way to the goal."""
         places = self._site.site.places
         start, goal = places[drawn.route.start], places[drawn.route.goal]
-        polygon = self._barrier(drawn)
+        hazard = self._hazard(drawn)
+        polygon = np.array(hazard.barrier.polygon)
         closed = self._with(polygon)
         way = self._path(self._open, (start.x, start.y), (goal.x, goal.y))
         if way is None:
             return None
-        along = lengths_along(way)
-        if drawn.trigger_m >= along[-1]:
-            return Saving(float(along[-1]), float(along[-1]), met=False)
-        warned = self._rest(closed, way, drawn.trigger_m, goal.x, goal.y)
-        seen = self._first_sight(way, drawn.trigger_m, polygon)
-        unwarned = float(along[-1]) if seen is None else self._rest(closed, way, seen, goal.x, goal.y)
+        length = float(lengths_along(way)[-1])
+        appears = _appears_at(hazard, way)
+        if appears is None:
+            return Saving(length, length, met=False)
+        warned = self._rest(closed, way, appears, goal.x, goal.y)
+        seen = self._first_sight(way, appears, polygon)
+        unwarned = length if seen is None else self._rest(closed, way, seen, goal.x, goal.y)
         if warned is None or unwarned is None:
             return None
-        met = bool(np.any(closed[self._rows(way)] >= LETHAL))
+        left = np.array(remaining([(x, y) for x, y in way.tolist()], appears))
+        met = bool(np.any(closed[self._rows(left)] >= LETHAL))
         return Saving(unwarned, min(warned, unwarned), met)
 
-    def _barrier(self, drawn: RouteDraw) -> Floats:
+    def _hazard(self, drawn: RouteDraw) -> PlannedHazard:
         site = self._site.site
         area = next(area for area in site.areas if area.id == drawn.area)
-        return np.array(barrier_across(area, site, self._site.map, drawn.seed).polygon)
+        return PlannedHazard(area, barrier_across(area, site, self._site.map, drawn.seed), drawn.trigger_m)
 
     def _with(self, polygon: Floats) -> Cells:
         """Return the costs with an obstacle on the floor."""
@@ -133,6 +140,14 @@ class RouteGeometry:
             if (free >= distances[near] - _TOLERANCE_M).any():
                 return float(driven)
         return None
+
+
+def _appears_at(hazard: PlannedHazard, way: Floats) -> float | None:
+    """Return the distance (m) along the way at which an obstacle appears: once it is due and the robot is away."""
+    for driven in np.arange(hazard.trigger_m, lengths_along(way)[-1], _STEP_M).tolist():
+        if is_clear_of_robot(hazard, _at(way, driven)):
+            return float(driven)
+    return None
 
 
 def _at(way: Floats, driven: float) -> tuple[float, float]:

@@ -55,18 +55,40 @@ def geometry(drives: Sequence[tuple[Saving, float, float]]) -> list[Block]:
     ]  # fmt: skip
 
 
-def computation(default: Mapping[str, float], fog: Mapping[str, float], robot: tuple[float, float]) -> Block:
-    """Return why the ratio of computation is what it is.
+def computation(  # the same shares in each setup, and what real processes took
+    default: Mapping[str, float],
+    full: Mapping[str, float] | None,
+    fog: Mapping[str, float],
+    robot: tuple[float, float],
+    live: tuple[float, float] | None,
+) -> Block:
+    """Return why the ratio of computation is what it is, and what of it the fog does.
 
-    default, fog: mean share of a core (%) by component of what move_base held; robot: that of the whole robot in the
-    two setups.
+    default, full, fog: mean share of a core (%) by component of what move_base held; full: None without such drives.
+    robot: that of the whole robot in `default` and `fog`; live: that of its real processes, None if nobody measured it.
     """
     before, after = sum(default.values()), sum(fog.values())
     local, planning = fog["local planning"], default["global planning"] + default["layers"]
     needed = THESIS_RATIO * after - default["local planning"]
     enough = "have" if needed > planning else "only have"
+    rates = ""
+    if full is not None:
+        between = sum(full.values())
+        rates = (
+            f"most of it is not the fog's work: `default` plans and controls at the usual rates of the ROS navigation "
+            f"stack, `full` and `fog` at lower ones. `full`, which plans for itself at the rates of `fog`, takes "
+            f"{before / between:.1f} times less than `default`, and `fog` {between / after:.1f} times less than "
+            "`full`. A robot at these rates that knows of no obstacle before it sees it, which would tell the fog's "
+            "share apart, has not been driven yet. Here "
+        )
+    processes = (
+        "lockstep leaves out the input and output of its processes, which are the same in all setups"
+        if live is None
+        else f"its real processes, which also read and write, took {live[0]:.2f} % and {live[1]:.2f} %: "
+        f"{live[0] / live[1]:.2f} times less, and this is what a robot's computer saves"
+    )
     return Paragraph(
-        f"Why {before / after:.1f} times, where the thesis has {THESIS_RATIO}: `default` spends "
+        f"Why {before / after:.1f} times, where the thesis has {THESIS_RATIO}: {rates}`default` spends "
         f"{default['global planning']:.2f} % on searching paths, {default['layers']:.2f} % on layers and "
         f"{default['local planning']:.2f} % on local planning. `fog` keeps the last of these, at half the rate of "
         f"control: {local:.2f} %, {100.0 * local / after:.0f} % of all that is left. That a robot must do itself, so "
@@ -74,8 +96,8 @@ def computation(default: Mapping[str, float], fog: Mapping[str, float], robot: t
         f"{needed:.2f} % instead of {planning:.2f} %: the faster they are, the less is saved by not doing them, and "
         "here they run on compiled kernels, and layers compute only what has changed. A stack whose search is "
         "slower, or that computes its layers as a whole, has a larger ratio. The whole robot, which must also locate "
-        f"itself, read its lidar and guard its wheels, computes {robot[0]:.2f} % and {robot[1]:.2f} %: "
-        f"{robot[0] / robot[1]:.1f} times less."
+        f"itself, read its lidar and guard its wheels, computes {robot[0]:.2f} % and {robot[1]:.2f} % in lockstep, "
+        f"{robot[0] / robot[1]:.1f} times less; {processes}."
     )
 
 

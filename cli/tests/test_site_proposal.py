@@ -42,7 +42,7 @@ def ring_of_corridors(width: float = 2.0) -> tuple[GridGeometry, NDArray[np.uint
 @pytest.mark.parametrize("seed", range(4))
 def test_proposed_site_has_a_path_and_a_detour_around_each_area(seed: int) -> None:
     geometry, cells = ring_of_corridors()
-    site = propose("ring", "map.yaml", geometry, cells, seed)
+    site = propose("ring", "map.yaml", geometry, cells, seed).site
     assert site.demo is not None
     assert site.demo.areas
     planner = Planner(geometry.width, geometry.height)
@@ -66,7 +66,7 @@ def test_proposed_site_has_a_path_and_a_detour_around_each_area(seed: int) -> No
 @pytest.mark.parametrize("seed", range(4))
 def test_nodes_are_on_a_wall_and_their_limits_end_before_the_opposite_wall(seed: int) -> None:
     geometry, cells = ring_of_corridors()
-    site = propose("ring", "map.yaml", geometry, cells, seed)
+    site = propose("ring", "map.yaml", geometry, cells, seed).site
     walls = (cells == 254).astype(np.uint8)
     for node in site.nodes:
         column, row = geometry.cell(node.x, node.y)
@@ -85,9 +85,23 @@ def test_map_without_a_second_path_gets_a_demo_without_areas() -> None:
     geometry = GridGeometry(600, 48, RESOLUTION, 0.0, 0.0)
     cells = np.full(geometry.shape, 254, dtype=np.uint8)
     cells[4:-4, 4:-4] = 0
-    site = propose("corridor", "map.yaml", geometry, cells)
+    site, why = propose("corridor", "map.yaml", geometry, cells)
     assert site.demo is not None
     assert site.demo.areas == []
+    assert "have no other way to the goal" in why
+    assert "Write areas and nodes of your own" in why
+
+
+def test_areas_are_found_on_a_floor_most_of_which_is_closed_rooms() -> None:
+    """Nearly all pairs of ends have no path between them: paths are counted, not pairs."""
+    small, ring = ring_of_corridors()
+    geometry = GridGeometry(960, 960, RESOLUTION, 0.0, 0.0)
+    cells = np.zeros(geometry.shape, dtype=np.uint8)
+    cells[::60, :] = cells[:, ::60] = 254
+    cells[: small.height, : small.width] = ring
+    cells[small.height, : small.width + 1] = cells[: small.height + 1, small.width] = 254
+    for seed in range(4):
+        assert propose("ring", "map.yaml", geometry, cells, seed).site.areas, f"seed {seed}"
 
 
 def test_map_without_free_floor_is_refused() -> None:
@@ -106,7 +120,7 @@ def test_written_site_is_valid_and_equals_the_proposal(tmp_path: Path) -> None:
     assert loaded.site.map == "map.yaml"
     assert loaded.map.geometry == geometry
     assert (loaded.map.cells == cells).all()
-    proposed = propose("my-floor-2", loaded.site.map, geometry, loaded.map.cells, seed=1)
+    proposed = propose("my-floor-2", loaded.site.map, geometry, loaded.map.cells, seed=1).site
     assert loaded.site.areas == proposed.areas
     assert loaded.site.nodes == proposed.nodes
     assert check_site(tmp_path / "sites" / "My Floor (2)")["ok"] is True
@@ -151,22 +165,35 @@ def test_every_proposed_node_reports_clear_on_the_empty_floor(seed: int) -> None
     geometry, cells = ring_of_corridors()
     # One block's sides are known as not free only, as in a recorded map: nothing echoes there.
     cells[44:-44, 44:220][cells[44:-44, 44:220] == 254] = 255
-    site = propose("ring", "map.yaml", geometry, cells, seed)
+    site = propose("ring", "map.yaml", geometry, cells, seed).site
     assert set(states(site, cells, geometry)) <= {"clear"}
 
 
 def test_no_node_is_proposed_where_no_wall_echoes() -> None:
     geometry, cells = ring_of_corridors()
     cells[cells == 254] = 255
-    assert propose("ring", "map.yaml", geometry, cells, 1).nodes == []
+    assert propose("ring", "map.yaml", geometry, cells, 1).site.nodes == []
 
 
 @pytest.mark.data
 @pytest.mark.parametrize("name", ["ipa/Freiburg52_scan.yaml", "ipa/NLB.yaml", "ipa/lab_intel.yaml", "utexas/2.yaml"])
 def test_every_node_proposed_on_a_recorded_floor_reports_clear(maps_dir: Path, name: str) -> None:
     static = load_map(maps_dir / name)
-    site = propose("floor", "map.yaml", static.geometry, static.cells, 1)
+    site = propose("floor", "map.yaml", static.geometry, static.cells, 1).site
     assert set(states(site, static.cells, static.geometry)) <= {"clear"}
+
+
+@pytest.mark.data
+@pytest.mark.parametrize(
+    ("name", "areas", "reason"),
+    [("mit/stata_basement.yaml", 3, ""), ("ipa/Freiburg52_scan.yaml", 0, "are not as wide all along")],
+)
+def test_a_floor_without_areas_is_told_with_the_reason(maps_dir: Path, name: str, areas: int, reason: str) -> None:
+    static = load_map(maps_dir / name)
+    site, why = propose("floor", "map.yaml", static.geometry, static.cells, 1)
+    assert len(site.areas) == areas
+    assert reason in why
+    assert bool(why) is not bool(areas)
 
 
 def test_existing_site_is_not_overwritten(tmp_path: Path) -> None:

@@ -373,6 +373,8 @@ def site_new(
         print_json(made)
     else:
         print_line(f"wrote {made['file']}: {made['areas']} watched areas. Try it: fognav demo --site {out}")
+        if made["why_no_areas"]:
+            print_line(f"no watched areas, so that a demo shows no hazard: {made['why_no_areas']}")
 
 
 @site_app.command("check", epilog="Example: fognav site check sites/estig")

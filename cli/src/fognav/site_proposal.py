@@ -5,10 +5,11 @@ A proposal is a starting point: it considers walls, not how people use the floor
 
 import math
 import random
+from collections import Counter
 from collections.abc import Iterator
 from dataclasses import dataclass
 from itertools import pairwise
-from typing import Final
+from typing import Final, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -46,15 +47,30 @@ _CANDIDATE_STEP_M: Final = 1.0
 _AREA_SPACING_M: Final = 4.0
 _MAX_DETOUR: Final = 4.0
 _MAX_AREAS: Final = 3
-_PAIRS: Final = 60
+_DRIVES: Final = 100
+"""How many paths are looked at."""
+_PAIRS: Final = 3000
+"""How many pairs of ends are drawn for them: on a large or branched floor most have no path of a suitable length."""
 _HEADINGS: Final = 36
 _BARRIERS: Final = 8
+_UNSEEN: Final = "have walls from which a sonar opposite does not get a clear echo, or too near for one"
 _NO_NOISE: Final = Noise(sonar_sigma=0.0, sonar_spike=0.0)
 _NO_ROBOT: Final = Robot(x=-1e6, y=-1e6, radius=0.1, height=0.1)
 
 
 class NoSiteError(ValueError):
     """The map has no path that is long enough for a robot; the message gives the criteria."""
+
+
+class Proposal(NamedTuple):
+    """A site; `why`: why it has no watched area, and what to do, "" if it has some."""
+
+    site: Site
+    why: str
+
+
+class _NoAreaError(ValueError):
+    """A spot can't be watched; the message says why, in words that fit other spots too."""
 
 
 @dataclass(frozen=True)
@@ -90,14 +106,16 @@ class _Drive:
     length: float
 
 
-def propose(name: str, map_path: str, geometry: GridGeometry, cells: NDArray[np.uint8], seed: int = 1) -> Site:
+def propose(name: str, map_path: str, geometry: GridGeometry, cells: NDArray[np.uint8], seed: int = 1) -> Proposal:
     """Return a site on the map (`cells`: 0 free, 254 occupied, 255 unknown); raises `NoSiteError`.
 
     With any one of the demo's areas blocked there is another path. A map without such areas gets a demo without areas.
     """
     floor = _floor(geometry, cells)
     best: _Drive | None = None
-    for drive in _drives(floor, random.Random(seed)):  # noqa: S311  # repeatable, not a secret
+    drives, reasons = 0, Counter[str]()
+    for drive in _drives(floor, random.Random(seed), reasons):  # noqa: S311  # repeatable, not a secret
+        drives += 1
         if best is None or _rank(drive) > _rank(best):
             best = drive
         if len(best.areas) >= 2:  # enough for the demo to choose from
@@ -112,7 +130,7 @@ def propose(name: str, map_path: str, geometry: GridGeometry, cells: NDArray[np.
         "b": Place(x=best.goal[0], y=best.goal[1], label="B"),
     }
     areas = [area for area, _ in best.areas]
-    return Site(
+    site = Site(
         id=name,
         name=name,
         map=map_path,
@@ -121,6 +139,22 @@ def propose(name: str, map_path: str, geometry: GridGeometry, cells: NDArray[np.
         nodes=[node for _, node in best.areas],
         robots=[RobotSite(id="r1", start=best.start)],
         demo=DemoPlan(start="a", goal="b", areas=[area.id for area in areas]),
+    )
+    return Proposal(site, "" if areas else _why(drives, reasons))
+
+
+def _why(drives: int, reasons: Counter[str]) -> str:
+    """Return why no spot on any path was good for a watched area, the most frequent reason first."""
+    tried = sum(reasons.values())
+    if not tried:
+        return (
+            f"{drives} paths were looked at, and none goes on for more than {sum(_ENDS_M):.0f} m: areas are proposed "
+            f"{_ENDS_M[0]:.0f} m behind the start at the earliest. Write your own areas into it, see docs/operations.md"
+        )
+    found = "; ".join(f"{count} {reason}" for reason, count in reasons.most_common())
+    return (
+        f"{tried} places on {drives} paths were looked at: {found}. Write areas and nodes of your own into it where a "
+        "sensor can watch the whole width, or try another --seed"
     )
 
 
@@ -139,12 +173,16 @@ def _floor(geometry: GridGeometry, cells: NDArray[np.uint8]) -> _Floor:
     return _Floor(geometry, raw, walls, half.inflated(raw), clearance, echoing)
 
 
-def _drives(floor: _Floor, generator: random.Random) -> Iterator[_Drive]:
+def _drives(floor: _Floor, generator: random.Random, reasons: Counter[str]) -> Iterator[_Drive]:
+    """Yield drives on the floor, and count in `reasons` why places on their paths have no area."""
     rows, columns = np.nonzero(floor.clearance >= PLACE_CLEARANCE_M)
     if rows.size == 0:
         return
     planner = Planner(floor.geometry.width, floor.geometry.height)
+    drives = 0
     for _ in range(_PAIRS):
+        if drives == _DRIVES:
+            return
         i, j = generator.randrange(rows.size), generator.randrange(rows.size)
         start, goal = (int(columns[i]), int(rows[i])), (int(columns[j]), int(rows[j]))
         apart = math.dist(start, goal) * floor.geometry.resolution
@@ -157,7 +195,8 @@ def _drives(floor: _Floor, generator: random.Random) -> Iterator[_Drive]:
         length = _length(path)
         if not DRIVE_M[0] <= length <= DRIVE_M[1]:
             continue
-        areas = _areas(floor, planner, path, length, start, goal)
+        drives += 1
+        areas = _areas(floor, planner, path, length, start, goal, reasons)
         ahead = path[min(len(path) - 1, round(1.0 / floor.geometry.resolution))]
         heading = math.atan2(ahead[1] - path[0][1], ahead[0] - path[0][0])
         pose = Pose(x=round(path[0][0], 3), y=round(path[0][1], 3), theta=round(heading, 3))
@@ -168,10 +207,16 @@ def _length(path: list[Point]) -> float:
     return sum(math.dist(a, b) for a, b in pairwise(path))
 
 
-def _areas(
-    floor: _Floor, planner: Planner, path: list[Point], length: float, start: tuple[int, int], goal: tuple[int, int]
+def _areas(  # noqa: PLR0913  # a path with its ends, and what it lies on
+    floor: _Floor,
+    planner: Planner,
+    path: list[Point],
+    length: float,
+    start: tuple[int, int],
+    goal: tuple[int, int],
+    reasons: Counter[str],
 ) -> list[tuple[AreaSite, NodeSite]]:
-    """Return watched areas along the path, each of which has a detour."""
+    """Return watched areas along the path, each of which has a detour; count in `reasons` why others were not taken."""
     found: list[tuple[AreaSite, NodeSite]] = []
     travelled, last, next_at = 0.0, -math.inf, _ENDS_M[0]
     for previous, point in pairwise(path):
@@ -181,11 +226,16 @@ def _areas(
         next_at = travelled + _CANDIDATE_STEP_M
         if travelled > length - _ENDS_M[1] or travelled - last < _AREA_SPACING_M:
             continue
-        candidate = _area_at(floor, point, len(found) + 1)
-        if candidate is None or not _is_sensed(floor, *candidate):
-            continue
-        detour = _detour(floor, planner, candidate[0].polygon, start, goal)
-        if detour is None or detour > _MAX_DETOUR * length:
+        try:
+            candidate = _area_at(floor, point, len(found) + 1)
+            _check_sensed(floor, *candidate)
+            detour = _detour(floor, planner, candidate[0].polygon, start, goal)
+            if detour is None:
+                raise _NoAreaError("have no other way to the goal")  # noqa: TRY301  # as the two before it
+            if detour > _MAX_DETOUR * length:
+                raise _NoAreaError(f"have another way only that is more than {_MAX_DETOUR:.0f} times as long")  # noqa: TRY301  # same
+        except _NoAreaError as error:
+            reasons[str(error)] += 1
             continue
         found.append(candidate)
         last = travelled
@@ -194,15 +244,15 @@ def _areas(
     return found
 
 
-def _area_at(floor: _Floor, spot: Point, number: int) -> tuple[AreaSite, NodeSite] | None:
-    """Return an area across the corridor at a spot with a node on its nearer wall, or None if it is not a corridor."""
+def _area_at(floor: _Floor, spot: Point, number: int) -> tuple[AreaSite, NodeSite]:
+    """Return an area across the corridor at a spot with a node on its nearer wall; raises `_NoAreaError`."""
     headings = np.linspace(0.0, math.pi, _HEADINGS, endpoint=False, dtype=np.float64)
     reach = _CORRIDOR_M[1]
     one, other = floor.ranges(spot, headings, reach), floor.ranges(spot, headings + math.pi, reach)
     narrowest = int(np.argmin(one + other))
     width = float(one[narrowest] + other[narrowest])
     if not _CORRIDOR_M[0] <= width <= _CORRIDOR_M[1]:
-        return None
+        raise _NoAreaError(f"are no corridor of {_CORRIDOR_M[0]} to {_CORRIDOR_M[1]} m")
     across = float(headings[narrowest])
     near, far = float(other[narrowest]), float(one[narrowest])
     if near > far:
@@ -213,10 +263,10 @@ def _area_at(floor: _Floor, spot: Point, number: int) -> tuple[AreaSite, NodeSit
     for side in (-half, half):
         beside = (spot[0] - dy * side, spot[1] + dx * side)
         if not floor.geometry.contains(*beside):
-            return None
+            raise _NoAreaError("are at the edge of the map")
         spread = floor.ranges(beside, np.array([across, across + math.pi]), reach)
         if abs(float(spread.sum()) - width) > 0.25 * width:
-            return None
+            raise _NoAreaError(f"are not as wide all along {_AREA_LENGTH_M} m: a door, a corner or an uneven wall")
     mount = (spot[0] - dx * (near - _MOUNT_GAP_M), spot[1] - dy * (near - _MOUNT_GAP_M))
     sonars = []
     for angle in _SONAR_ANGLES:
@@ -224,7 +274,7 @@ def _area_at(floor: _Floor, spot: Point, number: int) -> tuple[AreaSite, NodeSit
         echo = float(floor.ranges(mount, cone, _SONAR_MAX_M + 1.0).min())
         limit = min(echo, _SONAR_MAX_M) - _WALL_MARGIN_M
         if limit < _CORRIDOR_M[0] / 2:
-            return None
+            raise _NoAreaError(_UNSEEN)
         sonars.append(Sonar(angle=angle, range_limit=round(limit, 2), no_echo_is_clear=echo > _SONAR_MAX_M))
     corners = [
         (spot[0] + dx * u - dy * v, spot[1] + dy * u + dx * v)
@@ -246,27 +296,26 @@ def _area_at(floor: _Floor, spot: Point, number: int) -> tuple[AreaSite, NodeSit
     return area, node
 
 
-def _is_sensed(floor: _Floor, area: AreaSite, node: NodeSite) -> bool:
-    """Whether the simulated node is sure that its area is clear, and that one with a barrier is blocked.
+def _check_sensed(floor: _Floor, area: AreaSite, node: NodeSite) -> None:
+    """Raise `_NoAreaError` unless the simulated node is sure that its area is clear, and that a barrier blocks it.
 
     A wall may be too irregular, too oblique or unknown to echo; and no barrier may fit in for several seeds.
     """
     if _state_of(floor, node) != "clear":
-        return False
+        raise _NoAreaError(_UNSEEN)
     alone = Site(id="site", areas=[area], nodes=[node])
     static = StaticMap(floor.geometry, floor.raw)
     for seed in range(_BARRIERS):
         try:
             barrier = barrier_across(area, alone, static, seed)
         except BarrierError:
-            return False
+            raise _NoAreaError("have walls between which no barrier fits without a gap") from None
         floor.echoing.place(barrier)
         try:
             if _state_of(floor, node) != "blocked":
-                return False
+                raise _NoAreaError(_UNSEEN)
         finally:
             floor.echoing.remove(barrier.id)
-    return True
 
 
 def _state_of(floor: _Floor, node: NodeSite) -> AreaState:

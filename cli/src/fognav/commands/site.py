@@ -47,7 +47,7 @@ def new_site(map_file: Path, out: Path, seed: int) -> dict[str, object]:
     copied = None if (out / map_name).exists() else out / map_name
     try:
         static = load_map(map_file)
-        site = propose(identifier(out.resolve().name), map_name, static.geometry, static.cells, seed)
+        site, why = propose(identifier(out.resolve().name), map_name, static.geometry, static.cells, seed)
     except (MapFileError, NoSiteError) as error:
         raise WrongUseError(str(error)) from error
     try:
@@ -65,6 +65,7 @@ def new_site(map_file: Path, out: Path, seed: int) -> dict[str, object]:
         "file": str(target),
         "site": site.id,
         "areas": len(site.areas),
+        "why_no_areas": why,
         "places": {name: [place.x, place.y] for name, place in site.places.items()},
     }
 

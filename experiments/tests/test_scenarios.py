@@ -17,7 +17,7 @@ from fog_runtime.configuration.site import load_site
 from fognav_experiments.lockstep import DriveEvent
 from fognav_experiments.scenarios.description import Expected, FaultyNode, Scenario, SilentNode, deviations
 from fognav_experiments.scenarios.fleet_stage import FleetResult
-from fognav_experiments.scenarios.stage import Played, ScenarioError, _Stage, markdown_page, play, read_scenario
+from fognav_experiments.scenarios.stage import Played, ScenarioError, Stage, markdown_page, play, read_scenario
 
 ROOT = Path(__file__).parents[2]
 FILES = {file.stem: file for file in sorted((ROOT / "experiments" / "scenarios").glob("*.toml"))}
@@ -139,7 +139,7 @@ def test_nodes_that_fail_at_the_same_time_come_back_each_at_its_own_end():
     fog = SimpleNamespace(nodes=nodes)
     drive = SimpleNamespace(now=0.0, driven=0.0, system=SimpleNamespace(fog=fog), log_event=lambda _text: None)
     events = [SilentNode(node="n1", seconds=10.0), SilentNode(node="n2", seconds=20.0)]
-    stage = _Stage(drive, SimpleNamespace(events=events))
+    stage = Stage(drive, events)
 
     def heard(now):
         drive.now = now

@@ -58,6 +58,7 @@ if TYPE_CHECKING:
     from fog_runtime.configuration.site import LoadedSite
     from fognav_experiments.cpu import CpuMeter
     from fognav_experiments.rigs import Tuning
+    from fognav_sim.floor import Floor
     from fognav_sim.sensors import Noise
 
 WARM_UP_S: Final = 30.0
@@ -119,16 +120,18 @@ class LockstepDrive:
         lidar: str = DEFAULT_LIDAR,
         measure: Measure = unmeasured,
         tuning: Tuning | None = None,
+        ground: Floor | None = None,
     ) -> None:
-        """`watched`: whether the site has its areas and nodes, or what it has instead of them."""
+        """`watched`: whether the site has areas and nodes, or what it has instead. `ground`: if it is not the map's."""
         robot = msgspec.structs.replace(site.site.robots[0], start=start)
         self.site, self.goal, self.seed, self.hazard = site, goal, seed, hazard
         bare = msgspec.structs.replace(site.site, areas=[], nodes=[])
         with_nodes = watched if isinstance(watched, Site) else site.site if watched else bare
         floor = dataclasses.replace(site, site=with_nodes)
         self.system = System(
-            floor, robot, seed, noise=noise, base=base, lidar=lidar, bus=bus, measure=measure, tuning=tuning
-        )
+            floor, robot, seed, noise=noise, base=base, lidar=lidar, bus=bus, measure=measure, tuning=tuning,
+            floor=ground,
+        )  # fmt: skip
         self.world = self.system.world
         self.robot = self.system.robot
         self.events: list[DriveEvent] = []

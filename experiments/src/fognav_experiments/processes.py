@@ -213,6 +213,8 @@ class AgentProcess:
         self._measure = measure
         self.link = Link()
         """The robot's Wi-Fi: all messages go through it."""
+        self.observe: Callable[[Sequence[Publication], Moment], None] = lambda _publications, _at: None
+        """Is given what the robot publishes, whether it arrives or not."""
         self.received_bytes = 0
         """Bytes of the messages that were received and are of use in the robot's profile."""
         self._map_due = 0.0
@@ -281,6 +283,7 @@ class AgentProcess:
         """Tick the core; call it ten times a second."""
         with self._measure("messages"):
             publications = self.core.tick(at)
+        self.observe(publications, at)
         self._bus.publish(self.link.up(publications, at))
         self._ask_for_way_out(at)
 

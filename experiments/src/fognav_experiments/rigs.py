@@ -64,6 +64,8 @@ BOOT: Final = "lockstep"
 """Id of the agent's run: always the same, so that a run repeats itself exactly."""
 _INITIAL_WHEEL_TRAVEL_M: Final = (28.9, 0.04)
 """How far (m) the wheels have rolled before the start: a 16-bit encoder counter wraps during the drive."""
+_PORT_BYTES: Final = 4096
+"""What a serial port holds for a process that does not read it."""
 _GUARDIAN_STEPS: Final = 2
 _LIDAR_STEPS: Final = 2
 _STREAM_STEPS: Final = 5
@@ -164,6 +166,9 @@ class RobotRig:
         self._steps = 0
         self._stream_steps = _STREAM_STEPS
         self._nonce = 0
+        self.hung = False
+        """Whether the agent hangs: the guardian does not, and what base and lidar send waits."""
+        self._waiting: list[link.BaseFeedback] = []
 
     @property
     def now(self) -> float:
@@ -181,6 +186,8 @@ class RobotRig:
 
     def act(self) -> None:
         """Run the agent's loops that are due: as those of its process, all of them in the first step."""
+        if self.hung:
+            return
         at, step = moment(self.now), self._steps - 1
         self.process.deliver(at)
         if step % _MAP_STEPS == 0:
@@ -203,14 +210,16 @@ class RobotRig:
                 output = self.guardian.tick(now)
                 received += output.feedback
                 self._to_base += output.data
-        if received:
+        self._waiting += received
+        if self._waiting and not self.hung:
+            received, self._waiting = self._waiting, []
             with self._measure("localization"):
                 for feedback in received:
                     self.agent.on_base(link.decode_feedback(link.encode(feedback)), now)
 
     def _run_lidar(self, data: bytes, now: float) -> None:
-        self._from_lidar += data
-        if self._steps % _LIDAR_STEPS:
+        self._from_lidar = (self._from_lidar + data)[-_PORT_BYTES:]
+        if self._steps % _LIDAR_STEPS or self.hung:
             return
         if self.agent.lidar_on is not self._lidar_on:
             self._lidar_on, driver = self.agent.lidar_on, self._lidar_driver
@@ -356,12 +365,17 @@ class System:
         make_agent: Callable[[AgentConfig, int], AgentCore] = AgentCore,
         measure: Measure = unmeasured,
         tuning: Tuning | None = None,
+        floor: Floor | None = None,
     ) -> None:
-        """Assemble the system; `base` and `lidar` name the robot's hardware."""
+        """Assemble the system; `base` and `lidar` name the robot's hardware.
+
+        `floor`: the one that it drives on, if it is not exactly as the site's map says.
+        """
         tuned = tuning or Tuning()
         self.bus = bus or Bus(site.site.id)
         emulator = devices.make_base(base)
-        self.world = World(Floor(site.map.geometry, site.map.cells), robot, seed, axle_m=emulator.axle_m, noise=noise)
+        true_floor = floor or Floor(site.map.geometry, site.map.cells)
+        self.world = World(true_floor, robot, seed, axle_m=emulator.axle_m, noise=noise)
         self.fog = FogRig(site, self.world, self.bus, seed, 0.0, measure=measure)
         self.robot = RobotRig(
             site, robot, self.world, emulator, self.bus, seed, 0.0,
@@ -386,6 +400,7 @@ class System:
         self.robot.act()
         if self._steps % TICK_STEPS == 0:
             self.fog.tick(at)
-            self.robot.process.tick(at)
+            if not self.robot.hung:
+                self.robot.process.tick(at)
             self.fog.deliver(at)
         self._steps += 1

@@ -13,6 +13,7 @@ import numpy as np
 
 from fog_contracts.cones import SONAR_HALF_CONE
 from fog_kernels.emulation import disturb
+from fognav_sim.lidar_faults import LIDAR_MAX_M, LIDAR_MIN_M, LidarFaults
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -27,8 +28,6 @@ SONAR_MAX_M: Final = 4.0
 SONAR_RAYS: Final = 16
 SONAR_MAX_INCIDENCE: Final = math.radians(45.0)
 """Smooth surfaces reflect ultrasound like a mirror: beyond this angle of incidence no echo returns."""
-LIDAR_MIN_M: Final = 0.15
-LIDAR_MAX_M: Final = 12.0
 LIDAR_HEIGHT_M: Final = 0.25
 
 
@@ -48,6 +47,11 @@ class Noise:
     lidar_dropout: float = 0.01
     sonar_sigma: float = 0.004
     sonar_spike: float = 0.004
+    wheel_scale: tuple[float, float] = (1.0, 1.0)
+    wheel_gain: tuple[float, float] = (1.0, 1.0)
+    wheel_wander: float = 0.0
+    sonar_miss: float = 0.0
+    lidar: LidarFaults | None = None
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -93,6 +97,8 @@ def measure_lidar(
     for obstacle, seen, _ in floor.obstacle_ranges(x, y, directions, LIDAR_MAX_M):
         if obstacle.height >= LIDAR_HEIGHT_M:
             ranges = np.minimum(ranges, seen)
+    if noise.lidar is not None:
+        return noise.lidar.disturb(ranges, angles, (x, y), directions, generator)
     disturb(
         ranges,
         generator.standard_normal(ranges.size),
@@ -145,7 +151,7 @@ class Sonars:
         obstacle = self._nearest_obstacle(beam, fan, node.height)
         nearest = min(fan.nearest_wall, obstacle, _nearest_of_robot(fan, robot, node))
         nearest += self._ahead_m
-        if not SONAR_MIN_M <= nearest <= SONAR_MAX_M:
+        if not SONAR_MIN_M <= nearest <= SONAR_MAX_M or (noise.sonar_miss and generator.random() < noise.sonar_miss):
             return None
         return max(SONAR_MIN_M, nearest + noise.sonar_sigma * float(generator.standard_normal()))
 

@@ -28,6 +28,8 @@ if TYPE_CHECKING:
 
 _CONTACT_RELEASE_M: Final = 0.01
 """A contact has ended when the clearance exceeds this."""
+_WANDER_S: Final = 1.0
+"""Within which the speed of a wheel for the same command changes."""
 _BODY_CORNERS: Final = 8
 """Of the polygon around a robot's circle that the sensors of others measure."""
 
@@ -72,6 +74,9 @@ class World:
         self._wheel_commands = (0.0, 0.0)
         self.no_return_rad: tuple[float, float] | None = None
         """Sector of the lidar (from, to; rad, counter-clockwise) in which nothing returns its beams."""
+        self.held_wheels = [False, False]
+        """Whether the left and the right wheel turn on the spot."""
+        self._gain = [0.0, 0.0]
         self._others: tuple[World, ...] = ()
         start = robot.start
         self._body = _Body(start.x, start.y, start.theta)
@@ -160,13 +165,18 @@ class World:
             self._body.x, self._body.y, self._body.theta = old
             raise ValueError(f"({pose.x:.2f}, {pose.y:.2f}) is not free: choose a free place for the robot")
 
+    def turn(self, angle: float) -> None:
+        """Turn the robot by this angle (rad) at once, without its wheels."""
+        self._body.theta = math.remainder(self._body.theta + angle, math.tau)
+
     def step(self, dt: float) -> tuple[float, float]:
         """Simulate `dt` seconds; return how far the left and the right wheel rolled (m at nominal diameter)."""
         body = self._body
         share = 1.0 - math.exp(-dt / self._wheel_lag) if self._wheel_lag > 0 else 1.0
         # Friction stops the motors within a few millimetres, which cuts off the exponential tail.
-        body.left = _first_order_step(body.left, self._wheel_commands[0], share)
-        body.right = _first_order_step(body.right, self._wheel_commands[1], share)
+        left, right = self._driven_speeds(dt)
+        body.left = _first_order_step(body.left, left, share)
+        body.right = _first_order_step(body.right, right, share)
         wheel_travel = (body.left * dt, body.right * dt)
         if wheel_travel == (0.0, 0.0):
             return wheel_travel
@@ -174,8 +184,20 @@ class World:
             travel * scale + self.noise.slip * math.sqrt(abs(travel)) * float(self._rng.standard_normal())
             for travel, scale in zip(wheel_travel, self._diameter_scale, strict=True)
         ]
-        self._move(ground[0], ground[1])
+        left_scale, right_scale = self.noise.wheel_scale
+        left_held, right_held = self.held_wheels
+        self._move(0.0 if left_held else ground[0] * left_scale, 0.0 if right_held else ground[1] * right_scale)
         return wheel_travel
+
+    def _driven_speeds(self, dt: float) -> tuple[float, float]:
+        """Return the speeds (m/s) at which the motors turn for what is commanded."""
+        left, right = self._wheel_commands
+        gains = self.noise.wheel_gain
+        if (wander := self.noise.wheel_wander) > 0.0:
+            keep = math.exp(-dt / _WANDER_S)
+            fresh = wander * math.sqrt(1.0 - keep * keep)
+            self._gain = [keep * gain + fresh * float(self._rng.standard_normal()) for gain in self._gain]
+        return left * (gains[0] + self._gain[0]), right * (gains[1] + self._gain[1])
 
     def _move(self, left: float, right: float) -> None:
         body = self._body

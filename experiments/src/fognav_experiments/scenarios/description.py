@@ -29,16 +29,36 @@ class Event(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tru
 
 
 class Obstacle(Event, frozen=True, kw_only=True, tag="obstacle"):
-    """Somebody or something stands on the floor, for `seconds` (0: from then on), which lidar and sonars see."""
+    """Somebody or something stands on the floor, for `seconds` (0: from then on), which lidar and sonars see.
+
+    `area`: the watched area whose nodes must see it, if they are honest. It waits until the robot is `keep_m` away.
+    """
 
     polygon: Ring
     seconds: Seconds = 0.0
+    area: Id | None = None
+    keep_m: Metres = 0.0
+
+
+class Person(Event, frozen=True, kw_only=True, tag="person"):
+    """Somebody walks along a line (m) at `speed` (m/s), waits for a robot that is nearer than 1 m, and is gone then."""
+
+    line: list[PointXY]
+    speed: Annotated[float, Meta(gt=0.0, le=3.0)] = 1.0
 
 
 class NoGoZone(Event, frozen=True, kw_only=True, tag="zone"):
     """An operator draws a no-go zone, which no sensor sees; `seconds` later it is lifted (0: never)."""
 
     polygon: Ring
+    seconds: Seconds = 0.0
+
+
+class SpeedZone(Event, frozen=True, kw_only=True, tag="speed-zone"):
+    """An operator draws a zone with a limit of `speed` (m/s); `seconds` later it is lifted (0: never)."""
+
+    polygon: Ring
+    speed: Annotated[float, Meta(ge=0.01, le=2.54)]
     seconds: Seconds = 0.0
 
 
@@ -97,7 +117,62 @@ class BlindLidar(Event, frozen=True, kw_only=True, tag="blind-lidar"):
     end: float
 
 
-AnyEvent = Obstacle | NoGoZone | SilentNode | FaultyNode | LinkGap | SlowLink | Restart | Kidnapping | BlindLidar
+class HeldWheel(Event, frozen=True, kw_only=True, tag="held-wheel"):
+    """A threshold holds one side of the robot for `seconds`: its wheel turns on the spot, and its encoder counts."""
+
+    wheel: Literal["left", "right"]
+    seconds: Seconds
+
+
+class Push(Event, frozen=True, kw_only=True, tag="push"):
+    """A threshold turns the robot by this angle at once; its wheels do not."""
+
+    turn: float
+
+
+class HungAgent(Event, frozen=True, kw_only=True, tag="hung-agent"):
+    """The robot's agent hangs for `seconds`; its guardian does not, and what base and lidar send waits."""
+
+    seconds: Annotated[float, Meta(gt=0.0)]
+
+
+class SilentLidar(Event, frozen=True, kw_only=True, tag="silent-lidar"):
+    """The lidar sends nothing for `seconds`."""
+
+    seconds: Annotated[float, Meta(gt=0.0)]
+
+
+class BusyRadio(Event, frozen=True, kw_only=True, tag="busy-radio"):
+    """For `seconds` messages between robot and fog take times of a lognormal distribution, the same for 0.1 s.
+
+    `median_s`, `sigma`: of the times. `gaps_per_min`: how often nothing arrives in either direction, by a lognormal
+    distribution around 0.3 s.
+    """
+
+    seconds: Seconds
+    median_s: Annotated[float, Meta(gt=0.0)] = 0.003
+    sigma: Annotated[float, Meta(ge=0.0)] = 1.9
+    gaps_per_min: Annotated[float, Meta(ge=0.0)] = 1.0
+
+
+AnyEvent = (
+    Obstacle
+    | Person
+    | NoGoZone
+    | SpeedZone
+    | SilentNode
+    | FaultyNode
+    | LinkGap
+    | SlowLink
+    | BusyRadio
+    | Restart
+    | HungAgent
+    | SilentLidar
+    | HeldWheel
+    | Push
+    | Kidnapping
+    | BlindLidar
+)
 
 
 class Expected(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):

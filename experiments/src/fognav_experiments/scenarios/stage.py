@@ -2,35 +2,47 @@
 
 from __future__ import annotations
 
+import itertools
+import math
+import random
 import tomllib
 from functools import cache, partial
-from typing import TYPE_CHECKING, Final, NamedTuple
+from typing import TYPE_CHECKING, Final, Literal, NamedTuple, Protocol, runtime_checkable
 
 import msgspec
 
+from fog_contracts.geometry import distance_to_polygon
 from fog_contracts.messages import PolygonShape, Pose, RobotGoal, SimObstacle, Zone
 from fog_runtime.configuration.site import load_site
 from fognav_experiments.lockstep import LockstepDrive, LockstepResult, release_drives
 from fognav_experiments.rigs import moment
 from fognav_experiments.scenarios.description import (
     BlindLidar,
+    BusyRadio,
     FaultyNode,
+    HeldWheel,
+    HungAgent,
     Kidnapping,
     LinkGap,
     NoGoZone,
     Obstacle,
+    Person,
+    Push,
     Restart,
     Scenario,
+    SilentLidar,
     SilentNode,
     SlowLink,
+    SpeedZone,
     deviations,
 )
 from fognav_experiments.scenarios.fleet_stage import FleetResult, play_fleet
 from fognav_experiments.scenarios.node_faults import FaultyNodeSim
 from fognav_sim.drive.evaluation import DriveOutcome
+from fognav_sim.hardware import STEP_S
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Mapping
+    from collections.abc import Callable, Mapping, Sequence
     from pathlib import Path
 
     from fog_contracts.messages import Id
@@ -38,6 +50,23 @@ if TYPE_CHECKING:
     from fognav_experiments.rigs import FogProcessName
     from fognav_experiments.scenarios.description import AnyEvent
     from fognav_sim.nodes import SensorNode
+
+
+Word = Literal["fog", "agent", "lidar"]
+"""What a robot may lose."""
+_REPEAT_STEPS: Final = 10
+_PERSON_M: Final = 0.2
+"""Radius of somebody who walks."""
+_PERSON_RING: Final = [(math.cos(k * math.tau / 8), math.sin(k * math.tau / 8)) for k in range(8)]
+_PERSON_WAITS_M: Final = 1.0
+_GAP_S: Final = 0.3
+
+
+@runtime_checkable
+class StallingLidar(Protocol):
+    """The emulator of a lidar that can fall silent."""
+
+    stalled: bool
 
 
 class ScenarioError(ValueError):
@@ -95,7 +124,7 @@ def _play_alone(scenario: Scenario, site: LoadedSite) -> Played:
     if problem is None and scenario.profile != "fog":
         problem = run.switch(scenario.profile)
     drive, before = run.start(), len(run.events)
-    stage = _Stage(run, scenario)
+    stage = Stage(run, scenario.events)
     outcome = None if problem is None else DriveOutcome("stopped", problem)
     if outcome is None:
         run.system.fog.planner.set_goal(run.robot.id, goal, any_heading=True)
@@ -150,14 +179,29 @@ def _of_fleet(played: Played) -> str:
     )
 
 
-class _Stage:
-    """Begins and ends a scenario's events."""
+class Stage:
+    """Begins and ends the events of a drive; `seed` is that of the times that a busy radio takes.
 
-    def __init__(self, run: LockstepDrive, scenario: Scenario) -> None:
+    A subclass is told of what nothing published shows.
+    """
+
+    def __init__(self, run: LockstepDrive, events: Sequence[AnyEvent], seed: int = 1) -> None:
         self._run = run
         self._began = run.now
-        self._waiting = list(enumerate(scenario.events))
+        self._waiting = list(enumerate(events))
         self._ends: list[tuple[float, Callable[[], object]]] = []
+        self._repeated: list[Callable[[], bool]] = []
+        self._steps = 0
+        self._random = random.Random(seed)  # noqa: S311  # repeatable, not a secret
+
+    def on_lost(self, word: Word, *, lost: bool) -> None:
+        """Note that the robot does not get this from now on, or gets it again."""
+
+    def on_acknowledged(self, zone: Zone) -> None:
+        """Note that an operator's zone was acknowledged."""
+
+    def on_obstacle(self, area: str, *, stands: bool) -> None:
+        """Note that something stands before the nodes of an area, or is gone."""
 
     @property
     def elapsed(self) -> float:
@@ -176,17 +220,23 @@ class _Stage:
         for end in [end for end in self._ends if end[0] <= self.elapsed]:
             self._ends.remove(end)
             end[1]()
+        if self._steps % _REPEAT_STEPS == 0:
+            self._repeated = [repeat for repeat in self._repeated if repeat()]
+        self._steps += 1
 
-    def _begin(self, name: str, event: AnyEvent) -> None:
+    def _begin(self, name: str, event: AnyEvent) -> None:  # noqa: C901, PLR0912  # a table of the kinds of events
         run = self._run
         match event:
             case Obstacle():
-                run.world.place(SimObstacle(id=name, polygon=event.polygon))
-                self._later(event.seconds, partial(run.world.remove, name))
+                if not self._place(name, event):
+                    self._repeated.append(lambda: not self._place(name, event))
+            case Person():
+                self._repeated.append(partial(self._walk, name, event, self.elapsed))
             case NoGoZone():
-                zone = Zone(id=name, kind="BLOCKED", shape=PolygonShape(points=event.polygon))
-                self._put(zone)
-                self._later(event.seconds, partial(self._put, msgspec.structs.replace(zone, enabled=False, version=2)))
+                self._put_zone(Zone(id=name, kind="BLOCKED", shape=PolygonShape(points=event.polygon)), event.seconds)
+            case SpeedZone():
+                shape = PolygonShape(points=event.polygon)
+                self._put_zone(Zone(id=name, kind="SPEED_LIMIT", shape=shape, speed=event.speed), event.seconds)
             case SilentNode():
                 self._replace_node(event.node, lambda _node: [], event.seconds)
             case FaultyNode():
@@ -198,16 +248,93 @@ class _Stage:
             case SlowLink():
                 self._delay(event.delay_s)
                 self._later(event.seconds, partial(self._delay, 0.0))
+            case BusyRadio():
+                self._repeated.append(partial(self._transmit, event, self.elapsed + event.seconds))
             case Restart():
                 run.system.fog.stop(event.process)
                 self._later(event.seconds, partial(self._start_again, event.process))
+            case HungAgent():
+                self._hang(hung=True)
+                self._later(event.seconds, partial(self._hang, hung=False))
+            case SilentLidar():
+                self._stall(stalled=True)
+                self._later(event.seconds, partial(self._stall, stalled=False))
+            case HeldWheel():
+                self._hold(event.wheel, held=True)
+                self._later(event.seconds, partial(self._hold, event.wheel, held=False))
+            case Push():
+                run.world.turn(event.turn)
             case Kidnapping():
                 run.world.kidnap(Pose(x=event.to[0], y=event.to[1], theta=event.theta))
             case BlindLidar():
                 run.world.no_return_rad = (event.begin, event.end)
 
+    def _place(self, name: str, event: Obstacle) -> bool:
+        """Place an obstacle; return False if the robot is still too near."""
+        x, y, _ = self._run.world.pose
+        if event.keep_m and distance_to_polygon(event.polygon, x, y) < event.keep_m:
+            return False
+        self._run.world.place(SimObstacle(id=name, polygon=event.polygon))
+        if event.area is not None:
+            self.on_obstacle(event.area, stands=True)
+        self._later(event.seconds, partial(self._remove, name, event.area))
+        return True
+
+    def _remove(self, name: str, area: str | None) -> None:
+        self._run.world.remove(name)
+        if area is not None:
+            self.on_obstacle(area, stands=False)
+
+    def _walk(self, name: str, event: Person, began: float) -> bool:
+        """Move somebody on; return whether he is still there."""
+        legs = list(itertools.pairwise(event.line))
+        left = (self.elapsed - began) * event.speed
+        x, y, _ = self._run.world.pose
+        for (x0, y0), (x1, y1) in legs:
+            length = math.dist((x0, y0), (x1, y1))
+            if left <= length:
+                at = (x0 + (x1 - x0) * left / length, y0 + (y1 - y0) * left / length)
+                if math.dist(at, (x, y)) >= _PERSON_WAITS_M:
+                    ring = [(at[0] + dx * _PERSON_M, at[1] + dy * _PERSON_M) for dx, dy in _PERSON_RING]
+                    self._run.world.place(SimObstacle(id=name, polygon=ring, height=1.7))
+                return True
+            left -= length
+        self._run.world.remove(name)
+        return False
+
+    def _transmit(self, event: BusyRadio, until: float) -> bool:
+        """Draw the times of the next 0.1 s; return whether the radio is still busy."""
+        if self.elapsed >= until:
+            self._delay(0.0)
+            return False
+        self._delay(event.median_s * math.exp(event.sigma * self._random.gauss(0.0, 1.0)))
+        if self._random.random() < event.gaps_per_min * _REPEAT_STEPS * STEP_S / 60.0:
+            hears, is_heard = self._random.choice(((False, True), (True, False), (False, False)))
+            self._link(hears=hears, is_heard=is_heard)
+            seconds = _GAP_S * math.exp(self._random.gauss(0.0, 1.0))
+            self._later(max(seconds, 2 * STEP_S), partial(self._link, hears=True, is_heard=True))
+        return True
+
+    def _hang(self, *, hung: bool) -> None:
+        self._run.robot.hung = hung
+        self.on_lost("agent", lost=hung)
+
+    def _stall(self, *, stalled: bool) -> None:
+        lidar = self._run.robot.hardware.lidar
+        assert isinstance(lidar, StallingLidar), "the emulator of this lidar never falls silent"
+        lidar.stalled = stalled
+        self.on_lost("lidar", lost=stalled)
+
+    def _hold(self, wheel: Literal["left", "right"], *, held: bool) -> None:
+        self._run.world.held_wheels[("left", "right").index(wheel)] = held
+
+    def _put_zone(self, zone: Zone, seconds: float) -> None:
+        self._put(zone)
+        self._later(seconds, partial(self._put, msgspec.structs.replace(zone, enabled=False, version=2)))
+
     def _put(self, zone: Zone) -> None:
         self._run.system.fog.put_zone(zone, moment(self._run.now))
+        self.on_acknowledged(zone)
 
     def _replace_node(self, name: Id, replaced: Callable[[SensorNode], list[SensorNode]], seconds: float) -> None:
         """Let others take the place of a node; `seconds` later it is back."""
@@ -229,6 +356,7 @@ class _Stage:
     def _link(self, *, hears: bool, is_heard: bool) -> None:
         link = self._run.robot.process.link
         link.hears, link.is_heard = hears, is_heard
+        self.on_lost("fog", lost=not hears)
 
     def _delay(self, seconds: float) -> None:
         self._run.robot.process.link.delay_s = seconds

@@ -1,0 +1,151 @@
+"""Drives a hunted world in lockstep under the oracle's eyes."""
+
+from __future__ import annotations
+
+import math
+from functools import cache
+from pathlib import Path
+from typing import TYPE_CHECKING, Final
+
+import msgspec
+
+from fog_contracts.messages import Pose, RobotGoal
+from fog_runtime.configuration.maps import MapFileError, load_map
+from fog_runtime.configuration.site import LoadedSite
+from fognav_experiments.hunt import oracle as watching
+from fognav_experiments.hunt.oracle import Figures, Oracle, Violation
+from fognav_experiments.hunt.world import Built, HuntWorld, build, to_map
+from fognav_experiments.lockstep import LockstepDrive, release_drives
+from fognav_experiments.rigs import STAMP
+from fognav_experiments.scenarios.stage import Stage, Word
+from fognav_sim.drive.evaluation import DriveOutcome
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from fog_contracts.grid import StaticMap
+    from fog_contracts.messages import Zone
+
+_AFTER_S: Final = 3.0
+"""How long a drive goes on after a broken rule: what it leads to says more of it."""
+_BUSY_S: Final = 2.0
+"""How late messages are at most, but one in thousands, while a radio is busy."""
+
+
+class Hunted(msgspec.Struct, frozen=True, kw_only=True):
+    """How a drive of a world went: its end, its simulated seconds, what was broken, and its figures."""
+
+    title: str
+    outcome: str
+    reason: str
+    simulated_s: float
+    violations: list[Violation]
+    figures: Figures
+
+
+def read_world(file: Path) -> HuntWorld:
+    """Return the world of a file; raises `ValueError` with the file's name."""
+    try:
+        return msgspec.json.decode(file.read_bytes(), type=HuntWorld)
+    except (OSError, msgspec.DecodeError) as error:
+        raise ValueError(f"{file}: {error}. Correct it") from error
+
+
+def write_world(world: HuntWorld) -> bytes:
+    """Return a world as the text of its file, without what is as usual."""
+    usual = msgspec.to_builtins(HuntWorld(title="", start=(0.0, 0.0, 0.0), goal=(0.0, 0.0)))
+    said = {name: value for name, value in msgspec.to_builtins(world).items() if value != usual[name]}
+    return msgspec.json.format(msgspec.json.encode(said), indent=1) + b"\n"
+
+
+def load_recorded(name: str, folders: Sequence[Path]) -> StaticMap:
+    """Return the map of a file in one of the folders; raises `ValueError`."""
+    for folder in folders:
+        if (folder / name).is_file():
+            return _load(folder / name)
+    raise ValueError(f"map {name} is in no folder of: {', '.join(map(str, folders)) or 'none'}. Name its folder")
+
+
+@cache
+def _load(file: Path) -> StaticMap:
+    try:
+        return load_map(file)
+    except MapFileError as error:
+        raise ValueError(str(error)) from error
+
+
+def build_world(world: HuntWorld, folders: Sequence[Path] = ()) -> Built:
+    """Return a world's floor; its map is in one of the folders. Raises `ValueError`."""
+    return build(world, load_recorded(world.map, folders) if world.map else None)
+
+
+def hunt(world: HuntWorld, folders: Sequence[Path] = ()) -> Hunted:
+    """Drive a world to its end, or to its first broken rule and a few seconds more; the same for the same world."""
+    built = build_world(world, folders)
+    mission = RobotGoal(goal_id="hunt", pose=Pose(x=world.goal[0], y=world.goal[1], theta=0.0))
+    run = LockstepDrive(
+        LoadedSite(built.site, built.map, Path()), built.site.robots[0].start, mission, world.seed,
+        world.sensors.noise(), watched=True, hazard=None, bus=None, ground=built.floor,
+    )  # fmt: skip
+    oracle = Oracle(
+        watching.World(
+            radius=world.radius,
+            to_map=lambda x, y, theta: (*to_map(world, x, y), theta),
+            tolerance_m=0.10 + world.resolution + 0.5 * world.warp_m,
+            pose_floor_m=0.06 + world.resolution + world.warp_m,
+            gain=max(1.0, *world.sensors.gain) * (1.0 + 3.0 * world.sensors.wander),
+            late_s=_BUSY_S if world.busy else 0.0,
+        ),
+        STAMP,
+    )
+    run.system.bus.subscribe(oracle.handlers())
+    run.robot.process.observe = lambda publications, at: oracle.on_robot(publications, at.now)
+    outcome = _drive(world, run, oracle, mission)
+    found = Hunted(
+        title=world.title,
+        outcome=outcome.kind,
+        reason=outcome.reason,
+        simulated_s=round(run.now, 2),
+        violations=oracle.violations,
+        figures=oracle.figures.rounded(),
+    )
+    release_drives()
+    return found
+
+
+class _WatchedStage(Stage):
+    """Tells the oracle."""
+
+    def __init__(self, run: LockstepDrive, world: HuntWorld, oracle: Oracle) -> None:
+        super().__init__(run, world.events, world.seed)
+        self._oracle = oracle
+
+    def on_lost(self, word: Word, *, lost: bool) -> None:
+        (self._oracle.on_lost if lost else self._oracle.on_restored)(word, self._run.now)
+
+    def on_acknowledged(self, zone: Zone) -> None:
+        self._oracle.on_acknowledged(zone, self._run.now)
+
+    def on_obstacle(self, area: str, *, stands: bool) -> None:
+        if stands:
+            self._oracle.on_obstacle(area, self._run.now)
+        else:
+            self._oracle.on_obstacle_gone(area)
+
+
+def _drive(world: HuntWorld, run: LockstepDrive, oracle: Oracle, mission: RobotGoal) -> DriveOutcome:
+    problem = run.warm_up()
+    drive = run.start()
+    if problem is not None:
+        return DriveOutcome("stopped", problem)
+    stage = _WatchedStage(run, world, oracle)
+    run.system.fog.planner.set_goal(run.robot.id, mission, any_heading=True)
+    until = math.inf
+    outcome = None
+    while outcome is None and stage.elapsed < min(world.seconds, until):
+        stage.step()
+        run.step()
+        outcome = drive.outcome(run.now)
+        if oracle.violations and until == math.inf:
+            until = stage.elapsed + _AFTER_S
+    return outcome or DriveOutcome("stopped", f"ended after {stage.elapsed:.0f} s")

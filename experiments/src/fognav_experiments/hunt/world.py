@@ -1,0 +1,218 @@
+"""What the file of a hunted world says: a floor, a robot and its sensors, and what happens on a drive. Pure.
+
+It names no draw: the same file is the same drive, whatever the drawing of worlds has become. Lengths in m, angles in
+rad, times in s.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import TYPE_CHECKING, Annotated, NamedTuple
+
+import msgspec
+import numpy as np
+from msgspec import Meta
+
+from fog_contracts.grid import GridGeometry, StaticMap
+from fog_contracts.messages import Id, PointXY, Pose, Seconds
+from fog_contracts.site import AreaSite, NodeSite, RobotSite, Site, Sonar
+from fognav_experiments.scenarios.description import AnyEvent
+from fognav_sim.floor import Floor
+from fognav_sim.lidar_faults import LidarFaults
+from fognav_sim.sensors import Noise
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+Box = tuple[float, float, float, float]
+"""left, bottom, right, top (m)"""
+_FREE, _WALL = 0, 254
+_WAVES = 3
+
+
+class Watched(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """A watched area, a box, and its one node on the wall, at (x, y) and looking along theta; `limit` of its sonars."""
+
+    id: Id
+    box: Box
+    node: tuple[float, float, float]
+    limit: Annotated[float, Meta(gt=0.02, le=4.0)]
+
+
+class Patch(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """Surfaces within `radius` of (x, y) return a beam of the lidar with this probability."""
+
+    x: float
+    y: float
+    radius: float
+    returned: Annotated[float, Meta(ge=0.0, le=1.0)]
+
+
+class Sensors(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """How wheels and sensors err.
+
+    `recorded`: the lidar errs as recorded ones do, with `patches` and `dead` sectors. `scale`: travel on the ground for
+    what the encoders count, `gain`: speed for what is commanded, both left and right, `wander`: of the gain.
+    """
+
+    recorded: bool = False
+    patches: list[Patch] = []
+    dead: list[tuple[float, float]] = []
+    scale: tuple[float, float] = (1.0, 1.0)
+    gain: tuple[float, float] = (1.0, 1.0)
+    wander: float = 0.0
+    sonar_miss: Annotated[float, Meta(ge=0.0, le=1.0)] = 0.0
+    sonar_spike: Annotated[float, Meta(ge=0.0, le=1.0)] = 0.004
+
+    def noise(self) -> Noise:
+        """Return it as the simulator takes it."""
+        patches = tuple((patch.x, patch.y, patch.radius, patch.returned) for patch in self.patches)
+        lidar = LidarFaults(patches=patches, dead=tuple(self.dead)) if self.recorded or patches or self.dead else None
+        return Noise(
+            wheel_scale=self.scale, wheel_gain=self.gain, wheel_wander=self.wander,
+            sonar_miss=self.sonar_miss, sonar_spike=self.sonar_spike, lidar=lidar,
+        )  # fmt: skip
+
+
+class HuntWorld(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """A drive from `start` (x, y, theta) to `goal` on a floor of free boxes in solid wall, of `size` (x, y).
+
+    Or on that of a `map`, the file of a map_server map in one of the folders that the hunter is given.
+
+    `pillars`: walls in free boxes. `opened`: walls of the map that are not there (doors that were closed when it was
+    made); `placed`: things that are there and not on the map. `warp_m`: by how much the map is off at most, smoothly,
+    over `warp_length_m`. `seed`: of the sensors' noise.
+    """
+
+    title: str
+    start: tuple[float, float, float]
+    goal: PointXY
+    size: tuple[float, float] = (1.0, 1.0)
+    free: list[Box] = []
+    map: str = ""
+    pillars: list[Box] = []
+    opened: list[Box] = []
+    placed: list[Box] = []
+    resolution: Annotated[float, Meta(ge=0.02, le=0.2)] = 0.05
+    warp_m: Annotated[float, Meta(ge=0.0, le=0.3)] = 0.0
+    warp_length_m: Annotated[float, Meta(ge=2.0)] = 10.0
+    radius: Annotated[float, Meta(gt=0.05, le=0.5)] = 0.17
+    watched: list[Watched] = []
+    sensors: Sensors = Sensors()
+    events: list[AnyEvent] = []
+    seconds: Seconds = 240.0
+    seed: int = 1
+
+    @property
+    def busy(self) -> bool:
+        """Whether messages may be late."""
+        return any(event.__struct_config__.tag in {"slow-link", "busy-radio"} for event in self.events)
+
+
+class Built(NamedTuple):
+    """A world as the system takes it: the site, its map, and the floor as it truly is."""
+
+    site: Site
+    map: StaticMap
+    floor: Floor
+
+
+def build(world: HuntWorld, recorded: StaticMap | None = None) -> Built:
+    """Return a world's map and floor; raises `ValueError` for a start or goal that is not free on it.
+
+    `recorded`: what the file of its `map` holds, if it has one.
+    """
+    width, height = (math.ceil(side / world.resolution) for side in world.size)
+    geometry = GridGeometry(width, height, world.resolution, 0.0, 0.0) if recorded is None else recorded.geometry
+    plain = np.full(geometry.shape, _WALL, np.uint8) if recorded is None else recorded.cells
+    mapped = _cells(geometry, plain, world.free, [*world.pillars, *world.opened])
+    truth = _cells(geometry, plain, world.free, [*world.pillars, *world.placed])
+    site = Site(
+        id="hunt",
+        areas=[
+            AreaSite(id=area.id, label=area.id, polygon=_ring(area.box), number=number)
+            for number, area in enumerate(world.watched, start=1)
+        ],
+        nodes=[
+            NodeSite(
+                id=f"n-{area.id}", area=area.id, x=area.node[0], y=area.node[1], theta=area.node[2],
+                sonars=[Sonar(angle=angle, range_limit=area.limit) for angle in (-0.22, 0.22)],
+            )
+            for area in world.watched
+        ],
+        robots=[RobotSite(id="r1", start=_pose(world.start), radius=world.radius)],
+    )  # fmt: skip
+    floor = Floor(geometry, truth)
+    for name, (x, y) in (("start", world.start[:2]), ("goal", world.goal)):
+        if floor.nearest(x, y)[0] < world.radius:
+            raise ValueError(f"{world.title}: its {name} ({x:g}, {y:g}) is not free: choose another one")
+    return Built(site, StaticMap(geometry, _warped(world, geometry, mapped)), floor)
+
+
+def displacement(world: HuntWorld, x: float, y: float) -> tuple[float, float]:
+    """Return how far (m) what is drawn at (x, y) of the map truly is from there."""
+    dx, dy = _displaced(world, np.array([x]), np.array([y]))
+    return float(dx[0]), float(dy[0])
+
+
+def to_map(world: HuntWorld, x: float, y: float) -> tuple[float, float]:
+    """Return where the map draws what truly is at (x, y)."""
+    mx, my = x, y
+    for _ in range(3):
+        dx, dy = displacement(world, mx, my)
+        mx, my = x - dx, y - dy
+    return mx, my
+
+
+def _displaced(
+    world: HuntWorld, x: NDArray[np.float64], y: NDArray[np.float64]
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Sum a few waves, whose phases the world's seed gives."""
+    random = np.random.default_rng(world.seed)
+
+    def moved() -> NDArray[np.float64]:
+        total = np.zeros_like(x)
+        for _ in range(_WAVES):
+            direction, phase = random.uniform(0.0, math.tau, 2)
+            number = math.tau / world.warp_length_m * random.uniform(0.6, 1.4)
+            total += np.sin(number * (np.cos(direction) * x + np.sin(direction) * y) + phase)
+        return total * (world.warp_m / _WAVES)
+
+    return moved(), moved()
+
+
+def _warped(world: HuntWorld, geometry: GridGeometry, cells: NDArray[np.uint8]) -> NDArray[np.uint8]:
+    if world.warp_m == 0.0:
+        return cells
+    columns, rows = np.meshgrid(np.arange(geometry.width), np.arange(geometry.height))
+    x, y = (
+        geometry.origin_x + (columns + 0.5) * geometry.resolution,
+        geometry.origin_y + (rows + 0.5) * geometry.resolution,
+    )
+    dx, dy = _displaced(world, x.astype(np.float64), y.astype(np.float64))
+    from_column = np.clip(
+        np.floor((x + dx - geometry.origin_x) / geometry.resolution).astype(np.int64), 0, geometry.width - 1
+    )
+    from_row = np.clip(
+        np.floor((y + dy - geometry.origin_y) / geometry.resolution).astype(np.int64), 0, geometry.height - 1
+    )
+    return np.ascontiguousarray(cells[from_row, from_column])
+
+
+def _cells(geometry: GridGeometry, plain: NDArray[np.uint8], free: list[Box], walls: list[Box]) -> NDArray[np.uint8]:
+    cells = plain.copy()
+    for boxes, value in ((free, _FREE), (walls, _WALL)):
+        for box in boxes:
+            left, right = (max(0, round((x - geometry.origin_x) / geometry.resolution)) for x in box[::2])
+            bottom, top = (max(0, round((y - geometry.origin_y) / geometry.resolution)) for y in box[1::2])
+            cells[bottom:top, left:right] = value
+    return cells
+
+
+def _ring(box: Box) -> list[PointXY]:
+    left, bottom, right, top = box
+    return [(left, bottom), (right, bottom), (right, top), (left, top)]
+
+
+def _pose(start: tuple[float, float, float]) -> Pose:
+    return Pose(x=start[0], y=start[1], theta=start[2])

@@ -7,6 +7,7 @@ emulated time.
 
 from __future__ import annotations
 
+import itertools
 import math
 from dataclasses import dataclass, field, replace
 
@@ -22,7 +23,7 @@ from fog_contracts.replica import MasterMap
 from fog_kernels.inflation import inflate, inflation_table
 from fog_kernels.raycast import cast
 from robot_agent.agent.core import AgentCore, decide
-from robot_agent.config import agent_config
+from robot_agent.config import AgentConfig, agent_config
 from robot_agent.guardian.link import BaseFeedback
 from robot_agent.hardware import (
     BaseStatus,
@@ -33,6 +34,7 @@ from robot_agent.hardware import (
     WheelOdometry,
 )
 from robot_agent.lidars.repeated_scans import RepeatCounter
+from robot_agent.localization.pose import Pose2
 
 KEY = b"k" * 32
 TICK_M = math.pi * 0.072 / 508.8
@@ -71,6 +73,8 @@ class LittleWorld:
     lidar_noise: float = 0.01
     start_agent: type = AgentCore
     wheel_error: float = 0.0  # by how much the encoders count too far, as a share
+    config: AgentConfig = AGENT  # of the body and the lidar's place on it, too
+    posts: list = field(default_factory=list)  # rectangles (left, bottom, right, top in m) that no map has
 
     def __post_init__(self):
         self.static, self.geometry = grid_of(self.rooms, *self.size)
@@ -79,7 +83,7 @@ class LittleWorld:
         self.raw = self.static.copy()
         self.master = MasterMap("lab", self.geometry, self.static, inflate(self.raw, self.table), epoch=7)
         self.rng = np.random.default_rng(self.seed)
-        self.agent = self.start_agent(AGENT, self.seed)
+        self.agent = self.start_agent(self.config, self.seed)
         self.now = START
         self.steps = 0
         self.stream_steps = 5
@@ -198,7 +202,7 @@ class LittleWorld:
         saved = self.agent.pose_to_store(self.now)
         self.wheels = (0.0, 0.0)
         self.restarts += 1
-        self.agent = self.start_agent(replace(AGENT, boot=f"b{1 + self.restarts}"), self.seed + self.restarts)
+        self.agent = self.start_agent(replace(self.config, boot=f"b{1 + self.restarts}"), self.seed + self.restarts)
         if saved is not None:
             self.agent.restore(saved)
         return saved
@@ -284,6 +288,11 @@ class LittleWorld:
         if len(xs) and np.hypot(xs - nx, ys - ny).min() < 0.16:
             self.collided = True
             return
+        for corner in itertools.chain.from_iterable(map(_outline, self.posts)):
+            at = Pose2(nx, ny, self.theta).inverse_transform(np.array([corner]))[0]
+            if self.config.footprint.outside_by(*at) < 0.0:
+                self.collided = True
+                return
         self.travelled += math.hypot(nx - self.x, ny - self.y)
         self.x, self.y = nx, ny
         for wheel, speed in enumerate((left, right)):
@@ -300,10 +309,14 @@ class LittleWorld:
         new = np.arange(len(self.beams), due)
         if len(new):
             angles = -(new + 0.5) * 2 * math.pi / BEAMS  # clockwise, as the real head rotates
-            g = self.geometry
-            ranges = cast(self.solid, g.resolution, g.origin_x, g.origin_y, self.x, self.y, angles + self.theta, 12.0)
+            g, lidar = self.geometry, self.config.localization
+            x, y = Pose2(self.x, self.y, self.theta).transform(np.array([(lidar.lidar_x, lidar.lidar_y)]))[0]
+            ranges = cast(self.solid, g.resolution, g.origin_x, g.origin_y, x, y, angles + self.theta, 12.0)
+            for post in self.posts:
+                ranges = np.fmin(ranges, _ranges_of(post, x, y, angles + self.theta))
             ranges += self.lidar_noise * self.rng.standard_normal(len(ranges))
             ranges[~np.isfinite(ranges) | (self.rng.random(len(ranges)) < 0.02)] = math.nan
+            ranges[ranges < lidar.range_min] = math.nan
             self.beams.extend(zip(angles, ranges, strict=True))
             samples = LidarSamples(
                 angles_rad=np.array([math.remainder(a, 2 * math.pi) for a in angles], np.float32),
@@ -325,6 +338,23 @@ class LittleWorld:
             self.agent.on_scan(scan, self.now)
             self.beams = []
             self.scan_started = self.now
+
+
+def _ranges_of(post, x, y, directions):
+    """Return the range (m) of each ray from (x, y) to a rectangle, infinite beside it (the method of slabs)."""
+    left, bottom, right, top = post
+    with np.errstate(divide="ignore"):
+        across = np.sort([(left - x) / np.cos(directions), (right - x) / np.cos(directions)], axis=0)
+        along = np.sort([(bottom - y) / np.sin(directions), (top - y) / np.sin(directions)], axis=0)
+    enters, leaves = np.maximum(across[0], along[0]), np.minimum(across[1], along[1])
+    return np.where((enters <= leaves) & (enters > 0.0), enters, np.inf)
+
+
+def _outline(post, step=0.01):
+    """Return points (m) on the sides of a rectangle, a centimetre apart."""
+    left, bottom, right, top = post
+    xs, ys = (np.linspace(low, high, round((high - low) / step) + 1) for low, high in ((left, right), (bottom, top)))
+    return [(x, y) for x in xs for y in (bottom, top)] + [(x, y) for y in ys for x in (left, right)]
 
 
 def release_of(path, **changes):

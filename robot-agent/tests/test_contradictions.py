@@ -29,6 +29,7 @@ driver = "{lidar}"
 [{table}]
 {more}
 """
+CIRCLE = Footprint.circle(0.17)
 BOX = "footprint = [[0.3, 0.2], [-0.1, 0.2], [-0.1, -0.2], [0.3, -0.2]]"
 POSTS = "masks = [[2.0, 2.2], [2.1, 2.4], [-2.2, -2.0], [3.0, -3.0]]"
 
@@ -142,10 +143,22 @@ def test_masks_are_refused_just_where_the_robot_would_never_drive_ahead(middle):
 def test_what_may_surprise_is_remarked():
     behind = robot(mounting="masks = [[2.4, -2.4]]", more="rest_base = true", options='brc = "rts"', lidar="ld19")
     checked(behind)
-    told = remarks(behind, registry.make_lidar(behind).traits)
+    told = remarks(behind, registry.make_lidar(behind).traits, CIRCLE)
     assert ["never drives backwards" in told[0], "rest_base has no effect" in told[1]] == [True, True]
     can_rest = LidarTraits(range_min_m=0.1, range_max_m=8.0, scan_period_s=0.2, can_rest=True)
-    assert remarks(robot(mounting=POSTS, more="rest_base = true"), can_rest) == []
+    assert remarks(robot(mounting=POSTS, more="rest_base = true"), can_rest, CIRCLE) == []
+
+
+def test_rim_of_the_body_that_is_nearer_to_the_lidar_than_it_measures_is_remarked():
+    traits = registry.make_lidar(robot()).traits
+    for x_m, rest in ((0.0, None), (0.01, None), (0.10, "only 0.07 m"), (-0.10, "only 0.07 m")):
+        told = remarks(robot(mounting=f"x_m = {x_m}"), traits, CIRCLE)
+        assert [rest in one for one in told] == ([True] if rest else []), x_m
+    long = Footprint(((0.35, 0.25), (-0.35, 0.25), (-0.35, -0.25), (0.35, -0.25)))
+    assert "only 0.05 m" in remarks(robot(mounting="x_m = 0.30"), traits, long)[0]
+    assert (
+        remarks(robot(mounting="x_m = 0.30", lidar="ld19"), registry.make_lidar(robot(lidar="ld19")).traits, long) == []
+    )
 
 
 def test_distance_beyond_a_footprint_is_that_to_its_side():

@@ -60,9 +60,16 @@ def refuse_body(robot: RobotFile, base: BaseDriver, footprint: Footprint) -> Non
         )
 
 
-def remarks(robot: RobotFile, lidar: LidarTraits) -> list[str]:
+def remarks(robot: RobotFile, lidar: LidarTraits, footprint: Footprint) -> list[str]:
     """Return what a person may not expect of settings that are no mistake."""
     told = []
+    inside, place = -footprint.outside_by(robot.settings.lidar.x_m, robot.settings.lidar.y_m), "lidar.x_m and lidar.y_m"
+    if 0.0 <= inside < lidar.range_min_m:
+        told.append(
+            f"{place}: the lidar measures from {lidar.range_min_m:g} m on, and the body's rim is only {inside:.2f} m "
+            "from it: what stands within the rest when the robot is started, or comes in there from aside, it does not "
+            "see. Keep that free, or mount the lidar farther from the rim"
+        )
     if _hidden(robot.settings.lidar.masks, math.pi) >= BLIND_SHARE:
         told.append("lidar.masks hide the way behind: the robot never drives backwards, nor off a dock")
     if robot.settings.power.rest_base and not lidar.can_rest:

@@ -128,7 +128,7 @@ def contradictions(robot: RobotFile) -> list[str]:
 
     base, footprint = registry.make_base(robot), read_footprint(robot)
     refuse_contradictions(robot, base)
-    told = remarks(robot, registry.make_lidar(robot).traits)
+    told = remarks(robot, registry.make_lidar(robot).traits, footprint or Footprint.circle(ROBOT_RADIUS))
     if footprint is not None:
         refuse_body(robot, base, footprint)
         return told

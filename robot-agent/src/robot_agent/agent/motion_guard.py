@@ -33,7 +33,7 @@ class MotionGuard:
         # A point may come nearer while it is remembered, and the lidar need not be in the middle.
         reach = self._field.reach + abs(lidar.lidar_x) + abs(lidar.lidar_y)
         reach += config.stop_field.memory * config.drive_train.wheel_speed_max_m_s
-        self._points = NearPoints(lidar, reach, config.stop_field.memory)
+        self._points = NearPoints(lidar, reach, config.stop_field.memory, config.footprint)
         self.reason: str | None = None
         """Why the last command is zero although another one was requested; else None."""
         self.unseeing = False

@@ -24,6 +24,7 @@ from robot_agent.agent.edges.store import Store
 from robot_agent.agent.recording.input_writer import open_core
 from robot_agent.agent.service import Service
 from robot_agent.config import agent_config
+from robot_agent.contradictions import remarks
 from robot_agent.guardian.protection import run_in_real_time
 from robot_agent.hardware import DockingDriver
 
@@ -64,6 +65,8 @@ async def run(
     inscribed = round(config.footprint.inscribed_radius, 3)
     sizes = {"radius": config.radius, "inscribed_radius": inscribed}
     _log.info("robot_body", source=source, **sizes, site=site, entry=to_builtins(body))
+    for remark in remarks(robot, lidar.driver.traits, config.footprint):
+        _log.warning("robot_remark", remark=remark)
     use_one_thread()
     health = Health("map", "pose", "lidar", "base")
     async with ZenohEdge.open(

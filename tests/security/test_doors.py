@@ -15,6 +15,7 @@ from fog_runtime.access.credentials import Credentials
 from fog_runtime.clock import SystemClock
 from fog_runtime.locks.site_locks import SiteLocks
 from fog_runtime.stores.redis_connection import RedisConnection, StoreError
+from fog_runtime.transports.mqtt_broker import Broker
 from fog_runtime.transports.zenoh_edge import ZenohEdge
 from fog_supervisor.servers import start_mosquitto, start_redis, start_router
 
@@ -197,6 +198,49 @@ def test_sensors_of_others_publish_on_their_own_topics_only(servers, locks, user
     done, *refused = publish_results(servers["mosquitto"], Credentials.read(locks.credentials(user)), topics)
     assert done in {"Success", "No matching subscribers"}
     assert refused == ["Not authorized"] * 3
+
+
+async def test_home_assistant_discovers_the_areas_of_all_floors_and_its_states_are_sources_there(servers, locks):
+    """It has one connection: for discovery, its birth and will messages, and `mqtt_statestream`."""
+
+    def client(user):
+        own = Credentials.read(locks.credentials(user))
+        return Broker.of(servers["mosquitto"].url, own).client(user, None)
+
+    async def topics(connection, number):
+        async with asyncio.timeout(WAIT_S):
+            found = {(await anext(connection.messages)).topic.value}
+            while len(found) < number:
+                found.add((await anext(connection.messages)).topic.value)
+        return found
+
+    state = "homeassistant/binary_sensor/lift_door/state"
+    async with (
+        client("home-assistant") as home,
+        client("hazard-aggregator") as lab,
+        client("attic.hazard-aggregator") as up,
+    ):
+        for_home = set()
+        for floor, connection in (("lab", lab), ("attic", up)):
+            own = [
+                ch.HOME_ASSISTANT_AREA.key(site=floor, area="hall"),
+                ch.AREA_HAZARD.key(site=floor, area="hall"),
+                ch.AGGREGATOR_AVAILABILITY.key(site=floor),
+                ch.AGGREGATOR_ALERTS.key(site=floor),
+            ]
+            for topic in own:
+                await connection.publish(topic, b"x", qos=1, retain=True)
+            for_home |= {*own}
+            await connection.subscribe([(state, 1), ("homeassistant/status", 1)])
+        await home.subscribe([("homeassistant/#", 1), ("fog/v1/#", 1)])
+        assert await topics(home, len(for_home)) == for_home
+        await home.publish("homeassistant/status", b"online", qos=1, retain=True)
+        await home.publish(state, b"off", qos=1, retain=True)
+        for connection in (lab, up):
+            assert await topics(connection, 2) == {state, "homeassistant/status"}
+    refused = [ch.HOME_ASSISTANT_AREA.key(site="lab", area="hall"), ch.AREA_HAZARD.key(site="lab", area="hall"), "door"]
+    own = Credentials.read(locks.credentials("home-assistant"))
+    assert publish_results(servers["mosquitto"], own, refused) == ["Not authorized"] * len(refused)
 
 
 async def test_robot_neither_changes_the_map_nor_speaks_for_another_robot(servers, locks):

@@ -12,10 +12,12 @@ from fog_contracts.channels import AGGREGATOR, CHANNELS, NODE, ROLES, Channel, R
 from fog_contracts.generate import NOTE
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping, Sequence
+    from collections.abc import Iterable, Mapping, Sequence
 
 Access = Literal["read", "write"]
 
+_HOME_ASSISTANTS_OWN: Final = ("homeassistant/status", "homeassistant/+/+/state")
+"""Its birth and will messages, and the states of its entities (`mqtt_statestream` with the base `homeassistant`)."""
 _HEAD: Final = f"""\
 # Who may publish and receive what through the MQTT broker: Mosquitto's `acl_file`.
 # {NOTE}
@@ -37,10 +39,11 @@ def mqtt_acl(
 
     The users named in `unrestricted` may publish and receive everything. `floors` are further sites with their own
     users, named `SITE.NAME`, and their nodes: each may only use topics that name its site, and so none of the thesis.
+    The first site's Home Assistant is the building's: it reads what is for it on all floors, and may write its states.
     `devices` are sensors and gateways of others with the topics that they may use.
     """
     sections = [_HEAD]
-    sections += [_section(role, site) for role in ROLES if role != NODE and _lines(role, site)]
+    sections += [_section(role, site, floors or {}) for role in ROLES if role != NODE and _lines(role, site)]
     sections += [f"user {user}\ntopic readwrite #\ntopic read $SYS/#\n" for user in unrestricted]
     for device, topics in (devices or {}).items():
         lines = [f"topic readwrite {topic}" for topic in topics]
@@ -52,10 +55,13 @@ def mqtt_acl(
     return "\n".join(sections)
 
 
-def _section(role: Role, site: str) -> str:
+def _section(role: Role, site: str, floors: Iterable[str]) -> str:
     lines = _lines(role, site)
     if role == AGGREGATOR:
         lines.append("read  #")  # a source of an area may publish on any topic
+    if role == "home-assistant":
+        lines += [line for floor in floors for line in _floor_lines(role, floor)]
+        lines += [f"write {topic}" for topic in _HOME_ASSISTANTS_OWN]
     return "\n".join([f"# {ROLES[role]}", f"user {role}", *(f"topic {line}" for line in lines), ""])
 
 

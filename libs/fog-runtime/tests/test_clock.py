@@ -1,4 +1,8 @@
 import asyncio
+import os
+import shutil
+import subprocess
+import sys
 import time
 
 import pytest
@@ -245,6 +249,44 @@ async def test_fast_clock_scales_time_and_timeouts():
 def test_speed_out_of_range_is_refused(speed):
     with pytest.raises(ValueError, match="speed"):
         SystemClock(speed)
+
+
+SLEWED = """
+#define _GNU_SOURCE
+#include <dlfcn.h>
+#include <time.h>
+
+// The clocks that chrony slews, at its highest rate since the computer was booted; others are as they are.
+int clock_gettime(clockid_t id, struct timespec *at) {
+    static int (*real)(clockid_t, struct timespec *);
+    if (!real) *(void **)&real = dlsym(RTLD_NEXT, "clock_gettime");
+    const int result = real(id, at);
+    if (id == CLOCK_MONOTONIC || id == CLOCK_REALTIME || id == CLOCK_BOOTTIME) at->tv_sec += at->tv_sec / 12;
+    return result;
+}
+"""
+
+
+@pytest.mark.skipif(shutil.which("gcc") is None, reason="no gcc to build the slewed clock: apt-get install gcc")
+def test_clock_of_a_process_is_not_slewed_with_the_time_of_day(tmp_path):
+    source, library = tmp_path / "slewed.c", tmp_path / "slewed.so"
+    source.write_text(SLEWED)
+    subprocess.run(["gcc", "-shared", "-fPIC", "-o", library, source, "-ldl"], check=True)
+    program = "import time; from fog_runtime.clock import SystemClock; print(time.monotonic(), SystemClock().now())"
+    began = time.clock_gettime(time.CLOCK_MONOTONIC_RAW), time.monotonic()
+    slewed, now = map(
+        float,
+        subprocess.run(
+            [sys.executable, "-c", program],
+            env={**os.environ, "LD_PRELOAD": str(library)},
+            check=True,
+            capture_output=True,
+            text=True,
+        ).stdout.split(),
+    )
+    ended = time.clock_gettime(time.CLOCK_MONOTONIC_RAW), time.monotonic()
+    assert slewed > ended[1] + began[1] / 13, "the library has no effect"
+    assert began[0] <= now <= ended[0]
 
 
 async def test_a_tick_that_was_held_up_counts_as_late_by_as_much():

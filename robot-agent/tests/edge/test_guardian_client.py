@@ -130,13 +130,13 @@ async def test_early_link_that_has_waited_for_long_is_closed_and_made_anew(tmp_p
     guardian = Guardian(tmp_path / "guardian.sock")
     early = connect_early(guardian.path)
     await guardian.accept()
-    guardian.link.send(encode(msgspec.structs.replace(FEEDBACK, at=time.monotonic() - 40.0)))
+    guardian.link.send(encode(msgspec.structs.replace(FEEDBACK, at=SystemClock().now() - 40.0)))
     rig = Rig(guardian.path, early._replace(made=time.monotonic() - 40.0))
     tasks = [asyncio.create_task(loop) for loop in (rig.client.run(), rig.stream())]
     try:
         with guardian.link:
             await guardian.accept()
-        sent = msgspec.structs.replace(FEEDBACK, seq=9, at=time.monotonic() - 0.2)
+        sent = msgspec.structs.replace(FEEDBACK, seq=9, at=SystemClock().now() - 0.2)
         guardian.link.send(encode(sent))
         await rig.until(lambda: rig.feedback)
         assert (rig.feedback, rig.times) == ([sent], [sent.at])

@@ -131,7 +131,7 @@ async def test_changes_during_the_fetch_of_a_snapshot_are_applied_after_it(mappi
     mapping.fog.answers.put_nowait(old)
     await mapping.until(lambda: mapping.core.replica.version == mapping.master.version)
     assert mapping.fog.requests == 1
-    assert not mapping.core.wants_snapshot(time.monotonic())
+    assert not mapping.core.wants_snapshot(SystemClock().now())
 
 
 def test_every_query_of_the_core_is_served_and_commands_are_logged(rig, monkeypatch):
@@ -280,7 +280,7 @@ async def test_deltas_of_an_older_map_service_do_not_affect_the_new_map(mapping)
     fresh.master._version = type(fresh.master.version)(8, 0, fresh.master.version.hash)
     mapping.fog.answers.put_nowait(fresh.master.snapshot())
     await mapping.until(lambda: mapping.core.replica.version == fresh.master.version)
-    assert not mapping.core.wants_snapshot(time.monotonic())
+    assert not mapping.core.wants_snapshot(SystemClock().now())
 
 
 async def test_lost_last_delta_is_detected_by_the_heartbeat_after_a_grace_period(mapping):

@@ -14,7 +14,7 @@ from fog_contracts.site import NodeSite, RobotSite, Sonar
 from hazard_aggregator.debounce import DebounceError, Observation, RuleFactory
 from hazard_aggregator.fusion import AreaFusion
 from hazard_aggregator.registry import find_rule
-from hazard_aggregator.sensors.reading_order import FORGOTTEN_S, ReadingOrder
+from hazard_aggregator.sensors.reading_order import FORGOTTEN_S, ReadingOrder, Taken
 
 SQUARE = [(0.0, 0.0), (2.0, 0.0), (2.0, 1.0), (0.0, 1.0)]
 LIMIT = 1.2
@@ -44,6 +44,10 @@ def pose(x: float, y: float, *, height: float = 0.35, localized: bool = True) ->
         stamp=0.0,
         localized=localized,
     )
+
+
+def reading_at(seq: int, uptime_s: float) -> NodeReading:
+    return NodeReading(seq=seq, boot=1, uptime_ms=round(1000 * uptime_s), range_m=[3.0], status=["ok"], state="clear")
 
 
 class Rig:
@@ -429,6 +433,31 @@ def test_offline_node_is_unknown_until_new_readings_arrive():
     assert (rig.hazard.state, rig.hazard.penalty) == ("unknown", 200)
     rig.read(3.0, 3.0, times=5)
     assert rig.hazard.state == "clear"
+
+
+@pytest.mark.parametrize("period", [0.1, 1.0])
+@pytest.mark.parametrize("slew", [0.0, 0.5, 5.0, 100.0, -0.5, -5.0, -100.0])
+@pytest.mark.parametrize("ppm", [500, 1_000, 83_333])
+def test_readings_count_while_a_nodes_clock_is_slewed_and_afterwards(ppm, slew, period):
+    order, uptime, taken = ReadingOrder(), 1000.0, []
+    # A slew of nothing: an oscillator that is slow for good.
+    lasts = abs(slew) / (1e-6 * ppm) if slew else 20_000.0
+    for seq in range(round(min(lasts + 200.0, 20_000.0) / period)):
+        now = seq * period
+        slewed = 100.0 < now <= 100.0 + lasts
+        uptime += period * (1.0 + math.copysign(1e-6 * ppm, slew or -1.0) * slewed)
+        taken.append(order.place(reading_at(seq, uptime), 5000.0 + now))
+    assert all(isinstance(one, Taken) and one.counts for one in taken)
+
+
+def test_readings_that_the_network_holds_back_for_seconds_do_not_count():
+    order = ReadingOrder()
+    for seq in range(600):
+        assert isinstance(order.place(reading_at(seq, 0.1 * seq), 0.1 * seq), Taken)
+    held = [order.place(reading_at(seq, 0.1 * seq), 70.0) for seq in range(600, 700)]
+    assert held[:60] == ["late"] * 60
+    assert isinstance(held[-1], Taken)
+    assert held[-1].at > 69.0
 
 
 # --- Robots in the cone ---------------------------------------------------------------------------------------------

@@ -15,17 +15,27 @@ if TYPE_CHECKING:
     from fog_contracts.messages import Sent
 
 CLOCK_DRIFT: Final = 5e-4
-"""How much faster one host's monotonic clock may run than the other's: crystals 1e-4, corrected by NTP up to 5e-4."""
+"""How much faster one host's monotonic clock may run than the other's: crystals 1e-4, and nothing slews them."""
 MAX_CLOCKS: Final = 8
 """Senders' clocks that are remembered; one that was forgotten begins anew."""
 LATE_S: Final = 0.25
 """A sender that is not trusted yet must start anew when a heartbeat was this much (s) faster than those before."""
+GAP_S: Final = 3.0
+JITTER_S: Final = 0.3
+"""Messages come steadily when no two are further apart, and none takes longer by so much (s) than the one before."""
 
 
 class DelayEstimator:
-    """How much longer (s) each message of one sender takes than its fastest one, by the two monotonic clocks."""
+    """How much longer (s) each message of one sender takes than its fastest one, by the two monotonic clocks.
 
-    def __init__(self) -> None:
+    With `steady_s` the sender's clock may run at any rate, as one does that is slewed: of messages that have come
+    steadily for so long (s), the fastest one took no time, whatever faster ones there were before.
+    """
+
+    def __init__(self, steady_s: float = math.inf) -> None:
+        self._steady_s = steady_s
+        self._steady_since = -math.inf
+        self._latest = self._lowest = math.inf
         self._offset = math.inf
         self._offset_at = 0.0
         self.faster_by = 0.0
@@ -34,10 +44,19 @@ class DelayEstimator:
     def update(self, sent: float, now: float) -> float:
         """Return the delay of a message that was sent at `sent` of the sender's clock (s) and arrives `now`."""
         offset = now - sent
+        self._follow(offset, now)
         known = self._offset + CLOCK_DRIFT * (now - self._offset_at) if self._offset < math.inf else math.inf
         self.faster_by = max(0.0, known - offset)
         self._offset, self._offset_at = min(known, offset), now
         return offset - self._offset
+
+    def _follow(self, offset: float, now: float) -> None:
+        """Forget the fastest message of all when later ones came steadily, without a gap in which a queue forms."""
+        if now - self._offset_at > GAP_S or abs(offset - self._latest) > JITTER_S:
+            self._steady_since, self._lowest = now, math.inf
+        self._latest, self._lowest = offset, min(self._lowest, offset)
+        if now - self._steady_since >= self._steady_s:
+            self._offset, self._lowest, self._steady_since = self._lowest, math.inf, now
 
 
 class Delays:

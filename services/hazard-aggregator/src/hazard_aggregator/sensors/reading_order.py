@@ -24,6 +24,8 @@ FORGOTTEN_S: Final = 30.0
 """After so long a silence an earlier boot, or an older seq, is a node that repeats its numbers, and no late reading."""
 MIN_PERIOD_S: Final = 0.04
 """Readings closer together are one: a node's are 45 ms apart at the least (the firmware's `kShortestUs`)."""
+STEADY_S: Final = 15.0
+"""A node's clock is not ours: its oscillator may be poor, or a host's NTP slews it, by up to 0.0833 s each second."""
 _BOOTS: Final = 8
 _SEQ_RANGE: Final = 2**32
 
@@ -43,7 +45,7 @@ class ReadingOrder:
         self._seq = -1
         self._uptime_s = 0.0
         self._counted_uptime_s: float | None = None
-        self._delay = DelayEstimator()
+        self._delay = DelayEstimator(STEADY_S)
         self._accepted_at: float | None = None
 
     def place(self, reading: NodeReading, now: float) -> Taken | Rejection:
@@ -59,7 +61,7 @@ class ReadingOrder:
             return problem
         uptime_s = reading.uptime_ms / 1000
         if not same_boot or uptime_s < self._uptime_s:  # uptime begins anew, or its 32 bits have wrapped
-            self._delay, self._counted_uptime_s = DelayEstimator(), None
+            self._delay, self._counted_uptime_s = DelayEstimator(STEADY_S), None
         delay = self._delay.update(uptime_s, now)
         if delay > SILENT_S:
             return "late"

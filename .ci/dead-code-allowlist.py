@@ -115,3 +115,6 @@ _.get_code  # Python's import calls it
 _.authenticate  # amqtt calls its plugins
 _.topic_filtering
 _.also_on  # verified when an archive is read; the folder keeps the description as it is
+_.pause_writing  # asyncio calls its protocols
+_.resume_writing
+_.num_tickets  # ssl reads it

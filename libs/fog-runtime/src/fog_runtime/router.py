@@ -3,24 +3,42 @@
 With `--certificate` and `--key` it encrypts (`--listen tls/…`), with `--users` it admits only these, and with
 `--access` each of them may only do what that list allows. With `--health-port` it says at `/readyz` of this computer
 whether it answers its clients (`router_health`).
+
+Zenoh itself listens on a Unix socket, and gets only those connections that a relay has encrypted: connections that say
+nothing, or leave again, would keep it from everybody else (docs/adr/0055, docs/upstream/zenoh-accept-loop.md). A router
+to which no session can be opened for a while ends, to be started again.
 """
 
 import argparse
 import asyncio
 import contextlib
+import faulthandler
 import json
 import secrets
-from collections.abc import Sequence
+import ssl
+import tempfile
+import time
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Final
 
 import zenoh
 
-from fog_runtime import logs, process
+from fog_runtime import admission, logs, process
 from fog_runtime.access.credentials import Credentials
-from fog_runtime.health import serve_health
-from fog_runtime.router_health import RouterHealth
+from fog_runtime.health import Health, serve_health
+from fog_runtime.machine import descriptors
+from fog_runtime.relay import Connect, Relay, ZenohOpening, place_of, server_tls
+from fog_runtime.router_health import ANSWERS, RouterHealth
 from fog_runtime.transports.zenoh_edge import session_config
+
+WATCH_S: Final = 5.0
+"""How often the router looks whether a session can be opened to it (it asks itself less often while that works)."""
+DEAF_S: Final = 20.0
+"""After how long without any such session it ends, to be started again."""
+HANGS_S: Final = 60.0
+"""After how long without such a look it is ended: its loop, or the interpreter, hangs."""
 
 _log = logs.get("router")
 
@@ -51,6 +69,18 @@ class RouterLocks:
     access: Path | None = None
     credentials: Path | None = None
 
+    def tls(self) -> ssl.SSLContext:
+        """Return what its clients encrypt by; raises `RouterLocksError`."""
+        if self.certificate is None or self.key is None:
+            raise RouterLocksError("--listen tls/… needs --certificate and --key, or write tcp/…")
+        try:
+            return server_tls(self.certificate, self.key)
+        except OSError as error:
+            raise RouterLocksError(
+                f"the certificate {self.certificate} with the key {self.key} can't be used: {error.strerror or error}. "
+                "Issue it again (fognav ca issue), or correct the names"
+            ) from error
+
     def config(self, listen: Sequence[str], connect: Sequence[str]) -> zenoh.Config:
         """Return the router's configuration; raises `RouterLocksError` or `CredentialsError`."""
         for file in (self.certificate, self.key, self.users, self.access):
@@ -61,9 +91,8 @@ class RouterLocks:
         if self.access is not None:
             rules = json.loads(zenoh.Config.from_file(str(self.access)).get_json("access_control"))
             config.insert_json5("access_control", json.dumps(rules))
-        if self.certificate is not None:
-            config.insert_json5("transport/link/tls/listen_certificate", json.dumps(str(self.certificate)))
-            config.insert_json5("transport/link/tls/listen_private_key", json.dumps(str(self.key)))
+        # As many as the relay lets through that have not proved who they are, and some.
+        config.insert_json5("transport/unicast/accept_pending", json.dumps(2 * admission.STRANGERS))
         if self.users is not None:
             config.insert_json5("transport/auth/usrpwd/dictionary_file", json.dumps(str(self.users)))
             if not any(own.login("zenoh", each, "", encrypted=True) for each in connect):
@@ -73,18 +102,26 @@ class RouterLocks:
         return config
 
 
+class RouterDeafError(Exception):
+    """No session can be opened to this router."""
+
+
 @dataclass(frozen=True, kw_only=True)
 class HealthPort:
-    """Where a router says whether it answers: a port of this computer, and as whom it asks itself."""
+    """How a router finds out whether it answers: as whom it asks itself, and the port of this computer that tells."""
 
-    port: int
+    port: int | None = None
     credentials: Path | None = None
 
     def health(self, listen: str) -> RouterHealth:
         """Return the health of a router that listens there; raises `CredentialsError`."""
-        protocol, _, rest = listen.partition("/")
-        port = rest.partition("?")[0].rpartition(":")[2]
-        return RouterHealth(f"{protocol}/localhost:{port}", Credentials.read(self.credentials))
+        protocol = listen.partition("/")[0]
+        host, port = place_of(listen)
+        if host in ("0.0.0.0", "::", "127.0.0.1", "::1"):  # noqa: S104  # compared, not listened on
+            host = "localhost"
+        return RouterHealth(
+            f"{protocol}/{f'[{host}]' if ':' in host else host}:{port}", Credentials.read(self.credentials)
+        )
 
 
 async def run_router(
@@ -95,19 +132,55 @@ async def run_router(
 ) -> None:
     """Route between the clients of the endpoints `listen`, and those of the routers `connect`, until cancelled.
 
-    Routers at `connect` need not be up yet. Without `locks` everybody is admitted. Raises `zenoh.ZError` if an endpoint
-    of `listen` is taken, `OSError` if the port of its health is, and as `RouterLocks.config`.
+    Routers at `connect` need not be up yet. Without `locks` everybody is admitted. Raises `OSError` if an endpoint of
+    `listen` or the port of its health is taken, `RouterDeafError` when its clients can't reach it any more, and as
+    `RouterLocks.config`.
     """
+    locks = locks or RouterLocks()
     health = None if health_port is None else health_port.health(listen[0])
-    session = await asyncio.to_thread(zenoh.open, (locks or RouterLocks()).config(listen, connect))
-    try:
-        _log.info("listening", endpoints=list(listen), zid=str(session.zid()))
-        with contextlib.ExitStack() as stack:
-            if health_port is not None and health is not None:
+    descriptors.raise_limit()
+    with contextlib.ExitStack() as stack:
+        folder = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="fognav-router-")))
+        own = folder / "zenoh"
+        relays, listeners = [], []
+        for endpoint in listen:
+            encrypts = endpoint.startswith("tls/")
+            tls = locks.tls() if encrypts else None
+            relays.append(Relay(_to_socket(own), ZenohOpening, tls))
+            listeners.append(stack.enter_context(admission.listen(*place_of(endpoint))))
+        session = await asyncio.to_thread(zenoh.open, locks.config([f"unixsock-stream/{own}"], connect))
+        try:
+            _log.info("listening", endpoints=list(listen), zid=str(session.zid()))
+            if health_port is not None and health is not None and health_port.port is not None:
                 stack.enter_context(serve_health(health, port=health_port.port))
-            await asyncio.get_running_loop().create_future()
-    finally:
-        await asyncio.to_thread(session.close)
+            async with asyncio.TaskGroup() as tasks:
+                for relay, listener in zip(relays, listeners, strict=True):
+                    tasks.create_task(relay.serve([listener]))
+                if health is not None:
+                    tasks.create_task(_watch(health))
+        finally:
+            await asyncio.to_thread(session.close)
+
+
+def _to_socket(path: Path) -> Connect:
+    async def connect(make_protocol: Callable[[], asyncio.Protocol]) -> object:
+        return await asyncio.get_running_loop().create_unix_connection(make_protocol, str(path))
+
+    return connect
+
+
+async def _watch(health: Health) -> None:
+    """Raise `RouterDeafError` once no session could be opened for `DEAF_S`."""
+    answered_at = time.monotonic()
+    while True:
+        faulthandler.dump_traceback_later(HANGS_S, exit=True)
+        await asyncio.sleep(WATCH_S)
+        report = await asyncio.to_thread(health.report)
+        if report["ready"]:
+            answered_at = time.monotonic()
+        elif time.monotonic() - answered_at > DEAF_S:
+            faulthandler.dump_traceback_later(process.ENDING_S, exit=True)  # a session of it may not end, either
+            raise RouterDeafError(report["parts"][ANSWERS]["detail"])
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
@@ -120,7 +193,9 @@ def main(arguments: Sequence[str] | None = None) -> None:
     for option, what in _LOCKS.items():
         parser.add_argument(option, type=Path, metavar="FILE", help=what)
     parser.add_argument("--health-port", type=int, metavar="PORT", help="of this computer, where /readyz is served")
-    parser.add_argument("--health-credentials", type=Path, metavar="FILE", help="as whom it asks itself for /readyz")
+    parser.add_argument(
+        "--health-credentials", type=Path, metavar="FILE", help="as whom it asks itself whether it answers"
+    )
     parser.add_argument("--log-level", default="info", choices=["debug", "info", "warning", "error"])
     parser.add_argument("--log-format", default="json", choices=["json", "text"])
     options = parser.parse_args(arguments)
@@ -129,7 +204,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
         parser.error("--certificate and --key belong together")
     locks = RouterLocks(**{option.removeprefix("--"): getattr(options, option.removeprefix("--")) for option in _LOCKS})
     health = None
-    if options.health_port is not None:
+    if options.health_port is not None or options.health_credentials is not None or options.users is None:
         health = HealthPort(port=options.health_port, credentials=options.health_credentials)
     process.run(lambda: run_router(options.listen, options.connect, locks, health))
 

@@ -174,6 +174,8 @@ def router_program(port: int, *, address: str = LOOPBACK, locks: Path | None = N
     """Return a zenoh router; `address` and `locks` as for `mosquitto_program`."""
     scheme = "tcp" if locks is None else "tls"
     arguments = configurations.router_arguments(f"{scheme}/{address}:{port}", locks=_text(locks))
+    if locks is not None and (health := locks.parent / "credentials" / "health.toml").is_file():
+        arguments += ["--health-credentials", str(health)]
     command = (sys.executable, "-m", "fog_runtime.router", *arguments)
     url = f"{scheme}/{reachable(address)}:{port}"
     return ServerProgram(name="zenoh-router", port=port, address=address, url=url, command=command)

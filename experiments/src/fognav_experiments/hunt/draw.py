@@ -11,6 +11,7 @@ import random
 from typing import TYPE_CHECKING, Final, NamedTuple
 
 import msgspec
+import numpy as np
 
 from fognav_experiments.hunt.world import Box, HuntWorld, Patch, Sensors, Watched
 from fognav_experiments.scenarios.description import (
@@ -33,6 +34,7 @@ from fognav_experiments.scenarios.description import (
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
 
+    from fog_contracts.grid import StaticMap
     from fognav_experiments.rigs import FogProcessName
     from fognav_experiments.scenarios.description import AnyEvent
     from fognav_experiments.scenarios.node_faults import Fault
@@ -96,23 +98,24 @@ def draw_world(seed: int, number: int, attempt: int = 0) -> HuntWorld:
     return msgspec.convert(msgspec.to_builtins(world), HuntWorld)
 
 
-def draw_on_map(seed: int, number: int, attempt: int, file: str, bounds: Box) -> HuntWorld:
-    """Return a world on the floor of a map's file, which has these bounds (m); attempts as by `draw_world`."""
+def draw_on_map(seed: int, number: int, attempt: int, file: str, recorded: StaticMap) -> HuntWorld:
+    """Return a world on the floor of a map's file; attempts as by `draw_world`."""
     dice = random.Random(f"{seed} {number} {attempt} {file}")  # noqa: S311  # repeatable, not a secret
-    left, bottom, right, top = bounds
-    floor = _Floor(file, (1.0, 1.0), [], [], [], [bounds], [])
-    x, y = dice.uniform(left, right), dice.uniform(bottom, top)
+    rows, columns = np.nonzero(recorded.cells == 0)
+    cell = dice.randrange(len(rows))
+    x, y = recorded.geometry.centre(int(columns[cell]), int(rows[cell]))
     turn, reach = dice.uniform(-math.pi, math.pi), dice.uniform(5.0, 20.0)
     goal = (round(x + reach * math.cos(turn), 2), round(y + reach * math.sin(turn), 2))
-    around = (x - 15.0, y - 15.0, x + 15.0, y + 15.0)
+    around: Box = (x - 15.0, y - 15.0, x + 15.0, y + 15.0)
+    floor = _Floor(file, (1.0, 1.0), [], [], [], [around], [])
     return HuntWorld(
         title=f"{file}, seed {seed}, number {number}",
         start=(round(x, 2), round(y, 2), round(dice.uniform(-math.pi, math.pi), 2)),
         goal=goal,
         map=file,
         warp_m=dice.choice((0.0, 0.05)),
-        sensors=_sensors(dice, floor._replace(places=[around])),
-        events=_events(dice, floor._replace(places=[around]), reach),
+        sensors=_sensors(dice, floor),
+        events=_events(dice, floor, reach),
         seconds=200.0,
         seed=dice.randrange(1, 1_000_000),
     )
@@ -133,7 +136,7 @@ def _corridor(dice: random.Random) -> _Floor:
         rooms.append(door)
         if dice.random() < 0.5:
             opened.append(door)
-    watched = [_across(dice, "a1", dice.uniform(5.0, length - 5.0), bottom, top)] if dice.random() < 0.7 else []
+    watched = _watched(dice, (5.0, length - 5.0), bottom, top, rooms)
     size = (length + 2 * _WALL_M, top + 2.0)
     return _Floor("corridor", _size(size), [hall, *rooms], [], opened, [hall], watched)
 
@@ -165,20 +168,22 @@ def _office(dice: random.Random) -> _Floor:
             if dice.random() < 0.2:
                 opened.append(door)
             x += wide
-    watched = [_across(dice, "a1", dice.uniform(4.0, length - 4.0), bottom, top)] if dice.random() < 0.7 else []
+    watched = _watched(dice, (4.0, length - 4.0), bottom, top, free[1:])
     size = (length + 2 * _WALL_M, top + deep + 0.2 + _WALL_M)
     return _Floor("office", _size(size), [*free, *rooms], [], opened, [free[0], *rooms], watched)
 
 
-def _across(dice: random.Random, name: str, x: float, bottom: float, top: float) -> Watched:
-    """Return an area of a corridor with a node on its lower wall."""
+def _watched(
+    dice: random.Random, range_x: tuple[float, float], bottom: float, top: float, doors: list[Box]
+) -> list[Watched]:
+    """Return an area of a corridor with a node on its lower wall, mostly: it faces a wall, and no door."""
+    x = dice.uniform(*range_x)
+    if dice.random() < 0.2 or any(left - 1.0 < x < right + 1.0 for left, _, right, _ in doors):
+        return []
     half = dice.uniform(0.8, 1.5)
-    return Watched(
-        id=name,
-        box=_rounded(x - half, bottom, x + half, top),
-        node=(round(x, 2), round(bottom + 0.05, 2), round(math.pi / 2, 4)),
-        limit=round(min(3.5, top - bottom - 0.35), 2),
-    )
+    box = _rounded(x - half, bottom, x + half, top)
+    node = (round(x, 2), round(bottom + 0.05, 2), round(math.pi / 2, 4))
+    return [Watched(id="a1", box=box, node=node, limit=round(min(3.5, top - bottom - 0.35), 2))]
 
 
 def _thing(dice: random.Random, place: Box) -> Box:

@@ -24,7 +24,7 @@ if TYPE_CHECKING:
 RECORDS: Final = "drives.jsonl"
 FOUND: Final = "found"
 """Folder of the worlds that broke a rule, shrunk."""
-_ATTEMPTS: Final = 100
+_ATTEMPTS: Final = 200
 _RECORDED_EVERY: Final = 6
 """One world of so many is on a recorded floor."""
 _MOST_CELLS: Final = 3_000_000
@@ -127,20 +127,20 @@ def drive(task: Task) -> Found:
 
 
 def draw(task: Task, folders: Sequence[Path]) -> HuntWorld:
-    """Return the world of a task, whose start and goal are free."""
+    """Return the world of a task, on whose floor there is a way from start to goal."""
     for attempt in range(_ATTEMPTS):
         world = draw_world(task.seed, task.number, attempt)
         if task.maps and task.number % _RECORDED_EVERY == 0:
             name = task.maps[task.number // _RECORDED_EVERY % len(task.maps)]
             recorded = load_recorded(name, folders)
             if recorded.cells.size <= _MOST_CELLS:
-                world = draw_on_map(task.seed, task.number, attempt, name, recorded.geometry.bounds)
+                world = draw_on_map(task.seed, task.number, attempt, name, recorded)
         try:
-            build_world(world, folders)
+            if build_world(world, folders).connects(world):
+                return world
         except ValueError:
             continue
-        return world
-    raise ValueError(f"no world of seed {task.seed}, number {task.number} has a free start and goal: leave it out")
+    raise ValueError(f"no world of seed {task.seed}, number {task.number} has a way from start to goal: leave it out")
 
 
 def summary(records: Iterable[Record]) -> str:

@@ -16,6 +16,8 @@ from msgspec import Meta
 from fog_contracts.grid import GridGeometry, StaticMap
 from fog_contracts.messages import Id, PointXY, Pose, Seconds
 from fog_contracts.site import AreaSite, NodeSite, RobotSite, Site, Sonar
+from fog_kernels.components import Components
+from fog_kernels.distance import squared_distance_capped
 from fognav_experiments.scenarios.description import AnyEvent
 from fognav_sim.floor import Floor
 from fognav_sim.lidar_faults import LidarFaults
@@ -28,6 +30,8 @@ Box = tuple[float, float, float, float]
 """left, bottom, right, top (m)"""
 _FREE, _WALL = 0, 254
 _WAVES = 3
+_SPARE_M = 0.08
+"""More than its radius that a robot needs to each side."""
 
 
 class Watched(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
@@ -115,6 +119,20 @@ class Built(NamedTuple):
     site: Site
     map: StaticMap
     floor: Floor
+    truth: NDArray[np.uint8]
+    """The cells of the floor."""
+
+    def connects(self, world: HuntWorld) -> bool:
+        """Whether the robot fits through from start to goal, both on the map and on the floor."""
+        geometry, reach = self.map.geometry, world.radius + _SPARE_M
+        cap = math.ceil(reach / geometry.resolution) + 1
+        for cells in (self.map.cells, self.truth):
+            squared = squared_distance_capped(np.ascontiguousarray(cells != _FREE, np.uint8), cap)
+            near = np.sqrt(squared.astype(np.float64)) * geometry.resolution < reach
+            parts = Components(np.where(near, _WALL, _FREE).astype(np.uint8))
+            if not parts.connected(geometry.cell(*world.start[:2]), geometry.cell(*world.goal)):
+                return False
+        return True
 
 
 def build(world: HuntWorld, recorded: StaticMap | None = None) -> Built:
@@ -146,7 +164,7 @@ def build(world: HuntWorld, recorded: StaticMap | None = None) -> Built:
     for name, (x, y) in (("start", world.start[:2]), ("goal", world.goal)):
         if floor.nearest(x, y)[0] < world.radius:
             raise ValueError(f"{world.title}: its {name} ({x:g}, {y:g}) is not free: choose another one")
-    return Built(site, StaticMap(geometry, _warped(world, geometry, mapped)), floor)
+    return Built(site, StaticMap(geometry, _warped(world, geometry, mapped)), floor, truth)
 
 
 def displacement(world: HuntWorld, x: float, y: float) -> tuple[float, float]:

@@ -17,6 +17,7 @@ from fog_contracts.messages import (
     HazardArea,
     MapHeartbeat,
     PolygonShape,
+    RobotPath,
     RobotPose,
     RobotState,
     SimTruth,
@@ -215,6 +216,38 @@ def cleared_after_it_is_gone(d):
     d.hazard("clear", 2)
 
 
+def path(d, *points):
+    d.publish(ch.ROBOT_PATH, RobotPath(
+        plan_id=1, planner_epoch=1, goal_id="g", points=list(points), map_epoch=1, map_seq=1, released_length=5.0),
+        **R1)  # fmt: skip
+
+
+def barrier_ahead(d):
+    path(d, (0.0, 0.0), (6.0, 0.0))
+    d.drive(1)
+    d.oracle.on_barrier(SQUARE, d.now)
+
+
+def barrier_behind(d):
+    path(d, (0.0, 0.0), (8.0, 0.0))
+    d.drive(25)
+    d.oracle.on_barrier(SQUARE, d.now)
+
+
+def map_service_dies(d):
+    d.oracle.on_lost("map-service", d.now)
+    d.drive(5)
+
+
+def obstacle_while_the_aggregator_is_away(d):
+    d.oracle.on_lost("aggregator", d.now)
+    d.oracle.on_obstacle("a", d.now)
+    d.drive(4, speed=0.0)
+    d.oracle.on_restored("aggregator", d.now)
+    d.drive(1, speed=0.0)
+    d.hazard("blocked")
+
+
 @pytest.mark.parametrize(
     ("happens", "rules"),
     [
@@ -225,6 +258,8 @@ def cleared_after_it_is_gone(d):
         (older_map, ["version"]), (newer_epoch, []), (contact, ["contact"]),
         (unwritten, ["write"]), (unwritten_but_slow, []),
         (unconfirmed, ["hazard"]), (cleared, ["cleared"]), (cleared_after_it_is_gone, []),
+        (barrier_ahead, []), (barrier_behind, ["barrier"]), (map_service_dies, ["stop"]),
+        (obstacle_while_the_aggregator_is_away, []),
     ],
 )  # fmt: skip
 def test_oracle_sees_a_rule_broken_once_and_nothing_where_all_is_well(happens, rules):

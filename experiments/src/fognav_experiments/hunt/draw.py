@@ -92,6 +92,7 @@ def draw_world(seed: int, number: int, attempt: int = 0) -> HuntWorld:
         watched=floor.watched,
         sensors=sensors,
         events=_events(dice, floor, distance),
+        demo=bool(floor.watched) and dice.random() < 0.3,
         seconds=round(40.0 + 2.0 * distance / _SPEED_M_S * 0.5),
         seed=dice.randrange(1, 1_000_000),
     )

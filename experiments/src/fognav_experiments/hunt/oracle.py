@@ -8,6 +8,7 @@ Lengths in m, speeds in m/s, times in s of one clock; frame `map`, unless it say
 
 from __future__ import annotations
 
+import itertools
 import math
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final, Literal, NamedTuple
@@ -36,9 +37,11 @@ if TYPE_CHECKING:
         ZoneSet,
     )
 
-Rule = Literal["contact", "blocked", "speed", "stop", "pose", "version", "write", "hazard", "cleared"]
-Word = Literal["fog", "agent", "lidar"]
-"""What a robot may lose: the fog's messages, its own agent (which may hang), its lidar's data."""
+Rule = Literal["contact", "blocked", "speed", "stop", "pose", "version", "write", "hazard", "cleared", "barrier"]
+Word = Literal["fog", "map-service", "aggregator", "planner", "agent", "lidar"]
+"""What may be lost: all messages to the robot, a process of the fog, its own agent (which may hang), its lidar."""
+_MAP: Final[frozenset[Word]] = frozenset({"fog", "map-service"})
+"""Without one of these a robot does not learn what changes on the map."""
 
 _STANDING: Final = 0.02
 """A robot whose wheels are slower than this stands."""
@@ -58,8 +61,10 @@ _RAMP_S: Final = 0.8
 """0.5 s of a ramp, and what states and truth, ten times a second, come late."""
 _REACTION_S: Final = 1.0
 """From the announcement of what is blocked to a robot that knows: a map's version, a path."""
-_STOP_S: Final[dict[Word, float]] = {"fog": 4.0, "agent": 0.4, "lidar": 0.6}
+_STOP_S: Final[dict[Word, float]] = {"fog": 4.0, "map-service": 4.0, "agent": 0.4, "lidar": 0.6}
 """Wheels are zero so long after a word is lost: 3.5, 0.3 and 0.5 s by the documents, and what the truth comes late."""
+_HAZARDS: Final[frozenset[Word]] = frozenset({"map-service", "aggregator"})
+"""Without one of these no hazard is announced."""
 _SLOW_S: Final = 2.0
 """So long after an acknowledged write or a lost fog a robot that does not know better is slow."""
 _WRITTEN_S: Final = 2.5
@@ -154,7 +159,8 @@ class Oracle:
         self._zones: dict[str, _Known] = {}
         self._limits: dict[str, _Known] = {}
         self._lost: dict[Word, float] = {}
-        self._restored_at = -math.inf
+        self._restored: dict[Word, float] = {}
+        self._path: list[Point] = []
         self._newest: dict[str, tuple[int, ...]] = {}
         self._writes: dict[tuple[str, int], float] = {}
         self._written: dict[tuple[str, int], tuple[tuple[int, int], float]] = {}
@@ -181,7 +187,7 @@ class Oracle:
     def on_restored(self, word: Word, now: float) -> None:
         """Note that the robot gets this again."""
         if self._lost.pop(word, None) is not None:
-            self._restored_at = now
+            self._restored[word] = now
 
     def on_acknowledged(self, zone: Zone, now: float) -> None:
         """Note that an operator's zone was acknowledged."""
@@ -194,6 +200,17 @@ class Oracle:
     def on_obstacle_gone(self, area: str) -> None:
         """Note that it is gone, or that its nodes are not honest any more."""
         self._obstacles.pop(area, None)
+
+    def on_barrier(self, polygon: Sequence[Point], now: float) -> None:
+        """Note that a demonstration closes an area, which its robot was to drive through."""
+        x, y = self._place
+        legs = list(itertools.pairwise(self._path))
+        nearest = min(range(len(legs)), key=lambda leg: distance_to_segment(*legs[leg], x, y), default=0)
+        left = [(x, y), *self._path[nearest + 1 :]]
+        ahead = min((distance_to_polygon(polygon, *point) for point in _along(left)), default=math.inf)
+        if ahead > 0.0:
+            self._now = now
+            self._report("barrier", f"the area was closed, and what is left of the path passes it at {ahead:.1f} m")
 
     # --- what the robot publishes ------------------------------------------------------------------------------------
 
@@ -222,9 +239,9 @@ class Oracle:
             known = _Known(_to(polygon), at.now, f"area {area}", _UNKNOWN_SPEED)
             self._areas[area] = (hazard.state, known)
         standing = self._obstacles.get(area)
-        late = standing is not None and at.now > standing + _HAZARD_S + self._world.late_s
+        late = standing is not None and at.now > max(standing, self._back(_HAZARDS)) + _HAZARD_S + self._world.late_s
         if late and hazard.state == "clear" and message.confirmed:
-            self._report("cleared", area, f"area {area} is clear, and an obstacle stands there since {standing:.1f} s")
+            self._report("cleared", f"area {area} is clear, and an obstacle stands there since {standing:.1f} s")
         return ()
 
     def _on_zones(self, ids: Ids, message: ZoneSet, at: Moment) -> tuple[()]:
@@ -264,13 +281,15 @@ class Oracle:
 
     def _on_path(self, ids: Ids, message: RobotPath, at: Moment) -> tuple[()]:
         del at
+        if message.refusal is None:
+            self._path = list(message.points)
         self._grows(f"path of {ids['robot']}", (message.planner_epoch, message.plan_id))
         return ()
 
     def _grows(self, what: str, version: tuple[int, ...]) -> None:
         newest = self._newest.get(what, version)
         if version < newest:
-            self._report("version", what, f"{what} went back from {newest} to {version}")
+            self._report("version", f"{what} went back from {newest} to {version}")
         self._newest[what] = max(version, newest)
 
     # --- the truth ---------------------------------------------------------------------------------------------------
@@ -306,15 +325,12 @@ class Oracle:
         """Where the robot truly is, on its map."""
         return self._truths[-1][1:3]
 
-    def _since_restored(self) -> float:
-        return math.inf if not self._lost and self._restored_at < 0 else self._now - self._restored_at
-
     def _check_contact(self, truth: SimTruth) -> None:
         if truth.contacts > self._contacts:
             self._contacts = truth.contacts
             near = [o.id for o in truth.obstacles if distance_to_polygon(o.polygon, truth.x, truth.y) < 0.5]
             what = ", ".join(near) or "a wall"
-            self._report("contact", str(truth.contacts), f"drove into {what} at {self._speed:.2f} m/s in {self._mode}")
+            self._report("contact", f"drove into {what} at {self._speed:.2f} m/s in {self._mode}")
 
     def _check_speed(self) -> None:
         self._allowed_until = [(until, speed) for until, speed in self._allowed_until if until > self._now]
@@ -338,7 +354,13 @@ class Oracle:
     @property
     def _knows(self) -> bool:
         """Whether the robot hears the fog, and has for as long as it takes to know its map."""
-        return "fog" not in self._lost and self._since_restored() > self._reaction_s + _REACTION_S
+        if _MAP & self._lost.keys():
+            return False
+        return self._now - self._back(_MAP) > self._reaction_s + _REACTION_S
+
+    def _back(self, words: frozenset[Word]) -> float:
+        """Return when the last of these was there again; it may have been lost all the time, too."""
+        return max(self._now if word in self._lost else self._restored.get(word, -math.inf) for word in words)
 
     def _check_blocked(self) -> None:
         x, y = self._place
@@ -354,15 +376,17 @@ class Oracle:
             )  # fmt: skip
 
     def _check_stop(self) -> None:
-        for word in ("fog", "agent", "lidar"):
+        for word, limit in _STOP_S.items():
             seconds = self._now - self._lost.get(word, self._now)
-            late = seconds > _STOP_S[word] + (self._world.late_s if word == "fog" else 0.0)
+            late = seconds > limit + (self._world.late_s if word == "fog" else 0.0)
             self._lasts(
                 "stop", word, late and self._moves, f"wheels turn {seconds:.1f} s after it lost the {word}", 0.0
             )
 
     def _check_writes(self) -> None:
-        fast = self._speed > _UNKNOWN_SPEED * self._world.gain + _SPEED_MARGIN
+        fast = (
+            self._speed > _UNKNOWN_SPEED * self._world.gain + _SPEED_MARGIN and self._now - self._back(_MAP) > _SLOW_S
+        )
         for (zone, version), asked in list(self._writes.items()):
             late = fast and self._now - asked > _WRITTEN_S + self._world.late_s
             values = f"{self._speed:.2f} m/s, zone {zone} was published in no version for {self._now - asked:.1f} s"
@@ -377,7 +401,8 @@ class Oracle:
     def _check_hazards(self) -> None:
         for area, since in self._obstacles.items():
             state = self._areas[area][0] if area in self._areas else "unknown"
-            late = state != "blocked" and self._now - since > _HAZARD_S + self._world.late_s
+            known = max(since, self._back(_HAZARDS))
+            late = state != "blocked" and self._now - known > _HAZARD_S + self._world.late_s
             values = f"area {area} is {state} {self._now - since:.1f} s after an obstacle came"
             self._lasts("hazard", area, late, values, 0.0)
 
@@ -428,11 +453,10 @@ class Oracle:
             return
         since = self._broken.setdefault(key, self._now)
         if self._now - since >= seconds and since != math.inf:
-            self._report(rule, subject, values)
+            self._report(rule, values)
             self._broken[key] = math.inf
 
-    def _report(self, rule: Rule, subject: str, values: str) -> None:
-        del subject
+    def _report(self, rule: Rule, values: str) -> None:
         x, y = (self._truth.x, self._truth.y) if self._truth is not None else (0.0, 0.0)
         self.violations.append(
             Violation(rule=rule, at_s=round(self._now, 2), x=round(x, 2), y=round(y, 2), values=values)
@@ -454,3 +478,12 @@ def _mahalanobis(ex: float, ey: float, a: float, b: float, d: float) -> float:
     """Return how many deviations (ex, ey) is, by the covariance ((a, b), (b, d))."""
     determinant = max(a * d - b * b, 1e-12)
     return math.sqrt(max(0.0, (d * ex * ex - 2.0 * b * ex * ey + a * ey * ey) / determinant))
+
+
+def _along(line: Sequence[Point]) -> list[Point]:
+    """Return points every few centimetres along a polyline."""
+    points: list[Point] = []
+    for (x0, y0), (x1, y1) in itertools.pairwise(line):
+        count = math.ceil(math.hypot(x1 - x0, y1 - y0) / 0.05)
+        points += [(x0 + (x1 - x0) * k / count, y0 + (y1 - y0) * k / count) for k in range(count)]
+    return points

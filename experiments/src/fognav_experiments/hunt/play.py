@@ -18,7 +18,9 @@ from fognav_experiments.hunt.world import Built, HuntWorld, build, to_map
 from fognav_experiments.lockstep import LockstepDrive, release_drives
 from fognav_experiments.rigs import STAMP
 from fognav_experiments.scenarios.stage import Stage, Word
+from fognav_sim.barrier import BarrierError
 from fognav_sim.drive.evaluation import DriveOutcome
+from fognav_sim.drive.hazard import HazardSchedule
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -83,9 +85,11 @@ def hunt(world: HuntWorld, folders: Sequence[Path] = ()) -> Hunted:
     """Drive a world to its end, or to its first broken rule and a few seconds more; the same for the same world."""
     built = build_world(world, folders)
     mission = RobotGoal(goal_id="hunt", pose=Pose(x=world.goal[0], y=world.goal[1], theta=0.0))
+    site = LoadedSite(built.site, built.map, Path())
+    hazard = HazardSchedule.of(site, world.seed) if world.demo else None
     run = LockstepDrive(
-        LoadedSite(built.site, built.map, Path()), built.site.robots[0].start, mission, world.seed,
-        world.sensors.noise(), watched=True, hazard=None, bus=None, ground=built.floor,
+        site, built.site.robots[0].start, mission, world.seed,
+        world.sensors.noise(), watched=True, hazard=hazard, bus=None, ground=built.floor,
     )  # fmt: skip
     oracle = Oracle(
         watching.World(
@@ -141,10 +145,17 @@ def _drive(world: HuntWorld, run: LockstepDrive, oracle: Oracle, mission: RobotG
     stage = _WatchedStage(run, world, oracle)
     run.system.fog.planner.set_goal(run.robot.id, mission, any_heading=True)
     until = math.inf
-    outcome = None
+    outcome, closed = None, False
     while outcome is None and stage.elapsed < min(world.seconds, until):
         stage.step()
-        run.step()
+        try:
+            run.step()
+        except BarrierError as error:
+            return DriveOutcome("stopped", f"no area can be closed: {error}")
+        if drive.blocked_at_m is not None and drive.hazard is not None and not closed:
+            assert drive.hazard.planned is not None
+            closed = True
+            oracle.on_barrier(drive.hazard.planned.area.polygon, run.now)
         outcome = drive.outcome(run.now)
         if oracle.violations and until == math.inf:
             until = stage.elapsed + _AFTER_S

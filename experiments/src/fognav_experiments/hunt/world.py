@@ -15,7 +15,7 @@ from msgspec import Meta
 
 from fog_contracts.grid import GridGeometry, StaticMap
 from fog_contracts.messages import Id, PointXY, Pose, Seconds
-from fog_contracts.site import AreaSite, NodeSite, RobotSite, Site, Sonar
+from fog_contracts.site import AreaSite, DemoPlan, NodeSite, Place, RobotSite, Site, Sonar
 from fog_kernels.components import Components
 from fog_kernels.distance import squared_distance_capped
 from fognav_experiments.scenarios.description import AnyEvent
@@ -85,7 +85,8 @@ class HuntWorld(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields
 
     `pillars`: walls in free boxes. `opened`: walls of the map that are not there (doors that were closed when it was
     made); `placed`: things that are there and not on the map. `warp_m`: by how much the map is off at most, smoothly,
-    over `warp_length_m`. `seed`: of the sensors' noise.
+    over `warp_length_m`. `demo`: a barrier closes a watched area on the way, as in a demonstration. `seed`: of the
+    sensors' noise, and of that barrier.
     """
 
     title: str
@@ -104,6 +105,7 @@ class HuntWorld(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields
     watched: list[Watched] = []
     sensors: Sensors = Sensors()
     events: list[AnyEvent] = []
+    demo: bool = False
     seconds: Seconds = 240.0
     seed: int = 1
 
@@ -147,6 +149,8 @@ def build(world: HuntWorld, recorded: StaticMap | None = None) -> Built:
     truth = _cells(geometry, plain, world.free, [*world.pillars, *world.placed])
     site = Site(
         id="hunt",
+        places={"a": Place(x=world.start[0], y=world.start[1]), "b": Place(x=world.goal[0], y=world.goal[1])},
+        demo=DemoPlan(start="a", goal="b", areas=[area.id for area in world.watched]),
         areas=[
             AreaSite(id=area.id, label=area.id, polygon=_ring(area.box), number=number)
             for number, area in enumerate(world.watched, start=1)

@@ -52,8 +52,8 @@ if TYPE_CHECKING:
     from fognav_sim.nodes import SensorNode
 
 
-Word = Literal["fog", "agent", "lidar"]
-"""What a robot may lose."""
+Word = Literal["fog", "map-service", "aggregator", "planner", "agent", "lidar"]
+"""What may be lost: all messages to the robot, a process of the fog, the agent, the lidar."""
 _REPEAT_STEPS: Final = 10
 _PERSON_M: Final = 0.2
 """Radius of somebody who walks."""
@@ -221,7 +221,7 @@ class Stage:
             self._ends.remove(end)
             end[1]()
         if self._steps % _REPEAT_STEPS == 0:
-            self._repeated = [repeat for repeat in self._repeated if repeat()]
+            self._repeated = [repeat for repeat in list(self._repeated) if repeat()]
         self._steps += 1
 
     def _begin(self, name: str, event: AnyEvent) -> None:  # noqa: C901, PLR0912  # a table of the kinds of events
@@ -252,6 +252,7 @@ class Stage:
                 self._repeated.append(partial(self._transmit, event, self.elapsed + event.seconds))
             case Restart():
                 run.system.fog.stop(event.process)
+                self.on_lost(event.process, lost=True)
                 self._later(event.seconds, partial(self._start_again, event.process))
             case HungAgent():
                 self._hang(hung=True)
@@ -333,8 +334,17 @@ class Stage:
         self._later(seconds, partial(self._put, msgspec.structs.replace(zone, enabled=False, version=2)))
 
     def _put(self, zone: Zone) -> None:
-        self._run.system.fog.put_zone(zone, moment(self._run.now))
+        """Draw a zone: where nobody answers, an operator tries again."""
+        if self._waits_for_map(zone):
+            self._repeated.append(partial(self._waits_for_map, zone))
+
+    def _waits_for_map(self, zone: Zone) -> bool:
+        fog = self._run.system.fog
+        if not fog.map.alive:
+            return True
+        fog.put_zone(zone, moment(self._run.now))
         self.on_acknowledged(zone)
+        return False
 
     def _replace_node(self, name: Id, replaced: Callable[[SensorNode], list[SensorNode]], seconds: float) -> None:
         """Let others take the place of a node; `seconds` later it is back."""
@@ -352,6 +362,7 @@ class Stage:
 
     def _start_again(self, process: FogProcessName) -> None:
         self._run.system.fog.start_again(process, moment(self._run.now))
+        self.on_lost(process, lost=False)
 
     def _link(self, *, hears: bool, is_heard: bool) -> None:
         link = self._run.robot.process.link

@@ -58,6 +58,8 @@ def test_added_node_is_in_the_site_and_its_board_accepts_its_settings(floor: Pat
     assert done.returncode == 0, done.stderr
     node = load_site(floor).site.nodes[-1]
     assert (node.id, node.area, node.x, node.y) == ("n8", "z4", 33.2, 38.15)
+    assert not any(sonar.no_echo_is_clear for sonar in node.sonars), "what silence means, only a calibration shows"
+    assert all(sonar.range_max == pytest.approx(sonar.range_limit + 0.6, abs=0.011) for sonar in node.sonars)
     assert [round(sonar.range_limit, 2) for sonar in node.sonars] == json.loads(done.stdout)["range_limit_m"]
     assert (floor / "site.toml").read_text("utf-8").startswith(before.rstrip("\n"))
     written = floor / "board" / "node.json"
@@ -213,7 +215,8 @@ LEARNED = NodeCalibration(
     boot=1,
     config_version=1,
     result=["done", "done"],
-    range_limit_m=[1.5, 1.6],
+    range_limit_m=[2.7, 2.75],
+    range_max_m=[3.2, 3.25],
     no_echo_is_clear=[False, False],
     no_echo_us=[0, 0],
     samples=[256, 256],
@@ -232,21 +235,58 @@ def test_calibration_writes_limits_and_how_likely_false_echoes_are_into_the_site
     words = ["calibrate", "n1", "--site", str(floor), "--broker", "mqtt://127.0.0.1:1"]
     done = CliRunner().invoke(node_app, words)
     assert done.exit_code == 0, done.stderr
-    assert "blocked below 1.60 m; of 256 samples 2 echoed from nearer, 5 not at all" in done.stderr
+    assert "blocked below 2.75 m; of 256 samples 2 echoed from nearer, 5 not at all" in done.stderr
 
-    def stored() -> list[tuple[float, float | None]]:
+    def stored() -> list[tuple[float, float | None, float | None]]:
         (node,) = [node for node in load_site(floor).site.nodes if node.id == "n1"]
-        return [(sonar.range_limit, sonar.false_echo_rate) for sonar in node.sonars]
+        return [(sonar.range_limit, sonar.range_max, sonar.false_echo_rate) for sonar in node.sonars]
 
     shares = [pytest.approx(2 / 260, abs=1e-4), pytest.approx(4 / 260, abs=1e-4)]
     assert "warning" not in done.stderr
-    assert stored() == [(1.5, shares[0]), (1.6, shares[1])]
-    # A firmware that does not count them leaves what is known.
-    answers.append(
-        msgspec.structs.replace(LEARNED, range_limit_m=[1.4, 1.4], samples=[], false_echoes=[], no_echoes=[])
-    )
+    assert stored() == [(2.7, 3.2, shares[0]), (2.75, 3.25, shares[1])]
+    # A firmware that does not count or tell them leaves what is known.
+    silent = {"samples": [], "false_echoes": [], "no_echoes": [], "range_max_m": []}
+    answers.append(msgspec.structs.replace(LEARNED, range_limit_m=[2.6, 2.6], **silent))
     assert CliRunner().invoke(node_app, words).exit_code == 0
-    assert stored() == [(1.4, shares[0]), (1.4, shares[1])]
+    assert stored() == [(2.6, 3.2, shares[0]), (2.6, 3.25, shares[1])]
+
+
+@pytest.mark.parametrize(
+    ("learned", "says"),
+    [
+        ({"range_limit_m": [1.0, 2.7], "range_max_m": [1.5, 3.2]}, "sonar 1 hears something between 1.00 and 1.50 m"),
+        ({"range_limit_m": [2.7, 4.0], "range_max_m": [3.2, 4.5]}, "sonar 2 hears something between 4.00 and 4.50 m"),
+        (
+            {"range_limit_m": [2.7, 4.0], "range_max_m": [3.2, 0.0], "no_echo_is_clear": [False, True]},
+            "sonar 2 hears nothing, and the map has a",
+        ),
+    ],
+    ids=["somebody stood there", "door was open", "sonar is covered"],
+)
+def test_calibration_that_contradicts_the_map_is_written_only_by_force(monkeypatch, floor: Path, learned, says) -> None:
+    async def learn(*_: object) -> NodeCalibration:
+        return msgspec.structs.replace(LEARNED, **learned)
+
+    monkeypatch.setattr(on_broker, "learn", learn)
+    before = (floor / "site.toml").read_bytes()
+    words = ["calibrate", "n1", "--site", str(floor), "--broker", "mqtt://127.0.0.1:1"]
+    done = CliRunner().invoke(node_app, words)
+    assert done.exit_code == 1
+    assert says in " ".join(done.stderr.split())
+    assert (floor / "site.toml").read_bytes() == before
+    assert CliRunner().invoke(node_app, [*words, "--force"]).exit_code == 0
+    sonars = next(node for node in load_site(floor).site.nodes if node.id == "n1").sonars
+    assert [sonar.range_limit for sonar in sonars] == learned["range_limit_m"]
+
+
+def test_calibration_says_that_silence_alone_never_clears_an_area(monkeypatch) -> None:
+    async def learn(*_: object) -> NodeCalibration:
+        silent = {"range_limit_m": [4.0, 4.0], "range_max_m": [0.0, 0.0], "no_echo_is_clear": [True, True]}
+        return msgspec.structs.replace(LEARNED, **silent)
+
+    monkeypatch.setattr(on_broker, "learn", learn)
+    done = CliRunner().invoke(node_app, ["calibrate", "n1", "--site-id", "estig", "--broker", "mqtt://127.0.0.1:1"])
+    assert "warning: no sonar of n1 hears anything" in " ".join(done.stderr.split())
 
 
 def test_calibration_warns_of_a_sonar_that_hears_more_than_the_rule_takes_into_account(monkeypatch) -> None:
@@ -311,7 +351,10 @@ def test_broker_accepts_the_stored_password_and_no_other(tmp_path: Path) -> None
 def test_replacing_a_node_leaves_every_other_line_of_the_site(index, limits, silent, after) -> None:
     text = (ROOT / "sites" / "estig" / "site.toml").read_text("utf-8") + after
     nodes = msgspec.convert(tomllib.loads(text)["nodes"], list[NodeSite])
-    sonars = [Sonar(range_limit=limit / 100, no_echo_is_clear=silent) for limit in limits]
+    sonars = [
+        Sonar(range_limit=limit / 100, range_max=None if silent else (limit + 50) / 100, no_echo_is_clear=silent)
+        for limit in limits
+    ]
     nodes[index] = msgspec.structs.replace(nodes[index], sonars=sonars)
     changed = site_file.replaced(text, nodes[index])
     assert changed is not None

@@ -7,6 +7,7 @@ extern "C" {
 
 struct FognavSonar {
     int32_t limit_mm;
+    int32_t max_mm;
     int32_t no_echo_is_clear;
 };
 
@@ -19,6 +20,7 @@ Node* fognav_node_new(const FognavSonar* sonars, int count, uint32_t boot, int p
     settings.config.pause_ms = static_cast<uint16_t>(pause_ms);
     for (int i = 0; i < count; ++i) {
         settings.config.limits[i].limit_mm = sonars[i].limit_mm;
+        settings.config.limits[i].max_mm = sonars[i].max_mm;
         settings.config.limits[i].no_echo_is_clear = sonars[i].no_echo_is_clear != 0;
     }
     settings.boot = boot;
@@ -58,6 +60,8 @@ void fognav_node_temperature(Node* node, int temperature_dc) {
     node->set_temperature(static_cast<int16_t>(temperature_dc));
 }
 
+void fognav_node_measure_temperature(Node* node, int temperature_dc) { node->measure_temperature(temperature_dc); }
+
 void fognav_node_rssi(Node* node, int rssi) { node->set_rssi(static_cast<int16_t>(rssi)); }
 
 // A command, or a calibration that was stored; each returns a null pointer, or what is wrong with it.
@@ -74,6 +78,8 @@ const char* fognav_node_describe_calibration(int result) {
 }
 
 int32_t fognav_node_limit_mm(const Node* node, int sonar) { return node->config().limits[sonar].limit_mm; }
+
+int32_t fognav_node_max_mm(const Node* node, int sonar) { return node->config().limits[sonar].max_mm; }
 
 uint32_t fognav_node_no_echo_us(const Node* node, int sonar) { return node->config().limits[sonar].no_echo_us; }
 

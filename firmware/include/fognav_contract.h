@@ -77,7 +77,7 @@
 #define FOGNAV_NODE_VALUE_UNIT_FIELD "unit"
 #define FOGNAV_NODE_VALUE_UNIT_LENGTH_MAX 16
 
-/* node_config, subscribed by a node: Settings of a node: per sonar the range below which an echo means `blocked`. */
+/* node_config, subscribed by a node: Settings of a node: per sonar the range below which an echo means `blocked`, and beyond which `unknown` (0: none). The pause (ms) follows the time that the last sonar's echoes need. */
 #define FOGNAV_NODE_CONFIG_TOPIC "fog/v1/%s/nodes/%s/config" /* site, node */
 #define FOGNAV_NODE_CONFIG_TOPIC_SIZE 86
 #define FOGNAV_NODE_CONFIG_LIMIT 1024 /* bytes */
@@ -92,13 +92,17 @@
 #define FOGNAV_NODE_CONFIG_RANGE_LIMIT_M_MIN 0.0
 #define FOGNAV_NODE_CONFIG_RANGE_LIMIT_M_MIN_EXCLUSIVE 1
 #define FOGNAV_NODE_CONFIG_RANGE_LIMIT_M_MAX 20.0
+#define FOGNAV_NODE_CONFIG_RANGE_MAX_M_FIELD "range_max_m" /* m */
+#define FOGNAV_NODE_CONFIG_RANGE_MAX_M_ITEMS_MAX 8
+#define FOGNAV_NODE_CONFIG_RANGE_MAX_M_MIN 0.0
+#define FOGNAV_NODE_CONFIG_RANGE_MAX_M_MAX 20.0
 #define FOGNAV_NODE_CONFIG_NO_ECHO_IS_CLEAR_FIELD "no_echo_is_clear"
 #define FOGNAV_NODE_CONFIG_NO_ECHO_IS_CLEAR_ITEMS_MIN 1
 #define FOGNAV_NODE_CONFIG_NO_ECHO_IS_CLEAR_ITEMS_MAX 8
 #define FOGNAV_NODE_CONFIG_PAUSE_MS_FIELD "pause_ms" /* ms */
 #define FOGNAV_NODE_CONFIG_PAUSE_MS_MIN 10
 #define FOGNAV_NODE_CONFIG_PAUSE_MS_MAX 60000L
-#define FOGNAV_NODE_CONFIG_PAUSE_MS_DEFAULT 50
+#define FOGNAV_NODE_CONFIG_PAUSE_MS_DEFAULT 10
 
 /* node_command, subscribed by a node: what a node is to learn while nobody is in its sonars' way */
 #define FOGNAV_NODE_COMMAND_TOPIC "fog/v1/%s/nodes/%s/command" /* site, node */
@@ -137,6 +141,10 @@
 #define FOGNAV_NODE_CALIBRATION_NO_ECHO_IS_CLEAR_FIELD "no_echo_is_clear"
 #define FOGNAV_NODE_CALIBRATION_NO_ECHO_IS_CLEAR_ITEMS_MIN 1
 #define FOGNAV_NODE_CALIBRATION_NO_ECHO_IS_CLEAR_ITEMS_MAX 8
+#define FOGNAV_NODE_CALIBRATION_RANGE_MAX_M_FIELD "range_max_m" /* m */
+#define FOGNAV_NODE_CALIBRATION_RANGE_MAX_M_ITEMS_MAX 8
+#define FOGNAV_NODE_CALIBRATION_RANGE_MAX_M_MIN 0.0
+#define FOGNAV_NODE_CALIBRATION_RANGE_MAX_M_MAX 20.0
 #define FOGNAV_NODE_CALIBRATION_NO_ECHO_US_FIELD "no_echo_us"
 #define FOGNAV_NODE_CALIBRATION_NO_ECHO_US_ITEMS_MIN 1
 #define FOGNAV_NODE_CALIBRATION_NO_ECHO_US_ITEMS_MAX 8

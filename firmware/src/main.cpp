@@ -94,8 +94,10 @@ private:
 
     void take_value() {
         link_.publish_value(values_.message());
-        if (strcmp(values_.value().kind, "temperature") != 0) return;
-        node_.set_temperature(static_cast<int16_t>(values_.value().thousandths / 100));
+        // A voltage may have the name, too.
+        const Value& value = values_.value();
+        if (strcmp(value.kind, "temperature") != 0 || strcmp(value.unit, "C") != 0) return;
+        node_.measure_temperature(value.thousandths / 100);
     }
 
     const Settings& settings_;

@@ -270,10 +270,24 @@ def test_thesis_topic_home_assistant_and_values_are_options(switch_on):
     assert json.loads(description)["dev"]["ids"] == "fognav-lab-n1"
     found = {(value.kind, value.value, value.unit) for value in published(lines, ch.NODE_VALUE, NodeValue)}
     assert found == {("temperature", 30.5, "C"), ("gas", 1.651, "V")}
-    # 30 degrees: sound is faster than at 20.
-    assert published(lines, ch.NODE_READING, NodeReading)[-1].range_m[0] == pytest.approx(1.018, abs=0.004)
     board.tell("celsius -127")
     assert {value.kind for value in published(board.run(3), ch.NODE_VALUE, NodeValue)} == {"gas"}
+
+
+@pytest.mark.parametrize(
+    ("sensor", "says", "range_m"),
+    [
+        ({"sensor": "ds18b20", "pin": 13}, "celsius 30.5", 1.018),  # sound is faster than at 20 degrees
+        ({"sensor": "ds18b20", "pin": 13}, "celsius 85", 1.0),  # what it says when it was without power
+        ({"sensor": "analog", "full_scale_v": 60}, "analog 512", 1.0),  # 30 volts, whatever their name
+    ],
+)
+def test_ranges_follow_the_temperature_that_a_thermometer_measures_where_people_live(switch_on, sensor, says, range_m):
+    board = switch_on({**SETTINGS, "values": [{"kind": "temperature", **sensor}]})
+    board.measures(1000, 3000)
+    board.tell(says)
+    last = published(board.run(30), ch.NODE_READING, NodeReading)[-1]
+    assert last.range_m[0] == pytest.approx(range_m, abs=0.004)
 
 
 @pytest.mark.parametrize("sensor", ["vl53l0x", "vl53l1x"])

@@ -47,7 +47,7 @@ def test_uptime_goes_on_when_the_clock_of_32_bits_wraps(make_node, run):
 
 @pytest.mark.parametrize("metres", [(0.03, 0.03), (0.4, 4.0), (3.9, 2.2), (None, 1.0), (None, None)])
 def test_sonars_are_triggered_in_turn_and_only_when_the_echoes_of_the_other_have_died_away(core, metres):
-    """Else one would hear the other's burst: 27 ms are what echoes of an HC-SR04 need to fade."""
+    """Else one would hear the other's burst, and at times that vary: a ghost must not come twice at the same range."""
     node = FirmwareNode(core, msgspec.structs.replace(SITE, every_reading=True), 7, 0.0)
     triggered: list[tuple[int, int]] = []
     waiting: list[int] = []
@@ -66,7 +66,29 @@ def test_sonars_are_triggered_in_turn_and_only_when_the_echoes_of_the_other_have
     assert set(waiting) == {0} or None in metres, "an echo of the other is on its way"
     assert [sonar for _, sonar in triggered] == [i % 2 for i in range(len(triggered))]
     moments = [at for at, _ in triggered]
-    assert min(after - before for before, after in itertools.pairwise(moments)) >= 27_000
+    between = [after - before for before, after in itertools.pairwise(moments)]
+    assert min(between) >= 50_000
+    assert all(len(set(gaps)) >= 8 for gaps in (between[::2], between[1::2]))
+
+
+def test_burst_that_walls_throw_to_and_fro_is_no_echo_of_the_next_sonar(core):
+    """Walls 2.1 m apart: its third return, after 37 ms, was an echo from 1.66 m to a sonar that came after 27 ms."""
+    sonars = [Sonar(range_limit=1.8, range_max=2.4)] * 2
+    node = FirmwareNode(core, msgspec.structs.replace(SITE, sonars=sonars, every_reading=True), 7, 0.0)
+    flight = round(2 * 2.1 / 343.42 * 1e6)
+    bursts: list[int] = []
+
+    def trigger(_world, at_us):
+        rise = at_us + 450
+        late = [burst + count * flight for burst in bursts[-1:] for count in (2, 3, 4)]
+        sonar = core.sonar(node._node)
+        node._edges = [(rise, sonar, 1), (min(at for at in (*late, rise + flight) if at > rise), sonar, 0)]
+        bursts.append(rise)
+
+    node._trigger = trigger
+    published = [reading for step in range(1, 2000) for reading in node.poll(None, step * 0.01)]
+    assert {reading.state for reading in published[1:]} == {"clear"}
+    assert {tuple(reading.range_m) for reading in published[1:]} == {(2.1, 2.1)}
 
 
 @settings(deadline=None, max_examples=60)
@@ -97,7 +119,7 @@ def test_single_spike_never_changes_what_is_reported(make_node, run, spike):
 
     node = make_node(every_reading=True)
     published = [reading for step in range(1, 1000) for reading in node.poll(World(), 100.0 + step * 0.01)]
-    assert len(published) > 80
+    assert len(published) > 60
     assert {(reading.state, *reading.range_m, *reading.status) for reading in published} == {
         ("clear", 3.004, 3.004, "ok", "ok")
     }
@@ -112,17 +134,31 @@ def test_real_change_is_reported_with_its_second_measurement(make_node, run):
 
 
 @pytest.mark.parametrize("count", [1, 2])
-def test_first_echo_of_an_obstacle_is_verified_without_the_pause(core, run, count):
+@pytest.mark.parametrize("pause_ms", [10, 1000])
+def test_first_echo_of_an_obstacle_is_verified_at_once_by_the_same_sonar(core, run, count, pause_ms):
     """The aggregator takes readings that are less than 40 ms apart for one."""
     node = FirmwareNode(
         core, msgspec.structs.replace(SITE, sonars=[Sonar(range_limit=2.0)] * count, every_reading=True), 7, 100.0
     )
+    config = NodeConfig(version=1, range_limit_m=[2.0] * count, no_echo_is_clear=[False] * count, pause_ms=pause_ms)
+    assert node.configure(config)
+    triggered: list[tuple[int, int]] = []
+    answer = node._trigger
+
+    def trigger(world, at_us):
+        triggered.append((at_us, core.sonar(node._node)))
+        answer(world, at_us)
+
     run(node, (3.0,) * count, 3.05)
-    published = run(node, (1.0,) * count, 1.0)
-    first = [reading.state for reading in published].index("blocked")
+    node._trigger = trigger
+    published = run(node, (1.0,) * count, 2.0)
+    (began, sonar), (again, same) = triggered[:2]
+    assert sonar == same
+    assert 50_000 <= again - began <= 61_000
+    first = next(reading for reading in published if reading.state == "blocked")
+    assert first.uptime_ms * 1000 - began <= count * 61_000 + 15_000
     between = [after.uptime_ms - before.uptime_ms for before, after in itertools.pairwise(published)]
-    assert 44 <= between[first - 1] <= 58
-    assert min(between[first:]) >= 76
+    assert min(between) >= 50
 
 
 def test_obstacle_at_the_limit_does_not_flap(make_node, run):
@@ -138,7 +174,19 @@ def test_silence_is_clear_only_where_it_was_calibrated(make_node, run):
     node = make_node()
     config = NodeConfig(version=1, range_limit_m=[2.0, 2.5], no_echo_is_clear=[True, True])
     assert node.configure(config)
-    assert run(node, (None, None), 2.0)[-1].state == "clear"
+    assert run(node, (None, 3.0), 2.0)[-1].state == "clear"
+    # Both dead or covered would sound the same: silence alone never shows that nothing is there.
+    assert run(node, (None, None), 2.0)[-1].state == "unknown"
+
+
+def test_echo_from_behind_the_wall_is_unknown(make_node, run):
+    """What stands flush to the wall, slants or is soft sends the sound on a detour: the wall's echo comes late."""
+    node = make_node(sonars=[Sonar(range_limit=1.8, range_max=2.4), Sonar(range_limit=1.8, range_max=2.4)])
+    assert run(node, (2.1, 2.1), 1.0)[-1].state == "clear"
+    assert run(node, (3.3, 2.1), 1.0)[-1].state == "unknown"
+    assert run(node, (2.1, 2.41), 1.0)[-1].state == "unknown"
+    assert run(node, (2.1, 2.38), 1.0)[-1].state == "clear"
+    assert run(node, (3.3, 1.2), 1.0)[-1].state == "blocked"
 
 
 def test_sonar_without_an_answer_is_stuck_and_unknown(core):
@@ -201,6 +249,21 @@ def test_range_follows_the_temperature(core, run, make_node, tenths, metres):
     assert measured == pytest.approx(metres, abs=0.006)
 
 
+def test_measured_temperature_is_followed_in_small_steps_and_only_where_people_live(core, run, make_node):
+    """A DS18B20 that was without power says 85 degrees: 1.70 m would be 1.91 m, beyond the limit."""
+    node = make_node(sonars=[Sonar(range_limit=1.8)] * 2)
+    for wrong in (850, -1270, 501, -201, 33_000):
+        for _ in range(20):
+            core.measure_temperature(node._node, wrong)
+    measured = run(node, (1.7, 1.7), 2.0)[-1]
+    assert (measured.state, measured.range_m[0]) == ("blocked", pytest.approx(1.7, abs=0.006))
+    core.measure_temperature(node._node, 400)
+    assert run(node, (1.7, 1.7), 2.0)[-1].range_m[0] == pytest.approx(1.7, abs=0.006)
+    for _ in range(60):
+        core.measure_temperature(node._node, 400)
+    assert run(node, (1.7, 1.7), 2.0)[-1].range_m[0] == pytest.approx(1.76, abs=0.006)
+
+
 def test_saving_air_publishes_ten_readings_after_a_change_and_then_one_a_second(make_node, run):
     node = make_node()
     run(node, (3.0, 3.0), 5.0)
@@ -227,9 +290,9 @@ def test_readings_go_out_as_after_a_change_when_connection_or_configuration_is_n
 @pytest.mark.parametrize(
     ("free", "learned"),
     [
-        ((3.0, 3.5), [("calibrated", 2.8, 0), ("calibrated", 3.3, 0)]),
-        ((None, 3.5), [("calibrated", 4.0, 1), ("calibrated", 3.3, 0)]),
-        ((0.45, 3.5), [("its free distance", 2.0, 0), ("calibrated", 3.3, 0)]),
+        ((3.0, 3.5), [("calibrated", 2.8, 3.3, 0), ("calibrated", 3.3, 3.8, 0)]),
+        ((None, 3.5), [("calibrated", 4.0, 0.0, 1), ("calibrated", 3.3, 3.8, 0)]),
+        ((0.45, 3.5), [("its free distance", 2.0, 0.0, 0), ("calibrated", 3.3, 3.8, 0)]),
     ],
 )
 def test_calibration_learns_the_free_distance(core, make_node, run, free, learned):
@@ -239,16 +302,17 @@ def test_calibration_learns_the_free_distance(core, make_node, run, free, learne
     assert {reading.state for reading in run(node, free, 2.0)} == {"unknown"}
     run(node, free, 40.0)
     assert not core.calibrating(node._node)
-    for sonar, (words, limit, silent) in enumerate(learned):
+    for sonar, (words, limit, farthest, silent) in enumerate(learned):
         assert core.describe_calibration(core.calibration(node._node, sonar)).decode().startswith(words)
         assert core.limit_mm(node._node, sonar) / 1000 == pytest.approx(limit, abs=0.02)
+        assert core.max_mm(node._node, sonar) / 1000 == pytest.approx(farthest, abs=0.02)
         assert core.no_echo_is_clear(node._node, sonar) == silent
 
 
 def test_calibration_refuses_a_sonar_that_is_disturbed(core, make_node, run):
     node = make_node()
     assert node.command(ch.CALIBRATE) is None
-    for step in range(240):
+    for step in range(400):
         run(node, (3.0 if step % 2 else 1.5, 3.0), 0.2)
     assert not core.calibrating(node._node)
     assert b"unsteady" in core.describe_calibration(core.calibration(node._node, 0))
@@ -335,7 +399,7 @@ def test_unsteady_echoes_are_reported_with_the_remedy(core, make_node, run):
     node = make_node()
     assert node.command(ch.CALIBRATE) is None
     assert b"keep the way" in core.describe_calibration(core.calibration(node._node, 0))
-    for step in range(240):
+    for step in range(400):
         run(node, (3.0 if step % 2 else 1.5, 3.0), 0.2)
     assert node.take_calibration().result == ["unsteady", "done"]
 
@@ -359,8 +423,9 @@ def test_calibration_holds_until_another_version_comes_and_over_a_restart(core, 
     for each in (node, again):
         assert each.configure(msgspec.structs.replace(config, pause_ms=60))  # delivered again with each connection
         assert core.limit_mm(each._node, 0) == pytest.approx(2800, abs=20)
+        assert core.max_mm(each._node, 0) == pytest.approx(3300, abs=20)
         assert each.configure(msgspec.structs.replace(config, version=10, range_limit_m=[1.5, 1.5]))
-        assert core.limit_mm(each._node, 0) == 1500
+        assert (core.limit_mm(each._node, 0), core.max_mm(each._node, 0)) == (1500, 0)
 
 
 def test_stored_calibration_for_other_sonars_is_refused(make_node, run):

@@ -78,6 +78,7 @@ def _too_large(value):
         NodeConfig,
         version=st.integers(0, 2**53),
         range_limit_m=st.lists(st.floats(0.001, 20.0), min_size=2, max_size=2),
+        range_max_m=st.just([]) | st.lists(st.floats(0.0, 20.0), min_size=2, max_size=2),
         no_echo_is_clear=st.lists(st.booleans(), min_size=2, max_size=2),
         pause_ms=st.integers(10, 60_000),
     ),
@@ -92,6 +93,8 @@ def test_every_valid_configuration_is_applied_whatever_else_it_holds(core, make_
     assert core.configure(node._node, text, len(text)) is None
     for sonar, limit in enumerate(config.range_limit_m):
         assert core.limit_mm(node._node, sonar) == pytest.approx(limit * 1000, abs=0.5000001)
+        farthest = config.range_max_m[sonar] if config.range_max_m else 0.0
+        assert core.max_mm(node._node, sonar) == pytest.approx(farthest * 1000, abs=0.5000001)
         assert bool(core.no_echo_is_clear(node._node, sonar)) == config.no_echo_is_clear[sonar]
 
 
@@ -109,6 +112,14 @@ def test_every_valid_configuration_is_applied_whatever_else_it_holds(core, make_
         ('{"version": 1, "range_limit_m": [1, 1], "no_echo_is_clear": [true]}', "no_echo_is_clear is for another"),
         ('{"version": 1, "range_limit_m": [1, 0], "no_echo_is_clear": [true, true]}', "from 0.001 to 20 m"),
         ('{"version": 1, "range_limit_m": [1, 20.1], "no_echo_is_clear": [true, true]}', "from 0.001 to 20 m"),
+        (
+            '{"version": 1, "range_limit_m": [1, 1], "range_max_m": [1], "no_echo_is_clear": [true, true]}',
+            "range_max_m is for another",
+        ),
+        (
+            '{"version": 1, "range_limit_m": [1, 1], "range_max_m": [2, 21], "no_echo_is_clear": [true, true]}',
+            "from 0 to 20 m",
+        ),
         ('{"version": 1.5, "range_limit_m": [1, 1], "no_echo_is_clear": [true, true]}', "version"),
         ('{"version": 1, "range_limit_m": [1, 1], "no_echo_is_clear": [true, true], "pause_ms": 9}', "pause_ms"),
         ('{"version": 1, "range_limit_m": [1, 1], "no_echo_is_clear": [true, true], "pause_ms": 60001}', "pause_ms"),

@@ -59,12 +59,16 @@ def test_new_pause_is_applied_and_configuration_for_another_number_of_sonars_is_
         ([None, 2.4], (False, False), "blocked"),
         ([None, 2.7], (False, False), "unknown"),
         ([None, 2.7], (True, False), "clear"),
-        ([None, None], (True, True), "clear"),
+        ([None, None], (True, True), "unknown"),
+        ([2.2, 3.01], (False, False), "clear"),
+        ([2.61, 2.7], (False, False), "unknown"),
+        ([2.61, 2.4], (False, False), "blocked"),
         ([None, None], (True, False), "unknown"),
     ],
 )
 def test_no_echo_means_clear_only_if_calibrated_so(ranges, no_echo_is_clear, state):
-    config = NodeConfig(version=0, range_limit_m=[2.0, 2.5], no_echo_is_clear=list(no_echo_is_clear))
+    limits = {"range_limit_m": [2.0, 2.5], "range_max_m": [2.6, 0.0]}
+    config = NodeConfig(version=0, **limits, no_echo_is_clear=list(no_echo_is_clear))
     assert classify(ranges, config) == state
 
 

@@ -25,10 +25,10 @@ from fog_kernels.astar import Planner
 from fog_kernels.distance import squared_distance_capped
 from fog_kernels.inflation import inflate, inflation_table
 from fog_kernels.raycast import cast
+from fognav.nodes.placing import bounded, heard
 from fognav_sim.barrier import BarrierError, barrier_across
 from fognav_sim.floor import Floor
 from fognav_sim.node import classify, default_config
-from fognav_sim.sensors import Noise, Robot, Sonars
 
 PLACE_CLEARANCE_M: Final = 0.45
 DRIVE_M: Final = (15.0, 60.0)
@@ -54,8 +54,6 @@ _PAIRS: Final = 3000
 _HEADINGS: Final = 36
 _BARRIERS: Final = 8
 _UNSEEN: Final = "have walls from which a sonar opposite does not get a clear echo, or too near for one"
-_NO_NOISE: Final = Noise(sonar_sigma=0.0, sonar_spike=0.0)
-_NO_ROBOT: Final = Robot(x=-1e6, y=-1e6, radius=0.1, height=0.1)
 
 
 class NoSiteError(ValueError):
@@ -275,7 +273,7 @@ def _area_at(floor: _Floor, spot: Point, number: int) -> tuple[AreaSite, NodeSit
         limit = min(echo, _SONAR_MAX_M) - _WALL_MARGIN_M
         if limit < _CORRIDOR_M[0] / 2:
             raise _NoAreaError(_UNSEEN)
-        sonars.append(Sonar(angle=angle, range_limit=round(limit, 2), no_echo_is_clear=echo > _SONAR_MAX_M))
+        sonars.append(Sonar(angle=angle, range_limit=round(limit, 2)))
     corners = [
         (spot[0] + dx * u - dy * v, spot[1] + dy * u + dx * v)
         for u, v in ((-near, -half), (far, -half), (far, half), (-near, half))
@@ -293,7 +291,7 @@ def _area_at(floor: _Floor, spot: Point, number: int) -> tuple[AreaSite, NodeSit
         height=_NODE_HEIGHT_M,
         sonars=sonars,
     )
-    return area, node
+    return area, bounded(floor.echoing, node)
 
 
 def _check_sensed(floor: _Floor, area: AreaSite, node: NodeSite) -> None:
@@ -320,10 +318,7 @@ def _check_sensed(floor: _Floor, area: AreaSite, node: NodeSite) -> None:
 
 def _state_of(floor: _Floor, node: NodeSite) -> AreaState:
     """Return what a node reports on the floor without a robot, measured without noise."""
-    generator = np.random.default_rng(0)
-    sonars = Sonars(floor.echoing)
-    ranges = [sonars.measure(_NO_ROBOT, node, index, _NO_NOISE, generator) for index in range(len(node.sonars))]
-    return classify(ranges, default_config(node))
+    return classify(heard(floor.echoing, node), default_config(node))
 
 
 def _detour(

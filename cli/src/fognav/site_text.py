@@ -32,7 +32,8 @@ def to_toml(site: Site) -> str:
     )
     about_nodes = (
         "# A sensor node on a wall: `range_limit` is the calibrated distance below which an echo means an",
-        "# obstacle; set `no_echo_is_clear` only if no opposite wall is in range.",
+        "# obstacle, `range_max` the one beyond which it comes from behind the opposite wall and says nothing;",
+        "# `no_echo_is_clear` is for a calibration to say.",
     )
     lines = [
         *head,
@@ -75,7 +76,8 @@ def node_lines(node: NodeSite) -> list[str]:
     """Return a node as a table of `site.toml`, with an empty line at its end."""
     sonars = (
         f"    {{ angle = {_number(s.angle)}, range_limit = {_number(s.range_limit)}, "
-        f"no_echo_is_clear = {str(s.no_echo_is_clear).lower()}"
+        + ("" if s.range_max is None else f"range_max = {_number(s.range_max)}, ")
+        + f"no_echo_is_clear = {str(s.no_echo_is_clear).lower()}"
         + ("" if s.false_echo_rate is None else f", false_echo_rate = {_number(s.false_echo_rate)}")
         + " },"
         for s in node.sonars

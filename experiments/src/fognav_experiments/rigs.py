@@ -9,6 +9,8 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Final, Literal
 
+import msgspec
+
 from fog_contracts import channels as ch
 from fog_contracts.bus import Bus
 from fog_contracts.commands import signed_command
@@ -30,6 +32,7 @@ from fognav_experiments.processes import (
 from fognav_sim import devices
 from fognav_sim.floor import Floor
 from fognav_sim.hardware import STEP_S, Hardware
+from fognav_sim.node import default_config
 from fognav_sim.nodes import make_nodes
 from fognav_sim.world import World
 from hazard_aggregator.core import Aggregator
@@ -107,15 +110,7 @@ class Tuning:
         if self.pause_ms is None:
             return
         for node in nodes:
-            sonars = node.node.sonars
-            node.configure(
-                NodeConfig(
-                    version=1,
-                    range_limit_m=[sonar.range_limit for sonar in sonars],
-                    no_echo_is_clear=[sonar.no_echo_is_clear for sonar in sonars],
-                    pause_ms=self.pause_ms,
-                )
-            )
+            node.configure(msgspec.structs.replace(default_config(node.node), version=1, pause_ms=self.pause_ms))
 
 
 class RobotRig:

@@ -376,12 +376,36 @@ def test_node_that_stays_blocked_a_little_beyond_the_limit_is_believed_but_not_f
 
 def test_no_echo_is_clear_only_where_calibration_found_nothing_in_range():
     free = Rig(site("n1", no_echo_is_clear=True))
-    free.read(None, None, state="clear", times=5)
+    free.read(None, 3.0, state="clear", times=5)
     assert free.hazard.state == "clear"
     walled = Rig(site("n1", no_echo_is_clear=False))
-    walled.read(None, None, state="clear", times=20)
+    walled.read(None, 3.0, state="clear", times=20)
     assert walled.hazard.state == "unknown"
     assert "opposite wall" in walled.hazard.cause
+
+
+@pytest.mark.parametrize("reported", ["clear", "unknown"])
+def test_silence_of_all_its_sonars_clears_nothing_since_dead_and_covered_ones_are_silent_too(reported):
+    rig = Rig(site("n1", no_echo_is_clear=True))
+    rig.read(3.0, 3.0, times=5)
+    assert rig.hazard.state == "clear"
+    rig.read(None, None, state=reported, times=20)
+    assert rig.hazard.state == "unknown"
+    assert "dead or covered" in rig.hazard.cause or reported == "unknown"
+
+
+@pytest.mark.parametrize("reported", ["clear", "unknown"])
+def test_echo_from_behind_the_wall_clears_nothing(reported):
+    """Wall at 2.1 m: what is flush to it, slants or is soft sends the sound on a detour, and the echo comes late."""
+    sonars = [Sonar(angle=angle, range_limit=1.8, range_max=2.4) for angle in (0.0, 0.1)]
+    rig = Rig(msgspec.structs.replace(site("n1"), sonars=sonars))
+    rig.read(2.1, 2.38, state="clear", times=5)
+    assert rig.hazard.state == "clear"
+    rig.read(3.3, 2.1, state=reported, times=20)
+    assert rig.hazard.state == "unknown"
+    assert "none from beyond 2.40 m" in rig.hazard.cause or reported == "unknown"
+    rig.read(3.3, 0.8, state="blocked", times=5)
+    assert rig.hazard.state == "blocked"
 
 
 @pytest.mark.parametrize(("ranges", "state"), [((0.8, 3.0), "blocked"), ((3.0, 3.0), "clear")])

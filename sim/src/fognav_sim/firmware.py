@@ -26,7 +26,7 @@ class FirmwareError(RuntimeError):
 class Sonar(ctypes.Structure):
     """Calibration of a sonar, as the core's C interface takes it."""
 
-    _fields_ = (("limit_mm", ctypes.c_int32), ("no_echo_is_clear", ctypes.c_int32))
+    _fields_ = (("limit_mm", ctypes.c_int32), ("max_mm", ctypes.c_int32), ("no_echo_is_clear", ctypes.c_int32))
 
 
 def find_firmware() -> Path:
@@ -106,6 +106,7 @@ class Core(ctypes.CDLL):
             "configure": (ctypes.c_char_p, (node, ctypes.c_char_p, ctypes.c_uint32)),
             "connected": (None, (node,)),
             "temperature": (None, (node, ctypes.c_int)),
+            "measure_temperature": (None, (node, ctypes.c_int)),
             "rssi": (None, (node, ctypes.c_int)),
             "command": (ctypes.c_char_p, (node, ctypes.c_char_p, ctypes.c_uint32)),
             "restore": (ctypes.c_char_p, (node, ctypes.c_char_p, ctypes.c_uint32)),
@@ -113,6 +114,7 @@ class Core(ctypes.CDLL):
             "calibration": (ctypes.c_int, (node, ctypes.c_int)),
             "describe_calibration": (ctypes.c_char_p, (ctypes.c_int,)),
             "limit_mm": (ctypes.c_int32, (node, ctypes.c_int)),
+            "max_mm": (ctypes.c_int32, (node, ctypes.c_int)),
             "no_echo_is_clear": (ctypes.c_int, (node, ctypes.c_int)),
             "no_echo_us": (ctypes.c_uint32, (node, ctypes.c_int)),
         }

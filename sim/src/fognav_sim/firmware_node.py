@@ -40,8 +40,8 @@ class FirmwareNode:
     def __init__(self, core: Core, node: NodeSite, boot: int, start: float) -> None:
         self.node = node
         self.config = default_config(node)
-        limits = zip(self.config.range_limit_m, self.config.no_echo_is_clear, strict=True)
-        sonars = [Sonar(round(limit * 1000), int(silent)) for limit, silent in limits]
+        limits = zip(self.config.range_limit_m, self.config.range_max_m, self.config.no_echo_is_clear, strict=True)
+        sonars = [Sonar(round(1000 * limit), round(1000 * farthest), int(silent)) for limit, farthest, silent in limits]
         self._core = core
         self._node = core.new(
             (Sonar * len(sonars))(*sonars), len(sonars), boot, self.config.pause_ms, int(node.every_reading), FIRMWARE

@@ -1,9 +1,8 @@
 """A sensor node: the firmware's measurement cycle and classification, with the real sonar's timing. Pure.
 
 The sonars measure one after the other, each for its time of flight (36 ms without an echo) but at least until its
-echoes have decayed; then the reading is published and the firmware pauses. This gives about 9 readings a second with
-echoes, about 8 without. Source of the timing: HC-SR04 data sheet; the pause is the thesis's (section 3.3). Which
-readings are published, `publishing` decides.
+echoes have decayed; the reading is published with the last one's, and the firmware pauses. This gives about 8 readings
+a second. Source of the timing: HC-SR04 data sheet. Which readings are published, `publishing` decides.
 """
 
 from __future__ import annotations
@@ -21,8 +20,8 @@ if TYPE_CHECKING:
 
 NO_ECHO_S: Final = 0.036
 """The module ends its pulse after about 38 ms without an echo; the firmware times out just before."""
-ECHO_DECAY_S: Final = 0.027
-PUBLISH_S: Final = 0.002
+ECHO_DECAY_S: Final = 0.055
+"""From a trigger to the next: the mean of the firmware's, which vary."""
 FIRMWARE: Final = "sim-1"
 
 
@@ -31,6 +30,7 @@ def default_config(node: NodeSite) -> NodeConfig:
     return NodeConfig(
         version=0,
         range_limit_m=[sonar.range_limit for sonar in node.sonars],
+        range_max_m=[sonar.range_max or 0.0 for sonar in node.sonars],
         no_echo_is_clear=[sonar.no_echo_is_clear for sonar in node.sonars],
     )
 
@@ -38,18 +38,24 @@ def default_config(node: NodeSite) -> NodeConfig:
 def classify_sonars(ranges: list[float | None], config: NodeConfig) -> list[AreaState]:
     """Classify the range (m; None for no echo) of each sonar, without the firmware's hysteresis."""
     states: list[AreaState] = []
-    for measured, limit, silent in zip(ranges, config.range_limit_m, config.no_echo_is_clear, strict=True):
+    farthest = config.range_max_m or [0.0] * len(ranges)
+    limits = zip(ranges, config.range_limit_m, farthest, config.no_echo_is_clear, strict=True)
+    for measured, limit, most, silent in limits:
         if measured is None:
             states.append("clear" if silent else "unknown")
+        elif measured < limit:
+            states.append("blocked")
         else:
-            states.append("blocked" if measured < limit else "clear")
+            states.append("unknown" if most and measured > most else "clear")
     return states
 
 
 def classify(ranges: list[float | None], config: NodeConfig) -> AreaState:
-    """Classify ranges (m) as the firmware does: one near echo means blocked; clear takes every sonar."""
+    """Classify ranges (m) as the firmware does: one near echo means blocked; clear takes every sonar, and an echo."""
     states = classify_sonars(ranges, config)
-    return "blocked" if "blocked" in states else "unknown" if "unknown" in states else "clear"
+    if "blocked" in states:
+        return "blocked"
+    return "clear" if set(states) == {"clear"} and any(measured is not None for measured in ranges) else "unknown"
 
 
 class SonarNode:
@@ -65,6 +71,7 @@ class SonarNode:
         self._due = start
         self._index = 0
         self._ranges: list[float | None] = []
+        self._triggered = start
 
     def configure(self, config: NodeConfig) -> bool:
         """Apply a configuration; return False if it is for another number of sonars, and ignore it."""
@@ -99,12 +106,13 @@ class SonarNode:
                 flight = NO_ECHO_S if measured is None else 2 * measured / SOUND_M_S
                 self._ranges.append(measured)
                 self._index += 1
-                self._due += max(flight, ECHO_DECAY_S)
+                self._triggered = self._due
+                self._due += ECHO_DECAY_S if self._index < len(self.node.sonars) else flight
                 continue
             if self._publish.update(classify_sonars(self._ranges, self.config), self._ranges, self._due):
                 readings.append(self._reading())
             self._index, self._ranges = 0, []
-            self._due += PUBLISH_S + self.config.pause_ms / 1000
+            self._due = self._triggered + ECHO_DECAY_S + self.config.pause_ms / 1000
         return readings
 
     def _reading(self) -> NodeReading:

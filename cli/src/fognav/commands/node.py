@@ -138,6 +138,7 @@ def node_calibrate(  # noqa: PLR0913  # each option is an argument
     folder: Annotated[
         Path | None, typer.Option("--site", metavar="D", help="Folder of a site whose node gets the learned limits.")
     ] = None,
+    force: Annotated[bool, typer.Option("--force", help="Write them even if the map's walls are elsewhere.")] = False,
     broker: BrokerOption = None,
     site: Annotated[str | None, typer.Option("--site-id", metavar="ID", help="Default: the running system's.")] = None,
     fog: FogOption = None,
@@ -145,8 +146,9 @@ def node_calibrate(  # noqa: PLR0913  # each option is an argument
 ) -> None:
     """Let a node measure the free corridor, and take its range limits from that. Nobody may stand in its way.
 
-    With --site the limits, and how likely false echoes are, are written into site.toml; without, the aggregator's next
-    configuration replaces them.
+    With --site the limits, and how likely false echoes are, are written into site.toml, unless the node hears the wall
+    elsewhere than the map has it: somebody may have stood there. Without, the aggregator's next configuration replaces
+    them.
     """
     with exit_codes():
         loaded = None if folder is None else site_file.load(checkout.site_folder(folder))
@@ -158,8 +160,12 @@ def node_calibrate(  # noqa: PLR0913  # each option is an argument
         failed = [
             f"sonar {index + 1} {_RESULTS[result]}" for index, result in enumerate(learned.result) if result != "done"
         ]
+        unlike: list[str] = []
         if loaded is not None and node is not None and not failed and not no_echo:
-            site_file.replace(loaded, _with_limits(node, learned))
+            with_limits = _with_limits(node, learned)
+            unlike = [] if force else _unlike_the_map(loaded, node, learned)
+            if not unlike:
+                site_file.replace(loaded, with_limits)
         if json:
             print_json({"node": name, **msgspec.to_builtins(learned)})
         else:
@@ -174,6 +180,16 @@ def node_calibrate(  # noqa: PLR0913  # each option is an argument
                 print_line(warning)
         if failed:
             raise FailedError(f"node {name} keeps its old limits: {', '.join(failed)}")
+        if unlike:
+            raise FailedError(
+                f"site.toml was not changed: {'; '.join(unlike)}. Keep the way free and calibrate again; if the map or "
+                "the node's pose is wrong, mend that, or take what the node hears with --force"
+            )
+        if not no_echo and all(learned.no_echo_is_clear):
+            print_line(
+                f"warning: no sonar of {name} hears anything, and a dead one hears nothing either: this node will tell "
+                "of what stands there, but never that nothing does. Turn one sonar to something that echoes"
+            )
 
 
 @node_app.command("key", epilog="Example: fognav node key update-key.pem")
@@ -270,7 +286,7 @@ def node_sim(  # noqa: PLR0913  # each option is an argument
 
 _RESULTS: Final = {
     "done": "learned",
-    "stuck": "says the same distance always: check its wiring",
+    "stuck": "does not answer: check its supply (5 V), trigger and echo wires",
     "unsteady": "measured something that moved: let nobody stand there",
     "too_near": "looks at something too near: turn the node",
 }
@@ -351,7 +367,8 @@ def _pose(text: str) -> tuple[float, float, float]:
 
 
 def _placed(loaded: LoadedSite, name: str, area: str, pose: tuple[float, float, float], height: float) -> NodeSite:
-    from fognav.nodes.placing import PlacingError, check_sees, sonar_limits  # noqa: PLC0415  # kernels are slow
+    from fognav.nodes.placing import PlacingError, bounded, check_sees, sonar_limits  # noqa: PLC0415  # kernels are slow
+    from fognav_sim.floor import Floor  # noqa: PLC0415  # as above
 
     areas = {known.id: known for known in loaded.site.areas}
     if area not in areas:
@@ -369,9 +386,19 @@ def _placed(loaded: LoadedSite, name: str, area: str, pose: tuple[float, float, 
         }
         node = msgspec.convert(members, NodeSite)
         check_sees(node, areas[area], loaded.map)
+        node = bounded(Floor(loaded.map.geometry, loaded.map.cells), node)
     except (PlacingError, msgspec.ValidationError) as error:
         raise WrongUseError(f"node {name}: {error}") from error
     return node
+
+
+def _unlike_the_map(loaded: LoadedSite, node: NodeSite, learned: NodeCalibration) -> list[str]:
+    from fognav.nodes.placing import PlacingError, unlike_the_map  # noqa: PLC0415  # kernels are slow
+
+    try:
+        return unlike_the_map(loaded.map, node, learned)
+    except PlacingError as error:
+        return [f"node {node.id}: {error}"]
 
 
 def _with_limits(node: NodeSite, learned: NodeCalibration) -> NodeSite:
@@ -393,6 +420,7 @@ def _calibrated(sonar: Sonar, learned: NodeCalibration, index: int) -> Sonar:
     return msgspec.structs.replace(
         sonar,
         range_limit=min(4.0, learned.range_limit_m[index]),
+        range_max=(learned.range_max_m[index] or None) if index < len(learned.range_max_m) else sonar.range_max,
         no_echo_is_clear=learned.no_echo_is_clear[index],
         false_echo_rate=rate,
     )

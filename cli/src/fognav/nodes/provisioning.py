@@ -57,7 +57,12 @@ def settings(site: str, node: NodeSite, access: Access, password: str, profile: 
         "profile": profile,
         "every_reading": node.every_reading,
         "sonars": [
-            {"range_limit_m": sonar.range_limit, "no_echo_is_clear": sonar.no_echo_is_clear} for sonar in node.sonars
+            {
+                "range_limit_m": sonar.range_limit,
+                "range_max_m": sonar.range_max or 0.0,
+                "no_echo_is_clear": sonar.no_echo_is_clear,
+            }
+            for sonar in node.sonars
         ],
     }
 

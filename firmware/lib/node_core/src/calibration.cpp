@@ -77,6 +77,7 @@ void Calibration::apply(SonarLimit& limit) const {
         return;
     }
     limit.limit_mm = limit_mm();
+    limit.max_mm = max_mm();
     limit.no_echo_is_clear = silent();
 }
 
@@ -90,6 +91,12 @@ int32_t Calibration::limit_mm() const {
     if (silent()) return echoes_ == 0 ? kRangeMm : echoes_seen_[0] - kMarginMm;
     const int32_t margin = 3 * spread();
     return quartile(1) - (margin > kMarginMm ? margin : kMarginMm);
+}
+
+int32_t Calibration::max_mm() const {
+    if (silent()) return 0;
+    const int32_t margin = 3 * spread();
+    return quartile(2) + (margin > kBeyondMm ? margin : kBeyondMm);
 }
 
 }  // namespace fognav

@@ -1,5 +1,5 @@
-// Learns what a sensor measures while nobody is in its way: the limit below which an echo means `blocked`, and whether
-// "no echo" is what free space looks like. The thesis did this by hand (Mendes 2022, section 5.1). Or it learns the pulse
+// Learns what a sensor measures while nobody is in its way: the limit below which an echo means `blocked`, the farthest
+// echo of free space, and whether "no echo" is what free space looks like. The thesis did this by hand (Mendes 2022, section 5.1). Or it learns the pulse
 // by which a clone of the HC-SR04 says "no echo", while nothing at all is in its range.
 #pragma once
 
@@ -10,6 +10,7 @@ namespace fognav {
 constexpr int kCalibrationSamples = 64;  // from these the limit is learned
 constexpr int kFreeSamples = 256;        // and in these, after them, false echoes are counted
 constexpr int32_t kMarginMm = 200;       // the limit is at least so much nearer than the free distance
+constexpr int32_t kBeyondMm = 300;       // an echo so much farther than the free distance comes from elsewhere, at least
 constexpr int32_t kMinLimitMm = 300;     // nearer, a free distance guards nothing
 constexpr int32_t kMaxSpreadMm = 150;    // between the quartiles; more means that something moved
 constexpr int kSteadyShare = 90;         // percent of samples that must be alike: silent, or with an echo
@@ -52,6 +53,7 @@ private:
 
     // Where free space is silent, the limit is the range of the module, or lies before the nearest of the rare echoes.
     int32_t limit_mm() const;
+    int32_t max_mm() const;  // 0 where free space is silent
     bool silent() const { return silent_ * 100 >= kSteadyShare * (echoes_ + silent_); }
     bool heard() const { return echoes_ * 100 >= kSteadyShare * (echoes_ + silent_); }
     int32_t spread() const { return quartile(3) - quartile(1); }

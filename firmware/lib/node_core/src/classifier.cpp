@@ -6,7 +6,8 @@ State classify(const Sample& sample, const SonarLimit& limit, State before) {
     switch (sample.status) {
         case Status::ok: {
             const int32_t limit_mm = limit.limit_mm + (before == State::blocked ? kHysteresisMm : 0);
-            return sample.range_mm < limit_mm ? State::blocked : State::clear;
+            if (sample.range_mm < limit_mm) return State::blocked;
+            return limit.max_mm != 0 && sample.range_mm > limit.max_mm ? State::unknown : State::clear;
         }
         case Status::no_echo:
             return limit.no_echo_is_clear ? State::clear : State::unknown;
@@ -16,13 +17,15 @@ State classify(const Sample& sample, const SonarLimit& limit, State before) {
     return State::unknown;
 }
 
-State fuse(const State* states, int count) {
-    State fused = count > 0 ? State::clear : State::unknown;
+State fuse(const State* states, const Sample* samples, int count) {
+    bool heard = false;
+    bool clear = true;
     for (int i = 0; i < count; ++i) {
         if (states[i] == State::blocked) return State::blocked;
-        if (states[i] == State::unknown) fused = State::unknown;
+        clear = clear && states[i] == State::clear;
+        heard = heard || samples[i].status == Status::ok;
     }
-    return fused;
+    return clear && heard ? State::clear : State::unknown;
 }
 
 }  // namespace fognav

@@ -18,10 +18,11 @@ bool is(const char* key, size_t length, const char* field) {
 
 class ConfigReader {
 public:
-    // What the text does not set stays as it is in `config`.
+    // What the text does not set stays as it is in `config`, but for the farthest echoes.
     ConfigReader(const NodeConfig& config, int sonars, const char* version_field)
         : config_(config), version_field_(version_field) {
         config_.sonars = sonars;
+        for (SonarLimit& limit : config_.limits) limit.max_mm = 0;  // never the one of other limits
     }
 
     const char* read(const char* text, size_t size) {
@@ -43,6 +44,8 @@ private:
             version(json);
         } else if (is(key, length, FOGNAV_NODE_CONFIG_RANGE_LIMIT_M_FIELD)) {
             limits(json);
+        } else if (is(key, length, FOGNAV_NODE_CONFIG_RANGE_MAX_M_FIELD)) {
+            farthest(json);
         } else if (is(key, length, FOGNAV_NODE_CONFIG_NO_ECHO_IS_CLEAR_FIELD)) {
             silences(json);
         } else if (is(key, length, FOGNAV_NODE_CALIBRATION_NO_ECHO_US_FIELD)) {
@@ -60,6 +63,7 @@ private:
         if (silences_ == kMissing) return "no_echo_is_clear is missing";
         if (limits_ != config_.sonars) return "range_limit_m is for another number of sonars";
         if (silences_ != config_.sonars) return "no_echo_is_clear is for another number of sonars";
+        if (farthest_ > 0 && farthest_ != config_.sonars) return "range_max_m is for another number of sonars";
         if (pulses_ != kMissing && pulses_ != config_.sonars) return "no_echo_us is for another number of sonars";
         return nullptr;
     }
@@ -101,6 +105,19 @@ private:
         }
     }
 
+    void farthest(JsonReader& json) {
+        constexpr int64_t max_mm = static_cast<int64_t>(FOGNAV_NODE_CONFIG_RANGE_MAX_M_MAX * 1000);
+        if (!json.begin_array()) return;
+        farthest_ = 0;
+        while (json.next_element()) {
+            int64_t mm = 0;
+            if (!json.number_milli(mm)) return;
+            if (mm < 0 || mm > max_mm) refuse("range_max_m has a range that is not from 0 to 20 m");
+            if (farthest_ < kMaxSonars) config_.limits[farthest_].max_mm = static_cast<int32_t>(mm);
+            ++farthest_;
+        }
+    }
+
     void silences(JsonReader& json) {
         if (!json.begin_array()) return;
         silences_ = 0;
@@ -130,6 +147,7 @@ private:
     const char* problem_ = nullptr;
     bool has_version_ = false;
     int limits_ = kMissing;  // how many there were
+    int farthest_ = kMissing;
     int silences_ = kMissing;
     int pulses_ = kMissing;
 };

@@ -4,25 +4,28 @@ namespace fognav {
 
 MeasurementCycle::Action MeasurementCycle::step(uint32_t now_us) {
     if (phase_ == Phase::listen) return Action::listen;
-    if (now_us - since_us_ < wait_us_) return Action::wait;
-    if (phase_ == Phase::decay && ++current_ == sonars_) {
-        current_ = 0;
-        phase_ = Phase::pause;
-        since_us_ = now_us;
-        wait_us_ = pause_us_ + jitter_us();
+    if (phase_ == Phase::complete) {
+        phase_ = Phase::wait;
+        wait_us_ += pause_us_;
         return Action::finished;
     }
-    if (phase_ == Phase::pause) begun_us_ = now_us;
+    if (now_us - triggered_us_ < wait_us_) return Action::wait;
     phase_ = Phase::listen;
-    since_us_ = now_us;
-    wait_us_ = kDecayUs;
+    triggered_us_ = now_us;
+    wait_us_ = kDecayUs + jitter_us();
     return Action::trigger;
 }
 
-void MeasurementCycle::hurry() {
-    const uint32_t taken_us = since_us_ - begun_us_;
-    const uint32_t rest_us = taken_us < kShortestUs ? kShortestUs - taken_us : 0;
-    if (rest_us < wait_us_) wait_us_ = rest_us;
+void MeasurementCycle::measured(bool doubtful) {
+    phase_ = Phase::wait;
+    if (doubtful && !repeated_) {
+        repeated_ = true;
+        return;
+    }
+    if (++current_ < sonars_) return;
+    current_ = 0;
+    repeated_ = false;
+    phase_ = Phase::complete;
 }
 
 uint32_t MeasurementCycle::jitter_us() {

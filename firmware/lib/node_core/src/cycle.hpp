@@ -1,15 +1,16 @@
 // The order of a node's measurements: one sonar after the other, never two at once, since one would hear the other's
-// burst; then a pause. The pause varies a little, so that nodes that see each other do not stay in step.
+// burst; then a pause. The time between two bursts varies, so that no echo of an earlier one, or of another node's, comes
+// at the same moment each time: the spike filter drops what does not come twice.
 #pragma once
 
-#include "echo.hpp"
+#include <stdint.h>
 
 namespace fognav {
 
-constexpr uint32_t kDecayUs = 27000;  // after a trigger, until its echoes have died away
-constexpr uint32_t kJitterUs = 6000;  // the pause is longer by up to so much
-// Of a cycle without its pause: the aggregator takes readings that are closer together than 40 ms for one.
-constexpr uint32_t kShortestUs = 45000;
+// After a trigger, until its echoes have died away, at least: walls 2 m apart throw a burst to and fro, and its third
+// return, 38 ms old, was heard as one of the next sonar's from 1.7 m when that came after 27 ms.
+constexpr uint32_t kDecayUs = 50000;
+constexpr uint32_t kJitterUs = 10000;  // by up to so much longer
 
 class MeasurementCycle {
 public:
@@ -17,7 +18,7 @@ public:
         wait,     // nothing to do yet
         trigger,  // arm and trigger the sonar `current()` now
         listen,   // its echo is awaited: poll it, and call `measured` when there is a result
-        finished  // every sonar has measured once: take the reading; the next cycle begins after the pause
+        finished  // every sonar has measured: take the reading; the next cycle begins after the pause
     };
 
     // `seed` makes the jitter of each node its own; 0 means none.
@@ -28,32 +29,34 @@ public:
     // What to do at this time (micros(), 32 bits that wrap). `trigger` and `finished` are said once.
     Action step(uint32_t now_us);
 
-    void measured() { phase_ = Phase::decay; }
+    // The sonar's result is here. A doubtful one is measured again before the next sonar is, once in a cycle.
+    void measured(bool doubtful);
 
-    // After `finished`: leave the pause out, or most of it, this time.
-    void hurry();
+    // Right after `finished`: leave the pause out, this time.
+    void hurry() { wait_us_ -= pause_us_; }
 
     // Forget what has been measured in this cycle: begin it anew.
     void restart() {
-        phase_ = Phase::pause;
+        phase_ = Phase::wait;
         current_ = 0;
+        repeated_ = false;
     }
 
     int current() const { return current_; }
 
 private:
-    enum class Phase : uint8_t { pause, listen, decay };
+    enum class Phase : uint8_t { wait, listen, complete };
 
     uint32_t jitter_us();
 
-    Phase phase_ = Phase::pause;
+    Phase phase_ = Phase::wait;
     uint8_t current_ = 0;
+    bool repeated_ = false;
     int sonars_;
     uint32_t random_;
-    uint32_t pause_us_ = 50000;
-    uint32_t begun_us_ = 0;  // of the cycle: its first trigger
-    uint32_t since_us_ = 0;  // of the pause, or of the last trigger
-    uint32_t wait_us_ = 0;
+    uint32_t pause_us_ = 0;
+    uint32_t triggered_us_ = 0;
+    uint32_t wait_us_ = 0;  // from the last trigger to the next
 };
 
 }  // namespace fognav

@@ -102,6 +102,10 @@ size_t write_calibration(const CalibrationReport& report, char* buffer, size_t s
     json.begin_array();
     for (int i = 0; i < config.sonars; ++i) json.thousandths(config.limits[i].limit_mm);
     json.end_array();
+    json.key(FOGNAV_NODE_CALIBRATION_RANGE_MAX_M_FIELD);
+    json.begin_array();
+    for (int i = 0; i < config.sonars; ++i) json.thousandths(config.limits[i].max_mm);
+    json.end_array();
     json.key(FOGNAV_NODE_CALIBRATION_NO_ECHO_IS_CLEAR_FIELD);
     json.begin_array();
     for (int i = 0; i < config.sonars; ++i) json.value(config.limits[i].no_echo_is_clear);

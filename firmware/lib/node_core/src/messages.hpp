@@ -25,7 +25,7 @@ struct NodeConfig {
     uint64_t version = 0;
     int sonars = 0;
     SonarLimit limits[kMaxSonars] = {};
-    uint16_t pause_ms = 50;
+    uint16_t pause_ms = 10;
 };
 
 // What a node has learned: how it ended for each sonar, and the settings that count now. The configuration's version is

@@ -6,6 +6,14 @@
 
 namespace fognav {
 
+namespace {
+
+constexpr int32_t kColdestDc = -200;
+constexpr int32_t kWarmestDc = 500;
+constexpr int32_t kTemperatureStepDc = 5;
+
+}  // namespace
+
 static_assert(kMessageSize <= FOGNAV_NODE_READING_LIMIT, "a reading may be longer than its channel allows");
 
 Node::Node(const NodeSettings& settings)
@@ -49,21 +57,28 @@ void Node::forget() {
     for (SpikeFilter& filter : filters_) filter = SpikeFilter();
 }
 
+void Node::measure_temperature(int32_t temperature_dc) {
+    if (temperature_dc < kColdestDc || temperature_dc > kWarmestDc) return;
+    const int32_t step = temperature_dc - temperature_dc_;
+    const int32_t most = kTemperatureStepDc;
+    temperature_dc_ = static_cast<int16_t>(temperature_dc_ + (step > most ? most : step < -most ? -most : step));
+}
+
 void Node::take(const Sample& sample) {
     const int sonar = cycle_.current();
     const Sample counts = filters_[sonar].update(sample);
     if (calibrating_) calibrations_[sonar].update(sample, counts, sonars_[sonar].pulse_us());
     reading_.samples[sonar] = counts;
     states_[sonar] = classify(counts, config_.limits[sonar], states_[sonar]);
-    cycle_.measured();
+    // What may be a spike, or the first echo of an obstacle, is measured again at once.
+    cycle_.measured(filters_[sonar].contradicted());
 }
 
 Node::Event Node::finish() {
-    // What may be a spike, or the first echo of an obstacle, is measured again at once.
     if (doubtful()) cycle_.hurry();
     if (calibrating_ && calibration_ended()) return report_calibration();
     reading_.uptime_ms = uptime_us_ / 1000;
-    reading_.state = calibrating_ ? State::unknown : fuse(states_, reading_.sonars);
+    reading_.state = calibrating_ ? State::unknown : fuse(states_, reading_.samples, reading_.sonars);
     if (!publish_.update(reading_, states_)) return Event::none;
     length_ = write_reading(reading_, message_, sizeof message_);
     ++reading_.seq;

@@ -12,8 +12,8 @@
 
 namespace fognav {
 
-// A reading of eight sonars with the longest name of a firmware has 380 characters, a calibration 450.
-constexpr size_t kMessageSize = 512;
+// A reading of eight sonars with the longest name of a firmware has 380 characters, a calibration 520.
+constexpr size_t kMessageSize = 576;
 
 // After so long without a step what was measured before is not fresh: a board waits for seconds while it connects.
 constexpr uint32_t kGapUs = 250000;
@@ -62,6 +62,10 @@ public:
     // Tenths of a degree Celsius. Without a sensor of the temperature the node assumes 20 degrees, and is 0.2 % wrong per
     // degree.
     void set_temperature(int16_t temperature_dc) { temperature_dc_ = temperature_dc; }
+
+    // What a sensor measured. A room has -20 to 50 degrees, and air does not warm by more than half a degree between two
+    // readings: other values (a DS18B20 says 85 after it was without power) must not stretch the ranges.
+    void measure_temperature(int32_t temperature_dc);
     void set_rssi(int16_t rssi) { reading_.rssi = rssi; }
 
     // The connection has come back: readings go out as after a change.

@@ -6,8 +6,8 @@
 
 namespace fognav {
 
-// Two samples agree within this: somebody who walks moves 11 to 16 cm in a cycle of 0.11 s, and about half of that until
-// a contradicted sample is measured again (45 to 54 ms).
+// Two samples agree within this: somebody who walks moves 12 to 17 cm in a cycle of 0.12 s, and about half of that until
+// a contradicted sample is measured again (50 to 60 ms).
 constexpr int32_t kAgreeMm = 150;
 constexpr int kMaxHeld = 2;        // after so many samples that agree with nothing, the newest counts: nothing is hidden
 

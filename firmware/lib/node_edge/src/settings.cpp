@@ -185,7 +185,7 @@ private:
         static constexpr Entry kEntries[] = {
             {"sensor", &Reader::range_sensor}, {"trigger", &Reader::trigger}, {"echo", &Reader::echo},
             {"shutdown", &Reader::shutdown}, {"range_limit_m", &Reader::range_limit},
-            {"no_echo_is_clear", &Reader::no_echo_is_clear},
+            {"range_max_m", &Reader::range_max}, {"no_echo_is_clear", &Reader::no_echo_is_clear},
         };
         dispatch(kEntries, key, length,
                  "a sonar in node.json has a member that no setting is called; compare it with firmware/README.md");
@@ -209,6 +209,13 @@ private:
         if (!json_.number_milli(mm)) return;
         if (mm <= 0 || mm > 20000) refuse("range_limit_m of a sonar is not from 0.001 to 20 m");
         limit().limit_mm = static_cast<int32_t>(mm);
+    }
+
+    void range_max() {
+        int64_t mm = 0;
+        if (!json_.number_milli(mm)) return;
+        if (mm < 0 || mm > 20000) refuse("range_max_m of a sonar is not from 0 to 20 m");
+        limit().max_mm = static_cast<int32_t>(mm);
     }
 
     void value_member(const char* key, size_t length) {

@@ -47,16 +47,25 @@ class Place(Message, frozen=True, kw_only=True):
 class Sonar(Message, frozen=True, kw_only=True):
     """One sonar of a node: its direction relative to the node's, and the calibrated range limit.
 
-    An echo nearer than `range_limit` means `blocked`. `no_echo_is_clear` is true only where calibration recorded
-    that nothing is in range; elsewhere the opposite wall normally echoes, and a missing echo means `unknown`.
+    An echo nearer than `range_limit` means `blocked`. One from beyond `range_max`, the farthest that the free area
+    gives, means `unknown`: something before it reflects the sound away; None: any echo from beyond the limit is clear.
+    `no_echo_is_clear` is true only where calibration recorded that nothing is in range; elsewhere the opposite wall
+    normally echoes, and a missing echo means `unknown`. A node of which no sonar hears anything is never clear.
     `false_echo_rate`: the share of readings of the free area with an echo nearer than the limit, as its calibration
     showed it.
     """
 
     angle: Radians = 0.0
     range_limit: Annotated[float, Meta(gt=0.02, le=4.0)]
+    range_max: Annotated[float, Meta(gt=0.02, le=20.0)] | None = None
     no_echo_is_clear: bool = False
     false_echo_rate: Annotated[float, Meta(gt=0.0, lt=1.0)] | None = None
+
+    def __post_init__(self) -> None:
+        if self.range_max is not None and self.range_max <= self.range_limit:
+            raise ValueError(
+                f"range_max {self.range_max:g} must exceed range_limit {self.range_limit:g}: nothing is clear"
+            )
 
 
 class NodeSite(Message, frozen=True, kw_only=True):

@@ -46,6 +46,7 @@ def node_config(node: NodeSite) -> NodeConfig:
     config = NodeConfig(
         version=0,
         range_limit_m=[sonar.range_limit for sonar in node.sonars],
+        range_max_m=[sonar.range_max or 0.0 for sonar in node.sonars],
         no_echo_is_clear=[sonar.no_echo_is_clear for sonar in node.sonars],
     )
     return msgspec.structs.replace(config, version=zlib.crc32(msgspec.json.encode(config)))

@@ -34,13 +34,21 @@ class NodeValue(Message, frozen=True, kw_only=True):
     unit: Annotated[str, Meta(max_length=16)]
 
 
+FarthestRanges = Annotated[list[Annotated[float, Meta(ge=0.0, le=20.0)]], Meta(max_length=8)]
+
+
 class NodeConfig(Message, frozen=True, kw_only=True):
-    """Settings of a node: per sonar the range below which an echo means `blocked`."""
+    """Settings of a node: per sonar the range below which an echo means `blocked`, and beyond which `unknown`.
+
+    `range_max_m` of 0: any echo from beyond the limit is clear. The pause (ms) comes after the time that the last
+    sonar's echoes need.
+    """
 
     version: Count
     range_limit_m: Annotated[list[Annotated[float, Meta(gt=0.0, le=20.0)]], Meta(min_length=1, max_length=8)]
+    range_max_m: FarthestRanges = []
     no_echo_is_clear: Annotated[list[bool], Meta(min_length=1, max_length=8)]
-    pause_ms: Annotated[int, Meta(ge=10, le=60_000)] = 50
+    pause_ms: Annotated[int, Meta(ge=10, le=60_000)] = 10
 
 
 SampleCount = Annotated[int, Meta(ge=0, le=65_535)]
@@ -59,6 +67,7 @@ class NodeCalibration(Message, frozen=True, kw_only=True):
     result: Annotated[list[CalibrationResult], Meta(min_length=1, max_length=8)]
     range_limit_m: Annotated[list[Annotated[float, Meta(gt=0.0, le=20.0)]], Meta(min_length=1, max_length=8)]
     no_echo_is_clear: Annotated[list[bool], Meta(min_length=1, max_length=8)]
+    range_max_m: FarthestRanges = []
     no_echo_us: Annotated[list[Annotated[int, Meta(ge=0, le=80_000)]], Meta(min_length=1, max_length=8)]
     samples: Annotated[list[SampleCount], Meta(max_length=8)] = []
     false_echoes: Annotated[list[SampleCount], Meta(max_length=8)] = []

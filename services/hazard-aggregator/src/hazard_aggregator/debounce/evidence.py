@@ -24,9 +24,9 @@ Probability = Annotated[float, Meta(gt=0.0, lt=1.0)]
 NOISE_M: Final = 0.03
 """Two echoes of one thing at rest differ by at most this (m)."""
 SPEED_MPS: Final = 1.3
-"""How fast (m/s) a thing comes nearer or goes away: 0.15 m, as in the firmware's filter, in a node's cycle of 0.11 s.
+"""How fast (m/s) a thing comes nearer or goes away: 0.15 m, as in the firmware's filter, in a node's cycle of 0.12 s.
 
-What a node measures again at once, after 45 to 54 ms, has moved by less: the interval of the readings counts.
+What a node measures again at once, after 50 to 60 ms, has moved by less: the interval of the readings counts.
 """
 STILL_ECHOES: Final = 0.5
 MOVING_ECHOES: Final = 0.4

@@ -28,6 +28,7 @@ MIN_RANGE: Final = 0.02
 """Below this range (m) an HC-SR04 measures its own ringing (datasheet: 2 cm to 4 m)."""
 LIMIT_TOLERANCE: Final = 0.01
 """A range this close (m) to the limit may be classified either way: node and aggregator round differently."""
+_SILENT: Final = "no sonar of the node hears anything, as if they were dead or covered"
 NODE_HYSTERESIS: Final = 0.05
 """A node that is blocked stays so until its echo is this far (m) beyond the limit (the firmware's `kHysteresisMm`)."""
 
@@ -57,10 +58,16 @@ def classify_sonar(sonar: Sonar, status: str, measured: float | None, shift: flo
         return _classify_no_echo(sonar, measured)
     if measured is None:
         return "unknown", "it reports an echo without a range"
+    return _classify_echo(sonar, measured, shift)
+
+
+def _classify_echo(sonar: Sonar, measured: float, shift: float) -> tuple[AreaState, str]:
     if measured < MIN_RANGE:
         return "unknown", f"{measured:.3f} m is nearer than a sonar can measure"
     if measured < sonar.range_limit + shift:
         return "blocked", f"something at {measured:.2f} m, nearer than {sonar.range_limit:.2f} m"
+    if sonar.range_max is not None and measured > sonar.range_max:
+        return "unknown", f"an echo from {measured:.2f} m: the free area gives none from beyond {sonar.range_max:.2f} m"
     return "clear", f"nothing nearer than {sonar.range_limit:.2f} m"
 
 
@@ -167,6 +174,9 @@ def _fuse(site: NodeSite, reading: NodeReading, shift: float) -> tuple[list[tupl
         classify_sonar(sonar, status, measured, shift)
         for sonar, status, measured in zip(site.sonars, reading.status, reading.range_m, strict=True)
     ]
+    if all(status == "no_echo" for status in reading.status):
+        # A dead or covered sonar is as silent as a free area: alone, silence never shows that nothing is there.
+        classified = [("unknown", _SILENT if state == "clear" else reason) for state, reason in classified]
     states = {state for state, _ in classified}
     return classified, "blocked" if "blocked" in states else "unknown" if "unknown" in states else "clear"
 

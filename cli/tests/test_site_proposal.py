@@ -186,7 +186,7 @@ def test_every_node_proposed_on_a_recorded_floor_reports_clear(maps_dir: Path, n
 @pytest.mark.data
 @pytest.mark.parametrize(
     ("name", "areas", "reason"),
-    [("mit/stata_basement.yaml", 3, ""), ("ipa/Freiburg52_scan.yaml", 0, "are not as wide all along")],
+    [("mit/stata_basement.yaml", 2, ""), ("ipa/Freiburg52_scan.yaml", 0, "are not as wide all along")],
 )
 def test_a_floor_without_areas_is_told_with_the_reason(maps_dir: Path, name: str, areas: int, reason: str) -> None:
     static = load_map(maps_dir / name)

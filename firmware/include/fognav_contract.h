@@ -77,7 +77,7 @@
 #define FOGNAV_NODE_VALUE_UNIT_FIELD "unit"
 #define FOGNAV_NODE_VALUE_UNIT_LENGTH_MAX 16
 
-/* node_config, subscribed by a node: Settings of a node: per sonar the range below which an echo means `blocked`, and beyond which `unknown` (0: none). The pause (ms) follows the time that the last sonar's echoes need. */
+/* node_config, subscribed by a node: Settings of a node: per sonar the range below which an echo means `blocked`, and beyond which `unknown`. `range_max_m` of 0: any echo from beyond the limit is clear. The pause (ms) comes after the time that the last sonar's echoes need. */
 #define FOGNAV_NODE_CONFIG_TOPIC "fog/v1/%s/nodes/%s/config" /* site, node */
 #define FOGNAV_NODE_CONFIG_TOPIC_SIZE 86
 #define FOGNAV_NODE_CONFIG_LIMIT 1024 /* bytes */

@@ -321,6 +321,36 @@ def test_backup_of_a_node_takes_a_site_by_its_name(tmp_path):
     assert "name one of the sites" in " ".join(done.output.split())
 
 
+@pytest.mark.parametrize("command", ["backup", "restore"])
+def test_mistyped_node_or_site_leaves_nothing_behind(tmp_path, command):
+    folder = NodeFolder(tmp_path / "data")
+    hosted_sites([ESTIG], folder.locks, ["localhost", "127.0.0.1"])
+    folder.keys("estig")
+    settings.remember(folder.path, settings.settings_of({"estig": ESTIG}, "127.0.0.1", [], simulate=False))
+    file, wrong = tmp_path / "estig.tar.gz", tmp_path / "dta"
+    assert CliRunner().invoke(app, ["backup", str(file), "--up", str(folder.path)]).exit_code == 0
+    if command == "backup":
+        done = CliRunner().invoke(app, ["backup", str(tmp_path / "again.tar.gz"), "--up", str(wrong)])
+        assert f"{wrong} has no data of a fog node" in " ".join(done.output.split())
+    else:
+        upstairs = shutil.copytree(ESTIG, tmp_path / "upstairs")
+        description = (upstairs / "site.toml").read_text().replace('id = "estig"', 'id = "upstairs"', 1)
+        (upstairs / "site.toml").write_text(description)
+        options = ["--site", str(upstairs), "--up", str(wrong), "--replace"]
+        done = CliRunner().invoke(app, ["restore", str(file), *options])
+        assert "has the site upstairs, and the backup is of the site estig" in " ".join(done.output.split())
+        assert (upstairs / "site.toml").read_text() == description
+    assert done.exit_code != 0
+    assert not wrong.exists()
+
+
+def test_backup_into_a_device_is_refused(tmp_path):
+    pipe = tmp_path / "pipe"
+    os.mkfifo(pipe)
+    done = CliRunner().invoke(app, ["backup", str(pipe), "--up", str(tmp_path)])
+    assert "it is a folder or a device. Name another file" in " ".join(done.output.split())
+
+
 async def test_locks_of_another_authority_are_replaced_by_those_of_the_backup(tmp_path):
     estig, hosts = shutil.copytree(ESTIG, tmp_path / "site"), ["localhost", "127.0.0.1"]
     for name in ("data", "fresh"):

@@ -89,5 +89,7 @@ def check_writable(path: Path | None) -> None:
         raise WrongUseError(
             f"{path} can't be written: there is no folder {path.parent}. Create it or name another file"
         )
-    if path.is_dir() or not os.access(path if path.exists() else path.parent, os.W_OK):
-        raise WrongUseError(f"{path} can't be written: it is a folder, or you may not write there. Name another file")
+    is_other = path.exists() and not path.is_file()
+    if is_other or not os.access(path if path.exists() else path.parent, os.W_OK):
+        reason = "it is a folder or a device" if is_other else "you may not write there"
+        raise WrongUseError(f"{path} can't be written: {reason}. Name another file")

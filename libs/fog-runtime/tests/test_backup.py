@@ -150,6 +150,34 @@ async def test_files_of_somebody_else_are_not_overwritten_without_consent(tmp_pa
     assert not there.folders["secrets"].exists()
 
 
+async def test_another_sites_folder_is_never_overwritten(tmp_path, here, redis, other):
+    (here.folders["site"] / "site.toml").write_text('id = "test"\n')
+    file = tmp_path / "backup.tar.gz"
+    await fill(redis)
+    await backup.create(file, here, NOW)
+    there = place(tmp_path / "there", other)
+    there.folders["site"].mkdir(parents=True)
+    site = there.folders["site"] / "site.toml"
+    site.write_text('id = "upstairs"\n')
+    with pytest.raises(
+        BackupError, match="has the site upstairs, and the backup is of the site test: nothing was changed"
+    ):
+        await backup.restore(file, there, replace=True)
+    assert site.read_text() == 'id = "upstairs"\n'
+    assert await content(other) == {}
+    site.write_text("id = damaged")
+    await backup.restore(file, there, replace=True)
+    assert site.read_text() == 'id = "test"\n'
+
+
+async def test_backup_never_replaces_a_device(tmp_path, here, redis):
+    pipe = tmp_path / "pipe"
+    os.mkfifo(pipe)
+    with pytest.raises(BackupError, match=r"pipe can't be written \(it is no regular file\): name a file"):
+        await backup.create(pipe, here, NOW)
+    assert stat.S_ISFIFO(pipe.stat().st_mode)
+
+
 def damaged_in_the_middle(data: bytes) -> bytes:
     return data[: len(data) // 2] + bytes([data[len(data) // 2] ^ 0x55]) + data[len(data) // 2 + 1 :]
 

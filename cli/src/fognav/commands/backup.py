@@ -110,8 +110,9 @@ def _named(site: Path | None) -> Path | None:
 
 def _create_of_node(file: Path, up: Path, site: Path | None) -> "Created":
     from fognav.hosting.backups import create  # noqa: PLC0415  # keeps the other commands fast
-    from fognav.hosting.folders import NodeFolder  # noqa: PLC0415  # same
+    from fognav.hosting.folders import NodeFolder, require_node  # noqa: PLC0415  # same
 
+    require_node(up)
     return asyncio.run(create(file, NodeFolder(up), _named(site)))
 
 
@@ -119,7 +120,9 @@ def _restore_into_node(file: Path, up: Path, site: Path, *, replace: bool) -> Ba
     from fognav.hosting.backups import LOCKS, restore  # noqa: PLC0415  # same
     from fognav.hosting.folders import NodeFolder  # noqa: PLC0415  # same
 
-    made, refused, gone = asyncio.run(restore(file, NodeFolder(up), _named(site) or site, replace=replace))
+    directory = _named(site) or site
+    backup.require_same_site(read_archive(file), directory)  # before the node's folder is made
+    made, refused, gone = asyncio.run(restore(file, NodeFolder(up), directory, replace=replace))
     if LOCKS not in made.folders:
         print_line(f"the locks in {up} stay: they have the same authority, and what was added since")
     if refused:

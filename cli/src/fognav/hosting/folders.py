@@ -13,7 +13,7 @@ from typing import Final
 
 from fog_runtime.files import atomic_write
 from fog_runtime.keys import make_keys
-from fognav.output import FailedError
+from fognav.output import FailedError, WrongUseError
 from fognav.programs import SystemFolder
 
 FORMAT: Final = 1
@@ -81,6 +81,12 @@ class NodeFolder(SystemFolder):
                     "or name another folder with --data"
                 ) from None
             yield
+
+
+def require_node(path: Path) -> None:
+    """Raise `WrongUseError` if a folder has no fog node's data, before `NodeFolder` would make it."""
+    if not (path / _FORMAT_FILE).is_file():
+        raise WrongUseError(f"{path} has no data of a fog node: name the folder that `fognav up` was given with --data")
 
 
 def _check_format(path: Path) -> None:

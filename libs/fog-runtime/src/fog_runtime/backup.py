@@ -13,13 +13,14 @@ import asyncio
 import os
 import sys
 import time
+import tomllib
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final, NamedTuple
 
 from fog_runtime.access.credentials import NOBODY, Credentials, CredentialsError
 from fog_runtime.backup_archive import STAMP, Backup, BackupError, File, Key, read_archive, read_folder, write_archive
 from fog_runtime.configuration.settings import CommonSettings, SettingsError, load
-from fog_runtime.configuration.site import SiteError, load_site
+from fog_runtime.configuration.site import SITE_FILE, SiteError, load_site
 from fog_runtime.files import atomic_write
 from fog_runtime.stores.redis_connection import Command, RedisConnection, StoreError
 from fog_runtime.version import VERSION
@@ -69,10 +70,11 @@ async def create(file: Path, place: Place, now: float) -> Backup:
 async def restore(file: Path, place: Place, *, replace: bool, keep: Collection[str] = ()) -> Backup:
     """Restore a backup into Redis and into the folders; everything is checked before anything is changed.
 
-    What is there already is only replaced with `replace`, and the folders named in `keep` are not touched at all.
-    Returns what was restored. Raises `BackupError`.
+    What is there already is only replaced with `replace`, another site never, and the folders named in `keep` are not
+    touched at all. Returns what was restored. Raises `BackupError`.
     """
     backup = await asyncio.to_thread(read_archive, file)
+    require_same_site(backup, place.folders[SITE])
     backup = backup._replace(folders={name: files for name, files in backup.folders.items() if name not in keep})
     if unknown := sorted(set(backup.folders) - set(place.folders)):
         raise BackupError(f"{file} has a folder {unknown[0]!r}, for which there is no place: name it by its variable")
@@ -96,6 +98,27 @@ async def restore(file: Path, place: Place, *, replace: bool, keep: Collection[s
                     " are not. Make room or grant access, then restore again with --replace"
                 ) from error
     return backup
+
+
+def require_same_site(backup: Backup, folder: Path) -> None:
+    """Raise `BackupError` if a folder has another site than the backup; one that can't be read may be the same."""
+    file = folder / SITE_FILE
+    stored = backup.folders.get(SITE, {}).get(SITE_FILE)
+    if stored is None or not file.is_file():
+        return
+    own, there = (_site_id(data) for data in (stored.data, file.read_bytes()))
+    if own is not None and there is not None and own != there:
+        raise BackupError(
+            f"{folder} has the site {there}, and the backup is of the site {own}: nothing was changed. Name the folder"
+            f" of {own}, or one that is empty"
+        )
+
+
+def _site_id(data: bytes) -> object:
+    try:
+        return tomllib.loads(data.decode()).get("id")
+    except (UnicodeDecodeError, tomllib.TOMLDecodeError):
+        return None
 
 
 async def _require_no_leader(redis: RedisConnection, site: str) -> None:

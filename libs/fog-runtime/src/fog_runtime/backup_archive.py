@@ -101,7 +101,7 @@ def write_archive(file: Path, backup: Backup) -> Manifest:
     try:
         atomic_write(file, packed.getvalue())
     except OSError as error:
-        raise BackupError(f"{file} can't be written ({error.strerror}): name a folder with room") from error
+        raise BackupError(f"{file} can't be written ({error.strerror}): name a file in a folder with room") from error
     read_archive(file)
     return manifest
 

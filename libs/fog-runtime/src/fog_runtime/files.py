@@ -1,5 +1,6 @@
 """Atomic replacement of files."""
 
+import errno
 import os
 import tempfile
 from pathlib import Path
@@ -15,8 +16,10 @@ def atomic_write(path: Path, data: bytes, *, mode: int = PRIVATE, owner: int | N
     """Write a file durably; readers, even after a power cut, see either the old content or the new, never a part.
 
     `mode` are the file's permissions, whatever those of an earlier one were; as root one may name an `owner` (uid), who
-    also owns the file's folder if that is created.
+    also owns the file's folder if that is created. Raises `OSError`, for what is there and no file (a device), too.
     """
+    if path.exists() and not path.is_file():
+        raise OSError(errno.EINVAL, "it is no regular file", str(path))
     if not path.parent.is_dir():
         path.parent.mkdir(parents=True, exist_ok=True)
         if owner is not None:

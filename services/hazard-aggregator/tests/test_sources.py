@@ -440,7 +440,7 @@ def test_number_has_limits_with_hysteresis_and_a_plausible_range():
     assert rig.send("t", {"t": 37.0}) == "clear"
 
 
-@pytest.mark.parametrize("value", [True, "hot", None, [], "nan", "inf", 10**400])
+@pytest.mark.parametrize("value", [True, "hot", None, [], "nan", "inf", 10**400, "1_9", "\u0661\u0669"])
 def test_value_that_is_no_number_is_a_changed_format(value):
     rig = Rig(Source(id="s1", topic="t", pointer="/t", number=ABOVE_40, period_s=10.0))
     payload = value if isinstance(value, int) and value > 1 else json.dumps({"t": value})
@@ -561,6 +561,25 @@ BAD = Source(id="s1", topic="t", blocked=["1"], clear=["0"], period_s=1.0)
         (Source(id="s1", profile="home-assistant"), r"sources\.s1\.device: the profile home-assistant needs one"),
         (Source(id="s1", topic="t", period_s=1.0), "neither which values mean blocked and clear"),
         (Source(id="s1", topic="t", period_s=1.0, number=Limits()), "it needs `above` or `below`"),
+        (
+            Source(id="s1", topic="t", period_s=1.0, number=Limits(above=1.0, below=2.0)),
+            r"sources\.s1\.number: nothing would be clear: .* at least 2 and at most 1\. Raise `above`",
+        ),
+        (
+            Source(id="s1", topic="t", period_s=1.0, number=Limits(above=45.0, below=40.0, hysteresis=3.0)),
+            "nothing would",
+        ),
+        (Source(id="s1", topic="t", period_s=1.0, number=Limits(above=45.0, minimum=60.0)), "nothing would be clear"),
+        (
+            Source(id="s1", topic="t", blocked=["On", 1.0], clear=["off", "ON"], period_s=1.0),
+            r"sources\.s1: 'On' means both blocked and clear: take it out of one of them",
+        ),
+        (
+            Source(
+                id="s1", topic="t", blocked=["1"], clear=["0"], availability=Availability(topic="s", online=["offline"])
+            ),
+            r"sources\.s1\.availability: 'offline' means both online and offline",
+        ),
         (Source(id="s1", topic="t", blocked=["1"], clear=["0"]), "nobody would notice that it is dead"),
         (Source(id="s1", topic="t", blocked=["1"], clear=["0"], period_s=1.0, debounce={"rule": "x"}), "debounce.rule"),
     ],

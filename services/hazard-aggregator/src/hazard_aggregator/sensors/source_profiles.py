@@ -7,6 +7,7 @@ Home Assistant (MQTT statestream).
 
 from __future__ import annotations
 
+import math
 import re
 import unicodedata
 from typing import TYPE_CHECKING, Final
@@ -15,6 +16,7 @@ from msgspec import structs
 
 from fog_contracts.messages import Availability, Source
 from hazard_aggregator.area_size import AreaError
+from hazard_aggregator.sensors.source_reader import is_one_of
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -112,8 +114,33 @@ def _quantity(area: str, source: Source) -> Source:
 
 
 def _check_number(area: str, source: Source) -> None:
-    if source.number is None or (source.number.above is None and source.number.below is None):
-        raise SourceError(area, f"sources.{source.id}.number", "it needs `above` or `below`")
+    where, limits = f"sources.{source.id}.number", source.number
+    if limits is None or (limits.above is None and limits.below is None):
+        raise SourceError(area, where, "it needs `above` or `below`")
+    clear_from = max(_or(limits.below, -math.inf) + limits.hysteresis, _or(limits.minimum, -math.inf))
+    clear_to = min(_or(limits.above, math.inf) - limits.hysteresis, _or(limits.maximum, math.inf))
+    if clear_from > clear_to:
+        problem = (
+            f"nothing would be clear: that would be at least {clear_from:g} and at most {clear_to:g}. Raise `above`, "
+            "lower `below` or `hysteresis`, or widen `minimum` to `maximum`"
+        )
+        raise SourceError(area, where, problem)
+
+
+def _or(limit: float | None, none: float) -> float:
+    return none if limit is None else limit
+
+
+def _check_meanings(area: str, source: Source) -> None:
+    """Raise `SourceError` if a value means two things."""
+    where = f"sources.{source.id}"
+    pairs = [(where, "blocked", source.blocked, "clear", source.clear)] + [
+        (f"{where}.availability", "online", each.online, "offline", each.offline) for each in source.availabilities
+    ]
+    for where, name, one, other_name, other in pairs:
+        if both := [value for value in one if is_one_of(value, other)]:
+            problem = f"{both[0]!r} means both {name} and {other_name}: take it out of one of them"
+            raise SourceError(area, where, problem)
 
 
 def _filled_in(area: str, source: Source) -> Source:
@@ -178,6 +205,7 @@ def _check(area: str, source: Source) -> None:
         raise SourceError(area, where, problem)
     if source.number is not None:
         _check_number(area, source)
+    _check_meanings(area, source)
     if source.period_s is None and not source.availabilities:
         problem = "it has no `period_s` and no `availability`: nobody would notice that it is dead"
         raise SourceError(area, where, problem)

@@ -55,7 +55,7 @@ class SourceReader:
                 self._measured = True
                 return self._classify_number(number, source.number)
             for state, meaning in (("blocked", source.blocked), ("clear", source.clear)):
-                if _is_one_of(value, meaning):
+                if is_one_of(value, meaning):
                     return Classification(state, f"it reports {_quoted(value)}")  # type: ignore[arg-type]  # a literal
         except _FormatError as error:
             if source.number is not None and isinstance(error, _NoValueError):
@@ -100,9 +100,9 @@ def is_online(availability: Availability, payload: bytes | None) -> bool | None:
             value = _value(payload, [pointer])
         except _FormatError:
             continue
-        if _is_one_of(value, availability.offline):
+        if is_one_of(value, availability.offline):
             return False
-        if _is_one_of(value, availability.online):
+        if is_one_of(value, availability.online):
             return True
     return None
 
@@ -142,8 +142,9 @@ def _at(document: Any, pointer: str) -> Any:  # noqa: ANN401  # any JSON value
 def _number(value: Any) -> float:  # noqa: ANN401  # any JSON value
     if value is None or (isinstance(value, str) and value.casefold() in _NOTHING):
         raise _NoValueError(f"{_quoted(value)} is no number")
+    is_text = isinstance(value, str) and value.isascii() and "_" not in value  # Python would read 1_9 as 19
     try:
-        number = float(value) if isinstance(value, str | int | float) and not isinstance(value, bool) else None
+        number = float(value) if is_text or (isinstance(value, int | float) and not isinstance(value, bool)) else None
     except (ValueError, OverflowError):
         number = None
     if number is None or not abs(number) < float("inf"):
@@ -151,7 +152,7 @@ def _number(value: Any) -> float:  # noqa: ANN401  # any JSON value
     return number
 
 
-def _is_one_of(value: Any, meaning: list[str | bool | float]) -> bool:  # noqa: ANN401  # any JSON value
+def is_one_of(value: Any, meaning: list[str | bool | float]) -> bool:  # noqa: ANN401  # any JSON value
     """Whether a value is one of these; true is not 1, and texts are compared without regard to case."""
     if isinstance(value, str):
         return any(isinstance(other, str) and value.casefold() == other.casefold() for other in meaning)

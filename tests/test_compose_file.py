@@ -51,6 +51,17 @@ def test_base_of_our_images_has_a_digest_and_each_image_its_own_pins():
     assert [path for build in builds for path in build["MEMBERS"].split() if not (ROOT / path).is_dir()] == []
 
 
+def test_a_plain_up_shows_the_robots_cpu_by_grafana_and_by_prometheus_itself():
+    """Grafana is left out by a variable; what nobody has to install shows the same."""
+    grafana, prometheus = SERVICES["grafana"], SERVICES["prometheus"]
+    assert "profiles" not in grafana
+    assert grafana["scale"] == "${FOGNAV_GRAFANA:-1}"
+    assert "--web.console.templates=/etc/prometheus/consoles" in prometheus["command"]
+    assert (ROOT / mounts("prometheus")["/etc/prometheus"] / "consoles" / "robots.html").is_file()
+    links = re.findall(r'href="(/[^"]*)"', (ROOT / "deploy" / "gateway" / "Caddyfile").read_text("utf-8"))
+    assert links[0] == "/prometheus/consoles/robots.html"
+
+
 def test_services_of_one_image_are_built_alike():
     builds: dict[str, list[object]] = {}
     for service in SERVICES.values():

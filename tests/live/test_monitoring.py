@@ -5,6 +5,8 @@ from __future__ import annotations
 import asyncio
 import importlib.util
 import json
+import os
+import re
 import shutil
 import subprocess
 import sys
@@ -41,6 +43,15 @@ pytestmark = [
 ]
 
 
+def consoles() -> list[str]:
+    """Return the options by which the fog node's Prometheus finds its pages, with the folder of this checkout."""
+    compose = yaml.safe_load((ROOT / "docker-compose.yml").read_text("utf-8"))["services"]["prometheus"]
+    assert "./deploy/prometheus:/etc/prometheus:ro" in compose["volumes"]
+    given = [option for option in compose["command"] if option.startswith(("--web.console", "--web.external-url"))]
+    given += [option for option in compose["command"] if option.startswith("--web.route-prefix")]
+    return [option.replace("/etc/prometheus", str(DEPLOYED / "prometheus")) for option in given]
+
+
 class Prometheus:
     """A Prometheus on a loopback port that scrapes a running system with the deployed configuration."""
 
@@ -69,7 +80,7 @@ class Prometheus:
             self.process = subprocess.Popen(
                 child.command(
                     "prometheus", f"--config.file={file}", f"--storage.tsdb.path={folder / 'data'}",
-                    f"--web.listen-address=127.0.0.1:{self.port}",
+                    f"--web.listen-address=127.0.0.1:{self.port}", *consoles(),
                 ), stdout=log, stderr=log,
             )  # fmt: skip
 
@@ -185,6 +196,42 @@ async def test_every_panel_has_data_and_every_rule_works_while_a_robot_drives_an
         alert["labels"]["alertname"] for alert in prometheus.ask("alerts")["alerts"] if alert["state"] == "firing"
     }
     assert firing & {"ServiceDown", "NotOneLeader", "BrokerDown", "StoreDown", "StoreLost", "StoreNotDurable"} == set()
+
+
+async def test_prometheus_itself_shows_the_cpu_of_each_robot(prometheus: Prometheus) -> None:
+    """Above all what the robot's processes take, beside recorded drives; without Grafana, and without any script."""
+    await wait_for_robots(prometheus, ["r1"])
+
+    def page() -> str:
+        with urllib.request.urlopen(f"http://127.0.0.1:{prometheus.port}/consoles/robots.html", timeout=30.0) as answer:
+            return str(answer.read().decode("utf-8"))
+
+    deadline = time.monotonic() + 60.0
+    while "agent / decide" not in (shown := await asyncio.to_thread(page)):  # a rate needs a while
+        assert time.monotonic() < deadline, shown
+        await asyncio.sleep(0.5)
+    await asyncio.to_thread(look_at, prometheus)
+    headings = re.findall(r"<h[12][^>]*>(.*?)</h[12]>", shown)
+    assert headings == ["CPU of the robots", "Robot r1", "The fog node"]
+    assert "/prometheus/graph?" in shown, "behind the gateway its links must have its path"
+    rows = re.findall(r'<th scope="row">(.*?)</th><td>([0-9.]+) %</td>', shown)
+    names = [name for name, _ in rows]
+    assert names[:2] == ["now", "mean of 10 minutes"]
+    assert {name.split(" (")[0] for name in names if name.startswith("recorded")} == {
+        "recorded default", "recorded full", "recorded fog"
+    }  # fmt: skip
+    assert {"agent", "guardian", "watchdog", "agent / decide", *SERVICES} <= set(names)
+    (known,) = prometheus.series("100 * avg_over_time(robot:cpu:rate1m[10m])")
+    assert float(dict(reversed(rows))["mean of 10 minutes"]) == pytest.approx(float(known["value"][1]), rel=0.5)
+
+
+def look_at(prometheus: Prometheus) -> None:
+    """Let a browser draw the page into the file that FOGNAV_CONSOLE_PICTURE names, for people; by default no file."""
+    if (file := os.environ.get("FOGNAV_CONSOLE_PICTURE")) is None:
+        return
+    address = f"http://127.0.0.1:{prometheus.port}/consoles/robots.html"
+    options = ["--headless", "--no-sandbox", "--disable-gpu", "--window-size=1100,1500", f"--screenshot={file}"]
+    subprocess.run(["chromium", *options, address], check=True, capture_output=True, timeout=120)
 
 
 def drawn(prometheus: Prometheus, folder: Path) -> set[str]:

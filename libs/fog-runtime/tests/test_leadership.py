@@ -5,6 +5,7 @@ Time is simulated, and each process has an event loop of its own, so that one ca
 """
 
 import asyncio
+import itertools
 import os
 import threading
 
@@ -17,7 +18,7 @@ from lease_model import LeaseModel
 from fog_contracts import channels as ch
 from fog_contracts.fencing import Fence
 from fog_contracts.handlers import Publication, RefusedMessageError
-from fog_contracts.messages import Leader, MapHeartbeat, ZoneSet
+from fog_contracts.messages import Leader, MapHeartbeat, RobotState, ZoneSet
 from fog_runtime.clock import ManualClock
 from fog_runtime.health import Health
 from fog_runtime.leases import leadership
@@ -258,6 +259,24 @@ def test_what_a_leader_says_while_its_lease_is_uncertain_is_sent_once_it_is_rene
     world.run(0.3)
     assert len(world.sent) > sent + 1
     assert process.epoch in {epoch for _, _, epoch in world.sent[sent:]}
+
+
+def test_robot_that_tells_of_ever_higher_epochs_does_not_hold_up_the_fleet(world):
+    world.run(3.0)
+    began, forged = world.now, 10**13
+    for _ in range(300):
+        forged += 1000
+        state = RobotState(
+            mode="NORMAL", reasons=[], enabled=True, battery=None, goal_id=None, map_epoch=0, map_seq=0, plan_id=None,
+            epochs={SERVICE: forged},
+        )  # fmt: skip
+        for process in world.processes.values():
+            process.leadership.on_message(ch.ROBOT_STATE, state)
+        world.run(0.05)
+    beats = [at for at, _, _ in world.received if at > began]
+    assert len(beats) >= 145, "ten a second for 15 s"
+    assert max(later - at for at, later in itertools.pairwise(beats)) <= 0.5
+    assert len({epoch for at, _, epoch in world.received if at > began}) <= 1 + 2 * len(NAMES)
 
 
 def test_message_with_another_epoch_than_the_one_that_leads_is_never_sent(world):

@@ -15,7 +15,7 @@ from lease_model import LEASE_S, LeaseModel
 
 from fog_contracts.fencing import HEARD_LIMIT, MOST_AHEAD, Fence
 from fog_contracts.handlers import RefusedMessageError
-from fog_runtime.leases.lease import CUT_OFF_S, Granted, Held, Lease, LeftToOther
+from fog_runtime.leases.lease import CUT_OFF_S, HEARSAY_PAUSE_S, Granted, Held, Lease, LeftToOther
 
 ATTEMPT_S, STEP_S, PROBE_S = 0.4, 0.05, 0.2
 TAKEOVER_S = 2.0
@@ -126,6 +126,30 @@ def test_higher_epoch_stops_the_leader_at_once_until_redis_gives_it_one_above():
     assert request.floor == 9
     lease.on_reply(request, Granted(10), 100.2)
     assert (lease.epoch, lease.permission(100.2)) == (10, "granted")
+
+
+def test_higher_epoch_that_robots_tell_of_leaves_the_leader_acting_and_is_asked_about_once_in_ten_seconds():
+    lease = leading(5, at=100.0)
+    floors = []
+    for step in range(400):
+        now = 100.05 + 0.05 * step
+        lease.on_hearsay(lease.epoch + 1000)
+        assert lease.permission(now) == "granted"
+        if (request := lease.request(now)) is not None:
+            if request.floor >= lease.epoch:
+                floors.append(request.floor)
+            lease.on_reply(request, Granted(max(lease.epoch, request.floor + 1)), now + 0.01)
+    assert floors == [1005, 2006]
+    assert lease.epoch == 2007
+
+
+def test_epoch_that_robots_tell_of_is_one_step_of_theirs_however_often_it_is_forged():
+    lease, fence = leading(HEARD_LIMIT, at=100.0), Fence()
+    for _ in range(1000):
+        lease.on_hearsay(2**53)
+    request = lease.request(100.1)
+    fence.accept("planner", HEARD_LIMIT)
+    fence.accept("planner", request.floor)
 
 
 def test_same_epoch_of_another_process_stops_the_leader():
@@ -374,6 +398,10 @@ class Cluster(RuleBasedStateMachine):
             process.stopped_until = -1.0
         for _ in range(round(2 * TAKEOVER_S / STEP_S)):
             self.step()
+        for _ in range(round((HEARSAY_PAUSE_S + 2 * TAKEOVER_S) / STEP_S)):
+            if self.highest in {p.lease.epoch for p in self.processes}:
+                break
+            self.step()  # robots tell of an epoch once more, soon after another time
         leaders = [p for p in self.processes if p.lease.permission(p.clock(self.now)) == "granted"]
         assert len(leaders) == 1
         assert leaders[0].lease.epoch == self.highest, "receivers accept its messages"
@@ -457,7 +485,7 @@ class Cluster(RuleBasedStateMachine):
         if not process.network_cut:
             for epoch, holder in process.inbox:
                 lease.on_leader(epoch, holder, clock)
-            lease.on_epoch(self.highest)  # the robots' states tell it
+            lease.on_hearsay(self.highest)  # the robots' states tell it
         process.inbox.clear()
         if not process.needs_cut and self.now >= process.answered_at + PROBE_S:
             process.answered_at = self.now

@@ -145,7 +145,11 @@ class Leadership:
 
     def on_message(self, channel: Channel, message: object) -> None:
         """Hear which epochs of this service others know."""
-        self._lease.on_epoch(epoch_in(channel, message, self._service))
+        epoch = epoch_in(channel, message, self._service)
+        if ch.ROBOT in channel.publishers:
+            self._lease.on_hearsay(epoch)
+        else:
+            self._lease.on_epoch(epoch)
 
     def on_rival(self, epoch: int) -> None:
         """Hear that another process sent a message of this service with this epoch."""

@@ -15,8 +15,10 @@ The holder may act until a deadline, counted from *before* its last request was 
 
 Whoever hears an epoch above its own stops acting at once and asks Redis. If it still holds the lease, the other epoch
 is an old one, or was made without Redis: it continues with one above. A forged epoch leaves room for that, because a
-leader counts no further than receivers follow it (`within_reach`). Without Redis it gives way to a leader that is
-alive, and else makes a provisional epoch above all that it heard, which Redis confirms or corrects later.
+leader counts no further than receivers follow it (`within_reach`). What robots tell of epochs, anybody with one
+robot's password can say: a process whose lease Redis has confirmed goes on meanwhile, and asks only now and then.
+Without Redis it gives way to a leader that is alive, and else makes a provisional epoch above all that it heard, which
+Redis confirms or corrects later.
 
 Redis also leads from a leader that can't do its work to a process that can: one whose transports or threads do not
 answer gives the lease back, if a standby whose own do has left word in Redis that it is ready. If none has, it goes on:
@@ -50,6 +52,8 @@ It says so for `READY_SAID_S` more. Together they are shorter than `CUT_OFF_S` b
 for all, no standby is ready any more when the leader knows that it is cut off, and the lease stays where it is.
 """
 READY_SAID_S: Final = 0.45
+HEARSAY_PAUSE_S: Final = 10.0
+"""So seldom Redis is asked for an epoch above one of which robots tell: each new one makes all fetch the map anew."""
 _LISTEN_S: Final = 2 * ANNOUNCE_S + 0.1
 """Without Redis: how long a leader listens, after it did not run or could not hear, until it acts again."""
 _RATE_MARGIN: Final = 0.9
@@ -127,6 +131,9 @@ class Lease:
         self.leader: Leader | None = None
         """The other process that leads, if one was heard since this one last led."""
         self._floor = 0
+        self._hearsay = 0
+        """The highest epoch of which robots tell."""
+        self._hearsay_due = -math.inf
         self._deadline = -math.inf
         self._request_due = now
         self._silent_since: float | None = None
@@ -164,13 +171,17 @@ class Lease:
     def request(self, now: float) -> Request | None:
         """Return the request that is due, if any; its outcome must come before the next call (`on_reply`)."""
         cut_off = self.cut_off(now)
-        urgent = self._contested or (cut_off and not self._said_cut_off)
+        asks = self._hearsay > max(self._floor, self.epoch) and now >= self._hearsay_due
+        urgent = self._contested or asks or (cut_off and not self._said_cut_off)
         if now < self._request_due and not (self.epoch and urgent):
             return None
         self._request_due = now + RENEW_S
         self._said_cut_off = cut_off
         ready = now - self._answered_at <= READY_S
-        return Request(self.epoch, self._floor, self.confirmed, now, ready=ready, cut_off=cut_off)
+        if asks:
+            self._hearsay_due = now + HEARSAY_PAUSE_S
+        floor = max(self._floor, self._hearsay) if asks else self._floor
+        return Request(self.epoch, floor, self.confirmed, now, ready=ready, cut_off=cut_off)
 
     def on_reply(self, request: Request, reply: Reply, now: float) -> None:
         """Apply the outcome of a request."""
@@ -228,9 +239,15 @@ class Lease:
             self._hear(epoch)
 
     def on_epoch(self, epoch: int) -> None:
-        """Handle an epoch of this service that others have seen, whoever sent it and when; our own is no news."""
+        """Handle an epoch of this service that other services have seen, whoever sent it; our own is no news."""
         if epoch > self.epoch:
             self._hear(epoch)
+
+    def on_hearsay(self, epoch: int) -> None:
+        """Handle an epoch of this service that a robot says it received: it may be forged."""
+        self._hearsay = max(self._hearsay, self._within_reach(epoch))
+        if self.epoch and not self.confirmed:
+            self.on_epoch(epoch)
 
     def on_rival(self, epoch: int) -> None:
         """Handle a message of another process of this service that leads, or did; ours must be above its epoch."""
@@ -265,7 +282,8 @@ class Lease:
         quiet_since = max(self._listening_since, self._silent_since, self._leader_heard_at())
         if now - quiet_since > LEADER_LOST_S:
             # The distance keeps two processes apart that heard the same epochs.
-            self._lead(max(proposal, self._floor + 1 + proposal % 1000), now, confirmed=False)
+            heard = max(self._floor, self._hearsay)
+            self._lead(max(proposal, heard + 1 + proposal % 1000), now, confirmed=False)
 
     def give_up(self) -> None:
         """Stop acting for good: the process ends, and gives the lease back."""

@@ -96,6 +96,7 @@ class LittleWorld:
         self.link_delay = self.link_delay_growth = 0.0  # of heartbeats: s, and s per s
         self.bumper = self.wheel_drop = False
         self.fault = None
+        self.bumped = False
         self.stopped = None
         self.resting = False
         self.path = None
@@ -233,6 +234,7 @@ class LittleWorld:
                     status=BaseStatus(bumper_left=self.bumper, wheel_drop=self.wheel_drop, battery=0.8),
                     odometry=WheelOdometry(left_m=left, right_m=right),
                     fault=self.fault,
+                    bumped=self.bumped,
                     stopped=self.stopped,
                 ),
                 self.now,

@@ -30,6 +30,7 @@ from fog_contracts.messages import (
 )
 from fog_contracts.replica import MapError
 from robot_agent.agent.core import AgentCore, decide
+from robot_agent.lidar_mounting import Mounting
 
 
 @pytest.fixture
@@ -443,6 +444,59 @@ def test_the_speed_layer_limits_the_robot(driving):
         driving.send(ch.MAP_DELTA, delta)
     driving.run(1.0)
     assert sum(driving.wheels) / 2 == pytest.approx(0.12, abs=0.005)
+
+
+def test_zone_of_the_lowest_speed_limit_is_crossed_without_backing_up(world):
+    g = world.geometry
+    zone = g.window_around(2.4, 1.0, 3.0, 3.0)
+    cells = np.full((zone.height, zone.width), 1, np.uint8)
+    for delta in world.master.write([("speed", zone, cells)], [Cause(kind="zone", id="s", state="on")], []):
+        world.send(ch.MAP_DELTA, delta)
+    world.drive_to([(2.0, 2.0), (6.0, 2.0)])
+    world.run(35.0, lambda w: w.state().mode != "NORMAL")
+    assert (world.state().mode, world.state().reasons) == ("NORMAL", [])
+    assert world.x > 2.5
+    assert all(left + right >= 0.0 for _, left, right in world.commands)
+
+
+def test_path_that_begins_elsewhere_holds_the_robot_until_one_begins_where_it_is(world):
+    world.drive_to([(8.0, 2.0), (12.0, 2.0)])
+    world.run(2.0)
+    assert world.state().mode == "HOLD"
+    assert "the robot is 6.0 m off its path" in world.state().reasons[0]
+    assert world.travelled < 0.01
+    world.drive_to([(2.5, 2.0), (6.0, 2.0)], plan_id=2)
+    assert world.run(6.0, lambda w: w.travelled > 0.2)
+    assert world.state().mode == "NORMAL"
+
+
+def test_path_longer_than_any_robot_drives_is_not_followed(world):
+    world.drive_to([(2.0 + 5.0 * (n % 2), 2.0) for n in range(20_000)])
+    world.run(0.5)
+    assert world.state().mode == "HOLD"
+    assert "the path is longer than 2000 m" in world.state().reasons[0]
+
+
+class MaskedBehind(AgentCore):
+    """An agent whose lidar sees only the robot itself behind."""
+
+    _mounting = Mounting(masks=((2.4, -2.4),))
+
+    def on_lidar_samples(self, samples, now):
+        super().on_lidar_samples(self._mounting.apply_to_samples(samples), now)
+
+    def on_scan(self, scan, now):
+        super().on_scan(self._mounting.apply(scan), now)
+
+
+def test_robot_that_sees_nothing_behind_does_not_promise_to_back_off():
+    for agent, refused in ((AgentCore, False), (MaskedBehind, True)):
+        world = LittleWorld(start_agent=agent).ready()
+        world.fault, world.bumped, world.bumper = "the bumper was hit", True, True
+        world.run(0.5)
+        reply = world.command("back_off")
+        assert reply.accepted is not refused
+        assert ("the lidar sees nothing behind" in reply.reason) is refused
 
 
 def test_a_path_of_another_goal_or_an_older_plan_is_not_followed(world):

@@ -1,16 +1,23 @@
 from __future__ import annotations
 
 import math
+from pathlib import Path
 
+import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from fog_runtime.configuration.robot_file import parse_robot
 from robot_agent.bases.diffdrive import protocol
 from robot_agent.bases.diffdrive.driver import DiffDriveDriver, DiffDriveOptions
 from robot_agent.bases.diffdrive.protocol import Flag, Status, StatusParser
 from robot_agent.bases.diffdrive.stop import STOP
+from robot_agent.config import StopFieldConfig
+from robot_agent.footprint import Footprint
 from robot_agent.odometry import Motion, Odometry
+from robot_agent.registry import make_base
+from robot_agent.safety.stop_field import StopField
 
 EXAMPLE = b"$S,17,1024,-5,0001,11870*71FE\n"
 statuses = st.builds(
@@ -256,3 +263,16 @@ def test_travel_is_in_metres_by_the_options_and_survives_the_wrap():
 def test_battery_full_v_below_battery_empty_v_is_refused():
     with pytest.raises(ValueError, match="battery_full_v"):
         DiffDriveOptions(battery_full_v=9.0)
+
+
+def test_robot_keeps_more_distance_where_its_wheels_need_longer_to_come_to_rest():
+    ahead = np.array([(0.40, 0.0)])
+    limited = {}
+    for deceleration in (0.3, 1.0, 3.0):
+        options = f"{{ deceleration_m_s2 = {deceleration} }}"
+        text = f'[base]\ndriver = "diffdrive"\noptions = {options}\n[lidar]\ndriver = "ld19"\n'
+        drive = make_base(parse_robot(text, Path("robot.toml"), {})).drive_train
+        assert drive.deceleration_m_s2 == deceleration
+        field = StopField(Footprint.circle(0.17), drive, StopFieldConfig())
+        limited[deceleration] = field.limit((0.6, 0.6), ahead).wheels[0]
+    assert limited[0.3] < limited[1.0] < limited[3.0]

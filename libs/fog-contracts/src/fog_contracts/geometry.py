@@ -24,7 +24,7 @@ class GeometryError(ValueError):
 def sampled(corners: _Floats, spacing: float) -> _Floats:
     """Return the polyline through the corners (n, 2) as points (m, 2) at most `spacing` apart, all corners included."""
     steps = np.diff(corners, axis=0)
-    counts = np.array([max(1, math.ceil(math.hypot(x, y) / spacing)) for x, y in steps.tolist()], np.int64)
+    counts = np.maximum(np.ceil(np.hypot(steps[:, 0], steps[:, 1]) / spacing), 1.0).astype(np.int64)
     line = np.repeat(np.arange(len(counts)), counts)
     ends = np.cumsum(counts)
     number = np.arange(1, len(line) + 1) - (ends - counts)[line]

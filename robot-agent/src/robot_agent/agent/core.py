@@ -254,7 +254,7 @@ class AgentCore:
     def _evaluate_safety(self, now: float, request: Request | None = None) -> SafetyOutputs:
         pose = self._localizer.pose(now)
         trusted = pose if self._localizer.status in {"good", "weak"} else None
-        maneuver = self._maneuvers.inputs(self._safety.state, self.replica, trusted, now)
+        maneuver = self._maneuvers.inputs(self._safety.state, self.replica, trusted, now, request)
         ahead = self._maneuvers.way_ahead(request, maneuver)
         inputs = safety_inputs(
             self._base,

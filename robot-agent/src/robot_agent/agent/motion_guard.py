@@ -65,6 +65,10 @@ class MotionGuard:
         self.reason = self.reason or left.reason
         return left.wheels
 
+    def blindness(self, wheels: Wheels) -> str | None:
+        """Return why the robot would not move at these wheel speeds (m/s), as it sees too little there; else None."""
+        return self._view.visibility.limit(wheels, self._drive.twist(*wheels)).reason
+
     def hazard(
         self, wheels: Wheels, keep: Callable[[NDArray[np.float64]], NDArray[np.float64]], now: float
     ) -> str | None:

@@ -23,12 +23,14 @@ if TYPE_CHECKING:
 class ManeuverInputs(NamedTuple):
     """How the maneuver goes, and why the base must not seek its dock.
 
-    remaining: m to its end, rad of a turn. problem: what keeps the robot from it.
+    remaining: m to its end, rad of a turn. problem: what keeps the robot from it. blind_behind: why it would not drive
+    back.
     """
 
     remaining: float = math.inf
     problem: str | None = None
     dock_problem: str | None = None
+    blind_behind: str | None = None
 
 
 class SafetySupervisor:
@@ -101,6 +103,7 @@ def safety_inputs(  # noqa: PLR0913  # the gate weighs every source of the agent
         maneuver_remaining=maneuver.remaining,
         maneuver_problem=maneuver.problem,
         dock_problem=maneuver.dock_problem,
+        blind_behind=maneuver.blind_behind,
         caution=caution,
         resting=resting,
     )

@@ -19,6 +19,8 @@ _SEARCH_BACK_M: Final = 0.5
 _SEARCH_AHEAD_M: Final = 2.5
 _OFF_PATH_M: Final = 1.0
 _PROGRESS_M: Final = 0.1
+_SLOW_M_S: Final = 0.1
+"""A robot that must drive more slowly than this gets longer before it counts as stuck."""
 _END_M: Final = 0.05
 """A path released to within this of its end counts as released whole: rounded points change its length."""
 
@@ -121,6 +123,11 @@ class PathFollower:
         last = min(int(self.along.searchsorted(high, "right")), len(self.points) - 1)
         progress, distance = nearest_on(self.points, self.along, first, last, x, y)
         return (self.progress if math.isinf(distance) else progress), distance
+
+
+def at_speed(cap: float) -> float:
+    """Return which share of the time without progress counts for a robot that may go at `cap` (m/s) at most."""
+    return min(cap / _SLOW_M_S, 1.0)
 
 
 def first_blocked(

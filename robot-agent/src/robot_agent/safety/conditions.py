@@ -45,7 +45,8 @@ class SafetyInputs(msgspec.Struct, frozen=True, kw_only=True):
     base_fault: the guardian's fault, latched there unless it is `base_fault_passing`, which ends with its cause.
     base_stopped: why the guardian keeps the wheels at zero. bumped: the fault that it has latched is a bump.
     docked_for: s for which the robot has been on its dock, None off it. late_age: since this computer last ran the
-    agent too late, by `late_by`. resting: why the lidar stands still on purpose, or is being started.
+    agent too late, by `late_by`. resting: why the lidar stands still on purpose, or is being started. blind_behind: why
+    a robot that shall drive back would not move.
     """
 
     map_loaded: bool = False
@@ -75,6 +76,7 @@ class SafetyInputs(msgspec.Struct, frozen=True, kw_only=True):
     maneuver_remaining: float = math.inf
     maneuver_problem: str | None = None
     dock_problem: str | None = None
+    blind_behind: str | None = None
     caution: str | None = None
     resting: str | None = None
     late_age: float = math.inf

@@ -82,7 +82,7 @@ def _relevant_to_undocking(inputs: SafetyInputs) -> SafetyInputs:
 
 
 def _refuses_undocking(inputs: SafetyInputs) -> str | None:
-    return "the robot is not on its dock" if inputs.docked_for is None else None
+    return "the robot is not on its dock" if inputs.docked_for is None else inputs.blind_behind
 
 
 def _straight_end(inputs: SafetyInputs, _: SafetyConfig) -> tuple[str, bool] | None:
@@ -107,7 +107,9 @@ def _relevant_to_back_off(inputs: SafetyInputs) -> SafetyInputs:
 
 
 def _refuses_back_off(inputs: SafetyInputs) -> str | None:
-    return None if inputs.bumped else "the robot has bumped into nothing: there is nothing to back off from"
+    if not inputs.bumped:
+        return "the robot has bumped into nothing: there is nothing to back off from"
+    return inputs.blind_behind
 
 
 def _relevant_to_looking_around(inputs: SafetyInputs) -> SafetyInputs:

@@ -77,8 +77,13 @@ class Maneuvers:
             self.docking.order_if_low(feedback.status, state, driving.mission, now)
         return self.docking.is_due(state, driving.mission, now, at_rest=driving.wheels.at_rest)
 
-    def inputs(self, state: SafetyState, replica: Replica, trusted: Pose2 | None, now: float) -> ManeuverInputs:
-        """Return how the maneuver goes; `trusted`: the robot's pose if that is good enough."""
+    def inputs(
+        self, state: SafetyState, replica: Replica, trusted: Pose2 | None, now: float, request: Request | None = None
+    ) -> ManeuverInputs:
+        """Return how the maneuver goes; `trusted`: the robot's pose if that is good enough.
+
+        request: of a maneuver that shall begin.
+        """
         kind = None if state.maneuver is None else state.maneuver.kind
         # Just after a stop the twist still is that of the drive, and a pose that is extrapolated by it up to 2 cm too
         # far ahead: a way back from there would be too short by that. So maneuvers begin at a measured pose.
@@ -88,6 +93,9 @@ class Maneuvers:
             self._turning.begin(measured)
             for straight in self._straight.values():
                 straight.begin(measured)
+        match request:
+            case "undock" | "back_off" if kind is None:
+                return ManeuverInputs(blind_behind=self._guard.blindness(self._straight[request].wheels))
         if kind in self._straight:
             self._straight[kind].advance(measured)
             return ManeuverInputs(self._straight[kind].remaining(odom), self._guard.reason)

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
-from fog_contracts.geometry import PATH_SPACING_M, sampled
+from fog_contracts.geometry import PATH_SPACING_M, lengths_along, sampled
 from fog_contracts.liveness import Delays
 from robot_agent.motion.path_follower import PathFollower
 
@@ -15,6 +15,8 @@ if TYPE_CHECKING:
     from fog_contracts.messages import RobotGoal, RobotPath, RobotRelease
 
 _NEVER: Final = -math.inf
+PATH_MAX_M: Final = 2000.0
+"""A longer path is not followed: with a point every few centimetres it would hold up the wheel commands."""
 
 PathId = tuple[int, int]
 """Identity of a path: the planner's epoch and the plan's number."""
@@ -101,6 +103,9 @@ class Mission:
             self.follower.release(path.released_length)
             return False
         corners = np.array(path.points, dtype=np.float64)
+        self.follower = None
+        if lengths_along(corners)[-1] > PATH_MAX_M:
+            return False
         self.follower = PathFollower(sampled(corners, PATH_SPACING_M), path.released_length)
         return True
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+from dataclasses import replace
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -52,6 +54,8 @@ class PathDriving:
         self._recoveries = Recoveries()
         self._arrived = False
         """Whether the last decision was made within the tolerance of the path's end."""
+        self._cap = math.inf
+        """The fastest (m/s) that the robot might go when the last decision was asked for."""
 
     def configure(self, config: MotionConfig) -> None:
         """Follow paths by another configuration from now on, and drop the present path, and one that came early."""
@@ -96,7 +100,7 @@ class PathDriving:
         """
         blocked = self.wheels.decision.blocked if self.wheels.decision else None
         hindrance = Hindrance(guard.reason or blocked, guard.unseeing)
-        standstill = self._progress.problem(self.mission, hindrance, safety, now)
+        standstill = self._progress.problem(self.mission, hindrance, safety, now, cap=self._cap)
         return self._monitor.problem(self.mission, replica.version, now) or standstill
 
     def impassable(self, now: float) -> NDArray[np.float64]:
@@ -136,13 +140,12 @@ class PathDriving:
         follower.advance(pose.x, pose.y, now)
         if not safety.mission_may_drive:
             return None
-        recovery = None if self._arrived else self._recoveries.due(follower, pose, odom, safety.cap, now)
         scan, scan_pose = localizer.scan, localizer.scan_pose()
         points = np.zeros((0, 2))
         if scan is not None and scan_pose is not None:
             self._scans.add(scan, now)
             points = self._scans.points(scan_pose, now)
-        return make_job(
+        job = make_job(
             follower,
             plan_id=path.plan_id,
             planner_epoch=path.planner_epoch,
@@ -158,8 +161,12 @@ class PathDriving:
             lidar_points=points,
             footprint=self._footprint,
             config=self._config,
-            recovery=recovery,
         )
+        if job is None:
+            return None
+        self._cap = job.cap
+        recovery = None if self._arrived else self._recoveries.due(follower, pose, odom, job.cap, now)
+        return job if recovery is None else replace(job, recovery=recovery)
 
     def accept(self, decision: Decision) -> None:
         """Drive by a decision; one for a path that is no longer followed is dropped."""

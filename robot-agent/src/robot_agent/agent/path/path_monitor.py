@@ -9,6 +9,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Final, NamedTuple
 
 from fog_contracts.costs import INSCRIBED
+from robot_agent.agent.path.mission import PATH_MAX_M
 from robot_agent.motion.path_follower import first_blocked
 
 if TYPE_CHECKING:
@@ -19,6 +20,9 @@ if TYPE_CHECKING:
 
 BLOCK_NEAR_M: Final = 3.0
 """A blocked path this near stops the robot at once; farther away the planner gets `PLANNER_GRACE_S` to replan."""
+OFF_PATH_M: Final = 1.1
+"""A robot this far off its path waits for another one: nobody planned what lies between. From a little less on, 1.0 m,
+the planner plans anew."""
 PLANNER_GRACE_S: Final = 1.0
 """How long the planner may take for a path on the newest map."""
 MAP_GRACE_S: Final = 1.0
@@ -78,10 +82,10 @@ class PathMonitor:
         path = mission.path
         if path is None or not mission.active:
             return None
-        if path.refusal is not None:
-            return f"the planner finds no path: {path.refusal.reason}"
         if self._is_of_other_map(path, version, now):
             return "the path was planned on another map than the robot's"
+        if (unfit := _unfit(path, mission.follower)) is not None:
+            return unfit
         if version is not None and self._is_ahead_of_map(path, version, now):
             return f"the path was planned on version {path.map_seq} of the map; the robot has version {version.seq}"
         if self._blockage is None or self._blocked_since is None:
@@ -112,6 +116,21 @@ class PathMonitor:
         if self._awaited is None or self._awaited.epoch != version.epoch or self._awaited.seq <= version.seq:
             self._awaited = _Awaited(version.epoch, path.map_seq, now)
         return now - self._awaited.since > MAP_GRACE_S
+
+
+def _unfit(path: RobotPath, follower: PathFollower | None) -> str | None:
+    """Return why a robot where it is can't follow the path, on any map; None when it can."""
+    if path.refusal is not None:
+        return f"the planner finds no path: {path.refusal.reason}"
+    if follower is None:
+        return (
+            None
+            if not path.points
+            else f"the path is longer than {PATH_MAX_M:.0f} m: send the robot to a place on its way first"
+        )
+    if follower.distance > OFF_PATH_M:
+        return f"the robot is {follower.distance:.1f} m off its path, and waits for one that begins where it is"
+    return None
 
 
 def _find_blockage(path: RobotPath, follower: PathFollower, replica: Replica, version: Version) -> _Blockage | None:

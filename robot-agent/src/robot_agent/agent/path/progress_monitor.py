@@ -11,6 +11,8 @@ from typing import TYPE_CHECKING, Final, NamedTuple
 
 import numpy as np
 
+from robot_agent.motion.path_follower import at_speed
+
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
@@ -60,11 +62,13 @@ class ProgressMonitor:
         self._hindrance, self._hindered_at = Hindrance(), _NEVER
         self._place, self._reported_until = _NOWHERE, _NEVER
 
-    def problem(self, mission: Mission, hindrance: Hindrance, safety: SafetyOutputs, now: float) -> str | None:
+    def problem(
+        self, mission: Mission, hindrance: Hindrance, safety: SafetyOutputs, now: float, *, cap: float = math.inf
+    ) -> str | None:
         """Return why the robot must hold until a new plan or goal; None while it gets on. Call it steadily.
 
         safety: the gate's last outputs. A robot that they stop is not stuck, and one that an operator disables begins
-        anew.
+        anew. cap: the fastest that it may go (m/s).
         """
         self._forget_if_over(mission, safety)
         if hindrance.words is not None:
@@ -75,7 +79,7 @@ class ProgressMonitor:
             return None
         if not safety.mission_may_drive or _waits_for_release(follower):
             follower.restart_progress_timer(now)
-        if self._standstill is None and follower.stuck_for(now) > self._stuck_after:
+        if self._standstill is None and follower.stuck_for(now) * at_speed(cap) > self._stuck_after:
             self._hold(mission.path_id, follower, now)
         return None if self._standstill is None else self._standstill.reason
 
@@ -88,7 +92,7 @@ class ProgressMonitor:
         recent = now - self._hindered_at <= self._stuck_after
         hindrance = self._hindrance if recent else Hindrance()
         because = f": {hindrance.words}" if hindrance.words else ""
-        reason = f"no progress along the path for {self._stuck_after:.0f} s{because}"
+        reason = f"no progress along the path for {follower.stuck_for(now):.0f} s{because}"
         self._standstill = _Standstill(path_id, reason)
         if not hindrance.unseeing:
             self._place, self._reported_until = _bar_across(follower, self._ahead), now + _REPORTED_S

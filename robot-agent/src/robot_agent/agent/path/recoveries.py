@@ -6,6 +6,7 @@ import math
 from typing import TYPE_CHECKING, Final
 
 from robot_agent.localization.pose import wrap
+from robot_agent.motion.path_follower import at_speed
 from robot_agent.motion.recovery import Recovery, Situation, step
 from robot_agent.motion.recovery_moves import RecoveryMove
 from robot_agent.motion.trail import Trail
@@ -17,8 +18,6 @@ if TYPE_CHECKING:
 
 _AIM_M: Final = 0.3
 """The robot turns towards the point of its path this far ahead."""
-_SLOW_M_S: Final = 0.1
-"""A robot that must drive more slowly than this gets longer before it counts as stuck."""
 
 
 class Recoveries:
@@ -46,7 +45,7 @@ class Recoveries:
         heading = math.atan2(points[-1][1] - pose.y, points[-1][0] - pose.x)
         seen = Situation(
             place=(odom.x, odom.y),
-            stuck_for=follower.stuck_for(now) * min(cap / _SLOW_M_S, 1.0),
+            stuck_for=follower.stuck_for(now) * at_speed(cap),
             error=wrap(heading - pose.theta),
             trail=self._trail.length,
             refused=self._refused,

@@ -26,6 +26,15 @@ class DiffDriveOptions(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown
     wheel_speed_max_m_s: Annotated[
         float, Meta(gt=0.0, le=protocol.SPEED_MAX_MM_S / 1000.0, description="top speed of a wheel")
     ] = 0.6
+    deceleration_m_s2: Annotated[
+        float,
+        Meta(
+            ge=0.2,
+            le=5.0,
+            description="how fast a wheel that is commanded to zero comes to rest, at least, with the heaviest load on "
+            "the smoothest floor: the robot keeps its distance by it",
+        ),
+    ] = 1.0
     battery_empty_v: Annotated[float, Meta(ge=0.0, le=60.0, description="voltage of the empty battery")] = 10.5
     battery_full_v: Annotated[float, Meta(ge=0.0, le=60.0, description="voltage of the full battery")] = 12.6
 
@@ -50,6 +59,7 @@ class DiffDriveDriver:
             axle_m=options.axle_m,
             wheel_speed_max_m_s=options.wheel_speed_max_m_s,
             travel_wrap_m=protocol.COUNTS * self._metres_per_count,
+            deceleration_m_s2=options.deceleration_m_s2,
         )
 
     @property

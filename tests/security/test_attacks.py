@@ -1,20 +1,24 @@
 """Attacks of those who have no credential, on servers as `fognav` starts them: who has one is served all the same."""
 
 import asyncio
-import contextlib
 import resource
-import ssl
 import time
-from collections.abc import AsyncIterator, Callable, Iterator
-from contextlib import asynccontextmanager, contextmanager
+from collections.abc import Iterator
+from contextlib import contextmanager
 
+import httpx
 import psutil
 import pytest
+from attacks import ATTACKS, LIMIT_S, Attack, running
+from fronts import running_front
 from locked_servers import LockedSite
 
 from fog_contracts import channels as ch
 from fog_contracts import messages as m
+from fog_runtime.access.server_certificate import ServerCertificate
 from fog_runtime.clock import SystemClock
+from fog_runtime.health import Health
+from fog_runtime.http import Routes, Tokens, make_app
 from fog_runtime.transports.zenoh_edge import ZenohEdge
 from fog_supervisor import net
 from fog_supervisor.servers import router_program
@@ -23,12 +27,10 @@ from fognav.programs import ProgramSet, SystemFolder
 
 pytestmark = [pytest.mark.live, pytest.mark.timeout(300)]
 
-LIMIT_S = 60.0
 CONNECT_S = 2.0
 BACK_S = 5.0
 MAP_S = 1.0
 """Older than this, a map makes a robot slow down."""
-FLOOD = 1100
 MEMORY_BYTES = 150 * 1024 * 1024
 LOG_BYTES = 20_000
 
@@ -47,72 +49,6 @@ def few_files(number: int = 1024) -> Iterator[None]:
         yield
     finally:
         resource.setrlimit(resource.RLIMIT_NOFILE, before)
-
-
-class Attack:
-    """Opens connections from one address, `rate` a second, says something on each, and closes it after a while."""
-
-    def __init__(self, port: int, said: bytes, *, rate: int, held_s: float, encrypts: bool = False) -> None:
-        self._port = port
-        self._said = said
-        self.rate = rate
-        self._held_s = held_s
-        self._tls = net.unverified() if encrypts else None
-        self.made = 0
-
-    async def run(self) -> None:
-        loop = asyncio.get_running_loop()
-        begun = loop.time()
-        async with asyncio.TaskGroup() as tasks:
-            while True:
-                while self.made < (loop.time() - begun) * self.rate:
-                    self.made += 1
-                    tasks.create_task(self._hold())
-                await asyncio.sleep(0.01)
-
-    async def _hold(self) -> None:
-        with contextlib.suppress(OSError, TimeoutError):
-            async with asyncio.timeout(30.0):
-                reader, writer = await asyncio.open_connection(net.LOOPBACK, self._port, ssl=self._tls)
-            try:
-                writer.write(self._said)
-                async with asyncio.timeout(self._held_s):
-                    await reader.read()
-            finally:
-                writer.transport.abort()
-
-
-def client_hello() -> bytes:
-    """What a TLS client says first."""
-    incoming, outgoing = ssl.MemoryBIO(), ssl.MemoryBIO()
-    client = net.unverified().wrap_bio(incoming, outgoing, server_hostname="localhost")
-    with contextlib.suppress(ssl.SSLWantReadError):
-        client.do_handshake()
-    return outgoing.read()
-
-
-ATTACKS: dict[str, Callable[[int], Attack]] = {
-    "say nothing and leave": lambda port: Attack(port, b"", rate=20, held_s=0.0),
-    "say nothing and stay": lambda port: Attack(port, b"", rate=300, held_s=600.0),
-    "begin to encrypt and leave": lambda port: Attack(port, client_hello(), rate=20, held_s=0.0),
-    "begin to encrypt and stay": lambda port: Attack(port, client_hello(), rate=100, held_s=600.0),
-    "encrypt and stay": lambda port: Attack(port, b"", rate=40, held_s=600.0, encrypts=True),
-    "say nonsense": lambda port: Attack(port, b"GET / HTTP/1.1\r\n\r\n", rate=50, held_s=0.5),
-}
-
-
-@asynccontextmanager
-async def running(attack: Attack) -> AsyncIterator[None]:
-    """Run an attack, from its sixth second or 1,100th connection on: more than a process has descriptors."""
-    task = asyncio.create_task(attack.run())
-    try:
-        async with asyncio.timeout(LIMIT_S):
-            while attack.made < min(FLOOD, attack.rate * 6):  # noqa: ASYNC110  # the attack sets no event
-                await asyncio.sleep(0.1)
-        yield
-    finally:
-        task.cancel()
-        await asyncio.gather(task, return_exceptions=True)
 
 
 def opened(site: LockedSite, url: str, user: str, role: str):
@@ -176,6 +112,53 @@ async def connects_after(site: LockedSite, url: str) -> float:
             while not edge.connected:  # noqa: ASYNC110  # the edge sets no event
                 await asyncio.sleep(0.01)
             return time.monotonic() - begun
+
+
+def small_app():
+    made = make_app("Test", Health(), Tokens())
+    routes = Routes(made, "test")
+    routes.urgent("/robots/{robot}/stop")
+
+    @routes.post("/robots/{robot}/stop")
+    async def stop(robot: str) -> str:
+        return robot
+
+    return made
+
+
+HALF_A_HEADER = b"GET /healthz HTTP/1.1\r\nHost: fog\r\nX-Name: "
+ON_REST = ATTACKS | {
+    "begin a request and stay": lambda port: Attack(port, HALF_A_HEADER, rate=40, held_s=600.0, encrypts=True),
+    "send nonsense encrypted": lambda port: Attack(port, b"nonsense\r\n\r\n", rate=40, held_s=600.0, encrypts=True),
+}
+
+
+@pytest.mark.parametrize("name", ON_REST)
+async def test_rest_stops_robots_while_strangers_fill_its_connections(site, tmp_path, capfd, name):
+    folder = site.locks.folder("http")
+    certificate = ServerCertificate(folder / "server.pem", folder / "server.key")
+    with few_files():
+        fronts = running_front(small_app, tmp_path, certificate=certificate)
+        url = (await fronts.__aenter__()).replace("http:", "https:")
+    trust = site.credentials("console").tls_context()
+    try:
+
+        async def stop(client: httpx.AsyncClient) -> float:
+            begun = time.monotonic()
+            assert (await client.post("/robots/r1/stop")).json() == "r1"
+            return time.monotonic() - begun
+
+        front = psutil.Process().children()[-1]
+        async with httpx.AsyncClient(base_url=url, verify=trust, timeout=LIMIT_S) as client:
+            async with running(ON_REST[name](client.base_url.port)):
+                during = await stop(client)
+            after = await stop(client)
+        assert during < CONNECT_S
+        assert after < BACK_S
+        assert front.memory_info().rss < 2 * MEMORY_BYTES
+        assert len(capfd.readouterr().err) < LOG_BYTES
+    finally:
+        await fronts.__aexit__(None, None, None)
 
 
 async def test_router_to_which_no_session_can_be_opened_ends_and_is_started_again(site, tmp_path):

@@ -33,7 +33,8 @@ HANDSHAKE_PACE_S: Final = 0.01
 """Between the starts of two TLS handshakes, each of which costs a millisecond and more."""
 REPORT_S: Final = 10.0
 """How often the refused connections are logged, together."""
-_BACKLOG: Final = 1024
+BACKLOG: Final = 1024
+"""Connections that the operating system keeps until they are accepted."""
 _NO_DESCRIPTORS_S: Final = 0.1
 
 _log = logs.get("admission")
@@ -43,7 +44,7 @@ def listen(host: str, port: int) -> socket.socket:
     """Return a socket that listens; raises `OSError`, for one when the port is taken."""
     family, _, _, _, address = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM, flags=socket.AI_PASSIVE)[0]
     both = family == socket.AF_INET6 and address[0] == "::"
-    return socket.create_server(address[:2], family=family, backlog=_BACKLOG, dualstack_ipv6=both)
+    return socket.create_server(address[:2], family=family, backlog=BACKLOG, dualstack_ipv6=both)
 
 
 def source_of(host: str) -> str:
@@ -74,10 +75,10 @@ class Visitor:
         if self.timer is not None:
             self.timer.cancel()
 
-    def estrange(self) -> None:
+    def estrange(self, patience_s: float = PATIENCE_S) -> None:
         """Take it for a stranger again, with new time: for one, between two requests."""
         self.admit()
-        self._admission.place(self)
+        self._admission.place(self, patience_s)
 
     def left(self) -> None:
         """Forget it: its connection is lost."""
@@ -131,8 +132,6 @@ class Admission:
         self,
         make_protocol: Callable[[Visitor], asyncio.Protocol],
         tls: ssl.SSLContext | None = None,
-        *,
-        patience_s: float = PATIENCE_S,
     ) -> None:
         """Make a protocol for each; it must tell its visitor `admit` and, when the connection is lost, `left`.
 
@@ -140,7 +139,6 @@ class Admission:
         """
         self._make_protocol = make_protocol
         self._tls = tls
-        self._patience_s = patience_s
         self._silent = Places(SILENT)
         self._strangers = Places(STRANGERS)
         self._queue = Places(QUEUE)
@@ -157,9 +155,9 @@ class Admission:
             tasks.create_task(self._greet_all())
             tasks.create_task(self._report())
 
-    def place(self, visitor: Visitor) -> None:
+    def place(self, visitor: Visitor, patience_s: float) -> None:
         """Give a visitor that has sent something a stranger's place and time."""
-        visitor.timer = asyncio.get_running_loop().call_later(self._patience_s, self._refuse, visitor, "slow")
+        visitor.timer = asyncio.get_running_loop().call_later(patience_s, self._refuse, visitor, "slow")
         if (displaced := self._strangers.add(visitor)) is not None:
             self._refuse(displaced, "displaced")
 
@@ -175,7 +173,7 @@ class Admission:
                 await asyncio.sleep(_NO_DESCRIPTORS_S)
                 continue
             visitor = Visitor(self, connection, source_of(address[0]))
-            visitor.timer = loop.call_later(self._patience_s, self._refuse, visitor, "silent")
+            visitor.timer = loop.call_later(PATIENCE_S, self._refuse, visitor, "silent")
             if (displaced := self._silent.add(visitor)) is not None:
                 self._refuse(displaced, "displaced")
             loop.add_reader(connection, self._heard, visitor)
@@ -211,7 +209,7 @@ class Admission:
 
     async def _greet(self, visitor: Visitor) -> None:
         loop = asyncio.get_running_loop()
-        options = {} if self._tls is None else {"ssl_handshake_timeout": self._patience_s, "ssl_shutdown_timeout": 1.0}
+        options = {} if self._tls is None else {"ssl_handshake_timeout": PATIENCE_S, "ssl_shutdown_timeout": 1.0}
         try:
             visitor.transport, _ = await loop.connect_accepted_socket(
                 lambda: self._make_protocol(visitor), visitor.connection, ssl=self._tls, **options

@@ -8,9 +8,12 @@ its event loop, and returns the response.
 import asyncio
 import contextlib
 import gc
+import logging
 import os
 import signal
 import socket
+import time
+from collections import Counter
 from collections.abc import Callable, Collection, Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -18,19 +21,25 @@ from typing import Any, Final, NoReturn, Self
 
 import uvicorn
 from fastapi import FastAPI
+from uvicorn.protocols.http.h11_impl import H11Protocol, RequestResponseCycle
 
 from fog_runtime import logs
 from fog_runtime.access.server_certificate import ServerCertificate
+from fog_runtime.admission import BACKLOG, Admission, Visitor
 from fog_runtime.files import write_port_file
 from fog_runtime.http.gateway import BehindGateway
 from fog_runtime.http.link import CoreLink, FrontLink
 from fog_runtime.http.routes import answer_call
-from fog_runtime.machine import signals
+from fog_runtime.machine import descriptors, signals
 
 NICENESS: Final = 5
 """The front gets a third of the processor time of a core that wants some, too."""
 END_S: Final = 3.0
 """How long the front may take to end: open requests get 2 s."""
+BETWEEN_REQUESTS_S: Final = 60.0
+"""How long an answer may take to be sent, together with the next request's header."""
+SAME_S: Final = 10.0
+"""How often the server's own log repeats a line: whoever sends nonsense must not fill a disk."""
 
 _log = logs.get("http")
 
@@ -78,7 +87,7 @@ class Front:
         process has threads and connections. The front ends with this process.
         """
         family = socket.AF_INET6 if ":" in host else socket.AF_INET
-        with socket.create_server((host, port), family=family, backlog=128) as listener:
+        with socket.create_server((host, port), family=family, backlog=BACKLOG) as listener:
             ours, theirs = socket.socketpair()
             with theirs:
                 pid = os.fork()
@@ -116,11 +125,72 @@ def _behind(gateway: str, app: FastAPI) -> FastAPI:
     return app
 
 
+class _Connection(H11Protocol):
+    """A connection is a stranger's until the header of a request is complete, and again once that is answered."""
+
+    def __init__(self, visitor: Visitor, server: uvicorn.Server) -> None:
+        super().__init__(server.config, server.server_state, server.lifespan.state)
+        self._visitor = visitor
+
+    def handle_events(self) -> None:
+        super().handle_events()
+        begun: RequestResponseCycle | None = self.cycle  # whatever uvicorn's own type says
+        if begun is not None and not begun.response_complete:
+            self._visitor.admit()
+
+    def on_response_complete(self) -> None:
+        answered = self.cycle
+        super().on_response_complete()
+        if self.cycle is answered:  # no further request was waiting
+            self._visitor.estrange(BETWEEN_REQUESTS_S)
+
+    def connection_lost(self, exc: Exception | None) -> None:
+        self._visitor.left()
+        super().connection_lost(exc)
+
+
 class _Server(uvicorn.Server):
     @contextmanager
     def capture_signals(self) -> Iterator[None]:
         """Leave signals alone: the front ends with the core's process."""
         yield
+
+    async def startup(self, sockets: list[socket.socket] | None = None) -> None:
+        """Accept connections as `Admission` does, instead of as many as come."""
+        await self.lifespan.startup()
+        self.servers = []
+        admission = Admission(lambda visitor: _Connection(visitor, self), self.config.ssl)
+        self._accepting = asyncio.create_task(admission.serve(sockets or []))
+        self.started = True
+
+    def accept_no_more(self) -> None:
+        """Leave the listening socket alone."""
+        if self.started:
+            self._accepting.cancel()
+
+    async def shutdown(self, sockets: list[socket.socket] | None = None) -> None:
+        """Accept no more connections, and let open requests end."""
+        self.accept_no_more()
+        await super().shutdown(sockets)
+
+
+class _Sparing(logging.Filter):
+    """Passes a message on once in `SAME_S`, with the number of those before that it did not."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self._next: dict[str, float] = {}
+        self._left_out: Counter[str] = Counter()
+
+    def filter(self, record: logging.LogRecord) -> bool:
+        now, text = time.monotonic(), str(record.msg)
+        if now < self._next.get(text, 0.0):
+            self._left_out[text] += 1
+            return False
+        self._next[text] = now + SAME_S
+        if before := self._left_out.pop(text, 0):
+            record.msg = f"{text} ({before} more before)"
+        return True
 
 
 def _become_front(
@@ -165,6 +235,8 @@ async def _receive(
     if not await link.started():
         return
     app.state.core = link
+    descriptors.raise_limit()
+    logging.getLogger("uvicorn.error").addFilter(_Sparing())
     server = _Server(
         uvicorn.Config(
             app,
@@ -186,8 +258,8 @@ async def _receive(
     serving = asyncio.ensure_future(server.serve(sockets=[listener]))
     done, _ = await asyncio.wait({linked, serving}, return_when=asyncio.FIRST_COMPLETED)
     if linked in done:
-        for each in server.servers:
-            each.close()  # at once: the service is started again on this port
+        server.accept_no_more()
+        listener.close()  # at once: the service is started again on this port
         stop()  # open requests are still answered: their calls have failed
         await asyncio.wait({serving}, timeout=END_S)
     for task in done:

@@ -1,0 +1,79 @@
+"""Attacks of strangers on a server's port: many connections, which say nothing, nonsense, or half of something."""
+
+import asyncio
+import contextlib
+import ssl
+from collections.abc import AsyncIterator, Callable
+from contextlib import asynccontextmanager
+
+from fog_supervisor import net
+
+LIMIT_S = 60.0
+FLOOD = 1100
+"""More connections than a process usually has descriptors."""
+
+
+class Attack:
+    """Opens connections from one address, `rate` a second, says something on each, and closes it after a while."""
+
+    def __init__(self, port: int, said: bytes, *, rate: int, held_s: float, encrypts: bool = False) -> None:
+        self._port = port
+        self._said = said
+        self.rate = rate
+        self._held_s = held_s
+        self._tls = net.unverified() if encrypts else None
+        self.made = 0
+
+    async def run(self) -> None:
+        loop = asyncio.get_running_loop()
+        begun = loop.time()
+        async with asyncio.TaskGroup() as tasks:
+            while True:
+                while self.made < (loop.time() - begun) * self.rate:
+                    self.made += 1
+                    tasks.create_task(self._hold())
+                await asyncio.sleep(0.01)
+
+    async def _hold(self) -> None:
+        with contextlib.suppress(OSError, TimeoutError):
+            async with asyncio.timeout(30.0):
+                reader, writer = await asyncio.open_connection(net.LOOPBACK, self._port, ssl=self._tls)
+            try:
+                writer.write(self._said)
+                async with asyncio.timeout(self._held_s):
+                    await reader.read()
+            finally:
+                writer.transport.abort()
+
+
+def client_hello() -> bytes:
+    """What a TLS client says first."""
+    incoming, outgoing = ssl.MemoryBIO(), ssl.MemoryBIO()
+    client = net.unverified().wrap_bio(incoming, outgoing, server_hostname="localhost")
+    with contextlib.suppress(ssl.SSLWantReadError):
+        client.do_handshake()
+    return outgoing.read()
+
+
+ATTACKS: dict[str, Callable[[int], Attack]] = {
+    "say nothing and leave": lambda port: Attack(port, b"", rate=20, held_s=0.0),
+    "say nothing and stay": lambda port: Attack(port, b"", rate=300, held_s=600.0),
+    "begin to encrypt and leave": lambda port: Attack(port, client_hello(), rate=20, held_s=0.0),
+    "begin to encrypt and stay": lambda port: Attack(port, client_hello(), rate=100, held_s=600.0),
+    "encrypt and stay": lambda port: Attack(port, b"", rate=40, held_s=600.0, encrypts=True),
+    "say nonsense": lambda port: Attack(port, b"GET / HTTP/1.1\r\n\r\n", rate=50, held_s=0.5),
+}
+
+
+@asynccontextmanager
+async def running(attack: Attack) -> AsyncIterator[None]:
+    """Run an attack, from its sixth second or 1,100th connection on: more than a process has descriptors."""
+    task = asyncio.create_task(attack.run())
+    try:
+        async with asyncio.timeout(LIMIT_S):
+            while attack.made < min(FLOOD, attack.rate * 6):  # noqa: ASYNC110  # the attack sets no event
+                await asyncio.sleep(0.1)
+        yield
+    finally:
+        task.cancel()
+        await asyncio.gather(task, return_exceptions=True)

@@ -143,6 +143,8 @@ async def test_invalid_requests_do_not_reach_the_core(tmp_path):
     async with serving(tmp_path) as (service, client):
         assert (await client.put("/zones/z1", content=b"[" * 9_000)).status_code == 422
         assert (await client.put("/zones/z1", json={**ZONE, "kind": "SOFT"})).status_code == 422
+        deep = await client.put("/zones/z1", content=b'{"unknown": ' + b"[" * 4_900 + b"]" * 4_900 + b"}")
+        assert (deep.status_code, deep.json()["errors"][0]["field"]) == (422, "body")
         assert (await client.put("/zones/z1", content=b"x" * 10_001)).status_code == 413
         assert (await client.get("/nowhere")).status_code == 404
         assert service.calls == []

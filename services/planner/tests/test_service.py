@@ -411,8 +411,10 @@ async def test_each_session_that_asks_over_zenoh_is_an_asker_of_its_own(
     for session in ("a1", "b2"):
         asking = ASKER.set(session)
         await rig.service._serve_plan({}, PlanRequest(start=at, goal=at))
+        for robot in ("r1", "r2"):  # whichever it names
+            await rig.service._serve_egress({}, EgressRequest(robot=robot, pose=at))
         ASKER.reset(asking)
-    assert len(set(queue.askers)) == 2
+    assert [len(set(queue.askers[:3])), len(set(queue.askers[3:])), len(set(queue.askers))] == [1, 1, 2]
 
 
 async def test_queries_that_do_not_fit_are_answered_with_503_and_over_zenoh_with_when_to_ask_again(

@@ -172,7 +172,9 @@ class Service:
         if not self._answers:
             return None
         try:
-            return await self._queue.run("egress", request.robot, partial(self._answer, ch.PLANNER_EGRESS, request))
+            # Of the session that asks: it may name any robot.
+            answer = partial(self._answer, ch.PLANNER_EGRESS, request)
+            return await self._queue.run("egress", f"zenoh {ASKER.get()}", answer)
         except BusyError as error:
             return PlanReply(refusal=busy(str(error)), retry_after=error.retry_after)
 

@@ -377,6 +377,10 @@ async def read_body(request: Request, kind: type[T]) -> T:
         raise InvalidBodyError([_error_of(error)]) from error
     except (msgspec.DecodeError, UnicodeDecodeError) as error:
         raise InvalidBodyError([{"field": "body", "problem": f"not valid JSON: {error}"}]) from error
+    except RecursionError as error:
+        raise InvalidBodyError(
+            [{"field": "body", "problem": "lists or objects inside one another, too deep"}]
+        ) from error
 
 
 def schema(app: FastAPI, kind: Any) -> dict[str, Any]:

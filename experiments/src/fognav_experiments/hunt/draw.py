@@ -178,9 +178,14 @@ def _watched(
     dice: random.Random, range_x: tuple[float, float], bottom: float, top: float, doors: list[Box]
 ) -> list[Watched]:
     """Return an area of a corridor with a node on its lower wall, mostly: it faces a wall, and no door."""
-    x = dice.uniform(*range_x)
-    if dice.random() < 0.2 or any(left - 1.0 < x < right + 1.0 for left, _, right, _ in doors):
+    free = [
+        x
+        for x in (dice.uniform(*range_x) for _ in range(8))
+        if not any(left - 0.6 < x < right + 0.6 for left, _, right, _ in doors)
+    ]
+    if not free or dice.random() < 0.2:
         return []
+    x = free[0]
     half = dice.uniform(0.8, 1.5)
     box = _rounded(x - half, bottom, x + half, top)
     node = (round(x, 2), round(bottom + 0.05, 2), round(math.pi / 2, 4))

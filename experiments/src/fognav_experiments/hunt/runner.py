@@ -130,7 +130,7 @@ def draw(task: Task, folders: Sequence[Path]) -> HuntWorld:
     """Return the world of a task, on whose floor there is a way from start to goal."""
     for attempt in range(_ATTEMPTS):
         world = draw_world(task.seed, task.number, attempt)
-        if task.maps and task.number % _RECORDED_EVERY == 0:
+        if task.maps and task.number % _RECORDED_EVERY == 0 and attempt < _ATTEMPTS // 2:
             name = task.maps[task.number // _RECORDED_EVERY % len(task.maps)]
             recorded = load_recorded(name, folders)
             if recorded.cells.size <= _MOST_CELLS:

@@ -13,10 +13,12 @@ from types import SimpleNamespace
 import msgspec
 import pytest
 
+from fog_contracts.messages import NodeReading
 from fog_runtime.configuration.site import load_site
 from fognav_experiments.lockstep import DriveEvent
 from fognav_experiments.scenarios.description import Expected, FaultyNode, Scenario, SilentNode, deviations
 from fognav_experiments.scenarios.fleet_stage import FleetResult
+from fognav_experiments.scenarios.node_faults import LateNodeSim, SlewedNodeSim
 from fognav_experiments.scenarios.stage import Played, ScenarioError, Stage, markdown_page, play, read_scenario
 
 ROOT = Path(__file__).parents[2]
@@ -155,3 +157,20 @@ def test_the_page_of_scenarios_says_on_what_they_were_played():
     page = markdown_page({"wifi-gap-5s": played}, {"commit": "3baacc2", "machine cores": 2})
     assert "1 in one go, in lockstep; measured on: commit 3baacc2, machine cores 2." in page
     assert "| reached | 10.0 | 40 | yes |" in page
+
+
+class Readings:
+    """A healthy node that has a reading each 0.1 s."""
+
+    node = SimpleNamespace(id="n1")
+
+    def poll(self, _world, now):
+        return [NodeReading(seq=1, boot=1, uptime_ms=round(now * 1000), range_m=[1.0], status=["ok"], state="clear")]
+
+
+def test_readings_of_a_slewed_clock_and_of_a_busy_radio():
+    slewed, times = SlewedNodeSim(Readings(), 0.1), iter([0.25, 0.0, 0.0, 0.0])
+    assert [slewed.poll(None, now)[0].uptime_ms for now in (5.0, 6.0, 7.0)] == [5000, 6100, 7200]
+    late = LateNodeSim(Readings(), lambda: next(times))
+    arrived = [[reading.uptime_ms for reading in late.poll(None, now)] for now in (1.0, 1.1, 1.2, 1.3)]
+    assert arrived == [[], [], [], [1000, 1100, 1200, 1300]]

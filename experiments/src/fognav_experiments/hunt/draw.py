@@ -27,6 +27,7 @@ from fognav_experiments.scenarios.description import (
     Restart,
     SilentLidar,
     SilentNode,
+    SlewedNode,
     SlowLink,
     SpeedZone,
 )
@@ -69,7 +70,7 @@ def draw_world(seed: int, number: int, attempt: int = 0) -> HuntWorld:
     Its start or goal may not be free: make the next attempt then.
     """
     dice = random.Random(f"{seed} {number} {attempt}")  # noqa: S311  # repeatable, not a secret
-    kinds: list[Callable[[random.Random], _Floor]] = [_corridor, _corridor, _hall, _office, _office]
+    kinds: list[Callable[[random.Random], _Floor]] = [_corridor, _hall, _office, _office]
     floor = dice.choice(kinds)(dice)
     sensors = _sensors(dice, floor)
     start, goal = _start_and_goal(dice, floor)
@@ -272,7 +273,7 @@ def _event(  # noqa: C901, PLR0911, PLR0912  # a table of the kinds of events
     node = f"n-{floor.watched[0].id}" if floor.watched else ""
     kind = dice.choice((
         "zone", "zone", "speed", "thing", "person", "gap", "slow", "radio", "restart", "hang", "lidar", "wheel", "push",
-        *(("barrier", "barrier", "silent", "lie", "lie") if node else ()),
+        *(("barrier", "barrier", "silent", "lie", "lie", "clock") if node else ()),
     ))  # fmt: skip
     seconds = round(dice.choice((dice.uniform(0.5, 5.0), dice.uniform(5.0, 60.0))), 1)
     match kind:
@@ -308,6 +309,8 @@ def _event(  # noqa: C901, PLR0911, PLR0912  # a table of the kinds of events
             return Push(at_s=at_s, turn=round(math.radians(dice.uniform(-20.0, 20.0)), 3)), False
         case "silent":
             return SilentNode(at_s=at_s, node=node, seconds=seconds), True
+        case "clock":
+            return SlewedNode(at_s=at_s, node=node, rate=dice.choice((-0.08, -0.001, 0.0005, 0.08))), False
         case "lie":
             fault = dice.choice(_FAULTS)
             return FaultyNode(at_s=at_s, node=node, fault=fault, seconds=seconds), True

@@ -95,6 +95,13 @@ class Restart(Event, frozen=True, kw_only=True, tag="restart"):
     seconds: Annotated[float, Meta(gt=0.0)]
 
 
+class SlewedNode(Event, frozen=True, kw_only=True, tag="slewed-node"):
+    """From then on the clock of a sensor node gains `rate` seconds a second."""
+
+    node: Id
+    rate: Annotated[float, Meta(gt=-0.5, le=0.5)]
+
+
 class LinkGap(Event, frozen=True, kw_only=True, tag="link-gap"):
     """For `seconds` the robot hears nothing of the fog (`down`), or the fog nothing of the robot (`up`), or both."""
 
@@ -145,8 +152,8 @@ class SilentLidar(Event, frozen=True, kw_only=True, tag="silent-lidar"):
 class BusyRadio(Event, frozen=True, kw_only=True, tag="busy-radio"):
     """For `seconds` messages between robot and fog take times of a lognormal distribution, the same for 0.1 s.
 
-    `median_s`, `sigma`: of the times. `gaps_per_min`: how often nothing arrives in either direction, by a lognormal
-    distribution around 0.3 s.
+    And so do readings of the nodes, each its own. `median_s`, `sigma`: of the times. `gaps_per_min`: how often nothing
+    arrives in one direction or in both, by a lognormal distribution around 0.3 s.
     """
 
     seconds: Seconds
@@ -162,6 +169,7 @@ AnyEvent = (
     | SpeedZone
     | SilentNode
     | FaultyNode
+    | SlewedNode
     | LinkGap
     | SlowLink
     | BusyRadio

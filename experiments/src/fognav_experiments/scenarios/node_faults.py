@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+from collections import deque
 from typing import TYPE_CHECKING, Final, Literal
 
 import msgspec
 
 if TYPE_CHECKING:
+    from collections.abc import Callable
+
     from fog_contracts.messages import AreaState, NodeCalibration, NodeConfig, NodeReading
     from fognav_sim.nodes import SensorNode
     from fognav_sim.world import World
@@ -18,14 +21,12 @@ _NEAR_M: Final = 0.6
 _MARGIN_M: Final = 0.1
 
 
-class FaultyNodeSim:
-    """A node with a fault: it measures as the healthy one in it does, and reports something else."""
+class _ChangedNode:
+    """A node whose readings are changed on their way."""
 
-    def __init__(self, healthy: SensorNode, fault: Fault) -> None:
+    def __init__(self, healthy: SensorNode) -> None:
         self.node = healthy.node
         self._healthy = healthy
-        self._fault: Fault = fault
-        self._shown: AreaState | None = None
 
     def configure(self, config: NodeConfig) -> bool:
         """Apply a configuration."""
@@ -42,6 +43,52 @@ class FaultyNodeSim:
     def take_calibration(self) -> NodeCalibration | None:
         """Return the calibration that has ended since the last call, if one has."""
         return self._healthy.take_calibration()
+
+
+class SlewedNodeSim(_ChangedNode):
+    """A node whose clock gains `rate` seconds a second from now on."""
+
+    def __init__(self, healthy: SensorNode, rate: float) -> None:
+        super().__init__(healthy)
+        self._rate = rate
+        self._begun_ms: int | None = None
+
+    def poll(self, world: World, now: float) -> list[NodeReading]:
+        """Run the node up to `now` (s); return what it reports."""
+        return [self._report(reading) for reading in self._healthy.poll(world, now)]
+
+    def _report(self, reading: NodeReading) -> NodeReading:
+        self._begun_ms = reading.uptime_ms if self._begun_ms is None else self._begun_ms
+        shown = self._begun_ms + round((reading.uptime_ms - self._begun_ms) * (1.0 + self._rate))
+        return msgspec.structs.replace(reading, uptime_ms=shown)
+
+
+class LateNodeSim(_ChangedNode):
+    """A node whose readings take a time (s) on their way, which `delay` draws for each; none overtakes another."""
+
+    def __init__(self, healthy: SensorNode, delay: Callable[[], float]) -> None:
+        super().__init__(healthy)
+        self._delay = delay
+        self._under_way: deque[tuple[float, NodeReading]] = deque()
+
+    def poll(self, world: World, now: float) -> list[NodeReading]:
+        """Run the node up to `now` (s); return what arrives."""
+        for reading in self._healthy.poll(world, now):
+            last = self._under_way[-1][0] if self._under_way else now
+            self._under_way.append((max(now + self._delay(), last), reading))
+        arrived = []
+        while self._under_way and self._under_way[0][0] <= now:
+            arrived.append(self._under_way.popleft()[1])
+        return arrived
+
+
+class FaultyNodeSim(_ChangedNode):
+    """A node with a fault: it measures as the healthy one in it does, and reports something else."""
+
+    def __init__(self, healthy: SensorNode, fault: Fault) -> None:
+        super().__init__(healthy)
+        self._fault: Fault = fault
+        self._shown: AreaState | None = None
 
     def poll(self, world: World, now: float) -> list[NodeReading]:
         """Run the node up to `now` (s); return what it reports."""

@@ -32,12 +32,13 @@ from fognav_experiments.scenarios.description import (
     Scenario,
     SilentLidar,
     SilentNode,
+    SlewedNode,
     SlowLink,
     SpeedZone,
     deviations,
 )
 from fognav_experiments.scenarios.fleet_stage import FleetResult, play_fleet
-from fognav_experiments.scenarios.node_faults import FaultyNodeSim
+from fognav_experiments.scenarios.node_faults import FaultyNodeSim, LateNodeSim, SlewedNodeSim
 from fognav_sim.drive.evaluation import DriveOutcome
 from fognav_sim.hardware import STEP_S
 
@@ -242,6 +243,9 @@ class Stage:
             case FaultyNode():
                 fault = event.fault
                 self._replace_node(event.node, lambda node: [FaultyNodeSim(node, fault)], event.seconds)
+            case SlewedNode():
+                rate = event.rate
+                self._replace_node(event.node, lambda node: [SlewedNodeSim(node, rate)], 0.0)
             case LinkGap():
                 self._link(hears=not event.down, is_heard=not event.up)
                 self._later(event.seconds, partial(self._link, hears=True, is_heard=True))
@@ -249,7 +253,7 @@ class Stage:
                 self._delay(event.delay_s)
                 self._later(event.seconds, partial(self._delay, 0.0))
             case BusyRadio():
-                self._repeated.append(partial(self._transmit, event, self.elapsed + event.seconds))
+                self._busy(event)
             case Restart():
                 run.system.fog.stop(event.process)
                 self.on_lost(event.process, lost=True)
@@ -308,13 +312,21 @@ class Stage:
         if self.elapsed >= until:
             self._delay(0.0)
             return False
-        self._delay(event.median_s * math.exp(event.sigma * self._random.gauss(0.0, 1.0)))
+        self._delay(self._time(event))
         if self._random.random() < event.gaps_per_min * _REPEAT_STEPS * STEP_S / 60.0:
             hears, is_heard = self._random.choice(((False, True), (True, False), (False, False)))
             self._link(hears=hears, is_heard=is_heard)
             seconds = _GAP_S * math.exp(self._random.gauss(0.0, 1.0))
             self._later(max(seconds, 2 * STEP_S), partial(self._link, hears=True, is_heard=True))
         return True
+
+    def _busy(self, event: BusyRadio) -> None:
+        self._repeated.append(partial(self._transmit, event, self.elapsed + event.seconds))
+        for node in [node.node.id for node in self._run.system.fog.nodes]:
+            self._replace_node(node, lambda now: [LateNodeSim(now, partial(self._time, event))], event.seconds)
+
+    def _time(self, event: BusyRadio) -> float:
+        return event.median_s * math.exp(event.sigma * self._random.gauss(0.0, 1.0))
 
     def _hang(self, *, hung: bool) -> None:
         self._run.robot.hung = hung

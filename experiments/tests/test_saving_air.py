@@ -125,7 +125,7 @@ def test_person_beside_a_robot_is_a_hazard_at_once(where):
     corridor = Corridor()
     corridor.world.kidnap(Pose(x=BEFORE_LEFT_SONAR[0], y=BEFORE_LEFT_SONAR[1] + 0.15, theta=0.0))
     corridor.run(10.0)
-    assert [reading.state for reading in corridor.run(3.0)] == ["blocked"] * 3
+    assert {reading.state for reading in corridor.run(3.0)} == {"blocked"}
     assert corridor.state != "blocked", "it is the robot"
     corridor.put(where)
     assert corridor.seconds_until("blocked") < 0.5

@@ -107,7 +107,7 @@ def test_places_without_a_way_between_them_are_said(tmp_path: Path, estig) -> No
     )
     shown = run("site", "coverage", str(tmp_path))
     assert shown.returncode == 0, shown.stderr
-    assert "route a to b: there is no way" in shown.stderr
+    assert "route a to b: there is no way" in shown.stdout
 
 
 def run(*command: str) -> subprocess.CompletedProcess[str]:

@@ -40,6 +40,7 @@ from fognav.output import (
     OK,
     WRONG_USE,
     WrongUseError,
+    answers,
     check_writable,
     console,
     exit_codes,
@@ -132,7 +133,7 @@ def doctor_command(*, json: JsonOption = False) -> None:
             table.add_row(marks[check.state], check.name, check.found)
             if check.remedy:
                 table.add_row("", "", f"[dim]remedy: {check.remedy}[/]")
-        console.print(table)
+        answers.print(table)
     raise typer.Exit(NOT_TRUE if any(check.state == "missing" for check in found) else OK)
 
 

@@ -1,4 +1,4 @@
-"""Output of the command: text for people on standard error, one JSON object for scripts on standard output."""
+"""Output of the command: answers on standard output, one JSON object for scripts; progress and errors beside it."""
 
 import json
 import os
@@ -26,6 +26,9 @@ WRONG_USE: Final = 2
 console = Console(stderr=True, highlight=False, width=None if sys.stderr.isatty() else 200)
 
 
+answers = Console(highlight=False, width=None if sys.stdout.isatty() else 200)
+
+
 class WrongUseError(ValueError):
     """An option, argument or file can't be used; the message names it and the remedy."""
 
@@ -35,8 +38,13 @@ class FailedError(RuntimeError):
 
 
 def print_line(text: str) -> None:
-    """Write a line for people."""
+    """Write a line of what happens, for people, to standard error."""
     console.print(text, markup=False)
+
+
+def print_answer(text: str) -> None:
+    """Write a line of what was asked for, for people and their pipes, to standard output."""
+    answers.print(text, markup=False, soft_wrap=True)
 
 
 def fail(message: str, code: int = NOT_TRUE) -> NoReturn:

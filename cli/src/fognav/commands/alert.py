@@ -8,7 +8,7 @@ import typer
 from fognav.operate.fog import find_fog
 from fognav.operate.options import FogOption, JsonOption
 from fognav.operate.systems import AGGREGATOR
-from fognav.output import exit_codes, print_json, print_line
+from fognav.output import exit_codes, print_answer, print_json
 
 alert_app = typer.Typer(help="List and acknowledge alerts of areas and nodes.", no_args_is_help=True)
 
@@ -24,9 +24,9 @@ def alert_list(*, fog: FogOption = None, json: JsonOption = False) -> None:
         for alert in alerts:
             since = datetime.fromtimestamp(alert["since"], UTC).astimezone().isoformat(" ", "seconds")
             seen = f" [{alert['acknowledged_by']} looks after it]" if alert["acknowledged_by"] else ""
-            print_line(f"{alert['id']}: since {since}, {alert['reason']}{seen}")
+            print_answer(f"{alert['id']}: since {since}, {alert['reason']}{seen}")
         if not alerts:
-            print_line("no alerts")
+            print_answer("no alerts")
 
 
 @alert_app.command("acknowledge", epilog="Example: fognav alert acknowledge area-unknown.z1")
@@ -42,4 +42,4 @@ def alert_acknowledge(
         if json:
             print_json({"alert": seen})
         else:
-            print_line(f"{alert} is acknowledged by {seen['acknowledged_by']}")
+            print_answer(f"{alert} is acknowledged by {seen['acknowledged_by']}")

@@ -9,7 +9,7 @@ import typer
 from fognav.operate.fog import find_fog
 from fognav.operate.options import FogOption, JsonOption, duration
 from fognav.operate.systems import AGGREGATOR
-from fognav.output import WrongUseError, exit_codes, print_json, print_line
+from fognav.output import WrongUseError, exit_codes, print_answer, print_json
 
 area_app = typer.Typer(help="List the watched areas and their history, and override one.", no_args_is_help=True)
 
@@ -23,9 +23,9 @@ def area_list(*, fog: FogOption = None, json: JsonOption = False) -> None:
             print_json({"areas": areas})
             return
         for area in areas:
-            print_line(_line(area))
+            print_answer(_line(area))
         if not areas:
-            print_line("no areas")
+            print_answer("no areas")
 
 
 @area_app.command("override", epilog="Example: fognav area override z1 --state blocked --for 2h --reason 'wet floor'")
@@ -64,7 +64,7 @@ def area_override(  # noqa: PLR0913  # each option is an argument
         if json:
             print_json({"area": area, "override": override})
         else:
-            print_line(line)
+            print_answer(line)
 
 
 @area_app.command("history", epilog="Example: fognav area history z1 --limit 20")
@@ -85,9 +85,9 @@ def area_history(
             period = view["period"]
             began = datetime.fromtimestamp(period["began"], UTC).astimezone().isoformat(" ", "seconds")
             lasted = ("for " if view["ended"] is not None else "until now, for ") + _length(view["lasted_s"])
-            print_line(f"{began}: {period['state']} {lasted}, {period['cause']}")
+            print_answer(f"{began}: {period['state']} {lasted}, {period['cause']}")
         if not periods:
-            print_line(f"area {area} has no history yet")
+            print_answer(f"area {area} has no history yet")
 
 
 def _line(area: Mapping[str, Any]) -> str:

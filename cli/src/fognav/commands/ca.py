@@ -10,7 +10,7 @@ from fognav import checkout
 from fognav.locking import LocksOption, locks_errors, named_folder, open_locks, own_hosts
 from fognav.nodes import site_file
 from fognav.operate.options import JsonOption
-from fognav.output import NOT_TRUE, exit_codes, print_json, print_line
+from fognav.output import NOT_TRUE, exit_codes, print_answer, print_json
 
 if TYPE_CHECKING:
     from fog_runtime.locks.site_locks import SiteLocks
@@ -110,8 +110,8 @@ def _show(locks: "SiteLocks", *, json: bool) -> None:
         )
         return
     for name, until in expiries.items():
-        print_line(f"{name:10} valid until {until:%Y-%m-%d}" + (", renew it" if name in locks.expiring() else ""))
+        print_answer(f"{name:10} valid until {until:%Y-%m-%d}" + (", renew it" if name in locks.expiring() else ""))
     if locks.authority.rotating:
-        print_line("the authority before is still trusted: fognav ca rotate --finish ends that")
-    print_line(f"credentials in {locks.directory}/credentials: {', '.join(sorted(locks.users()))}")
-    print_line(_RELOAD)
+        print_answer("the authority before is still trusted: fognav ca rotate --finish ends that")
+    print_answer(f"credentials in {locks.directory}/credentials: {', '.join(sorted(locks.users()))}")
+    print_answer(_RELOAD)

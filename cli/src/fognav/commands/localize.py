@@ -12,7 +12,7 @@ from fognav import kernels
 from fognav.localization.logs import LidarLog, LogScan, Selection, read_log
 from fognav.localization.options import LogFormat, RangeMax, Scans  # noqa: TC001  # same
 from fognav.operate.options import JsonOption  # noqa: TC001  # same
-from fognav.output import NOT_TRUE, WrongUseError, check_writable, console, exit_codes, print_json
+from fognav.output import NOT_TRUE, WrongUseError, check_writable, console, exit_codes, print_answer, print_json
 
 if TYPE_CHECKING:
     from fog_contracts.grid import StaticMap
@@ -56,7 +56,7 @@ def localize_command(  # noqa: PLR0913  # each option is an argument
         print_json({"map": str(map_file), "log": str(log_file), "selection": scans, "seed": seed, **found})
     else:
         for name, value in found.items():
-            console.print(f"{name:26} {value}", markup=False)
+            print_answer(f"{name:26} {value}")
     if found.get("wrong") or found.get("falsely_good_scans") or found.get("converged_right") is False:
         raise typer.Exit(NOT_TRUE)
 

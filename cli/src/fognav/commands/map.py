@@ -13,7 +13,7 @@ from fognav.localization.options import LogFormat, RangeMax, Scans  # noqa: TC00
 from fognav.operate.fog import find_fog
 from fognav.operate.options import FogOption, JsonOption  # noqa: TC001  # same
 from fognav.operate.systems import MAP_SERVICE
-from fognav.output import WrongUseError, exit_codes, print_json, print_line
+from fognav.output import WrongUseError, exit_codes, print_answer, print_json
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -35,9 +35,9 @@ def map_hazards(*, fog: FogOption = None, json: JsonOption = False) -> None:
             print_json({"hazards": hazards})
             return
         for view in sorted(hazards, key=lambda view: str(view["hazard"]["area"])):
-            print_line(_line(view))
+            print_answer(_line(view))
         if not hazards:
-            print_line("no watched areas")
+            print_answer("no watched areas")
 
 
 def _line(view: Mapping[str, Any]) -> str:
@@ -80,7 +80,7 @@ def map_from_log(  # noqa: PLR0913  # each option is an argument
     if json:
         print_json({"file": f"{out}.yaml", **found})
     else:
-        print_line(f"wrote {out}.yaml: {found['width']} x {found['height']} cells, {found['occupied']} occupied")
+        print_answer(f"wrote {out}.yaml: {found['width']} x {found['height']} cells, {found['occupied']} occupied")
 
 
 def describe(map_: StaticMap) -> dict[str, object]:

@@ -23,7 +23,7 @@ from fognav.nodes.board_options import SITE, BoardOptions, SiteOption, with_boar
 from fognav.operate.fog import Fog, find_fog
 from fognav.operate.options import NUMBERS, FogOption, JsonOption
 from fognav.operate.systems import AGGREGATOR, BROKER
-from fognav.output import FailedError, WrongUseError, exit_codes, print_json, print_line
+from fognav.output import FailedError, WrongUseError, exit_codes, print_answer, print_json, print_line
 
 node_app = typer.Typer(help="Add, watch, calibrate and simulate sensor nodes.", no_args_is_help=True)
 
@@ -105,9 +105,9 @@ def node_list(*, fog: FogOption = None, json: JsonOption = False) -> None:
             print_json({"nodes": nodes})
             return
         for node in nodes:
-            print_line(_line(node))
+            print_answer(_line(node))
         if not nodes:
-            print_line("no nodes")
+            print_answer("no nodes")
 
 
 @node_app.command("watch", epilog="Example: fognav node watch n1 --count 20")
@@ -300,7 +300,7 @@ async def _watch(on: tuple[str, str, Credentials], name: str, count: int | None,
             values = {"state": reading} if isinstance(reading, str) else msgspec.to_builtins(reading)
             typer.echo(msgspec.json.encode(values).decode())
         else:
-            print_line(f"{time.strftime('%H:%M:%S')} {reading if isinstance(reading, str) else _reading(reading)}")
+            print_answer(f"{time.strftime('%H:%M:%S')} {reading if isinstance(reading, str) else _reading(reading)}")
         if isinstance(reading, NodeReading):
             seen += 1
             if seen == count:

@@ -19,7 +19,7 @@ from fognav.operate.fog import Fog, RefusedError, find_fog
 from fognav.operate.options import NUMBERS, FogOption, JsonOption, RobotOption, numbers
 from fognav.operate.outcome import Outcome
 from fognav.operate.systems import MAP_SERVICE, PLANNER
-from fognav.output import NOT_TRUE, FailedError, WrongUseError, envelope, exit_codes, print_json, print_line
+from fognav.output import NOT_TRUE, FailedError, WrongUseError, envelope, exit_codes, print_answer, print_json
 
 robot_app = typer.Typer(help="Enable, stop and send robots, and watch them.", no_args_is_help=True)
 
@@ -206,11 +206,11 @@ def robot_status(*, robot: RobotOption = None, fog: FogOption = None, json: Json
         if json:
             print_json({"mode": mode, "reasons": view["state"]["reasons"] if view["state"] else [], **view})
             return
-        print_line(f"{view['id']}: {_describe(view['state'], view['pose'])}")
+        print_answer(f"{view['id']}: {_describe(view['state'], view['pose'])}")
         if (goal := view["goal"]) is not None:
-            print_line(f"  goal: {goal['place'] or _position(goal['pose'])}")
+            print_answer(f"  goal: {goal['place'] or _position(goal['pose'])}")
         if (plan := view["plan"]) is not None and plan["refusal"] is not None:
-            print_line(f"  no path: {plan['refusal']['reason']}")
+            print_answer(f"  no path: {plan['refusal']['reason']}")
 
 
 @robot_app.command("watch", epilog="Example: fognav robot watch --seconds 60 --json")
@@ -273,7 +273,7 @@ def _report(outcome: Outcome, *, json: bool) -> None:
     if json:
         print_json(msgspec.to_builtins(outcome))
     else:
-        print_line(f"{'accepted' if outcome.accepted else 'refused'}: {outcome.reason} (mode {outcome.mode})")
+        print_answer(f"{'accepted' if outcome.accepted else 'refused'}: {outcome.reason} (mode {outcome.mode})")
     raise typer.Exit(0 if outcome.accepted else NOT_TRUE)
 
 
@@ -346,7 +346,7 @@ def _print_state(robot: str, state: Mapping[str, Any], pose: Mapping[str, Any] |
         sys.stdout.write(msgspec.json.encode(envelope({"robot": robot, **state, "pose": pose})).decode() + "\n")
         sys.stdout.flush()
     else:
-        print_line(f"{time.strftime('%H:%M:%S')} {_describe(state, pose)}")
+        print_answer(f"{time.strftime('%H:%M:%S')} {_describe(state, pose)}")
 
 
 def _describe(state: Mapping[str, Any] | None, pose: Mapping[str, Any] | None) -> str:

@@ -14,7 +14,7 @@ from fog_runtime.configuration.settings import SettingsError
 from fog_runtime.files import SHARED, atomic_write
 from fognav.locking import LocksOption, locks_errors, open_locks
 from fognav.operate.options import JsonOption
-from fognav.output import NOT_TRUE, WrongUseError, exit_codes, fail, print_json, print_line
+from fognav.output import NOT_TRUE, WrongUseError, exit_codes, fail, print_answer, print_json, print_line
 
 
 def robot_add(
@@ -98,9 +98,9 @@ def robot_check(
     from fog_contracts.generate.robot_toml import setting_text  # noqa: PLC0415  # keeps the other commands fast
 
     for name, value in values.items():
-        print_line(f"{name} = {setting_text(value)}")
+        print_answer(f"{name} = {setting_text(value)}")
     for remark in remarks:
-        print_line(remark)
+        print_answer(remark)
 
 
 def check_ports(robot: RobotFile) -> list[str]:

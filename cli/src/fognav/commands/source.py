@@ -10,7 +10,7 @@ from fognav.locking import LocksOption, locks_errors, open_locks
 from fognav.operate.fog import Fog, find_fog
 from fognav.operate.options import FogOption, JsonOption
 from fognav.operate.systems import AGGREGATOR
-from fognav.output import FailedError, WrongUseError, exit_codes, print_json, print_line
+from fognav.output import FailedError, WrongUseError, exit_codes, print_answer, print_json
 from hazard_aggregator.sensors.source_profiles import PROFILES
 
 source_app = typer.Typer(help="Use sensors that speak MQTT as evidence for an area.", no_args_is_help=True)
@@ -76,7 +76,7 @@ def source_add(  # noqa: PLR0913  # each option is an argument
         if json:
             print_json({"area": area, "source": msgspec.to_builtins(source)})
         else:
-            print_line(f"source {name} watches area {area}")
+            print_answer(f"source {name} watches area {area}")
 
 
 @source_app.command("remove", epilog="Example: fognav source remove fire-door --area z1")
@@ -99,7 +99,7 @@ def source_remove(
         if json:
             print_json({"area": area, "removed": name})
         else:
-            print_line(f"source {name} no longer watches area {area}")
+            print_answer(f"source {name} no longer watches area {area}")
 
 
 @source_app.command("list", epilog="Example: fognav source list --json")
@@ -118,9 +118,9 @@ def source_list(*, fog: FogOption = None, json: JsonOption = False) -> None:
             return
         for row in rows:
             state = f"{row['health']['state']}, {row['health']['reason']}" if row["health"] else "not known yet"
-            print_line(f"{row['area']}/{row['id']}: {state}")
+            print_answer(f"{row['area']}/{row['id']}: {state}")
         if not rows:
-            print_line("no sources")
+            print_answer("no sources")
 
 
 @source_app.command("user", epilog="Example: fognav source user zigbee2mqtt --topic 'zigbee2mqtt/#' --locks locks")
@@ -141,8 +141,8 @@ def source_user(
         if json:
             print_json({"user": name, "topics": topic, "credentials": str(file)})
         else:
-            print_line(f"wrote {file}: its user, password and certificate are what {name} needs; then delete it here")
-            print_line("the broker knows it once it has read its lists again (SIGHUP)")
+            print_answer(f"wrote {file}: its user, password and certificate are what {name} needs; then delete it here")
+            print_answer("the broker knows it once it has read its lists again (SIGHUP)")
 
 
 @source_app.command("profiles", epilog="Example: fognav source profiles")
@@ -153,7 +153,7 @@ def source_profiles(*, json: JsonOption = False) -> None:
         return
     for name, source in PROFILES.items():
         needs = "" if source.blocked else " (needs --above or --below)"
-        print_line(f"{name}: {source.topic}{needs}")
+        print_answer(f"{name}: {source.topic}{needs}")
 
 
 def _decoded(text: str | None) -> dict[str, Any]:

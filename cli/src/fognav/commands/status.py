@@ -10,7 +10,7 @@ from fognav.operate.options import FogOption, JsonOption
 from fognav.operate.presence import connected
 from fognav.operate.registry import System
 from fognav.operate.systems import SERVICE_PORTS, find_systems
-from fognav.output import FailedError, exit_codes, fail, print_json, print_line
+from fognav.output import FailedError, exit_codes, fail, print_answer, print_json
 
 
 def status_command(*, fog: FogOption = None, json: JsonOption = False) -> None:
@@ -48,11 +48,13 @@ def _remote(fog: Fog) -> System:
 
 
 def _show(system: System, present: list[str] | None) -> None:
-    print_line(f"{system.name}: {system.kind}" + (f", site {system.site}" if system.site else ""))
+    print_answer(f"{system.name}: {system.kind}" + (f", site {system.site}" if system.site else ""))
     for name, url in system.urls.items():
-        print_line(f"  {name:18} {url}")
+        print_answer(f"  {name:18} {url}")
     if system.token_file:
-        print_line(f"  {'token':18} {system.token_file}")
+        print_answer(f"  {'token':18} {system.token_file}")
     if present is not None:
-        print_line(f"  {'connected':18} {', '.join(present) or 'nothing'}")
-    print_line(f"  {'processes':18} {', '.join(f'{name} {pid}' for name, pid in system.pids.items()) or 'not visible'}")
+        print_answer(f"  {'connected':18} {', '.join(present) or 'nothing'}")
+    print_answer(
+        f"  {'processes':18} {', '.join(f'{name} {pid}' for name, pid in system.pids.items()) or 'not visible'}"
+    )

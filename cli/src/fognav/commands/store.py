@@ -8,7 +8,7 @@ import typer
 from fognav.operate.fog import Fog, find_fog
 from fognav.operate.options import FogOption, JsonOption
 from fognav.operate.systems import AGGREGATOR, MAP_SERVICE, PLANNER
-from fognav.output import NOT_TRUE, FailedError, WrongUseError, exit_codes, print_json, print_line
+from fognav.output import NOT_TRUE, FailedError, WrongUseError, exit_codes, print_answer, print_json
 
 store_app = typer.Typer(help="Show what Redis lost, and recover from it.", no_args_is_help=True)
 
@@ -31,7 +31,7 @@ def store_status(*, fog: FogOption = None, json: JsonOption = False) -> None:
             print_json({"services": found})
         else:
             for service, status in found.items():
-                print_line(_line(service, status))
+                print_answer(_line(service, status))
     if any(status["lost"] is not False for status in found.values()):
         raise typer.Exit(NOT_TRUE)
 
@@ -61,7 +61,7 @@ def _recover(fog: Fog, action: Literal["restore", "accept"], service: str | None
     if not lost and not failures:
         raise FailedError("Redis has lost nothing: there is nothing to recover")
     for name, status in lost.items():
-        print_line(_line(name, status))
+        print_answer(_line(name, status))
     if not yes:
         effect = "writes what is in memory to Redis" if action == "restore" else "gives up what Redis lacks"
         raise WrongUseError(f"nothing was changed. `fognav store {action} --yes` {effect}, for the services above")
@@ -71,7 +71,7 @@ def _recover(fog: Fog, action: Literal["restore", "accept"], service: str | None
         except FailedError as error:
             failures.append(str(error))
         else:
-            print_line(f"{name}: {'restored' if action == 'restore' else 'accepted'}")
+            print_answer(f"{name}: {'restored' if action == 'restore' else 'accepted'}")
     if failures:
         raise FailedError("; ".join(failures))
 

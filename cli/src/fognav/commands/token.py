@@ -12,7 +12,7 @@ from fog_runtime.files import atomic_write
 from fognav.locking import LocksOption, locks_errors, locks_folder, open_locks
 from fognav.operate.fog import find_fog
 from fognav.operate.options import JsonOption
-from fognav.output import FailedError, WrongUseError, exit_codes, print_json, print_line
+from fognav.output import FailedError, WrongUseError, exit_codes, print_answer, print_json
 
 token_app = typer.Typer(help="Create, list and revoke tokens of the REST APIs.", no_args_is_help=True)
 
@@ -61,7 +61,7 @@ def token_create(
             if json:
                 print_json({"name": name, "role": role, "credentials": str(out)})
             else:
-                print_line(f"wrote {out}: give it to {name}, who names it in FOGNAV_CREDENTIALS_FILE")
+                print_answer(f"wrote {out}: give it to {name}, who names it in FOGNAV_CREDENTIALS_FILE")
         elif json:
             print_json({"name": name, "role": role, "token": token})
         else:
@@ -81,7 +81,7 @@ def token_list(*, file: FileOption = None, json: JsonOption = False) -> None:
             print_json({"tokens": tokens})
             return
         for entry in entries:
-            print_line(f"{entry.name}: {entry.role}" + (f", since {entry.created}" if entry.created else ""))
+            print_answer(f"{entry.name}: {entry.role}" + (f", since {entry.created}" if entry.created else ""))
 
 
 @token_app.command("revoke", epilog="Example: fognav token revoke anna")
@@ -95,7 +95,7 @@ def token_revoke(name: NameArgument, *, file: FileOption = None, json: JsonOptio
         if json:
             print_json({"name": name, "revoked": True})
         else:
-            print_line(f"the token of {name} is revoked")
+            print_answer(f"the token of {name} is revoked")
 
 
 def _file(given: Path | None) -> Path:

@@ -10,7 +10,7 @@ import typer
 from fognav.operate.fog import find_fog
 from fognav.operate.options import FogOption, JsonOption, numbers, points
 from fognav.operate.systems import MAP_SERVICE
-from fognav.output import WrongUseError, exit_codes, print_json, print_line
+from fognav.output import WrongUseError, exit_codes, print_answer, print_json
 
 zone_app = typer.Typer(help="Draw, list, show and remove zones.", no_args_is_help=True)
 
@@ -70,9 +70,9 @@ def zone_list(*, fog: FogOption = None, json: JsonOption = False) -> None:
             print_json(found)
             return
         for zone in found["zones"]:
-            print_line(_line(zone) + ("" if zone["id"] in found["active"] else " (has no effect now)"))
+            print_answer(_line(zone) + ("" if zone["id"] in found["active"] else " (has no effect now)"))
         if not found["zones"]:
-            print_line("no zones")
+            print_answer("no zones")
 
 
 @zone_app.command("show", epilog="Example: fognav zone show z-1a2b3c4d")
@@ -90,7 +90,7 @@ def zone_remove(zone: ZoneId, *, fog: FogOption = None, json: JsonOption = False
         if json:
             print_json({"id": zone, "removed": True})
         else:
-            print_line(f"removed zone {zone}")
+            print_answer(f"removed zone {zone}")
 
 
 def _shape(
@@ -116,7 +116,7 @@ def _report(zone: Mapping[str, Any], *, json: bool) -> None:
     if json:
         print_json(zone)
     else:
-        print_line(_line(zone))
+        print_answer(_line(zone))
 
 
 def _line(zone: Mapping[str, Any]) -> str:

@@ -39,7 +39,6 @@ def _warm_kernels(monkeypatch: pytest.MonkeyPatch) -> None:
         ["bench", "reactions"],
         ["bench", "mutation"],
         ["bench", "rest"],
-        ["goal"],
         ["area", "list"],
         ["backup"],
         ["restore"],
@@ -51,7 +50,7 @@ def _warm_kernels(monkeypatch: pytest.MonkeyPatch) -> None:
         ["alert", "list"],
         ["alert", "acknowledge"],
         *(["token", name] for name in ("create", "list", "revoke")),
-        *(["zone", name] for name in ("add", "list", "show", "remove")),
+        *(["zone", name] for name in ("add", "list", "show", "enable", "disable", "remove")),
         *(
             ["robot", name]
             for name in (

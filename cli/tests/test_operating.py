@@ -5,6 +5,7 @@ import os
 import subprocess
 import sys
 import threading
+import time
 from collections.abc import Iterator
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
@@ -28,6 +29,10 @@ ROBOT = {
     "id": "r1", "configured": True, "pose": None, "goal": None, "plan": None,
     "state": {"mode": "NORMAL", "reasons": [], "goal_distance": None},
 }  # fmt: skip
+
+
+NOT_SENT = {"id", "author", "version", "expires_at"}
+"""What the map-service sets itself; the end follows from the time to live."""
 
 
 class Service:
@@ -250,7 +255,7 @@ def test_address_with_scheme_or_port_is_refused(address: str) -> None:
 )
 def test_zone_is_added_with_the_shape_of_its_option(demo: Service, options: list[str], shape: object) -> None:
     demo.answers["POST", "/api/v1/zones"] = (201, ZONE)
-    made = json.loads(run("zone", "add", *options, "--reason", "wet floor", "--ttl", "60", "--json"))
+    made = json.loads(run("zone", "add", *options, "--reason", "wet floor", "--for", "1m", "--json"))
     assert {key: made[key] for key in ZONE} == ZONE
     ((method, path, body, token),) = demo.requests
     assert (method, path, token) == ("POST", "/api/v1/zones", "Bearer secret")
@@ -270,11 +275,52 @@ def test_zone_is_added_with_the_shape_of_its_option(demo: Service, options: list
         (["--corridor", "0,0 1,0"], "--corridor needs --width"),
         (["--circle", "1,2,3", "--width", "1"], "--corridor needs --width"),
         (["--circle", "1,2,3", "--kind", "lava"], "lava"),
+        (["--circle", "1,2,3", "--for", "10"], "--for 10: give a number and its unit: 90s, 15m, 2h or 3d"),
+        (["--circle", "1,2,3", "--for", "10m", "--until", "+1h"], "give either --for or --until"),
+        (["--circle", "1,2,3", "--from", "tomorrow"], "--from tomorrow: give a time, such as 2026-11-24T18:30"),
+        (["--circle", "1,2,3", "--each", "mon-fri 18:00-20:00"], "--each needs --time-zone"),
+        (["--circle", "1,2,3", "--each", "noon", "--time-zone", "UTC"], "--each 'noon': give days and times"),
+        (["--circle", "1,2,3", "--each", "mon-fre 18:00-20:00", "--time-zone", "UTC"], "give days and times"),
+        (["--circle", "1,2,3", "--replace"], "--replace needs the --id"),
     ],
 )
 def test_zone_with_an_impossible_shape_is_refused_before_it_is_sent(demo: Service, options, problem: str) -> None:
     assert problem in run("zone", "add", *options, code=2)
     assert demo.requests == []
+
+
+def test_zone_has_all_the_times_that_rest_knows(demo: Service) -> None:
+    demo.answers["PUT", "/api/v1/zones/fire"] = (200, ZONE)
+    options = ["--circle", "1,2,3", "--id", "fire", "--replace", "--disabled"]
+    times = ["--time-zone", "Europe/Lisbon", "--from", "2026-11-24T18:30+01:00", "--until", "2026-12-24T00:00Z"]
+    run("zone", "add", *options, *times, "--each", "fri-mon,wed 18:00-20:30", "--each", "tue 08:00-07:00")
+    ((_, _, body, _),) = demo.requests
+    assert {name: body[name] for name in ("starts_at", "expires_at", "enabled", "schedule")} == {
+        "starts_at": 1795541400.0,
+        "expires_at": 1798070400.0,
+        "enabled": False,
+        "schedule": {
+            "time_zone": "Europe/Lisbon",
+            "times": [
+                {"days": ["fri", "sat", "sun", "mon", "wed"], "begin": "18:00", "end": "20:30"},
+                {"days": ["tue"], "begin": "08:00", "end": "07:00"},
+            ],
+        },
+    }
+    run("zone", "add", *options, "--from", "+90s")
+    assert demo.requests[-1][2]["starts_at"] == pytest.approx(time.time() + 90.0, abs=60.0)
+
+
+def test_zone_is_switched_off_and_on_without_a_change_of_anything_else(demo: Service) -> None:
+    timed = ZONE | {"ttl_s": 600.0, "expires_at": 1795541400.0, "version": 7}
+    demo.answers["GET", "/api/v1/zones/z-1"] = (200, timed)
+    demo.answers["PUT", "/api/v1/zones/z-1"] = (200, timed | {"enabled": False})
+    assert "disabled" in run("zone", "disable", "z-1")
+    _, (method, _, body, _) = demo.requests
+    assert method == "PUT"
+    assert body == {name: value for name, value in timed.items() if name not in NOT_SENT} | {"enabled": False}
+    run("zone", "enable", "z-1")
+    assert demo.requests[-1][2]["enabled"] is True
 
 
 def test_zones_are_listed_shown_and_removed(demo: Service) -> None:
@@ -424,11 +470,10 @@ def test_incomplete_override_is_refused_with_the_remedy(demo: Service, options: 
         ("1,2,0.5", {"pose": {"x": 1.0, "y": 2.0, "theta": 0.5}}),
     ],
 )
-@pytest.mark.parametrize("command", [["goal"], ["robot", "goal"]])
-def test_goal_is_a_place_or_a_position(demo: Service, command: list[str], goal: str, body: object) -> None:
+def test_goal_is_a_place_or_a_position(demo: Service, goal: str, body: object) -> None:
     demo.answers["PUT", "/api/v1/robots/r1/goal"] = (200, {})
     demo.answers["GET", "/api/v1/robots"] = (200, [ROBOT])
-    answer = json.loads(run(*command, goal, "--json"))
+    answer = json.loads(run("robot", "goal", goal, "--json"))
     assert {key: answer[key] for key in ("accepted", "mode")} == {"accepted": True, "mode": "NORMAL"}
     assert demo.requests[0][2] == body
 
@@ -456,7 +501,7 @@ def test_accepted_goal_says_what_a_robot_that_stands_waits_for(demo: Service, mo
 def test_refused_goal_is_reported_with_its_reason_and_exit_code_1(demo: Service) -> None:
     demo.answers["PUT", "/api/v1/robots/r1/goal"] = (422, {"detail": "the goal is in a wall"})
     demo.answers["GET", "/api/v1/robots"] = (200, [ROBOT])
-    done = CliRunner().invoke(app, ["goal", "1,2", "--json"])
+    done = CliRunner().invoke(app, ["robot", "goal", "1,2", "--json"])
     assert done.exit_code == 1
     answer = json.loads(done.stdout)
     assert (answer["accepted"], answer["mode"]) == (False, "NORMAL")
@@ -466,8 +511,8 @@ def test_refused_goal_is_reported_with_its_reason_and_exit_code_1(demo: Service)
 def test_robot_must_be_named_where_there_are_several(service: Service) -> None:
     with Registration(lambda: system("demo-1", service.url, robots=["r1", "r2"])) as registration:
         registration.update()
-        assert "name a robot with --robot; demo-1 has: r1, r2" in run("goal", "b", code=2)
-        assert "an id has only a to z" in run("goal", "b", "--robot", "R 2", code=2)
+        assert "name a robot with --robot; demo-1 has: r1, r2" in run("robot", "goal", "b", code=2)
+        assert "an id has only a to z" in run("robot", "goal", "b", "--robot", "R 2", code=2)
 
 
 @pytest.mark.parametrize("command", ["disable", "stop"])

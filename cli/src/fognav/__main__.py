@@ -25,7 +25,7 @@ from fognav.commands.hunt import hunt_command
 from fognav.commands.localize import localize_command
 from fognav.commands.map import map_app
 from fognav.commands.node import node_app
-from fognav.commands.robot import robot_app, robot_goal
+from fognav.commands.robot import robot_app
 from fognav.commands.robot_file import robot_add, robot_check, robot_new
 from fognav.commands.source import source_app
 from fognav.commands.status import status_command
@@ -34,7 +34,7 @@ from fognav.commands.token import token_app
 from fognav.commands.up import down_command, logs_command, up_command
 from fognav.commands.upgrade import upgrade_command
 from fognav.commands.zone import zone_app
-from fognav.operate.options import NUMBERS, JsonOption
+from fognav.operate.options import JsonOption
 from fognav.output import (
     NOT_TRUE,
     OK,
@@ -88,7 +88,6 @@ app.command("upgrade", epilog="Example: fognav upgrade --check")(upgrade_command
 app.command("down", epilog="Example: fognav down")(down_command)
 app.command("logs", epilog="Example: fognav logs map-service -f")(logs_command)
 app.command("status", epilog="Example: fognav status --json")(status_command)
-app.command("goal", context_settings=NUMBERS, epilog="Example: fognav goal b")(robot_goal)
 robot_app.command("add", epilog="Example: fognav robot add r2 --locks locks")(robot_add)
 robot_app.command("new", epilog="Example: fognav robot new --base roomba600 --lidar rplidar-a1 --out robot.toml")(
     robot_new

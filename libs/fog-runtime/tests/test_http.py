@@ -103,6 +103,12 @@ def is_problem(answer, status):
     return body
 
 
+async def test_the_first_page_says_what_answers_here(client):
+    first = await client.get("/")
+    assert first.status_code == 200
+    assert "/openapi.json" in first.text
+
+
 async def test_readiness_names_what_is_missing(client):
     assert (await client.get("/healthz")).json() == {"status": "ok"}
     answer = await client.get("/readyz")

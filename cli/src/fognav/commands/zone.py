@@ -1,25 +1,25 @@
-"""`fognav zone`: draw, list, show and remove the zones of a running system."""
+"""`fognav zone`: draw, list, show, switch and remove the zones of a running system."""
 
 import datetime as dt
 import secrets
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Annotated, Any, Final, Literal
 
 import typer
 
 from fognav.operate.fog import find_fog
-from fognav.operate.options import FogOption, JsonOption, numbers, points
+from fognav.operate.options import FogOption, JsonOption, duration, moment, numbers, points, weekly
 from fognav.operate.systems import MAP_SERVICE
 from fognav.output import WrongUseError, exit_codes, print_answer, print_json
 
-zone_app = typer.Typer(help="Draw, list, show and remove zones.", no_args_is_help=True)
+zone_app = typer.Typer(help="Draw, list, show, switch and remove zones.", no_args_is_help=True)
 
 _ZONES: Final = "/api/v1/zones"
 Kind = Literal["blocked", "penalty", "speed-limit"]
 ZoneId = Annotated[str, typer.Argument(metavar="ID", help="The zone's id, as fognav zone list shows it.")]
 
 
-@zone_app.command("add", epilog='Example: fognav zone add --circle 12.5,3,0.5 --reason "wet floor" --ttl 600')
+@zone_app.command("add", epilog='Example: fognav zone add --circle 12.5,3,0.5 --reason "wet floor" --for 10m')
 def zone_add(  # noqa: PLR0913  # each option is an argument
     *,
     circle: Annotated[str | None, typer.Option("--circle", metavar="X,Y,R", help="A circle.")] = None,
@@ -37,17 +37,37 @@ def zone_add(  # noqa: PLR0913  # each option is an argument
     factor: Annotated[float | None, typer.Option("--factor", help="For penalty: a metre counts this many.")] = None,
     speed: Annotated[float | None, typer.Option("--speed", metavar="M/S", help="For speed-limit.")] = None,
     reason: Annotated[str, typer.Option("--reason", help="Why, for other people.")] = "",
-    ttl: Annotated[float | None, typer.Option("--ttl", metavar="S", help="Remove its effect after this time.")] = None,
+    length: Annotated[
+        str | None, typer.Option("--for", metavar="TIME", help="How long from its start, such as 90s, 15m, 2h or 3d.")
+    ] = None,
+    start: Annotated[
+        str | None, typer.Option("--from", metavar="WHEN", help="When it starts: 2026-11-24T18:30, or +2h from now.")
+    ] = None,
+    end: Annotated[str | None, typer.Option("--until", metavar="WHEN", help="When it ends, instead of --for.")] = None,
+    each: Annotated[
+        list[str] | None,
+        typer.Option("--each", metavar="'DAYS TIMES'", help="Only then, each week: 'mon-fri 18:00-20:00'; repeatable."),
+    ] = None,
+    time_zone: Annotated[
+        str | None, typer.Option("--time-zone", metavar="NAME", help="Of --each, such as Europe/Lisbon.")
+    ] = None,
+    disabled: Annotated[
+        bool, typer.Option("--disabled", help="Without an effect until fognav zone enable ID.")
+    ] = False,
     identifier: Annotated[str | None, typer.Option("--id", metavar="ID", help="Its id; default: a new one.")] = None,
+    replace: Annotated[bool, typer.Option("--replace", help="Replace the zone of this --id.")] = False,
     fog: FogOption = None,
     json: JsonOption = False,
 ) -> None:
-    """Draw a zone, which takes effect at once.
+    """Draw a zone, which takes effect at once or at its times.
 
     Robots avoid a blocked zone, prefer other ways to one with a penalty, and drive slowly in one with a speed limit.
     """
     with exit_codes():
         shape = _shape(circle, rectangle, polygon, corridor, width)
+        if replace and identifier is None:
+            raise WrongUseError("--replace needs the --id of the zone that is replaced")
+        times = _times(length, start, end, each or [], time_zone)
         # With an id from here, an attempt whose answer was lost can be repeated without making a second zone.
         body: dict[str, object] = {
             "id": identifier or f"z-{secrets.token_hex(4)}",
@@ -55,10 +75,10 @@ def zone_add(  # noqa: PLR0913  # each option is an argument
             "shape": shape,
             "reason": reason,
         }
-        optional = {"factor": factor, "speed": speed, "ttl_s": ttl}
+        optional = {"factor": factor, "speed": speed, "enabled": False if disabled else None, **times}
         body |= {name: value for name, value in optional.items() if value is not None}
-        zone = find_fog(fog).send("POST", MAP_SERVICE, _ZONES, body)
-        _report(zone, json=json)
+        method, path = ("PUT", f"{_ZONES}/{identifier}") if replace else ("POST", _ZONES)
+        _report(find_fog(fog).send(method, MAP_SERVICE, path, body), json=json)
 
 
 @zone_app.command("list", epilog="Example: fognav zone list --json")
@@ -82,6 +102,18 @@ def zone_show(zone: ZoneId, *, fog: FogOption = None, json: JsonOption = False) 
         _report(find_fog(fog).get(MAP_SERVICE, f"{_ZONES}/{zone}"), json=json)
 
 
+@zone_app.command("enable", epilog="Example: fognav zone enable z-1a2b3c4d")
+def zone_enable(zone: ZoneId, *, fog: FogOption = None, json: JsonOption = False) -> None:
+    """Let a zone have its effect again; a time of --for begins anew."""
+    _switch(zone, fog, enabled=True, json=json)
+
+
+@zone_app.command("disable", epilog="Example: fognav zone disable z-1a2b3c4d")
+def zone_disable(zone: ZoneId, *, fog: FogOption = None, json: JsonOption = False) -> None:
+    """Take a zone's effect away, and keep the zone."""
+    _switch(zone, fog, enabled=False, json=json)
+
+
 @zone_app.command("remove", epilog="Example: fognav zone remove z-1a2b3c4d")
 def zone_remove(zone: ZoneId, *, fog: FogOption = None, json: JsonOption = False) -> None:
     """Remove a zone."""
@@ -91,6 +123,33 @@ def zone_remove(zone: ZoneId, *, fog: FogOption = None, json: JsonOption = False
             print_json({"id": zone, "removed": True})
         else:
             print_answer(f"removed zone {zone}")
+
+
+def _switch(zone: str, address: str | None, *, enabled: bool, json: bool) -> None:
+    with exit_codes():
+        fog = find_fog(address)
+        known = fog.get(MAP_SERVICE, f"{_ZONES}/{zone}")
+        body = {name: value for name, value in known.items() if name not in {"id", "author", "version"}}
+        if body.get("ttl_s") is not None:
+            del body["expires_at"]  # follows from it
+        changed = {"If-Match": f'"{known["version"]}"'}  # not over what another operator has changed meanwhile
+        _report(fog.send("PUT", MAP_SERVICE, f"{_ZONES}/{zone}", {**body, "enabled": enabled}, changed), json=json)
+
+
+def _times(
+    length: str | None, start: str | None, end: str | None, each: Sequence[str], time_zone: str | None
+) -> dict[str, object]:
+    """Return what a zone's body says of its times; raises `WrongUseError`."""
+    if length is not None and end is not None:
+        raise WrongUseError("give either --for or --until")
+    if bool(each) != (time_zone is not None):
+        raise WrongUseError("--each needs --time-zone, and nothing else has one")
+    return {
+        "ttl_s": None if length is None else duration(length, "--for"),
+        "starts_at": None if start is None else moment(start, "--from"),
+        "expires_at": None if end is None else moment(end, "--until"),
+        "schedule": {"time_zone": time_zone, "times": [weekly(text, "--each") for text in each]} if each else None,
+    }
 
 
 def _shape(
@@ -128,6 +187,13 @@ def _line(zone: Mapping[str, Any]) -> str:
     if zone["reason"]:
         parts.append(zone["reason"])
     parts.append(f"by {zone['author']}")
+    if not zone["enabled"]:
+        parts.append("disabled")
+    if zone["starts_at"] is not None:
+        parts.append(f"from {_time(zone['starts_at'])}")
+    if (schedule := zone.get("schedule")) is not None:
+        windows = "; ".join(f"{','.join(each['days'])} {each['begin']}-{each['end']}" for each in schedule["times"])
+        parts.append(f"each {windows} ({schedule['time_zone']})")
     if zone["expires_at"] is not None:
         parts.append(f"until {_time(zone['expires_at'])}")
     return ", ".join(parts)

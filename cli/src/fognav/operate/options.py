@@ -1,11 +1,13 @@
 """Options that several commands have, and the texts of points and shapes in their arguments."""
 
+import datetime as dt
 import math
 import re
 from typing import Annotated, Final
 
 import typer
 
+from fog_contracts.messages import WEEKDAYS
 from fognav.output import WrongUseError
 
 FogOption = Annotated[
@@ -47,6 +49,42 @@ def duration(text: str, option: str) -> float:
     if found is None or float(found[1]) <= 0.0:
         raise WrongUseError(f"{option} {text}: give a number and its unit: 90s, 15m, 2h or 3d")
     return float(found[1]) * _UNITS[found[2]]
+
+
+def moment(text: str, option: str) -> float:
+    """Return the Unix time (s) of a text like `2026-11-24T18:30`, here in local time, or `+2h` from now.
+
+    A time may carry its own offset (`…+01:00`, `…Z`). Raises `WrongUseError` that names the option.
+    """
+    if text.startswith("+"):
+        return dt.datetime.now(dt.UTC).timestamp() + duration(text[1:], option)
+    try:
+        return dt.datetime.fromisoformat(text).timestamp()
+    except (ValueError, OverflowError, OSError):
+        raise WrongUseError(
+            f"{option} {text}: give a time, such as 2026-11-24T18:30 (here) or 2026-11-24T18:30+01:00, or +2h from now"
+        ) from None
+
+
+_WEEKLY: Final = re.compile(r"([a-z]{3}(?:[,-][a-z]{3})*) (\d\d:\d\d)-(\d\d:\d\d)")
+
+
+def weekly(text: str, option: str) -> dict[str, object]:
+    """Return the weekly window of a text like `mon-fri 18:00-20:00` or `sat,sun 08:00-12:00`; raises as `moment`."""
+    found = _WEEKLY.fullmatch(text.strip().lower())
+    days: list[str] = []
+    for part in found[1].split(",") if found else []:
+        first, _, last = part.partition("-")
+        if not {first, last or first} <= set(WEEKDAYS):
+            found = None
+            break
+        begin, count = WEEKDAYS.index(first), (WEEKDAYS.index(last or first) - WEEKDAYS.index(first)) % len(WEEKDAYS)
+        days += [WEEKDAYS[(begin + step) % len(WEEKDAYS)] for step in range(count + 1)]
+    if found is None:
+        raise WrongUseError(
+            f"{option} {text!r}: give days and times, such as 'mon-fri 18:00-20:00' or 'sat,sun 08:00-12:00'"
+        )
+    return {"days": list(dict.fromkeys(days)), "begin": found[2], "end": found[3]}
 
 
 def points(text: str, least: int, form: str) -> list[Point]:

@@ -142,6 +142,12 @@ def make_app(
     app.state.urgent = []
     add_problem_handlers(app)
     _add_health(Routes(app, "health"), health)
+
+    @app.get("/", include_in_schema=False)
+    async def first_page() -> Response:  # for people who open the address
+        about = f"{title}. Its routes: /openapi.json; is it ready: /readyz; its measurements: /metrics\n"
+        return Response(about, media_type="text/plain")
+
     app.add_middleware(_BodyLimit, limit=body_limit)
     app.add_middleware(OpenLimit, urgent=app.state.urgent)
     generate = app.openapi

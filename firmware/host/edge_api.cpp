@@ -12,7 +12,10 @@ struct TestLink final : fognav::Link {
     void leave_broker() override { ++leaves; }
     bool broker_up() override { return broker != 0; }
     bool broker_failed() override { return failed != 0; }
-    void announce() override { ++announcements; }
+    bool announce() override {
+        ++announcements;
+        return true;
+    }
     void restart() override { ++restarts; }
 
     int network = 0;

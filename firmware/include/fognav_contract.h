@@ -10,6 +10,8 @@
 
 #define FOGNAV_ID_MAX 32 /* characters of the longest id: a-z, 0-9, and - except at the start */
 
+#define FOGNAV_BROKER_NAME "mosquitto" /* in the broker's certificate, whatever its address */
+
 /* node_availability, published by a node: whether a node is connected; `offline` is its last will */
 #define FOGNAV_NODE_AVAILABILITY_TOPIC "fog/v1/%s/nodes/%s/availability" /* site, node */
 #define FOGNAV_NODE_AVAILABILITY_TOPIC_SIZE 92

@@ -44,4 +44,12 @@ inline uint32_t chip_number() {
 #endif
 }
 
+inline size_t largest_free_block() {
+#if defined(ESP8266)
+    return ESP.getMaxFreeBlockSize();
+#else
+    return ESP.getMaxAllocHeap();
+#endif
+}
+
 }  // namespace fognav

@@ -3,6 +3,7 @@
 #include <time.h>
 
 #include "discovery.hpp"
+#include "scratch.hpp"
 
 namespace fognav {
 
@@ -20,31 +21,58 @@ void BoardLink::begin(const char* authority) {
     WiFi.persistent(false);  // the flash is not made for a write at every start
     WiFi.mode(WIFI_STA);
     WiFi.setAutoReconnect(false);  // `Connection` decides when
-    if (!settings_.tls) {
-        set_up(plain_);
-        return;
+    // Only the one that is needed comes to be.
+    if (settings_.tls) {
+        static TlsTransport transport(authority);
+        transport_ = &transport;
+    } else {
+        static PlainTransport transport;
+        transport_ = &transport;
     }
-#if defined(ESP8266)
-    static BearSSL::X509List trusted(authority);
-    secure_.setTrustAnchors(&trusted);
-#else
-    secure_.setCACert(authority);
-#endif
-    set_up(secure_);
-}
-
-template <class Client>
-void BoardLink::set_up(Client& client) {
-    client.setServer(settings_.broker, settings_.port);
-    client.setClientId(client_id_);
-    if (settings_.user[0] != 0) client.setCredentials(settings_.user, settings_.password);
-    client.setWill(availability_, FOGNAV_NODE_AVAILABILITY_QOS, true, FOGNAV_NODE_AVAILABILITY_OFFLINE);
-    client.onDisconnect([this](espMqttClientTypes::DisconnectReason) { failed_ = true; });
-    client.onMessage([this](const espMqttClientTypes::MessageProperties&, const char* topic, const uint8_t* payload,
+    client_.use(*transport_);
+    client_.setServer(settings_.broker, settings_.port);
+    client_.setClientId(client_id_);
+    if (settings_.user[0] != 0) client_.setCredentials(settings_.user, settings_.password);
+    client_.setWill(availability_, FOGNAV_NODE_AVAILABILITY_QOS, true, FOGNAV_NODE_AVAILABILITY_OFFLINE);
+    client_.onConnect([this](bool) {
+        accepted_ = true;
+        Serial.printf("connected to the broker at %s\n", settings_.broker);
+    });
+    client_.onDisconnect([this](espMqttClientTypes::DisconnectReason reason) {
+        failed_ = true;
+        say_why_it_ended(reason);
+    });
+    client_.onMessage([this](const espMqttClientTypes::MessageProperties&, const char* topic, const uint8_t* payload,
                             size_t length, size_t index, size_t total) { take(topic, payload, length, index, total); });
 }
 
+void BoardLink::say_why_it_ended(espMqttClientTypes::DisconnectReason reason) {
+    using espMqttClientTypes::DisconnectReason;
+    const char* words = "the broker ended the connection without an answer: do port and tls of node.json fit together?";
+    if (reason == DisconnectReason::MQTT_MALFORMED_CREDENTIALS || reason == DisconnectReason::MQTT_NOT_AUTHORIZED) {
+        words = "the broker refuses the node's user or password: write them anew (fognav node replace)";
+    } else if (reason == DisconnectReason::MQTT_IDENTIFIER_REJECTED) {
+        words = "the broker refuses the node's client id";
+    } else if (reason != DisconnectReason::TCP_DISCONNECTED) {
+        words = "the broker can't serve the node now";
+    } else if (accepted_) {
+        words = "the connection to the broker was lost";
+    } else if (!transport_->reached()) {
+        return;  // the transport has said it
+    }
+    Serial.printf("%s\n", words);
+}
+
 void BoardLink::join_network() {
+    if (joining_) {
+        const char* words = "is it in reach, and wifi_password right?";
+        if (WiFi.status() == WL_NO_SSID_AVAIL) words = "there is none of this name here (an ESP8266 knows 2.4 GHz only)";
+#if defined(ESP8266)
+        if (WiFi.status() == WL_WRONG_PASSWORD) words = "wifi_password of node.json is wrong";
+#endif
+        Serial.printf("the Wi-Fi network %s was not joined: %s\n", settings_.wifi_name, words);
+    }
+    joining_ = true;
     WiFi.disconnect();
     WiFi.begin(settings_.wifi_name, settings_.wifi_password);
 }
@@ -52,20 +80,32 @@ void BoardLink::join_network() {
 void BoardLink::connect_broker() {
     // Certificates have dates, and the board has no clock of its own: the fog node tells it the time.
     if (settings_.tls) configTime(0, 0, settings_.broker);
-    failed_ = false;
-    settings_.tls ? secure_.connect() : plain_.connect();
+    joining_ = false;
+    accepted_ = false;
+    failed_ = !client_.connect();
 }
 
-void BoardLink::announce() {
-    subscribe(inbox_.topic(Topic::config), FOGNAV_NODE_CONFIG_QOS);
-    subscribe(inbox_.topic(Topic::command), FOGNAV_NODE_COMMAND_QOS);
-    subscribe(inbox_.topic(Topic::update), FOGNAV_NODE_UPDATE_QOS);
-    publish(availability_, FOGNAV_NODE_AVAILABILITY_QOS, true, FOGNAV_NODE_AVAILABILITY_ONLINE);
-    publish(problem_topic_, FOGNAV_NODE_PROBLEM_QOS, true, problem_ != nullptr ? problem_ : "");
-    if (calibration_.length() > 0) {
-        publish(calibration_topic_, FOGNAV_NODE_CALIBRATION_QOS, true, calibration_.c_str());
+bool BoardLink::announce() {
+    return subscribe(inbox_.topic(Topic::config), FOGNAV_NODE_CONFIG_QOS) &&
+           subscribe(inbox_.topic(Topic::command), FOGNAV_NODE_COMMAND_QOS) &&
+           subscribe(inbox_.topic(Topic::update), FOGNAV_NODE_UPDATE_QOS) &&
+           publish(availability_, FOGNAV_NODE_AVAILABILITY_QOS, true, FOGNAV_NODE_AVAILABILITY_ONLINE) &&
+           publish(problem_topic_, FOGNAV_NODE_PROBLEM_QOS, true, problem_ != nullptr ? problem_ : "") &&
+           (calibration_.length() == 0 ||
+            publish(calibration_topic_, FOGNAV_NODE_CALIBRATION_QOS, true, calibration_.c_str())) &&
+           (!settings_.home_assistant || announce_to_home_assistant());
+}
+
+// The library refuses what it has no memory for, and gives no number then.
+bool BoardLink::was_taken(uint16_t packet) {
+    const bool refused = packet == 0;
+    if (refused != refused_) {
+        Serial.printf(refused ? "no message can be sent: %lu bytes of memory are free in one piece, and %lu are kept\n"
+                              : "messages can be sent again: %lu bytes of memory are free in one piece, and %lu are kept\n",
+                      static_cast<unsigned long>(largest_free_block()), static_cast<unsigned long>(EMC_MIN_FREE_MEMORY));
     }
-    if (settings_.home_assistant) announce_to_home_assistant();
+    refused_ = refused;
+    return !refused;
 }
 
 void BoardLink::set_calibration(const String& text) {
@@ -99,20 +139,11 @@ void BoardLink::take(const char* topic, const uint8_t* payload, size_t length, s
     report(receiver_.receive(inbox_.received(), inbox_.text(), inbox_.size()));
 }
 
-void BoardLink::subscribe(const char* topic, uint8_t qos) {
-    settings_.tls ? secure_.subscribe(topic, qos) : plain_.subscribe(topic, qos);
-}
-
-void BoardLink::publish(const char* topic, uint8_t qos, bool retain, const char* payload) {
-    settings_.tls ? secure_.publish(topic, qos, retain, payload) : plain_.publish(topic, qos, retain, payload);
-}
-
-void BoardLink::announce_to_home_assistant() {
+bool BoardLink::announce_to_home_assistant() {
     char topic[FOGNAV_HOME_ASSISTANT_TOPIC_SIZE];
-    static char text[2560];  // too much for the stack of an ESP8266
     snprintf(topic, sizeof topic, FOGNAV_HOME_ASSISTANT_TOPIC, settings_.node);
-    if (write_discovery(settings_, FOGNAV_FIRMWARE, text, sizeof text) == 0) return;
-    publish(topic, FOGNAV_HOME_ASSISTANT_QOS, true, text);
+    const size_t length = write_discovery(settings_, FOGNAV_FIRMWARE, scratch, sizeof scratch);
+    return length == 0 || publish(topic, FOGNAV_HOME_ASSISTANT_QOS, true, scratch);
 }
 
 }  // namespace fognav

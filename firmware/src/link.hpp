@@ -4,6 +4,7 @@
 #include <espMqttClient.h>
 
 #include "board.hpp"
+#include "broker_transport.hpp"
 #include "connection.hpp"
 #include "inbox.hpp"
 #include "node.hpp"
@@ -20,6 +21,14 @@ protected:
     ~Receiver() = default;
 };
 
+// The MQTT client, over a connection that it is given: the library's own ones make one each for plain and TLS, of which the
+// second takes 6 KB of an ESP8266 for its stack alone. It has no task, so callbacks come from `loop`, never in a step of the node.
+class BrokerClient final : public MqttClientSetup<BrokerClient> {
+public:
+    BrokerClient() : MqttClientSetup(espMqttClientTypes::UseInternalTask::NO) {}
+    void use(espMqttClientInternals::Transport& transport) { _transport = &transport; }
+};
+
 class BoardLink final : public Link {
 public:
     BoardLink(const Settings& settings, Receiver& receiver) : settings_(settings), receiver_(receiver) {}
@@ -27,16 +36,16 @@ public:
     // Prepare the client of the broker, which trusts this certificate authority (PEM) and no other.
     void begin(const char* authority);
 
-    void loop() { settings_.tls ? secure_.loop() : plain_.loop(); }
+    void loop() { client_.loop(); }
 
     void join_network() override;
     bool network_up() override { return WiFi.status() == WL_CONNECTED; }
     void connect_broker() override;
     // The library takes some turns of its loop for it, and connects no earlier.
-    void leave_broker() override { settings_.tls ? secure_.disconnect(true) : plain_.disconnect(true); }
-    bool broker_up() override { return settings_.tls ? secure_.connected() : plain_.connected(); }
+    void leave_broker() override { client_.disconnect(true); }
+    bool broker_up() override { return client_.connected(); }
     bool broker_failed() override { return failed_; }
-    void announce() override;
+    bool announce() override;
     void restart() override { ESP.restart(); }
 
     int rssi() { return WiFi.RSSI(); }
@@ -51,25 +60,24 @@ public:
     void publish_value(const char* message);
 
 private:
-    template <class Client>
-    void set_up(Client& client);
     void take(const char* topic, const uint8_t* payload, size_t length, size_t index, size_t total);
-    void subscribe(const char* topic, uint8_t qos);
-    void publish(const char* topic, uint8_t qos, bool retain, const char* payload);
-    void announce_to_home_assistant();
+    bool subscribe(const char* topic, uint8_t qos) { return was_taken(client_.subscribe(topic, qos)); }
+    bool publish(const char* topic, uint8_t qos, bool retain, const char* payload) {
+        return was_taken(client_.publish(topic, qos, retain, payload));
+    }
+    bool was_taken(uint16_t packet);
+    bool announce_to_home_assistant();
+    void say_why_it_ended(espMqttClientTypes::DisconnectReason reason);
 
     const Settings& settings_;
     Receiver& receiver_;
     Inbox inbox_;
-#if defined(ESP8266)
-    espMqttClient plain_;
-    espMqttClientSecure secure_;
-#else
-    // Without a task of its own: callbacks come from `loop`, and so never while the node takes a step.
-    espMqttClient plain_{espMqttClientTypes::UseInternalTask::NO};
-    espMqttClientSecure secure_{espMqttClientTypes::UseInternalTask::NO};
-#endif
+    BrokerClient client_;
+    BrokerTransport* transport_ = nullptr;
+    bool joining_ = false;
     bool failed_ = false;
+    bool accepted_ = false;  // by the broker, at the last attempt
+    bool refused_ = false;   // the last message, for lack of memory
     const char* problem_ = nullptr;
     String calibration_;
     char availability_[FOGNAV_NODE_AVAILABILITY_TOPIC_SIZE] = "";

@@ -7,14 +7,24 @@
 #include "files.hpp"
 #include "link.hpp"
 #include "portal_server.hpp"
+#include "scratch.hpp"
 #include "sensors.hpp"
 #include "update_board.hpp"
+
+#if defined(ESP32)
+#include <esp_task_wdt.h>
+#endif
+
+char fognav::scratch[2560];
 
 namespace {
 
 using namespace fognav;
 
 constexpr uint32_t kComplainEveryMs = 5000;
+#if defined(ESP32)
+constexpr uint32_t kWatchdogS = 60;
+#endif
 
 // All of a node that has settings.
 class Device final : Receiver {
@@ -43,7 +53,10 @@ public:
     void loop() {
         const bool was_up = connection_.up();
         connection_.step(millis());
-        if (connection_.up() && !was_up) node_.on_connected();
+        if (connection_.up() && !was_up) {
+            node_.on_connected();
+            keep_image();
+        }
         link_.loop();
         measure();
         if (values_.step(millis())) take_value();
@@ -123,6 +136,15 @@ PortalServer* server = nullptr;
     }
 }
 
+// Open the file system; on a fresh board, make one.
+bool mount() {
+#if defined(ESP8266)
+    return LittleFS.begin();  // makes one by itself
+#else
+    return LittleFS.begin(true);
+#endif
+}
+
 // nullptr, or why the node can't begin with what is on its flash.
 const char* read_flash() {
     const String text = read_file(kSettingsFile, kSettingsMax);
@@ -134,7 +156,7 @@ const char* read_flash() {
 }
 
 void open_portal() {
-    static PortalServer the_server(*portal);
+    static PortalServer the_server(*portal, settings);
     server = &the_server;
     the_server.begin();
 }
@@ -145,7 +167,7 @@ bool button_pressed() { return settings.button != kNoPin && digitalRead(settings
 
 void setup() {
     Serial.begin(115200);
-    if (!LittleFS.begin()) complain("the board has no file system: run `pio run --target uploadfs`");
+    if (!mount()) complain("the board has no file system, and none can be made: is its flash damaged?");
     const char* problem = read_flash();
     static PortalSwitch the_portal(problem == nullptr);
     portal = &the_portal;
@@ -158,8 +180,12 @@ void setup() {
     static Device the_device(settings);
     device = &the_device;
     device->begin(authority.c_str());
-#if defined(ESP32)
-    enableLoopWDT();  // an ESP8266's watches the loop by itself
+#if defined(ESP8266)
+    authority = String();  // its list of trusted authorities is a copy
+#else
+    // An ESP8266's watches the loop by itself, and is fed while it connects. This one is not, for half a minute at worst.
+    esp_task_wdt_init(kWatchdogS, true);
+    enableLoopWDT();
 #endif
 }
 

@@ -1,6 +1,7 @@
 #include "portal_server.hpp"
 
 #include "files.hpp"
+#include "scratch.hpp"
 
 namespace fognav {
 
@@ -8,6 +9,7 @@ namespace {
 
 constexpr uint16_t kDnsPort = 53;
 constexpr uint32_t kAnswerMs = 1000;  // until the answer has left, before the restart
+static_assert(sizeof scratch > kSettingsMax, "settings may not fit");
 
 }  // namespace
 
@@ -44,13 +46,11 @@ const char* PortalServer::field(const char* name) const {
 
 void PortalServer::submit() {
     portal_.on_request(millis());
-    static char text[kSettingsMax + 1];  // too much for the stack of an ESP8266, as are the settings
-    static Settings settings;
-    const char* problem = settings_from_form(*this, kBoard, text, sizeof text, settings);
-    if (problem == nullptr) problem = authority_problem(field("authority"), settings);
-    if (problem == nullptr && settings.tls && !write_file(kAuthorityFile, field("authority"))) problem = "the flash is full";
+    const char* problem = settings_from_form(*this, kBoard, scratch, kSettingsMax + 1, settings_);
+    if (problem == nullptr) problem = authority_problem(field("authority"), settings_);
+    if (problem == nullptr && settings_.tls && !write_file(kAuthorityFile, field("authority"))) problem = "the flash is full";
     // Last: only with it the node counts as set up.
-    if (problem == nullptr && !write_file(kSettingsFile, text)) problem = "the flash is full";
+    if (problem == nullptr && !write_file(kSettingsFile, scratch)) problem = "the flash is full";
     if (problem != nullptr) {
         server_.send(400, "text/plain", problem);
         return;

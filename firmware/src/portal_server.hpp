@@ -17,7 +17,8 @@ namespace fognav {
 
 class PortalServer final : Form {
 public:
-    explicit PortalServer(PortalSwitch& portal) : portal_(portal) {}
+    // `settings` receives what is typed: the node restarts then, or when the portal closes.
+    PortalServer(PortalSwitch& portal, Settings& settings) : portal_(portal), settings_(settings) {}
 
     void begin();
     void loop();
@@ -33,6 +34,7 @@ private:
     using Server = WebServer;
 #endif
     PortalSwitch& portal_;
+    Settings& settings_;
     DNSServer names_;
     mutable Server server_{80};
     mutable String field_;  // what `field` returned last

@@ -18,6 +18,10 @@ namespace fognav {
 // The number of the last update that was installed, 0 without one.
 uint32_t remembered_update();
 
+// What runs has reached the broker: an ESP32 keeps it. Before that its next start, whatever the cause, goes back to the image of
+// before. The boot loader of an ESP8266 can't.
+void keep_image();
+
 class FlashBoard final : public UpdateBoard {
 public:
     explicit FlashBoard(const Settings& settings) : settings_(settings) {}

@@ -1,6 +1,7 @@
 """The whole firmware of the board on this computer, in simulated time, behind stand-ins for the board's libraries."""
 
 import asyncio
+import configparser
 import hashlib
 import json
 import shutil
@@ -40,12 +41,18 @@ from fognav.stack import Stack, StackConfig
 # Compiled once, not by each worker of a parallel run.
 pytestmark = pytest.mark.xdist_group("firmware-board")
 
-# Of the cryptographic library that each board's core brings along: a header, and how a program is linked with it.
-CRYPTOGRAPHY = {"esp8266": ("bearssl/bearssl.h", "-lbearssl"), "esp32": ("mbedtls/ecdsa.h", "-lmbedcrypto")}
+# Of the cryptographic library that each board's core brings along: a header, and how a program is linked with it. The
+# stand-in for the second stack is asked before a signature is checked.
+WRAPPED = "-Wl,--wrap=br_ecdsa_i15_vrfy_asn1"
+CRYPTOGRAPHY = {
+    "esp8266": ("bearssl/bearssl.h", ["-lbearssl", WRAPPED]),
+    "esp32": ("mbedtls/ecdsa.h", ["-lmbedcrypto"]),
+}
+ENVIRONMENTS = {"esp8266": "d1_mini", "esp32": "d1_mini32"}
 NO_CRYPTOGRAPHY = "no {}, or no openssl: apt-get install libbearssl-dev libmbedtls-dev openssl"
 BOARDS = {"esp8266": ("ESP8266", [(14, 5), (12, 4)]), "esp32": ("ESP32", [(18, 22), (19, 21)])}
 SETTINGS = {
-    "site": "lab", "node": "n1", "wifi_name": "net", "wifi_password": "secret", "broker": "fog.local", "tls": False,
+    "site": "lab", "node": "n1", "wifi_name": "net", "wifi_password": "secret", "broker": "fog.lan", "tls": False,
     "port": 1883, "user": "n1", "every_reading": True, "sonars": [{"range_limit_m": 1.5}, {"range_limit_m": 2}],
 }  # fmt: skip
 PEM = "-----BEGIN CERTIFICATE----- MIIB -----END CERTIFICATE-----"
@@ -62,17 +69,27 @@ def programs(firmware, compiler, built):
         folders = ["src", "lib/node_core/src", "lib/node_edge/src", "host/board", *stand_ins]
         files = [str(file) for source in folders for file in sorted((firmware / source).glob("*.cpp"))]
         includes = [f"-I{firmware / source}" for source in ("include", *folders[1:])]
-        options = [f"-D{macro}", '-DFOGNAV_FIRMWARE="test"', "-std=gnu++17", *warnings, *checked]
+        number = "-DFOGNAV_FIRMWARE_NUMBER=firmware_number()"
+        options = [f"-D{macro}", '-DFOGNAV_FIRMWARE="test"', number, *flags(firmware, board), "-std=gnu++17"]
+        options += [*warnings, *checked]
         command = [compiler, *options, *includes, *files, *cryptography(board), "-o", str(folder / board)]
         done = subprocess.run(command, check=False, capture_output=True, text=True)
         assert done.returncode == 0, done.stderr
     return {board: folder / board for board in BOARDS}
 
 
+def flags(firmware, board):
+    """Return what a board's own environment of platformio.ini defines."""
+    found = configparser.ConfigParser(interpolation=None)
+    found.read(firmware / "platformio.ini")
+    text = found.get(f"env:{ENVIRONMENTS[board]}", "build_flags", fallback="")
+    return [word for word in text.split() if word.startswith("-D")]
+
+
 def cryptography(board):
     """How a board's program is linked with the real library, if that is installed here."""
-    header, library = CRYPTOGRAPHY[board]
-    return [library] if Path("/usr/include", header).is_file() and shutil.which("openssl") else []
+    header, options = CRYPTOGRAPHY[board]
+    return options if Path("/usr/include", header).is_file() and shutil.which("openssl") else []
 
 
 def openssl(folder, *arguments, text=None):
@@ -88,12 +105,12 @@ def make_key(folder, name):
 class Board:
     """A board that is switched on: it runs as long as a test lets time pass, and tells what it does."""
 
-    def __init__(self, program, pins, flash, boot=4):
+    def __init__(self, program, pins, flash, **world):
         self.pins = pins
         self.flash = flash
         self._process = subprocess.Popen(
             [program], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True,
-            env={"FLASH": str(flash), "ASAN_OPTIONS": "detect_leaks=0", "RANDOM_BITS": str(boot)},
+            env={"FLASH": str(flash), "ASAN_OPTIONS": "detect_leaks=0", **world},
         )  # fmt: skip
         self.restarted = False
         self.started = self._read()
@@ -139,12 +156,13 @@ class Board:
 def switch_on(programs, tmp_path):
     boards = []
 
-    def switch_on(settings=None, board="esp8266", authority=None):
+    def switch_on(settings=None, board="esp8266", authority=None, **world):
         if settings is not None:
             Path(tmp_path / "node.json").write_text(json.dumps(settings))
         if authority is not None:
             Path(tmp_path / "ca.pem").write_text(authority)
-        boards.append(Board(programs[board], BOARDS[board][1], tmp_path, boot=4 + len(boards)))
+        world = {"RANDOM_BITS": str(4 + len(boards)), **world}
+        boards.append(Board(programs[board], BOARDS[board][1], tmp_path, **world))
         return boards[-1]
 
     yield switch_on
@@ -171,7 +189,7 @@ def test_node_joins_connects_announces_itself_and_publishes_what_it_measures(swi
     board.measures(1000, 3000)
     lines = board.run(5)
     assert board.started[:4] == [
-        "server fog.local 1883", "client node-lab-n1", "user n1", "will fog/v1/lab/nodes/n1/availability 1 1 offline",
+        "server fog.lan 1883", "client node-lab-n1", "user n1", "will fog/v1/lab/nodes/n1/availability 1 1 offline",
     ]  # fmt: skip
     assert lines[:2] == ["join net", "connect"]
     assert [f"subscribe {row.key(site='lab', node='n1')} 1" in lines for row in (
@@ -212,11 +230,111 @@ def test_board_restarts_after_ten_minutes_without_a_broker(switch_on):
 def test_encrypted_node_trusts_its_authority_alone_and_asks_the_fog_for_the_time(switch_on, kind):
     settings = {key: value for key, value in SETTINGS.items() if key not in {"tls", "port"}}
     board = switch_on(settings, kind, PEM)
-    assert board.started[:2] == ["trust", "server fog.local 8883"]
+    assert board.started[:2] == ["trust", "server fog.lan 8883"]
+    board.tell("certificate fog.lan")
     assert ("watchdog" in board.started) == (kind == "esp32")  # an ESP8266's watches by itself
     lines = board.run(5)
-    assert "time from fog.local" in lines
+    assert "time from fog.lan" in lines
     assert published(lines, ch.NODE_AVAILABILITY) == ["online"]
+
+
+TLS = {key: value for key, value in SETTINGS.items() if key not in {"tls", "port"}}
+
+
+@pytest.mark.parametrize("settings", [SETTINGS, TLS], ids=["plain", "tls"])
+def test_memory_that_an_esp8266_has_beside_its_radio_suffices(switch_on, settings):
+    board = switch_on(settings, authority=PEM, HEAP="18000")
+    board.tell("certificate fog.lan")
+    lines = board.run(5)
+    assert published(lines, ch.NODE_AVAILABILITY) == ["online"]
+    assert len(published(lines, ch.NODE_READING)) > 20
+
+
+def test_messages_that_find_no_memory_are_told_and_no_node_is_connected_and_silent(switch_on):
+    board = switch_on(SETTINGS)
+    board.run(5)
+    board.tell("heap 3000")
+    assert [line for line in board.run(5) if line.startswith("serial")] == [
+        "serial no message can be sent: 3000 bytes of memory are free in one piece, and 4096 are kept"
+    ]
+    board.tell("broker 0", "run 5000", "broker 1")
+    lines = board.run(30)
+    assert "serial connected to the broker at fog.lan" in lines
+    assert not published(lines, ch.NODE_AVAILABILITY)
+    board.tell("heap 9000")
+    lines = board.run(60)
+    assert "serial messages can be sent again: 9000 bytes of memory are free in one piece, and 4096 are kept" in lines
+    assert published(lines, ch.NODE_AVAILABILITY) == ["online"]
+
+
+@pytest.mark.parametrize("kind", BOARDS)
+def test_node_that_is_told_an_address_checks_the_name_that_every_broker_of_ours_has(switch_on, kind):
+    board = switch_on({**TLS, "broker": "192.168.7.1"}, kind, PEM)
+    board.tell("certificate 192.168.7.1")  # as an address, which neither library compares
+    assert not published(board.run(60), ch.NODE_AVAILABILITY)
+    board.tell(f"certificate {ch.BROKER_NAME}")
+    lines = board.run(60)
+    assert f"verified {ch.BROKER_NAME}" in lines
+    assert published(lines, ch.NODE_AVAILABILITY) == ["online"]
+
+
+def test_name_that_an_esp8266_cannot_look_up_is_refused(switch_on):
+    settings = {**SETTINGS, "broker": "fog.local"}
+    assert "serial broker is a name in .local, which this board can't look up: give the fog node's address" in (
+        switch_on(settings).started
+    )
+    assert published(switch_on(settings, "esp32").run(5), ch.NODE_AVAILABILITY) == ["online"]
+
+
+@pytest.mark.parametrize("kind", BOARDS)
+@pytest.mark.parametrize("settings", [SETTINGS, TLS], ids=["plain", "tls"])
+def test_host_that_is_silent_resets_no_board(switch_on, settings, kind):
+    board = switch_on({**settings, "broker": "192.168.7.1"}, kind, PEM)
+    board.tell("broker silent")
+    lines = board.run(120)
+    assert not board.restarted
+    assert any("nobody answers at 192.168.7.1" in line for line in lines)
+    board.tell("broker 1")
+    assert published(board.run(60), ch.NODE_AVAILABILITY) == ["online"]
+
+
+@pytest.mark.parametrize("kind", BOARDS)
+def test_fresh_board_without_a_file_system_opens_its_portal(switch_on, kind):
+    assert "network fognav-c0ffee" in switch_on(board=kind, FRESH="1").started
+
+
+@pytest.mark.parametrize("kind", BOARDS)
+@pytest.mark.parametrize(
+    ("change", "world", "words"),
+    [
+        ({}, "wifi absent", "Wi-Fi network net was not joined: there is none of this name here"),
+        ({}, "network 0", "Wi-Fi network net was not joined: is it in reach, and wifi_password right?"),
+        ({"broker": "nowhere.lan"}, "broker 1", "the name nowhere.lan is not known in this network"),
+        ({}, "broker 0", "nobody answers at fog.lan, port 8883"),
+        ({}, "broker silent", "nobody answers at fog.lan, port 8883"),
+        ({}, "authority theirs", "Is ca.pem that of the fog node's authority"),
+        ({}, "certificate other.lan", "is its certificate for fog.lan (fognav ca issue)?"),
+        ({}, "broker 5", "the broker refuses the node's user or password"),
+        ({}, "broker 4", "the broker refuses the node's user or password"),
+        ({}, "broker 3", "the broker can't serve the node now"),
+        ({"tls": False}, "broker ends", "do port and tls of node.json fit together?"),
+        ({}, "broker 1", "connected to the broker at fog.lan"),
+    ],
+)
+def test_serial_port_says_in_words_what_is_wrong(switch_on, kind, change, world, words):
+    board = switch_on({**TLS, **change}, kind, PEM)
+    board.tell("certificate fog.lan", world)
+    spoken = [line for line in board.run(60) if line.startswith(("serial", "  "))]
+    assert any(words in line for line in spoken), spoken
+    assert ("connected to the broker" in "".join(spoken)) == (words.startswith("connected"))
+
+
+def test_esp8266_tells_a_wrong_password_of_the_network_and_a_lost_connection(switch_on):
+    board = switch_on(SETTINGS)
+    board.tell("wifi secret")
+    assert "serial the Wi-Fi network net was not joined: wifi_password of node.json is wrong" in board.run(60)
+    board.tell("wifi reachable", "run 60000", "broker 0")
+    assert "serial the connection to the broker was lost" in board.run(10)
 
 
 def test_configuration_counts_and_one_that_is_refused_is_told(switch_on):
@@ -312,7 +430,7 @@ def test_node_without_settings_opens_a_portal_and_is_set_up_there(switch_on):
     assert board.tell("request /settings", "run 10") == [
         "answer 400 broker is missing: the name or address of the fog node"
     ]
-    board.tell("field broker fog.local")
+    board.tell("field broker fog.lan")
     assert "answer 400 ca.pem is missing" in board.tell("request /settings", "run 10")[0]
     board.tell(f"field authority {PEM}")
     lines = board.tell("request /settings", "run 10")
@@ -324,6 +442,7 @@ def test_node_without_settings_opens_a_portal_and_is_set_up_there(switch_on):
     assert board.restarted
     again = switch_on()
     again.pins = again.pins[:1]
+    again.tell("certificate fog.lan")
     again.measures(1000)
     assert published(again.run(5), ch.NODE_AVAILABILITY) == ["online"]
 
@@ -394,10 +513,34 @@ def test_signed_update_is_installed_while_the_node_goes_on_measuring(updatable, 
         "fetch http://fog/n1.bin", "write /update.txt", "flash complete", "restart",
     ]  # fmt: skip
     assert (tmp_path / "flashed").read_bytes() == IMAGE
-    again = switch_on(board=kind)
+    again = switch_on(board=kind, FIRMWARE_NUMBER="2")
     again.run(5)
     again.send(ch.NODE_UPDATE, signed_update(tmp_path, kind))  # retained: it comes again with each connection
-    assert not any(line.startswith("fetch") for line in again.run(60))
+    lines = again.run(60)
+    assert not any(line.startswith("fetch") for line in lines)
+    assert not any(published(lines, ch.NODE_PROBLEM))
+
+
+def test_update_that_did_not_stay_is_told(updatable, switch_on, tmp_path):
+    """The board of before runs again, as after a trial that failed; the offer is still there."""
+    board, kind = updatable
+    (tmp_path / "served").write_bytes(IMAGE)
+    board.send(ch.NODE_UPDATE, signed_update(tmp_path, kind))
+    board.run(60)
+    again = switch_on(board=kind, FIRMWARE_NUMBER="1")
+    again.run(5)
+    again.send(ch.NODE_UPDATE, signed_update(tmp_path, kind))
+    lines = again.run(60)
+    assert not any(line.startswith("fetch") for line in lines)
+    assert "was installed and did not stay" in published(lines, ch.NODE_PROBLEM)[0]
+
+
+def test_esp32_keeps_a_new_image_once_it_has_reached_the_broker(switch_on):
+    board = switch_on(SETTINGS, "esp32")
+    board.tell("broker silent")
+    assert "image kept" not in board.started + board.run(60)
+    board.tell("broker 1")
+    assert "image kept" in board.run(60)
 
 
 @pytest.mark.parametrize(
@@ -469,7 +612,7 @@ class Bridge(Thread):
     def run(self):
         while not self.ended.is_set():
             if self.boards[-1].restarted:
-                self.boards.append(self._restart())
+                self.boards.append(self._restart(FIRMWARE_NUMBER="2"))
                 self.boards[-1].measures(3000, 3000)
             pass_on(self.boards[-1].run(0.5), self._client)
             with suppress(Empty):

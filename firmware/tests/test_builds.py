@@ -24,7 +24,7 @@ SETTINGS = {
     "site": "lab",
     "node": "n1",
     "wifi_name": "caf\u00e9",
-    "broker": "fog.local",
+    "broker": "fog.lan",
     "sonars": [{"trigger": 14, "echo": 5, "range_limit_m": 1.5}, {"trigger": 12, "echo": 4, "range_limit_m": 2}],
 }
 BOARD_C_LIBRARY = "/usr/lib/xtensa-lx106-elf/include"

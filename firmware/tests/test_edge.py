@@ -15,7 +15,7 @@ SETTINGS = {
     "node": "n1",
     "wifi_name": "caf\u00e9 \u20ac",
     "wifi_password": 'p"\\ss',
-    "broker": "fog.local",
+    "broker": "fog.lan",
     "sonars": list(PINS),
 }
 

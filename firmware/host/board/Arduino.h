@@ -37,6 +37,8 @@ struct Chip {
     [[noreturn]] void restart();
     uint32_t getChipId() { return 0xC0FFEE; }
     uint64_t getEfuseMac() { return 0xC0FFEE000000; }
+    uint32_t getMaxFreeBlockSize();
+    uint32_t getMaxAllocHeap() { return getMaxFreeBlockSize(); }
 };
 extern Chip ESP;
 
@@ -52,6 +54,7 @@ int digitalPinToInterrupt(int pin);
 void attachInterruptArg(uint8_t pin, void (*handler)(void*), void* argument, int mode);
 void configTime(long offset_s, int daylight_s, const char* server);
 uint32_t esp_random();
+uint32_t firmware_number();  // of the image that runs: the tests give FOGNAV_FIRMWARE_NUMBER as this
 void enableLoopWDT();
 
 void setup();

@@ -20,7 +20,11 @@ private:
 };
 
 struct FileSystem {
+#if defined(ESP8266)
     bool begin();
+#else
+    bool begin(bool format_on_fail = false);
+#endif
     File open(const char* name, const char* mode);
     bool rename(const char* from, const char* to);
 };

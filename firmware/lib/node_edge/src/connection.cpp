@@ -55,9 +55,13 @@ void Connection::step(uint32_t now_ms) {
             return;
         case Phase::connecting:
             if (link_.broker_up()) {
+                // Connected and silent is worse than gone: nobody would notice.
+                if (!link_.announce()) {
+                    wait(now_ms);
+                    return;
+                }
                 backoff_.reset();
                 enter(Phase::up, now_ms);
-                link_.announce();
             } else if (link_.broker_failed() || !link_.network_up() || now_ms - since_ms_ >= kBrokerTimeoutMs) {
                 wait(now_ms);
             }

@@ -22,7 +22,7 @@ public:
     virtual void leave_broker() = 0;    // end what was begun, if anything; 250 ms pass until the next attempt
     virtual bool broker_up() = 0;
     virtual bool broker_failed() = 0;  // the attempt that was begun has ended without success
-    virtual void announce() = 0;       // subscribe and say that the node is there
+    virtual bool announce() = 0;       // subscribe and say that the node is there; false: the broker was not told all
     virtual void restart() = 0;        // the board: a radio that has hung for ten minutes does not recover by itself
 };
 

@@ -124,7 +124,7 @@ const char kPortalPage[] =
     "<label>Site <input name=site></label><label>Node <input name=node></label>"
     "<label>Wi-Fi network <input name=wifi_name></label>"
     "<label>Wi-Fi password <input name=wifi_password type=password></label>"
-    "<label>Broker <input name=broker placeholder=fog.local></label><label>User <input name=user></label>"
+    "<label>Broker <input name=broker placeholder=192.168.7.1></label><label>User <input name=user></label>"
     "<label>Password <input name=password type=password></label>"
     "<label><input name=tls type=checkbox value=1 checked> encrypted (TLS)</label>"
     "<label>Pins <select name=profile><option>standard<option>thesis</select></label>"

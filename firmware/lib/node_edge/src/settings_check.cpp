@@ -1,8 +1,15 @@
 #include "settings_check.hpp"
 
+#include <string.h>
+
 namespace fognav {
 
 namespace {
+
+bool is_local(const char* host) {
+    const size_t length = strlen(host);
+    return length > 6 && strcmp(host + length - 6, ".local") == 0;
+}
 
 bool valid_id(const char* id) {
     if (*id == 0 || *id == '-') return false;
@@ -97,6 +104,9 @@ const char* settings_problem(const BoardPins& board, const Settings& settings) {
     if (!valid_id(settings.node)) return "node is missing, or not made of a to z, 0 to 9 and -";
     if (settings.wifi_name[0] == 0) return "wifi_name is missing";
     if (settings.broker[0] == 0) return "broker is missing: the name or address of the fog node";
+    if (!board.finds_local && is_local(settings.broker)) {
+        return "broker is a name in .local, which this board can't look up: give the fog node's address";
+    }
     if (settings.sonars == 0) return "sonars is missing: at least one";
     return pins_problem(board, settings);
 }

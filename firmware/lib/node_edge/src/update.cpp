@@ -100,11 +100,15 @@ const char* Updater::offer(const char* text, size_t size, uint32_t now_ms) {
     UpdateOffer found;
     const char* problem = read_update(text, size, found);
     if (problem != nullptr) return problem;
-    if (found.number == number_) return nullptr;
-    if (found.number < number_) return "the update is older than what runs: sign one with a higher number";
-    if (strcmp(found.board, board_) != 0) return "the update is for another board";
+    if (found.number == running_) return nullptr;
     // The broker delivers it again with each connection: what is under way goes on, and what has failed is not tried anew.
     if (is_same(found, offer_)) return nullptr;
+    if (found.number == number_) {
+        return "the update was installed and did not stay: it never reached the broker, or has another number in itself; "
+               "sign one with a higher number";
+    }
+    if (found.number < number_) return "the update is older than what runs: sign one with a higher number";
+    if (strcmp(found.board, board_) != 0) return "the update is for another board";
     char signed_lines[kSignedTextSize];
     const size_t length = signed_text(found, signed_lines, sizeof signed_lines);
     if (!port_.signature_is_good(signed_lines, length, found.signature, found.signature_size)) {

@@ -72,10 +72,10 @@ public:
     // `number` is that of the running firmware, `remembered` the last one installed: the higher one counts, so that an
     // image that calls itself older than it was signed is not installed again and again.
     Updater(UpdateBoard& port, const char* board, uint32_t number, uint32_t remembered)
-        : port_(port), board_(board), number_(number > remembered ? number : remembered) {}
+        : port_(port), board_(board), running_(number), number_(number > remembered ? number : remembered) {}
 
-    // Take an offer (JSON); return nullptr, or why it is refused. An offer of what runs already is neither, nor is the
-    // offer again that was taken last; another one replaces that, even while it is fetched. An empty text withdraws it.
+    // Take an offer (JSON); return nullptr, or why it is refused. An offer of what runs already is neither taken nor refused, nor
+    // is the offer again that was taken last; another one replaces that, even while it is fetched. An empty text withdraws it.
     const char* offer(const char* text, size_t size, uint32_t now_ms);
 
     // Go on; call it in every turn of the loop (millis(), 32 bits that wrap). Return nullptr, or why the update failed.
@@ -95,6 +95,7 @@ private:
 
     UpdateBoard& port_;
     const char* board_;
+    uint32_t running_;
     uint32_t number_;
     UpdateOffer offer_;  // the last one taken: one that is refused does not count
     Phase phase_ = Phase::idle;

@@ -49,6 +49,12 @@ Zenoh passes over what is recent if a newer message overtakes it while publisher
 messages of a recovered channel carry a version by which this is noticed.
 """
 
+BROKER_NAME: Final = "mosquitto"
+"""A name in the certificate of every broker of ours: a node that is told an address checks this instead of it.
+
+The TLS library of the ESP8266 compares names only, never addresses.
+"""
+
 ID_MAX: Final = 32
 """Characters of the longest id."""
 _ID: Final = rf"[a-z0-9][a-z0-9-]{{0,{ID_MAX - 1}}}"

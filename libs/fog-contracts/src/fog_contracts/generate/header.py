@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Final
 
 from msgspec import inspect
 
-from fog_contracts.channels import CHANNELS, ID_MAX, NODE, Channel
+from fog_contracts.channels import BROKER_NAME, CHANNELS, ID_MAX, NODE, Channel
 from fog_contracts.generate import NOTE
 from fog_contracts.generate.fields import Field, bounds, message_fields, summary
 
@@ -39,7 +39,8 @@ _HEAD: Final = f"""\
 def firmware_header() -> str:
     """Return the header's text."""
     blocks = [
-        _define("FOGNAV_ID_MAX", str(ID_MAX), "characters of the longest id: a-z, 0-9, and - except at the start")
+        _define("FOGNAV_ID_MAX", str(ID_MAX), "characters of the longest id: a-z, 0-9, and - except at the start"),
+        _define("FOGNAV_BROKER_NAME", f'"{BROKER_NAME}"', "in the broker's certificate, whatever its address"),
     ]
     blocks += [_channel(row) for row in CHANNELS.values() if NODE in (*row.publishers, *row.subscribers)]
     return _HEAD + "\n".join(blocks) + "\n#endif /* FOGNAV_CONTRACT_H */\n"

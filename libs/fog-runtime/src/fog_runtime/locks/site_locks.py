@@ -21,6 +21,7 @@ from typing import TYPE_CHECKING, Final, Self
 
 import msgspec
 
+from fog_contracts.channels import BROKER_NAME
 from fog_contracts.generate.mqtt_acl import mqtt_acl
 from fog_contracts.generate.zenoh_acl import zenoh_acl
 from fog_runtime.access.credentials import SERVERS, Credentials, Server, to_toml
@@ -95,7 +96,7 @@ class SiteLocks:
         self._folder.mkdir(mode=0o700, parents=True, exist_ok=True)
         if not (self._folder / AUTHORITY).exists():
             Authority.create(self._folder / AUTHORITY, f"Fognav {self._plan.site}", now=_now())
-        wanted = [*known_hosts, *(host for host in hosts if host not in known_hosts)]
+        wanted = [*known_hosts, *(host for host in (*hosts, BROKER_NAME) if host not in known_hosts)]
         self.renew(wanted, only_due=wanted == known_hosts)
         own: dict[str, Sequence[Server]] = {**users.SERVICES, **users.TOOLS, **users.THESIS}
         own[users.REDIS_ADMINISTRATOR] = ("redis",)
@@ -213,7 +214,7 @@ class SiteLocks:
         `hosts`: those of before, if none are given. Raises `AuthorityError`.
         """
         authority, renewed = self.authority, []
-        hosts = self._plan.hosts if hosts is None else hosts
+        hosts = list(dict.fromkeys([*(self._plan.hosts if hosts is None else hosts), BROKER_NAME]))
         for program in PROGRAMS:
             file = self.folder(program) / CERTIFICATE
             if only_due and file.exists() and expiry(file) - _now() > _RENEW_BEFORE:
@@ -222,7 +223,7 @@ class SiteLocks:
             self._files.write(program, KEY, issued.key.decode())
             self._files.write(program, CERTIFICATE, issued.chain.decode())
             renewed.append(program)
-        self._save(msgspec.structs.replace(self._plan, hosts=list(hosts)))
+        self._save(msgspec.structs.replace(self._plan, hosts=hosts))
         return renewed
 
     def _save(self, plan: _Plan) -> None:

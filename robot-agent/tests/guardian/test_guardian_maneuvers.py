@@ -363,6 +363,28 @@ def test_other_fault_ends_backing_off_and_is_latched_instead(status):
     assert not rig.core.moving
 
 
+@pytest.mark.parametrize("lifted", [{"cliff": True}, {"wheel_drop": True}])
+def test_robot_that_was_lifted_or_stands_at_an_edge_after_its_bump_backs_off_no_more(lifted):
+    rig = bumped()
+    rig.steps(0.1, None, bumper_left=False, **lifted)
+    rig.steps(0.1, None, **dict.fromkeys(lifted, False))
+    assert (rig.core.latched, rig.feedback.bumped) == (BUMP, False)
+    rig.steps(0.5, "back_off", -0.05)
+    assert not rig.core.moving
+
+
+def test_asking_for_another_maneuver_ends_the_one_that_runs():
+    rig = bumped()
+    rig.steps(0.2, "back_off", -0.05)
+    assert rig.step("seek_dock") == b"0.0000,0.0000;"
+    rig.steps(1.0)
+    assert not rig.core.moving
+    rig = seeking()
+    assert rig.step("back_off", 0.0) == b"take;"
+    rig.steps(1.0)
+    assert not rig.core.moving
+
+
 @pytest.mark.parametrize("status", [{}, {"cliff": True}])
 def test_robot_that_ends_backing_off_stands_at_once(status):
     rig = bumped()

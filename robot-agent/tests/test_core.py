@@ -8,7 +8,7 @@ from dataclasses import replace
 import msgspec
 import numpy as np
 import pytest
-from little_world import KEY, L_PATH, START, LittleWorld, release_of, trace
+from little_world import DT, KEY, L_PATH, START, LittleWorld, release_of, trace
 
 from fog_contracts import channels as ch
 from fog_contracts.commands import sign
@@ -288,6 +288,21 @@ def test_silent_guardian_stops_the_wheels(driving):
 def test_a_hung_control_loop_stops_the_robot_within_a_second(driving):
     driving.decide_on = False
     assert seconds_to_rest(driving) <= 0.4 + 0.2 + 0.5 + 0.1
+
+
+def test_computer_that_was_frozen_while_the_floor_is_free_invents_no_obstacle(driving):
+    driving.published.clear()
+    before = driving.travelled
+    driving.run(0.1)
+    driving.wheels = (0.0, 0.0)  # the guardian's doing
+    driving.steps += 1200
+    job = driving.agent.control_job(START + driving.steps * DT)  # it happens to run before the safety gate does
+    assert job.recovery is None
+    driving.run(0.2)
+    assert not any("no progress" in reason for reason in driving.state().reasons)
+    driving.run(9.0)
+    assert not any(report.points for report in driving.published_on(ch.ROBOT_OBSTACLES))
+    assert driving.travelled > before + 0.5
 
 
 def test_a_pressed_bumper_is_a_fault_until_an_operator_resets_it(driving):

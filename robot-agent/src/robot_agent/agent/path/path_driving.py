@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
@@ -35,6 +35,9 @@ if TYPE_CHECKING:
     from robot_agent.safety.gate import SafetyOutputs, SafetyState
     from robot_agent.safety.stop_field import Wheels
 
+_PAUSE_S: Final = 1.0
+"""Longer than a robot takes between two looks at its path, whatever it does."""
+
 
 class PathDriving:
     """The mission, its path with the blockages on it, and the decision that the wheels follow.
@@ -54,6 +57,8 @@ class PathDriving:
         self._recoveries = Recoveries()
         self._arrived = False
         """Whether the last decision was made within the tolerance of the path's end."""
+        self._ran_at = -math.inf
+        """When (s) this was last used: steadily, unless the computer is too late."""
         self._cap = math.inf
         """The fastest (m/s) that the robot might go when the last decision was asked for."""
 
@@ -98,10 +103,17 @@ class PathDriving:
 
         `guard` tells what limits the wheels, `safety` what the gate allowed last.
         """
+        self._notice_pause(now)
         blocked = self.wheels.decision.blocked if self.wheels.decision else None
         hindrance = Hindrance(guard.reason or blocked, guard.unseeing)
         standstill = self._progress.problem(self.mission, hindrance, safety, now, cap=self._cap)
         return self._monitor.problem(self.mission, replica.version, now) or standstill
+
+    def _notice_pause(self, now: float) -> None:
+        """Restart the timer of the progress after a time in which the computer ran nothing, and the robot stood."""
+        if now - self._ran_at > _PAUSE_S and self.mission.follower is not None:
+            self.mission.follower.restart_progress_timer(now)
+        self._ran_at = now
 
     def impassable(self, now: float) -> NDArray[np.float64]:
         """Return the points (n, 2; m, frame `map`) of a place that the robot could not pass, for some time."""
@@ -137,6 +149,7 @@ class PathDriving:
             return None
         if pose is None or odom is None or replica.geometry is None:
             return None
+        self._notice_pause(now)
         follower.advance(pose.x, pose.y, now)
         if not safety.mission_may_drive:
             return None

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 import random
-from typing import TYPE_CHECKING, Final, NamedTuple
+from typing import TYPE_CHECKING, Final, Literal, NamedTuple
 
 import msgspec
 import numpy as np
@@ -16,6 +16,7 @@ import numpy as np
 from fognav_experiments.hunt.world import Box, HuntWorld, Patch, Sensors, Watched
 from fognav_experiments.scenarios.description import (
     BusyRadio,
+    Command,
     FaultyNode,
     HeldWheel,
     HungAgent,
@@ -40,8 +41,13 @@ if TYPE_CHECKING:
     from fognav_experiments.scenarios.description import AnyEvent
     from fognav_experiments.scenarios.node_faults import Fault
 
+    CommandName = Literal["enable", "disable", "cancel", "egress", "back_off", "turn", "advance", "reset"]
+
 _PROCESSES: Final[tuple[FogProcessName, ...]] = ("aggregator", "map-service", "planner")
 _FAULTS: Final[tuple[Fault, ...]] = ("stuck", "flapping", "lies-clear", "lies-blocked")
+_COMMANDS: Final[tuple[CommandName, ...]] = (
+    "enable", "disable", "egress", "egress", "back_off", "turn", "advance", "reset",
+)  # fmt: skip
 _WALL_M: Final = 0.5
 _DOOR_M: Final = 0.9
 _HEADING_BIAS: Final = math.radians(2.5) * 0.235
@@ -249,12 +255,13 @@ def _sensors(dice: random.Random, floor: _Floor) -> Sensors:
 
 
 def _events(dice: random.Random, floor: _Floor, distance: float) -> list[AnyEvent]:
-    """Draw what happens: nothing, one thing, or several, two of them at the same time."""
+    """Draw what happens: nothing, one thing, or several, some of them at the same time."""
     events: list[AnyEvent] = []
     honest = True
-    at = [dice.uniform(0.0, 0.7 * distance / 0.25) for _ in range(3)]
+    at = [dice.uniform(0.0, 0.7 * distance / 0.25) for _ in range(6)]
     at[1] = dice.choice((at[0], at[1]))  # two at once
-    for at_s in at[: dice.choice((0, 1, 2, 3))]:
+    at[3] = at[2] + dice.uniform(0.0, 5.0)  # one soon after the other
+    for at_s in at[: dice.choice((0, 1, 2, 4, 6))]:
         event, lies = _event(dice, floor, round(at_s, 1))
         honest = honest and not lies
         events.append(event)
@@ -269,10 +276,11 @@ def _event(  # noqa: C901, PLR0911, PLR0912  # a table of the kinds of events
     dice: random.Random, floor: _Floor, at_s: float
 ) -> tuple[AnyEvent, bool]:
     """Return an event, and whether a node lies by it."""
-    place = dice.choice(floor.places)
+    place = dice.choice((floor.places[0], dice.choice(floor.places)))
     node = f"n-{floor.watched[0].id}" if floor.watched else ""
     kind = dice.choice((
-        "zone", "zone", "speed", "thing", "person", "gap", "slow", "radio", "restart", "hang", "lidar", "wheel", "push",
+        "zone", "zone", "command", "speed", "thing", "person", "gap", "slow", "radio", "restart", "hang", "lidar",
+        "wheel", "push",
         *(("barrier", "barrier", "silent", "lie", "lie", "clock") if node else ()),
     ))  # fmt: skip
     seconds = round(dice.choice((dice.uniform(0.5, 5.0), dice.uniform(5.0, 60.0))), 1)
@@ -305,6 +313,8 @@ def _event(  # noqa: C901, PLR0911, PLR0912  # a table of the kinds of events
             return SilentLidar(at_s=at_s, seconds=seconds), False
         case "wheel":
             return HeldWheel(at_s=at_s, wheel=dice.choice(("left", "right")), seconds=1.0), False
+        case "command":
+            return Command(at_s=at_s, command=dice.choice(_COMMANDS)), False
         case "push":
             return Push(at_s=at_s, turn=round(math.radians(dice.uniform(-20.0, 20.0)), 3)), False
         case "silent":

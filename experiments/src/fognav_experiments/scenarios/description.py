@@ -124,6 +124,12 @@ class BlindLidar(Event, frozen=True, kw_only=True, tag="blind-lidar"):
     end: float
 
 
+class Command(Event, frozen=True, kw_only=True, tag="command"):
+    """An operator gives the robot this command, once; it may refuse."""
+
+    command: Literal["enable", "disable", "cancel", "egress", "back_off", "turn", "advance", "reset"]
+
+
 class HeldWheel(Event, frozen=True, kw_only=True, tag="held-wheel"):
     """A threshold holds one side of the robot for `seconds`: its wheel turns on the spot, and its encoder counts."""
 
@@ -176,6 +182,7 @@ AnyEvent = (
     | Restart
     | HungAgent
     | SilentLidar
+    | Command
     | HeldWheel
     | Push
     | Kidnapping

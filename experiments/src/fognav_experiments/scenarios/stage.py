@@ -19,6 +19,7 @@ from fognav_experiments.rigs import moment
 from fognav_experiments.scenarios.description import (
     BlindLidar,
     BusyRadio,
+    Command,
     FaultyNode,
     HeldWheel,
     HungAgent,
@@ -264,6 +265,8 @@ class Stage:
             case SilentLidar():
                 self._stall(stalled=True)
                 self._later(event.seconds, partial(self._stall, stalled=False))
+            case Command():
+                run.robot.command(event.command)
             case HeldWheel():
                 self._hold(event.wheel, held=True)
                 self._later(event.seconds, partial(self._hold, event.wheel, held=False))

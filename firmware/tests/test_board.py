@@ -227,6 +227,24 @@ def test_board_restarts_after_ten_minutes_without_a_broker(switch_on):
 
 
 @pytest.mark.parametrize("kind", BOARDS)
+def test_node_is_back_after_an_hour_without_its_access_point(switch_on, kind):
+    """It tries again and again, and restarts every ten minutes, for a radio may hang: neither ever ends."""
+    board = switch_on(SETTINGS, kind)
+    board.run(5)
+    joined, seconds = 0, 0
+    board.tell("network 0")
+    while seconds < 3600:
+        joined += board.run(30).count("join net")
+        seconds += 30
+        if board.restarted:
+            board = switch_on(None, kind)
+            board.tell("network 0")
+    assert joined > 60, "once a minute at the least"
+    board.tell("network 1")
+    assert published(board.run(60), ch.NODE_AVAILABILITY) == ["online"]
+
+
+@pytest.mark.parametrize("kind", BOARDS)
 def test_encrypted_node_trusts_its_authority_alone_and_asks_the_fog_for_the_time(switch_on, kind):
     settings = {key: value for key, value in SETTINGS.items() if key not in {"tls", "port"}}
     board = switch_on(settings, kind, PEM)

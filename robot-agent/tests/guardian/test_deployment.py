@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import configparser
 import os
 import re
 import shutil
@@ -122,6 +123,14 @@ def test_installed_files_have_no_placeholder_left_and_are_not_writable_by_others
     assert servers[0] == "fog.local"
     assert len(servers) > 1
     assert entries(installed / "etc/systemd/timesyncd.conf.d/fognav.conf", "NTP") == []
+
+
+def test_robot_tries_for_ever_to_be_back_on_its_network(installed):
+    """By default NetworkManager pauses for minutes after four failed tries."""
+    read = configparser.ConfigParser()
+    read.read_string((installed / "etc/NetworkManager/conf.d/fognav.conf").read_text())
+    assert read["main"]["autoconnect-retries-default"] == "0"
+    assert read["connection"] == {"wifi.powersave": "2", "connection.auth-retries": "0"}
 
 
 def test_a_second_installation_keeps_what_was_changed_on_the_robot(installed):

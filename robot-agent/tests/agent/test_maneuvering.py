@@ -246,6 +246,9 @@ def test_robot_follows_its_way_out_at_the_speed_of_an_egress():
 class Guard:
     reason = "a chair"
 
+    def blindness(self, wheels):
+        return f"nothing at {wheels}"
+
     def limit(self, wheels, _now):
         return wheels
 
@@ -315,6 +318,16 @@ def test_gate_is_told_what_stops_an_egress_and_nothing_without_a_maneuver(maneuv
     ask_and_reply(maneuvers.egress, WAY_OUT, ORIGIN, 1.0)
     running = maneuvers.inputs(state("egress"), None, Pose2(0.25, 0.0, 0.0), 1.0)
     assert (running.remaining, running.problem) == (pytest.approx(0.75), "a chair")
+
+
+def test_gate_is_told_whether_a_robot_that_is_asked_to_drive_back_could(maneuvers):
+    for asked, seen in (
+        ("undock", "nothing at (-0.1, -0.1)"),
+        ("back_off", "nothing at (-0.05, -0.05)"),
+        ("turn", None),
+    ):
+        assert maneuvers.inputs(state(), None, None, 1.0, asked).blind_behind == seen
+        assert maneuvers.inputs(state("turn"), None, None, 1.0, asked).blind_behind is None
 
 
 def test_only_an_advance_has_a_way_ahead(maneuvers, localizer):

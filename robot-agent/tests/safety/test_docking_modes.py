@@ -404,6 +404,16 @@ def test_back_off_needs_a_bump():
     assert "bumped into nothing" in gate.run(request="back_off", base_fault="a cliff").refusal
 
 
+@pytest.mark.parametrize(("request_", "given"), [("back_off", BUMPED), ("undock", ON_DOCK)])
+def test_robot_that_sees_nothing_behind_refuses_to_drive_back(request_, given):
+    gate = Gate(enabled=False, **given)
+    blind = "the lidar sees nothing behind"
+    assert gate.run(request=request_, blind_behind=blind).refusal == blind
+    assert gate.out.mode != RULES[request_].mode
+    assert gate.run(request=request_).refusal is None
+    assert gate.run(blind_behind=blind, maneuver_remaining=0.05).mode == RULES[request_].mode, "it has begun"
+
+
 def test_back_off_of_an_agent_that_was_restarted_leads_to_init():
     gate = Gate(enabled=False)
     assert gate.run(request="back_off", maneuver_remaining=0.09, **BUMPED).mode == "EGRESS"

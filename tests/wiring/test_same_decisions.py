@@ -170,6 +170,11 @@ def signed(kind: CommandKind, now: float) -> RobotCommand:
     return sign(unsigned, OPERATOR_KEY)
 
 
+def _elsewhere(stamp: float) -> RobotPose:
+    """Return the pose of the other robot, which stands far from the path."""
+    return RobotPose(x=7.5, y=0.85, theta=0.0, covariance=[0.0] * 9, v=0.0, w=0.0, radius=0.17, height=0.5, stamp=stamp)
+
+
 def external_messages(step: int, readings: list[Any]) -> list[Publication]:
     """Return a step's messages of another robot and of thesis nodes, invalid ones, and a reading delivered twice."""
     at = moment(step * 0.01)
@@ -180,6 +185,7 @@ def external_messages(step: int, readings: list[Any]) -> list[Publication]:
     if step == EXTERNAL:
         seen = RobotObstacles(points=[(4.0, 7.0), (4.05, 7.0)], stamp=at.stamp, ttl=3.0)
         found += [
+            Publication(ch.ROBOT_POSE, _elsewhere(at.stamp), robot),
             Publication(ch.NODE_AVAILABILITY, "online", {"node": "n1"}),
             Publication(ch.NODE_AVAILABILITY, "perhaps", {"node": "n1"}),
             Publication(ch.THESIS_AREA, "blocked", {"number": "7"}),
@@ -188,10 +194,7 @@ def external_messages(step: int, readings: list[Any]) -> list[Publication]:
     if EXTERNAL <= step < EXTERNAL + 400 and step % 20 == 0:
         found.append(Publication(ch.THESIS_AREA, "clear", {"number": "2"}))
     if step >= EXTERNAL and step % 20 == 0:
-        pose = RobotPose(
-            x=7.5, y=0.85, theta=0.0, covariance=[0.0] * 9, v=0.0, w=0.0, radius=0.17, height=0.5, stamp=at.stamp
-        )
-        found.append(Publication(ch.ROBOT_POSE, pose, robot))
+        found.append(Publication(ch.ROBOT_POSE, _elsewhere(at.stamp), robot))
     if step == ARRIVAL:
         state = RobotState(
             mode="NORMAL", reasons=[], enabled=True, battery=0.5, goal_id=GOAL_ID, map_epoch=1, map_seq=1, plan_id=1,

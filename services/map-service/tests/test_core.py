@@ -44,7 +44,7 @@ from map_service.aggregator_monitor import TRUSTED_AFTER_S
 from map_service.core import MapCore
 from map_service.layers.base import CostLayer, write_cost
 from map_service.layers.obstacles import MAX_OF_ROBOT
-from map_service.layers.view_reach import CELL_HALF_WIDTH_M, MARGIN_M, RANGE_M
+from map_service.layers.view_reach import BEYOND_M, CELL_HALF_WIDTH_M, MARGIN_M, RANGE_M
 from map_service.pending import merge_overlapping
 from map_service.registry import LayersError, make_layers
 from map_service.zone_validation import ZoneError, list_size, prepare_zone
@@ -75,6 +75,8 @@ class Change:
 
 
 AGE_S = ch.AGGREGATOR_HEARTBEAT.max_age_s
+FAR = (-4.0, -4.0)
+"""Beside the little floor plan, but within sight of all of it."""
 
 
 class LivingAggregator:
@@ -138,8 +140,17 @@ class Rig:
         published = self.core.handlers()[ch.AREA_HAZARD]({"area": hazard.area}, hazard, Moment(stamp, stamp))
         return self._change([*published, *self.aggregator.announce(hazard, stamp)])
 
-    def on_obstacles(self, robot: str, obstacles: RobotObstacles, now: float, stamp: float) -> Change:
-        return self._deliver(ch.ROBOT_OBSTACLES, obstacles, now, stamp, robot=robot)
+    def on_obstacles(
+        self, robot: str, obstacles: RobotObstacles, now: float, stamp: float, at: tuple[float, float] | None = None
+    ) -> Change:
+        """Deliver a report of a robot that stands `at`: where its view is, or else 1 m right of its first point."""
+        if at is None and obstacles.view is not None:
+            at = obstacles.view.x, obstacles.view.y
+        elif at is None:
+            at = obstacles.points[0][0] + 1.0, obstacles.points[0][1]
+        placed = self.on_pose(robot, pose(*at), now)
+        change = self._deliver(ch.ROBOT_OBSTACLES, obstacles, now, stamp, robot=robot)
+        return Change(placed.deltas + change.deltas, placed.hazards + change.hazards, change.zones or placed.zones)
 
     def on_pose(self, robot: str, pose: RobotPose, now: float) -> Change:
         return self._deliver(ch.ROBOT_POSE, pose, now, now, robot=robot)
@@ -661,9 +672,9 @@ def test_obstacle_that_is_seen_between_two_views_beyond_it_stays():
 
 def test_robot_with_a_broken_lidar_takes_no_other_robots_room():
     rig = make_rig(floor_plan(600, 300))
-    wall = [(0.025 + 0.05 * (i % 500), 0.025 + 0.05 * (i // 500)) for i in range(25_000)]
+    wall = [(0.025 + 0.05 * (i % 200), 0.025 + 0.05 * (i // 200)) for i in range(25_000)]
     for start in range(0, 25_000, 2_000):
-        rig.on_obstacles("r1", obstacles(*wall[start : start + 2_000], ttl=600.0), 1.0, 1.0)
+        rig.on_obstacles("r1", obstacles(*wall[start : start + 2_000], ttl=600.0), 1.0, 1.0, at=(5.0, -0.5))
     assert rig.core.refused_cells == 25_000 - MAX_OF_ROBOT
     rig.on_obstacles("r2", obstacles((10.0, 10.0), ttl=600.0), 2.0, 2.0)
     assert cost_and_speed(rig, 10.0, 10.0)[0] == LETHAL
@@ -671,6 +682,44 @@ def test_robot_with_a_broken_lidar_takes_no_other_robots_room():
         rig.on_obstacles("r2", obstacles((10.0, 10.0), ttl=600.0, view=view_from(5.0, -0.3, 12.0)), now, now)
     rig.on_obstacles("r1", obstacles((20.0, 10.0), ttl=600.0), 5.0, 5.0)
     assert cost_and_speed(rig, 20.0, 10.0)[0] == LETHAL, "what was cleared made room"
+
+
+@pytest.mark.parametrize("at", [None, (2.0, 2.0)], ids=["no pose", "another pose"])
+def test_view_from_where_the_robot_is_not_clears_no_obstacle_and_adds_none(at):
+    rig = make_rig()
+    rig.on_obstacles("r1", obstacles((1.0, 1.0), ttl=600.0), 0.0, 0.0)
+    before = rig.cost.copy()
+    forged = obstacles((1.5, 0.5), ttl=600.0, view=view_from(0.4, 1.0, 12.0))
+    for now in (2.0, 3.0, 4.0):
+        if at is not None:
+            rig.on_pose("r2", pose(*at), now)
+        rig._deliver(ch.ROBOT_OBSTACLES, forged, now, now, robot="r2")
+    assert np.array_equal(rig.cost, before)
+    assert rig.core.refused_cells == 3
+
+
+@pytest.mark.parametrize(
+    ("view", "seen"),
+    [
+        (view_from(2.0, 7.0, 12.0), [(5.0, 7.0), (13.9, 7.0)]),  # not what is 13 m away
+        (view_from(2.0, 7.0, 3.0), [(5.0, 7.0)]),  # nor what is behind what it sees
+        (view_from(2.0, 7.0, 12.0, towards=math.pi, width=3.0), []),  # nor what is where it sees nothing
+        (None, [(5.0, 7.0), (13.9, 7.0)]),
+    ],
+)
+def test_robot_adds_what_it_can_see_only(view, seen):
+    rig = make_rig(floor_plan(600, 300))
+    points = [(5.0, 7.0), (13.9, 7.0), (15.0, 7.0)]
+    rig.on_obstacles("r1", obstacles(*points, ttl=600.0, view=view), 0.0, 0.0, at=(2.0, 7.0))
+    assert [point for point in points if cost_and_speed(rig, *point)[0] == LETHAL] == seen
+    assert rig.core.refused_cells == 3 - len(seen)
+
+
+def test_what_a_robot_could_not_pass_is_added_although_it_sees_nothing_there():
+    rig = make_rig()
+    nothing = view_from(1.0, 1.0, 3.0, towards=math.pi, width=3.0)
+    rig.on_obstacles("r1", obstacles((1.5, 1.0), ttl=600.0, view=nothing), 0.0, 0.0)
+    assert cost_and_speed(rig, 1.5, 1.0)[0] == LETHAL
 
 
 @settings(max_examples=40, deadline=None)
@@ -689,7 +738,7 @@ def test_obstacles_on_the_map_are_those_that_were_seen_and_neither_cleared_nor_e
     rig, known = make_rig(), {}
     free = rig.cost.copy()
     for step, (robot, cells, view, ttl) in enumerate(reports):
-        now = 1.0 + step
+        now = 1.0 + 1.5 * step  # nobody's pose is fresh any more
         # In the middle of cells; a view is none of a cell's, so that no bearing is between two sectors.
         points = [(0.05 * x + 0.025, 0.05 * y + 0.025) for x, y in cells]
         seen = (
@@ -697,8 +746,14 @@ def test_obstacles_on_the_map_are_those_that_were_seen_and_neither_cleared_nor_e
             if view is None
             else View(x=0.05 * view[0] + 0.01, y=0.05 * view[1] + 0.02, reach=bytes([view[2]]) * VIEW_SECTORS)
         )
+        told = points
+        if seen is not None:
+            reach = min(REACH_UNIT_M * view[2] + BEYOND_M, REACH_UNIT_M * 255)
+            at = seen.x, seen.y
+            points = [point for point in points if math.dist(point, at) <= reach]
+            known = {point: state for point, state in known.items() if math.dist(point, at) > 0.39}
         for point in points:
-            if rig.geometry.contains(*point):
+            if rig.geometry.contains(*point) and (seen is None or math.dist(point, at) > 0.39):
                 known[point] = [max(now + ttl, known.get(point, (0.0,))[0]), 0]
         if seen is not None:
             for point, state in known.items():
@@ -707,11 +762,11 @@ def test_obstacles_on_the_map_are_those_that_were_seen_and_neither_cleared_nor_e
                     continue
                 state[1] = state[1] + 1 if REACH_UNIT_M * view[2] > distance + MARGIN_M else 0
         known = {point: state for point, state in known.items() if state[1] < 2}
-        rig.on_obstacles(robot, obstacles(*points, ttl=ttl, view=seen), now, now)
+        rig.on_obstacles(robot, obstacles(*told, ttl=ttl, view=seen), now, now, at=None if seen else FAR)
         rig.tick(now + 0.5, now + 0.5)
         known = {point: state for point, state in known.items() if state[0] > now + 0.5}
         check = make_rig()
-        check.on_obstacles("r9", obstacles(*known, ttl=600.0), 0.0, 0.0)
+        check.on_obstacles("r9", obstacles(*known, ttl=600.0), 0.0, 0.0, at=FAR)
         assert np.array_equal(rig.cost, check.cost)
     rig.tick(1e4, 1e4)
     assert np.array_equal(rig.cost, free)
@@ -810,7 +865,7 @@ def apply_events(rig: Rig, history: list[tuple]) -> list[MapDelta]:
         elif kind == "hazard":
             change = rig.on_hazard(hazard(rest[1], seq, area=rest[0], penalty=rest[2]), now)
         elif kind == "obstacles":
-            change = rig.on_obstacles("r1", obstacles(*rest[0], ttl=rest[1]), now, now)
+            change = rig.on_obstacles("r1", obstacles(*rest[0], ttl=rest[1]), now, now, at=FAR)
         elif kind == "view":
             change = rig.on_obstacles("r1", obstacles(view=view_from(*rest[0], rest[1])), now, now)
         elif kind == "pose":

@@ -17,6 +17,7 @@ from fog_contracts.messages import (
     PolygonShape,
     RectangleShape,
     RobotObstacles,
+    RobotPose,
     Shape,
     View,
     Zone,
@@ -32,7 +33,7 @@ if TYPE_CHECKING:
     from fog_contracts.grid import StaticMap
 
 _AT: Final = Moment(0.0, 0.0)
-_OBSTACLES: Final = 10_000
+_OBSTACLES: Final = 4_000
 """As many obstacle cells as one robot may hold."""
 
 
@@ -113,7 +114,7 @@ def _worst_obstacles(floor: StaticMap) -> float:
     core = MapCore("bench", floor, 1, layers=make_layers(floor))
     core.load_zones([], _AT)
     core.tick(_AT)
-    handle, (left, bottom, *_) = core.handlers()[ch.ROBOT_OBSTACLES], floor.geometry.bounds
+    handlers, (left, bottom, *_) = core.handlers(), floor.geometry.bounds
     step, columns = floor.geometry.resolution, min(100, floor.geometry.width)
     cells = [divmod(number, columns) for number in range(min(_OBSTACLES, columns * min(100, floor.geometry.height)))]
     points = [(left + step * (column + 0.5), bottom + step * (row + 0.5)) for row, column in cells]
@@ -127,7 +128,12 @@ def _worst_obstacles(floor: StaticMap) -> float:
         )
         for _ in range(2)
     ]
-    return max(_timed(partial(handle, {"robot": "r1"}, report, _AT)) for report in reports)
+    pose = RobotPose(
+        x=middle[0], y=middle[1], theta=0.0, covariance=[0.0] * 9, v=0.0, w=0.0, radius=0.17, height=0.35, stamp=0.0
+    )
+    robot = {"robot": "r1"}
+    handlers[ch.ROBOT_POSE](robot, pose, _AT)
+    return max(_timed(partial(handlers[ch.ROBOT_OBSTACLES], robot, report, _AT)) for report in reports)
 
 
 def random_zones(floor: StaticMap, count: int) -> list[Zone]:

@@ -42,7 +42,8 @@ AGGREGATOR_DELAY = Gauge(
 )
 AREAS_UNCONFIRMED = Gauge("fognav_areas_unconfirmed", "Areas whose hazard no living aggregator confirms")
 OBSTACLES_REFUSED = Counter(
-    "fognav_obstacles_refused_total", "Obstacle cells that are not on the map because it holds as many as it may"
+    "fognav_obstacles_refused_total",
+    "Obstacle cells that are not on the map: it holds as many as it may, or their robot can't see them from its pose",
 )
 CLOCK_SYNCHRONIZED = Gauge("fognav_clock_synchronized", "Whether something keeps the time of day synchronized")
 CLOCK_UNKNOWN = (

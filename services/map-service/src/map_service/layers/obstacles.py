@@ -6,12 +6,13 @@ cell is cleared when the free view of two consecutive reports reaches beyond it,
 layered costmaps (Lu, Hershberger, Smart 2014).
 
 A point becomes a small lethal disc. Points on or near a robot belong to that robot and are left out: a robot must never
-enclose another one by having seen it. Whatever robots report, a report takes a few milliseconds: the map's heartbeat
-waits for it.
+enclose another one by having seen it. A robot is believed what it can see from the pose that it reports, and a report
+takes a few milliseconds, whatever it says: the map's heartbeat waits for it.
 """
 
 from __future__ import annotations
 
+import math
 from collections import Counter
 from typing import TYPE_CHECKING, NamedTuple
 
@@ -23,7 +24,7 @@ from fog_contracts.grid import Window
 from fog_contracts.messages import Cause
 from fog_contracts.raster import ShapeMask
 from map_service.layers.base import CostLayer, LayerFactory, NoOptions, write_cost
-from map_service.layers.view_reach import CELL_HALF_WIDTH_M, RANGE_M, sees_beyond
+from map_service.layers.view_reach import BEYOND_M, CELL_HALF_WIDTH_M, RANGE_M, sees_beyond, within
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -46,8 +47,11 @@ Of points that were seen from farther away than `RANGE_M` it grows with the dist
 """
 MAX_CELLS: Final = 20_000
 """Most cells that are held; a broken lidar must not fill the memory."""
-MAX_OF_ROBOT: Final = 10_000
-"""Most of them that one robot has added, so that its broken lidar takes no other robot's room."""
+MAX_OF_ROBOT: Final = 4_000
+"""Most of them that one robot has added, so that its broken lidar takes no other robot's room, nor the whole floor.
+
+Cells of 0.1 m, which are what robots report, on both sides of its way for as long as they last: 600 s at 0.3 m/s.
+"""
 VIEWS_TO_CLEAR: Final = 2
 """How many consecutive views must reach beyond a cell to clear it: one beam may have missed something thin."""
 _PATCH_CELLS: Final = 64
@@ -87,6 +91,13 @@ class ObstaclesLayer(CostLayer):
     def _on_obstacles(self, ids: Ids, seen: RobotObstacles, at: Moment) -> list[Publication]:
         robot, seen_until = ids["robot"], _Seen(at.now + seen.ttl, ids["robot"])
         points = np.array(seen.points, dtype=np.float64).reshape(-1, 2)
+        origin = self._seen_from(robot, seen.view, at.now)
+        if origin is None:
+            self.refused += len(points)
+            return []
+        visible = within(seen.view, points - origin)
+        self.refused += len(points) - int(visible.sum())
+        points = points[visible]
         cells, inside = self._geometry.cells(points)
         points, numbers = points[inside], self._numbers(cells[inside])
         known = self._views.flat[numbers] > 0
@@ -164,6 +175,15 @@ class ObstaclesLayer(CostLayer):
         """Return the cells ((n, 2), each (column, row)) of obstacles inside a window."""
         rows, columns = np.nonzero(self._views[window.rows, window.columns])
         return np.stack([columns + window.x, rows + window.y], axis=1).astype(np.int64)
+
+    def _seen_from(self, robot: str, view: View | None, now: float) -> tuple[float, float] | None:
+        """Return where a robot has seen its obstacles from; None if it can't have been there, by its latest pose."""
+        received, pose = self._poses.get(robot, (-math.inf, None))
+        if pose is None or now - received > ch.ROBOT_POSE.max_age_s:
+            return None
+        if view is None:
+            return pose.x, pose.y
+        return (view.x, view.y) if math.hypot(view.x - pose.x, view.y - pose.y) <= BEYOND_M else None
 
     def _near_robots(self, points: NDArray[np.float64], view: View | None, now: float) -> NDArray[np.bool_]:
         """Return which points ((n, 2), m) of a report are on or near a robot; `view`: where they were seen from."""

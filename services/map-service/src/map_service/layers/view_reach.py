@@ -1,4 +1,4 @@
-"""Which places a robot's free view reaches beyond. Pure."""
+"""Which places a robot's view reaches, and which it reaches beyond. Pure."""
 
 from __future__ import annotations
 
@@ -20,6 +20,30 @@ MARGIN_M: Final = 0.2
 CELL_HALF_WIDTH_M: Final = 0.06
 RANGE_M: Final = 6.0
 """Views clear up to this distance (m): beyond it, a small lidar's beams are farther apart than a cell is wide."""
+BEYOND_M: Final = 0.5
+"""So much farther off (m) than a view reaches, or a view from its robot's pose, nothing is reported."""
+_BESIDE: Final = 2
+"""The view of a cell is the widest of its sector and so many to both sides: one beam may end at something before it."""
+_UNSEEN_M: Final = 1.0
+"""Without an echo a view says nothing, and the robot may report what it could not pass, this near (m)."""
+_WHOLE_M: Final = REACH_UNIT_M * 255
+
+
+def within(view: View | None, offsets: NDArray[np.float64]) -> NDArray[np.bool_]:
+    """Return for each point, by its offset ((n, 2), m) from the view's origin, whether it may be seen from there.
+
+    Without a view, whether it is within the range of one.
+    """
+    distance = np.hypot(*offsets.T)
+    if view is None:
+        near: NDArray[np.bool_] = distance <= _WHOLE_M
+        return near
+    sectors = np.floor(np.arctan2(*offsets.T[::-1]) * (VIEW_SECTORS / (2.0 * np.pi))).astype(np.int64)
+    units = np.frombuffer(view.reach, np.uint8)
+    reach = np.where(units > 0, REACH_UNIT_M * units + BEYOND_M, _UNSEEN_M)
+    widest = np.max([np.roll(reach, shift) for shift in range(-_BESIDE, _BESIDE + 1)], axis=0)
+    seen: NDArray[np.bool_] = distance <= np.minimum(widest[sectors % VIEW_SECTORS], _WHOLE_M)
+    return seen
 
 
 def sees_beyond(view: View, offsets: NDArray[np.float64]) -> NDArray[np.bool_]:

@@ -42,6 +42,11 @@ REACTION, COMPUTING, SYSTEM, LIVE, COMPOSE = range(5)
 """Kinds of test modules, in the order in which they are started."""
 
 
+def pytest_addoption(parser: pytest.Parser) -> None:
+    """Add what takes long."""
+    parser.addoption("--long", action="store_true", help="drive new random worlds for ten minutes, too")
+
+
 def pytest_configure() -> None:
     """Give each worker its own range of ports, and the programs that it starts the usual signals.
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import itertools
 import math
+import time
 from pathlib import Path
 
 import msgspec
@@ -342,6 +343,13 @@ def test_world_that_breaks_a_rule(file):
 def test_worlds_of_a_fixed_seed_break_no_rule():
     tasks = [Task(seed=7, number=n, commit="", maps=[], folders=[], tries=0) for n in FIXED]
     assert {found.record.number: found.record.values for found in map(drive, tasks) if found.world} == {}
+
+
+def test_new_worlds_break_no_rule(request, tmp_path):
+    if not request.config.getoption("--long"):
+        pytest.skip("takes ten minutes: ask for it by --long")
+    records = list(runner.run(tmp_path, int(time.time()), 10.0, 1, "", [SITES], 20))
+    assert [(record.seed, record.number, record.values) for record in records if record.rules] == []
 
 
 def test_drawn_world_is_the_same_for_its_numbers_and_another_one_for_others():

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from collections import Counter
 from concurrent.futures import FIRST_COMPLETED, Future, wait
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
@@ -163,11 +164,15 @@ def summary(records: Iterable[Record]) -> str:
     if moving:
         slow = 100.0 * sum(record.figures.degraded_s for record in drives) / moving
         lines.append(f"DEGRADED for {slow:.1f} % of the time in which robots moved")
-    broken: dict[str, int] = {}
-    for rule in (rule for record in drives for rule in sorted(set(record.rules))):
-        broken[rule] = broken.get(rule, 0) + 1
-    lines.append("drives that broke a rule: " + (", ".join(f"{r} {n}" for r, n in sorted(broken.items())) or "none"))
+    ended = Counter[str](record.outcome for record in drives)
+    broken = Counter[str](rule for record in drives for rule in set(record.rules))
+    lines.append("ended: " + _counted(ended))
+    lines.append("drives that broke a rule: " + _counted(broken))
     return "\n".join(lines)
+
+
+def _counted(counts: Counter[str]) -> str:
+    return ", ".join(f"{name} {count}" for name, count in sorted(counts.items())) or "none"
 
 
 def _is_map(file: Path) -> bool:

@@ -13,6 +13,8 @@ from typing import TYPE_CHECKING, Final, Literal, NamedTuple
 import msgspec
 import numpy as np
 
+from fog_runtime.configuration import parts
+from fog_runtime.configuration.default_parts import DEFAULT_BASE, DEFAULT_LIDAR
 from fognav_experiments.hunt.world import Box, HuntWorld, Patch, Sensors, Watched
 from fognav_experiments.scenarios.description import (
     BusyRadio,
@@ -32,6 +34,7 @@ from fognav_experiments.scenarios.description import (
     SlowLink,
     SpeedZone,
 )
+from fognav_sim.emulators import BASES, LIDARS
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
@@ -96,6 +99,8 @@ def draw_world(seed: int, number: int, attempt: int = 0) -> HuntWorld:
         resolution=resolution,
         warp_m=round(warp, 3),
         radius=dice.choice((0.17, 0.17, 0.17, 0.22)),
+        base=dice.choice((DEFAULT_BASE, dice.choice(parts.names(BASES)))),
+        lidar=dice.choice((DEFAULT_LIDAR, dice.choice(parts.names(LIDARS)))),
         watched=floor.watched,
         sensors=sensors,
         events=_events(dice, floor, distance),

@@ -94,6 +94,7 @@ def hunt(world: HuntWorld, folders: Sequence[Path] = ()) -> Hunted:
     run = LockstepDrive(
         site, built.site.robots[0].start, mission, world.seed,
         world.sensors.noise(), watched=True, hazard=hazard, bus=None, ground=built.floor,
+        base=world.base, lidar=world.lidar,
     )  # fmt: skip
     oracle = Oracle(
         watching.World(

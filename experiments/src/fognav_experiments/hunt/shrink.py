@@ -10,13 +10,20 @@ from typing import TYPE_CHECKING, Any, Final
 
 from msgspec.structs import asdict, replace
 
+from fog_runtime.configuration.default_parts import DEFAULT_BASE, DEFAULT_LIDAR
 from fognav_experiments.hunt.world import HuntWorld, Sensors
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
 
 _LISTS: Final = ("events", "placed", "opened", "pillars", "watched")
-_PLAIN: Final[dict[str, Any]] = {"warp_m": 0.0, "resolution": 0.05, "radius": 0.17}
+_PLAIN: Final[dict[str, Any]] = {
+    "warp_m": 0.0,
+    "resolution": 0.05,
+    "radius": 0.17,
+    "base": DEFAULT_BASE,
+    "lidar": DEFAULT_LIDAR,
+}
 
 
 def shrink(world: HuntWorld, breaks: Callable[[HuntWorld], float | None], tries: int) -> HuntWorld:

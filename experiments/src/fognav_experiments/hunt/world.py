@@ -18,6 +18,7 @@ from fog_contracts.messages import Id, PointXY, Pose, Seconds
 from fog_contracts.site import AreaSite, DemoPlan, NodeSite, Place, RobotSite, Site, Sonar
 from fog_kernels.components import Components
 from fog_kernels.distance import squared_distance_capped
+from fog_runtime.configuration.default_parts import DEFAULT_BASE, DEFAULT_LIDAR
 from fognav_experiments.scenarios.description import AnyEvent
 from fognav_sim.floor import Floor
 from fognav_sim.lidar_faults import LidarFaults
@@ -102,6 +103,8 @@ class HuntWorld(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields
     warp_m: Annotated[float, Meta(ge=0.0, le=0.3)] = 0.0
     warp_length_m: Annotated[float, Meta(ge=2.0)] = 10.0
     radius: Annotated[float, Meta(gt=0.05, le=0.5)] = 0.17
+    base: Id = DEFAULT_BASE
+    lidar: Id = DEFAULT_LIDAR
     watched: list[Watched] = []
     sensors: Sensors = Sensors()
     events: list[AnyEvent] = []

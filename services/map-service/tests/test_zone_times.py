@@ -187,3 +187,46 @@ def test_windows_of_a_schedule_are_computed_once_in_days_at_any_time_of_the_day(
     for hour in range(48):
         active(times, hour * HOUR, T0 + hour * HOUR)
     assert len(computed) <= 2, "each computation has one or two Wednesdays"
+
+
+@pytest.mark.parametrize(
+    ("fields", "lasts"),
+    [
+        ({"expires_at": T0 + 5 * HOUR}, 0.1),
+        ({"expires_at": T0 + 5 * HOUR}, 2 * HOUR),
+        ({"ttl_s": HOUR}, 0.1),
+        ({"ttl_s": HOUR}, 2 * HOUR),
+    ],
+    ids=["end, a moment", "end, two hours", "time to live, a moment", "time to live, two hours"],
+)
+@pytest.mark.parametrize("jump", [3.5 * HOUR, 24 * HOUR, 365 * 24 * HOUR])
+def test_future_zone_is_in_force_in_its_time_although_the_clock_was_ahead_before(fields, lasts, jump):
+    begin = T0 + 3 * HOUR
+    future = zone(starts_at=begin, **fields)
+    times = ZoneTimes(future)
+    assert not active(times, 0.0, T0)
+    for share in (0.0, 0.5, 1.0):
+        active(times, 1.0 + share * lasts, T0 + 1.0 + share * lasts + jump)
+    restarted = ZoneTimes(future, times.progress("boot", 2.0 + lasts), boot="boot", now=2.0 + lasts)
+    for each in (times, restarted):
+        for now in (2.0 + lasts, 2.5 * HOUR, 2.5 * HOUR + 0.1):
+            active(each, now, T0 + now)
+        assert active(each, 3 * HOUR + 1.0, begin + 1.0)
+        assert each.over_for(3 * HOUR + 1.0) < 0.0
+        active(each, 10 * HOUR, T0 + 10 * HOUR)
+        assert not active(each, 10 * HOUR + 1.0, T0 + 10 * HOUR + 1.0)
+
+
+def test_zone_is_over_since_its_end_and_not_while_a_clock_is_ahead_for_a_moment():
+    times = ZoneTimes(zone(starts_at=T0 + HOUR, expires_at=T0 + 2 * HOUR))
+    active(times, 0.0, T0 + 5 * HOUR)
+    assert times.over_for(10.0) == 10.0
+    active(times, 10.0, T0 + 10.0)
+    assert times.over_for(10.0) < 0.0
+    assert active(times, 1.5 * HOUR, T0 + 1.5 * HOUR)
+    assert times.over_for(1.5 * HOUR) < 0.0
+    assert not active(times, 2 * HOUR, T0 + 2 * HOUR)
+    assert times.over_for(2 * HOUR + 60.0) == 60.0
+    disabled = ZoneTimes(zone(expires_at=T0 - 60.0, enabled=False))
+    active(disabled, 0.0, T0)
+    assert disabled.over_for(HOUR) < 0.0, "it may be enabled again"

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
 import pytest
+from msgspec import structs
 
 from fog_contracts.grid import GridGeometry
 from fog_contracts.messages import CircleShape, Message, Zone
@@ -19,7 +20,7 @@ from map_service.core import MapCore
 from map_service.registry import make_layers
 from map_service.service import Service
 from map_service.store import Store, StoreError
-from map_service.zone_writer import ConflictError
+from map_service.zone_writer import KEPT_S, ConflictError
 
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator
@@ -108,3 +109,30 @@ async def test_zone_that_a_hanging_redis_stored_late_answers_its_repeated_reques
     replaced = await service.zones.replace(zone("z1", "second"), 1, "ann", attempt)
     assert (replaced.reason, replaced.version) == ("first", 2)
     assert (await store.zones())[0] == [replaced] == service.core.zones.zones()
+
+
+async def test_zone_that_ended_an_hour_ago_is_deleted_and_stays_in_the_audit_trail(store: HangingStore) -> None:
+    service = await running(store)
+    service._leading = True  # there is no lease in this Redis, whose epoch it would ask for
+    clock = cast("ManualClock", service._clock)
+    await service.zones.create(structs.replace(zone("short"), ttl_s=10.0), "ann")
+    await service.zones.create(zone("lasting"), "ann")
+    loops = [asyncio.create_task(service.store_loop()), asyncio.create_task(service.publisher.commit_loop())]
+    try:
+        for step, left in ((11.0, ["lasting", "short"]), (KEPT_S - 5.0, ["lasting", "short"]), (10.0, ["lasting"])):
+            clock.advance(step)
+            service.core.tick(service._now())
+            for _ in range(600):
+                if service.core.zones.ids() == left[::-1]:
+                    break
+                await asyncio.sleep(0.1)
+            assert sorted(service.core.zones.ids()) == left
+    finally:
+        for loop in loops:
+            loop.cancel()
+        await asyncio.gather(*loops, return_exceptions=True)
+    assert [each.id for each in (await store.zones())[0]] == ["lasting"]
+    trail = (await service.audit(["zone"], None, 10)).entries
+    assert [(entry.id, entry.action, entry.who) for entry in trail] == [
+        ("short", "delete", "map-service"), ("lasting", "create", "ann"), ("short", "create", "ann"),
+    ]  # fmt: skip

@@ -177,6 +177,10 @@ class MapCore:
         """Return, by id, what must be stored of the times of zones; `boot` identifies the run of the clock."""
         return self._zones.progress(boot, now)
 
+    def zones_over(self, seconds: float, now: float) -> list[Zone]:
+        """Return the zones that have been over for so long (s), which will never be in force again."""
+        return self._zones.over(seconds, now)
+
     def put_zone(self, zone: Zone, at: Moment, spans: Spans | None = None) -> list[Publication]:
         """Add or replace a stored zone, whose cells may be given; raises `ShapeError` for an invalid shape."""
         self._zones.put(zone, at, spans)

@@ -163,6 +163,7 @@ class Service:
                 else:
                     await self._store.check()
                     await self._times.save(self._clock.now())
+                    await self.zones.delete_ended()
                     self._health.set("store", ok=True)
             except StoreError as error:
                 # What was stored but never acknowledged may have gone with a failed primary.

@@ -3,7 +3,8 @@
 The clock on the wall may be wrong, and is set while the process runs. It only names moments for people: what it says
 counts while the time is synchronized, and nothing ends by it alone. A zone that has started stays started, and ends
 once as much time has passed by the monotonic clock as remained when its end became known; while the time is not known,
-the zone is in force, which is the safe side.
+the zone is in force, which is the safe side. Only what was in force ends for good, and not before its start has come: a
+clock that is wrong for a moment takes no zone from the future.
 """
 
 from __future__ import annotations
@@ -64,6 +65,7 @@ class ZoneTimes:
         self._started = self._ended = False
         self._deadline: float | None = None
         """When it ends at the earliest, by the monotonic clock; None while that is not known."""
+        self._over_since = math.inf
         self._window_deadline = -math.inf
         """Until when the schedule's latest window lasts at least, by the monotonic clock."""
         if progress is not None and progress.version == zone.version:
@@ -71,6 +73,21 @@ class ZoneTimes:
 
     def is_active(self, at: Moment) -> bool:
         """Advance to `at`; return whether the zone is in force."""
+        active = self._advance(at)
+        over = self._zone.enabled and (self._ended or (not self._started and self._is_past(at)))
+        self._over_since = min(self._over_since, at.now) if over else math.inf
+        return active
+
+    def over_for(self, now: float) -> float:
+        """Return for how long (s) the zone has been over, so that it will never be in force again; negative: it is not.
+
+        It counts from when that was noticed, by the monotonic clock.
+        """
+        return now - self._over_since
+
+    def _advance(self, at: Moment) -> bool:
+        if self._ended and at.synchronized and at.stamp < (self._zone.starts_at or -math.inf):
+            self._started, self._ended, self._deadline = False, False, None  # a clock that was ahead had started it
         if not self._zone.enabled or self._ended:
             return False
         if not self._started and not self._start(at):
@@ -102,7 +119,8 @@ class ZoneTimes:
     def _start(self, at: Moment) -> bool:
         """Start the zone if its time has come; return whether it has started."""
         starts_at = self._zone.starts_at
-        self._started = starts_at is None or (at.synchronized and starts_at <= at.stamp)
+        begun = starts_at is None or (at.synchronized and starts_at <= at.stamp)
+        self._started = begun and not self._is_past(at)
         if self._started and self._zone.ttl_s is not None:
             self._deadline = at.now + self._zone.ttl_s
         return self._started
@@ -117,6 +135,11 @@ class ZoneTimes:
                 self._deadline = at.now + max(0.0, rest)
             self._ended = rest <= 0.0 and at.now >= self._deadline
         return self._ended
+
+    def _is_past(self, at: Moment) -> bool:
+        """Whether the moment that was named as its end has passed."""
+        end = self._zone.expires_at if self._zone.ttl_s is None else None
+        return end is not None and at.synchronized and end <= at.stamp
 
     def _is_scheduled(self, windows: _Windows, at: Moment) -> bool:
         if not at.synchronized:

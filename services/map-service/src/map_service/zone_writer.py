@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import asyncio
-from contextlib import contextmanager
-from typing import TYPE_CHECKING
+from contextlib import contextmanager, suppress
+from typing import TYPE_CHECKING, Final
 
 from msgspec import structs
 from prometheus_client import Counter
@@ -33,6 +33,9 @@ if TYPE_CHECKING:
     from map_service.zone_validation import PreparedZone
 
 ZONE_WRITES = Counter("fognav_zone_writes_total", "Writes of zones to the store, by outcome", ["outcome"])
+KEPT_S: Final = 3600.0
+"""Zones that have ended are kept for so long, for people to see; they count towards the most that there may be."""
+_DELETED_AT_ONCE: Final = 20
 MAX_PREPARING = 64
 """Most zones that are validated or wait for it; further requests are answered with 503."""
 
@@ -125,6 +128,12 @@ class ZoneWriter:
             await self._unless_ok(outcome, zone_id)
             self._publisher.publish(self._core.remove_zone(zone_id, self._now()))
         await self._publisher.all_on_map()
+
+    async def delete_ended(self) -> None:
+        """Delete zones that have been over for an hour; the audit trail keeps them. Raises `StoreError`."""
+        for zone in self._core.zones_over(KEPT_S, self._now().now)[:_DELETED_AT_ONCE]:
+            with suppress(ConflictError):  # somebody has changed it meanwhile
+                await self.delete(zone.id, zone.version, "map-service")
 
     async def delete_unusable(self, zone_id: str, who: str) -> None:
         """Delete a zone that is left out because its record is invalid; raises `StoreError`."""

@@ -67,6 +67,10 @@ class ZonesLayer(CostLayer):
         """Return, by id, what must be stored of the zones that begin or end."""
         return {entry.zone.id: entry.times.progress(boot, now) for entry in self.catalog.timed()}
 
+    def over(self, seconds: float, now: float) -> list[Zone]:
+        """Return the zones that have been over for so long (s)."""
+        return [entry.zone for entry in self.catalog.timed() if entry.times.over_for(now) >= seconds]
+
     def pop_changed(self) -> bool:
         """Return whether a zone was added, changed, removed, activated or ended since the last call."""
         changed, self._changed = self._changed, False

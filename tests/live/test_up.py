@@ -64,8 +64,12 @@ class Node:
         return done.stdout + done.stderr
 
     def systems(self) -> dict[str, dict[str, Any]]:
-        status = json.loads(self.run("status", "--json").partition("\nfognav:")[0])
-        return {system["site"]: system for system in status["systems"] if system["name"].startswith("fog-")}
+        systems = self.json("status")["systems"]
+        return {system["site"]: system for system in systems if system["name"].startswith("fog-")}
+
+    def json(self, *arguments: str) -> Any:
+        """Return the answer of a command, after which it may have a remark on standard error."""
+        return json.JSONDecoder().raw_decode(self.run(*arguments, "--json"))[0]
 
     def wait(self, condition: Callable[[], object], what: str) -> None:
         deadline = time.monotonic() + (START_S if self.source is None else FIRST_START_S)
@@ -138,6 +142,37 @@ def require_new_node_and_robot_admitted(node: Node, folder: Path) -> None:
     node.wait(lambda: "planner/estig" in (node.systems()["estig"]["connected"] or []), "it is connected again")
     after = node.systems()["estig"]["pids"]
     assert {name for name, pid in after.items() if before[name] != pid} == {"zenoh-router"}
+
+
+@pytest.fixture
+def simulated(tmp_path: Path) -> Iterator[Node]:
+    made = Node(tmp_path, "--sim")
+    yield made
+    made.end()
+
+
+def test_simulated_robot_and_nodes_are_connected_again_after_the_authority_was_replaced(simulated):
+    node = simulated
+    node.up()
+
+    def connected():
+        return set(node.systems()["estig"]["connected"] or [])
+
+    def restarted(before):
+        after = node.systems()["estig"]["pids"]
+        return all(after.get(name, before[name]) != before[name] for name in ("simulator", "robot-agent", "planner"))
+
+    def all_there():
+        areas = node.json("area", "list")["areas"]
+        states = [area["hazard"]["state"] for area in areas]
+        return "robot-agent/r1" in connected() and set(states) == {"clear"}
+
+    node.wait(all_there, "the robot is connected, and its nodes report")
+    for options in ((), ("--finish",)):
+        pids = node.systems()["estig"]["pids"]
+        node.run("ca", "rotate", *options, "--locks", str(node.data / "locks"))
+        node.wait(lambda pids=pids: restarted(pids), f"who has new credentials is started again {options}")
+        node.wait(all_there, f"robot and nodes are back {options}")
 
 
 def test_zone_survives_a_killed_service_and_a_restart_of_the_node(node, tmp_path):

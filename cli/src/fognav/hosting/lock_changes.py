@@ -74,6 +74,6 @@ class LockChanges:
     def _digest(self, name: str) -> bytes:
         found = hashlib.sha256()
         for path in self._files[name]:
-            for file in sorted(path.iterdir()) if path.is_dir() else [path]:
+            for file in sorted(path.iterdir()) if path.is_dir() else [path] if path.exists() else []:
                 found.update(file.name.encode() + b"\0" + hashlib.sha256(file.read_bytes()).digest())
         return found.digest()

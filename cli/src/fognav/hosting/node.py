@@ -112,7 +112,7 @@ class LocalNode:
             await self.supervisor.wait_ready(names, timeout_s)
 
     def lock_changes(self) -> LockChanges:
-        """Watch the files of every server's and service's locks."""
+        """Watch the files of every program's locks, those of simulated nodes and robots, too."""
         locks = self.config.locks
         servers: dict[str, list[Path]] = {name: [locks.folder(folder)] for name, folder in LOCKS.items()}
         services = {
@@ -120,7 +120,16 @@ class LocalNode:
             for site in self.config.sites
             for service in SERVICES
         }
-        return LockChanges(self.supervisor, servers | services)
+        robots = {} if not self.config.simulate else self._robot_locks()
+        return LockChanges(self.supervisor, servers | services | robots)
+
+    def _robot_locks(self) -> dict[str, list[Path]]:
+        files: dict[str, list[Path]] = {}
+        for site in self.config.sites:
+            nodes = [node.id for node in site.loaded.site.nodes]
+            for program, users in ((SIMULATOR, ["sim", *nodes]), (AGENT, [site.loaded.site.robots[0].id])):
+                files[site.name(program)] = [self.config.locks.credentials(site.name(user)) for user in users]
+        return files
 
     def system(self, site: HostedSite) -> System:
         """Return a site's part of the fog node as it is now."""

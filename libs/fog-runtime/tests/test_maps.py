@@ -102,12 +102,29 @@ def test_colour_palette_and_16_bit_images_are_read(tmp_path):
     assert load_map(describe(tmp_path, image="d.png")).cells.tolist() == [[254, 0, 255]]
 
 
-def test_alpha_counts_as_one_of_four_channels_in_trinary_mode(tmp_path):
-    # Opaque black: shade 1/4; transparent white: 3/4; transparent black: 0; opaque white: 1.
-    pixels = [[[0, 255], [255, 0], [0, 0], [255, 255]]]
-    assert load_occupancy(write(tmp_path, pixels)).values.tolist() == [[100, -1, 100, 0]]
+def test_transparent_pixels_are_unknown_and_alpha_says_nothing_of_opaque_ones(tmp_path):
+    """Alpha counted as a fourth colour, as in ROS 1: opaque dark grey became unknown, and a robot saw no wall there."""
+    pixels = [[[0, 255], [80, 255], [255, 255], [0, 0], [255, 254]]]
+    assert load_occupancy(write(tmp_path, pixels)).values.tolist() == [[100, 100, 0, -1, -1]]
     rgba = [[[v, v, v, a] for v, a in pixels[0]]]
-    assert load_occupancy(write(tmp_path, rgba)).values.tolist() == [[100, -1, 100, 0]]
+    assert load_occupancy(write(tmp_path, rgba)).values.tolist() == [[100, 100, 0, -1, -1]]
+
+
+def test_colours_count_by_their_brightness(tmp_path):
+    """Of 255: red 76, green 150, blue 29; by the mean of the three all were 85."""
+    pixels = [[[255, 0, 0], [0, 255, 0], [0, 0, 255], [150, 255, 120]]]
+    write(tmp_path, pixels)
+    shown = load_occupancy(describe(tmp_path, occupied_thresh=0.65, free_thresh=0.42))
+    assert shown.values.tolist() == [[100, 0, 100, 0]]
+
+
+@pytest.mark.data
+def test_dark_grey_of_a_recorded_floor_with_alpha_is_occupied(maps_dir):
+    with Image.open(maps_dir / "ipa" / "lab_intel.png") as image:
+        pixels = np.asarray(image)[::-1]
+    dark = (pixels[:, :, 0] < 89) & (pixels[:, :, 1] == 255)
+    assert dark.any()
+    assert (load_map(maps_dir / "ipa" / "lab_intel.yaml").cells[dark] == 254).all()
 
 
 def test_scale_mode_interpolates_between_thresholds_and_transparent_is_unknown(tmp_path):

@@ -1,7 +1,8 @@
 """Reading and writing map files of ROS's map_server (a YAML file beside an image).
 
-Pixels are interpreted as by Nav2's `nav2_map_server/map_io`: the shade is the mean of the colour channels, in trinary
-mode with alpha as one more channel; the occupancy is 1 - shade, or the shade when negated.
+Pixels are interpreted as by Nav2's `nav2_map_server/map_io` since 1.5: the shade is a pixel's brightness, what is
+not opaque is unknown (in ROS 1, and in Nav2 before, alpha was one more colour); the occupancy is 1 - shade, or the shade
+when negated.
 
 An image may have up to MAX_CELLS pixels. Reading a greyscale image of 8 bits takes at most 4 bytes of memory per cell,
 a coloured one 7: it is decoded as a whole, but converted band by band.
@@ -149,6 +150,10 @@ def _read_metadata(file: Path) -> _Metadata:
     )
 
 
+_BRIGHTNESS: Final = np.array([306.0, 601.0, 117.0]) / 1024.0
+"""What red, green and blue add to a pixel's brightness, in GraphicsMagick, by which Nav2 reads images."""
+
+
 @contextmanager
 def _opened(file: Path, image: Path) -> Iterator[Image.Image]:
     """Open an image of at most MAX_CELLS pixels; whatever goes wrong with it becomes a `MapFileError`."""
@@ -192,16 +197,13 @@ def _plain_mode(image: Image.Image) -> str | None:
 
 def _split_alpha(pixels: NDArray[np.float64], mode: str) -> tuple[NDArray[np.float64], NDArray[np.float64] | None]:
     """Split the pixels of an image in one of the plain modes into colours (h, w, n) and alpha (h, w) or None."""
-    if mode == "LA":
-        # Alpha must weigh as one of four channels, so grey is repeated as red, green and blue.
-        return np.repeat(pixels[:, :, :1], 3, axis=2), pixels[:, :, 1]
-    if mode == "RGBA":
-        return pixels[:, :, :3], pixels[:, :, 3]
+    if mode in {"LA", "RGBA"}:
+        return pixels[:, :, :-1], pixels[:, :, -1]
     return pixels[:, :, None] if pixels.ndim == 2 else pixels, None
 
 
 def load_occupancy(yaml_path: Path) -> Occupancy:
-    """Read a map file as map_server does, without applying the yaw; raises `MapFileError`."""
+    """Read a map file as Nav2's map_server does, without applying the yaw; raises `MapFileError`."""
     metadata = _read_metadata(yaml_path)
     with _opened(yaml_path, metadata.image) as picture:
         width, height = picture.size
@@ -227,10 +229,13 @@ def _bands(height: int, width: int) -> Iterator[slice]:
 def _occupancy(
     colours: NDArray[np.float64], alpha: NDArray[np.float64] | None, metadata: _Metadata
 ) -> NDArray[np.float64]:
-    """Return the occupancy (0..100, or -1 unknown) of pixels, in their order."""
-    if metadata.mode == "trinary" and alpha is not None:
-        colours = np.concatenate([colours, alpha[:, :, None]], axis=2)
-    shade: NDArray[np.float64] = colours.mean(axis=2)
+    """Return the occupancy (0..100, or -1 unknown) of pixels, in their order, by the rules of Nav2 since 1.5.
+
+    Transparent pixels are unknown; of opaque ones alpha says nothing.
+    """
+    shade: NDArray[np.float64] = colours[:, :, 0]
+    if colours.shape[2] > 1:
+        shade = np.rint(colours @ _BRIGHTNESS * 255.0) / 255.0
     if metadata.mode == "raw":
         percent = np.rint(shade * 255.0)
         return np.where(percent <= OCCUPIED_PERCENT, percent, UNKNOWN_PERCENT)
@@ -240,9 +245,9 @@ def _occupancy(
     else:
         between = np.full(occ.shape, float(UNKNOWN_PERCENT))
     values = np.where(
-        occ > metadata.occupied_thresh, OCCUPIED_PERCENT, np.where(occ < metadata.free_thresh, 0.0, between)
+        occ >= metadata.occupied_thresh, OCCUPIED_PERCENT, np.where(occ <= metadata.free_thresh, 0.0, between)
     )
-    if metadata.mode == "scale" and alpha is not None:
+    if alpha is not None:
         values = np.where(alpha < 1.0, UNKNOWN_PERCENT, values)
     return values
 

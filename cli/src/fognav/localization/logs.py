@@ -1,7 +1,7 @@
 """Recorded logs of a robot with a planar lidar: scans with odometry, and reference poses where the log has them.
 
-Formats: JSON lines (one object with `odom`, `ref` and `ranges` per scan after one with `meta`, gzipped or not), and
-CARMEN (`FLASER` messages; see the CARMEN toolkit's message formats).
+Formats: JSON lines (one object with `odom`, `ref` and `ranges` per scan after one with `meta`, gzipped or not), CARMEN
+(`FLASER` messages; see the CARMEN toolkit's message formats), and rosbag2 (`bags`).
 """
 
 from __future__ import annotations
@@ -15,6 +15,7 @@ from typing import IO, TYPE_CHECKING, Final, Literal, cast, get_args
 
 import numpy as np
 
+from fognav.localization.bags import is_bag, read_bag
 from fognav.output import WrongUseError
 from robot_agent.localization.pose import Pose2
 
@@ -70,10 +71,10 @@ def read_log(path: Path, log_format: Format = "auto") -> LidarLog:
     """Read a log; raises `WrongUseError` with file, line and remedy when it can't be used."""
     if log_format not in get_args(Format):
         raise WrongUseError(f"the format must be one of {', '.join(get_args(Format))}, not {log_format!r}")
+    if log_format == "rosbag2" or (log_format == "auto" and is_bag(path)):
+        return _finished([LogScan(*scan) for scan in read_bag(path)], coded=False)  # they say which returns count
     first = next(_lines(path), (0, ""))[1]
     found = log_format if log_format != "auto" else ("jsonl" if first.lstrip().startswith("{") else "carmen")
-    if found == "rosbag2":
-        raise WrongUseError(f"{path}: rosbag2 can't be read. Convert the bag to JSON lines or CARMEN")
     reader = _carmen_scan if found == "carmen" else _JsonScans()
     scans = list(_scans(path, reader))
     if not scans:
@@ -160,9 +161,9 @@ def _carmen_scan(line: str) -> LogScan | None:
     return LogScan(float(words[count + 8]), odom, laser, beam_angles(count), ranges)
 
 
-def _finished(scans: list[LogScan]) -> LidarLog:
-    """Remove codes for "no return", make the stamps increase, and tell odometry from reference."""
-    code = _no_return_code(scans)
+def _finished(scans: list[LogScan], *, coded: bool = True) -> LidarLog:
+    """Remove codes for "no return", if ranges are coded, make the stamps increase, and tell odometry from reference."""
+    code = _no_return_code(scans) if coded else math.inf
     start, last = scans[0].stamp, -math.inf
     finished: list[LogScan] = []
     steady = _median_period(scans)

@@ -9,7 +9,7 @@ import typer
 from fognav.localization.logs import Format, Selection
 
 LogFormat = Annotated[
-    Format, typer.Option("--format", help="Format of the log; intel is JSON lines, auto looks at the first line.")
+    Format, typer.Option("--format", help="Format of the log; intel is JSON lines, auto looks at the file.")
 ]
 Scans = Annotated[Selection, typer.Option("--scans", help="Scans to use: all, or those with odd or even numbers.")]
 RangeMax = Annotated[

@@ -1,8 +1,8 @@
 """Reading and writing map files of ROS's map_server (a YAML file beside an image).
 
 Pixels are interpreted as by Nav2's `nav2_map_server/map_io` since 1.5: the shade is a pixel's brightness, what is
-not opaque is unknown (in ROS 1, and in Nav2 before, alpha was one more colour); the occupancy is 1 - shade, or the shade
-when negated.
+not opaque is unknown (before, and in ROS 1, alpha was one more colour); the occupancy is 1 - shade, or the shade when
+negated.
 
 An image may have up to MAX_CELLS pixels. Reading a greyscale image of 8 bits takes at most 4 bytes of memory per cell,
 a coloured one 7: it is decoded as a whole, but converted band by band.

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 from contextlib import suppress
 from functools import cache
@@ -27,10 +28,13 @@ if TYPE_CHECKING:
     from collections.abc import Sequence
 
     from fog_contracts.grid import StaticMap
-    from fog_contracts.messages import Zone
+    from fog_contracts.messages import CommandKind, Zone
 
 _AFTER_S: Final = 3.0
 """How long a drive goes on after a broken rule: what it leads to says more of it."""
+_HELP_S: Final = 12.0
+_FIND_POSE: Final[tuple[CommandKind, ...]] = ("turn", "advance", "initial_pose")
+"""What an operator tries if a robot does not know its pose."""
 _BUSY_S: Final = 2.0
 """How late messages are at most, but one in thousands, while a radio is busy."""
 
@@ -142,6 +146,33 @@ class _WatchedStage(Stage):
             self._oracle.on_obstacle_gone(area)
 
 
+class _Helper:
+    """An operator who does what a robot's reasons ask for, beside enabling it: some commands are refused."""
+
+    def __init__(self, world: HuntWorld, now: float) -> None:
+        self._world = world
+        self._next = now
+        self._asked = itertools.cycle(_FIND_POSE)
+
+    def help(self, run: LockstepDrive) -> None:
+        """Give a command, at most one in a while."""
+        if run.state is None or run.now < self._next:
+            return
+        reasons, pose = " ".join(run.state.reasons), None
+        if "let the robot turn" in reasons:
+            kind = next(self._asked)
+            x, y, theta = run.world.pose
+            map_x, map_y = to_map(self._world, x, y)
+            pose = Pose(x=map_x, y=map_y, theta=theta) if kind == "initial_pose" else None
+        elif "the robot is in" in reasons and run.state.mode in {"INIT", "PROTECTIVE_STOP"}:
+            kind = "egress"
+        else:
+            return
+        self._next = run.now + _HELP_S
+        reply = run.robot.command(kind, pose)
+        run.log_event(f"operator: {kind}: {reply.reason or 'accepted'}")
+
+
 def _drive(world: HuntWorld, run: LockstepDrive, oracle: Oracle, mission: RobotGoal) -> DriveOutcome:
     problem = run.warm_up()
     drive = run.start()
@@ -149,7 +180,7 @@ def _drive(world: HuntWorld, run: LockstepDrive, oracle: Oracle, mission: RobotG
         return DriveOutcome("stopped", problem)
     stage = _WatchedStage(run, world, oracle)
     run.system.fog.planner.set_goal(run.robot.id, mission, any_heading=True)
-    until = math.inf
+    until, helper = math.inf, _Helper(world, run.now)
     outcome, closed = None, False
     while outcome is None and stage.elapsed < min(world.seconds, until):
         stage.step()
@@ -159,6 +190,7 @@ def _drive(world: HuntWorld, run: LockstepDrive, oracle: Oracle, mission: RobotG
             assert drive.hazard.planned is not None
             closed = True
             oracle.on_barrier(drive.hazard.planned.area.polygon, run.now)
+        helper.help(run)
         outcome = drive.outcome(run.now)
         if oracle.violations and until == math.inf:
             until = stage.elapsed + _AFTER_S

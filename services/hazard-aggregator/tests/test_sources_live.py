@@ -133,6 +133,24 @@ async def test_topic_that_ends_the_brokers_connection_is_refused_and_stored_by_a
         assert "U+0001" in json.dumps(areas)
 
 
+async def test_invalid_source_in_the_sites_file_leaves_its_area_unknown_and_the_others_watched(fog, tokens):
+    file = fog.site / "site.toml"
+    doors = SITE_SOURCE.replace('profile = "esphome-binary"', 'profile = "esphome-binary"\ntopic = "doors/+/state"')
+    file.write_text(file.read_text().split("[[nodes]]")[0] + doors)
+    fog.start("hazard_aggregator")
+    url = await fog.ready("hazard_aggregator")
+    async with httpx.AsyncClient(base_url=url, timeout=60) as client, broker(fog) as mqtt:
+        bell = {"id": "bell", "topic": "yard/bell", "blocked": ["1"], "clear": ["0"], "period_s": 60.0}
+        body = {"polygon": POLYGON, "sources": [bell]}
+        put = await client.put("/api/v1/areas/yard", json=body, headers=tokens["operator"])
+        assert put.status_code == 201, put.text
+        await mqtt.publish("yard/bell", "0")
+        await wait_for(client, "yard", lambda hazard: hazard["state"] == "clear")
+        assert (await wait_for(client, "hall", lambda _: True))["state"] == "unknown"
+    assert "site_area_unusable" in fog.log("hazard_aggregator")
+    assert "'doors/+/state' has a wildcard" in fog.log("hazard_aggregator")
+
+
 async def test_invalid_source_is_refused_with_the_field(fog, tokens):
     fog.start("hazard_aggregator")
     async with httpx.AsyncClient(base_url=await fog.ready("hazard_aggregator"), timeout=60) as client:

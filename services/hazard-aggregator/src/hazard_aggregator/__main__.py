@@ -65,7 +65,7 @@ async def main() -> None:
         cones = node_cones(loaded.site.nodes, loaded.map)
         unusable = UnusableAreas(Members(nodes, find_rule, settings.debounce, cones).checked, health)
         usable = unusable.made_usable(stored.definitions, stored.unreadable)
-        definitions = {d.id: d for d in [*loaded.site.definitions(), *usable]}
+        definitions = {d.id: d for d in [*unusable.of_site(loaded.site.definitions()), *usable]}
         fusion = AreaFusion(
             definitions.values(), loaded.site.nodes, 0, stored.hazards,
             registry=find_rule, default_rule=settings.debounce, cones=cones, robots=loaded.site.robots,

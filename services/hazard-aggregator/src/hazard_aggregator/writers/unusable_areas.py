@@ -10,6 +10,7 @@ from prometheus_client import Gauge
 from fog_contracts.messages import FusionPolicy
 from fog_runtime import logs
 from hazard_aggregator.area_size import AreaError, check_size
+from hazard_aggregator.sensors.source_profiles import SourceError
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Mapping
@@ -54,6 +55,22 @@ class UnusableAreas:
                 usable.append(structs.replace(rest, cone_of=None))
         self._records = records
         self._report(reasons)
+        return usable
+
+    def of_site(self, definitions: Iterable[AreaDefinition]) -> list[AreaDefinition]:
+        """Return the areas of a site's file; without anything that watches them those that have an invalid source.
+
+        They are unknown until somebody mends them, and the floor goes on. Raises `AreaError` for other mistakes.
+        """
+        usable = []
+        for definition in definitions:
+            try:
+                usable.append(self._checked(definition))
+            except SourceError as error:
+                remedy = "mend it in site.toml, or PUT the area; until then it is unknown"
+                _log.error("site_area_unusable", area=definition.id, reason=str(error), remedy=remedy)
+                rest = self._checked(structs.replace(definition, sources=[], fusion=FusionPolicy()))
+                usable.append(structs.replace(rest, nodes=[], cone_of=None))
         return usable
 
     def as_stored(self, definition: AreaDefinition) -> AreaDefinition:

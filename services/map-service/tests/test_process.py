@@ -26,9 +26,11 @@ from fog_contracts.messages import (
     NodeReading,
     RobotObstacles,
     RobotPose,
+    RobotState,
     ZoneSet,
 )
 from fog_contracts.replica import Applied, Replica
+from fog_runtime.leases.lease import HEARSAY_PAUSE_S
 
 pytestmark = pytest.mark.live
 CIRCLE = {"kind": "BLOCKED", "shape": {"type": "circle", "centre": [6.0, 3.0], "radius": 0.5}, "reason": "wet floor"}
@@ -291,6 +293,23 @@ async def test_obstacles_of_a_robot_are_on_the_map_until_they_expire(shared_fog,
         robot.zenoh.publish(ch.ROBOT_OBSTACLES, seen, robot="r1")
         await until(lambda: robot.cost(1.0, 1.0) == LETHAL, "seen", lambda: shared_fog.log("map_service"))
         await until(lambda: robot.cost(1.0, 1.0) == 0, "gone")
+
+
+async def test_robot_that_tells_of_ever_higher_epochs_does_not_hold_up_the_map(fog, until):
+    async with running(fog, "map_service") as (_, robot, _):
+        await until(lambda: robot.heartbeats, "heartbeats")
+        seen, began = len(robot.heartbeats), time.monotonic()
+        for _ in range(60):
+            epochs = {"map-service": robot.heartbeats[-1].epoch + 1_000_000}
+            state = RobotState(
+                mode="NORMAL", reasons=[], enabled=True, battery=None, goal_id=None, map_epoch=0, map_seq=0,
+                plan_id=None, epochs=epochs,
+            )  # fmt: skip
+            robot.zenoh.publish(ch.ROBOT_STATE, state, robot="r1")
+            await asyncio.sleep(0.05)
+        await until(lambda: len(robot.heartbeats) >= seen + 20, "heartbeats", lambda: fog.log("map_service"))
+        questions = 1 + (time.monotonic() - began) / HEARSAY_PAUSE_S
+        assert 1 < len({beat.epoch for beat in robot.heartbeats[seen:]}) <= 1 + questions
 
 
 async def test_clear_area_becomes_unknown_when_the_aggregator_dies(fog, until):

@@ -3,6 +3,8 @@
 import ctypes
 import json
 import os
+import pty
+import re
 import shutil
 import stat
 import subprocess
@@ -14,14 +16,18 @@ from types import SimpleNamespace
 import msgspec
 import paho.mqtt.client as paho
 import pytest
+import yaml
 from hypothesis import given
 from hypothesis import strategies as st
+from msgspec.structs import fields
 from paho.mqtt.enums import CallbackAPIVersion
-from typer.testing import CliRunner
+from typer.testing import CliRunner, Result
 
-from fog_contracts.messages import NodeCalibration
+from fog_contracts import channels as ch
+from fog_contracts.messages import NodeCalibration, NodeConfig, NodeReading
 from fog_contracts.site import NodeSite, Sonar
 from fog_runtime.configuration.site import load_site
+from fog_runtime.locks.site_locks import SiteLocks
 from fog_supervisor.servers import start_mosquitto
 from fognav.commands import node as node_command
 from fognav.commands.node import node_app
@@ -40,16 +46,20 @@ def floor(tmp_path: Path) -> Path:
     return Path(shutil.copytree(ROOT / "sites" / "estig", tmp_path / "floor"))
 
 
+NETWORK = ("--wifi", "Lab", "--wifi-password", "secret", "--fog-host", "192.168.7.1", "--no-tls")
+
+
 def run(*command: str) -> subprocess.CompletedProcess[str]:
     return subprocess.run(
-        [sys.executable, "-m", "fognav", "node", *command], cwd=ROOT, capture_output=True, text=True, check=False
-    )
+        [sys.executable, "-m", "fognav", "node", *command], cwd=ROOT, capture_output=True, text=True, check=False,
+        stdin=subprocess.DEVNULL,
+    )  # fmt: skip
 
 
 def add(floor: Path, pose: str = WALL_BELOW_Z4, **options: str) -> subprocess.CompletedProcess[str]:
-    values = {"area": "z4", "wifi": "Lab", "out": str(floor / "board"), "site": str(floor), **options}
+    values = {"area": "z4", "out": str(floor / "board"), "site": str(floor), **options}
     words = [word for name, value in values.items() for word in (f"--{name}", value)]
-    return run("add", "n8", "--pose", pose, "--json", *words)
+    return run("add", "n8", "--pose", pose, "--json", *words, *NETWORK)
 
 
 def test_added_node_is_in_the_site_and_its_board_accepts_its_settings(floor: Path, tmp_path: Path) -> None:
@@ -79,7 +89,7 @@ def test_added_node_is_in_the_site_and_its_board_accepts_its_settings(floor: Pat
 def test_publishing_of_a_node_is_in_the_site_and_in_its_boards_settings(floor: Path, options, every) -> None:
     words = [f"--{name}" for name in options]
     done = run(
-        "add", "n8", "--pose", WALL_BELOW_Z4, "--area", "z4", "--wifi", "Lab", "--out", str(floor / "board"),
+        "add", "n8", "--pose", WALL_BELOW_Z4, "--area", "z4", *NETWORK, "--out", str(floor / "board"),
         "--site", str(floor), *words,
     )  # fmt: skip
     assert done.returncode == 0, done.stderr
@@ -152,6 +162,116 @@ def test_node_that_would_be_of_no_use_is_refused_and_nothing_is_written(floor, p
     assert not (floor / "board").exists()
 
 
+@pytest.fixture
+def locks(tmp_path: Path) -> Path:
+    made = SiteLocks(tmp_path / "locks", "estig")
+    made.make(["fog.example", "192.168.7.1"])
+    return made.directory
+
+
+def new_board(floor: Path, *words: str) -> Result:
+    command = ["add", "n8", "--pose", WALL_BELOW_Z4, "--area", "z4", "--site", str(floor), "--wifi", "Lab"]
+    return CliRunner().invoke(node_app, [*command, "--out", str(floor / "board"), *words])
+
+
+@pytest.mark.parametrize(
+    ("words", "says"),
+    [
+        (["--fog-host", "192.168.7.1", "--no-tls"], "--wifi-password is missing"),
+        (["--wifi-password", "", "--no-tls"], "--fog-host is missing"),
+        (["--wifi-password", "", "--fog-host", "fog.local", "--no-tls"], "can't look up names in .local"),
+        (["--wifi-password", "", "--fog-host", "127.0.0.1", "--no-tls"], "that is the board itself"),
+        (["--wifi-password", "", "--fog-host", "192.168.7.1"], "nothing says whom the board shall trust"),
+        (["--wifi-password", "", "--fog-host", "nobody.example", "--locks", "LOCKS"], "for fog.example, 192.168.7.1"),
+        (["--wifi-password", "", "--fog-host", "192.168.7.1", "--no-tls", "--firmware", "esphome"], "TLS only"),
+        (
+            ["--wifi-password", "", "--fog-host", "192.168.7.2", "--locks", "LOCKS", "--firmware", "esphome"],
+            "192.168.7.2 is not in the broker's certificate",
+        ),
+    ],
+)
+def test_settings_by_which_no_board_could_connect_are_refused_and_nothing_is_written(floor, locks, words, says) -> None:
+    before = (floor / "site.toml").read_bytes()
+    done = new_board(floor, *(str(locks) if word == "LOCKS" else word for word in words))
+    assert done.exit_code == 2
+    assert says in " ".join(done.stderr.split())
+    assert (floor / "site.toml").read_bytes() == before
+    assert not (floor / "board").exists()
+
+
+def test_what_is_missing_is_asked_for_on_a_terminal(floor: Path) -> None:
+    board, terminal = pty.openpty()
+    command = ["add", "n8", "--pose", WALL_BELOW_Z4, "--area", "z4", "--site", str(floor), "--wifi", "Lab", "--no-tls"]
+    with subprocess.Popen(
+        [sys.executable, "-m", "fognav", "node", *command, "--out", str(floor / "board")], cwd=ROOT,
+        stdin=terminal, stderr=subprocess.PIPE, start_new_session=True,
+    ) as process:  # fmt: skip
+        assert process.stderr is not None
+        for asked, answer in ((b"network Lab: ", b"se cret\n"), (b"boards' network:", b"192.168.7.1\n")):
+            said = b""
+            while not said.endswith(asked):
+                said += (more := process.stderr.read(1))
+                assert more, said
+            os.write(board, answer)
+        rest = process.stderr.read()
+    os.close(board)
+    os.close(terminal)
+    assert process.returncode == 0, rest
+    written = json.loads((floor / "board" / "node.json").read_bytes())
+    assert (written["wifi_password"], written["broker"]) == ("se cret", "192.168.7.1")
+
+
+@pytest.mark.parametrize("host", ["192.168.7.1", "192.168.7.9", "fog.example"])
+def test_board_behind_locks_gets_a_password_and_whom_to_trust(floor: Path, locks: Path, host: str) -> None:
+    """An address need not be in the certificate: the firmware compares a name that is."""
+    done = new_board(floor, "--wifi-password", "", "--fog-host", host, "--locks", str(locks))
+    assert done.exit_code == 0, done.stderr
+    written = json.loads((floor / "board" / "node.json").read_bytes())
+    assert (written["broker"], written["port"], written["tls"]) == (host, 8883, True)
+    trusted = (floor / "board" / "ca.pem").read_text()
+    assert "BEGIN CERTIFICATE" in trusted
+    own = provisioning.credentials_in(floor / "board", "n8")
+    assert (own.user, own.passwords["mqtt"], own.authority) == ("n8", written["password"], trusted)
+    with pytest.raises(WrongUseError, match="that of node n8"):
+        provisioning.credentials_in(floor / "board", "n7")
+
+
+@pytest.mark.parametrize("profile", ["standard", "thesis"])
+def test_board_for_esphome_gets_all_that_its_configuration_reads(floor: Path, locks: Path, profile: str) -> None:
+    words = ("--wifi-password", "a'b\"c", "--locks", str(locks), "--firmware", "esphome", "--profile", profile)
+    done = new_board(floor, "--fog-host", "192.168.7.1", *words)
+    assert done.exit_code == 0, done.stderr
+    assert "esphome run" in done.stderr
+    configuration = (floor / "board" / "fognav-node.yaml").read_text("utf-8")
+    secrets = yaml.safe_load((floor / "board" / "secrets.yaml").read_text("utf-8"))
+    assert stat.S_IMODE((floor / "board" / "secrets.yaml").stat().st_mode) == 0o600
+    assert set(re.findall(r"!secret (\w+)", configuration)) <= set(secrets)
+    assert secrets["wifi_password"] == "a'b\"c"
+    assert secrets["authority"] == (floor / "board" / "ca.pem").read_text()
+    board = (ROOT / "firmware/lib/node_edge/src/board_pins.hpp").read_text("utf-8").split("kD1Mini32 = ")[1]
+    pins = [tuple(map(int, pair)) for pair in re.findall(r"\{(\d+), (\d+)\}", board)]
+    own = [(secrets[f"trigger_{number}"], secrets[f"echo_{number}"]) for number in (1, 2)]
+    assert own == (pins[:2] if profile == "standard" else pins[2:4])
+
+
+def test_configuration_for_esphome_uses_the_topics_and_fields_of_the_contract() -> None:
+    text = (ROOT / "firmware/esphome/fognav-node.yaml").read_text("utf-8")
+    topics = {topic.replace("${site}", "s").replace("${node}", "n") for topic in re.findall(r"topic: (fog/\S+)", text)}
+    used = (ch.NODE_READING, ch.NODE_AVAILABILITY, ch.NODE_CONFIG, ch.NODE_COMMAND, ch.NODE_PROBLEM)
+    assert topics == {channel.key(site="s", node="n") for channel in used}
+    assert set(re.findall(r'root\["(\w+)"\]', text)) == {field.name for field in fields(NodeReading)} - {"rssi"}
+    assert set(re.findall(r'x\["(\w+)"\]', text)) <= {field.name for field in fields(NodeConfig)}
+
+
+@pytest.mark.skipif("FOGNAV_ESPHOME" not in os.environ, reason="FOGNAV_ESPHOME names no `esphome` to check with")
+def test_esphome_finds_the_configuration_valid(floor: Path, locks: Path) -> None:
+    words = ("--wifi-password", "secret12", "--locks", str(locks), "--firmware", "esphome")
+    assert new_board(floor, "--fog-host", "192.168.7.1", *words).exit_code == 0
+    command = [os.environ["FOGNAV_ESPHOME"], "config", str(floor / "board" / "fognav-node.yaml")]
+    done = subprocess.run(command, capture_output=True, text=True, check=False, env={**os.environ, "HOME": str(floor)})
+    assert "Configuration is valid" in done.stdout + done.stderr, done.stdout + done.stderr
+
+
 def test_settings_of_another_board_are_never_overwritten_by_add(floor: Path) -> None:
     (floor / "board").mkdir()
     (floor / "board" / "node.json").write_text("{}")
@@ -165,7 +285,7 @@ def test_settings_of_another_board_are_never_overwritten_by_add(floor: Path) -> 
 def test_replaced_board_has_a_new_password_and_the_same_place(floor: Path, tmp_path: Path) -> None:
     passwords = tmp_path / "passwords"
     provisioning.set_password(passwords, "n1", "old")
-    words = ("--wifi", "Lab", "--site", str(floor), "--out", str(tmp_path), "--passwords", str(passwords))
+    words = (*NETWORK, "--site", str(floor), "--out", str(tmp_path), "--passwords", str(passwords))
     done = run("replace", "n1", *words)
     assert done.returncode == 0, done.stderr
     first = json.loads((tmp_path / "node.json").read_text())
@@ -182,7 +302,7 @@ def test_new_board_never_takes_the_file_of_another_node(floor: Path, tmp_path: P
     file = tmp_path / "node.json"
     for text, says in (('{"node": "n2"}', "that of node n2"), ("[]", "no node's settings")):
         file.write_text(text)
-        done = run("replace", "n1", "--wifi", "Lab", "--site", str(floor), "--out", str(tmp_path))
+        done = run("replace", "n1", *NETWORK, "--site", str(floor), "--out", str(tmp_path))
         assert done.returncode == 2
         assert says in " ".join(done.stderr.split())
         assert file.read_text() == text

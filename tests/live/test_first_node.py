@@ -21,6 +21,7 @@ from PIL import Image
 
 from fog_contracts.costs import LETHAL
 from fog_runtime.configuration.site import load_site
+from fog_runtime.locks.site_locks import SiteLocks
 from fog_supervisor import child, net
 from fog_supervisor.servers import start_mosquitto, start_redis, start_router
 
@@ -53,6 +54,9 @@ class Lab:
             start_router(folder / "zenoh"),
         ]
         broker, redis, router = self.servers
+        # A board gets its password from locks; the broker of this test lets in everybody.
+        self.locks = folder / "locks"
+        SiteLocks(self.locks, "estig").make(["fog.example"])
         self.port, self.map_port = net.free_port(), net.free_port()
         runtime = folder / "runtime"
         runtime.mkdir(mode=0o700)
@@ -94,6 +98,7 @@ class Lab:
     def words(self, command: str) -> list[str]:
         """The command with the page's folders in the test's, run by this interpreter."""
         inside = {name: str(self.folder / name) for name in ("floor", "board", "coverage.png")}
+        inside["~/.local/share/fognav/locks"] = str(self.locks)
         words = [inside.get(word, word) for word in shlex.split(command)]
         return [sys.executable, "-m", "fognav", *words[1:]] if words[0] == "./fognav" else words
 
@@ -192,3 +197,4 @@ def test_page_leads_from_a_site_to_a_hazard(lab: Lab) -> None:
     assert lab.cost_at(33.2, 39.4) == LETHAL
     assert (lab.folder / "coverage.png").stat().st_size > 1000
     assert oct((lab.folder / "board" / "node.json").stat().st_mode)[-3:] == "600"
+    assert "BEGIN CERTIFICATE" in (lab.folder / "board" / "ca.pem").read_text()

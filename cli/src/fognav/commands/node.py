@@ -41,7 +41,7 @@ BrokerOption = Annotated[
 @node_app.command(
     "add",
     context_settings=NUMBERS,
-    epilog="Example: fognav node add n8 --area z1 --pose 40.0,26.95,1.5708 --site sites/floor --wifi Lab",
+    epilog="Example: fognav node add n8 --area z1 --pose 40.0,26.95,1.5708 --site sites/floor --wifi Lab --locks LOCKS",
 )
 @with_board_options
 def node_add(
@@ -63,6 +63,7 @@ def node_add(
     Its range limits come from the map: the wall opposite, less 0.3 m. Calibrate it when it hangs.
     """
     with exit_codes():
+        board = board.completed()
         loaded = site_file.load(checkout.site_folder(board.site))
         if board.target.exists():
             raise WrongUseError(
@@ -80,7 +81,7 @@ def node_add(
         board.report("added", node)
 
 
-@node_app.command("replace", epilog="Example: fognav node replace n3 --site sites/floor --wifi Lab --out board")
+@node_app.command("replace", epilog="Example: fognav node replace n3 --site sites/floor --wifi Lab --locks LOCKS")
 @with_board_options
 def node_replace(name: NameArgument, *, board: BoardOptions) -> None:
     """Write the settings of a new board for a node of the site, with a new password.
@@ -88,6 +89,7 @@ def node_replace(name: NameArgument, *, board: BoardOptions) -> None:
     With --passwords the old board's password is worth nothing from the broker's next start on.
     """
     with exit_codes():
+        board = board.completed()
         loaded = site_file.load(checkout.site_folder(board.site))
         node = site_file.node_of(loaded, name)
         if (other := provisioning.node_in(board.target)) not in (None, name):
@@ -265,11 +267,17 @@ def node_sim(  # noqa: PLR0913  # each option is an argument
         bool | None,
         typer.Option("--every-reading/--saving-air", help="What it publishes; default: as the site's file says."),
     ] = None,
+    board: Annotated[
+        Path | None, typer.Option("--board", metavar="DIR", help="Folder of its board's settings, to log in by them.")
+    ] = None,
     site: SiteOption = SITE,
     broker: BrokerOption = None,
     fog: FogOption = None,
 ) -> None:
-    """Run one node of a site with the firmware's own code, on a real broker and a simulated floor; Ctrl-C ends it."""
+    """Run one node of a site with the firmware's own code, on a real broker and a simulated floor; Ctrl-C ends it.
+
+    A locked broker lets it in by its board's settings (--board), or by the credentials that the environment names.
+    """
     from fognav.nodes import simulated  # noqa: PLC0415  # the simulator's imports are slow
 
     with exit_codes():
@@ -278,10 +286,11 @@ def node_sim(  # noqa: PLR0913  # each option is an argument
         if every_reading is not None:
             node = msgspec.structs.replace(node, every_reading=every_reading)
         persons = [_numbers("--person", text, 2) for text in person or ()]
+        own = own_credentials() if board is None else provisioning.credentials_in(board, name)
         url, _, _ = _on(fog, broker, loaded.site.id)
         _compiled()
         node_code.prepare(print_line)
-        _run(_bounded(simulated.run(loaded, node, url, [(x, y) for x, y in persons]), seconds))
+        _run(_bounded(simulated.run(loaded, node, url, own, [(x, y) for x, y in persons]), seconds))
 
 
 _RESULTS: Final = {

@@ -2,24 +2,30 @@
 
 import functools
 import inspect
+import ipaddress
+import shutil
+import sys
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Annotated, Any, Final, Literal, cast
+from typing import Annotated, Any, Final, Literal, Self, cast
 
 import typer
 
 from fog_contracts.site import NodeSite
 from fog_runtime.configuration.site import LoadedSite
+from fognav import checkout
 from fognav.locking import LocksOption, locks_errors, locks_folder, open_locks
 from fognav.nodes import provisioning
 from fognav.operate.options import JsonOption
-from fognav.output import print_json, print_line
+from fognav.output import WrongUseError, print_json, print_line
 
 SITE: Final = Path("estig")
 SiteOption = Annotated[Path, typer.Option("--site", metavar="D", help="Folder of the site, or a name in sites/.")]
 _TLS_PORT: Final = 8883
 _OPEN_PORT: Final = 1883
+_ESPHOME: Final = Path("firmware", "esphome", "fognav-node.yaml")
+"""What ESPHome makes a node of; it reads the board's settings from beside its copy."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -28,52 +34,116 @@ class BoardOptions:
 
     wifi: Annotated[str, typer.Option("--wifi", metavar="NAME", help="Name of the Wi-Fi network.")]
     wifi_password: Annotated[
-        str,
-        typer.Option("--wifi-password", envvar="FOGNAV_WIFI_PASSWORD", help="Its password; better in the variable."),
-    ] = ""
+        str | None,
+        typer.Option(
+            "--wifi-password",
+            envvar="FOGNAV_WIFI_PASSWORD",
+            help="Its password, empty for an open network; better in the variable. Asked for, if not given.",
+        ),
+    ] = None
     site: SiteOption = SITE
-    fog_host: Annotated[str, typer.Option("--fog-host", metavar="HOST", help="The fog node's name for the boards.")] = (
-        "fog.local"
-    )
+    fog_host: Annotated[
+        str | None,
+        typer.Option(
+            "--fog-host", metavar="HOST", help="The fog node's address in the boards' network. Asked for, if not given."
+        ),
+    ] = None
     tls: Annotated[bool, typer.Option("--tls/--no-tls", help="Whether the broker's connections are encrypted.")] = True
     passwords: Annotated[
         Path | None,
         typer.Option("--passwords", metavar="F", help="Mosquitto's password file, which gets the node's password."),
     ] = None
     locks: LocksOption = None
+    firmware: Annotated[
+        Literal["fognav", "esphome"],
+        typer.Option("--firmware", help="What will run on the board; esphome: on a D1 mini 32, with two HC-SR04."),
+    ] = "fognav"
     profile: Annotated[
         Literal["standard", "thesis"],
         typer.Option("--profile", help="How it is wired: docs/hardware.md draws both."),
     ] = "standard"
     out: Annotated[
         Path,
-        typer.Option("--out", metavar="DIR", help="Where to write node.json; firmware/data is what pio uploads."),
+        typer.Option("--out", metavar="DIR", help="Where to write the settings; firmware/data is what pio uploads."),
     ] = Path("firmware/data")
     json: JsonOption = False
 
     @property
     def target(self) -> Path:
         """The file of the board's settings."""
-        return self.out / provisioning.SETTINGS_FILE
+        return self.out / (provisioning.ESPHOME_FILE if self.firmware == "esphome" else provisioning.SETTINGS_FILE)
+
+    def completed(self) -> Self:
+        """Return the options with what was missing, asked for on a terminal.
+
+        Raises `WrongUseError` for what can't work on a board, and without a terminal for what is missing.
+        """
+        password, host = self.wifi_password, self.fog_host
+        if password is None:
+            password = _asked(f"Password of the Wi-Fi network {self.wifi}", "--wifi-password", hidden=True)
+        if host is None:
+            host = _asked("The fog node's address in the boards' network", "--fog-host")
+        self._check_host(host)
+        self._check_trust(host)
+        return replace(self, wifi_password=password, fog_host=host)
+
+    def _check_host(self, host: str) -> None:
+        if host == "localhost" or (_is_address(host) and ipaddress.ip_address(host).is_loopback):
+            raise WrongUseError(
+                f"--fog-host {host}: on the board that is the board itself. Give the fog node's address"
+            )
+        if self.firmware == "fognav" and host.endswith(".local"):
+            raise WrongUseError(
+                f"--fog-host {host}: a D1 mini can't look up names in .local. Give the fog node's address"
+            )
+
+    def _check_trust(self, host: str) -> None:
+        if not self.tls:
+            if self.firmware == "esphome":
+                raise WrongUseError("--no-tls: the configuration for ESPHome speaks TLS only. Give --locks instead")
+            return
+        folder = locks_folder(self.locks)
+        if folder is None:
+            if not self._authority.exists():
+                raise WrongUseError(
+                    "TLS, and nothing says whom the board shall trust: give the folder of the fog node's locks "
+                    f"(--locks), put the certificate of the broker's authority into {self._authority}, or use --no-tls "
+                    "for a broker without certificates"
+                )
+            return
+        # The firmware compares a name as it is given, but of an address a name that is in the certificate anyway.
+        if self.firmware == "fognav" and _is_address(host):
+            return
+        with locks_errors():
+            known = open_locks(folder).hosts
+        if host not in known:
+            raise WrongUseError(
+                f"--fog-host {host} is not in the broker's certificate, so the board would not trust it: it is for "
+                f"{', '.join(known)}. Give one of them, or add yours (fognav up --host, fognav ca issue --host)"
+            )
+
+    @property
+    def _authority(self) -> Path:
+        return self.out / provisioning.AUTHORITY_FILE
 
     def provision(self, loaded: LoadedSite, node: NodeSite) -> None:
         """Write a board's settings with a new password, and let it in where `locks` or `passwords` say so.
 
         Raises `WrongUseError`, and `FailedError` for locks that can't be used.
         """
+        if self.wifi_password is None or self.fog_host is None:
+            raise TypeError("these options are not complete: see `completed`")
         port = _TLS_PORT if self.tls else _OPEN_PORT
         access = provisioning.Access(self.wifi, self.wifi_password, self.fog_host, port, self.tls)
         members = provisioning.settings(loaded.site.id, node, access, provisioning.new_password(), self.profile)
-        provisioning.provision(self.target, self._let_in(members), self.passwords)
-
-    def _let_in(self, members: dict[str, Any]) -> dict[str, Any]:
-        """Return the settings with the password that the site's locks give, and write beside them whom to trust."""
-        if (folder := locks_folder(self.locks)) is None:
-            return members
-        with locks_errors():
-            password, authority = provisioning.let_in(open_locks(folder), members["user"])
-        provisioning.write_authority(self.target.with_name(provisioning.AUTHORITY_FILE), authority)
-        return {**members, "password": password}
+        if (folder := locks_folder(self.locks)) is not None:
+            with locks_errors():
+                members["password"], authority = provisioning.let_in(open_locks(folder), node.id)
+            provisioning.write_authority(self._authority, authority)
+        if self.firmware == "esphome":
+            members = provisioning.esphome_secrets(members, self._authority)
+            shutil.copyfile(checkout.root() / _ESPHOME, self.out / _ESPHOME.name)
+        provisioning.provision(self.target, members, self.passwords)
 
     def report(self, verb: str, node: NodeSite) -> None:
         """Print what was written, and what to do with it."""
@@ -84,8 +154,26 @@ class BoardOptions:
             return
         words = " and ".join(f"{sonar.range_limit:.2f}" for sonar in node.sonars)
         print_line(f"{verb} {node.id} in area {node.area}: blocked below {words} m")
-        print_line(f"wrote {self.target}: flash it (firmware/README.md), then: fognav node calibrate {node.id}")
+        if self.firmware == "esphome":
+            print_line(f"wrote {self.target}, and what reads it: esphome run {self.out / _ESPHOME.name}")
+        else:
+            print_line(f"wrote {self.target}: flash it (firmware/README.md), then: fognav node calibrate {node.id}")
         print_line("the hazard-aggregator reads the site at its start: restart it")
+
+
+def _asked(what: str, option: str, *, hidden: bool = False) -> str:
+    """Return what a person answers; raises `WrongUseError` where nobody can be asked."""
+    if not sys.stdin.isatty():
+        raise WrongUseError(f"{option} is missing: {what[0].lower()}{what[1:]}")
+    return str(typer.prompt(what, hide_input=hidden, default="" if hidden else None, show_default=False, err=True))
+
+
+def _is_address(host: str) -> bool:
+    try:
+        ipaddress.ip_address(host)
+    except ValueError:
+        return False
+    return True
 
 
 def with_board_options(command: Callable[..., None]) -> Callable[..., None]:

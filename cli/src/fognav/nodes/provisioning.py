@@ -23,6 +23,9 @@ if TYPE_CHECKING:
 
 SETTINGS_FILE: Final = "node.json"
 AUTHORITY_FILE: Final = "ca.pem"
+ESPHOME_FILE: Final = "secrets.yaml"
+ESPHOME_PINS: Final = {"standard": ((18, 22), (19, 21)), "thesis": ((26, 22), (17, 19))}
+"""By profile, trigger and echo of both sonars of a D1 mini 32 (`board_pins.hpp`)."""
 _ITERATIONS: Final = 20_000
 
 
@@ -67,12 +70,43 @@ def settings(site: str, node: NodeSite, access: Access, password: str, profile: 
     }
 
 
+def esphome_secrets(members: dict[str, Any], authority: Path) -> dict[str, Any]:
+    """Return what `fognav-node.yaml` reads, from a board's settings and the certificates that it trusts (PEM).
+
+    JSON is YAML, too. Raises `WrongUseError` for a node of another kind than that file is for.
+    """
+    sonars = members["sonars"]
+    pins = ESPHOME_PINS[members["profile"]]
+    if len(sonars) != len(pins):
+        raise WrongUseError(f"node {members['node']} has {len(sonars)} sonars: the configuration for ESPHome has two")
+    try:
+        kept = {name: value for name, value in members.items() if name not in ("sonars", "tls", "profile")}
+        secrets = {**kept, "authority": authority.read_text("ascii")}
+    except (OSError, UnicodeDecodeError) as error:
+        raise WrongUseError(f"the authority's certificate {authority} can't be read: {error}") from error
+    for number, (sonar, (trigger, echo)) in enumerate(zip(sonars, pins, strict=True), 1):
+        for name in ("range_limit", "range_max"):
+            secrets[f"{name}_{number}"] = str(sonar[f"{name}_m"])
+        secrets |= {f"trigger_{number}": trigger, f"echo_{number}": echo}
+    return secrets
+
+
 def node_in(file: Path) -> str | None:
     """Return the id of the node that a `node.json` is for, or None without a file; raises `WrongUseError`."""
     try:
         return str(json.loads(file.read_bytes())["node"]) if file.exists() else None
     except (OSError, ValueError, TypeError, KeyError) as error:
         raise WrongUseError(f"{file} is no node's settings, or can't be read: move it away") from error
+
+
+def credentials_in(folder: Path, node: str) -> Credentials:
+    """Return what a node's board logs in with, and whom it trusts; raises `WrongUseError` for another one's folder."""
+    file, authority = folder / SETTINGS_FILE, folder / AUTHORITY_FILE
+    if (found := node_in(file)) != node:
+        raise WrongUseError(f"{file} is {f'that of node {found}' if found else 'missing'}: name the folder of {node}'s")
+    members = json.loads(file.read_bytes())
+    trusted = authority.read_text("ascii") if members["tls"] and authority.exists() else ""
+    return Credentials(user=members["user"], passwords={"mqtt": members["password"]}, authority=trusted, file=file)
 
 
 def provision(file: Path, members: dict[str, Any], passwords: Path | None) -> None:

@@ -13,7 +13,6 @@ from fog_contracts.geometry import GeometryError
 from fog_contracts.messages import Pose, SimObstacle
 from fog_contracts.site import RobotSite
 from fog_runtime.clock import SystemClock
-from fognav.locking import own_credentials
 from fognav.output import WrongUseError
 from fognav_sim.floor import Floor
 from fognav_sim.live import VirtualNode, run_nodes
@@ -25,6 +24,7 @@ if TYPE_CHECKING:
 
     from fog_contracts.geometry import Point
     from fog_contracts.site import NodeSite
+    from fog_runtime.access.credentials import Credentials
     from fog_runtime.configuration.site import LoadedSite
 
 PERSON_RADIUS_M: Final = 0.25
@@ -61,9 +61,11 @@ class StillFloor:
         return self._clock.now()
 
 
-async def run(loaded: LoadedSite, node: NodeSite, broker: str, persons: Sequence[Point]) -> None:
+async def run(
+    loaded: LoadedSite, node: NodeSite, broker: str, credentials: Credentials, persons: Sequence[Point]
+) -> None:
     """Run a node against a broker until cancelled; raises `WrongUseError` for a person who can't stand there."""
     clock = SystemClock(1.0)
     floor = StillFloor(loaded, persons, clock)
     (sonars,) = make_nodes([node], int(time.time()), clock.now())
-    await run_nodes([VirtualNode(sonars, floor, broker, clock, loaded.site.id, own_credentials())], clock)
+    await run_nodes([VirtualNode(sonars, floor, broker, clock, loaded.site.id, credentials)], clock)

@@ -161,6 +161,11 @@ class SiteLocks:
         return self._files.folder(program)
 
     @property
+    def hosts(self) -> list[str]:
+        """The names and addresses for which the servers' certificates are."""
+        return list(self._plan.hosts)
+
+    @property
     def authority(self) -> Authority:
         """The certificate authority; raises `AuthorityError`."""
         return Authority.open(self._folder / AUTHORITY)

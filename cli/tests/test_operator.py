@@ -140,3 +140,14 @@ async def test_later_hazards_and_stops_are_reported_with_their_reasons(rig: Rout
         "robot: PROTECTIVE_STOP (the lidar has been silent for 0.4 s)",
         f"robot: INIT (no message from the guardian for as long as the agent runs; {WAITING})",
     ]
+
+
+async def test_events_tell_when_a_reset_has_ended_the_reason_that_they_told(rig: RouterRig) -> None:
+    """A reset is carried out a moment after the mode is INIT: until then the base still says why it stands."""
+    rig.operator.enabling_paused = True
+    await rig.publish_state("FAULT", "base: the bumper is pressed")
+    await rig.publish_state("INIT", "base: the bumper is pressed", WAITING)
+    await rig.publish_state("INIT", WAITING)
+    await rig.publish_state("INIT", "the map is 1.2 s old", WAITING)
+    told = [text for text in rig.event_texts if text.startswith("robot: INIT")]
+    assert told == [f"robot: INIT (base: the bumper is pressed; {WAITING})", f"robot: INIT ({WAITING})"]

@@ -55,6 +55,8 @@ class Operator:
         """While this is true, the robot is not enabled."""
         self._policy = OperatorPolicy(clock.now())
         self._mode = ""
+        self._told_reasons: set[str] = set()
+        """Reasons of the mode in the log of events, without their numbers."""
         self._reported_areas: set[str] = set()
         self._unconfirmed = False
         self._last_refusal = ""
@@ -87,9 +89,13 @@ class Operator:
 
     def _on_state(self, _ids: Mapping[str, str], state: RobotState) -> None:
         now = self._clock.now()
-        if state.mode != self._mode:
-            self._scene.log_event(_describe_mode(state, first=not self._mode))
+        over = self._told_reasons - {_without_numbers(reason) for reason in state.reasons}
+        # A reset is carried out a moment after the mode is INIT: then what it has ended is no reason any more.
+        if state.mode != self._mode or (state.mode == "INIT" and over):
+            first = not self._mode
+            self._scene.log_event(_describe_mode(state, first=first))
             self._mode = state.mode
+            self._told_reasons = set() if first else {_without_numbers(reason) for reason in state.reasons[:2]}
         self._policy.on_state(state, now)
         self._scene.state = state
         self._scene.traces.update(state.traces)
@@ -195,11 +201,15 @@ class Operator:
             self._log_refusal(f"{kind}: refused by the robot, {reply.reason}")
 
     def _log_refusal(self, text: str) -> None:
-        # The seconds in a reason keep changing: report only a different reason.
-        reason = re.sub(r"\d+(\.\d+)?", "#", text)
+        reason = _without_numbers(text)
         if reason != self._last_refusal:
             self._last_refusal = reason
             self._scene.log_event(f"operator: {text}")
+
+
+def _without_numbers(reason: str) -> str:
+    """Return a reason that is the same while only its seconds or metres change."""
+    return re.sub(r"\d+(\.\d+)?", "#", reason)
 
 
 def _describe_mode(state: RobotState, *, first: bool) -> str:

@@ -215,6 +215,25 @@ async def test_robot_in_the_cone_does_not_block_the_area(fog, until):
         assert node.hazards[-1].explained_by == "r1"
 
 
+async def test_robot_has_the_body_of_the_site_whatever_it_claims(fog, until):
+    with (fog.site / "site.toml").open("a") as file:
+        file.write('\n[[robots]]\nid = "r1"\nheight = 0.1\nstart = { x = 1.0, y = 1.0, theta = 0.0 }\n')
+    fog.start("hazard_aggregator")
+    await fog.ready("hazard_aggregator")
+    async with connected_node(fog) as (node, zenoh):
+        await node.read(3.0, 8)
+        await until(lambda: node.state == "clear", "clear")
+        claims = RobotPose(
+            x=3.5, y=3.5, theta=0.0, covariance=[0.0] * 9, v=0.0, w=0.0, radius=0.17, height=0.35, stamp=1.0
+        )
+        for _ in range(40):
+            zenoh.publish(ch.ROBOT_POSE, claims, robot="r1")
+            await node.read(0.83)
+            await asyncio.sleep(0.05)
+        await until(lambda: node.state == "blocked", "blocked", lambda: fog.log("hazard_aggregator"))
+        assert node.hazards[-1].explained_by is None
+
+
 async def test_thesis_node_of_an_area_added_at_run_time_is_subscribed_without_a_restart(fog, until, tokens):
     fog.start("hazard_aggregator")
     url = await fog.ready("hazard_aggregator")

@@ -10,6 +10,7 @@ from robot_agent.bases.roomba600.emulator import FULL, PASSIVE, SAFE, Quirks, Ro
 from robot_agent.bases.roomba600.stop import STOP
 from robot_agent.guardian.core import GuardianCore
 from robot_agent.guardian.link import WheelCommand
+from robot_agent.hardware import BaseReading, BaseStatus, WheelOdometry
 
 BUMP = "the bumper is pressed (left)"
 
@@ -371,6 +372,40 @@ def test_robot_that_was_lifted_or_stands_at_an_edge_after_its_bump_backs_off_no_
     assert (rig.core.latched, rig.feedback.bumped) == (BUMP, False)
     rig.steps(0.5, "back_off", -0.05)
     assert not rig.core.moving
+
+
+def test_maneuver_begins_with_the_bases_own_bytes_and_no_others():
+    rig = Docking()
+    rig.steps(0.1, None)
+    assert rig.step("leave_dock") == b"", "it is on no dock"
+    rig = bumped()
+    rig.steps(0.2, None)
+    assert rig.step("back_off", 0.0) == b""
+    assert rig.core.moving
+
+
+def test_wheels_that_back_off_turn_at_the_mean_of_what_is_asked_for():
+    rig = backing_off()
+    rig.steps(0.5, speed=-0.02)
+    assert rig.wheels(rig.command(rig.now + 0.06, -0.03, -0.01, maneuver="back_off")) == (-0.02, -0.02)
+
+
+@pytest.mark.parametrize("left", [True, False])
+def test_wheel_that_goes_too_far_ends_backing_off_while_the_other_stands(left):
+    rig = backing_off()
+    travel = WheelOdometry(left_m=-0.1 if left else 0.0, right_m=0.0 if left else -0.1)
+    rig.base.frames.append(BaseReading(BaseStatus(), travel))
+    rig.core.on_bytes(b"", rig.now + 0.02)
+    rig.command(rig.now + 0.03, -0.05, -0.05, maneuver="back_off")
+    assert not rig.core.moving
+
+
+def test_other_maneuver_begins_at_once_after_one_that_was_ended_by_its_limit():
+    rig = leaving()
+    rig.steps(3.1)
+    assert "took longer than 3 s" in rig.feedback.stopped
+    rig.steps(2.0, speed=0.0, charging=False, docked=False)
+    assert b"seek;" in rig.steps(0.2, "seek_dock")
 
 
 def test_asking_for_another_maneuver_ends_the_one_that_runs():

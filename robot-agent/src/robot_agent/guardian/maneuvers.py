@@ -68,8 +68,8 @@ class Maneuvers:
         self.problem: str | None = None
         """Why the last one was ended although the agent did not stop asking for it."""
         self._ended: Maneuver | None = None
-        self._since = 0.0
-        self._begun_at: WheelOdometry | None = None
+        self._begun: tuple[float, WheelOdometry] | None = None
+        """When (s) the last one began, and where the wheels were."""
 
     def begin(self, asked: Maneuver | None, reading: BaseReading, situation: Situation, now: float) -> bytes:
         """Begin what is asked for if that is possible now; return the bytes for it. None runs."""
@@ -79,7 +79,7 @@ class Maneuvers:
             return b""
         data = self._opening(asked, reading.status, situation)
         if data is not None:
-            self.running, self._since, self._begun_at = asked, now, reading.odometry
+            self.running, self._begun = asked, (now, reading.odometry)
         return data or b""
 
     def _opening(self, asked: Maneuver, status: BaseStatus, situation: Situation) -> bytes | None:
@@ -103,6 +103,8 @@ class Maneuvers:
         """
         running = self.running
         assert running is not None
+        assert self._begun is not None
+        since, before = self._begun
         if running == "leave_dock" and not reading.status.charging:
             return True  # it is done: a silence at that moment has ended nothing
         if command is None:
@@ -114,10 +116,10 @@ class Maneuvers:
         if command.maneuver != running:
             return True
         limit = LIMITS[running]
-        if now - self._since > limit.seconds:
+        if now - since > limit.seconds:
             self.problem = f"{_NAMES[running]} took longer than {limit.seconds:.0f} s"
         # A travel that is no number is beyond every limit.
-        elif not self._travel(reading.odometry) < limit.travel:
+        elif not self._travel(before, reading.odometry) < limit.travel:
             self.problem = f"{_NAMES[running]} has reached its limit of {limit.travel:.2f} m"
         return self.problem is not None
 
@@ -135,8 +137,6 @@ class Maneuvers:
         """Return whether a pressed bumper is no fault now: what the robot backs off from, or the dock that it is on."""
         return self.is_running("back_off") or (self.running is not None and status.charging)
 
-    def _travel(self, odometry: WheelOdometry) -> float:
-        before = self._begun_at
-        assert before is not None
+    def _travel(self, before: WheelOdometry, odometry: WheelOdometry) -> float:
         left = math.remainder(odometry.left_m - before.left_m, self._wrap)
         return max(abs(left), abs(math.remainder(odometry.right_m - before.right_m, self._wrap)))

@@ -76,6 +76,7 @@ def test_each_program_mounts_its_own_locks_and_no_other_s():
             if source.endswith("locks"):
                 readers.setdefault(source, set()).add(name)
     own = {f"{program}-locks": {program} for program in OWNERS if program != SIMULATION}
+    own["mosquitto-locks"].add("mosquitto-relay")
     assert readers == {**own, "sim-locks": {"sim-robot"}, "locks": {"backup"}}
 
 

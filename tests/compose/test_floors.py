@@ -34,7 +34,7 @@ pytestmark = [
     pytest.mark.timeout(2 * BUILD_S + 1800),
     pytest.mark.skipif(SKIP_REASON is not None, reason=SKIP_REASON or ""),
 ]
-SHARED: Final = {"zenoh", "mosquitto", "redis"}
+SHARED: Final = {"zenoh", "mosquitto", "mosquitto-relay", "redis"}
 UPSTAIRS: Final = "upstairs"
 OWN: Final = {f"{name}-{UPSTAIRS}" for name in FOG - SHARED}
 ZONE: Final = {"kind": "BLOCKED", "shape": {"type": "circle", "centre": [9.0, 42.6], "radius": 0.5}, "reason": "wet"}

@@ -1,5 +1,7 @@
 """A fog node without containers, as a person runs it: `fognav up`, `status`, `logs` and `down`, with real servers."""
 
+import asyncio
+import contextlib
 import json
 import os
 import shutil
@@ -13,10 +15,17 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
+import httpx
 import psutil
 import pytest
+from attacks import ATTACKS, few_files, running
 from floor_ports import floor_ports
 
+from fog_contracts import channels as ch
+from fog_contracts.messages import RobotPose, RobotState
+from fog_runtime.access.credentials import Credentials
+from fog_runtime.clock import SystemClock
+from fog_runtime.transports.zenoh_edge import ZenohEdge
 from fog_supervisor import child, net
 from fognav.hosting.versions import Versions
 from fognav.output import FailedError, WrongUseError
@@ -310,3 +319,63 @@ def test_data_of_an_older_version_is_used_by_this_one(node, tmp_path):
     assert before == {name: (node.data / name).read_bytes() for name in kept}
     node.run("zone", "add", "--circle", "80,20,1", "--reason", "dry soon")
     node.down()
+
+
+class Watched:
+    """What a robot says of itself while it is watched, as an operator's tool hears it."""
+
+    def __init__(self) -> None:
+        self.modes: list[str] = []
+        self.ages: list[float] = []
+        self.at = time.monotonic()
+
+    def on_state(self, _ids: dict[str, str], state: RobotState) -> None:
+        self.modes.append(state.mode)
+
+    def on_pose(self, _ids: dict[str, str], _pose: RobotPose) -> None:
+        now = time.monotonic()
+        self.ages.append(now - self.at)
+        self.at = now
+
+
+async def test_robot_drives_on_and_stops_while_strangers_attack_every_server(node: Node) -> None:
+    """Silent connections beyond every usual number of descriptors, at broker, router and REST at once."""
+    node.options = ("--site", "estig", "--sim")
+    with few_files():
+        await asyncio.to_thread(node.up)
+    (system,) = (await asyncio.to_thread(node.systems)).values()
+    credentials = Credentials.read(Path(system["credentials_file"]))
+    planner, router = system["urls"]["planner"], system["urls"]["zenoh-router"]
+    robot, watched = system["robots"][0], Watched()
+    await asyncio.to_thread(node.run, "robot", "enable")
+    await asyncio.to_thread(node.run, "robot", "goal", "b")
+    async with (
+        ZenohEdge.open(
+            connect=[router], clock=SystemClock(), role="console", id="watch", site="estig", credentials=credentials
+        ) as edge,
+        httpx.AsyncClient(
+            base_url=planner,
+            timeout=60,
+            transport=httpx.AsyncHTTPTransport(verify=credentials.tls_context(), retries=5),
+        ) as client,
+        contextlib.AsyncExitStack() as attacks,
+    ):
+        edge.subscribe(ch.ROBOT_STATE, RobotState, watched.on_state)
+        edge.subscribe(ch.ROBOT_POSE, RobotPose, watched.on_pose)
+        async with asyncio.timeout(60):
+            while "NORMAL" not in watched.modes[-1:]:  # noqa: ASYNC110  # a robot sets no event
+                await asyncio.sleep(0.05)
+        watched.modes.clear()
+        watched.ages.clear()
+        for name in ("mosquitto", "zenoh-router", "planner"):
+            port = int(system["urls"][name].rpartition(":")[2])
+            await attacks.enter_async_context(running(ATTACKS["say nothing and stay"](port)))
+        assert set(watched.modes) == {"NORMAL"}, watched.modes
+        assert max(watched.ages) < 3.0
+        begun = time.monotonic()
+        stopped = await client.post(f"/api/v1/robots/{robot}/stop", json={})
+        assert stopped.status_code < 300, stopped.text
+        async with asyncio.timeout(60):
+            while watched.modes[-1] == "NORMAL":  # noqa: ASYNC110  # as above
+                await asyncio.sleep(0.01)
+        assert time.monotonic() - begun < 5.0  # less than 0.5, but for what else keeps this computer busy

@@ -2,16 +2,20 @@
 
 import asyncio
 import resource
+import struct
+import threading
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 
 import httpx
+import paho.mqtt.client as paho
 import psutil
 import pytest
-from attacks import ATTACKS, LIMIT_S, Attack, running
+from attacks import ATTACKS, LIMIT_S, Attack, few_files, running
 from fronts import running_front
 from locked_servers import LockedSite
+from paho.mqtt.enums import CallbackAPIVersion
 
 from fog_contracts import channels as ch
 from fog_contracts import messages as m
@@ -27,28 +31,19 @@ from fognav.programs import ProgramSet, SystemFolder
 
 pytestmark = [pytest.mark.live, pytest.mark.timeout(300)]
 
-CONNECT_S = 2.0
-BACK_S = 5.0
-MAP_S = 1.0
-"""Older than this, a map makes a robot slow down."""
+SERVED_S = 10.0
+"""Within which everybody else is served, during an attack and after it: 2 s on a computer that does nothing else.
+
+Without places for strangers it is not within a minute."""
+MAP_S = 3.0
+"""A robot with an older map holds; on a computer that does nothing else it is never older than 0.3 s."""
 MEMORY_BYTES = 150 * 1024 * 1024
 LOG_BYTES = 20_000
 
 
 @pytest.fixture(scope="module")
 def site(tmp_path_factory):
-    return LockedSite(tmp_path_factory.mktemp("attacked"), "lab", robots=["r1"], nodes=["n1"])
-
-
-@contextmanager
-def few_files(number: int = 1024) -> Iterator[None]:
-    """Start servers with as many descriptors as on a usual system; attackers have enough."""
-    before = resource.getrlimit(resource.RLIMIT_NOFILE)
-    resource.setrlimit(resource.RLIMIT_NOFILE, (number, before[1]))
-    try:
-        yield
-    finally:
-        resource.setrlimit(resource.RLIMIT_NOFILE, before)
+    return LockedSite(tmp_path_factory.mktemp("attacked"), "lab", robots=["r1"], nodes=["n1", "n2"])
 
 
 def opened(site: LockedSite, url: str, user: str, role: str):
@@ -98,8 +93,8 @@ async def test_robot_goes_on_and_another_connects_while_strangers_fill_the_route
             after = await connects_after(site, server.url)
             assert max(ages) < MAP_S, max(ages)
             beating.cancel()
-        assert during < CONNECT_S
-        assert after < BACK_S
+        assert during < SERVED_S
+        assert after < SERVED_S
         assert psutil.Process(server.pid).memory_info().rss < MEMORY_BYTES
         assert server.log.stat().st_size < LOG_BYTES, server.log.read_text()[-2000:]
 
@@ -149,16 +144,100 @@ async def test_rest_stops_robots_while_strangers_fill_its_connections(site, tmp_
             return time.monotonic() - begun
 
         front = psutil.Process().children()[-1]
-        async with httpx.AsyncClient(base_url=url, verify=trust, timeout=LIMIT_S) as client:
+        # From the attackers' own address a handshake may be displaced, and is tried again.
+        transport = httpx.AsyncHTTPTransport(verify=trust, retries=5)
+        async with httpx.AsyncClient(base_url=url, transport=transport, timeout=LIMIT_S) as client:
             async with running(ON_REST[name](client.base_url.port)):
                 during = await stop(client)
             after = await stop(client)
-        assert during < CONNECT_S
-        assert after < BACK_S
+        assert during < SERVED_S
+        assert after < SERVED_S
         assert front.memory_info().rss < 2 * MEMORY_BYTES
         assert len(capfd.readouterr().err) < LOG_BYTES
     finally:
         await fronts.__aexit__(None, None, None)
+
+
+def connect_packet(user: str, password: str) -> bytes:
+    """CONNECT of MQTT 3.1.1 (section 3.1)."""
+    fields = b"".join(struct.pack(">H", len(text)) + text.encode() for text in ("id", user, password))
+    return bytes((0x10, 10 + len(fields))) + b"\x00\x04MQTT\x04\xc2\x00\x1e" + fields
+
+
+ON_MQTT = ATTACKS | {
+    "begin CONNECT and stay": lambda port: Attack(port, b"\x10\xff\x01", rate=40, held_s=600.0, encrypts=True),
+    "guess passwords": lambda port: Attack(port, connect_packet("n1", "x"), rate=40, held_s=1.0, encrypts=True),
+}
+
+
+def mqtt_client(site: LockedSite, user: str, client_id: str, protocol: int = paho.MQTTv5) -> paho.Client:
+    client = paho.Client(CallbackAPIVersion.VERSION2, client_id, protocol=protocol)
+    own = site.credentials(user)
+    client.username_pw_set(own.user, own.passwords["mqtt"])
+    client.tls_set_context(own.tls_context())
+    return client
+
+
+@contextmanager
+def connected(client: paho.Client, port: int) -> Iterator[float]:
+    """Connect; yield how long that took (s)."""
+    answered = threading.Event()
+    client.on_connect = lambda *_: answered.set()
+    begun = time.monotonic()
+    client.connect_async(net.LOOPBACK, port)
+    client.reconnect_delay_set(1, 1)
+    client.loop_start()
+    try:
+        assert answered.wait(LIMIT_S)
+        yield time.monotonic() - begun
+    finally:
+        client.disconnect()
+        client.loop_stop()
+
+
+@pytest.mark.parametrize("name", ON_MQTT)
+async def test_node_goes_on_and_another_connects_while_strangers_fill_the_broker(site, name):
+    with few_files():
+        server = site.mosquitto()
+    topic = ch.NODE_READING.key(site="lab", node="n1")
+
+    def connects_after() -> float:
+        with connected(mqtt_client(site, "console", "console"), server.port) as took:
+            return took
+
+    ended: list[object] = []
+    with server:
+        node = mqtt_client(site, "n1", "node-lab-n1")
+        node.on_disconnect = lambda *reason: ended.append(reason)
+        with connected(node, server.port):
+            async with running(ON_MQTT[name](server.port)):
+                during = await asyncio.to_thread(connects_after)
+                begun = time.monotonic()
+                await asyncio.to_thread(node.publish(topic, b"{}", qos=1).wait_for_publish, LIMIT_S)
+                published = time.monotonic() - begun
+            after = await asyncio.to_thread(connects_after)
+            assert ended == []
+        processes = [psutil.Process(server.pid), *psutil.Process(server.pid).children()]
+        assert sum(each.memory_info().rss for each in processes) < MEMORY_BYTES
+        assert server.log.stat().st_size < LOG_BYTES, server.log.read_text()[-2000:]
+    assert during < SERVED_S
+    assert published < SERVED_S
+    assert after < SERVED_S
+
+
+@pytest.mark.parametrize("protocol", [paho.MQTTv31, paho.MQTTv311, paho.MQTTv5])
+async def test_client_of_one_user_ends_no_connection_of_another_by_its_id(site, protocol):
+    topics = {user: ch.NODE_AVAILABILITY.key(site="lab", node=user) for user in ("n1", "n2")}
+    ended: list[object] = []
+    with site.mosquitto() as server:
+        victim, thief = (mqtt_client(site, user, "node-lab-n1", protocol) for user in ("n1", "n2"))
+        for client, user in ((victim, "n1"), (thief, "n2")):
+            client.will_set(topics[user], b"offline", qos=1, retain=True)
+        victim.on_disconnect = lambda *reason: ended.append(reason)
+        with connected(victim, server.port), connected(thief, server.port):
+            await asyncio.to_thread(victim.publish(topics["n1"], b"online", qos=1).wait_for_publish, LIMIT_S)
+            await asyncio.to_thread(thief.publish(topics["n2"], b"online", qos=1).wait_for_publish, LIMIT_S)
+            assert ended == []
 
 
 async def test_router_to_which_no_session_can_be_opened_ends_and_is_started_again(site, tmp_path):

@@ -34,7 +34,7 @@ if TYPE_CHECKING:
 ROOT: Final = Path(__file__).parents[2]
 STAND_INS: Final = ROOT / "tests" / "compose" / "stand_ins.sh"
 SERVICES: Final = ("hazard-aggregator", "map-service", "planner")
-FOG: Final = {*SERVICES, "zenoh", "mosquitto", "redis", "prometheus", "gateway"}
+FOG: Final = {*SERVICES, "zenoh", "mosquitto", "mosquitto-relay", "redis", "prometheus", "gateway"}
 ONCE: Final = {"locks", "kernels", "sim-locks"}
 """The containers that do something and end."""
 PORTS: Final = {

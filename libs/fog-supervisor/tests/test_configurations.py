@@ -1,5 +1,6 @@
 """One source for the servers' configurations: deployed servers are configured like those of demo and tests."""
 
+import re
 import shlex
 import subprocess
 from pathlib import Path
@@ -8,7 +9,7 @@ import pytest
 import yaml
 
 from fog_contracts.channels import CHANNELS
-from fog_runtime import router
+from fog_runtime import broker, router
 from fog_supervisor import configurations
 from fog_supervisor.servers import mosquitto_program, redis_program, router_program, start_mosquitto, start_redis
 
@@ -41,8 +42,18 @@ def test_private_servers_have_the_limits_durability_and_locks_of_deployed_ones(t
     for name in ("mosquitto", "redis"):
         private = (tmp_path / f"{name}.conf").read_text()
         assert shared_lines(private) == shared_lines(deployed[f"{name}/{name}.conf"])
-        assert "127.0.0.1" in private
         assert "0.0.0.0" not in private
+
+
+def test_compose_starts_the_relay_of_the_broker_with_the_arguments_of_a_private_one(tmp_path: Path) -> None:
+    service = yaml.safe_load((ROOT / "docker-compose.yml").read_text())["services"]["mosquitto-relay"]
+    assert service["entrypoint"] == ["python", "-m", broker.__name__]
+    locks = Path(configurations.DEPLOYED_LOCKS)
+    private = mosquitto_program(tmp_path, 8883, address="0.0.0.0", locks=locks).command
+    given = [text for argument in service["command"] for text in argument.split("=", 1)]
+    assert given[: given.index("--to")] == list(private[3 : private.index("--configuration")])
+    (listener,) = re.findall(r"^listener (.*)$", configurations.deployed()["mosquitto/mosquitto.conf"], re.MULTILINE)
+    assert given[given.index("--to") + 1].split(":")[::-1] == listener.split()
 
 
 def test_compose_starts_the_router_with_the_arguments_of_a_private_one() -> None:

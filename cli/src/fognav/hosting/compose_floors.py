@@ -24,7 +24,7 @@ BASE: Final = "docker-compose.yml"
 OVERRIDE: Final = "docker-compose.override.yml"
 """What compose reads besides, without being told."""
 HEADER: Final = "# Written by `fognav site compose"
-_SHARED: Final = frozenset({"locks", "sim-locks", "kernels", "mosquitto", "redis", "zenoh"})
+_SHARED: Final = frozenset({"locks", "sim-locks", "kernels", "mosquitto", "mosquitto-relay", "redis", "zenoh"})
 _OUTSIDE: Final = "outside"
 """The gateways' way out, which has no names that could be mixed up."""
 _SITE: Final = re.compile(r"^\$\{FOGNAV_SITE:-[^}]*\}:/site")

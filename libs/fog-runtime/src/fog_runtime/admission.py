@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import asyncio
 import ipaddress
+import resource
 import socket
 from collections import Counter
 from functools import partial
@@ -21,8 +22,8 @@ if TYPE_CHECKING:
     import ssl
     from collections.abc import Callable, Iterator, Sequence
 
-SILENT: Final = 256
-"""Most connections that have sent nothing: each is a descriptor, and nothing else."""
+SILENT: Final = 1024
+"""Most connections that have sent nothing: each is a descriptor, and nothing else. Fewer where descriptors are few."""
 QUEUE: Final = 50
 """Most connections that wait for their TLS handshake: the last of them for half a second."""
 STRANGERS: Final = 96
@@ -139,7 +140,7 @@ class Admission:
         """
         self._make_protocol = make_protocol
         self._tls = tls
-        self._silent = Places(SILENT)
+        self._silent = Places(min(SILENT, resource.getrlimit(resource.RLIMIT_NOFILE)[0] // 4))
         self._strangers = Places(STRANGERS)
         self._queue = Places(QUEUE)
         self._filled = asyncio.Event()

@@ -11,13 +11,14 @@ from typing import TYPE_CHECKING, Final, Protocol, TypeAlias
 from urllib.parse import urlsplit
 
 from fog_runtime import admission, logs
+from fog_runtime.access.server_certificate import ServerCertificate
 
 if TYPE_CHECKING:
     import socket
     from collections.abc import Awaitable, Callable, Sequence
     from pathlib import Path
 
-Connect: TypeAlias = "Callable[[Callable[[], asyncio.Protocol]], Awaitable[object]]"
+Connect: TypeAlias = "Callable[[Callable[[], asyncio.Protocol]], Awaitable[tuple[asyncio.Transport, asyncio.Protocol]]]"
 
 _WAITING_BYTES: Final = 64 * 1024
 """What may wait for a slow receiver before its sender has to wait."""
@@ -31,7 +32,10 @@ _log = logs.get("relay")
 
 
 class Opening(Protocol):
-    """Reads what a server says first, until that shows that it has let the client in."""
+    """Reads what both say first, until that shows that the server has let the client in."""
+
+    def from_client(self, data: bytes) -> bytes:
+        """Return what to pass on of the client's next bytes; a `ValueError` ends the connection."""
 
     def admits(self, data: bytes) -> bool:
         """Whether it has, with these next bytes of the server's."""
@@ -46,6 +50,10 @@ class ZenohOpening:
 
     def __init__(self) -> None:
         self._unread = bytearray()
+
+    def from_client(self, data: bytes) -> bytes:
+        """Pass everything on."""
+        return data
 
     def admits(self, data: bytes) -> bool:
         """Whether OpenAck has come."""
@@ -105,6 +113,16 @@ class _Client(_End):
         self._relay.connecting.add(task)
         task.add_done_callback(self._relay.connecting.discard)
 
+    def data_received(self, data: bytes) -> None:
+        if isinstance(self.other, _Server) and (opening := self.other.opening) is not None:
+            try:
+                data = opening.from_client(data)
+            except ValueError:
+                assert self.transport is not None
+                self.transport.abort()
+                return
+        super().data_received(data)
+
     async def _connect(self) -> None:
         server = _Server(self, self._visitor, self._relay.make_opening())
         try:
@@ -132,11 +150,11 @@ class _Server(_End):
         super().__init__()
         self.other = client
         self._visitor = visitor
-        self._opening: Opening | None = opening
+        self.opening: Opening | None = opening
 
     def data_received(self, data: bytes) -> None:
-        if self._opening is not None and self._opening.admits(data):
-            self._opening = None
+        if self.opening is not None and self.opening.admits(data):
+            self.opening = None
             self._visitor.admit()
         super().data_received(data)
 
@@ -169,8 +187,18 @@ class Relay:
         self._was_unreachable = False
 
 
+def to_socket(path: Path) -> Connect:
+    """Return what connects a protocol to a server on a Unix socket."""
+
+    async def connect(make_protocol: Callable[[], asyncio.Protocol]) -> tuple[asyncio.Transport, asyncio.Protocol]:
+        return await asyncio.get_running_loop().create_unix_connection(make_protocol, str(path))
+
+    return connect
+
+
 def server_tls(certificate: Path, key: Path) -> ssl.SSLContext:
-    """Return what a server encrypts by; raises `OSError` when the files can't be used."""
+    """Return what a server encrypts by; raises `CertificateError` when the files can't be used."""
+    ServerCertificate.of(certificate, key)
     context = ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER)
     context.minimum_version = ssl.TLSVersion.TLSv1_2
     context.num_tickets = 0  # nobody resumes a session here

@@ -18,7 +18,7 @@ import secrets
 import ssl
 import tempfile
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
@@ -29,7 +29,7 @@ from fog_runtime import admission, logs, process
 from fog_runtime.access.credentials import Credentials
 from fog_runtime.health import Health, serve_health
 from fog_runtime.machine import descriptors
-from fog_runtime.relay import Connect, Relay, ZenohOpening, place_of, server_tls
+from fog_runtime.relay import Relay, ZenohOpening, place_of, server_tls, to_socket
 from fog_runtime.router_health import ANSWERS, RouterHealth
 from fog_runtime.transports.zenoh_edge import session_config
 
@@ -70,16 +70,10 @@ class RouterLocks:
     credentials: Path | None = None
 
     def tls(self) -> ssl.SSLContext:
-        """Return what its clients encrypt by; raises `RouterLocksError`."""
+        """Return what its clients encrypt by; raises `RouterLocksError` or `CertificateError`."""
         if self.certificate is None or self.key is None:
             raise RouterLocksError("--listen tls/… needs --certificate and --key, or write tcp/…")
-        try:
-            return server_tls(self.certificate, self.key)
-        except OSError as error:
-            raise RouterLocksError(
-                f"the certificate {self.certificate} with the key {self.key} can't be used: {error.strerror or error}. "
-                "Issue it again (fognav ca issue), or correct the names"
-            ) from error
+        return server_tls(self.certificate, self.key)
 
     def config(self, listen: Sequence[str], connect: Sequence[str]) -> zenoh.Config:
         """Return the router's configuration; raises `RouterLocksError` or `CredentialsError`."""
@@ -146,7 +140,7 @@ async def run_router(
         for endpoint in listen:
             encrypts = endpoint.startswith("tls/")
             tls = locks.tls() if encrypts else None
-            relays.append(Relay(_to_socket(own), ZenohOpening, tls))
+            relays.append(Relay(to_socket(own), ZenohOpening, tls))
             listeners.append(stack.enter_context(admission.listen(*place_of(endpoint))))
         session = await asyncio.to_thread(zenoh.open, locks.config([f"unixsock-stream/{own}"], connect))
         try:
@@ -160,13 +154,6 @@ async def run_router(
                     tasks.create_task(_watch(health))
         finally:
             await asyncio.to_thread(session.close)
-
-
-def _to_socket(path: Path) -> Connect:
-    async def connect(make_protocol: Callable[[], asyncio.Protocol]) -> object:
-        return await asyncio.get_running_loop().create_unix_connection(make_protocol, str(path))
-
-    return connect
 
 
 async def _watch(health: Health) -> None:

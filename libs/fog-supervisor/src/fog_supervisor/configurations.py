@@ -15,7 +15,6 @@ MQTT_PACKET_LIMIT: Final = 256 * 1024
 """Largest MQTT packet (bytes): above every MQTT channel's limit, small enough not to exhaust the memory."""
 MQTT_QUEUE_LIMIT: Final = 10_000
 """Messages that the broker queues for a slow or disconnected client."""
-MQTTS_PORT: Final = 8883
 DEPLOYED_LOCKS: Final = "/run/locks"
 """Where each server's container has its part of the locks."""
 REDIS_PORT: Final = 6379
@@ -26,8 +25,7 @@ _MOSQUITTO: Final = f"""\
 {_NOTE}
 # The broker of the sensor nodes. The aggregator publishes all retained messages again after each reconnect, so a lost
 # database does no harm.
-listener {{listener}}
-{{doors}}persistence true
+{{listener}}{{doors}}persistence true
 persistence_location {{data}}/
 autosave_interval 30
 # Larger than any message of the contracts, small enough not to exhaust the memory.
@@ -41,8 +39,6 @@ log_type notice
 connection_messages false
 """
 _MOSQUITTO_LOCKED: Final = """\
-certfile {locks}/server.pem
-keyfile {locks}/server.key
 allow_anonymous false
 password_file {locks}/users
 acl_file {locks}/access
@@ -78,12 +74,13 @@ aclfile {locks}/users
 def mosquitto(listener: str, data: str, *, locks: str | None = None, extra: Sequence[str] = ()) -> str:
     """Return a `mosquitto.conf`.
 
-    `listener` is a port, or a port and an address; `data` the folder of the broker's database; `locks` that with its
-    certificate, users and access list (`fog_runtime.locks`), without which it admits everybody, unencrypted; the
-    `extra` lines are appended.
+    `listener` is a port and an address, and empty where `fog_runtime.broker` adds it; `data` the folder of the broker's
+    database; `locks` that with its users and access list (`fog_runtime.locks`), without which it admits everybody: with
+    them it is behind a relay, which encrypts. The `extra` lines are appended.
     """
     doors = "allow_anonymous true\n" if locks is None else _MOSQUITTO_LOCKED.format(locks=locks)
-    return _MOSQUITTO.format(listener=listener, data=data, doors=doors) + "".join(f"{line}\n" for line in extra)
+    listens = f"listener {listener}\n" if listener else ""
+    return _MOSQUITTO.format(listener=listens, data=data, doors=doors) + "".join(f"{line}\n" for line in extra)
 
 
 def redis(bind: str, data: str, *, port: int = REDIS_PORT, locks: str | None = None, encrypted: bool = True) -> str:
@@ -112,7 +109,7 @@ def router_arguments(endpoint: str, *, locks: str | None = None) -> list[str]:
 def deployed() -> dict[str, str]:
     """Return the files that the compose file mounts into its servers, by their paths below `deploy/`."""
     return {
-        "mosquitto/mosquitto.conf": mosquitto(str(MQTTS_PORT), "/mosquitto/data", locks=DEPLOYED_LOCKS),
+        "mosquitto/mosquitto.conf": mosquitto("1883 127.0.0.1", "/mosquitto/data", locks=DEPLOYED_LOCKS),
         "redis/redis.conf": redis("0.0.0.0", "/data", locks=DEPLOYED_LOCKS),  # noqa: S104  # inside a container; compose publishes no port
     }
 

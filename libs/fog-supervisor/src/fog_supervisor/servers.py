@@ -105,20 +105,24 @@ def mosquitto_program(
 ) -> ServerProgram:
     """Return an MQTT broker that listens on `address`, configured in `folder`; `extra` is added to its configuration.
 
-    With the folder of its `locks` (`fog_runtime.locks`) it encrypts and admits only the users there, else everybody.
-    Raises `ServerError` when it is not installed.
+    With the folder of its `locks` (`fog_runtime.locks`) a relay before it encrypts (`fog_runtime.broker`), and only the
+    users there are admitted, else everybody. Raises `ServerError` when it is not installed.
     """
     program = _installed("mosquitto", "mosquitto")
     # As root, Mosquitto switches to another user, who may have no access to a private folder.
     lines = [*(["user root"] if os.geteuid() == 0 else []), *extra.splitlines()]
     file = folder / "mosquitto.conf"
-    text = configurations.mosquitto(f"{port} {address}", str(folder), locks=_text(locks), extra=lines)
-    file.write_text(text, "utf-8")
+    listener = f"{port} {address}" if locks is None else ""
+    file.write_text(configurations.mosquitto(listener, str(folder), locks=_text(locks), extra=lines), "utf-8")
+    command: tuple[str, ...] = (program, "-c", str(file))
+    if locks is not None:
+        files = ("--certificate", f"{locks}/server.pem", "--key", f"{locks}/server.key", "--configuration", str(file))
+        listen = f"tls/{address}:{port}"
+        command = (sys.executable, "-m", "fog_runtime.broker", "--listen", listen, *files, "--program", program)
     scheme = "mqtt" if locks is None else "mqtts"
     return ServerProgram(
-        name="mosquitto", port=port, address=address, url=f"{scheme}://{reachable(address)}:{port}",
-        command=(program, "-c", str(file)),
-    )  # fmt: skip
+        name="mosquitto", port=port, address=address, url=f"{scheme}://{reachable(address)}:{port}", command=command
+    )
 
 
 def embedded_broker_program(port: int, *, address: str = LOOPBACK, locks: Path | None = None) -> ServerProgram:

@@ -381,6 +381,34 @@ def test_looking_around_ends_after_its_way_after_its_time_and_when_nothing_moves
     assert any(f"longer than {longest:.0f} s" in reason for reason in gate.out.reasons)
 
 
+@pytest.mark.parametrize(("localization", "word"), [("weak", "uncertain"), ("lost", "unknown"), ("none", "unknown")])
+def test_looking_around_that_found_nothing_out_says_how_well_the_place_is_known(localization, word):
+    gate = Gate(enabled=False, localization=localization)
+    gate.run(request="turn", maneuver_remaining=1.0)
+    assert gate.run(maneuver_remaining=0.0).reasons[0] == f"the turn ended: it is done, and the pose is {word}"
+
+
+@pytest.mark.parametrize("kind", ["turn", "advance"])
+def test_robot_that_was_enabled_waits_for_an_operator_after_it_looked_around(kind):
+    gate = Gate(localization="weak")
+    assert gate.run(request=kind, maneuver_remaining=1.0).mode == "EGRESS"
+    gate.run(maneuver_remaining=0.5, localization="good")
+    assert (gate.out.mode, gate.state.enabled) == ("INIT", False)
+
+
+@pytest.mark.parametrize(
+    ("kind", "given"),
+    [("dock", {}), ("undock", ON_DOCK), ("turn", {"localization": "lost"}), ("advance", {"localization": "lost"})],
+)
+def test_blocked_path_of_a_mission_does_not_keep_a_robot_from_a_maneuver(kind, given):
+    gate = Gate(enabled=kind == "dock", **given)
+    blocked = {**MISSION, "path_problem": "the path is blocked", "maneuver_remaining": 1.0}
+    assert gate.run(request=kind, **blocked).refusal is None
+    assert gate.run(0.5, **blocked).mode == RULES[kind].mode
+    if kind == "dock":
+        assert gate.run(0.5, **blocked, docked_for=0.1).mode == "DOCK"
+
+
 @pytest.mark.parametrize("kind", ["turn", "advance"])
 def test_looking_around_that_goes_the_wrong_way_ends_and_says_so_by_its_name(kind):
     gate = Gate(enabled=False, localization="lost")

@@ -68,6 +68,9 @@ def parts_named(names: Sequence[str]) -> list[Part]:
     return [known[name] for name in names] or list(PARTS)
 
 
+_LOOKING_AROUND: Final = (
+    'inputs, localization="good", inside_blocked=inside, map_loaded=True, map_age=0.0, map_gap=0.0, mission=False'
+)
 PARTS: Final = (
     Part(
         "safety",
@@ -103,6 +106,36 @@ PARTS: Final = (
                     'side = "ahead" if twist.v > 0.0 else "behind"',
                 )
             ),
+            *(
+                Equivalent(
+                    "maneuver_rules",
+                    f"return {words}, {done}",
+                    f"{done} -> {not done}",
+                    "a robot is disabled after an egress, a turn and an advance, done or not",
+                )
+                for words, done in (
+                    ('"the robot is out"', True),
+                    ('f"the way out ends, and the robot is still in {still}"', False),
+                    ('"the robot knows where it is"', True),
+                    ("ahead", False),
+                    ('f"it is done, and the pose is {_POSE_WORDS[inputs.localization]}{detail}"', True),
+                )
+            ),
+            *(
+                Equivalent(
+                    "maneuver_rules",
+                    code,
+                    change,
+                    "conditions ask for what is worse than good, and for more than a second",
+                )
+                for code, change in (
+                    ('localization="good",', "'good' -> 'goodX'"),
+                    ("map_age=0.0,", "0.0 -> 1.0"),
+                    ("map_gap=0.0,", "0.0 -> 1.0"),
+                    (_LOOKING_AROUND, "'good' -> 'goodX'"),
+                    (_LOOKING_AROUND, "0.0 -> 1.0"),
+                )
+            ),
         ),
     ),
     Part(
@@ -129,6 +162,12 @@ PARTS: Final = (
         ),
         ("numpy", "hypothesis.strategies", "robot_agent.config"),
         (
+            Equivalent(
+                "maneuvers",
+                '"seek_dock": Limit(60.0, 5.0, 0.0),',
+                "0.0 -> 1.0",
+                "a base that seeks its dock is told no wheel speeds",
+            ),
             Equivalent(
                 "core",
                 "elapsed = 0.0 if self._stepped_at is None else max(0.0, min(now - self._stepped_at, STEP_S))",

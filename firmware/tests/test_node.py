@@ -230,8 +230,8 @@ def test_edge_that_comes_after_the_loop_read_its_clock_is_no_missing_echo(core):
 
 def test_what_was_measured_before_a_long_wait_is_not_fresh_after_it(make_node, run):
     """A board waits for seconds while it connects; the echoes of before came from a corridor that was free."""
-    for stopped in range(0, 130, 10):  # ms: anywhere in the cycle
-        node = make_node()
+    nodes = [make_node() for _ in range(13)]
+    for node, stopped in zip(nodes, range(0, 130, 10), strict=True):  # ms: anywhere in the cycle
         assert run(node, (3.0, 3.0), 2)[-1].state == "clear"
         waits = 102.0 + stopped / 1000
         node.poll(SimpleNamespace(sonar=lambda _node, _index: 3.0), waits)

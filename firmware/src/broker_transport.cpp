@@ -1,6 +1,7 @@
 #include "broker_transport.hpp"
 
 #include "fognav_contract.h"
+#include "in_flash.hpp"
 
 namespace fognav {
 
@@ -24,13 +25,13 @@ bool look_up(const char* host, IPAddress& address) {
 }
 
 void say_unreachable(const char* host, uint16_t port) {
-    Serial.printf("nobody answers at %s, port %u: is it the fog node's address, and does its broker run?\n", host,
+    Serial.printf(IN_FLASH("nobody answers at %s, port %u: is it the fog node's address, and does its broker run?\n"), host,
                   static_cast<unsigned>(port));
 }
 
 void say_not_trusted(const char* reason, const char* name) {
-    Serial.printf("TLS with the broker failed: %s\n  Is ca.pem that of the fog node's authority (fognav node replace), and "
-                  "is its certificate for %s (fognav ca issue)?\n",
+    Serial.printf(IN_FLASH("TLS with the broker failed: %s\n  Is ca.pem that of the fog node's authority (fognav node replace), and "
+                  "is its certificate for %s (fognav ca issue)?\n"),
                   reason, name);
 }
 
@@ -44,7 +45,7 @@ bool BrokerTransport::connect(const char* host, uint16_t port) {
         reached_ = open(host, address, port, host);
         return reached_;
     }
-    Serial.printf("the name %s is not known in this network: give broker the fog node's address in node.json\n", host);
+    Serial.printf(IN_FLASH("the name %s is not known in this network: give broker the fog node's address in node.json\n"), host);
     return false;
 }
 
@@ -72,7 +73,7 @@ bool PlainTransport::open(const char* host, IPAddress address, uint16_t port, co
 #if defined(ESP8266)
 
 TlsTransport::TlsTransport(const char* authority) : BrokerTransport(secure_), trusted_(authority) {
-    if (trusted_.getCount() == 0) Serial.printf("ca.pem can't be read: paste the whole file of the fog node's authority\n");
+    if (trusted_.getCount() == 0) Serial.printf(IN_FLASH("ca.pem can't be read: paste the whole file of the fog node's authority\n"));
     secure_.setTrustAnchors(&trusted_);
     secure_.setBufferSizes(kReceiveSize, kSendSize);
 }

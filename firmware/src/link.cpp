@@ -3,6 +3,7 @@
 #include <time.h>
 
 #include "discovery.hpp"
+#include "in_flash.hpp"
 #include "scratch.hpp"
 
 namespace fognav {
@@ -36,7 +37,7 @@ void BoardLink::begin(const char* authority) {
     client_.setWill(availability_, FOGNAV_NODE_AVAILABILITY_QOS, true, FOGNAV_NODE_AVAILABILITY_OFFLINE);
     client_.onConnect([this](bool) {
         accepted_ = true;
-        Serial.printf("connected to the broker at %s\n", settings_.broker);
+        Serial.printf(IN_FLASH("connected to the broker at %s\n"), settings_.broker);
     });
     client_.onDisconnect([this](espMqttClientTypes::DisconnectReason reason) {
         failed_ = true;
@@ -48,15 +49,15 @@ void BoardLink::begin(const char* authority) {
 
 void BoardLink::say_why_it_ended(espMqttClientTypes::DisconnectReason reason) {
     using espMqttClientTypes::DisconnectReason;
-    const char* words = "the broker ended the connection without an answer: do port and tls of node.json fit together?";
+    const char* words = IN_FLASH("the broker ended the connection without an answer: do port and tls of node.json fit together?");
     if (reason == DisconnectReason::MQTT_MALFORMED_CREDENTIALS || reason == DisconnectReason::MQTT_NOT_AUTHORIZED) {
-        words = "the broker refuses the node's user or password: write them anew (fognav node replace)";
+        words = IN_FLASH("the broker refuses the node's user or password: write them anew (fognav node replace)");
     } else if (reason == DisconnectReason::MQTT_IDENTIFIER_REJECTED) {
-        words = "the broker refuses the node's client id";
+        words = IN_FLASH("the broker refuses the node's client id");
     } else if (reason != DisconnectReason::TCP_DISCONNECTED) {
-        words = "the broker can't serve the node now";
+        words = IN_FLASH("the broker can't serve the node now");
     } else if (accepted_) {
-        words = "the connection to the broker was lost";
+        words = IN_FLASH("the connection to the broker was lost");
     } else if (!transport_->reached()) {
         return;  // the transport has said it
     }
@@ -65,12 +66,12 @@ void BoardLink::say_why_it_ended(espMqttClientTypes::DisconnectReason reason) {
 
 void BoardLink::join_network() {
     if (joining_) {
-        const char* words = "is it in reach, and wifi_password right?";
-        if (WiFi.status() == WL_NO_SSID_AVAIL) words = "there is none of this name here (an ESP8266 knows 2.4 GHz only)";
+        const char* words = IN_FLASH("is it in reach, and wifi_password right?");
+        if (WiFi.status() == WL_NO_SSID_AVAIL) words = IN_FLASH("there is none of this name here (an ESP8266 knows 2.4 GHz only)");
 #if defined(ESP8266)
-        if (WiFi.status() == WL_WRONG_PASSWORD) words = "wifi_password of node.json is wrong";
+        if (WiFi.status() == WL_WRONG_PASSWORD) words = IN_FLASH("wifi_password of node.json is wrong");
 #endif
-        Serial.printf("the Wi-Fi network %s was not joined: %s\n", settings_.wifi_name, words);
+        Serial.printf(IN_FLASH("the Wi-Fi network %s was not joined: %s\n"), settings_.wifi_name, words);
     }
     joining_ = true;
     WiFi.disconnect();
@@ -100,8 +101,8 @@ bool BoardLink::announce() {
 bool BoardLink::was_taken(uint16_t packet) {
     const bool refused = packet == 0;
     if (refused != refused_) {
-        Serial.printf(refused ? "no message can be sent: %lu bytes of memory are free in one piece, and %lu are kept\n"
-                              : "messages can be sent again: %lu bytes of memory are free in one piece, and %lu are kept\n",
+        Serial.printf(refused ? IN_FLASH("no message can be sent: %lu bytes of memory are free in one piece, and %lu are kept\n")
+                              : IN_FLASH("messages can be sent again: %lu bytes of memory are free in one piece, and %lu are kept\n"),
                       static_cast<unsigned long>(largest_free_block()), static_cast<unsigned long>(EMC_MIN_FREE_MEMORY));
     }
     refused_ = refused;

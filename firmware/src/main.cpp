@@ -5,6 +5,7 @@
 #include "board.hpp"
 #include "connection.hpp"
 #include "files.hpp"
+#include "in_flash.hpp"
 #include "link.hpp"
 #include "portal_server.hpp"
 #include "scratch.hpp"
@@ -100,7 +101,7 @@ private:
 
     void end_calibration() {
         const bool stored = write_file(kCalibrationFile, node_.message());
-        link_.report(stored ? nullptr : "the calibration can't be stored, and ends with the next restart: the flash is full");
+        link_.report(stored ? nullptr : IN_FLASH("the calibration can't be stored, and ends with the next restart: the flash is full"));
         link_.set_calibration(node_.message());
         for (int i = 0; i < settings_.sonars; ++i) Serial.printf("sonar %d: %s\n", i, describe(node_.calibration(i)));
     }
@@ -148,7 +149,7 @@ bool mount() {
 // nullptr, or why the node can't begin with what is on its flash.
 const char* read_flash() {
     const String text = read_file(kSettingsFile, kSettingsMax);
-    if (text.length() == 0) return "node.json is missing, empty or longer than 2 KB";
+    if (text.length() == 0) return IN_FLASH("node.json is missing, empty or longer than 2 KB");
     const char* problem = read_settings(text.c_str(), text.length(), kBoard, settings);
     if (problem != nullptr) return problem;
     authority = read_file(kAuthorityFile, kAuthorityMax);
@@ -167,7 +168,7 @@ bool button_pressed() { return settings.button != kNoPin && digitalRead(settings
 
 void setup() {
     Serial.begin(115200);
-    if (!mount()) complain("the board has no file system, and none can be made: is its flash damaged?");
+    if (!mount()) complain(IN_FLASH("the board has no file system, and none can be made: is its flash damaged?"));
     const char* problem = read_flash();
     static PortalSwitch the_portal(problem == nullptr);
     portal = &the_portal;

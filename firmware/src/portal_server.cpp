@@ -1,6 +1,7 @@
 #include "portal_server.hpp"
 
 #include "files.hpp"
+#include "in_flash.hpp"
 #include "scratch.hpp"
 
 namespace fognav {
@@ -22,7 +23,7 @@ void PortalServer::begin() {
     names_.start(kDnsPort, "*", WiFi.softAPIP());
     server_.on("/", [this] {
         portal_.on_request(millis());
-        server_.send(200, "text/html", kPortalPage);
+        server_.send_P(200, "text/html", kPortalPage);
     });
     server_.on("/settings", HTTP_POST, [this] { submit(); });
     // Phones ask for pages of their makers, and show what they get instead as the place to log in.
@@ -31,7 +32,7 @@ void PortalServer::begin() {
         server_.send(302, "text/plain", "");
     });
     server_.begin();
-    Serial.printf("set-up: join the network %s and open http://192.168.4.1/\n", name);
+    Serial.printf(IN_FLASH("set-up: join the network %s and open http://192.168.4.1/\n"), name);
 }
 
 void PortalServer::loop() {
@@ -55,7 +56,7 @@ void PortalServer::submit() {
         server_.send(400, "text/plain", problem);
         return;
     }
-    server_.send(200, "text/plain", "Saved. The node restarts and joins your network.");
+    server_.send(200, "text/plain", IN_FLASH("Saved. The node restarts and joins your network."));
     delay(kAnswerMs);
     ESP.restart();
 }

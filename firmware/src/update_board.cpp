@@ -13,6 +13,7 @@ extern "C" bool verifyRollbackLater() { return true; }
 #include <stdlib.h>
 
 #include "files.hpp"
+#include "in_flash.hpp"
 
 namespace fognav {
 
@@ -67,7 +68,7 @@ void FlashBoard::abandon_flash() { Update.end(); }
 void FlashBoard::remember(uint32_t number) {
     char text[12];
     snprintf(text, sizeof text, "%lu", static_cast<unsigned long>(number));
-    if (!write_file(kUpdateFile, text)) Serial.printf("the number of the update can't be stored: the flash is full\n");
+    if (!write_file(kUpdateFile, text)) Serial.printf(IN_FLASH("the number of the update can't be stored: the flash is full\n"));
 }
 
 }  // namespace fognav

@@ -70,6 +70,15 @@ def test_libraries_compile_for_the_esp8266_with_its_c_library_alone(firmware, tm
     assert int(sizes[1]) + int(sizes[2]) == 0, "it has no variables of its own"
 
 
+def test_variables_heap_and_stack_fit_into_an_esp8266(firmware):
+    if shutil.which("xtensa-lx106-elf-g++") is None or shutil.which("g++") is None:
+        pytest.skip("no xtensa-lx106-elf-g++: apt-get install gcc-xtensa-lx106 picolibc-xtensa-lx106-elf")
+    printed = run(str(firmware.parent / ".ci" / "firmware-budget"))
+    # The deepest that is known: an offer of an update, on its way from the broker.
+    assert "MqttClient::loop()" in printed
+    assert "Updater::offer" in printed
+
+
 def test_no_input_makes_the_node_fault(firmware, compiler, tmp_path):
     program, inputs = tmp_path / "fuzz", tmp_path / "inputs"
     sanitizers = (

@@ -18,6 +18,7 @@ public:
     void begin() {}
     void handleClient();
     void send(int code, const char* type, const char* text);
+    void send_P(int code, const char* type, const char* text) { send(code, type, text); }
     void sendHeader(const char* name, const char* value);
     String arg(const char* name);
 

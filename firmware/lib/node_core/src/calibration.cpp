@@ -1,5 +1,7 @@
 #include "calibration.hpp"
 
+#include "in_flash.hpp"
+
 namespace fognav {
 
 namespace {
@@ -11,15 +13,15 @@ constexpr int32_t kRangeMm = 4000;  // data sheet
 const char* describe(CalibrationResult result) {
     switch (result) {
         case CalibrationResult::running:
-            return "calibration is under way: keep the way in front of the sonars free";
+            return IN_FLASH("calibration is under way: keep the way in front of the sonars free");
         case CalibrationResult::done:
             return "calibrated";
         case CalibrationResult::stuck:
-            return "the sonar does not answer: check its supply (5 V), trigger and echo wires";
+            return IN_FLASH("the sonar does not answer: check its supply (5 V), trigger and echo wires");
         case CalibrationResult::unsteady:
-            return "its echoes are unsteady: keep the way free, or aim the sonar at a flat wall, and repeat";
+            return IN_FLASH("its echoes are unsteady: keep the way free, or aim the sonar at a flat wall, and repeat");
         case CalibrationResult::too_near:
-            return "its free distance is below half a metre: mount the sonar where it looks farther";
+            return IN_FLASH("its free distance is below half a metre: mount the sonar where it looks farther");
     }
     return "";
 }

@@ -3,6 +3,7 @@
 #include <string.h>
 
 #include "fognav_contract.h"
+#include "in_flash.hpp"
 #include "json_reader.hpp"
 
 namespace fognav {
@@ -32,7 +33,7 @@ public:
         if (json.begin_object()) {
             while (json.next_member(key, length)) member(json, key, length);
         }
-        if (!json.at_end()) return "it is not a JSON object, or a member has the wrong type";
+        if (!json.at_end()) return IN_FLASH("it is not a JSON object, or a member has the wrong type");
         return problem_ != nullptr ? problem_ : missing();
     }
 
@@ -59,12 +60,12 @@ private:
 
     const char* missing() const {
         if (!has_version_) return "version is missing";
-        if (limits_ == kMissing) return "range_limit_m is missing";
-        if (silences_ == kMissing) return "no_echo_is_clear is missing";
-        if (limits_ != config_.sonars) return "range_limit_m is for another number of sonars";
-        if (silences_ != config_.sonars) return "no_echo_is_clear is for another number of sonars";
-        if (farthest_ > 0 && farthest_ != config_.sonars) return "range_max_m is for another number of sonars";
-        if (pulses_ != kMissing && pulses_ != config_.sonars) return "no_echo_us is for another number of sonars";
+        if (limits_ == kMissing) return IN_FLASH("range_limit_m is missing");
+        if (silences_ == kMissing) return IN_FLASH("no_echo_is_clear is missing");
+        if (limits_ != config_.sonars) return IN_FLASH("range_limit_m is for another number of sonars");
+        if (silences_ != config_.sonars) return IN_FLASH("no_echo_is_clear is for another number of sonars");
+        if (farthest_ > 0 && farthest_ != config_.sonars) return IN_FLASH("range_max_m is for another number of sonars");
+        if (pulses_ != kMissing && pulses_ != config_.sonars) return IN_FLASH("no_echo_us is for another number of sonars");
         return nullptr;
     }
 
@@ -77,7 +78,7 @@ private:
         if (!json.number_milli(milli)) return;
         has_version_ = true;
         config_.version = static_cast<uint64_t>(milli / kMilli);
-        if (milli < 0 || milli % kMilli != 0) refuse("version is not a whole number from 0 on");
+        if (milli < 0 || milli % kMilli != 0) refuse(IN_FLASH("version is not a whole number from 0 on"));
     }
 
     void pause(JsonReader& json) {
@@ -86,7 +87,7 @@ private:
         const bool whole = milli % kMilli == 0;
         const int64_t pause_ms = milli / kMilli;
         if (!whole || pause_ms < FOGNAV_NODE_CONFIG_PAUSE_MS_MIN || pause_ms > FOGNAV_NODE_CONFIG_PAUSE_MS_MAX) {
-            refuse("pause_ms is not a whole number from 10 to 60000");
+            refuse(IN_FLASH("pause_ms is not a whole number from 10 to 60000"));
             return;
         }
         config_.pause_ms = static_cast<uint16_t>(pause_ms);
@@ -99,7 +100,7 @@ private:
         while (json.next_element()) {
             int64_t mm = 0;
             if (!json.number_milli(mm)) return;
-            if (mm <= 0 || mm > max_mm) refuse("range_limit_m has a limit that is not from 0.001 to 20 m");
+            if (mm <= 0 || mm > max_mm) refuse(IN_FLASH("range_limit_m has a limit that is not from 0.001 to 20 m"));
             if (limits_ < kMaxSonars) config_.limits[limits_].limit_mm = static_cast<int32_t>(mm);
             ++limits_;
         }
@@ -112,7 +113,7 @@ private:
         while (json.next_element()) {
             int64_t mm = 0;
             if (!json.number_milli(mm)) return;
-            if (mm < 0 || mm > max_mm) refuse("range_max_m has a range that is not from 0 to 20 m");
+            if (mm < 0 || mm > max_mm) refuse(IN_FLASH("range_max_m has a range that is not from 0 to 20 m"));
             if (farthest_ < kMaxSonars) config_.limits[farthest_].max_mm = static_cast<int32_t>(mm);
             ++farthest_;
         }
@@ -136,7 +137,7 @@ private:
             int64_t milli = 0;
             if (!json.number_milli(milli)) return;
             const int64_t us = milli / kMilli;
-            if (milli < 0 || us > FOGNAV_NODE_CALIBRATION_NO_ECHO_US_MAX) refuse("no_echo_us has a pulse beyond 80000");
+            if (milli < 0 || us > FOGNAV_NODE_CALIBRATION_NO_ECHO_US_MAX) refuse(IN_FLASH("no_echo_us has a pulse beyond 80000"));
             if (pulses_ < kMaxSonars) config_.limits[pulses_].no_echo_us = static_cast<uint32_t>(us);
             ++pulses_;
         }

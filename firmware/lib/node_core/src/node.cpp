@@ -3,6 +3,7 @@
 #include <string.h>
 
 #include "fognav_contract.h"
+#include "in_flash.hpp"
 
 namespace fognav {
 
@@ -114,8 +115,8 @@ const char* Node::command(const char* text, size_t size) {
     } else if (is(FOGNAV_NODE_COMMAND_LEARN_NO_ECHO)) {
         calibrate(CalibrationGoal::no_echo);
     } else {
-        return "this firmware does not know the command: it knows " FOGNAV_NODE_COMMAND_CALIBRATE
-               " and " FOGNAV_NODE_COMMAND_LEARN_NO_ECHO;
+        return IN_FLASH("this firmware does not know the command: it knows " FOGNAV_NODE_COMMAND_CALIBRATE
+               " and " FOGNAV_NODE_COMMAND_LEARN_NO_ECHO);
     }
     return nullptr;
 }

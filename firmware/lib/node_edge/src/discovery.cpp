@@ -3,6 +3,7 @@
 #include <stdio.h>
 
 #include "fognav_contract.h"
+#include "in_flash.hpp"
 #include "json_writer.hpp"
 
 namespace fognav {
@@ -52,13 +53,13 @@ size_t write_discovery(const Settings& settings, const char* firmware, char* buf
     text_member(json, "availability_topic", topic);
     json.key("cmps");
     json.begin_object();
-    sensor(json, settings, "state", "{{ value_json.state }}");
+    sensor(json, settings, "state", IN_FLASH("{{ value_json.state }}"));
     json.end_object();
     for (int i = 0; i < settings.sonars; ++i) {
         char name[20];
         char value_template[48];
         snprintf(name, sizeof name, "range-%d", i);
-        snprintf(value_template, sizeof value_template, "{{ value_json.range_m[%d] }}", i);
+        snprintf(value_template, sizeof value_template, IN_FLASH("{{ value_json.range_m[%d] }}"), i);
         sensor(json, settings, name, value_template);
         text_member(json, "device_class", "distance");
         text_member(json, "unit_of_measurement", "m");

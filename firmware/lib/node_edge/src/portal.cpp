@@ -3,6 +3,7 @@
 #include <stdio.h>
 #include <string.h>
 
+#include "in_flash.hpp"
 #include "json_writer.hpp"
 
 namespace fognav {
@@ -38,7 +39,7 @@ const char* write_sonars(const Form& form, JsonWriter& json) {
         const char* text = form.field(field);
         if (!given(text)) continue;
         const int32_t limit_mm = millimetres(text);
-        if (limit_mm == 0) return "a range limit is not in metres, such as 1.8";
+        if (limit_mm == 0) return IN_FLASH("a range limit is not in metres, such as 1.8");
         json.begin_object();
         json.key("range_limit_m");
         json.thousandths(limit_mm);
@@ -46,7 +47,7 @@ const char* write_sonars(const Form& form, JsonWriter& json) {
         ++count;
     }
     json.end_array();
-    return count > 0 ? nullptr : "the range limit of the first sensor is missing, in metres";
+    return count > 0 ? nullptr : IN_FLASH("the range limit of the first sensor is missing, in metres");
 }
 
 const char* write_fields(const Form& form, char* buffer, size_t size, size_t& length) {
@@ -72,7 +73,7 @@ const char* write_fields(const Form& form, char* buffer, size_t size, size_t& le
     if (problem != nullptr) return problem;
     json.end_object();
     length = json.finish();
-    return length > 0 ? nullptr : "the settings are too long: shorten the names and passwords";
+    return length > 0 ? nullptr : IN_FLASH("the settings are too long: shorten the names and passwords");
 }
 
 }  // namespace
@@ -82,7 +83,7 @@ const char* settings_from_form(const Form& form, const BoardPins& board, char* b
     const char* provisioning = form.field("provisioning");
     if (given(provisioning)) {
         length = strlen(provisioning);
-        if (length + 1 > size) return "the provisioning file is longer than 2 KB";
+        if (length + 1 > size) return IN_FLASH("the provisioning file is longer than 2 KB");
         memcpy(buffer, provisioning, length + 1);
     } else {
         const char* problem = write_fields(form, buffer, size, length);
@@ -93,10 +94,11 @@ const char* settings_from_form(const Form& form, const BoardPins& board, char* b
 
 const char* authority_problem(const char* pem, const Settings& settings) {
     if (!settings.tls) return nullptr;
-    if (!given(pem)) return "ca.pem is missing: the certificate of the authority that signed the broker's";
-    if (strlen(pem) > kAuthorityMax) return "ca.pem is longer than 4 KB: it is one certificate, not a list of them";
-    const bool whole = strstr(pem, "-----BEGIN CERTIFICATE-----") != nullptr && strstr(pem, "-----END CERTIFICATE-----") != nullptr;
-    return whole ? nullptr : "ca.pem is no certificate: it begins with -----BEGIN CERTIFICATE-----";
+    if (!given(pem)) return IN_FLASH("ca.pem is missing: the certificate of the authority that signed the broker's");
+    if (strlen(pem) > kAuthorityMax) return IN_FLASH("ca.pem is longer than 4 KB: it is one certificate, not a list of them");
+    const bool whole =
+        strstr(pem, "-----BEGIN CERTIFICATE-----") != nullptr && strstr(pem, "-----END CERTIFICATE-----") != nullptr;
+    return whole ? nullptr : IN_FLASH("ca.pem is no certificate: it begins with -----BEGIN CERTIFICATE-----");
 }
 
 void portal_name(uint32_t chip, char (&name)[16]) {
@@ -114,7 +116,7 @@ void PortalSwitch::step(bool pressed, uint32_t now_ms) {
 }
 
 // Escapes: what somebody types is never put into the page.
-const char kPortalPage[] =
+const char kPortalPage[] FLASH_SECTION =
     "<!doctype html><html lang=en><meta charset=utf-8><meta name=viewport content='width=device-width'>"
     "<title>Fognav node</title><style>body{font:16px sans-serif;max-width:34em;margin:2em auto;padding:0 1em}"
     "label{display:block;margin:.6em 0}input,textarea,select{width:100%;box-sizing:border-box;font:inherit}"

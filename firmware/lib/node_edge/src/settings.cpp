@@ -4,6 +4,7 @@
 
 #include "fognav_contract.h"
 #include "hexadecimal.hpp"
+#include "in_flash.hpp"
 #include "json_reader.hpp"
 #include "settings_check.hpp"
 
@@ -27,7 +28,7 @@ public:
             while (json_.next_member(key, length)) member(key, length);
         }
         if (problem_ != nullptr) return problem_;
-        if (!json_.at_end()) return "node.json is not a JSON object, or a member has the wrong type or is too long";
+        if (!json_.at_end()) return IN_FLASH("node.json is not a JSON object, or a member has the wrong type or is too long");
         use_profile(board, settings_);
         return settings_problem(board, settings_);
     }
@@ -74,7 +75,7 @@ private:
         return least;
     }
 
-    int8_t pin() { return static_cast<int8_t>(number(0, kPinMax, "a pin is not a GPIO number from 0 to 39")); }
+    int8_t pin() { return static_cast<int8_t>(number(0, kPinMax, IN_FLASH("a pin is not a GPIO number from 0 to 39"))); }
 
     // The index of a word in a list of them; another word is refused with `problem`.
     template <size_t count>
@@ -100,7 +101,7 @@ private:
             {"profile", &Reader::profile}, {"button", &Reader::button}, {"update_key", &Reader::update_key},
             {"sonars", &Reader::sonars}, {"values", &Reader::values},
         };
-        dispatch(kEntries, key, length, "node.json has a member that no setting is called; compare it with firmware/README.md");
+        dispatch(kEntries, key, length, IN_FLASH("node.json has a member that no setting is called; compare it with firmware/README.md"));
     }
 
     void site() { text(settings_.site); }
@@ -115,11 +116,11 @@ private:
     void button() { settings_.button = pin(); }
 
     void port() {
-        settings_.port = static_cast<uint16_t>(number(1, 65535, "port is not a whole number from 1 to 65535"));
+        settings_.port = static_cast<uint16_t>(number(1, 65535, IN_FLASH("port is not a whole number from 1 to 65535")));
     }
 
     void thesis_area() {
-        settings_.thesis_area = static_cast<uint32_t>(number(0, 9999, "thesis_area is not a whole number up to 9999"));
+        settings_.thesis_area = static_cast<uint32_t>(number(0, 9999, IN_FLASH("thesis_area is not a whole number up to 9999")));
     }
 
     void every_reading() {
@@ -130,13 +131,13 @@ private:
     void temperature() {
         int64_t milli = 0;
         if (!json_.number_milli(milli)) return;
-        if (milli < -40 * kMilli || milli > 60 * kMilli) refuse("temperature_c is not from -40 to 60 degrees");
+        if (milli < -40 * kMilli || milli > 60 * kMilli) refuse(IN_FLASH("temperature_c is not from -40 to 60 degrees"));
         settings_.temperature_dc = static_cast<int32_t>(milli / 100);
     }
 
     void profile() {
         static constexpr const char* kProfiles[] = {"standard", "thesis"};
-        settings_.thesis_pins = word(kProfiles, "profile is neither standard nor thesis") == 1;
+        settings_.thesis_pins = word(kProfiles, IN_FLASH("profile is neither standard nor thesis")) == 1;
     }
 
     void update_key() {
@@ -144,14 +145,14 @@ private:
         if (!json_.text(found, sizeof found)) return;
         settings_.updates = bytes(found, settings_.update_key, kUpdateKeySize) == static_cast<int>(kUpdateKeySize) &&
                             settings_.update_key[0] == 4;
-        if (!settings_.updates) refuse("update_key is not a public key: 130 hexadecimal digits that begin with 04");
+        if (!settings_.updates) refuse(IN_FLASH("update_key is not a public key: 130 hexadecimal digits that begin with 04"));
     }
 
     void sonars() {
         if (!json_.begin_array()) return;
         while (json_.next_element()) {
             if (settings_.sonars == kMaxSonars) {
-                refuse("node.json has more than eight sonars");
+                refuse(IN_FLASH("node.json has more than eight sonars"));
                 json_.skip_value();
                 continue;
             }
@@ -164,7 +165,7 @@ private:
         if (!json_.begin_array()) return;
         while (json_.next_element()) {
             if (settings_.values == kMaxValues) {
-                refuse("node.json has more than four values");
+                refuse(IN_FLASH("node.json has more than four values"));
                 json_.skip_value();
                 continue;
             }
@@ -188,7 +189,7 @@ private:
             {"range_max_m", &Reader::range_max}, {"no_echo_is_clear", &Reader::no_echo_is_clear},
         };
         dispatch(kEntries, key, length,
-                 "a sonar in node.json has a member that no setting is called; compare it with firmware/README.md");
+                 IN_FLASH("a sonar in node.json has a member that no setting is called; compare it with firmware/README.md"));
     }
 
     RangeSensorSettings& sensor() { return settings_.sensors[settings_.sonars]; }
@@ -197,7 +198,7 @@ private:
     void range_sensor() {
         static constexpr const char* kKinds[] = {"hc-sr04", "vl53l0x", "vl53l1x"};
         sensor().kind =
-            static_cast<RangeSensorKind>(word(kKinds, "a sonar's sensor is none of hc-sr04, vl53l0x and vl53l1x"));
+            static_cast<RangeSensorKind>(word(kKinds, IN_FLASH("a sonar's sensor is none of hc-sr04, vl53l0x and vl53l1x")));
     }
     void trigger() { sensor().pins.trigger = pin(); }
     void echo() { sensor().pins.echo = pin(); }
@@ -207,14 +208,14 @@ private:
     void range_limit() {
         int64_t mm = 0;
         if (!json_.number_milli(mm)) return;
-        if (mm <= 0 || mm > 20000) refuse("range_limit_m of a sonar is not from 0.001 to 20 m");
+        if (mm <= 0 || mm > 20000) refuse(IN_FLASH("range_limit_m of a sonar is not from 0.001 to 20 m"));
         limit().limit_mm = static_cast<int32_t>(mm);
     }
 
     void range_max() {
         int64_t mm = 0;
         if (!json_.number_milli(mm)) return;
-        if (mm < 0 || mm > 20000) refuse("range_max_m of a sonar is not from 0 to 20 m");
+        if (mm < 0 || mm > 20000) refuse(IN_FLASH("range_max_m of a sonar is not from 0 to 20 m"));
         limit().max_mm = static_cast<int32_t>(mm);
     }
 
@@ -225,7 +226,7 @@ private:
             {"full_scale_v", &Reader::full_scale},
         };
         dispatch(kEntries, key, length,
-                 "a value in node.json has a member that no setting is called; compare it with firmware/README.md");
+                 IN_FLASH("a value in node.json has a member that no setting is called; compare it with firmware/README.md"));
     }
 
     ValueSettings& value() { return settings_.value_sensors[settings_.values]; }
@@ -235,13 +236,13 @@ private:
 
     void value_sensor() {
         static constexpr const char* kKinds[] = {"ds18b20", "analog"};
-        value().kind = static_cast<ValueSensorKind>(word(kKinds, "a value's sensor is neither ds18b20 nor analog"));
+        value().kind = static_cast<ValueSensorKind>(word(kKinds, IN_FLASH("a value's sensor is neither ds18b20 nor analog")));
     }
 
     void full_scale() {
         int64_t milli = 0;
         if (!json_.number_milli(milli)) return;
-        if (milli <= 0 || milli > 100 * kMilli) refuse("full_scale_v of a value is not above 0 and up to 100 V");
+        if (milli <= 0 || milli > 100 * kMilli) refuse(IN_FLASH("full_scale_v of a value is not above 0 and up to 100 V"));
         value().full_scale_mv = static_cast<int32_t>(milli);
     }
 
@@ -253,7 +254,9 @@ private:
 }  // namespace
 
 const char* read_settings(const char* text, size_t size, const BoardPins& board, Settings& settings) {
-    settings = Settings();
+    // A temporary would be a second one on the stack.
+    static constexpr Settings kFresh FLASH_SECTION = {};
+    settings = kFresh;
     return SettingsReader(text, size, settings).read(board);
 }
 

@@ -4,6 +4,7 @@
 #include <string.h>
 
 #include "hexadecimal.hpp"
+#include "in_flash.hpp"
 #include "json_reader.hpp"
 
 namespace fognav {
@@ -27,11 +28,11 @@ public:
         if (json.begin_object()) {
             while (json.next_member(key, length)) member(json, key, length);
         }
-        if (!json.at_end()) return "the update is not a JSON object, or a member has the wrong type or is too long";
+        if (!json.at_end()) return IN_FLASH("the update is not a JSON object, or a member has the wrong type or is too long");
         if (problem_ != nullptr) return problem_;
         const bool complete = offer_.number != 0 && offer_.board[0] != 0 && offer_.size != 0 && has_hash_ &&
                               offer_.signature_size != 0 && offer_.url[0] != 0;
-        return complete ? nullptr : "the update lacks its number, board, size, sha256, signature or url";
+        return complete ? nullptr : IN_FLASH("the update lacks its number, board, size, sha256, signature or url");
     }
 
 private:
@@ -46,12 +47,12 @@ private:
             char text[2 * kHashSize + 1];
             if (!json.text(text, sizeof text)) return;
             has_hash_ = bytes(text, offer_.hash, kHashSize) == static_cast<int>(kHashSize);
-            if (!has_hash_) problem_ = "the update's sha256 is not 64 hexadecimal digits";
+            if (!has_hash_) problem_ = IN_FLASH("the update's sha256 is not 64 hexadecimal digits");
         } else if (is(key, length, FOGNAV_NODE_UPDATE_SIGNATURE_FIELD)) {
             char text[2 * kSignatureMax + 1];
             if (!json.text(text, sizeof text)) return;
             const int found = bytes(text, offer_.signature, kSignatureMax);
-            if (found < 0) problem_ = "the update's signature is not made of hexadecimal digits";
+            if (found < 0) problem_ = IN_FLASH("the update's signature is not made of hexadecimal digits");
             offer_.signature_size = found < 0 ? 0 : static_cast<size_t>(found);
         } else if (is(key, length, FOGNAV_NODE_UPDATE_URL_FIELD)) {
             json.text(offer_.url, sizeof offer_.url);
@@ -64,7 +65,7 @@ private:
         int64_t milli = 0;
         if (!json.number_milli(milli)) return 0;
         if (milli % kMilli == 0 && milli > 0 && milli / kMilli <= most) return static_cast<uint32_t>(milli / kMilli);
-        problem_ = "the update's number or size is not a whole number in its limits";
+        problem_ = IN_FLASH("the update's number or size is not a whole number in its limits");
         return 0;
     }
 
@@ -80,14 +81,16 @@ bool is_same(const UpdateOffer& a, const UpdateOffer& b) {
 }  // namespace
 
 const char* read_update(const char* text, size_t size, UpdateOffer& offer) {
-    offer = UpdateOffer();
+    // A temporary would be a second one on the stack.
+    static constexpr UpdateOffer kFresh FLASH_SECTION = {};
+    offer = kFresh;
     return OfferReader(offer).read(text, size);
 }
 
 size_t signed_text(const UpdateOffer& offer, char* buffer, size_t size) {
     char hash[2 * kHashSize + 1];
     for (size_t i = 0; i < kHashSize; ++i) snprintf(hash + 2 * i, 3, "%02x", offer.hash[i]);
-    const int length = snprintf(buffer, size, "fognav-firmware\n%s\n%lu\n%lu\n%s\n", offer.board,
+    const int length = snprintf(buffer, size, IN_FLASH("fognav-firmware\n%s\n%lu\n%lu\n%s\n"), offer.board,
                                 static_cast<unsigned long>(offer.number), static_cast<unsigned long>(offer.size), hash);
     return static_cast<size_t>(length);
 }
@@ -104,15 +107,15 @@ const char* Updater::offer(const char* text, size_t size, uint32_t now_ms) {
     // The broker delivers it again with each connection: what is under way goes on, and what has failed is not tried anew.
     if (is_same(found, offer_)) return nullptr;
     if (found.number == number_) {
-        return "the update was installed and did not stay: it never reached the broker, or has another number in itself; "
-               "sign one with a higher number";
+        return IN_FLASH("the update was installed and did not stay: it never reached the broker, or has another number in itself; "
+               "sign one with a higher number");
     }
-    if (found.number < number_) return "the update is older than what runs: sign one with a higher number";
-    if (strcmp(found.board, board_) != 0) return "the update is for another board";
+    if (found.number < number_) return IN_FLASH("the update is older than what runs: sign one with a higher number");
+    if (strcmp(found.board, board_) != 0) return IN_FLASH("the update is for another board");
     char signed_lines[kSignedTextSize];
     const size_t length = signed_text(found, signed_lines, sizeof signed_lines);
     if (!port_.signature_is_good(signed_lines, length, found.signature, found.signature_size)) {
-        return "the update is not signed by the key in update_key of node.json";
+        return IN_FLASH("the update is not signed by the key in update_key of node.json");
     }
     withdraw();
     offer_ = found;
@@ -149,27 +152,27 @@ const char* Updater::begin(uint32_t now_ms) {
     phase_ = Phase::fetching;
     fetched_ = 0;
     since_ms_ = now_ms;
-    if (!port_.open(offer_.url, offer_.size)) return fail("the update's url does not answer with its size", now_ms);
+    if (!port_.open(offer_.url, offer_.size)) return fail(IN_FLASH("the update's url does not answer with its size"), now_ms);
     port_.begin_hash();
-    return port_.begin_flash(offer_.size) ? nullptr : fail("the update is too large for the flash", now_ms);
+    return port_.begin_flash(offer_.size) ? nullptr : fail(IN_FLASH("the update is too large for the flash"), now_ms);
 }
 
 const char* Updater::fetch(uint32_t now_ms) {
     uint8_t piece[kPieceSize];
     const uint32_t missing = offer_.size - fetched_;
     const int count = port_.fetch(piece, missing < kPieceSize ? missing : kPieceSize);
-    if (count < 0) return fail("the connection to the update's url was lost", now_ms);
+    if (count < 0) return fail(IN_FLASH("the connection to the update's url was lost"), now_ms);
     if (count == 0) {
         const bool lost = now_ms - since_ms_ >= kFetchTimeoutMs;
-        return lost ? fail("the update's url has sent nothing for 30 s", now_ms) : nullptr;
+        return lost ? fail(IN_FLASH("the update's url has sent nothing for 30 s"), now_ms) : nullptr;
     }
     since_ms_ = now_ms;
     port_.add_to_hash(piece, static_cast<size_t>(count));
     fetched_ += static_cast<uint32_t>(count);
     const bool last = fetched_ == offer_.size;
     // The last piece is not written before the hash is right: a board takes a flash that is complete for an image to start.
-    if (last && !hash_is_right()) return fail("what the update's url sent is not what was signed", now_ms);
-    if (!port_.write_flash(piece, static_cast<size_t>(count))) return fail("the flash can't be written", now_ms);
+    if (last && !hash_is_right()) return fail(IN_FLASH("what the update's url sent is not what was signed"), now_ms);
+    if (!port_.write_flash(piece, static_cast<size_t>(count))) return fail(IN_FLASH("the flash can't be written"), now_ms);
     if (!last) return nullptr;
     port_.close();
     return finish();
@@ -186,7 +189,7 @@ const char* Updater::finish() {
     // Before the commit: a board that is reset in between keeps what runs, and takes the next number.
     port_.remember(offer_.number);
     number_ = offer_.number;
-    if (!port_.commit_flash()) return "the board refuses the update: it is not for this board or this size of flash";
+    if (!port_.commit_flash()) return IN_FLASH("the board refuses the update: it is not for this board or this size of flash");
     port_.restart();
     return nullptr;
 }

@@ -197,7 +197,18 @@ def test_folder_without_a_site_is_refused_with_the_known_sites(tmp_path: Path, c
 
 
 def test_site_can_be_checked_by_its_name() -> None:
-    assert "estig: ok" in runner.invoke(app, ["site", "check", "estig"]).output
+    said = runner.invoke(app, ["site", "check", "estig"]).output
+    assert "estig: ok" in said
+    assert "range_max" not in said
+
+
+def test_check_of_a_site_names_nodes_that_take_any_far_echo_for_clear(tmp_path: Path) -> None:
+    shutil.copytree(Path(__file__).parents[2] / "sites" / "estig", tmp_path / "floor")
+    file = tmp_path / "floor" / "site.toml"
+    file.write_text(file.read_text("utf-8").replace(", range_max = 2.85", ""), "utf-8")
+    said = runner.invoke(app, ["site", "check", str(tmp_path / "floor")]).output
+    assert "floor: ok" in said
+    assert "['n4']" in said
 
 
 def test_image_in_place_of_a_map_file_is_refused_with_the_remedy(tmp_path: Path) -> None:

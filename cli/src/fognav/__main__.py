@@ -396,6 +396,11 @@ def site_check(
         print_json(found)
     elif found["ok"]:
         print_line(f"{folder}: ok ({found['areas']} areas, {found['nodes']} nodes, {found['places']} places)")
+        if found["unbounded_nodes"]:
+            print_line(
+                f"nodes with a sonar without range_max: {found['unbounded_nodes']}. To it an echo from behind the wall "
+                "is clear: fognav node calibrate NODE --site DIR, unless it hears no wall"
+            )
     else:
         fail(str(found["problem"]))
     raise typer.Exit(OK if found["ok"] else NOT_TRUE)

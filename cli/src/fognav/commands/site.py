@@ -101,4 +101,5 @@ def check_site(folder: Path) -> dict[str, object]:
         "places": len(site.places),
         "robots": len(site.robots),
         "demo": site.demo is not None,
+        "unbounded_nodes": [node.id for node in site.nodes if any(each.range_max is None for each in node.sonars)],
     }

@@ -306,6 +306,14 @@ def test_gate_is_told_how_much_of_a_straight_way_is_left_and_what_stops_it(maneu
     assert maneuvers.inputs(state(kind), None, None, 4.0).remaining == pytest.approx(length), "it begins anew"
 
 
+def test_way_back_that_the_gate_is_told_counts_from_where_a_rolling_robot_turns_round(maneuvers, localizer):
+    maneuvers.inputs(state("back_off"), None, None, 1.0)
+    localizer.odom = Pose2(0.03, 0.0, 0.0)
+    assert maneuvers.inputs(state("back_off"), None, None, 1.1).remaining == pytest.approx(0.09)
+    localizer.odom = ORIGIN
+    assert maneuvers.inputs(state("back_off"), None, None, 1.5).remaining == pytest.approx(0.06)
+
+
 def test_gate_is_told_how_far_a_turn_has_to_go_and_what_stops_it(maneuvers, localizer):
     begun = maneuvers.inputs(state("turn"), None, None, 1.0)
     assert (begun.remaining, begun.problem) == (pytest.approx(2.8), "a chair")

@@ -35,8 +35,8 @@ from fog_runtime.transports.zenoh_edge import session_config
 
 WATCH_S: Final = 5.0
 """How often the router looks whether a session can be opened to it (it asks itself less often while that works)."""
-DEAF_S: Final = 20.0
-"""After how long without any such session it ends, to be started again."""
+DEAF_S: Final = 40.0
+"""After how long without any such session it ends: longer than a small computer is busy with its start."""
 HANGS_S: Final = 60.0
 """After how long without such a look it is ended: its loop, or the interpreter, hangs."""
 

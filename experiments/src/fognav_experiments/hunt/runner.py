@@ -152,14 +152,16 @@ def summary(records: Iterable[Record]) -> str:
     lines = [f"{len(drives)} drives, {hours:.2f} simulated hours, {driven:.2f} km driven"]
     for label, chosen in (
         ("exact maps", [r for r in drives if r.exact]),
-        ("warped ones", [r for r in drives if not r.exact]),
+        ("maps that are off", [r for r in drives if not r.exact]),
     ):
         poses = sum(record.figures.poses for record in chosen)
         if poses:
             rms = (sum(record.figures.squared_error for record in chosen) / poses) ** 0.5
             share = 100.0 * sum(record.figures.within_two_sigma for record in chosen) / poses
             worst = max(record.figures.worst_error_m for record in chosen)
-            lines.append(f"{label}: pose error rms {rms:.3f} m, worst {worst:.2f} m, {share:.1f} % within 2 sigma")
+            clearance = min(record.figures.min_clearance_m for record in chosen)
+            pose = f"pose error rms {rms:.3f} m, worst {worst:.2f} m, {share:.1f} % within 2 sigma"
+            lines.append(f"{label}: {len(chosen)} drives, {pose}, least clearance {clearance:.3f} m")
     moving = sum(record.figures.moving_s for record in drives)
     if moving:
         slow = 100.0 * sum(record.figures.degraded_s for record in drives) / moving

@@ -71,13 +71,16 @@ class LittleWorld:
     pose: tuple = (2.0, 2.0, 0.0)
     seed: int = 1
     lidar_noise: float = 0.01
+    lidar_noise_share: float = 0.0  # of the range, besides
     start_agent: type = AgentCore
+    resolution: float = 0.05
+    glass: list = field(default_factory=list)  # rectangles whose walls return nothing
     wheel_error: float = 0.0  # by how much the encoders count too far, as a share
     config: AgentConfig = AGENT  # of the body and the lidar's place on it, too
     posts: list = field(default_factory=list)  # rectangles (left, bottom, right, top in m) that no map has
 
     def __post_init__(self):
-        self.static, self.geometry = grid_of(self.rooms, *self.size)
+        self.static, self.geometry = grid_of(self.rooms, *self.size, self.resolution)
         self.solid = (self.static == 254).astype(np.uint8)
         self.table = inflation_table(self.geometry.resolution, Inflation(cost_scaling=6.0))
         self.raw = self.static.copy()
@@ -316,8 +319,12 @@ class LittleWorld:
             ranges = cast(self.solid, g.resolution, g.origin_x, g.origin_y, x, y, angles + self.theta, 12.0)
             for post in self.posts:
                 ranges = np.fmin(ranges, _ranges_of(post, x, y, angles + self.theta))
-            ranges += self.lidar_noise * self.rng.standard_normal(len(ranges))
-            ranges[~np.isfinite(ranges) | (self.rng.random(len(ranges)) < 0.02)] = math.nan
+            ranges[~np.isfinite(ranges)] = math.nan
+            for left, bottom, right, top in self.glass:
+                ends = x + ranges * np.cos(angles + self.theta), y + ranges * np.sin(angles + self.theta)
+                ranges[(ends[0] > left) & (ends[0] < right) & (ends[1] > bottom) & (ends[1] < top)] = math.nan
+            ranges += (self.lidar_noise + self.lidar_noise_share * ranges) * self.rng.standard_normal(len(ranges))
+            ranges[self.rng.random(len(ranges)) < 0.02] = math.nan
             ranges[ranges < lidar.range_min] = math.nan
             self.beams.extend(zip(angles, ranges, strict=True))
             samples = LidarSamples(

@@ -173,19 +173,6 @@ def test_number_of_particles_equals_foxs_formula() -> None:
     assert len(result.x) == math.ceil(bound)
 
 
-def test_random_share_of_particles_is_drawn_from_the_free_positions() -> None:
-    particles = cloud(2000, 1.0, 1.0, 0.0)
-    free = np.array([[5.0, 6.0], [8.0, 2.0]])
-    result = resample(
-        *particles, np.full(2000, 1 / 2000), 2000, 2000, 0.05, rng_state(2), random_share=0.25, free_xy=free, jitter=0.1
-    )
-    fresh = result.x != 1.0
-    assert fresh.mean() == pytest.approx(0.25, abs=0.03)
-    nearest = np.minimum(np.abs(result.x[fresh] - 5.0), np.abs(result.x[fresh] - 8.0))
-    assert nearest.max() <= 0.05 + 1e-6
-    assert np.ptp(result.theta[fresh]) > 6.0
-
-
 def test_estimate_is_the_circular_mean_of_the_cluster_with_the_highest_weight() -> None:
     rng = np.random.default_rng(4)
     x = np.concatenate([rng.normal(2, 0.1, 300), rng.normal(9, 0.1, 700)]).astype(np.float32)
@@ -316,5 +303,3 @@ def test_invalid_arrays_and_generator_states_are_refused_by_name() -> None:
         estimate(x, y, theta, np.zeros(3))
     with pytest.raises(ValueError, match="n_min"):
         resample(x, y, theta, weights, 5, 4, 0.05, rng_state(1))
-    with pytest.raises(ValueError, match="free_xy"):
-        resample(x, y, theta, weights, 3, 3, 0.05, rng_state(1), random_share=0.1)

@@ -61,6 +61,9 @@ class SafetyConfig:
     scan_lost: float = 0.45
     identical_scans: int = 3
     base_lost: float = 0.3
+    position_sigma_max: float = 0.8
+    """A robot whose position has a larger standard deviation (m) in some direction does not drive a mission: one in
+    twenty would be more than 1.6 m from where it believes to be."""
     hold_needs_operator_after: float = 60.0
     stops_to_fault: int = 3
     stops_within: float = 60.0
@@ -139,15 +142,13 @@ class LocalizationConfig:
     field_reach: float = 2.0
     sharpness: float = 12.0
     """Logarithm of the weight ratio between a pose that all beams fit and one that none fits."""
-    alphas: tuple[float, float, float, float] = (0.05, 0.05, 0.05, 0.05)
+    alphas: tuple[float, float, float, float] = (0.05, 0.05, 0.01, 0.05)
     """Variances of the odometry's noise per squared motion, over steps of `update_distance` and `update_angle`:
     rotation from rotation, rotation from translation, translation from translation, translation from rotation."""
     update_distance: float = 0.1
     update_angle: float = 0.1
     match_sigma: float = 0.08
     """Standard deviation (m) of a beam's end when the estimate is refined by matching the scan."""
-    recovery_slow: float = 0.001
-    recovery_fast: float = 0.1
     range_min: float = 0.15
     range_max: float = 12.0
     lidar_x: float = 0.0

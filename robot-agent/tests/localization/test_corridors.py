@@ -48,7 +48,7 @@ class Drive:
         ranges += 0.01 * self.rng.standard_normal(len(ranges))
         hit = ranges < LIDAR_M
         points = np.column_stack((ranges[hit] * np.cos(angles[hit]), ranges[hit] * np.sin(angles[hit])))
-        self.filter.add(DeskewedScan(points, self.odom, 0.0), self.fields, recover=False)
+        self.filter.add(DeskewedScan(points, self.odom, 0.0), self.fields)
 
     def advance(self) -> None:
         turn = -0.5 * self.true.theta - 0.1 * (self.true.y - 2.0)

@@ -34,18 +34,18 @@ def driven(seed: int, *, drift: float) -> tuple[ParticleFilter, Pose2, Pose2]:
     one = ParticleFilter(CONFIG, seed)
     one.start(START, ORIGIN, 0.1, 0.05)
     true, odom = START, ORIGIN
-    one.add(scan_at(true, odom), FIELDS, recover=False)
+    one.add(scan_at(true, odom), FIELDS)
     for _ in range(20):
         true = true.compose(Pose2(0.3, 0.0, 0.0))
         odom = odom.compose(Pose2(0.3, 0.0, drift))
-        one.add(scan_at(true, odom), FIELDS, recover=False)
+        one.add(scan_at(true, odom), FIELDS)
     return one, true, odom
 
 
 def test_given_pose_is_refined_by_the_first_scan():
     one = ParticleFilter(CONFIG, 1)
     one.start(Pose2(3.3, 1.8, 0.2), ORIGIN, 0.4, 0.3)
-    one.add(scan_at(START, ORIGIN), FIELDS, recover=False)
+    one.add(scan_at(START, ORIGIN), FIELDS)
     found = one.pose(ORIGIN)
     assert math.hypot(found.x - START.x, found.y - START.y) < 0.06
     assert abs(found.theta) < 0.03
@@ -56,9 +56,9 @@ def test_given_pose_is_refined_by_the_first_scan():
 def test_scan_with_too_few_points_leaves_the_given_pose():
     one = ParticleFilter(CONFIG, 1)
     one.start(START, ORIGIN, 0.4, 0.3)
-    one.add(DeskewedScan(np.ones((3, 2)), ORIGIN, 0.0), FIELDS, recover=False)
+    one.add(DeskewedScan(np.ones((3, 2)), ORIGIN, 0.0), FIELDS)
     assert one.pose(ORIGIN) == START
-    one.add(scan_at(START, ORIGIN), FIELDS, recover=False)
+    one.add(scan_at(START, ORIGIN), FIELDS)
     assert one.uncertainty.along < 0.2
 
 
@@ -83,24 +83,25 @@ def test_between_updates_the_pose_follows_the_odometry():
 def test_scan_corrects_the_pose_after_0_1_m_or_0_1_rad_and_not_before(step, updated):
     one = ParticleFilter(CONFIG, 1)
     one.start(START, ORIGIN, 0.1, 0.05)
-    one.add(scan_at(START, ORIGIN), FIELDS, recover=False)
+    one.add(scan_at(START, ORIGIN), FIELDS)
     before = one.covariance.copy()
-    one.add(scan_at(START.compose(step), step), FIELDS, recover=False)
+    one.add(scan_at(START.compose(step), step), FIELDS)
     assert (one.covariance != before).any() == updated
 
 
 def test_defaults_are_those_that_recorded_drives_with_real_odometry_support():
-    # Odometry of real bases is 5 to 90 times better than alphas of 0.2 say, and sharper weights lose honesty.
-    assert CONFIG.alphas == (0.05, 0.05, 0.05, 0.05)
+    # Odometry of real bases is 5 to 90 times better than alphas of 0.2 say, and sharper weights lose honesty. What a
+    # wrong scale does to distances is no noise: it is learned (`odometry_scale`).
+    assert CONFIG.alphas == (0.05, 0.05, 0.01, 0.05)
     assert (CONFIG.sharpness, CONFIG.beams, CONFIG.particles_min, CONFIG.particles_max) == (12.0, 60, 500, 2000)
 
 
 def test_standing_robot_is_not_updated():
     one = ParticleFilter(CONFIG, 1)
     one.start(START, ORIGIN, 0.1, 0.05)
-    one.add(scan_at(START, ORIGIN), FIELDS, recover=False)
+    one.add(scan_at(START, ORIGIN), FIELDS)
     before, covariance = one.pose(ORIGIN), one.covariance
-    one.add(scan_at(START, Pose2(0.05, 0.0, 0.05)), FIELDS, recover=False)
+    one.add(scan_at(START, Pose2(0.05, 0.0, 0.05)), FIELDS)
     assert one.pose(ORIGIN) == before
     assert one.covariance is covariance
 
@@ -121,17 +122,6 @@ def test_number_of_particles_shrinks_with_their_spread_and_the_seed_repeats_ever
     assert other.pose(odom) != one.pose(odom)
 
 
-def test_random_particles_are_added_only_when_allowed_and_the_fit_declines():
-    spreads = []
-    for recover in (False, True):
-        one, _, odom = driven(2, drift=0.0)
-        for _ in range(6):
-            odom = odom.compose(Pose2(0.3, 0.0, 0.0))
-            one.add(scan_at(Pose2(12.0, 8.0, -2.0), odom), FIELDS, recover=recover)
-        spreads.append(float(np.ptp(one._x)))
-    assert spreads[1] > spreads[0] + 3.0
-
-
 CORRIDOR = map_fields(*grid_of([(1, 1, 41, 3)], 42.0, 4.0), CONFIG)
 MIDDLE = Pose2(20.0, 2.0, 0.0)
 
@@ -149,7 +139,7 @@ def corridor_scan(pose: Pose2, odom: Pose2) -> DeskewedScan:
 def test_pose_given_in_a_plain_corridor_stays_as_uncertain_along_it_as_it_was_given(sigma):
     one = ParticleFilter(CONFIG, 1)
     one.start(MIDDLE, ORIGIN, sigma, 0.2)
-    one.add(corridor_scan(MIDDLE, ORIGIN), CORRIDOR, recover=False)
+    one.add(corridor_scan(MIDDLE, ORIGIN), CORRIDOR)
     assert one.uncertainty.along > 0.9 * sigma
     assert one.uncertainty.across < 0.1
     assert abs(one.pose(ORIGIN).x - MIDDLE.x) < 0.15 * sigma + 0.05  # nothing was observed that could move it
@@ -160,10 +150,10 @@ def test_uncertainty_along_a_plain_corridor_grows_as_the_odometry_and_covers_its
     true = Pose2(10.0, 2.0, 0.0)
     one.start(true, ORIGIN, 0.05, 0.02)
     odom = ORIGIN
-    one.add(corridor_scan(true, odom), CORRIDOR, recover=False)
+    one.add(corridor_scan(true, odom), CORRIDOR)
     for _ in range(100):
         true, odom = true.compose(Pose2(0.2, 0.0, 0.0)), odom.compose(Pose2(0.208, 0.0, 0.001))  # 4 % too long
-        one.add(corridor_scan(true, odom), CORRIDOR, recover=False)
+        one.add(corridor_scan(true, odom), CORRIDOR, scale_sigma=0.05)
     found = one.pose(odom)
     assert abs(found.y - true.y) < 0.1
     assert one.uncertainty.across < 0.1
@@ -173,11 +163,11 @@ def test_uncertainty_along_a_plain_corridor_grows_as_the_odometry_and_covers_its
 def test_widened_estimate_finds_a_robot_that_moved_without_its_odometry():
     one = ParticleFilter(CONFIG, 1)
     one.start(START, ORIGIN, 0.05, 0.03)
-    one.add(scan_at(START, ORIGIN), FIELDS, recover=False)
+    one.add(scan_at(START, ORIGIN), FIELDS)
     moved = START.compose(Pose2(0.9, 0.0, 0.2))
     one.widen(ORIGIN, 0.9, 0.3)
     assert one.uncertainty.along > 0.9
-    one.add(scan_at(moved, ORIGIN), FIELDS, recover=False)
+    one.add(scan_at(moved, ORIGIN), FIELDS)
     found = one.pose(ORIGIN)
     assert math.hypot(found.x - moved.x, found.y - moved.y) < 0.08
 
@@ -185,7 +175,7 @@ def test_widened_estimate_finds_a_robot_that_moved_without_its_odometry():
 def test_motion_in_one_step_or_many_spreads_the_particles_alike():
     spreads = []
     for pieces in (1, 10):
-        one = ParticleFilter(CONFIG, 3)
+        one = ParticleFilter(LocalizationConfig(alphas=(0.05, 0.05, 0.05, 0.05)), 3)
         one.start(START, ORIGIN, 1e-6, 1e-6)
         step = Pose2(0.96 / pieces, 0.0, 0.0)
         odom = ORIGIN

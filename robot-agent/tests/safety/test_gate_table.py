@@ -31,6 +31,22 @@ class Row(NamedTuple):
 
 
 ROWS = [
+    Row(
+        "position too uncertain",
+        {"localization": "weak", "position_sigma": 0.81},
+        {"position_sigma": 0.81},
+        "HOLD",
+        "alone",
+        "the robot may be 1.6 m from where it believes to be",
+    ),
+    Row(
+        "may be in a blocked place",
+        {"near_blocked": "the no-go zone wet", "position_sigma": 0.4},
+        {},
+        "HOLD",
+        "alone",
+        "the robot may already be in the no-go zone wet: it may be 0.8 m farther",
+    ),
     Row("base fault", {"base_fault": "OI mode"}, {}, "FAULT", "operator", "base: OI mode"),
     Row("bumper", {"bumper": True}, {}, "FAULT", "operator", "the bumper is pressed"),
     Row("cliff", {"cliff": True}, {}, "FAULT", "operator", "a cliff sensor sees no floor"),

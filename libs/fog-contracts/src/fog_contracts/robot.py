@@ -86,7 +86,7 @@ class OdometrySettings(_Table, frozen=True, kw_only=True):
             description="noise of the odometry (Thrun, Burgard, Fox 2005, table 5.6): of rotation by rotation, of "
             "rotation by translation, of translation by translation, of translation by rotation"
         ),
-    ] = (0.05, 0.05, 0.05, 0.05)
+    ] = (0.05, 0.05, 0.01, 0.05)
 
 
 class MotionSettings(_Table, frozen=True, kw_only=True):

@@ -277,9 +277,6 @@ def _sample_size(
         _arrays.F32_OUT,
         _arrays.F32_OUT,
         _arrays.F32_OUT,
-        float64,
-        _arrays.F64_GRID,
-        float64,
         _arrays.U64_OUT,
     ),
     cache=True,
@@ -293,9 +290,6 @@ def _draw_low_variance(
     new_x: Any,
     new_y: Any,
     new_theta: Any,
-    random_share: float,
-    free: Any,
-    jitter: float,
     state: Any,
 ) -> None:
     n = new_x.size
@@ -308,22 +302,9 @@ def _draw_low_variance(
         target = (i + offset) * step
         while source < last and cumulated[source] <= target:
             source += 1
-        chance = 1.0
-        if random_share > 0.0:
-            s0, s1, s2, s3, chance = _draw(s0, s1, s2, s3)
-        if chance < random_share:
-            s0, s1, s2, s3, a = _draw(s0, s1, s2, s3)
-            s0, s1, s2, s3, b = _draw(s0, s1, s2, s3)
-            s0, s1, s2, s3, c = _draw(s0, s1, s2, s3)
-            s0, s1, s2, s3, d = _draw(s0, s1, s2, s3)
-            place = np.int64(a * free.shape[0])
-            new_x[i] = free[place, 0] + (b - 0.5) * jitter
-            new_y[i] = free[place, 1] + (c - 0.5) * jitter
-            new_theta[i] = (2.0 * d - 1.0) * math.pi
-        else:
-            new_x[i] = x[source]
-            new_y[i] = y[source]
-            new_theta[i] = theta[source]
+        new_x[i] = x[source]
+        new_y[i] = y[source]
+        new_theta[i] = theta[source]
     state[0], state[1], state[2], state[3] = s0, s1, s2, s3
 
 
@@ -573,16 +554,12 @@ def resample(
     kld_z: float = KLD_Z,
     bin_xy: float = BIN_XY,
     bin_theta: float = BIN_THETA,
-    random_share: float = 0.0,
-    free_xy: NDArray[np.float64] | None = None,
-    jitter: float = 0.05,
 ) -> Resampled:
     """Draw new particles in proportion to the weights; their number, n_min..n_max, depends on their spread.
 
     With this number the Kullback-Leibler distance between the samples and the distribution over bins stays below
     `kld_err` with the confidence of the quantile `kld_z` (Fox 2001); the draw is systematic, with low variance.
-    `random_share` of the particles is drawn around the positions `free_xy`, float64 (m, 2) in metres, within
-    +-jitter/2, at any heading (augmented MCL's recovery). n_min = n_max gives a fixed number.
+    n_min = n_max gives a fixed number.
     Raises TypeError or ValueError for wrong types, shapes or ranges, and when no weight is above 0.
     """
     _check_particles(x, y, theta)
@@ -590,12 +567,6 @@ def resample(
     _check_state(rng_state)
     if not 1 <= n_min <= n_max:
         raise ValueError(f"n_min must be at least 1 and at most n_max, not {n_min} and {n_max}")
-    if not 0.0 <= random_share <= 1.0:
-        raise ValueError(f"random_share must be 0..1, not {random_share}")
-    places = np.zeros((1, 2)) if free_xy is None else free_xy
-    _arrays.exact(places, np.float64, 2, "free_xy")
-    if random_share > 0.0 and (free_xy is None or free_xy.shape[0] == 0 or free_xy.shape[1] != 2):
-        raise ValueError("random_share above 0 needs free_xy of shape (m, 2) with m >= 1")
     cumulated = np.cumsum(weights)
     if not (np.isfinite(cumulated[-1]) and cumulated[-1] > 0.0 and weights.min() >= 0.0):
         raise ValueError("weights must be at least 0 and not all 0")
@@ -615,9 +586,7 @@ def resample(
         )
     )
     new_x, new_y, new_theta = (np.empty(n, np.float32) for _ in range(3))
-    _draw_low_variance(
-        x, y, theta, cumulated, new_x, new_y, new_theta, float(random_share), places, float(jitter), rng_state
-    )
+    _draw_low_variance(x, y, theta, cumulated, new_x, new_y, new_theta, rng_state)
     return Resampled(new_x, new_y, new_theta, np.full(n, 1.0 / n))
 
 

@@ -68,13 +68,15 @@ class Compared(NamedTuple):
 class Tolerances(NamedTuple):
     """Distances (m) by which a scan is compared with a map.
 
-    near: a beam that ends so near to a wall may agree with it, on: and ends on it. range: by how much the range of one
+    near: a beam that ends so near to a wall may agree with it, on: and ends on it, or within `on_share` of its range.
+    range: by how much the range of one
     that agrees with none may differ from the expected range before it counts as short or long.
     """
 
     near: float
     on: float
     range: float
+    on_share: float = 0.0
 
 
 @njit(
@@ -172,7 +174,7 @@ def _into_frame(points: Any, x: float, y: float, cos: float, sin: float, out: An
 @njit(
     void(
         _arrays.F64_GRID, float64, float64, float64, _arrays.U8_GRID, _arrays.F32_GRID, float64, float64, float64,
-        float64, float64, float64, float64, float64, _arrays.I64_OUT,
+        float64, float64, float64, float64, float64, float64, _arrays.I64_OUT,
     ),
     cache=True,
     nogil=True,
@@ -192,6 +194,7 @@ def _compared(
     near: float,
     on: float,
     tolerance: float,
+    on_share: float,
     counts: Any,
 ) -> None:
     height, width = wall_distance.shape
@@ -209,7 +212,8 @@ def _compared(
         distance = outside
         if 0 <= column < width and 0 <= row < height:
             distance = float(wall_distance[row, column])
-        excess = math.hypot(ends[i, 0] - x, ends[i, 1] - y) - expected[i] * resolution
+        measured = math.hypot(ends[i, 0] - x, ends[i, 1] - y)
+        excess = measured - expected[i] * resolution
         if distance > near:
             if excess > tolerance:
                 counts[1] += 1
@@ -217,7 +221,7 @@ def _compared(
                 counts[2] += 1
         elif abs(excess) < 3.0 * tolerance:
             counts[0] += 1
-            if distance > on:
+            if distance > max(on, on_share * measured):
                 counts[3] += 1
 
 
@@ -383,7 +387,7 @@ def compared(
     counts = np.zeros(4, np.int64)
     _compared(
         points, *pose, cells, wall_distance, _arrays.positive(resolution, "resolution"), *origin, outside, reach,
-        tolerances.near, tolerances.on, tolerances.range, counts,
+        tolerances.near, tolerances.on, tolerances.range, tolerances.on_share, counts,
     )  # fmt: skip
     return Compared(*counts.tolist())
 

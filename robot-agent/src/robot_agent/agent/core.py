@@ -265,6 +265,7 @@ class AgentCore:
             path_problem=self._driving.path_problem(self.replica, self._guard, self.safety, now),
             inside_blocked=self._navigation.inside_blocked(trusted, self._reporter, now) if trusted else None,
             blocked_ahead=self._navigation.blocked_ahead(trusted, ahead, self._reporter, now) if trusted else None,
+            near_blocked=self._navigation.near_blocked(trusted) if trusted else None,
             maneuver=maneuver,
             caution=self._navigation.caution(pose, now) if pose else None,
             resting=self._rest.reason,

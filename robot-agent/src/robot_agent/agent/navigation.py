@@ -6,6 +6,7 @@ for no message of the fog's planner.
 
 from __future__ import annotations
 
+import math
 from typing import TYPE_CHECKING, Final
 
 import numpy as np
@@ -30,6 +31,12 @@ if TYPE_CHECKING:
 
 _STEP_M: Final = 0.05
 """Distance between the places on the way ahead that are looked up in the map."""
+_CERTAIN_M: Final = 0.15
+"""The planner keeps paths so far from blocked places that a smaller standard deviation of the pose does not matter."""
+_WAY_M: Final = 0.5
+"""The direction of the way is that of its next metres, ..."""
+_ALONG_SHARE: Final = 0.3
+"""... of which this share lies in the direction in which the pose is uncertain; else it leads neither way there."""
 
 
 class Navigation:
@@ -162,6 +169,26 @@ class Navigation:
                 place = pose.compose(Pose2(float(along), float(aside), 0.0))
                 if (name := self.inside_blocked(place, reporter, now)) is not None:
                     return name
+        return None
+
+    def near_blocked(self, pose: Pose2) -> str | None:
+        """Return the name of a blocked area or zone that the robot may be in: on its way, by two standard deviations.
+
+        What lies behind it does not count, so that it may drive away.
+        """
+        spread, follower = self._localizer.uncertainty, self._driving.mission.follower
+        if spread.along < _CERTAIN_M or follower is None or not self.profile.hazards:
+            return None
+        points, _ = follower.released_ahead(_WAY_M)
+        way, axis = points[-1] - points[0], np.array(spread.axis)
+        farther = float(way @ axis)
+        if not abs(farther) > _ALONG_SHARE * math.hypot(*way):
+            return None
+        reach = math.copysign(2.0 * spread.along, farther)
+        for shift in np.linspace(0.0, reach, 2 + int(2.0 * spread.along / _STEP_M))[1:]:
+            place = Pose2(pose.x + shift * spread.axis[0], pose.y + shift * spread.axis[1], pose.theta)
+            if (name := self._places.named(place, self.replica)) is not None:
+                return name
         return None
 
     def caution(self, pose: Pose2, now: float) -> str | None:

@@ -22,8 +22,10 @@ _NEAR_M: Final = 0.25
 _RANGE_TOLERANCE_M: Final = 0.40
 """Range difference from which a beam counts as short or long."""
 _ON_WALL_M: Final = 0.12
-"""An agreeing beam of a right pose ends this near to the wall: farther ones are blurred."""
-_TOLERANCES: Final = Tolerances(_NEAR_M, _ON_WALL_M, _RANGE_TOLERANCE_M)
+_ON_WALL_CELLS: Final = 1.5
+_ON_WALL_SHARE: Final = 0.02
+"""An agreeing beam of a right pose ends this near to the wall: farther ones are blurred. A map draws its walls no finer
+than its cells, and ranges of a small lidar are wrong by up to 2 % (RPLidar A1, data sheet: 1 to 2.5 %)."""
 _CONTRADICTION_LIMIT: Final = 0.2
 """Share of contradicting beams above which a pose is wrong, or the map."""
 _CONTRADICTION_CLEAR: Final = 0.04
@@ -72,7 +74,9 @@ def evaluate_fit(fields: MapFields, pose: Pose2, points: NDArray[np.float64], ra
 
     `range_max`: m, the lidar's rated range.
     """
-    beams = fields.compared(pose, points, range_max + 1.0, _TOLERANCES)
+    on_wall = max(_ON_WALL_M, _ON_WALL_CELLS * fields.geometry.resolution)
+    tolerances = Tolerances(_NEAR_M, on_wall, _RANGE_TOLERANCE_M, _ON_WALL_SHARE)
+    beams = fields.compared(pose, points, range_max + 1.0, tolerances)
     informative = beams.agree + beams.long
     return Fit(
         agree=beams.agree / max(informative + beams.short, 1),
@@ -93,8 +97,6 @@ class FitMonitor:
         """Reason of the status; empty when good."""
         self.trial_failed = False
         """Whether the newest scan ended a trial without success."""
-        self.fits = False
-        """Whether the newest scan by itself confirms the pose, whatever else speaks against it."""
         self._recent: deque[Localization] = deque(maxlen=9)
         self._contradicted = 0
         self._proven = False
@@ -137,8 +139,7 @@ class FitMonitor:
     def add(self, fit: Fit, spread: Uncertainty, *, doubt: str = "") -> None:
         """Add the fit of the newest scan, with the pose's standard deviations; a pose in `doubt` is at most weak."""
         grade, reason = grade_fit(fit, spread, proven=self._proven)
-        self.fits = grade == "good"
-        if self.fits and doubt:
+        if grade == "good" and doubt:
             grade, reason = "weak", doubt
         self._contradicted = self._contradicted + 1 if fit.contradict > _CONTRADICTION_LIMIT else 0
         if self._contradicted >= _CONTRADICTED_SCANS_LIMIT:
@@ -207,6 +208,11 @@ def _weakness(fit: Fit, *, proven: bool) -> str:
     if fit.blurred > _BLURRED_LIMIT:
         return f"{fit.blurred:.0%} of the beams end beside the walls of the map"
     return ""
+
+
+def tells_place(fit: Fit) -> bool:
+    """Whether most of a scan shows the place that a pose says, whatever doors are open: enough to measure a way by."""
+    return fit.informative >= _INFORMATIVE_LEAST and fit.contradict <= _CONTRADICTION_LIMIT and fit.agree >= 0.7
 
 
 def confirms(fit: Fit) -> bool:

@@ -18,10 +18,11 @@ import numpy as np
 from robot_agent.config import LocalizationConfig
 from robot_agent.localization.deskew import DeskewedScan, deskew
 from robot_agent.localization.doubt import Doubt
-from robot_agent.localization.fit import FitMonitor, evaluate_fit
+from robot_agent.localization.fit import FitMonitor, evaluate_fit, tells_place
 from robot_agent.localization.hypotheses import apart
 from robot_agent.localization.map_fields import MapFields, map_fields
 from robot_agent.localization.odometry_buffer import OdometryBuffer
+from robot_agent.localization.odometry_scale import OdometryScale
 from robot_agent.localization.particle_filter import ParticleFilter
 from robot_agent.localization.pose import Pose2
 from robot_agent.localization.relocalization import Relocalization
@@ -67,6 +68,7 @@ class Localizer:
     def __init__(self, config: LocalizationConfig | None = None, seed: int = 0) -> None:
         self._config = config or LocalizationConfig()
         self._odometry = OdometryBuffer()
+        self._scale = OdometryScale()
         self._filter = ParticleFilter(self._config, seed)
         self._monitor = FitMonitor()
         self._fields: MapFields | None = None
@@ -98,7 +100,7 @@ class Localizer:
 
     def on_odometry(self, timestamp: float, x: float, y: float, theta: float) -> None:
         """Add the pose in `odom` (m, rad; theta not wrapped) that arrived at `timestamp` (s)."""
-        self._odometry.add(timestamp, x, y, theta)
+        self._odometry.add(timestamp, *self._scale.calibrated(x, y, theta))
 
     def on_unmeasured_motion(self, distance: float, angle: float, detail: str) -> None:
         """Take notice that the robot may have moved this far (m, rad) without its odometry; `detail` says why.
@@ -108,6 +110,7 @@ class Localizer:
         odom = self._odometry.latest()
         if odom is not None and self._filter.has_pose:
             self._filter.widen(odom, distance, angle)
+            self._scale.forget_anchor()
             self._monitor.doubt(detail)
 
     def on_absolute_observation(self, observation: AbsoluteObservation) -> bool:
@@ -120,6 +123,7 @@ class Localizer:
         odom = self._odometry.pose(observation.stamp)
         assert odom is not None
         self._relocalization.cancel()
+        self._scale.forget_anchor()
         if not self._filter.observe(observation.pose, observation.covariance, odom):
             self._monitor.begin("checking the pose that was measured")
             self._doubt.restart()
@@ -131,7 +135,7 @@ class Localizer:
         if self.scan is None or self._fields is None:
             return
         if self._filter.has_pose:
-            self._filter.add(self.scan, self._fields, recover=self._monitor.status != "good" and not self._monitor.fits)
+            self._filter.add(self.scan, self._fields, self._scale.sigma)
             self._evaluate(self.scan, self._fields, now)
         if self._relocalization.active:
             self._relocalization.on_scan(self.scan, self._fields)
@@ -254,6 +258,7 @@ class Localizer:
         self._local_scans = 0
         self._doubt.restart()
         odom = self._odometry.latest() or Pose2(0.0, 0.0, 0.0)
+        self._scale.forget_anchor()
         self._filter.start(pose, odom, sigma_xy, sigma_theta)
 
     def _evaluate(self, scan: DeskewedScan, fields: MapFields, now: float) -> None:
@@ -268,6 +273,10 @@ class Localizer:
             self._look_nearby(scan, now)
             return
         self._local_scans = 0
+        if self._filter.jumped:
+            self._scale.forget_anchor()
+        elif self._monitor.status in {"good", "weak"} and tells_place(fit):
+            self._scale.observe(pose, self._filter.covariance, scan.odom, self._filter.unseen)
         if self._monitor.trial_failed:
             self.global_localization()
         elif self._monitor.status in {"good", "weak"}:
@@ -281,6 +290,7 @@ class Localizer:
         self._local_scans += 1
         if self._local_scans == 1:
             self._filter.widen(scan.odom, *_LOCAL_SIGMAS)
+            self._scale.forget_anchor()
             self._monitor.restart()
             self._doubt.begin(scan.odom)
         elif self._local_scans > _LOCAL_SCANS and not self._relocalization.active and self._may_search(scan, now):
@@ -318,6 +328,7 @@ class Localizer:
             self._monitor.begin_found()
         self._doubt.restart()
         self._local_scans = 1
+        self._scale.forget_anchor()
         self._filter.start(outcome.pose, outcome.odom, *_FOUND_SIGMAS)
-        self._filter.add(scan, fields, recover=False)
+        self._filter.add(scan, fields)
         self._evaluate(scan, fields, now)

@@ -1,7 +1,9 @@
 """Monte Carlo localization over the likelihood field of the static map.
 
-Methods: augmented recovery (Thrun, Burgard and Fox 2005, chapters 8.2 and 8.3), sample size by KLD (Fox 2003), the
-estimate refined by scan matching. The particles never see the refinement: it would make them too sure.
+Methods: Monte Carlo localization (Thrun, Burgard and Fox 2005, chapter 8.2), sample size by KLD (Fox 2003), the
+estimate refined by scan matching. The particles never see the refinement: it would make them too sure. No random
+particles are added: a robot that is lost is looked for by a search (`relocalization`), and in a plain corridor nothing
+would contradict them.
 """
 
 from __future__ import annotations
@@ -30,13 +32,17 @@ _SPREAD_SAMPLES: Final = 16_000
 """Poses drawn around a given or doubtful pose: enough that some hundred of them fit."""
 _SPREAD_JITTER: Final = 0.15
 """Their noise between the coarse and the fine field, as a share of the smallest spread."""
+_MEAN_OF_TWICE_U2: Final = 2.0 / 3.0
+_MEAN_OF_U4: Final = 1.0 / 5.0
+"""Means of 2 u^2 and u^4, for the variance of what is drawn."""
+_STILL_UNSEEN: Final = 0.5
+"""Share of the variance that was drawn from which on the scan has not observed that direction."""
 _SPREAD_SHARPNESS: Final = 3.0
 """Their weights are this many times as sharp as those of an update: one scan must do what many updates do."""
 _SPREAD_BEAMS_MIN: Final = 5
 _WIDEN_FROM: Final = (0.1, 0.1, 0.05)
 """Least standard deviations (m, m, rad) of an estimate in doubt."""
 _MATCH_BEAMS: Final = 180
-_RANDOM_SHARE_MAX: Final = 0.1
 _STEPS_MAX: Final = 20
 _SKIP_M: Final = 0.5
 """A beam that ends farther than this from any wall of the map hit something unknown, ..."""
@@ -53,6 +59,10 @@ _JUMP_M: Final = 1.0
 _JUMP_SIGMAS: Final = 3.0
 """The estimate jumps when it moves farther than this, and than so many of its standard deviations."""
 _STRAIGHT_RAD: Final = 1e-6
+_SHRINK_MOST: Final = 0.5
+"""Driving back takes back what the scale has done, but of the variance no more than this share at once."""
+_SEEN_BELOW: Final = 0.9
+"""A scan that leaves more of the variance has not seen how far the robot is: its curvature there is noise."""
 _GATE: Final = 11.345
 """Squared Mahalanobis distance (0.99 quantile, 3 degrees of freedom) beyond which two poses contradict each other."""
 
@@ -76,7 +86,8 @@ class ParticleFilter:
         """Odometry at which the estimate was made."""
         self._spread: tuple[NDArray[np.float64], NDArray[np.float64]] | None = None
         """Smallest and largest standard deviations (m, m, rad) around the estimate that no scan has narrowed yet."""
-        self._slow = self._fast = 0.0
+        self.unseen = np.zeros(2)
+        """Way (m, `map`) since scans observed how far the robot is: the odometry's scale is wrong by a share of it."""
         self.jumped = False
         """Whether the last update moved the estimate to another place."""
         self.covariance: NDArray[np.float64] = np.zeros((3, 3))
@@ -131,8 +142,8 @@ class ParticleFilter:
 
     def _start(self, pose: Pose2, odom: Pose2, least: NDArray[np.float64], most: NDArray[np.float64]) -> None:
         self._anchor, self._estimate = odom, pose
-        self._slow = self._fast = 0.0
         self._spread = (least, most)
+        self.unseen = np.zeros(2)
         self.covariance = np.diag(most**2)
         self._set_particles(np.array(pose) + self._rng.standard_normal((self._config.particles_start, 3)) * most)
 
@@ -152,21 +163,22 @@ class ParticleFilter:
                 covariance = self.covariance - gain @ self.covariance
         self._anchor, self._estimate = odom, Pose2(pose.x, pose.y, wrap(pose.theta))
         self._spread = None
+        self.unseen = np.zeros(2)
         self.covariance = 0.5 * (covariance + covariance.T)
         count = self._config.particles_start
         self._set_particles(self._rng.multivariate_normal(np.array(self._estimate), self.covariance, count))
         return agrees
 
-    def add(self, scan: DeskewedScan, fields: MapFields, *, recover: bool) -> None:
+    def add(self, scan: DeskewedScan, fields: MapFields, scale_sigma: float = 0.0) -> None:
         """Correct the estimate by a scan when the robot moved since the last one; there must be an estimate.
 
-        `recover`: whether random particles may be added over the map when scans fit less and less.
+        `scale_sigma`: standard deviation of the share by which the odometry counts too far, all the time.
         """
         self.jumped = False
         if self._spread is not None:
             self._narrow(scan, fields, *self._spread)
         else:
-            self._update(scan, fields, recover=recover)
+            self._update(scan, fields, scale_sigma)
 
     def _set_particles(self, poses: NDArray[np.float64]) -> None:
         self._x, self._y, self._theta = (np.ascontiguousarray(poses[:, i], np.float32) for i in range(3))
@@ -186,7 +198,8 @@ class ParticleFilter:
         if len(points) < _SPREAD_BEAMS_MIN:
             return
         sharpness = self._config.sharpness
-        spread = least + (most - least) * self._rng.random((_SPREAD_SAMPLES, 1)) ** 2
+        # Each direction by itself: else a scan that sees two walls would rule out what it can't see along them.
+        spread = least + (most - least) * self._rng.random((_SPREAD_SAMPLES, 3)) ** 2
         poses = np.array(pose) + self._rng.standard_normal((_SPREAD_SAMPLES, 3)) * spread
         poses = _drawn(self._rng, poses, sharpness * fields.agreements(poses, points, fields.coarse))
         poses += self._rng.standard_normal(poses.shape) * (_SPREAD_JITTER * least)
@@ -195,48 +208,84 @@ class ParticleFilter:
         self._set_particles(poses)
         self._weights = np.exp(log_weights - log_weights.max())
         self._weights /= self._weights.sum()
-        self._conclude(scan, fields)
-        self._resample(fields, 0.0)
+        kept = least_certain(self._x, self._y, self._weights)
+        if kept is not None:
+            difference = most[0] - least[0]
+            drawn = least[0] ** 2 + least[0] * difference * _MEAN_OF_TWICE_U2 + difference**2 * _MEAN_OF_U4
+            if kept.variance > _STILL_UNSEEN * drawn:
+                kept = kept._replace(variance=float(most[0] ** 2))
+                self._move_along(kept)
+        self._conclude(scan, fields, one_cloud=kept is not None)
+        self._resample()
 
-    def _update(self, scan: DeskewedScan, fields: MapFields, *, recover: bool) -> None:
+    def _update(self, scan: DeskewedScan, fields: MapFields, scale_sigma: float) -> None:
         config = self._config
         step = scan.odom.relative_to(self._anchor)
         length, angle = math.hypot(step.x, step.y), abs(step.theta)
         if length < config.update_distance and angle < config.update_angle:
             return
+        before = self._estimate
         self._move(scan.odom, max(length / config.update_distance, angle / config.update_angle))
         self._estimate = self.pose(scan.odom)
         self._anchor = scan.odom
+        prior = self._spread_by_scale(before, self._estimate, scale_sigma)
         predicted, reach = self._estimate, max(_JUMP_M, _JUMP_SIGMAS * self.uncertainty.along)
         log_likelihoods = self._log_likelihoods(scan, fields)
         kept = self._weigh(log_likelihoods)
         self._conclude(scan, fields, one_cloud=kept is not None)
+        self._see(prior)
         self.jumped = _distance(predicted, self._estimate) > reach
-        # Unknown objects lower the average too: random particles are added only while the pose is not good.
-        random_share = self._random_share() if recover else 0.0
         # Each draw makes the cloud along a plain corridor more ragged: there it waits until few particles carry the
         # weight (Grisetti, Stachniss and Burgard 2007).
-        if kept is None or random_share or self._effective < _RESAMPLE_BELOW * self.size:
-            self._resample(fields, random_share)
-            if not random_share:
-                self._move_along(kept)
+        if kept is None or self._effective < _RESAMPLE_BELOW * self.size:
+            self._resample()
+            self._move_along(kept)
 
     def _move(self, odom: Pose2, steps: float) -> None:
         """Move the particles along the odometry, in steps of the size that the noise is given for."""
         for before, length, after in _chords(self._anchor, odom, min(max(1, round(steps)), _STEPS_MAX)):
             amcl.motion_update(self._x, self._y, self._theta, before, length, after, self._config.alphas, self._state)
 
+    def _spread_by_scale(self, before: Pose2 | None, after: Pose2 | None, sigma: float) -> NDArray[np.float64]:
+        """Spread the particles along a step by what the odometry's scale may be wrong; return their covariance (2, 2).
+
+        The scale is wrong by the same share all the way, so the deviation grows with the way, not with its root.
+        """
+        assert before is not None
+        assert after is not None
+        step = np.array((after.x - before.x, after.y - before.y))
+        length = math.hypot(*step)
+        covariance = self._covariance_xy()
+        if length > 0.0:
+            cos, sin = (float(value) for value in step / length)
+            variance = cos * cos * covariance[0, 0] + 2.0 * cos * sin * covariance[0, 1] + sin * sin * covariance[1, 1]
+            growth = sigma * sigma * length * (2.0 * float(self.unseen @ step) / length + length)
+            mean = float(self._weights @ (cos * self._x + sin * self._y))
+            wanted = Along((cos, sin), mean, max(variance + growth, _SHRINK_MOST * variance))
+            self._x, self._y = moved_to(wanted, self._x, self._y, self._weights)
+            self.unseen = self.unseen + step
+            covariance = self._covariance_xy()
+        return covariance
+
+    def _covariance_xy(self) -> NDArray[np.float64]:
+        return np.asarray(np.cov(np.stack((self._x, self._y)), aweights=self._weights, ddof=0))
+
+    def _see(self, prior: NDArray[np.float64]) -> None:
+        """Forget of the way what the scan has observed, by the covariances (2, 2) of the position before and after."""
+        before, after = (
+            float(self.unseen @ covariance[:2, :2] @ self.unseen) for covariance in (prior, self.covariance)
+        )
+        if after < _SEEN_BELOW * before:
+            self.unseen = self.unseen * (after / before)
+
     def _log_likelihoods(self, scan: DeskewedScan, fields: MapFields) -> NDArray[np.float64]:
-        """Return the logarithms (n) of the particles' likelihoods by a scan, but for a constant; follow their mean."""
+        """Return the logarithms (n) of the particles' likelihoods by a scan, but for a constant."""
         config = self._config
         points = self._explained(scan.beams(config.beams), fields)
         agreements = np.zeros(self.size)
         if len(points):
             poses = np.column_stack((self._x, self._y, self._theta)).astype(np.float64)
             agreements = fields.agreements(poses, points, fields.fine)
-        average = float(self._weights @ agreements)
-        self._slow += (config.recovery_slow if self._slow else 1.0) * (average - self._slow)
-        self._fast += (config.recovery_fast if self._fast else 1.0) * (average - self._fast)
         # AMCL's weight, 1 + sum of p^3, spans one order of magnitude at most and leaves the cloud three times as
         # wide as need be at this odometry noise. The exponent here is linear in the same sum.
         return np.asarray(config.sharpness * (agreements - agreements.max()))
@@ -260,12 +309,6 @@ class ParticleFilter:
     def _effective(self) -> float:
         """Number of equally weighted particles that would tell as much."""
         return 1.0 / float(self._weights @ self._weights)
-
-    def _random_share(self) -> float:
-        """Return the share of random particles that augmented recovery asks for."""
-        if self._slow <= 0.0:
-            return 0.0
-        return min(_RANDOM_SHARE_MAX, max(0.0, 1.0 - self._fast / self._slow))
 
     def _explained(self, points: NDArray[np.float64], fields: MapFields) -> NDArray[np.float64]:
         """Return the beams (n, 2) without those that end far from every wall: persons and other unknown objects.
@@ -301,7 +344,7 @@ class ParticleFilter:
                 return group.estimate
         return heaviest.estimate
 
-    def _resample(self, fields: MapFields, random_share: float) -> None:
+    def _resample(self) -> None:
         config = self._config
         self._x, self._y, self._theta, self._weights = amcl.resample(
             self._x,
@@ -315,9 +358,6 @@ class ParticleFilter:
             kld_z=config.kld_z,
             bin_xy=config.bin_xy,
             bin_theta=config.bin_theta,
-            random_share=random_share,
-            free_xy=fields.free_places if random_share else None,
-            jitter=fields.geometry.resolution,
         )
 
 

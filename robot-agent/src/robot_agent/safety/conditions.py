@@ -39,9 +39,11 @@ class SafetyInputs(msgspec.Struct, frozen=True, kw_only=True):
     missing, 0 when none are. plan_age: since the planner's last message about the goal. released_remaining: m of
     released path ahead. path_problem: why the path must not be driven. inside_blocked: the blocked area or zone that
     the robot is in; blocked_ahead: the one on the way of an advance that runs or is asked for, both by a pose that is
-    good or weak. maneuver_remaining: m to the end of the maneuver that runs, rad of a turn, infinite while not known.
-    maneuver_problem: what keeps the robot from getting there. dock_problem: why the base must not drive into its dock
-    by itself. caution: a reason to drive slowly here. guardian_lost: why there is no link to the guardian.
+    good or weak; near_blocked: the one that it may be in, ahead, by how uncertain the pose is. position_sigma: standard
+    deviation (m) of the position in its least certain direction. maneuver_remaining: m to the end of the maneuver that
+    runs, rad of a turn, infinite while not known. maneuver_problem: what keeps the robot from getting there.
+    dock_problem: why the base must not drive into its dock by itself. caution: a reason to drive slowly here.
+    guardian_lost: why there is no link to the guardian.
     base_fault: the guardian's fault, latched there unless it is `base_fault_passing`, which ends with its cause.
     base_stopped: why the guardian keeps the wheels at zero. bumped: the fault that it has latched is a bump.
     docked_for: s for which the robot has been on its dock, None off it. late_age: since this computer last ran the
@@ -73,6 +75,8 @@ class SafetyInputs(msgspec.Struct, frozen=True, kw_only=True):
     path_problem: str | None = None
     inside_blocked: str | None = None
     blocked_ahead: str | None = None
+    near_blocked: str | None = None
+    position_sigma: float = 0.0
     maneuver_remaining: float = math.inf
     maneuver_problem: str | None = None
     dock_problem: str | None = None
@@ -213,6 +217,22 @@ CONDITIONS: Final[tuple[Condition, ...]] = (
         operator=True,
     ),
     Condition(Level.DEGRADED, lambda i, _: i.localization == "weak", lambda i: f"the pose is uncertain{_detail(i)}"),
+    Condition(
+        Level.HOLD,
+        lambda i, c: i.localization == "weak" and i.position_sigma > c.position_sigma_max,
+        lambda i: (
+            f"the robot may be {2.0 * i.position_sigma:.1f} m from where it believes to be: "
+            "give it its pose, or let it turn where it sees more"
+        ),
+    ),
+    Condition(
+        Level.HOLD,
+        lambda i, _: i.mission and i.near_blocked is not None,
+        lambda i: (
+            f"the robot may already be in {i.near_blocked}: "
+            f"it may be {2.0 * i.position_sigma:.1f} m farther than it believes"
+        ),
+    ),
     Condition(
         Level.PROTECTIVE_STOP,
         lambda i, _: i.inside_blocked is not None,

@@ -76,7 +76,7 @@ EDGES = {
 PURE_LIBRARIES = {
     "__future__", "abc", "binascii", "bisect", "collections", "contextlib", "dataclasses", "enum", "functools",
     "hashlib", "heapq", "hmac", "html", "itertools", "json", "math", "msgspec", "numba", "numpy", "operator", "random",
-    "re", "struct", "textwrap", "typing", "zlib",
+    "re", "struct", "textwrap", "typing", "unicodedata", "zlib",
 }  # fmt: skip
 """What pure modules may import besides each other: no clock, file, process or hidden state; `random` only seeded."""
 

@@ -169,7 +169,7 @@ def test_whole_grid_of_corridors():
     error, sigma = np.concatenate(errors), np.concatenate(sigmas)
     within = (np.abs(error) <= 2.0 * sigma).mean(axis=0)
     ratio = np.sqrt((sigma**2).mean(axis=0) / (error**2).mean(axis=0))
-    print(f"within 2 sigma: {within}, sigma by rms error: {ratio}")  # noqa: T201
+    print(f"within 2 sigma: {within}, sigma by rms error: {ratio}")  # noqa: T201  # the figures of the grid
     assert not failed
     assert (within > 0.9).all()
 

@@ -30,8 +30,9 @@ def hunt_command(  # noqa: PLR0913  # each option is an argument
         list[Path] | None, typer.Option("--replay", metavar="FILE", help="Drive the worlds of these files instead.")
     ] = None,
 ) -> None:
-    """Drive random worlds in lockstep under the eyes of an oracle that knows what must always hold.
+    """Drive random worlds, and look for broken rules.
 
+    They are driven in lockstep, under the eyes of an oracle that knows what must always hold.
     Floors, the map's errors, sensors, radio, people, operators and failures are drawn from the seed. Every drive is
     recorded, and a seed goes on where it was; a world that breaks a rule is shrunk to a file that drives it again
     (--replay). With --minutes 0 the records are summed up. The exit code is 1 if a rule was broken.

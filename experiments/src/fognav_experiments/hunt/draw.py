@@ -1,4 +1,4 @@
-"""Draws random worlds: floors, what maps and sensors get wrong about them, and what happens. Pure.
+"""Draws random worlds: floors, what maps and sensors get wrong about them, and what happens.
 
 What sensors, floors and radios do is drawn from recordings of real ones: lidars that lose whole patches and sectors,
 odometry with a bias, maps good to 5 to 10 cm, radios with a long tail. Everything else is drawn to be unkind.

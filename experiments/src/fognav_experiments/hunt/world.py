@@ -1,4 +1,4 @@
-"""What the file of a hunted world says: a floor, a robot and its sensors, and what happens on a drive. Pure.
+"""What the file of a hunted world says: a floor, a robot and its sensors, and what happens on a drive.
 
 It names no draw: the same file is the same drive, whatever the drawing of worlds has become. Lengths in m, angles in
 rad, times in s.

@@ -77,6 +77,10 @@ class Localizer:
         """Scans since a lost robot was looked for near its last pose; 0 while it is not lost."""
         self._doubt = Doubt()
         self._verify_again_at = -math.inf
+        self._tells_place = False
+        """Whether most of the newest scan shows the place of the pose."""
+        self._tracked = False
+        """Whether the pose was good once, and was followed by wheels and scans since."""
         self.scan: DeskewedScan | None = None
         """The newest scan, without its skew."""
 
@@ -111,6 +115,7 @@ class Localizer:
         if odom is not None and self._filter.has_pose:
             self._filter.widen(odom, distance, angle)
             self._scale.forget_anchor()
+            self._tracked = False
             self._monitor.doubt(detail)
 
     def on_absolute_observation(self, observation: AbsoluteObservation) -> bool:
@@ -256,6 +261,7 @@ class Localizer:
     def _start(self, pose: Pose2, sigma_xy: float, sigma_theta: float) -> None:
         self._relocalization.cancel()
         self._local_scans = 0
+        self._tracked = False
         self._doubt.restart()
         odom = self._odometry.latest() or Pose2(0.0, 0.0, 0.0)
         self._scale.forget_anchor()
@@ -266,6 +272,8 @@ class Localizer:
         pose = self._filter.pose(scan.odom)
         assert pose is not None
         fit = evaluate_fit(fields, pose, scan.beams(_FIT_BEAMS), self._config.range_max)
+        self._tells_place = tells_place(fit)
+        self._tracked = not self._filter.jumped and (self._tracked or self._monitor.status == "good")
         self._doubt.add(fit, scan.odom, jumped=self._filter.jumped)
         self._monitor.add(fit, self._filter.uncertainty, doubt=self._doubt.reason)
         if self._monitor.status == "lost":
@@ -275,7 +283,7 @@ class Localizer:
         self._local_scans = 0
         if self._filter.jumped:
             self._scale.forget_anchor()
-        elif self._monitor.status in {"good", "weak"} and tells_place(fit):
+        elif self._monitor.status in {"good", "weak"} and self._tells_place:
             self._scale.observe(pose, self._filter.covariance, scan.odom, self._filter.unseen)
         if self._monitor.trial_failed:
             self.global_localization()
@@ -293,6 +301,7 @@ class Localizer:
             self._scale.forget_anchor()
             self._monitor.restart()
             self._doubt.begin(scan.odom)
+            self._tracked = False
         elif self._local_scans > _LOCAL_SCANS and not self._relocalization.active and self._may_search(scan, now):
             self.global_localization()
 
@@ -316,11 +325,18 @@ class Localizer:
             if undecided or not fits_again:
                 self._monitor.lose(outcome.detail)
             return
-        self._doubt.verify()
         pose = self._filter.pose(outcome.odom)
-        if fits_again and pose is not None and not apart(pose, outcome.pose):
-            self._verify_again_at = now + _VERIFY_EVERY_S
-            return
+        if fits_again and pose is not None:
+            same = not apart(pose, outcome.pose)
+            if same:
+                self._doubt.verify()
+            if same or (self._tracked and self._tells_place):
+                # Where a door was opened, a place without that door elsewhere explains every scan a little better than
+                # the robot's own. Wheels that have counted all the way say more than that.
+                self._relocalization.cancel()
+                self._verify_again_at = now + _VERIFY_EVERY_S
+                return
+        self._doubt.verify()
         if fits_again:
             self._monitor.lose("the robot was found elsewhere on the map: it was carried, or its pose was wrong")
             self._monitor.restart()
@@ -328,6 +344,7 @@ class Localizer:
             self._monitor.begin_found()
         self._doubt.restart()
         self._local_scans = 1
+        self._tracked = False
         self._scale.forget_anchor()
         self._filter.start(outcome.pose, outcome.odom, *_FOUND_SIGMAS)
         self._filter.add(scan, fields)

@@ -99,7 +99,7 @@ def test_check_prints_what_a_file_may_say_and_names_the_ports_that_are_not_set(t
     printed = result.output.splitlines()
     assert 'base.driver = "roomba600"' in printed
     assert "lidar.mirrored = false" in printed
-    assert "odometry.alphas = [0.05, 0.05, 0.05, 0.05]" in printed
+    assert "odometry.alphas = [0.05, 0.05, 0.01, 0.05]" in printed
     assert [line for line in printed if "is not set" in line] == [
         "lidar.port is not set: a robot needs it, a demo does not"
     ]

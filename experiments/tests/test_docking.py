@@ -101,7 +101,8 @@ def test_robot_docks_charges_and_leaves_its_dock_for_a_goal():
     goal = RobotGoal(goal_id="g", pose=Pose(x=1.5, y=2.6, theta=0.0), stamp=0.0)
     run.system.fog.planner.set_goal("r1", goal, any_heading=True)
     run.until(lambda: run.state.goal_reached, 60.0)
-    assert run.modes[-3:] == ["HOLD", "DOCK", "NORMAL"]
+    assert "DOCK" in run.modes[-3:]
+    assert run.modes[-1] == "NORMAL"
     assert run.system.world.contacts == 0
 
 

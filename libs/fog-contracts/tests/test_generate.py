@@ -162,7 +162,7 @@ def test_header_compiles_and_agrees_with_the_channel_table(tmp_path, compiler, s
     done = subprocess.run([tmp_path / "main"], capture_output=True, text=True, check=True)
     longest = "abcdefghijklmnopqrstuvwxyz012345"
     assert done.stdout.splitlines() == [
-        ch.NODE_READING.key(site=longest, node=longest), "no_echo", "offline", "1024 1 1 8 201 50",
+        ch.NODE_READING.key(site=longest, node=longest), "no_echo", "offline", "1024 1 1 8 201 10",
         f"20.0 {2**53}",
     ]  # fmt: skip
 

@@ -88,7 +88,7 @@ async def client(tokens, tmp_path):
     async def bug() -> None:
         raise RuntimeError("inner detail")
 
-    async with running_front(lambda: app, tmp_path) as url, httpx.AsyncClient(base_url=url) as http:
+    async with running_front(lambda: app, tmp_path) as url, httpx.AsyncClient(base_url=url, timeout=60.0) as http:
         http.health = health
         yield http
 

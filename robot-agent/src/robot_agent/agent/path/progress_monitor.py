@@ -31,6 +31,9 @@ _RELEASED_END_M: Final = 0.3
 _REPORTED_S: Final = 120.0
 """How long the place is reported: afterwards the lidar's view clears it, and the way is tried again."""
 
+_TRIES_S: Final = 5.0
+"""A robot that was hindered tries to get free: so long after that it may still get a little further."""
+
 _NOWHERE: Final = np.zeros((0, 2))
 _NEVER: Final = -math.inf
 
@@ -89,7 +92,7 @@ class ProgressMonitor:
 
     def _hold(self, path_id: PathId | None, follower: PathFollower, now: float) -> None:
         """Record a standstill with what hindered the robot last, and the place ahead, unless the lidar is the cause."""
-        recent = now - self._hindered_at <= self._stuck_after
+        recent = now - self._hindered_at <= follower.stuck_for(now) + _TRIES_S
         hindrance = self._hindrance if recent else Hindrance()
         because = f": {hindrance.words}" if hindrance.words else ""
         reason = f"no progress along the path for {follower.stuck_for(now):.0f} s{because}"

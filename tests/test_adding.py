@@ -35,6 +35,8 @@ MAKE_POLYGONS = {
     "experiments/src/fognav_experiments/scenarios/stage.py", "robot-agent/src/robot_agent/agent/blocked_places.py"
 }  # fmt: skip
 """They make a shape of a list of corners, whatever other kinds there are."""
+ORACLE = "experiments/src/fognav_experiments/hunt/oracle.py"
+"""It computes for itself where zones are: an error in the shapes must not be its own, too."""
 DRAWING_COMMANDS = {
     f"cli/src/fognav/{name}.py"
     for name in ("commands/zone", "bench/costmap", "bench/fleet", "bench/floor", "bench/rest_clients")
@@ -284,7 +286,7 @@ def test_only_messages_shapes_and_the_commands_that_draw_them_distinguish_kinds_
     asking = re.compile(rf"\b({'|'.join(names)})\b|\btype\b\W+({'|'.join(tags)})\b")
     files = [file for source in SOURCES for suffix in ("py", "js") for file in source.parent.rglob(f"*.{suffix}")]
     found = {str(file.relative_to(ROOT)) for file in files if asking.search(file.read_text("utf-8"))}
-    assert found == {f"{MESSAGES}/zones.py", SHAPES, *DRAWING_COMMANDS, *MAKE_POLYGONS}
+    assert found == {f"{MESSAGES}/zones.py", SHAPES, *DRAWING_COMMANDS, *MAKE_POLYGONS, ORACLE}
 
 
 # --- The document ---------------------------------------------------------------------------------------------------

@@ -334,7 +334,7 @@ def test_world_that_broke_a_rule_breaks_it_no_more(file):
     assert hunt(read_world(file), [SITES]).violations == []
 
 
-@pytest.mark.xfail(reason="not mended yet: move its file to `mended` when it is", strict=False)
+@pytest.mark.xfail(reason="not mended yet: move its file to `mended` when it is", strict=True)
 @pytest.mark.parametrize("file", sorted((HUNT / "found").glob("*.json")), ids=lambda file: file.stem)
 def test_world_that_breaks_a_rule(file):
     assert hunt(read_world(file), [SITES]).violations == []

@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 from little_world import LittleWorld
 
-from fog_contracts.messages import Pose
+from fog_contracts import channels as ch
+from fog_contracts.messages import PolygonShape, Pose, Zone, ZoneSet
 from robot_agent.localization.absolute import AbsoluteObservation
 from robot_agent.localization.pose import Pose2
 
@@ -85,3 +86,23 @@ def test_jump_of_the_encoders_along_a_plain_corridor_stays_uncertain_since_no_sc
         assert error < 2.6 * sigma, f"{error:.2f} m off, {sigma:.2f} m claimed"
         assert world.agent.localizer.status == "weak"
     assert world.state().mode == "HOLD", world.state().reasons
+
+
+def test_robot_that_may_already_be_in_a_zone_ahead_holds_and_drives_away_from_it():
+    world = LittleWorld(**PLAIN_CORRIDOR, pose=(28.0, 2.0, 0.0))
+    world.agent.load(world.master.snapshot(), world.now)
+    world.run(0.6)
+    assert world.command("initial_pose", pose=Pose(x=28.0, y=2.0, theta=0.0)).accepted
+    world.run(3.0)
+    assert world.command("enable").accepted
+    outline = [(28.7, 1.0), (30.0, 1.0), (30.0, 3.0), (28.7, 3.0)]
+    zone = Zone(id="wet", kind="BLOCKED", shape=PolygonShape(points=outline))
+    world.send(ch.ZONES, ZoneSet(epoch=7, seq=1, zones=[zone], active=["wet"]))
+    world.block(28.7, 1.0, 30.0, 3.0)
+    world.drive_to([(28.0, 2.0), (28.4, 2.0)])
+    world.run(3.0)
+    assert world.state().mode == "HOLD"
+    assert any("may already be in the no-go zone wet" in reason for reason in world.state().reasons)
+    assert world.x == pytest.approx(28.0, abs=0.05)
+    world.drive_to([(28.0, 2.0), (26.0, 2.0)], goal_id="g2", plan_id=2)
+    assert world.run(60.0, lambda w: w.x < 27.0), world.state().reasons

@@ -624,6 +624,25 @@ def test_block_that_late_poses_explain_in_part_stays():
     assert (rig.hazard.state, rig.hazard.penalty) == ("blocked", 254)
 
 
+def test_box_that_one_node_saw_stays_impassable_when_late_poses_explain_another_nodes_block():
+    rig = Rig(site("n1"), site("n2"))
+    for node in ("n1", "n2"):
+        rig.read(3.0, 3.0, node=node, times=5)
+    rig.core.on_pose("r1", msgspec.structs.replace(pose(1.0, -2.0), clock=rig.now + 5000.0), rig.now)
+    rig.wait(3.5)
+    rig.read(0.4, 3.0, node="n2", times=5)  # a box, and the node is never heard again
+    began = rig.now
+    for _ in range(19):
+        rig.read(0.83, 3.0, node="n1", times=2)
+        rig.wait(0.1)
+    assert rig.hazard.state == "blocked"
+    for moment in (began - 0.2, began, began + 1.5, rig.now):
+        rig.core.on_pose("r1", msgspec.structs.replace(pose(1.0, 0.5), clock=moment + 5000.0), rig.now)
+    rig.wait(0.1)
+    assert rig.hazard.nodes == {"n1": "unknown", "n2": "unknown"}
+    assert (rig.hazard.state, rig.hazard.penalty) == ("unknown", 254)
+
+
 @pytest.mark.parametrize("delay", [0.0, 0.7, 2.0])
 def test_box_in_a_corridor_stays_blocked_while_a_robot_passes_it(delay):
     rig = Rig(site("n1"))

@@ -280,13 +280,14 @@ class AreaFusion:
         for node in area.nodes.values():
             if node.state != "blocked" or node.site is None:
                 continue
-            robots = [
-                classify_reading(node.site, reading, self._poses.at(taken_at, settled=True)).explained_by
-                for taken_at, reading in node.unexplained
-            ]
-            if robots and None not in robots:
-                node.invalidate(f"it saw the robot {robots[-1]}, whose pose came late")
-                area.take_back()
+            robot = None
+            for taken_at, reading in node.unexplained:  # the oldest first: for a box, it is the only one
+                robot = classify_reading(node.site, reading, self._poses.at(taken_at, settled=True)).explained_by
+                if robot is None:
+                    break
+            if robot is not None:
+                node.invalidate(f"it saw the robot {robot}, whose pose came late")
+                area.take_back(node.id)
 
     def _after(self, applied: Iterable[Applied], stamp: float) -> list[AreaHazard]:
         """Return the hazards that change with what sources said."""

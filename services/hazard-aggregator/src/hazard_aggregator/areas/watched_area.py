@@ -43,6 +43,7 @@ class WatchedArea:
         self.hazard: AreaHazard | None = None
         self._last_known_blocked = False  # then unknown costs as much as blocked
         self._known_before = False  # the same, before the area became blocked
+        self._blocked_by: set[str] = set()  # nodes that were blocked when they last knew anything
         self._measured: AreaState = "unknown"
         self._confirmed = False  # whether readings of this run have confirmed a state
         self._restored: AreaHazard | None = None
@@ -72,9 +73,11 @@ class WatchedArea:
         if not self._confirmed and is_impassable(hazard):
             self._last_known_blocked = True
 
-    def take_back(self) -> None:
-        """Handle that what blocked the area was none: an unknown area is impassable only if it was so before."""
-        self._last_known_blocked = self._known_before
+    def take_back(self, node: str) -> None:
+        """Handle that what a node saw was no hazard: if it alone saw one, the area is as impassable as before that."""
+        self._blocked_by.discard(node)
+        if not self._blocked_by:
+            self._last_known_blocked = self._known_before
 
     def set_epoch(self, epoch: int) -> None:
         """Give the current hazard another epoch."""
@@ -125,6 +128,11 @@ class WatchedArea:
         if state == "blocked" and self._measured != "blocked":
             self._known_before = self._last_known_blocked
         self._measured = state
+        self._blocked_by = {
+            name
+            for name, node in self.nodes.items()
+            if node.state == "blocked" or (node.state == "unknown" and name in self._blocked_by)
+        }
         if state != "unknown":
             self._last_known_blocked = state == "blocked"
             self._confirmed = self._confirmed or (deciding is not None and deciding.ever_received)

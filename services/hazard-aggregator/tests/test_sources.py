@@ -231,6 +231,17 @@ def test_zigbee2mqtt_that_starts_again_clears_nothing_by_what_it_knew_before(asl
     assert rig.send(topic, blocked) == "blocked"
 
 
+def test_zigbee2mqtt_clears_nothing_by_what_it_knew_before_though_the_device_comes_after_the_gateway():
+    rig, topic, _, clear = connected(OCCUPANCY)
+    rig.send(f"{HALL}/availability", {"state": "offline"})
+    rig.send("zigbee2mqtt/bridge/state", {"state": "offline"})
+    rig.send("zigbee2mqtt/bridge/state", {"state": "online"})
+    rig.send(f"{HALL}/availability", {"state": "online"})
+    assert rig.send(topic, clear) == "unknown"
+    assert "may repeat what it knew before" in rig.hazard.cause
+    assert rig.send(topic, clear) == "clear"
+
+
 def test_zigbee2mqtt_that_starts_again_blocks_by_what_it_knew_before():
     rig, topic, blocked, clear = connected(OCCUPANCY)
     rig.send("zigbee2mqtt/bridge/state", {"state": "offline"})

@@ -141,17 +141,17 @@ def _apply_availability(
 ) -> bool:
     """Apply what says whether a source's sensor is connected; return whether it was understood."""
     was_online, online = source.online, is_online(availability, payload)
+    if availability.recalls and online and not retained and not source.said.get(availability.topic):
+        source.recalled = True
     source.say(availability.topic, online=online is True)
     if not online:
-        source.pending, source.recalled = None, False
+        source.pending = None
         reason = "it went offline" if online is False else f"{availability.topic} says neither online nor offline"
         if source.state != "unknown" or was_online:
             source.invalidate(reason)
     elif source.online and not was_online:
         pending, source.pending = source.pending, None
-        if availability.recalls and not retained:
-            source.recalled = True
-        elif pending is not None:
+        if pending is not None and not source.recalled:
             return _read(source, pending, now, stamp)
     return online is not None
 

@@ -85,6 +85,20 @@ def test_added_node_is_in_the_site_and_its_board_accepts_its_settings(floor: Pat
     assert problem(text, ctypes.c_uint32(len(text))) is None
 
 
+def test_maker_is_told_at_once_of_a_node_that_hears_no_wall_and_of_a_heading_by_which_it_does(floor: Path) -> None:
+    done = add(floor, "33.20,38.15,0.35")
+    assert done.returncode == 0, done.stderr
+    told = " ".join(done.stderr.split())
+    assert "no sonar of n8 hears a wall" in told
+    found = re.search(r"with --pose (33\.2,38\.15,\S+) it hears a wall", told)
+    assert found is not None, told
+    shutil.copy(ROOT / "sites" / "estig" / "site.toml", floor)
+    again = add(floor, found[1], out=str(floor / "again"))
+    assert again.returncode == 0, again.stderr
+    assert "hears a wall" not in again.stderr
+    assert any(sonar.range_max is not None for sonar in load_site(floor).site.nodes[-1].sonars)
+
+
 @pytest.mark.parametrize(("options", "every"), [({}, False), ({"every-reading": ""}, True)])
 def test_publishing_of_a_node_is_in_the_site_and_in_its_boards_settings(floor: Path, options, every) -> None:
     words = [f"--{name}" for name in options]

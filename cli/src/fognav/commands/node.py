@@ -376,7 +376,14 @@ def _pose(text: str) -> tuple[float, float, float]:
 
 
 def _placed(loaded: LoadedSite, name: str, area: str, pose: tuple[float, float, float], height: float) -> NodeSite:
-    from fognav.nodes.placing import PlacingError, bounded, check_sees, sonar_limits  # noqa: PLC0415  # kernels are slow
+    from fognav.nodes.placing import (  # noqa: PLC0415  # kernels are slow
+        PlacingError,
+        bounded,
+        check_sees,
+        heading_that_hears,
+        hears,
+        sonar_limits,
+    )
     from fognav_sim.floor import Floor  # noqa: PLC0415  # as above
 
     areas = {known.id: known for known in loaded.site.areas}
@@ -398,6 +405,15 @@ def _placed(loaded: LoadedSite, name: str, area: str, pose: tuple[float, float, 
         node = bounded(Floor(loaded.map.geometry, loaded.map.cells), node)
     except (PlacingError, msgspec.ValidationError) as error:
         raise WrongUseError(f"node {name}: {error}") from error
+    if not hears(node):
+        heading = heading_that_hears(loaded.map, node, areas[area])
+        remedy = (
+            "move it opposite a wall" if heading is None else f"with --pose {x:g},{y:g},{heading:g} it hears a wall"
+        )
+        print_line(
+            f"warning: on the map no sonar of {name} hears a wall, and a dead one hears nothing either: it will tell "
+            f"of what stands there, but never that nothing does, and its area stays unknown: {remedy}"
+        )
     return node
 
 

@@ -33,6 +33,7 @@ RELIABLE_M: Final = SONAR_MAX_M - 0.2
 """Up to here a wall echoes reliably."""
 NEAREST_LIMIT_M: Final = 0.3
 _RAYS: Final = 15
+_TURNS: Final = [math.radians(sign * turn) for turn in range(5, 65, 5) for sign in (1, -1)]
 _NO_NOISE: Final = Noise(sonar_sigma=0.0, sonar_spike=0.0)
 _NO_ROBOT: Final = Robot(x=-1e6, y=-1e6, radius=0.1, height=0.1)
 
@@ -124,3 +125,23 @@ def check_sees(node: NodeSite, area: AreaSite, static: StaticMap) -> None:
         if (inside[seen.rows, seen.columns] & cells).any():
             return
     raise PlacingError(f"the node would see nothing of area {area.id}: check its pose, above all the direction")
+
+
+def hears(node: NodeSite) -> bool:
+    """Whether a `bounded` node hears any wall: one that does not can never tell that nothing stands there."""
+    return any(sonar.range_max is not None for sonar in node.sonars)
+
+
+def heading_that_hears(static: StaticMap, node: NodeSite, area: AreaSite) -> float | None:
+    """Return the heading (rad) nearest to a node's own by which it hears a wall and sees its area, None without one."""
+    floor, angles = Floor(static.geometry, static.cells), [sonar.angle for sonar in node.sonars]
+    for turn in sorted(_TURNS, key=abs):
+        theta = round(math.remainder(node.theta + turn, math.tau), 2)
+        try:
+            turned = structs.replace(node, theta=theta, sonars=sonar_limits(static, (node.x, node.y, theta), angles))
+            check_sees(turned, area, static)
+        except PlacingError:
+            continue
+        if hears(bounded(floor, turned)):
+            return theta
+    return None

@@ -88,7 +88,12 @@ class _End(asyncio.Protocol):
         self.transport = None
         if self.other is not None and (transport := self.other.transport) is not None:
             transport.close()
-            asyncio.get_running_loop().call_later(_FLUSH_S, transport.abort)
+            asyncio.get_running_loop().call_later(_FLUSH_S, self.other.abort)
+
+    def abort(self) -> None:
+        """End the connection at once, if it still is one: a transport that is gone may fail."""
+        if self.transport is not None:
+            self.transport.abort()
 
     def pause_writing(self) -> None:
         if self.other is not None and self.other.transport is not None:

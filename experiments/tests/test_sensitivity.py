@@ -29,6 +29,7 @@ from fognav_experiments.sensitivity.planes import (
 )
 from fognav_experiments.sensitivity.publish import publish
 from fognav_experiments.sensitivity.sources import digest
+from fognav_sim.node import default_config
 
 ESTIG = Path(__file__).parents[2] / "sites" / "estig"
 _spec = importlib.util.spec_from_file_location("ring_site", Path(__file__).parent / "ring_site.py")
@@ -57,6 +58,10 @@ def swept(setup, variation, distance_m, run=1, **changes):
 
 
 # --- what is driven ---
+
+
+def test_point_that_changes_nothing_drives_with_nodes_as_they_are_by_default(estig):
+    assert BASE.pause_ms == default_config(estig.site.nodes[0]).pause_ms
 
 
 def test_each_drive_comes_once_and_the_robot_on_its_own_once_per_speed(estig):

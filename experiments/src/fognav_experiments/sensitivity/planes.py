@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Final, Literal, NamedTuple
 
 import msgspec
 
+from fog_contracts.messages import NodeConfig
 from fognav_experiments.comparison.driven import DrivenRoute
 from fognav_experiments.comparison.statistics import Estimate, estimate
 
@@ -31,6 +32,12 @@ OF_THE_ROBOT: Final[frozenset[Quantity]] = frozenset({"speed_m_s"})
 """What also changes the robot that nobody warns; it is driven once for all values of the others."""
 
 
+NODE_PAUSE_MS: Final[int] = next(
+    field.default for field in msgspec.structs.fields(NodeConfig) if field.name == "pause_ms"
+)
+"""The pause of a node that nobody has configured otherwise."""
+
+
 class Variation(msgspec.Struct, frozen=True, kw_only=True):
     """A point of a plane.
 
@@ -39,7 +46,7 @@ class Variation(msgspec.Struct, frozen=True, kw_only=True):
     """
 
     readings: int = 0
-    pause_ms: int = 50
+    pause_ms: int = NODE_PAUSE_MS
     areas: int = 0
     speed_m_s: float = 0.3
 

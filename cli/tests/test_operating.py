@@ -6,7 +6,7 @@ import subprocess
 import sys
 import threading
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
 
@@ -47,6 +47,8 @@ class Service:
             def answer(self) -> None:
                 body = self.rfile.read(int(self.headers.get("Content-Length", 0)))
                 token = self.headers.get("Authorization")
+                while service.hanging.is_set():
+                    time.sleep(0.01)
                 service.requests.append((self.command, self.path, json.loads(body or b"null"), token))
                 status, value = service.answers.get((self.command, self.path), (404, {"detail": "there is no such"}))
                 data = json.dumps(value).encode() if status != 204 else b""
@@ -60,8 +62,21 @@ class Service:
             def log_message(self, *_: object) -> None:
                 pass
 
-        self.server = ThreadingHTTPServer(("127.0.0.1", 0), Handler)
+        self._handler = Handler
+        self.hanging = threading.Event()
+        """While it is set, no request is answered."""
+        self.listen(0)
+
+    def listen(self, port: int) -> None:
+        """Begin to answer at a port (0: any free one)."""
+        self.server = ThreadingHTTPServer(("127.0.0.1", port), self._handler)
         threading.Thread(target=self.server.serve_forever, args=(0.02,), daemon=True).start()
+
+    def close(self) -> int:
+        """End, and return the port, at which connections are refused from now on."""
+        self.server.shutdown()
+        self.server.server_close()
+        return self.server.server_port
 
     @property
     def url(self) -> str:
@@ -83,8 +98,7 @@ def runtime(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 def service() -> Iterator[Service]:
     running = Service()
     yield running
-    running.server.shutdown()
-    running.server.server_close()
+    running.close()
 
 
 def system(name: str, url: str, **others: object) -> System:
@@ -525,6 +539,59 @@ def test_stop_needs_neither_key_nor_token_and_takes_the_way_that_works(service: 
         answer = {"accepted": True, "reason": "disabled", "mode": "NORMAL"}
         service.answers["POST", "/api/v1/robots/r1/stop"] = (200, answer)
         assert run("robot", command).startswith("accepted: disabled")
+
+
+STOP = "/api/v1/robots/r1/stop"
+STOPPED = (200, {"accepted": True, "reason": "disabled", "mode": "INIT"})
+
+
+class StopTold:
+    """Runs `robot disable` with a robot that only the planner reaches, and lets `then` happen when it is told of."""
+
+    def __init__(self, monkeypatch: pytest.MonkeyPatch, then: Callable[[], None]) -> None:
+        self.told: list[tuple[float, str]] = []
+        begun = time.monotonic()
+
+        def tell(text: str) -> None:
+            self.told.append((time.monotonic() - begun, text))
+            then()
+
+        monkeypatch.setattr("fognav.commands.robot.print_line", tell)
+        self.answer = run("robot", "disable")
+
+
+@pytest.mark.parametrize("status", [500, 503, 504, 429])
+def test_stop_that_the_planner_can_not_carry_out_is_told_and_tried_until_it_is_through(
+    demo: Service, monkeypatch: pytest.MonkeyPatch, status: int
+) -> None:
+    demo.answers["POST", STOP] = (status, {"detail": "the store does not answer"})
+
+    done = StopTold(monkeypatch, lambda: demo.answers.update({("POST", STOP): STOPPED}))
+
+    assert done.answer.startswith("accepted: disabled")
+    ((_, told),) = done.told
+    assert "the robot is not known to have stopped yet" in told
+    assert "the store does not answer" in told
+
+
+def test_stop_is_tried_again_after_the_planner_was_restarted(demo: Service, monkeypatch: pytest.MonkeyPatch) -> None:
+    demo.answers["POST", STOP] = STOPPED
+    port = demo.close()
+
+    done = StopTold(monkeypatch, lambda: demo.listen(port))
+
+    assert done.answer.startswith("accepted: disabled")
+    assert ["Connection refused" in told for _, told in done.told] == [True]
+
+
+def test_stop_is_told_to_be_open_while_the_planner_hangs(demo: Service, monkeypatch: pytest.MonkeyPatch) -> None:
+    demo.answers["POST", STOP] = STOPPED
+    demo.hanging.set()
+
+    done = StopTold(monkeypatch, demo.hanging.clear)
+
+    assert done.answer.startswith("accepted: disabled")
+    assert len(done.told) == 1
 
 
 def test_commands_go_through_the_planner_for_who_has_a_token_and_no_key(demo: Service) -> None:

@@ -14,12 +14,21 @@ import typer
 from fog_contracts.commands import PROFILE_OF, STOPS
 from fog_contracts.messages import CommandKind, Id, Mode, Pose, ProfileName
 from fog_runtime import logs
-from fognav.operate import rest_commands
+from fognav.operate import rest_commands, stopping
 from fognav.operate.fog import Fog, RefusedError, find_fog
 from fognav.operate.options import NUMBERS, FogOption, JsonOption, RobotOption, numbers
 from fognav.operate.outcome import Outcome
 from fognav.operate.systems import MAP_SERVICE, PLANNER
-from fognav.output import NOT_TRUE, FailedError, WrongUseError, envelope, exit_codes, print_answer, print_json
+from fognav.output import (
+    NOT_TRUE,
+    FailedError,
+    WrongUseError,
+    envelope,
+    exit_codes,
+    print_answer,
+    print_json,
+    print_line,
+)
 
 robot_app = typer.Typer(help="Enable, stop and send robots, and watch them.", no_args_is_help=True)
 
@@ -43,9 +52,10 @@ def robot_enable(*, robot: RobotOption = None, fog: FogOption = None, json: Json
 def robot_disable(*, robot: RobotOption = None, fog: FogOption = None, json: JsonOption = False) -> None:
     """Stop a robot at once; its mission is kept.
 
-    The robot continues it when it is enabled again.
+    The robot continues it when it is enabled again. While it can't be reached, this says so and tries again.
     """
-    _run_command("disable", robot, fog, json=json)
+    with exit_codes():
+        _report(stopping.stop(find_fog(fog), robot, print_line), json=json)
 
 
 @robot_app.command("reset", epilog="Example: fognav robot reset && fognav robot enable")
@@ -113,13 +123,15 @@ def robot_advance(*, robot: RobotOption = None, fog: FogOption = None, json: Jso
 
 @robot_app.command("stop", epilog="Example: fognav robot stop")
 def robot_stop(*, robot: RobotOption = None, fog: FogOption = None, json: JsonOption = False) -> None:
-    """Stop a robot at once and end its mission."""
+    """Stop a robot at once and end its mission.
+
+    While the robot can't be reached, neither directly nor through the planner, this says so and tries again.
+    """
     with exit_codes():
         found = find_fog(fog)
-        chosen = found.robot(robot)
-        outcome = _send(found, chosen, "disable")
+        outcome = stopping.stop(found, robot, print_line)
         # The robot comes first: it stops whether or not the planner answers.
-        reason = f"{outcome.reason}; {_end_mission(found, chosen)}"
+        reason = f"{outcome.reason}; {_end_mission(found, robot)}"
         _report(msgspec.structs.replace(outcome, reason=reason), json=json)
 
 
@@ -243,19 +255,11 @@ def _run_command(kind: CommandKind, robot: str | None, fog: str | None, *, json:
 def _send(fog: Fog, robot: str, kind: CommandKind, pose: Pose | None = None) -> Outcome:
     """Command a robot: by a command signed here, or through the planner, which signs it for who has a token.
 
-    A stop takes the other way where the first one fails. Raises `FailedError`, `WrongUseError`.
+    Raises `FailedError`, `WrongUseError`.
     """
     if fog.commands_by_rest and kind not in STOPS:
         return rest_commands.command(fog, robot, kind, pose)
-    try:
-        return asyncio.run(_command(fog, robot, kind, pose))
-    except FailedError as error:
-        if kind != "disable":
-            raise
-        try:
-            return rest_commands.stop(fog, robot)
-        except FailedError as other:
-            raise FailedError(f"{error}; {other}") from other
+    return asyncio.run(_command(fog, robot, kind, pose))
 
 
 async def _command(fog: Fog, robot: str, kind: CommandKind, pose: Pose | None = None) -> Outcome:
@@ -277,9 +281,9 @@ def _report(outcome: Outcome, *, json: bool) -> None:
     raise typer.Exit(0 if outcome.accepted else NOT_TRUE)
 
 
-def _end_mission(fog: Fog, robot: str) -> str:
+def _end_mission(fog: Fog, robot: str | None) -> str:
     try:
-        fog.send("DELETE", PLANNER, f"/api/v1/robots/{robot}/goal")
+        fog.send("DELETE", PLANNER, f"/api/v1/robots/{fog.robot(robot)}/goal")
     except RefusedError as error:
         return "it had no mission" if error.status == 404 else str(error)
     except FailedError as error:

@@ -3,7 +3,7 @@
 import asyncio
 import getpass
 from collections import deque
-from collections.abc import AsyncIterator, Mapping
+from collections.abc import AsyncIterator, Callable, Mapping
 from contextlib import asynccontextmanager
 from typing import Final
 
@@ -66,9 +66,17 @@ class Robot:
             return None
         return self.state
 
-    async def command(self, kind: CommandKind, key: bytes | None, pose: Pose | None = None) -> Outcome:
+    async def command(
+        self,
+        kind: CommandKind,
+        key: bytes | None,
+        pose: Pose | None = None,
+        *,
+        on_reply: Callable[[], None] | None = None,
+    ) -> Outcome:
         """Send a command signed with the operators' `key`; a stop needs none.
 
+        `on_reply` is called when the robot has replied, before its mode is waited for.
         Raises `FailedError` when the robot does not answer.
         """
         state = self.state
@@ -89,6 +97,8 @@ class Robot:
                 f"robot {self.id} did not answer within {REPLY_TIMEOUT_S:.0f} s. Check its id, that its agent runs, "
                 f"and that it is connected to {router(self._fog)}"
             )
+        if on_reply is not None:
+            on_reply()
         after = await self.next_state()
         return Outcome(accepted=reply.accepted, reason=reply.reason, mode=after.mode if after is not None else None)
 

@@ -105,3 +105,14 @@ def test_whatever_was_seen_a_drive_on_which_all_scans_fit_alike_ends_every_doubt
     for number in range(20):
         doubt.add(fit(after), Pose2(30.0 + 0.5 * number, 0.0, 0.0), jumped=number == 0)
     assert doubt.reason == ""
+
+
+def test_no_drive_verifies_a_pose_while_other_places_explain_the_scans_as_well():
+    doubt = Doubt()
+    doubt.begin(Pose2(0.0, 0.0, 0.0))
+    for number in range(20):
+        doubt.add(fit(0.98), Pose2(0.5 * number, 0.0, 0.0), jumped=False, rivalled=True)
+    assert doubt.to_verify
+    for number in range(20, 32):
+        doubt.add(fit(0.98), Pose2(0.5 * number, 0.0, 0.0), jumped=False)
+    assert not doubt.to_verify

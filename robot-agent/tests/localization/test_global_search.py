@@ -12,6 +12,7 @@ from little_world import L_ROOMS, grid_of
 from robot_agent.config import LocalizationConfig
 from robot_agent.localization import global_search
 from robot_agent.localization.global_search import GlobalSearch
+from robot_agent.localization.hypotheses import Near
 from robot_agent.localization.map_fields import MapFields, map_fields
 from robot_agent.localization.pose import Pose2, wrap
 
@@ -29,8 +30,8 @@ def view(fields: MapFields, pose: Pose2):
     return np.column_stack((ranges[hit] * np.cos(angles[hit]), ranges[hit] * np.sin(angles[hit])))
 
 
-def search(fields: MapFields, points) -> tuple[Hypotheses, int]:
-    one = GlobalSearch(fields, points, ORIGIN, CONFIG.range_max)
+def search(fields: MapFields, points, near: Near | None = None) -> tuple[Hypotheses, int]:
+    one = GlobalSearch(fields, points, ORIGIN, CONFIG.range_max, near)
     for shares in range(1, 1000):
         result = one.advance(fields)
         if result is not None:
@@ -56,6 +57,17 @@ def test_scan_decides_for_no_place_that_it_does_not_confirm():
     assert math.dist(result.contenders[0].pose[:2], place[:2]) < 0.1
     assert len(result.contenders) == 1
     assert result.decided is None
+
+
+def test_place_near_the_last_good_pose_is_among_those_found_though_more_others_look_like_it_than_are_kept():
+    rooms = [(1 + 4 * (number % 6), 1 + 4 * (number // 6)) for number in range(36)]
+    mapped = map_fields(*grid_of([(x, y, x + 3, y + 2.5) for x, y in rooms], 26, 26), CONFIG)
+    # Furniture stands in the robot's room, and in none on the map.
+    room = [(1, 1, 4, 3.5), (1, 21, 4, 23.2), (1, 21, 2.6, 23.5), (3.2, 21, 4, 23.5)]
+    points = view(map_fields(*grid_of(room, 26, 26), CONFIG), Pose2(2.2, 22.1, 0.7))
+    for near, found in ((None, False), (Near(2.0, 22.0, 1.5), True)):
+        result, _ = search(mapped, points, near)
+        assert any(math.dist(place.pose, (2.2, 22.1, 0.7)) < 0.15 for place in result.contenders) is found
 
 
 def test_twin_rooms_leave_the_search_undecided():

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -10,7 +11,7 @@ from little_world import grid_of
 
 from robot_agent.config import LocalizationConfig
 from robot_agent.localization.deskew import DeskewedScan
-from robot_agent.localization.hypotheses import Hypotheses, Hypothesis
+from robot_agent.localization.hypotheses import Hypotheses, Hypothesis, Near, weighed
 from robot_agent.localization.map_fields import map_fields
 from robot_agent.localization.pose import Pose2
 from robot_agent.localization.relocalization import Relocalization
@@ -50,6 +51,40 @@ def test_places_that_explain_a_scan_alike_leave_it_undecided_and_a_single_one_de
     assert Hypotheses([Hypothesis(TRUE, -0.1), Hypothesis(TWIN, -0.9)], ORIGIN).decided == TRUE
     assert Hypotheses([Hypothesis(TRUE, -0.1)], ORIGIN).decided == TRUE
     assert Hypotheses([], ORIGIN).decided is None
+
+
+def test_place_near_the_last_good_pose_is_excluded_only_by_what_explains_the_scans_far_better():
+    """A wheel was held beside furniture, and the other end of the corridor explained the scans a little better."""
+    near = Hypothesis(TRUE, -3.0, near=True)
+    assert Hypotheses([Hypothesis(TWIN, -0.1), near], ORIGIN).decided is None
+    assert Hypotheses([Hypothesis(TWIN, -0.1), near], ORIGIN).contenders[1] == near
+    assert Hypotheses([Hypothesis(TWIN, -0.1), replace(near, log_quality=-4.0)], ORIGIN).decided == TWIN
+    assert Hypotheses([Hypothesis(TWIN, -0.9), replace(near, log_quality=-0.1)], ORIGIN).decided == TRUE
+
+
+def test_of_the_places_near_the_last_good_pose_only_those_are_left_that_explain_the_scans_nearly_as_well():
+    near = [Hypothesis(Pose2(x, 1.6, 1.2), quality, near=True) for x, quality in ((7.2, -1.0), (8.2, -2.0))]
+    assert Hypotheses([Hypothesis(TWIN, -0.1), *near], ORIGIN).contenders == [Hypothesis(TWIN, -0.1), near[0]]
+
+
+def test_place_near_the_last_good_pose_counts_no_more_than_others_once_two_scans_do_not_confirm_it():
+    here, odom = Pose2(7.2, 1.6, 1.2), ORIGIN
+    place = Hypothesis(Pose2(7.2, 2.2, 1.2), -0.1, near=True)
+    for near in (True, False):
+        place = weighed(place, Pose2(7.2, 2.2, 1.2), scan_at(here, odom), FIELDS, 12.0)
+        assert place.near is near
+
+
+def test_places_that_no_scan_fits_any_more_are_looked_for_anew_near_the_last_good_pose():
+    """A wheel that is held turns the robot unnoticed: the places that were followed by its wheels are all wrong."""
+    one, near = Relocalization(CONFIG), Near(7.2, 1.6, 2.5)
+    assert one.begin(scan_at(TRUE, ORIGIN), FIELDS, near)
+    search(one)
+    assert any(place.near for place in one.places)
+    true, odom = Pose2(TRUE.x, TRUE.y, TRUE.theta - 1.2), Pose2(0.0, 0.0, 0.3)
+    one.on_scan(scan_at(true, odom), FIELDS, near, shaken=True)
+    search(one)
+    assert any(place.near and math.dist(place.pose, true) < 0.15 for place in one.places)
 
 
 def test_scans_from_one_spot_are_no_news():

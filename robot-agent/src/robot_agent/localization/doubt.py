@@ -67,8 +67,13 @@ class Doubt:
         """Forget everything of another pose."""
         self._since = self._level = self._suspect_for_m = None
 
-    def add(self, fit: Fit, odom: Pose2, *, jumped: bool) -> None:
-        """Add the fit of the newest scan; `jumped`: whether it moved the estimate to another place."""
+    def add(self, fit: Fit, odom: Pose2, *, jumped: bool, rivalled: bool = False) -> None:
+        """Add the fit of the newest scan; `jumped`: whether it moved the estimate to another place.
+
+        `rivalled`: whether a search left other places that explain the scans as well: then no drive verifies a pose.
+        """
+        if self._since is not None and rivalled:
+            self._since = odom
         if jumped or casts_doubt(fit) or (self._since is not None and fit.agree < _VERIFIED_AGREEMENT):
             self._since = odom
         elif self._since is not None and _driven(self._since, odom) > _VERIFIED_AFTER_M:

@@ -48,6 +48,8 @@ _GOOD_HEADING_RAD: Final = 0.2
 """Standard deviations up to which a pose may be good."""
 _LOST_ACROSS_M: Final = 1.0
 """Across its least certain direction a pose must be more certain than this; along a plain corridor it need not be."""
+_SHAKEN_SCANS: Final = 2
+"""So many of the last nine scans that fit nowhere near the pose tell that the robot moved otherwise than its wheels."""
 _CONTRADICTED_SCANS_LIMIT: Final = 25
 """After this many contradicted scans in a row (some 4.5 s) the pose is lost, however the rest fits."""
 
@@ -101,6 +103,11 @@ class FitMonitor:
         self._contradicted = 0
         self._proven = False
         self._trial_scans = 0
+
+    @property
+    def shaken(self) -> bool:
+        """Whether some of the last scans show that the robot was turned or moved by something other than its wheels."""
+        return self._recent.count("lost") >= _SHAKEN_SCANS
 
     def begin(self, detail: str, trial_scans: int = 0) -> None:
         """Begin with a given pose; with a trial it must become good within so many scans."""

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Final
+from typing import TYPE_CHECKING, Final, NamedTuple
 
 import numpy as np
 
-from robot_agent.localization.fit import Fit, evaluate_fit
+from robot_agent.localization.fit import Fit, confirms, evaluate_fit
 from robot_agent.localization.pose import Pose2, wrap
 from robot_agent.localization.scan_match import match_scan
 
@@ -22,6 +22,8 @@ _AMBIGUOUS: Final = 0.85
 """A second place that explains the scans this well, as a share of the best, leaves the search ambiguous."""
 AMBIGUOUS_LATER: Final = 0.6
 """The same after more than one scan, for the product over all scans."""
+_CARRIED: Final = math.log(0.03)
+"""A robot was carried only if another place explains the scans so much better than any that it came to by itself."""
 _HOPELESS: Final = math.log(1e-3)
 """A place that explains the scans so much worse than the best one is dropped."""
 _APART_M: Final = 0.6
@@ -36,13 +38,31 @@ _MATCH_COVARIANCE: Final = np.diag(np.square((0.2, 0.2, 0.1)))
 _BEAMS: Final = 180
 
 
+class Near(NamedTuple):
+    """Where the pose was good last, in `map`, and how far the robot may have come since (m)."""
+
+    x: float
+    y: float
+    radius: float
+
+    def holds(self, pose: Pose2) -> bool:
+        """Whether the robot may have come to a pose, as it does that slips, or is pushed or turned."""
+        return math.hypot(pose.x - self.x, pose.y - self.y) <= self.radius
+
+
 @dataclass(frozen=True, slots=True)
 class Hypothesis:
-    """A pose in `map`, the product (as logarithm) of how well it explains the scans, and the misfits in a row."""
+    """A pose in `map`, the product (as logarithm) of how well it explains the scans, and the misfits in a row.
+
+    near: the robot may have come there from where its pose was good last, and the scans confirm it; to all other
+    places somebody has carried it. unconfirmed: number of the last scans in a row that do not confirm a near place.
+    """
 
     pose: Pose2
     log_quality: float
     misfits: int = 0
+    near: bool = False
+    unconfirmed: int = 0
 
 
 def quality(score: float, fit: Fit) -> float:
@@ -68,7 +88,9 @@ def weighed(place: Hypothesis, pose: Pose2, scan: DeskewedScan, fields: MapField
     fit = evaluate_fit(fields, matched, points, range_max)
     score = float(fields.agreements(np.array([matched]), points, fields.fine)[0])
     log_quality = place.log_quality + math.log(max(quality(score, fit), 1e-3))
-    return Hypothesis(matched, log_quality, 0 if fits(fit) else place.misfits + 1)
+    misfits = 0 if fits(fit) else place.misfits + 1
+    unconfirmed = 0 if confirms(fit) else place.unconfirmed + 1
+    return Hypothesis(matched, log_quality, misfits, place.near and unconfirmed < _MISFITS_MAX, unconfirmed)
 
 
 class Hypotheses:
@@ -94,9 +116,19 @@ class Hypotheses:
 
     @property
     def contenders(self) -> list[Hypothesis]:
-        """The best place, and those that explain the scans nearly as well; best first."""
+        """The best place, and those that explain the scans nearly as well; best first.
+
+        And the best of the near ones, with those nearly as good as that, until they explain the scans much worse: a
+        robot slips more often than it is carried to a place that looks alike, and things that the map lacks spoil the
+        fit of its own place.
+        """
+        if not self._places:
+            return []
         limit = math.log(_AMBIGUOUS if self._scans == 1 else AMBIGUOUS_LATER)
-        return [place for place in self._places if place.log_quality > self._places[0].log_quality + limit]
+        best = self._places[0].log_quality
+        near = max((place.log_quality for place in self._places if place.near), default=-math.inf)
+        least = best if near <= best + _CARRIED else near
+        return [place for place in self._places if place.log_quality > (least if place.near else best) + limit]
 
     @property
     def decided(self) -> Pose2 | None:

@@ -18,13 +18,13 @@ import numpy as np
 from robot_agent.config import LocalizationConfig
 from robot_agent.localization.deskew import DeskewedScan, deskew
 from robot_agent.localization.doubt import Doubt
-from robot_agent.localization.fit import FitMonitor, evaluate_fit, tells_place
-from robot_agent.localization.hypotheses import apart
+from robot_agent.localization.fit import FitMonitor, confirms, evaluate_fit, tells_place
+from robot_agent.localization.hypotheses import Near, apart
 from robot_agent.localization.map_fields import MapFields, map_fields
 from robot_agent.localization.odometry_buffer import OdometryBuffer
 from robot_agent.localization.odometry_scale import OdometryScale
 from robot_agent.localization.particle_filter import ParticleFilter
-from robot_agent.localization.pose import Pose2
+from robot_agent.localization.pose import Pose2, wrap
 from robot_agent.localization.relocalization import Relocalization
 
 if TYPE_CHECKING:
@@ -47,6 +47,9 @@ _LOCAL_SIGMAS: Final = (1.0, 0.5)
 """Standard deviations (m, rad) within which a lost robot is looked for first."""
 _VERIFY_EVERY_S: Final = 5.0
 """Least time between two searches of the whole map that only confirm the pose, as while a door stands open."""
+_NEAR_M: Final = 2.5
+"""So far from where its pose was good last a robot may be that was pushed or turned, or whose wheel was held."""
+_TURNED_RAD: Final = 0.5
 _LOCAL_SCANS: Final = 5
 """After this many scans that do not fit there either, the whole map is searched."""
 
@@ -79,8 +82,13 @@ class Localizer:
         self._verify_again_at = -math.inf
         self._tells_place = False
         """Whether most of the newest scan shows the place of the pose."""
+        self._confirmed = False
+        """Whether the newest scan by itself confirms the pose."""
         self._tracked = False
         """Whether the pose was good once, and was followed by wheels and scans since."""
+        self._near: Near | None = None
+        """Where the robot may have come to by itself since its pose was good; None before that."""
+        self._last_odom: Pose2 | None = None
         self.scan: DeskewedScan | None = None
         """The newest scan, without its skew."""
 
@@ -114,6 +122,7 @@ class Localizer:
         odom = self._odometry.latest()
         if odom is not None and self._filter.has_pose:
             self._filter.widen(odom, distance, angle)
+            self._come(distance)
             self._scale.forget_anchor()
             self._tracked = False
             self._monitor.doubt(detail)
@@ -132,6 +141,7 @@ class Localizer:
         if not self._filter.observe(observation.pose, observation.covariance, odom):
             self._monitor.begin("checking the pose that was measured")
             self._doubt.restart()
+            self._near = None
         return True
 
     def on_scan(self, scan: LaserScan, now: float) -> None:
@@ -143,7 +153,8 @@ class Localizer:
             self._filter.add(self.scan, self._fields, self._scale.sigma)
             self._evaluate(self.scan, self._fields, now)
         if self._relocalization.active:
-            self._relocalization.on_scan(self.scan, self._fields)
+            shaken = self._monitor.shaken
+            self._relocalization.on_scan(self.scan, self._fields, self._near, shaken=shaken)
             self._settle(self.scan, self._fields, now)
         elif not self._filter.has_pose and self._may_search(self.scan, now):
             self.global_localization()
@@ -164,7 +175,9 @@ class Localizer:
 
     def global_localization(self) -> bool:
         """Search the whole map, a share with each scan, keeping the estimate; False: no map or no scan yet."""
-        if self._fields is None or self.scan is None or not self._relocalization.begin(self.scan, self._fields):
+        if self._fields is None or self.scan is None:
+            return False
+        if not self._relocalization.begin(self.scan, self._fields, self._near):
             return False
         self._monitor.begin_search()
         return True
@@ -262,6 +275,7 @@ class Localizer:
         self._relocalization.cancel()
         self._local_scans = 0
         self._tracked = False
+        self._near = None
         self._doubt.restart()
         odom = self._odometry.latest() or Pose2(0.0, 0.0, 0.0)
         self._scale.forget_anchor()
@@ -272,10 +286,13 @@ class Localizer:
         pose = self._filter.pose(scan.odom)
         assert pose is not None
         fit = evaluate_fit(fields, pose, scan.beams(_FIT_BEAMS), self._config.range_max)
-        self._tells_place = tells_place(fit)
-        self._tracked = not self._filter.jumped and (self._tracked or self._monitor.status == "good")
-        self._doubt.add(fit, scan.odom, jumped=self._filter.jumped)
+        self._tells_place, self._confirmed = tells_place(fit), confirms(fit)
+        shaken = self._filter.jumped or self._monitor.shaken
+        self._tracked = not shaken and (self._tracked or self._monitor.status == "good")
+        rivalled = not self._tracked and len(self._relocalization.places) > 1
+        self._doubt.add(fit, scan.odom, jumped=self._filter.jumped, rivalled=rivalled)
         self._monitor.add(fit, self._filter.uncertainty, doubt=self._doubt.reason)
+        self._follow(pose, scan.odom)
         if self._monitor.status == "lost":
             self._relocalization.verifies = False
             self._look_nearby(scan, now)
@@ -291,7 +308,20 @@ class Localizer:
             if not self._doubt.to_verify:
                 self._relocalization.cancel()
             elif self._may_verify(now):
-                self._relocalization.begin(scan, fields, verifies=True)
+                self._relocalization.begin(scan, fields, self._near, verifies=True)
+
+    def _follow(self, pose: Pose2, odom: Pose2) -> None:
+        """Follow where the robot may have come to, by the pose at the newest scan."""
+        if self._monitor.status == "good":
+            self._near = Near(pose.x, pose.y, _NEAR_M)
+        elif self._last_odom is not None:
+            step = odom.relative_to(self._last_odom)
+            self._come(math.hypot(step.x, step.y))
+        self._last_odom = odom
+
+    def _come(self, distance: float) -> None:
+        if self._near is not None:
+            self._near = self._near._replace(radius=self._near.radius + distance)
 
     def _look_nearby(self, scan: DeskewedScan, now: float) -> None:
         """Look for a lost robot near its last pose, since most slipped or were pushed; then on the whole map."""
@@ -307,7 +337,8 @@ class Localizer:
 
     def _may_verify(self, now: float) -> bool:
         """Whether the last search of the whole map for places that look like that of the pose is long enough ago."""
-        return not self._relocalization.active and self._relocalization.may_begin(now) and now >= self._verify_again_at
+        ready = not self._relocalization.active and not self._monitor.shaken and now >= self._verify_again_at
+        return ready and self._relocalization.may_begin(now)
 
     def _may_search(self, scan: DeskewedScan, now: float) -> bool:
         """Whether the pose is lost, and the last search is long enough ago or was made elsewhere."""
@@ -321,6 +352,8 @@ class Localizer:
         fits_again = self._doubt.to_verify and self._monitor.status == "weak"
         if outcome.pose is None:
             # The particles of a lost robot may slide to one of several places alike: that decides for none of them.
+            if self._relocalization.active and fits_again and self._may_be_turned(outcome.odom):
+                self._relocalization.verifies = False
             undecided = self._relocalization.active and not self._relocalization.verifies
             if undecided or not fits_again:
                 self._monitor.lose(outcome.detail)
@@ -336,6 +369,11 @@ class Localizer:
                 self._relocalization.cancel()
                 self._verify_again_at = now + _VERIFY_EVERY_S
                 return
+        weighed = pose is not None and any(not apart(pose, other) for other in outcome.beaten)
+        if fits_again and self._confirmed and self._near is not None and not weighed:
+            # A door stood open, or people hid the walls, when the search left out the place that the scan confirms now.
+            self._relocalization.begin(scan, fields, self._near, verifies=True)
+            return
         self._doubt.verify()
         if fits_again:
             self._monitor.lose("the robot was found elsewhere on the map: it was carried, or its pose was wrong")
@@ -345,7 +383,20 @@ class Localizer:
         self._doubt.restart()
         self._local_scans = 1
         self._tracked = False
+        self._near = None
         self._scale.forget_anchor()
         self._filter.start(outcome.pose, outcome.odom, *_FOUND_SIGMAS)
         self._filter.add(scan, fields)
         self._evaluate(scan, fields, now)
+
+    def _may_be_turned(self, odom: Pose2) -> bool:
+        """Whether a lost robot that fits again near its last pose fits there in another direction as well.
+
+        Whoever turned it by hand did no more than one who pushed it. Far places that look alike are less likely: with
+        those the robot drives on, slowly.
+        """
+        pose = None if self._tracked and self._tells_place else self._filter.pose(odom)
+        return pose is not None and any(
+            place.near and abs(wrap(place.pose.theta - pose.theta)) > _TURNED_RAD
+            for place in self._relocalization.places
+        )

@@ -14,7 +14,7 @@ from robot_agent.localization.rivals import Rivals
 if TYPE_CHECKING:
     from robot_agent.config import LocalizationConfig
     from robot_agent.localization.deskew import DeskewedScan
-    from robot_agent.localization.hypotheses import Hypotheses, Hypothesis
+    from robot_agent.localization.hypotheses import Hypotheses, Hypothesis, Near
     from robot_agent.localization.map_fields import MapFields
 
 _POINTS_MIN: Final = 10
@@ -30,11 +30,15 @@ _CHECKING: Final = "one place is left: the whole map is searched for others that
 
 
 class Outcome(NamedTuple):
-    """The pose in `map` that was found, when the odometry said `odom`; or None, and why."""
+    """The pose in `map` that was found, when the odometry said `odom`; or None, and why.
+
+    beaten: near places that the scans confirm, and that explain them much worse all the same.
+    """
 
     pose: Pose2 | None
     odom: Pose2
     detail: str = ""
+    beaten: tuple[Pose2, ...] = ()
 
 
 class Relocalization:
@@ -83,15 +87,18 @@ class Relocalization:
         """End the search and forget all places."""
         self._search = self._hypotheses = self._rivals = None
 
-    def begin(self, scan: DeskewedScan, fields: MapFields, *, verifies: bool = False) -> bool:
-        """Begin a search with a scan; False if the map has no free place, or the scan too few points."""
+    def begin(self, scan: DeskewedScan, fields: MapFields, near: Near | None = None, *, verifies: bool = False) -> bool:
+        """Begin a search with a scan; False if the map has no free place, or the scan too few points.
+
+        near: where the robot may have come to by itself, since its pose was good last.
+        """
         if not len(fields.free_places) or len(scan.points) < _POINTS_MIN:
             return False
         self.cancel()
         self.verifies = verifies
         self._scans.clear()
         self._scans.append(scan)
-        self._search_with(scan, fields)
+        self._search_with(scan, fields, near)
         return True
 
     def advance(self, fields: MapFields) -> None:
@@ -107,8 +114,11 @@ class Relocalization:
                 self._rivals = None
                 self._join(self._hypotheses, rivals)
 
-    def on_scan(self, scan: DeskewedScan, fields: MapFields) -> None:
-        """Do one share of the search, and weigh the places by the scan."""
+    def on_scan(self, scan: DeskewedScan, fields: MapFields, near: Near | None = None, *, shaken: bool = False) -> None:
+        """Do one share of the search, and weigh the places by the scan; `near` as for a search that begins.
+
+        shaken: whether the robot was moved otherwise than its wheels say.
+        """
         hypotheses = self._hypotheses
         if self.searching:
             self.advance(fields)
@@ -120,13 +130,19 @@ class Relocalization:
             return
         if not hypotheses.add(scan, fields, self._config.range_max):
             return
+        if not hypotheses.places or (shaken and hypotheses.best.misfits):
+            # The places were followed by wheels that the robot did not follow.
+            self.begin(scan, fields, near, verifies=self.verifies)
+            return
         self._scans.append(scan)
         self._confirmed = False
-        if not self.searching and hypotheses.places and (hypotheses.decided is not None or not hypotheses.complete):
+        if self.searching or hypotheses.best.misfits:
+            return
+        if hypotheses.decided is not None or not hypotheses.complete:
             self._search_with(scan, fields)
 
-    def _search_with(self, scan: DeskewedScan, fields: MapFields) -> None:
-        self._search = GlobalSearch(fields, scan.beams(self._config.beams), scan.odom, self._config.range_max)
+    def _search_with(self, scan: DeskewedScan, fields: MapFields, near: Near | None = None) -> None:
+        self._search = GlobalSearch(fields, scan.beams(self._config.beams), scan.odom, self._config.range_max, near)
 
     def _on_found(self, found: Hypotheses) -> None:
         known = self._hypotheses
@@ -158,7 +174,8 @@ class Relocalization:
         if not self._confirmed:
             return Outcome(None, hypotheses.odom, _CHECKING if self.searching else _undecided(1))
         self.cancel()
-        return Outcome(found, hypotheses.odom)
+        beaten = tuple(place.pose for place in hypotheses.places if place.near)
+        return Outcome(found, hypotheses.odom, beaten=beaten)
 
 
 def _undecided(contenders: int) -> str:

@@ -31,9 +31,9 @@ WRONG = Fit(agree=0.2, explained=0.2, contradict=0.6, informative=80)
 SURE = Uncertainty(0.05, 0.03, 0.02)
 
 
-def points_at(pose: Pose2, *, shorten: float = 0.0):
+def points_at(pose: Pose2, *, shorten: float = 0.0, fields=FIELDS):
     angles = np.linspace(-math.pi, math.pi, 120, endpoint=False)
-    ranges = FIELDS.ranges(pose.x, pose.y, angles + pose.theta, 12.0) - shorten
+    ranges = fields.ranges(pose.x, pose.y, angles + pose.theta, 12.0) - shorten
     hit = np.isfinite(ranges)
     return np.column_stack((ranges[hit] * np.cos(angles[hit]), ranges[hit] * np.sin(angles[hit])))
 
@@ -127,6 +127,15 @@ def test_walls_that_lie_beside_those_of_the_map_blur_the_scan():
     moved = Pose2(PLACE.x + 0.17, PLACE.y + 0.17, PLACE.theta)
     assert evaluate_fit(FIELDS, PLACE, points_at(PLACE), 12.0).blurred < 0.05
     assert evaluate_fit(FIELDS, moved, points_at(PLACE), 12.0).blurred > 0.5
+
+
+def test_pose_that_is_a_little_off_blurs_no_scan_of_a_wide_hall():
+    hall = map_fields(*grid_of([(0.5, 0.5, 16.5, 12.5), (3.0, 0.4, 3.6, 0.5)], 17.0, 13.0), LocalizationConfig())
+    place = Pose2(8.0, 6.5, 0.3)
+    off = Pose2(place.x + 0.05, place.y + 0.05, place.theta + math.radians(1.6))
+    fit = evaluate_fit(hall, off, points_at(place, fields=hall), 12.0)
+    assert fit.agree > 0.9
+    assert fit.blurred < 0.15
 
 
 def test_single_bad_scan_does_not_lose_the_pose_and_five_of_nine_do():

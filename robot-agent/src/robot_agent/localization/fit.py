@@ -23,9 +23,10 @@ _RANGE_TOLERANCE_M: Final = 0.40
 """Range difference from which a beam counts as short or long."""
 _ON_WALL_M: Final = 0.12
 _ON_WALL_CELLS: Final = 1.5
-_ON_WALL_SHARE: Final = 0.02
+_ON_WALL_SHARE: Final = 0.03
 """An agreeing beam of a right pose ends this near to the wall: farther ones are blurred. A map draws its walls no finer
-than its cells, and ranges of a small lidar are wrong by up to 2 % (RPLidar A1, data sheet: 1 to 2.5 %)."""
+than its cells; ranges of a small lidar are wrong by up to 2 % (RPLidar A1, data sheet: 1 to 2.5 %), and a heading that
+is off by 1.3 degrees, as a right one may be, moves the ends of the beams by as much."""
 _CONTRADICTION_LIMIT: Final = 0.2
 """Share of contradicting beams above which a pose is wrong, or the map."""
 _CONTRADICTION_CLEAR: Final = 0.04

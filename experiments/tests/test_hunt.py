@@ -12,6 +12,7 @@ import pytest
 
 from fog_contracts import channels as ch
 from fog_contracts.bus import Bus
+from fog_contracts.costs import LETHAL
 from fog_contracts.handlers import Publication
 from fog_contracts.messages import (
     AreaHazard,
@@ -76,9 +77,10 @@ class Drive:
                 [Publication(ch.ROBOT_POSE, pose, R1), Publication(ch.ROBOT_STATE, state, R1)], self.now
             )
 
-    def hazard(self, state, seq=1):
+    def hazard(self, state, seq=1, penalty=None):
+        cost = penalty or (LETHAL if state == "blocked" else 0)
         hazard = AreaHazard(
-            area="a", state=state, severity=0, penalty=0, since=STAMP, seq=seq, epoch=1, cause="test")  # fmt: skip
+            area="a", state=state, severity=0, penalty=cost, since=STAMP, seq=seq, epoch=1, cause="test")  # fmt: skip
         self.publish(ch.HAZARD, HazardArea(hazard=hazard, polygon=SQUARE), area="a")
 
     def zone(self, **effect):
@@ -106,6 +108,12 @@ def stopped_before_the_zone(d):
 def blocked_area(d):
     d.hazard("blocked")
     d.drive(11)
+
+
+def area_that_was_blocked_and_is_unknown(d):
+    d.hazard("blocked")
+    d.hazard("unknown", 2, penalty=LETHAL)
+    d.drive(17, speed=0.14)
 
 
 def limited(d):
@@ -252,7 +260,8 @@ def obstacle_while_the_aggregator_is_away(d):
 @pytest.mark.parametrize(
     ("happens", "rules"),
     [
-        (blocked_zone, ["blocked"]), (blocked_area, ["blocked"]), (zone_just_drawn, []), (stopped_before_the_zone, []),
+        (blocked_zone, ["blocked"]), (blocked_area, ["blocked"]),
+        (area_that_was_blocked_and_is_unknown, ["blocked"]), (zone_just_drawn, []), (stopped_before_the_zone, []),
         (limited, ["speed"]), (unknown_area, ["speed"]), (degraded, ["speed"]), (slowed_down, []),
         (lost_fog, ["stop"]), (short_gap, []), (hung_agent, ["stop"]),
         (wrong_pose, ["pose"]), (honest_pose, []), (lost_robot, ["pose"]),

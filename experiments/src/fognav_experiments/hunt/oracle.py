@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING, Final, Literal, NamedTuple
 import msgspec
 
 from fog_contracts import channels as ch
+from fog_contracts.costs import LETHAL
 from fog_contracts.geometry import contains_point, distance_to_polygon, distance_to_segment
 from fog_contracts.messages import PolygonShape, RobotPose, RobotState
 
@@ -156,6 +157,8 @@ class Oracle:
         self._version = (0, 0)
         self._poses: list[tuple[float, RobotPose]] = []
         self._areas: dict[str, tuple[AreaState, _Known]] = {}
+        self._impassable: dict[str, _Known] = {}
+        """Areas that are blocked, or unknown and as costly: nobody has seen them free since."""
         self._zones: dict[str, _Known] = {}
         self._limits: dict[str, _Known] = {}
         self._lost: dict[Word, float] = {}
@@ -235,9 +238,13 @@ class Oracle:
     def _on_hazard(self, ids: Ids, message: HazardArea, at: Moment) -> tuple[()]:
         area, hazard, polygon = ids["area"], message.hazard, message.polygon
         before = self._areas.get(area)
+        known = _Known(_to(polygon), at.now, f"area {area}", _UNKNOWN_SPEED)
         if before is None or before[0] != hazard.state or hazard.state == "clear":
-            known = _Known(_to(polygon), at.now, f"area {area}", _UNKNOWN_SPEED)
             self._areas[area] = (hazard.state, known)
+        if hazard.penalty < LETHAL:
+            self._impassable.pop(area, None)
+        else:
+            self._impassable.setdefault(area, known)
         standing = self._obstacles.get(area)
         late = standing is not None and at.now > max(standing, self._back(_HAZARDS)) + _HAZARD_S + self._world.late_s
         if late and hazard.state == "clear" and message.confirmed:
@@ -364,8 +371,7 @@ class Oracle:
 
     def _check_blocked(self) -> None:
         x, y = self._place
-        blocked = [known for state, known in self._areas.values() if state == "blocked"] + list(self._zones.values())
-        for known in blocked:
+        for known in [*self._impassable.values(), *self._zones.values()]:
             depth = self._world.radius - known.distance(x, y)
             knows = self._knows and self._now - known.since > self._reaction_s
             moves = self._speed > _STANDING and self._mode not in {"EGRESS", "FAULT", "INIT"}

@@ -22,19 +22,33 @@ from fog_contracts.messages import (
     RobotPath,
     RobotPose,
     RobotState,
+    SimObstacle,
     SimTruth,
     Zone,
     ZoneSet,
 )
-from fognav_experiments.hunt import oracle, runner
+from fognav_experiments.hunt import oracle, play, runner
 from fognav_experiments.hunt.draw import draw_world
 from fognav_experiments.hunt.oracle import Figures, Violation
 from fognav_experiments.hunt.play import Hunted, hunt, read_world, write_world
 from fognav_experiments.hunt.runner import Task, drive
 from fognav_experiments.hunt.shrink import shrink
-from fognav_experiments.hunt.world import HuntWorld, Patch, Sensors, Watched, build, displacement, to_map
+from fognav_experiments.hunt.world import HuntWorld, Mounting, Patch, Sensors, Watched, build, displacement, to_map
+from fognav_experiments.lockstep import LockstepDrive
 from fognav_experiments.rigs import STAMP, moment
-from fognav_experiments.scenarios.description import HungAgent, NoGoZone, Person, Push
+from fognav_experiments.scenarios.description import (
+    BadLine,
+    ClockChange,
+    DeadAgent,
+    DeceivedNode,
+    FrozenLidar,
+    Hole,
+    HungAgent,
+    NoGoZone,
+    Obstacle,
+    Person,
+    Push,
+)
 
 FIXED = (6, 10, 12, 13, 14, 18, 24)
 """Numbers of the worlds that are always driven: all floors, bases and lidars, and most kinds of events."""
@@ -53,6 +67,7 @@ class Drive:
         self.now = self.x = 0.0
         self.mode, self.version = "NORMAL", (1, 1)
         self.claimed_m, self.wrong_m, self.contacts = 0.05, 0.0, 0
+        self.obstacles, self.reasons = [], []
 
     def publish(self, channel, message, **ids):
         self.bus.publish([Publication(channel, message, ids)])
@@ -64,15 +79,15 @@ class Drive:
             self.x += 0.1 * speed
             stamp = STAMP + self.now
             self.publish(ch.SIM_TRUTH, SimTruth(
-                robot="r1", x=self.x, y=0.0, theta=0.0, left=speed, right=speed, distance=self.x, clearance=0.5,
-                min_clearance=0.5, contacts=self.contacts, stamp=stamp), **R1)  # fmt: skip
+                robot="r1", x=self.x, y=0.0, theta=0.0, left=speed, right=speed, distance=abs(self.x), clearance=0.5,
+                min_clearance=0.5, contacts=self.contacts, obstacles=self.obstacles, stamp=stamp), **R1)  # fmt: skip
             variance = self.claimed_m**2
             pose = RobotPose(
                 x=self.x + self.wrong_m, y=0.0, theta=0.0, covariance=[variance, 0, 0, 0, variance, 0, 0, 0, 0.01],
                 v=speed, w=0.0, radius=0.17, height=0.3, stamp=stamp)  # fmt: skip
             state = RobotState(
-                mode=self.mode, reasons=[], enabled=True, battery=None, goal_id=None, map_epoch=self.version[0],
-                map_seq=self.version[1], plan_id=None, stamp=stamp)  # fmt: skip
+                mode=self.mode, reasons=self.reasons, enabled=True, battery=None, goal_id=None,
+                map_epoch=self.version[0], map_seq=self.version[1], plan_id=None, stamp=stamp)  # fmt: skip
             self.oracle.on_robot(
                 [Publication(ch.ROBOT_POSE, pose, R1), Publication(ch.ROBOT_STATE, state, R1)], self.now
             )
@@ -195,6 +210,57 @@ def contact(d):
     d.drive(1)
 
 
+def driven_on_after_a_low_step(d):
+    d.drive(1)
+    d.obstacles = [SimObstacle(id="step", polygon=[(0.3, -1.0), (0.5, -1.0), (0.5, 1.0), (0.3, 1.0)], height=0.1)]
+    contact(d)
+
+
+def stopped_at_a_low_step(d):
+    d.drive(1)
+    d.obstacles = [SimObstacle(id="step", polygon=[(0.3, -1.0), (0.5, -1.0), (0.5, 1.0), (0.3, 1.0)], height=0.1)]
+    d.contacts = 1
+    d.drive(0.3)
+    d.drive(2, speed=0.0)
+
+
+def over_the_stairs(d):
+    d.oracle.on_lost("floor", d.now)
+    d.drive(1)
+
+
+def fallen(d):
+    d.drive(1)
+    d.oracle.on_fallen(d.now)
+
+
+def backing_off_from_the_stairs(d):
+    d.mode = "FAULT"
+    d.drive(1, speed=0.0)
+    d.oracle.on_lost("floor", d.now)
+    d.drive(1, speed=-0.1)
+
+
+def repeated_turns(d):
+    d.oracle.on_lost("new turns", d.now)
+    d.drive(2)
+
+
+def silent_base(d):
+    d.oracle.on_lost("base", d.now)
+    d.drive(1)
+
+
+def map_called_old(d):
+    d.mode, d.reasons = "HOLD", ["the map is 4.0 s old"]
+    d.drive(32, speed=0.0)
+
+
+def map_called_old_in_a_gap(d):
+    d.oracle.on_lost("fog", d.now)
+    map_called_old(d)
+
+
 def unwritten(d):
     d.zone(kind="PENALTY", factor=2.0)
     d.drive(7)
@@ -265,7 +331,10 @@ def obstacle_while_the_aggregator_is_away(d):
         (limited, ["speed"]), (unknown_area, ["speed"]), (degraded, ["speed"]), (slowed_down, []),
         (lost_fog, ["stop"]), (short_gap, []), (hung_agent, ["stop"]),
         (wrong_pose, ["pose"]), (honest_pose, []), (lost_robot, ["pose"]),
-        (older_map, ["version"]), (newer_epoch, []), (contact, ["contact"]),
+        (older_map, ["version"]), (newer_epoch, []), (contact, ["contact", "stop"]),
+        (driven_on_after_a_low_step, ["stop"]), (stopped_at_a_low_step, []), (over_the_stairs, ["stop"]),
+        (fallen, ["contact"]), (backing_off_from_the_stairs, []), (repeated_turns, ["stop"]), (silent_base, ["stop"]),
+        (map_called_old, ["late"]), (map_called_old_in_a_gap, []),
         (unwritten, ["write"]), (unwritten_but_slow, []),
         (unconfirmed, ["hazard"]), (cleared, ["cleared"]), (cleared_after_it_is_gone, []),
         (barrier_ahead, []), (barrier_behind, ["barrier"]), (map_service_dies, ["stop"]),
@@ -304,6 +373,52 @@ def test_world_of_a_file_is_driven_again_to_the_bit(tmp_path):
     assert first.violations == []
     assert first.outcome == "reached", first.reason
     assert hunt(read_world(file)) == first
+
+
+BOX = [(3.6, 0.6), (3.9, 0.6), (3.9, 2.4), (3.6, 2.4)]
+PLAIN = msgspec.structs.replace(WORLD, warp_m=0.0, placed=[], sensors=Sensors(), events=[])
+
+
+@pytest.mark.parametrize(
+    ("event", "outcome", "mode"),
+    [
+        (Hole(at_s=1.0, polygon=BOX), "stopped", "FAULT (base: a cliff sensor sees no floor"),
+        (Obstacle(at_s=1.0, polygon=BOX, height=0.1), "contact", ""),
+        (Obstacle(at_s=1.0, polygon=BOX, height=0.1, soft=True), "contact", ""),
+        (DeadAgent(at_s=5.0, seconds=3.0), "reached", "INIT"),
+        (FrozenLidar(at_s=5.0, seconds=6.0), "reached", "PROTECTIVE_STOP (the lidar repeats itself"),
+        (BadLine(at_s=5.0, device="base", seconds=2.0, stalled=True), "reached", "FAULT (base: the base has sent no"),
+        (
+            BadLine(at_s=5.0, device="lidar", seconds=1.0, lost=1.0),
+            "reached",
+            "PROTECTIVE_STOP (the lidar has been silent",
+        ),
+        (BadLine(at_s=2.0, device="base", seconds=40.0, lost=0.1), "stopped", "FAULT (base: the base has sent no"),
+        (DeceivedNode(at_s=1.0, node="n-a1", lost=1.0), "reached", "DEGRADED (the state of the area a1 is unknown"),
+        (DeceivedNode(at_s=1.0, node="n-a1", scale=0.0, offset=0.3), "refused", "HOLD (the planner finds no path"),
+        (ClockChange(at_s=1.0, computer="robot", jump_s=-3600.0, rate=0.083, crystal=1e-4), "reached", ""),
+        (ClockChange(at_s=1.0, computer="fog", jump_s=3600.0, rate=-0.083, crystal=1e-4), "reached", ""),
+    ],
+    ids=lambda value: type(value).__name__ if isinstance(value, msgspec.Struct) else "",
+)
+def test_robot_meets_what_is_drawn_and_no_rule_is_broken(monkeypatch, event, outcome, mode):
+    runs = []
+    monkeypatch.setattr(
+        play, "LockstepDrive", lambda *given, **more: runs.append(LockstepDrive(*given, **more)) or runs[0]
+    )
+    found = hunt(msgspec.structs.replace(PLAIN, events=[event]))
+    assert (found.outcome, found.violations) == (outcome, [])
+    told = [entry.description for entry in runs[0].events]
+    assert (
+        any(entry.startswith(f"robot: {mode}") for entry in told[told.index(f"event 0: {type(event).__name__}") :])
+        or not mode
+    )
+
+
+def test_lidar_that_is_mounted_otherwise_and_a_roomba_with_quirks_lead_to_the_goal():
+    mounting = Mounting(x=0.1, y=-0.05, yaw=2.0, mirrored=True, masks=[(2.0, 2.5), (-2.0, -1.8)])
+    found = hunt(msgspec.structs.replace(PLAIN, mounting=mounting, quirks={"mode_offset": 1, "damaged": 9}))
+    assert (found.outcome, found.violations) == ("reached", [])
 
 
 def test_file_that_is_no_world_is_named(tmp_path):

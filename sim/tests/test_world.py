@@ -1,5 +1,6 @@
 """The simulated floor against geometry computed by hand."""
 
+import dataclasses
 import math
 
 import numpy as np
@@ -43,6 +44,14 @@ def run(world, seconds, left, right):
         rolled[0] += a
         rolled[1] += b
     return rolled
+
+
+def test_robot_slides_on_where_its_wheels_do_not_hold():
+    world = hall(2.0, 2.0, noise=dataclasses.replace(IDEAL, grip=1.0))
+    rolled = run(world, 2.0, 0.3, 0.3)
+    assert world.pose[0] == pytest.approx(2.0 + rolled[0] - 0.045, abs=0.005)
+    assert run(world, 1.0, 0.0, 0.0) == [0.0, 0.0]
+    assert world.pose[0] == pytest.approx(2.0 + rolled[0], abs=0.005)
 
 
 @settings(deadline=None)

@@ -26,6 +26,7 @@ from fog_contracts.messages import RobotGoal
 from fog_contracts.site import Site
 from fog_contracts.stages import SPANS, durations_ms
 from fog_runtime.configuration.default_parts import DEFAULT_BASE, DEFAULT_LIDAR
+from fog_runtime.configuration.robot_file import default_robot
 from fog_runtime.configuration.site import load_site
 from fognav_experiments.processes import Measure, unmeasured
 from fognav_experiments.rigs import STAMP, System
@@ -55,6 +56,7 @@ if TYPE_CHECKING:
         Trace,
     )
     from fog_contracts.site import Place
+    from fog_runtime.configuration.robot_file import RobotFile
     from fog_runtime.configuration.site import LoadedSite
     from fognav_experiments.cpu import CpuMeter
     from fognav_experiments.rigs import Tuning
@@ -116,8 +118,7 @@ class LockstepDrive:
         watched: bool | Site,
         hazard: HazardSchedule | None,
         bus: Bus | None,
-        base: str = DEFAULT_BASE,
-        lidar: str = DEFAULT_LIDAR,
+        mounted: RobotFile | None = None,
         measure: Measure = unmeasured,
         tuning: Tuning | None = None,
         ground: Floor | None = None,
@@ -129,7 +130,7 @@ class LockstepDrive:
         with_nodes = watched if isinstance(watched, Site) else site.site if watched else bare
         floor = dataclasses.replace(site, site=with_nodes)
         self.system = System(
-            floor, robot, seed, noise=noise, base=base, lidar=lidar, bus=bus, measure=measure, tuning=tuning,
+            floor, robot, seed, noise=noise, mounted=mounted, bus=bus, measure=measure, tuning=tuning,
             floor=ground,
         )  # fmt: skip
         self.world = self.system.world
@@ -364,8 +365,8 @@ def run_lockstep(  # noqa: PLR0913  # the options of a run
     schedule = HazardSchedule.of(site, seed, hazard) if hazard is not None else None
     run = LockstepDrive(
         site, start, mission, seed, noise,
-        watched=watched, hazard=schedule, bus=bus, base=base, lidar=lidar, measure=cpu.measure if cpu else unmeasured,
-        tuning=tuning,
+        watched=watched, hazard=schedule, bus=bus, mounted=default_robot(base, lidar),
+        measure=cpu.measure if cpu else unmeasured, tuning=tuning,
     )  # fmt: skip
     problem = run.warm_up()
     if problem is None and profile != "fog":

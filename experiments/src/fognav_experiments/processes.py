@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Final
 
 from fog_contracts import channels as ch
 from fog_contracts.codec import encode
+from fog_contracts.handlers import Moment
 from fog_contracts.messages import MapSnapshot, Message, PlanReply, RobotGoal, RobotState
 from fognav_experiments.link import Link
 from planner.keepers.dock_goals import DockGoals
@@ -21,7 +22,7 @@ if TYPE_CHECKING:
     from collections.abc import Iterable, Mapping, Sequence
 
     from fog_contracts.bus import Bus
-    from fog_contracts.handlers import Handler, Ids, Moment, Publication, QueryHandler
+    from fog_contracts.handlers import Handler, Ids, Publication, QueryHandler
     from fog_contracts.messages import EgressRequest, Pose, ProfileName, Zone
     from hazard_aggregator.core import Aggregator
     from map_service.core import MapCore
@@ -42,6 +43,54 @@ USED: Final[Mapping[ProfileName, frozenset[ch.Channel]]] = {
 """What a robot receives from the fog that its profile uses."""
 
 
+class _Drift:
+    """By how much a clock is ahead."""
+
+    def __init__(self) -> None:
+        self._rate = self._gained = self._since = 0.0
+
+    def ahead(self, now: float) -> float:
+        return self._gained + self._rate * (now - self._since)
+
+    def change(self, now: float, jump_s: float, rate: float) -> None:
+        self._gained, self._since, self._rate = self.ahead(now) + jump_s, now, rate
+
+
+class ComputerClock:
+    """A computer's two clocks: call it with the true time, to get what they show.
+
+    The wall clock may jump and be slewed. What counts intervals runs as its crystal does, a little too fast or slow.
+    """
+
+    def __init__(self) -> None:
+        self._crystal = _Drift()
+        self._wall = _Drift()
+
+    def __call__(self, at: Moment) -> Moment:
+        """Return what its clocks show."""
+        counted, shown = self._crystal.ahead(at.now), self._wall.ahead(at.now)
+        if counted == shown == 0.0:
+            return at
+        return Moment(at.now + counted, at.stamp + shown, at.synchronized, at.clock)
+
+    def ahead(self, now: float) -> float:
+        """Return by how much (s) the wall clock is ahead at the true time `now`."""
+        return self._wall.ahead(now)
+
+    def change(self, now: float, *, jump_s: float = 0.0, rate: float = 0.0, crystal: float = 0.0) -> None:
+        """Set the wall clock forward; from now on it gains `rate` seconds a second, the other clock `crystal`."""
+        self._wall.change(now, jump_s, rate)
+        self._crystal.change(now, 0.0, crystal)
+
+    def heard(self, handler: Handler) -> Handler:
+        """Return a handler that is given what the clocks show, for one of messages."""
+        return lambda ids, message, at: handler(ids, message, self(at))
+
+    def asked(self, handler: QueryHandler) -> QueryHandler:
+        """Return a handler that is given what the clocks show, for one of queries."""
+        return lambda ids, request, at: handler(ids, request, self(at))
+
+
 QUERY_TIMEOUT_S: Final = 3.0
 """How long a robot waits for the reply to a query."""
 
@@ -52,10 +101,14 @@ def unmeasured(_component: str) -> AbstractContextManager[object]:
 
 
 class FogProcess:
-    """A process of the fog, which may die; another one takes its place on the bus then."""
+    """A process of the fog, which may die; another one takes its place on the bus then.
 
-    def __init__(self, bus: Bus) -> None:
+    All times that it is given are true: its core is given what its computer's clock shows.
+    """
+
+    def __init__(self, bus: Bus, clock: ComputerClock | None = None) -> None:
         self._bus = bus
+        self._clock = clock or ComputerClock()
         self._connected: list[Handler | QueryHandler] = []
         self.alive = True
 
@@ -65,19 +118,23 @@ class FogProcess:
         self._bus.disconnect(self._connected)
 
     def _subscribe(self, handlers: Mapping[ch.Channel, Handler]) -> None:
-        self._bus.subscribe(handlers)
-        self._connected += handlers.values()
+        own = {channel: self._clock.heard(handler) for channel, handler in handlers.items()}
+        self._bus.subscribe(own)
+        self._connected += own.values()
 
     def _serve(self, query_handlers: Mapping[ch.Channel, QueryHandler]) -> None:
-        self._bus.serve(query_handlers)
-        self._connected += query_handlers.values()
+        own = {channel: self._clock.asked(handler) for channel, handler in query_handlers.items()}
+        self._bus.serve(own)
+        self._connected += own.values()
 
 
 class AggregatorProcess(FogProcess):
     """The hazard-aggregator, with a store without delay."""
 
-    def __init__(self, core: Aggregator, bus: Bus, measure: Measure = unmeasured) -> None:
-        super().__init__(bus)
+    def __init__(
+        self, core: Aggregator, bus: Bus, measure: Measure = unmeasured, clock: ComputerClock | None = None
+    ) -> None:
+        super().__init__(bus, clock)
         self.core = core
         self._measure = measure
         self._subscribe({channel: self._with_store(handler) for channel, handler in core.handlers().items()})
@@ -90,7 +147,7 @@ class AggregatorProcess(FogProcess):
     def tick(self, at: Moment) -> None:
         """Tick the core; call it ten times a second."""
         with self._measure("aggregator"):
-            self._bus.publish(self._store(self.core.tick(at)))
+            self._bus.publish(self._store(self.core.tick(self._clock(at))))
 
     def _with_store(self, handler: Handler) -> Handler:
         def handle(ids: Ids, message: Message | str, at: Moment) -> Sequence[Publication]:
@@ -107,8 +164,10 @@ class AggregatorProcess(FogProcess):
 class MapProcess(FogProcess):
     """The map-service; `load_zones` and `put_zone` replace its store and REST API."""
 
-    def __init__(self, core: MapCore, bus: Bus, measure: Measure = unmeasured) -> None:
-        super().__init__(bus)
+    def __init__(
+        self, core: MapCore, bus: Bus, measure: Measure = unmeasured, clock: ComputerClock | None = None
+    ) -> None:
+        super().__init__(bus, clock)
         self.core = core
         self._measure = measure
         self._serving = False
@@ -116,16 +175,16 @@ class MapProcess(FogProcess):
 
     def load_zones(self, zones: Iterable[Zone], at: Moment) -> None:
         """Load the stored zones; the map is not served before."""
-        self._bus.publish(self.core.load_zones(zones, at))
+        self._bus.publish(self.core.load_zones(zones, self._clock(at)))
 
     def put_zone(self, zone: Zone, at: Moment) -> None:
         """Add or replace an operator's zone."""
-        self._bus.publish(self.core.put_zone(zone, at))
+        self._bus.publish(self.core.put_zone(zone, self._clock(at)))
 
     def tick(self, at: Moment) -> None:
         """Tick the core, and serve queries once the map is complete; call it ten times a second."""
         with self._measure("map-service"):
-            self._bus.publish(self.core.tick(at))
+            self._bus.publish(self.core.tick(self._clock(at)))
         if self.core.serving and not self._serving:
             self._serving = True
             self._serve(self.core.query_handlers())
@@ -147,9 +206,10 @@ class PlannerProcess(FogProcess):
         bus: Bus,
         staging: Mapping[str, Pose] | None = None,
         measure: Measure = unmeasured,
+        clock: ComputerClock | None = None,
     ) -> None:
         """`staging`: by robot, the pose in front of its dock."""
-        super().__init__(bus)
+        super().__init__(bus, clock)
         self.core = core
         self._measure = measure
         self._docks = DockGoals(staging or {})
@@ -169,16 +229,17 @@ class PlannerProcess(FogProcess):
         Call it ten times a second, and when it is `due`.
         """
         self.due = False
+        shown = self._clock(at)
         with self._measure("planner"):
-            self._bus.publish(self.core.tick(at))
+            self._bus.publish(self.core.tick(shown))
             self.core.missions.pop_reached()
-            for job in self.core.jobs(at):
+            for job in self.core.jobs(shown):
                 job.run()
-                self.due = self.core.add(job, at.now) or self.due
-        if self.core.wants_snapshot(at.now):
+                self.due = self.core.add(job, shown.now) or self.due
+        if self.core.wants_snapshot(shown.now):
             snapshot = self._bus.query(ch.MAP_SNAPSHOT, None, MapSnapshot, at)
             if snapshot is not None:
-                self.core.load(snapshot, at.now)
+                self.core.load(snapshot, shown.now)
                 self.due = True
 
     def deliver(self, at: Moment) -> None:
@@ -205,10 +266,18 @@ class PlannerProcess(FogProcess):
 
 
 class AgentProcess:
-    """A robot's agent; its caller passes the data of base and lidar to the core."""
+    """A robot's agent; its caller passes the data of base and lidar to the core. Times as for the fog's processes."""
 
-    def __init__(self, core: AgentCore, robot: str, bus: Bus, measure: Measure = unmeasured) -> None:
+    def __init__(
+        self,
+        core: AgentCore,
+        robot: str,
+        bus: Bus,
+        measure: Measure = unmeasured,
+        clock: ComputerClock | None = None,
+    ) -> None:
         self.core = core
+        self._clock = clock or ComputerClock()
         self._bus = bus
         self._measure = measure
         self.link = Link()
@@ -221,8 +290,14 @@ class AgentProcess:
         self._way_out: tuple[EgressRequest, float] | None = None
         """The newest request for a way out without a reply, and when its query times out."""
         handlers = {channel: self._measured(channel, handler) for channel, handler in core.handlers().items()}
+        queries = {channel: self._clock.asked(handler) for channel, handler in core.query_handlers().items()}
         bus.subscribe(handlers, only={"robot": robot})
-        bus.serve(core.query_handlers(), only={"robot": robot})
+        bus.serve(queries, only={"robot": robot})
+        self._connected: list[Handler | QueryHandler] = [*handlers.values(), *queries.values()]
+
+    def stop(self) -> None:
+        """Die: nothing is received or answered any more."""
+        self._bus.disconnect(self._connected)
 
     def _measured(self, channel: ch.Channel, handler: Handler) -> Handler:
         component = "layers" if channel is ch.MAP_DELTA else "messages"
@@ -231,7 +306,7 @@ class AgentProcess:
             if channel in USED[self.core.profile.name]:
                 self.received_bytes += len(encode(channel, message))
             with self._measure(component):
-                return handler(ids, message, at)
+                return handler(ids, message, self._clock(at))
 
         def handle(ids: Ids, message: Message, at: Moment) -> Sequence[Publication]:
             return self.link.down(lambda when: receive(ids, message, when), at)
@@ -244,7 +319,7 @@ class AgentProcess:
 
     def fetch_map(self, at: Moment) -> None:
         """Ask for a snapshot if the core wants one and none is under way; call it 20 times a second."""
-        if self.link.whole and self.core.wants_snapshot(at.now) and at.now >= self._map_due:
+        if self.link.whole and self.core.wants_snapshot(self._clock(at).now) and at.now >= self._map_due:
             until = self._map_due = at.now + QUERY_TIMEOUT_S
             self.link.ask(
                 lambda when: self._bus.query(ch.MAP_SNAPSHOT, None, MapSnapshot, when),
@@ -260,10 +335,11 @@ class AgentProcess:
         if snapshot is not None:
             self.received_bytes += len(snapshot.cost) + len(snapshot.speed) + len(snapshot.static)
             with self._measure("layers"):
-                self.core.load(snapshot, at.now)
+                self.core.load(snapshot, self._clock(at).now)
 
     def control(self, at: Moment) -> None:
         """Run the robot's own global planner, if its profile has one, and its local planner, as often as this says."""
+        at = self._clock(at)
         with self._measure("layers"):
             search = self.core.search(at.now)
         if search is not None:
@@ -276,13 +352,14 @@ class AgentProcess:
 
     def stream(self, at: Moment) -> WheelCommand:
         """Return the wheel command for the guardian; call it 20 times a second."""
+        shown = self._clock(at)
         with self._measure("safety and wheels"):
-            return self.core.stream(at.now, at.stamp)
+            return self.core.stream(shown.now, shown.stamp)
 
     def tick(self, at: Moment) -> None:
         """Tick the core; call it ten times a second."""
         with self._measure("messages"):
-            publications = self.core.tick(at)
+            publications = self.core.tick(self._clock(at))
         self.observe(publications, at)
         self._bus.publish(self.link.up(publications, at))
         self._ask_for_way_out(at)
@@ -290,7 +367,7 @@ class AgentProcess:
     def _ask_for_way_out(self, at: Moment) -> None:
         if self._way_out is not None and at.now >= self._way_out[1]:
             self._on_way_out(self._way_out, None, at)
-        if (request := self.core.egress_request(at.now)) is not None:
+        if (request := self.core.egress_request(self._clock(at).now)) is not None:
             asked = self._way_out = (request, at.now + QUERY_TIMEOUT_S if self.link.whole else at.now)
             self.link.ask(
                 lambda when: self._bus.query(ch.PLANNER_EGRESS, request, PlanReply, when),
@@ -302,7 +379,7 @@ class AgentProcess:
         """Pass on the reply to the newest query; one that comes after its time is nobody's."""
         if asked is self._way_out:
             self._way_out = None
-            self.core.on_egress_reply(asked[0], reply, at.now)
+            self.core.on_egress_reply(asked[0], reply, self._clock(at).now)
 
 
 class Fog:
@@ -319,9 +396,10 @@ class Fog:
         measure: Measure = unmeasured,
     ) -> None:
         """`staging`: by robot, the pose in front of its dock. `measure`: of the services' work."""
-        self.aggregator = AggregatorProcess(aggregator, bus, measure)
-        self.map = MapProcess(map_, bus, measure)
-        self.planner = PlannerProcess(planner, bus, staging, measure)
+        self.clock = ComputerClock()
+        self.aggregator = AggregatorProcess(aggregator, bus, measure, self.clock)
+        self.map = MapProcess(map_, bus, measure, self.clock)
+        self.planner = PlannerProcess(planner, bus, staging, measure, self.clock)
 
     def start(self, at: Moment) -> None:
         """Connect everything, with no zones stored."""

@@ -7,6 +7,7 @@ and guardian as bytes on their lines, and an operator. Lockstep leaves out socke
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import TYPE_CHECKING, Final, Literal
 
 import msgspec
@@ -17,11 +18,11 @@ from fog_contracts.commands import signed_command
 from fog_contracts.cones import node_cones
 from fog_contracts.handlers import Moment, Publication
 from fog_contracts.messages import CommandReply, NodeConfig
-from fog_runtime.configuration.default_parts import DEFAULT_BASE, DEFAULT_LIDAR
-from fog_runtime.configuration.robot_file import default_robot
+from fog_runtime.configuration.robot_file import RobotFile, default_robot
 from fognav_experiments.processes import (
     AgentProcess,
     AggregatorProcess,
+    ComputerClock,
     Fog,
     FogProcess,
     MapProcess,
@@ -34,6 +35,7 @@ from fognav_sim.floor import Floor
 from fognav_sim.hardware import STEP_S, Hardware
 from fognav_sim.node import default_config
 from fognav_sim.nodes import make_nodes
+from fognav_sim.sensors import LidarPlace
 from fognav_sim.world import World
 from hazard_aggregator.core import Aggregator
 from hazard_aggregator.fusion import AreaFusion
@@ -53,6 +55,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Mapping
 
     from fog_contracts.messages import CommandKind, Pose, Zone
+    from fog_contracts.robot import RobotSettings
     from fog_contracts.site import RobotSite
     from fog_runtime.configuration.site import LoadedSite
     from fognav_sim.emulators import BaseEmulator
@@ -126,34 +129,44 @@ class RobotRig:
         seed: int,
         start: float,
         *,
-        base: str = DEFAULT_BASE,
-        lidar: str = DEFAULT_LIDAR,
+        mounted: RobotFile | None = None,
         make_agent: Callable[[AgentConfig, int], AgentCore] = AgentCore,
         measure: Measure = unmeasured,
     ) -> None:
-        """Assemble the robot around its emulated base; `base` names its driver, `lidar` driver and emulator."""
+        """Assemble the robot around its emulated base, `mounted` as its settings say (default: the thesis's robot)."""
         self.id = robot.id
         self._bus = bus
         self._measure = measure
-        mounted = default_robot(base, lidar)
-        driver, self._lidar_driver = make_base(mounted), make_lidar(mounted)
-        lidar_emulator = devices.make_lidar(lidar, world.lidar)
+        self.clock = ComputerClock()
+        settings = (mounted or default_robot()).settings
+        self._mounted = mounted or default_robot()
+        driver, self._lidar_driver = make_base(self._mounted), make_lidar(self._mounted)
+        lidar_emulator = devices.make_lidar(
+            settings.lidar.driver, partial(world.lidar_at, LidarPlace.of(settings.lidar))
+        )
         self.hardware = Hardware(
             world, base_emulator, lidar_emulator, start, initial_wheel_travel_m=_INITIAL_WHEEL_TRAVEL_M
         )
         self.guardian = GuardianCore(driver)
-        config = agent_config(
-            robot.id,
-            OPERATOR_KEY,
-            driver.drive_train,
-            self._lidar_driver.traits,
-            robot,
-            boot=BOOT,
-            finds_dock=isinstance(driver, DockingDriver),
+        self._boot = BOOT
+        self._boots = 0
+        self._new_agent: Callable[[], AgentCore] = lambda: make_agent(
+            agent_config(
+                robot.id,
+                OPERATOR_KEY,
+                driver.drive_train,
+                self._lidar_driver.traits,
+                robot,
+                boot=self._boot,
+                finds_dock=isinstance(driver, DockingDriver),
+                settings=None if settings == plain_settings(settings) else settings,
+            ),
+            seed,
         )
-        self.agent = make_agent(config, seed)
-        self.agent.restore(start_pose(site.site.id, robot))
-        self.process = AgentProcess(self.agent, robot.id, bus, measure)
+        self.agent = self._new_agent()
+        self._stored = start_pose(site.site.id, robot)
+        self.agent.restore(self._stored)
+        self.process = AgentProcess(self.agent, robot.id, bus, measure, self.clock)
         self._to_base = b""
         self._to_lidar = self._lidar_driver.begin(start)
         self._from_lidar = b""
@@ -163,7 +176,44 @@ class RobotRig:
         self._nonce = 0
         self.hung = False
         """Whether the agent hangs: the guardian does not, and what base and lidar send waits."""
+        self.dead = False
+        """Whether there is no agent: base and lidar are not read."""
         self._waiting: list[link.BaseFeedback] = []
+
+    def kill(self) -> None:
+        """Let the agent die, if there is one."""
+        if self.dead:
+            return
+        self.dead = True
+        self.process.stop()
+        self._waiting, self._from_lidar = [], b""
+        self._to_base += self.guardian.on_agent_lost(self.shown.now).data
+
+    def start_again(self) -> None:
+        """Start another agent, with what the dead one has stored, if none lives."""
+        if not self.dead:
+            return
+        self.dead = False
+        self._boots += 1
+        self._boot = f"{BOOT}-{self._boots}"
+        before = self.process
+        self.agent = self._new_agent()
+        self.agent.restore(self._stored)
+        self.process = AgentProcess(self.agent, self.id, self._bus, self._measure, self.clock)
+        self.process.link, self.process.observe = before.link, before.observe
+        self.process.received_bytes = before.received_bytes
+        self._to_lidar += self._lidar_driver.begin(self.shown.now)
+        self._lidar_on = True
+
+    @property
+    def absent(self) -> bool:
+        """Whether the agent does nothing: it hangs, or there is none."""
+        return self.hung or self.dead
+
+    @property
+    def shown(self) -> Moment:
+        """What the clocks of the robot's computer show."""
+        return self.clock(moment(self.now))
 
     @property
     def now(self) -> float:
@@ -176,12 +226,13 @@ class RobotRig:
         self.hardware.receive(self._to_base, self._to_lidar)
         self._to_base = self._to_lidar = b""
         base, lidar = self.hardware.step(STEP_S)
-        self._run_guardian(base, self.now)
-        self._run_lidar(lidar, self.now)
+        shown = self.shown.now
+        self._run_guardian(base, shown)
+        self._run_lidar(lidar, shown)
 
     def act(self) -> None:
         """Run the agent's loops that are due: as those of its process, all of them in the first step."""
-        if self.hung:
+        if self.absent:
             return
         at, step = moment(self.now), self._steps - 1
         self.process.deliver(at)
@@ -194,7 +245,7 @@ class RobotRig:
             command = link.decode_command(link.encode(self.process.stream(at)))
             self._stream_steps = _IDLE_STREAM_STEPS if self.agent.idle else _STREAM_STEPS
             with self._measure("guardian"):
-                self._to_base += self.guardian.on_command(command, at.now).data
+                self._to_base += self.guardian.on_command(command, self.shown.now).data
 
     def _run_guardian(self, data: bytes, now: float) -> None:
         with self._measure("guardian"):
@@ -206,7 +257,9 @@ class RobotRig:
                 received += output.feedback
                 self._to_base += output.data
         self._waiting += received
-        if self._waiting and not self.hung:
+        if self.dead:
+            self._waiting = []
+        elif self._waiting and not self.hung:
             received, self._waiting = self._waiting, []
             with self._measure("localization"):
                 for feedback in received:
@@ -214,7 +267,7 @@ class RobotRig:
 
     def _run_lidar(self, data: bytes, now: float) -> None:
         self._from_lidar = (self._from_lidar + data)[-_PORT_BYTES:]
-        if self._steps % _LIDAR_STEPS or self.hung:
+        if self._steps % _LIDAR_STEPS or self.absent:
             return
         if self.agent.lidar_on is not self._lidar_on:
             self._lidar_on, driver = self.agent.lidar_on, self._lidar_driver
@@ -242,14 +295,24 @@ class RobotRig:
             robot=self.id,
             operator="lockstep",
             nonce=f"lockstep-{self._nonce:08d}",
-            boot=BOOT,
-            issued_at=self.now,
+            boot=self._boot,
+            issued_at=self.shown.now,
             key=OPERATOR_KEY,
             pose=pose,
         )
         reply = self._bus.query(ch.ROBOT_COMMAND, command, CommandReply, moment(self.now), robot=self.id)
-        assert reply is not None
+        if reply is None:
+            return CommandReply(accepted=False, reason="the agent does not answer")
         return reply
+
+    def store(self) -> None:
+        """Store the agent's pose as its process does; call it now and then."""
+        self._stored = self.agent.pose_to_store(self.shown.now) or self._stored
+
+
+def plain_settings(settings: RobotSettings) -> RobotSettings:
+    """Return the settings of a robot with the same drivers, and nothing else that is not as usual."""
+    return default_robot(settings.base.driver, settings.lidar.driver).settings
 
 
 def make_aggregator(site: LoadedSite, epoch: int) -> Aggregator:
@@ -318,17 +381,21 @@ class FogRig(Fog):
             case "aggregator":
                 hazards = self.aggregator.core.announced().values()
                 core = make_aggregator(self._site, self.aggregator.core.epoch + 1)
-                self.aggregator = AggregatorProcess(core, self._bus, self._measured_by)
-                self._bus.publish(core.restore([], hazards, at))
+                self.aggregator = AggregatorProcess(core, self._bus, self._measured_by, self.clock)
+                self._bus.publish(core.restore([], hazards, self.clock(at)))
             case "map-service":
                 epoch = self.map.core.costmap.version.epoch + 1
-                self.map = MapProcess(make_map(self._site, epoch), self._bus, self._measured_by)
+                self.map = MapProcess(make_map(self._site, epoch), self._bus, self._measured_by, self.clock)
                 self.map.load_zones(self._zones.values(), at)
                 self._bus.publish(self.aggregator.core.republish_all())  # what the broker has retained
             case "planner":
                 ended = self.planner.core
                 self.planner = PlannerProcess(
-                    PlannerCore(epoch=ended.epoch + 1), self._bus, self._site.site.staging, self._measured_by
+                    PlannerCore(epoch=ended.epoch + 1),
+                    self._bus,
+                    self._site.site.staging,
+                    self._measured_by,
+                    self.clock,
                 )
                 for robot, mission in ended.missions.active():
                     if mission.goal is not None:
@@ -354,27 +421,26 @@ class System:
         seed: int,
         *,
         noise: Noise | None = None,
-        base: str = DEFAULT_BASE,
-        lidar: str = DEFAULT_LIDAR,
+        mounted: RobotFile | None = None,
         bus: Bus | None = None,
         make_agent: Callable[[AgentConfig, int], AgentCore] = AgentCore,
         measure: Measure = unmeasured,
         tuning: Tuning | None = None,
         floor: Floor | None = None,
     ) -> None:
-        """Assemble the system; `base` and `lidar` name the robot's hardware.
+        """Assemble the system; `mounted` names the robot's hardware.
 
         `floor`: the one that it drives on, if it is not exactly as the site's map says.
         """
         tuned = tuning or Tuning()
         self.bus = bus or Bus(site.site.id)
-        emulator = devices.make_base(base)
+        emulator = devices.make_base((mounted or default_robot()).settings.base.driver)
         true_floor = floor or Floor(site.map.geometry, site.map.cells)
         self.world = World(true_floor, robot, seed, axle_m=emulator.axle_m, noise=noise)
         self.fog = FogRig(site, self.world, self.bus, seed, 0.0, measure=measure)
         self.robot = RobotRig(
             site, robot, self.world, emulator, self.bus, seed, 0.0,
-            base=base, lidar=lidar, make_agent=lambda config, number: make_agent(tuned.agent(config), number),
+            mounted=mounted, make_agent=lambda config, number: make_agent(tuned.agent(config), number),
             measure=measure,
         )  # fmt: skip
         tuned.tune(self.fog.nodes)
@@ -395,7 +461,8 @@ class System:
         self.robot.act()
         if self._steps % TICK_STEPS == 0:
             self.fog.tick(at)
-            if not self.robot.hung:
+            if not self.robot.absent:
                 self.robot.process.tick(at)
+                self.robot.store()
             self.fog.deliver(at)
         self._steps += 1

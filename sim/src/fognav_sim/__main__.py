@@ -49,9 +49,7 @@ async def main() -> None:
     clock = SystemClock(settings.speed)
     mounted = load_robot(os.environ).settings
     base = devices.make_base(mounted.base.driver)
-    place = LidarPlace(
-        x=mounted.lidar.x_m, y=mounted.lidar.y_m, yaw=mounted.lidar.yaw_rad, mirrored=mounted.lidar.mirrored
-    )
+    place = LidarPlace.of(mounted.lidar)
     floor = Floor(loaded.map.geometry, loaded.map.cells)
     world = World(floor, robot, settings.seed, axle_m=base.axle_m)
     lidar = devices.make_lidar(mounted.lidar.driver, partial(world.lidar_at, place))

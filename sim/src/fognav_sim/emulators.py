@@ -68,5 +68,13 @@ class DockingBase(Protocol):
         """
 
 
+@runtime_checkable
+class QuirkyBase(Protocol):
+    """What the emulator of a base adds if single ones of its kind are known to deviate from their specification."""
+
+    def set_quirks(self, **quirks: float) -> None:
+        """Let it deviate so from now on: by names and values of its own."""
+
+
 class LidarEmulator(SerialEmulator, Protocol):
     """A lidar. It measures the world whenever its outgoing bytes are read."""

@@ -48,6 +48,7 @@ class Floor:
         self._outlines: dict[str, list[Point]] = {}
         self._edges: dict[str, tuple[NDArray[np.float64], NDArray[np.float64]]] = {}
         self._circles: dict[str, tuple[float, float, float]] = {}
+        self._soft: set[str] = set()
         self.changes = 0
         """How often an obstacle was placed or removed."""
 
@@ -56,10 +57,14 @@ class Floor:
         """The obstacles on the floor; walls are in the map."""
         return list(self._obstacles.values())
 
-    def place(self, obstacle: SimObstacle, *, solid: bool = True) -> None:
+    def is_soft(self, obstacle_id: str) -> bool:
+        """Return whether an obstacle swallows sound."""
+        return obstacle_id in self._soft
+
+    def place(self, obstacle: SimObstacle, *, solid: bool = True, soft: bool = False) -> None:
         """Place an obstacle, replacing one with the same id; raises `GeometryError` for an invalid outline.
 
-        One that is not `solid` is seen by sensors only: `nearest` passes over it.
+        One that is not `solid` is seen by sensors only: `nearest` passes over it. One that is `soft` swallows sound.
         """
         outline = normalized_polygon(obstacle.polygon)
         points = np.array(outline)
@@ -72,6 +77,7 @@ class Floor:
             self._outlines.pop(obstacle.id, None)
         self._edges[obstacle.id] = edges, np.hypot(edges[:, 2] - edges[:, 0], edges[:, 3] - edges[:, 1])
         self._circles[obstacle.id] = _circle_around(points)
+        (self._soft.add if soft else self._soft.discard)(obstacle.id)
 
     def remove(self, obstacle_id: str) -> bool:
         """Remove an obstacle; return False if there is none with this id."""
@@ -79,6 +85,7 @@ class Floor:
         self._outlines.pop(obstacle_id, None)
         self._edges.pop(obstacle_id, None)
         self._circles.pop(obstacle_id, None)
+        self._soft.discard(obstacle_id)
         return self._obstacles.pop(obstacle_id, None) is not None
 
     def nearest(self, x: float, y: float) -> tuple[float, float]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import random
 from typing import TYPE_CHECKING, Final
 
 from fognav_sim.emulators import DockingBase
@@ -19,13 +20,31 @@ _BUFFER_BYTES: Final = 4096
 
 
 class Line:
-    """The rate of a serial line: bytes are queued and delivered at the line's rate; overflow drops the oldest."""
+    """The rate of a serial line: bytes are queued and delivered at the line's rate; overflow drops the oldest.
 
-    def __init__(self, baud: int) -> None:
+    `lost` and `flipped`: share of the bytes that do not arrive, or with a wrong bit, in both directions. While it is
+    `stalled`, what the device sends waits, as in an adapter that hangs.
+    """
+
+    def __init__(self, baud: int, seed: int = 1) -> None:
         self._rate = baud / _BITS_PER_BYTE
         self._queue = bytearray()
         self._credit = 0.0
         self.lost_bytes = 0
+        self.lost = self.flipped = 0.0
+        self.stalled = False
+        self._random = random.Random(seed)  # noqa: S311  # repeatable, not a secret
+
+    def disturb(self, data: bytes) -> bytes:
+        """Return what arrives of these bytes."""
+        if self.lost == self.flipped == 0.0:
+            return data
+        arrived = bytearray()
+        for byte in data:
+            drawn = self._random.random()
+            if drawn >= self.lost:
+                arrived.append(byte ^ (1 << self._random.randrange(8)) if drawn < self.lost + self.flipped else byte)
+        return bytes(arrived)
 
     def send(self, data: bytes, dt: float) -> bytes:
         """Queue bytes; return those that the line delivers in `dt` seconds."""
@@ -34,13 +53,15 @@ class Line:
         if surplus > 0:
             del self._queue[:surplus]
             self.lost_bytes += surplus
+        if self.stalled:
+            return b""
         self._credit += self._rate * dt
         count = min(int(self._credit), len(self._queue))
         # An idle line accumulates no credit: the next byte takes its full time.
         self._credit = self._credit - count if self._queue[count:] else 0.0
         sent = bytes(self._queue[:count])
         del self._queue[:count]
-        return sent
+        return self.disturb(sent)
 
 
 class Hardware:
@@ -61,19 +82,19 @@ class Hardware:
         self.base = base
         self.lidar = lidar
         base.add_wheel_travel(*initial_wheel_travel_m)
-        self._base_line, self._lidar_line = Line(base.baud), Line(lidar.baud)
+        self.base_line, self.lidar_line = Line(base.baud), Line(lidar.baud)
 
     @property
     def lost_bytes(self) -> int:
         """Bytes dropped because the lines were too slow for the devices."""
-        return self._base_line.lost_bytes + self._lidar_line.lost_bytes
+        return self.base_line.lost_bytes + self.lidar_line.lost_bytes
 
     def receive(self, to_base: bytes, to_lidar: bytes) -> None:
         """Pass on what the host has written to both lines."""
         if to_base:
-            self.base.receive(to_base, self.now)
+            self.base.receive(self.base_line.disturb(to_base), self.now)
         if to_lidar:
-            self.lidar.receive(to_lidar, self.now)
+            self.lidar.receive(self.lidar_line.disturb(to_lidar), self.now)
 
     def step(self, dt: float = STEP_S) -> tuple[bytes, bytes]:
         """Simulate `dt` seconds; return the bytes that base and lidar sent meanwhile."""
@@ -82,13 +103,13 @@ class Hardware:
         base.add_wheel_travel(*world.step(dt))
         self.now += dt
         bump_left, bump_right = world.bumpers
-        base.set_sensors(bump_left=bump_left, bump_right=bump_right, cliff=False)
+        base.set_sensors(bump_left=bump_left, bump_right=bump_right, cliff=world.over_cliff)
         if world.robot.dock is not None and isinstance(base, DockingBase):
             base.set_dock(*seen_from_dock(world.pose, world.robot.dock))
         base.tick(self.now, dt)
         return (
-            self._base_line.send(base.outgoing(self.now), dt),
-            self._lidar_line.send(self.lidar.outgoing(self.now), dt),
+            self.base_line.send(base.outgoing(self.now), dt),
+            self.lidar_line.send(self.lidar.outgoing(self.now), dt),
         )
 
 

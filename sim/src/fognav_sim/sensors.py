@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Final, NamedTuple
+from typing import TYPE_CHECKING, Final, NamedTuple, Self
 
 import numpy as np
 
@@ -18,6 +18,7 @@ from fognav_sim.lidar_faults import LIDAR_MAX_M, LIDAR_MIN_M, LidarFaults
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
+    from fog_contracts.robot import LidarSettings
     from fog_contracts.site import NodeSite
     from fognav_sim.floor import Floor
 
@@ -37,7 +38,8 @@ class Noise:
 
     Standard deviations: `wheel_diameter` (share, drawn once per wheel), `slip` (share of the travel, per square root
     of a metre), lidar `range_sigma` (m) plus `range_share` of the range, `lidar_dropout` (probability per beam),
-    `sonar_sigma` (m), `sonar_spike` (probability of a single outlier).
+    `sonar_sigma` (m), `sonar_spike` (probability of a single outlier). `grip` (m/s2): what a wheel holds on the floor
+    without skidding.
     """
 
     wheel_diameter: float = 0.004
@@ -50,6 +52,7 @@ class Noise:
     wheel_scale: tuple[float, float] = (1.0, 1.0)
     wheel_gain: tuple[float, float] = (1.0, 1.0)
     wheel_wander: float = 0.0
+    grip: float = math.inf
     sonar_miss: float = 0.0
     lidar: LidarFaults | None = None
 
@@ -65,16 +68,48 @@ class Robot:
 
 
 @dataclass(frozen=True, kw_only=True)
+class Deception:
+    """What a node's sonars hear instead of what is there, in this order.
+
+    An echo comes from `scale` times its range and `offset` (m) more: a wrong temperature, a detour, something on the
+    sonar itself. None comes with the probability `lost`: a dead or covered sonar. Anything comes with `stray`.
+    """
+
+    scale: float = 1.0
+    offset: float = 0.0
+    lost: float = 0.0
+    stray: float = 0.0
+
+    def hear(self, measured: float | None, generator: np.random.Generator) -> float | None:
+        """Return what is heard of a true measurement."""
+        if generator.random() < self.stray:
+            return float(generator.uniform(0.1, SONAR_MAX_M))
+        if measured is None or generator.random() < self.lost:
+            return None
+        heard = self.scale * measured + self.offset
+        return heard if heard <= SONAR_MAX_M else None
+
+
+@dataclass(frozen=True, kw_only=True)
 class LidarPlace:
     """Where a lidar is mounted: its axis (m) and the direction of its zero (rad) in the robot's frame.
 
-    A `mirrored` one hangs upside down: its angles grow clockwise, seen from above.
+    A `mirrored` one hangs upside down: its angles grow clockwise, seen from above. In the sectors `posts` (from, to;
+    rad, counter-clockwise in the robot's frame) it sees parts of the robot, 0.16 m away.
     """
 
     x: float = 0.0
     y: float = 0.0
     yaw: float = 0.0
     mirrored: bool = False
+    posts: tuple[tuple[float, float], ...] = ()
+
+    @classmethod
+    def of(cls, mounted: LidarSettings) -> Self:
+        """Return where a robot's settings say that it is."""
+        return cls(
+            x=mounted.x_m, y=mounted.y_m, yaw=mounted.yaw_rad, mirrored=mounted.mirrored, posts=tuple(mounted.masks)
+        )
 
     def pose(self, robot: tuple[float, float, float]) -> tuple[float, float, float]:
         """Return the lidar's pose on the floor for the robot's (m, m, rad)."""
@@ -117,27 +152,34 @@ _Beam = tuple[float, float, float, float]
 
 
 class _Fan(NamedTuple):
-    """The rays of a sonar's cone from (x, y), the walls that they meet, and the nearest wall (m) that echoes."""
+    """The rays of a sonar's cone from (x, y), the walls that they meet, and those of them that echo."""
 
     x: float
     y: float
     directions: NDArray[np.float64]
     walls: NDArray[np.float64]
-    nearest_wall: float
+    echoes: NDArray[np.float64]
+
+
+class _Heard(NamedTuple):
+    """The range (m) of the nearest wall or obstacle that echoes, and what hides what is behind it, for each ray."""
+
+    nearest: float
+    hidden: NDArray[np.float64]
 
 
 class Sonars:
     """The sonars of a floor's nodes.
 
     A sonar's cone is a fan of rays. Walls and boxes echo only below a maximum angle of incidence; an obstacle that is
-    lower than the cone at its range is not seen. Nodes and walls do not move, so what the walls echo is computed once,
-    and what the obstacles do whenever one of them has changed.
+    lower than the cone at its range is not seen, and a soft one hides what is behind it. Nodes and walls do not move,
+    so what the walls echo is computed once, and what the obstacles do whenever one of them has changed.
     """
 
     def __init__(self, floor: Floor) -> None:
         self._floor = floor
         self._fans: dict[_Beam, _Fan] = {}
-        self._obstacles: dict[tuple[_Beam, float], float] = {}
+        self._obstacles: dict[tuple[_Beam, float], _Heard] = {}
         self._as_of = floor.changes
 
     def measure(
@@ -148,8 +190,8 @@ class Sonars:
             return float(generator.uniform(0.1, SONAR_MAX_M))
         beam = (node.x, node.y, node.theta, node.sonars[index].angle)
         fan = self._fan(beam)
-        obstacle = self._nearest_obstacle(beam, fan, node.height)
-        nearest = min(fan.nearest_wall, obstacle, _nearest_of_robot(fan, robot, node))
+        heard = self._nearest_standing(beam, fan, node.height)
+        nearest = min(heard.nearest, _nearest_of_robot(fan, heard.hidden, robot, node))
         nearest += self._ahead_m
         if not SONAR_MIN_M <= nearest <= SONAR_MAX_M or (noise.sonar_miss and generator.random() < noise.sonar_miss):
             return None
@@ -166,11 +208,11 @@ class Sonars:
             directions = theta + angle + np.linspace(-SONAR_HALF_CONE, SONAR_HALF_CONE, SONAR_RAYS)
             x, y = node_x + self._ahead_m * math.cos(theta), node_y + self._ahead_m * math.sin(theta)
             walls = self._floor.wall_ranges(x, y, directions, SONAR_MAX_M)
-            self._fans[beam] = _Fan(x, y, directions, walls, float(np.min(_echo_ranges(walls, directions))))
+            self._fans[beam] = _Fan(x, y, directions, walls, _echo_ranges(walls, directions))
         return self._fans[beam]
 
-    def _nearest_obstacle(self, beam: _Beam, fan: _Fan, height: float) -> float:
-        """Return the range (m) of the nearest obstacle that echoes, infinite for none."""
+    def _nearest_standing(self, beam: _Beam, fan: _Fan, height: float) -> _Heard:
+        """Return the range (m) of the nearest wall or obstacle that echoes, infinite for none."""
         if self._as_of != self._floor.changes:
             self._as_of = self._floor.changes
             self._obstacles.clear()
@@ -178,22 +220,27 @@ class Sonars:
             self._obstacles[beam, height] = self._search_obstacles(fan, height)
         return self._obstacles[beam, height]
 
-    def _search_obstacles(self, fan: _Fan, height: float) -> float:
-        nearest = math.inf
+    def _search_obstacles(self, fan: _Fan, height: float) -> _Heard:
+        hidden, standing = fan.walls, []
         for obstacle, ranges, incidence in self._floor.obstacle_ranges(fan.x, fan.y, fan.directions, SONAR_MAX_M):
-            # A wall hides everything behind it, whether it echoes or not.
-            seen = (ranges < fan.walls) & (incidence <= SONAR_MAX_INCIDENCE)
-            seen &= _in_cone(obstacle.height, height, ranges)
-            nearest = min(nearest, float(np.min(np.where(seen, ranges, np.inf))))
-        return nearest
+            met = np.where(_in_cone(obstacle.height, height, ranges), ranges, np.inf)
+            if self._floor.is_soft(obstacle.id):
+                hidden = np.minimum(hidden, met)
+            else:
+                standing.append(np.where(incidence <= SONAR_MAX_INCIDENCE, met, np.inf))
+        # A wall hides everything behind it, whether it echoes or not; so does what is soft.
+        nearest = float(np.min(np.where(fan.walls <= hidden, fan.echoes, np.inf)))
+        for met in standing:
+            nearest = min(nearest, float(np.min(np.where(met < hidden, met, np.inf))))
+        return _Heard(nearest, hidden)
 
 
-def _nearest_of_robot(fan: _Fan, robot: Robot, node: NodeSite) -> float:
+def _nearest_of_robot(fan: _Fan, hidden: NDArray[np.float64], robot: Robot, node: NodeSite) -> float:
     """Return the range (m) at which a robot echoes, infinite if it does not."""
     if math.hypot(robot.x - fan.x, robot.y - fan.y) - robot.radius > SONAR_MAX_M:
         return math.inf
     ranges = _circle_ranges(robot.x, robot.y, robot.radius, fan.x, fan.y, fan.directions)
-    seen = (ranges < fan.walls) & _in_cone(robot.height, node.height, ranges)
+    seen = (ranges < hidden) & _in_cone(robot.height, node.height, ranges)
     return float(np.min(np.where(seen, ranges, np.inf)))
 
 

@@ -12,22 +12,28 @@ from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
-from fog_contracts.geometry import distance_to_polygon, normalized_polygon
+from fog_contracts.geometry import contains_point, distance_to_polygon, normalized_polygon
 from fog_contracts.messages import SimObstacle, SimTruth
 from fognav_sim.floor import MAX_CLEARANCE_M
-from fognav_sim.sensors import LidarPlace, Noise, Robot, Sonars, measure_lidar
+from fognav_sim.sensors import Deception, LidarPlace, Noise, Robot, Sonars, measure_lidar
 
 if TYPE_CHECKING:
     from collections.abc import Iterable
 
     from numpy.typing import NDArray
 
+    from fog_contracts.geometry import Point
     from fog_contracts.messages import Pose
     from fog_contracts.site import NodeSite, RobotSite
     from fognav_sim.floor import Floor
 
 _CONTACT_RELEASE_M: Final = 0.01
 """A contact has ended when the clearance exceeds this."""
+_CLIFF_SENSORS_RAD: Final = (-1.05, -0.3, 0.3, 1.05)
+_CLIFF_SENSORS_SHARE: Final = 0.95
+"""Directions of the cliff sensors, and how far they are from the robot's middle, of its radius."""
+_POST_M: Final = 0.16
+"""How far parts of the robot that its lidar sees are from its axis."""
 _WANDER_S: Final = 1.0
 """Within which the speed of a wheel for the same command changes."""
 _BODY_CORNERS: Final = 8
@@ -76,7 +82,13 @@ class World:
         """Sector of the lidar (from, to; rad, counter-clockwise) in which nothing returns its beams."""
         self.held_wheels = [False, False]
         """Whether the left and the right wheel turn on the spot."""
+        self.holes: dict[str, list[Point]] = {}
+        """Outlines of holes in the floor, such as stairs that lead down: only the base's cliff sensors find them."""
+        self.deceived: dict[str, Deception] = {}
+        """What the sonars of some nodes hear instead of what is there."""
         self._gain = [0.0, 0.0]
+        self._ground = (0.0, 0.0)
+        """How far (m) each wheel moved the robot in the last step, where the floor's grip is limited."""
         self._others: tuple[World, ...] = ()
         start = robot.start
         self._body = _Body(start.x, start.y, start.theta)
@@ -95,15 +107,15 @@ class World:
         """The obstacles on the floor; walls are in the map."""
         return self._floor.obstacles
 
-    def place(self, obstacle: SimObstacle) -> None:
-        """Place an obstacle, replacing one with the same id.
+    def place(self, obstacle: SimObstacle, *, soft: bool = False) -> None:
+        """Place an obstacle, replacing one with the same id; one that is `soft` swallows sound.
 
         Raises `GeometryError` for an invalid outline, `ValueError` if it would stand on the robot.
         """
         outline = normalized_polygon(obstacle.polygon)
         if distance_to_polygon(outline, self._body.x, self._body.y) <= self.robot.radius:
             raise ValueError(f"{obstacle.id} would stand on robot {self.robot.id}: place it elsewhere")
-        self._floor.place(obstacle)
+        self._floor.place(obstacle, soft=soft)
 
     def remove(self, obstacle_id: str) -> bool:
         """Remove an obstacle; return False if there is none with this id."""
@@ -144,6 +156,23 @@ class World:
         return self._body.bump_left, self._body.bump_right
 
     @property
+    def over_cliff(self) -> bool:
+        """Whether a cliff sensor, one of four along the robot's front, is over a hole."""
+        return any(
+            contains_point(hole, *self._ahead(angle)) for hole in self.holes.values() for angle in _CLIFF_SENSORS_RAD
+        )
+
+    @property
+    def fallen(self) -> bool:
+        """Whether the robot's middle is over a hole."""
+        return any(contains_point(hole, self._body.x, self._body.y) for hole in self.holes.values())
+
+    def _ahead(self, angle: float) -> Point:
+        """Return the place (m) under the robot's rim in this direction (rad) from its heading."""
+        reach, along = _CLIFF_SENSORS_SHARE * self.robot.radius, self._body.theta + angle
+        return self._body.x + reach * math.cos(along), self._body.y + reach * math.sin(along)
+
+    @property
     def contacts(self) -> int:
         """Number of contacts with walls, obstacles and other robots so far, as far as this one drove into them."""
         return self._body.contacts
@@ -178,12 +207,19 @@ class World:
         body.left = _first_order_step(body.left, left, share)
         body.right = _first_order_step(body.right, right, share)
         wheel_travel = (body.left * dt, body.right * dt)
-        if wheel_travel == (0.0, 0.0):
+        if wheel_travel == self._ground == (0.0, 0.0):
             return wheel_travel
         ground = [
             travel * scale + self.noise.slip * math.sqrt(abs(travel)) * float(self._rng.standard_normal())
             for travel, scale in zip(wheel_travel, self._diameter_scale, strict=True)
         ]
+        if (grip := self.noise.grip) < math.inf:
+            change = grip * dt * dt
+            ground = [
+                min(max(travel, before - change), before + change)
+                for travel, before in zip(ground, self._ground, strict=True)
+            ]
+            self._ground = (ground[0], ground[1])
         left_scale, right_scale = self.noise.wheel_scale
         left_held, right_held = self.held_wheels
         self._move(0.0 if left_held else ground[0] * left_scale, 0.0 if right_held else ground[1] * right_scale)
@@ -256,12 +292,16 @@ class World:
         if self.no_return_rad is not None:
             begin, end = self.no_return_rad
             ranges[(angles - begin) % math.tau <= (end - begin) % math.tau] = np.nan
+        for begin, end in place.posts:
+            ranges[(seen_along + place.yaw - begin) % math.tau <= (end - begin) % math.tau] = _POST_M
         return ranges
 
     def sonar(self, node: NodeSite, index: int) -> float | None:
         """Measure with one sonar of a node: range of the nearest echo (m), None without an echo."""
         robot = Robot(x=self._body.x, y=self._body.y, radius=self.robot.radius, height=self.robot.height)
-        return self._sonars.measure(robot, node, index, self.noise, self._rng)
+        measured = self._sonars.measure(robot, node, index, self.noise, self._rng)
+        deception = self.deceived.get(node.id)
+        return measured if deception is None else deception.hear(measured, self._rng)
 
     def truth(self, stamp: float, sustained_speed: float = 1.0) -> SimTruth:
         """Return the ground truth."""

@@ -15,12 +15,19 @@ import numpy as np
 
 from fog_runtime.configuration import parts
 from fog_runtime.configuration.default_parts import DEFAULT_BASE, DEFAULT_LIDAR
-from fognav_experiments.hunt.world import Box, HuntWorld, Patch, Sensors, Watched
+from fognav_experiments.hunt.world import Box, HuntWorld, Mounting, Patch, Sensors, Watched
 from fognav_experiments.scenarios.description import (
+    BadLine,
+    BlindLidar,
     BusyRadio,
+    ClockChange,
     Command,
+    DeadAgent,
+    DeceivedNode,
     FaultyNode,
+    FrozenLidar,
     HeldWheel,
+    Hole,
     HungAgent,
     LinkGap,
     NoGoZone,
@@ -51,6 +58,19 @@ _FAULTS: Final[tuple[Fault, ...]] = ("stuck", "flapping", "lies-clear", "lies-bl
 _COMMANDS: Final[tuple[CommandName, ...]] = (
     "enable", "disable", "egress", "egress", "back_off", "turn", "advance", "reset",
 )  # fmt: skip
+_SLEWS: Final = (0.083333, 0.0005, 0.001)
+"""What chrony slews by at most, the kernel for NTP, and twice that."""
+_QUIRKS: Final[tuple[dict[str, int | float | bool], ...]] = (
+    {"mode_offset": 1}, {"mode_noise": 7}, {"text_period_s": 5.0}, {"damaged": 9}, {"mode_change_s": 0.1},
+    {"stays_safe_on_dock": True}, {"mode_offset": 1, "mode_noise": 11, "text_period_s": 0.7, "damaged": 9},
+)  # fmt: skip
+"""Of single Roombas, as their owners report them."""
+_DECEPTIONS: Final[tuple[dict[str, float], ...]] = (
+    {"lost": 1.0}, {"lost": 0.5}, {"scale": 0.0, "offset": 0.3}, {"offset": 1.2}, {"offset": -0.4}, {"scale": 1.125},
+    {"scale": 0.9}, {"stray": 0.2}, {"stray": 1.0}, {"scale": 0.0, "offset": 3.9},
+)  # fmt: skip
+"""Dead, covered, something on it, detours, temperatures, cross-talk, always the same from afar."""
+_LIDAR_M: Final = 0.25
 _WALL_M: Final = 0.5
 _DOOR_M: Final = 0.9
 _HEADING_BIAS: Final = math.radians(2.5) * 0.235
@@ -87,6 +107,7 @@ def draw_world(seed: int, number: int, attempt: int = 0) -> HuntWorld:
     resolution = dice.choice((0.05, 0.05, 0.05, 0.10))
     warp = dice.choice((0.0, dice.uniform(0.02, 0.08)))
     placed = [_thing(dice, dice.choice(floor.places)) for _ in range(dice.choice((0, 0, 0, 1, 3)))]
+    base = dice.choice((DEFAULT_BASE, dice.choice(parts.names(BASES))))
     world = HuntWorld(
         title=f"{floor.kind}, seed {seed}, number {number}",
         start=start,
@@ -99,8 +120,10 @@ def draw_world(seed: int, number: int, attempt: int = 0) -> HuntWorld:
         resolution=resolution,
         warp_m=round(warp, 3),
         radius=dice.choice((0.17, 0.17, 0.17, 0.22)),
-        base=dice.choice((DEFAULT_BASE, dice.choice(parts.names(BASES)))),
+        base=base,
         lidar=dice.choice((DEFAULT_LIDAR, dice.choice(parts.names(LIDARS)))),
+        mounting=_mounting(dice),
+        quirks=dice.choice(_QUIRKS) if base == DEFAULT_BASE and dice.random() < 0.3 else {},
         watched=floor.watched,
         sensors=sensors,
         events=_events(dice, floor, distance),
@@ -127,6 +150,7 @@ def draw_on_map(seed: int, number: int, attempt: int, file: str, recorded: Stati
         goal=goal,
         map=file,
         warp_m=dice.choice((0.0, 0.05)),
+        mounting=_mounting(dice),
         sensors=_sensors(dice, floor),
         events=_events(dice, floor, reach),
         seconds=200.0,
@@ -251,8 +275,27 @@ def _sensors(dice: random.Random, floor: _Floor) -> Sensors:
         scale=(round(1.0 + encoder - bias / 2, 4), round(1.0 + encoder + bias / 2, 4)),
         gain=(round(gains[0], 3), round(gains[1], 3)),
         wander=dice.choice((0.0, 0.05)),
+        slip=dice.choice((0.01, 0.01, 0.03)),
+        grip=dice.choice((0.0, 0.0, 2.5, 1.0)),
         sonar_miss=dice.choice((0.0, 0.0, 0.05)),
         sonar_spike=dice.choice((0.004, 0.01)),
+    )
+
+
+def _mounting(dice: random.Random) -> Mounting:
+    """Return a mounting, mostly the usual one: over the axle, its zero ahead."""
+    if dice.random() < 0.6:
+        return Mounting()
+    masks = []
+    for _ in range(dice.choice((0, 0, 1, 3))):
+        begin = dice.uniform(0.8, 5.0)
+        masks.append((round(begin, 2), round(begin + dice.uniform(0.1, 0.4), 2)))
+    return Mounting(
+        x=round(dice.choice((0.0, dice.uniform(-0.12, 0.12))), 3),
+        y=round(dice.choice((0.0, dice.uniform(-0.08, 0.08))), 3),
+        yaw=round(dice.choice((0.0, math.pi / 2, math.pi, dice.uniform(-math.pi, math.pi))), 4),
+        mirrored=dice.random() < 0.4,
+        masks=masks,
     )
 
 
@@ -285,8 +328,8 @@ def _event(  # noqa: C901, PLR0911, PLR0912  # a table of the kinds of events
     node = f"n-{floor.watched[0].id}" if floor.watched else ""
     kind = dice.choice((
         "zone", "zone", "command", "speed", "thing", "person", "gap", "slow", "radio", "restart", "hang", "lidar",
-        "wheel", "push",
-        *(("barrier", "barrier", "silent", "lie", "lie", "clock") if node else ()),
+        "dead", "frozen", "blind", "stall", "line", "clocks", "hole", "low", "wheel", "push",
+        *(("barrier", "barrier", "silent", "lie", "deceived", "deceived", "soft", "clock") if node else ()),
     ))  # fmt: skip
     seconds = round(dice.choice((dice.uniform(0.5, 5.0), dice.uniform(5.0, 60.0))), 1)
     match kind:
@@ -316,6 +359,38 @@ def _event(  # noqa: C901, PLR0911, PLR0912  # a table of the kinds of events
             return HungAgent(at_s=at_s, seconds=seconds), False
         case "lidar":
             return SilentLidar(at_s=at_s, seconds=seconds), False
+        case "dead":
+            return DeadAgent(at_s=at_s, seconds=seconds), False
+        case "frozen":
+            return FrozenLidar(at_s=at_s, seconds=seconds, turns=dice.choice((1, 1, 2, 5))), False
+        case "blind":
+            begin, wide = dice.uniform(-math.pi, math.pi), dice.uniform(0.3, 2.1)
+            return BlindLidar(at_s=at_s, begin=round(begin, 2), end=round(begin + wide, 2), seconds=seconds), False
+        case "stall":
+            brief = round(dice.choice((dice.uniform(0.05, 0.15), dice.uniform(0.2, 2.0))), 2)
+            return BadLine(at_s=at_s, device=dice.choice(("base", "lidar")), seconds=brief, stalled=True), False
+        case "line":
+            lost, flipped = dice.choice(((0.0005, 0.0), (0.0, 0.0005), (0.01, 0.0), (0.0, 0.01), (0.1, 0.1)))
+            return BadLine(
+                at_s=at_s, device=dice.choice(("base", "lidar")), seconds=seconds, lost=lost, flipped=flipped
+            ), False
+        case "clocks":
+            jump = dice.choice((0.0, dice.choice((-3600.0, -30.0, -2.0, -0.5, 0.5, 2.0, 30.0, 3600.0, 1e6))))
+            rate = dice.choice((-1.0, 1.0)) * dice.choice(_SLEWS)
+            crystal = dice.choice((0.0, -1e-4, 1e-4))
+            return ClockChange(
+                at_s=at_s,
+                computer=dice.choice(("robot", "fog")),
+                jump_s=jump,
+                rate=rate,
+                crystal=crystal,
+                seconds=seconds,
+            ), False
+        case "hole":
+            return Hole(at_s=at_s, polygon=_ring(_thing(dice, place)), keep_m=_KEEP_M), False
+        case "low":
+            box, height = _thing(dice, place), round(dice.uniform(0.04, _LIDAR_M - 0.01), 2)
+            return Obstacle(at_s=at_s, polygon=_ring(box), height=height, keep_m=_KEEP_M), False
         case "wheel":
             return HeldWheel(at_s=at_s, wheel=dice.choice(("left", "right")), seconds=1.0), False
         case "command":
@@ -326,6 +401,9 @@ def _event(  # noqa: C901, PLR0911, PLR0912  # a table of the kinds of events
             return SilentNode(at_s=at_s, node=node, seconds=seconds), True
         case "clock":
             return SlewedNode(at_s=at_s, node=node, rate=dice.choice((-0.08, -0.001, 0.0005, 0.08))), False
+        case "deceived":
+            deception = dice.choice(_DECEPTIONS)
+            return DeceivedNode(at_s=at_s, node=node, seconds=dice.choice((0.0, seconds)), **deception), True
         case "lie":
             fault = dice.choice(_FAULTS)
             return FaultyNode(at_s=at_s, node=node, fault=fault, seconds=seconds), True
@@ -334,7 +412,8 @@ def _event(  # noqa: C901, PLR0911, PLR0912  # a table of the kinds of events
     x = area.node[0]
     barrier = _rounded(x - 0.3, bottom + 0.25, x + 0.3, top - 0.05)
     return Obstacle(
-        at_s=at_s, polygon=_ring(barrier), seconds=dice.choice((0.0, seconds)), keep_m=_KEEP_M, area=area.id
+        at_s=at_s, polygon=_ring(barrier), seconds=dice.choice((0.0, seconds)), keep_m=_KEEP_M,
+        area=None if kind == "soft" else area.id, soft=kind == "soft",
     ), False  # fmt: skip
 
 

@@ -38,9 +38,12 @@ if TYPE_CHECKING:
         ZoneSet,
     )
 
-Rule = Literal["contact", "blocked", "speed", "stop", "pose", "version", "write", "hazard", "cleared", "barrier"]
-Word = Literal["fog", "map-service", "aggregator", "planner", "agent", "lidar"]
-"""What may be lost: all messages to the robot, a process of the fog, its own agent (which may hang), its lidar."""
+Rule = Literal[
+    "contact", "blocked", "speed", "stop", "pose", "version", "write", "hazard", "cleared", "barrier", "late"
+]
+Word = Literal["fog", "map-service", "aggregator", "planner", "agent", "lidar", "new turns", "base", "floor"]
+"""What may be lost: all messages to the robot, a process of the fog, its own agent (which may hang), its lidar, or new
+turns of it, what its base sends, the floor before its front wheel."""
 _MAP: Final[frozenset[Word]] = frozenset({"fog", "map-service"})
 """Without one of these a robot does not learn what changes on the map."""
 
@@ -56,14 +59,23 @@ _MODE_SPEED: Final[dict[Mode, float]] = {
     "EGRESS": 0.10,
     "DOCK": 0.30,
 }
+_TOLD: Final[frozenset[Mode]] = frozenset({"INIT", "FAULT"})
+"""Modes in which it moves only as an operator has just told it to."""
 _UNKNOWN_SPEED: Final = 0.15
 _SPEED_MARGIN: Final = 0.02
 _RAMP_S: Final = 0.8
 """0.5 s of a ramp, and what states and truth, ten times a second, come late."""
 _REACTION_S: Final = 1.0
 """From the announcement of what is blocked to a robot that knows: a map's version, a path."""
-_STOP_S: Final[dict[Word, float]] = {"fog": 4.0, "map-service": 4.0, "agent": 0.4, "lidar": 0.6}
-"""Wheels are zero so long after a word is lost: 3.5, 0.3 and 0.5 s by the documents, and what the truth comes late."""
+_STOP_S: Final[dict[Word, float]] = {
+    "fog": 4.0, "map-service": 4.0, "agent": 0.4, "lidar": 0.6, "new turns": 1.4, "base": 0.6, "floor": 0.4,
+}  # fmt: skip
+"""Wheels are zero so long after a word is lost: 3.5, 0.3 and 0.5 s by the documents, three turns and a ramp, 0.3 s for
+the base, a frame for the floor, and what the truth comes late."""
+_BUMPED_S: Final = 0.4
+"""And so long after the bumper touched something."""
+_SEEN_M: Final = 0.25
+"""What is lower no lidar sees: only the bumper finds it."""
 _HAZARDS: Final[frozenset[Word]] = frozenset({"map-service", "aggregator"})
 """Without one of these no hazard is announced."""
 _SLOW_S: Final = 2.0
@@ -72,6 +84,9 @@ _WRITTEN_S: Final = 2.5
 """A robot's state, once a second, names a version that holds an acknowledged write so long after it."""
 _HAZARD_S: Final = 2.0
 """From an obstacle before an honest node to the announced hazard: five readings of at most 0.3 s, and 0.35 s."""
+_LATE_S: Final = 30.0
+"""A robot that loses nothing takes nothing for late that is not, for longer: whatever its clock or the fog's does."""
+_SETTLED_S: Final = 5.0
 _POSE_SIGMAS: Final = 4.0
 _POSE_S: Final = 1.5
 """A claim is broken if it is for so long: a robot that was pushed needs a scan or two to know."""
@@ -150,10 +165,12 @@ class Oracle:
         self._truth: SimTruth | None = None
         self._speed = 0.0
         self._contacts = 0
+        self._bumped = math.inf
         self._broken: dict[tuple[str, str], float] = {}
         self._mode: Mode = "INIT"
         self._allowed_until: list[tuple[float, float]] = []
         self._state_at = -math.inf
+        self._old_map = False
         self._version = (0, 0)
         self._poses: list[tuple[float, RobotPose]] = []
         self._areas: dict[str, tuple[AreaState, _Known]] = {}
@@ -191,6 +208,12 @@ class Oracle:
         """Note that the robot gets this again."""
         if self._lost.pop(word, None) is not None:
             self._restored[word] = now
+
+    def on_fallen(self, now: float) -> None:
+        """Note that its middle is over a hole, which it was told to back off from at most."""
+        self._now = now
+        if self._mode not in _TOLD:
+            self._report("contact", f"fell into a hole at {self._speed:.2f} m/s in {self._mode}")
 
     def on_acknowledged(self, zone: Zone, now: float) -> None:
         """Note that an operator's zone was acknowledged."""
@@ -231,6 +254,7 @@ class Oracle:
             self._allowed_until.append((now + _RAMP_S, _MODE_SPEED[self._mode]))
             self._mode = state.mode
         self._state_at = now
+        self._old_map = any(reason.startswith("the map is") and reason.endswith("old") for reason in state.reasons)
         self._version = (state.map_epoch, state.map_seq)
 
     # --- what the fog publishes --------------------------------------------------------------------------------------
@@ -313,6 +337,7 @@ class Oracle:
         self._check_speed()
         self._check_blocked()
         self._check_stop()
+        self._check_late()
         self._check_writes()
         self._check_hazards()
         self._check_poses()
@@ -334,9 +359,11 @@ class Oracle:
 
     def _check_contact(self, truth: SimTruth) -> None:
         if truth.contacts > self._contacts:
-            self._contacts = truth.contacts
-            near = [o.id for o in truth.obstacles if distance_to_polygon(o.polygon, truth.x, truth.y) < 0.5]
-            what = ", ".join(near) or "a wall"
+            self._contacts, self._bumped = truth.contacts, self._now
+            near = [o for o in truth.obstacles if distance_to_polygon(o.polygon, truth.x, truth.y) < 0.5]
+            if any(o.height < _SEEN_M for o in near):
+                return
+            what = ", ".join(o.id for o in near) or "a wall"
             self._report("contact", f"drove into {what} at {self._speed:.2f} m/s in {self._mode}")
 
     def _check_speed(self) -> None:
@@ -385,9 +412,26 @@ class Oracle:
         for word, limit in _STOP_S.items():
             seconds = self._now - self._lost.get(word, self._now)
             late = seconds > limit + (self._world.late_s if word == "fog" else 0.0)
-            self._lasts(
-                "stop", word, late and self._moves, f"wheels turn {seconds:.1f} s after it lost the {word}", 0.0
-            )
+            moves = self._moves and not (word == "floor" and self._is_told)
+            self._lasts("stop", word, late and moves, f"wheels turn {seconds:.1f} s after it lost the {word}", 0.0)
+        seconds = self._now - self._bumped
+        if not self._moves or self._is_told:
+            self._bumped = math.inf
+        elif seconds > _BUMPED_S:
+            self._report("stop", f"wheels turn {seconds:.1f} s after the bumper touched something")
+            self._bumped = math.inf
+
+    @property
+    def _is_told(self) -> bool:
+        """Whether it moves as an operator has just told it to, at most."""
+        return self._mode in _TOLD and self._speed <= _MODE_SPEED[self._mode] * self._world.gain + _SPEED_MARGIN
+
+    def _check_late(self) -> None:
+        settled = not self._lost and self._now - max(self._restored.values(), default=-math.inf) > _SETTLED_S
+        late = settled and self._old_map and self._world.late_s == 0.0
+        self._lasts(
+            "late", "map", late, f"its map is old for {_LATE_S:.0f} s, in {self._mode}, and nothing is lost", _LATE_S
+        )
 
     def _check_writes(self) -> None:
         fast = (

@@ -23,6 +23,7 @@ from fognav_experiments.scenarios.stage import Stage, Word
 from fognav_sim.barrier import BarrierError
 from fognav_sim.drive.evaluation import DriveOutcome
 from fognav_sim.drive.hazard import HazardSchedule
+from fognav_sim.emulators import QuirkyBase
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -98,8 +99,13 @@ def hunt(world: HuntWorld, folders: Sequence[Path] = ()) -> Hunted:
     run = LockstepDrive(
         site, built.site.robots[0].start, mission, world.seed,
         world.sensors.noise(), watched=True, hazard=hazard, bus=None, ground=built.floor,
-        base=world.base, lidar=world.lidar,
+        mounted=world.mounted(),
     )  # fmt: skip
+    if world.quirks:
+        base = run.robot.hardware.base
+        if not isinstance(base, QuirkyBase):
+            raise ValueError(f"{world.title}: no quirks of a {world.base} are known: leave them out")
+        base.set_quirks(**world.quirks)
     oracle = Oracle(
         watching.World(
             radius=world.radius,
@@ -108,6 +114,7 @@ def hunt(world: HuntWorld, folders: Sequence[Path] = ()) -> Hunted:
             pose_floor_m=0.06 + world.resolution + world.warp_m,
             gain=max(1.0, *world.sensors.gain) * (1.0 + 3.0 * world.sensors.wander),
             late_s=_BUSY_S if world.busy else 0.0,
+            ahead_s=lambda: run.robot.clock.ahead(run.now),
         ),
         STAMP,
     )
@@ -132,6 +139,17 @@ class _WatchedStage(Stage):
     def __init__(self, run: LockstepDrive, world: HuntWorld, oracle: Oracle) -> None:
         super().__init__(run, world.events, world.seed)
         self._oracle = oracle
+        self._over_cliff = self._fallen = False
+
+    def step(self) -> None:
+        super().step()
+        world = self._run.world
+        if world.over_cliff is not self._over_cliff:
+            self._over_cliff = world.over_cliff
+            self.on_lost("floor", lost=self._over_cliff)
+        if world.fallen and not self._fallen:
+            self._fallen = True
+            self._oracle.on_fallen(self._run.now)
 
     def on_lost(self, word: Word, *, lost: bool) -> None:
         (self._oracle.on_lost if lost else self._oracle.on_restored)(word, self._run.now)

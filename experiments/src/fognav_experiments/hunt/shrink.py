@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any, Final
 from msgspec.structs import asdict, replace
 
 from fog_runtime.configuration.default_parts import DEFAULT_BASE, DEFAULT_LIDAR
-from fognav_experiments.hunt.world import HuntWorld, Sensors
+from fognav_experiments.hunt.world import HuntWorld, Mounting, Sensors
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
@@ -23,6 +23,8 @@ _PLAIN: Final[dict[str, Any]] = {
     "radius": 0.17,
     "base": DEFAULT_BASE,
     "lidar": DEFAULT_LIDAR,
+    "mounting": Mounting(),
+    "quirks": {},
 }
 
 

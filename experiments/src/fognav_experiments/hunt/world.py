@@ -7,6 +7,7 @@ rad, times in s.
 from __future__ import annotations
 
 import math
+from functools import cache
 from typing import TYPE_CHECKING, Annotated, NamedTuple
 
 import msgspec
@@ -19,6 +20,7 @@ from fog_contracts.site import AreaSite, DemoPlan, NodeSite, Place, RobotSite, S
 from fog_kernels.components import Components
 from fog_kernels.distance import squared_distance_capped
 from fog_runtime.configuration.default_parts import DEFAULT_BASE, DEFAULT_LIDAR
+from fog_runtime.configuration.robot_file import RobotFile, default_robot
 from fognav_experiments.scenarios.description import AnyEvent
 from fognav_sim.floor import Floor
 from fognav_sim.lidar_faults import LidarFaults
@@ -29,6 +31,8 @@ if TYPE_CHECKING:
 
 Box = tuple[float, float, float, float]
 """left, bottom, right, top (m)"""
+_Wave = tuple[float, float, float, float]
+"""Its number (1/m), cosine and sine of its direction, its phase (rad)."""
 _FREE, _WALL = 0, 254
 _WAVES = 3
 _SPARE_M = 0.08
@@ -58,6 +62,7 @@ class Sensors(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=T
 
     `recorded`: the lidar errs as recorded ones do, with `patches` and `dead` sectors. `scale`: travel on the ground for
     what the encoders count, `gain`: speed for what is commanded, both left and right, `wander`: of the gain.
+    `grip` (m/s2): what wheels hold on the floor, 0: everything.
     """
 
     recorded: bool = False
@@ -66,6 +71,8 @@ class Sensors(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=T
     scale: tuple[float, float] = (1.0, 1.0)
     gain: tuple[float, float] = (1.0, 1.0)
     wander: float = 0.0
+    slip: Annotated[float, Meta(ge=0.0, le=0.1)] = 0.01
+    grip: Annotated[float, Meta(ge=0.0)] = 0.0
     sonar_miss: Annotated[float, Meta(ge=0.0, le=1.0)] = 0.0
     sonar_spike: Annotated[float, Meta(ge=0.0, le=1.0)] = 0.004
 
@@ -75,8 +82,19 @@ class Sensors(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=T
         lidar = LidarFaults(patches=patches, dead=tuple(self.dead)) if self.recorded or patches or self.dead else None
         return Noise(
             wheel_scale=self.scale, wheel_gain=self.gain, wheel_wander=self.wander,
-            sonar_miss=self.sonar_miss, sonar_spike=self.sonar_spike, lidar=lidar,
+            slip=self.slip, grip=self.grip or math.inf, sonar_miss=self.sonar_miss, sonar_spike=self.sonar_spike,
+            lidar=lidar,
         )  # fmt: skip
+
+
+class Mounting(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """How the lidar is mounted, as in a robot's settings; in its `masks` it sees the robot."""
+
+    x: float = 0.0
+    y: float = 0.0
+    yaw: float = 0.0
+    mirrored: bool = False
+    masks: list[tuple[float, float]] = []
 
 
 class HuntWorld(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
@@ -86,8 +104,8 @@ class HuntWorld(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields
 
     `pillars`: walls in free boxes. `opened`: walls of the map that are not there (doors that were closed when it was
     made); `placed`: things that are there and not on the map. `warp_m`: by how much the map is off at most, smoothly,
-    over `warp_length_m`. `demo`: a barrier closes a watched area on the way, as in a demonstration. `seed`: of the
-    sensors' noise, and of that barrier.
+    over `warp_length_m`. `quirks`: what the base does otherwise than others of its kind. `demo`: a barrier closes a
+    watched area on the way, as in a demonstration. `seed`: of the sensors' noise, and of that barrier.
     """
 
     title: str
@@ -105,12 +123,22 @@ class HuntWorld(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields
     radius: Annotated[float, Meta(gt=0.05, le=0.5)] = 0.17
     base: Id = DEFAULT_BASE
     lidar: Id = DEFAULT_LIDAR
+    mounting: Mounting = Mounting()
+    quirks: dict[str, int | float | bool] = {}
     watched: list[Watched] = []
     sensors: Sensors = Sensors()
     events: list[AnyEvent] = []
     demo: bool = False
     seconds: Seconds = 240.0
     seed: int = 1
+
+    def mounted(self) -> RobotFile:
+        """Return the robot's settings."""
+        plain, at = default_robot(self.base, self.lidar), self.mounting
+        lidar = msgspec.structs.replace(
+            plain.settings.lidar, x_m=at.x, y_m=at.y, yaw_rad=at.yaw, mirrored=at.mirrored, masks=at.masks
+        )
+        return RobotFile(settings=msgspec.structs.replace(plain.settings, lidar=lidar))
 
     @property
     def busy(self) -> bool:
@@ -176,8 +204,13 @@ def build(world: HuntWorld, recorded: StaticMap | None = None) -> Built:
 
 def displacement(world: HuntWorld, x: float, y: float) -> tuple[float, float]:
     """Return how far (m) what is drawn at (x, y) of the map truly is from there."""
-    dx, dy = _displaced(world, np.array([x]), np.array([y]))
-    return float(dx[0]), float(dy[0])
+    if world.warp_m == 0.0:
+        return 0.0, 0.0
+    dx, dy = (
+        world.warp_m / _WAVES * sum(math.sin(number * (cos * x + sin * y) + phase) for number, cos, sin, phase in waves)
+        for waves in _waves(world.seed, world.warp_length_m)
+    )
+    return dx, dy
 
 
 def to_map(world: HuntWorld, x: float, y: float) -> tuple[float, float]:
@@ -192,18 +225,29 @@ def to_map(world: HuntWorld, x: float, y: float) -> tuple[float, float]:
 def _displaced(
     world: HuntWorld, x: NDArray[np.float64], y: NDArray[np.float64]
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Sum a few waves, whose phases the world's seed gives."""
-    random = np.random.default_rng(world.seed)
+    """Sum a few waves."""
 
-    def moved() -> NDArray[np.float64]:
+    def moved(waves: list[_Wave]) -> NDArray[np.float64]:
         total = np.zeros_like(x)
-        for _ in range(_WAVES):
-            direction, phase = random.uniform(0.0, math.tau, 2)
-            number = math.tau / world.warp_length_m * random.uniform(0.6, 1.4)
-            total += np.sin(number * (np.cos(direction) * x + np.sin(direction) * y) + phase)
+        for number, cos, sin, phase in waves:
+            total += np.sin(number * (cos * x + sin * y) + phase)
         return total * (world.warp_m / _WAVES)
 
-    return moved(), moved()
+    along_x, along_y = _waves(world.seed, world.warp_length_m)
+    return moved(along_x), moved(along_y)
+
+
+@cache
+def _waves(seed: int, length_m: float) -> tuple[list[_Wave], list[_Wave]]:
+    """Return the waves along x and y, whose phases the seed gives."""
+    random = np.random.default_rng(seed)
+
+    def wave() -> _Wave:
+        direction, phase = (float(drawn) for drawn in random.uniform(0.0, math.tau, 2))
+        number = math.tau / length_m * random.uniform(0.6, 1.4)
+        return number, math.cos(direction), math.sin(direction), phase
+
+    return [wave() for _ in range(_WAVES)], [wave() for _ in range(_WAVES)]
 
 
 def _warped(world: HuntWorld, geometry: GridGeometry, cells: NDArray[np.uint8]) -> NDArray[np.uint8]:

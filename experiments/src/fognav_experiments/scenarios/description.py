@@ -32,11 +32,22 @@ class Obstacle(Event, frozen=True, kw_only=True, tag="obstacle"):
     """Somebody or something stands on the floor, for `seconds` (0: from then on), which lidar and sonars see.
 
     `area`: the watched area whose nodes must see it, if they are honest. It waits until the robot is `keep_m` away.
+    What has less than 0.25 m of `height` (m) no lidar sees, and a sonar only if it reaches up into its cone: a low
+    thing, or the edge of a table top that a lidar looks beneath. What is `soft` swallows sound.
     """
 
     polygon: Ring
     seconds: Seconds = 0.0
     area: Id | None = None
+    keep_m: Metres = 0.0
+    height: Annotated[float, Meta(gt=0.0, le=5.0)] = 1.0
+    soft: bool = False
+
+
+class Hole(Event, frozen=True, kw_only=True, tag="hole"):
+    """Stairs lead down where the map has floor: only a base's cliff sensors find them. It waits as an obstacle does."""
+
+    polygon: Ring
     keep_m: Metres = 0.0
 
 
@@ -81,6 +92,35 @@ class FaultyNode(Event, frozen=True, kw_only=True, tag="faulty-node"):
     seconds: Seconds = 0.0
 
 
+class DeceivedNode(Event, frozen=True, kw_only=True, tag="deceived-node"):
+    """The sonars of a node hear something else than what is there, for `seconds` (0: for ever); its firmware is honest.
+
+    An echo comes from `scale` times its range and `offset` (m) more, none with the probability `lost`, and any with
+    `stray`: a wrong temperature, a detour, something on the sonar, a dead or covered one, another one's bursts.
+    """
+
+    node: Id
+    scale: Annotated[float, Meta(ge=0.0, le=3.0)] = 1.0
+    offset: Annotated[float, Meta(ge=-4.0, le=4.0)] = 0.0
+    lost: Annotated[float, Meta(ge=0.0, le=1.0)] = 0.0
+    stray: Annotated[float, Meta(ge=0.0, le=1.0)] = 0.0
+    seconds: Seconds = 0.0
+
+
+class ClockChange(Event, frozen=True, kw_only=True, tag="clock"):
+    """A computer's wall clock jumps by `jump_s` and gains `rate` seconds a second for `seconds` then.
+
+    chrony slews by 83,333 ppm at most, NTP's kernel by 500. Processes count intervals by a clock that nothing slews
+    (ADR 56): from then on it gains `crystal` seconds a second.
+    """
+
+    computer: Literal["robot", "fog"]
+    jump_s: float = 0.0
+    rate: Annotated[float, Meta(gt=-0.5, le=0.5)] = 0.0
+    crystal: Annotated[float, Meta(ge=-1e-4, le=1e-4)] = 0.0
+    seconds: Seconds = 0.0
+
+
 class SlowLink(Event, frozen=True, kw_only=True, tag="slow-link"):
     """For `seconds` each message between robot and fog takes `delay_s`, and none is lost."""
 
@@ -118,10 +158,11 @@ class Kidnapping(Event, frozen=True, kw_only=True, tag="kidnapping"):
 
 
 class BlindLidar(Event, frozen=True, kw_only=True, tag="blind-lidar"):
-    """From then on nothing returns the lidar's beams between two angles (counter-clockwise, 0: ahead)."""
+    """Nothing returns the lidar's beams between two angles (counter-clockwise) for `seconds` (0: for ever)."""
 
     begin: float
     end: float
+    seconds: Seconds = 0.0
 
 
 class Command(Event, frozen=True, kw_only=True, tag="command"):
@@ -149,10 +190,36 @@ class HungAgent(Event, frozen=True, kw_only=True, tag="hung-agent"):
     seconds: Annotated[float, Meta(gt=0.0)]
 
 
+class DeadAgent(Event, frozen=True, kw_only=True, tag="dead-agent"):
+    """The robot's agent dies, and another one is started `seconds` later, with what was stored."""
+
+    seconds: Annotated[float, Meta(gt=0.0)]
+
+
 class SilentLidar(Event, frozen=True, kw_only=True, tag="silent-lidar"):
     """The lidar sends nothing for `seconds`."""
 
     seconds: Annotated[float, Meta(gt=0.0)]
+
+
+class FrozenLidar(Event, frozen=True, kw_only=True, tag="frozen-lidar"):
+    """The lidar sends its last turns again and again for `seconds`, as a stuck bridge or a driver's buffer does."""
+
+    seconds: Annotated[float, Meta(gt=0.0)]
+    turns: Annotated[int, Meta(ge=1, le=5)] = 1
+
+
+class BadLine(Event, frozen=True, kw_only=True, tag="bad-line"):
+    """For `seconds` the serial line of a device loses bytes, or changes a bit, with these probabilities, both ways.
+
+    While it is `stalled` what the device sends waits, and comes at once then.
+    """
+
+    device: Literal["base", "lidar"]
+    seconds: Annotated[float, Meta(gt=0.0)]
+    lost: Annotated[float, Meta(ge=0.0, le=1.0)] = 0.0
+    flipped: Annotated[float, Meta(ge=0.0, le=1.0)] = 0.0
+    stalled: bool = False
 
 
 class BusyRadio(Event, frozen=True, kw_only=True, tag="busy-radio"):
@@ -175,13 +242,19 @@ AnyEvent = (
     | SpeedZone
     | SilentNode
     | FaultyNode
+    | DeceivedNode
     | SlewedNode
     | LinkGap
     | SlowLink
     | BusyRadio
     | Restart
     | HungAgent
+    | DeadAgent
+    | ClockChange
     | SilentLidar
+    | FrozenLidar
+    | BadLine
+    | Hole
     | Command
     | HeldWheel
     | Push

@@ -17,11 +17,17 @@ from fog_runtime.configuration.site import load_site
 from fognav_experiments.lockstep import LockstepDrive, LockstepResult, release_drives
 from fognav_experiments.rigs import moment
 from fognav_experiments.scenarios.description import (
+    BadLine,
     BlindLidar,
     BusyRadio,
+    ClockChange,
     Command,
+    DeadAgent,
+    DeceivedNode,
     FaultyNode,
+    FrozenLidar,
     HeldWheel,
+    Hole,
     HungAgent,
     Kidnapping,
     LinkGap,
@@ -42,6 +48,7 @@ from fognav_experiments.scenarios.fleet_stage import FleetResult, play_fleet
 from fognav_experiments.scenarios.node_faults import FaultyNodeSim, LateNodeSim, SlewedNodeSim
 from fognav_sim.drive.evaluation import DriveOutcome
 from fognav_sim.hardware import STEP_S
+from fognav_sim.sensors import Deception
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping, Sequence
@@ -54,8 +61,8 @@ if TYPE_CHECKING:
     from fognav_sim.nodes import SensorNode
 
 
-Word = Literal["fog", "map-service", "aggregator", "planner", "agent", "lidar"]
-"""What may be lost: all messages to the robot, a process of the fog, the agent, the lidar."""
+Word = Literal["fog", "map-service", "aggregator", "planner", "agent", "lidar", "new turns", "base", "floor"]
+"""What may be lost: messages to the robot, a process of the fog, agent, lidar, its new turns, base, floor ahead."""
 _REPEAT_STEPS: Final = 10
 _PERSON_M: Final = 0.2
 """Radius of somebody who walks."""
@@ -69,6 +76,8 @@ class StallingLidar(Protocol):
     """The emulator of a lidar that can fall silent."""
 
     stalled: bool
+    frozen: bool
+    frozen_revolutions: int
 
 
 class ScenarioError(ValueError):
@@ -226,7 +235,7 @@ class Stage:
             self._repeated = [repeat for repeat in list(self._repeated) if repeat()]
         self._steps += 1
 
-    def _begin(self, name: str, event: AnyEvent) -> None:  # noqa: C901, PLR0912  # a table of the kinds of events
+    def _begin(self, name: str, event: AnyEvent) -> None:  # noqa: C901, PLR0912, PLR0915  # a table of the kinds of events
         run = self._run
         match event:
             case Obstacle():
@@ -253,6 +262,13 @@ class Stage:
             case SlowLink():
                 self._delay(event.delay_s)
                 self._later(event.seconds, partial(self._delay, 0.0))
+            case DeceivedNode():
+                self._run.world.deceived[event.node] = Deception(
+                    scale=event.scale, offset=event.offset, lost=event.lost, stray=event.stray
+                )
+                self._later(event.seconds, partial(self._run.world.deceived.pop, event.node, None))
+            case ClockChange():
+                self._set_clock(event)
             case BusyRadio():
                 self._busy(event)
             case Restart():
@@ -262,9 +278,22 @@ class Stage:
             case HungAgent():
                 self._hang(hung=True)
                 self._later(event.seconds, partial(self._hang, hung=False))
+            case DeadAgent():
+                run.robot.kill()
+                self.on_lost("agent", lost=True)
+                self._later(event.seconds, self._start_agent)
             case SilentLidar():
                 self._stall(stalled=True)
                 self._later(event.seconds, partial(self._stall, stalled=False))
+            case FrozenLidar():
+                self._freeze(event.turns)
+                self._later(event.seconds, partial(self._freeze, 0))
+            case BadLine():
+                self._disturb(event, begins=True)
+                self._later(event.seconds, partial(self._disturb, event, begins=False))
+            case Hole():
+                if not self._open(name, event):
+                    self._repeated.append(lambda: not self._open(name, event))
             case Command():
                 run.robot.command(event.command)
             case HeldWheel():
@@ -275,17 +304,26 @@ class Stage:
             case Kidnapping():
                 run.world.kidnap(Pose(x=event.to[0], y=event.to[1], theta=event.theta))
             case BlindLidar():
-                run.world.no_return_rad = (event.begin, event.end)
+                self._blind((event.begin, event.end))
+                self._later(event.seconds, partial(self._blind, None))
 
     def _place(self, name: str, event: Obstacle) -> bool:
         """Place an obstacle; return False if the robot is still too near."""
         x, y, _ = self._run.world.pose
         if event.keep_m and distance_to_polygon(event.polygon, x, y) < event.keep_m:
             return False
-        self._run.world.place(SimObstacle(id=name, polygon=event.polygon))
+        self._run.world.place(SimObstacle(id=name, polygon=event.polygon, height=event.height), soft=event.soft)
         if event.area is not None:
             self.on_obstacle(event.area, stands=True)
         self._later(event.seconds, partial(self._remove, name, event.area))
+        return True
+
+    def _open(self, name: str, event: Hole) -> bool:
+        """Open a hole; return False if the robot is still too near."""
+        x, y, _ = self._run.world.pose
+        if distance_to_polygon(event.polygon, x, y) < max(event.keep_m, self._run.world.robot.radius):
+            return False
+        self._run.world.holes[name] = list(event.polygon)
         return True
 
     def _remove(self, name: str, area: str | None) -> None:
@@ -340,6 +378,33 @@ class Stage:
         assert isinstance(lidar, StallingLidar), "the emulator of this lidar never falls silent"
         lidar.stalled = stalled
         self.on_lost("lidar", lost=stalled)
+
+    def _freeze(self, turns: int) -> None:
+        lidar = self._run.robot.hardware.lidar
+        assert isinstance(lidar, StallingLidar), "the emulator of this lidar never falls silent"
+        lidar.frozen, lidar.frozen_revolutions = turns > 0, max(turns, 1)
+        if turns <= 1:
+            self.on_lost("new turns", lost=turns > 0)
+
+    def _blind(self, sector: tuple[float, float] | None) -> None:
+        self._run.world.no_return_rad = sector
+
+    def _disturb(self, event: BadLine, *, begins: bool) -> None:
+        hardware = self._run.robot.hardware
+        line = hardware.base_line if event.device == "base" else hardware.lidar_line
+        line.lost, line.flipped = (event.lost, event.flipped) if begins else (0.0, 0.0)
+        line.stalled = event.stalled and begins
+        if event.stalled:
+            self.on_lost(event.device, lost=begins)
+
+    def _start_agent(self) -> None:
+        self._run.robot.start_again()
+        self.on_lost("agent", lost=False)
+
+    def _set_clock(self, event: ClockChange) -> None:
+        clock = self._run.robot.clock if event.computer == "robot" else self._run.system.fog.clock
+        clock.change(self._run.now, jump_s=event.jump_s, rate=event.rate, crystal=event.crystal)
+        self._later(event.seconds, lambda: clock.change(self._run.now, crystal=event.crystal))
 
     def _hold(self, wheel: Literal["left", "right"], *, held: bool) -> None:
         self._run.world.held_wheels[("left", "right").index(wheel)] = held

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections import deque
-from typing import TYPE_CHECKING, Final
+from typing import TYPE_CHECKING, Any, Final
 
 from robot_agent.bases.roomba600.emulator.body import AXLE_MM, Battery, Wheels, World
 from robot_agent.bases.roomba600.emulator.cleaning import Cleaning
@@ -96,6 +96,11 @@ class RoombaEmulator:
         self._stream = Stream()
         self._sensors = Sensors(self.world, self.battery, self._wheels, self._stream, lambda: self.mode)
         self._outgoing = bytearray()
+
+    def set_quirks(self, **quirks: Any) -> None:  # noqa: ANN401  # the fields of `Quirks`
+        """Let it deviate from the specification from now on, in these fields of `Quirks`; its rate stays."""
+        self.quirks = Quirks(baud=self.baud, **quirks)
+        self._noise = LineNoise(self.quirks)
 
     @property
     def seeking_dock(self) -> bool:

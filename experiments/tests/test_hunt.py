@@ -60,9 +60,9 @@ R1 = {"robot": "r1"}
 class Drive:
     """A robot that drives along the x axis from 0 at 0.2 m/s, as its messages and the truth tell it."""
 
-    def __init__(self):
+    def __init__(self, wrong_s=0.0):
         self.bus = Bus("test")
-        self.oracle = oracle.Oracle(oracle.World(radius=0.17), STAMP)
+        self.oracle = oracle.Oracle(oracle.World(radius=0.17, wrong_s=wrong_s), STAMP)
         self.bus.subscribe(self.oracle.handlers())
         self.now = self.x = 0.0
         self.mode, self.version = "NORMAL", (1, 1)
@@ -345,6 +345,16 @@ def test_oracle_sees_a_rule_broken_once_and_nothing_where_all_is_well(happens, r
     drive = Drive()
     happens(drive)
     assert [violation.rule for violation in drive.oracle.violations] == rules, drive.oracle.violations
+
+
+@pytest.mark.parametrize(("seconds", "rules"), [(0.2, []), (0.4, ["stop"])])
+def test_oracle_lets_wheels_follow_a_command_with_a_wrong_bit_until_the_next_one(seconds, rules):
+    drive = Drive(wrong_s=0.2)
+    drive.oracle.on_lost("agent", drive.now)
+    drive.drive(1, speed=0.0)
+    drive.drive(seconds)
+    drive.drive(1, speed=0.0)
+    assert [violation.rule for violation in drive.oracle.violations] == rules
 
 
 WORLD = HuntWorld(

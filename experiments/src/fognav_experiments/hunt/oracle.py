@@ -112,7 +112,8 @@ class World:
     `to_map`: where a true pose is on the robot's map, which may be warped. `tolerance_m`: by how much a border on the
     map may be off, its cells included. `pose_floor_m`: deviation that no map of this kind lets a robot know. `gain`:
     speed of the base for a command, highest of its wheels. `late_s`: how long a message may take on its way.
-    `ahead_s`: by how much a robot's wall clock is ahead.
+    `ahead_s`: by how much a robot's wall clock is ahead. `wrong_s`: how long wheels may do what nobody commanded: a
+    Roomba can't tell a command with a wrong bit, and follows it until the next one.
     """
 
     radius: float
@@ -122,6 +123,7 @@ class World:
     gain: float = 1.0
     late_s: float = 0.0
     ahead_s: Callable[[], float] = lambda: 0.0
+    wrong_s: float = 0.0
 
 
 class Figures(msgspec.Struct, kw_only=True):
@@ -413,7 +415,8 @@ class Oracle:
             seconds = self._now - self._lost.get(word, self._now)
             late = seconds > limit + (self._world.late_s if word == "fog" else 0.0)
             moves = self._moves and not (word == "floor" and self._is_told)
-            self._lasts("stop", word, late and moves, f"wheels turn {seconds:.1f} s after it lost the {word}", 0.0)
+            values = f"wheels turn {seconds:.1f} s after it lost the {word}"
+            self._lasts("stop", word, late and moves, values, self._world.wrong_s)
         seconds = self._now - self._bumped
         if not self._moves or self._is_told:
             self._bumped = math.inf

@@ -38,6 +38,8 @@ _FIND_POSE: Final[tuple[CommandKind, ...]] = ("turn", "advance", "initial_pose")
 """What an operator tries if a robot does not know its pose."""
 _BUSY_S: Final = 2.0
 """How late messages are at most, but one in thousands, while a radio is busy."""
+_WRONG_S: Final = 0.2
+"""A guardian repeats what wheels shall do every 0.05 s; the repetition may be lost, too, and truth comes every 0.1 s."""
 
 
 class Hunted(msgspec.Struct, frozen=True, kw_only=True):
@@ -114,6 +116,7 @@ def hunt(world: HuntWorld, folders: Sequence[Path] = ()) -> Hunted:
             pose_floor_m=0.06 + world.resolution + world.warp_m,
             gain=max(1.0, *world.sensors.gain) * (1.0 + 3.0 * world.sensors.wander),
             late_s=_BUSY_S if world.busy else 0.0,
+            wrong_s=_WRONG_S if world.garbles else 0.0,
             ahead_s=lambda: run.robot.clock.ahead(run.now),
         ),
         STAMP,

@@ -21,7 +21,7 @@ from fog_kernels.components import Components
 from fog_kernels.distance import squared_distance_capped
 from fog_runtime.configuration.default_parts import DEFAULT_BASE, DEFAULT_LIDAR
 from fog_runtime.configuration.robot_file import RobotFile, default_robot
-from fognav_experiments.scenarios.description import AnyEvent
+from fognav_experiments.scenarios.description import AnyEvent, BadLine
 from fognav_sim.floor import Floor
 from fognav_sim.lidar_faults import LidarFaults
 from fognav_sim.sensors import Noise
@@ -144,6 +144,11 @@ class HuntWorld(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields
     def busy(self) -> bool:
         """Whether messages may be late."""
         return any(event.__struct_config__.tag in {"slow-link", "busy-radio"} for event in self.events)
+
+    @property
+    def garbles(self) -> bool:
+        """Whether bytes to and from the base may arrive with a wrong bit."""
+        return any(isinstance(event, BadLine) and event.device == "base" and event.flipped for event in self.events)
 
 
 class Built(NamedTuple):

@@ -39,7 +39,7 @@ _FIND_POSE: Final[tuple[CommandKind, ...]] = ("turn", "advance", "initial_pose")
 _BUSY_S: Final = 2.0
 """How late messages are at most, but one in thousands, while a radio is busy."""
 _WRONG_S: Final = 0.2
-"""A guardian repeats what wheels shall do every 0.05 s; the repetition may be lost, too, and truth comes every 0.1 s."""
+"""A guardian repeats a command every 0.05 s, which may be lost, too; truth comes every 0.1 s."""
 
 
 class Hunted(msgspec.Struct, frozen=True, kw_only=True):

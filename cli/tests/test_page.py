@@ -59,7 +59,7 @@ def loaded_site() -> LoadedSite:
         places={"a": Place(x=0.0, y=1.5, label="A"), "b": Place(x=15.0, y=1.5, label="B")},
         areas=[area],
         nodes=[node],
-        robots=[RobotSite(id="r1", start=Pose(x=0.0, y=1.5, theta=0.0))],
+        robots=[RobotSite(id="r1", start=Pose(x=0.0, y=1.5, theta=0.0), radius=0.17)],
         demo=DemoPlan(start="a", goal="b", areas=["z1"]),
     )
     return LoadedSite(site, StaticMap(geometry, cells), Path("/nowhere"))

@@ -32,7 +32,7 @@ def ring_site():
         places={"west": Place(x=START.x, y=START.y, theta=START.theta), "east": GOAL},
         areas=[area],
         nodes=[node],
-        robots=[RobotSite(id="r1", start=START)],
+        robots=[RobotSite(id="r1", start=START, radius=0.17)],
         demo=DemoPlan(start="west", goal="east", areas=["z1"]),
     )
     return LoadedSite(site, StaticMap(geometry, cells), Path())

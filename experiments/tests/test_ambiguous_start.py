@@ -22,7 +22,7 @@ def two_rooms() -> LoadedSite:
     for room in ROOMS:
         left, bottom, right, top = (round(20 * value) for value in room)
         cells[bottom:top, left:right] = 0
-    robot = RobotSite(id="r1", start=Pose(x=2.5, y=1.5, theta=-0.5))
+    robot = RobotSite(id="r1", start=Pose(x=2.5, y=1.5, theta=-0.5), radius=0.17)
     site = Site(id="rooms", places={"a": Place(x=8.8, y=3.3, theta=0.0)}, areas=[], nodes=[], robots=[robot])
     return LoadedSite(site, StaticMap(geometry, cells), Path())
 

@@ -23,7 +23,9 @@ APART_M = 0.8
 
 
 def fleet_of(*starts):
-    missions = [Mission(RobotSite(id=f"r{n}", start=Pose(x=x, y=1.5, theta=t)), (7.5, 1.5)) for n, (x, t) in starts]
+    missions = [
+        Mission(RobotSite(id=f"r{n}", start=Pose(x=x, y=1.5, theta=t), radius=0.17), (7.5, 1.5)) for n, (x, t) in starts
+    ]
     return Fleet(ring.ring_site(), missions, 1, CpuMeter())
 
 

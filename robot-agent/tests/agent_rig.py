@@ -217,7 +217,7 @@ class AgentProcess:
         site, key = folder / "site", folder / "operator.key"
         site.mkdir(exist_ok=True)
         x, y, theta = start
-        start_pose = f"start = {{ x = {x}, y = {y}, theta = {theta} }}"
+        start_pose = f"start = {{ x = {x}, y = {y}, theta = {theta} }}\nradius = 0.17"
         dock = "" if body.dock is None else "dock = {{ x = {}, y = {}, theta = {} }}\n".format(*body.dock)
         (site / "site.toml").write_text(f'id = "{SITE}"\n[[robots]]\nid = "{ROBOT}"\n{start_pose}\n{dock}')
         key.write_text(KEY.hex() + "\n")

@@ -20,7 +20,7 @@ def hall(footprint, lidar_x, posts, seed=1):
     """A robot in a hall, with its lidar so far ahead of its axle, before posts that no map has."""
     lidar = LidarSettings(driver="l", x_m=lidar_x)
     settings = RobotSettings(base=BaseSettings(driver="b"), lidar=lidar)
-    start = RobotSite(id="r1", start=Pose(x=2.0, y=3.0, theta=0.0))
+    start = RobotSite(id="r1", start=Pose(x=2.0, y=3.0, theta=0.0), radius=0.17)
     config = agent_config("r1", KEY, DRIVE_TRAIN, LIDAR, start, boot="b1", footprint=footprint, settings=settings)
     return LittleWorld(HALL, (11.0, 6.0), (2.0, 3.0, 0.0), seed, config=config, posts=posts).ready()
 

@@ -32,6 +32,7 @@ ROBOT = """
 [[robots]]
 id = "r1"
 start = { x = 1.0, y = 1.0, theta = 0.0 }
+radius = 0.17
 """
 AREA_WITHOUT_NODES = """
 [[areas]]

@@ -16,6 +16,7 @@ ROBOT_AND_AREA = """
 [[robots]]
 id = "r1"
 start = { x = 1.0, y = 1.0, theta = 0.0 }
+radius = 0.17
 
 [[areas]]
 id = "gate"

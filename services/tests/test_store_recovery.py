@@ -22,7 +22,7 @@ async def run(*arguments: str, code: int) -> str:
 
 async def test_lost_records_are_shown_and_restored_or_given_up_by_command(fog, tokens, monkeypatch):
     with (fog.site / "site.toml").open("a") as site:
-        site.write('[[robots]]\nid = "r1"\nstart = { x = 1.0, y = 1.0, theta = 0.0 }\n')
+        site.write('[[robots]]\nid = "r1"\nstart = { x = 1.0, y = 1.0, theta = 0.0 }\nradius = 0.17\n')
     urls = {}
     for module, name in SERVICES.items():
         fog.start(module)

@@ -37,7 +37,9 @@ def site(width, node_at=6.0):
     sonars = [Sonar(angle=angle, range_limit=width - 0.35) for angle in (-0.22, 0.22)]
     node = NodeSite(id="n1", area="z1", x=node_at, y=1.05, theta=math.pi / 2, sonars=sonars)
     start = Pose(x=1.0, y=1.0 + width / 2, theta=0.0)
-    return Site(id="s", areas=[area], nodes=[node] if node_at else [], robots=[RobotSite(id="r1", start=start)])
+    return Site(
+        id="s", areas=[area], nodes=[node] if node_at else [], robots=[RobotSite(id="r1", start=start, radius=0.17)]
+    )
 
 
 def can_pass(static, obstacle):

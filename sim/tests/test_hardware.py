@@ -24,7 +24,12 @@ def hall():
     geometry = GridGeometry(120, 80, 0.05, 0.0, 0.0)
     cells = np.zeros(geometry.shape, np.uint8)
     cells[:2], cells[-2:], cells[:, :2], cells[:, -2:] = 254, 254, 254, 254
-    return World(Floor(geometry, cells), RobotSite(id="r1", start=Pose(x=1.0, y=2.0, theta=0.0)), seed=1, axle_m=0.235)
+    return World(
+        Floor(geometry, cells),
+        RobotSite(id="r1", start=Pose(x=1.0, y=2.0, theta=0.0), radius=0.17),
+        seed=1,
+        axle_m=0.235,
+    )
 
 
 def hardware_in(world, start=0.0, **more):

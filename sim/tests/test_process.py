@@ -40,6 +40,7 @@ sonars = [{ angle = -0.1, range_limit = 2.2 }, { angle = 0.1, range_limit = 2.2 
 [[robots]]
 id = "r1"
 start = { x = 1.0, y = 1.5, theta = 0.0 }
+radius = 0.17
 """
 BOX = SimObstacle(id="box", polygon=[(3.5, 1.0), (4.5, 1.0), (4.5, 1.4), (3.5, 1.4)], height=1.0)
 

@@ -28,7 +28,7 @@ def hall(x=2.0, y=2.0, theta=0.0, *, noise=IDEAL, seed=1, wheel_lag=0.0):
     geometry = GridGeometry(120, 80, 0.05, 0.0, 0.0)
     cells = np.zeros(geometry.shape, np.uint8)
     cells[:4], cells[-4:], cells[:, :4], cells[:, -4:] = 254, 254, 254, 254
-    robot = RobotSite(id="r1", start=Pose(x=x, y=y, theta=theta))
+    robot = RobotSite(id="r1", start=Pose(x=x, y=y, theta=theta), radius=0.17)
     return World(Floor(geometry, cells), robot, seed, axle_m=AXLE_M, noise=noise, wheel_lag=wheel_lag)
 
 
@@ -170,7 +170,7 @@ def test_lidar_gets_no_return_beyond_twelve_metres():
     geometry = GridGeometry(400, 80, 0.05, 0.0, 0.0)
     cells = np.zeros(geometry.shape, np.uint8)
     cells[:, -4:] = 254
-    robot = RobotSite(id="r1", start=Pose(x=7.0, y=2.0, theta=0.0))
+    robot = RobotSite(id="r1", start=Pose(x=7.0, y=2.0, theta=0.0), radius=0.17)
     world = World(Floor(geometry, cells), robot, 1, axle_m=AXLE_M, noise=IDEAL)
     assert np.isnan(world.lidar(np.zeros(1), 0.0)[0])
     world.kidnap(Pose(x=8.0, y=2.0, theta=0.0))

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fog_contracts.cones import SONAR_HALF_CONE
-from fog_contracts.costs import DEFAULT_INFLATION, FREE, LETHAL
+from fog_contracts.costs import DEFAULT_INFLATION, FREE, LETHAL, ROBOT_RADIUS
 from fog_contracts.geometry import Point
 from fog_contracts.grid import GridGeometry, StaticMap
 from fog_contracts.messages import AreaState, Pose
@@ -135,7 +135,7 @@ def propose(name: str, map_path: str, geometry: GridGeometry, cells: NDArray[np.
         places=places,
         areas=areas,
         nodes=[node for _, node in best.areas],
-        robots=[RobotSite(id="r1", start=best.start)],
+        robots=[RobotSite(id="r1", start=best.start, radius=ROBOT_RADIUS)],
         demo=DemoPlan(start="a", goal="b", areas=[area.id for area in areas]),
     )
     return Proposal(site, "" if areas else _why(drives, reasons))

@@ -38,6 +38,7 @@ sonars = [{ range_limit = 1.5 }, { angle = 0.2, range_limit = 1.5, no_echo_is_cl
 [[robots]]
 id = "r1"
 start = { x = 0.5, y = 0.5, theta = 0 }
+radius = 0.2
 
 [demo]
 start = "door"
@@ -97,7 +98,12 @@ def test_site_loads_with_its_map_and_counter_clockwise_areas(folder):
         ('goal = "desk"', 'goal = "roof"', "demo.goal", "one of: desk, door"),
         ('areas = ["a1"]', 'areas = ["a7"]', "demo.areas[0]", "one of: a1"),
         ('id = "n1"', 'id = "planner"', "nodes[0].id", "name of a role"),
-        ("[demo]", '[[robots]]\nid = "r1"\nstart = { x = 1, y = 1, theta = 0 }\n[demo]', "robots.id", "twice"),
+        (
+            "[demo]",
+            '[[robots]]\nid = "r1"\nstart = { x = 1, y = 1, theta = 0 }\nradius = 1\n[demo]',
+            "robots.id",
+            "twice",
+        ),
         ('name = "A small lab"', 'map = "none.yaml"', "map", "none.yaml"),
         ("range_limit = 1.5 }, {", "range_limit = 9 }, {", "nodes[0].sonars[0].range_limit", "4.0"),
     ],

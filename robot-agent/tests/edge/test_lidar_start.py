@@ -75,7 +75,9 @@ def motor(monkeypatch):
 def environment(folder, port):
     key = folder / "operator.key"
     key.write_text(KEY.hex())
-    (folder / "site.toml").write_text('id = "lab"\n[[robots]]\nid = "r1"\nstart = { x = 1.0, y = 1.0, theta = 0.0 }\n')
+    (folder / "site.toml").write_text(
+        'id = "lab"\n[[robots]]\nid = "r1"\nstart = { x = 1.0, y = 1.0, theta = 0.0 }\nradius = 0.17\n'
+    )
     return {
         "FOGNAV_ROBOT": "r1",
         "FOGNAV_SITE_DIR": str(folder),

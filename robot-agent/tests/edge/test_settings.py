@@ -47,6 +47,7 @@ def test_robot_whose_body_nobody_gives_is_refused_with_the_remedy(tmp_path):
         ("id = ", "site.toml: "),
         (SITE.replace('"r1"', '"r2"'), "there is no 'r1' .known: r2."),
         (SITE.replace('"lab"', "3"), "Expected `str`"),
+        (SITE.replace("radius = 0.2", ""), "missing required field `radius`.* Add how far .* the robot's body reaches"),
     ],
 )
 def test_a_wrong_site_file_is_named_with_its_remedy(tmp_path, text, words):

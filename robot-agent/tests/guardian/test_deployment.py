@@ -135,23 +135,23 @@ def test_robot_tries_for_ever_to_be_back_on_its_network(installed):
 
 def test_a_second_installation_keeps_what_was_changed_on_the_robot(installed):
     env, toml = installed / "etc/fognav/robot.env", installed / "etc/fognav/robot.toml"
-    env.write_text(env.read_text().replace("r1", "r9"))
+    env.write_text(env.read_text() + "FOGNAV_SEED=9\n")
     before = toml.read_text()
     install(installed)
-    assert environment(installed)["FOGNAV_ROBOT"] == "r9"
+    assert environment(installed)["FOGNAV_SEED"] == "9"
     assert toml.read_text() == before
 
 
 def test_a_second_installation_with_credentials_lets_the_robot_through_a_locked_router(installed, tmp_path):
     env, credentials = installed / "etc/fognav/robot.env", tmp_path / "r1.toml"
-    env.write_text(env.read_text().replace("r1", "r9"))
+    env.write_text(env.read_text() + "FOGNAV_SEED=9\n")
     credentials.write_text("")
     assert environment(installed)["FOGNAV_ZENOH_CONNECT"] == "tcp/fog.local:7447"
     install(installed, "--credentials", str(credentials))
     found = environment(installed)
     assert found["FOGNAV_ZENOH_CONNECT"] == "tls/fog.local:7447"
     assert found["FOGNAV_CREDENTIALS_FILE"] == "/etc/fognav/credentials.toml"
-    assert found["FOGNAV_ROBOT"] == "r9"
+    assert found["FOGNAV_SEED"] == "9"
 
 
 class Update:
@@ -255,6 +255,32 @@ def test_another_installation_brings_the_site_of_today_to_a_robot_that_had_none(
     install(installed)
     assert configured(installed)[1].radius == 0.25
     assert environment(installed)["FOGNAV_SITE"] == "lab"
+
+
+@pytest.mark.parametrize(
+    ("text", "problem"),
+    [
+        (SITE.replace("radius = 0.30", ""), "the entry of r1 has no `radius`, so nobody knows its body: add how far"),
+        (SITE.replace('"r1"', '"r2"'), "has no [[robots]] entry with the id r1: add it"),
+        (SITE.replace("[[robots]]", "[[robots"), "fog-node-site.toml: "),
+    ],
+)
+def test_installer_refuses_a_robot_whose_body_its_site_does_not_say_and_replaces_nothing(
+    installed, site_file, text, problem
+):
+    site_file.write_text(text)
+    with pytest.raises(subprocess.CalledProcessError) as refused:
+        install(installed)
+    assert problem in refused.value.stderr
+    assert configured(installed)[1].radius == 0.30
+
+
+def test_installer_does_not_call_a_robot_by_another_id_than_its_own(installed, site_file):
+    site_file.write_text(SITE + SITE[SITE.index("[[robots]]") :].replace('"r1"', '"r2"').replace("0.30", "0.20"))
+    with pytest.raises(subprocess.CalledProcessError) as refused:
+        install(installed, "--robot", "r2")
+    assert "this is r1 by" in refused.value.stderr
+    assert "correct FOGNAV_ROBOT there" in refused.value.stderr
 
 
 def test_installed_agent_does_not_start_without_its_body(installed):

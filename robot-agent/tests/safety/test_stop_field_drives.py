@@ -49,7 +49,7 @@ class Driven:
         geometry = GridGeometry(100, 80, 0.05, 0.0, 0.0)
         cells = np.zeros(geometry.shape, np.uint8)
         x, y, theta = pose
-        body = RobotSite(id="r1", start=Pose(x=x, y=y, theta=theta))
+        body = RobotSite(id="r1", start=Pose(x=x, y=y, theta=theta), radius=0.17)
         self.world = World(Floor(geometry, cells), body, seed, axle_m=AXLE, noise=NOISE)
         for number, polygon in enumerate(obstacles):
             self.world.place(SimObstacle(id=f"o{number}", polygon=polygon, height=1.0))

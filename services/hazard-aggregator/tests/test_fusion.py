@@ -536,8 +536,8 @@ def test_pose_older_than_three_seconds_explains_no_echo():
 @pytest.mark.parametrize(
     ("robot", "of_the_site"),
     [
-        (pose(1.0, 0.5, height=0.35), RobotSite(id="r1", start=START, height=0.2)),  # lower than the node
-        (msgspec.structs.replace(pose(1.0, 0.5), radius=0.9), RobotSite(id="r1", start=START)),
+        (pose(1.0, 0.5, height=0.35), RobotSite(id="r1", start=START, height=0.2, radius=0.17)),  # lower than the node
+        (msgspec.structs.replace(pose(1.0, 0.5), radius=0.9), RobotSite(id="r1", start=START, radius=0.17)),
     ],
 )
 def test_echo_is_explained_by_a_robots_body_of_the_site_not_by_the_one_that_it_claims(robot, of_the_site):

@@ -217,7 +217,7 @@ async def test_robot_in_the_cone_does_not_block_the_area(fog, until):
 
 async def test_robot_has_the_body_of_the_site_whatever_it_claims(fog, until):
     with (fog.site / "site.toml").open("a") as file:
-        file.write('\n[[robots]]\nid = "r1"\nheight = 0.1\nstart = { x = 1.0, y = 1.0, theta = 0.0 }\n')
+        file.write('\n[[robots]]\nid = "r1"\nradius = 0.17\nheight = 0.1\nstart = { x = 1.0, y = 1.0, theta = 0.0 }\n')
     fog.start("hazard_aggregator")
     await fog.ready("hazard_aggregator")
     async with connected_node(fog) as (node, zenoh):

@@ -57,8 +57,8 @@ def test_robot_is_sent_again_only_after_two_seconds() -> None:
 
 def test_front_of_the_dock_is_0_7_m_before_it_and_robots_without_one_are_left_out() -> None:
     robots = [
-        RobotSite(id="r1", start=FRONT, dock=Pose(x=1.0, y=2.0, theta=1.5707963267948966)),
-        RobotSite(id="r2", start=FRONT),
+        RobotSite(id="r1", start=FRONT, dock=Pose(x=1.0, y=2.0, theta=1.5707963267948966), radius=0.17),
+        RobotSite(id="r2", start=FRONT, radius=0.17),
     ]
     staging = Site(id="s", robots=robots).staging
     assert list(staging) == ["r1"]

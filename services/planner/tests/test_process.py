@@ -58,6 +58,7 @@ theta = 1.5
 [[robots]]
 id = "r1"
 start = { x = 1.0, y = 7.0, theta = 0.0 }
+radius = 0.17
 """
 MAP = """
 image: map.pgm

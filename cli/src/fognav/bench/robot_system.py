@@ -55,7 +55,7 @@ def write_site(folder: Path, floor: StaticMap) -> Path:
         f'id = "{_SITE}"\nname = "Benchmark floor"\nmap = "map.yaml"\n'
         f"[places.{far}]\nx = {right - 4.0:.1f}\ny = {rows[-1]:.1f}\n"
         f"[places.{near}]\nx = 4.0\ny = {rows[0]:.1f}\n"
-        f'[[robots]]\nid = "{NAME}"\nstart = {{ x = 4.0, y = {rows[0]:.1f}, theta = 0.0 }}\n',
+        f'[[robots]]\nid = "{NAME}"\nstart = {{ x = 4.0, y = {rows[0]:.1f}, theta = 0.0 }}\nradius = 0.17\n',
         "utf-8",
     )
     return folder

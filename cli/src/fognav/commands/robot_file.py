@@ -134,7 +134,7 @@ def contradictions(robot: RobotFile) -> list[str]:
         return told
     if robot.settings.base.driver != DEFAULT_BASE:
         told.append(
-            f"body.footprint is not set: the body is a circle of the site's `radius`, {ROBOT_RADIUS} m by default"
+            "body.footprint is not set: the body is a circle of the `radius` of the robot's entry in the site's file"
         )
     try:
         refuse_body(robot, base, Footprint.circle(ROBOT_RADIUS))

@@ -6,7 +6,6 @@ from typing import Annotated, Any, Final
 from msgspec import Meta, field
 from msgspec.structs import asdict
 
-from fog_contracts.costs import ROBOT_RADIUS
 from fog_contracts.messages import (
     AlertPolicy,
     AreaDefinition,
@@ -119,13 +118,15 @@ class SourceSite(Source, frozen=True, kw_only=True):
 class RobotSite(Message, frozen=True, kw_only=True):
     """A robot of this site: its start pose, and the radius and height of its body.
 
+    `radius`: how far its body reaches from the point between its driven wheels. Nobody guesses it: a robot that takes
+    itself for smaller than it is touches what it believes to pass.
     `dock`: its pose while it stands on its dock, facing it; None if it has none here.
     """
 
     id: Id
     start: Pose
     dock: Pose | None = None
-    radius: Annotated[float, Meta(gt=0.0, le=2.0)] = ROBOT_RADIUS
+    radius: Annotated[float, Meta(gt=0.0, le=2.0)]
     height: Annotated[float, Meta(gt=0.0, le=3.0)] = 0.35
 
     @property

@@ -27,6 +27,7 @@ if TYPE_CHECKING:
     from robot_agent.hardware import BaseDriver
 
 SITE_FILE: Final = "site.toml"
+_ADD_RADIUS: Final = "Add how far (m) the robot's body reaches from the point between its driven wheels"
 
 
 class Settings(CommonSettings, frozen=True, kw_only=True):
@@ -100,7 +101,8 @@ def read_site(settings: Settings) -> tuple[str, RobotSite]:
             f"{file} can't be read: {error.strerror}. Copy the fog node's {SITE_FILE} there, or correct FOGNAV_SITE_DIR"
         ) from error
     except (tomllib.TOMLDecodeError, UnicodeDecodeError, msgspec.ValidationError) as error:
-        raise SettingsError(f"{file}: {error}. Correct the field that it names") from error
+        remedy = _ADD_RADIUS if "`radius`" in str(error) else "Correct the field that it names"
+        raise SettingsError(f"{file}: {error}. {remedy}") from error
     if settings.site not in {"", site.id}:
         raise SettingsError(
             f"FOGNAV_SITE is {settings.site!r}, but {file} describes {site.id!r}, whose start and dock are on another "

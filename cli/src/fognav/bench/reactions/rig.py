@@ -14,6 +14,7 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Final
 
+from fog_contracts.costs import ROBOT_RADIUS
 from fog_contracts.messages import Pose
 from fog_contracts.site import RobotSite
 from fog_runtime.clock import SystemClock
@@ -53,13 +54,14 @@ class Rig(RunningSystem):
         folder = Path(contexts.enter_context(TemporaryDirectory(prefix="fognav-")))
         floor = await asyncio.to_thread(make_office, *_FLOOR_M)
         y = float(corridor_rows(_FLOOR_M[1])[0])
-        robot = RobotSite(id=ROBOT, start=Pose(x=_START_X_M, y=y, theta=0.0))
+        robot = RobotSite(id=ROBOT, start=Pose(x=_START_X_M, y=y, theta=0.0), radius=ROBOT_RADIUS)
         self.body = contexts.enter_context(Body(folder, floor, robot, self._seed))
         key = secrets.token_bytes(32)
         site = folder / "site"
         site.mkdir()
         start = f"{{ x = {_START_X_M}, y = {y}, theta = 0.0 }}"
-        (site / "site.toml").write_text(f'id = "{SITE}"\n[[robots]]\nid = "{ROBOT}"\nstart = {start}\n', "utf-8")
+        entry = f'[[robots]]\nid = "{ROBOT}"\nstart = {start}\nradius = {ROBOT_RADIUS}\n'
+        (site / "site.toml").write_text(f'id = "{SITE}"\n{entry}', "utf-8")
         (folder / "operator.key").write_text(key.hex() + "\n", "utf-8")
         self._supervisor = await contexts.enter_async_context(Supervisor(lambda _event: None))
         endpoint = self._add_programs(folder, site)

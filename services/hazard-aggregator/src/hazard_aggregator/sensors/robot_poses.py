@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Final, NamedTuple
 
 from msgspec import structs
 
+from fog_contracts.costs import ROBOT_RADIUS
 from fog_contracts.liveness import DelayEstimator
 from fog_contracts.messages import Pose
 from fog_contracts.site import RobotSite
@@ -29,7 +30,7 @@ SPEED_M_S: Final = 0.3
 MAX_SPEED_M_S: Final = 0.5
 """A robot may have begun to drive at the first speed since its pose; none drives faster than the second."""
 _POSES: Final = 200
-_ANY_ROBOT: Final = RobotSite(id="any", start=Pose(x=0.0, y=0.0, theta=0.0))
+_ANY_ROBOT: Final = RobotSite(id="any", start=Pose(x=0.0, y=0.0, theta=0.0), radius=ROBOT_RADIUS)
 
 
 class Whereabouts(NamedTuple):

@@ -12,6 +12,7 @@ import time
 
 import pytest
 from channel_traffic import NODES, NUMBER, ONE_ROBOT, PAUSE_S, ROBOTS, WAIT_S, Process, Traffic, copies, frozen, until
+from locked_servers import TESTER
 from sample_messages import sample, sample_of
 
 from fog_contracts import channels as ch
@@ -36,7 +37,7 @@ WITHOUT_LOCKS = {"thesis-node", "thesis-robot"}
 
 @pytest.fixture(scope="module")
 def locks(tmp_path_factory):
-    made = SiteLocks(tmp_path_factory.mktemp("locks"), "lab")
+    made = SiteLocks(tmp_path_factory.mktemp("locks"), "lab", unrestricted=[TESTER])
     made.make(["127.0.0.1"], robots=ROBOTS, nodes=NODES)
     return made
 
@@ -57,7 +58,8 @@ def broker(locks, tmp_path_factory):
 
 ROBOT_PROCESSES = [Process(ch.ROBOT, robot) for robot in ROBOTS]
 TOOLS = [Process(role, role) for role in (ch.CONSOLE, "recorder", ch.SIM)] + [
-    Process(ch.CONSOLE, ch.CONSOLE, ONE_ROBOT)
+    Process(ch.CONSOLE, ch.CONSOLE, ONE_ROBOT),
+    Process("recorder", TESTER),
 ]
 
 

@@ -41,7 +41,7 @@ _EVERYTHING: Final[dict[str, object]] = {
         "put", "delete", "declare_subscriber", "query", "declare_queryable", "reply", "liveliness_token",
         "liveliness_query", "declare_liveliness_subscriber",
     ],
-    "key_exprs": ["**"],
+    "key_exprs": ["**", "**/@adv/**"],  # a chunk that begins with @ is no part of **
 }  # fmt: skip
 
 

@@ -122,8 +122,10 @@ def small_app():
 
 
 HALF_A_HEADER = b"GET /healthz HTTP/1.1\r\nHost: fog\r\nX-Name: "
+HALF_A_STOP = b"POST /robots/r1/stop HTTP/1.1\r\nHost: fog\r\nContent-Length: 100\r\n\r\n{"
 ON_REST = ATTACKS | {
     "begin a request and stay": lambda port: Attack(port, HALF_A_HEADER, rate=40, held_s=600.0, encrypts=True),
+    "begin a stop and stay": lambda port: Attack(port, HALF_A_STOP, rate=40, held_s=600.0, encrypts=True),
     "send nonsense encrypted": lambda port: Attack(port, b"nonsense\r\n\r\n", rate=40, held_s=600.0, encrypts=True),
 }
 

@@ -12,6 +12,7 @@ import time
 import httpx
 import msgspec
 import pytest
+from fastapi import Response
 
 from fog_contracts.messages import Zone
 from fog_runtime.health import Health
@@ -29,7 +30,7 @@ from fog_runtime.http import (
     places,
     unused,
 )
-from fog_runtime.http.link import CoreLink
+from fog_runtime.http.link import CoreLink, FrontLink
 
 pytestmark = pytest.mark.live
 DEADLINE_S = 60.0
@@ -78,7 +79,7 @@ class Service:
 
         @routes.post("/robots/{robot}/stop")
         async def stop(robot: str) -> str:
-            return robot
+            return await service.stop(robot)
 
         @routes.get("/bug")
         async def bug() -> str:
@@ -105,6 +106,11 @@ class Service:
             return host
 
         return made
+
+    async def stop(self, robot: str) -> str:
+        if robot == "silent":
+            await self.release.wait()
+        return robot
 
     async def url(self) -> str:
         async with asyncio.timeout(DEADLINE_S):
@@ -179,45 +185,78 @@ async def test_body_that_does_not_arrive_is_refused_after_a_while(tmp_path, monk
         assert service.calls == []
 
 
-async def test_client_that_ends_none_of_its_requests_leaves_places_to_others_and_to_stops(tmp_path, monkeypatch):
+async def test_client_whose_requests_take_long_leaves_places_to_others_and_to_stops(tmp_path, monkeypatch):
     monkeypatch.setattr(places, "MAX_OF_CLIENT", 3)
-    monkeypatch.setattr(places, "MAX_URGENT_OF_CLIENT", 2)
-    monkeypatch.setattr(app, "BODY_S", 2 * DEADLINE_S)
-    # The server asks for the body only once the request has its place: without that answer the test's own next request
-    # could take it, and this one would be refused.
-    begun = b"PUT /zones/z1 HTTP/1.1\r\nHost: fog\r\nExpect: 100-continue\r\nContent-Length: 100\r\n\r\n"
-    async with serving(tmp_path) as (_, client), contextlib.AsyncExitStack() as connections:
+    monkeypatch.setattr(places, "MAX_URGENT_OF_PATH", 2)
+    async with serving(tmp_path) as (service, client), asyncio.TaskGroup() as tasks:
 
-        async def begin(request: bytes) -> None:
-            reader, writer = await asyncio.open_connection("127.0.0.1", client.base_url.port)
-            connections.callback(writer.close)
-            writer.write(request)
-            assert b" 100 " in await asyncio.wait_for(reader.readline(), DEADLINE_S)
-            writer.write(b"{")
+        async def until_refused(method: str, path: str) -> httpx.Response:
+            """Open requests, which are answered after the release only, until one more is refused."""
+            open_requests = set()
+            while True:
+                open_requests.add(tasks.create_task(client.request(method, path)))
+                answered, open_requests = await asyncio.wait(open_requests, timeout=0.1)
+                if answered:
+                    return answered.pop().result()
 
-        async def answer(method: str, path: str, status: int) -> httpx.Response:
-            async with asyncio.timeout(DEADLINE_S):
-                while (found := await client.request(method, path)).status_code != status:  # noqa: ASYNC110  # no event tells
-                    await asyncio.sleep(0.01)
-            return found
-
-        for _ in range(3):
-            await begin(begun)
-        refused = await client.get("/encoded")
+        refused = await until_refused("GET", "/slow")
         assert (refused.status_code, refused.headers["retry-after"]) == (503, "1")
+        assert refused.headers["connection"] == "close"
         assert refused.headers["content-type"] == "application/problem+json"
         assert "3 of your requests are being served" in refused.json()["detail"]
         assert (await client.get("/readyz")).status_code == 200
-        assert (await client.post("/robots/r1/stop")).json() == "r1"
         other = httpx.AsyncHTTPTransport(local_address="127.0.0.2")
         async with httpx.AsyncClient(transport=other, base_url=client.base_url) as neighbour:
             assert (await neighbour.get("/encoded")).status_code == 200
-        for _ in range(2):
-            await begin(begun.replace(b"PUT /zones/z1", b"POST /robots/r1/stop"))
-        assert (await client.post("/robots/r1/stop")).status_code == 503
-        await connections.aclose()
-        await answer("GET", "/encoded", 200)
-        await answer("POST", "/robots/r1/stop", 200)
+        refused = await until_refused("POST", "/robots/silent/stop")
+        assert "2 such requests are being served" in refused.json()["detail"]
+        assert (await client.post("/robots/r1/stop")).json() == "r1"
+        service.release.set()
+
+
+async def test_client_that_asks_for_health_too_often_at_once_is_refused(tmp_path, monkeypatch):
+    monkeypatch.setattr(places, "MAX_HEALTH_OF_CLIENT", 0)
+    async with serving(tmp_path) as (_, client):
+        assert (await client.get("/metrics")).status_code == 503
+        assert (await client.get("/encoded")).status_code == 200
+
+
+async def test_client_that_ends_none_of_its_requests_takes_no_place(tmp_path, monkeypatch):
+    monkeypatch.setattr(places, "MAX_OF_CLIENT", 1)
+    monkeypatch.setattr(places, "MAX_URGENT_OF_PATH", 1)
+    monkeypatch.setattr(app, "BODY_S", 2 * DEADLINE_S)
+    async with serving(tmp_path) as (_, client), contextlib.AsyncExitStack() as connections:
+        for begun in (b"PUT /zones/z1", b"POST /robots/r1/stop"):
+            reader, writer = await asyncio.open_connection("127.0.0.1", client.base_url.port)
+            connections.callback(writer.close)
+            writer.write(begun + b" HTTP/1.1\r\nHost: fog\r\nExpect: 100-continue\r\nContent-Length: 100\r\n\r\n")
+            assert b" 100 " in await asyncio.wait_for(reader.readline(), DEADLINE_S)  # it waits for the body
+            writer.write(b"{")
+        assert (await client.get("/encoded")).status_code == 200
+        assert (await client.post("/robots/r1/stop")).json() == "r1"
+
+
+async def test_stop_is_begun_before_whatever_waits_in_the_core():
+    core, front = socket.socketpair()
+    calling, answering = await CoreLink.over(front), await FrontLink.over(core)
+    begun = []
+
+    async def answer(route: str, _: bytes) -> Response:
+        begun.append(route)
+        return Response()
+
+    routes = ["GET /metrics"] * 10 + ["GET /robots"] * 10 + ["POST /stop"]
+    ranks = {"POST /stop": 0, "GET /robots": 1, "GET /metrics": 2}
+    running = [
+        asyncio.create_task(calling.run(lambda: None)),
+        asyncio.create_task(answering.answer_calls(answer, ranks.__getitem__)),
+    ]
+    await asyncio.gather(*(calling.call(route, b"") for route in routes))
+    assert begun[1:] == sorted(begun[1:], key=ranks.__getitem__)
+    assert begun.index("POST /stop") <= 1
+    calling._messages.close()
+    await asyncio.gather(*running)
+    answering.close()
 
 
 async def test_open_request_is_answered_at_the_end(tmp_path):

@@ -21,7 +21,7 @@ _DRAIN_FACTOR: Final = 16
 """A body is read and discarded up to this many times the limit."""
 
 BODY_S: Final = 10.0
-"""How long a body may take to arrive: a client that sends slowly must not hold a place for long."""
+"""How long a body may take to arrive."""
 
 Scope = MutableMapping[str, Any]
 Receive = Callable[[], Awaitable[MutableMapping[str, Any]]]
@@ -139,7 +139,7 @@ def make_app(
     app.state.standby = standby
     app.state.endpoints = {}
     app.state.core = None
-    app.state.urgent = []
+    app.state.urgent = {}
     add_problem_handlers(app)
     _add_health(Routes(app, "health"), health)
 
@@ -148,8 +148,8 @@ def make_app(
         about = f"{title}. Its routes: /openapi.json; is it ready: /readyz; its measurements: /metrics\n"
         return Response(about, media_type="text/plain")
 
-    app.add_middleware(_BodyLimit, limit=body_limit)
     app.add_middleware(OpenLimit, urgent=app.state.urgent)
+    app.add_middleware(_BodyLimit, limit=body_limit)  # before it: who sends no whole body takes no place
     generate = app.openapi
 
     def openapi() -> dict[str, Any]:

@@ -29,7 +29,7 @@ from fog_runtime.admission import BACKLOG, Admission, Visitor
 from fog_runtime.files import write_port_file
 from fog_runtime.http.gateway import BehindGateway
 from fog_runtime.http.link import CoreLink, FrontLink
-from fog_runtime.http.routes import answer_call
+from fog_runtime.http.routes import answer_call, rank_of
 from fog_runtime.machine import descriptors, signals
 
 NICENESS: Final = 5
@@ -37,7 +37,7 @@ NICENESS: Final = 5
 END_S: Final = 3.0
 """How long the front may take to end: open requests get 2 s."""
 BETWEEN_REQUESTS_S: Final = 60.0
-"""How long an answer may take to be sent, together with the next request's header."""
+"""How long an answer may take to be sent, together with the next request."""
 SAME_S: Final = 10.0
 """How often the server's own log repeats a line: whoever sends nonsense must not fill a disk."""
 
@@ -103,7 +103,9 @@ class Front:
         when the front ends by itself.
         """
         link = await FrontLink.over(self._link)
-        answering = asyncio.ensure_future(link.answer_calls(lambda route, data: answer_call(app, route, data)))
+        answering = asyncio.ensure_future(
+            link.answer_calls(lambda route, data: answer_call(app, route, data), lambda route: rank_of(app, route))
+        )
         try:
             await link.start()
             _log.info("listening", url=f"{self._scheme}://{self._host}:{self._port}", port=self._port)
@@ -126,7 +128,7 @@ def _behind(gateway: str, app: FastAPI) -> FastAPI:
 
 
 class _Connection(H11Protocol):
-    """A connection is a stranger's until the header of a request is complete, and again once that is answered."""
+    """A connection is a stranger's until a request is complete, and again once that is answered."""
 
     def __init__(self, visitor: Visitor, server: uvicorn.Server) -> None:
         super().__init__(server.config, server.server_state, server.lifespan.state)
@@ -135,7 +137,7 @@ class _Connection(H11Protocol):
     def handle_events(self) -> None:
         super().handle_events()
         begun: RequestResponseCycle | None = self.cycle  # whatever uvicorn's own type says
-        if begun is not None and not begun.response_complete:
+        if begun is not None and not begun.more_body and not begun.response_complete:
             self._visitor.admit()
 
     def on_response_complete(self) -> None:

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import asyncio
 import itertools
+from collections import deque
 from typing import TYPE_CHECKING, Final
 
 import msgspec
@@ -165,11 +166,37 @@ class FrontLink:
         """Let the front end; calls that are open are still answered."""
         await self._messages.write(Stop())
 
-    async def answer_calls(self, answer: Callable[[str, bytes], Awaitable[Response]]) -> None:
-        """Answer calls with `answer(route, arguments)`, many at a time, until the front ends."""
-        while (data := await self._messages.read()) is not None:
-            call = msgspec.msgpack.decode(data, type=Call)
-            task = asyncio.create_task(self._reply(call, answer))
+    async def answer_calls(
+        self, answer: Callable[[str, bytes], Awaitable[Response]], rank: Callable[[str], int] = lambda _: 0
+    ) -> None:
+        """Answer calls with `answer(route, arguments)`, many at a time, until the front ends.
+
+        Of those that wait to be begun, a route with a lower `rank` (0 to 2) comes before the others.
+        """
+        waiting: tuple[deque[Call], ...] = (deque(), deque(), deque())
+        came = asyncio.Event()
+        beginning = asyncio.create_task(self._begin_all(waiting, came, answer))
+        try:
+            while (data := await self._messages.read()) is not None:
+                call = msgspec.msgpack.decode(data, type=Call)
+                waiting[rank(call.route)].append(call)
+                came.set()
+        finally:
+            beginning.cancel()
+
+    async def _begin_all(
+        self,
+        waiting: tuple[deque[Call], ...],
+        came: asyncio.Event,
+        answer: Callable[[str, bytes], Awaitable[Response]],
+    ) -> None:
+        while True:
+            first = next((calls for calls in waiting if calls), None)
+            if first is None:
+                came.clear()
+                await came.wait()
+                continue
+            task = asyncio.create_task(self._reply(first.popleft(), answer))
             self._tasks.add(task)
             task.add_done_callback(self._tasks.discard)
             await asyncio.sleep(PAUSE_S)

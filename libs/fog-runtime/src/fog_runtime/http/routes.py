@@ -46,7 +46,7 @@ Handler = TypeVar("Handler", bound=Callable[..., Awaitable[object]])
 _ANSWERS: Final = {201: "The new record", 204: "Done", 503: "The answer while something is missing"}
 _SCHEMAS: Final = "#/components/schemas/{name}"
 ALWAYS_SERVED: Final = frozenset({"/healthz", "/readyz", "/metrics"})
-"""Routes that are served however many requests are open."""
+"""Routes that are served however many others are open."""
 _UNAVAILABLE: Final = "The service is started again, or serves too many requests: `Retry-After` says when to try again"
 
 
@@ -142,7 +142,7 @@ class Routes:
 
     def urgent(self, path: str) -> None:
         """Give requests to this path places of their own, which no other requests take (`fog_runtime.http.places`)."""
-        self._app.state.urgent.append(compile_path(path)[0])
+        self._app.state.urgent[path] = compile_path(path)[0]
 
     def get(self, path: str, **options: Any) -> Callable[[Handler], Handler]:
         """Add a route that reads."""
@@ -283,6 +283,12 @@ class Endpoint(NamedTuple):
     path: str
     arguments: type[msgspec.Struct]
     run: Callable[..., Awaitable[Response]]
+
+
+def rank_of(app: FastAPI, route: str) -> int:
+    """Return 0 for a route that comes before all others, 2 for one that comes after them, and 1 for these."""
+    path = route.partition(" ")[2]
+    return 0 if path in app.state.urgent else 2 if path in ALWAYS_SERVED else 1
 
 
 async def answer_call(app: FastAPI, route: str, arguments: bytes) -> Response:

@@ -55,6 +55,9 @@ _.get_disambiguator
 KernelLocator
 type_cells  # numba: a name that compiled signatures close over
 _.FACTORY  # bases, lidars, debounce rules and cost layers are found by their entry points
+_.add_to  # same: commands
+_.list_commands  # typer asks for them
+_.get_command
 _.SIGNATURE
 _.press_clean  # the emulated Roomba: tests press its button
 _.switch_on  # same, held while it is switched on

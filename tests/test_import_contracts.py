@@ -26,26 +26,12 @@ SOURCES = sorted({path.parent for path in ROOT.glob("*/src/*/__init__.py")} | {
 EDGES = {
     "fog_runtime",
     "fog_supervisor",
-    "fognav_experiments.comparison.agreement", "fognav_experiments.comparison.archive",
-    "fognav_experiments.comparison.publish", "fognav_experiments.comparison.records",
-    "fognav_experiments.comparison.repeated",
-    "fognav_experiments.comparison.report", "fognav_experiments.comparison.runner",
-    "fognav_experiments.comparison.trial", "fognav_experiments.cpu", "fognav_experiments.gaps",
-    "fognav_experiments.fleet", "fognav_experiments.hunt.draw", "fognav_experiments.hunt.play",
-    "fognav_experiments.hunt.runner", "fognav_experiments.hunt.shrink", "fognav_experiments.hunt.world",
-    "fognav_experiments.scenarios.description",
-    "fognav_experiments.scenarios.fleet_stage",
-    "fognav_experiments.scenarios.node_faults", "fognav_experiments.scenarios.stage",
-    "fognav_experiments.sensitivity.publish", "fognav_experiments.sensitivity.sources",
-    "fognav_experiments.sensitivity.sweep", "fognav_experiments.worker_pool",
-    "fognav_experiments.lockstep", "fognav_experiments.rigs", "fognav_experiments.smoothness",
     "fognav.__main__", "fognav.bench", "fognav.commands", "fognav.checkout", "fognav.checks", "fognav.demo.attempt",
     "fognav.demo.background", "fognav.demo.operator", "fognav.demo.options", "fognav.demo.placement",
     "fognav.demo.preparation", "fognav.demo.presence", "fognav.demo.report", "fognav.demo.run", "fognav.demo.scene",
-    "fognav.demo.servers", "fognav.demo.usage", "fognav.demo.view", "fognav.doctor", "fognav.film",
+    "fognav.demo.servers", "fognav.demo.usage", "fognav.demo.view", "fognav.doctor",
     "fognav.generated", "fognav.kernels", "fognav.node_code",
-    "fognav.hardware_drive",
-    "fognav.live_drive", "fognav.locking", "fognav.operate", "fognav.output", "fognav.page.app", "fognav.hosting",
+    "fognav.locking", "fognav.operate", "fognav.output", "fognav.page.app", "fognav.hosting",
     "fognav.programs",
     "fognav.pytest_progress", "fognav.recording", "fognav.localization", "fognav.map_picture", "fognav.mutation",
     "fognav.nodes.board_options", "fognav.nodes.on_broker", "fognav.nodes.provisioning", "fognav.nodes.simulated",
@@ -75,6 +61,9 @@ EDGES = {
     "fognav_sim.settings",
 }  # fmt: skip
 """What may touch the world: packages and modules of I/O, clocks, threads and processes."""
+
+LABORATORY = "fognav_experiments."
+"""Measures, and no system runs it: its modules are pure where the contract lists them, and may else do anything."""
 
 PURE_LIBRARIES = {
     "__future__", "abc", "binascii", "bisect", "collections", "contextlib", "dataclasses", "enum", "functools",
@@ -117,7 +106,8 @@ def covered(module: str, listed: set[str]) -> bool:
 
 def test_every_module_is_listed_as_pure_or_as_an_edge() -> None:
     pure = set(CONTRACTS["Cores touch no world"]["source_modules"])
-    undecided = [module for module in modules() if covered(module, pure) == covered(module, EDGES)]
+    divided = [module for module in modules() if not module.startswith(LABORATORY)]
+    undecided = [module for module in divided if covered(module, pure) == covered(module, EDGES)]
     assert undecided == [], (
         "each module is either listed in the contract 'Cores touch no world' (pyproject.toml) or in EDGES (here)"
     )
@@ -297,7 +287,7 @@ PLANTED = {
     "output imports the demonstration": ("cli/src/fognav/output.py", "fognav.demo.run", "fognav:"),
     "the demonstration's scene imports its run": ("cli/src/fognav/demo/scene.py", "fognav.demo.run", "demonstration:"),
     "processes import rigs": (
-        "experiments/src/fognav_experiments/processes.py", "fognav_experiments.rigs", "fognav-experiments:",
+        "experiments/src/fognav_experiments/processes.py", "fognav_experiments.rigs", "laboratory:",
     ),
     "a pose imports the localizer": (
         "robot-agent/src/robot_agent/localization/pose.py", "robot_agent.localization.localizer", "localization:",

@@ -11,8 +11,6 @@ from fognav import kernels, node_code, system
 from fognav.__main__ import app
 from fognav.commands import demo
 from fognav.nodes import simulated
-from fognav_experiments.comparison import runner
-from fognav_experiments.sensitivity import sweep
 from fognav_sim import firmware
 from fognav_sim.nodes import why_model
 
@@ -27,7 +25,7 @@ def no_work(monkeypatch: pytest.MonkeyPatch) -> None:
         raise ReachedError
 
     monkeypatch.setattr(kernels, "warm_cache", lambda _: None)
-    for module, name in ((demo, "run_demo"), (simulated, "run"), (runner, "run"), (sweep, "workers")):
+    for module, name in ((demo, "run_demo"), (simulated, "run")):
         monkeypatch.setattr(module, name, reached)
 
 
@@ -36,15 +34,12 @@ def no_work(monkeypatch: pytest.MonkeyPatch) -> None:
     [
         ["demo", "--headless", "--embedded"],
         ["node", "sim", "n1", "--broker", "mqtt://127.0.0.1:1"],
-        ["experiment", "--runs", "1"],
-        ["experiment", "sensitivity", "--areas", "none", "--routes", "1"],
     ],
 )
 def test_command_says_in_one_line_that_nodes_run_a_model_and_why(command, tmp_path: Path, monkeypatch) -> None:
-    out = ["--out", str(tmp_path / "out")] if command[0] == "experiment" else []
     for folder, lines in ((tmp_path, 1), (firmware.find_firmware(), 0)):
         monkeypatch.setenv("FOGNAV_FIRMWARE_DIR", str(folder))
-        done = CliRunner().invoke(app, [*command, *out])
+        done = CliRunner().invoke(app, command)
         assert isinstance(done.exception, ReachedError), done.output
         said = " ".join(done.output.split())
         assert (

@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 from typer.testing import CliRunner
 
-from fognav.commands.experiment import experiment_app
+from fognav_experiments.commands.experiment import experiment_app
 from fognav_experiments.comparison.draws import ExperimentSpec, RouteSpec, draw
 from fognav_experiments.comparison.records import Folder
 

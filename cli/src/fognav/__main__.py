@@ -20,8 +20,7 @@ from fognav.commands.bench import bench_app
 from fognav.commands.ca import ca_app
 from fognav.commands.channels import channels_command
 from fognav.commands.coverage import site_coverage
-from fognav.commands.experiment import experiment_app
-from fognav.commands.hunt import hunt_command
+from fognav.commands.installed import Commands
 from fognav.commands.localize import localize_command
 from fognav.commands.map import map_app
 from fognav.commands.node import node_app
@@ -53,6 +52,7 @@ from fognav_sim import emulators
 
 app = typer.Typer(
     name="fognav",
+    cls=Commands,
     help="Keep a small indoor robot out of danger that it can't see yet.",
     no_args_is_help=True,
     add_completion=False,
@@ -72,8 +72,6 @@ app.add_typer(ca_app, name="ca")
 app.add_typer(map_app, name="map")
 app.add_typer(store_app, name="store")
 app.add_typer(bench_app, name="bench")
-app.add_typer(experiment_app, name="experiment")
-app.command("hunt", epilog="Example: fognav hunt --minutes 10 --seed 1 --jobs 2")(hunt_command)
 app.command("localize", epilog="Example: fognav localize --map floor.yaml --log drive.log.gz --scans even --json")(
     localize_command
 )

@@ -16,11 +16,11 @@ import pytest
 from fog_contracts import channels as ch
 from fog_contracts.messages import Pose, RobotGoal
 from fog_runtime.configuration.site import load_site
-from fognav.hardware_drive import HardwareRun, Terminal, drive_hardware
 from fognav.operate.outcome import Outcome
 from fognav.output import FailedError, WrongUseError
 from fognav_experiments.comparison.draws import RouteDraw, RouteSpec
 from fognav_experiments.comparison.guided import start_of
+from fognav_experiments.comparison.hardware_drive import HardwareRun, Terminal, drive_hardware
 from fognav_experiments.comparison.records import Folder
 from fognav_experiments.comparison.runner import Task
 from fognav_experiments.rigs import System

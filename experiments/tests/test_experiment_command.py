@@ -9,14 +9,17 @@ import tomllib
 import pytest
 from typer.testing import CliRunner
 
-from fognav import checkout, hardware_drive
-from fognav.commands import experiment
-from fognav_experiments.comparison import archive, runner
+from fognav import checkout, kernels
+from fognav.__main__ import app
+from fognav_experiments.commands import experiment
+from fognav_experiments.comparison import archive, hardware_drive, runner
 from fognav_experiments.comparison.driven import ComparedDrive
 from fognav_experiments.comparison.measured import MeasuredDrive
 from fognav_experiments.comparison.records import Folder
 from fognav_experiments.scenarios import stage
 from fognav_experiments.scenarios.fleet_stage import FleetResult
+from fognav_experiments.sensitivity import sweep
+from fognav_sim import firmware
 
 OUT = ["--out", "unused"]
 
@@ -147,3 +150,26 @@ def test_scenarios_that_are_ended_early_leave_the_table_of_those_that_were_playe
     page = table.read_text("utf-8")
     assert "| reached | 9.9 | 37 | yes" in page
     assert "wifi-gap-5s" not in page
+
+
+class ReachedError(Exception):
+    """The command went on to its work."""
+
+
+@pytest.mark.parametrize(
+    "arguments", [["--runs", "1"], ["sensitivity", "--areas", "none", "--routes", "1"]], ids=["drives", "sensitivity"]
+)
+def test_drives_say_in_one_line_that_nodes_run_a_model_and_why(arguments, tmp_path, monkeypatch):
+    def reached(*_, **__):
+        raise ReachedError
+
+    monkeypatch.setattr(kernels, "warm_cache", lambda _: None)
+    for module, name in ((runner, "run"), (sweep, "workers")):
+        monkeypatch.setattr(module, name, reached)
+    for folder, lines in ((tmp_path, 1), (firmware.find_firmware(), 0)):
+        monkeypatch.setenv("FOGNAV_FIRMWARE_DIR", str(folder))
+        done = CliRunner().invoke(app, ["experiment", *arguments, "--out", str(tmp_path / "out")])
+        assert isinstance(done.exception, ReachedError), done.output
+        said = " ".join(done.output.split())
+        reason = "simulated sensor nodes run a model in Python, not the firmware: there are no sources"
+        assert said.count(reason) == lines

@@ -14,6 +14,11 @@ if TYPE_CHECKING:
     from fognav_experiments.hunt.play import Hunted
 
 
+def add_to(app: typer.Typer) -> None:
+    """Add the command to `fognav`."""
+    app.command("hunt", epilog="Example: fognav hunt --minutes 10 --seed 1 --jobs 2")(hunt_command)
+
+
 def hunt_command(  # noqa: PLR0913  # each option is an argument
     *,
     minutes: Annotated[float, typer.Option("--minutes", metavar="M", min=0.0, help="Begin drives for so long.")] = 1.0,

@@ -8,9 +8,9 @@ import pytest
 from PIL import Image
 
 from fog_runtime.configuration.site import load_site
-from fognav.film import FRAME_S, Film, UnfilmedDriveError
 from fognav_experiments.comparison import runner
 from fognav_experiments.comparison.draws import draw
+from fognav_experiments.comparison.film import FRAME_S, Film, UnfilmedDriveError
 from fognav_experiments.comparison.records import Record
 from fognav_experiments.comparison.timeline import Timeline
 

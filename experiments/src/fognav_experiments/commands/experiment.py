@@ -21,8 +21,8 @@ if TYPE_CHECKING:
 
     from fog_contracts.messages import ProfileName
     from fog_runtime.configuration.site import LoadedSite
-    from fognav.live_drive import LiveOptions
     from fognav_experiments.comparison.draws import RouteDraw
+    from fognav_experiments.comparison.live_drive import LiveOptions
     from fognav_experiments.comparison.measured import MeasuredDrive
     from fognav_experiments.comparison.records import DriveFiles, Folder, Record
     from fognav_experiments.comparison.runner import Task
@@ -32,6 +32,12 @@ if TYPE_CHECKING:
     D = TypeVar("D", Record, MeasuredDrive, SweptDrive)
 
 experiment_app = typer.Typer(help="Compare setups as the thesis did, and play scenarios.")
+
+
+def add_to(app: typer.Typer) -> None:
+    """Add the command to `fognav`."""
+    app.add_typer(experiment_app, name="experiment")
+
 
 _NOT_SWEPT: Final = "none"
 _SETUPS: Final[tuple[ProfileName, ...]] = ("default", "full", "fog")
@@ -78,8 +84,8 @@ def experiment_command(  # noqa: PLR0913  # each option is an argument
         return
     from fog_runtime.configuration.site import SiteError, load_site  # noqa: PLC0415  # keeps the other commands fast
     from fognav.bench import machine  # noqa: PLC0415  # same
-    from fognav.live_drive import LiveOptions  # noqa: PLC0415  # same
     from fognav_experiments.comparison import archive, runner  # noqa: PLC0415  # same
+    from fognav_experiments.comparison.live_drive import LiveOptions  # noqa: PLC0415  # same
     from fognav_experiments.comparison.records import Folder, FolderError  # noqa: PLC0415  # same
 
     with exit_codes():
@@ -121,7 +127,7 @@ def _prepare() -> None:
 
 def _drive_live(site: LoadedSite, asked: Sequence[Task], folder: Folder, options: LiveOptions) -> int:
     """Drive by real processes; return how many drives failed."""
-    from fognav.live_drive import live_drives  # noqa: PLC0415  # keeps the other commands fast
+    from fognav_experiments.comparison.live_drive import live_drives  # noqa: PLC0415  # keeps the other commands fast
 
     _prepare()
     files, names = folder.measured("live"), [options.name(task) for task in asked]
@@ -132,7 +138,7 @@ def _drive_real_robot(
     site: LoadedSite, asked: Sequence[Task], folder: Folder, address: str | None, robot: str | None
 ) -> int:
     """Drive a robot of a fog node, with a person at this terminal; return how many drives failed."""
-    from fognav.hardware_drive import drive_hardware  # noqa: PLC0415  # zenoh: keeps the other commands fast
+    from fognav_experiments.comparison.hardware_drive import drive_hardware  # noqa: PLC0415  # zenoh: keeps the other commands fast
 
     files = folder.measured("hardware")
     drive_hardware(site, asked, files, find_fog(address), robot, checkout.revision(), print_line)
@@ -269,8 +275,8 @@ def film_command(
     The drives are those of the records that `fognav experiment --out DIR` wrote; nothing is driven again.
     """
     from fog_runtime.configuration.site import SiteError, load_site  # noqa: PLC0415  # keeps the other commands fast
-    from fognav.film import Film, UnfilmedDriveError  # noqa: PLC0415  # same
     from fognav_experiments.comparison import runner  # noqa: PLC0415  # same
+    from fognav_experiments.comparison.film import Film, UnfilmedDriveError  # noqa: PLC0415  # same
     from fognav_experiments.comparison.records import FolderError  # noqa: PLC0415  # same
 
     with exit_codes():

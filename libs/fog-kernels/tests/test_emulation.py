@@ -8,7 +8,19 @@ from typing import TYPE_CHECKING
 import numpy as np
 import pytest
 
-from fog_kernels.emulation import FULL_CIRCLE_Q6, disturb, edge_ranges, encode_nodes, nearest_occupied, node_angles
+from fog_kernels.emulation import (
+    FULL_CIRCLE_Q6,
+    Beams,
+    Drawn,
+    RecordedErrors,
+    disturb,
+    disturb_as_recorded,
+    edge_ranges,
+    encode_nodes,
+    nearest_occupied,
+    node_angles,
+    set_in_sectors,
+)
 from fog_kernels.lidar import decode_nodes
 
 if TYPE_CHECKING:
@@ -47,6 +59,51 @@ def test_errors_are_those_of_the_drawn_numbers() -> None:
     returned = (expected >= 0.15) & (expected <= 12.0) & (uniform >= 0.2)
     assert 0 < returned.sum() < 500
     assert np.array_equal(measured, np.where(returned, expected, np.nan), equal_nan=True)
+
+
+RECORDED = RecordedErrors(
+    noise=np.array(((0.0, 0.0016), (2.0, 0.0018), (2.5, 0.0030), (12.0, 0.054))),
+    loss=np.array(((0.0, 0.20), (0.45, 0.05), (4.0, 0.01), (12.0, 0.06))),
+    tail=0.15,
+    tail_sigmas=4.0,
+    outliers=0.1,
+    low=0.15,
+    high=12.0,
+)
+
+
+def test_errors_as_recorded_are_those_of_numpy() -> None:
+    generator, n = np.random.default_rng(4), 4000
+    patches, dead = np.array(((1.0, 1.0, 4.0, 0.3), (-3.0, 2.0, 5.0, 0.5))), np.array(((-1.0, -0.5), (3.0, -3.0)))
+    true = np.where(generator.random(n) < 0.1, np.inf, generator.uniform(0.0, 14.0, n))
+    true[:4] = (0.0, 2.0, 2.5, 12.0)
+    angle = generator.uniform(-math.pi, math.pi, n)
+    beams = Beams(angle, np.cos(angle + 0.7), np.sin(angle + 0.7))
+    drawn = Drawn(generator.random(n), generator.standard_normal(n), generator.random((5, n)))
+    measured = true.copy()
+    disturb_as_recorded(measured, beams, drawn, RECORDED, (0.3, -0.2), patches, dead)
+
+    known = np.where(np.isfinite(true), true, 12.0)
+    sigma = np.interp(known, *RECORDED.noise.T) * np.where(drawn.tail < 0.15, 4.0, 1.0)
+    expected = np.where(drawn.uniform[0] < 0.1, 0.15 + (12.0 - 0.15) * drawn.uniform[1], true + sigma * drawn.normal)
+    lost = drawn.uniform[2] < np.interp(known, *RECORDED.loss.T)
+    for (x, y, radius, returned), uniform in zip(patches, drawn.uniform[3:], strict=True):
+        inside = np.hypot(0.3 + known * beams.cos - x, -0.2 + known * beams.sin - y) < radius
+        lost |= inside & (uniform >= returned)
+    for begin, end in dead:
+        lost |= (angle - begin) % math.tau <= (end - begin) % math.tau
+    seen = (expected >= 0.15) & (expected <= 12.0) & ~lost
+    assert 0 < seen.sum() < n
+    assert np.array_equal(measured, np.where(seen, expected, np.nan), equal_nan=True)
+
+
+def test_ranges_in_sectors_are_set() -> None:
+    angle = np.linspace(-7.0, 7.0, 1000)
+    sectors = np.array(((-1.0, -0.5), (3.0, -3.0), (6.0, 6.2)))
+    measured = np.ones(angle.size)
+    set_in_sectors(measured, angle, sectors, 0.16)
+    inside = [(angle - begin) % math.tau <= (end - begin) % math.tau for begin, end in sectors]
+    assert np.array_equal(measured, np.where(np.any(inside, axis=0), 0.16, 1.0))
 
 
 def _edges_by_numpy(
@@ -96,6 +153,11 @@ def test_arrays_that_do_not_fit_are_refused() -> None:
     one, two = np.zeros(1), np.zeros(2)
     with pytest.raises(ValueError, match="n ranges and errors"):
         disturb(one, two, one, sigma=0.0, share=0.0, dropout=0.0, low=0.0, high=1.0)
+    with pytest.raises(ValueError, match="n ranges and angles"):
+        set_in_sectors(one, two, np.zeros((1, 2)), 0.0)
+    drawn = Drawn(one, one, np.zeros((2, 1)))
+    with pytest.raises(ValueError, match="1 ranges and 0 patches do not fit"):
+        disturb_as_recorded(one, Beams(one, one, one), drawn, RECORDED, (0.0, 0.0), np.zeros((0, 4)), np.zeros((0, 2)))
     with pytest.raises(ValueError, match="n angles, starts and ranges"):
         encode_nodes(np.zeros(1, np.int64), np.zeros(1, np.bool_), two, 0.1, 1.0)
     with pytest.raises(ValueError, match="k edges and lengths"):

@@ -124,7 +124,9 @@ class Floor:
     def obstacle_ranges(
         self, x: float, y: float, directions: NDArray[np.float64], reach: float
     ) -> Iterator[tuple[SimObstacle, NDArray[np.float64], NDArray[np.float64]]]:
-        """Yield each obstacle with the range (m; infinite for none) and the incidence (rad) of each ray on it.
+        """Yield each obstacle with the range (m; infinite for none) of each ray, and how square the ray meets it.
+
+        That is the sine of the angle between ray and edge, the cosine of the angle of incidence.
 
         Those that a sensor of this `reach` (m) can't measure are left out.
         """
@@ -133,8 +135,7 @@ class Floor:
             middle_x, middle_y, radius = self._circles[name]
             if math.hypot(middle_x - x, middle_y - y) - radius <= reach + _REACH_MARGIN_M:
                 waves = waves or (np.cos(directions), np.sin(directions))
-                ranges, squareness = edge_ranges(*self._edges[name], x, y, *waves)
-                yield obstacle, ranges, np.arccos(squareness)
+                yield obstacle, *edge_ranges(*self._edges[name], x, y, *waves)
 
 
 def _circle_around(points: NDArray[np.float64]) -> tuple[float, float, float]:

@@ -7,23 +7,27 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from functools import cached_property
 from typing import TYPE_CHECKING, Final
 
 import numpy as np
+
+from fog_kernels.emulation import Beams, Drawn, RecordedErrors, disturb_as_recorded
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
 LIDAR_MIN_M: Final = 0.15
 LIDAR_MAX_M: Final = 12.0
-_LOSS_RANGES_M: Final = (0.0, 0.3, 0.45, 1.0, 4.0, 8.0, 12.0)
-_LOSS: Final = (0.20, 0.15, 0.05, 0.01, 0.01, 0.03, 0.06)
-"""Share of single measurements without a return, by range."""
-_NOISE_RANGES_M: Final = (0.0, 2.0, 2.5, 12.0)
-_NOISE_M: Final = (0.0016, 0.0018, 0.0030, 0.054)
-_TAIL: Final = 0.15
-_TAIL_SIGMAS: Final = 4.0
-_OUTLIERS: Final = 4e-4
+_ERRORS: Final = RecordedErrors(
+    noise=np.array(((0.0, 0.0016), (2.0, 0.0018), (2.5, 0.0030), (12.0, 0.054))),
+    loss=np.array(((0.0, 0.20), (0.3, 0.15), (0.45, 0.05), (1.0, 0.01), (4.0, 0.01), (8.0, 0.03), (12.0, 0.06))),
+    tail=0.15,
+    tail_sigmas=4.0,
+    outliers=4e-4,
+    low=LIDAR_MIN_M,
+    high=LIDAR_MAX_M,
+)
 _FLICKER_RAD: Final = math.radians(2.0)
 
 
@@ -39,6 +43,14 @@ class LidarFaults:
     patches: tuple[tuple[float, float, float, float], ...] = ()
     dead: tuple[tuple[float, float], ...] = ()
 
+    @cached_property
+    def _patches(self) -> NDArray[np.float64]:
+        return np.array(self.patches).reshape(-1, 4)
+
+    @cached_property
+    def _dead(self) -> NDArray[np.float64]:
+        return np.array(self.dead).reshape(-1, 2)
+
     def disturb(
         self,
         ranges: NDArray[np.float64],
@@ -46,23 +58,18 @@ class LidarFaults:
         place: tuple[float, float],
         directions: NDArray[np.float64],
         generator: np.random.Generator,
-    ) -> NDArray[np.float64]:
-        """Return what is measured of these true ranges (m), nan for no return.
+    ) -> None:
+        """Turn these true ranges (m) into what is measured of them, nan for no return.
 
         `angles` are those of the beams in the lidar's frame, `directions` those on the floor (rad); it is at `place`.
         """
-        finite = np.where(np.isfinite(ranges), ranges, LIDAR_MAX_M)
-        sigma = np.interp(finite, _NOISE_RANGES_M, _NOISE_M)
-        sigma = np.where(generator.random(ranges.size) < _TAIL, _TAIL_SIGMAS * sigma, sigma)
-        measured = ranges + sigma * generator.standard_normal(ranges.size)
-        outliers = generator.random(ranges.size) < _OUTLIERS
-        measured = np.where(outliers, generator.uniform(LIDAR_MIN_M, LIDAR_MAX_M, ranges.size), measured)
-        lost = generator.random(ranges.size) < np.interp(finite, _LOSS_RANGES_M, _LOSS)
-        end_x, end_y = place[0] + finite * np.cos(directions), place[1] + finite * np.sin(directions)
-        for x, y, radius, returned in self.patches:
-            lost |= (np.hypot(end_x - x, end_y - y) < radius) & (generator.random(ranges.size) >= returned)
-        for begin, end in self.dead:
-            first, last = np.array((begin, end)) + _FLICKER_RAD * generator.standard_normal(2)
-            lost |= (angles - first) % math.tau <= (last - first) % math.tau
-        seen = (measured >= LIDAR_MIN_M) & (measured <= LIDAR_MAX_M) & ~lost
-        return np.where(seen, measured, np.nan)
+        drawn = Drawn(
+            generator.random(ranges.size),
+            generator.standard_normal(ranges.size),
+            generator.random((3 + len(self.patches), ranges.size)),
+        )
+        dead = self._dead
+        if dead.size:
+            dead = dead + _FLICKER_RAD * generator.standard_normal(dead.shape)
+        beams = Beams(angles, np.cos(directions), np.sin(directions))
+        disturb_as_recorded(ranges, beams, drawn, _ERRORS, place, self._patches, dead)

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from functools import cached_property
 from typing import TYPE_CHECKING, Final, NamedTuple, Self
 
 import numpy as np
@@ -104,6 +105,11 @@ class LidarPlace:
     mirrored: bool = False
     posts: tuple[tuple[float, float], ...] = ()
 
+    @cached_property
+    def sectors(self) -> NDArray[np.float64]:
+        """The posts as float64[n, 2]."""
+        return np.array(self.posts).reshape(-1, 2)
+
     @classmethod
     def of(cls, mounted: LidarSettings) -> Self:
         """Return where a robot's settings say that it is."""
@@ -133,7 +139,8 @@ def measure_lidar(
         if obstacle.height >= LIDAR_HEIGHT_M:
             ranges = np.minimum(ranges, seen)
     if noise.lidar is not None:
-        return noise.lidar.disturb(ranges, angles, (x, y), directions, generator)
+        noise.lidar.disturb(ranges, angles, (x, y), directions, generator)
+        return ranges
     disturb(
         ranges,
         generator.standard_normal(ranges.size),
@@ -222,12 +229,12 @@ class Sonars:
 
     def _search_obstacles(self, fan: _Fan, height: float) -> _Heard:
         hidden, standing = fan.walls, []
-        for obstacle, ranges, incidence in self._floor.obstacle_ranges(fan.x, fan.y, fan.directions, SONAR_MAX_M):
+        for obstacle, ranges, squareness in self._floor.obstacle_ranges(fan.x, fan.y, fan.directions, SONAR_MAX_M):
             met = np.where(_in_cone(obstacle.height, height, ranges), ranges, np.inf)
             if self._floor.is_soft(obstacle.id):
                 hidden = np.minimum(hidden, met)
             else:
-                standing.append(np.where(incidence <= SONAR_MAX_INCIDENCE, met, np.inf))
+                standing.append(np.where(np.arccos(squareness) <= SONAR_MAX_INCIDENCE, met, np.inf))
         # A wall hides everything behind it, whether it echoes or not; so does what is soft.
         nearest = float(np.min(np.where(fan.walls <= hidden, fan.echoes, np.inf)))
         for met in standing:

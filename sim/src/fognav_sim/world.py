@@ -14,6 +14,7 @@ import numpy as np
 
 from fog_contracts.geometry import contains_point, distance_to_polygon, normalized_polygon
 from fog_contracts.messages import SimObstacle, SimTruth
+from fog_kernels.emulation import set_in_sectors
 from fognav_sim.floor import MAX_CLEARANCE_M
 from fognav_sim.sensors import Deception, LidarPlace, Noise, Robot, Sonars, measure_lidar
 
@@ -158,7 +159,7 @@ class World:
     @property
     def over_cliff(self) -> bool:
         """Whether a cliff sensor, one of four along the robot's front, is over a hole."""
-        return any(
+        return bool(self.holes) and any(
             contains_point(hole, *self._ahead(angle)) for hole in self.holes.values() for angle in _CLIFF_SENSORS_RAD
         )
 
@@ -290,10 +291,9 @@ class World:
         seen_along = -angles if place.mirrored else angles
         ranges = measure_lidar(self._floor, place.pose(self.pose), seen_along, self.noise, self._rng)
         if self.no_return_rad is not None:
-            begin, end = self.no_return_rad
-            ranges[(angles - begin) % math.tau <= (end - begin) % math.tau] = np.nan
-        for begin, end in place.posts:
-            ranges[(seen_along + place.yaw - begin) % math.tau <= (end - begin) % math.tau] = _POST_M
+            set_in_sectors(ranges, angles, np.array((self.no_return_rad,)), math.nan)
+        if place.posts:
+            set_in_sectors(ranges, seen_along + place.yaw, place.sectors, _POST_M)
         return ranges
 
     def sonar(self, node: NodeSite, index: int) -> float | None:

@@ -30,6 +30,43 @@ _BOOL_FLAT = types.Array(boolean, 1, "C", readonly=True)
 _I64_FLAT = types.Array(types.int64, 1, "C", readonly=True)
 
 
+class RecordedErrors(NamedTuple):
+    """How a lidar of which there are recordings errs.
+
+    noise, loss: float64[n, 2], ranges (m) with the standard deviation there (m), and with the share of measurements
+    that don't return. Of all errors the share `tail` is `tail_sigmas` times as large; `outliers`: share of measurements
+    that give any range from `low` to `high` (m), which are its limits.
+    """
+
+    noise: NDArray[np.float64]
+    loss: NDArray[np.float64]
+    tail: float
+    tail_sigmas: float
+    outliers: float
+    low: float
+    high: float
+
+
+class Beams(NamedTuple):
+    """A lidar's n beams: float64[n] each. angle: rad, in the lidar's frame. cos, sin: of the direction on the floor."""
+
+    angle: NDArray[np.float64]
+    cos: NDArray[np.float64]
+    sin: NDArray[np.float64]
+
+
+class Drawn(NamedTuple):
+    """Numbers drawn for n beams.
+
+    tail, normal: float64[n], one beneath 1 and one of the standard normal distribution. uniform: float64[3 + p, n],
+    beneath 1: whether it is an outlier, where, whether it is lost, and whether each of p patches swallows it.
+    """
+
+    tail: NDArray[np.float64]
+    normal: NDArray[np.float64]
+    uniform: NDArray[np.float64]
+
+
 class NodeAngles(NamedTuple):
     """Where a lidar's head stands at n measurements.
 
@@ -85,6 +122,99 @@ def _disturb(
         known = ranges[i] if math.isfinite(ranges[i]) else 0.0
         measured = ranges[i] + (sigma + share * known) * normal[i]
         ranges[i] = measured if low <= measured <= high and not uniform[i] < dropout else math.nan
+
+
+_helper = njit(inline="always", cache=True)
+"""As in `clearance`: small functions that are compiled into the kernels that use them."""
+
+
+@_helper
+def _interpolated(x: float, table: Any) -> float:
+    """Return what `numpy.interp` does between the rows (x, y) of a table."""
+    k = 0
+    while k < table.shape[0] and x >= table[k, 0]:
+        k += 1
+    y: float = table[max(k - 1, 0), 1]
+    if 0 < k < table.shape[0]:
+        slope = (table[k, 1] - y) / (table[k, 0] - table[k - 1, 0])
+        y += slope * (x - table[k - 1, 0])
+    return y
+
+
+@_helper
+def _in_sector(angle: float, begin: float, end: float) -> bool:
+    return (angle - begin) % math.tau <= (end - begin) % math.tau
+
+
+@njit(void(_arrays.F64_OUT, _arrays.F64_FLAT, _arrays.F64_GRID, float64), cache=True, nogil=True)
+def _set_in_sectors(ranges: Any, angles: Any, sectors: Any, value: float) -> None:
+    for i in range(ranges.size):
+        for k in range(sectors.shape[0]):
+            if _in_sector(angles[i], sectors[k, 0], sectors[k, 1]):
+                ranges[i] = value
+
+
+@njit(
+    void(
+        _arrays.F64_OUT,
+        _arrays.F64_FLAT,
+        _arrays.F64_FLAT,
+        _arrays.F64_FLAT,
+        _arrays.F64_FLAT,
+        _arrays.F64_FLAT,
+        _arrays.F64_GRID,
+        _arrays.F64_GRID,
+        _arrays.F64_GRID,
+        float64,
+        float64,
+        float64,
+        float64,
+        float64,
+        float64,
+        float64,
+        _arrays.F64_GRID,
+        _arrays.F64_GRID,
+    ),
+    cache=True,
+    nogil=True,
+)
+def _disturb_as_recorded(
+    ranges: Any,
+    angles: Any,
+    cos: Any,
+    sin: Any,
+    tail: Any,
+    normal: Any,
+    uniform: Any,
+    noise: Any,
+    loss: Any,
+    tail_share: float,
+    tail_sigmas: float,
+    outliers: float,
+    low: float,
+    high: float,
+    x: float,
+    y: float,
+    patches: Any,
+    dead: Any,
+) -> None:
+    for i in range(ranges.size):
+        known = ranges[i] if math.isfinite(ranges[i]) else high
+        sigma = _interpolated(known, noise)
+        if tail[i] < tail_share:
+            sigma *= tail_sigmas
+        measured = ranges[i] + sigma * normal[i]
+        if uniform[0, i] < outliers:
+            measured = low + (high - low) * uniform[1, i]
+        lost = uniform[2, i] < _interpolated(known, loss)
+        end_x = x + known * cos[i]
+        end_y = y + known * sin[i]
+        for k in range(patches.shape[0]):
+            if math.hypot(end_x - patches[k, 0], end_y - patches[k, 1]) < patches[k, 2]:
+                lost = lost or uniform[3 + k, i] >= patches[k, 3]
+        for k in range(dead.shape[0]):
+            lost = lost or _in_sector(angles[i], dead[k, 0], dead[k, 1])
+        ranges[i] = measured if low <= measured <= high and not lost else math.nan
 
 
 @njit(
@@ -202,6 +332,43 @@ def disturb(
     if not ranges.shape == normal.shape == uniform.shape:
         raise ValueError(f"n ranges and errors, not {ranges.shape}, {normal.shape} and {uniform.shape}")
     _disturb(ranges, normal, uniform, sigma, share, dropout, low, high)
+
+
+def disturb_as_recorded(
+    ranges: NDArray[np.float64],
+    beams: Beams,
+    drawn: Drawn,
+    errors: RecordedErrors,
+    place: tuple[float, float],
+    patches: NDArray[np.float64],
+    dead: NDArray[np.float64],
+) -> None:
+    """Add errors as recorded to the ranges of a lidar at `place` (m; float64[n]), in place; nan where it measures none.
+
+    patches: float64[p, 4], x, y, radius (m) of what returns a beam with the fourth one's probability only. dead:
+    float64[d, 2], sectors (from, to; rad, counter-clockwise) of beams that don't return. Raises ValueError for arrays
+    that do not fit.
+    """
+    n, p = ranges.size, len(patches)
+    shapes = {values.shape for values in (*beams, drawn.tail, drawn.normal)}
+    if shapes != {(n,)} or drawn.uniform.shape != (3 + p, n) or patches.shape != (p, 4) or dead.shape[1:] != (2,):
+        raise ValueError(f"{n} ranges and {p} patches do not fit beams, drawn numbers or sectors")
+    noise, loss, tail, tail_sigmas, outliers, low, high = errors
+    _disturb_as_recorded(
+        ranges, *beams, *drawn, noise, loss, tail, tail_sigmas, outliers, low, high, *place, patches, dead
+    )
+
+
+def set_in_sectors(
+    ranges: NDArray[np.float64], angles: NDArray[np.float64], sectors: NDArray[np.float64], value: float
+) -> None:
+    """Set the ranges (float64[n]), in place, whose angles (rad) lie in sectors (from, to; counter-clockwise).
+
+    sectors: float64[k, 2], rad. Raises ValueError for arrays that do not fit.
+    """
+    if ranges.shape != angles.shape or sectors.shape[1:] != (2,):
+        raise ValueError(f"n ranges and angles, k sectors, not {ranges.shape}, {angles.shape} and {sectors.shape}")
+    _set_in_sectors(ranges, angles, sectors, value)
 
 
 def edge_ranges(

@@ -10,7 +10,7 @@ import math
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numba import float64, njit, void
+from numba import boolean, float64, njit, void
 
 from fog_kernels import _arrays
 
@@ -78,6 +78,22 @@ def _cast(occupied: Any, x: float, y: float, angles: Any, reach: float, out: Any
                     break
 
 
+@njit(
+    boolean(_arrays.U8_GRID, float64, float64, _arrays.F64_FLAT, float64, float64, _arrays.F64_OUT),
+    cache=True,
+    nogil=True,
+)
+def _cast_metres(occupied: Any, x: float, y: float, angles: Any, reach: float, resolution: float, out: Any) -> bool:
+    """Write the ranges in metres; return False for angles that aren't finite."""
+    for i in range(angles.size):
+        if not math.isfinite(angles[i]):
+            return False
+    _cast(occupied, x, y, angles, reach, out)
+    for i in range(out.size):
+        out[i] *= resolution
+    return True
+
+
 def cast(
     occupied: NDArray[np.bool_ | np.uint8],
     resolution: float,
@@ -98,9 +114,9 @@ def cast(
     resolution = _arrays.positive(resolution, "resolution")
     directions = _arrays.vector(angles, "angles")
     start = ((float(x) - origin_x) / resolution, (float(y) - origin_y) / resolution)
-    if not (all(map(math.isfinite, start)) and np.isfinite(directions).all()):
-        raise ValueError("x, y, origin and angles must be finite")
+    reach = _arrays.positive(max_range, "max_range") / resolution
     out = np.empty(directions.size)
-    _cast(cells, start[0], start[1], directions, _arrays.positive(max_range, "max_range") / resolution, out)
-    out *= resolution
+    finite = math.isfinite(start[0]) and math.isfinite(start[1])
+    if not (finite and _cast_metres(cells, *start, directions, reach, resolution, out)):
+        raise ValueError("x, y, origin and angles must be finite")
     return out

@@ -158,13 +158,21 @@ class DiffDriveEmulator:
 
 
 def crc16(data: bytes) -> int:
-    """CRC-16, polynomial 0x1021, initial value 0xFFFF, bit by bit."""
+    """CRC-16, polynomial 0x1021, initial value 0xFFFF."""
     crc = 0xFFFF
     for byte in data:
-        crc ^= byte << 8
-        for _ in range(8):
-            crc = ((crc << 1) ^ 0x1021 if crc & 0x8000 else crc << 1) & 0xFFFF
+        crc = (crc << 8 & 0xFF00) ^ _CRC16[crc >> 8 ^ byte]
     return crc
+
+
+def _crc16_of_byte(byte: int) -> int:
+    crc = byte << 8
+    for _ in range(8):
+        crc = ((crc << 1) ^ 0x1021 if crc & 0x8000 else crc << 1) & 0xFFFF
+    return crc
+
+
+_CRC16: Final = tuple(map(_crc16_of_byte, range(256)))
 
 
 def _whole(text: str) -> int | None:

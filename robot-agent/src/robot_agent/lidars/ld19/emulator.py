@@ -7,6 +7,7 @@ revolutions have their samples at the same angles.
 from __future__ import annotations
 
 import math
+import struct
 from collections import deque
 from collections.abc import Callable
 from typing import TYPE_CHECKING, Final
@@ -29,6 +30,7 @@ _PACKET_S: Final = _SAMPLES / SAMPLES_PER_S
 # After a pause of the simulation, missed packets are not sent in a burst.
 _CATCH_UP_S: Final = 0.5
 _REVOLUTIONS_MAX: Final = 5
+_BODY: Final = struct.Struct("<BBHH" + _SAMPLES * "HB" + "HH")
 # Packets per call of the measuring function: 11 ms.
 _CHUNK: Final = 4
 
@@ -92,41 +94,41 @@ class Ld19Emulator:
         angles = (starts[:, None] + span * np.arange(_SAMPLES) / (_SAMPLES - 1)) % 36_000.0
         counter_clockwise = np.deg2rad(-angles.reshape(-1) / 100.0)
         ranges = np.asarray(self._measure((counter_clockwise + math.pi) % math.tau - math.pi, now), np.float64)
-        returned = np.isfinite(ranges) & (ranges >= RANGE_MIN_M) & (ranges <= RANGE_MAX_M)
-        millimetres = np.where(returned, np.rint(np.where(returned, ranges, 0.0) * 1000.0), 0.0).astype(int)
-        strength = np.where(returned, np.clip(240.0 - 12.0 * np.where(returned, ranges, 0.0), 0.0, 255.0), 0.0).astype(
-            int
-        )
-        packets = []
-        for number in range(count):
-            part = slice(number * _SAMPLES, (number + 1) * _SAMPLES)
-            start = int(starts[number])
-            samples = list(zip(millimetres[part].tolist(), strength[part].tolist(), strict=True))
-            packets.append(self._packet(start, (start + span) % 36_000, samples))
-        return packets
+        returned = (ranges >= RANGE_MIN_M) & (ranges <= RANGE_MAX_M)
+        known = np.where(returned, ranges, 0.0)
+        strength = np.where(returned, 240.0 - 12.0 * known, 0.0)
+        samples = np.column_stack((np.rint(known * 1000.0), strength)).astype(int).reshape(count, -1).tolist()
+        return [
+            self._packet(start, (start + span) % 36_000, part)
+            for start, part in zip(starts.astype(int).tolist(), samples, strict=True)
+        ]
 
-    def _packet(self, start: int, end: int, samples: list[tuple[int, int]]) -> bytes:
-        body = bytearray((0x54, 0x2C))
-        body += round(SCANS_PER_S * 360.0).to_bytes(2, "little") + start.to_bytes(2, "little")
-        for millimetres, strength in samples:
-            body += millimetres.to_bytes(2, "little") + bytes((strength,))
-        body += end.to_bytes(2, "little") + (int(self._milliseconds) % 30_000).to_bytes(2, "little")
-        body.append(crc8(body))
+    def _packet(self, start: int, end: int, samples: list[int]) -> bytes:
+        speed, milliseconds = round(SCANS_PER_S * 360.0), int(self._milliseconds) % 30_000
+        body = _BODY.pack(0x54, 0x2C, speed, start, *samples, end, milliseconds)
+        body += bytes((crc8(body),))
         before = self._position
         self._position = (before + _SAMPLES * SCANS_PER_S / SAMPLES_PER_S) % 1.0
         self._milliseconds += 1000.0 * _PACKET_S
         if self._position < before:
             self._last_revolutions.append(self._revolution)
             self._revolution, self._replayed = [], 0
-        self._revolution.append(bytes(body))
-        return bytes(body)
+        self._revolution.append(body)
+        return body
 
 
-def crc8(data: bytes | bytearray) -> int:
-    """CRC-8, polynomial 0x4D, initial value 0, bit by bit."""
+def crc8(data: bytes) -> int:
+    """CRC-8, polynomial 0x4D, initial value 0."""
     crc = 0
     for byte in data:
-        crc ^= byte
-        for _ in range(8):
-            crc = ((crc << 1) ^ 0x4D if crc & 0x80 else crc << 1) & 0xFF
+        crc = _CRC8[crc ^ byte]
     return crc
+
+
+def _crc8_of_byte(byte: int) -> int:
+    for _ in range(8):
+        byte = ((byte << 1) ^ 0x4D if byte & 0x80 else byte << 1) & 0xFF
+    return byte
+
+
+_CRC8: Final = bytes(map(_crc8_of_byte, range(256)))

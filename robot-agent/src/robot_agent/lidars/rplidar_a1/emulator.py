@@ -195,12 +195,12 @@ class RplidarEmulator:
             keep = (turned > (high - low) % math.tau) | start
             raw, start = raw[keep], start[keep]
         begin = 0
-        for boundary in np.flatnonzero(start):
+        for boundary in start.nonzero()[0].tolist():
             self._revolution += raw[begin:boundary].tobytes()
             self._last_revolutions.append(bytes(self._revolution))
             self._revolution.clear()
             self._replayed = 0
-            begin = int(boundary)
+            begin = boundary
         self._revolution += raw[begin:].tobytes()
         self._outgoing += raw.tobytes()
 

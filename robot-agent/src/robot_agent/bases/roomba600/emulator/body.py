@@ -150,8 +150,12 @@ class Wheels:
     @property
     def encoders(self) -> tuple[int, int]:
         """(left, right) encoder readings, 16 bit."""
-        left, right = (math.floor(ticks) & 0xFFFF for ticks in self._ticks)
-        return left, right
+        return self.encoder(0), self.encoder(1)
+
+    def encoder(self, wheel: int) -> int:
+        """Return the reading (16 bit) of the left (0) or right (1) wheel's encoder."""
+        ticks = self._ticks[wheel]
+        return math.floor(ticks) & 0xFFFF
 
     def reset_encoders(self) -> None:
         """Count from zero."""

@@ -10,7 +10,7 @@ from robot_agent.bases.roomba600.emulator.body import AXLE_MM, Battery, Wheels, 
 from robot_agent.bases.roomba600.emulator.cleaning import Cleaning
 from robot_agent.bases.roomba600.emulator.docking import Dock, Search
 from robot_agent.bases.roomba600.emulator.quirks import LineNoise, Quirks
-from robot_agent.bases.roomba600.emulator.sensors import Sensors, Stream
+from robot_agent.bases.roomba600.emulator.sensors import Field, Sensors, Stream, as_bytes
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -179,9 +179,11 @@ class RoombaEmulator:
         self._obey(now)
         self._protect()
         self._drive_by_itself(dt)
-        moving = sum(abs(speed) for speed in self.wheel_speeds_m_s)
+        left, right = self.wheel_speeds_m_s
         # Safe and Full mode end the charging.
-        self.battery.tick(dt, powered=self.world.powered and self.mode in {OFF, PASSIVE}, wheels_m_s=moving)
+        self.battery.tick(
+            dt, powered=self.world.powered and self.mode in {OFF, PASSIVE}, wheels_m_s=abs(left) + abs(right)
+        )
         if self.battery.charge_mah <= 0.0:
             self._leave(OFF)
         self._send_stream(now)
@@ -221,12 +223,12 @@ class RoombaEmulator:
 
     def _send_stream(self, now: float) -> None:
         if not self.asleep:
-            self._outgoing += self._stream.due(now, self._packet_in_stream, self._noise.frame)
+            self._outgoing += self._stream.due(now, self._noise.frame)
 
-    def _packet_in_stream(self, packet_id: int) -> bytes:
+    def _fields_in_stream(self, packet_id: int) -> list[Field]:
         if packet_id == 35:
-            return bytes((self._noise.mode(self.mode),))
-        return self._sensors.packet(packet_id)
+            return [Field(lambda: self._noise.mode(self.mode), 1)]
+        return self._sensors.fields(packet_id)
 
     # --- commands ---
 
@@ -268,7 +270,7 @@ class RoombaEmulator:
     def _report(self, opcode: int, arguments: bytes, now: float) -> None:
         """Send packets once (opcodes 142, 149), or begin, resume or pause their stream (148, 150)."""
         if opcode == 148:
-            self._stream.begin(arguments[1:], now)
+            self._stream.begin(arguments[1:], self._fields_in_stream, now)
         elif opcode == 150:
             if arguments[0]:
                 self._stream.resume(now)
@@ -276,7 +278,7 @@ class RoombaEmulator:
                 self._stream.pause()
         else:
             ids = arguments if opcode == 142 else arguments[1:]
-            self._outgoing += b"".join(self._sensors.packet(packet_id) for packet_id in ids)
+            self._outgoing += b"".join(as_bytes(self._sensors.fields(packet_id)) for packet_id in ids)
 
     def _leave(self, mode: int, *, keep_stream: bool = False) -> None:
         """Stop the motors and enter a mode in which the host does not drive."""

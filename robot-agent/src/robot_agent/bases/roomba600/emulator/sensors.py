@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from typing import TYPE_CHECKING, Final
+from typing import TYPE_CHECKING, Final, NamedTuple
 
 from robot_agent.bases.roomba600.emulator.body import WHEEL_MA_PER_M_S
 
 if TYPE_CHECKING:
+    from collections.abc import Callable, Iterable
+
     from robot_agent.bases.roomba600.emulator.body import Battery, Wheels, World
 
 STREAM_PERIOD_S: Final = 0.015
@@ -20,11 +21,26 @@ _GROUPS: Final = {
     0: range(7, 27), 1: range(7, 17), 2: range(17, 21), 3: range(21, 27), 4: range(27, 35), 5: range(35, 43),
     6: range(7, 43), 100: range(7, 59), 101: range(43, 59), 106: range(46, 52), 107: range(54, 59),
 }  # fmt: skip
+_MASKS: Final = (0, 0xFF, 0xFFFF)
+"""Of numbers by their sizes in bytes."""
 
-_BYTES: Final = tuple(bytes((number,)) for number in range(256))
 
-Packet = Callable[[int], bytes]
-"""Returns the bytes of a packet by its id."""
+class Field(NamedTuple):
+    """A number in a packet: how it is read, and its size in bytes; `before` it are these bytes."""
+
+    read: Callable[[], int]
+    size: int
+    before: bytes = b""
+
+
+def as_bytes(fields: Iterable[Field]) -> bytes:
+    """Return the numbers as they are sent now."""
+    return b"".join([before + (read() & _MASKS[size]).to_bytes(size, "big") for read, size, before in fields])
+
+
+def _led_by(before: bytes, fields: list[Field]) -> list[Field]:
+    """Return the fields with these bytes before the first one."""
+    return [Field(*fields[0][:2], before), *fields[1:]] if fields else [Field(int, 0, before)]
 
 
 class Stream:
@@ -32,12 +48,16 @@ class Stream:
 
     def __init__(self) -> None:
         self.ids: tuple[int, ...] = ()
+        self._fields: list[Field] = []
         self._running = False
         self._next_frame = 0.0
 
-    def begin(self, ids: bytes, now: float) -> None:
-        """Stream these packets from now on; none ends the stream."""
+    def begin(self, ids: bytes, fields: Callable[[int], list[Field]], now: float) -> None:
+        """Stream these packets from now on, which have these fields by their ids; none ends the stream."""
         self.ids = tuple(ids)
+        self._fields = []
+        for packet_id in ids:
+            self._fields += _led_by(bytes((packet_id,)), fields(packet_id))
         self._running = bool(ids)
         self._next_frame = now + STREAM_PERIOD_S
 
@@ -53,9 +73,9 @@ class Stream:
 
     def forget(self) -> None:
         """Forget the packets."""
-        self.ids = ()
+        self.ids, self._fields = (), []
 
-    def due(self, now: float, packet: Packet, line: Callable[[bytes, float], bytes]) -> bytes:
+    def due(self, now: float, line: Callable[[bytes, float], bytes]) -> bytes:
         """Return the frames up to `now`, each with its checksum, as `line` passes them on."""
         if not self._running:
             return b""
@@ -64,7 +84,7 @@ class Stream:
         frames = b""
         while self._next_frame <= now:
             self._next_frame += STREAM_PERIOD_S
-            body = b"".join(_BYTES[packet_id] + packet(packet_id) for packet_id in self.ids)
+            body = as_bytes(self._fields)
             if len(body) <= 0xFF:
                 frame = bytes((19, len(body))) + body
                 frames += line(frame + bytes((-sum(frame) & 0xFF,)), now)
@@ -83,22 +103,17 @@ class Sensors:
         self._mode = mode
         self._readers = self._values()
 
-    def packet(self, packet_id: int) -> bytes:
-        """Return a packet or a group of packets; nothing for an unknown id."""
+    def fields(self, packet_id: int) -> list[Field]:
+        """Return the fields of a packet or a group of packets; none for an unknown id."""
         if packet_id in _GROUPS:
-            return b"".join(self.packet(single) for single in _GROUPS[packet_id])
+            return [field for single in _GROUPS[packet_id] for field in self.fields(single)]
         if not 7 <= packet_id <= 58:
-            return b""
-        read = self._readers.get(packet_id)
-        value = read() if read is not None else 0
-        return (value & 0xFFFF).to_bytes(2, "big") if packet_id in _WIDE else bytes((value & 0xFF,))
+            return []
+        return [Field(self._readers.get(packet_id, int), 2 if packet_id in _WIDE else 1)]
 
     def _values(self) -> dict[int, Callable[[], int]]:
         """Return how each packet's value is read; all others are zero."""
         world, battery, wheels = self._world, self._battery, self._wheels
-
-        def cliff(place: int) -> Callable[[], int]:
-            return lambda: int(world.cliffs[place])
 
         def floor_signal(place: int) -> Callable[[], int]:
             return lambda: 4 if world.cliffs[place] else 2700
@@ -107,10 +122,15 @@ class Sensors:
             return lambda: world.light_signals[place]
 
         return {
-            7: lambda: _bits(world.bump_right, world.bump_left, world.wheel_drop_right, world.wheel_drop_left),
-            **{9 + place: cliff(place) for place in range(4)},
-            13: lambda: int(world.virtual_wall),
-            14: lambda: _bits(world.overcurrent_right, world.overcurrent_left) << 3,
+            7: lambda: (
+                world.bump_right | world.bump_left << 1 | world.wheel_drop_right << 2 | world.wheel_drop_left << 3
+            ),
+            9: lambda: world.cliff_left,
+            10: lambda: world.cliff_front_left,
+            11: lambda: world.cliff_front_right,
+            12: lambda: world.cliff_right,
+            13: lambda: world.virtual_wall,
+            14: lambda: world.overcurrent_right << 3 | world.overcurrent_left << 4,
             19: wheels.take_distance,
             20: wheels.take_angle,
             21: self._charging_state,
@@ -120,20 +140,20 @@ class Sensors:
             25: lambda: round(battery.charge_mah),
             26: lambda: round(battery.capacity_mah),
             **{28 + place: floor_signal(place) for place in range(4)},
-            34: lambda: _bits(world.charger, world.home_base),
+            34: lambda: world.charger | world.home_base << 1,
             35: self._mode,
             38: lambda: len(self._stream.ids),
             39: lambda: wheels.requested[0],
             40: lambda: wheels.requested[1],
             41: lambda: wheels.right_mm_s,
             42: lambda: wheels.left_mm_s,
-            43: lambda: wheels.encoders[0],
-            44: lambda: wheels.encoders[1],
-            45: lambda: _bits(*(signal > 300 for signal in world.light_signals)),
+            43: lambda: wheels.encoder(0),
+            44: lambda: wheels.encoder(1),
+            45: lambda: sum((signal > 300) << place for place, signal in enumerate(world.light_signals)),
             **{46 + place: light(place) for place in range(6)},
             54: lambda: _motor_ma(wheels.left_mm_s),
             55: lambda: _motor_ma(wheels.right_mm_s),
-            58: lambda: int(wheels.left_mm_s > 0 and wheels.right_mm_s > 0),
+            58: lambda: wheels.left_mm_s > 0 and wheels.right_mm_s > 0,
         }
 
     def _charging_state(self) -> int:
@@ -144,7 +164,3 @@ class Sensors:
 
 def _motor_ma(speed_mm_s: int) -> int:
     return round(WHEEL_MA_PER_M_S * abs(speed_mm_s) / 1000.0)
-
-
-def _bits(*flags: bool) -> int:
-    return sum(flag << place for place, flag in enumerate(flags))

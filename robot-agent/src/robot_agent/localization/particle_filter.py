@@ -271,7 +271,10 @@ class ParticleFilter:
         return covariance
 
     def _covariance_xy(self) -> NDArray[np.float64]:
-        return np.asarray(np.cov(np.stack((self._x, self._y)), aweights=self._weights, ddof=0))
+        # What `numpy.cov` does, with a third of its calls: twice an update.
+        places, total = np.array((self._x, self._y), np.float64), self._weights.sum()
+        places -= ((places * self._weights).sum(axis=1) / total)[:, None]
+        return np.asarray(np.dot(places, (places * self._weights).T) * (1.0 / total))
 
     def _see(self, prior: NDArray[np.float64]) -> None:
         """Forget of the way what the scan has observed, by the covariances (2, 2) of the position before and after."""

@@ -65,12 +65,14 @@ class ComputerClock:
     def __init__(self) -> None:
         self._crystal = _Drift()
         self._wall = _Drift()
+        self._true = True
+        """Whether neither was ever changed."""
 
     def __call__(self, at: Moment) -> Moment:
         """Return what its clocks show."""
-        counted, shown = self._crystal.ahead(at.now), self._wall.ahead(at.now)
-        if counted == shown == 0.0:
+        if self._true:
             return at
+        counted, shown = self._crystal.ahead(at.now), self._wall.ahead(at.now)
         return Moment(at.now + counted, at.stamp + shown, at.synchronized, at.clock)
 
     def ahead(self, now: float) -> float:
@@ -79,6 +81,7 @@ class ComputerClock:
 
     def change(self, now: float, *, jump_s: float = 0.0, rate: float = 0.0, crystal: float = 0.0) -> None:
         """Set the wall clock forward; from now on it gains `rate` seconds a second, the other clock `crystal`."""
+        self._true = False
         self._wall.change(now, jump_s, rate)
         self._crystal.change(now, 0.0, crystal)
 
@@ -97,7 +100,10 @@ QUERY_TIMEOUT_S: Final = 3.0
 
 def unmeasured(_component: str) -> AbstractContextManager[object]:
     """Measure nothing."""
-    return nullcontext()
+    return _NOTHING
+
+
+_NOTHING: Final = nullcontext()
 
 
 class FogProcess:

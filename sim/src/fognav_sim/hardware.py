@@ -58,7 +58,7 @@ class Line:
         self._credit += self._rate * dt
         count = min(int(self._credit), len(self._queue))
         # An idle line accumulates no credit: the next byte takes its full time.
-        self._credit = self._credit - count if self._queue[count:] else 0.0
+        self._credit = self._credit - count if count < len(self._queue) else 0.0
         sent = bytes(self._queue[:count])
         del self._queue[:count]
         return self.disturb(sent)

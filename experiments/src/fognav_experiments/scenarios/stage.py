@@ -221,14 +221,13 @@ class Stage:
 
     def step(self) -> None:
         """Begin and end what is due."""
-        due = [
-            (n, event) for n, event in self._waiting if self.elapsed >= event.at_s and self._run.driven >= event.at_m
-        ]
+        elapsed, driven = self.elapsed, self._run.driven
+        due = [(n, event) for n, event in self._waiting if elapsed >= event.at_s and driven >= event.at_m]
         for number, event in due:
             self._waiting.remove((number, event))
             self._run.log_event(f"event {number}: {type(event).__name__}")
             self._begin(f"event-{number}", event)
-        for end in [end for end in self._ends if end[0] <= self.elapsed]:
+        for end in [end for end in self._ends if end[0] <= elapsed]:
             self._ends.remove(end)
             end[1]()
         if self._steps % _REPEAT_STEPS == 0:

@@ -5,9 +5,10 @@ It takes the same tables of handlers as a process's edges, so code that connects
 
 from __future__ import annotations
 
-from collections import deque
+from collections import defaultdict, deque
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, TypeVar
+from functools import cache
+from typing import TYPE_CHECKING, Any, NamedTuple, TypeVar
 
 from fog_contracts.codec import ContractError, decode, decode_text, encode, encode_text
 from fog_contracts.handlers import RefusedMessageError, completed
@@ -24,7 +25,6 @@ M = TypeVar("M", bound=Message)
 
 @dataclass(frozen=True)
 class _Subscription:
-    channel: Channel
     handler: Handler
     only: Ids
 
@@ -36,10 +36,10 @@ class _Service:
     only: Ids
 
 
-@dataclass(frozen=True)
-class _InFlight:
+class _InFlight(NamedTuple):
     channel: Channel
     key: str
+    ids: Ids
     data: bytes
 
 
@@ -48,7 +48,7 @@ class Bus:
 
     def __init__(self, site: str) -> None:
         self._site = site
-        self._subscriptions: list[_Subscription] = []
+        self._subscriptions: defaultdict[Channel, list[_Subscription]] = defaultdict(list)
         self._services: list[_Service] = []
         self._in_flight: deque[_InFlight] = deque()
         self.refused: list[str] = []
@@ -59,7 +59,8 @@ class Bus:
 
         `only` restricts channels with these ids to these values: a robot subscribes to its own.
         """
-        self._subscriptions += [_Subscription(c, handler, _fitting(c, only)) for c, handler in handlers.items()]
+        for channel, handler in handlers.items():
+            self._subscriptions[channel].append(_Subscription(handler, _fitting(channel, only)))
 
     def serve(self, query_handlers: Mapping[Channel, QueryHandler], *, only: Ids | None = None) -> None:
         """Answer each channel's queries with its handler; `only` as for `subscribe`."""
@@ -73,7 +74,8 @@ class Bus:
     def disconnect(self, handlers: Iterable[Handler | QueryHandler]) -> None:
         """End the subscriptions and services of these handlers, as when their process dies."""
         ended = set(map(id, handlers))
-        self._subscriptions = [s for s in self._subscriptions if id(s.handler) not in ended]
+        for channel, subscriptions in self._subscriptions.items():
+            self._subscriptions[channel] = [s for s in subscriptions if id(s.handler) not in ended]
         self._services = [s for s in self._services if id(s.query_handler) not in ended]
 
     def publish(self, publications: Iterable[Publication]) -> None:
@@ -83,7 +85,7 @@ class Bus:
             if message is None:
                 continue  # a bus retains nothing, so there is nothing to delete
             data = encode(channel, message) if isinstance(message, Message) else encode_text(channel, message)
-            self._in_flight.append(_InFlight(channel, self._key(channel, publication.ids), data))
+            self._in_flight.append(_InFlight(channel, self._key(channel, publication.ids), publication.ids, data))
 
     def deliver(self, at: Moment) -> int:
         """Deliver all queued messages and those published in response; return how many were delivered.
@@ -93,10 +95,9 @@ class Bus:
         count = 0
         while self._in_flight:
             message = self._in_flight.popleft()
-            ids = self._ids(message.channel, message.key)
-            for subscription in self._subscriptions:
-                if subscription.channel is message.channel and _matches(subscription.only, ids):
-                    self._call(message, ids, subscription.handler, at)
+            for subscription in self._subscriptions[message.channel]:
+                if _matches(subscription.only, message.ids):
+                    self._call(message, subscription.handler, at)
             count += 1
         return count
 
@@ -105,34 +106,34 @@ class Bus:
 
         Raises `ContractError` when the request or the reply violates the channel's contract.
         """
-        requested = self._ids(channel, self._key(channel, ids))
+        self._key(channel, ids)  # they are valid
         for service in self._services:
-            if service.channel is channel and _matches(service.only, requested):
+            if service.channel is channel and _matches(service.only, ids):
                 received = None if request is None else roundtrip(channel, request)
-                reply = completed(service.query_handler(requested, received, at))
+                reply = completed(service.query_handler(ids, received, at))
                 if not isinstance(reply, kind):
                     raise ContractError(channel.name, f"was answered with {type(reply).__name__}, not {kind.__name__}")
                 return roundtrip(channel, reply, reply=channel.kind == "query")
         return None
 
-    def _call(self, message: _InFlight, ids: dict[str, str], handler: Handler, at: Moment) -> None:
+    def _call(self, message: _InFlight, handler: Handler, at: Moment) -> None:
         # Each subscriber gets its own copy.
         content = _decoded(message.channel, message.data)
         try:
-            publications: Sequence[Publication] = handler(ids, content, at)
+            publications: Sequence[Publication] = handler(message.ids, content, at)
         except RefusedMessageError as error:
             self.refused.append(f"{message.key}: {error}")
         else:
             self.publish(publications)
 
     def _key(self, channel: Channel, ids: Ids) -> str:
-        return channel.key(**ids, **({"site": self._site} if "site" in channel.fields else {}))
+        return _checked_key(channel, self._site, tuple(ids.items()))
 
-    def _ids(self, channel: Channel, key: str) -> dict[str, str]:
-        ids = channel.match(key)
-        assert ids is not None
-        ids.pop("site", None)
-        return ids
+
+@cache
+def _checked_key(channel: Channel, site: str, ids: tuple[tuple[str, str], ...]) -> str:
+    """Return the key with these ids, of which a process that runs cores has few."""
+    return channel.key(**dict(ids), **({"site": site} if "site" in channel.fields else {}))
 
 
 def roundtrip(channel: Channel, message: M, *, reply: bool = False) -> M:

@@ -10,6 +10,8 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, Generic, Protocol, TypeVar, runtime_checkable
 
+import msgspec
+
 from fog_contracts.channels import Channel
 from fog_contracts.messages import Message, Sent
 
@@ -19,8 +21,7 @@ Ids = Mapping[str, str]
 """The variable parts of a topic or key by name, without the site: for example `{"robot": "r1"}`."""
 
 
-@dataclass(frozen=True, slots=True)
-class Moment:
+class Moment(msgspec.Struct, frozen=True):
     """When an input is handled: `now` in seconds of the receiver's monotonic clock, `stamp` in seconds since the epoch.
 
     Ages and timeouts are computed from `now` alone; `stamp` is for traces and people. `synchronized` says whether the

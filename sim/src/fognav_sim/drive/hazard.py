@@ -67,10 +67,12 @@ class PlannedHazard:
 def entry_distance(path: Sequence[Point], polygon: Sequence[Point]) -> float | None:
     """Return the distance (m) along the path at which it first enters the polygon, or None when it never does."""
     travelled = 0.0
+    west, south, east, north = (limit(values) for limit in (min, max) for values in zip(*polygon, strict=True))
     for (x0, y0), (x1, y1) in itertools.pairwise(path):
         length = math.hypot(x1 - x0, y1 - y0)
         steps = max(1, math.ceil(length / _STEP_M))
-        for step in range(steps + 1):
+        near = min(x0, x1) <= east and max(x0, x1) >= west and min(y0, y1) <= north and max(y0, y1) >= south
+        for step in range(steps + 1) if near else ():
             t = step / steps
             if contains_point(polygon, x0 + t * (x1 - x0), y0 + t * (y1 - y0)):
                 return travelled + t * length

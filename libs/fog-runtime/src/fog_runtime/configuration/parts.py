@@ -8,7 +8,9 @@ A setting chooses a part by its name. All parts, Fognav's own included, are regi
 Imports only the standard library, because the watchdog uses it.
 """
 
-from importlib.metadata import entry_points
+import sys
+from functools import cache
+from importlib.metadata import EntryPoints, entry_points
 from typing import TypeVar
 
 T = TypeVar("T")
@@ -20,7 +22,14 @@ class PartError(ValueError):
 
 def names(group: str) -> list[str]:
     """Return the names of all parts of a group, sorted."""
-    return sorted({point.name for point in entry_points(group=group)})
+    return sorted({point.name for point in _points(group, tuple(sys.path))})
+
+
+@cache
+def _points(group: str, path: tuple[str, ...]) -> EntryPoints:
+    """Return a group's parts on this path of imports: looking for them reads a file of each installed package."""
+    del path
+    return entry_points(group=group)
 
 
 def load(group: str, name: str, kind: type[T]) -> T:
@@ -31,7 +40,7 @@ def load(group: str, name: str, kind: type[T]) -> T:
             type.
 
     """
-    points = entry_points(group=group, name=name)
+    points = _points(group, tuple(sys.path)).select(name=name)
     if not points:
         known = ", ".join(names(group)) or "none"
         raise PartError(

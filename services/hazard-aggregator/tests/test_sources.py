@@ -242,6 +242,20 @@ def test_zigbee2mqtt_clears_nothing_by_what_it_knew_before_though_the_device_com
     assert rig.send(topic, clear) == "clear"
 
 
+def test_zigbee2mqtt_clears_nothing_by_what_it_knew_before_when_it_tells_home_assistant_that_has_started():
+    """HomeAssistant.onMQTTMessage of Zigbee2MQTT 2.12: later bridge/state, then each state from its cache."""
+    rig, topic, _, clear = connected(OCCUPANCY)
+    rig.send("zigbee2mqtt/bridge/state", {"state": "offline"})
+    rig.send("zigbee2mqtt/bridge/state", {"state": "online"})
+    rig.send(f"{HALL}/availability", {"state": "online"})
+    rig.send(topic, clear)
+    rig.send("zigbee2mqtt/bridge/state", {"state": "online"})
+    assert rig.send(topic, clear) == "unknown"
+    assert rig.send(topic, clear) == "clear"
+    rig.send("zigbee2mqtt/bridge/state", {"state": "online"})
+    assert rig.send(topic, clear) == "clear"
+
+
 def test_zigbee2mqtt_that_starts_again_blocks_by_what_it_knew_before():
     rig, topic, blocked, clear = connected(OCCUPANCY)
     rig.send("zigbee2mqtt/bridge/state", {"state": "offline"})

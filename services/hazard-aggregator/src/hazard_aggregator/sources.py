@@ -141,8 +141,9 @@ def _apply_availability(
 ) -> bool:
     """Apply what says whether a source's sensor is connected; return whether it was understood."""
     was_online, online = source.online, is_online(availability, payload)
-    if availability.recalls and online and not retained and not source.said.get(availability.topic):
-        source.recalled = True
+    # It may be online already, and say so again before it repeats what it knows, for somebody who has just started.
+    if availability.recalls and online and not retained:
+        source.recalled |= source.state == "unknown" or not source.said.get(availability.topic)
     source.say(availability.topic, online=online is True)
     if not online:
         source.pending = None

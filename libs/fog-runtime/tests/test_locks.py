@@ -1,7 +1,9 @@
 """Locked doors: real servers with certificates and users, clients with credentials, and everybody else."""
 
 import asyncio
+import base64
 import datetime as dt
+import hashlib
 import ssl
 
 import aiomqtt
@@ -303,6 +305,28 @@ def test_users_whom_the_servers_lists_lack_are_admitted_again_with_the_passwords
     for program in ("mosquitto", "redis"):
         assert "upstairs.map-service" in (locks.folder(program) / "users").read_text()
     assert Credentials.read(locks.credentials("upstairs.map-service")).passwords == service
+
+
+def test_hashes_of_an_earlier_version_are_replaced_by_such_as_the_broker_checks_quickly(tmp_path, monkeypatch):
+    def listed():
+        lines = (locks.folder("mosquitto") / "users").read_text().splitlines()
+        return {user: hashed.split("$") for user, _, hashed in (line.partition(":") for line in lines)}
+
+    locks = SiteLocks(tmp_path, "lab")
+    with monkeypatch.context() as earlier:
+        earlier.setattr(users, "_ITERATIONS", 20_000)
+        locks.make(HOSTS, nodes=["n1"])
+    before = listed()
+    locks.credentials("n1").unlink()  # its board alone knows its password
+    locks.make(HOSTS, nodes=["n1"])
+    after = listed()
+    assert after.keys() == before.keys()
+    assert after.pop("n1") == before["n1"]
+    for user, (_, kind, iterations, salt, hashed) in after.items():
+        assert (kind, iterations) == ("7", "101")
+        password = Credentials.read(locks.credentials(user)).passwords["mqtt"].encode()
+        expected = hashlib.pbkdf2_hmac("sha512", password, base64.b64decode(salt), 101)
+        assert base64.b64decode(hashed) == expected
 
 
 def test_a_robot_is_added_replaced_and_removed(tmp_path):

@@ -104,6 +104,7 @@ class SiteLocks:
         own |= dict.fromkeys(self._plan.unrestricted, ("mqtt", "zenoh"))
         self._set_users(_locked_out(own, self._files, self.credentials) | self._not_yet_admitted(robots, nodes))
         self._write_rights_in_redis()
+        self._write_hashes_of_mqtt()
         self._write_access()
 
     def add_floor(self, site: str, *, robots: Sequence[str] = (), nodes: Sequence[str] = ()) -> None:
@@ -295,6 +296,19 @@ class SiteLocks:
             password = _passwords(self.credentials(user)).get("redis")
             lines.append(line if password is None else users.line("redis", user, password, self._plan.site))
         self._files.write_lines("redis", lines)
+
+    def _write_hashes_of_mqtt(self) -> None:
+        """Replace hashes of other versions, which take longer to check, where the passwords are here."""
+        lines = self._files.lines("mosquitto")
+        passwords = {
+            line: password
+            for line in lines
+            if not users.has_mqtt_cost(line)
+            and (password := _passwords(self.credentials(user_of(line))).get("mqtt")) is not None
+        }
+        if passwords:
+            renewed = [users.mqtt_line(user_of(line), passwords[line]) if line in passwords else line for line in lines]
+            self._files.write_lines("mosquitto", renewed)
 
     def _write_access(self) -> None:
         """Write what each user may do; robots and nodes are the users who have no role."""

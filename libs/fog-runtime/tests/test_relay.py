@@ -1,8 +1,29 @@
-"""The relay before a server, where its connections end."""
+"""The relay before a server: how many connections a user has, and where they end."""
 
 import asyncio
+import contextlib
+import json
 
-from fog_runtime import relay
+import pytest
+import zenoh
+
+from fog_runtime import admission, relay
+from fog_runtime.mqtt_opening import MqttOpening
+from fog_runtime.transports.zenoh_edge import session_config
+from fog_supervisor import net
+
+WAIT_S = 60.0
+CONNECT = b"\x10\x12\x00\x04MQTT\x04\x82\x00\x1e\x00\x02id\x00\x02"
+"""All but a user's name of two letters."""
+CONNACK = b"\x20\x02\x00\x00"
+OPEN_SYN = bytes.fromhex(
+    "c20ae7c0891531308f894938b7736af33af3783b3be6ac0793763a246e7c46af9e2ce8aab1d4ccd97060f6ea30"
+    "7f068e0b442342ed481630c212afdaad97a89ba9f17f010001020304050607432642240272312008f91c1fc1d9"
+    "6379c3a92494b9610ebc6cad0abdf647de42507bb9107d99ff89"
+)
+"""What a client of zenoh 1.10.2 sends as the user r1."""
+AUTHENTICATION_AT = 76
+"""Where its extension begins that names the user."""
 
 
 class Gone(asyncio.Transport):
@@ -48,3 +69,84 @@ async def test_connection_that_does_not_take_what_is_left_is_ended_after_its_oth
     server.connection_lost(None)
     await asyncio.sleep(0.01)
     assert client.transport.aborted == 1
+
+
+@contextlib.asynccontextmanager
+async def relaying(connect_to, make_opening):
+    """Run a relay; yield its port."""
+    with admission.listen(net.LOOPBACK, 0) as listener:
+        task = asyncio.create_task(relay.Relay(connect_to, make_opening).serve([listener]))
+        yield listener.getsockname()[1]
+        task.cancel()
+        await asyncio.gather(task, return_exceptions=True)
+
+
+async def test_user_with_too_many_connections_gets_no_more_and_others_do(tmp_path, monkeypatch):
+    monkeypatch.setattr(relay, "OF_USER", 2)
+
+    async def let_in(reader, writer):
+        await reader.read(1)
+        writer.write(CONNACK)
+
+    async with (
+        asyncio.timeout(WAIT_S),
+        await asyncio.start_unix_server(let_in, tmp_path / "server"),
+        relaying(relay.to_socket(tmp_path / "server"), MqttOpening) as port,
+        contextlib.AsyncExitStack() as opened,
+    ):
+
+        async def let_in_as(user):
+            reader, writer = await asyncio.open_connection(net.LOOPBACK, port)
+            opened.callback(writer.close)
+            writer.write(CONNECT + user)
+            try:
+                return writer if await reader.read(len(CONNACK)) else None
+            except ConnectionResetError:
+                return None
+
+        first, second = await let_in_as(b"n1"), await let_in_as(b"n1")
+        assert first
+        assert second
+        assert await let_in_as(b"n1") is None
+        assert await let_in_as(b"n2")
+        first.close()
+        while not await let_in_as(b"n1"):
+            pass
+
+
+@pytest.mark.live
+async def test_relay_knows_as_whom_zenoh_has_let_each_client_in(tmp_path, monkeypatch):
+    users, seen = {"r1": "secret", "attic.r2": "other", "a" * 200: "long"}, []
+    monkeypatch.setattr(relay.Relay, "admitted", lambda _self, _client, user, _source: seen.append(user))
+    (tmp_path / "users").write_text("".join(f"{name}:{password}\n" for name, password in users.items()))
+
+    def config(mode, user, password, **endpoints):
+        made = session_config(mode, **endpoints)
+        made.insert_json5("transport/auth/usrpwd", json.dumps({"user": user, "password": password}))
+        return made
+
+    locked = config("router", "router", "x", listen=[f"unixsock-stream/{tmp_path}/zenoh"])
+    locked.insert_json5("transport/auth/usrpwd/dictionary_file", json.dumps(str(tmp_path / "users")))
+    router = await asyncio.to_thread(zenoh.open, locked)
+    async with relaying(relay.to_socket(tmp_path / "zenoh"), relay.ZenohOpening) as port:
+        for user, password in users.items():
+            opened = await asyncio.to_thread(
+                zenoh.open, config("client", user, password, connect=[f"tcp/{net.LOOPBACK}:{port}"])
+            )
+            await asyncio.to_thread(opened.close)
+    await asyncio.to_thread(router.close)
+    assert seen == [*users]
+
+
+@pytest.mark.parametrize("damage", [slice(0, 60), slice(0, 100), slice(0, 3)])
+def test_client_that_does_not_say_whole_who_it_is_is_refused(damage):
+    with pytest.raises(ValueError, match="end"):
+        relay._user_of_open_syn(OPEN_SYN[damage])
+
+
+def test_client_that_names_two_users_is_refused():
+    """Zenoh would take one of them, and the relay the other."""
+    assert relay._user_of_open_syn(OPEN_SYN) == "r1"
+    twice = bytes((OPEN_SYN[AUTHENTICATION_AT] | relay._MORE,)) + OPEN_SYN[AUTHENTICATION_AT + 1 :]
+    with pytest.raises(ValueError, match="more than one user"):
+        relay._user_of_open_syn(OPEN_SYN[:AUTHENTICATION_AT] + twice + OPEN_SYN[AUTHENTICATION_AT:])

@@ -162,6 +162,10 @@ class Admission:
         if (displaced := self._strangers.add(visitor)) is not None:
             self._refuse(displaced, "displaced")
 
+    def count_refused(self, source: str, reason: str) -> None:
+        """Count a connection that its protocol has ended, for the log."""
+        self._refused[source, reason] += 1
+
     async def _accept(self, listener: socket.socket) -> None:
         loop = asyncio.get_running_loop()
         while True:

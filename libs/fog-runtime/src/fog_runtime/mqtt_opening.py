@@ -74,8 +74,8 @@ def _text(data: bytes) -> bytes:
     return len(data).to_bytes(2, "big") + data
 
 
-def with_user_in_id(packet: bytes) -> bytes:
-    """Return the body of a CONNECT packet whose client id begins with `USER/`; raises `MalformedError`.
+def with_user_in_id(packet: bytes) -> tuple[bytes, bytes]:
+    """Return the body of a CONNECT packet whose client id begins with `USER/`, and the user; raises `MalformedError`.
 
     An id that the broker shall choose stays empty, and who gives no user's name keeps his.
     """
@@ -97,14 +97,15 @@ def with_user_in_id(packet: bytes) -> bytes:
     except _IncompleteError as error:
         raise MalformedError("a CONNECT packet that ends too early") from error
     if not client or not user:
-        return packet
-    return packet[:before] + _text(user + b"/" + client) + packet[after:]
+        return packet, user
+    return packet[:before] + _text(user + b"/" + client) + packet[after:], user
 
 
 class MqttOpening:
     """Changes the client id in CONNECT, and sees in CONNACK whether the broker has let the client in."""
 
     def __init__(self) -> None:
+        self.user = ""
         self._sent = bytearray()
         self._connected = False
         self._answered = bytearray()
@@ -121,10 +122,10 @@ class MqttOpening:
             size = reader.number()
             if size > CONNECT_BYTES:
                 raise MalformedError("a CONNECT packet that is too long")
-            packet = with_user_in_id(reader.take(size))
+            packet, user = with_user_in_id(reader.take(size))
         except _IncompleteError:
             return b""
-        self._connected = True
+        self._connected, self.user = True, user.decode(errors="replace")
         return bytes((_CONNECT,)) + _number(len(packet)) + packet + bytes(self._sent[reader.at :])
 
     def admits(self, data: bytes) -> bool:

@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import asyncio
-import dataclasses
 from typing import TYPE_CHECKING
 
+from msgspec import structs
 from prometheus_client import Counter, Gauge
 
 from fog_contracts import channels as ch
@@ -90,7 +90,7 @@ class Service:
         self._refused_cells = 0
 
     def _now(self) -> Moment:
-        return dataclasses.replace(self._edges.now(), synchronized=self._synchronized())
+        return structs.replace(self._edges.now(), synchronized=self._synchronized())
 
     def subscribe(self) -> None:
         """Register the core's handlers; call before the connections run."""

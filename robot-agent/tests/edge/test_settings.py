@@ -91,6 +91,23 @@ def test_agent_refuses_a_lidar_outside_of_the_body_that_its_site_gives(tmp_path,
         read_given(given, robot)
 
 
+@pytest.mark.parametrize(("half_m", "taken"), [(0.15, True), (0.17, False)])
+def test_agent_refuses_a_footprint_that_reaches_beyond_the_radius_that_the_fog_knows(tmp_path, half_m, taken):
+    (tmp_path / "site.toml").write_text(SITE)
+    (tmp_path / "key").write_text("ab" * 32)
+    corners = [[x, y] for x, y in ((half_m, half_m), (-half_m, half_m), (-half_m, -half_m), (half_m, -half_m))]
+    (tmp_path / "robot.toml").write_text(
+        f'[base]\ndriver = "roomba600"\n[lidar]\ndriver = "ld19"\n[body]\nfootprint = {corners}\n'
+    )
+    robot = load_robot({"FOGNAV_ROBOT_FILE": str(tmp_path / "robot.toml")})
+    given = settings(tmp_path, site_dir=tmp_path, operator_key_file=tmp_path / "key")
+    if taken:
+        assert read_given(given, robot).footprint is not None
+        return
+    with pytest.raises(SettingsError, match=r"robot.toml:6: body.footprint: it reaches 0.24 m .* is 0.2 m"):
+        read_given(given, robot)
+
+
 def test_footprint_is_a_polygon_in_metres_and_a_wrong_one_is_named():
     assert read_footprint(load_robot({})) is None
     box = read_footprint(load_robot({"FOGNAV_FOOTPRINT": "[[0.2, 0.15], [-0.1, 0.15], [-0.1, -0.15], [0.2, -0.15]]"}))

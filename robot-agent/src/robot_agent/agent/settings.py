@@ -27,6 +27,7 @@ if TYPE_CHECKING:
     from robot_agent.hardware import BaseDriver
 
 SITE_FILE: Final = "site.toml"
+_BODY_TOLERANCE_M: Final = 0.02
 _ADD_RADIUS: Final = "Add how far (m) the robot's body reaches from the point between its driven wheels"
 
 
@@ -76,6 +77,14 @@ def read_given(settings: Settings, robot: RobotFile) -> Given:
     site, body = read_site(settings)
     refuse_contradictions(robot, base)
     refuse_body(robot, base, footprint or Footprint.circle(body.radius))
+    if footprint is not None and footprint.circumscribed_radius > body.radius + _BODY_TOLERANCE_M:
+        raise robot.error(
+            "body.footprint",
+            f"it reaches {footprint.circumscribed_radius:.2f} m from the point between the driven wheels, and the "
+            f"`radius` in {settings.site_dir / SITE_FILE}, by which the fog node knows this robot's echoes, is "
+            f"{body.radius:g} m",
+            "Correct the one that is wrong, the site's file on the fog node too",
+        )
     return Given(
         site=site,
         body=body,

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import shutil
+from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -153,6 +154,17 @@ def test_of_several_lidars_the_usual_topic_is_taken_and_else_none(tmp_path: Path
     front = [("/front" if topic == "/scan" else topic, at, each) for topic, at, each in drive()]
     with pytest.raises(WrongUseError, match=r"several topics of type .*LaserScan \(/front, /rear\)"):
         read_log(record(tmp_path / "neither", front + rear))
+
+
+@pytest.mark.parametrize("wrong", ["/odom", "/scan", "/tf_static"])
+def test_recording_with_values_that_are_no_numbers_is_refused_in_words(tmp_path: Path, wrong: str) -> None:
+    instead = {
+        "/odom": odometry(100.5, Pose2(math.nan, 0.0, 0.0)),
+        "/scan": replace(scan(100.55, [1.0] * BEAMS), angle_increment=math.nan),
+        "/tf_static": transform(100.0, "base_link", "laser", Pose2(0.0, math.inf, 0.0)),
+    }
+    with pytest.raises(WrongUseError, match=r"bag is damaged: .* not finite"):
+        read_log(record(tmp_path / "bag", [*drive(), (wrong, 100.6, instead[wrong])]))
 
 
 @pytest.mark.parametrize("storage", StoragePlugin)

@@ -7,6 +7,7 @@ frame in the frame `map` (`/tf`, by a localization or mapping that ran beside it
 from __future__ import annotations
 
 import bisect
+import itertools
 import math
 from typing import TYPE_CHECKING, Any, Final, NamedTuple
 
@@ -16,7 +17,7 @@ from fognav.output import WrongUseError
 from robot_agent.localization.pose import Pose2
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping
+    from collections.abc import Iterable, Mapping
     from pathlib import Path
 
     from numpy.typing import NDArray
@@ -108,6 +109,12 @@ def _scans(path: Path, messages: Mapping[str, list[tuple[float, Any]]]) -> list[
         raise WrongUseError(f"{path} has no odometry. {_DAMAGED}")
     stamps = np.array([stamp for stamp, _ in odometry])
     poses = [_planar(message.pose.pose) for _, message in odometry]
+    _check(path, "a pose of the odometry", itertools.chain.from_iterable(poses))
+    for _, message in messages[TRANSFORMS]:
+        for transform in message.transforms:
+            moved, turned = transform.transform.translation, transform.transform.rotation
+            values = (moved.x, moved.y, moved.z, turned.x, turned.y, turned.z, turned.w)
+            _check(path, f"the transform to {transform.child_frame_id}", values)
     parents = {
         transform.child_frame_id.lstrip("/"): (transform.header.frame_id.lstrip("/"), transform.transform)
         for _, message in messages[TRANSFORMS]
@@ -133,6 +140,7 @@ def _scans(path: Path, messages: Mapping[str, list[tuple[float, Any]]]) -> list[
         valid = np.isfinite(ranges) & (ranges >= message.range_min) & (ranges <= message.range_max)
         angles = message.angle_min + message.angle_increment * np.arange(len(ranges))
         lidar = pose.compose(mounting.pose)
+        _check(path, f"an angle of the scan at {stamp:.3f} s", angles)
         earlier = bisect.bisect_right(corrections, stamp + _WAIT_S, key=lambda each: each[0])
         found.append(
             BagScan(
@@ -199,10 +207,12 @@ def _planar(pose: Any) -> Pose2:  # noqa: ANN401  # same
     heading = math.atan2(
         2.0 * (turned.w * turned.z + turned.x * turned.y), 1.0 - 2.0 * (turned.y * turned.y + turned.z * turned.z)
     )
-    found = Pose2(float(pose.position.x), float(pose.position.y), heading)
-    if not all(map(math.isfinite, found)):
-        raise ValueError(f"a pose of the odometry is not finite: {found}")
-    return found
+    return Pose2(float(pose.position.x), float(pose.position.y), heading)
+
+
+def _check(path: Path, what: str, values: Iterable[float]) -> None:
+    if not all(map(math.isfinite, values)):
+        raise WrongUseError(f"{path} is damaged: {what} is not finite. {_DAMAGED}")
 
 
 def _stamp(message: Any) -> float:  # noqa: ANN401  # same

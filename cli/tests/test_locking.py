@@ -93,7 +93,7 @@ def test_added_robot_gets_one_file_and_a_removed_one_is_unknown(locks: SiteLocks
 
 def test_added_node_s_board_gets_the_password_and_the_authority(locks: SiteLocks, tmp_path: Path) -> None:
     floor = Path(shutil.copytree(ROOT / "sites" / "estig", tmp_path / "floor"))
-    network = ("--wifi", "Lab", "--wifi-password", "secret", "--fog-host", "192.168.7.1")
+    network = ("--wifi", "Lab", "--wifi-password", "secret12", "--fog-host", "192.168.7.1")
     words = ("--area", "z4", "--pose", "33.20,38.15,1.5708", *network, "--site", str(floor))
     run("node", "add", "n8", *words, "--out", str(tmp_path / "board"), "--json")
     board = json.loads((tmp_path / "board" / "node.json").read_text())

@@ -46,7 +46,7 @@ def floor(tmp_path: Path) -> Path:
     return Path(shutil.copytree(ROOT / "sites" / "estig", tmp_path / "floor"))
 
 
-NETWORK = ("--wifi", "Lab", "--wifi-password", "secret", "--fog-host", "192.168.7.1", "--no-tls")
+NETWORK = ("--wifi", "Lab", "--wifi-password", "secret12", "--fog-host", "192.168.7.1", "--no-tls")
 
 
 def run(*command: str) -> subprocess.CompletedProcess[str]:
@@ -194,7 +194,21 @@ def new_board(floor: Path, *words: str) -> Result:
         (["--fog-host", "192.168.7.1", "--no-tls"], "--wifi-password is missing"),
         (["--wifi-password", "", "--no-tls"], "--fog-host is missing"),
         (["--wifi-password", "", "--fog-host", "fog.local", "--no-tls"], "can't look up names in .local"),
+        (["--wifi-password", "", "--fog-host", "FOG.local", "--no-tls"], "can't look up names in .local"),
         (["--wifi-password", "", "--fog-host", "127.0.0.1", "--no-tls"], "that is the board itself"),
+        (["--wifi-password", "", "--fog-host", "LocalHost", "--no-tls"], "that is the board itself"),
+        (["--wifi-password", "", "--fog-host", "http://fog.lab", "--no-tls"], "neither a name nor an address"),
+        (["--wifi-password", "", "--fog-host", "192.168.7.1:8883", "--no-tls"], "neither a name nor an address"),
+        (["--wifi-password", "", "--fog-host", "192.168.7", "--no-tls"], "neither a name nor an address"),
+        (["--wifi-password", "", "--fog-host", "", "--no-tls"], "neither a name nor an address"),
+        (["--wifi-password", "", "--fog-host", "0.0.0.0", "--locks", "LOCKS"], "no board connects to that"),
+        (["--wifi-password", "", "--fog-host", "255.255.255.255", "--locks", "LOCKS"], "no board connects to that"),
+        (["--wifi-password", "", "--fog-host", "fd00::5", "--locks", "LOCKS"], "own IPv4 address"),
+        (["--wifi-password", "short12", "--fog-host", "192.168.7.1", "--no-tls"], "has 7 characters"),
+        (["--wifi-password", "g" * 64, "--fog-host", "192.168.7.1", "--no-tls"], "has 64 characters"),
+        (["--wifi", "", "--wifi-password", "", "--fog-host", "192.168.7.1", "--no-tls"], "1 to 32 bytes"),
+        (["--wifi", 17 * "\u00fc", "--wifi-password", "", "--fog-host", "192.168.7.1", "--no-tls"], "1 to 32 bytes"),
+        (["--pose", "33.20,38.15,90", "--wifi-password", "", "--fog-host", "192.168.7.1", "--no-tls"], "are 1.5708"),
         (["--wifi-password", "", "--fog-host", "192.168.7.1"], "nothing says whom the board shall trust"),
         (["--wifi-password", "", "--fog-host", "nobody.example", "--locks", "LOCKS"], "for fog.example, 192.168.7.1"),
         (["--wifi-password", "", "--fog-host", "192.168.7.1", "--no-tls", "--firmware", "esphome"], "TLS only"),
@@ -221,7 +235,7 @@ def test_what_is_missing_is_asked_for_on_a_terminal(floor: Path) -> None:
         stdin=terminal, stderr=subprocess.PIPE, start_new_session=True,
     ) as process:  # fmt: skip
         assert process.stderr is not None
-        for asked, answer in ((b"network Lab: ", b"se cret\n"), (b"boards' network:", b"192.168.7.1\n")):
+        for asked, answer in ((b"network Lab: ", b"se cret2\n"), (b"boards' network:", b"192.168.7.1\n")):
             said = b""
             while not said.endswith(asked):
                 said += (more := process.stderr.read(1))
@@ -232,7 +246,7 @@ def test_what_is_missing_is_asked_for_on_a_terminal(floor: Path) -> None:
     os.close(terminal)
     assert process.returncode == 0, rest
     written = json.loads((floor / "board" / "node.json").read_bytes())
-    assert (written["wifi_password"], written["broker"]) == ("se cret", "192.168.7.1")
+    assert (written["wifi_password"], written["broker"]) == ("se cret2", "192.168.7.1")
 
 
 @pytest.mark.parametrize("host", ["192.168.7.1", "192.168.7.9", "fog.example"])
@@ -252,7 +266,7 @@ def test_board_behind_locks_gets_a_password_and_whom_to_trust(floor: Path, locks
 
 @pytest.mark.parametrize("profile", ["standard", "thesis"])
 def test_board_for_esphome_gets_all_that_its_configuration_reads(floor: Path, locks: Path, profile: str) -> None:
-    words = ("--wifi-password", "a'b\"c", "--locks", str(locks), "--firmware", "esphome", "--profile", profile)
+    words = ("--wifi-password", "a'b\"cdefg", "--locks", str(locks), "--firmware", "esphome", "--profile", profile)
     done = new_board(floor, "--fog-host", "192.168.7.1", *words)
     assert done.exit_code == 0, done.stderr
     assert "esphome run" in done.stderr
@@ -260,7 +274,7 @@ def test_board_for_esphome_gets_all_that_its_configuration_reads(floor: Path, lo
     secrets = yaml.safe_load((floor / "board" / "secrets.yaml").read_text("utf-8"))
     assert stat.S_IMODE((floor / "board" / "secrets.yaml").stat().st_mode) == 0o600
     assert set(re.findall(r"!secret (\w+)", configuration)) <= set(secrets)
-    assert secrets["wifi_password"] == "a'b\"c"
+    assert secrets["wifi_password"] == "a'b\"cdefg"
     assert secrets["authority"] == (floor / "board" / "ca.pem").read_text()
     board = (ROOT / "firmware/lib/node_edge/src/board_pins.hpp").read_text("utf-8").split("kD1Mini32 = ")[1]
     pins = [tuple(map(int, pair)) for pair in re.findall(r"\{(\d+), (\d+)\}", board)]

@@ -138,7 +138,7 @@ def require_new_node_and_robot_admitted(node: Node, folder: Path) -> None:
     before = node.systems()["estig"]["pids"]
     locks = ("--locks", str(node.data / "locks"))
     place = ("--area", "z1", "--pose", "40.0,26.95,1.5708")
-    network = ("--wifi", "Lab", "--wifi-password", "secret", "--fog-host", "192.168.7.1")
+    network = ("--wifi", "Lab", "--wifi-password", "secret12", "--fog-host", "192.168.7.1")
     node.run("node", "add", "n8", *place, *network, "--site", str(site), "--out", str(board), *locks)
     node.wait(lambda: "changed: mosquitto uses" in node.printed.read_text(), "the broker knows the node")
     password = json.loads((board / "node.json").read_bytes())["password"]

@@ -372,6 +372,11 @@ def _numbers(option: str, text: str, length: int) -> list[float]:
 
 def _pose(text: str) -> tuple[float, float, float]:
     x, y, theta = _numbers("--pose", text, 3)
+    if abs(theta) > math.tau:
+        raise WrongUseError(
+            f"--pose {text}: its direction is in radians, and {theta:g} is more than a turn. {theta:g} degrees are "
+            f"{math.remainder(math.radians(theta), math.tau):.4f}"
+        )
     return x, y, theta
 
 

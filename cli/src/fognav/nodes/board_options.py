@@ -3,6 +3,7 @@
 import functools
 import inspect
 import ipaddress
+import re
 import shutil
 import sys
 from collections.abc import Callable
@@ -24,6 +25,13 @@ SITE: Final = Path("estig")
 SiteOption = Annotated[Path, typer.Option("--site", metavar="D", help="Folder of the site, or a name in sites/.")]
 _TLS_PORT: Final = 8883
 _OPEN_PORT: Final = 1883
+_WIFI_NAME_BYTES: Final = 32
+_WIFI_PASSWORD: Final = re.compile(r"[ -~]{8,63}|[0-9A-Fa-f]{64}")
+"""Of WPA2: a shorter one is no access point's, and no board's library takes a longer one."""
+_HOST_NAME: Final = re.compile(r"(?=.{1,64}\Z)([A-Za-z0-9-]+\.)*[A-Za-z0-9-]*[A-Za-z][A-Za-z0-9-]*")
+_IP: Final = 4
+"""The boards' libraries are built without IPv6."""
+_NOBODYS: Final = (0, 2**32 - 1)
 _ESPHOME: Final = Path("firmware", "esphome", "fognav-node.yaml")
 """What ESPHome makes a node of; it reads the board's settings from beside its copy."""
 
@@ -83,16 +91,37 @@ class BoardOptions:
             password = _asked(f"Password of the Wi-Fi network {self.wifi}", "--wifi-password", hidden=True)
         if host is None:
             host = _asked("The fog node's address in the boards' network", "--fog-host")
+        self._check_wifi(password)
         self._check_host(host)
         self._check_trust(host)
         return replace(self, wifi_password=password, fog_host=host)
 
+    def _check_wifi(self, password: str) -> None:
+        if not 1 <= len(self.wifi.encode()) <= _WIFI_NAME_BYTES:
+            raise WrongUseError(f"--wifi {self.wifi!r}: a network's name has 1 to {_WIFI_NAME_BYTES} bytes")
+        if password and not _WIFI_PASSWORD.fullmatch(password):
+            raise WrongUseError(
+                f"--wifi-password: this one has {len(password)} characters, and that of a network has 8 to 63, from "
+                "space to ~ (or its key, 64 hexadecimal digits). Correct it, or give an empty one for an open network"
+            )
+
     def _check_host(self, host: str) -> None:
-        if host == "localhost" or (_is_address(host) and ipaddress.ip_address(host).is_loopback):
+        address = _address(host)
+        if host.lower() == "localhost" or (address is not None and address.is_loopback):
             raise WrongUseError(
                 f"--fog-host {host}: on the board that is the board itself. Give the fog node's address"
             )
-        if self.firmware == "fognav" and host.endswith(".local"):
+        if address is None and not _HOST_NAME.fullmatch(host):
+            raise WrongUseError(
+                f"--fog-host {host!r} is neither a name nor an address. Give the fog node's address and nothing else, "
+                "such as 192.168.7.1"
+            )
+        if address is not None and (address.version != _IP or address.is_multicast or int(address) in _NOBODYS):
+            raise WrongUseError(
+                f"--fog-host {host}: no board connects to that. Give the fog node's own IPv4 address, such as "
+                "192.168.7.1"
+            )
+        if self.firmware == "fognav" and host.lower().endswith(".local"):
             raise WrongUseError(
                 f"--fog-host {host}: a D1 mini can't look up names in .local. Give the fog node's address"
             )
@@ -112,7 +141,7 @@ class BoardOptions:
                 )
             return
         # The firmware compares a name as it is given, but of an address a name that is in the certificate anyway.
-        if self.firmware == "fognav" and _is_address(host):
+        if self.firmware == "fognav" and _address(host) is not None:
             return
         with locks_errors():
             known = open_locks(folder).hosts
@@ -168,12 +197,11 @@ def _asked(what: str, option: str, *, hidden: bool = False) -> str:
     return str(typer.prompt(what, hide_input=hidden, default="" if hidden else None, show_default=False, err=True))
 
 
-def _is_address(host: str) -> bool:
+def _address(host: str) -> ipaddress.IPv4Address | ipaddress.IPv6Address | None:
     try:
-        ipaddress.ip_address(host)
+        return ipaddress.ip_address(host)
     except ValueError:
-        return False
-    return True
+        return None
 
 
 def with_board_options(command: Callable[..., None]) -> Callable[..., None]:

@@ -16,12 +16,9 @@ from fognav import __version__, checkout, doctor, kernels, node_code, system
 from fognav.commands.alert import alert_app
 from fognav.commands.area import area_app
 from fognav.commands.backup import backup_command, restore_command
-from fognav.commands.bench import bench_app
 from fognav.commands.ca import ca_app
 from fognav.commands.channels import channels_command
-from fognav.commands.coverage import site_coverage
-from fognav.commands.installed import Commands
-from fognav.commands.localize import localize_command
+from fognav.commands.installed import Commands, SiteCommands
 from fognav.commands.map import map_app
 from fognav.commands.node import node_app
 from fognav.commands.robot import robot_app
@@ -59,7 +56,7 @@ app = typer.Typer(
     rich_markup_mode=None,
     pretty_exceptions_enable=False,
 )
-site_app = typer.Typer(help="Create and check sites.", no_args_is_help=True)
+site_app = typer.Typer(cls=SiteCommands, help="Create and check sites.", no_args_is_help=True)
 app.add_typer(site_app, name="site")
 app.add_typer(zone_app, name="zone")
 app.add_typer(area_app, name="area")
@@ -71,10 +68,6 @@ app.add_typer(token_app, name="token")
 app.add_typer(ca_app, name="ca")
 app.add_typer(map_app, name="map")
 app.add_typer(store_app, name="store")
-app.add_typer(bench_app, name="bench")
-app.command("localize", epilog="Example: fognav localize --map floor.yaml --log drive.log.gz --scans even --json")(
-    localize_command
-)
 app.command(
     "backup", epilog="Example: fognav backup fog.tar.gz --site sites/estig --secrets keys --data /var/lib/fognav"
 )(backup_command)
@@ -91,7 +84,6 @@ robot_app.command("new", epilog="Example: fognav robot new --base roomba600 --li
     robot_new
 )
 robot_app.command("check", epilog="Example: fognav robot check robot.toml")(robot_check)
-site_app.command("coverage", epilog="Example: fognav site coverage sites/estig --png coverage.png")(site_coverage)
 app.command("channels", epilog="Example: fognav channels --format acl --broker mqtt")(channels_command)
 
 Yes = Annotated[bool, typer.Option("--yes", help="Install missing system packages without asking (as does CI=true).")]

@@ -9,7 +9,7 @@ An entry is a function that gets a `typer.Typer` and adds to it.
 from __future__ import annotations
 
 from types import FunctionType
-from typing import TYPE_CHECKING, Any, Final
+from typing import TYPE_CHECKING, Any, ClassVar
 
 import typer
 from typer.core import TyperGroup
@@ -21,12 +21,11 @@ from fognav.output import fail
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-_GROUP: Final = "fognav.commands"
-
 
 class Commands(TyperGroup):
     """The command line; others are loaded only when it does not know a command itself, and to list all."""
 
+    entry_points: ClassVar = "fognav.commands"
     _loaded = False
 
     def list_commands(self, ctx: Any) -> list[str]:  # noqa: ANN401  # typer's class is private
@@ -46,9 +45,15 @@ class Commands(TyperGroup):
         self._loaded = True
         added = typer.Typer(rich_markup_mode=self.rich_markup_mode)
         try:
-            for name in parts.names(_GROUP):
-                add_to: Callable[[typer.Typer], None] = parts.load(_GROUP, name, FunctionType)
+            for name in parts.names(self.entry_points):
+                add_to: Callable[[typer.Typer], None] = parts.load(self.entry_points, name, FunctionType)
                 add_to(added)
         except parts.PartError as error:
             fail(str(error))
         self.commands.update(get_group(added).commands)
+
+
+class SiteCommands(Commands):
+    """The same for `fognav site`."""
+
+    entry_points: ClassVar = "fognav.commands.site"

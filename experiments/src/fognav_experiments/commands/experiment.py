@@ -83,7 +83,7 @@ def experiment_command(  # noqa: PLR0913  # each option is an argument
     if context.invoked_subcommand is not None:
         return
     from fog_runtime.configuration.site import SiteError, load_site  # noqa: PLC0415  # keeps the other commands fast
-    from fognav.bench import machine  # noqa: PLC0415  # same
+    from fognav_experiments.bench import machine  # noqa: PLC0415  # same
     from fognav_experiments.comparison import archive, runner  # noqa: PLC0415  # same
     from fognav_experiments.comparison.live_drive import LiveOptions  # noqa: PLC0415  # same
     from fognav_experiments.comparison.records import Folder, FolderError  # noqa: PLC0415  # same
@@ -358,7 +358,7 @@ def sensitivity_command(  # noqa: PLR0913  # each option is an argument
 
 
 def _measured_on() -> dict[str, object]:
-    from fognav.bench import machine  # noqa: PLC0415  # keeps the other commands fast
+    from fognav_experiments.bench import machine  # noqa: PLC0415  # keeps the other commands fast
 
     return {"commit": checkout.revision(), **machine.describe()}
 

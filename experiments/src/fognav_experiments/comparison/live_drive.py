@@ -20,11 +20,11 @@ from fog_runtime.configuration.maps import save_map
 from fog_runtime.configuration.site import SITE_FILE, LoadedSite, load_site
 from fog_supervisor.supervisor import NotReadyError
 from fognav import __version__
-from fognav.bench.cpu_quota import cpu_quota
-from fognav.bench.robot import NORMAL_PRIORITY
 from fognav.demo.options import Options
 from fognav.demo.run import Demo
 from fognav.output import FailedError
+from fognav_experiments.bench.cpu_quota import cpu_quota
+from fognav_experiments.bench.robot import NORMAL_PRIORITY
 from fognav_experiments.comparison.draws import RouteDraw
 from fognav_experiments.comparison.driven import drive_name, facts
 from fognav_experiments.comparison.measured import MeasuredDrive

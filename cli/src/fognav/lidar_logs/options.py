@@ -1,0 +1,17 @@
+"""Options of the commands that read logs."""
+
+from __future__ import annotations
+
+from typing import Annotated
+
+import typer
+
+from fognav.lidar_logs.logs import Format, Selection
+
+LogFormat = Annotated[
+    Format, typer.Option("--format", help="Format of the log; intel is JSON lines, auto looks at the file.")
+]
+Scans = Annotated[Selection, typer.Option("--scans", help="Scans to use: all, or those with odd or even numbers.")]
+RangeMax = Annotated[
+    float, typer.Option("--range-max", metavar="M", min=1.0, max=200.0, help="Longer ranges are not used (m).")
+]

@@ -1,0 +1,211 @@
+"""Measures path searches on a floor: from scratch, and again after a hazard on the path, against exact references.
+
+Every query is planned from scratch by A*. Its cost is compared with that of a Dijkstra search from the goal, which is
+another kernel, and with the length that a scenario of the MovingAI benchmarks publishes. Then a hazard is put onto the
+path, and the path is planned again, guided by the goal's field over the floor without the hazard; its cost is compared
+with that of a search without a guide on the same costs. Times are of the processor, so that other work on the machine
+counts little.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+import time
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Final, NamedTuple
+
+import numpy as np
+
+from fog_contracts.costs import DEFAULT_INFLATION, FREE, INSCRIBED, LETHAL, NEUTRAL_WEIGHT
+from fog_kernels.astar import Planner
+from fog_kernels.components import Components
+from fog_kernels.inflation import inflate, inflation_table
+from fog_kernels.steps import STRAIGHT
+from fog_kernels.tiles import TilePatterns
+from fog_runtime.configuration.maps import load_map
+from fognav_experiments.bench.fleet import percentile
+from fognav_experiments.bench.office import make_office
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Sequence
+    from pathlib import Path
+
+    from numpy.typing import NDArray
+
+    from fog_contracts.grid import StaticMap
+    from fog_kernels.guides import GoalField
+
+    Cell = tuple[int, int]
+    Grid = NDArray[np.uint8]
+
+_HAZARD_CELLS: Final = 40
+"""Side of the hazard: 2 m at 5 cm."""
+_ALONG: Final = (0.3, 0.7)
+"""Where on the path the hazard lies, as shares of its cells ..."""
+_NEAR_GOAL: Final = (0.9, 0.95)
+"""... and where it lies near the goal."""
+_PATTERN_BYTES: Final = 200_000_000
+
+
+class MapTextError(ValueError):
+    """A file is no map or scenario of the MovingAI benchmarks; the text names file and remedy."""
+
+
+class Query(NamedTuple):
+    """Start and goal (column, row), and the published length of the shortest path (cells) on a map without margins."""
+
+    start: Cell
+    goal: Cell
+    length: float | None = None
+
+
+@dataclass(frozen=True)
+class Floor:
+    """What is searched: the cells of the map as they are, the costs, and how these follow from those."""
+
+    raw: Grid
+    costmap: Grid
+    costs_of: Callable[[Grid], Grid]
+
+
+def load_floor(map_file: Path | None, seed: int) -> Floor:
+    """Return the floor of a map_server YAML or of MovingAI's `.map`, or an office.
+
+    Raises `MapTextError`, `MapFileError` and `OSError`.
+    """
+    if map_file is not None and map_file.suffix == ".map":
+        return read_movingai(map_file)
+    return floor_of(make_office(seed=seed) if map_file is None else load_map(map_file))
+
+
+def floor_of(static: StaticMap) -> Floor:
+    """Return the floor of a map with the margins that a robot's planner keeps."""
+    table = inflation_table(static.geometry.resolution, DEFAULT_INFLATION)
+    raw = np.ascontiguousarray(static.cells)
+    return Floor(raw, inflate(raw, table), lambda cells: inflate(cells, table))
+
+
+def read_movingai(path: Path) -> Floor:
+    """Return the floor of a `.map` of the MovingAI benchmarks (Sturtevant 2012), without margins, as its lengths are.
+
+    Raises `MapTextError` and `OSError`.
+    """
+    lines = path.read_text("utf-8", errors="replace").splitlines()
+    rows = [row for row in lines[lines.index("map") + 1 :] if row] if "map" in lines else []
+    if not rows or len({len(row) for row in rows}) != 1:
+        raise MapTextError(f"{path}: needs a line `map` and rows of equal length after it, as MovingAI's maps have")
+    raw = np.array([[FREE if cell in ".GS" else LETHAL for cell in row] for row in rows], np.uint8)
+    return Floor(raw, raw.copy(), np.copy)
+
+
+def read_scenario(path: Path, most: int) -> list[Query]:
+    """Return up to `most` queries of a `.scen` file, spread over all of it; raises `MapTextError` and `OSError`."""
+    lines = [line.split() for line in path.read_text("utf-8", errors="replace").splitlines()[1:] if line.strip()]
+    try:
+        queries = [Query((int(x), int(y)), (int(u), int(v)), float(length)) for *_, x, y, u, v, length in lines]
+    except ValueError as error:
+        raise MapTextError(f"{path}: needs rows of nine columns, as MovingAI's scenarios have ({error})") from error
+    if not queries:
+        raise MapTextError(f"{path}: has no queries")
+    chosen = np.unique(np.linspace(0, len(queries) - 1, min(most, len(queries))).round().astype(int))
+    return [queries[index] for index in chosen]
+
+
+def long_queries(costmap: Grid, count: int, rng: np.random.Generator) -> list[Query]:
+    """Return queries between free cells of the largest part of the floor, at least half of its diagonal apart."""
+    components = Components(costmap)
+    height, width = costmap.shape
+    labels = components.labels(0, 0, width, height)
+    largest = int(np.argmax(np.bincount(labels[labels >= 0])))
+    rows, columns = np.nonzero((labels == largest) & (costmap < INSCRIBED // 2))
+    least = 0.5 * math.hypot(float(np.ptp(rows)), float(np.ptp(columns)))
+    queries: list[Query] = []
+    while len(queries) < count:
+        first, last = rng.integers(len(rows), size=2)
+        if math.hypot(float(rows[first] - rows[last]), float(columns[first] - columns[last])) >= least:
+            queries.append(Query((int(columns[first]), int(rows[first])), (int(columns[last]), int(rows[last]))))
+    return queries
+
+
+@dataclass
+class Figures:
+    """What was measured: times in ms, and how many results equal their references."""
+
+    cold: list[float] = dataclasses.field(default_factory=list)
+    field: list[float] = dataclasses.field(default_factory=list)
+    expansions: list[int] = dataclasses.field(default_factory=list)
+    replan: list[float] = dataclasses.field(default_factory=list)
+    replan_near_goal: list[float] = dataclasses.field(default_factory=list)
+    optimal: int = 0
+    replans_optimal: int = 0
+
+    def summary(self) -> dict[str, float | int]:
+        """Return the figures by the names of the command's JSON."""
+        replans = len(self.replan) + len(self.replan_near_goal)
+        return {
+            "queries": len(self.cold),
+            "optimal": self.optimal,
+            "median_ms": percentile(self.cold, 50),
+            "mean_ms": round(float(np.mean(self.cold)), 2),
+            "p99_ms": percentile(self.cold, 99),
+            "expansions_median": int(np.median(self.expansions)),
+            "field_median_ms": percentile(self.field, 50),
+            "replans": replans,
+            "replans_optimal": self.replans_optimal,
+            "replan_median_ms": percentile(self.replan, 50),
+            "replan_p99_ms": percentile(self.replan, 99),
+            "replan_near_goal_median_ms": percentile(self.replan_near_goal, 50),
+            "replan_near_goal_p99_ms": percentile(self.replan_near_goal, 99),
+        }
+
+
+def measure(
+    floor: Floor, queries: Sequence[Query], rng: np.random.Generator, on_progress: Callable[[int], object]
+) -> dict[str, float | int]:
+    """Run all queries and return the figures; `on_progress` is called with the number of those that are done."""
+    height, width = floor.costmap.shape
+    planner, figures = Planner(width, height), Figures()
+    for number, query in enumerate(queries):
+        _measure_query(floor, query, planner, figures, rng)
+        on_progress(number + 1)
+    return figures.summary()
+
+
+def _measure_query(floor: Floor, query: Query, planner: Planner, figures: Figures, rng: np.random.Generator) -> None:
+    start, goal, length = query
+    begun = time.thread_time()
+    found = planner.plan(floor.costmap, start, goal)
+    figures.cold.append(1000.0 * (time.thread_time() - begun))
+    figures.expansions.append(found.expansions)
+    begun = time.thread_time()
+    guide = planner.goal_field(floor.costmap, goal, TilePatterns(_PATTERN_BYTES))
+    figures.field.append(1000.0 * (time.thread_time() - begun))
+    expected = math.inf if length is None else NEUTRAL_WEIGHT * length
+    figures.optimal += found.cost == _cost(guide, start, width=floor.costmap.shape[1]) and (
+        length is None or math.isclose(found.cost, expected, rel_tol=1e-5, abs_tol=NEUTRAL_WEIGHT * 5e-3)
+    )
+    if not found.found or len(found.cells) <= 2 * _HAZARD_CELLS:
+        return
+    for where, times in ((_ALONG, figures.replan), (_NEAR_GOAL, figures.replan_near_goal)):
+        column, row = found.cells[round(rng.uniform(*where) * (len(found.cells) - 1))].tolist()
+        costmap = _with_hazard(floor, column, row)
+        if max(costmap[start[1], start[0]], costmap[goal[1], goal[0]]) >= INSCRIBED:
+            continue  # the hazard lies on the robot or on its goal
+        begun = time.thread_time()
+        again = planner.plan(costmap, start, goal, field=guide)
+        times.append(1000.0 * (time.thread_time() - begun))
+        figures.replans_optimal += again.cost == planner.plan(costmap, start, goal).cost
+
+
+def _cost(guide: GoalField, start: Cell, *, width: int) -> float:
+    """Return the cost that a goal's field has at a cell, in the unit of a plan's cost; infinite without a path."""
+    cost = int(guide.costs(np.array([start[1] * width + start[0]], np.int32))[0])
+    return math.inf if cost < 0 else cost / (2.0 * STRAIGHT)
+
+
+def _with_hazard(floor: Floor, column: int, row: int) -> Grid:
+    """Return the costs with a square hazard around a cell."""
+    raw, half = floor.raw.copy(), _HAZARD_CELLS // 2
+    raw[max(0, row - half) : row + half, max(0, column - half) : column + half] = LETHAL
+    return floor.costs_of(raw)

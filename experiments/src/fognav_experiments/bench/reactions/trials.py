@@ -1,0 +1,116 @@
+"""Runs the trials of all faults on several robots at once, and keeps their times in a log that later runs continue."""
+
+from __future__ import annotations
+
+import asyncio
+import json
+import math
+import statistics
+import sys
+from collections import deque
+from typing import TYPE_CHECKING, Final
+
+from fognav.output import FailedError, WrongUseError
+from fognav_experiments.bench.reactions.faults import FAULTS, Fault
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Mapping
+    from pathlib import Path
+
+_WORKER: Final = "fognav_experiments.bench.reactions.worker"
+_PROBLEMS_MAX: Final = 20
+"""Robots that did not drive (again), after which the machine or the robot is to blame."""
+
+Times = dict[str, list[float | None]]
+
+
+def read_log(log: Path | None) -> Times:
+    """Return the times of earlier runs, by fault; raises `WrongUseError` for a file that is no such log."""
+    times: Times = {}
+    if log is None or not log.exists():
+        return times
+    for number, line in enumerate(log.read_text("utf-8").splitlines(), 1):
+        try:
+            entry = json.loads(line)
+            times.setdefault(entry["fault"], []).append(entry["seconds"])
+        except (ValueError, KeyError, TypeError) as error:
+            raise WrongUseError(f"{log}, line {number}: no trial of this command. Name another file") from error
+    return times
+
+
+def due(times: Times, wanted: Callable[[Fault], int]) -> deque[str]:
+    """Return the faults that are to be tried, in turn, until each has as many trials as wanted."""
+    missing = {fault.name: wanted(fault) - len(times.get(fault.name, ())) for fault in FAULTS}
+    rounds = max(0, *missing.values())
+    return deque(name for done in range(rounds) for name, count in missing.items() if count > done)
+
+
+async def measure(waiting: deque[str], robots: int, log: Path | None, tell: Callable[[str], object]) -> Times:
+    """Try the waiting faults on so many robots at once; return the times in s, None where the wheels were not stopped.
+
+    Raises `FailedError` when robots do not drive any more.
+    """
+    times: Times = {}
+    total, problems = len(waiting), 0
+
+    def on_result(entry: Mapping[str, object]) -> None:
+        nonlocal problems
+        if "problem" in entry:
+            problems += 1
+            tell(f"no trial of {entry['fault']}: {entry['problem']}")
+            if problems >= _PROBLEMS_MAX:
+                raise FailedError(f"{problems} trials failed, the last one because: {entry['problem']}")
+            waiting.append(str(entry["fault"]))
+            return
+        seconds = entry["seconds"]
+        times.setdefault(str(entry["fault"]), []).append(float(seconds) if isinstance(seconds, float) else None)
+        if log is not None:
+            with log.open("a", encoding="utf-8") as file:
+                file.write(json.dumps(entry) + "\n")
+        tell(f"{sum(map(len, times.values()))} of {total}: {entry['fault']}: {seconds}")
+
+    async with asyncio.TaskGroup() as tasks:
+        for number in range(min(robots, total)):
+            tasks.create_task(_robot(number + 1, waiting, on_result))
+    return times
+
+
+async def _robot(seed: int, waiting: deque[str], on_result: Callable[[Mapping[str, object]], None]) -> None:
+    pipe = asyncio.subprocess.PIPE
+    worker = await asyncio.create_subprocess_exec(sys.executable, "-m", _WORKER, str(seed), stdin=pipe, stdout=pipe)
+    assert worker.stdin is not None
+    assert worker.stdout is not None
+    try:
+        while waiting:
+            worker.stdin.write(f"{waiting.popleft()}\n".encode())
+            line = await worker.stdout.readline()
+            if not line:
+                raise FailedError(f"robot {seed} ended with exit code {await worker.wait()}: see its error above")
+            on_result(json.loads(line))
+    finally:
+        # The end of its input ends the worker, which ends its robot.
+        worker.stdin.close()
+        await worker.wait()
+
+
+def percentile(values: list[float], share: float) -> float:
+    """Return the smallest value that at least `share` of the values do not exceed."""
+    return sorted(values)[max(0, math.ceil(share * len(values)) - 1)]
+
+
+def row(fault: Fault, times: list[float | None]) -> dict[str, object]:
+    """Return the figures of one fault in s; a trial in which the wheels were not stopped has no time."""
+    stopped = [seconds for seconds in times if seconds is not None]
+    late = [seconds for seconds in stopped if fault.limit_s is not None and seconds > fault.limit_s]
+    return {
+        "fault": fault.name,
+        "kind": fault.kind,
+        "trials": len(times),
+        "stopped": len(stopped),
+        "median_s": round(statistics.median(stopped), 3) if stopped else None,
+        "p99_s": round(percentile(stopped, 0.99), 3) if stopped else None,
+        "max_s": round(max(stopped), 3) if stopped else None,
+        "limit_s": None if fault.limit_s is None else round(fault.limit_s, 3),
+        "design": fault.design,
+        "beyond_limit": len(late) + (len(times) - len(stopped) if fault.limit_s is not None else 0),
+    }

@@ -1,0 +1,265 @@
+"""Measures a warning, live: from the first echo of an obstacle at a sensor node to the path that a robot receives.
+
+Broker, Redis, router, aggregator, map-service and planner are processes of their own, behind locks. The site's nodes
+run the firmware's code in this one, in front of a simulated floor, with an MQTT connection each; the robot is a
+stand-in with a goal (`standing_robot`). All times are of this machine's clock.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import random
+import time
+from contextlib import asynccontextmanager
+from typing import TYPE_CHECKING, Any, Final, NamedTuple
+
+import numpy as np
+import zenoh
+
+from fog_contracts import channels as ch
+from fog_contracts.codec import decode
+from fog_contracts.messages import MapDelta
+from fog_runtime.clock import SystemClock
+from fog_runtime.transports.zenoh_edge import session_config
+from fog_supervisor import net
+from fog_supervisor.supervisor import NotReadyError, log_tail
+from fognav.nodes.simulated import StillFloor
+from fognav.output import FailedError
+from fognav.programs import AGGREGATOR, MAP_SERVICE, PLANNER, SERVERS, SERVICES
+from fognav.stack import Stack, StackConfig
+from fognav.stack_doors import doors_of
+from fognav_experiments.bench.running import in_background
+from fognav_experiments.bench.standing_robot import StandingRobot
+from fognav_sim.barrier import BarrierError, barrier_across
+from fognav_sim.drive.hazard import draw_hazard, entry_distance
+from fognav_sim.live import VirtualNode, run_nodes
+from fognav_sim.nodes import make_nodes
+from fognav_sim.world import World
+
+if TYPE_CHECKING:
+    from collections.abc import AsyncIterator, Callable, Iterable, Mapping, Sequence
+
+    from fog_contracts.messages import Trace
+    from fog_contracts.site import NodeSite
+    from fog_runtime.configuration.site import LoadedSite
+    from fognav_experiments.bench.standing_robot import Arrived
+    from fognav_sim.drive.hazard import PlannedHazard
+
+    TraceKey = tuple[str, int, int]  # area, epoch and sequence number
+
+_BENCH: Final = "bench"
+"""The user who stands for the robot."""
+_READY_S: Final = 120.0
+_TIMEOUT_S: Final = 10.0
+"""A warning that has not reached the robot after this is missed."""
+_POLL_S: Final = 0.02
+_NODES_STEP_S: Final = 0.002
+"""How often the nodes' code runs, which a board's does without a pause: an echo is timed as exactly."""
+_PHASE_S: Final = 0.3
+"""Obstacles come at any moment of the nodes' cycle, which is shorter than this."""
+
+
+class Warned(NamedTuple):
+    """The moments (s of this machine's clock) of one warning, in their order."""
+
+    echo: float
+    reading: float
+    confirmed: float
+    delta: float
+    path: float
+
+
+_SPANS: Final = {
+    "echo_to_path": ("echo", "path"),
+    "echo_to_reading": ("echo", "reading"),
+    "reading_to_confirmed": ("reading", "confirmed"),
+    "confirmed_to_delta": ("confirmed", "delta"),
+    "delta_to_path": ("delta", "path"),
+}
+
+
+class _WatchedWorld(World):
+    """A world that tells when a node's sonar first measured something nearer than its limit."""
+
+    echo: float | None = None
+
+    def sonar(self, node: NodeSite, index: int) -> float | None:
+        """Return what a sonar measures (m)."""
+        measured = super().sonar(node, index)
+        if self.echo is None and measured is not None and measured < node.sonars[index].range_limit:
+            self.echo = time.time()
+        return measured
+
+
+class _Deltas:
+    """When the map's deltas arrived (s), by the traces of the hazards in them."""
+
+    def __init__(self) -> None:
+        self.arrived: dict[TraceKey, float] = {}
+
+    def on_delta(self, sample: zenoh.Sample) -> None:
+        """Note a delta; it is called on another thread."""
+        now = time.time()
+        delta = decode(ch.MAP_DELTA, sample.payload.to_bytes(), MapDelta)
+        for trace in delta.traces:
+            self.arrived[_key(trace)] = now
+
+
+def _key(trace: Trace) -> TraceKey:
+    return trace.area, trace.epoch, trace.seq
+
+
+def first_warning(
+    paths: Iterable[Arrived], area: str, placed: float, echo: float | None, deltas: Mapping[TraceKey, float]
+) -> Warned | None:
+    """Return the moments of the first of these paths around an area that answers an obstacle; None if one is missing.
+
+    The obstacle was placed at `placed` (s), and had its first echo at `echo`. `deltas` says when those of the map
+    arrived (s): a path may be here before the delta that it answers, since each has a subscriber of its own.
+    """
+    for arrived in paths:
+        trace = next((t for t in arrived.path.traces if t.area == area and t.first_reading >= placed), None)
+        delta = None if trace is None else deltas.get(_key(trace))
+        if trace is not None and delta is not None and echo is not None:
+            return Warned(echo, trace.first_reading, trace.confirmed, delta, arrived.at)
+    return None
+
+
+async def measure(
+    loaded: LoadedSite, rule: str, trials: int, seed: int, on_progress: Callable[[], object]
+) -> dict[str, Any]:
+    """Return the percentiles (ms) of a debounce rule's warnings; raises `FailedError` when the fog does not answer.
+
+    The site's first robot stands where it starts, and its goal is that of the site's demonstration.
+    """
+    site = loaded.site
+    floor = StillFloor(loaded, (), SystemClock(), world=_WatchedWorld)
+    assert isinstance(floor.world, _WatchedWorld)
+    extra = {"DEBOUNCE": rule, "HAZARDS_WAIT_S": "0"}
+    doors = doors_of(site, unrestricted=(_BENCH,))
+    config = StackConfig(site_dir=loaded.directory, robot="none", extra=extra, doors=doors)
+    async with Stack(config) as stack:
+        await stack.start_servers(_READY_S)
+        for name in SERVICES:
+            stack.supervisor.start(name)
+        try:
+            await stack.supervisor.wait_ready([*SERVERS, *SERVICES], _READY_S)
+        except NotReadyError as error:
+            raise FailedError(f"{error}\n{log_tail(stack.log(PLANNER))}") from error
+        async with _nodes(stack, loaded, floor):
+            own = stack.doors.credentials(_BENCH)
+            settings = session_config("client", connect=[stack.zenoh_endpoint], credentials=own)
+            with await asyncio.to_thread(zenoh.open, settings) as session:
+                trial = _Trials(stack, loaded, floor.world, session, seed)
+                async with trial.robot.publishing():
+                    warned = [await trial.run(number, on_progress) for number in range(trials)]
+    return figures(rule, warned)
+
+
+def figures(rule: str, warned: Sequence[Warned | None]) -> dict[str, Any]:
+    """Return how many warnings were measured and missed, and the percentiles of their pieces (ms)."""
+    arrived = [each for each in warned if each is not None]
+    row: dict[str, Any] = {"rule": rule, "warnings": len(warned), "missed": len(warned) - len(arrived)}
+    for name, (begin, end) in _SPANS.items():
+        times = [1000.0 * (getattr(each, end) - getattr(each, begin)) for each in arrived]
+        for label, p in (("p50", 50), ("p99", 99), ("max", 100)):
+            row[f"{name}_{label}_ms"] = round(float(np.percentile(times, p)), 1) if times else None
+    return row
+
+
+@asynccontextmanager
+async def _nodes(stack: Stack, loaded: LoadedSite, floor: StillFloor) -> AsyncIterator[None]:
+    """Run all nodes of the site, each with its own connection."""
+    clock = SystemClock()
+    nodes = [
+        VirtualNode(
+            sensor, floor, stack.mqtt_url, clock, loaded.site.id, stack.doors.credentials(sensor.node.id)
+        )
+        for sensor in make_nodes(loaded.site.nodes, int(time.time()), clock.now(), "firmware", apart=0.025)
+    ]  # fmt: skip
+    async with in_background(run_nodes(nodes, clock, _NODES_STEP_S), "nodes"):
+        yield
+
+
+class _Trials:
+    """Obstacles that come and go in an area on the robot's way, one after another."""
+
+    def __init__(
+        self, stack: Stack, loaded: LoadedSite, world: _WatchedWorld, session: zenoh.Session, seed: int
+    ) -> None:
+        self._stack, self._loaded, self._world = stack, loaded, world
+        self._seed = seed
+        self._random = random.Random(seed)  # noqa: S311  # repeatable, no secret
+        self._deltas = _Deltas()
+        site = loaded.site
+        robot = site.robots[0]
+        self.robot = StandingRobot(session, site.id, robot.id, robot.start)
+        session.declare_subscriber(ch.MAP_DELTA.key(site=site.id), self._deltas.on_delta)
+
+    async def run(self, number: int, on_progress: Callable[[], object]) -> Warned | None:
+        """Measure one warning, and clear up after it; None if the robot was not warned."""
+        hazard = await self._drive(number)
+        await asyncio.sleep(self._random.uniform(0.0, _PHASE_S))
+        self.robot.forget()
+        self._world.echo = None
+        placed = time.time()
+        self._world.place(hazard.barrier)
+        warned = await self._warned(hazard.area.id, placed)
+        self._world.remove(hazard.barrier.id)
+        await self._until(self._clear, "all areas are clear again")
+        on_progress()
+        return warned
+
+    async def _drive(self, number: int) -> PlannedHazard:
+        """Send the robot to the goal, and return an obstacle on its path."""
+        site, seed = self._loaded.site, self._seed + number
+        assert site.demo is not None
+        goal = site.places[site.demo.goal]
+        await self._until(self._clear, "all areas are clear")
+        port = self._stack.port(PLANNER)
+        assert port is not None
+        where = {"pose": {"x": goal.x, "y": goal.y}}
+
+        async def accepted() -> bool:
+            path = f"/api/v1/robots/{self.robot.id}/goal"
+            answer = await asyncio.to_thread(net.request, "PUT", port, path, body=where, token=self._stack.token)
+            return answer.status == 200 and isinstance(answer.body, dict)
+
+        self.robot.forget()
+        await self._until(accepted, "the planner accepts the goal")
+
+        async def drawn() -> bool:
+            return bool(self.robot.paths) and self.robot.paths[-1].path.refusal is None
+
+        await self._until(drawn, "the robot has a path")
+        points = self.robot.paths[-1].path.points
+        try:
+            return draw_hazard(site, points, seed, lambda area: barrier_across(area, site, self._loaded.map, seed))
+        except BarrierError as error:
+            raise FailedError(str(error)) from error
+
+    async def _warned(self, area: str, placed: float) -> Warned | None:
+        polygon = next(each.polygon for each in self._loaded.site.areas if each.id == area)
+        deadline = time.monotonic() + _TIMEOUT_S
+        while time.monotonic() < deadline:
+            paths = [each for each in self.robot.paths if entry_distance(each.path.points, polygon) is None]
+            warned = first_warning(paths, area, placed, self._world.echo, self._deltas.arrived)
+            if warned is not None:
+                return warned
+            await asyncio.sleep(_POLL_S)
+        return None
+
+    async def _clear(self) -> bool:
+        """Whether the aggregator believes all nodes, and none of them sees anything."""
+        port = self._stack.port(AGGREGATOR)
+        assert port is not None
+        answer = await asyncio.to_thread(net.request, "GET", port, "/api/v1/nodes", token=self._stack.token)
+        return isinstance(answer.body, list) and all(node["state"] == "clear" for node in answer.body)
+
+    async def _until(self, condition: Callable[[], Any], what: str) -> None:
+        deadline = time.monotonic() + _READY_S
+        while not await condition():
+            if time.monotonic() > deadline:
+                logs = "\n".join(log_tail(self._stack.log(name)) for name in (AGGREGATOR, MAP_SERVICE, PLANNER))
+                raise FailedError(f"waited {_READY_S:.0f} s until {what}\n{logs}")
+            await asyncio.sleep(_POLL_S)

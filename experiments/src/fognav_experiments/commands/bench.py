@@ -1,0 +1,506 @@
+"""`fognav bench`: measure parts of the system on this machine."""
+
+from __future__ import annotations
+
+import asyncio
+import os
+from functools import partial
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Annotated
+
+import typer
+from rich.progress import Progress
+
+from fognav import kernels
+from fognav.output import NOT_TRUE, WrongUseError, check_writable, console, exit_codes, print_json
+
+bench_app = typer.Typer(help="Measure parts of the system on this machine.", no_args_is_help=True)
+
+
+def add_to(app: typer.Typer) -> None:
+    """Add the command to `fognav`."""
+    app.add_typer(bench_app, name="bench")
+
+
+@bench_app.command("fleet", epilog="Example: fognav bench fleet --robots 50 --goals 50 --zones 300 --json")
+def fleet_command(  # noqa: PLR0913  # the options of a command
+    *,
+    robots: Annotated[int, typer.Option("--robots", metavar="N", min=1, max=500, help="Robots with a goal.")] = 50,
+    goals: Annotated[int, typer.Option("--goals", metavar="G", min=1, max=500, help="Different goals.")] = 50,
+    zones: Annotated[int, typer.Option("--zones", metavar="Z", min=0, max=5000, help="No-go zones.")] = 300,
+    trials: Annotated[int, typer.Option("--trials", metavar="T", min=1, help="Hazards of each kind.")] = 5,
+    seed: Annotated[int, typer.Option("--seed", metavar="N", min=0, help="Seed of floor, places and zones.")] = 1,
+    live: Annotated[
+        bool,
+        typer.Option("--live", help="Measure a planner's process, with a router, a store and robots' subscribers."),
+    ] = False,
+    json: Annotated[bool, typer.Option("--json", help="Write one JSON object to standard output.")] = False,
+) -> None:
+    """Measure the planner with many robots.
+
+    One hazard lies across all paths, then one cuts all goals off, then they are reachable again. The map is an office
+    of 100 x 60 m at 5 cm. Times are in ms, from a change of the map to each robot's path or refusal: within the
+    planner's core, or, with --live, from its publication to the robot's subscriber.
+    """
+    import numpy as np  # noqa: PLC0415  # keeps the other commands fast
+
+    from fognav_experiments.bench import fleet_live, machine  # noqa: PLC0415  # same
+    from fognav_experiments.bench.fleet import Fleet, FleetMap, measure, place_fleet  # noqa: PLC0415  # same
+    from fognav_experiments.bench.office import make_office  # noqa: PLC0415  # same
+
+    kernels.warm_cache(lambda text: console.print(text, markup=False))
+    rng = np.random.default_rng(seed)
+    with exit_codes(), Progress(console=console, disable=not console.is_terminal) as progress:
+        task = progress.add_task("planning the first paths", total=trials)
+        map_ = FleetMap(make_office(seed=seed), zones, rng)
+
+        def show(done: int, _total: int) -> None:
+            progress.update(task, completed=done, description="hazards")
+
+        if live:
+            fleet = place_fleet(map_, robots, goals, rng)
+            figures = asyncio.run(fleet_live.measure(map_, fleet, trials, show))
+        else:
+            figures = measure(map_, Fleet(map_, robots, goals, rng), trials, show)
+    asked = {"robots": robots, "goals": goals, "zones": zones, "trials": trials, "seed": seed, "live": live}
+    if json:
+        print_json({"bench": "fleet", **asked, **figures, **machine.describe()})
+        return
+    for name, value in (asked | figures).items():
+        console.print(f"{name:24} {value}", markup=False)
+
+
+@bench_app.command("floor", epilog="Example: fognav bench floor --width 500 --height 500 --json")
+def floor_command(
+    *,
+    width: Annotated[float, typer.Option("--width", metavar="M", min=40.0, max=2000.0, help="Width (m).")] = 500.0,
+    height: Annotated[float, typer.Option("--height", metavar="M", min=30.0, max=2000.0, help="Height (m).")] = 500.0,
+    json: Annotated[bool, typer.Option("--json", help="Write one JSON object to standard output.")] = False,
+) -> None:
+    """Measure a map-service and a planner on a large floor, at 5 cm per cell.
+
+    Real processes: until each is ready, their memory, a snapshot of the map, a path across the whole floor, and another
+    one after a zone closed it. By default the largest floor that there may be, 10,000 x 10,000 cells; it takes some
+    minutes, and memory of several GB.
+    """
+    from fognav_experiments.bench import floor, machine  # noqa: PLC0415  # keeps the other commands fast
+
+    kernels.warm_cache(lambda text: console.print(text, markup=False))
+    with exit_codes(), TemporaryDirectory(prefix="fognav-") as folder:
+        cells = floor.prepare(Path(folder), width, height)
+        figures = asyncio.run(
+            floor.measure(Path(folder), cells, width, height, lambda step: console.print(step, markup=False))
+        )
+    asked = {"width": width, "height": height}
+    if json:
+        print_json({"bench": "floor", **asked, **figures, **machine.describe()})
+        return
+    for name, value in (asked | figures).items():
+        console.print(f"{name:26} {value}", markup=False)
+
+
+@bench_app.command("costmap", epilog="Example: fognav bench costmap --zones 5000 --json")
+def costmap_command(
+    *,
+    zones: Annotated[int, typer.Option("--zones", metavar="Z", min=1, max=5000, help="Zones of 5 x 5 m.")] = 5000,
+    repeats: Annotated[int, typer.Option("--repeats", metavar="N", min=1, help="Repetitions of each figure.")] = 5,
+    seed: Annotated[int, typer.Option("--seed", metavar="N", min=0, help="Seed of the floor.")] = 1,
+    json: Annotated[bool, typer.Option("--json", help="Write one JSON object to standard output.")] = False,
+) -> None:
+    """Measure the map-service's core.
+
+    Full updates and a change of 2 x 2 m, the legal zones that cost most, the start with many zones, a snapshot. The map
+    is an office of 100 x 60 m at 5 cm. Times are in ms.
+    """
+    from fognav_experiments.bench import costmap, machine  # noqa: PLC0415  # keeps the other commands fast
+    from fognav_experiments.bench.office import make_office  # noqa: PLC0415  # same
+
+    kernels.warm_cache(lambda text: console.print(text, markup=False))
+    figures = costmap.measure(make_office(seed=seed), zones, repeats)
+    if json:
+        print_json({"bench": "costmap", "repeats": repeats, "seed": seed, **figures, **machine.describe()})
+        return
+    for name, value in figures.items():
+        console.print(f"{name:22} {value}", markup=False)
+
+
+@bench_app.command("robot", epilog="Example: fognav bench robot --seconds 30 --cpu-quota 0.2 --json")
+def robot_command(
+    *,
+    seconds: Annotated[
+        float, typer.Option("--seconds", metavar="S", min=1.0, max=120.0, help="Length of each measurement.")
+    ] = 30.0,
+    cpu_quota: Annotated[
+        float | None,
+        typer.Option("--cpu-quota", metavar="SHARE", min=0.01, max=4.0, help="Limit the robot to a share of a core."),
+    ] = None,
+    json: Annotated[bool, typer.Option("--json", help="Write one JSON object to standard output.")] = False,
+) -> None:
+    """Measure what the robot's processes cost.
+
+    Agent, guardian and watchdog, standing by and driving on a map of 2000 x 1140 cells. Fog, simulator and emulated
+    devices are processes of their own, which do not count. CPU is in percent of one core.
+    """
+    from fognav_experiments.bench import machine, robot  # noqa: PLC0415  # keeps the other commands fast
+
+    kernels.warm_cache(lambda text: console.print(text, markup=False))
+    with exit_codes():
+        figures = robot.measure(seconds, cpu_quota, lambda phase: console.print(phase, markup=False))
+    asked = {"seconds": seconds, "cpu_quota": cpu_quota}
+    if json:
+        print_json({"bench": "robot", **asked, **figures, **machine.describe()})
+        return
+    for name, value in (asked | figures).items():
+        console.print(f"{name:22} {value}", markup=False)
+
+
+@bench_app.command("rest", epilog="Example: fognav bench rest --clients 32 --seconds 60 --json")
+def rest_command(
+    *,
+    clients: Annotated[int, typer.Option("--clients", metavar="N", min=1, max=128, help="Clients at once.")] = 32,
+    seconds: Annotated[float, typer.Option("--seconds", metavar="S", min=1.0, help="How long they ask.")] = 30.0,
+    zones: Annotated[int, typer.Option("--zones", metavar="Z", min=0, max=4900, help="Zones of 5 x 5 m.")] = 4900,
+    json: Annotated[bool, typer.Option("--json", help="Write one JSON object to standard output.")] = False,
+) -> None:
+    """Measure how steady the map's heartbeat is under load, and how long zones take without any.
+
+    Clients send a map-service the costliest zones, read all zones and pictures, send invalid and oversized bodies, or
+    send and read slowly; another process times the heartbeat (100 ms), without clients (`idle_`) and with them.
+    """
+    from fognav_experiments.bench import machine, rest  # noqa: PLC0415  # keeps the other commands fast
+    from fognav_experiments.bench.office import make_office  # noqa: PLC0415  # same
+    from fognav_experiments.bench.site import write_site  # noqa: PLC0415  # same
+
+    kernels.warm_cache(lambda text: console.print(text, markup=False))
+    floor = make_office()
+    with exit_codes(), TemporaryDirectory(prefix="fognav-") as folder:
+        write_site(Path(folder), floor)
+        figures = asyncio.run(rest.measure(Path(folder), floor, zones=zones, clients=clients, seconds=seconds))
+    asked = {"clients": clients, "seconds": seconds, "zones": zones}
+    if json:
+        print_json({"bench": "rest", **asked, **figures, **machine.describe()})
+        return
+    for name, value in (asked | figures).items():
+        console.print(f"{name:26} {value}", markup=False)
+
+
+@bench_app.command("localization", epilog="Example: fognav bench localization --json")
+def localization_command(
+    *,
+    particles: Annotated[int, typer.Option("--particles", metavar="N", min=10, max=50_000, help="Particles.")] = 2000,
+    beams: Annotated[int, typer.Option("--beams", metavar="N", min=10, max=1000, help="Beams of an update.")] = 60,
+    repeats: Annotated[int, typer.Option("--repeats", metavar="N", min=1, help="Repetitions of each figure.")] = 200,
+    seed: Annotated[int, typer.Option("--seed", metavar="N", min=0, help="Seed of floor and particles.")] = 1,
+    json: Annotated[bool, typer.Option("--json", help="Write one JSON object to standard output.")] = False,
+) -> None:
+    """Measure the localization.
+
+    One cycle of the particle filter (move, weight, cluster, resample) beside the same with plainly written scores, the
+    match of a scan, and the search of a whole office of 100 x 60 m at 5 cm. Times are in ms.
+    """
+    from fognav_experiments.bench import localization, machine  # noqa: PLC0415  # keeps the other commands fast
+    from fognav_experiments.bench.office import make_office  # noqa: PLC0415  # same
+
+    kernels.warm_cache(lambda text: console.print(text, markup=False))
+    figures = localization.measure(make_office(seed=seed), particles, beams, repeats, seed)
+    if json:
+        asked = {"particles": particles, "beams": beams, "repeats": repeats, "seed": seed}
+        print_json({"bench": "localization", **asked, **figures, **machine.describe()})
+        return
+    for name, value in figures.items():
+        console.print(f"{name:22} {value}", markup=False)
+
+
+@bench_app.command("planner", epilog="Example: fognav bench planner --map office.yaml --queries 30 --json")
+def planner_command(
+    *,
+    map_file: Annotated[
+        Path | None,
+        typer.Option("--map", metavar="FILE", help="A map_server YAML, or MovingAI's `.map`; else an office."),
+    ] = None,
+    scenario: Annotated[
+        Path | None, typer.Option("--scen", metavar="FILE", help="MovingAI's queries with their shortest lengths.")
+    ] = None,
+    queries: Annotated[int, typer.Option("--queries", metavar="N", min=1, max=10_000, help="How many.")] = 30,
+    seed: Annotated[int, typer.Option("--seed", metavar="N", min=0, help="Seed of office, queries and hazards.")] = 1,
+    json: Annotated[bool, typer.Option("--json", help="Write one JSON object to standard output.")] = False,
+) -> None:
+    """Measure path searches: from scratch, and again after a hazard of 2 x 2 m on the path.
+
+    The office has 100 x 60 m at 5 cm; without a scenario, queries are long ones. `optimal` counts the queries that cost
+    what a Dijkstra search finds, and have the published length; `replans_optimal` the replans that cost what a search
+    from scratch finds. Times are in ms of the processor; `field_median_ms` is that of the goal's field, once per goal.
+    """
+    import numpy as np  # noqa: PLC0415  # keeps the other commands fast
+
+    from fog_runtime.configuration.maps import MapFileError  # noqa: PLC0415  # same
+    from fognav_experiments.bench import machine, planner  # noqa: PLC0415  # same
+
+    kernels.warm_cache(lambda text: console.print(text, markup=False))
+    rng = np.random.default_rng(seed)
+    with exit_codes(), Progress(console=console, disable=not console.is_terminal) as progress:
+        try:
+            floor = planner.load_floor(map_file, seed)
+            asked = planner.read_scenario(scenario, queries) if scenario else None
+        except (planner.MapTextError, MapFileError, OSError) as error:
+            raise WrongUseError(str(error)) from error
+        asked = asked or planner.long_queries(floor.costmap, queries, rng)
+        task = progress.add_task("queries", total=len(asked))
+        figures = planner.measure(floor, asked, rng, lambda done: progress.update(task, completed=done))
+    height, width = floor.costmap.shape
+    what = {"map": "office" if map_file is None else map_file.name, "width": width, "height": height, "seed": seed}
+    if json:
+        print_json({"bench": "planner", **what, **figures, **machine.describe()})
+        return
+    for name, value in (what | figures).items():
+        console.print(f"{name:27} {value}", markup=False)
+
+
+@bench_app.command("dwa", epilog="Example: fognav bench dwa --repeats 2000 --json")
+def dwa_command(
+    *,
+    repeats: Annotated[int, typer.Option("--repeats", metavar="N", min=1, help="Repetitions of each figure.")] = 1000,
+    json: Annotated[bool, typer.Option("--json", help="Write one JSON object to standard output.")] = False,
+) -> None:
+    """Measure a robot's decision among 25 x 35 arcs.
+
+    The distances around it and the choice, for a round body and a rectangle in a corridor, and a whole decision. Times
+    are in ms; `peer_ratio` is by 1.75 ms, which ROS 1's local planner took for as many arcs on another x86 server.
+    """
+    from fognav_experiments.bench import dwa, machine  # noqa: PLC0415  # keeps the other commands fast
+
+    kernels.warm_cache(lambda text: console.print(text, markup=False))
+    figures = dwa.measure(repeats)
+    if json:
+        print_json({"bench": "dwa", "repeats": repeats, **figures, **machine.describe()})
+        return
+    for name, value in figures.items():
+        console.print(f"{name:22} {value}", markup=False)
+
+
+@bench_app.command("pipeline", epilog="Example: fognav bench pipeline --nodes 500 --rate 20 --seconds 30 --json")
+def pipeline_command(
+    *,
+    nodes: Annotated[int, typer.Option("--nodes", metavar="N", min=1, max=2000, help="Nodes that publish.")] = 500,
+    rate: Annotated[float, typer.Option("--rate", metavar="HZ", min=1.0, max=50.0, help="Readings per second.")] = 20.0,
+    robots: Annotated[int, typer.Option("--robots", metavar="N", min=0, max=200, help="Robots with poses.")] = 50,
+    seconds: Annotated[float, typer.Option("--seconds", metavar="S", min=4.0, help="How long they publish.")] = 30.0,
+    open_: Annotated[bool, typer.Option("--open", help="Without locks: no encryption, no passwords.")] = False,
+    json: Annotated[bool, typer.Option("--json", help="Write one JSON object to standard output.")] = False,
+) -> None:
+    """Measure the way from readings to the map.
+
+    Broker, aggregator and map-service are real processes behind locks; so is the generator of the load. Readings that
+    the aggregator did not get are lost; times are in ms, from the confirmation of a hazard to the map's delta.
+    """
+    from fognav_experiments.bench import machine, pipeline  # noqa: PLC0415  # keeps the other commands fast
+
+    kernels.warm_cache(lambda text: console.print(text, markup=False))
+    with exit_codes(), TemporaryDirectory(prefix="fognav-") as folder:
+        figures = asyncio.run(
+            pipeline.measure(
+                Path(folder), nodes=nodes, rate=rate, robots=robots, seconds=seconds, locked=not open_,
+                on_phase=lambda text: console.print(text, markup=False),
+            )
+        )  # fmt: skip
+    asked = {"nodes": nodes, "rate": rate, "robots": robots, "seconds": seconds, "locked": not open_}
+    if json:
+        print_json({"bench": "pipeline", **asked, **figures, **machine.describe()})
+        return
+    for name, value in (asked | figures).items():
+        console.print(f"{name:28} {value}", markup=False)
+
+
+@bench_app.command("warning", epilog="Example: fognav bench warning --warnings 50 --json")
+def warning_command(  # noqa: PLR0913  # the options of the command
+    *,
+    warnings: Annotated[int, typer.Option("--warnings", metavar="N", min=1, help="Obstacles for each rule.")] = 50,
+    rule: Annotated[
+        list[str] | None, typer.Option("--rule", metavar="R", help="A debounce rule; may be repeated. Default: two.")
+    ] = None,
+    site: Annotated[Path, typer.Option("--site", metavar="D", help="Folder of the site.")] = Path("estig"),
+    false_echoes: Annotated[
+        float | None,
+        typer.Option("--false-echoes", metavar="N", min=0.0, max=50.0, help="Invent echoes in N % of measurements."),
+    ] = None,
+    hours: Annotated[
+        float, typer.Option("--hours", metavar="H", min=0.01, help="Simulated hours with nothing but false echoes.")
+    ] = 2.0,
+    seed: Annotated[int, typer.Option("--seed", metavar="N", min=0, help="Seed of the obstacles.")] = 1,
+    json: Annotated[bool, typer.Option("--json", help="Write one JSON object to standard output.")] = False,
+) -> None:
+    """Measure a warning: from an obstacle's first echo at a node to the path that a robot receives around it.
+
+    The whole fog runs as real processes behind locks, the nodes run the firmware's code, with an MQTT connection each,
+    and the robot is a stand-in with a goal. Obstacles close an area on its way, one after another. Times are in ms.
+
+    With --false-echoes the nodes and the aggregator's core run in simulated time instead, whatever the machine's load:
+    all sonars hear what is not there, their nodes are calibrated in that, and false alarms are counted, too.
+    """
+    from fognav import checkout  # noqa: PLC0415  # keeps the other commands fast
+    from fognav.nodes import site_file  # noqa: PLC0415  # same
+    from fognav_experiments.bench import false_echoes as noise  # noqa: PLC0415  # same
+    from fognav_experiments.bench import machine, warning  # noqa: PLC0415  # same
+
+    kernels.warm_cache(lambda text: console.print(text, markup=False))
+    rows = []
+    with exit_codes(), Progress(console=console, disable=not console.is_terminal) as progress:
+        loaded = site_file.load(checkout.site_folder(site))
+        for each in rule or ["evidence", "consecutive"]:
+            task = progress.add_task(each, total=warnings)
+            advance = partial(progress.advance, task)
+            if false_echoes is not None:
+                rows.append(noise.measure(loaded, each, noise.Asked(false_echoes / 100.0, hours, warnings, seed)))
+                progress.update(task, completed=warnings)
+                continue
+            rows.append(asyncio.run(warning.measure(loaded, each, warnings, seed, advance)))
+    if json:
+        print_json({"bench": "warning", "warnings": warnings, "seed": seed, "rows": rows, **machine.describe()})
+        return
+    for row in rows:
+        for name, value in row.items():
+            console.print(f"{name:28} {value}", markup=False)
+
+
+@bench_app.command("debounce", epilog="Example: fognav bench debounce --recordings DIR --png rules.png")
+def debounce_command(
+    *,
+    recordings: Annotated[
+        Path,
+        typer.Option("--recordings", metavar="DIR", help="Recordings of a sonar (CSV: time in s, distance in cm)."),
+    ],
+    trials: Annotated[
+        int, typer.Option("--trials", metavar="N", min=1, help="Obstacles per rule and echo rate.")
+    ] = 500,
+    hours: Annotated[float, typer.Option("--hours", metavar="H", min=0.01, help="Hours without an obstacle.")] = 2.0,
+    seed: Annotated[int, typer.Option("--seed", metavar="N", min=0, help="Seed of the trials.")] = 1,
+    png: Annotated[Path | None, typer.Option("--png", metavar="FILE", help="Draw the figures.")] = None,
+    json: Annotated[bool, typer.Option("--json", help="Write one JSON object to standard output.")] = False,
+) -> None:
+    """Compare the debounce rules on recorded echoes.
+
+    Obstacles of the recordings come, stay and go, with 50 to 100 % of their echoes. Figures: time to detection, misses
+    after 2 s, losses within 4 s, how much of these 4 s the obstacle is known, and false alarms per hour of the
+    background, as recorded and with 2 % false echoes; and what the evidence rule learns from the recordings: echo_rate
+    and false_echo_rate.
+    """
+    from fognav_experiments.bench import machine  # noqa: PLC0415  # keeps the other commands fast
+    from fognav_experiments.bench.debounce_rules import comparison, plot, sonar_recording  # noqa: PLC0415  # same
+
+    with exit_codes():
+        check_writable(png)
+        try:
+            loaded = sonar_recording.recordings_in(recordings)
+        except ValueError as error:
+            raise WrongUseError(str(error)) from error
+        rows = comparison.measure(loaded, trials, hours, seed, lambda rule: console.print(rule, markup=False))
+        if png is not None:
+            plot.draw(rows, png)
+    learned = [{"echo_rate": round(r.echo_rate, 3), "false_echo_rate": round(r.false_echo_rate, 3)} for r in loaded]
+    asked = {"trials": trials, "hours": hours, "seed": seed, "readings": sum(r.samples for r in loaded)}
+    if json:
+        print_json({"bench": "debounce", **asked, "learned": learned, "rows": rows, **machine.describe()})
+        return
+    for values in learned:
+        console.print("learned: " + "  ".join(f"{name} {value}" for name, value in values.items()), markup=False)
+    for line in comparison.table(rows):
+        console.print(line, markup=False, soft_wrap=True)
+
+
+@bench_app.command("reactions", epilog="Example: fognav bench reactions --trials 200 --write docs/reaction-times.md")
+def reactions_command(
+    *,
+    trials: Annotated[
+        int, typer.Option("--trials", metavar="N", min=1, help="Trials of each process or pair that dies or hangs.")
+    ] = 3,
+    others: Annotated[
+        int | None, typer.Option("--others", metavar="N", min=0, help="Trials of each other fault; default: as many.")
+    ] = None,
+    robots: Annotated[int, typer.Option("--robots", metavar="N", min=1, max=32, help="Robots at once.")] = 2,
+    log: Annotated[
+        Path | None, typer.Option("--log", metavar="FILE", help="Keep each trial there, and continue the ones there.")
+    ] = None,
+    write: Annotated[
+        Path | None,
+        typer.Option("--write", metavar="FILE", help="Write the tables to a Markdown file; its remarks stay."),
+    ] = None,
+    json: Annotated[bool, typer.Option("--json", help="Write one JSON object to standard output.")] = False,
+) -> None:
+    """Measure how soon the wheels stop.
+
+    Processes of driving robots are killed or stopped, one by one and in pairs; sensors, lidar, map, planner and network
+    fail; an operator stops the robot. The time ends when the emulated base's wheels are commanded to stand, or to be
+    slow. A trial takes some five seconds. Exit code 1: a trial was beyond its limit.
+    """
+    from fognav_experiments.bench import machine  # noqa: PLC0415  # keeps the other commands fast
+    from fognav_experiments.bench.reactions import page  # noqa: PLC0415  # same
+    from fognav_experiments.bench.reactions.faults import FAULTS  # noqa: PLC0415  # same
+    from fognav_experiments.bench.reactions.trials import due, measure, read_log, row  # noqa: PLC0415  # same
+
+    kernels.warm_cache(lambda text: console.print(text, markup=False))
+    with exit_codes():
+        check_writable(log)
+        check_writable(write)
+        times = read_log(log)
+        other = trials if others is None else others
+        waiting = due(times, lambda fault: trials if fault.kind == "process" else other)
+        found = asyncio.run(measure(waiting, robots, log, lambda text: console.print(text, markup=False)))
+    rows = [row(fault, every) for fault in FAULTS if (every := times.get(fault.name, []) + found.get(fault.name, []))]
+    if write is not None:
+        command = f"fognav bench reactions --trials {trials} --others {other} --robots {robots} --log FILE --write PAGE"
+        kept = page.remarks(write.read_text("utf-8")) if write.exists() else ""
+        write.write_text(page.markdown(rows, command, machine.sentence(), robots, kept), "utf-8")
+    if json:
+        print_json({"bench": "reactions", "trials": trials, "others": other, "rows": rows, **machine.describe()})
+    else:
+        for values in rows:
+            console.print("  ".join(f"{name} {value}" for name, value in values.items()), markup=False)
+    if any(each["beyond_limit"] for each in rows):
+        raise typer.Exit(NOT_TRUE)
+
+
+@bench_app.command("mutation", epilog="Example: fognav bench mutation --part guardian --module core")
+def mutation_command(
+    *,
+    part: Annotated[
+        list[str] | None, typer.Option("--part", metavar="NAME", help="Only this part; may be repeated.")
+    ] = None,
+    module: Annotated[
+        str, typer.Option("--module", metavar="NAME", help="Only mutants of modules whose name ends so.")
+    ] = "",
+    coverage: Annotated[
+        bool, typer.Option("--coverage", help="Measure only which lines and branches the tests reach.")
+    ] = False,
+    jobs: Annotated[int, typer.Option("--jobs", metavar="N", min=0, help="Mutants at once; 0: one per core.")] = 0,
+    json: Annotated[bool, typer.Option("--json", help="Write one JSON object to standard output.")] = False,
+) -> None:
+    """Test the tests of what stops the robot.
+
+    Changes one operator, number or statement of safety gate, guardian, watchdog, recoveries or maneuvers, and runs
+    their tests, which must notice it; prints each change that none does. Exit code 1: a line or branch that no test
+    reaches, or fewer than 90 percent of the changes noticed.
+    """
+    from fognav import checkout  # noqa: PLC0415  # keeps the other commands fast
+    from fognav_experiments.mutation import report  # noqa: PLC0415  # same
+    from fognav_experiments.mutation.parts import parts_named  # noqa: PLC0415  # same
+    from fognav_experiments.mutation.run import measure  # noqa: PLC0415  # same
+
+    def tell(text: str) -> None:
+        console.print(text, markup=False, soft_wrap=True)
+
+    with exit_codes():
+        root, chosen = checkout.root(), parts_named(part or [])
+        figures = {
+            each.name: measure(
+                each, root, jobs=jobs or os.cpu_count() or 1, only=None if coverage else module, tell=tell
+            )
+            for each in chosen
+        }
+    if json:
+        print_json({"bench": "mutation", "parts": report.values(figures)})
+    else:
+        for line in report.lines(figures):
+            tell(line)
+    if not report.passes(figures):
+        raise typer.Exit(NOT_TRUE)

@@ -1,0 +1,148 @@
+"""`fognav localize`: evaluate the localization on a recorded log."""
+
+from __future__ import annotations
+
+from pathlib import Path  # noqa: TC003  # Typer reads annotations at run time
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+from rich.progress import Progress
+
+from fognav import kernels
+from fognav.lidar_logs.logs import LidarLog, LogScan, Selection, read_log
+from fognav.lidar_logs.options import LogFormat, RangeMax, Scans  # noqa: TC001  # same
+from fognav.operate.options import JsonOption  # noqa: TC001  # same
+from fognav.output import NOT_TRUE, WrongUseError, check_writable, console, exit_codes, print_answer, print_json
+
+if TYPE_CHECKING:
+    from fog_contracts.grid import StaticMap
+
+
+def add_to(app: typer.Typer) -> None:
+    """Add the command to `fognav`."""
+    epilog = "Example: fognav localize --map floor.yaml --log drive.log.gz --scans even --json"
+    app.command("localize", epilog=epilog)(localize_command)
+
+
+def localize_command(  # noqa: PLR0913  # each option is an argument
+    *,
+    map_file: Annotated[Path, typer.Option("--map", metavar="MAP.yaml", help="map_server map of the building.")],
+    log_file: Annotated[Path, typer.Option("--log", metavar="LOG", help="JSON lines or CARMEN, gzipped or not.")],
+    log_format: LogFormat = "auto",
+    scans: Scans = "all",
+    search: Annotated[bool, typer.Option("--global", help="Start by a search of the whole map.")] = False,
+    kidnap: Annotated[bool, typer.Option("--kidnap", help="Carry the robot away unnoticed, half way.")] = False,
+    trials: Annotated[
+        int | None,
+        typer.Option("--trials", metavar="N", min=1, help="With --global or --kidnap: N random excerpts of the log."),
+    ] = None,
+    first: Annotated[int, typer.Option("--first", metavar="N", min=0, help="Leave out N of the scans first.")] = 0,
+    count: Annotated[int | None, typer.Option("--count", metavar="N", min=2, help="Use at most N scans.")] = None,
+    range_max: RangeMax = 30.0,
+    seed: Annotated[int, typer.Option("--seed", metavar="N", min=0, help="Seed of the filter and of added noise.")] = 1,
+    png: Annotated[Path | None, typer.Option("--png", metavar="F", help="Draw map, reference and estimates.")] = None,
+    json: JsonOption = False,
+) -> None:
+    """Evaluate the localization on a recorded log.
+
+    The log has reference poses. If its odometry is its reference (corrected CARMEN logs), noise is added to it. The
+    exit code is 1 if no pose was found, or one that is wrong. With --trials starts without a pose (--global) or robots
+    that are carried away unnoticed (--kidnap) are counted, and it is 1 if any pose was wrong while it was good.
+    """
+    with exit_codes():
+        check_writable(png)
+        map_, log = _load_map(map_file), read_log(log_file, log_format)
+        used = _with_references(log, scans, first, count, log_file)
+        kernels.warm_cache(lambda text: console.print(text, markup=False))
+        if trials is None:
+            found = _evaluate(map_, used, log, png, search=search, kidnap=kidnap, range_max=range_max, seed=seed)
+        else:
+            found = _try(map_, used, log, trials, search=search, kidnap=kidnap, range_max=range_max, seed=seed)
+    if json:
+        print_json({"map": str(map_file), "log": str(log_file), "selection": scans, "seed": seed, **found})
+    else:
+        for name, value in found.items():
+            print_answer(f"{name:26} {value}")
+    if found.get("wrong") or found.get("falsely_good_scans") or found.get("converged_right") is False:
+        raise typer.Exit(NOT_TRUE)
+
+
+def _load_map(file: Path) -> StaticMap:
+    from fog_runtime.configuration.maps import MapFileError, load_map  # noqa: PLC0415  # keeps the other commands fast
+
+    try:
+        return load_map(file)
+    except MapFileError as error:
+        raise WrongUseError(str(error)) from error
+
+
+def _with_references(log: LidarLog, scans: Selection, first: int, count: int | None, file: Path) -> list[LogScan]:
+    used = [scan for scan in log.select(scans) if scan.reference is not None][first:][:count]
+    if len(used) < 2:
+        raise WrongUseError(f"{file} has fewer than two such scans with a reference pose. Name a corrected log")
+    return used
+
+
+def _try(  # noqa: PLR0913  # the command's options
+    map_: StaticMap,
+    used: list[LogScan],
+    log: LidarLog,
+    trials: int,
+    *,
+    search: bool,
+    kidnap: bool,
+    range_max: float,
+    seed: int,
+) -> dict[str, object]:
+    from fognav_experiments.localization.evaluation import with_noise  # noqa: PLC0415  # as above
+    from fognav_experiments.localization.trials import random_kidnappings, random_starts  # noqa: PLC0415  # same
+    from robot_agent.config import LocalizationConfig  # noqa: PLC0415  # same
+    from robot_agent.localization.map_fields import map_fields  # noqa: PLC0415  # same
+
+    if search == kidnap:
+        raise WrongUseError("--trials counts starts without a pose or kidnapped robots: add --global or --kidnap")
+    if not log.odometry_measured:
+        used = with_noise(used, seed)
+    config = LocalizationConfig(range_max=range_max)
+    fields = map_fields(map_.cells, map_.geometry, config)
+    with Progress(console=console, disable=not console.is_terminal) as progress:
+        task = progress.add_task("localizing", total=trials)
+        run = random_kidnappings if kidnap else random_starts
+        return run(
+            fields, used, config, trials=trials, seed=seed,
+            on_trial=lambda n: progress.update(task, completed=n + 1),
+        )  # fmt: skip
+
+
+def _evaluate(  # noqa: PLR0913  # the command's options
+    map_: StaticMap,
+    used: list[LogScan],
+    log: LidarLog,
+    png: Path | None,
+    *,
+    search: bool,
+    kidnap: bool,
+    range_max: float,
+    seed: int,
+) -> dict[str, object]:
+    from fognav_experiments.localization.evaluation import figures, kidnapped, track, with_noise  # noqa: PLC0415  # as above
+    from fognav_experiments.localization.plot import write_plot  # noqa: PLC0415  # same
+    from robot_agent.config import LocalizationConfig  # noqa: PLC0415  # same
+    from robot_agent.localization.map_fields import map_fields  # noqa: PLC0415  # same
+
+    if not log.odometry_measured:
+        used = with_noise(used, seed)
+    gap = None
+    if kidnap:
+        used, gap = kidnapped(used)
+    config = LocalizationConfig(range_max=range_max)
+    fields = map_fields(map_.cells, map_.geometry, config)
+    with Progress(console=console, disable=not console.is_terminal) as progress:
+        task = progress.add_task("localizing", total=len(used))
+        samples = track(
+            fields, used, config, seed=seed, search=search, on_scan=lambda n: progress.update(task, completed=n + 1)
+        )
+    if png is not None:
+        write_plot(png, map_, samples)
+    odometry = "measured" if log.odometry_measured else "reference with noise"
+    return {"odometry": odometry, "global": search, **figures(samples, search=search, gap=gap)}

@@ -1,0 +1,1 @@
+"""Evaluates the localization on recorded logs."""

@@ -1,0 +1,183 @@
+"""Evaluation of the localizer on a log: errors against the reference, time lost, convergence, time per update."""
+
+from __future__ import annotations
+
+import itertools
+import math
+import time
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, Final
+
+import numpy as np
+
+from robot_agent.hardware import LaserScan
+from robot_agent.localization.localizer import Localizer
+from robot_agent.localization.pose import Pose2, wrap
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Sequence
+
+    from numpy.typing import NDArray
+
+    from fognav.lidar_logs.logs import LogScan
+    from robot_agent.config import LocalizationConfig
+    from robot_agent.localization.map_fields import MapFields
+
+_START_SIGMAS: Final = (0.2, 0.1)
+"""Standard deviations (m, rad) of the pose at which tracking starts: the reference's."""
+_FALSELY_GOOD_M: Final = 0.5
+_RIGHT_M: Final = 0.5
+_RIGHT_RAD: Final = 0.26
+_NOISE: Final = (0.05, 0.02, 0.05)
+"""Odometry noise of logs without an odometry of their own: standard deviation of translation per sqrt(m) (m), of
+heading per sqrt(m) and per sqrt(rad) (rad)."""
+
+
+@dataclass(frozen=True, slots=True)
+class Sample:
+    """The estimate at one scan (None: no pose) with its status, the reference, and the time that the scan took.
+
+    sigma_along: m, standard deviation of the position in its least certain direction.
+    """
+
+    estimate: Pose2 | None
+    status: str
+    reference: Pose2
+    sigma_along: float
+    milliseconds: float
+
+    @property
+    def position_error(self) -> float:
+        """Distance (m) from the reference; infinite without an estimate."""
+        if self.estimate is None:
+            return math.inf
+        return math.hypot(self.estimate.x - self.reference.x, self.estimate.y - self.reference.y)
+
+    @property
+    def heading_error(self) -> float:
+        """Angle (rad) from the reference; infinite without an estimate."""
+        return math.inf if self.estimate is None else abs(wrap(self.estimate.theta - self.reference.theta))
+
+
+def with_noise(scans: Sequence[LogScan], seed: int) -> list[LogScan]:
+    """Return the scans with noise added to their odometry, as a random walk over distance and rotation."""
+    rng = np.random.default_rng(seed)
+    per_metre, heading_per_metre, heading_per_radian = _NOISE
+    odom, noisy = scans[0].odom, [scans[0]]
+    for before, scan in itertools.pairwise(scans):
+        step = scan.odom.relative_to(before.odom)
+        length, angle = math.hypot(step.x, step.y), abs(step.theta)
+        dx, dy = rng.standard_normal(2) * per_metre * math.sqrt(length)
+        dtheta = rng.standard_normal() * math.hypot(
+            heading_per_metre * math.sqrt(length), heading_per_radian * math.sqrt(angle)
+        )
+        odom = odom.compose(Pose2(step.x + dx, step.y + 0.2 * dy, step.theta + dtheta))
+        noisy.append(replace(scan, odom=odom))
+    return noisy
+
+
+def track(
+    fields: MapFields,
+    scans: Sequence[LogScan],
+    config: LocalizationConfig,
+    *,
+    seed: int,
+    search: bool,
+    on_scan: Callable[[int], None] = lambda _: None,
+) -> list[Sample]:
+    """Run the localizer over scans with references; start at the first reference, or by a search of the whole map."""
+    localizer = Localizer(config, seed)
+    localizer.load_map(fields)
+    samples: list[Sample] = []
+    heading = scans[0].odom.theta
+    for number, scan in enumerate(scans):
+        assert scan.reference is not None
+        heading += wrap(scan.odom.theta - heading)
+        localizer.on_odometry(scan.stamp, scan.odom.x, scan.odom.y, heading)
+        if not samples and not search:
+            localizer.initial_pose(*scan.reference, *_START_SIGMAS)
+        begun = time.perf_counter()
+        localizer.on_scan(_laser_scan(scan), scan.stamp)
+        if search and not samples:
+            localizer.global_localization()
+        milliseconds = (time.perf_counter() - begun) * 1000.0
+        while localizer.searching:
+            localizer.continue_search(scan.stamp)
+        samples.append(
+            Sample(
+                localizer.pose(scan.stamp),
+                localizer.status,
+                scan.reference,
+                localizer.uncertainty.along,
+                milliseconds,
+            )
+        )
+        on_scan(number)
+    return samples
+
+
+def _laser_scan(scan: LogScan) -> LaserScan:
+    return LaserScan(
+        angles_rad=scan.angles,
+        ranges_m=scan.ranges,
+        quality=np.where(np.isfinite(scan.ranges), 1, 0).astype(np.uint8),
+        started_at=scan.stamp,
+        ended_at=scan.stamp,
+        repeats=1,
+    )
+
+
+def kidnapped(scans: Sequence[LogScan]) -> tuple[list[LogScan], int]:
+    """Return the scans without their third quarter, of which the odometry shows nothing, and where that gap is."""
+    gap, after = len(scans) // 2, 3 * len(scans) // 4
+    last, first = scans[gap - 1].odom, scans[after].odom
+    moved = [replace(scan, odom=last.compose(scan.odom.relative_to(first))) for scan in scans[after:]]
+    return [*scans[:gap], *moved], gap
+
+
+def figures(samples: Sequence[Sample], *, search: bool, gap: int | None = None) -> dict[str, object]:
+    """Return the figures of an evaluation; errors count from the first scan at which there is a pose to rely on.
+
+    A pose is relied on while its status is good or weak. `gap`: number of the first scan after a kidnapping.
+    """
+    relied = np.array([sample.status in {"good", "weak"} for sample in samples])
+    good = np.array([sample.status == "good" for sample in samples])
+    errors = np.array([sample.position_error for sample in samples])
+    headings = np.degrees([sample.heading_error for sample in samples])
+    converged = int(np.argmax(relied)) if relied.any() else None
+    used = np.isfinite(errors)
+    if search:
+        used &= np.arange(len(samples)) >= (len(samples) if converged is None else converged)
+    found: dict[str, object] = {
+        "scans": len(samples),
+        "position_error_median_m": _percentile(errors[used], 50),
+        "position_error_p95_m": _percentile(errors[used], 95),
+        "position_error_max_m": _percentile(errors[used], 100),
+        "heading_error_median_deg": _percentile(headings[used], 50),
+        "heading_error_p95_deg": _percentile(headings[used], 95),
+        "lost_share": round(float(np.mean([sample.status == "lost" for sample in samples[converged or 0 :]])), 4),
+        "good_share": round(float(good.mean()), 4),
+        "falsely_good_share": round(float(np.mean([is_falsely_good(sample) for sample in samples])), 4),
+        "converged_after_scans": None if converged is None else converged + 1,
+        "converged_right": converged is not None and is_right(samples[converged]),
+        "sigma_along_median_m": _percentile(np.array([sample.sigma_along for sample in samples])[used], 50),
+        "update_ms": _percentile(np.array([sample.milliseconds for sample in samples]), 50),
+    }
+    if gap is not None:
+        right = [number for number in range(gap, len(samples)) if relied[number] and is_right(samples[number])]
+        found["recovered_after_scans"] = right[0] - gap + 1 if right else None
+    return found
+
+
+def is_right(sample: Sample) -> bool:
+    """Return whether an estimate is near enough to the reference to go on from."""
+    return sample.position_error <= _RIGHT_M and sample.heading_error <= _RIGHT_RAD
+
+
+def is_falsely_good(sample: Sample) -> bool:
+    """Return whether an estimate is good by its status and yet far from the reference."""
+    return sample.status == "good" and sample.position_error > _FALSELY_GOOD_M
+
+
+def _percentile(values: NDArray[np.float64], percent: float) -> float | None:
+    return round(float(np.percentile(values, percent)), 4) if len(values) else None

@@ -1,0 +1,185 @@
+"""`fognav bench`: the figures that others rely on are there, and those that can be checked are right."""
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+from typer.testing import CliRunner
+
+from fog_kernels.components import Components
+from fog_supervisor.servers import ServerError
+from fog_supervisor.supervisor import NotReadyError
+from fognav.__main__ import app
+from fognav_experiments.bench import costmap, dwa, fleet, fleet_live, localization, office, planner, rest, site
+from fognav_experiments.bench import floor as floor_bench
+
+
+def test_office_is_connected_and_the_same_for_the_same_seed() -> None:
+    floor = office.make_office(60.0, 40.0, seed=3)
+    assert floor.geometry.shape == (800, 1200)
+    assert np.array_equal(floor.cells, office.make_office(60.0, 40.0, seed=3).cells)
+    labels = Components(floor.cells).labels(*floor.geometry.whole)
+    counts = np.bincount(labels[labels >= 0])
+    assert counts.max() > 0.95 * counts.sum()
+
+
+def test_every_robot_of_a_fleet_is_planned_refused_and_planned_again() -> None:
+    rng = np.random.default_rng(1)
+    map_ = fleet.FleetMap(office.make_office(60.0, 40.0), 10, rng)
+    robots = fleet.Fleet(map_, 4, 3, rng)
+    seen: list[tuple[int, int]] = []
+    figures = fleet.measure(map_, robots, 1, lambda done, total: seen.append((done, total)))
+    assert seen == [(1, 1)]
+    assert robots.core.replanner.refusals == {208: 4}
+    assert figures["replans"] == 4
+    for key in ("replan_p50_ms", "replan_p99_ms", "cut_off_ms", "back_ms", "rss_mb", "bytes_per_robot"):
+        assert isinstance(figures[key], float | int)
+        assert figures[key] > 0
+    path = robots.core.missions.of("r0").plan
+    assert path is not None
+    assert path.route is not None
+
+
+@pytest.mark.live
+async def test_every_robot_of_a_real_planner_gets_its_path_its_refusal_and_a_path_again() -> None:
+    rng = np.random.default_rng(1)
+    map_ = fleet.FleetMap(office.make_office(60.0, 40.0), 10, rng)
+    seen: list[tuple[int, int]] = []
+    robots = fleet.place_fleet(map_, 4, 3, rng)
+    figures = await fleet_live.measure(map_, robots, 1, lambda done, total: seen.append((done, total)), quiet_s=0.5)
+    assert seen == [(1, 1)]
+    assert figures["replans"] == 4
+    for key in ("replan_p50_ms", "replan_p99_ms", "cut_off_ms", "cut_off_explained_ms", "back_ms", "goal_fields_mb"):
+        assert figures[key] > 0
+    assert figures["cut_off_explained_ms"] >= figures["cut_off_ms"]
+    assert figures["rss_mb"] > 50
+    # A path of two points has some 100 bytes, and a delta more; a heartbeat of the map comes ten times a second.
+    assert figures["bytes_per_robot"] > 200
+    assert figures["steady_bytes_per_robot_s"] > 100
+
+
+@pytest.mark.live
+async def test_real_services_start_on_a_floor_and_lead_a_robot_across_it_and_round_a_zone(tmp_path: Path) -> None:
+    cells = floor_bench.prepare(tmp_path, 60.0, 40.0)
+    assert cells == 1200 * 800
+    steps: list[str] = []
+    figures = await floor_bench.measure(tmp_path, cells, 60.0, 40.0, steps.append)
+    assert steps == ["starting the map-service", "starting the planner", "planning"]
+    for key in ("map_ready_s", "planner_ready_s", "path_ms", "replan_ms"):
+        assert figures[key] > 0
+    for service in ("map", "planner"):
+        assert figures[f"{service}_peak_mb"] >= figures[f"{service}_rss_mb"] > 50
+        assert figures[f"{service}_peak_bytes_per_cell"] == pytest.approx(
+            1e6 * figures[f"{service}_peak_mb"] / cells, rel=0.01
+        )
+
+
+def test_figures_come_with_schema_machine_and_versions(monkeypatch: pytest.MonkeyPatch) -> None:
+    small = office.make_office(60.0, 40.0)
+    monkeypatch.setattr(office, "make_office", lambda **_: small)
+    done = CliRunner().invoke(
+        app, ["bench", "fleet", "--robots", "2", "--goals", "1", "--zones", "2", "--trials", "1", "--json"]
+    )
+    assert done.exit_code == 0, done.output
+    printed = json.loads(done.stdout)
+    assert (printed["schema"], printed["bench"], printed["robots"]) == (1, "fleet", 2)
+    assert printed["machine"]["cores"] >= 1
+    assert printed["machine"]["governor"]
+    assert set(printed["versions"]) == {"python", "numba", "numpy"}
+    assert {"replan_p50_ms", "replan_p99_ms", "cut_off_ms", "rss_mb", "bytes_per_robot"} <= printed.keys()
+
+
+@pytest.mark.parametrize("cells", [None, "map"])
+def test_planner_figures_count_what_equals_its_reference(cells, tmp_path, monkeypatch):
+    small = office.make_office(60.0, 40.0)
+    monkeypatch.setattr(planner, "make_office", lambda **_: small)
+    options = ["--queries", "3", "--json"]
+    if cells is not None:
+        rows = ["." * 130, "." * 60 + "@" + "." * 69, "." * 130] + ["." * 130] * 60
+        (tmp_path / "m.map").write_text("\n".join(["type octile", "height 63", "width 130", "map", *rows]))
+        (tmp_path / "m.scen").write_text("version 1\n0\tm.map\t130\t63\t2\t30\t127\t30\t125.0\n")
+        options += ["--map", str(tmp_path / "m.map"), "--scen", str(tmp_path / "m.scen")]
+    done = CliRunner().invoke(app, ["bench", "planner", *options])
+    assert done.exit_code == 0, done.output
+    printed = json.loads(done.stdout)
+    assert printed["queries"] == printed["optimal"] == (3 if cells is None else 1)
+    assert printed["replans"] == printed["replans_optimal"] > 0
+    for key in ("median_ms", "p99_ms", "expansions_median", "replan_median_ms", "field_median_ms"):
+        assert printed[key] > 0
+    assert printed["versions"].keys() == {"python", "numba", "numpy"}
+
+
+def test_planner_bench_names_the_file_that_is_no_map(tmp_path):
+    (tmp_path / "m.map").write_text("a picture")
+    done = CliRunner().invoke(app, ["bench", "planner", "--map", str(tmp_path / "m.map")])
+    assert done.exit_code == 2
+    assert "m.map: needs a line `map`" in " ".join(done.output.split())
+
+
+def test_costmap_figures_are_of_the_whole_floor_and_of_legal_zones() -> None:
+    floor = office.make_office(60.0, 40.0)
+    figures = costmap.measure(floor, 50, 1)
+    assert figures["cells"] == 800 * 1200
+    assert figures["portions"] >= 4, "a zone over the whole floor, put and removed"
+    for key in (
+        "full_ms",
+        "window_ms",
+        "worst_zone_ms",
+        "worst_portion_ms",
+        "load_zones_ms",
+        "snapshot_ms",
+        "worst_obstacles_ms",
+    ):
+        assert figures[key] > 0
+
+
+@pytest.mark.live
+async def test_clients_of_every_kind_are_answered_while_the_heartbeat_is_timed(tmp_path) -> None:
+    floor = office.make_office(60.0, 40.0)
+    site.write_site(tmp_path, floor)
+    figures = await rest.measure(tmp_path, floor, zones=50, clients=10, seconds=3.0, idle_s=0.5)
+    assert (
+        {"200", "201", "204", "413", "422"}
+        <= figures["requests"].keys()
+        <= {*["200", "201", "204", "413", "422", "503"]}
+    )
+    for key in ("heartbeat_gap_p50_ms", "heartbeat_gap_p99_ms", "heartbeat_gap_max_ms"):
+        assert figures[f"idle_{key}"] > 0
+        assert figures[key] > 0
+    assert figures["rss_mb"] > 50
+    for key in ("read_zones_ms", "ready_s", "list_zones_ms", "worst_zone_ms"):
+        assert figures[key] > 0
+
+
+@pytest.mark.parametrize("error", [NotReadyError("redis: exited with 1"), ServerError("mosquitto is not installed")])
+def test_system_that_does_not_start_is_a_sentence_and_no_traceback(monkeypatch, error):
+    async def measure(*_: object, **_options: object) -> None:
+        raise error
+
+    monkeypatch.setattr(rest, "measure", measure)
+    done = CliRunner().invoke(app, ["bench", "rest"])
+    assert (done.exit_code, f"fognav: {error}" in done.output) == (1, True)
+
+
+def test_localization_figures_are_there_and_the_search_and_match_ran() -> None:
+    figures = localization.measure(office.make_office(60.0, 40.0), 300, 60, 2, 1)
+    assert figures["cells"] == 800 * 1200
+    for key in (
+        "cycle_ms",
+        "reference_cycle_ms",
+        "ratio",
+        "move_ms",
+        "score_ms",
+        "clusters_ms",
+        "match_ms",
+        "search_ms",
+    ):
+        assert figures[key] > 0
+
+
+def test_dwa_figures_are_of_both_bodies_and_of_a_whole_decision() -> None:
+    figures = dwa.measure(2)
+    assert figures["arcs"] == 875
+    assert all(figures[key] > 0 for key in ("decision_ms", "cycle_ms"))
+    assert {"field_ms", "field_long_ms", "cycle_long_ms", "peer_ratio"} <= figures.keys()

@@ -3,7 +3,8 @@
 Everybody in the network may open connections and say nothing, or something that never ends. A connection is a
 stranger's until its protocol admits it. Strangers have a limited number of places and a limited time. Who comes when
 all places are taken gets that of another: the oldest connection of the address with the most. So whoever floods a
-server displaces itself, and a client that proves itself soon gets in, even from the same address (docs/adr/0055).
+server displaces itself, and a client that proves itself soon gets in, even from the same address. An address from which
+somebody was admitted goes before those that nobody knows, as long as few wait there (docs/adr/0055).
 """
 
 from __future__ import annotations
@@ -20,7 +21,7 @@ from fog_runtime import logs
 
 if TYPE_CHECKING:
     import ssl
-    from collections.abc import Callable, Iterator, Sequence
+    from collections.abc import Callable, Collection, Iterator, Sequence
 
 SILENT: Final = 1024
 """Most connections that have sent nothing: each is a descriptor, and nothing else. Fewer where descriptors are few."""
@@ -32,6 +33,10 @@ PATIENCE_S: Final = 10.0
 """How long a stranger may take until it is admitted."""
 HANDSHAKE_PACE_S: Final = 0.01
 """Between the starts of two TLS handshakes, each of which costs a millisecond and more."""
+KNOWN: Final = 1024
+"""Addresses that are remembered because somebody was admitted from there."""
+FEW: Final = 4
+"""How many may wait at such an address that goes before others."""
 REPORT_S: Final = 10.0
 """How often the refused connections are logged, together."""
 BACKLOG: Final = 1024
@@ -71,6 +76,11 @@ class Visitor:
 
     def admit(self) -> None:
         """Take it for no stranger any more: nobody takes its place, and it has as much time as it wants."""
+        self._admission.know(self.source)
+        self.release()
+
+    def release(self) -> None:
+        """Take its place and its time from it."""
         if self.places is not None:
             self.places.remove(self)
         if self.timer is not None:
@@ -78,20 +88,22 @@ class Visitor:
 
     def estrange(self, patience_s: float = PATIENCE_S) -> None:
         """Take it for a stranger again, with new time: for one, between two requests."""
-        self.admit()
+        self.release()
         self._admission.place(self, patience_s)
 
     def left(self) -> None:
         """Forget it: its connection is lost."""
-        self.admit()
+        self.release()
         self.transport = None
 
 
 class Places:
-    """Connections that share a number of places, by source, the oldest first."""
+    """Connections that share a number of places, by source, the oldest first; `known` are sources that go before."""
 
-    def __init__(self, limit: int) -> None:
+    def __init__(self, limit: int, known: Collection[str] = ()) -> None:
         self._limit = limit
+        self._known = known
+        self._known_is_next = True
         self._by_source: dict[str, dict[Visitor, None]] = {}
         self._taken = 0
 
@@ -99,8 +111,8 @@ class Places:
         """Give it a place; return the visitor that has lost its own for that, if any."""
         displaced = None
         if self._taken >= self._limit:
-            most = max(self._by_source.values(), key=len)
-            displaced = next(iter(most))
+            most = max(self._by_source, key=self._weight)
+            displaced = next(iter(self._by_source[most]))
             self.remove(displaced)
         self._by_source.setdefault(visitor.source, {})[visitor] = None
         self._taken += 1
@@ -117,13 +129,23 @@ class Places:
         self._taken -= 1
 
     def next(self) -> Visitor | None:
-        """Return the oldest of a source, and of another one the next time; None when all places are free."""
+        """Return the oldest of a source, and of another one the next time; None when all places are free.
+
+        Every other time it is of a source that goes before, if one waits.
+        """
         if not self._by_source:
             return None
-        source, own = next(iter(self._by_source.items()))
-        del self._by_source[source]
+        source = next(iter(self._by_source))
+        if self._known_is_next:
+            source = next((each for each in self._by_source if self._weight(each) <= 0), source)
+        self._known_is_next = not self._known_is_next
+        own = self._by_source.pop(source)
         self._by_source[source] = own  # the last from now on
         return next(iter(own))
+
+    def _weight(self, source: str) -> int:
+        """Return how many places a source has, 0 or less while it goes before others."""
+        return len(self._by_source[source]) - (FEW if source in self._known else 0)
 
 
 class Admission:
@@ -140,9 +162,11 @@ class Admission:
         """
         self._make_protocol = make_protocol
         self._tls = tls
-        self._silent = Places(min(SILENT, resource.getrlimit(resource.RLIMIT_NOFILE)[0] // 4))
-        self._strangers = Places(STRANGERS)
-        self._queue = Places(QUEUE)
+        self._known: dict[str, None] = {}
+        """Sources from which somebody was admitted, the latest last."""
+        self._silent = Places(min(SILENT, resource.getrlimit(resource.RLIMIT_NOFILE)[0] // 4), self._known)
+        self._strangers = Places(STRANGERS, self._known)
+        self._queue = Places(QUEUE, self._known)
         self._filled = asyncio.Event()
         self._greetings: set[asyncio.Task[None]] = set()
         self._refused: Counter[tuple[str, str]] = Counter()
@@ -155,6 +179,13 @@ class Admission:
                 tasks.create_task(self._accept(listener))
             tasks.create_task(self._greet_all())
             tasks.create_task(self._report())
+
+    def know(self, source: str) -> None:
+        """Remember that somebody was admitted from there."""
+        self._known.pop(source, None)
+        self._known[source] = None
+        if len(self._known) > KNOWN:
+            del self._known[next(iter(self._known))]
 
     def place(self, visitor: Visitor, patience_s: float) -> None:
         """Give a visitor that has sent something a stranger's place and time."""
@@ -191,7 +222,7 @@ class Admission:
         except OSError:
             gone = True
         if gone:
-            visitor.admit()
+            visitor.release()
             visitor.connection.close()
             return
         assert visitor.places is not None
@@ -232,7 +263,7 @@ class Admission:
     def _refuse(self, visitor: Visitor, reason: str) -> None:
         """End a stranger's connection, whatever it is at."""
         self._refused[visitor.source, reason] += 1
-        visitor.admit()
+        visitor.release()
         if visitor.transport is not None:
             visitor.transport.abort()  # type: ignore[attr-defined]  # every transport of a connection has it
         elif visitor.greeting is not None:

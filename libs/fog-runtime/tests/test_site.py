@@ -104,6 +104,7 @@ def test_site_loads_with_its_map_and_counter_clockwise_areas(folder):
             "robots.id",
             "twice",
         ),
+        ("radius = 0.2\n", "", "robots[0]", "required field `radius`. Add `radius`, how far (m) the robot's body"),
         ('name = "A small lab"', 'map = "none.yaml"', "map", "none.yaml"),
         ("range_limit = 1.5 }, {", "range_limit = 9 }, {", "nodes[0].sonars[0].range_limit", "4.0"),
     ],

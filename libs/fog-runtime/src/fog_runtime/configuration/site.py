@@ -19,6 +19,8 @@ from fog_contracts.site import AreaSite, NodeSite, Place, Site
 from fog_runtime.configuration.maps import MapFileError, load_map
 
 SITE_FILE: Final = "site.toml"
+_MEANING: Final = {"radius": ", how far (m) the robot's body reaches from the point between its driven wheels"}
+"""Of fields that files of an earlier version need not have."""
 _BORDER: Final = 1e-6
 """Metres by which a vertex may lie off the map: the rounding error of a polygon drawn along the map's edge."""
 
@@ -83,7 +85,7 @@ def _read(file: Path, text: str | None) -> Site:
         if "places[...]" in path:
             path = path.replace("places[...]", f"places.{_bad_place(data)}")
         missing = re.search(r"required field `(\w+)`", problem)
-        remedy = f"Add `{missing[1]}`" if missing else "Correct the value"
+        remedy = f"Add `{missing[1]}`{_MEANING.get(missing[1], '')}" if missing else "Correct the value"
         raise SiteError(file, path.strip("`").removeprefix("$").lstrip(".") or "file", problem, remedy) from error
     if unknown := _unknown_key(data, msgspec.to_builtins(site), ""):
         raise SiteError(file, unknown, "is not a field of a site", "Correct its spelling or remove it")

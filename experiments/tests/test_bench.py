@@ -11,7 +11,7 @@ from fog_kernels.components import Components
 from fog_supervisor.servers import ServerError
 from fog_supervisor.supervisor import NotReadyError
 from fognav.__main__ import app
-from fognav_experiments.bench import costmap, dwa, fleet, fleet_live, localization, office, planner, rest, site
+from fognav_experiments.bench import costmap, dwa, fleet, fleet_live, localization, office, planner, rest
 from fognav_experiments.bench import floor as floor_bench
 
 
@@ -137,7 +137,7 @@ def test_costmap_figures_are_of_the_whole_floor_and_of_legal_zones() -> None:
 @pytest.mark.live
 async def test_clients_of_every_kind_are_answered_while_the_heartbeat_is_timed(tmp_path) -> None:
     floor = office.make_office(60.0, 40.0)
-    site.write_site(tmp_path, floor)
+    office.write_site(tmp_path, floor)
     figures = await rest.measure(tmp_path, floor, zones=50, clients=10, seconds=3.0, idle_s=0.5)
     assert (
         {"200", "201", "204", "413", "422"}

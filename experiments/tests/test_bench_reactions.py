@@ -12,7 +12,7 @@ from typer.testing import CliRunner
 
 from fognav import checkout, kernels
 from fognav.output import WrongUseError
-from fognav_experiments.bench.reactions import page, trials
+from fognav_experiments.bench.reactions import trials
 from fognav_experiments.bench.reactions.body import Commanded, slower_after
 from fognav_experiments.bench.reactions.faults import FAULTS
 from fognav_experiments.bench.reactions.trials import due, measure, percentile, read_log, row
@@ -75,7 +75,7 @@ def test_faults_are_tried_in_turn_until_each_has_its_trials(tmp_path: Path) -> N
 
 def test_page_has_a_table_for_each_kind_of_fault_with_its_limit() -> None:
     rows = [row(BY_NAME[name], [0.02, 0.03]) for name in ("agent killed", "cliff", "watchdog and guardian killed")]
-    text = page.markdown(rows, "the command", "a machine", 2)
+    text = trials.markdown(rows, "the command", "a machine", 2)
     assert "| agent killed | 2 | 2 | 0.025 | 0.03 | 0.03 | 0.3 | 0 | 0.3 |" in text
     assert "| cliff | 2 | 2 | 0.025 | 0.03 | 0.03 | 0.05 | 0 | one sensor frame: 0.05 |" in text
     assert "| watchdog and guardian killed | 2 | 2 | 0.025 | 0.03 | 0.03 | none | 0 | none: needs hardware |" in text
@@ -101,7 +101,7 @@ def test_page_that_is_written_again_keeps_its_remarks(tmp_path: Path, monkeypatc
     assert "| 0.023 |" in text
     assert "| 0.021 |" not in text
     assert text.endswith("-->\n\nA fourth robot ran beside.\n")
-    assert page.remarks((checkout.root() / "docs" / "reaction-times.md").read_text("utf-8"))
+    assert trials.remarks((checkout.root() / "docs" / "reaction-times.md").read_text("utf-8"))
 
 
 def test_documented_limits_are_those_that_are_judged_by() -> None:

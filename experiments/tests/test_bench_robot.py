@@ -10,7 +10,7 @@ import pytest
 from fog_runtime.configuration.site import load_site
 from fog_runtime.machine import task_usage
 from fognav.output import WrongUseError
-from fognav_experiments.bench import cpu_quota, office, robot, robot_system
+from fognav_experiments.bench import office, robot
 
 
 def write_thread(proc: Path, pid: int, thread: int, name: str, nanoseconds: int, switches: int) -> None:
@@ -91,7 +91,7 @@ def test_quota_is_written_in_the_words_of_either_version_of_control_groups(
         removed.append(folder.parent)
 
     monkeypatch.setattr(Path, "rmdir", rmdir)
-    with cpu_quota.cpu_quota(0.2, tmp_path) as group:
+    with robot.cpu_quota(0.2, tmp_path) as group:
         group.add(41)
     words = {"cpu.max": "2000 10000"} if version == 2 else {"cpu.cfs_period_us": "10000", "cpu.cfs_quota_us": "2000"}
     assert kept == [{**words, "cgroup.procs": "41"}]
@@ -101,14 +101,14 @@ def test_quota_is_written_in_the_words_of_either_version_of_control_groups(
 def test_quota_that_the_system_refuses_is_named_with_the_remedy(tmp_path: Path) -> None:
     with (
         pytest.raises(WrongUseError, match=r"--cpu-quota: .*Run this as root"),
-        cpu_quota.cpu_quota(0.2, tmp_path / "none"),
+        robot.cpu_quota(0.2, tmp_path / "none"),
     ):
         pass
 
 
 def test_site_of_the_benchmark_is_valid_and_its_robot_stands_on_free_floor(tmp_path: Path) -> None:
     floor = office.make_office(60.0, 40.0)
-    loaded = load_site(robot_system.write_site(tmp_path, floor))
+    loaded = load_site(robot.write_site(tmp_path, floor))
     start, far = loaded.site.robots[0].start, loaded.site.places["far"]
     for place in (start, far):
         column, row = floor.geometry.cell(place.x, place.y)

@@ -18,7 +18,7 @@ from fognav.nodes.simulated import StillFloor
 from fognav.output import FailedError, WrongUseError
 from fognav_experiments.bench import false_echoes, warning
 from fognav_experiments.bench.false_echoes import Asked, FalseEchoes, calibrated
-from fognav_experiments.bench.standing_robot import Arrived
+from fognav_experiments.bench.warning import Arrived
 
 needs_compiler = pytest.mark.skipif(
     shutil.which("g++") is None, reason="the firmware's code needs a C++ compiler (g++)"

@@ -13,11 +13,10 @@ import pytest
 
 from fognav import checkout
 from fognav.output import WrongUseError
-from fognav_experiments.mutation import report
-from fognav_experiments.mutation.child import Coverage
+from fognav_experiments.mutation import run
 from fognav_experiments.mutation.mutants import mutants, mutate
 from fognav_experiments.mutation.parts import PARTS, parts_named
-from fognav_experiments.mutation.run import ModuleScore, Survivor, score
+from fognav_experiments.mutation.run import Coverage, ModuleScore, Survivor, score
 
 
 def changes(source: str) -> list[str]:
@@ -99,14 +98,14 @@ def test_score_counts_neither_equivalent_mutants_nor_modules_without_any() -> No
     reached = Coverage(10, 10, 2, 2, "")
     good = ModuleScore("a.b", reached, 11, 1, [Survivor("a.b", mutant)])
     assert (good.killed, score([good])) == (9, 0.9)
-    assert report.passes({"a": [good]})
-    assert not report.passes({"a": [good._replace(mutants=10)]})
-    assert not report.passes({"a": [good._replace(coverage=Coverage(10, 9, 2, 2, "lines [3]"))]})
+    assert run.passes({"a": [good]})
+    assert not run.passes({"a": [good._replace(mutants=10)]})
+    assert not run.passes({"a": [good._replace(coverage=Coverage(10, 9, 2, 2, "lines [3]"))]})
     assert score([]) == 1.0
-    text = "\n".join(report.lines({"a": [good]}))
+    text = "\n".join(run.report_lines({"a": [good]}))
     assert "9 of 10 mutants noticed; 1 more change nothing" in text
     assert "survives: a.b:1: x = 1: 1 -> 2" in text
-    assert report.values({"a": [good]})["a"]["score"] == 0.9
+    assert run.report_values({"a": [good]})["a"]["score"] == 0.9
 
 
 def fognav(*arguments: str) -> tuple[int, dict[str, Any]]:

@@ -28,7 +28,7 @@ from fognav_experiments.sensitivity.planes import (
     varied_site,
 )
 from fognav_experiments.sensitivity.publish import publish
-from fognav_experiments.sensitivity.sources import digest
+from fognav_experiments.sensitivity.sweep import digest
 from fognav_sim.node import default_config
 
 ESTIG = Path(__file__).parents[2] / "sites" / "estig"

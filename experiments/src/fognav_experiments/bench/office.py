@@ -1,4 +1,4 @@
-"""A floor for benchmarks, the same for the same seed: corridors in a grid, with furnished rooms along them."""
+"""Floors and sites for benchmarks: corridors in a grid, with furnished rooms along them, the same for the same seed."""
 
 from __future__ import annotations
 
@@ -9,9 +9,13 @@ import numpy as np
 
 from fog_contracts.costs import FREE, LETHAL
 from fog_contracts.grid import GridGeometry, StaticMap
+from fog_runtime.configuration.maps import save_map
 
 if TYPE_CHECKING:
+    from pathlib import Path
+
     from numpy.typing import NDArray
+
 
 RESOLUTION: Final = 0.05
 CORRIDOR: Final = 2.4
@@ -70,3 +74,12 @@ def _add_rooms(floor: _Floor, rng: np.random.Generator, left: float, right: floa
                 x, low = rng.uniform(left + 0.5, end - 1.5), rng.uniform(bottom + 1.2, top - 1.2)
                 floor.fill(x, low, x + 0.7, low + 0.5, LETHAL)
         left = end
+
+
+SITE: Final = "bench"
+
+
+def write_site(folder: Path, floor: StaticMap) -> None:
+    """Write a site without areas and robots."""
+    save_map(folder / "map", floor)
+    (folder / "site.toml").write_text(f'id = "{SITE}"\nmap = "map.yaml"\n', "utf-8")

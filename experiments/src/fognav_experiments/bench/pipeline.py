@@ -28,8 +28,7 @@ from fognav.output import FailedError
 from fognav.programs import AGGREGATOR, MAP_SERVICE, SERVERS
 from fognav.stack import Stack, StackConfig
 from fognav.stack_doors import Doors
-from fognav_experiments.bench.office import make_office
-from fognav_experiments.bench.site import SITE, write_site
+from fognav_experiments.bench.office import SITE, make_office, write_site
 
 if TYPE_CHECKING:
     from asyncio.subprocess import Process

@@ -2,7 +2,7 @@
 
 Broker, Redis, router, aggregator, map-service and planner are processes of their own, behind locks. The site's nodes
 run the firmware's code in this one, in front of a simulated floor, with an MQTT connection each; the robot is a
-stand-in with a goal (`standing_robot`). All times are of this machine's clock.
+stand-in with a goal. All times are of this machine's clock.
 """
 
 from __future__ import annotations
@@ -17,9 +17,9 @@ import numpy as np
 import zenoh
 
 from fog_contracts import channels as ch
-from fog_contracts.codec import decode
-from fog_contracts.messages import MapDelta
-from fog_runtime.clock import SystemClock
+from fog_contracts.codec import decode, encode
+from fog_contracts.messages import MapDelta, RobotPath, RobotPose, RobotState
+from fog_runtime.clock import SystemClock, ticker
 from fog_runtime.transports.zenoh_edge import session_config
 from fog_supervisor import net
 from fog_supervisor.supervisor import NotReadyError, log_tail
@@ -29,7 +29,6 @@ from fognav.programs import AGGREGATOR, MAP_SERVICE, PLANNER, SERVERS, SERVICES
 from fognav.stack import Stack, StackConfig
 from fognav.stack_doors import doors_of
 from fognav_experiments.bench.running import in_background
-from fognav_experiments.bench.standing_robot import StandingRobot
 from fognav_sim.barrier import BarrierError, barrier_across
 from fognav_sim.drive.hazard import draw_hazard, entry_distance
 from fognav_sim.live import VirtualNode, run_nodes
@@ -38,11 +37,11 @@ from fognav_sim.world import World
 
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator, Callable, Iterable, Mapping, Sequence
+    from contextlib import AbstractAsyncContextManager
 
-    from fog_contracts.messages import Trace
+    from fog_contracts.messages import Pose, Trace
     from fog_contracts.site import NodeSite
     from fog_runtime.configuration.site import LoadedSite
-    from fognav_experiments.bench.standing_robot import Arrived
     from fognav_sim.drive.hazard import PlannedHazard
 
     TraceKey = tuple[str, int, int]  # area, epoch and sequence number
@@ -263,3 +262,62 @@ class _Trials:
                 logs = "\n".join(log_tail(self._stack.log(name)) for name in (AGGREGATOR, MAP_SERVICE, PLANNER))
                 raise FailedError(f"waited {_READY_S:.0f} s until {what}\n{logs}")
             await asyncio.sleep(_POLL_S)
+
+
+_RADIUS_M: Final = 0.17
+_HEIGHT_M: Final = 0.1
+"""Lower than any sensor of a site: it is no hazard itself."""
+
+
+class Arrived(NamedTuple):
+    """A path, and when it arrived (s of this machine's clock)."""
+
+    at: float
+    path: RobotPath
+
+
+class StandingRobot:
+    """A robot that stands at its pose."""
+
+    def __init__(self, session: zenoh.Session, site: str, id: str, pose: Pose) -> None:  # noqa: A002  # the robot's
+        self.id = id
+        self.paths: list[Arrived] = []
+        """Paths and refusals since the last `forget`, oldest first, each plan once."""
+        self._latest: RobotPath | None = None
+        self._session, self._pose = session, pose
+        self._keys = {row: row.key(site=site, robot=id) for row in (ch.ROBOT_POSE, ch.ROBOT_STATE)}
+        self._clock = SystemClock()
+        session.declare_subscriber(ch.ROBOT_PATH.key(site=site, robot=id), self._on_path)
+
+    def _on_path(self, sample: zenoh.Sample) -> None:
+        """Note a path; it is called on another thread."""
+        now = time.time()
+        path, before = decode(ch.ROBOT_PATH, sample.payload.to_bytes(), RobotPath), self._latest
+        if before is None or (path.planner_epoch, path.plan_id) != (before.planner_epoch, before.plan_id):
+            self._latest = path
+            self.paths.append(Arrived(now, path))
+
+    def forget(self) -> None:
+        """Forget the paths so far."""
+        self.paths = []
+
+    def publishing(self) -> AbstractAsyncContextManager[None]:
+        """Publish pose and state meanwhile."""
+        return in_background(self._publish(), "robot")
+
+    async def _publish(self) -> None:
+        x, y, theta = self._pose.x, self._pose.y, self._pose.theta
+        async for _ in ticker(self._clock, ch.ROBOT_POSE.period_s):
+            stamp = self._clock.stamp()
+            pose = RobotPose(
+                x=x, y=y, theta=theta, covariance=[0.0] * 9, v=0.0, w=0.0, radius=_RADIUS_M, height=_HEIGHT_M,
+                stamp=stamp,
+            )  # fmt: skip
+            self._session.put(self._keys[ch.ROBOT_POSE], encode(ch.ROBOT_POSE, pose))
+            if (path := self._latest) is not None:
+                state = RobotState(
+                    mode="NORMAL", reasons=[], enabled=True, battery=None, goal_id=path.goal_id,
+                    map_epoch=path.map_epoch, map_seq=path.map_seq, plan_id=path.plan_id,
+                    planner_epoch=path.planner_epoch, stamp=stamp,
+                )  # fmt: skip
+                self._session.put(self._keys[ch.ROBOT_STATE], encode(ch.ROBOT_STATE, state))

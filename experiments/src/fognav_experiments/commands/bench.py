@@ -169,8 +169,7 @@ def rest_command(
     send and read slowly; another process times the heartbeat (100 ms), without clients (`idle_`) and with them.
     """
     from fognav_experiments.bench import machine, rest  # noqa: PLC0415  # keeps the other commands fast
-    from fognav_experiments.bench.office import make_office  # noqa: PLC0415  # same
-    from fognav_experiments.bench.site import write_site  # noqa: PLC0415  # same
+    from fognav_experiments.bench.office import make_office, write_site  # noqa: PLC0415  # same
 
     kernels.warm_cache(lambda text: console.print(text, markup=False))
     floor = make_office()
@@ -385,18 +384,17 @@ def debounce_command(
     background, as recorded and with 2 % false echoes; and what the evidence rule learns from the recordings: echo_rate
     and false_echo_rate.
     """
-    from fognav_experiments.bench import machine  # noqa: PLC0415  # keeps the other commands fast
-    from fognav_experiments.bench.debounce_rules import comparison, plot, sonar_recording  # noqa: PLC0415  # same
+    from fognav_experiments.bench import debounce, machine  # noqa: PLC0415  # keeps the other commands fast
 
     with exit_codes():
         check_writable(png)
         try:
-            loaded = sonar_recording.recordings_in(recordings)
+            loaded = debounce.recordings_in(recordings)
         except ValueError as error:
             raise WrongUseError(str(error)) from error
-        rows = comparison.measure(loaded, trials, hours, seed, lambda rule: console.print(rule, markup=False))
+        rows = debounce.measure(loaded, trials, hours, seed, lambda rule: console.print(rule, markup=False))
         if png is not None:
-            plot.draw(rows, png)
+            debounce.draw(rows, png)
     learned = [{"echo_rate": round(r.echo_rate, 3), "false_echo_rate": round(r.false_echo_rate, 3)} for r in loaded]
     asked = {"trials": trials, "hours": hours, "seed": seed, "readings": sum(r.samples for r in loaded)}
     if json:
@@ -404,7 +402,7 @@ def debounce_command(
         return
     for values in learned:
         console.print("learned: " + "  ".join(f"{name} {value}" for name, value in values.items()), markup=False)
-    for line in comparison.table(rows):
+    for line in debounce.table(rows):
         console.print(line, markup=False, soft_wrap=True)
 
 
@@ -434,9 +432,15 @@ def reactions_command(
     slow. A trial takes some five seconds. Exit code 1: a trial was beyond its limit.
     """
     from fognav_experiments.bench import machine  # noqa: PLC0415  # keeps the other commands fast
-    from fognav_experiments.bench.reactions import page  # noqa: PLC0415  # same
     from fognav_experiments.bench.reactions.faults import FAULTS  # noqa: PLC0415  # same
-    from fognav_experiments.bench.reactions.trials import due, measure, read_log, row  # noqa: PLC0415  # same
+    from fognav_experiments.bench.reactions.trials import (  # noqa: PLC0415  # same
+        due,
+        markdown,
+        measure,
+        read_log,
+        remarks,
+        row,
+    )
 
     kernels.warm_cache(lambda text: console.print(text, markup=False))
     with exit_codes():
@@ -449,8 +453,8 @@ def reactions_command(
     rows = [row(fault, every) for fault in FAULTS if (every := times.get(fault.name, []) + found.get(fault.name, []))]
     if write is not None:
         command = f"fognav bench reactions --trials {trials} --others {other} --robots {robots} --log FILE --write PAGE"
-        kept = page.remarks(write.read_text("utf-8")) if write.exists() else ""
-        write.write_text(page.markdown(rows, command, machine.sentence(), robots, kept), "utf-8")
+        kept = remarks(write.read_text("utf-8")) if write.exists() else ""
+        write.write_text(markdown(rows, command, machine.sentence(), robots, kept), "utf-8")
     if json:
         print_json({"bench": "reactions", "trials": trials, "others": other, "rows": rows, **machine.describe()})
     else:
@@ -482,9 +486,8 @@ def mutation_command(
     reaches, or fewer than 90 percent of the changes noticed.
     """
     from fognav import checkout  # noqa: PLC0415  # keeps the other commands fast
-    from fognav_experiments.mutation import report  # noqa: PLC0415  # same
+    from fognav_experiments.mutation import run  # noqa: PLC0415  # same
     from fognav_experiments.mutation.parts import parts_named  # noqa: PLC0415  # same
-    from fognav_experiments.mutation.run import measure  # noqa: PLC0415  # same
 
     def tell(text: str) -> None:
         console.print(text, markup=False, soft_wrap=True)
@@ -492,15 +495,15 @@ def mutation_command(
     with exit_codes():
         root, chosen = checkout.root(), parts_named(part or [])
         figures = {
-            each.name: measure(
+            each.name: run.measure(
                 each, root, jobs=jobs or os.cpu_count() or 1, only=None if coverage else module, tell=tell
             )
             for each in chosen
         }
     if json:
-        print_json({"bench": "mutation", "parts": report.values(figures)})
+        print_json({"bench": "mutation", "parts": run.report_values(figures)})
     else:
-        for line in report.lines(figures):
+        for line in run.report_lines(figures):
             tell(line)
-    if not report.passes(figures):
+    if not run.passes(figures):
         raise typer.Exit(NOT_TRUE)

@@ -94,8 +94,11 @@ def _try(  # noqa: PLR0913  # the command's options
     range_max: float,
     seed: int,
 ) -> dict[str, object]:
-    from fognav_experiments.localization.evaluation import with_noise  # noqa: PLC0415  # as above
-    from fognav_experiments.localization.trials import random_kidnappings, random_starts  # noqa: PLC0415  # same
+    from fognav_experiments.localization_trials import (  # noqa: PLC0415  # same
+        random_kidnappings,
+        random_starts,
+        with_noise,  # as above
+    )
     from robot_agent.config import LocalizationConfig  # noqa: PLC0415  # same
     from robot_agent.localization.map_fields import map_fields  # noqa: PLC0415  # same
 
@@ -125,8 +128,13 @@ def _evaluate(  # noqa: PLR0913  # the command's options
     range_max: float,
     seed: int,
 ) -> dict[str, object]:
-    from fognav_experiments.localization.evaluation import figures, kidnapped, track, with_noise  # noqa: PLC0415  # as above
-    from fognav_experiments.localization.plot import write_plot  # noqa: PLC0415  # same
+    from fognav_experiments.localization_trials import (  # noqa: PLC0415  # as above
+        figures,
+        kidnapped,
+        track,
+        with_noise,
+        write_plot,  # same
+    )
     from robot_agent.config import LocalizationConfig  # noqa: PLC0415  # same
     from robot_agent.localization.map_fields import map_fields  # noqa: PLC0415  # same
 

@@ -23,8 +23,7 @@ from fognav import __version__
 from fognav.demo.options import Options
 from fognav.demo.run import Demo
 from fognav.output import FailedError
-from fognav_experiments.bench.cpu_quota import cpu_quota
-from fognav_experiments.bench.robot import NORMAL_PRIORITY
+from fognav_experiments.bench.robot import NORMAL_PRIORITY, cpu_quota
 from fognav_experiments.comparison.draws import RouteDraw
 from fognav_experiments.comparison.driven import drive_name, facts
 from fognav_experiments.comparison.measured import MeasuredDrive

@@ -1,18 +1,36 @@
-"""Runs every mutant of a part, several at once, and counts those that its tests notice."""
+"""Runs every mutant of a part, several at once, and counts those that its tests notice.
+
+Each run of a part's tests is a forked process, on a changed module or on all modules as they are. The libraries are
+loaded once, before the fork. The modules of the part are imported in the child only, so that every module that takes a
+name from the changed one gets it from there.
+"""
 
 from __future__ import annotations
 
+import importlib
+import importlib.machinery
+import importlib.util
+import json
+import math
 import os
+import resource
+import signal
+import sys
+import tempfile
 import time
-from typing import TYPE_CHECKING, NamedTuple
+from pathlib import Path
+from typing import TYPE_CHECKING, Final, NamedTuple, NoReturn
 
 from fognav.output import FailedError
-from fognav_experiments.mutation import child
 from fognav_experiments.mutation.mutants import Mutant, mutants, mutate
+from fognav_experiments.mutation.parts import LEAST_SCORE
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator
-    from pathlib import Path
+    import ast
+    from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+    from types import CodeType, ModuleType
+
+    import pytest
 
     from fognav_experiments.mutation.parts import Part
 
@@ -33,7 +51,7 @@ class ModuleScore(NamedTuple):
     """Figures of one module. `equivalent` mutants change nothing and are no part of the score."""
 
     module: str
-    coverage: child.Coverage
+    coverage: Coverage
     mutants: int
     equivalent: int
     survivors: list[Survivor]
@@ -63,8 +81,8 @@ def measure(part: Part, root: Path, *, jobs: int, only: str | None, tell: Callab
 
     Raises `FailedError` if a test fails without any change.
     """
-    child.preload(part, part.files(root))
-    unchanged = child.try_unchanged(part, root)
+    preload(part, part.files(root))
+    unchanged = try_unchanged(part, root)
     if unchanged.failed:
         raise FailedError(f"{unchanged.failed[0]} fails without any change: mend it first")
     tasks, equivalent = _tasks(part, root, only) if only is not None else ([], {})
@@ -112,10 +130,244 @@ def _run(
         while waiting and len(running) < jobs:
             task = waiting.pop()
             tree = mutate(task.source, task.mutant)
-            running[child.start_mutant(part, root, task.module, tree, seconds)] = task
+            running[start_mutant(part, root, task.module, tree, seconds)] = task
         # Not os.wait(): other children of this process are none of these.
         ended = [(pid, status) for pid in running for got, status in [os.waitpid(pid, os.WNOHANG)] if got]
         for pid, status in ended:
             yield running.pop(pid), os.WIFEXITED(status) and os.WEXITSTATUS(status) == 0
         if not ended:
             time.sleep(0.005)
+
+
+_SKIPPED_PLUGINS: Final = ("cacheprovider", "faulthandler", "doctest", "junitxml", "stepwise", "unraisableexception")
+_INI: Final = "[pytest]\nfilterwarnings = ignore\nmarkers =\n  live: x\n  reaction: x\n  data: x\n"
+
+
+_PATIENCE_S: Final = 120
+_CPU_S: Final = 20
+"""Processor time of a mutant besides thrice what its tests take while their coverage is measured, which slows them."""
+
+
+class Coverage(NamedTuple):
+    """Lines and branches of a module, and how many of them the tests reach; `missing` names the rest."""
+
+    lines: int
+    lines_reached: int
+    branches: int
+    branches_reached: int
+    missing: str
+
+
+class TestRun(NamedTuple):
+    """Result of the tests on the unchanged modules: seconds of each test, and the coverage of each module."""
+
+    seconds: dict[str, float]
+    coverage: dict[str, Coverage]
+    failed: list[str]
+
+
+class _Timing:
+    """Records how long each test takes, and which fail; pytest calls it."""
+
+    def __init__(self) -> None:
+        self.seconds: dict[str, float] = {}
+        self.failed: list[str] = []
+
+    def pytest_runtest_logreport(self, report: pytest.TestReport) -> None:
+        self.seconds[report.nodeid] = self.seconds.get(report.nodeid, 0.0) + report.duration
+        if report.failed:
+            self.failed.append(report.nodeid)
+
+
+class _ByHand:
+    """Leaves out property tests: what only they reach by chance is not reached for certain; pytest calls it."""
+
+    def pytest_collection_modifyitems(self, items: list[pytest.Item]) -> None:
+        items[:] = [item for item in items if not getattr(getattr(item, "obj", None), "is_hypothesis_test", False)]
+
+
+class _QuickFirst:
+    """Sorts the tests so that those run first that are done soonest, property tests last; pytest calls it."""
+
+    def __init__(self, seconds: dict[str, float]) -> None:
+        self._seconds = seconds
+
+    def pytest_collection_modifyitems(self, items: list[pytest.Item]) -> None:
+        items.sort(key=lambda item: self._seconds.get(item.nodeid, math.inf))
+
+
+def preload(part: Part, modules: Iterable[str]) -> None:
+    """Import what every run of the part's tests needs; raises `FailedError` if that imports a module of the part."""
+    for name in ("pytest", "hypothesis", *part.preload):
+        importlib.import_module(name)
+    for name in modules:
+        if name in sys.modules:
+            raise FailedError(f"{name} is imported before it can be changed: correct `preload` of part {part.name}")
+
+
+def try_unchanged(part: Part, root: Path) -> TestRun:
+    """Run the tests but property tests on the modules as they are, with coverage of their lines and branches."""
+    with tempfile.TemporaryDirectory(prefix="fognav-mutation-") as folder:
+        report = Path(folder) / "result.json"
+        child = os.fork()
+        if child == 0:
+            _end_with(lambda: _measure(part, root, report))
+        os.waitpid(child, 0)
+        found = json.loads(report.read_text("utf-8"))
+    coverage = {name: Coverage(**values) for name, values in found["coverage"].items()}
+    return TestRun(found["seconds"], coverage, found["failed"])
+
+
+def start_mutant(part: Part, root: Path, module: str, tree: ast.Module, seconds: dict[str, float]) -> int:
+    """Start the tests on a changed module; return the child's id. It exits with 0 if no test fails."""
+    child = os.fork()
+    if child == 0:
+        # A mutant may loop for ever, which its processor time shows soon however busy the machine is, or wait for ever.
+        took = int(sum(seconds.values()))
+        resource.setrlimit(resource.RLIMIT_CPU, (_CPU_S + 3 * took, resource.RLIM_INFINITY))
+        signal.alarm(_PATIENCE_S + 10 * took)
+
+        def run() -> int:
+            sys.meta_path.insert(0, _Finder(module, tree))
+            return _pytest(part, root, ["-x"], [_QuickFirst(seconds)])
+
+        _end_with(run)
+    return child
+
+
+class _Finder:
+    """Finds one module, as its changed tree."""
+
+    def __init__(self, name: str, tree: ast.Module) -> None:
+        self._name, self._tree = name, tree
+
+    def find_spec(
+        self, name: str, path: Sequence[str] | None, _target: ModuleType | None = None
+    ) -> importlib.machinery.ModuleSpec | None:
+        if name != self._name:
+            return None
+        found = importlib.machinery.PathFinder.find_spec(name, path)
+        assert found is not None
+        assert found.origin is not None
+        loader = _Loader(name, found.origin, compile(self._tree, found.origin, "exec"))
+        return importlib.util.spec_from_file_location(name, found.origin, loader=loader)
+
+
+class _Loader(importlib.machinery.SourceFileLoader):
+    """Loads a module from code that was compiled already."""
+
+    def __init__(self, name: str, path: str, code: CodeType) -> None:
+        super().__init__(name, path)
+        self._code = code
+
+    def get_code(self, _fullname: str) -> CodeType:
+        return self._code
+
+
+def _end_with(run: Callable[[], int]) -> NoReturn:
+    """Run the child's work silently and end it, whatever the work raises."""
+    code = 1
+    try:
+        quiet = os.open(os.devnull, os.O_RDWR)
+        for descriptor in (0, 1, 2):
+            os.dup2(quiet, descriptor)
+        code = run()
+    finally:
+        os._exit(code)
+
+
+def _pytest(part: Part, root: Path, options: list[str], plugins: list[object]) -> int:
+    import pytest  # noqa: PLC0415  # for developers, absent from an installation
+
+    os.environ["PYTEST_DISABLE_PLUGIN_AUTOLOAD"] = "1"
+    os.environ["CI"] = "1"  # the same examples of property tests in every run
+    folder = root / "robot-agent/tests"
+    with tempfile.TemporaryDirectory(prefix="fognav-mutation-") as temporary:
+        ini = Path(temporary) / "pytest.ini"
+        ini.write_text(_INI, "utf-8")
+        skipped = [word for name in _SKIPPED_PLUGINS for word in ("-p", f"no:{name}")]
+        arguments = ["-c", str(ini), "--rootdir", str(root), "--confcutdir", str(root), "--import-mode=importlib", "-q"]
+        arguments += ["--assert=plain", "-m", "not live", "--ignore-glob=*_drives.py", *skipped, *options]
+        return int(pytest.main([*arguments, *(str(folder / test) for test in part.tests)], plugins=plugins))
+
+
+def _measure(part: Part, root: Path, report: Path) -> int:
+    from coverage import Coverage as Tracer  # noqa: PLC0415  # for developers, absent from an installation
+
+    files = part.files(root)
+    tracer = Tracer(data_file=None, branch=True, config_file=False, include=[str(path) for path in files.values()])
+    tracer.exclude("if TYPE_CHECKING:")
+    timing = _Timing()
+    started = time.monotonic()
+    tracer.start()
+    code = _pytest(part, root, [], [timing, _ByHand()])
+    tracer.stop()
+    if code and not timing.failed:
+        timing.failed.append(f"pytest ended with {code} after {time.monotonic() - started:.1f} s")
+    figures = report.with_name("coverage.json")
+    tracer.json_report(outfile=str(figures))
+    measured = json.loads(figures.read_text("utf-8"))["files"]
+    by_path = {Path(name).resolve(): values for name, values in measured.items()}
+    coverage = {name: _coverage(by_path.get(path.resolve()))._asdict() for name, path in files.items()}
+    report.write_text(json.dumps({"seconds": timing.seconds, "coverage": coverage, "failed": timing.failed}), "utf-8")
+    return 0
+
+
+def _coverage(values: dict[str, object] | None) -> Coverage:
+    """Return the figures of one module's entry in coverage's report; none for a module that was never imported."""
+    if values is None:
+        return Coverage(1, 0, 0, 0, "never imported")
+    summary = values["summary"]
+    assert isinstance(summary, dict)
+    missing = f"lines {values['missing_lines']}, branches {values['missing_branches']}"
+    return Coverage(
+        summary["num_statements"],
+        summary["covered_lines"],
+        summary["num_branches"],
+        summary["covered_branches"],
+        "" if summary["missing_lines"] == summary["missing_branches"] == 0 else missing,
+    )
+
+
+def passes(figures: Mapping[str, list[ModuleScore]]) -> bool:
+    """Return whether tests reach every line and branch, and notice enough mutants of each part."""
+    reached = all(not module.coverage.missing for modules in figures.values() for module in modules)
+    return reached and all(score(modules) >= LEAST_SCORE for modules in figures.values())
+
+
+def report_lines(figures: Mapping[str, list[ModuleScore]]) -> Iterator[str]:
+    """Yield the lines of the report."""
+    for part, modules in figures.items():
+        for module in modules:
+            reached = module.coverage
+            yield (
+                f"{module.module}: {reached.lines_reached} of {reached.lines} lines and {reached.branches_reached} of "
+                f"{reached.branches} branches reached"
+            )
+            if reached.missing:
+                yield f"  not reached: {reached.missing}"
+            if module.mutants:
+                asked = module.mutants - module.equivalent
+                yield f"  {module.killed} of {asked} mutants noticed; {module.equivalent} more change nothing"
+            yield from (f"  survives: {survivor}" for survivor in module.survivors)
+        if any(module.mutants for module in modules):
+            yield f"{part}: score {score(modules):.1%}"
+
+
+def report_values(figures: Mapping[str, list[ModuleScore]]) -> dict[str, object]:
+    """Return the figures of each part as values of a JSON object."""
+    return {
+        part: {"score": round(score(modules), 4), "modules": [_values(module) for module in modules]}
+        for part, modules in figures.items()
+    }
+
+
+def _values(module: ModuleScore) -> dict[str, object]:
+    return {
+        "module": module.module,
+        "coverage": module.coverage._asdict(),
+        "mutants": module.mutants,
+        "equivalent": module.equivalent,
+        "killed": module.killed,
+        "survivors": [str(survivor) for survivor in module.survivors],
+    }

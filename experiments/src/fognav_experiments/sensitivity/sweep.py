@@ -1,12 +1,18 @@
-"""Drives a sweep: on every core of this machine, or on the workers of a Dask cluster; may be killed at any moment."""
+"""Drives a sweep: on every core of this machine, or on the workers of a Dask cluster; may be killed at any moment.
+
+A digest of the sources that a drive in lockstep runs says whether two machines drive the same.
+"""
 
 from __future__ import annotations
 
 import contextlib
+import hashlib
 import socket
 from concurrent.futures import FIRST_COMPLETED, Executor, wait
+from functools import cache
 from importlib.metadata import version
 from importlib.util import find_spec
+from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
 from fog_contracts.messages import Pose
@@ -14,7 +20,6 @@ from fognav_experiments import worker_pool
 from fognav_experiments.lockstep import release_drives, run_lockstep
 from fognav_experiments.rigs import Tuning
 from fognav_experiments.sensitivity.planes import SweptDrive, varied_site
-from fognav_experiments.sensitivity.sources import digest
 from fognav_sim.drive.hazard import HazardRequest
 
 if TYPE_CHECKING:
@@ -23,6 +28,26 @@ if TYPE_CHECKING:
     from fog_runtime.configuration.site import LoadedSite
     from fognav_experiments.comparison.records import DriveFiles
     from fognav_experiments.sensitivity.planes import SweepTask
+
+_PACKAGES: Final = (
+    "fog_contracts", "fog_kernels", "fog_runtime", "fog_supervisor", "fognav_experiments", "fognav_sim",
+    "hazard_aggregator", "map_service", "planner", "robot_agent",
+)  # fmt: skip
+
+
+@cache
+def digest() -> str:
+    """Return a hash of all modules of Fognav that a drive can import, as they are installed here."""
+    found = hashlib.sha256()
+    for package in _PACKAGES:
+        spec = find_spec(package)
+        if spec is None or spec.submodule_search_locations is None:
+            raise RuntimeError(f"the package {package} is not installed: install fognav-experiments again")
+        for place in map(Path, spec.submodule_search_locations):
+            for file in sorted(place.rglob("*.py")):
+                found.update(f"{package}/{file.relative_to(place)}".encode() + b"\0" + file.read_bytes() + b"\0")
+    return found.hexdigest()[:16]
+
 
 CONNECT_S: Final = 20.0
 """Timeout of the connection to a cluster's scheduler."""

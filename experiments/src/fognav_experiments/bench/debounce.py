@@ -1,27 +1,121 @@
 """Compares debounce rules on recorded echoes: how soon they detect an obstacle, miss it, and raise false alarms.
 
-Each trial joins a stretch of the recorded background to one of recorded obstacles. A share of the obstacle's echoes is
-replaced by the background, as if the obstacle had not echoed, and everything passes the filter of the firmware's nodes.
+A recording of an HC-SR04 is a CSV file whose second column is the measured distance in cm, and its first one the time
+in s. It begins with nothing in range but the background. Each trial joins a stretch of the recorded background to one
+of recorded obstacles. A share of the obstacle's echoes is replaced by the background, as if the obstacle had not
+echoed, and everything passes the filter of the firmware's nodes.
 """
 
 from __future__ import annotations
 
+import csv
+from dataclasses import dataclass
 from itertools import pairwise
 from statistics import mean, median
 from typing import TYPE_CHECKING, Any, Final, NamedTuple
 
 import numpy as np
+from PIL import Image, ImageDraw
 
 from fog_contracts.site import learned_share
-from fognav_experiments.bench.debounce_rules.sonar_recording import SpikeFilter, filtered
 from hazard_aggregator.debounce import Observation, SonarSample, make_rule
 from hazard_aggregator.registry import find_rule
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Mapping, Sequence
+    from collections.abc import Callable, Iterable, Mapping, Sequence
+    from pathlib import Path
 
     from fog_contracts.messages import AreaState
-    from fognav_experiments.bench.debounce_rules.sonar_recording import Recording
+
+CALIBRATION_S: Final = 5.0
+"""The background's distance is the median of the first so many seconds."""
+LIMIT_SHARE: Final = 0.9
+"""An echo nearer than this share of the background's distance is an obstacle."""
+AGREE_M: Final = 0.15
+MAX_HELD: Final = 2
+"""As in the firmware: `kAgreeMm` and `kMaxHeld`."""
+
+
+@dataclass(frozen=True)
+class Recording:
+    """Ranges (m) of the background and of obstacles, in the order of their measurement.
+
+    `limit` (m) parts them; `echo_rate` and `false_echo_rate` are the likelihoods learned from it, `samples` how many
+    readings it has, and `period_s` their interval.
+    """
+
+    limit: float
+    period_s: float
+    background: list[float]
+    obstacle: list[float]
+    echo_rate: float
+    false_echo_rate: float
+    samples: int
+
+
+def load(path: Path) -> Recording:
+    """Return a recording; raises `ValueError` that names the file and what is missing in it."""
+    with path.open(newline="", encoding="utf-8") as file:
+        rows = list(csv.reader(file))[1:]
+    try:
+        times, ranges = [float(row[0]) for row in rows], [float(row[1]) / 100 for row in rows]
+    except (ValueError, IndexError) as error:
+        raise ValueError(f"{path}: {error}: each line needs a time in s and a distance in cm") from error
+    still = [r for t, r in zip(times, ranges, strict=True) if t - times[0] < CALIBRATION_S]
+    if len(still) < 10:
+        raise ValueError(
+            f"{path}: only {len(still)} readings in the first {CALIBRATION_S:g} s: it must begin with those"
+        )
+    limit = LIMIT_SHARE * median(still)
+    near = [i for i, measured in enumerate(ranges) if measured < limit]
+    if not near or near[0] < len(still):
+        raise ValueError(f"{path}: no obstacle comes nearer than {limit:.2f} m after the first {CALIBRATION_S:g} s")
+    present = ranges[near[0] : near[-1] + 1]
+    obstacle = [measured for measured in present if measured < limit]
+    return Recording(
+        limit=limit,
+        period_s=median(b - a for a, b in pairwise(times)),
+        background=ranges[: near[0]],
+        obstacle=obstacle,
+        # The rule of succession (Laplace): what did not happen in a short recording may happen.
+        echo_rate=(len(obstacle) + 1) / (len(present) + 2),
+        false_echo_rate=1 / (near[0] + 2),
+        samples=len(ranges),
+    )
+
+
+def recordings_in(folder: Path) -> list[Recording]:
+    """Return all recordings (`*.csv`) of a folder; raises `ValueError` without any."""
+    found = [load(path) for path in sorted(folder.glob("*.csv"))]
+    if not found:
+        raise ValueError(f"{folder}: there is no recording (*.csv) in it")
+    return found
+
+
+class SpikeFilter:
+    """The filter of the firmware's nodes (`spike_filter.hpp`) for ranges (m)."""
+
+    def __init__(self) -> None:
+        self._accepted: float | None = None
+        self._candidate = 0.0
+        self._held = 0
+
+    def update(self, measured: float) -> float:
+        """Return the range that counts: a change only when a second sample agrees with it."""
+        confirmed = self._held > 0 and abs(measured - self._candidate) <= AGREE_M
+        given_up = self._held >= MAX_HELD
+        if self._accepted is None or confirmed or given_up or abs(measured - self._accepted) <= AGREE_M:
+            self._accepted, self._held = measured, 0
+        else:
+            self._candidate, self._held = measured, self._held + 1
+        return self._accepted
+
+
+def filtered(ranges: Iterable[float]) -> Sequence[float]:
+    """Return the ranges that a node's readings have."""
+    spikes = SpikeFilter()
+    return [spikes.update(measured) for measured in ranges]
+
 
 STRESS_RATE: Final = 0.02
 """Share of false echoes at random ranges in the second figure of false alarms: more than any recording has."""
@@ -200,3 +294,53 @@ def _stretch(ranges: Sequence[float], count: int, rng: np.random.Generator) -> l
     """Return `count` successive ranges from a random place on; after the last one the first follows."""
     start = int(rng.integers(len(ranges)))
     return [ranges[(start + i) % len(ranges)] for i in range(count)]
+
+
+_PANELS: Final = (
+    ("detection_median_ms", "time to detection, median, ms"),
+    ("detection_p95_ms", "time to detection, 95th percentile, ms"),
+    ("missed_percent", "obstacles missed for 2 s, %"),
+    ("lost_percent", "obstacles lost within 4 s, %"),
+    ("known_percent", "share of its 4 s an obstacle is known, %"),
+)
+_COLOURS: Final = ("#d62728", "#1f77b4", "#2ca02c", "#9467bd", "#ff7f0e")
+_WIDTH: Final = 380
+_HEIGHT: Final = 280
+_MARGIN: Final = 46
+_LEGEND: Final = 40
+
+
+def draw(rows: Sequence[dict[str, Any]], path: Path) -> None:
+    """Write a PNG with one panel per figure, and one line per rule."""
+    rules = list(dict.fromkeys(row["rule"] for row in rows))
+    image = Image.new("RGB", (_WIDTH * len(_PANELS), _HEIGHT + _LEGEND), "white")
+    canvas = ImageDraw.Draw(image)
+    for index, (key, title) in enumerate(_PANELS):
+        lines = [[(row["echo_rate"], row[key]) for row in rows if row["rule"] == rule] for rule in rules]
+        _panel(canvas, index * _WIDTH, title, [[(x, y) for x, y in line if y is not None] for line in lines])
+    for index, rule in enumerate(rules):
+        x, y = _MARGIN + index * _WIDTH // 2, _HEIGHT + _LEGEND // 2
+        canvas.line((x, y, x + 24, y), fill=_COLOURS[index % len(_COLOURS)], width=3)
+        alarms = next(row["false_alarms_stressed_per_h"] for row in rows if row["rule"] == rule)
+        canvas.text((x + 30, y - 6), f"{rule} ({alarms:g}/h)", fill="black")
+    image.save(path)
+
+
+def _panel(canvas: ImageDraw.ImageDraw, left: int, title: str, lines: Sequence[Sequence[tuple[float, float]]]) -> None:
+    points = [point for line in lines for point in line]
+    low, high = min(x for x, _ in points), max(x for x, _ in points)
+    top = max(1.0, *(y for _, y in points))
+
+    def place(point: tuple[float, float]) -> tuple[float, float]:
+        x, y = point
+        across = (x - low) / max(high - low, 1e-9)
+        return left + _MARGIN + across * (_WIDTH - 1.5 * _MARGIN), _HEIGHT - _MARGIN - y / top * (_HEIGHT - 2 * _MARGIN)
+
+    canvas.text((left + _MARGIN, 12), title, fill="black")
+    for x in (low, (low + high) / 2, high):
+        canvas.text((place((x, 0))[0] - 10, _HEIGHT - _MARGIN + 6), f"{100 * x:.0f} %", fill="black")
+    for y in (0.0, top / 2, top):
+        canvas.text((left + 4, place((low, y))[1] - 6), f"{y:.0f}", fill="black")
+        canvas.line((*place((low, y)), *place((high, y))), fill="#dddddd")
+    for index, line in enumerate(lines):
+        canvas.line([place(point) for point in line], fill=_COLOURS[index % len(_COLOURS)], width=2)

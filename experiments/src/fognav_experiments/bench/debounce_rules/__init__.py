@@ -1,1 +1,0 @@
-"""The comparison of debounce rules on recorded echoes (`fognav bench debounce`)."""

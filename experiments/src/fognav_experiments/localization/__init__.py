@@ -1,1 +1,0 @@
-"""Evaluates the localization on recorded logs."""

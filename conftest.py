@@ -14,6 +14,7 @@ from fog_supervisor import net
 
 if TYPE_CHECKING:
     from xdist.scheduler import LoadScopeScheduling
+    from xdist.workermanage import WorkerController
 
 # In CI the examples are the same in every run; on a developer's machine each run tries new ones.
 settings.register_profile(
@@ -60,22 +61,25 @@ def pytest_configure() -> None:
 
 
 @cache
-def group_of(module: str) -> tuple[int, int]:
-    """Return the group of a test module, as its kind and a number; a group runs on one worker, one test after another.
+def group_of(module: str) -> tuple[int, str]:
+    """Return the group of a test module, as its kind and a name; a group runs on one worker, one test after another.
 
-    Tests that measure the reaction time of real processes never run in parallel. Modules that only compute share one
-    worker per core except one; that core is left for the tests that wait. The tests of any other module with real
-    processes stay together, because they share its servers; tests of the whole system take longest and start first.
+    Tests that measure the reaction time of real processes never run in parallel. The tests of any other module stay
+    together, because they share its servers; those of the firmware share what is compiled for them.
     """
     text = (ROOT / module).read_text("utf-8")
-    number = sum(module.encode())
     if "mark.compose" in text:
-        return COMPOSE, 0
+        return COMPOSE, ""
     if "mark.reaction" in text:
-        return REACTION, 0
+        return REACTION, ""
     if "mark.live" in text:
-        return (SYSTEM if module.startswith("tests/") else LIVE), number
-    return COMPUTING, number % max(1, (os.cpu_count() or 1) - 1)
+        return (SYSTEM if module.startswith("tests/") else LIVE), module
+    return COMPUTING, "firmware" if module.startswith("firmware/") else module
+
+
+def computes(worker: str) -> bool:
+    """Whether this worker prefers tests that only compute: one per core except one, which tests that wait share."""
+    return int(worker.removeprefix("gw")) < max(1, (os.cpu_count() or 1) - 1)
 
 
 def module_of(nodeid: str) -> str:
@@ -93,6 +97,16 @@ def pytest_xdist_make_scheduler(config: pytest.Config, log: object) -> "LoadScop
     class GroupScheduling(LoadScopeScheduling):
         def _split_scope(self, nodeid: str) -> str:
             return str(group_of(module_of(nodeid)))
+
+        def _assign_work_unit(self, node: "WorkerController") -> None:
+            # Each worker takes the other kind when there is no more of its own, so that none is idle before the end.
+            preferred = computes(node.gateway.id)
+            first = (
+                scope for scope, tests in self.workqueue.items()
+                if (group_of(module_of(next(iter(tests))))[0] == COMPUTING) == preferred
+            )  # fmt: skip
+            self.workqueue.move_to_end(next(first, next(iter(self.workqueue))), last=False)
+            super()._assign_work_unit(node)
 
     return GroupScheduling(config, log)
 

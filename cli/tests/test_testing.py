@@ -6,7 +6,7 @@ import pty
 import subprocess
 import sys
 from pathlib import Path
-from types import ModuleType
+from types import ModuleType, SimpleNamespace
 
 import pytest
 
@@ -66,14 +66,10 @@ def test_bar_on_a_terminal_shows_progress_and_failures_at_once(folder: Path) -> 
     assert "3 skipped: no sonar: plug one in" in text
 
 
-@pytest.mark.parametrize(("ci", "beyond_the_cores"), [("", 1), ("true", 0)])
-def test_tests_run_on_all_cores_unless_the_arguments_choose_otherwise(
-    monkeypatch: pytest.MonkeyPatch, ci: str, beyond_the_cores: int
-) -> None:
-    monkeypatch.setenv("CI", ci)
+def test_tests_run_on_all_cores_unless_the_arguments_choose_otherwise() -> None:
     command = testing.pytest_command(["-k", "replica"], terminal=False)
     assert command[:3] == [sys.executable, "-m", "pytest"]
-    assert command[command.index("-n") + 1] == str((os.cpu_count() or 1) + beyond_the_cores)
+    assert command[command.index("-n") + 1] == str((os.cpu_count() or 1) + 2)
     assert command[-2:] == ["-k", "replica"]
     for arguments in (["-n", "0"], ["-n4"], ["--pdb"], ["-s"], ["--collect-only"]):
         assert "--dist" not in testing.pytest_command(arguments, terminal=False)
@@ -97,11 +93,44 @@ def test_tests_of_reaction_times_share_one_worker(grouping: ModuleType) -> None:
     assert grouping.group_of("tests/replay/test_replay.py")[0] == grouping.SYSTEM
 
 
-def test_computing_tests_leave_one_core_free(grouping: ModuleType) -> None:
-    modules = [path.relative_to(checkout.root()) for path in checkout.root().glob("*/*/tests/test_*.py")]
-    groups = {grouping.group_of(str(module)) for module in modules}
-    computing = {group for group in groups if group[0] == grouping.COMPUTING}
-    assert 1 <= len(computing) <= max(1, (os.cpu_count() or 1) - 1)
+class Worker:
+    """One of pytest-xdist's workers, as its scheduler sees it: it is told which tests to run, by their places."""
+
+    shutting_down = False
+
+    def __init__(self, number: int) -> None:
+        self.gateway = SimpleNamespace(id=f"gw{number}")
+        self.given: list[int] = []
+
+    def send_runtest_some(self, places: list[int]) -> None:
+        self.given += places
+
+    def shutdown(self) -> None:
+        self.shutting_down = True
+
+
+def test_one_worker_per_core_but_one_computes_and_none_is_idle_while_there_are_tests(
+    grouping: ModuleType, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(os, "cpu_count", lambda: 3)
+    computing = [f"libs/fog-contracts/tests/test_{name}.py::test_it" for name in ("bus", "codec", "cones", "shapes")]
+    waiting = [f"tests/live/test_{name}.py::test_it" for name in ("up", "monitoring", "first_node", "operating")]
+    config = SimpleNamespace(
+        getoption=lambda _: "loadgroup",
+        getvalue=lambda _: ["popen"] * 3,
+        option=SimpleNamespace(loadscopereorder=False),
+    )
+    scheduler = grouping.pytest_xdist_make_scheduler(config, None)
+    workers = [Worker(number) for number in range(3)]
+    for worker in workers:
+        scheduler.add_node(worker)
+    for worker in workers:
+        scheduler.add_node_collection(worker, [*waiting, *computing])
+    scheduler.schedule()
+    kinds = [["computes" if place >= len(waiting) else "waits" for place in worker.given] for worker in workers]
+    assert kinds == [["computes"] * 2, ["computes"] * 2, ["waits"] * 2]
+    scheduler.mark_test_complete(workers[0], workers[0].given[0])
+    assert workers[0].given[2] < len(waiting)
 
 
 def test_no_test_times_out_that_was_told_to_try_more(tmp_path):

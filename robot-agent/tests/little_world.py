@@ -43,6 +43,8 @@ DRIVE_TRAIN = DriveTrain(axle_m=AXLE, wheel_speed_max_m_s=0.5, travel_wrap_m=65_
 DT = 0.01
 BEAMS = 360
 SCAN_S = 0.18
+ANGLES = -(np.arange(BEAMS) + 0.5) * 2 * math.pi / BEAMS  # clockwise, as the real head rotates
+WRAPPED = np.array([math.remainder(angle, 2 * math.pi) for angle in ANGLES])
 LIDAR = LidarTraits(range_min_m=0.15, range_max_m=12.0, scan_period_s=SCAN_S)
 AGENT = agent_config("r1", KEY, DRIVE_TRAIN, LIDAR, boot="b1")
 START = 1_000.0
@@ -76,6 +78,7 @@ class LittleWorld:
     resolution: float = 0.05
     glass: list = field(default_factory=list)  # rectangles whose walls return nothing
     wheel_error: float = 0.0  # by how much the encoders count too far, as a share
+    wheel_noise: float = 0.0  # by how much (m) they are off after a metre at random, both alike
     config: AgentConfig = AGENT  # of the body and the lidar's place on it, too
     posts: list = field(default_factory=list)  # rectangles (left, bottom, right, top in m) that no map has
 
@@ -287,21 +290,26 @@ class LittleWorld:
         self.theta += 0.5 * w * DT
         g = self.geometry
         near = g.window_around(nx - 0.2, ny - 0.2, nx + 0.2, ny + 0.2)
-        rows, columns = np.nonzero(self.solid[near.rows, near.columns])
-        xs = g.origin_x + (columns + near.x + 0.5) * g.resolution
-        ys = g.origin_y + (rows + near.y + 0.5) * g.resolution
-        if len(xs) and np.hypot(xs - nx, ys - ny).min() < 0.16:
-            self.collided = True
-            return
+        solid = self.solid[near.rows, near.columns]
+        if solid.any():
+            rows, columns = np.nonzero(solid)
+            xs = g.origin_x + (columns + near.x + 0.5) * g.resolution
+            ys = g.origin_y + (rows + near.y + 0.5) * g.resolution
+            if np.hypot(xs - nx, ys - ny).min() < 0.16:
+                self.collided = True
+                return
         for corner in itertools.chain.from_iterable(map(_outline, self.posts)):
             at = Pose2(nx, ny, self.theta).inverse_transform(np.array([corner]))[0]
             if self.config.footprint.outside_by(*at) < 0.0:
                 self.collided = True
                 return
-        self.travelled += math.hypot(nx - self.x, ny - self.y)
+        moved = math.hypot(nx - self.x, ny - self.y)
+        self.travelled += moved
         self.x, self.y = nx, ny
+        slip = self.wheel_noise * math.sqrt(moved) * self.rng.standard_normal() if self.wheel_noise else 0.0
         for wheel, speed in enumerate((left, right)):
-            self.ticks[wheel] += speed * DT * (1 + self.wheel_error + 0.02 * self.rng.standard_normal()) / TICK_M
+            counted = speed * DT * (1 + self.wheel_error + 0.02 * self.rng.standard_normal())
+            self.ticks[wheel] += (counted + slip) / TICK_M
 
     def _scan(self):
         """Cast the beams that the head measures during this step."""
@@ -311,9 +319,9 @@ class LittleWorld:
             return
         share = (self.now - self.scan_started) / SCAN_S
         due = min(BEAMS, round(share * BEAMS))
-        new = np.arange(len(self.beams), due)
-        if len(new):
-            angles = -(new + 0.5) * 2 * math.pi / BEAMS  # clockwise, as the real head rotates
+        new = slice(len(self.beams), due)
+        if due > len(self.beams):
+            angles = ANGLES[new]
             g, lidar = self.geometry, self.config.localization
             x, y = Pose2(self.x, self.y, self.theta).transform(np.array([(lidar.lidar_x, lidar.lidar_y)]))[0]
             ranges = cast(self.solid, g.resolution, g.origin_x, g.origin_y, x, y, angles + self.theta, 12.0)
@@ -326,18 +334,18 @@ class LittleWorld:
             ranges += (self.lidar_noise + self.lidar_noise_share * ranges) * self.rng.standard_normal(len(ranges))
             ranges[self.rng.random(len(ranges)) < 0.02] = math.nan
             ranges[ranges < lidar.range_min] = math.nan
-            self.beams.extend(zip(angles, ranges, strict=True))
+            self.beams.extend(ranges.tolist())
             samples = LidarSamples(
-                angles_rad=np.array([math.remainder(a, 2 * math.pi) for a in angles], np.float32),
+                angles_rad=WRAPPED[new].astype(np.float32),
                 ranges_m=ranges.astype(np.float32),
                 started_at=self.now - DT,
                 ended_at=self.now,
             )
             self.agent.on_lidar_samples(samples, self.now)
         if len(self.beams) == BEAMS:
-            data = self.frozen_scan if self.frozen_scan is not None else np.array(self.beams)
+            data = self.frozen_scan if self.frozen_scan is not None else np.column_stack((ANGLES, self.beams))
             scan = LaserScan(
-                angles_rad=np.array([math.remainder(a, 2 * math.pi) for a in data[:, 0]]),
+                angles_rad=WRAPPED.copy(),
                 ranges_m=data[:, 1].copy(),
                 quality=np.full(BEAMS, 40, np.uint8),
                 started_at=self.scan_started,

@@ -104,7 +104,8 @@ def test_obstacle_beside_or_on_the_path_that_only_the_lidar_sees_is_avoided(worl
     window = world.geometry.window_around(*box)
     world.solid[window.rows, window.columns] = 1
     world.drive_to(L_PATH)
-    assert world.run(30, lambda w: w.x > 7.5), world.state().reasons
+    # It may hesitate between the two sides: of 30 seeds, 4 needed 31 to 55 s.
+    assert world.run(60, lambda w: w.x > 7.5), world.state().reasons
     assert not world.collided
     assert abs(world.y - 2.0) < 0.15
 

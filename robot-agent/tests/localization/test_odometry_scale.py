@@ -65,3 +65,44 @@ def test_robot_that_was_carried_does_not_spoil_what_was_learned():
     scale.forget_anchor()
     driven(scale, 30, error=0.05, begin=40.0)
     assert scale.value == pytest.approx(learned, abs=0.01)
+
+
+def driven_unsteadily(scale, noise, *, steps=95, seed=0):
+    """Drive with wheels that count 2 % too far, and besides that at random, by a variance (m2) per metre.
+
+    Poses are as a filter's: each scan, right to 1 cm, mends a tenth of what the wheels have made wrong.
+    """
+    rng, off, raw = np.random.default_rng(seed), 0.0, 0.0
+    for number in range(steps):
+        random = math.sqrt(0.1 * noise) * rng.standard_normal()
+        raw += 0.1 * 1.02 + random
+        off = 0.9 * (off + random)
+        seen = 0.1 * (number + 1) + off + 0.01 * rng.standard_normal()
+        scale.observe(Pose2(seen, 0.0, 0.0), SEEN, scale.calibrated(raw, 0.0, 0.0), NOTHING_UNSEEN)
+
+
+@pytest.mark.parametrize("noise", [0.0005, 0.001])
+def test_wheels_that_count_unsteadily_leave_the_share_as_uncertain_as_it_is(noise):
+    squares = []
+    for seed in range(60):
+        scale = OdometryScale()
+        driven_unsteadily(scale, noise, seed=seed)
+        squares.append(((scale.value - 1.0 / 1.02) / scale.sigma) ** 2)
+    assert 0.4 < np.mean(squares) < 1.5
+    assert np.mean(np.less_equal(squares, 4.0)) > 0.85
+
+
+def test_steadiness_of_the_wheels_is_learned_from_observed_metres():
+    steady, unsteady = OdometryScale(), OdometryScale()
+    driven(steady, 400, error=0.02)
+    driven_unsteadily(unsteady, 0.002, steps=400)
+    assert steady.noise < 0.0002
+    assert unsteady.noise > 0.001
+
+
+def test_blind_way_tells_nothing_of_how_steady_the_wheels_are():
+    scale = OdometryScale()
+    driven(scale, 20, error=0.0)
+    before = scale.noise
+    driven(scale, 300, error=0.0, unseen_from=0.0)
+    assert scale.noise == pytest.approx(before, rel=0.4)

@@ -65,7 +65,8 @@ def group_of(module: str) -> tuple[int, str]:
     """Return the group of a test module, as its kind and a name; a group runs on one worker, one test after another.
 
     Tests that measure the reaction time of real processes never run in parallel. The tests of any other module stay
-    together, because they share its servers; those of the firmware share what is compiled for them.
+    together, because they share its servers; those of the firmware share what is compiled for them. Tests of the whole
+    system, and those that have a time limit of their own, take longest and start first.
     """
     text = (ROOT / module).read_text("utf-8")
     if "mark.compose" in text:
@@ -73,7 +74,7 @@ def group_of(module: str) -> tuple[int, str]:
     if "mark.reaction" in text:
         return REACTION, ""
     if "mark.live" in text:
-        return (SYSTEM if module.startswith("tests/") else LIVE), module
+        return (SYSTEM if module.startswith("tests/") or "mark.timeout" in text else LIVE), module
     return COMPUTING, "firmware" if module.startswith("firmware/") else module
 
 

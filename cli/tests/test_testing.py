@@ -91,6 +91,7 @@ def test_tests_of_reaction_times_share_one_worker(grouping: ModuleType) -> None:
     assert faults[0] == grouping.REACTION
     assert grouping.group_of("cli/tests/test_stack.py")[0] == grouping.LIVE
     assert grouping.group_of("tests/replay/test_replay.py")[0] == grouping.SYSTEM
+    assert grouping.group_of("services/tests/test_rest.py")[0] == grouping.SYSTEM
 
 
 class Worker:

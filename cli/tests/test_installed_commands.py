@@ -21,7 +21,7 @@ def add_to(app: typer.Typer) -> None:
 @pytest.fixture
 def app(monkeypatch: pytest.MonkeyPatch) -> typer.Typer:
     points = [metadata.EntryPoint("measure", f"{__name__}:add_to", "fognav.commands")]
-    monkeypatch.setattr(parts, "entry_points", lambda **_: points)
+    monkeypatch.setattr(parts, "_points", lambda *_: metadata.EntryPoints(points))
     monkeypatch.setattr(metadata.EntryPoint, "load", lambda _: add_to)
     LOADED.clear()
     app = typer.Typer(cls=installed.Commands, rich_markup_mode=None)
@@ -50,5 +50,5 @@ def test_package_that_can_not_be_loaded_is_named(app: typer.Typer, monkeypatch: 
 
 
 def test_without_other_packages_there_are_only_our_own(app: typer.Typer, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(parts, "entry_points", lambda **_: [])
+    monkeypatch.setattr(parts, "_points", lambda *_: metadata.EntryPoints())
     assert "No such command 'measure'" in CliRunner().invoke(app, ["measure"]).stderr

@@ -8,7 +8,6 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from fog_contracts.costs import INSCRIBED
-from fognav.lidar_logs.logs import read_log
 from fognav.lidar_logs.options import LogFormat, RangeMax, Scans  # noqa: TC001  # Typer reads annotations at run time
 from fognav.operate.fog import find_fog
 from fognav.operate.options import FogOption, JsonOption  # noqa: TC001  # same
@@ -68,7 +67,7 @@ def map_from_log(  # noqa: PLR0913  # each option is an argument
     Each beam clears the cells that it passes and marks the one where it ends.
     """
     from fog_runtime.configuration.maps import save_map  # noqa: PLC0415  # keeps the other commands fast
-    from fognav.lidar_logs.log_map import build_map  # noqa: PLC0415  # same
+    from fognav.lidar_logs.logs import build_map, read_log  # noqa: PLC0415  # same
 
     with exit_codes():
         map_ = build_map(read_log(log_file, log_format).select(scans), resolution, range_max)

@@ -1,13 +1,13 @@
-"""Options of the commands that read logs."""
+"""Options of the commands that read logs, apart from what reads them: a command line is read without numpy."""
 
 from __future__ import annotations
 
-from typing import Annotated
+from typing import Annotated, Literal
 
 import typer
 
-from fognav.lidar_logs.logs import Format, Selection
-
+Format = Literal["auto", "intel", "jsonl", "carmen", "rosbag2"]
+Selection = Literal["all", "odd", "even"]
 LogFormat = Annotated[
     Format, typer.Option("--format", help="Format of the log; intel is JSON lines, auto looks at the file.")
 ]

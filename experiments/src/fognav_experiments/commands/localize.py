@@ -9,13 +9,14 @@ import typer
 from rich.progress import Progress
 
 from fognav import kernels
-from fognav.lidar_logs.logs import LidarLog, LogScan, Selection, read_log
 from fognav.lidar_logs.options import LogFormat, RangeMax, Scans  # noqa: TC001  # same
 from fognav.operate.options import JsonOption  # noqa: TC001  # same
 from fognav.output import NOT_TRUE, WrongUseError, check_writable, console, exit_codes, print_answer, print_json
 
 if TYPE_CHECKING:
     from fog_contracts.grid import StaticMap
+    from fognav.lidar_logs.logs import LidarLog, LogScan
+    from fognav.lidar_logs.options import Selection
 
 
 def add_to(app: typer.Typer) -> None:
@@ -49,6 +50,8 @@ def localize_command(  # noqa: PLR0913  # each option is an argument
     exit code is 1 if no pose was found, or one that is wrong. With --trials starts without a pose (--global) or robots
     that are carried away unnoticed (--kidnap) are counted, and it is 1 if any pose was wrong while it was good.
     """
+    from fognav.lidar_logs.logs import read_log  # noqa: PLC0415  # keeps the other commands fast
+
     with exit_codes():
         check_writable(png)
         map_, log = _load_map(map_file), read_log(log_file, log_format)

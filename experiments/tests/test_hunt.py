@@ -452,6 +452,13 @@ def test_goal_inside_a_wall_is_refused():
         build(msgspec.structs.replace(WORLD, goal=(0.2, 0.2)))
 
 
+def test_obstacle_in_an_area_that_nothing_watches_is_refused():
+    events = [Obstacle(polygon=SQUARE, area="a1")]
+    build(msgspec.structs.replace(WORLD, events=events))
+    with pytest.raises(ValueError, match="area a1, which is not watched"):
+        build(msgspec.structs.replace(WORLD, events=events, watched=[]))
+
+
 def test_no_go_zone_that_an_operator_draws_is_kept():
     corner = [(5.5, 0.5), (6.0, 0.5), (6.0, 1.2), (5.5, 1.2)]
     world = msgspec.structs.replace(WORLD, events=[NoGoZone(polygon=corner)], sensors=Sensors(), warp_m=0.0)

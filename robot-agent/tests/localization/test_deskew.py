@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 
 from robot_agent.config import LocalizationConfig
 from robot_agent.hardware import LaserScan
-from robot_agent.localization.deskew import deskew, spread
+from robot_agent.localization.deskew import DeskewedScan, deskew, follows, spread
 from robot_agent.localization.odometry_buffer import OdometryBuffer
 from robot_agent.localization.pose import Pose2
 
@@ -71,3 +71,28 @@ def test_beams_are_spread_over_the_whole_scan():
     points = np.arange(20.0).reshape(10, 2)
     assert spread(points, 4)[:, 0].tolist() == [0.0, 6.0, 12.0, 18.0]
     assert spread(points, 99) is points
+
+
+def in_a_room(true: Pose2, odom: Pose2, rng: np.random.Generator) -> DeskewedScan:
+    """A scan from a pose in a room of 8 x 5 m, when the wheels say `odom`."""
+    angles = np.linspace(-math.pi, math.pi, 300, endpoint=False) + true.theta
+    with np.errstate(divide="ignore"):
+        x = np.where(np.cos(angles) > 0, 8.0 - true.x, -true.x) / np.cos(angles)
+        y = np.where(np.sin(angles) > 0, 5.0 - true.y, -true.y) / np.sin(angles)
+    ranges = np.minimum(x, y) * rng.normal(1.0, 0.01, 300)
+    points = np.column_stack((ranges * np.cos(angles - true.theta), ranges * np.sin(angles - true.theta)))
+    return DeskewedScan(points[rng.random(300) > 0.3], odom, 0.0)
+
+
+@given(
+    x=st.floats(1.0, 7.0), y=st.floats(1.0, 4.0), heading=st.floats(-math.pi, math.pi), seed=st.integers(0, 2**32 - 1)
+)
+def test_scans_follow_each_other_as_the_wheels_say_and_not_if_the_robot_was_carried(x, y, heading, seed):
+    rng, begin, step = np.random.default_rng(seed), Pose2(x, y, heading), Pose2(0.08, 0.0, 0.3)
+    before = in_a_room(begin, Pose2(7.0, -3.0, 1.0), rng)
+    odom = before.odom.compose(step)
+    assert follows(in_a_room(begin.compose(step), odom, rng), before)
+    assert not follows(in_a_room(begin.compose(Pose2(0.08, 0.0, 1.2)), odom, rng), before)
+    empty = DeskewedScan(np.empty((0, 2)), odom, 0.0)
+    assert not follows(empty, before)
+    assert not follows(before, empty)

@@ -323,7 +323,7 @@ def _events(dice: random.Random, floor: _Floor, distance: float) -> list[AnyEven
 def _event(  # noqa: C901, PLR0911, PLR0912  # a table of the kinds of events
     dice: random.Random, floor: _Floor, at_s: float
 ) -> tuple[AnyEvent, bool]:
-    """Return an event, and whether a node lies by it."""
+    """Return an event, and whether a node lies by it; what is soft hides what stands beside or behind it."""
     place = dice.choice((floor.places[0], dice.choice(floor.places)))
     node = f"n-{floor.watched[0].id}" if floor.watched else ""
     kind = dice.choice((
@@ -414,7 +414,7 @@ def _event(  # noqa: C901, PLR0911, PLR0912  # a table of the kinds of events
     return Obstacle(
         at_s=at_s, polygon=_ring(barrier), seconds=dice.choice((0.0, seconds)), keep_m=_KEEP_M,
         area=None if kind == "soft" else area.id, soft=kind == "soft",
-    ), False  # fmt: skip
+    ), kind == "soft"  # fmt: skip
 
 
 def _zone(dice: random.Random, place: Box) -> Box:

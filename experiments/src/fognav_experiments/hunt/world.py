@@ -21,7 +21,7 @@ from fog_kernels.components import Components
 from fog_kernels.distance import squared_distance_capped
 from fog_runtime.configuration.default_parts import DEFAULT_BASE, DEFAULT_LIDAR
 from fog_runtime.configuration.robot_file import RobotFile, default_robot
-from fognav_experiments.scenarios.description import AnyEvent, BadLine
+from fognav_experiments.scenarios.description import AnyEvent, BadLine, Obstacle
 from fognav_sim.floor import Floor
 from fognav_sim.lidar_faults import LidarFaults
 from fognav_sim.sensors import Noise
@@ -200,6 +200,10 @@ def build(world: HuntWorld, recorded: StaticMap | None = None) -> Built:
         ],
         robots=[RobotSite(id="r1", start=_pose(world.start), radius=world.radius)],
     )  # fmt: skip
+    watched = {area.id for area in world.watched}
+    for event in world.events:
+        if isinstance(event, Obstacle) and event.area is not None and event.area not in watched:
+            raise ValueError(f"{world.title}: an obstacle stands in area {event.area}, which is not watched: add it")
     floor = Floor(geometry, truth)
     for name, (x, y) in (("start", world.start[:2]), ("goal", world.goal)):
         if floor.nearest(x, y)[0] < world.radius:

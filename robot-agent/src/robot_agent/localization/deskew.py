@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
@@ -16,6 +16,16 @@ if TYPE_CHECKING:
     from robot_agent.hardware import LaserScan
     from robot_agent.localization.odometry_buffer import OdometryBuffer
     from robot_agent.localization.pose import Pose2
+
+_COMPARED: Final = 120
+_COMPARED_LEAST: Final = 20
+_BESIDE_RAD: Final = 0.04
+"""A beam is compared with those of the scan before that went this near to its direction."""
+_ALIKE_M: Final = 0.1
+_ALIKE_SHARE: Final = 0.05
+"""Ranges differ by no more than this, and this share of them: along a wall that is seen at a low angle by most."""
+_ALIKE_BEAMS: Final = 0.7
+"""Share of the beams that must be alike."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -40,6 +50,26 @@ def spread(points: NDArray[np.float64], count: int) -> NDArray[np.float64]:
     if len(points) <= count:
         return points
     return points[np.arange(count) * (len(points) - 1) // max(count - 1, 1)]
+
+
+def follows(scan: DeskewedScan, before: DeskewedScan) -> bool:
+    """Whether a scan shows what the one before it showed, from where the wheels say that the robot is since.
+
+    If it does not, somebody has carried or turned the robot, or stands around it. The map is not asked: so a door that
+    was opened since it was made, which spoils how scans fit the map, says nothing here.
+    """
+    seen = before.odom.inverse_transform(scan.odom.transform(scan.beams(_COMPARED)))
+    order = np.argsort(angles := np.arctan2(before.points[:, 1], before.points[:, 0]))
+    if not len(order):
+        return False
+    bearings, ranges = angles[order], np.hypot(before.points[:, 0], before.points[:, 1])[order]
+    bearing, distance = np.arctan2(seen[:, 1], seen[:, 0]), np.hypot(seen[:, 0], seen[:, 1])
+    beside = (np.searchsorted(bearings, bearing)[:, None] + np.arange(-2, 2)) % len(order)
+    turned = np.abs((bearings[beside] - bearing[:, None] + np.pi) % (2.0 * np.pi) - np.pi)
+    compared = turned < _BESIDE_RAD
+    alike = compared & (np.abs(ranges[beside] - distance[:, None]) < _ALIKE_M + _ALIKE_SHARE * distance[:, None])
+    count = int(compared.any(axis=1).sum())
+    return count >= _COMPARED_LEAST and int(alike.any(axis=1).sum()) >= _ALIKE_BEAMS * count
 
 
 def deskew(scan: LaserScan, odometry: OdometryBuffer, config: LocalizationConfig) -> DeskewedScan | None:

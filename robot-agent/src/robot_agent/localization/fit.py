@@ -36,6 +36,8 @@ right poses, some in a crowd, fail here, and 97 % of those at wrong poses."""
 _CONTRADICTION_PROVEN: Final = 0.12
 _AGREEMENT_PROVEN: Final = 0.8
 """One that was good before may also stay so within these limits: a door was opened, yet the rest is as it was."""
+_CONTRADICTION_DOORS: Final = 0.35
+"""Share that passes through walls of the map beside one or two doors that were opened since it was made."""
 _BLURRED_LIMIT: Final = 0.15
 """Share of blurred beams above which a pose is not good: 0.2 % of those at right poses, half of the wrong ones that the
 limits above let through. 0.1 would slow a robot down on an empty floor."""
@@ -144,12 +146,16 @@ class FitMonitor:
             self.status = "weak"
         self.detail = detail
 
-    def add(self, fit: Fit, spread: Uncertainty, *, doubt: str = "") -> None:
-        """Add the fit of the newest scan, with the pose's standard deviations; a pose in `doubt` is at most weak."""
+    def add(self, fit: Fit, spread: Uncertainty, *, doubt: str = "", kept: bool = False) -> None:
+        """Add the fit of the newest scan, with the pose's standard deviations.
+
+        A pose in `doubt` is at most weak; one that is `kept` is not lost however many scans contradict it.
+        """
         grade, reason = grade_fit(fit, spread, proven=self._proven)
         if grade == "good" and doubt:
             grade, reason = "weak", doubt
-        self._contradicted = self._contradicted + 1 if fit.contradict > _CONTRADICTION_LIMIT else 0
+        contradicted = fit.contradict > _CONTRADICTION_LIMIT and not kept
+        self._contradicted = self._contradicted + 1 if contradicted else 0
         if self._contradicted >= _CONTRADICTED_SCANS_LIMIT:
             grade = "lost"
         self._recent.append(grade)
@@ -221,6 +227,11 @@ def _weakness(fit: Fit, *, proven: bool) -> str:
 def tells_place(fit: Fit) -> bool:
     """Whether most of a scan shows the place that a pose says, whatever doors are open: enough to measure a way by."""
     return fit.informative >= _INFORMATIVE_LEAST and fit.contradict <= _CONTRADICTION_LIMIT and fit.agree >= 0.7
+
+
+def shows_place(fit: Fit) -> bool:
+    """Whether half of a scan shows the place of a pose, and no more passes through walls than at opened doors."""
+    return fit.informative >= _INFORMATIVE_LEAST and fit.contradict <= _CONTRADICTION_DOORS and fit.agree >= 0.5
 
 
 def confirms(fit: Fit) -> bool:

@@ -16,9 +16,9 @@ import msgspec
 import numpy as np
 
 from robot_agent.config import LocalizationConfig
-from robot_agent.localization.deskew import DeskewedScan, deskew
+from robot_agent.localization.deskew import DeskewedScan, deskew, follows
 from robot_agent.localization.doubt import Doubt
-from robot_agent.localization.fit import FitMonitor, confirms, evaluate_fit, tells_place
+from robot_agent.localization.fit import FitMonitor, confirms, evaluate_fit, shows_place, tells_place
 from robot_agent.localization.hypotheses import Near, apart
 from robot_agent.localization.map_fields import MapFields, map_fields
 from robot_agent.localization.odometry_buffer import OdometryBuffer
@@ -47,6 +47,9 @@ _LOCAL_SIGMAS: Final = (1.0, 0.5)
 """Standard deviations (m, rad) within which a lost robot is looked for first."""
 _VERIFY_EVERY_S: Final = 5.0
 """Least time between two searches of the whole map that only confirm the pose, as while a door stands open."""
+_FOLLOWED_M: Final = 5.0
+"""A pose that was good for so long a way is kept against places that explain the scans better, while each scan shows
+what the one before it did: nobody carried the robot, and opened doors are more likely than such a way to a wrong place."""
 _NEAR_M: Final = 2.5
 """So far from where its pose was good last a robot may be that was pushed or turned, or whose wheel was held."""
 _TURNED_RAD: Final = 0.5
@@ -86,6 +89,12 @@ class Localizer:
         """Whether the newest scan by itself confirms the pose."""
         self._tracked = False
         """Whether the pose was good once, and was followed by wheels and scans since."""
+        self._shows_place = False
+        """Whether half of the newest scan shows the place of the pose."""
+        self._continuous = False
+        """Whether the newest scan shows what the one before it did."""
+        self._followed_m = 0.0
+        """How far the robot has driven with a good pose, while each scan showed what the one before it did."""
         self._near: Near | None = None
         """Where the robot may have come to by itself since its pose was good; None before that."""
         self._last_odom: Pose2 | None = None
@@ -146,7 +155,8 @@ class Localizer:
 
     def on_scan(self, scan: LaserScan, now: float) -> None:
         """Process a whole scan: correct the pose when the robot has moved, and evaluate the fit."""
-        self.scan = deskew(scan, self._odometry, self._config)
+        before, self.scan = self.scan, deskew(scan, self._odometry, self._config)
+        self._continuous = before is not None and self.scan is not None and follows(self.scan, before)
         if self.scan is None or self._fields is None:
             return
         if self._filter.has_pose:
@@ -275,6 +285,7 @@ class Localizer:
         self._relocalization.cancel()
         self._local_scans = 0
         self._tracked = False
+        self._followed_m = 0.0
         self._near = None
         self._doubt.restart()
         odom = self._odometry.latest() or Pose2(0.0, 0.0, 0.0)
@@ -286,12 +297,13 @@ class Localizer:
         pose = self._filter.pose(scan.odom)
         assert pose is not None
         fit = evaluate_fit(fields, pose, scan.beams(_FIT_BEAMS), self._config.range_max)
-        self._tells_place, self._confirmed = tells_place(fit), confirms(fit)
+        self._tells_place, self._shows_place, self._confirmed = tells_place(fit), shows_place(fit), confirms(fit)
         shaken = self._filter.jumped or self._monitor.shaken
         self._tracked = not shaken and (self._tracked or self._monitor.status == "good")
         rivalled = not self._tracked and len(self._relocalization.places) > 1
         self._doubt.add(fit, scan.odom, jumped=self._filter.jumped, rivalled=rivalled)
-        self._monitor.add(fit, self._filter.uncertainty, doubt=self._doubt.reason)
+        self._follow_way(scan.odom, shaken=shaken)
+        self._monitor.add(fit, self._filter.uncertainty, doubt=self._doubt.reason, kept=self._is_kept)
         self._follow(pose, scan.odom)
         if self._monitor.status == "lost":
             self._relocalization.verifies = False
@@ -318,6 +330,19 @@ class Localizer:
             step = odom.relative_to(self._last_odom)
             self._come(math.hypot(step.x, step.y))
         self._last_odom = odom
+
+    def _follow_way(self, odom: Pose2, *, shaken: bool) -> None:
+        """Measure the way on which a good pose was followed without a break."""
+        if shaken or not self._tracked or not self._continuous:
+            self._followed_m = 0.0
+        elif self._monitor.status == "good" and self._last_odom is not None:
+            step = odom.relative_to(self._last_odom)
+            self._followed_m += math.hypot(step.x, step.y)
+
+    @property
+    def _is_kept(self) -> bool:
+        """Whether the way from a good pose to this one says more than a place that explains the scans better."""
+        return self._tracked and (self._tells_place or (self._shows_place and self._followed_m > _FOLLOWED_M))
 
     def _come(self, distance: float) -> None:
         if self._near is not None:
@@ -363,9 +388,9 @@ class Localizer:
             same = not apart(pose, outcome.pose)
             if same:
                 self._doubt.verify()
-            if same or (self._tracked and self._tells_place):
-                # Where a door was opened, a place without that door elsewhere explains every scan a little better than
-                # the robot's own. Wheels that have counted all the way say more than that.
+            if same or self._is_kept:
+                # Where a door was opened, a place without that door elsewhere explains every scan better than the
+                # robot's own. Wheels that have counted all the way say more than that.
                 self._relocalization.cancel()
                 self._verify_again_at = now + _VERIFY_EVERY_S
                 return
@@ -383,6 +408,7 @@ class Localizer:
         self._doubt.restart()
         self._local_scans = 1
         self._tracked = False
+        self._followed_m = 0.0
         self._near = None
         self._scale.forget_anchor()
         self._filter.start(outcome.pose, outcome.odom, *_FOUND_SIGMAS)
@@ -395,7 +421,7 @@ class Localizer:
         Whoever turned it by hand did no more than one who pushed it. Far places that look alike are less likely: with
         those the robot drives on, slowly.
         """
-        pose = None if self._tracked and self._tells_place else self._filter.pose(odom)
+        pose = None if self._is_kept else self._filter.pose(odom)
         return pose is not None and any(
             place.near and abs(wrap(place.pose.theta - pose.theta)) > _TURNED_RAD
             for place in self._relocalization.places

@@ -49,7 +49,7 @@ _VERIFY_EVERY_S: Final = 5.0
 """Least time between two searches of the whole map that only confirm the pose, as while a door stands open."""
 _FOLLOWED_M: Final = 5.0
 """A pose that was good for so long a way is kept against places that explain the scans better, while each scan shows
-what the one before it did: nobody carried the robot, and opened doors are more likely than such a way to a wrong place."""
+what the one before it did: nobody carried the robot, opened doors are more likely than such a way to a wrong place."""
 _NEAR_M: Final = 2.5
 """So far from where its pose was good last a robot may be that was pushed or turned, or whose wheel was held."""
 _TURNED_RAD: Final = 0.5

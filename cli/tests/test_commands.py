@@ -11,6 +11,7 @@ from fog_contracts import channels as ch
 from fog_runtime.record import Recorder
 from fognav import checkout, doctor, recording, system
 from fognav.__main__ import app
+from fognav.output import WrongUseError
 
 runner = CliRunner()
 
@@ -96,6 +97,17 @@ def test_doctor_writes_one_object_with_schema_and_version() -> None:
     assert printed["schema"] == 1
     assert printed["fognav"]
     assert {"python", "mosquitto", "redis-server", "kernel cache"} <= {check["name"] for check in printed["checks"]}
+
+
+def test_doctor_of_an_installed_command_needs_no_checkout(monkeypatch: pytest.MonkeyPatch) -> None:
+    def no_checkout() -> Path:
+        raise WrongUseError("this command works only in a checkout")
+
+    monkeypatch.setattr(checkout, "root", no_checkout)
+    done = runner.invoke(app, ["doctor", "--json"], catch_exceptions=False)
+    states = {check["name"]: check["state"] for check in json.loads(done.stdout)["checks"]}
+    assert states["python packages"] == "ok"
+    assert "uv" in states
 
 
 def test_doctor_fails_with_the_remedy_if_a_server_is_missing(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -18,7 +18,7 @@ import psutil
 from fognav import checkout, kernels, system
 from fognav.locking import VARIABLE as LOCKS_VARIABLE
 from fognav.locking import locks_errors, locks_folder, open_locks
-from fognav.output import FailedError
+from fognav.output import FailedError, WrongUseError
 
 State = Literal["ok", "missing", "optional"]
 
@@ -65,9 +65,18 @@ def check_python() -> Check:
     return Check("python", "missing", found, "install Python 3.11 or newer")
 
 
+def _checkout() -> Path | None:
+    """Return the folder of the checkout; None for an installed command, which has none."""
+    try:
+        return checkout.root()
+    except WrongUseError:
+        return None
+
+
 def check_uv() -> Check:
     """Check for the installer of Python packages, which ./fognav installs by itself."""
-    own = [checkout.root() / ".fognav" / folder / "bin" / "uv" for folder in ("uv", "uv-env")]
+    root = _checkout()
+    own = [root / ".fognav" / folder / "bin" / "uv" for folder in ("uv", "uv-env")] if root else []
     path = next((candidate for candidate in own if candidate.is_file()), None) or shutil.which("uv")
     if path is None:
         return Check("uv", "optional", "not found", "not needed now: ./fognav installs it when packages change")
@@ -75,8 +84,9 @@ def check_uv() -> Check:
 
 
 def check_packages() -> Check:
-    """Check whether ./fognav has created the environment from the pins."""
-    if (checkout.root() / ".fognav" / "stamp").is_file():
+    """Check whether ./fognav has created the environment of its checkout from the pins."""
+    root = _checkout()
+    if root is None or (root / ".fognav" / "stamp").is_file():
         return Check("python packages", "ok", f"in {sys.prefix}")
     return Check("python packages", "optional", f"in {sys.prefix}, not created by ./fognav", "run ./fognav once")
 

@@ -3,17 +3,22 @@
 from __future__ import annotations
 
 import asyncio
-import os
 from functools import partial
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 from rich.progress import Progress
 
 from fognav import kernels
-from fognav.output import NOT_TRUE, WrongUseError, check_writable, console, exit_codes, print_json
+from fognav.operate.options import JsonOption  # noqa: TC001  # Typer reads annotations at run time
+from fognav.output import NOT_TRUE, WrongUseError, check_writable, console, exit_codes, print_json, print_line
+from fognav_experiments.bench import machine
+from fognav_experiments.commands.mutation import mutation_command
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping
 
 bench_app = typer.Typer(help="Measure parts of the system on this machine.", no_args_is_help=True)
 
@@ -21,6 +26,17 @@ bench_app = typer.Typer(help="Measure parts of the system on this machine.", no_
 def add_to(app: typer.Typer) -> None:
     """Add the command to `fognav`."""
     app.add_typer(bench_app, name="bench")
+
+
+def _show(bench: str, asked: Mapping[str, object], figures: Mapping[str, object], *, json: bool) -> None:
+    """Write what was asked and measured: for people, or as the JSON object of a benchmark."""
+    if json:
+        print_json({"bench": bench, **asked, **figures, **machine.describe()})
+        return
+    shown = {**asked, **figures}
+    width = max(map(len, shown))
+    for name, value in shown.items():
+        print_line(f"{name:{width}} {value}")
 
 
 @bench_app.command("fleet", epilog="Example: fognav bench fleet --robots 50 --goals 50 --zones 300 --json")
@@ -35,7 +51,7 @@ def fleet_command(  # noqa: PLR0913  # the options of a command
         bool,
         typer.Option("--live", help="Measure a planner's process, with a router, a store and robots' subscribers."),
     ] = False,
-    json: Annotated[bool, typer.Option("--json", help="Write one JSON object to standard output.")] = False,
+    json: JsonOption = False,
 ) -> None:
     """Measure the planner with many robots.
 
@@ -45,11 +61,11 @@ def fleet_command(  # noqa: PLR0913  # the options of a command
     """
     import numpy as np  # noqa: PLC0415  # keeps the other commands fast
 
-    from fognav_experiments.bench import fleet_live, machine  # noqa: PLC0415  # same
+    from fognav_experiments.bench import fleet_live  # noqa: PLC0415  # same
     from fognav_experiments.bench.fleet import Fleet, FleetMap, measure, place_fleet  # noqa: PLC0415  # same
     from fognav_experiments.bench.office import make_office  # noqa: PLC0415  # same
 
-    kernels.warm_cache(lambda text: console.print(text, markup=False))
+    kernels.warm_cache(print_line)
     rng = np.random.default_rng(seed)
     with exit_codes(), Progress(console=console, disable=not console.is_terminal) as progress:
         task = progress.add_task("planning the first paths", total=trials)
@@ -64,11 +80,7 @@ def fleet_command(  # noqa: PLR0913  # the options of a command
         else:
             figures = measure(map_, Fleet(map_, robots, goals, rng), trials, show)
     asked = {"robots": robots, "goals": goals, "zones": zones, "trials": trials, "seed": seed, "live": live}
-    if json:
-        print_json({"bench": "fleet", **asked, **figures, **machine.describe()})
-        return
-    for name, value in (asked | figures).items():
-        console.print(f"{name:24} {value}", markup=False)
+    _show("fleet", asked, figures, json=json)
 
 
 @bench_app.command("floor", epilog="Example: fognav bench floor --width 500 --height 500 --json")
@@ -76,7 +88,7 @@ def floor_command(
     *,
     width: Annotated[float, typer.Option("--width", metavar="M", min=40.0, max=2000.0, help="Width (m).")] = 500.0,
     height: Annotated[float, typer.Option("--height", metavar="M", min=30.0, max=2000.0, help="Height (m).")] = 500.0,
-    json: Annotated[bool, typer.Option("--json", help="Write one JSON object to standard output.")] = False,
+    json: JsonOption = False,
 ) -> None:
     """Measure a map-service and a planner on a large floor, at 5 cm per cell.
 
@@ -84,20 +96,14 @@ def floor_command(
     one after a zone closed it. By default the largest floor that there may be, 10,000 x 10,000 cells; it takes some
     minutes, and memory of several GB.
     """
-    from fognav_experiments.bench import floor, machine  # noqa: PLC0415  # keeps the other commands fast
+    from fognav_experiments.bench import floor  # noqa: PLC0415  # keeps the other commands fast
 
-    kernels.warm_cache(lambda text: console.print(text, markup=False))
+    kernels.warm_cache(print_line)
     with exit_codes(), TemporaryDirectory(prefix="fognav-") as folder:
         cells = floor.prepare(Path(folder), width, height)
-        figures = asyncio.run(
-            floor.measure(Path(folder), cells, width, height, lambda step: console.print(step, markup=False))
-        )
+        figures = asyncio.run(floor.measure(Path(folder), cells, width, height, print_line))
     asked = {"width": width, "height": height}
-    if json:
-        print_json({"bench": "floor", **asked, **figures, **machine.describe()})
-        return
-    for name, value in (asked | figures).items():
-        console.print(f"{name:26} {value}", markup=False)
+    _show("floor", asked, figures, json=json)
 
 
 @bench_app.command("costmap", epilog="Example: fognav bench costmap --zones 5000 --json")
@@ -106,23 +112,19 @@ def costmap_command(
     zones: Annotated[int, typer.Option("--zones", metavar="Z", min=1, max=5000, help="Zones of 5 x 5 m.")] = 5000,
     repeats: Annotated[int, typer.Option("--repeats", metavar="N", min=1, help="Repetitions of each figure.")] = 5,
     seed: Annotated[int, typer.Option("--seed", metavar="N", min=0, help="Seed of the floor.")] = 1,
-    json: Annotated[bool, typer.Option("--json", help="Write one JSON object to standard output.")] = False,
+    json: JsonOption = False,
 ) -> None:
     """Measure the map-service's core.
 
     Full updates and a change of 2 x 2 m, the legal zones that cost most, the start with many zones, a snapshot. The map
     is an office of 100 x 60 m at 5 cm. Times are in ms.
     """
-    from fognav_experiments.bench import costmap, machine  # noqa: PLC0415  # keeps the other commands fast
+    from fognav_experiments.bench import costmap  # noqa: PLC0415  # keeps the other commands fast
     from fognav_experiments.bench.office import make_office  # noqa: PLC0415  # same
 
-    kernels.warm_cache(lambda text: console.print(text, markup=False))
+    kernels.warm_cache(print_line)
     figures = costmap.measure(make_office(seed=seed), zones, repeats)
-    if json:
-        print_json({"bench": "costmap", "repeats": repeats, "seed": seed, **figures, **machine.describe()})
-        return
-    for name, value in figures.items():
-        console.print(f"{name:22} {value}", markup=False)
+    _show("costmap", {"repeats": repeats, "seed": seed}, figures, json=json)
 
 
 @bench_app.command("robot", epilog="Example: fognav bench robot --seconds 30 --cpu-quota 0.2 --json")
@@ -135,24 +137,20 @@ def robot_command(
         float | None,
         typer.Option("--cpu-quota", metavar="SHARE", min=0.01, max=4.0, help="Limit the robot to a share of a core."),
     ] = None,
-    json: Annotated[bool, typer.Option("--json", help="Write one JSON object to standard output.")] = False,
+    json: JsonOption = False,
 ) -> None:
     """Measure what the robot's processes cost.
 
     Agent, guardian and watchdog, standing by and driving on a map of 2000 x 1140 cells. Fog, simulator and emulated
     devices are processes of their own, which do not count. CPU is in percent of one core.
     """
-    from fognav_experiments.bench import machine, robot  # noqa: PLC0415  # keeps the other commands fast
+    from fognav_experiments.bench import robot  # noqa: PLC0415  # keeps the other commands fast
 
-    kernels.warm_cache(lambda text: console.print(text, markup=False))
+    kernels.warm_cache(print_line)
     with exit_codes():
-        figures = robot.measure(seconds, cpu_quota, lambda phase: console.print(phase, markup=False))
+        figures = robot.measure(seconds, cpu_quota, print_line)
     asked = {"seconds": seconds, "cpu_quota": cpu_quota}
-    if json:
-        print_json({"bench": "robot", **asked, **figures, **machine.describe()})
-        return
-    for name, value in (asked | figures).items():
-        console.print(f"{name:22} {value}", markup=False)
+    _show("robot", asked, figures, json=json)
 
 
 @bench_app.command("rest", epilog="Example: fognav bench rest --clients 32 --seconds 60 --json")
@@ -161,27 +159,23 @@ def rest_command(
     clients: Annotated[int, typer.Option("--clients", metavar="N", min=1, max=128, help="Clients at once.")] = 32,
     seconds: Annotated[float, typer.Option("--seconds", metavar="S", min=1.0, help="How long they ask.")] = 30.0,
     zones: Annotated[int, typer.Option("--zones", metavar="Z", min=0, max=4900, help="Zones of 5 x 5 m.")] = 4900,
-    json: Annotated[bool, typer.Option("--json", help="Write one JSON object to standard output.")] = False,
+    json: JsonOption = False,
 ) -> None:
     """Measure how steady the map's heartbeat is under load, and how long zones take without any.
 
     Clients send a map-service the costliest zones, read all zones and pictures, send invalid and oversized bodies, or
     send and read slowly; another process times the heartbeat (100 ms), without clients (`idle_`) and with them.
     """
-    from fognav_experiments.bench import machine, rest  # noqa: PLC0415  # keeps the other commands fast
+    from fognav_experiments.bench import rest  # noqa: PLC0415  # keeps the other commands fast
     from fognav_experiments.bench.office import make_office, write_site  # noqa: PLC0415  # same
 
-    kernels.warm_cache(lambda text: console.print(text, markup=False))
+    kernels.warm_cache(print_line)
     floor = make_office()
     with exit_codes(), TemporaryDirectory(prefix="fognav-") as folder:
         write_site(Path(folder), floor)
         figures = asyncio.run(rest.measure(Path(folder), floor, zones=zones, clients=clients, seconds=seconds))
     asked = {"clients": clients, "seconds": seconds, "zones": zones}
-    if json:
-        print_json({"bench": "rest", **asked, **figures, **machine.describe()})
-        return
-    for name, value in (asked | figures).items():
-        console.print(f"{name:26} {value}", markup=False)
+    _show("rest", asked, figures, json=json)
 
 
 @bench_app.command("localization", epilog="Example: fognav bench localization --json")
@@ -191,24 +185,20 @@ def localization_command(
     beams: Annotated[int, typer.Option("--beams", metavar="N", min=10, max=1000, help="Beams of an update.")] = 60,
     repeats: Annotated[int, typer.Option("--repeats", metavar="N", min=1, help="Repetitions of each figure.")] = 200,
     seed: Annotated[int, typer.Option("--seed", metavar="N", min=0, help="Seed of floor and particles.")] = 1,
-    json: Annotated[bool, typer.Option("--json", help="Write one JSON object to standard output.")] = False,
+    json: JsonOption = False,
 ) -> None:
     """Measure the localization.
 
     One cycle of the particle filter (move, weight, cluster, resample) beside the same with plainly written scores, the
     match of a scan, and the search of a whole office of 100 x 60 m at 5 cm. Times are in ms.
     """
-    from fognav_experiments.bench import localization, machine  # noqa: PLC0415  # keeps the other commands fast
+    from fognav_experiments.bench import localization  # noqa: PLC0415  # keeps the other commands fast
     from fognav_experiments.bench.office import make_office  # noqa: PLC0415  # same
 
-    kernels.warm_cache(lambda text: console.print(text, markup=False))
+    kernels.warm_cache(print_line)
     figures = localization.measure(make_office(seed=seed), particles, beams, repeats, seed)
-    if json:
-        asked = {"particles": particles, "beams": beams, "repeats": repeats, "seed": seed}
-        print_json({"bench": "localization", **asked, **figures, **machine.describe()})
-        return
-    for name, value in figures.items():
-        console.print(f"{name:22} {value}", markup=False)
+    asked = {"particles": particles, "beams": beams, "repeats": repeats, "seed": seed}
+    _show("localization", asked, figures, json=json)
 
 
 @bench_app.command("planner", epilog="Example: fognav bench planner --map office.yaml --queries 30 --json")
@@ -223,7 +213,7 @@ def planner_command(
     ] = None,
     queries: Annotated[int, typer.Option("--queries", metavar="N", min=1, max=10_000, help="How many.")] = 30,
     seed: Annotated[int, typer.Option("--seed", metavar="N", min=0, help="Seed of office, queries and hazards.")] = 1,
-    json: Annotated[bool, typer.Option("--json", help="Write one JSON object to standard output.")] = False,
+    json: JsonOption = False,
 ) -> None:
     """Measure path searches: from scratch, and again after a hazard of 2 x 2 m on the path.
 
@@ -234,9 +224,9 @@ def planner_command(
     import numpy as np  # noqa: PLC0415  # keeps the other commands fast
 
     from fog_runtime.configuration.maps import MapFileError  # noqa: PLC0415  # same
-    from fognav_experiments.bench import machine, planner  # noqa: PLC0415  # same
+    from fognav_experiments.bench import planner  # noqa: PLC0415  # same
 
-    kernels.warm_cache(lambda text: console.print(text, markup=False))
+    kernels.warm_cache(print_line)
     rng = np.random.default_rng(seed)
     with exit_codes(), Progress(console=console, disable=not console.is_terminal) as progress:
         try:
@@ -249,33 +239,25 @@ def planner_command(
         figures = planner.measure(floor, asked, rng, lambda done: progress.update(task, completed=done))
     height, width = floor.costmap.shape
     what = {"map": "office" if map_file is None else map_file.name, "width": width, "height": height, "seed": seed}
-    if json:
-        print_json({"bench": "planner", **what, **figures, **machine.describe()})
-        return
-    for name, value in (what | figures).items():
-        console.print(f"{name:27} {value}", markup=False)
+    _show("planner", what, figures, json=json)
 
 
 @bench_app.command("dwa", epilog="Example: fognav bench dwa --repeats 2000 --json")
 def dwa_command(
     *,
     repeats: Annotated[int, typer.Option("--repeats", metavar="N", min=1, help="Repetitions of each figure.")] = 1000,
-    json: Annotated[bool, typer.Option("--json", help="Write one JSON object to standard output.")] = False,
+    json: JsonOption = False,
 ) -> None:
     """Measure a robot's decision among 25 x 35 arcs.
 
     The distances around it and the choice, for a round body and a rectangle in a corridor, and a whole decision. Times
     are in ms; `peer_ratio` is by 1.75 ms, which ROS 1's local planner took for as many arcs on another x86 server.
     """
-    from fognav_experiments.bench import dwa, machine  # noqa: PLC0415  # keeps the other commands fast
+    from fognav_experiments.bench import dwa  # noqa: PLC0415  # keeps the other commands fast
 
-    kernels.warm_cache(lambda text: console.print(text, markup=False))
+    kernels.warm_cache(print_line)
     figures = dwa.measure(repeats)
-    if json:
-        print_json({"bench": "dwa", "repeats": repeats, **figures, **machine.describe()})
-        return
-    for name, value in figures.items():
-        console.print(f"{name:22} {value}", markup=False)
+    _show("dwa", {"repeats": repeats}, figures, json=json)
 
 
 @bench_app.command("pipeline", epilog="Example: fognav bench pipeline --nodes 500 --rate 20 --seconds 30 --json")
@@ -286,29 +268,25 @@ def pipeline_command(
     robots: Annotated[int, typer.Option("--robots", metavar="N", min=0, max=200, help="Robots with poses.")] = 50,
     seconds: Annotated[float, typer.Option("--seconds", metavar="S", min=4.0, help="How long they publish.")] = 30.0,
     open_: Annotated[bool, typer.Option("--open", help="Without locks: no encryption, no passwords.")] = False,
-    json: Annotated[bool, typer.Option("--json", help="Write one JSON object to standard output.")] = False,
+    json: JsonOption = False,
 ) -> None:
     """Measure the way from readings to the map.
 
     Broker, aggregator and map-service are real processes behind locks; so is the generator of the load. Readings that
     the aggregator did not get are lost; times are in ms, from the confirmation of a hazard to the map's delta.
     """
-    from fognav_experiments.bench import machine, pipeline  # noqa: PLC0415  # keeps the other commands fast
+    from fognav_experiments.bench import pipeline  # noqa: PLC0415  # keeps the other commands fast
 
-    kernels.warm_cache(lambda text: console.print(text, markup=False))
+    kernels.warm_cache(print_line)
     with exit_codes(), TemporaryDirectory(prefix="fognav-") as folder:
         figures = asyncio.run(
             pipeline.measure(
                 Path(folder), nodes=nodes, rate=rate, robots=robots, seconds=seconds, locked=not open_,
-                on_phase=lambda text: console.print(text, markup=False),
+                on_phase=print_line,
             )
         )  # fmt: skip
     asked = {"nodes": nodes, "rate": rate, "robots": robots, "seconds": seconds, "locked": not open_}
-    if json:
-        print_json({"bench": "pipeline", **asked, **figures, **machine.describe()})
-        return
-    for name, value in (asked | figures).items():
-        console.print(f"{name:28} {value}", markup=False)
+    _show("pipeline", asked, figures, json=json)
 
 
 @bench_app.command("warning", epilog="Example: fognav bench warning --warnings 50 --json")
@@ -327,7 +305,7 @@ def warning_command(  # noqa: PLR0913  # the options of the command
         float, typer.Option("--hours", metavar="H", min=0.01, help="Simulated hours with nothing but false echoes.")
     ] = 2.0,
     seed: Annotated[int, typer.Option("--seed", metavar="N", min=0, help="Seed of the obstacles.")] = 1,
-    json: Annotated[bool, typer.Option("--json", help="Write one JSON object to standard output.")] = False,
+    json: JsonOption = False,
 ) -> None:
     """Measure a warning: from an obstacle's first echo at a node to the path that a robot receives around it.
 
@@ -340,9 +318,9 @@ def warning_command(  # noqa: PLR0913  # the options of the command
     from fognav import checkout  # noqa: PLC0415  # keeps the other commands fast
     from fognav.nodes import site_file  # noqa: PLC0415  # same
     from fognav_experiments.bench import false_echoes as noise  # noqa: PLC0415  # same
-    from fognav_experiments.bench import machine, warning  # noqa: PLC0415  # same
+    from fognav_experiments.bench import warning  # noqa: PLC0415  # same
 
-    kernels.warm_cache(lambda text: console.print(text, markup=False))
+    kernels.warm_cache(print_line)
     rows = []
     with exit_codes(), Progress(console=console, disable=not console.is_terminal) as progress:
         loaded = site_file.load(checkout.site_folder(site))
@@ -375,7 +353,7 @@ def debounce_command(
     hours: Annotated[float, typer.Option("--hours", metavar="H", min=0.01, help="Hours without an obstacle.")] = 2.0,
     seed: Annotated[int, typer.Option("--seed", metavar="N", min=0, help="Seed of the trials.")] = 1,
     png: Annotated[Path | None, typer.Option("--png", metavar="FILE", help="Draw the figures.")] = None,
-    json: Annotated[bool, typer.Option("--json", help="Write one JSON object to standard output.")] = False,
+    json: JsonOption = False,
 ) -> None:
     """Compare the debounce rules on recorded echoes.
 
@@ -384,7 +362,7 @@ def debounce_command(
     background, as recorded and with 2 % false echoes; and what the evidence rule learns from the recordings: echo_rate
     and false_echo_rate.
     """
-    from fognav_experiments.bench import debounce, machine  # noqa: PLC0415  # keeps the other commands fast
+    from fognav_experiments.bench import debounce  # noqa: PLC0415  # keeps the other commands fast
 
     with exit_codes():
         check_writable(png)
@@ -392,7 +370,7 @@ def debounce_command(
             loaded = debounce.recordings_in(recordings)
         except ValueError as error:
             raise WrongUseError(str(error)) from error
-        rows = debounce.measure(loaded, trials, hours, seed, lambda rule: console.print(rule, markup=False))
+        rows = debounce.measure(loaded, trials, hours, seed, print_line)
         if png is not None:
             debounce.draw(rows, png)
     learned = [{"echo_rate": round(r.echo_rate, 3), "false_echo_rate": round(r.false_echo_rate, 3)} for r in loaded]
@@ -423,7 +401,7 @@ def reactions_command(
         Path | None,
         typer.Option("--write", metavar="FILE", help="Write the tables to a Markdown file; its remarks stay."),
     ] = None,
-    json: Annotated[bool, typer.Option("--json", help="Write one JSON object to standard output.")] = False,
+    json: JsonOption = False,
 ) -> None:
     """Measure how soon the wheels stop.
 
@@ -431,7 +409,6 @@ def reactions_command(
     fail; an operator stops the robot. The time ends when the emulated base's wheels are commanded to stand, or to be
     slow. A trial takes some five seconds. Exit code 1: a trial was beyond its limit.
     """
-    from fognav_experiments.bench import machine  # noqa: PLC0415  # keeps the other commands fast
     from fognav_experiments.bench.reactions.faults import FAULTS  # noqa: PLC0415  # same
     from fognav_experiments.bench.reactions.trials import (  # noqa: PLC0415  # same
         due,
@@ -442,14 +419,14 @@ def reactions_command(
         row,
     )
 
-    kernels.warm_cache(lambda text: console.print(text, markup=False))
+    kernels.warm_cache(print_line)
     with exit_codes():
         check_writable(log)
         check_writable(write)
         times = read_log(log)
         other = trials if others is None else others
         waiting = due(times, lambda fault: trials if fault.kind == "process" else other)
-        found = asyncio.run(measure(waiting, robots, log, lambda text: console.print(text, markup=False)))
+        found = asyncio.run(measure(waiting, robots, log, print_line))
     rows = [row(fault, every) for fault in FAULTS if (every := times.get(fault.name, []) + found.get(fault.name, []))]
     if write is not None:
         command = f"fognav bench reactions --trials {trials} --others {other} --robots {robots} --log FILE --write PAGE"
@@ -464,46 +441,4 @@ def reactions_command(
         raise typer.Exit(NOT_TRUE)
 
 
-@bench_app.command("mutation", epilog="Example: fognav bench mutation --part guardian --module core")
-def mutation_command(
-    *,
-    part: Annotated[
-        list[str] | None, typer.Option("--part", metavar="NAME", help="Only this part; may be repeated.")
-    ] = None,
-    module: Annotated[
-        str, typer.Option("--module", metavar="NAME", help="Only mutants of modules whose name ends so.")
-    ] = "",
-    coverage: Annotated[
-        bool, typer.Option("--coverage", help="Measure only which lines and branches the tests reach.")
-    ] = False,
-    jobs: Annotated[int, typer.Option("--jobs", metavar="N", min=0, help="Mutants at once; 0: one per core.")] = 0,
-    json: Annotated[bool, typer.Option("--json", help="Write one JSON object to standard output.")] = False,
-) -> None:
-    """Test the tests of what stops the robot.
-
-    Changes one operator, number or statement of safety gate, guardian, watchdog, recoveries or maneuvers, and runs
-    their tests, which must notice it; prints each change that none does. Exit code 1: a line or branch that no test
-    reaches, or fewer than 90 percent of the changes noticed.
-    """
-    from fognav import checkout  # noqa: PLC0415  # keeps the other commands fast
-    from fognav_experiments.mutation import run  # noqa: PLC0415  # same
-    from fognav_experiments.mutation.parts import parts_named  # noqa: PLC0415  # same
-
-    def tell(text: str) -> None:
-        console.print(text, markup=False, soft_wrap=True)
-
-    with exit_codes():
-        root, chosen = checkout.root(), parts_named(part or [])
-        figures = {
-            each.name: run.measure(
-                each, root, jobs=jobs or os.cpu_count() or 1, only=None if coverage else module, tell=tell
-            )
-            for each in chosen
-        }
-    if json:
-        print_json({"bench": "mutation", "parts": run.report_values(figures)})
-    else:
-        for line in run.report_lines(figures):
-            tell(line)
-    if not run.passes(figures):
-        raise typer.Exit(NOT_TRUE)
+bench_app.command("mutation", epilog="Example: fognav bench mutation --part guardian --module core")(mutation_command)

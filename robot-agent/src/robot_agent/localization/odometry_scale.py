@@ -21,8 +21,8 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
 _PRIOR_SIGMA: Final = 0.065
-"""Recorded odometry was wrong by 2.9 and 2.5 % (Intel, CSAIL), wheels that were measured with a ruler by more: with 10 %
-a robot stands before it is 1.5 m wrong, wherever in a plain corridor it begins."""
+"""Recorded odometry was wrong by 2.9 and 2.5 % (Intel, CSAIL), wheels that were measured with a ruler by more: with
+10 % a robot stands before it is 1.5 m wrong, wherever in a plain corridor it begins."""
 _CHORD_MIN_M: Final = 2.0
 _CHORD_MAX_M: Final = 10.0
 """Distance between the two poses from which on it says something, and after which the next one begins."""

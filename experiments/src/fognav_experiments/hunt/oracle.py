@@ -381,7 +381,8 @@ class Oracle:
         if self._mode == "EGRESS":
             limit = max(limit, _MODE_SPEED["EGRESS"])
         allowed = limit * self._world.gain + _SPEED_MARGIN
-        self._lasts("speed", why, self._speed > allowed, f"{self._speed:.2f} m/s {why}, not {limit:.2f}", 0.25)
+        values = f"{self._speed:.2f} m/s {why}, not {limit:.2f}"
+        self._lasts("speed", why, self._speed > allowed, values, 0.25 + self._world.wrong_s)
 
     @property
     def _reaction_s(self) -> float:

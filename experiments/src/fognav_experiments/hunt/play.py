@@ -38,8 +38,11 @@ _FIND_POSE: Final[tuple[CommandKind, ...]] = ("turn", "advance", "initial_pose")
 """What an operator tries if a robot does not know its pose."""
 _BUSY_S: Final = 2.0
 """How late messages are at most, but one in thousands, while a radio is busy."""
-_WRONG_S: Final = 0.2
-"""A guardian repeats a command every 0.05 s, which may be lost, too; truth comes every 0.1 s."""
+_REPEATED_S: Final = 0.05
+"""How often a guardian repeats a command, of five bytes."""
+_UNLUCKY: Final = 1e-3
+_SETTLED_S: Final = 0.3
+"""What wheels take to stop after a wrong command, and to be seen standing: truth comes every 0.1 s."""
 
 
 class Hunted(msgspec.Struct, frozen=True, kw_only=True):
@@ -116,7 +119,7 @@ def hunt(world: HuntWorld, folders: Sequence[Path] = ()) -> Hunted:
             pose_floor_m=0.06 + world.resolution + world.warp_m,
             gain=max(1.0, *world.sensors.gain) * (1.0 + 3.0 * world.sensors.wander),
             late_s=_BUSY_S if world.busy else 0.0,
-            wrong_s=_WRONG_S if world.garbles else 0.0,
+            wrong_s=_wrong_s(world.garbled),
             ahead_s=lambda: run.robot.clock.ahead(run.now),
         ),
         STAMP,
@@ -134,6 +137,13 @@ def hunt(world: HuntWorld, folders: Sequence[Path] = ()) -> Hunted:
     )
     release_drives()
     return found
+
+
+def _wrong_s(garbled: float) -> float:
+    """Return for how long wheels may do what arrived wrong, if this share of bytes does: once in 1,000 times longer."""
+    if garbled == 0.0:
+        return 0.0
+    return _SETTLED_S + _REPEATED_S * math.log(_UNLUCKY) / math.log(1.0 - (1.0 - garbled) ** 5)
 
 
 class _WatchedStage(Stage):

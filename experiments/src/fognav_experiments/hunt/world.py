@@ -146,9 +146,10 @@ class HuntWorld(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields
         return any(event.__struct_config__.tag in {"slow-link", "busy-radio"} for event in self.events)
 
     @property
-    def garbles(self) -> bool:
-        """Whether bytes to and from the base may arrive with a wrong bit."""
-        return any(isinstance(event, BadLine) and event.device == "base" and event.flipped for event in self.events)
+    def garbled(self) -> float:
+        """Share of the bytes to and from the base that are lost or wrong at worst."""
+        lines = [event for event in self.events if isinstance(event, BadLine) and event.device == "base"]
+        return max((line.lost + line.flipped for line in lines), default=0.0)
 
 
 class Built(NamedTuple):

@@ -85,8 +85,10 @@ async def test_user_with_too_many_connections_gets_no_more_and_others_do(tmp_pat
     monkeypatch.setattr(relay, "OF_USER", 2)
 
     async def let_in(reader, writer):
-        await reader.read(1)
-        writer.write(CONNACK)
+        with contextlib.closing(writer):
+            await reader.read(1)
+            writer.write(CONNACK)
+            await reader.read()  # until its client leaves
 
     async with (
         asyncio.timeout(WAIT_S),

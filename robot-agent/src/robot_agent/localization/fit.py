@@ -230,8 +230,9 @@ def tells_place(fit: Fit) -> bool:
 
 
 def shows_place(fit: Fit) -> bool:
-    """Whether half of a scan shows the place of a pose, and no more passes through walls than at opened doors."""
-    return fit.informative >= _INFORMATIVE_LEAST and fit.contradict <= _CONTRADICTION_DOORS and fit.agree >= 0.5
+    """Whether enough of a scan shows the place of a pose, and no more passes through walls than at opened doors."""
+    enough = fit.informative >= _INFORMATIVE_LEAST and fit.agree >= _AGREEMENT_CLEAR
+    return enough and fit.contradict <= _CONTRADICTION_DOORS
 
 
 def confirms(fit: Fit) -> bool:

@@ -90,7 +90,7 @@ class Localizer:
         self._tracked = False
         """Whether the pose was good once, and was followed by wheels and scans since."""
         self._shows_place = False
-        """Whether enough of the newest scan shows the place of the pose, doors opened since and furniture left aside."""
+        """Whether enough of the newest scan shows the place of the pose, opened doors and furniture left aside."""
         self._continuous = False
         """Whether the newest scan shows what the one before it did."""
         self._followed_m = 0.0

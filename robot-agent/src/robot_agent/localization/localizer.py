@@ -150,6 +150,7 @@ class Localizer:
         if not self._filter.observe(observation.pose, observation.covariance, odom):
             self._monitor.begin("checking the pose that was measured")
             self._doubt.restart()
+            self._tracked = False
             self._near = None
         return True
 

@@ -45,10 +45,8 @@ EDGES = {
     "map_service.__main__", "map_service.api", "map_service.registry", "map_service.service", "map_service.settings",
     "map_service.publisher", "map_service.store", "map_service.times_keeper", "map_service.unusable_zones",
     "map_service.zone_writer",
-    "planner.__main__", "planner.rest", "planner.cycle", "planner.keepers.dock_keeper", "planner.keepers.map_keeper",
-    "planner.keepers.mission_keeper", "planner.keepers.path_record", "planner.keepers.plan_metrics",
-    "planner.robot_commands", "planner.query_queue", "planner.service", "planner.settings", "planner.store",
-    "planner.threads",
+    "planner.__main__", "planner.api", "planner.map_keeper", "planner.plan_records", "planner.query_queue",
+    "planner.robot_commands", "planner.service", "planner.store",
     "robot_agent.__main__", "robot_agent.agent.edges", "robot_agent.agent.recording.input_writer",
     "robot_agent.agent.process", "robot_agent.agent.recording.replay", "robot_agent.agent.service",
     "robot_agent.agent.settings", "robot_agent.contradictions",
@@ -295,7 +293,7 @@ PLANTED = {
     "the interface of layers imports one": (
         "services/map-service/src/map_service/layers/base.py", "map_service.layers.hazards", "cost layers:",
     ),
-    "a core loads a C library": ("services/planner/src/planner/search/route.py", "ctypes", "planner.search.route"),
+    "a core loads a C library": ("services/planner/src/planner/path_search.py", "ctypes", "planner.path_search"),
     "a proposal of a site logs": ("cli/src/fognav/site_proposal.py", "logging", "fognav.site_proposal"),
 }  # fmt: skip
 

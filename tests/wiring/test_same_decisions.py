@@ -50,8 +50,8 @@ from hazard_aggregator.registry import find_rule
 from map_service.core import MapCore
 from map_service.registry import make_layers
 from planner.core import PlannerCore
-from planner.keepers.mission_keeper import Order
 from planner.robot_commands import CommandError
+from planner.store import Order
 from robot_agent.agent.core import AgentCore
 from robot_agent.agent.recording import input_log as log
 
@@ -334,13 +334,13 @@ def lockstep() -> Run:
 def live(lockstep: Run) -> tuple[Run, Any]:
     with pytest.MonkeyPatch.context() as patch:
         for module in (
-            "planner.threads",
+            "planner.query_queue",
             "robot_agent.agent.edges.map_loader",
             "robot_agent.agent.service",
             "fog_runtime.work",
         ):
             patch.setattr(f"{module}.ThreadPoolExecutor", live_services.InlineExecutor)
-        patch.setattr("planner.keepers.mission_keeper.secrets.token_hex", lambda _: GOAL_ID)
+        patch.setattr("planner.store.secrets.token_hex", lambda _: GOAL_ID)
         return asyncio.run(drive_live(lockstep))
 
 

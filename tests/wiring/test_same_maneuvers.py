@@ -19,7 +19,7 @@ from fog_contracts import channels as ch
 from fog_contracts.messages import CommandKind, CommandReply, Pose, RobotGoal
 from fog_runtime.configuration.site import LoadedSite
 from fognav_experiments.rigs import OPERATOR_KEY, System, moment
-from planner.keepers.mission_keeper import Order
+from planner.store import Order
 from robot_agent.agent.recording import input_log as log
 
 
@@ -115,7 +115,7 @@ def lockstep() -> Any:
 def live(lockstep: Any) -> Any:
     with pytest.MonkeyPatch.context() as patch:
         for name in (
-            "planner.threads",
+            "planner.query_queue",
             "robot_agent.agent.edges.map_loader",
             "robot_agent.agent.service",
             "fog_runtime.work",
@@ -124,7 +124,7 @@ def live(lockstep: Any) -> Any:
         # The planner names missions at random.
         goals = [message.goal_id for _, _, message in lockstep.decisions()["robot_goal"] if message.pose is not None]
         names = iter(dict.fromkeys(goals))
-        patch.setattr("planner.keepers.mission_keeper.secrets.token_hex", lambda _: next(names))
+        patch.setattr("planner.store.secrets.token_hex", lambda _: next(names))
         return asyncio.run(drive_live(lockstep))
 
 

@@ -33,7 +33,7 @@ def rest_routes() -> dict[str, OpenApi]:
     # The services import kernels and web frameworks, which takes time: only this function needs them.
     from hazard_aggregator.rest.api import make_api as make_aggregator  # noqa: PLC0415  # see above
     from map_service.api import make_api as make_map  # noqa: PLC0415  # same
-    from planner.rest.api import make_api as make_planner  # noqa: PLC0415  # same
+    from planner.api import make_api as make_planner  # noqa: PLC0415  # same
 
     loaded = load_site(checkout.site_folder(None))
     clock, health, tokens = SystemClock(), Health(), Tokens()

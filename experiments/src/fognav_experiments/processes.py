@@ -15,7 +15,7 @@ from fog_contracts.codec import encode
 from fog_contracts.handlers import Moment
 from fog_contracts.messages import MapSnapshot, Message, PlanReply, RobotGoal, RobotState
 from fognav_experiments.link import Link
-from planner.keepers.dock_goals import DockGoals
+from planner.missions import DockGoals
 from robot_agent.agent.core import decide
 
 if TYPE_CHECKING:

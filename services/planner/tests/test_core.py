@@ -41,8 +41,8 @@ from fog_contracts.replica import MapError
 from fog_kernels.astar import Planner
 from planner.config import PlannerConfig
 from planner.core import PlannerCore
-from planner.search.goal_fields import GoalFields
-from planner.search.route import Route
+from planner.heuristics import GoalFields
+from planner.path_search import Route
 
 
 def crosses(points: NDArray[np.float64], cost: Grid, geometry: GridGeometry) -> bool:

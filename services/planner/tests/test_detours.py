@@ -15,9 +15,8 @@ from fog_kernels.astar import Planner
 from fog_kernels.steps import SEALED
 from planner.config import PlannerConfig
 from planner.core import PlannerCore
-from planner.search.detours import DeadEndsJob, Detours
-from planner.search.goal_fields import GoalFields
-from planner.search.path_search import PathSearch
+from planner.heuristics import DeadEndsJob, Detours, GoalFields
+from planner.path_search import PathSearch
 
 if TYPE_CHECKING:
     from fog_kernels.guides import Detour

@@ -24,7 +24,7 @@ from fog_contracts.handlers import Moment
 from fog_contracts.messages import RobotPath
 from planner.config import PlannerConfig
 from planner.core import PlannerCore
-from planner.search.route import Route
+from planner.path_search import Route
 
 if TYPE_CHECKING:
     from ring_map import Box

@@ -8,10 +8,8 @@ import pytest
 
 from fog_contracts.messages import Pose, Refusal, RobotGoal, RobotState
 from fog_contracts.site import RobotSite, Site
-from planner.keepers.dock_goals import DockGoals
-from planner.keepers.dock_keeper import DockKeeper
-from planner.keepers.mission_keeper import NO_MISSION, MissionConflictError
-from planner.store import StoreError
+from planner.missions import DockGoals
+from planner.store import NO_MISSION, DockKeeper, MissionConflictError, StoreError
 
 FRONT = Pose(x=1.0, y=2.0, theta=0.5)
 

@@ -15,9 +15,9 @@ from fog_kernels.astar import Planner
 from fog_kernels.components import Components
 from fog_kernels.distance import squared_distance_capped
 from fog_kernels.inflation import inflate, inflation_table
-from planner.maps.planning_map import PlanningMap
-from planner.reasons.explanation import Cuts
-from planner.reasons.regions import Region, Regions
+from planner.planning_map import PlanningMap
+from planner.refusals import Cuts
+from planner.regions import Region, Regions
 
 RES = 0.1
 REACH = DEFAULT_INFLATION.inscribed_radius / RES

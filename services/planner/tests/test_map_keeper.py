@@ -10,19 +10,17 @@ from ring_map import RingMap
 
 from fog_runtime.clock import ManualClock
 from fog_runtime.health import Health
+from planner import map_keeper, planning_map
 from planner.core import PlannerCore
-from planner.keepers import map_keeper
-from planner.keepers.map_keeper import MapKeeper
-from planner.maps import planning_map
-from planner.query_queue import QueryQueue
-from planner.threads import Threads
+from planner.map_keeper import MapKeeper
+from planner.query_queue import QueryQueue, Threads
 
 if TYPE_CHECKING:
     import pytest
 
     from fog_contracts.costs import Inflation
     from fog_contracts.messages import MapSnapshot
-    from planner.maps.planning_map import PreparedMap
+    from planner.planning_map import PreparedMap
 
 
 class MapService:

@@ -37,17 +37,13 @@ from fog_kernels.astar import Planner
 from fog_kernels.inflation import inflate, inflation_table
 from fog_kernels.lines import line_cost
 from planner.config import PlannerConfig
-from planner.maps.planning_map import CostChange, MapTracker, PlanningMap
-from planner.reasons.blocked_regions import BlockedRegions, cover
-from planner.reasons.refusals import refuse
-from planner.reasons.regions import Region, Regions
-from planner.replanning.mission import Mission, Plan
-from planner.replanning.path_monitor import distance_to_change, effect_of_change, may_save, reason_from_pose
-from planner.replanning.replan_policy import is_kept
-from planner.search.egress import find_egress
-from planner.search.goal_fields import FieldJob, GoalFields
-from planner.search.path_search import PathSearch, SearchResult
-from planner.search.route import Route
+from planner.heuristics import FieldJob, GoalFields
+from planner.missions import Mission, Plan
+from planner.path_search import PathSearch, Route, SearchResult, find_egress
+from planner.planning_map import CostChange, MapTracker, PlanningMap
+from planner.refusals import refuse
+from planner.regions import BlockedRegions, Region, Regions, cover
+from planner.replanner import distance_to_change, effect_of_change, is_kept, may_save, reason_from_pose
 
 CONFIG = PlannerConfig()
 TRACE = Trace(area="z1", epoch=1, seq=5)

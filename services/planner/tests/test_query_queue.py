@@ -7,8 +7,7 @@ from typing import Any, cast
 
 import pytest
 
-from planner.query_queue import PER_ASKER, WAITING, BusyError, Kind, QueryQueue
-from planner.threads import Threads
+from planner.query_queue import PER_ASKER, WAITING, BusyError, Kind, QueryQueue, Threads
 
 
 class Work:

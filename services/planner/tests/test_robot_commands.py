@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from types import SimpleNamespace
 from typing import TYPE_CHECKING, Any, cast
 
 import httpx
 import msgspec
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
 from fog_contracts import channels as ch
 from fog_contracts.commands import CommandGate
@@ -17,9 +20,9 @@ from fog_runtime.access.token_file import TokenEntry, token_hash
 from fog_runtime.clock import ManualClock
 from fog_runtime.health import Health
 from fog_runtime.http import Tokens
+from planner.api import make_api
 from planner.core import PlannerCore
-from planner.rest.api import make_api
-from planner.robot_commands import CommandError
+from planner.robot_commands import OTHERS, PERIOD_S, REMEMBERED_S, SENDERS, CommandError, DoubledRobots, StopRecords
 from planner.service import Service
 from planner.store import StoreError
 
@@ -231,3 +234,89 @@ async def test_watching_a_robot_waits_for_its_next_state(rig: Rig) -> None:
     assert (await waiting).json()["state"]["mode"] == "NORMAL"
     with pytest.raises(CommandError, match="no state for 3 s"):
         await rig.operator.next_state("r1", 101.0)
+
+
+def test_two_agents_of_one_id_are_found_until_one_is_switched_off():
+    robots = DoubledRobots()
+    finds = [robots.on_state("r1", "ab"[number % 2], 0.5 * number) for number in range(10)]
+    assert (finds.count(True), finds.index(True)) == (1, 4), "a, b, a, b, a"
+    assert robots.found(5.0) == ["r1"]
+    assert not robots.is_doubled("r2", 5.0)
+    now = 5.0
+    while robots.is_doubled("r1", now):
+        robots.on_state("r1", "a", now)
+        now += 1.0
+        assert now <= 5.0 + REMEMBERED_S + 1.0, "the agent that was switched off is not forgotten"
+    robots.on_state("r1", "b", now)
+    assert not robots.is_doubled("r1", now), "the other one came back, alone"
+
+
+@given(runs=st.lists(st.lists(st.floats(0.05, 5.0), min_size=1, max_size=20), max_size=12), late=st.integers(0, 20))
+def test_agent_that_is_restarted_ever_so_often_is_one_robot_though_a_state_comes_late(runs, late):
+    robots, now = DoubledRobots(), 0.0
+    for number, pauses in enumerate(runs):
+        for index, pause in enumerate(pauses):
+            now += pause
+            robots.on_state("r1", f"run-{number}", now)
+            if number > 0 and (number, index) == (late, 0):
+                robots.on_state("r1", f"run-{number - 1}", now)
+    assert robots.found(now) == []
+
+
+def test_agent_that_does_not_tell_its_run_is_not_judged():
+    robots = DoubledRobots()
+    assert not any(robots.on_state("r1", "", now * 0.5) for now in range(20))
+
+
+def test_first_stops_of_some_senders_are_recorded_alone_and_all_else_is_counted():
+    records = StopRecords()
+    alone = [records.count("r1", f"s{n}", 0.0) for n in range(SENDERS + 2)]
+    assert alone == [True] * SENDERS + [False, False]
+    assert not records.count("r1", "s0", 1.0)
+    assert records.count("r2", "s0", 1.0), "another robot's stops are another matter"
+    assert records.due(PERIOD_S - 0.1) == {}
+    assert records.due(PERIOD_S) == {"r1": {OTHERS: 2, "s0": 1}}
+
+
+def test_sender_who_goes_on_gets_no_entry_of_its_own_again_and_one_who_returns_does():
+    records = StopRecords()
+    for sender in ("flood", "once", "flood"):
+        records.count("r1", sender, 0.0)
+    records.recorded("r1", records.due(PERIOD_S)["r1"], PERIOD_S)
+    assert not records.count("r1", "flood", PERIOD_S + 1.0)
+    assert records.count("r1", "once", PERIOD_S + 1.0)
+
+
+STOPS = st.lists(
+    st.tuples(st.floats(0.0, 400.0), st.sampled_from(["r1", "r2"]), st.integers(0, 7), st.integers(1, 50)), max_size=60
+)
+
+
+@given(STOPS)
+def test_every_stop_is_recorded_or_counted_once_in_few_entries(stops):
+    records, entries, sent, told = StopRecords(), Counter(), 0, 0
+    now = 0.0
+
+    def record() -> None:
+        nonlocal told
+        for robot, repeats in records.due(now).items():
+            entries[robot] += 1
+            told += sum(repeats.values())
+            records.recorded(robot, repeats, now)
+
+    for pause, robot, sender, repetitions in stops:
+        now += pause
+        record()
+        for _ in range(repetitions):
+            sent += 1
+            if records.count(robot, f"s{sender}", now):
+                entries[robot] += 1
+                told += 1
+    periods = now / PERIOD_S + 1.0
+    assert max(entries.values(), default=0) <= (SENDERS + 1) * periods
+    now += PERIOD_S + 1.0
+    record()
+    assert told == sent
+    now += PERIOD_S + 1.0
+    record()
+    assert records.due(now) == {}

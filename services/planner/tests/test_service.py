@@ -14,7 +14,7 @@ import pytest
 from prometheus_client import REGISTRY
 from ring_map import LEFT, LOWER, RIGHT, UPPER, RingMap, goal, pose
 
-import planner.keepers.path_record
+import planner.plan_records
 import planner.service
 from fog_contracts import channels as ch
 from fog_contracts.handlers import Moment, Publication, RefusedMessageError
@@ -23,17 +23,17 @@ from fog_runtime.clock import ManualClock
 from fog_runtime.health import Health
 from fog_runtime.http import Tokens
 from fog_runtime.transports.zenoh_edge import ASKER
+from planner.api import make_api
 from planner.core import PlannerCore
-from planner.keepers.path_record import PathRecord
+from planner.plan_records import PathRecord
 from planner.query_queue import BusyError
-from planner.rest.api import make_api
 from planner.service import Service
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Mapping, Sequence
 
     from fog_contracts.handlers import Handler, Ids
-    from planner.cycle import CycleResult
+    from planner.service import CycleResult
 
 
 class Session:
@@ -266,7 +266,7 @@ class EndlessCore(PlannerCore):
 async def test_paths_are_recorded_after_half_a_second_although_searches_are_left(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    monkeypatch.setattr(planner.keepers.path_record, "MOST_UNRECORDED", 10**9)
+    monkeypatch.setattr(planner.plan_records, "MOST_UNRECORDED", 10**9)
     core = EndlessCore(epoch=1)
     rig = Rig(core)
     core.clock = rig.clock

@@ -13,8 +13,7 @@ from fog_runtime.leases.lease import Request
 from fog_runtime.leases.lease_store import LeaseStore
 from fog_runtime.stores.idempotency import Attempt, IdempotencyError
 from fog_supervisor.servers import Server, start_redis
-from planner.keepers.mission_keeper import MissionKeeper
-from planner.store import Audit, RecoveryError, Store, StoredGoal, StoreError
+from planner.store import Audit, MissionKeeper, RecoveryError, Store, StoredGoal, StoreError
 
 pytestmark = pytest.mark.live
 AUDIT = Audit(1.0, "anna", "goal")

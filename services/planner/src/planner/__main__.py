@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import asyncio
 import os
+from typing import TYPE_CHECKING
 
 from fog_runtime import logs, process
+from fog_runtime.access.operator_key import OperatorKeyError, read_operator_key
 from fog_runtime.clock import SystemClock
-from fog_runtime.configuration.settings import describe, load
+from fog_runtime.configuration.settings import InflationSettings, SettingsError, describe, load
 from fog_runtime.configuration.site import load_site
 from fog_runtime.health import Health
 from fog_runtime.http import Front, load_tokens, unused
@@ -15,14 +17,38 @@ from fog_runtime.leases.leadership import Leadership
 from fog_runtime.leases.lease_store import LeaseStore
 from fog_runtime.machine.memory import release_startup_memory, release_when
 from fog_runtime.transports.zenoh_edge import ZenohEdge
+from planner.api import make_api
 from planner.config import PlannerConfig
 from planner.core import PlannerCore
-from planner.rest.api import make_api
 from planner.service import Service
-from planner.settings import Settings, read_key
 from planner.store import Store
 
+if TYPE_CHECKING:
+    from pathlib import Path
+
 _log = logs.get("planner")
+
+
+class Settings(InflationSettings, frozen=True, kw_only=True):
+    """The inflation should equal the map-service's: a different one only makes the search slower.
+
+    `release_m` is the released length: how far (m) a robot may drive without a message from the planner.
+    """
+
+    release_m: float = 15.0
+
+
+def read_key(file: Path | None) -> bytes | None:
+    """Return the key that signs commands to robots, None without a file; raises `SettingsError` for an unusable one.
+
+    Without it the planner can stop robots, but not enable them.
+    """
+    if file is None:
+        return None
+    try:
+        return read_operator_key(file)
+    except OperatorKeyError as error:
+        raise SettingsError(str(error)) from error
 
 
 async def main() -> None:

@@ -2,10 +2,10 @@
 
 Pure: inputs are values, time is an argument, no I/O and no background work. This module coordinates the others:
 
-- a map delta (`planning_map`) that affects a path, or could shorten it, requests a replan (`path_monitor`);
-- so do a new goal, a pose off the path and a new snapshot of the map (`mission`);
-- `tick` searches a path for every robot that needs one (`replanner`, guided by `goal_fields`), the most urgent one
-  first (`missions`), keeps the current path unless the new one is clearly better (`replan_policy`), and publishes
+- a map delta (`planning_map`) that affects a path, or could shorten it, requests a replan (`replanner`);
+- so do a new goal, a pose off the path and a new snapshot of the map (`missions`);
+- `tick` searches a path for every robot that needs one (`replanner`, guided by `heuristics`), the most urgent one
+  first (`missions`), keeps the current path unless the new one is clearly better, and publishes
   goals, paths and refusals;
 - what may take long is a job for another thread: distance fields, reasons of refusals, answers to queries (`queries`).
 """
@@ -20,15 +20,13 @@ from fog_contracts.fencing import Fence
 from fog_contracts.handlers import Publication
 from fog_contracts.replica import MapError
 from planner.config import PlannerConfig
-from planner.maps.planning_map import MapTracker, PreparedMap
+from planner.heuristics import DeadEndsJob, FieldJob, GoalFields
+from planner.missions import Missions
+from planner.planning_map import MapTracker, PreparedMap
 from planner.queries import Answerer, ExplainJob, View
-from planner.reasons.blocked_regions import BlockedRegions, cover
-from planner.reasons.refusals import goal_out_of_reach
-from planner.replanning.missions import Missions
-from planner.replanning.path_monitor import effect_of_change, reason_from_pose
-from planner.replanning.replanner import Replanner
-from planner.search.detours import DeadEndsJob
-from planner.search.goal_fields import FieldJob, GoalFields
+from planner.refusals import goal_out_of_reach
+from planner.regions import BlockedRegions, cover
+from planner.replanner import Replanner, effect_of_change, reason_from_pose
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -47,8 +45,8 @@ if TYPE_CHECKING:
         RobotPose,
         RobotState,
     )
-    from planner.maps.planning_map import CostChange, PlanningMap
-    from planner.replanning.mission import Mission
+    from planner.missions import Mission
+    from planner.planning_map import CostChange, PlanningMap
 
     Job = DeadEndsJob | FieldJob | ExplainJob
 

@@ -9,11 +9,9 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 from fog_contracts.messages import PlanReply
-from planner.reasons.explanation import Cuts
-from planner.reasons.refusals import goal_occupied, nearest_reachable, no_map, no_path, start_occupied
-from planner.reasons.regions import Regions
-from planner.search.egress import find_egress
-from planner.search.path_search import PathSearch
+from planner.path_search import PathSearch, find_egress
+from planner.refusals import Cuts, goal_occupied, nearest_reachable, no_map, no_path, start_occupied
+from planner.regions import Regions
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -21,10 +19,10 @@ if TYPE_CHECKING:
     from fog_contracts.messages import EgressRequest, PlanRequest, Refusal
     from fog_kernels.guides import GoalField
     from planner.config import PlannerConfig
-    from planner.maps.planning_map import Cell, PlanningMap
-    from planner.reasons.regions import Region, Source
-    from planner.replanning.mission import Plan
-    from planner.search.path_search import Covers, Question, SearchResult
+    from planner.missions import Plan
+    from planner.path_search import Covers, Question, SearchResult
+    from planner.planning_map import Cell, PlanningMap
+    from planner.regions import Region, Source
 
 
 @dataclass(frozen=True)

@@ -1,4 +1,4 @@
-"""A bounded queue of long answers: one at a time, the most important first, and a limit for each asker.
+"""The planner's threads, and the bounded queue of long answers: one at a time, the most important first.
 
 Whatever runs here never delays planning: it is work for another thread. Who asks too much is told to come back later.
 """
@@ -8,6 +8,7 @@ from __future__ import annotations
 import asyncio
 import heapq
 import itertools
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, Final, Literal, TypeVar
 
@@ -16,9 +17,27 @@ from prometheus_client import Counter, Gauge
 if TYPE_CHECKING:
     from collections.abc import Awaitable, Callable
 
-    from planner.threads import Threads
-
 T = TypeVar("T")
+
+ThreadName = Literal["core", "field", "query"]
+
+
+class Threads:
+    """Runs functions on named threads; each thread runs one at a time. The kernels release the GIL."""
+
+    def __init__(self) -> None:
+        names: tuple[ThreadName, ...] = ("core", "field", "query")
+        self._threads = {name: ThreadPoolExecutor(1, thread_name_prefix=f"planner {name}") for name in names}
+
+    async def run(self, thread: ThreadName, function: Callable[[], T]) -> T:
+        """Return the function's result, or raise its exception."""
+        return await asyncio.get_running_loop().run_in_executor(self._threads[thread], function)
+
+    def close(self) -> None:
+        """Shut the threads down once their current work is done."""
+        for thread in self._threads.values():
+            thread.shutdown(wait=False, cancel_futures=True)
+
 
 Kind = Literal["map", "egress", "explanation", "plan"]
 

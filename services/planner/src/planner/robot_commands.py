@@ -7,6 +7,8 @@ robot must be sent again by a person.
 from __future__ import annotations
 
 import asyncio
+from collections import Counter
+from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Final
 
 import msgspec
@@ -17,15 +19,127 @@ from fog_contracts.commands import STOPS
 from fog_runtime import logs
 from fog_runtime.clock import ticker
 from fog_runtime.robot_commands import REPLY_TIMEOUT_S, RobotCommands
-from planner.doubled_robots import DoubledRobots
-from planner.stop_records import PERIOD_S, StopRecords
 from planner.store import Audit, StoreError
 
 if TYPE_CHECKING:
+    from collections.abc import Mapping
+
     from fog_contracts.messages import CommandKind, CommandReply, Pose, RobotState
     from fog_runtime.clock import Clock
     from fog_runtime.transports.zenoh_edge import ZenohEdge
     from planner.store import Store
+
+RETURNS: Final = 3
+"""How often the states must change back to an earlier run: a late one after a restart changes back to it, and again."""
+REMEMBERED_S: Final = 10.0
+"""How long a run, and what was found, are remembered after they were last heard."""
+
+
+@dataclass
+class _Runs:
+    current: str = ""
+    heard_at: dict[str, float] = field(default_factory=dict)
+    returns: int = 0
+    found_at: float | None = None
+
+
+class DoubledRobots:
+    """Robots whose id two agents use at the same time, as when a memory card was copied.
+
+    Both would follow every path and goal of that id, each from where the other one stands. They are found by their
+    states: each run of an agent has an id of its own (`boot`), and never comes back.
+    """
+
+    def __init__(self) -> None:
+        self._runs: dict[str, _Runs] = {}
+
+    def on_state(self, robot: str, boot: str, now: float) -> bool:
+        """Handle a state of the agent run `boot`, at `now` (s, monotonic); return whether the robot is a new find."""
+        if not boot:
+            return False
+        runs = self._runs.setdefault(robot, _Runs())
+        runs.heard_at = {run: at for run, at in runs.heard_at.items() if now - at <= REMEMBERED_S}
+        if len(runs.heard_at) <= 1:
+            runs.returns = 0
+        new = False
+        if boot != runs.current and boot in runs.heard_at:
+            runs.returns += 1
+            if runs.returns >= RETURNS:
+                new, runs.found_at = not self.is_doubled(robot, now), now
+        runs.current = boot
+        runs.heard_at[boot] = now
+        return new
+
+    def is_doubled(self, robot: str, now: float) -> bool:
+        """Whether two agents use this id now."""
+        runs = self._runs.get(robot)
+        return runs is not None and runs.found_at is not None and now - runs.found_at <= REMEMBERED_S
+
+    def found(self, now: float) -> list[str]:
+        """Return the ids that two agents use now, sorted."""
+        return sorted(robot for robot in self._runs if self.is_doubled(robot, now))
+
+
+PERIOD_S: Final = 600.0
+"""How long repeated stops of a robot are counted before an entry tells of them."""
+SENDERS: Final = 4
+"""How many senders have entries of their own, for each robot and period; all others are counted together."""
+OTHERS: Final = "others"
+
+
+@dataclass
+class _Period:
+    begun_at: float
+    senders: set[str] = field(default_factory=set)
+    repeats: Counter[str] = field(default_factory=Counter)
+
+
+class StopRecords:
+    """Which stops without a token are recorded one by one, and which are only counted.
+
+    Anybody may stop a robot, as often as they like. So that nobody can push the rest out of the audit trail by that,
+    only the first stop of each sender is an entry of its own, for some senders; what they repeat is counted, and one
+    entry per robot and period tells how often.
+    """
+
+    def __init__(self) -> None:
+        self._periods: dict[str, _Period] = {}
+
+    def count(self, robot: str, sender: str, now: float) -> bool:
+        """Count a stop at `now` (s, monotonic); return whether it is to be recorded by itself."""
+        period = self._periods.setdefault(robot, _Period(now))
+        if sender not in period.senders and len(period.senders) < SENDERS:
+            period.senders.add(sender)
+            return True
+        self.unrecorded(robot, sender)
+        return False
+
+    def unrecorded(self, robot: str, sender: str) -> None:
+        """Count a stop that has no entry of its own, because it is a repetition or could not be recorded."""
+        period = self._periods[robot]
+        period.repeats[sender if sender in period.senders else OTHERS] += 1
+
+    def due(self, now: float) -> dict[str, Mapping[str, int]]:
+        """Return, for each robot whose period is over, how often each sender repeated a stop; may be called again."""
+        due: dict[str, Mapping[str, int]] = {}
+        for robot, period in list(self._periods.items()):
+            if now - period.begun_at < PERIOD_S:
+                continue
+            if period.repeats:
+                due[robot] = dict(period.repeats)
+            else:
+                del self._periods[robot]
+        return due
+
+    def recorded(self, robot: str, repeats: Mapping[str, int], now: float) -> None:
+        """Begin the next period of a robot whose repeated stops, as returned by `due`, are recorded now.
+
+        Who repeated them is known, and gets no entry of its own again while going on.
+        """
+        period = self._periods[robot]
+        later = period.repeats - Counter(repeats)
+        self._periods[robot] = _Period(now, period.senders & {*repeats, *later}, later)
+
 
 STATE_MAX_AGE_S: Final = 3.0
 """A command names the robot's clock by its latest state, which comes once a second."""

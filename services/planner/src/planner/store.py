@@ -1,11 +1,17 @@
-"""The robots' missions in Redis, so that a restarted planner continues them."""
+"""The robots' missions in Redis: what is ordered is stored first, then in force; a restarted planner continues it."""
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Final
+import asyncio
+import secrets
+from contextlib import contextmanager
+from functools import partial
+from typing import TYPE_CHECKING, Final, NamedTuple
 
-from fog_contracts.messages import Message, RobotGoal
+from fog_contracts.messages import Message, Refusal, RobotGoal
+from fog_runtime import logs
 from fog_runtime.stores import store_keys
+from fog_runtime.stores.redis_connection import StoreRefusedError
 from fog_runtime.stores.redis_store import (
     ANY,
     Audit,
@@ -16,11 +22,21 @@ from fog_runtime.stores.redis_store import (
     StoreLostError,
     Table,
 )
+from planner.missions import DockGoals
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping
+    from collections.abc import Awaitable, Callable, Iterator, Mapping
+    from typing import Literal
 
+    from fog_contracts.messages import Pose, RobotState
+    from fog_runtime.clock import Clock
+    from fog_runtime.health import Health
     from fog_runtime.stores.idempotency import Attempt
+    from fog_runtime.stores.redis_store import StoreStatus
+    from planner.core import PlannerCore
+
+    Send = Callable[["Order"], Awaitable["StoredGoal | Refusal"]]
+    """Gives a robot a mission, or returns why there is none; may raise `StoreError`."""
 
 __all__ = ["ANY", "Audit", "RecoveryError", "Store", "StoreError", "StoreLostError", "StoredGoal"]
 
@@ -72,3 +88,278 @@ class Store(RedisStore):
     async def restore(self, goals: Mapping[str, StoredGoal], audit: Audit) -> None:
         """Replace the stored missions by these, on an administrator's decision after Redis lost them."""
         await self._adopt({_GOALS.name: goals}, audit)
+
+
+STORE_PERIOD_S = 0.5
+NO_MISSION: Final = ""
+"""Instead of a mission's id: expect that a robot has none."""
+_ATTEMPTS: Final = 2
+"""How often a conditional write is tried: what is stored may differ from what this process knows, once."""
+
+_log = logs.get("planner")
+
+
+class Order(NamedTuple):
+    """A mission as an operator orders it, and the conditions of the order.
+
+    `any_heading`: ignore the pose's theta. `expected` is the id of the mission that it replaces, or `NO_MISSION`; None
+    replaces any.
+    """
+
+    robot: str
+    pose: Pose
+    who: str
+    place: str | None = None
+    any_heading: bool = False
+    attempt: Attempt | None = None
+    expected: str | None = None
+
+
+class MissionConflictError(Exception):
+    """A robot has another mission than the writer expected; the message names it."""
+
+    def __init__(self, robot: str, stored: StoredGoal | None) -> None:
+        has = "no mission" if stored is None else f"the mission {stored.goal.goal_id}"
+        super().__init__(f"robot {robot} has {has}, and not the one that was expected: read it again, then retry")
+
+
+class MissionKeeper:
+    """Keeps the missions of store and core equal; `change_core` passes a change to the core's thread."""
+
+    def __init__(
+        self,
+        core: PlannerCore,
+        store: Store,
+        clock: Clock,
+        health: Health,
+        change_core: Callable[[Callable[[], object]], None],
+    ) -> None:
+        self._core = core
+        self._store = store
+        self._clock = clock
+        self._health = health
+        self._change_core = change_core
+        self._loaded = asyncio.Event()
+        self._lock = asyncio.Lock()
+        self._reload = True
+        self._leading = False
+        self._reached: dict[str, str] = {}
+        self.goals: dict[str, StoredGoal] = {}
+        """The missions by robot."""
+
+    async def lead(self, epoch: int, *, confirmed: bool) -> None:
+        """Load the stored missions and continue with this epoch; raises `StoreError` for a confirmed one.
+
+        With a provisional epoch, while the store can't be read, or when it lost records, only the known missions go on.
+        """
+        self._store.epoch = epoch
+        try:
+            async with self._lock:
+                await self._load()
+        except StoreError as error:
+            if confirmed and not isinstance(error, StoreLostError):
+                raise
+            self._reload = True
+        self._leading = True
+        self._change_core(partial(self._core.lead, epoch, knows_missions=not self._reload))
+
+    def stand_by(self) -> None:
+        """Forget the missions: another planner changes them until this one leads again."""
+        self._leading, self._reload = False, True
+        self._store.epoch = 0
+        self._loaded.clear()
+        self.goals.clear()
+        self._reached.clear()
+        self._change_core(self._core.stand_by)
+        self._health.set("goals", ok=True, detail="loaded when this process leads")
+
+    async def earlier_result(self, attempt: Attempt | None) -> StoredGoal | None:
+        """Return the mission that an earlier attempt stored, which is in force; None for a first attempt.
+
+        Raises `IdempotencyError` for another request's attempt, and `StoreError`.
+        """
+        with self._uncertain_write():
+            earlier = await self._store.earlier_result(attempt)
+            if earlier is not None and self._reload:
+                async with self._lock:
+                    await self._load()
+            return earlier
+
+    async def send(self, order: Order) -> StoredGoal:
+        """Give a robot a mission.
+
+        Raises `MissionConflictError`, and `StoreError`, after which the mission may or may not be stored.
+        """
+        async with self._lock:
+            stamp, place, pose = self._clock.stamp(), order.place, order.pose
+            goal = RobotGoal(goal_id=secrets.token_hex(8), pose=pose, place=place, stamp=stamp)
+            stored = StoredGoal(goal=goal, any_heading=order.any_heading)
+            await self._store_mission(order, stored, Audit(stamp, order.who, "goal", order.attempt))
+            self._begin(order.robot, stored)
+        _log.info("goal_accepted", robot=order.robot, goal=goal.goal_id, x=pose.x, y=pose.y, place=place, who=order.who)
+        return stored
+
+    async def cancel(self, robot: str, who: str, expected: str | None = None) -> bool:
+        """End a robot's mission; False when it has none. With `expected`, only the mission of that id.
+
+        Raises `MissionConflictError` and `StoreError`.
+        """
+        async with self._lock:
+            with self._uncertain_write():
+                if self._reload:
+                    # It may have one that was stored although its request failed: "none" would be wrong.
+                    await self._load()
+            stored = self.goals.get(robot)
+            if stored is None:
+                return False
+            if expected not in (None, stored.goal.goal_id):
+                raise MissionConflictError(robot, stored)
+            with self._uncertain_write():
+                await self._store.delete(robot, stored.goal.goal_id, Audit(self._clock.stamp(), who, "cancel"))
+            self._cancel(robot)
+        _log.info("goal_cancelled", robot=robot, goal=stored.goal.goal_id, who=who)
+        return True
+
+    async def store_status(self) -> StoreStatus:
+        """Return what Redis and this process have; raises `StoreError`."""
+        return await self._store.status({"goals": len(self.goals)} if self._loaded.is_set() else {})
+
+    async def recover_store(self, action: Literal["restore", "accept"], who: str) -> None:
+        """Restore the missions from memory, or accept those in Redis, after Redis lost records.
+
+        Raises `RecoveryError` and `StoreError`.
+        """
+        await self._store.require_loss()
+        async with self._lock:
+            audit = Audit(self._clock.stamp(), who, action)
+            if action == "accept":
+                await self._store.accept_loss(audit)
+                self._reload = True
+            elif self._loaded.is_set():
+                await self._store.restore(self.goals, audit)
+            else:
+                raise RecoveryError(
+                    "this service was started after the loss and has no missions: restore a backup of Redis, or accept"
+                )
+
+    def end(self, robot: str, goal_id: str) -> None:
+        """Mark a reached goal for deletion, unless the robot has another one by now."""
+        stored = self.goals.get(robot)
+        if stored is not None and stored.goal.goal_id == goal_id:
+            del self.goals[robot]
+            self._reached[robot] = goal_id
+            _log.info("goal_reached", robot=robot, goal=goal_id)
+
+    async def store_loop(self) -> None:
+        """Load the missions, retrying until the store answers; then delete ended ones, and monitor the store."""
+        while True:
+            try:
+                if self._leading and self._reload:
+                    async with self._lock:
+                        await self._load()
+                    self._change_core(partial(self._core.lead, self._store.epoch, knows_missions=True))
+                for robot, goal_id in list(self._reached.items()):
+                    await self._store.delete(robot, goal_id, Audit(self._clock.stamp(), robot, "reached"))
+                    if self._reached.get(robot) == goal_id:
+                        del self._reached[robot]
+                await self._store.check()
+                self._health.set("store", ok=True)
+            except StoreError as error:
+                # What was stored but never acknowledged may have gone with a failed primary.
+                self._reload = True
+                self._health.set("store", ok=False, detail=str(error))
+                if self._leading and not self._loaded.is_set():
+                    self._health.set("goals", ok=False, detail=f"not loaded yet: {error}")
+            await asyncio.sleep(STORE_PERIOD_S)
+
+    @contextmanager
+    def _uncertain_write(self) -> Iterator[None]:
+        """Reload the missions after a failure: one may have been written although the reply was lost."""
+        if not self._loaded.is_set():
+            raise StoreRefusedError("the stored missions are not loaded yet")
+        try:
+            yield
+        except StoreError as error:
+            self._reload = True
+            self._health.set("store", ok=False, detail=str(error))
+            raise
+
+    async def _store_mission(self, order: Order, stored: StoredGoal, audit: Audit) -> None:
+        """Store a mission if the robot's mission is the expected one; raises `MissionConflictError`, `StoreError`."""
+        robot, expected = order.robot, order.expected
+        for _ in range(_ATTEMPTS):
+            if expected is not None:
+                await self._require(expected, robot)
+            # One that is reached may still be stored.
+            before = ANY if expected is None else expected or self._reached.get(robot, "0")
+            with self._uncertain_write():
+                outcome = await self._store.put(robot, stored, audit, expected=before)
+            if outcome == "ok":
+                return
+            if expected is None:
+                raise StoreError("another request with this Idempotency-Key is in progress: repeat it")
+            self._reload = True
+        raise MissionConflictError(robot, self.goals.get(robot))
+
+    async def _require(self, expected: str, robot: str) -> None:
+        """Raise `MissionConflictError` unless the robot's mission is the expected one; raises `StoreError`, too."""
+        with self._uncertain_write():
+            if self._reload:
+                await self._load()
+        known = self.goals.get(robot)
+        if expected != (NO_MISSION if known is None else known.goal.goal_id):
+            raise MissionConflictError(robot, known)
+
+    async def _load(self) -> None:
+        """Put the stored missions into force, and end those that are not stored; hold the lock.
+
+        Raises `StoreError`.
+        """
+        stored = await self._store.goals()
+        for robot in [robot for robot in self.goals if robot not in stored]:
+            self._cancel(robot)
+        for robot, mission in stored.items():
+            # One that is reached may still be stored, until its deletion succeeds.
+            if mission != self.goals.get(robot) and mission.goal.goal_id != self._reached.get(robot):
+                self._begin(robot, mission)
+        self._reload = False
+        self._loaded.set()
+        self._health.set("goals", ok=True, detail=f"{len(self.goals)} loaded")
+
+    def _cancel(self, robot: str) -> None:
+        del self.goals[robot]
+        self._change_core(partial(self._core.cancel, robot))
+
+    def _begin(self, robot: str, stored: StoredGoal) -> None:
+        self.goals[robot] = stored
+        self._change_core(partial(self._core.set_goal, robot, stored.goal, any_heading=stored.any_heading))
+
+
+class DockKeeper:
+    """Gives missions for docks, one at a time for each robot."""
+
+    def __init__(self, staging: Mapping[str, Pose], send: Send) -> None:
+        """`staging`: by robot, the pose in front of its dock."""
+        self._goals = DockGoals(staging)
+        self._send = send
+        self._tasks: set[asyncio.Task[None]] = set()
+
+    def on_state(self, robot: str, state: RobotState, goal: RobotGoal | None, now: float) -> None:
+        """Send the robot, which has just published its state, in front of its dock if it wants to and is not sent."""
+        pose = self._goals.due(robot, state, goal, now)
+        if pose is not None:
+            replaced = NO_MISSION if goal is None else goal.goal_id
+            task = asyncio.get_running_loop().create_task(self._give(robot, pose, replaced), name="dock")
+            self._tasks.add(task)
+            task.add_done_callback(self._tasks.discard)
+
+    async def _give(self, robot: str, pose: Pose, replaced: str) -> None:
+        try:
+            outcome = await self._send(Order(robot, pose, f"robot {robot}, to its dock", expected=replaced))
+        except MissionConflictError:
+            return  # an operator was faster
+        except StoreError as error:
+            _log.error("dock_goal_failed", robot=robot, reason=str(error))
+            return
+        if isinstance(outcome, Refusal):
+            _log.warning("dock_goal_refused", robot=robot, reason=outcome.reason)

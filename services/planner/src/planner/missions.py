@@ -1,23 +1,49 @@
-"""The planner's state of one robot: its pose, its goal, and its current plan."""
+"""Missions: each robot's pose, goal and current plan, and the order in which their paths are searched. Pure."""
 
 from __future__ import annotations
 
 import math
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING, Final, Literal
 
 from msgspec import structs
 
 from fog_contracts.messages import PointXY, Refusal, RobotGoal, RobotPath, RobotPose, RobotRelease, Trace
-from planner.replanning.switch_limiter import SwitchLimiter
 
 if TYPE_CHECKING:
+    from collections.abc import Iterator, Mapping
+
+    from fog_contracts.grid import GridGeometry
     from fog_contracts.handlers import Moment
     from fog_contracts.messages import Pose, RobotState
     from fog_contracts.replica import Version
     from planner.config import PlannerConfig
-    from planner.search.path_search import Question
-    from planner.search.route import Route
+    from planner.path_search import Question, Route
+    from planner.planning_map import Cell
+
+_QUIET_S: Final = 60.0
+"""After so long without a switch, the next one counts as the first again."""
+
+
+@dataclass
+class SwitchLimiter:
+    """When a robot was last moved to another way, and how often in a row. Times are of the planner's clock (s)."""
+
+    last: float = -math.inf
+    in_a_row: int = 0
+    deferred_until: float = math.inf
+    """When a switch that had to wait is searched again."""
+
+    def allowed_from(self, config: PlannerConfig) -> float:
+        """Return from when on a passable path may be left for another way."""
+        doubled = config.switch_dwell_s * 2.0 ** max(0, self.in_a_row - 1)
+        return self.last + min(doubled, config.max_switch_dwell_s)
+
+    def record(self, now: float) -> None:
+        """Record a switch, forced or not."""
+        self.in_a_row = self.in_a_row + 1 if now - self.last < _QUIET_S else 1
+        self.last = now
+
 
 ReplanReason = Literal["goal", "map", "epoch", "off_path", "clearing", "refused"]
 """Why a path is replanned; `map` is a change of costs within the swept corridor of the remaining path."""
@@ -237,3 +263,162 @@ def received_path(state: RobotState) -> PathId | None:
     if state.plan_id is None or state.planner_epoch is None:
         return None
     return state.planner_epoch, state.plan_id
+
+
+_URGENCY: Final[dict[ReplanReason, int]] = {
+    "map": 0, "off_path": 1, "epoch": 2, "goal": 3, "clearing": 4, "refused": 5,
+}  # fmt: skip
+"""Whose path is searched first; among equals the robot nearest to the change along its path."""
+
+
+class Missions:
+    """The missions by robot."""
+
+    def __init__(self) -> None:
+        self._missions: dict[str, Mission] = {}
+        self._reached: list[tuple[str, str]] = []
+
+    def of(self, robot: str) -> Mission:
+        """Return a robot's mission, which may have no goal."""
+        mission = self._missions.get(robot)
+        if mission is None:
+            mission = self._missions[robot] = Mission()
+        return mission
+
+    def items(self) -> list[tuple[str, Mission]]:
+        """Return all robots with their missions."""
+        return list(self._missions.items())
+
+    def active(self) -> Iterator[tuple[str, Mission]]:
+        """Yield the robots that have a goal, with their missions."""
+        return ((robot, mission) for robot, mission in self.items() if mission.target is not None)
+
+    def set_goal(self, robot: str, goal: RobotGoal, *, any_heading: bool) -> None:
+        """Give a robot a mission; the same goal again changes nothing. `any_heading`: ignore the goal's theta."""
+        if goal.pose is None:
+            self.of(robot).end()
+        else:
+            self.of(robot).begin(goal, any_heading=any_heading)
+
+    def goal(self, robot: str) -> RobotGoal | None:
+        """Return the robot's goal, if it has one."""
+        mission = self._missions.get(robot)
+        return mission.goal if mission and mission.target else None
+
+    def reach(self, robot: str, goal_id: str) -> None:
+        """End a robot's mission because it has reached this goal; another goal of it stays."""
+        goal = self.goal(robot)
+        if goal is not None and goal.goal_id == goal_id:
+            self.of(robot).end()
+            self._reached.append((robot, goal_id))
+
+    def publish_all_now(self) -> None:
+        """Make all goals and paths due."""
+        for mission in self._missions.values():
+            mission.publish_all_now()
+
+    def drop(self) -> None:
+        """Forget all goals and plans, without telling the robots."""
+        self._reached.clear()
+        for mission in self._missions.values():
+            mission.drop()
+
+    def pop_reached(self) -> list[tuple[str, str]]:
+        """Return (robot, goal id) of the goals that were reached since the last call."""
+        reached, self._reached = self._reached, []
+        return reached
+
+    def located(self, now: float, config: PlannerConfig) -> set[str]:
+        """Return the robots that have a goal and a recent pose."""
+        return {
+            robot
+            for robot, mission in self.active()
+            if mission.pose is not None and now - mission.pose_received <= config.max_pose_age_s
+        }
+
+    def to_replan(self, now: float, config: PlannerConfig) -> list[tuple[str, Mission, ReplanReason]]:
+        """Return the located robots whose search is due now, most urgent first."""
+        located = self.located(now, config)
+        due = [
+            (robot, mission, reason)
+            for robot, mission in self.active()
+            if robot in located and (reason := mission.replan_due(now, config)) is not None
+        ]
+        return sorted(due, key=lambda entry: (_URGENCY[entry[2]], entry[1].danger))
+
+    def unexplained(self, now_known: Explained, now: float, config: PlannerConfig) -> dict[str, tuple[Plan, Question]]:
+        """Return the refused plans whose reasons are unknown or may have changed, by robot, each with what is open.
+
+        `now_known`: the newest versions of map and regions. While the map changes, reasons are not asked for all the
+        time.
+        """
+        found = {}
+        for robot, mission in self.active():
+            plan = mission.plan
+            if plan is None or plan.question is None:
+                continue
+            known = plan.explained_for
+            new_regions = known is None or known[1] != now_known[1]
+            new_map = known is not None and known[0] != now_known[0]
+            if new_regions or (new_map and now - plan.explained_at >= config.explain_period_s):
+                found[robot] = plan, plan.question
+        return found
+
+    def explain(
+        self, plans: Mapping[str, Plan], answers: Mapping[str, Refusal], explained_for: Explained, now: float
+    ) -> bool:
+        """Use the explained refusals of these robots' plans; return whether one differs from what was published."""
+        changed = False
+        for robot, plan in plans.items():
+            plan.explained_for, plan.explained_at = explained_for, now
+            refusal, mission = answers.get(robot), self.of(robot)
+            if refusal is not None and mission.plan is plan and refusal != plan.refusal:
+                mission.replace_refusal(refusal)
+                changed = True
+        return changed
+
+    def search_again(self, goal: Cell, geometry: GridGeometry) -> None:
+        """Search again for the robots whose search for a path to a goal's cell took too long: it has a field now."""
+        for _, mission in self.active():
+            target = mission.target
+            if target is None or not mission.search_ran_out:
+                continue
+            if geometry.cell(target.x, target.y) == goal:
+                mission.request_replan("refused", [])
+
+    def goal_cells(self, geometry: GridGeometry) -> Iterator[Cell]:
+        """Yield the cells of all goals that lie on the map."""
+        for _, mission in self.active():
+            if mission.target is not None:
+                cell = geometry.cell(mission.target.x, mission.target.y)
+                if geometry.contains_cell(*cell):
+                    yield cell
+
+
+PAUSE_S: Final = 2.0
+"""A goal takes a moment to be stored and set; until then it is not given again."""
+
+
+class DockGoals:
+    """Which robot is to be sent to the front of its dock; `now` is s of a monotonic clock."""
+
+    def __init__(self, staging: Mapping[str, Pose]) -> None:
+        """`staging`: by robot, the pose (frame `map`) in front of its dock."""
+        self._staging = staging
+        self._sent_at: dict[str, float] = {}
+
+    def due(self, robot: str, state: RobotState, goal: RobotGoal | None, now: float) -> Pose | None:
+        """Return the pose to send a robot to that has just published its state; None when it needs no other goal.
+
+        A state from before the robot heard of its mission, or of the end of it, tells nothing: an operator who has sent
+        it elsewhere meanwhile would be overruled.
+        """
+        pose = self._staging.get(robot)
+        if pose is None or not state.wants_dock or (goal is not None and goal.pose == pose):
+            return None
+        if state.goal_id != (None if goal is None else goal.goal_id):
+            return None
+        if now - self._sent_at.get(robot, -math.inf) < PAUSE_S:
+            return None
+        self._sent_at[robot] = now
+        return pose

@@ -1,36 +1,117 @@
-"""Searches a path on the costmap from a robot's position to a goal, both in metres."""
+"""Searches paths on the costmap, in metres: to a goal, and out of a blocked area. Pure."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import cached_property
 from typing import TYPE_CHECKING, Literal
 
 import numpy as np
+from numpy.typing import NDArray
 
 from fog_contracts.costs import FREE, INSCRIBED, LETHAL
+from fog_contracts.geometry import lengths_along, sampled
 from fog_kernels.astar import Planner, nearest_traversable
-from fog_kernels.lines import line_cost
-from planner.reasons.refusals import (
+from fog_kernels.lines import cost_from, first_inside, leaves, line_cost, nearest_between
+from planner.refusals import (
     TIMEOUT,
     goal_occupied,
     goal_out_of_reach,
     nearest_reachable,
     no_path,
     refuse,
+    remove_regions,
     start_occupied,
     start_outside,
 )
-from planner.search.route import Floats, Route
 
 if TYPE_CHECKING:
-    from fog_contracts.grid import GridGeometry
+    from collections.abc import Sequence
+
+    from fog_contracts.grid import GridGeometry, Window
     from fog_contracts.messages import PointXY, Refusal
     from fog_kernels.astar import PlanResult
     from fog_kernels.guides import Detour, GoalField
     from planner.config import PlannerConfig
-    from planner.maps.planning_map import Cell, Grid, PlanningMap
+    from planner.planning_map import Cell, Grid, PlanningMap
+    from planner.regions import Region
+
+Floats = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Route:
+    """Corners (n, 2) joined by straight lines; the first `escape_lines` lines lead out of impassable cells."""
+
+    corners: Floats
+    spacing: float
+    escape_lines: int = 0
+
+    @cached_property
+    def points(self) -> Floats:
+        """The polyline (n, 2), sampled at most `spacing` apart; every corner is a sample."""
+        return sampled(self.corners, self.spacing)
+
+    @property
+    def corner_points(self) -> list[PointXY]:
+        """The corners as they are published; whoever samples them at the same spacing gets `points`, bit for bit."""
+        return [(x, y) for x, y in self.corners.tolist()]
+
+    @property
+    def length(self) -> float:
+        """Length in m."""
+        return float(self._corner_along[-1])
+
+    def nearest(self, x: float, y: float, after: float = 0.0, window: float = math.inf) -> tuple[float, float]:
+        """Return how far along (m) the point nearest to (x, y) is, and its distance.
+
+        Only `after - 0.5 .. after + window` along is searched, so that a route that passes a place twice is not cut
+        short.
+        """
+        lengths = self._corner_along
+        found = nearest_between(self.corners, lengths, after - 0.5, after + window, x, y)
+        if math.isinf(found[1]):
+            found = nearest_between(self.corners, lengths, -math.inf, math.inf, x, y)
+        if math.isinf(found[1]):  # all corners are one point
+            return 0.0, math.hypot(self.corners[0, 0] - x, self.corners[0, 1] - y)
+        return found
+
+    @cached_property
+    def _corner_along(self) -> Floats:
+        return lengths_along(self.corners)
+
+    def remaining(self, along: float) -> Floats:
+        """Return the polyline from `along` (m) to the end: a point there, then the corners that follow."""
+        lengths = self._corner_along
+        after = int(np.searchsorted(lengths, along, side="right"))
+        if after == 0 or after == len(lengths):
+            return self.corners[max(0, after - 1) :]
+        before, behind = self.corners[after - 1], self.corners[after]
+        share = (along - lengths[after - 1]) / (lengths[after] - lengths[after - 1])
+        return np.concatenate(((before + share * (behind - before))[None, :], self.corners[after:]))
+
+    def cost(self, costmap: Grid, geometry: GridGeometry, along: float = 0.0) -> float:
+        """Return the cost of the route from `along` on, as the kernels integrate it; infinite when it is impassable.
+
+        Escape lines are left out, because they lead through impassable cells on purpose.
+        """
+        lengths = self._corner_along
+        begin = max(along, float(lengths[self.escape_lines]))
+        grid = geometry.origin_x, geometry.origin_y, geometry.resolution
+        return cost_from(costmap, self.corners, lengths, begin, grid)
+
+    def distance_to(self, mask: NDArray[np.bool_], window: Window, geometry: GridGeometry, along: float) -> float:
+        """Return how far (m) beyond `along` the route first enters the cells of a mask over a window; else infinity."""
+        grid = geometry.origin_x, geometry.origin_y, geometry.resolution
+        begin = along - geometry.resolution
+        first = first_inside(self.corners, self._corner_along, self.spacing, begin, grid, (window.x, window.y), mask)
+        return max(0.0, first - along)
+
+    def differs_from(self, other: Route, along: float, reach: float) -> bool:
+        """Whether this route leaves the rest of another, from `along` (m) on, by more than `reach` (m) somewhere."""
+        return leaves(self.corners, other.remaining(along), reach, max(reach, self.spacing))
 
 
 @dataclass(frozen=True)
@@ -208,3 +289,37 @@ class PathSearch:
 
 def _is_passable(cost: Grid, a: Floats, b: Floats) -> bool:
     return not math.isinf(line_cost(cost, float(a[0]), float(a[1]), float(b[0]), float(b[1])))
+
+
+def find_egress(
+    planning_map: PlanningMap, regions: Sequence[Region], start: PointXY, config: PlannerConfig, planner: Planner
+) -> SearchResult:
+    """Return the cheapest path from a point (m, frame `map`) to a traversable cell, however far it is.
+
+    Inside the regions that close the robot's cell, and in their inflation, the static map's costs apply; elsewhere the
+    costmap's. `regions` are those that are on, `planner` searches on maps of this size.
+    """
+    geometry = planning_map.geometry
+    cell = geometry.cell(*start)
+    if not geometry.contains_cell(*cell):
+        return refused(start_outside(geometry, start))
+    around_robot = [region for region in regions if region.closes(*cell)]
+    others = [region for region in regions if region not in around_robot]
+    margin = math.ceil(config.inflation.inflation_radius / geometry.resolution) + 2
+    free = remove_regions(planning_map, around_robot, others, margin)
+    begin = _traversable(free, planning_map, cell, config)
+    cells = None if begin is None else planner.exit_path(free, planning_map.cost, begin)
+    if cells is None:
+        return refused(start_occupied(start, around_robot))
+    corners = geometry.centres(cells)
+    return SearchResult(Route(corners, config.point_spacing, escape_lines=len(corners) - 1), 0.0, None)
+
+
+def _traversable(free: Grid, planning_map: PlanningMap, cell: Cell, config: PlannerConfig) -> Cell | None:
+    """Return the robot's cell, or, if it is too near to a wall or obstacle, the nearest one where a robot may be."""
+    if free[cell[1], cell[0]] < INSCRIBED:
+        return cell
+    if planning_map.static[cell[1], cell[0]] != FREE:
+        return None
+    reach = math.floor(config.inflation.inscribed_radius / planning_map.geometry.resolution) + 1
+    return nearest_traversable(free, cell, reach)

@@ -13,7 +13,7 @@ from fog_contracts.codec import ContractError
 from fog_contracts.messages import MapSnapshot
 from fog_contracts.replica import MapError
 from fog_runtime import logs
-from planner.maps.planning_map import prepare_map
+from planner.planning_map import prepare_map
 
 if TYPE_CHECKING:
     from collections.abc import Callable

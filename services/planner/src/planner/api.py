@@ -1,10 +1,12 @@
-"""REST under /api/v1: robots with their missions, and plans on request. Robots need a viewer's or operator's token."""
+"""REST under /api/v1: robots with their missions, plans on request, and operators' commands to robots."""
 
 from collections.abc import Callable
 
 from fastapi import FastAPI
 
 from fog_contracts.messages import (
+    CommandKind,
+    CommandReply,
     Id,
     Message,
     Metres,
@@ -42,12 +44,95 @@ from fog_runtime.http import (
     must_be_new,
 )
 from fog_runtime.stores.idempotency import IdempotencyError
-from planner.keepers.mission_keeper import NO_MISSION, MissionConflictError, Order
 from planner.query_queue import BusyError
-from planner.rest.command_api import add_commands
-from planner.robot_commands import CommandError
+from planner.robot_commands import CommandError, RobotOperator
 from planner.service import Service
-from planner.store import StoredGoal, StoreError
+from planner.store import NO_MISSION, MissionConflictError, Order, StoredGoal, StoreError
+
+
+class StartPose(Message, frozen=True, kw_only=True):
+    """Where a robot stands: m and rad, frame `map`."""
+
+    x: Metres
+    y: Metres
+    theta: Radians
+
+
+class CommandBody(Message, frozen=True, kw_only=True):
+    """A command; `initial_pose` comes with a pose, or with the id of a place that has a heading."""
+
+    kind: CommandKind
+    pose: StartPose | None = None
+    place: Id | None = None
+
+
+class CommandOutcome(Message, frozen=True, kw_only=True):
+    """An accepted command: what the robot says of it, and the robot's mode before it."""
+
+    accepted: bool
+    reason: str
+    mode: Mode | None
+
+
+def add_commands(
+    routes: Routes,
+    operator: RobotOperator,
+    site: Site,
+    *,
+    check: Callable[[str], None],
+    mode: Callable[[str], Mode | None],
+) -> None:
+    """Add the routes; `check` raises a `ProblemError` for an unknown robot, `mode` returns a robot's mode."""
+    routes.raises(
+        CommandError,
+        {504: "The robot does not answer, or this service has no operators' key: `detail` names the remedy"},
+        lambda error: ProblemError(504, str(error)),
+    )
+
+    def outcome(robot: str, reply: CommandReply) -> CommandOutcome:
+        if not reply.accepted:
+            raise ProblemError(409, reply.reason, mode=mode(robot))
+        return CommandOutcome(accepted=True, reason=reply.reason, mode=mode(robot))
+
+    @routes.post(
+        "/api/v1/robots/{robot}/commands",
+        raises=[CommandError, StoreError],
+        problems={404: "No robot has this id", 409: "The robot refuses: `detail` has its reason, `mode` its mode"},
+    )
+    async def post_command(robot: str, body: Body[CommandBody], caller: Operator) -> CommandOutcome:
+        """Command a robot; the robot itself accepts or refuses."""
+        check(robot)
+        return outcome(robot, await operator.send(body.kind, robot, caller.name, _pose(body, site)))
+
+    routes.urgent("/api/v1/robots/{robot}/stop")
+
+    @routes.post(
+        "/api/v1/robots/{robot}/stop",
+        raises=[CommandError],
+        problems={404: "No robot has this id", 409: "The robot refuses: `detail` has its reason"},
+    )
+    async def stop(robot: str, client: ClientHost) -> CommandOutcome:
+        """Stop a robot at once. Anybody may: this needs no token. An operator must enable it again."""
+        check(robot)
+        return outcome(robot, await operator.stop(robot, f"stop from {client or 'an unknown address'}"))
+
+
+def _pose(body: CommandBody, site: Site) -> Pose | None:
+    """Return the pose of a command; raises a `ProblemError` for one that does not belong to it, or lacks."""
+    if body.kind != "initial_pose":
+        if body.pose is not None or body.place is not None:
+            raise ProblemError(422, f"{body.kind} takes neither pose nor place: leave them out", field="body.pose")
+        return None
+    if (body.pose is None) == (body.place is None):
+        raise ProblemError(422, "give either a pose or a place, and not both", field="body.pose")
+    if body.pose is not None:
+        return Pose(x=body.pose.x, y=body.pose.y, theta=body.pose.theta)
+    place = site.places.get(body.place or "")
+    if place is None or place.theta is None:
+        known = ", ".join(sorted(name for name, found in site.places.items() if found.theta is not None)) or "none"
+        detail = f"there is no place {body.place} with a heading; places that have one: {known}"
+        raise ProblemError(422, detail, field="body.place")
+    return Pose(x=place.x, y=place.y, theta=place.theta)
 
 
 class GoalPose(Message, frozen=True, kw_only=True):

@@ -1,1 +1,0 @@
-"""The map that paths are planned on. Pure."""

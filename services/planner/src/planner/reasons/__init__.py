@@ -1,1 +1,0 @@
-"""Why there is no path: the hazards and zones behind lethal cells, and the refusals that name them. Pure."""

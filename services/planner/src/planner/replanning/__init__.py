@@ -1,1 +1,0 @@
-"""Missions: when a robot needs another path, and whether a path that was found replaces the current one. Pure."""

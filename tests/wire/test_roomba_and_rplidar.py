@@ -8,13 +8,13 @@ import time
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 from fognav_sim.pty_port import PtyPort
 from robot_agent.bases.roomba600 import open_interface as oi
 from robot_agent.bases.roomba600.driver import Roomba600Driver, Roomba600Options
-from robot_agent.bases.roomba600.emulator import RoombaEmulator
+from robot_agent.bases.roomba600.emulator import SAFE, RoombaEmulator
 from robot_agent.lidars.rplidar_a1 import protocol as rplidar
 from robot_agent.lidars.rplidar_a1.emulator import RplidarEmulator
 from robot_agent.odometry import EncoderFault, Motion, Odometry
@@ -147,6 +147,32 @@ def test_reset_of_the_robot_is_detected_as_an_encoder_fault():
     driver.receive_data(roomba.outgoing(1.016), 1.016)
     (reading,) = events(driver)
     assert isinstance(odometry.update(reading.odometry, 1.016), EncoderFault)
+
+
+speed = st.integers(-500, 500)
+
+
+@given(st.lists(st.tuples(speed, speed), min_size=4, max_size=6), st.data())
+def test_a_lost_byte_confuses_a_roomba_for_two_wheel_commands_at_most(speeds, data):
+    driver, roomba = Roomba600Driver(Roomba600Options()), RoombaEmulator()
+    roomba.receive(oi.start() + oi.safe(), 0.0)
+    commands = [driver.drive(left / 1000, right / 1000) for left, right in speeds]
+    place = data.draw(st.integers(0, len(commands[0]) - 1), label="lost byte of the first command")
+    commands[0] = commands[0][:place] + commands[0][place + 1 :]
+    for command in commands:
+        roomba.receive(command, 0.0)
+    obeys = roomba.wheel_speeds_m_s == pytest.approx([speed / 1000 for speed in speeds[-1]], abs=0.0011)
+    assert obeys or roomba.mode != SAFE, "a mode that the stream reports"
+
+
+@given(st.binary(max_size=9))
+@example(bytes((0, 145)))
+@example(bytes((149, 255)))
+@example(bytes((140, 0, 255)))
+def test_a_rolling_roomba_obeys_zero_speeds_whatever_bytes_it_has_got(garbage):
+    driver, roomba = Roomba600Driver(Roomba600Options()), RoombaEmulator()
+    roomba.receive(oi.start() + oi.safe() + driver.drive(0.2, 0.2) + garbage + driver.drive(0.0, 0.0), 0.0)
+    assert roomba.wheel_speeds_m_s == (0.0, 0.0) or roomba.cleaning or roomba.seeking_dock, "a mode that is reported"
 
 
 # --- RPLidar ---

@@ -21,7 +21,7 @@ IGNORED_AFTER_WAKE_S = Roomba600Driver.timing.ignored_after_wake
 def commands(data: bytes) -> list[tuple[int, bytes]]:
     """The guardian's bytes, cut into the commands that it knows."""
     cut = []
-    while data:
+    while data := data.lstrip(b"\0"):  # no opcode: completes a command whose bytes were lost
         size = {128: 1, 129: 2, 131: 1, 145: 5}.get(data[0]) or 2 + data[1]
         assert data[0] in {128, 129, 131, 145, 148}
         cut.append((data[0], data[1:size]))

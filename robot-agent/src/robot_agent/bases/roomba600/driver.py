@@ -103,6 +103,8 @@ class Roomba600Driver:
         self._safe_sent_at = -math.inf
         self._modes = _DRIVING
         self._on_charger = False
+        self._rolls = False
+        """Whether the speeds that were asked for last were not zero."""
         self._received_at = 0.0
         other = 19200 if options.baud == 115200 else 115200
         line = None if options.brc == "none" else WakeLine(options.brc, BRC_PULSE_S)
@@ -199,8 +201,14 @@ class Roomba600Driver:
         self._status_packets = _status_packets(self._stream)
 
     def drive(self, left_m_s: float, right_m_s: float) -> bytes:
-        """Return Drive Direct; speeds beyond the top speed are scaled, which keeps the curve."""
-        return oi.drive_wheels(left_m_s, right_m_s)
+        """Return Drive Direct; speeds beyond the top speed are scaled, which keeps the curve.
+
+        The first zeros after other speeds come twice: between them is what completes any command into whose middle a
+        lost or wrong byte may have led the robot (ADR 62).
+        """
+        stops, self._rolls = self._rolls, left_m_s != 0.0 or right_m_s != 0.0
+        command = oi.RESYNC + oi.drive_wheels(left_m_s, right_m_s)
+        return command + oi.RESYNC_ANY + command if stops and not self._rolls else command
 
     def _status(self, frame: oi.Frame) -> BaseStatus:
         """Return the status; that of the last frame as long as no packet has changed that it is made of."""

@@ -236,6 +236,15 @@ def seek_dock() -> bytes:
     return b"\x8f"
 
 
+RESYNC: Final = bytes(4)
+"""Before a command: completes one of fixed length in whose middle the receiver is, for a byte of it was lost. No byte
+of it is an opcode, so a receiver between two commands ignores it."""
+RESYNC_ANY: Final = bytes(2 + 2 * 255)
+"""Completes any command: Song (140), Stream (148) and Query List (149) say themselves how long they are."""
+_SEVERING: Final = frozenset({129, 140, 148, 149})
+"""Baud, after which the robot hears nothing more, and those that may swallow the next 255 bytes or more."""
+
+
 def drive_direct(right_mm_s: int, left_mm_s: int) -> bytes:
     """Drive each wheel at its own speed (145), right wheel first as on the wire, mm/s.
 
@@ -252,6 +261,9 @@ def drive_direct(right_mm_s: int, left_mm_s: int) -> bytes:
 def drive_wheels(left_m_s: float, right_m_s: float) -> bytes:
     """Drive Direct from speeds in m/s; beyond 0.5 both wheels are scaled alike, which keeps the curvature.
 
+    A speed may differ by 1 mm/s, so that none holds one of the `_SEVERING` opcodes: should the byte before be lost, the
+    robot would obey it.
+
     Raises:
         ValueError: if a speed is not finite.
 
@@ -260,7 +272,15 @@ def drive_wheels(left_m_s: float, right_m_s: float) -> bytes:
         raise ValueError(f"wheel speeds must be finite: left {left_m_s}, right {right_m_s} m/s")
     fastest = max(abs(left_m_s), abs(right_m_s)) * 1000.0
     scale = 1000.0 * min(1.0, WHEEL_SPEED_MAX_MM_S / fastest) if fastest else 0.0
-    return drive_direct(round(right_m_s * scale), round(left_m_s * scale))
+    return drive_direct(_harmless(right_m_s * scale), _harmless(left_m_s * scale))
+
+
+def _harmless(speed_mm_s: float) -> int:
+    """Round to a speed whose bytes do not sever the connection if the robot takes them for an opcode."""
+    speed = round(speed_mm_s)
+    while speed & 0xFF in _SEVERING:
+        speed += 1 if speed < 0 else -1
+    return speed
 
 
 def sensors(packet_id: int) -> bytes:

@@ -415,7 +415,9 @@ class Oracle:
         for word, limit in _STOP_S.items():
             seconds = self._now - self._lost.get(word, self._now)
             late = seconds > limit + (self._world.late_s if word == "fog" else 0.0)
-            moves = self._moves and not (word == "floor" and self._is_told)
+            # An operator who tells it to turn or to drive out needs no map.
+            told = self._is_told if word == "floor" else word in _MAP and (self._is_told or self._mode == "EGRESS")
+            moves = self._moves and not told
             values = f"wheels turn {seconds:.1f} s after it lost the {word}"
             self._lasts("stop", word, late and moves, values, self._world.wrong_s)
         seconds = self._now - self._bumped

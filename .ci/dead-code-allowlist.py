@@ -55,6 +55,7 @@ _.get_disambiguator
 KernelLocator
 type_cells  # numba: a name that compiled signatures close over
 _.FACTORY  # bases, lidars, debounce rules and cost layers are found by their entry points
+_.DEFAULT  # same: profiles
 _.add_to  # same: commands
 _.list_commands  # typer asks for them
 _.get_command

@@ -8,6 +8,7 @@ import os
 import subprocess
 import sys
 from dataclasses import replace
+from functools import partial
 
 import msgspec
 import numpy as np
@@ -19,10 +20,12 @@ from fog_contracts.commands import sign
 from fog_contracts.messages import AreaHazard, HazardArea, PolygonShape, RobotCommand, Zone, ZoneSet
 from fog_contracts.replica import MapError
 from fog_runtime.record import Recorder, read_entries
+from robot_agent.agent.core import AgentCore
 from robot_agent.agent.recording import input_log as log
 from robot_agent.agent.recording.replay import ReplayError, main, replay
 from robot_agent.localization.absolute import AbsoluteObservation
 from robot_agent.localization.pose import Pose2
+from robot_agent.registry import profile
 
 
 def write(path, entries):
@@ -100,7 +103,7 @@ def drive(tmp_path_factory):
     """A logged drive: where its log is, and the world at its end."""
     path = tmp_path_factory.mktemp("log") / "drive.mcap"
     entries = []
-    world = LittleWorld(seed=4, start_agent=lambda config, seed: log.LoggedAgent(config, seed, entries.append))
+    world = LittleWorld(seed=4, start_agent=lambda config, seed: log.LoggedAgent(config, seed, entries.append, profile))
     drive_through_most_situations(world)
     plan_on_the_robot(world)
     write(path, entries)
@@ -139,7 +142,7 @@ def test_replays_in_other_processes_with_other_hash_seeds_give_the_same_outputs(
 
 
 def test_logging_changes_no_decision(drive):
-    plain = LittleWorld(seed=4)
+    plain = LittleWorld(seed=4, start_agent=partial(AgentCore, find_profile=profile))
     drive_through_most_situations(plain)
     plan_on_the_robot(plain)
     assert plain.commands == drive[1].commands

@@ -27,6 +27,7 @@ from planner.service import Service as PlannerService
 from robot_agent.agent.core import AgentCore
 from robot_agent.agent.edges.map_loader import MapLoader
 from robot_agent.agent.service import Service as AgentService
+from robot_agent.registry import profile
 
 if TYPE_CHECKING:
     from collections.abc import Awaitable, Callable, Coroutine, Iterable, Sequence
@@ -294,7 +295,7 @@ class LiveServices:
         self.planner = PlannerService(
             self.planner_core, MemoryStore(), edges["planner"], clock, Health(), staging=loaded.site.staging
         )
-        self.agent_core = AgentCore(config, seed)
+        self.agent_core = AgentCore(config, seed, find_profile=profile)
         store = MemoryStore()
         self.agent = AgentService(self.agent_core, edges["robot-agent"], store, clock, Health())
         self.agent_map = MapLoader(

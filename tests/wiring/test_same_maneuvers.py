@@ -21,6 +21,7 @@ from fog_runtime.configuration.site import LoadedSite
 from fognav_experiments.rigs import OPERATOR_KEY, System, moment
 from planner.store import Order
 from robot_agent.agent.recording import input_log as log
+from robot_agent.registry import profile
 
 
 def module(path: Path) -> Any:
@@ -63,7 +64,7 @@ def drive_in_lockstep() -> Any:
     bus = same.RecordingBus(site.site.id)
 
     def logged(config: Any, seed: int) -> Any:  # as the system's own maker of agents
-        return log.LoggedAgent(config, seed, entries.append)
+        return log.LoggedAgent(config, seed, entries.append, profile)
 
     system = System(site, site.site.robots[0], SEED, bus=bus, make_agent=logged)
     run = same.Run(bus, replace(entries[0].config, operator_key=OPERATOR_KEY))

@@ -35,7 +35,6 @@ from fognav_sim.drive.drive import Drive, DriveSummary
 from fognav_sim.drive.evaluation import DriveOutcome
 from fognav_sim.drive.hazard import HazardRequest, HazardSchedule
 from fognav_sim.drive.operator import OperatorPolicy
-from robot_agent.profiles import PROFILES
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -406,7 +405,9 @@ def main() -> None:
     parser.add_argument("--start", help="place to start from (default: the demo's)")
     parser.add_argument("--goal", help="place to drive to (default: the demo's)")
     parser.add_argument("--area", help="area that becomes blocked (default: one of the demo's on the path)")
-    parser.add_argument("--profile", choices=sorted(PROFILES), default="fog", help="who plans (default: fog)")
+    parser.add_argument(
+        "--profile", choices=sorted(PROFILE_OF.values()), default="fog", help="who plans (default: fog)"
+    )
     parser.add_argument("--no-hazard", action="store_true")
     parser.add_argument("--track", action="store_true", help="include the true track in the result")
     arguments = parser.parse_args()

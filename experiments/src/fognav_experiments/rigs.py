@@ -49,7 +49,7 @@ from robot_agent.config import agent_config
 from robot_agent.guardian import link
 from robot_agent.guardian.core import GuardianCore
 from robot_agent.hardware import DockingDriver
-from robot_agent.registry import make_base, make_lidar
+from robot_agent.registry import make_base, make_lidar, profile
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Mapping
@@ -63,6 +63,8 @@ if TYPE_CHECKING:
     from fognav_sim.sensors import Noise
     from robot_agent.config import AgentConfig
 
+AGENT: Final = partial(AgentCore, find_profile=profile)
+"""What drives a robot: it may be switched to all profiles that are installed."""
 STAMP: Final = 1_700_000_000.0
 """The emulated wall clock at time zero: results must not depend on the date of a run."""
 OPERATOR_KEY: Final = b"lockstep operator key, no secret"
@@ -130,7 +132,7 @@ class RobotRig:
         start: float,
         *,
         mounted: RobotFile | None = None,
-        make_agent: Callable[[AgentConfig, int], AgentCore] = AgentCore,
+        make_agent: Callable[[AgentConfig, int], AgentCore] = AGENT,
         measure: Measure = unmeasured,
     ) -> None:
         """Assemble the robot around its emulated base, `mounted` as its settings say (default: the thesis's robot)."""
@@ -423,7 +425,7 @@ class System:
         noise: Noise | None = None,
         mounted: RobotFile | None = None,
         bus: Bus | None = None,
-        make_agent: Callable[[AgentConfig, int], AgentCore] = AgentCore,
+        make_agent: Callable[[AgentConfig, int], AgentCore] = AGENT,
         measure: Measure = unmeasured,
         tuning: Tuning | None = None,
         floor: Floor | None = None,

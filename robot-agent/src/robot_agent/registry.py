@@ -1,4 +1,4 @@
-"""The robot's base and lidar by the names of their drivers in its settings, with the drivers' own options."""
+"""Parts of a robot by name: base and lidar as its settings name them, with their own options, and profiles."""
 
 from __future__ import annotations
 
@@ -8,10 +8,12 @@ from fog_runtime.configuration import parts
 from fog_runtime.configuration.settings import SettingsError
 from robot_agent.device_signature import Signature
 from robot_agent.hardware import BaseFactory, LidarFactory
+from robot_agent.profiles import ENTRY_POINTS, FOG, Profile, ProfileError
 
 if TYPE_CHECKING:
     import msgspec
 
+    from fog_contracts.messages import ProfileName
     from fog_runtime.configuration.robot_file import RobotFile
     from robot_agent.hardware import BaseDriver, LidarDriver
 
@@ -71,3 +73,20 @@ def make_lidar(robot: RobotFile) -> LidarDriver:
         yaw_rad=given.yaw_rad, mirrored=given.mirrored, latency_s=given.latency_s, masks=tuple(given.masks)
     )
     return driver if mounting.plain else MountedLidar(driver, mounting)
+
+
+def profile(name: ProfileName) -> Profile:
+    """Return a profile by its name; raises `ProfileError` if its package is not installed here."""
+    if name == FOG.name:
+        return FOG
+    installed = parts.names(ENTRY_POINTS)
+    if name not in installed:
+        others = " or ".join([FOG.name, *installed])
+        raise ProfileError(
+            f"the profile {name} is not installed on this robot: "
+            f"install fognav-experiments there and restart its agent, or use {others}"
+        )
+    try:
+        return parts.load(ENTRY_POINTS, name, Profile)
+    except parts.PartError as error:
+        raise ProfileError(str(error)) from error

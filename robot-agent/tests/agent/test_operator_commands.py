@@ -1,15 +1,19 @@
 from __future__ import annotations
 
+from functools import partial
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from little_world import AGENT, KEY
+from little_world import AGENT, KEY, LittleWorld
 
 from fog_contracts.commands import sign
 from fog_contracts.grid import GridGeometry
 from fog_contracts.handlers import Moment
 from fog_contracts.messages import Pose, RobotCommand
+from fog_runtime.configuration import parts
+from robot_agent import registry
+from robot_agent.agent.core import AgentCore
 from robot_agent.agent.operator_commands import OperatorCommands, initial_pose_refusal
 
 AT = Moment(10.0, 1_000.0)
@@ -91,3 +95,15 @@ def test_impossible_initial_pose_is_refused_with_the_reason(pose, geometry, at_r
     replica = SimpleNamespace(geometry=GridGeometry(10, 10, 0.1, 0.0, 0.0) if geometry else None, static=static)
     refusal = initial_pose_refusal(pose, replica, at_rest=at_rest)
     assert refusal is None if word is None else word in refusal
+
+
+def test_a_profile_that_is_not_installed_is_refused_with_the_remedy(monkeypatch):
+    monkeypatch.setattr(parts, "names", lambda _group: [])
+    world = LittleWorld(start_agent=partial(AgentCore, find_profile=registry.profile)).ready()
+    assert world.command("disable").accepted
+    world.run(0.6)
+    reply = world.command("profile_full")
+    assert not reply.accepted
+    assert "install fognav-experiments there and restart its agent, or use fog" in reply.reason
+    assert world.state().profile == "fog"
+    assert world.command("profile_fog").accepted

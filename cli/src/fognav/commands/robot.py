@@ -165,7 +165,8 @@ def robot_profile(
     """Let a robot navigate by another profile; it must be at rest.
 
     fog: by the fog's map and paths, as usual. default: on its own, as without Fognav, knowing no hazard, area or zone.
-    full: on its own, but with the fog's hazards. An agent that restarts is in the profile fog again.
+    full: on its own, but with the fog's hazards. Both need fognav-experiments on the robot.
+    An agent that restarts is in the profile fog again.
     """
     kind = next(kind for kind, name in PROFILE_OF.items() if name == profile)
     _run_command(kind, robot, fog, json=json)

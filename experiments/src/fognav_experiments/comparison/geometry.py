@@ -18,9 +18,9 @@ from fog_kernels.astar import Planner
 from fog_kernels.inflation import inflate, inflation_table
 from fog_kernels.raycast import cast
 from fog_kernels.spans import raise_costs
+from fognav_experiments.onboard.navigator import Search
 from fognav_sim.barrier import barrier_across
 from fognav_sim.drive.hazard import PlannedHazard, is_clear_of_robot, remaining
-from robot_agent.onboard.search import Search
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray

@@ -47,6 +47,7 @@ from robot_agent.agent.sensing.sensors import BaseSource, LidarSource
 from robot_agent.localization.localizer import Localizer, SavedPose
 from robot_agent.motion.local_planner import Decision, Job, decide
 from robot_agent.odometry import EncoderFault, Odometry, possible_motion
+from robot_agent.profiles import fog_only
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
@@ -70,8 +71,7 @@ if TYPE_CHECKING:
     from robot_agent.guardian.link import BaseFeedback, WheelCommand
     from robot_agent.hardware import LaserScan, LidarSamples
     from robot_agent.localization.absolute import AbsoluteObservation
-    from robot_agent.onboard.search import Found, Search
-    from robot_agent.profiles import Profile
+    from robot_agent.profiles import FindProfile, Found, Profile, Search
     from robot_agent.safety.conditions import Request
     from robot_agent.safety.gate import SafetyOutputs
 
@@ -87,7 +87,7 @@ __all__ = ["AgentCore", "Decision", "Job", "SavedPose", "decide"]
 class AgentCore:
     """One robot. All methods belong on one thread; `decide` and `prepare_map` may run on others."""
 
-    def __init__(self, config: AgentConfig, seed: int = 0) -> None:
+    def __init__(self, config: AgentConfig, seed: int = 0, find_profile: FindProfile = fog_only) -> None:
         self._config = config
         self._base = BaseSource()
         self._odometry = Odometry(config.drive_train)
@@ -98,7 +98,7 @@ class AgentCore:
         self._map = MapFollower()
         self._places = BlockedPlaces()
         self._driving = PathDriving(config)
-        self._navigation = Navigation(config, self._map, self._places, self._driving, self._localizer)
+        self._navigation = Navigation(config, self._map, self._places, self._driving, self._localizer, find_profile)
         self._fog = FogInputs(self._navigation, self._places, self._driving, self._localizer)
         self._guard = MotionGuard(config, self._localizer)
         self._maneuvers = Maneuvers(config, self._localizer, self._guard)

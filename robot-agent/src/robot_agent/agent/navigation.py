@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Final
 import numpy as np
 
 from robot_agent.localization.pose import Pose2
-from robot_agent.profiles import FOG, PROFILES
+from robot_agent.profiles import FOG, ProfileError
 
 if TYPE_CHECKING:
     from fog_contracts.follower import MapFollower
@@ -25,9 +25,7 @@ if TYPE_CHECKING:
     from robot_agent.agent.sensing.obstacle_reporter import ObstacleReporter
     from robot_agent.config import AgentConfig
     from robot_agent.localization.localizer import Localizer
-    from robot_agent.onboard.navigator import OnboardNavigator
-    from robot_agent.onboard.search import Found, Search
-    from robot_agent.profiles import Profile
+    from robot_agent.profiles import FindProfile, Found, OwnPlanner, Profile, Search
 
 _STEP_M: Final = 0.05
 """Distance between the places on the way ahead that are looked up in the map."""
@@ -49,13 +47,15 @@ class Navigation:
         places: BlockedPlaces,
         driving: PathDriving,
         localizer: Localizer,
+        find_profile: FindProfile,
     ) -> None:
         self._config = config
+        self._find_profile = find_profile
         self._fog = map_follower
         self._places = places
         self._driving = driving
         self._localizer = localizer
-        self._onboard: OnboardNavigator | None = None
+        self._onboard: OwnPlanner | None = None
         self._own_plans = 0
         """Number of the robot's own last plan: no other path gets it, of whatever profile."""
         self._fog_heard_at = 0.0
@@ -206,7 +206,10 @@ class Navigation:
         """Navigate by another profile; return why not, None when it is done. The present path is dropped."""
         if not at_rest:
             return "the robot is driving: disable it first"
-        self.profile = PROFILES[name]
+        try:
+            self.profile = self._find_profile(name)
+        except ProfileError as error:
+            return str(error)
         self._driving.configure(self.profile.motion(self._config.motion))
         self._begin_onboard()
         return None
@@ -216,10 +219,6 @@ class Navigation:
         if self._onboard is not None:
             self._own_plans = self._onboard.plans
         self._onboard = None
-        if not self.profile.onboard or self._fog.version is None:
-            return
-        # Only now: a robot that drives by the fog's map has no planner of its own in its memory.
-        from robot_agent.onboard.navigator import OnboardNavigator  # noqa: PLC0415  # see above
-
-        radius = self._config.footprint.inscribed_radius
-        self._onboard = OnboardNavigator(self.profile, self._fog.replica, radius, self._own_plans)
+        if self.profile.planner is not None and self._fog.version is not None:
+            radius = self._config.footprint.inscribed_radius
+            self._onboard = self.profile.planner(self._fog.replica, radius, self._own_plans)

@@ -31,6 +31,7 @@ from robot_agent.localization.absolute import AbsoluteObservation
 from robot_agent.localization.localizer import SavedPose
 from robot_agent.localization.pose import Pose2
 from robot_agent.motion.local_planner import Decision
+from robot_agent.profiles import fog_only
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping, Sequence
@@ -39,7 +40,7 @@ if TYPE_CHECKING:
     from fog_contracts.handlers import Handler, Ids, Moment, Publication, QueryHandler
     from fog_contracts.messages import Message
     from robot_agent.motion.local_planner import Job
-    from robot_agent.onboard.search import Found, Search
+    from robot_agent.profiles import FindProfile, Found, Search
 
 LOG_KEY: Final = b"known to all: signs commands in logs only"
 """Replaces the operators' key in a log."""
@@ -307,11 +308,13 @@ TOPIC_OF_ENTRY: Final[Mapping[type[Entry], str]] = {kind: topic for topic, kind 
 class LoggedAgent(AgentCore):
     """An `AgentCore` that passes all of its inputs and outputs to `write`, which must not block."""
 
-    def __init__(self, config: AgentConfig, seed: int, write: Callable[[Entry], object]) -> None:
+    def __init__(
+        self, config: AgentConfig, seed: int, write: Callable[[Entry], object], find_profile: FindProfile = fog_only
+    ) -> None:
         self._write = write
         self._key = config.operator_key
         write(Started(config=replace(config, operator_key=LOG_KEY), seed=seed))
-        super().__init__(config, seed)
+        super().__init__(config, seed, find_profile)
 
     def handlers(self) -> Mapping[Channel, Handler]:
         """Return the core's handlers, each of which logs its message and publications."""

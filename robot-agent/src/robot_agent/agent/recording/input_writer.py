@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Final, Self
 from prometheus_client import Counter
 
 from fog_runtime import logs
+from robot_agent import registry
 from robot_agent.agent.core import AgentCore
 from robot_agent.agent.recording.input_log import TOPIC_OF_ENTRY, EntriesLost, LoggedAgent
 
@@ -123,7 +124,7 @@ def open_core(config: AgentConfig, seed: int, input_log: Path | None) -> Iterato
         except OSError as error:
             _log.error("input_log_not_opened", path=str(input_log), reason=error.strerror or str(error))
     if writer is None:
-        yield AgentCore(config, seed)
+        yield AgentCore(config, seed, registry.profile)
         return
     with writer:
-        yield LoggedAgent(config, seed, writer.write)
+        yield LoggedAgent(config, seed, writer.write, registry.profile)

@@ -19,6 +19,7 @@ from fog_contracts.channels import CHANNELS
 from fog_contracts.handlers import Moment
 from fog_contracts.replica import MapError
 from fog_runtime.record import RecordError, read_entries
+from robot_agent import registry
 from robot_agent.agent.core import decide
 from robot_agent.agent.recording import input_log as log
 
@@ -26,7 +27,7 @@ if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
 
     from robot_agent.motion.local_planner import Job
-    from robot_agent.onboard.search import Found
+    from robot_agent.profiles import Found
 
 _LISTED_MAX: Final = 20
 """Differences that are listed; further ones are only counted."""
@@ -109,7 +110,7 @@ class _Run:
         self._produced: list[bytes] = []
         self._job: Job | None = None
         self._found: Found | None = None
-        self._agent = log.LoggedAgent(started.config, started.seed, self._on_entry)
+        self._agent = log.LoggedAgent(started.config, started.seed, self._on_entry, registry.profile)
 
     def _on_entry(self, entry: log.Entry) -> None:
         if not isinstance(entry, log.Output):

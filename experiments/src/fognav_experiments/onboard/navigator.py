@@ -1,32 +1,40 @@
-"""When the robot's own costmap is updated, and when a path is searched on it."""
+"""When the robot's own costmap is updated, when a path is searched on it, and the search itself."""
 
 from __future__ import annotations
 
 import math
+from dataclasses import dataclass, replace
+from functools import partial
 from typing import TYPE_CHECKING, Final
 
-from fog_contracts.messages import RobotPath
-from fog_kernels.astar import Planner
+import numpy as np
+
+from fog_contracts.costs import INSCRIBED
+from fog_contracts.messages import Refusal, RobotPath
+from fog_kernels.astar import Planner, nearest_traversable
+from fog_kernels.lines import line_cost
+from fognav_experiments.onboard.costmap import OnboardCostmap
 from robot_agent.motion.path_follower import first_blocked
-from robot_agent.onboard.costmap import OnboardCostmap
-from robot_agent.onboard.search import Search
+from robot_agent.profiles import FOG, Found, Profile
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
 
-    import numpy as np
     from numpy.typing import NDArray
 
+    from fog_contracts.grid import GridGeometry
     from fog_contracts.handlers import Moment
-    from fog_contracts.messages import Refusal, RobotGoal
+    from fog_contracts.messages import PlanCode, PointXY, RobotGoal
     from fog_contracts.raster import Spans
     from fog_contracts.replica import Replica
     from robot_agent.localization.localizer import Localizer
     from robot_agent.localization.pose import Pose2
     from robot_agent.motion.path_follower import PathFollower
-    from robot_agent.onboard.search import Found
-    from robot_agent.profiles import Profile
 
+    Grid = NDArray[np.uint8]
+
+_LAYERS_PERIOD_S: Final = 0.5
+"""How often the layers of the costmap are updated."""
 _EXPLAINED_M: Final = 0.25
 """A lidar point this near to a wall of the floor plan is explained by it."""
 _TURN_RATE: Final = 0.5
@@ -38,6 +46,8 @@ _REFUSED_RETRY_S: Final = 1.0
 _GOAL_OCCUPIED: Final = 206
 _BY_OBSTACLES: Final = frozenset({205, _GOAL_OCCUPIED, 208})
 """Refusals that obstacles may be the cause of: around the robot, at the goal, and on all ways to it."""
+_ESCAPE_M: Final = 0.5
+"""How far from the robot its path may begin, when it stands where its centre should not be."""
 _EARLY_S: Final = 1e-6
 """Rounding of a clock must not put off what is due."""
 
@@ -45,11 +55,14 @@ _EARLY_S: Final = 1e-6
 class OnboardNavigator:
     """Keeps the robot's own costmap up to date and says when to search. Times are s of the robot's monotonic clock.
 
-    `plans`: number of the plan that the robot made last, by this navigator or one before.
+    `plans`: number of the plan that the robot made last, by this navigator or one before. `planning_period`: a path is
+    searched from scratch this often; None: only for a new goal, and when the path is blocked.
     """
 
-    def __init__(self, profile: Profile, floor: Replica, inscribed_radius: float, plans: int = 0) -> None:
-        self._profile = profile
+    def __init__(
+        self, floor: Replica, inscribed_radius: float, plans: int = 0, *, planning_period: float | None = None
+    ) -> None:
+        self._planning_period = planning_period
         self._costmap = OnboardCostmap(floor, inscribed_radius)
         geometry = self._costmap.geometry
         self._planner = Planner(geometry.width, geometry.height)
@@ -78,7 +91,7 @@ class OnboardNavigator:
         closed: the places that the fog closes. impassable: (n, 2) m, frame `map`: a place that the robot could not
         pass. No planner of the fog is told of it here, and the costmap may show it as open.
         """
-        if now - self._updated_at < self._profile.layers_period - _EARLY_S:
+        if now - self._updated_at < _LAYERS_PERIOD_S - _EARLY_S:
             return False
         self._updated_at = now
         self._costmap.close(closed)
@@ -105,7 +118,7 @@ class OnboardNavigator:
 
     def searched(self, found: Found) -> bool:
         """Return whether it was found on this costmap, not on that of a profile before."""
-        return found.planner is self._planner
+        return found.by is self._planner
 
     def path(self, found: Found, follower: PathFollower | None, at: Moment) -> RobotPath | None:
         """Return the path to follow from now on, or the refusal; None if the present path is kept.
@@ -137,9 +150,8 @@ class OnboardNavigator:
         )
 
     def _is_due(self, goal: RobotGoal, follower: PathFollower | None, now: float) -> bool:
-        period = self._profile.planning_period
-        if period is not None:
-            return now - self._searched_at >= period - _EARLY_S
+        if self._planning_period is not None:
+            return now - self._searched_at >= self._planning_period - _EARLY_S
         if self._refused:
             return now - self._searched_at >= _REFUSED_RETRY_S
         return self._doubted or self._is_other(goal) or follower is None or self._is_blocked(follower)
@@ -163,3 +175,62 @@ class OnboardNavigator:
     def _is_blocked(self, follower: PathFollower) -> bool:
         ahead = first_blocked(self.replica.cost, self._costmap.geometry, follower, known_to_planner=True)
         return ahead is not None
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Search:
+    """A search that is due: A* from scratch, with the kernel of the fog's planner.
+
+    `run` may be called on any thread, while nobody writes the costmap.
+    """
+
+    planner: Planner
+    cost: Grid
+    geometry: GridGeometry
+    start: PointXY
+    goal: RobotGoal
+
+    def run(self) -> Found:
+        """Return the cheapest path, or a refusal."""
+        assert self.goal.pose is not None
+        geometry, goal = self.geometry, (self.goal.pose.x, self.goal.pose.y)
+        first, last = geometry.cell(*self.start), geometry.cell(*goal)
+        if not geometry.contains_cell(*first):
+            return self._refused(203, "the robot is off its map")
+        if not geometry.contains_cell(*last):
+            return self._refused(204, "the goal is off the map")
+        free = nearest_traversable(self.cost, first, math.floor(_ESCAPE_M / geometry.resolution))
+        if free is None:
+            return self._refused(205, f"nothing is free within {_ESCAPE_M} m of the robot")
+        if self.cost[last[1], last[0]] >= INSCRIBED:
+            return self._refused(206, "the goal is occupied")
+        found = self.planner.plan(self.cost, free, last)
+        if not found.found:
+            return self._refused(208, "no path leads to the goal on the robot's own map")
+        return Found(by=self.planner, goal=self.goal, points=self._points(found.cells, goal))
+
+    def _points(self, cells: NDArray[np.int32], goal: PointXY) -> list[PointXY]:
+        """Return the corners of a path by cells, from the robot to the goal exactly where the lines are free."""
+        corners = self.planner.shortcut(self.cost, cells) if len(cells) > 1 else np.repeat(cells, 2, axis=0)
+        ends = self.geometry.grid_coordinates(np.array((self.start, goal)))
+        points = self.geometry.centres(corners)
+        for end, inner, exact in ((0, 1, self.start), (-1, -2, goal)):
+            x, y = ends[end]
+            next_x, next_y = corners[inner]
+            if not math.isinf(line_cost(self.cost, float(x), float(y), float(next_x), float(next_y))):
+                points[end] = exact
+        return [(float(x), float(y)) for x, y in points]
+
+    def _refused(self, code: PlanCode, reason: str) -> Found:
+        return Found(by=self.planner, goal=self.goal, points=[], refusal=Refusal(code=code, reason=reason))
+
+
+FULL: Final = replace(FOG, name="full", planner=OnboardNavigator)
+DEFAULT: Final = Profile(
+    name="default",
+    planner=partial(OnboardNavigator, planning_period=0.1),
+    hazards=False,
+    control_period=0.1,
+    window=3.0,
+    horizon=1.7,
+)

@@ -15,8 +15,8 @@ from fog_contracts.raster import polygon_spans
 from fog_contracts.replica import MasterMap, Replica
 from fog_kernels.inflation import inflate, inflation_table
 from fog_kernels.raycast import cast
+from fognav_experiments.onboard.costmap import OnboardCostmap
 from robot_agent.localization.pose import Pose2
-from robot_agent.onboard.costmap import OnboardCostmap
 
 GEOMETRY = GridGeometry(120, 100, 0.05, 0.0, 0.0)
 TABLE = inflation_table(0.05, DEFAULT_INFLATION)

@@ -8,10 +8,9 @@ from fog_contracts.grid import GridGeometry
 from fog_contracts.handlers import Moment
 from fog_contracts.messages import Pose, RobotGoal
 from fog_contracts.replica import MasterMap, Replica
+from fognav_experiments.onboard.navigator import OnboardNavigator
 from robot_agent.localization.pose import Pose2
 from robot_agent.motion.path_follower import PathFollower
-from robot_agent.onboard.navigator import OnboardNavigator
-from robot_agent.profiles import FULL
 
 GEOMETRY = GridGeometry(160, 60, 0.05, 0.0, 0.0)
 START = Pose2(1.0, 1.5, 0.0)
@@ -22,7 +21,7 @@ def navigator():
     """Return a navigator on an empty floor of 8 x 3 m."""
     static, floor = np.zeros(GEOMETRY.shape, np.uint8), Replica()
     floor.load(MasterMap("hall", GEOMETRY, static, static, epoch=3).snapshot())
-    return OnboardNavigator(FULL, floor, 0.17)
+    return OnboardNavigator(floor, 0.17)
 
 
 def followed(path):

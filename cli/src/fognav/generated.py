@@ -31,7 +31,7 @@ WRITE: Final = "./fognav channels --write"
 def rest_routes() -> dict[str, OpenApi]:
     """Return each service's OpenAPI description by the service's name."""
     # The services import kernels and web frameworks, which takes time: only this function needs them.
-    from hazard_aggregator.rest.api import make_api as make_aggregator  # noqa: PLC0415  # see above
+    from hazard_aggregator.api import make_api as make_aggregator  # noqa: PLC0415  # see above
     from map_service.api import make_api as make_map  # noqa: PLC0415  # same
     from planner.api import make_api as make_planner  # noqa: PLC0415  # same
 

@@ -6,6 +6,7 @@ import httpx
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from prometheus_client import REGISTRY
 
 from fog_contracts import channels as ch
 from fog_contracts.codec import encode
@@ -18,8 +19,8 @@ from fog_contracts.messages import (
     AreaHazard,
     HazardOverride,
 )
-from hazard_aggregator.areas.alerts import LISTED, AlertError, Alerts
-from hazard_aggregator.areas.node_report import NodeReport
+from hazard_aggregator.alert_keeper import NodeMetrics
+from hazard_aggregator.alerts import LISTED, AlertError, Alerts, NodeReport
 
 SQUARE = [(0.0, 0.0), (2.0, 0.0), (2.0, 1.0), (0.0, 1.0)]
 POLICY = AlertPolicy(unknown_after_s=10.0, blocked_after_s=20.0, node_after_s=5.0)
@@ -188,3 +189,48 @@ async def test_alert_is_published_acknowledged_kept_over_a_kill_and_in_the_audit
             actions = [entry[b"action"] for _, entry in await redis.xrange("fog:test:audit:alert")]
             await asyncio.sleep(0.05)
     assert actions == [b"raise", b"acknowledge", b"end"]
+
+
+def node_report(node, state="clear", age=0.1, *, flapping=False) -> NodeReport:
+    return NodeReport(node, "hall", state, "", online=True, age=age, received=9, ignored=0, flapping=flapping)
+
+
+def metric(name: str, node: str) -> float | None:
+    return REGISTRY.get_sample_value(f"fognav_node_{name}", {"area": "hall", "node": node})
+
+
+@pytest.fixture
+def metrics():
+    shown = NodeMetrics()
+    yield shown
+    shown.show(())
+
+
+def test_node_is_unknown_silent_or_flapping(metrics):
+    metrics.show([node_report("n1"), node_report("n2", "unknown", 40.0), node_report("n3", "unknown", flapping=True)])
+    found = [[metric(name, node) for name in ("unknown", "silence_seconds", "flapping")] for node in ("n1", "n2", "n3")]
+    assert found == [[0, 0.1, 0], [1, 40.0, 0], [1, 0.1, 1]]
+
+
+def test_node_without_a_reading_has_no_silence(metrics):
+    metrics.show([node_report("n1", "unknown", None)])
+    assert (metric("unknown", "n1"), metric("silence_seconds", "n1")) == (1, None)
+    metrics.show(())
+    assert metric("unknown", "n1") is None
+
+
+def test_node_without_a_reading_since_its_definition_changed_has_no_silence_any_more(metrics):
+    metrics.show([node_report("n1", age=0.1), node_report("n2", age=0.2)])
+    for _ in range(2):
+        metrics.show([node_report("n1", "unknown", None), node_report("n2", age=0.3)])
+        assert [metric("silence_seconds", node) for node in ("n1", "n2")] == [None, 0.3]
+        assert metric("unknown", "n1") == 1
+    metrics.show([node_report("n1", age=0.4)])
+    assert metric("silence_seconds", "n1") == 0.4
+
+
+def test_metrics_of_a_node_that_is_gone_are_removed(metrics):
+    metrics.show([node_report("n1"), node_report("n2")])
+    metrics.show([node_report("n2")])
+    assert [metric(name, "n1") for name in ("unknown", "silence_seconds", "flapping")] == [None, None, None]
+    assert metric("unknown", "n2") == 0

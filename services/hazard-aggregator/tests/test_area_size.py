@@ -10,7 +10,7 @@ from fog_contracts.messages import AREAS_MAX, AggregatorHeartbeat, AreaDefinitio
 from fog_contracts.messages.basics import Count, Hash, Stamp
 from fog_runtime.health import Health
 from hazard_aggregator.area_size import AreaError, check_size, excess
-from hazard_aggregator.writers.unusable_areas import UnusableAreas
+from hazard_aggregator.records import UnusableAreas
 
 POLYGON = [(0.0, 0.0), (1.0, 0.0), (1.0, 1.0)]
 

@@ -1,11 +1,13 @@
 """When the aggregator publishes: dangers at once, reliefs once stored, everything again for a new broker."""
 
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 from msgspec import structs
 
 from fog_contracts import channels as ch
 from fog_contracts.handlers import Moment, Publication, RefusedMessageError
-from fog_contracts.hazards import digest
+from fog_contracts.hazards import digest, is_relief
 from fog_contracts.messages import (
     AggregatorHeartbeat,
     AreaDefinition,
@@ -16,7 +18,7 @@ from fog_contracts.messages import (
     RobotPose,
 )
 from fog_contracts.site import NodeSite, Sonar
-from hazard_aggregator.core import Aggregator
+from hazard_aggregator.core import Aggregator, Outbox
 from hazard_aggregator.fusion import AreaFusion
 from hazard_aggregator.publications import wsn_line
 from hazard_aggregator.registry import find_rule
@@ -337,3 +339,59 @@ def test_thesis_line_has_the_position_of_node_or_area_and_none_when_clear():
     assert wsn_line(AREA, stored("blocked", 254), NODE) == "7,0.000,0.500"
     assert wsn_line(AREA, stored("clear", 0)) == "7,-999,-999"
     assert wsn_line(AREA, stored("unknown", 200)) == "7,1.000,0.500"
+
+
+def hazard(state: str, seq: int, penalty: int | None = None, area: str = "hall") -> AreaHazard:
+    cost = {"blocked": 254, "unknown": 200, "clear": 0}[state] if penalty is None else penalty
+    return AreaHazard(area=area, state=state, severity=0, penalty=cost, since=0.0, seq=seq, epoch=1, cause="")
+
+
+def test_danger_is_announced_at_once_and_relief_once_it_is_stored():
+    outbox = Outbox()
+    blocked, clear = hazard("blocked", 1), hazard("clear", 2)
+    assert outbox.offer([blocked]) == [blocked]
+    assert outbox.offer([clear]) == []
+    assert outbox.announced() == [blocked]
+    assert outbox.withheld() == ["hall"]
+    assert outbox.mark_stored([clear]) == [clear]
+    assert outbox.announced() == [clear]
+    assert outbox.unstored() == []
+
+
+def test_stored_clear_is_not_announced_after_a_newer_danger():
+    outbox = Outbox()
+    outbox.offer([hazard("blocked", 1)])
+    clear = hazard("clear", 2)
+    outbox.offer([clear])
+    newer = hazard("blocked", 3)
+    assert outbox.offer([newer]) == [newer]
+    assert outbox.mark_stored([clear]) == []
+    assert outbox.announced() == [newer]
+    assert outbox.unstored() == [newer]
+
+
+states = st.sampled_from([("blocked", 254), ("unknown", 254), ("unknown", 200), ("clear", 0)])
+
+
+@given(st.lists(st.one_of(states, st.just("store"), st.just("begin")), max_size=60))
+def test_no_relief_is_announced_before_it_is_stored(steps):
+    outbox = Outbox()
+    on_disk: AreaHazard | None = None
+    announced: AreaHazard | None = None
+    in_flight: list[AreaHazard] = []
+    for seq, step in enumerate(steps):
+        if step == "begin":
+            in_flight = outbox.unstored()
+            continue
+        if step == "store":
+            on_disk = in_flight[0] if in_flight else on_disk
+            released = outbox.mark_stored(in_flight)
+            in_flight = []
+        else:
+            released = outbox.offer([hazard(step[0], seq, step[1])])
+        for newest in released:
+            if is_relief(newest, announced):
+                assert on_disk is newest
+            assert announced is None or newest.seq > announced.seq
+            announced = newest
+    assert outbox.announced() == ([announced] if announced else [])

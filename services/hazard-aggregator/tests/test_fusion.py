@@ -13,8 +13,8 @@ from fog_contracts.messages import AreaDefinition, AreaHazard, NodeReading, Pose
 from fog_contracts.site import NodeSite, RobotSite, Sonar
 from hazard_aggregator.debounce import DebounceError, Observation, RuleFactory
 from hazard_aggregator.fusion import AreaFusion
+from hazard_aggregator.readings import FORGOTTEN_S, ReadingOrder, Taken
 from hazard_aggregator.registry import find_rule
-from hazard_aggregator.sensors.reading_order import FORGOTTEN_S, ReadingOrder, Taken
 
 SQUARE = [(0.0, 0.0), (2.0, 0.0), (2.0, 1.0), (0.0, 1.0)]
 LIMIT = 1.2

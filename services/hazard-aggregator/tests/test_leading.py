@@ -13,7 +13,7 @@ from fog_contracts.messages import AreaDefinition, AreaHazard
 from fog_runtime.clock import ManualClock
 from fog_runtime.health import Health
 from fog_supervisor.servers import start_redis
-from hazard_aggregator.areas.area_override import AreaOverride
+from hazard_aggregator.areas import AreaOverride
 from hazard_aggregator.core import Aggregator
 from hazard_aggregator.fusion import AreaFusion
 from hazard_aggregator.registry import find_rule

@@ -12,7 +12,7 @@ from fog_contracts import channels as ch
 from fog_contracts.handlers import Moment
 from fog_contracts.messages import AreaDefinition, AreaHazard, NodeReading, UnknownPolicy
 from fog_contracts.site import NodeSite, Sonar
-from hazard_aggregator.areas.area_override import AreaOverride, Rest
+from hazard_aggregator.areas import AreaOverride, Rest
 from hazard_aggregator.core import Aggregator
 from hazard_aggregator.fusion import AreaFusion
 from hazard_aggregator.overrides import StoredOverrides

@@ -13,8 +13,8 @@ from fog_contracts.messages import AreaDefinition, NodeReading
 from fog_contracts.site import NodeSite, Sonar
 from hazard_aggregator.debounce import DEFAULT_RULE
 from hazard_aggregator.fusion import AreaFusion
+from hazard_aggregator.readings import FORGOTTEN_S, MIN_PERIOD_S, SILENT_S
 from hazard_aggregator.registry import find_rule
-from hazard_aggregator.sensors.reading_order import FORGOTTEN_S, MIN_PERIOD_S, SILENT_S
 
 READINGS = int(os.environ.get("FOGNAV_PERMUTED_READINGS", "12000"))
 SEQS = 2**32

@@ -19,11 +19,11 @@ from fog_contracts.messages import (
 )
 from fog_contracts.site import NodeSite, Sonar
 from hazard_aggregator.area_size import AreaError
-from hazard_aggregator.areas.voting import fuse
+from hazard_aggregator.areas import fuse
 from hazard_aggregator.fusion import AreaFusion
+from hazard_aggregator.node_state import FlapDetector
 from hazard_aggregator.registry import find_rule
-from hazard_aggregator.sensors.flapping import FlapDetector
-from hazard_aggregator.sensors.source_profiles import PROFILES
+from hazard_aggregator.source_values import PROFILES
 
 SQUARE = [(0.0, 0.0), (2.0, 0.0), (2.0, 1.0), (0.0, 1.0)]
 TOO_LONG = object()

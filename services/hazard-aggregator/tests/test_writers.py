@@ -18,14 +18,14 @@ from fog_runtime.http import Tokens, token_hash
 from fog_runtime.stores.idempotency import Attempt
 from fog_supervisor.servers import start_redis
 from hazard_aggregator import area_size
-from hazard_aggregator.areas.area_override import AreaOverride
+from hazard_aggregator.api import make_api
+from hazard_aggregator.areas import AreaOverride
 from hazard_aggregator.core import Aggregator
 from hazard_aggregator.fusion import AreaFusion
 from hazard_aggregator.registry import find_rule
-from hazard_aggregator.rest.api import make_api
 from hazard_aggregator.service import Service
 from hazard_aggregator.store import Audit, Store, StoreError
-from hazard_aggregator.writers.area_writer import ConflictError
+from hazard_aggregator.writers import ConflictError
 
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator, Iterable

@@ -11,7 +11,7 @@ from fognav.operate.fog import Fog, find_fog
 from fognav.operate.options import FogOption, JsonOption
 from fognav.operate.systems import AGGREGATOR
 from fognav.output import FailedError, WrongUseError, exit_codes, print_answer, print_json
-from hazard_aggregator.sensors.source_profiles import PROFILES
+from hazard_aggregator.source_values import PROFILES
 
 source_app = typer.Typer(help="Use sensors that speak MQTT as evidence for an area.", no_args_is_help=True)
 

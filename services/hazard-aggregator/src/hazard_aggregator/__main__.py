@@ -11,7 +11,7 @@ from fog_contracts.cones import node_cones
 from fog_contracts.handlers import Moment
 from fog_runtime import logs, process
 from fog_runtime.clock import SystemClock, boot_id
-from fog_runtime.configuration.settings import describe, load
+from fog_runtime.configuration.settings import CommonSettings, describe, load
 from fog_runtime.configuration.site import load_site
 from fog_runtime.health import Health
 from fog_runtime.http import Front, load_tokens, unused
@@ -20,22 +20,28 @@ from fog_runtime.leases.lease_store import LeaseStore
 from fog_runtime.machine.memory import release_startup_memory
 from fog_runtime.transports.mqtt_inputs import MqttEdgeWithInputs
 from fog_runtime.transports.zenoh_edge import ZenohEdge
-from hazard_aggregator.areas.members import Members
-from hazard_aggregator.availability import LAST_WILL
+from hazard_aggregator.api import make_api
+from hazard_aggregator.areas import Members
 from hazard_aggregator.core import Aggregator
+from hazard_aggregator.debounce import DEFAULT_RULE
 from hazard_aggregator.fusion import AreaFusion
 from hazard_aggregator.overrides import StoredOverrides
+from hazard_aggregator.publisher import LAST_WILL
+from hazard_aggregator.records import UnusableAreas
 from hazard_aggregator.registry import find_rule
-from hazard_aggregator.rest.api import make_api
 from hazard_aggregator.service import Service
-from hazard_aggregator.settings import Settings
 from hazard_aggregator.store import Store, load_at_start
-from hazard_aggregator.writers.unusable_areas import UnusableAreas
 
 SENSORS: Final = (ch.NODE_READING, ch.NODE_VALUE, ch.NODE_AVAILABILITY, ch.THESIS_AREA)
 """What nodes say comes in one order, and does not delay what the aggregator says (ADR 37)."""
 
 _log = logs.get("aggregator")
+
+
+class Settings(CommonSettings, frozen=True, kw_only=True):
+    """`debounce` names the rule of areas that choose none (entry points `fognav.debounce_rules`)."""
+
+    debounce: str = DEFAULT_RULE
 
 
 async def main() -> None:

@@ -6,6 +6,7 @@ The metrics of nodes follow the same reports.
 from __future__ import annotations
 
 from collections import deque
+from contextlib import suppress
 from typing import TYPE_CHECKING, Final, get_args
 
 from prometheus_client import Gauge
@@ -16,18 +17,54 @@ from fog_contracts.messages import AlertKind
 from fog_runtime import logs
 from fog_runtime.clock import ticker
 from fog_runtime.stores.redis_connection import StoreRefusedError
-from hazard_aggregator.areas.alerts import AlertEvent, Alerts
-from hazard_aggregator.node_metrics import NodeMetrics
+from hazard_aggregator.alerts import AlertEvent, Alerts
 from hazard_aggregator.store import StoreError
 
 if TYPE_CHECKING:
     import asyncio
+    from collections.abc import Iterable
 
     from fog_contracts.messages import Alert
     from fog_runtime.clock import Clock
     from fog_runtime.transports.edges import Edges
+    from hazard_aggregator.alerts import NodeReport
     from hazard_aggregator.core import Aggregator
     from hazard_aggregator.store import Store
+
+_LABELS: Final = ["area", "node"]
+UNKNOWN = Gauge("fognav_node_unknown", "1 while nothing is known from a node or source", _LABELS)
+SILENCE = Gauge("fognav_node_silence_seconds", "Time since the last reading of a node or source", _LABELS)
+FLAPPING = Gauge("fognav_node_flapping", "1 while a node or source changes too often to be believed", _LABELS)
+
+
+class NodeMetrics:
+    """The metrics of the nodes and sources that an aggregator knows; only those that are gone are removed."""
+
+    def __init__(self) -> None:
+        self._shown: set[tuple[str, str]] = set()
+
+    def show(self, reports: Iterable[NodeReport]) -> None:
+        """Set the metrics to these reports; a node without a reading has no silence."""
+        gone, self._shown = self._shown, set()
+        for report in reports:
+            labels = (report.area, report.id)
+            self._shown.add(labels)
+            UNKNOWN.labels(*labels).set(report.state == "unknown")
+            FLAPPING.labels(*labels).set(report.flapping)
+            if report.age is not None:
+                SILENCE.labels(*labels).set(report.age)
+            else:
+                _remove_silence(labels)  # of the readings before its definition changed
+        for labels in gone - self._shown:
+            UNKNOWN.remove(*labels)
+            FLAPPING.remove(*labels)
+            _remove_silence(labels)
+
+
+def _remove_silence(labels: tuple[str, str]) -> None:
+    with suppress(KeyError):  # without a reading it had none
+        SILENCE.remove(*labels)
+
 
 _PERIOD_S: Final = 1.0
 _QUEUE: Final = 10_000

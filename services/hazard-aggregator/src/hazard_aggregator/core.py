@@ -1,22 +1,23 @@
 """The aggregator's decisions: area states from readings, when a hazard may be announced, and what is republished.
 
 Pure: every input comes with its `Moment`, and everything to be published is returned. `fusion` turns readings into
-states. `outbox` withholds a relief until it is stored: the process writes `to_store()` and then calls `mark_stored`.
+states. `Outbox` withholds a relief until it is stored: the process writes `to_store()` and then calls `mark_stored`.
 """
 
 from __future__ import annotations
 
 import math
-from typing import TYPE_CHECKING, Final
+from collections import deque
+from typing import TYPE_CHECKING, Final, Literal, NamedTuple
+
+from msgspec import structs
 
 from fog_contracts import channels as ch
+from fog_contracts.fencing import within_reach
 from fog_contracts.handlers import Publication, RefusedMessageError
-from fog_contracts.hazards import digest
+from fog_contracts.hazards import digest, is_relief
 from fog_contracts.messages import AggregatorHeartbeat
-from hazard_aggregator.foreign_messages import ForeignMessages
-from hazard_aggregator.outbox import Outbox
 from hazard_aggregator.overrides import Overrides
-from hazard_aggregator.own_messages import OwnMessages
 from hazard_aggregator.publications import definition_publication, deletions, hazard_publications, node_publication
 
 if TYPE_CHECKING:
@@ -27,12 +28,141 @@ if TYPE_CHECKING:
     from fog_contracts.geometry import Point
     from fog_contracts.handlers import Handler, Ids, Moment, QueryHandler
     from fog_contracts.messages import AreaDefinition, AreaHazard, NodeReading, NodeValue, RobotPose
-    from hazard_aggregator.areas.area_override import AreaOverride
-    from hazard_aggregator.areas.node_report import NodeReport
-    from hazard_aggregator.foreign_messages import ForeignMessage
+    from hazard_aggregator.alerts import NodeReport
+    from hazard_aggregator.areas import AreaOverride
     from hazard_aggregator.fusion import AreaFusion
     from hazard_aggregator.overrides import StoredOverrides
-    from hazard_aggregator.sensors.reading_order import Rejection
+    from hazard_aggregator.readings import Rejection
+
+_MAX_FOREIGN: Final = 100
+"""Messages of others between two calls of `pop`; further ones are not counted."""
+
+ForeignKind = Literal["area", "hazard", "heartbeat"]
+
+
+class ForeignMessage(NamedTuple):
+    """A message of another sender on our topics: about an area that we don't list, or above our epoch."""
+
+    kind: ForeignKind
+    epoch: int
+    area: str
+
+
+class ForeignMessages:
+    """Collects them; `epoch` is the highest one of another sender that receivers follow, 0 before the first."""
+
+    def __init__(self) -> None:
+        self.epoch = 0
+        self._found: list[ForeignMessage] = []
+
+    def add(self, kind: ForeignKind, epoch: int, area: str) -> None:
+        """Record a message that another sender published."""
+        self.epoch = max(self.epoch, within_reach(epoch, self.epoch))
+        if len(self._found) < _MAX_FOREIGN:
+            self._found.append(ForeignMessage(kind, epoch, area))
+
+    def pop(self) -> list[ForeignMessage]:
+        """Return the messages since the last call."""
+        found, self._found = self._found, []
+        return found
+
+
+_HAZARDS: Final = 64
+"""Hazards remembered per area: more than one area changes while a message is under way."""
+_HEARTBEATS: Final = 3000
+"""Heartbeats remembered: those of ten minutes."""
+
+
+class OwnMessages:
+    """The latest hazards and heartbeats that were published."""
+
+    def __init__(self) -> None:
+        self._hazards: dict[str, deque[tuple[int, int, str, int]]] = {}
+        self._heartbeats: deque[tuple[int, float]] = deque(maxlen=_HEARTBEATS)
+
+    def add(self, hazard: AreaHazard) -> None:
+        """Remember a hazard that is published now."""
+        if not self.contains(hazard):
+            self._hazards.setdefault(hazard.area, deque(maxlen=_HAZARDS)).append(_content(hazard))
+
+    def contains(self, hazard: AreaHazard) -> bool:
+        """Whether this hazard was published here."""
+        return _content(hazard) in self._hazards.get(hazard.area, ())
+
+    def add_heartbeat(self, heartbeat: AggregatorHeartbeat) -> None:
+        """Remember a heartbeat that is published now."""
+        self._heartbeats.append((heartbeat.epoch, heartbeat.uptime))
+
+    def contains_heartbeat(self, heartbeat: AggregatorHeartbeat) -> bool:
+        """Whether this heartbeat was published here."""
+        # The newest one is the most likely.
+        return (heartbeat.epoch, heartbeat.uptime) in reversed(self._heartbeats)
+
+
+def _content(hazard: AreaHazard) -> tuple[int, int, str, int]:
+    return hazard.epoch, hazard.seq, hazard.state, hazard.penalty
+
+
+class Outbox:
+    """Per area the newest hazard, whether it is stored, and the last announced one.
+
+    A relief is a change that allows robots more than before. A slow or dead store must not delay a danger, and a crash
+    must not undo an announced relief: a `clear` that was announced but not stored would leave robots in an area that
+    the restarted aggregator announces as blocked.
+    """
+
+    def __init__(self) -> None:
+        self._announced: dict[str, AreaHazard] = {}
+        self._unstored: dict[str, AreaHazard] = {}
+
+    def offer(self, hazards: Iterable[AreaHazard]) -> list[AreaHazard]:
+        """Add changed hazards, all of which must be stored; return those to announce at once."""
+        to_announce: list[AreaHazard] = []
+        for hazard in hazards:
+            self._unstored[hazard.area] = hazard
+            if not is_relief(hazard, self._announced.get(hazard.area)):
+                self._announced[hazard.area] = hazard
+                to_announce.append(hazard)
+        return to_announce
+
+    def unstored(self) -> list[AreaHazard]:
+        """Return the hazards that must be stored, the newest of each area."""
+        return list(self._unstored.values())
+
+    def mark_stored(self, hazards: Iterable[AreaHazard]) -> list[AreaHazard]:
+        """Record that these hazards are stored; return those to announce now, unless a newer one replaced them."""
+        to_announce: list[AreaHazard] = []
+        for hazard in hazards:
+            if self._unstored.get(hazard.area) is not hazard:
+                continue
+            del self._unstored[hazard.area]
+            if self._announced.get(hazard.area) is not hazard:
+                self._announced[hazard.area] = hazard
+                to_announce.append(hazard)
+        return to_announce
+
+    def announced(self) -> list[AreaHazard]:
+        """Return the last announced hazard of every area, to republish after a reconnect."""
+        return list(self._announced.values())
+
+    def withheld(self) -> list[str]:
+        """Return the areas whose newest hazard is announced only once it is stored."""
+        return sorted(area for area, hazard in self._unstored.items() if self._announced.get(area) is not hazard)
+
+    def set_epoch(self, epoch: int) -> None:
+        """Give all hazards another epoch; those that are not stored yet must be stored with it."""
+        for area, hazard in self._announced.items():
+            renamed = self._announced[area] = structs.replace(hazard, epoch=epoch)
+            if self._unstored.get(area) is hazard:
+                self._unstored[area] = renamed
+        for area, hazard in self._unstored.items():
+            if hazard.epoch != epoch:
+                self._unstored[area] = structs.replace(hazard, epoch=epoch)
+
+    def forget(self, area: str) -> None:
+        """Discard a removed area's hazards."""
+        self._announced.pop(area, None)
+        self._unstored.pop(area, None)
 
 
 _HALF_TICK_S: Final = 0.05

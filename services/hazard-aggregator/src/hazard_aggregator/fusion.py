@@ -1,7 +1,7 @@
 """Turns readings into hazards: passes each reading to the areas that its node watches.
 
-`reading_order` decides which readings are news, `plausibility` what one shows, `node_state` with its debounce rule when
-a node's state is confirmed, and `watched_area` what that means for an area. Pure: time comes as `now` (s, the
+`readings` decides which readings are news and what one shows, `node_state` with its debounce rule when a node's state
+is confirmed, and `areas` what that means for an area. Pure: time comes as `now` (s, the
 receiver's monotonic clock) and `stamp` (s since the epoch, for people and traces).
 """
 
@@ -10,14 +10,11 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 from fog_contracts.channels import BLOCKED, CLEAR
-from hazard_aggregator.areas.members import THESIS_NODE, Members
-from hazard_aggregator.areas.node_report import node_reports
-from hazard_aggregator.areas.watched_area import WatchedArea
+from hazard_aggregator.alerts import node_reports
+from hazard_aggregator.areas import THESIS_NODE, Members, WatchedArea
 from hazard_aggregator.debounce import DEFAULT_RULE
-from hazard_aggregator.sensors.node_state import SourceState
-from hazard_aggregator.sensors.plausibility import Classification, classify_reading
-from hazard_aggregator.sensors.reading_order import ReadingOrder, Taken
-from hazard_aggregator.sensors.robot_poses import RobotPoses
+from hazard_aggregator.node_state import SourceState
+from hazard_aggregator.readings import Classification, ReadingOrder, RobotPoses, Taken, classify_reading
 from hazard_aggregator.sources import Sources
 
 if TYPE_CHECKING:
@@ -28,11 +25,11 @@ if TYPE_CHECKING:
     from fog_contracts.geometry import Point
     from fog_contracts.messages import AreaDefinition, AreaHazard, AreaState, NodeReading, NodeValue, RobotPose
     from fog_contracts.site import NodeSite, RobotSite
-    from hazard_aggregator.areas.area_override import AreaOverride
-    from hazard_aggregator.areas.node_report import NodeReport
+    from hazard_aggregator.alerts import NodeReport
+    from hazard_aggregator.areas import AreaOverride
     from hazard_aggregator.debounce import Registry
-    from hazard_aggregator.sensors.node_state import NodeState
-    from hazard_aggregator.sensors.reading_order import Rejection
+    from hazard_aggregator.node_state import NodeState
+    from hazard_aggregator.readings import Rejection
     from hazard_aggregator.sources import Applied
 
 LATE_TICK_S: Final = 0.5

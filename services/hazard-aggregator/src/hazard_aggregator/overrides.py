@@ -10,7 +10,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
-from hazard_aggregator.areas.area_override import AreaOverride, Rest
+from hazard_aggregator.areas import AreaOverride, Rest
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Mapping

@@ -12,13 +12,10 @@ from fog_runtime.clock import ticker
 from fog_runtime.transports.edges import Edges
 from hazard_aggregator.alert_keeper import AlertKeeper
 from hazard_aggregator.area_size import excess
-from hazard_aggregator.availability import Availability
-from hazard_aggregator.history_keeper import HistoryKeeper
-from hazard_aggregator.publisher import Publisher
+from hazard_aggregator.publisher import Availability, HistoryKeeper, Publisher
+from hazard_aggregator.records import Records
 from hazard_aggregator.store import StoreError, StoreLostError
-from hazard_aggregator.writers.area_writer import AreaWriter
-from hazard_aggregator.writers.override_writer import OverrideWriter
-from hazard_aggregator.writers.records import Records
+from hazard_aggregator.writers import AreaWriter, OverrideWriter
 
 if TYPE_CHECKING:
     from collections.abc import Sequence

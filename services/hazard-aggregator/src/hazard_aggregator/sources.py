@@ -5,16 +5,16 @@ from __future__ import annotations
 from itertools import chain
 from typing import TYPE_CHECKING, Final, NamedTuple
 
-from hazard_aggregator.sensors.node_state import SourceState
-from hazard_aggregator.sensors.plausibility import Classification
-from hazard_aggregator.sensors.source_reader import is_online
+from hazard_aggregator.node_state import SourceState
+from hazard_aggregator.readings import Classification
+from hazard_aggregator.source_values import is_online
 
 if TYPE_CHECKING:
     from collections.abc import Iterable
     from collections.abc import Set as AbstractSet
 
     from fog_contracts.messages import Availability, NodeValue
-    from hazard_aggregator.areas.watched_area import WatchedArea
+    from hazard_aggregator.areas import WatchedArea
 
 _WRAP: Final = 2**32
 

@@ -13,8 +13,9 @@ from fog_runtime import logs
 from fog_runtime.stores import store_keys, store_scripts
 from fog_runtime.stores.audit import CursorError
 from fog_runtime.stores.redis_store import Audit, Outcome, RecoveryError, RedisStore, StoreError, StoreLostError, Table
-from hazard_aggregator.areas.alerts import StoredAlerts
-from hazard_aggregator.areas.area_history import (
+from hazard_aggregator.alerts import StoredAlerts
+from hazard_aggregator.areas import AreaOverride, Rest
+from hazard_aggregator.history import (
     MAX_PERIODS,
     RETENTION_S,
     HistoryPage,
@@ -22,7 +23,6 @@ from hazard_aggregator.areas.area_history import (
     page_of,
     sameness,
 )
-from hazard_aggregator.areas.area_override import AreaOverride, Rest
 
 if TYPE_CHECKING:
     from collections.abc import Iterable
@@ -30,7 +30,7 @@ if TYPE_CHECKING:
     from fog_contracts.handlers import Moment
     from fog_contracts.messages import Alert
     from fog_runtime.stores.idempotency import Attempt
-    from hazard_aggregator.areas.alerts import AlertEvent
+    from hazard_aggregator.alerts import AlertEvent
 
 __all__ = [
     "Audit",

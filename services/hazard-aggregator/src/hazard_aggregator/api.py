@@ -1,4 +1,7 @@
-"""REST under /api/v1: areas with their state, and the health of nodes. Reading needs no token, PUT an operator's."""
+"""REST under /api/v1: areas with their state, history, overrides and alerts, and the health of nodes.
+
+Reading needs no token, a change an operator's.
+"""
 
 from collections.abc import Callable
 from typing import Annotated, Any
@@ -8,17 +11,26 @@ from fastapi import FastAPI
 
 from fog_contracts.geometry import GeometryError, Point, normalized_polygon
 from fog_contracts.grid import GridGeometry
+from fog_contracts.handlers import Moment
 from fog_contracts.messages import (
+    Alert,
     AlertPolicy,
     AreaDefinition,
     AreaHazard,
     AreaState,
+    Author,
+    Count,
     FusionPolicy,
     Id,
     Message,
+    OverrideReason,
+    OverrideState,
     Penalty,
     Ring,
+    Seconds,
     Source,
+    Stamp,
+    TimeToLive,
     UnknownPolicy,
 )
 from fog_runtime.clock import Clock
@@ -26,10 +38,12 @@ from fog_runtime.health import Health
 from fog_runtime.http import (
     Answer,
     Body,
+    Caller,
     IdempotencyKey,
     IfMatch,
     IfNoneMatch,
     Operator,
+    PageSize,
     ProblemError,
     Routes,
     Tokens,
@@ -40,15 +54,177 @@ from fog_runtime.http import (
     expected_version,
     make_app,
     must_be_new,
+    next_page,
 )
+from fog_runtime.stores.audit import CursorError
 from fog_runtime.stores.idempotency import IdempotencyError
+from hazard_aggregator.alerts import AlertError
 from hazard_aggregator.area_size import AreaError, TooManyAreasError, check_size
-from hazard_aggregator.rest.alert_api import add_alerts
-from hazard_aggregator.rest.history_api import add_history
-from hazard_aggregator.rest.override_api import OverrideView, add_overrides, no_such_area, override_view
+from hazard_aggregator.areas import LONGEST_S, AreaOverride
+from hazard_aggregator.history import PeriodView
 from hazard_aggregator.service import Service
 from hazard_aggregator.store import StoreError
-from hazard_aggregator.writers.area_writer import ConflictError
+from hazard_aggregator.writers import ConflictError
+
+
+def add_alerts(routes: Routes, service: Service) -> None:
+    """Add the routes of alerts."""
+    add_store_errors(routes)
+    routes.raises(AlertError, {404: "There is no such alert"}, lambda error: ProblemError(404, str(error)))
+
+    @routes.get("/api/v1/alerts")
+    async def alerts() -> list[Alert]:
+        """Return the active alerts, oldest first: areas and nodes that people should look after.
+
+        Those that began, ended or were acknowledged earlier are in the audit trail (kind `alert`).
+        """
+        return service.alerts.active()
+
+    @routes.put("/api/v1/alerts/{alert_id}/acknowledgement", raises=[AlertError, StoreError])
+    async def acknowledge(alert_id: str, caller: Operator) -> Alert:
+        """Record that somebody looks after an alert; it stays until its condition ends."""
+        return await service.alerts.acknowledge(alert_id, caller.name)
+
+
+def add_history(routes: Routes, service: Service, clock: Clock) -> None:
+    """Add the route that reads histories; `routes` knows the errors of the store."""
+    routes.raises(
+        CursorError, {422: "The cursor is invalid"}, lambda error: ProblemError(422, str(error), field="query.cursor")
+    )
+
+    @routes.get(
+        "/api/v1/areas/{area_id}/history", raises=[CursorError, StoreError], problems={404: "No area has this id"}
+    )
+    async def area_history(area_id: str, limit: PageSize, cursor: str | None = None) -> Answer[list[PeriodView]]:
+        """Return an area's states and how long each lasted, newest first; the Link header has the next page's address.
+
+        A period continues over restarts. The history goes back by 90 days, and 10,000 periods.
+        """
+        if not any(known.id == area_id for known in service.core.definitions()):
+            raise ProblemError(404, f"there is no area {area_id}")
+        page = await service.history.page(area_id, cursor, limit, Moment(clock.now(), clock.stamp(), clock=clock.id))
+        return Answer(page.periods, next_page(f"/api/v1/areas/{area_id}/history", page.next, limit))
+
+
+class OverrideBody(Message, frozen=True, kw_only=True):
+    """What an operator says of an area instead of its nodes, why, and for how long (`ttl_s`).
+
+    `blocked` for 30 days at most; `clear`, which needs an admin's token, for 15 minutes at most.
+    """
+
+    state: OverrideState
+    reason: OverrideReason
+    ttl_s: TimeToLive
+
+
+class OverrideView(Message, frozen=True, kw_only=True):
+    """An override in force; `rest_s` is the time until it ends."""
+
+    state: OverrideState
+    author: Author
+    reason: OverrideReason
+    set_at: Stamp
+    ttl_s: TimeToLive
+    rest_s: Seconds
+    version: Count
+
+
+def override_view(service: Service, area: str, now: float) -> OverrideView | None:
+    """Return the override of an area that is in force."""
+    override = service.core.overrides.get(area)
+    return None if override is None else _view(override, service.core.overrides.rest_s(area, now))
+
+
+def add_overrides(routes: Routes, service: Service, clock: Clock) -> None:
+    """Add the routes that set and remove overrides; `routes` knows the errors of areas and of the store."""
+
+    @routes.get("/api/v1/areas/{area_id}/override", problems={404: "No area has this id, or it has no override"})
+    async def get_override(area_id: str) -> Answer[OverrideView]:
+        """Return an area's override with its ETag."""
+        _require_area(service, area_id)
+        view = override_view(service, area_id, clock.now())
+        if view is None:
+            raise _without_override(area_id)
+        return Answer(view, etag(view.version))
+
+    @routes.put(
+        "/api/v1/areas/{area_id}/override",
+        status=(200, 201),
+        raises=[ConflictError, IdempotencyError, StoreError],
+        problems={404: "No area has this id"},
+    )
+    async def put_override(
+        area_id: str,
+        body: Body[OverrideBody],
+        caller: Operator,
+        if_match: IfMatch = None,
+        idempotency_key: IdempotencyKey = None,
+    ) -> Answer[OverrideView]:
+        """Override an area for a time; replies once it is durably stored.
+
+        Robots avoid a `blocked` area whatever its nodes measure. They may pass a `clear` one, at half speed.
+        """
+        _require_area(service, area_id)
+        _require_allowed(body, caller)
+        new = service.core.overrides.get(area_id) is None
+        override = await service.overrides.put(
+            area_id,
+            body.state,
+            body.reason,
+            body.ttl_s,
+            caller.name,
+            expected=expected_version(if_match),
+            attempt=attempt_of(idempotency_key, caller, f"PUT /api/v1/areas/{area_id}/override", body),
+        )
+        rest_s = max(0.0, override.deadline - clock.now())
+        return Answer(_view(override, rest_s), etag(override.version), status=201 if new else 200)
+
+    @routes.delete(
+        "/api/v1/areas/{area_id}/override",
+        raises=[ConflictError, StoreError],
+        problems={404: "No area has this id, or it has no override"},
+    )
+    async def delete_override(area_id: str, caller: Operator, if_match: IfMatch = None) -> None:
+        """End an area's override, with If-Match only if it is unchanged: its nodes count again."""
+        if not await service.overrides.remove(area_id, caller.name, expected_version(if_match)):
+            raise _without_override(area_id)
+
+
+def no_such_area(area: str) -> ProblemError:
+    """Return the problem of a request about an area that does not exist."""
+    return ProblemError(404, f"there is no area {area}: GET /api/v1/areas lists those that there are")
+
+
+def _without_override(area: str) -> ProblemError:
+    return ProblemError(404, f"area {area} has no override: its nodes and sources decide; PUT one first")
+
+
+def _require_area(service: Service, area: str) -> None:
+    if not any(known.id == area and not known.removed for known in service.core.definitions()):
+        raise no_such_area(area)
+
+
+def _require_allowed(body: OverrideBody, caller: Caller) -> None:
+    if body.state == "clear" and caller.role != "admin":
+        raise ProblemError(
+            403, f"to declare an area clear needs the role admin; {caller.name} has the role {caller.role}"
+        )
+    if body.ttl_s > (longest := LONGEST_S[body.state]):
+        raise ProblemError(
+            422, f"an area can be overridden as {body.state} for {longest:g} s at most", field="body.ttl_s"
+        )
+
+
+def _view(override: AreaOverride, rest_s: float) -> OverrideView:
+    return OverrideView(
+        state=override.state,
+        author=override.author,
+        reason=override.reason,
+        set_at=override.set_at,
+        ttl_s=override.ttl_s,
+        rest_s=rest_s,
+        version=override.version,
+    )
 
 
 class AreaBody(Message, frozen=True, kw_only=True):

@@ -1,23 +1,122 @@
-"""One area: fuses its nodes to one state, and turns each change of it into a hazard. Pure; time is an argument.
+"""Areas: their nodes and sources, whose states are fused to one, and the hazard that each change of it is. Pure.
 
 An operator's override counts instead of the nodes; what these give without it goes on underneath.
 """
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Final, NamedTuple
+from typing import TYPE_CHECKING, Any, Final, NamedTuple
 
 from msgspec import structs
 
 from fog_contracts.costs import LETHAL
-from fog_contracts.messages import SEVERITY, AreaHazard, HazardOverride, Trace
-from hazard_aggregator.areas.voting import fuse
-from hazard_aggregator.sensors.node_state import SourceState
+from fog_contracts.messages import (
+    SEVERITY,
+    AreaHazard,
+    Author,
+    Count,
+    Finite,
+    HazardOverride,
+    Id,
+    Message,
+    OverrideReason,
+    OverrideState,
+    Seconds,
+    Stamp,
+    TimeToLive,
+    Trace,
+)
+from hazard_aggregator.area_size import AreaError
+from hazard_aggregator.debounce import make_rule
+from hazard_aggregator.node_state import FlapDetector, NodeState, SourceState
+from hazard_aggregator.source_values import SourceError, SourceReader, resolve
 
 if TYPE_CHECKING:
-    from fog_contracts.messages import AreaDefinition, AreaState
-    from hazard_aggregator.areas.area_override import AreaOverride
-    from hazard_aggregator.sensors.node_state import NodeState
+    from collections.abc import Collection, Iterable, Mapping
+
+    from fog_contracts.geometry import Point
+    from fog_contracts.messages import AreaDefinition, AreaState, FusionPolicy, Source
+    from fog_contracts.site import NodeSite
+    from hazard_aggregator.debounce import Registry, Rule
+
+LONGEST_S: Final[Mapping[OverrideState, float]] = {"blocked": 30 * 86_400.0, "clear": 900.0}
+"""How long (s) an override may last: one that declares an area clear counts against what nodes measure."""
+
+
+class AreaOverride(Message, frozen=True, kw_only=True):
+    """An operator's word on an area, as it is stored: it holds until `deadline` (s) of the clock of the boot `boot`."""
+
+    area: Id
+    state: OverrideState
+    author: Author
+    reason: OverrideReason
+    ttl_s: TimeToLive
+    set_at: Stamp
+    boot: str
+    deadline: Finite
+    version: Count
+
+
+class Rest(Message, frozen=True, kw_only=True):
+    """The time (s) that was left of this version of an override when it was last stored.
+
+    `deadline` (s) is the same as a time of the clock of the boot `boot`, so that a restart within it prolongs nothing.
+    """
+
+    version: Count
+    rest_s: Seconds
+    boot: str = ""
+    deadline: Finite = 0.0
+
+
+_ROUNDING: Final = 1e-9
+"""Sums of weights that should be equal differ by less."""
+
+
+def fuse(states: Mapping[str, AreaState], policy: FusionPolicy) -> AreaState:
+    """Return the state that nodes and sources give together.
+
+    It is blocked when those that are reach the policy's threshold, and clear when those that are unknown could not make
+    it so; without any it is unknown.
+    """
+    if not states:
+        return "unknown"
+    blocked = sum(_weight(name, policy) for name, state in states.items() if state == "blocked")
+    unknown = sum(_weight(name, policy) for name, state in states.items() if state == "unknown")
+    threshold = _threshold(states, policy)
+    if blocked >= threshold - _ROUNDING:
+        return "blocked"
+    return "unknown" if blocked + unknown >= threshold - _ROUNDING else "clear"
+
+
+def check_fusion(definition: AreaDefinition, thesis_node: str | None) -> None:
+    """Raise `AreaError` for a policy by which the area could never be blocked.
+
+    `thesis_node` is the id of the node that may report by the area's number, alone where nothing else watches it.
+    """
+    policy = definition.fusion
+    if definition.penalty is not None and policy.rule != "any":
+        problem = "each node or source makes an area with a penalty costly, whatever the others say: use `any`"
+        raise AreaError(definition.id, "fusion.rule", problem)
+    members = [*definition.nodes, *(source.id for source in definition.sources if source.penalty is None)]
+    if not members and thesis_node is not None:
+        members = [thesis_node]
+    if policy.rule in ("any", "all") or not members:
+        return
+    reachable = sum(_weight(name, policy) for name in members)
+    if policy.at_least > reachable:
+        problem = f"{policy.at_least:g} is more than all nodes and sources have together ({reachable:g}): lower it"
+        raise AreaError(definition.id, "fusion.at_least", problem)
+
+
+def _threshold(members: Iterable[str], policy: FusionPolicy) -> float:
+    if policy.rule == "any":
+        return 1.0
+    return float(len(list(members))) if policy.rule == "all" else policy.at_least
+
+
+def _weight(name: str, policy: FusionPolicy) -> float:
+    return policy.weights.get(name, 1.0) if policy.rule == "weighted" else 1.0
 
 
 PASSABLE_PENALTY: Final = 200
@@ -230,3 +329,108 @@ def _told(override: AreaOverride, measured: _Measured) -> HazardOverride:
         measured=measured.state,
         measured_penalty=measured.penalty,
     )
+
+
+THESIS_NODE: Final = "thesis-area-{number}"
+"""The id of a thesis node, which has none of its own, within its area."""
+_NO_CONES: Final[Mapping[str, list[Point]]] = {}
+_EACH_MESSAGE: Final[Mapping[str, Any]] = {"rule": "consecutive", "to_blocked": 1, "to_clear": 1}
+"""A source's messages are its sensor's own decisions."""
+
+
+class Members:
+    """Makes nodes, sources and their debounce rules; `registry` finds rules by name, nodes use the `default_rule`.
+
+    `cones` are the outlines of what the sonars of each node see (`fog_contracts.cones`), for areas that are one.
+    """
+
+    def __init__(
+        self,
+        sites: Mapping[str, NodeSite],
+        registry: Registry,
+        default_rule: str,
+        cones: Mapping[str, list[Point]] = _NO_CONES,
+    ) -> None:
+        self._sites = sites
+        self._cones = cones
+        self._registry = registry
+        self._default_rule = default_rule
+
+    def checked(self, definition: AreaDefinition) -> AreaDefinition:
+        """Return an area as it counts: one that is the cone of a node has the polygon of that node's cone now.
+
+        Raises `AreaError` when its node, debounce, sources or fusion are invalid.
+        """
+        self._check(definition)
+        if definition.cone_of is None or definition.removed:
+            return definition
+        polygon = self.cone(definition.id, definition.cone_of, definition.nodes)
+        return structs.replace(definition, polygon=polygon)
+
+    def cone(self, area: str, node: str, nodes: Collection[str]) -> list[Point]:
+        """Return what the sonars of a node see as the polygon of an area with these nodes; raises `AreaError`."""
+        remedy = "name one of the area's nodes, or give the area a polygon"
+        if node not in self._sites:
+            problem = f"the site has no node {node}: {remedy}"
+        elif node not in nodes:
+            problem = f"node {node} is none of the area's nodes: {remedy}"
+        elif node not in self._cones:
+            problem = f"node {node} stands in a wall of the map, or looks at one: move or turn it, or {remedy}"
+        else:
+            return self._cones[node]
+        raise AreaError(area, "cone_of", problem)
+
+    def _check(self, definition: AreaDefinition) -> None:
+        self.new_rule(definition)
+        names = [*definition.nodes, *(source.id for source in definition.sources)]
+        for source in definition.sources:
+            if names.count(source.id) > 1:
+                problem = "another node or source of the area has this id"
+                raise SourceError(definition.id, f"sources.{source.id}", problem)
+            if source.id in self._sites:
+                problem = "a node of the site has this id, and its readings would count as the source's: choose another"
+                raise SourceError(definition.id, f"sources.{source.id}", problem)
+            self._new_source(definition, source)
+            if source.quantity is not None and source.quantity.node not in self._sites:
+                problem = f"the site has no node {source.quantity.node}: add it to site.toml first"
+                raise SourceError(definition.id, f"sources.{source.id}.quantity.node", problem)
+        number = definition.number
+        check_fusion(definition, None if number is None else THESIS_NODE.format(number=number))
+
+    def new_rule(self, definition: AreaDefinition) -> Rule:
+        """Return a fresh debounce rule for a node of an area; raises `DebounceError` for invalid settings."""
+        return make_rule(definition.id, definition.debounce, self._registry, self._default_rule)
+
+    def thesis_node(self, definition: AreaDefinition) -> NodeState:
+        """Return the node of an area that reports by the area's number only."""
+        name = THESIS_NODE.format(number=definition.number)
+        return NodeState(name, None, self.new_rule(definition), area_penalty=definition.penalty)
+
+    def of_area(self, definition: AreaDefinition, old: WatchedArea | None) -> dict[str, NodeState]:
+        """Return the nodes and sources of an area; those of its `old` definition keep their states."""
+        known = old.nodes if old is not None else {}
+        keep_rules = old is not None and old.definition.debounce == definition.debounce
+        thesis = THESIS_NODE.format(number=definition.number)
+        names = list(dict.fromkeys([*definition.nodes, *({thesis} & known.keys() - self._sites.keys())]))
+        members: dict[str, NodeState] = {}
+        for name in names:
+            node = known.get(name)
+            if node is None or isinstance(node, SourceState):
+                node = NodeState(name, self._sites.get(name), self.new_rule(definition))
+            elif not keep_rules:
+                node.rule = self.new_rule(definition)
+            members[name] = node
+        for source in definition.sources:
+            new, before = self._new_source(definition, source), known.get(source.id)
+            unchanged = isinstance(before, SourceState) and before.source == new.source
+            members[source.id] = before if unchanged and before is not None else new
+        for member in members.values():
+            member.flaps.max_changes = definition.unknown.max_changes
+            member.area_penalty = definition.penalty
+        return members
+
+    def _new_source(self, definition: AreaDefinition, source: Source) -> SourceState:
+        resolved = resolve(definition.id, source)
+        rule = make_rule(definition.id, resolved.debounce or _EACH_MESSAGE, self._registry, self._default_rule)
+        flaps = FlapDetector(definition.unknown.max_changes)
+        return SourceState(source.id, None, rule, flaps=flaps, source=resolved, reader=SourceReader(resolved))

@@ -3,18 +3,49 @@
 from __future__ import annotations
 
 import math
+from collections import deque
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Final
 
 from fog_contracts.messages import UnknownPolicy
-from hazard_aggregator.sensors.flapping import FlapDetector
 
 if TYPE_CHECKING:
     from fog_contracts.messages import AreaState, Availability, NodeReading, Source
     from fog_contracts.site import NodeSite
     from hazard_aggregator.debounce import Rule
-    from hazard_aggregator.sensors.plausibility import Classification
-    from hazard_aggregator.sensors.source_reader import SourceReader
+    from hazard_aggregator.readings import Classification
+    from hazard_aggregator.source_values import SourceReader
+
+WINDOW_S: Final = 60.0
+STEADY_S: Final = 5.0
+"""So long (s) one state must last before a flapping node is believed again."""
+
+
+class FlapDetector:
+    """Counts the changes of state within a minute; nodes tell only those between blocked and clear."""
+
+    def __init__(self, max_changes: int) -> None:
+        self.max_changes = max_changes
+        self.flapping = False
+        self._changes: deque[float] = deque()
+        self._state: AreaState | None = None
+        self._since = 0.0
+
+    def update(self, confirmed: AreaState, now: float) -> bool:
+        """Take a confirmed state at `now` (s); return whether the node flaps."""
+        if self.flapping and now - self._since >= STEADY_S:
+            self.flapping = False
+            self._changes.clear()
+        if confirmed != self._state:
+            if self._state is not None:
+                self._changes.append(now)
+            self._state, self._since = confirmed, now
+        while self._changes and now - self._changes[0] > WINDOW_S:
+            self._changes.popleft()
+        if len(self._changes) > self.max_changes:
+            self.flapping = True
+        return self.flapping
+
 
 EXPLAINED_S: Final = 7.0
 """Robots may explain a node's echoes for so long (s), which crossing its cone takes; then nothing is known any more."""

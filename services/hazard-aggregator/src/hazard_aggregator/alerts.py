@@ -1,7 +1,8 @@
-"""What an operator must be told: areas unknown or blocked for long, nodes and sources unknown for long. Pure."""
+"""The health of nodes and sources, and what an operator must be told: what is unknown or blocked for long. Pure."""
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final, Literal, NamedTuple
 
 from msgspec import structs
@@ -12,8 +13,49 @@ if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator, Mapping
 
     from fog_contracts.handlers import Moment
-    from fog_contracts.messages import AlertKind, AreaDefinition, AreaHazard
-    from hazard_aggregator.areas.node_report import NodeReport
+    from fog_contracts.messages import AlertKind, AreaDefinition, AreaHazard, AreaState
+    from hazard_aggregator.areas import WatchedArea
+
+
+@dataclass(frozen=True)
+class NodeReport:
+    """Health of a node; `age` is the time (s) since its last reading, None before the first one.
+
+    `penalty` is the area's cost while this node or source alone is blocked; None: the area is impassable then.
+    `flapping`: it is unknown because it changed too often.
+    """
+
+    id: str
+    area: str
+    state: AreaState
+    reason: str
+    online: bool | None
+    age: float | None
+    received: int
+    ignored: int
+    penalty: int | None = None
+    flapping: bool = False
+
+
+def node_reports(areas: Iterable[WatchedArea], now: float) -> list[NodeReport]:
+    """Return the health of every node of these areas at `now` (s, the receiver's clock)."""
+    return [
+        NodeReport(
+            id=node.id,
+            area=area.definition.id,
+            state=node.state,
+            reason=node.reason,
+            online=node.online,
+            age=node.silent_for(now) if node.ever_received else None,
+            received=node.received,
+            ignored=node.ignored,
+            penalty=node.penalty,
+            flapping=node.state == "unknown" and node.flaps.flapping,
+        )
+        for area in areas
+        for node in area.nodes.values()
+    ]
+
 
 LISTED: Final = 40
 """Alerts of one message: with the longest reasons they still fit into its channel."""

@@ -1,1 +1,0 @@
-"""The aggregator's REST API: areas, their history, overrides and alerts."""

@@ -1,1 +1,0 @@
-"""Changes of areas and overrides by operators: each is stored before it takes effect."""

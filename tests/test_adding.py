@@ -312,7 +312,7 @@ def test_document_names_exactly_the_groups_of_entry_points() -> None:
     for file in [*ROOT.glob("*/pyproject.toml"), *ROOT.glob("*/*/pyproject.toml")]:
         registered |= set(tomllib.loads(file.read_text("utf-8"))["project"].get("entry-points", {}))
     parts = (ROOT / "docs" / "adding-a-base-or-lidar.md").read_text("utf-8")
-    rows = entry("a debounce rule") + entry("a cost layer") + entry("a command")
+    rows = entry("a debounce rule") + entry("a cost layer") + entry("a profile of navigation") + entry("a command")
     named = set(re.findall(r"`(fognav\.[a-z_.]+)`", rows))
     named |= set(re.findall(r'entry-points\."(fognav\.[a-z_]+)"', parts))
     assert named == {group for group in registered if group.startswith("fognav.")}

@@ -33,8 +33,8 @@ from robot_agent.hardware import (
     LidarTraits,
     WheelOdometry,
 )
-from robot_agent.lidars.repeated_scans import RepeatCounter
 from robot_agent.localization.pose import Pose2
+from robot_agent.scan_builder import RepeatCounter
 
 KEY = b"k" * 32
 TICK_M = math.pi * 0.072 / 508.8

@@ -6,7 +6,7 @@ import tracemalloc
 
 import numpy as np
 
-from robot_agent.lidars.scan_builder import Samples, ScanBuilder
+from robot_agent.scan_builder import Samples, ScanBuilder
 
 
 def batch(count: int) -> Samples:

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Final, NamedTuple
 
 import numpy as np
 
-from robot_agent.lidars.scan_builder import Samples, ScanBuilder
+from robot_agent.scan_builder import Samples, ScanBuilder
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray

@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Final, NamedTuple, Protocol
 import numpy as np
 
 from fog_kernels.lidar import FULL_CIRCLE_Q6, NODE_BYTES, decode_nodes, in_metres
-from robot_agent.lidars.scan_builder import Samples, ScanBuilder
+from robot_agent.scan_builder import Samples, ScanBuilder
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray

@@ -156,8 +156,8 @@ def run_tests(context: typer.Context, *, yes: Yes = False) -> None:
 def check_command(*, json: JsonOption = False) -> None:
     """Run all static checks.
 
-    These are format, lint, types, import contracts, dead code and generated files. All of them run; the exit code is 1
-    if one fails.
+    These are format, lint, types, import contracts, declared imports, dead code and generated files. All of them
+    run; the exit code is 1 if one fails.
     """
     from fognav import checks  # noqa: PLC0415  # keeps the other commands fast
 

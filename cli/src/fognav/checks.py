@@ -1,4 +1,4 @@
-"""The static checks: format, lint, types, import contracts, dead code, generated files.
+"""The static checks: format, lint, types, import contracts, declared imports, dead code, generated files.
 
 Each check is a program whose exit code is 0 if it passes. All of them run, as many at once as there are cores.
 """
@@ -37,6 +37,11 @@ CHECKS: Final = (
     # The longest first: the others run beside it.
     Check("types", (str(_TOOLS / "mypy"),), "correct the types listed above"),
     Check("import contracts", (str(_TOOLS / "lint-imports"),), "import inwards only: [tool.importlinter]"),
+    Check(
+        "declared imports",
+        (".ci/declared-imports", str(_TOOLS / "deptry")),
+        "declare in a member's pyproject.toml what it imports, and run requirements/compile",
+    ),
     Check("lint", (str(_TOOLS / "ruff"), "check", "."), "ruff check --fix . applies the automatic corrections"),
     Check("format", (str(_TOOLS / "ruff"), "format", "--check", "."), "ruff format ."),
     Check(

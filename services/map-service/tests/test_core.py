@@ -42,12 +42,11 @@ from fog_contracts.replica import Applied, Replica
 from fog_contracts.shapes import ShapeError
 from map_service.aggregator_monitor import TRUSTED_AFTER_S
 from map_service.core import MapCore
+from map_service.costmap import merge_overlapping
 from map_service.layers.base import CostLayer, write_cost
-from map_service.layers.obstacles import MAX_OF_ROBOT
-from map_service.layers.view_reach import BEYOND_M, CELL_HALF_WIDTH_M, MARGIN_M, RANGE_M
-from map_service.pending import merge_overlapping
+from map_service.layers.obstacles import BEYOND_M, CELL_HALF_WIDTH_M, MARGIN_M, MAX_OF_ROBOT, RANGE_M
 from map_service.registry import LayersError, make_layers
-from map_service.zone_validation import ZoneError, list_size, prepare_zone
+from map_service.zones import ZoneError, list_size, prepare_zone
 
 
 @dataclass

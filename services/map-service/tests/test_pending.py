@@ -21,10 +21,10 @@ from fog_contracts.messages import (
 )
 from fog_contracts.replica import Applied, Replica
 from map_service.core import COMMIT_CELLS, MapCore
+from map_service.costmap import TILE, PendingUpdates
 from map_service.layers.base import UpdatedBounds
-from map_service.pending import TILE, PendingUpdates
 from map_service.registry import make_layers
-from map_service.zone_validation import MAX_COVERAGE, MAX_ZONES, ZoneError, check_room, prepare_zone
+from map_service.zones import MAX_COVERAGE, MAX_ZONES, ZoneError, check_room, prepare_zone
 
 GEOMETRY = GridGeometry(500, 300, 0.05, 0.0, 0.0)
 windows = st.builds(

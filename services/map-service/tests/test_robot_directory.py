@@ -5,7 +5,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from fog_contracts.messages import RobotState
-from map_service.robot_directory import ALIVE_S, RobotDirectory
+from map_service.core import ALIVE_S, RobotDirectory
 
 
 def state(metrics):

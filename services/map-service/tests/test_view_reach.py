@@ -7,7 +7,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from fog_contracts.messages import REACH_UNIT_M, VIEW_SECTORS, View
-from map_service.layers.view_reach import CELL_HALF_WIDTH_M, MARGIN_M, RANGE_M, sees_beyond
+from map_service.layers.obstacles import CELL_HALF_WIDTH_M, MARGIN_M, RANGE_M, sees_beyond
 
 
 def expected(units: list[int], dx: float, dy: float) -> bool:

@@ -25,7 +25,7 @@ from fog_contracts.messages import (
 from map_service.core import MapCore
 from map_service.registry import make_layers
 from map_service.zone_times import StoredState
-from map_service.zone_validation import prepare_zone, zones_spans
+from map_service.zones import prepare_zone, zones_spans
 
 if TYPE_CHECKING:
     from collections.abc import Callable

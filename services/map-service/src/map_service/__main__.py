@@ -8,8 +8,8 @@ import os
 from fog_contracts import channels as ch
 from fog_runtime import logs, metrics, process
 from fog_runtime.backup_archive import STAMP
-from fog_runtime.clock import SystemClock, WallClock, boot_id
-from fog_runtime.configuration.settings import describe, load
+from fog_runtime.clock import SystemClock, WallClock, WallClockSource, boot_id
+from fog_runtime.configuration.settings import InflationSettings, describe, load
 from fog_runtime.configuration.site import load_site
 from fog_runtime.health import Health
 from fog_runtime.http import Front, load_tokens, unused
@@ -22,10 +22,20 @@ from map_service.api import make_api
 from map_service.core import MapCore
 from map_service.registry import make_layers
 from map_service.service import Service
-from map_service.settings import Settings
 from map_service.store import Store
 
 _log = logs.get("map")
+
+
+class Settings(InflationSettings, frozen=True, kw_only=True):
+    """Settings of the map-service.
+
+    `hazards_wait_s`: how long (s) the first map waits for the aggregator's hazards. `wall_clock`: when the time of day
+    is believed: while the kernel says that it is synchronized (`kernel`), or always (`trusted`).
+    """
+
+    hazards_wait_s: float = 3.0
+    wall_clock: WallClockSource = "kernel"
 
 
 async def main() -> None:

@@ -58,13 +58,13 @@ from fog_runtime.http.routes import InvalidBodyError
 from fog_runtime.stores.audit import KINDS, AuditEntry, CursorError
 from fog_runtime.stores.idempotency import Attempt, IdempotencyError
 from fog_runtime.work import BusyError, Worker
+from map_service.core import ScrapeTarget
 from map_service.costmap import LayeredCostmap
 from map_service.layers.base import Grid
-from map_service.robot_directory import ScrapeTarget
 from map_service.service import Service
 from map_service.store import StoreError
-from map_service.zone_validation import ZoneError
 from map_service.zone_writer import ConflictError
+from map_service.zones import ZoneError
 
 AuditKind = Literal["alert", "area", "mission", "override", "robot", "stop", "store", "zone"]
 

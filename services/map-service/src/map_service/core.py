@@ -8,23 +8,21 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
-from typing import TYPE_CHECKING, TypeVar
+from typing import TYPE_CHECKING, Final, TypeVar
 
 from msgspec import structs
 
 from fog_contracts import channels as ch
 from fog_contracts.costs import DEFAULT_INFLATION
 from fog_contracts.handlers import Moment, Publication
-from fog_contracts.messages import HazardArea, ZoneSet
+from fog_contracts.messages import HazardArea, Message, ZoneSet
 from map_service.costmap import LayeredCostmap
 from map_service.layers.hazards import HazardsLayer
 from map_service.layers.zones import ZonesLayer
-from map_service.robot_directory import RobotDirectory
 from map_service.zone_times import StoredState
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Mapping, Sequence
-    from typing import Final
 
     from fog_contracts.channels import Channel
     from fog_contracts.costs import Inflation
@@ -34,8 +32,39 @@ if TYPE_CHECKING:
     from fog_contracts.raster import Spans
     from map_service.aggregator_monitor import AggregatorMonitor
     from map_service.layers.base import CostLayer
-    from map_service.zone_catalog import ZoneCatalog
     from map_service.zone_times import Progress
+    from map_service.zones import ZoneCatalog
+
+ALIVE_S: Final = 15.0
+"""How long a robot counts as alive after its last state: three scrapes, so that a short gap of the Wi-Fi hides none."""
+
+
+class ScrapeTarget(Message, frozen=True, kw_only=True):
+    """A target in the form of Prometheus's HTTP service discovery: one address (host:port), and the robot's id."""
+
+    targets: list[str]
+    labels: dict[str, str]
+
+
+class RobotDirectory:
+    """The robots that were heard of lately, by id; times are those of the caller's monotonic clock (s)."""
+
+    def __init__(self) -> None:
+        self._heard: dict[str, tuple[float, str]] = {}
+
+    def heard(self, robot: str, state: RobotState, now: float) -> None:
+        """Remember a robot's state; forget robots that have been silent."""
+        self._heard[robot] = now, state.metrics
+        self._heard = {name: entry for name, entry in self._heard.items() if now - entry[0] <= ALIVE_S}
+
+    def targets(self, now: float) -> list[ScrapeTarget]:
+        """Return the robots that are alive and serve metrics, ordered by id."""
+        return [
+            ScrapeTarget(targets=[address], labels={"robot": robot})
+            for robot, (at, address) in sorted(self._heard.items())
+            if address and now - at <= ALIVE_S
+        ]
+
 
 L = TypeVar("L", bound="CostLayer")
 

@@ -6,26 +6,142 @@ Pure, apart from `measure`, by which a process observes how long the steps take.
 from __future__ import annotations
 
 from contextlib import nullcontext
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 from msgspec import structs
 
+from fog_contracts.grid import Window
 from fog_contracts.messages import Trace
 from fog_contracts.replica import MasterMap
-from map_service.layers.inflation import InflationLayer
-from map_service.pending import PendingUpdates
+from fog_kernels.inflation import inflate, inflate_window, inflation_table
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Sequence
+    from collections.abc import Callable, Iterable, Sequence
     from contextlib import AbstractContextManager
+    from typing import Final
 
     from fog_contracts.costs import Inflation
-    from fog_contracts.grid import StaticMap, Window
+    from fog_contracts.grid import GridGeometry, StaticMap
     from fog_contracts.handlers import Later
     from fog_contracts.messages import Cause, Layer, MapDelta, MapHeartbeat, MapSnapshot
     from fog_contracts.replica import Version
-    from map_service.layers.base import CostLayer, Grid
+    from map_service.layers.base import CostLayer, Grid, UpdatedBounds
+
+TILE: Final = 64
+"""Cells per side of the tiles by which large changes are remembered."""
+MAX_WINDOWS: Final = 64
+"""Most windows that are recomputed exactly; more of them are recomputed by tiles."""
+
+
+class Portion(NamedTuple):
+    """Windows to be recomputed now, and the changes that they are parts of."""
+
+    windows: list[Window]
+    bounds: list[UpdatedBounds]
+
+
+class PendingUpdates:
+    """The updated bounds of all layers that are not on the map yet.
+
+    A change of a large floor takes longer than the fleet may wait for a heartbeat. So what is large is recomputed in
+    portions, each a version of its own, and what is small (a hazard) goes before it.
+    """
+
+    def __init__(self, geometry: GridGeometry) -> None:
+        self._geometry = geometry
+        self._tiles = np.zeros((-(-geometry.height // TILE), -(-geometry.width // TILE)), dtype=np.bool_)
+        self._in_tiles: list[UpdatedBounds] = []
+
+    @property
+    def waiting(self) -> bool:
+        """Whether something was left for a later portion."""
+        return bool(self._in_tiles)
+
+    def take(self, updated: Sequence[UpdatedBounds], cells: int | None) -> Portion:
+        """Add bounds, and return a portion of about `cells` (None: all that waits); small windows come first."""
+        exact: list[UpdatedBounds] = []
+        remaining = self._geometry.width * self._geometry.height if cells is None else cells
+        for bounds in updated:
+            size = bounds.window.width * bounds.window.height
+            if len(exact) < MAX_WINDOWS and size <= remaining:
+                exact.append(bounds)
+                remaining -= size
+            else:
+                self._postpone(bounds)
+        if cells is None and self._in_tiles:
+            remaining = self._tiles.size * TILE * TILE
+        windows = merge_overlapping([bounds.window for bounds in exact])
+        large = self._take_tiles(remaining)
+        causes = [bounds for bounds in self._in_tiles if any(_overlap(bounds.window, window) for window in large)]
+        if not self._tiles.any():
+            self._in_tiles = []
+        return Portion([*windows, *large], [*exact, *causes])
+
+    def _postpone(self, bounds: UpdatedBounds) -> None:
+        window = bounds.window
+        if window.empty:
+            return
+        self._in_tiles.append(bounds)
+        last_row, last_column = (window.y + window.height - 1) // TILE, (window.x + window.width - 1) // TILE
+        self._tiles[window.y // TILE : last_row + 1, window.x // TILE : last_column + 1] = True
+
+    def _take_tiles(self, cells: int) -> list[Window]:
+        """Remove tiles of about `cells` in all, bottom first, and return them as windows that don't overlap."""
+        windows: list[Window] = []
+        while cells >= TILE * TILE and self._tiles.any():
+            row = int(np.argmax(self._tiles.any(axis=1)))
+            first = int(np.argmax(self._tiles[row]))
+            run = self._tiles[row, first : first + cells // (TILE * TILE)]
+            columns = len(run) if run.all() else int(np.argmin(run))
+            # Equal runs above make one window.
+            limit = max(1, cells // (TILE * TILE * columns))
+            above = self._tiles[row : row + limit, first : first + columns].sum(axis=1) == columns
+            rows = len(above) if above.all() else int(np.argmin(above))
+            self._tiles[row : row + rows, first : first + columns] = False
+            window = Window(first * TILE, row * TILE, columns * TILE, rows * TILE)
+            cells -= window.width * window.height
+            windows.append(self._geometry.clip(window))
+        return windows
+
+
+def _overlap(a: Window, b: Window) -> bool:
+    return not a.intersection(b).empty
+
+
+def merge_overlapping(windows: list[Window]) -> list[Window]:
+    """Merge overlapping windows, so that no cell is computed twice; disjoint windows stay separate and small."""
+    result: list[Window] = []
+    for window in windows:
+        if window.empty:
+            continue
+        grown = window
+        disjoint = []
+        for other in result:
+            if grown.intersection(other).empty:
+                disjoint.append(other)
+            else:
+                grown = grown.union(other)
+        # Once grown, it may overlap further windows.
+        result = [*disjoint, grown] if grown == window else merge_overlapping([*disjoint, grown])
+    return result
+
+
+class InflationLayer:
+    """Holds the inflated map of a grid of this resolution (m per cell)."""
+
+    def __init__(self, raw: Grid, resolution: float, inflation: Inflation) -> None:
+        self._table = inflation_table(resolution, inflation)
+        self.cost = inflate(raw, self._table)
+
+    def update(self, raw: Grid, windows: Iterable[Window]) -> list[Window]:
+        """Update the inflation around windows in which `raw` changed; return the windows of `cost` that it rewrote."""
+        rewritten = (Window(*inflate_window(raw, self._table, *window, self.cost)) for window in windows)
+        return [window for window in rewritten if not window.empty]
+
+    def inflate_all(self, raw: Grid) -> Grid:
+        """Return the inflation of a whole map, computed from scratch."""
+        return inflate(raw, self._table)
 
 
 class LayeredCostmap:

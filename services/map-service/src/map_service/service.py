@@ -14,8 +14,7 @@ from fog_runtime.clock import ticker
 from fog_runtime.transports.edges import Edges
 from map_service.publisher import Publisher
 from map_service.store import StoreError, StoreLostError
-from map_service.times_keeper import TimesKeeper
-from map_service.zone_writer import ZoneWriter
+from map_service.zone_writer import TimesKeeper, ZoneWriter
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence

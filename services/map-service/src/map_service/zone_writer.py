@@ -1,4 +1,4 @@
-"""Writes of zones: validated, stored first, then put on the map; and the zones loaded from the store."""
+"""Writes of zones: validated, stored first, then put on the map; and what is loaded from the store and kept in it."""
 
 from __future__ import annotations
 
@@ -7,18 +7,17 @@ from contextlib import contextmanager, suppress
 from typing import TYPE_CHECKING, Final
 
 from msgspec import structs
-from prometheus_client import Counter
+from prometheus_client import Counter, Gauge
 
 from fog_contracts import channels as ch
 from fog_runtime import logs
 from fog_runtime.work import Worker
 from map_service.store import Audit, RecoveryError, StoreError
-from map_service.unusable_zones import UnusableZones
 from map_service.zone_times import StoredState
-from map_service.zone_validation import check_list_size, check_room, list_size, prepare_zone, zones_spans
+from map_service.zones import check_list_size, check_room, list_size, prepare_zone, zones_spans
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator
+    from collections.abc import Callable, Iterator, Mapping
     from typing import Literal
 
     from fog_contracts.handlers import Moment
@@ -29,8 +28,64 @@ if TYPE_CHECKING:
     from map_service.core import MapCore
     from map_service.publisher import Publisher
     from map_service.store import Outcome, Store
-    from map_service.times_keeper import TimesKeeper
-    from map_service.zone_validation import PreparedZone
+    from map_service.zone_times import Progress
+    from map_service.zones import PreparedZone
+
+PERIOD_S: Final = 30.0
+"""How often the remaining times are stored: after a boot, a zone may last longer by up to this time."""
+
+
+class TimesKeeper:
+    """Stores the times of zones: at once when one starts or ends, else periodically; `boot` is `clock.boot_id`."""
+
+    def __init__(self, core: MapCore, store: Store, boot: str) -> None:
+        self.boot = boot
+        self._core = core
+        self._store = store
+        self._stored: dict[str, Progress] = {}
+        self._stored_at = 0.0
+
+    async def load(self) -> Mapping[str, Progress]:
+        """Return the stored times by the zones' ids; raises `StoreError`."""
+        return await self._store.zone_times()
+
+    async def save(self, now: float) -> None:
+        """Store the times if that is due at `now` (s, monotonic); raises `StoreError`."""
+        current = self._core.zone_progress(self.boot, now)
+        steps, stored_steps = (
+            {name: (times.version, times.started, times.ended) for name, times in found.items()}
+            for found in (current, self._stored)
+        )
+        if steps == stored_steps and (not current or now < self._stored_at + PERIOD_S):
+            return
+        await self._store.write_zone_times(current)
+        self._stored, self._stored_at = current, now
+
+
+UNUSABLE = Gauge("fognav_zones_unusable", "Stored zones that are left out of the map because their record is invalid")
+
+_log = logs.get("map")
+
+
+class UnusableZones:
+    """Why each of them is left out, by id."""
+
+    def __init__(self) -> None:
+        self.reasons: dict[str, str] = {}
+
+    def replace(self, reasons: Mapping[str, str]) -> None:
+        """Record which zones are left out now; each new one is logged."""
+        for name, reason in reasons.items():
+            if self.reasons.get(name) != reason:
+                _log.error("stored_zone_unusable", zone=name, reason=reason, remedy="DELETE the zone and add it again")
+        self.reasons = dict(reasons)
+        UNUSABLE.set(len(reasons))
+
+    def detail(self) -> str:
+        """Return a text for /readyz that names them; empty without any."""
+        named = ", ".join(f"{name} ({reason})" for name, reason in sorted(self.reasons.items()))
+        return f"; left out, because their records are invalid: {named}"[:500] if named else ""
+
 
 ZONE_WRITES = Counter("fognav_zone_writes_total", "Writes of zones to the store, by outcome", ["outcome"])
 KEPT_S: Final = 3600.0
@@ -38,8 +93,6 @@ KEPT_S: Final = 3600.0
 _DELETED_AT_ONCE: Final = 20
 MAX_PREPARING = 64
 """Most zones that are validated or wait for it; further requests are answered with 503."""
-
-_log = logs.get("map")
 
 
 class ConflictError(Exception):

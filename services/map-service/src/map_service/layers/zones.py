@@ -9,9 +9,8 @@ from fog_contracts.messages import Cause
 from fog_contracts.shapes import shape_spans
 from fog_kernels.spans import lower_speeds, raise_costs
 from map_service.layers.base import CostLayer, LayerFactory, NoOptions
-from map_service.zone_catalog import ZoneCatalog, ZoneEntry
 from map_service.zone_times import Progress, StoredState, ZoneTimes
-from map_service.zone_validation import named_spans
+from map_service.zones import ZoneCatalog, ZoneEntry, named_spans
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Mapping

@@ -153,7 +153,7 @@ class Extension(Message, frozen=True, kw_only=True):
 )  # fmt: skip
 
 SHAPE = (
-    Edit(f"{MESSAGES}/zones.py", r"^Shape = ", before='''\
+    Edit(f"{MESSAGES}/maps.py", r"^Shape = ", before='''\
 class RingShape(Message, frozen=True, kw_only=True, tag="ring", tag_field="type"):
     """Everything between two circles around one centre."""
 
@@ -165,7 +165,7 @@ class RingShape(Message, frozen=True, kw_only=True, tag="ring", tag_field="type"
 ''', behind=" | RingShape"),
     Edit(SHAPES, r"^from fog_contracts\.messages import", before="""\
 from fog_contracts.messages import RingShape
-from fog_contracts.raster import mask_spans, rasterize_line
+from fog_contracts.shapes import mask_spans, rasterize_line
 """),
     Edit(SHAPES, r"^KINDS: ", before="""\
 class _Ring(ShapeKind[RingShape]):
@@ -286,7 +286,7 @@ def test_only_messages_shapes_and_the_commands_that_draw_them_distinguish_kinds_
     asking = re.compile(rf"\b({'|'.join(names)})\b|\btype\b\W+({'|'.join(tags)})\b")
     files = [file for source in SOURCES for suffix in ("py", "js") for file in source.parent.rglob(f"*.{suffix}")]
     found = {str(file.relative_to(ROOT)) for file in files if asking.search(file.read_text("utf-8"))}
-    assert found == {f"{MESSAGES}/zones.py", SHAPES, *DRAWING_COMMANDS, *MAKE_POLYGONS, ORACLE}
+    assert found == {f"{MESSAGES}/maps.py", SHAPES, *DRAWING_COMMANDS, *MAKE_POLYGONS, ORACLE}
 
 
 # --- The document ---------------------------------------------------------------------------------------------------

@@ -8,9 +8,8 @@ from pathlib import Path
 import pytest
 from typer.testing import CliRunner
 
+from fog_contracts.generate.acl import mqtt_acl, zenoh_acl
 from fog_contracts.generate.header import firmware_header
-from fog_contracts.generate.mqtt_acl import mqtt_acl
-from fog_contracts.generate.zenoh_acl import zenoh_acl
 from fognav import checkout, generated
 from fognav.__main__ import app
 

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from fog_contracts.costs import DEFAULT_INFLATION
 from fog_contracts.grid import GridGeometry, StaticMap
 from fog_contracts.messages import SimObstacle
-from fog_contracts.raster import rasterize
+from fog_contracts.shapes import rasterize
 from fog_contracts.site import AreaSite, Site
 from fog_kernels.astar import Planner
 from fog_kernels.inflation import inflate, inflation_table

@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from fog_contracts.costs import Inflation
 from fog_contracts.grid import GridGeometry, StaticMap
 from fog_contracts.messages import Pose
-from fog_contracts.raster import rasterize
+from fog_contracts.shapes import rasterize
 from fog_contracts.site import AreaSite, NodeSite, RobotSite, Site, Sonar
 from fog_kernels.astar import Planner
 from fog_kernels.inflation import inflate, inflation_table

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from fog_contracts.geometry import normalized_polygon
 from fog_contracts.grid import GridGeometry
-from fog_contracts.raster import rasterize
+from fog_contracts.shapes import rasterize
 from fog_contracts.site import NodeSite, Site, Sonar
 
 HERE = Path(__file__).parent

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from fog_contracts.costs import DEFAULT_INFLATION
 from fog_contracts.geometry import contains_point, distance_to_polygon
-from fog_contracts.raster import rasterize
+from fog_contracts.shapes import rasterize
 from fog_contracts.site import AreaSite, Site
 from fog_kernels.astar import Planner
 from fog_kernels.inflation import inflate, inflation_table

@@ -9,11 +9,10 @@ from importlib.metadata import distribution
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
+from fog_contracts.generate.acl import mqtt_acl, zenoh_acl
 from fog_contracts.generate.header import firmware_header
 from fog_contracts.generate.markdown import OpenApi, channels_markdown
-from fog_contracts.generate.mqtt_acl import mqtt_acl
 from fog_contracts.generate.robot_toml import robot_settings_markdown
-from fog_contracts.generate.zenoh_acl import zenoh_acl
 from fog_runtime.clock import SystemClock
 from fog_runtime.configuration.robot_file import default_robot
 from fog_runtime.configuration.site import load_site

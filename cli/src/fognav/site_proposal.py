@@ -19,7 +19,7 @@ from fog_contracts.costs import DEFAULT_INFLATION, FREE, LETHAL, ROBOT_RADIUS
 from fog_contracts.geometry import Point
 from fog_contracts.grid import GridGeometry, StaticMap
 from fog_contracts.messages import AreaState, Pose
-from fog_contracts.raster import rasterize
+from fog_contracts.shapes import rasterize
 from fog_contracts.site import AreaSite, DemoPlan, NodeSite, Place, RobotSite, Site, Sonar
 from fog_kernels.astar import Planner
 from fog_kernels.distance import squared_distance_capped

@@ -16,7 +16,7 @@ import numpy as np
 from fog_contracts.cones import sonar_cone
 from fog_contracts.costs import DEFAULT_INFLATION, FREE, LETHAL
 from fog_contracts.geometry import lengths_along
-from fog_contracts.raster import rasterize
+from fog_contracts.shapes import rasterize
 from fog_kernels.astar import Planner, nearest_traversable
 from fog_kernels.distance import squared_distance_capped
 from fog_kernels.inflation import inflate, inflation_table

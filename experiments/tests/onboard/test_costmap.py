@@ -11,8 +11,8 @@ from hypothesis import strategies as st
 
 from fog_contracts.costs import DEFAULT_INFLATION, LETHAL
 from fog_contracts.grid import GridGeometry
-from fog_contracts.raster import polygon_spans
 from fog_contracts.replica import MasterMap, Replica
+from fog_contracts.shapes import polygon_spans
 from fog_kernels.inflation import inflate, inflation_table
 from fog_kernels.raycast import cast
 from fognav_experiments.onboard.costmap import OnboardCostmap

@@ -3,8 +3,7 @@
 import pytest
 
 from fog_contracts import channels as ch
-from fog_contracts.fencing import HEARD_LIMIT, MOST_AHEAD, Fence, epoch_in
-from fog_contracts.handlers import Moment, RefusedMessageError
+from fog_contracts.handlers import HEARD_LIMIT, MOST_AHEAD, Fence, Moment, RefusedMessageError, epoch_in
 from fog_contracts.messages import Leader, MapHeartbeat, RobotGoal, ZoneSet
 
 AT = Moment(1.0, 2.0)

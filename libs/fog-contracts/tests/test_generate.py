@@ -13,11 +13,10 @@ import pytest
 from fog_contracts import channels as ch
 from fog_contracts import messages as m
 from fog_contracts.channels import CHANNELS
-from fog_contracts.generate.fields import bounds, message_fields, parts, type_text
+from fog_contracts.generate import bounds, message_fields, parts, type_text
+from fog_contracts.generate.acl import mqtt_acl, zenoh_acl
 from fog_contracts.generate.header import firmware_header
 from fog_contracts.generate.markdown import channels_markdown
-from fog_contracts.generate.mqtt_acl import mqtt_acl
-from fog_contracts.generate.zenoh_acl import zenoh_acl
 
 OPENAPI = {
     "paths": {

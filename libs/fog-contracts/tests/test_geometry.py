@@ -15,7 +15,7 @@ from fog_contracts.geometry import (
     signed_area,
 )
 from fog_contracts.grid import GridGeometry, Window
-from fog_contracts.raster import rasterize
+from fog_contracts.shapes import rasterize
 
 SQUARE = [(0.0, 0.0), (1.0, 0.0), (1.0, 1.0), (0.0, 1.0)]
 GRID = GridGeometry(40, 30, 0.1, -2.0, -1.0)

@@ -5,8 +5,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from msgspec import structs
 
-from fog_contracts.hazards import digest
-from fog_contracts.messages import AggregatorHeartbeat, AreaHazard
+from fog_contracts.messages import AggregatorHeartbeat, AreaHazard, hazards_digest
 
 HAZARDS = st.lists(
     st.builds(
@@ -22,9 +21,9 @@ HAZARDS = st.lists(
 def test_digest_does_not_depend_on_the_order_and_fits_into_the_heartbeat(hazards, order):
     shuffled = list(hazards)
     order.shuffle(shuffled)
-    assert digest(shuffled) == digest(hazards)
-    AggregatorHeartbeat(epoch=1, areas={}, complete=True, digest=digest(hazards), uptime=0.0, stamp=0.0)
-    assert 0 <= digest(hazards) < 2**63
+    assert hazards_digest(shuffled) == hazards_digest(hazards)
+    AggregatorHeartbeat(epoch=1, areas={}, complete=True, digest=hazards_digest(hazards), uptime=0.0, stamp=0.0)
+    assert 0 <= hazards_digest(hazards) < 2**63
 
 
 @pytest.mark.parametrize("change", [{"seq": 8}, {"state": "unknown"}, {"penalty": 1}, {"area": "gate"}])
@@ -32,5 +31,5 @@ def test_digest_covers_area_seq_state_and_penalty(change):
     hazard = AreaHazard(
         area="hall", state="clear", severity=0, penalty=0, since=0.0, seq=7, epoch=1, cause="", nodes={"n1": "clear"}
     )
-    assert digest([structs.replace(hazard, **change)]) != digest([hazard])
-    assert digest([structs.replace(hazard, cause="another", since=5.0)]) == digest([hazard])
+    assert hazards_digest([structs.replace(hazard, **change)]) != hazards_digest([hazard])
+    assert hazards_digest([structs.replace(hazard, cause="another", since=5.0)]) == hazards_digest([hazard])

@@ -11,8 +11,7 @@ from hypothesis import strategies as st
 from fog_contracts.geometry import GeometryError, normalized_polygon
 from fog_contracts.grid import GridGeometry
 from fog_contracts.messages import CircleShape, CorridorShape, PolygonShape, RectangleShape, Shape
-from fog_contracts.raster import rasterize
-from fog_contracts.shapes import KINDS, ShapeError, normalized_shape, rasterize_shape, shape_contains
+from fog_contracts.shapes import KINDS, ShapeError, normalized_shape, rasterize, rasterize_shape, shape_contains
 
 GRID = GridGeometry(80, 60, 0.05, -1.0, -0.5)
 coordinate = st.floats(-1.5, 3.5).map(lambda v: round(v, 2))

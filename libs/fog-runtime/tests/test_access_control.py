@@ -14,8 +14,7 @@ from paho.mqtt.enums import CallbackAPIVersion
 
 from fog_contracts import channels as ch
 from fog_contracts import messages as m
-from fog_contracts.generate.mqtt_acl import mqtt_acl
-from fog_contracts.generate.zenoh_acl import zenoh_acl
+from fog_contracts.generate.acl import mqtt_acl, zenoh_acl
 from fog_runtime.clock import SystemClock
 from fog_runtime.transports import zenoh_edge
 from fog_runtime.transports.zenoh_edge import ZenohEdge, session_config

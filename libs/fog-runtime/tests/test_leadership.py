@@ -16,8 +16,7 @@ from hypothesis.stateful import RuleBasedStateMachine, invariant, rule
 from lease_model import LeaseModel
 
 from fog_contracts import channels as ch
-from fog_contracts.fencing import Fence
-from fog_contracts.handlers import Publication, RefusedMessageError
+from fog_contracts.handlers import Fence, Publication, RefusedMessageError
 from fog_contracts.messages import Leader, MapHeartbeat, RobotState, ZoneSet
 from fog_runtime.clock import ManualClock
 from fog_runtime.health import Health

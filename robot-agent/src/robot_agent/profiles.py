@@ -19,8 +19,8 @@ if TYPE_CHECKING:
 
     from fog_contracts.handlers import Moment
     from fog_contracts.messages import PointXY, ProfileName, Refusal, RobotGoal, RobotPath
-    from fog_contracts.raster import Spans
     from fog_contracts.replica import Replica
+    from fog_contracts.shapes import Spans
     from robot_agent.config import MotionConfig
     from robot_agent.localization.localizer import Localizer
     from robot_agent.localization.pose import Pose2

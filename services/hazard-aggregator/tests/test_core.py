@@ -7,7 +7,6 @@ from msgspec import structs
 
 from fog_contracts import channels as ch
 from fog_contracts.handlers import Moment, Publication, RefusedMessageError
-from fog_contracts.hazards import digest, is_relief
 from fog_contracts.messages import (
     AggregatorHeartbeat,
     AreaDefinition,
@@ -16,6 +15,8 @@ from fog_contracts.messages import (
     NodeReading,
     NodeValue,
     RobotPose,
+    hazards_digest,
+    is_relief,
 )
 from fog_contracts.site import NodeSite, Sonar
 from hazard_aggregator.core import Aggregator, Outbox
@@ -210,7 +211,7 @@ def test_heartbeat_is_published_five_times_a_second_and_lists_every_announced_ha
     assert len(beats) == 10
     announced = rig.core.announced()["hall"]
     assert (beats[-1].epoch, beats[-1].areas, beats[-1].complete) == (5, {"hall": announced.seq}, True)
-    assert beats[-1].digest == digest([announced])
+    assert beats[-1].digest == hazards_digest([announced])
     assert beats[-1].uptime - beats[0].uptime == pytest.approx(1.8)
     rig.read(3.0)
     assert rig.core.withheld() == ["hall"]

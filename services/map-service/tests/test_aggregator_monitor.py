@@ -12,8 +12,7 @@ from msgspec import structs
 from fog_contracts import channels as ch
 from fog_contracts.grid import GridGeometry, StaticMap
 from fog_contracts.handlers import Moment, Publication, RefusedMessageError
-from fog_contracts.hazards import digest
-from fog_contracts.messages import AggregatorHeartbeat, AreaDefinition, AreaHazard, HazardOverride
+from fog_contracts.messages import AggregatorHeartbeat, AreaDefinition, AreaHazard, HazardOverride, hazards_digest
 from map_service.aggregator_monitor import IN_FLIGHT_S, TRUSTED_AFTER_S
 from map_service.core import MapCore
 from map_service.layers.hazards import HazardsLayer
@@ -57,7 +56,7 @@ class Fog:
         self, *announced: AreaHazard, epoch: int = 5, delay: float = 0.0, complete: bool = True, **changes
     ) -> None:
         message = AggregatorHeartbeat(
-            epoch=epoch, areas={h.area: h.seq for h in announced}, complete=complete, digest=digest(announced),
+            epoch=epoch, areas={h.area: h.seq for h in announced}, complete=complete, digest=hazards_digest(announced),
             uptime=self.now - delay + 5000.0, stamp=0.0,
         )  # fmt: skip
         self.deliver(ch.AGGREGATOR_HEARTBEAT, structs.replace(message, **changes))
@@ -130,7 +129,7 @@ def test_area_costs_something_on_the_map_1500_ms_after_the_last_heartbeat_whatev
 
     def beat(now: float) -> None:
         message = AggregatorHeartbeat(
-            epoch=5, areas={"hall": 3}, complete=True, digest=digest([CLEAR]), uptime=now + 5000.0, stamp=0.0
+            epoch=5, areas={"hall": 3}, complete=True, digest=hazards_digest([CLEAR]), uptime=now + 5000.0, stamp=0.0
         )
         core.handlers()[ch.AGGREGATOR_HEARTBEAT]({}, message, Moment(now, now))
 

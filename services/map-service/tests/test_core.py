@@ -14,7 +14,6 @@ from fog_contracts import channels as ch
 from fog_contracts.costs import INSCRIBED, LETHAL, UNKNOWN, penalty_cost
 from fog_contracts.grid import GridGeometry, Window
 from fog_contracts.handlers import Moment, Publication, RefusedMessageError
-from fog_contracts.hazards import digest
 from fog_contracts.messages import (
     REACH_UNIT_M,
     VIEW_SECTORS,
@@ -36,10 +35,10 @@ from fog_contracts.messages import (
     View,
     Zone,
     ZoneSet,
+    hazards_digest,
 )
-from fog_contracts.raster import ShapeMask
 from fog_contracts.replica import Applied, Replica
-from fog_contracts.shapes import ShapeError
+from fog_contracts.shapes import ShapeError, ShapeMask
 from map_service.aggregator_monitor import TRUSTED_AFTER_S
 from map_service.core import MapCore
 from map_service.costmap import merge_overlapping
@@ -89,7 +88,7 @@ class LivingAggregator:
     def heartbeat(self, stamp: float, *, areas: dict[str, int] | None = None, complete: bool = False):
         listed = {name: h.seq for name, h in self.announced.items()} if areas is None else areas
         return AggregatorHeartbeat(
-            epoch=self.epoch, areas=listed, complete=complete, digest=digest(self.announced.values()),
+            epoch=self.epoch, areas=listed, complete=complete, digest=hazards_digest(self.announced.values()),
             uptime=stamp + 1e5, stamp=stamp,
         )  # fmt: skip
 

@@ -17,8 +17,8 @@ from fog_contracts.messages import (
     RobotPose,
     Trace,
 )
-from fog_contracts.raster import rasterize
 from fog_contracts.replica import MasterMap
+from fog_contracts.shapes import rasterize
 from fog_kernels.inflation import inflate, inflation_table
 
 Grid = NDArray[np.uint8]

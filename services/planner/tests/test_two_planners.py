@@ -10,8 +10,7 @@ import httpx
 import pytest
 
 from fog_contracts import channels as ch
-from fog_contracts.fencing import Fence
-from fog_contracts.handlers import Moment, RefusedMessageError
+from fog_contracts.handlers import Fence, Moment, RefusedMessageError
 from fog_contracts.messages import RobotGoal, RobotPath, RobotPose, RobotRelease
 from fog_runtime.clock import SystemClock, ticker
 

@@ -10,7 +10,7 @@ from msgspec import structs
 
 from fog_contracts.cones import SONAR_HALF_CONE, sonar_cone
 from fog_contracts.costs import FREE
-from fog_contracts.raster import rasterize
+from fog_contracts.shapes import rasterize
 from fog_contracts.site import NodeSite, Sonar
 from fog_kernels.raycast import cast
 from fognav_sim.floor import Floor

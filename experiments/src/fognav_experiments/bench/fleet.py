@@ -33,9 +33,8 @@ from fog_contracts.messages import (
     Zone,
     ZoneSet,
 )
-from fog_contracts.raster import rasterize
 from fog_contracts.replica import MasterMap
-from fog_contracts.shapes import rasterize_shape
+from fog_contracts.shapes import rasterize, rasterize_shape
 from fog_kernels.components import Components
 from fog_kernels.inflation import inflate, inflate_window, inflation_table
 from fognav_experiments.bench.office import CORRIDOR, corridor_rows

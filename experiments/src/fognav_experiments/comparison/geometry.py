@@ -13,7 +13,7 @@ import numpy as np
 from fog_contracts.costs import DEFAULT_INFLATION, LETHAL, Inflation
 from fog_contracts.geometry import lengths_along
 from fog_contracts.messages import Pose, RobotGoal
-from fog_contracts.raster import polygon_spans
+from fog_contracts.shapes import polygon_spans
 from fog_kernels.astar import Planner
 from fog_kernels.inflation import inflate, inflation_table
 from fog_kernels.raycast import cast

@@ -24,7 +24,7 @@ if TYPE_CHECKING:
 
     from fog_contracts.grid import GridGeometry
     from fog_contracts.messages import PointXY
-    from fog_contracts.raster import Spans
+    from fog_contracts.shapes import Spans
     from robot_agent.localization.pose import Pose2
 
     Cells = NDArray[np.int64]

@@ -25,8 +25,8 @@ if TYPE_CHECKING:
     from fog_contracts.grid import GridGeometry
     from fog_contracts.handlers import Moment
     from fog_contracts.messages import PlanCode, PointXY, RobotGoal
-    from fog_contracts.raster import Spans
     from fog_contracts.replica import Replica
+    from fog_contracts.shapes import Spans
     from robot_agent.localization.localizer import Localizer
     from robot_agent.localization.pose import Pose2
     from robot_agent.motion.path_follower import PathFollower

@@ -21,7 +21,7 @@ class MapFollower:
     """Keeps a replica at the newest known version of the map.
 
     The newest version is the highest that a heartbeat, a delta or a snapshot announced: higher epoch first, then higher
-    seq. It never goes back: a writer with a lower epoch was replaced (`fog_contracts.fencing`).
+    seq. It never goes back: a writer with a lower epoch was replaced (`fog_contracts.handlers`).
 
     A map-service that takes over has another epoch, and usually the same map: as its hash proves that, the copy goes on
     under its new name, without a snapshot.

@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
-    from fog_contracts.raster import Spans
+    from fog_contracts.shapes import Spans
 
 
 @njit(

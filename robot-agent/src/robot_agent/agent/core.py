@@ -24,8 +24,8 @@ from typing import TYPE_CHECKING, Final
 from msgspec.structs import replace
 
 from fog_contracts import channels as ch
-from fog_contracts.fencing import Fence
 from fog_contracts.follower import MapFollower
+from fog_contracts.handlers import Fence
 from fog_contracts.messages import LoopHealth
 from fog_contracts.replica import MapError
 from robot_agent.agent.blocked_places import BlockedPlaces

@@ -18,8 +18,8 @@ if TYPE_CHECKING:
     from fog_contracts.follower import MapFollower
     from fog_contracts.handlers import Moment
     from fog_contracts.messages import MapDelta, MapHeartbeat, ProfileName, RobotPath, RobotRelease
-    from fog_contracts.raster import Spans
     from fog_contracts.replica import Replica, Version
+    from fog_contracts.shapes import Spans
     from robot_agent.agent.blocked_places import BlockedPlaces
     from robot_agent.agent.path.path_driving import PathDriving
     from robot_agent.agent.sensing.obstacle_reporter import ObstacleReporter

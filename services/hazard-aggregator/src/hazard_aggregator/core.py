@@ -13,10 +13,8 @@ from typing import TYPE_CHECKING, Final, Literal, NamedTuple
 from msgspec import structs
 
 from fog_contracts import channels as ch
-from fog_contracts.fencing import within_reach
-from fog_contracts.handlers import Publication, RefusedMessageError
-from fog_contracts.hazards import digest, is_relief
-from fog_contracts.messages import AggregatorHeartbeat
+from fog_contracts.handlers import Publication, RefusedMessageError, within_reach
+from fog_contracts.messages import AggregatorHeartbeat, hazards_digest, is_relief
 from hazard_aggregator.overrides import Overrides
 from hazard_aggregator.publications import definition_publication, deletions, hazard_publications, node_publication
 
@@ -408,7 +406,7 @@ class Aggregator:
             epoch=self.epoch,
             areas=areas,
             complete=self._complete,
-            digest=digest(announced[area] for area, seq in areas.items() if seq > 0),
+            digest=hazards_digest(announced[area] for area, seq in areas.items() if seq > 0),
             uptime=at.now,
             stamp=at.stamp,
         )

@@ -10,10 +10,9 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Final
 
 from fog_contracts import channels as ch
-from fog_contracts.fencing import within_reach
-from fog_contracts.handlers import RefusedMessageError
-from fog_contracts.hazards import digest
+from fog_contracts.handlers import RefusedMessageError, within_reach
 from fog_contracts.liveness import HeartbeatWatch
+from fog_contracts.messages import hazards_digest
 
 if TYPE_CHECKING:
     from collections.abc import Collection, Mapping
@@ -145,7 +144,7 @@ class AggregatorMonitor:
     ) -> None:
         announced = [area for area, seq in heartbeat.areas.items() if seq > 0]
         missing = {area for area in announced if area not in received or not self._listed(received[area])}
-        self._digest_differs = not missing and digest(received[area] for area in announced) != heartbeat.digest
+        self._digest_differs = not missing and hazards_digest(received[area] for area in announced) != heartbeat.digest
         if self._digest_differs:
             missing.update(announced)
         missing.update(area for area in heartbeat.areas if area not in defined)

@@ -29,7 +29,7 @@ if TYPE_CHECKING:
     from fog_contracts.grid import StaticMap
     from fog_contracts.handlers import Handler, Ids, Later, QueryHandler
     from fog_contracts.messages import AreaDefinition, MapSnapshot, RobotState, Zone
-    from fog_contracts.raster import Spans
+    from fog_contracts.shapes import Spans
     from map_service.aggregator_monitor import AggregatorMonitor
     from map_service.layers.base import CostLayer
     from map_service.zone_times import Progress

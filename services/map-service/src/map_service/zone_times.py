@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     from collections.abc import Mapping
 
     from fog_contracts.handlers import Moment
-    from fog_contracts.raster import Spans
+    from fog_contracts.shapes import Spans
 
 _UNKNOWN_S: Final = 60.0
 _DAYS_AHEAD: Final = 8

@@ -26,7 +26,7 @@ if TYPE_CHECKING:
 
     from fog_contracts.grid import GridGeometry, Window
     from fog_contracts.messages import Zone
-    from fog_contracts.raster import Spans
+    from fog_contracts.shapes import Spans
     from map_service.zone_times import ZoneTimes
 
 T = TypeVar("T")

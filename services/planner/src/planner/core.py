@@ -16,8 +16,7 @@ from functools import partial
 from typing import TYPE_CHECKING, Final
 
 from fog_contracts import channels as ch
-from fog_contracts.fencing import Fence
-from fog_contracts.handlers import Publication
+from fog_contracts.handlers import Fence, Publication
 from fog_contracts.replica import MapError
 from planner.config import PlannerConfig
 from planner.heuristics import DeadEndsJob, FieldJob, GoalFields

@@ -14,8 +14,7 @@ from fog_contracts import channels as ch
 from fog_contracts.costs import FREE, LETHAL
 from fog_contracts.geometry import GeometryError, contains_point, normalized_polygon
 from fog_contracts.messages import Cause, HazardArea, Zone
-from fog_contracts.raster import rasterize
-from fog_contracts.shapes import rasterize_shape, shape_contains
+from fog_contracts.shapes import rasterize, rasterize_shape, shape_contains
 from fog_kernels.distance import squared_distance_capped
 
 if TYPE_CHECKING:
@@ -25,7 +24,7 @@ if TYPE_CHECKING:
     from fog_contracts.grid import GridGeometry, Window
     from fog_contracts.handlers import Handler, Ids, Moment, Publication
     from fog_contracts.messages import ZoneSet
-    from fog_contracts.raster import ShapeMask
+    from fog_contracts.shapes import ShapeMask
     from planner.planning_map import PlanningMap
 
 Grid = NDArray[np.uint8]

@@ -12,8 +12,7 @@ from typing import TYPE_CHECKING, Final
 from msgspec import inspect
 
 from fog_contracts.channels import BROKER_NAME, CHANNELS, ID_MAX, NODE, Channel
-from fog_contracts.generate import NOTE
-from fog_contracts.generate.fields import Field, bounds, message_fields, summary
+from fog_contracts.generate import NOTE, Field, bounds, message_fields, summary
 
 if TYPE_CHECKING:
     from fog_contracts.messages import Message

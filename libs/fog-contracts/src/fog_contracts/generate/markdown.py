@@ -10,8 +10,7 @@ from typing import TYPE_CHECKING, Any, Final
 import msgspec
 
 from fog_contracts.channels import CHANNELS, DURABILITIES, KIB, MIB, ROLES, Channel, Role
-from fog_contracts.generate import NOTE
-from fog_contracts.generate.fields import Field, bounds, message_fields, parts, summary, type_text
+from fog_contracts.generate import NOTE, Field, bounds, message_fields, parts, summary, type_text
 
 if TYPE_CHECKING:
     from fog_contracts.messages import Message

@@ -3,13 +3,9 @@
 One module per family of channels; all of their names are here, so that whoever uses a message need not know its family.
 """
 
-from fog_contracts.messages.alerts import *
 from fog_contracts.messages.areas import *
 from fog_contracts.messages.basics import *
-from fog_contracts.messages.hazards import *
 from fog_contracts.messages.maps import *
 from fog_contracts.messages.nodes import *
-from fog_contracts.messages.plans import *
 from fog_contracts.messages.robots import *
 from fog_contracts.messages.simulation import *
-from fog_contracts.messages.zones import *

@@ -1,10 +1,26 @@
-"""Definitions of areas: the sensors that watch them, and their policies (MQTT, JSON)."""
+"""Areas: the sensors that watch them, their policies, their hazards as they are announced, alerts (MQTT, JSON)."""
 
-from typing import Annotated, Any, Literal
+import hashlib
+from collections.abc import Iterable
+from typing import Annotated, Any, Final, Literal
 
 from msgspec import Meta, field
 
-from fog_contracts.messages.basics import AreaState, Count, Finite, Id, Message, Ring, Seconds
+from fog_contracts.messages.basics import (
+    AreaState,
+    Author,
+    Count,
+    Finite,
+    Hash,
+    Id,
+    Message,
+    Ring,
+    Seconds,
+    Sentence,
+    Stamp,
+    TimeToLive,
+    Trace,
+)
 
 
 class UnknownPolicy(Message, frozen=True, kw_only=True):
@@ -147,3 +163,119 @@ class AreaDefinition(Message, frozen=True, kw_only=True):
     version: Count = 0
     removed: bool = False
     epoch: Count = 0
+
+
+SEVERITY: Final = {"clear": 0, "unknown": 1, "unknown_after_blocked": 2, "blocked": 3}
+"""Severity of an area's hazard by its state; an area that was blocked before it became unknown ranks higher."""
+AREAS_MAX: Final = 1000
+"""Areas of a site: so many fit into one heartbeat of the aggregator, whatever their ids."""
+
+
+OverrideState = Literal["blocked", "clear"]
+OverrideReason = Annotated[str, Meta(min_length=1, max_length=200)]
+"""Why an operator overrides an area, for other people."""
+
+
+class HazardOverride(Message, frozen=True, kw_only=True):
+    """An operator's word on an area, which counts instead of its nodes' for a time: `ttl_s` from `set_at` on.
+
+    `measured` and `measured_penalty` are what the area's state and penalty would be without it.
+    """
+
+    state: OverrideState
+    author: Author
+    reason: OverrideReason
+    set_at: Stamp
+    ttl_s: TimeToLive
+    measured: AreaState
+    measured_penalty: Annotated[int, Meta(ge=0, le=254)]
+
+
+class AreaHazard(Message, frozen=True, kw_only=True):
+    """State of one area; `seq` grows by one with each change, `epoch` with each start of the aggregator.
+
+    With an `override` the state is not that of the nodes: `blocked`, or `unknown` and passable where an operator
+    declared the area clear, which nobody measures (ADR 16).
+    """
+
+    area: Id
+    state: AreaState
+    severity: Annotated[int, Meta(ge=0, le=3)]
+    penalty: Annotated[int, Meta(ge=0, le=254)]
+    since: Stamp
+    seq: Count
+    epoch: Count
+    cause: Sentence
+    nodes: dict[Id, AreaState] = {}
+    explained_by: Id | None = None
+    override: HazardOverride | None = None
+    trace: Trace | None = None
+
+
+class AggregatorHeartbeat(Message, frozen=True, kw_only=True):
+    """The aggregator's sign of life, and its word on every area: a hazard that it does not list is not its own.
+
+    `areas` has the `seq` of each area's announced hazard (0: none yet), `digest` (`hazards_digest`) covers these
+    hazards. Without `complete` there may be further areas, whose records are not loaded yet. `uptime` is
+    the sender's monotonic clock with an arbitrary origin; how late a heartbeat arrives is computed from it, never from
+    `stamp`.
+    """
+
+    epoch: Count
+    areas: dict[Id, Count]
+    complete: bool
+    digest: Hash
+    uptime: Annotated[float, Meta(ge=0.0, le=1e12, extra={"unit": "s"})]
+    stamp: Stamp
+
+
+_HASH_BITS = 63
+
+
+def is_relief(hazard: AreaHazard, before: AreaHazard | None) -> bool:
+    """Whether a hazard allows robots more than the one before (an area without one counts as forbidden)."""
+    if before is None:
+        return hazard.state == "clear"
+    if hazard.penalty < before.penalty:
+        return True
+    return hazard.state == "clear" and before.state != "clear"
+
+
+def hazards_digest(hazards: Iterable[AreaHazard]) -> int:
+    """Return a 63-bit hash of the hazards' areas, seqs, states and penalties; their order does not matter."""
+    lines = sorted(f"{h.area} {h.seq} {h.state} {h.penalty}" for h in hazards)
+    whole = hashlib.blake2b("\n".join(lines).encode(), digest_size=8).digest()
+    return int.from_bytes(whole, "big") >> (64 - _HASH_BITS)
+
+
+AlertKind = Literal["area-unknown", "area-blocked", "node-unknown"]
+
+
+class Alert(Message, frozen=True, kw_only=True):
+    """A condition of an area, or of a node or source in it, that has lasted for as long as the area's policy allows.
+
+    It lasts since `since` and was raised at `raised`, or acknowledged by an operator at `acknowledged_at`. `reason` is
+    the newest one.
+    """
+
+    id: Annotated[str, Meta(max_length=100)]
+    kind: AlertKind
+    area: Id
+    node: Id | None = None
+    reason: Annotated[str, Meta(max_length=200)]
+    since: Stamp
+    raised: Stamp
+    acknowledged_by: Author | None = None
+    acknowledged_at: Stamp | None = None
+
+
+class AlertList(Message, frozen=True, kw_only=True):
+    """The present alerts, those that nobody has acknowledged first: the first of very many only.
+
+    `total` counts all of them, `unseen` those that nobody has acknowledged.
+    """
+
+    epoch: Count
+    total: Count
+    unseen: Count
+    alerts: list[Alert]

@@ -19,7 +19,7 @@ from typing import TYPE_CHECKING, Final, Protocol
 from prometheus_client import Counter, Gauge
 
 from fog_contracts import channels as ch
-from fog_contracts.fencing import epoch_in
+from fog_contracts.handlers import epoch_in
 from fog_contracts.messages import Leader
 from fog_runtime import logs
 from fog_runtime.leases.lease import ANNOUNCE_S, CUT_OFF_S, Lease

@@ -1,7 +1,7 @@
 """Which of several copies of a service may act: one holds a lease, and its epoch is the fencing number. Pure, no I/O.
 
 Redis grants the lease for a short time and draws an epoch with it, larger than every one before (`lease_store`). Every
-message carries its sender's epoch and receivers refuse a lower one (`fog_contracts.fencing`), so a process that wakes
+message carries its sender's epoch and receivers refuse a lower one (`fog_contracts.handlers`), so a process that wakes
 up after another took over can do no harm. Times are seconds of the process's own monotonic clock.
 
 The holder may act until a deadline, counted from *before* its last request was sent:
@@ -31,7 +31,7 @@ import math
 from dataclasses import dataclass
 from typing import Final, Literal
 
-from fog_contracts.fencing import within_reach
+from fog_contracts.handlers import within_reach
 
 LEASE_S: Final = 1.2
 """Duration of the lease in Redis."""

@@ -22,8 +22,7 @@ from typing import TYPE_CHECKING, Final, Self
 import msgspec
 
 from fog_contracts.channels import BROKER_NAME
-from fog_contracts.generate.mqtt_acl import mqtt_acl
-from fog_contracts.generate.zenoh_acl import zenoh_acl
+from fog_contracts.generate.acl import mqtt_acl, zenoh_acl
 from fog_runtime.access.credentials import SERVERS, Credentials, Server, to_toml
 from fog_runtime.files import PRIVATE, atomic_write
 from fog_runtime.locks import users

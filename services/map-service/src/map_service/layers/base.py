@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from fog_contracts.channels import Channel
     from fog_contracts.handlers import Handler, Moment, Publication
     from fog_contracts.messages import Cause, Trace
-    from fog_contracts.raster import ShapeMask
+    from fog_contracts.shapes import ShapeMask
 
 Options = TypeVar("Options", bound=msgspec.Struct)
 Grid = NDArray[np.uint8]

@@ -16,12 +16,10 @@ from msgspec import structs
 
 from fog_contracts import channels as ch
 from fog_contracts.costs import DEGRADED_SPEED, LETHAL
-from fog_contracts.fencing import Fence
 from fog_contracts.geometry import GeometryError, normalized_polygon
-from fog_contracts.handlers import Publication, RefusedMessageError
-from fog_contracts.hazards import is_relief
-from fog_contracts.messages import SEVERITY, AreaHazard, Cause, HazardArea
-from fog_contracts.raster import rasterize
+from fog_contracts.handlers import Fence, Publication, RefusedMessageError
+from fog_contracts.messages import SEVERITY, AreaHazard, Cause, HazardArea, is_relief
+from fog_contracts.shapes import rasterize
 from map_service.aggregator_monitor import AggregatorMonitor
 from map_service.layers.base import CostLayer, LayerFactory, NoOptions, write_cost, write_speed_limit
 
@@ -32,7 +30,7 @@ if TYPE_CHECKING:
     from fog_contracts.grid import GridGeometry, Window
     from fog_contracts.handlers import Handler, Ids, Moment
     from fog_contracts.messages import AggregatorHeartbeat, AreaDefinition
-    from fog_contracts.raster import ShapeMask
+    from fog_contracts.shapes import ShapeMask
     from map_service.layers.base import Grid
 
 

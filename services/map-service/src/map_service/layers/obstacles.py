@@ -22,7 +22,7 @@ from fog_contracts import channels as ch
 from fog_contracts.costs import LETHAL
 from fog_contracts.grid import Window
 from fog_contracts.messages import REACH_UNIT_M, VIEW_SECTORS, Cause
-from fog_contracts.raster import ShapeMask
+from fog_contracts.shapes import ShapeMask
 from map_service.layers.base import CostLayer, LayerFactory, NoOptions, write_cost
 
 if TYPE_CHECKING:

@@ -1,23 +1,130 @@
-"""The zenoh router's access control: what each role may send to it and receive from it, by the channel table.
+"""Access control of Mosquitto and the zenoh router: what each role may send and receive, by the channel table.
 
-What no rule allows is denied. A client is identified by its user name or by its certificate's common name.
+What no line or rule allows is denied. For Mosquitto a node's user name is the node's id (`%u`), any other is a role;
+the router identifies a client by its user name or by its certificate's common name.
 """
 
 from __future__ import annotations
 
 import json
+import re
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Final, Literal
 
-from fog_contracts.channels import CHANNELS, ROBOT, ROLES, Channel, Role
+from fog_contracts.channels import AGGREGATOR, CHANNELS, NODE, ROBOT, ROLES, Channel, Role
 from fog_contracts.generate import NOTE
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping, Sequence
+    from collections.abc import Iterable, Mapping, Sequence
+
+Access = Literal["read", "write"]
+
+_HOME_ASSISTANTS_OWN: Final = ("homeassistant/status", "homeassistant/+/+/state")
+"""Its birth and will messages, and the states of its entities (`mqtt_statestream` with the base `homeassistant`)."""
+_MQTT_HEAD: Final = f"""\
+# Who may publish and receive what through the MQTT broker: Mosquitto's `acl_file`.
+# {NOTE}
+#
+# A sensor node's user name is the node's id, any other user name is a role. Topics that no line allows are denied.
+# A `pattern` line holds for every user, with the user name for %u, so no node's id may be a role's name.
+# Mosquitto 2.0 accepts every subscription and checks each message when it is delivered.
+"""
+
+
+def mqtt_acl(
+    site: str = "+",
+    *,
+    unrestricted: Sequence[str] = (),
+    floors: Mapping[str, Sequence[str]] | None = None,
+    devices: Mapping[str, Sequence[str]] | None = None,
+) -> str:
+    """Return the list for one site, or, without a site's id, for all sites that share the broker.
+
+    The users named in `unrestricted` may publish and receive everything. `floors` are further sites with their own
+    users, named `SITE.NAME`, and their nodes: each may only use topics that name its site, and so none of the thesis.
+    The first site's Home Assistant is the building's: it reads what is for it on all floors, and may write its states.
+    `devices` are sensors and gateways of others with the topics that they may use.
+    """
+    sections = [_MQTT_HEAD]
+    sections += [_section(role, site, floors or {}) for role in ROLES if role != NODE and _lines(role, site)]
+    sections += [f"user {user}\ntopic readwrite #\ntopic read $SYS/#\n" for user in unrestricted]
+    for device, topics in (devices or {}).items():
+        lines = [f"topic readwrite {topic}" for topic in topics]
+        sections.append("\n".join(["# A device of others: only its own topics", f"user {device}", *lines, ""]))
+    for floor, nodes in (floors or {}).items():
+        sections += [_floor_section(role, floor) for role in ROLES if role != NODE and _floor_lines(role, floor)]
+        sections += [_floor_node(floor, node) for node in nodes]
+    sections.append(_nodes(site))
+    return "\n".join(sections)
+
+
+def _section(role: Role, site: str, floors: Iterable[str]) -> str:
+    lines = _lines(role, site)
+    if role == AGGREGATOR:
+        lines.append("read  #")  # a source of an area may publish on any topic
+    if role == "home-assistant":
+        lines += [line for floor in floors for line in _floor_lines(role, floor)]
+        lines += [f"write {topic}" for topic in _HOME_ASSISTANTS_OWN]
+    return "\n".join([f"# {ROLES[role]}", f"user {role}", *(f"topic {line}" for line in lines), ""])
+
+
+def _floor_section(role: Role, floor: str) -> str:
+    lines = _floor_lines(role, floor)
+    if role == AGGREGATOR:
+        # The thesis's topics, of one level, belong to the first site.
+        lines += ["deny  +", "read  #"]
+    return "\n".join([f"# {ROLES[role]} ({floor})", f"user {floor}.{role}", *(f"topic {line}" for line in lines), ""])
+
+
+def _floor_node(floor: str, node: str) -> str:
+    lines = [
+        f"topic {access:5} {_topic(row, floor, node)}" for access, row in _mqtt_rights(NODE) if "site" in row.fields
+    ]
+    return "\n".join([f"# {ROLES[NODE]} ({floor})", f"user {floor}.{node}", *lines, ""])
+
+
+def _floor_lines(role: Role, floor: str) -> list[str]:
+    return [f"{access:5} {_topic(row, floor)}" for access, row in _mqtt_rights(role) if "site" in row.fields]
+
+
+def _nodes(site: str) -> str:
+    lines = [f"pattern {access} {_topic(row, site, '%u')}" for access, row in _mqtt_rights(NODE)]
+    return "\n".join([f"# {ROLES[NODE]}: only its own topics", *lines, ""])
+
+
+def _lines(role: Role, site: str) -> list[str]:
+    rights = _mqtt_rights(role)
+    lines = [f"{access:5} {_topic(row, site)}" for access, row in rights]
+    allowed = {row for _, row in rights}
+    # MQTT has no wildcard for part of a level: `area 3` needs `+`, so all other topics that match `+` are denied.
+    one_level = [re.compile("[^/]+") for _, row in rights if "number" in row.fields]
+    return lines + [
+        f"deny  {row.template}"
+        for row in CHANNELS.values()
+        if row.transport == "mqtt" and row not in allowed and any(each.fullmatch(row.template) for each in one_level)
+    ]
+
+
+def _mqtt_rights(role: Role) -> list[tuple[Access, Channel]]:
+    rights: list[tuple[Access, Channel]] = []
+    for row in CHANNELS.values():
+        if row.transport == "mqtt":
+            if role in row.publishers:
+                rights.append(("write", row))
+            if role in row.subscribers or role == "recorder":
+                rights.append(("read", row))
+    return rights
+
+
+def _topic(row: Channel, site: str, node: str = "+") -> str:
+    if "number" in row.fields:
+        return "+"
+    return row.template.format(**{name: {"site": site, "node": node}.get(name, "+") for name in row.fields})
+
 
 Flow = Literal["ingress", "egress"]
 
-_HEAD: Final = f"""\
+_ZENOH_HEAD: Final = f"""\
 // Who may publish, subscribe, query and reply through the zenoh router: a part of its configuration.
 // {NOTE}
 //
@@ -105,7 +212,7 @@ def zenoh_acl(
         policies.append({"subjects": [by_user, by_certificate], "rules": [rule["id"] for rule in client_rules]})
     return "".join(
         [
-            _HEAD % (_ROBOTS if robots else _ROLES_ONLY),
+            _ZENOH_HEAD % (_ROBOTS if robots else _ROLES_ONLY),
             '{\n  "access_control": {\n    "enabled": true,\n    "default_permission": "deny",\n',
             *(
                 _array(title, rows)
@@ -121,9 +228,9 @@ def _clients(site: str, robots: Sequence[str], prefix: str = "") -> list[tuple[s
     clients = []
     for role in ROLES:
         if role == ROBOT and robots:
-            clients += [(f"{prefix}{robot}", _rights(role, site, robot)) for robot in robots]
+            clients += [(f"{prefix}{robot}", _zenoh_rights(role, site, robot)) for robot in robots]
         else:
-            clients.append((f"{prefix}{role}", _rights(role, site, "*")))
+            clients.append((f"{prefix}{role}", _zenoh_rights(role, site, "*")))
     return clients
 
 
@@ -140,7 +247,7 @@ def _row(row: dict[str, object]) -> str:
     return f'      {head}, "key_exprs": [\n{listed}      ]}}'
 
 
-def _rights(role: Role, site: str, robot: str) -> _Rights:
+def _zenoh_rights(role: Role, site: str, robot: str) -> _Rights:
     rights = _Rights()
     for row in CHANNELS.values():
         if row.transport != "zenoh":

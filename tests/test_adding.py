@@ -165,7 +165,6 @@ class RingShape(Message, frozen=True, kw_only=True, tag="ring", tag_field="type"
 ''', behind=" | RingShape"),
     Edit(SHAPES, r"^from fog_contracts\.messages import", before="""\
 from fog_contracts.messages import RingShape
-from fog_contracts.shapes import mask_spans, rasterize_line
 """),
     Edit(SHAPES, r"^KINDS: ", before="""\
 class _Ring(ShapeKind[RingShape]):

@@ -398,6 +398,14 @@ def test_restarted_agent_that_was_carried_away_does_not_trust_its_saved_pose(dri
     assert driving.error()[0] < 0.1
 
 
+def test_pose_that_an_operator_gives_is_kept_when_the_first_feedback_of_the_base_follows_a_saved_one(driving):
+    driving.restart()
+    driving.agent.localizer.initial_pose(driving.x, driving.y, driving.theta)
+    given = driving.agent.localizer.detail
+    driving.agent.localizer.follow_saved()
+    assert driving.agent.localizer.detail == given != ""
+
+
 def test_carried_robot_stops_until_an_operator_enables_it(world):
     world.x, world.y, world.theta = 12.0, 7.0, 1.0
     assert world.run(3.0, lambda w: w.state().mode == "PROTECTIVE_STOP")

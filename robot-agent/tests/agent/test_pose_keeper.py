@@ -6,12 +6,19 @@ import msgspec
 import pytest
 
 from robot_agent.agent.sensing.pose_keeper import SEARCH_AGAIN_S, PoseKeeper
+from robot_agent.guardian.link import BaseFeedback
+from robot_agent.hardware import BaseStatus, WheelOdometry
 from robot_agent.localization.localizer import SavedPose
 
 POSE = SavedPose(site="lab", x=1.0, y=2.0, theta=3.1, sigma_xy=0.1, sigma_theta=0.1)
 
 
 FIELDS = object()
+
+
+def feedback(seq, left, fault=None):
+    wheels = WheelOdometry(left_m=left, right_m=2.0)
+    return BaseFeedback(seq=seq, status=BaseStatus(), odometry=wheels, fault=fault, stopped=None)
 
 
 class FakeLocalizer:
@@ -22,6 +29,7 @@ class FakeLocalizer:
         self.can_search = True
         self.searches = 0
         self.restored = []
+        self.followed = 0
         self.trusted = POSE
         self.moving = (0.0, 0.0)
 
@@ -37,6 +45,9 @@ class FakeLocalizer:
 
     def restore(self, saved):
         self.restored.append(saved)
+
+    def follow_saved(self):
+        self.followed += 1
 
     def load_map(self, fields):
         self.fields = fields
@@ -97,6 +108,26 @@ def test_a_stored_pose_waits_for_the_map_of_its_site(keeper, localizer, site, re
 def test_stored_pose_is_restored_immediately_on_the_map_of_its_site(keeper, localizer):
     keeper.restore(POSE, "lab")
     assert localizer.restored == [POSE]
+
+
+@pytest.mark.parametrize("base_first", [True, False])
+@pytest.mark.parametrize(
+    ("first", "followed"),
+    [((7, 2.5), 1), ((6, 2.0), 0), ((7, 3.6), 0), ((7, 2.0, "wheel drop"), 0)],
+    ids=["same guardian", "another guardian", "the wheels have turned", "it was lifted"],
+)
+def test_stored_pose_is_followed_if_one_guardian_has_watched_the_robot_since(
+    keeper, localizer, first, followed, base_first
+):
+    keeper.on_base(feedback(6, 2.0))
+    stored = keeper.to_store("lab", 0.0)
+    successor = PoseKeeper(localizer)
+    if base_first:
+        successor.on_base(feedback(*first))
+    successor.restore(stored, "lab")
+    successor.on_base(feedback(*first))
+    assert localizer.restored == [stored]
+    assert localizer.followed == followed
 
 
 @pytest.mark.parametrize(

@@ -159,6 +159,7 @@ class AgentCore:
         self._base.on_feedback(feedback, now)
         if slept and not self._base.asleep:
             self._localizer.on_unmeasured_motion(*POSSIBLE_WHILE_SUSPENDED, "the base was asleep")
+        self._pose_keeper.on_base(feedback)
         motion = self._odometry.update(feedback.odometry, now)
         if isinstance(motion, EncoderFault):
             return

@@ -112,6 +112,11 @@ class FitMonitor:
         """Whether some of the last scans show that the robot was turned or moved by something other than its wheels."""
         return self._recent.count("lost") >= _SHAKEN_SCANS
 
+    @property
+    def on_trial(self) -> bool:
+        """Whether the pose must become good soon."""
+        return self._trial_scans > 0
+
     def begin(self, detail: str, trial_scans: int = 0) -> None:
         """Begin with a given pose; with a trial it must become good within so many scans."""
         self.restart()

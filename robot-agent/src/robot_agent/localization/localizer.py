@@ -39,6 +39,7 @@ if TYPE_CHECKING:
     from robot_agent.safety.conditions import Localization
 
 _FIT_BEAMS: Final = 120
+_SAVED: Final = "checking the saved pose"
 _TRIAL_SCANS: Final = 8
 """A saved pose must become good within so many scans."""
 _FOUND_SIGMAS: Final = (0.2, 0.1)
@@ -58,7 +59,10 @@ _LOCAL_SCANS: Final = 5
 
 
 class SavedPose(msgspec.Struct, frozen=True, kw_only=True):
-    """A pose to restore after a restart, in `map` of a site (m, rad), with its standard deviations."""
+    """A pose to restore after a restart, in `map` of a site (m, rad), with its standard deviations.
+
+    base: number of the base's feedback then, and its wheels' counters (m, left and right); None: unknown.
+    """
 
     site: str
     x: float
@@ -66,6 +70,7 @@ class SavedPose(msgspec.Struct, frozen=True, kw_only=True):
     theta: float
     sigma_xy: float
     sigma_theta: float
+    base: tuple[int, float, float] | None = None
 
 
 class Localizer:
@@ -88,7 +93,7 @@ class Localizer:
         self._confirmed = False
         """Whether the newest scan by itself confirms the pose."""
         self._tracked = False
-        """Whether the pose was good once, and was followed by wheels and scans since."""
+        """Whether the pose was good once, or was given, and was followed by wheels and scans since."""
         self._shows_place = False
         """Whether enough of the newest scan shows the place of the pose, opened doors and furniture left aside."""
         self._continuous = False
@@ -176,13 +181,20 @@ class Localizer:
         The next scan narrows them in the directions that it observes.
         """
         self._start(Pose2(x, y, theta), sigma_xy, sigma_theta)
+        self._tracked = True  # an operator's word, too, says more than an opened door does
         self._monitor.begin("checking the given pose")
 
     def restore(self, saved: SavedPose) -> None:
         """Start at a saved pose with larger deviations; if the next scans don't fit it, search the whole map."""
         pose = Pose2(saved.x, saved.y, saved.theta)
         self._start(pose, max(0.3, 2.0 * saved.sigma_xy), max(0.2, 2.0 * saved.sigma_theta))
-        self._monitor.begin("checking the saved pose", _TRIAL_SCANS)
+        self._monitor.begin(_SAVED, _TRIAL_SCANS)
+
+    def follow_saved(self) -> None:
+        """Trust a saved pose that no scan has tried yet like one that was followed: somebody has watched the robot."""
+        if self._monitor.on_trial:
+            self._tracked = True
+            self._monitor.begin(_SAVED)
 
     def global_localization(self) -> bool:
         """Search the whole map, a share with each scan, keeping the estimate; False: no map or no scan yet."""

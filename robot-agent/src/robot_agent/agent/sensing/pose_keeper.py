@@ -5,11 +5,14 @@ from __future__ import annotations
 import math
 from typing import TYPE_CHECKING, Final
 
+import msgspec
+
 from robot_agent.localization.localizer import SavedPose
 
 if TYPE_CHECKING:
     from fog_contracts.messages import Mode
     from fog_contracts.site import RobotSite
+    from robot_agent.guardian.link import BaseFeedback
     from robot_agent.localization.localizer import Localizer
     from robot_agent.localization.map_fields import MapFields
 
@@ -21,6 +24,8 @@ _MOVED_DRIVING_M: Final = 0.5
 _TURNED_DRIVING_RAD: Final = 0.4
 """Of a robot that moves only a pose this far from the stored one is stored: a restart finds it from there."""
 _SIGMA_CHANGED: Final = 0.05
+_FOLLOWED_M: Final = 1.5
+"""The wheels of a robot whose agent died have turned so far at most since its pose was stored: it is told to stand."""
 _START_SIGMA_M: Final = 0.25
 _START_SIGMA_RAD: Final = 0.15
 """Standard deviations of a robot that was put on its start pose by hand."""
@@ -35,11 +40,22 @@ class PoseKeeper:
         """A stored pose to start at as soon as the map of its site is loaded."""
         self._searched_at = -math.inf
         self._stored: SavedPose | None = None
+        self._restored: SavedPose | None = None
+        """The stored pose that was started at, until the base's first feedback."""
+        self._feedback: BaseFeedback | None = None
+        """The newest of the base."""
+
+    def on_base(self, feedback: BaseFeedback) -> None:
+        """Handle feedback of the base: the first tells whether a guardian has watched the robot since it was stored."""
+        self._feedback = feedback
+        restored, self._restored = self._restored, None
+        if restored is not None and _is_followed(restored, feedback):
+            self._localizer.follow_saved()
 
     def restore(self, saved: SavedPose, site: str) -> None:
         """Start at a stored pose, at once if the map of its site is loaded already; the next scans verify it."""
         if site == saved.site:
-            self._localizer.restore(saved)
+            self._start(saved)
         else:
             self._pending = saved
 
@@ -48,7 +64,13 @@ class PoseKeeper:
         self._localizer.load_map(fields)
         pending, self._pending = self._pending, None
         if pending is not None and pending.site == site:
-            self._localizer.restore(pending)
+            self._start(pending)
+
+    def _start(self, saved: SavedPose) -> None:
+        self._localizer.restore(saved)
+        self._restored = saved
+        if self._feedback is not None:
+            self.on_base(self._feedback)
 
     def search(self, mode: Mode, now: float, *, at_rest: bool) -> bool:
         """Begin a global search when there is no pose; return whether one began.
@@ -76,7 +98,10 @@ class PoseKeeper:
         if pose is None or (self._stored is not None and not _differs(pose, self._stored, moves=moves)):
             return None
         self._stored = pose
-        return pose
+        if (feedback := self._feedback) is None:
+            return pose
+        wheels = feedback.odometry
+        return msgspec.structs.replace(pose, base=(feedback.seq, wheels.left_m, wheels.right_m))
 
 
 def start_pose(site: str, robot: RobotSite) -> SavedPose:
@@ -85,6 +110,15 @@ def start_pose(site: str, robot: RobotSite) -> SavedPose:
     return SavedPose(
         site=site, x=start.x, y=start.y, theta=start.theta, sigma_xy=_START_SIGMA_M, sigma_theta=_START_SIGMA_RAD
     )
+
+
+def _is_followed(saved: SavedPose, feedback: BaseFeedback) -> bool:
+    """Whether the guardian of a stored pose still lives, has seen no wheel drop, and its wheels have hardly turned."""
+    if saved.base is None or feedback.fault is not None:
+        return False
+    seq, left, right = saved.base
+    wheels = feedback.odometry
+    return feedback.seq > seq and max(abs(wheels.left_m - left), abs(wheels.right_m - right)) < _FOLLOWED_M
 
 
 def _differs(new: SavedPose, old: SavedPose, *, moves: bool) -> bool:

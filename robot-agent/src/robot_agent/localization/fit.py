@@ -234,6 +234,12 @@ def tells_place(fit: Fit) -> bool:
     return fit.informative >= _INFORMATIVE_LEAST and fit.contradict <= _CONTRADICTION_LIMIT and fit.agree >= 0.7
 
 
+def differs_by_doors(fit: Fit) -> bool:
+    """Whether a scan shows the place of a pose sharply, but for a few beams, as one does beside an opened door."""
+    enough = fit.informative >= _INFORMATIVE_LEAST and fit.agree >= _AGREEMENT_PROVEN
+    return enough and fit.blurred <= _BLURRED_LIMIT
+
+
 def shows_place(fit: Fit) -> bool:
     """Whether enough of a scan shows the place of a pose, and no more passes through walls than at opened doors."""
     enough = fit.informative >= _INFORMATIVE_LEAST and fit.agree >= _AGREEMENT_CLEAR

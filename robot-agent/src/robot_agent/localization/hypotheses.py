@@ -100,7 +100,8 @@ class Hypotheses:
         """`complete`: whether no place that fits was left out because there are too many."""
         self.complete = complete
         self._places = sorted(places, key=lambda place: -place.log_quality)
-        self._scans = 1
+        self.scans = 1
+        """Number of scans that counted."""
         self.odom = odom
         """Pose in `odom` to which the poses belong."""
 
@@ -124,7 +125,7 @@ class Hypotheses:
         """
         if not self._places:
             return []
-        limit = math.log(_AMBIGUOUS if self._scans == 1 else AMBIGUOUS_LATER)
+        limit = math.log(_AMBIGUOUS if self.scans == 1 else AMBIGUOUS_LATER)
         best = self._places[0].log_quality
         near = max((place.log_quality for place in self._places if place.near), default=-math.inf)
         least = best if near <= best + _CARRIED else near
@@ -148,7 +149,7 @@ class Hypotheses:
             if possible and all(apart(place.pose, other.pose) for other in left):
                 left.append(place)
         self._places, self.odom = left, scan.odom
-        self._scans += 1
+        self.scans += 1
         return True
 
     def join(self, places: Iterable[Hypothesis]) -> None:

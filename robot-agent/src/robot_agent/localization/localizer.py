@@ -18,7 +18,7 @@ import numpy as np
 from robot_agent.config import LocalizationConfig
 from robot_agent.localization.deskew import DeskewedScan, deskew, follows
 from robot_agent.localization.doubt import Doubt
-from robot_agent.localization.fit import FitMonitor, confirms, evaluate_fit, shows_place, tells_place
+from robot_agent.localization.fit import FitMonitor, confirms, differs_by_doors, evaluate_fit, shows_place, tells_place
 from robot_agent.localization.hypotheses import Near, apart
 from robot_agent.localization.map_fields import MapFields, map_fields
 from robot_agent.localization.odometry_buffer import OdometryBuffer
@@ -54,6 +54,10 @@ what the one before it did: nobody carried the robot, opened doors are more like
 _NEAR_M: Final = 2.5
 """So far from where its pose was good last a robot may be that was pushed or turned, or whose wheel was held."""
 _TURNED_RAD: Final = 0.5
+_SAVED_OR_FOUND: Final = (
+    "the scan fits the saved pose but for a few beams, as beside an opened door, and another place better: let the "
+    "robot advance (`fognav robot advance`), or give the initial pose"
+)
 _LOCAL_SCANS: Final = 5
 """After this many scans that do not fit there either, the whole map is searched."""
 
@@ -94,6 +98,10 @@ class Localizer:
         """Whether the newest scan by itself confirms the pose."""
         self._tracked = False
         """Whether the pose was good once, or was given, and was followed by wheels and scans since."""
+        self._but_for_doors = False
+        """Whether the newest scan shows the place of the pose but for what may be an opened door."""
+        self._saved = self._contested = False
+        """Whether the pose is a saved one that was not good yet, and whether a search has found a better place."""
         self._shows_place = False
         """Whether enough of the newest scan shows the place of the pose, opened doors and furniture left aside."""
         self._continuous = False
@@ -188,6 +196,7 @@ class Localizer:
         """Start at a saved pose with larger deviations; if the next scans don't fit it, search the whole map."""
         pose = Pose2(saved.x, saved.y, saved.theta)
         self._start(pose, max(0.3, 2.0 * saved.sigma_xy), max(0.2, 2.0 * saved.sigma_theta))
+        self._saved = True
         self._monitor.begin(_SAVED, _TRIAL_SCANS)
 
     def follow_saved(self) -> None:
@@ -297,7 +306,7 @@ class Localizer:
     def _start(self, pose: Pose2, sigma_xy: float, sigma_theta: float) -> None:
         self._relocalization.cancel()
         self._local_scans = 0
-        self._tracked = False
+        self._tracked = self._saved = self._contested = False
         self._followed_m = 0.0
         self._near = None
         self._doubt.restart()
@@ -311,6 +320,7 @@ class Localizer:
         assert pose is not None
         fit = evaluate_fit(fields, pose, scan.beams(_FIT_BEAMS), self._config.range_max)
         self._tells_place, self._shows_place, self._confirmed = tells_place(fit), shows_place(fit), confirms(fit)
+        self._but_for_doors = differs_by_doors(fit)
         shaken = self._filter.jumped or self._monitor.shaken
         self._tracked = not shaken and (self._tracked or self._monitor.status == "good")
         rivalled = not self._tracked and len(self._relocalization.places) > 1
@@ -318,6 +328,11 @@ class Localizer:
         self._follow_way(scan.odom, shaken=shaken)
         self._monitor.add(fit, self._filter.uncertainty, doubt=self._doubt.reason, kept=self._is_kept)
         self._follow(pose, scan.odom)
+        if self._monitor.status == "good":
+            self._saved = self._contested = False
+        elif self._contested and self._but_for_doors:
+            self._monitor.lose(_SAVED_OR_FOUND)
+            return
         if self._monitor.status == "lost":
             self._relocalization.verifies = False
             self._look_nearby(scan, now)
@@ -397,6 +412,13 @@ class Localizer:
                 self._monitor.lose(outcome.detail)
             return
         pose = self._filter.pose(outcome.odom)
+        contests = self._saved and self._but_for_doors and outcome.by_one_scan
+        if contests and pose is not None and apart(pose, outcome.pose):
+            # A door was opened beside a robot that only started again; or somebody has carried it.
+            self._contested = True
+            self._relocalization.cancel()
+            self._monitor.lose(_SAVED_OR_FOUND)
+            return
         if fits_again and pose is not None:
             same = not apart(pose, outcome.pose)
             if same:

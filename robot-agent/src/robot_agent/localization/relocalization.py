@@ -32,13 +32,15 @@ _CHECKING: Final = "one place is left: the whole map is searched for others that
 class Outcome(NamedTuple):
     """The pose in `map` that was found, when the odometry said `odom`; or None, and why.
 
-    beaten: near places that the scans confirm, and that explain them much worse all the same.
+    beaten: near places that the scans confirm, and that explain them much worse all the same. by_one_scan: no other
+    place was ever in question.
     """
 
     pose: Pose2 | None
     odom: Pose2
     detail: str = ""
     beaten: tuple[Pose2, ...] = ()
+    by_one_scan: bool = False
 
 
 class Relocalization:
@@ -175,7 +177,7 @@ class Relocalization:
             return Outcome(None, hypotheses.odom, _CHECKING if self.searching else _undecided(1))
         self.cancel()
         beaten = tuple(place.pose for place in hypotheses.places if place.near)
-        return Outcome(found, hypotheses.odom, beaten=beaten)
+        return Outcome(found, hypotheses.odom, beaten=beaten, by_one_scan=hypotheses.scans == 1)
 
 
 def _undecided(contenders: int) -> str:

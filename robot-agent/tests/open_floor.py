@@ -7,7 +7,7 @@ import numpy as np
 from fog_contracts.costs import DEFAULT_INFLATION
 from fog_kernels.clearance import clearance
 from fog_kernels.dwa import DwaLimits, DwaSettings
-from fog_kernels.robot.body import cover
+from fog_kernels.robot import cover
 from robot_agent.footprint import Footprint
 
 ROUND = cover(Footprint.circle(0.17).polygon)

@@ -13,7 +13,7 @@ from typing import Final
 
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
 
-from fog_kernels.cache.sources import sources_of
+from fog_kernels.sources import sources_of
 from fognav.output import console
 
 _WARM_TIMEOUT_S: Final = 900.0

@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 
     from fog_kernels.clearance import Clearance
     from fog_kernels.dwa import DwaLimits, DwaSettings
-    from fog_kernels.robot.body import Body
+    from fog_kernels.robot import Body
 
 SWEEP_STEP = 0.025
 """m between two places on the way of a body that isn't round."""

@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from fog_contracts.costs import DEFAULT_INFLATION, Inflation
 from fog_kernels.clearance import NEAR, clearance
 from fog_kernels.dwa import DwaLimits, DwaSettings, dwa
-from fog_kernels.robot.body import Body, cover
+from fog_kernels.robot import Body, cover
 
 LIMITS = DwaLimits(axle=0.235, wheel_max=0.5)
 SETTINGS = DwaSettings()

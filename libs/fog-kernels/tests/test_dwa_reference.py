@@ -17,7 +17,7 @@ from fog_contracts.costs import DEFAULT_INFLATION
 from fog_kernels.clearance import Clearance, clearance
 from fog_kernels.dwa import DwaLimits, DwaResult, DwaSettings, dwa
 from fog_kernels.inflation import inflate, inflation_table
-from fog_kernels.robot.body import cover
+from fog_kernels.robot import cover
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray

@@ -12,7 +12,7 @@ import pytest
 from compiler import compiled_only
 
 import fog_kernels
-from fog_kernels.cache.sources import digest_of, sources_of
+from fog_kernels.sources import digest_of, sources_of
 
 FACTOR = "FACTOR = {}\n"
 CALLED = """
@@ -52,9 +52,8 @@ def package(tmp_path: Path) -> Path:
     """A copy of the package, without its kernels, and with a kernel that calls one of another module."""
     source, copy = Path(fog_kernels.__file__).parent, tmp_path / "fog_kernels"
     copy.mkdir()
-    for name in ("__init__", "_arrays", "warm"):
+    for name in ("__init__", "_arrays", "cache", "sources", "warm"):
         shutil.copy(source / f"{name}.py", copy)
-    shutil.copytree(source / "cache", copy / "cache", ignore=shutil.ignore_patterns("__pycache__"))
     (copy / "factor.py").write_text(FACTOR.format(10))
     (copy / "called.py").write_text(CALLED.format(1))
     (copy / "calling.py").write_text(CALLING)

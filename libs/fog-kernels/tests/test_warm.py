@@ -19,7 +19,7 @@ from fog_contracts.costs import DEFAULT_INFLATION
 from fog_kernels import warm
 warm.warm()
 from fog_kernels import amcl, astar, clearance, components, distance, dwa, inflation
-from fog_kernels.robot import body, settings
+from fog_kernels import robot
 from fog_kernels import emulation, lidar, lines, raycast, tiles
 raw = np.zeros((60, 60), np.uint8)
 raw[0] = 254
@@ -59,7 +59,7 @@ for source in (raw, shut):
     emulation.nearest_occupied(source, (3, 3), 2, 0.05, (0.0, 0.0), (0.2, 0.2))
     lines.leaves(np.zeros((2, 2)), np.ones((2, 2)), 0.5, 0.1)
     limits = dwa.DwaLimits(axle=0.235, wheel_max=0.5)
-    shape, how = body.cover([(0.2, -0.1), (0.2, 0.1), (-0.2, 0.1), (-0.2, -0.1)]), settings.DEFAULT_SETTINGS
+    shape, how = robot.cover([(0.2, -0.1), (0.2, 0.1), (-0.2, 0.1), (-0.2, -0.1)]), robot.DEFAULT_SETTINGS
     around = clearance.clearance(cost, 0.05, 0, 0, [(1, 2)], 1, 1, shape, DEFAULT_INFLATION, limits, how)
     dwa.dwa(0, 0, 1, 1, np.float32(0), around, [(1, 1), (2, 1)], 2, 1, None, shape, limits)
     ranges = raycast.cast(source, 0.05, 0, 0, 1, 1, [0, -1.5], 5)

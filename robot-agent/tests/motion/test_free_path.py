@@ -10,7 +10,7 @@ from fog_contracts.costs import DEFAULT_INFLATION
 from fog_contracts.grid import GridGeometry
 from fog_kernels.clearance import clearance
 from fog_kernels.dwa import DwaLimits, DwaSettings
-from fog_kernels.robot.body import cover
+from fog_kernels.robot import cover
 from robot_agent.config import LOCAL_INFLATION
 from robot_agent.footprint import Footprint
 from robot_agent.localization.pose import Pose2

@@ -7,7 +7,7 @@ from fog_contracts.costs import DEFAULT_INFLATION
 from fog_kernels.clearance import clearance
 from fog_kernels.course import distances
 from fog_kernels.dwa import DwaLimits, DwaSettings
-from fog_kernels.robot.body import cover
+from fog_kernels.robot import cover
 from robot_agent.footprint import Footprint
 from robot_agent.localization.deskew import DeskewedScan
 from robot_agent.localization.pose import Pose2

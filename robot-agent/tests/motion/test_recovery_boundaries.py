@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from open_floor import LONG, PADDING, ROUND, around
 
 from fog_contracts.costs import UNKNOWN
-from fog_kernels.robot.body import cover
+from fog_kernels.robot import cover
 from robot_agent.footprint import Footprint
 from robot_agent.localization.pose import Pose2
 from robot_agent.motion.recovery import Attempt, Recovery, Situation, step

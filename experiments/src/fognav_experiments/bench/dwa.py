@@ -24,7 +24,7 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
-    from fog_kernels.robot.body import Body
+    from fog_kernels.robot import Body
 
 PEER_MS: Final = 1.75
 """ROS 1's `base_local_planner` (commit 9ad64419, -O3) on as many arcs, checking the robot's centre; x86 server."""

@@ -14,7 +14,7 @@ if TYPE_CHECKING:
 
 # Before any kernel is compiled: each one's module imports this one first. numba's settings are no declared names.
 vars(config)["CACHE_LOCATOR_CLASSES"] = (
-    "fog_kernels.cache.locator.KernelLocator,UserProvidedCacheLocator,InTreeCacheLocator,UserWideCacheLocator,"
+    "fog_kernels.cache.KernelLocator,UserProvidedCacheLocator,InTreeCacheLocator,UserWideCacheLocator,"
     "IPythonCacheLocator,ZipCacheLocator"
 )
 

@@ -24,8 +24,7 @@ from fog_kernels import _arrays
 if TYPE_CHECKING:
     from numpy.typing import ArrayLike, NDArray
 
-    from fog_kernels.robot.body import Body
-    from fog_kernels.robot.settings import DwaLimits, DwaSettings
+    from fog_kernels.robot import Body, DwaLimits, DwaSettings
 
 NEAR: Final = PENALTY_MAX
 """Marks cells where only the distance at the exact position tells whether the body is free."""

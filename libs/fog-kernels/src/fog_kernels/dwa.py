@@ -25,13 +25,13 @@ from numba import float64, int64, njit, types
 from fog_contracts.costs import INSCRIBED, LETHAL, PENALTY_MAX
 from fog_kernels import _arrays
 from fog_kernels.clearance import NEAR, sampling_slack
-from fog_kernels.robot.settings import DEFAULT_SETTINGS, MAX_STEPS, DwaLimits, DwaResult, DwaSettings
+from fog_kernels.robot import DEFAULT_SETTINGS, MAX_STEPS, DwaLimits, DwaResult, DwaSettings
 
 if TYPE_CHECKING:
     from numpy.typing import ArrayLike, NDArray
 
     from fog_kernels.clearance import Clearance
-    from fog_kernels.robot.body import Body
+    from fog_kernels.robot import Body
 
 __all__ = ["DwaLimits", "DwaParameters", "DwaResult", "DwaSettings", "dwa"]
 

@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING
 from numba.core import event
 from numba.core.dispatcher import Dispatcher
 
-from fog_kernels.cache.locator import remove_outdated
+from fog_kernels.cache import remove_outdated
 
 if TYPE_CHECKING:
     from collections.abc import Callable

@@ -17,7 +17,7 @@ from fog_contracts.costs import NO_SPEED_LIMIT
 from fog_kernels.clearance import Clearance, clearance
 from fog_kernels.course import distances
 from fog_kernels.dwa import dwa
-from fog_kernels.robot.body import Body, cover
+from fog_kernels.robot import Body, cover
 from robot_agent.localization.pose import Pose2, wrap
 from robot_agent.motion.band import course, give_way
 from robot_agent.motion.detour import free_path
@@ -28,7 +28,7 @@ if TYPE_CHECKING:
 
     from fog_contracts.costs import Inflation
     from fog_contracts.grid import GridGeometry
-    from fog_kernels.robot.settings import DwaLimits, DwaSettings
+    from fog_kernels.robot import DwaLimits, DwaSettings
     from robot_agent.config import MotionConfig
     from robot_agent.footprint import Footprint
     from robot_agent.motion.band import Course

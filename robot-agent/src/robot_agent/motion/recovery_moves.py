@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from fog_kernels.clearance import Clearance
-    from fog_kernels.robot.body import Body
+    from fog_kernels.robot import Body
     from robot_agent.localization.pose import Pose2
 
 BACK_M_S: Final = 0.08

@@ -1,4 +1,4 @@
-"""Where numba keeps compiled kernels, and when they are out of date.
+"""Where numba keeps compiled kernels, when they are out of date, and how they are loaded without its compiler.
 
 numba compiles a kernel anew when its own module has changed. But a kernel holds what it calls and the constants that it
 uses, whichever module they come from: here, a change of any module that the kernel's module imports makes it compile
@@ -14,14 +14,17 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final, Protocol
 
 from numba.core import caching
+from numba.core.runtime.nrt import rtsys
 
-from fog_kernels.cache.loading import load_without_compiler
-from fog_kernels.cache.sources import digest_of
+from fog_kernels.sources import digest_of
 
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-_PACKAGE: Final = Path(__file__).parents[1]
+    from numba.core.base import BaseContext
+    from numba.core.typing.templates import Signature
+
+_PACKAGE: Final = Path(__file__).parent
 _CHOICES: Final[tuple[Any, ...]] = (
     caching.UserProvidedCacheLocator,
     caching.InTreeCacheLocator,
@@ -87,4 +90,16 @@ def _sources_tag(file: Path) -> str:
     return digest_of(file).hex()[:12]
 
 
-load_without_compiler()
+def _load_overload(self: caching.FunctionCache, sig: Signature, target_context: BaseContext) -> object:
+    """As `numba.core.caching.Cache.load_overload`, but that only the runtime of kernels (their memory) is prepared.
+
+    numba imports the implementations of all functions that kernels may call (60 modules) whenever it looks for a
+    compiled kernel. A kernel that is found contains what it calls: the modules cost some 0.1 s and 8 MB for nothing.
+    Where a kernel is not found, compiling it imports them.
+    """
+    rtsys.initialize(target_context)
+    with self._guard_against_spurious_io_errors():
+        return self._load_overload(sig, target_context)  # type: ignore[no-untyped-call]  # numba has no types
+
+
+setattr(caching.FunctionCache, "load_overload", _load_overload)  # noqa: B010  # numba has no setting for it

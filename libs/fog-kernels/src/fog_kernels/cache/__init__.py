@@ -1,1 +1,0 @@
-"""Where compiled kernels are kept, and which sources they come from."""

@@ -74,6 +74,10 @@ class Fit:
     blurred: float = 0.0
 
 
+NO_FIT: Final = Fit(agree=0.0, explained=0.0, contradict=1.0, informative=0)
+"""Of no scan: it shows nothing."""
+
+
 def evaluate_fit(fields: MapFields, pose: Pose2, points: NDArray[np.float64], range_max: float) -> Fit:
     """Compare points (n, 2; m, frame `base`) measured at a pose in `map` with the ranges of the static map there.
 

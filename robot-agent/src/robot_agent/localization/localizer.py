@@ -18,7 +18,15 @@ import numpy as np
 from robot_agent.config import LocalizationConfig
 from robot_agent.localization.deskew import DeskewedScan, deskew, follows
 from robot_agent.localization.doubt import Doubt
-from robot_agent.localization.fit import FitMonitor, confirms, differs_by_doors, evaluate_fit, shows_place, tells_place
+from robot_agent.localization.fit import (
+    NO_FIT,
+    FitMonitor,
+    confirms,
+    differs_by_doors,
+    evaluate_fit,
+    shows_place,
+    tells_place,
+)
 from robot_agent.localization.hypotheses import Near, apart
 from robot_agent.localization.map_fields import MapFields, map_fields
 from robot_agent.localization.odometry_buffer import OdometryBuffer
@@ -92,18 +100,12 @@ class Localizer:
         """Scans since a lost robot was looked for near its last pose; 0 while it is not lost."""
         self._doubt = Doubt()
         self._verify_again_at = -math.inf
-        self._tells_place = False
-        """Whether most of the newest scan shows the place of the pose."""
-        self._confirmed = False
-        """Whether the newest scan by itself confirms the pose."""
+        self._fit = NO_FIT
+        """Of the newest scan at the pose."""
         self._tracked = False
         """Whether the pose was good once, or was given, and was followed by wheels and scans since."""
-        self._but_for_doors = False
-        """Whether the newest scan shows the place of the pose but for what may be an opened door."""
         self._saved = self._contested = False
         """Whether the pose is a saved one that was not good yet, and whether a search has found a better place."""
-        self._shows_place = False
-        """Whether enough of the newest scan shows the place of the pose, opened doors and furniture left aside."""
         self._continuous = False
         """Whether the newest scan shows what the one before it did."""
         self._followed_m = 0.0
@@ -319,8 +321,7 @@ class Localizer:
         pose = self._filter.pose(scan.odom)
         assert pose is not None
         fit = evaluate_fit(fields, pose, scan.beams(_FIT_BEAMS), self._config.range_max)
-        self._tells_place, self._shows_place, self._confirmed = tells_place(fit), shows_place(fit), confirms(fit)
-        self._but_for_doors = differs_by_doors(fit)
+        self._fit = fit
         shaken = self._filter.jumped or self._monitor.shaken
         self._tracked = not shaken and (self._tracked or self._monitor.status == "good")
         rivalled = not self._tracked and len(self._relocalization.places) > 1
@@ -330,7 +331,7 @@ class Localizer:
         self._follow(pose, scan.odom)
         if self._monitor.status == "good":
             self._saved = self._contested = False
-        elif self._contested and self._but_for_doors:
+        elif self._contested and differs_by_doors(self._fit):
             self._monitor.lose(_SAVED_OR_FOUND)
             return
         if self._monitor.status == "lost":
@@ -340,7 +341,7 @@ class Localizer:
         self._local_scans = 0
         if self._filter.jumped:
             self._scale.forget_anchor()
-        elif self._monitor.status in {"good", "weak"} and self._tells_place:
+        elif self._monitor.status in {"good", "weak"} and tells_place(self._fit):
             self._scale.observe(pose, self._filter.covariance, scan.odom, self._filter.unseen)
         if self._monitor.trial_failed:
             self.global_localization()
@@ -370,7 +371,7 @@ class Localizer:
     @property
     def _is_kept(self) -> bool:
         """Whether the way from a good pose to this one says more than a place that explains the scans better."""
-        return self._tracked and (self._tells_place or (self._shows_place and self._followed_m > _FOLLOWED_M))
+        return self._tracked and (tells_place(self._fit) or (shows_place(self._fit) and self._followed_m > _FOLLOWED_M))
 
     def _come(self, distance: float) -> None:
         if self._near is not None:
@@ -412,7 +413,7 @@ class Localizer:
                 self._monitor.lose(outcome.detail)
             return
         pose = self._filter.pose(outcome.odom)
-        contests = self._saved and self._but_for_doors and outcome.by_one_scan
+        contests = self._saved and differs_by_doors(self._fit) and outcome.by_one_scan
         if contests and pose is not None and apart(pose, outcome.pose):
             # A door was opened beside a robot that only started again; or somebody has carried it.
             self._contested = True
@@ -430,23 +431,25 @@ class Localizer:
                 self._verify_again_at = now + _VERIFY_EVERY_S
                 return
         weighed = pose is not None and any(not apart(pose, other) for other in outcome.beaten)
-        if fits_again and self._confirmed and self._near is not None and not weighed:
+        if fits_again and confirms(self._fit) and self._near is not None and not weighed:
             # A door stood open, or people hid the walls, when the search left out the place that the scan confirms now.
             self._relocalization.begin(scan, fields, self._near, verifies=True)
             return
-        self._doubt.verify()
         if fits_again:
             self._monitor.lose("the robot was found elsewhere on the map: it was carried, or its pose was wrong")
             self._monitor.restart()
         else:
             self._monitor.begin_found()
+        self._start_at_found(outcome.pose, outcome.odom, scan, fields, now)
+
+    def _start_at_found(self, pose: Pose2, odom: Pose2, scan: DeskewedScan, fields: MapFields, now: float) -> None:
         self._doubt.restart()
         self._local_scans = 1
         self._tracked = False
         self._followed_m = 0.0
         self._near = None
         self._scale.forget_anchor()
-        self._filter.start(outcome.pose, outcome.odom, *_FOUND_SIGMAS)
+        self._filter.start(pose, odom, *_FOUND_SIGMAS)
         self._filter.add(scan, fields)
         self._evaluate(scan, fields, now)
 

@@ -2,9 +2,13 @@
 
 from __future__ import annotations
 
+import re
+from collections import Counter
+
 import msgspec
 import pytest
 
+from fognav_experiments import plots
 from fognav_experiments.comparison.agreement import agreement, compare_drives, compared, resources
 from fognav_experiments.comparison.document import to_markdown
 from fognav_experiments.comparison.measured import MeasuredDrive
@@ -153,7 +157,9 @@ def test_memory_is_drawn_by_route_and_setup_from_what_each_drive_took():
     figure, table = memory(drives)
     assert figure.file == "memory.svg"
     assert "mean of 4 drives" in figure.caption
-    assert figure.svg.count("<rect") == 1 + 2 + 3  # ground, legend, and no bar of fog on the route that it lacks
+    bars = Counter(re.findall(r"fill: (#\w+)", figure.svg))
+    assert bars[plots.COLOURS["default"]] == 1 + 2  # in the legend, and on each route
+    assert bars[plots.COLOURS["fog"]] == 1 + 1
     assert [row[:2] for row in table.rows] == [["A to B", "300.0"], ["C to D", "400.0"]]
     assert table.rows[0][2].startswith("235.0 ± ")
     assert table.rows[1][2] == "-"

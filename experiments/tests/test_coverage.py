@@ -123,7 +123,7 @@ def test_command_prints_json_and_draws_a_picture(tmp_path: Path) -> None:
     report = json.loads(shown.stdout)
     assert [area["id"] for area in report["areas"]] == [f"z{n}" for n in range(1, 8)]
     assert {(route["from"], route["to"]) for route in report["routes"]} >= {("a", "b"), ("c", "d")}
-    colours = {colour for _, colour in Image.open(picture).getcolors(1 << 24)}
+    colours = {colour for _, colour in Image.open(picture).convert("RGB").getcolors(1 << 24)}
     assert {(150, 215, 160), (60, 110, 230), (210, 60, 40), (0, 140, 60)} <= colours
 
 

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
-from fognav_experiments.map_picture import MapPicture
+from fognav_experiments.plots import floor, write_png
 from robot_agent.hardware import LaserScan
 from robot_agent.localization.localizer import Localizer
 from robot_agent.localization.pose import Pose2, wrap
@@ -282,9 +282,7 @@ def _kidnapped(scans: Sequence[LogScan], rng: np.random.Generator) -> tuple[list
     return [*scans[begin : begin + before], *moved], before
 
 
-_COLOURS: Final = {"good": (0, 140, 60), "weak": (230, 150, 0), "lost": (210, 0, 0), "none": (210, 0, 0)}
-_REFERENCE: Final = (60, 110, 230)
-_ERROR: Final = (240, 120, 120)
+_COLOURS: Final = {"good": "#008c3c", "weak": "#e69600", "lost": "#d20000", "none": "#d20000"}
 
 
 def write_plot(path: Path, map_: StaticMap, samples: Sequence[Sample]) -> None:
@@ -292,12 +290,11 @@ def write_plot(path: Path, map_: StaticMap, samples: Sequence[Sample]) -> None:
 
     Raises `WrongUseError` if the file can't be written.
     """
-    picture = MapPicture(map_)
-    picture.line(((sample.reference.x, sample.reference.y) for sample in samples), _REFERENCE)
-    for sample in samples:
-        if sample.estimate is None:
-            continue
-        estimate = (sample.estimate.x, sample.estimate.y)
-        picture.line([(sample.reference.x, sample.reference.y), estimate], _ERROR)
-        picture.dot(estimate, _COLOURS[sample.status])
-    picture.write(path)
+    figure, axes = floor(map_)
+    axes.plot([sample.reference.x for sample in samples], [sample.reference.y for sample in samples], color="#3c6ee6")
+    for status, colour in _COLOURS.items():
+        pairs = [(s.reference, s.estimate) for s in samples if s.estimate is not None and s.status == status]
+        if pairs:
+            axes.plot(*np.array([[(a.x, a.y), (b.x, b.y)] for a, b in pairs]).T, color="#f07878", linewidth=1)
+            axes.scatter([b.x for _, b in pairs], [b.y for _, b in pairs], 12, color=colour, zorder=3)
+    write_png(figure, path)

@@ -16,13 +16,12 @@ if TYPE_CHECKING:
     from fog_contracts.site import Site
     from fog_runtime.configuration.site import LoadedSite
     from fognav_experiments.coverage import Coverage
-    from fognav_experiments.map_picture import MapPicture
 
-_CONE: Final = (150, 215, 160)
-_AREA: Final = (60, 110, 230)
-_SEEN: Final = (0, 140, 60)
-_BLIND: Final = (210, 60, 40)
-_NODE: Final = (20, 60, 30)
+_CONE: Final = "#96d7a0"
+_AREA: Final = "#3c6ee6"
+_SEEN: Final = "#008c3c"
+_BLIND: Final = "#d23c28"
+_NODE: Final = "#143c1e"
 
 
 def add_to(app: typer.Typer) -> None:
@@ -55,7 +54,7 @@ def site_coverage(
             raise FailedError(str(error)) from error
         found = coverage(loaded.site, loaded.map)
         if png is not None:
-            _draw(loaded, found).write(png)
+            _draw(loaded, found, png)
         if json:
             print_json(_as_json(loaded.site, found))
             return
@@ -110,27 +109,22 @@ def _as_json(site: Site, found: Coverage) -> dict[str, Any]:
     }
 
 
-def _draw(loaded: LoadedSite, found: Coverage) -> MapPicture:
+def _draw(loaded: LoadedSite, found: Coverage, file: Path) -> None:
     """Draw areas in blue, what nodes see in green, and routes: red where they are blind."""
-    from fognav_experiments.map_picture import MapPicture  # noqa: PLC0415  # keeps the other commands fast
+    from fognav_experiments.plots import floor, write_png  # noqa: PLC0415  # keeps the other commands fast
 
-    picture = MapPicture(loaded.map)
+    figure, axes = floor(loaded.map)
     for area in found.areas:
         for ring in area.cones:
-            picture.area(ring, outline=_CONE, fill=_CONE)
+            axes.fill(*zip(*ring, strict=True), color=_CONE)
     for area_site in loaded.site.areas:
-        picture.area(area_site.polygon, outline=_AREA)
+        axes.fill(*zip(*area_site.polygon, strict=True), fill=False, edgecolor=_AREA)
     for route in found.routes:
-        picture.line(map(tuple, route.points.tolist()), _SEEN, width=3)
+        axes.plot(*route.points.T, color=_SEEN)
     # A stretch that one route shares with another is blind for both.
     for route in found.routes:
-        travelled = route.travelled
         for begin, end in route.blind:
-            within = route.points[(travelled >= begin) & (travelled <= end)]
-            if len(within) > 1:
-                picture.line(map(tuple, within.tolist()), _BLIND, width=3)
-    for node in loaded.site.nodes:
-        picture.dot((node.x, node.y), _NODE, radius=4)
-    for place in loaded.site.places.values():
-        picture.dot((place.x, place.y), _AREA, radius=6)
-    return picture
+            axes.plot(*route.points[(route.travelled >= begin) & (route.travelled <= end)].T, color=_BLIND)
+    for places, size, colour in ((loaded.site.nodes, 16, _NODE), (loaded.site.places.values(), 40, _AREA)):
+        axes.scatter([place.x for place in places], [place.y for place in places], size, color=colour, zorder=3)
+    write_png(figure, file)

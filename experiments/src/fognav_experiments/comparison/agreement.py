@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Final, NamedTuple
 
 from fognav_experiments.comparison.document import Block, Heading, Paragraph, Table
 from fognav_experiments.comparison.measured import KINDS, ROBOTS_PROCESSES
-from fognav_experiments.comparison.statistics import estimate
+from fognav_experiments.statistics import estimate
 
 if TYPE_CHECKING:
     from collections.abc import Sequence

@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Final
 
 from fognav_experiments.comparison.document import Block, Paragraph, Table
-from fognav_experiments.comparison.statistics import Estimate, estimate
+from fognav_experiments.statistics import Estimate, estimate
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence

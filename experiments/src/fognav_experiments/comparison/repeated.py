@@ -4,12 +4,13 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Final, NamedTuple
 
-from fognav_experiments.comparison import agreement, figures, limits
+from fognav_experiments import plots
+from fognav_experiments.comparison import agreement, limits
 from fognav_experiments.comparison.document import Block, Figure, Heading, Paragraph, Table
 from fognav_experiments.comparison.driven import route_ends
 from fognav_experiments.comparison.measured import KINDS
-from fognav_experiments.comparison.statistics import Estimate, estimate
 from fognav_experiments.comparison.thesis import MEMORY_UNKNOWN, REALITY_UNKNOWN
+from fognav_experiments.statistics import Estimate, estimate
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
@@ -67,7 +68,7 @@ def memory(measured: Sequence[MeasuredDrive]) -> list[Block]:
     )
     rows = [[name, *(_text(series[setup][number]) for setup in setups)] for number, name in enumerate(titles)]
     return [
-        Figure(MEMORY_FILE, figures.bars(title, "MB", titles, series), caption),
+        Figure(MEMORY_FILE, plots.bars(title, "MB", titles, series), caption),
         Table([f"{title}, MB", *setups], rows),
     ]
 
@@ -105,7 +106,7 @@ def _charts(kind: Kind, pairs: Sequence[Compared]) -> list[Block]:
             f"As figure {quantity.figure} of the thesis, which compares simulation and reality: mean "
             f"{quantity.title.lower()} in lockstep and by {_BY[kind]}, with 95 % confidence intervals."
         )
-        svg = figures.bars(f"{quantity.title}, lockstep and {kind}", quantity.unit, groups, series)
+        svg = plots.bars(f"{quantity.title}, lockstep and {kind}", quantity.unit, groups, series)
         blocks.append(Figure(f"{kind}-{quantity.file}.svg", svg, caption))
         columns += [[limits.text(found) for found in values] for values in series.values()]
         columns.append([

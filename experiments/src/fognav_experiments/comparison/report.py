@@ -5,13 +5,14 @@ from __future__ import annotations
 from collections import defaultdict
 from typing import TYPE_CHECKING, Any, Final, NamedTuple
 
-from fognav_experiments.comparison import agreement, figures, limits, repeated
+from fognav_experiments import plots
+from fognav_experiments.comparison import agreement, limits, repeated
 from fognav_experiments.comparison.document import Block, Code, Figure, Heading, Paragraph, Table, flat
 from fognav_experiments.comparison.driven import route_ends
 from fognav_experiments.comparison.records import ALIKE, MOVE_BASE, OF_FOG, ON_FOG, ON_ROBOT, machines
 from fognav_experiments.comparison.repeated import SETUPS
-from fognav_experiments.comparison.statistics import Estimate, compare, estimate
 from fognav_experiments.comparison.thesis import PLACES, REPORTED
+from fognav_experiments.statistics import Estimate, compare, estimate
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping, Sequence
@@ -305,7 +306,7 @@ def _routes(pairs: Sequence[Drives], setups: Sequence[ProfileName]) -> list[Bloc
             for number, route in enumerate(routes)
         ]
         groups = [route_ends(route) for route in routes]
-        svg = figures.bars(quantity.title, quantity.unit, groups, series)
+        svg = plots.bars(quantity.title, quantity.unit, groups, series)
         blocks.append(Figure(f"{quantity.file}.svg", svg, quantity.caption))
         blocks.append(Table([f"{quantity.title}, {quantity.unit}", *setups], rows))
     return blocks
@@ -383,7 +384,7 @@ def _tracks(pairs: Sequence[Drives], setups: Sequence[ProfileName], site: Site |
     drives = max(pairs, key=lambda drives: drives[first].distance_m - drives[last].distance_m)
     record = drives[first]
     blocked, stops = _ends(record, site) if site is not None else ((), {})
-    svg = figures.tracks({setup: drives[setup].track for setup in setups}, blocked, stops)
+    svg = plots.tracks({setup: drives[setup].track for setup in setups}, blocked, stops)
     lengths = ", ".join(f"{setup} {drives[setup].distance_m:.0f} m" for setup in setups)
     caption = (
         f"As figures 6.1 and 6.2: run {record.run}, {route_ends(record.route)}, {record.area} is blocked: {lengths}."

@@ -12,7 +12,7 @@ import msgspec
 
 from fog_contracts.messages import NodeConfig
 from fognav_experiments.comparison.driven import DrivenRoute
-from fognav_experiments.comparison.statistics import Estimate, estimate
+from fognav_experiments.statistics import Estimate, estimate
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Sequence

@@ -6,6 +6,7 @@ from collections import Counter
 from typing import TYPE_CHECKING, Any, Final
 
 from fog_runtime.files import SHARED, atomic_write
+from fognav_experiments import plots
 from fognav_experiments.comparison.document import (
     Block,
     Code,
@@ -18,7 +19,6 @@ from fognav_experiments.comparison.document import (
     to_markdown,
 )
 from fognav_experiments.comparison.limits import text
-from fognav_experiments.sensitivity.heat_map import heat_map
 from fognav_experiments.sensitivity.planes import UNITS, gain
 
 if TYPE_CHECKING:
@@ -87,6 +87,15 @@ def _plane(drives: Sequence[SweptDrive], plane: Plane) -> list[Block]:
     ]  # fmt: skip
     return [
         Heading(f"{plane.x.quantity} and {plane.y.quantity}"),
-        Figure(f"{name}.svg", heat_map("What the fog saves per route", plane, gains), caption),
+        Figure(
+            f"{name}.svg",
+            plots.heat_map(
+                "What the fog saves per route",
+                (UNITS[plane.x.quantity], plane.x.values),
+                (UNITS[plane.y.quantity], plane.y.values),
+                [[gains.get(plane.at(x, y)) for x in plane.x.values] for y in plane.y.values],
+            ),
+            caption,
+        ),
         Table([UNITS[plane.x.quantity], UNITS[plane.y.quantity], "routes", "metres saved", "seconds saved"], rows),
     ]

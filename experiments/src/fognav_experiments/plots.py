@@ -1,0 +1,169 @@
+"""Plots: bars, tracks, heat maps, curves, and floors to draw on. The same input gives the same bytes."""
+
+from __future__ import annotations
+
+import io
+from itertools import chain
+from math import nan
+from textwrap import fill
+from typing import TYPE_CHECKING, Final
+
+import numpy as np
+from matplotlib import rc_context
+from matplotlib.colors import LinearSegmentedColormap
+from matplotlib.figure import Figure
+from matplotlib.transforms import offset_copy
+
+from fog_contracts.costs import FREE, LETHAL
+from fog_runtime.files import SHARED, atomic_write
+from fognav.output import WrongUseError
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping, Sequence
+    from pathlib import Path
+
+    from matplotlib.axes import Axes
+
+    from fog_contracts.grid import StaticMap
+    from fognav_experiments.statistics import Estimate
+
+COLOURS: Final = {
+    "default": "#d9822b", "full": "#3b7dd8", "fog": "#2a9d5c", "lockstep": "#9a9a9a", "live": "#7a4fb5",
+    "hardware": "#444444",
+}  # fmt: skip
+"""Colours of the setups, of which those of the first two are the thesis's, and of how a drive was made."""
+_SAVED: Final = LinearSegmentedColormap.from_list("saved", [COLOURS["default"], "white", COLOURS["fog"]])
+_FLOOR_PX: Final = 1600
+
+
+def bars(title: str, unit: str, groups: Sequence[str], series: Mapping[str, Sequence[Estimate | None]]) -> str:
+    """Return a chart as SVG with a group of bars per route: each setup's mean, with its 95 % confidence interval.
+
+    `groups`: their names, each of one or two lines. `series`: for each setup, or whatever else has a colour, an
+    estimate per group, None without one.
+    """
+    figure = Figure(figsize=(6.6, 3.4), layout="constrained")
+    axes = figure.add_subplot()
+    width = 0.7 / len(series)
+    for place, (setup, values) in enumerate(series.items()):
+        known = [(number, found) for number, found in enumerate(values) if found is not None]
+        middles = [number + width * (place - (len(series) - 1) / 2) for number, _ in known]
+        halves = [nan if found.half is None else found.half for _, found in known]
+        means = [found.mean for _, found in known]
+        axes.bar(middles, means, 0.95 * width, yerr=halves, capsize=3, color=COLOURS[setup], label=setup)
+    axes.set_xticks(range(len(groups)), groups)
+    axes.set_ylim(bottom=0.0)
+    axes.tick_params(length=0)
+    axes.grid(axis="y", color="#ddd")
+    axes.set_axisbelow(True)
+    _title(figure, axes, f"{title} ({unit})")
+    return _svg(figure)
+
+
+def tracks(
+    paths: Mapping[str, Sequence[tuple[float, float]]],
+    blocked: Sequence[tuple[float, float]] = (),
+    stops: Mapping[str, tuple[float, float]] | None = None,
+) -> str:
+    """Return the true tracks (m) of several setups as SVG, seen from above.
+
+    `blocked`: corners of the area that was blocked; `stops`: names and positions of the route's ends.
+    """
+    shown = np.array([*chain.from_iterable(paths.values()), *blocked, *(stops or {}).values()])
+    low, high = shown.min(axis=0) - 2.0, shown.max(axis=0) + 2.0
+    wide, tall = high - low
+    figure = Figure(figsize=(6.6, 1.0 + 6.0 * tall / wide), layout="constrained")
+    axes = figure.add_subplot(aspect="equal", xlabel="m", ylabel="m", xlim=(low[0], high[0]), ylim=(low[1], high[1]))
+    if blocked:
+        axes.fill(*zip(*blocked, strict=True), facecolor="#e9b4b4", edgecolor="#b03030")
+        axes.annotate("blocked", np.mean(blocked, axis=0), ha="center", va="center")
+    for number, (setup, path) in enumerate(paths.items()):
+        # A little apart, so that tracks on the same way are all seen.
+        apart = offset_copy(axes.transData, figure, x=1.5 * number, y=-1.5 * number, units="points")
+        axes.plot(*zip(*path, strict=True), color=COLOURS[setup], label=setup, transform=apart)
+    for name, stop in (stops or {"": next(iter(paths.values()))[0]}).items():
+        axes.plot(*stop, "ko")
+        axes.annotate(name, stop, (6, 5), textcoords="offset points", weight="bold")
+    _title(figure, axes, "")
+    return _svg(figure)
+
+
+def heat_map(
+    title: str,
+    across: tuple[str, Sequence[float]],
+    upwards: tuple[str, Sequence[float]],
+    saved: Sequence[Sequence[tuple[Estimate, Estimate] | None]],
+) -> str:
+    """Return a plane of two quantities as SVG, by their names and values: the greener a cell, the more is saved there.
+
+    `saved`: by rows, what a cell says: metres with their 95 % confidence interval, and seconds; None, where none was
+    driven, is grey.
+    """
+    columns, rows = len(across[1]), len(upwards[1])
+    figure = Figure(figsize=(max(1.2 + 1.1 * columns, 4.5), 1.2 + 0.7 * rows), layout="constrained")
+    axes = figure.add_subplot(title=title, xlabel=across[0], ylabel=fill(upwards[0], 8 * rows), facecolor="#eee")
+    metres = np.array([[nan if cell is None else cell[0].mean for cell in row] for row in saved])
+    most = max(np.abs(metres[~np.isnan(metres)]), default=0.0) or 1.0
+    axes.pcolormesh(np.ma.masked_invalid(metres), cmap=_SAVED, vmin=-most, vmax=most, edgecolors="white")
+    for row, cells in enumerate(saved):
+        for column, cell in enumerate(cells):
+            if cell is not None:
+                half = "" if cell[0].half is None else f" ± {cell[0].half:.1f}"
+                words = f"{cell[0].mean:.1f}{half} m\n{cell[1].mean:.0f} s"
+                axes.text(column + 0.5, row + 0.5, words, ha="center", va="center")
+    axes.set_xticks(np.arange(columns) + 0.5, [f"{x:g}" for x in across[1]])
+    axes.set_yticks(np.arange(rows) + 0.5, [f"{y:g}" for y in upwards[1]])
+    axes.tick_params(length=0)
+    return _svg(figure)
+
+
+def curves(panels: Mapping[str, Mapping[str, Sequence[tuple[float, float]]]], across: str) -> Figure:
+    """Return panels by their titles, side by side, each with lines of points by their names; one legend for all."""
+    figure = Figure(figsize=(3.8 * len(panels), 3.4), layout="constrained")
+    for axes, (title, lines) in zip(figure.subplots(1, len(panels), squeeze=False)[0], panels.items(), strict=True):
+        axes.set(title=title, xlabel=across)
+        axes.grid(color="#ddd")
+        for name, points in lines.items():
+            axes.plot(*zip(*points, strict=True), label=name)
+        axes.set_ylim(bottom=0)
+    figure.legend(*figure.axes[0].get_legend_handles_labels(), loc="outside lower center", ncols=len(panels))
+    return figure
+
+
+def floor(map_: StaticMap) -> tuple[Figure, Axes]:
+    """Return a map to draw on, in metres of frame `map`: free cells white, occupied black, unknown grey."""
+    geometry = map_.geometry
+    size = np.array((geometry.width, geometry.height))
+    figure = Figure(figsize=_FLOOR_PX / 100 * size / size.max(), layout="constrained")
+    axes = figure.add_subplot(xlabel="m", ylabel="m")
+    shades = np.full(map_.cells.shape, 200, np.uint8)
+    shades[map_.cells == FREE], shades[map_.cells == LETHAL] = 255, 0
+    (left, bottom), (wide, high) = (geometry.origin_x, geometry.origin_y), size * geometry.resolution
+    extent = (left, left + wide, bottom, bottom + high)
+    axes.imshow(shades, cmap="gray", vmin=0, vmax=255, origin="lower", extent=extent, interpolation="nearest")
+    return figure, axes
+
+
+def write_png(figure: Figure, file: Path) -> None:
+    """Write a picture; raises `WrongUseError` if the file can't be written."""
+    data = io.BytesIO()
+    figure.savefig(data, format="png", metadata={"Software": None})
+    try:
+        atomic_write(file, data.getvalue(), mode=SHARED)
+    except OSError as error:
+        raise WrongUseError(f"{file} can't be written: {error.strerror}. Name another file") from error
+
+
+def _title(figure: Figure, axes: Axes, title: str) -> None:
+    """Put a title above on the left, and what the colours mean on the right."""
+    axes.set_title(title, loc="left", weight="bold", size="medium")
+    figure.legend(loc="outside upper right", ncols=4, frameon=False)
+
+
+def _svg(figure: Figure) -> str:
+    """Return a figure as an element that a page can contain, with its words as text."""
+    data = io.StringIO()
+    with rc_context({"svg.hashsalt": "fognav", "svg.fonttype": "none"}):
+        figure.savefig(data, format="svg", metadata={"Date": None, "Creator": None, "Format": None, "Type": None})
+    text = " ".join(data.getvalue().split()).replace("> <", "><")
+    return text[text.index("<svg") :] + "\n"

@@ -43,6 +43,7 @@ if TYPE_CHECKING:
     from robot_agent.hardware import LaserScan
     from robot_agent.localization.absolute import AbsoluteObservation
     from robot_agent.localization.hypotheses import Hypothesis
+    from robot_agent.localization.relocalization import Outcome
     from robot_agent.localization.uncertainty import Uncertainty
     from robot_agent.safety.conditions import Localization
 
@@ -413,23 +414,8 @@ class Localizer:
                 self._monitor.lose(outcome.detail)
             return
         pose = self._filter.pose(outcome.odom)
-        contests = self._saved and differs_by_doors(self._fit) and outcome.by_one_scan
-        if contests and pose is not None and apart(pose, outcome.pose):
-            # A door was opened beside a robot that only started again; or somebody has carried it.
-            self._contested = True
-            self._relocalization.cancel()
-            self._monitor.lose(_SAVED_OR_FOUND)
+        if pose is not None and self._keeps(pose, outcome, now, fits_again=fits_again):
             return
-        if fits_again and pose is not None:
-            same = not apart(pose, outcome.pose)
-            if same:
-                self._doubt.verify()
-            if same or self._is_kept:
-                # Where a door was opened, a place without that door elsewhere explains every scan better than the
-                # robot's own. Wheels that have counted all the way say more than that.
-                self._relocalization.cancel()
-                self._verify_again_at = now + _VERIFY_EVERY_S
-                return
         weighed = pose is not None and any(not apart(pose, other) for other in outcome.beaten)
         if fits_again and confirms(self._fit) and self._near is not None and not weighed:
             # A door stood open, or people hid the walls, when the search left out the place that the scan confirms now.
@@ -441,6 +427,28 @@ class Localizer:
         else:
             self._monitor.begin_found()
         self._start_at_found(outcome.pose, outcome.odom, scan, fields, now)
+
+    def _keeps(self, pose: Pose2, outcome: Outcome, now: float, *, fits_again: bool) -> bool:
+        """Whether the pose is not given up for the place that was found."""
+        assert outcome.pose is not None
+        same = not apart(pose, outcome.pose)
+        if self._saved and differs_by_doors(self._fit) and outcome.by_one_scan and not same:
+            # A door was opened beside a robot that only started again; or somebody has carried it.
+            self._contested = True
+            self._relocalization.cancel()
+            self._monitor.lose(_SAVED_OR_FOUND)
+            return True
+        if not fits_again:
+            return False
+        if same:
+            self._doubt.verify()
+        if same or self._is_kept:
+            # Where a door was opened, a place without that door elsewhere explains every scan better than the
+            # robot's own. Wheels that have counted all the way say more than that.
+            self._relocalization.cancel()
+            self._verify_again_at = now + _VERIFY_EVERY_S
+            return True
+        return False
 
     def _start_at_found(self, pose: Pose2, odom: Pose2, scan: DeskewedScan, fields: MapFields, now: float) -> None:
         self._doubt.restart()

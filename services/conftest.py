@@ -17,9 +17,9 @@ from lateness import Lateness
 from redis.asyncio import Redis
 
 from fog_contracts.grid import GridGeometry, StaticMap
-from fog_runtime.access.credentials import Credentials
 from fog_runtime.clock import SystemClock
 from fog_runtime.configuration.maps import save_map
+from fog_runtime.credentials import Credentials
 from fog_runtime.locks.site_locks import SiteLocks
 from fog_runtime.transports.mqtt_edge import MqttEdge
 from fog_runtime.transports.zenoh_edge import ZenohEdge

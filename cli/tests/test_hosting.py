@@ -17,8 +17,8 @@ import pytest
 from typer.testing import CliRunner
 
 from fog_runtime import backup
-from fog_runtime.access.credentials import Credentials
-from fog_runtime.backup_archive import STAMP, BackupError
+from fog_runtime.backup import STAMP, BackupError
+from fog_runtime.credentials import Credentials
 from fog_runtime.locks.site_locks import SiteLocks
 from fog_runtime.stores.redis_connection import RedisConnection
 from fog_supervisor.supervisor import Program, Supervisor

@@ -9,9 +9,9 @@ from pathlib import Path
 import pytest
 from typer.testing import CliRunner
 
-from fog_runtime.access.credentials import Credentials
-from fog_runtime.access.token_file import create_token
+from fog_runtime.credentials import Credentials
 from fog_runtime.locks.site_locks import SiteLocks
+from fog_runtime.token_file import create_token
 from fognav import doctor
 from fognav.__main__ import app
 from fognav.locking import VARIABLE

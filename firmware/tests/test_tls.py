@@ -9,7 +9,7 @@ from cryptography import x509
 from cryptography.hazmat.primitives.serialization import Encoding, PublicFormat
 
 from fog_contracts.channels import BROKER_NAME
-from fog_runtime.access.credentials import Credentials
+from fog_runtime.credentials import Credentials
 from fog_runtime.locks.site_locks import AUTHORITY, SiteLocks
 from fog_supervisor.servers import start_mosquitto
 

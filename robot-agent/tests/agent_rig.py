@@ -52,7 +52,7 @@ if TYPE_CHECKING:
 
     from locked_servers import LockedRouter
 
-    from fog_runtime.slots import Slot
+    from fog_runtime.concurrency import Slot
 
 SITE = "lab"
 ROBOT = "r1"

@@ -5,7 +5,7 @@ import asyncio
 import httpx
 import pytest
 
-from fog_runtime.access.credentials import Credentials
+from fog_runtime.credentials import Credentials
 from fog_runtime.locks.site_locks import SiteLocks
 
 pytestmark = pytest.mark.live

@@ -45,7 +45,7 @@ from compose_project import (
 
 from fog_contracts import channels as ch
 from fog_contracts.messages import CommandReply, RobotPose, RobotState, SimCommand, SimObstacle
-from fog_runtime.access.credentials import Credentials
+from fog_runtime.credentials import Credentials
 from fog_runtime.transports.mqtt_broker import Broker
 
 if TYPE_CHECKING:

@@ -20,7 +20,7 @@ from lateness import Lateness
 from fog_contracts import channels as ch
 from fog_contracts.messages import NodeReading, SimCommand
 from fog_runtime.clock import SystemClock
-from fog_runtime.configuration.default_parts import DEFAULT_BASE, DEFAULT_LIDAR
+from fog_runtime.configuration.parts import DEFAULT_BASE, DEFAULT_LIDAR
 from fog_runtime.configuration.site import load_site
 from fog_runtime.transports.mqtt_edge import MqttEdge
 from fog_runtime.transports.zenoh_edge import ZenohEdge

@@ -21,8 +21,8 @@ import pytest
 
 from fog_contracts import channels as ch
 from fog_contracts.messages import MapHeartbeat, SimTruth
-from fog_runtime.access.credentials import Credentials
 from fog_runtime.clock import SystemClock
+from fog_runtime.credentials import Credentials
 from fog_runtime.record import read
 from fog_runtime.transports.zenoh_edge import ZenohEdge
 from fog_supervisor import child

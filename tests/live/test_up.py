@@ -23,8 +23,8 @@ from floor_ports import floor_ports
 
 from fog_contracts import channels as ch
 from fog_contracts.messages import RobotPose, RobotState
-from fog_runtime.access.credentials import Credentials
 from fog_runtime.clock import SystemClock
+from fog_runtime.credentials import Credentials
 from fog_runtime.transports.zenoh_edge import ZenohEdge
 from fog_supervisor import child, net
 from fognav.hosting.versions import Versions

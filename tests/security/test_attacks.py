@@ -19,8 +19,8 @@ from paho.mqtt.enums import CallbackAPIVersion
 
 from fog_contracts import channels as ch
 from fog_contracts import messages as m
-from fog_runtime.access.server_certificate import ServerCertificate
 from fog_runtime.clock import SystemClock
+from fog_runtime.credentials import ServerCertificate
 from fog_runtime.health import Health
 from fog_runtime.http import Routes, Tokens, make_app
 from fog_runtime.transports.zenoh_edge import ZenohEdge

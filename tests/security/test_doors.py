@@ -11,8 +11,8 @@ from paho.mqtt.enums import CallbackAPIVersion
 
 from fog_contracts import channels as ch
 from fog_contracts import messages as m
-from fog_runtime.access.credentials import Credentials
 from fog_runtime.clock import SystemClock
+from fog_runtime.credentials import Credentials
 from fog_runtime.locks.site_locks import SiteLocks
 from fog_runtime.stores.redis_connection import RedisConnection, StoreError
 from fog_runtime.transports.mqtt_broker import Broker

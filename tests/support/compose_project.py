@@ -22,8 +22,8 @@ from typing import TYPE_CHECKING, Any, Final
 import httpx
 from lateness import Lateness
 
-from fog_runtime.access.credentials import Credentials
 from fog_runtime.clock import SystemClock
+from fog_runtime.credentials import Credentials
 from fog_runtime.transports.zenoh_edge import ZenohEdge
 from fognav.hosting.compose_floors import BASE, OVERRIDE
 from fognav.hosting.compose_floors import override as floors_override

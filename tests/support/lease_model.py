@@ -1,6 +1,6 @@
 """The model of the lease in Redis, for the tests of all that is built on it."""
 
-from fog_runtime.leases.lease import Granted, Held, LeftToOther
+from fog_runtime.lease import Granted, Held, LeftToOther
 
 LEASE_S = 1.2
 READY_SAID_S = 0.45

@@ -5,7 +5,7 @@ from __future__ import annotations
 from contextlib import contextmanager
 from typing import TYPE_CHECKING, Final
 
-from fog_runtime.access.credentials import VARIABLE, Credentials
+from fog_runtime.credentials import VARIABLE, Credentials
 from fog_runtime.locks.site_locks import SiteLocks
 from fog_supervisor.servers import Server, start_mosquitto, start_redis, start_router
 

@@ -337,7 +337,7 @@ def live(lockstep: Run) -> tuple[Run, Any]:
             "planner.query_queue",
             "robot_agent.agent.edges.map_loader",
             "robot_agent.agent.service",
-            "fog_runtime.work",
+            "fog_runtime.concurrency",
         ):
             patch.setattr(f"{module}.ThreadPoolExecutor", live_services.InlineExecutor)
         patch.setattr("planner.store.secrets.token_hex", lambda _: GOAL_ID)
@@ -383,7 +383,7 @@ def test_live_services_reply_refuse_and_drive_as_in_lockstep(lockstep, live):
 def table_pairs(live: Any, kind: str, side: str) -> set[Any]:
     """Return the table's pairs of role and channel on one side, for the roles that run here.
 
-    Here each service runs once and always leads: without `fog_runtime.leases.leadership`, which announces the leader
+    Here each service runs once and always leads: without `fog_runtime.leadership`, which announces the leader
     and asks who is present.
     """
     rows = [row for row in ch.CHANNELS.values() if row.kind == kind and row not in {ch.LEADER, ch.LIVE}]

@@ -119,7 +119,7 @@ def live(lockstep: Any) -> Any:
             "planner.query_queue",
             "robot_agent.agent.edges.map_loader",
             "robot_agent.agent.service",
-            "fog_runtime.work",
+            "fog_runtime.concurrency",
         ):
             patch.setattr(f"{name}.ThreadPoolExecutor", live_services.InlineExecutor)
         # The planner names missions at random.

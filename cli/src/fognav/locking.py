@@ -9,8 +9,8 @@ from typing import TYPE_CHECKING, Annotated, Final
 
 import typer
 
-from fog_runtime.access.credentials import VARIABLE as CREDENTIALS_VARIABLE
-from fog_runtime.access.credentials import Credentials, CredentialsError
+from fog_runtime.credentials import VARIABLE as CREDENTIALS_VARIABLE
+from fog_runtime.credentials import Credentials, CredentialsError
 from fognav.output import FailedError, WrongUseError
 
 if TYPE_CHECKING:

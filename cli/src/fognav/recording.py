@@ -10,8 +10,8 @@ from typing import Final
 
 from fog_contracts.channels import Channel
 from fog_contracts.messages import Message
-from fog_runtime.access.credentials import NOBODY, Credentials
 from fog_runtime.clock import Clock, SystemClock
+from fog_runtime.credentials import NOBODY, Credentials
 from fog_runtime.record import Recorder, RecordError, bytes_lost, read, record_all, replay
 from fog_runtime.transports.mqtt_edge import MqttEdge
 from fog_runtime.transports.zenoh_edge import ZenohEdge

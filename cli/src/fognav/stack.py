@@ -9,9 +9,9 @@ from pathlib import Path
 from types import TracebackType
 from typing import Final, Self
 
-from fog_runtime.access.operator_key import read_operator_key
-from fog_runtime.configuration.default_parts import DEFAULT_BASE, DEFAULT_LIDAR
+from fog_runtime.configuration.parts import DEFAULT_BASE, DEFAULT_LIDAR
 from fog_runtime.keys import ADMIN_TOKEN, OPERATOR_KEY, TOKENS, make_keys
+from fog_runtime.operator_key import read_operator_key
 from fog_supervisor import net
 from fog_supervisor.supervisor import Event, Supervisor
 from fognav.programs import (

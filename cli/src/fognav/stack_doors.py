@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import Final
 
 from fog_contracts.site import Site
-from fog_runtime.access.credentials import NOBODY, Credentials
+from fog_runtime.credentials import NOBODY, Credentials
 from fog_runtime.locks.site_locks import CREDENTIALS, SiteLocks
 from fog_supervisor import net
 

@@ -15,7 +15,7 @@ import msgspec
 from fog_contracts import channels as ch
 from fog_contracts.bus import Bus
 from fog_contracts.messages import Pose, RobotGoal
-from fog_runtime.configuration.default_parts import DEFAULT_BASE
+from fog_runtime.configuration.parts import DEFAULT_BASE
 from fognav_experiments.rigs import STAMP, TICK_STEPS, FogRig, RobotRig, moment
 from fognav_sim import devices
 from fognav_sim.drive.drive import Drive

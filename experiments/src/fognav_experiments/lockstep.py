@@ -25,7 +25,7 @@ from fog_contracts.handlers import Publication
 from fog_contracts.messages import RobotGoal
 from fog_contracts.site import Site
 from fog_contracts.stages import SPANS, durations_ms
-from fog_runtime.configuration.default_parts import DEFAULT_BASE, DEFAULT_LIDAR
+from fog_runtime.configuration.parts import DEFAULT_BASE, DEFAULT_LIDAR
 from fog_runtime.configuration.robot_file import default_robot
 from fog_runtime.configuration.site import load_site
 from fognav_experiments.processes import Measure, unmeasured

@@ -12,7 +12,7 @@ import pytest
 from redis.asyncio import Redis
 
 from fog_runtime import backup
-from fog_runtime.backup_archive import BackupError, read_archive
+from fog_runtime.backup import BackupError, read_archive
 from fog_supervisor.servers import Server, start_redis
 
 pytestmark = pytest.mark.live

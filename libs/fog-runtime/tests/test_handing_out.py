@@ -5,12 +5,12 @@ from pathlib import Path
 
 import pytest
 
-from fog_runtime.access.credentials import Credentials
-from fog_runtime.access.token_file import token_hash
+from fog_runtime.credentials import Credentials
 from fog_runtime.keys import ADMIN_TOKEN, OPERATOR_KEY, TOKENS
 from fog_runtime.locks import __main__ as command
 from fog_runtime.locks.handing_out import OWNERS, SIMULATION
 from fog_runtime.locks.site_locks import SiteLocks
+from fog_runtime.token_file import token_hash
 
 SITE = Path(__file__).parents[3] / "sites" / "estig"
 SERVICES = {"hazard-aggregator", "map-service", "planner"}

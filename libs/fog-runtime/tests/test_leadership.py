@@ -18,10 +18,10 @@ from lease_model import LeaseModel
 from fog_contracts import channels as ch
 from fog_contracts.handlers import Fence, Publication, RefusedMessageError
 from fog_contracts.messages import Leader, MapHeartbeat, RobotState, ZoneSet
+from fog_runtime import leadership
 from fog_runtime.clock import ManualClock
 from fog_runtime.health import Health
-from fog_runtime.leases import leadership
-from fog_runtime.leases.leadership import Leadership
+from fog_runtime.leadership import Leadership
 from fog_runtime.stores.redis_connection import StoreError
 from fog_runtime.transports.edges import Edges
 

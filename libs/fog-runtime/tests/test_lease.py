@@ -14,7 +14,7 @@ from hypothesis.stateful import RuleBasedStateMachine, initialize, invariant, ru
 from lease_model import LEASE_S, LeaseModel
 
 from fog_contracts.handlers import HEARD_LIMIT, MOST_AHEAD, Fence, RefusedMessageError
-from fog_runtime.leases.lease import CUT_OFF_S, HEARSAY_PAUSE_S, Granted, Held, Lease, LeftToOther
+from fog_runtime.lease import CUT_OFF_S, HEARSAY_PAUSE_S, Granted, Held, Lease, LeftToOther
 
 ATTEMPT_S, STEP_S, PROBE_S = 0.4, 0.05, 0.2
 TAKEOVER_S = 2.0

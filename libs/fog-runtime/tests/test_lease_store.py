@@ -9,9 +9,9 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from lease_model import LeaseModel
 
-from fog_runtime.leases import lease_store
-from fog_runtime.leases.lease import ATTEMPT_S, LEASE_S, READY_SAID_S, Granted, Held, LeftToOther, Request
-from fog_runtime.leases.lease_store import LeaseStore
+from fog_runtime import leadership
+from fog_runtime.leadership import LeaseStore
+from fog_runtime.lease import ATTEMPT_S, LEASE_S, READY_SAID_S, Granted, Held, LeftToOther, Request
 from fog_supervisor.servers import Server, start_redis
 
 pytestmark = pytest.mark.live
@@ -30,7 +30,7 @@ SLOWER = 500.0
 def no_haste(monkeypatch: pytest.MonkeyPatch) -> None:
     """Let nothing end while a test runs, however slowly: what has to end, the test ends itself (`expire`)."""
     for name, seconds in (("ATTEMPT_S", ATTEMPT_S), ("LEASE_S", LEASE_S), ("READY_SAID_S", READY_SAID_S)):
-        monkeypatch.setattr(lease_store, name, SLOWER * seconds)
+        monkeypatch.setattr(leadership, name, SLOWER * seconds)
 
 
 async def expire(store: LeaseStore, key: str, after_s: float) -> None:
@@ -57,7 +57,7 @@ STEPS = st.lists(
 @settings(max_examples=40, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(steps=STEPS)
 def test_redis_decides_as_the_model_does(redis: Server, steps, monkeypatch):
-    monkeypatch.setattr("fog_runtime.leases.lease_store._now_ms", lambda: 3)
+    monkeypatch.setattr("fog_runtime.leadership._now_ms", lambda: 3)
     asyncio.run(compare(redis, steps))
 
 
@@ -149,7 +149,7 @@ async def test_redis_that_hangs_or_is_away_gives_no_reply_in_time(tmp_path: Path
         async with LeaseStore(server.url, "away", "planner") as store:
             assert await store.acquire("a", NEW) is not None
             await store._redis.write(("CLIENT", "PAUSE", 600_000))
-            monkeypatch.setattr(lease_store, "ATTEMPT_S", ATTEMPT_S)
+            monkeypatch.setattr(leadership, "ATTEMPT_S", ATTEMPT_S)
             began = asyncio.get_running_loop().time()
             assert await store.acquire("a", NEW) is None
             assert asyncio.get_running_loop().time() - began >= ATTEMPT_S * 0.9

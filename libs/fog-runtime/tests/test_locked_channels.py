@@ -17,8 +17,8 @@ from sample_messages import sample, sample_of
 
 from fog_contracts import channels as ch
 from fog_contracts import messages as m
-from fog_runtime.access.credentials import Credentials
 from fog_runtime.clock import SystemClock
+from fog_runtime.credentials import Credentials
 from fog_runtime.locks.site_locks import SiteLocks
 from fog_runtime.transports.mqtt_edge import MqttEdge
 from fog_runtime.transports.zenoh_edge import ZenohEdge

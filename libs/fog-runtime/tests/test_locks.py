@@ -13,9 +13,9 @@ from redis.asyncio import Redis
 
 from fog_contracts import channels as ch
 from fog_contracts import messages as m
-from fog_runtime.access.credentials import NOBODY, Credentials, CredentialsError, to_toml
 from fog_runtime.clock import SystemClock
-from fog_runtime.leases.lease_store import LeaseStore
+from fog_runtime.credentials import NOBODY, Credentials, CredentialsError, to_toml
+from fog_runtime.leadership import LeaseStore
 from fog_runtime.locks import users
 from fog_runtime.locks.authority import Authority, AuthorityError
 from fog_runtime.locks.members import LocksError

@@ -11,7 +11,7 @@ from functools import cache
 
 import pytest
 
-from fog_runtime.machine import memory
+from fog_runtime import process
 
 
 class Cycle:
@@ -25,7 +25,7 @@ import gc
 import numpy as np
 from numba import njit
 from fog_kernels.components import Components
-from fog_runtime.machine.memory import release_startup_memory
+from fog_runtime.process import release_startup_memory
 
 Components(np.zeros((50, 50), np.uint8))
 print(release_startup_memory())
@@ -58,7 +58,7 @@ def test_collector_of_garbage_passes_over_what_the_start_has_made() -> None:
 def test_what_is_loaded_without_collections_is_passed_over_by_later_ones() -> None:
     assert gc.isenabled()
     try:
-        with memory.loading(lambda: False):
+        with process.loading(lambda: False):
             assert not gc.isenabled()
             made = [[number] for number in range(100)]
         assert gc.isenabled()
@@ -71,7 +71,7 @@ def test_what_is_loaded_without_collections_is_passed_over_by_later_ones() -> No
 @pytest.mark.parametrize("made_garbage", [True, False])
 def test_garbage_is_collected_when_much_was_made_while_loading(*, made_garbage: bool) -> None:
     try:
-        with memory.loading(lambda: made_garbage):
+        with process.loading(lambda: made_garbage):
             cycle = Cycle()
             cycle.itself, gone = cycle, weakref.ref(cycle)
             del cycle
@@ -83,10 +83,10 @@ def test_garbage_is_collected_when_much_was_made_while_loading(*, made_garbage: 
 
 async def test_memory_is_released_as_soon_as_the_process_is_ready(monkeypatch: pytest.MonkeyPatch) -> None:
     released: list[int] = []
-    monkeypatch.setattr(memory, "_POLL_S", 0.001)
-    monkeypatch.setattr(memory, "release_startup_memory", lambda: released.append(0))
+    monkeypatch.setattr(process, "_POLL_S", 0.001)
+    monkeypatch.setattr(process, "release_startup_memory", lambda: released.append(0))
     ready: list[str] = []
-    waiting = asyncio.create_task(memory.release_when(lambda: bool(ready)))
+    waiting = asyncio.create_task(process.release_when(lambda: bool(ready)))
     await asyncio.sleep(0.01)
     assert released == []
     ready.append("map")
@@ -96,7 +96,7 @@ async def test_memory_is_released_as_soon_as_the_process_is_ready(monkeypatch: p
 
 LIBRARIES = """
 import numpy as np
-from fog_runtime.machine.memory import release_startup_memory
+from fog_runtime.process import release_startup_memory
 
 def held():
     with open("/proc/self/smaps") as maps:

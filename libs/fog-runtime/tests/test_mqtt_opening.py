@@ -6,7 +6,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from fog_runtime.mqtt_opening import MalformedError, MqttOpening
+from fog_runtime.broker import MalformedError, MqttOpening
 
 WORDS = st.text(alphabet="abcXYZ019-_.", max_size=200)
 

@@ -8,9 +8,15 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from fog_runtime.configuration.robot_file import ROBOT_FILE, default_robot, load_robot, parse_robot
+from fog_runtime.configuration.robot_file import (
+    ROBOT_FILE,
+    default_robot,
+    find_line,
+    key_lines,
+    load_robot,
+    parse_robot,
+)
 from fog_runtime.configuration.settings import SettingsError
-from fog_runtime.configuration.toml_lines import find_line, key_lines
 
 FILE = Path("robot.toml")
 TEXT = """# my robot

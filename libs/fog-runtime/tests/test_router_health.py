@@ -11,9 +11,9 @@ from pathlib import Path
 import httpx
 import pytest
 
-from fog_runtime.access.credentials import NOBODY, Credentials, to_toml
+from fog_runtime.credentials import NOBODY, Credentials, to_toml
 from fog_runtime.locks.site_locks import SiteLocks
-from fog_runtime.router_health import AGAIN_S, ANSWERS, OPEN_S, RouterHealth
+from fog_runtime.router import AGAIN_S, ANSWERS, OPEN_S, RouterHealth
 
 ROOT = Path(__file__).parents[3]
 LISTENING = re.compile(r'"url": "(http://127\.0\.0\.1:\d+)"')

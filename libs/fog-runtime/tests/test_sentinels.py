@@ -17,7 +17,7 @@ from redis.asyncio import Redis
 from redis.exceptions import RedisError
 
 from fog_contracts.messages import Message
-from fog_runtime.access.credentials import Credentials
+from fog_runtime.credentials import Credentials
 from fog_runtime.locks.site_locks import SiteLocks
 from fog_runtime.stores.redis_connection import RedisAddress, RedisConnection, parse_address
 from fog_runtime.stores.redis_store import Audit, RedisStore, StoreError, Table

@@ -17,10 +17,10 @@ from prometheus_client import REGISTRY
 from fog_contracts.messages import Trace
 from fog_contracts.stages import SPANS
 from fog_runtime import logs, metrics
+from fog_runtime.concurrency import Slot
 from fog_runtime.configuration.settings import CommonSettings, InflationSettings, Secret, SettingsError, describe, load
 from fog_runtime.files import SHARED, atomic_write
 from fog_runtime.health import Health, serve_health
-from fog_runtime.slots import Slot
 
 
 async def test_slot_holds_only_the_newest_value_with_its_age():

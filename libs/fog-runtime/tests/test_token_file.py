@@ -7,8 +7,8 @@ import sys
 
 import pytest
 
-from fog_runtime.access.token_file import TokensError, audit_file, create_token, read_tokens, revoke_token
 from fog_runtime.http import load_tokens
+from fog_runtime.token_file import TokensError, audit_file, create_token, read_tokens, revoke_token
 
 
 @pytest.fixture
@@ -85,7 +85,7 @@ def test_unknown_name_is_refused_with_the_known_ones(file):
 
 def run(*arguments):
     return subprocess.run(
-        [sys.executable, "-m", "fog_runtime.access.token_file", *arguments], capture_output=True, text=True, check=False
+        [sys.executable, "-m", "fog_runtime.token_file", *arguments], capture_output=True, text=True, check=False
     )
 
 
@@ -101,7 +101,7 @@ def test_fog_node_manages_tokens_without_the_fognav_command(file):
 def test_concurrent_changes_are_all_kept(file):
     writers = [
         subprocess.Popen(
-            [sys.executable, "-m", "fog_runtime.access.token_file", str(file), "create", f"n{i}", "viewer"],
+            [sys.executable, "-m", "fog_runtime.token_file", str(file), "create", f"n{i}", "viewer"],
             stdout=subprocess.DEVNULL,
         )
         for i in range(4)

@@ -15,7 +15,7 @@ from hypothesis import strategies as st
 from redis.asyncio import Redis
 from redis.exceptions import AuthenticationError, NoPermissionError
 
-from fog_runtime.access.credentials import Credentials
+from fog_runtime.credentials import Credentials
 from fog_runtime.locks.site_locks import SiteLocks
 from fog_supervisor.embedded.access_list import AccessList, Passwords, matches
 from fog_supervisor.servers import (

@@ -15,12 +15,11 @@ from contextlib import ExitStack
 from functools import partial
 from typing import TYPE_CHECKING
 
-from fog_runtime import logs, process
+from fog_runtime import logs, machine, process
 from fog_runtime.clock import SystemClock
 from fog_runtime.configuration.robot_file import load_robot
 from fog_runtime.configuration.settings import describe, load
-from fog_runtime.machine import signals
-from fog_runtime.machine.memory import loading
+from fog_runtime.process import loading
 from robot_agent import registry
 from robot_agent.agent.edges.guardian_client import connect_early
 from robot_agent.agent.edges.lidar_start import LidarParts, lidar_start
@@ -75,5 +74,5 @@ def _has_compiled() -> bool:
 
 
 if __name__ == "__main__":
-    signals.ignore_terminal_stops()
+    machine.ignore_terminal_stops()
     process.run(main)

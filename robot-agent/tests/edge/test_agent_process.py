@@ -16,7 +16,7 @@ from locked_servers import locked_router
 from fog_contracts import channels as ch
 from fog_contracts.grid import Window
 from fog_contracts.messages import PlanReply, Pose, RobotGoal
-from fog_runtime.machine.signals import TERMINAL_STOPS
+from fog_runtime.machine import TERMINAL_STOPS
 from robot_agent.agent.recording.replay import replay
 from robot_agent.localization.localizer import SavedPose
 

@@ -15,11 +15,11 @@ import pytest
 from guardian_rig import DEADLINE_S
 from little_world import KEY
 
-from fog_runtime.access.credentials import CredentialsError
 from fog_runtime.clock import SystemClock
 from fog_runtime.configuration import parts
 from fog_runtime.configuration.robot_file import default_robot
 from fog_runtime.configuration.settings import SettingsError
+from fog_runtime.credentials import CredentialsError
 from fognav_sim.pty_port import PtyPort
 from robot_agent import __main__ as program
 from robot_agent.agent.edges.lidar_edge import LidarEdge

@@ -16,7 +16,7 @@ import numpy as np
 import pytest
 from guardian_rig import STOP_S, wait_for
 
-from fog_runtime.machine.signals import ENDING, TERMINAL_STOPS
+from fog_runtime.machine import ENDING, TERMINAL_STOPS
 from robot_agent.bases.diffdrive.emulator import DiffDriveEmulator
 from robot_agent.bases.roomba600.emulator import SAFE, RoombaEmulator
 from robot_agent.lidars.rplidar_a1.emulator import RplidarEmulator

@@ -11,7 +11,7 @@ import pytest
 
 from fog_contracts import channels as ch
 from fog_contracts.messages import AreaHazard, MapHeartbeat, NodeReading
-from fog_runtime.leases.lease import CUT_OFF_S
+from fog_runtime.lease import CUT_OFF_S
 
 pytestmark = pytest.mark.live
 

@@ -11,11 +11,11 @@ from msgspec import structs
 from fog_contracts.grid import GridGeometry
 from fog_contracts.handlers import Moment
 from fog_contracts.messages import AreaDefinition
-from fog_runtime.access.token_file import TokenEntry
 from fog_runtime.clock import ManualClock
 from fog_runtime.health import Health
 from fog_runtime.http import Tokens, token_hash
 from fog_runtime.stores.idempotency import Attempt
+from fog_runtime.token_file import TokenEntry
 from fog_supervisor.servers import start_redis
 from hazard_aggregator import area_size
 from hazard_aggregator.api import make_api

@@ -36,7 +36,7 @@ CROSSING = {"type": "polygon", "points": [[0.1 * i, 30.0 + (-1) ** i * (i % 7)] 
 TOO_LONG = {"type": "corridor", "line": [[1.0 + i % 2 * 90.0, 1.0 + i % 2 * 58.0] for i in range(500)], "width": 0.3}
 STOPPED_CLIENT = """
 import pathlib, sys, time, zenoh
-from fog_runtime.access.credentials import Credentials
+from fog_runtime.credentials import Credentials
 from fog_runtime.transports.zenoh_edge import session_config
 own = Credentials.read(pathlib.Path(sys.argv[2]))
 session = zenoh.open(session_config("client", connect=[sys.argv[1]], credentials=own))

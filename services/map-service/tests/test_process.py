@@ -30,7 +30,7 @@ from fog_contracts.messages import (
     ZoneSet,
 )
 from fog_contracts.replica import Applied, Replica
-from fog_runtime.leases.lease import HEARSAY_PAUSE_S
+from fog_runtime.lease import HEARSAY_PAUSE_S
 
 pytestmark = pytest.mark.live
 CIRCLE = {"kind": "BLOCKED", "shape": {"type": "circle", "centre": [6.0, 3.0], "radius": 0.5}, "reason": "wet floor"}

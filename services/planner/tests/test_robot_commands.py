@@ -16,10 +16,10 @@ from fog_contracts import channels as ch
 from fog_contracts.commands import CommandGate
 from fog_contracts.messages import CommandReply, RobotCommand, RobotState
 from fog_contracts.site import Place
-from fog_runtime.access.token_file import TokenEntry, token_hash
 from fog_runtime.clock import ManualClock
 from fog_runtime.health import Health
 from fog_runtime.http import Tokens
+from fog_runtime.token_file import TokenEntry, token_hash
 from planner.api import make_api
 from planner.core import PlannerCore
 from planner.robot_commands import OTHERS, PERIOD_S, REMEMBERED_S, SENDERS, CommandError, DoubledRobots, StopRecords

@@ -15,8 +15,8 @@ from fog_contracts import channels as ch
 from fog_contracts.geometry import GeometryError
 from fog_contracts.messages import CommandReply, NodeConfig, SimCommand
 from fog_runtime import logs
-from fog_runtime.access.credentials import NOBODY, Credentials
 from fog_runtime.clock import Ticker
+from fog_runtime.credentials import NOBODY, Credentials
 from fog_runtime.transports.mqtt_edge import MqttEdge, Will
 from fognav_sim.hardware import STEP_S
 from fognav_sim.pty_port import PtyPort

@@ -17,12 +17,12 @@ from fog_contracts import channels as ch
 from fog_contracts.codec import ContractError
 from fog_contracts.messages import RobotState
 from fog_runtime import logs, process
-from fog_runtime.access.credentials import Credentials
-from fog_runtime.access.operator_key import read_operator_key
 from fog_runtime.clock import SystemClock, ticker
 from fog_runtime.configuration.settings import CommonSettings, SettingsError, describe, load
 from fog_runtime.configuration.site import load_site
+from fog_runtime.credentials import Credentials
 from fog_runtime.health import Health, serve_health
+from fog_runtime.operator_key import read_operator_key
 from fog_runtime.robot_commands import RobotCommands
 from fog_runtime.transports.zenoh_edge import ZenohEdge
 from fog_supervisor.supervisor import Event, Program, Supervisor

@@ -3,8 +3,8 @@
 from pathlib import Path
 from typing import Literal
 
-from fog_runtime.access.credentials import NOBODY, Credentials
 from fog_runtime.configuration.settings import CommonSettings
+from fog_runtime.credentials import NOBODY, Credentials
 
 
 class Settings(CommonSettings, frozen=True, kw_only=True):

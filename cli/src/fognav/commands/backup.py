@@ -10,9 +10,9 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from fog_runtime import backup
-from fog_runtime.access.credentials import CredentialsError
-from fog_runtime.backup_archive import Backup, BackupError, read_archive
+from fog_runtime.backup import Backup, BackupError, read_archive
 from fog_runtime.configuration.site import SiteError, load_site
+from fog_runtime.credentials import CredentialsError
 from fognav import checkout
 from fognav.locking import locks_errors, own_credentials
 from fognav.output import FailedError, WrongUseError, check_writable, exit_codes, print_line

@@ -14,8 +14,8 @@ import typer
 from fog_contracts import channels as ch
 from fog_contracts.messages import Id, NodeCalibration, NodeReading, NodeUpdate
 from fog_contracts.site import NodeSite, Sonar, learned_share
-from fog_runtime.access.credentials import Credentials
 from fog_runtime.configuration.site import LoadedSite
+from fog_runtime.credentials import Credentials
 from fognav import checkout, kernels, node_code
 from fognav.locking import own_credentials
 from fognav.nodes import on_broker, provisioning, site_file, updating

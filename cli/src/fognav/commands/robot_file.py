@@ -8,7 +8,7 @@ import msgspec
 import typer
 
 from fog_contracts.messages import Id
-from fog_runtime.configuration.default_parts import DEFAULT_BASE, DEFAULT_LIDAR
+from fog_runtime.configuration.parts import DEFAULT_BASE, DEFAULT_LIDAR
 from fog_runtime.configuration.robot_file import ROBOT_FILE, RobotFile, default_robot, describe_robot, load_robot
 from fog_runtime.configuration.settings import SettingsError
 from fog_runtime.files import SHARED, atomic_write

@@ -6,9 +6,9 @@ from typing import Annotated, Final
 
 import typer
 
-from fog_runtime.access.credentials import to_toml
-from fog_runtime.access.token_file import Role, TokensError, create_token, read_tokens, revoke_token
+from fog_runtime.credentials import to_toml
 from fog_runtime.files import atomic_write
+from fog_runtime.token_file import Role, TokensError, create_token, read_tokens, revoke_token
 from fognav.locking import LocksOption, locks_errors, locks_folder, open_locks
 from fognav.operate.fog import find_fog
 from fognav.operate.options import JsonOption

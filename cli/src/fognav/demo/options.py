@@ -7,7 +7,7 @@ from pathlib import Path
 from fog_contracts.messages import ProfileName
 from fog_contracts.site import Place
 from fog_runtime.configuration import parts
-from fog_runtime.configuration.default_parts import DEFAULT_BASE, DEFAULT_LIDAR
+from fog_runtime.configuration.parts import DEFAULT_BASE, DEFAULT_LIDAR
 from fog_runtime.configuration.robot_file import ROBOT_FILE, default_robot, load_robot
 from fog_runtime.configuration.site import LoadedSite
 from fognav.output import WrongUseError

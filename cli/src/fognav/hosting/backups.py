@@ -12,8 +12,8 @@ from pathlib import Path
 from typing import Final, NamedTuple
 
 from fog_runtime import backup
-from fog_runtime.access.credentials import Credentials
-from fog_runtime.backup_archive import Backup, read_archive
+from fog_runtime.backup import Backup, read_archive
+from fog_runtime.credentials import Credentials
 from fog_runtime.files import atomic_write
 from fog_runtime.locks.server_files import ANYBODY, USERS, user_of
 from fog_runtime.locks.site_locks import AUTHORITY, SiteLocks

@@ -9,7 +9,7 @@ from functools import partial
 from pathlib import Path
 from typing import Final
 
-from fog_runtime.configuration.default_parts import DEFAULT_BASE, DEFAULT_LIDAR
+from fog_runtime.configuration.parts import DEFAULT_BASE, DEFAULT_LIDAR
 from fog_runtime.keys import ADMIN_TOKEN, OPERATOR_KEY, TOKENS
 from fog_runtime.locks.site_locks import CERTIFICATE, KEY, SiteLocks
 from fog_supervisor import net

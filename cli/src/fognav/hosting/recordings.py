@@ -15,7 +15,7 @@ from mcap.exceptions import McapError
 from mcap.reader import SeekingReader
 from mcap.records import Statistics
 
-from fog_runtime.backup_archive import File
+from fog_runtime.backup import File
 from fog_runtime.files import PRIVATE, atomic_write
 
 FOLDER: Final = "recordings"

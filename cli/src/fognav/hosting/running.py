@@ -7,8 +7,8 @@ from collections.abc import Callable, Iterator
 from functools import partial
 from typing import Final
 
-from fog_runtime.machine import signals
-from fog_runtime.machine.service_manager import ServiceManager
+from fog_runtime import machine
+from fog_runtime.machine import ServiceManager
 from fog_supervisor.supervisor import Event
 from fognav.hosting import log_files
 from fognav.hosting.lock_changes import LockChanges
@@ -65,7 +65,7 @@ async def run_node(config: NodeConfig, print_line: Callable[[str], None], *, che
             stopped = True
             running.cancel()
 
-    for number in signals.ending():
+    for number in machine.ending():
         loop.add_signal_handler(number, stop)
     try:
         require_free_ports(node)
@@ -84,7 +84,7 @@ async def run_node(config: NodeConfig, print_line: Callable[[str], None], *, che
         print_line("the fog node has ended; its data stays in " + str(config.folder.path))
     finally:
         node.remove_devices()
-        for number in signals.ending():
+        for number in machine.ending():
             loop.remove_signal_handler(number)
 
 

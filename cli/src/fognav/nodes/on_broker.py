@@ -12,7 +12,7 @@ import aiomqtt
 from fog_contracts import channels as ch
 from fog_contracts.codec import ContractError, decode, decode_text, encode, encode_text
 from fog_contracts.messages import NodeCalibration, NodeReading
-from fog_runtime.access.credentials import NOBODY, Credentials
+from fog_runtime.credentials import NOBODY, Credentials
 from fog_runtime.transports.mqtt_broker import Broker
 from fognav.output import FailedError, WrongUseError
 

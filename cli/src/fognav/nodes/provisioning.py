@@ -11,7 +11,7 @@ import stat
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Final
 
-from fog_runtime.access.credentials import Credentials
+from fog_runtime.credentials import Credentials
 from fog_runtime.files import PRIVATE, atomic_write
 from fognav.output import WrongUseError
 

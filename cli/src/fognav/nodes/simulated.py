@@ -24,8 +24,8 @@ if TYPE_CHECKING:
 
     from fog_contracts.geometry import Point
     from fog_contracts.site import NodeSite
-    from fog_runtime.access.credentials import Credentials
     from fog_runtime.configuration.site import LoadedSite
+    from fog_runtime.credentials import Credentials
 
 PERSON_RADIUS_M: Final = 0.25
 _MITE_M: Final = 0.01

@@ -22,7 +22,7 @@ from cryptography.hazmat.primitives.serialization import (
 
 from fog_contracts.messages import NodeUpdate
 from fog_runtime.files import PRIVATE, atomic_write
-from fog_runtime.machine.own_address import reachable_address
+from fog_runtime.own_address import reachable_address
 from fog_runtime.transports.mqtt_broker import Broker
 from fognav.output import WrongUseError
 

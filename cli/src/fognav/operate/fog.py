@@ -13,8 +13,8 @@ from urllib.parse import quote, urlsplit
 import msgspec
 
 from fog_contracts.messages import Id
-from fog_runtime.access.credentials import Credentials
-from fog_runtime.access.operator_key import OperatorKeyError, read_operator_key
+from fog_runtime.credentials import Credentials
+from fog_runtime.operator_key import OperatorKeyError, read_operator_key
 from fog_supervisor import net
 from fognav.locking import own_credentials
 from fognav.operate.registry import System, registered

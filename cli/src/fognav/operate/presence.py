@@ -3,8 +3,8 @@
 import asyncio
 from typing import Final
 
-from fog_runtime.access.credentials import Credentials
 from fog_runtime.clock import SystemClock
+from fog_runtime.credentials import Credentials
 from fog_runtime.transports.zenoh_edge import ZenohEdge
 from fognav.operate.registry import System
 from fognav.operate.systems import ROUTER

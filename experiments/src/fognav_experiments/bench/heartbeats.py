@@ -16,7 +16,7 @@ import msgspec
 import zenoh
 
 from fog_contracts import channels as ch
-from fog_runtime.access.credentials import Credentials
+from fog_runtime.credentials import Credentials
 from fog_runtime.transports.zenoh_edge import session_config
 
 

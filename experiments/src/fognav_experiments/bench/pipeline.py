@@ -21,7 +21,7 @@ import zenoh
 from fog_contracts import channels as ch
 from fog_contracts.codec import decode
 from fog_contracts.messages import MapDelta
-from fog_runtime.access.credentials import NOBODY
+from fog_runtime.credentials import NOBODY
 from fog_runtime.transports.zenoh_edge import session_config
 from fog_supervisor import net
 from fognav.output import FailedError

@@ -19,9 +19,9 @@ from fog_contracts import channels as ch
 from fog_contracts.messages import RobotPose, RobotState
 from fog_runtime.clock import SystemClock
 from fog_runtime.configuration.maps import save_map
-from fog_runtime.machine.task_usage import ProcessUsage, memory_mb, sample, usage
 from fog_runtime.robot_commands import RobotCommands
 from fog_runtime.transports.zenoh_edge import ZenohEdge
+from fog_runtime.usage import ProcessUsage, memory_mb, sample, usage
 from fog_supervisor import net
 from fognav.output import WrongUseError
 from fognav.programs import AGENT, PLANNER, ROBOT, WATCHDOG

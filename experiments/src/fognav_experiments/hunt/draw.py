@@ -14,7 +14,7 @@ import msgspec
 import numpy as np
 
 from fog_runtime.configuration import parts
-from fog_runtime.configuration.default_parts import DEFAULT_BASE, DEFAULT_LIDAR
+from fog_runtime.configuration.parts import DEFAULT_BASE, DEFAULT_LIDAR
 from fognav_experiments.hunt.world import Box, HuntWorld, Mounting, Patch, Sensors, Watched
 from fognav_experiments.scenarios.description import (
     BadLine,

@@ -19,7 +19,7 @@ from fog_contracts.messages import Id, PointXY, Pose, Seconds
 from fog_contracts.site import AreaSite, DemoPlan, NodeSite, Place, RobotSite, Site, Sonar
 from fog_kernels.components import Components
 from fog_kernels.distance import squared_distance_capped
-from fog_runtime.configuration.default_parts import DEFAULT_BASE, DEFAULT_LIDAR
+from fog_runtime.configuration.parts import DEFAULT_BASE, DEFAULT_LIDAR
 from fog_runtime.configuration.robot_file import RobotFile, default_robot
 from fognav_experiments.scenarios.description import AnyEvent, BadLine, Obstacle
 from fognav_sim.floor import Floor

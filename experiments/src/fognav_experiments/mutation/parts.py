@@ -269,7 +269,7 @@ PARTS: Final = (
         "watchdog",
         ("guardian.watchdog",),
         ("guardian/test_watchdog.py",),
-        ("robot_agent.serial_port", "fog_runtime.configuration.parts", "fog_runtime.machine.service_manager"),
+        ("robot_agent.serial_port", "fog_runtime.configuration.parts", "fog_runtime.machine"),
         (
             Equivalent(
                 "watchdog",

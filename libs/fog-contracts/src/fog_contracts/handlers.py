@@ -125,7 +125,7 @@ class Fence:
     """The highest epoch received of each service, by its role.
 
     A service has one leader at a time, whose epoch is larger than that of every leader before it
-    (`fog_runtime.leases.lease`). A leader that was replaced without knowing it, because it was stopped or cut off,
+    (`fog_runtime.lease`). A leader that was replaced without knowing it, because it was stopped or cut off,
     still sends its own epoch.
     """
 

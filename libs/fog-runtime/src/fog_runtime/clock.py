@@ -13,7 +13,7 @@ from collections.abc import AsyncIterator, Callable
 from pathlib import Path
 from typing import Final, Literal, Protocol, get_args
 
-from fog_runtime.machine.machine_clock import MachineClock
+from fog_runtime.machine import MachineClock
 
 WallClockSource = Literal["kernel", "trusted"]
 _EARLIEST: Final = 1_735_689_600.0

@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Final
 
 from fog_contracts.commands import KEY_BYTES
-from fog_runtime.access.token_file import TOKEN_BYTES, token_hash
+from fog_runtime.token_file import TOKEN_BYTES, token_hash
 
 ADMIN_TOKEN: Final = "admin.token"  # noqa: S105  # a file's name
 TOKENS: Final = "tokens.toml"

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Final, Protocol, TypeAlias
 from urllib.parse import urlsplit
 
 from fog_runtime import admission, logs
-from fog_runtime.access.server_certificate import ServerCertificate
+from fog_runtime.credentials import ServerCertificate
 
 if TYPE_CHECKING:
     import socket

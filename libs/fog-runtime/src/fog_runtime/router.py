@@ -2,36 +2,87 @@
 
 With `--certificate` and `--key` it encrypts (`--listen tls/…`), with `--users` it admits only these, and with
 `--access` each of them may only do what that list allows. With `--health-port` it says at `/readyz` of this computer
-whether it answers its clients (`router_health`).
+whether it answers its clients (`RouterHealth`).
 
 Zenoh itself listens on a Unix socket, and gets only those connections that a relay has encrypted: connections that say
 nothing, or leave again, would keep it from everybody else (docs/adr/0055, docs/upstream/zenoh-accept-loop.md). A router
 to which no session can be opened for a while ends, to be started again.
 """
 
+from __future__ import annotations
+
 import argparse
 import asyncio
 import contextlib
 import faulthandler
 import json
+import math
 import secrets
-import ssl
 import tempfile
+import threading
 import time
-from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Final
+from typing import TYPE_CHECKING, Any, Final
 
 import zenoh
 
-from fog_runtime import admission, logs, process
-from fog_runtime.access.credentials import Credentials
+from fog_runtime import admission, logs, machine, process
+from fog_runtime.credentials import Credentials
 from fog_runtime.health import Health, serve_health
-from fog_runtime.machine import descriptors
 from fog_runtime.relay import Relay, ZenohOpening, place_of, server_tls, to_socket
-from fog_runtime.router_health import ANSWERS, RouterHealth
 from fog_runtime.transports.zenoh_edge import session_config
+
+if TYPE_CHECKING:
+    import ssl
+    from collections.abc import Sequence
+
+ANSWERS: Final = "answers"
+"""The condition: a session can be opened."""
+OPEN_S: Final = 1.5
+"""How long that may take: less than a container's check waits for the answer (deploy/images/ready)."""
+
+AGAIN_S: Final = 15.0
+"""For how long an answer is good: a session costs a small computer half a second of processor time."""
+
+
+class RouterHealth(Health):
+    """Health of a router, which is asked for a report unless it has answered just before.
+
+    A router whose process runs may still serve nobody: stopped, out of file descriptors, with a certificate that
+    expired. That its port accepts connections says nothing, for the operating system accepts them in its name.
+    """
+
+    def __init__(self, endpoint: str, credentials: Credentials) -> None:
+        """Ask at an endpoint such as `tls/localhost:7447`, as a user who need not have any right.
+
+        Raises `CredentialsError` if the endpoint would reveal the password.
+        """
+        super().__init__(ANSWERS)
+        self._endpoint = endpoint
+        self._config = session_config("client", connect=[endpoint], credentials=credentials)
+        self._config.insert_json5("connect/timeout_ms", json.dumps(round(1000 * OPEN_S)))
+        self._config.insert_json5("connect/exit_on_failure", "true")
+        self._one_at_a_time = threading.Lock()
+        self._answered_at = -math.inf
+
+    def report(self) -> dict[str, Any]:
+        """Open and close a session, and return what came of it, or of the last one; takes `OPEN_S` at most."""
+        with self._one_at_a_time:
+            if time.monotonic() - self._answered_at > AGAIN_S:
+                answers, problem = self._ask()
+                self._answered_at = time.monotonic() if answers else -math.inf
+                self.set(ANSWERS, answers, problem)
+        return super().report()
+
+    def _ask(self) -> tuple[bool, str]:
+        try:
+            with zenoh.open(self._config) as session:
+                known = list(session.info.routers_zid())
+        except zenoh.ZError as error:
+            return False, f"no session within {OPEN_S:g} s at {self._endpoint}: {error}"
+        return bool(known), "" if known else f"the session at {self._endpoint} ended at once"
+
 
 WATCH_S: Final = 5.0
 """How often the router looks whether a session can be opened to it (it asks itself less often while that works)."""
@@ -132,7 +183,7 @@ async def run_router(
     """
     locks = locks or RouterLocks()
     health = None if health_port is None else health_port.health(listen[0])
-    descriptors.raise_limit()
+    machine.raise_limit()
     with contextlib.ExitStack() as stack:
         folder = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="fognav-router-")))
         own = folder / "zenoh"

@@ -18,10 +18,9 @@ from fog_contracts.codec import ContractError
 from fog_contracts.messages import CommandReply, LoopHealth, PlanReply, RobotCommand, RobotState
 from fog_runtime import logs, metrics
 from fog_runtime.clock import Phase, Ticker
-from fog_runtime.machine.service_manager import ServiceManager
-from fog_runtime.machine.suspension import SuspensionMonitor
-from fog_runtime.machine.task_usage import name_thread
+from fog_runtime.machine import ServiceManager, SuspensionMonitor
 from fog_runtime.transports.edges import Edges
+from fog_runtime.usage import name_thread
 from robot_agent.agent.core import decide
 from robot_agent.agent.edges.exporter import Observed, RobotCollector, parent
 

@@ -12,18 +12,18 @@ from msgspec import Meta
 from fog_contracts.commands import KEY_BYTES
 from fog_contracts.messages import Id
 from fog_contracts.site import Site
-from fog_runtime.access.operator_key import OperatorKeyError
-from fog_runtime.access.operator_key import read_operator_key as read_key
 from fog_runtime.configuration.robot_file import VARIABLES
 from fog_runtime.configuration.settings import CommonSettings, SettingsError
+from fog_runtime.operator_key import OperatorKeyError
+from fog_runtime.operator_key import read_operator_key as read_key
 from robot_agent import registry
 from robot_agent.contradictions import refuse_body, refuse_contradictions
 from robot_agent.footprint import Footprint, FootprintError
 
 if TYPE_CHECKING:
     from fog_contracts.site import RobotSite
-    from fog_runtime.access.credentials import Credentials
     from fog_runtime.configuration.robot_file import RobotFile
+    from fog_runtime.credentials import Credentials
     from robot_agent.hardware import BaseDriver
 
 SITE_FILE: Final = "site.toml"

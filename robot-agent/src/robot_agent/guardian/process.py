@@ -19,12 +19,11 @@ from typing import TYPE_CHECKING, Final, Literal
 import msgspec
 
 from fog_contracts.messages import SENTENCE_MAX
-from fog_runtime import logs
+from fog_runtime import logs, machine
 from fog_runtime.configuration.robot_file import load_robot
 from fog_runtime.configuration.settings import SettingsError, load
 from fog_runtime.logs import Level
-from fog_runtime.machine import signals
-from fog_runtime.machine.machine_clock import MachineClock
+from fog_runtime.machine import MachineClock
 from robot_agent.device_signature import LISTEN_S, LineCheck
 from robot_agent.guardian.core import GuardianCore, Limits, Output
 from robot_agent.guardian.frame_clock import UNKNOWN_S, FrameClock
@@ -351,9 +350,9 @@ def main() -> int:
         return BAD_SETTINGS
     logs.configure("guardian", settings.log_level, settings.log_format)
     guardian = Guardian(settings, core, listener, check)
-    for number in signals.ENDING:
+    for number in machine.ENDING:
         signal.signal(number, guardian.end)
-    signals.ignore_terminal_stops()
+    machine.ignore_terminal_stops()
     priority = run_in_real_time(settings.realtime_priority)
     logs.get("guardian").info(
         "started", base=robot.settings.base.driver, port=settings.base_port, priority=priority, memory=lock_memory()

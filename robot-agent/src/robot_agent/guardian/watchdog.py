@@ -20,10 +20,10 @@ from contextlib import suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Final, NamedTuple
 
+from fog_runtime import machine
 from fog_runtime.configuration import parts
-from fog_runtime.configuration.default_parts import DEFAULT_BASE
-from fog_runtime.machine import signals
-from fog_runtime.machine.service_manager import ServiceManager
+from fog_runtime.configuration.parts import DEFAULT_BASE
+from fog_runtime.machine import ServiceManager
 from robot_agent.guardian.heartbeat import silence_limit
 from robot_agent.guardian.protection import lock_memory, run_in_real_time
 from robot_agent.port_names import PortNameError
@@ -74,7 +74,7 @@ def log_event(event: str, **fields: object) -> None:
 
 def _terminate(signum: int, _frame: FrameType | None) -> None:
     # A second signal must not interrupt the stop that the first one requested.
-    for number in signals.ENDING:
+    for number in machine.ENDING:
         signal.signal(number, signal.SIG_IGN)
     raise _Terminated(signal.Signals(signum).name)
 
@@ -294,10 +294,10 @@ def main() -> int:
     """Guard until a signal ends the process."""
     try:
         _own_session()
-        signals.ignore_terminal_stops()
+        machine.ignore_terminal_stops()
         settings = read_settings()
         log_event("started", priority=run_in_real_time(settings.realtime_priority), memory=lock_memory())
-        for number in signals.ending():
+        for number in machine.ending():
             signal.signal(number, _terminate)
         MANAGER.ready()
         return _guard_always(settings)

@@ -15,9 +15,8 @@ from fog_runtime.configuration.settings import CommonSettings, describe, load
 from fog_runtime.configuration.site import load_site
 from fog_runtime.health import Health
 from fog_runtime.http import Front, load_tokens, unused
-from fog_runtime.leases.leadership import Leadership, process_id
-from fog_runtime.leases.lease_store import LeaseStore
-from fog_runtime.machine.memory import release_startup_memory
+from fog_runtime.leadership import Leadership, LeaseStore, process_id
+from fog_runtime.process import release_startup_memory
 from fog_runtime.transports.mqtt_inputs import MqttEdgeWithInputs
 from fog_runtime.transports.zenoh_edge import ZenohEdge
 from hazard_aggregator.api import make_api

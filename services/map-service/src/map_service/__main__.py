@@ -7,15 +7,14 @@ import os
 
 from fog_contracts import channels as ch
 from fog_runtime import logs, metrics, process
-from fog_runtime.backup_archive import STAMP
+from fog_runtime.backup import STAMP
 from fog_runtime.clock import SystemClock, WallClock, WallClockSource, boot_id
 from fog_runtime.configuration.settings import InflationSettings, describe, load
 from fog_runtime.configuration.site import load_site
 from fog_runtime.health import Health
 from fog_runtime.http import Front, load_tokens, unused
-from fog_runtime.leases.leadership import Leadership, process_id
-from fog_runtime.leases.lease_store import LeaseStore
-from fog_runtime.machine.memory import release_startup_memory
+from fog_runtime.leadership import Leadership, LeaseStore, process_id
+from fog_runtime.process import release_startup_memory
 from fog_runtime.transports.mqtt_edge import MqttEdge
 from fog_runtime.transports.zenoh_edge import ZenohEdge
 from map_service.api import make_api

@@ -30,6 +30,7 @@ from fog_contracts.messages import (
 )
 from fog_contracts.site import Place, Site
 from fog_runtime.clock import Clock
+from fog_runtime.concurrency import BusyError, Worker
 from fog_runtime.health import Health
 from fog_runtime.http import (
     RETRY_AFTER,
@@ -57,7 +58,6 @@ from fog_runtime.http import (
 from fog_runtime.http.routes import InvalidBodyError
 from fog_runtime.stores.audit import KINDS, AuditEntry, CursorError
 from fog_runtime.stores.idempotency import Attempt, IdempotencyError
-from fog_runtime.work import BusyError, Worker
 from map_service.core import ScrapeTarget
 from map_service.costmap import LayeredCostmap
 from map_service.layers.base import Grid

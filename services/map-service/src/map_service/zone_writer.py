@@ -11,7 +11,7 @@ from prometheus_client import Counter, Gauge
 
 from fog_contracts import channels as ch
 from fog_runtime import logs
-from fog_runtime.work import Worker
+from fog_runtime.concurrency import Worker
 from map_service.store import Audit, RecoveryError, StoreError
 from map_service.zone_times import StoredState
 from map_service.zones import check_list_size, check_room, list_size, prepare_zone, zones_spans

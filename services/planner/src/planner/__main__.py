@@ -7,15 +7,14 @@ import os
 from typing import TYPE_CHECKING
 
 from fog_runtime import logs, process
-from fog_runtime.access.operator_key import OperatorKeyError, read_operator_key
 from fog_runtime.clock import SystemClock
 from fog_runtime.configuration.settings import InflationSettings, SettingsError, describe, load
 from fog_runtime.configuration.site import load_site
 from fog_runtime.health import Health
 from fog_runtime.http import Front, load_tokens, unused
-from fog_runtime.leases.leadership import Leadership
-from fog_runtime.leases.lease_store import LeaseStore
-from fog_runtime.machine.memory import release_startup_memory, release_when
+from fog_runtime.leadership import Leadership, LeaseStore
+from fog_runtime.operator_key import OperatorKeyError, read_operator_key
+from fog_runtime.process import release_startup_memory, release_when
 from fog_runtime.transports.zenoh_edge import ZenohEdge
 from planner.api import make_api
 from planner.config import PlannerConfig

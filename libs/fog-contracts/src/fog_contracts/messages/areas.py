@@ -1,6 +1,5 @@
 """Areas: the sensors that watch them, their policies, their hazards as they are announced, alerts (MQTT, JSON)."""
 
-import hashlib
 from collections.abc import Iterable
 from typing import Annotated, Any, Final, Literal
 
@@ -243,6 +242,8 @@ def is_relief(hazard: AreaHazard, before: AreaHazard | None) -> bool:
 
 def hazards_digest(hazards: Iterable[AreaHazard]) -> int:
     """Return a 63-bit hash of the hazards' areas, seqs, states and penalties; their order does not matter."""
+    import hashlib  # noqa: PLC0415  # the guardian loads messages, too, and never needs it
+
     lines = sorted(f"{h.area} {h.seq} {h.state} {h.penalty}" for h in hazards)
     whole = hashlib.blake2b("\n".join(lines).encode(), digest_size=8).digest()
     return int.from_bytes(whole, "big") >> (64 - _HASH_BITS)

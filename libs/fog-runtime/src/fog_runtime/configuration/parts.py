@@ -11,7 +11,14 @@ Imports only the standard library, because the watchdog uses it.
 import sys
 from functools import cache
 from importlib.metadata import EntryPoints, entry_points
-from typing import TypeVar
+from typing import Final, TypeVar
+
+# The hardware of the thesis: the one place outside their own folders that names a base or a lidar.
+DEFAULT_BASE: Final = "roomba600"
+"""In the entry points `fognav.bases`, `fognav.base_stops` and `fognav.base_emulators`."""
+DEFAULT_LIDAR: Final = "rplidar-a1"
+"""In the entry points `fognav.lidars` and `fognav.lidar_emulators`."""
+
 
 T = TypeVar("T")
 

@@ -3,6 +3,7 @@
 Without a file the robot is the thesis's: a Roomba 600 with an RPLidar A1 and every default.
 """
 
+import re
 import tomllib
 from collections.abc import Mapping
 from dataclasses import dataclass, field
@@ -12,9 +13,66 @@ from typing import Any, Final, TypeVar
 import msgspec
 
 from fog_contracts.robot import BaseSettings, LidarSettings, RobotSettings
-from fog_runtime.configuration.default_parts import DEFAULT_BASE, DEFAULT_LIDAR
+from fog_runtime.configuration.parts import DEFAULT_BASE, DEFAULT_LIDAR
 from fog_runtime.configuration.settings import SettingsError
-from fog_runtime.configuration.toml_lines import find_line, key_lines
+
+_PART: Final = r"""(?:[A-Za-z0-9_-]+|"[^"]*"|'[^']*')"""
+_DOTTED: Final = rf"{_PART}(?:\s*\.\s*{_PART})*"
+_HEADER: Final = re.compile(rf"\s*\[\[?\s*({_DOTTED})\s*\]")
+_KEY: Final = re.compile(rf"\s*({_DOTTED})\s*=")
+_TOKEN: Final = re.compile(
+    r'"""(?:\\.|[^\\])*?"""|\'\'\'.*?\'\'\'|"(?:\\.|[^"\\\n])*"|\'[^\'\n]*\'|#[^\n]*|[\[{]|[\]}]|\n', re.DOTALL
+)
+
+
+def key_lines(text: str) -> dict[str, int]:
+    """Return the line, from 1, of every table and key of a valid TOML text, by their dotted names.
+
+    Keys inside of an inline table or an array of several lines are not listed: look for the name that leads to them.
+    """
+    lines: dict[str, int] = {}
+    table = ""
+    for number, line in _statements(text):
+        if (header := _HEADER.match(line)) is not None:
+            table = _plain(header.group(1))
+            lines.setdefault(table, number)
+        elif (key := _KEY.match(line)) is not None:
+            name = _plain(key.group(1))
+            lines.setdefault(f"{table}.{name}" if table else name, number)
+    return lines
+
+
+def find_line(lines: dict[str, int], key: str) -> int | None:
+    """Return the line of a key, else of the innermost table or value around it; None if there is none."""
+    while key:
+        if key in lines:
+            return lines[key]
+        key = key.rpartition(".")[0]
+    return None
+
+
+def _statements(text: str) -> list[tuple[int, str]]:
+    """Return each statement with the number of its first line; strings and brackets may span lines."""
+    found: list[tuple[int, str]] = []
+    begin = depth = 0
+    number = 1
+    for token in _TOKEN.finditer(text):
+        kind = token.group()
+        if kind == "\n" and depth == 0:
+            found.append((number, text[begin : token.start()]))
+            number += text.count("\n", begin, token.end())
+            begin = token.end()
+        elif kind in "[{":
+            depth += 1
+        elif kind in "]}":
+            depth -= 1
+    found.append((number, text[begin:]))
+    return found
+
+
+def _plain(dotted: str) -> str:
+    return ".".join(part.strip().strip("\"'") for part in dotted.split("."))
+
 
 ROBOT_FILE: Final = "FOGNAV_ROBOT_FILE"
 """The variable that names the file."""

@@ -9,8 +9,7 @@ from typing import Any, Final, Literal, TypeVar
 import msgspec
 
 from fog_contracts.costs import DEFAULT_INFLATION, Inflation
-from fog_runtime.access.credentials import Credentials
-from fog_runtime.access.server_certificate import ServerCertificate
+from fog_runtime.credentials import Credentials, ServerCertificate
 from fog_runtime.logs import Level
 
 S = TypeVar("S", bound=msgspec.Struct)
@@ -75,7 +74,7 @@ class CommonSettings(msgspec.Struct, frozen=True, kw_only=True):
     log_format: Literal["json", "text"] = "json"
     tokens_file: Path | None = None
     credentials_file: Path | None = None
-    """Who this process is, and whom it trusts (`fog_runtime.access.credentials`); without one it is nobody."""
+    """Who this process is, and whom it trusts (`fog_runtime.credentials`); without one it is nobody."""
     operator_key_file: Path | None = None
 
     @property

@@ -1,6 +1,5 @@
 """The REST interface of all services: problem documents (RFC 9457), tokens with roles, health, metrics, limits."""
 
-from fog_runtime.access.token_file import TokensError, token_hash
 from fog_runtime.http.app import make_app
 from fog_runtime.http.front import Front, FrontError, unused
 from fog_runtime.http.paging import PageSize, next_page
@@ -25,6 +24,7 @@ from fog_runtime.http.store_routes import (
     must_be_new,
 )
 from fog_runtime.http.tokens import Admin, Caller, Operator, Tokens, Viewer, load_tokens
+from fog_runtime.token_file import TokensError, token_hash
 
 __all__ = [
     "RETRY_AFTER",

@@ -23,14 +23,13 @@ import uvicorn
 from fastapi import FastAPI
 from uvicorn.protocols.http.h11_impl import H11Protocol, RequestResponseCycle
 
-from fog_runtime import logs
-from fog_runtime.access.server_certificate import ServerCertificate
+from fog_runtime import logs, machine
 from fog_runtime.admission import BACKLOG, Admission, Visitor
+from fog_runtime.credentials import ServerCertificate
 from fog_runtime.files import write_port_file
 from fog_runtime.http.gateway import BehindGateway
 from fog_runtime.http.link import CoreLink, FrontLink
 from fog_runtime.http.routes import answer_call, rank_of
-from fog_runtime.machine import descriptors, signals
 
 NICENESS: Final = 5
 """The front gets a third of the processor time of a core that wants some, too."""
@@ -205,7 +204,7 @@ def _become_front(
     status = 1
     try:
         signal.set_wakeup_fd(-1)  # the parent's loop listens at its other end
-        for number in signals.ending():
+        for number in machine.ending():
             signal.signal(number, signal.SIG_IGN)
         _leave_files({listener.fileno(), link.fileno()})
         gc.freeze()  # shared with the parent until one of them writes
@@ -237,7 +236,7 @@ async def _receive(
     if not await link.started():
         return
     app.state.core = link
-    descriptors.raise_limit()
+    machine.raise_limit()
     logging.getLogger("uvicorn.error").addFilter(_Sparing())
     server = _Server(
         uvicorn.Config(

@@ -10,8 +10,8 @@ from fastapi import Depends, Request
 from fastapi.security import HTTPAuthorizationCredentials, HTTPBearer
 
 from fog_runtime import logs
-from fog_runtime.access.token_file import ROLES, Role, TokenEntry, TokensError, read_tokens, token_hash
 from fog_runtime.http.problems import ProblemError
+from fog_runtime.token_file import ROLES, Role, TokenEntry, TokensError, read_tokens, token_hash
 
 _RANKS: Final = {role: rank for rank, role in enumerate(ROLES)}
 _bearer = HTTPBearer(auto_error=False, description="A token of the tokens file")

@@ -18,16 +18,16 @@ from typing import TYPE_CHECKING, Final
 import msgspec
 
 from fog_contracts.messages import Id
-from fog_runtime.access.credentials import CredentialsError
-from fog_runtime.access.token_file import ROLES, TokensError, create_token, read_tokens, revoke_token
 from fog_runtime.configuration.settings import SettingsError, load
 from fog_runtime.configuration.site import SiteError, load_site
+from fog_runtime.credentials import CredentialsError
 from fog_runtime.keys import TOKENS, make_keys
 from fog_runtime.locks.authority import AuthorityError
 from fog_runtime.locks.handing_out import hand_out, hand_out_on_floor, keys_of
 from fog_runtime.locks.members import LocksError
 from fog_runtime.locks.site_locks import SiteLocks
 from fog_runtime.locks.users import on_floor
+from fog_runtime.token_file import ROLES, TokensError, create_token, read_tokens, revoke_token
 
 if TYPE_CHECKING:
     from collections.abc import Sequence

@@ -16,12 +16,12 @@ from __future__ import annotations
 from functools import partial
 from typing import TYPE_CHECKING, Final
 
-from fog_runtime.access.credentials import Credentials, to_toml
-from fog_runtime.access.token_file import create_token, read_tokens, revoke_token, token_hash
+from fog_runtime.credentials import Credentials, to_toml
 from fog_runtime.files import atomic_write
 from fog_runtime.keys import OPERATOR_KEY, TOKENS
 from fog_runtime.locks import users
 from fog_runtime.locks.site_locks import CREDENTIALS
+from fog_runtime.token_file import create_token, read_tokens, revoke_token, token_hash
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence

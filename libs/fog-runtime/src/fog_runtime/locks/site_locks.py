@@ -6,7 +6,7 @@
     redis/      server.pem server.key users
     zenoh/      server.pem server.key users access.json5
     http/       server.pem server.key             of the REST APIs and the gateway
-    credentials/NAME.toml                         one file for each user (`fog_runtime.access.credentials`)
+    credentials/NAME.toml                         one file for each user (`fog_runtime.credentials`)
     credentials/SITE/NAME.toml                    the same for further sites of the same servers, its floors
 
 Each server reads its own folder, each service its own credentials, so that none has another's secrets. Whoever adds a
@@ -23,7 +23,7 @@ import msgspec
 
 from fog_contracts.channels import BROKER_NAME
 from fog_contracts.generate.acl import mqtt_acl, zenoh_acl
-from fog_runtime.access.credentials import SERVERS, Credentials, Server, to_toml
+from fog_runtime.credentials import SERVERS, Credentials, Server, to_toml
 from fog_runtime.files import PRIVATE, atomic_write
 from fog_runtime.locks import users
 from fog_runtime.locks.authority import SERVER_DAYS, Authority, expiry

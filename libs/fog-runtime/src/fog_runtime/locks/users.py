@@ -10,7 +10,7 @@ import hashlib
 import secrets
 from typing import TYPE_CHECKING, Final
 
-from fog_runtime.access.credentials import SERVERS, Server
+from fog_runtime.credentials import SERVERS, Server
 from fog_runtime.stores import store_keys
 
 if TYPE_CHECKING:

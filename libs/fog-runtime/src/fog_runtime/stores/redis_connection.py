@@ -20,8 +20,8 @@ from redis.backoff import NoBackoff
 from redis.exceptions import BusyLoadingError, OutOfMemoryError, ReadOnlyError, RedisError
 from redis.exceptions import TimeoutError as RedisTimeoutError
 
-from fog_runtime.access.credentials import NOBODY, Credentials
-from fog_runtime.cancellation import raise_if_cancelled
+from fog_runtime.concurrency import raise_if_cancelled
+from fog_runtime.credentials import NOBODY, Credentials
 
 if TYPE_CHECKING:
     from collections.abc import Sequence

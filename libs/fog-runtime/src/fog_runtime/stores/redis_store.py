@@ -16,7 +16,7 @@ from prometheus_client import Gauge
 
 from fog_contracts.messages import Message
 from fog_runtime import logs
-from fog_runtime.access.credentials import NOBODY
+from fog_runtime.credentials import NOBODY
 from fog_runtime.stores import store_scripts
 from fog_runtime.stores.audit import KINDS, AuditPage, read_page
 from fog_runtime.stores.idempotency import LIFETIME_S, IdempotencyError
@@ -27,7 +27,7 @@ if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
     from pathlib import Path
 
-    from fog_runtime.access.credentials import Credentials
+    from fog_runtime.credentials import Credentials
     from fog_runtime.stores.idempotency import Attempt
 
 __all__ = [
@@ -103,7 +103,7 @@ class RedisStore:
 
     `data_dir` is a folder that survives restarts: in it the service `service` remembers which store it uses, so that it
     notices at its start that Redis was emptied. Without it, only a running service notices. Set `epoch` to that with
-    which the service leads (`fog_runtime.leases.lease`), and to 0 while it stands by: Redis refuses writes unless it
+    which the service leads (`fog_runtime.lease`), and to 0 while it stands by: Redis refuses writes unless it
     granted that one last.
     """
 

@@ -29,7 +29,7 @@ _log = logs.get("edges")
 
 
 class Gate(Protocol):
-    """Whether this process may act (`fog_runtime.leases.leadership`)."""
+    """Whether this process may act (`fog_runtime.leadership`)."""
 
     def admit(self, channel: Channel, message: object, send: Callable[[], None]) -> None:
         """Send a message now, later or never; called on the thread that publishes."""

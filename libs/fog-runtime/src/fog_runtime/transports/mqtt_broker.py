@@ -8,7 +8,7 @@ from urllib.parse import unquote, urlsplit
 
 import aiomqtt
 
-from fog_runtime.access.credentials import NOBODY, Credentials
+from fog_runtime.credentials import NOBODY, Credentials
 
 _KEEPALIVE_S: Final = 10
 """A connection without traffic for 1.5 times as long is considered lost by both sides."""

@@ -19,9 +19,9 @@ from fog_contracts.channels import Channel
 from fog_contracts.codec import ContractError, encode, encode_text
 from fog_contracts.messages import Message
 from fog_runtime import logs, metrics
-from fog_runtime.access.credentials import NOBODY, Credentials
-from fog_runtime.cancellation import raise_if_cancelled
 from fog_runtime.clock import Clock
+from fog_runtime.concurrency import raise_if_cancelled
+from fog_runtime.credentials import NOBODY, Credentials
 from fog_runtime.transports.mqtt_broker import Broker, Inbox
 from fog_runtime.transports.mqtt_subscriptions import ForeignHandler, Ids, Subscriptions
 

@@ -10,7 +10,7 @@ from __future__ import annotations
 import asyncio
 from typing import TYPE_CHECKING, Final
 
-from fog_runtime.access.credentials import NOBODY, Credentials
+from fog_runtime.credentials import NOBODY, Credentials
 from fog_runtime.transports.mqtt_edge import MqttEdge, Will
 
 if TYPE_CHECKING:

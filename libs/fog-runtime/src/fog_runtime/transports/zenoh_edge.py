@@ -29,9 +29,9 @@ from fog_contracts.codec import ContractError, decode, encode
 from fog_contracts.handlers import RefusedMessageError
 from fog_contracts.messages import Message
 from fog_runtime import logs, metrics
-from fog_runtime.access.credentials import NOBODY, Credentials
 from fog_runtime.clock import Clock
-from fog_runtime.slots import Slot
+from fog_runtime.concurrency import Slot
+from fog_runtime.credentials import NOBODY, Credentials
 from fog_runtime.transports.reply_parts import GONE, PART, PART_BYTES, REPLY, LargeReplies
 from fog_runtime.transports.zenoh_presence import ask_who_is_present
 from fog_runtime.transports.zenoh_query import ask

@@ -12,7 +12,7 @@ from prometheus_client.core import CounterMetricFamily, GaugeMetricFamily
 from prometheus_client.registry import Collector
 
 from fog_contracts.messages import Power
-from fog_runtime.machine import computer, task_usage
+from fog_runtime import usage
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Mapping
@@ -43,7 +43,7 @@ class Observed(NamedTuple):
 class RobotCollector(Collector):
     """Collects on the thread that serves the metrics; the agent's loop only replaces `observed` and `pids`."""
 
-    def __init__(self, root: Path = computer.ROOT) -> None:
+    def __init__(self, root: Path = usage.ROOT) -> None:
         """`root` is where the computer's /proc and /sys are."""
         self._root = root
         self.observed: Observed | None = None
@@ -74,7 +74,7 @@ class RobotCollector(Collector):
             "fognav_process_resident_bytes", "Memory that a process keeps resident", labels=["process"]
         )
         for process, pid in self.pids.items():
-            threads = task_usage.sample(pid, self._root / "proc").values()
+            threads = usage.sample(pid, self._root / "proc").values()
             seconds: dict[str, float] = {}
             for thread in threads:
                 seconds[thread.name] = seconds.get(thread.name, 0.0) + thread.cpu_s
@@ -82,7 +82,7 @@ class RobotCollector(Collector):
                 cpu.add_metric([process, name], used)
             if threads:
                 wakeups.add_metric([process], sum(thread.wakeups for thread in threads))
-                memory.add_metric([process], 1e6 * task_usage.memory_mb(pid, self._root / "proc"))
+                memory.add_metric([process], 1e6 * usage.memory_mb(pid, self._root / "proc"))
         return [cpu, wakeups, memory]
 
     def _computer(self) -> list[Metric]:
@@ -92,12 +92,12 @@ class RobotCollector(Collector):
                 "fognav_computer_celsius",
                 "Temperature inside the robot's computer",
                 "zone",
-                computer.temperatures(root),
+                usage.temperatures(root),
             ),
             _by_label(
-                "fognav_computer_throttled", "1 while this slows the computer down", "cause", computer.throttling(root)
+                "fognav_computer_throttled", "1 while this slows the computer down", "cause", usage.throttling(root)
             ),
-            _by_label("fognav_wifi_level_dbm", "Strength of the Wi-Fi signal", "interface", computer.wifi_levels(root)),
+            _by_label("fognav_wifi_level_dbm", "Strength of the Wi-Fi signal", "interface", usage.wifi_levels(root)),
         ]
 
 
@@ -168,7 +168,7 @@ def _by_label(name: str, text: str, label: str, values: Mapping[str, float]) -> 
     return family
 
 
-def parent(pid: int, root: Path = computer.ROOT) -> int | None:
+def parent(pid: int, root: Path = usage.ROOT) -> int | None:
     """Return the id of the process that started this one; None if it has ended."""
     try:
         # The name before it may contain anything, even brackets.

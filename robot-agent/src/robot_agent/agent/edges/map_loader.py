@@ -17,7 +17,7 @@ from fog_contracts.messages import MapSnapshot
 from fog_contracts.replica import MapError
 from fog_runtime import logs
 from fog_runtime.clock import Ticker
-from fog_runtime.machine.task_usage import name_thread
+from fog_runtime.usage import name_thread
 from robot_agent.agent.sensing.pose_keeper import start_pose
 
 if TYPE_CHECKING:

@@ -1,4 +1,4 @@
-"""How a process proves who it is, and whom it trusts: its credentials, a file for each service, robot, node or person.
+"""How a process proves who it is, and whom it trusts: its credentials, and the certificate of a REST API.
 
     user = "map-service"
     authority = '''-----BEGIN CERTIFICATE-----...'''   # the certificate authorities that its servers may have
@@ -16,7 +16,7 @@ from __future__ import annotations
 
 import ipaddress
 import tomllib
-from typing import TYPE_CHECKING, Final, Literal, Self
+from typing import TYPE_CHECKING, Final, Literal, NamedTuple, Self
 
 import msgspec
 
@@ -148,3 +148,32 @@ def to_toml(user: str, *, authority: str, passwords: dict[Server, str], token: s
 def _quoted(text: str) -> str:
     """Return a TOML string; escapes of JSON are escapes of TOML."""
     return msgspec.json.encode(text).decode()
+
+
+class CertificateError(ValueError):
+    """A certificate or its key can't be used; the message names the files and the remedy."""
+
+
+class ServerCertificate(NamedTuple):
+    """The files of a certificate, with those between it and its authority, and of its private key (both PEM)."""
+
+    file: Path
+    key: Path
+
+    @classmethod
+    def of(cls, file: Path | None, key: Path | None) -> Self | None:
+        """Return what two settings name, checked; None without either. Raises `CertificateError`."""
+        if file is None and key is None:
+            return None
+        if file is None or key is None:
+            raise CertificateError("FOGNAV_HTTP_CERTIFICATE_FILE and FOGNAV_HTTP_KEY_FILE belong together: set both")
+        import ssl  # noqa: PLC0415  # the guardian reads settings, too, and never needs it
+
+        try:
+            ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER).load_cert_chain(file, key)
+        except OSError as error:
+            raise CertificateError(
+                f"the certificate {file} with the key {key} can't be used: {error.strerror or error}. "
+                "Issue it again (fognav ca issue), or correct the names"
+            ) from error
+        return cls(file, key)

@@ -1,12 +1,13 @@
 """Runs the lease of a process: one of several copies of a service leads, the others follow everything and say nothing.
 
-`lease` decides, `lease_store` asks Redis. The edges pass everything that is published through `admit`, and answer
+`lease` decides, `LeaseStore` asks Redis. The edges pass everything that is published through `admit`, and answer
 queries only while this process leads. See docs/adr/0012-one-leader-by-lease-and-epoch.md.
 """
 
 from __future__ import annotations
 
 import asyncio
+import math
 import os
 import re
 import secrets
@@ -14,7 +15,8 @@ import socket
 import threading
 import time
 from collections import deque
-from typing import TYPE_CHECKING, Final, Protocol
+from functools import partial
+from typing import TYPE_CHECKING, Any, Final, Protocol, Self
 
 from prometheus_client import Counter, Gauge
 
@@ -22,17 +24,177 @@ from fog_contracts import channels as ch
 from fog_contracts.handlers import epoch_in
 from fog_contracts.messages import Leader
 from fog_runtime import logs
-from fog_runtime.leases.lease import ANNOUNCE_S, CUT_OFF_S, Lease
-from fog_runtime.leases.probes import Probes
-from fog_runtime.stores.redis_connection import StoreError
+from fog_runtime.credentials import NOBODY
+from fog_runtime.lease import (
+    ANNOUNCE_S,
+    ATTEMPT_S,
+    CUT_OFF_S,
+    LEASE_S,
+    READY_SAID_S,
+    Granted,
+    Held,
+    Lease,
+    LeftToOther,
+    Reply,
+    Request,
+)
+from fog_runtime.stores.redis_connection import RedisConnection, StoreError
 
 if TYPE_CHECKING:
     from collections.abc import Awaitable, Callable, Mapping
 
     from fog_contracts.channels import Channel, Role
+    from fog_runtime.credentials import Credentials
     from fog_runtime.health import Health
-    from fog_runtime.leases.lease import Reply, Request
+    from fog_runtime.stores.redis_connection import Command
     from fog_runtime.transports.zenoh_edge import ZenohEdge
+
+# The lease is "EPOCH HOLDER" and expires; the epoch stays. An epoch that Redis has granted is renewed as long as nobody
+# drew another one, even if the lease expired or Redis lost it meanwhile; a provisional one must be above every other.
+# Whoever asks in vain, but knows of a higher epoch than the leader's, leaves that in Redis (the floor), and the leader
+# draws one above it at its next renewal. Else nobody might tell it of a provisional epoch that receivers heard, and
+# they would refuse it for ever.
+# A standby that has what it needs to lead leaves its name for a moment (ready). A leader that is cut off from what it
+# needs finds it, and gives the lease back.
+# The clock (ms) only keeps epochs growing that Redis and all who could know have forgotten.
+_ACQUIRE: Final = """
+local holder, epoch, floor, confirmed = ARGV[1], tonumber(ARGV[2]), tonumber(ARGV[3]), ARGV[4] == '1'
+local stored = tonumber(redis.call('GET', KEYS[2]) or '0')
+local lease = redis.call('GET', KEYS[1])
+local held_epoch, held_by
+if lease then held_epoch, held_by = string.match(lease, '^(%d+) (.*)$') end
+local left = tonumber(redis.call('GET', KEYS[3]) or '0')
+local ready, cut_off = ARGV[7] == '1', ARGV[8] == '1'
+if held_by and held_by ~= holder then
+  if ready then redis.call('SET', KEYS[4], holder, 'PX', ARGV[9]) end
+  if floor > math.max(left, tonumber(held_epoch)) then redis.call('SET', KEYS[3], string.format('%.0f', floor)) end
+  return {0, held_epoch, held_by, redis.call('PTTL', KEYS[1])}
+end
+local successor = redis.call('GET', KEYS[4])
+if cut_off and successor and successor ~= holder then
+  redis.call('DEL', KEYS[1])
+  return {2}
+end
+floor = math.max(floor, left)
+if epoch == 0 and held_by then epoch, confirmed = tonumber(held_epoch), true end
+if epoch <= floor or epoch < stored or (epoch == stored and not confirmed) then
+  epoch = math.max(stored + 1, floor + 1, tonumber(ARGV[5]))
+end
+local text = string.format('%.0f', epoch)
+if epoch ~= stored then redis.call('SET', KEYS[2], text) end
+redis.call('SET', KEYS[1], text .. ' ' .. holder, 'PX', ARGV[6])
+return {1, text}
+"""
+_GRANTED, _LEFT_TO_OTHER = 1, 2
+_RELEASE: Final = """
+local lease = redis.call('GET', KEYS[1])
+if lease and string.match(lease, '^%d+ (.*)$') == ARGV[1] then return redis.call('DEL', KEYS[1]) end
+return 0
+"""
+
+
+class LeaseStore:
+    """The lease of one service of a site; none of its calls raises for a Redis that does not answer."""
+
+    def __init__(self, url: str, site: str, service: str, *, credentials: Credentials = NOBODY) -> None:
+        self._redis = RedisConnection(url, timeout_s=ATTEMPT_S, credentials=credentials)
+        self._keys = tuple(f"fog:{site}:{service}:{name}" for name in ("lease", "epoch", "floor", "ready"))
+
+    async def __aenter__(self) -> Self:
+        """Return the store; it connects with the first command."""
+        return self
+
+    async def __aexit__(self, *_: object) -> None:
+        """Close the connections."""
+        await self._redis.aclose()
+
+    async def acquire(self, holder: str, request: Request) -> Reply:
+        """Take or renew the lease; None when Redis did not answer in time: it may have done it all the same."""
+        arguments = (
+            holder, request.epoch, request.floor, int(request.confirmed), _now_ms(), round(LEASE_S * 1000),
+            int(request.ready), int(request.cut_off), round(READY_SAID_S * 1000),
+        )  # fmt: skip
+        reply = await self._attempt(("EVAL", _ACQUIRE, len(self._keys), *self._keys, *arguments))
+        match reply:
+            case None:
+                return None
+            case [outcome] if outcome == _LEFT_TO_OTHER:
+                return LeftToOther()
+            case [outcome, epoch] if outcome == _GRANTED:
+                return Granted(int(epoch))
+            case [_, epoch, other, remaining_ms]:
+                return Held(int(epoch), other.decode("utf-8", "replace"), max(0, remaining_ms) / 1000)
+        raise AssertionError(f"the script returned {reply!r}")
+
+    async def release(self, holder: str) -> None:
+        """Give the lease back, if this process holds it, so that another takes over at once; else it expires."""
+        await self._attempt(("EVAL", _RELEASE, 1, self._keys[0], holder))
+
+    async def _attempt(self, command: Command) -> Any:  # noqa: ANN401  # redis does not type its replies
+        """Execute a command once, in at most `ATTEMPT_S`; None when Redis did not answer, or refused it."""
+        try:
+            async with asyncio.timeout(ATTEMPT_S):
+                (reply,) = await self._redis.write(command)
+        except (StoreError, TimeoutError):
+            return None
+        return reply
+
+
+def _now_ms() -> int:
+    return int(time.time() * 1000)
+
+
+PROBE_S: Final = 0.2
+"""Pause between an answer and the next question (real seconds)."""
+
+AGE: Final = Gauge(
+    "fognav_answer_age_seconds",
+    "Time since what this process needs to lead (broker, router, thread) was last asked something that it answered",
+    ["needed"],
+)
+
+
+class Probes:
+    """When everything that is needed last answered, by the monotonic clock; `needs`: by name, what asks it.
+
+    A connection says for 10 to 15 s that it is up after nothing passes on it any more; a thread that hangs says
+    nothing. A question returns whether it was answered, and is asked again only then: it may take as long as it likes.
+    """
+
+    def __init__(self, needs: Mapping[str, Callable[[], Awaitable[bool]]]) -> None:
+        """Prepare; nothing has answered yet."""
+        self._needs = needs
+        self._started_at = time.monotonic()
+        self._answered_at = dict.fromkeys(needs, -math.inf)
+
+    def answered_at(self) -> float:
+        """Return when the question was asked that was answered last, of the need for which that is longest ago.
+
+        -inf while something has answered none.
+        """
+        return min(self._answered_at.values(), default=time.monotonic())
+
+    def silent(self, seconds: float) -> list[str]:
+        """Return the names of what has answered no question of the last `seconds`; none so soon after the start."""
+        return [name for name in self._answered_at if self._age(name) > seconds]
+
+    def start(self, tasks: asyncio.TaskGroup) -> None:
+        """Ask, as tasks of a group, until these are cancelled."""
+        for name, ask in self._needs.items():
+            AGE.labels(name).set_function(partial(self._age, name))
+            tasks.create_task(self._probe(name, ask), name=f"probe of {name}")
+
+    def _age(self, name: str) -> float:
+        """Return the time since the last question that was answered, or since the start."""
+        return time.monotonic() - max(self._started_at, self._answered_at[name])
+
+    async def _probe(self, name: str, ask: Callable[[], Awaitable[bool]]) -> None:
+        while True:
+            asked_at = time.monotonic()
+            if await ask():
+                self._answered_at[name] = asked_at
+            await asyncio.sleep(PROBE_S)
+
 
 _TICK_S: Final = 0.05
 _RETRY_S: Final = 0.2

@@ -1,6 +1,6 @@
 """The tokens file: who may call the REST APIs in which role. It holds hashes only, and each change is logged beside it.
 
-`python -m fog_runtime.access.token_file FILE create NAME ROLE`, `... list`, `... revoke NAME`: on a fog node, where the
+`python -m fog_runtime.token_file FILE create NAME ROLE`, `... list`, `... revoke NAME`: on a fog node, where the
 command `fognav token` is not installed. The services notice a change with the next request.
 """
 
@@ -148,7 +148,7 @@ def _to_toml(entries: list[TokenEntry]) -> str:
 
 def main() -> int:
     """Create, list or revoke tokens as the command line says; return the exit code."""
-    parser = argparse.ArgumentParser(prog="python -m fog_runtime.access.token_file")
+    parser = argparse.ArgumentParser(prog="python -m fog_runtime.token_file")
     parser.add_argument("file", type=Path)
     actions = parser.add_subparsers(dest="action", required=True)
     create = actions.add_parser("create")

@@ -1,1 +1,0 @@
-"""Leases: which of several copies of a service may act."""

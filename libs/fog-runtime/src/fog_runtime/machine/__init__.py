@@ -1,1 +1,0 @@
-"""What Linux tells of the computer and the process: clock, signals, memory, threads, temperature, service manager."""

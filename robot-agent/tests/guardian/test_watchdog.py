@@ -556,7 +556,7 @@ def process(watch, monkeypatch):
     """Return what the process did to its session and its signals, and the handlers that it set."""
     done, handlers = [], {}
     monkeypatch.setattr(watchdog.os, "setsid", lambda: done.append("setsid"))
-    monkeypatch.setattr(watchdog.signals, "ignore_terminal_stops", lambda: done.append("ignore stops"))
+    monkeypatch.setattr(watchdog.machine, "ignore_terminal_stops", lambda: done.append("ignore stops"))
     monkeypatch.setattr(watchdog.signal, "signal", lambda number, handler: handlers.update({number: handler}))
     monkeypatch.setattr(watchdog, "run_in_real_time", lambda priority: f"priority {priority}")
     monkeypatch.setattr(watchdog, "lock_memory", lambda: "locked")

@@ -33,6 +33,9 @@ CONNECT_BYTES: Final = 64 * 1024
 _CONNECT: Final = 0x10
 _CONNACK: Final = 0x20
 _MQTT_5: Final = 5
+_LEVELS: Final = frozenset({3, 4, _MQTT_5, 0x83, 0x84})
+"""Versions of the protocol; the highest bit is a bridge's. Mosquitto takes 0x85 for MQTT 5 whose only properties are those
+of the will, so that it reads the user elsewhere than this relay."""
 _WILL: Final = 0x04
 _USER: Final = 0x80
 _TEXT_MAX: Final = 0xFFFF
@@ -101,6 +104,8 @@ def with_user_in_id(packet: bytes) -> tuple[bytes, bytes]:
     try:
         reader.text()  # the protocol's name
         level, flags, *_ = reader.take(4)  # and the keep-alive
+        if level not in _LEVELS:
+            raise MalformedError(f"the protocol's version {level:#x}")
         if level == _MQTT_5:
             reader.take(reader.number())
         before = reader.at

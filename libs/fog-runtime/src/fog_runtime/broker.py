@@ -34,8 +34,8 @@ _CONNECT: Final = 0x10
 _CONNACK: Final = 0x20
 _MQTT_5: Final = 5
 _LEVELS: Final = frozenset({3, 4, _MQTT_5, 0x83, 0x84})
-"""Versions of the protocol; the highest bit is a bridge's. Mosquitto takes 0x85 for MQTT 5 whose only properties are those
-of the will, so that it reads the user elsewhere than this relay."""
+"""Versions of the protocol; the highest bit is a bridge's. Mosquitto takes 0x85 for MQTT 5 with properties of
+the will alone, so that it reads the user elsewhere than this relay."""
 _WILL: Final = 0x04
 _USER: Final = 0x80
 _TEXT_MAX: Final = 0xFFFF

@@ -59,6 +59,7 @@ _.DEFAULT  # same: profiles
 _.add_to  # same: commands
 _.list_commands  # typer asks for them
 _.get_command
+_.format_commands
 _.SIGNATURE
 _.press_clean  # the emulated Roomba: tests press its button
 _.switch_on  # same, held while it is switched on

@@ -1,4 +1,5 @@
 import json
+import re
 import shutil
 import subprocess
 import sys
@@ -11,6 +12,7 @@ from fog_contracts import channels as ch
 from fog_runtime.record import Recorder
 from fognav import checkout, doctor, recording, system
 from fognav.__main__ import app
+from fognav.commands import installed
 from fognav.output import WrongUseError
 
 runner = CliRunner()
@@ -79,9 +81,15 @@ def test_every_command_has_help_with_an_example(command: list[str]) -> None:
 @pytest.mark.parametrize("group", [[], ["site"], ["token"], ["zone"], ["robot"]])
 def test_list_of_commands_truncates_no_sentence(group: list[str]) -> None:
     done = runner.invoke(app, [*group, "--help"], env={"COLUMNS": "80"})
-    commands = done.output.partition("Commands:\n")[2].strip().splitlines()
-    assert len(commands) >= 2
+    commands = [line for line in done.output.splitlines() if re.match(r"  [a-z]", line)]
+    assert len(commands) >= 2 + len(group)
     assert [line for line in commands if not line.endswith(".") or line.endswith("...")] == []
+
+
+def test_commands_are_listed_by_who_uses_them_and_none_has_no_group() -> None:
+    listed = runner.invoke(app, ["--help"]).output.partition("\nTry it:\n")[2]
+    assert re.findall(r"^(\w.*):$", listed, re.MULTILINE) == list(installed.GROUPS[1:-1])
+    assert listed.split()[0] == "demo"
 
 
 @pytest.mark.parametrize("arguments", [["demo", "--speed", "0"], ["--help"], ["nonsense"]])

@@ -36,6 +36,12 @@ def test_command_of_another_package_runs_and_is_listed_after_our_own(app: typer.
     assert commands.split() == ["own", "measure", "Measure", "it."]
 
 
+def test_command_of_another_package_is_listed_in_the_group_that_it_names(app: typer.Typer) -> None:
+    app.command("drive", rich_help_panel="Drive", help="Drive it.")(lambda: None)
+    listed = CliRunner().invoke(app, ["--help"]).stdout
+    assert listed.split("Drive:\n")[1].split() == ["drive", "Drive", "it."]
+
+
 def test_our_own_command_loads_no_other_package(app: typer.Typer) -> None:
     assert CliRunner().invoke(app, ["own"]).stdout == "done\n"
     assert LOADED == []

@@ -13,12 +13,12 @@ from rich.table import Table
 
 from fog_runtime.configuration import parts
 from fognav import __version__, checkout, doctor, kernels, node_code, system
+from fognav.commands import installed
 from fognav.commands.alert import alert_app
 from fognav.commands.area import area_app
 from fognav.commands.backup import backup_command, restore_command
 from fognav.commands.ca import ca_app
 from fognav.commands.channels import channels_command
-from fognav.commands.installed import Commands, SiteCommands
 from fognav.commands.map import map_app
 from fognav.commands.node import node_app
 from fognav.commands.robot import robot_app
@@ -49,42 +49,54 @@ from fognav_sim import emulators
 
 app = typer.Typer(
     name="fognav",
-    cls=Commands,
+    cls=installed.Commands,
     help="Keep a small indoor robot out of danger that it can't see yet.",
     no_args_is_help=True,
     add_completion=False,
     rich_markup_mode=None,
     pretty_exceptions_enable=False,
 )
-site_app = typer.Typer(cls=SiteCommands, help="Create and check sites.", no_args_is_help=True)
-app.add_typer(site_app, name="site")
-app.add_typer(zone_app, name="zone")
-app.add_typer(area_app, name="area")
-app.add_typer(alert_app, name="alert")
-app.add_typer(source_app, name="source")
-app.add_typer(node_app, name="node")
-app.add_typer(robot_app, name="robot")
-app.add_typer(token_app, name="token")
-app.add_typer(ca_app, name="ca")
-app.add_typer(map_app, name="map")
-app.add_typer(store_app, name="store")
-app.command(
-    "backup", epilog="Example: fognav backup fog.tar.gz --site sites/estig --secrets keys --data /var/lib/fognav"
-)(backup_command)
-app.command(
-    "restore", epilog="Example: fognav restore fog.tar.gz --site sites/estig --secrets keys --data /var/lib/fognav"
-)(restore_command)
-app.command("up", epilog="Example: fognav up --site sites/estig --site sites/floor2")(up_command)
-app.command("upgrade", epilog="Example: fognav upgrade --check")(upgrade_command)
-app.command("down", epilog="Example: fognav down")(down_command)
-app.command("logs", epilog="Example: fognav logs map-service -f")(logs_command)
-app.command("status", epilog="Example: fognav status --json")(status_command)
+site_app = typer.Typer(cls=installed.SiteCommands, help="Create and check sites.", no_args_is_help=True)
+for group, name, added in (
+    (installed.OPERATE, "robot", robot_app),
+    (installed.OPERATE, "zone", zone_app),
+    (installed.OPERATE, "area", area_app),
+    (installed.OPERATE, "alert", alert_app),
+    (installed.OPERATE, "map", map_app),
+    (installed.SET_UP, "site", site_app),
+    (installed.SET_UP, "node", node_app),
+    (installed.SET_UP, "source", source_app),
+    (installed.RUN, "store", store_app),
+    (installed.RUN, "token", token_app),
+    (installed.RUN, "ca", ca_app),
+):
+    app.add_typer(added, name=name, rich_help_panel=group)
+for group, name, command, example in (
+    (installed.OPERATE, "status", status_command, "status --json"),
+    (installed.RUN, "up", up_command, "up --site sites/estig --site sites/floor2"),
+    (installed.RUN, "down", down_command, "down"),
+    (installed.RUN, "logs", logs_command, "logs map-service -f"),
+    (installed.RUN, "upgrade", upgrade_command, "upgrade --check"),
+    (
+        installed.RUN,
+        "backup",
+        backup_command,
+        "backup fog.tar.gz --site sites/estig --secrets keys --data /var/lib/fognav",
+    ),
+    (
+        installed.RUN,
+        "restore",
+        restore_command,
+        "restore fog.tar.gz --site sites/estig --secrets keys --data /var/lib/fognav",
+    ),
+    (installed.DEVELOP, "channels", channels_command, "channels --format acl --broker mqtt"),
+):
+    app.command(name, epilog=f"Example: fognav {example}", rich_help_panel=group)(command)
 robot_app.command("add", epilog="Example: fognav robot add r2 --locks locks")(robot_add)
 robot_app.command("new", epilog="Example: fognav robot new --base roomba600 --lidar rplidar-a1 --out robot.toml")(
     robot_new
 )
 robot_app.command("check", epilog="Example: fognav robot check robot.toml")(robot_check)
-app.command("channels", epilog="Example: fognav channels --format acl --broker mqtt")(channels_command)
 
 Yes = Annotated[bool, typer.Option("--yes", help="Install missing system packages without asking (as does CI=true).")]
 
@@ -109,23 +121,6 @@ def _main(
     del version  # handled by its callback
 
 
-@app.command("doctor", epilog="Example: fognav doctor --json")
-def doctor_command(*, json: JsonOption = False) -> None:
-    """Show what is installed, what is missing and how to install it."""
-    found = list(doctor.checks())
-    if json:
-        print_json(doctor.as_json(found))
-    else:
-        table = Table(box=None, padding=(0, 2), show_header=False)
-        marks = {"ok": "[green]ok[/]", "missing": "[red]missing[/]", "optional": "[yellow]optional[/]"}
-        for check in found:
-            table.add_row(marks[check.state], check.name, check.found)
-            if check.remedy:
-                table.add_row("", "", f"[dim]remedy: {check.remedy}[/]")
-        answers.print(table)
-    raise typer.Exit(NOT_TRUE if any(check.state == "missing" for check in found) else OK)
-
-
 def _prepare(*, yes: bool) -> None:
     try:
         system.ensure([system.MOSQUITTO, system.REDIS], yes=yes, print_line=print_line)
@@ -138,6 +133,7 @@ def _prepare(*, yes: bool) -> None:
     "test",
     context_settings={"allow_extra_args": True, "ignore_unknown_options": True},
     epilog="Example: fognav test --yes -k replica",
+    rich_help_panel=installed.DEVELOP,
 )
 def run_tests(context: typer.Context, *, yes: Yes = False) -> None:
     """Set up what is missing, then run every test on all cores.
@@ -152,7 +148,7 @@ def run_tests(context: typer.Context, *, yes: Yes = False) -> None:
     raise typer.Exit(done.returncode)
 
 
-@app.command("check", epilog="Example: fognav check --json")
+@app.command("check", epilog="Example: fognav check --json", rich_help_panel=installed.DEVELOP)
 def check_command(*, json: JsonOption = False) -> None:
     """Run all static checks.
 
@@ -182,7 +178,9 @@ def check_command(*, json: JsonOption = False) -> None:
     print_line(f"all {len(results)} checks passed ({seconds:.0f} s)")
 
 
-@app.command("demo", epilog="Example: fognav demo --headless --report report.json --seed 7")
+@app.command(
+    "demo", epilog="Example: fognav demo --headless --report report.json --seed 7", rich_help_panel=installed.TRY_IT
+)
 def demo_command(  # noqa: PLR0913  # each option is an argument
     *,
     headless: Annotated[bool, typer.Option("--headless", help="No terminal view and no page: for scripts.")] = False,
@@ -226,7 +224,7 @@ def demo_command(  # noqa: PLR0913  # each option is an argument
     yes: Yes = False,
     json: JsonOption = False,
 ) -> None:
-    """Run the system with simulated hardware; block the robot's path.
+    """Run the whole system with simulated hardware; block its path.
 
     The exit code is 0 if the robot reached the goal without contact and avoided the blocked area; 1 if it did not, or
     the demo was interrupted (see the report); 2 if an option or file can't be used.
@@ -273,12 +271,29 @@ def demo_command(  # noqa: PLR0913  # each option is an argument
     raise typer.Exit(OK if values["success"] else NOT_TRUE)
 
 
+@app.command("doctor", epilog="Example: fognav doctor --json", rich_help_panel=installed.TRY_IT)
+def doctor_command(*, json: JsonOption = False) -> None:
+    """Show what is installed, what is missing and how to install it."""
+    found = list(doctor.checks())
+    if json:
+        print_json(doctor.as_json(found))
+    else:
+        table = Table(box=None, padding=(0, 2), show_header=False)
+        marks = {"ok": "[green]ok[/]", "missing": "[red]missing[/]", "optional": "[yellow]optional[/]"}
+        for check in found:
+            table.add_row(marks[check.state], check.name, check.found)
+            if check.remedy:
+                table.add_row("", "", f"[dim]remedy: {check.remedy}[/]")
+        answers.print(table)
+    raise typer.Exit(NOT_TRUE if any(check.state == "missing" for check in found) else OK)
+
+
 Broker = Annotated[str, typer.Option("--mqtt", metavar="URL", help="MQTT broker.")]
 Router = Annotated[str, typer.Option("--zenoh", metavar="ENDPOINT", help="zenoh router.")]
 SiteId = Annotated[str, typer.Option("--site", metavar="ID", help="Id of the site, the second part of every key.")]
 
 
-@app.command("record", epilog="Example: fognav record drive.mcap --seconds 60")
+@app.command("record", epilog="Example: fognav record drive.mcap --seconds 60", rich_help_panel=installed.MEASURE)
 def record_command(
     file: Annotated[Path, typer.Argument(metavar="FILE", help="MCAP file to write.")],
     *,
@@ -307,7 +322,7 @@ def record_command(
         print_line(f"wrote {file}: {recorded['seconds']} s, {recorded['messages']}")
 
 
-@app.command("replay", epilog="Example: fognav replay drive.mcap --speed 2")
+@app.command("replay", epilog="Example: fognav replay drive.mcap --speed 2", rich_help_panel=installed.MEASURE)
 def replay_command(
     file: Annotated[Path, typer.Argument(metavar="FILE", help="MCAP file of a recording.")],
     *,

@@ -15,7 +15,7 @@ from fognav.output import NOT_TRUE, exit_codes, print_answer, print_json
 if TYPE_CHECKING:
     from fog_runtime.locks.site_locks import SiteLocks
 
-ca_app = typer.Typer(help="Create, renew and replace the certificates of a site's servers.", no_args_is_help=True)
+ca_app = typer.Typer(help="Create, renew and replace certificates of a site's servers.", no_args_is_help=True)
 
 _SITE = "estig"
 HostOption = Annotated[

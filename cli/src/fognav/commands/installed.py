@@ -1,15 +1,17 @@
-"""Commands of other packages, found by entry points: those that measure are the laboratory's, where it is installed.
+"""The list of commands, by who uses them; and those of other packages, found by entry points.
+
+Those that measure are the laboratory's, where it is installed.
 
     [project.entry-points."fognav.commands"]
     my-command = "my_package.commands:add_to"
 
-An entry is a function that gets a `typer.Typer` and adds to it.
+An entry is a function that gets a `typer.Typer` and adds to it; the `rich_help_panel` of a command is its group.
 """
 
 from __future__ import annotations
 
 from types import FunctionType
-from typing import TYPE_CHECKING, Any, ClassVar
+from typing import TYPE_CHECKING, Any, ClassVar, Final
 
 import typer
 from typer.core import TyperGroup
@@ -20,6 +22,16 @@ from fognav.output import fail
 
 if TYPE_CHECKING:
     from collections.abc import Callable
+
+TRY_IT: Final = "Try it"
+OPERATE: Final = "Operate"
+SET_UP: Final = "Set up a robot or node"
+RUN: Final = "Run a fog node"
+MEASURE: Final = "Measure"
+DEVELOP: Final = "Change Fognav"
+OTHERS: Final = "Commands"
+GROUPS: Final = (TRY_IT, OPERATE, SET_UP, RUN, MEASURE, DEVELOP, OTHERS)
+"""Groups of commands, in the order in which a newcomer needs them; the last has those that name none."""
 
 
 class Commands(TyperGroup):
@@ -38,6 +50,21 @@ class Commands(TyperGroup):
         if cmd_name not in self.commands:
             self._load()
         return super().get_command(ctx, cmd_name)
+
+    def format_commands(self, ctx: Any, formatter: Any) -> None:  # noqa: ANN401  # same
+        """Write the list of commands, by groups, with one column for all names."""
+        names = self.list_commands(ctx)
+        groups = {name: getattr(self.commands[name], "rich_help_panel", None) or OTHERS for name in names}
+        width = max(map(len, names), default=0)
+        for group in dict.fromkeys((*GROUPS, *groups.values())):
+            rows = [
+                (name.ljust(width), self.commands[name].get_short_help_str(formatter.width - 6 - width))
+                for name in names
+                if groups[name] == group
+            ]
+            if rows:
+                with formatter.section(group):
+                    formatter.write_dl(rows)
 
     def _load(self) -> None:
         if self._loaded:

@@ -30,7 +30,7 @@ from fognav.output import (
     print_line,
 )
 
-robot_app = typer.Typer(help="Enable, stop and send robots, and watch them.", no_args_is_help=True)
+robot_app = typer.Typer(help="Send, stop and watch robots; describe a new one.", no_args_is_help=True)
 
 _WAITS_FOR: Final[Mapping[Mode | None, str]] = {
     "INIT": "; it waits to be enabled (fognav robot enable)",

@@ -12,6 +12,7 @@ import typer
 from rich.progress import Progress
 
 from fognav import kernels
+from fognav.commands.installed import MEASURE
 from fognav.operate.options import JsonOption  # noqa: TC001  # Typer reads annotations at run time
 from fognav.output import NOT_TRUE, WrongUseError, check_writable, console, exit_codes, print_json, print_line
 from fognav_experiments.bench import machine
@@ -25,7 +26,7 @@ bench_app = typer.Typer(help="Measure parts of the system on this machine.", no_
 
 def add_to(app: typer.Typer) -> None:
     """Add the command to `fognav`."""
-    app.add_typer(bench_app, name="bench")
+    app.add_typer(bench_app, name="bench", rich_help_panel=MEASURE)
 
 
 def _show(bench: str, asked: Mapping[str, object], figures: Mapping[str, object], *, json: bool) -> None:

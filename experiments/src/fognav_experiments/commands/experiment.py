@@ -12,6 +12,7 @@ import typer
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
 from fognav import checkout, kernels, node_code
+from fognav.commands.installed import MEASURE
 from fognav.operate.fog import find_fog
 from fognav.operate.options import FogOption, JsonOption, RobotOption  # noqa: TC001  # Typer reads annotations at run time
 from fognav.output import NOT_TRUE, FailedError, WrongUseError, console, exit_codes, print_json, print_line
@@ -36,7 +37,7 @@ experiment_app = typer.Typer(help="Compare setups as the thesis did, and play sc
 
 def add_to(app: typer.Typer) -> None:
     """Add the command to `fognav`."""
-    app.add_typer(experiment_app, name="experiment")
+    app.add_typer(experiment_app, name="experiment", rich_help_panel=MEASURE)
 
 
 _NOT_SWEPT: Final = "none"

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from fognav import checkout, kernels, node_code
+from fognav.commands.installed import MEASURE
 from fognav.output import NOT_TRUE, WrongUseError, exit_codes, print_line
 
 if TYPE_CHECKING:
@@ -16,7 +17,9 @@ if TYPE_CHECKING:
 
 def add_to(app: typer.Typer) -> None:
     """Add the command to `fognav`."""
-    app.command("hunt", epilog="Example: fognav hunt --minutes 10 --seed 1 --jobs 2")(hunt_command)
+    app.command("hunt", epilog="Example: fognav hunt --minutes 10 --seed 1 --jobs 2", rich_help_panel=MEASURE)(
+        hunt_command
+    )
 
 
 def hunt_command(  # noqa: PLR0913  # each option is an argument

@@ -9,6 +9,7 @@ import typer
 from rich.progress import Progress
 
 from fognav import kernels
+from fognav.commands.installed import MEASURE
 from fognav.lidar_logs.options import LogFormat, RangeMax, Scans  # noqa: TC001  # same
 from fognav.operate.options import JsonOption  # noqa: TC001  # same
 from fognav.output import NOT_TRUE, WrongUseError, check_writable, console, exit_codes, print_answer, print_json
@@ -22,7 +23,7 @@ if TYPE_CHECKING:
 def add_to(app: typer.Typer) -> None:
     """Add the command to `fognav`."""
     epilog = "Example: fognav localize --map floor.yaml --log drive.log.gz --scans even --json"
-    app.command("localize", epilog=epilog)(localize_command)
+    app.command("localize", epilog=epilog, rich_help_panel=MEASURE)(localize_command)
 
 
 def localize_command(  # noqa: PLR0913  # each option is an argument

@@ -609,6 +609,30 @@ def test_block_of_which_late_poses_explain_all_is_taken_back():
     assert rig.hazard.state == "clear"
 
 
+def test_robot_that_says_late_again_and_again_that_it_stood_there_unblocks_an_area_a_few_times_only():
+    rig = Rig(site("n1"))
+    rig.read(3.0, 3.0, times=5)
+
+    def say(x: float, moment: float) -> None:
+        rig.core.on_pose("r1", msgspec.structs.replace(pose(x, 0.5), clock=moment + 5000.0), rig.now)
+
+    say(-3.0, rig.now)
+    rig.changes.clear()
+    before, passable = rig.now, 0
+    for _ in range(300):
+        rig.read(0.83, 3.0)  # a box
+        rig.now += 0.02
+        for x, moment in ((1.0, before + 0.002), (1.0, rig.now - 0.002), (-3.0, rig.now - 0.001)):
+            say(x, moment)
+        before = rig.now
+        rig.wait(0.0)
+        passable += rig.hazard.penalty < 254
+    assert passable * PERIOD <= 3.0
+    assert rig.hazard.state == "blocked"
+    rig.read(3.0, 3.0, times=5)
+    assert rig.hazard.state == "clear"
+
+
 def test_block_that_late_poses_explain_in_part_stays():
     rig = Rig(site("n1"))
     rig.read(3.0, 3.0, times=5)

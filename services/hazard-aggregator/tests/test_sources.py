@@ -530,6 +530,7 @@ def test_one_message_for_two_sources():
         ("doors/#", "has a wildcard .* give each sensor a source of its own"),
         ("a/b+/c", "has a wildcard"),
         ("{device}", "it is empty"),
+        ("door" + "/" * 201, "it has 201 slashes, and brokers refuse more than 200"),
     ],
 )
 def test_topic_that_no_single_sensor_has_is_refused(field, topic, problem):

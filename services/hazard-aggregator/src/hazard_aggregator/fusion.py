@@ -13,7 +13,7 @@ from fog_contracts.channels import BLOCKED, CLEAR
 from hazard_aggregator.alerts import node_reports
 from hazard_aggregator.areas import THESIS_NODE, Members, WatchedArea
 from hazard_aggregator.debounce import DEFAULT_RULE
-from hazard_aggregator.node_state import SourceState
+from hazard_aggregator.node_state import TAKEN_BACK_MAX, SourceState
 from hazard_aggregator.readings import Classification, ReadingOrder, RobotPoses, Taken, classify_reading
 from hazard_aggregator.sources import Sources
 
@@ -275,7 +275,7 @@ class AreaFusion:
     def _take_back(self, area: WatchedArea) -> None:
         """Take back what blocked an area if poses that came late show that it was a robot, all of it."""
         for node in area.nodes.values():
-            if node.state != "blocked" or node.site is None:
+            if node.state != "blocked" or node.site is None or node.taken_back >= TAKEN_BACK_MAX:
                 continue
             robot = None
             for taken_at, reading in node.unexplained:  # the oldest first: for a box, it is the only one
@@ -283,7 +283,7 @@ class AreaFusion:
                 if robot is None:
                     break
             if robot is not None:
-                node.invalidate(f"it saw the robot {robot}, whose pose came late")
+                node.take_back(robot)
                 area.take_back(node.id)
 
     def _after(self, applied: Iterable[Applied], stamp: float) -> list[AreaHazard]:

@@ -51,6 +51,8 @@ EXPLAINED_S: Final = 7.0
 """Robots may explain a node's echoes for so long (s), which crossing its cone takes; then nothing is known any more."""
 _EXPLAINED_PAUSE_S: Final = 3.0
 """After so long without an explained echo the robot is gone, and the time begins anew."""
+TAKEN_BACK_MAX: Final = 3
+"""So often poses that come late take back what a node saw, until it sees a clear area: they may be invented."""
 _UNEXPLAINED_MAX: Final = 300
 _PERIODS: Final = 3
 """A source is silent after so many of its periods."""
@@ -75,6 +77,7 @@ class NodeState:
     explained_at: float = -math.inf
     unexplained: list[tuple[float, NodeReading]] = field(default_factory=list)
     """The readings with echoes that no robot explained, since one confirmed that the area is clear."""
+    taken_back: int = 0
     run_state: AreaState | None = None
     run_began: float = 0.0
     received: int = 0
@@ -112,6 +115,11 @@ class NodeState:
         self.run_state = None
         self.unexplained.clear()
         self.rule.reset()
+
+    def take_back(self, robot: str) -> None:
+        """Set the state to unknown: what blocked it was this robot, whose poses came late."""
+        self.taken_back += 1
+        self.invalidate(f"it saw the robot {robot}, whose pose came late")
 
     def flap(self) -> None:
         """Set the state to unknown until it is steady."""
@@ -175,6 +183,7 @@ class NodeState:
             self.run_state = None
         elif confirmed == "clear":
             self.unexplained.clear()
+            self.taken_back = 0
         if confirmed != "unknown" and self.flaps.update(confirmed, taken_at):
             self.flap()
             return

@@ -234,6 +234,8 @@ PROFILES: Final[Mapping[str, Source]] = {
 
 _ENTITY: Final = re.compile(r"/(binary_sensor|sensor)/[^/]+$")
 
+_SLASHES: Final = 200
+"""In a topic to which Mosquitto lets one subscribe."""
 _VALUE_PERIOD_S: Final = 2.0
 """A node with several quantities takes turns."""
 
@@ -340,6 +342,8 @@ def _checked(area: str, where: str, topic: str) -> str:
         problem = "it is empty: name the sensor's topic"
     elif bad := next((each for each in topic if not _is_allowed(each)), None):
         problem = f"{topic!r} has the character U+{ord(bad):04X}, which brokers refuse: name the topic without it"
+    elif topic.count("/") > _SLASHES:
+        problem = f"it has {topic.count('/')} slashes, and brokers refuse more than {_SLASHES}: name the sensor's topic"
     elif topic.startswith("$"):
         problem = f"{topic!r} is the broker's own, or a shared subscription ($): name the sensor's topic"
     elif "+" in topic or "#" in topic:

@@ -126,10 +126,10 @@ def test_tests_of_what_stops_the_robot_reach_every_line_and_branch(part: str) ->
 
 
 @pytest.mark.timeout(700)
-def test_tests_of_the_guardians_revival_notice_nine_of_ten_changes() -> None:
-    code, parts = fognav("--part", "guardian", "--module", "revival")
-    (revival,) = (module for module in parts["guardian"]["modules"] if module["mutants"])
-    assert revival["module"] == "robot_agent.guardian.revival"
-    assert revival["mutants"] > 20
-    assert parts["guardian"]["score"] >= 0.9, revival["survivors"]
+def test_tests_of_how_the_guardian_wakes_its_base_notice_nine_of_ten_changes() -> None:
+    code, parts = fognav("--part", "guardian", "--module", "awakening")
+    (awakening,) = (module for module in parts["guardian"]["modules"] if module["mutants"])
+    assert awakening["module"] == "robot_agent.guardian.awakening"
+    assert awakening["mutants"] > 20
+    assert parts["guardian"]["score"] >= 0.9, awakening["survivors"]
     assert code == 0

@@ -12,9 +12,9 @@ from robot_agent.bases.roomba600.driver import BRC_PULSE_S, Roomba600Driver, Roo
 from robot_agent.bases.roomba600.emulator import PASSIVE, SAFE, Quirks, RoombaEmulator
 from robot_agent.bases.roomba600.mode_monitor import ModeMonitor
 from robot_agent.bases.roomba600.open_interface import SLOW_STREAM, Mode, stream_frame_size
+from robot_agent.guardian.awakening import ATTEMPT_S, OTHERS_AFTER, Attempt
 from robot_agent.guardian.core import GuardianCore
 from robot_agent.guardian.link import WheelCommand
-from robot_agent.guardian.revival import ATTEMPT_S, OTHERS_AFTER, Attempt
 
 STEP = 0.01
 QUIRKS = {

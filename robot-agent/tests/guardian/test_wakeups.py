@@ -18,9 +18,9 @@ from fog_runtime.configuration.robot_file import default_robot
 from robot_agent.bases.roomba600.emulator import RoombaEmulator
 from robot_agent.device_signature import LineCheck
 from robot_agent.guardian.core import GuardianCore
-from robot_agent.guardian.heartbeat import LONGEST_S
 from robot_agent.guardian.link import WheelCommand, encode
 from robot_agent.guardian.process import Guardian, GuardianSettings
+from robot_agent.guardian.timing import HEARTBEAT_MAX_S
 from robot_agent.hardware import Awakening, WakeLine
 from robot_agent.registry import make_base, signatures
 from robot_agent.serial_port import Port, open_port
@@ -116,7 +116,7 @@ def test_guardian_waits_no_longer_than_its_next_heartbeat_may(rig):
     for _ in range(2):
         before = rig.sent_at
         rig.cycle(LONG_S)
-        assert LONGEST_S - 0.01 < rig.sent_at - before < LONG_S / 2 + late.seconds()
+        assert HEARTBEAT_MAX_S - 0.01 < rig.sent_at - before < LONG_S / 2 + late.seconds()
         assert rig.heartbeats() == 1
 
 
@@ -130,14 +130,14 @@ def test_commands_wake_a_guardian_at_rest_and_frames_one_whose_wheels_turn(rig):
     rig.line.port.read_available()
     rig.drive(0.1)
     # The frames' time, or what is left until a heartbeat: on a busy machine most of that has passed.
-    until = min(rig.now() + 0.02, rig.sent_at + LONGEST_S)
+    until = min(rig.now() + 0.02, rig.sent_at + HEARTBEAT_MAX_S)
     rig.cycle(0.02)
     assert rig.now() >= until - 0.001
     assert rig.core._command.seq == rig.seq  # read in the cycle all the same
     rig.agent.close()
     begun, late = time.monotonic(), Lateness(lambda: [os.getpid()])
     rig.cycle(LONG_S)  # which the end of the link ends
-    assert time.monotonic() - begun < LONGEST_S + 1.0 + late.seconds()
+    assert time.monotonic() - begun < HEARTBEAT_MAX_S + 1.0 + late.seconds()
     assert rig.guardian._agent is None
 
 

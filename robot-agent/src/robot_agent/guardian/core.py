@@ -17,12 +17,10 @@ from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Final, NamedTuple
 
 from fog_contracts.messages import SENTENCE_MAX
-from robot_agent.guardian.base_faults import fault_of, is_bump
-from robot_agent.guardian.base_sleep import BaseSleep
-from robot_agent.guardian.feedback import FeedbackPolicy
+from robot_agent.guardian.awakening import Attempt, BaseSleep, Revival
+from robot_agent.guardian.base_reports import FeedbackPolicy, fault_of, is_bump
 from robot_agent.guardian.link import WHEEL_SPEED_MAX_M_S, BaseFeedback, WheelCommand
 from robot_agent.guardian.maneuvers import Maneuvers, Situation
-from robot_agent.guardian.revival import Attempt, Revival
 from robot_agent.hardware import ASLEEP, NO_FRESH_COMMAND, ON_CHARGER, DockingDriver
 
 if TYPE_CHECKING:

@@ -26,22 +26,58 @@ from fog_runtime.logs import Level
 from fog_runtime.machine import MachineClock
 from robot_agent.device_signature import LISTEN_S, LineCheck
 from robot_agent.guardian.core import GuardianCore, Limits, Output
-from robot_agent.guardian.frame_clock import UNKNOWN_S, FrameClock
-from robot_agent.guardian.heartbeat import LONGEST_S, Heartbeats
 from robot_agent.guardian.link import PACKET_LIMIT, WheelCommand, decode_command, encode
 from robot_agent.guardian.protection import lock_memory, run_in_real_time
-from robot_agent.guardian.wakeups import Commands, Wakeups
+from robot_agent.guardian.timing import HEARTBEAT_MAX_S, UNKNOWN_S, FrameClock, Heartbeats
 from robot_agent.guardian.watchdog import BAD_SETTINGS, PORT_LOST
 from robot_agent.registry import make_base, signatures
 from robot_agent.serial_port import Port, PortLost
 
 if TYPE_CHECKING:
+    from collections.abc import Callable
     from types import FrameType
 
     from fog_contracts.robot import MotionSettings
-    from robot_agent.guardian.revival import Attempt
+    from robot_agent.guardian.awakening import Attempt
 
-RESTING_S: Final = LONGEST_S
+
+class Wakeups:
+    """The descriptors that are watched, each with the handler of its events."""
+
+    def __init__(self) -> None:
+        self._poll = select.poll()
+        self._handlers: dict[int, Callable[[], None]] = {}
+
+    def watch(self, descriptor: int, handler: Callable[[], None], *, input_too: bool = True) -> None:
+        """Call `handler` for each input, from now on; without `input_too` only when the other end has closed."""
+        self._handlers[descriptor] = handler
+        self._poll.register(descriptor, select.POLLIN if input_too else 0)
+
+    def forget(self, descriptor: int) -> None:
+        """Watch a descriptor no longer."""
+        self._poll.unregister(descriptor)
+        del self._handlers[descriptor]
+
+    def wait(self, real_s: float) -> None:
+        """Wait for an event, `real_s` real seconds at most, and handle it."""
+        for descriptor, _ in self._poll.poll(1000.0 * real_s):
+            if (handler := self._handlers.get(descriptor)) is not None:  # None: closed by the handler before
+                handler()
+
+
+class Commands:
+    """Tells whether the agent has sent something, without an exception for each time that it has not."""
+
+    def __init__(self, agent: socket.socket) -> None:
+        self._poll = select.poll()
+        self._poll.register(agent, select.POLLIN)
+
+    def pending(self) -> bool:
+        """Return whether a read of the socket would not block: a packet, or the end of the link."""
+        return bool(self._poll.poll(0))
+
+
+RESTING_S: Final = HEARTBEAT_MAX_S
 """Period while no wheel turns; but a command of the agent is applied at once, and comes a little more often."""
 AGENT_LIVES_S: Final = 1.0
 """An agent sends a command every 0.05 s, an idle one every 0.1 s; one that was silent for longer than this hangs, and

@@ -1,16 +1,20 @@
-"""When the guardian looks at its base while a wheel turns: every second frame, just after it has come. Pure.
+"""When the guardian looks at its base and sends heartbeats, and when the watchdog gives it up as hung. Pure.
 
-Waiting for bytes would wake the process for each piece of a frame, which some adapters pass on every millisecond; a
-look at each frame costs twice as much as one at two. A look at any other time than just after the second frame would
-let a frame wait for longer: so each look comes a little earlier than the last one, until one comes too early.
+The watchdog uses this too, so it imports almost nothing.
 
-Frames may come more slowly than the base's driver says, by a clock of the base's own or a busy line. Then nearly every
-look would come too early and be repeated, so looks that do make the period longer, by half at most, and others
-bring it back.
+Waiting for the bytes of a base whose wheel turns would wake the process for each piece of a frame, which some adapters
+pass on every millisecond; a look at each frame costs twice as much as one at two. A look at any other time than just
+after the second frame would let a frame wait for longer: so each look comes a little earlier than the last one, until
+one comes too early.
+
+Frames may come more slowly than the driver of the base says, by a clock of its own or a busy line. Then nearly every
+look would come too early and be repeated, so looks that do make the period longer, by half at most, and others bring
+it back.
 """
 
 from __future__ import annotations
 
+import math
 from typing import Final
 
 FRAMES: Final = 2
@@ -83,3 +87,41 @@ class FrameClock:
 
     def _expect(self) -> None:
         self._missing, self._tries = FRAMES, 0
+
+
+HEARTBEAT_MIN_S: Final = 0.07
+"""No two heartbeats are nearer to one another: they share the guardian's wake-ups for base and agent."""
+HEARTBEAT_MAX_S: Final = 0.105
+"""The longest pause that the guardian leaves between two, however commands and frames wake it: a little more than that
+between two commands to a robot that stands, so that these alone wake its guardian."""
+LATENESS_S: Final = 0.095
+"""Real seconds by which the machine may delay a heartbeat or the watchdog.
+
+Programs of normal priority get 50 ms of each second before any with a real-time priority, by the kernel's own rule.
+"""
+
+
+def silence_limit(speed: float) -> float:
+    """Return the real seconds without a heartbeat after which the guardian is killed: 0.2 at speed 1.
+
+    speed: simulated over wall time. It shortens the pauses, but no delay of the machine.
+    """
+    return HEARTBEAT_MAX_S / speed + LATENESS_S
+
+
+class Heartbeats:
+    """The times of one guardian's heartbeats; `now` is s of its clock."""
+
+    def __init__(self) -> None:
+        self._sent_at = -math.inf
+
+    def wait(self, longest: float, now: float) -> float:
+        """Return how long (s) the guardian may wait for events: `longest`, or until a heartbeat has to be sent."""
+        return max(0.0, min(longest, self._sent_at + HEARTBEAT_MAX_S - now))
+
+    def is_due(self, now: float) -> bool:
+        """Return whether to send one now; if so, it counts as sent."""
+        if now - self._sent_at < HEARTBEAT_MIN_S:
+            return False
+        self._sent_at = now
+        return True

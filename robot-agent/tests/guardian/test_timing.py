@@ -1,4 +1,4 @@
-"""When the guardian looks at a base that sends frames: seldom, and yet soon after each frame."""
+"""Looks at the base are seldom and yet soon after each frame, and heartbeats come in time for the watchdog."""
 
 from __future__ import annotations
 
@@ -10,7 +10,18 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from robot_agent.guardian.frame_clock import EARLIER_S, FRAMES, LATER_S, UNKNOWN_S, FrameClock
+from robot_agent.guardian.timing import (
+    EARLIER_S,
+    FRAMES,
+    HEARTBEAT_MAX_S,
+    HEARTBEAT_MIN_S,
+    LATENESS_S,
+    LATER_S,
+    UNKNOWN_S,
+    FrameClock,
+    Heartbeats,
+    silence_limit,
+)
 
 FRAME_S = 0.015
 END_S = 6.0
@@ -150,3 +161,50 @@ def test_pause_of_the_machine_is_not_made_up_for_by_looks_at_once():
     clock.begin(0.0)
     clock.on_look(40, 0.6)
     assert clock.wait(0.6) >= 0.5 * FRAMES * FRAME_S - EARLIER_S
+
+
+AHEAD_OF_REAL_TIME_S = 0.05
+"""What the kernel keeps for programs of normal priority in each second."""
+
+
+def heartbeats(commands, period):
+    """Times of the heartbeats of a guardian that waits for `period` s, and is woken at the times of `commands`, too."""
+    beats, now, sent = Heartbeats(), 0.0, []
+    pending = sorted(commands)
+    while now < 1.0:
+        if beats.is_due(now):
+            sent.append(now)
+        timeout = now + beats.wait(period, now)
+        while pending and pending[0] <= now:
+            pending.pop(0)
+        now = min([timeout, *pending[:1]])
+    return sent
+
+
+@given(st.lists(st.floats(0.001, 0.999), max_size=40), st.sampled_from([0.015, 0.034, HEARTBEAT_MAX_S]))
+def test_pause_between_two_heartbeats_has_both_limits_whatever_wakes_the_guardian(commands, period):
+    sent = heartbeats(commands, period)
+    pauses = [after - before for before, after in itertools.pairwise(sent)]
+    assert max(pauses) <= HEARTBEAT_MAX_S + 1e-9
+    assert min(pauses) >= HEARTBEAT_MIN_S - 1e-9
+
+
+def test_command_shortly_before_a_heartbeat_at_rest_does_not_delay_it():
+    sent = heartbeats([HEARTBEAT_MIN_S - 0.001], HEARTBEAT_MAX_S)
+    assert sent[1] == pytest.approx(HEARTBEAT_MAX_S)
+
+
+def test_commands_to_a_robot_that_stands_are_all_that_wakes_its_guardian():
+    commands = [0.1 * number for number in range(1, 10)]
+    assert heartbeats(commands, HEARTBEAT_MAX_S) == pytest.approx([0.0, *commands])
+
+
+@pytest.mark.parametrize("speed", [0.5, 1.0, 1.4, 2.0, 3.0, 10.0])
+def test_watchdog_leaves_the_machine_the_same_real_time_at_every_speed(speed):
+    margin = silence_limit(speed) - HEARTBEAT_MAX_S / speed
+    assert margin == pytest.approx(LATENESS_S)
+    assert margin > 1.5 * AHEAD_OF_REAL_TIME_S
+
+
+def test_hung_guardian_of_a_robot_is_given_up_after_200_ms():
+    assert silence_limit(1.0) == pytest.approx(0.2)

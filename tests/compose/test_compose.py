@@ -46,7 +46,7 @@ from compose_project import (
 from fog_contracts import channels as ch
 from fog_contracts.messages import CommandReply, RobotPose, RobotState, SimCommand, SimObstacle
 from fog_runtime.credentials import Credentials
-from fog_runtime.transports.mqtt_broker import Broker
+from fog_runtime.transports.mqtt_connection import Broker
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator

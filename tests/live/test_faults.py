@@ -23,7 +23,7 @@ from driver import START, LiveSystem
 
 from fog_contracts.geometry import contains_point
 from fog_contracts.messages import Pose, SimCommand, SimObstacle
-from fog_runtime.transports.mqtt_broker import Broker
+from fog_runtime.transports.mqtt_connection import Broker
 from fog_supervisor import net
 from fognav.programs import AGENT, AGGREGATOR, BROKER, MAP_SERVICE, PLANNER, REDIS, ROUTER
 

@@ -15,7 +15,7 @@ from fog_runtime.clock import SystemClock
 from fog_runtime.credentials import Credentials
 from fog_runtime.locks.site_locks import SiteLocks
 from fog_runtime.stores.redis_connection import RedisConnection, StoreError
-from fog_runtime.transports.mqtt_broker import Broker
+from fog_runtime.transports.mqtt_connection import Broker
 from fog_runtime.transports.zenoh_edge import ZenohEdge
 from fog_supervisor.servers import start_mosquitto, start_redis, start_router
 

@@ -35,7 +35,7 @@ if TYPE_CHECKING:
     from fog_contracts.channels import Channel, Role
     from fog_contracts.messages import Message
     from fog_runtime.configuration.site import LoadedSite
-    from fog_runtime.transports.mqtt_subscriptions import ForeignHandler
+    from fog_runtime.transports.mqtt_connection import ForeignHandler
     from robot_agent.config import AgentConfig
     from robot_agent.guardian.link import WheelCommand
 

@@ -63,7 +63,7 @@ def own_credentials(default: str | None = None) -> Credentials:
 def locks_errors() -> Iterator[None]:
     """Turn errors of locks into those of commands."""
     from fog_runtime.locks.authority import AuthorityError  # noqa: PLC0415  # keeps the other commands fast
-    from fog_runtime.locks.members import LocksError  # noqa: PLC0415  # same
+    from fog_runtime.locks.users import LocksError  # noqa: PLC0415  # same
 
     try:
         yield

@@ -8,7 +8,7 @@ from fronts import running_front
 
 from fog_runtime.health import Health
 from fog_runtime.http import ClientHost, Routes, Tokens, make_app
-from fog_runtime.http.gateway import AGAIN_S, KNOWN_S, BehindGateway, addresses_of
+from fog_runtime.http.front import AGAIN_S, KNOWN_S, BehindGateway, addresses_of
 
 CLIENT, LIAR = "192.0.2.7", "198.51.100.9"
 

@@ -27,7 +27,6 @@ from fog_runtime.http import (
     Tokens,
     app,
     make_app,
-    places,
     unused,
 )
 from fog_runtime.http.link import CoreLink, FrontLink
@@ -186,8 +185,8 @@ async def test_body_that_does_not_arrive_is_refused_after_a_while(tmp_path, monk
 
 
 async def test_client_whose_requests_take_long_leaves_places_to_others_and_to_stops(tmp_path, monkeypatch):
-    monkeypatch.setattr(places, "MAX_OF_CLIENT", 3)
-    monkeypatch.setattr(places, "MAX_URGENT_OF_PATH", 2)
+    monkeypatch.setattr(app, "MAX_OF_CLIENT", 3)
+    monkeypatch.setattr(app, "MAX_URGENT_OF_PATH", 2)
     async with serving(tmp_path) as (service, client), asyncio.TaskGroup() as tasks:
 
         async def until_refused(method: str, path: str) -> httpx.Response:
@@ -215,15 +214,15 @@ async def test_client_whose_requests_take_long_leaves_places_to_others_and_to_st
 
 
 async def test_client_that_asks_for_health_too_often_at_once_is_refused(tmp_path, monkeypatch):
-    monkeypatch.setattr(places, "MAX_HEALTH_OF_CLIENT", 0)
+    monkeypatch.setattr(app, "MAX_HEALTH_OF_CLIENT", 0)
     async with serving(tmp_path) as (_, client):
         assert (await client.get("/metrics")).status_code == 503
         assert (await client.get("/encoded")).status_code == 200
 
 
 async def test_client_that_ends_none_of_its_requests_takes_no_place(tmp_path, monkeypatch):
-    monkeypatch.setattr(places, "MAX_OF_CLIENT", 1)
-    monkeypatch.setattr(places, "MAX_URGENT_OF_PATH", 1)
+    monkeypatch.setattr(app, "MAX_OF_CLIENT", 1)
+    monkeypatch.setattr(app, "MAX_URGENT_OF_PATH", 1)
     monkeypatch.setattr(app, "BODY_S", 2 * DEADLINE_S)
     async with serving(tmp_path) as (_, client), contextlib.AsyncExitStack() as connections:
         for begun in (b"PUT /zones/z1", b"POST /robots/r1/stop"):

@@ -18,12 +18,12 @@ from fog_runtime.credentials import NOBODY, Credentials, CredentialsError, to_to
 from fog_runtime.leadership import LeaseStore
 from fog_runtime.locks import users
 from fog_runtime.locks.authority import Authority, AuthorityError
-from fog_runtime.locks.members import LocksError
 from fog_runtime.locks.site_locks import SiteLocks
+from fog_runtime.locks.users import LocksError
 from fog_runtime.router import RouterLocks, RouterLocksError
 from fog_runtime.stores.redis_connection import RedisConnection, StoreError
 from fog_runtime.stores.redis_store import RedisStore
-from fog_runtime.transports.mqtt_broker import Broker
+from fog_runtime.transports.mqtt_connection import Broker
 from fog_runtime.transports.mqtt_edge import MqttEdge
 from fog_runtime.transports.zenoh_edge import ZenohEdge
 from fog_supervisor.servers import start_mosquitto, start_redis, start_router

@@ -17,8 +17,7 @@ from fog_contracts import channels as ch
 from fog_contracts import messages as m
 from fog_contracts.codec import ContractError, encode
 from fog_runtime.clock import SystemClock
-from fog_runtime.transports.mqtt_edge import MqttEdge, Will
-from fog_runtime.transports.mqtt_inputs import MqttEdgeWithInputs
+from fog_runtime.transports.mqtt_edge import MqttEdge, MqttEdgeWithInputs, Will
 from fog_supervisor.servers import start_mosquitto
 
 pytestmark = pytest.mark.live

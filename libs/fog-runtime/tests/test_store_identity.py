@@ -2,8 +2,7 @@
 
 import pytest
 
-from fog_runtime.stores.redis_connection import StoreError
-from fog_runtime.stores.store_identity import LOST, StoreIdentity, StoreLostError
+from fog_runtime.stores.redis_connection import LOST, StoreError, StoreIdentity, StoreLostError
 
 
 def verify(identity: StoreIdentity, generation: str, writes: dict[str, int]) -> None:

@@ -25,8 +25,8 @@ from fog_contracts.handlers import RefusedMessageError
 from fog_contracts.replica import MasterMap
 from fog_runtime.clock import SystemClock
 from fog_runtime.transports.edges import Edges
-from fog_runtime.transports.reply_parts import PART_BYTES, decode_announcement
 from fog_runtime.transports.zenoh_edge import ASKER, ZenohEdge, session_config
+from fog_runtime.transports.zenoh_query import PART_BYTES, decode_announcement
 from fog_supervisor.net import free_port
 from fog_supervisor.servers import start_router
 

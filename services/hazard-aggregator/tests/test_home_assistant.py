@@ -10,7 +10,7 @@ import pytest
 from fog_contracts import channels as ch
 from fog_contracts.handlers import Publication
 from fog_contracts.messages import AreaDefinition
-from fog_runtime.transports.mqtt_broker import Broker
+from fog_runtime.transports.mqtt_connection import Broker
 from hazard_aggregator.publications import discovery, discovery_publication
 
 SQUARE = [(0.0, 0.0), (2.0, 0.0), (2.0, 1.0), (0.0, 1.0)]

@@ -10,7 +10,7 @@ import pytest
 
 from fog_contracts import channels as ch
 from fog_contracts.messages import AreaHazard, MapDelta, NodeValue
-from fog_runtime.transports.mqtt_broker import Broker
+from fog_runtime.transports.mqtt_connection import Broker
 
 pytestmark = pytest.mark.live
 

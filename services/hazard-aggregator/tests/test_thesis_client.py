@@ -6,7 +6,7 @@ import contextlib
 import aiomqtt
 import pytest
 
-from fog_runtime.transports.mqtt_broker import Broker
+from fog_runtime.transports.mqtt_connection import Broker
 
 pytestmark = pytest.mark.live
 PERIOD_S = 0.1

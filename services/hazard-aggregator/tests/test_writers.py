@@ -14,7 +14,7 @@ from fog_contracts.messages import AreaDefinition
 from fog_runtime.clock import ManualClock
 from fog_runtime.health import Health
 from fog_runtime.http import Tokens, token_hash
-from fog_runtime.stores.idempotency import Attempt
+from fog_runtime.stores.redis_store import Attempt
 from fog_runtime.token_file import TokenEntry
 from fog_supervisor.servers import start_redis
 from hazard_aggregator import area_size

@@ -14,7 +14,7 @@ from fog_contracts.grid import GridGeometry
 from fog_contracts.messages import CircleShape, Message, Zone
 from fog_runtime.clock import ManualClock
 from fog_runtime.health import Health
-from fog_runtime.stores.idempotency import Attempt
+from fog_runtime.stores.redis_store import Attempt
 from fog_supervisor.servers import start_redis
 from map_service.core import MapCore
 from map_service.registry import make_layers

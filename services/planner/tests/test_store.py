@@ -11,7 +11,7 @@ from fog_runtime.clock import SystemClock
 from fog_runtime.health import Health
 from fog_runtime.leadership import LeaseStore
 from fog_runtime.lease import Request
-from fog_runtime.stores.idempotency import Attempt, IdempotencyError
+from fog_runtime.stores.redis_store import Attempt, IdempotencyError
 from fog_supervisor.servers import Server, start_redis
 from planner.store import Audit, MissionKeeper, RecoveryError, Store, StoredGoal, StoreError
 

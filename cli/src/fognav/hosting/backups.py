@@ -15,9 +15,8 @@ from fog_runtime import backup
 from fog_runtime.backup import Backup, read_archive
 from fog_runtime.credentials import Credentials
 from fog_runtime.files import atomic_write
-from fog_runtime.locks.server_files import ANYBODY, USERS, user_of
 from fog_runtime.locks.site_locks import AUTHORITY, SiteLocks
-from fog_runtime.locks.users import REDIS_ADMINISTRATOR, on_floor
+from fog_runtime.locks.users import ANYBODY, REDIS_ADMINISTRATOR, USERS, on_floor, user_of
 from fog_supervisor import net, servers
 from fog_supervisor.supervisor import Event, Supervisor
 from fognav.hosting import recordings

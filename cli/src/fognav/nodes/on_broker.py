@@ -13,7 +13,7 @@ from fog_contracts import channels as ch
 from fog_contracts.codec import ContractError, decode, decode_text, encode, encode_text
 from fog_contracts.messages import NodeCalibration, NodeReading
 from fog_runtime.credentials import NOBODY, Credentials
-from fog_runtime.transports.mqtt_broker import Broker
+from fog_runtime.transports.mqtt_connection import Broker
 from fognav.output import FailedError, WrongUseError
 
 if TYPE_CHECKING:

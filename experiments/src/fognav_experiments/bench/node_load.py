@@ -23,7 +23,7 @@ from fog_contracts import channels as ch
 from fog_contracts.codec import encode
 from fog_contracts.messages import NodeReading, RobotPose
 from fog_runtime.credentials import Credentials
-from fog_runtime.transports.mqtt_broker import Broker
+from fog_runtime.transports.mqtt_connection import Broker
 from fog_runtime.transports.zenoh_edge import session_config
 
 BLOCKED_S: Final = 0.5

@@ -287,16 +287,8 @@ def _pytest(part: Part, root: Path, options: list[str], plugins: list[object]) -
         ini.write_text(_INI, "utf-8")
         skipped = [word for name in _SKIPPED_PLUGINS for word in ("-p", f"no:{name}")]
         arguments = ["-c", str(ini), "--rootdir", str(root), "--confcutdir", str(root), "--import-mode=importlib", "-q"]
-        arguments += [
-            "-o",
-            f"pythonpath={root / 'tests/support'}",
-            "--assert=plain",
-            "-m",
-            "not live",
-            "--ignore-glob=*_drives.py",
-            *skipped,
-            *options,
-        ]
+        arguments += ["-o", f"pythonpath={root / 'tests/support'}"]
+        arguments += ["--assert=plain", "-m", "not live", "--ignore-glob=*_drives.py", *skipped, *options]
         return int(pytest.main([*arguments, *(str(folder / test) for test in part.tests)], plugins=plugins))
 
 

@@ -17,7 +17,7 @@ from fog_runtime.health import Health
 from fog_runtime.http import Front, load_tokens, unused
 from fog_runtime.leadership import Leadership, LeaseStore, process_id
 from fog_runtime.process import release_startup_memory
-from fog_runtime.transports.mqtt_inputs import MqttEdgeWithInputs
+from fog_runtime.transports.mqtt_edge import MqttEdgeWithInputs
 from fog_runtime.transports.zenoh_edge import ZenohEdge
 from hazard_aggregator.api import make_api
 from hazard_aggregator.areas import Members

@@ -57,7 +57,7 @@ from fog_runtime.http import (
     next_page,
 )
 from fog_runtime.stores.audit import CursorError
-from fog_runtime.stores.idempotency import IdempotencyError
+from fog_runtime.stores.redis_store import IdempotencyError
 from hazard_aggregator.alerts import AlertError
 from hazard_aggregator.area_size import AreaError, TooManyAreasError, check_size
 from hazard_aggregator.areas import LONGEST_S, AreaOverride

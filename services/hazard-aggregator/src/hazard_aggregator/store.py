@@ -10,7 +10,7 @@ from msgspec import structs
 
 from fog_contracts.messages import AreaDefinition, AreaHazard, Count, Id, Message, Ring
 from fog_runtime import logs
-from fog_runtime.stores import store_keys, store_scripts
+from fog_runtime.stores import store_scripts
 from fog_runtime.stores.audit import CursorError
 from fog_runtime.stores.redis_store import Audit, Outcome, RecoveryError, RedisStore, StoreError, StoreLostError, Table
 from hazard_aggregator.alerts import StoredAlerts
@@ -29,7 +29,7 @@ if TYPE_CHECKING:
 
     from fog_contracts.handlers import Moment
     from fog_contracts.messages import Alert
-    from fog_runtime.stores.idempotency import Attempt
+    from fog_runtime.stores.redis_store import Attempt
     from hazard_aggregator.alerts import AlertEvent
 
 __all__ = [
@@ -43,13 +43,13 @@ __all__ = [
     "load_at_start",
 ]
 
-_AREAS: Final = Table(store_keys.AREAS, "area")
-_HAZARDS: Final = store_keys.HAZARDS
-_OVERRIDES: Final = Table(store_keys.OVERRIDES, "override")
-_RESTS: Final = store_keys.OVERRIDE_RESTS
-_ALERTS: Final = store_keys.ALERTS
+_AREAS: Final = Table(store_scripts.AREAS, "area")
+_HAZARDS: Final = store_scripts.HAZARDS
+_OVERRIDES: Final = Table(store_scripts.OVERRIDES, "override")
+_RESTS: Final = store_scripts.OVERRIDE_RESTS
+_ALERTS: Final = store_scripts.ALERTS
 _ALL: Final = "all"
-_HISTORY: Final = store_keys.HISTORY
+_HISTORY: Final = store_scripts.HISTORY
 _CURSOR: Final = re.compile(r"[0-9]{1,15}-[0-9]{1,15}")
 
 _log = logs.get("store")

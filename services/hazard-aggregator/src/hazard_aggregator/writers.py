@@ -14,7 +14,7 @@ from hazard_aggregator.store import Audit
 if TYPE_CHECKING:
     from fog_contracts.messages import AreaDefinition, OverrideState
     from fog_runtime.clock import Clock
-    from fog_runtime.stores.idempotency import Attempt
+    from fog_runtime.stores.redis_store import Attempt
     from fog_runtime.transports.edges import Edges
     from hazard_aggregator.core import Aggregator
     from hazard_aggregator.publisher import Publisher

@@ -57,7 +57,7 @@ from fog_runtime.http import (
 )
 from fog_runtime.http.routes import InvalidBodyError
 from fog_runtime.stores.audit import KINDS, AuditEntry, CursorError
-from fog_runtime.stores.idempotency import Attempt, IdempotencyError
+from fog_runtime.stores.redis_store import Attempt, IdempotencyError
 from map_service.core import ScrapeTarget
 from map_service.costmap import LayeredCostmap
 from map_service.layers.base import Grid

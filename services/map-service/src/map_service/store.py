@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Final
 from msgspec import structs
 
 from fog_contracts.messages import Message, Zone
-from fog_runtime.stores import store_keys
+from fog_runtime.stores import store_scripts
 from fog_runtime.stores.redis_store import (
     ANY,
     Audit,
@@ -23,14 +23,14 @@ from map_service.zone_times import Progress
 if TYPE_CHECKING:
     from collections.abc import Iterable
 
-    from fog_runtime.stores.idempotency import Attempt
+    from fog_runtime.stores.redis_store import Attempt
 
 __all__ = ["Audit", "Outcome", "RecoveryError", "Store", "StoreError", "StoreLostError"]
 
-_ZONES: Final = Table(store_keys.ZONES, "zone")
+_ZONES: Final = Table(store_scripts.ZONES, "zone")
 
 
-_TIMES: Final = store_keys.ZONE_TIMES
+_TIMES: Final = store_scripts.ZONE_TIMES
 _ALL: Final = "all"
 
 

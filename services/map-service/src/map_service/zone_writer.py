@@ -23,8 +23,7 @@ if TYPE_CHECKING:
     from fog_contracts.handlers import Moment
     from fog_contracts.messages import Zone
     from fog_runtime.health import Health
-    from fog_runtime.stores.idempotency import Attempt
-    from fog_runtime.stores.redis_store import StoreStatus
+    from fog_runtime.stores.redis_store import Attempt, StoreStatus
     from map_service.core import MapCore
     from map_service.publisher import Publisher
     from map_service.store import Outcome, Store

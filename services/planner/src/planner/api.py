@@ -43,7 +43,7 @@ from fog_runtime.http import (
     make_app,
     must_be_new,
 )
-from fog_runtime.stores.idempotency import IdempotencyError
+from fog_runtime.stores.redis_store import IdempotencyError
 from planner.query_queue import BusyError
 from planner.robot_commands import CommandError, RobotOperator
 from planner.service import Service

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Final, NamedTuple
 
 from fog_contracts.messages import Message, Refusal, RobotGoal
 from fog_runtime import logs
-from fog_runtime.stores import store_keys
+from fog_runtime.stores import store_scripts
 from fog_runtime.stores.redis_connection import StoreRefusedError
 from fog_runtime.stores.redis_store import (
     ANY,
@@ -31,8 +31,7 @@ if TYPE_CHECKING:
     from fog_contracts.messages import Pose, RobotState
     from fog_runtime.clock import Clock
     from fog_runtime.health import Health
-    from fog_runtime.stores.idempotency import Attempt
-    from fog_runtime.stores.redis_store import StoreStatus
+    from fog_runtime.stores.redis_store import Attempt, StoreStatus
     from planner.core import PlannerCore
 
     Send = Callable[["Order"], Awaitable["StoredGoal | Refusal"]]
@@ -40,7 +39,7 @@ if TYPE_CHECKING:
 
 __all__ = ["ANY", "Audit", "RecoveryError", "Store", "StoreError", "StoreLostError", "StoredGoal"]
 
-_GOALS: Final = Table(store_keys.GOALS, "mission", version="goal.goal_id")
+_GOALS: Final = Table(store_scripts.GOALS, "mission", version="goal.goal_id")
 
 
 class StoredGoal(Message, frozen=True, kw_only=True):

@@ -2,7 +2,6 @@
 
 from fog_runtime.http.app import make_app
 from fog_runtime.http.front import Front, FrontError, unused
-from fog_runtime.http.paging import PageSize, next_page
 from fog_runtime.http.problems import RETRY_AFTER, ProblemError
 from fog_runtime.http.routes import (
     Answer,
@@ -18,10 +17,12 @@ from fog_runtime.http.routes import (
 from fog_runtime.http.store_routes import (
     IdempotencyKey,
     IfNoneMatch,
+    PageSize,
     add_recovery,
     add_store_errors,
     attempt_of,
     must_be_new,
+    next_page,
 )
 from fog_runtime.http.tokens import Admin, Caller, Operator, Tokens, Viewer, load_tokens
 from fog_runtime.token_file import TokensError, token_hash

@@ -9,12 +9,13 @@ import asyncio
 import contextlib
 import gc
 import logging
+import math
 import os
 import signal
 import socket
 import time
 from collections import Counter
-from collections.abc import Callable, Collection, Iterator
+from collections.abc import Awaitable, Callable, Collection, Iterable, Iterator, MutableMapping
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, Final, NoReturn, Self
@@ -27,9 +28,67 @@ from fog_runtime import logs, machine
 from fog_runtime.admission import BACKLOG, Admission, Visitor
 from fog_runtime.credentials import ServerCertificate
 from fog_runtime.files import write_port_file
-from fog_runtime.http.gateway import BehindGateway
 from fog_runtime.http.link import CoreLink, FrontLink
 from fog_runtime.http.routes import answer_call, rank_of
+
+Scope = MutableMapping[str, Any]
+Receive = Callable[[], Awaitable[MutableMapping[str, Any]]]
+Send = Callable[[MutableMapping[str, Any]], Awaitable[None]]
+App = Callable[[Scope, Receive, Send], Awaitable[None]]
+Resolve = Callable[[str], Awaitable[set[str]]]
+
+KNOWN_S: Final = 10.0
+"""For how long an address is believed to be the gateway's."""
+AGAIN_S: Final = 1.0
+"""How soon the name is looked up again for somebody who is not the gateway."""
+_HEADER: Final = b"x-forwarded-for"
+
+
+async def addresses_of(name: str) -> set[str]:
+    """Return the addresses of a name; none if it has none now."""
+    try:
+        found = await asyncio.get_running_loop().getaddrinfo(name, None, type=socket.SOCK_STREAM)
+    except OSError:
+        return set()
+    return {str(address[0]) for *_, address in found}
+
+
+class BehindGateway:
+    """Gives the app the gateway's client instead of the gateway.
+
+    Nobody but the gateway is believed, for others could pretend to be many clients, or another one. It is known by its
+    name: in a network of containers its address changes with each start.
+    """
+
+    def __init__(self, app: App, gateway: str, resolve: Resolve = addresses_of) -> None:
+        """`gateway` is its name or address; `resolve` looks a name up."""
+        self._app = app
+        self._gateway = gateway
+        self._resolve = resolve
+        self._addresses: set[str] = set()
+        self._looked_up = -math.inf
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        """Pass a request on."""
+        peer = scope.get("client")
+        named = _named(scope["headers"]) if scope["type"] == "http" else ""
+        if named and peer and await self._is_gateway(peer[0]):
+            scope = {**scope, "client": (named, 0)}
+        await self._app(scope, receive, send)
+
+    async def _is_gateway(self, address: str) -> bool:
+        age = asyncio.get_running_loop().time() - self._looked_up
+        if age > (KNOWN_S if address in self._addresses else AGAIN_S):
+            self._looked_up = asyncio.get_running_loop().time()
+            self._addresses = await self._resolve(self._gateway)
+        return address in self._addresses
+
+
+def _named(headers: Iterable[tuple[bytes, bytes]]) -> str:
+    """Return the client that the gateway itself has seen: the last one, after those that the client claims."""
+    values = [value for name, value in headers if name == _HEADER]
+    return values[-1].decode("latin-1").rpartition(",")[2].strip() if values else ""
+
 
 NICENESS: Final = 5
 """The front gets a third of the processor time of a core that wants some, too."""

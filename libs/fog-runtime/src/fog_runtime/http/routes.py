@@ -141,7 +141,7 @@ class Routes:
         self._app.add_exception_handler(kind, answer)
 
     def urgent(self, path: str) -> None:
-        """Give requests to this path places of their own, which no other requests take (`fog_runtime.http.places`)."""
+        """Give requests to this path places of their own, which no other requests take (`fog_runtime.http.app`)."""
         self._app.state.urgent[path] = compile_path(path)[0]
 
     def get(self, path: str, **options: Any) -> Callable[[Handler], Handler]:

@@ -1,16 +1,36 @@
-"""What the REST interfaces of all services with a store have in common: its errors, its recovery, idempotency keys."""
+"""What the REST interfaces of all services with a store have in common: errors, recovery, idempotency, pages."""
 
 from typing import Annotated, Any, Literal, Protocol
+from urllib.parse import urlencode
 
-from fastapi import Header
+from fastapi import Depends, Header, Query
 
 from fog_contracts.messages import Message
 from fog_runtime.http.problems import RETRY_AFTER, ProblemError
 from fog_runtime.http.routes import Body, Routes
 from fog_runtime.http.tokens import Admin, Caller, Viewer
-from fog_runtime.stores.idempotency import Attempt, IdempotencyError
 from fog_runtime.stores.redis_connection import StoreError, StoreRefusedError
-from fog_runtime.stores.redis_store import RecoveryError, StoreStatus
+from fog_runtime.stores.redis_store import Attempt, IdempotencyError, RecoveryError, StoreStatus
+
+
+def _page_size(
+    limit: Annotated[int, Query(description="The most entries of a page: at least 1 and at most 1000 count")] = 100,
+) -> int:
+    return max(1, min(limit, 1000))
+
+
+PageSize = Annotated[int, Depends(_page_size)]
+"""The parameter `limit`, brought into its bounds before it is passed on."""
+
+
+def next_page(path: str, cursor: str | None, limit: int, **query: str | None) -> dict[str, str]:
+    """Return the Link header with the next page's address; none without a cursor."""
+    if cursor is None:
+        return {}
+    given = {**query, "cursor": cursor, "limit": limit}
+    address = urlencode({name: value for name, value in given.items() if value is not None})
+    return {"Link": f'<{path}?{address}>; rel="next"'}
+
 
 IdempotencyKey = Annotated[
     str | None,

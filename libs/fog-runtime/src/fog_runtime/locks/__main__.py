@@ -24,9 +24,8 @@ from fog_runtime.credentials import CredentialsError
 from fog_runtime.keys import TOKENS, make_keys
 from fog_runtime.locks.authority import AuthorityError
 from fog_runtime.locks.handing_out import hand_out, hand_out_on_floor, keys_of
-from fog_runtime.locks.members import LocksError
 from fog_runtime.locks.site_locks import SiteLocks
-from fog_runtime.locks.users import on_floor
+from fog_runtime.locks.users import LocksError, on_floor
 from fog_runtime.token_file import ROLES, TokensError, create_token, read_tokens, revoke_token
 
 if TYPE_CHECKING:

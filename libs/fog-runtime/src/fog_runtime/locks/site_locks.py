@@ -27,8 +27,7 @@ from fog_runtime.credentials import SERVERS, Credentials, Server, to_toml
 from fog_runtime.files import PRIVATE, atomic_write
 from fog_runtime.locks import users
 from fog_runtime.locks.authority import SERVER_DAYS, Authority, expiry
-from fog_runtime.locks.members import LocksError, Members, require_own_topics
-from fog_runtime.locks.server_files import ANYBODY, ServerFiles, user_of
+from fog_runtime.locks.users import ANYBODY, LocksError, Members, ServerFiles, require_own_topics, user_of
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping, Sequence

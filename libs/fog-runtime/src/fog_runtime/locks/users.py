@@ -1,4 +1,4 @@
-"""The users of a site's servers, each in the form in which its server reads them.
+"""The users of a site's servers: which they are, and their passwords and rights as each server reads them, and where.
 
 A password is random and long, so that the cheapest hash is enough; the router needs it as it is.
 """
@@ -7,14 +7,20 @@ from __future__ import annotations
 
 import base64
 import hashlib
+import os
+import re
 import secrets
+import stat
 from typing import TYPE_CHECKING, Final
 
+from fog_contracts.channels import ROLES
 from fog_runtime.credentials import SERVERS, Server
-from fog_runtime.stores import store_keys
+from fog_runtime.files import atomic_write
+from fog_runtime.stores import store_scripts
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping, Sequence
+    from collections.abc import Collection, Iterable, Mapping, Sequence
+    from pathlib import Path
 
 PASSWORD_BYTES: Final = 24
 _ITERATIONS: Final = 101
@@ -97,8 +103,8 @@ def redis_line(user: str, password: str, site: str) -> str:
     It may read the whole audit trail. Raises `KeyError` for a user that is no service.
     """
     _, service = of_floor(user)
-    audited = (f"audit:{kind}" for kind in store_keys.AUDITED[service])
-    own = [*store_keys.OWN[service], *store_keys.BOOKKEEPING, *audited, f"{service}:*"]
+    audited = (f"audit:{kind}" for kind in store_scripts.AUDITED[service])
+    own = [*store_scripts.OWN[service], *store_scripts.BOOKKEEPING, *audited, f"{service}:*"]
     keys = " ".join([*(f"~fog:{site}:{name}" for name in own), f"%R~fog:{site}:audit:*"])
     return f"user {user} on {_redis_secret(password)} resetchannels -@all {_COMMANDS} {keys}"
 
@@ -123,3 +129,104 @@ transactions for which the user has no right (7.0). Nobody can log in as a user 
 
 def _redis_secret(password: str) -> str:
     return "#" + hashlib.sha256(password.encode()).hexdigest()
+
+
+USERS: Final = "users"
+ANYBODY: Final = "default"
+"""Redis's name for who gives none."""
+_OF_ALL: Final = 0o077
+
+
+class ServerFiles:
+    """The programs' folders below one folder; `mode` are the permissions of files that are new there."""
+
+    def __init__(self, folder: Path, mode: int) -> None:
+        self._folder = folder
+        self._mode = mode
+
+    def folder(self, program: str) -> Path:
+        """Return the folder of a program."""
+        return self._folder / program
+
+    def lines(self, program: str) -> list[str]:
+        """Return a program's list of users, a line for each; that of a new Redis refuses who gives no name."""
+        file = self.folder(program) / USERS
+        if file.exists():
+            return file.read_text("utf-8").splitlines()
+        return [REDIS_NOBODY] if program == "redis" else []
+
+    def members(self, program: str) -> list[str]:
+        """Return whom a program admits."""
+        return [user for line in self.lines(program) if (user := user_of(line)) != ANYBODY]
+
+    def write_lines(self, program: str, lines: Iterable[str]) -> None:
+        """Replace a program's list of users."""
+        self.write(program, USERS, "".join(f"{line}\n" for line in lines))
+
+    def write(self, program: str, name: str, text: str) -> None:
+        """Write a file of a program, for those who could read it before."""
+        file = self.folder(program) / name
+        file.parent.mkdir(mode=0o755 if self._mode & _OF_ALL else 0o700, parents=True, exist_ok=True)
+        # A file stays readable for whom an administrator gave it to: servers mostly run as users of their own.
+        before = file.stat() if file.exists() else None
+        atomic_write(file, text.encode(), mode=self._mode if before is None else stat.S_IMODE(before.st_mode))
+        if before is not None and os.geteuid() == 0:
+            os.chown(file, before.st_uid, before.st_gid)
+
+
+def user_of(line: str) -> str:
+    """Return whose line it is, in any of the lists: `name:…`, or Redis's `user name …`."""
+    return line.split()[1] if line.startswith("user ") else line.partition(":")[0]
+
+
+_DEVICE_TOPIC: Final = re.compile(r"(?!fog/)[\w.-]+/(?:(?:[\w.-]+|\+)/)*(?:[\w.-]+|\+|#)", re.ASCII)
+"""No topic of one level, such as the thesis's, and none of Fognav's own."""
+
+
+class LocksError(ValueError):
+    """Locks can't be made or changed so; the message names the file and the remedy."""
+
+
+class Members:
+    """The users in the servers' files that are no parts of Fognav."""
+
+    def __init__(self, files: ServerFiles, *, unrestricted: Sequence[str], devices: Collection[str]) -> None:
+        """Take the servers' files, the users who may do everything, and the sensors and gateways of others."""
+        self._files = files
+        self._unrestricted = unrestricted
+        self._devices = devices
+
+    def of(self, program: str, floor: str) -> list[str]:
+        """Return the members who use a program, by their names on a floor (empty: the first site)."""
+        members = [user for user in self._files.members(program) if not self.is_reserved(user)]
+        return [name for own, name in map(of_floor, members) if own == floor]
+
+    def is_reserved(self, user: str) -> bool:
+        """Return whether a name belongs to a part of Fognav."""
+        parts = {*ROLES, REDIS_ADMINISTRATOR, HEALTH, ANYBODY}
+        return of_floor(user)[1] in parts or user in self._unrestricted
+
+    def require_free_name(self, user: str) -> None:
+        """Raise `LocksError` if the name belongs to a part of Fognav."""
+        if self.is_reserved(user):
+            raise LocksError(f"{user} is the name of a part of Fognav: give the robot, node or device another id")
+
+    def require_different_ids(self, robots: Sequence[str], nodes: Sequence[str]) -> None:
+        """Raise `LocksError` if one of these robots has the name of a node or device, or the other way round."""
+        known_nodes, known_robots = (set(self._files.members(each)) for each in ("mosquitto", "zenoh"))
+        taken = set(robots) & ({*nodes} | known_nodes) | set(nodes) & (known_robots | {*self._devices})
+        if taken := {user for user in taken if not self.is_reserved(user)}:
+            raise LocksError(
+                f"{', '.join(sorted(taken))}: a robot, a node and a device of one site need different ids, since each "
+                "is a user of its servers: rename one of them"
+            )
+
+
+def require_own_topics(device: str, topics: Sequence[str]) -> None:
+    """Raise `LocksError` if a sensor or gateway of others can't have one of these MQTT topics (with wildcards)."""
+    for topic in topics:
+        if not _DEVICE_TOPIC.fullmatch(topic):
+            raise LocksError(
+                f"{device} can't have the topic {topic!r}: name one of its own with two levels at least, such as "
+                "zigbee2mqtt/#, of letters, digits, '_', '.' and '-', and none below fog/"
+            )

@@ -13,6 +13,7 @@ import asyncio
 from typing import TYPE_CHECKING, Any, Final, NamedTuple
 from urllib.parse import parse_qsl, unquote, urlsplit
 
+from prometheus_client import Gauge
 from redis.asyncio import Redis
 from redis.asyncio.retry import Retry
 from redis.asyncio.sentinel import MasterNotFoundError, Sentinel
@@ -22,9 +23,11 @@ from redis.exceptions import TimeoutError as RedisTimeoutError
 
 from fog_runtime.concurrency import raise_if_cancelled
 from fog_runtime.credentials import NOBODY, Credentials
+from fog_runtime.files import atomic_write
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
+    from collections.abc import Mapping, Sequence
+    from pathlib import Path
 
 Argument = str | bytes | int
 Command = tuple[Argument, ...]
@@ -225,3 +228,100 @@ def _connect(address: RedisAddress, timeout_s: float, credentials: Credentials) 
     once = {**timeouts, **tls, "retry": Retry(NoBackoff(), 0)}
     sentinel = _Sentinels(sentinels, sentinel_kwargs=once, **options)
     return sentinel.master_for(address.sentinel_name), sentinel
+
+
+LOST: Final = Gauge(
+    "fognav_store_lost", "Whether Redis lost acknowledged records (1), so that writes are refused until it is decided"
+)
+_REMEDY: Final = (
+    "writes are refused until an administrator decides: `fognav store restore` (write back what this service has in"
+    " memory) or `fognav store accept` (go on with what Redis has), or POST /api/v1/store/recovery with"
+    ' {"action": "restore"} or {"action": "accept"}; see docs/operations.md'
+)
+
+
+class StoreLostError(StoreRefusedError):
+    """Redis lost acknowledged records; the message says how, and what an administrator can do."""
+
+    def __init__(self, what: str) -> None:
+        super().__init__(f"{what}: {_REMEDY}")
+        self.what = what
+        LOST.set(1)
+
+
+class Expectation(NamedTuple):
+    """What a store must have: its generation, empty if this service used none before, and at least these writes."""
+
+    generation: str
+    writes: Mapping[str, int]
+
+
+class StoreIdentity:
+    """Notices that Redis lost acknowledged records: that it was emptied, replaced, or went back to an older state.
+
+    A site's store has a generation (a random text, written once) and counts the writes of each table. A service
+    remembers both, and in the file `marker`, if there is one, the generation of the store that it used last, so that it
+    notices a loss at its start too.
+
+    `generation` is empty until the store was seen.
+    """
+
+    def __init__(self, marker: Path | None) -> None:
+        self._marker = marker
+        self._acknowledged: dict[str, int] = {}
+        self.generation = ""
+        LOST.set(0)
+
+    def guard(self, table: str) -> dict[str, object]:
+        """Return what must hold for a write to the table, for the scripts."""
+        return {"generation": self.generation, "table": table, "acknowledged": self._acknowledged.get(table, 0)}
+
+    def acknowledge(self, table: str, writes: int) -> None:
+        """Record that Redis acknowledged a write; `writes` is the table's count of them."""
+        self._acknowledged[table] = max(writes, self._acknowledged.get(table, 0))
+
+    def expectation(self) -> Expectation:
+        """Return what the store must have from now on; raises `StoreError` when the marker file can't be read.
+
+        Take it before Redis is asked: a write that is acknowledged while the answer travels is not in that answer.
+        """
+        return Expectation(self.generation or self._remembered(), dict(self._acknowledged))
+
+    def verify(self, expected: Expectation, generation: str, writes: Mapping[str, int]) -> None:
+        """Compare the store (`generation` is empty if it has none) with what was expected of it.
+
+        Raises `StoreLostError`, and `StoreError` when the marker file can't be read or written.
+        """
+        if expected.generation and generation != expected.generation:
+            kind = "was emptied" if not generation else "was replaced by another store"
+            raise StoreLostError(f"Redis {kind}, so acknowledged records are lost")
+        for table, acknowledged in expected.writes.items():
+            if (found := writes.get(table, 0)) < acknowledged:
+                raise StoreLostError(
+                    f"Redis went back to an older state: it has {found} of {acknowledged} writes of {table}"
+                )
+        if generation and not self.generation:
+            self.adopt(generation, writes)
+        LOST.set(0)
+
+    def adopt(self, generation: str, writes: Mapping[str, int]) -> None:
+        """Use this store from now on; raises `StoreError` when the marker file can't be written."""
+        if self._marker is not None and generation != self._remembered():
+            try:
+                atomic_write(self._marker, generation.encode())
+            except OSError as error:
+                raise StoreError(
+                    f"{self._marker} can't be written ({error}): let FOGNAV_DATA_DIR name a folder for it"
+                ) from error
+        self.generation, self._acknowledged = generation, dict(writes)
+        LOST.set(0)
+
+    def _remembered(self) -> str:
+        if self._marker is None:
+            return ""
+        try:
+            return self._marker.read_text("ascii").strip()
+        except FileNotFoundError:
+            return ""
+        except (OSError, UnicodeDecodeError) as error:
+            raise StoreError(f"{self._marker} can't be read ({error}): delete it to accept what Redis has") from error

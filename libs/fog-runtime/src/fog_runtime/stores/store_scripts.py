@@ -1,4 +1,6 @@
-"""The scripts that write to the store. Each is one atomic step of Redis: after a crash all of it is stored, or nothing.
+"""The keys that each service writes in Redis, below `fog:SITE:`, and the scripts that write them.
+
+A service with a new key names it here: Redis refuses it every other one.
 
 Every script begins with the guard: it writes nothing into a store that was emptied, replaced, or went back to an older
 state, nor for a process that another one has replaced: the last key holds the epoch that was granted last, and
@@ -6,7 +8,39 @@ state, nor for a process that another one has replaced: the last key holds the e
 JSON object; it returns an outcome, the number of writes of the table, and details.
 """
 
-from typing import Final
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Final
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping, Sequence
+
+AREAS: Final = "areas"
+HAZARDS: Final = "hazards"
+OVERRIDES: Final = "overrides"
+OVERRIDE_RESTS: Final = "override_rests"
+ALERTS: Final = "alerts"
+HISTORY: Final = "history"
+"""Of each area: `history:AREA`."""
+ZONES: Final = "zones"
+ZONE_TIMES: Final = "zone_times"
+GOALS: Final = "goals"
+
+OWN: Final[Mapping[str, Sequence[str]]] = {
+    "hazard-aggregator": (AREAS, HAZARDS, OVERRIDES, OVERRIDE_RESTS, ALERTS, f"{HISTORY}:*"),
+    "map-service": (ZONES, ZONE_TIMES),
+    "planner": (GOALS,),
+}
+"""The keys of each service's own records, as patterns."""
+AUDITED: Final[Mapping[str, Sequence[str]]] = {
+    "hazard-aggregator": ("alert", "area", "override", "store"),
+    "map-service": ("zone", "store"),
+    "planner": ("mission", "robot", "stop", "store"),
+}
+"""The kinds of records whose audit trail (`audit:KIND`) each service writes."""
+BOOKKEEPING: Final = ("probe", "generation", "writes", "floors", "no-attempt", "idempotency:*")
+"""Keys that every service of a site writes: by which they notice that Redis lost something."""
+
 
 AUDIT_ENTRIES: Final = 100_000
 """Entries of the audit trail that are kept, for each kind of record."""

@@ -32,9 +32,7 @@ from fog_runtime import logs, metrics
 from fog_runtime.clock import Clock
 from fog_runtime.concurrency import Slot
 from fog_runtime.credentials import NOBODY, Credentials
-from fog_runtime.transports.reply_parts import GONE, PART, PART_BYTES, REPLY, LargeReplies
-from fog_runtime.transports.zenoh_presence import ask_who_is_present
-from fog_runtime.transports.zenoh_query import ask
+from fog_runtime.transports.zenoh_query import GONE, PART, PART_BYTES, REPLY, LargeReplies, ask, ask_who_is_present
 
 M = TypeVar("M", bound=Message)
 Ids = dict[str, str]

@@ -1,22 +1,98 @@
-"""Asking on a zenoh session: sends a query and collects its reply, large ones part by part."""
+"""Asking on a zenoh session: queries whose large replies come part by part, and who is present.
+
+A reply that is sent in one piece to a client that has stopped reading fills the router's queues, and holds up what the
+router carries for everybody else. So a large reply is only announced, and fetched in parts of one network packet each:
+a client that stops reading stops asking.
+"""
 
 from __future__ import annotations
 
 import asyncio
+import contextlib
+import secrets
+from collections import OrderedDict
 from dataclasses import dataclass
 from functools import partial
-from typing import TYPE_CHECKING, Final, Protocol
+from typing import TYPE_CHECKING, Final, NamedTuple, Protocol
 
 import msgspec
 import zenoh
 
 from fog_contracts.codec import ContractError
-from fog_runtime.transports.reply_parts import GONE, PART, PARTS_AT_ONCE, REPLY, decode_announcement
 
 if TYPE_CHECKING:
     from collections.abc import Callable
 
     from fog_contracts.channels import Channel
+
+PART_BYTES: Final = 32 * 1024
+"""Replies up to this size are sent at once; the parts of larger ones have this size."""
+PARTS_AT_ONCE: Final = 4
+"""How many parts of a reply are requested at the same time."""
+KEPT_REPLIES: Final = 32
+KEPT_BYTES: Final = 64 * 1024 * 1024
+"""Large replies that a key keeps for those who are still fetching them: the latest used ones, at least one."""
+REPLY: Final = "reply"
+PART: Final = "part"
+"""The parameters of a query for a part: which reply, and the part's number from 0."""
+GONE: Final = b"this reply is not kept any more: ask again"
+
+
+class Announcement(msgspec.Struct, frozen=True):
+    """Sent, as the attachment of an empty reply, in place of a large one: its name and size (bytes)."""
+
+    reply: str
+    size: int
+
+    @property
+    def parts(self) -> int:
+        """How many parts it has."""
+        return -(-self.size // PART_BYTES)
+
+    def encoded(self) -> bytes:
+        """Return the attachment (JSON)."""
+        return msgspec.json.encode(self)
+
+
+def decode_announcement(data: bytes) -> Announcement:
+    """Return an announcement from its attachment; raises `msgspec.DecodeError`."""
+    return msgspec.json.decode(data, type=Announcement)
+
+
+class LargeReplies:
+    """The latest large replies under one key."""
+
+    def __init__(self) -> None:
+        self._id = secrets.token_hex(4)
+        self._kept: OrderedDict[str, bytes] = OrderedDict()
+
+    def announce(self, data: bytes) -> Announcement:
+        """Keep a reply, and return what announces it; the same bytes keep their name."""
+        for name, kept in self._kept.items():
+            if kept is data:
+                self._kept.move_to_end(name)
+                return Announcement(name, len(data))
+        name = self._id + secrets.token_hex(8)
+        self._kept[name] = data
+        while len(self._kept) > KEPT_REPLIES or (
+            len(self._kept) > 1 and sum(map(len, self._kept.values())) > KEPT_BYTES
+        ):
+            self._kept.popitem(last=False)
+        return Announcement(name, len(data))
+
+    def announced(self, reply: str) -> bool:
+        """Whether a reply of this name was announced here, and not by another process under the same key."""
+        return reply.startswith(self._id)
+
+    def part(self, reply: str, number: str) -> bytes | None:
+        """Return a part, or None when the reply is not kept or has no such part."""
+        data = self._kept.get(reply)
+        if data is None or not number.isascii() or not number.isdigit() or len(number) > 9:
+            return None
+        self._kept.move_to_end(reply)
+        begin = int(number) * PART_BYTES
+        return data[begin : begin + PART_BYTES] if begin < len(data) else None
+
 
 PART_TIMEOUT_S: Final = 2.0
 """After this time (real seconds) a part is requested again."""
@@ -148,3 +224,40 @@ class _Query:
         if isinstance(result, Exception):
             raise result
         return result
+
+
+_GRACE_S: Final = 0.5
+"""How much longer than asked for a question may take (real seconds): on a congested link, even asking may block."""
+
+
+class Presence(NamedTuple):
+    """The keys of those who are present; `complete`: the router has answered, and not only this process itself."""
+
+    keys: set[str]
+    complete: bool
+
+
+async def ask_who_is_present(threads: Threads, session: zenoh.Session, keys: str, timeout_s: float) -> Presence:
+    """Return who is present under these keys, as far as routers answer within `timeout_s` (real seconds)."""
+    found: set[str] = set()
+    failures: list[str] = []
+    done = asyncio.Event()
+
+    def on_reply(reply: zenoh.Reply) -> None:
+        # zenoh reports a router that does not answer in time as the error "Timeout".
+        if reply.ok is not None:
+            threads.call(found.add, str(reply.ok.key_expr))
+        else:
+            threads.call(failures.append, "no answer")
+
+    get = partial(
+        session.liveliness().get,
+        keys,
+        zenoh.handlers.Callback(on_reply, lambda: threads.call(done.set)),
+        timeout=timeout_s,
+    )
+    with contextlib.suppress(TimeoutError):
+        async with asyncio.timeout(timeout_s + _GRACE_S):
+            await threads.in_thread(get)
+            await done.wait()
+    return Presence(found, complete=done.is_set() and not failures)

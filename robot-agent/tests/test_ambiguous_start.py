@@ -8,7 +8,7 @@ import pytest
 from little_world import LittleWorld
 
 from fog_contracts.messages import Pose, RobotCommand
-from robot_agent.localization.localizer import SavedPose
+from robot_agent.localization.pose import SavedPose
 
 ALIKE = {"rooms": [(1, 1, 4.5, 4), (6, 1, 9.5, 4)], "size": (11.0, 6.0)}
 # The second room has a niche that is so shallow that one scan does not tell the rooms apart: six more do, and a turn

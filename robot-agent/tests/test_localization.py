@@ -14,8 +14,8 @@ from little_world import L_ROOMS, grid_of
 from fog_kernels.raycast import cast
 from robot_agent.config import LocalizationConfig
 from robot_agent.hardware import LaserScan
-from robot_agent.localization.localizer import Localizer, SavedPose
-from robot_agent.localization.pose import Pose2, wrap
+from robot_agent.localization.localizer import Localizer
+from robot_agent.localization.pose import Pose2, SavedPose, wrap
 
 STATIC, GEOMETRY = grid_of(L_ROOMS, 15.0, 12.0)
 SOLID = (STATIC == 254).astype(np.uint8)

@@ -23,8 +23,7 @@ from fog_runtime.record import Recorder, read_entries
 from robot_agent.agent.core import AgentCore
 from robot_agent.agent.recording import input_log as log
 from robot_agent.agent.recording.replay import ReplayError, main, replay
-from robot_agent.localization.absolute import AbsoluteObservation
-from robot_agent.localization.pose import Pose2
+from robot_agent.localization.pose import AbsoluteObservation, Pose2
 from robot_agent.registry import profile
 
 

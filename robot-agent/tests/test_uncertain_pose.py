@@ -10,8 +10,7 @@ from little_world import LittleWorld
 
 from fog_contracts import channels as ch
 from fog_contracts.messages import PolygonShape, Pose, Zone, ZoneSet
-from robot_agent.localization.absolute import AbsoluteObservation
-from robot_agent.localization.pose import Pose2
+from robot_agent.localization.pose import AbsoluteObservation, Pose2
 
 PLAIN_CORRIDOR = {"rooms": [(1.0, 1.0, 61.0, 3.0)], "size": (62.0, 4.0)}
 TICKS_PER_M = 508.8 / (math.pi * 0.072)

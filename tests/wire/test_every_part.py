@@ -17,7 +17,7 @@ from robot_agent import registry
 from robot_agent.guardian.core import GuardianCore
 from robot_agent.guardian.link import WheelCommand
 from robot_agent.guardian.watchdog import STOPS
-from robot_agent.odometry import Motion, Odometry
+from robot_agent.localization.odometry import Motion, Odometry
 from robot_agent.stop_command import StopCommand
 
 STEP = 0.01

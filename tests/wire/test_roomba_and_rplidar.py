@@ -17,7 +17,7 @@ from robot_agent.bases.roomba600.driver import Roomba600Driver, Roomba600Options
 from robot_agent.bases.roomba600.emulator import SAFE, RoombaEmulator
 from robot_agent.lidars.rplidar_a1 import protocol as rplidar
 from robot_agent.lidars.rplidar_a1.emulator import RplidarEmulator
-from robot_agent.odometry import EncoderFault, Motion, Odometry
+from robot_agent.localization.odometry import EncoderFault, Motion, Odometry
 from robot_agent.serial_port import open_port
 
 

@@ -53,7 +53,7 @@ class WheelOdometry(msgspec.Struct, frozen=True, kw_only=True):
     """Travel of each wheel by its encoder (m, forward positive), from an arbitrary origin.
 
     The counters wrap at the drive train's `travel_wrap_m` and start anywhere when the base restarts: only differences
-    are meaningful, and `robot_agent.odometry` rejects the implausible ones.
+    are meaningful, and `robot_agent.localization.odometry` rejects the implausible ones.
     """
 
     left_m: Finite

@@ -21,7 +21,7 @@ from robot_agent.agent.sensing.obstacle_reporter import ObstacleReporter
 from robot_agent.config import LocalizationConfig
 from robot_agent.localization.localizer import Pose2
 from robot_agent.localization.map_fields import map_fields
-from robot_agent.localization.uncertainty import Uncertainty
+from robot_agent.localization.pose import Uncertainty
 
 RADIUS = 0.17
 BARRIER = (16.0, 1.0, 16.6, 3.4)

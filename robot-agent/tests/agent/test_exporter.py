@@ -9,7 +9,7 @@ from prometheus_client import CollectorRegistry, generate_latest
 
 from fog_contracts.messages import LoopHealth, Power, RobotState
 from robot_agent.agent.edges.exporter import Observed, RobotCollector, parent
-from robot_agent.localization.uncertainty import Uncertainty
+from robot_agent.localization.pose import Uncertainty
 
 
 def write(root, path, text):

@@ -22,7 +22,7 @@ from fog_contracts.messages import (
 from robot_agent.agent.blocked_places import BlockedPlaces
 from robot_agent.agent.sensing.obstacle_reporter import ObstacleReporter, view
 from robot_agent.localization.localizer import Pose2
-from robot_agent.localization.uncertainty import Uncertainty
+from robot_agent.localization.pose import Uncertainty
 
 GEOMETRY = GridGeometry(100, 100, 0.1, 0.0, 0.0)
 HERE = Pose2(5.0, 5.0, 0.0)

@@ -8,7 +8,7 @@ import pytest
 from robot_agent.agent.sensing.pose_keeper import SEARCH_AGAIN_S, PoseKeeper
 from robot_agent.guardian.link import BaseFeedback
 from robot_agent.hardware import BaseStatus, WheelOdometry
-from robot_agent.localization.localizer import SavedPose
+from robot_agent.localization.pose import SavedPose
 
 POSE = SavedPose(site="lab", x=1.0, y=2.0, theta=3.1, sigma_xy=0.1, sigma_theta=0.1)
 

@@ -15,7 +15,7 @@ from robot_agent.bases.diffdrive.protocol import Flag, Status, StatusParser
 from robot_agent.bases.diffdrive.stop import STOP
 from robot_agent.config import StopFieldConfig
 from robot_agent.footprint import Footprint
-from robot_agent.odometry import Motion, Odometry
+from robot_agent.localization.odometry import Motion, Odometry
 from robot_agent.registry import make_base
 from robot_agent.safety.stop_field import StopField
 

@@ -18,7 +18,7 @@ from fog_contracts.grid import Window
 from fog_contracts.messages import PlanReply, Pose, RobotGoal
 from fog_runtime.machine import TERMINAL_STOPS
 from robot_agent.agent.recording.replay import replay
-from robot_agent.localization.localizer import SavedPose
+from robot_agent.localization.pose import SavedPose
 
 pytestmark = [pytest.mark.live, pytest.mark.reaction, pytest.mark.timeout(150)]
 

@@ -12,7 +12,7 @@ from fog_runtime.clock import SystemClock
 from robot_agent.agent.edges.guardian_client import FEEDBACK_TIMEOUT_S, RESET_VALID_S, GuardianClient, connect_early
 from robot_agent.guardian.link import BaseFeedback, WheelCommand, decode_command, encode
 from robot_agent.hardware import BaseStatus, WheelOdometry
-from robot_agent.localization.odometry_buffer import OdometryBuffer
+from robot_agent.localization.odometry import OdometryBuffer
 
 pytestmark = pytest.mark.live
 

@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from robot_agent.config import LocalizationConfig
 from robot_agent.hardware import LaserScan
 from robot_agent.localization.deskew import DeskewedScan, deskew, follows, spread
-from robot_agent.localization.odometry_buffer import OdometryBuffer
+from robot_agent.localization.odometry import OdometryBuffer
 from robot_agent.localization.pose import Pose2
 
 POST = (2.0, 1.0)

@@ -23,7 +23,7 @@ from robot_agent.agent.motion_guard import MotionGuard
 from robot_agent.config import agent_config
 from robot_agent.hardware import DriveTrain, LidarSamples, LidarTraits
 from robot_agent.localization.localizer import Localizer
-from robot_agent.odometry import integrate
+from robot_agent.localization.odometry import integrate
 
 SEEDS = int(os.environ.get("FOGNAV_TEST_STOP_FIELD_SEEDS", "20"))
 AXLE = 0.235

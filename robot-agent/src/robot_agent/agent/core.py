@@ -44,9 +44,10 @@ from robot_agent.agent.sensing.barred_way import WAY_M
 from robot_agent.agent.sensing.obstacle_reporter import ObstacleReporter
 from robot_agent.agent.sensing.pose_keeper import PoseKeeper
 from robot_agent.agent.sensing.sensors import BaseSource, LidarSource
-from robot_agent.localization.localizer import Localizer, SavedPose
+from robot_agent.localization.localizer import Localizer
+from robot_agent.localization.odometry import EncoderFault, Odometry, possible_motion
+from robot_agent.localization.pose import SavedPose
 from robot_agent.motion.local_planner import Decision, Job, decide
-from robot_agent.odometry import EncoderFault, Odometry, possible_motion
 from robot_agent.profiles import fog_only
 
 if TYPE_CHECKING:
@@ -70,7 +71,7 @@ if TYPE_CHECKING:
     from robot_agent.config import AgentConfig
     from robot_agent.guardian.link import BaseFeedback, WheelCommand
     from robot_agent.hardware import LaserScan, LidarSamples
-    from robot_agent.localization.absolute import AbsoluteObservation
+    from robot_agent.localization.pose import AbsoluteObservation
     from robot_agent.profiles import FindProfile, Found, Profile, Search
     from robot_agent.safety.conditions import Request
     from robot_agent.safety.gate import SafetyOutputs

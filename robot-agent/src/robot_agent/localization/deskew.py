@@ -14,7 +14,7 @@ if TYPE_CHECKING:
 
     from robot_agent.config import LocalizationConfig
     from robot_agent.hardware import LaserScan
-    from robot_agent.localization.odometry_buffer import OdometryBuffer
+    from robot_agent.localization.odometry import OdometryBuffer
     from robot_agent.localization.pose import Pose2
 
 _COMPARED: Final = 120

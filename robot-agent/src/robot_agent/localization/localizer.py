@@ -2,9 +2,9 @@
 
 Frames: `odom` is the frame of the wheels' odometry since start, `map` is the site's, `base` the robot's centre. Between
 corrections the pose follows the odometry, so it is smooth and never older than the last feedback.
-Pure: times are arguments, randomness comes from the seed. The parts are modules of their own: `odometry_buffer`,
-`deskew`, `map_fields`, `particle_filter`, `scan_match`, `fit` (how a scan fits the map, and the status), and
-`relocalization` with `global_search`, `hypotheses` and `rivals` for a robot that does not know where it is.
+Pure: times are arguments, randomness comes from the seed. The parts are modules of their own: `odometry`, `deskew`,
+`map_fields`, `particle_filter`, `scan_match`, `fit` (how a scan fits the map, and the status), and `relocalization`
+with `hypotheses` for a robot that does not know where it is.
 """
 
 from __future__ import annotations
@@ -12,14 +12,13 @@ from __future__ import annotations
 import math
 from typing import TYPE_CHECKING, Final
 
-import msgspec
 import numpy as np
 
 from robot_agent.config import LocalizationConfig
 from robot_agent.localization.deskew import DeskewedScan, deskew, follows
-from robot_agent.localization.doubt import Doubt
 from robot_agent.localization.fit import (
     NO_FIT,
+    Doubt,
     FitMonitor,
     confirms,
     differs_by_doors,
@@ -29,10 +28,10 @@ from robot_agent.localization.fit import (
 )
 from robot_agent.localization.hypotheses import Near, apart
 from robot_agent.localization.map_fields import MapFields, map_fields
-from robot_agent.localization.odometry_buffer import OdometryBuffer
+from robot_agent.localization.odometry import OdometryBuffer
 from robot_agent.localization.odometry_scale import OdometryScale
 from robot_agent.localization.particle_filter import ParticleFilter
-from robot_agent.localization.pose import Pose2, wrap
+from robot_agent.localization.pose import Pose2, SavedPose, wrap
 from robot_agent.localization.relocalization import Relocalization
 
 if TYPE_CHECKING:
@@ -41,10 +40,9 @@ if TYPE_CHECKING:
     from fog_contracts.grid import GridGeometry
     from fog_kernels.scans import Track
     from robot_agent.hardware import LaserScan
-    from robot_agent.localization.absolute import AbsoluteObservation
     from robot_agent.localization.hypotheses import Hypothesis
+    from robot_agent.localization.pose import AbsoluteObservation, Uncertainty
     from robot_agent.localization.relocalization import Outcome
-    from robot_agent.localization.uncertainty import Uncertainty
     from robot_agent.safety.conditions import Localization
 
 _FIT_BEAMS: Final = 120
@@ -69,21 +67,6 @@ _SAVED_OR_FOUND: Final = (
 )
 _LOCAL_SCANS: Final = 5
 """After this many scans that do not fit there either, the whole map is searched."""
-
-
-class SavedPose(msgspec.Struct, frozen=True, kw_only=True):
-    """A pose to restore after a restart, in `map` of a site (m, rad), with its standard deviations.
-
-    base: number of the base's feedback then, and its wheels' counters (m, left and right); None: unknown.
-    """
-
-    site: str
-    x: float
-    y: float
-    theta: float
-    sigma_xy: float
-    sigma_theta: float
-    base: tuple[int, float, float] | None = None
 
 
 class Localizer:

@@ -14,9 +14,8 @@ from typing import TYPE_CHECKING, Final
 import numpy as np
 
 from fog_kernels import amcl
-from robot_agent.localization.pose import Pose2, wrap
+from robot_agent.localization.pose import Pose2, Uncertainty, uncertainty, wrap
 from robot_agent.localization.scan_match import match_scan
-from robot_agent.localization.uncertainty import Uncertainty, uncertainty
 from robot_agent.localization.unobserved import ALONG_LEAST_M, Along, least_certain, moved_to, observed, shifts_along
 
 if TYPE_CHECKING:

@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from prometheus_client.core import Metric
 
     from fog_contracts.messages import RobotState
-    from robot_agent.localization.uncertainty import Uncertainty
+    from robot_agent.localization.pose import Uncertainty
 
 _NUMBER: Final = re.compile(r"-?[\d.]+")
 

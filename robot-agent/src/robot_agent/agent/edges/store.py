@@ -9,7 +9,7 @@ import msgspec
 from fog_contracts.messages import MapSnapshot
 from fog_runtime import logs
 from fog_runtime.files import atomic_write
-from robot_agent.localization.localizer import SavedPose
+from robot_agent.localization.pose import SavedPose
 
 if TYPE_CHECKING:
     from pathlib import Path

@@ -13,8 +13,7 @@ from typing import TYPE_CHECKING, Final
 import numpy as np
 
 from fog_contracts.costs import LETHAL
-from robot_agent.localization.absolute import AbsoluteObservation
-from robot_agent.localization.pose import Pose2, wrap
+from robot_agent.localization.pose import AbsoluteObservation, Pose2, wrap
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray

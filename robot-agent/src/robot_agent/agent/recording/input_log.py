@@ -27,9 +27,7 @@ from robot_agent.agent.prepared_map import PreparedMap
 from robot_agent.config import AgentConfig
 from robot_agent.guardian.link import BaseFeedback, WheelCommand
 from robot_agent.hardware import LaserScan, LidarSamples
-from robot_agent.localization.absolute import AbsoluteObservation
-from robot_agent.localization.localizer import SavedPose
-from robot_agent.localization.pose import Pose2
+from robot_agent.localization.pose import AbsoluteObservation, Pose2, SavedPose
 from robot_agent.motion.local_planner import Decision
 from robot_agent.profiles import fog_only
 

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Final
 
 import msgspec
 
-from robot_agent.localization.localizer import SavedPose
+from robot_agent.localization.pose import SavedPose
 
 if TYPE_CHECKING:
     from fog_contracts.messages import Mode

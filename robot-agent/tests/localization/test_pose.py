@@ -7,9 +7,8 @@ import math
 import numpy as np
 import pytest
 
-from robot_agent.localization.absolute import AbsoluteObservation
 from robot_agent.localization.localizer import Localizer
-from robot_agent.localization.pose import Pose2
+from robot_agent.localization.pose import AbsoluteObservation, Pose2
 
 PRIOR = np.diag(np.square((0.4, 0.4, 0.1)))
 TRUE = Pose2(5.0, 2.0, 0.3)

@@ -10,11 +10,11 @@ import pytest
 from little_world import L_ROOMS, grid_of
 
 from robot_agent.config import LocalizationConfig
-from robot_agent.localization import global_search
-from robot_agent.localization.global_search import GlobalSearch
+from robot_agent.localization import relocalization
 from robot_agent.localization.hypotheses import Near
 from robot_agent.localization.map_fields import MapFields, map_fields
 from robot_agent.localization.pose import Pose2, wrap
+from robot_agent.localization.relocalization import GlobalSearch
 
 if TYPE_CHECKING:
     from robot_agent.localization.hypotheses import Hypotheses
@@ -89,7 +89,7 @@ def test_work_is_done_in_shares_and_their_size_does_not_matter(monkeypatch):
     fields = map_fields(*grid_of(L_ROOMS, 15.0, 12.0), CONFIG)
     points = view(fields, Pose2(5.0, 2.0, 1.0))
     whole, few = search(fields, points)
-    monkeypatch.setattr(global_search, "_CHUNK", 1000)
+    monkeypatch.setattr(relocalization, "_CHUNK", 1000)
     parts, many = search(fields, points)
     assert parts.places == whole.places
     assert many > 5 * few

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from fognav_experiments.gaps import door_ajar, drive, series
-from robot_agent.agent.path.recoveries import Recoveries
+from robot_agent.motion.recovery import Recoveries
 
 SEEDS = int(os.environ.get("FOGNAV_GAP_SEEDS", "2"))
 

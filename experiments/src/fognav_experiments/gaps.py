@@ -19,7 +19,6 @@ import numpy as np
 
 from fog_contracts.costs import ROBOT_RADIUS
 from fog_contracts.grid import GridGeometry
-from robot_agent.agent.path.recoveries import Recoveries
 from robot_agent.agent.path.wheel_control import WheelControl
 from robot_agent.config import agent_config
 from robot_agent.footprint import Footprint
@@ -28,8 +27,8 @@ from robot_agent.localization.deskew import DeskewedScan
 from robot_agent.localization.pose import Pose2
 from robot_agent.motion.local_planner import decide, make_job, twist
 from robot_agent.motion.path_follower import PathFollower
-from robot_agent.motion.recent_scans import RecentScans
-from robot_agent.motion.surfaces import smoothed
+from robot_agent.motion.recent_scans import RecentScans, smoothed
+from robot_agent.motion.recovery import Recoveries
 from robot_agent.safety.gate import SafetyOutputs
 from robot_agent.safety.stop_field import StopField
 
@@ -290,7 +289,7 @@ def drive(scene: Scene, rng: np.random.Generator, seconds: float = _TIME_S, *, s
             )  # fmt: skip
             wheels.decision = decision = None if job is None else decide(job)
             if decision is not None:
-                recoveries.on_decision(decision)
+                recoveries.on_decision(decision.blocked)
             if decision is not None and abs(decision.w) > 0.05:
                 reversals += turning * decision.w < 0.0
                 turning = decision.w

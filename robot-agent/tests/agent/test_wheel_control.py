@@ -1,21 +1,76 @@
+"""From decisions to wheel commands, 20 a second: smooth, and fresh or at rest."""
+
 from __future__ import annotations
 
 import math
+from itertools import pairwise
 
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
-from robot_agent.agent.path.wheel_control import WheelControl
+from robot_agent.agent.path.wheel_control import Limits, WheelControl, approach
 from robot_agent.config import agent_config
 from robot_agent.hardware import DriveTrain, LidarTraits
 from robot_agent.motion.local_planner import Decision
 from robot_agent.safety.gate import SafetyOutputs
+
+DT = 0.05
+LIMITS = Limits(acceleration=1.0, jerk=5.0)
+speeds = st.floats(-0.5, 0.5)
+
+
+@given(st.lists(st.tuples(speeds, st.integers(1, 12)), min_size=1, max_size=8))
+def test_growth_is_limited_in_acceleration_and_jerk_and_never_overshoots(wishes):
+    speed = rate = 0.0
+    for wanted, steps in wishes:
+        for _ in range(steps):
+            before, rate_before = speed, rate
+            speed, rate = approach(speed, wanted, rate, DT, LIMITS)
+            change = speed - before
+            assert abs(change) <= LIMITS.acceleration * DT + 1e-12
+            assert min(before, wanted, 0.0) - 1e-12 <= speed <= max(before, wanted, 0.0) + 1e-12
+            if abs(speed) > abs(before):
+                assert abs(change) <= (max(abs(rate_before), 0.0) + LIMITS.jerk * DT) * DT + 1e-12
+
+
+@given(speeds, speeds)
+def test_every_speed_is_reached(begin, wanted):
+    speed, rate = begin, 0.0
+    for _ in range(60):
+        speed, rate = approach(speed, wanted, rate, DT, LIMITS)
+    assert speed == wanted
+
+
+@given(st.floats(0.05, 0.5), st.floats(0.0, 1.0), st.floats(-1.0, 1.0))
+def test_braking_begins_at_once_whatever_the_rate_before(speed, share, rate):
+    slower, _ = approach(speed, share * speed, rate, DT, LIMITS)
+    assert slower == pytest.approx(max(speed - LIMITS.acceleration * DT, share * speed))
+
+
+def test_reversal_passes_through_standstill():
+    assert approach(0.02, -0.3, 0.0, DT, LIMITS) == (0.0, 0.0)
+    speed, rate = approach(0.0, -0.3, 0.0, DT, LIMITS)
+    assert (speed, rate) == (pytest.approx(-LIMITS.jerk * DT**2), pytest.approx(-LIMITS.jerk * DT))
+
+
+def test_start_from_rest_rises_and_levels_off_gently():
+    speed, rate, track = 0.0, 0.0, [0.0]
+    while speed < 0.3:
+        speed, rate = approach(speed, 0.3, rate, DT, LIMITS)
+        track.append(speed)
+        assert len(track) < 16, f"0.3 m/s are not reached: {track}"
+    steps = [after - before for before, after in pairwise(track)]
+    assert steps[0] == pytest.approx(LIMITS.jerk * DT**2)
+    assert max(steps) > 3.0 * steps[0]
+    assert steps[-1] < max(steps)
+
 
 CONFIG = agent_config(
     "r1", b"k" * 32, DriveTrain(axle_m=0.235, wheel_speed_max_m_s=0.5),
     LidarTraits(range_min_m=0.15, range_max_m=12.0, scan_period_s=0.18),
     boot="b1",
 )  # fmt: skip
-DT = 0.05
 
 
 def outputs(stop="none", cap=0.3):

@@ -10,9 +10,19 @@ from open_floor import LONG, PADDING, ROUND, around
 
 from fog_contracts.costs import UNKNOWN
 from robot_agent.localization.pose import Pose2
-from robot_agent.motion.recovery import MOVE_MAX_S, PATIENCE_S, SERIES, Recovery, Situation, step
-from robot_agent.motion.recovery_moves import RecoveryMove, clearances, recovery_speeds
-from robot_agent.motion.trail import LENGTH_M, Trail
+from robot_agent.motion.recovery import (
+    LENGTH_M,
+    MOVE_MAX_S,
+    PATIENCE_S,
+    SERIES,
+    Recovery,
+    RecoveryMove,
+    Situation,
+    Trail,
+    clearances,
+    recovery_speeds,
+    step,
+)
 
 DT = 0.2
 STUCK = Situation(place=(0.0, 0.0), stuck_for=PATIENCE_S, error=0.5, trail=0.5)

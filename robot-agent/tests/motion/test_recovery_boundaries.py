@@ -14,9 +14,16 @@ from fog_contracts.costs import UNKNOWN
 from fog_kernels.robot import cover
 from robot_agent.footprint import Footprint
 from robot_agent.localization.pose import Pose2
-from robot_agent.motion.recovery import Attempt, Recovery, Situation, step
-from robot_agent.motion.recovery_moves import RecoveryMove, clearances, recovery_speeds
-from robot_agent.motion.trail import Trail
+from robot_agent.motion.recovery import (
+    Attempt,
+    Recovery,
+    RecoveryMove,
+    Situation,
+    Trail,
+    clearances,
+    recovery_speeds,
+    step,
+)
 
 HERE = Pose2(1.5, 1.5, 0.0)
 ORIGIN = Pose2(0.0, 0.0, 0.0)

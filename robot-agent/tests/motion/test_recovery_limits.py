@@ -12,13 +12,20 @@ from open_floor import LONG, PADDING, ROUND, around
 
 from fog_contracts.costs import UNKNOWN
 from fog_contracts.grid import GridGeometry
-from robot_agent.agent.path.recoveries import Recoveries
 from robot_agent.localization.pose import Pose2
-from robot_agent.motion.local_planner import Decision, Job, decide
+from robot_agent.motion.local_planner import Job, decide
 from robot_agent.motion.path_follower import PathFollower
-from robot_agent.motion.recovery import Attempt, Recovery, Situation, step
-from robot_agent.motion.recovery_moves import RecoveryMove, clearances, recovery_speeds
-from robot_agent.motion.trail import Trail
+from robot_agent.motion.recovery import (
+    Attempt,
+    Recoveries,
+    Recovery,
+    RecoveryMove,
+    Situation,
+    Trail,
+    clearances,
+    recovery_speeds,
+    step,
+)
 
 HERE = Pose2(1.5, 1.5, 0.0)
 STUCK = Situation(place=(0.0, 0.0), stuck_for=4.0, error=0.5, trail=0.5)
@@ -228,7 +235,7 @@ def test_robot_that_must_drive_slowly_gets_longer(cap, stuck_s, due):
 def test_move_that_finds_no_room_ends_and_a_reset_forgets_the_trail(blocked, goes_on):
     pose = Pose2(1.0, 0.0, 0.0)
     recoveries, follower, _ = recovering(pose, [(0.0, 0.0), (3.0, 0.0)])
-    recoveries.on_decision(Decision(plan_id=1, planner_epoch=1, made_at=4.1, blocked=blocked))
+    recoveries.on_decision(blocked)
     assert (recoveries.due(follower, pose, pose, 0.3, 4.3) is not None) == goes_on
     recoveries.reset()
     assert recoveries.due(follower, pose, pose, 0.3, 30.0) is None

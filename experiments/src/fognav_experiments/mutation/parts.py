@@ -211,28 +211,27 @@ PARTS: Final = (
     ),
     Part(
         "recoveries",
-        ("motion.recovery", "motion.recovery_moves", "motion.trail", "agent.path.recoveries", "agent.power"),
+        ("motion.recovery",),
         (
             "motion/test_recovery.py",
             "motion/test_recovery_boundaries.py",
             "motion/test_recovery_limits.py",
-            "agent/test_power.py",
-            "agent/test_recoveries.py",
+            "motion/test_recoveries.py",
         ),
-        ("numpy", "hypothesis.strategies", "fog_kernels.clearance", "robot_agent.config", "robot_agent.motion.band"),
+        ("numpy", "hypothesis.strategies", "fog_kernels.clearance", "robot_agent.config"),
         (
             Equivalent(
                 "recovery", "since: float = 0.0", "0.0 -> 1.0", "only a move that runs has a begin, and it sets its own"
             ),
             Equivalent(
-                "recoveries",
+                "recovery",
                 "self._refused = False",
                 "False -> True",
                 "only a move that runs can be refused, and the call that begins one forgets what was before",
             ),
             *(
                 Equivalent(
-                    "recovery_moves",
+                    "recovery",
                     "known = _known(around, centre_x[..., None] + rim_x, centre_y[..., None] + rim_y).all(axis=2)",
                     f"centre_{axis}[..., None] + rim_{axis} -> centre_{axis}[..., None] - rim_{axis}",
                     "the points of the rim lie opposite one another",
@@ -240,14 +239,14 @@ PARTS: Final = (
                 for axis in "xy"
             ),
             Equivalent(
-                "recovery_moves",
+                "recovery",
                 "_STEPS: Final = 10",
                 "10 -> 11",
                 "poses of the arc a centimetre apart: one more changes less than the rounding",
             ),
             *(
                 Equivalent(
-                    "recovery_moves",
+                    "recovery",
                     "times = np.linspace(0.0, reach, _STEPS + 1)",
                     change,
                     "poses of the arc about a centimetre apart: one more or less changes less than the rounding",

@@ -6,25 +6,24 @@ import math
 from dataclasses import replace
 from typing import TYPE_CHECKING, Final
 
+import msgspec
 import numpy as np
 
 from robot_agent.agent.path.mission import Mission
-from robot_agent.agent.path.path_monitor import PathMonitor
-from robot_agent.agent.path.path_traces import PathTraces
-from robot_agent.agent.path.progress_monitor import Hindrance, ProgressMonitor
-from robot_agent.agent.path.recoveries import Recoveries
+from robot_agent.agent.path.path_monitor import Hindrance, PathMonitor, ProgressMonitor
 from robot_agent.agent.path.wheel_control import WheelControl
 from robot_agent.motion.local_planner import Decision, make_job, twist
 from robot_agent.motion.recent_scans import RecentScans
+from robot_agent.motion.recovery import Recoveries
 from robot_agent.safety.gate import MANEUVERS
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
+    from collections.abc import Callable, Iterable
 
     from numpy.typing import NDArray
 
     from fog_contracts.handlers import Moment
-    from fog_contracts.messages import RobotGoal, RobotPath, RobotRelease
+    from fog_contracts.messages import RobotGoal, RobotPath, RobotRelease, Trace
     from fog_contracts.replica import Replica
     from robot_agent.agent.motion_guard import MotionGuard
     from robot_agent.config import AgentConfig, MotionConfig
@@ -34,6 +33,39 @@ if TYPE_CHECKING:
     from robot_agent.motion.local_planner import Job
     from robot_agent.safety.gate import SafetyOutputs, SafetyState
     from robot_agent.safety.stop_field import Wheels
+
+_RECENT_MAX: Final = 16
+
+
+class PathTraces:
+    """Traces of the followed path, open until its first wheel command. Stamps are seconds since the epoch.
+
+    `recent`: the last closed traces, for the state message.
+    """
+
+    def __init__(self) -> None:
+        self.recent: list[Trace] = []
+        self._open: list[Trace] = []
+        self._finished: list[Trace] = []
+
+    def begin(self, traces: Iterable[Trace], stamp: float) -> None:
+        """Open the traces of a new path; those of the path before it are dropped."""
+        self._open = [msgspec.structs.replace(trace, path_received=stamp) for trace in traces]
+
+    def close(self, stamp: float) -> None:
+        """Close the open traces: a wheel command follows the new path."""
+        if not self._open:
+            return
+        closed = [msgspec.structs.replace(trace, first_command=stamp) for trace in self._open]
+        self._open = []
+        self._finished.extend(closed)
+        self.recent = [*self.recent, *closed][-_RECENT_MAX:]
+
+    def take_finished(self) -> list[Trace]:
+        """Return the traces that were closed since the last call, each once."""
+        finished, self._finished = self._finished, []
+        return finished
+
 
 _PAUSE_S: Final = 1.0
 """Longer than a robot takes between two looks at its path, whatever it does."""
@@ -187,7 +219,7 @@ class PathDriving:
             return
         self.wheels.decision = decision
         self._arrived = decision.arrived
-        self._recoveries.on_decision(decision)
+        self._recoveries.on_decision(decision.blocked)
         if decision.at_goal:
             self.mission.reach()
             self._stop_following()

@@ -10,7 +10,7 @@ import numpy as np
 
 from fog_kernels.scans import Mounting, Placed, placed
 from fog_kernels.sweep import half_planes
-from robot_agent.motion.surfaces import smoothed
+from robot_agent.motion.recent_scans import smoothed
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray

@@ -3,18 +3,16 @@
 from __future__ import annotations
 
 import math
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
-from robot_agent.agent.path.recoveries import Recoveries
 from robot_agent.localization.pose import Pose2
 from robot_agent.motion.path_follower import PathFollower
+from robot_agent.motion.recovery import Recoveries
 
 FAST = 0.3
-BLOCKED = SimpleNamespace(blocked="no room")
-FREE = SimpleNamespace(blocked=None)
+BLOCKED = "no room"
 
 
 class Stuck:
@@ -78,7 +76,7 @@ def test_time_of_a_move_is_no_time_without_progress():
 def test_move_that_can_not_be_made_is_given_up_and_one_that_can_goes_on():
     stuck = Stuck()
     assert stuck.due(104.0) is not None
-    stuck.recoveries.on_decision(FREE)
+    stuck.recoveries.on_decision(None)
     assert stuck.due(104.2) is not None
     stuck.recoveries.on_decision(BLOCKED)
     assert stuck.due(104.4) is None

@@ -365,6 +365,20 @@ async def test_locks_of_another_authority_are_replaced_by_those_of_the_backup(tm
     assert (folder.locks / "authority.pem").read_bytes() == (original.locks / "authority.pem").read_bytes()
 
 
+async def test_locks_of_another_site_are_never_replaced_by_those_of_a_backup(tmp_path, upstairs):
+    for name, site, directory in (("data", "estig", ESTIG), ("other", "upstairs", upstairs)):
+        folder = NodeFolder(tmp_path / name)
+        hosted_sites([directory], folder.locks, ["localhost", "127.0.0.1"])
+        folder.keys(site)
+        settings.remember(folder.path, settings.settings_of({site: directory}, "127.0.0.1", [], simulate=False))
+    await backups.create(tmp_path / "estig.tar.gz", NodeFolder(tmp_path / "data"), ESTIG)
+    before = (folder.locks / "authority.pem").read_bytes()
+    with pytest.raises(BackupError, match="are the locks of upstairs too, and the backup's are of another authority"):
+        await backups.restore(tmp_path / "estig.tar.gz", folder, tmp_path / "restored", replace=True)
+    assert (folder.locks / "authority.pem").read_bytes() == before
+    assert not (tmp_path / "restored").exists()
+
+
 def hosted(name: str, pid: int, data: Path) -> System:
     return System(name=name, kind="fog node", site="estig", urls={}, pids={"up": pid}, data=str(data))
 

@@ -178,6 +178,14 @@ async def test_backup_never_replaces_a_device(tmp_path, here, redis):
     assert stat.S_ISFIFO(pipe.stat().st_mode)
 
 
+async def test_backup_by_a_link_is_written_where_the_link_leads(tmp_path, here, redis):
+    (tmp_path / "link.tar.gz").symlink_to(tmp_path / "backup.tar.gz")
+    for _ in range(2):
+        await backup.create(tmp_path / "link.tar.gz", here, NOW)
+    assert (tmp_path / "link.tar.gz").is_symlink()
+    assert read_archive(tmp_path / "backup.tar.gz").site == "test"
+
+
 def damaged_in_the_middle(data: bytes) -> bytes:
     return data[: len(data) // 2] + bytes([data[len(data) // 2] ^ 0x55]) + data[len(data) // 2 + 1 :]
 

@@ -11,8 +11,10 @@ from contextlib import asynccontextmanager
 from pathlib import Path
 from typing import Final, NamedTuple
 
+import msgspec
+
 from fog_runtime import backup
-from fog_runtime.backup import Backup, read_archive
+from fog_runtime.backup import Backup, BackupError, read_archive
 from fog_runtime.credentials import Credentials
 from fog_runtime.files import atomic_write
 from fog_runtime.locks.site_locks import AUTHORITY, SiteLocks
@@ -46,6 +48,13 @@ class Restored(NamedTuple):
     backup: Backup
     refused: Sequence[str]
     missing: Sequence[str]
+
+
+class _Sites(msgspec.Struct):
+    """What the description of locks says of their sites."""
+
+    site: str
+    floors: list[str] = []
 
 
 def site_of(folder: NodeFolder, directory: Path | None) -> tuple[str, Path]:
@@ -96,6 +105,8 @@ async def restore(file: Path, folder: NodeFolder, directory: Path, *, replace: b
             for name, content in archive.folders.get(LOCKS, {}).items():
                 atomic_write(folder.locks / name, content.data, mode=content.mode)
         stay = replace and _same_authority(archive, folder.locks)
+        if replace and not stay:
+            _require_same_sites(archive, folder.locks)
         refused = sorted(_users(archive) - SiteLocks.open(folder.locks).users()) if stay else []
         # Another floor's backup has brought one of another moment: it stays, and the next backup writes a new one.
         indexed = not replace and recordings.index_folder(folder.path).exists()
@@ -111,6 +122,19 @@ def _same_authority(archive: Backup, locks: Path) -> bool:
     return (
         file is not None and own.exists() and not _certificates(file.data).isdisjoint(_certificates(own.read_bytes()))
     )
+
+
+def _require_same_sites(archive: Backup, locks: Path) -> None:
+    """Raise `BackupError` if the locks of a backup, of another authority, would lock out a site of these locks."""
+    file = archive.folders.get(LOCKS, {}).get(LOCKS_FILE)
+    if file is None:
+        return
+    theirs = msgspec.json.decode(file.data, type=_Sites)
+    if others := set(SiteLocks.open(locks).sites) - {theirs.site, *theirs.floors}:
+        raise BackupError(
+            f"{locks} are the locks of {', '.join(sorted(others))} too, and the backup's are of another authority, "
+            "which nobody there would trust: nothing was changed. Name another folder with --up"
+        )
 
 
 def _certificates(authority: bytes) -> set[bytes]:

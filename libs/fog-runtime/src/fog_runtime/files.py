@@ -16,8 +16,10 @@ def atomic_write(path: Path, data: bytes, *, mode: int = PRIVATE, owner: int | N
     """Write a file durably; readers, even after a power cut, see either the old content or the new, never a part.
 
     `mode` are the file's permissions, whatever those of an earlier one were; as root one may name an `owner` (uid), who
-    also owns the file's folder if that is created. Raises `OSError`, for what is there and no file (a device), too.
+    also owns the file's folder if that is created. What a symbolic link names is replaced, never the link: /dev/stdout
+    is one. Raises `OSError`, for what is there and no file (a device), too.
     """
+    path = path.resolve() if path.is_symlink() else path
     if path.exists() and not path.is_file():
         raise OSError(errno.EINVAL, "it is no regular file", str(path))
     if not path.parent.is_dir():

@@ -22,7 +22,7 @@ from fog_runtime.configuration.settings import describe, load
 from fog_runtime.process import loading
 from robot_agent import registry
 from robot_agent.agent.edges.guardian_client import connect_early
-from robot_agent.agent.edges.lidar_start import LidarParts, lidar_start
+from robot_agent.agent.edges.lidar_edge import LidarParts, lidar_start
 from robot_agent.agent.settings import Settings, read_given, read_port
 from robot_agent.device_signature import LineCheck
 

@@ -15,9 +15,8 @@ from fog_contracts.costs import DEFAULT_INFLATION, DEGRADED_SPEED, ROBOT_RADIUS,
 from fog_contracts.messages import Pose  # noqa: TC001  # read at run time, when a configuration is decoded
 from fog_contracts.robot import MotionSettings
 from fog_kernels.dwa import DwaLimits, DwaSettings
-from robot_agent.footprint import Footprint
+from robot_agent.footprint import BLIND_SHARE, TRAVEL_HALF_RAD, Footprint
 from robot_agent.hardware import DriveTrain  # noqa: TC001  # read at run time, when a configuration is decoded
-from robot_agent.sight import BLIND_SHARE, TRAVEL_HALF_RAD
 
 if TYPE_CHECKING:
     from fog_contracts.robot import RobotSettings

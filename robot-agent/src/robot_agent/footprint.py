@@ -1,4 +1,7 @@
-"""The robot's footprint: the outline of its body on the floor, a convex polygon in the frame `base`."""
+"""The robot's footprint, a convex polygon in the frame `base`, and in which directions it must see to drive.
+
+Without numpy: the agent looks at its settings before it loads that.
+"""
 
 from __future__ import annotations
 
@@ -10,6 +13,14 @@ from typing import TYPE_CHECKING, Final
 if TYPE_CHECKING:
     import numpy as np
     from numpy.typing import NDArray
+
+SECTORS: Final = 72
+"""Directions of the lidar, each 5 degrees wide, counter-clockwise from straight behind in `base`."""
+TRAVEL_HALF_RAD: Final = 0.70
+"""Directions this near to the heading are those of travel: a body of 0.17 m needs 40 degrees 0.26 m ahead."""
+BLIND_SHARE: Final = 0.5
+"""A robot does not drive where this share of the sectors of travel has no sample."""
+
 
 Vertex = tuple[float, float]
 

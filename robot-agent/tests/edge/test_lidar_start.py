@@ -22,8 +22,7 @@ from fog_runtime.configuration.settings import SettingsError
 from fog_runtime.credentials import CredentialsError
 from fognav_sim.pty_port import PtyPort
 from robot_agent import __main__ as program
-from robot_agent.agent.edges.lidar_edge import LidarEdge
-from robot_agent.agent.edges.lidar_start import LidarStart
+from robot_agent.agent.edges.lidar_edge import LidarEdge, LidarStart
 from robot_agent.bases.roomba600.emulator import RoombaEmulator
 from robot_agent.device_signature import LISTEN_S, LineCheck, SerialSettings
 from robot_agent.lidars.rplidar_a1 import protocol as rplidar

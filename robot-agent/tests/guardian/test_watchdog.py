@@ -19,8 +19,7 @@ from types import SimpleNamespace
 import pytest
 
 from robot_agent.guardian import watchdog
-from robot_agent.port_names import PortNameError
-from robot_agent.serial_port import PortLost
+from robot_agent.serial_port import PortLost, PortNameError
 from robot_agent.stop_command import StopCommand
 
 BASE = StopCommand(stop=b"stop", hold=b"hold", baud=57_600)

@@ -105,7 +105,7 @@ def robot_check(
 
 def check_ports(robot: RobotFile) -> list[str]:
     """Return the settings of ports that are empty; raises `SettingsError` for a port that no process would open."""
-    from robot_agent.port_names import PortNameError, check_port_name  # noqa: PLC0415  # keeps the others fast
+    from robot_agent.serial_port import PortNameError, check_port_name  # noqa: PLC0415  # keeps the others fast
 
     ports = {"base.port": robot.settings.base.port, "lidar.port": robot.settings.lidar.port}
     for name, port in ports.items():
@@ -122,8 +122,12 @@ def contradictions(robot: RobotFile) -> list[str]:
     """Return what a person may not expect of the settings; raises `SettingsError` for those that contradict others."""
     from fog_contracts.costs import ROBOT_RADIUS  # noqa: PLC0415  # keeps the others fast
     from robot_agent import registry  # noqa: PLC0415  # keeps the others fast
-    from robot_agent.agent.settings import read_footprint  # noqa: PLC0415  # keeps the others fast
-    from robot_agent.contradictions import refuse_body, refuse_contradictions, remarks  # noqa: PLC0415  # keeps the others fast
+    from robot_agent.agent.settings import (  # noqa: PLC0415  # keeps the others fast
+        read_footprint,
+        refuse_body,
+        refuse_contradictions,
+        remarks,
+    )
     from robot_agent.footprint import Footprint  # noqa: PLC0415  # keeps the others fast
 
     base, footprint = registry.make_base(robot), read_footprint(robot)

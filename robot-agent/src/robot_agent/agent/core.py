@@ -29,13 +29,11 @@ from fog_contracts.handlers import Fence
 from fog_contracts.messages import LoopHealth
 from fog_contracts.replica import MapError
 from robot_agent.agent.blocked_places import BlockedPlaces
-from robot_agent.agent.fog_inputs import FogInputs
 from robot_agent.agent.maneuvering.maneuvers import Maneuvers
 from robot_agent.agent.motion_guard import MotionGuard
-from robot_agent.agent.navigation import Navigation
+from robot_agent.agent.navigation import Navigation, PreparedMap, prepare_map
 from robot_agent.agent.operator_commands import OperatorCommands, initial_pose_refusal
 from robot_agent.agent.path.path_driving import PathDriving
-from robot_agent.agent.prepared_map import PreparedMap, prepare_map
 from robot_agent.agent.publishing import PublishingPolicy
 from robot_agent.agent.reports import hindrances, robot_pose, robot_state
 from robot_agent.agent.rest_policy import IdleScans, RestPolicy
@@ -100,7 +98,6 @@ class AgentCore:
         self._places = BlockedPlaces()
         self._driving = PathDriving(config)
         self._navigation = Navigation(config, self._map, self._places, self._driving, self._localizer, find_profile)
-        self._fog = FogInputs(self._navigation, self._places, self._driving, self._localizer)
         self._guard = MotionGuard(config, self._localizer)
         self._maneuvers = Maneuvers(config, self._localizer, self._guard)
         self._safety = SafetySupervisor(config.safety)
@@ -122,7 +119,7 @@ class AgentCore:
 
     def handlers(self) -> Mapping[ch.Channel, Handler]:
         """Return the handlers of all subscribed channels; of channels with `{robot}` the robot's own only."""
-        return self._fence.guarded(self._fog.handlers())
+        return self._fence.guarded(self._navigation.handlers())
 
     def query_handlers(self) -> Mapping[ch.Channel, QueryHandler]:
         """Return the handlers of all served queries."""

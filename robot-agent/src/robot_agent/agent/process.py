@@ -23,8 +23,8 @@ from robot_agent.agent.edges.map_loader import MapLoader
 from robot_agent.agent.edges.store import Store
 from robot_agent.agent.recording.input_writer import open_core
 from robot_agent.agent.service import Service
+from robot_agent.agent.settings import remarks
 from robot_agent.config import agent_config
-from robot_agent.contradictions import remarks
 from robot_agent.guardian.protection import run_in_real_time
 from robot_agent.hardware import DockingDriver
 
@@ -32,7 +32,7 @@ if TYPE_CHECKING:
     from fog_runtime.clock import SystemClock
     from fog_runtime.configuration.robot_file import RobotFile
     from robot_agent.agent.edges.guardian_client import EarlyLink
-    from robot_agent.agent.edges.lidar_start import LidarParts
+    from robot_agent.agent.edges.lidar_edge import LidarParts
     from robot_agent.agent.settings import Given, Settings
 
 _log = logs.get("agent")

@@ -8,8 +8,7 @@ from __future__ import annotations
 import sys
 
 from robot_agent.guardian.watchdog import BadSettings, log_event, read_settings, stop_wheels
-from robot_agent.port_names import PortNameError
-from robot_agent.serial_port import PortLost, open_port
+from robot_agent.serial_port import PortLost, PortNameError, open_port
 
 
 def main() -> int:

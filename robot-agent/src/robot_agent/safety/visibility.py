@@ -12,8 +12,8 @@ from typing import TYPE_CHECKING, Final, Literal
 
 import numpy as np
 
+from robot_agent.footprint import SECTORS
 from robot_agent.safety.stop_field import Limited, turn_in_place
-from robot_agent.sight import SECTORS
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray

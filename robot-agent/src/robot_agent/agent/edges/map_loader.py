@@ -26,7 +26,7 @@ if TYPE_CHECKING:
     from fog_runtime.transports.zenoh_edge import ZenohEdge
     from robot_agent.agent.core import AgentCore
     from robot_agent.agent.edges.store import Store
-    from robot_agent.agent.prepared_map import PreparedMap
+    from robot_agent.agent.navigation import PreparedMap
 
 CHECK_S: Final = 0.1
 FIRST_CHECK_S: Final = 0.05

@@ -23,7 +23,7 @@ from fog_contracts.commands import sign
 from fog_contracts.handlers import completed
 from fog_contracts.messages import EgressRequest, LoopHealth, MapSnapshot, Mode, PlanReply, RobotCommand
 from robot_agent.agent.core import AgentCore
-from robot_agent.agent.prepared_map import PreparedMap
+from robot_agent.agent.navigation import PreparedMap
 from robot_agent.config import AgentConfig
 from robot_agent.guardian.link import BaseFeedback, WheelCommand
 from robot_agent.hardware import LaserScan, LidarSamples

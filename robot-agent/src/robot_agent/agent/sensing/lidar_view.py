@@ -8,8 +8,8 @@ import numpy as np
 
 from fog_contracts.costs import LETHAL
 from fog_kernels.raycast import cast
+from robot_agent.footprint import SECTORS
 from robot_agent.safety.visibility import SECTOR_ANGLES, Visibility
-from robot_agent.sight import SECTORS
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray

@@ -11,14 +11,12 @@ import pytest
 from fog_runtime.configuration.robot_file import parse_robot
 from fog_runtime.configuration.settings import SettingsError
 from robot_agent import registry
-from robot_agent.agent.settings import read_footprint
+from robot_agent.agent.settings import read_footprint, refuse_body, refuse_contradictions, remarks
 from robot_agent.config import VisibilityConfig
-from robot_agent.contradictions import refuse_body, refuse_contradictions, remarks
-from robot_agent.footprint import Footprint
+from robot_agent.footprint import SECTORS, Footprint
 from robot_agent.hardware import LidarTraits, Twist
 from robot_agent.lidar_mounting import Mounting
 from robot_agent.safety.visibility import Visibility
-from robot_agent.sight import SECTORS
 
 FILE = """[base]
 driver = "{base}"

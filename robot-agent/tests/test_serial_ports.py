@@ -1,8 +1,10 @@
+"""Which serial ports are accepted: by names that stay with a device, and real ones only on a clock of real time."""
+
 from __future__ import annotations
 
 import pytest
 
-from robot_agent.port_names import PortNameError, check_port_name
+from robot_agent.serial_port import PortNameError, check_port_name, refuse_speed
 
 
 class Machine:
@@ -72,3 +74,16 @@ def test_a_name_by_id_that_two_adapters_share_is_refused_for_their_sockets(machi
         machine.check("/dev/serial/by-id/usb-Silicon_Labs_CP2102_0001")
     machine.check("/dev/serial/by-path/pci-usb-1")
     machine.check("/dev/serial/by-path/pci-usb-2")
+
+
+@pytest.mark.parametrize("speed", [0.1, 0.99, 1.01, 5.0])
+def test_real_base_is_refused_on_a_scaled_clock(speed: float) -> None:
+    refusal = refuse_speed(speed, "/dev/ttyUSB0")
+    assert refusal is not None
+    assert "/dev/ttyUSB0" in refusal
+    assert "FOGNAV_SPEED" in refusal
+
+
+@pytest.mark.parametrize(("speed", "device"), [(1.0, "/dev/ttyUSB0"), (1.0, "/dev/pts/3"), (5.0, "/dev/pts/3")])
+def test_real_time_and_simulated_devices_are_accepted(speed: float, device: str) -> None:
+    assert refuse_speed(speed, device) is None

@@ -30,6 +30,7 @@ def _warm_kernels(monkeypatch: pytest.MonkeyPatch) -> None:
         ["doctor"],
         ["test"],
         ["channels"],
+        ["docs"],
         ["demo"],
         ["site", "new"],
         ["site", "check"],

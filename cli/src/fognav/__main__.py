@@ -19,6 +19,7 @@ from fognav.commands.area import area_app
 from fognav.commands.backup import backup_command, restore_command
 from fognav.commands.ca import ca_app
 from fognav.commands.channels import channels_command
+from fognav.commands.docs import docs_command
 from fognav.commands.map import map_app
 from fognav.commands.node import node_app
 from fognav.commands.robot import robot_app
@@ -89,6 +90,7 @@ for group, name, command, example in (
         restore_command,
         "restore fog.tar.gz --site sites/estig --secrets keys --data /var/lib/fognav",
     ),
+    (installed.DEVELOP, "docs", docs_command, "docs --serve"),
     (installed.DEVELOP, "channels", channels_command, "channels --format acl --broker mqtt"),
 ):
     app.command(name, epilog=f"Example: fognav {example}", rich_help_panel=group)(command)

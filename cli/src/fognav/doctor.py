@@ -4,7 +4,6 @@ import datetime as dt
 import os
 import platform
 import re
-import shutil
 import socket
 import subprocess
 import sys
@@ -75,12 +74,9 @@ def _checkout() -> Path | None:
 
 def check_uv() -> Check:
     """Check for the installer of Python packages, which ./fognav installs by itself."""
-    root = _checkout()
-    own = [root / ".fognav" / folder / "bin" / "uv" for folder in ("uv", "uv-env")] if root else []
-    path = next((candidate for candidate in own if candidate.is_file()), None) or shutil.which("uv")
-    if path is None:
+    if (path := system.find_uv(_checkout())) is None:
         return Check("uv", "optional", "not found", "not needed now: ./fognav installs it when packages change")
-    return Check("uv", "ok", f"{_version(Path(path))} ({path})")
+    return Check("uv", "ok", f"{_version(path)} ({path})")
 
 
 def check_packages() -> Check:

@@ -127,6 +127,13 @@ class AptProvider:
 PROVIDERS: Final[list[Provider]] = [AptProvider()]
 
 
+def find_uv(root: Path | None) -> Path | None:
+    """Return the installer of Python packages: that which ./fognav got into the checkout `root`, or one on the PATH."""
+    own = [root / ".fognav" / folder / "bin" / "uv" for folder in ("uv", "uv-env")] if root else []
+    found = next((str(candidate) for candidate in own if candidate.is_file()), None) or shutil.which("uv")
+    return Path(found) if found else None
+
+
 def find(tool: Tool) -> Path | None:
     """Return the path of the program, from PATH or from the system's folders for servers."""
     return find_program(*tool.executables)

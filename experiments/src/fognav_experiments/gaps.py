@@ -19,7 +19,7 @@ import numpy as np
 
 from fog_contracts.costs import ROBOT_RADIUS
 from fog_contracts.grid import GridGeometry
-from robot_agent.agent.path.wheel_control import WheelControl
+from robot_agent.agent.wheel_control import WheelControl
 from robot_agent.config import agent_config
 from robot_agent.footprint import Footprint
 from robot_agent.hardware import DriveTrain, LidarTraits

@@ -17,7 +17,7 @@ from fog_contracts.handlers import Moment
 from fog_kernels.astar import Planner
 from fog_kernels.inflation import inflate, inflation_table
 from fog_kernels.raycast import cast
-from robot_agent.agent.sensing.obstacle_reporter import ObstacleReporter
+from robot_agent.agent.obstacle_reporter import ObstacleReporter
 from robot_agent.config import LocalizationConfig
 from robot_agent.localization.localizer import Pose2
 from robot_agent.localization.map_fields import map_fields

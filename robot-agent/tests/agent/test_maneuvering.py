@@ -10,11 +10,9 @@ import pytest
 from little_world import AGENT
 
 from fog_contracts.messages import PlanReply, Refusal
-from robot_agent.agent.maneuvering.egress import Egress
-from robot_agent.agent.maneuvering.maneuvers import Maneuvers
-from robot_agent.agent.maneuvering.straight import Straight
-from robot_agent.agent.maneuvering.turning import Turning
-from robot_agent.agent.path.path_driving import PathDriving
+from robot_agent.agent.egress import Egress
+from robot_agent.agent.maneuvers import Maneuvers, Straight, Turning
+from robot_agent.agent.path_driving import PathDriving
 from robot_agent.hardware import BaseStatus
 from robot_agent.localization.pose import Pose2
 from robot_agent.safety.gate import SafetyOutputs, SafetyState

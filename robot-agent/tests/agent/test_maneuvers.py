@@ -9,7 +9,7 @@ import pytest
 from little_world import AGENT
 
 from fog_contracts.messages import PlanReply
-from robot_agent.agent.maneuvering.maneuvers import Maneuvers
+from robot_agent.agent.maneuvers import Maneuvers
 from robot_agent.localization.localizer import Localizer
 from robot_agent.localization.pose import Pose2
 from robot_agent.safety.gate import SafetyOutputs, SafetyState

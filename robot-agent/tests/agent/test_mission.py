@@ -10,7 +10,7 @@ from fog_contracts import channels as ch
 from fog_contracts.bus import roundtrip
 from fog_contracts.geometry import PATH_SPACING_M, sampled
 from fog_contracts.messages import Pose, Refusal, RobotGoal, RobotPath, RobotRelease
-from robot_agent.agent.path.mission import Mission
+from robot_agent.agent.mission import Mission
 
 GOAL = RobotGoal(goal_id="g1", pose=Pose(x=5.0, y=0.0, theta=0.0))
 PATH = RobotPath(

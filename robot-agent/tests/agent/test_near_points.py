@@ -7,7 +7,7 @@ import math
 import numpy as np
 import pytest
 
-from robot_agent.agent.sensing.near_points import NearPoints
+from robot_agent.agent.motion_guard import NearPoints
 from robot_agent.config import LocalizationConfig
 from robot_agent.footprint import Footprint
 from robot_agent.hardware import LidarSamples

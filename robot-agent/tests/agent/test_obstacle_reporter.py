@@ -20,7 +20,7 @@ from fog_contracts.messages import (
     ZoneSet,
 )
 from robot_agent.agent.blocked_places import BlockedPlaces
-from robot_agent.agent.sensing.obstacle_reporter import ObstacleReporter, view
+from robot_agent.agent.obstacle_reporter import ObstacleReporter, view
 from robot_agent.localization.localizer import Pose2
 from robot_agent.localization.pose import Uncertainty
 

@@ -7,8 +7,8 @@ import pytest
 from fog_contracts.grid import GridGeometry, Window
 from fog_contracts.messages import Pose, Refusal, RobotGoal, RobotPath
 from fog_contracts.replica import MasterMap, Replica, Version
-from robot_agent.agent.path.mission import Mission
-from robot_agent.agent.path.path_monitor import BLOCK_NEAR_M, MAP_GRACE_S, PLANNER_GRACE_S, PathMonitor
+from robot_agent.agent.mission import Mission
+from robot_agent.agent.path_monitor import BLOCK_NEAR_M, MAP_GRACE_S, PLANNER_GRACE_S, PathMonitor
 
 GEOMETRY = GridGeometry(200, 20, 0.1, 0.0, 0.0)
 PATH = RobotPath(

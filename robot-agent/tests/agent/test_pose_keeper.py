@@ -5,7 +5,7 @@ import math
 import msgspec
 import pytest
 
-from robot_agent.agent.sensing.pose_keeper import SEARCH_AGAIN_S, PoseKeeper
+from robot_agent.agent.pose_keeper import SEARCH_AGAIN_S, PoseKeeper
 from robot_agent.guardian.link import BaseFeedback
 from robot_agent.hardware import BaseStatus, WheelOdometry
 from robot_agent.localization.pose import SavedPose

@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 
 from fog_contracts.messages import Pose, Refusal, RobotGoal, RobotPath
-from robot_agent.agent.path.mission import Mission
-from robot_agent.agent.path.path_monitor import Hindrance, ProgressMonitor
+from robot_agent.agent.mission import Mission
+from robot_agent.agent.path_monitor import Hindrance, ProgressMonitor
 from robot_agent.config import MotionConfig
 from robot_agent.safety.gate import SafetyOutputs
 

@@ -7,7 +7,7 @@ import pytest
 
 from fog_contracts import channels as ch
 from fog_contracts.messages import RobotObstacles, RobotPose, RobotState, Trace
-from robot_agent.agent.path.path_driving import PathTraces
+from robot_agent.agent.path_driving import PathTraces
 from robot_agent.agent.publishing import STANDING_POSE_S, PublishingPolicy
 
 POSE = RobotPose(x=0.0, y=0.0, theta=0.0, covariance=[0.0] * 9, v=0.0, w=0.0, radius=0.2, height=0.3, stamp=0.0)

@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from robot_agent.agent.path.wheel_control import Limits, WheelControl, approach
+from robot_agent.agent.wheel_control import Limits, WheelControl, approach
 from robot_agent.config import agent_config
 from robot_agent.hardware import DriveTrain, LidarTraits
 from robot_agent.motion.local_planner import Decision

@@ -8,7 +8,7 @@ import pytest
 from msgspec.structs import replace
 
 from fog_contracts.robot import BaseSettings, LidarSettings, MotionSettings, RobotSettings
-from robot_agent.agent.maneuvering.maneuvers import ADVANCE_M, UNDOCK_M
+from robot_agent.agent.maneuvers import ADVANCE_M, UNDOCK_M
 from robot_agent.config import agent_config
 from robot_agent.hardware import DriveTrain, LidarTraits
 from robot_agent.safety.conditions import SafetyInputs

@@ -257,7 +257,7 @@ PARTS: Final = (
     ),
     Part(
         "maneuvers",
-        ("agent.maneuvering",),
+        ("agent.docking", "agent.egress", "agent.maneuvers"),
         ("agent/test_docking.py", "agent/test_maneuvers.py", "agent/test_maneuvering.py"),
         ("numpy", "hypothesis.strategies", "robot_agent.localization.localizer", "robot_agent.config"),
     ),

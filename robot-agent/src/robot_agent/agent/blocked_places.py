@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from fog_contracts.messages import HazardArea, Shape, Zone, ZoneSet
     from fog_contracts.replica import Replica
     from fog_contracts.shapes import Spans
-    from robot_agent.agent.sensing.obstacle_reporter import ObstacleReporter
+    from robot_agent.agent.obstacle_reporter import ObstacleReporter
     from robot_agent.localization.pose import Pose2
 
 

@@ -29,19 +29,17 @@ from fog_contracts.handlers import Fence
 from fog_contracts.messages import LoopHealth
 from fog_contracts.replica import MapError
 from robot_agent.agent.blocked_places import BlockedPlaces
-from robot_agent.agent.maneuvering.maneuvers import Maneuvers
+from robot_agent.agent.maneuvers import Maneuvers
 from robot_agent.agent.motion_guard import MotionGuard
 from robot_agent.agent.navigation import Navigation, PreparedMap, prepare_map
+from robot_agent.agent.obstacle_reporter import WAY_M, ObstacleReporter
 from robot_agent.agent.operator_commands import OperatorCommands, initial_pose_refusal
-from robot_agent.agent.path.path_driving import PathDriving
+from robot_agent.agent.path_driving import PathDriving
+from robot_agent.agent.pose_keeper import PoseKeeper
 from robot_agent.agent.publishing import PublishingPolicy
 from robot_agent.agent.reports import hindrances, robot_pose, robot_state
 from robot_agent.agent.rest_policy import IdleScans, RestPolicy
-from robot_agent.agent.safety_supervisor import SafetySupervisor, safety_inputs
-from robot_agent.agent.sensing.barred_way import WAY_M
-from robot_agent.agent.sensing.obstacle_reporter import ObstacleReporter
-from robot_agent.agent.sensing.pose_keeper import PoseKeeper
-from robot_agent.agent.sensing.sensors import BaseSource, LidarSource
+from robot_agent.agent.safety_supervisor import BaseSource, LidarSource, SafetySupervisor, safety_inputs
 from robot_agent.localization.localizer import Localizer
 from robot_agent.localization.odometry import EncoderFault, Odometry, possible_motion
 from robot_agent.localization.pose import SavedPose

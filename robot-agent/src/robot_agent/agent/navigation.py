@@ -33,8 +33,8 @@ if TYPE_CHECKING:
     from fog_contracts.replica import DecodedMap, Replica, Version
     from fog_contracts.shapes import Spans
     from robot_agent.agent.blocked_places import BlockedPlaces
-    from robot_agent.agent.path.path_driving import PathDriving
-    from robot_agent.agent.sensing.obstacle_reporter import ObstacleReporter
+    from robot_agent.agent.obstacle_reporter import ObstacleReporter
+    from robot_agent.agent.path_driving import PathDriving
     from robot_agent.config import AgentConfig
     from robot_agent.localization.localizer import Localizer
     from robot_agent.localization.map_fields import MapFields

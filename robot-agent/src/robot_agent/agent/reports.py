@@ -16,8 +16,8 @@ if TYPE_CHECKING:
     from fog_contracts.handlers import Moment
     from fog_contracts.messages import ProfileName, Trace
     from fog_contracts.replica import Version
-    from robot_agent.agent.maneuvering.docking import Docking
-    from robot_agent.agent.path.mission import Mission
+    from robot_agent.agent.docking import Docking
+    from robot_agent.agent.mission import Mission
     from robot_agent.config import AgentConfig
     from robot_agent.guardian.link import BaseFeedback
     from robot_agent.localization.hypotheses import Hypothesis

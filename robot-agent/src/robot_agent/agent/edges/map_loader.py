@@ -18,7 +18,7 @@ from fog_contracts.replica import MapError
 from fog_runtime import logs
 from fog_runtime.clock import Ticker
 from fog_runtime.usage import name_thread
-from robot_agent.agent.sensing.pose_keeper import start_pose
+from robot_agent.agent.pose_keeper import start_pose
 
 if TYPE_CHECKING:
     from fog_contracts.site import RobotSite

@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Final, NamedTuple
 import numpy as np
 
 from fog_contracts.costs import INSCRIBED
-from robot_agent.agent.path.mission import PATH_MAX_M
+from robot_agent.agent.mission import PATH_MAX_M
 from robot_agent.motion.path_follower import at_speed, first_blocked
 
 if TYPE_CHECKING:
@@ -24,7 +24,7 @@ if TYPE_CHECKING:
 
     from fog_contracts.messages import RobotPath
     from fog_contracts.replica import Replica, Version
-    from robot_agent.agent.path.mission import Mission, PathId
+    from robot_agent.agent.mission import Mission, PathId
     from robot_agent.motion.path_follower import PathFollower
     from robot_agent.safety.gate import SafetyOutputs
 

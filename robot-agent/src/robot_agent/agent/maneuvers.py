@@ -1,17 +1,17 @@
-"""The robot's maneuvers: what the safety gate must know of the one that runs, and the command that drives it. Pure."""
+"""Straight ahead or back by a short way, measured by the wheels: off the dock, from a bump, or to look around. Pure."""
 
 from __future__ import annotations
 
+import math
 from functools import partial
 from typing import TYPE_CHECKING, Final
 
 import msgspec
 
-from robot_agent.agent.maneuvering.docking import Docking
-from robot_agent.agent.maneuvering.egress import Egress
-from robot_agent.agent.maneuvering.straight import Straight
-from robot_agent.agent.maneuvering.turning import Turning
+from robot_agent.agent.docking import Docking
+from robot_agent.agent.egress import Egress
 from robot_agent.agent.safety_supervisor import ManeuverInputs
+from robot_agent.localization.pose import wrap
 from robot_agent.safety.gate import MANEUVERS
 
 if TYPE_CHECKING:
@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 
     from fog_contracts.replica import Replica
     from robot_agent.agent.motion_guard import MotionGuard
-    from robot_agent.agent.path.path_driving import PathDriving
+    from robot_agent.agent.path_driving import PathDriving
     from robot_agent.config import AgentConfig
     from robot_agent.guardian.link import BaseFeedback, WheelCommand
     from robot_agent.guardian.link import Maneuver as BaseManeuver
@@ -29,6 +29,95 @@ if TYPE_CHECKING:
     from robot_agent.safety.gate import SafetyOutputs, SafetyState
     from robot_agent.safety.maneuver_rules import ManeuverKind
     from robot_agent.safety.stop_field import Wheels
+
+ROLL_MAX_M: Final = 0.05
+"""How far a robot may still roll the other way after it was told to stop: what it needs from 0.3 m/s."""
+
+
+class Straight:
+    """One such movement: how far (m, negative: back) and how fast (m/s)."""
+
+    def __init__(self, distance: float, speed: float) -> None:
+        self._distance = abs(distance)
+        self._sign = math.copysign(1.0, distance)
+        self._speed = speed
+        self._begun_at: Pose2 | None = None
+        self._rolled = 0.0
+
+    def begin(self, odom: Pose2 | None) -> None:
+        """Begin at this pose in `odom`; None: there is no odometry, and no way to measure it."""
+        self._begun_at, self._rolled = odom, 0.0
+
+    def advance(self, odom: Pose2 | None) -> None:
+        """Let the way count from where the robot turns round, if it still rolls the other way when it begins."""
+        if odom is None or self._begun_at is None:
+            return
+        rolled = -self._sign * odom.relative_to(self._begun_at).x
+        if 0.0 < rolled <= ROLL_MAX_M - self._rolled:
+            self._begun_at, self._rolled = odom, self._rolled + rolled
+
+    def remaining(self, odom: Pose2 | None) -> float:
+        """Return the way (m) that is left; infinite if it can't be measured."""
+        if odom is None or self._begun_at is None:
+            return math.inf
+        return self._distance - self._sign * odom.relative_to(self._begun_at).x
+
+    @property
+    def wheels(self) -> Wheels:
+        """The wheel speeds, m/s."""
+        speed = self._sign * self._speed
+        return speed, speed
+
+
+_HEADINGS: Final = (0.7, -0.7, 0.0)
+"""Headings (rad) to turn to, one after another, relative to the first: scans count 0.2 rad apart, and a lidar with a
+mask sees other walls."""
+_REACHED_RAD: Final = 0.04
+_RATE_RAD_S: Final = 0.4
+_SLOWEST_RAD_S: Final = 0.08
+_GAIN_PER_S: Final = 2.0
+
+
+class Turning:
+    """One such movement of a robot whose wheels are so far apart (m), and that may turn so fast (rad/s)."""
+
+    def __init__(self, axle_m: float, rate_max: float) -> None:
+        self._half = 0.5 * axle_m
+        self._rate = min(_RATE_RAD_S, rate_max)
+        self._first: float | None = None
+        self._left: list[float] = []
+
+    def begin(self, odom: Pose2 | None) -> None:
+        """Begin at this pose in `odom`; None: there is no odometry, and no way to measure it."""
+        self._first = None if odom is None else odom.theta
+        self._left = list(_HEADINGS)
+
+    def advance(self, odom: Pose2 | None) -> None:
+        """Go on to the next heading when one is reached."""
+        if self._left and abs(self._error(odom)) <= _REACHED_RAD:
+            self._left.pop(0)
+
+    def remaining(self, odom: Pose2 | None) -> float:
+        """Return by how much (rad) the robot has to turn yet; 0 at the end, infinite if it can't be measured."""
+        if odom is None or self._first is None:
+            return math.inf
+        between = sum(abs(after - before) for before, after in zip(self._left, self._left[1:], strict=False))
+        return between + abs(self._error(odom))
+
+    def wheels(self, odom: Pose2 | None) -> Wheels:
+        """Return the wheel speeds, m/s."""
+        error = self._error(odom)
+        if error == 0.0:
+            return 0.0, 0.0
+        rate = math.copysign(min(self._rate, max(_SLOWEST_RAD_S, _GAIN_PER_S * abs(error))), error)
+        return -rate * self._half, rate * self._half
+
+    def _error(self, odom: Pose2 | None) -> float:
+        """Return the angle (rad) to the present heading; 0 when there is none."""
+        if odom is None or self._first is None or not self._left:
+            return 0.0
+        return wrap(self._first + self._left[0] - odom.theta)
+
 
 UNDOCK_M: Final = 0.3
 """Off the dock the robot has room to turn."""

@@ -1,6 +1,8 @@
 """The way out of a blocked area, on an operator's command: asked of the planner, then driven slowly.
 
 The safety gate decides whether the robot may move (`robot_agent.safety.maneuver`); the stop field guards each command.
+The map's costs must not count there, so the way is followed without regard to them: turn in place towards it, then
+drive along it (pure pursuit).
 """
 
 from __future__ import annotations
@@ -12,9 +14,10 @@ import numpy as np
 
 from fog_contracts.geometry import PATH_SPACING_M, sampled
 from fog_contracts.messages import EgressRequest, Pose
+from robot_agent.hardware import Twist
+from robot_agent.localization.pose import wrap
 from robot_agent.motion.local_planner import turning_at_most, wheels
 from robot_agent.motion.path_follower import PathFollower
-from robot_agent.motion.slow_follower import follow_slowly
 
 if TYPE_CHECKING:
     from fog_contracts.messages import PlanReply
@@ -22,6 +25,24 @@ if TYPE_CHECKING:
     from robot_agent.localization.pose import Pose2
     from robot_agent.safety.gate import SafetyOutputs
     from robot_agent.safety.stop_field import Wheels
+
+_LOOKAHEAD_M: Final = 0.25
+_TURN_FROM_RAD: Final = 0.35
+"""With a larger error of its heading the robot turns in place."""
+_TURN_MAX_RAD_S: Final = 0.8
+_GAIN_PER_S: Final = 2.0
+
+
+def follow_slowly(follower: PathFollower, pose: Pose2, speed: float) -> Twist:
+    """Return the motion (m/s, rad/s) of a robot at `pose` (frame `map`) along the path, at most at `speed` (m/s)."""
+    points, _ = follower.released_ahead(_LOOKAHEAD_M)
+    x, y = points[-1]
+    error = wrap(math.atan2(y - pose.y, x - pose.x) - pose.theta)
+    w = min(max(_GAIN_PER_S * error, -_TURN_MAX_RAD_S), _TURN_MAX_RAD_S)
+    if abs(error) > _TURN_FROM_RAD:
+        return Twist(0.0, w)
+    return Twist(speed * math.cos(error), w)
+
 
 _ASK_AGAIN_S: Final = 1.0
 """Pause before the planner is asked again, after it gave no way out or did not answer."""

@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 
     from fog_contracts.messages import Pose
     from fog_contracts.replica import Replica
-    from robot_agent.agent.path.mission import Mission
+    from robot_agent.agent.mission import Mission
     from robot_agent.config import AgentConfig
     from robot_agent.hardware import BaseStatus
     from robot_agent.localization.localizer import Localizer

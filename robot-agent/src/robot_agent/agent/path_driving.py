@@ -9,9 +9,9 @@ from typing import TYPE_CHECKING, Final
 import msgspec
 import numpy as np
 
-from robot_agent.agent.path.mission import Mission
-from robot_agent.agent.path.path_monitor import Hindrance, PathMonitor, ProgressMonitor
-from robot_agent.agent.path.wheel_control import WheelControl
+from robot_agent.agent.mission import Mission
+from robot_agent.agent.path_monitor import Hindrance, PathMonitor, ProgressMonitor
+from robot_agent.agent.wheel_control import WheelControl
 from robot_agent.motion.local_planner import Decision, make_job, twist
 from robot_agent.motion.recent_scans import RecentScans
 from robot_agent.motion.recovery import Recoveries

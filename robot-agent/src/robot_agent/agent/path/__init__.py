@@ -1,1 +1,0 @@
-"""Driving along the planner's path: mission, progress, recoveries, and the wheel commands. Pure."""

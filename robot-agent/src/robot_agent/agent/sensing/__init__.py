@@ -1,1 +1,0 @@
-"""What the robot itself knows: pose, base and lidar, and obstacles near it. Pure."""

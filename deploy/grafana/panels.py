@@ -164,7 +164,7 @@ ROBOTS: Final = Dashboard(
                 ),
                 Panel(
                     "Reasons of the mode",
-                    "Why a robot is slow or stands; numbers are left out.",
+                    "Why a robot is slow or stands.",
                     ((f"fognav_robot_reason{_R}", "{{robot}} {{reason}}"),),
                     "states",
                     width=24,

@@ -67,7 +67,7 @@ class Drive:
         self.now = self.x = 0.0
         self.mode, self.version = "NORMAL", (1, 1)
         self.claimed_m, self.wrong_m, self.contacts = 0.05, 0.0, 0
-        self.obstacles, self.reasons = [], []
+        self.obstacles, self.codes = [], []
 
     def publish(self, channel, message, **ids):
         self.bus.publish([Publication(channel, message, ids)])
@@ -86,7 +86,7 @@ class Drive:
                 x=self.x + self.wrong_m, y=0.0, theta=0.0, covariance=[variance, 0, 0, 0, variance, 0, 0, 0, 0.01],
                 v=speed, w=0.0, radius=0.17, height=0.3, stamp=stamp)  # fmt: skip
             state = RobotState(
-                mode=self.mode, reasons=self.reasons, enabled=True, battery=None, goal_id=None,
+                mode=self.mode, reasons=[], codes=self.codes, enabled=True, battery=None, goal_id=None,
                 map_epoch=self.version[0], map_seq=self.version[1], plan_id=None, stamp=stamp)  # fmt: skip
             self.oracle.on_robot(
                 [Publication(ch.ROBOT_POSE, pose, R1), Publication(ch.ROBOT_STATE, state, R1)], self.now
@@ -252,7 +252,7 @@ def silent_base(d):
 
 
 def map_called_old(d):
-    d.mode, d.reasons = "HOLD", ["the map is 4.0 s old"]
+    d.mode, d.codes = "HOLD", ["map_old"]
     d.drive(32, speed=0.0)
 
 

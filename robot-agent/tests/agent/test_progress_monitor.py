@@ -6,9 +6,9 @@ import msgspec
 import numpy as np
 import pytest
 
-from fog_contracts.messages import Pose, Refusal, RobotGoal, RobotPath
+from fog_contracts.messages import Pose, Reason, ReasonCode, Refusal, RobotGoal, RobotPath
 from robot_agent.agent.mission import Mission
-from robot_agent.agent.path_monitor import Hindrance, ProgressMonitor
+from robot_agent.agent.path_monitor import ProgressMonitor
 from robot_agent.config import MotionConfig
 from robot_agent.safety.gate import SafetyOutputs
 
@@ -17,9 +17,9 @@ PATH = RobotPath(
     plan_id=1, planner_epoch=3, goal_id="g1", points=[(1.0, 1.0), (5.0, 1.0)], map_epoch=7, map_seq=0,
     released_length=99.0,
 )  # fmt: skip
-FREE = Hindrance(None, unseeing=False)
-NEAR = Hindrance("an obstacle is so near that no arc is free", unseeing=False)
-BLIND = Hindrance("the lidar sees nothing ahead", unseeing=True)
+FREE = None
+NEAR = Reason(ReasonCode.OBSTACLE_NEAR, "an obstacle is so near that no arc is free")
+BLIND = Reason(ReasonCode.LIDAR_BLIND, "the lidar sees nothing ahead")
 SENTENCE = "no progress along the path for 10 s"
 
 

@@ -256,7 +256,7 @@ class Oracle:
             self._allowed_until.append((now + _RAMP_S, _MODE_SPEED[self._mode]))
             self._mode = state.mode
         self._state_at = now
-        self._old_map = any(reason.startswith("the map is") and reason.endswith("old") for reason in state.reasons)
+        self._old_map = not {"map_late", "map_old"}.isdisjoint(state.codes)
         self._version = (state.map_epoch, state.map_seq)
 
     # --- what the fog publishes --------------------------------------------------------------------------------------

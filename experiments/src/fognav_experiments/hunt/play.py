@@ -189,13 +189,13 @@ class _Helper:
         """Give a command, at most one in a while."""
         if run.state is None or run.now < self._next:
             return
-        reasons, pose = " ".join(run.state.reasons), None
-        if "let the robot turn" in reasons:
+        codes, pose = run.state.codes, None
+        if "pose_lost" in codes:
             kind = next(self._asked)
             x, y, theta = run.world.pose
             map_x, map_y = to_map(self._world, x, y)
             pose = Pose(x=map_x, y=map_y, theta=theta) if kind == "initial_pose" else None
-        elif "the robot is in" in reasons and run.state.mode in {"INIT", "PROTECTIVE_STOP"}:
+        elif "in_blocked" in codes and run.state.mode in {"INIT", "PROTECTIVE_STOP"}:
             kind = "egress"
         else:
             return

@@ -9,7 +9,7 @@ import numpy as np
 from fog_contracts import channels as ch
 from fog_contracts.costs import LETHAL
 from fog_contracts.geometry import contains_point
-from fog_contracts.messages import PolygonShape
+from fog_contracts.messages import PolygonShape, Reason, ReasonCode
 from fog_contracts.shapes import shape_contains, shape_spans
 
 if TYPE_CHECKING:
@@ -89,11 +89,12 @@ class BlockedPlaces:
                 return f"the no-go zone {zone.id}" + (f" ({zone.reason})" if zone.reason else "")
         return None
 
-    def caution(self, pose: Pose2) -> str | None:
+    def caution(self, pose: Pose2) -> Reason | None:
         """Return why the robot must drive slowly where it is (m, frame `map`); None when it need not."""
         for hazard in self._hazards.values():
             if hazard.hazard.state == "unknown" and contains_point(hazard.polygon, pose.x, pose.y):
-                return f"the state of the area {hazard.label or hazard.hazard.area} is unknown"
+                sentence = f"the state of the area {hazard.label or hazard.hazard.area} is unknown"
+                return Reason(ReasonCode.AREA_UNKNOWN, sentence)
         return None
 
 

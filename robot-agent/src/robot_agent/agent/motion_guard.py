@@ -26,6 +26,7 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
+    from fog_contracts.messages import Reason
     from fog_contracts.replica import Replica
     from fog_kernels.scans import Track
     from robot_agent.config import AgentConfig, LocalizationConfig, VisibilityConfig
@@ -192,10 +193,8 @@ class MotionGuard:
         reach = self._field.reach + abs(lidar.lidar_x) + abs(lidar.lidar_y)
         reach += config.stop_field.memory * config.drive_train.wheel_speed_max_m_s
         self._points = NearPoints(lidar, reach, config.stop_field.memory, config.footprint)
-        self.reason: str | None = None
+        self.reason: Reason | None = None
         """Why the last command is zero although another one was requested; else None."""
-        self.unseeing = False
-        """Whether that is because the lidar does not see enough, and not because it sees an obstacle."""
 
     def on_samples(self, samples: LidarSamples) -> None:
         """Handle the lidar's newest samples."""
@@ -209,13 +208,12 @@ class MotionGuard:
         """Return the wheel speeds (m/s) that may be commanded at `now` (s, monotonic) instead of these."""
         if wheels == (0.0, 0.0):
             # Nothing to limit; the points wait until they are needed.
-            self.reason, self.unseeing = None, False
+            self.reason = None
             return wheels
         points = self._points.seen_from(self._localizer, now)
         seen = self._field.limit(wheels, points)
         unseen = self._view.visibility.limit(seen.wheels, self._drive.twist(*seen.wheels))
         self.reason = seen.reason or unseen.reason
-        self.unseeing = seen.reason is None and unseen.reason is not None
         if unseen.wheels == seen.wheels:
             return seen.wheels
         # Of an arc, sight may leave only the turn, and a body that is not round needs room for it.

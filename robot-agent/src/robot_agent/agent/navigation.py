@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Final, NamedTuple
 import numpy as np
 
 from fog_contracts import channels as ch
+from fog_contracts.messages import Reason, ReasonCode
 from fog_contracts.replica import decode_map
 from robot_agent.localization.pose import Pose2
 from robot_agent.profiles import FOG, ProfileError
@@ -243,13 +244,13 @@ class Navigation:
                 return name
         return None
 
-    def caution(self, pose: Pose2, now: float) -> str | None:
+    def caution(self, pose: Pose2, now: float) -> Reason | None:
         """Return why the robot must drive slowly where it is; None when it need not."""
         if not self.profile.hazards:
             return None
         silent = now - self._fog_heard_at
         if self.profile.onboard and silent > self._config.safety.map_late:
-            return f"the fog's hazards are {silent:.1f} s old"
+            return Reason(ReasonCode.HAZARDS_OLD, f"the fog's hazards are {silent:.1f} s old")
         return self._places.caution(pose)
 
     # --- profiles ---

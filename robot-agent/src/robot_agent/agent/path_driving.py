@@ -10,7 +10,7 @@ import msgspec
 import numpy as np
 
 from robot_agent.agent.mission import Mission
-from robot_agent.agent.path_monitor import Hindrance, PathMonitor, ProgressMonitor
+from robot_agent.agent.path_monitor import PathMonitor, ProgressMonitor
 from robot_agent.agent.wheel_control import WheelControl
 from robot_agent.motion.local_planner import Decision, make_job, twist
 from robot_agent.motion.recent_scans import RecentScans
@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from fog_contracts.handlers import Moment
-    from fog_contracts.messages import RobotGoal, RobotPath, RobotRelease, Trace
+    from fog_contracts.messages import Reason, RobotGoal, RobotPath, RobotRelease, Trace
     from fog_contracts.replica import Replica
     from robot_agent.agent.motion_guard import MotionGuard
     from robot_agent.config import AgentConfig, MotionConfig
@@ -130,15 +130,14 @@ class PathDriving:
         """Look for blockages along the path; call it whenever the map may have changed."""
         self._monitor.check(self.mission, replica, now)
 
-    def path_problem(self, replica: Replica, guard: MotionGuard, safety: SafetyOutputs, now: float) -> str | None:
+    def path_problem(self, replica: Replica, guard: MotionGuard, safety: SafetyOutputs, now: float) -> Reason | None:
         """Return why the path must not be driven; None when it may. Call it steadily: it measures durations.
 
         `guard` tells what limits the wheels, `safety` what the gate allowed last.
         """
         self._notice_pause(now)
         blocked = self.wheels.decision.blocked if self.wheels.decision else None
-        hindrance = Hindrance(guard.reason or blocked, guard.unseeing)
-        standstill = self._progress.problem(self.mission, hindrance, safety, now, cap=self._cap)
+        standstill = self._progress.problem(self.mission, guard.reason or blocked, safety, now, cap=self._cap)
         return self._monitor.problem(self.mission, replica.version, now) or standstill
 
     def _notice_pause(self, now: float) -> None:

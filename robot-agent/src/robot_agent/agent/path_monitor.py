@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING, Final, NamedTuple
 import numpy as np
 
 from fog_contracts.costs import INSCRIBED
+from fog_contracts.messages import Reason, ReasonCode
 from robot_agent.agent.mission import PATH_MAX_M
 from robot_agent.motion.path_follower import at_speed, first_blocked
 
@@ -43,7 +44,7 @@ class _Blockage(NamedTuple):
     """Where along the path (m from its start) it is blocked, and the reason to report."""
 
     position: float
-    reason: str
+    reason: Reason
 
 
 class _Awaited(NamedTuple):
@@ -87,17 +88,18 @@ class PathMonitor:
         elif self._blocked_since is None:
             self._blocked_since = now
 
-    def problem(self, mission: Mission, version: Version | None, now: float) -> str | None:
+    def problem(self, mission: Mission, version: Version | None, now: float) -> Reason | None:
         """Return why the path must not be driven; None when it may. Call it steadily: it measures durations."""
         path = mission.path
         if path is None or not mission.active:
             return None
         if self._is_of_other_map(path, version, now):
-            return "the path was planned on another map than the robot's"
+            return Reason(ReasonCode.PATH_OF_OTHER_MAP, "the path was planned on another map than the robot's")
         if (unfit := _unfit(path, mission.follower)) is not None:
             return unfit
         if version is not None and self._is_ahead_of_map(path, version, now):
-            return f"the path was planned on version {path.map_seq} of the map; the robot has version {version.seq}"
+            sentence = f"the path was planned on version {path.map_seq} of the map; the robot has version {version.seq}"
+            return Reason(ReasonCode.PATH_NEWER_THAN_MAP, sentence)
         if self._blockage is None or self._blocked_since is None:
             return None
         progress = mission.follower.progress if mission.follower else 0.0
@@ -128,18 +130,16 @@ class PathMonitor:
         return now - self._awaited.since > MAP_GRACE_S
 
 
-def _unfit(path: RobotPath, follower: PathFollower | None) -> str | None:
+def _unfit(path: RobotPath, follower: PathFollower | None) -> Reason | None:
     """Return why a robot where it is can't follow the path, on any map; None when it can."""
     if path.refusal is not None:
-        return f"the planner finds no path: {path.refusal.reason}"
+        return Reason(ReasonCode.PATH_REFUSED, f"the planner finds no path: {path.refusal.reason}")
     if follower is None:
-        return (
-            None
-            if not path.points
-            else f"the path is longer than {PATH_MAX_M:.0f} m: send the robot to a place on its way first"
-        )
+        sentence = f"the path is longer than {PATH_MAX_M:.0f} m: send the robot to a place on its way first"
+        return Reason(ReasonCode.PATH_TOO_LONG, sentence) if path.points else None
     if follower.distance > OFF_PATH_M:
-        return f"the robot is {follower.distance:.1f} m off its path, and waits for one that begins where it is"
+        sentence = f"the robot is {follower.distance:.1f} m off its path, and waits for one that begins where it is"
+        return Reason(ReasonCode.PATH_LEFT, sentence)
     return None
 
 
@@ -158,7 +158,8 @@ def _find_blockage(path: RobotPath, follower: PathFollower, replica: Replica, ve
     column, row = replica.geometry.cell(*follower.points[-1])
     goal_blocked = replica.geometry.contains_cell(column, row) and replica.cost[row, column] >= INSCRIBED
     subject = "the goal is blocked" if goal_blocked else f"the path is blocked {ahead:.1f} m ahead"
-    return _Blockage(follower.progress + ahead, f"{subject} on the newest map; waiting for a new plan")
+    reason = Reason(ReasonCode.PATH_BLOCKED, f"{subject} on the newest map; waiting for a new plan")
+    return _Blockage(follower.progress + ahead, reason)
 
 
 _AHEAD_M: Final = 0.28
@@ -179,18 +180,11 @@ _NOWHERE: Final = np.zeros((0, 2))
 _NEVER: Final = -math.inf
 
 
-class Hindrance(NamedTuple):
-    """What keeps the wheels from turning now: in words, and whether it is the lidar's view and not the place."""
-
-    words: str | None = None
-    unseeing: bool = False
-
-
 class _Standstill(NamedTuple):
     """The path on which the robot got no further, and the reason."""
 
     path_id: PathId | None
-    reason: str
+    reason: Reason
 
 
 class ProgressMonitor:
@@ -203,19 +197,20 @@ class ProgressMonitor:
         self._stuck_after = stuck_after
         self._ahead = radius + _AHEAD_M
         self._standstill: _Standstill | None = None
-        self._hindrance, self._hindered_at = Hindrance(), _NEVER
+        self._hindrance: Reason | None = None
+        self._hindered_at = _NEVER
         self._place, self._reported_until = _NOWHERE, _NEVER
 
     def problem(
-        self, mission: Mission, hindrance: Hindrance, safety: SafetyOutputs, now: float, *, cap: float = math.inf
-    ) -> str | None:
+        self, mission: Mission, hindrance: Reason | None, safety: SafetyOutputs, now: float, *, cap: float = math.inf
+    ) -> Reason | None:
         """Return why the robot must hold until a new plan or goal; None while it gets on. Call it steadily.
 
-        safety: the gate's last outputs. A robot that they stop is not stuck, and one that an operator disables begins
-        anew. cap: the fastest that it may go (m/s).
+        hindrance: what keeps the wheels from turning now. safety: the gate's last outputs. A robot that they stop is
+        not stuck, and one that an operator disables begins anew. cap: the fastest that it may go (m/s).
         """
         self._forget_if_over(mission, safety)
-        if hindrance.words is not None:
+        if hindrance is not None:
             # It comes and goes while the robot looks for a way: the last one counts.
             self._hindrance, self._hindered_at = hindrance, now
         follower = mission.follower
@@ -234,11 +229,11 @@ class ProgressMonitor:
     def _hold(self, path_id: PathId | None, follower: PathFollower, now: float) -> None:
         """Record a standstill with what hindered the robot last, and the place ahead, unless the lidar is the cause."""
         recent = now - self._hindered_at <= follower.stuck_for(now) + _TRIES_S
-        hindrance = self._hindrance if recent else Hindrance()
-        because = f": {hindrance.words}" if hindrance.words else ""
+        hindrance = self._hindrance if recent else None
+        because = f": {hindrance}" if hindrance is not None else ""
         reason = f"no progress along the path for {follower.stuck_for(now):.0f} s{because}"
-        self._standstill = _Standstill(path_id, reason)
-        if not hindrance.unseeing:
+        self._standstill = _Standstill(path_id, Reason(ReasonCode.NO_PROGRESS, reason))
+        if hindrance is None or hindrance.code is not ReasonCode.LIDAR_BLIND:
             self._place, self._reported_until = _bar_across(follower, self._ahead), now + _REPORTED_S
 
     def _forget_if_over(self, mission: Mission, safety: SafetyOutputs) -> None:

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Final
 import msgspec
 import numpy as np
 
-from fog_contracts.messages import LoopHealth, Pose, RobotPose, RobotState
+from fog_contracts.messages import LoopHealth, Pose, Reason, ReasonCode, RobotPose, RobotState
 from robot_agent.agent.power import power_warnings
 
 if TYPE_CHECKING:
@@ -59,7 +59,7 @@ def robot_state(  # noqa: PLR0913  # a message gathers from all parts of the age
     version: Version | None,
     feedback: BaseFeedback | None,
     *,
-    hindrances: list[str],
+    hindrances: list[Reason],
     battery_low: float,
     traces: list[Trace],
     loop: LoopHealth,
@@ -78,12 +78,14 @@ def robot_state(  # noqa: PLR0913  # a message gathers from all parts of the age
     path = mission.path
     warnings = power_warnings(feedback.status if feedback else None, battery_low)
     if docking.ordered:
-        warnings.append("on its way to its dock")
+        warnings.append(Reason(ReasonCode.DOCKING, "on its way to its dock"))
     elif docking.given_up:
-        warnings.append(f"docking given up: {docking.given_up}")
+        warnings.append(Reason(ReasonCode.DOCKING_GIVEN_UP, f"docking given up: {docking.given_up}"))
+    reasons = (*safety.reasons, *hindrances, *warnings)
     return RobotState(
         mode=safety.mode,
-        reasons=[reason[:_REASON_LIMIT] for reason in (*safety.reasons, *hindrances, *warnings)],
+        reasons=[reason[:_REASON_LIMIT] for reason in reasons],
+        codes=[reason.code for reason in reasons],
         enabled=safety.enabled,
         battery=feedback.status.battery if feedback else None,
         goal_id=mission.goal_id,
@@ -108,7 +110,7 @@ def robot_state(  # noqa: PLR0913  # a message gathers from all parts of the age
     )
 
 
-def hindrances(mission: Mission | None, decision: Decision | None, limited: str | None) -> list[str]:
+def hindrances(mission: Mission | None, decision: Decision | None, limited: Reason | None) -> list[Reason]:
     """Return why a robot makes little progress to its goal; `limited`: why it is stopped.
 
     mission: None while the robot must not drive or has no goal: then there is nothing to report.
@@ -119,5 +121,5 @@ def hindrances(mission: Mission | None, decision: Decision | None, limited: str 
     if decision is not None and decision.blocked:
         found.append(decision.blocked)
     if mission.follower is None:
-        found.append("waiting for a path")
+        found.append(Reason(ReasonCode.PATH_AWAITED, "waiting for a path"))
     return found

@@ -12,6 +12,7 @@ from robot_agent.safety.conditions import SafetyInputs
 from robot_agent.safety.gate import SafetyState, step
 
 if TYPE_CHECKING:
+    from fog_contracts.messages import Reason
     from robot_agent.agent.mission import Mission
     from robot_agent.agent.navigation import Navigation
     from robot_agent.config import SafetyConfig
@@ -136,12 +137,12 @@ def safety_inputs(  # noqa: PLR0913  # the gate weighs every source of the agent
     localizer: Localizer,
     mission: Mission,
     *,
-    path_problem: str | None,
+    path_problem: Reason | None,
     inside_blocked: str | None,
     blocked_ahead: str | None,
     near_blocked: str | None,
     maneuver: ManeuverInputs,
-    caution: str | None,
+    caution: Reason | None,
     resting: str | None,
     now: float,
 ) -> SafetyInputs:

@@ -339,5 +339,5 @@ class Service:
     def _report_mode(self, state: RobotState) -> None:
         if state.mode == self._mode:
             return
-        _log.info("mode_changed", mode=state.mode, before=self._mode, reasons=state.reasons)
+        _log.info("mode_changed", mode=state.mode, before=self._mode, codes=state.codes, reasons=state.reasons)
         self._mode = state.mode

@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING, Final, NamedTuple
 import numpy as np
 
 from fog_contracts.costs import NO_SPEED_LIMIT
+from fog_contracts.messages import Reason, ReasonCode
 from fog_kernels.clearance import Clearance, clearance
 from fog_kernels.course import beside, distances
 from fog_kernels.dwa import dwa
@@ -145,7 +146,7 @@ class Decision:
     right: float = 0.0
     arrived: bool = False
     at_goal: bool = False
-    blocked: str | None = None
+    blocked: Reason | None = None
 
 
 def wheels(v: float, w: float, axle: float) -> tuple[float, float]:
@@ -210,7 +211,7 @@ def decide(job: Job) -> Decision:
     at_heading = goal_theta is None or abs(wrap(goal_theta - job.pose.theta)) <= config.arcs.heading_tolerance
     blocked = None
     if chosen.n_admissible == 0 and not arrived:
-        blocked = "an obstacle is so near that no arc is free"
+        blocked = Reason(ReasonCode.OBSTACLE_NEAR, "an obstacle is so near that no arc is free")
     left, right = wheels(chosen.v, chosen.w, limits.axle)
     return Decision(
         plan_id=job.plan_id,
@@ -239,7 +240,7 @@ def _recover(job: Job, move: RecoveryMove, around: Clearance, body: Body) -> Dec
         w=w,
         left=left,
         right=right,
-        blocked=None if chosen else "there is no room to turn or back up",
+        blocked=None if chosen else Reason(ReasonCode.NO_ROOM, "there is no room to turn or back up"),
     )
 
 

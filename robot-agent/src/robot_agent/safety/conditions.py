@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Final, Literal, NamedTuple
 
 import msgspec
 
+from fog_contracts.messages import Reason, ReasonCode
 from robot_agent.hardware import NO_FRESH_COMMAND, ON_CHARGER
 
 if TYPE_CHECKING:
@@ -72,7 +73,7 @@ class SafetyInputs(msgspec.Struct, frozen=True, kw_only=True):
     mission: bool = False
     plan_age: float = 0.0
     released_remaining: float = 0.0
-    path_problem: str | None = None
+    path_problem: Reason | None = None
     inside_blocked: str | None = None
     blocked_ahead: str | None = None
     near_blocked: str | None = None
@@ -81,7 +82,7 @@ class SafetyInputs(msgspec.Struct, frozen=True, kw_only=True):
     maneuver_problem: str | None = None
     dock_problem: str | None = None
     blind_behind: str | None = None
-    caution: str | None = None
+    caution: Reason | None = None
     resting: str | None = None
     late_age: float = math.inf
     late_by: float = 0.0
@@ -97,7 +98,7 @@ class Finding(NamedTuple):
     """
 
     level: Level
-    reason: str
+    reason: Reason
     operator: bool = False
     about_map: bool = False
     late: bool = False
@@ -115,11 +116,12 @@ def _always(_: SafetyInputs) -> bool:
 class Condition(NamedTuple):
     """One row of the table; `holds` gets inputs and limits, `sentence` gets the inputs. The rest as in `Finding`.
 
-    `by_delay`: whether a computer that ran late explains it.
+    `code`: unless the sentence brings its own. `by_delay`: whether a computer that ran late explains it.
 
     An age that is no number fails every comparison with its limit, so it counts as too old.
     """
 
+    code: ReasonCode
     level: Level
     holds: Callable[[SafetyInputs, SafetyConfig], bool]
     sentence: Callable[[SafetyInputs], str]
@@ -156,29 +158,40 @@ def _rests_on_dock(inputs: SafetyInputs) -> bool:
 
 CONDITIONS: Final[tuple[Condition, ...]] = (
     # --- base and guardian ---
-    Condition(Level.FAULT, lambda i, _: i.base_fault is not None, lambda i: f"base: {i.base_fault}"),
-    # The dock itself may press it (ADR 35), and no word but "undock" moves the robot there.
-    Condition(Level.FAULT, lambda i, _: i.bumper and i.docked_for is None, lambda _: "the bumper is pressed"),
-    Condition(Level.FAULT, lambda i, _: i.cliff, lambda _: "a cliff sensor sees no floor"),
-    Condition(Level.FAULT, lambda i, _: i.wheel_drop, lambda _: "a wheel has dropped"),
     Condition(
+        ReasonCode.BASE_FAULT, Level.FAULT, lambda i, _: i.base_fault is not None, lambda i: f"base: {i.base_fault}"
+    ),
+    # The dock itself may press it (ADR 35), and no word but "undock" moves the robot there.
+    Condition(
+        ReasonCode.BUMPER,
+        Level.FAULT,
+        lambda i, _: i.bumper and i.docked_for is None,
+        lambda _: "the bumper is pressed",
+    ),
+    Condition(ReasonCode.CLIFF, Level.FAULT, lambda i, _: i.cliff, lambda _: "a cliff sensor sees no floor"),
+    Condition(ReasonCode.WHEEL_DROP, Level.FAULT, lambda i, _: i.wheel_drop, lambda _: "a wheel has dropped"),
+    Condition(
+        ReasonCode.GUARDIAN_LOST,
         Level.PROTECTIVE_STOP,
         lambda i, _: i.guardian_lost is not None,
         lambda i: f"the guardian is not connected: {i.guardian_lost}",
     ),
     Condition(
+        ReasonCode.GUARDIAN_SILENT,
         Level.PROTECTIVE_STOP,
         lambda i, c: i.guardian_lost is None and not _guardian_heard(i, c),
         lambda i: f"no message from the guardian for {_seconds(i.base_age)}",
         by_delay=_always,
     ),
     Condition(
+        ReasonCode.WHEELS_HELD,
         Level.PROTECTIVE_STOP,
         lambda i, c: _guardian_heard(i, c) and _held(i),
         lambda i: f"the guardian holds the wheels: {i.base_stopped}",
         by_delay=lambda i: i.base_stopped == NO_FRESH_COMMAND,
     ),
     Condition(
+        ReasonCode.ON_DOCK,
         Level.HOLD,
         lambda i, _: _rests_on_dock(i),
         lambda _: "the robot is on its dock: a goal or `fognav robot undock` takes it off",
@@ -186,38 +199,49 @@ CONDITIONS: Final[tuple[Condition, ...]] = (
     ),
     # --- lidar ---
     Condition(
+        ReasonCode.LIDAR_SILENT,
         Level.PROTECTIVE_STOP,
         lambda i, c: i.resting is None and not i.lidar_age <= c.lidar_lost,
         lambda i: f"the lidar has been silent for {_seconds(i.lidar_age)}",
         by_delay=_always,
     ),
     Condition(
+        ReasonCode.SCAN_MISSING,
         Level.PROTECTIVE_STOP,
         lambda i, c: i.resting is None and not i.scan_age <= c.scan_lost,
         lambda i: f"no complete scan of the lidar for {_seconds(i.scan_age)}",
         by_delay=_always,
     ),
     Condition(
+        ReasonCode.LIDAR_REPEATS,
         Level.PROTECTIVE_STOP,
         lambda i, c: i.resting is None and i.identical_scans >= c.identical_scans,
         lambda i: f"the lidar repeats itself: {i.identical_scans - 1} scans in a row equal earlier ones",
     ),
-    Condition(Level.HOLD, lambda i, _: i.resting is not None, lambda i: str(i.resting), rest=True),
+    Condition(ReasonCode.AT_REST, Level.HOLD, lambda i, _: i.resting is not None, lambda i: str(i.resting), rest=True),
     # --- pose ---
     Condition(
+        ReasonCode.POSE_UNKNOWN,
         Level.PROTECTIVE_STOP,
         lambda i, _: i.localization == "none",
         lambda i: f"the pose is not known yet{_detail(i)}",
         operator=True,
     ),
     Condition(
+        ReasonCode.POSE_LOST,
         Level.PROTECTIVE_STOP,
         lambda i, _: i.localization == "lost",
         lambda i: f"the pose is lost{_detail(i)}",
         operator=True,
     ),
-    Condition(Level.DEGRADED, lambda i, _: i.localization == "weak", lambda i: f"the pose is uncertain{_detail(i)}"),
     Condition(
+        ReasonCode.POSE_UNCERTAIN,
+        Level.DEGRADED,
+        lambda i, _: i.localization == "weak",
+        lambda i: f"the pose is uncertain{_detail(i)}",
+    ),
+    Condition(
+        ReasonCode.POSITION_WIDE,
         Level.HOLD,
         lambda i, c: i.localization == "weak" and i.position_sigma > c.position_sigma_max,
         lambda i: (
@@ -226,6 +250,7 @@ CONDITIONS: Final[tuple[Condition, ...]] = (
         ),
     ),
     Condition(
+        ReasonCode.MAY_BE_BLOCKED,
         Level.HOLD,
         lambda i, _: i.mission and i.near_blocked is not None,
         lambda i: (
@@ -234,39 +259,61 @@ CONDITIONS: Final[tuple[Condition, ...]] = (
         ),
     ),
     Condition(
+        ReasonCode.IN_BLOCKED,
         Level.PROTECTIVE_STOP,
         lambda i, _: i.inside_blocked is not None,
         lambda i: f"the robot is in {i.inside_blocked}",
         operator=True,
     ),
     # --- map ---
-    Condition(Level.HOLD, lambda i, _: not i.map_loaded, lambda _: "no map was received yet", about_map=True),
     Condition(
+        ReasonCode.MAP_MISSING,
+        Level.HOLD,
+        lambda i, _: not i.map_loaded,
+        lambda _: "no map was received yet",
+        about_map=True,
+    ),
+    Condition(
+        ReasonCode.MAP_OLD,
         Level.HOLD,
         lambda i, c: i.map_loaded and not i.map_age <= c.map_lost,
         lambda i: f"the map is {_seconds(i.map_age)} old",
         about_map=True,
     ),
     Condition(
+        ReasonCode.MAP_LATE,
         Level.DEGRADED,
         lambda i, c: i.map_loaded and c.map_late < i.map_age <= c.map_lost,
         lambda i: f"the map is {_seconds(i.map_age)} old",
     ),
     Condition(
+        ReasonCode.MAP_GAP,
         Level.HOLD,
         lambda i, c: not i.map_gap <= c.gap_lost,
         lambda i: f"changes of the map have been missing for {_seconds(i.map_gap)}",
         about_map=True,
     ),
     # --- plan ---
-    Condition(Level.DEGRADED, lambda i, _: i.caution is not None, lambda i: str(i.caution)),
-    Condition(Level.HOLD, lambda i, _: i.mission and i.path_problem is not None, lambda i: str(i.path_problem)),
     Condition(
+        ReasonCode.AREA_UNKNOWN,
+        Level.DEGRADED,
+        lambda i, _: i.caution is not None,
+        lambda i: i.caution or "",
+    ),
+    Condition(
+        ReasonCode.PATH_BLOCKED,
+        Level.HOLD,
+        lambda i, _: i.mission and i.path_problem is not None,
+        lambda i: i.path_problem or "",
+    ),
+    Condition(
+        ReasonCode.PLANNER_LATE,
         Level.DEGRADED,
         lambda i, c: _planner_silent(i, c) and i.released_remaining > c.released_end,
         lambda i: f"the planner has been silent for {_seconds(i.plan_age)}",
     ),
     Condition(
+        ReasonCode.PLANNER_LOST,
         Level.HOLD,
         lambda i, c: _planner_silent(i, c) and not i.released_remaining > c.released_end,
         lambda i: f"the planner has been silent for {_seconds(i.plan_age)} and no released path is left",
@@ -283,9 +330,11 @@ def collect_findings(inputs: SafetyInputs, config: SafetyConfig) -> list[Finding
 def _finding(condition: Condition, inputs: SafetyInputs, config: SafetyConfig) -> Finding:
     late = inputs.late_age <= config.late_explains and condition.by_delay(inputs)
     cause = f"; this computer was {inputs.late_by:.1f} s late" if late else ""
+    sentence = condition.sentence(inputs)
+    code = sentence.code if isinstance(sentence, Reason) else condition.code
     return Finding(
         condition.level,
-        condition.sentence(inputs) + cause,
+        Reason(code, sentence + cause),
         condition.operator,
         condition.about_map,
         late,

@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Final, Literal
 import msgspec
 from msgspec.structs import replace
 
-from fog_contracts.messages import Mode
+from fog_contracts.messages import Mode, Reason, ReasonCode
 from robot_agent.config import SafetyConfig
 from robot_agent.safety import maneuver
 from robot_agent.safety.conditions import Finding, Level, SafetyInputs, collect_findings
@@ -37,6 +37,8 @@ STOPPED_MODES: Final[frozenset[Mode]] = frozenset({"INIT", "HOLD", "PROTECTIVE_S
 IMMEDIATE_STOP_MODES: Final[frozenset[Mode]] = frozenset({"INIT", "PROTECTIVE_STOP", "FAULT"})
 MANEUVERS: Final[frozenset[Mode]] = frozenset({"EGRESS", "DOCK"})
 _NEVER: Final = -math.inf
+_PLAN_AWAITED: Final = Reason(ReasonCode.PLAN_AWAITED, "waiting for a plan on the fresh map")
+_NOT_ENABLED: Final = Reason(ReasonCode.NOT_ENABLED, "waiting for an operator to enable")
 
 
 class SafetyState(msgspec.Struct, frozen=True):
@@ -59,7 +61,7 @@ class SafetyState(msgspec.Struct, frozen=True):
     """Whether the last protective stop is one of these, so far."""
     latched: tuple[Finding, ...] = ()
     """Findings that stay until an operator acts: faults until a reset, the others until an enable."""
-    reasons: tuple[str, ...] = ("just started",)
+    reasons: tuple[Reason, ...] = (Reason(ReasonCode.JUST_STARTED, "just started"),)
     last_reasons: tuple[str, ...] = ()
     """Reasons of the last escalation, reported during the 2 s before the mode is relaxed."""
     maneuver: Maneuver | None = None
@@ -75,7 +77,7 @@ class SafetyOutputs:
     """
 
     mode: Mode
-    reasons: tuple[str, ...]
+    reasons: tuple[Reason, ...]
     cap: float
     stop: Literal["none", "ramp", "immediate"]
     changed: bool
@@ -92,7 +94,7 @@ def step(
 ) -> tuple[SafetyState, SafetyOutputs]:
     """Evaluate the inputs at `now` (s, monotonic, never going back); return the new state and the outputs.
 
-    Modes and their conditions: the table of modes in docs/architecture.md, guided by ISO 3691-4 without claiming
+    Modes and their conditions: docs/safety.md, guided by ISO 3691-4 without claiming
     conformity.
     """
     config, before = config or SafetyConfig(), state.mode
@@ -107,7 +109,7 @@ def step(
     if any(finding.about_map for finding in findings):
         map_held_at = now
     elif inputs.mission and now - inputs.plan_age <= map_held_at:
-        findings.append(Finding(Level.HOLD, "waiting for a plan on the fresh map"))
+        findings.append(Finding(Level.HOLD, _PLAN_AWAITED))
 
     demanded = max((finding.level for finding in findings), default=Level.NORMAL)
     last_demanded = tuple(
@@ -291,12 +293,8 @@ def _advance(
     faults = tuple(finding for finding in findings if finding.level == Level.FAULT)
     if not faults and len(stops) >= config.stops_to_fault:
         causes = "; ".join(finding.reason for finding in findings if finding.level == Level.PROTECTIVE_STOP)
-        faults = (
-            Finding(
-                Level.FAULT,
-                f"{len(stops)} protective stops within {config.stops_within:.0f} s, the last because: {causes}",
-            ),
-        )
+        sentence = f"{len(stops)} protective stops within {config.stops_within:.0f} s, the last because: {causes}"
+        faults = (Finding(Level.FAULT, Reason(ReasonCode.STOPS_REPEATED, sentence)),)
     if faults:
         fault_reasons = tuple(finding.reason for finding in faults)
         return replace(
@@ -319,7 +317,7 @@ def _advance(
         held = (
             f"stopped for more than {config.hold_needs_operator_after:.0f} s, an operator must enable again ({causes})"
         )
-        latched = (*latched, Finding(Level.HOLD, held, operator=True))
+        latched = (*latched, Finding(Level.HOLD, Reason(ReasonCode.HELD_TOO_LONG, held), operator=True))
     worst = tuple(finding.reason for finding in findings if finding.level == demanded)
     return replace(
         state,
@@ -349,23 +347,27 @@ def _is_recent(level: Level, last_demanded: float, now: float, config: SafetyCon
     return level == Level.NORMAL or now - last_demanded < config.relax_after
 
 
-def _reasons(state: SafetyState, findings: list[Finding]) -> tuple[str, ...]:
+def _reasons(state: SafetyState, findings: list[Finding]) -> tuple[Reason, ...]:
     """Return why the mode is what it is, the most restrictive reason first."""
     current = [finding.reason for finding in sorted(findings, key=lambda f: f.level, reverse=True)]
     if state.mode == "FAULT":
         latched = [finding.reason for finding in state.latched]
         return (*latched, *(reason for reason in current if reason not in latched))
-    if state.maneuver is not None and state.mode == "INIT":
-        return (*current, f"as soon as its lidar runs: {RULES[state.maneuver.kind].doing}")
-    if state.mode == "INIT":
-        ended = (state.maneuver_end,) if state.maneuver_end else ()
-        return (*current, *ended, "waiting for an operator to enable")
     if state.maneuver is not None:
-        return (*current, RULES[state.maneuver.kind].doing)
-    latched = [f"{f.reason} (an operator must enable again)" for f in state.latched if f.reason not in current]
+        waits = "as soon as its lidar runs: " if state.mode == "INIT" else ""
+        return (*current, Reason(ReasonCode.MANEUVER, waits + RULES[state.maneuver.kind].doing))
+    if state.mode == "INIT":
+        ended = (Reason(ReasonCode.MANEUVER_ENDED, state.maneuver_end),) if state.maneuver_end else ()
+        return (*current, *ended, _NOT_ENABLED)
+    latched = [
+        Reason(f.reason.code, f"{f.reason} (an operator must enable again)")
+        for f in state.latched
+        if f.reason not in current
+    ]
     reasons = (*current, *latched)
     if not reasons and state.mode != "NORMAL":
-        return tuple(f"over, waiting until healthy for 2 s: {reason}" for reason in state.last_reasons)
+        over = "over, waiting until healthy for 2 s"
+        return tuple(Reason(ReasonCode.RECOVERING, f"{over}: {reason}") for reason in state.last_reasons)
     return reasons
 
 

@@ -9,6 +9,7 @@ from __future__ import annotations
 import math
 from typing import TYPE_CHECKING, Final, Literal, NamedTuple
 
+from fog_contracts.messages import Reason, ReasonCode
 from fog_kernels.sweep import first_contact, half_planes
 
 if TYPE_CHECKING:
@@ -31,7 +32,7 @@ class Limited(NamedTuple):
 
     wheels: Wheels
     zone: Zone = "free"
-    reason: str | None = None
+    reason: Reason | None = None
 
 
 _ROUND_M: Final = 0.002
@@ -96,9 +97,8 @@ class StopField:
             return Limited(turning)
         share = self._share(fastest, contact)
         if share * fastest < config.slowest:
-            return Limited(
-                (0.0, 0.0), "stop", f"the lidar sees an obstacle {_side(points[index])}, too near to drive on"
-            )
+            reason = f"the lidar sees an obstacle {_side(points[index])}, too near to drive on"
+            return Limited((0.0, 0.0), "stop", Reason(ReasonCode.OBSTACLE_NEAR, reason))
         return Limited((wheels[0] * share, wheels[1] * share), "slow")
 
     def _braking_time(self, fastest: float) -> float:

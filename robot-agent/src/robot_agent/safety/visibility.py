@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Final, Literal
 
 import numpy as np
 
+from fog_contracts.messages import Reason, ReasonCode
 from robot_agent.footprint import SECTORS
 from robot_agent.safety.stop_field import Limited, turn_in_place
 
@@ -91,7 +92,8 @@ class Visibility:
         self._sight = sight
         if sight == "blind":
             side = "ahead" if twist.v > 0.0 else "behind"
-            return Limited((0.0, 0.0), "stop", f"the lidar sees nothing {side}: it is blind there, or faces glass")
+            reason = f"the lidar sees nothing {side}: it is blind there, or faces glass"
+            return Limited((0.0, 0.0), "stop", Reason(ReasonCode.LIDAR_BLIND, reason))
         if sight == "poor" and abs(twist.v) > self._config.speed:
             share = self._config.speed / abs(twist.v)
             return Limited((wheels[0] * share, wheels[1] * share), "slow")

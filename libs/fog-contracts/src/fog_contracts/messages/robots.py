@@ -1,6 +1,7 @@
 """Missions, paths and refusals of the planner; state, observations and commands of a robot (zenoh, msgpack)."""
 
-from typing import Annotated, Final, Literal
+from enum import StrEnum
+from typing import Annotated, Final, Literal, Self
 
 from msgspec import Meta
 from msgspec.structs import replace
@@ -197,6 +198,83 @@ ProfileName = Literal["default", "full", "fog"]
 """How a robot navigates: on its own; on its own with the fog's hazards; or by the fog's map and paths."""
 
 
+class ReasonCode(StrEnum):
+    """What is the matter with a robot, for logs, metrics, tests and programs; the sentence beside it is for people."""
+
+    # base and guardian
+    BASE_FAULT = "base_fault"
+    BUMPER = "bumper"
+    CLIFF = "cliff"
+    WHEEL_DROP = "wheel_drop"
+    GUARDIAN_LOST = "guardian_lost"
+    GUARDIAN_SILENT = "guardian_silent"
+    WHEELS_HELD = "wheels_held"
+    ON_DOCK = "on_dock"
+    BATTERY_LOW = "battery_low"
+    CHARGER_FAULT = "charger_fault"
+    # lidar
+    LIDAR_SILENT = "lidar_silent"
+    SCAN_MISSING = "scan_missing"
+    LIDAR_REPEATS = "lidar_repeats"
+    AT_REST = "at_rest"
+    LIDAR_BLIND = "lidar_blind"
+    OBSTACLE_NEAR = "obstacle_near"
+    # pose
+    POSE_UNKNOWN = "pose_unknown"
+    POSE_LOST = "pose_lost"
+    POSE_UNCERTAIN = "pose_uncertain"
+    POSITION_WIDE = "position_wide"
+    MAY_BE_BLOCKED = "may_be_blocked"
+    IN_BLOCKED = "in_blocked"
+    # map
+    MAP_MISSING = "map_missing"
+    MAP_LATE = "map_late"
+    MAP_OLD = "map_old"
+    MAP_GAP = "map_gap"
+    HAZARDS_OLD = "hazards_old"
+    AREA_UNKNOWN = "area_unknown"
+    # plan and path
+    PLANNER_LATE = "planner_late"
+    PLANNER_LOST = "planner_lost"
+    PLAN_AWAITED = "plan_awaited"
+    PATH_AWAITED = "path_awaited"
+    PATH_OF_OTHER_MAP = "path_of_other_map"
+    PATH_NEWER_THAN_MAP = "path_newer_than_map"
+    PATH_REFUSED = "path_refused"
+    PATH_TOO_LONG = "path_too_long"
+    PATH_LEFT = "path_left"
+    PATH_BLOCKED = "path_blocked"
+    NO_PROGRESS = "no_progress"
+    NO_ROOM = "no_room"
+    # the gate's own
+    JUST_STARTED = "just_started"
+    NOT_ENABLED = "not_enabled"
+    RECOVERING = "recovering"
+    HELD_TOO_LONG = "held_too_long"
+    STOPS_REPEATED = "stops_repeated"
+    MANEUVER = "maneuver"
+    MANEUVER_ENDED = "maneuver_ended"
+    DOCKING = "docking"
+    DOCKING_GIVEN_UP = "docking_given_up"
+
+
+class Reason(str):
+    """A sentence for people with its identifier for programs; codecs know neither: send both."""
+
+    __slots__ = ("code",)
+    code: ReasonCode
+
+    def __new__(cls, code: ReasonCode, sentence: str) -> Self:
+        """Return a sentence with its identifier."""
+        reason = super().__new__(cls, sentence)
+        reason.code = code
+        return reason
+
+    def __reduce__(self) -> tuple[type[Self], tuple[ReasonCode, str]]:
+        """Return what a copy is made from."""
+        return type(self), (self.code, str(self))
+
+
 class RobotState(Message, frozen=True, kw_only=True):
     """A robot's mode with its reasons, the map version and plan that it follows, and the epochs that it received.
 
@@ -205,6 +283,7 @@ class RobotState(Message, frozen=True, kw_only=True):
     `metrics` is the address (host:port) at which Prometheus reaches the robot's metrics; empty if it can't.
     `docked`: it stands on its dock. `wants_dock`: it asks the planner for the goal in front of its dock.
     `places`: where on the map it may be, most likely first, while its scans do not decide; empty otherwise.
+    `codes` identifies each of the `reasons`, in their order (`ReasonCode`); a newer robot may have others.
     """
 
     mode: Mode
@@ -231,6 +310,7 @@ class RobotState(Message, frozen=True, kw_only=True):
     docked: bool = False
     wants_dock: bool = False
     places: Annotated[list[Pose], Meta(max_length=8)] = []
+    codes: list[Annotated[str, Meta(max_length=32)]] = []
 
 
 VIEW_SECTORS: Final = 180

@@ -5,8 +5,7 @@ What does not exist is missing: a base without a battery sensor, a computer with
 
 from __future__ import annotations
 
-import re
-from typing import TYPE_CHECKING, Final, NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 from prometheus_client.core import CounterMetricFamily, GaugeMetricFamily
 from prometheus_client.registry import Collector
@@ -22,8 +21,6 @@ if TYPE_CHECKING:
 
     from fog_contracts.messages import RobotState
     from robot_agent.localization.pose import Uncertainty
-
-_NUMBER: Final = re.compile(r"-?[\d.]+")
 
 
 class Observed(NamedTuple):
@@ -117,8 +114,7 @@ def _agent(observed: Observed) -> list[Metric]:
     return [
         _by_label("fognav_robot_mode", "1 for the mode that the robot is in", "mode", {state.mode: 1}),
         _by_label(
-            "fognav_robot_reason", "1 for each reason of the mode, without its numbers", "reason",
-            dict.fromkeys((_NUMBER.sub("#", reason) for reason in state.reasons), 1),
+            "fognav_robot_reason", "1 for each reason of the mode", "reason", dict.fromkeys(state.codes, 1)
         ),
         _by_label("fognav_robot_map_version", "Version of the robot's map", "part", version),
         _single("fognav_robot_map_age_seconds", "Time since the robot's map was last confirmed", observed.map_age),

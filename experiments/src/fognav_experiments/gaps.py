@@ -23,8 +23,8 @@ from robot_agent.agent.wheel_control import WheelControl
 from robot_agent.config import agent_config
 from robot_agent.footprint import Footprint
 from robot_agent.hardware import DriveTrain, LidarTraits
-from robot_agent.localization.deskew import DeskewedScan
 from robot_agent.localization.pose import Pose2
+from robot_agent.localization.scans import DeskewedScan
 from robot_agent.motion.local_planner import decide, make_job, twist
 from robot_agent.motion.path_follower import PathFollower
 from robot_agent.motion.recent_scans import RecentScans, smoothed

@@ -16,8 +16,8 @@ from robot_agent.config import LocalizationConfig
 from robot_agent.hardware import LaserScan, LidarSamples
 from robot_agent.lidar_mounting import MountedLidar, Mounting
 from robot_agent.lidars.rplidar_a1.emulator import RplidarEmulator
-from robot_agent.localization.deskew import deskew
 from robot_agent.localization.odometry import OdometryBuffer
+from robot_agent.localization.scans import deskew
 from robot_agent.registry import make_lidar
 
 ANGLES = np.linspace(-math.pi + 0.001, math.pi, 360)

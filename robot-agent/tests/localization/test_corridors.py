@@ -15,10 +15,10 @@ from hypothesis import strategies as st
 from little_world import grid_of
 
 from robot_agent.config import LocalizationConfig
-from robot_agent.localization.deskew import DeskewedScan
 from robot_agent.localization.map_fields import map_fields
 from robot_agent.localization.particle_filter import ParticleFilter
 from robot_agent.localization.pose import Pose2
+from robot_agent.localization.scans import DeskewedScan
 from robot_agent.localization.unobserved import Along, least_certain, moved_to, observed, shifts_along
 
 LENGTHS = [float(length) for length in os.environ.get("FOGNAV_CORRIDORS", "30,70").split(",")]

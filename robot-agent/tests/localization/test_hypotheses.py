@@ -10,11 +10,11 @@ import pytest
 from little_world import grid_of
 
 from robot_agent.config import LocalizationConfig
-from robot_agent.localization.deskew import DeskewedScan
 from robot_agent.localization.hypotheses import Hypotheses, Hypothesis, Near, weighed
 from robot_agent.localization.map_fields import map_fields
 from robot_agent.localization.pose import Pose2
 from robot_agent.localization.relocalization import Relocalization
+from robot_agent.localization.scans import DeskewedScan
 
 CONFIG = LocalizationConfig()
 # Two equal rooms; only one of them has a niche behind its corner, which is seen from its upper half.

@@ -9,10 +9,10 @@ import pytest
 from little_world import L_ROOMS, grid_of
 
 from robot_agent.config import LocalizationConfig
-from robot_agent.localization.deskew import DeskewedScan
 from robot_agent.localization.map_fields import map_fields
 from robot_agent.localization.particle_filter import ParticleFilter
 from robot_agent.localization.pose import Pose2
+from robot_agent.localization.scans import DeskewedScan
 
 CONFIG = LocalizationConfig()
 FIELDS = map_fields(*grid_of(L_ROOMS, 15.0, 12.0), CONFIG)

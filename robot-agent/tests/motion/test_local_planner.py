@@ -21,8 +21,8 @@ from fog_kernels.dwa import DwaLimits, DwaSettings
 from fog_kernels.robot import cover
 from robot_agent.config import MotionConfig
 from robot_agent.footprint import Footprint
-from robot_agent.localization.deskew import DeskewedScan
 from robot_agent.localization.pose import Pose2
+from robot_agent.localization.scans import DeskewedScan
 from robot_agent.motion.detour import detour
 from robot_agent.motion.local_planner import course, decide, give_way, make_job, twist, wheels
 from robot_agent.motion.path_follower import PathFollower, first_blocked

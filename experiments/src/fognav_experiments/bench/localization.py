@@ -12,11 +12,10 @@ from numba import njit
 
 from fog_kernels import amcl
 from robot_agent.config import LocalizationConfig
-from robot_agent.localization.deskew import DeskewedScan
 from robot_agent.localization.map_fields import MapFields, map_fields
 from robot_agent.localization.pose import Pose2
 from robot_agent.localization.relocalization import Relocalization
-from robot_agent.localization.scan_match import match_scan
+from robot_agent.localization.scans import DeskewedScan, match_scan
 
 if TYPE_CHECKING:
     from collections.abc import Callable

@@ -17,13 +17,13 @@ import numpy as np
 
 from robot_agent.localization.fit import Fit, confirms, evaluate_fit
 from robot_agent.localization.pose import Pose2, wrap
-from robot_agent.localization.scan_match import match_scan
+from robot_agent.localization.scans import match_scan
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Sequence
 
-    from robot_agent.localization.deskew import DeskewedScan
     from robot_agent.localization.map_fields import MapFields
+    from robot_agent.localization.scans import DeskewedScan
 
 _AMBIGUOUS: Final = 0.85
 """A second place that explains the scans this well, as a share of the best, leaves the search ambiguous."""

@@ -2,9 +2,10 @@
 
 Frames: `odom` is the frame of the wheels' odometry since start, `map` is the site's, `base` the robot's centre. Between
 corrections the pose follows the odometry, so it is smooth and never older than the last feedback.
-Pure: times are arguments, randomness comes from the seed. The parts are modules of their own: `odometry`, `deskew`,
-`map_fields`, `particle_filter`, `scan_match`, `fit` (how a scan fits the map, and the status), and `relocalization`
-with `hypotheses` for a robot that does not know where it is.
+Pure: times are arguments, randomness comes from the seed. The parts are modules of their own: `odometry`, `scans`,
+`map_fields`, `particle_filter`, `fit` (how a scan fits the map, and the status), and `relocalization` with `hypotheses`
+for a robot that does not know where it is. What is left is long, so that all that may change the pose or its status is
+read in one class.
 """
 
 from __future__ import annotations
@@ -15,7 +16,6 @@ from typing import TYPE_CHECKING, Final
 import numpy as np
 
 from robot_agent.config import LocalizationConfig
-from robot_agent.localization.deskew import DeskewedScan, deskew, follows
 from robot_agent.localization.fit import (
     NO_FIT,
     Doubt,
@@ -33,6 +33,7 @@ from robot_agent.localization.odometry_scale import OdometryScale
 from robot_agent.localization.particle_filter import ParticleFilter
 from robot_agent.localization.pose import Pose2, SavedPose, wrap
 from robot_agent.localization.relocalization import Relocalization
+from robot_agent.localization.scans import DeskewedScan, deskew, follows
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray

@@ -15,7 +15,7 @@ import numpy as np
 
 from fog_kernels import amcl
 from robot_agent.localization.pose import Pose2, Uncertainty, uncertainty, wrap
-from robot_agent.localization.scan_match import match_scan
+from robot_agent.localization.scans import match_scan
 from robot_agent.localization.unobserved import ALONG_LEAST_M, Along, least_certain, moved_to, observed, shifts_along
 
 if TYPE_CHECKING:
@@ -24,8 +24,8 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from robot_agent.config import LocalizationConfig
-    from robot_agent.localization.deskew import DeskewedScan
     from robot_agent.localization.map_fields import MapFields
+    from robot_agent.localization.scans import DeskewedScan
 
 _SPREAD_SAMPLES: Final = 16_000
 """Poses drawn around a given or doubtful pose: enough that some hundred of them fit."""

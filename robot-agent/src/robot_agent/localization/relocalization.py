@@ -23,8 +23,8 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from robot_agent.config import LocalizationConfig
-    from robot_agent.localization.deskew import DeskewedScan
     from robot_agent.localization.map_fields import MapFields
+    from robot_agent.localization.scans import DeskewedScan
 
 _CHUNK: Final = 40_000
 """Candidate poses scored with each scan: some 10 ms."""

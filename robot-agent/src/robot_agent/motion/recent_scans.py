@@ -16,7 +16,7 @@ from robot_agent.localization.pose import Pose2
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-    from robot_agent.localization.deskew import DeskewedScan
+    from robot_agent.localization.scans import DeskewedScan
 
 _SURFACE_M: Final = 0.06
 """Neighbours in a scan that are nearer than this may lie on one surface."""

@@ -2,7 +2,8 @@
 
 `LoggedAgent` is an `AgentCore` that passes an entry to `write` before every input and after every output. A new core
 that gets the same inputs gives the same outputs to the last bit (`replay`, beside this). An agent without a log is a
-plain `AgentCore` and has no overhead.
+plain `AgentCore` and has no overhead. The module is long, because each input of the core has an entry, and what writes
+it.
 
 No secret enters the log: its configuration holds `LOG_KEY` in place of the operators' key, and commands that were
 signed with theirs are signed anew with it.

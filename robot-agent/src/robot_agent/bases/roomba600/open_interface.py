@@ -4,7 +4,8 @@ Nothing here touches a port or a clock: bytes and arrival times go in, values co
 Source: iRobot Create 2 Open Interface specification based on the Roomba 600 (2018).
 
 The robot is driven in Safe mode, so that its own cliff, wheel drop and charger protection stays on. Full mode is for
-leaving the dock only, where Safe mode does not move the wheels.
+leaving the dock only, where Safe mode does not move the wheels. The module is as long as the interface: one document
+describes it, so that both are read side by side.
 """
 
 from __future__ import annotations

@@ -2,7 +2,8 @@
 
 Nothing here touches a port or a clock: bytes and arrival times go in, values come out. Nodes are decoded in bulk by
 compiled code, so that thousands of them a second cost a small computer little.
-Source: Slamtec, RPLIDAR interface protocol and application notes, A1 (protocol version 1.0, revision 2.x).
+Source: Slamtec, RPLIDAR interface protocol and application notes, A1 (protocol version 1.0, revision 2.x). The
+module is as long as the protocol, with which it is read side by side.
 """
 
 from __future__ import annotations

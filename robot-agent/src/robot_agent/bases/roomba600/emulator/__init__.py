@@ -10,8 +10,7 @@ What owners report of single robots is in `Quirks`. Not emulated: the five minut
 `asleep`), songs, LEDs, brushes, the command for another baud rate (they are accepted and have no effect).
 """
 
-from robot_agent.bases.roomba600.emulator.body import Battery
+from robot_agent.bases.roomba600.emulator.body import Battery, Quirks
 from robot_agent.bases.roomba600.emulator.robot import BOOT_TEXT, FULL, OFF, PASSIVE, SAFE, RoombaEmulator
-from robot_agent.bases.roomba600.emulator.sensors import Quirks
 
 __all__ = ["BOOT_TEXT", "FULL", "OFF", "PASSIVE", "SAFE", "Battery", "Quirks", "RoombaEmulator"]

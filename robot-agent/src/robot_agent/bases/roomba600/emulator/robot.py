@@ -11,8 +11,18 @@ import math
 from collections import deque
 from typing import TYPE_CHECKING, Any, Final, NamedTuple
 
-from robot_agent.bases.roomba600.emulator.body import AXLE_MM, Battery, Wheels, World
-from robot_agent.bases.roomba600.emulator.sensors import Field, LineNoise, Quirks, Sensors, Stream, as_bytes
+from robot_agent.bases.roomba600.emulator.body import (
+    AXLE_MM,
+    Battery,
+    Field,
+    LineNoise,
+    Quirks,
+    Sensors,
+    Stream,
+    Wheels,
+    World,
+    as_bytes,
+)
 
 if TYPE_CHECKING:
     from collections.abc import Iterator

@@ -1,9 +1,33 @@
-"""What a process asks of the kernel so that nothing delays it."""
+"""What the two processes that keep the wheels safe load, and what they ask of the kernel so that nothing delays them.
+
+They restart while the wheels are held, and must be small.
+"""
 
 import os
+import subprocess
+import sys
 import threading
 
+import pytest
+
 from robot_agent.guardian.protection import run_in_real_time
+
+CODE = "import importlib, sys; importlib.import_module(sys.argv[1]); print(*sys.modules)"
+
+
+@pytest.mark.parametrize(
+    ("module", "unneeded"),
+    [
+        (
+            "robot_agent.guardian.__main__",
+            {"numpy", "numba", "zenoh", "fastapi", "prometheus_client", "asyncio", "ssl", "hashlib"},
+        ),
+        ("robot_agent.guardian.watchdog", {"numpy", "msgspec", "asyncio", "dataclasses", "fog_contracts"}),
+    ],
+)
+def test_process_of_the_wheels_loads_no_library_that_it_does_not_need(module: str, unneeded: set[str]) -> None:
+    done = subprocess.run([sys.executable, "-c", CODE, module], capture_output=True, text=True, check=True)
+    assert unneeded & set(done.stdout.split()) == set()
 
 
 def test_thread_that_ends_meanwhile_keeps_no_other_from_its_priority(monkeypatch):

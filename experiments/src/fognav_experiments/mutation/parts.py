@@ -216,7 +216,6 @@ PARTS: Final = (
             "motion/test_recovery.py",
             "motion/test_recovery_boundaries.py",
             "motion/test_recovery_limits.py",
-            "motion/test_recoveries.py",
         ),
         ("numpy", "hypothesis.strategies", "fog_kernels.clearance", "robot_agent.config"),
         (

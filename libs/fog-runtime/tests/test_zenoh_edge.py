@@ -25,7 +25,8 @@ from fog_contracts.handlers import RefusedMessageError
 from fog_contracts.replica import MasterMap
 from fog_runtime.clock import SystemClock
 from fog_runtime.transports.edges import Edges
-from fog_runtime.transports.zenoh_edge import ASKER, ZenohEdge, session_config
+from fog_runtime.transports.zenoh_declarations import ASKER
+from fog_runtime.transports.zenoh_edge import ZenohEdge, session_config
 from fog_runtime.transports.zenoh_query import PART_BYTES, decode_announcement
 from fog_supervisor.net import free_port
 from fog_supervisor.servers import start_router

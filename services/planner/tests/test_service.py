@@ -22,7 +22,7 @@ from fog_contracts.messages import EgressRequest, PlanRequest, Pose, RobotGoal, 
 from fog_runtime.clock import ManualClock
 from fog_runtime.health import Health
 from fog_runtime.http import Tokens
-from fog_runtime.transports.zenoh_edge import ASKER
+from fog_runtime.transports.zenoh_declarations import ASKER
 from planner.api import make_api
 from planner.core import PlannerCore
 from planner.plan_records import PathRecord

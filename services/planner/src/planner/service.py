@@ -25,7 +25,7 @@ from fog_contracts.messages import PlanReply, RobotPath, RobotPose, RobotState
 from fog_runtime import logs, metrics
 from fog_runtime.clock import ticker
 from fog_runtime.transports.edges import Edges
-from fog_runtime.transports.zenoh_edge import ASKER
+from fog_runtime.transports.zenoh_declarations import ASKER
 from planner.map_keeper import MapKeeper
 from planner.plan_records import PathRecord, PlanMetrics
 from planner.query_queue import BusyError, QueryQueue, Threads

@@ -16,7 +16,7 @@ from fog_contracts.costs import (
     is_traversable,
     penalty_cost,
 )
-from fog_contracts.layering import combine_costs, combine_speed_limits
+from fog_contracts.grid import combine_costs, combine_speed_limits
 
 KEY = b"k" * 32
 

@@ -3,7 +3,7 @@ from typing import Annotated
 import msgspec
 import pytest
 
-from fog_contracts.options import OptionError, read_options
+from fog_contracts.site import OptionError, read_options
 
 
 class Limits(msgspec.Struct, kw_only=True):

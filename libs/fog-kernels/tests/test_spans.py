@@ -8,8 +8,7 @@ from compiler import examples
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from fog_contracts.grid import Window
-from fog_contracts.layering import combine_costs, combine_speed_limits
+from fog_contracts.grid import Window, combine_costs, combine_speed_limits
 from fog_contracts.shapes import ShapeMask, Spans, mask_spans
 from fog_kernels.spans import lower_speeds, raise_costs
 

@@ -10,8 +10,8 @@ from typing import TYPE_CHECKING
 import pytest
 
 from fog_runtime import machine
+from fog_runtime.health import reachable_address
 from fog_runtime.machine import ServiceManager, SuspensionMonitor
-from fog_runtime.own_address import reachable_address
 from fog_runtime.usage import name_thread, sample
 
 if TYPE_CHECKING:
@@ -45,7 +45,7 @@ def test_nothing_is_announced_without_a_way_to_the_fog(endpoints):
 
 
 def test_loopback_is_not_announced_to_a_fog_elsewhere(monkeypatch):
-    monkeypatch.setattr("fog_runtime.own_address._own_side", lambda _towards: "192.0.2.20")
+    monkeypatch.setattr("fog_runtime.health._own_side", lambda _towards: "192.0.2.20")
     assert reachable_address("127.0.0.1", 9100, ["tcp/192.0.2.1:7447"]) == ""
     assert reachable_address("localhost", 9100, ["tcp/192.0.2.1:7447"]) == ""
 

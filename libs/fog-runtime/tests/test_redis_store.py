@@ -9,8 +9,8 @@ from redis.asyncio import Redis
 from fog_contracts.messages import Message
 from fog_runtime.leadership import LeaseStore
 from fog_runtime.lease import Request
-from fog_runtime.stores.redis_connection import StoreRefusedError
-from fog_runtime.stores.redis_store import ANY, Audit, RedisStore, StoreError, Table
+from fog_runtime.stores.redis_connection import StoreError, StoreRefusedError
+from fog_runtime.stores.redis_store import ANY, Audit, RedisStore, Table
 from fog_supervisor.servers import Server, start_redis
 
 pytestmark = pytest.mark.live

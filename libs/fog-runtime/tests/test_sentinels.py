@@ -19,8 +19,8 @@ from redis.exceptions import RedisError
 from fog_contracts.messages import Message
 from fog_runtime.credentials import Credentials
 from fog_runtime.locks.site_locks import SiteLocks
-from fog_runtime.stores.redis_connection import RedisAddress, RedisConnection, parse_address
-from fog_runtime.stores.redis_store import Audit, RedisStore, StoreError, Table
+from fog_runtime.stores.redis_connection import RedisAddress, RedisConnection, StoreError, parse_address
+from fog_runtime.stores.redis_store import Audit, RedisStore, Table
 from fog_supervisor import configurations
 from fog_supervisor.net import LOOPBACK, free_port
 from fog_supervisor.servers import Server, ServerProgram, find_program, start_redis

@@ -13,7 +13,8 @@ from hypothesis import strategies as st
 from hypothesis.stateful import RuleBasedStateMachine, invariant, precondition, rule, run_state_machine_as_test
 
 from fog_contracts.messages import Message
-from fog_runtime.stores.redis_store import Attempt, Audit, RedisStore, StoreLostError, Table
+from fog_runtime.stores.redis_connection import StoreLostError
+from fog_runtime.stores.redis_store import Attempt, Audit, RedisStore, Table
 from fog_supervisor.servers import Server, start_redis
 
 pytestmark = pytest.mark.live

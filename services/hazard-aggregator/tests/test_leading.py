@@ -12,13 +12,14 @@ from fog_contracts.handlers import Moment
 from fog_contracts.messages import AreaDefinition, AreaHazard
 from fog_runtime.clock import ManualClock
 from fog_runtime.health import Health
+from fog_runtime.stores.redis_store import Audit
 from fog_supervisor.servers import start_redis
 from hazard_aggregator.areas import AreaOverride
 from hazard_aggregator.core import Aggregator
 from hazard_aggregator.fusion import AreaFusion
 from hazard_aggregator.registry import find_rule
 from hazard_aggregator.service import Service
-from hazard_aggregator.store import Audit, Store
+from hazard_aggregator.store import Store
 
 if TYPE_CHECKING:
     from pathlib import Path

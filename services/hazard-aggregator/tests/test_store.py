@@ -11,12 +11,14 @@ from fog_contracts.handlers import Moment
 from fog_contracts.messages import AreaDefinition, AreaHazard
 from fog_runtime.health import Health
 from fog_runtime.stores.audit import CursorError
+from fog_runtime.stores.redis_connection import StoreError
+from fog_runtime.stores.redis_store import Audit
 from fog_supervisor.servers import Server, start_redis
 from hazard_aggregator.areas import Members
 from hazard_aggregator.history import Period, period_of
 from hazard_aggregator.records import UnusableAreas
 from hazard_aggregator.registry import find_rule
-from hazard_aggregator.store import Audit, Store, StoreError
+from hazard_aggregator.store import Store
 
 pytestmark = pytest.mark.live
 AUDIT = Audit(at=1.0, who="anna", action="put")

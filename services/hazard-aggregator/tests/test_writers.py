@@ -14,7 +14,8 @@ from fog_contracts.messages import AreaDefinition
 from fog_runtime.clock import ManualClock
 from fog_runtime.health import Health
 from fog_runtime.http import Tokens, token_hash
-from fog_runtime.stores.redis_store import Attempt
+from fog_runtime.stores.redis_connection import StoreError
+from fog_runtime.stores.redis_store import Attempt, Audit
 from fog_runtime.token_file import TokenEntry
 from fog_supervisor.servers import start_redis
 from hazard_aggregator import area_size
@@ -24,7 +25,7 @@ from hazard_aggregator.core import Aggregator
 from hazard_aggregator.fusion import AreaFusion
 from hazard_aggregator.registry import find_rule
 from hazard_aggregator.service import Service
-from hazard_aggregator.store import Audit, Store, StoreError
+from hazard_aggregator.store import Store
 from hazard_aggregator.writers import ConflictError
 
 if TYPE_CHECKING:

@@ -8,8 +8,10 @@ import pytest
 from redis.asyncio import Redis
 
 from fog_contracts.messages import CircleShape, Zone
+from fog_runtime.stores.redis_connection import StoreError
+from fog_runtime.stores.redis_store import Audit
 from fog_supervisor.servers import Server, start_redis
-from map_service.store import Audit, Store, StoreError
+from map_service.store import Store
 
 pytestmark = pytest.mark.live
 AUDIT = Audit(1.0, "anna", "create")

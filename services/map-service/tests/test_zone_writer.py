@@ -14,12 +14,13 @@ from fog_contracts.grid import GridGeometry
 from fog_contracts.messages import CircleShape, Message, Zone
 from fog_runtime.clock import ManualClock
 from fog_runtime.health import Health
+from fog_runtime.stores.redis_connection import StoreError
 from fog_runtime.stores.redis_store import Attempt
 from fog_supervisor.servers import start_redis
 from map_service.core import MapCore
 from map_service.registry import make_layers
 from map_service.service import Service
-from map_service.store import Store, StoreError
+from map_service.store import Store
 from map_service.zone_writer import KEPT_S, ConflictError
 
 if TYPE_CHECKING:

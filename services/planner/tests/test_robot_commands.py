@@ -19,12 +19,12 @@ from fog_contracts.site import Place
 from fog_runtime.clock import ManualClock
 from fog_runtime.health import Health
 from fog_runtime.http import Tokens
+from fog_runtime.stores.redis_connection import StoreError
 from fog_runtime.token_file import TokenEntry, token_hash
 from planner.api import make_api
 from planner.core import PlannerCore
 from planner.robot_commands import OTHERS, PERIOD_S, REMEMBERED_S, SENDERS, CommandError, DoubledRobots, StopRecords
 from planner.service import Service
-from planner.store import StoreError
 
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator

@@ -11,9 +11,10 @@ from fog_runtime.clock import SystemClock
 from fog_runtime.health import Health
 from fog_runtime.leadership import LeaseStore
 from fog_runtime.lease import Request
-from fog_runtime.stores.redis_store import Attempt, IdempotencyError
+from fog_runtime.stores.redis_connection import StoreError
+from fog_runtime.stores.redis_store import Attempt, Audit, IdempotencyError, RecoveryError
 from fog_supervisor.servers import Server, start_redis
-from planner.store import Audit, MissionKeeper, RecoveryError, Store, StoredGoal, StoreError
+from planner.store import MissionKeeper, Store, StoredGoal
 
 pytestmark = pytest.mark.live
 AUDIT = Audit(1.0, "anna", "goal")

@@ -22,7 +22,7 @@ from cryptography.hazmat.primitives.serialization import (
 
 from fog_contracts.messages import NodeUpdate
 from fog_runtime.files import PRIVATE, atomic_write
-from fog_runtime.own_address import reachable_address
+from fog_runtime.health import reachable_address
 from fog_runtime.transports.mqtt_connection import Broker
 from fognav.output import WrongUseError
 

@@ -6,6 +6,8 @@ advanced in place: the same seed gives the same particles bit for bit.
 
 Methods: odometry motion model (Thrun, Burgard and Fox 2005, table 5.6); likelihood field with AMCL's sum of cubes
 (chapter 6.4); sample size by Kullback-Leibler distance (Fox 2001), drawn with low variance (chapter 4.3).
+
+One module, although long: kernels that share helpers, each with the wrapper that checks its arrays.
 """
 
 # Kernels take arrays and scalars, typed by their compiled signatures, and are single functions where a call per cell

@@ -4,6 +4,8 @@ Methods: A* (Hart, Nilsson and Raphael 1968) on a circular bucket queue (Dial 19
 cell is expanded again when a cheaper path to it appears; the search ends only when no open cell can lead to a cheaper
 path. An entry is never put into a bucket below the current one (pathmax, Mero 1984), nor beyond the last: the search is
 exact for every heuristic that never overestimates, also for the rounded one of a goal field.
+
+Long, because the search is one kernel: a call per cell would cost more than its work.
 """
 
 # Kernels take arrays and scalars, typed by their compiled signatures, and are single functions where a call per cell

@@ -12,6 +12,8 @@ in it, instead of one for each robot. The bound is tight for a goal whose field 
 same at every border cell that matters.
 
 Nothing here has to be exact for a search to stay optimal: any set A gives a valid bound.
+
+One module, although long: its kernels inline the same steps, and only together give a bound.
 """
 
 # Kernels take arrays and scalars, typed by their compiled signatures.

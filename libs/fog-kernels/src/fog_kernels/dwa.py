@@ -7,6 +7,8 @@ distance to go, the heading error relative to the path ahead, and the highest co
 errors are corrected by turning in place, so that a path that starts behind the robot isn't reached by a wide arc.
 
 The tests contain a plain reference implementation, with which a property test compares the kernel.
+
+One module, although long: all of it is compiled into the one kernel.
 """
 
 # Kernels take arrays and scalars, typed by their compiled signatures, and are single functions where a call per cell

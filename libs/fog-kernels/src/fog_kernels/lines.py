@@ -1,6 +1,8 @@
 """Straight lines and paths made of them: integrals of the weight, shortcuts, how far lines part, nearest places.
 
 Costs are integrated along lines of sight cell by cell (Amanatides and Woo 1987).
+
+One module, although long: each kernel stands with the wrapper that checks its arrays.
 """
 
 # Kernels take arrays and scalars, typed by their compiled signatures.

@@ -12,8 +12,7 @@ from prometheus_client import REGISTRY
 
 from fog_runtime import logs
 from fog_runtime.configuration.robot_file import describe_robot
-from fog_runtime.health import Health, serve_health
-from fog_runtime.own_address import reachable_address
+from fog_runtime.health import Health, reachable_address, serve_health
 from fog_runtime.process import release_startup_memory
 from fog_runtime.transports.zenoh_edge import ZenohEdge, use_one_thread
 from robot_agent import registry

@@ -16,9 +16,8 @@ from fog_contracts.handlers import Publication
 from fog_contracts.messages import AlertKind
 from fog_runtime import logs
 from fog_runtime.clock import ticker
-from fog_runtime.stores.redis_connection import StoreRefusedError
+from fog_runtime.stores.redis_connection import StoreError, StoreRefusedError
 from hazard_aggregator.alerts import AlertEvent, Alerts
-from hazard_aggregator.store import StoreError
 
 if TYPE_CHECKING:
     import asyncio

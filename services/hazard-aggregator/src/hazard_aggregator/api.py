@@ -57,13 +57,13 @@ from fog_runtime.http import (
     next_page,
 )
 from fog_runtime.stores.audit import CursorError
+from fog_runtime.stores.redis_connection import StoreError
 from fog_runtime.stores.redis_store import IdempotencyError
 from hazard_aggregator.alerts import AlertError
 from hazard_aggregator.area_size import AreaError, TooManyAreasError, check_size
 from hazard_aggregator.areas import LONGEST_S, AreaOverride
 from hazard_aggregator.history import PeriodView
 from hazard_aggregator.service import Service
-from hazard_aggregator.store import StoreError
 from hazard_aggregator.writers import ConflictError
 
 

@@ -13,10 +13,10 @@ from fog_contracts import channels as ch
 from fog_contracts.handlers import Publication
 from fog_contracts.messages import AreaHazard, AreaState
 from fog_runtime import logs, metrics
+from fog_runtime.stores.redis_connection import StoreError
 from fog_runtime.transports.mqtt_edge import Will
 from hazard_aggregator.history import period_of
 from hazard_aggregator.publications import discovery_publication
-from hazard_aggregator.store import StoreError
 
 if TYPE_CHECKING:
     from collections.abc import Sequence

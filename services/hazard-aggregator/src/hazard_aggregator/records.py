@@ -12,11 +12,12 @@ from prometheus_client import Gauge
 from fog_contracts import channels as ch
 from fog_contracts.messages import FusionPolicy
 from fog_runtime import logs
-from fog_runtime.stores.redis_connection import StoreRefusedError
+from fog_runtime.stores.redis_connection import StoreError, StoreRefusedError
+from fog_runtime.stores.redis_store import Audit, RecoveryError
 from hazard_aggregator.area_size import AreaError, check_size
 from hazard_aggregator.overrides import StoredOverrides
 from hazard_aggregator.source_values import SourceError
-from hazard_aggregator.store import Audit, RecoveryError, Stored, StoreError
+from hazard_aggregator.store import Stored
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence

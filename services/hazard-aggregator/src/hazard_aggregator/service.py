@@ -9,12 +9,12 @@ from prometheus_client import Counter, Gauge
 
 from fog_runtime import logs
 from fog_runtime.clock import ticker
+from fog_runtime.stores.redis_connection import StoreError, StoreLostError
 from fog_runtime.transports.edges import Edges
 from hazard_aggregator.alert_keeper import AlertKeeper
 from hazard_aggregator.area_size import excess
 from hazard_aggregator.publisher import Availability, HistoryKeeper, Publisher
 from hazard_aggregator.records import Records
-from hazard_aggregator.store import StoreError, StoreLostError
 from hazard_aggregator.writers import AreaWriter, OverrideWriter
 
 if TYPE_CHECKING:

@@ -12,7 +12,8 @@ from fog_contracts.messages import AreaDefinition, AreaHazard, Count, Id, Messag
 from fog_runtime import logs
 from fog_runtime.stores import store_scripts
 from fog_runtime.stores.audit import CursorError
-from fog_runtime.stores.redis_store import Audit, Outcome, RecoveryError, RedisStore, StoreError, StoreLostError, Table
+from fog_runtime.stores.redis_connection import StoreError
+from fog_runtime.stores.redis_store import Audit, Outcome, RedisStore, Table
 from hazard_aggregator.alerts import StoredAlerts
 from hazard_aggregator.areas import AreaOverride, Rest
 from hazard_aggregator.history import (
@@ -31,17 +32,6 @@ if TYPE_CHECKING:
     from fog_contracts.messages import Alert
     from fog_runtime.stores.redis_store import Attempt
     from hazard_aggregator.alerts import AlertEvent
-
-__all__ = [
-    "Audit",
-    "Outcome",
-    "RecoveryError",
-    "Store",
-    "StoreError",
-    "StoreLostError",
-    "Stored",
-    "load_at_start",
-]
 
 _AREAS: Final = Table(store_scripts.AREAS, "area")
 _HAZARDS: Final = store_scripts.HAZARDS

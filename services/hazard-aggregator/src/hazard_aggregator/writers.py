@@ -7,9 +7,9 @@ from typing import TYPE_CHECKING, Final, NamedTuple
 from msgspec import structs
 
 from fog_runtime import logs
+from fog_runtime.stores.redis_store import Audit
 from hazard_aggregator.area_size import check_count
 from hazard_aggregator.areas import AreaOverride
-from hazard_aggregator.store import Audit
 
 if TYPE_CHECKING:
     from fog_contracts.messages import AreaDefinition, OverrideState

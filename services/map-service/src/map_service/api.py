@@ -57,12 +57,12 @@ from fog_runtime.http import (
 )
 from fog_runtime.http.routes import InvalidBodyError
 from fog_runtime.stores.audit import KINDS, AuditEntry, CursorError
+from fog_runtime.stores.redis_connection import StoreError
 from fog_runtime.stores.redis_store import Attempt, IdempotencyError
 from map_service.core import ScrapeTarget
 from map_service.costmap import LayeredCostmap
 from map_service.layers.base import Grid
 from map_service.service import Service
-from map_service.store import StoreError
 from map_service.zone_writer import ConflictError
 from map_service.zones import ZoneError
 

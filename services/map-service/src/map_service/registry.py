@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any, Final
 
-from fog_contracts.options import OptionError, read_options
+from fog_contracts.site import OptionError, read_options
 from fog_runtime.configuration import parts
 from map_service.layers.base import CostLayer, LayerFactory
 

@@ -11,9 +11,9 @@ from prometheus_client import Counter, Gauge
 from fog_contracts import channels as ch
 from fog_runtime import logs
 from fog_runtime.clock import ticker
+from fog_runtime.stores.redis_connection import StoreError, StoreLostError
 from fog_runtime.transports.edges import Edges
 from map_service.publisher import Publisher
-from map_service.store import StoreError, StoreLostError
 from map_service.zone_writer import TimesKeeper, ZoneWriter
 
 if TYPE_CHECKING:

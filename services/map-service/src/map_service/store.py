@@ -8,24 +8,13 @@ from msgspec import structs
 
 from fog_contracts.messages import Message, Zone
 from fog_runtime.stores import store_scripts
-from fog_runtime.stores.redis_store import (
-    ANY,
-    Audit,
-    Outcome,
-    RecoveryError,
-    RedisStore,
-    StoreError,
-    StoreLostError,
-    Table,
-)
+from fog_runtime.stores.redis_store import ANY, Audit, Outcome, RedisStore, Table
 from map_service.zone_times import Progress
 
 if TYPE_CHECKING:
     from collections.abc import Iterable
 
     from fog_runtime.stores.redis_store import Attempt
-
-__all__ = ["Audit", "Outcome", "RecoveryError", "Store", "StoreError", "StoreLostError"]
 
 _ZONES: Final = Table(store_scripts.ZONES, "zone")
 

@@ -12,7 +12,8 @@ from prometheus_client import Counter, Gauge
 from fog_contracts import channels as ch
 from fog_runtime import logs
 from fog_runtime.concurrency import Worker
-from map_service.store import Audit, RecoveryError, StoreError
+from fog_runtime.stores.redis_connection import StoreError
+from fog_runtime.stores.redis_store import Audit, RecoveryError
 from map_service.zone_times import StoredState
 from map_service.zones import check_list_size, check_room, list_size, prepare_zone, zones_spans
 
@@ -23,10 +24,10 @@ if TYPE_CHECKING:
     from fog_contracts.handlers import Moment
     from fog_contracts.messages import Zone
     from fog_runtime.health import Health
-    from fog_runtime.stores.redis_store import Attempt, StoreStatus
+    from fog_runtime.stores.redis_store import Attempt, Outcome, StoreStatus
     from map_service.core import MapCore
     from map_service.publisher import Publisher
-    from map_service.store import Outcome, Store
+    from map_service.store import Store
     from map_service.zone_times import Progress
     from map_service.zones import PreparedZone
 

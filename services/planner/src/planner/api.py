@@ -43,11 +43,12 @@ from fog_runtime.http import (
     make_app,
     must_be_new,
 )
+from fog_runtime.stores.redis_connection import StoreError
 from fog_runtime.stores.redis_store import IdempotencyError
 from planner.query_queue import BusyError
 from planner.robot_commands import CommandError, RobotOperator
 from planner.service import Service
-from planner.store import NO_MISSION, MissionConflictError, Order, StoredGoal, StoreError
+from planner.store import NO_MISSION, MissionConflictError, Order, StoredGoal
 
 
 class StartPose(Message, frozen=True, kw_only=True):

@@ -19,7 +19,8 @@ from fog_contracts.commands import STOPS
 from fog_runtime import logs
 from fog_runtime.clock import ticker
 from fog_runtime.robot_commands import REPLY_TIMEOUT_S, RobotCommands
-from planner.store import Audit, StoreError
+from fog_runtime.stores.redis_connection import StoreError
+from fog_runtime.stores.redis_store import Audit
 
 if TYPE_CHECKING:
     from collections.abc import Mapping

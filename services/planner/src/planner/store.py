@@ -11,17 +11,8 @@ from typing import TYPE_CHECKING, Final, NamedTuple
 from fog_contracts.messages import Message, Refusal, RobotGoal
 from fog_runtime import logs
 from fog_runtime.stores import store_scripts
-from fog_runtime.stores.redis_connection import StoreRefusedError
-from fog_runtime.stores.redis_store import (
-    ANY,
-    Audit,
-    Outcome,
-    RecoveryError,
-    RedisStore,
-    StoreError,
-    StoreLostError,
-    Table,
-)
+from fog_runtime.stores.redis_connection import StoreError, StoreLostError, StoreRefusedError
+from fog_runtime.stores.redis_store import ANY, Audit, Outcome, RecoveryError, RedisStore, Table
 from planner.missions import DockGoals
 
 if TYPE_CHECKING:
@@ -36,8 +27,6 @@ if TYPE_CHECKING:
 
     Send = Callable[["Order"], Awaitable["StoredGoal | Refusal"]]
     """Gives a robot a mission, or returns why there is none; may raise `StoreError`."""
-
-__all__ = ["ANY", "Audit", "RecoveryError", "Store", "StoreError", "StoreLostError", "StoredGoal"]
 
 _GOALS: Final = Table(store_scripts.GOALS, "mission", version="goal.goal_id")
 

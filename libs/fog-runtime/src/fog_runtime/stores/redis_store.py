@@ -77,19 +77,6 @@ class Attempt:
         return bytes(result.record)
 
 
-__all__ = [
-    "ANY",
-    "UNFENCED",
-    "Audit",
-    "Outcome",
-    "RecoveryError",
-    "RedisStore",
-    "StoreError",
-    "StoreLostError",
-    "StoreStatus",
-    "Table",
-]
-
 M = TypeVar("M", bound=Message)
 
 DURABLE: Final = Gauge(

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any, Final, Generic, NamedTuple, Protocol, Typ
 
 import msgspec
 
-from fog_contracts.options import OptionError, read_options
+from fog_contracts.site import OptionError, read_options
 from hazard_aggregator.area_size import AreaError
 
 if TYPE_CHECKING:

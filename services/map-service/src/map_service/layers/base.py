@@ -10,8 +10,7 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-from fog_contracts.grid import StaticMap, Window
-from fog_contracts.layering import combine_costs, combine_speed_limits
+from fog_contracts.grid import StaticMap, Window, combine_costs, combine_speed_limits
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping, Sequence

@@ -21,6 +21,7 @@ settings.register_profile(
     "default", deadline=None, suppress_health_check=[HealthCheck.too_slow]
 )  # a busy machine is no defect
 settings.register_profile("repeatable", parent=settings.get_profile("default"), derandomize=True)
+settings.register_profile("quick", parent=settings.get_profile("repeatable"), max_examples=25)
 settings.load_profile("default")
 if os.environ.get("CI", "").lower() in {"1", "true"}:
     settings.load_profile("repeatable")
@@ -48,11 +49,13 @@ def pytest_addoption(parser: pytest.Parser) -> None:
     parser.addoption("--long", action="store_true", help="drive new random worlds for ten minutes, too")
 
 
-def pytest_configure() -> None:
-    """Give each worker its own range of ports, and the programs that it starts the usual signals.
+def pytest_configure(config: pytest.Config) -> None:
+    """Try fewer examples in the quick tier; give each worker its own range of ports, and its programs usual signals.
 
     Two workers that search for a port at the same moment would find the same one.
     """
+    if config.getoption("tier", "all") == "quick":
+        settings.load_profile("quick")
     if signal.getsignal(signal.SIGHUP) == signal.SIG_IGN:
         # Under nohup. What is ignored is inherited by the programs that tests start and hang up; a handler is not.
         signal.signal(signal.SIGHUP, lambda *_: None)
@@ -119,9 +122,16 @@ def claims() -> frozenset[str]:
     return frozenset(re.findall(r"`([\w/-]+/test_\w+\.py::test_\w+)`", text))
 
 
-def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Start with the tests that take longest, if several workers share them; no test that was made longer times out.
+def is_quick(item: pytest.Item) -> bool:
+    """Whether a test is one of some minutes: all that only compute, but for whole drives, and some of each process."""
+    computes_only = group_of(module_of(item.nodeid))[0] == COMPUTING and item.get_closest_marker("drive") is None
+    return computes_only or item.get_closest_marker("smoke") is not None
 
+
+def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
+    """Leave out what another tier runs, and start with the tests that take longest, if several workers share them.
+
+    No test that was made longer times out.
     The tests that show a claim of docs/security.md are marked: `./fognav test -m claim`.
     """
     for item in items:
@@ -131,6 +141,10 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
         for item in items:
             if item.get_closest_marker("timeout") is None:
                 item.add_marker(pytest.mark.timeout(0))
+    if (tier := config.getoption("tier", "all")) != "all":
+        left_out = [item for item in items if is_quick(item) != (tier == "quick")]
+        items[:] = [item for item in items if is_quick(item) == (tier == "quick")]
+        config.hook.pytest_deselected(items=left_out)
     if "PYTEST_XDIST_WORKER" in os.environ:
         items.sort(key=lambda item: group_of(module_of(item.nodeid)))
 

@@ -75,6 +75,38 @@ def test_tests_run_on_all_cores_unless_the_arguments_choose_otherwise() -> None:
         assert "--dist" not in testing.pytest_command(arguments, terminal=False)
 
 
+@pytest.mark.parametrize(
+    ("arguments", "tier"),
+    [
+        ([], "quick"), (["-q", "-x"], "quick"), (["--all"], "all"), (["--rest", "-q"], "rest"), (["--long"], "all"),
+        (["-k", "replica"], "all"), (["-m", "claim"], "all"), (["cli/tests/test_testing.py::test_x"], "all"),
+    ],
+)  # fmt: skip
+def test_quick_tests_run_unless_all_are_asked_for_or_some_by_name(arguments: list[str], tier: str) -> None:
+    command = testing.pytest_command(arguments, terminal=False)
+    assert [argument for argument in command if "tier" in argument] == [f"--tier={tier}"]
+    assert not {"--all", "--rest"} & set(command)
+
+
+@pytest.mark.drive
+def test_each_test_belongs_to_the_quick_ones_or_to_the_rest_and_the_last_line_tells_how_many_are_left_out() -> None:
+    def ids(tier: str) -> tuple[set[str], str]:
+        module = "services/planner/tests/test_process.py"
+        collect = ["-m", "pytest", "-p", "fognav.pytest_progress", "--collect-only", "-q", f"--tier={tier}", module]
+        alone = {name: value for name, value in os.environ.items() if not name.startswith("PYTEST_XDIST")}
+        done = subprocess.run(
+            [sys.executable, *collect], cwd=checkout.root(), env=alone, capture_output=True, text=True, check=True
+        )
+        return {line for line in done.stdout.splitlines() if "::" in line}, done.stdout
+
+    (quick, told), (rest, _), (every, _) = ids("quick"), ids("rest"), ids("all")
+    assert quick
+    assert rest
+    assert quick | rest == every
+    assert not quick & rest
+    assert f"\n{len(rest)} tests of whole drives, real processes and containers were left out" in told
+
+
 @pytest.fixture(scope="module")
 def grouping() -> ModuleType:
     spec = importlib.util.spec_from_file_location("root_conftest", checkout.root() / "conftest.py")

@@ -148,6 +148,7 @@ async def test_drive_commands_move_the_robot_and_the_ground_truth_shows_it(tmp_p
     assert len(log) / (log[-1]["now"] - log[0]["now"]) > 50.0
 
 
+@pytest.mark.smoke
 async def test_placed_obstacle_shows_in_the_readings_and_in_the_ground_truth(tmp_path):
     async with simulator(tmp_path, speed=4) as (rig, _):
         await until(lambda: rig.readings[-1].state == "clear", "the floor is clear")

@@ -138,9 +138,10 @@ def _prepare(*, yes: bool) -> None:
     rich_help_panel=installed.DEVELOP,
 )
 def run_tests(context: typer.Context, *, yes: Yes = False) -> None:
-    """Set up what is missing, then run every test on all cores.
+    """Set up what is missing, then run the tests on all cores: some minutes of them, or those that you name.
 
-    This includes the tests with real brokers. Further arguments go to pytest (`-n 0` runs one test at a time).
+    With --all every test runs, with --rest those that are left out without it, with --long new random worlds, too.
+    Further arguments go to pytest (`-n 0` runs one test at a time).
     """
     from fognav import testing  # noqa: PLC0415  # keeps the other commands fast
 

@@ -1,19 +1,42 @@
-"""A pytest plugin: a progress bar on a terminal instead of dots, and at the end a summary of the skipped tests.
+"""A pytest plugin of `fognav test`: which tests are left out, a progress bar instead of dots, a summary of the skipped.
 
-`fognav test` loads it; with pytest-xdist it runs in the process that distributes the tests.
+With pytest-xdist the bar and the summary are those of the process that distributes the tests.
 """
 
 from collections import Counter
 from collections.abc import Generator
-from typing import Final
+from typing import TYPE_CHECKING, Final
 
 import pytest
 from _pytest.terminal import TerminalReporter  # pytest has no public name for it
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
 
+if TYPE_CHECKING:
+    from xdist.workermanage import WorkerController
+
 _NAME: Final = "fognav-progress-bar"
 _SKIPPED: Final = "Skipped: "
+_LEFT_OUT: Final = "fognav_left_out"
+
+
+def pytest_addoption(parser: pytest.Parser) -> None:
+    """Add the choice of tests; the root's conftest.py knows which belong where."""
+    tiers = ("quick", "rest", "all")
+    parser.addoption("--tier", choices=tiers, default="all", help="quick: some minutes; rest: all others; all: both")
+
+
+def pytest_deselected(items: list[pytest.Item]) -> None:
+    """Count what is left out, for the process that distributes the tests as well."""
+    if items:
+        output = getattr(items[0].config, "workeroutput", vars(items[0].config))
+        output[_LEFT_OUT] = output.get(_LEFT_OUT, 0) + len(items)
+
+
+@pytest.hookimpl(optionalhook=True)
+def pytest_testnodedown(node: "WorkerController") -> None:
+    """Take over a worker's count; each has left out the same tests."""
+    vars(node.config)[_LEFT_OUT] = node.workeroutput.get(_LEFT_OUT, 0)
 
 
 class ProgressBar:
@@ -88,3 +111,9 @@ def pytest_terminal_summary(terminalreporter: TerminalReporter) -> None:
         terminalreporter.section("skipped")
         for reason, count in reasons.most_common():
             terminalreporter.line(f"{count} skipped: {reason}")
+    config = terminalreporter.config
+    if config.getoption("tier") == "quick":
+        count = vars(config).get(_LEFT_OUT, 0)
+        terminalreporter.line(
+            f"{count} tests of whole drives, real processes and containers were left out: `fognav test --all` runs them"
+        )

@@ -1,11 +1,11 @@
-"""How `fognav test` runs pytest: on all cores, with progress, and with the optional programs that can be installed."""
+"""How `fognav test` runs pytest: which tests, on all cores, with progress, and with programs that can be installed."""
 
 import os
 import sys
 from collections.abc import Callable, Sequence
 from typing import Final
 
-from fognav import system
+from fognav import checkout, system
 
 _OVERRIDES: Final = (
     "-n",
@@ -20,6 +20,9 @@ _OVERRIDES: Final = (
 )
 """Arguments that choose another distribution of the tests, or need a single process."""
 
+_TIERS: Final = {"--all": "all", "--rest": "rest"}
+"""Arguments that ask for every test, or for those that are left out without one."""
+
 
 def workers() -> int:
     """Return how many tests run at once: two more than there are cores, because most tests of processes wait.
@@ -31,12 +34,23 @@ def workers() -> int:
 
 def pytest_command(arguments: Sequence[str], *, terminal: bool | None = None) -> list[str]:
     """Return the command line of pytest, with the user's arguments last."""
-    command = [sys.executable, "-m", "pytest", "-p", "fognav.pytest_progress", "-r", "fE"]
+    tier = next((_TIERS[argument] for argument in arguments if argument in _TIERS), None)
+    if tier is None:
+        tier = "all" if _selects(arguments) else "quick"
+    arguments = [argument for argument in arguments if argument not in _TIERS]
+    command = [sys.executable, "-m", "pytest", "-p", "fognav.pytest_progress", "-r", "fE", f"--tier={tier}"]
     if sys.stderr.isatty() if terminal is None else terminal:
         command += ["-o", "console_output_style=classic"]  # the bar shows the progress
     if not any(argument.startswith(_OVERRIDES) for argument in arguments):
         command += ["-n", str(workers()), "--dist", "loadgroup", "--no-loadscope-reorder"]
     return [*command, *arguments]
+
+
+def _selects(arguments: Sequence[str]) -> bool:
+    """Whether the user says which tests to run, by their path, a name or a marker: then no tier leaves one out."""
+    paths = (argument.partition("::")[0] for argument in arguments if not argument.startswith("-"))
+    by_name = any(argument.startswith(("-k", "-m", "--long")) for argument in arguments)
+    return by_name or any((checkout.root() / path).exists() for path in paths)
 
 
 def get_optional_tools(*, yes: bool, print_line: Callable[[str], None]) -> None:

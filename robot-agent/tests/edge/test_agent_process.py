@@ -46,6 +46,7 @@ async def enabled(robot) -> None:
     await until(lambda: robot.fog.state.mode == "NORMAL", "the robot is in NORMAL")
 
 
+@pytest.mark.smoke
 async def test_agent_localizes_refuses_a_wrong_key_and_drives_a_path(robot):
     await robot.localized()
     assert robot.fog.state.mode == "INIT"

@@ -37,6 +37,7 @@ def alive(pid: int) -> bool:
         return False
 
 
+@pytest.mark.smoke
 def test_wheels_stop_each_time_the_guardian_is_killed_and_drive_again(rig):
     for _ in range(3):
         rig.drive()

@@ -59,6 +59,7 @@ async def connected_node(fog):
         yield node, zenoh
 
 
+@pytest.mark.smoke
 async def test_echoes_block_an_area_and_free_readings_clear_it(fog, until):
     fog.start("hazard_aggregator")
     await fog.ready("hazard_aggregator")

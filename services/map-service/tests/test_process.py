@@ -128,6 +128,7 @@ async def test_no_area_is_clear_without_an_aggregator(fog, until):
         await until(lambda: robot.cost(3.5, 3.0) == LETHAL, "lethal", lambda: fog.log("map_service"))
 
 
+@pytest.mark.smoke
 async def test_zone_reaches_the_robot_and_survives_a_kill_of_the_map_service(fog, until, tokens):
     async with running(fog, "map_service") as (client, robot, _):
         answer = await client.post("/api/v1/zones", json=CIRCLE, headers=tokens["operator"])

@@ -261,6 +261,7 @@ def via(path: RobotPath) -> str:
     return "upper" if max(y for _, y in path.points) > 10.0 else "lower"
 
 
+@pytest.mark.smoke
 async def test_mission_is_replanned_around_a_hazard_survives_a_kill_and_ends_when_reached(
     tmp_path: Path,
 ) -> None:

@@ -89,7 +89,7 @@ def runtime(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path))
     for name in ("AGGREGATOR_PORT", "MAP_PORT", "PLANNER_PORT"):
         monkeypatch.setenv(f"FOGNAV_{name}", "1")
-    for name in ("FOG", "TOKEN", "TOKEN_FILE", "TOKENS_FILE", "OPERATOR_KEY_FILE"):
+    for name in ("FOG", "TOKEN", "TOKEN_FILE", "TOKENS_FILE"):
         monkeypatch.delenv(f"FOGNAV_{name}", raising=False)
     return tmp_path / "fognav"
 
@@ -594,7 +594,7 @@ def test_stop_is_told_to_be_open_while_the_planner_hangs(demo: Service, monkeypa
     assert len(done.told) == 1
 
 
-def test_commands_go_through_the_planner_for_who_has_a_token_and_no_key(demo: Service) -> None:
+def test_commands_go_through_the_planner_which_signs_them(demo: Service) -> None:
     path = "/api/v1/robots/r1/commands"
     demo.answers["POST", path] = (200, {"accepted": True, "reason": "enabled; the mode is NORMAL", "mode": "INIT"})
     demo.answers["GET", "/api/v1/robots/r1"] = (200, {"state": {"mode": "NORMAL"}})
@@ -607,16 +607,9 @@ def test_commands_go_through_the_planner_for_who_has_a_token_and_no_key(demo: Se
     assert "needs the role operator" in run("robot", "pose", "1,2,0", code=1)
 
 
-@pytest.mark.parametrize("command", ["enable", "reset"])
-def test_signed_command_needs_a_key_and_a_router(demo: Service, tmp_path, monkeypatch, command: str) -> None:
+def test_command_needs_a_token_that_the_planner_signs_for(demo: Service, tmp_path: Path) -> None:
     (tmp_path / "token").unlink()
-    assert "the token file" in run("robot", command, code=2)
-    monkeypatch.setenv("FOGNAV_OPERATOR_KEY_FILE", str(tmp_path / "key"))
-    (tmp_path / "key").write_text("aa")
-    assert "is only 1 bytes long" in run("robot", command, code=2)
-    (tmp_path / "key").write_text("aa" * 32)
-    output = run("robot", command, code=1)
-    assert "the zenoh router tcp/127.0.0.1:1 can't be reached" in output
+    assert "the token file" in run("robot", "enable", code=2)
 
 
 def test_pose_needs_a_heading(demo: Service) -> None:

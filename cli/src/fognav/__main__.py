@@ -138,10 +138,10 @@ def _prepare(*, yes: bool) -> None:
     rich_help_panel=installed.DEVELOP,
 )
 def run_tests(context: typer.Context, *, yes: Yes = False) -> None:
-    """Set up what is missing, then run the tests on all cores: some minutes of them, or those that you name.
+    """Set up what is missing, then run the tests on all cores.
 
-    With --all every test runs, with --rest those that are left out without it, with --long new random worlds, too.
-    Further arguments go to pytest (`-n 0` runs one test at a time).
+    These are some minutes of them, or those that you name. With --all every test runs, with --rest those that are
+    left out without it, with --long new random worlds, too. Further arguments go to pytest (`-n 0` runs one at a time).
     """
     from fognav import testing  # noqa: PLC0415  # keeps the other commands fast
 

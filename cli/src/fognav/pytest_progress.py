@@ -5,15 +5,12 @@ With pytest-xdist the bar and the summary are those of the process that distribu
 
 from collections import Counter
 from collections.abc import Generator
-from typing import TYPE_CHECKING, Final
+from typing import Any, Final
 
 import pytest
 from _pytest.terminal import TerminalReporter  # pytest has no public name for it
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
-
-if TYPE_CHECKING:
-    from xdist.workermanage import WorkerController
 
 _NAME: Final = "fognav-progress-bar"
 _SKIPPED: Final = "Skipped: "
@@ -34,7 +31,7 @@ def pytest_deselected(items: list[pytest.Item]) -> None:
 
 
 @pytest.hookimpl(optionalhook=True)
-def pytest_testnodedown(node: "WorkerController") -> None:
+def pytest_testnodedown(node: Any) -> None:  # noqa: ANN401  # a worker of pytest-xdist, which has no types
     """Take over a worker's count; each has left out the same tests."""
     vars(node.config)[_LEFT_OUT] = node.workeroutput.get(_LEFT_OUT, 0)
 

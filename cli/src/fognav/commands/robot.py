@@ -11,7 +11,7 @@ from typing import Annotated, Any, Final
 import msgspec
 import typer
 
-from fog_contracts.commands import PROFILE_OF, STOPS
+from fog_contracts.commands import PROFILE_OF
 from fog_contracts.messages import CommandKind, Id, Mode, Pose, ProfileName
 from fog_runtime import logs
 from fognav.operate import rest_commands, stopping
@@ -150,7 +150,7 @@ def robot_pose(pose: Start, *, robot: RobotOption = None, fog: FogOption = None,
             raise WrongUseError(f"place {pose} has no heading: give {place['x']},{place['y']},THETA")
         else:
             x, y, theta = place["x"], place["y"], place["theta"]
-        outcome = _send(found, found.robot(robot), "initial_pose", Pose(x=x, y=y, theta=theta))
+        outcome = rest_commands.command(found, found.robot(robot), "initial_pose", Pose(x=x, y=y, theta=theta))
         _report(outcome, json=json)
 
 
@@ -202,7 +202,7 @@ def robot_cancel(*, robot: RobotOption = None, fog: FogOption = None, json: Json
             _report(Outcome(accepted=False, reason=str(error), mode=_view(found, chosen)[1]), json=json)
         except FailedError as error:
             # Without the planner the robot can drop its goal itself, until the planner is back.
-            outcome = _send(found, chosen, "cancel")
+            outcome = asyncio.run(_cancel(found, chosen))
             _report(msgspec.structs.replace(outcome, reason=f"{outcome.reason}; {error}"), json=json)
         _report(
             Outcome(accepted=True, reason=f"the mission of robot {chosen} is ended", mode=_view(found, chosen)[1]),
@@ -241,36 +241,21 @@ def robot_watch(
     with exit_codes(), contextlib.suppress(KeyboardInterrupt):
         found = find_fog(fog)
         chosen = found.robot(robot)
-        if found.commands_by_rest:
-            _watch_by_rest(found, chosen, seconds, json=json)
-        else:
-            asyncio.run(_watch(found, chosen, seconds, json=json))
+        _watch(found, chosen, seconds, json=json)
 
 
 def _run_command(kind: CommandKind, robot: str | None, fog: str | None, *, json: bool) -> None:
     with exit_codes():
         found = find_fog(fog)
-        _report(_send(found, found.robot(robot), kind), json=json)
+        _report(rest_commands.command(found, found.robot(robot), kind), json=json)
 
 
-def _send(fog: Fog, robot: str, kind: CommandKind, pose: Pose | None = None) -> Outcome:
-    """Command a robot: by a command signed here, or through the planner, which signs it for who has a token.
-
-    Raises `FailedError`, `WrongUseError`.
-    """
-    if fog.commands_by_rest and kind not in STOPS:
-        return rest_commands.command(fog, robot, kind, pose)
-    return asyncio.run(_command(fog, robot, kind, pose))
-
-
-async def _command(fog: Fog, robot: str, kind: CommandKind, pose: Pose | None = None) -> Outcome:
+async def _cancel(fog: Fog, robot: str) -> Outcome:
     from fognav.operate.robots import connect  # noqa: PLC0415  # zenoh: keeps the other commands fast
 
     logs.configure("fognav", "error", "text")
-    # A command that can't be signed is refused before anything is connected; a stop needs no signature.
-    key = None if kind in STOPS else fog.operator_key
     async with connect(fog, robot) as connected:
-        return await connected.command(kind, key, pose)
+        return await connected.stop("cancel")
 
 
 def _report(outcome: Outcome, *, json: bool) -> None:
@@ -325,20 +310,7 @@ def _view(fog: Fog, robot: str) -> tuple[Mapping[str, Any], Any]:
     raise FailedError(f"there is no robot {robot} at {fog.system.name}; known robots: {known}")
 
 
-async def _watch(fog: Fog, robot: str, seconds: float, *, json: bool) -> None:
-    from fognav.operate.robots import connect  # noqa: PLC0415  # zenoh: keeps the other commands fast
-
-    logs.configure("fognav", "error", "text")
-    ends = time.monotonic() + seconds if seconds else None
-    async with connect(fog, robot) as connected:
-        while ends is None or time.monotonic() < ends:
-            state = await connected.next_state()
-            if state is None:
-                raise FailedError(f"robot {robot} publishes no state: check that its agent runs and is connected")
-            _print_state(robot, msgspec.to_builtins(state), msgspec.to_builtins(connected.pose), json=json)
-
-
-def _watch_by_rest(fog: Fog, robot: str, seconds: float, *, json: bool) -> None:
+def _watch(fog: Fog, robot: str, seconds: float, *, json: bool) -> None:
     ends = time.monotonic() + seconds if seconds else math.inf
     for view in rest_commands.states(fog, robot):
         _print_state(robot, view["state"], view["pose"], json=json)

@@ -55,7 +55,6 @@ class Presence:
             urls=urls,
             pids={"demo": os.getpid(), **stack.pids()},
             token_file=str(stack.token_file),
-            key_file=str(stack.key_file),
             credentials_file=None if credentials is None else str(credentials),
             robots=[self._plan.robot],
             speed=self._scene.speed,

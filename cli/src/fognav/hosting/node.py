@@ -148,7 +148,6 @@ class LocalNode:
             },
             pids={UP: os.getpid(), **{name: pid for name, pid in found.items() if pid is not None}},
             token_file=str(keys / ADMIN_TOKEN),
-            key_file=str(keys / OPERATOR_KEY),
             credentials_file=str(self.config.locks.credentials(site.name("console"))),
             robots=[robot.id for robot in site.loaded.site.robots],
             data=str(folder.path),

@@ -14,7 +14,6 @@ import msgspec
 
 from fog_contracts.messages import Id
 from fog_runtime.credentials import Credentials
-from fog_runtime.operator_key import OperatorKeyError, read_operator_key
 from fog_supervisor import net
 from fognav.locking import own_credentials
 from fognav.operate.registry import System, registered
@@ -24,7 +23,6 @@ from fognav.output import FailedError, WrongUseError
 FOG: Final = "FOGNAV_FOG"
 TOKEN: Final = "FOGNAV_TOKEN"  # noqa: S105  # a variable's name
 TOKEN_FILE: Final = "FOGNAV_TOKEN_FILE"  # noqa: S105  # same
-KEY_FILE: Final = "FOGNAV_OPERATOR_KEY_FILE"
 _GIVE_TOKEN: Final = f"Set {TOKEN} to an operator's token, or {TOKEN_FILE} to a file that holds it"
 
 
@@ -70,25 +68,6 @@ class Fog:
     def credentials(self) -> Credentials:
         """The caller's credentials, or nobody's; raises `WrongUseError` for a file that can't be used."""
         return own_credentials(self.system.credentials_file)
-
-    @property
-    def commands_by_rest(self) -> bool:
-        """Whether commands to robots go through the planner: the caller has a token, and not the operators' key."""
-        return not (os.environ.get(KEY_FILE) or self.system.key_file) and self.token is not None
-
-    @cached_property
-    def operator_key(self) -> bytes:
-        """The key that signs commands to robots; raises `WrongUseError` without one."""
-        file = os.environ.get(KEY_FILE) or self.system.key_file
-        if file is None:
-            raise WrongUseError(
-                f"commands to the robots of {self.system.name} are signed: set {KEY_FILE} to the site's operator.key, "
-                f"or let the planner sign them. {_GIVE_TOKEN}"
-            )
-        try:
-            return read_operator_key(Path(file))
-        except OperatorKeyError as error:
-            raise WrongUseError(str(error)) from error
 
     def robot(self, chosen: str | None) -> str:
         """Return the chosen robot, or the only one; raises `WrongUseError` when there is a choice."""

@@ -37,7 +37,6 @@ class System(msgspec.Struct, frozen=True, kw_only=True):
     urls: dict[str, str]
     pids: dict[str, int]
     token_file: str | None = None
-    key_file: str | None = None
     credentials_file: str | None = None
     robots: list[str] = []
     speed: float = 1.0

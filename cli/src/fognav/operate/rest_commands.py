@@ -1,4 +1,4 @@
-"""Commands to a robot through the planner's REST API, for who has a token and not the operators' key."""
+"""Commands to a robot through the planner's REST API, which signs them for who has an operator's token."""
 
 from collections.abc import Iterator, Mapping
 from typing import Any

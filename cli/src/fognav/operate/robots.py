@@ -1,4 +1,4 @@
-"""Signed commands to a robot, and its states, over the zenoh router of a running system."""
+"""A robot's states, and its stop, straight over the zenoh router of a running system."""
 
 import asyncio
 import getpass
@@ -9,8 +9,7 @@ from typing import Final
 
 from fog_contracts import channels as ch
 from fog_contracts.codec import ContractError
-from fog_contracts.commands import STOPS
-from fog_contracts.messages import CommandKind, Pose, RobotPath, RobotPose, RobotState
+from fog_contracts.messages import CommandKind, RobotPath, RobotPose, RobotState
 from fog_runtime.clock import SystemClock
 from fog_runtime.robot_commands import REPLY_TIMEOUT_S, RobotCommands
 from fog_runtime.transports.zenoh_edge import ZenohEdge
@@ -25,7 +24,7 @@ _PATHS: Final = 64
 
 
 class Robot:
-    """A robot of a running system: its latest state, pose and paths, and commands to it."""
+    """A robot of a running system: its latest state, pose and paths, and what stops it."""
 
     def __init__(self, edge: ZenohEdge, fog: Fog, robot: str, clock: SystemClock) -> None:
         self._edge = edge
@@ -66,30 +65,17 @@ class Robot:
             return None
         return self.state
 
-    async def command(
-        self,
-        kind: CommandKind,
-        key: bytes | None,
-        pose: Pose | None = None,
-        *,
-        on_reply: Callable[[], None] | None = None,
-    ) -> Outcome:
-        """Send a command signed with the operators' `key`; a stop needs none.
+    async def stop(self, kind: CommandKind = "disable", *, on_reply: Callable[[], None] | None = None) -> Outcome:
+        """Send one of the commands that stop a robot, and need no signature.
 
         `on_reply` is called when the robot has replied, before its mode is waited for.
         Raises `FailedError` when the robot does not answer.
         """
-        state = self.state
-        if kind not in STOPS and state is None and (state := await self.next_state()) is None:
-            raise FailedError(
-                f"robot {self.id} publishes no state. Check its id, that its agent runs, and that it is connected to "
-                f"{router(self._fog)}"
-            )
-        commands = RobotCommands(self._edge, operator=getpass.getuser(), key=key)
+        commands = RobotCommands(self._edge, operator=getpass.getuser(), key=None)
         try:
             # The timeout is in the clock's seconds, of which more pass in a fast simulation.
             timeout_s = REPLY_TIMEOUT_S * max(1.0, self.clock.speed)
-            reply = await commands.send(kind, self.id, state, pose, timeout_s)
+            reply = await commands.send(kind, self.id, None, timeout_s=timeout_s)
         except ContractError as error:
             raise FailedError(f"robot {self.id} gave an invalid reply: {error}. Check that versions match") from error
         if reply is None:

@@ -141,7 +141,7 @@ class _Stop:
         self._running = asyncio.get_running_loop(), task
         try:
             async with connect(self._fog, robot) as connected:
-                return await connected.command("disable", None, on_reply=self._replied)
+                return await connected.stop(on_reply=self._replied)
         finally:
             self._running = None
 

@@ -313,7 +313,6 @@ class _ConnectedRobot:
     def __init__(self, fog: Fog, connected: Robot) -> None:
         self._fog = fog
         self._connected = connected
-        self._key = None if fog.commands_by_rest else fog.operator_key
 
     @property
     def id(self) -> str:
@@ -337,9 +336,9 @@ class _ConnectedRobot:
         await self._connected.clock.sleep(PERIOD_S)
 
     async def command(self, kind: CommandKind, pose: Pose | None = None) -> Outcome:
-        if self._key is None and kind not in STOPS:
-            return await asyncio.to_thread(rest_commands.command, self._fog, self.id, kind, pose)
-        return await self._connected.command(kind, self._key, pose)
+        if kind in STOPS:
+            return await self._connected.stop(kind)
+        return await asyncio.to_thread(rest_commands.command, self._fog, self.id, kind, pose)
 
     async def set_goal(self, place: str) -> str:
         answer = await asyncio.to_thread(self._fog.send, "PUT", PLANNER, self._goal, {"place": place})

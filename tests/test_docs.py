@@ -54,6 +54,13 @@ def test_contributing_names_every_variable_that_makes_tests_longer() -> None:
     assert variables - named == set()
 
 
+def test_changelog_has_at_most_40_entries_of_one_line_for_each_release() -> None:
+    releases = re.split(r"^## ", (ROOT / "CHANGELOG.md").read_text("utf-8"), flags=re.MULTILINE)[1:]
+    entries = [[line for line in release.splitlines()[1:] if line and line[0] != "#"] for release in releases]
+    assert [line for lines in entries for line in lines if not line.startswith("- ") or len(line) > 120] == []
+    assert [len(lines) for lines in entries if len(lines) > 40] == [], "drop what matters least to who upgrades"
+
+
 @pytest.mark.parametrize("record", sorted((ROOT / "docs" / "adr").glob("0*.md")), ids=lambda path: path.stem)
 def test_decision_records_have_a_number_and_a_dated_status(record: Path) -> None:
     title, empty, status, *_ = record.read_text("utf-8").splitlines()

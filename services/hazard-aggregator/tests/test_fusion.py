@@ -474,6 +474,17 @@ def test_readings_count_while_a_nodes_clock_is_slewed_and_afterwards(ppm, slew, 
     assert all(isinstance(one, Taken) and one.counts for one in taken)
 
 
+@pytest.mark.parametrize("ppm", [1_000, 83_333])
+def test_slewed_clock_is_followed_though_the_radio_holds_back_readings_now_and_then(ppm):
+    order, uptime, arrived, refused = ReadingOrder(), 1000.0, 0.0, 0
+    for seq in range(60_000):
+        now = 0.1 * seq
+        uptime += 0.1 * (1.0 - 1e-6 * ppm * (100.0 < now < 100.0 + 5e6 / ppm))
+        arrived = max(arrived, now + max(0.0, 0.4 - now % 10.0))  # every 10 s one waits for 0.4 s, and others behind it
+        refused += not isinstance(order.place(reading_at(seq, uptime), 5000.0 + arrived), Taken)
+    assert refused == 0
+
+
 def test_readings_that_the_network_holds_back_for_seconds_do_not_count():
     order = ReadingOrder()
     for seq in range(600):

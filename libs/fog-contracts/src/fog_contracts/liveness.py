@@ -9,6 +9,7 @@ and whatever one takes longer is its delay, which counts as age. No wall clock i
 from __future__ import annotations
 
 import math
+from collections import deque
 from typing import TYPE_CHECKING, Final
 
 if TYPE_CHECKING:
@@ -21,8 +22,10 @@ MAX_CLOCKS: Final = 8
 LATE_S: Final = 0.25
 """A sender that is not trusted yet must start anew when a heartbeat was this much (s) faster than those before."""
 GAP_S: Final = 3.0
+PIECE_S: Final = 2.5
 JITTER_S: Final = 0.3
-"""Messages come steadily when no two are further apart, and none takes longer by so much (s) than the one before."""
+"""Messages come steadily when no two are further apart than the gap, and the fastest one of each piece of time takes no
+longer, or shorter, by more than this (s) than that of the piece before: a radio holds back single ones all the time."""
 
 
 class DelayEstimator:
@@ -33,9 +36,10 @@ class DelayEstimator:
     """
 
     def __init__(self, steady_s: float = math.inf) -> None:
-        self._steady_s = steady_s
-        self._steady_since = -math.inf
-        self._latest = self._lowest = math.inf
+        self._pieces = 0 if steady_s == math.inf else round(steady_s / PIECE_S)
+        self._fastest: deque[float] = deque(maxlen=self._pieces)  # of each whole piece since when they come steadily
+        self._piece_at = -math.inf
+        self._piece = math.inf
         self._offset = math.inf
         self._offset_at = 0.0
         self.faster_by = 0.0
@@ -44,7 +48,8 @@ class DelayEstimator:
     def update(self, sent: float, now: float) -> float:
         """Return the delay of a message that was sent at `sent` of the sender's clock (s) and arrives `now`."""
         offset = now - sent
-        self._follow(offset, now)
+        if self._pieces:
+            self._follow(offset, now)
         known = self._offset + CLOCK_DRIFT * (now - self._offset_at) if self._offset < math.inf else math.inf
         self.faster_by = max(0.0, known - offset)
         self._offset, self._offset_at = min(known, offset), now
@@ -52,11 +57,18 @@ class DelayEstimator:
 
     def _follow(self, offset: float, now: float) -> None:
         """Forget the fastest message of all when later ones came steadily, without a gap in which a queue forms."""
-        if now - self._offset_at > GAP_S or abs(offset - self._latest) > JITTER_S:
-            self._steady_since, self._lowest = now, math.inf
-        self._latest, self._lowest = offset, min(self._lowest, offset)
-        if now - self._steady_since >= self._steady_s:
-            self._offset, self._lowest, self._steady_since = self._lowest, math.inf, now
+        if now - self._offset_at > GAP_S:
+            self._fastest.clear()
+            self._piece_at, self._piece = now, math.inf
+        self._piece = min(self._piece, offset)
+        if now - self._piece_at < PIECE_S:
+            return
+        if self._fastest and abs(self._piece - self._fastest[-1]) > JITTER_S:
+            self._fastest.clear()
+        self._fastest.append(self._piece)
+        self._piece_at, self._piece = now, math.inf
+        if len(self._fastest) == self._pieces:
+            self._offset = min(self._fastest)
 
 
 class Delays:

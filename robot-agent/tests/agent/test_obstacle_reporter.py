@@ -26,7 +26,7 @@ from fog_contracts.messages import (
 from fog_kernels.astar import Planner
 from fog_kernels.inflation import inflate, inflation_table
 from fog_kernels.raycast import cast
-from robot_agent.agent.blocked_places import BlockedPlaces
+from robot_agent.agent.navigation import BlockedPlaces
 from robot_agent.agent.obstacle_reporter import ObstacleReporter, view
 from robot_agent.config import LocalizationConfig
 from robot_agent.localization.map_fields import map_fields

@@ -28,7 +28,6 @@ from fog_contracts.follower import MapFollower
 from fog_contracts.handlers import Fence
 from fog_contracts.messages import LoopHealth
 from fog_contracts.replica import MapError
-from robot_agent.agent.blocked_places import BlockedPlaces
 from robot_agent.agent.maneuvers import Maneuvers
 from robot_agent.agent.motion_guard import MotionGuard
 from robot_agent.agent.navigation import Navigation, PreparedMap, prepare_map
@@ -36,8 +35,7 @@ from robot_agent.agent.obstacle_reporter import WAY_M, ObstacleReporter
 from robot_agent.agent.operator_commands import OperatorCommands, initial_pose_refusal
 from robot_agent.agent.path_driving import PathDriving
 from robot_agent.agent.pose_keeper import PoseKeeper
-from robot_agent.agent.publishing import PublishingPolicy
-from robot_agent.agent.reports import hindrances, robot_pose, robot_state
+from robot_agent.agent.reports import PublishingPolicy, hindrances, robot_pose, robot_state
 from robot_agent.agent.rest_policy import IdleScans, RestPolicy
 from robot_agent.agent.safety_supervisor import BaseSource, LidarSource, SafetySupervisor, safety_inputs
 from robot_agent.localization.localizer import Localizer
@@ -93,9 +91,8 @@ class AgentCore:
         self._pose_keeper = PoseKeeper(self._localizer)
         self._fence = Fence()
         self._map = MapFollower()
-        self._places = BlockedPlaces()
         self._driving = PathDriving(config)
-        self._navigation = Navigation(config, self._map, self._places, self._driving, self._localizer, find_profile)
+        self._navigation = Navigation(config, self._map, self._driving, self._localizer, find_profile)
         self._guard = MotionGuard(config, self._localizer)
         self._maneuvers = Maneuvers(config, self._localizer, self._guard)
         self._safety = SafetySupervisor(config.safety)

@@ -1,3 +1,5 @@
+"""What the base measures reaches state, metrics and reasons; pose, state and obstacles are published when due."""
+
 from __future__ import annotations
 
 import itertools
@@ -6,9 +8,91 @@ import msgspec
 import pytest
 
 from fog_contracts import channels as ch
-from fog_contracts.messages import RobotObstacles, RobotPose, RobotState, Trace
+from fog_contracts.messages import Power, RobotObstacles, RobotPose, RobotState, Trace
+from fog_runtime.configuration.robot_file import default_robot
 from robot_agent.agent.path_driving import PathTraces
-from robot_agent.agent.publishing import STANDING_POSE_S, PublishingPolicy
+from robot_agent.agent.reports import STANDING_POSE_S, PublishingPolicy, power_warnings
+from robot_agent.bases.diffdrive.emulator import DiffDriveEmulator
+from robot_agent.bases.roomba600.driver import MEASURE_S
+from robot_agent.bases.roomba600.emulator import Battery, RoombaEmulator
+from robot_agent.guardian.core import GuardianCore
+from robot_agent.hardware import BaseStatus
+from robot_agent.registry import make_base
+
+
+def readings(base, name, seconds, *, change=None):
+    """The feedback of a base in emulated time; `change` is called before each step with the time."""
+    core, now, feedback = GuardianCore(make_base(default_robot(base=name))), 10.0, []
+    for step in range(round(seconds / 0.01)):
+        now += 0.01
+        if change is not None:
+            change(step * 0.01)
+        base.tick(now, 0.01)
+        outputs = [core.on_bytes(base.outgoing(now), now), core.tick(now)]
+        for output in outputs:
+            feedback += output.feedback
+            base.receive(output.data, now)
+    return feedback
+
+
+def test_battery_charger_and_light_bumper_of_a_roomba_are_read():
+    base = RoombaEmulator(battery=Battery(charge_mah=650.0, capacity_mah=2600.0))
+    base.world.light_signals = (0, 10, 250, 3000, 4095, 7)
+    base.world.temperature_c = 31
+    status = readings(base, "roomba600", 1.0)[-1].status
+    assert status.battery == pytest.approx(0.25, abs=0.001)
+    assert status.proximity == (0, 10, 250, 3000, 4095, 7)
+    power = status.power
+    assert (power.charge_ah, power.capacity_ah, power.temperature_c) == (0.65, 2.6, 31.0)
+    assert power.voltage_v == pytest.approx(base.battery.voltage_mv / 1000, abs=0.01)
+    assert power.current_a == pytest.approx(-0.18)
+    assert power.charging == "no"
+    base.world.home_base = True
+    status = readings(base, "roomba600", 1.0)[-1].status
+    assert (status.charging, status.power.charging) == (True, "bulk")
+    assert status.power.current_a == pytest.approx(1.25)
+
+
+def test_voltage_of_a_board_is_read():
+    status = readings(DiffDriveEmulator(), "diffdrive", 0.5)[-1].status
+    assert status.power.voltage_v is not None
+    assert 10.0 < status.power.voltage_v < 13.0
+    assert status.proximity == ()
+
+
+def test_noise_of_the_measurements_sends_no_more_feedback():
+    def flicker(base):
+        def change(at):
+            base.world.light_signals = (round(at * 1000) % 4000,) * 6
+
+        return change
+
+    still, noisy = RoombaEmulator(), RoombaEmulator()
+    expected = len(readings(still, "roomba600", 4.0))
+    feedback = readings(noisy, "roomba600", 4.0, change=flicker(noisy))
+    assert len(feedback) == expected
+    assert len({each.status.proximity for each in feedback}) >= 4.0 / MEASURE_S - 1
+
+
+@pytest.mark.parametrize(
+    ("status", "warnings"),
+    [
+        (None, []),
+        (BaseStatus(), []),
+        (BaseStatus(battery=0.2), []),
+        (BaseStatus(battery=0.199), ["the battery is low (15 %): take the robot to its charger"]),
+        (BaseStatus(battery=0.15), ["the battery is low (15 %): take the robot to its charger"]),
+        (BaseStatus(battery=0.0), ["the battery is low (0 %): take the robot to its charger"]),
+        (BaseStatus(battery=0.1, charging=True), []),
+        (
+            BaseStatus(battery=0.9, charging=True, power=Power(charging="fault")),
+            ["the charger reports a fault: the battery does not charge"],
+        ),
+    ],
+)
+def test_a_low_battery_and_a_charger_in_fault_are_reasons(status, warnings):
+    assert power_warnings(status, 0.2) == warnings
+
 
 POSE = RobotPose(x=0.0, y=0.0, theta=0.0, covariance=[0.0] * 9, v=0.0, w=0.0, radius=0.2, height=0.3, stamp=0.0)
 STATE = RobotState(mode="HOLD", reasons=["the map is 1.2 s old"], enabled=True, battery=0.8, goal_id=None, map_epoch=1,

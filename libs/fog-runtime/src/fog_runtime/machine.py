@@ -1,7 +1,6 @@
 """A process on its machine: clock, suspension, signals, service manager, open files. Standard library only."""
 
 import os
-import resource
 import signal
 import socket
 import time
@@ -122,6 +121,8 @@ class ServiceManager:
 
 def raise_limit() -> None:
     """Allow as many as the system lets this process allow itself; each connection of a client takes one or more."""
+    import resource  # noqa: PLC0415  # the guardian and the watchdog load this module, too, and never need it
+
     soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
     if soft != hard:
         resource.setrlimit(resource.RLIMIT_NOFILE, (hard, hard))

@@ -29,8 +29,9 @@ from fog_contracts.messages import (
     ZoneSet,
 )
 from fog_contracts.replica import MapError
-from robot_agent.agent.core import AgentCore, decide
+from robot_agent.agent.core import AgentCore
 from robot_agent.lidar_mounting import Mounting
+from robot_agent.motion.local_planner import decide
 
 
 @pytest.fixture

@@ -22,7 +22,7 @@ from fog_contracts.messages import PlanReply, Pose, RobotCommand, RobotGoal, Rob
 from fog_contracts.replica import MasterMap
 from fog_kernels.inflation import inflate, inflation_table
 from fog_kernels.raycast import cast
-from robot_agent.agent.core import AgentCore, decide
+from robot_agent.agent.core import AgentCore
 from robot_agent.config import AgentConfig, agent_config
 from robot_agent.guardian.link import BaseFeedback
 from robot_agent.hardware import (
@@ -34,6 +34,7 @@ from robot_agent.hardware import (
     WheelOdometry,
 )
 from robot_agent.localization.pose import Pose2
+from robot_agent.motion.local_planner import decide
 from robot_agent.scan_builder import RepeatCounter
 
 KEY = b"k" * 32

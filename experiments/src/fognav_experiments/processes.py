@@ -16,7 +16,7 @@ from fog_contracts.handlers import Moment
 from fog_contracts.messages import MapSnapshot, Message, PlanReply, RobotGoal, RobotState
 from fognav_experiments.link import Link
 from planner.missions import DockGoals
-from robot_agent.agent.core import decide
+from robot_agent.motion.local_planner import decide
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Mapping, Sequence

@@ -6,8 +6,8 @@ Values and times go in, values come out. `now` is the robot's own monotonic cloc
 - calls `stream` 20 times a second, 10 times while `idle`, and sends the wheel command to the guardian; base and lidar
   need not be read before a call that `repeats`;
 - runs `search(now).run()`, if there is a search, on any thread, and passes the result to `on_found`; then
-  `decide(control_job(now))`, on any thread, and passes the decision to `accept`; every `profile.control_period`,
-  unless the robot is `standing_by` and there was no job;
+  `decide(control_job(now))` of `motion.local_planner`, on any thread, and passes the decision to `accept`; every
+  `profile.control_period`, unless the robot is `standing_by` and there was no job;
 - calls `tick` 10 times a second and publishes what it returns;
 - sends the query of `egress_request` to the planner, and passes the reply to `on_egress_reply`;
 - lets the lidar's motor turn while `lidar_on`;
@@ -40,8 +40,6 @@ from robot_agent.agent.rest_policy import IdleScans, RestPolicy
 from robot_agent.agent.safety_supervisor import BaseSource, LidarSource, SafetySupervisor, safety_inputs
 from robot_agent.localization.localizer import Localizer
 from robot_agent.localization.odometry import EncoderFault, Odometry, possible_motion
-from robot_agent.localization.pose import SavedPose
-from robot_agent.motion.local_planner import Decision, Job, decide
 from robot_agent.profiles import fog_only
 
 if TYPE_CHECKING:
@@ -65,7 +63,8 @@ if TYPE_CHECKING:
     from robot_agent.config import AgentConfig
     from robot_agent.guardian.link import BaseFeedback, WheelCommand
     from robot_agent.hardware import LaserScan, LidarSamples
-    from robot_agent.localization.pose import AbsoluteObservation
+    from robot_agent.localization.pose import AbsoluteObservation, SavedPose
+    from robot_agent.motion.local_planner import Decision, Job
     from robot_agent.profiles import FindProfile, Found, Profile, Search
     from robot_agent.safety.conditions import Request
     from robot_agent.safety.gate import SafetyOutputs
@@ -75,8 +74,6 @@ POSSIBLE_WHILE_SUSPENDED: Final = (0.5, 0.5)
 STANDBY_S: Final = 0.14
 """A robot that stands by looks at its inputs at the first call after this time: at every second one. They age by 0.2 s
 more at most, and it stands; the gate's limits begin at 0.3 s."""
-
-__all__ = ["AgentCore", "Decision", "Job", "SavedPose", "decide"]
 
 
 class AgentCore:

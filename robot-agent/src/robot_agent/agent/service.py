@@ -21,8 +21,8 @@ from fog_runtime.clock import Phase, Ticker
 from fog_runtime.machine import ServiceManager, SuspensionMonitor
 from fog_runtime.transports.edges import Edges
 from fog_runtime.usage import name_thread
-from robot_agent.agent.core import decide
 from robot_agent.agent.edges.exporter import Observed, RobotCollector, parent
+from robot_agent.motion.local_planner import decide
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence

@@ -20,8 +20,8 @@ from fog_contracts.handlers import Moment
 from fog_contracts.replica import MapError
 from fog_runtime.record import RecordError, read_entries
 from robot_agent import registry
-from robot_agent.agent.core import decide
 from robot_agent.agent.recording import input_log as log
+from robot_agent.motion.local_planner import decide
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence

@@ -136,7 +136,7 @@ class PathDriving:
         `guard` tells what limits the wheels, `safety` what the gate allowed last.
         """
         self._notice_pause(now)
-        blocked = self.wheels.decision.blocked if self.wheels.decision else None
+        blocked = self.wheels.decision.hindrance if self.wheels.decision else None
         standstill = self._progress.problem(self.mission, guard.reason or blocked, safety, now, cap=self._cap)
         return self._monitor.problem(self.mission, replica.version, now) or standstill
 

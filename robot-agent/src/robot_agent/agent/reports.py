@@ -146,8 +146,8 @@ def hindrances(mission: Mission | None, decision: Decision | None, limited: Reas
     if mission is None:
         return []
     found = [] if limited is None else [limited]
-    if decision is not None and decision.blocked:
-        found.append(decision.blocked)
+    if decision is not None and decision.hindrance is not None:
+        found.append(decision.hindrance)
     if mission.follower is None:
         found.append(Reason(ReasonCode.PATH_AWAITED, "waiting for a path"))
     return found

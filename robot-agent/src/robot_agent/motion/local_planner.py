@@ -129,12 +129,18 @@ class Job:
     recovery: RecoveryMove | None = None
 
 
+_BLOCKED: Final = {
+    ReasonCode.OBSTACLE_NEAR: "an obstacle is so near that no arc is free",
+    ReasonCode.NO_ROOM: "there is no room to turn or back up",
+}
+
+
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Decision:
     """Speeds v, w (m/s, rad/s) and the wheels' speeds (m/s) for the next period.
 
     `arrived`: the path's end is reached. `at_goal`: that is the goal, and its heading is reached, too. `blocked`: why
-    the robot can't move although it should.
+    the robot can't move although it should; its sentence is left out, because decisions are logged and read again.
     """
 
     plan_id: int
@@ -146,7 +152,12 @@ class Decision:
     right: float = 0.0
     arrived: bool = False
     at_goal: bool = False
-    blocked: Reason | None = None
+    blocked: ReasonCode | None = None
+
+    @property
+    def hindrance(self) -> Reason | None:
+        """Why the robot can't move although it should, in words."""
+        return None if self.blocked is None else Reason(self.blocked, _BLOCKED[self.blocked])
 
 
 def wheels(v: float, w: float, axle: float) -> tuple[float, float]:
@@ -209,9 +220,6 @@ def decide(job: Job) -> Decision:
     )
     arrived = math.hypot(end[0] - job.pose.x, end[1] - job.pose.y) <= tolerance
     at_heading = goal_theta is None or abs(wrap(goal_theta - job.pose.theta)) <= config.arcs.heading_tolerance
-    blocked = None
-    if chosen.n_admissible == 0 and not arrived:
-        blocked = Reason(ReasonCode.OBSTACLE_NEAR, "an obstacle is so near that no arc is free")
     left, right = wheels(chosen.v, chosen.w, limits.axle)
     return Decision(
         plan_id=job.plan_id,
@@ -223,7 +231,7 @@ def decide(job: Job) -> Decision:
         right=right,
         arrived=arrived,
         at_goal=job.ends_here and arrived and at_heading,
-        blocked=blocked,
+        blocked=ReasonCode.OBSTACLE_NEAR if chosen.n_admissible == 0 and not arrived else None,
     )
 
 
@@ -240,7 +248,7 @@ def _recover(job: Job, move: RecoveryMove, around: Clearance, body: Body) -> Dec
         w=w,
         left=left,
         right=right,
-        blocked=None if chosen else Reason(ReasonCode.NO_ROOM, "there is no room to turn or back up"),
+        blocked=None if chosen else ReasonCode.NO_ROOM,
     )
 
 

@@ -64,6 +64,7 @@ def test_stale_file_is_listed_by_check_and_updated_by_write(tmp_path: Path, monk
 
 
 @pytest.mark.parametrize("seed", ["1", "2"])
+@pytest.mark.drive
 def test_generated_files_do_not_depend_on_the_hash_seed(seed: str) -> None:
     done = subprocess.run(
         [sys.executable, "-m", "fognav", "channels", "--check"],

@@ -81,6 +81,7 @@ def test_nodes_are_on_a_wall_and_their_limits_end_before_the_opposite_wall(seed:
             assert sonar.range_limit < echoes.min()
 
 
+@pytest.mark.drive
 def test_map_without_a_second_path_gets_a_demo_without_areas() -> None:
     geometry = GridGeometry(600, 48, RESOLUTION, 0.0, 0.0)
     cells = np.full(geometry.shape, 254, dtype=np.uint8)
@@ -177,6 +178,7 @@ def test_no_node_is_proposed_where_no_wall_echoes() -> None:
 
 @pytest.mark.data
 @pytest.mark.parametrize("name", ["ipa/Freiburg52_scan.yaml", "ipa/NLB.yaml", "ipa/lab_intel.yaml", "utexas/2.yaml"])
+@pytest.mark.drive
 def test_every_node_proposed_on_a_recorded_floor_reports_clear(maps_dir: Path, name: str) -> None:
     static = load_map(maps_dir / name)
     site = propose("floor", "map.yaml", static.geometry, static.cells, 1).site

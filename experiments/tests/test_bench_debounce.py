@@ -66,6 +66,7 @@ def test_default_rule_confirms_recorded_obstacles_within_a_quarter_second_and_ra
 
 @pytest.mark.data
 @pytest.mark.parametrize("rule", ["consecutive", "evidence"])
+@pytest.mark.drive
 def test_table_in_the_documentation_is_what_its_command_gives(data_dir, monkeypatch, rule):
     monkeypatch.setattr(debounce, "RULES", {rule: debounce.RULES[rule]})
     rows = debounce.measure(debounce.recordings_in(data_dir / "hcsr04"), 500, 5.0, 1, lambda _: None)

@@ -199,6 +199,7 @@ def short_run(tmp_path_factory):
     return folder, [first, *rest]
 
 
+@pytest.mark.drive
 def test_a_run_that_was_killed_goes_on_where_it_was(short_run):
     folder, records = short_run
     assert [record.setup for record in records] == SETUPS

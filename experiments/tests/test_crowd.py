@@ -129,6 +129,7 @@ class Run:
 
 
 @pytest.mark.parametrize("seed", range(SEEDS))
+@pytest.mark.drive
 def test_robot_among_walking_people_touches_none_and_arrives_or_says_why_it_stands(seed):
     run = Run(seed)
     world = run.system.world

@@ -90,6 +90,7 @@ def test_a_report_of_an_archive_needs_a_folder_of_its_own(tmp_path):
     assert "name a folder for the report with --out DIR" in " ".join(result.output.split())
 
 
+@pytest.mark.drive
 def test_the_committed_results_are_small_and_can_be_reported_again(tmp_path):
     packed = checkout.root() / "docs" / "results" / "estig" / "drives.jsonl.xz"
     assert packed.stat().st_size < 3_000_000

@@ -411,6 +411,7 @@ PLAIN = msgspec.structs.replace(WORLD, warp_m=0.0, placed=[], sensors=Sensors(),
     ],
     ids=lambda value: type(value).__name__ if isinstance(value, msgspec.Struct) else "",
 )
+@pytest.mark.drive
 def test_robot_meets_what_is_drawn_and_no_rule_is_broken(monkeypatch, event, outcome, mode):
     runs = []
     monkeypatch.setattr(
@@ -471,16 +472,19 @@ SITES = Path(__file__).parents[2] / "sites"
 
 
 @pytest.mark.parametrize("file", sorted((HUNT / "mended").glob("*.json")), ids=lambda file: file.stem)
+@pytest.mark.drive
 def test_world_that_broke_a_rule_breaks_it_no_more(file):
     assert hunt(read_world(file), [SITES]).violations == []
 
 
 @pytest.mark.xfail(reason="not mended yet: move its file to `mended` when it is", strict=True)
 @pytest.mark.parametrize("file", sorted((HUNT / "found").glob("*.json")), ids=lambda file: file.stem)
+@pytest.mark.drive
 def test_world_that_breaks_a_rule(file):
     assert hunt(read_world(file), [SITES]).violations == []
 
 
+@pytest.mark.drive
 def test_worlds_of_a_fixed_seed_break_no_rule():
     tasks = [Task(seed=7, number=n, commit="", maps=[], folders=[], tries=0) for n in FIXED]
     assert {found.record.number: found.record.values for found in map(drive, tasks) if found.world} == {}

@@ -250,6 +250,7 @@ def test_recorded_floor_with_real_odometry_meets_its_targets(data_dir, tmp_path)
 
 @pytest.mark.data
 @pytest.mark.parametrize("name", ["seattle-corrected.log.gz", "intel_odom_ref_scan.jsonl.gz"])
+@pytest.mark.drive
 def test_robot_carried_away_on_a_recorded_floor_is_never_good_elsewhere(data_dir, tmp_path, name):
     log = data_dir / "lidar_logs" / name
     if not log.is_file():
@@ -308,6 +309,7 @@ def test_robot_carried_to_where_half_of_its_beams_agree_is_not_good_there_after_
 
 
 @pytest.mark.data
+@pytest.mark.drive
 def test_robot_whose_place_is_not_among_those_that_a_search_keeps_is_not_good_at_another(data_dir, tmp_path):
     """Number 8 of 20 starts in a large building: dozens of places looked alike, and a wrong one was left over."""
     log = data_dir / "lidar_logs" / "infinite-corridor-corrected.log.gz"

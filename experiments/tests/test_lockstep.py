@@ -50,6 +50,7 @@ def test_robot_without_a_hazard_takes_the_short_path_through_the_watched_area(fr
     assert free.distance_m == pytest.approx(free.planned_m, abs=1.0)
 
 
+@pytest.mark.drive
 def test_robot_with_another_base_and_lidar_reaches_its_goal(free):
     other = drive(3, base="diffdrive", lidar="ld19")
     assert (other.outcome, other.contacts) == ("reached", 0), other.reason
@@ -83,6 +84,7 @@ def test_hazard_reaches_the_wheels_within_a_second_and_every_stage_is_stamped(wa
     assert stages["total"] < 1000.0
 
 
+@pytest.mark.drive
 def test_robot_without_nodes_meets_the_barrier_once_and_remembers_it():
     site = load_site(ESTIG)
     # In the corridor of the barrier, because a shorter drive shows the same.

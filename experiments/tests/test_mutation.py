@@ -118,6 +118,7 @@ def fognav(*arguments: str) -> tuple[int, dict[str, Any]]:
 
 @pytest.mark.timeout(700)
 @pytest.mark.parametrize("part", [part.name for part in PARTS])
+@pytest.mark.drive
 def test_tests_of_what_stops_the_robot_reach_every_line_and_branch(part: str) -> None:
     code, parts = fognav("--part", part, "--coverage")
     missing = {module["module"]: module["coverage"]["missing"] for module in parts[part]["modules"]}
@@ -126,6 +127,7 @@ def test_tests_of_what_stops_the_robot_reach_every_line_and_branch(part: str) ->
 
 
 @pytest.mark.timeout(700)
+@pytest.mark.drive
 def test_tests_of_how_the_guardian_wakes_its_base_notice_nine_of_ten_changes() -> None:
     code, parts = fognav("--part", "guardian", "--module", "awakening")
     (awakening,) = (module for module in parts["guardian"]["modules"] if module["mutants"])

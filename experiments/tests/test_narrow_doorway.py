@@ -87,6 +87,7 @@ class Run:
         assert y == pytest.approx(1.5, abs=0.2)
 
 
+@pytest.mark.drive
 def test_robot_before_a_doorway_too_narrow_for_it_holds_and_is_led_round_to_its_goal():
     run = Run(north_open=True)
     run.drive_to_the_doorway()

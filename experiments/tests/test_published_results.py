@@ -44,6 +44,7 @@ def test_results_have_an_archive():
 
 
 @pytest.mark.parametrize("packed", ARCHIVES, ids=lambda file: file.parent.name)
+@pytest.mark.drive
 def test_published_report_is_what_its_archive_gives(packed, tmp_path):
     folder, report, published = Folder(tmp_path / "drives"), tmp_path / "report", packed.parent
     archive.unpack(packed, folder)

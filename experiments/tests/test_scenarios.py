@@ -46,6 +46,7 @@ def test_every_scenario_is_about_its_site(name):
 
 
 @pytest.mark.parametrize("name", PLAYED)
+@pytest.mark.drive
 def test_a_scenario_ends_as_expected(name):
     played = play(read_scenario(FILES[name]), ROOT / "sites")
     assert played.deviations == [], played.result

@@ -139,6 +139,7 @@ def test_the_page_names_the_interval_of_several_routes_and_the_commits_of_its_dr
 # --- where they are driven ---
 
 
+@pytest.mark.drive
 def test_a_cluster_of_two_workers_of_these_sources_drives_a_sweep_and_goes_on_where_it_was(tmp_path, monkeypatch):
     site = ring.ring_site()
     plane = Plane(Axis("readings", [3]), Axis("pause_ms", [100]))

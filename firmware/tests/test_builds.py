@@ -79,6 +79,7 @@ def test_variables_heap_and_stack_fit_into_an_esp8266(firmware):
     assert "Updater::offer" in printed
 
 
+@pytest.mark.drive
 def test_no_input_makes_the_node_fault(firmware, compiler, tmp_path):
     program, inputs = tmp_path / "fuzz", tmp_path / "inputs"
     sanitizers = (

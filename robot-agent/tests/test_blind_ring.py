@@ -30,6 +30,7 @@ def post(x, y, width=0.05):
 
 
 @pytest.mark.parametrize(("lidar_x", "y"), [(0.10, 3.0), (0.12, 3.0), (0.13, 3.04)])
+@pytest.mark.drive
 def test_post_at_the_goal_is_not_touched_by_a_robot_whose_lidar_is_mounted_forward(lidar_x, y):
     world = hall(CIRCLE, lidar_x, [post(4.4, y)])
     world.drive_to([(2.0, 3.0), (4.5, 3.0)])
@@ -38,6 +39,7 @@ def test_post_at_the_goal_is_not_touched_by_a_robot_whose_lidar_is_mounted_forwa
     assert world.travelled > 1.9
 
 
+@pytest.mark.drive
 def test_legs_across_the_way_are_not_touched_by_a_long_body_with_its_lidar_at_the_front():
     world = hall(LONG, 0.30, [post(4.5, 3.0 + 0.35 * k, 0.04) for k in range(-5, 6)])
     world.drive_to([(2.0, 3.0), (7.0, 3.0)])

@@ -159,6 +159,7 @@ WORST = [
 
 @pytest.mark.timeout(900)
 @pytest.mark.parametrize("cell", WORST, ids=str)
+@pytest.mark.drive
 def test_robot_in_a_plain_corridor_arrives_and_is_never_far_from_where_it_believes_to_be(cell):
     outcome = drive(cell)
     assert outcome.reached or (cell.may_stand and "the robot may be" in outcome.reasons[0]), outcome.reasons
@@ -206,6 +207,7 @@ def test_whole_grid_of_corridors(cell):
 
 @pytest.mark.timeout(900)
 @pytest.mark.parametrize(("resolution", "share"), [(0.05, 0.015), (0.1, 0.004)])
+@pytest.mark.drive
 def test_robot_in_a_wide_hall_or_on_a_coarse_map_is_not_slowed_down_while_its_pose_is_right(resolution, share):
     world = LittleWorld(
         rooms=[(1, 1, 23, 17), (4, 17, 6, 18)], size=(24.0, 19.0), pose=(4.0, 4.0, 0.0), resolution=resolution,

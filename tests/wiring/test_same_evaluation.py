@@ -140,6 +140,7 @@ async def evaluate_in_demo(
 
 
 @pytest.mark.parametrize("strays", [False, True])
+@pytest.mark.drive
 async def test_demo_and_lockstep_evaluate_the_same_messages_alike(*, strays: bool) -> None:
     site: LoadedSite = ring.ring_site()
     result, observations = drive_in_lockstep(site, strays=strays)

@@ -71,6 +71,7 @@ def test_default_drives_up_to_what_its_lidar_sees_and_turns_back():
 
 
 @pytest.mark.parametrize("profile", ["default", "full"])
+@pytest.mark.drive
 def test_a_robot_that_plans_for_itself_takes_another_way_round_a_place_that_it_does_not_fit_through(profile):
     # Seven cells of 5 cm: the middle one is free on the costmap, where a body of 0.34 m has not its padding.
     necked = [(1, 1, 5, 2.4), (5, 1.5, 5.2, 1.85), (5.2, 1, 9, 2.4), *RING[1:]]

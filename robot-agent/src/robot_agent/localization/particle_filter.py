@@ -62,8 +62,11 @@ _JUMP_SIGMAS: Final = 3.0
 _STRAIGHT_RAD: Final = 1e-6
 _SHRINK_MOST: Final = 0.5
 """Driving back takes back what the scale has done, but of the variance no more than this share at once."""
-_SEEN_BELOW: Final = 0.9
+_SEEN_BELOW: Final = 0.97
 """A scan that leaves more of the variance has not seen how far the robot is: its curvature there is noise."""
+_CREDIT: Final = 0.2
+"""Share that counts of the little that a scan along a plain corridor tells of how far the robot is. Walls of a map are
+bent by some centimetres: scan after scan sees the same bends, which are not where the walls really have theirs."""
 _GATE: Final = 11.345
 """Squared Mahalanobis distance (0.99 quantile, 3 degrees of freedom) beyond which two poses contradict each other."""
 
@@ -276,10 +279,11 @@ class ParticleFilter:
         return np.asarray(np.dot(places, (places * self._weights).T) * (1.0 / total))
 
     def _see(self, prior: NDArray[np.float64]) -> None:
-        """Forget of the way what the scan has observed, by the covariances (2, 2) of the position before and after."""
-        before, after = (
-            float(self.unseen @ covariance[:2, :2] @ self.unseen) for covariance in (prior, self.covariance)
-        )
+        """Forget of the way what the scan has observed, by the covariances (2, 2) of the position before and after.
+
+        The latter is that of the particles: matching a scan finds some curvature in every corridor.
+        """
+        before, after = (float(self.unseen @ covariance @ self.unseen) for covariance in (prior, self._covariance_xy()))
         if after < _SEEN_BELOW * before:
             self.unseen = self.unseen * (after / before)
 
@@ -300,7 +304,7 @@ class ParticleFilter:
         # Where matching the last scan left no doubt, the weights of this one may speak for themselves.
         unseen = self.uncertainty.along >= ALONG_LEAST_M
         before = least_certain(self._x, self._y, self._weights) if unseen else None
-        kept = before and observed(before, (self._x, self._y, self._theta), self._weights, log_likelihoods)
+        kept = before and observed(before, (self._x, self._y, self._theta), self._weights, log_likelihoods, _CREDIT)
         self._weights = self._weights * np.exp(log_likelihoods)
         self._weights /= self._weights.sum()
         self._move_along(kept)

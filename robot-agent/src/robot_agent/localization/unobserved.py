@@ -72,19 +72,21 @@ def observed(
     particles: tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.float32]],
     weights: NDArray[np.float64],
     log_likelihoods: NDArray[np.float64],
+    credit: float = 1.0,
 ) -> Along | None:
     """Return the mean and variance along the direction of `before` that a scan leaves.
 
-    particles: x, y (m) and theta (rad), each (n); weights: before the scan; log_likelihoods: (n) of the scan. None if
-    the scan sees that direction so well that the weighted particles tell it best.
+    particles: x, y (m) and theta (rad), each (n); weights: before the scan; log_likelihoods: (n) of the scan. credit:
+    share of what the scan tells of that direction that counts. None if it sees that direction so well that the weighted
+    particles tell it best.
     """
     x, y, theta = (np.asarray(values, np.float64) for values in particles)
     cos, sin = before.direction
     turns = np.remainder(theta - theta[0] + math.pi, 2.0 * math.pi)
     scaled = [_standardized(values, weights) for values in (cos * x + sin * y, cos * y - sin * x, turns)]
     gradient, curvature = _along_terms(np.column_stack(scaled), weights, log_likelihoods)
-    share = 1.0 / max(1.0 + curvature, _TINY)
-    shift = share * gradient
+    share = 1.0 / max(1.0 + credit * curvature, _TINY)
+    shift = share * credit * gradient
     if not _STRONG <= share <= 1.0 / _STRONG or abs(shift) > 1.0:
         return None
     variance = share * before.variance

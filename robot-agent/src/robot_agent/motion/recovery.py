@@ -22,6 +22,7 @@ from robot_agent.motion.path_follower import at_speed
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
+    from fog_contracts.messages import ReasonCode
     from fog_kernels.clearance import Clearance
     from fog_kernels.robot import Body
     from robot_agent.localization.pose import Pose2
@@ -310,6 +311,6 @@ class Recoveries:
             return RecoveryMove(heading=heading)
         return RecoveryMove(trail=pose.transform(self._trail.behind(odom)))
 
-    def on_decision(self, blocked: str | None) -> None:
+    def on_decision(self, blocked: ReasonCode | None) -> None:
         """Record whether the move that runs could be made; `blocked`: why the newest decision does not let it."""
         self._refused = self._state.running is not None and blocked is not None

@@ -46,7 +46,6 @@ goal = "desk"
 areas = ["a1"]
 """
 
-
 POLYGON = "polygon = [[1.5, 1.5], [1.5, 0.5], [2.5, 0.5], [2.5, 1.5]]"
 OF_ANOTHER_AREA = f'cone_of = "n1"\n[[areas]]\nid = "a2"\n{POLYGON}'
 

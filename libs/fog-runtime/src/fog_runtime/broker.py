@@ -42,6 +42,8 @@ _TEXT_MAX: Final = 0xFFFF
 _CONTINUES: Final = 0x80
 _NUMBER_BYTES: Final = 4
 
+_log = logs.get("broker")
+
 
 class MalformedError(ValueError):
     """What should be a CONNECT packet is none."""
@@ -177,8 +179,6 @@ _GONE_S: Final = 10.0
 another network stack, and its relay must be started again to be in it."""
 _AGAIN_S: Final = 2.0
 """How often it looks for a new certificate, and whether the broker of `--to` is there."""
-
-_log = logs.get("broker")
 
 
 class BrokerEndedError(Exception):

@@ -17,6 +17,8 @@ from fog_runtime.files import write_port_file
 
 _ANY: Final = ("", "0.0.0.0", "::")  # noqa: S104  # compared with, not listened on
 
+_log = logs.get("health")
+
 
 def reachable_address(host: str, port: int, towards: Sequence[str]) -> str:
     """Return `host:port` as the machines in `towards` can use it, or an empty text if they can't reach it.
@@ -58,9 +60,6 @@ def _is_loopback(host: str) -> bool:
 
 def _join(host: str, port: int) -> str:
     return f"[{host}]:{port}" if ":" in host else f"{host}:{port}"
-
-
-_log = logs.get("health")
 
 
 class Health:

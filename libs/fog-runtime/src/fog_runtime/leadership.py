@@ -92,6 +92,8 @@ if lease and string.match(lease, '^%d+ (.*)$') == ARGV[1] then return redis.call
 return 0
 """
 
+_log = logs.get("leadership")
+
 
 class LeaseStore:
     """The lease of one service of a site; none of its calls raises for a Redis that does not answer."""
@@ -207,8 +209,6 @@ TAKEOVERS: Final = Counter("fognav_takeovers_total", "How often this process beg
 HELD_BACK: Final = Counter(
     "fognav_held_back_messages_total", "Messages that waited because the lease was uncertain", ["channel"]
 )
-
-_log = logs.get("leadership")
 
 
 class Member(Protocol):

@@ -1,6 +1,6 @@
 """Which of several copies of a service may act: one holds a lease, and its epoch is the fencing number. Pure, no I/O.
 
-Redis grants the lease for a short time and draws an epoch with it, larger than every one before (`lease_store`). Every
+Redis grants the lease for a short time and draws an epoch with it, larger than every one before (`leadership`). Every
 message carries its sender's epoch and receivers refuse a lower one (`fog_contracts.handlers`), so a process that wakes
 up after another took over can do no harm. Times are seconds of the process's own monotonic clock.
 

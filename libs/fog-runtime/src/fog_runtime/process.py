@@ -30,6 +30,8 @@ _POLL_S: Final = 0.5
 _LIBRARY: Final = re.compile(r"\.so(\.|$)")
 _MAPPING: Final = re.compile(r"^([0-9a-f]+)-([0-9a-f]+) (\S+) \S+ \S+ \S+ *(.*)$")
 
+_log = logs.get("process")
+
 
 @contextmanager
 def loading(made_garbage: Callable[[], bool]) -> Iterator[None]:
@@ -101,8 +103,6 @@ def _unchanged_parts(smaps: str) -> list[tuple[int, int]]:
 
 ENDING_S: Final = 9.0
 """How long an orderly end may take: less than container engines and service managers wait before they kill."""
-
-_log = logs.get("process")
 
 T = TypeVar("T")
 

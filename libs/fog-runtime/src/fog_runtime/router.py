@@ -45,6 +45,8 @@ OPEN_S: Final = 1.5
 AGAIN_S: Final = 15.0
 """For how long an answer is good: a session costs a small computer half a second of processor time."""
 
+_log = logs.get("router")
+
 
 class RouterHealth(Health):
     """Health of a router, which is asked for a report unless it has answered just before.
@@ -90,8 +92,6 @@ DEAF_S: Final = 40.0
 """After how long without any such session it ends: longer than a small computer is busy with its start."""
 HANGS_S: Final = 60.0
 """After how long without such a look it is ended: its loop, or the interpreter, hangs."""
-
-_log = logs.get("router")
 
 _LOCKS = {
     "--certificate": "its certificate, for --listen tls/ADDRESS:PORT",

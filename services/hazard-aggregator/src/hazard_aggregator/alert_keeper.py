@@ -35,6 +35,8 @@ UNKNOWN = Gauge("fognav_node_unknown", "1 while nothing is known from a node or 
 SILENCE = Gauge("fognav_node_silence_seconds", "Time since the last reading of a node or source", _LABELS)
 FLAPPING = Gauge("fognav_node_flapping", "1 while a node or source changes too often to be believed", _LABELS)
 
+_log = logs.get("alerts")
+
 
 class NodeMetrics:
     """The metrics of the nodes and sources that an aggregator knows; only those that are gone are removed."""
@@ -70,8 +72,6 @@ _QUEUE: Final = 10_000
 """Events that wait while Redis is away; beyond them the oldest are missing in the history."""
 
 ALERTS = Gauge("fognav_alerts", "Alerts of areas and nodes that an operator has acknowledged, or not", ["kind", "seen"])
-
-_log = logs.get("alerts")
 
 
 class AlertKeeper:

@@ -30,6 +30,8 @@ if TYPE_CHECKING:
 
 LAST_WILL: Final = Will(ch.AGGREGATOR_AVAILABILITY, ch.OFFLINE)
 
+_history_log = logs.get("history")
+
 
 class Availability:
     """The word of the one that leads: `offline` comes from a copy that stood by, or from the leader before, too."""
@@ -59,8 +61,6 @@ class Availability:
 _QUEUE: Final = 10_000
 """Hazards that wait while Redis is away; beyond them the oldest are missing in the history."""
 _PERIOD_S: Final = 0.5
-
-_history_log = logs.get("history")
 
 
 class HistoryKeeper:

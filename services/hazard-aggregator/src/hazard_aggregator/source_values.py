@@ -27,7 +27,6 @@ if TYPE_CHECKING:
 _SHOWN: Final = 40
 """Characters of a payload that a reason quotes."""
 
-
 _NOTHING: Final = frozenset({"nan", "none", "null"})
 """What is sent instead of a number that was not measured; ESPHome sends `nan`, or `None` if so configured."""
 

@@ -24,6 +24,8 @@ if TYPE_CHECKING:
 ATTEMPTS: Final = 2
 """How often a change is tried: what is stored may differ from what this process knows, once."""
 
+_log = logs.get("aggregator")
+
 
 class _Earlier(NamedTuple):
     """The result of an earlier attempt at the same request."""
@@ -110,8 +112,6 @@ class AreaWriter:
 OVERRIDE_CHANGED: Final = "has another override by now, or none: read it again, then retry"
 PERIOD_S: Final = 10.0
 """How often the remaining times are stored: after a boot, an override may last longer by up to this time."""
-
-_log = logs.get("aggregator")
 
 
 class OverrideWriter:

@@ -18,7 +18,6 @@ if TYPE_CHECKING:
 
 _ZONES: Final = Table(store_scripts.ZONES, "zone")
 
-
 _TIMES: Final = store_scripts.ZONE_TIMES
 _ALL: Final = "all"
 

@@ -34,6 +34,8 @@ if TYPE_CHECKING:
 PERIOD_S: Final = 30.0
 """How often the remaining times are stored: after a boot, a zone may last longer by up to this time."""
 
+_log = logs.get("map")
+
 
 class TimesKeeper:
     """Stores the times of zones: at once when one starts or ends, else periodically; `boot` is `clock.boot_id`."""
@@ -63,8 +65,6 @@ class TimesKeeper:
 
 
 UNUSABLE = Gauge("fognav_zones_unusable", "Stored zones that are left out of the map because their record is invalid")
-
-_log = logs.get("map")
 
 
 class UnusableZones:

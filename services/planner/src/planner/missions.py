@@ -48,7 +48,6 @@ class SwitchLimiter:
 ReplanReason = Literal["goal", "map", "epoch", "off_path", "clearing", "refused"]
 """Why a path is replanned; `map` is a change of costs within the swept corridor of the remaining path."""
 
-
 Explained = tuple["Version", int]
 PathId = tuple[int, int]
 """Identity of a path: the planner's epoch and the plan's number."""

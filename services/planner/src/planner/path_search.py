@@ -148,7 +148,6 @@ def refused(refusal: Refusal, question: Question | None = None, *, searched: boo
 Covers = Callable[[float, float, float], bool]
 """Whether a point (m, frame `map`) lies in a blocked hazard or zone, or within a margin (m) of it."""
 
-
 Share = Callable[["Cell", "Cell"], "Detour | None"]
 """Returns a bound for a search between two cells that others can use, too; None without one."""
 

@@ -35,6 +35,8 @@ RETURNS: Final = 3
 REMEMBERED_S: Final = 10.0
 """How long a run, and what was found, are remembered after they were last heard."""
 
+_log = logs.get("planner")
+
 
 @dataclass
 class _Runs:
@@ -148,8 +150,6 @@ STATE_MAX_AGE_S: Final = 3.0
 _RECORDS_PERIOD_S: Final = 10.0
 
 DOUBLED = Gauge("fognav_planner_robots_doubled", "Robots whose id two agents use; nothing is planned for them")
-
-_log = logs.get("planner")
 
 
 class CommandError(Exception):

@@ -30,6 +30,8 @@ if TYPE_CHECKING:
 
 _GOALS: Final = Table(store_scripts.GOALS, "mission", version="goal.goal_id")
 
+_log = logs.get("planner")
+
 
 class StoredGoal(Message, frozen=True, kw_only=True):
     """A mission as it is stored; `any_heading`: ignore the goal's theta."""
@@ -83,8 +85,6 @@ NO_MISSION: Final = ""
 """Instead of a mission's id: expect that a robot has none."""
 _ATTEMPTS: Final = 2
 """How often a conditional write is tried: what is stored may differ from what this process knows, once."""
-
-_log = logs.get("planner")
 
 
 class Order(NamedTuple):

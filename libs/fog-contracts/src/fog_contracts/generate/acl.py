@@ -139,7 +139,6 @@ _ROLES_ONLY: Final = (
 )
 _ROBOTS: Final = "The name is the role, for a robot its id; a robot may publish only as itself."
 
-
 _EVERYTHING: Final[dict[str, object]] = {
     "id": "everything",
     "permission": "allow",

@@ -169,7 +169,6 @@ SEVERITY: Final = {"clear": 0, "unknown": 1, "unknown_after_blocked": 2, "blocke
 AREAS_MAX: Final = 1000
 """Areas of a site: so many fit into one heartbeat of the aggregator, whatever their ids."""
 
-
 OverrideState = Literal["blocked", "clear"]
 OverrideReason = Annotated[str, Meta(min_length=1, max_length=200)]
 """Why an operator overrides an area, for other people."""

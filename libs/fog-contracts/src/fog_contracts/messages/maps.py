@@ -146,7 +146,6 @@ class CorridorShape(Message, frozen=True, kw_only=True, tag="corridor", tag_fiel
 
 Shape = PolygonShape | RectangleShape | CircleShape | CorridorShape
 
-
 WEEKDAYS: Final = ("mon", "tue", "wed", "thu", "fri", "sat", "sun")
 Weekday = Literal["mon", "tue", "wed", "thu", "fri", "sat", "sun"]
 TimeOfDay = Annotated[str, Meta(pattern=r"^([01][0-9]|2[0-3]):[0-5][0-9]$(?!\n)")]

@@ -193,7 +193,6 @@ class Power(Message, frozen=True, kw_only=True):
 
 Strength = Annotated[int, Meta(ge=0, le=4095)]
 
-
 ProfileName = Literal["default", "full", "fog"]
 """How a robot navigates: on its own; on its own with the fog's hazards; or by the fog's map and paths."""
 
@@ -315,7 +314,6 @@ class RobotState(Message, frozen=True, kw_only=True):
 
 VIEW_SECTORS: Final = 180
 """Sectors of a robot's view, each 2 degrees wide, counted counter-clockwise from the map's x axis."""
-
 
 REACH_UNIT_M: Final = 0.05
 """Unit of a view's ranges, which end at 255 of them: 12.75 m."""

@@ -19,7 +19,6 @@ DEFAULT_BASE: Final = "roomba600"
 DEFAULT_LIDAR: Final = "rplidar-a1"
 """In the entry points `fognav.lidars` and `fognav.lidar_emulators`."""
 
-
 T = TypeVar("T")
 
 

@@ -43,6 +43,8 @@ AGAIN_S: Final = 1.0
 """How soon the name is looked up again for somebody who is not the gateway."""
 _HEADER: Final = b"x-forwarded-for"
 
+_log = logs.get("http")
+
 
 async def addresses_of(name: str) -> set[str]:
     """Return the addresses of a name; none if it has none now."""
@@ -98,8 +100,6 @@ BETWEEN_REQUESTS_S: Final = 60.0
 """How long an answer may take to be sent, together with the next request."""
 SAME_S: Final = 10.0
 """How often the server's own log repeats a line: whoever sends nonsense must not fill a disk."""
-
-_log = logs.get("http")
 
 
 class _Unused:

@@ -38,6 +38,8 @@ if TYPE_CHECKING:
 LIFETIME_S: Final = 86_400
 """Seconds for which a result is remembered."""
 
+_log = logs.get("store")
+
 
 class IdempotencyError(ValueError):
     """An idempotency key was used for another request before."""
@@ -92,8 +94,6 @@ UNFENCED: Final = -1
 
 ANY: Final = "*"
 """Expect no particular version: overwrite what is stored."""
-
-_log = logs.get("store")
 
 
 class Audit(NamedTuple):
@@ -324,7 +324,7 @@ class RedisStore:
 
     @property
     def _epoch_key(self) -> str:
-        """The key of the highest epoch of the service (`lease_store`)."""
+        """The key of the highest epoch of the service (`leadership`)."""
         return f"{self._service}:epoch"
 
     # --- Inside -----------------------------------------------------------------------------------------------------

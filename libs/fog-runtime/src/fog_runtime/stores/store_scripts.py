@@ -41,7 +41,6 @@ AUDITED: Final[Mapping[str, Sequence[str]]] = {
 BOOKKEEPING: Final = ("probe", "generation", "writes", "floors", "no-attempt", "idempotency:*")
 """Keys that every service of a site writes: by which they notice that Redis lost something."""
 
-
 AUDIT_ENTRIES: Final = 100_000
 """Entries of the audit trail that are kept, for each kind of record."""
 

@@ -24,7 +24,6 @@ if TYPE_CHECKING:
     Reply = Callable[[dict[str, str], Any], Answer]
     OnReply = Callable[[Channel, Message | None, Message], object]
 
-
 _log = logs.get("edges")
 
 

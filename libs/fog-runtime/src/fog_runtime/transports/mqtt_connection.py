@@ -22,6 +22,8 @@ _KEEPALIVE_S: Final = 10
 _TIMEOUT_S: Final = 5.0
 _QUEUE: Final = 10_000
 
+_log = logs.get("mqtt_edge")
+
 
 class Inbox(asyncio.Queue[aiomqtt.Message]):
     """Passes each message on as soon as it is read from the connection; until it is opened, it keeps them.
@@ -120,9 +122,6 @@ FOREIGN_LIMIT: Final = 16 * 1024
 """Bytes of the longest payload of such a topic."""
 FOREIGN: Final = "foreign"
 """The label of such messages in metrics, in place of a channel's name."""
-
-_log = logs.get("mqtt_edge")
-
 
 _ROUTES: Final = 10_000
 """Topics whose handlers are remembered: thousands of messages a second come on the same few hundred topics."""

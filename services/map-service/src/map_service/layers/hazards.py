@@ -33,7 +33,6 @@ if TYPE_CHECKING:
     from fog_contracts.shapes import ShapeMask
     from map_service.layers.base import Grid
 
-
 _AGGREGATOR: Final = ch.AREA_HAZARD.publishers[0]
 
 

@@ -8,7 +8,7 @@ import pytest
 
 from robot_agent.safety.conditions import SafetyInputs
 from robot_agent.safety.gate import SafetyState, step
-from robot_agent.safety.maneuver_rules import RULES
+from robot_agent.safety.maneuver import RULES
 
 DT = 0.05
 CHARGES = "the base is on its charger, where it does not drive"

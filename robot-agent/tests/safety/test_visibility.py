@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from robot_agent.config import VisibilityConfig
 from robot_agent.hardware import DriveTrain, Twist
 from robot_agent.safety.gate import SafetyOutputs
-from robot_agent.safety.visibility import SECTOR_ANGLES, Visibility, sector_of
+from robot_agent.safety.stop_field import SECTOR_ANGLES, Visibility, sector_of
 from robot_agent.safety.wheel_limits import limit_wheels
 from robot_agent.scan_builder import RepeatCounter
 

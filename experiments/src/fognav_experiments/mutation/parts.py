@@ -79,19 +79,19 @@ PARTS: Final = (
         ("numpy", "hypothesis.strategies", "fog_kernels.sweep", "robot_agent.config", "robot_agent.footprint"),
         (
             Equivalent(
-                "visibility",
+                "stop_field",
                 "turns = np.asarray(angles) / math.tau + 0.5",
                 "np.asarray(angles) / math.tau + 0.5 -> np.asarray(angles) / math.tau - 0.5",
                 "whole turns are taken off afterwards",
             ),
             Equivalent(
-                "visibility",
+                "stop_field",
                 "sectors: NDArray[np.int64] = np.floor((turns - np.floor(turns)) * SECTORS).astype(np.int64) % SECTORS",
                 "turns - np.floor(turns) -> turns + np.floor(turns)",
                 "whole turns more are whole circles of sectors, which the remainder takes off",
             ),
             Equivalent(
-                "visibility",
+                "stop_field",
                 "SECTOR_ANGLES: Final = np.array("
                 "[(sector + 0.5) * math.tau / SECTORS - math.pi for sector in range(SECTORS)])",
                 "(sector + 0.5) * math.tau / SECTORS - math.pi -> (sector + 0.5) * math.tau / SECTORS + math.pi",
@@ -99,7 +99,7 @@ PARTS: Final = (
             ),
             *(
                 Equivalent(
-                    "visibility", code, "twist.v > 0.0 -> twist.v >= 0.0", "a robot that does not advance is let pass"
+                    "stop_field", code, "twist.v > 0.0 -> twist.v >= 0.0", "a robot that does not advance is let pass"
                 )
                 for code in (
                     "heading = lead if twist.v > 0.0 else math.pi - lead",
@@ -108,7 +108,7 @@ PARTS: Final = (
             ),
             *(
                 Equivalent(
-                    "maneuver_rules",
+                    "maneuver",
                     f"return {words}, {done}",
                     f"{done} -> {not done}",
                     "a robot is disabled after an egress, a turn and an advance, done or not",
@@ -123,7 +123,7 @@ PARTS: Final = (
             ),
             *(
                 Equivalent(
-                    "maneuver_rules",
+                    "maneuver",
                     code,
                     change,
                     "conditions ask for what is worse than good, and for more than a second",
@@ -256,8 +256,8 @@ PARTS: Final = (
     ),
     Part(
         "maneuvers",
-        ("agent.docking", "agent.egress", "agent.maneuvers"),
-        ("agent/test_docking.py", "agent/test_maneuvers.py", "agent/test_maneuvering.py"),
+        ("agent.docking", "agent.maneuvers"),
+        ("agent/test_docking.py", "agent/test_maneuvers.py"),
         ("numpy", "hypothesis.strategies", "robot_agent.localization.localizer", "robot_agent.config"),
     ),
     Part(

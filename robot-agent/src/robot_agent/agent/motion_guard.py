@@ -18,8 +18,7 @@ from fog_kernels.scans import Mounting, Placed, placed
 from fog_kernels.sweep import half_planes
 from robot_agent.footprint import SECTORS
 from robot_agent.motion.recent_scans import smoothed
-from robot_agent.safety.stop_field import StopField
-from robot_agent.safety.visibility import SECTOR_ANGLES, Visibility
+from robot_agent.safety.stop_field import SECTOR_ANGLES, StopField, Visibility
 
 if TYPE_CHECKING:
     from collections.abc import Callable

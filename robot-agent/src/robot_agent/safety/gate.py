@@ -19,11 +19,10 @@ from fog_contracts.messages import Mode, Reason, ReasonCode
 from robot_agent.config import SafetyConfig
 from robot_agent.safety import maneuver
 from robot_agent.safety.conditions import Finding, Level, SafetyInputs, collect_findings
-from robot_agent.safety.maneuver import Maneuver
-from robot_agent.safety.maneuver_rules import RULES
+from robot_agent.safety.maneuver import RULES, Maneuver
 
 if TYPE_CHECKING:
-    from robot_agent.safety.maneuver_rules import ManeuverKind
+    from robot_agent.safety.maneuver import ManeuverKind
 
 MODE_OF: Final[dict[Level, Mode]] = {
     Level.NORMAL: "NORMAL",

@@ -6,25 +6,224 @@
 - A back-off: straight back by a few centimetres from what the robot has bumped into.
 - A turn in place, or some centimetres straight ahead, of a robot that does not know its place: scans may tell it then.
 
-Each suspends the conditions that it is made for (`robot_agent.safety.maneuver_rules`), and ends for good with anything
-else that would stop the robot.
+Each suspends the conditions that it is made for, and ends for good with anything else that would stop the robot. One
+table, `RULES`, says what it suspends, what refuses it, and when it is over.
 """
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING, Final, Literal, NamedTuple
 
 import msgspec
 from msgspec.structs import replace
 
 from robot_agent.safety.conditions import Level, collect_findings
-from robot_agent.safety.maneuver_rules import RULES, ManeuverKind
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
+    from collections.abc import Callable, Mapping, Sequence
 
+    from fog_contracts.messages import Mode
     from robot_agent.config import SafetyConfig
     from robot_agent.safety.conditions import Finding, SafetyInputs
+
+ManeuverKind = Literal["egress", "dock", "undock", "back_off", "turn", "advance"]
+
+
+_POSE_WORDS: Final[Mapping[str, str]] = {"weak": "uncertain", "lost": "unknown", "none": "unknown"}
+
+
+class Rules(NamedTuple):
+    """One row of the table.
+
+    mode: the mode meanwhile. name, doing: what it is called, and what the robot does. relevant: the inputs that count.
+    refusal: why it can't begin, besides what would end it. end: why it is over, and whether it is done. longest: s that
+    it may take. cap: m/s. needs_enable: only an enabled robot begins it. stays_enabled: a robot that was enabled before
+    may drive on when it is done.
+    """
+
+    mode: Mode
+    name: str
+    doing: str
+    relevant: Callable[[SafetyInputs], SafetyInputs]
+    refusal: Callable[[SafetyInputs], str | None]
+    end: Callable[[SafetyInputs, SafetyConfig], tuple[str, bool] | None]
+    longest: Callable[[SafetyConfig], float]
+    cap: Callable[[SafetyConfig], float]
+    needs_enable: bool = False
+    stays_enabled: bool = False
+
+
+def _relevant_to_egress(inputs: SafetyInputs) -> SafetyInputs:
+    return replace(inputs, inside_blocked=None, mission=False)
+
+
+def _refuses_egress(inputs: SafetyInputs) -> str | None:
+    return "the robot is in no blocked area or zone: there is nothing to leave" if not inputs.inside_blocked else None
+
+
+def _egress_end(inputs: SafetyInputs, config: SafetyConfig) -> tuple[str, bool] | None:
+    if not inputs.maneuver_remaining <= config.egress_end:
+        return None
+    still = inputs.inside_blocked
+    if still is None:
+        return "the robot is out", True
+    return f"the way out ends, and the robot is still in {still}", False
+
+
+def _relevant_to_docking(inputs: SafetyInputs) -> SafetyInputs:
+    # The dock itself may press the bumper. What the guardian keeps at rest there shall rest.
+    if inputs.docked_for is not None:
+        return replace(inputs, mission=False, bumper=False, base_stopped=None, docked_for=None)
+    return replace(inputs, mission=False)
+
+
+def _refuses_docking(inputs: SafetyInputs) -> str | None:
+    return "the robot is on its dock" if inputs.docked_for is not None else inputs.dock_problem
+
+
+def _docking_end(inputs: SafetyInputs, config: SafetyConfig) -> tuple[str, bool] | None:
+    if inputs.docked_for is None:
+        return None if inputs.dock_problem is None else (inputs.dock_problem, False)
+    # The contacts may bounce, and the base corrects its place by itself.
+    return ("the robot is on its dock", True) if inputs.docked_for >= config.dock_settled else None
+
+
+def _relevant_to_undocking(inputs: SafetyInputs) -> SafetyInputs:
+    # On its dock the guardian lets the base drive straight back only, and holds the wheels between two of its modes.
+    on_dock = inputs.docked_for is not None
+    return replace(inputs, mission=False, base_stopped=None, docked_for=None, bumper=inputs.bumper and not on_dock)
+
+
+def _refuses_undocking(inputs: SafetyInputs) -> str | None:
+    return "the robot is not on its dock" if inputs.docked_for is None else inputs.blind_behind
+
+
+def _straight_end(inputs: SafetyInputs, _: SafetyConfig) -> tuple[str, bool] | None:
+    return ("it is done", True) if inputs.maneuver_remaining <= 0.0 else None
+
+
+def _relevant_to_back_off(inputs: SafetyInputs) -> SafetyInputs:
+    # A few centimetres under an operator's eyes: place, map and plan don't matter, base and lidar do.
+    fault = None if inputs.bumped else inputs.base_fault
+    return replace(
+        inputs,
+        base_fault=fault,
+        bumper=False,
+        base_stopped=None,
+        localization="good",
+        inside_blocked=None,
+        map_loaded=True,
+        map_age=0.0,
+        map_gap=0.0,
+        mission=False,
+    )
+
+
+def _refuses_back_off(inputs: SafetyInputs) -> str | None:
+    if not inputs.bumped:
+        return "the robot has bumped into nothing: there is nothing to back off from"
+    return inputs.blind_behind
+
+
+def _relevant_to_looking_around(inputs: SafetyInputs) -> SafetyInputs:
+    # A robot that does not know its place knows no zone, and needs no map to turn: base and lidar guard it. But an
+    # uncertain pose is good enough to drive by, so that it is good enough for zones and areas, too.
+    inside = inputs.inside_blocked if inputs.localization == "weak" else None
+    return replace(
+        inputs, localization="good", inside_blocked=inside, map_loaded=True, map_age=0.0, map_gap=0.0, mission=False
+    )
+
+
+def _refuses_looking_around(inputs: SafetyInputs) -> str | None:
+    if inputs.docked_for is not None:
+        return "the robot is on its dock: undock it first"
+    if inputs.localization == "good":
+        return "the robot knows where it is: there is nothing to find out"
+    return _lies_ahead(inputs)
+
+
+def _lies_ahead(inputs: SafetyInputs) -> str | None:
+    """Return the sentence about a blocked place on the way of an advance; None without one."""
+    return None if inputs.blocked_ahead is None else f"{inputs.blocked_ahead} is on the way ahead"
+
+
+def _looking_around_end(inputs: SafetyInputs, _: SafetyConfig) -> tuple[str, bool] | None:
+    if inputs.localization == "good":
+        return "the robot knows where it is", True
+    if (ahead := _lies_ahead(inputs)) is not None:
+        return ahead, False
+    if inputs.maneuver_remaining > 0.0:
+        return None
+    detail = f": {inputs.localization_detail}" if inputs.localization_detail else ""
+    return f"it is done, and the pose is {_POSE_WORDS[inputs.localization]}{detail}", True
+
+
+RULES: Final[Mapping[ManeuverKind, Rules]] = {
+    "egress": Rules(
+        "EGRESS",
+        "the egress",
+        "leaving a blocked area on an operator's command",
+        _relevant_to_egress,
+        _refuses_egress,
+        _egress_end,
+        lambda c: c.egress_max,
+        lambda c: c.speed_egress,
+    ),
+    "dock": Rules(
+        "DOCK",
+        "the docking",
+        "the base drives into its dock by itself",
+        _relevant_to_docking,
+        _refuses_docking,
+        _docking_end,
+        lambda c: c.dock_max,
+        lambda _: 0.0,
+        needs_enable=True,
+        stays_enabled=True,
+    ),
+    "undock": Rules(
+        "DOCK",
+        "the undocking",
+        "leaving the dock, straight back",
+        _relevant_to_undocking,
+        _refuses_undocking,
+        _straight_end,
+        lambda c: c.undock_max,
+        lambda c: c.speed_egress,
+        stays_enabled=True,
+    ),
+    "back_off": Rules(
+        "EGRESS",
+        "the back-off",
+        "backing off from what it has bumped into, on an operator's command",
+        _relevant_to_back_off,
+        _refuses_back_off,
+        _straight_end,
+        lambda c: c.back_off_max,
+        lambda c: c.speed_back_off,
+    ),
+    "turn": Rules(
+        "EGRESS",
+        "the turn",
+        "turning in place on an operator's command, to find out where it is",
+        _relevant_to_looking_around,
+        _refuses_looking_around,
+        _looking_around_end,
+        lambda c: c.turn_max,
+        lambda c: c.speed_egress,
+    ),
+    "advance": Rules(
+        "EGRESS",
+        "the advance",
+        "driving a little ahead on an operator's command, to find out where it is",
+        _relevant_to_looking_around,
+        _refuses_looking_around,
+        _looking_around_end,
+        lambda c: c.advance_max,
+        lambda c: c.speed_egress,
+    ),
+}
+"""Every maneuver; the mode EGRESS also stands for the back-off, the turn and the advance, DOCK for both ways."""
 
 
 class Maneuver(msgspec.Struct, frozen=True):

@@ -1,4 +1,4 @@
-"""What a process tells of itself, what Linux tells of it, and the memory that it gives back once it has started."""
+"""What a process tells of itself, what Linux tells of it and gives it, and the memory that it gives back."""
 
 from __future__ import annotations
 
@@ -8,6 +8,7 @@ import os
 import socket
 import subprocess
 import sys
+import threading
 import weakref
 from concurrent.futures import ThreadPoolExecutor
 from functools import cache
@@ -238,3 +239,42 @@ def _run() -> tuple[int, int, int]:
     done = subprocess.run([sys.executable, "-c", CODE], capture_output=True, text=True, check=True, timeout=120)
     released, held_kib, looked_at = map(int, done.stdout.split())
     return released, held_kib, looked_at
+
+
+def test_thread_that_ends_meanwhile_keeps_no_other_from_its_priority(monkeypatch):
+    given = []
+
+    def set_scheduler(thread, policy, parameters):
+        if thread == os.getpid():
+            raise ProcessLookupError
+        given.append((thread, policy, parameters.sched_priority))
+
+    monkeypatch.setattr(os, "sched_setscheduler", set_scheduler)
+    ended = threading.Event()
+    other = threading.Thread(target=ended.wait)
+    other.start()
+    try:
+        assert machine.run_in_real_time(5) == "SCHED_RR 5"
+        assert (other.native_id, os.SCHED_RR, 5) in given
+    finally:
+        ended.set()
+        other.join()
+
+
+def refuse(*_: object):
+    raise PermissionError
+
+
+def test_priority_that_is_refused_is_told(monkeypatch):
+    monkeypatch.setattr(os, "sched_setscheduler", refuse)
+    monkeypatch.setattr(os, "setpriority", refuse)
+    assert machine.run_in_real_time(5).startswith("refused: ")
+    assert machine.run_in_real_time(0) == "not requested"
+
+
+def test_program_that_gets_no_real_time_gets_more_of_the_processor_where_that_is_allowed(monkeypatch):
+    given = []
+    monkeypatch.setattr(os, "sched_setscheduler", refuse)
+    monkeypatch.setattr(os, "setpriority", lambda *call: given.append(call))
+    assert machine.run_in_real_time(15).startswith("niceness -15, as SCHED_RR was refused: ")
+    assert (os.PRIO_PROCESS, os.getpid(), -15) in given

@@ -16,8 +16,8 @@ import pytest
 from agent_rig import ROBOT, SITE, Robot, until
 from locked_servers import locked_router
 
+from fog_runtime.machine import run_in_real_time
 from fog_supervisor import child
-from robot_agent.guardian.protection import run_in_real_time
 
 BURST_S = float(os.environ.get("FOGNAV_BURST_S", "4"))
 _DEVICES = 20

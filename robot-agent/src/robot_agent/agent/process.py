@@ -13,6 +13,7 @@ from prometheus_client import REGISTRY
 from fog_runtime import logs
 from fog_runtime.configuration.robot_file import describe_robot
 from fog_runtime.health import Health, reachable_address, serve_health
+from fog_runtime.machine import run_in_real_time
 from fog_runtime.process import release_startup_memory
 from fog_runtime.transports.zenoh_edge import ZenohEdge, use_one_thread
 from robot_agent import registry
@@ -24,7 +25,6 @@ from robot_agent.agent.recording.input_writer import open_core
 from robot_agent.agent.service import Service
 from robot_agent.agent.settings import remarks
 from robot_agent.config import agent_config
-from robot_agent.guardian.protection import run_in_real_time
 from robot_agent.hardware import DockingDriver
 
 if TYPE_CHECKING:

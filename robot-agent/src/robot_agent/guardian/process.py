@@ -23,11 +23,10 @@ from fog_runtime import logs, machine
 from fog_runtime.configuration.robot_file import load_robot
 from fog_runtime.configuration.settings import SettingsError, load
 from fog_runtime.logs import Level
-from fog_runtime.machine import MachineClock
+from fog_runtime.machine import MachineClock, lock_memory, run_in_real_time
 from robot_agent.device_signature import LISTEN_S, LineCheck
 from robot_agent.guardian.core import GuardianCore, Limits, Output
 from robot_agent.guardian.link import PACKET_LIMIT, WheelCommand, decode_command, encode
-from robot_agent.guardian.protection import lock_memory, run_in_real_time
 from robot_agent.guardian.timing import HEARTBEAT_MAX_S, UNKNOWN_S, FrameClock, Heartbeats
 from robot_agent.guardian.watchdog import BAD_SETTINGS, PORT_LOST
 from robot_agent.registry import make_base, signatures

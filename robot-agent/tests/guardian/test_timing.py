@@ -85,8 +85,9 @@ def test_each_frame_is_looked_at_soon_whatever_its_phase_and_exact_rate(phase, d
     base = Base(phase, FRAME_S * (1.0 + drift), jitter, seed)
     looks = looks_at(base, seed=seed)
     waits = delays(base, looks)
-    # As if one looked once a frame, at no particular moment: then a frame waits for 7.5 ms on average, for 15 at most.
-    assert sum(waits) / len(waits) < 0.012
+    # As if one looked once a frame: then it waits for 15 ms at most, and for 7.5 on average at no particular moment. A
+    # base 1 % faster than it says drifts through all moments, and stays long at the late ones.
+    assert sum(waits) / len(waits) < FRAME_S
     assert max(waits) < LATE_S
     assert len(looks) / looks[-1] < 1.4 / (FRAMES * FRAME_S)
 

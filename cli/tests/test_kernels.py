@@ -1,7 +1,10 @@
 """The cache of compiled kernels is checked without importing them, and compiling shows its progress."""
 
 import os
+import threading
 from pathlib import Path
+
+import pytest
 
 from fognav import kernels
 
@@ -53,3 +56,13 @@ def test_progress_without_a_terminal_is_one_line_per_kernel() -> None:
     with kernels._progress_display(printed.append) as show:
         show("3 of 9 kernels ready: astar.search\n")
     assert printed == ["3 of 9 kernels ready: astar.search"]
+
+
+def test_command_that_is_interrupted_while_kernels_compile_leaves_no_thread_to_wait_for() -> None:
+    def interrupt(_line: str) -> None:
+        raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        kernels._run(interrupt)
+    timers = [thread for thread in threading.enumerate() if isinstance(thread, threading.Timer)]
+    assert all(timer.finished.is_set() for timer in timers)

@@ -86,12 +86,18 @@ def _run(on_line: Callable[[str], None]) -> None:
     timeout = threading.Timer(_WARM_TIMEOUT_S, process.kill)
     timeout.start()
     output: list[str] = []
-    with process:
-        assert process.stdout is not None
-        for line in process.stdout:
-            output.append(line)
-            on_line(line)
-    timeout.cancel()
+    try:
+        with process:
+            assert process.stdout is not None
+            for line in process.stdout:
+                output.append(line)
+                on_line(line)
+    except BaseException:
+        process.kill()
+        process.wait()
+        raise
+    finally:  # who is interrupted would wait at the end for the timer's thread
+        timeout.cancel()
     if process.returncode != 0:
         raise KernelsError(f"the kernels could not be compiled:\n{''.join(output).strip()[-2000:]}")
 

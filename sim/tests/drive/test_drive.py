@@ -125,8 +125,8 @@ CORNERS = st.lists(st.tuples(st.integers(-2, 8), st.integers(-3, 3)), min_size=1
 def test_barrier_appears_ahead_of_a_robot_on_any_path_and_away_from_it(
     corners: list[tuple[int, int]], seed: int
 ) -> None:
-    """Also where the path passes beside the area, or through it, before it enters it."""
-    points = [(0.0, 0.0), *((4.0 * x, 2.0 * y) for x, y in corners), GOAL]
+    """Also where the path passes beside the area, or through it, before it enters it; none only grazes its corner."""
+    points = [(0.0, 0.0), *((4.0 * x, 1.9 * y) for x, y in corners), GOAL]
     hazard = HazardSchedule(SITE, seed, lambda area: SimObstacle(id="barrier", polygon=area.polygon))
     tested = Drive(goal=GOAL, goal_id="g", areas=SITE.areas, truth=truth(0.0), now=0.0, hazard=hazard)
     tested.on_path(msgspec.structs.replace(path(), points=points), 1.0)

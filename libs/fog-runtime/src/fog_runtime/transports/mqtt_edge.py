@@ -386,9 +386,8 @@ INPUTS: Final = "mqtt-inputs"
 class MqttEdgeWithInputs(MqttEdge):
     """Publishes and subscribes on one connection, and receives the channels `inputs` on another.
 
-    A broker acknowledges a publication on the connection on which it came, behind all that it delivers there, and a
-    client sends no more than 20 publications that are not acknowledged. On one connection, what a process has to say
-    would wait behind what it has not read yet.
+    A broker acknowledges a publication behind all that it delivers on the same connection, and a client sends no more
+    than 20 that are not acknowledged. On one connection, what a process says would wait behind what it has not read.
 
     Topics that are no channel's come on the second one, too. Among what one connection delivers, the order is the
     broker's.

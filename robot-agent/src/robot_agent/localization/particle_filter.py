@@ -279,11 +279,10 @@ class ParticleFilter:
         return np.asarray(np.dot(places, (places * self._weights).T) * (1.0 / total))
 
     def _see(self, prior: NDArray[np.float64]) -> None:
-        """Forget of the way what the scan has observed, by the covariances (2, 2) of the position before and after.
-
-        The latter is that of the particles: matching a scan finds some curvature in every corridor.
-        """
-        before, after = (float(self.unseen @ covariance @ self.unseen) for covariance in (prior, self._covariance_xy()))
+        """Forget of the way what the scan has observed, by the covariances (2, 2) of the position before and after."""
+        before, after = (
+            float(self.unseen @ covariance[:2, :2] @ self.unseen) for covariance in (prior, self.covariance)
+        )
         if after < _SEEN_BELOW * before:
             self.unseen = self.unseen * (after / before)
 

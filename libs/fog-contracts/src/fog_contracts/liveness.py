@@ -25,8 +25,8 @@ GAP_S: Final = 3.0
 PIECE_S: Final = 2.5
 JITTER_S: Final = 0.6
 """Messages come steadily when no two are further apart than the gap, and the fastest one of each piece of time takes no
-longer, or shorter, by more than this (s) than that of the piece before: a radio holds back single ones all the time, and
-a clock that is slewed as fast as chrony does, by 8.3 %, adds up to half of it."""
+longer, or shorter, by more than this (s) than that of the piece before: a radio holds back single ones all the time,
+and a clock that is slewed as fast as chrony does, by 8.3 %, adds up to half of it."""
 
 
 class DelayEstimator:

@@ -70,6 +70,8 @@ def test_tests_run_on_all_cores_unless_the_arguments_choose_otherwise() -> None:
     command = testing.pytest_command(["-k", "replica"], terminal=False)
     assert command[:3] == [sys.executable, "-m", "pytest"]
     assert command[command.index("-n") + 1] == str((os.cpu_count() or 1) + 2)
+    quick = testing.pytest_command([], terminal=False)
+    assert quick[quick.index("-n") + 1] == str(os.cpu_count() or 1), "they compute, and the real processes need time"
     assert command[-2:] == ["-k", "replica"]
     for arguments in (["-n", "0"], ["-n4"], ["--pdb"], ["-s"], ["--collect-only"]):
         assert "--dist" not in testing.pytest_command(arguments, terminal=False)

@@ -24,12 +24,13 @@ _TIERS: Final = {"--all": "all", "--rest": "rest"}
 """Arguments that ask for every test, or for those that are left out without one."""
 
 
-def workers() -> int:
+def workers(tier: str) -> int:
     """Return how many tests run at once: two more than there are cores, because most tests of processes wait.
 
-    The root's conftest.py lets no more of them compute than there are cores to spare.
+    The root's conftest.py lets no more of them compute than there are cores to spare. Nearly all quick ones do: more at
+    once would leave no time to the real processes of the others.
     """
-    return (os.cpu_count() or 1) + 2
+    return (os.cpu_count() or 1) + (0 if tier == "quick" else 2)
 
 
 def pytest_command(arguments: Sequence[str], *, terminal: bool | None = None) -> list[str]:
@@ -42,7 +43,7 @@ def pytest_command(arguments: Sequence[str], *, terminal: bool | None = None) ->
     if sys.stderr.isatty() if terminal is None else terminal:
         command += ["-o", "console_output_style=classic"]  # the bar shows the progress
     if not any(argument.startswith(_OVERRIDES) for argument in arguments):
-        command += ["-n", str(workers()), "--dist", "loadgroup", "--no-loadscope-reorder"]
+        command += ["-n", str(workers(tier)), "--dist", "loadgroup", "--no-loadscope-reorder"]
     return [*command, *arguments]
 
 

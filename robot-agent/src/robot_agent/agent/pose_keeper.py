@@ -113,7 +113,10 @@ def start_pose(site: str, robot: RobotSite) -> SavedPose:
 
 
 def _is_followed(saved: SavedPose, feedback: BaseFeedback) -> bool:
-    """Whether the guardian of a stored pose still lives, has seen no wheel drop, and its wheels have hardly turned."""
+    """Whether the guardian of a stored pose still lives, has seen no wheel drop, and its wheels have hardly turned.
+
+    Each guardian numbers its feedback from 1, so that another one is behind unless it has run for longer.
+    """
     if saved.base is None or feedback.fault is not None:
         return False
     seq, left, right = saved.base

@@ -21,10 +21,8 @@ settings.register_profile(
     "default", deadline=None, suppress_health_check=[HealthCheck.too_slow]
 )  # a busy machine is no defect
 settings.register_profile("repeatable", parent=settings.get_profile("default"), derandomize=True)
-settings.register_profile("quick", parent=settings.get_profile("repeatable"), max_examples=25)
 settings.load_profile("default")
-CI: Final = os.environ.get("CI", "").lower() in {"1", "true"}
-if CI:
+if os.environ.get("CI", "").lower() in {"1", "true"}:
     settings.load_profile("repeatable")
 
 # A script's shell lets its background jobs ignore what the keyboard sends; so would all programs that tests start.
@@ -50,13 +48,11 @@ def pytest_addoption(parser: pytest.Parser) -> None:
     parser.addoption("--long", action="store_true", help="drive new random worlds for ten minutes, too")
 
 
-def pytest_configure(config: pytest.Config) -> None:
-    """Try fewer examples where somebody waits; give each worker its own range of ports, and its programs usual signals.
+def pytest_configure() -> None:
+    """Give each worker its own range of ports, and the programs that it starts the usual signals.
 
     Two workers that search for a port at the same moment would find the same one.
     """
-    if config.getoption("tier", "all") == "quick" and not CI:
-        settings.load_profile("quick")
     if signal.getsignal(signal.SIGHUP) == signal.SIG_IGN:
         # Under nohup. What is ignored is inherited by the programs that tests start and hang up; a handler is not.
         signal.signal(signal.SIGHUP, lambda *_: None)

@@ -217,16 +217,19 @@ def test_future_zone_is_in_force_in_its_time_although_the_clock_was_ahead_before
         assert not active(each, 10 * HOUR + 1.0, T0 + 10 * HOUR + 1.0)
 
 
-def test_zone_is_over_since_its_end_and_not_while_a_clock_is_ahead_for_a_moment():
-    times = ZoneTimes(zone(starts_at=T0 + HOUR, expires_at=T0 + 2 * HOUR))
-    active(times, 0.0, T0 + 5 * HOUR)
-    assert times.over_for(10.0) == 10.0
-    active(times, 10.0, T0 + 10.0)
-    assert times.over_for(10.0) < 0.0
+def test_zone_is_over_since_its_end_also_after_a_restart_and_not_while_a_clock_is_ahead():
+    coming = zone(starts_at=T0 + HOUR, expires_at=T0 + 2 * HOUR)
+    times = ZoneTimes(coming)
+    for now in (0.0, 0.5 * HOUR):
+        active(times, now, T0 + 5 * HOUR + now)
+        assert times.over_for(now) < 0.0, "it was never in force"
     assert active(times, 1.5 * HOUR, T0 + 1.5 * HOUR)
     assert times.over_for(1.5 * HOUR) < 0.0
     assert not active(times, 2 * HOUR, T0 + 2 * HOUR)
     assert times.over_for(2 * HOUR + 60.0) == 60.0
+    restarted = ZoneTimes(coming, times.progress("boot", 2.2 * HOUR), boot="boot", now=2.5 * HOUR)
+    assert not active(restarted, 2.5 * HOUR, T0 + 2.5 * HOUR)
+    assert restarted.over_for(3 * HOUR) == pytest.approx(HOUR)
     disabled = ZoneTimes(zone(expires_at=T0 - 60.0, enabled=False))
     active(disabled, 0.0, T0)
     assert disabled.over_for(HOUR) < 0.0, "it may be enabled again"

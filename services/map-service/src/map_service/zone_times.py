@@ -74,14 +74,15 @@ class ZoneTimes:
     def is_active(self, at: Moment) -> bool:
         """Advance to `at`; return whether the zone is in force."""
         active = self._advance(at)
-        over = self._zone.enabled and (self._ended or (not self._started and self._is_past(at)))
+        over = self._zone.enabled and self._ended
         self._over_since = min(self._over_since, at.now) if over else math.inf
         return active
 
     def over_for(self, now: float) -> float:
-        """Return for how long (s) the zone has been over, so that it will never be in force again; negative: it is not.
+        """Return for how long (s) the zone has been over after it was in force; negative: it is not.
 
-        It counts from when that was noticed, by the monotonic clock.
+        It counts from when that was noticed, by the monotonic clock. A zone whose time has passed without it is not
+        over: a clock that is ahead says the same of zones to come.
         """
         return now - self._over_since
 
@@ -112,6 +113,8 @@ class ZoneTimes:
         self._started, self._ended = progress.started, progress.ended
         if boot and progress.boot == boot:
             self._deadline = progress.deadline
+            if self._ended and self._deadline is not None:
+                self._over_since = self._deadline
         elif self._zone.ttl_s is not None and progress.rest_s is not None:
             # Nobody knows how long the machine was off.
             self._deadline = now + progress.rest_s

@@ -10,6 +10,7 @@ from pathlib import Path
 import pytest
 
 ROOT = Path(__file__).parents[1]
+PARTS = ("libs", "services", "robot-agent", "sim", "experiments", "cli")
 LINK = re.compile(r"\]\(([^)\s]+)\)")
 
 
@@ -74,6 +75,14 @@ def test_decision_records_have_a_number_and_a_dated_status(record: Path) -> None
 def test_no_two_decision_records_have_one_number() -> None:
     numbers = [record.stem[:4] for record in (ROOT / "docs" / "adr").glob("0*.md")]
     assert sorted(numbers) == sorted(set(numbers))
+
+
+def test_decision_records_that_sources_and_documents_name_exist() -> None:
+    numbers = {int(record.stem[:4]) for record in (ROOT / "docs" / "adr").glob("0*.md")}
+    files = [path for part in PARTS for path in (ROOT / part).rglob("src/**/*.py")] + documents()
+    named = {path: {int(n) for n in re.findall(r"\bADR (\d+)", path.read_text("utf-8"))} for path in files}
+    missing = {str(path.relative_to(ROOT)): sorted(n - numbers) for path, n in named.items() if n - numbers}
+    assert missing == {}, "docs/adr/README.md says where the others stand"
 
 
 def test_all_members_have_the_same_version() -> None:

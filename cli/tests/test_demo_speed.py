@@ -1,4 +1,4 @@
-"""When late processes and stops lower a demo's speed: docs/adr/0008-what-excuses-a-demo.md."""
+"""When late processes and stops lower a demo's speed: docs/operations.md."""
 
 import pytest
 

@@ -1,4 +1,4 @@
-"""Checks whether this machine sustains the speed of a demonstration. Pure. See docs/adr/0008-what-excuses-a-demo.md.
+"""Checks whether this machine sustains the speed of a demonstration. Pure. See docs/operations.md.
 
 At a speed that the machine can't sustain, the processes miss their periods and limits although the system works
 correctly; the demonstration then starts again more slowly. Speed 1 is never lowered.

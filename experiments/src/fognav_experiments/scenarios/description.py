@@ -111,7 +111,7 @@ class ClockChange(Event, frozen=True, kw_only=True, tag="clock"):
     """A computer's wall clock jumps by `jump_s` and gains `rate` seconds a second for `seconds` then.
 
     chrony slews by 83,333 ppm at most, NTP's kernel by 500. Processes count intervals by a clock that nothing slews
-    (ADR 56): from then on it gains `crystal` seconds a second.
+    (ADR 17): from then on it gains `crystal` seconds a second.
     """
 
     computer: Literal["robot", "fog"]

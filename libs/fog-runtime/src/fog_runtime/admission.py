@@ -4,7 +4,7 @@ Everybody in the network may open connections and say nothing, or something that
 stranger's until its protocol admits it. Strangers have a limited number of places and a limited time. Who comes when
 all places are taken gets that of another: the oldest connection of the address with the most. So whoever floods a
 server displaces itself, and a client that proves itself soon gets in, even from the same address. An address from which
-somebody was admitted goes before those that nobody knows, as long as few wait there (docs/adr/0055).
+somebody was admitted goes before those that nobody knows, as long as few wait there (ADR 55).
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
 """Runs Mosquitto behind a relay: `python -m fog_runtime.broker --listen tls/0.0.0.0:8883 --certificate … --key …`.
 
 Connections that say nothing would fill the broker's descriptors, and one user's client could end those of others
-(`MqttOpening`, docs/adr/0055). With `--configuration` it runs Mosquitto, which then listens on a Unix socket of this
+(`MqttOpening`, ADR 55). With `--configuration` it runs Mosquitto, which then listens on a Unix socket of this
 process, and reads its files again on SIGHUP; with `--to ADDRESS:PORT` a broker runs there. A new certificate is used as
 soon as it is there.
 """

@@ -1,7 +1,7 @@
 """Runs the lease of a process: one of several copies of a service leads, the others follow everything and say nothing.
 
 `lease` decides, `LeaseStore` asks Redis. The edges pass everything that is published through `admit`, and answer
-queries only while this process leads. See docs/adr/0012-one-leader-by-lease-and-epoch.md.
+queries only while this process leads. See ADR 12.
 """
 
 from __future__ import annotations

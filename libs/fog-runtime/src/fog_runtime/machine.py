@@ -27,7 +27,7 @@ class MachineClock:
         return self._speed
 
     def now(self) -> float:
-        """Monotonic seconds, by the hardware's own rate: what corrects the time of day does not slew them (ADR 56)."""
+        """Monotonic seconds, by the hardware's own rate: what corrects the time of day does not slew them (ADR 17)."""
         return time.clock_gettime(time.CLOCK_MONOTONIC_RAW) * self._speed
 
     def stamp(self) -> float:

@@ -5,7 +5,7 @@ With `--certificate` and `--key` it encrypts (`--listen tls/…`), with `--users
 whether it answers its clients (`RouterHealth`).
 
 Zenoh itself listens on a Unix socket, and gets only those connections that a relay has encrypted: connections that say
-nothing, or leave again, would keep it from everybody else (docs/adr/0055, docs/upstream/zenoh-accept-loop.md). A router
+nothing, or leave again, would keep it from everybody else (ADR 55, docs/upstream/zenoh-accept-loop.md). A router
 to which no session can be opened for a while ends, to be started again.
 """
 

@@ -204,7 +204,7 @@ class GuardianCore:
         if silent > timing.frame_timeout:
             reason = f"the base has sent no valid frame for {silent:.1f} s: check cable and power"
             if not base.moved and self._latched is None:
-                # Nothing that must be stopped has begun, so it is waited for as at its start (ADR 34).
+                # Nothing that must be stopped has begun, so it is waited for as at its start (docs/safety.md).
                 base.awake, base.silence = False, reason
                 return Output(self._wake(now), self._reminder(now))
             stop = self._latch(reason, now)

@@ -32,7 +32,7 @@ from hazard_aggregator.service import Service
 from hazard_aggregator.store import Store, load_at_start
 
 SENSORS: Final = (ch.NODE_READING, ch.NODE_VALUE, ch.NODE_AVAILABILITY, ch.THESIS_AREA)
-"""What nodes say comes in one order, and does not delay what the aggregator says (ADR 37)."""
+"""What nodes say comes in one order, and does not delay what the aggregator says (docs/performance.md)."""
 
 _log = logs.get("aggregator")
 

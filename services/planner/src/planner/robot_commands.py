@@ -1,6 +1,6 @@
 """Operators' commands to robots, for callers without a key: signed here, recorded, answered by the robot itself.
 
-The planner's leader is the only service that signs (docs/adr/0031). It keeps no command: one that did not reach its
+The planner's leader is the only service that signs (ADR 31). It keeps no command: one that did not reach its
 robot must be sent again by a person.
 """
 

@@ -1,4 +1,4 @@
-"""The process that receives requests, so that requests delay the core as little as possible (docs/adr/0024).
+"""The process that receives requests, so that requests delay the core as little as possible (ADR 24).
 
 It is forked from the core's process before that has threads and connections, and reads, checks and limits requests:
 sizes, tokens, JSON, types. What is well-formed it passes on over a link; the core's process runs the route's handler on

@@ -1,7 +1,7 @@
 """The base of all services' stores in Redis: versioned records, epochs, the audit trail, and what Redis may not lose.
 
 A service's store adds its own keys and records. All keys of a site begin with `fog:SITE:`. Why writes are scripts, and
-how a loss of acknowledged records is noticed: docs/adr/0013-store-that-notices-its-loss.md.
+how a loss of acknowledged records is noticed: ADR 13.
 """
 
 from __future__ import annotations

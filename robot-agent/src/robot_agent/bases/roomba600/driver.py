@@ -265,7 +265,7 @@ class Roomba600Driver:
         """Return Drive Direct; speeds beyond the top speed are scaled, which keeps the curve.
 
         The first zeros after other speeds come twice: between them is what completes any command into whose middle a
-        lost or wrong byte may have led the robot (ADR 62).
+        lost or wrong byte may have led the robot (docs/safety.md).
         """
         stops, self._rolls = self._rolls, left_m_s != 0.0 or right_m_s != 0.0
         command = oi.RESYNC + oi.drive_wheels(left_m_s, right_m_s)

@@ -1,8 +1,8 @@
 """The transport of the sensor side: typed publishing and subscribing on MQTT channels over one connection.
 
 The client is paho-mqtt, driven through aiomqtt. It speaks MQTT 3.1.1, which costs far less for each message than MQTT 5
-(docs/performance.md). Each connection starts a clean session and subscribes again: state that must survive is retained, or
-published again by `on_connect`, never kept by a broker.
+(docs/performance.md). Each connection starts a clean session and subscribes again. State that must survive is retained,
+or published again by `on_connect`, never kept by a broker.
 """
 
 import asyncio

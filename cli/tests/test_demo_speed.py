@@ -10,8 +10,7 @@ from fognav.demo.options import DrivePlan, Options
 from fognav.demo.report import modes
 from fognav.demo.scene import Scene
 from fognav.demo.speed import SpeedWatch, TooFastError
-from fognav_sim.drive.drive import Drive
-from fognav_sim.drive.evaluation import DriveOutcome
+from fognav_sim.drive.drive import Drive, DriveOutcome
 
 REACHED = DriveOutcome("reached", "the robot stands 0.08 m from its goal")
 TIMEOUT = DriveOutcome("timeout", "the goal was not reached within 600 s")

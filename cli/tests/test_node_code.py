@@ -11,7 +11,7 @@ from fognav import kernels, node_code, system
 from fognav.__main__ import app
 from fognav.commands import demo
 from fognav.nodes import simulated
-from fognav_sim import firmware
+from fognav_sim import nodes
 from fognav_sim.nodes import why_model
 
 
@@ -37,7 +37,7 @@ def no_work(monkeypatch: pytest.MonkeyPatch) -> None:
     ],
 )
 def test_command_says_in_one_line_that_nodes_run_a_model_and_why(command, tmp_path: Path, monkeypatch) -> None:
-    for folder, lines in ((tmp_path, 1), (firmware.find_firmware(), 0)):
+    for folder, lines in ((tmp_path, 1), (nodes.find_firmware(), 0)):
         monkeypatch.setenv("FOGNAV_FIRMWARE_DIR", str(folder))
         done = CliRunner().invoke(app, command)
         assert isinstance(done.exception, ReachedError), done.output
@@ -99,7 +99,7 @@ def test_missing_compiler_is_installed_if_the_user_agrees_and_else_nodes_run_a_m
     request.getfixturevalue("no_compiler")
     monkeypatch.delenv("CI", raising=False)
     monkeypatch.setattr(system, "PROVIDERS", [installer])
-    monkeypatch.setattr("fognav_sim.nodes.build_library", lambda _: firmware.find_compiler())
+    monkeypatch.setattr("fognav_sim.nodes.build_library", lambda _: nodes.find_compiler())
     monkeypatch.setattr(system, "find", lambda tool: shutil.which(tool.executables[0]))
     node_code.prepare(lines.append, yes=agreed)
     assert len(lines) == len(said) + (agreed and fails)

@@ -34,7 +34,7 @@ from fognav.commands.node import node_app
 from fognav.nodes import on_broker, provisioning, site_file
 from fognav.operate.systems import AGGREGATOR
 from fognav.output import FailedError, WrongUseError
-from fognav_sim.firmware import Core, FirmwareError, build_library, find_compiler
+from fognav_sim.nodes import Core, FirmwareError, build_library, find_compiler
 from hazard_aggregator.debounce.evidence import Options, learned_rates
 
 ROOT = Path(__file__).parents[2]

@@ -3,7 +3,7 @@ from pathlib import Path
 
 import pytest
 
-from fog_supervisor import embedded
+from fog_supervisor import servers
 from fognav import system
 from fognav.demo.servers import embedded_servers
 from fognav.system import AptProvider, MissingToolsError, Tool, ensure
@@ -133,6 +133,6 @@ def test_only_the_missing_server_is_replaced(monkeypatch: pytest.MonkeyPatch) ->
 
 def test_without_packages_the_missing_servers_are_an_error(monkeypatch: pytest.MonkeyPatch) -> None:
     no_server(monkeypatch)
-    monkeypatch.setattr(embedded, "available", lambda _: False)
+    monkeypatch.setattr(servers, "has_stand_in", lambda _: False)
     with pytest.raises(MissingToolsError, match="missing: mosquitto and redis-server"):
         embedded_servers(forced=False, yes=False, print_line=ignore)

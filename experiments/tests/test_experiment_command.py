@@ -19,7 +19,7 @@ from fognav_experiments.comparison.records import Folder
 from fognav_experiments.scenarios import stage
 from fognav_experiments.scenarios.fleet_stage import FleetResult
 from fognav_experiments.sensitivity import sweep
-from fognav_sim import firmware
+from fognav_sim import nodes
 
 OUT = ["--out", "unused"]
 
@@ -167,7 +167,7 @@ def test_drives_say_in_one_line_that_nodes_run_a_model_and_why(arguments, tmp_pa
     monkeypatch.setattr(kernels, "warm_cache", lambda _: None)
     for module, name in ((runner, "run"), (sweep, "workers")):
         monkeypatch.setattr(module, name, reached)
-    for folder, lines in ((tmp_path, 1), (firmware.find_firmware(), 0)):
+    for folder, lines in ((tmp_path, 1), (nodes.find_firmware(), 0)):
         monkeypatch.setenv("FOGNAV_FIRMWARE_DIR", str(folder))
         done = CliRunner().invoke(app, ["experiment", *arguments, "--out", str(tmp_path / "out")])
         assert isinstance(done.exception, ReachedError), done.output

@@ -14,9 +14,8 @@ from fognav_experiments.lockstep import run_lockstep
 from fognav_experiments.rigs import FogRig
 from fognav_sim.barrier import BarrierError
 from fognav_sim.drive.hazard import HazardRequest
-from fognav_sim.firmware import FirmwareError, find_compiler
-from fognav_sim.firmware_node import FirmwareNode
 from fognav_sim.floor import Floor
+from fognav_sim.nodes import FirmwareError, FirmwareNode, find_compiler
 from fognav_sim.world import World
 
 ESTIG = Path(__file__).parents[2] / "sites" / "estig"

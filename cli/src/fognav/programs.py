@@ -91,7 +91,7 @@ def server_programs(
 ) -> Sequence[ServerProgram]:
     """Return broker, store and router, configured in the folder; `locks` gives the folder of each one's locks, if any.
 
-    Those named in `embedded` are Python packages instead (`fog_supervisor.embedded`). Raises `ServerError` when one is
+    Those named in `embedded` are Python packages instead (`servers.STAND_INS`). Raises `ServerError` when one is
     not installed.
     """
     at = {name: locks(LOCKS[name]) for name in SERVERS}

@@ -47,7 +47,7 @@ class StackConfig:
     `robot` is the id of the site's robot, `base` and `lidar` name its hardware, and `robot_file` has its settings, of
     which the ports do not count; `extra` contains further FOGNAV_ settings for every process. With `doors` the servers
     encrypt, and admit only those users; without, everybody on this machine. The servers named in `embedded` are Python
-    packages (`fog_supervisor.embedded`).
+    packages (`servers.STAND_INS`).
     """
 
     site_dir: Path

@@ -21,7 +21,7 @@ from fog_kernels.astar import Planner, nearest_traversable
 from fog_kernels.distance import squared_distance_capped
 from fog_kernels.inflation import inflate, inflation_table
 from fog_kernels.raycast import cast
-from fognav_sim.lidar_faults import LIDAR_MAX_M
+from fognav_sim.sensors import LIDAR_MAX_M
 
 if TYPE_CHECKING:
     from collections.abc import Sequence

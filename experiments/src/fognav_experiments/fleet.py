@@ -31,7 +31,7 @@ if TYPE_CHECKING:
     from fog_contracts.site import RobotSite
     from fog_runtime.configuration.site import LoadedSite
     from fognav_experiments.cpu import CpuMeter
-    from fognav_sim.drive.evaluation import DriveOutcome
+    from fognav_sim.drive.drive import DriveOutcome
 
 READY_S: Final = 20.0
 _OPERATOR_STEPS: Final = 50

@@ -31,8 +31,7 @@ from fog_runtime.configuration.site import load_site
 from fognav_experiments.processes import Measure, unmeasured
 from fognav_experiments.rigs import STAMP, System
 from fognav_sim.barrier import BarrierError
-from fognav_sim.drive.drive import Drive, DriveSummary
-from fognav_sim.drive.evaluation import DriveOutcome
+from fognav_sim.drive.drive import Drive, DriveOutcome, DriveSummary
 from fognav_sim.drive.hazard import HazardRequest, HazardSchedule
 from fognav_sim.drive.operator import OperatorPolicy
 

@@ -17,7 +17,7 @@ from redis.exceptions import AuthenticationError, NoPermissionError
 
 from fog_runtime.credentials import Credentials
 from fog_runtime.locks.site_locks import SiteLocks
-from fog_supervisor.embedded.access_list import AccessList, Passwords, matches
+from fog_supervisor.embedded_broker import AccessList, Passwords, matches
 from fog_supervisor.servers import (
     Server,
     embedded_broker_program,

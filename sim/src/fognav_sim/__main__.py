@@ -7,13 +7,16 @@ ground truth.
 import asyncio
 import os
 from functools import partial
+from pathlib import Path
+from typing import Literal
 
 from fog_contracts.site import RobotSite
 from fog_runtime import logs, process
 from fog_runtime.clock import SystemClock
 from fog_runtime.configuration.robot_file import load_robot
-from fog_runtime.configuration.settings import SettingsError, describe, load
+from fog_runtime.configuration.settings import CommonSettings, SettingsError, describe, load
 from fog_runtime.configuration.site import LoadedSite, load_site
+from fog_runtime.credentials import NOBODY, Credentials
 from fog_runtime.health import Health, serve_health
 from fog_runtime.transports.zenoh_edge import ZenohEdge
 from fognav_sim import devices
@@ -22,8 +25,32 @@ from fognav_sim.hardware import Hardware
 from fognav_sim.live import LiveWorld, VirtualNode, run_nodes
 from fognav_sim.nodes import make_nodes
 from fognav_sim.sensors import LidarPlace
-from fognav_sim.settings import Settings
 from fognav_sim.world import World
+
+
+class Settings(CommonSettings, frozen=True, kw_only=True):
+    """FOGNAV_RUN_DIR: folder of the devices `base` and `lidar`; FOGNAV_TRUTH_LOG: file for the ground truth.
+
+    The robot's hardware, and the lidar's place on it, are those of its robot file
+    (`fog_runtime.configuration.robot_file`).
+    """
+
+    run_dir: Path
+    robot: str = ""
+    """Id of the robot in `site.toml`; empty: the first."""
+    nodes: Literal["auto", "firmware", "model"] = "auto"
+    """What the sensor nodes run: the firmware's core, compiled for this computer, or a model of it in Python.
+    `auto`: the firmware where its sources and a C++ compiler are."""
+    seed: int = 1
+    truth_log: Path | None = None
+    node_credentials_dir: Path | None = None
+    """Folder with the credentials of each sensor node, `NODE.toml`; without it the nodes are nobody."""
+
+    def credentials_of(self, node: str) -> Credentials:
+        """Read the credentials of a sensor node; raises `CredentialsError`."""
+        folder = self.node_credentials_dir
+        return NOBODY if folder is None else Credentials.read(folder / f"{node}.toml")
+
 
 _log = logs.get("sim")
 _INITIAL_WHEEL_TRAVEL_M = (28.4, 0.5)

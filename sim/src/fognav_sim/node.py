@@ -1,8 +1,8 @@
-"""A sensor node: the firmware's measurement cycle and classification, with the real sonar's timing. Pure.
+"""A sensor node: the measurement cycle and classification of the firmware, with the timing of the real sonar. Pure.
 
 The sonars measure one after the other, each for its time of flight (36 ms without an echo) but at least until its
 echoes have decayed; the reading is published with the last one's, and the firmware pauses. This gives about 8 readings
-a second. Source of the timing: HC-SR04 data sheet. Which readings are published, `publishing` decides.
+a second. Source of the timing: HC-SR04 data sheet.
 """
 
 from __future__ import annotations
@@ -10,13 +10,52 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Final
 
 from fog_contracts.messages import AreaState, NodeConfig, NodeReading, SonarStatus
-from fognav_sim.publishing import PublishPolicy
 from fognav_sim.sensors import SOUND_M_S
 
 if TYPE_CHECKING:
+    from collections.abc import Sequence
+
     from fog_contracts.messages import NodeCalibration
     from fog_contracts.site import NodeSite
     from fognav_sim.world import World
+
+HEARTBEAT_S: Final = 1.0
+EQUAL_READINGS: Final = 10
+MOVED_M: Final = 0.1
+
+
+class PublishPolicy:
+    """After a change every reading until ten equal ones have gone out, then one a second; or, as the thesis, every one.
+
+    A change is another state of a sonar, or a range of a blocked one that is 0.1 m off that of the last change.
+    """
+
+    def __init__(self, *, every_reading: bool) -> None:
+        self._every_reading = every_reading
+        self._sonars: list[tuple[AreaState, float]] = []
+        self._equal = 0
+        self._published = 0.0
+
+    def restart(self) -> None:
+        """Publish again as after a change."""
+        self._equal = 0
+
+    def update(self, states: Sequence[AreaState], ranges: Sequence[float | None], now: float) -> bool:
+        """Take each sonar's state and range (m; None for no echo) at `now` (s); return whether they go out."""
+        shown = [(state, measured or 0.0) for state, measured in zip(states, ranges, strict=True)]
+        if not self._sonars:
+            self._sonars = [("unknown", 0.0)] * len(shown)
+        for index, ((state, measured), (before, reference)) in enumerate(zip(shown, self._sonars, strict=True)):
+            if state != before or (state == "blocked" and abs(measured - reference) > MOVED_M):
+                self._sonars[index] = shown[index]
+                self._equal = 0
+        repeated = self._equal < EQUAL_READINGS
+        self._equal += repeated
+        if not (self._every_reading or repeated or now - self._published >= HEARTBEAT_S):
+            return False
+        self._published = now
+        return True
+
 
 NO_ECHO_S: Final = 0.036
 """The module ends its pulse after about 38 ms without an echo; the firmware times out just before."""

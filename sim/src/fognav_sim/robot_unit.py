@@ -25,10 +25,36 @@ from fog_runtime.health import Health, serve_health
 from fog_runtime.operator_key import read_operator_key
 from fog_runtime.robot_commands import RobotCommands
 from fog_runtime.transports.zenoh_edge import ZenohEdge
+from fog_supervisor.net import put_goal
 from fog_supervisor.supervisor import Event, Program, Supervisor
 from fognav_sim.drive.operator import OperatorCommand, OperatorPolicy, Shuttle
-from fognav_sim.planner_client import put_goal
-from fognav_sim.unit_health import UnitHealth
+
+SILENT_S: Final = 5.0
+"""A robot tells its state once a second."""
+
+
+class UnitHealth:
+    """The conditions of a robot's health; times are in s of one monotonic clock."""
+
+    def __init__(self, robot: str) -> None:
+        """Start without a state: a robot that has never spoken is not well."""
+        self._robot = robot
+        self._state: RobotState | None = None
+        self._at = 0.0
+
+    def on_state(self, state: RobotState, now: float) -> None:
+        """Take note of the robot's state."""
+        self._state, self._at = state, now
+
+    def conditions(self, now: float) -> dict[str, str]:
+        """Return why each condition is not met, empty if it is: `speaks`, `no_fault`."""
+        if self._state is None:
+            return {"speaks": f"{self._robot} has told no state yet", "no_fault": "its state is unknown"}
+        silent = now - self._at
+        speaks = "" if silent <= SILENT_S else f"{self._robot} has told no state for {silent:.0f} s"
+        fault = f"FAULT: {'; '.join(self._state.reasons)}" if self._state.mode == "FAULT" else ""
+        return {"speaks": speaks, "no_fault": fault}
+
 
 _POLICY_PERIOD_S: Final = 1.0
 _TIMEOUT_S: Final = 5.0

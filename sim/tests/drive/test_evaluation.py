@@ -6,7 +6,7 @@ import pytest
 
 from fog_contracts.messages import Refusal, RobotPath, RobotState, SimTruth
 from fog_contracts.site import AreaSite
-from fognav_sim.drive.evaluation import FALSE_ARRIVAL_S, REFUSAL_GRACE_S, DriveEvaluation
+from fognav_sim.drive.drive import FALSE_ARRIVAL_S, REFUSAL_GRACE_S, DriveEvaluation
 
 Z1 = AreaSite(id="z1", polygon=[(4.0, -1.0), (6.0, -1.0), (6.0, 1.0), (4.0, 1.0)])
 Z2 = AreaSite(id="z2", polygon=[(4.0, 3.0), (6.0, 3.0), (6.0, 5.0), (4.0, 5.0)])

@@ -14,7 +14,7 @@ from fognav.demo.run import Demo
 from fognav.demo.view import show
 from fognav.output import WrongUseError, console
 from fognav.page.app import serve
-from fognav_sim.drive.evaluation import DriveOutcome
+from fognav_sim.drive.drive import DriveOutcome
 
 _SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 

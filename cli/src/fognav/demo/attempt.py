@@ -22,8 +22,7 @@ from fognav.programs import ROBOT, WATCHDOG
 from fognav.recording import recording
 from fognav.stack import Stack, StackConfig
 from fognav.stack_doors import doors_of
-from fognav_sim.drive.drive import Drive, DriveSummary
-from fognav_sim.drive.evaluation import DriveOutcome
+from fognav_sim.drive.drive import Drive, DriveOutcome, DriveSummary
 from fognav_sim.drive.hazard import HazardSchedule
 
 READY_S: Final = 90.0

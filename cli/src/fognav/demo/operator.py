@@ -26,12 +26,12 @@ from fog_runtime.clock import Clock
 from fog_runtime.robot_commands import RobotCommands
 from fog_runtime.transports.zenoh_edge import ZenohEdge
 from fog_supervisor import net
+from fog_supervisor.net import put_goal
 from fognav.demo.scene import Scene
 from fognav.programs import PLANNER
 from fognav.stack import Stack
 from fognav_sim.drive.hazard import path_length
 from fognav_sim.drive.operator import OperatorPolicy
-from fognav_sim.planner_client import put_goal
 
 if TYPE_CHECKING:
     from fognav_sim.drive.drive import Drive

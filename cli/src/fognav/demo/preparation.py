@@ -12,7 +12,7 @@ from fognav.demo.background import Background
 from fognav.demo.operator import Operator
 from fognav.demo.options import DrivePlan
 from fognav.demo.scene import Scene
-from fognav_sim.drive.evaluation import DriveOutcome
+from fognav_sim.drive.drive import DriveOutcome
 from robot_agent.config import SafetyConfig
 from robot_agent.safety.gate import IMMEDIATE_STOP_MODES
 

@@ -9,7 +9,7 @@ from fognav.demo.options import DrivePlan, Options
 from fognav.demo.report import modes, report
 from fognav.demo.scene import Scene
 from fognav.demo.speed import TooFastError
-from fognav_sim.drive.evaluation import DriveOutcome
+from fognav_sim.drive.drive import DriveOutcome
 
 
 class Demo:

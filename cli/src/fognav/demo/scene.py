@@ -22,7 +22,7 @@ from fog_contracts.messages import (
 )
 from fog_contracts.stages import Traces, durations_ms, hazard_to_path_ms
 from fog_runtime.configuration.site import LoadedSite
-from fognav_sim.drive.evaluation import DriveOutcome
+from fognav_sim.drive.drive import DriveOutcome
 
 _EVENTS: Final = 200
 _TRAIL: Final = 20_000

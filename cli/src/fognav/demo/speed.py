@@ -8,7 +8,7 @@ from collections.abc import Sequence
 from typing import Final
 
 from fog_contracts.messages import RobotState, SimTruth
-from fognav_sim.drive.evaluation import DriveOutcome
+from fognav_sim.drive.drive import DriveOutcome
 
 MAX_LATE_CHECKS: Final = 2
 """After this many consecutive checks with late processes the attempt is given up."""

@@ -23,6 +23,7 @@ from fog_runtime.robot_commands import RobotCommands
 from fog_runtime.transports.zenoh_edge import ZenohEdge
 from fog_runtime.usage import ProcessUsage, memory_mb, sample, usage
 from fog_supervisor import net
+from fog_supervisor.net import put_goal
 from fognav.output import WrongUseError
 from fognav.programs import AGENT, PLANNER, ROBOT, WATCHDOG
 from fognav.stack import Stack, StackConfig
@@ -30,7 +31,6 @@ from fognav.stack_doors import Doors
 from fognav_experiments.bench.office import corridor_rows, make_office
 from fognav_experiments.bench.running import RunningSystem, first_child
 from fognav_sim.drive.operator import OperatorPolicy
-from fognav_sim.planner_client import put_goal
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Mapping

@@ -8,8 +8,7 @@ from typing import TYPE_CHECKING, Final
 from fog_contracts.messages import Pose, SimTruth
 from fognav_experiments.comparison.driven import facts
 from fognav_experiments.comparison.measured import MeasuredDrive
-from fognav_sim.drive.drive import Drive
-from fognav_sim.drive.evaluation import DriveOutcome
+from fognav_sim.drive.drive import Drive, DriveOutcome
 from fognav_sim.drive.hazard import HazardRequest, HazardSchedule
 
 if TYPE_CHECKING:

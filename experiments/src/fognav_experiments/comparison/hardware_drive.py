@@ -17,7 +17,7 @@ from fognav.operate.robots import connect
 from fognav.operate.systems import PLANNER
 from fognav.output import FailedError, WrongUseError
 from fognav_experiments.comparison.guided import GuidedDrive, stands_at, start_of, where_to_place
-from fognav_sim.drive.evaluation import DriveOutcome
+from fognav_sim.drive.drive import DriveOutcome
 from fognav_sim.drive.hazard import HazardRequest, HazardSchedule
 
 if TYPE_CHECKING:

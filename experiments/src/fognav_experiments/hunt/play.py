@@ -21,7 +21,7 @@ from fognav_experiments.lockstep import LockstepDrive, release_drives
 from fognav_experiments.rigs import STAMP
 from fognav_experiments.scenarios.stage import Stage, Word
 from fognav_sim.barrier import BarrierError
-from fognav_sim.drive.evaluation import DriveOutcome
+from fognav_sim.drive.drive import DriveOutcome
 from fognav_sim.drive.hazard import HazardSchedule
 from fognav_sim.emulators import QuirkyBase
 

@@ -23,8 +23,7 @@ from fog_runtime.configuration.parts import DEFAULT_BASE, DEFAULT_LIDAR
 from fog_runtime.configuration.robot_file import RobotFile, default_robot
 from fognav_experiments.scenarios.description import AnyEvent, BadLine, Obstacle
 from fognav_sim.floor import Floor
-from fognav_sim.lidar_faults import LidarFaults
-from fognav_sim.sensors import Noise
+from fognav_sim.sensors import LidarFaults, Noise
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray

@@ -11,6 +11,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final
+from urllib.parse import urlsplit
 
 LOOPBACK: Final = "127.0.0.1"
 EVERY_ADDRESS: Final = ("0.0.0.0", "")  # noqa: S104  # compared, not listened on
@@ -97,6 +98,27 @@ def request(  # noqa: PLR0913  # the parts of a request
         return Response(response.status, json.loads(text))
     except json.JSONDecodeError:
         return Response(response.status, text)
+
+
+def put_goal(planner_url: str, robot: str, place: str, token: str) -> Response:
+    """Give a robot a place of the site as its goal; return the planner's answer, which may be a refusal.
+
+    Raises `OSError` if the planner can't be reached, `ValueError` for an address that is not like `http://host:8000`.
+    """
+    address = urlsplit(planner_url)
+    if address.scheme != "http" or not address.hostname:
+        raise ValueError(f"the planner's address must look like http://host:8000, not {planner_url}")
+    try:
+        return request(
+            "PUT",
+            address.port or http.client.HTTP_PORT,
+            f"{address.path.rstrip('/')}/api/v1/robots/{robot}/goal",
+            body={"place": place},
+            token=token,
+            host=address.hostname,
+        )
+    except http.client.HTTPException as error:
+        raise ConnectionError(f"the planner closed the connection: {error!r}") from error
 
 
 def reachable(address: str) -> str:

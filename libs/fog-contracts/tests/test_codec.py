@@ -152,6 +152,12 @@ def test_replies_have_their_own_type_and_limit():
         decode(ch.ROBOT_COMMAND, data, m.CommandReply)
 
 
+def test_reply_of_an_older_robot_has_no_identifiers():
+    old = msgspec.msgpack.encode({"accepted": False, "reason": "no"})
+    reply = decode(ch.ROBOT_COMMAND, old, m.CommandReply, reply=True)
+    assert (reply.reason, reply.code, reply.causes) == ("no", "", [])
+
+
 def test_text_that_is_too_long_or_not_utf8_is_refused():
     assert decode_text(ch.NODE_AVAILABILITY, b"online") == "online"
     with pytest.raises(ContractError, match="UTF-8"):

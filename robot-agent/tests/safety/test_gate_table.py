@@ -287,8 +287,9 @@ def test_enable_is_refused_by_conditions_that_stop_at_once_and_by_no_other(row):
     out = gate.run(request="enable", **row.holds)
     if RANK[row.mode] >= 3:
         assert out.mode == ("FAULT" if row.mode == "FAULT" else "INIT")
-        assert out.refusal.startswith("the cause is still there: ")
+        assert out.refusal.code == "cause_remains"
         assert row.words in out.refusal
+        assert set(out.refusal.causes) <= {reason.code for reason in out.reasons}
     else:
         assert out.refusal is None
         assert out.mode == row.mode
@@ -334,14 +335,17 @@ def test_reset_without_a_fault_is_refused_and_changes_nothing(before):
     gate = Gate(before)
     out = gate.run(request="reset", **(TO[before] or {}))
     assert out.mode == before
-    assert out.refusal == f"there is no fault to reset: the mode is {before}"
+    assert out.refusal.code == "no_fault"
 
 
 def test_reset_of_a_fault_needs_its_cause_gone_and_leads_to_init():
     gate = Gate("FAULT")
-    assert gate.run(request="enable").refusal == "a fault is latched, reset it first: the bumper is pressed"
-    refused = gate.run(request="reset", bumper=True, cliff=True)
-    assert refused.refusal == "the cause is still there: the bumper is pressed; a cliff sensor sees no floor"
+    latched = gate.run(request="enable").refusal
+    assert latched == "a fault is latched, reset it first: the bumper is pressed"
+    assert (latched.code, latched.causes) == ("fault_latched", ("bumper",))
+    refused = gate.run(request="reset", bumper=True, cliff=True).refusal
+    assert refused == "the cause is still there: the bumper is pressed; a cliff sensor sees no floor"
+    assert (refused.code, refused.causes) == ("cause_remains", ("bumper", "cliff"))
     assert gate.run(1.0).reasons == ("the bumper is pressed",)
     assert gate.run(cliff=True).reasons == ("the bumper is pressed", "a cliff sensor sees no floor")
     accepted = gate.run(request="reset", base_fault="the bumper is pressed (left)")
@@ -355,7 +359,7 @@ def test_fault_before_the_first_enable_is_latched_and_an_enable_says_that_it_nee
     assert gate.run(**fault).mode == "FAULT"
     assert gate.run(60.0, **fault).mode == "FAULT"
     assert gate.run(60.0).mode == "FAULT"
-    assert gate.run(request="enable").refusal.startswith("a fault is latched, reset it first: ")
+    assert gate.run(request="enable").refusal.code == "fault_latched"
     assert gate.run(request="disable").mode == "FAULT"
     accepted = gate.run(request="reset")
     assert (accepted.mode, accepted.refusal) == ("INIT", None)

@@ -13,7 +13,7 @@ from prometheus_client import Gauge
 
 from fog_contracts import channels as ch
 from fog_contracts.geometry import GeometryError
-from fog_contracts.messages import CommandReply, NodeConfig, SimCommand
+from fog_contracts.messages import CommandReply, NodeConfig, Reason, SimCommand, SimRefusal
 from fog_runtime import logs
 from fog_runtime.clock import Ticker
 from fog_runtime.credentials import NOBODY, Credentials
@@ -157,13 +157,14 @@ class LiveWorld:
             if command.kidnap is not None:
                 self.world.kidnap(command.kidnap)
         except (GeometryError, ValueError) as error:
-            return CommandReply(accepted=False, reason=str(error))
+            return CommandReply.refused(Reason(SimRefusal.MISFIT, str(error)))
         if command.lidar_silent is not None:
             self.lidar_silent = command.lidar_silent
         if command.nodes_silent is not None:
             self.silent_nodes = frozenset(command.nodes_silent)
         if missing:
-            return CommandReply(accepted=False, reason=f"no such obstacle to remove: {', '.join(missing)}")
+            sentence = f"no such obstacle to remove: {', '.join(missing)}"
+            return CommandReply.refused(Reason(SimRefusal.NO_OBSTACLE, sentence))
         return CommandReply(accepted=True, reason="")
 
     async def publish_truth(self, edge: ZenohEdge, robot: str) -> None:

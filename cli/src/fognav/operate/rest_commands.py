@@ -40,7 +40,14 @@ def _outcome(fog: Fog, robot: str, path: str, body: object) -> Outcome:
     except RefusedError as error:
         if error.status != 409:
             raise
-        return Outcome(accepted=False, reason=error.reason, mode=error.problem.get("mode"))
+        problem = error.problem
+        return Outcome(
+            accepted=False,
+            reason=error.reason,
+            mode=problem.get("mode"),
+            code=problem.get("refusal", ""),
+            causes=problem.get("causes", []),
+        )
     return Outcome(accepted=True, reason=answer["reason"], mode=_mode(fog, robot) or answer["mode"])
 
 

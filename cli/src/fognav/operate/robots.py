@@ -86,7 +86,13 @@ class Robot:
         if on_reply is not None:
             on_reply()
         after = await self.next_state()
-        return Outcome(accepted=reply.accepted, reason=reply.reason, mode=after.mode if after is not None else None)
+        return Outcome(
+            accepted=reply.accepted,
+            reason=reply.reason,
+            mode=after.mode if after is not None else None,
+            code=reply.code,
+            causes=reply.causes,
+        )
 
 
 @asynccontextmanager

@@ -9,7 +9,7 @@ from typing import Final
 
 import msgspec
 
-from fog_contracts.messages import CommandKind, Pose, ProfileName, RobotCommand
+from fog_contracts.messages import CommandKind, Pose, ProfileName, Reason, RefusalCode, RobotCommand
 
 VALID_S: Final = 5.0
 """Seconds of the robot's clock after `issued_at` during which a command is valid."""
@@ -76,29 +76,34 @@ class CommandGate:
         self._boot = boot
         self._nonce_expiry: dict[str, float] = {}
 
-    def refusal(self, command: RobotCommand, now: float) -> str | None:
+    def refusal(self, command: RobotCommand, now: float) -> Reason | None:
         """Return why the command is refused at `now`, or None to accept it; each is accepted once, a stop always."""
         if command.robot != self._robot:
-            return f"this robot is {self._robot}, the command is for {command.robot}"
+            sentence = f"this robot is {self._robot}, the command is for {command.robot}"
+            return Reason(RefusalCode.OTHER_ROBOT, sentence)
         if command.kind in STOPS:
             return None
         if not hmac.compare_digest(command.signature, _signature(command, self._key)):
-            return "the signature does not match: sign the command with the site's operator key"
+            sentence = "the signature does not match: sign the command with the site's operator key"
+            return Reason(RefusalCode.NOT_SIGNED, sentence)
         if command.boot != self._boot:
-            return "the command was issued to another run of the agent, which restarted: issue it again"
+            sentence = "the command was issued to another run of the agent, which restarted: issue it again"
+            return Reason(RefusalCode.OTHER_RUN, sentence)
         return _age_refusal(now - command.issued_at) or self._use(command, now)
 
-    def _use(self, command: RobotCommand, now: float) -> str | None:
+    def _use(self, command: RobotCommand, now: float) -> Reason | None:
         self._nonce_expiry = {nonce: expiry for nonce, expiry in self._nonce_expiry.items() if expiry >= now}
         if command.nonce in self._nonce_expiry:
-            return "this command was already carried out: issue a new one"
+            return Reason(RefusalCode.REPEATED, "this command was already carried out: issue a new one")
         self._nonce_expiry[command.nonce] = command.issued_at + 2 * VALID_S
         return None
 
 
-def _age_refusal(age: float) -> str | None:
+def _age_refusal(age: float) -> Reason | None:
     if age < 0.0:
-        return f"the command was issued {-age:.1f} s in the future of the robot's clock: take `clock` from its state"
+        ahead = f"the command was issued {-age:.1f} s in the future of the robot's clock: take `clock` from its state"
+        return Reason(RefusalCode.FROM_FUTURE, ahead)
     if age > VALID_S:
-        return f"the command is {age:.1f} s old, more than {VALID_S:.0f} s: issue it again"
+        old = f"the command is {age:.1f} s old, more than {VALID_S:.0f} s: issue it again"
+        return Reason(RefusalCode.TOO_OLD, old)
     return None

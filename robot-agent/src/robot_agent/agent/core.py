@@ -53,6 +53,7 @@ if TYPE_CHECKING:
         PlanReply,
         Pose,
         ProfileName,
+        Reason,
         RobotCommand,
         RobotObstacles,
         RobotPose,
@@ -279,7 +280,7 @@ class AgentCore:
             self._driving.wheels.pass_reset()
         return outputs
 
-    def order_dock(self, now: float) -> str | None:
+    def order_dock(self, now: float) -> Reason | None:
         """Let the robot go to its dock; return why it does not, None if it does."""
         self._rest.wake()
         docked = self._base.docked_for(now) is not None
@@ -290,7 +291,7 @@ class AgentCore:
         self._maneuvers.docking.give_up("its goal was cancelled")
         return self._driving.cancel_goal()
 
-    def set_initial_pose(self, pose: Pose | None) -> str | None:
+    def set_initial_pose(self, pose: Pose | None) -> Reason | None:
         """Start localization at a pose in `map`; return why the pose is refused, None when it is accepted."""
         refusal = initial_pose_refusal(pose, self.replica, at_rest=self._driving.wheels.at_rest)
         if refusal is None and pose is not None:
@@ -298,7 +299,7 @@ class AgentCore:
             self._localizer.initial_pose(pose.x, pose.y, pose.theta)
         return refusal
 
-    def switch_profile(self, name: ProfileName) -> str | None:
+    def switch_profile(self, name: ProfileName) -> Reason | None:
         """Navigate by another profile; return why not, None when it is done."""
         self._rest.wake()
         return self._navigation.switch(name, at_rest=self._driving.wheels.at_rest)

@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Final
 import numpy as np
 
 from fog_contracts.costs import LETHAL
+from fog_contracts.messages import Reason, ReasonCode, RefusalCode
 from robot_agent.localization.pose import AbsoluteObservation, Pose2, wrap
 
 if TYPE_CHECKING:
@@ -65,16 +66,17 @@ class Docking:
         """Whether the robot is on its way to its dock, or to be sent there."""
         return self._ordered_at is not None
 
-    def order(self, state: SafetyState, mission: Mission, *, docked: bool, now: float) -> str | None:
+    def order(self, state: SafetyState, mission: Mission, *, docked: bool, now: float) -> Reason | None:
         """Let the robot go to its dock; return why it does not, None if it does."""
         if self._staging is None:
-            return "the site gives this robot no dock: set `dock` of its [[robots]] entry in site.toml"
+            sentence = "the site gives this robot no dock: set `dock` of its [[robots]] entry in site.toml"
+            return Reason(RefusalCode.NO_DOCK, sentence)
         if not self._config.finds_dock:
-            return "this base does not drive into a dock by itself"
+            return Reason(RefusalCode.NO_DOCK, "this base does not drive into a dock by itself")
         if docked:
-            return "the robot is on its dock"
+            return Reason(ReasonCode.ON_DOCK, "the robot is on its dock")
         if not state.enabled or state.mode == "FAULT":
-            return "the robot drives to its dock: enable it first"
+            return Reason(ReasonCode.NOT_ENABLED, "the robot drives to its dock: enable it first")
         self._ordered_at, self._goal_before, self.given_up = now, mission.goal_id, ""
         if self._is_ours(mission):
             mission.resume()  # the planner does not send the robot where it sends it already
@@ -119,27 +121,27 @@ class Docking:
         """Record whether the safety gate lets the base look for its dock."""
         self._ordered_at, self.given_up = None, refusal or ""
 
-    def problem(self, replica: Replica, now: float, *, running: bool) -> str | None:
+    def problem(self, replica: Replica, now: float, *, running: bool) -> Reason | None:
         """Return why the base must not drive into its dock from where it is; None when it may.
 
         running: it does so already.
         """
         pose, points = self._localizer.pose(now), self._localizer.points_in_map()
         if self._dock is None or self._staging is None or pose is None or points is None:
-            return "the robot does not know where its dock is"
+            return Reason(RefusalCode.DOCK_NOT_KNOWN, "the robot does not know where its dock is")
         ahead = math.hypot(pose.x - self._dock.x, pose.y - self._dock.y)
         if running:
             begun = math.hypot(self._staging.x - self._dock.x, self._staging.y - self._dock.y)
             if ahead > begun + _SURROUNDINGS_M:
-                return "the robot moved away from its dock"
+                return Reason(RefusalCode.DOCK_FAR, "the robot moved away from its dock")
         else:
             off = pose.relative_to(self._staging)
             if math.hypot(off.x, off.y) > _STAGED_M or abs(off.theta) > _STAGED_RAD:
-                return "the robot is not in front of its dock"
+                return Reason(RefusalCode.DOCK_FAR, "the robot is not in front of its dock")
         if self._blocked_between(pose, ahead, replica):
-            return "the place between the robot and its dock is blocked"
+            return Reason(RefusalCode.DOCK_BARRED, "the place between the robot and its dock is blocked")
         if self._is_between(pose, points):
-            return "the lidar sees something between the robot and its dock"
+            return Reason(RefusalCode.DOCK_BARRED, "the lidar sees something between the robot and its dock")
         return None
 
     def without_dock(self, points: NDArray[np.float64], pose: Pose2) -> NDArray[np.float64]:

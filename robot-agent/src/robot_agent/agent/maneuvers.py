@@ -28,7 +28,7 @@ from robot_agent.safety.gate import MANEUVERS
 if TYPE_CHECKING:
     from collections.abc import Mapping
 
-    from fog_contracts.messages import PlanReply
+    from fog_contracts.messages import PlanReply, Reason
     from fog_contracts.replica import Replica
     from robot_agent.agent.motion_guard import MotionGuard
     from robot_agent.agent.path_driving import PathDriving
@@ -333,7 +333,7 @@ class Maneuvers:
             case _:
                 return self._straight[kind].wheels
 
-    def _dock_problem(self, replica: Replica, now: float, *, running: bool) -> str | None:
+    def _dock_problem(self, replica: Replica, now: float, *, running: bool) -> Reason | None:
         problem = self.docking.problem(replica, now, running=running)
         pose = self._localizer.pose(now)
         if problem is not None or not running or pose is None:

@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Final
 import numpy as np
 
 from fog_contracts.costs import LETHAL
+from fog_contracts.messages import Reason, ReasonCode
 from fog_kernels.raycast import cast
 from fog_kernels.scans import Mounting, Placed, placed
 from fog_kernels.sweep import half_planes
@@ -25,7 +26,6 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
-    from fog_contracts.messages import Reason
     from fog_contracts.replica import Replica
     from fog_kernels.scans import Track
     from robot_agent.config import AgentConfig, LocalizationConfig, VisibilityConfig
@@ -220,20 +220,20 @@ class MotionGuard:
         self.reason = self.reason or left.reason
         return left.wheels
 
-    def blindness(self, wheels: Wheels) -> str | None:
+    def blindness(self, wheels: Wheels) -> Reason | None:
         """Return why the robot would not move at these wheel speeds (m/s), as it sees too little there; else None."""
         return self._view.visibility.limit(wheels, self._drive.twist(*wheels)).reason
 
     def hazard(
         self, wheels: Wheels, keep: Callable[[NDArray[np.float64]], NDArray[np.float64]], now: float
-    ) -> str | None:
+    ) -> Reason | None:
         """Return why a robot that nobody slows down must not go on at these wheel speeds (m/s); None when it may.
 
         keep: returns those of the points (n, 2; m) in `base` that count.
         """
         points = keep(self._points.seen_from(self._localizer, now))
         if self._field.limit(wheels, points).zone != "free":
-            return "the lidar sees an obstacle near the robot's way"
+            return Reason(ReasonCode.OBSTACLE_NEAR, "the lidar sees an obstacle near the robot's way")
         if self._view.visibility.limit(wheels, self._drive.twist(*wheels)).zone == "free":
             return None
-        return "the lidar does not see enough of the robot's way"
+        return Reason(ReasonCode.LIDAR_BLIND, "the lidar does not see enough of the robot's way")

@@ -14,7 +14,7 @@ import numpy as np
 from fog_contracts import channels as ch
 from fog_contracts.costs import LETHAL
 from fog_contracts.geometry import contains_point
-from fog_contracts.messages import PolygonShape, Reason, ReasonCode
+from fog_contracts.messages import PolygonShape, Reason, ReasonCode, RefusalCode
 from fog_contracts.replica import decode_map
 from fog_contracts.shapes import shape_contains, shape_spans
 from robot_agent.localization.pose import Pose2
@@ -346,14 +346,14 @@ class Navigation:
 
     # --- profiles ---
 
-    def switch(self, name: ProfileName, *, at_rest: bool) -> str | None:
+    def switch(self, name: ProfileName, *, at_rest: bool) -> Reason | None:
         """Navigate by another profile; return why not, None when it is done. The present path is dropped."""
         if not at_rest:
-            return "the robot is driving: disable it first"
+            return Reason(RefusalCode.DRIVING, "the robot is driving: disable it first")
         try:
             self.profile = self._find_profile(name)
         except ProfileError as error:
-            return str(error)
+            return Reason(RefusalCode.NO_PROFILE, str(error))
         self._driving.configure(self.profile.motion(self._config.motion))
         self._begin_onboard()
         return None

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Final, Protocol
 
 from fog_contracts.commands import PROFILE_OF, CommandGate
 from fog_contracts.costs import LETHAL
-from fog_contracts.messages import CommandReply
+from fog_contracts.messages import CommandReply, Reason, ReasonCode, RefusalCode
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -18,7 +18,6 @@ if TYPE_CHECKING:
     from robot_agent.safety.conditions import Request
     from robot_agent.safety.gate import SafetyOutputs
 
-_REASON_LIMIT: Final = 500
 _ACCEPTED: Final[Mapping[Request, str]] = {
     "reset": "the fault is reset; enable the robot to let it drive",
     "egress": "the robot leaves the blocked area slowly; watch it",
@@ -35,16 +34,16 @@ class CommandTarget(Protocol):
     def request(self, request: Request, now: float) -> SafetyOutputs:
         """Pass a request to the safety gate; the outputs carry its refusal."""
 
-    def order_dock(self, now: float) -> str | None:
+    def order_dock(self, now: float) -> Reason | None:
         """Let the robot go to its dock; return why it does not, None if it does."""
 
     def cancel_goal(self) -> str | None:
         """Cancel the goal; return its id, None without one."""
 
-    def set_initial_pose(self, pose: Pose | None) -> str | None:
+    def set_initial_pose(self, pose: Pose | None) -> Reason | None:
         """Start localization at a pose in `map`; return why the pose is refused, None when it is accepted."""
 
-    def switch_profile(self, name: ProfileName) -> str | None:
+    def switch_profile(self, name: ProfileName) -> Reason | None:
         """Navigate by another profile; return why not, None when it is done."""
 
 
@@ -59,7 +58,7 @@ class OperatorCommands:
         """Execute a command, or refuse it with a reason."""
         refusal = self._gate.refusal(command, at.now)
         if refusal is not None:
-            return _refused(refusal)
+            return CommandReply.refused(refusal)
         match command.kind:
             case "enable" | "disable" | "reset" | "egress" | "undock" | "back_off" | "turn" | "advance":
                 return self._request(command.kind, at.now)
@@ -75,50 +74,46 @@ class OperatorCommands:
     def _cancel(self) -> CommandReply:
         goal = self._robot.cancel_goal()
         if goal is None:
-            return _refused("there is no goal to cancel")
+            return CommandReply.refused(Reason(RefusalCode.NO_GOAL, "there is no goal to cancel"))
         return CommandReply(accepted=True, reason=f"the goal {goal} is cancelled on the robot")
 
     def _send_to_dock(self, now: float) -> CommandReply:
         refusal = self._robot.order_dock(now)
         if refusal is not None:
-            return _refused(refusal)
+            return CommandReply.refused(refusal)
         return CommandReply(accepted=True, reason="the robot goes to its dock; watch it while it drives into it")
 
     def _start_localization(self, pose: Pose | None) -> CommandReply:
         refusal = self._robot.set_initial_pose(pose)
         if refusal is not None:
-            return _refused(refusal)
+            return CommandReply.refused(refusal)
         return CommandReply(accepted=True, reason="accepted; the next lidar scans verify it")
 
     def _switch(self, profile: ProfileName) -> CommandReply:
         refusal = self._robot.switch_profile(profile)
         if refusal is not None:
-            return _refused(refusal)
+            return CommandReply.refused(refusal)
         return CommandReply(accepted=True, reason=f"the robot navigates by the profile {profile} from now on")
 
     def _request(self, request: Request, now: float) -> CommandReply:
         outputs = self._robot.request(request, now)
         if outputs.refusal is not None:
-            return _refused(outputs.refusal)
+            return CommandReply.refused(outputs.refusal)
         return CommandReply(accepted=True, reason=_ACCEPTED.get(request, f"{request}d; the mode is {outputs.mode}"))
 
 
-def initial_pose_refusal(pose: Pose | None, replica: Replica, *, at_rest: bool) -> str | None:
+def initial_pose_refusal(pose: Pose | None, replica: Replica, *, at_rest: bool) -> Reason | None:
     """Return why an operator's initial pose is impossible; None when it is possible."""
     geometry = replica.geometry
     if pose is None:
-        return "the command carries no pose: give x, y and theta"
+        return Reason(RefusalCode.POSE_MISSING, "the command carries no pose: give x, y and theta")
     if geometry is None:
-        return "the robot has no map yet: wait until it has loaded one"
+        return Reason(ReasonCode.MAP_MISSING, "the robot has no map yet: wait until it has loaded one")
     if not at_rest:
-        return "the robot is driving: disable it first"
+        return Reason(RefusalCode.DRIVING, "the robot is driving: disable it first")
     column, row = geometry.cell(pose.x, pose.y)
     if not geometry.contains_cell(column, row):
-        return f"({pose.x:.2f}, {pose.y:.2f}) is off the map"
+        return Reason(RefusalCode.POSE_OFF_MAP, f"({pose.x:.2f}, {pose.y:.2f}) is off the map")
     if replica.static[row, column] == LETHAL:
-        return f"({pose.x:.2f}, {pose.y:.2f}) is in a wall of the map"
+        return Reason(RefusalCode.POSE_IN_WALL, f"({pose.x:.2f}, {pose.y:.2f}) is in a wall of the map")
     return None
-
-
-def _refused(reason: str) -> CommandReply:
-    return CommandReply(accepted=False, reason=reason[:_REASON_LIMIT])

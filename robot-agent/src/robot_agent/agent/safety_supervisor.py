@@ -101,8 +101,8 @@ class ManeuverInputs(NamedTuple):
 
     remaining: float = math.inf
     problem: str | None = None
-    dock_problem: str | None = None
-    blind_behind: str | None = None
+    dock_problem: Reason | None = None
+    blind_behind: Reason | None = None
 
 
 class SafetySupervisor:

@@ -80,8 +80,8 @@ class SafetyInputs(msgspec.Struct, frozen=True, kw_only=True):
     position_sigma: float = 0.0
     maneuver_remaining: float = math.inf
     maneuver_problem: str | None = None
-    dock_problem: str | None = None
-    blind_behind: str | None = None
+    dock_problem: Reason | None = None
+    blind_behind: Reason | None = None
     caution: Reason | None = None
     resting: str | None = None
     late_age: float = math.inf

@@ -15,11 +15,11 @@ from typing import TYPE_CHECKING, Final, Literal
 import msgspec
 from msgspec.structs import replace
 
-from fog_contracts.messages import Mode, Reason, ReasonCode
+from fog_contracts.messages import Mode, Reason, ReasonCode, RefusalCode
 from robot_agent.config import SafetyConfig
 from robot_agent.safety import maneuver
 from robot_agent.safety.conditions import Finding, Level, SafetyInputs, collect_findings
-from robot_agent.safety.maneuver import RULES, Maneuver
+from robot_agent.safety.maneuver import RULES, Maneuver, because
 
 if TYPE_CHECKING:
     from robot_agent.safety.maneuver import ManeuverKind
@@ -80,7 +80,7 @@ class SafetyOutputs:
     cap: float
     stop: Literal["none", "ramp", "immediate"]
     changed: bool
-    refusal: str | None
+    refusal: Reason | None
 
     @property
     def mission_may_drive(self) -> bool:
@@ -184,7 +184,7 @@ def _may_undock(
 
 def _apply_request(
     state: SafetyState, inputs: SafetyInputs, findings: list[Finding], now: float, config: SafetyConfig
-) -> tuple[SafetyState, str | None]:
+) -> tuple[SafetyState, Reason | None]:
     match inputs.request:
         case None:
             return state, None
@@ -197,14 +197,14 @@ def _apply_request(
     return _enable(state, inputs, findings)
 
 
-def _reset(state: SafetyState, inputs: SafetyInputs, config: SafetyConfig) -> tuple[SafetyState, str | None]:
+def _reset(state: SafetyState, inputs: SafetyInputs, config: SafetyConfig) -> tuple[SafetyState, Reason | None]:
     if state.mode != "FAULT" and inputs.base_fault is None:
-        return state, f"there is no fault to reset: the mode is {state.mode}"
+        return state, Reason(RefusalCode.NO_FAULT, f"there is no fault to reset: the mode is {state.mode}")
     # The guardian latches the base's own faults, and checks their causes again when it is reset.
     causes = collect_findings(replace(inputs, base_fault=None), config)
     present = [finding.reason for finding in causes if finding.level == Level.FAULT]
     if present:
-        return state, f"the cause is still there: {'; '.join(present)}"
+        return state, because(RefusalCode.CAUSE_REMAINS, "the cause is still there", present)
     reset = replace(state, mode="INIT", enabled=False, latched=(), stops=(), maneuver=None, answered=inputs.base_fault)
     if state.maneuver is not None:
         name = RULES[state.maneuver.kind].name
@@ -214,16 +214,17 @@ def _reset(state: SafetyState, inputs: SafetyInputs, config: SafetyConfig) -> tu
 
 def _begin(
     kind: ManeuverKind, state: SafetyState, inputs: SafetyInputs, now: float, config: SafetyConfig
-) -> tuple[SafetyState, str | None]:
+) -> tuple[SafetyState, Reason | None]:
     rules = RULES[kind]
     if state.mode == "FAULT" and kind != "back_off":
         return state, _latched_fault(state)
     if state.maneuver is not None:
-        return state, f"the robot makes a maneuver already: {RULES[state.maneuver.kind].doing}"
+        doing = RULES[state.maneuver.kind].doing
+        return state, Reason(RefusalCode.MANEUVER_RUNS, f"the robot makes a maneuver already: {doing}")
     if rules.needs_enable and (not state.enabled or state.latched):
-        return state, "the robot must be enabled for that"
+        return state, Reason(ReasonCode.NOT_ENABLED, "the robot must be enabled for that")
     begun = maneuver.begin(kind, inputs, now, config)
-    if isinstance(begun, str):
+    if not isinstance(begun, Maneuver):
         return state, begun
     # The bump stays latched while the robot backs off from it. What else is latched has to be answered by an operator,
     # so that the robot is disabled after any other maneuver.
@@ -240,21 +241,23 @@ def _interrupted(state: SafetyState) -> SafetyState:
     return replace(state, mode="FAULT" if faults else "INIT", maneuver=None, latched=faults)
 
 
-def _latched_fault(state: SafetyState) -> str:
-    return f"a fault is latched, reset it first: {'; '.join(f.reason for f in state.latched)}"
+def _latched_fault(state: SafetyState) -> Reason:
+    latched = [finding.reason for finding in state.latched]
+    return because(RefusalCode.FAULT_LATCHED, "a fault is latched, reset it first", latched)
 
 
-def _enable(state: SafetyState, inputs: SafetyInputs, findings: list[Finding]) -> tuple[SafetyState, str | None]:
+def _enable(state: SafetyState, inputs: SafetyInputs, findings: list[Finding]) -> tuple[SafetyState, Reason | None]:
     if state.mode == "FAULT":
         return state, _latched_fault(state)
     if state.maneuver is not None:
-        return state, f"wait, or disable the robot: {RULES[state.maneuver.kind].doing}"
+        doing = RULES[state.maneuver.kind].doing
+        return state, Reason(RefusalCode.MANEUVER_RUNS, f"wait, or disable the robot: {doing}")
     limit = min((finding.level for finding in state.latched), default=Level.PROTECTIVE_STOP)
     if not inputs.map_loaded:
         limit = Level.HOLD
     present = [finding.reason for finding in findings if finding.level >= limit]
     if present:
-        return state, f"the cause is still there: {'; '.join(present)}"
+        return state, because(RefusalCode.CAUSE_REMAINS, "the cause is still there", present)
     return replace(state, enabled=True, latched=(), stopped_since=math.inf, maneuver_end=""), None
 
 
@@ -370,7 +373,7 @@ def _reasons(state: SafetyState, findings: list[Finding]) -> tuple[Reason, ...]:
     return reasons
 
 
-def _outputs(state: SafetyState, before: Mode, refusal: str | None, config: SafetyConfig) -> SafetyOutputs:
+def _outputs(state: SafetyState, before: Mode, refusal: Reason | None, config: SafetyConfig) -> SafetyOutputs:
     caps: dict[Mode, float] = {"NORMAL": config.speed_normal, "DEGRADED": config.speed_degraded}
     if state.maneuver is not None and state.mode in MANEUVERS:
         caps[state.mode] = RULES[state.maneuver.kind].cap(config)

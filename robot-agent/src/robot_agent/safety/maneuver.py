@@ -17,6 +17,7 @@ from typing import TYPE_CHECKING, Final, Literal, NamedTuple
 import msgspec
 from msgspec.structs import replace
 
+from fog_contracts.messages import Reason, ReasonCode, RefusalCode
 from robot_agent.safety.conditions import Level, collect_findings
 
 if TYPE_CHECKING:
@@ -45,7 +46,7 @@ class Rules(NamedTuple):
     name: str
     doing: str
     relevant: Callable[[SafetyInputs], SafetyInputs]
-    refusal: Callable[[SafetyInputs], str | None]
+    refusal: Callable[[SafetyInputs], Reason | None]
     end: Callable[[SafetyInputs, SafetyConfig], tuple[str, bool] | None]
     longest: Callable[[SafetyConfig], float]
     cap: Callable[[SafetyConfig], float]
@@ -57,8 +58,11 @@ def _relevant_to_egress(inputs: SafetyInputs) -> SafetyInputs:
     return replace(inputs, inside_blocked=None, mission=False)
 
 
-def _refuses_egress(inputs: SafetyInputs) -> str | None:
-    return "the robot is in no blocked area or zone: there is nothing to leave" if not inputs.inside_blocked else None
+def _refuses_egress(inputs: SafetyInputs) -> Reason | None:
+    if inputs.inside_blocked:
+        return None
+    sentence = "the robot is in no blocked area or zone: there is nothing to leave"
+    return Reason(RefusalCode.NOT_BLOCKED_IN, sentence)
 
 
 def _egress_end(inputs: SafetyInputs, config: SafetyConfig) -> tuple[str, bool] | None:
@@ -77,8 +81,10 @@ def _relevant_to_docking(inputs: SafetyInputs) -> SafetyInputs:
     return replace(inputs, mission=False)
 
 
-def _refuses_docking(inputs: SafetyInputs) -> str | None:
-    return "the robot is on its dock" if inputs.docked_for is not None else inputs.dock_problem
+def _refuses_docking(inputs: SafetyInputs) -> Reason | None:
+    if inputs.docked_for is not None:
+        return Reason(ReasonCode.ON_DOCK, "the robot is on its dock")
+    return inputs.dock_problem
 
 
 def _docking_end(inputs: SafetyInputs, config: SafetyConfig) -> tuple[str, bool] | None:
@@ -94,8 +100,10 @@ def _relevant_to_undocking(inputs: SafetyInputs) -> SafetyInputs:
     return replace(inputs, mission=False, base_stopped=None, docked_for=None, bumper=inputs.bumper and not on_dock)
 
 
-def _refuses_undocking(inputs: SafetyInputs) -> str | None:
-    return "the robot is not on its dock" if inputs.docked_for is None else inputs.blind_behind
+def _refuses_undocking(inputs: SafetyInputs) -> Reason | None:
+    if inputs.docked_for is None:
+        return Reason(RefusalCode.NOT_ON_DOCK, "the robot is not on its dock")
+    return inputs.blind_behind
 
 
 def _straight_end(inputs: SafetyInputs, _: SafetyConfig) -> tuple[str, bool] | None:
@@ -119,9 +127,10 @@ def _relevant_to_back_off(inputs: SafetyInputs) -> SafetyInputs:
     )
 
 
-def _refuses_back_off(inputs: SafetyInputs) -> str | None:
+def _refuses_back_off(inputs: SafetyInputs) -> Reason | None:
     if not inputs.bumped:
-        return "the robot has bumped into nothing: there is nothing to back off from"
+        sentence = "the robot has bumped into nothing: there is nothing to back off from"
+        return Reason(RefusalCode.NOT_BUMPED, sentence)
     return inputs.blind_behind
 
 
@@ -134,17 +143,20 @@ def _relevant_to_looking_around(inputs: SafetyInputs) -> SafetyInputs:
     )
 
 
-def _refuses_looking_around(inputs: SafetyInputs) -> str | None:
+def _refuses_looking_around(inputs: SafetyInputs) -> Reason | None:
     if inputs.docked_for is not None:
-        return "the robot is on its dock: undock it first"
+        return Reason(ReasonCode.ON_DOCK, "the robot is on its dock: undock it first")
     if inputs.localization == "good":
-        return "the robot knows where it is: there is nothing to find out"
+        sentence = "the robot knows where it is: there is nothing to find out"
+        return Reason(RefusalCode.POSE_KNOWN, sentence)
     return _lies_ahead(inputs)
 
 
-def _lies_ahead(inputs: SafetyInputs) -> str | None:
-    """Return the sentence about a blocked place on the way of an advance; None without one."""
-    return None if inputs.blocked_ahead is None else f"{inputs.blocked_ahead} is on the way ahead"
+def _lies_ahead(inputs: SafetyInputs) -> Reason | None:
+    """Return the reason of a blocked place on the way of an advance; None without one."""
+    if inputs.blocked_ahead is None:
+        return None
+    return Reason(RefusalCode.BLOCKED_AHEAD, f"{inputs.blocked_ahead} is on the way ahead")
 
 
 def _looking_around_end(inputs: SafetyInputs, _: SafetyConfig) -> tuple[str, bool] | None:
@@ -242,7 +254,7 @@ class End(NamedTuple):
     done: bool = False
 
 
-def begin(kind: ManeuverKind, inputs: SafetyInputs, now: float, config: SafetyConfig) -> Maneuver | str:
+def begin(kind: ManeuverKind, inputs: SafetyInputs, now: float, config: SafetyConfig) -> Maneuver | Reason:
     """Return a maneuver that begins at `now` (s, monotonic), or why there can't be one."""
     rules = RULES[kind]
     refusal = rules.refusal(inputs)
@@ -251,8 +263,13 @@ def begin(kind: ManeuverKind, inputs: SafetyInputs, now: float, config: SafetyCo
     findings = collect_findings(rules.relevant(inputs), config)
     causes = [finding.reason for finding in findings if finding.level >= Level.HOLD and not finding.rest]
     if causes:
-        return f"the robot must not move: {'; '.join(causes)}"
+        return because(RefusalCode.MUST_NOT_MOVE, "the robot must not move", causes)
     return Maneuver(now, float("inf"), now, kind)
+
+
+def because(code: RefusalCode, sentence: str, causes: Sequence[Reason]) -> Reason:
+    """Return the refusal of a request that `causes` do not allow, with their sentences and identifiers."""
+    return Reason(code, f"{sentence}: {'; '.join(causes)}", [cause.code for cause in causes])
 
 
 def proceed(

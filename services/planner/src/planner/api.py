@@ -92,13 +92,16 @@ def add_commands(
 
     def outcome(robot: str, reply: CommandReply) -> CommandOutcome:
         if not reply.accepted:
-            raise ProblemError(409, reply.reason, mode=mode(robot))
+            raise ProblemError(409, reply.reason, mode=mode(robot), refusal=reply.code, causes=reply.causes)
         return CommandOutcome(accepted=True, reason=reply.reason, mode=mode(robot))
 
     @routes.post(
         "/api/v1/robots/{robot}/commands",
         raises=[CommandError, StoreError],
-        problems={404: "No robot has this id", 409: "The robot refuses: `detail` has its reason, `mode` its mode"},
+        problems={
+            404: "No robot has this id",
+            409: "The robot refuses: `detail` has its reason, `refusal` and `causes` its identifiers, `mode` its mode",
+        },
     )
     async def post_command(robot: str, body: Body[CommandBody], caller: Operator) -> CommandOutcome:
         """Command a robot; the robot itself accepts or refuses."""

@@ -49,8 +49,8 @@ def message_fields(kind: type[Message]) -> list[Field]:
     return [_field(each) for each in described.fields]
 
 
-def summary(kind: type[Message]) -> str:
-    """Return a message's docstring as one paragraph."""
+def summary(kind: type) -> str:
+    """Return a type's docstring as one paragraph."""
     return " ".join((kind.__doc__ or "").split())
 
 

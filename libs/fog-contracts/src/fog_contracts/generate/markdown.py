@@ -5,12 +5,14 @@ from __future__ import annotations
 import math
 import re
 from collections.abc import Iterable, Mapping, Sequence
-from typing import TYPE_CHECKING, Any, Final
+from typing import TYPE_CHECKING, Any, Final, TypeGuard
 
 import msgspec
 
+from fog_contracts import messages
 from fog_contracts.channels import CHANNELS, DURABILITIES, KIB, MIB, ROLES, Channel, Role
 from fog_contracts.generate import NOTE, Field, bounds, message_fields, parts, summary, type_text
+from fog_contracts.messages import Described
 
 if TYPE_CHECKING:
     from fog_contracts.messages import Message
@@ -39,13 +41,20 @@ A reply over 32 KiB is only announced, and its parts are asked for: the reply is
 `{"reply": NAME, "size": BYTES}`; the query `KEY?reply=NAME;part=NUMBER` returns a part of 32 KiB (the last one is
 shorter), or an error once the reply is not kept any more. Replies are dropped on a congested link: ask again.
 """
+_IDENTIFIERS: Final = """\
+## Identifiers
+
+Programs compare identifiers, people read the sentences beside them. Those of a robot's reasons (`ReasonCode`) are in
+[safety.md](safety.md#reasons).
+"""
 _LARGE: Final = 2**31
 _METHODS: Final = ("get", "put", "post", "patch", "delete")
 
 
 def channels_markdown(services: Mapping[str, OpenApi]) -> str:
     """Return the whole document; `services` are the OpenAPI descriptions by the name of the service."""
-    return _HEAD + "\n".join([_roles(), _durabilities(), _mqtt(), _zenoh(), _messages(), _routes(services)])
+    parts = [_roles(), _durabilities(), _mqtt(), _zenoh(), _messages(), _identifiers(), _routes(services)]
+    return _HEAD + "\n".join(parts)
 
 
 def _roles() -> str:
@@ -119,6 +128,20 @@ def _messages() -> str:
 def _one(kind: type[Message]) -> str:
     rows = ([f"`{f.name}`", _linked(type_text(f.type)), f.unit, _limits(f), _default(f)] for f in message_fields(kind))
     return f"### {kind.__name__}\n\n{summary(kind)}\n\n" + _table(["field", "type", "unit", "limits", "default"], rows)
+
+
+def _identifiers() -> str:
+    """Return a table of each enumeration of identifiers whose members say what they mean."""
+    described = [kind for _, kind in sorted(vars(messages).items()) if isinstance(kind, type) and _is_described(kind)]
+    sections = [_IDENTIFIERS]
+    for kind in described:
+        rows = ([f"`{member}`", member.says] for member in kind)
+        sections.append(f"### {kind.__name__}\n\n{summary(kind)}\n\n" + _table(["identifier", "says"], rows))
+    return "\n".join(sections)
+
+
+def _is_described(kind: type) -> TypeGuard[type[Described]]:
+    return issubclass(kind, Described) and kind is not Described
 
 
 def _routes(services: Mapping[str, OpenApi]) -> str:

@@ -4,7 +4,9 @@ Stamps are seconds since the Unix epoch by the sender's clock (`fog_runtime.cloc
 people. Freshness is never computed from them but from the receiver's own monotonic clock.
 """
 
-from typing import Annotated, Final, Literal
+from collections.abc import Iterable
+from enum import StrEnum
+from typing import Annotated, Final, Literal, Self
 
 from msgspec import Meta, Struct
 
@@ -32,6 +34,9 @@ Cells = Annotated[int, Meta(ge=0, le=65_535, extra={"unit": "cells"})]
 SENTENCE_MAX: Final = 500
 """Characters of the longest sentence."""
 Sentence = Annotated[str, Meta(max_length=SENTENCE_MAX)]
+Code = Annotated[str, Meta(max_length=32)]
+"""An identifier for programs, beside a sentence for people."""
+Codes = list[Code]
 PointXY = tuple[Metres, Metres]
 Ring = Annotated[list[PointXY], Meta(min_length=3, max_length=500)]
 
@@ -42,6 +47,39 @@ CalibrationResult = Literal["done", "stuck", "unsteady", "too_near"]
 
 class Message(Struct, frozen=True, kw_only=True):
     """Base of all messages: frozen, fields by name; unknown fields are ignored when decoding."""
+
+
+class Described(StrEnum):
+    """Base of identifiers, each with what it says, for the documents that are made of them."""
+
+    says: str
+
+    def __new__(cls, code: str, says: str) -> Self:
+        """Return an identifier with what it says."""
+        member = str.__new__(cls, code)
+        member._value_, member.says = code, says
+        return member
+
+
+class Reason(str):
+    """A sentence for people with its identifier for programs, and those of its causes.
+
+    Codecs know only the sentence: send the others beside it.
+    """
+
+    __slots__ = ("causes", "code")
+    code: StrEnum
+    causes: tuple[StrEnum, ...]
+
+    def __new__(cls, code: StrEnum, sentence: str, causes: Iterable[StrEnum] = ()) -> Self:
+        """Return a sentence with its identifier, and those of its causes."""
+        reason = super().__new__(cls, sentence)
+        reason.code, reason.causes = code, tuple(causes)
+        return reason
+
+    def __reduce__(self) -> tuple[type[Self], tuple[StrEnum, str, tuple[StrEnum, ...]]]:
+        """Return what a copy is made from."""
+        return type(self), (self.code, str(self), self.causes)
 
 
 class Pose(Message, frozen=True, kw_only=True):

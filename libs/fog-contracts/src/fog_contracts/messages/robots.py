@@ -7,9 +7,13 @@ from msgspec import Meta
 from msgspec.structs import replace
 
 from fog_contracts.messages.basics import (
+    SENTENCE_MAX,
     AngularSpeed,
     Boot,
+    Code,
+    Codes,
     Count,
+    Described,
     Epochs,
     Finite,
     Id,
@@ -18,6 +22,7 @@ from fog_contracts.messages.basics import (
     PointXY,
     Pose,
     Radians,
+    Reason,
     Seconds,
     Sent,
     Sentence,
@@ -257,21 +262,39 @@ class ReasonCode(StrEnum):
     DOCKING_GIVEN_UP = "docking_given_up"
 
 
-class Reason(str):
-    """A sentence for people with its identifier for programs; codecs know neither: send both."""
+class RefusalCode(Described):
+    """Why a robot refuses a command; where a condition refuses it by itself, its `ReasonCode` says so."""
 
-    __slots__ = ("code",)
-    code: ReasonCode
-
-    def __new__(cls, code: ReasonCode, sentence: str) -> Self:
-        """Return a sentence with its identifier."""
-        reason = super().__new__(cls, sentence)
-        reason.code = code
-        return reason
-
-    def __reduce__(self) -> tuple[type[Self], tuple[ReasonCode, str]]:
-        """Return what a copy is made from."""
-        return type(self), (self.code, str(self))
+    # the command itself
+    OTHER_ROBOT = "other_robot", "the command is for another robot"
+    NOT_SIGNED = "not_signed", "the signature is not the site's operators'"
+    OTHER_RUN = "other_run", "it was issued to the agent before its restart"
+    FROM_FUTURE = "from_future", "it was issued in the future of the robot's clock"
+    TOO_OLD = "too_old", "it is older than 5 s"
+    REPEATED = "repeated", "it was carried out before"
+    # enable and reset
+    CAUSE_REMAINS = "cause_remains", "conditions that stopped the robot still hold: `causes`"
+    FAULT_LATCHED = "fault_latched", "a fault must be reset first: `causes`"
+    NO_FAULT = "no_fault", "there is no fault to reset"
+    MANEUVER_RUNS = "maneuver_runs", "a maneuver must end first"
+    # maneuvers
+    MUST_NOT_MOVE = "must_not_move", "conditions keep the robot from moving: `causes`"
+    NOT_BLOCKED_IN = "not_blocked_in", "the robot is in no blocked area or zone"
+    NOT_BUMPED = "not_bumped", "the robot has bumped into nothing"
+    NOT_ON_DOCK = "not_on_dock", "the robot is not on its dock"
+    POSE_KNOWN = "pose_known", "the robot knows where it is"
+    BLOCKED_AHEAD = "blocked_ahead", "a blocked area or zone is on the way"
+    NO_DOCK = "no_dock", "the site or the base has no dock for it"
+    DOCK_NOT_KNOWN = "dock_not_known", "the robot does not know where its dock is"
+    DOCK_FAR = "dock_far", "the robot is not in front of its dock"
+    DOCK_BARRED = "dock_barred", "something is between the robot and its dock"
+    # goal, pose and profile
+    NO_GOAL = "no_goal", "there is no goal to cancel"
+    DRIVING = "driving", "the robot must stand for that"
+    POSE_MISSING = "pose_missing", "the command carries no pose"
+    POSE_OFF_MAP = "pose_off_map", "the pose is off the map"
+    POSE_IN_WALL = "pose_in_wall", "the pose is in a wall"
+    NO_PROFILE = "no_profile", "the robot has no such profile"
 
 
 class RobotState(Message, frozen=True, kw_only=True):
@@ -309,7 +332,7 @@ class RobotState(Message, frozen=True, kw_only=True):
     docked: bool = False
     wants_dock: bool = False
     places: Annotated[list[Pose], Meta(max_length=8)] = []
-    codes: list[Annotated[str, Meta(max_length=32)]] = []
+    codes: Codes = []
 
 
 VIEW_SECTORS: Final = 180
@@ -380,10 +403,21 @@ class RobotCommand(Message, frozen=True, kw_only=True):
 
 
 class CommandReply(Message, frozen=True, kw_only=True):
-    """Whether the command was accepted, and if not, why."""
+    """Whether the command was accepted, and if not, why.
+
+    `code` identifies the refusal (`RefusalCode` or `ReasonCode`), `causes` the conditions behind it (`ReasonCode`); a
+    newer robot may have others, an older one sends none.
+    """
 
     accepted: bool
     reason: Sentence
+    code: Code = ""
+    causes: Codes = []
+
+    @classmethod
+    def refused(cls, why: Reason) -> Self:
+        """Return a refusal, its sentence cut to the message's limit."""
+        return cls(accepted=False, reason=why[:SENTENCE_MAX], code=why.code, causes=list(why.causes))
 
 
 class EgressRequest(Message, frozen=True, kw_only=True):

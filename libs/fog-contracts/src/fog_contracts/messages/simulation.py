@@ -4,7 +4,7 @@ from typing import Annotated
 
 from msgspec import Meta
 
-from fog_contracts.messages.basics import Count, Id, Message, Metres, Pose, Radians, Ring, Speed, Stamp
+from fog_contracts.messages.basics import Count, Described, Id, Message, Metres, Pose, Radians, Ring, Speed, Stamp
 
 
 class SimObstacle(Message, frozen=True, kw_only=True):
@@ -31,6 +31,13 @@ class SimTruth(Message, frozen=True, kw_only=True):
     obstacles: list[SimObstacle] = []
     stamp: Stamp = 0.0
     sustained_speed: float = 1.0
+
+
+class SimRefusal(Described):
+    """Why the simulated world refuses a change."""
+
+    MISFIT = "misfit", "what is placed has no valid shape or place"
+    NO_OBSTACLE = "no_obstacle", "there is no such obstacle to remove"
 
 
 class SimCommand(Message, frozen=True, kw_only=True):

@@ -1,18 +1,25 @@
-"""A separate fog for each test: broker, Redis and router on free loopback ports, and the processes under test."""
+"""A fog for each test: its site and the processes under test, beside broker, Redis and router on loopback ports.
+
+The servers of a test go on to the next one of this pytest process, emptied, unless the test killed or changed one.
+"""
 
 import asyncio
 import hashlib
 import os
+import secrets
 import subprocess
+import threading
 import time
 from collections.abc import AsyncIterator, Callable, Iterator
-from contextlib import AsyncExitStack, asynccontextmanager
+from contextlib import AsyncExitStack, asynccontextmanager, contextmanager
 from pathlib import Path
 
 import httpx
 import numpy as np
+import paho.mqtt.client as paho
 import programs
 import pytest
+import redis
 from lateness import Lateness
 from redis.asyncio import Redis
 
@@ -51,17 +58,117 @@ DEADLINE_S = 60.0
 """For any wait, which ends with what it waits for: long, because a busy machine may be ten times slower."""
 
 
-class Fog:
-    """The servers, a site, and processes that can be started and killed."""
+class Servers:
+    """Broker, Redis and router of the site, and the files by which they admit its users (if `locked`)."""
 
     def __init__(self, folder: Path, *, locked: bool = True) -> None:
-        self.folder = folder
         self.locks = locks = SiteLocks(folder / "locks", "test", unrestricted=["test"]) if locked else None
         if locks is not None:
             locks.make(["127.0.0.1", "localhost"], nodes=["n1"])
         self.mosquitto: Server = start_mosquitto(folder / "mosquitto", locks=locks and locks.folder("mosquitto"))
         self.redis: Server = start_redis(folder / "redis", locks=locks and locks.folder("redis"))
         self.router: Server = start_router(folder / "router", locks=locks and locks.folder("zenoh"))
+        self._began = self._state()
+
+    def all(self) -> tuple[Server, ...]:
+        return self.mosquitto, self.redis, self.router
+
+    def redis_options(self) -> dict[str, object]:
+        """Return how a client of Redis that may do everything connects."""
+        if self.locks is None:
+            return {"port": self.redis.port}
+        own = Credentials.read(self.locks.credentials("administrator"))
+        return {
+            "port": self.redis.port, "ssl": True, "ssl_ca_data": own.authority, "username": own.user,
+            "password": own.passwords["redis"],
+        }  # fmt: skip
+
+    def _state(self) -> tuple[object, ...]:
+        """Return what tells whether a test has restarted a server, or changed a setting of Redis."""
+        with redis.Redis(**self.redis_options()) as client:
+            return *(server.pid for server in self.all()), client.config_get("*")
+
+    def empty(self) -> bool:
+        """Remove everything that is stored; return whether they are as good as new."""
+        if not all(server.running() for server in self.all()) or self._state() != self._began:
+            return False
+        with redis.Redis(**self.redis_options()) as client:
+            client.flushall()
+        self._remove_retained()
+        return True
+
+    def _remove_retained(self) -> None:
+        """Delete all messages that the broker retains, and wait until it has done so."""
+        end = f"end-of-test/{secrets.token_hex(8)}"
+        retained: list[str] = []
+        client = paho.Client(paho.CallbackAPIVersion.VERSION2)
+        if self.locks is not None:
+            own = Credentials.read(self.locks.credentials("test"))
+            client.tls_set_context(own.tls_context())
+            client.username_pw_set(own.user, own.passwords["mqtt"])
+        ended = threading.Semaphore(0)
+
+        def on_message(_client: paho.Client, _data: object, message: paho.MQTTMessage) -> None:
+            if message.topic == end:
+                ended.release()
+            elif message.retain:
+                retained.append(message.topic)
+
+        client.on_message = on_message
+        client.on_subscribe = lambda *_: ended.release()
+        client.connect("127.0.0.1", self.mosquitto.port)
+        client.loop_start()
+        try:
+            client.subscribe("#", qos=1)
+            assert ended.acquire(timeout=DEADLINE_S), "the broker does not answer"
+            # A broker sends what it retains before what comes after the subscription.
+            client.publish(end, qos=1)
+            assert ended.acquire(timeout=DEADLINE_S), "the broker sends nothing"
+            for topic in retained:
+                client.publish(topic, b"", qos=1, retain=True).wait_for_publish(DEADLINE_S)
+        finally:
+            client.disconnect()
+            client.loop_stop()
+
+    def close(self) -> None:
+        for server in self.all():
+            server.stop()
+
+
+class ServersPool:
+    """Lends servers to one test at a time; those that come back as good as new are lent again."""
+
+    def __init__(self, new_folder: Callable[[], Path]) -> None:
+        self._new_folder = new_folder
+        self._idle: list[Servers] = []
+
+    @contextmanager
+    def lend(self) -> Iterator[Servers]:
+        """Lend emptied servers, or new ones if none are idle."""
+        lent = None
+        while lent is None and self._idle:
+            if not (lent := self._idle.pop()).empty():
+                lent.close()
+                lent = None
+        lent = lent or Servers(self._new_folder())
+        try:
+            yield lent
+        finally:
+            self._idle.append(lent)
+
+    def close(self) -> None:
+        while self._idle:
+            self._idle.pop().close()
+
+
+class Fog:
+    """A site with servers, and processes that can be started and killed."""
+
+    def __init__(self, folder: Path, servers: Servers) -> None:
+        self.folder = folder
+        self.servers = servers
+        self.locks = servers.locks
+        self.mosquitto, self.redis, self.router = servers.all()
         self.site = folder / "site"
         self.site.mkdir()
         (self.site / "site.toml").write_text(SITE)
@@ -116,13 +223,7 @@ class Fog:
 
     def raw_redis(self) -> Redis:
         """Return a client of Redis that may do everything."""
-        if self.locks is None:
-            return Redis.from_url(self.redis.url)
-        own = Credentials.read(self.credentials_file("administrator"))
-        return Redis(
-            port=self.redis.port, ssl=True, ssl_ca_data=own.authority, username=own.user,
-            password=own.passwords["redis"],
-        )  # fmt: skip
+        return Redis(**self.servers.redis_options())
 
     def kill(self, module: str) -> None:
         """Kill a process, as a crash would."""
@@ -132,10 +233,9 @@ class Fog:
 
     def lateness(self) -> Lateness:
         """Return what tells how late a busy machine makes the processes from now on, this one among them."""
-        servers = (self.mosquitto, self.redis, self.router)
 
         def pids() -> list[int]:
-            running = [server.pid for server in servers if server.running()]
+            running = [server.pid for server in self.servers.all() if server.running()]
             return [os.getpid(), *running, *(process.pid for process in self.processes.values())]
 
         return Lateness(pids)
@@ -193,8 +293,6 @@ class Fog:
             except subprocess.TimeoutExpired:
                 process.kill()
                 process.wait()
-        for server in (self.mosquitto, self.redis, self.router):
-            server.stop()
 
 
 class Proxy:
@@ -298,44 +396,57 @@ def proxy(fog: Fog, proxy_of: Callable[[Server], Proxy]) -> Proxy:
     return proxy_of(fog.redis)
 
 
-@pytest.fixture
-def fog(tmp_path: Path) -> Iterator[Fog]:
-    running = Fog(tmp_path)
+@pytest.fixture(scope="session")
+def servers_pool(tmp_path_factory: pytest.TempPathFactory) -> Iterator[ServersPool]:
+    pool = ServersPool(lambda: tmp_path_factory.mktemp("servers"))
     try:
-        yield running
+        yield pool
     finally:
-        running.close()
+        pool.close()
+
+
+@contextmanager
+def running_fog(folder: Path, pool: ServersPool, *modules: str) -> Iterator[Fog]:
+    with pool.lend() as servers:
+        running = Fog(folder, servers)
+        try:
+            for module in modules:
+                running.start(module)
+            yield running
+        finally:
+            running.close()
+
+
+@pytest.fixture
+def fog(tmp_path: Path, servers_pool: ServersPool) -> Iterator[Fog]:
+    with running_fog(tmp_path, servers_pool) as running:
+        yield running
 
 
 @pytest.fixture(scope="module")
-def shared_fog(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Fog]:
+def shared_fog(tmp_path_factory: pytest.TempPathFactory, servers_pool: ServersPool) -> Iterator[Fog]:
     """Yield a fog with a running map-service, shared by the tests of a module that kill and restart nothing."""
-    running = Fog(tmp_path_factory.mktemp("fog"))
-    try:
-        running.start("map_service")
+    with running_fog(tmp_path_factory.mktemp("fog"), servers_pool, "map_service") as running:
         yield running
-    finally:
-        running.close()
 
 
 @pytest.fixture(scope="module")
 def shared_open_fog(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Fog]:
     """Yield as `shared_fog` one whose servers admit everybody, unencrypted: for tests that change what they send."""
-    running = Fog(tmp_path_factory.mktemp("fog"), locked=False)
+    servers = Servers(tmp_path_factory.mktemp("servers"), locked=False)
+    running = Fog(tmp_path_factory.mktemp("fog"), servers)
     try:
         running.start("map_service")
         yield running
     finally:
         running.close()
+        servers.close()
 
 
 @pytest.fixture(scope="module")
-def all_services(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Fog]:
+def all_services(tmp_path_factory: pytest.TempPathFactory, servers_pool: ServersPool) -> Iterator[Fog]:
     """Yield a fog in which all services run, shared by the tests of a module that kill and restart nothing."""
-    running = Fog(tmp_path_factory.mktemp("fog"))
-    try:
-        for module in ("hazard_aggregator", "map_service", "planner"):
-            running.start(module)
+    with running_fog(
+        tmp_path_factory.mktemp("fog"), servers_pool, "hazard_aggregator", "map_service", "planner"
+    ) as running:
         yield running
-    finally:
-        running.close()

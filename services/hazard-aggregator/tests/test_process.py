@@ -181,7 +181,7 @@ async def test_aggregator_started_without_redis_restores_the_blocked_area_later(
     async with connected_node(fog) as (node, _):
         await node.read(0.8, 5)
         await until(lambda: node.state == "blocked", "blocked")
-        await until(lambda: is_blocked_stored(fog), "stored")
+        await blockage_is_stored(fog)
         fog.kill("hazard_aggregator")
         fog.redis.kill()
         fog.mosquitto.kill()
@@ -195,8 +195,10 @@ async def test_aggregator_started_without_redis_restores_the_blocked_area_later(
         await until(lambda: node.hazards[-1].penalty == 254, "restored", lambda: fog.log("hazard_aggregator"))
 
 
-def is_blocked_stored(fog) -> bool:
-    return any(b"blocked" in path.read_bytes() for path in fog.redis.folder.glob("appendonlydir/*.aof"))
+async def blockage_is_stored(fog) -> None:
+    async with fog.raw_redis() as raw, asyncio.timeout(60):
+        while not any(b"blocked" in stored for stored in await raw.hvals("fog:test:hazards")):  # noqa: ASYNC110  # a query
+            await asyncio.sleep(0.01)
 
 
 async def test_robot_in_the_cone_does_not_block_the_area(fog, until):

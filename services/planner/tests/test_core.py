@@ -668,7 +668,7 @@ ZONE_TIMES: dict[str, dict[str, Any]] = {
 """Times of zones: by the planner's clock some have come and others have not, which says nothing."""
 
 
-def test_refusal_never_blames_a_clear_area_in_a_wall_or_a_zone_that_is_off() -> None:
+def test_refusal_never_blames_a_clear_area_in_a_wall_a_zone_that_is_off_or_one_that_only_slows() -> None:
     drive = Drive(start=LEFT)
     drive.send(drive.map.put("z1", UPPER) + drive.map.put("z2", LOWER))
     for name in ("z1", "z2"):
@@ -677,7 +677,11 @@ def test_refusal_never_blames_a_clear_area_in_a_wall_or_a_zone_that_is_off() -> 
     drive.deliver(ch.HAZARD, drive.map.hazard_area("inside wall", "clear"))
     del drive.map.areas["inside wall"]
     zones = [Zone(id=name, kind="BLOCKED", shape=ACROSS, **times) for name, times in ZONE_TIMES.items()]
-    drive.deliver(ch.ZONES, ZoneSet(epoch=1, seq=2, zones=zones, active=[]))
+    zones += [
+        Zone(id="off", kind="BLOCKED", shape=ACROSS, enabled=False),
+        Zone(id="slow", kind="SPEED_LIMIT", speed=0.1, shape=ACROSS),
+    ]
+    drive.deliver(ch.ZONES, ZoneSet(epoch=1, seq=2, zones=zones, active=["slow"]))
     refusal = drive.go(*RIGHT).refusal
     assert refusal
     assert [cause.id for cause in refusal.causes] == ["z1", "z2"]

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any, cast
 import httpx
 import pytest
 from prometheus_client import REGISTRY
-from ring_map import LEFT, LOWER, RIGHT, UPPER, RingMap, goal, pose
+from ring_map import LEFT, RIGHT, RingMap, goal, pose
 
 import planner.plan_records
 import planner.service
@@ -146,15 +146,6 @@ class ReplyingCore(PlannerCore):
         return {ch.ROBOT_POSE: answer}
 
 
-def test_publications_of_handlers_are_published_by_their_cycle() -> None:
-    rig = Rig(ReplyingCore(epoch=1))
-    rig.session.subscribed[ch.ROBOT_POSE]({"robot": "r1"}, pose(1.0, 7.0))
-    rig.cycle()
-    assert [(p.channel.name, p.ids) for p in rig.published] == [("robot_goal", {"robot": "r1"})]
-    rig.cycle()
-    assert len(rig.published) == 1
-
-
 def test_message_refused_by_a_handler_is_reported_and_the_cycle_continues() -> None:
     rig = Rig(ReplyingCore(epoch=1))
     for robot in ("r2", "r1"):
@@ -180,23 +171,6 @@ def test_handler_that_fails_is_logged_and_the_cycle_continues(caplog: pytest.Log
     rig.cycle()
     assert rig.published == []
     assert "handler_failed" in caplog.messages
-
-
-def test_messages_that_arrive_during_a_cycle_wait_for_the_next() -> None:
-    class FloodedCore(RecordingCore):
-        def handlers(self) -> Mapping[ch.Channel, Handler]:
-            def flood(ids: Ids, message: Any, at: Moment) -> list[Publication]:
-                self.handled.append((ch.ROBOT_POSE, at))
-                rig.session.subscribed[ch.ROBOT_POSE](dict(ids), message)
-                return []
-
-            return {ch.ROBOT_POSE: flood}
-
-    core = FloodedCore()
-    rig = Rig(core)
-    rig.session.subscribed[ch.ROBOT_POSE]({"robot": "r1"}, pose(1.0, 7.0))
-    rig.cycle()
-    assert len(core.handled) == 1
 
 
 class SlowCore(PlannerCore):
@@ -247,84 +221,6 @@ def test_paths_are_published_one_by_one_and_a_long_cycle_leaves_the_rest_for_the
         assert published == [([robot], number + 1) for number, robot in enumerate(robots[:done])][-count:]
         with_path.clear()
         searched.clear()
-
-
-class EndlessCore(PlannerCore):
-    """Whose searches never end; each takes 0.2 s by the rig's clock."""
-
-    def plan(self, at: Moment) -> Iterator[str]:
-        for robot in super().plan(at):
-            self.clock.advance(0.2)
-            yield robot
-        while True:
-            self.clock.advance(0.2)
-            yield "r0"
-
-    clock: ManualClock
-
-
-async def test_paths_are_recorded_after_half_a_second_although_searches_are_left(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    monkeypatch.setattr(planner.plan_records, "MOST_UNRECORDED", 10**9)
-    core = EndlessCore(epoch=1)
-    rig = Rig(core)
-    core.clock = rig.clock
-    ring_map = RingMap()
-    core.load(ring_map.master.snapshot(), 10.0)
-    core.handlers()[ch.MAP_HEARTBEAT]({}, ring_map.master.heartbeat(0.0), Moment(10.0, 10.0))
-    core.handlers()[ch.ROBOT_POSE]({"robot": "r0"}, pose(*LEFT), Moment(10.0, 10.0))
-    core.set_goal("r0", goal(*RIGHT, "r0"))
-    planning = asyncio.create_task(rig.service.plan_loop())
-    rig.service._wake.set()
-    try:
-        async with asyncio.timeout(60.0):
-            while "r0" not in rig.service._record.paths:  # noqa: ASYNC110  # set by the loop of plans
-                await asyncio.sleep(0.001)
-    finally:
-        planning.cancel()
-        rig.service.close()
-    assert rig.service._record.paths["r0"].points
-
-
-class NotingQueue:
-    """Notes how many robots' paths were recorded when work came, and does none."""
-
-    def __init__(self, record: PathRecord) -> None:
-        self.recorded: list[int] = []
-        self._record = record
-
-    async def run(self, _kind: str, _asker: str, _work: object) -> None:
-        self.recorded.append(len(self._record.paths))
-
-    def close(self) -> None:
-        """There is nothing to end."""
-
-
-async def test_reasons_of_refusals_are_looked_for_before_all_refusals_are_recorded(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    monkeypatch.setattr(planner.service, "RECORDED_AT_ONCE", 1)
-    core, ring_map = PlannerCore(epoch=1), RingMap()
-    rig = Rig(core)
-    queue = NotingQueue(rig.service._record)
-    monkeypatch.setattr(rig.service, "_queue", queue)
-    for name, box in (("z1", UPPER), ("z2", LOWER)):
-        ring_map.put(name, box)
-    core.load(ring_map.master.snapshot(), 10.0)
-    core.handlers()[ch.MAP_HEARTBEAT]({}, ring_map.master.heartbeat(0.0), Moment(10.0, 10.0))
-    robots = [f"r{number}" for number in range(12)]
-    for robot in robots:
-        core.handlers()[ch.ROBOT_POSE]({"robot": robot}, pose(*LEFT), Moment(10.0, 10.0))
-        core.set_goal(robot, goal(*RIGHT, robot))
-    planning = asyncio.create_task(rig.service.plan_loop())
-    rig.service._wake.set()
-    async with asyncio.timeout(60.0):
-        while len(rig.service._record.paths) < len(robots):  # noqa: ASYNC110  # filled by the loop of plans
-            await asyncio.sleep(0.001)
-    planning.cancel()
-    rig.service.close()
-    assert queue.recorded[0] < len(robots)
 
 
 def test_what_was_published_is_recorded_a_part_at_a_time_and_oldest_first() -> None:

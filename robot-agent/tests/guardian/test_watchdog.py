@@ -8,11 +8,9 @@ from __future__ import annotations
 import io
 import json
 import os
-import runpy
 import signal
 import subprocess
 import sys
-from contextlib import suppress
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -208,32 +206,7 @@ def lives(watch, *lives_of_guardians):
     return rest
 
 
-def open_ends(guardian) -> int:
-    """Return how many descriptors of this process refer to the pipes between a guardian and its watchdog."""
-    count = 0
-    for entry in Path("/proc/self/fd").iterdir():
-        with suppress(OSError):  # another of the process' own was closed meanwhile
-            count += pipe_of(entry.name) in guardian.pipes
-    return count
-
-
 # --- one guardian ---
-
-
-def test_guardian_is_started_in_a_session_of_its_own_with_port_heartbeat_and_a_sign_of_life(watch, monkeypatch):
-    monkeypatch.setenv("FOGNAV_ROBOT", "r7")
-    lives(watch, ["beat", 0])
-    watch.guard()
-    (guardian,) = watch.guardians
-    port, heartbeat, alive = guardian.passed
-    assert guardian.command == [sys.executable, "-m", "robot_agent.guardian"]
-    assert guardian.new_session is True
-    assert port == 55
-    expected = {
-        "FOGNAV_BASE_FD": "55", "FOGNAV_BASE_PORT": "/dev/serial/by-id/base", "FOGNAV_HEARTBEAT_FD": str(heartbeat),
-        "FOGNAV_WATCHDOG_FD": str(alive), "FOGNAV_ROBOT": "r7",
-    }  # fmt: skip
-    assert guardian.env.items() >= expected.items()
 
 
 def test_wheels_are_held_until_the_first_heartbeat_and_stopped_after_the_guardian_has_ended(watch):
@@ -252,31 +225,6 @@ def test_wheels_are_held_until_the_first_heartbeat_and_stopped_after_the_guardia
     }  # fmt: skip
     assert "kill" not in watch.guardians[0].done
     assert "terminate" not in watch.guardians[0].done
-
-
-def test_descriptors_are_closed_when_a_guardian_has_ended_and_it_is_told_so(watch):
-    def first_wait() -> str:
-        assert open_ends(watch.guardians[0]) == 4, "the watchdog's ends, and the guardian's own"
-        return "beat"
-
-    lives(watch, [first_wait, 0])
-    watch.guard()
-    (guardian,) = watch.guardians
-    assert not guardian.watchdog_is_there()
-    os.close(guardian.alive)
-    assert open_ends(guardian) == 0
-
-
-def test_heartbeats_pipe_ends_with_the_guardian_because_the_watchdog_holds_no_end_of_it(watch):
-    def first_wait() -> str:
-        # Only the guardian's own copy is left.
-        assert not Path(f"/proc/self/fd/{watch.guardians[0].passed[1]}").exists()
-        assert not Path(f"/proc/self/fd/{watch.guardians[0].passed[2]}").exists()
-        assert watch.guardians[0].watchdog_is_there()
-        return "beat"
-
-    lives(watch, [first_wait, 0])
-    assert watch.guard() == 0
 
 
 def test_silent_guardian_is_killed_at_its_limit_and_the_wheels_stop(watch):
@@ -355,14 +303,6 @@ def test_log_without_a_reader_ends_nothing(watch, monkeypatch):
     assert watch.guard() == 0
 
 
-def test_log_is_flushed_line_by_line(watch, monkeypatch):
-    flushed = []
-    monkeypatch.setattr(watch.log, "flush", lambda: flushed.append(watch.log.getvalue()))
-    watchdog.log_event("one")
-    assert flushed == [watch.log.getvalue()]
-    assert flushed[0].endswith("\n")
-
-
 # --- guardian after guardian, port after port ---
 
 
@@ -386,13 +326,6 @@ def test_wheels_are_held_for_0_3_s_before_the_next_guardian_every_0_1_s(watch):
     pause = watch.line.written[stops[2] + 1 : stops[3] - 1]
     assert pause == [(100.0, b"hold"), (100.1, b"hold"), (100.2, b"hold")]
     assert watch.clock.slept == [0.1, 0.1, 0.1]
-
-
-def test_pause_is_in_seconds_of_the_clock_and_no_wait_is_longer_than_what_is_left(watch):
-    lives(watch, ["beat", 0], ["beat", 3])
-    watchdog._guard(watch.line, settings(speed=2.0))
-    assert watch.clock.slept == [0.1, 0.05]
-    assert watch.clock.waits[-1] == pytest.approx(0.105 / 2.0 + 0.095)
 
 
 def test_real_device_on_another_clock_is_refused_after_its_wheels_were_stopped(watch):
@@ -432,13 +365,6 @@ def test_lost_port_is_tried_every_tenth_of_a_second_and_its_reason_told_once(wat
         "base: unplugged", "base: unplugged", "base: unplugged", "base: busy"
     ]  # fmt: skip
     assert [data for _, data in watch.line.written].count(b"closed") == 2
-
-
-def test_port_is_tried_again_after_a_tenth_of_a_second_of_the_clock(watch, monkeypatch):
-    opens(monkeypatch, PortLost("base", "unplugged"), watch.line)
-    lives(watch, ["beat", 78])
-    watchdog._guard_always(settings(speed=4.0))
-    assert watch.clock.slept == [0.025]
 
 
 def test_base_that_rolls_is_stopped_within_a_tenth_of_a_second_of_the_return_of_its_port(watch, monkeypatch):
@@ -563,27 +489,6 @@ def process(watch, monkeypatch):
     return done, handlers
 
 
-def test_process_leaves_its_session_tells_how_it_runs_and_guards(watch, process, monkeypatch):
-    done, handlers = process
-    opens(monkeypatch, watch.line)
-    lives(watch, ["beat", 78])
-    assert watchdog.main() == 78
-    assert done == ["setsid", "ignore stops"]
-    assert (watch.events[0]["event"], watch.events[0]["priority"]) == ("started", "priority 15")
-    assert watch.manager.told[0] == "ready"
-    assert {signal.SIGTERM, signal.SIGINT} <= set(handlers)
-
-
-def test_leader_of_a_group_stays_in_its_session(watch, process, monkeypatch):
-    def refused():
-        raise PermissionError
-
-    monkeypatch.setattr(watchdog.os, "setsid", refused)
-    monkeypatch.setenv("FOGNAV_SPEED", "0")
-    assert watchdog.main() == 78
-    assert watch.events[-1]["event"] == "bad_settings"
-
-
 def test_signal_ends_the_process_in_order_and_a_second_one_changes_nothing(watch, process, monkeypatch):
     _, handlers = process
 
@@ -597,17 +502,3 @@ def test_signal_ends_the_process_in_order_and_a_second_one_changes_nothing(watch
     assert (watch.events[-1]["event"], watch.events[-1]["signal"]) == ("ended", "SIGTERM")
     ignored = {number for number, handler in handlers.items() if handler is signal.SIG_IGN}
     assert {signal.SIGTERM, signal.SIGINT, signal.SIGHUP, signal.SIGQUIT} <= ignored
-
-
-def test_module_run_as_a_program_exits_with_the_code(environment, process, monkeypatch):
-    monkeypatch.delenv("FOGNAV_BASE_PORT")
-    monkeypatch.delitem(sys.modules, "robot_agent.guardian.watchdog")
-    with pytest.raises(SystemExit) as end:
-        runpy.run_module("robot_agent.guardian.watchdog", run_name="__main__", alter_sys=False)
-    assert end.value.code == 78
-
-
-def test_codes_by_which_a_guardian_tells_why_it_ended_are_fixed():
-    assert (watchdog.PORT_LOST, watchdog.BAD_SETTINGS) == (3, 78)
-    assert watchdog.REALTIME_PRIORITY == 15
-    assert watchdog.STARTUP_S == 15.0

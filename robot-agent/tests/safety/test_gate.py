@@ -60,68 +60,6 @@ def test_healthy_robot_stays_in_init_until_an_operator_enables_it():
     assert out.reasons == ("waiting for an operator to enable",)
 
 
-@pytest.mark.parametrize(
-    ("missing", "word"),
-    [
-        ({"map_loaded": False}, "no map"),
-        ({"localization": "none"}, "pose"),
-        ({"scan_age": math.inf}, "scan"),
-        ({"base_age": math.inf}, "guardian"),
-        ({"inside_blocked": "the zone wet-floor"}, "wet-floor"),
-        ({"bumper": True}, "bumper"),
-    ],
-)
-def test_enable_is_refused_with_the_cause_while_an_input_is_missing(missing, word):
-    gate = Gate()
-    out = gate.run(request="enable", **missing)
-    assert out.refusal is not None
-    assert word in out.refusal
-    assert gate.run(5.0).mode == ("FAULT" if word == "bumper" else "INIT")
-
-
-def test_enable_is_accepted_when_all_inputs_are_healthy():
-    assert Gate().enabled().out.cap == 0.30
-
-
-@pytest.mark.parametrize(
-    ("changes", "mode"),
-    [
-        ({"map_age": 1.1}, "DEGRADED"),
-        ({"map_age": 3.1}, "HOLD"),
-        ({"map_gap": 0.9}, "NORMAL"),
-        ({"map_gap": 1.1}, "HOLD"),
-        ({"localization": "weak"}, "DEGRADED"),
-        ({"localization": "lost"}, "PROTECTIVE_STOP"),
-        ({"mission": True, "plan_age": 1.6, "released_remaining": 5.0}, "DEGRADED"),
-        ({"mission": True, "plan_age": 1.6, "released_remaining": 0.0}, "HOLD"),
-        ({"mission": True, "path_problem": "goal blocked"}, "HOLD"),
-        ({"mission": False, "path_problem": "goal blocked", "plan_age": math.inf}, "NORMAL"),
-        ({"lidar_age": 0.31}, "PROTECTIVE_STOP"),
-        ({"scan_age": 0.46}, "PROTECTIVE_STOP"),
-        ({"identical_scans": 2}, "NORMAL"),
-        ({"identical_scans": 3}, "PROTECTIVE_STOP"),
-        ({"base_age": 0.31}, "PROTECTIVE_STOP"),
-        ({"guardian_lost": "connection closed"}, "PROTECTIVE_STOP"),
-        ({"base_stopped": "commands are stale"}, "PROTECTIVE_STOP"),
-        ({"inside_blocked": "zone x"}, "PROTECTIVE_STOP"),
-        ({"base_fault": "OI mode is PASSIVE"}, "FAULT"),
-        ({"bumper": True}, "FAULT"),
-        ({"cliff": True}, "FAULT"),
-        ({"wheel_drop": True}, "FAULT"),
-        ({"map_age": math.nan}, "HOLD"),
-        ({"scan_age": math.nan}, "PROTECTIVE_STOP"),
-        ({"base_age": math.nan}, "PROTECTIVE_STOP"),
-        ({"caution": "area z4 is unknown"}, "DEGRADED"),
-    ],
-)
-def test_finding_changes_the_mode_in_the_same_step_and_gives_a_reason(changes, mode):
-    gate = Gate().enabled()
-    out = gate.run(DT, **changes)
-    assert out.mode == mode
-    assert out.changed == (mode != "NORMAL")
-    assert bool(out.reasons) == (mode != "NORMAL")
-
-
 @pytest.mark.parametrize("changes", [{"map_age": 2.0}, {"map_gap": 2.0}, {"scan_age": 1.0}])
 def test_mode_relaxes_after_two_seconds_without_findings(changes):
     gate = Gate().enabled()
@@ -139,18 +77,6 @@ def test_mode_relaxes_to_the_worst_finding_of_the_last_two_seconds():
     assert gate.run(0.3).mode == "HOLD"
 
 
-def test_hold_for_a_stale_map_ends_only_with_a_newer_plan():
-    gate = Gate().enabled()
-    driving = {"mission": True, "plan_age": 0.3, "released_remaining": 5.0}
-    assert gate.run(1.0, **driving).mode == "NORMAL"
-    assert gate.run(1.0, **{**driving, "map_age": 4.0}).mode == "HOLD"
-    for age in (0.9, 1.2):  # a plan from before the map was received again
-        out = gate.run(DT, **{**driving, "plan_age": age})
-        assert out.mode == "HOLD"
-        assert "waiting for a plan on the fresh map" in out.reasons
-    assert gate.run(2.2, **{**driving, "plan_age": 0.0}).mode == "NORMAL"
-
-
 def test_plan_from_before_a_missing_map_holds_the_robot_however_long_a_plan_may_be_silent():
     config, state, modes = replace(CONFIG, plan_late=60.0), Gate().enabled().state, []
     old, new = inputs(mission=True, plan_age=4.0), inputs(mission=True, plan_age=0.1)
@@ -161,48 +87,6 @@ def test_plan_from_before_a_missing_map_holds_the_robot_however_long_a_plan_may_
     assert modes[50] == ("NORMAL", inputs())
     assert modes[51] == ("HOLD", old)
     assert modes[-1] == ("NORMAL", new)
-
-
-def test_short_hold_ends_by_itself_and_long_hold_needs_an_operator():
-    gate = Gate().enabled()
-    gate.run(50.0, map_age=9.0)
-    assert gate.run(2.2).mode == "NORMAL"
-    gate.run(61.0, map_age=9.0)
-    out = gate.run(10.0)
-    assert out.mode == "HOLD"
-    assert any("an operator must enable" in reason for reason in out.reasons)
-    assert gate.run(request="enable", map_age=9.0).refusal is not None
-    gate.run(2.2)
-    assert gate.run(request="enable").refusal is None
-    assert gate.run(2.2).mode == "NORMAL"
-
-
-@pytest.mark.parametrize("changes", [{"localization": "lost"}, {"inside_blocked": "zone x"}])
-def test_lost_pose_and_blocked_zone_need_an_operator_after_they_end(changes):
-    gate = Gate().enabled()
-    gate.run(DT, **changes)
-    assert gate.run(request="enable", **changes).refusal is not None
-    out = gate.run(30.0)
-    assert out.mode == "PROTECTIVE_STOP"
-    assert any("an operator must enable" in reason for reason in out.reasons)
-    assert gate.run(request="enable").refusal is None
-    assert gate.run(2.2).mode == "NORMAL"
-
-
-def test_protective_stop_for_a_silent_lidar_ends_by_itself():
-    gate = Gate().enabled()
-    assert gate.run(1.0, scan_age=1.0).mode == "PROTECTIVE_STOP"
-    assert gate.run(2.2).mode == "NORMAL"
-
-
-def test_third_protective_stop_within_a_minute_is_a_fault():
-    gate = Gate().enabled()
-    for _ in range(2):
-        assert gate.run(DT, scan_age=1.0).mode == "PROTECTIVE_STOP"
-        assert gate.run(2.5).mode == "NORMAL"
-    out = gate.run(DT, scan_age=1.0)
-    assert out.mode == "FAULT"
-    assert "3 protective stops" in out.reasons[0]
 
 
 LATE_STOPS = [
@@ -261,43 +145,6 @@ def test_excused_stop_before_a_disable_excuses_and_counts_nothing_later():
     gate.run(DT, request="enable")
     assert gate.run(DT, lidar_age=0.4).mode == "PROTECTIVE_STOP"
     assert (len(gate.state.stops), gate.state.late_stops) == (1, 1)
-
-
-def test_protective_stops_half_a_minute_apart_are_no_fault():
-    gate = Gate().enabled()
-    for _ in range(4):
-        assert gate.run(DT, scan_age=1.0).mode == "PROTECTIVE_STOP"
-        assert gate.run(31.0).mode == "NORMAL"
-
-
-def test_fault_needs_its_cause_gone_then_a_reset_then_an_enable():
-    gate = Gate().enabled()
-    gate.run(DT, bumper=True)
-    assert gate.run(100.0).mode == "FAULT"
-    assert gate.run(request="enable").refusal is not None
-    assert gate.run(request="reset", bumper=True).refusal is not None
-    assert gate.run(request="disable").mode == "FAULT"
-    out = gate.run(request="reset")
-    assert out.refusal is None
-    assert out.mode == "INIT"
-    assert gate.run(10.0).mode == "INIT"
-    gate.enabled()
-
-
-def test_fault_latched_by_the_guardian_while_disabled_can_be_reset():
-    gate = Gate()
-    fault = {"base_fault": "the bumper is pressed (left)"}
-    assert gate.run(request="enable", **fault).refusal is not None
-    assert gate.run(**fault).mode == "FAULT"
-    assert gate.run(request="reset", **fault, bumper=True).refusal is not None
-    assert gate.run(request="reset", **fault).refusal is None
-    gate.enabled()
-
-
-def test_disable_stops_immediately_and_lasts():
-    gate = Gate().enabled()
-    assert gate.run(request="disable").stop == "immediate"
-    assert gate.run(10.0).mode == "INIT"
 
 
 AGES = st.sampled_from([0.0, 0.2, 0.35, 0.5, 1.2, 2.0, 3.5, math.inf])

@@ -26,170 +26,138 @@ class Row(NamedTuple):
 
     name: str
     holds: dict
-    not_yet: dict
     mode: str
-    left: str
-    """By whom a robot in this mode is released: by an operator, or alone."""
     words: str
+    not_yet: dict | None = None
+    left: str = "alone"
+    """By whom a robot in this mode is released: by an operator, or alone."""
 
 
 ROWS = [
     Row(
         "position too uncertain",
         {"localization": "weak", "position_sigma": 0.81},
-        {"position_sigma": 0.81},
         "HOLD",
-        "alone",
         "the robot may be 1.6 m from where it believes to be",
+        not_yet={"position_sigma": 0.81},
     ),
     Row(
         "may be in a blocked place",
         {"near_blocked": "the no-go zone wet", "position_sigma": 0.4},
-        {},
         "HOLD",
-        "alone",
         "the robot may already be in the no-go zone wet: it may be 0.8 m farther",
     ),
-    Row("base fault", {"base_fault": "OI mode"}, {}, "FAULT", "operator", "base: OI mode"),
-    Row("bumper", {"bumper": True}, {}, "FAULT", "operator", "the bumper is pressed"),
-    Row("cliff", {"cliff": True}, {}, "FAULT", "operator", "a cliff sensor sees no floor"),
-    Row("wheel drop", {"wheel_drop": True}, {}, "FAULT", "operator", "a wheel has dropped"),
-    Row(
-        "guardian lost",
-        {"guardian_lost": "closed"},
-        {},
-        "PROTECTIVE_STOP",
-        "alone",
-        "the guardian is not connected: closed",
-    ),
+    Row("base fault", {"base_fault": "OI mode"}, "FAULT", "base: OI mode", left="operator"),
+    Row("bumper", {"bumper": True}, "FAULT", "the bumper is pressed", left="operator"),
+    Row("cliff", {"cliff": True}, "FAULT", "a cliff sensor sees no floor", left="operator"),
+    Row("wheel drop", {"wheel_drop": True}, "FAULT", "a wheel has dropped", left="operator"),
+    Row("guardian lost", {"guardian_lost": "closed"}, "PROTECTIVE_STOP", "the guardian is not connected: closed"),
     Row(
         "guardian silent",
         {"base_age": 0.301},
-        {"base_age": 0.3},
         "PROTECTIVE_STOP",
-        "alone",
         "no message from the guardian for 0.3 s",
+        not_yet={"base_age": 0.3},
     ),
     Row(
         "guardian never heard",
         {"base_age": math.inf},
-        {},
         "PROTECTIVE_STOP",
-        "alone",
         "no message from the guardian for as long as the agent runs",
     ),
     Row(
         "wheels held",
         {"base_stopped": "no fresh command"},
-        {},
         "PROTECTIVE_STOP",
-        "alone",
         "the guardian holds the wheels: no fresh command",
     ),
-    Row("on its dock", {"docked_for": 0.0, "mission": False}, {}, "HOLD", "alone", "the robot is on its dock"),
+    Row("on its dock", {"docked_for": 0.0, "mission": False}, "HOLD", "the robot is on its dock"),
     Row(
         "on its dock, charging",
         {"docked_for": 5.0, "base_stopped": "the base is on its charger, where it does not drive", "mission": False},
-        {},
         "HOLD",
-        "alone",
         "the robot is on its dock",
     ),
     Row(
         "wheels held on the dock",
         {"docked_for": 5.0, "base_stopped": "not ready"},
-        {},
         "PROTECTIVE_STOP",
-        "alone",
         "the guardian holds the wheels: not ready",
     ),
     Row(
         "lidar silent",
         {"lidar_age": 0.301},
-        {"lidar_age": 0.3},
         "PROTECTIVE_STOP",
-        "alone",
         "the lidar has been silent for 0.3 s",
+        not_yet={"lidar_age": 0.3},
     ),
     Row(
         "scan lost",
         {"scan_age": 0.451},
-        {"scan_age": 0.45},
         "PROTECTIVE_STOP",
-        "alone",
         "no complete scan of the lidar for 0.5 s",
+        not_yet={"scan_age": 0.45},
     ),
     Row(
         "scans repeat",
         {"identical_scans": 3},
-        {"identical_scans": 2},
         "PROTECTIVE_STOP",
-        "alone",
         "the lidar repeats itself",
+        not_yet={"identical_scans": 2},
     ),
-    Row("at rest", {"resting": "at rest"}, {}, "HOLD", "alone", "at rest"),
-    Row("pose unknown", {"localization": "none"}, {}, "PROTECTIVE_STOP", "operator", "the pose is not known yet"),
+    Row("at rest", {"resting": "at rest"}, "HOLD", "at rest"),
+    Row("pose unknown", {"localization": "none"}, "PROTECTIVE_STOP", "the pose is not known yet", left="operator"),
     Row(
         "pose lost",
         {"localization": "lost", "localization_detail": "no fit"},
-        {},
         "PROTECTIVE_STOP",
-        "operator",
         "the pose is lost: no fit",
+        left="operator",
     ),
-    Row("pose weak", {"localization": "weak"}, {}, "DEGRADED", "alone", "the pose is uncertain"),
-    Row("in a zone", {"inside_blocked": "the zone x"}, {}, "PROTECTIVE_STOP", "operator", "the robot is in the zone x"),
-    Row("map lost", {"map_age": 3.01}, {"map_age": 0.99}, "HOLD", "alone", "the map is 3.0 s old"),
-    Row("map late", {"map_age": 1.01}, {"map_age": 1.0}, "DEGRADED", "alone", "the map is 1.0 s old"),
-    Row("map still late", {"map_age": 3.0}, {}, "DEGRADED", "alone", "the map is 3.0 s old"),
+    Row("pose weak", {"localization": "weak"}, "DEGRADED", "the pose is uncertain"),
     Row(
-        "map gap",
-        {"map_gap": 1.01},
-        {"map_gap": 1.0},
-        "HOLD",
-        "alone",
-        "changes of the map have been missing for 1.0 s",
+        "in a zone", {"inside_blocked": "the zone x"}, "PROTECTIVE_STOP", "the robot is in the zone x", left="operator"
     ),
-    Row("caution", {"caution": "area z4 is unknown"}, {}, "DEGRADED", "alone", "area z4 is unknown"),
+    Row("map lost", {"map_age": 3.01}, "HOLD", "the map is 3.0 s old", not_yet={"map_age": 0.99}),
+    Row("map late", {"map_age": 1.01}, "DEGRADED", "the map is 1.0 s old", not_yet={"map_age": 1.0}),
+    Row("map still late", {"map_age": 3.0}, "DEGRADED", "the map is 3.0 s old"),
+    Row(
+        "map gap", {"map_gap": 1.01}, "HOLD", "changes of the map have been missing for 1.0 s", not_yet={"map_gap": 1.0}
+    ),
+    Row("caution", {"caution": "area z4 is unknown"}, "DEGRADED", "area z4 is unknown"),
     Row(
         "path problem",
         {"path_problem": "goal blocked"},
-        {"path_problem": "goal blocked", "mission": False},
         "HOLD",
-        "alone",
         "goal blocked",
+        not_yet={"path_problem": "goal blocked", "mission": False},
     ),
     Row(
         "no progress",
         {"path_problem": "no progress along the path for 10 s: an obstacle is near"},
-        {"path_problem": None},
         "HOLD",
-        "alone",
         "no progress along the path for 10 s: an obstacle is near",
+        not_yet={"path_problem": None},
     ),
     Row(
         "planner late",
         {"plan_age": 1.51},
-        {"plan_age": 1.5},
         "DEGRADED",
-        "alone",
         "the planner has been silent for 1.5 s",
+        not_yet={"plan_age": 1.5},
     ),
     Row(
         "planner late before the end",
         {"plan_age": 2.0, "released_remaining": 0.151},
-        {},
         "DEGRADED",
-        "alone",
         "the planner has been silent for 2.0 s",
     ),
     Row(
         "planner lost",
         {"plan_age": 1.51, "released_remaining": 0.15},
-        {"plan_age": 1.51, "released_remaining": 0.15, "mission": False},
         "HOLD",
-        "alone",
         "and no released path is left",
+        not_yet={"plan_age": 1.51, "released_remaining": 0.15, "mission": False},
     ),
 ]
 RANK = {"NORMAL": 0, "DEGRADED": 1, "HOLD": 2, "PROTECTIVE_STOP": 3, "FAULT": 4}
@@ -277,7 +245,7 @@ def test_mode_after_a_condition_begins_and_after_it_ends(before, row):
 @pytest.mark.parametrize("row", ROWS, ids=[row.name for row in ROWS])
 def test_condition_holds_beyond_its_limit_and_not_at_it(row):
     gate = Gate()
-    assert gate.run(**row.not_yet).mode == "NORMAL"
+    assert gate.run(**(row.not_yet or {})).mode == "NORMAL"
     assert gate.run(**row.holds).mode == row.mode
 
 
@@ -486,6 +454,53 @@ def test_disable_forgets_latches_and_stops():
     gate.run(request="disable")
     assert (gate.state.latched, gate.state.stops, gate.state.enabled) == ((), (), False)
     assert gate.run(request="enable").refusal is None
+
+
+def at_moments(*steps: tuple[float, dict]) -> list:
+    """Enable a robot that has been healthy before t = 100, then run the steps at exact times; return their outputs."""
+    state, outputs = SafetyState(), []
+    before = [(97.0 + 0.25 * number, {"request": "enable"} if number == 0 else {}) for number in range(12)]
+    for now, changes in (*before, *steps):
+        state, out = step(state, inputs(**{"plan_age": 0.125, **changes}), now)
+        outputs.append(out)
+    assert outputs[11].mode == "NORMAL"
+    return outputs[12:]
+
+
+@pytest.mark.parametrize(("plan_age", "waits"), [(1.0, True), (1.0625, True), (0.9375, False)])
+def test_plan_of_the_moment_at_which_the_map_was_still_missing_is_not_newer(plan_age: float, *, waits: bool) -> None:
+    out = at_moments((100.0, {"map_gap": 2.0}), (101.0, {"plan_age": plan_age}))[-1]
+    assert ("waiting for a plan on the fresh map" in out.reasons) == waits
+
+
+def test_mode_is_relaxed_at_2_s_and_not_before() -> None:
+    late, relaxed = at_moments((100.0, {"caution": "slow"}), (101.9375, {}), (102.0, {}))[1:]
+    assert (late.mode, relaxed.mode) == ("DEGRADED", "NORMAL")
+    assert late.reasons == ("over, waiting until healthy for 2 s: slow",)
+    assert relaxed.reasons == ()
+
+
+def test_hold_needs_an_operator_at_60_s_and_not_before() -> None:
+    blocked = {"path_problem": "blocked"}
+    before, at = at_moments((100.0, blocked), (159.9375, blocked), (160.0, blocked))[1:]
+    assert before.reasons == ("blocked",)
+    assert at.reasons[1].startswith("stopped for more than 60 s, an operator must enable again (blocked)")
+
+
+@pytest.mark.parametrize(("third", "mode"), [(159.9375, "FAULT"), (160.0, "PROTECTIVE_STOP")])
+def test_protective_stop_counts_for_60_s_and_not_at_60_s(third: float, mode: str) -> None:
+    silent = {"lidar_age": 9.0}
+    steps = [(100.0, silent), (102.5, {}), (130.0, silent), (132.5, {}), (159.0, {}), (third, silent)]
+    assert at_moments(*steps)[-1].mode == mode
+
+
+def test_stop_in_a_zone_after_a_long_hold_stays_a_stop_and_is_enabled_without_either_cause() -> None:
+    blocked, inside = {"path_problem": "blocked"}, {"inside_blocked": "the zone x"}
+    steps = [(100.0, blocked), (160.0, blocked), (161.0, {**blocked, **inside}), (164.0, blocked)]
+    stopped, refused = at_moments(*steps, (164.5, {**blocked, "request": "enable"}))[-2:]
+    assert stopped.mode == "PROTECTIVE_STOP"
+    assert refused.refusal == "the cause is still there: blocked"
+    assert at_moments(*steps, (164.5, {"request": "enable"}))[-1].refusal is None
 
 
 RESTING = {"resting": "at rest", "lidar_age": 700.0, "scan_age": 700.0, "identical_scans": 3}

@@ -11,7 +11,7 @@ from fog_runtime.locks.handing_out import OWNERS, SIMULATION
 ROOT = Path(__file__).parents[1]
 COMPOSE = yaml.safe_load((ROOT / "docker-compose.yml").read_text("utf-8"))
 SERVICES: dict[str, dict[str, Any]] = COMPOSE["services"]
-HANDS_OUT = {"locks", "sim-locks"}
+HANDS_OUT = {"credentials", "sim-credentials"}
 BEHIND = {"hazard-aggregator", "map-service", "planner"}
 PI_MIB = 4096
 """Memory of the Raspberry Pi on which a fog node is to run."""
@@ -83,8 +83,10 @@ def test_each_program_mounts_its_own_locks_and_no_other_s():
 def test_whoever_hands_out_secrets_has_no_network_and_a_place_for_each_program():
     for name in HANDS_OUT:
         assert SERVICES[name]["network_mode"] == "none"
-    assert {f"/out/{program}" for program in OWNERS} == {path for path in mounts("sim-locks") if path[:5] == "/out/"}
-    assert {path: mounts("sim-locks")[path] for path in mounts("locks")} == mounts("locks")
+    assert {f"/out/{program}" for program in OWNERS} == {
+        path for path in mounts("sim-credentials") if path[:5] == "/out/"
+    }
+    assert {path: mounts("sim-credentials")[path] for path in mounts("credentials")} == mounts("credentials")
 
 
 def test_no_secret_is_in_an_environment_or_a_command():

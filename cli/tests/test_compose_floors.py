@@ -44,7 +44,7 @@ def test_written_file_names_the_command_that_writes_it_again(tmp_path, monkeypat
 
 def test_each_floor_has_every_container_but_the_shared_ones(made):
     base = yaml.safe_load(COMPOSE)["services"]
-    shared = {*SERVERS, "mosquitto-relay", "locks", "sim-locks", "kernels"}
+    shared = {*SERVERS, "mosquitto-relay", "credentials", "sim-credentials", "kernels"}
     expected = {f"{name}-{site}" for name in base.keys() - shared for site in ("attic", "first-floor")}
     assert made["services"].keys() - shared == expected
 
@@ -85,7 +85,7 @@ def test_no_floor_has_the_data_or_the_secrets_of_another(made, tmp_path):
     base = set(yaml.safe_load(COMPOSE)["volumes"])
     assert mounted("attic") & mounted("first-floor") == {"kernels", "gateway-locks"}
     assert mounted("attic") & base == {"kernels", "gateway-locks"}
-    handed_out = made["services"]["locks"]["volumes"]
+    handed_out = made["services"]["credentials"]["volumes"]
     assert f"{tmp_path / 'attic'}:/floors/attic:ro" in handed_out
     assert "planner-locks-attic:/out/floors/attic/planner" in handed_out
     assert {*made["volumes"]} >= {text.partition(":")[0] for text in handed_out if not text.startswith("/")}

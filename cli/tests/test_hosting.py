@@ -213,10 +213,10 @@ async def test_locks_that_change_while_the_node_starts_come_into_force(node, tmp
     monkeypatch.setattr(LocalNode, "start", start)
     told: list[str] = []
     running_node = asyncio.create_task(running.run_node(node.config, told.append))
-    await until(lambda: "the locks have changed: zenoh-router uses the new ones" in told or running_node.done())
+    await until(lambda: "credentials have changed: zenoh-router uses the new ones" in told or running_node.done())
     running_node.cancel()
     await asyncio.wait({running_node})
-    assert "the locks have changed: zenoh-router uses the new ones" in told
+    assert "credentials have changed: zenoh-router uses the new ones" in told
 
 
 def test_log_is_cut_without_a_copy_on_a_full_disk(tmp_path):
@@ -373,7 +373,9 @@ async def test_locks_of_another_site_are_never_replaced_by_those_of_a_backup(tmp
         settings.remember(folder.path, settings.settings_of({site: directory}, "127.0.0.1", [], simulate=False))
     await backups.create(tmp_path / "estig.tar.gz", NodeFolder(tmp_path / "data"), ESTIG)
     before = (folder.locks / "authority.pem").read_bytes()
-    with pytest.raises(BackupError, match="are the locks of upstairs too, and the backup's are of another authority"):
+    with pytest.raises(
+        BackupError, match="has the credentials of upstairs too, and the backup's are of another authority"
+    ):
         await backups.restore(tmp_path / "estig.tar.gz", folder, tmp_path / "restored", replace=True)
     assert (folder.locks / "authority.pem").read_bytes() == before
     assert not (tmp_path / "restored").exists()

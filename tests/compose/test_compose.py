@@ -99,8 +99,8 @@ def sim(fog: Project) -> Project:
 
 def test_one_up_makes_every_service_healthy_and_creates_the_secrets(fog: Project) -> None:
     containers = fog.containers()
-    assert set(containers) == FOG | {"locks", "kernels"}
-    assert [containers[name]["State"]["ExitCode"] for name in ("locks", "kernels")] == [0, 0]
+    assert set(containers) == FOG | {"credentials", "kernels"}
+    assert [containers[name]["State"]["ExitCode"] for name in ("credentials", "kernels")] == [0, 0]
     assert {name: fog.containers()[name]["State"]["Health"]["Status"] for name in FOG} == dict.fromkeys(FOG, "healthy")
 
 
@@ -179,7 +179,7 @@ def test_zone_created_with_the_admin_token_survives_a_restart_of_the_map_service
 def test_new_node_is_let_in_and_removed_without_a_restart_of_the_broker(fog: Project, tmp_path: Path) -> None:
     started = fog.containers()["mosquitto"]["State"]["StartedAt"]
     file = tmp_path / "n99.toml"
-    file.write_text(fog.locks("node", "n99"), "utf-8")
+    file.write_text(fog.run_credentials("node", "n99"), "utf-8")
     broker = Broker.of(f"mqtts://{fog.address('FOGNAV_MQTT_PORT')}", Credentials.read(file))
 
     async def admitted() -> bool:
@@ -190,7 +190,7 @@ def test_new_node_is_let_in_and_removed_without_a_restart_of_the_broker(fog: Pro
             return False
 
     wait(lambda: None if asyncio.run(admitted()) else "the new node is refused", 30)
-    fog.locks("remove", "n99")
+    fog.run_credentials("remove", "n99")
     wait(lambda: "the former node is let in" if asyncio.run(admitted()) else None, 30)
     assert fog.containers()["mosquitto"]["State"]["StartedAt"] == started
 

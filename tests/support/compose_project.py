@@ -35,7 +35,7 @@ ROOT: Final = Path(__file__).parents[2]
 STAND_INS: Final = ROOT / "tests" / "compose" / "stand_ins.sh"
 SERVICES: Final = ("hazard-aggregator", "map-service", "planner")
 FOG: Final = {*SERVICES, "zenoh", "mosquitto", "mosquitto-relay", "redis", "prometheus", "gateway"}
-ONCE: Final = {"locks", "kernels", "sim-locks"}
+ONCE: Final = {"credentials", "kernels", "sim-credentials"}
 """The containers that do something and end."""
 PORTS: Final = {
     "FOGNAV_HTTPS_PORT": ("gateway", 8443),
@@ -229,14 +229,14 @@ class Project:
         with httpx.Client(verify=self.credentials("console").tls_context(), timeout=COMMAND_S) as client:
             return client.request(method, url, **options)
 
-    def locks(self, *arguments: str) -> str:
+    def run_credentials(self, *arguments: str) -> str:
         """Run a command of the container that has all secrets."""
-        return self("run", "--rm", "--no-TTY", "--no-deps", "locks", *arguments)
+        return self("run", "--rm", "--no-TTY", "--no-deps", "credentials", *arguments)
 
     def credentials(self, user: str) -> Credentials:
         if user not in self._credentials:
             file = self._folder / f"{user.replace('/', '.')}.toml"
-            file.write_text(self.locks("show", f"credentials/{user}.toml"), "utf-8")
+            file.write_text(self.run_credentials("show", f"credentials/{user}.toml"), "utf-8")
             self._credentials[user] = Credentials.read(file)
         return self._credentials[user]
 
@@ -345,4 +345,4 @@ async def watching(sim: Project, floor: str = "") -> AsyncIterator[ZenohEdge]:
 def token(fog: Project, floor: str = "") -> dict[str, str]:
     """Return the header with the administrator's token of a floor, by default the first one."""
     file = f"floors/{floor}/admin.token" if floor else "admin.token"
-    return {"Authorization": f"Bearer {fog.locks('show', file).strip()}"}
+    return {"Authorization": f"Bearer {fog.run_credentials('show', file).strip()}"}

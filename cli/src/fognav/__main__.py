@@ -94,7 +94,7 @@ for group, name, command, example in (
     (installed.DEVELOP, "channels", channels_command, "channels --format acl --broker mqtt"),
 ):
     app.command(name, epilog=f"Example: fognav {example}", rich_help_panel=group)(command)
-robot_app.command("add", epilog="Example: fognav robot add r2 --locks locks")(robot_add)
+robot_app.command("add", epilog="Example: fognav robot add r2 --credentials DIR")(robot_add)
 robot_app.command("new", epilog="Example: fognav robot new --base roomba600 --lidar rplidar-a1 --out robot.toml")(
     robot_new
 )

@@ -105,7 +105,7 @@ def check_kernels() -> Check:
 
 
 def check_certificates() -> Check | None:
-    """Check until when the certificates are valid of the locks that FOGNAV_LOCKS_DIR names; None without any."""
+    """Check until when the certificates are valid that FOGNAV_CREDENTIALS_DIR names; None without any."""
     folder = locks_folder(None)
     if folder is None:
         return None

@@ -1,4 +1,4 @@
-"""The locks of a site's servers as the commands use them: their folder, and their errors in a user's words."""
+"""A site's certificates and users as the commands use them: their folder, and their errors in a user's words."""
 
 import os
 import socket
@@ -16,16 +16,22 @@ from fognav.output import FailedError, WrongUseError
 if TYPE_CHECKING:
     from fog_runtime.locks.site_locks import SiteLocks
 
-VARIABLE: Final = "FOGNAV_LOCKS_DIR"
+VARIABLE: Final = "FOGNAV_CREDENTIALS_DIR"
+_FORMER_VARIABLE: Final = "FOGNAV_LOCKS_DIR"
 LocksOption = Annotated[
     Path | None,
-    typer.Option("--locks", metavar="DIR", help=f"Folder of the site's certificates and users; default: {VARIABLE}."),
+    typer.Option(
+        "--credentials",
+        "--locks",
+        metavar="DIR",
+        help=f"Folder of the site's certificates and users; default: {VARIABLE}.",
+    ),
 ]
 
 
 def locks_folder(given: Path | None) -> Path | None:
     """Return the folder that an option or the environment names, or None."""
-    named = os.environ.get(VARIABLE)
+    named = os.environ.get(VARIABLE) or os.environ.get(_FORMER_VARIABLE)
     return given or (Path(named) if named else None)
 
 
@@ -33,12 +39,12 @@ def named_folder(given: Path | None) -> Path:
     """Return the folder that an option or the environment names; raises `WrongUseError` without one."""
     folder = locks_folder(given)
     if folder is None:
-        raise WrongUseError(f"name the folder of the site's locks with --locks or {VARIABLE}")
+        raise WrongUseError(f"name the folder of the site's certificates and users with --credentials or {VARIABLE}")
     return folder
 
 
 def open_locks(given: Path | None) -> "SiteLocks":
-    """Open the locks in the folder that an option or the environment names.
+    """Open the certificates and users in the folder that an option or the environment names.
 
     Raises `WrongUseError` without one, and `LocksError`.
     """
@@ -61,7 +67,7 @@ def own_credentials(default: str | None = None) -> Credentials:
 
 @contextmanager
 def locks_errors() -> Iterator[None]:
-    """Turn errors of locks into those of commands."""
+    """Turn errors of certificates and users into those of commands."""
     from fog_runtime.locks.authority import AuthorityError  # noqa: PLC0415  # keeps the other commands fast
     from fog_runtime.locks.users import LocksError  # noqa: PLC0415  # same
 

@@ -160,7 +160,7 @@ def test_certificate_of_the_authority_is_shown_without_its_key(node):
 
 def test_administrator_reads_a_file_of_the_locks_and_nothing_else(node):
     assert node.run("show", ADMIN_TOKEN) == (node.locks / ADMIN_TOKEN).read_text()
-    assert "they have: " in node.refused("show", "../out/planner/operator.key").lower()
+    assert "there are: " in node.refused("show", "../out/planner/operator.key").lower()
 
 
 def renamed(folder: Path, site: str) -> Path:
@@ -221,7 +221,7 @@ def test_two_floors_of_the_same_id_are_refused(node, upstairs, tmp_path):
 
 def test_locks_of_another_site_are_refused(node, tmp_path, monkeypatch):
     monkeypatch.setenv("FOGNAV_SITE_DIR", str(renamed(tmp_path / "site", "annex")))
-    assert "has the locks of site estig, not of annex" in node.refused()
+    assert "has the credentials of site estig, not of annex" in node.refused()
 
 
 def test_locks_of_a_version_that_did_not_check_the_router_get_its_password(node):

@@ -124,7 +124,7 @@ def _restore_into_node(file: Path, up: Path, site: Path, *, replace: bool) -> Ba
     backup.require_same_site(read_archive(file), directory)  # before the node's folder is made
     made, refused, gone = asyncio.run(restore(file, NodeFolder(up), directory, replace=replace))
     if LOCKS not in made.folders:
-        print_line(f"the locks in {up} stay: they have the same authority, and what was added since")
+        print_line(f"the credentials in {up} stay: they have the same authority, and what was added since")
     if refused:
         print_line(f"they do not admit {', '.join(refused)}, whom the backup has: add them again, if they shall be")
     if gone:

@@ -27,7 +27,7 @@ HostOption = Annotated[
 _RELOAD = "the servers use it after a restart; Mosquitto after SIGHUP, too"
 
 
-@ca_app.command("create", epilog="Example: fognav ca create --site sites/floor --locks locks --host fog.local")
+@ca_app.command("create", epilog="Example: fognav ca create --site sites/floor --credentials DIR --host fog.local")
 def ca_create(
     *,
     site: Annotated[Path, typer.Option("--site", metavar="D", help="Folder of the site, or a name in sites/.")] = Path(

@@ -41,7 +41,7 @@ BrokerOption = Annotated[
 @node_app.command(
     "add",
     context_settings=NUMBERS,
-    epilog="Example: fognav node add n8 --area z1 --pose 40.0,26.95,1.5708 --site sites/floor --wifi Lab --locks LOCKS",
+    epilog="Example: fognav node add n8 --area z1 --pose 40,26.95,1.57 --site sites/floor --wifi Lab --credentials DIR",
 )
 @with_board_options
 def node_add(
@@ -81,7 +81,7 @@ def node_add(
         board.report("added", node)
 
 
-@node_app.command("replace", epilog="Example: fognav node replace n3 --site sites/floor --wifi Lab --locks LOCKS")
+@node_app.command("replace", epilog="Example: fognav node replace n3 --site sites/floor --wifi Lab --credentials DIR")
 @with_board_options
 def node_replace(name: NameArgument, *, board: BoardOptions) -> None:
     """Write the settings of a new board for a node of the site, with a new password.

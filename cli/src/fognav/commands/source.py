@@ -123,7 +123,7 @@ def source_list(*, fog: FogOption = None, json: JsonOption = False) -> None:
             print_answer("no sources")
 
 
-@source_app.command("user", epilog="Example: fognav source user zigbee2mqtt --topic 'zigbee2mqtt/#' --locks locks")
+@source_app.command("user", epilog="Example: fognav source user zigbee2mqtt --topic 'zigbee2mqtt/#' --credentials DIR")
 def source_user(
     name: Annotated[str, typer.Argument(metavar="USER", help="The user's name: a to z, 0 to 9 and -.")],
     *,
@@ -131,7 +131,7 @@ def source_user(
     locks: LocksOption = None,
     json: JsonOption = False,
 ) -> None:
-    """Let a sensor, or the gateway of many, use a locked broker: these topics and no other."""
+    """Let a sensor, or the gateway of many, use a broker with passwords: these topics and no other."""
     with exit_codes(), locks_errors():
         try:
             msgspec.convert(name, Id)

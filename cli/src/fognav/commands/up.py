@@ -31,7 +31,7 @@ def up_command(  # noqa: PLR0913  # each option is an argument
     bind: Annotated[
         str,
         typer.Option("--bind", envvar="FOGNAV_BIND", metavar="ADDRESS", help="On which address to listen."),
-    ] = "0.0.0.0",  # noqa: S104  # behind locks
+    ] = "0.0.0.0",  # noqa: S104  # with TLS and passwords
     host: Annotated[
         list[str] | None,
         typer.Option("--host", metavar="NAME", help="Another name of this computer, for its certificates."),

@@ -132,8 +132,8 @@ def _require_same_sites(archive: Backup, locks: Path) -> None:
     theirs = msgspec.json.decode(file.data, type=_Sites)
     if others := set(SiteLocks.open(locks).sites) - {theirs.site, *theirs.floors}:
         raise BackupError(
-            f"{locks} are the locks of {', '.join(sorted(others))} too, and the backup's are of another authority, "
-            "which nobody there would trust: nothing was changed. Name another folder with --up"
+            f"{locks} has the credentials of {', '.join(sorted(others))} too, and the backup's are of another "
+            "authority, which nobody there would trust: nothing was changed. Name another folder with --up"
         )
 
 

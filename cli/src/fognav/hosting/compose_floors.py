@@ -1,6 +1,6 @@
 """Further floors of a fog node in containers: an override of docker-compose.yml, made from it.
 
-The floors share broker, Redis, router and the container that hands out locks. Each has its own services, gateway,
+The floors share broker, Redis, router and the container that hands out credentials. Each has its own services, gateway,
 Prometheus and Grafana, which are those of the compose file with the floor's id in their names. Its networks are its
 own, too, and there its containers answer to the usual names (`planner`, `gateway`): so their settings and
 configuration files are the same on every floor. Two floors share nothing else but what the gateways have in common:
@@ -24,7 +24,9 @@ BASE: Final = "docker-compose.yml"
 OVERRIDE: Final = "docker-compose.override.yml"
 """What compose reads besides, without being told."""
 HEADER: Final = "# Written by `fognav site compose"
-_SHARED: Final = frozenset({"locks", "sim-locks", "kernels", "mosquitto", "mosquitto-relay", "redis", "zenoh"})
+_SHARED: Final = frozenset(
+    {"credentials", "sim-credentials", "kernels", "mosquitto", "mosquitto-relay", "redis", "zenoh"}
+)
 _OUTSIDE: Final = "outside"
 """The gateways' way out, which has no names that could be mixed up."""
 _SITE: Final = re.compile(r"^\$\{FOGNAV_SITE:-[^}]*\}:/site")
@@ -41,8 +43,8 @@ def override(folders: Sequence[Path], compose: str) -> str:
     """
     base = yaml.safe_load(compose)
     services: _Part = {name: {"networks": {}} for name in ("mosquitto", "redis", "zenoh")}
-    services["locks"] = {"environment": {"FOGNAV_FLOORS_DIR": "/floors"}, "volumes": []}
-    services["sim-locks"] = copy.deepcopy(services["locks"])
+    services["credentials"] = {"environment": {"FOGNAV_FLOORS_DIR": "/floors"}, "volumes": []}
+    services["sim-credentials"] = copy.deepcopy(services["credentials"])
     made: _Part = {"services": services, "networks": {}, "volumes": {}}
     for index, (site, folder) in enumerate(_sites(folders).items(), start=1):
         _add(made, base, _Floor(site, folder, index))
@@ -103,7 +105,7 @@ def _add(made: _Part, base: Mapping[str, Any], floor: _Floor) -> None:
             services[server]["networks"][floor.name(network)] = None
     mounted = {text.partition(":")[0] for name in own for text in services[floor.name(name)].get("volumes", [])}
     made["volumes"] |= {name: None for name in sorted(map(floor.name, base["volumes"])) if name in mounted}
-    _add_locks(services, floor)
+    _add_credentials(services, floor)
 
 
 def _service(base: Mapping[str, Any], name: str, own: Sequence[str], floor: _Floor) -> _Part:
@@ -127,16 +129,16 @@ def _service(base: Mapping[str, Any], name: str, own: Sequence[str], floor: _Flo
         }
     environment: _Part = service.get("environment", {})
     if "FOGNAV_TOKENS_FILE" in environment and name == "backup":
-        # The first floor's backup has all locks; this one has what the floor has of its own.
+        # The first floor's backup has everybody's credentials; this one has what the floor has of its own.
         environment["FOGNAV_TOKENS_FILE"] = f"/locks/floors/{floor.site}/tokens.toml"
     return service
 
 
-def _add_locks(services: _Part, floor: _Floor) -> None:
-    """Let the containers that hand out locks know the floor, and give them a place for each of its programs."""
+def _add_credentials(services: _Part, floor: _Floor) -> None:
+    """Let the containers that hand out credentials know the floor, and give them a place for each of its programs."""
     places = {service: f"{service}-locks-{floor.site}" for service in ("hazard-aggregator", "map-service", "planner")}
-    for name in ("locks", "sim-locks"):
-        own = places | ({"simulation": f"sim-locks-{floor.site}"} if name == "sim-locks" else {})
+    for name in ("credentials", "sim-credentials"):
+        own = places | ({"simulation": f"sim-locks-{floor.site}"} if name == "sim-credentials" else {})
         services[name]["volumes"] += [
             f"{floor.folder}:/floors/{floor.site}:ro",
             *(f"{volume}:{_OUT}/{floor.site}/{program}" for program, volume in own.items()),

@@ -106,9 +106,9 @@ async def attend(
     manager.ready()
     troubles = Troubles(print_line)
     while True:
-        with troubles.told("changed locks are not in force"):
+        with troubles.told("changed credentials are not in force"):
             if (changed := await changes.round()) is not None:
-                print_line(f"the locks have changed: {changed} uses the new ones")
+                print_line(f"credentials have changed: {changed} uses the new ones")
         for site, each in zip(node.config.sites, registrations, strict=True):
             with troubles.told(f"the entry of site {site.id} in the register is not current"):
                 each.update()

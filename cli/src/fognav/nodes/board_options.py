@@ -129,15 +129,17 @@ class BoardOptions:
     def _check_trust(self, host: str) -> None:
         if not self.tls:
             if self.firmware == "esphome":
-                raise WrongUseError("--no-tls: the configuration for ESPHome speaks TLS only. Give --locks instead")
+                raise WrongUseError(
+                    "--no-tls: the configuration for ESPHome speaks TLS only. Give --credentials instead"
+                )
             return
         folder = locks_folder(self.locks)
         if folder is None:
             if not self._authority.exists():
                 raise WrongUseError(
-                    "TLS, and nothing says whom the board shall trust: give the folder of the fog node's locks "
-                    f"(--locks), put the certificate of the broker's authority into {self._authority}, or use --no-tls "
-                    "for a broker without certificates"
+                    "TLS, and nothing says whom the board shall trust: give the folder of the fog node's credentials "
+                    f"(--credentials), put the certificate of the broker's authority into {self._authority}, or use "
+                    "--no-tls for a broker without certificates"
                 )
             return
         # The firmware compares a name as it is given, but of an address a name that is in the certificate anyway.

@@ -268,7 +268,7 @@ def pipeline_command(
     rate: Annotated[float, typer.Option("--rate", metavar="HZ", min=1.0, max=50.0, help="Readings per second.")] = 20.0,
     robots: Annotated[int, typer.Option("--robots", metavar="N", min=0, max=200, help="Robots with poses.")] = 50,
     seconds: Annotated[float, typer.Option("--seconds", metavar="S", min=4.0, help="How long they publish.")] = 30.0,
-    open_: Annotated[bool, typer.Option("--open", help="Without locks: no encryption, no passwords.")] = False,
+    open_: Annotated[bool, typer.Option("--open", help="Without encryption and passwords.")] = False,
     json: JsonOption = False,
 ) -> None:
     """Measure the way from readings to the map.

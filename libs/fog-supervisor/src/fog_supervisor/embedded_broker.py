@@ -230,7 +230,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     """Run the broker until a signal."""
     parser = argparse.ArgumentParser(prog="fog_supervisor.embedded_broker", description="Run an MQTT broker.")
     parser.add_argument("--listen", required=True, metavar="ADDRESS:PORT")
-    parser.add_argument("--locks", type=Path, metavar="DIR", help="Mosquitto's part of the locks")
+    parser.add_argument("--locks", type=Path, metavar="DIR", help="Mosquitto's certificate, users and access list")
     options = parser.parse_args(arguments)
     logging.basicConfig(stream=sys.stderr, level=logging.WARNING, format="%(levelname)s %(name)s: %(message)s")
     asyncio.run(serve(options.listen, options.locks))

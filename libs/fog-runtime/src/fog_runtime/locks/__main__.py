@@ -141,7 +141,7 @@ def _shown(locks: SiteLocks, name: str) -> str:
     if not file.is_relative_to(locks.directory.resolve()) or not file.is_file():
         files = sorted(path for path in locks.directory.rglob("*") if path.is_file())
         names = ", ".join(path.relative_to(locks.directory).as_posix() for path in files)
-        raise LocksError(f"the locks have no file {name}. They have: {names}")
+        raise LocksError(f"there is no file {name}. There are: {names}")
     return file.read_text("utf-8")
 
 
@@ -154,7 +154,9 @@ def _keep_owner(folder: Path) -> None:
 
 
 def _parser() -> argparse.ArgumentParser:
-    parser = argparse.ArgumentParser(prog="locks", description="The locks of a fog node in containers.")
+    parser = argparse.ArgumentParser(
+        prog="credentials", description="The certificates, users and secrets of a fog node in containers."
+    )
     parser.add_argument("--floor", metavar="SITE", default="", help="the floor that is meant; default: the first one")
     commands = parser.add_subparsers(dest="command", metavar="COMMAND")
     commands.add_parser("make", help="create what is missing, and hand it out (default)")

@@ -71,7 +71,8 @@ class SiteLocks:
             opened._plan = _read_plan(folder)
         except OSError as error:
             raise LocksError(
-                f"{folder} has no locks of a site ({error.strerror}). Create them (fognav ca create --locks {folder})"
+                f"{folder} has no certificates and users of a site ({error.strerror}). Create them "
+                f"(fognav ca create --credentials {folder})"
             ) from error
         except msgspec.DecodeError as error:
             raise LocksError(f"{folder / _PLAN}: {error}. Restore it from a backup") from error
@@ -86,8 +87,8 @@ class SiteLocks:
         before = _read_plan(self._folder) if (self._folder / _PLAN).exists() else self._plan
         if before.site != self._plan.site:
             raise LocksError(
-                f"{self._folder} has the locks of site {before.site}, not of {self._plan.site}: name a folder (or "
-                "volume) of its own for each site"
+                f"{self._folder} has the credentials of site {before.site}, not of {self._plan.site}: name a folder "
+                "(or volume) of its own for each site"
             )
         known_hosts = before.hosts
         self._plan = msgspec.structs.replace(self._plan, floors=before.floors, devices=before.devices)

@@ -3,13 +3,11 @@
 from __future__ import annotations
 
 import asyncio
-import gc
 import os
 import socket
 import subprocess
 import sys
 import threading
-import weakref
 from concurrent.futures import ThreadPoolExecutor
 from functools import cache
 from typing import TYPE_CHECKING
@@ -165,32 +163,6 @@ def test_compiler_is_released_after_the_start_and_still_works() -> None:
 def test_collector_of_garbage_passes_over_what_the_start_has_made() -> None:
     _, _, looked_at = _run()
     assert looked_at < 1_000, "modules alone are more than 100,000 objects, which take 90 ms"
-
-
-def test_what_is_loaded_without_collections_is_passed_over_by_later_ones() -> None:
-    assert gc.isenabled()
-    try:
-        with process.loading(lambda: False):
-            assert not gc.isenabled()
-            made = [[number] for number in range(100)]
-        assert gc.isenabled()
-        looked_at = {id(found) for found in gc.get_objects()}
-        assert not looked_at & {id(item) for item in made}
-    finally:
-        gc.unfreeze()
-
-
-@pytest.mark.parametrize("made_garbage", [True, False])
-def test_garbage_is_collected_when_much_was_made_while_loading(*, made_garbage: bool) -> None:
-    try:
-        with process.loading(lambda: made_garbage):
-            cycle = Cycle()
-            cycle.itself, gone = cycle, weakref.ref(cycle)
-            del cycle
-        assert (gone() is None) == made_garbage
-    finally:
-        gc.unfreeze()
-        gc.collect()
 
 
 async def test_memory_is_released_as_soon_as_the_process_is_ready(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -122,9 +122,11 @@ def test_signal_ends_a_process_in_order_that_loads_something_for_ever():
 
 
 def test_what_was_loaded_aside_is_returned_and_its_error_is_logged_with_status_one():
-    with start_loading("return 'loaded on ' + threading.current_thread().name") as child:
+    with start_loading(
+        "import gc; return f'on {threading.current_thread().name}, collects: {gc.isenabled()}'"
+    ) as child:
         out, _ = child.communicate(timeout=60)
-    assert (out, child.returncode) == ("loaded on loading\ncleaned\n", 0)
+    assert (out, child.returncode) == ("on loading, collects: False\ncleaned\n", 0)
     with start_loading("raise ImportError('no such kernel')") as child:
         out, err = child.communicate(timeout=60)
     assert (out, child.returncode) == ("cleaned\n", 1)

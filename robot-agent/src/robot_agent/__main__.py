@@ -10,8 +10,8 @@ connects and wires. It is loaded on a thread: where kernels are compiled for min
 
 from __future__ import annotations
 
+import asyncio
 import os
-from contextlib import ExitStack
 from functools import partial
 from typing import TYPE_CHECKING
 
@@ -19,10 +19,9 @@ from fog_runtime import logs, machine, process
 from fog_runtime.clock import SystemClock
 from fog_runtime.configuration.robot_file import load_robot
 from fog_runtime.configuration.settings import describe, load
-from fog_runtime.process import loading
 from robot_agent import registry
-from robot_agent.agent.edges.guardian_client import connect_early
-from robot_agent.agent.edges.lidar_edge import LidarParts, lidar_start
+from robot_agent.agent.edges.guardian_client import GuardianClient
+from robot_agent.agent.edges.lidar_edge import Devices, LidarEdge
 from robot_agent.agent.settings import Settings, read_given, read_port
 from robot_agent.device_signature import LineCheck
 
@@ -30,10 +29,9 @@ if TYPE_CHECKING:
     from collections.abc import Awaitable, Callable
 
     from fog_runtime.configuration.robot_file import RobotFile
-    from robot_agent.agent.edges.guardian_client import EarlyLink
     from robot_agent.agent.settings import Given
 
-    Run = Callable[[Settings, RobotFile, Given, SystemClock, LidarParts, EarlyLink | None], Awaitable[None]]
+    Run = Callable[[Settings, RobotFile, Given, SystemClock, Devices], Awaitable[None]]
 
 _log = logs.get("agent")
 
@@ -44,19 +42,19 @@ async def main() -> None:
     logs.configure("robot-agent", settings.log_level, settings.log_format)
     _log.info("settings_loaded", **describe(settings))
     robot, clock = load_robot(os.environ), SystemClock(settings.speed)
-    port, name, signatures = read_port(robot), robot.settings.lidar.driver, registry.signatures()
-    serial = signatures[name].serial if name in signatures else None
+    port, name = read_port(robot), robot.settings.lidar.driver
     given = read_given(settings, robot)
-    check = partial(LineCheck, port, name, signatures)
-    with lidar_start(port, serial, check, clock) as start, ExitStack() as links:
-        with loading(_has_compiled):
-            driver = await process.load_aside(partial(registry.make_lidar, robot))
-            if start is not None:
-                start.begin(driver)
-            if (link := connect_early(settings.guardian_socket)) is not None:
-                links.enter_context(link.socket)
-            run = await process.load_aside(_load_agent)
-        await run(settings, robot, given, clock, LidarParts(port, driver, check, start), link)
+    driver = await process.load_aside(partial(registry.make_lidar, robot))
+    check = partial(LineCheck, port, name, registry.signatures())
+    guardian, lidar = GuardianClient(settings.guardian_socket, clock), LidarEdge(port, driver, clock, check=check)
+    tasks = [asyncio.create_task(edge.run()) for edge in (guardian, lidar)]
+    try:
+        run = await process.load_aside(_load_agent)
+        await run(settings, robot, given, clock, Devices(guardian, lidar, tasks))
+    finally:
+        for task in tasks:
+            task.cancel()
+        await asyncio.gather(*tasks, return_exceptions=True)
 
 
 def _load_agent() -> Run:
@@ -64,13 +62,6 @@ def _load_agent() -> Run:
     from robot_agent.agent.process import run  # noqa: PLC0415  # as said above
 
     return run
-
-
-def _has_compiled() -> bool:
-    """Whether kernels were compiled, which leaves 100 MB of garbage, instead of loaded."""
-    from fog_kernels.warm import cache_misses  # noqa: PLC0415  # loads numba
-
-    return cache_misses() > 0
 
 
 if __name__ == "__main__":

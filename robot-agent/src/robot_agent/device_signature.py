@@ -35,13 +35,11 @@ class Signature(NamedTuple):
     recognizes: whether bytes from a line, beginning anywhere, can only come from such a device.
     question: bytes that make a silent one answer, and that no other device obeys; empty: it is never silent.
     answered: whether the bytes that followed the question are the answer.
-    serial: the driver's, for who opens the port before that is loaded (`agent.edges.lidar_edge`); None: nobody does.
     """
 
     recognizes: Callable[[bytes], bool]
     question: bytes = b""
     answered: Callable[[bytes], bool] = _never
-    serial: SerialSettings | None = None
 
 
 def foreign(own: str, heard: bytes, signatures: Mapping[str, Signature]) -> str | None:

@@ -9,7 +9,8 @@ import pytest
 from guardian_rig import DEADLINE_S
 
 from fog_runtime.clock import SystemClock
-from robot_agent.agent.edges.guardian_client import FEEDBACK_TIMEOUT_S, RESET_VALID_S, GuardianClient, connect_early
+from robot_agent.agent.edges import guardian_client
+from robot_agent.agent.edges.guardian_client import FEEDBACK_TIMEOUT_S, RESET_VALID_S, GuardianClient
 from robot_agent.guardian.link import BaseFeedback, WheelCommand, decode_command, encode
 from robot_agent.hardware import BaseStatus, WheelOdometry
 from robot_agent.localization.odometry import OdometryBuffer
@@ -57,18 +58,18 @@ class Guardian:
 
 
 class Rig:
-    def __init__(self, path, link=None):
+    def __init__(self, path):
         self.path = path
         self.clock = SkippingClock()
         self.feedback = []
         self.times = []
         self.losses = []
-        self.client = GuardianClient(
-            path,
-            self.clock,
+        self.client = GuardianClient(path, self.clock)
+
+    def begin(self):
+        self.client.begin(
             lambda feedback, at: (self.feedback.append(feedback), self.times.append(at)),
             lambda _, reason: self.losses.append(reason),
-            link,
         )
 
     async def until(self, condition):
@@ -91,6 +92,7 @@ def command(seq=1, **more):
 @pytest.fixture
 async def rig(tmp_path):
     made = Rig(tmp_path / "guardian.sock")
+    made.begin()
     tasks = [asyncio.create_task(loop) for loop in (made.client.run(), made.stream())]
     yield made
     for task in tasks:
@@ -98,26 +100,23 @@ async def rig(tmp_path):
     await asyncio.gather(*tasks, return_exceptions=True)
 
 
-async def test_what_the_guardian_sent_on_an_early_link_is_passed_on_with_its_times(tmp_path):
-    guardian = Guardian(tmp_path / "guardian.sock")
-    link = connect_early(guardian.path)
+async def test_what_the_guardian_sent_while_the_agent_was_loaded_is_passed_on_with_its_times(tmp_path):
+    guardian, rig = Guardian(tmp_path / "guardian.sock"), Rig(tmp_path / "guardian.sock")
+    tasks = [asyncio.create_task(rig.client.run())]
     await guardian.accept()
     begun = time.monotonic()
     sent = [msgspec.structs.replace(FEEDBACK, seq=number, at=begun - 1.0 + 0.1 * number) for number in range(5)]
     for feedback in sent:
         guardian.link.send(encode(feedback))
-    rig = Rig(guardian.path, link)
-    tasks = [asyncio.create_task(loop) for loop in (rig.client.run(), rig.stream())]
+    await rig.until(lambda: rig.client.pid)
+    rig.begin()
+    tasks.append(asyncio.create_task(rig.stream()))
     try:
         await rig.until(lambda: len(rig.feedback) == len(sent))
         assert rig.feedback == sent
         assert rig.times == [feedback.at for feedback in sent]
         assert rig.client.send(command(seq=7))
         assert (await guardian.receive()).seq == 7
-        guardian.link.close()
-        await guardian.accept()  # the next link is the client's own
-        guardian.link.send(encode(FEEDBACK))
-        await rig.until(lambda: rig.feedback[-1] == FEEDBACK)
     finally:
         for task in tasks:
             task.cancel()
@@ -125,14 +124,18 @@ async def test_what_the_guardian_sent_on_an_early_link_is_passed_on_with_its_tim
         guardian.close()
 
 
-async def test_early_link_that_has_waited_for_long_is_closed_and_made_anew(tmp_path):
+async def test_link_that_nobody_has_read_for_long_is_made_anew(tmp_path, monkeypatch):
     """Its socket may be full, and the guardian keeps what is newest to itself."""
-    guardian = Guardian(tmp_path / "guardian.sock")
-    early = connect_early(guardian.path)
+    guardian, rig = Guardian(tmp_path / "guardian.sock"), Rig(tmp_path / "guardian.sock")
+    tasks = [asyncio.create_task(rig.client.run())]
     await guardian.accept()
     guardian.link.send(encode(msgspec.structs.replace(FEEDBACK, at=SystemClock().now() - 40.0)))
-    rig = Rig(guardian.path, early._replace(made=time.monotonic() - 40.0))
-    tasks = [asyncio.create_task(loop) for loop in (rig.client.run(), rig.stream())]
+    await rig.until(lambda: rig.client.pid)
+    loaded = time.monotonic() + 40.0
+    with monkeypatch.context() as later:
+        later.setattr(guardian_client.time, "monotonic", lambda: loaded)
+        rig.begin()
+    tasks.append(asyncio.create_task(rig.stream()))
     try:
         with guardian.link:
             await guardian.accept()
@@ -145,10 +148,6 @@ async def test_early_link_that_has_waited_for_long_is_closed_and_made_anew(tmp_p
             task.cancel()
         await asyncio.gather(*tasks, return_exceptions=True)
         guardian.close()
-
-
-def test_without_a_guardian_there_is_no_early_link(tmp_path):
-    assert connect_early(tmp_path / "guardian.sock") is None
 
 
 async def test_missing_guardian_is_reported_and_connected_when_it_starts(rig):

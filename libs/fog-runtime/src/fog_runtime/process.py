@@ -12,14 +12,13 @@ import signal
 import sys
 import threading
 from concurrent.futures import Future
-from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Final, TypeVar
 
 from fog_runtime import logs, machine
 
 if TYPE_CHECKING:
-    from collections.abc import Awaitable, Callable, Iterator
+    from collections.abc import Awaitable, Callable
 
 _DONTNEED: Final = 4
 """`MADV_DONTNEED` of madvise(2)."""
@@ -31,23 +30,6 @@ _LIBRARY: Final = re.compile(r"\.so(\.|$)")
 _MAPPING: Final = re.compile(r"^([0-9a-f]+)-([0-9a-f]+) (\S+) \S+ \S+ \S+ *(.*)$")
 
 _log = logs.get("process")
-
-
-@contextmanager
-def loading(made_garbage: Callable[[], bool]) -> Iterator[None]:
-    """Load modules without collecting garbage: to look at all of them again and again takes a tenth of the time.
-
-    What was made meanwhile is passed over by the collector from then on, as by `release_startup_memory`. Where
-    `made_garbage` says at the end that there is some worth it, it is collected before.
-    """
-    gc.disable()
-    try:
-        yield
-        if made_garbage():
-            gc.collect()
-    finally:
-        gc.freeze()
-        gc.enable()
 
 
 def release_startup_memory() -> int:
@@ -120,10 +102,13 @@ async def load_aside(load: Callable[[], T]) -> T:
     def work() -> None:
         if not result.set_running_or_notify_cancel():
             return  # cancelled before this thread's first line; the loop waits for its end
+        gc.disable()  # to look at all modules again and again while more are loaded takes a fifteenth of the time
         try:
             result.set_result(load())
         except BaseException as error:  # noqa: BLE001  # raised to who awaits it
             result.set_exception(error)
+        finally:
+            gc.enable()
 
     thread = threading.Thread(target=work, name="loading", daemon=True)
     _loading.add(thread)

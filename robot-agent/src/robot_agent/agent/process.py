@@ -17,8 +17,6 @@ from fog_runtime.machine import run_in_real_time
 from fog_runtime.process import release_startup_memory
 from fog_runtime.transports.zenoh_edge import ZenohEdge, use_one_thread
 from robot_agent import registry
-from robot_agent.agent.edges.guardian_client import GuardianClient
-from robot_agent.agent.edges.lidar_edge import LidarEdge
 from robot_agent.agent.edges.map_loader import MapLoader
 from robot_agent.agent.edges.store import Store
 from robot_agent.agent.recording.input_writer import open_core
@@ -30,29 +28,21 @@ from robot_agent.hardware import DockingDriver
 if TYPE_CHECKING:
     from fog_runtime.clock import SystemClock
     from fog_runtime.configuration.robot_file import RobotFile
-    from robot_agent.agent.edges.guardian_client import EarlyLink
-    from robot_agent.agent.edges.lidar_edge import LidarParts
+    from robot_agent.agent.edges.lidar_edge import Devices
     from robot_agent.agent.settings import Given, Settings
 
 _log = logs.get("agent")
 
 
-async def run(
-    settings: Settings,
-    robot: RobotFile,
-    given: Given,
-    clock: SystemClock,
-    lidar: LidarParts,
-    link: EarlyLink | None,
-) -> None:
-    """Localize, follow paths and gate the wheels until cancelled; `link`: to the guardian, if it was made already."""
-    site, body = given.site, given.body
+async def run(settings: Settings, robot: RobotFile, given: Given, clock: SystemClock, devices: Devices) -> None:
+    """Localize, follow paths and gate the wheels until cancelled."""
+    site, body, guardian, lidar = given.site, given.body, devices.guardian, devices.lidar
     _log.info("robot_settings", **describe_robot(robot, *registry.options(robot)))
     config = agent_config(
         settings.robot,
         given.operator_key,
         given.base.drive_train,
-        lidar.driver.traits,
+        lidar.traits,
         body,
         boot=secrets.token_hex(8),
         obstacle_ttl=settings.obstacle_memory_s,
@@ -64,7 +54,7 @@ async def run(
     inscribed = round(config.footprint.inscribed_radius, 3)
     sizes = {"radius": config.radius, "inscribed_radius": inscribed}
     _log.info("robot_body", source=source, **sizes, site=site, entry=to_builtins(body))
-    for remark in remarks(robot, lidar.driver.traits, config.footprint):
+    for remark in remarks(robot, lidar.traits, config.footprint):
         _log.warning("robot_remark", remark=remark)
     use_one_thread()
     health = Health("map", "pose", "lidar", "base")
@@ -81,10 +71,8 @@ async def run(
             agent = Service(core, zenoh, store, clock, health, address)
             map_loader = MapLoader(core, zenoh, store, clock, site=site, phase=agent.phase)
             map_loader.begin()
-            guardian = GuardianClient(settings.guardian_socket, clock, agent.on_feedback, agent.on_base_lost, link)
-            lidar_edge = LidarEdge(
-                lidar.port, lidar.driver, clock, core.on_lidar_samples, check=lidar.check, start=lidar.start
-            )
+            guardian.begin(agent.on_feedback, agent.on_base_lost)
+            lidar.on_samples = core.on_lidar_samples
             agent.subscribe()
             REGISTRY.register(agent.collector)
             zenoh.declare_liveliness("robot-agent", settings.robot)
@@ -94,10 +82,15 @@ async def run(
             priority = settings.agent_realtime_priority if settings.speed == 1.0 else 0
             _log.info("started", priority=run_in_real_time(priority))
             async with asyncio.TaskGroup() as tasks:
-                tasks.create_task(guardian.run(), name="base")
-                tasks.create_task(lidar_edge.run(), name="lidar")
-                tasks.create_task(agent.stream_loop(guardian, lidar_edge), name="stream")
+                for task in devices.tasks:
+                    tasks.create_task(_ended(task))
+                tasks.create_task(agent.stream_loop(guardian, lidar), name="stream")
                 tasks.create_task(agent.control_loop(), name="control")
                 tasks.create_task(map_loader.run(body), name="map")
                 tasks.create_task(agent.publish_loop(), name="publish")
-                tasks.create_task(agent.housekeeping_loop(lidar_edge, guardian), name="housekeeping")
+                tasks.create_task(agent.housekeeping_loop(lidar, guardian), name="housekeeping")
+
+
+async def _ended(task: asyncio.Task[None]) -> None:
+    """Wait for a task: its error ends the others, and is cancelled with them."""
+    await task

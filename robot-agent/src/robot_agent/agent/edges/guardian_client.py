@@ -12,7 +12,7 @@ import select
 import socket
 import struct
 import time
-from typing import TYPE_CHECKING, Final, NamedTuple
+from typing import TYPE_CHECKING, Final
 
 import msgspec
 
@@ -32,56 +32,28 @@ RESET_VALID_S: Final = 1.0
 """An operator's reset that could not be passed on within this time expires: it must not clear a later fault."""
 _SENT_WITHIN_S: Final = 30.0
 """The first feedback of a link that is older than this, by the time that it says, says that of another clock."""
-_EARLY_S: Final = 5.0
-"""Later than this (of the system's clock) an early link may be full, and the guardian keeps the newest to itself."""
+_UNREAD_S: Final = 5.0
+"""A link unread for longer (of the system's clock) may be full, and the guardian keeps the newest to itself."""
 _PACKETS_AT_ONCE: Final = 64
 """A flood of packets must not block the stream."""
 
 _log = logs.get("base")
 
 
-class EarlyLink(NamedTuple):
-    """A link to the guardian, and when it was made (s of `time.monotonic`)."""
-
-    socket: socket.socket
-    made: float
-
-
-def connect_early(path: Path) -> EarlyLink | None:
-    """Connect to the guardian without waiting, while the agent is being loaded; None if there is none that answers.
-
-    What it sends meanwhile waits in the socket, with its times: the first scan finds the odometry of its whole turn.
-    """
-    link = socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET)
-    link.settimeout(0)
-    try:
-        link.connect(str(path))
-    except OSError:  # `GuardianClient.run` connects, and says why it can't
-        link.close()
-        return None
-    return EarlyLink(link, time.monotonic())
-
-
 class GuardianClient:
-    """One connection to the guardian at a time; `receive` calls `on_feedback` with the time at which it was sent.
+    """One connection to the guardian at a time. `run` may connect while the agent is still loaded, before `begin`.
 
-    Where the guardian tells no time, or one of another clock, it is the time of arrival.
+    What the guardian sends meanwhile waits in the socket, with its times: the first scan finds odometry of its whole
+    turn.
     """
 
-    def __init__(
-        self,
-        path: Path,
-        clock: Clock,
-        on_feedback: Callable[[BaseFeedback, float], object],
-        on_lost: Callable[[float, str], object],
-        link: EarlyLink | None = None,
-    ) -> None:
-        """`link`: the first connection, if it was made before; it belongs to this object, which closes an old one."""
+    def __init__(self, path: Path, clock: Clock) -> None:
         self._path = path
-        self._early = link
         self._clock = clock
-        self._on_feedback = on_feedback
-        self._on_lost = on_lost
+        self._on_feedback: Callable[[BaseFeedback, float], object] = _ignored
+        self._on_lost: Callable[[float, str], object] = _ignored
+        self._linked_at = math.inf
+        """When this link was made (s of `time.monotonic`)."""
         self._socket: socket.socket | None = None
         self._readable = select.poll()
         self._end: asyncio.Future[str] | None = None
@@ -98,6 +70,19 @@ class GuardianClient:
         self._sent_at = -math.inf
         """The time of the last feedback that was passed on."""
         self._limited = logs.RateLimited(_log)
+
+    def begin(
+        self, on_feedback: Callable[[BaseFeedback, float], object], on_lost: Callable[[float, str], object]
+    ) -> None:
+        """Let `receive` pass feedback on, with the time at which it was sent, and `run` that the link is lost.
+
+        Where the guardian tells no time, or one of another clock, it is the time of arrival. A link that has waited
+        for long, as while kernels were compiled, is made anew.
+        """
+        self._on_feedback, self._on_lost = on_feedback, on_lost
+        self._feedback_at = self._clock.now()
+        if self._end is not None and not self._end.done() and time.monotonic() - self._linked_at > _UNREAD_S:
+            self._end.set_result("nobody has read the link for long; it is made anew")
 
     def send(self, command: WheelCommand) -> bool:
         """Send a command without waiting; False when there is no guardian, or it does not read.
@@ -124,12 +109,11 @@ class GuardianClient:
         """Stay connected until cancelled."""
         while True:
             try:
-                early = self._take_early()
-                with early or socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET) as link:
+                with socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET) as link:
                     link.settimeout(0)
-                    if early is None:
-                        await asyncio.get_running_loop().sock_connect(link, str(self._path))
+                    await asyncio.get_running_loop().sock_connect(link, str(self._path))
                     self._socket, self._feedback_at = link, self._clock.now()
+                    self._linked_at = time.monotonic()
                     self.pid = _peer(link)
                     reason = await self._read(link)
             except OSError as error:
@@ -138,14 +122,6 @@ class GuardianClient:
                 self._socket = self.pid = None
             self._lost(reason)
             await self._clock.sleep(RETRY_S)
-
-    def _take_early(self) -> socket.socket | None:
-        """Return the early link, once; closed, and None, if kernels were compiled or the computer slept since."""
-        early, self._early = self._early, None
-        if early is None or time.monotonic() - early.made <= _EARLY_S:
-            return early and early.socket
-        early.socket.close()
-        return None
 
     async def _read(self, link: socket.socket) -> str:
         """Let `receive` pass feedback on until the link breaks; return the reason."""
@@ -210,6 +186,10 @@ class GuardianClient:
             self._last_logged = reason
             _log.warning("base_lost", reason=reason)
         self._on_lost(self._clock.now(), reason)
+
+
+def _ignored(_what: object, _at: object) -> None:
+    """For what comes before `begin`."""
 
 
 def _peer(link: socket.socket) -> int | None:

@@ -4,18 +4,15 @@ The stream of wheel commands reads the port, 20 times a second: its safety gate 
 time cost a small computer far less than each alone, and the process is not woken for them.
 
 A lidar takes as long to begin as the rest of the agent to load, about a second: its port is listened to before anything
-is written, its motor starts, and its first whole scan needs two turns of the head. So `LidarStart` begins its scan
-meanwhile. The motor waits for the driver, the last that may refuse a setting. Whatever fails there is left to the edge,
-which opens the port again, and says why.
+is written, its motor starts, and its first whole scan needs two turns of the head. So the edge runs before there is a
+core, and reads the port itself until somebody wants the samples.
 """
 
 from __future__ import annotations
 
 import asyncio
-import threading
-from concurrent.futures import Future
-from contextlib import AbstractContextManager, ExitStack, nullcontext, suppress
-from typing import TYPE_CHECKING, Final, NamedTuple, Self
+from contextlib import suppress
+from typing import TYPE_CHECKING, Final, NamedTuple
 
 from fog_runtime import logs
 from fog_runtime.configuration.settings import SettingsError
@@ -26,11 +23,13 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
 
     from fog_runtime.clock import Clock
+    from robot_agent.agent.edges.guardian_client import GuardianClient
     from robot_agent.device_signature import LineCheck, SerialSettings
     from robot_agent.hardware import LaserScan, LidarDriver, LidarSamples
 
 _log = logs.get("lidar")
 
+REOPEN_S: Final = 1.0
 _PERIOD_S: Final = 0.02
 ANSWER_S: Final = 0.1
 """A device that is asked what it is has answered within this time."""
@@ -58,108 +57,6 @@ async def wrong_device(port: Port, check: LineCheck, clock: Clock) -> str | None
     return None
 
 
-class LidarStart:
-    """A scan that a thread begins: `begin` once the driver is loaded, then `take` the port; a context manager.
-
-    Until then the thread reads the port as the stream of wheel commands does later, and nobody gets the scans.
-    """
-
-    def __init__(self, path: str, serial: SerialSettings, check: Callable[[], LineCheck], clock: Clock) -> None:
-        """Take over `serial` and `check` as the lidar's edge has them of the driver, which uses the same clock."""
-        self._path = path
-        self._serial = serial
-        self._check = check
-        self._clock = clock
-        self._driver: Future[LidarDriver] = Future()
-        self._port: Port | None = None
-        self._taken = threading.Event()
-        self._thread = threading.Thread(target=self._run, name="lidar start", daemon=True)
-
-    def begin(self, driver: LidarDriver) -> None:
-        """Let the scan begin as soon as the port was listened to; the driver belongs to this object until `take`.
-
-        A driver whose options want other serial settings than its signature's gets no scan: the edge opens the port.
-        """
-        if driver.serial == self._serial:
-            self._driver.set_result(driver)
-        else:
-            self._driver.cancel()
-
-    def take(self) -> Port | None:
-        """Return the port, on which the driver's scan has begun; None if it has not.
-
-        Call it after `begin`; it blocks for 0.3 s of the clock at most, and for what the port needs to write.
-        Whoever takes it closes it, and ends the scan before.
-        """
-        self._taken.set()
-        self._thread.join()
-        return self._port
-
-    def __enter__(self) -> Self:
-        self._thread.start()
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        """Wait for the thread, and end a scan that nobody has taken over."""
-        self._driver.cancel()
-        port = self.take()
-        if port is None or port.fileno() < 0:
-            return
-        with port, suppress(PortLost):
-            port.write(self._driver.result().stop_command)
-            set_motor(port, self._serial, on=False)
-
-    def _run(self) -> None:
-        try:
-            with suppress(PortLost, PortNameError, asyncio.CancelledError):
-                asyncio.run(self._scan())
-        except Exception as error:  # noqa: BLE001  # the edge begins anew, and fails where this is no accident
-            _log.error("lidar_start_failed", error=error, port=self._path)
-
-    async def _scan(self) -> None:
-        with ExitStack() as contexts:
-            port = contexts.enter_context(open_port(self._path, self._serial.baud))
-            if refuse_speed(self._clock.speed, port.device) is not None:
-                return
-            port.discard_input()
-            if await wrong_device(port, self._check(), self._clock) is not None:
-                return
-            driver = await asyncio.wrap_future(self._driver)
-            set_motor(port, self._serial, on=True)
-            contexts.callback(self._stop_motor, port)
-            port.write(driver.begin(self._clock.now()))
-            while not self._taken.is_set():
-                await self._clock.sleep(_PERIOD_S)
-                now = self._clock.now()
-                if reply := driver.receive(port.read_available(), now).data + driver.tick(now):
-                    port.write(reply)
-            self._port = port
-            contexts.pop_all()
-
-    def _stop_motor(self, port: Port) -> None:
-        with suppress(PortLost):
-            set_motor(port, self._serial, on=False)
-
-
-def lidar_start(
-    path: str, serial: SerialSettings | None, check: Callable[[], LineCheck], clock: Clock
-) -> AbstractContextManager[LidarStart | None]:
-    """Return the start of a lidar's scan; of None where its driver must be loaded to know the serial settings."""
-    return nullcontext() if serial is None else LidarStart(path, serial, check, clock)
-
-
-class LidarParts(NamedTuple):
-    """The robot's lidar: its port, its driver, the check of what is on the port, and its scan's start, if any."""
-
-    port: str
-    driver: LidarDriver
-    check: Callable[[], LineCheck]
-    start: LidarStart | None
-
-
-REOPEN_S: Final = 1.0
-
-
 class LidarEdge:
     """Keeps a scan running on one port; `poll` reads it, on the loop's thread."""
 
@@ -168,21 +65,18 @@ class LidarEdge:
         path: str,
         driver: LidarDriver,
         clock: Clock,
-        on_samples: Callable[[LidarSamples, float], object],
+        on_samples: Callable[[LidarSamples, float], object] | None = None,
         *,
         check: Callable[[], LineCheck] | None = None,
-        start: LidarStart | None = None,
     ) -> None:
-        """`on_samples` is called with the newest samples by `poll`; `check` makes a fresh check for each opening.
-
-        `start`: the scan that was begun with this driver while the agent was loaded.
-        """
+        """`check` makes a fresh check for each opening of the port."""
+        self.on_samples = on_samples
+        """Called with the newest samples by `poll`. Until it is set, the edge reads the port itself, for nobody."""
+        self.traits = driver.traits
         self._path = path
         self._driver = driver
         self._clock = clock
-        self._on_samples = on_samples
         self._check = check
-        self._start = start
         self._last_logged = ""
         self._resting = False
         self._port: Port | None = None
@@ -197,20 +91,18 @@ class LidarEdge:
             SettingsError: when the port's name is refused, or the clock's speed is a simulation's and the port real.
 
         """
-        begun = None if self._start is None else await asyncio.to_thread(self._start.take)
         while True:
             try:
-                with begun or open_port(self._path, self._driver.serial.baud) as port:
+                with open_port(self._path, self._driver.serial.baud) as port:
                     if (refusal := refuse_speed(self._clock.speed, port.device)) is not None:
                         raise SettingsError(refusal)
                     _log.info("port_open", path=self._path)
-                    if begun is not None or await self._begin(port):
+                    if await self._begin(port):
                         await self._scan(port)
             except PortLost as error:
                 self._report(str(error))
             except PortNameError as error:
                 raise SettingsError(f"lidar.port: {error}") from error
-            begun = None
             await self._clock.sleep(REOPEN_S)
 
     async def _begin(self, port: Port) -> bool:
@@ -229,6 +121,9 @@ class LidarEdge:
         self._resting, self._fetched = False, b""
         self._port, self._lost = port, asyncio.get_running_loop().create_future()
         try:
+            while self.on_samples is None and not self._lost.done():
+                self.poll(self._clock.now())
+                await self._clock.sleep(_PERIOD_S)
             await self._lost
         finally:
             self._port = None
@@ -270,8 +165,8 @@ class LidarEdge:
             data, self._fetched = self._fetched + port.read_available(), b""
             events = driver.receive(data, now)
             scans = events.scans
-            if events.samples is not None:
-                self._on_samples(events.samples, now)
+            if events.samples is not None and self.on_samples is not None:
+                self.on_samples(events.samples, now)
             if reply := events.data + driver.tick(now):
                 port.write(reply)
         except PortLost as error:
@@ -299,3 +194,11 @@ class LidarEdge:
         if problem and problem != self._last_logged:
             _log.warning("lidar_problem", reason=problem)
         self._last_logged = problem
+
+
+class Devices(NamedTuple):
+    """The edges of base and lidar, and the tasks that run them since before the rest of the agent was loaded."""
+
+    guardian: GuardianClient
+    lidar: LidarEdge
+    tasks: Sequence[asyncio.Task[None]]

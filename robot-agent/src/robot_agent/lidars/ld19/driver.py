@@ -7,9 +7,9 @@ from typing import Annotated, Final
 import msgspec
 from msgspec import Meta
 
+from robot_agent.device_signature import SerialSettings
 from robot_agent.hardware import LaserScan, LidarEvents, LidarFactory, LidarTraits
 from robot_agent.lidars.ld19 import protocol
-from robot_agent.lidars.ld19.signature import SERIAL
 
 SAMPLES_TIMEOUT_S: Final = 1.0
 
@@ -26,7 +26,7 @@ class Ld19Options(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fiel
 class Ld19Driver:
     """Protocol of one lidar; see `robot_agent.hardware.LidarDriver`."""
 
-    serial = SERIAL
+    serial = SerialSettings(230400)
     stop_command = b""
 
     def __init__(self, options: Ld19Options | None = None) -> None:

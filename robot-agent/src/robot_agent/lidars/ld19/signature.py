@@ -4,9 +4,7 @@ from __future__ import annotations
 
 from typing import Final
 
-from robot_agent.device_signature import SerialSettings, Signature
-
-SERIAL: Final = SerialSettings(230400)
+from robot_agent.device_signature import Signature
 
 _HEADER: Final = b"\x54\x2c"
 _PACKET: Final = 47
@@ -33,4 +31,4 @@ def _crc(data: bytes) -> int:
     return crc
 
 
-SIGNATURE: Final = Signature(recognizes=_recognizes, serial=SERIAL)
+SIGNATURE: Final = Signature(recognizes=_recognizes)

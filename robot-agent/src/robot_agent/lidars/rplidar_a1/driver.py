@@ -7,9 +7,9 @@ from typing import Annotated, Final, Literal
 import msgspec
 from msgspec import Meta
 
+from robot_agent.device_signature import SerialSettings
 from robot_agent.hardware import LaserScan, LidarEvents, LidarFactory, LidarTraits
 from robot_agent.lidars.rplidar_a1 import protocol as rplidar
-from robot_agent.lidars.rplidar_a1.signature import SERIAL
 
 STOP_S: Final = 0.1
 """Time between a stop and the next request; the device needs 1 ms, and its last bytes must arrive."""
@@ -34,7 +34,8 @@ class RplidarA1Options(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown
 class RplidarA1Driver:
     """Protocol of one lidar; see `robot_agent.hardware.LidarDriver`."""
 
-    serial = SERIAL
+    serial = SerialSettings(115200, dtr=False)
+    """The motor of an A1 runs while DTR is cleared."""
     stop_command = rplidar.stop()
 
     def __init__(self, options: RplidarA1Options | None = None) -> None:

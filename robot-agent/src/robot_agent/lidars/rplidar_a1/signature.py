@@ -5,10 +5,7 @@ from __future__ import annotations
 import re
 from typing import Final
 
-from robot_agent.device_signature import SerialSettings, Signature
-
-# The motor of an A1 runs while DTR is cleared.
-SERIAL: Final = SerialSettings(115200, dtr=False)
+from robot_agent.device_signature import Signature
 
 _TEXT: Final = re.compile(rb"RP ?LIDAR System")
 _DESCRIPTOR: Final = re.compile(
@@ -52,4 +49,4 @@ def _capsules_at(data: bytes, begin: int) -> bool:
 
 
 # A silent one is not asked: whoever asks it in its own protocol presses the buttons of a Roomba.
-SIGNATURE: Final = Signature(recognizes=_recognizes, serial=SERIAL)
+SIGNATURE: Final = Signature(recognizes=_recognizes)

@@ -6,8 +6,12 @@ import sys
 import tomllib
 from importlib import metadata
 from pathlib import Path
+from typing import get_args
 
 import pytest
+
+from fog_contracts.messages.basics import AreaState
+from fog_contracts.messages.robots import Mode, ProfileName
 
 ROOT = Path(__file__).parents[1]
 PARTS = ("libs", "services", "robot-agent", "sim", "experiments", "cli")
@@ -44,6 +48,12 @@ def test_operations_names_every_metric_and_none_that_nobody_exports() -> None:
     named = set(re.findall(r"`(fognav_[a-z0-9_]+)[`{]", (ROOT / "docs" / "operations.md").read_text("utf-8")))
     assert named <= defined, f"no process exports {sorted(named - defined)}"
     assert defined <= named, f"docs/operations.md lacks {sorted(defined - named)}: say what each is for"
+
+
+def test_glossary_names_every_mode_profile_and_state_of_an_area() -> None:
+    terms = {*get_args(Mode), *get_args(ProfileName), *get_args(AreaState)}
+    explained = set(re.findall(r"`([\w.]+)`", (ROOT / "docs" / "glossary.md").read_text("utf-8")))
+    assert terms - explained == set()
 
 
 def test_contributing_names_every_variable_that_makes_tests_longer() -> None:

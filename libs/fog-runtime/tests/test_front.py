@@ -22,6 +22,7 @@ from fog_runtime.http import (
     Encoded,
     Front,
     FrontError,
+    ProblemCode,
     ProblemError,
     Routes,
     Tokens,
@@ -42,6 +43,10 @@ async def main():
     await Front.fork(make).serve(make(), pathlib.Path(sys.argv[1]))
 asyncio.run(main())
 """
+
+
+class Gone(ProblemCode):
+    GONE = "gone", 410, "It is gone"
 
 
 class Service:
@@ -84,9 +89,9 @@ class Service:
         async def bug() -> str:
             raise RuntimeError("inner detail")
 
-        @routes.get("/gone", problems={410: "It is gone"})
+        @routes.get("/gone", problems=[Gone.GONE])
         async def gone() -> str:
-            raise ProblemError(410, "it is gone", headers={"X-Since": "monday"}, since=7)
+            raise ProblemError(Gone.GONE, "it is gone", headers={"X-Since": "monday"}, since=7)
 
         @routes.get("/encoded")
         async def encoded() -> Encoded[list[int]]:
@@ -297,7 +302,7 @@ async def test_calls_to_a_core_that_has_ended_are_to_be_repeated():
     for call in (calling, link.call("GET /slow", b"")):
         with pytest.raises(ProblemError) as refused:
             await call
-        assert (refused.value.status, refused.value.headers) == (503, {"Retry-After": "1"})
+        assert (refused.value.code, refused.value.headers) == ("restarted", {"Retry-After": "1"})
         await running
 
 

@@ -13,8 +13,10 @@ from fog_runtime.http import (
     Answer,
     Body,
     Front,
+    HttpProblem,
     IfMatch,
     Operator,
+    ProblemCode,
     ProblemError,
     Routes,
     TokensError,
@@ -30,6 +32,12 @@ pytestmark = pytest.mark.live
 
 class BusyError(Exception):
     """What a service raises and knows no HTTP of."""
+
+
+class OwnProblem(ProblemCode):
+    BUSY = "busy", 503, "It is busy"
+    THERE = "there", 409, "It is there"
+    STALE = "stale", 412, "It has changed"
 
 
 class Point(BaseModel):
@@ -59,13 +67,13 @@ async def client(tokens, tmp_path):
         return point
 
     routes = Routes(app, "test")
-    routes.raises(BusyError, {503: "It is busy"}, lambda error: ProblemError(503, f"busy: {error}"))
+    routes.raises(BusyError, [OwnProblem.BUSY], lambda error: ProblemError(OwnProblem.BUSY, f"busy: {error}"))
 
     @routes.put("/zones/{zone}")
     async def zones(zone: str, body: Body[Zone]) -> dict[str, str]:
         return {"kind": body.kind}
 
-    @routes.post("/zones", status=201, raises=[BusyError], problems={409: "It is there"})
+    @routes.post("/zones", status=201, raises=[BusyError], problems=[OwnProblem.THERE])
     async def make_zone(body: Body[Zone], caller: Operator, if_match: IfMatch = None) -> Answer[Zone]:
         """Make a zone."""
         if body.reason:
@@ -82,7 +90,8 @@ async def client(tokens, tmp_path):
 
     @app.get("/stale")
     async def stale() -> None:
-        raise ProblemError(412, "it has changed", field="header.if-match", headers={"ETag": '"2"'}, version=2)
+        headers = {"ETag": '"2"'}
+        raise ProblemError(OwnProblem.STALE, "it has changed", field="header.if-match", headers=headers, code=2)
 
     @app.get("/bug")
     async def bug() -> None:
@@ -99,6 +108,7 @@ def is_problem(answer, status):
     body = answer.json()
     assert body["status"] == status
     assert body["title"]
+    assert body["type"].startswith("urn:fognav:")
     assert body["detail"]
     return body
 
@@ -156,12 +166,16 @@ def test_if_match_header_gives_a_version_or_any_or_an_invalid_one(header, versio
 
 
 async def test_openapi_describes_responses_errors_and_tokens_by_the_signature(client):
-    paths = (await client.get("/openapi.json")).json()["paths"]
+    described = (await client.get("/openapi.json")).json()
+    assert described["x-problems"]["there"] == {"status": 409, "says": "It is there"}
+    assert set(HttpProblem) > described["x-problems"].keys() - set(OwnProblem) > {"failed", "token_missing"}
+    paths = described["paths"]
     post = paths["/zones"]["post"]
     assert set(post["responses"]) == {"201", "401", "403", "408", "409", "413", "422", "500", "503"}
     assert post["responses"]["201"]["content"]["application/json"]["schema"] == {"$ref": "#/components/schemas/Zone"}
     problem = {"application/problem+json": {"schema": {"$ref": "#/components/schemas/Problem"}}}
-    assert post["responses"]["503"]["description"].startswith("It is busy. The service is started again, or")
+    assert post["responses"]["503"]["description"].startswith("It is busy (`busy`); This process stands by")
+    assert post["responses"]["409"]["description"] == "It is there (`there`)"
     assert post["responses"]["503"]["content"] == problem
     assert post["security"] == [{"HTTPBearer": []}]
     assert [parameter["name"] for parameter in post["parameters"]] == ["If-Match"]
@@ -199,17 +213,17 @@ async def test_openapi_describes_message_bodies_and_resolves_all_references(clie
 
 
 @pytest.mark.parametrize(
-    ("header", "status", "detail"),
+    ("header", "status", "code"),
     [
-        (None, 401, "needs a token"),
-        ("Bearer wrong", 401, "the token is unknown"),
-        ("Basic b3A6eA==", 401, "needs a token"),
-        ("Bearer vi-token", 403, "needs the role operator; vi has the role viewer"),
+        (None, 401, "token_missing"),
+        ("Bearer wrong", 401, "token_unknown"),
+        ("Basic b3A6eA==", 401, "token_missing"),
+        ("Bearer vi-token", 403, "role_too_low"),
     ],
 )
-async def test_missing_unknown_or_insufficient_token_is_refused(client, header, status, detail):
+async def test_missing_unknown_or_insufficient_token_is_refused(client, header, status, code):
     answer = await client.get("/secret", headers={"Authorization": header} if header else {})
-    assert detail in is_problem(answer, status)["detail"]
+    assert is_problem(answer, status)["type"] == f"urn:fognav:{code}"
     assert ("www-authenticate" in answer.headers) == (status == 401)
 
 
@@ -222,8 +236,10 @@ async def test_problems_contain_fields_headers_and_extra_members(client):
     answer = await client.get("/stale")
     body = is_problem(answer, 412)
     assert body["errors"] == [{"field": "header.if-match", "problem": "it has changed"}]
-    assert (answer.headers["etag"], body["version"]) == ('"2"', 2)
-    assert "/nowhere" in is_problem(await client.get("/nowhere"), 404)["detail"]
+    assert (answer.headers["etag"], body["code"], body["type"]) == ('"2"', 2, "urn:fognav:stale")
+    nowhere = is_problem(await client.get("/nowhere"), 404)
+    assert "/nowhere" in nowhere["detail"]
+    assert nowhere["type"] == "urn:fognav:no_route"
     assert "GET" in (await client.delete("/secret")).headers["allow"]
     assert "inner detail" not in is_problem(await client.get("/bug"), 500)["detail"]
 

@@ -314,9 +314,10 @@ async def test_invalid_goals_are_refused_with_a_reason_and_all_goals_without_the
         assert (wall.status_code, wall.headers["content-type"]) == (422, "application/problem+json")
         problem = wall.json()
         assert (problem["code"], problem["name"]) == (206, "GOAL_OCCUPIED")
+        assert problem["type"] == "urn:fognav:goal_refused"
         assert problem["errors"][0]["field"] == "body.pose"
         assert (await put({"pose": {"x": 99.0, "y": 6.0}})).json()["code"] == 204
-        assert (await put({"place": "nowhere"})).json()["errors"][0]["field"] == "body.place"
+        assert (await put({"place": "nowhere"})).json()["type"] == "urn:fognav:no_place"
         assert (await put({})).status_code == 422
         assert (await put({"place": "right"}, url="/api/v1/robots/r9/goal")).status_code == 404
         assert (await put({"place": "right"}, {})).status_code == 401

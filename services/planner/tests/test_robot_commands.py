@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 
 from fog_contracts import channels as ch
 from fog_contracts.commands import CommandGate
-from fog_contracts.messages import CommandReply, RobotCommand, RobotState
+from fog_contracts.messages import CommandReply, Reason, ReasonCode, RefusalCode, RobotCommand, RobotState
 from fog_contracts.site import Place
 from fog_runtime.clock import ManualClock
 from fog_runtime.health import Health
@@ -48,7 +48,7 @@ class Robot:
         self.records: list[tuple[str, str, bytes]] = []
         self.stops: list[tuple[str, str, dict[str, Any]]] = []
         self.answers = True
-        self.refusal = ""
+        self.refusal: Reason | None = None
         self.store_error: Exception | None = None
         self.published: dict[ch.Channel, Any] = {}
 
@@ -62,7 +62,9 @@ class Robot:
             return None
         self.received.append(command)
         refusal = self.gate.refusal(command, self.clock.now()) or self.refusal
-        return CommandReply(accepted=not refusal, reason=refusal or f"{command.kind} is done")
+        if refusal is not None:
+            return CommandReply.refused(refusal)
+        return CommandReply(accepted=True, reason=f"{command.kind} is done")
 
     async def record_command(self, robot: str, command: bytes, audit: Any) -> None:
         if self.store_error:
@@ -133,12 +135,15 @@ async def test_initial_pose_is_a_pose_or_a_place_with_a_heading(rig: Rig) -> Non
     assert len(rig.robot.received) == 2
 
 
-async def test_robots_refusal_is_a_problem_with_its_reason_and_mode(rig: Rig) -> None:
-    rig.robot.refusal = "the cause is still there: the bumper is pressed"
+async def test_robots_refusal_is_a_problem_with_its_reason_identifiers_and_mode(rig: Rig) -> None:
+    sentence = "the cause is still there: the bumper is pressed"
+    rig.robot.refusal = Reason(RefusalCode.CAUSE_REMAINS, sentence, [ReasonCode.BUMPER])
     rig.robot.state("FAULT")
     answer = await rig.command({"kind": "reset"})
     assert (answer.status_code, answer.headers["content-type"]) == (409, "application/problem+json")
-    assert (answer.json()["detail"], answer.json()["mode"]) == (rig.robot.refusal, "FAULT")
+    assert (answer.json()["type"], answer.json()["detail"]) == ("urn:fognav:command_refused", sentence)
+    assert (answer.json()["refusal"], answer.json()["causes"]) == ("cause_remains", ["bumper"])
+    assert answer.json()["mode"] == "FAULT"
 
 
 async def test_only_operators_command_and_only_known_robots(rig: Rig) -> None:
@@ -218,7 +223,7 @@ async def test_goal_of_an_id_that_two_agents_use_is_refused_until_one_is_gone(ri
         boot = f"run-{number % 2}"
         rig.robot.published[ch.ROBOT_STATE]({"robot": "r1"}, msgspec.structs.replace(state, boot=boot))
     answer = await rig.client.put("/api/v1/robots/r1/goal", json={"place": "b"}, headers=OPERATOR)
-    assert (answer.status_code, "two agents use the id of robot r1" in answer.json()["detail"]) == (409, True)
+    assert (answer.status_code, answer.json()["type"]) == (409, "urn:fognav:robot_doubled")
     assert rig.operator.doubled_detail() == "two agents use the id of r1"
     rig.robot.clock.advance(10.1)
     assert not rig.operator.is_doubled("r1")

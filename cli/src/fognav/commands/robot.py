@@ -184,7 +184,7 @@ def robot_goal(goal: Target, *, robot: RobotOption = None, fog: FogOption = None
         try:
             found.send("PUT", PLANNER, f"/api/v1/robots/{chosen}/goal", _goal(goal))
         except RefusedError as error:
-            _report(Outcome(accepted=False, reason=str(error), mode=_view(found, chosen)[1]), json=json)
+            _report(_refused(error, _view(found, chosen)[1]), json=json)
         mode = _view(found, chosen)[1]
         waits = _WAITS_FOR.get(mode, "")
         _report(Outcome(accepted=True, reason=f"robot {chosen} goes to {goal}{waits}", mode=mode), json=json)
@@ -199,7 +199,7 @@ def robot_cancel(*, robot: RobotOption = None, fog: FogOption = None, json: Json
         try:
             found.send("DELETE", PLANNER, f"/api/v1/robots/{chosen}/goal")
         except RefusedError as error:
-            _report(Outcome(accepted=False, reason=str(error), mode=_view(found, chosen)[1]), json=json)
+            _report(_refused(error, _view(found, chosen)[1]), json=json)
         except FailedError as error:
             # Without the planner the robot can drop its goal itself, until the planner is back.
             outcome = asyncio.run(_cancel(found, chosen))
@@ -267,11 +267,15 @@ def _report(outcome: Outcome, *, json: bool) -> None:
     raise typer.Exit(0 if outcome.accepted else NOT_TRUE)
 
 
+def _refused(error: RefusedError, mode: Mode | None) -> Outcome:
+    return Outcome(accepted=False, reason=str(error), mode=mode, code=error.code)
+
+
 def _end_mission(fog: Fog, robot: str | None) -> str:
     try:
         fog.send("DELETE", PLANNER, f"/api/v1/robots/{fog.robot(robot)}/goal")
     except RefusedError as error:
-        return "it had no mission" if error.status == 404 else str(error)
+        return "it had no mission" if error.code == "no_mission" else str(error)
     except FailedError as error:
         return f"its mission is not ended: {error}"
     return "its mission is ended"

@@ -27,12 +27,17 @@ _GIVE_TOKEN: Final = f"Set {TOKEN} to an operator's token, or {TOKEN_FILE} to a 
 
 
 class RefusedError(FailedError):
-    """A service refused a request; `status` and `reason` are those of its problem document."""
+    """A service refused a request; `status`, `code` and `reason` are those of its problem document."""
 
     def __init__(self, message: str, status: int, problem: object = None) -> None:
         super().__init__(message)
         self.status = status
         self.problem: Mapping[str, Any] = problem if isinstance(problem, dict) else {}
+
+    @property
+    def code(self) -> str:
+        """The problem's identifier; empty without one."""
+        return str(self.problem.get("type", "")).rpartition(":")[2]
 
     @property
     def reason(self) -> str:

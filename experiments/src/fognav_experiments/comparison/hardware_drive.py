@@ -348,7 +348,7 @@ class _ConnectedRobot:
         try:
             await asyncio.to_thread(self._fog.send, "DELETE", PLANNER, self._goal)
         except RefusedError as error:
-            if error.status != 404:  # it had none
+            if error.code != "no_mission":
                 raise
 
     @property

@@ -39,11 +39,13 @@ from fog_runtime.http import (
     Answer,
     Body,
     Caller,
+    HttpProblem,
     IdempotencyKey,
     IfMatch,
     IfNoneMatch,
     Operator,
     PageSize,
+    ProblemCode,
     ProblemError,
     Routes,
     Tokens,
@@ -67,10 +69,24 @@ from hazard_aggregator.service import Service
 from hazard_aggregator.writers import ConflictError
 
 
+class AreaProblem(ProblemCode):
+    """Problems of the hazard-aggregator."""
+
+    NO_AREA = "no_area", 404, "No area has this id"
+    NO_OVERRIDE = "no_override", 404, "The area has no override"
+    NO_ALERT = "no_alert", 404, "There is no such alert"
+    CLEAR_NEEDS_ADMIN = "clear_needs_admin", 403, "Only an admin may declare an area clear"
+    AREA_CHANGED = "area_changed", 412, "The area is not as the request expects: somebody else changed or added it"
+    AREA_INVALID = "area_invalid", 422, "The area is invalid: `errors` names its fields"
+    TOO_MANY_AREAS = "too_many_areas", 422, "The site has as many areas as it may have"
+    NO_NODE = "no_node", 422, "The site has no such node"
+    OVERRIDE_TOO_LONG = "override_too_long", 422, "An area can't be overridden for so long"
+
+
 def add_alerts(routes: Routes, service: Service) -> None:
     """Add the routes of alerts."""
     add_store_errors(routes)
-    routes.raises(AlertError, {404: "There is no such alert"}, lambda error: ProblemError(404, str(error)))
+    routes.raises(AlertError, [AreaProblem.NO_ALERT], lambda error: ProblemError(AreaProblem.NO_ALERT, str(error)))
 
     @routes.get("/api/v1/alerts")
     async def alerts() -> list[Alert]:
@@ -89,19 +105,19 @@ def add_alerts(routes: Routes, service: Service) -> None:
 def add_history(routes: Routes, service: Service, clock: Clock) -> None:
     """Add the route that reads histories; `routes` knows the errors of the store."""
     routes.raises(
-        CursorError, {422: "The cursor is invalid"}, lambda error: ProblemError(422, str(error), field="query.cursor")
+        CursorError,
+        [HttpProblem.REQUEST_INVALID],
+        lambda error: ProblemError(HttpProblem.REQUEST_INVALID, str(error), field="query.cursor"),
     )
 
-    @routes.get(
-        "/api/v1/areas/{area_id}/history", raises=[CursorError, StoreError], problems={404: "No area has this id"}
-    )
+    @routes.get("/api/v1/areas/{area_id}/history", raises=[CursorError, StoreError], problems=[AreaProblem.NO_AREA])
     async def area_history(area_id: str, limit: PageSize, cursor: str | None = None) -> Answer[list[PeriodView]]:
         """Return an area's states and how long each lasted, newest first; the Link header has the next page's address.
 
         A period continues over restarts. The history goes back by 90 days, and 10,000 periods.
         """
         if not any(known.id == area_id for known in service.core.definitions()):
-            raise ProblemError(404, f"there is no area {area_id}")
+            raise no_such_area(area_id)
         page = await service.history.page(area_id, cursor, limit, Moment(clock.now(), clock.stamp(), clock=clock.id))
         return Answer(page.periods, next_page(f"/api/v1/areas/{area_id}/history", page.next, limit))
 
@@ -138,7 +154,7 @@ def override_view(service: Service, area: str, now: float) -> OverrideView | Non
 def add_overrides(routes: Routes, service: Service, clock: Clock) -> None:
     """Add the routes that set and remove overrides; `routes` knows the errors of areas and of the store."""
 
-    @routes.get("/api/v1/areas/{area_id}/override", problems={404: "No area has this id, or it has no override"})
+    @routes.get("/api/v1/areas/{area_id}/override", problems=[AreaProblem.NO_AREA, AreaProblem.NO_OVERRIDE])
     async def get_override(area_id: str) -> Answer[OverrideView]:
         """Return an area's override with its ETag."""
         _require_area(service, area_id)
@@ -151,7 +167,7 @@ def add_overrides(routes: Routes, service: Service, clock: Clock) -> None:
         "/api/v1/areas/{area_id}/override",
         status=(200, 201),
         raises=[ConflictError, IdempotencyError, StoreError],
-        problems={404: "No area has this id"},
+        problems=[AreaProblem.NO_AREA, AreaProblem.CLEAR_NEEDS_ADMIN, AreaProblem.OVERRIDE_TOO_LONG],
     )
     async def put_override(
         area_id: str,
@@ -182,7 +198,7 @@ def add_overrides(routes: Routes, service: Service, clock: Clock) -> None:
     @routes.delete(
         "/api/v1/areas/{area_id}/override",
         raises=[ConflictError, StoreError],
-        problems={404: "No area has this id, or it has no override"},
+        problems=[AreaProblem.NO_AREA, AreaProblem.NO_OVERRIDE],
     )
     async def delete_override(area_id: str, caller: Operator, if_match: IfMatch = None) -> None:
         """End an area's override, with If-Match only if it is unchanged: its nodes count again."""
@@ -192,11 +208,12 @@ def add_overrides(routes: Routes, service: Service, clock: Clock) -> None:
 
 def no_such_area(area: str) -> ProblemError:
     """Return the problem of a request about an area that does not exist."""
-    return ProblemError(404, f"there is no area {area}: GET /api/v1/areas lists those that there are")
+    return ProblemError(AreaProblem.NO_AREA, f"there is no area {area}: GET /api/v1/areas lists those that there are")
 
 
 def _without_override(area: str) -> ProblemError:
-    return ProblemError(404, f"area {area} has no override: its nodes and sources decide; PUT one first")
+    detail = f"area {area} has no override: its nodes and sources decide; PUT one first"
+    return ProblemError(AreaProblem.NO_OVERRIDE, detail)
 
 
 def _require_area(service: Service, area: str) -> None:
@@ -206,13 +223,11 @@ def _require_area(service: Service, area: str) -> None:
 
 def _require_allowed(body: OverrideBody, caller: Caller) -> None:
     if body.state == "clear" and caller.role != "admin":
-        raise ProblemError(
-            403, f"to declare an area clear needs the role admin; {caller.name} has the role {caller.role}"
-        )
+        detail = f"to declare an area clear needs the role admin; {caller.name} has the role {caller.role}"
+        raise ProblemError(AreaProblem.CLEAR_NEEDS_ADMIN, detail)
     if body.ttl_s > (longest := LONGEST_S[body.state]):
-        raise ProblemError(
-            422, f"an area can be overridden as {body.state} for {longest:g} s at most", field="body.ttl_s"
-        )
+        detail = f"an area can be overridden as {body.state} for {longest:g} s at most"
+        raise ProblemError(AreaProblem.OVERRIDE_TOO_LONG, detail, field="body.ttl_s")
 
 
 def _view(override: AreaOverride, rest_s: float) -> OverrideView:
@@ -300,13 +315,13 @@ def _add_areas(routes: Routes, service: Service, geometry: GridGeometry, clock: 
     add_store_errors(routes)
     routes.raises(
         ConflictError,
-        {412: "Somebody else changed the area"},
-        lambda error: ProblemError(412, str(error)),
+        [AreaProblem.AREA_CHANGED],
+        lambda error: ProblemError(AreaProblem.AREA_CHANGED, str(error)),
     )
     routes.raises(
         TooManyAreasError,
-        {422: "The area is invalid, or one too many"},
-        lambda error: ProblemError(422, error.problem, field="path"),
+        [AreaProblem.TOO_MANY_AREAS],
+        lambda error: ProblemError(AreaProblem.TOO_MANY_AREAS, error.problem, field="path"),
     )
 
     def area_views() -> dict[str, AreaView]:
@@ -327,7 +342,7 @@ def _add_areas(routes: Routes, service: Service, geometry: GridGeometry, clock: 
         """List all areas with their state."""
         return list(area_views().values())
 
-    @routes.get("/api/v1/areas/{area_id}", problems={404: "No area has this id"})
+    @routes.get("/api/v1/areas/{area_id}", problems=[AreaProblem.NO_AREA])
     async def get_area(area_id: str) -> Answer[AreaView]:
         """Return one area with its ETag."""
         view = area_views().get(area_id)
@@ -339,6 +354,7 @@ def _add_areas(routes: Routes, service: Service, geometry: GridGeometry, clock: 
         "/api/v1/areas/{area_id}",
         status=(200, 201),
         raises=[ConflictError, IdempotencyError, StoreError, TooManyAreasError],
+        problems=[AreaProblem.AREA_INVALID, AreaProblem.NO_NODE],
     )
     async def put_area(
         area_id: str,
@@ -388,18 +404,17 @@ def _validated(area_id: str, body: AreaBody, service: Service, geometry: GridGeo
     for index, node in enumerate(body.nodes):
         if node not in service.core.nodes:
             detail = f"the site has no node {node}: add it to site.toml first, with its position and range limits"
-            raise ProblemError(422, detail, field=f"body.nodes.{index}")
+            raise ProblemError(AreaProblem.NO_NODE, detail, field=f"body.nodes.{index}")
     try:
         polygon = _polygon(area_id, body, service, geometry)
         fields = {**msgspec.to_builtins(body), "id": area_id, "polygon": polygon}
         definition = service.core.checked(msgspec.convert(fields, AreaDefinition))
         check_size(definition)
     except msgspec.ValidationError as error:  # the id comes from the path
-        raise ProblemError(
-            422, f"{area_id!r} is no valid id: use a to z, 0 to 9 and -, at most 32", field="path"
-        ) from error
+        detail = f"{area_id!r} is no valid id: use a to z, 0 to 9 and -, at most 32"
+        raise ProblemError(HttpProblem.REQUEST_INVALID, detail, field="path") from error
     except AreaError as error:
-        raise ProblemError(422, error.problem, field=f"body.{error.field}") from error
+        raise ProblemError(AreaProblem.AREA_INVALID, error.problem, field=f"body.{error.field}") from error
     return definition
 
 
@@ -408,18 +423,20 @@ def _polygon(area_id: str, body: AreaBody, service: Service, geometry: GridGeome
     if body.cone_of is not None:
         if body.polygon is not None:
             detail = f"the area has a polygon, too, and is the cone of {body.cone_of}: leave out one of them"
-            raise ProblemError(422, detail, field="body.cone_of")
+            raise ProblemError(AreaProblem.AREA_INVALID, detail, field="body.cone_of")
         return service.core.cone(area_id, body.cone_of, body.nodes)
     if body.polygon is None:
         detail = "an area needs a place: draw a polygon, or name one of its nodes in cone_of"
-        raise ProblemError(422, detail, field="body.polygon")
+        raise ProblemError(AreaProblem.AREA_INVALID, detail, field="body.polygon")
     try:
         polygon = normalized_polygon(body.polygon)
     except GeometryError as error:
-        raise ProblemError(422, f"{error}; draw a simple polygon", field="body.polygon") from error
+        detail = f"{error}; draw a simple polygon"
+        raise ProblemError(AreaProblem.AREA_INVALID, detail, field="body.polygon") from error
     for index, (x, y) in enumerate(polygon):
         if not geometry.contains(x, y):
             left, bottom, right, top = geometry.bounds
             reach = f"the map reaches from ({left:.2f}, {bottom:.2f}) to ({right:.2f}, {top:.2f}) m"
-            raise ProblemError(422, f"({x:.2f}, {y:.2f}) lies off the map: {reach}", field=f"body.polygon.{index}")
+            detail = f"({x:.2f}, {y:.2f}) lies off the map: {reach}"
+            raise ProblemError(AreaProblem.AREA_INVALID, detail, field=f"body.polygon.{index}")
     return polygon

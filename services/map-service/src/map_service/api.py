@@ -37,11 +37,13 @@ from fog_runtime.http import (
     Answer,
     Body,
     Encoded,
+    HttpProblem,
     IdempotencyKey,
     IfMatch,
     IfNoneMatch,
     Operator,
     PageSize,
+    ProblemCode,
     ProblemError,
     Routes,
     Tokens,
@@ -73,9 +75,22 @@ Image.preinit()  # the first picture would load PIL's formats, while the map is 
 _PNG: Final = "image/png"
 _MAX_PICTURES: Final = 4
 """Most pictures that are being encoded or wait for it."""
-_ZONES_NOT_LOADED: Final = {503: "The stored zones are not loaded yet, or the store does not answer"}
 _REFUSALS: Final = (ZoneError, BusyError, IdempotencyError, StoreError)
-_NO_SUCH_ZONE: Final = {404: "No zone has this id", **_ZONES_NOT_LOADED}
+
+
+class MapProblem(ProblemCode):
+    """Problems of the map-service."""
+
+    NO_ZONE = "no_zone", 404, "No zone has this id"
+    ZONE_EXISTS = "zone_exists", 409, "A zone with this id exists already"
+    ZONE_CHANGED = "zone_changed", 412, "The zone is not as the request expects: somebody else changed or added it"
+    ZONE_INVALID = "zone_invalid", 422, "The zone is invalid, or one too many: `errors` names its fields"
+    ZONES_NOT_LOADED = "zones_not_loaded", 503, "The stored zones are not loaded yet"
+    BUSY = "busy", 503, "Too many requests wait for a calculation: `Retry-After` says when to try again"
+
+
+_ZONES_NOT_LOADED: Final = (MapProblem.ZONES_NOT_LOADED,)
+_NO_SUCH_ZONE: Final = (MapProblem.NO_ZONE, MapProblem.ZONES_NOT_LOADED)
 
 
 class ZoneBody(Message, frozen=True, kw_only=True):
@@ -184,9 +199,8 @@ def _add_zone_writes(routes: Routes, service: Service, clock: Clock) -> None:
     ) -> Answer[Zone]:
         """Replace a zone; with If-Match, only if it is unchanged. With `If-None-Match: *`, add it if it is new."""
         if body.id not in (None, zone_id):
-            raise ProblemError(
-                422, f"the path names zone {zone_id}: leave the id out, or give the same id", field="body.id"
-            )
+            detail = f"the path names zone {zone_id}: leave the id out, or give the same id"
+            raise ProblemError(HttpProblem.REQUEST_INVALID, detail, field="body.id")
         attempt = attempt_of(idempotency_key, caller, f"PUT /api/v1/zones/{zone_id}", body)
         new = must_be_new(if_none_match)
         # Before the condition, which the first attempt may have made false.
@@ -225,28 +239,32 @@ def _add_errors(routes: Routes) -> None:
     """Register the problem document of each exception that the service raises."""
     routes.raises(
         ZoneError,
-        {422: "The zone is invalid: `errors` names its fields"},
-        lambda error: ProblemError(422, error.message, field=f"body.{error.field}"),
+        [MapProblem.ZONE_INVALID],
+        lambda error: ProblemError(MapProblem.ZONE_INVALID, error.message, field=f"body.{error.field}"),
     )
     add_store_errors(routes)
     routes.raises(
-        CursorError, {422: "The cursor is invalid"}, lambda error: ProblemError(422, str(error), field="query.cursor")
+        CursorError,
+        [HttpProblem.REQUEST_INVALID],
+        lambda error: ProblemError(HttpProblem.REQUEST_INVALID, str(error), field="query.cursor"),
     )
     _add_busy_error(routes)
     routes.raises(
         ConflictError,
-        {409: "A zone with this id exists already", 412: "Somebody else changed the zone"},
+        [MapProblem.ZONE_EXISTS, MapProblem.ZONE_CHANGED],
         _conflict,
     )
-    routes.raises(InvalidBodyError, {}, _with_remedies)
+    routes.raises(InvalidBodyError, [], _with_remedies)
 
 
 def _conflict(error: ConflictError) -> ProblemError:
     if error.outcome == "exists":
-        return ProblemError(409, f"zone {error.zone} exists already: choose another id, or PUT it")
+        detail = f"zone {error.zone} exists already: choose another id, or PUT it"
+        return ProblemError(MapProblem.ZONE_EXISTS, detail)
     if error.outcome == "missing":
-        return ProblemError(404, f"there is no zone {error.zone} any more: POST it to add it again")
-    return ProblemError(412, f"zone {error.zone} was changed by somebody else: read it again, then retry")
+        return ProblemError(MapProblem.NO_ZONE, f"there is no zone {error.zone} any more: POST it to add it again")
+    detail = f"zone {error.zone} was changed by somebody else: read it again, then retry"
+    return ProblemError(MapProblem.ZONE_CHANGED, detail)
 
 
 def _with_remedies(error: InvalidBodyError) -> InvalidBodyError:
@@ -267,8 +285,8 @@ def _with_remedies(error: InvalidBodyError) -> InvalidBodyError:
 def _add_busy_error(routes: Routes) -> None:
     routes.raises(
         BusyError,
-        {503: "Too many requests wait for a calculation; `Retry-After` says when to try again"},
-        lambda error: ProblemError(503, f"{error}: try again", headers=RETRY_AFTER),
+        [MapProblem.BUSY],
+        lambda error: ProblemError(MapProblem.BUSY, f"{error}: try again", headers=RETRY_AFTER),
     )
 
 
@@ -354,9 +372,8 @@ def _add_scrape_targets(routes: Routes, service: Service, clock: Clock) -> None:
 
 def _require_zones(service: Service) -> None:
     if not service.core.zones_loaded:
-        raise ProblemError(
-            503, "the stored zones are not loaded yet: try again once /readyz reports ready", headers=RETRY_AFTER
-        )
+        detail = "the stored zones are not loaded yet: try again once /readyz reports ready"
+        raise ProblemError(MapProblem.ZONES_NOT_LOADED, detail, headers=RETRY_AFTER)
 
 
 async def _put_new(service: Service, zone: Zone, who: str, attempt: Attempt | None) -> Answer[Zone]:
@@ -366,11 +383,12 @@ async def _put_new(service: Service, zone: Zone, who: str, attempt: Attempt | No
         msgspec.convert(zone.id, Id)
     except msgspec.ValidationError as error:
         detail = f"{zone.id!r} is no valid id: use a to z, 0 to 9 and -, at most 32"
-        raise ProblemError(422, detail, field="path") from error
+        raise ProblemError(HttpProblem.REQUEST_INVALID, detail, field="path") from error
     try:
         zone = await service.zones.create(zone, who, attempt)
     except ConflictError as error:
-        raise ProblemError(412, f"zone {zone.id} exists already: PUT it with If-Match") from error
+        detail = f"zone {zone.id} exists already: PUT it with If-Match"
+        raise ProblemError(MapProblem.ZONE_CHANGED, detail) from error
     return Answer(zone, etag(zone.version), status=201)
 
 
@@ -378,7 +396,8 @@ def _find_zone(service: Service, zone_id: str) -> Zone:
     _require_zones(service)
     entry = service.core.zones.get(zone_id)
     if entry is None:
-        raise ProblemError(404, f"there is no zone {zone_id}: GET /api/v1/zones lists those that there are")
+        detail = f"there is no zone {zone_id}: GET /api/v1/zones lists those that there are"
+        raise ProblemError(MapProblem.NO_ZONE, detail)
     return entry.zone
 
 
@@ -386,12 +405,13 @@ def _require_matching(service: Service, zone_id: str, if_match: str | None) -> N
     zone = _find_zone(service, zone_id)
     if expected_version(if_match) not in (None, zone.version):
         detail = f"zone {zone_id} is at version {zone.version}, not {if_match}: read it again, then retry"
-        raise ProblemError(412, detail)
+        raise ProblemError(MapProblem.ZONE_CHANGED, detail)
 
 
 def _zone_from_body(body: ZoneBody, zone_id: str, author: str, stamp: float) -> Zone:
     if body.ttl_s is not None and body.expires_at is not None:
-        raise ProblemError(422, "give either ttl_s or expires_at, not both", field="body.ttl_s")
+        detail = "give either ttl_s or expires_at, not both"
+        raise ProblemError(HttpProblem.REQUEST_INVALID, detail, field="body.ttl_s")
     return Zone(
         id=zone_id,
         kind=body.kind,

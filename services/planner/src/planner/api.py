@@ -27,10 +27,12 @@ from fog_runtime.http import (
     Answer,
     Body,
     ClientHost,
+    HttpProblem,
     IdempotencyKey,
     IfMatch,
     IfNoneMatch,
     Operator,
+    ProblemCode,
     ProblemError,
     Routes,
     Tokens,
@@ -49,6 +51,20 @@ from planner.query_queue import BusyError
 from planner.robot_commands import CommandError, RobotOperator
 from planner.service import Service
 from planner.store import NO_MISSION, MissionConflictError, Order, StoredGoal
+
+
+class PlannerProblem(ProblemCode):
+    """Problems of the planner."""
+
+    NO_ROBOT = "no_robot", 404, "No robot has this id"
+    NO_MISSION = "no_mission", 404, "The robot has no mission"
+    NO_PLACE = "no_place", 422, "The site has no such place"
+    GOAL_REFUSED = "goal_refused", 422, "The goal can never be reached: Nav2's `code` and `name` say why"
+    MISSION_CHANGED = "mission_changed", 412, "The robot has another mission than the request expects, or has one"
+    ROBOT_DOUBLED = "robot_doubled", 409, "Two agents use this robot's id"
+    COMMAND_REFUSED = "command_refused", 409, "The robot refuses: `refusal` and `causes` identify why"
+    COMMAND_LOST = "command_lost", 504, "The robot does not answer, or this service has no operators' key"
+    BUSY = "busy", 503, "Too many plans wait, or of this client: `Retry-After` says when to try again"
 
 
 class StartPose(Message, frozen=True, kw_only=True):
@@ -86,22 +102,25 @@ def add_commands(
     """Add the routes; `check` raises a `ProblemError` for an unknown robot, `mode` returns a robot's mode."""
     routes.raises(
         CommandError,
-        {504: "The robot does not answer, or this service has no operators' key: `detail` names the remedy"},
-        lambda error: ProblemError(504, str(error)),
+        [PlannerProblem.COMMAND_LOST],
+        lambda error: ProblemError(PlannerProblem.COMMAND_LOST, str(error)),
     )
 
     def outcome(robot: str, reply: CommandReply) -> CommandOutcome:
         if not reply.accepted:
-            raise ProblemError(409, reply.reason, mode=mode(robot), refusal=reply.code, causes=reply.causes)
+            raise ProblemError(
+                PlannerProblem.COMMAND_REFUSED,
+                reply.reason,
+                mode=mode(robot),
+                refusal=reply.code,
+                causes=reply.causes,
+            )
         return CommandOutcome(accepted=True, reason=reply.reason, mode=mode(robot))
 
     @routes.post(
         "/api/v1/robots/{robot}/commands",
         raises=[CommandError, StoreError],
-        problems={
-            404: "No robot has this id",
-            409: "The robot refuses: `detail` has its reason, `refusal` and `causes` its identifiers, `mode` its mode",
-        },
+        problems=[PlannerProblem.NO_ROBOT, PlannerProblem.COMMAND_REFUSED, PlannerProblem.NO_PLACE],
     )
     async def post_command(robot: str, body: Body[CommandBody], caller: Operator) -> CommandOutcome:
         """Command a robot; the robot itself accepts or refuses."""
@@ -113,7 +132,7 @@ def add_commands(
     @routes.post(
         "/api/v1/robots/{robot}/stop",
         raises=[CommandError],
-        problems={404: "No robot has this id", 409: "The robot refuses: `detail` has its reason"},
+        problems=[PlannerProblem.NO_ROBOT, PlannerProblem.COMMAND_REFUSED],
     )
     async def stop(robot: str, client: ClientHost) -> CommandOutcome:
         """Stop a robot at once. Anybody may: this needs no token. An operator must enable it again."""
@@ -125,17 +144,19 @@ def _pose(body: CommandBody, site: Site) -> Pose | None:
     """Return the pose of a command; raises a `ProblemError` for one that does not belong to it, or lacks."""
     if body.kind != "initial_pose":
         if body.pose is not None or body.place is not None:
-            raise ProblemError(422, f"{body.kind} takes neither pose nor place: leave them out", field="body.pose")
+            detail = f"{body.kind} takes neither pose nor place: leave them out"
+            raise ProblemError(HttpProblem.REQUEST_INVALID, detail, field="body.pose")
         return None
     if (body.pose is None) == (body.place is None):
-        raise ProblemError(422, "give either a pose or a place, and not both", field="body.pose")
+        detail = "give either a pose or a place, and not both"
+        raise ProblemError(HttpProblem.REQUEST_INVALID, detail, field="body.pose")
     if body.pose is not None:
         return Pose(x=body.pose.x, y=body.pose.y, theta=body.pose.theta)
     place = site.places.get(body.place or "")
     if place is None or place.theta is None:
         known = ", ".join(sorted(name for name, found in site.places.items() if found.theta is not None)) or "none"
         detail = f"there is no place {body.place} with a heading; places that have one: {known}"
-        raise ProblemError(422, detail, field="body.place")
+        raise ProblemError(PlannerProblem.NO_PLACE, detail, field="body.place")
     return Pose(x=place.x, y=place.y, theta=place.theta)
 
 
@@ -205,7 +226,7 @@ def _goal_answer(robot: str, stored: StoredGoal, status: int = 200) -> Answer[Go
 
 
 def _without_mission(robot: str) -> ProblemError:
-    return ProblemError(404, f"robot {robot} has no mission: PUT one first")
+    return ProblemError(PlannerProblem.NO_MISSION, f"robot {robot} has no mission: PUT one first")
 
 
 def _plan_view(path: RobotPath) -> PlanView:
@@ -235,7 +256,8 @@ class _Robots:
         """Raise a `ProblemError` for an unknown robot."""
         known = self.ids()
         if robot not in known:
-            raise ProblemError(404, f"there is no robot {robot}; known robots: {', '.join(known) or 'none'}")
+            detail = f"there is no robot {robot}; known robots: {', '.join(known) or 'none'}"
+            raise ProblemError(PlannerProblem.NO_ROBOT, detail)
 
     def mode(self, robot: str) -> Mode | None:
         """Return a robot's mode, None without a state."""
@@ -258,14 +280,15 @@ class _Robots:
 def _goal_pose(body: GoalBody, site: Site) -> tuple[Pose, bool]:
     """Return the pose of a goal, and whether any heading will do; raises a `ProblemError` for an invalid goal."""
     if (body.place is None) == (body.pose is None):
-        raise ProblemError(422, "give either a place or a pose, and not both", field="body")
+        raise ProblemError(HttpProblem.REQUEST_INVALID, "give either a place or a pose, and not both", field="body")
     if body.pose is not None:
         theta = body.pose.theta
         return Pose(x=body.pose.x, y=body.pose.y, theta=theta or 0.0), theta is None
     place = site.places.get(body.place or "")
     if place is None:
         names = ", ".join(sorted(site.places)) or "none"
-        raise ProblemError(422, f"there is no place {body.place}; known places: {names}", field="body.place")
+        detail = f"there is no place {body.place}; known places: {names}"
+        raise ProblemError(PlannerProblem.NO_PLACE, detail, field="body.place")
     return Pose(x=place.x, y=place.y, theta=place.theta or 0.0), place.theta is None
 
 
@@ -293,7 +316,7 @@ def _add_views(routes: Routes, service: Service, robots: _Robots) -> None:
         """List all robots with pose, state, mission and plan."""
         return [robots.view(robot) for robot in robots.ids()]
 
-    @routes.get("/api/v1/robots/{robot}", raises=[CommandError], problems={404: "No robot has this id"})
+    @routes.get("/api/v1/robots/{robot}", raises=[CommandError], problems=[PlannerProblem.NO_ROBOT])
     async def get_robot(robot: str, _caller: Viewer, after: float | None = None) -> RobotView:
         """Return a robot with pose, state, mission and plan.
 
@@ -304,7 +327,7 @@ def _add_views(routes: Routes, service: Service, robots: _Robots) -> None:
             await service.operator.next_state(robot, after)
         return robots.view(robot)
 
-    @routes.get("/api/v1/robots/{robot}/goal", problems={404: "No robot has this id, or it has no mission"})
+    @routes.get("/api/v1/robots/{robot}/goal", problems=[PlannerProblem.NO_ROBOT, PlannerProblem.NO_MISSION])
     async def get_goal(robot: str, _caller: Viewer) -> Answer[GoalView]:
         """Return a robot's mission with its ETag."""
         robots.check(robot)
@@ -318,20 +341,20 @@ def _add_orders(routes: Routes, service: Service, robots: _Robots, site: Site) -
     """Add the routes that send and stop robots."""
     routes.raises(
         MissionConflictError,
-        {412: "The robot has another mission than the request expects, or has one"},
-        lambda error: ProblemError(412, str(error)),
+        [PlannerProblem.MISSION_CHANGED],
+        lambda error: ProblemError(PlannerProblem.MISSION_CHANGED, str(error)),
     )
 
     @routes.put(
         "/api/v1/robots/{robot}/goal",
         status=(200, 201),
         raises=[IdempotencyError, MissionConflictError, StoreError],
-        problems={
-            404: "No robot has this id",
-            409: "Two agents use this robot's id",
-            422: "The body is invalid, or the goal can never be reached: then with Nav2's `code` and `name`, and the"
-            " `nearest` reachable point",
-        },
+        problems=[
+            PlannerProblem.NO_ROBOT,
+            PlannerProblem.ROBOT_DOUBLED,
+            PlannerProblem.NO_PLACE,
+            PlannerProblem.GOAL_REFUSED,
+        ],
     )
     async def put_goal(  # headers are parameters
         robot: str,
@@ -348,7 +371,7 @@ def _add_orders(routes: Routes, service: Service, robots: _Robots, site: Site) -
         robots.check(robot)
         if service.operator.is_doubled(robot):
             detail = f"two agents use the id of robot {robot}: switch one off, or give it another id, then try again"
-            raise ProblemError(409, detail)
+            raise ProblemError(PlannerProblem.ROBOT_DOUBLED, detail)
         pose, any_heading = _goal_pose(body, site)
         order = Order(
             robot,
@@ -364,14 +387,19 @@ def _add_orders(routes: Routes, service: Service, robots: _Robots, site: Site) -
         if isinstance(answer, Refusal):
             field = "body.place" if body.place else "body.pose"
             raise ProblemError(
-                422, answer.reason, field=field, code=answer.code, name=answer.name, nearest=answer.nearest
+                PlannerProblem.GOAL_REFUSED,
+                answer.reason,
+                field=field,
+                code=answer.code,
+                name=answer.name,
+                nearest=answer.nearest,
             )
         return _goal_answer(robot, answer, status=201 if new else 200)
 
     @routes.delete(
         "/api/v1/robots/{robot}/goal",
         raises=[MissionConflictError, StoreError],
-        problems={404: "No robot has this id, or it has no mission"},
+        problems=[PlannerProblem.NO_ROBOT, PlannerProblem.NO_MISSION],
     )
     async def delete_goal(robot: str, caller: Operator, if_match: IfMatch = None) -> None:
         """Cancel a robot's mission; with If-Match, only if it is the one that was read."""
@@ -383,8 +411,10 @@ def _add_orders(routes: Routes, service: Service, robots: _Robots, site: Site) -
 def _add_plan(routes: Routes, service: Service) -> None:
     routes.raises(
         BusyError,
-        {503: "Too many plans are waiting, or of this client; try again after `Retry-After`"},
-        lambda error: ProblemError(503, str(error), headers={"Retry-After": f"{error.retry_after:.0f}"}),
+        [PlannerProblem.BUSY],
+        lambda error: ProblemError(
+            PlannerProblem.BUSY, str(error), headers={"Retry-After": f"{error.retry_after:.0f}"}
+        ),
     )
 
     @routes.post("/api/v1/plan", raises=[BusyError])

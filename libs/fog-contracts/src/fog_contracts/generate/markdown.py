@@ -47,6 +47,12 @@ _IDENTIFIERS: Final = """\
 Programs compare identifiers, people read the sentences beside them. Those of a robot's reasons (`ReasonCode`) are in
 [safety.md](safety.md#reasons).
 """
+_REST: Final = """\
+## REST
+
+Errors are RFC 9457 problem documents: `type` is `urn:fognav:` and an identifier of the tables below, `title` what it
+says, `detail` a sentence with the remedy. Writing requires a bearer token.
+"""
 _LARGE: Final = 2**31
 _METHODS: Final = ("get", "put", "post", "patch", "delete")
 
@@ -145,7 +151,10 @@ def _is_described(kind: type) -> TypeGuard[type[Described]]:
 
 
 def _routes(services: Mapping[str, OpenApi]) -> str:
-    sections = ["## REST\n\nErrors are RFC 9457 problem documents. Writing requires a bearer token.\n"]
+    sections = [_REST]
+    problems = [described.get("x-problems", {}) for described in services.values()]
+    names = set[str]().union(*problems).intersection(*problems)
+    shared = {code: problems[0][code] for code in sorted(names)}
     for name, described in services.items():
         rows = [_route(method, path, path_item[method]) for path, path_item in sorted(described["paths"].items())
                 for method in _METHODS if method in path_item]  # fmt: skip
@@ -153,7 +162,15 @@ def _routes(services: Mapping[str, OpenApi]) -> str:
             f"### {name}\n\n"
             + _table(["route", "description", "parameters", "body", "responses", "errors", "token"], rows)
         )
+        own = {code: text for code, text in described.get("x-problems", {}).items() if code not in shared}
+        sections.append(f"#### Problems of {name}\n\n{_problems(own)}")
+    sections.append(f"### Problems of every service\n\n{_problems(shared)}")
     return "\n".join(sections)
+
+
+def _problems(described: Mapping[str, Any]) -> str:
+    rows = ([f"`{code}`", str(text["status"]), text["says"].replace("|", "\\|")] for code, text in described.items())
+    return _table(["identifier", "status", "says"], rows)
 
 
 def _route(method: str, path: str, operation: Mapping[str, Any]) -> list[str]:

@@ -2,7 +2,7 @@
 
 from fog_runtime.http.app import make_app
 from fog_runtime.http.front import Front, FrontError, unused
-from fog_runtime.http.problems import RETRY_AFTER, ProblemError
+from fog_runtime.http.problems import RETRY_AFTER, HttpProblem, ProblemCode, ProblemError
 from fog_runtime.http.routes import (
     Answer,
     Body,
@@ -37,11 +37,13 @@ __all__ = [
     "Encoded",
     "Front",
     "FrontError",
+    "HttpProblem",
     "IdempotencyKey",
     "IfMatch",
     "IfNoneMatch",
     "Operator",
     "PageSize",
+    "ProblemCode",
     "ProblemError",
     "Routes",
     "Tokens",

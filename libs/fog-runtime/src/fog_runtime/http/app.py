@@ -15,7 +15,7 @@ from fog_contracts.messages import Message
 from fog_runtime import metrics
 from fog_runtime.admission import source_of
 from fog_runtime.health import Health
-from fog_runtime.http.problems import RETRY_AFTER, add_problem_handlers, problem
+from fog_runtime.http.problems import RETRY_AFTER, HttpProblem, add_problem_handlers, problem
 from fog_runtime.http.routes import ALWAYS_SERVED, Answer, Routes
 from fog_runtime.http.tokens import Tokens
 from fog_runtime.version import VERSION
@@ -93,7 +93,8 @@ class OpenLimit:
             places = self._health if path in ALWAYS_SERVED else self._usual
         if refusal := places.refusal(whose):
             # Who goes on must connect again, which `admission` paces.
-            await problem(503, refusal, headers={**RETRY_AFTER, "Connection": "close"})(scope, receive, send)
+            headers = {**RETRY_AFTER, "Connection": "close"}
+            await problem(HttpProblem.OVERLOADED, refusal, headers=headers)(scope, receive, send)
             return
         with places.taken(whose):
             await self._app(scope, receive, send)
@@ -131,7 +132,8 @@ class _BodyLimit:
             async with asyncio.timeout(BODY_S):
                 body, refusal = await self._read(receive)
         except TimeoutError:
-            slow = problem(408, f"the body did not arrive within {BODY_S:.0f} s", headers={"Connection": "close"})
+            detail = f"the body did not arrive within {BODY_S:.0f} s"
+            slow = problem(HttpProblem.BODY_SLOW, detail, headers={"Connection": "close"})
             await slow(scope, receive, send)
             return
         if refusal is not None:
@@ -168,7 +170,8 @@ class _BodyLimit:
                 body += part
         if size > self._limit:
             headers = {"Connection": "close"} if more else None
-            return None, problem(413, f"the body has more than {self._limit} bytes", headers=headers)
+            detail = f"the body has more than {self._limit} bytes"
+            return None, problem(HttpProblem.BODY_TOO_LARGE, detail, headers=headers)
         return bytes(body), None
 
 
@@ -227,6 +230,7 @@ def make_app(
     app.state.endpoints = {}
     app.state.core = None
     app.state.urgent = {}
+    app.state.problems = {HttpProblem.NO_ROUTE, HttpProblem.METHOD_NOT_ALLOWED}
     add_problem_handlers(app)
     _add_health(Routes(app, "health"), health)
 
@@ -243,6 +247,9 @@ def make_app(
         if app.openapi_schema is None:
             described = generate()
             described.setdefault("components", {}).setdefault("schemas", {}).update(app.state.schemas)
+            described["x-problems"] = {
+                code: {"status": code.status, "says": code.says} for code in sorted(app.state.problems)
+            }
             app.openapi_schema = described
         return app.openapi_schema
 

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Final
 import msgspec
 from fastapi import Response
 
-from fog_runtime.http.problems import RETRY_AFTER, ProblemError
+from fog_runtime.http.problems import RETRY_AFTER, HttpProblem, ProblemError
 
 if TYPE_CHECKING:
     import socket
@@ -126,7 +126,7 @@ class CoreLink:
     async def call(self, route: str, arguments: bytes) -> Response:
         """Call a route in the core's process; return its response.
 
-        Raises `ProblemError` (503) when that process has ended: it may have done what it was called for.
+        Raises `ProblemError` when that process has ended: it may have done what it was called for.
         """
         if self._ended:
             raise _core_ended()
@@ -143,7 +143,7 @@ class CoreLink:
 
 
 def _core_ended() -> ProblemError:
-    return ProblemError(503, "the service has ended, and is started again", headers=RETRY_AFTER)
+    return ProblemError(HttpProblem.RESTARTED, "the service has ended, and is started again", headers=RETRY_AFTER)
 
 
 class FrontLink:

@@ -1,8 +1,9 @@
-"""Errors as problem documents (RFC 9457): a status, a plain sentence, and the path of each field that is wrong."""
+"""Errors as problem documents (RFC 9457): an identifier, a plain sentence, and the path of each field that is wrong."""
 
 import re
+from enum import StrEnum
 from http import HTTPStatus
-from typing import Final
+from typing import Final, Self
 
 import msgspec
 from fastapi import FastAPI, Request, Response
@@ -20,6 +21,43 @@ RETRY_AFTER: Final = {"Retry-After": "1"}
 _log = logs.get("http")
 
 
+class ProblemCode(StrEnum):
+    """Base of identifiers of problems, each with its status and what it says, of which OpenAPI is made.
+
+    Each service has its own; those that all services share are `HttpProblem`.
+    """
+
+    status: int
+    says: str
+
+    def __new__(cls, code: str, status: int, says: str) -> Self:
+        """Return an identifier with its status and what it says."""
+        member = str.__new__(cls, code)
+        member._value_, member.status, member.says = code, status, says
+        return member
+
+
+class HttpProblem(ProblemCode):
+    """Problems of any service."""
+
+    TOKEN_MISSING = "token_missing", 401, "The request has no token"
+    TOKEN_UNKNOWN = "token_unknown", 401, "The token is unknown"
+    ROLE_TOO_LOW = "role_too_low", 403, "The token's role does not allow this"
+    NO_ROUTE = "no_route", 404, "The service has no such route"
+    METHOD_NOT_ALLOWED = "method_not_allowed", 405, "The route has no such method: `Allow` has those that it has"
+    BODY_SLOW = "body_slow", 408, "The body did not arrive in time"
+    BODY_TOO_LARGE = "body_too_large", 413, "The body is too large"
+    REQUEST_INVALID = "request_invalid", 422, "Body, parameter or header is invalid: `errors` names the fields"
+    KEY_REUSED = "key_reused", 422, "The Idempotency-Key was used for another request"
+    NOTHING_LOST = "nothing_lost", 409, "There is nothing to recover"
+    FAILED = "failed", 500, "The service failed: its log names the reason"
+    STANDS_BY = "stands_by", 503, "This process stands by: another one leads"
+    RESTARTED = "restarted", 503, "The service is started again: `Retry-After` says when to try again"
+    OVERLOADED = "overloaded", 503, "The service serves too many requests: `Retry-After` says when to try again"
+    STORE_AWAY = "store_away", 503, "The store does not answer, or refuses writes; nothing was changed"
+    STORE_UNCERTAIN = "store_uncertain", 503, "The store fell silent: the change may be stored; repeat the request"
+
+
 class FieldProblem(msgspec.Struct, frozen=True):
     """One invalid field of a request: its path, and what is wrong."""
 
@@ -28,7 +66,7 @@ class FieldProblem(msgspec.Struct, frozen=True):
 
 
 class Problem(msgspec.Struct, frozen=True):
-    """A problem document; some carry further members, such as the planner's `code` and `nearest`."""
+    """A problem document, identified by its `type`; some carry more, such as the planner's `code` and `nearest`."""
 
     type: str
     title: str
@@ -38,22 +76,23 @@ class Problem(msgspec.Struct, frozen=True):
 
 
 class ProblemError(Exception):
-    """An error response: raised anywhere in a handler, it becomes a problem document.
+    """An error response: raised anywhere in a handler, it becomes a problem document of `code`, with its status.
 
     `field` is the path of the invalid part of the request (`body.polygon.0`); `extra` members are added unchanged.
     """
 
     def __init__(
         self,
-        status: int,
+        code: ProblemCode,
         detail: str,
+        /,
         *,
         field: str | None = None,
         headers: dict[str, str] | None = None,
         **extra: object,
     ) -> None:
         super().__init__(detail)
-        self.status = status
+        self.code = code
         self.detail = detail
         self.errors = [] if field is None else [{"field": field, "problem": detail}]
         self.headers = headers
@@ -61,17 +100,22 @@ class ProblemError(Exception):
 
 
 def problem(
-    status: int,
+    code: ProblemCode | int,
     detail: str,
+    /,
     *,
     errors: list[dict[str, str]] | None = None,
     headers: dict[str, str] | None = None,
     **extra: object,
 ) -> JSONResponse:
-    """Build a problem document: `errors` holds one `{"field": path, "problem": sentence}` for each invalid field."""
+    """Build a problem document: `errors` holds one `{"field": path, "problem": sentence}` for each invalid field.
+
+    A status without an identifier gives one without a type.
+    """
+    status = code if isinstance(code, int) else code.status
     body: dict[str, object] = {
-        "type": "about:blank",
-        "title": HTTPStatus(status).phrase,
+        "type": "about:blank" if isinstance(code, int) else f"urn:fognav:{code}",
+        "title": HTTPStatus(status).phrase if isinstance(code, int) else code.says,
         "status": status,
         "detail": detail,
         **extra,
@@ -87,6 +131,7 @@ def _allowed_methods(request: Request) -> list[str]:
     return sorted({method for route in matching if isinstance(route, Route) for method in route.methods or ()})
 
 
+_BY_STATUS: Final = {404: HttpProblem.NO_ROUTE, 405: HttpProblem.METHOD_NOT_ALLOWED}
 _SENTENCES: Final = re.compile(r"^(Value error|Assertion failed), ")
 
 
@@ -95,7 +140,7 @@ def add_problem_handlers(app: FastAPI) -> None:
 
     @app.exception_handler(ProblemError)
     async def _(_: Request, error: ProblemError) -> Response:
-        return problem(error.status, error.detail, errors=error.errors, headers=error.headers, **error.extra)
+        return problem(error.code, error.detail, errors=error.errors, headers=error.headers, **error.extra)
 
     @app.exception_handler(HTTPException)
     async def _(request: Request, error: HTTPException) -> Response:
@@ -105,7 +150,7 @@ def add_problem_handlers(app: FastAPI) -> None:
         headers = dict(error.headers or {})
         if error.status_code == HTTPStatus.METHOD_NOT_ALLOWED:
             headers["Allow"] = ", ".join(_allowed_methods(request))
-        return problem(error.status_code, detail, headers=headers)
+        return problem(_BY_STATUS.get(error.status_code, error.status_code), detail, headers=headers)
 
     @app.exception_handler(RequestValidationError)
     async def _(_: Request, error: RequestValidationError) -> Response:
@@ -113,9 +158,9 @@ def add_problem_handlers(app: FastAPI) -> None:
             {"field": ".".join(str(part) for part in e["loc"]), "problem": _SENTENCES.sub("", e["msg"])}
             for e in error.errors()
         ]
-        return problem(422, f"{errors[0]['field']}: {errors[0]['problem']}", errors=errors)
+        return problem(HttpProblem.REQUEST_INVALID, f"{errors[0]['field']}: {errors[0]['problem']}", errors=errors)
 
     @app.exception_handler(Exception)
     async def _(request: Request, error: Exception) -> Response:
         _log.error("request_failed", error=error, method=request.method, path=request.url.path)
-        return problem(500, "the service failed: see its log for the reason")
+        return problem(HttpProblem.FAILED, "the service failed: see its log for the reason")

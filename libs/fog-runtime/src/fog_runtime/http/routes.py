@@ -1,9 +1,9 @@
 """Routes whose signatures declare body, response, role and headers; behaviour and OpenAPI follow from them.
 
 routes = Routes(app, "zones")
-routes.raises(StoreError, {503: "The store does not answer"}, lambda error: ProblemError(503, str(error)))
+routes.raises(BusyError, [MapProblem.BUSY], lambda error: ProblemError(MapProblem.BUSY, str(error)))
 
-@routes.put("/api/v1/zones/{zone_id}", raises=[StoreError], problems={404: "There is no such zone"})
+@routes.put("/api/v1/zones/{zone_id}", raises=[BusyError], problems=[MapProblem.NO_ZONE])
 async def put_zone(zone_id: str, body: Body[ZoneBody], caller: Operator, if_match: IfMatch = None) -> Answer[Zone]:
 ...
 """
@@ -33,7 +33,7 @@ import msgspec
 from fastapi import Depends, FastAPI, Header, Request, Response
 from starlette.routing import compile_path
 
-from fog_runtime.http.problems import PROBLEM, Problem, ProblemError
+from fog_runtime.http.problems import PROBLEM, RETRY_AFTER, HttpProblem, Problem, ProblemCode, ProblemError
 from fog_runtime.http.tokens import Caller
 
 if TYPE_CHECKING:
@@ -47,7 +47,6 @@ _ANSWERS: Final = {201: "The new record", 204: "Done", 503: "The answer while so
 _SCHEMAS: Final = "#/components/schemas/{name}"
 ALWAYS_SERVED: Final = frozenset({"/healthz", "/readyz", "/metrics"})
 """Routes that are served however many others are open."""
-_UNAVAILABLE: Final = "The service is started again, or serves too many requests: `Retry-After` says when to try again"
 
 
 class _BodyMarker:
@@ -118,19 +117,19 @@ class Routes:
     callers, and the return type its response: a msgspec type, an `Answer` or `Encoded` of one, None for 204, or a ready
     `Response`.
     The first `status` is the usual one; those of a route that may create something are (200, 201), for example.
-    `raises` lists exceptions that become problem documents as registered by `Routes.raises`; `problems` describes
-    further ones. In a service, FastAPI runs in another process than the handlers (`fog_runtime.http.front`), and their
+    `raises` lists exceptions that become problem documents as registered by `Routes.raises`; `problems` lists further
+    documents. In a service, FastAPI runs in another process than the handlers (`fog_runtime.http.front`), and their
     arguments, which must be of types that msgspec knows, are passed on by name.
     """
 
     def __init__(self, app: FastAPI, tag: str) -> None:
         self._app = app
         self._tag = tag
-        self._raised: dict[type[Exception], Mapping[int, str]] = {}
+        self._raised: dict[type[Exception], Sequence[ProblemCode]] = {}
 
-    def raises(self, kind: type[E], described: Mapping[int, str], convert: Callable[[E], ProblemError]) -> None:
-        """Answer exceptions of this type with the problem that `convert` returns; `described` documents each status."""
-        self._raised[kind] = described
+    def raises(self, kind: type[E], problems: Sequence[ProblemCode], convert: Callable[[E], ProblemError]) -> None:
+        """Answer exceptions of this type with the problem that `convert` returns, one of `problems`."""
+        self._raised[kind] = problems
         handle = self._app.exception_handlers[ProblemError]
 
         async def answer(request: Request, error: Exception) -> Response:
@@ -168,20 +167,18 @@ class Routes:
         status: int | tuple[int, ...] = 200,
         media_type: str = "",
         raises: Sequence[type[Exception]] = (),
-        problems: Mapping[int, str] | None = None,
+        problems: Sequence[ProblemCode] = (),
     ) -> Callable[[Handler], Handler]:
         def add(handler: Handler) -> Handler:
             signature = _Signature(handler)
             statuses = (status,) if isinstance(status, int) else status
             if signature.answer is type(None):
                 statuses = (204,)
-            described = {status: text for kind in raises for status, text in self._raised[kind].items()} | dict(
-                problems or {}
-            )
+            own = [*problems, *(code for kind in raises for code in self._raised[kind])]
             standby: Callable[[], str] = str
             if signature.needs_token and method != "GET":
                 standby = self._app.state.standby
-                described = {503: "This process stands by: another one leads"} | described
+                own.append(HttpProblem.STANDS_BY)
             route = f"{method} {path}"
             run = _handling(handler, statuses[0], standby)
             self._app.state.endpoints[route] = Endpoint(method, path, signature.arguments, run)
@@ -193,7 +190,7 @@ class Routes:
                 status_code=statuses[0],
                 response_model=None,
                 response_class=Response,
-                responses=self._responses(path, signature, statuses, media_type, described),
+                responses=self._responses(path, signature, statuses, media_type, own),
                 openapi_extra=self._body(signature),
             )
             return handler
@@ -207,7 +204,12 @@ class Routes:
         return {"requestBody": {"required": True, "content": content}}
 
     def _responses(
-        self, path: str, signature: "_Signature", statuses: Sequence[int], media_type: str, problems: Mapping[int, str]
+        self,
+        path: str,
+        signature: "_Signature",
+        statuses: Sequence[int],
+        media_type: str,
+        own: Sequence[ProblemCode],
     ) -> dict[int | str, dict[str, Any]]:
         """Describe the responses to requests that this route is for.
 
@@ -222,29 +224,30 @@ class Routes:
             status: {"description": _ANSWERS.get(status, "The answer"), **({"content": content} if content else {})}
             for status in statuses
         }
-        for status, text in _problems(path, signature, problems).items():
-            response = responses.setdefault(status, {"description": text})
+        for code in dict.fromkeys([*own, *_shared_problems(path, signature)]):
+            self._app.state.problems.add(code)
+            text = f"{code.says} (`{code}`)"
+            response = responses.get(code.status)
+            if response is None:
+                response = responses[code.status] = {"description": text}
+            elif code.status not in statuses:
+                response["description"] += f"; {text}"
             response["content"] = {**response.get("content", {}), PROBLEM: {"schema": schema(self._app, Problem)}}
         return responses
 
 
-def _problems(path: str, signature: "_Signature", problems: Mapping[int, str]) -> dict[int, str]:
-    """Return the description of each problem document that a route may answer with; `problems` are its own."""
-    described: dict[int, str] = {500: "The service failed: its log names the reason"}
+def _shared_problems(path: str, signature: "_Signature") -> list[ProblemCode]:
+    """Return what any route of this signature may answer with."""
+    found: list[ProblemCode] = [HttpProblem.FAILED, HttpProblem.RESTARTED]
+    if path not in ALWAYS_SERVED:
+        found.append(HttpProblem.OVERLOADED)
     if signature.needs_token:
-        described |= {401: "The token is missing or unknown", 403: "The token's role does not allow this"}
-    if signature.has_parameters:
-        described |= {422: "A parameter is invalid: `errors` names it"}
+        found += [HttpProblem.TOKEN_MISSING, HttpProblem.TOKEN_UNKNOWN, HttpProblem.ROLE_TOO_LOW]
+    if signature.has_parameters or signature.body is not None:
+        found.append(HttpProblem.REQUEST_INVALID)
     if signature.body is not None:
-        described |= {
-            408: "The body did not arrive in time",
-            413: "The body is too large",
-            422: "The body is invalid: `errors` names the fields",
-        }
-    described |= problems
-    unavailable = "The service is started again" if path in ALWAYS_SERVED else _UNAVAILABLE
-    described[503] = f"{problems[503]}. {unavailable}" if 503 in problems else unavailable
-    return described
+        found += [HttpProblem.BODY_SLOW, HttpProblem.BODY_TOO_LARGE]
+    return found
 
 
 class _Signature:
@@ -311,7 +314,7 @@ def _handling(
 
     async def run(**arguments: Any) -> Response:
         if reason := standby():
-            raise ProblemError(503, f"{reason}; send the request there", headers={"Retry-After": "1"})
+            raise ProblemError(HttpProblem.STANDS_BY, f"{reason}; send the request there", headers=RETRY_AFTER)
         answer = await handler(**arguments)
         if isinstance(answer, Response):
             return answer
@@ -351,7 +354,9 @@ def _encoded(arguments: dict[str, Any]) -> bytes:
     try:
         return msgspec.msgpack.encode(arguments)
     except OverflowError as error:
-        raise ProblemError(422, "an integer needs more than 64 bits: use a smaller one") from error
+        raise ProblemError(
+            HttpProblem.REQUEST_INVALID, "an integer needs more than 64 bits: use a smaller one"
+        ) from error
 
 
 def _reader(kind: Any) -> Callable[[Request], Awaitable[Any]]:
@@ -365,7 +370,8 @@ class InvalidBodyError(ProblemError):
     """A body that does not fit its type; a route may raise it again with a more helpful text."""
 
     def __init__(self, errors: list[dict[str, str]]) -> None:
-        super().__init__(422, "; ".join(f"{error['field']}: {error['problem']}" for error in errors))
+        text = "; ".join(f"{error['field']}: {error['problem']}" for error in errors)
+        super().__init__(HttpProblem.REQUEST_INVALID, text)
         self.errors = errors
 
 

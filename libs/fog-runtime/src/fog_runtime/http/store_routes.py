@@ -6,7 +6,7 @@ from urllib.parse import urlencode
 from fastapi import Depends, Header, Query
 
 from fog_contracts.messages import Message
-from fog_runtime.http.problems import RETRY_AFTER, ProblemError
+from fog_runtime.http.problems import RETRY_AFTER, HttpProblem, ProblemError
 from fog_runtime.http.routes import Body, Routes
 from fog_runtime.http.tokens import Admin, Caller, Viewer
 from fog_runtime.stores.redis_connection import StoreError, StoreRefusedError
@@ -72,23 +72,28 @@ def attempt_of(key: str | None, caller: Caller, target: str, body: Any) -> Attem
 def must_be_new(if_none_match: str | None) -> bool:
     """Return whether an If-None-Match header asks for a new record; raises `ProblemError` for any value but `*`."""
     if if_none_match not in (None, "*"):
-        raise ProblemError(422, "send `If-None-Match: *`, or leave it out", field="header.If-None-Match")
+        detail = "send `If-None-Match: *`, or leave it out"
+        raise ProblemError(HttpProblem.REQUEST_INVALID, detail, field="header.If-None-Match")
     return if_none_match is not None
 
 
 def add_store_errors(routes: Routes) -> None:
     """Register the problem documents of the store's errors."""
-    routes.raises(StoreError, {503: "The store does not answer, or refuses writes: `detail` names the cause"}, _problem)
+    routes.raises(StoreError, [HttpProblem.STORE_AWAY, HttpProblem.STORE_UNCERTAIN], _problem)
     routes.raises(
         IdempotencyError,
-        {422: "The body is invalid, or the Idempotency-Key was used for another request"},
-        lambda error: ProblemError(422, str(error), field="header.Idempotency-Key"),
+        [HttpProblem.KEY_REUSED],
+        lambda error: ProblemError(HttpProblem.KEY_REUSED, str(error), field="header.Idempotency-Key"),
     )
 
 
 def add_recovery(routes: Routes, service: Recoverable) -> None:
     """Add the route by which an administrator decides what happens after Redis lost records."""
-    routes.raises(RecoveryError, {409: "There is nothing to recover"}, lambda error: ProblemError(409, str(error)))
+    routes.raises(
+        RecoveryError,
+        [HttpProblem.NOTHING_LOST],
+        lambda error: ProblemError(HttpProblem.NOTHING_LOST, str(error)),
+    )
 
     @routes.get("/api/v1/store", raises=[StoreError])
     async def store_status(_caller: Viewer) -> StoreStatus:
@@ -103,9 +108,9 @@ def add_recovery(routes: Routes, service: Recoverable) -> None:
 
 def _problem(error: StoreError) -> ProblemError:
     if isinstance(error, StoreRefusedError):
-        return ProblemError(503, f"nothing was changed: {error}", headers=RETRY_AFTER)
+        return ProblemError(HttpProblem.STORE_AWAY, f"nothing was changed: {error}", headers=RETRY_AFTER)
     return ProblemError(
-        503,
+        HttpProblem.STORE_UNCERTAIN,
         f"the change may or may not be stored: repeat the request, with its Idempotency-Key if it had one ({error})",
         headers=RETRY_AFTER,
     )

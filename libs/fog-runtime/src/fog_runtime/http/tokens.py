@@ -10,7 +10,7 @@ from fastapi import Depends, Request
 from fastapi.security import HTTPAuthorizationCredentials, HTTPBearer
 
 from fog_runtime import logs
-from fog_runtime.http.problems import ProblemError
+from fog_runtime.http.problems import HttpProblem, ProblemError
 from fog_runtime.token_file import ROLES, Role, TokenEntry, TokensError, read_tokens, token_hash
 
 _RANKS: Final = {role: rank for rank, role in enumerate(ROLES)}
@@ -87,13 +87,16 @@ def require(role: Role) -> Callable[..., Caller]:
     ) -> Caller:
         challenge = {"WWW-Authenticate": "Bearer"}
         if credentials is None:
-            raise ProblemError(401, "this request needs a token: send `Authorization: Bearer TOKEN`", headers=challenge)
+            detail = "this request needs a token: send `Authorization: Bearer TOKEN`"
+            raise ProblemError(HttpProblem.TOKEN_MISSING, detail, headers=challenge)
         tokens: Tokens = request.app.state.tokens
         caller = tokens.caller(credentials.credentials)
         if caller is None:
-            raise ProblemError(401, "the token is unknown: use one of the site's tokens", headers=challenge)
+            detail = "the token is unknown: use one of the site's tokens"
+            raise ProblemError(HttpProblem.TOKEN_UNKNOWN, detail, headers=challenge)
         if _RANKS[caller.role] < _RANKS[role]:
-            raise ProblemError(403, f"this request needs the role {role}; {caller.name} has the role {caller.role}")
+            detail = f"this request needs the role {role}; {caller.name} has the role {caller.role}"
+            raise ProblemError(HttpProblem.ROLE_TOO_LOW, detail)
         return caller
 
     return check

@@ -39,7 +39,7 @@ ORACLE = "experiments/src/fognav_experiments/hunt/oracle.py"
 """It computes for itself where zones are: an error in the shapes must not be its own, too."""
 DRAWING_COMMANDS = {
     "cli/src/fognav/commands/zone.py",
-    *(f"experiments/src/fognav_experiments/bench/{name}.py" for name in ("costmap", "fleet", "floor", "rest")),
+    *(f"experiments/src/fognav_experiments/bench/{name}.py" for name in ("cores", "fleet", "floor", "rest")),
 }
 AGGREGATOR = "services/hazard-aggregator/src/hazard_aggregator/core.py"
 MAP_API = "services/map-service/src/map_service/api.py"

@@ -8,12 +8,18 @@ from collections import Counter
 import msgspec
 import pytest
 
-from fognav_experiments import plots
-from fognav_experiments.comparison.agreement import agreement, compare_drives, compared, resources
+from fognav_experiments import figures
 from fognav_experiments.comparison.document import to_markdown
-from fognav_experiments.comparison.measured import MeasuredDrive
+from fognav_experiments.comparison.drives import MeasuredDrive
 from fognav_experiments.comparison.records import Folder, FolderError, Record
-from fognav_experiments.comparison.repeated import beside_lockstep, memory
+from fognav_experiments.comparison.repeated import (
+    agreement,
+    beside_lockstep,
+    compare_drives,
+    compared,
+    memory,
+    resources,
+)
 from fognav_experiments.comparison.report import build
 
 SHARED = {
@@ -158,8 +164,8 @@ def test_memory_is_drawn_by_route_and_setup_from_what_each_drive_took():
     assert figure.file == "memory.svg"
     assert "mean of 4 drives" in figure.caption
     bars = Counter(re.findall(r"fill: (#\w+)", figure.svg))
-    assert bars[plots.COLOURS["default"]] == 1 + 2  # in the legend, and on each route
-    assert bars[plots.COLOURS["fog"]] == 1 + 1
+    assert bars[figures.COLOURS["default"]] == 1 + 2  # in the legend, and on each route
+    assert bars[figures.COLOURS["fog"]] == 1 + 1
     assert [row[:2] for row in table.rows] == [["A to B", "300.0"], ["C to D", "400.0"]]
     assert table.rows[0][2].startswith("235.0 ± ")
     assert table.rows[1][2] == "-"

@@ -7,12 +7,10 @@ import lzma
 import msgspec
 import pytest
 
-from fognav_experiments.comparison import archive
-from fognav_experiments.comparison.driven import ComparedDrive
-from fognav_experiments.comparison.measured import MeasuredDrive
-from fognav_experiments.comparison.publish import publish
+from fognav_experiments.comparison import records
+from fognav_experiments.comparison.drives import ComparedDrive, MeasuredDrive, Timeline
 from fognav_experiments.comparison.records import ON_FOG, ON_ROBOT, Asked, Folder, FolderError, Record, machines
-from fognav_experiments.comparison.timeline import Timeline
+from fognav_experiments.comparison.report import publish
 
 ASKED = Asked(site="ring", site_digest="0" * 16, seed=1)
 
@@ -75,14 +73,14 @@ def recorded(tmp_path):
 
 
 def test_an_archive_is_small_and_gives_all_records_back(recorded, tmp_path):
-    packed = tmp_path / archive.NAME
-    assert archive.write(recorded, packed) == packed.stat().st_size
+    packed = tmp_path / records.ARCHIVE
+    assert records.write_archive(recorded, packed) == packed.stat().st_size
     assert packed.stat().st_size < sum(file.stat().st_size for file in recorded.drives.path.iterdir()) / 2
     again = Folder(tmp_path / "again")
-    assert archive.unpack(packed, again, ASKED) == 3
+    assert records.unpack_archive(packed, again, ASKED) == 3
     assert again.drives.read() == recorded.drives.read()
     assert again.description() == recorded.description()
-    assert archive.pack(again) == packed.read_bytes()
+    assert records.pack_archive(again) == packed.read_bytes()
 
 
 def test_drives_by_real_processes_are_in_the_archive_too(recorded, tmp_path):
@@ -92,8 +90,8 @@ def test_drives_by_real_processes_are_in_the_archive_too(recorded, tmp_path):
     before, after = Folder(tmp_path / "before"), Folder(tmp_path / "after")
     before.begin(ASKED, {})
     before.measured("live").write(live)
-    archive.write(before, tmp_path / archive.NAME)
-    assert archive.unpack(tmp_path / archive.NAME, after) == 1
+    records.write_archive(before, tmp_path / records.ARCHIVE)
+    assert records.unpack_archive(tmp_path / records.ARCHIVE, after) == 1
     assert after.measured("live").read() == [live]
     assert after.drives.read() == []
 
@@ -104,13 +102,13 @@ def test_an_experiment_goes_on_with_an_archive_where_it_was(tmp_path):
     first.begin(ASKED, {"machine": {"cores": 2, "load": 1.0}})
     first.drives.write(RECORDS[0])
     first.drives.write(RECORDS[1])
-    archive.write(first, tmp_path / archive.NAME)
+    records.write_archive(first, tmp_path / records.ARCHIVE)
     second.begin(ASKED, {"machine": {"cores": 4, "load": 1.0}})
     kept = msgspec.structs.replace(RECORDS[1], wall_s=-1.0)
     second.drives.write(kept)
-    assert archive.unpack(tmp_path / archive.NAME, second, ASKED) == 1
+    assert records.unpack_archive(tmp_path / records.ARCHIVE, second, ASKED) == 1
     assert second.drives.read() == [RECORDS[0], kept]
-    assert archive.unpack(tmp_path / archive.NAME, second, ASKED) == 0
+    assert records.unpack_archive(tmp_path / records.ARCHIVE, second, ASKED) == 0
     # Who went on with it elsewhere is named, and the same machine under another load only once.
     assert [machine["machine"]["cores"] for machine in machines(second.description())] == [4, 2]
     second.begin(ASKED, {"machine": {"cores": 2, "load": 9.0}})
@@ -122,7 +120,7 @@ def test_an_experiment_goes_on_with_an_archive_where_it_was(tmp_path):
 def test_from_a_report_s_archive_the_same_report_is_made_again(recorded, tmp_path):
     publish(recorded, tmp_path / "report")
     again = Folder(tmp_path / "again")
-    archive.unpack(tmp_path / "report" / archive.NAME, again)
+    records.unpack_archive(tmp_path / "report" / records.ARCHIVE, again)
     for file in publish(again, tmp_path / "second"):
         assert file.read_bytes() == (tmp_path / "report" / file.name).read_bytes(), file.name
 
@@ -157,30 +155,30 @@ def headed(**experiment):
     ],
 )
 def test_a_damaged_archive_is_refused_and_leaves_nothing_behind(recorded, tmp_path, damage, words):
-    file = tmp_path / archive.NAME
-    file.write_bytes(damage(archive.pack(recorded)))
+    file = tmp_path / records.ARCHIVE
+    file.write_bytes(damage(records.pack_archive(recorded)))
     with pytest.raises(FolderError, match=words) as refused:
-        archive.unpack(file, Folder(tmp_path / "out"))
+        records.unpack_archive(file, Folder(tmp_path / "out"))
     assert str(file) in str(refused.value)
     assert not (tmp_path / "out").exists()
 
 
 def test_an_archive_writes_no_file_outside_its_folder(tmp_path):
     record = msgspec.to_builtins(msgspec.structs.replace(RECORDS[0], route="/../../../evil"))
-    (tmp_path / archive.NAME).write_bytes(packed(HEAD, {"folder": "drives", "record": record}))
+    (tmp_path / records.ARCHIVE).write_bytes(packed(HEAD, {"folder": "drives", "record": record}))
     with pytest.raises(FolderError, match="which is none of a file"):
-        archive.unpack(tmp_path / archive.NAME, Folder(tmp_path / "out"))
-    assert [file.name for file in tmp_path.iterdir()] == [archive.NAME]
+        records.unpack_archive(tmp_path / records.ARCHIVE, Folder(tmp_path / "out"))
+    assert [file.name for file in tmp_path.iterdir()] == [records.ARCHIVE]
 
 
 def test_an_archive_of_another_experiment_is_refused(recorded, tmp_path):
-    file = tmp_path / archive.NAME
-    archive.write(recorded, file)
+    file = tmp_path / records.ARCHIVE
+    records.write_archive(recorded, file)
     other = msgspec.structs.replace(ASKED, seed=2)
     with pytest.raises(FolderError, match="another experiment"):
-        archive.unpack(file, Folder(tmp_path / "out"), other)
+        records.unpack_archive(file, Folder(tmp_path / "out"), other)
     assert not (tmp_path / "out").exists()
     Folder(tmp_path / "theirs").begin(other, {})
     with pytest.raises(FolderError, match="another experiment"):
-        archive.unpack(file, Folder(tmp_path / "theirs"))
+        records.unpack_archive(file, Folder(tmp_path / "theirs"))
     assert Folder(tmp_path / "theirs").drives.read() == []

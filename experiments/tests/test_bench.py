@@ -11,14 +11,14 @@ from fog_kernels.components import Components
 from fog_supervisor.servers import ServerError
 from fog_supervisor.supervisor import NotReadyError
 from fognav.__main__ import app
-from fognav_experiments.bench import costmap, dwa, fleet, fleet_live, localization, office, planner, rest
+from fognav_experiments.bench import common, cores, fleet, fleet_live, planner, rest
 from fognav_experiments.bench import floor as floor_bench
 
 
 def test_office_is_connected_and_the_same_for_the_same_seed() -> None:
-    floor = office.make_office(60.0, 40.0, seed=3)
+    floor = common.make_office(60.0, 40.0, seed=3)
     assert floor.geometry.shape == (800, 1200)
-    assert np.array_equal(floor.cells, office.make_office(60.0, 40.0, seed=3).cells)
+    assert np.array_equal(floor.cells, common.make_office(60.0, 40.0, seed=3).cells)
     labels = Components(floor.cells).labels(*floor.geometry.whole)
     counts = np.bincount(labels[labels >= 0])
     assert counts.max() > 0.95 * counts.sum()
@@ -26,7 +26,7 @@ def test_office_is_connected_and_the_same_for_the_same_seed() -> None:
 
 def test_every_robot_of_a_fleet_is_planned_refused_and_planned_again() -> None:
     rng = np.random.default_rng(1)
-    map_ = fleet.FleetMap(office.make_office(60.0, 40.0), 10, rng)
+    map_ = fleet.FleetMap(common.make_office(60.0, 40.0), 10, rng)
     robots = fleet.Fleet(map_, 4, 3, rng)
     seen: list[tuple[int, int]] = []
     figures = fleet.measure(map_, robots, 1, lambda done, total: seen.append((done, total)))
@@ -44,7 +44,7 @@ def test_every_robot_of_a_fleet_is_planned_refused_and_planned_again() -> None:
 @pytest.mark.live
 async def test_every_robot_of_a_real_planner_gets_its_path_its_refusal_and_a_path_again() -> None:
     rng = np.random.default_rng(1)
-    map_ = fleet.FleetMap(office.make_office(60.0, 40.0), 10, rng)
+    map_ = fleet.FleetMap(common.make_office(60.0, 40.0), 10, rng)
     seen: list[tuple[int, int]] = []
     robots = fleet.place_fleet(map_, 4, 3, rng)
     figures = await fleet_live.measure(map_, robots, 1, lambda done, total: seen.append((done, total)), quiet_s=0.5)
@@ -76,8 +76,8 @@ async def test_real_services_start_on_a_floor_and_lead_a_robot_across_it_and_rou
 
 
 def test_figures_come_with_schema_machine_and_versions(monkeypatch: pytest.MonkeyPatch) -> None:
-    small = office.make_office(60.0, 40.0)
-    monkeypatch.setattr(office, "make_office", lambda **_: small)
+    small = common.make_office(60.0, 40.0)
+    monkeypatch.setattr(common, "make_office", lambda **_: small)
     done = CliRunner().invoke(
         app, ["bench", "fleet", "--robots", "2", "--goals", "1", "--zones", "2", "--trials", "1", "--json"]
     )
@@ -92,7 +92,7 @@ def test_figures_come_with_schema_machine_and_versions(monkeypatch: pytest.Monke
 
 @pytest.mark.parametrize("cells", [None, "map"])
 def test_planner_figures_count_what_equals_its_reference(cells, tmp_path, monkeypatch):
-    small = office.make_office(60.0, 40.0)
+    small = common.make_office(60.0, 40.0)
     monkeypatch.setattr(planner, "make_office", lambda **_: small)
     options = ["--queries", "3", "--json"]
     if cells is not None:
@@ -118,8 +118,8 @@ def test_planner_bench_names_the_file_that_is_no_map(tmp_path):
 
 
 def test_costmap_figures_are_of_the_whole_floor_and_of_legal_zones() -> None:
-    floor = office.make_office(60.0, 40.0)
-    figures = costmap.measure(floor, 50, 1)
+    floor = common.make_office(60.0, 40.0)
+    figures = cores.measure_costmap(floor, 50, 1)
     assert figures["cells"] == 800 * 1200
     assert figures["portions"] >= 4, "a zone over the whole floor, put and removed"
     for key in (
@@ -136,8 +136,8 @@ def test_costmap_figures_are_of_the_whole_floor_and_of_legal_zones() -> None:
 
 @pytest.mark.live
 async def test_clients_of_every_kind_are_answered_while_the_heartbeat_is_timed(tmp_path) -> None:
-    floor = office.make_office(60.0, 40.0)
-    office.write_site(tmp_path, floor)
+    floor = common.make_office(60.0, 40.0)
+    common.write_site(tmp_path, floor)
     figures = await rest.measure(tmp_path, floor, zones=50, clients=10, seconds=3.0, idle_s=0.5)
     assert (
         {"200", "201", "204", "413", "422"}
@@ -163,7 +163,7 @@ def test_system_that_does_not_start_is_a_sentence_and_no_traceback(monkeypatch, 
 
 
 def test_localization_figures_are_there_and_the_search_and_match_ran() -> None:
-    figures = localization.measure(office.make_office(60.0, 40.0), 300, 60, 2, 1)
+    figures = cores.measure_localization(common.make_office(60.0, 40.0), 300, 60, 2, 1)
     assert figures["cells"] == 800 * 1200
     for key in (
         "cycle_ms",
@@ -179,7 +179,7 @@ def test_localization_figures_are_there_and_the_search_and_match_ran() -> None:
 
 
 def test_dwa_figures_are_of_both_bodies_and_of_a_whole_decision() -> None:
-    figures = dwa.measure(2)
+    figures = cores.measure_dwa(2)
     assert figures["arcs"] == 875
     assert all(figures[key] > 0 for key in ("decision_ms", "cycle_ms"))
     assert {"field_ms", "field_long_ms", "cycle_long_ms", "peer_ratio"} <= figures.keys()

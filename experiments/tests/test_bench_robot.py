@@ -10,7 +10,7 @@ import pytest
 from fog_runtime import usage
 from fog_runtime.configuration.site import load_site
 from fognav.output import WrongUseError
-from fognav_experiments.bench import office, robot
+from fognav_experiments.bench import common, robot
 
 
 def write_thread(proc: Path, pid: int, thread: int, name: str, nanoseconds: int, switches: int) -> None:
@@ -107,7 +107,7 @@ def test_quota_that_the_system_refuses_is_named_with_the_remedy(tmp_path: Path) 
 
 
 def test_site_of_the_benchmark_is_valid_and_its_robot_stands_on_free_floor(tmp_path: Path) -> None:
-    floor = office.make_office(60.0, 40.0)
+    floor = common.make_office(60.0, 40.0)
     loaded = load_site(robot.write_site(tmp_path, floor))
     start, far = loaded.site.robots[0].start, loaded.site.places["far"]
     for place in (start, far):

@@ -17,15 +17,13 @@ from hypothesis import strategies as st
 from fog_runtime.configuration.site import load_site
 from fognav_experiments.comparison import runner
 from fognav_experiments.comparison.document import Table
-from fognav_experiments.comparison.draws import ExperimentSpec, RouteSpec, draw
-from fognav_experiments.comparison.geometry import RouteGeometry, Saving
-from fognav_experiments.comparison.limits import geometry
-from fognav_experiments.comparison.publish import publish
+from fognav_experiments.comparison.drives import ExperimentSpec, RouteSpec, draw
+from fognav_experiments.comparison.limits import RouteGeometry, Saving, allowed_savings
 from fognav_experiments.comparison.records import MOVE_BASE, Asked, Folder, FolderError
-from fognav_experiments.comparison.report import paired
-from fognav_experiments.cpu import CpuMeter
+from fognav_experiments.comparison.report import paired, publish
+from fognav_experiments.figures import compare, estimate, t_cdf, t_quantile
+from fognav_experiments.machine import CpuMeter
 from fognav_experiments.rigs import System
-from fognav_experiments.statistics import compare, estimate, t_cdf, t_quantile
 
 pytestmark = pytest.mark.timeout(900)
 
@@ -85,9 +83,9 @@ def test_an_experiment_that_the_site_does_not_fit_is_refused(tmp_path):
 
 def test_a_warning_saves_only_where_the_obstacle_bars_the_way_and_at_most_the_way_back():
     site = load_site(ESTIG)
-    geometry = RouteGeometry(site)
+    allowed_savings = RouteGeometry(site)
     drawn = [route for run in range(1, 5) for route in draw(runner.read_spec(site, ESTIG), 1, run)]
-    savings = [geometry.saving(route) for route in drawn]
+    savings = [allowed_savings.saving(route) for route in drawn]
     assert all(saving is not None and saving.saved_m >= 0.0 for saving in savings)
     assert {route.area for route, saving in zip(drawn, savings, strict=True) if saving.met} == {"z4"}
     for route, saving in zip(drawn, savings, strict=True):
@@ -96,7 +94,7 @@ def test_a_warning_saves_only_where_the_obstacle_bars_the_way_and_at_most_the_wa
             # The robot sees z4 from 12 m, and comes back to where the ways part.
             assert 25.0 < saving.saved_m < 40.0
             # A robot that learns of it under way saves less.
-            late = geometry.saving(msgspec.structs.replace(route, moment="under way", trigger_m=10.0))
+            late = allowed_savings.saving(msgspec.structs.replace(route, moment="under way", trigger_m=10.0))
             assert late.saved_m < saving.saved_m
 
 
@@ -105,9 +103,9 @@ def test_an_obstacle_that_appears_behind_the_robot_has_not_met_it():
     site = load_site(ESTIG)
     route = next(route for route in draw(runner.read_spec(site, ESTIG), 1, 1) if route.route.name == "ab")
     barred = msgspec.structs.replace(route, area="z4", moment="under way", trigger_m=10.0)
-    geometry = RouteGeometry(site)
-    assert geometry.saving(barred).met
-    behind = geometry.saving(msgspec.structs.replace(barred, trigger_m=50.0))
+    allowed_savings = RouteGeometry(site)
+    assert allowed_savings.saving(barred).met
+    behind = allowed_savings.saving(msgspec.structs.replace(barred, trigger_m=50.0))
     assert not behind.met
     assert behind.saved_m == pytest.approx(0.0, abs=0.01)
 
@@ -118,7 +116,7 @@ def test_an_obstacle_that_appears_behind_the_robot_has_not_met_it():
 @pytest.mark.parametrize(("allowed_m", "share"), [(20.0, "50 %"), (1e-5, "-"), (0.0, "-")])
 def test_what_was_saved_is_no_share_of_what_a_map_allows_by_rounding_alone(allowed_m, share):
     """On a recorded floor the report said that 2,590,647 % of what the map allows had been saved."""
-    _, table = geometry([(Saving(50.0 + allowed_m, 50.0, met=True), 10.0, 40.0)] * 2)
+    _, table = allowed_savings([(Saving(50.0 + allowed_m, 50.0, met=True), 10.0, 40.0)] * 2)
     assert isinstance(table, Table)
     assert [row[table.header.index("share")] for row in table.rows] == [share, share]
 

@@ -12,13 +12,11 @@ from typer.testing import CliRunner
 from fognav import checkout, kernels
 from fognav.__main__ import app
 from fognav_experiments.commands import experiment
-from fognav_experiments.comparison import archive, hardware_drive, runner
-from fognav_experiments.comparison.driven import ComparedDrive
-from fognav_experiments.comparison.measured import MeasuredDrive
+from fognav_experiments.comparison import hardware_drive, records, runner, sensitivity
+from fognav_experiments.comparison.drives import ComparedDrive, MeasuredDrive
 from fognav_experiments.comparison.records import Folder
 from fognav_experiments.scenarios import stage
-from fognav_experiments.scenarios.fleet_stage import FleetResult
-from fognav_experiments.sensitivity import sweep
+from fognav_experiments.scenarios.fleet import FleetResult
 from fognav_sim import nodes
 
 OUT = ["--out", "unused"]
@@ -105,7 +103,7 @@ def test_a_report_shows_the_live_drives_of_another_folder_and_its_archive_keeps_
     """Its own folder stays as it was; another experiment's drives are refused."""
     packed = checkout.root() / "docs" / "results" / "estig" / "drives.jsonl.xz"
     driven, lockstep, live = (Folder(tmp_path / name) for name in ("driven", "lockstep", "live"))
-    archive.unpack(packed, driven)
+    records.unpack_archive(packed, driven)
     for folder in (lockstep, live):
         folder.adopt(driven.description())
     asked = [record for record in driven.drives.read() if record.run == 1]
@@ -121,7 +119,7 @@ def test_a_report_shows_the_live_drives_of_another_folder_and_its_archive_keeps_
     for name in ("memory.svg", "live-distance.svg", "live-time.svg"):
         assert (tmp_path / "report" / name).is_file()
     again = Folder(tmp_path / "again")
-    archive.unpack(tmp_path / "report" / archive.NAME, again)
+    records.unpack_archive(tmp_path / "report" / records.ARCHIVE, again)
     assert len(again.measured("live").read()) == len(asked) > 0
     description = live.description()
     description["asked"]["seed"] += 1
@@ -165,7 +163,7 @@ def test_drives_say_in_one_line_that_nodes_run_a_model_and_why(arguments, tmp_pa
         raise ReachedError
 
     monkeypatch.setattr(kernels, "warm_cache", lambda _: None)
-    for module, name in ((runner, "run"), (sweep, "workers")):
+    for module, name in ((runner, "run"), (sensitivity, "workers")):
         monkeypatch.setattr(module, name, reached)
     for folder, lines in ((tmp_path, 1), (nodes.find_firmware(), 0)):
         monkeypatch.setenv("FOGNAV_FIRMWARE_DIR", str(folder))

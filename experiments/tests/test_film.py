@@ -9,10 +9,9 @@ from PIL import Image
 
 from fog_runtime.configuration.site import load_site
 from fognav_experiments.comparison import runner
-from fognav_experiments.comparison.draws import draw
+from fognav_experiments.comparison.drives import Timeline, draw
 from fognav_experiments.comparison.film import FRAME_S, Film, UnfilmedDriveError
 from fognav_experiments.comparison.records import Record
-from fognav_experiments.comparison.timeline import Timeline
 
 ESTIG = Path(__file__).parents[2] / "sites" / "estig"
 PINK, RED = (246, 178, 178), (208, 40, 40)

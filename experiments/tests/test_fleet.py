@@ -11,8 +11,8 @@ import pytest
 
 from fog_contracts.messages import Pose
 from fog_contracts.site import RobotSite
-from fognav_experiments.cpu import CpuMeter
-from fognav_experiments.fleet import Fleet, Mission
+from fognav_experiments.machine import CpuMeter
+from fognav_experiments.scenarios.fleet import Fleet, Mission
 from fognav_sim.world import World
 
 _spec = importlib.util.spec_from_file_location("ring_site", Path(__file__).parent / "ring_site.py")

@@ -12,8 +12,8 @@ from fog_contracts.geometry import distance_to_polygon
 from fog_runtime.configuration.maps import load_map, save_map
 from fog_runtime.configuration.site import load_site
 from fognav_experiments.comparison import runner
-from fognav_experiments.comparison.draws import draw
-from fognav_experiments.comparison.geometry import RouteGeometry
+from fognav_experiments.comparison.drives import draw
+from fognav_experiments.comparison.limits import RouteGeometry
 from fognav_sim.barrier import KEEP_AWAY_M
 
 FLOORS = Path(__file__).parents[1] / "floors"

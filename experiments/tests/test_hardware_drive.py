@@ -18,8 +18,7 @@ from fog_contracts.messages import Pose, RobotGoal
 from fog_runtime.configuration.site import load_site
 from fognav.operate.outcome import Outcome
 from fognav.output import FailedError, WrongUseError
-from fognav_experiments.comparison.draws import RouteDraw, RouteSpec
-from fognav_experiments.comparison.guided import start_of
+from fognav_experiments.comparison.drives import RouteDraw, RouteSpec, start_of
 from fognav_experiments.comparison.hardware_drive import HardwareRun, Terminal, drive_hardware
 from fognav_experiments.comparison.records import Folder
 from fognav_experiments.comparison.runner import Task

@@ -31,8 +31,7 @@ from fognav_experiments.hunt import oracle, play, runner
 from fognav_experiments.hunt.draw import draw_world
 from fognav_experiments.hunt.oracle import Figures, Violation
 from fognav_experiments.hunt.play import Hunted, hunt, read_world, write_world
-from fognav_experiments.hunt.runner import Task, drive
-from fognav_experiments.hunt.shrink import shrink
+from fognav_experiments.hunt.runner import Task, drive, shrink
 from fognav_experiments.hunt.world import HuntWorld, Mounting, Patch, Sensors, Watched, build, displacement, to_map
 from fognav_experiments.lockstep import LockstepDrive
 from fognav_experiments.rigs import STAMP, moment

@@ -8,7 +8,7 @@ import numpy as np
 
 from fog_runtime.configuration.site import load_site
 from fognav_experiments.comparison import runner
-from fognav_experiments.comparison.draws import draw
+from fognav_experiments.comparison.drives import draw
 from fognav_experiments.comparison.live_drive import write_route
 
 ESTIG = Path(__file__).parents[2] / "sites" / "estig"

@@ -8,14 +8,14 @@ from pathlib import Path
 
 import pytest
 
-from fognav_experiments.comparison import archive
-from fognav_experiments.comparison.publish import publish
+from fognav_experiments.comparison import records
 from fognav_experiments.comparison.records import Folder
+from fognav_experiments.comparison.report import publish
 from fognav_experiments.comparison.runner import site_digest
 
 pytestmark = pytest.mark.timeout(900)
 ROOT = Path(__file__).parents[2]
-ARCHIVES = sorted((ROOT / "docs" / "results").glob(f"*/{archive.NAME}"))
+ARCHIVES = sorted((ROOT / "docs" / "results").glob(f"*/{records.ARCHIVE}"))
 WITH_FLOOR = {"README.md", "report.html", "tracks.svg"}
 """They say what the floor allows, and show its stops and areas, which are not in the archive."""
 
@@ -47,7 +47,7 @@ def test_results_have_an_archive():
 @pytest.mark.drive
 def test_published_report_is_what_its_archive_gives(packed, tmp_path):
     folder, report, published = Folder(tmp_path / "drives"), tmp_path / "report", packed.parent
-    archive.unpack(packed, folder)
+    records.unpack_archive(packed, folder)
     asked = folder.description()["asked"]
     site = ROOT / "sites" / asked["site"]
     known = site.is_dir() and site_digest(site) == asked["site_digest"]

@@ -17,7 +17,7 @@ from fog_contracts.messages import NodeReading
 from fog_runtime.configuration.site import load_site
 from fognav_experiments.lockstep import DriveEvent
 from fognav_experiments.scenarios.description import Expected, FaultyNode, Scenario, SilentNode, deviations
-from fognav_experiments.scenarios.fleet_stage import FleetResult
+from fognav_experiments.scenarios.fleet import FleetResult
 from fognav_experiments.scenarios.node_faults import LateNodeSim, SlewedNodeSim
 from fognav_experiments.scenarios.stage import Played, ScenarioError, Stage, markdown_page, play, read_scenario
 

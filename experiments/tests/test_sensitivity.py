@@ -11,23 +11,22 @@ import pytest
 from distributed import LocalCluster
 
 from fog_runtime.configuration.site import load_site
-from fognav_experiments.comparison import runner
-from fognav_experiments.comparison.draws import ExperimentSpec, RouteSpec, draw
+from fognav_experiments.comparison import runner, sensitivity
+from fognav_experiments.comparison.drives import ExperimentSpec, RouteSpec, draw
 from fognav_experiments.comparison.records import DriveFiles
-from fognav_experiments.sensitivity import sweep as sweeping
-from fognav_experiments.sensitivity.planes import (
+from fognav_experiments.comparison.sensitivity import (
     BASE,
     Axis,
     Plane,
     SweptDrive,
     Variation,
+    digest,
     gain,
+    publish,
     sweep_tasks,
     unwarned,
     varied_site,
 )
-from fognav_experiments.sensitivity.publish import publish
-from fognav_experiments.sensitivity.sweep import digest
 from fognav_sim.node import default_config
 
 ESTIG = Path(__file__).parents[2] / "sites" / "estig"
@@ -147,17 +146,17 @@ def test_a_cluster_of_two_workers_of_these_sources_drives_a_sweep_and_goes_on_wh
     files = DriveFiles(tmp_path, SweptDrive)
     with (
         LocalCluster(n_workers=2, threads_per_worker=1, dashboard_address=None) as cluster,
-        sweeping.workers(1, cluster.scheduler_address) as pool,
+        sensitivity.workers(1, cluster.scheduler_address) as pool,
     ):
         with monkeypatch.context() as patch:
-            patch.setattr(sweeping, "digest", lambda: "0" * 16)
+            patch.setattr(sensitivity, "digest", lambda: "0" * 16)
             with pytest.raises(
-                sweeping.ClusterError, match=r"runs other sources of Fognav .+ than this machine \(0000"
+                sensitivity.ClusterError, match=r"runs other sources of Fognav .+ than this machine \(0000"
             ):
-                next(sweeping.sweep(site, asked, files, pool))
+                next(sensitivity.sweep(site, asked, files, pool))
         assert files.read() == []
-        drives = list(sweeping.sweep(site, asked, files, pool))
-        assert list(sweeping.sweep(site, asked, files, pool)) == []
+        drives = list(sensitivity.sweep(site, asked, files, pool))
+        assert list(sensitivity.sweep(site, asked, files, pool)) == []
     assert {(drive.version, drive.sources) for drive in drives} == {(version("fognav-experiments"), digest())}
     assert {drive.setup for drive in drives} == {"default", "fog"}
     assert all(drive.success for drive in drives)
@@ -165,6 +164,6 @@ def test_a_cluster_of_two_workers_of_these_sources_drives_a_sweep_and_goes_on_wh
 
 
 def test_a_cluster_where_nobody_answers_is_named(monkeypatch):
-    monkeypatch.setattr(sweeping, "CONNECT_S", 0.5)
-    with pytest.raises(sweeping.ClusterError, match=r"no scheduler answers at tcp://127\.0\.0\.1:9"):
-        sweeping.workers(1, "tcp://127.0.0.1:9").__enter__()
+    monkeypatch.setattr(sensitivity, "CONNECT_S", 0.5)
+    with pytest.raises(sensitivity.ClusterError, match=r"no scheduler answers at tcp://127\.0\.0\.1:9"):
+        sensitivity.workers(1, "tcp://127.0.0.1:9").__enter__()

@@ -9,7 +9,7 @@ import pytest
 from typer.testing import CliRunner
 
 from fognav_experiments.commands.experiment import experiment_app
-from fognav_experiments.comparison.draws import ExperimentSpec, RouteSpec, draw
+from fognav_experiments.comparison.drives import ExperimentSpec, RouteSpec, draw
 from fognav_experiments.comparison.records import Folder
 
 pytestmark = [pytest.mark.live, pytest.mark.timeout(300)]

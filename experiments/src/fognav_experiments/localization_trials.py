@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
-from fognav_experiments.plots import floor, write_png
+from fognav_experiments.figures import floor, write_png
 from robot_agent.hardware import LaserScan
 from robot_agent.localization.localizer import Localizer
 from robot_agent.localization.pose import Pose2, wrap

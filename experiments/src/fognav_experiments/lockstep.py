@@ -56,7 +56,7 @@ if TYPE_CHECKING:
     from fog_contracts.site import Place
     from fog_runtime.configuration.robot_file import RobotFile
     from fog_runtime.configuration.site import LoadedSite
-    from fognav_experiments.cpu import CpuMeter
+    from fognav_experiments.machine import CpuMeter
     from fognav_experiments.rigs import Tuning
     from fognav_sim.floor import Floor
     from fognav_sim.sensors import Noise

@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, Any, Final, NamedTuple
 import numpy as np
 
 from fog_contracts.site import learned_share
-from fognav_experiments.plots import curves, write_png
+from fognav_experiments.figures import curves, write_png
 from hazard_aggregator.debounce import Observation, SonarSample, make_rule
 from hazard_aggregator.registry import find_rule
 

@@ -37,7 +37,7 @@ from fog_contracts.replica import MasterMap
 from fog_contracts.shapes import rasterize, rasterize_shape
 from fog_kernels.components import Components
 from fog_kernels.inflation import inflate, inflate_window, inflation_table
-from fognav_experiments.bench.office import CORRIDOR, corridor_rows
+from fognav_experiments.bench.common import CORRIDOR, corridor_rows
 from planner.core import PlannerCore
 
 if TYPE_CHECKING:

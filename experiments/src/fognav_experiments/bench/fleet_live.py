@@ -33,9 +33,8 @@ from fognav.output import FailedError
 from fognav.programs import PLANNER, REDIS, ROUTER
 from fognav.stack import Stack, StackConfig
 from fognav.stack_doors import Doors
+from fognav_experiments.bench.common import SITE, in_background, write_site
 from fognav_experiments.bench.fleet import closures, hazard_message, percentile
-from fognav_experiments.bench.office import SITE, write_site
-from fognav_experiments.bench.running import in_background
 
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator, Callable, Mapping, Sequence

@@ -22,8 +22,7 @@ from fog_supervisor.supervisor import NotReadyError, log_tail
 from fognav.output import FailedError
 from fognav.programs import MAP_SERVICE, PLANNER, SERVERS
 from fognav.stack import Stack, StackConfig
-from fognav_experiments.bench.office import SITE, corridor_rows, make_office, write_site
-from fognav_experiments.bench.running import in_background
+from fognav_experiments.bench.common import SITE, corridor_rows, in_background, make_office, write_site
 
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator, Callable

@@ -24,8 +24,8 @@ from fog_kernels.inflation import inflate, inflation_table
 from fog_kernels.steps import STRAIGHT
 from fog_kernels.tiles import TilePatterns
 from fog_runtime.configuration.maps import load_map
+from fognav_experiments.bench.common import make_office
 from fognav_experiments.bench.fleet import percentile
-from fognav_experiments.bench.office import make_office
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence

@@ -1,7 +1,8 @@
 """Measures how steadily a map-service sends its heartbeat while clients ask it for all that costs it time.
 
 A real process with Redis, broker and router of its own, locked as in the field; the heartbeat is timed by another
-process. The same run measures it without clients first: on a busy machine only the two together mean something.
+process (`python -m fognav_experiments.bench.rest`), in which no other work delays what it measures. The same run
+measures it without clients first: on a busy machine only the two together mean something.
 """
 
 from __future__ import annotations
@@ -11,29 +12,35 @@ import contextlib
 import itertools
 import subprocess
 import sys
+import time
 from collections import Counter
 from contextlib import asynccontextmanager, contextmanager
+from pathlib import Path
 from typing import TYPE_CHECKING, Final, Self
 
 import msgspec
 import numpy as np
 import psutil
+import zenoh
 
+from fog_contracts import channels as ch
+from fog_runtime.credentials import Credentials
 from fog_runtime.stores.redis_store import Audit
+from fog_runtime.transports.zenoh_edge import session_config
 from fog_supervisor.net import LOOPBACK
 from fognav.programs import MAP_SERVICE, PLANNER, SERVERS
 from fognav.stack import Stack, StackConfig
 from fognav.stack_doors import Doors
-from fognav_experiments.bench.costmap import random_zones, worst_shapes
-from fognav_experiments.bench.office import SITE
+from fognav_experiments.bench.common import SITE
+from fognav_experiments.bench.cores import random_zones, worst_shapes
 from map_service.store import Store
 
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator, Awaitable, Callable, Iterator, Sequence
-    from pathlib import Path
 
     from fog_contracts.grid import StaticMap
     from fog_contracts.messages import Shape, Zone
+
 
 IDLE_S: Final = 5.0
 """How long the heartbeat is measured without clients, unless told otherwise."""
@@ -109,7 +116,7 @@ async def _map_service(config: StackConfig, zones: list[Zone]) -> AsyncIterator[
 @contextmanager
 def _listener(stack: Stack) -> Iterator[subprocess.Popen[bytes]]:
     command = (
-        sys.executable, "-m", "fognav_experiments.bench.heartbeats", SITE, stack.zenoh_endpoint,
+        sys.executable, "-m", "fognav_experiments.bench.rest", SITE, stack.zenoh_endpoint,
         str(stack.doors.file(PLANNER)),
     )  # fmt: skip
     with subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE) as process:
@@ -284,3 +291,24 @@ class _Connection:
         if "\r\nconnection: close" in head:
             self._writer.close()
         return status
+
+
+def main() -> None:
+    """Listen as the command line says, until standard input ends."""
+    site, endpoint, own = sys.argv[1:]
+    config = session_config("client", connect=[endpoint], credentials=Credentials.read(Path(own)))
+    times: list[float] = []
+    with zenoh.open(config) as session:
+        session.declare_subscriber(ch.MAP_HEARTBEAT.key(site=site), lambda _: times.append(time.monotonic()))
+        begin = time.monotonic()
+        for _ in sys.stdin:
+            end = time.monotonic()
+            inside = [begin, *(at for at in times.copy() if begin < at < end), end]
+            gaps = [later - earlier for earlier, later in itertools.pairwise(inside)]
+            sys.stdout.buffer.write(msgspec.json.encode(gaps) + b"\n")
+            sys.stdout.flush()
+            begin = end
+
+
+if __name__ == "__main__":
+    main()

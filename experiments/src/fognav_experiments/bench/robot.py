@@ -28,8 +28,7 @@ from fognav.output import WrongUseError
 from fognav.programs import AGENT, PLANNER, ROBOT, WATCHDOG
 from fognav.stack import Stack, StackConfig
 from fognav.stack_doors import Doors
-from fognav_experiments.bench.office import corridor_rows, make_office
-from fognav_experiments.bench.running import RunningSystem, first_child
+from fognav_experiments.bench.common import RunningSystem, corridor_rows, first_child, make_office
 from fognav_sim.drive.operator import OperatorPolicy
 
 if TYPE_CHECKING:

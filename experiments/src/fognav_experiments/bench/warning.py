@@ -28,7 +28,7 @@ from fognav.output import FailedError
 from fognav.programs import AGGREGATOR, MAP_SERVICE, PLANNER, SERVERS, SERVICES
 from fognav.stack import Stack, StackConfig
 from fognav.stack_doors import doors_of
-from fognav_experiments.bench.running import in_background
+from fognav_experiments.bench.common import in_background
 from fognav_sim.barrier import BarrierError, barrier_across
 from fognav_sim.drive.hazard import draw_hazard, entry_distance
 from fognav_sim.live import VirtualNode, run_nodes

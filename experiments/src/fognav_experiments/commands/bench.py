@@ -15,7 +15,7 @@ from fognav import kernels
 from fognav.commands.installed import MEASURE
 from fognav.operate.options import JsonOption  # noqa: TC001  # Typer reads annotations at run time
 from fognav.output import NOT_TRUE, WrongUseError, check_writable, console, exit_codes, print_json, print_line
-from fognav_experiments.bench import machine
+from fognav_experiments import machine
 from fognav_experiments.commands.mutation import mutation_command
 
 if TYPE_CHECKING:
@@ -63,8 +63,8 @@ def fleet_command(  # noqa: PLR0913  # the options of a command
     import numpy as np  # noqa: PLC0415  # keeps the other commands fast
 
     from fognav_experiments.bench import fleet_live  # noqa: PLC0415  # same
+    from fognav_experiments.bench.common import make_office  # noqa: PLC0415  # same
     from fognav_experiments.bench.fleet import Fleet, FleetMap, measure, place_fleet  # noqa: PLC0415  # same
-    from fognav_experiments.bench.office import make_office  # noqa: PLC0415  # same
 
     kernels.warm_cache(print_line)
     rng = np.random.default_rng(seed)
@@ -120,11 +120,11 @@ def costmap_command(
     Full updates and a change of 2 x 2 m, the legal zones that cost most, the start with many zones, a snapshot. The map
     is an office of 100 x 60 m at 5 cm. Times are in ms.
     """
-    from fognav_experiments.bench import costmap  # noqa: PLC0415  # keeps the other commands fast
-    from fognav_experiments.bench.office import make_office  # noqa: PLC0415  # same
+    from fognav_experiments.bench import cores  # noqa: PLC0415  # keeps the other commands fast
+    from fognav_experiments.bench.common import make_office  # noqa: PLC0415  # same
 
     kernels.warm_cache(print_line)
-    figures = costmap.measure(make_office(seed=seed), zones, repeats)
+    figures = cores.measure_costmap(make_office(seed=seed), zones, repeats)
     _show("costmap", {"repeats": repeats, "seed": seed}, figures, json=json)
 
 
@@ -168,7 +168,7 @@ def rest_command(
     send and read slowly; another process times the heartbeat (100 ms), without clients (`idle_`) and with them.
     """
     from fognav_experiments.bench import rest  # noqa: PLC0415  # keeps the other commands fast
-    from fognav_experiments.bench.office import make_office, write_site  # noqa: PLC0415  # same
+    from fognav_experiments.bench.common import make_office, write_site  # noqa: PLC0415  # same
 
     kernels.warm_cache(print_line)
     floor = make_office()
@@ -193,11 +193,11 @@ def localization_command(
     One cycle of the particle filter (move, weight, cluster, resample) beside the same with plainly written scores, the
     match of a scan, and the search of a whole office of 100 x 60 m at 5 cm. Times are in ms.
     """
-    from fognav_experiments.bench import localization  # noqa: PLC0415  # keeps the other commands fast
-    from fognav_experiments.bench.office import make_office  # noqa: PLC0415  # same
+    from fognav_experiments.bench import cores  # noqa: PLC0415  # keeps the other commands fast
+    from fognav_experiments.bench.common import make_office  # noqa: PLC0415  # same
 
     kernels.warm_cache(print_line)
-    figures = localization.measure(make_office(seed=seed), particles, beams, repeats, seed)
+    figures = cores.measure_localization(make_office(seed=seed), particles, beams, repeats, seed)
     asked = {"particles": particles, "beams": beams, "repeats": repeats, "seed": seed}
     _show("localization", asked, figures, json=json)
 
@@ -254,10 +254,10 @@ def dwa_command(
     The distances around it and the choice, for a round body and a rectangle in a corridor, and a whole decision. Times
     are in ms; `peer_ratio` is by 1.75 ms, which ROS 1's local planner took for as many arcs on another x86 server.
     """
-    from fognav_experiments.bench import dwa  # noqa: PLC0415  # keeps the other commands fast
+    from fognav_experiments.bench import cores  # noqa: PLC0415  # keeps the other commands fast
 
     kernels.warm_cache(print_line)
-    figures = dwa.measure(repeats)
+    figures = cores.measure_dwa(repeats)
     _show("dwa", {"repeats": repeats}, figures, json=json)
 
 
@@ -411,14 +411,7 @@ def reactions_command(
     slow. A trial takes some five seconds. Exit code 1: a trial was beyond its limit.
     """
     from fognav_experiments.bench.reactions.faults import FAULTS  # noqa: PLC0415  # same
-    from fognav_experiments.bench.reactions.trials import (  # noqa: PLC0415  # same
-        due,
-        markdown,
-        measure,
-        read_log,
-        remarks,
-        row,
-    )
+    from fognav_experiments.bench.reactions.trials import due, markdown, measure, read_log, remarks, row  # noqa: PLC0415  # same
 
     kernels.warm_cache(print_line)
     with exit_codes():

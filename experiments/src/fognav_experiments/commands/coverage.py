@@ -111,7 +111,7 @@ def _as_json(site: Site, found: Coverage) -> dict[str, Any]:
 
 def _draw(loaded: LoadedSite, found: Coverage, file: Path) -> None:
     """Draw areas in blue, what nodes see in green, and routes: red where they are blind."""
-    from fognav_experiments.plots import floor, write_png  # noqa: PLC0415  # keeps the other commands fast
+    from fognav_experiments.figures import floor, write_png  # noqa: PLC0415  # keeps the other commands fast
 
     figure, axes = floor(loaded.map)
     for area in found.areas:

@@ -22,13 +22,12 @@ if TYPE_CHECKING:
 
     from fog_contracts.messages import ProfileName
     from fog_runtime.configuration.site import LoadedSite
-    from fognav_experiments.comparison.draws import RouteDraw
+    from fognav_experiments.comparison.drives import MeasuredDrive, RouteDraw
     from fognav_experiments.comparison.live_drive import LiveOptions
-    from fognav_experiments.comparison.measured import MeasuredDrive
     from fognav_experiments.comparison.records import DriveFiles, Folder, Record
     from fognav_experiments.comparison.runner import Task
+    from fognav_experiments.comparison.sensitivity import Plane, SweptDrive
     from fognav_experiments.scenarios.stage import Played
-    from fognav_experiments.sensitivity.planes import Plane, SweptDrive
 
     D = TypeVar("D", Record, MeasuredDrive, SweptDrive)
 
@@ -84,10 +83,10 @@ def experiment_command(  # noqa: PLR0913  # each option is an argument
     if context.invoked_subcommand is not None:
         return
     from fog_runtime.configuration.site import SiteError, load_site  # noqa: PLC0415  # keeps the other commands fast
-    from fognav_experiments.bench import machine  # noqa: PLC0415  # same
-    from fognav_experiments.comparison import archive, runner  # noqa: PLC0415  # same
+    from fognav_experiments import machine  # noqa: PLC0415  # same
+    from fognav_experiments.comparison import runner  # noqa: PLC0415  # same
     from fognav_experiments.comparison.live_drive import LiveOptions  # noqa: PLC0415  # same
-    from fognav_experiments.comparison.records import Folder, FolderError  # noqa: PLC0415  # same
+    from fognav_experiments.comparison.records import Folder, FolderError, unpack_archive  # noqa: PLC0415  # same
 
     with exit_codes():
         if out is None:
@@ -105,7 +104,7 @@ def experiment_command(  # noqa: PLR0913  # each option is an argument
             folder, commit = Folder(out), checkout.revision()
             begun = runner.new(loaded, place, seed)
             if source is not None:
-                print_line(f"{archive.unpack(source, folder, begun)} drives of {source} added to {out}")
+                print_line(f"{unpack_archive(source, folder, begun)} drives of {source} added to {out}")
             folder.begin(begun, {"commit": commit, **machine.describe()})
         except (SiteError, runner.SpecError, FolderError) as error:
             raise WrongUseError(str(error)) from error
@@ -165,8 +164,8 @@ def report_command(
     drives.
     """
     from fog_runtime.configuration.site import SiteError  # noqa: PLC0415  # keeps the other commands fast
-    from fognav_experiments.comparison.publish import publish  # noqa: PLC0415  # keeps the other commands fast
     from fognav_experiments.comparison.records import FolderError  # noqa: PLC0415  # same
+    from fognav_experiments.comparison.report import publish  # noqa: PLC0415  # keeps the other commands fast
     from fognav_experiments.comparison.runner import SpecError  # noqa: PLC0415  # same
 
     with exit_codes():
@@ -187,8 +186,7 @@ def _records_of(source: Path, with_live: Sequence[Path] = ()) -> Iterator[Folder
 
     `with_live`: folders and archives whose drives by real processes are added, in a folder that lasts as long.
     """
-    from fognav_experiments.comparison import archive  # noqa: PLC0415  # keeps the other commands fast
-    from fognav_experiments.comparison.records import Folder  # noqa: PLC0415  # same
+    from fognav_experiments.comparison.records import Folder, unpack_archive  # noqa: PLC0415  # keeps the other commands fast
 
     if not source.is_file() and not with_live:
         yield Folder(source)
@@ -196,7 +194,7 @@ def _records_of(source: Path, with_live: Sequence[Path] = ()) -> Iterator[Folder
     with TemporaryDirectory(prefix="fognav-records-") as temporary:
         folder = Folder(Path(temporary))
         if source.is_file():
-            archive.unpack(source, folder)
+            unpack_archive(source, folder)
         else:
             folder.add(Folder(source))
         for other in with_live:
@@ -329,8 +327,11 @@ def sensitivity_command(  # noqa: PLR0913  # each option is an argument
     from fog_runtime.configuration.site import SiteError, load_site  # noqa: PLC0415  # keeps the other commands fast
     from fognav_experiments.comparison import runner  # noqa: PLC0415  # same
     from fognav_experiments.comparison.records import Folder, FolderError  # noqa: PLC0415  # same
-    from fognav_experiments.sensitivity.planes import Axis, Plane  # noqa: PLC0415  # same
-    from fognav_experiments.sensitivity.sweep import ClusterError  # noqa: PLC0415  # same
+    from fognav_experiments.comparison.sensitivity import (  # noqa: PLC0415  # same
+        Axis,
+        ClusterError,  # same
+        Plane,
+    )
 
     with exit_codes():
         swept, command = [], "fognav experiment sensitivity"
@@ -359,7 +360,7 @@ def sensitivity_command(  # noqa: PLR0913  # each option is an argument
 
 
 def _measured_on() -> dict[str, object]:
-    from fognav_experiments.bench import machine  # noqa: PLC0415  # keeps the other commands fast
+    from fognav_experiments import machine  # noqa: PLC0415  # keeps the other commands fast
 
     return {"commit": checkout.revision(), **machine.describe()}
 
@@ -375,17 +376,17 @@ def _sweep(  # noqa: PLR0913  # what is driven, where and how
     cluster: str | None,
 ) -> int:
     """Drive a sweep and publish it; return how many drives failed."""
+    from fognav_experiments.comparison import sensitivity  # noqa: PLC0415  # same
     from fognav_experiments.comparison.records import DriveFiles  # noqa: PLC0415  # keeps the other commands fast
-    from fognav_experiments.sensitivity import planes, publish, sweep  # noqa: PLC0415  # same
 
     node_code.prepare(print_line)
     kernels.warm_cache(print_line)
-    asked, files = planes.sweep_tasks(swept, drawn), DriveFiles(folder.path / "sweep", planes.SweptDrive)
+    asked, files = sensitivity.sweep_tasks(swept, drawn), DriveFiles(folder.path / "sweep", sensitivity.SweptDrive)
     names = [task.name for task in asked]
-    with sweep.workers(jobs or os.cpu_count() or 1, cluster) as pool:
-        failed = _show(names, files, sweep.sweep(site, asked, files, pool, checkout.revision()))
+    with sensitivity.workers(jobs or os.cpu_count() or 1, cluster) as pool:
+        failed = _show(names, files, sensitivity.sweep(site, asked, files, pool, checkout.revision()))
     drives = [drive for drive in files.read() if drive.name in names]
-    for file in publish.publish(drives, swept, command, folder.description()["measured_on"], folder.path):
+    for file in sensitivity.publish(drives, swept, command, folder.description()["measured_on"], folder.path):
         print_line(str(file))
     return failed
 

@@ -17,9 +17,8 @@ if TYPE_CHECKING:
 
     from fog_contracts.messages import PointXY, ProfileName
     from fog_runtime.configuration.site import LoadedSite
-    from fognav_experiments.comparison.draws import RouteDraw
+    from fognav_experiments.comparison.drives import RouteDraw, Timeline
     from fognav_experiments.comparison.records import Record
-    from fognav_experiments.comparison.timeline import Timeline
 
 FRAME_S: Final = 4.0
 """Simulated time from one picture to the next."""

@@ -16,7 +16,7 @@ from fognav.operate.fog import RefusedError
 from fognav.operate.robots import connect
 from fognav.operate.systems import PLANNER
 from fognav.output import FailedError, WrongUseError
-from fognav_experiments.comparison.guided import GuidedDrive, stands_at, start_of, where_to_place
+from fognav_experiments.comparison.drives import GuidedDrive, stands_at, start_of, where_to_place
 from fognav_sim.drive.drive import DriveOutcome
 from fognav_sim.drive.hazard import HazardRequest, HazardSchedule
 
@@ -30,7 +30,7 @@ if TYPE_CHECKING:
     from fognav.operate.fog import Fog
     from fognav.operate.outcome import Outcome
     from fognav.operate.robots import Robot
-    from fognav_experiments.comparison.measured import MeasuredDrive
+    from fognav_experiments.comparison.drives import MeasuredDrive
     from fognav_experiments.comparison.records import DriveFiles
     from fognav_experiments.comparison.runner import Task
     from fognav_sim.drive.hazard import PlannedHazard

@@ -24,9 +24,7 @@ from fognav.demo.options import Options
 from fognav.demo.run import Demo
 from fognav.output import FailedError
 from fognav_experiments.bench.robot import NORMAL_PRIORITY, cpu_quota
-from fognav_experiments.comparison.draws import RouteDraw
-from fognav_experiments.comparison.driven import drive_name, facts
-from fognav_experiments.comparison.measured import MeasuredDrive
+from fognav_experiments.comparison.drives import MeasuredDrive, RouteDraw, drive_name, facts
 from fognav_experiments.comparison.records import DriveFiles
 from fognav_experiments.comparison.runner import Task
 from fognav_sim.drive.hazard import HazardRequest

@@ -1,87 +1,61 @@
-"""The report of a comparison: the thesis's figures and tables with ours beside them, and what ours adds. Pure."""
+"""The report of a comparison: what the fog saves by route, setup and component, and its files.
+
+Markdown with its figures, one HTML file, CSV of drives and means, and the archive of all records.
+"""
 
 from __future__ import annotations
 
-from collections import defaultdict
-from typing import TYPE_CHECKING, Any, Final, NamedTuple
+import csv
+import io
+from typing import TYPE_CHECKING, Any, Final
 
-from fognav_experiments import plots
-from fognav_experiments.comparison import agreement, limits, repeated
-from fognav_experiments.comparison.document import Block, Code, Figure, Heading, Paragraph, Table, flat
-from fognav_experiments.comparison.driven import route_ends
-from fognav_experiments.comparison.records import ALIKE, MOVE_BASE, OF_FOG, ON_FOG, ON_ROBOT, machines
+from fog_runtime.configuration.site import load_site
+from fog_runtime.files import SHARED, atomic_write
+from fognav_experiments import figures
+from fognav_experiments.comparison import limits, repeated, runner
+from fognav_experiments.comparison.document import (
+    Block,
+    Code,
+    Figure,
+    Heading,
+    Paragraph,
+    Table,
+    flat,
+    to_html,
+    to_markdown,
+)
+from fognav_experiments.comparison.drives import KINDS, draw, route_ends
+from fognav_experiments.comparison.limits import RouteGeometry
+from fognav_experiments.comparison.records import (
+    ALIKE,
+    ARCHIVE,
+    MOVE_BASE,
+    OF_FOG,
+    ON_FOG,
+    ON_ROBOT,
+    FolderError,
+    machines,
+    write_archive,
+    write_csv,
+)
 from fognav_experiments.comparison.repeated import SETUPS
-from fognav_experiments.comparison.thesis import PLACES, REPORTED
-from fognav_experiments.statistics import Estimate, compare, estimate
+from fognav_experiments.comparison.thesis import QUANTITIES, Drives, beside_thesis, paired, places
+from fognav_experiments.figures import Estimate, compare, estimate
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Mapping, Sequence
+    from collections.abc import Mapping, Sequence
+    from pathlib import Path
 
     from fog_contracts.messages import ProfileName
     from fog_contracts.site import Site
-    from fognav_experiments.comparison.geometry import Saving
-    from fognav_experiments.comparison.measured import MeasuredDrive
-    from fognav_experiments.comparison.records import Record
+    from fog_runtime.configuration.site import LoadedSite
+    from fognav_experiments.comparison.drives import MeasuredDrive
+    from fognav_experiments.comparison.limits import Saving
+    from fognav_experiments.comparison.records import Folder, Record
+
 
 TITLE: Final = "What the fog saves a robot: the thesis's experiment, repeated"
 PAIRS: Final[tuple[tuple[ProfileName, ProfileName], ...]] = (("default", "full"), ("default", "fog"), ("full", "fog"))
-
-Drives = dict["ProfileName", "Record"]
-
-
-class Quantity(NamedTuple):
-    """A measured quantity: its figure's title, unit, name of the file, and its value for a drive."""
-
-    title: str
-    unit: str
-    file: str
-    caption: str
-    value: Callable[[Record], float]
-
-
-QUANTITIES: Final = (
-    Quantity(
-        "Distance per route",
-        "m",
-        "distance",
-        "As figures 6.3 and 6.7 of the thesis: mean distance per route, with 95 % confidence intervals.",
-        lambda record: record.distance_m,
-    ),
-    Quantity(
-        "Time per route",
-        "s",
-        "time",
-        "As figures 6.4 and 6.8: mean time per route, with 95 % confidence intervals.",
-        lambda record: record.time_s or 0.0,
-    ),
-    Quantity(
-        "CPU of what move_base held",
-        "% of a core",
-        "cpu-move-base",
-        "As figures 6.5 and 6.9: global planning, layers and local planning, with 95 % confidence intervals.",
-        lambda record: record.cpu_percent(MOVE_BASE),
-    ),
-    Quantity(
-        "CPU of the whole robot",
-        "% of a core",
-        "cpu-robot",
-        "Not in the thesis: all that the robot computes, without the input and output of its processes.",
-        lambda record: record.cpu_percent(ON_ROBOT),
-    ),
-)
-
-
-def paired(records: Sequence[Record]) -> list[Drives]:
-    """Return the drives of each run and route of which every setup that was tried at all has a successful one."""
-    tried = {record.setup for record in records}
-    drives: dict[tuple[int, str], Drives] = defaultdict(dict)
-    for record in records:
-        drives[record.run, record.route][record.setup] = record
-    return [
-        by_setup
-        for _, by_setup in sorted(drives.items())
-        if by_setup.keys() == tried and all(record.success for record in by_setup.values())
-    ]
 
 
 def build(
@@ -109,9 +83,9 @@ def build(
     return [
         *blocks,
         Heading("Beside the thesis"),
-        *_beside_thesis(pairs, met, setups, measured, records),
+        *beside_thesis(pairs, met, setups, measured, records),
         Heading("Each figure of the thesis, and where it is here"),
-        *_places(measured, records),
+        *places(measured, records),
         Heading("Distance, time and computation per route"),
         *_routes(pairs, setups),
         Heading("Paired differences"),
@@ -119,7 +93,7 @@ def build(
         *_bounds(pairs, savings),
         Heading("Where the computation goes"),
         *_components(pairs, setups, measured),
-        *agreement.agreement(measured, records, str(experiment["measured_on"].get("commit", ""))),
+        *repeated.agreement(measured, records, str(experiment["measured_on"].get("commit", ""))),
         *repeated.beside_lockstep(measured, records),
         *_cost(measured),
         Heading("One drive, seen from above"),
@@ -195,99 +169,13 @@ def _bounds(pairs: Sequence[Drives], savings: Mapping[tuple[int, str], Saving]) 
         )
         for drives in both
     ]
-    blocks = limits.geometry(drives)
+    blocks = limits.allowed_savings(drives)
     return [Heading("What the floor allows to save"), *blocks] if blocks else []
 
 
 def _cost(measured: Sequence[MeasuredDrive]) -> list[Block]:
-    cost = [*agreement.resources(measured), *repeated.memory(measured)]
+    cost = [*repeated.resources(measured), *repeated.memory(measured)]
     return [Heading("What the robot's processes cost"), *cost] if cost else []
-
-
-def _beside_thesis(
-    pairs: Sequence[Drives],
-    met: Sequence[Drives],
-    setups: Sequence[ProfileName],
-    measured: Sequence[MeasuredDrive],
-    records: Sequence[Record],
-) -> list[Block]:
-    ours = {"6.3, 6.7": _saved(pairs, met, QUANTITIES[0]), "6.4, 6.8": _saved(pairs, met, QUANTITIES[1])}
-    shares = {setup: _mean(pairs, setup, QUANTITIES[2]) for setup in setups}
-    ours["6.5, 6.9"] = ", ".join(f"{setup} {found.mean:.2f} %" for setup, found in shares.items())
-    if "default" in shares and "fog" in shares:
-        whole = [_mean(pairs, setup, QUANTITIES[3]).mean for setup in ("default", "fog")]
-        ours["6.5, 6.9"] += f": default / fog = {shares['default'].mean / shares['fog'].mean:.1f}"
-        if "full" in shares:
-            lower_rates = shares["default"].mean / shares["full"].mean
-            ours["6.5, 6.9"] += f", of which default / full, by lower rates above all, {lower_rates:.1f}"
-        ours["6.5, 6.9"] += f"; whole robot {whole[0]:.2f} % and {whole[1]:.2f} %: {whole[0] / whole[1]:.1f}"
-        if (live := agreement.of_processes(measured)) is not None:
-            ours["6.5, 6.9"] += f"; its real processes {live[0]:.2f} % and {live[1]:.2f} %: {live[0] / live[1]:.2f}"
-    ours["6.6, 6.10"] = _memory(measured)
-    reactions = [record.reaction_s for drives in pairs for record in drives.values() if record.reaction_s is not None]
-    if reactions:
-        ours["(text)"] = (
-            f"{estimate(reactions).mean:.2f} s from the first echo to the first wheel command "
-            f"({len(reactions)} drives); not comparable, see below"
-        )
-    rows = [
-        [row.figures, row.subject, row.simulated, row.real, ours.get(row.figures, "not measured")] for row in REPORTED
-    ]
-    return [
-        Table(["figure", "what", "thesis, simulated", "thesis, real", "here"], rows),
-        Paragraph(
-            "The thesis draws one of two or three corridors to be blocked, so that often the blocked one is "
-            f"not on the robot's way. The obstacle met a robot that did not know of it in {len(met)} of "
-            f"{len(pairs)} drives here. The floor is another one, made in the manner of the thesis's. Its "
-            f"figures 6.11 and 6.12 compare simulation and reality, {_reality(measured, records)}."
-        ),
-        Paragraph(
-            "Times of `default` and `full`, and what `fog` saves of them, are about 2 s too large: in lockstep a robot "
-            "that plans for itself begins to drive that much after the start, for it has only just changed its setup. "
-            "Real processes wait for it first."
-        ),
-        Paragraph(
-            "The time from an echo to a wheel command is not comparable with the thesis's 3 s: lockstep has the "
-            "waiting times (of measuring, debouncing and control), but no radio, no brokers and no time of "
-            "computation, all of which the thesis's robot had. `fognav demo --report FILE` measures it over real "
-            "processes."
-        ),
-    ]
-
-
-def _reality(measured: Sequence[MeasuredDrive], records: Sequence[Record]) -> str:
-    driven = sum(drive.kind == "hardware" for drive in measured)
-    if driven:
-        return f"as do {driven} drives of a real robot, further below"
-    live = len(agreement.compared(measured, records))
-    return "for which there is no robot here" + (
-        f": {live} drives by real processes on a simulated one are compared with lockstep, further below"
-        if live
-        else ""
-    )
-
-
-def _memory(measured: Sequence[MeasuredDrive]) -> str:
-    """Return in words the largest memory of the robot's processes, by setup."""
-    peaks: dict[str, float] = {}
-    for drive in measured:
-        if (peak := drive.robots_peak_mb()) is not None:
-            peaks[drive.setup] = max(peak, peaks.get(drive.setup, 0.0))
-    if not peaks:
-        return "all setups run in one process in lockstep, which says nothing of a robot's memory"
-    words = ", ".join(f"{setup} {peaks[setup]:.0f} MB" for setup in SETUPS if setup in peaks)
-    return f"largest of all the robot's processes together: {words}"
-
-
-def _saved(pairs: Sequence[Drives], met: Sequence[Drives], quantity: Quantity) -> str:
-    """Return in words what `fog` saves against `default`."""
-    words = ["default - fog"]
-    for subject, chosen in (("all", pairs), ("obstacle met", met)):
-        both = [drives for drives in chosen if "default" in drives and "fog" in drives]
-        if both:
-            found = compare([quantity.value(d["default"]) for d in both], [quantity.value(d["fog"]) for d in both])
-            words.append(f"{subject}: {limits.text(found.difference)} {quantity.unit}")
-    return "; ".join(words) if len(words) > 1 else "not measured"
 
 
 def _routes(pairs: Sequence[Drives], setups: Sequence[ProfileName]) -> list[Block]:
@@ -302,11 +190,11 @@ def _routes(pairs: Sequence[Drives], setups: Sequence[ProfileName]) -> list[Bloc
             for setup in setups
         }
         rows = [
-            [route_ends(route), *(limits.text(series[setup][number]) for setup in setups)]
+            [route_ends(route), *(str(series[setup][number]) for setup in setups)]
             for number, route in enumerate(routes)
         ]
         groups = [route_ends(route) for route in routes]
-        svg = plots.bars(quantity.title, quantity.unit, groups, series)
+        svg = figures.bars(quantity.title, quantity.unit, groups, series)
         blocks.append(Figure(f"{quantity.file}.svg", svg, quantity.caption))
         blocks.append(Table([f"{quantity.title}, {quantity.unit}", *setups], rows))
     return blocks
@@ -326,7 +214,7 @@ def _differences(pairs: Sequence[Drives], met: Sequence[Drives], setups: Sequenc
                     [quantity.value(drives[after]) for drives in chosen],
                 )
                 rows.append([
-                    f"{before} - {after}", subject, f"{quantity.title}, {quantity.unit}", limits.text(found.difference),
+                    f"{before} - {after}", subject, f"{quantity.title}, {quantity.unit}", str(found.difference),
                     str(found.difference.n), _probability(found.p_t), _probability(found.p_flip),
                 ])  # fmt: skip
     return [
@@ -371,7 +259,7 @@ def _components(
             {name: _share(pairs, setup, [name]) for name in MOVE_BASE} if setup in setups else {} for setup in SETUPS
         )
         whole = _share(pairs, "default", ON_ROBOT), _share(pairs, "fog", ON_ROBOT)
-        blocks.append(limits.computation(default, full or None, fog, whole, agreement.of_processes(measured)))
+        blocks.append(limits.computation(default, full or None, fog, whole, repeated.of_processes(measured)))
     return blocks
 
 
@@ -384,7 +272,7 @@ def _tracks(pairs: Sequence[Drives], setups: Sequence[ProfileName], site: Site |
     drives = max(pairs, key=lambda drives: drives[first].distance_m - drives[last].distance_m)
     record = drives[first]
     blocked, stops = _ends(record, site) if site is not None else ((), {})
-    svg = plots.tracks({setup: drives[setup].track for setup in setups}, blocked, stops)
+    svg = figures.tracks({setup: drives[setup].track for setup in setups}, blocked, stops)
     lengths = ", ".join(f"{setup} {drives[setup].distance_m:.0f} m" for setup in setups)
     caption = (
         f"As figures 6.1 and 6.2: run {record.run}, {route_ends(record.route)}, {record.area} is blocked: {lengths}."
@@ -398,19 +286,6 @@ def _ends(record: Record, site: Site) -> tuple[Sequence[tuple[float, float]], di
     names = [name for name in site.places if record.route.startswith(name) or record.route.endswith(name)]
     stops = {name.upper(): (site.places[name].x, site.places[name].y) for name in names}
     return [(x, y) for x, y in blocked], stops
-
-
-def _places(measured: Sequence[MeasuredDrive], records: Sequence[Record]) -> list[Block]:
-    """Return where a reader of the thesis finds its figures again."""
-    real = any(drive.kind == "hardware" for drive in measured)
-    known = repeated.places(measured, records)
-    rows = [[figure, shows, place.format(**known)] for figure, shows, place in PLACES]
-    words = "Its chapter 6 has no tables. Figures of its real runs (6.7 to 6.12) are those of a robot; " + (
-        "drives of a real one are among those by real processes."
-        if real
-        else "here all robots are simulated, until `fognav experiment --hardware` drives one."
-    )
-    return [Table(["figure", "shows", "here"], rows), Paragraph(words)]
 
 
 def _failures(records: Sequence[Record], measured: Sequence[MeasuredDrive]) -> list[Block]:
@@ -456,11 +331,45 @@ def summary_rows(records: Sequence[Record]) -> list[list[str]]:
     return rows
 
 
-def _mean(pairs: Sequence[Drives], setup: ProfileName, quantity: Quantity) -> Estimate:
-    return estimate([quantity.value(drives[setup]) for drives in pairs])
-
-
 def _probability(p: float | None) -> str:
     if p is None:
         return "-"
     return "< 0.0001" if p < 0.0001 else f"{p:.4f}"
+
+
+def publish(folder: Folder, target: Path, site: Path | None = None) -> list[Path]:
+    """Write the report of a folder's records into another one, or the same; return its files. Raises `FolderError`.
+
+    `site`: folder of the floor; with it the report says what the map allows, if the drives were on this very floor.
+    """
+    experiment, records = folder.description(), folder.drives.read()
+    measured = [drive for kind in KINDS for drive in folder.measured(kind).read()]
+    if not records:
+        raise FolderError(f"{folder.path} holds no drives yet: run `fognav experiment --out {folder.path}` first")
+    known = site is not None and runner.site_digest(site) == experiment["asked"]["site_digest"]
+    loaded = load_site(site) if known and site is not None else None
+    savings = {} if site is None or loaded is None else _savings(records, experiment["asked"], site, loaded)
+    blocks = build(records, experiment, savings, measured, None if loaded is None else loaded.site)
+    summary = io.StringIO()
+    csv.writer(summary, lineterminator="\n").writerows(summary_rows(records))
+    texts = {
+        "README.md": to_markdown(blocks),
+        "report.html": to_html(TITLE, blocks),
+        "summary.csv": summary.getvalue(),
+        **{block.file: block.svg for block in blocks if isinstance(block, Figure)},
+    }
+    for name, text in texts.items():
+        atomic_write(target / name, text.encode(), mode=SHARED)
+    write_csv(target / "drives.csv", records)
+    write_archive(folder, target / ARCHIVE)
+    return [target / name for name in (*texts, "drives.csv", ARCHIVE)]
+
+
+def _savings(
+    records: Sequence[Record], asked: dict[str, Any], place: Path, site: LoadedSite
+) -> dict[tuple[int, str], Saving]:
+    """Return, by run and route, what the map of the drives allows to save."""
+    spec, geometry = runner.read_spec(site, place), RouteGeometry(site)
+    drawn = [route for run in {record.run for record in records} for route in draw(spec, asked["seed"], run)]
+    found = {(route.run, route.route.name): geometry.saving(route) for route in drawn}
+    return {key: saving for key, saving in found.items() if saving is not None}

@@ -3,22 +3,28 @@
 from __future__ import annotations
 
 import hashlib
+import os
+import time
 import tomllib
 from concurrent.futures import FIRST_COMPLETED, wait
 from functools import cache
+from importlib.metadata import version
 from typing import TYPE_CHECKING, NamedTuple
 
 import msgspec
 
+from fog_contracts.bus import Bus
+from fog_contracts.messages import Pose
+from fog_contracts.stages import TOTAL
 from fog_runtime.configuration.site import load_site
-from fognav_experiments import worker_pool
-from fognav_experiments.comparison.draws import ExperimentSpec, draw
-from fognav_experiments.comparison.driven import drive_name
-from fognav_experiments.comparison.geometry import RouteGeometry
-from fognav_experiments.comparison.records import Asked, Folder, FolderError
-from fognav_experiments.comparison.trial import drive
-from fognav_experiments.lockstep import release_drives
+from fognav_experiments import machine
+from fognav_experiments.comparison.drives import ExperimentSpec, TimelineRecorder, draw, drive_name, facts
+from fognav_experiments.comparison.limits import RouteGeometry
+from fognav_experiments.comparison.records import Asked, Folder, FolderError, Record
+from fognav_experiments.lockstep import release_drives, run_lockstep
+from fognav_experiments.machine import CpuMeter
 from fognav_sim.barrier import BarrierError, barrier_across
+from fognav_sim.drive.hazard import HazardRequest
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
@@ -26,8 +32,49 @@ if TYPE_CHECKING:
 
     from fog_contracts.messages import ProfileName
     from fog_runtime.configuration.site import LoadedSite
-    from fognav_experiments.comparison.draws import RouteDraw
-    from fognav_experiments.comparison.records import Record
+    from fognav_experiments.comparison.drives import RouteDraw
+
+
+def drive(site: LoadedSite, drawn: RouteDraw, setup: ProfileName, jobs: int = 1, commit: str = "") -> Record:
+    """Drive a drawn route in a setup; the same but for CPU and wall time whenever it is repeated.
+
+    `jobs` (drives that run at the same time on this machine) and `commit` are only recorded. Raises `BarrierError` for
+    an area that no barrier closes.
+    """
+    places = site.site.places
+    origin, goal = places[drawn.route.start], places[drawn.route.goal]
+    start = Pose(x=origin.x, y=origin.y, theta=drawn.theta if origin.theta is None else origin.theta)
+    cpu, bus = CpuMeter(), Bus(site.site.id)
+    recorder = TimelineRecorder(bus, setup)
+    begun = time.perf_counter()
+    result = run_lockstep(
+        site,
+        start,
+        goal,
+        drawn.seed,
+        HazardRequest(area=drawn.area, trigger_m=drawn.trigger_m),
+        watched=setup != "default",
+        profile=setup,
+        cpu=cpu,
+        bus=bus,
+    )
+    appears = (event.time_s for event in result.events if event.description.startswith("barrier appears"))
+    total = result.stages_ms.get(TOTAL)
+    return msgspec.convert(
+        facts(Record, drawn, setup, result)
+        | {
+            "reaction_s": None if total is None else total / 1000.0,
+            "cpu_s": {name: round(seconds, 4) for name, seconds in sorted(cpu.seconds.items())},
+            "jobs": jobs,
+            "load": round(os.getloadavg()[0], 2),
+            "wall_s": round(time.perf_counter() - begun, 1),
+            "version": version("fognav-experiments"),
+            "commit": commit,
+            "timeline": None if result.time_s is None else recorder.timeline(result.time_s, next(appears, None)),
+        },
+        Record,
+    )
+
 
 SPEC_FILE = "experiment.toml"
 _RUNS_TO_SEARCH = 50
@@ -97,7 +144,7 @@ def run(site_folder: Path, asked: list[Task], folder: Folder, jobs: int = 1, com
             folder.drives.write(record)
             yield record
         return
-    with worker_pool.open_pool(jobs) as pool:
+    with machine.open_pool(jobs) as pool:
         waiting = {pool.submit(_drive, site_folder, task, jobs, commit) for task in due}
         while waiting:
             done, waiting = wait(waiting, return_when=FIRST_COMPLETED)

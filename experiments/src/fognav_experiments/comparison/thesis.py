@@ -1,8 +1,25 @@
-"""What the thesis reports (Mendes 2022, chapter 6), as its text states it; its figures give no numbers."""
+"""What the thesis reports (Mendes 2022, chapter 6), as its text states it, and the same quantities here. Pure.
+
+Its figures give no numbers.
+"""
 
 from __future__ import annotations
 
-from typing import Final, NamedTuple
+from collections import defaultdict
+from typing import TYPE_CHECKING, Final, NamedTuple
+
+from fognav_experiments.comparison import repeated
+from fognav_experiments.comparison.document import Block, Paragraph, Table
+from fognav_experiments.comparison.records import MOVE_BASE, ON_ROBOT
+from fognav_experiments.comparison.repeated import SETUPS
+from fognav_experiments.figures import Estimate, compare, estimate
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Sequence
+
+    from fog_contracts.messages import ProfileName
+    from fognav_experiments.comparison.drives import MeasuredDrive
+    from fognav_experiments.comparison.records import Record
 
 
 class Reported(NamedTuple):
@@ -62,5 +79,165 @@ PLACES: Final = (
     ("6.12", "time, simulated and real", "{time}"),
 )
 """The thesis's figures of chapter 6: what each shows, and where a report has the same."""
-MEMORY_UNKNOWN: Final = "only by real processes (fognav experiment --live): lockstep runs all setups in one"
-REALITY_UNKNOWN: Final = "only by real processes (fognav experiment --live or --hardware)"
+
+
+Drives = dict["ProfileName", "Record"]
+
+
+class Quantity(NamedTuple):
+    """A measured quantity: its figure's title, unit, name of the file, and its value for a drive."""
+
+    title: str
+    unit: str
+    file: str
+    caption: str
+    value: Callable[[Record], float]
+
+
+QUANTITIES: Final = (
+    Quantity(
+        "Distance per route",
+        "m",
+        "distance",
+        "As figures 6.3 and 6.7 of the thesis: mean distance per route, with 95 % confidence intervals.",
+        lambda record: record.distance_m,
+    ),
+    Quantity(
+        "Time per route",
+        "s",
+        "time",
+        "As figures 6.4 and 6.8: mean time per route, with 95 % confidence intervals.",
+        lambda record: record.time_s or 0.0,
+    ),
+    Quantity(
+        "CPU of what move_base held",
+        "% of a core",
+        "cpu-move-base",
+        "As figures 6.5 and 6.9: global planning, layers and local planning, with 95 % confidence intervals.",
+        lambda record: record.cpu_percent(MOVE_BASE),
+    ),
+    Quantity(
+        "CPU of the whole robot",
+        "% of a core",
+        "cpu-robot",
+        "Not in the thesis: all that the robot computes, without the input and output of its processes.",
+        lambda record: record.cpu_percent(ON_ROBOT),
+    ),
+)
+
+
+def paired(records: Sequence[Record]) -> list[Drives]:
+    """Return the drives of each run and route of which every setup that was tried at all has a successful one."""
+    tried = {record.setup for record in records}
+    drives: dict[tuple[int, str], Drives] = defaultdict(dict)
+    for record in records:
+        drives[record.run, record.route][record.setup] = record
+    return [
+        by_setup
+        for _, by_setup in sorted(drives.items())
+        if by_setup.keys() == tried and all(record.success for record in by_setup.values())
+    ]
+
+
+def beside_thesis(
+    pairs: Sequence[Drives],
+    met: Sequence[Drives],
+    setups: Sequence[ProfileName],
+    measured: Sequence[MeasuredDrive],
+    records: Sequence[Record],
+) -> list[Block]:
+    """Return the thesis's figures with ours beside them, and how they can be compared."""
+    ours = {"6.3, 6.7": _saved(pairs, met, QUANTITIES[0]), "6.4, 6.8": _saved(pairs, met, QUANTITIES[1])}
+    shares = {setup: _mean(pairs, setup, QUANTITIES[2]) for setup in setups}
+    ours["6.5, 6.9"] = ", ".join(f"{setup} {found.mean:.2f} %" for setup, found in shares.items())
+    if "default" in shares and "fog" in shares:
+        whole = [_mean(pairs, setup, QUANTITIES[3]).mean for setup in ("default", "fog")]
+        ours["6.5, 6.9"] += f": default / fog = {shares['default'].mean / shares['fog'].mean:.1f}"
+        if "full" in shares:
+            lower_rates = shares["default"].mean / shares["full"].mean
+            ours["6.5, 6.9"] += f", of which default / full, by lower rates above all, {lower_rates:.1f}"
+        ours["6.5, 6.9"] += f"; whole robot {whole[0]:.2f} % and {whole[1]:.2f} %: {whole[0] / whole[1]:.1f}"
+        if (live := repeated.of_processes(measured)) is not None:
+            ours["6.5, 6.9"] += f"; its real processes {live[0]:.2f} % and {live[1]:.2f} %: {live[0] / live[1]:.2f}"
+    ours["6.6, 6.10"] = _memory(measured)
+    reactions = [record.reaction_s for drives in pairs for record in drives.values() if record.reaction_s is not None]
+    if reactions:
+        ours["(text)"] = (
+            f"{estimate(reactions).mean:.2f} s from the first echo to the first wheel command "
+            f"({len(reactions)} drives); not comparable, see below"
+        )
+    rows = [
+        [row.figures, row.subject, row.simulated, row.real, ours.get(row.figures, "not measured")] for row in REPORTED
+    ]
+    return [
+        Table(["figure", "what", "thesis, simulated", "thesis, real", "here"], rows),
+        Paragraph(
+            "The thesis draws one of two or three corridors to be blocked, so that often the blocked one is "
+            f"not on the robot's way. The obstacle met a robot that did not know of it in {len(met)} of "
+            f"{len(pairs)} drives here. The floor is another one, made in the manner of the thesis's. Its "
+            f"figures 6.11 and 6.12 compare simulation and reality, {_reality(measured, records)}."
+        ),
+        Paragraph(
+            "Times of `default` and `full`, and what `fog` saves of them, are about 2 s too large: in lockstep a robot "
+            "that plans for itself begins to drive that much after the start, for it has only just changed its setup. "
+            "Real processes wait for it first."
+        ),
+        Paragraph(
+            "The time from an echo to a wheel command is not comparable with the thesis's 3 s: lockstep has the "
+            "waiting times (of measuring, debouncing and control), but no radio, no brokers and no time of "
+            "computation, all of which the thesis's robot had. `fognav demo --report FILE` measures it over real "
+            "processes."
+        ),
+    ]
+
+
+def _reality(measured: Sequence[MeasuredDrive], records: Sequence[Record]) -> str:
+    driven = sum(drive.kind == "hardware" for drive in measured)
+    if driven:
+        return f"as do {driven} drives of a real robot, further below"
+    live = len(repeated.compared(measured, records))
+    return "for which there is no robot here" + (
+        f": {live} drives by real processes on a simulated one are compared with lockstep, further below"
+        if live
+        else ""
+    )
+
+
+def _memory(measured: Sequence[MeasuredDrive]) -> str:
+    """Return in words the largest memory of the robot's processes, by setup."""
+    peaks: dict[str, float] = {}
+    for drive in measured:
+        if (peak := drive.robots_peak_mb()) is not None:
+            peaks[drive.setup] = max(peak, peaks.get(drive.setup, 0.0))
+    if not peaks:
+        return "all setups run in one process in lockstep, which says nothing of a robot's memory"
+    words = ", ".join(f"{setup} {peaks[setup]:.0f} MB" for setup in SETUPS if setup in peaks)
+    return f"largest of all the robot's processes together: {words}"
+
+
+def _saved(pairs: Sequence[Drives], met: Sequence[Drives], quantity: Quantity) -> str:
+    """Return in words what `fog` saves against `default`."""
+    words = ["default - fog"]
+    for subject, chosen in (("all", pairs), ("obstacle met", met)):
+        both = [drives for drives in chosen if "default" in drives and "fog" in drives]
+        if both:
+            found = compare([quantity.value(d["default"]) for d in both], [quantity.value(d["fog"]) for d in both])
+            words.append(f"{subject}: {found.difference!s} {quantity.unit}")
+    return "; ".join(words) if len(words) > 1 else "not measured"
+
+
+def places(measured: Sequence[MeasuredDrive], records: Sequence[Record]) -> list[Block]:
+    """Return where a reader of the thesis finds its figures again."""
+    real = any(drive.kind == "hardware" for drive in measured)
+    known = repeated.places(measured, records)
+    rows = [[figure, shows, place.format(**known)] for figure, shows, place in PLACES]
+    words = "Its chapter 6 has no tables. Figures of its real runs (6.7 to 6.12) are those of a robot; " + (
+        "drives of a real one are among those by real processes."
+        if real
+        else "here all robots are simulated, until `fognav experiment --hardware` drives one."
+    )
+    return [Table(["figure", "shows", "here"], rows), Paragraph(words)]
+
+
+def _mean(pairs: Sequence[Drives], setup: ProfileName, quantity: Quantity) -> Estimate:
+    return estimate([quantity.value(drives[setup]) for drives in pairs])

@@ -1,4 +1,9 @@
-"""Hunts: drives world after world until its time is over, records each, and shrinks what broke a rule."""
+"""Hunts: drives world after world until its time is over, records each, and shrinks what broke a rule.
+
+A world that breaks a rule is made smaller while it still breaks it: what is left is what it takes. Each try is a whole
+drive of some seconds of computation, so the few changes are tried that make a world simpler to a reader, the largest
+first, instead of the hundreds of small ones of a general shrinker.
+"""
 
 from __future__ import annotations
 
@@ -6,21 +11,22 @@ import time
 from collections import Counter
 from concurrent.futures import FIRST_COMPLETED, Future, wait
 from pathlib import Path
-from typing import TYPE_CHECKING, Final
+from typing import TYPE_CHECKING, Any, Final
 
 import msgspec
+from msgspec.structs import asdict, replace
 
+from fog_runtime.configuration.parts import DEFAULT_BASE, DEFAULT_LIDAR
 from fog_runtime.files import SHARED, atomic_write
-from fognav_experiments import worker_pool
+from fognav_experiments import machine
 from fognav_experiments.hunt.draw import draw_on_map, draw_world
 from fognav_experiments.hunt.oracle import Figures, Rule
 from fognav_experiments.hunt.play import Hunted, build_world, hunt, load_recorded, write_world
-from fognav_experiments.hunt.shrink import shrink
+from fognav_experiments.hunt.world import HuntWorld, Mounting, Sensors
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable, Iterator, Sequence
+    from collections.abc import Callable, Iterable, Iterator, Sequence
 
-    from fognav_experiments.hunt.world import HuntWorld
 
 RECORDS: Final = "drives.jsonl"
 FOUND: Final = "found"
@@ -97,7 +103,7 @@ def run(  # noqa: PLR0913  # the options of a hunt
         while time.monotonic() < until:
             yield _keep(folder, drive(task()))
         return
-    with worker_pool.open_pool(jobs) as pool:
+    with machine.open_pool(jobs) as pool:
         waiting: set[Future[Found]] = {pool.submit(drive, task()) for _ in range(jobs)}
         while waiting:
             done, waiting = wait(waiting, return_when=FIRST_COMPLETED)
@@ -200,3 +206,66 @@ def _record(task: Task, world: HuntWorld, hunted: Hunted) -> Record:
         exact=world.warp_m == 0.0, rules=[violation.rule for violation in hunted.violations],
         values="" if first is None else f"at {first.at_s} s, ({first.x}, {first.y}): {first.values}",
     )  # fmt: skip
+
+
+_LISTS: Final = ("events", "placed", "opened", "pillars", "watched")
+_PLAIN: Final[dict[str, Any]] = {
+    "warp_m": 0.0,
+    "resolution": 0.05,
+    "radius": 0.17,
+    "base": DEFAULT_BASE,
+    "lidar": DEFAULT_LIDAR,
+    "mounting": Mounting(),
+    "quirks": {},
+}
+
+
+def shrink(world: HuntWorld, breaks: Callable[[HuntWorld], float | None], tries: int) -> HuntWorld:
+    """Return the smallest world found in so many tries.
+
+    `breaks`: when (s) a world breaks the rule that it is about, or None if it does not.
+    """
+    left = tries
+    changed = True
+    while changed and left > 0:
+        changed = False
+        for smaller in _smaller(world):
+            if left <= 0:
+                break
+            left -= 1
+            if breaks(smaller) is not None:
+                world, changed = smaller, True
+                break
+    return world
+
+
+def _smaller(world: HuntWorld) -> Iterator[HuntWorld]:
+    """Yield the next simpler worlds."""
+    if world.sensors != Sensors():
+        yield replace(world, sensors=Sensors())
+    for name in _LISTS:
+        yield from (replace(world, **{name: fewer}) for fewer in _fewer(getattr(world, name)))
+    for name, plain in _PLAIN.items():
+        if getattr(world, name) != plain:
+            yield replace(world, **{name: plain})
+    for sensors in _plainer(world.sensors):
+        yield replace(world, sensors=sensors)
+    for free in _fewer(world.free[1:]):
+        yield replace(world, free=[*world.free[:1], *free])
+
+
+def _plainer(sensors: Sensors) -> Iterator[Sensors]:
+    usual = asdict(Sensors())
+    for name, value in asdict(sensors).items():
+        if isinstance(value, list):
+            yield from (replace(sensors, **{name: fewer}) for fewer in _fewer(value))
+        elif value != usual[name]:
+            yield replace(sensors, **{name: usual[name]})
+
+
+def _fewer(items: list[Any]) -> Iterator[list[Any]]:
+    """Yield none of them, if there are several, and all but one."""
+    if len(items) > 1:
+        yield []
+    for index in range(len(items)):
+        yield items[:index] + items[index + 1 :]

@@ -44,7 +44,7 @@ from fognav_experiments.scenarios.description import (
     SpeedZone,
     deviations,
 )
-from fognav_experiments.scenarios.fleet_stage import FleetResult, play_fleet
+from fognav_experiments.scenarios.fleet import FleetResult, play_fleet
 from fognav_experiments.scenarios.node_faults import FaultyNodeSim, LateNodeSim, SlewedNodeSim
 from fognav_sim.drive.drive import DriveOutcome
 from fognav_sim.hardware import STEP_S

@@ -33,9 +33,8 @@ from fog_runtime.transports.zenoh_edge import ZenohEdge
 from fog_supervisor import net
 from fog_supervisor.servers import router_program
 from fog_supervisor.supervisor import Program, Supervisor
-from fognav_experiments.bench.office import corridor_rows, make_office
+from fognav_experiments.bench.common import RunningSystem, corridor_rows, first_child, make_office
 from fognav_experiments.bench.reactions.body import BASE, LIDAR, Body
-from fognav_experiments.bench.running import RunningSystem, first_child
 
 if TYPE_CHECKING:
     from collections.abc import Callable

@@ -1,28 +1,33 @@
-"""Runs the trials of all faults on several robots at once, and keeps their times in a log that later runs continue.
+"""Tries all faults on several robots at once, and keeps their times in a log that later runs continue.
 
-It also writes the page `docs/reaction-times.md`.
+Each robot has a process of its own (`python -m fognav_experiments.bench.reactions.trials`), which tries the faults that
+standard input names. It also writes the page `docs/reaction-times.md`.
 """
 
 from __future__ import annotations
 
 import asyncio
+import inspect
 import json
 import math
 import os
 import statistics
 import sys
+import time
 from collections import deque
 from typing import TYPE_CHECKING, Final
 
 from fognav import checkout
 from fognav.output import FailedError, WrongUseError
 from fognav_experiments.bench.reactions.faults import FAULTS, Fault
+from fognav_experiments.bench.reactions.rig import Rig
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Mapping, Sequence
+    from collections.abc import Awaitable, Callable, Mapping, Sequence
     from pathlib import Path
 
-_WORKER: Final = "fognav_experiments.bench.reactions.worker"
+
+_WORKER: Final = "fognav_experiments.bench.reactions.trials"
 _PROBLEMS_MAX: Final = 20
 """Robots that did not drive (again), after which the machine or the robot is to blame."""
 
@@ -186,3 +191,54 @@ def _line(each: dict[str, object]) -> str:
     limit = "none" if each["limit_s"] is None else each["limit_s"]
     figures = " | ".join(str(each[name]) for name in ("trials", "stopped", "median_s", "p99_s", "max_s"))
     return f"| {each['fault']} | {figures} | {limit} | {each['beyond_limit']} | {each['design']} |"
+
+
+_BETWEEN_S: Final = 0.3
+"""Time that the agent gets to notice what has ended, before it is disabled."""
+
+
+async def _finished(result: Awaitable[object] | None) -> None:
+    if inspect.isawaitable(result):
+        await result
+
+
+async def try_fault(rig: Rig, fault: Fault) -> float | None:
+    """Return how long (s) after the fault the wheels were still too fast; None if they are in the end."""
+    await rig.wait_driving()
+    begun = time.monotonic()
+    await _finished(fault.begin(rig))
+    await asyncio.sleep(max(0.0, begun + fault.observed_s - time.monotonic()))
+    found = rig.body.slower_after(begun, fault.speed)
+    await _finished(fault.end(rig))
+    await rig.revive()
+    await asyncio.sleep(_BETWEEN_S)
+    await rig.disable()
+    return found
+
+
+async def _work(seed: int) -> None:
+    faults = {fault.name: fault for fault in FAULTS}
+    names = asyncio.Queue[str]()
+    asyncio.get_running_loop().add_reader(sys.stdin, lambda: names.put_nowait(sys.stdin.readline().strip()))
+    name = await names.get()
+    while name:
+        try:
+            async with Rig(seed) as rig:
+                while name:
+                    seconds = await try_fault(rig, faults[name])
+                    _tell(fault=name, seconds=seconds)
+                    name = await names.get()
+        except* (TimeoutError, ProcessLookupError) as problems:
+            # Another robot goes on with the next fault: its predecessor does not drive any more.
+            _tell(fault=name, problem="; ".join(str(problem) for problem in problems.exceptions))
+            seed += 1000
+        name = await names.get() if name else name
+
+
+def _tell(**values: object) -> None:
+    sys.stdout.write(json.dumps(values) + "\n")
+    sys.stdout.flush()
+
+
+if __name__ == "__main__":
+    asyncio.run(_work(int(sys.argv[1])))

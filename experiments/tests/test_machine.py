@@ -13,14 +13,14 @@ import pytest
 DEADLINE_S = 60.0
 PARENT = """
 import os, time
-from fognav_experiments import worker_pool
+from fognav_experiments import machine
 
 def drive():
     print(os.getpid(), flush=True)
     time.sleep(1e6)
 
 if __name__ == "__main__":
-    with worker_pool.open_pool(2) as pool:
+    with machine.open_pool(2) as pool:
         pool.submit(drive)
         pool.submit(drive).result()
 """

@@ -1,9 +1,13 @@
-"""Floors and sites for benchmarks: corridors in a grid, with furnished rooms along them, the same for the same seed."""
+"""What benchmarks have in common: floors and sites, repeatable by seed, and systems that are started and ended."""
 
 from __future__ import annotations
 
+import asyncio
 import itertools
-from typing import TYPE_CHECKING, Final
+from abc import ABC, abstractmethod
+from contextlib import AsyncExitStack, asynccontextmanager, suppress
+from pathlib import Path
+from typing import TYPE_CHECKING, Final, Self
 
 import numpy as np
 
@@ -12,9 +16,52 @@ from fog_contracts.grid import GridGeometry, StaticMap
 from fog_runtime.configuration.maps import save_map
 
 if TYPE_CHECKING:
-    from pathlib import Path
+    from collections.abc import AsyncIterator, Coroutine
 
     from numpy.typing import NDArray
+
+
+class RunningSystem(ABC):
+    """A system that runs while its context is open; what `start` entered ends with it, also when `start` fails."""
+
+    def __init__(self) -> None:
+        self._contexts = AsyncExitStack()
+
+    @abstractmethod
+    async def _start(self) -> None:
+        """Start the parts, each entered into `_contexts`."""
+
+    async def __aenter__(self) -> Self:
+        try:
+            await self._start()
+        except BaseException:
+            await self._contexts.aclose()
+            raise
+        return self
+
+    async def __aexit__(self, *_: object) -> None:
+        await self._contexts.aclose()
+
+
+@asynccontextmanager
+async def in_background(work: Coroutine[None, None, None], name: str) -> AsyncIterator[None]:
+    """Run a loop while the context is open, and cancel it then; raises what the loop raised."""
+    task = asyncio.create_task(work, name=name)
+    try:
+        yield
+    finally:
+        task.cancel()
+        with suppress(asyncio.CancelledError):
+            await task
+
+
+def first_child(pid: int) -> int | None:
+    """Return the id of the first child of a process's main thread, such as the watchdog's guardian; None without one.
+
+    Raises `FileNotFoundError` for a process that has ended.
+    """
+    children = Path(f"/proc/{pid}/task/{pid}/children").read_text("ascii").split()
+    return int(children[0]) if children else None
 
 
 RESOLUTION: Final = 0.05

@@ -1,0 +1,376 @@
+"""How what the fog saves depends on its parts: debouncing, the nodes' period and number, the robot's speed.
+
+A sweep drives planes of two quantities each, on every core of this machine, or on the workers of a Dask cluster; it may
+be killed at any moment. At each point the robot that the fog leads is compared with the one on its own, on the same
+drawn routes. A heat map of each plane, and a page that explains them, say what was found.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import hashlib
+import random
+import socket
+from collections import Counter
+from concurrent.futures import FIRST_COMPLETED, Executor, wait
+from functools import cache
+from importlib.metadata import version
+from importlib.util import find_spec
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Final, Literal, NamedTuple
+
+import msgspec
+
+from fog_contracts.messages import NodeConfig, Pose
+from fog_runtime.files import SHARED, atomic_write
+from fognav_experiments.comparison.document import (
+    Block,
+    Code,
+    Figure,
+    Heading,
+    Paragraph,
+    Table,
+    flat,
+    to_html,
+    to_markdown,
+)
+from fognav_experiments.comparison.drives import DrivenRoute
+from fognav_experiments.figures import Estimate, estimate, heat_map
+from fognav_experiments.lockstep import release_drives, run_lockstep
+from fognav_experiments.machine import open_pool
+from fognav_experiments.rigs import Tuning
+from fognav_sim.drive.hazard import HazardRequest
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable, Iterator, Mapping, Sequence
+
+    from fog_contracts.messages import ProfileName
+    from fog_contracts.site import Site
+    from fog_runtime.configuration.site import LoadedSite
+    from fognav_experiments.comparison.drives import RouteDraw
+    from fognav_experiments.comparison.records import DriveFiles
+
+
+Quantity = Literal["readings", "pause_ms", "areas", "speed_m_s"]
+UNITS: Final[dict[Quantity, str]] = {
+    "readings": "readings that confirm a state (debounce N)",
+    "pause_ms": "pause of a node between two readings, ms",
+    "areas": "watched areas (0: all)",
+    "speed_m_s": "highest speed of the robot, m/s",
+}
+OF_THE_ROBOT: Final[frozenset[Quantity]] = frozenset({"speed_m_s"})
+"""What also changes the robot that nobody warns; it is driven once for all values of the others."""
+
+
+NODE_PAUSE_MS: Final[int] = next(
+    field.default for field in msgspec.structs.fields(NodeConfig) if field.name == "pause_ms"
+)
+"""The pause of a node that nobody has configured otherwise."""
+
+
+class Variation(msgspec.Struct, frozen=True, kw_only=True):
+    """A point of a plane.
+
+    `readings` in a row confirm a state, 0: by the site's own rule. `pause_ms`: of a node between two readings. `areas`:
+    how many are watched, 0: all. `speed_m_s`: the robot's highest.
+    """
+
+    readings: int = 0
+    pause_ms: int = NODE_PAUSE_MS
+    areas: int = 0
+    speed_m_s: float = 0.3
+
+    @property
+    def name(self) -> str:
+        """The point's name in files."""
+        return f"n{self.readings}-p{self.pause_ms}-a{self.areas}-v{self.speed_m_s:g}"
+
+
+BASE: Final = Variation()
+
+
+class Axis(NamedTuple):
+    """A quantity and its values."""
+
+    quantity: Quantity
+    values: Sequence[float]
+
+
+class Plane(NamedTuple):
+    """Two quantities of which every combination is tried, all others as they are by default."""
+
+    x: Axis
+    y: Axis
+
+    def at(self, x: float, y: float) -> Variation:
+        """Return the point with these values."""
+        changed = {self.x.quantity: x, self.y.quantity: y}
+        return msgspec.convert(msgspec.to_builtins(BASE) | changed, Variation)
+
+    def points(self) -> list[Variation]:
+        """Return every point, row by row."""
+        return [self.at(x, y) for y in self.y.values for x in self.x.values]
+
+
+class SweptDrive(DrivenRoute, frozen=True, kw_only=True):
+    """One drive of a sweep in lockstep.
+
+    `sources`: digest of the program on the machine that drove it.
+    """
+
+    variation: Variation
+    sources: str = ""
+
+    @property
+    def name(self) -> str:
+        """Name of the record's file, without suffix."""
+        return f"{self.run:04}-{self.route}-{self.setup}-{self.variation.name}"
+
+
+class SweepTask(NamedTuple):
+    """A drive to run."""
+
+    drawn: RouteDraw
+    setup: ProfileName
+    variation: Variation
+
+    @property
+    def name(self) -> str:
+        """Name of its record."""
+        return f"{self.drawn.run:04}-{self.drawn.route.name}-{self.setup}-{self.variation.name}"
+
+
+def unwarned(variation: Variation) -> Variation:
+    """Return the variation by which the robot on its own drives: what the fog has means nothing to it."""
+    own = {quantity: getattr(variation, quantity) for quantity in OF_THE_ROBOT}
+    return msgspec.convert(msgspec.to_builtins(BASE) | own, Variation)
+
+
+def sweep_tasks(planes: Iterable[Plane], drawn: Sequence[RouteDraw]) -> list[SweepTask]:
+    """Return the drives of all points, each once."""
+    found: dict[str, SweepTask] = {}
+    for route in drawn:
+        for plane in planes:
+            for point in plane.points():
+                both = SweepTask(route, "default", unwarned(point)), SweepTask(route, "fog", point)
+                found |= {task.name: task for task in both}
+    return list(found.values())
+
+
+def varied_site(site: Site, variation: Variation, seed: int) -> Site:
+    """Return the site with so many of its watched areas, drawn from the seed, that debounce as the variation says."""
+    kept = [area.id for area in site.areas]
+    if 0 < variation.areas < len(kept):
+        kept = random.Random(seed).sample(kept, variation.areas)  # noqa: S311  # repeatable, not a secret
+    debounce = {"rule": "consecutive", "to_blocked": variation.readings, "to_clear": variation.readings}
+    areas = [
+        msgspec.structs.replace(area, debounce=debounce) if variation.readings else area
+        for area in site.areas
+        if area.id in kept
+    ]
+    return msgspec.structs.replace(site, areas=areas, nodes=[node for node in site.nodes if node.area in kept])
+
+
+class Gain(NamedTuple):
+    """What the fog saves at a point: metres and seconds, over the routes that both robots drove."""
+
+    metres: Estimate
+    seconds: Estimate
+
+
+def gain(drives: Iterable[SweptDrive], point: Variation) -> Gain | None:
+    """Return what the fog saves at a point; None without a route that both robots drove to its end."""
+    known = {(drive.setup, drive.variation, drive.run, drive.route): drive for drive in drives if drive.success}
+    metres, seconds = [], []
+    for (setup, variation, run, route), led in known.items():
+        alone = known.get(("default", unwarned(point), run, route))
+        if setup == "fog" and variation == point and alone is not None:
+            metres.append(alone.distance_m - led.distance_m)
+            seconds.append((alone.time_s or 0.0) - (led.time_s or 0.0))
+    return Gain(estimate(metres), estimate(seconds)) if metres else None
+
+
+_PACKAGES: Final = (
+    "fog_contracts", "fog_kernels", "fog_runtime", "fog_supervisor", "fognav_experiments", "fognav_sim",
+    "hazard_aggregator", "map_service", "planner", "robot_agent",
+)  # fmt: skip
+
+
+@cache
+def digest() -> str:
+    """Return a hash of all modules of Fognav that a drive can import, as they are installed here."""
+    found = hashlib.sha256()
+    for package in _PACKAGES:
+        spec = find_spec(package)
+        if spec is None or spec.submodule_search_locations is None:
+            raise RuntimeError(f"the package {package} is not installed: install fognav-experiments again")
+        for place in map(Path, spec.submodule_search_locations):
+            for file in sorted(place.rglob("*.py")):
+                found.update(f"{package}/{file.relative_to(place)}".encode() + b"\0" + file.read_bytes() + b"\0")
+    return found.hexdigest()[:16]
+
+
+CONNECT_S: Final = 20.0
+"""Timeout of the connection to a cluster's scheduler."""
+
+
+class ClusterError(RuntimeError):
+    """A cluster can't be used; the message says why, and what to do."""
+
+
+@contextlib.contextmanager
+def workers(jobs: int, cluster: str | None) -> Iterator[Executor]:
+    """Give what runs drives: processes of this machine, or the workers of the cluster at an address.
+
+    Raises `ClusterError` without Dask, or if nobody answers at the address.
+    """
+    if cluster is None:
+        with open_pool(jobs) as pool:
+            yield pool
+        return
+    if find_spec("distributed") is None:
+        raise ClusterError("--cluster needs Dask: install fognav-experiments[cluster]")
+    from distributed import Client  # noqa: PLC0415  # optional
+
+    try:
+        client = Client(cluster, timeout=CONNECT_S)
+    except (OSError, ValueError) as error:
+        raise ClusterError(f"no scheduler answers at {cluster}: {error}. Start one by `dask scheduler`") from error
+    with client, client.get_executor(retries=1) as pool:
+        yield pool
+
+
+def sweep(
+    site: LoadedSite, asked: Sequence[SweepTask], files: DriveFiles[SweptDrive], pool: Executor, commit: str = ""
+) -> Iterator[SweptDrive]:
+    """Run the drives that have no record yet, and yield each record once it is written; `commit` is only recorded.
+
+    Raises `ClusterError` if a worker runs other sources than this process.
+    """
+    due, sources = [task for task in asked if not files.has(task.name)], digest()
+    waiting = {pool.submit(swept_drive, site, task, commit, sources) for task in due}
+    try:
+        while waiting:
+            done, waiting = wait(waiting, return_when=FIRST_COMPLETED)
+            for future in done:
+                drive = future.result()
+                files.write(drive)
+                yield drive
+    finally:
+        for future in waiting:
+            future.cancel()
+
+
+def swept_drive(site: LoadedSite, task: SweepTask, commit: str, sources: str) -> SweptDrive:
+    """Drive one task in lockstep; the same whenever and wherever it is repeated.
+
+    commit, sources: revision and digest of the sources of who asks. Raises `ClusterError` if this process has others:
+    the drive would be recorded for a commit that did not make it.
+    """
+    if (own := digest()) != sources:
+        raise ClusterError(
+            f"the worker {socket.gethostname()} runs other sources of Fognav {version('fognav-experiments')} ({own}) "
+            f"than this machine ({sources}): install the same on it, and start it again"
+        )
+    drawn, variation = task.drawn, task.variation
+    origin, goal = (site.site.places[name] for name in (drawn.route.start, drawn.route.goal))
+    result = run_lockstep(
+        site,
+        Pose(x=origin.x, y=origin.y, theta=drawn.theta if origin.theta is None else origin.theta),
+        goal,
+        drawn.seed,
+        HazardRequest(area=drawn.area, trigger_m=drawn.trigger_m),
+        watched=varied_site(site.site, variation, drawn.seed) if task.setup != "default" else False,
+        profile=task.setup,
+        tuning=Tuning(pause_ms=variation.pause_ms, speed_m_s=variation.speed_m_s),
+    )
+    release_drives()
+    return SweptDrive(
+        variation=variation,
+        setup=task.setup,
+        run=drawn.run,
+        route=drawn.route.name,
+        seed=drawn.seed,
+        area=drawn.area,
+        success=result.success,
+        outcome=result.outcome,
+        distance_m=result.distance_m,
+        time_s=result.time_s,
+        commit=commit,
+        version=version("fognav-experiments"),
+        sources=own,
+    )
+
+
+TITLE: Final = "How what the fog saves depends on its parts"
+
+
+def publish(
+    drives: Sequence[SweptDrive], planes: Sequence[Plane], command: str, measured_on: Mapping[str, Any], target: Path
+) -> list[Path]:
+    """Write the pages and figures of a sweep into a folder; return the files."""
+    blocks: list[Block] = [
+        Heading(TITLE, 1),
+        Paragraph(
+            "The same drawn obstacles are met by a robot on its own and by one that the fog leads, in lockstep. Each "
+            f"cell says how many metres and seconds the second saves{_spread(drives, planes)}; "
+            "one quantity changes along each side, all others are as by default. Only routes count on which the "
+            "obstacle bars the shortest way. Of a part of the areas only, which ones are watched is drawn per route: "
+            "an obstacle that no sensor sees saves nothing."
+        ),
+        Code(command),
+        Table(["measured on", ""], [*([name, str(value)] for name, value in flat(measured_on)), *_commits(drives)]),
+    ]
+    for plane in planes:
+        blocks += _plane(drives, plane)
+    failed = [drive for drive in drives if not drive.success]
+    blocks.append(Paragraph(f"{len(drives)} drives, of which {len(failed)} failed and count for nothing."))
+    if failed:
+        blocks.append(Table(["drive", "outcome"], [[drive.name, drive.outcome] for drive in failed]))
+    texts = {
+        "README.md": to_markdown(blocks),
+        "report.html": to_html(TITLE, blocks),
+        **{block.file: block.svg for block in blocks if isinstance(block, Figure)},
+    }
+    for name, content in texts.items():
+        atomic_write(target / name, content.encode(), mode=SHARED)
+    return [target / name for name in texts]
+
+
+def _spread(drives: Sequence[SweptDrive], planes: Sequence[Plane]) -> str:
+    """Return in words what a cell's figures are; a single route has no confidence interval."""
+    found = [gain(drives, point) for plane in planes for point in plane.points()]
+    if any(cell.metres.n > 1 for cell in found if cell is not None):
+        return " on average, with the 95 % confidence interval where there is more than one route"
+    return " on the one route, which says nothing of others"
+
+
+def _commits(drives: Sequence[SweptDrive]) -> list[list[str]]:
+    """Return how many of the drives each commit made."""
+    counts = sorted(Counter(drive.commit or "not known" for drive in drives).items())
+    return [["commit", f"{commit}: {count} of the drives"] for commit, count in counts]
+
+
+def _plane(drives: Sequence[SweptDrive], plane: Plane) -> list[Block]:
+    gains = {point: found for point in plane.points() if (found := gain(drives, point)) is not None}
+    name = f"{plane.x.quantity}-{plane.y.quantity}".replace("_", "-")
+    caption = f"Metres and seconds that the fog saves, by {UNITS[plane.x.quantity]} and {UNITS[plane.y.quantity]}."
+    rows = [
+        [f"{getattr(point, plane.x.quantity):g}", f"{getattr(point, plane.y.quantity):g}", str(found.metres.n),
+         str(found.metres), str(found.seconds)]
+        for point, found in gains.items()
+    ]  # fmt: skip
+    return [
+        Heading(f"{plane.x.quantity} and {plane.y.quantity}"),
+        Figure(
+            f"{name}.svg",
+            heat_map(
+                "What the fog saves per route",
+                (UNITS[plane.x.quantity], plane.x.values),
+                (UNITS[plane.y.quantity], plane.y.values),
+                [[gains.get(plane.at(x, y)) for x in plane.x.values] for y in plane.y.values],
+            ),
+            caption,
+        ),
+        Table([UNITS[plane.x.quantity], UNITS[plane.y.quantity], "routes", "metres saved", "seconds saved"], rows),
+    ]

@@ -32,8 +32,8 @@ def mutation_command(
     their tests, which must notice it; prints each change that none does. Exit code 1: a line or branch that no test
     reaches, or fewer than 90 percent of the changes noticed.
     """
-    from fognav_experiments.mutation import run  # noqa: PLC0415  # keeps the other commands fast
-    from fognav_experiments.mutation.parts import parts_named  # noqa: PLC0415  # same
+    from fognav_experiments import mutation  # noqa: PLC0415  # keeps the other commands fast
+    from fognav_experiments.mutation import parts_named  # noqa: PLC0415  # same
 
     def tell(text: str) -> None:
         console.print(text, markup=False, soft_wrap=True)
@@ -41,15 +41,15 @@ def mutation_command(
     with exit_codes():
         root, chosen = checkout.root(), parts_named(part or [])
         figures = {
-            each.name: run.measure(
+            each.name: mutation.measure(
                 each, root, jobs=jobs or os.cpu_count() or 1, only=None if coverage else module, tell=tell
             )
             for each in chosen
         }
     if json:
-        print_json({"bench": "mutation", "parts": run.report_values(figures)})
+        print_json({"bench": "mutation", "parts": mutation.report_values(figures)})
     else:
-        for line in run.report_lines(figures):
+        for line in mutation.report_lines(figures):
             tell(line)
-    if not run.passes(figures):
+    if not mutation.passes(figures):
         raise typer.Exit(NOT_TRUE)

@@ -1,4 +1,4 @@
-"""Runs every mutant of a part, several at once, and counts those that its tests notice.
+"""Mutation tests: whether the tests of the parts that stop the robot notice each small change of their code.
 
 Each run of a part's tests is a forked process, on a changed module or on all modules as they are. The libraries are
 loaded once, before the fork. The modules of the part are imported in the child only, so that every module that takes a
@@ -21,9 +21,8 @@ import time
 from pathlib import Path
 from typing import TYPE_CHECKING, Final, NamedTuple, NoReturn
 
-from fognav.output import FailedError
-from fognav_experiments.mutation.mutants import Mutant, mutants, mutate
-from fognav_experiments.mutation.parts import LEAST_SCORE
+from fognav.output import FailedError, WrongUseError
+from fognav_experiments.mutants import Mutant, mutants, mutate
 
 if TYPE_CHECKING:
     import ast
@@ -32,7 +31,96 @@ if TYPE_CHECKING:
 
     import pytest
 
-    from fognav_experiments.mutation.parts import Part
+
+LEAST_SCORE: Final = 0.9
+"""Share of the mutants that the tests of a part must notice; a few change nothing, and no test could notice these."""
+
+
+class Part(NamedTuple):
+    """A part of the robot.
+
+    modules: names below `robot_agent`; a package stands for all its modules. tests: files or folders below
+    `robot-agent/tests`. preload: what the tests import besides these modules and is the same for every mutant.
+    """
+
+    name: str
+    modules: tuple[str, ...]
+    tests: tuple[str, ...]
+    preload: tuple[str, ...]
+
+    def files(self, root: Path) -> dict[str, Path]:
+        """Return the source of each module, by its full name, in a checkout."""
+        package = root / "robot-agent/src/robot_agent"
+        found: dict[str, Path] = {}
+        for name in self.modules:
+            path = package.joinpath(*name.split("."))
+            files = sorted(path.glob("*.py")) if path.is_dir() else [path.with_suffix(".py")]
+            for file in files:
+                if file.stem != "__init__":
+                    found[".".join(("robot_agent", *file.relative_to(package).with_suffix("").parts))] = file
+        return found
+
+
+def parts_named(names: Sequence[str]) -> list[Part]:
+    """Return the parts of these names, or all; raises `WrongUseError` for an unknown name."""
+    known = {part.name: part for part in PARTS}
+    for name in names:
+        if name not in known:
+            raise WrongUseError(f"there is no part {name!r}: name one of {', '.join(known)}")
+    return [known[name] for name in names] or list(PARTS)
+
+
+PARTS: Final = (
+    Part(
+        "safety",
+        ("safety",),
+        ("safety",),
+        ("numpy", "hypothesis.strategies", "fog_kernels.sweep", "robot_agent.config", "robot_agent.footprint"),
+    ),
+    Part(
+        "guardian",
+        (
+            "guardian.awakening",
+            "guardian.base_reports",
+            "guardian.core",
+            "guardian.link",
+            "guardian.maneuvers",
+            "guardian.timing",
+        ),
+        (
+            "guardian/test_awakening.py",
+            "guardian/test_guardian_core.py",
+            "guardian/test_guardian_limits.py",
+            "guardian/test_guardian_maneuvers.py",
+            "guardian/test_guardian_moments.py",
+            "guardian/test_guardian_self_driving.py",
+            "guardian/test_timing.py",
+        ),
+        ("numpy", "hypothesis.strategies", "robot_agent.config"),
+    ),
+    Part(
+        "recoveries",
+        ("motion.recovery",),
+        (
+            "motion/test_recovery.py",
+            "motion/test_recovery_boundaries.py",
+            "motion/test_recovery_limits.py",
+        ),
+        ("numpy", "hypothesis.strategies", "fog_kernels.clearance", "robot_agent.config"),
+    ),
+    Part(
+        "maneuvers",
+        ("agent.docking", "agent.maneuvers"),
+        ("agent/test_docking.py", "agent/test_maneuvers.py"),
+        ("numpy", "hypothesis.strategies", "robot_agent.localization.localizer", "robot_agent.config"),
+    ),
+    Part(
+        "watchdog",
+        ("guardian.watchdog",),
+        ("guardian/test_watchdog.py",),
+        ("robot_agent.serial_port", "fog_runtime.configuration.parts", "fog_runtime.machine"),
+    ),
+)
 
 
 class Survivor(NamedTuple):
@@ -48,23 +136,22 @@ class Survivor(NamedTuple):
 
 
 class ModuleScore(NamedTuple):
-    """Figures of one module. `equivalent` mutants change nothing and are no part of the score."""
+    """Figures of one module."""
 
     module: str
     coverage: Coverage
     mutants: int
-    equivalent: int
     survivors: list[Survivor]
 
     @property
     def killed(self) -> int:
         """Number of mutants that a test notices."""
-        return self.mutants - self.equivalent - len(self.survivors)
+        return self.mutants - len(self.survivors)
 
 
 def score(modules: list[ModuleScore]) -> float:
-    """Return the share of the mutants that tests notice, of those that change something; 1 without any."""
-    asked = sum(module.mutants - module.equivalent for module in modules)
+    """Return the share of the mutants that tests notice; 1 without any."""
+    asked = sum(module.mutants for module in modules)
     return sum(module.killed for module in modules) / asked if asked else 1.0
 
 
@@ -85,7 +172,7 @@ def measure(part: Part, root: Path, *, jobs: int, only: str | None, tell: Callab
     unchanged = try_unchanged(part, root)
     if unchanged.failed:
         raise FailedError(f"{unchanged.failed[0]} fails without any change: mend it first")
-    tasks, equivalent = _tasks(part, root, only) if only is not None else ([], {})
+    tasks = [] if only is None else _tasks(part, root, only)
     survivors: dict[str, list[Survivor]] = {}
     for done, (task, survives) in enumerate(_run(part, root, tasks, unchanged.seconds, jobs), 1):
         if survives:
@@ -96,28 +183,17 @@ def measure(part: Part, root: Path, *, jobs: int, only: str | None, tell: Callab
         ModuleScore(
             module,
             coverage,
-            sum(task.module == module for task in tasks) + equivalent.get(module, 0),
-            equivalent.get(module, 0),
+            sum(task.module == module for task in tasks),
             sorted(survivors.get(module, []), key=lambda survivor: survivor.mutant.line),
         )
         for module, coverage in unchanged.coverage.items()
     ]
 
 
-def _tasks(part: Part, root: Path, only: str) -> tuple[list[_Task], dict[str, int]]:
-    """Return the mutants to try, and how many of each module change nothing."""
-    tasks: list[_Task] = []
-    equivalent: dict[str, int] = {}
-    for module, path in part.files(root).items():
-        if not module.endswith(only):
-            continue
-        source = path.read_text("utf-8")
-        for mutant in mutants(source):
-            if part.why_equivalent(module, mutant) is None:
-                tasks.append(_Task(module, source, mutant))
-            else:
-                equivalent[module] = equivalent.get(module, 0) + 1
-    return tasks, equivalent
+def _tasks(part: Part, root: Path, only: str) -> list[_Task]:
+    """Return the mutants to try."""
+    sources = {module: path.read_text("utf-8") for module, path in part.files(root).items() if module.endswith(only)}
+    return [_Task(module, source, mutant) for module, source in sources.items() for mutant in mutants(source)]
 
 
 def _run(
@@ -348,8 +424,7 @@ def report_lines(figures: Mapping[str, list[ModuleScore]]) -> Iterator[str]:
             if reached.missing:
                 yield f"  not reached: {reached.missing}"
             if module.mutants:
-                asked = module.mutants - module.equivalent
-                yield f"  {module.killed} of {asked} mutants noticed; {module.equivalent} more change nothing"
+                yield f"  {module.killed} of {module.mutants} mutants noticed"
             yield from (f"  survives: {survivor}" for survivor in module.survivors)
         if any(module.mutants for module in modules):
             yield f"{part}: score {score(modules):.1%}"
@@ -368,7 +443,6 @@ def _values(module: ModuleScore) -> dict[str, object]:
         "module": module.module,
         "coverage": module.coverage._asdict(),
         "mutants": module.mutants,
-        "equivalent": module.equivalent,
         "killed": module.killed,
         "survivors": [str(survivor) for survivor in module.survivors],
     }

@@ -17,6 +17,7 @@ from typing import TYPE_CHECKING, Final, NamedTuple
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
+
 _TINY: Final = 1e-3
 """A number below this is a tolerance, or zero: a tenth more would mean the same."""
 _LIMITS: Final[dict[type[ast.cmpop], type[ast.cmpop]]] = {

@@ -163,7 +163,7 @@ def test_drives_say_in_one_line_that_nodes_run_a_model_and_why(arguments, tmp_pa
         raise ReachedError
 
     monkeypatch.setattr(kernels, "warm_cache", lambda _: None)
-    for module, name in ((runner, "run"), (sensitivity, "workers")):
+    for module, name in ((runner, "run"), (sensitivity, "sweep")):
         monkeypatch.setattr(module, name, reached)
     for folder, lines in ((tmp_path, 1), (nodes.find_firmware(), 0)):
         monkeypatch.setenv("FOGNAV_FIRMWARE_DIR", str(folder))

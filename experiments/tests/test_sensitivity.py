@@ -4,14 +4,12 @@ from __future__ import annotations
 
 import importlib.util
 import re
-from importlib.metadata import version
 from pathlib import Path
 
 import pytest
-from distributed import LocalCluster
 
 from fog_runtime.configuration.site import load_site
-from fognav_experiments.comparison import runner, sensitivity
+from fognav_experiments.comparison import runner
 from fognav_experiments.comparison.drives import ExperimentSpec, RouteSpec, draw
 from fognav_experiments.comparison.records import DriveFiles
 from fognav_experiments.comparison.sensitivity import (
@@ -20,9 +18,9 @@ from fognav_experiments.comparison.sensitivity import (
     Plane,
     SweptDrive,
     Variation,
-    digest,
     gain,
     publish,
+    sweep,
     sweep_tasks,
     unwarned,
     varied_site,
@@ -115,7 +113,7 @@ def test_a_heat_map_has_a_cell_for_every_point_and_the_greenest_where_most_is_sa
     drives = [swept("default", BASE, 100.0)]
     drives += [swept("fog", point, 60.0 + 10.0 * n) for n, point in enumerate(DEBOUNCE.points()[:3])]
     files = publish(drives, [DEBOUNCE], "fognav experiment sensitivity", {"machine": {"cores": 2}}, tmp_path)
-    assert {file.name for file in files} == {"README.md", "report.html", "readings-pause-ms.svg"}
+    assert {file.name for file in files} == {"README.md", "readings-pause-ms.svg"}
     picture = (tmp_path / "readings-pause-ms.svg").read_text("utf-8")
     assert picture.count("fill: #2a9d5c") == 1
     words = re.findall(r">([^<>]+)</text>", picture)
@@ -139,31 +137,13 @@ def test_the_page_names_the_interval_of_several_routes_and_the_commits_of_its_dr
 
 
 @pytest.mark.drive
-def test_a_cluster_of_two_workers_of_these_sources_drives_a_sweep_and_goes_on_where_it_was(tmp_path, monkeypatch):
+def test_a_sweep_drives_both_robots_and_goes_on_where_it_was(tmp_path):
     site = ring.ring_site()
     plane = Plane(Axis("readings", [3]), Axis("pause_ms", [100]))
     asked = sweep_tasks([plane], [DRAWN])
     files = DriveFiles(tmp_path, SweptDrive)
-    with (
-        LocalCluster(n_workers=2, threads_per_worker=1, dashboard_address=None) as cluster,
-        sensitivity.workers(1, cluster.scheduler_address) as pool,
-    ):
-        with monkeypatch.context() as patch:
-            patch.setattr(sensitivity, "digest", lambda: "0" * 16)
-            with pytest.raises(
-                sensitivity.ClusterError, match=r"runs other sources of Fognav .+ than this machine \(0000"
-            ):
-                next(sensitivity.sweep(site, asked, files, pool))
-        assert files.read() == []
-        drives = list(sensitivity.sweep(site, asked, files, pool))
-        assert list(sensitivity.sweep(site, asked, files, pool)) == []
-    assert {(drive.version, drive.sources) for drive in drives} == {(version("fognav-experiments"), digest())}
+    drives = list(sweep(site, asked, files, jobs=2))
+    assert list(sweep(site, asked, files, jobs=2)) == []
     assert {drive.setup for drive in drives} == {"default", "fog"}
     assert all(drive.success for drive in drives)
     assert gain(drives, plane.points()[0]).metres.mean > 0.5
-
-
-def test_a_cluster_where_nobody_answers_is_named(monkeypatch):
-    monkeypatch.setattr(sensitivity, "CONNECT_S", 0.5)
-    with pytest.raises(sensitivity.ClusterError, match=r"no scheduler answers at tcp://127\.0\.0\.1:9"):
-        sensitivity.workers(1, "tcp://127.0.0.1:9").__enter__()

@@ -9,16 +9,20 @@ import signal
 import threading
 import time
 from collections import defaultdict
+from concurrent import futures
 from concurrent.futures import ProcessPoolExecutor
 from contextlib import contextmanager
 from importlib.metadata import version
 from multiprocessing.connection import wait
 from pathlib import Path
-from typing import TYPE_CHECKING, Final
+from typing import TYPE_CHECKING, Final, TypeVar
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator
+    from collections.abc import Callable, Iterator, Sequence
     from multiprocessing.connection import Connection
+
+T = TypeVar("T")
+R = TypeVar("R")
 
 
 def describe() -> dict[str, object]:
@@ -129,6 +133,19 @@ def open_pool(jobs: int) -> Iterator[ProcessPoolExecutor]:
         except BaseException:
             interrupt.close()
             raise
+
+
+def results(drive: Callable[[T], R], tasks: Sequence[T], jobs: int) -> Iterator[R]:
+    """Drive tasks, so many at a time, and yield what each gives once it ends; one at a time in this process."""
+    if jobs == 1:
+        yield from map(drive, tasks)
+        return
+    with open_pool(jobs) as pool:
+        waiting = {pool.submit(drive, task) for task in tasks}
+        while waiting:
+            done, waiting = futures.wait(waiting, return_when=futures.FIRST_COMPLETED)
+            for future in done:
+                yield future.result()
 
 
 def _begin(interrupted: Connection) -> None:

@@ -15,7 +15,7 @@ from fognav import checkout, kernels, node_code
 from fognav.commands.installed import MEASURE
 from fognav.operate.fog import find_fog
 from fognav.operate.options import FogOption, JsonOption, RobotOption  # noqa: TC001  # Typer reads annotations at run time
-from fognav.output import NOT_TRUE, FailedError, WrongUseError, console, exit_codes, print_json, print_line
+from fognav.output import NOT_TRUE, WrongUseError, console, exit_codes, print_json, print_line
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
@@ -156,7 +156,7 @@ def report_command(
         typer.Option("--with-live", metavar="DIR|FILE", help="Adds the drives of --live and --hardware from here."),
     ] = None,
 ) -> None:
-    """Write the report of an experiment: Markdown, one HTML file, figures, CSV and an archive of all records.
+    """Write the report of an experiment: Markdown, figures, CSV and an archive of all records.
 
     It shows the thesis's figures with ours beside them, paired differences with their tests, and where CPU time went.
     From the archive, drives.jsonl.xz, the report is made again, and the experiment goes on (--from). Memory, and what
@@ -314,24 +314,17 @@ def sensitivity_command(  # noqa: PLR0913  # each option is an argument
     routes: Annotated[int, typer.Option("--routes", metavar="N", min=1, help="Routes of each point.")] = 3,
     seed: Annotated[int, typer.Option("--seed", metavar="N", min=0, help="Seed of all draws.")] = 1,
     jobs: Annotated[int | None, typer.Option("--jobs", metavar="N", min=1, help="Drives at a time; all cores.")] = None,
-    cluster: Annotated[str | None, typer.Option("--cluster", metavar="ADDRESS", help="A Dask scheduler.")] = None,
     site: Annotated[Path | None, typer.Option("--site", metavar="DIR", help="Site with experiment.toml.")] = None,
 ) -> None:
     """Sweep debouncing, the nodes' pause and number, and the robot's speed; draw what the fog saves as heat maps.
 
     Two planes are driven, readings by pause and areas by speed, on the first routes whose obstacle bars the way; with
-    --readings none or --areas none only the other. A sweep that was killed goes on where it was. The drives
-    run on every core, with --cluster on the workers of a Dask cluster (fognav-experiments[cluster]), which need the
-    same sources of Fognav and nothing else.
+    --readings none or --areas none only the other. A sweep that was killed goes on where it was.
     """
     from fog_runtime.configuration.site import SiteError, load_site  # noqa: PLC0415  # keeps the other commands fast
     from fognav_experiments.comparison import runner  # noqa: PLC0415  # same
     from fognav_experiments.comparison.records import Folder, FolderError  # noqa: PLC0415  # same
-    from fognav_experiments.comparison.sensitivity import (  # noqa: PLC0415  # same
-        Axis,
-        ClusterError,  # same
-        Plane,
-    )
+    from fognav_experiments.comparison.sensitivity import Axis, Plane  # noqa: PLC0415  # same
 
     with exit_codes():
         swept, command = [], "fognav experiment sensitivity"
@@ -350,11 +343,9 @@ def sensitivity_command(  # noqa: PLR0913  # each option is an argument
             drawn = runner.barred_routes(loaded, runner.read_spec(loaded, place), seed, routes)
             folder = Folder(out)
             folder.begin(runner.new(loaded, place, seed), _measured_on())
-            failed = _sweep(loaded, folder, swept, drawn, command, jobs=jobs, cluster=cluster)
+            failed = _sweep(loaded, folder, swept, drawn, command, jobs or os.cpu_count() or 1)
         except (SiteError, runner.SpecError, FolderError) as error:
             raise WrongUseError(str(error)) from error
-        except ClusterError as error:
-            raise FailedError(str(error)) from error
     if failed:
         raise typer.Exit(NOT_TRUE)
 
@@ -365,15 +356,13 @@ def _measured_on() -> dict[str, object]:
     return {"commit": checkout.revision(), **machine.describe()}
 
 
-def _sweep(  # noqa: PLR0913  # what is driven, where and how
+def _sweep(  # what is driven, where and how
     site: LoadedSite,
     folder: Folder,
     swept: Sequence[Plane],
     drawn: Sequence[RouteDraw],
     command: str,
-    *,
-    jobs: int | None,
-    cluster: str | None,
+    jobs: int,
 ) -> int:
     """Drive a sweep and publish it; return how many drives failed."""
     from fognav_experiments.comparison import sensitivity  # noqa: PLC0415  # same
@@ -383,8 +372,7 @@ def _sweep(  # noqa: PLR0913  # what is driven, where and how
     kernels.warm_cache(print_line)
     asked, files = sensitivity.sweep_tasks(swept, drawn), DriveFiles(folder.path / "sweep", sensitivity.SweptDrive)
     names = [task.name for task in asked]
-    with sensitivity.workers(jobs or os.cpu_count() or 1, cluster) as pool:
-        failed = _show(names, files, sensitivity.sweep(site, asked, files, pool, checkout.revision()))
+    failed = _show(names, files, sensitivity.sweep(site, asked, files, jobs, checkout.revision()))
     drives = [drive for drive in files.read() if drive.name in names]
     for file in sensitivity.publish(drives, swept, command, folder.description()["measured_on"], folder.path):
         print_line(str(file))

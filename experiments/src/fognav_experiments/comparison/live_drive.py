@@ -13,7 +13,7 @@ from typing import Any, Final
 
 import msgspec
 
-from fog_contracts.messages import Pose, ProfileName
+from fog_contracts.messages import ProfileName
 from fog_contracts.site import DemoPlan, Site
 from fog_runtime import logs
 from fog_runtime.configuration.maps import save_map
@@ -24,7 +24,7 @@ from fognav.demo.options import Options
 from fognav.demo.run import Demo
 from fognav.output import FailedError
 from fognav_experiments.bench.robot import NORMAL_PRIORITY, cpu_quota
-from fognav_experiments.comparison.drives import MeasuredDrive, RouteDraw, drive_name, facts
+from fognav_experiments.comparison.drives import MeasuredDrive, RouteDraw, drive_name, facts, start_of
 from fognav_experiments.comparison.records import DriveFiles
 from fognav_experiments.comparison.runner import Task
 from fognav_sim.drive.hazard import HazardRequest
@@ -99,12 +99,10 @@ def drive_live(
 
 def write_route(site: LoadedSite, drawn: RouteDraw, folder: Path) -> None:
     """Write a site like this one, whose robot starts where the route does, and whose demonstration is the route."""
-    origin = site.site.places[drawn.route.start]
-    start = Pose(x=origin.x, y=origin.y, theta=drawn.theta if origin.theta is None else origin.theta)
     changed = msgspec.structs.replace(
         site.site,
         map="map.yaml",
-        robots=[msgspec.structs.replace(site.site.robots[0], start=start)],
+        robots=[msgspec.structs.replace(site.site.robots[0], start=start_of(site, drawn))],
         demo=DemoPlan(start=drawn.route.start, goal=drawn.route.goal, areas=[drawn.area]),
     )
     save_map(folder / "map", site.map)

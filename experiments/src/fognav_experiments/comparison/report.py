@@ -1,6 +1,6 @@
 """The report of a comparison: what the fog saves by route, setup and component, and its files.
 
-Markdown with its figures, one HTML file, CSV of drives and means, and the archive of all records.
+Markdown with its figures, CSV of drives and means, and the archive of all records.
 """
 
 from __future__ import annotations
@@ -21,7 +21,6 @@ from fognav_experiments.comparison.document import (
     Paragraph,
     Table,
     flat,
-    to_html,
     to_markdown,
 )
 from fognav_experiments.comparison.drives import KINDS, draw, route_ends
@@ -354,7 +353,6 @@ def publish(folder: Folder, target: Path, site: Path | None = None) -> list[Path
     csv.writer(summary, lineterminator="\n").writerows(summary_rows(records))
     texts = {
         "README.md": to_markdown(blocks),
-        "report.html": to_html(TITLE, blocks),
         "summary.csv": summary.getvalue(),
         **{block.file: block.svg for block in blocks if isinstance(block, Figure)},
     }

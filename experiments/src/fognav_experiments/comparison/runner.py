@@ -6,23 +6,20 @@ import hashlib
 import os
 import time
 import tomllib
-from concurrent.futures import FIRST_COMPLETED, wait
-from functools import cache
+from functools import cache, partial
 from importlib.metadata import version
 from typing import TYPE_CHECKING, NamedTuple
 
 import msgspec
 
 from fog_contracts.bus import Bus
-from fog_contracts.messages import Pose
 from fog_contracts.stages import TOTAL
 from fog_runtime.configuration.site import load_site
-from fognav_experiments import machine
-from fognav_experiments.comparison.drives import ExperimentSpec, TimelineRecorder, draw, drive_name, facts
+from fognav_experiments.comparison.drives import ExperimentSpec, TimelineRecorder, draw, drive_name, facts, start_of
 from fognav_experiments.comparison.limits import RouteGeometry
 from fognav_experiments.comparison.records import Asked, Folder, FolderError, Record
 from fognav_experiments.lockstep import release_drives, run_lockstep
-from fognav_experiments.machine import CpuMeter
+from fognav_experiments.machine import CpuMeter, results
 from fognav_sim.barrier import BarrierError, barrier_across
 from fognav_sim.drive.hazard import HazardRequest
 
@@ -41,16 +38,13 @@ def drive(site: LoadedSite, drawn: RouteDraw, setup: ProfileName, jobs: int = 1,
     `jobs` (drives that run at the same time on this machine) and `commit` are only recorded. Raises `BarrierError` for
     an area that no barrier closes.
     """
-    places = site.site.places
-    origin, goal = places[drawn.route.start], places[drawn.route.goal]
-    start = Pose(x=origin.x, y=origin.y, theta=drawn.theta if origin.theta is None else origin.theta)
     cpu, bus = CpuMeter(), Bus(site.site.id)
     recorder = TimelineRecorder(bus, setup)
     begun = time.perf_counter()
     result = run_lockstep(
         site,
-        start,
-        goal,
+        start_of(site, drawn),
+        site.site.places[drawn.route.goal],
         drawn.seed,
         HazardRequest(area=drawn.area, trigger_m=drawn.trigger_m),
         watched=setup != "default",
@@ -138,19 +132,9 @@ def check_barriers(site: LoadedSite, asked: Sequence[Task]) -> None:
 def run(site_folder: Path, asked: list[Task], folder: Folder, jobs: int = 1, commit: str = "") -> Iterator[Record]:
     """Run the tasks that have no record yet, and yield each record once it is written; `commit` is only recorded."""
     due = [task for task in asked if not folder.drives.has(task.name)]
-    if jobs == 1:
-        for task in due:
-            record = _drive(site_folder, task, jobs, commit)
-            folder.drives.write(record)
-            yield record
-        return
-    with machine.open_pool(jobs) as pool:
-        waiting = {pool.submit(_drive, site_folder, task, jobs, commit) for task in due}
-        while waiting:
-            done, waiting = wait(waiting, return_when=FIRST_COMPLETED)
-            for future in done:
-                folder.drives.write(future.result())
-                yield future.result()
+    for record in results(partial(_drive, site_folder, jobs, commit), due, jobs):
+        folder.drives.write(record)
+        yield record
 
 
 def new(site: LoadedSite, site_folder: Path, seed: int) -> Asked:
@@ -185,7 +169,7 @@ def recorded_draw(folder: Folder, site: LoadedSite, place: Path, run: int, route
     return drawn[route] if route is not None else next(iter(drawn.values()))
 
 
-def _drive(site_folder: Path, task: Task, jobs: int, commit: str) -> Record:
+def _drive(site_folder: Path, jobs: int, commit: str, task: Task) -> Record:
     record = drive(_site(site_folder), task.drawn, task.setup, jobs, commit)
     release_drives()
     return record

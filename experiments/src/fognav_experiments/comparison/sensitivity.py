@@ -1,27 +1,21 @@
 """How what the fog saves depends on its parts: debouncing, the nodes' period and number, the robot's speed.
 
-A sweep drives planes of two quantities each, on every core of this machine, or on the workers of a Dask cluster; it may
-be killed at any moment. At each point the robot that the fog leads is compared with the one on its own, on the same
-drawn routes. A heat map of each plane, and a page that explains them, say what was found.
+A sweep drives planes of two quantities each, on every core of this machine, and may be killed at any moment. At each
+point the robot that the fog leads is compared with the one on its own, on the same drawn routes. A heat map of each
+plane, and a page that explains them, say what was found.
 """
 
 from __future__ import annotations
 
-import contextlib
-import hashlib
 import random
-import socket
 from collections import Counter
-from concurrent.futures import FIRST_COMPLETED, Executor, wait
-from functools import cache
+from functools import partial
 from importlib.metadata import version
-from importlib.util import find_spec
-from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final, Literal, NamedTuple
 
 import msgspec
 
-from fog_contracts.messages import NodeConfig, Pose
+from fog_contracts.messages import NodeConfig
 from fog_runtime.files import SHARED, atomic_write
 from fognav_experiments.comparison.document import (
     Block,
@@ -31,18 +25,18 @@ from fognav_experiments.comparison.document import (
     Paragraph,
     Table,
     flat,
-    to_html,
     to_markdown,
 )
-from fognav_experiments.comparison.drives import DrivenRoute
+from fognav_experiments.comparison.drives import DrivenRoute, start_of
 from fognav_experiments.figures import Estimate, estimate, heat_map
 from fognav_experiments.lockstep import release_drives, run_lockstep
-from fognav_experiments.machine import open_pool
+from fognav_experiments.machine import results
 from fognav_experiments.rigs import Tuning
 from fognav_sim.drive.hazard import HazardRequest
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator, Mapping, Sequence
+    from pathlib import Path
 
     from fog_contracts.messages import ProfileName
     from fog_contracts.site import Site
@@ -113,13 +107,9 @@ class Plane(NamedTuple):
 
 
 class SweptDrive(DrivenRoute, frozen=True, kw_only=True):
-    """One drive of a sweep in lockstep.
-
-    `sources`: digest of the program on the machine that drove it.
-    """
+    """One drive of a sweep in lockstep."""
 
     variation: Variation
-    sources: str = ""
 
     @property
     def name(self) -> str:
@@ -190,94 +180,26 @@ def gain(drives: Iterable[SweptDrive], point: Variation) -> Gain | None:
     return Gain(estimate(metres), estimate(seconds)) if metres else None
 
 
-_PACKAGES: Final = (
-    "fog_contracts", "fog_kernels", "fog_runtime", "fog_supervisor", "fognav_experiments", "fognav_sim",
-    "hazard_aggregator", "map_service", "planner", "robot_agent",
-)  # fmt: skip
-
-
-@cache
-def digest() -> str:
-    """Return a hash of all modules of Fognav that a drive can import, as they are installed here."""
-    found = hashlib.sha256()
-    for package in _PACKAGES:
-        spec = find_spec(package)
-        if spec is None or spec.submodule_search_locations is None:
-            raise RuntimeError(f"the package {package} is not installed: install fognav-experiments again")
-        for place in map(Path, spec.submodule_search_locations):
-            for file in sorted(place.rglob("*.py")):
-                found.update(f"{package}/{file.relative_to(place)}".encode() + b"\0" + file.read_bytes() + b"\0")
-    return found.hexdigest()[:16]
-
-
-CONNECT_S: Final = 20.0
-"""Timeout of the connection to a cluster's scheduler."""
-
-
-class ClusterError(RuntimeError):
-    """A cluster can't be used; the message says why, and what to do."""
-
-
-@contextlib.contextmanager
-def workers(jobs: int, cluster: str | None) -> Iterator[Executor]:
-    """Give what runs drives: processes of this machine, or the workers of the cluster at an address.
-
-    Raises `ClusterError` without Dask, or if nobody answers at the address.
-    """
-    if cluster is None:
-        with open_pool(jobs) as pool:
-            yield pool
-        return
-    if find_spec("distributed") is None:
-        raise ClusterError("--cluster needs Dask: install fognav-experiments[cluster]")
-    from distributed import Client  # noqa: PLC0415  # optional
-
-    try:
-        client = Client(cluster, timeout=CONNECT_S)
-    except (OSError, ValueError) as error:
-        raise ClusterError(f"no scheduler answers at {cluster}: {error}. Start one by `dask scheduler`") from error
-    with client, client.get_executor(retries=1) as pool:
-        yield pool
-
-
 def sweep(
-    site: LoadedSite, asked: Sequence[SweepTask], files: DriveFiles[SweptDrive], pool: Executor, commit: str = ""
+    site: LoadedSite, asked: Sequence[SweepTask], files: DriveFiles[SweptDrive], jobs: int, commit: str = ""
 ) -> Iterator[SweptDrive]:
-    """Run the drives that have no record yet, and yield each record once it is written; `commit` is only recorded.
+    """Run the drives that have no record yet, so many at a time, and yield each record once it is written.
 
-    Raises `ClusterError` if a worker runs other sources than this process.
+    `commit` is only recorded.
     """
-    due, sources = [task for task in asked if not files.has(task.name)], digest()
-    waiting = {pool.submit(swept_drive, site, task, commit, sources) for task in due}
-    try:
-        while waiting:
-            done, waiting = wait(waiting, return_when=FIRST_COMPLETED)
-            for future in done:
-                drive = future.result()
-                files.write(drive)
-                yield drive
-    finally:
-        for future in waiting:
-            future.cancel()
+    due = [task for task in asked if not files.has(task.name)]
+    for drive in results(partial(swept_drive, site, commit), due, jobs):
+        files.write(drive)
+        yield drive
 
 
-def swept_drive(site: LoadedSite, task: SweepTask, commit: str, sources: str) -> SweptDrive:
-    """Drive one task in lockstep; the same whenever and wherever it is repeated.
-
-    commit, sources: revision and digest of the sources of who asks. Raises `ClusterError` if this process has others:
-    the drive would be recorded for a commit that did not make it.
-    """
-    if (own := digest()) != sources:
-        raise ClusterError(
-            f"the worker {socket.gethostname()} runs other sources of Fognav {version('fognav-experiments')} ({own}) "
-            f"than this machine ({sources}): install the same on it, and start it again"
-        )
+def swept_drive(site: LoadedSite, commit: str, task: SweepTask) -> SweptDrive:
+    """Drive one task in lockstep; the same whenever it is repeated."""
     drawn, variation = task.drawn, task.variation
-    origin, goal = (site.site.places[name] for name in (drawn.route.start, drawn.route.goal))
     result = run_lockstep(
         site,
-        Pose(x=origin.x, y=origin.y, theta=drawn.theta if origin.theta is None else origin.theta),
-        goal,
+        start_of(site, drawn),
+        site.site.places[drawn.route.goal],
         drawn.seed,
         HazardRequest(area=drawn.area, trigger_m=drawn.trigger_m),
         watched=varied_site(site.site, variation, drawn.seed) if task.setup != "default" else False,
@@ -298,7 +220,6 @@ def swept_drive(site: LoadedSite, task: SweepTask, commit: str, sources: str) ->
         time_s=result.time_s,
         commit=commit,
         version=version("fognav-experiments"),
-        sources=own,
     )
 
 
@@ -308,7 +229,7 @@ TITLE: Final = "How what the fog saves depends on its parts"
 def publish(
     drives: Sequence[SweptDrive], planes: Sequence[Plane], command: str, measured_on: Mapping[str, Any], target: Path
 ) -> list[Path]:
-    """Write the pages and figures of a sweep into a folder; return the files."""
+    """Write the page and figures of a sweep into a folder; return the files."""
     blocks: list[Block] = [
         Heading(TITLE, 1),
         Paragraph(
@@ -329,7 +250,6 @@ def publish(
         blocks.append(Table(["drive", "outcome"], [[drive.name, drive.outcome] for drive in failed]))
     texts = {
         "README.md": to_markdown(blocks),
-        "report.html": to_html(TITLE, blocks),
         **{block.file: block.svg for block in blocks if isinstance(block, Figure)},
     }
     for name, content in texts.items():

@@ -58,16 +58,18 @@ def test_area_that_no_barrier_closes_is_named_before_the_first_drive(tmp_path, m
 
 
 def test_a_sweep_of_one_plane_drives_no_other_and_its_page_names_that_command(tmp_path, monkeypatch):
-    asked = []
-    monkeypatch.setattr(experiment, "_sweep", lambda *args, **_: asked.append(args) or 0)
-    arguments = ["sensitivity", "--areas", "none", "--routes", "1", "--out", str(tmp_path / "sweep")]
+    monkeypatch.setattr(kernels, "warm_cache", lambda _: None)
+    monkeypatch.setattr(sensitivity, "sweep", lambda *_: iter(()))
+    arguments = ["sensitivity", "--areas", "none", "--routes", "1", "--out", str(tmp_path)]
     result = CliRunner().invoke(experiment.experiment_app, arguments, catch_exceptions=False)
-    assert result.exit_code == 0, result.output
-    ((_, _, planes, _, command),) = asked
-    assert [(plane.x.quantity, plane.y.quantity) for plane in planes] == [("readings", "pause_ms")]
-    assert command == (
+    assert "no record of 0002-ab-default-" in result.output
+    page = (tmp_path / "README.md").read_text("utf-8")
+    command = (
         "fognav experiment sensitivity --readings 2,5,20 --pause 50,500 --areas none --routes 1 --seed 1 --out DIR"
     )
+    assert command in page
+    assert "## readings and pause_ms" in page
+    assert "## areas" not in page
 
 
 def test_a_drive_that_was_skipped_is_named_and_is_no_success(tmp_path, monkeypatch):

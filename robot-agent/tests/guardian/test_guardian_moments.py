@@ -21,84 +21,10 @@ STAND = b"0.0000,0.0000;"
 RTS = WakeLine(name="rts", seconds=1.1)
 
 
-def at_zero(rig: Rig, left: float = 0.05, right: float = 0.05) -> Rig:
-    """Drive until t = 0, when the last command is given; it slows the wheels, so it is sent at once."""
-    rig.drive(-0.88, -0.02)
-    rig.frame(-0.01)
-    assert rig.wheels(rig.command(0.0, left, right)) == (left, right)
-    return rig
-
-
 # --- commands ---
 
 
-def test_command_is_fresh_at_0_2_s_still() -> None:
-    rig = at_zero(Rig(begin=-1.0))
-    rig.frame(0.15)
-    assert rig.wheels(rig.core.tick(0.2)) == (0.05, 0.05)
-    assert rig.frame(0.2, overcurrent=True).feedback[-1].stopped is None
-    assert rig.wheels(rig.core.tick(0.2001)) == (0.0, 0.0)
-    assert rig.frame(0.201).feedback[-1].stopped == "no fresh command from the agent"
-
-
-def test_feedback_says_nothing_stopped_while_the_robot_drives_and_names_it_after_the_agent_was_lost() -> None:
-    rig = Rig(begin=99.0)
-    rig.drive(99.2, 100.0)
-    assert rig.frame(100.01, overcurrent=True).feedback[-1].stopped is None
-    rig.core.on_agent_lost(100.02)
-    assert rig.frame(100.03).feedback[-1].stopped == "no fresh command from the agent"
-
-
-def test_unchanged_command_is_repeated_at_0_05_s() -> None:
-    rig = at_zero(Rig(begin=-1.0))
-    assert rig.wheels(rig.core.tick(0.0499)) is None
-    assert rig.wheels(rig.core.tick(0.05)) == (0.05, 0.05)
-
-
-def test_command_as_fast_as_allowed_is_not_scaled() -> None:
-    assert Rig().drive(0.1, 1.0, 0.5, 0.12) == (0.5, 0.12)
-
-
-def test_core_tells_whether_a_wheel_is_told_to_turn() -> None:
-    rig = Rig()
-    assert not rig.core.moving
-    rig.drive(0.1, 1.0, 0.0, 0.1)
-    assert rig.core.moving
-    rig.command(1.01, 0.0, 0.0)
-    assert not rig.core.moving
-
-
 # --- a base that is not awake ---
-
-
-def test_waking_is_repeated_after_1_s_and_not_at_it() -> None:
-    rig = Rig(awake=False)
-    assert rig.core.tick(1.0).data == STAND
-    assert rig.core.tick(1.001).data == b"wake;"
-
-
-def test_zero_speed_is_repeated_at_0_05_s_to_a_base_that_is_not_awake() -> None:
-    rig = Rig(awake=False)
-    assert rig.core.tick(0.05).data == STAND
-    late = Rig(awake=False, begin=100.0)
-    assert late.core.tick(100.02).data == b""
-
-
-def test_wake_command_counts_as_a_stop_that_needs_no_repetition() -> None:
-    rig = Rig(awake=False, base=PlainBase(ignored_after_wake=0.0))
-    rig.frame(0.01)
-    assert rig.command(0.02, 0.0, 0.0).data == b""
-    assert rig.command(0.051, 0.0, 0.0).data == STAND
-
-
-def test_frames_before_the_first_wake_command_are_reported_as_from_a_base_at_rest() -> None:
-    base = PlainBase()
-    rig = Rig.__new__(Rig)
-    rig.base, rig.core = base, GuardianCore(base)
-    (first,) = rig.frame(1.0).feedback
-    assert first.stopped == "the base is not ready to drive yet"
-    assert rig.frame(1.06).feedback == ()
-    assert len(rig.frame(1.1).feedback) == 1
 
 
 def test_charging_base_is_held_at_zero_from_the_first_tick_and_woken_when_it_falls_silent() -> None:
@@ -147,30 +73,6 @@ def test_charging_base_that_is_awake_stands_and_says_why() -> None:
 
 
 # --- a base that falls silent ---
-
-
-def test_base_is_silent_after_0_3_s_and_not_at_it() -> None:
-    rig = Rig(begin=-1.0)
-    rig.drive(-0.9, 0.0)
-    rig.core.tick(0.3)
-    assert rig.core.latched is None
-    rig.core.tick(0.3001)
-    assert rig.core.latched == "the base has sent no valid frame for 0.3 s: check cable and power"
-
-
-def test_silent_base_is_stopped_at_once_then_every_0_05_s_and_reported_every_0_045_s() -> None:
-    rig = Rig(begin=-1.0)
-    rig.drive(-0.9, -0.5)
-    outputs = {now: rig.core.tick(now) for now in (0.0, 0.02, 0.0449, 0.045, 0.0499, 0.05, 0.07)}
-    assert [now for now, output in outputs.items() if output.data] == [0.0, 0.05]
-    assert [now for now, output in outputs.items() if output.feedback] == [0.0, 0.045]
-    assert outputs[0.0].feedback[0].fault == rig.core.latched
-    assert not outputs[0.0].feedback[0].passing
-    late = Rig(begin=99.0)
-    late.drive(99.1, 99.2)
-    outputs = {now: late.core.tick(now) for now in (100.0, 100.01)}
-    assert (outputs[100.0].data, outputs[100.01].data) == (STAND, b"")
-    assert outputs[100.01].feedback == ()
 
 
 SILENCE = "the base has sent no valid frame for 0.3 s: check cable and power"
@@ -246,14 +148,6 @@ def test_silence_on_the_way_off_the_dock_is_latched() -> None:
     assert leaving.core.latched == SILENCE
 
 
-def test_core_counts_the_frames_of_its_base() -> None:
-    rig = Rig(awake=False)
-    assert rig.core.frames == 0
-    rig.frame(0.05)
-    rig.frame(0.1)
-    assert rig.core.frames == 2
-
-
 def test_of_frames_that_came_together_the_newest_is_told_and_each_that_says_something_else() -> None:
     rig = Rig()
     free, pressed = BaseStatus(), BaseStatus(bumper_left=True)
@@ -282,13 +176,6 @@ def test_first_fault_is_answered_with_a_stop_even_if_zero_was_sent_a_moment_ago(
     assert rig.frame(1.07, bumper_left=True).data == STAND
 
 
-def test_overcurrent_is_a_fault_at_0_3_s() -> None:
-    rig = Rig(begin=-1.0)
-    rig.frame(0.0, overcurrent=True)
-    rig.frame(0.3, overcurrent=True)
-    assert rig.core.latched == "a wheel motor draws too much current: it is blocked"
-
-
 # --- what is tried on a base that never answers ---
 
 
@@ -303,15 +190,6 @@ def attempts(rig: Rig, until: float, step: float = 0.02) -> dict[float, object]:
     return found
 
 
-def test_silent_base_is_given_up_with_the_remedy_and_its_first_frame_ends_that() -> None:
-    rig = Rig(awake=False)
-    attempts(rig, 6.0)
-    assert rig.core.unanswered == "the base does not answer at 115200 baud: check its cable and power"
-    assert rig.base.bauds == []
-    rig.frame(6.5)
-    assert rig.core.unanswered is None
-
-
 def test_another_rate_is_set_and_the_base_woken_at_once_at_it() -> None:
     rig = Rig(awake=False, base=PlainBase(awakening=Awakening(bauds=(115_200, 19_200))))
     (at, first), *_ = attempts(rig, 6.0).items()
@@ -320,16 +198,6 @@ def test_another_rate_is_set_and_the_base_woken_at_once_at_it() -> None:
     other = Rig(awake=False, base=PlainBase(awakening=Awakening(bauds=(115_200, 19_200))))
     attempts(other, at + 0.02)
     assert other.core.tick(at + 0.02).data == b"wake;"
-
-
-def test_pulse_changes_no_rate_and_is_followed_by_the_usual_wait() -> None:
-    rig = Rig(awake=False, base=PlainBase(awakening=Awakening(bauds=(115_200,), line=RTS)))
-    (at, first), *_ = attempts(rig, 6.0).items()
-    assert first.line == RTS
-    assert rig.base.bauds == []
-    other = Rig(awake=False, base=PlainBase(awakening=Awakening(bauds=(115_200,), line=RTS)))
-    attempts(other, at + 0.02)
-    assert other.core.tick(at + 0.02).data == b""
 
 
 def test_base_that_sends_frames_is_woken_only_whatever_its_mode() -> None:
@@ -341,20 +209,7 @@ def test_base_that_sends_frames_is_woken_only_whatever_its_mode() -> None:
     assert rig.core.unanswered is None
 
 
-def test_base_counts_as_silent_after_its_wake_timeout_and_not_at_it() -> None:
-    rig = Rig(awake=False, begin=-1.5, base=PlainBase(awakening=Awakening(bauds=(115_200,), line=RTS)))
-    rig.frame(0.0, mode_problem="it sleeps")
-    tried = {now: rig.core.tick(now).attempt for now in (1.0, 2.25, 3.5, 4.75, 6.0)}
-    assert [now for now, attempt in tried.items() if attempt is not None] == [6.0]
-
-
 # --- feedback and messages ---
-
-
-def test_feedback_is_due_at_0_045_s_while_the_wheels_turn() -> None:
-    rig = Rig(begin=-1.0)
-    assert len(rig.frame(0.0, overcurrent=True).feedback) == 1
-    assert len(rig.frame(0.045, travel=0.01, overcurrent=True).feedback) == 1
 
 
 @pytest.mark.parametrize(("speed", "accepted"), [(0.5, True), (-0.5, True), (0.501, False), (-0.501, False)])
@@ -367,10 +222,6 @@ def test_command_of_more_than_0_5_m_s_is_no_command(speed, accepted) -> None:
         else:
             with pytest.raises(msgspec.ValidationError):
                 link.decode_command(data)
-
-
-def test_largest_packet_has_4096_bytes() -> None:
-    assert link.PACKET_LIMIT == 4096
 
 
 # --- a base that is put to sleep ---

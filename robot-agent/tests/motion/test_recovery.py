@@ -3,21 +3,28 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
+from little_world import AGENT
 from open_floor import LONG, PADDING, ROUND, around
 
 from fog_contracts.costs import UNKNOWN
+from fog_contracts.grid import GridGeometry
+from fog_kernels.robot import cover
+from robot_agent.footprint import Footprint
 from robot_agent.localization.pose import Pose2
+from robot_agent.motion.local_planner import Job, decide
 from robot_agent.motion.path_follower import PathFollower
 from robot_agent.motion.recovery import (
     LENGTH_M,
     MOVE_MAX_S,
     PATIENCE_S,
     SERIES,
+    Attempt,
     Recoveries,
     Recovery,
     RecoveryMove,
@@ -30,6 +37,11 @@ from robot_agent.motion.recovery import (
 
 DT = 0.2
 STUCK = Situation(place=(0.0, 0.0), stuck_for=PATIENCE_S, error=0.5, trail=0.5)
+HERE = Pose2(1.5, 1.5, 0.0)
+WIDE = cover(Footprint(((-0.1, -0.1), (0.12, -0.1), (0.12, 0.3), (-0.1, 0.3))).polygon)
+"""Reaches farther to the left of its axle than to the right."""
+ROUNDING = 0.007
+"""What distances lose between the field's cells, and between the poses of an arc that are looked at (m)."""
 
 
 def distance(body, pose, points):
@@ -83,6 +95,18 @@ def test_moves_at_one_place_have_an_end(seen):
         begun += state.running is not None and state.running != before.running
         assert state.running is None or now - state.since <= MOVE_MAX_S
     assert begun <= len(SERIES)
+
+
+def test_series_turns_backs_up_15_cm_turns_and_backs_up_30_cm():
+    state, now, moves = Recovery(), 0.0, []
+    for _ in range(4):
+        state, now = step(state, STUCK._replace(trail=0.6), now), now + 0.2
+        moves.append((state.running, round(state.until, 6)))
+        state, now = step(state, STUCK._replace(refused=True), now), now + 0.2
+    assert moves == [
+        (Attempt("turn"), 0.6), (Attempt("back", 0.15), 0.45), (Attempt("turn"), 0.6), (Attempt("back", 0.3), 0.3)
+    ]  # fmt: skip
+    assert step(state, STUCK, now).running is None
 
 
 def test_series_begins_anew_elsewhere_only():
@@ -179,6 +203,105 @@ def test_no_move_brings_the_body_nearer_to_anything_than_its_padding(things, the
     poses = drive(lambda _: move, pose, points, body, 1.6)
     for reached in poses:
         assert distance(body, reached, points) >= min(begin, PADDING) - 0.006
+
+
+def backing(*behind, pose=HERE, body=ROUND, things=()):
+    """Return the speeds of backing up along points in `base` of a robot at a pose."""
+    move = RecoveryMove(trail=pose.transform(np.array(behind)))
+    return recovery_speeds(move, pose, around(list(things), body, *pose[:2]), body, PADDING, 0.3)
+
+
+def nearest(body, poses, points):
+    """Return the exact distance of each point (n, 2) from a body along poses (m, 3); below 0 inside."""
+    discs = body.discs if len(body.discs) else np.array([(0.0, 0.0, body.circumscribed)])
+    x, y, theta = (values[:, None] for values in np.array(poses).T)
+    ahead, left, radius = discs.T
+    centre_x = x + np.cos(theta) * ahead - np.sin(theta) * left
+    centre_y = y + np.sin(theta) * ahead + np.cos(theta) * left
+    away = np.hypot(points[:, 0] - centre_x[..., None], points[:, 1] - centre_y[..., None]) - radius[:, None]
+    return away.min(axis=(0, 1))
+
+
+def arc(pose, v, w, seconds, steps=60):
+    """Return the poses of an arc, by small steps."""
+    poses, dt = [pose], seconds / steps
+    for _ in range(steps):
+        x, y, theta = poses[-1]
+        middle = theta + 0.5 * w * dt
+        poses.append(Pose2(x + v * dt * math.cos(middle), y + v * dt * math.sin(middle), theta + w * dt))
+    return poses
+
+
+def first_at(body, poses, candidates, away):
+    """Return the point (1, 2) after the last one that is nearer than `away` m; they lead away from the robot.
+
+    Not the first one that is farther: a body is covered by discs along its rim, so its inside may seem to be far.
+    """
+    return candidates[np.flatnonzero(nearest(body, poses, candidates) < away)[-1] + 1][None]
+
+
+@pytest.mark.parametrize("body", [ROUND, LONG, WIDE], ids=["round", "long", "wide"])
+@given(
+    theta=st.floats(-3.1, 3.1),
+    bend=st.sampled_from([-3.0, -1.0, 0.0, 0.5, 2.0]),
+    place=st.floats(-3.1, 3.1),
+    away=st.floats(-0.02, 0.06),
+)
+@settings(deadline=None, max_examples=25)  # the field is made anew for each
+def test_robot_backs_up_exactly_where_the_next_10_cm_keep_the_padding(body, theta, bend, place, away):
+    pose = Pose2(1.5, 1.5, theta)
+    behind = np.array([(-math.sin(bend * s) / bend if bend else -s, -(1.0 - math.cos(bend * s)) / bend if bend else 0.0)
+                       for s in np.arange(0.02, 0.3, 0.02)])  # fmt: skip
+    free = backing(*behind, pose=pose, body=body)
+    assert free is not None
+    v, w = free
+    poses = arc(pose, v, w, 0.1 / abs(v) if v else 0.35 / abs(w))
+    # A thing beside the way, and nearer to its begin or to its end.
+    rays = np.arange(0.0, 0.8, 0.002)[:, None] * (math.cos(place), math.sin(place)) + (1.5, 1.5)
+    thing = first_at(body, poses, rays, away)
+    kept, begin = nearest(body, poses[1:], thing)[0], nearest(body, poses[:1], thing)[0]
+    found = backing(*behind, pose=pose, body=body, things=thing)
+    if begin >= PADDING + ROUNDING and kept >= PADDING + ROUNDING:
+        assert found == free
+    if begin >= PADDING + ROUNDING and kept < PADDING - ROUNDING:
+        assert found is None
+
+
+def test_robot_that_is_too_near_to_a_thing_may_go_away_from_it_but_not_nearer():
+    thing = (1.5 + 0.17 + 0.5 * PADDING, 1.5)
+    assert backing((-0.2, 0.0), things=[thing]) == pytest.approx((-0.08, 0.0))
+    assert backing((-0.2, 0.0), pose=Pose2(1.5, 1.5, math.pi), things=[thing]) is None
+
+
+@pytest.mark.parametrize(("outwards", "room"), [(-0.01, True), (0.01, False)])
+@pytest.mark.parametrize("side", [(-1.0, 0.0), (1.0, 0.0), (0.0, -1.0), (0.0, 1.0)])
+def test_body_may_reach_to_the_border_of_the_map_and_not_beyond(side, outwards, room):
+    field = around([])
+    half = 0.5 * len(field.cost) * field.resolution
+    away = half - 0.17 + outwards
+    x, y = field.origin_x + half + away * side[0], field.origin_y + half + away * side[1]
+    assert (clearances(field, ROUND, (np.array([x]), np.array([y]), np.array([0.0])))[0] > 0.0) == room
+
+
+@pytest.mark.parametrize("rate", [0.2, 0.5, 2.75])
+@pytest.mark.parametrize(
+    "move", [RecoveryMove(heading=2.0), RecoveryMove(heading=-2.0), RecoveryMove(trail=np.array([[1.36, 1.54]]))]
+)
+def test_recovery_turns_no_faster_than_the_robot_may_and_keeps_its_arc(rate, move):
+    window = GridGeometry(width=60, height=60, resolution=0.05, origin_x=0.0, origin_y=0.0)
+    motion = replace(AGENT.motion, limits=replace(AGENT.motion.limits, w_max=rate))
+    made = decide(
+        Job(
+            plan_id=1, planner_epoch=1, made_at=0.0, pose=HERE, v=0.0, w=0.0, path=np.array([[1.5, 1.5], [2.5, 1.5]]),
+            ends_here=False, goal_theta=None, arrived=False, cap=0.3, cost=np.zeros(window.shape, np.uint8),
+            window=window, lidar_points=np.zeros((0, 2)), footprint=AGENT.footprint, config=motion, recovery=move,
+        )
+    )  # fmt: skip
+    v, w = recovery_speeds(move, HERE, around([]), ROUND, PADDING, 0.3)
+    assert abs(w) > 0.2
+    share = min(1.0, rate / abs(w))
+    assert (made.v, made.w) == pytest.approx((v * share, w * share))
+    assert (made.right - made.left) / motion.limits.axle == pytest.approx(w * share)
 
 
 @pytest.mark.parametrize("theta", [0.0, 3.1])

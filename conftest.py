@@ -1,8 +1,11 @@
 """Shared by all tests: hypothesis profiles, the folder of recordings, and which tests may run in parallel."""
 
 import os
+import platform
 import re
 import signal
+import subprocess
+from datetime import UTC, datetime
 from functools import cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
@@ -13,6 +16,7 @@ from hypothesis import HealthCheck, settings
 from fog_supervisor import net
 
 if TYPE_CHECKING:
+    from _pytest.terminal import TerminalReporter
     from xdist.scheduler import LoadScopeScheduling
     from xdist.workermanage import WorkerController
 
@@ -39,13 +43,9 @@ LONGER: Final = (
     "FOGNAV_WRITES",
 )  # fmt: skip
 """Variables that set how much some tests try, which may take hours then (CONTRIBUTING.md)."""
+LAST_LONG_RUN: Final = ROOT / "tests" / "last-long-run.txt"
 REACTION, COMPUTING, SYSTEM, LIVE, COMPOSE = range(5)
 """Kinds of test modules, in the order in which they are started."""
-
-
-def pytest_addoption(parser: pytest.Parser) -> None:
-    """Add what takes long."""
-    parser.addoption("--long", action="store_true", help="drive new random worlds for ten minutes, too")
 
 
 def pytest_configure() -> None:
@@ -125,6 +125,14 @@ def is_quick(item: pytest.Item) -> bool:
     return computes_only or item.get_closest_marker("smoke") is not None
 
 
+def belongs(item: pytest.Item, tier: str) -> bool:
+    """Whether a test is run with those of a tier; what needs containers is one of the rest and a long one."""
+    long = item.get_closest_marker("long") is not None
+    if tier == "long":
+        return long or item.get_closest_marker("compose") is not None
+    return not long and (tier == "all" or is_quick(item) == (tier == "quick"))
+
+
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
     """Leave out what another tier runs, and start with the tests that take longest, if several workers share them.
 
@@ -138,12 +146,27 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
         for item in items:
             if item.get_closest_marker("timeout") is None:
                 item.add_marker(pytest.mark.timeout(0))
-    if (tier := config.getoption("tier", "all")) != "all":
-        left_out = [item for item in items if is_quick(item) != (tier == "quick")]
-        items[:] = [item for item in items if is_quick(item) == (tier == "quick")]
+    tier = config.getoption("tier", "all")
+    if left_out := [item for item in items if not belongs(item, tier)]:
+        items[:] = [item for item in items if belongs(item, tier)]
         config.hook.pytest_deselected(items=left_out)
     if "PYTEST_XDIST_WORKER" in os.environ:
         items.sort(key=lambda item: group_of(module_of(item.nodeid)))
+
+
+def pytest_terminal_summary(terminalreporter: "TerminalReporter", config: pytest.Config) -> None:
+    """Keep the date and result of the last run of all long tests, to be committed."""
+    if config.getoption("tier", "all") != "long" or config.args_source != pytest.Config.ArgsSource.TESTPATHS:
+        return
+    counts = {kind: len(terminalreporter.stats.get(kind, [])) for kind in ("passed", "failed", "error", "skipped")}
+    told = ", ".join(f"{count} {kind}" for kind, count in counts.items() if count) or "no test ran"
+    git = ["git", "-C", str(ROOT), "describe", "--always", "--dirty"]
+    done = subprocess.run(git, capture_output=True, text=True, check=False)  # noqa: S603  # a fixed command, no shell
+    commit = done.stdout.strip() or "no commit"
+    machine = f"{os.cpu_count()} cores, {platform.system()} {platform.machine()}"
+    line = f"{datetime.now(UTC):%Y-%m-%d}, {commit}: {told} ({machine})\n"
+    LAST_LONG_RUN.write_text(line, "utf-8")
+    terminalreporter.line(f"commit {LAST_LONG_RUN.relative_to(ROOT)}: {line}")
 
 
 @pytest.fixture(scope="session")

@@ -80,14 +80,14 @@ def test_tests_run_on_all_cores_unless_the_arguments_choose_otherwise() -> None:
 @pytest.mark.parametrize(
     ("arguments", "tier"),
     [
-        ([], "quick"), (["-q", "-x"], "quick"), (["--all"], "all"), (["--rest", "-q"], "rest"), (["--long"], "all"),
+        ([], "quick"), (["-q", "-x"], "quick"), (["--all"], "all"), (["--rest", "-q"], "rest"), (["--long"], "long"),
         (["-k", "replica"], "all"), (["-m", "claim"], "all"), (["cli/tests/test_testing.py::test_x"], "all"),
     ],
 )  # fmt: skip
 def test_quick_tests_run_unless_all_are_asked_for_or_some_by_name(arguments: list[str], tier: str) -> None:
     command = testing.pytest_command(arguments, terminal=False)
     assert [argument for argument in command if "tier" in argument] == [f"--tier={tier}"]
-    assert not {"--all", "--rest"} & set(command)
+    assert not {"--all", "--rest", "--long"} & set(command)
 
 
 @pytest.mark.drive

@@ -489,9 +489,9 @@ def test_worlds_of_a_fixed_seed_break_no_rule():
     assert {found.record.number: found.record.values for found in map(drive, tasks) if found.world} == {}
 
 
-def test_new_worlds_break_no_rule(request, tmp_path):
-    if not request.config.getoption("--long"):
-        pytest.skip("takes ten minutes: ask for it by --long")
+@pytest.mark.long
+@pytest.mark.timeout(0)
+def test_new_worlds_break_no_rule(tmp_path):
     records = list(runner.run(tmp_path, int(time.time()), 10.0, 1, "", [SITES], 20))
     assert [(record.seed, record.number, record.values) for record in records if record.rules] == []
 

@@ -141,7 +141,8 @@ def run_tests(context: typer.Context, *, yes: Yes = False) -> None:
     """Set up what is missing, then run the tests on all cores.
 
     These are some minutes of them, or those that you name. With --all every test runs, with --rest those that are
-    left out without it, with --long new random worlds, too. Further arguments go to pytest (`-n 0` runs one at a time).
+    left out without it, with --long new random worlds and containers, which keeps its result in
+    tests/last-long-run.txt. Further arguments go to pytest (`-n 0` runs one at a time).
     """
     from fognav import testing  # noqa: PLC0415  # keeps the other commands fast
 

@@ -19,8 +19,8 @@ _LEFT_OUT: Final = "fognav_left_out"
 
 def pytest_addoption(parser: pytest.Parser) -> None:
     """Add the choice of tests; the root's conftest.py knows which belong where."""
-    tiers = ("quick", "rest", "all")
-    parser.addoption("--tier", choices=tiers, default="all", help="quick: some minutes; rest: all others; all: both")
+    tiers = ("quick", "rest", "all", "long")
+    parser.addoption("--tier", choices=tiers, default="all", help="quick: some minutes; rest: others; all: both; long")
 
 
 def pytest_deselected(items: list[pytest.Item]) -> None:

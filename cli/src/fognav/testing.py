@@ -20,8 +20,8 @@ _OVERRIDES: Final = (
 )
 """Arguments that choose another distribution of the tests, or need a single process."""
 
-_TIERS: Final = {"--all": "all", "--rest": "rest"}
-"""Arguments that ask for every test, or for those that are left out without one."""
+_TIERS: Final = {"--all": "all", "--rest": "rest", "--long": "long"}
+"""Arguments that ask for every test, those that are left out without one, or those that all tests leave out."""
 
 
 def workers(tier: str) -> int:
@@ -50,7 +50,7 @@ def pytest_command(arguments: Sequence[str], *, terminal: bool | None = None) ->
 def _selects(arguments: Sequence[str]) -> bool:
     """Whether the user says which tests to run, by their path, a name or a marker: then no tier leaves one out."""
     paths = (argument.partition("::")[0] for argument in arguments if not argument.startswith("-"))
-    by_name = any(argument.startswith(("-k", "-m", "--long")) for argument in arguments)
+    by_name = any(argument.startswith(("-k", "-m")) for argument in arguments)
     return by_name or any((checkout.root() / path).exists() for path in paths)
 
 

@@ -30,13 +30,6 @@ def test_relative_links_point_to_existing_files(document: Path) -> None:
     assert not missing, f"{document.relative_to(ROOT)} points at {', '.join(missing)}"
 
 
-def test_test_folders_in_the_readme_exist() -> None:
-    named = re.findall(r"\./fognav test ((?:[\w./-]+ ?)+)", (ROOT / "README.md").read_text("utf-8"))
-    folders = [folder for group in named for folder in group.split() if "/" in folder]
-    assert folders
-    assert [folder for folder in folders if not (ROOT / folder).exists()] == []
-
-
 def test_operations_names_every_metric_and_none_that_nobody_exports() -> None:
     sources = [
         path for part in ("libs", "services", "robot-agent", "sim") for path in (ROOT / part).rglob("src/**/*.py")
@@ -70,21 +63,6 @@ def test_changelog_has_at_most_40_entries_of_one_line_for_each_release() -> None
     entries = [[line for line in release.splitlines()[1:] if line and line[0] != "#"] for release in releases]
     assert [line for lines in entries for line in lines if not line.startswith("- ") or len(line) > 120] == []
     assert [len(lines) for lines in entries if len(lines) > 40] == [], "drop what matters least to who upgrades"
-
-
-@pytest.mark.parametrize("record", sorted((ROOT / "docs" / "adr").glob("0*.md")), ids=lambda path: path.stem)
-def test_decision_records_have_a_number_and_a_dated_status(record: Path) -> None:
-    title, empty, status, *_ = record.read_text("utf-8").splitlines()
-    assert title.startswith(f"# {int(record.stem[:4])}. ")
-    assert empty == ""
-    assert re.fullmatch(
-        r"\*\*Status\.\*\* (Proposed|Accepted|Superseded by \[ADR \d+\]\(.+\)), \d{4}-\d\d-\d\d\.", status
-    )
-
-
-def test_no_two_decision_records_have_one_number() -> None:
-    numbers = [record.stem[:4] for record in (ROOT / "docs" / "adr").glob("0*.md")]
-    assert sorted(numbers) == sorted(set(numbers))
 
 
 def test_decision_records_that_sources_and_documents_name_exist() -> None:

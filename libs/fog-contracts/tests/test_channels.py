@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import copy
 import math
 import re
 
@@ -121,12 +120,6 @@ def test_every_role_publishes_or_subscribes():
 
 def test_default_silence_limit_of_an_area_is_the_maximum_age_of_readings():
     assert NODE_READING.max_age_s == UnknownPolicy().silent_after_s
-
-
-def test_channels_are_compared_and_hashed_by_identity():
-    duplicate = copy.copy(NODE_READING)
-    assert {NODE_READING: 1}.get(duplicate) is None
-    assert hash(NODE_READING) == object.__hash__(NODE_READING)
 
 
 LARGEST = 2**53

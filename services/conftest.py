@@ -125,7 +125,9 @@ class Servers:
             client.publish(end, qos=1)
             assert ended.acquire(timeout=DEADLINE_S), "the broker sends nothing"
             for topic in retained:
-                client.publish(topic, b"", qos=1, retain=True).wait_for_publish(DEADLINE_S)
+                client.publish(topic, b"", retain=True)
+            # Acknowledged after all that was sent before it.
+            client.publish(end, qos=1).wait_for_publish(DEADLINE_S)
         finally:
             client.disconnect()
             client.loop_stop()

@@ -101,11 +101,7 @@ PARTS: Final = (
     Part(
         "recoveries",
         ("motion.recovery",),
-        (
-            "motion/test_recovery.py",
-            "motion/test_recovery_boundaries.py",
-            "motion/test_recovery_limits.py",
-        ),
+        ("motion/test_recovery.py",),
         ("numpy", "hypothesis.strategies", "fog_kernels.clearance", "robot_agent.config"),
     ),
     Part(

@@ -276,7 +276,8 @@ def node_sim(  # noqa: PLR0913  # each option is an argument
 ) -> None:
     """Run one node of a site with the firmware's own code, on a real broker and a simulated floor; Ctrl-C ends it.
 
-    A locked broker lets it in by its board's settings (--board), or by the credentials that the environment names.
+    A broker with passwords lets it in by its board's settings (--board), or by the credentials that the environment
+    names.
     """
     from fognav.nodes import simulated  # noqa: PLC0415  # the simulator's imports are slow
 

@@ -43,8 +43,8 @@ def up_command(  # noqa: PLR0913  # each option is an argument
 ) -> None:
     """Run a fog node on this machine until Ctrl-C.
 
-    It has broker, Redis, router, and the services of each site. All doors have locks. Data stays in one folder, and is
-    used again by the next start.
+    It has broker, Redis, router, and the services of each site. Everything uses TLS and passwords. Data stays in one
+    folder, and is used again by the next start.
     """
     from fognav.hosting.folders import NodeFolder, default_data  # noqa: PLC0415  # keeps the other commands fast
     from fognav.hosting.unit import NAME, write_unit  # noqa: PLC0415  # same

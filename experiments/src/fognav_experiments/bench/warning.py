@@ -1,8 +1,8 @@
 """Measures a warning, live: from the first echo of an obstacle at a sensor node to the path that a robot receives.
 
-Broker, Redis, router, aggregator, map-service and planner are processes of their own, behind locks. The site's nodes
-run the firmware's code in this one, in front of a simulated floor, with an MQTT connection each; the robot is a
-stand-in with a goal. All times are of this machine's clock.
+Broker, Redis, router, aggregator, map-service and planner are processes of their own, with TLS and passwords. The
+site's nodes run the firmware's code in this one, in front of a simulated floor, with an MQTT connection each; the
+robot is a stand-in with a goal. All times are of this machine's clock.
 """
 
 from __future__ import annotations

@@ -273,8 +273,9 @@ def pipeline_command(
 ) -> None:
     """Measure the way from readings to the map.
 
-    Broker, aggregator and map-service are real processes behind locks; so is the generator of the load. Readings that
-    the aggregator did not get are lost; times are in ms, from the confirmation of a hazard to the map's delta.
+    Broker, aggregator and map-service are real processes with TLS and passwords; so is the generator of the load.
+    Readings that the aggregator did not get are lost; times are in ms, from the confirmation of a hazard to the map's
+    delta.
     """
     from fognav_experiments.bench import pipeline  # noqa: PLC0415  # keeps the other commands fast
 
@@ -310,8 +311,9 @@ def warning_command(  # noqa: PLR0913  # the options of the command
 ) -> None:
     """Measure a warning: from an obstacle's first echo at a node to the path that a robot receives around it.
 
-    The whole fog runs as real processes behind locks, the nodes run the firmware's code, with an MQTT connection each,
-    and the robot is a stand-in with a goal. Obstacles close an area on its way, one after another. Times are in ms.
+    The whole fog runs as real processes with TLS and passwords, the nodes run the firmware's code, with an MQTT
+    connection each, and the robot is a stand-in with a goal. Obstacles close an area on its way, one after another.
+    Times are in ms.
 
     With --false-echoes the nodes and the aggregator's core run in simulated time instead, whatever the machine's load:
     all sonars hear what is not there, their nodes are calibrated in that, and false alarms are counted, too.

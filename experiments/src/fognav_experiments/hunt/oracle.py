@@ -70,7 +70,8 @@ _REACTION_S: Final = 1.0
 _STOP_S: Final[dict[Word, float]] = {
     "fog": 4.0, "map-service": 4.0, "agent": 0.4, "lidar": 0.6, "new turns": 1.4, "base": 0.6, "floor": 0.4,
 }  # fmt: skip
-"""Wheels are zero so long after a word is lost: 3.5, 0.3 and 0.5 s by the documents, three turns and a ramp, 0.3 s for
+"""Wheels are zero so long after a source is lost: 3.5, 0.3 and 0.5 s by the documents, three turns and a ramp, 0.3 s
+for
 the base, a frame for the floor, and what the truth comes late."""
 _BUMPED_S: Final = 0.4
 """And so long after the bumper touched something."""

@@ -21,7 +21,7 @@ Without Redis it gives way to a leader that is alive, and else makes a provision
 Redis confirms or corrects later.
 
 Redis also leads from a leader that can't do its work to a process that can: one whose transports or threads do not
-answer gives the lease back, if a standby whose own do has left word in Redis that it is ready. If none has, it goes on:
+answer gives the lease back, if a standby whose own do has said in Redis that it is ready. If none has, it goes on:
 what it still does is better than nothing.
 """
 

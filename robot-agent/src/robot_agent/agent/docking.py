@@ -1,4 +1,4 @@
-"""The way to the dock: from an operator's word, or a low battery, to the pose in front of it. Pure.
+"""The way to the dock: from an operator's command, or a low battery, to the pose in front of it. Pure.
 
 The planner gives the goal in front of the dock to a robot that wants it, and the robot drives there like to any other.
 There it looks whether anything is in between, and asks its safety gate to let the base look for the dock. Whatever

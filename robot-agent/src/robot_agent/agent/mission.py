@@ -64,7 +64,7 @@ class Mission:
         return None if self.path is None else (self.path.planner_epoch, self.path.plan_id)
 
     def planner_age(self, now: float) -> float:
-        """Return the age (s) of the planner's last word on goal, path or refusal; infinite without one.
+        """Return the age (s) of the planner's last message on goal, path or refusal; infinite without one.
 
         It counts from when that was sent, as far as the delays of paths and releases tell.
         """

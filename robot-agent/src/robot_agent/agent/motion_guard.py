@@ -1,4 +1,4 @@
-"""The last word on every wheel command: the stop field over what the lidar has just seen, and what it did not see.
+"""The last limit of every wheel command: the stop field over what the lidar has just seen, and what it did not see.
 
 `NearPoints` is what the lidar saw near the robot during the last moments, each sample from where the robot was when it
 was taken; `LidarView` what the newest whole scan covers, against what the map leads to expect from there.

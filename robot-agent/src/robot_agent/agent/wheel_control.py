@@ -87,7 +87,7 @@ class WheelControl:
         self._reset_pending = True
 
     def command(self, outputs: SafetyOutputs, guard: Callable[[Wheels, float], Wheels], now: float) -> WheelCommand:
-        """Return the wheel speeds to send at `now` (s, monotonic); `guard` has the last word on them."""
+        """Return the wheel speeds to send at `now` (s, monotonic); `guard` limits them last."""
         dt = 0.0 if self._streamed_at is None else min(max(now - self._streamed_at, 0.0), _STEP_MAX_S)
         self._streamed_at = now
         limits, safety, last = self._config.motion.limits, self._config.safety, self.speeds

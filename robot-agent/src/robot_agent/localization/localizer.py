@@ -176,7 +176,7 @@ class Localizer:
         The next scan narrows them in the directions that it observes.
         """
         self._start(Pose2(x, y, theta), sigma_xy, sigma_theta)
-        self._tracked = True  # an operator's word, too, says more than an opened door does
+        self._tracked = True  # an operator's pose, too, says more than an opened door does
         self._monitor.begin("checking the given pose")
 
     def restore(self, saved: SavedPose) -> None:

@@ -265,7 +265,7 @@ class AreaBody(Message, frozen=True, kw_only=True):
 class AreaView(Message, frozen=True, kw_only=True):
     """An area with its announced hazard; `withheld`: a newer hazard, a relief, is not announced until it is stored.
 
-    `override` is an operator's word, which counts instead of the nodes'.
+    `override` is an operator's state of it, which counts instead of the nodes'.
     """
 
     definition: AreaDefinition

@@ -44,7 +44,7 @@ LONGEST_S: Final[Mapping[OverrideState, float]] = {"blocked": 30 * 86_400.0, "cl
 
 
 class AreaOverride(Message, frozen=True, kw_only=True):
-    """An operator's word on an area, as it is stored: it holds until `deadline` (s) of the clock of the boot `boot`."""
+    """An operator's stored override of an area: it holds until `deadline` (s) of the clock of the boot `boot`."""
 
     area: Id
     state: OverrideState
@@ -184,7 +184,7 @@ class WatchedArea:
             self.hazard = structs.replace(self.hazard, epoch=epoch)
 
     def evaluate(self, epoch: int, seq: int, stamp: float, override: AreaOverride | None = None) -> AreaHazard | None:
-        """Fuse the nodes, unless an operator's word counts; return the area's hazard, with this epoch and `seq`.
+        """Fuse the nodes, unless an operator's override counts; return the area's hazard, with this epoch and `seq`.
 
         None when it did not change.
         """
@@ -247,7 +247,7 @@ class WatchedArea:
         return _Measured(state, penalty, severity, self._cause(state, deciding), deciding)
 
     def _overridden(self, measured: _Measured, override: AreaOverride | None) -> _Measured:
-        """Return what counts: what the nodes measure, or the operator's word.
+        """Return what counts: what the nodes measure, or the operator's override.
 
         An area that an operator declared clear is unknown and passable: nobody measures that it is clear.
         """

@@ -358,7 +358,7 @@ class Aggregator:
         return self._announce(self._fusion.on_thesis_state(int(ids["number"]), text.strip(), at.now, at.stamp))
 
     def _on_hazard(self, ids: Ids, hazard: AreaHazard, at: Moment) -> list[Publication]:
-        """Hear what the broker distributes as our word: it must be ours.
+        """Hear what the broker distributes as our message: it must be ours.
 
         A hazard that an earlier run left retained is restored, so that a danger survives a restart without Redis. Our
         own word is published again over every other one; against a higher epoch it needs a new epoch (`outranked_by`).

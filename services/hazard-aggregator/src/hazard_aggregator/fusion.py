@@ -216,7 +216,7 @@ class AreaFusion:
         return self._evaluate(area, stamp) if area else []
 
     def set_override(self, area_id: str, override: AreaOverride | None, stamp: float) -> list[AreaHazard]:
-        """Let an operator's word count for an area, whether it is known already or not; or, with None, no more."""
+        """Let an operator's override count for an area, whether it is known already or not; or, with None, no more."""
         if override is None:
             self._overrides.pop(area_id, None)
         else:

@@ -22,7 +22,7 @@ MAX_PERIODS: Final = 10_000
 
 
 class Period(Message, frozen=True, kw_only=True):
-    """A time in which an area had one state and penalty, and one operator's word or none (`overridden`).
+    """A time in which an area had one state and penalty, and one operator's override or none (`overridden`).
 
     `began` is s since the epoch, `cause` what was said then.
     """

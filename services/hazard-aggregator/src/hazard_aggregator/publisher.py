@@ -34,14 +34,14 @@ _history_log = logs.get("history")
 
 
 class Availability:
-    """The word of the one that leads: `offline` comes from a copy that stood by, or from the leader before, too."""
+    """The presence of the one that leads: `offline` comes from a copy that stood by, or from the leader before, too."""
 
     def __init__(self, edges: Edges, leading: asyncio.Event) -> None:
         self._edges = edges
         self._leading = leading
 
     def subscribe(self, mqtt: MqttEdge) -> None:
-        """Register what keeps the word true; call before the connection runs."""
+        """Register what keeps the presence true; call before the connection runs."""
         mqtt.on(ch.AGGREGATOR_AVAILABILITY, self._on_availability)
         mqtt.on_connect(self._on_connect)
 

@@ -144,7 +144,7 @@ class PlannerCore:
         self.missions.publish_all_now()
 
     def stand_by(self) -> None:
-        """Forget all missions, without a word to the robots: another planner leads."""
+        """Forget all missions, without a message to the robots: another planner leads."""
         self.epoch, self._knows_missions = 0, False
         self.missions.drop()
 

@@ -175,7 +175,7 @@ OverrideReason = Annotated[str, Meta(min_length=1, max_length=200)]
 
 
 class HazardOverride(Message, frozen=True, kw_only=True):
-    """An operator's word on an area, which counts instead of its nodes' for a time: `ttl_s` from `set_at` on.
+    """An operator's override of an area, which counts instead of its nodes' for a time: `ttl_s` from `set_at` on.
 
     `measured` and `measured_penalty` are what the area's state and penalty would be without it.
     """
@@ -211,7 +211,7 @@ class AreaHazard(Message, frozen=True, kw_only=True):
 
 
 class AggregatorHeartbeat(Message, frozen=True, kw_only=True):
-    """The aggregator's sign of life, and its word on every area: a hazard that it does not list is not its own.
+    """The aggregator's sign of life, and its list of every area: a hazard that it does not list is not its own.
 
     `areas` has the `seq` of each area's announced hazard (0: none yet), `digest` (`hazards_digest`) covers these
     hazards. Without `complete` there may be further areas, whose records are not loaded yet. `uptime` is

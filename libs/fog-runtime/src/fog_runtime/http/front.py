@@ -93,9 +93,9 @@ def _named(headers: Iterable[tuple[bytes, bytes]]) -> str:
 
 
 NICENESS: Final = 5
-"""The front gets a third of the processor time of a core that wants some, too."""
+"""The HTTP process gets a third of the processor time of a core that wants some, too."""
 END_S: Final = 3.0
-"""How long the front may take to end: open requests get 2 s."""
+"""How long the HTTP process may take to end: open requests get 2 s."""
 BETWEEN_REQUESTS_S: Final = 60.0
 """How long an answer may take to be sent, together with the next request."""
 SAME_S: Final = 10.0
@@ -110,7 +110,7 @@ class _Unused:
 
 
 def unused() -> Any:  # noqa: ANN401  # it stands for anything
-    """Return a placeholder for what an app is made over but never uses: in a front, no handler is called."""
+    """Return a placeholder for what an app is made over but never uses: in an HTTP process, no handler is called."""
     return _Unused()
 
 
@@ -119,7 +119,7 @@ class FrontError(Exception):
 
 
 class Front:
-    """The front as the core's process sees it."""
+    """The HTTP process as the core's process sees it."""
 
     def __init__(self, pid: int, link: socket.socket, scheme: str, host: str, port: int) -> None:
         """Use `Front.fork`."""
@@ -138,7 +138,7 @@ class Front:
         certificate: ServerCertificate | None = None,
         gateway: str = "",
     ) -> Self:
-        """Fork the front, which accepts connections once `serve` runs; raises `OSError` when the port is taken.
+        """Fork the HTTP process, which accepts connections once `serve` runs; raises `OSError` when the port is taken.
 
         `make_app` is called there: the handlers of its routes are never called, and need nothing behind them. With a
         `certificate` it speaks HTTPS. The host `gateway`, and no other, is believed for whom it asks. Fork before this
@@ -155,7 +155,7 @@ class Front:
             return cls(pid, ours, scheme, host, int(listener.getsockname()[1]))
 
     async def serve(self, app: FastAPI, port_file: Path | None = None) -> None:
-        """Answer what the front passes on with the routes of `app`, until cancelled.
+        """Answer what the HTTP process passes on with the routes of `app`, until cancelled.
 
         The port is logged as `listening` and written to `port_file`. Open requests get 2 s to end. Raises `FrontError`
         when the front ends by itself.
@@ -212,7 +212,7 @@ class _Connection(H11Protocol):
 class _Server(uvicorn.Server):
     @contextmanager
     def capture_signals(self) -> Iterator[None]:
-        """Leave signals alone: the front ends with the core's process."""
+        """Leave signals alone: the HTTP process ends with the core's process."""
         yield
 
     async def startup(self, sockets: list[socket.socket] | None = None) -> None:
@@ -259,7 +259,7 @@ def _become_front(
     link: socket.socket,
     certificate: ServerCertificate | None,
 ) -> NoReturn:
-    """Run the front in a forked child, and end the process."""
+    """Run the HTTP process in a forked child, and end the process."""
     status = 1
     try:
         signal.set_wakeup_fd(-1)  # the parent's loop listens at its other end

@@ -159,17 +159,17 @@ class FrontLink:
         return cls(await _Messages.over(end))
 
     async def start(self) -> None:
-        """Let the front accept connections."""
+        """Let the HTTP process accept connections."""
         await self._messages.write(Start())
 
     async def stop(self) -> None:
-        """Let the front end; calls that are open are still answered."""
+        """Let the HTTP process end; calls that are open are still answered."""
         await self._messages.write(Stop())
 
     async def answer_calls(
         self, answer: Callable[[str, bytes], Awaitable[Response]], rank: Callable[[str], int] = lambda _: 0
     ) -> None:
-        """Answer calls with `answer(route, arguments)`, many at a time, until the front ends.
+        """Answer calls with `answer(route, arguments)`, many at a time, until the HTTP process ends.
 
         Of those that wait to be begun, a route with a lower `rank` (0 to 2) comes before the others.
         """

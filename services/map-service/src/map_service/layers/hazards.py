@@ -46,9 +46,9 @@ class _Area:
     """The last hazard that was confirmed or is no relief."""
     confirmed: bool = False
     declared_clear_at: float = 0.0
-    """When the operator did so whose word was accepted last (`set_at`)."""
+    """When the operator did so whose override was accepted last (`set_at`)."""
     declared_until: float = -math.inf
-    """How long that word may count while no aggregator lives that would end it (s, monotonic)."""
+    """How long that override may count while no aggregator lives that would end it (s, monotonic)."""
     defined_by: int = 0
     """The highest epoch of an aggregator that announced this definition."""
 
@@ -260,7 +260,7 @@ def _may_relieve(hazard: AreaHazard, shown: AreaHazard) -> bool:
 
 
 def _note_declaration(area: _Area, hazard: AreaHazard, now: float) -> None:
-    """Remember how long an operator's word may count that the area is clear, from when it was first accepted."""
+    """Remember how long an operator's override may count that the area is clear, from when it was first accepted."""
     override = hazard.override
     if override is not None and override.state == "clear" and override.set_at != area.declared_clear_at:
         area.declared_clear_at, area.declared_until = override.set_at, now + override.ttl_s

@@ -6,7 +6,16 @@ from collections.abc import AsyncIterator, Callable
 import pytest
 
 from fog_contracts import channels as ch
-from fog_contracts.messages import AreaHazard, CommandReply, HazardArea, RobotCommand, RobotState
+from fog_contracts.messages import (
+    AreaHazard,
+    CommandReply,
+    HazardArea,
+    Reason,
+    ReasonCode,
+    RefusalCode,
+    RobotCommand,
+    RobotState,
+)
 from fog_runtime.clock import SystemClock
 from fog_runtime.configuration.site import load_site
 from fog_runtime.transports.zenoh_edge import ZenohEdge
@@ -20,7 +29,9 @@ pytestmark = pytest.mark.live
 TIMEOUT_S = 60.0
 SPEED = 10.0
 """The operator's clock runs ten times as fast."""
-WAITING = "waiting for an operator to enable"
+WAITING = Reason(ReasonCode.NOT_ENABLED, "waiting for an operator to enable")
+NO_GUARDIAN = Reason(ReasonCode.GUARDIAN_SILENT, "no message from the guardian for as long as the agent runs")
+BUMPED = Reason(ReasonCode.BASE_FAULT, "base: the bumper is pressed")
 
 
 async def until(condition: Callable[[], bool], description: str) -> None:
@@ -49,14 +60,16 @@ class RouterRig:
     def event_texts(self) -> list[str]:
         return [text for _, text in self.scene.events]
 
-    async def publish_state(self, mode: str, *reasons: str, goal: str | None = None) -> None:
+    async def publish_state(self, mode: str, *why: Reason, goal: str | None = None) -> None:
         """Publish a robot state until the operator has received it: subscriptions reach the router with a delay."""
+        reasons = [str(reason) for reason in why]
         state = RobotState(
-            mode=mode, reasons=list(reasons), enabled=mode != "INIT", battery=None, goal_id=goal, map_epoch=1,
+            mode=mode, reasons=reasons, codes=[reason.code for reason in why],
+            enabled=mode != "INIT", battery=None, goal_id=goal, map_epoch=1,
             map_seq=1, plan_id=None,
         )  # fmt: skip
         deadline = time.monotonic() + TIMEOUT_S
-        while self.scene.state is None or (self.scene.state.mode, self.scene.state.reasons) != (mode, [*reasons]):
+        while self.scene.state is None or (self.scene.state.mode, self.scene.state.reasons) != (mode, reasons):
             assert time.monotonic() < deadline, f"{mode} was not received"
             self._robot.publish(ch.ROBOT_STATE, state, robot="r1")
             await asyncio.sleep(0.02)
@@ -96,9 +109,10 @@ async def rig() -> AsyncIterator[RouterRig]:
 async def test_normal_start_of_a_robot_gives_three_events(rig: RouterRig) -> None:
     rig.operator.enabling_paused = True
     await rig.publish_hazard("z1", "unknown", "not heard yet")
-    await rig.publish_state("INIT", "no message from the guardian for as long as the agent runs", WAITING)
+    await rig.publish_state("INIT", NO_GUARDIAN, WAITING)
     await rig.publish_hazard("z1", "clear", "node n1: 5 in a row")
-    await rig.publish_state("INIT", "the pose is not known yet: checking the saved pose", WAITING)
+    pose = Reason(ReasonCode.POSE_UNKNOWN, "the pose is not known yet: checking the saved pose")
+    await rig.publish_state("INIT", pose, WAITING)
     await rig.publish_state("INIT", WAITING)
     rig.operator.enabling_paused = False
     await until(lambda: "operator: enable" in rig.event_texts, "it is enabled")
@@ -118,8 +132,10 @@ async def test_robot_is_not_enabled_while_enabling_is_paused(rig: RouterRig) -> 
 
 
 async def test_refused_enable_is_reported_once_with_its_reason(rig: RouterRig) -> None:
-    rig.reply = CommandReply(accepted=False, reason="the cause is still there: the lidar has been silent for 9.0 s")
-    await rig.publish_state("INIT", "the lidar has been silent for 1.0 s", WAITING)
+    silent = Reason(ReasonCode.LIDAR_SILENT, "the lidar has been silent for 9.0 s")
+    remains = Reason(RefusalCode.CAUSE_REMAINS, f"the cause is still there: {silent}", [silent.code])
+    rig.reply = CommandReply.refused(remains)
+    await rig.publish_state("INIT", silent, WAITING)
     assert rig.operator.ready_s == 0.0
     await until(lambda: len(rig.commands) >= 2, "the command was sent twice")
     refusals = [text for text in rig.event_texts if text.startswith("operator: ")]
@@ -131,8 +147,9 @@ async def test_later_hazards_and_stops_are_reported_with_their_reasons(rig: Rout
     await rig.publish_hazard("z1", "unknown", "node n1 is silent")
     await rig.publish_hazard("z2", "blocked", "node n2: something at 0.20 m")
     await rig.publish_state("NORMAL")
-    await rig.publish_state("PROTECTIVE_STOP", "the lidar has been silent for 0.4 s")
-    await rig.publish_state("INIT", "no message from the guardian for as long as the agent runs", WAITING)
+    silent = Reason(ReasonCode.LIDAR_SILENT, "the lidar has been silent for 0.4 s")
+    await rig.publish_state("PROTECTIVE_STOP", silent)
+    await rig.publish_state("INIT", NO_GUARDIAN, WAITING)
     assert [text for text in rig.event_texts if not text.startswith("operator")] == [
         "area z1: unknown (node n1 is silent)",
         "area z2: blocked (node n2: something at 0.20 m)",
@@ -145,9 +162,9 @@ async def test_later_hazards_and_stops_are_reported_with_their_reasons(rig: Rout
 async def test_events_tell_when_a_reset_has_ended_the_reason_that_they_told(rig: RouterRig) -> None:
     """A reset is carried out a moment after the mode is INIT: until then the base still says why it stands."""
     rig.operator.enabling_paused = True
-    await rig.publish_state("FAULT", "base: the bumper is pressed")
-    await rig.publish_state("INIT", "base: the bumper is pressed", WAITING)
+    await rig.publish_state("FAULT", BUMPED)
+    await rig.publish_state("INIT", BUMPED, WAITING)
     await rig.publish_state("INIT", WAITING)
-    await rig.publish_state("INIT", "the map is 1.2 s old", WAITING)
+    await rig.publish_state("INIT", Reason(ReasonCode.MAP_LATE, "the map is 1.2 s old"), WAITING)
     told = [text for text in rig.event_texts if text.startswith("robot: INIT")]
     assert told == [f"robot: INIT (base: the bumper is pressed; {WAITING})", f"robot: INIT ({WAITING})"]

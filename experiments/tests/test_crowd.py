@@ -153,16 +153,11 @@ def test_robot_among_walking_people_touches_none_and_arrives_or_says_why_it_stan
         run.system.step()
         # Somebody beside it in a watched area: it was blocked, and its sonars hear only the robot now. An operator who
         # sees that nobody is left lets it out.
-        inside = run.state.mode == "PROTECTIVE_STOP" and any(
-            "the robot is in" in reason for reason in run.state.reasons
-        )
+        inside = run.state.mode == "PROTECTIVE_STOP" and "in_blocked" in run.state.codes
         if inside and run.system.now > asked + 5.0:
             asked = run.system.now
             assert run.system.robot.command("egress").accepted
-        waits = any(
-            "an operator must enable" in reason or "for an operator to" in reason for reason in run.state.reasons
-        )
-        if run.state.mode in {"HOLD", "INIT"} and waits:
+        if run.state.mode in {"HOLD", "INIT"} and run.state.awaits_operator:
             assert run.system.robot.command("enable").accepted
     assert run.state.goal_reached, run.state
     assert world.contacts == 0

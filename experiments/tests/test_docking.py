@@ -185,7 +185,7 @@ def test_robot_that_something_separates_from_its_dock_does_not_let_its_base_look
     run.system.world.place(SimObstacle(id="leg", polygon=box))
     run.run(0.5)
     assert run.system.robot.command("dock").accepted
-    run.until(lambda: any("docking given up" in reason for reason in run.state.reasons), 60.0)
+    run.until(lambda: "docking_given_up" in run.state.codes, 60.0)
     assert "DOCK" not in run.modes
     assert run.system.world.contacts == 0
 

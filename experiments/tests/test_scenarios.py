@@ -13,7 +13,7 @@ from types import SimpleNamespace
 import msgspec
 import pytest
 
-from fog_contracts.messages import NodeReading
+from fog_contracts.messages import NodeReading, ReasonCode
 from fog_runtime.configuration.site import load_site
 from fognav_experiments.lockstep import DriveEvent
 from fognav_experiments.scenarios.description import Expected, FaultyNode, Scenario, SilentNode, deviations
@@ -71,7 +71,7 @@ def test_several_robots_and_an_event_do_not_go_together(tmp_path):
 
 def test_what_nobody_records_of_several_robots_cannot_be_expected_of_them(tmp_path):
     file, two = tmp_path / "two.toml", FILES["robots-2"].read_text("utf-8")
-    for line in ('never = ["PROTECTIVE_STOP"]', 'modes = ["NORMAL"]', 'reason = "lost"'):
+    for line in ('never = ["PROTECTIVE_STOP"]', 'modes = ["NORMAL"]', 'reason = "pose_lost"'):
         file.write_text(f"{two}{line}\n")
         with pytest.raises(ScenarioError, match=r"two\.toml: .*has no modes, never or reason"):
             read_scenario(file)
@@ -117,14 +117,14 @@ class Result(msgspec.Struct):
         (Expected(time_s=(0.0, 30.0)), Result(), "reached", "it took 40.0 s"),
         (Expected(modes=["FAULT"]), Result(), "reached", "never in FAULT"),
         (Expected(never=["HOLD"]), Result(), "reached", "was in HOLD"),
-        (Expected(reason="bumper"), Result(), "reached", "no reason 'bumper'"),
+        (Expected(reason=ReasonCode.BUMPER), Result(), "reached", "no reason bumper"),
     ],
 )
 def test_each_deviation_from_what_is_expected_is_found(expected, result, outcome, words):
-    events = [DriveEvent(time_s=1.0, distance_m=1.0, description="robot: HOLD (the map is 3.1 s old)")]
+    events = [DriveEvent(time_s=1.0, distance_m=1.0, description="robot: HOLD (the map is old)", codes=["map_old"])]
     (found,) = deviations(expected, result, outcome, events)
     assert words in found
-    assert deviations(Expected(modes=["HOLD"], reason="3.1 s old"), Result(), "reached", events) == []
+    assert deviations(Expected(modes=["HOLD"], reason=ReasonCode.MAP_OLD), Result(), "reached", events) == []
 
 
 def test_scenarios_can_be_told_from_one_another():

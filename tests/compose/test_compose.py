@@ -301,7 +301,7 @@ def test_service_whose_fog_is_not_ready_is_unhealthy_until_it_is(sim: Project) -
 
 
 def has_bumped(state: RobotState | None) -> bool:
-    return state is not None and state.mode == "FAULT" and any("bumper" in each for each in state.reasons)
+    return state is not None and state.mode == "FAULT" and not {"bumper", "base_fault"}.isdisjoint(state.codes)
 
 
 def send_far(sim: Project, pose: RobotPose, admin: dict[str, str]) -> str:

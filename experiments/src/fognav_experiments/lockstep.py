@@ -71,12 +71,16 @@ TRUTH_STEPS: Final = 10
 """Steps of 10 ms between two evaluations, the period of the simulator's ground truth."""
 
 
-class DriveEvent(msgspec.Struct, frozen=True, kw_only=True):
-    """An event of a drive, with the time (s) and the distance driven (m) since the goal was given."""
+class DriveEvent(msgspec.Struct, frozen=True, kw_only=True, omit_defaults=True):
+    """An event of a drive, with the time (s) and the distance driven (m) since the goal was given.
+
+    `codes` identify the reasons of a mode that the robot enters.
+    """
 
     time_s: float
     distance_m: float
     description: str
+    codes: list[str] = []
 
 
 class LockstepResult(DriveSummary, frozen=True, kw_only=True):
@@ -173,10 +177,11 @@ class LockstepDrive:
         """Distance driven since the goal was given, m."""
         return self.world.distance - self.start_distance_m
 
-    def log_event(self, description: str) -> None:
-        """Record an event."""
+    def log_event(self, description: str, codes: Sequence[str] = ()) -> None:
+        """Record an event, and the identifiers of the reasons of a mode."""
         time_s, distance_m = round(self.now - self.started_at, 2), round(self.driven, 2)
-        self.events.append(DriveEvent(time_s=time_s, distance_m=distance_m, description=description))
+        event = DriveEvent(time_s=time_s, distance_m=distance_m, description=description, codes=[*codes])
+        self.events.append(event)
 
     def step(self) -> None:
         """Simulate 10 ms."""
@@ -255,7 +260,7 @@ class LockstepDrive:
             self.operator.on_state(state, self.now)
             if state.mode != self._mode:
                 self._mode = state.mode
-                self.log_event(f"robot: {state.mode} ({'; '.join(state.reasons[:2])})")
+                self.log_event(f"robot: {state.mode} ({'; '.join(state.reasons[:2])})", state.codes[:2])
         if self._steps % OPERATOR_STEPS == 0:
             self._operate()
 

@@ -6,13 +6,13 @@ import pytest
 from fog_contracts.messages import Mode, RobotState
 from fognav_sim.drive.operator import FAULT_RESPONSE_S, HOLD_RESPONSE_S, STOP_RESPONSE_S, OperatorPolicy, Shuttle
 
-WAITING = "waiting for an operator to enable"
+WAITING = "not_enabled"
 
 
-def state(mode: Mode, *reasons: str, enabled: bool = True, reached: bool = False) -> RobotState:
+def state(mode: Mode, *codes: str, enabled: bool = True, reached: bool = False) -> RobotState:
     return RobotState(
-        mode=mode, reasons=list(reasons), enabled=enabled and mode != "INIT", battery=None, goal_id="g", map_epoch=1,
-        map_seq=1, plan_id=1, goal_reached=reached,
+        mode=mode, reasons=list(codes), codes=list(codes), enabled=enabled and mode != "INIT", battery=None,
+        goal_id="g", map_epoch=1, map_seq=1, plan_id=1, goal_reached=reached,
     )  # fmt: skip
 
 
@@ -22,7 +22,7 @@ def test_no_command_is_due_before_the_first_state() -> None:
 
 def test_ready_robot_is_enabled_at_once_and_one_that_is_not_ready_after_a_while() -> None:
     policy = OperatorPolicy(0.0)
-    policy.on_state(state("INIT", "the pose is not known", WAITING), 1.0)
+    policy.on_state(state("INIT", "pose_unknown", WAITING), 1.0)
     assert policy.command_due(1.0 + STOP_RESPONSE_S - 0.1) is None
     assert policy.command_due(1.0 + STOP_RESPONSE_S) == "enable"
     policy.on_state(state("INIT", WAITING), 2.0)

@@ -1,7 +1,6 @@
 """The operator of a demonstration: monitors and enables the robot, sends its goal, changes the simulated world."""
 
 import asyncio
-import re
 from collections.abc import Mapping
 from typing import TYPE_CHECKING, Final
 
@@ -59,7 +58,7 @@ class Operator:
         """Reasons of the mode in the log of events, without their numbers."""
         self._reported_areas: set[str] = set()
         self._unconfirmed = False
-        self._last_refusal = ""
+        self._last_refusal: tuple[str, ...] = ()
         self._enabled_once = False
         robot = {"robot": self._robot}
         edge.subscribe(ch.ROBOT_POSE, RobotPose, self._on_pose, **robot)
@@ -89,13 +88,13 @@ class Operator:
 
     def _on_state(self, _ids: Mapping[str, str], state: RobotState) -> None:
         now = self._clock.now()
-        over = self._told_reasons - {_without_numbers(reason) for reason in state.reasons}
+        over = self._told_reasons.difference(state.codes)
         # A reset is carried out a moment after the mode is INIT: then what it has ended is no reason any more.
         if state.mode != self._mode or (state.mode == "INIT" and over):
             first = not self._mode
             self._scene.log_event(_describe_mode(state, first=first))
             self._mode = state.mode
-            self._told_reasons = set() if first else {_without_numbers(reason) for reason in state.reasons[:2]}
+            self._told_reasons = set() if first else set(state.codes[:2])
         self._policy.on_state(state, now)
         self._scene.state = state
         self._scene.traces.update(state.traces)
@@ -191,25 +190,21 @@ class Operator:
     async def _send(self, kind: CommandKind) -> None:
         reply = await self.command(kind)
         if reply is None:
-            self._log_refusal(f"{kind}: no reply from the robot")
+            self._log_refusal((kind,), f"{kind}: no reply from the robot")
         elif reply.accepted:
-            self._last_refusal = ""
+            self._last_refusal = ()
             again = " again" if kind == "enable" and self._enabled_once else ""
             self._enabled_once = self._enabled_once or kind == "enable"
             self._scene.log_event(f"operator: {kind}{again}")
         else:
-            self._log_refusal(f"{kind}: refused by the robot, {reply.reason}")
+            why = (kind, reply.code, *reply.causes)
+            self._log_refusal(why, f"{kind}: refused by the robot, {reply.reason}")
 
-    def _log_refusal(self, text: str) -> None:
-        reason = _without_numbers(text)
-        if reason != self._last_refusal:
-            self._last_refusal = reason
+    def _log_refusal(self, why: tuple[str, ...], text: str) -> None:
+        """Tell why a command was not carried out, once as long as its identifiers stay the same."""
+        if why != self._last_refusal:
+            self._last_refusal = why
             self._scene.log_event(f"operator: {text}")
-
-
-def _without_numbers(reason: str) -> str:
-    """Return a reason that is the same while only its seconds or metres change."""
-    return re.sub(r"\d+(\.\d+)?", "#", reason)
 
 
 def _describe_mode(state: RobotState, *, first: bool) -> str:

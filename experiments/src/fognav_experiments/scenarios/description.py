@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Literal, Protocol
 import msgspec
 from msgspec import Meta
 
-from fog_contracts.messages import Id, Mode, PointXY, ProfileName, Ring
+from fog_contracts.messages import Id, Mode, PointXY, ProfileName, ReasonCode, Ring
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -267,7 +267,7 @@ class Expected(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=
     """What must be true of the drive, besides that the robot touches nothing.
 
     `outcome`: how it ends; `driving` if it had not ended after the scenario's time. `modes`: modes that the robot must
-    have entered, `never`: those that it must not have. `reason`: text in one of the reasons of its modes. Of several
+    have entered, `never`: those that it must not have. `reason`: identifier of a reason of its modes. Of several
     robots all must arrive; their distances are added up, and there are at most `plans` paths for all of them together.
     `plans` is only for several robots; `modes`, `never` and `reason` are only for one.
     """
@@ -277,7 +277,7 @@ class Expected(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=
     time_s: tuple[Seconds, Seconds] = (0.0, 1e6)
     modes: list[Mode] = []
     never: list[Mode] = []
-    reason: str = ""
+    reason: ReasonCode | None = None
     plans: int | None = None
 
 
@@ -353,6 +353,6 @@ def deviations(expected: Expected, result: Ended, outcome: str, events: Sequence
         found.append(f"it took {result.time_s:.1f} s, not {shortest:g} to {longest:g}")
     found += [f"never in {mode}" for mode in expected.modes if mode not in modes]
     found += [f"was in {mode}" for mode in expected.never if mode in modes]
-    if expected.reason and not any(expected.reason in description for description in entered):
-        found.append(f"no reason {expected.reason!r}")
+    if expected.reason is not None and not any(expected.reason in event.codes for event in events):
+        found.append(f"no reason {expected.reason}")
     return found

@@ -114,6 +114,7 @@ def robot_state(  # noqa: PLR0913  # a message gathers from all parts of the age
         mode=safety.mode,
         reasons=[reason[:_REASON_LIMIT] for reason in reasons],
         codes=[reason.code for reason in reasons],
+        awaits_operator=safety.awaits_operator,
         enabled=safety.enabled,
         battery=feedback.status.battery if feedback else None,
         goal_id=mission.goal_id,

@@ -67,6 +67,11 @@ class SafetyState(msgspec.Struct, frozen=True):
     maneuver_end: str = ""
     """Why the last maneuver ended, until the robot is enabled; empty without one."""
 
+    @property
+    def awaits_operator(self) -> bool:
+        """Whether the robot does not drive before an operator enables or resets it."""
+        return self.maneuver is None and (self.mode in {"INIT", "FAULT"} or bool(self.latched))
+
 
 @dataclass(frozen=True, slots=True)
 class SafetyOutputs:

@@ -3,7 +3,7 @@
 from dataclasses import dataclass
 from typing import Final, Literal
 
-from fog_contracts.messages import RobotState
+from fog_contracts.messages import ReasonCode, RobotState
 
 OperatorCommand = Literal["enable", "reset"]
 
@@ -16,9 +16,12 @@ FAULT_RESPONSE_S: Final = 2.0
 """Time after which a fault is reset; the robot refuses while the cause persists."""
 
 
+_READY: Final = {ReasonCode.NOT_ENABLED, ReasonCode.JUST_STARTED}
+
+
 def waits_only_for_operator(state: RobotState) -> bool:
     """Whether the only reason why a robot in INIT does not drive is that no operator has enabled it."""
-    return state.mode == "INIT" and len(state.reasons) <= 1
+    return state.mode == "INIT" and _READY.issuperset(state.codes)
 
 
 class OperatorPolicy:

@@ -231,13 +231,8 @@ class Fog:
     async def _operate(self) -> None:
         """Reset a fault and enable a robot that waits for it."""
         state = self.state
-        if state is None:
-            return
-        waits = state.mode == "INIT" or any("an operator must enable" in reason for reason in state.reasons)
-        if state.mode == "FAULT":
-            await self._commands.send("reset", ROBOT, state)
-        elif waits:
-            await self._commands.send("enable", ROBOT, state)
+        if state is not None and state.awaits_operator:
+            await self._commands.send("reset" if state.mode == "FAULT" else "enable", ROBOT, state)
 
     async def stop_unsigned(self) -> None:
         """Disable the robot, as anybody may."""

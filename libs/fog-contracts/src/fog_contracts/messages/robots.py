@@ -306,6 +306,7 @@ class RobotState(Message, frozen=True, kw_only=True):
     `docked`: it stands on its dock. `wants_dock`: it asks the planner for the goal in front of its dock.
     `places`: where on the map it may be, most likely first, while its scans do not decide; empty otherwise.
     `codes` identifies each of the `reasons`, in their order (`ReasonCode`); a newer robot may have others.
+    `awaits_operator`: it does not drive before an operator enables or resets it.
     """
 
     mode: Mode
@@ -333,6 +334,7 @@ class RobotState(Message, frozen=True, kw_only=True):
     wants_dock: bool = False
     places: Annotated[list[Pose], Meta(max_length=8)] = []
     codes: Codes = []
+    awaits_operator: bool = False
 
 
 VIEW_SECTORS: Final = 180

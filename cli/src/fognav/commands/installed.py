@@ -1,6 +1,6 @@
 """The list of commands, by who uses them; and those of other packages, found by entry points.
 
-Those that measure are the laboratory's, where it is installed.
+Those that measure come with fognav-experiments, where it is installed.
 
     [project.entry-points."fognav.commands"]
     my-command = "my_package.commands:add_to"

@@ -1,1 +1,1 @@
-"""The laboratory's commands, which `fognav` finds by entry points."""
+"""The commands of the experiments, which `fognav` finds by entry points."""

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from fognav.hosting.versions import Versions
+from fognav.hosting.upgrading import Versions
 
 ROOT = Path(__file__).parents[1]
 

@@ -12,7 +12,7 @@ import pytest
 from rosbags.rosbag2 import StoragePlugin, Writer
 from rosbags.typesys import Stores, get_typestore
 
-from fognav.lidar_logs.logs import read_log
+from fognav.lidar_logs import read_log
 from fognav.output import WrongUseError
 from robot_agent.localization.pose import Pose2
 

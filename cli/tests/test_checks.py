@@ -3,7 +3,7 @@ import sys
 from pathlib import Path
 
 from fognav import checkout
-from fognav.checks import CHECKS, Check, CheckResult, run_checks
+from fognav.commands.develop import CHECKS, Check, CheckResult, run_checks
 
 
 def python(name: str, code: str) -> Check:

@@ -6,10 +6,10 @@ from fog_contracts.messages import LoopHealth, Mode, RobotState, SimTruth
 from fog_runtime.configuration.site import load_site
 from fognav import checkout
 from fognav.demo.attempt import Attempt
+from fognav.demo.machine import SpeedWatch, TooFastError
 from fognav.demo.options import DrivePlan, Options
-from fognav.demo.report import modes
+from fognav.demo.run import modes
 from fognav.demo.scene import Scene
-from fognav.demo.speed import SpeedWatch, TooFastError
 from fognav_sim.drive.drive import Drive, DriveOutcome
 
 REACHED = DriveOutcome("reached", "the robot stands 0.08 m from its goal")

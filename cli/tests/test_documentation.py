@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from fognav import documentation, generated
-from fognav.rest_reference import rest_page
+from fognav.documentation import rest_page
 
 ROOT = Path(__file__).parents[2]
 BUILDER = documentation.find_builder(ROOT)

@@ -23,13 +23,11 @@ from fog_runtime.locks.site_locks import SiteLocks
 from fog_runtime.stores.redis_connection import RedisConnection
 from fog_supervisor.supervisor import Program, Supervisor
 from fognav.__main__ import app
-from fognav.hosting import backups, local_nodes, lock_changes, log_files, running, settings, unit
-from fognav.hosting.floors import hosted_sites
-from fognav.hosting.folders import FORMAT, NodeFolder, default_data
-from fognav.hosting.lock_changes import LockChanges
-from fognav.hosting.node import LocalNode, NodeConfig
+from fognav.hosting import backups, fog_node, folders, local_nodes, log_files
+from fognav.hosting.fog_node import LocalNode, LockChanges, NodeConfig
+from fognav.hosting.folders import FORMAT, NodeFolder, default_data, hosted_sites
 from fognav.locking import locks_errors
-from fognav.operate.registry import Registration, System, registered
+from fognav.operate.systems import Registration, System, registered
 from fognav.output import FailedError, WrongUseError
 
 ESTIG = Path(__file__).parents[2] / "sites" / "estig"
@@ -115,7 +113,7 @@ def test_log_is_bounded_and_followed_across_its_cut(tmp_path):
 def test_unit_runs_the_same_command_with_this_shell_s_settings(monkeypatch):
     monkeypatch.setenv("FOGNAV_MAP_PORT", "9002")
     monkeypatch.setenv("FOGNAV_BIND", "a $b %c")
-    text = unit.unit_text(["up", "--site", "/srv/my floor", "--data", "/$d"])
+    text = local_nodes.unit_text(["up", "--site", "/srv/my floor", "--data", "/$d"])
     command = next(line for line in text.splitlines() if line.startswith("ExecStart="))
     assert command.endswith('/fognav up --site "/srv/my floor" --data "/$$d"')
     assert "Environment=FOGNAV_MAP_PORT=9002\n" in text
@@ -141,7 +139,7 @@ def node(tmp_path: Path) -> LocalNode:
 def test_systemd_accepts_the_unit(tmp_path, monkeypatch):
     monkeypatch.setenv("FOGNAV_MAP_PORT", "8102")
     monkeypatch.setenv("XDG_CONFIG_HOME", str(tmp_path))
-    file = unit.write_unit(["up", "--site", "/srv/100% $ite"])
+    file = local_nodes.write_unit(["up", "--site", "/srv/100% $ite"])
     command = ["systemd-analyze", "--user", "verify", "--man=no", "--recursive-errors=no", str(file)]
     known = {"PATH": os.environ["PATH"], "HOME": str(tmp_path), "XDG_RUNTIME_DIR": str(tmp_path)}
     done = subprocess.run(command, env=known, capture_output=True, text=True, timeout=60, check=False)
@@ -152,7 +150,7 @@ def test_systemd_accepts_the_unit(tmp_path, monkeypatch):
 
 
 async def test_bookkeeping_that_fails_is_told_once_and_ends_nothing(node, tmp_path, monkeypatch):
-    monkeypatch.setattr(running, "PERIOD_S", 0.01)
+    monkeypatch.setattr(fog_node, "PERIOD_S", 0.01)
     monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path))
     (tmp_path / "fognav").mkdir(mode=0o755)  # not private, so it can't be used
     keys = node.config.folder.keys("estig")
@@ -167,7 +165,7 @@ async def test_bookkeeping_that_fails_is_told_once_and_ends_nothing(node, tmp_pa
     told: list[str] = []
     site = node.config.sites[0]
     with Registration(lambda: node.system(site)) as registration:
-        attending = asyncio.create_task(running.attend(node, [registration], node.lock_changes(), told.append))
+        attending = asyncio.create_task(fog_node.attend(node, [registration], node.lock_changes(), told.append))
         try:
             await until(lambda: len(told) >= 2)
             assert "site estig" in told[0]
@@ -196,11 +194,11 @@ async def test_check_that_a_signal_ends_has_failed(node, tmp_path, monkeypatch):
         await asyncio.sleep(timeout_s)
 
     monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path))
-    monkeypatch.setattr(running, "require_free_ports", lambda _: None)
+    monkeypatch.setattr(fog_node, "require_free_ports", lambda _: None)
     monkeypatch.setattr(LocalNode, "start", start)
     with pytest.raises(FailedError, match="ended the check"):
-        await running.run_node(node.config, lambda _: None, check=True)
-    await running.run_node(node.config, lambda _: None)
+        await fog_node.run_node(node.config, lambda _: None, check=True)
+    await fog_node.run_node(node.config, lambda _: None)
 
 
 async def test_locks_that_change_while_the_node_starts_come_into_force(node, tmp_path, monkeypatch):
@@ -208,11 +206,11 @@ async def test_locks_that_change_while_the_node_starts_come_into_force(node, tmp
         started.config.locks.add_robot("r7")
 
     monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path))
-    monkeypatch.setattr(running, "PERIOD_S", 0.01)
-    monkeypatch.setattr(running, "require_free_ports", lambda _: None)
+    monkeypatch.setattr(fog_node, "PERIOD_S", 0.01)
+    monkeypatch.setattr(fog_node, "require_free_ports", lambda _: None)
     monkeypatch.setattr(LocalNode, "start", start)
     told: list[str] = []
-    running_node = asyncio.create_task(running.run_node(node.config, told.append))
+    running_node = asyncio.create_task(fog_node.run_node(node.config, told.append))
     await until(lambda: "credentials have changed: zenoh-router uses the new ones" in told or running_node.done())
     running_node.cancel()
     await asyncio.wait({running_node})
@@ -242,7 +240,7 @@ async def test_port_is_required_free_at_the_address_where_its_program_listens(no
             replace(each, port=other.getsockname()[1]) for each in node.server_set if each.name == "redis"
         ]
         with pytest.raises(FailedError, match=r"redis can't listen on 127\.0\.0\.1 port"):
-            running.require_free_ports(node)
+            fog_node.require_free_ports(node)
 
 
 def connected(place: backup.Place) -> RedisConnection:
@@ -253,7 +251,7 @@ async def test_backup_of_each_floor_is_restored_on_an_empty_machine(tmp_path, up
     floors = {"estig": shutil.copytree(ESTIG, tmp_path / "site"), "upstairs": upstairs}
     folder = NodeFolder(tmp_path / "data")
     hosted_sites(list(floors.values()), folder.locks, ["localhost", "127.0.0.1"])
-    settings.remember(folder.path, settings.settings_of(floors, "127.0.0.1", [], simulate=False))
+    folders.remember(folder.path, folders.settings_of(floors, "127.0.0.1", [], simulate=False))
     tokens = {}
     for floor, directory in floors.items():
         tokens[floor] = (folder.keys(floor) / "admin.token").read_text()
@@ -292,7 +290,7 @@ async def test_older_backup_of_one_floor_locks_nobody_out_who_was_added_since(tm
     hosted_sites([estig], folder.locks, hosts)
     folder.keys("estig")
     SiteLocks.open(folder.locks).add_robot("sold")
-    settings.remember(folder.path, settings.settings_of({"estig": estig}, "127.0.0.1", [], simulate=False))
+    folders.remember(folder.path, folders.settings_of({"estig": estig}, "127.0.0.1", [], simulate=False))
     await backups.create(tmp_path / "older.tar.gz", folder, estig)
     hosted_sites([estig, upstairs], folder.locks, hosts)
     SiteLocks.open(folder.locks).add_robot("r7")
@@ -312,7 +310,7 @@ def test_backup_of_a_node_takes_a_site_by_its_name(tmp_path):
     folder = NodeFolder(tmp_path / "data")
     hosted_sites([ESTIG], folder.locks, ["localhost", "127.0.0.1"])
     folder.keys("estig")
-    settings.remember(folder.path, settings.settings_of({"estig": ESTIG}, "127.0.0.1", [], simulate=False))
+    folders.remember(folder.path, folders.settings_of({"estig": ESTIG}, "127.0.0.1", [], simulate=False))
     file = tmp_path / "estig.tar.gz"
     done = CliRunner().invoke(app, ["backup", str(file), "--up", str(folder.path), "--site", "estig"])
     assert (done.exit_code, file.exists()) == (0, True), done.output
@@ -326,7 +324,7 @@ def test_mistyped_node_or_site_leaves_nothing_behind(tmp_path, command):
     folder = NodeFolder(tmp_path / "data")
     hosted_sites([ESTIG], folder.locks, ["localhost", "127.0.0.1"])
     folder.keys("estig")
-    settings.remember(folder.path, settings.settings_of({"estig": ESTIG}, "127.0.0.1", [], simulate=False))
+    folders.remember(folder.path, folders.settings_of({"estig": ESTIG}, "127.0.0.1", [], simulate=False))
     file, wrong = tmp_path / "estig.tar.gz", tmp_path / "dta"
     assert CliRunner().invoke(app, ["backup", str(file), "--up", str(folder.path)]).exit_code == 0
     if command == "backup":
@@ -357,7 +355,7 @@ async def test_locks_of_another_authority_are_replaced_by_those_of_the_backup(tm
         folder = NodeFolder(tmp_path / name)
         hosted_sites([estig], folder.locks, hosts)
         folder.keys("estig")
-        settings.remember(folder.path, settings.settings_of({"estig": estig}, "127.0.0.1", [], simulate=False))
+        folders.remember(folder.path, folders.settings_of({"estig": estig}, "127.0.0.1", [], simulate=False))
     original = NodeFolder(tmp_path / "data")
     await backups.create(tmp_path / "older.tar.gz", original, estig)
     made, *_ = await backups.restore(tmp_path / "older.tar.gz", folder, estig, replace=True)
@@ -370,7 +368,7 @@ async def test_locks_of_another_site_are_never_replaced_by_those_of_a_backup(tmp
         folder = NodeFolder(tmp_path / name)
         hosted_sites([directory], folder.locks, ["localhost", "127.0.0.1"])
         folder.keys(site)
-        settings.remember(folder.path, settings.settings_of({site: directory}, "127.0.0.1", [], simulate=False))
+        folders.remember(folder.path, folders.settings_of({site: directory}, "127.0.0.1", [], simulate=False))
     await backups.create(tmp_path / "estig.tar.gz", NodeFolder(tmp_path / "data"), ESTIG)
     before = (folder.locks / "authority.pem").read_bytes()
     with pytest.raises(
@@ -404,9 +402,9 @@ def test_one_of_several_nodes_is_named_by_site_or_data(tmp_path, monkeypatch):
 
 def test_start_of_a_node_is_remembered_with_its_options_and_ports(tmp_path, monkeypatch):
     monkeypatch.setenv("FOGNAV_MAP_PORT", "9002")
-    made = settings.settings_of({"estig": ESTIG}, "127.0.0.2", ["fog.local"], simulate=True)
-    settings.remember(tmp_path, made)
-    found = settings.recall(tmp_path)
+    made = folders.settings_of({"estig": ESTIG}, "127.0.0.2", ["fog.local"], simulate=True)
+    folders.remember(tmp_path, made)
+    found = folders.recall(tmp_path)
     assert found == made
     assert found.arguments == ["--site", str(ESTIG), "--bind", "127.0.0.2", "--host", "fog.local", "--sim"]
     assert found.environment["FOGNAV_MAP_PORT"] == "9002"
@@ -414,9 +412,9 @@ def test_start_of_a_node_is_remembered_with_its_options_and_ports(tmp_path, monk
     assert found.command(Path("/my data")) == (
         f"FOGNAV_MAP_PORT=9002 ./fognav up --site {ESTIG} --bind 127.0.0.2 --host fog.local --sim --data '/my data'"
     )
-    (tmp_path / settings.FILE).write_text("{")
+    (tmp_path / folders.FILE).write_text("{")
     with pytest.raises(FailedError, match="start it once"):
-        settings.recall(tmp_path)
+        folders.recall(tmp_path)
 
 
 async def test_changed_locks_reach_their_program_alone_and_once(tmp_path):
@@ -463,7 +461,7 @@ async def test_program_that_stays_unready_is_told_once_and_holds_no_other_back(t
             (folder / "users").write_text("r2")
         assert [await changes.round() for _ in range(3)] == [None, "zenoh-router", None]
         await until(lambda: supervisor.pid("zenoh-router"))
-        monkeypatch.setattr(lock_changes, "_READY_S", 0.0)
+        monkeypatch.setattr(fog_node, "_RESTARTED_S", 0.0)
         with pytest.raises(FailedError, match=r"zenoh-router is not ready .*its port is closed"):
             await changes.round()
         assert await changes.round() == "planner"

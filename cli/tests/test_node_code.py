@@ -7,9 +7,9 @@ from pathlib import Path
 import pytest
 from typer.testing import CliRunner
 
-from fognav import kernels, node_code, system
+from fognav import kernels, system
 from fognav.__main__ import app
-from fognav.commands import demo
+from fognav.demo import view
 from fognav.nodes import simulated
 from fognav_sim import nodes
 from fognav_sim.nodes import why_model
@@ -25,7 +25,7 @@ def no_work(monkeypatch: pytest.MonkeyPatch) -> None:
         raise ReachedError
 
     monkeypatch.setattr(kernels, "warm_cache", lambda _: None)
-    for module, name in ((demo, "run_demo"), (simulated, "run")):
+    for module, name in ((view, "run_demo"), (simulated, "run")):
         monkeypatch.setattr(module, name, reached)
 
 
@@ -101,7 +101,7 @@ def test_missing_compiler_is_installed_if_the_user_agrees_and_else_nodes_run_a_m
     monkeypatch.setattr(system, "PROVIDERS", [installer])
     monkeypatch.setattr("fognav_sim.nodes.build_library", lambda _: nodes.find_compiler())
     monkeypatch.setattr(system, "find", lambda tool: shutil.which(tool.executables[0]))
-    node_code.prepare(lines.append, yes=agreed)
+    system.prepare_node_code(lines.append, yes=agreed)
     assert len(lines) == len(said) + (agreed and fails)
     assert all(part in " ".join(lines) for part in said)
     assert installer.asked_for == (["g++"] if agreed else [""])

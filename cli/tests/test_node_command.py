@@ -29,9 +29,10 @@ from fog_contracts.site import NodeSite, Sonar
 from fog_runtime.configuration.site import load_site
 from fog_runtime.locks.site_locks import SiteLocks
 from fog_supervisor.servers import start_mosquitto
+from fognav import site_files
 from fognav.commands import node as node_command
 from fognav.commands.node import node_app
-from fognav.nodes import on_broker, provisioning, site_file
+from fognav.nodes import board_settings, on_broker
 from fognav.operate.systems import AGGREGATOR
 from fognav.output import FailedError, WrongUseError
 from fognav_sim.nodes import Core, FirmwareError, build_library, find_compiler
@@ -146,13 +147,13 @@ def test_node_whose_password_the_broker_cannot_get_is_not_added(floor: Path, tmp
 
 
 def test_site_file_is_never_written_with_a_text_that_makes_the_site_invalid(floor: Path, monkeypatch) -> None:
-    loaded = site_file.load(floor)
+    loaded = load_site(floor)
     node = loaded.site.nodes[0]
-    monkeypatch.setattr(site_file, "atomic_write", lambda *_, **__: pytest.fail("the file was written"))
+    monkeypatch.setattr(site_files, "atomic_write", lambda *_, **__: pytest.fail("the file was written"))
     with pytest.raises(WrongUseError, match=r"'n1' is used twice.*nothing was changed"):
-        site_file.with_node(loaded, node)
+        site_files.with_node(loaded, node)
     with pytest.raises(WrongUseError, match="nothing was changed"):
-        site_file.replace(loaded, msgspec.structs.replace(node, area="nowhere"))
+        site_files.replace(loaded, msgspec.structs.replace(node, area="nowhere"))
 
 
 @pytest.mark.parametrize(
@@ -258,10 +259,10 @@ def test_board_behind_locks_gets_a_password_and_whom_to_trust(floor: Path, locks
     assert (written["broker"], written["port"], written["tls"]) == (host, 8883, True)
     trusted = (floor / "board" / "ca.pem").read_text()
     assert "BEGIN CERTIFICATE" in trusted
-    own = provisioning.credentials_in(floor / "board", "n8")
+    own = board_settings.credentials_in(floor / "board", "n8")
     assert (own.user, own.passwords["mqtt"], own.authority) == ("n8", written["password"], trusted)
     with pytest.raises(WrongUseError, match="that of node n8"):
-        provisioning.credentials_in(floor / "board", "n7")
+        board_settings.credentials_in(floor / "board", "n7")
 
 
 @pytest.mark.parametrize("profile", ["standard", "thesis"])
@@ -312,7 +313,7 @@ def test_settings_of_another_board_are_never_overwritten_by_add(floor: Path) -> 
 
 def test_replaced_board_has_a_new_password_and_the_same_place(floor: Path, tmp_path: Path) -> None:
     passwords = tmp_path / "passwords"
-    provisioning.set_password(passwords, "n1", "old")
+    board_settings.set_password(passwords, "n1", "old")
     words = (*NETWORK, "--site", str(floor), "--out", str(tmp_path), "--passwords", str(passwords))
     done = run("replace", "n1", *words)
     assert done.returncode == 0, done.stderr
@@ -339,23 +340,23 @@ def test_new_board_never_takes_the_file_of_another_node(floor: Path, tmp_path: P
 def test_password_file_keeps_its_owner_and_permissions(tmp_path: Path) -> None:
     """The broker, which reads it, is another user than who adds a node."""
     file = tmp_path / "passwords"
-    provisioning.set_password(file, "n1", "first")
+    board_settings.set_password(file, "n1", "first")
     assert stat.S_IMODE(file.stat().st_mode) == 0o600
     owner = (1883, 1883) if os.geteuid() == 0 else (os.geteuid(), os.getegid())
     os.chown(file, *owner)
     file.chmod(0o640)
-    provisioning.set_password(file, "n2", "second")
+    board_settings.set_password(file, "n2", "second")
     found = file.stat()
     assert (stat.S_IMODE(found.st_mode), found.st_uid, found.st_gid) == (0o640, *owner)
 
 
 def test_password_file_of_another_user_is_left_to_him(tmp_path: Path, monkeypatch) -> None:
     file = tmp_path / "passwords"
-    provisioning.set_password(file, "n1", "first")
+    board_settings.set_password(file, "n1", "first")
     before = file.read_bytes()
     monkeypatch.setattr(os, "geteuid", lambda: file.stat().st_uid + 1)
     with pytest.raises(WrongUseError, match="belongs to another user"):
-        provisioning.set_password(file, "n2", "second")
+        board_settings.set_password(file, "n2", "second")
     assert file.read_bytes() == before
 
 
@@ -470,9 +471,9 @@ def test_board_with_another_number_of_sonars_is_told_and_not_written(monkeypatch
 @pytest.mark.live
 def test_broker_accepts_the_stored_password_and_no_other(tmp_path: Path) -> None:
     passwords = tmp_path / "passwords"
-    provisioning.set_password(passwords, "n2", "of another node")
-    provisioning.set_password(passwords, "n1", "s3cret")
-    provisioning.set_password(passwords, "n1", "newer")
+    board_settings.set_password(passwords, "n2", "of another node")
+    board_settings.set_password(passwords, "n1", "s3cret")
+    board_settings.set_password(passwords, "n1", "newer")
     passwords.chmod(0o644)  # the broker may run as another user
     with start_mosquitto(tmp_path / "broker", extra=f"allow_anonymous false\npassword_file {passwords}") as server:
         codes = {}
@@ -504,7 +505,7 @@ def test_replacing_a_node_leaves_every_other_line_of_the_site(index, limits, sil
         for limit in limits
     ]
     nodes[index] = msgspec.structs.replace(nodes[index], sonars=sonars)
-    changed = site_file.replaced(text, nodes[index])
+    changed = site_files.replaced(text, nodes[index])
     assert changed is not None
     found, before = tomllib.loads(changed), tomllib.loads(text)
     assert msgspec.convert(found.pop("nodes"), list[NodeSite]) == nodes
@@ -516,7 +517,7 @@ def test_replacing_a_node_leaves_every_other_line_of_the_site(index, limits, sil
 
 def test_node_in_a_table_of_another_form_is_not_touched() -> None:
     node = NodeSite(id="n1", area="z1", x=0.0, y=0.0, theta=0.0, sonars=[Sonar(range_limit=1.0)])
-    assert site_file.replaced('nodes = [{ id = "n1", area = "z1" }]\n', node) is None
+    assert site_files.replaced('nodes = [{ id = "n1", area = "z1" }]\n', node) is None
 
 
 @pytest.mark.live

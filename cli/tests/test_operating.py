@@ -16,8 +16,8 @@ import pytest
 from typer.testing import CliRunner
 
 from fognav.__main__ import app
-from fognav.operate import registry
-from fognav.operate.registry import Registration, System, registered
+from fognav.operate import systems
+from fognav.operate.systems import Registration, System, registered
 from fognav.output import FailedError
 
 ZONE = {
@@ -146,7 +146,7 @@ def test_register_lists_a_demo_until_its_end(runtime: Path) -> None:
 
 def test_register_forgets_a_demo_that_was_killed(runtime: Path) -> None:
     code = (
-        "import sys; from fognav.operate.registry import *\n"
+        "import sys; from fognav.operate.systems import *\n"
         "Registration(lambda: System(name='demo-9', kind='demo', site='', urls={}, pids={})).update()\n"
         "print('up', flush=True); sys.stdin.read()"
     )
@@ -162,7 +162,7 @@ def test_register_forgets_a_demo_that_was_killed(runtime: Path) -> None:
 
 def test_register_keeps_the_systems_of_one_name_of_two_processes_apart(runtime: Path) -> None:
     code = (
-        "import sys; from fognav.operate.registry import *\n"
+        "import sys; from fognav.operate.systems import *\n"
         "with Registration(lambda: System(name='fog-estig', kind='fog node', site='', urls={}, pids={})) as entry:\n"
         "    entry.update(); print('up', flush=True); sys.stdin.read()"
     )
@@ -191,7 +191,7 @@ def test_register_forgets_a_demo_whose_process_id_belongs_to_another_process(run
 
 
 def test_unreadable_entry_is_removed(runtime: Path) -> None:
-    registry.folder()
+    systems.folder()
     (runtime / "demo-1.json").write_text('{"pid": 1')
     assert registered() == []
     assert list(runtime.iterdir()) == []
@@ -212,7 +212,7 @@ def test_folder_that_is_not_private_is_not_trusted(runtime: Path, tmp_path: Path
 def test_without_a_runtime_folder_the_register_is_in_the_temporary_folder(monkeypatch, tmp_path: Path) -> None:
     monkeypatch.delenv("XDG_RUNTIME_DIR")
     monkeypatch.setattr("tempfile.gettempdir", lambda: str(tmp_path))
-    assert registry.folder() == tmp_path / f".fognav-{os.getuid()}"
+    assert systems.folder() == tmp_path / f".fognav-{os.getuid()}"
 
 
 def test_command_without_a_system_fails_with_the_remedy() -> None:

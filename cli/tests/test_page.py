@@ -29,10 +29,10 @@ from fog_runtime.configuration.site import LoadedSite
 from fog_supervisor import net
 from fognav import system
 from fognav.demo.options import Options
+from fognav.demo.page import map_png, serve
 from fognav.demo.run import Demo
 from fognav.demo.view import render
 from fognav.output import WrongUseError
-from fognav.page.app import map_png, serve
 
 FLAGS = [
     "--no-sandbox",

@@ -12,9 +12,8 @@ import pytest
 
 from fog_contracts.messages import SimObstacle
 from fog_runtime.record import Recorder
-from fognav.hosting import backups, recordings, settings
-from fognav.hosting.floors import hosted_sites
-from fognav.hosting.folders import NodeFolder
+from fognav.hosting import backups, folders
+from fognav.hosting.folders import NodeFolder, hosted_sites
 
 ESTIG = Path(__file__).parents[2] / "sites" / "estig"
 SECOND = 1_000_000_000
@@ -38,20 +37,20 @@ def data(tmp_path: Path) -> Path:
 
 
 def test_index_tells_path_size_and_time_also_of_what_was_cut_off(data):
-    cut, drive = recordings.write_index(data)
+    cut, drive = backups.write_index(data)
     assert (cut.path, cut.bytes, cut.messages, cut.begins) == ("cut.mcap", 200, None, None)
     assert (drive.path, drive.messages, drive.begins, drive.ends) == ("morning/drive.mcap", 2, 100.0, 107.0)
 
 
 def test_index_of_nothing_is_empty(tmp_path):
-    assert recordings.write_index(tmp_path) == []
+    assert backups.write_index(tmp_path) == []
 
 
 def test_recording_that_was_cut_off_anywhere_is_in_the_index(data):
     whole = (data / "recordings" / "morning" / "drive.mcap").read_bytes()
     for end in range(len(whole)):
         (data / "recordings" / f"{end:05}.mcap").write_bytes(whole[:end])
-    index = {each.path: each for each in recordings.write_index(data)}
+    index = {each.path: each for each in backups.write_index(data)}
     assert [index[f"{end:05}.mcap"].bytes for end in range(len(whole))] == list(range(len(whole)))
     assert {index[f"{end:05}.mcap"].messages for end in range(len(whole))} == {None}
 
@@ -63,7 +62,7 @@ def test_recording_with_a_damaged_byte_anywhere_is_in_the_index(data):
             damaged = bytearray(whole)
             damaged[place] = value
             (data / "recordings" / f"{place:05}-{value}.mcap").write_bytes(damaged)
-    assert {each.unreadable for each in recordings.write_index(data)} == {None}
+    assert {each.unreadable for each in backups.write_index(data)} == {None}
 
 
 def test_file_that_can_not_be_read_is_named_in_the_index(tmp_path):
@@ -74,7 +73,7 @@ def test_file_that_can_not_be_read_is_named_in_the_index(tmp_path):
     (folder / "loop.mcap").symlink_to(folder / "loop.mcap")
     os.mkfifo(folder / "pipe.mcap")
     Path(os.fsdecode(os.fsencode(folder) + b"/\xff.mcap")).write_bytes(b"")
-    index = {each.path: each.unreadable for each in recordings.write_index(tmp_path)}
+    index = {each.path: each.unreadable for each in backups.write_index(tmp_path)}
     assert {path for path, reason in index.items() if reason} == {"link.mcap", "loop.mcap", "pipe.mcap"}
     assert index.keys() == {"link.mcap", "loop.mcap", "pipe.mcap", "\\xff.mcap"}
 
@@ -83,7 +82,7 @@ def test_backup_is_restored_on_an_empty_machine_and_tells_which_recordings_are_g
     folder, site = NodeFolder(data), shutil.copytree(ESTIG, tmp_path / "site")
     hosted_sites([site], folder.locks, ["localhost", "127.0.0.1"])
     token = (folder.keys("estig") / "admin.token").read_text()
-    settings.remember(folder.path, settings.settings_of({"estig": site}, "127.0.0.1", [], simulate=False))
+    folders.remember(folder.path, folders.settings_of({"estig": site}, "127.0.0.1", [], simulate=False))
     file = tmp_path / "fog.tar.gz"
     asyncio.run(backups.create(file, folder, None))
 
@@ -116,8 +115,8 @@ def test_index_that_can_not_be_written_is_told_and_the_rest_is_backed_up(data, t
     folder, site = NodeFolder(data), shutil.copytree(ESTIG, tmp_path / "site")
     hosted_sites([site], folder.locks, ["localhost", "127.0.0.1"])
     token = (folder.keys("estig") / "admin.token").read_bytes()
-    settings.remember(folder.path, settings.settings_of({"estig": site}, "127.0.0.1", [], simulate=False))
-    recordings.index_folder(folder.path).write_text("a file in the place of the folder")
+    folders.remember(folder.path, folders.settings_of({"estig": site}, "127.0.0.1", [], simulate=False))
+    backups.index_folder(folder.path).write_text("a file in the place of the folder")
     file = tmp_path / "fog.tar.gz"
     done = subprocess.run(
         [sys.executable, "-m", "fognav", "backup", str(file), "--up", str(data)],
@@ -130,19 +129,19 @@ def test_index_that_can_not_be_written_is_told_and_the_rest_is_backed_up(data, t
     other = NodeFolder(tmp_path / "other")
     made = asyncio.run(backups.restore(file, other, tmp_path / "restored", replace=False))
     assert (other.path / "keys" / "estig" / "admin.token").read_bytes() == token
-    assert (made.missing, recordings.FOLDER in made.backup.folders) == ([], False)
+    assert (made.missing, backups.RECORDINGS in made.backup.folders) == ([], False)
 
 
 def test_recordings_of_a_later_backup_are_named_though_another_floor_s_index_is_there(data, tmp_path):
     folder, site = NodeFolder(data), shutil.copytree(ESTIG, tmp_path / "site")
     hosted_sites([site], folder.locks, ["localhost", "127.0.0.1"])
     folder.keys("estig")
-    settings.remember(folder.path, settings.settings_of({"estig": site}, "127.0.0.1", [], simulate=False))
+    folders.remember(folder.path, folders.settings_of({"estig": site}, "127.0.0.1", [], simulate=False))
     asyncio.run(backups.create(tmp_path / "fog.tar.gz", folder, None))
     other = NodeFolder(tmp_path / "other")
     record(other.path / "recordings" / "later.mcap")
-    recordings.write_index(other.path)
+    backups.write_index(other.path)
     made = asyncio.run(backups.restore(tmp_path / "fog.tar.gz", other, tmp_path / "restored", replace=False))
     assert made.missing == ["cut.mcap", "morning/drive.mcap"]
-    (index,) = recordings.index_folder(other.path).iterdir()
+    (index,) = backups.index_folder(other.path).iterdir()
     assert [each["path"] for each in json.loads(index.read_bytes())] == ["later.mcap"]

@@ -5,9 +5,9 @@ from typing import Any
 
 import pytest
 
-from fognav.operate import rest_commands
+from fognav.operate import robot_commands
 from fognav.operate.fog import Fog, RefusedError
-from fognav.operate.registry import System
+from fognav.operate.systems import System
 
 
 @dataclass(frozen=True)
@@ -24,5 +24,5 @@ class ExpiredToken(Fog):
 
 def test_stop_is_not_called_failed_for_a_token_that_may_not_read_the_mode(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("FOGNAV_TOKEN", "expired")
-    outcome = rest_commands.stop(ExpiredToken(), "r1")
+    outcome = robot_commands.stop_by_planner(ExpiredToken(), "r1")
     assert (outcome.accepted, outcome.reason, outcome.mode) == (True, "disabled", "INIT")

@@ -16,8 +16,8 @@ from fog_kernels.inflation import inflate, inflation_table
 from fog_kernels.raycast import cast
 from fog_runtime.configuration.maps import load_map, save_map
 from fog_runtime.configuration.site import load_site
-from fognav.commands.site import check_site, identifier, new_site
 from fognav.output import WrongUseError
+from fognav.site_files import check_site, identifier, new_site
 from fognav.site_proposal import NoSiteError, propose
 from fognav_sim.barrier import barrier_across
 from fognav_sim.drive.hazard import draw_hazard

@@ -6,7 +6,7 @@ import msgspec
 import pytest
 
 from fog_contracts.site import AreaSite, Place, Site
-from fognav.site_text import to_toml
+from fognav.site_files import to_toml
 
 SQUARE = [(0.0, 0.0), (1.0, 0.0), (1.0, 1.0)]
 

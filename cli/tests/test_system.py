@@ -5,7 +5,7 @@ import pytest
 
 from fog_supervisor import servers
 from fognav import system
-from fognav.demo.servers import embedded_servers
+from fognav.demo.options import embedded_servers
 from fognav.system import AptProvider, MissingToolsError, Tool, ensure
 
 GHOST = Tool("ghost", ("fognav-ghost",), "ghost-package", "nothing")

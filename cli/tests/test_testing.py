@@ -10,7 +10,8 @@ from types import ModuleType, SimpleNamespace
 
 import pytest
 
-from fognav import checkout, testing
+from fognav import checkout
+from fognav.commands import develop
 
 TESTS = """
 import pytest
@@ -35,7 +36,7 @@ def folder(tmp_path: Path) -> Path:
 
 
 def command(*, terminal: bool = False) -> list[str]:
-    return testing.pytest_command(["-n", "0", "test_some.py"], terminal=terminal)
+    return develop.pytest_command(["-n", "0", "test_some.py"], terminal=terminal)
 
 
 def test_skipped_tests_are_summarized_once_per_reason(folder: Path) -> None:
@@ -67,14 +68,14 @@ def test_bar_on_a_terminal_shows_progress_and_failures_at_once(folder: Path) -> 
 
 
 def test_tests_run_on_all_cores_unless_the_arguments_choose_otherwise() -> None:
-    command = testing.pytest_command(["-k", "replica"], terminal=False)
+    command = develop.pytest_command(["-k", "replica"], terminal=False)
     assert command[:3] == [sys.executable, "-m", "pytest"]
     assert command[command.index("-n") + 1] == str((os.cpu_count() or 1) + 2)
-    quick = testing.pytest_command([], terminal=False)
+    quick = develop.pytest_command([], terminal=False)
     assert quick[quick.index("-n") + 1] == str(os.cpu_count() or 1), "they compute, and the real processes need time"
     assert command[-2:] == ["-k", "replica"]
     for arguments in (["-n", "0"], ["-n4"], ["--pdb"], ["-s"], ["--collect-only"]):
-        assert "--dist" not in testing.pytest_command(arguments, terminal=False)
+        assert "--dist" not in develop.pytest_command(arguments, terminal=False)
 
 
 @pytest.mark.parametrize(
@@ -85,7 +86,7 @@ def test_tests_run_on_all_cores_unless_the_arguments_choose_otherwise() -> None:
     ],
 )  # fmt: skip
 def test_quick_tests_run_unless_all_are_asked_for_or_some_by_name(arguments: list[str], tier: str) -> None:
-    command = testing.pytest_command(arguments, terminal=False)
+    command = develop.pytest_command(arguments, terminal=False)
     assert [argument for argument in command if "tier" in argument] == [f"--tier={tier}"]
     assert not {"--all", "--rest", "--long"} & set(command)
 

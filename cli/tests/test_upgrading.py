@@ -10,13 +10,11 @@ from pathlib import Path
 import psutil
 import pytest
 
-from fognav.hosting import local_nodes, settings, unit, upgrading
-from fognav.hosting.floors import hosted_sites
-from fognav.hosting.folders import NodeFolder
+from fognav.hosting import folders, local_nodes, upgrading
+from fognav.hosting.folders import NodeFolder, hosted_sites
 from fognav.hosting.local_nodes import RunningNode
-from fognav.hosting.upgrading import BACKUPS, Upgrade
-from fognav.hosting.versions import Versions
-from fognav.operate.registry import System
+from fognav.hosting.upgrading import BACKUPS, Upgrade, Versions
+from fognav.operate.systems import System
 from fognav.output import FailedError, WrongUseError
 
 ESTIG = Path(__file__).parents[2] / "sites" / "estig"
@@ -59,7 +57,7 @@ def folder(tmp_path: Path) -> NodeFolder:
     made = NodeFolder(tmp_path / "data")
     hosted_sites([ESTIG], made.locks, ["localhost", "127.0.0.1"])
     made.keys("estig")
-    settings.remember(made.path, settings.settings_of({"estig": ESTIG}, "127.0.0.1", [], simulate=False))
+    folders.remember(made.path, folders.settings_of({"estig": ESTIG}, "127.0.0.1", [], simulate=False))
     return made
 
 
@@ -71,8 +69,8 @@ def started(folder: NodeFolder, monkeypatch: pytest.MonkeyPatch) -> list[str]:
     monkeypatch.setattr(upgrading, "running_nodes", lambda: nodes)
     monkeypatch.setattr(upgrading, "end_node", lambda pid: found.append(f"end {pid}"))
     monkeypatch.setattr(upgrading, "systems_of", lambda _: [])
-    monkeypatch.setattr(unit, "runs", lambda pid: pid == 1)
-    monkeypatch.setattr(unit, "start", lambda: found.append("unit"))
+    monkeypatch.setattr(local_nodes, "systemd_runs", lambda pid: pid == 1)
+    monkeypatch.setattr(local_nodes, "start_unit", lambda: found.append("unit"))
     return found
 
 

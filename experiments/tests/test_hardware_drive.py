@@ -16,7 +16,7 @@ import pytest
 from fog_contracts import channels as ch
 from fog_contracts.messages import Pose, RobotGoal
 from fog_runtime.configuration.site import load_site
-from fognav.operate.outcome import Outcome
+from fognav.operate.fog import Outcome
 from fognav.output import FailedError, WrongUseError
 from fognav_experiments.comparison.drives import RouteDraw, RouteSpec, start_of
 from fognav_experiments.comparison.hardware_drive import HardwareRun, Terminal, drive_hardware

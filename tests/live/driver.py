@@ -25,12 +25,11 @@ from fog_runtime.configuration.site import load_site
 from fog_runtime.transports.mqtt_edge import MqttEdge
 from fog_runtime.transports.zenoh_edge import ZenohEdge
 from fog_supervisor import net
+from fognav.demo.machine import children
 from fognav.demo.operator import Operator
 from fognav.demo.scene import Scene
-from fognav.demo.usage import children
 from fognav.programs import AGENT, MAP_SERVICE, PLANNER, WATCHDOG
-from fognav.stack import Stack, StackConfig
-from fognav.stack_doors import doors_of
+from fognav.stack import Stack, StackConfig, doors_of
 
 if TYPE_CHECKING:
     from collections.abc import Callable

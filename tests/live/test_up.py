@@ -27,7 +27,7 @@ from fog_runtime.clock import SystemClock
 from fog_runtime.credentials import Credentials
 from fog_runtime.transports.zenoh_edge import ZenohEdge
 from fog_supervisor import child, net
-from fognav.hosting.versions import Versions
+from fognav.hosting.upgrading import Versions
 from fognav.output import FailedError, WrongUseError
 
 pytestmark = [pytest.mark.live, pytest.mark.timeout(300)]

@@ -56,16 +56,15 @@ from fog_runtime.record import RecordError, read
 from fog_runtime.transports.zenoh_edge import ZenohEdge
 from fog_supervisor import net
 from fognav.demo.attempt import Attempt
-from fognav.demo.background import Background
+from fognav.demo.machine import SpeedWatch
 from fognav.demo.operator import Operator
 from fognav.demo.options import DrivePlan, Options
+from fognav.demo.preparation import Background
 from fognav.demo.scene import Scene
-from fognav.demo.speed import SpeedWatch
 from fognav.output import WrongUseError
 from fognav.programs import AGENT, MAP_SERVICE, SERVERS, SERVICES, SIMULATOR, WATCHDOG
 from fognav.recording import recording, summary
-from fognav.stack import Stack, StackConfig
-from fognav.stack_doors import doors_of
+from fognav.stack import Stack, StackConfig, doors_of
 from fognav_sim.drive.hazard import entry_distance
 from robot_agent.agent.recording.replay import replay
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 from fog_supervisor import net
-from fognav.hosting.floors import PORT_STEP
+from fognav.hosting.folders import PORT_STEP
 
 if TYPE_CHECKING:
     from collections.abc import Iterable

@@ -88,8 +88,8 @@ def test_every_session_is_opened_in_the_role_of_its_program():
         # It publishes what other roles published, for which no role has the right.
         "cli/src/fognav/recording.py:play": "console",
         "cli/src/fognav/demo/attempt.py:_open": "console",
-        "cli/src/fognav/operate/robots.py:connect": "console",
-        "cli/src/fognav/operate/presence.py:_connected": "console",
+        "cli/src/fognav/operate/robot_commands.py:connect": "console",
+        "cli/src/fognav/commands/status.py:_connected": "console",
     }
     assert set(opened["sim/src"].values()) == {"console", "sim"}
 

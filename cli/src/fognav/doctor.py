@@ -13,11 +13,14 @@ from pathlib import Path
 from typing import Final, Literal
 
 import psutil
+import typer
+from rich.table import Table
 
 from fognav import checkout, kernels, system
 from fognav.locking import VARIABLE as LOCKS_VARIABLE
 from fognav.locking import locks_errors, locks_folder, open_locks
-from fognav.output import FailedError, WrongUseError
+from fognav.operate.options import JsonOption
+from fognav.output import NOT_TRUE, OK, FailedError, WrongUseError, answers, print_json
 
 State = Literal["ok", "missing", "optional"]
 
@@ -168,3 +171,19 @@ def checks() -> Iterator[Check]:
 def as_json(found: list[Check]) -> dict[str, object]:
     """Return the JSON of `fognav doctor --json`."""
     return {"ok": all(c.state != "missing" for c in found), "checks": [asdict(check) for check in found]}
+
+
+def doctor_command(*, json: JsonOption = False) -> None:
+    """Show what is installed, what is missing and how to install it."""
+    found = list(checks())
+    if json:
+        print_json(as_json(found))
+    else:
+        table = Table(box=None, padding=(0, 2), show_header=False)
+        marks = {"ok": "[green]ok[/]", "missing": "[red]missing[/]", "optional": "[yellow]optional[/]"}
+        for check in found:
+            table.add_row(marks[check.state], check.name, check.found)
+            if check.remedy:
+                table.add_row("", "", f"[dim]remedy: {check.remedy}[/]")
+        answers.print(table)
+    raise typer.Exit(NOT_TRUE if any(check.state == "missing" for check in found) else OK)

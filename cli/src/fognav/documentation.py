@@ -1,22 +1,133 @@
-"""Gathers the pages of the documentation's site, and builds it.
+"""Gathers the pages of the documentation's site, writes that of the REST routes, and builds the site.
 
 The site mirrors the repository: a document is shown as it is, at its path, so that its links hold. Sources and folders
 that it links to become pages, too: `x.py` the page `x.py.md`, a folder the `README.md` in it. A link that leads nowhere
 is taken for one of these, whose page the strict build misses.
 """
 
+import json
 import os
 import re
 import shutil
 import subprocess
 import sys
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from functools import partial
 from pathlib import Path
-from typing import Final
+from typing import Any, Final
 
-from fognav import rest_reference, system
+from fognav import system
 from fognav.output import FailedError
+
+Described = Mapping[str, Any]
+"""A part of an OpenAPI description."""
+_METHODS: Final = ("get", "put", "post", "patch", "delete")
+_HEAD: Final = """\
+# REST
+
+The routes of the three services. [Channels](../docs/channels.md#rest) has them at a glance. A service serves its own
+description at `/openapi.json`; errors are problem documents (RFC 9457).
+"""
+_LIMITS: Final = {
+    "minimum": ">=", "exclusiveMinimum": ">", "maximum": "<=", "exclusiveMaximum": "<", "minLength": "characters >=",
+    "maxLength": "characters <=", "minItems": "items >=", "maxItems": "items <=", "pattern": "like",
+}  # fmt: skip
+
+
+def rest_page(services: Mapping[str, Described]) -> str:
+    """Return the page in Markdown; `services` are the descriptions by the name of the service."""
+    types: dict[str, Described] = {}
+    sections = [_HEAD]
+    for service, described in services.items():
+        sections.append(f"## {service}\n")
+        sections += [
+            _route(f"{method.upper()} {path}", operations[method])
+            for path, operations in sorted(described["paths"].items())
+            for method in _METHODS
+            if method in operations
+        ]
+        types |= described.get("components", {}).get("schemas", {})
+    sections.append("## Types\n")
+    sections += [_type(name, types[name]) for name in sorted(types)]
+    return "\n".join(sections)
+
+
+def _route(name: str, operation: Described) -> str:
+    role = "Needs a token.\n" if operation.get("security") else ""
+    body = _content(operation.get("requestBody", {}))
+    parameters = [
+        [f"`{each['name']}`", each["in"], _text(each["schema"]), each.get("description", "")]
+        for each in operation.get("parameters", [])
+    ]
+    answers = [
+        [status, _content(answer), answer.get("description", "")]
+        for status, answer in sorted(operation["responses"].items())
+    ]
+    parts = [
+        f"### `{name}`\n",
+        f"{_paragraph(operation.get('description', ''))}\n",
+        role,
+        f"Body: {body}\n" if body else "",
+        _table(["parameter", "in", "type", "meaning"], parameters),
+        _table(["status", "answer", "meaning"], answers),
+    ]
+    return "\n".join(part for part in parts if part)
+
+
+def _type(name: str, schema: Described) -> str:
+    required = schema.get("required", [])
+    rows = [
+        [
+            f"`{field}`", _text(of), _limits(of),
+            "" if field in required else f"`{json.dumps(of['default'])}`" if "default" in of else "none",
+        ]
+        for field, of in schema.get("properties", {}).items()
+    ]  # fmt: skip
+    about = _paragraph(schema.get("description", ""))
+    fields = _table(["field", "type", "limits", "default"], rows) if rows else f"{_text(schema)}\n"
+    return f"### {name}\n\n{about}\n\n{fields}"
+
+
+def _content(of: Described) -> str:
+    """Return the type of a body or an answer."""
+    return " or ".join(
+        _text(content.get("schema", {})) if "json" in kind else f"`{kind}`"
+        for kind, content in of.get("content", {}).items()
+    )
+
+
+def _text(schema: Described) -> str:
+    """Return a schema's type for people, with links to the types of this page."""
+    if "$ref" in schema:
+        name = schema["$ref"].rpartition("/")[2]
+        return f"[{name}](#{name.lower()})"
+    if several := schema.get("anyOf") or schema.get("oneOf") or schema.get("allOf"):
+        return " or ".join(map(_text, several))
+    if "enum" in schema:
+        return " or ".join(f"`{value}`" for value in schema["enum"])
+    if items := schema.get("prefixItems") or (schema.get("items") and [schema["items"]]):
+        return f"list of {', '.join(map(_text, items))}"
+    return str(schema.get("type", "anything"))
+
+
+def _limits(schema: Described) -> str:
+    for each in (schema, *schema.get("anyOf", ())):
+        if found := [f"{sign} `{each[key]}`" for key, sign in _LIMITS.items() if key in each]:
+            return ", ".join(found)
+    return ""
+
+
+def _paragraph(text: str) -> str:
+    """Return a docstring's text as one paragraph for each of its own."""
+    return "\n\n".join(" ".join(part.split()) for part in text.split("\n\n"))
+
+
+def _table(columns: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
+    lines = [[" ".join(cell.split()).replace("|", "\\|") for cell in row] for row in rows]
+    if not lines:
+        return ""
+    return "".join(f"| {' | '.join(line)} |\n" for line in [columns, ["---"] * len(columns), *lines])
+
 
 _LINK: Final = re.compile(r"(?<=\]\()(?![a-z]+:|#)[^)\s#]+")
 _SHOWN: Final = frozenset({".md", ".png", ".svg", ".gif", ".html", ".csv", ".xz"})
@@ -87,9 +198,9 @@ def _folder(root: Path, folder: Path, pages: Mapping[str, object]) -> str:
     return _PAGE.format(title=path, path=path, text="\n".join(lines))
 
 
-def write(root: Path, folder: Path, services: Mapping[str, rest_reference.Described]) -> None:
+def write(root: Path, folder: Path, services: Mapping[str, Described]) -> None:
     """Write what has changed of the site's configuration and pages into a folder."""
-    found = gather(root) | {"reference/rest.md": rest_reference.rest_page(services)}
+    found = gather(root) | {"reference/rest.md": rest_page(services)}
     pages = folder / "pages"
     for file in [file for file in pages.rglob("*") if file.is_file()]:
         if file.relative_to(pages).as_posix() not in found:

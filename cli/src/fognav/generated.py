@@ -19,6 +19,7 @@ from fog_runtime.configuration.site import load_site
 from fog_runtime.health import Health
 from fog_runtime.http import Tokens, unused
 from fognav import checkout
+from robot_agent import registry
 
 if TYPE_CHECKING:
     import msgspec
@@ -51,8 +52,6 @@ def markdown() -> str:
 
 def robot_settings() -> str:
     """Return `docs/robot-settings.md`."""
-    from robot_agent import registry  # noqa: PLC0415  # drivers need numpy: only this function waits for it
-
     own = distribution("robot-agent").entry_points
     drivers: list[tuple[str, msgspec.Struct]] = []
     for part, group in (("base", registry.BASES), ("lidar", registry.LIDARS)):

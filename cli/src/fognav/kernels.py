@@ -14,14 +14,14 @@ from typing import Final
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
 
 from fog_kernels.sources import sources_of
-from fognav.output import console
+from fognav.output import FailedError, console
 
 _WARM_TIMEOUT_S: Final = 900.0
 _COMPILES: Final = re.compile(r"^(@|\w+ = )njit\(", re.MULTILINE)
 _PROGRESS: Final = re.compile(r"(\d+) of (\d+) kernels ready: (.*)")
 
 
-class KernelsError(RuntimeError):
+class KernelsError(FailedError):
     """The kernels could not be compiled; the message contains the compiler's output."""
 
 

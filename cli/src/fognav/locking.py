@@ -5,16 +5,17 @@ import socket
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Final
+from typing import Annotated, Final
 
+import psutil
 import typer
 
 from fog_runtime.credentials import VARIABLE as CREDENTIALS_VARIABLE
 from fog_runtime.credentials import Credentials, CredentialsError
+from fog_runtime.locks.authority import AuthorityError
+from fog_runtime.locks.site_locks import SiteLocks
+from fog_runtime.locks.users import LocksError
 from fognav.output import FailedError, WrongUseError
-
-if TYPE_CHECKING:
-    from fog_runtime.locks.site_locks import SiteLocks
 
 VARIABLE: Final = "FOGNAV_CREDENTIALS_DIR"
 _FORMER_VARIABLE: Final = "FOGNAV_LOCKS_DIR"
@@ -43,13 +44,11 @@ def named_folder(given: Path | None) -> Path:
     return folder
 
 
-def open_locks(given: Path | None) -> "SiteLocks":
+def open_locks(given: Path | None) -> SiteLocks:
     """Open the certificates and users in the folder that an option or the environment names.
 
     Raises `WrongUseError` without one, and `LocksError`.
     """
-    from fog_runtime.locks.site_locks import SiteLocks  # noqa: PLC0415  # keeps the other commands fast
-
     return SiteLocks.open(named_folder(given))
 
 
@@ -68,9 +67,6 @@ def own_credentials(default: str | None = None) -> Credentials:
 @contextmanager
 def locks_errors() -> Iterator[None]:
     """Turn errors of certificates and users into those of commands."""
-    from fog_runtime.locks.authority import AuthorityError  # noqa: PLC0415  # keeps the other commands fast
-    from fog_runtime.locks.users import LocksError  # noqa: PLC0415  # same
-
     try:
         yield
     except (AuthorityError, LocksError) as error:
@@ -83,8 +79,6 @@ def locks_errors() -> Iterator[None]:
 
 def own_hosts() -> list[str]:
     """Return the names and addresses by which clients may reach this computer."""
-    import psutil  # noqa: PLC0415  # keeps the other commands fast
-
     name = socket.gethostname()
     found = [name, f"{name}.local", "localhost"]
     for addresses in psutil.net_if_addrs().values():

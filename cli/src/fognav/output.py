@@ -11,6 +11,9 @@ from typing import Final, NoReturn
 import typer
 from rich.console import Console
 
+from fog_runtime.configuration.settings import SettingsError
+from fog_runtime.configuration.site import SiteError
+from fog_runtime.token_file import TokensError
 from fog_supervisor.servers import ServerError
 from fog_supervisor.supervisor import NotReadyError
 from fognav import __version__
@@ -24,8 +27,6 @@ NOT_TRUE: Final = 1
 WRONG_USE: Final = 2
 
 console = Console(stderr=True, highlight=False, width=None if sys.stderr.isatty() else 200)
-
-
 answers = Console(highlight=False, width=None if sys.stdout.isatty() else 200)
 
 
@@ -58,9 +59,9 @@ def exit_codes() -> Iterator[None]:
     """Turn the errors of a command into their messages and exit codes."""
     try:
         yield
-    except WrongUseError as error:
+    except (WrongUseError, SiteError, SettingsError) as error:
         fail(str(error), WRONG_USE)
-    except (FailedError, NotReadyError, ServerError) as error:
+    except (FailedError, NotReadyError, ServerError, TokensError) as error:
         fail(str(error))
 
 

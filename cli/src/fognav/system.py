@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Final, Protocol
 
 from fog_supervisor.servers import find_program
+from fognav.output import FailedError
 
 _INSTALL_TIMEOUT_S: Final = 600.0
 
@@ -45,7 +46,7 @@ PROMETHEUS: Final = Tool("prometheus", ("prometheus",), "prometheus", "tests of 
 TOOLS: Final = (MOSQUITTO, REDIS, CHROMIUM, COMPILER, BOARD_COMPILER, FIRMWARE_CHECKER, PROMETHEUS)
 
 
-class MissingToolsError(RuntimeError):
+class MissingToolsError(FailedError):
     """Programs are missing and were not installed; the message names them and how to install them."""
 
 
@@ -186,3 +187,39 @@ def ensure(
     if still := [name for name, path in paths.items() if path is None]:
         raise MissingToolsError(f"{' and '.join(still)} can't be found although the installation succeeded")
     return {name: path for name, path in paths.items() if path is not None}
+
+
+def prepare_node_code(print_line: Callable[[str], None], *, yes: bool = False) -> None:
+    """Compile the firmware's core; where that can't be, print one line with the reason.
+
+    A missing compiler is installed if the user agrees (`yes`: without asking).
+    """
+    from fognav_sim.nodes import why_model  # noqa: PLC0415  # keeps the other commands fast
+
+    reason = why_model()
+    if reason is not None and _lacks_compiler():
+        try:
+            ensure([COMPILER], yes=yes, print_line=print_line)
+        except NoAttemptError:
+            pass  # the reason says how to install it
+        except MissingToolsError as error:
+            print_line(str(error))
+        else:
+            reason = why_model()
+    if reason is not None:
+        print_line(f"simulated sensor nodes run a model in Python, not the firmware: {reason.splitlines()[0]}")
+
+
+def _lacks_compiler() -> bool:
+    """Whether there are sources to compile, and nothing that could."""
+    from fognav_sim.nodes import FirmwareError, find_compiler, find_firmware  # noqa: PLC0415  # same
+
+    try:
+        find_firmware()
+    except FirmwareError:
+        return False
+    try:
+        find_compiler()
+    except FirmwareError:
+        return True
+    return False

@@ -1,58 +1,151 @@
-"""Connects the demonstration with its views: the terminal, the page, or none."""
+"""`fognav demo`, `record` and `replay`: the whole system with simulated hardware, and what its channels carry."""
 
 import asyncio
-import contextlib
-import signal
-from collections.abc import Callable
 from pathlib import Path
+from typing import Annotated
+
+import typer
 
 from fog_runtime import logs
-from fog_runtime.configuration.site import SiteError, load_site
-from fog_supervisor.supervisor import NotReadyError
-from fognav.demo.options import Options
-from fognav.demo.run import Demo
-from fognav.demo.view import show
-from fognav.output import WrongUseError, console
-from fognav.page.app import serve
-from fognav_sim.drive.drive import DriveOutcome
-
-_SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
+from fog_runtime.configuration import parts
+from fog_runtime.configuration.site import load_site
+from fognav import checkout, kernels, recording, system
+from fognav.operate.options import JsonOption, YesOption
+from fognav.output import NOT_TRUE, OK, check_writable, exit_codes, print_json, print_line, write_report
+from fognav_sim import emulators
 
 
-async def run_demo(
-    folder: Path, options: Options, *, headless: bool, page_port: int, print_line: Callable[[str], None]
-) -> dict[str, object]:
-    """Run a demonstration on a site's folder until its outcome or a signal; return the report.
+def _known_parts(group: str) -> str:
+    return " or ".join(parts.names(group))
 
-    Raises `WrongUseError` for a site that is not suitable.
+
+Broker = Annotated[str, typer.Option("--mqtt", metavar="URL", help="MQTT broker.")]
+Router = Annotated[str, typer.Option("--zenoh", metavar="ENDPOINT", help="zenoh router.")]
+SiteId = Annotated[str, typer.Option("--site", metavar="ID", help="Id of the site, the second part of every key.")]
+
+
+def demo_command(  # noqa: PLR0913  # each option is an argument
+    *,
+    headless: Annotated[bool, typer.Option("--headless", help="No terminal view and no page: for scripts.")] = False,
+    report: Annotated[Path | None, typer.Option("--report", metavar="F", help="Write the report (JSON) here.")] = None,
+    site: Annotated[
+        Path | None,
+        typer.Option("--site", metavar="D", help="Folder of a site, or a name in sites/; default: estig."),
+    ] = None,
+    seed: Annotated[int, typer.Option("--seed", metavar="N", min=0, help="Seed of the noise and of the hazard.")] = 1,
+    speed: Annotated[
+        float,
+        typer.Option("--speed", metavar="K", min=0.1, max=50.0, help="Simulated seconds per second."),
+    ] = 1.0,
+    no_hazard: Annotated[bool, typer.Option("--no-hazard", help="Place no barrier on the path.")] = False,
+    base: Annotated[
+        str | None, typer.Option("--base", metavar="NAME", help=f"The robot's base: {_known_parts(emulators.BASES)}.")
+    ] = None,
+    lidar: Annotated[
+        str | None,
+        typer.Option("--lidar", metavar="NAME", help=f"The robot's lidar: {_known_parts(emulators.LIDARS)}."),
+    ] = None,
+    robot_file: Annotated[
+        Path | None,
+        typer.Option(
+            "--robot-file", metavar="F", help="Settings of the robot, from fognav robot new; its ports do not count."
+        ),
+    ] = None,
+    keep_running: Annotated[
+        bool, typer.Option("--keep-running", help="Keep the system running after the drive, until Ctrl-C.")
+    ] = False,
+    record: Annotated[
+        Path | None, typer.Option("--record", metavar="F", help="Record every channel to this MCAP file.")
+    ] = None,
+    embedded: Annotated[
+        bool,
+        typer.Option("--embedded", help="Use Python packages instead of Mosquitto and Redis, as without them."),
+    ] = False,
+    page_port: Annotated[
+        int, typer.Option("--page-port", metavar="P", min=0, max=65535, help="Port of the page; 0: any free one.")
+    ] = 0,
+    yes: YesOption = False,
+    json: JsonOption = False,
+) -> None:
+    """Run the whole system with simulated hardware; block its path.
+
+    The exit code is 0 if the robot reached the goal without contact and avoided the blocked area; 1 if it did not, or
+    the demo was interrupted (see the report); 2 if an option or file can't be used.
     """
-    logs.configure("demo", "warning", "text")
-    stop = asyncio.Event()
-    loop = asyncio.get_running_loop()
-    for number in _SIGNALS:
-        loop.add_signal_handler(number, stop.set)
-    try:
-        site = load_site(folder)
-    except SiteError as error:
-        raise WrongUseError(str(error)) from error
-    in_terminal = not headless and console.is_terminal
-    demo = Demo(site, options, None if in_terminal else print_line)
-    try:
-        async with contextlib.AsyncExitStack() as views:
-            if not headless:
-                demo.page_url = demo.scene.page_url = await views.enter_async_context(serve(demo, page_port))
-                print_line(f"watch the demo at {demo.page_url}")
-            if in_terminal:
-                view = asyncio.create_task(show(demo, console))
-                views.push_async_callback(_end, view)
-            return await demo.run(stop)
-    except (NotReadyError, TimeoutError) as error:
-        print_line(str(error))
-        demo.scene.outcome = DriveOutcome("stopped", str(error))
-        return demo.report()
+    from fognav.demo.options import Options, embedded_servers, hardware  # noqa: PLC0415  # kernels are slow
+    from fognav.demo.view import run_demo  # noqa: PLC0415  # same
+
+    with exit_codes():
+        loaded = load_site(checkout.site_folder(site))
+        for file in (report, record):
+            check_writable(file)
+        base, lidar = hardware(robot_file, base, lidar)
+        # What can't be used was refused by now, before anything is installed or compiled.
+        packages = embedded_servers(forced=embedded, yes=yes, print_line=print_line)
+        system.prepare_node_code(print_line, yes=yes)
+        kernels.warm_cache(print_line)
+        options = Options(
+            seed=seed,
+            speed=speed,
+            hazard=not no_hazard,
+            base=base,
+            lidar=lidar,
+            robot_file=robot_file and robot_file.resolve(),
+            keep_running=keep_running,
+            record=record,
+            embedded=packages,
+        )
+        values = asyncio.run(run_demo(loaded, options, headless=headless, page_port=page_port, print_line=print_line))
+        if report is not None:
+            write_report(report, values)
+    if json:
+        print_json(values)
+    raise typer.Exit(OK if values["success"] else NOT_TRUE)
 
 
-async def _end(view: asyncio.Task[None]) -> None:
-    view.cancel()
-    with contextlib.suppress(asyncio.CancelledError):
-        await view
+def record_command(
+    file: Annotated[Path, typer.Argument(metavar="FILE", help="MCAP file to write.")],
+    *,
+    mqtt: Broker = "mqtt://127.0.0.1:1883",
+    zenoh: Router = "tcp/127.0.0.1:7447",
+    site: SiteId = "estig",
+    seconds: Annotated[float, typer.Option("--seconds", min=0.0, help="Duration; 0: until Ctrl-C.")] = 0.0,
+    json: JsonOption = False,
+) -> None:
+    """Record every channel of a running system to an MCAP file.
+
+    Foxglove opens such files; fognav replay publishes their messages again.
+    """
+    logs.configure("record", "error", "text")
+    with exit_codes():
+        check_writable(file)
+        recorded = asyncio.run(recording.record(file, mqtt_url=mqtt, zenoh_endpoint=zenoh, site=site, seconds=seconds))
+    if json:
+        print_json(recorded)
+    else:
+        print_line(f"wrote {file}: {recorded['seconds']} s, {recorded['messages']}")
+
+
+def replay_command(
+    file: Annotated[Path, typer.Argument(metavar="FILE", help="MCAP file of a recording.")],
+    *,
+    mqtt: Broker = "mqtt://127.0.0.1:1883",
+    zenoh: Router = "tcp/127.0.0.1:7447",
+    site: SiteId = "estig",
+    speed: Annotated[float, typer.Option("--speed", min=0.1, max=50.0, help="Speed factor.")] = 1.0,
+    json: JsonOption = False,
+) -> None:
+    """Publish a recording's messages again, with their timing.
+
+    They go to a broker and a router; services connected there process them like live messages.
+    """
+    logs.configure("replay", "error", "text")  # the command itself reports errors
+    with exit_codes():
+        sent = asyncio.run(recording.play(file, mqtt_url=mqtt, zenoh_endpoint=zenoh, site=site, speed=speed))
+    if json:
+        print_json(sent)
+    else:
+        lost = (
+            f"; the file is cut off: {sent['bytes_lost']} bytes at its end are incomplete" if sent["bytes_lost"] else ""
+        )
+        print_line(f"published {sent['sent']} messages of {file}{lost}")

@@ -1,23 +1,19 @@
 """`fognav map`: maps of buildings, and what is on the fog's map now."""
 
-from __future__ import annotations
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Annotated, Any
 
-from pathlib import Path  # noqa: TC003  # Typer reads annotations at run time
-from typing import TYPE_CHECKING, Annotated, Any
-
+import numpy as np
 import typer
 
-from fog_contracts.costs import INSCRIBED
-from fognav.lidar_logs.options import LogFormat, RangeMax, Scans  # noqa: TC001  # Typer reads annotations at run time
+from fog_contracts.costs import FREE, INSCRIBED, LETHAL, UNKNOWN
+from fog_contracts.grid import StaticMap
+from fog_runtime.configuration.maps import save_map
 from fognav.operate.fog import find_fog
-from fognav.operate.options import FogOption, JsonOption  # noqa: TC001  # same
+from fognav.operate.options import FogOption, JsonOption, LogFormat, RangeMax, Scans
 from fognav.operate.systems import MAP_SERVICE
 from fognav.output import WrongUseError, exit_codes, print_answer, print_json
-
-if TYPE_CHECKING:
-    from collections.abc import Mapping
-
-    from fog_contracts.grid import StaticMap
 
 map_app = typer.Typer(help="Make maps of buildings; show the hazards on the fog's map.", no_args_is_help=True)
 
@@ -66,8 +62,7 @@ def map_from_log(  # noqa: PLR0913  # each option is an argument
 
     Each beam clears the cells that it passes and marks the one where it ends.
     """
-    from fog_runtime.configuration.maps import save_map  # noqa: PLC0415  # keeps the other commands fast
-    from fognav.lidar_logs.logs import build_map, read_log  # noqa: PLC0415  # same
+    from fognav.lidar_logs import build_map, read_log  # noqa: PLC0415  # kernels are slow
 
     with exit_codes():
         map_ = build_map(read_log(log_file, log_format).select(scans), resolution, range_max)
@@ -84,10 +79,6 @@ def map_from_log(  # noqa: PLR0913  # each option is an argument
 
 def describe(map_: StaticMap) -> dict[str, object]:
     """Return size, resolution and origin of a map, and how many of its cells are free, occupied and unknown."""
-    import numpy as np  # noqa: PLC0415  # keeps the other commands fast
-
-    from fog_contracts.costs import FREE, LETHAL, UNKNOWN  # noqa: PLC0415  # same
-
     geometry = map_.geometry
     names = {"free": FREE, "occupied": LETHAL, "unknown": UNKNOWN}
     return {

@@ -14,12 +14,12 @@ import typer
 from fog_contracts import channels as ch
 from fog_contracts.messages import Id, NodeCalibration, NodeReading, NodeUpdate
 from fog_contracts.site import NodeSite, Sonar, learned_share
-from fog_runtime.configuration.site import LoadedSite
+from fog_runtime.configuration.site import LoadedSite, load_site
 from fog_runtime.credentials import Credentials
-from fognav import checkout, kernels, node_code
+from fognav import checkout, kernels, site_files, system
 from fognav.locking import own_credentials
-from fognav.nodes import on_broker, provisioning, site_file, updating
-from fognav.nodes.board_options import SITE, BoardOptions, SiteOption, with_board_options
+from fognav.nodes import on_broker
+from fognav.nodes.board_settings import SITE, BoardOptions, SiteOption, credentials_in, node_in, with_board_options
 from fognav.operate.fog import Fog, find_fog
 from fognav.operate.options import NUMBERS, FogOption, JsonOption
 from fognav.operate.systems import AGGREGATOR, BROKER
@@ -64,7 +64,7 @@ def node_add(
     """
     with exit_codes():
         board = board.completed()
-        loaded = site_file.load(checkout.site_folder(board.site))
+        loaded = load_site(checkout.site_folder(board.site))
         if board.target.exists():
             raise WrongUseError(
                 f"{board.target} already exists: it is another node's. Move it, or name a folder with --out"
@@ -73,11 +73,11 @@ def node_add(
             raise WrongUseError(
                 f"the site has a node {name} already: fognav node replace {name} makes a new board of it"
             )
-        _compiled()
+        kernels.warm_cache(print_line)
         node = msgspec.structs.replace(_placed(loaded, name, area, _pose(pose), height), every_reading=every_reading)
-        text = site_file.with_node(loaded, node)
+        text = site_files.with_node(loaded, node)
         board.provision(loaded, node)
-        site_file.write(loaded, text)
+        site_files.write(loaded, text)
         board.report("added", node)
 
 
@@ -90,9 +90,9 @@ def node_replace(name: NameArgument, *, board: BoardOptions) -> None:
     """
     with exit_codes():
         board = board.completed()
-        loaded = site_file.load(checkout.site_folder(board.site))
-        node = site_file.node_of(loaded, name)
-        if (other := provisioning.node_in(board.target)) not in (None, name):
+        loaded = load_site(checkout.site_folder(board.site))
+        node = site_files.node_of(loaded, name)
+        if (other := node_in(board.target)) not in (None, name):
             raise WrongUseError(f"{board.target} is that of node {other}: move it, or name a folder with --out")
         board.provision(loaded, node)
         board.report("replaced", node)
@@ -153,8 +153,8 @@ def node_calibrate(  # noqa: PLR0913  # each option is an argument
     them.
     """
     with exit_codes():
-        loaded = None if folder is None else site_file.load(checkout.site_folder(folder))
-        node = None if loaded is None else site_file.node_of(loaded, name)
+        loaded = None if folder is None else load_site(checkout.site_folder(folder))
+        node = None if loaded is None else site_files.node_of(loaded, name)
         url, site_id, own = _on(fog, broker, site if loaded is None else loaded.site.id)
         command = ch.LEARN_NO_ECHO if no_echo else ch.CALIBRATE
         print_line(f"node {name} measures for about {'10' if no_echo else '40'} s: keep the way in front of it free")
@@ -167,7 +167,7 @@ def node_calibrate(  # noqa: PLR0913  # each option is an argument
             with_limits = _with_limits(node, learned)
             unlike = [] if force else _unlike_the_map(loaded, node, learned)
             if not unlike:
-                site_file.replace(loaded, with_limits)
+                site_files.replace(loaded, with_limits)
         if json:
             print_json({"node": name, **msgspec.to_builtins(learned)})
         else:
@@ -203,7 +203,7 @@ def node_key(
     Keep the file where no server is: who has it can put any program onto the nodes.
     """
     with exit_codes():
-        print_line(updating.make_key(file))
+        print_line(on_broker.make_key(file))
 
 
 @node_app.command(
@@ -232,12 +232,12 @@ def node_update(  # noqa: PLR0913  # each option is an argument
     The node fetches it while it goes on measuring. The offer is withdrawn at the end.
     """
     with exit_codes():
-        data = updating.read_image(image)
+        data = on_broker.read_image(image)
         url, site_id, own = _on(fog, broker, site)
-        elsewhere = None if address is None else updating.ServedImage(address, fetched=True)
-        with nullcontext(elsewhere) if elsewhere is not None else updating.served(data, url) as image_at:
+        elsewhere = None if address is None else on_broker.ServedImage(address, fetched=True)
+        with nullcontext(elsewhere) if elsewhere is not None else on_broker.served(data, url) as image_at:
             try:
-                offer = msgspec.convert(updating.signed_offer(data, number, board, key, image_at.url), NodeUpdate)
+                offer = msgspec.convert(on_broker.signed_offer(data, number, board, key, image_at.url), NodeUpdate)
             except msgspec.ValidationError as error:
                 raise WrongUseError(f"the offer is not valid: {error}") from error
             reading = _run(on_broker.update(url, site_id, _checked(name), offer, own, seconds=seconds))
@@ -282,15 +282,15 @@ def node_sim(  # noqa: PLR0913  # each option is an argument
     from fognav.nodes import simulated  # noqa: PLC0415  # the simulator's imports are slow
 
     with exit_codes():
-        loaded = site_file.load(checkout.site_folder(site))
-        node = site_file.node_of(loaded, name)
+        loaded = load_site(checkout.site_folder(site))
+        node = site_files.node_of(loaded, name)
         if every_reading is not None:
             node = msgspec.structs.replace(node, every_reading=every_reading)
         persons = [_numbers("--person", text, 2) for text in person or ()]
-        own = own_credentials() if board is None else provisioning.credentials_in(board, name)
+        own = own_credentials() if board is None else credentials_in(board, name)
         url, _, _ = _on(fog, broker, loaded.site.id)
-        _compiled()
-        node_code.prepare(print_line)
+        kernels.warm_cache(print_line)
+        system.prepare_node_code(print_line)
         _run(_bounded(simulated.run(loaded, node, url, own, [(x, y) for x, y in persons]), seconds))
 
 
@@ -483,10 +483,3 @@ def _line(node: dict[str, Any]) -> str:
     age = "never heard" if node["age_s"] is None else f"{node['age_s']:.1f} s ago"
     reason = f" ({node['reason']})" if node["reason"] else ""
     return f"{node['id']}: area {node['area']}, {node['state']}{reason}, {age}, {node['received']} readings"
-
-
-def _compiled() -> None:
-    try:
-        kernels.warm_cache(print_line)
-    except kernels.KernelsError as error:
-        raise FailedError(str(error)) from error

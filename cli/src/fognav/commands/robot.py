@@ -14,10 +14,9 @@ import typer
 from fog_contracts.commands import PROFILE_OF
 from fog_contracts.messages import CommandKind, Id, Mode, Pose, ProfileName
 from fog_runtime import logs
-from fognav.operate import rest_commands, stopping
-from fognav.operate.fog import Fog, RefusedError, find_fog
+from fognav.operate import robot_commands
+from fognav.operate.fog import Fog, Outcome, RefusedError, find_fog
 from fognav.operate.options import NUMBERS, FogOption, JsonOption, RobotOption, numbers
-from fognav.operate.outcome import Outcome
 from fognav.operate.systems import MAP_SERVICE, PLANNER
 from fognav.output import (
     NOT_TRUE,
@@ -55,7 +54,7 @@ def robot_disable(*, robot: RobotOption = None, fog: FogOption = None, json: Jso
     The robot continues it when it is enabled again. While it can't be reached, this says so and tries again.
     """
     with exit_codes():
-        _report(stopping.stop(find_fog(fog), robot, print_line), json=json)
+        _report(robot_commands.stop(find_fog(fog), robot, print_line), json=json)
 
 
 @robot_app.command("reset", epilog="Example: fognav robot reset && fognav robot enable")
@@ -129,7 +128,7 @@ def robot_stop(*, robot: RobotOption = None, fog: FogOption = None, json: JsonOp
     """
     with exit_codes():
         found = find_fog(fog)
-        outcome = stopping.stop(found, robot, print_line)
+        outcome = robot_commands.stop(found, robot, print_line)
         # The robot comes first: it stops whether or not the planner answers.
         reason = f"{outcome.reason}; {_end_mission(found, robot)}"
         _report(msgspec.structs.replace(outcome, reason=reason), json=json)
@@ -150,7 +149,7 @@ def robot_pose(pose: Start, *, robot: RobotOption = None, fog: FogOption = None,
             raise WrongUseError(f"place {pose} has no heading: give {place['x']},{place['y']},THETA")
         else:
             x, y, theta = place["x"], place["y"], place["theta"]
-        outcome = rest_commands.command(found, found.robot(robot), "initial_pose", Pose(x=x, y=y, theta=theta))
+        outcome = robot_commands.command(found, found.robot(robot), "initial_pose", Pose(x=x, y=y, theta=theta))
         _report(outcome, json=json)
 
 
@@ -247,14 +246,12 @@ def robot_watch(
 def _run_command(kind: CommandKind, robot: str | None, fog: str | None, *, json: bool) -> None:
     with exit_codes():
         found = find_fog(fog)
-        _report(rest_commands.command(found, found.robot(robot), kind), json=json)
+        _report(robot_commands.command(found, found.robot(robot), kind), json=json)
 
 
 async def _cancel(fog: Fog, robot: str) -> Outcome:
-    from fognav.operate.robots import connect  # noqa: PLC0415  # zenoh: keeps the other commands fast
-
     logs.configure("fognav", "error", "text")
-    async with connect(fog, robot) as connected:
+    async with robot_commands.connect(fog, robot) as connected:
         return await connected.stop("cancel")
 
 
@@ -316,7 +313,7 @@ def _view(fog: Fog, robot: str) -> tuple[Mapping[str, Any], Any]:
 
 def _watch(fog: Fog, robot: str, seconds: float, *, json: bool) -> None:
     ends = time.monotonic() + seconds if seconds else math.inf
-    for view in rest_commands.states(fog, robot):
+    for view in robot_commands.states(fog, robot):
         _print_state(robot, view["state"], view["pose"], json=json)
         if time.monotonic() >= ends:
             return

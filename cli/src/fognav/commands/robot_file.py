@@ -7,6 +7,8 @@ from typing import Annotated
 import msgspec
 import typer
 
+from fog_contracts.costs import ROBOT_RADIUS
+from fog_contracts.generate.robot_toml import robot_toml, setting_text
 from fog_contracts.messages import Id
 from fog_runtime.configuration.parts import DEFAULT_BASE, DEFAULT_LIDAR
 from fog_runtime.configuration.robot_file import ROBOT_FILE, RobotFile, default_robot, describe_robot, load_robot
@@ -15,6 +17,10 @@ from fog_runtime.files import SHARED, atomic_write
 from fognav.locking import LocksOption, locks_errors, open_locks
 from fognav.operate.options import JsonOption
 from fognav.output import NOT_TRUE, WrongUseError, exit_codes, fail, print_answer, print_json, print_line
+from robot_agent import registry
+from robot_agent.agent.settings import read_footprint, refuse_body, refuse_contradictions, remarks
+from robot_agent.footprint import Footprint
+from robot_agent.serial_port import PortNameError, check_port_name
 
 
 def robot_add(
@@ -95,7 +101,6 @@ def robot_check(
     if json:
         print_json({"ok": True, "remarks": remarks, **values})
         return
-    from fog_contracts.generate.robot_toml import setting_text  # noqa: PLC0415  # keeps the other commands fast
 
     for name, value in values.items():
         print_answer(f"{name} = {setting_text(value)}")
@@ -105,8 +110,6 @@ def robot_check(
 
 def check_ports(robot: RobotFile) -> list[str]:
     """Return the settings of ports that are empty; raises `SettingsError` for a port that no process would open."""
-    from robot_agent.serial_port import PortNameError, check_port_name  # noqa: PLC0415  # keeps the others fast
-
     ports = {"base.port": robot.settings.base.port, "lidar.port": robot.settings.lidar.port}
     for name, port in ports.items():
         try:
@@ -120,16 +123,6 @@ def check_ports(robot: RobotFile) -> list[str]:
 
 def contradictions(robot: RobotFile) -> list[str]:
     """Return what a person may not expect of the settings; raises `SettingsError` for those that contradict others."""
-    from fog_contracts.costs import ROBOT_RADIUS  # noqa: PLC0415  # keeps the others fast
-    from robot_agent import registry  # noqa: PLC0415  # keeps the others fast
-    from robot_agent.agent.settings import (  # noqa: PLC0415  # keeps the others fast
-        read_footprint,
-        refuse_body,
-        refuse_contradictions,
-        remarks,
-    )
-    from robot_agent.footprint import Footprint  # noqa: PLC0415  # keeps the others fast
-
     base, footprint = registry.make_base(robot), read_footprint(robot)
     refuse_contradictions(robot, base)
     told = remarks(robot, registry.make_lidar(robot).traits, footprint or Footprint.circle(ROBOT_RADIUS))
@@ -150,18 +143,11 @@ def contradictions(robot: RobotFile) -> list[str]:
 
 def robot_text(robot: RobotFile) -> str:
     """Return a commented robot file with these settings; raises `SettingsError` for unknown hardware."""
-    # Drivers need numpy: only this command waits for it.
-    from fog_contracts.generate.robot_toml import robot_toml  # noqa: PLC0415  # see above
-    from robot_agent import registry  # noqa: PLC0415  # keeps the others fast
-
     return robot_toml(robot.settings, *registry.options(robot))
 
 
 def effective(robot: RobotFile) -> dict[str, object]:
     """Return all effective settings by their dotted names; raises `SettingsError` for what no process would accept."""
-    from robot_agent import registry  # noqa: PLC0415  # drivers need numpy: the other commands don't wait for it
-    from robot_agent.agent.settings import read_footprint  # noqa: PLC0415  # keeps the others fast
-
     registry.make_base(robot)
     registry.make_lidar(robot)
     read_footprint(robot)

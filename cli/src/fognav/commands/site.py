@@ -1,105 +1,91 @@
-"""`fognav site`: reads and writes the files of a proposed or checked site."""
+"""`fognav site`: creates and checks sites, and lets a fog node in containers serve several."""
 
-import re
-from collections.abc import Sequence
 from pathlib import Path
-from typing import Final
+from typing import Annotated
 
-from fog_runtime.configuration.maps import MapFileError, load_map, save_map
-from fog_runtime.configuration.site import SITE_FILE, SiteError, load_site
-from fog_runtime.files import SHARED, atomic_write
-from fognav.output import WrongUseError
-from fognav.site_text import to_toml
+import typer
 
-_ID_LENGTH = 32
-_MAP: Final = "map.yaml"
+from fognav import checkout, kernels, site_files
+from fognav.commands import installed
+from fognav.hosting.compose_floors import OVERRIDE
+from fognav.operate.options import JsonOption
+from fognav.output import NOT_TRUE, exit_codes, fail, print_json, print_line
 
-
-def identifier(name: str) -> str:
-    """Return an id for a name: lower-case letters, digits and hyphens."""
-    plain = re.sub(r"[^a-z0-9]+", "-", name.lower()).strip("-")
-    return plain[:_ID_LENGTH].strip("-") or "site"
+site_app = typer.Typer(cls=installed.SiteCommands, help="Create and check sites.", no_args_is_help=True)
 
 
-def _map_in(out: Path, map_file: Path) -> str:
-    """Return the name of the site's map in its own folder, where it is copied to unless it is there already.
+@site_app.command(
+    "new", epilog="Example: fognav site new --map floor.yaml --out sites/floor && fognav demo --site sites/floor"
+)
+def site_new(
+    *,
+    map_file: Annotated[Path, typer.Option("--map", metavar="MAP.yaml", help="map_server YAML; it is copied to DIR.")],
+    out: Annotated[Path, typer.Option("--out", metavar="DIR", help="Folder to create, without a site in it.")],
+    seed: Annotated[int, typer.Option("--seed", metavar="N", min=0, help="Each seed proposes other places.")] = 1,
+    json: JsonOption = False,
+) -> None:
+    """Propose a site on any map_server map, ready for a demo.
 
-    A site must not depend on files elsewhere: containers get nothing but its folder. Raises `WrongUseError` if another
-    map is in the way.
+    This writes a commented DIR/site.toml with places, a robot and watched areas, as a starting point.
     """
-    if map_file.resolve().parent == out.resolve():
-        return map_file.name
-    for name in (_MAP, f"{Path(_MAP).stem}.pgm"):
-        if (out / name).exists():
-            raise WrongUseError(f"{out / name} already exists: name another folder with --out, or remove it")
-    return _MAP
-
-
-def new_site(map_file: Path, out: Path, seed: int) -> dict[str, object]:
-    """Write `out`/site.toml for a map, and copy the map there; raises `WrongUseError`, and then writes nothing."""
-    # Checking a site must not wait for the kernels, which only a proposal needs.
-    from fognav.site_proposal import NoSiteError, propose  # noqa: PLC0415  # see above
-
-    target = out / SITE_FILE
-    if target.exists():
-        raise WrongUseError(f"{target} already exists: name another folder with --out, or remove it")
-    map_name = _map_in(out, map_file)
-    copied = None if (out / map_name).exists() else out / map_name
-    try:
-        static = load_map(map_file)
-        site, why = propose(identifier(out.resolve().name), map_name, static.geometry, static.cells, seed)
-    except (MapFileError, NoSiteError) as error:
-        raise WrongUseError(str(error)) from error
-    try:
-        if copied is not None:
-            save_map(copied.with_suffix(""), static)
-        atomic_write(target, to_toml(site).encode(), mode=SHARED)
-    except OSError as error:
-        raise WrongUseError(f"{target} can't be written: {error.strerror}. Name another folder with --out") from error
-    try:
-        load_site(out)
-    except SiteError:
-        target.unlink()
-        raise
-    return {
-        "file": str(target),
-        "site": site.id,
-        "areas": len(site.areas),
-        "why_no_areas": why,
-        "places": {name: [place.x, place.y] for name, place in site.places.items()},
-    }
-
-
-def compose_floors(folders: Sequence[Path], root: Path, out: Path) -> dict[str, object]:
-    """Write the override of a checkout's compose file for further floors; without folders, remove it.
-
-    Raises `WrongUseError` as `override`, and for a file that this command has not written.
-    """
-    from fognav.hosting.compose_floors import BASE, HEADER, override  # noqa: PLC0415  # keeps the other commands fast
-
-    if out.exists() and not out.read_text("utf-8").startswith(HEADER):
-        raise WrongUseError(f"{out} is not by this command: move it, or name another file with --out")
-    if folders:
-        atomic_write(out, override(folders, (root / BASE).read_text("utf-8")).encode(), mode=SHARED)
+    with exit_codes():
+        kernels.warm_cache(print_line)
+        made = site_files.new_site(map_file, out, seed)
+    if json:
+        print_json(made)
     else:
-        out.unlink(missing_ok=True)
-    return {"file": str(out), "sites": [str(folder) for folder in folders]}
+        print_line(f"wrote {made['file']}: {made['areas']} watched areas. Try it: fognav demo --site {out}")
+        if made["why_no_areas"]:
+            print_line(f"no watched areas, so that a demo shows no hazard: {made['why_no_areas']}")
 
 
-def check_site(folder: Path) -> dict[str, object]:
-    """Return the contents of a site, or the problem with it."""
-    try:
-        loaded = load_site(folder)
-    except SiteError as error:
-        return {"ok": False, "problem": str(error)}
-    site = loaded.site
-    return {
-        "ok": True,
-        "site": site.id,
-        "areas": len(site.areas),
-        "nodes": len(site.nodes),
-        "places": len(site.places),
-        "robots": len(site.robots),
-        "demo": site.demo is not None,
-        "unbounded_nodes": [node.id for node in site.nodes if any(each.range_max is None for each in node.sonars)],
-    }
+@site_app.command("check", epilog="Example: fognav site check sites/estig")
+def site_check(
+    folder: Annotated[Path, typer.Argument(metavar="DIR", help="Folder with site.toml, or a name in sites/.")],
+    *,
+    json: JsonOption = False,
+) -> None:
+    """Check a site: map, ids, and that everything is on free floor."""
+    with exit_codes():
+        found = site_files.check_site(checkout.site_folder(folder))
+    if json:
+        print_json(found)
+    elif found["ok"]:
+        print_line(f"{folder}: ok ({found['areas']} areas, {found['nodes']} nodes, {found['places']} places)")
+        if found["unbounded_nodes"]:
+            print_line(
+                f"nodes with a sonar without range_max: {found['unbounded_nodes']}. To it an echo from behind the wall "
+                "is clear: fognav node calibrate NODE --site DIR, unless it hears no wall"
+            )
+    else:
+        fail(str(found["problem"]))
+    if not found["ok"]:
+        raise typer.Exit(NOT_TRUE)
+
+
+@site_app.command(
+    "compose", epilog="Example: fognav site compose sites/upstairs && docker compose up -d --remove-orphans"
+)
+def site_compose(
+    folders: Annotated[
+        list[Path] | None, typer.Argument(metavar="[DIR]...", help="Every floor but the first; none: no further ones.")
+    ] = None,
+    *,
+    out: Annotated[
+        Path | None, typer.Option("--out", metavar="FILE", help="Default: docker-compose.override.yml here.")
+    ] = None,
+    json: JsonOption = False,
+) -> None:
+    """Let the fog node in containers serve further floors.
+
+    It writes the file that compose reads besides docker-compose.yml, at its next `docker compose up`. Name all floors
+    each time, in the same order, which gives them their ports; and again after an upgrade.
+    """
+    with exit_codes():
+        root = checkout.root()
+        sites = [checkout.site_folder(folder) for folder in folders or []]
+        made = site_files.compose_floors(sites, root, out or root / OVERRIDE)
+    if json:
+        print_json(made)
+    else:
+        print_line(f"{made['file']} has {len(sites)} further floors: docker compose up -d --remove-orphans")

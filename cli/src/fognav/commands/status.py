@@ -1,15 +1,18 @@
 """`fognav status`: the systems that run on this machine, or one fog node elsewhere."""
 
+import asyncio
 import os
+from typing import Final
 
 import msgspec
 
+from fog_runtime.clock import SystemClock
+from fog_runtime.credentials import Credentials
+from fog_runtime.transports.zenoh_edge import ZenohEdge
 from fognav.locking import own_credentials
 from fognav.operate.fog import FOG, Fog, find_fog
 from fognav.operate.options import FogOption, JsonOption
-from fognav.operate.presence import connected
-from fognav.operate.registry import System
-from fognav.operate.systems import SERVICE_PORTS, find_systems
+from fognav.operate.systems import ROUTER, SERVICE_PORTS, System, find_systems
 from fognav.output import FailedError, exit_codes, fail, print_answer, print_json
 
 
@@ -58,3 +61,27 @@ def _show(system: System, present: list[str] | None) -> None:
     print_answer(
         f"  {'processes':18} {', '.join(f'{name} {pid}' for name, pid in system.pids.items()) or 'not visible'}"
     )
+
+
+_CONSOLE: Final = "status"
+
+
+def connected(system: System, credentials: Credentials) -> list[str] | None:
+    """Return the connected processes as `role/id`, sorted; None if the system has no router that can be reached.
+
+    They say so themselves for as long as their sessions are open (channel `live`): no safety signal, and a process that
+    hangs is still listed.
+    """
+    if ROUTER not in system.urls or not system.site:
+        return None
+    return asyncio.run(_connected(system.urls[ROUTER], system.site, credentials))
+
+
+async def _connected(endpoint: str, site: str, credentials: Credentials) -> list[str] | None:
+    opened = ZenohEdge.open(
+        connect=[endpoint], clock=SystemClock(), role="console", id=_CONSOLE, site=site, credentials=credentials
+    )
+    async with opened as edge:
+        if not edge.connected:
+            return None
+        return sorted(f"{role}/{name}" for role, name in await edge.present())

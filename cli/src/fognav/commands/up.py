@@ -1,18 +1,19 @@
-"""`fognav up`, `down` and `logs`: a fog node on this machine, without containers."""
+"""`fognav up`, `down`, `logs` and `upgrade`: a fog node on this machine without containers, and its newer versions."""
 
 import asyncio
 import os
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import Annotated, Final
 
 import typer
 
 from fognav import checkout, kernels, system
+from fognav.hosting import log_files
+from fognav.hosting.fog_node import NodeConfig, run_node
+from fognav.hosting.folders import NodeFolder, default_data, hosted_sites, remember, settings_of
+from fognav.hosting.local_nodes import UNIT, end_node, named_node, write_unit
 from fognav.locking import locks_errors, own_hosts
 from fognav.output import FailedError, exit_codes, print_line
-
-if TYPE_CHECKING:
-    from fognav.hosting.folders import NodeFolder
 
 SitesOption = Annotated[
     list[Path] | None,
@@ -46,9 +47,6 @@ def up_command(  # noqa: PLR0913  # each option is an argument
     It has broker, Redis, router, and the services of each site. Everything uses TLS and passwords. Data stays in one
     folder, and is used again by the next start.
     """
-    from fognav.hosting.folders import NodeFolder, default_data  # noqa: PLC0415  # keeps the other commands fast
-    from fognav.hosting.unit import NAME, write_unit  # noqa: PLC0415  # same
-
     with exit_codes(), locks_errors():
         folders = [checkout.site_folder(each) for each in site] if site else [checkout.site_folder(None)]
         path = (data or default_data()).absolute()
@@ -57,24 +55,17 @@ def up_command(  # noqa: PLR0913  # each option is an argument
             options += ["--data", str(path), "--bind", bind, *(["--sim"] if sim else [])]
             options += [word for each in host or [] for word in ("--host", each)]
             print_line(f"wrote {write_unit(['up', *options])}. Start it now and at each boot:")
-            print_line(f"  systemctl --user daemon-reload && systemctl --user enable --now {NAME}")
+            print_line(f"  systemctl --user daemon-reload && systemctl --user enable --now {UNIT}")
             print_line(f"  loginctl enable-linger {os.environ.get('USER', '$USER')}")
             return
-        try:
-            system.ensure([system.MOSQUITTO, system.REDIS], yes=yes, print_line=print_line)
-            kernels.warm_cache(print_line)
-        except (system.MissingToolsError, kernels.KernelsError) as error:
-            raise FailedError(str(error)) from error
+        system.ensure([system.MOSQUITTO, system.REDIS], yes=yes, print_line=print_line)
+        kernels.warm_cache(print_line)
         folder = NodeFolder(path)
         with folder.in_use():
             _run(folders, folder, bind, host or [], sim=sim, check=check)
 
 
-def _run(folders: list[Path], folder: "NodeFolder", bind: str, hosts: list[str], *, sim: bool, check: bool) -> None:
-    from fognav.hosting.floors import hosted_sites  # noqa: PLC0415  # keeps the other commands fast
-    from fognav.hosting.node import NodeConfig  # noqa: PLC0415  # same
-    from fognav.hosting.running import run_node  # noqa: PLC0415  # same
-    from fognav.hosting.settings import remember, settings_of  # noqa: PLC0415  # same
+def _run(folders: list[Path], folder: NodeFolder, bind: str, hosts: list[str], *, sim: bool, check: bool) -> None:
 
     sites, locks = hosted_sites(folders, folder.locks, [*own_hosts(), *hosts])
     config = NodeConfig(folder=folder, sites=sites, locks=locks, address=bind, simulate=sim)
@@ -93,8 +84,6 @@ def down_command(
 
     It ends with all its sites; other nodes of yours go on.
     """
-    from fognav.hosting.local_nodes import end_node, named_node  # noqa: PLC0415  # keeps the other commands fast
-
     with exit_codes():
         node = named_node(name, data)
         if node is None:
@@ -112,10 +101,6 @@ def logs_command(
     data: DataOption = None,
 ) -> None:
     """Show the logs of the fog node of `fognav up`."""
-    from fognav.hosting import log_files  # noqa: PLC0415  # keeps the other commands fast
-    from fognav.hosting.folders import default_data  # noqa: PLC0415  # same
-    from fognav.hosting.local_nodes import named_node  # noqa: PLC0415  # same
-
     with exit_codes():
         running = None if data else named_node(None, None)
         folder = (data or (running.data if running else default_data())) / "logs"
@@ -132,3 +117,45 @@ def logs_command(
             log_files.show(shown, lines, follow=follow)
         except KeyboardInterrupt:
             return
+
+
+_SHOWN: Final = 30
+
+
+def upgrade_command(
+    revision: Annotated[
+        str | None, typer.Argument(metavar="VERSION", help="Tag, branch or commit; default: the newest release.")
+    ] = None,
+    *,
+    data: DataOption = None,
+    check: Annotated[bool, typer.Option("--check", help="Tell what would change, and change nothing.")] = False,
+) -> None:
+    """Upgrade this checkout and its fog node, with all data.
+
+    It makes a backup of each site, ends the node, and starts the new version once. If that fails, version and data are
+    those of before.
+    """
+    from fognav.hosting.backups import backup_errors  # noqa: PLC0415  # the client of Redis is slow
+    from fognav.hosting.upgrading import Upgrade, Versions  # noqa: PLC0415  # same
+
+    with exit_codes(), backup_errors():
+        versions = Versions(checkout.root())
+        current = versions.current()
+        to = versions.newest() if revision is None else versions.named(revision)
+        if to == current:
+            print_line(f"this is {current[:12]} already: nothing to upgrade")
+            return
+        if revision is None and versions.contains(to):
+            print_line(
+                f"{current[:12]} has the newest release, {to[:12]}, and more: nothing to upgrade. Name a branch to "
+                "follow what is not released yet (fognav upgrade main)"
+            )
+            return
+        changes = versions.changes(to)
+        print_line(f"from {current[:12]} to {to[:12]}: {len(changes)} changes (CHANGELOG.md tells what they mean)")
+        for subject in changes[:_SHOWN]:
+            print_line(f"  {subject}")
+        if len(changes) > _SHOWN:
+            print_line(f"  and {len(changes) - _SHOWN} more")
+        if not check:
+            Upgrade(NodeFolder((data or default_data()).absolute()), versions, print_line).run(to)

@@ -1,8 +1,9 @@
-"""The options of a demonstration, and the drive that they give on a site."""
+"""The options of a demonstration, the servers that it runs on, and the drive that they give on a site."""
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Final
 
 from fog_contracts.messages import ProfileName
 from fog_contracts.site import Place
@@ -10,6 +11,8 @@ from fog_runtime.configuration import parts
 from fog_runtime.configuration.parts import DEFAULT_BASE, DEFAULT_LIDAR
 from fog_runtime.configuration.robot_file import ROBOT_FILE, default_robot, load_robot
 from fog_runtime.configuration.site import LoadedSite
+from fog_supervisor import servers
+from fognav import programs, system
 from fognav.output import WrongUseError
 from fognav_sim import emulators
 from fognav_sim.drive.hazard import HazardRequest
@@ -86,3 +89,29 @@ class DrivePlan:
     def watched_areas(self) -> set[str]:
         """Ids of the areas that have nodes."""
         return {node.area for node in self.site.site.nodes}
+
+
+_TOOLS: Final = {programs.BROKER: system.MOSQUITTO, programs.REDIS: system.REDIS}
+
+
+def embedded_servers(*, forced: bool, yes: bool, print_line: Callable[[str], None]) -> frozenset[str]:
+    """Return which servers run as Python packages, after an attempt to install what is missing, and say what they lack.
+
+    All of them when `forced`. Raises `MissingToolsError` if no package stands in for a missing one.
+    """
+    missing = list(_TOOLS)
+    if not forced:
+        try:
+            system.ensure(list(_TOOLS.values()), yes=yes, print_line=print_line)
+        except system.MissingToolsError as error:
+            missing = [name for name, tool in _TOOLS.items() if system.find(tool) is None]
+            if not all(servers.has_stand_in(name) for name in missing):
+                raise
+            print_line(str(error))
+        else:
+            return frozenset()
+    print_line("this demo runs without them, on Python packages. They are for trying Fognav only:")
+    for name in missing:
+        package, limits = servers.STAND_INS[name]
+        print_line(f"  {package} instead of {_TOOLS[name].name}: {limits}")
+    return frozenset(missing)

@@ -10,7 +10,7 @@ from fog_supervisor import net
 from fognav import checkout
 from fognav.demo.options import DrivePlan
 from fognav.demo.scene import Scene
-from fognav.operate.registry import Registration, System, registered
+from fognav.operate.systems import Registration, System, registered
 from fognav.output import FailedError, WrongUseError
 from fognav.programs import AGENT, BROKER, ROUTER, SERVICES
 from fognav.stack import Stack

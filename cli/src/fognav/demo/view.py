@@ -1,7 +1,10 @@
-"""The demonstration in a terminal: robot, watched areas, processes and events."""
+"""The views of a demonstration: in a terminal with robot, watched areas, processes and events; on a page; or none."""
 
 import asyncio
+import contextlib
 import math
+import signal
+from collections.abc import Callable
 from typing import Final
 
 from rich.console import Console, Group, RenderableType
@@ -11,8 +14,15 @@ from rich.table import Table
 from rich.text import Text
 
 from fog_contracts.stages import STAGES, durations_ms, hazard_to_path_ms
+from fog_runtime import logs
+from fog_runtime.configuration.site import LoadedSite
+from fog_supervisor.supervisor import NotReadyError
+from fognav.demo.options import Options
+from fognav.demo.page import serve
 from fognav.demo.run import Demo
 from fognav.demo.scene import Scene
+from fognav.output import console
+from fognav_sim.drive.drive import DriveOutcome
 from fognav_sim.drive.hazard import path_length
 
 _PERIOD_S = 0.2
@@ -25,8 +35,6 @@ _MODE_STYLES = {
     "DOCK": "bold magenta",
 }
 _STATE_STYLES = {"blocked": "bold red", "clear": "green", "unknown": "yellow"}
-
-
 _VALUE_WIDTH: Final = 8
 """Width of the longest state or time: narrow terminals truncate names, never values."""
 
@@ -128,3 +136,41 @@ async def show(demo: Demo, console: Console) -> None:
                 await asyncio.sleep(_PERIOD_S)
         finally:
             live.update(render(demo.scene, console.height), refresh=True)
+
+
+_SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
+
+
+async def run_demo(
+    site: LoadedSite, options: Options, *, headless: bool, page_port: int, print_line: Callable[[str], None]
+) -> dict[str, object]:
+    """Run a demonstration on a site until its outcome or a signal; return the report.
+
+    Raises `WrongUseError` for a site that is not suitable.
+    """
+    logs.configure("demo", "warning", "text")
+    stop = asyncio.Event()
+    loop = asyncio.get_running_loop()
+    for number in _SIGNALS:
+        loop.add_signal_handler(number, stop.set)
+    in_terminal = not headless and console.is_terminal
+    demo = Demo(site, options, None if in_terminal else print_line)
+    try:
+        async with contextlib.AsyncExitStack() as views:
+            if not headless:
+                demo.page_url = demo.scene.page_url = await views.enter_async_context(serve(demo, page_port))
+                print_line(f"watch the demo at {demo.page_url}")
+            if in_terminal:
+                view = asyncio.create_task(show(demo, console))
+                views.push_async_callback(_end, view)
+            return await demo.run(stop)
+    except (NotReadyError, TimeoutError) as error:
+        print_line(str(error))
+        demo.scene.outcome = DriveOutcome("stopped", str(error))
+        return demo.report()
+
+
+async def _end(view: asyncio.Task[None]) -> None:
+    view.cancel()
+    with contextlib.suppress(asyncio.CancelledError):
+        await view

@@ -1,31 +1,127 @@
 """Backs up and restores a fog node of `fognav up`: one file for each site, with the locks of all.
 
 A backup may be made while the node runs. It is restored while the node is down, on an empty machine, too; only its
-Redis runs meanwhile.
+Redis runs meanwhile. Recordings are large, and kept elsewhere; a backup has an index of what lies in `recordings/` of
+the data folder, by which somebody who restores it sees what there was, and what is missing.
 """
 
 import asyncio
+import os
+import struct
 import time
-from collections.abc import AsyncIterator, Sequence
-from contextlib import asynccontextmanager
+from collections.abc import AsyncIterator, Iterator, Mapping, Sequence
+from contextlib import asynccontextmanager, contextmanager
 from pathlib import Path
-from typing import Final, NamedTuple
+from typing import IO, Final, NamedTuple
 
 import msgspec
+from mcap.exceptions import McapError
+from mcap.reader import SeekingReader
+from mcap.records import Statistics
 
 from fog_runtime import backup
-from fog_runtime.backup import Backup, BackupError, read_archive
-from fog_runtime.credentials import Credentials
-from fog_runtime.files import atomic_write
+from fog_runtime.backup import Backup, BackupError, File, read_archive
+from fog_runtime.configuration.site import SiteError
+from fog_runtime.credentials import Credentials, CredentialsError
+from fog_runtime.files import PRIVATE, atomic_write
 from fog_runtime.locks.site_locks import AUTHORITY, SiteLocks
 from fog_runtime.locks.users import ANYBODY, REDIS_ADMINISTRATOR, USERS, on_floor, user_of
 from fog_supervisor import net, servers
 from fog_supervisor.supervisor import Event, Supervisor
-from fognav.hosting import recordings
-from fognav.hosting.folders import LOCKS_FILE, NodeFolder
-from fognav.hosting.settings import REDIS_PORT, recall
-from fognav.output import WrongUseError
+from fognav import checkout
+from fognav.hosting.folders import LOCKS_FILE, REDIS_PORT, NodeFolder, recall, require_node
+from fognav.locking import locks_errors, own_credentials
+from fognav.output import FailedError, WrongUseError, print_line
 from fognav.programs import MAP_SERVICE, REDIS, ProgramSet
+
+RECORDINGS: Final = "recordings"
+_INDEX: Final = "index"
+_FILE: Final = "recordings.json"
+_NANOSECONDS: Final = 1e9
+_MAGIC: Final = b"\x89MCAP0\r\n"
+"""With these bytes a recording begins and, unless it was cut off, ends."""
+_DAMAGED: Final = (McapError, struct.error, OSError, ValueError, LookupError, MemoryError)
+"""What the reader raises for a damaged summary: `OSError` if it leads to a place before the file's beginning."""
+
+
+class Recording(msgspec.Struct, frozen=True, kw_only=True):
+    """A recording: its path below `recordings/`, its size, and its messages; times in s since the epoch.
+
+    Who was killed while recording left no summary: then there are no times, and no number of messages. `unreadable`
+    says why a file could not be looked at; its size is then 0.
+    """
+
+    path: str
+    bytes: int
+    messages: int | None = None
+    begins: float | None = None
+    ends: float | None = None
+    unreadable: str | None = None
+
+
+def index_folder(data: Path) -> Path:
+    """Return the folder of a node's data that has the index alone."""
+    return data / RECORDINGS / _INDEX
+
+
+def write_index(data: Path) -> list[Recording]:
+    """Bring the index up to date, and return it; raises `OSError` if it can't be written.
+
+    A recording that is damaged, cut off or can't be read is in it, too.
+    """
+    folder = data / RECORDINGS
+    found = [_described(file, folder) for file in sorted(folder.rglob("*.mcap")) if not file.is_dir()]
+    index_folder(data).mkdir(mode=0o700, parents=True, exist_ok=True)
+    atomic_write(index_folder(data) / _FILE, msgspec.json.format(msgspec.json.encode(found)), mode=PRIVATE)
+    return found
+
+
+def missing_recordings(data: Path, index: Mapping[str, File]) -> list[str]:
+    """Return which recordings of a backup's index are not there; `index` are the files of its folder.
+
+    Raises `msgspec.DecodeError`.
+    """
+    file = index.get(_FILE)
+    listed = msgspec.json.decode(file.data, type=list[Recording]) if file is not None else []
+    return [each.path for each in listed if not (data / RECORDINGS / each.path).exists()]
+
+
+def _described(file: Path, folder: Path) -> Recording:
+    # A file's name may be no text at all, which the index could not hold.
+    path = os.fsencode(file.relative_to(folder)).decode(errors="backslashreplace")
+    try:
+        if not file.is_file():
+            return Recording(path=path, bytes=0, unreadable="no file, or a link to what is not there")
+        with file.open("rb") as stream:
+            size = stream.seek(0, os.SEEK_END)
+            statistics = _statistics(stream, size)
+    except OSError as error:
+        return Recording(path=path, bytes=0, unreadable=error.strerror or str(error))
+    made = Recording(path=path, bytes=size)
+    if statistics is None:
+        return made
+    return msgspec.structs.replace(
+        made,
+        messages=statistics.message_count,
+        begins=statistics.message_start_time / _NANOSECONDS,
+        ends=statistics.message_end_time / _NANOSECONDS,
+    )
+
+
+def _statistics(stream: IO[bytes], size: int) -> Statistics | None:
+    """Return what a recording's summary says, `None` without a usable one; raises `OSError`."""
+    if size < 2 * len(_MAGIC):
+        return None
+    stream.seek(-len(_MAGIC), os.SEEK_END)
+    if stream.read() != _MAGIC:
+        return None
+    stream.seek(0)
+    try:
+        summary = SeekingReader(stream, record_size_limit=size).get_summary()
+    except _DAMAGED:
+        return None
+    return summary.statistics if summary is not None else None
+
 
 LOCKS: Final = "locks"
 _READY_S: Final = 60.0
@@ -80,15 +176,15 @@ async def create(file: Path, folder: NodeFolder, directory: Path | None) -> Crea
     site, path = site_of(folder, directory)
     no_index = None
     try:
-        await asyncio.to_thread(recordings.write_index, folder.path)
+        await asyncio.to_thread(write_index, folder.path)
     except OSError as error:
         no_index = (
-            f"the index of {folder.path / recordings.FOLDER} can't be written to "
-            f"{recordings.index_folder(folder.path)} ({error.strerror or error}): make room there, or grant access"
+            f"the index of {folder.path / RECORDINGS} can't be written to "
+            f"{index_folder(folder.path)} ({error.strerror or error}): make room there, or grant access"
         )
     async with _redis(folder, site, path) as place:
         if no_index is not None:  # an older index would name as missing what was deleted since
-            del place.folders[recordings.FOLDER]
+            del place.folders[RECORDINGS]
         return Created(await backup.create(file, place, time.time()), no_index)
 
 
@@ -109,11 +205,11 @@ async def restore(file: Path, folder: NodeFolder, directory: Path, *, replace: b
             _require_same_sites(archive, folder.locks)
         refused = sorted(_users(archive) - SiteLocks.open(folder.locks).users()) if stay else []
         # Another floor's backup has brought one of another moment: it stays, and the next backup writes a new one.
-        indexed = not replace and recordings.index_folder(folder.path).exists()
-        keep = ({LOCKS} if stay else set()) | ({recordings.FOLDER} if indexed else set())
+        indexed = not replace and index_folder(folder.path).exists()
+        keep = ({LOCKS} if stay else set()) | ({RECORDINGS} if indexed else set())
         async with redis_of(folder, archive.site, directory) as place:
             made = await backup.restore(file, place, replace=replace, keep=keep)
-        return Restored(made, refused, recordings.missing(folder.path, archive.folders.get(recordings.FOLDER, {})))
+        return Restored(made, refused, missing_recordings(folder.path, archive.folders.get(RECORDINGS, {})))
 
 
 def _same_authority(archive: Backup, locks: Path) -> bool:
@@ -183,7 +279,7 @@ def _place(folder: NodeFolder, site: str, directory: Path, redis: str) -> backup
         backup.SITE: directory,
         backup.SECRETS: folder.path / "keys" / site,
         LOCKS: folder.locks,
-        recordings.FOLDER: recordings.index_folder(folder.path),
+        RECORDINGS: index_folder(folder.path),
     }
     service = MAP_SERVICE if site == locks.sites[0] else on_floor(site, MAP_SERVICE)
     return backup.Place(redis, site, folders, folder.data(service), credentials)
@@ -191,3 +287,55 @@ def _place(folder: NodeFolder, site: str, directory: Path, redis: str) -> backup
 
 def _ignore(_: Event) -> None:
     """Leave out what happens to Redis: if it does not become ready, `NotReadyError` says why."""
+
+
+@contextmanager
+def backup_errors() -> Iterator[None]:
+    """Turn errors of backups into those of commands."""
+    with locks_errors():
+        try:
+            yield
+        except WrongUseError:
+            raise
+        except (BackupError, CredentialsError, SiteError, ValueError) as error:
+            raise FailedError(str(error)) from error
+
+
+def _named(site: Path | None) -> Path | None:
+    """Return a site's folder, also by its name in `sites/`; a folder without a site, to restore one, as it is."""
+    try:
+        return site and checkout.site_folder(site)
+    except WrongUseError:
+        return site
+
+
+def create_of_node(file: Path, up: Path, site: Path | None) -> Created:
+    """Back up a site of the node with its data in `up`; raises `WrongUseError` without any, and as `create`."""
+    require_node(up)
+    return asyncio.run(create(file, NodeFolder(up), _named(site)))
+
+
+def restore_into_node(file: Path, up: Path, site: Path, *, replace: bool) -> Backup:
+    """Restore a backup into the node with its data in `up`, and tell what differs from it; raises as `restore`."""
+    directory = _named(site) or site
+    backup.require_same_site(read_archive(file), directory)  # before the node's folder is made
+    made, refused, gone = asyncio.run(restore(file, NodeFolder(up), directory, replace=replace))
+    if LOCKS not in made.folders:
+        print_line(f"the credentials in {up} stay: they have the same authority, and what was added since")
+    if refused:
+        print_line(f"they do not admit {', '.join(refused)}, whom the backup has: add them again, if they shall be")
+    if gone:
+        print_line(f"recordings that are not in {up / 'recordings'}: {', '.join(gone)}")
+    return made
+
+
+def place_of(redis: str, name: str, site: Path, secrets: Path | None, data: Path) -> backup.Place:
+    """Return the place of a fog node that is not by `fognav up`: whoever has its folders may back it up."""
+    folders = {backup.SITE: site, **({backup.SECRETS: secrets} if secrets else {})}
+    return backup.Place(redis, name, folders, data, own_credentials(None))
+
+
+def report(done: str, made: Backup, file: Path) -> None:
+    """Tell a person what was backed up or restored."""
+    files = ", ".join(f"{len(content)} files of the {name}" for name, content in made.folders.items())
+    print_line(f"{done} site {made.site}: {len(made.keys)} keys of Redis, {files}: {file}")

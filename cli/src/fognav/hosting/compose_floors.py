@@ -16,9 +16,7 @@ from typing import Any, Final
 
 import yaml  # type: ignore[import-untyped]  # PyYAML ships no types
 
-from fog_runtime.configuration.site import SiteError, load_site
-from fognav.hosting.floors import PORT_STEP
-from fognav.output import WrongUseError
+from fognav.hosting.folders import PORT_STEP, load_sites
 
 BASE: Final = "docker-compose.yml"
 OVERRIDE: Final = "docker-compose.override.yml"
@@ -39,33 +37,18 @@ _Part = dict[str, Any]
 def override(folders: Sequence[Path], compose: str) -> str:
     """Return the override for these sites, in the order of their ports; `compose` is the text of the compose file.
 
-    Raises `WrongUseError` for a folder without a usable site, or two sites of one id.
+    Raises as `load_sites`.
     """
     base = yaml.safe_load(compose)
     services: _Part = {name: {"networks": {}} for name in ("mosquitto", "redis", "zenoh")}
     services["credentials"] = {"environment": {"FOGNAV_FLOORS_DIR": "/floors"}, "volumes": []}
     services["sim-credentials"] = copy.deepcopy(services["credentials"])
     made: _Part = {"services": services, "networks": {}, "volumes": {}}
-    for index, (site, folder) in enumerate(_sites(folders).items(), start=1):
+    for index, (site, folder) in enumerate(zip(load_sites(folders), folders, strict=True), start=1):
         _add(made, base, _Floor(site, folder, index))
     written = yaml.safe_dump(made, sort_keys=False)
     words = shlex.join(str(folder) for folder in folders)
     return f"{HEADER} {words}`: run that again after an upgrade.\n{written}"
-
-
-def _sites(folders: Sequence[Path]) -> dict[str, Path]:
-    found: dict[str, Path] = {}
-    for folder in folders:
-        try:
-            site = load_site(folder).site.id
-        except SiteError as error:
-            raise WrongUseError(str(error)) from error
-        if site in found:
-            raise WrongUseError(
-                f"{folder} and {found[site]} have the same id {site!r}: give one another in {folder / 'site.toml'}"
-            )
-        found[site] = folder
-    return found
 
 
 class _Floor:

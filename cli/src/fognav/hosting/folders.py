@@ -1,18 +1,28 @@
-"""The data of a fog node on this machine: one folder, which survives restarts and upgrades.
+"""The data of a fog node on this machine: one folder, which survives restarts and upgrades; its settings and sites.
 
 `locks/` has certificates, users and credentials (`fog_runtime.locks`), `keys/SITE/` the tokens and the key of a site,
-and the rest is as in `fognav.programs`. `format` is the version of this layout.
+`up.json` how the node was last started, by which other commands back it up and start it, and the rest is as in
+`fognav.programs`. `format` is the version of this layout. Each site has its services and ports; all share broker, store
+and router.
 """
 
 import fcntl
 import os
-from collections.abc import Iterator
+import shlex
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
 
-from fog_runtime.files import atomic_write
+import msgspec
+
+from fog_runtime.configuration.site import LoadedSite, load_site
+from fog_runtime.files import PRIVATE, atomic_write
 from fog_runtime.keys import make_keys
+from fog_runtime.locks.site_locks import CREDENTIALS, SiteLocks
+from fog_runtime.locks.users import on_floor
+from fognav.operate.systems import MQTTS_PORT, SERVICE_PORTS, ZENOH_PORT, port
 from fognav.output import FailedError, WrongUseError
 from fognav.programs import SystemFolder
 
@@ -102,3 +112,143 @@ def _check_format(path: Path) -> None:
             f"{path} was written by a newer Fognav (format {text}, this one knows {FORMAT}): upgrade this one, "
             "or restore a backup into another folder"
         )
+
+
+FILE: Final = "up.json"
+REDIS_PORT: Final = ("FOGNAV_REDIS_PORT", 6380)
+"""Not 6379, where a Redis of the operating system listens."""
+_PORTS: Final = (MQTTS_PORT, REDIS_PORT, ZENOH_PORT, *SERVICE_PORTS.values())
+
+
+class NodeSettings(msgspec.Struct, frozen=True, kw_only=True):
+    """The options of `fognav up`: `sites` are folders by their sites' ids, and `ports` are by their variables."""
+
+    sites: dict[str, str]
+    address: str
+    hosts: list[str]
+    simulate: bool = False
+    ports: dict[str, int]
+
+    @property
+    def arguments(self) -> list[str]:
+        """The options again, without the data folder."""
+        sites = [word for folder in self.sites.values() for word in ("--site", folder)]
+        hosts = [word for host in self.hosts for word in ("--host", host)]
+        return [*sites, "--bind", self.address, *hosts, *(["--sim"] if self.simulate else [])]
+
+    @property
+    def environment(self) -> dict[str, str]:
+        """The variables that give the ports."""
+        return {name: str(number) for name, number in self.ports.items()}
+
+    def command(self, data: Path) -> str:
+        """Return what starts the node again from this shell, with the variables that it lacks."""
+        here = _ports()
+        lacking = [f"{name}={number}" for name, number in self.ports.items() if here.get(name) != number]
+        return shlex.join([*lacking, "./fognav", "up", *self.arguments, "--data", str(data)])
+
+
+def settings_of(sites: dict[str, Path], address: str, hosts: Sequence[str], *, simulate: bool) -> NodeSettings:
+    """Return the settings of a node that is started from this shell."""
+    return NodeSettings(
+        sites={site: str(folder) for site, folder in sites.items()},
+        address=address,
+        hosts=list(hosts),
+        simulate=simulate,
+        ports=_ports(),
+    )
+
+
+def _ports() -> dict[str, int]:
+    return {setting[0]: port(setting) for setting in _PORTS}
+
+
+def remember(folder: Path, settings: NodeSettings) -> None:
+    """Write the settings into a data folder."""
+    atomic_write(folder / FILE, msgspec.json.format(msgspec.json.encode(settings)), mode=PRIVATE)
+
+
+def recall(folder: Path) -> NodeSettings:
+    """Return the settings in a data folder; raises `FailedError` if no node was started with it yet."""
+    try:
+        return msgspec.json.decode((folder / FILE).read_bytes(), type=NodeSettings)
+    except (OSError, msgspec.DecodeError) as error:
+        raise FailedError(
+            f"{folder / FILE} does not say how the fog node was started ({error}): start it once "
+            f"(fognav up --data {folder}), or name another folder"
+        ) from error
+
+
+PORT_STEP: Final = 10
+"""Between the ports of a service on one floor and on the next."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class HostedSite:
+    """A site of the fog node; `index` is its place among them, which it keeps, and 0 the first."""
+
+    loaded: LoadedSite
+    index: int
+
+    @property
+    def id(self) -> str:
+        """Id of the site."""
+        return self.loaded.site.id
+
+    @property
+    def directory(self) -> Path:
+        """Its folder."""
+        return self.loaded.directory
+
+    def name(self, part: str) -> str:
+        """Return the name of one of its programs or users: with the site's id, except on the first."""
+        return part if self.index == 0 else on_floor(self.id, part)
+
+    @property
+    def ports(self) -> Mapping[str, int]:
+        """The port of each service's REST API: those of the compose file, on each further floor 10 higher."""
+        return {service: port(setting) + PORT_STEP * self.index for service, setting in SERVICE_PORTS.items()}
+
+    def node_credentials(self, locks: SiteLocks) -> Path:
+        """Return the folder with the credentials of its sensor nodes."""
+        return locks.directory / CREDENTIALS / ("" if self.index == 0 else self.id)
+
+
+def hosted_sites(folders: Sequence[Path], locks: Path, hosts: Sequence[str]) -> tuple[list[HostedSite], SiteLocks]:
+    """Return the sites in these folders, and the locks at `locks` with everybody of them, made where they are missing.
+
+    A site keeps its place, and so its ports, for as long as the locks exist. Raises `LocksError` or `AuthorityError`,
+    and as `load_sites`.
+    """
+    loaded = load_sites(folders)
+    first = next(iter(loaded))
+    known = SiteLocks.open(locks).sites if (locks / LOCKS_FILE).exists() else [first]
+    made = SiteLocks(locks, known[0])
+    own = loaded.get(known[0])
+    made.make(hosts, robots=_robots(own), nodes=_nodes(own))
+    for site, each in loaded.items():
+        if site != known[0]:
+            made.add_floor(site, robots=_robots(each), nodes=_nodes(each))
+    return [HostedSite(loaded=each, index=made.sites.index(site)) for site, each in loaded.items()], made
+
+
+def load_sites(folders: Sequence[Path]) -> dict[str, LoadedSite]:
+    """Return the sites in these folders by their ids; raises `SiteError`, and `WrongUseError` for two of one id."""
+    loaded: dict[str, LoadedSite] = {}
+    for folder in folders:
+        each = load_site(folder)
+        if each.site.id in loaded:
+            raise WrongUseError(
+                f"{folder} and {loaded[each.site.id].directory} have the same id {each.site.id!r}: "
+                f"give one of them another in {folder / 'site.toml'}"
+            )
+        loaded[each.site.id] = each
+    return loaded
+
+
+def _robots(loaded: LoadedSite | None) -> list[str]:
+    return [] if loaded is None else [robot.id for robot in loaded.site.robots]
+
+
+def _nodes(loaded: LoadedSite | None) -> list[str]:
+    return [] if loaded is None else [node.id for node in loaded.site.nodes]

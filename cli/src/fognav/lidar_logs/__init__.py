@@ -1,1 +1,270 @@
-"""Localization on recorded logs: reading logs, building maps from them, and evaluating the particle filter."""
+"""Recorded logs of a robot with a planar lidar: scans with odometry, and reference poses where the log has them.
+
+Formats: JSON lines (one object with `odom`, `ref` and `ranges` per scan after one with `meta`, gzipped or not), CARMEN
+(`FLASER` messages; see the CARMEN toolkit's message formats), and rosbag2 (`bags`). A map is made from a log at its
+reference poses: each beam clears the cells that it passes and marks the one where it ends.
+"""
+
+from __future__ import annotations
+
+import gzip
+import json
+import math
+import zlib
+from dataclasses import dataclass, replace
+from typing import IO, TYPE_CHECKING, Final, cast, get_args
+
+import numpy as np
+
+from fog_contracts.costs import FREE, LETHAL, UNKNOWN
+from fog_contracts.grid import GridGeometry, StaticMap
+from fognav.lidar_logs.bags import is_bag, read_bag
+from fognav.operate.options import Format, Selection
+from fognav.output import WrongUseError
+from robot_agent.localization.pose import Pose2
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Iterator, Sequence
+    from pathlib import Path
+
+    from numpy.typing import NDArray
+
+_CODE_SHARE: Final = 0.98
+"""Readings above this share of the largest one are the device's code for "no return", ..."""
+_CODE_READINGS: Final = 0.001
+"""... if they are at least this share of all readings."""
+_SAME_M: Final = 1e-3
+_FIELD_OF_VIEW: Final = math.pi
+_GZIP: Final = b"\x1f\x8b"
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class LogScan:
+    """One scan of a log: stamp (s, increasing), `odom` and `reference` poses (m, rad), ranges (n; m, nan: no return).
+
+    angles: (n,) rad in the lidar's frame. The reference is None where the log has none.
+    """
+
+    stamp: float
+    odom: Pose2
+    reference: Pose2 | None
+    angles: NDArray[np.float64]
+    ranges: NDArray[np.float64]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class LidarLog:
+    """The scans of a log in order of time.
+
+    odometry_measured: False if the log's odometry is its reference, so that it has no error of its own.
+    """
+
+    scans: tuple[LogScan, ...]
+    odometry_measured: bool
+
+    def select(self, selection: Selection) -> tuple[LogScan, ...]:
+        """Return all scans, or those with odd or even numbers, counted from 0."""
+        first, step = {"all": (0, 1), "odd": (1, 2), "even": (0, 2)}[selection]
+        return self.scans[first::step]
+
+
+def read_log(path: Path, log_format: Format = "auto") -> LidarLog:
+    """Read a log; raises `WrongUseError` with file, line and remedy when it can't be used."""
+    if log_format not in get_args(Format):
+        raise WrongUseError(f"the format must be one of {', '.join(get_args(Format))}, not {log_format!r}")
+    if log_format == "rosbag2" or (log_format == "auto" and is_bag(path)):
+        return _finished([LogScan(*scan) for scan in read_bag(path)], coded=False)  # they say which returns count
+    first = next(_lines(path), (0, ""))[1]
+    found = log_format if log_format != "auto" else ("jsonl" if first.lstrip().startswith("{") else "carmen")
+    reader = _carmen_scan if found == "carmen" else _JsonScans()
+    scans = list(_scans(path, reader))
+    if not scans:
+        raise WrongUseError(f"{path} has no scan in the format {found}. Name another file or --format")
+    return _finished(scans)
+
+
+def _opened(path: Path) -> IO[bytes]:
+    with path.open("rb") as file:
+        packed = file.read(2) == _GZIP
+    return cast("IO[bytes]", gzip.open(path, "rb") if packed else path.open("rb"))
+
+
+def _scans(path: Path, reader: Callable[[str], LogScan | None]) -> Iterator[LogScan]:
+    for number, line in _lines(path):
+        try:
+            scan = reader(line)
+        except (ValueError, KeyError, IndexError, TypeError, OverflowError) as error:
+            message = f"{path}, line {number}: {type(error).__name__}: {error}. Correct or remove the line"
+            raise WrongUseError(message) from error
+        if scan is not None:
+            yield scan
+
+
+def _lines(path: Path) -> Iterator[tuple[int, str]]:
+    """Yield the lines with their numbers, from 1; raises `WrongUseError` where the file is damaged or cut off."""
+    number = 1
+    try:
+        with _opened(path) as file:
+            # Decoded one by one: a text file would fail up to 8 KiB before the damaged line.
+            for line in file:
+                yield number, line.decode()
+                number += 1
+    except (OSError, UnicodeDecodeError, EOFError, zlib.error) as error:
+        message = f"{path}, line {number}: can't be read as a log: {error}. Name a whole .jsonl.gz or CARMEN file"
+        raise WrongUseError(message) from error
+
+
+def _pose(values: Sequence[float] | Sequence[str]) -> Pose2:
+    x, y, theta = (float(value) for value in values)
+    if not all(map(math.isfinite, (x, y, theta))):
+        raise ValueError(f"a pose must be finite, not {list(values)}")
+    return Pose2(x, y, theta)
+
+
+def beam_angles(count: int, field_of_view: float = _FIELD_OF_VIEW) -> NDArray[np.float64]:
+    """Return the angles (rad) of `count` beams over a field of view, symmetric if odd, else without the last one."""
+    if count < 2:
+        raise ValueError(f"a scan must have two beams or more, not {count}")
+    step = field_of_view / (count - 1 if count % 2 else count)
+    return np.arange(count, dtype=np.float64) * step - field_of_view / 2.0
+
+
+class _JsonScans:
+    """Reads JSON lines; the first one may carry the field of view and the code for "no return"."""
+
+    def __init__(self) -> None:
+        self._field_of_view = _FIELD_OF_VIEW
+
+    def __call__(self, line: str) -> LogScan | None:
+        if not line.strip():
+            return None
+        values = json.loads(line)
+        if not isinstance(values, dict):
+            raise ValueError("a line must be a JSON object")  # noqa: TRY004  # of a file's text, not of an argument
+        if "ranges" not in values:
+            self._field_of_view = math.radians(float(values.get("fov_deg", math.degrees(self._field_of_view))))
+            return None
+        ranges = np.array([math.nan if value is None else float(value) for value in values["ranges"]])
+        reference = _pose(values["ref"]) if values.get("ref") is not None else None
+        angles = beam_angles(len(ranges), self._field_of_view)
+        return LogScan(float(values["t"]), _pose(values["odom"]), reference, angles, ranges)
+
+
+def _carmen_scan(line: str) -> LogScan | None:
+    words = line.split()
+    if not words or words[0] != "FLASER":
+        return None
+    count = int(words[1])
+    if count < 1 or len(words) < count + 9:
+        raise ValueError(f"FLASER with {count} ranges must have {count + 9} fields or more, not {len(words)}")
+    ranges = np.array([float(word) for word in words[2 : count + 2]])
+    laser, odom = _pose(words[count + 2 : count + 5]), _pose(words[count + 5 : count + 8])
+    return LogScan(float(words[count + 8]), odom, laser, beam_angles(count), ranges)
+
+
+def _finished(scans: list[LogScan], *, coded: bool = True) -> LidarLog:
+    """Remove codes for "no return", if ranges are coded, make the stamps increase, and tell odometry from reference."""
+    code = _no_return_code(scans) if coded else math.inf
+    start, last = scans[0].stamp, -math.inf
+    finished: list[LogScan] = []
+    steady = _median_period(scans)
+    for scan in scans:
+        stamp = scan.stamp - start
+        if not last < stamp < last + 60.0 * steady and finished:
+            stamp = last + steady  # constant, coarse or wrapped stamps
+        last = stamp
+        ranges = np.where((scan.ranges > 0.0) & (scan.ranges < code), scan.ranges, math.nan)
+        finished.append(replace(scan, stamp=stamp, ranges=ranges))
+    moved = [scan for scan in finished if scan.reference is not None and _offset(scan) != _offset(finished[0])]
+    if finished[0].reference is not None and not any(_differs(finished[0], scan) for scan in moved):
+        return LidarLog(tuple(finished), odometry_measured=False)
+    return LidarLog(tuple(finished), odometry_measured=True)
+
+
+def _offset(scan: LogScan) -> Pose2:
+    assert scan.reference is not None
+    return scan.reference.relative_to(scan.odom)
+
+
+def _differs(first: LogScan, scan: LogScan) -> bool:
+    """Whether the reference lies elsewhere, as seen from the odometry, than in the first scan."""
+    return max(map(abs, _offset(scan).relative_to(_offset(first)))) > _SAME_M
+
+
+def _no_return_code(scans: list[LogScan]) -> float:
+    readings = np.concatenate([scan.ranges for scan in scans])
+    readings = readings[np.isfinite(readings)]
+    if not len(readings):
+        return math.inf
+    limit = _CODE_SHARE * float(readings.max())
+    return limit if (readings > limit).mean() > _CODE_READINGS else math.inf
+
+
+def _median_period(scans: list[LogScan]) -> float:
+    periods = np.diff([scan.stamp for scan in scans])
+    periods = periods[(periods > 0.0) & (periods < 60.0)]
+    return float(np.median(periods)) if len(periods) else 1.0
+
+
+_MARGIN_M: Final = 1.0
+_OCCUPIED_SHARE: Final = 0.3
+"""A cell is occupied if this share of the beams that reached it ended there: walls are grazed by many others."""
+_MAX_CELLS: Final = 40_000_000
+
+
+def build_map(scans: Sequence[LogScan], resolution: float, range_max: float) -> StaticMap:
+    """Return the map that the scans show at their reference poses.
+
+    resolution: m per cell; range_max: m, beams beyond it are not used. Raises `WrongUseError` without references.
+    """
+    ends = [(pose.x, pose.y, points) for pose, points in _rays(scans, range_max)]
+    if not ends:
+        raise WrongUseError("the log has no reference poses, so no map can be built from it. Use a corrected log")
+    everything = np.concatenate([points for _, _, points in ends] + [np.array([(x, y) for x, y, _ in ends])])
+    low = np.floor((everything.min(axis=0) - _MARGIN_M) / resolution) * resolution
+    width, height = np.ceil((everything.max(axis=0) + _MARGIN_M - low) / resolution).astype(int)
+    if width * height > _MAX_CELLS:
+        raise WrongUseError(f"the map would have {width} x {height} cells. Choose a coarser --resolution")
+    geometry = GridGeometry(int(width), int(height), resolution, float(low[0]), float(low[1]))
+    hits, passes = np.zeros(geometry.shape, np.int32), np.zeros(geometry.shape, np.int32)
+    for x, y, points in ends:
+        _count(geometry, hits, passes, np.array((x, y)), points)
+    cells = np.full(geometry.shape, UNKNOWN, np.uint8)
+    cells[passes + hits > 0] = FREE
+    cells[hits >= np.maximum(1.0, _OCCUPIED_SHARE * (hits + passes))] = LETHAL
+    return StaticMap(geometry, cells)
+
+
+def _rays(scans: Sequence[LogScan], range_max: float) -> Iterator[tuple[Pose2, NDArray[np.float64]]]:
+    """Yield each scan's reference pose and where its beams end (n, 2; m, frame of the reference)."""
+    for scan in scans:
+        if scan.reference is None:
+            continue
+        used = np.isfinite(scan.ranges) & (scan.ranges <= range_max)
+        ranges, angles = scan.ranges[used], scan.angles[used]
+        points = np.column_stack((ranges * np.cos(angles), ranges * np.sin(angles)))
+        yield scan.reference, scan.reference.transform(points)
+
+
+def _count(
+    geometry: GridGeometry,
+    hits: NDArray[np.int32],
+    passes: NDArray[np.int32],
+    start: NDArray[np.float64],
+    ends: NDArray[np.float64],
+) -> None:
+    """Add one scan's beams: each cell counts once per scan, as hit if any beam ended in it, else as passed."""
+    cells, inside = geometry.cells(ends)
+    hit = np.unique(cells[inside, 1] * geometry.width + cells[inside, 0])
+    lengths = np.hypot(*(ends - start).T)
+    steps = np.maximum(1, np.ceil(lengths / (0.5 * geometry.resolution))).astype(int)
+    beams = np.repeat(np.arange(len(ends)), steps)
+    along = (np.arange(steps.sum()) - np.repeat(np.cumsum(steps) - steps, steps)) / np.repeat(steps, steps)
+    # The last cell or so before the end belongs to the wall.
+    along = along[keep := (1.0 - along) * lengths[beams] > geometry.resolution]
+    beams = beams[keep]
+    points = start + along[:, None] * (ends[beams] - start)
+    between, within = geometry.cells(points)
+    passed = np.unique(between[within, 1] * geometry.width + between[within, 0])
+    hits.ravel()[hit] += 1
+    passes.ravel()[np.setdiff1d(passed, hit, assume_unique=True)] += 1

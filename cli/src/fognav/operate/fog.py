@@ -12,12 +12,11 @@ from urllib.parse import quote, urlsplit
 
 import msgspec
 
-from fog_contracts.messages import Id
+from fog_contracts.messages import Id, Mode
 from fog_runtime.credentials import Credentials
 from fog_supervisor import net
 from fognav.locking import own_credentials
-from fognav.operate.registry import System, registered
-from fognav.operate.systems import FOG_NODE, MAP_SERVICE, PLANNER, ROUTER, addresses, find_systems
+from fognav.operate.systems import FOG_NODE, MAP_SERVICE, PLANNER, ROUTER, System, addresses, find_systems, registered
 from fognav.output import FailedError, WrongUseError
 
 FOG: Final = "FOGNAV_FOG"
@@ -43,6 +42,19 @@ class RefusedError(FailedError):
     def reason(self) -> str:
         """The service's own words."""
         return str(self.problem.get("detail") or self)
+
+
+class Outcome(msgspec.Struct, frozen=True, kw_only=True):
+    """What became of a command: the robot's answer, and its mode afterwards (None if it publishes no state).
+
+    `code` identifies the refusal, and `causes` the conditions behind it, as in `CommandReply`.
+    """
+
+    accepted: bool
+    reason: str
+    mode: Mode | None
+    code: str = ""
+    causes: list[str] = []
 
 
 @dataclass(frozen=True)

@@ -3,12 +3,23 @@
 import datetime as dt
 import math
 import re
-from typing import Annotated, Final
+from typing import Annotated, Final, Literal
 
 import typer
 
 from fog_contracts.messages import WEEKDAYS
 from fognav.output import WrongUseError
+
+Format = Literal["auto", "intel", "jsonl", "carmen", "rosbag2"]
+Selection = Literal["all", "odd", "even"]
+LogFormat = Annotated[
+    Format, typer.Option("--format", help="Format of the log; intel is JSON lines, auto looks at the file.")
+]
+Scans = Annotated[Selection, typer.Option("--scans", help="Scans to use: all, or those with odd or even numbers.")]
+RangeMax = Annotated[
+    float, typer.Option("--range-max", metavar="M", min=1.0, max=200.0, help="Longer ranges are not used (m).")
+]
+
 
 FogOption = Annotated[
     str | None,
@@ -22,6 +33,9 @@ RobotOption = Annotated[
     str | None, typer.Option("--robot", metavar="ID", help="The robot; not needed where there is only one.")
 ]
 JsonOption = Annotated[bool, typer.Option("--json", help="Write one JSON object to standard output.")]
+YesOption = Annotated[
+    bool, typer.Option("--yes", help="Install missing system packages without asking (as does CI=true).")
+]
 
 Point = tuple[float, float]
 

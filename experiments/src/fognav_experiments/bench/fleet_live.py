@@ -31,8 +31,7 @@ from fog_supervisor import net
 from fog_supervisor.supervisor import NotReadyError, log_tail
 from fognav.output import FailedError
 from fognav.programs import PLANNER, REDIS, ROUTER
-from fognav.stack import Stack, StackConfig
-from fognav.stack_doors import Doors
+from fognav.stack import Doors, Stack, StackConfig
 from fognav_experiments.bench.common import SITE, in_background, write_site
 from fognav_experiments.bench.fleet import closures, hazard_message, percentile
 

@@ -33,8 +33,7 @@ from fog_runtime.transports.zenoh_edge import session_config
 from fog_supervisor import net
 from fognav.output import FailedError
 from fognav.programs import AGGREGATOR, MAP_SERVICE, SERVERS
-from fognav.stack import Stack, StackConfig
-from fognav.stack_doors import Doors
+from fognav.stack import Doors, Stack, StackConfig
 from fognav_experiments.bench.common import SITE, make_office, write_site
 
 if TYPE_CHECKING:

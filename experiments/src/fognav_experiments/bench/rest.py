@@ -29,8 +29,7 @@ from fog_runtime.stores.redis_store import Audit
 from fog_runtime.transports.zenoh_edge import session_config
 from fog_supervisor.net import LOOPBACK
 from fognav.programs import MAP_SERVICE, PLANNER, SERVERS
-from fognav.stack import Stack, StackConfig
-from fognav.stack_doors import Doors
+from fognav.stack import Doors, Stack, StackConfig
 from fognav_experiments.bench.common import SITE
 from fognav_experiments.bench.cores import random_zones, worst_shapes
 from map_service.store import Store

@@ -26,8 +26,7 @@ from fog_supervisor import net
 from fog_supervisor.net import put_goal
 from fognav.output import WrongUseError
 from fognav.programs import AGENT, PLANNER, ROBOT, WATCHDOG
-from fognav.stack import Stack, StackConfig
-from fognav.stack_doors import Doors
+from fognav.stack import Doors, Stack, StackConfig
 from fognav_experiments.bench.common import RunningSystem, corridor_rows, first_child, make_office
 from fognav_sim.drive.operator import OperatorPolicy
 

@@ -26,8 +26,7 @@ from fog_supervisor.supervisor import NotReadyError, log_tail
 from fognav.nodes.simulated import StillFloor
 from fognav.output import FailedError
 from fognav.programs import AGGREGATOR, MAP_SERVICE, PLANNER, SERVERS, SERVICES
-from fognav.stack import Stack, StackConfig
-from fognav.stack_doors import doors_of
+from fognav.stack import Stack, StackConfig, doors_of
 from fognav_experiments.bench.common import in_background
 from fognav_sim.barrier import BarrierError, barrier_across
 from fognav_sim.drive.hazard import draw_hazard, entry_distance

@@ -318,15 +318,15 @@ def warning_command(  # noqa: PLR0913  # the options of the command
     With --false-echoes the nodes and the aggregator's core run in simulated time instead, whatever the machine's load:
     all sonars hear what is not there, their nodes are calibrated in that, and false alarms are counted, too.
     """
-    from fognav import checkout  # noqa: PLC0415  # keeps the other commands fast
-    from fognav.nodes import site_file  # noqa: PLC0415  # same
+    from fog_runtime.configuration.site import load_site  # noqa: PLC0415  # keeps the other commands fast
+    from fognav import checkout  # noqa: PLC0415  # same
     from fognav_experiments.bench import false_echoes as noise  # noqa: PLC0415  # same
     from fognav_experiments.bench import warning  # noqa: PLC0415  # same
 
     kernels.warm_cache(print_line)
     rows = []
     with exit_codes(), Progress(console=console, disable=not console.is_terminal) as progress:
-        loaded = site_file.load(checkout.site_folder(site))
+        loaded = load_site(checkout.site_folder(site))
         for each in rule or ["evidence", "consecutive"]:
             task = progress.add_task(each, total=warnings)
             advance = partial(progress.advance, task)

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Final, TypeVar
 import typer
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
-from fognav import checkout, kernels, node_code
+from fognav import checkout, kernels, system
 from fognav.commands.installed import MEASURE
 from fognav.operate.fog import find_fog
 from fognav.operate.options import FogOption, JsonOption, RobotOption  # noqa: TC001  # Typer reads annotations at run time
@@ -121,7 +121,7 @@ def experiment_command(  # noqa: PLR0913  # each option is an argument
 
 
 def _prepare() -> None:
-    node_code.prepare(print_line)
+    system.prepare_node_code(print_line)
     kernels.warm_cache(print_line)
 
 
@@ -226,7 +226,7 @@ def scenarios_command(
             scenarios = {file.stem: read_scenario(file) for file in files}
         except ScenarioError as error:
             raise WrongUseError(str(error)) from error
-        node_code.prepare(print_line)
+        system.prepare_node_code(print_line)
         kernels.warm_cache(print_line)
         drives = {}
         for name, scenario in scenarios.items():
@@ -368,7 +368,7 @@ def _sweep(  # what is driven, where and how
     from fognav_experiments.comparison import sensitivity  # noqa: PLC0415  # same
     from fognav_experiments.comparison.records import DriveFiles  # noqa: PLC0415  # keeps the other commands fast
 
-    node_code.prepare(print_line)
+    system.prepare_node_code(print_line)
     kernels.warm_cache(print_line)
     asked, files = sensitivity.sweep_tasks(swept, drawn), DriveFiles(folder.path / "sweep", sensitivity.SweptDrive)
     names = [task.name for task in asked]

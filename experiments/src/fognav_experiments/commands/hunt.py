@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from fognav import checkout, kernels, node_code
+from fognav import checkout, kernels, system
 from fognav.commands.installed import MEASURE
 from fognav.output import NOT_TRUE, WrongUseError, exit_codes, print_line
 
@@ -50,7 +50,7 @@ def hunt_command(  # noqa: PLR0913  # each option is an argument
     with exit_codes():
         root = checkout.root()
         folders = [root / "sites", *([data] if data is not None else [])]
-        node_code.prepare(print_line)
+        system.prepare_node_code(print_line)
         kernels.warm_cache(print_line)
         folder = out or root / "experiments" / "hunt"
         try:

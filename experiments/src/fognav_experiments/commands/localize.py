@@ -10,14 +10,18 @@ from rich.progress import Progress
 
 from fognav import kernels
 from fognav.commands.installed import MEASURE
-from fognav.lidar_logs.options import LogFormat, RangeMax, Scans  # noqa: TC001  # same
-from fognav.operate.options import JsonOption  # noqa: TC001  # same
+from fognav.operate.options import (  # noqa: TC001  # same
+    JsonOption,  # same
+    LogFormat,
+    RangeMax,
+    Scans,
+)
 from fognav.output import NOT_TRUE, WrongUseError, check_writable, console, exit_codes, print_answer, print_json
 
 if TYPE_CHECKING:
     from fog_contracts.grid import StaticMap
-    from fognav.lidar_logs.logs import LidarLog, LogScan
-    from fognav.lidar_logs.options import Selection
+    from fognav.lidar_logs import LidarLog, LogScan
+    from fognav.operate.options import Selection
 
 
 def add_to(app: typer.Typer) -> None:
@@ -51,7 +55,7 @@ def localize_command(  # noqa: PLR0913  # each option is an argument
     exit code is 1 if no pose was found, or one that is wrong. With --trials starts without a pose (--global) or robots
     that are carried away unnoticed (--kidnap) are counted, and it is 1 if any pose was wrong while it was good.
     """
-    from fognav.lidar_logs.logs import read_log  # noqa: PLC0415  # keeps the other commands fast
+    from fognav.lidar_logs import read_log  # noqa: PLC0415  # keeps the other commands fast
 
     with exit_codes():
         check_writable(png)
@@ -101,7 +105,7 @@ def _try(  # noqa: PLR0913  # the command's options
     from fognav_experiments.localization_trials import (  # noqa: PLC0415  # same
         random_kidnappings,
         random_starts,
-        with_noise,  # as above
+        with_noise,
     )
     from robot_agent.config import LocalizationConfig  # noqa: PLC0415  # same
     from robot_agent.localization.map_fields import map_fields  # noqa: PLC0415  # same
@@ -137,7 +141,7 @@ def _evaluate(  # noqa: PLR0913  # the command's options
         kidnapped,
         track,
         with_noise,
-        write_plot,  # same
+        write_plot,
     )
     from robot_agent.config import LocalizationConfig  # noqa: PLC0415  # same
     from robot_agent.localization.map_fields import map_fields  # noqa: PLC0415  # same

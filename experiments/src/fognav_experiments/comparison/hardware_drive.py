@@ -11,9 +11,9 @@ from typing import TYPE_CHECKING, Final, Protocol
 from fog_contracts.commands import PROFILE_OF, STOPS
 from fog_runtime import logs
 from fognav import __version__
-from fognav.operate import rest_commands
+from fognav.operate import robot_commands
 from fognav.operate.fog import RefusedError
-from fognav.operate.robots import connect
+from fognav.operate.robot_commands import connect
 from fognav.operate.systems import PLANNER
 from fognav.output import FailedError, WrongUseError
 from fognav_experiments.comparison.drives import GuidedDrive, stands_at, start_of, where_to_place
@@ -27,9 +27,8 @@ if TYPE_CHECKING:
 
     from fog_contracts.messages import CommandKind, Mode, Pose, ProfileName, RobotPath, RobotPose, RobotState
     from fog_runtime.configuration.site import LoadedSite
-    from fognav.operate.fog import Fog
-    from fognav.operate.outcome import Outcome
-    from fognav.operate.robots import Robot
+    from fognav.operate.fog import Fog, Outcome
+    from fognav.operate.robot_commands import Robot
     from fognav_experiments.comparison.drives import MeasuredDrive
     from fognav_experiments.comparison.records import DriveFiles
     from fognav_experiments.comparison.runner import Task
@@ -338,7 +337,7 @@ class _ConnectedRobot:
     async def command(self, kind: CommandKind, pose: Pose | None = None) -> Outcome:
         if kind in STOPS:
             return await self._connected.stop(kind)
-        return await asyncio.to_thread(rest_commands.command, self._fog, self.id, kind, pose)
+        return await asyncio.to_thread(robot_commands.command, self._fog, self.id, kind, pose)
 
     async def set_goal(self, place: str) -> str:
         answer = await asyncio.to_thread(self._fog.send, "PUT", PLANNER, self._goal, {"place": place})

@@ -1,4 +1,4 @@
-"""Serves the page, the map as an image, and the scene as a stream of events, on the loopback address."""
+"""Serves a demonstration to browsers on loopback: the page, the map as an image, the scene as a stream of events."""
 
 import asyncio
 import contextlib

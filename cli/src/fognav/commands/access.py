@@ -1,0 +1,211 @@
+"""`fognav token` and `fognav ca`: who may use the REST APIs, and the certificate authority of a site.
+
+With the authority come the users and access lists of the servers.
+"""
+
+import datetime as dt
+import os
+from pathlib import Path
+from typing import Annotated, Final
+
+import typer
+
+from fog_runtime.configuration.site import load_site
+from fog_runtime.credentials import to_toml
+from fog_runtime.files import atomic_write
+from fog_runtime.locks.site_locks import SiteLocks
+from fog_runtime.token_file import Role, create_token, read_tokens, revoke_token
+from fognav import checkout
+from fognav.locking import LocksOption, locks_errors, locks_folder, named_folder, open_locks, own_hosts
+from fognav.operate.fog import find_fog
+from fognav.operate.options import JsonOption
+from fognav.output import NOT_TRUE, FailedError, WrongUseError, exit_codes, print_answer, print_json
+
+token_app = typer.Typer(help="Create, list and revoke tokens of the REST APIs.", no_args_is_help=True)
+
+_VARIABLE: Final = "FOGNAV_TOKENS_FILE"
+_TOKENS: Final = "tokens.toml"
+
+FileOption = Annotated[
+    Path | None,
+    typer.Option(
+        "--file", metavar="F", help=f"The services' tokens file; default: {_VARIABLE}, else a running demo's."
+    ),
+]
+NameArgument = Annotated[str, typer.Argument(metavar="NAME", help="Who uses it; audit entries show this name.")]
+
+
+@token_app.command("create", epilog="Example: fognav token create anna --role operator --file /run/fognav/tokens.toml")
+def token_create(
+    name: NameArgument,
+    *,
+    role: Annotated[
+        Role, typer.Option("--role", help="viewer reads, operator writes, admin also recovers.")
+    ] = "viewer",
+    file: FileOption = None,
+    out: Annotated[
+        Path | None,
+        typer.Option("--out", metavar="FILE", help="Write it there, as credentials (FOGNAV_CREDENTIALS_FILE)."),
+    ] = None,
+    locks: LocksOption = None,
+    json: JsonOption = False,
+) -> None:
+    """Create a token and print it, or write it to a file.
+
+    Only its hash is stored: it can't be shown again. The running services accept it at once.
+    """
+    with exit_codes(), locks_errors():
+        if out is not None and out.exists():
+            raise WrongUseError(f"{out} already exists: name another file with --out, or remove it")
+        authority = open_locks(locks).authority.trusted if locks_folder(locks) is not None else ""
+        token = create_token(_tokens_file(file), name, role)
+        if out is not None:
+            text = to_toml(name, authority=authority, passwords={}, token=token)
+            atomic_write(out, text.encode())
+            if json:
+                print_json({"name": name, "role": role, "credentials": str(out)})
+            else:
+                print_answer(f"wrote {out}: give it to {name}, who names it in FOGNAV_CREDENTIALS_FILE")
+        elif json:
+            print_json({"name": name, "role": role, "token": token})
+        else:
+            typer.echo(token)
+
+
+@token_app.command("list", epilog="Example: fognav token list --json")
+def token_list(*, file: FileOption = None, json: JsonOption = False) -> None:
+    """List who has a token, in which role."""
+    with exit_codes():
+        entries = read_tokens(_tokens_file(file))
+        if json:
+            tokens = [{"name": entry.name, "role": entry.role, "created": entry.created} for entry in entries]
+            print_json({"tokens": tokens})
+            return
+        for entry in entries:
+            print_answer(f"{entry.name}: {entry.role}" + (f", since {entry.created}" if entry.created else ""))
+
+
+@token_app.command("revoke", epilog="Example: fognav token revoke anna")
+def token_revoke(name: NameArgument, *, file: FileOption = None, json: JsonOption = False) -> None:
+    """Revoke a token: the services refuse it from their next request on."""
+    with exit_codes():
+        revoke_token(_tokens_file(file), name)
+        if json:
+            print_json({"name": name, "revoked": True})
+        else:
+            print_answer(f"the token of {name} is revoked")
+
+
+def _tokens_file(given: Path | None) -> Path:
+    """Return the tokens file; raises `WrongUseError` when there is none to find."""
+    if given is not None:
+        return given
+    if named := os.environ.get(_VARIABLE):
+        return Path(named)
+    try:
+        token_file = find_fog(None).system.token_file
+    except FailedError:
+        token_file = None
+    if token_file is None:
+        raise WrongUseError(f"name the services' tokens file with --file or {_VARIABLE}")
+    return Path(token_file).with_name(_TOKENS)
+
+
+ca_app = typer.Typer(help="Create, renew and replace certificates of a site's servers.", no_args_is_help=True)
+
+_SITE = "estig"
+HostOption = Annotated[
+    list[str] | None,
+    typer.Option(
+        "--host", metavar="NAME|ADDRESS", help="How clients reach the servers; may be repeated. Default: this computer."
+    ),
+]
+_RELOAD = "the servers use it after a restart; Mosquitto after SIGHUP, too"
+
+
+@ca_app.command("create", epilog="Example: fognav ca create --site sites/floor --credentials DIR --host fog.local")
+def ca_create(
+    *,
+    site: Annotated[Path, typer.Option("--site", metavar="D", help="Folder of the site, or a name in sites/.")] = Path(
+        _SITE
+    ),
+    host: HostOption = None,
+    locks: LocksOption = None,
+    json: JsonOption = False,
+) -> None:
+    """Create a site's certificate authority, its servers' certificates, and a file of credentials for each user.
+
+    Users are the services, the tools, and the robots and nodes of the site. What is there already stays.
+    """
+    with exit_codes(), locks_errors():
+        loaded = load_site(checkout.site_folder(site)).site
+        made = SiteLocks(named_folder(locks), loaded.id)
+        made.make(
+            host or own_hosts(),
+            robots=[robot.id for robot in loaded.robots],
+            nodes=[node.id for node in loaded.nodes],
+        )
+        _show(made, json=json)
+
+
+@ca_app.command("issue", epilog="Example: fognav ca issue --host fog.local --host 192.168.7.1")
+def ca_issue(*, host: HostOption = None, locks: LocksOption = None, json: JsonOption = False) -> None:
+    """Issue new certificates for all servers, for the names and addresses of before or those given."""
+    with exit_codes(), locks_errors():
+        opened = open_locks(locks)
+        opened.renew(host, only_due=False)
+        _show(opened, json=json)
+
+
+@ca_app.command("rotate", epilog="Example: fognav ca rotate, and when all have new credentials: ... --finish")
+def ca_rotate(
+    *,
+    finish: Annotated[bool, typer.Option("--finish", help="Trust the authority before no longer.")] = False,
+    locks: LocksOption = None,
+    json: JsonOption = False,
+) -> None:
+    """Replace the certificate authority, while everything runs.
+
+    Until --finish both are trusted, and who knows only the old one accepts the new certificates, too: hand out the
+    credentials again (robots, nodes, people) at any time before.
+    """
+    with exit_codes(), locks_errors():
+        opened = open_locks(locks)
+        if finish:
+            opened.authority.finish()
+        else:
+            opened.authority.rotate(now=dt.datetime.now(dt.UTC))
+        opened.trust_again()
+        opened.renew(only_due=False)
+        _show(opened, json=json)
+
+
+@ca_app.command("show", epilog="Example: fognav ca show --json")
+def ca_show(*, locks: LocksOption = None, json: JsonOption = False) -> None:
+    """Show until when the authority and the servers' certificates are valid; the exit code is 1 if one expires soon."""
+    with exit_codes(), locks_errors():
+        opened = open_locks(locks)
+        _show(opened, json=json)
+        if opened.expiring():
+            raise typer.Exit(NOT_TRUE)
+
+
+def _show(locks: SiteLocks, *, json: bool) -> None:
+    expiries = locks.expiries()
+    if json:
+        print_json(
+            {
+                "locks": str(locks.directory),
+                "rotating": locks.authority.rotating,
+                "valid_until": {name: until.isoformat() for name, until in expiries.items()},
+                "expiring": locks.expiring(),
+                "credentials": sorted(locks.users()),
+            }
+        )
+        return
+    for name, until in expiries.items():
+        print_answer(f"{name:10} valid until {until:%Y-%m-%d}" + (", renew it" if name in locks.expiring() else ""))
+    if locks.authority.rotating:
+        print_answer("the authority before is still trusted: fognav ca rotate --finish ends that")
+    print_answer(f"credentials in {locks.directory}/credentials: {', '.join(sorted(locks.users()))}")
+    print_answer(_RELOAD)

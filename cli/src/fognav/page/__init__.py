@@ -1,1 +1,0 @@
-"""The demonstration in a browser: the map with everything that moves on it."""

@@ -222,18 +222,6 @@ def test_node_boots_faster_than_the_router_and_connects_when_it_is_there(connect
     assert connection.up
 
 
-@pytest.mark.parametrize("part", ["network", "broker"])
-def test_node_announces_itself_again_after_a_loss(connection, part):
-    connection.run(10)
-    setattr(connection, part, False)
-    connection.run(30)
-    assert not connection.up
-    setattr(connection, part, True)
-    connection.run(60)
-    assert connection.up
-    assert len(connection.announcements) == 2
-
-
 def test_refused_node_asks_ever_more_rarely(connection):
     connection.refused = True
     connection.run(540)
@@ -257,14 +245,6 @@ def test_hundred_nodes_do_not_come_back_at_one_moment(core):
         moments.add(node.connects[-1] // 500)
         node.close()
     assert len(moments) > 20
-
-
-def test_board_restarts_after_ten_minutes_without_a_broker_and_only_then(connection):
-    connection.broker = False
-    connection.run(590)
-    assert connection.restarts == []
-    connection.run(20)
-    assert len(connection.restarts) == 1
 
 
 @settings(deadline=None)

@@ -711,16 +711,6 @@ def test_driving_robot_is_stopped_by_anyone_with_any_clock(world, issued_at):
     assert world.ask(stop).accepted
 
 
-@pytest.mark.parametrize(
-    ("pose", "word"),
-    [(None, "no pose"), (Pose(x=99.0, y=0.0, theta=0.0), "off the map"), (Pose(x=0.2, y=0.2, theta=0.0), "wall")],
-)
-def test_impossible_initial_pose_is_refused(world, pose, word):
-    reply = world.command("initial_pose", pose=pose)
-    assert not reply.accepted
-    assert word in reply.reason
-
-
 def test_an_initial_pose_is_refused_while_the_robot_drives(driving):
     assert "disable it first" in driving.command("initial_pose", pose=Pose(x=2.0, y=2.0, theta=0.0)).reason
 

@@ -222,21 +222,6 @@ def test_rplidar_scans_show_the_room(request_bytes, nodes):
         assert scan.ended_at - scan.started_at == pytest.approx(1 / 5.5, abs=0.02)
 
 
-def test_frozen_link_gives_identical_scans():
-    lidar = RplidarEmulator(box)
-    parser, assembler = rplidar.Parser(), rplidar.ScanAssembler()
-    lidar.receive(rplidar.scan(), 0.0)
-    repeats = []
-    for number in range(200):
-        lidar.frozen = number > 60
-        parser.receive_data(lidar.outgoing(number * 0.01))
-        for event in events(parser):
-            if isinstance(event, rplidar.Nodes):
-                repeats += [scan.repeats for scan in assembler.feed(event, number * 0.01)]
-    assert max(repeats[:2]) == 1
-    assert repeats[-1] >= 3
-
-
 def test_scan_restarted_in_mid_stream_gives_whole_scans():
     lidar = RplidarEmulator(box)
     parser, assembler = rplidar.Parser(), rplidar.ScanAssembler()
@@ -297,27 +282,3 @@ def test_base_is_driven_over_a_pty_and_stopped_after_a_crash_of_its_host(tmp_pat
                 assert time.monotonic() - begin < 20.0
                 simulate()
     assert not link.is_symlink()
-
-
-@pytest.mark.live
-def test_whole_scans_are_received_over_a_pty():
-    lidar = RplidarEmulator(box)
-    parser, assembler = rplidar.Parser(), rplidar.ScanAssembler()
-    scans = []
-    deadline = time.monotonic() + 60.0
-    with PtyPort() as line, open_port(str(line.path), 115200) as port:
-        port.set_line("dtr", on=False)
-        port.write(rplidar.stop() + rplidar.get_health() + rplidar.scan())
-        while len(scans) < 3:
-            assert time.monotonic() < deadline
-            select.select([line], [], [], 0.005)
-            now = time.monotonic()
-            lidar.receive(line.read(), now)
-            line.write(lidar.outgoing(now))
-            parser.receive_data(port.read_available())
-            for event in events(parser):
-                if isinstance(event, rplidar.Nodes):
-                    scans.extend(assembler.feed(event, now))
-    assert parser.resyncs == 0
-    for scan in scans:
-        assert scan.angles_rad.size > 300

@@ -92,14 +92,3 @@ def test_a_stalled_head_is_silent_and_goes_on_without_a_burst():
     lidar.stalled = False
     assert len(lidar.outgoing(0.41)) <= 47 * 5
     assert lidar.outgoing(50.0) == b"", "a pause gives no burst"
-
-
-def test_a_frozen_link_repeats_one_scan():
-    lidar = Ld19Emulator(box)
-    sent(lidar, 0.5)
-    lidar.frozen = True
-    packets = sent(lidar, 1.0, begin=0.51)
-    begins = np.flatnonzero(np.diff(u16(packets, 4)) < 0) + 1
-    scans = {packets[a:b].tobytes() for a, b in itertools.pairwise(begins)}
-    assert len(begins) > 5
-    assert len(scans) == 1

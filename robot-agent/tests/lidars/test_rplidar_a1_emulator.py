@@ -128,18 +128,6 @@ def test_a_stalled_head_is_silent_and_goes_on_without_a_burst():
     assert len(lidar.outgoing(0.41)) <= 5 * 21
 
 
-def test_a_frozen_link_repeats_one_scan():
-    lidar = RplidarEmulator(box)
-    scanned(lidar, 0.5)
-    lidar.frozen = True
-    data = b"".join(lidar.outgoing(0.5 + number * 0.01) for number in range(1, 101))
-    nodes = nodes_of(data)
-    starts = np.flatnonzero(nodes[:, 0] & 1)
-    scans = {nodes[a:b].tobytes() for a, b in itertools.pairwise(starts)}
-    assert len(starts) > 4
-    assert len(scans) == 1
-
-
 def test_a_device_in_error_does_not_scan():
     lidar = RplidarEmulator(box)
     lidar.health = 2

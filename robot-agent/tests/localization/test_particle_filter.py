@@ -42,17 +42,6 @@ def driven(seed: int, *, drift: float) -> tuple[ParticleFilter, Pose2, Pose2]:
     return one, true, odom
 
 
-def test_given_pose_is_refined_by_the_first_scan():
-    one = ParticleFilter(CONFIG, 1)
-    one.start(Pose2(3.3, 1.8, 0.2), ORIGIN, 0.4, 0.3)
-    one.add(scan_at(START, ORIGIN), FIELDS)
-    found = one.pose(ORIGIN)
-    assert math.hypot(found.x - START.x, found.y - START.y) < 0.06
-    assert abs(found.theta) < 0.03
-    assert one.uncertainty.along < 0.1
-    assert one.uncertainty.heading < 0.04
-
-
 def test_scan_with_too_few_points_leaves_the_given_pose():
     one = ParticleFilter(CONFIG, 1)
     one.start(START, ORIGIN, 0.4, 0.3)
@@ -60,15 +49,6 @@ def test_scan_with_too_few_points_leaves_the_given_pose():
     assert one.pose(ORIGIN) == START
     one.add(scan_at(START, ORIGIN), FIELDS)
     assert one.uncertainty.along < 0.2
-
-
-def test_between_updates_the_pose_follows_the_odometry():
-    one = ParticleFilter(CONFIG, 1)
-    assert one.pose(ORIGIN) is None
-    assert not one.has_pose
-    one.start(START, Pose2(9.0, 9.0, 1.0), 0.1, 0.05)
-    step = Pose2(0.2, -0.1, 0.3)
-    assert one.pose(Pose2(9.0, 9.0, 1.0).compose(step)) == pytest.approx(START.compose(step))
 
 
 @pytest.mark.parametrize(
@@ -87,13 +67,6 @@ def test_scan_corrects_the_pose_after_0_1_m_or_0_1_rad_and_not_before(step, upda
     before = one.covariance.copy()
     one.add(scan_at(START.compose(step), step), FIELDS)
     assert (one.covariance != before).any() == updated
-
-
-def test_defaults_are_those_that_recorded_drives_with_real_odometry_support():
-    # Odometry of real bases is 5 to 90 times better than alphas of 0.2 say, and sharper weights lose honesty. What a
-    # wrong scale does to distances is no noise: it is learned (`odometry_scale`).
-    assert CONFIG.alphas == (0.05, 0.05, 0.01, 0.05)
-    assert (CONFIG.sharpness, CONFIG.beams, CONFIG.particles_min, CONFIG.particles_max) == (12.0, 60, 500, 2000)
 
 
 def test_standing_robot_is_not_updated():

@@ -62,22 +62,6 @@ async def test_history_continues_over_a_kill(fog, client, tokens):
     assert after["lasted_s"] > before["lasted_s"]
 
 
-async def test_one_of_eight_concurrent_changes_to_a_version_succeeds(fog, client, tokens):
-    async def put(number: int) -> httpx.Response:
-        body = {"polygon": POLYGON, "nodes": ["n1"], "label": f"by writer {number}"}
-        return await client.put("/api/v1/areas/hall", json=body, headers={**tokens["operator"], "If-Match": '"0"'})
-
-    answers = await asyncio.gather(*(put(number) for number in range(8)))
-    assert sorted(answer.status_code for answer in answers) == [200] + 7 * [412]
-    (label,) = [answer.json()["label"] for answer in answers if answer.status_code == 200]
-    assert (await client.get("/api/v1/areas/hall")).json()["definition"]["label"] == label
-    async with fog.raw_redis() as raw:
-        assert json.loads(await raw.hget("fog:test:areas", "hall"))["label"] == label
-        ((_, entry),) = await raw.xrange("fog:test:audit:area")
-    assert (entry[b"who"], entry[b"id"]) == (b"anna", b"hall")
-    assert json.loads(entry[b"before"])["version"] == 0, "the site's own definition, which was not stored"
-
-
 async def test_version_stored_by_another_writer_is_loaded_after_the_conflict(fog, client, tokens):
     other = AreaDefinition(id="hall", polygon=[(1.0, 1.0), (2.0, 1.0), (2.0, 2.0)], label="elsewhere", version=5)
     async with fog.raw_redis() as raw:

@@ -218,25 +218,6 @@ async def test_robot_in_the_cone_does_not_block_the_area(fog, until):
         assert node.hazards[-1].explained_by == "r1"
 
 
-async def test_robot_has_the_body_of_the_site_whatever_it_claims(fog, until):
-    with (fog.site / "site.toml").open("a") as file:
-        file.write('\n[[robots]]\nid = "r1"\nradius = 0.17\nheight = 0.1\nstart = { x = 1.0, y = 1.0, theta = 0.0 }\n')
-    fog.start("hazard_aggregator")
-    await fog.ready("hazard_aggregator")
-    async with connected_node(fog) as (node, zenoh):
-        await node.read(3.0, 8)
-        await until(lambda: node.state == "clear", "clear")
-        claims = RobotPose(
-            x=3.5, y=3.5, theta=0.0, covariance=[0.0] * 9, v=0.0, w=0.0, radius=0.17, height=0.35, stamp=1.0
-        )
-        for _ in range(40):
-            zenoh.publish(ch.ROBOT_POSE, claims, robot="r1")
-            await node.read(0.83)
-            await asyncio.sleep(0.05)
-        await until(lambda: node.state == "blocked", "blocked", lambda: fog.log("hazard_aggregator"))
-        assert node.hazards[-1].explained_by is None
-
-
 async def test_thesis_node_of_an_area_added_at_run_time_is_subscribed_without_a_restart(fog, until, tokens):
     fog.start("hazard_aggregator")
     url = await fog.ready("hazard_aggregator")
@@ -267,28 +248,3 @@ async def test_malformed_messages_are_refused_and_the_aggregator_goes_on(fog, un
         metrics = (await client.get(f"{url}/metrics")).text
         assert 'fognav_refused_messages_total{channel="node_reading"} 4.0' in metrics
         assert 'fognav_refused_messages_total{channel="node_availability"} 1.0' in metrics
-
-
-async def test_messages_and_metrics_of_an_area_that_nobody_lists_are_deleted(fog, until, tokens):
-    gone = AreaHazard(area="gone", state="blocked", severity=3, penalty=254, since=0, seq=1, epoch=1, cause="")
-    square = [(1.0, 1.0), (2.0, 1.0), (2.0, 2.0), (1.0, 2.0)]
-    async with connected_node(fog) as (node, _):
-        assert await node.mqtt.publish(ch.AREA_HAZARD, gone, wait=True, area="gone")
-        definition = AreaDefinition(id="gone", polygon=square)
-        assert await node.mqtt.publish(ch.AREA_DEFINITION, definition, wait=True, area="gone")
-    fog.start("hazard_aggregator")
-    url = await fog.ready("hazard_aggregator")
-    async with connected_node(fog) as (node, _), httpx.AsyncClient(timeout=60) as client:
-        await until(lambda: node.heartbeats, "a heartbeat", lambda: fog.log("hazard_aggregator"))
-        assert (list(node.heartbeats[-1].areas), node.heartbeats[-1].complete) == (["hall"], True)
-        await until(lambda: "hall" in {hazard.area for hazard in node.hazards}, "the hazard")
-        assert 'fognav_hazards{area="hall"' in (await client.get(f"{url}/metrics")).text
-        body = {"polygon": square, "removed": True}
-        put = await client.put(f"{url}/api/v1/areas/hall", json=body, headers=tokens["operator"])
-        assert put.status_code == 200, put.text
-        await until(lambda: node.heartbeats[-1].areas == {}, "no area is listed", lambda: fog.log("hazard_aggregator"))
-        assert 'fognav_hazards{area="hall"' not in (await client.get(f"{url}/metrics")).text
-    async with connected_node(fog) as (late, _):
-        await until(lambda: late.configs, "retained messages")
-        await until(lambda: late.heartbeats, "what was retained has arrived")
-        assert {hazard.area for hazard in late.hazards} | {area.id for area in late.definitions} == set()

@@ -151,16 +151,6 @@ async def test_invalid_source_in_the_sites_file_leaves_its_area_unknown_and_the_
     assert "'doors/+/state' has a wildcard" in fog.log("hazard_aggregator")
 
 
-async def test_invalid_source_is_refused_with_the_field(fog, tokens):
-    fog.start("hazard_aggregator")
-    async with httpx.AsyncClient(base_url=await fog.ready("hazard_aggregator"), timeout=60) as client:
-        body = {"polygon": POLYGON, "sources": [{"id": "s1", "profile": "knx"}]}
-        answer = await client.put("/api/v1/areas/yard", json=body, headers=tokens["operator"])
-    assert answer.status_code == 422
-    assert answer.json()["errors"][0]["field"] == "body.sources.s1.profile"
-    assert "zigbee2mqtt-occupancy" in answer.json()["detail"]
-
-
 HEAT_OF_A_NODE = """
 [[sources]]
 id = "heat"

@@ -112,13 +112,6 @@ async def test_period_of_an_area_is_written_once_continues_over_restarts_and_is_
             await store.history("hall", cursor="1", limit=9, at=at(0.0))
 
 
-async def test_unreadable_record_is_left_out_and_the_others_are_loaded(redis: Server):
-    async with Store(redis.url, "test") as store, Redis.from_url(redis.url) as raw:
-        await store.save_hazards([hazard(1)])
-        await raw.hset("fog:test:hazards", "gate", b"nonsense")
-        assert (await store.load()).hazards == [hazard(1)]
-
-
 def test_stored_area_with_an_unknown_rule_stays_on_the_map_unwatched_and_is_named(caplog):
     polygon = [(0, 0), (1, 0), (1, 1)]
     areas = [

@@ -26,11 +26,9 @@ from fog_contracts.messages import (
     NodeReading,
     RobotObstacles,
     RobotPose,
-    RobotState,
     ZoneSet,
 )
 from fog_contracts.replica import Applied, Replica
-from fog_runtime.lease import HEARSAY_PAUSE_S
 
 pytestmark = pytest.mark.live
 CIRCLE = {"kind": "BLOCKED", "shape": {"type": "circle", "centre": [6.0, 3.0], "radius": 0.5}, "reason": "wet floor"}
@@ -115,19 +113,6 @@ async def test_blocked_readings_become_lethal_cells_on_the_robots_map(fog, until
         assert asked.hazard.state == "blocked"
 
 
-async def test_no_area_is_clear_without_an_aggregator(fog, until):
-    async with running(fog, "map_service") as (client, robot, mqtt):
-        await mqtt.publish(ch.AREA_HAZARD, hazard("clear", 1), area="hall")
-        request = partial(client.get, "/api/v1/hazards")
-        answer = await poll(
-            request, lambda got: "does not confirm that the area is clear" in got.json()[0]["hazard"]["cause"]
-        )
-        assert answer.json()[0]["hazard"]["state"] == "unknown"
-        await until(lambda: robot.heartbeats, "heartbeats")
-        await mqtt.publish(ch.AREA_HAZARD, hazard("blocked", 2), area="hall")
-        await until(lambda: robot.cost(3.5, 3.0) == LETHAL, "lethal", lambda: fog.log("map_service"))
-
-
 @pytest.mark.smoke
 async def test_zone_reaches_the_robot_and_survives_a_kill_of_the_map_service(fog, until, tokens):
     async with running(fog, "map_service") as (client, robot, _):
@@ -176,19 +161,6 @@ async def test_zones_are_versioned_and_audited(shared_fog, tokens):
         assert (entries[0]["after"], entries[2]["before"]) == (None, None)
         again = await client.post("/api/v1/zones", json=body, headers=operator)
         assert again.headers["etag"] == '"3"', "an ETag never names two states"
-
-
-async def test_one_of_eight_concurrent_changes_to_a_version_succeeds(client, tokens):
-    body = {**CIRCLE, "id": "contested"}
-    created = await client.post("/api/v1/zones", json=body, headers=tokens["operator"])
-    assert created.status_code == 201
-    headers = {**tokens["operator"], "If-Match": created.headers["etag"]}
-    answers = await asyncio.gather(
-        *(client.put("/api/v1/zones/contested", json=CIRCLE, headers=headers) for _ in range(8))
-    )
-    assert sorted(answer.status_code for answer in answers) == [200] + 7 * [412]
-    etags = {answer.headers["etag"] for answer in answers if answer.status_code == 200}
-    assert {(await client.get("/api/v1/zones/contested")).headers["etag"]} == etags
 
 
 async def test_invalid_zone_is_refused_naming_its_field(client, tokens):
@@ -294,23 +266,6 @@ async def test_obstacles_of_a_robot_are_on_the_map_until_they_expire(shared_fog,
         robot.zenoh.publish(ch.ROBOT_OBSTACLES, seen, robot="r1")
         await until(lambda: robot.cost(1.0, 1.0) == LETHAL, "seen", lambda: shared_fog.log("map_service"))
         await until(lambda: robot.cost(1.0, 1.0) == 0, "gone")
-
-
-async def test_robot_that_tells_of_ever_higher_epochs_does_not_hold_up_the_map(fog, until):
-    async with running(fog, "map_service") as (_, robot, _):
-        await until(lambda: robot.heartbeats, "heartbeats")
-        seen, began = len(robot.heartbeats), time.monotonic()
-        for _ in range(60):
-            epochs = {"map-service": robot.heartbeats[-1].epoch + 1_000_000}
-            state = RobotState(
-                mode="NORMAL", reasons=[], enabled=True, battery=None, goal_id=None, map_epoch=0, map_seq=0,
-                plan_id=None, epochs=epochs,
-            )  # fmt: skip
-            robot.zenoh.publish(ch.ROBOT_STATE, state, robot="r1")
-            await asyncio.sleep(0.05)
-        await until(lambda: len(robot.heartbeats) >= seen + 20, "heartbeats", lambda: fog.log("map_service"))
-        questions = 1 + (time.monotonic() - began) / HEARSAY_PAUSE_S
-        assert 1 < len({beat.epoch for beat in robot.heartbeats[seen - 1 :]}) <= 1 + questions
 
 
 async def test_clear_area_becomes_unknown_when_the_aggregator_dies(fog, until):

@@ -161,7 +161,7 @@ def test_a_lost_byte_confuses_a_roomba_for_two_wheel_commands_at_most(speeds, da
     commands[0] = commands[0][:place] + commands[0][place + 1 :]
     for command in commands:
         roomba.receive(command, 0.0)
-    obeys = roomba.wheel_speeds_m_s == pytest.approx([speed / 1000 for speed in speeds[-1]], abs=0.0011)
+    obeys = roomba.wheel_speeds_m_s == pytest.approx([speed / 1000 for speed in speeds[-1]], abs=0.0021)
     assert obeys or roomba.mode != SAFE, "a mode that the stream reports"
 
 

@@ -86,7 +86,7 @@ async def test_restarted_aggregator_restores_the_blocked_area(fog, until):
         fog.kill("hazard_aggregator")
         fog.start("hazard_aggregator")
         await until(lambda: node.hazards[-1].epoch > epoch, "restarted", lambda: fog.log("hazard_aggregator"))
-        assert node.state == "blocked"
+        assert next(hazard for hazard in node.hazards if hazard.epoch > epoch).state == "blocked"
         await until(lambda: node.state == "unknown", "unknown because its node is silent")
         assert node.hazards[-1].penalty == 254
 

@@ -262,7 +262,7 @@ def drive_direct(right_mm_s: int, left_mm_s: int) -> bytes:
 def drive_wheels(left_m_s: float, right_m_s: float) -> bytes:
     """Drive Direct from speeds in m/s; beyond 0.5 both wheels are scaled alike, which keeps the curvature.
 
-    A speed may differ by 1 mm/s, so that none holds one of the `_SEVERING` opcodes: should the byte before be lost, the
+    A speed may be 2 mm/s less, so that none holds one of the `_SEVERING` opcodes: should the byte before be lost, the
     robot would obey it.
 
     Raises:

@@ -671,12 +671,6 @@ def test_too_old_command_changes_nothing(world):
     assert world.state().mode == "NORMAL"
 
 
-def test_command_is_executed_once(world):
-    command = sign(RobotCommand(kind="enable", robot="r1", operator="ann", nonce="n" * 16, **world.run_and_clock), KEY)
-    assert world.ask(command).accepted
-    assert "already" in world.ask(command).reason
-
-
 def test_command_replayed_to_a_restarted_agent_is_refused(world):
     command = RobotCommand(kind="enable", robot="r1", operator="ann", nonce="n" * 16, **world.run_and_clock)
     assert world.ask(sign(command, KEY)).accepted

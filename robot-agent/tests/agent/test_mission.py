@@ -67,17 +67,6 @@ def test_a_release_extends_the_path_as_its_repetition_does_and_keeps_the_progres
     assert mission.planner_age(4.0) == 1.0
 
 
-@pytest.mark.parametrize("other", [{"plan_id": 4}, {"plan_id": 6}, {"planner_epoch": 4}])
-def test_a_release_of_a_path_that_the_robot_lacks_extends_nothing_and_keeps_nothing_alive(mission, other):
-    mission.on_release(release(released_length=4.0, **other), 3.0)
-    assert mission.follower.released == 2.0
-    assert mission.path is PATH
-    assert mission.planner_age(4.0) == 2.0
-    mission.drop_path()
-    mission.on_release(release(**other), 5.0)
-    assert (mission.path, mission.planner_age(6.0)) == (None, 5.0)
-
-
 def test_a_release_keeps_a_refusal_alive(mission):
     refusal = changed(PATH, plan_id=6, points=[], refusal=Refusal(code=208, reason="cut off", causes=[]))
     mission.on_path(refusal, 3.0)
@@ -95,16 +84,6 @@ def test_planner_age_counts_from_when_path_and_releases_were_sent_by_their_delay
     # The clock of another host, of which nothing is known yet.
     mission.on_release(release(plan_id=6, sent=(4, 55.0)), 9.0)
     assert mission.planner_age(9.0) == 0.0
-
-
-def test_newest_path_that_comes_before_its_goal_is_kept_for_it(mission):
-    early = [changed(PATH, goal_id="g2", plan_id=plan_id) for plan_id in (8, 9, 7)]
-    assert [mission.on_path(path, 3.0) for path in early] == [False] * 3
-    assert mission.path is PATH
-    assert mission.take_early_path() is None
-    assert mission.on_goal(changed(GOAL, goal_id="g2"), 4.0)
-    assert mission.take_early_path() == early[1]
-    assert mission.take_early_path() is None
 
 
 METRES = st.floats(-20, 20)

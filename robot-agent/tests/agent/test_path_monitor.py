@@ -5,10 +5,10 @@ import numpy as np
 import pytest
 
 from fog_contracts.grid import GridGeometry, Window
-from fog_contracts.messages import Pose, Refusal, RobotGoal, RobotPath
+from fog_contracts.messages import Pose, RobotGoal, RobotPath
 from fog_contracts.replica import MasterMap, Replica, Version
 from robot_agent.agent.mission import Mission
-from robot_agent.agent.path_monitor import BLOCK_NEAR_M, MAP_GRACE_S, PLANNER_GRACE_S, PathMonitor
+from robot_agent.agent.path_monitor import MAP_GRACE_S, PLANNER_GRACE_S, PathMonitor
 
 GEOMETRY = GridGeometry(200, 20, 0.1, 0.0, 0.0)
 PATH = RobotPath(
@@ -87,20 +87,6 @@ def test_map_that_follows_the_paths_within_a_second_is_no_problem_however_often_
     assert rig.problem(now + 0.2 + MAP_GRACE_S) is not None
 
 
-def test_near_blockage_is_a_problem_immediately_and_until_it_is_cleared(rig):
-    rig.set(1.0 + BLOCK_NEAR_M - 0.2, 254)
-    assert "the path is blocked 2.8 m ahead" in rig.problem(1.0)
-    rig.set(1.0 + BLOCK_NEAR_M - 0.2, 0)
-    assert rig.problem(1.1) is None
-
-
-def test_distant_blockage_is_a_problem_after_the_planners_grace_period(rig):
-    rig.set(8.0, 254)
-    assert rig.problem(1.0) is None
-    assert rig.problem(1.0 + PLANNER_GRACE_S) is None
-    assert rig.problem(1.1 + PLANNER_GRACE_S) is not None
-
-
 def test_blockage_becomes_near_as_the_robot_approaches(rig):
     rig.set(5.0, 254)
     assert rig.problem(1.0) is None
@@ -114,12 +100,6 @@ def test_new_path_that_is_blocked_too_gets_no_new_grace_period(rig):
     rig.follow(msgspec.structs.replace(PATH, plan_id=2), 1.8)
     assert rig.problem(1.8) is None
     assert rig.problem(1.1 + PLANNER_GRACE_S) is not None
-
-
-def test_blocked_goal_is_named_in_the_problem(rig):
-    rig.set(15.0, 253)
-    assert rig.problem(1.0) is None
-    assert "the goal is blocked" in rig.problem(1.1 + PLANNER_GRACE_S)
 
 
 def test_a_planner_that_knew_the_map_may_lead_the_robot_out_of_a_lethal_cell(rig):
@@ -145,12 +125,6 @@ def test_path_of_another_map_is_a_problem_after_a_grace_period(rig):
     assert "another map" in rig.monitor.problem(rig.mission, other, 1.1 + PLANNER_GRACE_S)
     assert rig.monitor.problem(rig.mission, rig.replica.version, 3.0) is None
     assert rig.monitor.problem(rig.mission, other, 3.1) is None
-
-
-def test_refusal_is_a_problem_with_the_planners_reason(rig):
-    refusal = Refusal(code=208, reason="Z4 cuts the only way", causes=[])
-    rig.mission.on_path(msgspec.structs.replace(PATH, plan_id=2, points=[], refusal=refusal), 1.0)
-    assert "Z4 cuts the only way" in rig.problem(1.0)
 
 
 def test_ended_mission_has_no_problem(rig):

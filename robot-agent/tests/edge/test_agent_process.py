@@ -181,24 +181,6 @@ async def test_a_bumper_needs_an_authenticated_reset_that_reaches_the_guardian(r
     await until(lambda: robot.body.moving, "it drives again")
 
 
-async def test_a_bumper_held_pressed_before_the_first_enable_is_a_fault_until_a_reset(robot):
-    await robot.localized()
-    robot.body.robot.world.bump_left = True
-    await until(lambda: robot.fog.state.mode == "FAULT", "the fault is reported")
-    refused = await robot.fog.command("enable")
-    assert "reset it first" in refused.reason
-    refused = await robot.fog.command("reset")
-    assert "the cause is still there" in refused.reason
-    robot.body.robot.world.bump_left = False
-    end = time.monotonic() + DEADLINE_S
-    while not (reply := await robot.fog.command("reset")).accepted:
-        assert "the cause is still there" in reply.reason
-        assert time.monotonic() < end, f"the bumper is free, but no reset is accepted: {reply}"
-    await until(lambda: robot.watchdog.count("fault_reset") == 1, "the guardian is reset")
-    assert "NORMAL" not in {state.mode for state in robot.fog.states}
-    await enabled(robot)
-
-
 async def test_changes_of_the_map_are_applied_and_lost_ones_are_fetched(robot):
     await robot.localized()
     master, before = robot.fog.master, robot.fog.snapshots

@@ -81,14 +81,6 @@ def questions(sleep: BaseSleep, begin: float, seconds: float) -> list[float]:
     return [n / 16 for n in range(round(seconds * 16)) if sleep.ask(begin + n / 16)]
 
 
-def end_by_question(sleep: BaseSleep, at: float, number: int) -> None:
-    """Put it to sleep, and let it answer to its question of this number."""
-    assert sleep.begin(at) == b"sleep;"
-    assert len(questions(sleep, at, 1.0 + 0.5 * number)) == number
-    assert sleep.on_frame(at + 0.5 + 0.5 * number)
-    assert not sleep.asleep
-
-
 def test_sleeping_base_is_asked_after_a_second_and_every_half_second() -> None:
     assert questions(asleep(), 0.0, 3.0) == [1.0, 1.5, 2.0, 2.5]
 
@@ -99,20 +91,3 @@ def test_base_that_did_not_stay_asleep_is_left_awake_for_a_minute() -> None:
     assert sleep.begin(69.9375) == b""
     assert not sleep.asleep
     assert sleep.begin(70.0) == b"sleep;"
-
-
-@pytest.mark.parametrize("number", [1, 2, 3, 4])
-def test_base_that_answers_first_questions_of_two_sleeps_in_a_row_is_asked_no_more(number: int) -> None:
-    sleep = BaseSleep(SleepingBase())
-    for at in (100.0, 200.0):
-        end_by_question(sleep, at, number)
-    for at in (300.0, 400.0):
-        assert sleep.begin(at) == b"sleep;"
-        assert questions(sleep, at, 90.0) == []
-        sleep.on_frame(at + 30.0)
-
-
-def test_base_that_answers_later_questions_is_asked_on() -> None:
-    sleep = BaseSleep(SleepingBase())
-    for at in (100.0, 200.0, 300.0, 400.0):
-        end_by_question(sleep, at, 5)

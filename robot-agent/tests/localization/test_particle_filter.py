@@ -86,15 +86,6 @@ def test_scans_correct_odometry_that_drifts():
     assert math.hypot(*np.subtract(START.compose(odom)[:2], true[:2])) > 0.8  # error of the odometry alone
 
 
-def test_number_of_particles_shrinks_with_their_spread_and_the_seed_repeats_everything():
-    one, _, odom = driven(2, drift=0.0)
-    assert CONFIG.particles_min <= one.size < CONFIG.particles_start
-    again, _, _ = driven(2, drift=0.0)
-    other, _, _ = driven(3, drift=0.0)
-    assert again.pose(odom) == one.pose(odom)
-    assert other.pose(odom) != one.pose(odom)
-
-
 CORRIDOR = map_fields(*grid_of([(1, 1, 41, 3)], 42.0, 4.0), CONFIG)
 MIDDLE = Pose2(20.0, 2.0, 0.0)
 

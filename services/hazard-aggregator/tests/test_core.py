@@ -13,8 +13,6 @@ from fog_contracts.messages import (
     AreaHazard,
     NodeConfig,
     NodeReading,
-    NodeValue,
-    RobotPose,
     hazards_digest,
     is_relief,
 )
@@ -73,20 +71,6 @@ class Rig:
 
     def lines(self) -> list[str]:
         return [p.message for p in self.published if p.channel is ch.THESIS_WSN]
-
-
-def test_handler_of_every_channel_accepts_its_message():
-    rig = Rig()
-    pose = RobotPose(x=9.0, y=9.0, theta=0.0, covariance=[0.0] * 9, v=0.0, w=0.0, radius=0.2, height=0.3, stamp=0.0)
-    rig.read(3.0, 1)
-    rig.deliver(ch.NODE_VALUE, NodeValue(seq=1, boot=1, kind="gas", value=9.0, unit="ppm"), node="n1")
-    rig.deliver(ch.NODE_AVAILABILITY, "online", node="n1")
-    rig.deliver(ch.THESIS_AREA, "clear", number="7")
-    rig.deliver(ch.AREA_HAZARD, stored("blocked", 254), area="hall")
-    rig.deliver(ch.ROBOT_POSE, pose, robot="r1")
-    rig.deliver(ch.AGGREGATOR_HEARTBEAT, heartbeat(epoch=4))
-    rig.deliver(ch.AGGREGATOR_REQUEST, ch.REPUBLISH)
-    assert len(rig.core.handlers()) == 8
 
 
 def test_danger_is_published_at_once_with_its_thesis_line():
@@ -345,18 +329,6 @@ def test_thesis_line_has_the_position_of_node_or_area_and_none_when_clear():
 def hazard(state: str, seq: int, penalty: int | None = None, area: str = "hall") -> AreaHazard:
     cost = {"blocked": 254, "unknown": 200, "clear": 0}[state] if penalty is None else penalty
     return AreaHazard(area=area, state=state, severity=0, penalty=cost, since=0.0, seq=seq, epoch=1, cause="")
-
-
-def test_danger_is_announced_at_once_and_relief_once_it_is_stored():
-    outbox = Outbox()
-    blocked, clear = hazard("blocked", 1), hazard("clear", 2)
-    assert outbox.offer([blocked]) == [blocked]
-    assert outbox.offer([clear]) == []
-    assert outbox.announced() == [blocked]
-    assert outbox.withheld() == ["hall"]
-    assert outbox.mark_stored([clear]) == [clear]
-    assert outbox.announced() == [clear]
-    assert outbox.unstored() == []
 
 
 def test_stored_clear_is_not_announced_after_a_newer_danger():

@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Annotated, Final, Generic, Literal, NamedTuple
 import msgspec
 from msgspec import Meta
 
-from fog_contracts.messages import Finite, Power, Sentence, Strength
+from fog_contracts.messages import Code, Finite, Power, Sentence, Strength
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -23,6 +23,7 @@ if TYPE_CHECKING:
     import numpy as np
     from numpy.typing import NDArray
 
+    from fog_contracts.messages import Reason
     from robot_agent.device_signature import SerialSettings
     from robot_agent.stop_command import StopCommand
 
@@ -66,7 +67,8 @@ class BaseStatus(msgspec.Struct, frozen=True, kw_only=True):
     `overcurrent`: a wheel motor draws too much current. `battery`: charged fraction. `charging`: a charger is
     connected. `docked`: it is that of the dock, and no cable is plugged in. `power`: what it measures of battery and
     charger. `proximity`: strengths of its light sensors from the left to the right, in its own unit. `mode_problem`:
-    why the base does not obey wheel commands (None: it is in its driving mode).
+    why the base does not obey wheel commands (None: it is in its driving mode), `mode_code` its identifier, of the
+    driver's own (`fog_contracts.messages.Described`).
     """
 
     bumper_left: bool = False
@@ -80,6 +82,7 @@ class BaseStatus(msgspec.Struct, frozen=True, kw_only=True):
     power: Power | None = None
     proximity: tuple[Strength, ...] = ()
     mode_problem: Sentence | None = None
+    mode_code: Code = ""
 
     @property
     def bumper(self) -> bool:
@@ -290,8 +293,8 @@ class LidarDriver(Protocol):
         """Rated ranges and scan period of this lidar."""
 
     @property
-    def problem(self) -> str:
-        """Why there is no scan; empty while scans arrive."""
+    def problem(self) -> Reason | Literal[""]:
+        """Why there is no scan, with an identifier of the driver's own; empty while scans arrive."""
 
     @property
     def corrupted(self) -> int:

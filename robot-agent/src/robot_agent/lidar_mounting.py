@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, TypeVar
+from typing import TYPE_CHECKING, Literal, TypeVar
 
 import numpy as np
 
@@ -13,6 +13,7 @@ from robot_agent.hardware import LidarSamples
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
+    from fog_contracts.messages import Reason
     from robot_agent.device_signature import SerialSettings
     from robot_agent.hardware import LaserScan, LidarDriver, LidarEvents, LidarTraits
 
@@ -90,7 +91,7 @@ class MountedLidar:
         return self._driver.traits
 
     @property
-    def problem(self) -> str:
+    def problem(self) -> Reason | Literal[""]:
         """Why there is no scan; empty while scans arrive."""
         return self._driver.problem
 

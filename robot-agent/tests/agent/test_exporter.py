@@ -101,7 +101,9 @@ def test_computer_tells_temperature_throttling_and_signal_where_it_has_them(coll
 
 def test_agent_tells_mode_reasons_map_pose_and_errors(collector, metric):
     collector.observed = observed(
-        state=state(mode="DEGRADED", codes=["map_late", "map_late"], loop=LoopHealth(late_stops=2)),
+        state=state(
+            mode="DEGRADED", codes=["map_late", "map_late"], base_fault="bumper", loop=LoopHealth(late_stops=2)
+        ),
         map_age=1.2,
         particles=512,
         uncertainty=Uncertainty(0.2, 0.05, 0.03),
@@ -110,6 +112,7 @@ def test_agent_tells_mode_reasons_map_pose_and_errors(collector, metric):
     assert metric("robot_mode", mode="DEGRADED") == 1
     assert metric("robot_mode", mode="NORMAL") is None
     assert metric("robot_reason", reason="map_late") == 1
+    assert metric("robot_base_fault", fault="bumper") == 1
     assert metric("robot_map_age_seconds") == pytest.approx(1.2)
     assert (metric("robot_map_version", part="epoch"), metric("robot_map_version", part="seq")) == (7, 3)
     assert metric("particles") == 512

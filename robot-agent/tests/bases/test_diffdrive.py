@@ -234,11 +234,11 @@ def test_every_flag_is_decoded():
 
 
 @pytest.mark.parametrize(
-    ("flags", "words"), [(Flag(0), "switched off"), (Flag.EMERGENCY_STOP, "emergency button"), (Flag.ENABLED, None)]
+    ("flags", "code"), [(Flag(0), "motors_off"), (Flag.EMERGENCY_STOP, "emergency_button"), (Flag.ENABLED, "")]
 )
-def test_mode_problem_names_the_reason(flags, words):
-    problem = reading(Status(0, 0, 0, flags, 0)).status.mode_problem
-    assert problem is None if words is None else words in problem
+def test_mode_problem_has_its_identifier(flags, code):
+    status = reading(Status(0, 0, 0, flags, 0)).status
+    assert (status.mode_code, status.mode_problem is None) == (code, not code)
 
 
 @pytest.mark.parametrize(("millivolts", "charge"), [(0, None), (9_000, 0.0), (11_550, 0.5), (13_000, 1.0)])

@@ -98,7 +98,7 @@ def test_silence_restarts_the_scan():
     line.run(1.0)
     line.device.stalled = True
     line.run(SAMPLES_TIMEOUT_S + 0.1)
-    assert "no measurement" in line.driver.problem
+    assert line.driver.problem.code == "no_samples"
     line.device.stalled = False
     before = len(line.scans)
     line.run(1.0)
@@ -111,7 +111,7 @@ def test_lidar_that_does_not_answer_is_asked_repeatedly():
     line.cut = True
     line.run(3 * (ANSWER_TIMEOUT_S + STOP_S) + 0.2)
     assert line.sent.count(rplidar.get_health()) >= 3
-    assert "does not answer" in line.driver.problem
+    assert line.driver.problem.code == "no_answer"
     line.cut = False
     line.run(3.0)
     assert line.scans
@@ -122,6 +122,7 @@ def test_lidar_in_error_is_reset_and_restarted():
     line.device.health, line.device.error_code = 2, 7
     line.run(0.5)
     assert line.sent.endswith(rplidar.reset())
+    assert line.driver.problem.code == "reports_error"
     assert "error 7" in line.driver.problem
     assert "supply or cable" in line.driver.problem
     line.device.health = 0

@@ -8,6 +8,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from fog_contracts.messages import Reason
 from robot_agent.bases.roomba600.driver import Roomba600Driver, Roomba600Options
 from robot_agent.bases.roomba600.emulator import FULL, OFF, PASSIVE, SAFE, RoombaEmulator
 from robot_agent.guardian.core import COMMAND_FRESH_S, GuardianCore
@@ -405,6 +406,6 @@ def test_the_stop_command_stops_the_wheels():
 
 def test_fault_longer_than_its_field_in_the_feedback_is_cut() -> None:
     core = GuardianCore(Roomba600Driver(Roomba600Options()))
-    core._latch("the base left its driving mode: " + "x" * 600, now=1.0)
+    core._latch(Reason("mode_left", "the base left its driving mode: " + "x" * 600), now=1.0)
     assert core.latched is not None
     assert len(core.latched) == 500

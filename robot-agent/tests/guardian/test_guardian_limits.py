@@ -8,6 +8,8 @@ from plain_base import Rig
 from robot_agent.guardian.core import Limits
 from robot_agent.hardware import BaseReading, BaseStatus, WheelOdometry
 
+DROPPED = "a wheel has dropped: the robot was lifted or hangs over an edge"
+
 
 def test_command_is_fresh_for_0_2_s_and_no_longer() -> None:
     rig = Rig()
@@ -97,25 +99,26 @@ def test_overcurrent_that_pauses_begins_anew_although_a_driver_gives_an_earlier_
 
 
 @pytest.mark.parametrize(
-    ("status", "reason"),
+    ("status", "code", "reason"),
     [
-        ({"cliff": True}, "a cliff sensor sees no floor"),
-        ({"wheel_drop": True}, "a wheel has dropped: the robot was lifted or hangs over an edge"),
-        ({"bumper_left": True}, "the bumper is pressed (left)"),
-        ({"bumper_right": True}, "the bumper is pressed (right)"),
-        ({"bumper_left": True, "bumper_right": True}, "the bumper is pressed (both sides)"),
-        ({"mode_problem": "it sleeps"}, "the base left its driving mode: it sleeps"),
-        ({"cliff": True, "mode_problem": "it sleeps"}, "a cliff sensor sees no floor"),
-        ({"wheel_drop": True, "bumper_left": True}, "a wheel has dropped: the robot was lifted or hangs over an edge"),
+        ({"cliff": True}, "cliff", "a cliff sensor sees no floor"),
+        ({"wheel_drop": True}, "wheel_drop", DROPPED),
+        ({"bumper_left": True}, "bumper", "the bumper is pressed (left)"),
+        ({"bumper_right": True}, "bumper", "the bumper is pressed (right)"),
+        ({"bumper_left": True, "bumper_right": True}, "bumper", "the bumper is pressed (both sides)"),
+        ({"mode_problem": "it sleeps"}, "mode_left", "the base left its driving mode: it sleeps"),
+        ({"mode_problem": "it sleeps", "mode_code": "nap"}, "nap", "the base left its driving mode: it sleeps"),
+        ({"cliff": True, "mode_problem": "it sleeps"}, "cliff", "a cliff sensor sees no floor"),
+        ({"wheel_drop": True, "bumper_left": True}, "wheel_drop", DROPPED),
     ],
 )
-def test_each_fault_stops_the_wheels_in_its_frame_and_the_first_one_stays(status, reason) -> None:
+def test_each_fault_stops_the_wheels_in_its_frame_and_the_first_one_stays(status, code, reason) -> None:
     rig = Rig()
     assert rig.drive(0.1, 1.0) == (0.1, 0.1)
     output = rig.frame(1.001, **status)
     assert rig.wheels(output) == (0.0, 0.0)
     assert rig.core.latched == reason
-    assert output.feedback[-1].fault == reason
+    assert (output.feedback[-1].fault, output.feedback[-1].fault_code) == (reason, code)
     assert rig.frame(1.02).data == b""
     assert rig.frame(1.03, cliff=True, bumper_right=True).data == b""
     assert rig.core.latched == reason

@@ -10,7 +10,10 @@ from typing import NamedTuple
 import pytest
 
 from fog_contracts.messages import ReasonCode
+from robot_agent.bases.diffdrive.driver import DiffDriveFault
+from robot_agent.bases.roomba600.driver import RoombaFault
 from robot_agent.config import SafetyConfig
+from robot_agent.guardian.base_reports import FaultCode
 from robot_agent.safety.conditions import CONDITIONS, Finding, Level, SafetyInputs, collect_findings
 from robot_agent.safety.gate import MODE_OF, SafetyState, step
 
@@ -211,6 +214,13 @@ def test_safety_document_lists_every_identifier_once_and_each_condition_with_its
     modes = {row[0].strip("| `"): row[1] for row in rows}
     expected = {c.code: MODE_OF[c.level] + (", operator" if c.operator else "") for c in CONDITIONS}
     assert {code: modes[code] for code in expected} == expected
+
+
+def test_safety_document_names_each_fault_of_the_guardian_and_of_the_bases():
+    text = (Path(__file__).parents[3] / "docs" / "safety.md").read_text("utf-8")
+    section = text.partition("## Guardian and watchdog")[2].partition("\n- ")[0]
+    for code in (*FaultCode, *RoombaFault, *DiffDriveFault):
+        assert f"`{code}`" in section
 
 
 @pytest.mark.parametrize("row", ROWS, ids=[row.name for row in ROWS])

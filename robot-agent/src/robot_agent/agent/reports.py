@@ -115,6 +115,7 @@ def robot_state(  # noqa: PLR0913  # a message gathers from all parts of the age
         reasons=[reason[:_REASON_LIMIT] for reason in reasons],
         codes=[reason.code for reason in reasons],
         awaits_operator=safety.awaits_operator,
+        base_fault=feedback.fault_code if feedback else "",
         enabled=safety.enabled,
         battery=feedback.status.battery if feedback else None,
         goal_id=mission.goal_id,

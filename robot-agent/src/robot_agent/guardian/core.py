@@ -16,9 +16,9 @@ import math
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Final, NamedTuple
 
-from fog_contracts.messages import SENTENCE_MAX
+from fog_contracts.messages import SENTENCE_MAX, Reason
 from robot_agent.guardian.awakening import Attempt, BaseSleep, Revival
-from robot_agent.guardian.base_reports import FeedbackPolicy, fault_of, is_bump
+from robot_agent.guardian.base_reports import FaultCode, FeedbackPolicy, fault_of
 from robot_agent.guardian.link import WHEEL_SPEED_MAX_M_S, BaseFeedback, WheelCommand
 from robot_agent.guardian.maneuvers import Maneuvers, Situation
 from robot_agent.hardware import ASLEEP, NO_FRESH_COMMAND, ON_CHARGER, DockingDriver
@@ -81,7 +81,7 @@ class _Base:
     """How often control was taken since."""
     moved: bool = False
     """Whether a wheel was told to turn, or might turn by itself, since it was woken."""
-    silence: str | None = None
+    silence: Reason | None = None
     """The fault of a base that fell silent before it moved, until its next frame."""
     harmless: BaseStatus | None = None
     """The status that was checked last, if it is no fault, whatever the time: of an awake base without a maneuver."""
@@ -108,7 +108,7 @@ class GuardianCore:
         self._revival = Revival(self.driver.awakening)
         self._command: WheelCommand | None = None
         self._command_at = _NEVER
-        self._latched: str | None = None
+        self._latched: Reason | None = None
         self._bumped = False
         """Whether the latched fault is a pressed bumper."""
         self._maneuvers = Maneuvers(self.driver)
@@ -122,7 +122,7 @@ class GuardianCore:
         """Number of valid frames of the base."""
 
     @property
-    def latched(self) -> str | None:
+    def latched(self) -> Reason | None:
         """The fault that stops the wheels until a reset; None without one."""
         return self._latched
 
@@ -202,7 +202,8 @@ class GuardianCore:
             return self._bring_up(now)
         silent = now - base.reading_at
         if silent > timing.frame_timeout:
-            reason = f"the base has sent no valid frame for {silent:.1f} s: check cable and power"
+            sentence = f"the base has sent no valid frame for {silent:.1f} s: check cable and power"
+            reason = Reason(FaultCode.BASE_SILENT, sentence)
             if not base.moved and self._latched is None:
                 # Nothing that must be stopped has begun, so it is waited for as at its start (docs/safety.md).
                 base.awake, base.silence = False, reason
@@ -324,11 +325,11 @@ class GuardianCore:
         base.awake, base.woken_at, base.restrained, base.takes = False, now, True, 0
         return self._restrain(now)
 
-    def _latch(self, reason: str, now: float) -> bytes:
+    def _latch(self, reason: Reason, now: float) -> bytes:
         first = self._latched is None
         if first:
             # A driver's own words may fill the whole field.
-            self._latched, self._bumped = reason[:SENTENCE_MAX], is_bump(reason)
+            self._latched, self._bumped = Reason(reason.code, reason[:SENTENCE_MAX]), reason.code == FaultCode.BUMPER
         if self._maneuvers.running is not None:
             return self._end_maneuver(now)
         self._wheels, self._stepped_at = (0.0, 0.0), now
@@ -405,11 +406,13 @@ class GuardianCore:
         return () if reading is None or not self._feedback.is_overdue(now) else (self._report(reading, now),)
 
     def _report(self, reading: BaseReading, now: float) -> BaseFeedback:
+        fault = self._latched or self._base.silence
         return BaseFeedback(
             seq=self._feedback.on_report(reading, now),
             status=reading.status,
             odometry=reading.odometry,
-            fault=self._latched or self._base.silence,
+            fault=None if fault is None else str(fault),
+            fault_code="" if fault is None else fault.code,
             stopped=self._stopped(now),
             corrupted=self.corrupted,
             bumped=self._bumped,

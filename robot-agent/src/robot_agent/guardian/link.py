@@ -8,7 +8,7 @@ from typing import Annotated, Final, Literal
 import msgspec
 from msgspec import Meta, Struct
 
-from fog_contracts.messages import Count, Sentence
+from fog_contracts.messages import Code, Count, Sentence
 from robot_agent.hardware import BaseStatus, WheelOdometry
 
 PACKET_LIMIT = 4096
@@ -42,7 +42,8 @@ class WheelCommand(Struct, frozen=True, kw_only=True):
 class BaseFeedback(Struct, frozen=True, kw_only=True):
     """The newest reading of the base.
 
-    `fault`: the guardian's latched fault, or the silence of a base that has not moved yet (None: none). `stopped`: why
+    `fault`: the guardian's latched fault, or the silence of a base that has not moved yet (None: none), `fault_code`
+    its identifier. `stopped`: why
     the guardian keeps the wheels at zero whatever the agent requests (None: it does not). `corrupted`: damaged frames
     of the base so far. `bumped`: the fault is a pressed bumper, from which the robot may back off. `passing`: it is the
     silence of a base that has not moved yet, and ends with it. `at`: when it was sent, s of the monotonic clock that
@@ -54,6 +55,7 @@ class BaseFeedback(Struct, frozen=True, kw_only=True):
     odometry: WheelOdometry
     fault: Sentence | None
     stopped: Sentence | None
+    fault_code: Code = ""
     corrupted: Count = 0
     bumped: bool = False
     passing: bool = False

@@ -36,6 +36,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable
     from types import FrameType
 
+    from fog_contracts.messages import Reason
     from fog_contracts.robot import MotionSettings
     from robot_agent.guardian.awakening import Attempt
 
@@ -119,7 +120,7 @@ class Guardian:
         self._commands: Commands | None = None
         self._agent_heard_at = -1.0
         self._heartbeats = Heartbeats()
-        self._latched: str | None = None
+        self._latched: Reason | None = None
         self._pulse: tuple[Literal["rts", "dtr"], float] | None = None
         self._corrupted = 0
         self._log = logs.get("guardian")
@@ -294,8 +295,11 @@ class Guardian:
         if output.data:
             self._port.write(output.data)
         if self._core.latched != self._latched:
-            self._latched = self._core.latched
-            self._log.warning("fault_latched" if self._latched else "fault_reset", reason=self._latched)
+            self._latched = latched = self._core.latched
+            if latched is None:
+                self._log.warning("fault_reset")
+            else:
+                self._log.warning("fault_latched", fault=latched.code, reason=str(latched))
         if self._agent is None:
             return
         for feedback in output.feedback:

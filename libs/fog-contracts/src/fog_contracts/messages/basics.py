@@ -68,16 +68,16 @@ class Reason(str):
     """
 
     __slots__ = ("causes", "code")
-    code: StrEnum
-    causes: tuple[StrEnum, ...]
+    code: str
+    causes: tuple[str, ...]
 
-    def __new__(cls, code: StrEnum, sentence: str, causes: Iterable[StrEnum] = ()) -> Self:
+    def __new__(cls, code: str, sentence: str, causes: Iterable[str] = ()) -> Self:
         """Return a sentence with its identifier, and those of its causes."""
         reason = super().__new__(cls, sentence)
         reason.code, reason.causes = code, tuple(causes)
         return reason
 
-    def __reduce__(self) -> tuple[type[Self], tuple[StrEnum, str, tuple[StrEnum, ...]]]:
+    def __reduce__(self) -> tuple[type[Self], tuple[str, str, tuple[str, ...]]]:
         """Return what a copy is made from."""
         return type(self), (self.code, str(self), self.causes)
 

@@ -306,7 +306,8 @@ class RobotState(Message, frozen=True, kw_only=True):
     `docked`: it stands on its dock. `wants_dock`: it asks the planner for the goal in front of its dock.
     `places`: where on the map it may be, most likely first, while its scans do not decide; empty otherwise.
     `codes` identifies each of the `reasons`, in their order (`ReasonCode`); a newer robot may have others.
-    `awaits_operator`: it does not drive before an operator enables or resets it.
+    `awaits_operator`: it does not drive before an operator enables or resets it. `base_fault` identifies the fault that
+    the guardian has latched: a base may have its own.
     """
 
     mode: Mode
@@ -335,6 +336,7 @@ class RobotState(Message, frozen=True, kw_only=True):
     places: Annotated[list[Pose], Meta(max_length=8)] = []
     codes: Codes = []
     awaits_operator: bool = False
+    base_fault: Code = ""
 
 
 VIEW_SECTORS: Final = 180

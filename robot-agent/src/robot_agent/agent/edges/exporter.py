@@ -116,6 +116,10 @@ def _agent(observed: Observed) -> list[Metric]:
         _by_label(
             "fognav_robot_reason", "1 for each reason of the mode", "reason", dict.fromkeys(state.codes, 1)
         ),
+        _by_label(
+            "fognav_robot_base_fault",
+            "1 for the fault that the guardian has latched", "fault", {state.base_fault: 1} if state.base_fault else {},
+        ),
         _by_label("fognav_robot_map_version", "Version of the robot's map", "part", version),
         _single("fognav_robot_map_age_seconds", "Time since the robot's map was last confirmed", observed.map_age),
         _single("fognav_particles", "Particles of the localization", observed.particles or None),

@@ -12,8 +12,9 @@ from __future__ import annotations
 
 import asyncio
 from contextlib import suppress
-from typing import TYPE_CHECKING, Final, NamedTuple
+from typing import TYPE_CHECKING, Final, Literal, NamedTuple
 
+from fog_contracts.messages import Described, Reason
 from fog_runtime import logs
 from fog_runtime.configuration.settings import SettingsError
 from robot_agent.device_signature import LISTEN_S
@@ -57,6 +58,13 @@ async def wrong_device(port: Port, check: LineCheck, clock: Clock) -> str | None
     return None
 
 
+class PortProblem(Described):
+    """Why nothing is heard of a lidar's driver yet."""
+
+    PORT_CLOSED = "port_closed", "its port can't be opened, or was lost"
+    WRONG_DEVICE = "wrong_device", "another device speaks on its port"
+
+
 class LidarEdge:
     """Keeps a scan running on one port; `poll` reads it, on the loop's thread."""
 
@@ -82,7 +90,7 @@ class LidarEdge:
         self._port: Port | None = None
         self._lost: asyncio.Future[None] | None = None
         self._fetched = b""
-        self.problem = "the lidar's port was not opened yet"
+        self.problem: Reason | Literal[""] = Reason(PortProblem.PORT_CLOSED, "the lidar's port was not opened yet")
 
     async def run(self) -> None:
         """Open the port, scan, and start over when it is lost, until cancelled.
@@ -100,7 +108,7 @@ class LidarEdge:
                     if await self._begin(port):
                         await self._scan(port)
             except PortLost as error:
-                self._report(str(error))
+                self._report(Reason(PortProblem.PORT_CLOSED, str(error)))
             except PortNameError as error:
                 raise SettingsError(f"lidar.port: {error}") from error
             await self._clock.sleep(REOPEN_S)
@@ -110,7 +118,7 @@ class LidarEdge:
         set_motor(port, self._driver.serial, on=True)
         port.discard_input()
         if self._check is not None and (problem := await wrong_device(port, self._check(), self._clock)) is not None:
-            self._report(problem)
+            self._report(Reason(PortProblem.WRONG_DEVICE, problem))
             return False
         port.write(self._driver.begin(self._clock.now()))
         return True
@@ -189,10 +197,10 @@ class LidarEdge:
             port.discard_input()
             port.write(self._driver.begin(now))
 
-    def _report(self, problem: str) -> None:
+    def _report(self, problem: Reason | Literal[""]) -> None:
         self.problem = problem
         if problem and problem != self._last_logged:
-            _log.warning("lidar_problem", reason=problem)
+            _log.warning("lidar_problem", problem=problem.code, reason=str(problem))
         self._last_logged = problem
 
 

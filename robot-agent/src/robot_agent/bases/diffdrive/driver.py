@@ -8,11 +8,18 @@ from typing import Annotated, Final
 import msgspec
 from msgspec import Meta
 
-from fog_contracts.messages import Power
+from fog_contracts.messages import Described, Power
 from robot_agent.bases.diffdrive import protocol
 from robot_agent.bases.diffdrive.protocol import Flag
 from robot_agent.bases.diffdrive.stop import STOP
 from robot_agent.hardware import Awakening, BaseFactory, BaseReading, BaseStatus, BaseTiming, DriveTrain, WheelOdometry
+
+
+class DiffDriveFault(Described):
+    """Why the board does not obey."""
+
+    EMERGENCY_BUTTON = "emergency_button", "its emergency button is pressed"
+    MOTORS_OFF = "motors_off", "its motors are switched off"
 
 
 class DiffDriveOptions(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
@@ -99,6 +106,7 @@ class DiffDriveDriver:
 
     def _base_status(self, status: protocol.Status) -> BaseStatus:
         flags = status.flags
+        fault = _fault(flags)
         return BaseStatus(
             bumper_left=Flag.BUMPER_LEFT in flags,
             bumper_right=Flag.BUMPER_RIGHT in flags,
@@ -108,7 +116,8 @@ class DiffDriveDriver:
             battery=self._charge(status.battery_mv),
             charging=Flag.CHARGER in flags,
             power=Power(voltage_v=status.battery_mv / 1000.0) if status.battery_mv else None,
-            mode_problem=_mode_problem(flags),
+            mode_problem=None if fault is None else fault.says,
+            mode_code=fault or "",
         )
 
     def _charge(self, battery_mv: int) -> float | None:
@@ -118,10 +127,10 @@ class DiffDriveDriver:
         return min(1.0, max(0.0, (battery_mv / 1000.0 - empty) / (full - empty)))
 
 
-def _mode_problem(flags: Flag) -> str | None:
+def _fault(flags: Flag) -> DiffDriveFault | None:
     if Flag.EMERGENCY_STOP in flags:
-        return "its emergency button is pressed"
-    return None if Flag.ENABLED in flags else "its motors are switched off"
+        return DiffDriveFault.EMERGENCY_BUTTON
+    return None if Flag.ENABLED in flags else DiffDriveFault.MOTORS_OFF
 
 
 FACTORY: Final = BaseFactory(options=DiffDriveOptions, make=DiffDriveDriver, stop=STOP)

@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING, Annotated, Final, Literal, NamedTuple
 import msgspec
 from msgspec import Meta
 
-from fog_contracts.messages import Power
+from fog_contracts.messages import Described, Power
 from robot_agent.bases.roomba600 import open_interface as oi
 from robot_agent.bases.roomba600.open_interface import Mode
 from robot_agent.bases.roomba600.stop import STOP
@@ -45,6 +45,17 @@ SAME_FRAMES: Final = 3
 NOISE_S: Final = 0.1
 """A number that is no mode is ignored for so long."""
 _MODES: Final = {mode.value: mode for mode in Mode}
+
+
+class RoombaFault(Described):
+    """Why a Roomba does not obey: the mode that its Open Interface is in."""
+
+    STARTING = "starting", "its Open Interface is being started"
+    MODE_OFF = "mode_off", "mode Off"
+    MODE_PASSIVE = "mode_passive", "mode Passive: a button, its charger or its own protection ended Safe"
+    MODE_SAFE = "mode_safe", "mode Safe, while it leaves its dock"
+    MODE_FULL = "mode_full", "mode Full, which nobody asked for"
+    MODE_UNKNOWN = "mode_unknown", "a mode that does not exist"
 
 
 class ModeMonitor:
@@ -327,6 +338,7 @@ def _status(frame: oi.Frame, mode: oi.Mode | int | None, modes: frozenset[oi.Mod
         power=measured.power,
         proximity=measured.proximity,
         mode_problem=None if mode in modes else _mode_problem(frame, mode),
+        mode_code="" if mode in modes else _MODE_FAULTS.get(mode, RoombaFault.MODE_UNKNOWN),
     )
 
 
@@ -336,6 +348,15 @@ def _mode_problem(frame: oi.Frame, mode: oi.Mode | int | None) -> str:
     name = mode.name.capitalize() if isinstance(mode, oi.Mode) else f"number {mode}"
     reason = ", because a charger is connected" if frame.on_charger else ""
     return f"its Open Interface is in mode {name} instead of Safe{reason}"
+
+
+_MODE_FAULTS: Final[Mapping[int | None, RoombaFault]] = {
+    None: RoombaFault.STARTING,
+    oi.Mode.OFF: RoombaFault.MODE_OFF,
+    oi.Mode.PASSIVE: RoombaFault.MODE_PASSIVE,
+    oi.Mode.SAFE: RoombaFault.MODE_SAFE,
+    oi.Mode.FULL: RoombaFault.MODE_FULL,
+}
 
 
 FACTORY: Final = BaseFactory(options=Roomba600Options, make=Roomba600Driver, stop=STOP)

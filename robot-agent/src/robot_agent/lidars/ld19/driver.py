@@ -2,16 +2,23 @@
 
 from __future__ import annotations
 
-from typing import Annotated, Final
+from typing import Annotated, Final, Literal
 
 import msgspec
 from msgspec import Meta
 
+from fog_contracts.messages import Described, Reason
 from robot_agent.device_signature import SerialSettings
 from robot_agent.hardware import LaserScan, LidarEvents, LidarFactory, LidarTraits
 from robot_agent.lidars.ld19 import protocol
 
 SAMPLES_TIMEOUT_S: Final = 1.0
+
+
+class Ld19Problem(Described):
+    """Why there is no scan."""
+
+    NO_PACKETS = "no_packets", "no valid packet arrives"
 
 
 class Ld19Options(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
@@ -35,7 +42,7 @@ class Ld19Driver:
         self._parser = protocol.Parser()
         self._assembler = protocol.ScanAssembler(chosen.intensity_min)
         self._samples_at = 0.0
-        self.problem = ""
+        self.problem: Reason | Literal[""] = ""
 
     @property
     def corrupted(self) -> int:
@@ -61,9 +68,8 @@ class Ld19Driver:
     def tick(self, now: float) -> bytes:
         """Advance time; a silent lidar is a problem, but no command can restart it."""
         if now - self._samples_at > SAMPLES_TIMEOUT_S:
-            self.problem = (
-                f"the lidar has sent no valid packet for {SAMPLES_TIMEOUT_S:.0f} s; check its cable and power"
-            )
+            sentence = f"the lidar has sent no valid packet for {SAMPLES_TIMEOUT_S:.0f} s; check its cable and power"
+            self.problem = Reason(Ld19Problem.NO_PACKETS, sentence)
         return b""
 
 

@@ -7,6 +7,7 @@ from typing import Annotated, Final, Literal
 import msgspec
 from msgspec import Meta
 
+from fog_contracts.messages import Described, Reason
 from robot_agent.device_signature import SerialSettings
 from robot_agent.hardware import LaserScan, LidarEvents, LidarFactory, LidarTraits
 from robot_agent.lidars.rplidar_a1 import protocol as rplidar
@@ -16,6 +17,14 @@ STOP_S: Final = 0.1
 ANSWER_TIMEOUT_S: Final = 1.0
 SAMPLES_TIMEOUT_S: Final = 1.0
 RESET_S: Final = 2.0
+
+
+class RplidarA1Problem(Described):
+    """Why there is no scan."""
+
+    NO_ANSWER = "no_answer", "it does not answer"
+    NO_SAMPLES = "no_samples", "it has stopped measuring"
+    REPORTS_ERROR = "reports_error", "it reports an error of its own"
 
 
 class RplidarA1Options(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
@@ -47,7 +56,7 @@ class RplidarA1Driver:
         self._assembler = rplidar.ScanAssembler()
         self._phase: Literal["closed", "stopping", "checking", "scanning", "resetting"] = "closed"
         self._since = 0.0
-        self.problem = ""
+        self.problem: Reason | Literal[""] = ""
 
     @property
     def incomplete(self) -> int:
@@ -88,10 +97,12 @@ class RplidarA1Driver:
         if self._phase == "stopping" and waited >= STOP_S:
             return self._enter("checking", now, rplidar.get_health())
         if self._phase == "checking" and waited > ANSWER_TIMEOUT_S:
-            self.problem = "the lidar does not answer; check its cable and power"
+            sentence = "the lidar does not answer; check its cable and power"
+            self.problem = Reason(RplidarA1Problem.NO_ANSWER, sentence)
             return self._enter("stopping", now, rplidar.stop())
         if self._phase == "scanning" and waited > SAMPLES_TIMEOUT_S:
-            self.problem = f"the lidar has sent no measurement for {SAMPLES_TIMEOUT_S:.0f} s; its scan is restarted"
+            sentence = f"the lidar has sent no measurement for {SAMPLES_TIMEOUT_S:.0f} s; its scan is restarted"
+            self.problem = Reason(RplidarA1Problem.NO_SAMPLES, sentence)
             return self._enter("stopping", now, rplidar.stop())
         if self._phase == "resetting" and waited > RESET_S:
             return self._enter("stopping", now, rplidar.stop())
@@ -99,10 +110,11 @@ class RplidarA1Driver:
 
     def _on_health(self, health: rplidar.Health, now: float) -> bytes:
         if health.status == rplidar.HealthStatus.ERROR:
-            self.problem = (
+            sentence = (
                 f"the lidar reports error {health.error_code}; it is reset. The cause is nearly always its supply or "
                 "cable (5 V at the plug, under load), or mounting screws that are longer than 4 mm"
             )
+            self.problem = Reason(RplidarA1Problem.REPORTS_ERROR, sentence)
             return self._enter("resetting", now, rplidar.reset())
         return self._enter("scanning", now, rplidar.scan())
 

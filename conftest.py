@@ -43,12 +43,13 @@ LONGER: Final = (
     "FOGNAV_WRITES",
 )  # fmt: skip
 """Variables that set how much some tests try, which may take hours then (CONTRIBUTING.md)."""
+COMMIT: Final = pytest.StashKey[str]()
 LAST_LONG_RUN: Final = ROOT / "tests" / "last-long-run.txt"
 REACTION, COMPUTING, SYSTEM, LIVE, COMPOSE = range(5)
 """Kinds of test modules, in the order in which they are started."""
 
 
-def pytest_configure() -> None:
+def pytest_configure(config: pytest.Config) -> None:
     """Give each worker its own range of ports, and the programs that it starts the usual signals.
 
     Two workers that search for a port at the same moment would find the same one.
@@ -56,6 +57,8 @@ def pytest_configure() -> None:
     if signal.getsignal(signal.SIGHUP) == signal.SIG_IGN:
         # Under nohup. What is ignored is inherited by the programs that tests start and hang up; a handler is not.
         signal.signal(signal.SIGHUP, lambda *_: None)
+    if config.getoption("tier", "all") == "long":
+        config.stash[COMMIT] = commit()
     share = len(net.PORTS) // WORKERS
     net.PORTS = net.PORTS[int(WORKER) * share : (int(WORKER) + 1) * share]
 
@@ -154,17 +157,22 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
         items.sort(key=lambda item: group_of(module_of(item.nodeid)))
 
 
+def commit() -> str:
+    """Return what is tested, as git names it."""
+    git = ["git", "-C", str(ROOT), "describe", "--always", "--dirty"]
+    done = subprocess.run(git, capture_output=True, text=True, check=False)  # noqa: S603  # a fixed command, no shell
+    return done.stdout.strip() or "no commit"
+
+
 def pytest_terminal_summary(terminalreporter: "TerminalReporter", config: pytest.Config) -> None:
     """Keep the date and result of the last run of all long tests, to be committed."""
-    if config.getoption("tier", "all") != "long" or config.args_source != pytest.Config.ArgsSource.TESTPATHS:
+    selected = config.args_source != pytest.Config.ArgsSource.TESTPATHS or config.option.keyword
+    if config.getoption("tier", "all") != "long" or selected or config.option.markexpr:
         return
     counts = {kind: len(terminalreporter.stats.get(kind, [])) for kind in ("passed", "failed", "error", "skipped")}
     told = ", ".join(f"{count} {kind}" for kind, count in counts.items() if count) or "no test ran"
-    git = ["git", "-C", str(ROOT), "describe", "--always", "--dirty"]
-    done = subprocess.run(git, capture_output=True, text=True, check=False)  # noqa: S603  # a fixed command, no shell
-    commit = done.stdout.strip() or "no commit"
     machine = f"{os.cpu_count()} cores, {platform.system()} {platform.machine()}"
-    line = f"{datetime.now(UTC):%Y-%m-%d}, {commit}: {told} ({machine})\n"
+    line = f"{datetime.now(UTC):%Y-%m-%d}, {config.stash[COMMIT]}: {told} ({machine})\n"
     LAST_LONG_RUN.write_text(line, "utf-8")
     terminalreporter.line(f"commit {LAST_LONG_RUN.relative_to(ROOT)}: {line}")
 

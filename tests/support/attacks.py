@@ -33,6 +33,8 @@ class Attack:
         self._said = said
         self.rate = rate
         self._held_s = held_s
+        # Of connections that soon end no more pile up after a moment.
+        self.enough = min(FLOOD, rate * (6 if held_s >= 1.0 else 2))
         self._tls = net.unverified() if encrypts else None
         self.made = 0
 
@@ -80,11 +82,14 @@ ATTACKS: dict[str, Callable[[int], Attack]] = {
 
 @asynccontextmanager
 async def running(attack: Attack) -> AsyncIterator[None]:
-    """Run an attack, from its sixth second or 1,100th connection on: more than a process has descriptors."""
+    """Run an attack, from its second or, if connections stay, sixth second, or from its 1,100th connection on.
+
+    These are more than a process has descriptors.
+    """
     task = asyncio.create_task(attack.run())
     try:
         async with asyncio.timeout(LIMIT_S):
-            while attack.made < min(FLOOD, attack.rate * 6):  # noqa: ASYNC110  # the attack sets no event
+            while attack.made < attack.enough:  # noqa: ASYNC110  # the attack sets no event
                 await asyncio.sleep(0.1)
         yield
     finally:

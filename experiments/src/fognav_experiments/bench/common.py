@@ -13,12 +13,17 @@ import numpy as np
 
 from fog_contracts.costs import FREE, LETHAL
 from fog_contracts.grid import GridGeometry, StaticMap
+from fog_contracts.messages import RobotPose, RobotState
 from fog_runtime.configuration.maps import save_map
+from fog_supervisor import net
 
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator, Coroutine
 
     from numpy.typing import NDArray
+
+    from fog_contracts.messages import RobotPath
+    from fognav.stack import Stack
 
 
 class RunningSystem(ABC):
@@ -53,6 +58,28 @@ async def in_background(work: Coroutine[None, None, None], name: str) -> AsyncIt
         task.cancel()
         with suppress(asyncio.CancelledError):
             await task
+
+
+async def ask(stack: Stack, service: str, method: str, path: str, body: object = None) -> net.Response:
+    """Send a request to a service that runs; return its answer, also a refusal."""
+    port = stack.port(service)
+    assert port is not None
+    return await asyncio.to_thread(net.request, method, port, path, body=body, token=stack.token)
+
+
+def standing(x: float, y: float, stamp: float, theta: float = 0.0) -> RobotPose:
+    """Return the pose of a stand-in for a robot, lower than any sensor: it is no hazard itself."""
+    return RobotPose(
+        x=x, y=y, theta=theta, covariance=[0.0] * 9, v=0.0, w=0.0, radius=0.17, height=0.1, stamp=stamp
+    )  # fmt: skip
+
+
+def following(path: RobotPath, stamp: float = 0.0) -> RobotState:
+    """Return the state of a stand-in that has this path: the planner does not repeat a path that its robot names."""
+    return RobotState(
+        mode="NORMAL", reasons=[], enabled=True, battery=None, goal_id=path.goal_id, map_epoch=path.map_epoch,
+        map_seq=path.map_seq, plan_id=path.plan_id, planner_epoch=path.planner_epoch, stamp=stamp,
+    )  # fmt: skip
 
 
 def first_child(pid: int) -> int | None:

@@ -28,8 +28,6 @@ from fog_contracts.messages import (
     RectangleShape,
     RobotGoal,
     RobotPath,
-    RobotPose,
-    RobotState,
     Zone,
     ZoneSet,
 )
@@ -37,7 +35,7 @@ from fog_contracts.replica import MasterMap
 from fog_contracts.shapes import rasterize, rasterize_shape
 from fog_kernels.components import Components
 from fog_kernels.inflation import inflate, inflate_window, inflation_table
-from fognav_experiments.bench.common import CORRIDOR, corridor_rows
+from fognav_experiments.bench.common import CORRIDOR, corridor_rows, following, standing
 from planner.core import PlannerCore
 
 if TYPE_CHECKING:
@@ -201,10 +199,7 @@ class Fleet:
         """Deliver a heartbeat of the map and every robot's pose."""
         self._deliver(ch.MAP_HEARTBEAT, self.map.master.heartbeat(self.now))
         for robot, ((x, y), _) in self._trips.items():
-            pose = RobotPose(
-                x=x, y=y, theta=0.0, covariance=[0.0] * 9, v=0.0, w=0.0, radius=0.17, height=0.1, stamp=self.now
-            )
-            self._deliver(ch.ROBOT_POSE, pose, robot=robot)
+            self._deliver(ch.ROBOT_POSE, standing(x, y, self.now), robot=robot)
 
     def settle(self) -> None:
         """Let all searches and jobs end, those that have to wait too; nothing is measured."""
@@ -222,12 +217,7 @@ class Fleet:
         for publication in publications:
             path = publication.message
             if isinstance(path, RobotPath):
-                state = RobotState(
-                    mode="NORMAL", reasons=[], enabled=True, battery=None, goal_id=path.goal_id,
-                    map_epoch=path.map_epoch, map_seq=path.map_seq, plan_id=path.plan_id,
-                    planner_epoch=path.planner_epoch,
-                )  # fmt: skip
-                self._deliver(ch.ROBOT_STATE, state, **publication.ids)
+                self._deliver(ch.ROBOT_STATE, following(path), **publication.ids)
 
     def trial(self, deltas: Sequence[MapDelta], hazard: HazardArea) -> Times:
         """Deliver a change of the map; return when each robot had its answer."""

@@ -24,15 +24,14 @@ import zenoh
 
 from fog_contracts import channels as ch
 from fog_contracts.codec import decode
-from fog_contracts.messages import RobotPath, RobotPose, RobotState
+from fog_contracts.messages import RobotPath
 from fog_runtime.clock import SystemClock, ticker
 from fog_runtime.transports.zenoh_edge import ZenohEdge, session_config
-from fog_supervisor import net
 from fog_supervisor.supervisor import NotReadyError, log_tail
 from fognav.output import FailedError
 from fognav.programs import PLANNER, REDIS, ROUTER
 from fognav.stack import Doors, Stack, StackConfig
-from fognav_experiments.bench.common import SITE, in_background, write_site
+from fognav_experiments.bench.common import SITE, ask, following, in_background, standing, write_site
 from fognav_experiments.bench.fleet import closures, hazard_message, percentile
 
 if TYPE_CHECKING:
@@ -117,21 +116,15 @@ class _Planner:
     def __init__(self, stack: Stack, world: StandIns, fleet: Mapping[str, Trip]) -> None:
         self.world = world
         self._fleet = fleet
-        self._stack = stack
+        self._ask = partial(ask, stack, PLANNER)
         self.process = psutil.Process(stack.pids()[PLANNER])
-        port = stack.port(PLANNER)
-        assert port is not None
-        self._port = port
-
-    async def _request(self, method: str, path: str, body: object = None) -> net.Response:
-        return await asyncio.to_thread(net.request, method, self._port, path, body=body, token=self._stack.token)
 
     async def send_all(self) -> None:
         """Give every robot a mission, as an operator does, and wait for the paths; raises `FailedError`."""
         await self._know(len(self._fleet))
         goal_ids = {}
         for robot, (_, (x, y)) in self._fleet.items():
-            response = await self._request("PUT", f"/api/v1/robots/{robot}/goal", {"pose": {"x": x, "y": y}})
+            response = await self._ask("PUT", f"/api/v1/robots/{robot}/goal", {"pose": {"x": x, "y": y}})
             if not isinstance(response.body, dict) or "goal_id" not in response.body:
                 raise FailedError(f"the planner refused the goal of {robot} at ({x}, {y}): {response.reason}")
             goal_ids[robot] = response.body["goal_id"]
@@ -147,14 +140,14 @@ class _Planner:
     async def _know(self, robots: int) -> None:
         """Wait until the planner has heard of so many robots: it has goals for no others."""
         deadline = time.monotonic() + _READY_S
-        while not isinstance(found := (await self._request("GET", "/api/v1/robots")).body, list) or len(found) < robots:
+        while not isinstance(found := (await self._ask("GET", "/api/v1/robots")).body, list) or len(found) < robots:
             if time.monotonic() > deadline:
                 raise FailedError(f"the planner does not know its {robots} robots within {_READY_S:.0f} s: {found}")
             await asyncio.sleep(QUIET_S / 10)
 
     async def field_bytes(self) -> float:
         """Return the memory of all distance fields."""
-        found = _FIELD_BYTES.search(str((await self._request("GET", "/metrics")).body))
+        found = _FIELD_BYTES.search(str((await self._ask("GET", "/metrics")).body))
         if found is None:
             raise FailedError("the planner's /metrics lack fognav_planner_goal_fields_bytes")
         return float(found[1])
@@ -342,21 +335,12 @@ class StandIns:
 
     def _publish_pose(self, robot: str) -> None:
         x, y = self._fleet[robot].place
-        pose = RobotPose(
-            x=x, y=y, theta=0.0, covariance=[0.0] * 9, v=0.0, w=0.0, radius=0.17, height=0.1,
-            stamp=self._clock.stamp(),
-        )  # fmt: skip
-        self._edge.publish(ch.ROBOT_POSE, pose, robot=robot)
+        self._edge.publish(ch.ROBOT_POSE, standing(x, y, self._clock.stamp()), robot=robot)
 
     def _publish_state(self, robot: str) -> None:
         path = self.receivers.paths.get(robot)
-        if path is None:
-            return
-        state = RobotState(
-            mode="NORMAL", reasons=[], enabled=True, battery=None, goal_id=path.goal_id, map_epoch=path.map_epoch,
-            map_seq=path.map_seq, plan_id=path.plan_id, planner_epoch=path.planner_epoch, stamp=self._clock.stamp(),
-        )  # fmt: skip
-        self._edge.publish(ch.ROBOT_STATE, state, robot=robot)
+        if path is not None:
+            self._edge.publish(ch.ROBOT_STATE, following(path, self._clock.stamp()), robot=robot)
 
     async def change(self, deltas: Sequence[MapDelta], hazard: HazardArea, *, refused: bool) -> Change:
         """Publish a change of the map; return what followed until every robot has a path, or is `refused` one.

@@ -14,15 +14,14 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
 from fog_contracts import channels as ch
-from fog_contracts.messages import MapSnapshot, RobotPath, RobotPose
+from fog_contracts.messages import MapSnapshot, RobotPath
 from fog_runtime.clock import SystemClock, ticker
 from fog_runtime.transports.zenoh_edge import ZenohEdge
-from fog_supervisor import net
 from fog_supervisor.supervisor import NotReadyError, log_tail
 from fognav.output import FailedError
 from fognav.programs import MAP_SERVICE, PLANNER, SERVERS
 from fognav.stack import Stack, StackConfig
-from fognav_experiments.bench.common import SITE, corridor_rows, in_background, make_office, write_site
+from fognav_experiments.bench.common import SITE, ask, corridor_rows, in_background, make_office, standing, write_site
 
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator, Callable
@@ -113,10 +112,7 @@ class _Robot:
         """Publish the pose until cancelled."""
         clock, (x, y) = SystemClock(), self._place
         async for _ in ticker(clock, ch.ROBOT_POSE.period_s):
-            pose = RobotPose(
-                x=x, y=y, theta=0.0, covariance=[0.0] * 9, v=0.0, w=0.0, radius=0.17, height=0.1, stamp=clock.stamp()
-            )
-            self._edge.publish(ch.ROBOT_POSE, pose, robot=ROBOT)
+            self._edge.publish(ch.ROBOT_POSE, standing(x, y, clock.stamp()), robot=ROBOT)
 
     async def measure(self, goal: PointXY) -> dict[str, float | int]:
         """Read a snapshot, drive to a goal, then have a zone put across the path, and taken off again."""
@@ -157,12 +153,10 @@ class _Robot:
 
         Raises `FailedError` for another refusal.
         """
-        port = self._stack.port(service)
-        assert port is not None
         deadline = time.monotonic() + _READY_S
         while True:
             begun = time.perf_counter()
-            response = await asyncio.to_thread(net.request, method, port, path, body=body, token=self._stack.token)
+            response = await ask(self._stack, service, method, path, body)
             if response.status in (200, 201):
                 return begun
             if response.status != 404 or time.monotonic() > deadline:

@@ -30,11 +30,10 @@ from fog_contracts.messages import MapDelta, NodeReading, RobotPose
 from fog_runtime.credentials import NOBODY, Credentials
 from fog_runtime.transports.mqtt_connection import Broker
 from fog_runtime.transports.zenoh_edge import session_config
-from fog_supervisor import net
 from fognav.output import FailedError
 from fognav.programs import AGGREGATOR, MAP_SERVICE, SERVERS
 from fognav.stack import Doors, Stack, StackConfig
-from fognav_experiments.bench.common import SITE, make_office, write_site
+from fognav_experiments.bench.common import SITE, ask, make_office, write_site
 
 if TYPE_CHECKING:
     from asyncio.subprocess import Process
@@ -94,9 +93,7 @@ class _Fog:
         raise FailedError("nodes are not clear though all measure that: this machine can't keep up")
 
     async def _list(self, path: str) -> list[dict[str, Any]]:
-        port = self._stack.port(AGGREGATOR)
-        assert port is not None
-        answer = await asyncio.to_thread(net.request, "GET", port, path, token=self._stack.token)
+        answer = await ask(self._stack, AGGREGATOR, "GET", path)
         if not isinstance(answer.body, list):
             raise FailedError(f"the aggregator does not answer {path}: {answer.reason}")
         return answer.body

@@ -18,16 +18,15 @@ import zenoh
 
 from fog_contracts import channels as ch
 from fog_contracts.codec import decode, encode
-from fog_contracts.messages import MapDelta, RobotPath, RobotPose, RobotState
+from fog_contracts.messages import MapDelta, RobotPath
 from fog_runtime.clock import SystemClock, ticker
 from fog_runtime.transports.zenoh_edge import session_config
-from fog_supervisor import net
 from fog_supervisor.supervisor import NotReadyError, log_tail
 from fognav.nodes.simulated import StillFloor
 from fognav.output import FailedError
 from fognav.programs import AGGREGATOR, MAP_SERVICE, PLANNER, SERVERS, SERVICES
 from fognav.stack import Stack, StackConfig, doors_of
-from fognav_experiments.bench.common import in_background
+from fognav_experiments.bench.common import ask, following, in_background, standing
 from fognav_sim.barrier import BarrierError, barrier_across
 from fognav_sim.drive.hazard import draw_hazard, entry_distance
 from fognav_sim.live import VirtualNode, run_nodes
@@ -214,13 +213,11 @@ class _Trials:
         assert site.demo is not None
         goal = site.places[site.demo.goal]
         await self._until(self._clear, "all areas are clear")
-        port = self._stack.port(PLANNER)
-        assert port is not None
         where = {"pose": {"x": goal.x, "y": goal.y}}
 
         async def accepted() -> bool:
             path = f"/api/v1/robots/{self.robot.id}/goal"
-            answer = await asyncio.to_thread(net.request, "PUT", port, path, body=where, token=self._stack.token)
+            answer = await ask(self._stack, PLANNER, "PUT", path, where)
             return answer.status == 200 and isinstance(answer.body, dict)
 
         self.robot.forget()
@@ -249,9 +246,7 @@ class _Trials:
 
     async def _clear(self) -> bool:
         """Whether the aggregator believes all nodes, and none of them sees anything."""
-        port = self._stack.port(AGGREGATOR)
-        assert port is not None
-        answer = await asyncio.to_thread(net.request, "GET", port, "/api/v1/nodes", token=self._stack.token)
+        answer = await ask(self._stack, AGGREGATOR, "GET", "/api/v1/nodes")
         return isinstance(answer.body, list) and all(node["state"] == "clear" for node in answer.body)
 
     async def _until(self, condition: Callable[[], Any], what: str) -> None:
@@ -261,11 +256,6 @@ class _Trials:
                 logs = "\n".join(log_tail(self._stack.log(name)) for name in (AGGREGATOR, MAP_SERVICE, PLANNER))
                 raise FailedError(f"waited {_READY_S:.0f} s until {what}\n{logs}")
             await asyncio.sleep(_POLL_S)
-
-
-_RADIUS_M: Final = 0.17
-_HEIGHT_M: Final = 0.1
-"""Lower than any sensor of a site: it is no hazard itself."""
 
 
 class Arrived(NamedTuple):
@@ -308,15 +298,6 @@ class StandingRobot:
         x, y, theta = self._pose.x, self._pose.y, self._pose.theta
         async for _ in ticker(self._clock, ch.ROBOT_POSE.period_s):
             stamp = self._clock.stamp()
-            pose = RobotPose(
-                x=x, y=y, theta=theta, covariance=[0.0] * 9, v=0.0, w=0.0, radius=_RADIUS_M, height=_HEIGHT_M,
-                stamp=stamp,
-            )  # fmt: skip
-            self._session.put(self._keys[ch.ROBOT_POSE], encode(ch.ROBOT_POSE, pose))
+            self._session.put(self._keys[ch.ROBOT_POSE], encode(ch.ROBOT_POSE, standing(x, y, stamp, theta)))
             if (path := self._latest) is not None:
-                state = RobotState(
-                    mode="NORMAL", reasons=[], enabled=True, battery=None, goal_id=path.goal_id,
-                    map_epoch=path.map_epoch, map_seq=path.map_seq, plan_id=path.plan_id,
-                    planner_epoch=path.planner_epoch, stamp=stamp,
-                )  # fmt: skip
-                self._session.put(self._keys[ch.ROBOT_STATE], encode(ch.ROBOT_STATE, state))
+                self._session.put(self._keys[ch.ROBOT_STATE], encode(ch.ROBOT_STATE, following(path, stamp)))

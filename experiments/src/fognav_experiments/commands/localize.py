@@ -56,16 +56,38 @@ def localize_command(  # noqa: PLR0913  # each option is an argument
     that are carried away unnoticed (--kidnap) are counted, and it is 1 if any pose was wrong while it was good.
     """
     from fognav.lidar_logs import read_log  # noqa: PLC0415  # keeps the other commands fast
+    from fognav_experiments import localization_trials as tried  # noqa: PLC0415  # same
+    from robot_agent.config import LocalizationConfig  # noqa: PLC0415  # same
+    from robot_agent.localization.map_fields import map_fields  # noqa: PLC0415  # same
 
     with exit_codes():
+        if trials is not None and search == kidnap:
+            raise WrongUseError("--trials counts starts without a pose or kidnapped robots: add --global or --kidnap")
         check_writable(png)
         map_, log = _load_map(map_file), read_log(log_file, log_format)
         used = _with_references(log, scans, first, count, log_file)
         kernels.warm_cache(lambda text: console.print(text, markup=False))
-        if trials is None:
-            found = _evaluate(map_, used, log, png, search=search, kidnap=kidnap, range_max=range_max, seed=seed)
-        else:
-            found = _try(map_, used, log, trials, search=search, kidnap=kidnap, range_max=range_max, seed=seed)
+        if not log.odometry_measured:
+            used = tried.with_noise(used, seed)
+        used, gap = tried.kidnapped(used) if kidnap and trials is None else (used, None)
+        config = LocalizationConfig(range_max=range_max)
+        fields = map_fields(map_.cells, map_.geometry, config)
+        with Progress(console=console, disable=not console.is_terminal) as progress:
+            task = progress.add_task("localizing", total=trials or len(used))
+
+            def show(number: int) -> None:
+                progress.update(task, completed=number + 1)
+
+            if trials is not None:
+                run = tried.random_kidnappings if kidnap else tried.random_starts
+                found = run(fields, used, config, trials=trials, seed=seed, on_trial=show)
+            else:
+                samples = tried.track(fields, used, config, seed=seed, search=search, on_scan=show)
+                odometry = "measured" if log.odometry_measured else "reference with noise"
+                figures = tried.figures(samples, search=search, gap=gap)
+                found = {"odometry": odometry, "global": search, **figures}
+                if png is not None:
+                    tried.write_plot(png, map_, samples)
     if json:
         print_json({"map": str(map_file), "log": str(log_file), "selection": scans, "seed": seed, **found})
     else:
@@ -89,76 +111,3 @@ def _with_references(log: LidarLog, scans: Selection, first: int, count: int | N
     if len(used) < 2:
         raise WrongUseError(f"{file} has fewer than two such scans with a reference pose. Name a corrected log")
     return used
-
-
-def _try(  # noqa: PLR0913  # the command's options
-    map_: StaticMap,
-    used: list[LogScan],
-    log: LidarLog,
-    trials: int,
-    *,
-    search: bool,
-    kidnap: bool,
-    range_max: float,
-    seed: int,
-) -> dict[str, object]:
-    from fognav_experiments.localization_trials import (  # noqa: PLC0415  # same
-        random_kidnappings,
-        random_starts,
-        with_noise,
-    )
-    from robot_agent.config import LocalizationConfig  # noqa: PLC0415  # same
-    from robot_agent.localization.map_fields import map_fields  # noqa: PLC0415  # same
-
-    if search == kidnap:
-        raise WrongUseError("--trials counts starts without a pose or kidnapped robots: add --global or --kidnap")
-    if not log.odometry_measured:
-        used = with_noise(used, seed)
-    config = LocalizationConfig(range_max=range_max)
-    fields = map_fields(map_.cells, map_.geometry, config)
-    with Progress(console=console, disable=not console.is_terminal) as progress:
-        task = progress.add_task("localizing", total=trials)
-        run = random_kidnappings if kidnap else random_starts
-        return run(
-            fields, used, config, trials=trials, seed=seed,
-            on_trial=lambda n: progress.update(task, completed=n + 1),
-        )  # fmt: skip
-
-
-def _evaluate(  # noqa: PLR0913  # the command's options
-    map_: StaticMap,
-    used: list[LogScan],
-    log: LidarLog,
-    png: Path | None,
-    *,
-    search: bool,
-    kidnap: bool,
-    range_max: float,
-    seed: int,
-) -> dict[str, object]:
-    from fognav_experiments.localization_trials import (  # noqa: PLC0415  # as above
-        figures,
-        kidnapped,
-        track,
-        with_noise,
-        write_plot,
-    )
-    from robot_agent.config import LocalizationConfig  # noqa: PLC0415  # same
-    from robot_agent.localization.map_fields import map_fields  # noqa: PLC0415  # same
-
-    if not log.odometry_measured:
-        used = with_noise(used, seed)
-    gap = None
-    if kidnap:
-        used, gap = kidnapped(used)
-    config = LocalizationConfig(range_max=range_max)
-    fields = map_fields(map_.cells, map_.geometry, config)
-    with Progress(console=console, disable=not console.is_terminal) as progress:
-        task = progress.add_task("localizing", total=len(used))
-        samples = track(
-            fields, used, config, seed=seed, search=search, on_scan=lambda n: progress.update(task, completed=n + 1)
-        )
-    if png is not None:
-        write_plot(png, map_, samples)
-    odometry = "measured" if log.odometry_measured else "reference with noise"
-    return {"odometry": odometry, "global": search, **figures(samples, search=search, gap=gap)}

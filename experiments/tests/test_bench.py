@@ -8,10 +8,11 @@ import pytest
 from typer.testing import CliRunner
 
 from fog_kernels.components import Components
+from fog_runtime.configuration.site import load_site
 from fog_supervisor.servers import ServerError
 from fog_supervisor.supervisor import NotReadyError
 from fognav.__main__ import app
-from fognav_experiments.bench import common, cores, fleet, fleet_live, planner, rest
+from fognav_experiments.bench import common, cores, fleet, fleet_live, pipeline, planner, rest
 from fognav_experiments.bench import floor as floor_bench
 
 
@@ -183,3 +184,26 @@ def test_dwa_figures_are_of_both_bodies_and_of_a_whole_decision() -> None:
     assert figures["arcs"] == 875
     assert all(figures[key] > 0 for key in ("decision_ms", "cycle_ms"))
     assert {"field_ms", "field_long_ms", "cycle_long_ms", "peer_ratio"} <= figures.keys()
+
+
+# --- from readings to the map ---
+
+
+def test_site_of_the_benchmark_is_valid_and_one_area_has_most_nodes(tmp_path):
+    pipeline.write_nodes(tmp_path, 400)
+    site = load_site(tmp_path).site
+    sizes = sorted(len(definition.nodes) for definition in site.definitions())
+    assert (sum(sizes), sizes[-1], sizes[-2]) == (400, 130, 4)
+
+
+@pytest.mark.live
+async def test_no_reading_of_a_small_load_is_lost_and_hazards_reach_the_map(tmp_path):
+    phases: list[str] = []
+    figures = await pipeline.measure(tmp_path, nodes=12, rate=20.0, robots=2, seconds=5.0, on_phase=phases.append)
+    assert len(phases) == 3
+    assert figures["sent"] >= 1200
+    assert figures["lost"] == 0
+    assert figures["hazards"] >= 1
+    assert 0 < figures["confirmed_to_delta_p50_ms"] <= figures["confirmed_to_delta_p99_ms"]
+    assert figures["confirmed_to_delta_p50_ms"] < figures["reading_to_delta_p50_ms"]
+    assert figures["aggregator_us_per_reading"] > 0

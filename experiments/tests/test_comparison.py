@@ -10,6 +10,7 @@ from collections import Counter
 from pathlib import Path
 
 import msgspec
+import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
@@ -19,6 +20,7 @@ from fognav_experiments.comparison import runner
 from fognav_experiments.comparison.document import Table
 from fognav_experiments.comparison.drives import ExperimentSpec, RouteSpec, draw
 from fognav_experiments.comparison.limits import RouteGeometry, Saving, allowed_savings
+from fognav_experiments.comparison.live_drive import write_route
 from fognav_experiments.comparison.records import MOVE_BASE, Asked, Folder, FolderError
 from fognav_experiments.comparison.report import paired, publish
 from fognav_experiments.figures import compare, estimate, t_cdf, t_quantile
@@ -251,3 +253,20 @@ def test_a_film_finds_in_the_records_what_happened_and_when(short_run):
     assert [record.setup for record in folder.read_drives(RUN, "westeast", ["fog", "default"])] == ["fog", "default"]
     with pytest.raises(FolderError, match=f"no drive {RUN + 1:04}-westeast-fog: run"):
         folder.read_drives(RUN + 1, "westeast", ["fog"])
+
+
+# --- by real processes ---
+
+
+def test_a_route_s_site_is_the_same_but_for_the_start_of_the_robot_and_the_demonstration(tmp_path):
+    site = load_site(ESTIG)
+    drawn = draw(runner.read_spec(site, ESTIG), 1, 2)[1]
+    write_route(site, drawn, tmp_path)
+    written = load_site(tmp_path)
+    assert np.array_equal(written.map.cells, site.map.cells)
+    assert written.map.geometry == site.map.geometry
+    assert (written.site.areas, written.site.nodes) == (site.site.areas, site.site.nodes)
+    assert written.site.places == site.site.places
+    start, origin = written.site.robots[0].start, site.site.places[drawn.route.start]
+    assert (start.x, start.y, start.theta) == (origin.x, origin.y, drawn.theta)
+    assert (written.site.demo.goal, written.site.demo.areas) == (drawn.route.goal, [drawn.area])

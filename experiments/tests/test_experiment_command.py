@@ -15,8 +15,7 @@ from fognav_experiments.commands import experiment
 from fognav_experiments.comparison import hardware_drive, records, runner, sensitivity
 from fognav_experiments.comparison.drives import ComparedDrive, MeasuredDrive
 from fognav_experiments.comparison.records import Folder
-from fognav_experiments.scenarios import stage
-from fognav_experiments.scenarios.fleet import FleetResult
+from fognav_experiments.scenarios import play as playing
 from fognav_sim import nodes
 
 OUT = ["--out", "unused"]
@@ -136,12 +135,12 @@ def test_scenarios_that_are_ended_early_leave_the_table_of_those_that_were_playe
     def play(scenario, _sites):
         if scenario.title.startswith("No Wi-Fi for 5 s"):
             raise KeyboardInterrupt
-        result = FleetResult(
+        result = playing.FleetResult(
             contacts=0, reason="", distance_m=9.9, time_s=37.0, arrived=1, gap_m=1.0, plans=1, planner_percent=0.1
         )
-        return stage.Played(scenario, result, "reached", [])
+        return playing.Played(scenario, result, "reached", [])
 
-    monkeypatch.setattr(stage, "play", play)
+    monkeypatch.setattr(playing, "play", play)
     monkeypatch.setattr(experiment.system, "prepare_node_code", lambda _inform: None)
     monkeypatch.setattr(experiment.kernels, "warm_cache", lambda _inform: None)
     table = tmp_path / "table.md"

@@ -9,6 +9,7 @@ from pathlib import Path
 
 import msgspec
 import pytest
+from typer.testing import CliRunner
 
 from fog_contracts import channels as ch
 from fog_contracts.bus import Bus
@@ -27,6 +28,7 @@ from fog_contracts.messages import (
     Zone,
     ZoneSet,
 )
+from fognav.__main__ import app
 from fognav_experiments.hunt import oracle, play, runner
 from fognav_experiments.hunt.draw import draw_world
 from fognav_experiments.hunt.oracle import Figures, Violation
@@ -530,3 +532,42 @@ def test_hunt_goes_on_where_it_was_and_keeps_what_it_found(tmp_path, monkeypatch
     assert len(read_world(tmp_path / "found" / "contact-1-2.json").events) == 1
     assert "3 drives, 0.00 simulated hours" in runner.summary(runner.read_records(tmp_path))
     assert "broke a rule: contact 3" in runner.summary(runner.read_records(tmp_path))
+
+
+# --- the command ---
+
+
+CORRIDOR = HuntWorld(
+    title="a short corridor", start=(1.5, 1.5, 0.0), goal=(5.0, 1.5), size=(7.0, 3.0), free=[(0.5, 0.5, 6.5, 2.5)],
+    seconds=20.0,
+)  # fmt: skip
+
+
+def run(*arguments: object):
+    return CliRunner().invoke(app, ["hunt", *map(str, arguments)])
+
+
+def test_replay_tells_which_rule_was_broken_and_where(tmp_path):
+    kind, unfair = tmp_path / "kind.json", tmp_path / "unfair.json"
+    kind.write_bytes(write_world(CORRIDOR))
+    wall = Obstacle(at_m=1.5, polygon=[(3.19, 0.5), (3.6, 0.5), (3.6, 2.5), (3.19, 2.5)])  # 2 cm before the robot
+    unfair.write_bytes(write_world(msgspec.structs.replace(CORRIDOR, events=[wall])))
+    assert run("--replay", kind).exit_code == 0
+    told = run("--replay", kind, "--replay", unfair)
+    assert told.exit_code == 1
+    assert "kind.json: reached" in told.output
+    assert "contact at" in told.output
+
+
+def test_records_are_summed_up_without_a_drive(tmp_path):
+    told = run("--minutes", 0, "--out", tmp_path)
+    assert told.exit_code == 0
+    assert "0 drives, 0.00 simulated hours" in told.output
+
+
+def test_damaged_file_is_named(tmp_path):
+    file = tmp_path / "world.json"
+    file.write_text("{}")
+    told = run("--replay", file)
+    assert told.exit_code == 2
+    assert "world.json" in told.output

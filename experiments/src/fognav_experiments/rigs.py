@@ -2,6 +2,7 @@
 
 `processes` has what each process does around its core; this module has their surroundings: sensor nodes, base, lidar
 and guardian as bytes on their lines, and an operator. Lockstep leaves out sockets, threads and the time of computation.
+Robot and fog stand in one file, longer than others, since each step of the system is one of both.
 """
 
 from __future__ import annotations

@@ -1,8 +1,9 @@
-"""`fognav bench`: measure parts of the system on this machine."""
+"""`fognav bench`: measure parts of the system on this machine. Long, because it lists the options of all benchmarks."""
 
 from __future__ import annotations
 
 import asyncio
+import os
 from functools import partial
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -11,12 +12,11 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 from rich.progress import Progress
 
-from fognav import kernels
+from fognav import checkout, kernels
 from fognav.commands.installed import MEASURE
 from fognav.operate.options import JsonOption  # noqa: TC001  # Typer reads annotations at run time
 from fognav.output import NOT_TRUE, WrongUseError, check_writable, console, exit_codes, print_json, print_line
 from fognav_experiments import machine
-from fognav_experiments.commands.mutation import mutation_command
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -319,7 +319,6 @@ def warning_command(  # noqa: PLR0913  # the options of the command
     all sonars hear what is not there, their nodes are calibrated in that, and false alarms are counted, too.
     """
     from fog_runtime.configuration.site import load_site  # noqa: PLC0415  # keeps the other commands fast
-    from fognav import checkout  # noqa: PLC0415  # same
     from fognav_experiments.bench import false_echoes as noise  # noqa: PLC0415  # same
     from fognav_experiments.bench import warning  # noqa: PLC0415  # same
 
@@ -412,22 +411,14 @@ def reactions_command(
     fail; an operator stops the robot. The time ends when the emulated base's wheels are commanded to stand, or to be
     slow. A trial takes some five seconds. Exit code 1: a trial was beyond its limit.
     """
-    from fognav_experiments.bench.reactions.faults import FAULTS  # noqa: PLC0415  # same
-    from fognav_experiments.bench.reactions.trials import due, markdown, measure, read_log, remarks, row  # noqa: PLC0415  # same
+    from fognav_experiments.bench.reactions import trials as reactions  # noqa: PLC0415  # keeps the other commands fast
 
     kernels.warm_cache(print_line)
+    other = trials if others is None else others
     with exit_codes():
         check_writable(log)
         check_writable(write)
-        times = read_log(log)
-        other = trials if others is None else others
-        waiting = due(times, lambda fault: trials if fault.kind == "process" else other)
-        found = asyncio.run(measure(waiting, robots, log, print_line))
-    rows = [row(fault, every) for fault in FAULTS if (every := times.get(fault.name, []) + found.get(fault.name, []))]
-    if write is not None:
-        command = f"fognav bench reactions --trials {trials} --others {other} --robots {robots} --log FILE --write PAGE"
-        kept = remarks(write.read_text("utf-8")) if write.exists() else ""
-        write.write_text(markdown(rows, command, machine.sentence(), robots, kept), "utf-8")
+        rows = reactions.run(trials, other, robots, log, write, print_line)
     if json:
         print_json({"bench": "reactions", "trials": trials, "others": other, "rows": rows, **machine.describe()})
     else:
@@ -437,4 +428,45 @@ def reactions_command(
         raise typer.Exit(NOT_TRUE)
 
 
-bench_app.command("mutation", epilog="Example: fognav bench mutation --part guardian --module core")(mutation_command)
+@bench_app.command("mutation", epilog="Example: fognav bench mutation --part guardian --module core")
+def mutation_command(
+    *,
+    part: Annotated[
+        list[str] | None, typer.Option("--part", metavar="NAME", help="Only this part; may be repeated.")
+    ] = None,
+    module: Annotated[
+        str, typer.Option("--module", metavar="NAME", help="Only mutants of modules whose name ends so.")
+    ] = "",
+    coverage: Annotated[
+        bool, typer.Option("--coverage", help="Measure only which lines and branches the tests reach.")
+    ] = False,
+    jobs: Annotated[int, typer.Option("--jobs", metavar="N", min=0, help="Mutants at once; 0: one per core.")] = 0,
+    json: JsonOption = False,
+) -> None:
+    """Test the tests of what stops the robot.
+
+    Changes one operator, number or statement of safety gate, guardian, watchdog, recoveries or maneuvers, and runs
+    their tests, which must notice it; prints each change that none does. Exit code 1: a line or branch that no test
+    reaches, or fewer than 90 percent of the changes noticed.
+    """
+    from fognav_experiments import mutation  # noqa: PLC0415  # keeps the other commands fast
+    from fognav_experiments.mutation import parts_named  # noqa: PLC0415  # same
+
+    def tell(text: str) -> None:
+        console.print(text, markup=False, soft_wrap=True)
+
+    with exit_codes():
+        root, chosen = checkout.root(), parts_named(part or [])
+        figures = {
+            each.name: mutation.measure(
+                each, root, jobs=jobs or os.cpu_count() or 1, only=None if coverage else module, tell=tell
+            )
+            for each in chosen
+        }
+    if json:
+        print_json({"bench": "mutation", "parts": mutation.report_values(figures)})
+    else:
+        for line in mutation.report_lines(figures):
+            tell(line)
+    if not mutation.passes(figures):
+        raise typer.Exit(NOT_TRUE)

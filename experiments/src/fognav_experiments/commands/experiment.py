@@ -27,7 +27,7 @@ if TYPE_CHECKING:
     from fognav_experiments.comparison.records import DriveFiles, Folder, Record
     from fognav_experiments.comparison.runner import Task
     from fognav_experiments.comparison.sensitivity import Plane, SweptDrive
-    from fognav_experiments.scenarios.stage import Played
+    from fognav_experiments.scenarios.play import Played
 
     D = TypeVar("D", Record, MeasuredDrive, SweptDrive)
 
@@ -218,7 +218,7 @@ def scenarios_command(
     """
     from fog_runtime.files import SHARED, atomic_write  # noqa: PLC0415  # keeps the other commands fast
     from fognav_experiments.comparison.document import flat  # noqa: PLC0415  # same
-    from fognav_experiments.scenarios.stage import ScenarioError, markdown_page, play, read_scenario  # noqa: PLC0415  # same
+    from fognav_experiments.scenarios.play import ScenarioError, markdown_page, play, read_scenario  # noqa: PLC0415  # same
 
     with exit_codes():
         files = _scenario_files(names or [])
@@ -226,8 +226,7 @@ def scenarios_command(
             scenarios = {file.stem: read_scenario(file) for file in files}
         except ScenarioError as error:
             raise WrongUseError(str(error)) from error
-        system.prepare_node_code(print_line)
-        kernels.warm_cache(print_line)
+        _prepare()
         drives = {}
         for name, scenario in scenarios.items():
             drives[name] = play(scenario, checkout.root() / "sites")
@@ -368,8 +367,7 @@ def _sweep(  # what is driven, where and how
     from fognav_experiments.comparison import sensitivity  # noqa: PLC0415  # same
     from fognav_experiments.comparison.records import DriveFiles  # noqa: PLC0415  # keeps the other commands fast
 
-    system.prepare_node_code(print_line)
-    kernels.warm_cache(print_line)
+    _prepare()
     asked, files = sensitivity.sweep_tasks(swept, drawn), DriveFiles(folder.path / "sweep", sensitivity.SweptDrive)
     names = [task.name for task in asked]
     failed = _show(names, files, sensitivity.sweep(site, asked, files, jobs, checkout.revision()))

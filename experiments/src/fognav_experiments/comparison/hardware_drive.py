@@ -377,18 +377,10 @@ def drive_hardware(  # noqa: PLR0913  # what is driven, where, and by whom
     setups = list(dict.fromkeys(task.setup for task in asked))
     # All routes of a setup one after another: each begins where the one before has ended.
     ordered = sorted(asked, key=lambda task: (task.drawn.run, setups.index(task.setup)))
-    asyncio.run(_drive_all(site, ordered, files, fog, fog.robot(robot), commit, say))
 
+    async def drive_all() -> None:
+        async with connect(fog, fog.robot(robot)) as connected:
+            with Terminal(sys.stdin.fileno(), say) as terminal:
+                await HardwareRun(site, _ConnectedRobot(fog, connected), terminal, commit).run(ordered, files)
 
-async def _drive_all(  # noqa: PLR0913  # same
-    site: LoadedSite,
-    asked: Sequence[Task],
-    files: DriveFiles[MeasuredDrive],
-    fog: Fog,
-    robot: str,
-    commit: str,
-    say: Callable[[str], None],
-) -> None:
-    async with connect(fog, robot) as connected:
-        with Terminal(sys.stdin.fileno(), say) as terminal:
-            await HardwareRun(site, _ConnectedRobot(fog, connected), terminal, commit).run(asked, files)
+    asyncio.run(drive_all())

@@ -49,7 +49,7 @@ if TYPE_CHECKING:
     from fog_contracts.grid import StaticMap
     from fognav_experiments.rigs import FogProcessName
     from fognav_experiments.scenarios.description import AnyEvent
-    from fognav_experiments.scenarios.node_faults import Fault
+    from fognav_experiments.scenarios.stage import Fault
 
     CommandName = Literal["enable", "disable", "cancel", "egress", "back_off", "turn", "advance", "reset"]
 

@@ -1,7 +1,8 @@
 """What must hold of any drive, checked against the ground truth and what was published. Pure.
 
 It knows messages and the simulator's truth, and nothing of how Fognav works: its limits are those that the documents
-promise, each with a margin for what a message says late.
+promise, each with a margin for what a message says late. All rules stand in one file, longer than others, since they
+judge by the same few facts.
 
 Lengths in m, speeds in m/s, times in s of one clock; frame `map`, unless it says `true`.
 """

@@ -1,20 +1,18 @@
-"""Lets a scenario happen to a drive in lockstep."""
+"""Lets a scenario happen to a drive in lockstep, and to what its sensor nodes report."""
 
 from __future__ import annotations
 
 import itertools
 import math
 import random
-import tomllib
-from functools import cache, partial
-from typing import TYPE_CHECKING, Final, Literal, NamedTuple, Protocol, runtime_checkable
+from collections import deque
+from functools import partial
+from typing import TYPE_CHECKING, Final, Literal, Protocol, runtime_checkable
 
 import msgspec
 
 from fog_contracts.geometry import distance_to_polygon
-from fog_contracts.messages import PolygonShape, Pose, RobotGoal, SimObstacle, Zone
-from fog_runtime.configuration.site import load_site
-from fognav_experiments.lockstep import LockstepDrive, LockstepResult, release_drives
+from fog_contracts.messages import PolygonShape, Pose, SimObstacle, Zone
 from fognav_experiments.rigs import moment
 from fognav_experiments.scenarios.description import (
     BadLine,
@@ -36,29 +34,24 @@ from fognav_experiments.scenarios.description import (
     Person,
     Push,
     Restart,
-    Scenario,
     SilentLidar,
     SilentNode,
     SlewedNode,
     SlowLink,
     SpeedZone,
-    deviations,
 )
-from fognav_experiments.scenarios.fleet import FleetResult, play_fleet
-from fognav_experiments.scenarios.node_faults import FaultyNodeSim, LateNodeSim, SlewedNodeSim
-from fognav_sim.drive.drive import DriveOutcome
 from fognav_sim.hardware import STEP_S
 from fognav_sim.sensors import Deception
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Mapping, Sequence
-    from pathlib import Path
+    from collections.abc import Callable, Sequence
 
-    from fog_contracts.messages import Id
-    from fog_runtime.configuration.site import LoadedSite
+    from fog_contracts.messages import AreaState, Id, NodeCalibration, NodeConfig, NodeReading
+    from fognav_experiments.lockstep import LockstepDrive
     from fognav_experiments.rigs import FogProcessName
     from fognav_experiments.scenarios.description import AnyEvent
     from fognav_sim.nodes import SensorNode
+    from fognav_sim.world import World
 
 
 Word = Literal["fog", "map-service", "aggregator", "planner", "agent", "lidar", "new turns", "base", "floor"]
@@ -78,116 +71,6 @@ class StallingLidar(Protocol):
     stalled: bool
     frozen: bool
     frozen_revolutions: int
-
-
-class ScenarioError(ValueError):
-    """A scenario's file is invalid; the message names file and place."""
-
-
-class Played(NamedTuple):
-    """A scenario that was played: its result, how it ended, and what differs from what was expected."""
-
-    scenario: Scenario
-    result: LockstepResult | FleetResult
-    outcome: str
-    deviations: list[str]
-
-
-def read_scenario(file: Path) -> Scenario:
-    """Return the scenario of a file; raises `ScenarioError`."""
-    try:
-        return msgspec.convert(tomllib.loads(file.read_text("utf-8")), Scenario)
-    except (OSError, tomllib.TOMLDecodeError, msgspec.ValidationError) as error:
-        raise ScenarioError(f"{file}: {error}. Correct it") from error
-
-
-def play(scenario: Scenario, sites: Path) -> Played:
-    """Drive a scenario on its site, one of the folder `sites`."""
-    site = _site(sites / scenario.site)
-    played = _play_others(scenario, site) if scenario.others else _play_alone(scenario, site)
-    release_drives()
-    return played
-
-
-def _play_others(scenario: Scenario, site: LoadedSite) -> Played:
-    result, outcome = play_fleet(scenario, site)
-    found = deviations(scenario.expected, result, outcome, ())
-    most = scenario.expected.plans
-    if most is not None and result.plans > most:
-        found.append(f"{result.plans} paths, more than {most}")
-    return Played(scenario, result, outcome, found)
-
-
-def _play_alone(scenario: Scenario, site: LoadedSite) -> Played:
-    x, y, theta = scenario.start
-    goal = RobotGoal(goal_id="scenario", pose=Pose(x=scenario.goal[0], y=scenario.goal[1], theta=0.0))
-    run = LockstepDrive(
-        site,
-        Pose(x=x, y=y, theta=theta),
-        goal,
-        scenario.seed,
-        None,
-        watched=scenario.profile != "default",
-        hazard=None,
-        bus=None,
-    )
-    problem = run.warm_up()
-    if problem is None and scenario.profile != "fog":
-        problem = run.switch(scenario.profile)
-    drive, before = run.start(), len(run.events)
-    stage = Stage(run, scenario.events)
-    outcome = None if problem is None else DriveOutcome("stopped", problem)
-    if outcome is None:
-        run.system.fog.planner.set_goal(run.robot.id, goal, any_heading=True)
-    while outcome is None and stage.elapsed < scenario.seconds:
-        stage.step()
-        run.step()
-        outcome = drive.outcome(run.now)
-    ended = outcome or DriveOutcome("stopped", f"ended after {scenario.seconds:.0f} s")
-    result = run.result(drive, ended)
-    name = "driving" if outcome is None else outcome.kind
-    return Played(scenario, result, name, deviations(scenario.expected, result, name, result.events[before:]))
-
-
-_PAGE: Final = """\
-# Drives on which something goes wrong
-
-```
-fognav experiment scenarios --table FILE
-```
-
-{count} in one go, in lockstep; measured on: {facts}.
-
-Times are those of the simulated clock. `driving` means that the robot had not ended its drive after the scenario's
-time, which may be what is expected. What is expected of each, and checked, stands in its file.
-"""
-
-
-def markdown_page(drives: Mapping[str, Played], measured_on: Mapping[str, object]) -> str:
-    """Return a Markdown page of scenarios that were played, by name: what happens, and how each drive ended.
-
-    `measured_on`: commit, machine and versions, by name.
-    """
-    rows = [
-        f"| [{name}](../../experiments/scenarios/{name}.toml) | {played.scenario.title} | {played.outcome} | "
-        f"{played.result.distance_m:.1f} | {played.result.time_s or played.scenario.seconds:.0f} | "
-        f"{'; '.join(played.deviations) or 'yes'}{_of_fleet(played)} |"
-        for name, played in drives.items()
-    ]
-    header = ["| scenario | what happens | outcome | m | s | as expected |", "| --- | --- | --- | --- | --- | --- |"]
-    facts = ", ".join(f"{name} {value}" for name, value in measured_on.items())
-    return "\n".join([_PAGE.format(count=len(drives), facts=facts), *header, *rows]) + "\n"
-
-
-def _of_fleet(played: Played) -> str:
-    """Return in words what several robots did to one another and to the planner."""
-    result = played.result
-    if not isinstance(result, FleetResult):
-        return ""
-    return (
-        f"; {result.arrived} of {1 + len(played.scenario.others)} arrived, nearest {result.gap_m:.2f} m, "
-        f"{result.plans} paths, planner {result.planner_percent:.1f} % of a core"
-    )
 
 
 class Stage:
@@ -456,6 +339,108 @@ class Stage:
             self._ends.append((self.elapsed + seconds, action))
 
 
-@cache
-def _site(folder: Path) -> LoadedSite:
-    return load_site(folder)
+Fault = Literal["stuck", "flapping", "lies-clear", "lies-blocked"]
+FLAP_S: Final = 1.0
+"""How long a flapping node says the same."""
+_NEAR_M: Final = 0.6
+_MARGIN_M: Final = 0.1
+
+
+class _ChangedNode:
+    """A node whose readings are changed on their way."""
+
+    def __init__(self, healthy: SensorNode) -> None:
+        self.node = healthy.node
+        self._healthy = healthy
+
+    def configure(self, config: NodeConfig) -> bool:
+        """Apply a configuration."""
+        return self._healthy.configure(config)
+
+    def on_connected(self) -> None:
+        """Publish as after a change."""
+        self._healthy.on_connected()
+
+    def command(self, text: str) -> str | None:
+        """Begin what a command asks for; return None, or why not."""
+        return self._healthy.command(text)
+
+    def take_calibration(self) -> NodeCalibration | None:
+        """Return the calibration that has ended since the last call, if one has."""
+        return self._healthy.take_calibration()
+
+
+class SlewedNodeSim(_ChangedNode):
+    """A node whose clock gains `rate` seconds a second from now on."""
+
+    def __init__(self, healthy: SensorNode, rate: float) -> None:
+        super().__init__(healthy)
+        self._rate = rate
+        self._begun_ms: int | None = None
+
+    def poll(self, world: World, now: float) -> list[NodeReading]:
+        """Run the node up to `now` (s); return what it reports."""
+        return [self._report(reading) for reading in self._healthy.poll(world, now)]
+
+    def _report(self, reading: NodeReading) -> NodeReading:
+        self._begun_ms = reading.uptime_ms if self._begun_ms is None else self._begun_ms
+        shown = self._begun_ms + round((reading.uptime_ms - self._begun_ms) * (1.0 + self._rate))
+        return msgspec.structs.replace(reading, uptime_ms=shown)
+
+
+class LateNodeSim(_ChangedNode):
+    """A node whose readings take a time (s) on their way, which `delay` draws for each; none overtakes another."""
+
+    def __init__(self, healthy: SensorNode, delay: Callable[[], float]) -> None:
+        super().__init__(healthy)
+        self._delay = delay
+        self._under_way: deque[tuple[float, NodeReading]] = deque()
+
+    def poll(self, world: World, now: float) -> list[NodeReading]:
+        """Run the node up to `now` (s); return what arrives."""
+        for reading in self._healthy.poll(world, now):
+            last = self._under_way[-1][0] if self._under_way else now
+            self._under_way.append((max(now + self._delay(), last), reading))
+        arrived = []
+        while self._under_way and self._under_way[0][0] <= now:
+            arrived.append(self._under_way.popleft()[1])
+        return arrived
+
+
+class FaultyNodeSim(_ChangedNode):
+    """A node with a fault: it measures as the healthy one in it does, and reports something else."""
+
+    def __init__(self, healthy: SensorNode, fault: Fault) -> None:
+        super().__init__(healthy)
+        self._fault: Fault = fault
+        self._shown: AreaState | None = None
+
+    def poll(self, world: World, now: float) -> list[NodeReading]:
+        """Run the node up to `now` (s); return what it reports."""
+        if (state := self._state(now)) != self._shown:
+            self._shown = state
+            self._healthy.on_connected()  # a change of what it reports goes out as one of what it measures would
+        return [self._report(reading, now) for reading in self._healthy.poll(world, now)]
+
+    def _state(self, now: float) -> AreaState:
+        match self._fault:
+            case "stuck":
+                return "unknown"
+            case "flapping":
+                return "blocked" if int(now / FLAP_S) % 2 == 0 else "clear"
+            case "lies-blocked":
+                return "blocked"
+            case "lies-clear":
+                return "clear"
+
+    def _report(self, reading: NodeReading, now: float) -> NodeReading:
+        sonars = self.node.sonars
+        state = self._state(now)
+        if self._fault == "stuck":
+            none: list[float | None] = [None] * len(sonars)
+            return msgspec.structs.replace(reading, range_m=none, status=["stuck"] * len(sonars), state=state)
+        # The wall across the corridor is a little farther away than the limit.
+        ranges: list[float | None] = [
+            _NEAR_M if state == "blocked" else sonar.range_limit + _MARGIN_M for sonar in sonars
+        ]
+        return msgspec.structs.replace(reading, range_m=ranges, status=["ok"] * len(sonars), state=state)

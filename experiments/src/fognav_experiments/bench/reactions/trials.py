@@ -19,6 +19,7 @@ from typing import TYPE_CHECKING, Final
 
 from fognav import checkout
 from fognav.output import FailedError, WrongUseError
+from fognav_experiments import machine
 from fognav_experiments.bench.reactions.faults import FAULTS, Fault
 from fognav_experiments.bench.reactions.rig import Rig
 
@@ -32,6 +33,25 @@ _PROBLEMS_MAX: Final = 20
 """Robots that did not drive (again), after which the machine or the robot is to blame."""
 
 Times = dict[str, list[float | None]]
+
+
+def run(  # how often, on how many robots, and where to
+    processes: int, others: int, robots: int, log: Path | None, page: Path | None, tell: Callable[[str], object]
+) -> list[dict[str, object]]:
+    """Try each fault of processes so often, with the trials of the log, and each other one; return a row for each.
+
+    Writes the page; what people remarked on it stays. Raises as `measure` and `read_log` do.
+    """
+    times = read_log(log)
+    waiting = due(times, lambda fault: processes if fault.kind == "process" else others)
+    found = asyncio.run(measure(waiting, robots, log, tell))
+    rows = [row(fault, every) for fault in FAULTS if (every := times.get(fault.name, []) + found.get(fault.name, []))]
+    if page is not None:
+        command = f"fognav bench reactions --trials {processes} --others {others} --robots {robots}"
+        kept = remarks(page.read_text("utf-8")) if page.exists() else ""
+        written = markdown(rows, f"{command} --log FILE --write PAGE", machine.sentence(), robots, kept)
+        page.write_text(written, "utf-8")
+    return rows
 
 
 def read_log(log: Path | None) -> Times:
@@ -168,7 +188,7 @@ def remarks(page: str) -> str:
     return page.partition(_MARK)[2].strip()
 
 
-def markdown(rows: Sequence[dict[str, object]], command: str, machine: str, robots: int, kept: str = "") -> str:
+def markdown(rows: Sequence[dict[str, object]], command: str, where: str, robots: int, kept: str = "") -> str:
     """Return the page, of this process and the checkout that it runs from, with the remarks `kept` at its end."""
     tables = []
     for kind, title in _TITLES.items():
@@ -179,7 +199,7 @@ def markdown(rows: Sequence[dict[str, object]], command: str, machine: str, robo
         mark=_MARK,
         tables="\n\n".join(tables),
         command=command,
-        machine=machine,
+        machine=where,
         robots=robots,
         commit=checkout.revision() or "unknown",
         niceness=os.getpriority(os.PRIO_PROCESS, 0),

@@ -1,6 +1,7 @@
-"""Several robots in the same corridors, on an emulated clock: one fog node, and each robot in its own world.
+"""Plays scenarios in lockstep, with one robot or several, and tells how they went.
 
-A world holds one robot. The others are in its way wherever they are, and its lidar and the sonars see them.
+Several robots share the corridors and one fog node, each in its own world, which holds one robot: the others are in its
+way wherever they are, and its lidar and the sonars see them.
 """
 
 from __future__ import annotations
@@ -8,6 +9,8 @@ from __future__ import annotations
 import dataclasses
 import itertools
 import math
+import tomllib
+from functools import cache
 from typing import TYPE_CHECKING, Final, NamedTuple
 
 import msgspec
@@ -17,22 +20,25 @@ from fog_contracts.bus import Bus
 from fog_contracts.messages import Pose, RobotGoal
 from fog_contracts.site import RobotSite
 from fog_runtime.configuration.parts import DEFAULT_BASE
+from fog_runtime.configuration.site import load_site
+from fognav_experiments.lockstep import LockstepDrive, LockstepResult, release_drives
 from fognav_experiments.machine import CpuMeter
 from fognav_experiments.rigs import STAMP, TICK_STEPS, FogRig, RobotRig, moment
+from fognav_experiments.scenarios.description import Scenario, deviations
+from fognav_experiments.scenarios.stage import Stage
 from fognav_sim import devices
-from fognav_sim.drive.drive import Drive
+from fognav_sim.drive.drive import Drive, DriveOutcome
 from fognav_sim.drive.operator import OperatorPolicy
 from fognav_sim.floor import Floor
 from fognav_sim.world import World
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
+    from collections.abc import Mapping, Sequence
+    from pathlib import Path
 
     from fog_contracts.handlers import Ids, Moment, Publication
     from fog_contracts.messages import RobotPath, RobotState
     from fog_runtime.configuration.site import LoadedSite
-    from fognav_experiments.scenarios.description import Scenario
-    from fognav_sim.drive.drive import DriveOutcome
 
 
 READY_S: Final = 20.0
@@ -262,3 +268,118 @@ def _ended(vehicles: Sequence[Vehicle]) -> _Ending | None:
                 return _Ending("driving", f"robot {vehicle.id} is at ({x:.1f}, {y:.1f}){mode}")
             return _Ending(vehicle.outcome.kind, f"robot {vehicle.id}: {vehicle.outcome.reason}")
     return None
+
+
+class ScenarioError(ValueError):
+    """A scenario's file is invalid; the message names file and place."""
+
+
+class Played(NamedTuple):
+    """A scenario that was played: its result, how it ended, and what differs from what was expected."""
+
+    scenario: Scenario
+    result: LockstepResult | FleetResult
+    outcome: str
+    deviations: list[str]
+
+
+def read_scenario(file: Path) -> Scenario:
+    """Return the scenario of a file; raises `ScenarioError`."""
+    try:
+        return msgspec.convert(tomllib.loads(file.read_text("utf-8")), Scenario)
+    except (OSError, tomllib.TOMLDecodeError, msgspec.ValidationError) as error:
+        raise ScenarioError(f"{file}: {error}. Correct it") from error
+
+
+def play(scenario: Scenario, sites: Path) -> Played:
+    """Drive a scenario on its site, one of the folder `sites`."""
+    site = _site(sites / scenario.site)
+    played = _play_others(scenario, site) if scenario.others else _play_alone(scenario, site)
+    release_drives()
+    return played
+
+
+def _play_others(scenario: Scenario, site: LoadedSite) -> Played:
+    result, outcome = play_fleet(scenario, site)
+    found = deviations(scenario.expected, result, outcome, ())
+    most = scenario.expected.plans
+    if most is not None and result.plans > most:
+        found.append(f"{result.plans} paths, more than {most}")
+    return Played(scenario, result, outcome, found)
+
+
+def _play_alone(scenario: Scenario, site: LoadedSite) -> Played:
+    x, y, theta = scenario.start
+    goal = RobotGoal(goal_id="scenario", pose=Pose(x=scenario.goal[0], y=scenario.goal[1], theta=0.0))
+    run = LockstepDrive(
+        site,
+        Pose(x=x, y=y, theta=theta),
+        goal,
+        scenario.seed,
+        None,
+        watched=scenario.profile != "default",
+        hazard=None,
+        bus=None,
+    )
+    problem = run.warm_up()
+    if problem is None and scenario.profile != "fog":
+        problem = run.switch(scenario.profile)
+    drive, before = run.start(), len(run.events)
+    stage = Stage(run, scenario.events)
+    outcome = None if problem is None else DriveOutcome("stopped", problem)
+    if outcome is None:
+        run.system.fog.planner.set_goal(run.robot.id, goal, any_heading=True)
+    while outcome is None and stage.elapsed < scenario.seconds:
+        stage.step()
+        run.step()
+        outcome = drive.outcome(run.now)
+    ended = outcome or DriveOutcome("stopped", f"ended after {scenario.seconds:.0f} s")
+    result = run.result(drive, ended)
+    name = "driving" if outcome is None else outcome.kind
+    return Played(scenario, result, name, deviations(scenario.expected, result, name, result.events[before:]))
+
+
+_PAGE: Final = """\
+# Drives on which something goes wrong
+
+```
+fognav experiment scenarios --table FILE
+```
+
+{count} in one go, in lockstep; measured on: {facts}.
+
+Times are those of the simulated clock. `driving` means that the robot had not ended its drive after the scenario's
+time, which may be what is expected. What is expected of each, and checked, stands in its file.
+"""
+
+
+def markdown_page(drives: Mapping[str, Played], measured_on: Mapping[str, object]) -> str:
+    """Return a Markdown page of scenarios that were played, by name: what happens, and how each drive ended.
+
+    `measured_on`: commit, machine and versions, by name.
+    """
+    rows = [
+        f"| [{name}](../../experiments/scenarios/{name}.toml) | {played.scenario.title} | {played.outcome} | "
+        f"{played.result.distance_m:.1f} | {played.result.time_s or played.scenario.seconds:.0f} | "
+        f"{'; '.join(played.deviations) or 'yes'}{_of_fleet(played)} |"
+        for name, played in drives.items()
+    ]
+    header = ["| scenario | what happens | outcome | m | s | as expected |", "| --- | --- | --- | --- | --- | --- |"]
+    facts = ", ".join(f"{name} {value}" for name, value in measured_on.items())
+    return "\n".join([_PAGE.format(count=len(drives), facts=facts), *header, *rows]) + "\n"
+
+
+def _of_fleet(played: Played) -> str:
+    """Return in words what several robots did to one another and to the planner."""
+    result = played.result
+    if not isinstance(result, FleetResult):
+        return ""
+    return (
+        f"; {result.arrived} of {1 + len(played.scenario.others)} arrived, nearest {result.gap_m:.2f} m, "
+        f"{result.plans} paths, planner {result.planner_percent:.1f} % of a core"
+    )
+
+
+@cache
+def _site(folder: Path) -> LoadedSite:
+    return load_site(folder)

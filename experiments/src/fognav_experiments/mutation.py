@@ -135,7 +135,6 @@ class ModuleScore(NamedTuple):
     """Figures of one module."""
 
     module: str
-    coverage: Coverage
     mutants: int
     survivors: list[Survivor]
 
@@ -157,10 +156,10 @@ class _Task(NamedTuple):
     mutant: Mutant
 
 
-def measure(part: Part, root: Path, *, jobs: int, only: str | None, tell: Callable[[str], object]) -> list[ModuleScore]:
+def measure(part: Part, root: Path, *, jobs: int, only: str, tell: Callable[[str], object]) -> list[ModuleScore]:
     """Return the figures of each module of a part.
 
-    only: mutants of modules whose name ends so, all for an empty text, and none for None. `tell` gets each survivor.
+    only: mutants of modules whose name ends so, all for an empty text. `tell` gets each survivor.
 
     Raises `FailedError` if a test fails without any change.
     """
@@ -168,7 +167,7 @@ def measure(part: Part, root: Path, *, jobs: int, only: str | None, tell: Callab
     unchanged = try_unchanged(part, root)
     if unchanged.failed:
         raise FailedError(f"{unchanged.failed[0]} fails without any change: mend it first")
-    tasks = [] if only is None else _tasks(part, root, only)
+    tasks = _tasks(part, root, only)
     survivors: dict[str, list[Survivor]] = {}
     for done, (task, survives) in enumerate(_run(part, root, tasks, unchanged.seconds, jobs), 1):
         if survives:
@@ -178,11 +177,10 @@ def measure(part: Part, root: Path, *, jobs: int, only: str | None, tell: Callab
     return [
         ModuleScore(
             module,
-            coverage,
             sum(task.module == module for task in tasks),
             sorted(survivors.get(module, []), key=lambda survivor: survivor.mutant.line),
         )
-        for module, coverage in unchanged.coverage.items()
+        for module in part.files(root)
     ]
 
 
@@ -217,24 +215,13 @@ _INI: Final = "[pytest]\nfilterwarnings = ignore\nmarkers =\n  live: x\n  reacti
 
 _PATIENCE_S: Final = 120
 _CPU_S: Final = 20
-"""Processor time of a mutant besides thrice what its tests take while their coverage is measured, which slows them."""
-
-
-class Coverage(NamedTuple):
-    """Lines and branches of a module, and how many of them the tests reach; `missing` names the rest."""
-
-    lines: int
-    lines_reached: int
-    branches: int
-    branches_reached: int
-    missing: str
+"""Processor time of a mutant besides thrice what its tests take."""
 
 
 class TestRun(NamedTuple):
-    """Result of the tests on the unchanged modules: seconds of each test, and the coverage of each module."""
+    """Result of the tests on the unchanged modules: seconds of each test, and those that failed."""
 
     seconds: dict[str, float]
-    coverage: dict[str, Coverage]
     failed: list[str]
 
 
@@ -249,13 +236,6 @@ class _Timing:
         self.seconds[report.nodeid] = self.seconds.get(report.nodeid, 0.0) + report.duration
         if report.failed:
             self.failed.append(report.nodeid)
-
-
-class _ByHand:
-    """Leaves out property tests: what only they reach by chance is not reached for certain; pytest calls it."""
-
-    def pytest_collection_modifyitems(self, items: list[pytest.Item]) -> None:
-        items[:] = [item for item in items if not getattr(getattr(item, "obj", None), "is_hypothesis_test", False)]
 
 
 class _QuickFirst:
@@ -278,16 +258,14 @@ def preload(part: Part, modules: Iterable[str]) -> None:
 
 
 def try_unchanged(part: Part, root: Path) -> TestRun:
-    """Run the tests but property tests on the modules as they are, with coverage of their lines and branches."""
+    """Run the tests on the modules as they are."""
     with tempfile.TemporaryDirectory(prefix="fognav-mutation-") as folder:
         report = Path(folder) / "result.json"
         child = os.fork()
         if child == 0:
-            _end_with(lambda: _measure(part, root, report))
+            _end_with(lambda: _time_tests(part, root, report))
         os.waitpid(child, 0)
-        found = json.loads(report.read_text("utf-8"))
-    coverage = {name: Coverage(**values) for name, values in found["coverage"].items()}
-    return TestRun(found["seconds"], coverage, found["failed"])
+        return TestRun(**json.loads(report.read_text("utf-8")))
 
 
 def start_mutant(part: Part, root: Path, module: str, tree: ast.Module, seconds: dict[str, float]) -> int:
@@ -364,63 +342,26 @@ def _pytest(part: Part, root: Path, options: list[str], plugins: list[object]) -
         return int(pytest.main([*arguments, *(str(folder / test) for test in part.tests)], plugins=plugins))
 
 
-def _measure(part: Part, root: Path, report: Path) -> int:
-    from coverage import Coverage as Tracer  # noqa: PLC0415  # for developers, absent from an installation
-
-    files = part.files(root)
-    tracer = Tracer(data_file=None, branch=True, config_file=False, include=[str(path) for path in files.values()])
-    tracer.exclude("if TYPE_CHECKING:")
-    timing = _Timing()
-    started = time.monotonic()
-    tracer.start()
-    code = _pytest(part, root, [], [timing, _ByHand()])
-    tracer.stop()
+def _time_tests(part: Part, root: Path, report: Path) -> int:
+    timing, started = _Timing(), time.monotonic()
+    code = _pytest(part, root, [], [timing])
     if code and not timing.failed:
         timing.failed.append(f"pytest ended with {code} after {time.monotonic() - started:.1f} s")
-    figures = report.with_name("coverage.json")
-    tracer.json_report(outfile=str(figures))
-    measured = json.loads(figures.read_text("utf-8"))["files"]
-    by_path = {Path(name).resolve(): values for name, values in measured.items()}
-    coverage = {name: _coverage(by_path.get(path.resolve()))._asdict() for name, path in files.items()}
-    report.write_text(json.dumps({"seconds": timing.seconds, "coverage": coverage, "failed": timing.failed}), "utf-8")
+    report.write_text(json.dumps({"seconds": timing.seconds, "failed": timing.failed}), "utf-8")
     return 0
 
 
-def _coverage(values: dict[str, object] | None) -> Coverage:
-    """Return the figures of one module's entry in coverage's report; none for a module that was never imported."""
-    if values is None:
-        return Coverage(1, 0, 0, 0, "never imported")
-    summary = values["summary"]
-    assert isinstance(summary, dict)
-    missing = f"lines {values['missing_lines']}, branches {values['missing_branches']}"
-    return Coverage(
-        summary["num_statements"],
-        summary["covered_lines"],
-        summary["num_branches"],
-        summary["covered_branches"],
-        "" if summary["missing_lines"] == summary["missing_branches"] == 0 else missing,
-    )
-
-
 def passes(figures: Mapping[str, list[ModuleScore]]) -> bool:
-    """Return whether tests reach every line and branch, and notice enough mutants of each part."""
-    reached = all(not module.coverage.missing for modules in figures.values() for module in modules)
-    return reached and all(score(modules) >= LEAST_SCORE for modules in figures.values())
+    """Return whether tests notice enough mutants of each part."""
+    return all(score(modules) >= LEAST_SCORE for modules in figures.values())
 
 
 def report_lines(figures: Mapping[str, list[ModuleScore]]) -> Iterator[str]:
     """Yield the lines of the report."""
     for part, modules in figures.items():
         for module in modules:
-            reached = module.coverage
-            yield (
-                f"{module.module}: {reached.lines_reached} of {reached.lines} lines and {reached.branches_reached} of "
-                f"{reached.branches} branches reached"
-            )
-            if reached.missing:
-                yield f"  not reached: {reached.missing}"
             if module.mutants:
-                yield f"  {module.killed} of {module.mutants} mutants noticed"
+                yield f"{module.module}: {module.killed} of {module.mutants} mutants noticed"
             yield from (f"  survives: {survivor}" for survivor in module.survivors)
         if any(module.mutants for module in modules):
             yield f"{part}: score {score(modules):.1%}"
@@ -437,7 +378,6 @@ def report_values(figures: Mapping[str, list[ModuleScore]]) -> dict[str, object]
 def _values(module: ModuleScore) -> dict[str, object]:
     return {
         "module": module.module,
-        "coverage": module.coverage._asdict(),
         "mutants": module.mutants,
         "killed": module.killed,
         "survivors": [str(survivor) for survivor in module.survivors],

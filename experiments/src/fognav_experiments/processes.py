@@ -12,9 +12,8 @@ from typing import TYPE_CHECKING, Final
 
 from fog_contracts import channels as ch
 from fog_contracts.codec import encode
-from fog_contracts.handlers import Moment
 from fog_contracts.messages import MapSnapshot, Message, PlanReply, RobotGoal, RobotState
-from fognav_experiments.link import Link
+from fognav_experiments.computers import ComputerClock, Link
 from planner.missions import DockGoals
 from robot_agent.motion.local_planner import decide
 
@@ -22,7 +21,7 @@ if TYPE_CHECKING:
     from collections.abc import Iterable, Mapping, Sequence
 
     from fog_contracts.bus import Bus
-    from fog_contracts.handlers import Handler, Ids, Publication, QueryHandler
+    from fog_contracts.handlers import Handler, Ids, Moment, Publication, QueryHandler
     from fog_contracts.messages import EgressRequest, Pose, ProfileName, Zone
     from hazard_aggregator.core import Aggregator
     from map_service.core import MapCore
@@ -41,57 +40,6 @@ USED: Final[Mapping[ProfileName, frozenset[ch.Channel]]] = {
     }),
 }  # fmt: skip
 """What a robot receives from the fog that its profile uses."""
-
-
-class _Drift:
-    """By how much a clock is ahead."""
-
-    def __init__(self) -> None:
-        self._rate = self._gained = self._since = 0.0
-
-    def ahead(self, now: float) -> float:
-        return self._gained + self._rate * (now - self._since)
-
-    def change(self, now: float, jump_s: float, rate: float) -> None:
-        self._gained, self._since, self._rate = self.ahead(now) + jump_s, now, rate
-
-
-class ComputerClock:
-    """A computer's two clocks: call it with the true time, to get what they show.
-
-    The wall clock may jump and be slewed. What counts intervals runs as its crystal does, a little too fast or slow.
-    """
-
-    def __init__(self) -> None:
-        self._crystal = _Drift()
-        self._wall = _Drift()
-        self._true = True
-        """Whether neither was ever changed."""
-
-    def __call__(self, at: Moment) -> Moment:
-        """Return what its clocks show."""
-        if self._true:
-            return at
-        counted, shown = self._crystal.ahead(at.now), self._wall.ahead(at.now)
-        return Moment(at.now + counted, at.stamp + shown, at.synchronized, at.clock)
-
-    def ahead(self, now: float) -> float:
-        """Return by how much (s) the wall clock is ahead at the true time `now`."""
-        return self._wall.ahead(now)
-
-    def change(self, now: float, *, jump_s: float = 0.0, rate: float = 0.0, crystal: float = 0.0) -> None:
-        """Set the wall clock forward; from now on it gains `rate` seconds a second, the other clock `crystal`."""
-        self._true = False
-        self._wall.change(now, jump_s, rate)
-        self._crystal.change(now, 0.0, crystal)
-
-    def heard(self, handler: Handler) -> Handler:
-        """Return a handler that is given what the clocks show, for one of messages."""
-        return lambda ids, message, at: handler(ids, message, self(at))
-
-    def asked(self, handler: QueryHandler) -> QueryHandler:
-        """Return a handler that is given what the clocks show, for one of queries."""
-        return lambda ids, request, at: handler(ids, request, self(at))
 
 
 QUERY_TIMEOUT_S: Final = 3.0

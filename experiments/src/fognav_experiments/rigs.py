@@ -20,10 +20,10 @@ from fog_contracts.cones import node_cones
 from fog_contracts.handlers import Moment, Publication
 from fog_contracts.messages import CommandReply, NodeConfig
 from fog_runtime.configuration.robot_file import RobotFile, default_robot
+from fognav_experiments.computers import ComputerClock
 from fognav_experiments.processes import (
     AgentProcess,
     AggregatorProcess,
-    ComputerClock,
     Fog,
     FogProcess,
     MapProcess,

@@ -6,7 +6,7 @@ import asyncio
 import math
 import os
 import sys
-from typing import TYPE_CHECKING, Final, Protocol
+from typing import TYPE_CHECKING, Final
 
 from fog_contracts.commands import PROFILE_OF, STOPS
 from fog_runtime import logs
@@ -46,38 +46,62 @@ _NO: Final = ("n", "no", "")
 _ENDED: Final = "ended: repeat the command to go on with this drive"
 
 
-class DrivenRobot(Protocol):
-    """A robot that is sent on routes: its latest state and pose, commands and goals."""
+class ConnectedRobot:
+    """A robot that is sent on routes: commands as `fognav robot` sends them, goals by the planner of its fog node."""
+
+    def __init__(self, fog: Fog, connected: Robot) -> None:
+        self._fog = fog
+        self._connected = connected
 
     @property
     def id(self) -> str:
         """Its id."""
+        return self._connected.id
 
     @property
     def state(self) -> RobotState | None:
         """The latest state that it published."""
+        return self._connected.state
 
     @property
     def pose(self) -> RobotPose | None:
         """The latest pose that it published."""
+        return self._connected.pose
 
     def now(self) -> float:
         """Return the monotonic time, s."""
+        return self._connected.clock.now()
 
     def take_paths(self) -> list[RobotPath]:
         """Return what the planner published for it since the last call."""
+        return self._connected.take_paths()
 
     async def wait(self) -> None:
         """Wait for `PERIOD_S`."""
+        await self._connected.clock.sleep(PERIOD_S)
 
     async def command(self, kind: CommandKind, pose: Pose | None = None) -> Outcome:
         """Send an operator's command; raises `FailedError` if the robot does not answer."""
+        if kind in STOPS:
+            return await self._connected.stop(kind)
+        return await asyncio.to_thread(robot_commands.command, self._fog, self.id, kind, pose)
 
     async def set_goal(self, place: str) -> str:
         """Send it to a place; return the goal's id."""
+        answer = await asyncio.to_thread(self._fog.send, "PUT", PLANNER, self._goal, {"place": place})
+        return str(answer["goal_id"])
 
     async def end_goal(self) -> None:
         """End its mission, if it has one."""
+        try:
+            await asyncio.to_thread(self._fog.send, "DELETE", PLANNER, self._goal)
+        except RefusedError as error:
+            if error.code != "no_mission":
+                raise
+
+    @property
+    def _goal(self) -> str:
+        return f"/api/v1/robots/{self.id}/goal"
 
 
 class Terminal:
@@ -134,7 +158,7 @@ class _SkippedError(Exception):
 class HardwareRun:
     """Leads a person and a robot through drives of an experiment."""
 
-    def __init__(self, site: LoadedSite, robot: DrivenRobot, terminal: Terminal, commit: str = "") -> None:
+    def __init__(self, site: LoadedSite, robot: ConnectedRobot, terminal: Terminal, commit: str = "") -> None:
         """`commit`: the program's revision, which is only recorded."""
         self._site = site
         self._robot = robot
@@ -306,55 +330,6 @@ class HardwareRun:
         self._robot.take_paths()
 
 
-class _ConnectedRobot:
-    """A robot that is connected to a fog node: commands as `fognav robot` sends them, goals by the planner."""
-
-    def __init__(self, fog: Fog, connected: Robot) -> None:
-        self._fog = fog
-        self._connected = connected
-
-    @property
-    def id(self) -> str:
-        return self._connected.id
-
-    @property
-    def state(self) -> RobotState | None:
-        return self._connected.state
-
-    @property
-    def pose(self) -> RobotPose | None:
-        return self._connected.pose
-
-    def now(self) -> float:
-        return self._connected.clock.now()
-
-    def take_paths(self) -> list[RobotPath]:
-        return self._connected.take_paths()
-
-    async def wait(self) -> None:
-        await self._connected.clock.sleep(PERIOD_S)
-
-    async def command(self, kind: CommandKind, pose: Pose | None = None) -> Outcome:
-        if kind in STOPS:
-            return await self._connected.stop(kind)
-        return await asyncio.to_thread(robot_commands.command, self._fog, self.id, kind, pose)
-
-    async def set_goal(self, place: str) -> str:
-        answer = await asyncio.to_thread(self._fog.send, "PUT", PLANNER, self._goal, {"place": place})
-        return str(answer["goal_id"])
-
-    async def end_goal(self) -> None:
-        try:
-            await asyncio.to_thread(self._fog.send, "DELETE", PLANNER, self._goal)
-        except RefusedError as error:
-            if error.code != "no_mission":
-                raise
-
-    @property
-    def _goal(self) -> str:
-        return f"/api/v1/robots/{self.id}/goal"
-
-
 def drive_hardware(  # noqa: PLR0913  # what is driven, where, and by whom
     site: LoadedSite,
     asked: Sequence[Task],
@@ -381,6 +356,6 @@ def drive_hardware(  # noqa: PLR0913  # what is driven, where, and by whom
     async def drive_all() -> None:
         async with connect(fog, fog.robot(robot)) as connected:
             with Terminal(sys.stdin.fileno(), say) as terminal:
-                await HardwareRun(site, _ConnectedRobot(fog, connected), terminal, commit).run(ordered, files)
+                await HardwareRun(site, ConnectedRobot(fog, connected), terminal, commit).run(ordered, files)
 
     asyncio.run(drive_all())

@@ -75,13 +75,26 @@ def _process(name: str, names: tuple[str, ...], number: signal.Signals, *, stops
     )
 
 
-def _base(rig: Rig, *, sensor: str, value: bool) -> None:
-    setattr(rig.body.base.world, sensor, value)
+def _switched(  # noqa: PLR0913  # what a fault consists of
+    name: str,
+    kind: Kind,
+    limit_s: float,
+    design: str,
+    switch: Callable[..., None],
+    *,
+    speed: float = 0.0,
+    observed_s: float = 1.2,
+) -> Fault:
+    """Return a fault that is switched on and off again; `switch` is called with the rig and `on`."""
+    return Fault(name, kind, limit_s, design, partial(switch, on=True), partial(switch, on=False), speed, observed_s)
+
+
+def _base(rig: Rig, *, sensor: str, on: bool) -> None:
+    setattr(rig.body.base.world, sensor, on)
 
 
 def _sensor(name: str, sensor: str, *, limit_s: float = _FRAME_S, design: str = "one sensor frame: 0.05") -> Fault:
-    begin, end = (partial(_base, sensor=sensor, value=value) for value in (True, False))
-    return Fault(name, "device", limit_s, design, begin, end)
+    return _switched(name, "device", limit_s, design, partial(_base, sensor=sensor))
 
 
 def _full_mode(rig: Rig) -> None:
@@ -133,11 +146,6 @@ def _fog(rig: Rig, *, what: str, on: bool) -> None:
     setattr(rig.fog, what, on)
 
 
-def _silent(name: str, what: str, limit_s: float, design: str, *, speed: float = 0.0, observed_s: float) -> Fault:
-    begin, end = (partial(_fog, what=what, on=on) for on in (True, False))
-    return Fault(name, "fog", limit_s, design, begin, end, speed, observed_s)
-
-
 def _zone(rig: Rig, *, ahead_m: float, lost: bool = False) -> None:
     x, y, theta = rig.body.world.pose
     rig.fog.block(x + ahead_m * math.cos(theta), y + ahead_m * math.sin(theta), lost=lost)
@@ -185,47 +193,30 @@ FAULTS: Final = (
     _sensor("wheel drops", "wheel_drop_left"),
     _sensor("wheel motor blocked", "overcurrent_left", limit_s=0.3 + _CYCLE_S, design="0.3 of high current + 0.1"),
     Fault("base put into Full mode", "device", _FRAME_S, "one sensor frame: 0.05", _full_mode, _nothing),
-    Fault(
-        "base: every frame damaged",
-        "device",
-        0.3 + _CYCLE_S,
-        "0.3 without a frame + 0.1",
-        partial(_noise, on=True),
-        partial(_noise, on=False),
-    ),
-    Fault(
+    _switched("base: every frame damaged", "device", 0.3 + _CYCLE_S, "0.3 without a frame + 0.1", _noise),
+    _switched(
         "lidar falls silent",
         "device",
         _READ_S + 0.3 + _CYCLE_S,
         "read 0.05 + 0.3 + 0.1",
-        partial(_lidar, fault="stalled", on=True),
-        partial(_lidar, fault="stalled", on=False),
+        partial(_lidar, fault="stalled"),
     ),
     Fault("lidar unplugged", "device", 0.3 + _CYCLE_S, "0.3 + 0.1", _unplug, _plug),
-    Fault(
+    _switched(
         "lidar repeats a turn",
         "device",
         3 * _TURN_S + _CYCLE_S,
         "3 turns of 0.19 + 0.1",
-        partial(_lidar, fault="frozen", on=True),
-        partial(_lidar, fault="frozen", on=False),
+        partial(_lidar, fault="frozen"),
     ),
-    Fault(
+    _switched(
         "lidar repeats five turns",
         "device",
         3 * _TURN_S + _CYCLE_S,
         "3 turns of 0.19 + 0.1",
-        partial(_lidar, fault="frozen", on=True, revolutions=5),
-        partial(_lidar, fault="frozen", on=False),
+        partial(_lidar, fault="frozen", revolutions=5),
     ),
-    Fault(
-        "lidar sees nothing ahead",
-        "device",
-        3 * _TURN_S + _CYCLE_S,
-        "3 turns of 0.19 + 0.1",
-        partial(_blind, on=True),
-        partial(_blind, on=False),
-    ),
+    _switched("lidar sees nothing ahead", "device", 3 * _TURN_S + _CYCLE_S, "3 turns of 0.19 + 0.1", _blind),
     Fault(
         "box 0.06 m ahead, slow",
         "device",
@@ -235,26 +226,29 @@ FAULTS: Final = (
         _no_box,
         _SLOW_M_S,
     ),
-    _silent(
+    _switched(
         "map silent, slow",
-        "map_silent",
+        "fog",
         _POLL_S + 1.0 + _SLOWING_S + _CYCLE_S,
         "poll 0.05 + 1.0 + braking 0.15 + 0.1",
+        partial(_fog, what="map_silent"),
         speed=_DEGRADED_M_S,
         observed_s=1.8,
     ),
-    _silent(
+    _switched(
         "map silent, stop",
-        "map_silent",
+        "fog",
         _POLL_S + 3.0 + _RAMP_S + _CYCLE_S,
         "poll 0.05 + 3.0 + ramp 0.5 + 0.1",
+        partial(_fog, what="map_silent"),
         observed_s=4.5,
     ),
-    _silent(
+    _switched(
         "planner silent, slow",
-        "planner_silent",
+        "fog",
         _POLL_S + 1.5 + _SLOWING_S + _CYCLE_S,
         "poll 0.05 + 1.5 + braking 0.15 + 0.1",
+        partial(_fog, what="planner_silent"),
         speed=_DEGRADED_M_S,
         observed_s=2.3,
     ),

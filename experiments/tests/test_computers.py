@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 from fog_contracts import channels as ch
 from fog_contracts.handlers import Publication
 from fog_contracts.messages import MapSnapshot
-from fognav_experiments.link import Link
+from fognav_experiments.computers import Link
 from fognav_experiments.processes import QUERY_TIMEOUT_S, AgentProcess
 from fognav_experiments.rigs import moment
 

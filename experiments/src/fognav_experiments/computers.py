@@ -1,17 +1,70 @@
-"""A robot's Wi-Fi in lockstep: messages that arrive at once, late, in one direction only, or not at all. Pure."""
+"""What a computer in lockstep has around it: clocks that may be wrong, and a Wi-Fi that delays and loses. Pure."""
 
 from __future__ import annotations
 
 from collections import deque
 from typing import TYPE_CHECKING, TypeVar
 
+from fog_contracts.handlers import Moment
+
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
 
-    from fog_contracts.handlers import Moment, Publication
+    from fog_contracts.handlers import Handler, Publication, QueryHandler
 
     Arrival = Callable[[Moment], Sequence[Publication]]
     R = TypeVar("R")
+
+
+class _Drift:
+    """By how much a clock is ahead."""
+
+    def __init__(self) -> None:
+        self._rate = self._gained = self._since = 0.0
+
+    def ahead(self, now: float) -> float:
+        return self._gained + self._rate * (now - self._since)
+
+    def change(self, now: float, jump_s: float, rate: float) -> None:
+        self._gained, self._since, self._rate = self.ahead(now) + jump_s, now, rate
+
+
+class ComputerClock:
+    """A computer's two clocks: call it with the true time, to get what they show.
+
+    The wall clock may jump and be slewed. What counts intervals runs as its crystal does, a little too fast or slow.
+    """
+
+    def __init__(self) -> None:
+        self._crystal = _Drift()
+        self._wall = _Drift()
+        self._true = True
+        """Whether neither was ever changed."""
+
+    def __call__(self, at: Moment) -> Moment:
+        """Return what its clocks show."""
+        if self._true:
+            return at
+        counted, shown = self._crystal.ahead(at.now), self._wall.ahead(at.now)
+        return Moment(at.now + counted, at.stamp + shown, at.synchronized, at.clock)
+
+    def ahead(self, now: float) -> float:
+        """Return by how much (s) the wall clock is ahead at the true time `now`."""
+        return self._wall.ahead(now)
+
+    def change(self, now: float, *, jump_s: float = 0.0, rate: float = 0.0, crystal: float = 0.0) -> None:
+        """Set the wall clock forward; from now on it gains `rate` seconds a second, the other clock `crystal`."""
+        self._true = False
+        self._wall.change(now, jump_s, rate)
+        self._crystal.change(now, 0.0, crystal)
+
+    def heard(self, handler: Handler) -> Handler:
+        """Return a handler that is given what the clocks show, for one of messages."""
+        return lambda ids, message, at: handler(ids, message, self(at))
+
+    def asked(self, handler: QueryHandler) -> QueryHandler:
+        """Return a handler that is given what the clocks show, for one of queries."""
+        return lambda ids, request, at: handler(ids, request, self(at))
 
 
 class Link:

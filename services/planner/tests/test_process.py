@@ -314,7 +314,7 @@ async def test_invalid_goals_are_refused_with_a_reason_and_all_goals_without_the
         assert (wall.status_code, wall.headers["content-type"]) == (422, "application/problem+json")
         problem = wall.json()
         assert (problem["code"], problem["name"]) == (206, "GOAL_OCCUPIED")
-        assert problem["type"] == "urn:fognav:goal_refused"
+        assert (problem["type"], problem["refusal"]) == ("urn:fognav:goal_refused", "goal_in_wall")
         assert problem["errors"][0]["field"] == "body.pose"
         assert (await put({"pose": {"x": 99.0, "y": 6.0}})).json()["code"] == 204
         assert (await put({"place": "nowhere"})).json()["type"] == "urn:fognav:no_place"

@@ -265,7 +265,8 @@ def _report(outcome: Outcome, *, json: bool) -> None:
 
 
 def _refused(error: RefusedError, mode: Mode | None) -> Outcome:
-    return Outcome(accepted=False, reason=str(error), mode=mode, code=error.code)
+    code = error.problem.get("refusal") or error.code
+    return Outcome(accepted=False, reason=str(error), mode=mode, code=code)
 
 
 def _end_mission(fog: Fog, robot: str | None) -> str:

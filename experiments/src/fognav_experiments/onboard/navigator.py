@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Final
 import numpy as np
 
 from fog_contracts.costs import INSCRIBED
-from fog_contracts.messages import Refusal, RobotPath
+from fog_contracts.messages import PlanRefusal, Refusal, RobotPath
 from fog_kernels.astar import Planner, nearest_traversable
 from fog_kernels.lines import line_cost
 from fognav_experiments.onboard.costmap import OnboardCostmap
@@ -196,17 +196,19 @@ class Search:
         geometry, goal = self.geometry, (self.goal.pose.x, self.goal.pose.y)
         first, last = geometry.cell(*self.start), geometry.cell(*goal)
         if not geometry.contains_cell(*first):
-            return self._refused(203, "the robot is off its map")
+            return self._refused(203, PlanRefusal.START_OFF_MAP, "the robot is off its map")
         if not geometry.contains_cell(*last):
-            return self._refused(204, "the goal is off the map")
+            return self._refused(204, PlanRefusal.GOAL_OFF_MAP, "the goal is off the map")
         free = nearest_traversable(self.cost, first, math.floor(_ESCAPE_M / geometry.resolution))
         if free is None:
-            return self._refused(205, f"nothing is free within {_ESCAPE_M} m of the robot")
+            return self._refused(
+                205, PlanRefusal.START_OBSTRUCTED, f"nothing is free within {_ESCAPE_M} m of the robot"
+            )
         if self.cost[last[1], last[0]] >= INSCRIBED:
-            return self._refused(206, "the goal is occupied")
+            return self._refused(206, PlanRefusal.GOAL_OBSTRUCTED, "the goal is occupied")
         found = self.planner.plan(self.cost, free, last)
         if not found.found:
-            return self._refused(208, "no path leads to the goal on the robot's own map")
+            return self._refused(208, PlanRefusal.CUT_OFF, "no path leads to the goal on the robot's own map")
         return Found(by=self.planner, goal=self.goal, points=self._points(found.cells, goal))
 
     def _points(self, cells: NDArray[np.int32], goal: PointXY) -> list[PointXY]:
@@ -221,8 +223,9 @@ class Search:
                 points[end] = exact
         return [(float(x), float(y)) for x, y in points]
 
-    def _refused(self, code: PlanCode, reason: str) -> Found:
-        return Found(by=self.planner, goal=self.goal, points=[], refusal=Refusal(code=code, reason=reason))
+    def _refused(self, code: PlanCode, kind: PlanRefusal, reason: str) -> Found:
+        refusal = Refusal(code=code, kind=kind, reason=reason)
+        return Found(by=self.planner, goal=self.goal, points=[], refusal=refusal)
 
 
 FULL: Final = replace(FOG, name="full", planner=OnboardNavigator)

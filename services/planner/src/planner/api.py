@@ -59,7 +59,11 @@ class PlannerProblem(ProblemCode):
     NO_ROBOT = "no_robot", 404, "No robot has this id"
     NO_MISSION = "no_mission", 404, "The robot has no mission"
     NO_PLACE = "no_place", 422, "The site has no such place"
-    GOAL_REFUSED = "goal_refused", 422, "The goal can never be reached: Nav2's `code` and `name` say why"
+    GOAL_REFUSED = (
+        "goal_refused",
+        422,
+        "The goal can never be reached: `refusal`, and Nav2's `code` and `name`, say why",
+    )
     MISSION_CHANGED = "mission_changed", 412, "The robot has another mission than the request expects, or has one"
     ROBOT_DOUBLED = "robot_doubled", 409, "Two agents use this robot's id"
     COMMAND_REFUSED = "command_refused", 409, "The robot refuses: `refusal` and `causes` identify why"
@@ -392,6 +396,7 @@ def _add_orders(routes: Routes, service: Service, robots: _Robots, site: Site) -
                 field=field,
                 code=answer.code,
                 name=answer.name,
+                refusal=answer.kind,
                 nearest=answer.nearest,
             )
         return _goal_answer(robot, answer, status=201 if new else 200)

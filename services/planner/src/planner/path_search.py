@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from fog_contracts.costs import FREE, INSCRIBED, LETHAL
 from fog_contracts.geometry import lengths_along, sampled
+from fog_contracts.messages import PlanRefusal
 from fog_kernels.astar import Planner, nearest_traversable
 from fog_kernels.lines import cost_from, first_inside, leaves, line_cost, nearest_between
 from planner.refusals import (
@@ -208,7 +209,7 @@ class PathSearch:
     ) -> SearchResult:
         if found is not None:
             reason = f"no path was found within {most} expanded cells"
-            return refused(refuse(TIMEOUT, reason), searched=True)
+            return refused(refuse(TIMEOUT, PlanRefusal.SEARCH_TOO_LONG, reason), searched=True)
         return refused(no_path(nearest_reachable(planning_map, question.start_cell, question.goal_cell)), question)
 
     def _search(

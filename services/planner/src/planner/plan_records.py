@@ -67,7 +67,8 @@ class PathRecord:
             for trace in path.traces:
                 metrics.observe_trace(trace, ["plan"])
         if path.refusal is not None:
-            _log.warning("plan_refused", robot=robot, plan=path.plan_id, reason=path.refusal.reason)
+            refusal = path.refusal
+            _log.warning("plan_refused", robot=robot, plan=path.plan_id, refusal=refusal.kind, reason=refusal.reason)
         else:
             _log.info("plan_published", robot=robot, plan=path.plan_id, corners=len(path.points), map_seq=path.map_seq,
                       hazards=[trace.area for trace in path.traces])  # fmt: skip

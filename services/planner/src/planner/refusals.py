@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Final, Literal
 import numpy as np
 
 from fog_contracts.costs import FREE, INSCRIBED, LETHAL, PENALTY_MAX, UNKNOWN
-from fog_contracts.messages import PLAN_CODES, Cause, PlanCode, PointXY, Refusal
+from fog_contracts.messages import PLAN_CODES, Cause, PlanCode, PlanRefusal, PointXY, Refusal
 from fog_kernels.astar import nearest_traversable
 from fog_kernels.components import Components
 from fog_kernels.distance import squared_distance_capped
@@ -240,25 +240,28 @@ _NEAR_GOAL_M: Final = 5.0
 """How far from a goal in a wall a reachable point is searched."""
 
 
-def refuse(code: PlanCode, reason: str, causes: Iterable[Cause] = (), nearest: PointXY | None = None) -> Refusal:
+def refuse(
+    code: PlanCode, kind: PlanRefusal, reason: str, causes: Iterable[Cause] = (), nearest: PointXY | None = None
+) -> Refusal:
     """Return a refusal, its sentence and causes cut to the message's limits; `nearest` in m, frame `map`."""
     sentence = f"{PLAN_CODES[code]}: {reason}"
-    return Refusal(code=code, reason=sentence[:500], causes=list(causes)[:16], nearest=nearest)
+    return Refusal(code=code, kind=kind, reason=sentence[:500], causes=list(causes)[:16], nearest=nearest)
 
 
 def no_map() -> Refusal:
     """Refuse because no map was received yet."""
-    return refuse(TIMEOUT, "the planner has no map yet: try again when it is ready")
+    return refuse(TIMEOUT, PlanRefusal.NO_MAP, "the planner has no map yet: try again when it is ready")
 
 
 def busy(reason: str) -> Refusal:
     """Refuse because too many queries are waiting."""
-    return refuse(TIMEOUT, reason)
+    return refuse(TIMEOUT, PlanRefusal.TOO_MANY_QUERIES, reason)
 
 
 def start_outside(geometry: GridGeometry, start: PointXY) -> Refusal:
     """Refuse because the robot stands off the map."""
-    return refuse(203, f"the robot at {_point(start)} is outside the map {_extent(geometry)}")
+    reason = f"the robot at {_point(start)} is outside the map {_extent(geometry)}"
+    return refuse(203, PlanRefusal.START_OFF_MAP, reason)
 
 
 def start_occupied(start: PointXY, inside: Sequence[Region] | None = None) -> Refusal:
@@ -268,9 +271,11 @@ def start_occupied(start: PointXY, inside: Sequence[Region] | None = None) -> Re
     """
     where = f"the robot at {_point(start)} stands "
     if inside:
-        return refuse(205, f"{where}inside or at the edge of {_listed(inside)}", _causes(inside))
-    what = "in a closed place" if inside is None else "on a wall, an obstacle or unknown space"
-    return refuse(205, where + what)
+        reason = f"{where}inside or at the edge of {_listed(inside)}"
+        return refuse(205, PlanRefusal.START_CLOSED, reason, _causes(inside))
+    if inside is None:
+        return refuse(205, PlanRefusal.START_CLOSED, f"{where}in a closed place")
+    return refuse(205, PlanRefusal.START_OBSTRUCTED, f"{where}on a wall, an obstacle or unknown space")
 
 
 def goal_out_of_reach(planning_map: PlanningMap, goal: PointXY) -> Refusal | None:
@@ -281,15 +286,17 @@ def goal_out_of_reach(planning_map: PlanningMap, goal: PointXY) -> Refusal | Non
     geometry, lower_bound = planning_map.geometry, planning_map.lower_bound
     column, row = geometry.cell(*goal)
     if not geometry.contains_cell(column, row):
-        return refuse(204, f"the goal {_point(goal)} lies outside the map {_extent(geometry)}")
+        reason = f"the goal {_point(goal)} lies outside the map {_extent(geometry)}"
+        return refuse(204, PlanRefusal.GOAL_OFF_MAP, reason)
     if lower_bound[row, column] < INSCRIBED:
         return None
     near = nearest_traversable(lower_bound, (column, row), round(_NEAR_GOAL_M / geometry.resolution))
     nearest = geometry.centre(*near) if near else None
-    where = {LETHAL: "in a wall", UNKNOWN: "in unknown space"}.get(
-        int(planning_map.static[row, column]), "too near a wall for the robot"
-    )
-    return refuse(206, f"the goal {_point(goal)} lies {where}{_nearest_clause(nearest)}", nearest=nearest)
+    kind, where = {
+        LETHAL: (PlanRefusal.GOAL_IN_WALL, "in a wall"),
+        UNKNOWN: (PlanRefusal.GOAL_UNKNOWN, "in unknown space"),
+    }.get(int(planning_map.static[row, column]), (PlanRefusal.GOAL_NEAR_WALL, "too near a wall for the robot"))
+    return refuse(206, kind, f"the goal {_point(goal)} lies {where}{_nearest_clause(nearest)}", nearest=nearest)
 
 
 def goal_occupied(goal: PointXY, nearest: PointXY | None, inside: Sequence[Region] | None = None) -> Refusal:
@@ -297,29 +304,30 @@ def goal_occupied(goal: PointXY, nearest: PointXY | None, inside: Sequence[Regio
 
     `inside`: the regions that close it; None while they are not known.
     """
+    kind = PlanRefusal.GOAL_CLOSED
     if inside is None:
         where = "in a place that is closed now"
     elif inside:
         where = f"inside or at the edge of {_listed(inside)}"
     else:
-        where = "on or beside an obstacle that a robot sees"
+        kind, where = PlanRefusal.GOAL_OBSTRUCTED, "on or beside an obstacle that a robot sees"
     causes = [] if inside is None else _causes(inside) or [_OBSTACLE]
-    return refuse(206, f"the goal {_point(goal)} lies {where}{_nearest_clause(nearest)}", causes, nearest)
+    return refuse(206, kind, f"the goal {_point(goal)} lies {where}{_nearest_clause(nearest)}", causes, nearest)
 
 
 def no_path(nearest: PointXY, cut: Cut | None = None) -> Refusal:
     """Refuse because every path to the goal is blocked; `cut` tells by what, None while that is not known."""
     if cut is None:
-        return refuse(208, f"every path is blocked{_nearest_clause(nearest)}", (), nearest)
+        return refuse(208, PlanRefusal.CUT_OFF, f"every path is blocked{_nearest_clause(nearest)}", (), nearest)
     if cut.kind == "walls":
         reason = f"no path leads there: walls or unknown space lie between{_nearest_clause(nearest)}"
-        return refuse(208, reason, [_WALL], nearest)
+        return refuse(208, PlanRefusal.CUT_BY_WALLS, reason, [_WALL], nearest)
     if cut.kind == "obstacles":
         reason = f"every path is blocked by obstacles that robots see{_nearest_clause(nearest)}"
-        return refuse(208, reason, [_OBSTACLE], nearest)
+        return refuse(208, PlanRefusal.CUT_BY_OBSTACLES, reason, [_OBSTACLE], nearest)
     joint = ", which must all end" if cut.jointly and len(cut.regions) > 1 else ""
     reason = f"every path is blocked by {_listed(cut.regions)}{joint}{_nearest_clause(nearest)}"
-    return refuse(208, reason, _causes(cut.regions), nearest)
+    return refuse(208, PlanRefusal.CUT_BY_PLACES, reason, _causes(cut.regions), nearest)
 
 
 def nearest_reachable(planning_map: PlanningMap, start: Cell, goal: Cell) -> PointXY:

@@ -47,11 +47,36 @@ PlanCode = Literal[0, 203, 204, 205, 206, 207, 208]
 Points = Annotated[list[PointXY], Meta(max_length=100_000)]
 
 
+class PlanRefusal(Described):
+    """Why there is no path, closer than Nav2's code."""
+
+    NO_MAP = "no_map", "the planner has no map yet"
+    TOO_MANY_QUERIES = "too_many_queries", "the planner is busy"
+    SEARCH_TOO_LONG = "search_too_long", "no path was found within the cells that a search may expand"
+    START_OFF_MAP = "start_off_map", "the robot is off the map"
+    START_CLOSED = "start_closed", "the robot is in a closed place"
+    START_OBSTRUCTED = "start_obstructed", "the robot is on a wall, an obstacle or unknown space"
+    GOAL_OFF_MAP = "goal_off_map", "the goal is off the map"
+    GOAL_IN_WALL = "goal_in_wall", "the goal is in a wall"
+    GOAL_UNKNOWN = "goal_unknown", "the goal is in unknown space"
+    GOAL_NEAR_WALL = "goal_near_wall", "the goal is too near a wall for the robot"
+    GOAL_CLOSED = "goal_closed", "the goal is in a closed place: `causes`, once they are known"
+    GOAL_OBSTRUCTED = "goal_obstructed", "the goal is on or beside an obstacle that a robot sees"
+    CUT_OFF = "cut_off", "every path is blocked; by what is not known yet"
+    CUT_BY_WALLS = "cut_by_walls", "walls or unknown space lie between"
+    CUT_BY_OBSTACLES = "cut_by_obstacles", "obstacles that robots see block every path"
+    CUT_BY_PLACES = "cut_by_places", "areas or zones block every path: `causes`"
+
+
 class Refusal(Message, frozen=True, kw_only=True):
-    """Why there is no path: Nav2's code, a sentence, what blocks the path, and the nearest reachable point."""
+    """Why there is no path: Nav2's code, a sentence, what blocks the path, and the nearest reachable point.
+
+    `kind` identifies it closer than the code does (`PlanRefusal`); empty from an older planner.
+    """
 
     code: PlanCode
     reason: Sentence
+    kind: Code = ""
     causes: list[Cause] = []
     nearest: PointXY | None = None
 

@@ -118,7 +118,7 @@ PLANTED = {
         "robot-agent/src/robot_agent/guardian/core.py", "import robot_agent.bases.roomba600.driver as _planted",
     ),
     "An emulator shares no code with its driver": (
-        "robot-agent/src/robot_agent/lidars/ld19/emulator.py", "import robot_agent.lidars.ld19.protocol as _planted",
+        "robot-agent/src/robot_agent/lidars/ld19/emulator.py", "import robot_agent.lidars.ld19.driver as _planted",
     ),
     "The oracle knows nothing of what it watches": (
         "experiments/src/fognav_experiments/hunt/oracle.py", "import planner.core as _planted",

@@ -19,7 +19,7 @@ for program in sys.argv[1:]:
     os.wait()
 """
 PROGRAMS = {
-    "robot": "robot_agent.agent.process",
+    "robot": "robot_agent.agent.service",
     "planner": "planner.__main__",
     "map": "map_service.__main__",
     "sim": "fognav_sim.__main__",

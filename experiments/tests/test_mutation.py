@@ -104,7 +104,7 @@ def fognav(*arguments: str) -> tuple[int, dict[str, Any]]:
 def test_tests_of_how_the_guardian_wakes_its_base_notice_nine_of_ten_changes() -> None:
     code, parts = fognav("--part", "guardian", "--module", "awakening")
     (awakening,) = (module for module in parts["guardian"]["modules"] if module["mutants"])
-    assert awakening["module"] == "robot_agent.guardian.awakening"
+    assert awakening["module"] == "robot_agent.guardian.base"
     assert awakening["mutants"] > 20
     assert parts["guardian"]["score"] >= 0.9, awakening["survivors"]
     assert code == 0

@@ -30,8 +30,8 @@ from fog_contracts.messages import (
 )
 from fog_contracts.replica import MapError
 from robot_agent.agent.core import AgentCore
-from robot_agent.lidar_mounting import Mounting
 from robot_agent.motion.local_planner import decide
+from robot_agent.scan_builder import Mounting
 
 
 @pytest.fixture

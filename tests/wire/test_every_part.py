@@ -14,11 +14,11 @@ from fog_runtime.configuration.robot_file import default_robot, load_robot
 from fog_runtime.configuration.settings import SettingsError
 from fognav_sim import devices, emulators
 from robot_agent import registry
+from robot_agent.device_signature import StopCommand
 from robot_agent.guardian.core import GuardianCore
 from robot_agent.guardian.link import WheelCommand
 from robot_agent.guardian.watchdog import STOPS
 from robot_agent.localization.odometry import Motion, Odometry
-from robot_agent.stop_command import StopCommand
 
 STEP = 0.01
 BASES = parts.names(registry.BASES)

@@ -14,9 +14,8 @@ from fog_runtime.configuration import parts
 from fog_runtime.configuration.robot_file import default_robot
 from fognav_sim import devices
 from robot_agent import registry
-from robot_agent.device_signature import LISTEN_S, LineCheck, foreign
+from robot_agent.device_signature import LISTEN_S, LineCheck, StopCommand, foreign
 from robot_agent.guardian.watchdog import STOPS
-from robot_agent.stop_command import StopCommand
 
 SIGNATURES = registry.signatures()
 BASES = parts.names(registry.BASES)

@@ -24,10 +24,9 @@ from robot_agent.config import agent_config
 from robot_agent.footprint import Footprint
 from robot_agent.hardware import DriveTrain, LidarTraits
 from robot_agent.localization.pose import Pose2
-from robot_agent.localization.scans import DeskewedScan
+from robot_agent.localization.scans import DeskewedScan, RecentScans, smoothed
 from robot_agent.motion.local_planner import decide, make_job, twist
 from robot_agent.motion.path_follower import PathFollower
-from robot_agent.motion.recent_scans import RecentScans, smoothed
 from robot_agent.motion.recovery import Recoveries
 from robot_agent.safety.gate import SafetyOutputs
 from robot_agent.safety.stop_field import StopField

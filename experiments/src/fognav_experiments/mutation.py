@@ -80,8 +80,7 @@ PARTS: Final = (
     Part(
         "guardian",
         (
-            "guardian.awakening",
-            "guardian.base_reports",
+            "guardian.base",
             "guardian.core",
             "guardian.link",
             "guardian.maneuvers",
@@ -106,8 +105,8 @@ PARTS: Final = (
     ),
     Part(
         "maneuvers",
-        ("agent.docking", "agent.maneuvers"),
-        ("agent/test_docking.py", "agent/test_maneuvers.py"),
+        ("agent.maneuvers", "agent.power"),
+        ("agent/test_docking.py", "agent/test_maneuvers.py", "agent/test_rest.py"),
         ("numpy", "hypothesis.strategies", "robot_agent.localization.localizer", "robot_agent.config"),
     ),
     Part(

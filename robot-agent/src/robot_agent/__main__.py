@@ -4,7 +4,7 @@ It drives through the guardian, which stops the wheels when the agent is gone. T
 (`robot_agent.guardian.watchdog`) starts the guardian.
 
 Loading the agent takes about a second, numba and the kernels most of it, and so does the lidar until its first scan. So
-this module imports little, reads all settings and begins the scan; then it loads `robot_agent.agent.process`, which
+this module imports little, reads all settings and begins the scan; then it loads `robot_agent.agent.service`, which
 connects and wires. It is loaded on a thread: where kernels are compiled for minutes, a signal ends the process as soon.
 """
 
@@ -59,7 +59,7 @@ async def main() -> None:
 
 def _load_agent() -> Run:
     """Load the kernels, while the lidar starts."""
-    from robot_agent.agent.process import run  # noqa: PLC0415  # as said above
+    from robot_agent.agent.service import run  # noqa: PLC0415  # as said above
 
     return run
 

@@ -1,8 +1,9 @@
-"""How to tell which device is on a serial line before anything but a stop command is written to it.
+"""What is known of the device on a serial line before its driver is loaded: how it sounds, and how to stop a base.
 
 Two adapters may be swapped, and what is harmless to one device may move another: whoever opens a port listens first,
 and leaves alone what sounds like another device. Only the watchdog writes before: the base's stop command, which no
-lidar obeys, because a base that moves can't wait. Imports only the standard library, because the guardian uses it.
+lidar obeys, because a base that moves can't wait. Imports only the standard library, because guardian and watchdog use
+it.
 """
 
 from __future__ import annotations
@@ -96,3 +97,16 @@ class LineCheck:
     def answer(self, name: str, data: bytes) -> str | None:
         """Return the sentence for a device that answered its question; None if it did not."""
         return wrong_device(self._path, self._own, name) if self._signatures[name].answered(data) else None
+
+
+class StopCommand(NamedTuple):
+    """What the watchdog needs to stop a base; registered under its name in the entry points `fognav.base_stops`.
+
+    baud: of the base's serial line (8N1).
+    stop: stops the wheels in any state of the base, also after a command that was truncated anywhere.
+    hold: repeated while no guardian runs; changes nothing on a base at rest.
+    """
+
+    baud: int
+    stop: bytes
+    hold: bytes

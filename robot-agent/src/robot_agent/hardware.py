@@ -24,8 +24,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from fog_contracts.messages import Reason
-    from robot_agent.device_signature import SerialSettings
-    from robot_agent.stop_command import StopCommand
+    from robot_agent.device_signature import SerialSettings, StopCommand
 
 NO_FRESH_COMMAND: Final = "no fresh command from the agent"
 """Why the guardian keeps the wheels at zero when the agent is silent or late."""

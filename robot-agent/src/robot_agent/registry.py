@@ -64,7 +64,7 @@ def make_base(robot: RobotFile) -> BaseDriver:
 
 def make_lidar(robot: RobotFile) -> LidarDriver:
     """Make the driver of the robot's lidar, as it is mounted; raises `SettingsError`."""
-    from robot_agent.lidar_mounting import MountedLidar, Mounting  # noqa: PLC0415  # numpy: the guardian needs none
+    from robot_agent.scan_builder import MountedLidar, Mounting  # noqa: PLC0415  # numpy: the guardian needs none
 
     factory = lidar_factory(robot)
     driver = factory.make(robot.options("lidar", factory.options))

@@ -19,8 +19,8 @@ from fog_contracts.site import RobotSite
 from fog_runtime.configuration.robot_file import default_robot
 from robot_agent.config import agent_config
 from robot_agent.footprint import Footprint
+from robot_agent.guardian.__main__ import limits_of
 from robot_agent.guardian.core import Limits
-from robot_agent.guardian.process import limits_of
 from robot_agent.hardware import DriveTrain, LidarTraits
 
 KEY = b"k" * 32

@@ -12,9 +12,9 @@ from little_world import AGENT
 from fog_contracts.costs import LETHAL
 from fog_contracts.grid import GridGeometry
 from fog_contracts.messages import Pose, RobotGoal
-from robot_agent.agent.docking import Docking
 from robot_agent.agent.maneuvers import Straight
 from robot_agent.agent.mission import Mission
+from robot_agent.agent.power import Docking
 from robot_agent.hardware import BaseStatus
 from robot_agent.localization.pose import Pose2
 from robot_agent.safety.gate import SafetyState

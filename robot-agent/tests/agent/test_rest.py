@@ -8,9 +8,9 @@ import pytest
 from little_world import AGENT, L_PATH, LittleWorld
 
 from fog_contracts.messages import Pose
-from robot_agent.agent import rest_policy
+from robot_agent.agent import power
 from robot_agent.agent.core import AgentCore
-from robot_agent.agent.rest_policy import IdleScans, RestPolicy
+from robot_agent.agent.power import IdleScans, RestPolicy
 
 AFTER = 20.0
 
@@ -100,7 +100,7 @@ def test_lidar_that_does_not_wake_stops_the_robot():
     w.run(AFTER + 1.0)
     w.spin_up = 1e9
     w.drive_to(L_PATH[:3])
-    w.run(rest_policy.WAKE_TIMEOUT_S + 0.5)
+    w.run(power.WAKE_TIMEOUT_S + 0.5)
     assert w.state().mode == "PROTECTIVE_STOP"
     assert "the lidar has been silent" in w.state().reasons[0]
     assert w.travelled == 0.0
@@ -166,7 +166,7 @@ def test_base_that_does_not_wake_stops_the_robot():
     w.wake_s = 1e9
     w.run(AFTER + 1.0)
     w.drive_to(L_PATH[:3])
-    w.run(rest_policy.WAKE_TIMEOUT_S + 0.5)
+    w.run(power.WAKE_TIMEOUT_S + 0.5)
     assert w.state().mode == "PROTECTIVE_STOP"
     assert "the guardian holds the wheels: the base is not ready to drive yet" in w.state().reasons
     assert w.travelled == 0.0

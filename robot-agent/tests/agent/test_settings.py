@@ -24,8 +24,8 @@ from robot_agent.agent.settings import (
 from robot_agent.config import VisibilityConfig
 from robot_agent.footprint import SECTORS, Footprint
 from robot_agent.hardware import LidarTraits, Twist
-from robot_agent.lidar_mounting import Mounting
 from robot_agent.safety.stop_field import Visibility
+from robot_agent.scan_builder import Mounting
 
 SITE = """
 id = "lab"

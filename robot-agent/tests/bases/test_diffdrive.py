@@ -9,10 +9,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from fog_runtime.configuration.robot_file import parse_robot
-from robot_agent.bases.diffdrive import protocol
-from robot_agent.bases.diffdrive.driver import DiffDriveDriver, DiffDriveOptions
-from robot_agent.bases.diffdrive.protocol import Flag, Status, StatusParser
-from robot_agent.bases.diffdrive.stop import STOP
+from robot_agent.bases.diffdrive import driver as diffdrive
+from robot_agent.bases.diffdrive.driver import DiffDriveDriver, DiffDriveOptions, Flag, Status, StatusParser
+from robot_agent.bases.diffdrive.signature import STOP
 from robot_agent.config import StopFieldConfig
 from robot_agent.footprint import Footprint
 from robot_agent.localization.odometry import Motion, Odometry
@@ -66,16 +65,16 @@ def numbered(count: int) -> list[Status]:
 
 def test_the_checksum_is_the_one_of_the_specification():
     assert crc(b"123456789") == 0x29B1
-    assert protocol.line(b"123456789") == b"$123456789*29B1\n"
+    assert diffdrive.line(b"123456789") == b"$123456789*29B1\n"
 
 
 def test_commands_are_the_lines_of_the_specification():
-    assert protocol.enable() == b"$E*F991\n"
-    assert protocol.line(b"X") == b"$X*3A0D\n"
-    assert protocol.velocity(300, -250) == f"$V,300,-250*{crc(b'V,300,-250'):04X}\n".encode()
-    assert STOP.stop == (b"\n" + protocol.velocity(0, 0) + protocol.line(b"X")) * 2
-    assert STOP.hold == b"\n" + protocol.velocity(0, 0)
-    assert STOP.baud == protocol.BAUD
+    assert diffdrive.enable() == b"$E*F991\n"
+    assert diffdrive.line(b"X") == b"$X*3A0D\n"
+    assert diffdrive.velocity(300, -250) == f"$V,300,-250*{crc(b'V,300,-250'):04X}\n".encode()
+    assert STOP.stop == (b"\n" + diffdrive.velocity(0, 0) + diffdrive.line(b"X")) * 2
+    assert STOP.hold == b"\n" + diffdrive.velocity(0, 0)
+    assert STOP.baud == diffdrive.BAUD
 
 
 def test_example_of_the_specification_is_decoded():
@@ -85,13 +84,13 @@ def test_example_of_the_specification_is_decoded():
 @pytest.mark.parametrize("speeds", [(2001, 0), (0, -2001)])
 def test_speeds_beyond_the_protocol_are_refused(speeds):
     with pytest.raises(ValueError, match="2000"):
-        protocol.velocity(*speeds)
+        diffdrive.velocity(*speeds)
 
 
 @settings(deadline=None)
 @given(st.floats(-5, 5), st.floats(-5, 5), st.floats(0.1, 2.0))
 def test_scaled_wheel_speeds_fit_and_keep_the_curve(left, right, fastest_m_s):
-    body = protocol.wheels(left, right, fastest_m_s)[1:].split(b"*")[0]
+    body = diffdrive.wheels(left, right, fastest_m_s)[1:].split(b"*")[0]
     sent_left, sent_right = (int(field) for field in body.split(b",")[1:])
     fastest = max(abs(left), abs(right))
     scale = 1000.0 if fastest <= fastest_m_s else 1000.0 * fastest_m_s / fastest
@@ -102,7 +101,7 @@ def test_scaled_wheel_speeds_fit_and_keep_the_curve(left, right, fastest_m_s):
 @pytest.mark.parametrize("bad", [math.nan, math.inf])
 def test_speed_that_is_not_finite_is_refused(bad):
     with pytest.raises(ValueError, match="finite"):
-        protocol.wheels(0.0, bad, 0.5)
+        diffdrive.wheels(0.0, bad, 0.5)
 
 
 # --- status ---
@@ -206,7 +205,7 @@ def test_partial_line_before_the_first_good_one_is_not_counted():
     [b"S,256,0,0,0001,0", b"S,1,2147483648,0,0001,0", b"S,1,0,0,01,0", b"S,1,0,0,0001,65536", b"S,1,+1,0,0001,0"],
 )
 def test_invalid_status_with_a_right_checksum_is_dropped(body):
-    assert parse(protocol.line(body)) == []
+    assert parse(diffdrive.line(body)) == []
 
 
 # --- the base ---

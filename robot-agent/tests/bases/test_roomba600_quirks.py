@@ -11,7 +11,7 @@ from guardian_rig import wait_for
 from robot_agent.bases.roomba600.driver import BRC_PULSE_S, ModeMonitor, Roomba600Driver, Roomba600Options
 from robot_agent.bases.roomba600.emulator import PASSIVE, SAFE, Quirks, RoombaEmulator
 from robot_agent.bases.roomba600.open_interface import SLOW_STREAM, Mode, stream_frame_size
-from robot_agent.guardian.awakening import ATTEMPT_S, OTHERS_AFTER, Attempt
+from robot_agent.guardian.base import ATTEMPT_S, OTHERS_AFTER, Attempt
 from robot_agent.guardian.core import GuardianCore
 from robot_agent.guardian.link import WheelCommand
 

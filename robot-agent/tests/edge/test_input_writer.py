@@ -43,7 +43,7 @@ def test_an_agent_without_a_log_is_a_plain_core():
 
 
 def test_an_agent_without_a_log_loads_no_library_for_one():
-    program = "import sys, robot_agent.agent.process; print('mcap' in sys.modules)"
+    program = "import sys, robot_agent.agent.service; print('mcap' in sys.modules)"
     done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True)
     assert done.stdout.strip() == "False"
 

@@ -32,7 +32,7 @@ LOADING_FOR_EVER = """
 import importlib.machinery, runpy, sys, time
 class Endless:
     def find_spec(self, name, path, target=None):
-        if name == "robot_agent.agent.process":
+        if name == "robot_agent.agent.service":
             return importlib.machinery.ModuleSpec(name, self)
     def create_module(self, spec):
         return None

@@ -18,8 +18,7 @@ from fog_runtime.clock import SystemClock
 from fog_runtime.health import Health
 from robot_agent.agent import service as service_module
 from robot_agent.agent.core import AgentCore
-from robot_agent.agent.edges.map_loader import MapLoader
-from robot_agent.agent.edges.store import Store
+from robot_agent.agent.edges.map_loader import MapLoader, Store
 from robot_agent.agent.service import Service
 
 

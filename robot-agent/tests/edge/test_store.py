@@ -4,7 +4,7 @@ import msgspec
 import pytest
 from little_world import LittleWorld
 
-from robot_agent.agent.edges.store import Store
+from robot_agent.agent.edges.map_loader import Store
 from robot_agent.localization.pose import SavedPose
 
 POSE = SavedPose(site="lab", x=1.0, y=2.0, theta=0.5, sigma_xy=0.1, sigma_theta=0.05)

@@ -8,7 +8,7 @@ from __future__ import annotations
 import pytest
 from plain_base import PlainBase
 
-from robot_agent.guardian.awakening import Attempt, BaseSleep, Revival
+from robot_agent.guardian.base import Attempt, BaseSleep, Revival
 from robot_agent.hardware import Awakening, WakeLine
 
 RTS = WakeLine(name="rts", seconds=1.1)

@@ -33,7 +33,7 @@ os.execv(sys.executable, [sys.executable, "-c", sys.argv[1]])
 """
 LOADS_ALL = """
 import mmap
-import robot_agent.guardian.process, robot_agent.guardian.stop_base
+import robot_agent.guardian.__main__, robot_agent.guardian.stop_base
 from fog_runtime.configuration.robot_file import default_robot
 from robot_agent.registry import make_base, signatures
 make_base(default_robot()), signatures()

@@ -7,7 +7,7 @@ from plain_base import DockingBase, PlainBase, Rig
 
 from robot_agent.bases.roomba600.driver import Roomba600Driver, Roomba600Options
 from robot_agent.bases.roomba600.emulator import FULL, PASSIVE, SAFE, Quirks, RoombaEmulator
-from robot_agent.bases.roomba600.stop import STOP
+from robot_agent.bases.roomba600.signature import STOP
 from robot_agent.guardian.core import GuardianCore
 from robot_agent.guardian.link import WheelCommand
 from robot_agent.hardware import BaseReading, BaseStatus, WheelOdometry

@@ -12,8 +12,8 @@ import pytest
 
 from fog_runtime.configuration.robot_file import default_robot
 from robot_agent.device_signature import LineCheck
+from robot_agent.guardian.__main__ import Guardian, GuardianSettings
 from robot_agent.guardian.core import GuardianCore
-from robot_agent.guardian.process import Guardian, GuardianSettings
 from robot_agent.hardware import Awakening, WakeLine
 from robot_agent.registry import make_base, signatures
 from robot_agent.serial_port import Port, open_port

@@ -16,9 +16,9 @@ from types import SimpleNamespace
 
 import pytest
 
+from robot_agent.device_signature import StopCommand
 from robot_agent.guardian import watchdog
 from robot_agent.serial_port import PortLost, PortNameError
-from robot_agent.stop_command import StopCommand
 
 BASE = StopCommand(stop=b"stop", hold=b"hold", baud=57_600)
 

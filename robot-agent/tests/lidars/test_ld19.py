@@ -5,8 +5,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from robot_agent.lidars.ld19.driver import SAMPLES_TIMEOUT_S, Ld19Driver, Ld19Options
-from robot_agent.lidars.ld19.protocol import Parser, ScanAssembler
+from robot_agent.lidars.ld19.driver import SAMPLES_TIMEOUT_S, Ld19Driver, Ld19Options, Parser, ScanAssembler
 
 # A few values of the checksum's table, as the maker's header file has them.
 KNOWN_CRC = {1: 0x4D, 2: 0x9A, 64: 0x3E, 255: 0xA8}

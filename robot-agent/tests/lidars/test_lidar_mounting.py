@@ -14,11 +14,11 @@ from fog_runtime.configuration.robot_file import RobotFile
 from fognav_sim.sensors import LidarPlace
 from robot_agent.config import LocalizationConfig
 from robot_agent.hardware import LaserScan, LidarSamples
-from robot_agent.lidar_mounting import MountedLidar, Mounting
 from robot_agent.lidars.rplidar_a1.emulator import RplidarEmulator
 from robot_agent.localization.odometry import OdometryBuffer
 from robot_agent.localization.scans import deskew
 from robot_agent.registry import make_lidar
+from robot_agent.scan_builder import MountedLidar, Mounting
 
 ANGLES = np.linspace(-math.pi + 0.001, math.pi, 360)
 

@@ -7,8 +7,8 @@ import math
 import numpy as np
 import pytest
 
-from robot_agent.localization.odometry_scale import OdometryScale
 from robot_agent.localization.pose import Pose2
+from robot_agent.localization.unobserved import OdometryScale
 
 SEEN = np.diag([0.02**2, 0.02**2, 1e-4])
 NOTHING_UNSEEN = np.zeros(2)

@@ -14,7 +14,7 @@ from fog_kernels.robot import cover
 from robot_agent.config import LOCAL_INFLATION
 from robot_agent.footprint import Footprint
 from robot_agent.localization.pose import Pose2
-from robot_agent.motion.detour import detour, free_path, local_costs
+from robot_agent.motion.path_follower import detour, free_path, local_costs
 
 BODY = cover(Footprint.circle(0.17).polygon)
 LIMITS, SETTINGS = DwaLimits(axle=0.235, wheel_max=0.5), DwaSettings()

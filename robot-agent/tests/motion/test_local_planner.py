@@ -22,11 +22,9 @@ from fog_kernels.robot import cover
 from robot_agent.config import MotionConfig
 from robot_agent.footprint import Footprint
 from robot_agent.localization.pose import Pose2
-from robot_agent.localization.scans import DeskewedScan
-from robot_agent.motion.detour import detour
+from robot_agent.localization.scans import DeskewedScan, RecentScans
 from robot_agent.motion.local_planner import course, decide, give_way, make_job, twist, wheels
-from robot_agent.motion.path_follower import PathFollower, first_blocked
-from robot_agent.motion.recent_scans import RecentScans
+from robot_agent.motion.path_follower import PathFollower, detour, first_blocked
 
 GRID = GridGeometry(200, 120, 0.05, 0.0, 0.0)
 CONFIG = MotionConfig(limits=DwaLimits(axle=0.235, wheel_max=0.5))

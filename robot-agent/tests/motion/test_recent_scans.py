@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from robot_agent.motion.recent_scans import SHIFT_MAX_M, smoothed
+from robot_agent.localization.scans import SHIFT_MAX_M, smoothed
 
 
 def test_noise_of_a_wall_shrinks_as_that_of_a_mean_of_three():

@@ -13,8 +13,7 @@ from hypothesis import strategies as st
 from robot_agent.config import SafetyConfig
 from robot_agent.safety import gate as gate_module
 from robot_agent.safety.conditions import Level, SafetyInputs, collect_findings
-from robot_agent.safety.gate import SafetyOutputs, SafetyState, step
-from robot_agent.safety.wheel_limits import limit_wheels, ramp_down
+from robot_agent.safety.gate import SafetyOutputs, SafetyState, limit_wheels, ramp_down, step
 
 CONFIG = SafetyConfig()
 DT = 0.05

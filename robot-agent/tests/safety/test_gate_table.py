@@ -13,7 +13,7 @@ from fog_contracts.messages import ReasonCode
 from robot_agent.bases.diffdrive.driver import DiffDriveFault
 from robot_agent.bases.roomba600.driver import RoombaFault
 from robot_agent.config import SafetyConfig
-from robot_agent.guardian.base_reports import FaultCode
+from robot_agent.guardian.base import FaultCode
 from robot_agent.safety.conditions import CONDITIONS, Finding, Level, SafetyInputs, collect_findings
 from robot_agent.safety.gate import MODE_OF, SafetyState, step
 

@@ -11,9 +11,8 @@ from hypothesis import strategies as st
 
 from robot_agent.config import VisibilityConfig
 from robot_agent.hardware import DriveTrain, Twist
-from robot_agent.safety.gate import SafetyOutputs
+from robot_agent.safety.gate import SafetyOutputs, limit_wheels
 from robot_agent.safety.stop_field import SECTOR_ANGLES, Visibility, sector_of
-from robot_agent.safety.wheel_limits import limit_wheels
 from robot_agent.scan_builder import RepeatCounter
 
 AROUND = np.radians(np.arange(-179.5, 180.0, 1.0))

@@ -6,8 +6,7 @@ import math
 
 import pytest
 
-from robot_agent.safety.gate import SafetyOutputs
-from robot_agent.safety.wheel_limits import limit_wheels, ramp_down
+from robot_agent.safety.gate import SafetyOutputs, limit_wheels, ramp_down
 
 
 def limited(requested, last, *, cap=0.3, stop="none", dt=0.125, acceleration=2.0):

@@ -35,8 +35,8 @@ from robot_agent.agent.obstacle_reporter import WAY_M, ObstacleReporter
 from robot_agent.agent.operator_commands import OperatorCommands, initial_pose_refusal
 from robot_agent.agent.path_driving import PathDriving
 from robot_agent.agent.pose_keeper import PoseKeeper
+from robot_agent.agent.power import IdleScans, RestPolicy
 from robot_agent.agent.reports import PublishingPolicy, hindrances, robot_pose, robot_state
-from robot_agent.agent.rest_policy import IdleScans, RestPolicy
 from robot_agent.agent.safety_supervisor import BaseSource, LidarSource, SafetySupervisor, safety_inputs
 from robot_agent.localization.localizer import Localizer
 from robot_agent.localization.odometry import EncoderFault, Odometry, possible_motion

@@ -17,7 +17,7 @@ import numpy as np
 
 from fog_contracts.geometry import PATH_SPACING_M, sampled
 from fog_contracts.messages import EgressRequest, Pose
-from robot_agent.agent.docking import Docking
+from robot_agent.agent.power import Docking
 from robot_agent.agent.safety_supervisor import ManeuverInputs
 from robot_agent.hardware import Twist
 from robot_agent.localization.pose import wrap

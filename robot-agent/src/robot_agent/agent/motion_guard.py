@@ -18,7 +18,7 @@ from fog_kernels.raycast import cast
 from fog_kernels.scans import Mounting, Placed, placed
 from fog_kernels.sweep import half_planes
 from robot_agent.footprint import SECTORS
-from robot_agent.motion.recent_scans import smoothed
+from robot_agent.localization.scans import smoothed
 from robot_agent.safety.stop_field import SECTOR_ANGLES, StopField, Visibility
 
 if TYPE_CHECKING:

@@ -12,8 +12,8 @@ import numpy as np
 from robot_agent.agent.mission import Mission
 from robot_agent.agent.path_monitor import PathMonitor, ProgressMonitor
 from robot_agent.agent.wheel_control import WheelControl
+from robot_agent.localization.scans import RecentScans
 from robot_agent.motion.local_planner import Decision, make_job, twist
-from robot_agent.motion.recent_scans import RecentScans
 from robot_agent.motion.recovery import Recoveries
 from robot_agent.safety.gate import MANEUVERS
 

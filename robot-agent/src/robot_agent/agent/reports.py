@@ -23,8 +23,8 @@ if TYPE_CHECKING:
     from fog_contracts.handlers import Moment
     from fog_contracts.messages import Message, ProfileName, RobotObstacles, Trace
     from fog_contracts.replica import Version
-    from robot_agent.agent.docking import Docking
     from robot_agent.agent.mission import Mission
+    from robot_agent.agent.power import Docking
     from robot_agent.config import AgentConfig
     from robot_agent.guardian.link import BaseFeedback
     from robot_agent.hardware import BaseStatus

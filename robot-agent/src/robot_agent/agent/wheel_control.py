@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Final, NamedTuple
 
 from robot_agent.guardian.link import WheelCommand
 from robot_agent.motion.local_planner import twist, wheels
-from robot_agent.safety.wheel_limits import capped, limit_wheels, ramp_down
+from robot_agent.safety.gate import capped, limit_wheels, ramp_down
 
 if TYPE_CHECKING:
     from collections.abc import Callable

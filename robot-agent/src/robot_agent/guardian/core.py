@@ -17,8 +17,7 @@ from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Final, NamedTuple
 
 from fog_contracts.messages import SENTENCE_MAX, Reason
-from robot_agent.guardian.awakening import Attempt, BaseSleep, Revival
-from robot_agent.guardian.base_reports import FaultCode, FeedbackPolicy, fault_of
+from robot_agent.guardian.base import Attempt, BaseSleep, FaultCode, FeedbackPolicy, Revival, fault_of
 from robot_agent.guardian.link import WHEEL_SPEED_MAX_M_S, BaseFeedback, WheelCommand
 from robot_agent.guardian.maneuvers import Maneuvers, Situation
 from robot_agent.hardware import ASLEEP, NO_FRESH_COMMAND, ON_CHARGER, DockingDriver

@@ -24,9 +24,9 @@ from fog_runtime import machine
 from fog_runtime.configuration import parts
 from fog_runtime.configuration.parts import DEFAULT_BASE
 from fog_runtime.machine import ServiceManager, lock_memory, run_in_real_time
+from robot_agent.device_signature import StopCommand
 from robot_agent.guardian.timing import silence_limit
 from robot_agent.serial_port import Port, PortLost, PortNameError, open_port, refuse_speed
-from robot_agent.stop_command import StopCommand
 
 if TYPE_CHECKING:
     from types import FrameType

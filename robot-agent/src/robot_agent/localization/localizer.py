@@ -29,11 +29,11 @@ from robot_agent.localization.fit import (
 from robot_agent.localization.hypotheses import Near, apart
 from robot_agent.localization.map_fields import MapFields, map_fields
 from robot_agent.localization.odometry import OdometryBuffer
-from robot_agent.localization.odometry_scale import OdometryScale
 from robot_agent.localization.particle_filter import ParticleFilter
 from robot_agent.localization.pose import Pose2, SavedPose, wrap
 from robot_agent.localization.relocalization import Relocalization
 from robot_agent.localization.scans import DeskewedScan, deskew, follows
+from robot_agent.localization.unobserved import OdometryScale
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray

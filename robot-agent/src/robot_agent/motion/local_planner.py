@@ -22,7 +22,7 @@ from fog_kernels.course import beside, distances
 from fog_kernels.dwa import dwa
 from fog_kernels.robot import Body, cover
 from robot_agent.localization.pose import Pose2, wrap
-from robot_agent.motion.detour import free_path
+from robot_agent.motion.path_follower import free_path
 from robot_agent.motion.recovery import recovery_speeds
 
 if TYPE_CHECKING:

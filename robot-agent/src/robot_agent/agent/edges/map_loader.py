@@ -1,5 +1,7 @@
 """The edge that brings the map to the core: from disk at the start, then from the map-service, whenever it is wanted.
 
+The last snapshot of the map is stored for offline starts, and beside it the last trusted pose.
+
 Decoding a large map and computing localization's fields takes most of a second on a small computer: it runs on a
 thread, while the stream of wheel commands goes on.
 """
@@ -11,29 +13,88 @@ import random
 from concurrent.futures import Future, ThreadPoolExecutor
 from typing import TYPE_CHECKING, Final
 
+import msgspec
+
 from fog_contracts import channels as ch
 from fog_contracts.codec import ContractError
 from fog_contracts.messages import MapSnapshot
 from fog_contracts.replica import MapError
 from fog_runtime import logs
 from fog_runtime.clock import Ticker
+from fog_runtime.files import atomic_write
 from fog_runtime.usage import name_thread
 from robot_agent.agent.pose_keeper import start_pose
+from robot_agent.localization.pose import SavedPose
 
 if TYPE_CHECKING:
+    from pathlib import Path
+
     from fog_contracts.site import RobotSite
     from fog_runtime.clock import Clock, Phase
     from fog_runtime.transports.zenoh_edge import ZenohEdge
     from robot_agent.agent.core import AgentCore
-    from robot_agent.agent.edges.store import Store
     from robot_agent.agent.navigation import PreparedMap
+
+_log = logs.get("agent")
+_store_log = logs.get("store")
+_snapshots = msgspec.msgpack.Decoder(MapSnapshot)
+_poses = msgspec.json.Decoder(SavedPose)
+
+
+class Store:
+    """Two files in the robot's data folder; each write replaces a file as a whole. All methods block."""
+
+    def __init__(self, folder: Path) -> None:
+        self._pose = folder / "pose.json"
+        self._snapshot = folder / "snapshot.msgpack"
+
+    def pose(self, site: str) -> SavedPose | None:
+        """Return the stored pose on this site, None without a valid one."""
+        data = _read(self._pose)
+        if data is None:
+            return None
+        try:
+            saved = _poses.decode(data)
+        except (msgspec.DecodeError, UnicodeDecodeError) as error:
+            _store_log.warning("stored_pose_refused", file=str(self._pose), reason=str(error))
+            return None
+        return saved if saved.site == site else None
+
+    def put_pose(self, saved: SavedPose) -> None:
+        """Store a pose; raises `OSError`."""
+        atomic_write(self._pose, msgspec.json.encode(saved))
+
+    def snapshot(self, site: str) -> MapSnapshot | None:
+        """Return the stored map of this site, None without a readable one (its hash is not checked)."""
+        data = _read(self._snapshot)
+        if data is None:
+            return None
+        try:
+            snapshot = _snapshots.decode(data)
+        except (msgspec.DecodeError, UnicodeDecodeError) as error:
+            _store_log.warning("stored_map_refused", file=str(self._snapshot), reason=str(error))
+            return None
+        return snapshot if snapshot.site == site else None
+
+    def put_snapshot(self, snapshot: MapSnapshot) -> None:
+        """Store a map; raises `OSError`."""
+        atomic_write(self._snapshot, msgspec.msgpack.encode(snapshot))
+
+
+def _read(file: Path) -> bytes | None:
+    try:
+        return file.read_bytes()
+    except FileNotFoundError:
+        return None
+    except OSError as error:
+        _store_log.warning("file_not_readable", file=str(file), reason=str(error))
+        return None
+
 
 CHECK_S: Final = 0.1
 FIRST_CHECK_S: Final = 0.05
 SNAPSHOT_TIMEOUT_S: Final = 3.0
 """Timeout of a snapshot request."""
-
-_log = logs.get("agent")
 
 
 class MapLoader:

@@ -21,7 +21,7 @@ from msgspec import Meta
 from fog_contracts.messages import Described, Power
 from robot_agent.bases.roomba600 import open_interface as oi
 from robot_agent.bases.roomba600.open_interface import Mode
-from robot_agent.bases.roomba600.stop import STOP
+from robot_agent.bases.roomba600.signature import STOP
 from robot_agent.hardware import (
     Awakening,
     BaseFactory,

@@ -1,6 +1,6 @@
-"""How a Roomba sounds on a serial line: stream frames, and the text that it prints when it boots or charges.
+"""How a Roomba sounds on a serial line, by stream frames and the text that it prints, and how to stop it: plain bytes.
 
-A silent one is asked for its OI mode. Plain bytes, with no imports but the guardian's own.
+A silent one is asked for its OI mode. No imports but the watchdog's own.
 """
 
 from __future__ import annotations
@@ -8,7 +8,7 @@ from __future__ import annotations
 import re
 from typing import Final
 
-from robot_agent.device_signature import Signature
+from robot_agent.device_signature import Signature, StopCommand
 
 _TEXT: Final = re.compile(rb"bl-start|bootloader id|STR730|Flash CRC|bat: +min|Slept for")
 _FRAME_MAX: Final = 172
@@ -41,3 +41,11 @@ def _answered(data: bytes) -> bool:
 
 # Start, Sensors 35: without Start the base would ignore the question. It ends in Passive mode, with its wheels at rest.
 SIGNATURE: Final = Signature(recognizes=_recognizes, question=bytes((128, 142, 35)), answered=_answered)
+
+
+_ZERO_SPEED: Final = bytes((0, 0, 0, 0, 145, 0, 0, 0, 0))
+_STOP: Final = bytes((128, 131)) + _ZERO_SPEED
+
+# Start, Safe, Drive Direct 0 0. Sent twice: the guardian may have died in the middle of a command, and the base would
+# take its missing bytes from what precedes the second copy: 2 + 2 * 255 at most, if a byte was wrong (docs/safety.md).
+STOP: Final = StopCommand(baud=115200, stop=_STOP + bytes(512) + _STOP, hold=_ZERO_SPEED)

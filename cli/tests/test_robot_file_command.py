@@ -60,9 +60,11 @@ def test_check_prints_the_effective_settings_or_the_line_of_a_mistake(tmp_path):
     line = text.splitlines().index("axle_m = 0.28") + 1
     assert result.exit_code == 1
     assert f"robot.toml:{line}: base.options.axle_m" in json.loads(result.stdout)["problem"]
+    assert json.loads(result.stdout)["setting"] == "base.options.axle_m"
     file.write_text(text.replace("footprint = []", "footprint = [[1, 1], [0.5, 1], [1, 2]]"))
-    problem = json.loads(run(app, ["robot", "check", str(file), "--json"]).stdout)["problem"]
-    assert f"robot.toml:{line_of(file, '[body]', 'footprint = ')}: body.footprint: " in problem
+    refused = json.loads(run(app, ["robot", "check", str(file), "--json"]).stdout)
+    assert refused["setting"] == "body.footprint"
+    assert f"robot.toml:{line_of(file, '[body]', 'footprint = ')}: body.footprint: " in refused["problem"]
 
 
 def line_of(file, table, begin):
@@ -87,6 +89,7 @@ def test_check_refuses_the_ports_that_no_process_would_open(tmp_path, base, lida
     result = run(app, ["robot", "check", str(file), "--json"])
     assert result.exit_code == 1
     place = line_of(file, "[lidar]" if key == "lidar.port" else "[base]", "port = ")
+    assert json.loads(result.stdout)["setting"] == key
     assert f"robot.toml:{place}: {key}: " in json.loads(result.stdout)["problem"]
     assert problem in json.loads(result.stdout)["problem"]
 

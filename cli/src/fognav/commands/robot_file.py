@@ -95,7 +95,7 @@ def robot_check(
         remarks += contradictions(robot)
     except SettingsError as error:
         if json:
-            print_json({"ok": False, "problem": str(error)})
+            print_json({"ok": False, "setting": error.setting, "problem": str(error)})
             raise typer.Exit(NOT_TRUE) from error
         fail(str(error))
     if json:

@@ -301,7 +301,13 @@ class Service:
     def _log_command(self, _channel: ch.Channel, request: Message | None, reply: Message) -> None:
         if isinstance(request, RobotCommand) and isinstance(reply, CommandReply):
             _log.info(
-                "command", kind=request.kind, operator=request.operator, accepted=reply.accepted, reason=reply.reason
+                "command",
+                kind=request.kind,
+                operator=request.operator,
+                accepted=reply.accepted,
+                refusal=reply.code,
+                causes=reply.causes,
+                reason=reply.reason,
             )
 
     # --- Publications -----------------------------------------------------------------------------------------------

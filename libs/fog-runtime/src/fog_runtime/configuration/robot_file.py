@@ -103,7 +103,7 @@ class RobotFile:
 
     def error(self, key: str, problem: str, remedy: str = "Correct it") -> SettingsError:
         """Return an error that names the place of a setting, the problem and the remedy."""
-        return SettingsError(f"{_place(key, self.path, self.lines, self.variables)}: {problem}. {remedy}")
+        return SettingsError(f"{_place(key, self.path, self.lines, self.variables)}: {problem}. {remedy}", key)
 
     def options(self, part: str, kind: type[Options]) -> Options:
         """Return the options of a driver, `part` being "base" or "lidar", as its own type; raises `SettingsError`."""
@@ -139,7 +139,7 @@ def parse_robot(text: str | None, path: Path | None, environ: Mapping[str, str])
     except msgspec.ValidationError as error:
         key, problem = _explain(error)
         place = _place(key, path, lines, variables)
-        raise SettingsError(f"{place}: {problem}. {_remedy(key, path, tree)}") from error
+        raise SettingsError(f"{place}: {problem}. {_remedy(key, path, tree)}", key) from error
     return RobotFile(settings=settings, path=path, lines=lines, variables=variables)
 
 

@@ -18,7 +18,14 @@ _PASSWORD: Final = re.compile(r"(?<=://)([^/@:]*):([^/@]*)@")
 
 
 class SettingsError(ValueError):
-    """A setting is missing or invalid; the message names the variable or the file and field, and the remedy."""
+    """A setting is missing or invalid; the message names the variable or the file and field, and the remedy.
+
+    `setting` is its dotted name in a robot's file, empty for others.
+    """
+
+    def __init__(self, message: str, setting: str = "") -> None:
+        super().__init__(message)
+        self.setting = setting
 
 
 class Secret:

@@ -12,9 +12,8 @@ from typing import Final, Self
 from fog_contracts.site import Site
 from fog_runtime.configuration.parts import DEFAULT_BASE, DEFAULT_LIDAR
 from fog_runtime.credentials import NOBODY, Credentials
-from fog_runtime.keys import ADMIN_TOKEN, OPERATOR_KEY, TOKENS, make_keys
+from fog_runtime.keys import ADMIN_TOKEN, OPERATOR_KEY, TOKENS, make_keys, read_operator_key
 from fog_runtime.locks.site_locks import CREDENTIALS, SiteLocks
-from fog_runtime.operator_key import read_operator_key
 from fog_supervisor import net
 from fog_supervisor.supervisor import Event, Supervisor
 from fognav.programs import (

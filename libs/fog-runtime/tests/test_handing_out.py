@@ -8,7 +8,7 @@ import pytest
 from fog_runtime.credentials import Credentials
 from fog_runtime.keys import ADMIN_TOKEN, OPERATOR_KEY, TOKENS
 from fog_runtime.locks import __main__ as command
-from fog_runtime.locks.handing_out import OWNERS, SIMULATION
+from fog_runtime.locks.__main__ import OWNERS, SIMULATION
 from fog_runtime.locks.site_locks import SiteLocks
 from fog_runtime.token_file import token_hash
 
@@ -54,7 +54,7 @@ def node(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.Capture
     fog_node = FogNode(tmp_path, monkeypatch, capsys)
     if os.geteuid() != 0:
         own = dict.fromkeys(OWNERS, os.geteuid())
-        monkeypatch.setattr("fog_runtime.locks.handing_out.OWNERS", own)
+        monkeypatch.setattr("fog_runtime.locks.__main__.OWNERS", own)
     fog_node.run()
     return fog_node
 

@@ -22,7 +22,7 @@ from fog_runtime.configuration.settings import CommonSettings, SettingsError, de
 from fog_runtime.configuration.site import load_site
 from fog_runtime.credentials import Credentials
 from fog_runtime.health import Health, serve_health
-from fog_runtime.operator_key import read_operator_key
+from fog_runtime.keys import read_operator_key
 from fog_runtime.robot_commands import RobotCommands
 from fog_runtime.transports.zenoh_edge import ZenohEdge
 from fog_supervisor.net import put_goal

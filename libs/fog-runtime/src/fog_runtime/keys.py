@@ -1,17 +1,20 @@
-"""The secrets of a site: `python -m fog_runtime.keys DIR` creates those missing in DIR and keeps the others.
+"""The secrets of a site, as files of one folder.
 
 - `admin.token`: a bearer token for REST writes; `tokens.toml`: its hash, for the services (FOGNAV_TOKENS_FILE).
 - `operator.key`: the key that signs commands to robots (FOGNAV_OPERATOR_KEY_FILE), hexadecimal.
 """
 
+from __future__ import annotations
+
 import os
 import secrets
-import sys
-from pathlib import Path
-from typing import Final
+from typing import TYPE_CHECKING, Final
 
 from fog_contracts.commands import KEY_BYTES
 from fog_runtime.token_file import TOKEN_BYTES, token_hash
+
+if TYPE_CHECKING:
+    from pathlib import Path
 
 ADMIN_TOKEN: Final = "admin.token"  # noqa: S105  # a file's name
 TOKENS: Final = "tokens.toml"
@@ -46,20 +49,22 @@ def make_keys(directory: Path, *, mode: int = 0o600) -> list[Path]:
     return created
 
 
-def main() -> int:
-    """Create the missing secrets in the folder that the command line names."""
-    if len(sys.argv) != 2:
-        sys.stderr.write("usage: python -m fog_runtime.keys DIR\n")
-        return 2
+class OperatorKeyError(ValueError):
+    """A file is no operators' key; the message names the file and the remedy."""
+
+
+def read_operator_key(file: Path) -> bytes:
+    """Return the key that signs commands to robots from a file with its hexadecimal digits (`operator.key`).
+
+    Raises `OperatorKeyError`.
+    """
+    remedy = f"Write {2 * KEY_BYTES} or more hexadecimal digits into it (openssl rand -hex {KEY_BYTES})"
     try:
-        created = make_keys(Path(sys.argv[1]))
+        key = bytes.fromhex(file.read_text("ascii").strip())
     except OSError as error:
-        sys.stderr.write(f"{error}\n")
-        return 1
-    for file in created:
-        sys.stdout.write(f"created {file}\n")
-    return 0
-
-
-if __name__ == "__main__":
-    sys.exit(main())
+        raise OperatorKeyError(f"the operators' key {file} can't be read: {error.strerror}. {remedy}") from error
+    except ValueError as error:
+        raise OperatorKeyError(f"the operators' key {file} is not hexadecimal. {remedy}") from error
+    if len(key) < KEY_BYTES:
+        raise OperatorKeyError(f"the operators' key {file} is only {len(key)} bytes long. {remedy}")
+    return key

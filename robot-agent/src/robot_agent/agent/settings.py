@@ -19,8 +19,8 @@ from fog_contracts.messages import Id
 from fog_contracts.site import Site
 from fog_runtime.configuration.robot_file import VARIABLES
 from fog_runtime.configuration.settings import CommonSettings, SettingsError
-from fog_runtime.operator_key import OperatorKeyError
-from fog_runtime.operator_key import read_operator_key as read_key
+from fog_runtime.keys import OperatorKeyError
+from fog_runtime.keys import read_operator_key as read_key
 from robot_agent import registry
 from robot_agent.footprint import BLIND_SHARE, SECTORS, TRAVEL_HALF_RAD, Footprint, FootprintError
 from robot_agent.hardware import DockingDriver, SleepingDriver

@@ -12,8 +12,8 @@ from fog_runtime.configuration.settings import InflationSettings, SettingsError,
 from fog_runtime.configuration.site import load_site
 from fog_runtime.health import Health
 from fog_runtime.http import Front, load_tokens, unused
+from fog_runtime.keys import OperatorKeyError, read_operator_key
 from fog_runtime.leadership import Leadership, LeaseStore
-from fog_runtime.operator_key import OperatorKeyError, read_operator_key
 from fog_runtime.process import release_startup_memory, release_when
 from fog_runtime.transports.zenoh_edge import ZenohEdge
 from planner.api import make_api

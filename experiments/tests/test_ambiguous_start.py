@@ -4,13 +4,12 @@ import math
 from pathlib import Path
 
 import numpy as np
+import ring_site as ring
 
-from fog_contracts import channels as ch
 from fog_contracts.grid import GridGeometry, StaticMap
 from fog_contracts.messages import Pose
 from fog_contracts.site import Place, RobotSite, Site
 from fog_runtime.configuration.site import LoadedSite
-from fognav_experiments.rigs import System
 
 ROOMS = [(1.0, 1.0, 4.5, 4.0), (6.0, 1.0, 9.5, 4.0), (7.6, 4.0, 8.4, 4.3)]
 """Left, bottom, right, top (m); the last one is a niche that is too shallow to tell the rooms apart by one scan."""
@@ -28,28 +27,23 @@ def two_rooms() -> LoadedSite:
 
 
 def test_turn_decides_where_the_robot_is_so_that_it_may_be_enabled():
-    site = two_rooms()
-    system, states = System(site, site.site.robots[0], 3), []
-    system.bus.subscribe({ch.ROBOT_STATE: lambda _ids, state, _at: states.append(state) or ()})
+    run = ring.Run(two_rooms())
 
     def until(condition, seconds):
-        end = system.now + seconds
-        while not (states and condition(states[-1])):
-            assert system.now < end, states[-1:]
-            system.step()
+        run.until(lambda: run.state and condition(run.state), seconds)
 
-    system.world.kidnap(Pose(x=7.3, y=2.3, theta=1.2))
+    run.system.world.kidnap(Pose(x=7.3, y=2.3, theta=1.2))
     until(lambda state: len(state.places) > 1, 40.0)
-    assert any(math.dist((place.x, place.y), (7.3, 2.3)) < 0.2 for place in states[-1].places)
-    assert "the pose is lost" in system.robot.command("enable").reason
-    assert system.robot.command("turn").accepted
+    assert any(math.dist((place.x, place.y), (7.3, 2.3)) < 0.2 for place in run.state.places)
+    assert "the pose is lost" in run.system.robot.command("enable").reason
+    assert run.system.robot.command("turn").accepted
     until(lambda state: state.mode == "EGRESS", 1.5)
     until(lambda state: state.mode == "INIT", 20.0)
     until(lambda state: not state.places, 1.5)
-    assert math.dist(system.world.pose[:2], (7.3, 2.3)) < 0.05
-    pose = system.robot.agent.localizer.pose(system.now)
-    assert math.dist((pose.x, pose.y), system.world.pose[:2]) < 0.1
-    until(lambda _: system.robot.agent.localizer.status == "good", 3.0)
-    assert system.robot.command("enable").accepted
+    assert math.dist(run.system.world.pose[:2], (7.3, 2.3)) < 0.05
+    pose = run.system.robot.agent.localizer.pose(run.system.now)
+    assert math.dist((pose.x, pose.y), run.system.world.pose[:2]) < 0.1
+    until(lambda _: run.system.robot.agent.localizer.status == "good", 3.0)
+    assert run.system.robot.command("enable").accepted
     until(lambda state: state.mode == "NORMAL", 5.0)
-    assert system.world.contacts == 0
+    assert run.system.world.contacts == 0

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import csv
 import gc
-import importlib.util
 import re
 from collections import Counter
 from pathlib import Path
@@ -12,6 +11,7 @@ from pathlib import Path
 import msgspec
 import numpy as np
 import pytest
+import ring_site as ring
 from hypothesis import given
 from hypothesis import strategies as st
 
@@ -30,10 +30,6 @@ from fognav_experiments.rigs import System
 pytestmark = pytest.mark.timeout(900)
 
 ESTIG = Path(__file__).parents[2] / "sites" / "estig"
-_spec = importlib.util.spec_from_file_location("ring_site", Path(__file__).parent / "ring_site.py")
-ring = importlib.util.module_from_spec(_spec)
-_spec.loader.exec_module(ring)
-
 SPEC = ExperimentSpec(routes=[RouteSpec(start="west", goal="east", areas=["z1"])])
 ASKED = Asked(site="ring", site_digest="0" * 16, seed=1)
 SETUPS = ["default", "full", "fog"]

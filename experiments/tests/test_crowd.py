@@ -3,21 +3,14 @@
 FOGNAV_CROWD_SEEDS sets the number of drives.
 """
 
-import importlib.util
 import math
 import os
-from pathlib import Path
 
 import numpy as np
 import pytest
+import ring_site as ring
 
-from fog_contracts import channels as ch
-from fog_contracts.messages import Pose, RobotGoal, SimObstacle
-from fognav_experiments.rigs import System
-
-_spec = importlib.util.spec_from_file_location("ring_site", Path(__file__).parent / "ring_site.py")
-ring = importlib.util.module_from_spec(_spec)
-_spec.loader.exec_module(ring)
+from fog_contracts.messages import SimObstacle
 
 pytestmark = pytest.mark.timeout(900)
 SEEDS = int(os.environ.get("FOGNAV_CROWD_SEEDS", "2"))
@@ -99,40 +92,14 @@ class Crowd:
             self.world.remove(person.id)
 
 
-class Run:
-    """The whole system with a robot on its way to the east."""
-
-    def __init__(self, seed):
-        site = ring.ring_site()
-        self.system = System(site, site.site.robots[0], seed)
-        self.states = []
-        self.system.bus.subscribe({ch.ROBOT_STATE: self._on_state})
-        self.until(lambda: self.states and self.state.reasons == ["waiting for an operator to enable"], 12.0)
-        assert self.system.robot.command("enable").accepted
-        pose = Pose(x=ring.GOAL.x, y=ring.GOAL.y, theta=0.0)
-        self.system.fog.planner.set_goal("r1", RobotGoal(goal_id="g1", pose=pose), any_heading=True)
-        self.until(lambda: self.system.world.distance > 0.5, 20.0)
-
-    def _on_state(self, _ids, state, _at):
-        self.states.append(state)
-        return ()
-
-    @property
-    def state(self):
-        return self.states[-1]
-
-    def until(self, condition, seconds):
-        end = self.system.now + seconds
-        while not condition():
-            assert self.system.now < end, self.states[-1:]
-            self.system.step()
-
-
 @pytest.mark.parametrize("seed", range(SEEDS))
 @pytest.mark.drive
 def test_robot_among_walking_people_touches_none_and_arrives_or_says_why_it_stands(seed):
-    run = Run(seed)
-    world = run.system.world
+    run = ring.Run(seed=seed)
+    run.enable()
+    run.send()
+    run.until(lambda: run.world.distance > 0.5, 20.0)
+    world = run.world
     crowd = Crowd(world, seed)
     stood, before = 0.0, world.distance
     end = run.system.now + CROWDED_S
@@ -156,8 +123,8 @@ def test_robot_among_walking_people_touches_none_and_arrives_or_says_why_it_stan
         inside = run.state.mode == "PROTECTIVE_STOP" and "in_blocked" in run.state.codes
         if inside and run.system.now > asked + 5.0:
             asked = run.system.now
-            assert run.system.robot.command("egress").accepted
+            assert run.robot.command("egress").accepted
         if run.state.mode in {"HOLD", "INIT"} and run.state.awaits_operator:
-            assert run.system.robot.command("enable").accepted
+            assert run.robot.command("enable").accepted
     assert run.state.goal_reached, run.state
     assert world.contacts == 0

@@ -1,22 +1,17 @@
 """A robot goes to its dock on an operator's word, charges, and leaves it for a goal: all cores together."""
 
-import importlib.util
+import itertools
 import math
 from dataclasses import replace
-from pathlib import Path
 
 import msgspec
 import pytest
+import ring_site as ring
 
-from fog_contracts import channels as ch
 from fog_contracts.messages import Pose, RectangleShape, RobotGoal, SimObstacle, Zone
 from fog_runtime.configuration.site import LoadedSite
-from fognav_experiments.rigs import System, moment
+from fognav_experiments.rigs import moment
 from robot_agent.agent.core import AgentCore
-
-_spec = importlib.util.spec_from_file_location("ring_site", Path(__file__).parent / "ring_site.py")
-ring = importlib.util.module_from_spec(_spec)
-_spec.loader.exec_module(ring)
 
 DOCK = Pose(x=0.78, y=1.5, theta=math.pi)  # its wall is 11 cm behind the body's front
 
@@ -29,60 +24,47 @@ def site_with_dock(start=None):
     return LoadedSite(msgspec.structs.replace(loaded.site, robots=[robot]), loaded.map, loaded.directory)
 
 
-class Run:
-    """The whole system, with an enabled robot in NORMAL; every mode and wheel speed is recorded."""
+class Run(ring.Run):
+    """The whole system, with an enabled robot in NORMAL; every mode is recorded."""
 
     def __init__(self, *, site=None, charge=0.9, dock_below=0.0):
-        site = site or site_with_dock()
-
         def make_agent(config, seed):
             return AgentCore(replace(config, dock_below=dock_below), seed)
 
-        self.system = System(site, site.site.robots[0], 3, make_agent=make_agent)
+        super().__init__(site or site_with_dock(), make_agent=make_agent)
         self.base.battery.charge_mah = charge * self.base.battery.capacity_mah
-        self.state, self.modes, self.fastest = None, [], {}
-        self.system.bus.subscribe({ch.ROBOT_STATE: self._on_state})
-        self.until(lambda: self.state and self.state.reasons == ["waiting for an operator to enable"], 12.0)
-        assert self.system.robot.command("enable").accepted
+        self.enable()
         self.until(lambda: self.state.mode == "NORMAL", 5.0)
 
-    def _on_state(self, _ids, state, _at):
-        self.state = state
-        if not self.modes or self.modes[-1] != state.mode:
-            self.modes.append(state.mode)
-        return ()
+    @property
+    def modes(self):
+        return [mode for mode, _ in itertools.groupby(state.mode for state in self.states)]
 
     @property
     def base(self):
-        return self.system.robot.hardware.base
+        return self.robot.hardware.base
 
     @property
     def wheels(self):
         return self.base.wheel_speeds_m_s
-
-    def until(self, condition, seconds):
-        end = self.system.now + seconds
-        while not condition():
-            assert self.system.now < end, self.state
-            self.system.step()
 
     def run(self, seconds):
         for _ in range(round(seconds * 100)):
             self.system.step()
 
     def away(self):
-        x, y, _ = self.system.world.pose
+        x, y, _ = self.world.pose
         return math.dist((x, y), (DOCK.x, DOCK.y))
 
     def until_seeking(self):
-        assert self.system.robot.command("dock").accepted
+        assert self.robot.command("dock").accepted
         self.until(lambda: self.base.seeking_dock, 60.0)
         self.until(lambda: self.wheels != (0.0, 0.0) and self.away() < 0.6, 10.0)
 
 
 def test_robot_docks_charges_and_leaves_its_dock_for_a_goal():
     run = Run(site=site_with_dock(Pose(x=1.5, y=2.6, theta=-math.pi / 2)))
-    assert run.system.robot.command("dock").accepted
+    assert run.robot.command("dock").accepted
     run.until(lambda: run.state.mode == "DOCK", 60.0)
     assert run.away() < 1.0
     run.until(lambda: run.state.docked and run.state.mode == "HOLD", 30.0)
@@ -93,8 +75,8 @@ def test_robot_docks_charges_and_leaves_its_dock_for_a_goal():
     run.run(3.0)
     assert run.state.reasons == ["the robot is on its dock: a goal or `fognav robot undock` takes it off"]
     assert run.state.power.charging in {"bulk", "trickle"}
-    pose = run.system.robot.agent.pose(moment(run.system.now))
-    x, y, theta = run.system.world.pose
+    pose = run.robot.agent.pose(moment(run.system.now))
+    x, y, theta = run.world.pose
     assert math.dist((pose.x, pose.y), (x, y)) < 0.05
     assert abs(math.remainder(pose.theta - theta, math.tau)) < 0.06
 
@@ -103,16 +85,16 @@ def test_robot_docks_charges_and_leaves_its_dock_for_a_goal():
     run.until(lambda: run.state.goal_reached, 60.0)
     assert "DOCK" in run.modes[-3:]
     assert run.modes[-1] == "NORMAL"
-    assert run.system.world.contacts == 0
+    assert run.world.contacts == 0
 
 
 def test_operator_takes_a_disabled_robot_off_its_dock_and_it_stays_disabled():
     run = Run()
     run.until_seeking()
     run.until(lambda: run.state.docked and run.state.mode == "HOLD", 30.0)
-    assert run.system.robot.command("disable").accepted
+    assert run.robot.command("disable").accepted
     run.run(1.0)
-    assert run.system.robot.command("undock").accepted
+    assert run.robot.command("undock").accepted
     run.until(lambda: run.state.mode == "DOCK", 1.0)
     run.until(lambda: run.state.mode != "DOCK", 12.0)
     assert run.state.mode == "INIT"
@@ -128,24 +110,24 @@ def bump(run):
 
 
 def stop(run):
-    assert run.system.robot.command("disable").accepted
+    assert run.robot.command("disable").accepted
 
 
 def zone(run):
-    x, y, _ = run.system.world.pose
+    x, y, _ = run.world.pose
     shape = RectangleShape(corner=(x - 0.5, y - 0.5), opposite=(x + 0.5, y + 0.5))
     run.system.fog.map.put_zone(Zone(id="wet", kind="BLOCKED", shape=shape, reason="wet"), moment(run.system.now))
 
 
 def blind(run):
-    run.system.robot.hardware.lidar.blind_sector_rad = (-1.05, 1.05)
+    run.robot.hardware.lidar.blind_sector_rad = (-1.05, 1.05)
 
 
 def obstacle(run):
     # 1 cm between the body and something that stands beside the robot's way, which it turns against.
-    x, y, _ = run.system.world.pose
+    x, y, _ = run.world.pose
     near = x - 0.17 - 0.06
-    run.system.world.place(SimObstacle(id="leg", polygon=[(near - 0.05, y - 0.03), (near, y - 0.03), (near, y + 0.03),
+    run.world.place(SimObstacle(id="leg", polygon=[(near - 0.05, y - 0.03), (near, y - 0.03), (near, y + 0.03),
                                                           (near - 0.05, y + 0.03)]))  # fmt: skip
 
 
@@ -182,36 +164,36 @@ def test_robot_that_something_separates_from_its_dock_does_not_let_its_base_look
     run = Run()
     x, y = DOCK.x + 0.3, DOCK.y
     box = [(x - 0.04, y - 0.04), (x + 0.04, y - 0.04), (x + 0.04, y + 0.04), (x - 0.04, y + 0.04)]
-    run.system.world.place(SimObstacle(id="leg", polygon=box))
+    run.world.place(SimObstacle(id="leg", polygon=box))
     run.run(0.5)
-    assert run.system.robot.command("dock").accepted
+    assert run.robot.command("dock").accepted
     run.until(lambda: "docking_given_up" in run.state.codes, 60.0)
     assert "DOCK" not in run.modes
-    assert run.system.world.contacts == 0
+    assert run.world.contacts == 0
 
 
 @pytest.mark.parametrize(("kind", "words"), [("disable", None), ("cancel", "its goal was cancelled")])
 def test_robot_goes_to_its_dock_by_no_older_word(kind, words):
     run = Run(site=site_with_dock(Pose(x=1.5, y=2.6, theta=-math.pi / 2)))
-    assert run.system.robot.command("dock").accepted
+    assert run.robot.command("dock").accepted
     run.run(2.0)
     assert run.state.wants_dock
-    assert run.system.robot.command(kind).accepted
+    assert run.robot.command(kind).accepted
     run.run(0.5)
     assert not run.state.wants_dock
     if words:
         assert f"docking given up: {words}" in run.state.reasons
-    run.system.robot.command("enable")
+    run.robot.command("enable")
     run.run(3.0)
     assert not run.state.wants_dock
 
 
 def test_site_without_a_dock_and_a_robot_that_is_not_enabled_refuse():
     run = Run(site=ring.ring_site())
-    assert "no dock" in run.system.robot.command("dock").reason
+    assert "no dock" in run.robot.command("dock").reason
     run = Run()
-    run.system.robot.command("disable")
-    assert "enable it first" in run.system.robot.command("dock").reason
+    run.robot.command("disable")
+    assert "enable it first" in run.robot.command("dock").reason
 
 
 # --- a low battery ---
@@ -238,13 +220,13 @@ def test_robot_stays_where_it_is_with_a_charge_above_the_limit_or_without_one(ch
 def test_robot_with_a_low_battery_tries_once_and_waits_for_people_then():
     run = Run(site=site_with_dock(Pose(x=1.5, y=2.6, theta=-math.pi / 2)), charge=0.25, dock_below=0.3)
     run.until(lambda: run.state.wants_dock and run.state.goal_id, 1.0)
-    assert run.system.robot.command("cancel").accepted
+    assert run.robot.command("cancel").accepted
     run.run(3.0)
     assert not run.state.wants_dock
     assert "docking given up: its goal was cancelled" in run.state.reasons
-    run.system.robot.command("disable")
+    run.robot.command("disable")
     run.run(0.5)
-    run.system.robot.command("enable")
+    run.robot.command("enable")
     run.until(lambda: run.state.wants_dock, 1.0)
 
 
@@ -253,30 +235,30 @@ def test_robot_with_a_low_battery_tries_once_and_waits_for_people_then():
 
 def test_robot_backs_off_from_a_bump_by_ten_centimetres_at_most_and_keeps_its_fault():
     run = Run()
-    before, bumped = run.away(), list(run.system.world.pose)
+    before, bumped = run.away(), list(run.world.pose)
     bump(run)
     run.until(lambda: run.state.mode == "FAULT", 1.0)
-    assert "the cause is still there" in run.system.robot.command("reset").reason
-    assert run.system.robot.command("back_off").accepted
+    assert "the cause is still there" in run.robot.command("reset").reason
+    assert run.robot.command("back_off").accepted
     run.until(lambda: run.state.mode == "EGRESS", 0.5)
     fastest, end = 0.0, run.system.now + 10.0
     while run.state.mode == "EGRESS":
         assert run.system.now < end, f"the back-off has not ended after 10 s: {run.state}"
         run.system.step()
         fastest = max(fastest, -min(run.wheels))
-        if math.dist(run.system.world.pose[:2], bumped[:2]) > 0.03:
+        if math.dist(run.world.pose[:2], bumped[:2]) > 0.03:
             run.base.world.bump_left = False
     assert 0.07 < run.away() - before <= 0.10
     assert fastest <= 0.051
     assert run.state.mode == "FAULT"
     run.run(1.0)
     assert run.wheels == (0.0, 0.0)
-    assert run.system.robot.command("back_off").accepted is True
+    assert run.robot.command("back_off").accepted is True
     run.run(0.3)
-    assert run.system.robot.command("disable").accepted
+    assert run.robot.command("disable").accepted
     run.run(0.3)
     assert (run.wheels, run.state.mode) == ((0.0, 0.0), "FAULT")
-    assert run.system.robot.command("reset").accepted
+    assert run.robot.command("reset").accepted
     run.until(lambda: run.state.mode == "INIT", 0.5)
 
 
@@ -288,15 +270,15 @@ def test_robot_that_drove_into_something_a_moment_ago_backs_off_by_nine_to_ten_c
     run.system.fog.planner.set_goal("r1", goal, any_heading=True)
     run.until(lambda: min(run.wheels) > 0.28, 20.0)
     run.run(later_s)
-    heading = run.system.world.pose[2]
+    heading = run.world.pose[2]
     bump(run)
     run.until(lambda: run.state.mode == "FAULT", 1.0)
     run.run(ordered_after_s)
-    assert run.system.robot.command("back_off").accepted
+    assert run.robot.command("back_off").accepted
     along = []
     for _ in range(300):
         run.system.step()
-        x, y, _ = run.system.world.pose
+        x, y, _ = run.world.pose
         along.append(x * math.cos(heading) + y * math.sin(heading))
         if along[-1] < max(along) - 0.03:
             run.base.world.bump_left = False
@@ -306,17 +288,17 @@ def test_robot_that_drove_into_something_a_moment_ago_backs_off_by_nine_to_ten_c
 
 def test_robot_does_not_back_off_into_what_its_lidar_sees_behind_it():
     run = Run()
-    x, y, _ = run.system.world.pose
+    x, y, _ = run.world.pose
     behind = x + 0.17 + 0.05
-    run.system.world.place(SimObstacle(id="box", polygon=[(behind, y - 0.2), (behind + 0.2, y - 0.2),
+    run.world.place(SimObstacle(id="box", polygon=[(behind, y - 0.2), (behind + 0.2, y - 0.2),
                                                           (behind + 0.2, y + 0.2), (behind, y + 0.2)]))  # fmt: skip
     bump(run)
     run.until(lambda: run.state.mode == "FAULT", 1.0)
-    assert run.system.robot.command("back_off").accepted
+    assert run.robot.command("back_off").accepted
     run.until(lambda: run.state.mode == "EGRESS", 0.5)
     run.until(lambda: run.state.mode == "FAULT", 6.0)
-    assert run.system.world.contacts == 0
-    assert run.system.world.clearance() > 0.01
+    assert run.world.contacts == 0
+    assert run.world.clearance() > 0.01
 
 
 def test_robot_without_a_bump_does_not_back_off():

@@ -1,7 +1,6 @@
 """Drives of a robot with a person at a terminal, who is scripted; robot and fog node are the real cores in lockstep."""
 
 import asyncio
-import importlib.util
 import math
 import os
 import pty
@@ -12,6 +11,7 @@ from pathlib import Path
 
 import msgspec
 import pytest
+import ring_site as ring
 
 from fog_contracts import channels as ch
 from fog_contracts.messages import Pose, RobotGoal
@@ -26,12 +26,6 @@ from fognav_experiments.rigs import System
 from fognav_sim.barrier import barrier_across
 
 ESTIG = Path(__file__).parents[2] / "sites" / "estig"
-_spec = importlib.util.spec_from_file_location(
-    "ring_site", Path(__file__).parents[2] / "experiments" / "tests" / "ring_site.py"
-)
-ring = importlib.util.module_from_spec(_spec)
-_spec.loader.exec_module(ring)
-
 SITE = ring.ring_site()
 DRAWN = RouteDraw(
     run=1, route=RouteSpec(start="west", goal="east", areas=["z1"]), seed=3, theta=ring.START.theta, area="z1",

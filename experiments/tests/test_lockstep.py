@@ -1,11 +1,11 @@
 """Whole drives in lockstep, from the sensor nodes to the wheels, evaluated by the simulator's ground truth."""
 
-import importlib.util
 import math
 from pathlib import Path
 
 import msgspec
 import pytest
+import ring_site as ring
 
 from fog_contracts.bus import Bus
 from fog_contracts.geometry import contains_point
@@ -19,10 +19,6 @@ from fognav_sim.nodes import FirmwareError, FirmwareNode, find_compiler
 from fognav_sim.world import World
 
 ESTIG = Path(__file__).parents[2] / "sites" / "estig"
-_spec = importlib.util.spec_from_file_location("ring_site", Path(__file__).parent / "ring_site.py")
-ring = importlib.util.module_from_spec(_spec)
-_spec.loader.exec_module(ring)
-
 pytestmark = pytest.mark.timeout(900)
 
 

@@ -1,11 +1,10 @@
 """Nodes that save air, as a board does by default, tell nothing later than nodes that publish every reading."""
 
-import importlib.util
 from dataclasses import replace
-from pathlib import Path
 
 import msgspec
 import pytest
+import ring_site as ring
 
 from fog_contracts import channels as ch
 from fog_contracts.bus import Bus
@@ -14,10 +13,6 @@ from fog_contracts.messages import Pose, RobotPose, SimObstacle
 from fognav_experiments.rigs import FogRig, moment
 from fognav_sim.floor import Floor
 from fognav_sim.world import World
-
-_spec = importlib.util.spec_from_file_location("ring_site", Path(__file__).parent / "ring_site.py")
-ring = importlib.util.module_from_spec(_spec)
-_spec.loader.exec_module(ring)
 
 BEFORE_LEFT_SONAR = (7.1, 1.6)
 BEFORE_RIGHT_SONAR = (7.85, 1.6)

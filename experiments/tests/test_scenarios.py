@@ -4,7 +4,6 @@ FOGNAV_SCENARIOS=all plays all of them (about 10 minutes), otherwise some short 
 
 from __future__ import annotations
 
-import importlib.util
 import math
 import os
 from functools import partial
@@ -14,6 +13,7 @@ from types import SimpleNamespace
 import msgspec
 import numpy as np
 import pytest
+import ring_site as ring
 
 from fog_contracts.messages import NodeReading, Pose, ReasonCode
 from fog_contracts.site import RobotSite
@@ -192,10 +192,6 @@ def test_readings_of_a_slewed_clock_and_of_a_busy_radio():
 
 # --- several robots ---
 
-
-_spec = importlib.util.spec_from_file_location("ring_site", Path(__file__).parent / "ring_site.py")
-ring = importlib.util.module_from_spec(_spec)
-_spec.loader.exec_module(ring)
 
 APART_M = 0.8
 

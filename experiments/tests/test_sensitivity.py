@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-import importlib.util
 import re
 from pathlib import Path
 
 import pytest
+import ring_site as ring
 
 from fog_runtime.configuration.site import load_site
 from fognav_experiments.comparison import runner
@@ -28,10 +28,6 @@ from fognav_experiments.comparison.sensitivity import (
 from fognav_sim.node import default_config
 
 ESTIG = Path(__file__).parents[2] / "sites" / "estig"
-_spec = importlib.util.spec_from_file_location("ring_site", Path(__file__).parent / "ring_site.py")
-ring = importlib.util.module_from_spec(_spec)
-_spec.loader.exec_module(ring)
-
 pytestmark = pytest.mark.timeout(900)
 
 DEBOUNCE = Plane(Axis("readings", [2, 20]), Axis("pause_ms", [50, 500]))

@@ -3,24 +3,19 @@
 FOGNAV_RIDE_SEEDS sets the number of drives. Lengths in m, angles in rad, times in s.
 """
 
-import importlib.util
 import math
 import os
-from pathlib import Path
 
 import msgspec
 import numpy as np
 import pytest
+import ring_site as ring
 
 from fog_contracts import channels as ch
 from fog_contracts.messages import Pose, RobotGoal
 from fognav_experiments.rigs import System
 from robot_agent.agent.core import AgentCore
 from robot_agent.localization.pose import wrap
-
-_spec = importlib.util.spec_from_file_location("ring_site", Path(__file__).parent / "ring_site.py")
-ring = importlib.util.module_from_spec(_spec)
-_spec.loader.exec_module(ring)
 
 SEEDS = range(1, 1 + int(os.environ.get("FOGNAV_RIDE_SEEDS", "2")))
 GOALS = [Pose(x=4.2, y=1.4, theta=1.57), Pose(x=1.5, y=6.3, theta=-0.6), Pose(x=2.6, y=1.2, theta=3.1)]

@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING, Any
 
 import msgspec
 import pytest
+import ring_site as ring
 
 from fog_contracts import channels as ch
 from fog_contracts.bus import Bus
@@ -72,7 +73,6 @@ def module(path: Path) -> Any:
 
 live_services = module(HERE / "live_services.py")
 usage = module(HERE / "channel_usage.py")
-ring = module(HERE.parents[1] / "experiments" / "tests" / "ring_site.py")
 
 SEED = 3
 STEPS = 1500

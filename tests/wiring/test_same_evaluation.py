@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import importlib.util
 from dataclasses import dataclass, replace
-from pathlib import Path
 from types import SimpleNamespace
 from typing import TYPE_CHECKING, Any, cast
 
 import msgspec
 import pytest
+import ring_site as ring
 
 from fog_contracts import channels as ch
 from fog_contracts.bus import Bus
@@ -34,13 +33,6 @@ if TYPE_CHECKING:
     from fog_runtime.transports.zenoh_edge import ZenohEdge
     from fognav.stack import Stack
     from fognav_experiments.lockstep import LockstepResult
-
-RING_SITE = Path(__file__).parents[2] / "experiments" / "tests" / "ring_site.py"
-_spec = importlib.util.spec_from_file_location("ring_site", RING_SITE)
-assert _spec is not None
-assert _spec.loader is not None
-ring: Any = importlib.util.module_from_spec(_spec)
-_spec.loader.exec_module(ring)
 
 SEED = 3
 INSIDE_Z1 = (7.5, 1.5)

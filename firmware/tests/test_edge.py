@@ -206,13 +206,6 @@ def connection(core):
     made.close()
 
 
-def test_node_connects_as_soon_as_network_and_broker_answer_and_announces_itself_once(connection):
-    connection.run(10)
-    assert connection.up
-    assert len(connection.announcements) == 1
-    assert connection.announcements[0] < 4000
-
-
 def test_node_boots_faster_than_the_router_and_connects_when_it_is_there(connection):
     connection.network = False
     connection.run(300)

@@ -451,12 +451,6 @@ def test_clone_that_says_no_echo_by_a_short_pulse_is_learned(make_node, run):
     assert run(restarted, (0.4, 3.0), 2.0)[-1].status == ["no_echo", "ok"]
 
 
-def test_command_that_is_not_known_is_refused_in_words(make_node):
-    assert make_node().command("dance") == (
-        "this firmware does not know the command: it knows calibrate and learn-no-echo"
-    )
-
-
 @settings(deadline=None, max_examples=12)
 @given(st.lists(st.tuples(*[st.sampled_from([0.8, 0.95, 1.1, 2.2, 3.0, None])] * 2), min_size=1, max_size=6))
 def test_as_many_readings_are_published_as_by_the_model(core, segments):

@@ -132,28 +132,6 @@ def portal(core):
     made.close()
 
 
-def test_node_without_settings_keeps_its_portal_open(core):
-    portal = Portal(core, has_settings=False)
-    assert portal.run(0.1)
-    assert portal.run(3600)
-    portal.close()
-
-
-def test_node_with_settings_opens_a_portal_only_when_its_button_is_held(portal):
-    assert not portal.run(3600)
-    assert not portal.run(2.5, pressed=True)
-    assert not portal.run(60)
-    assert portal.run(3.5, pressed=True)
-
-
-def test_portal_that_nobody_uses_closes_after_ten_minutes(portal):
-    assert portal.run(3.5, pressed=True)
-    assert portal.run(590)
-    portal.request()
-    assert portal.run(590)
-    assert not portal.run(20)
-
-
 class Inbox:
     """What a node lab/n1 receives."""
 
@@ -342,13 +320,6 @@ def test_signed_update_is_fetched_in_pieces_checked_and_started(board):
 )
 def test_update_that_does_not_fit_is_refused(board, change, words):
     assert words in board.offer(**change)
-    assert board.run(10) == []
-    assert board.calls == []
-
-
-def test_update_with_a_bad_signature_is_refused_before_anything_is_fetched(board):
-    board.good = False
-    assert "not signed by the key" in board.offer()
     assert board.run(10) == []
     assert board.calls == []
 

@@ -100,6 +100,15 @@ async def rig(tmp_path):
     await asyncio.gather(*tasks, return_exceptions=True)
 
 
+@pytest.fixture
+async def guardian(rig):
+    """Return a guardian to which the agent of `rig` is connected."""
+    made = Guardian(rig.path)
+    await made.accept()
+    yield made
+    made.close()
+
+
 async def test_what_the_guardian_sent_while_the_agent_was_loaded_is_passed_on_with_its_times(tmp_path):
     guardian, rig = Guardian(tmp_path / "guardian.sock"), Rig(tmp_path / "guardian.sock")
     tasks = [asyncio.create_task(rig.client.run())]
@@ -164,9 +173,7 @@ async def test_missing_guardian_is_reported_and_connected_when_it_starts(rig):
     await rig.until(lambda: "the guardian closed the link" in rig.losses)
 
 
-async def test_bad_feedback_is_ignored_and_a_silent_base_is_reported(rig):
-    guardian = Guardian(rig.path)
-    await guardian.accept()
+async def test_bad_feedback_is_ignored_and_a_silent_base_is_reported(rig, guardian):
     guardian.link.send(b"\xc1 nonsense")
     guardian.link.send(encode(FEEDBACK))
     await rig.until(lambda: rig.feedback == [FEEDBACK])
@@ -181,26 +188,20 @@ async def test_bad_feedback_is_ignored_and_a_silent_base_is_reported(rig):
     rig.losses.clear()
     rig.client.send(command())
     assert not rig.losses
-    guardian.close()
 
 
 @pytest.mark.parametrize(
     ("age", "trusted"), [(0.04, True), (0.3, True), (20.0, True), (31.0, False), (-0.01, False), (None, False)]
 )
-async def test_feedback_counts_from_when_it_was_sent_by_the_clock_of_both(rig, age, trusted):
-    guardian = Guardian(rig.path)
-    await guardian.accept()
+async def test_feedback_counts_from_when_it_was_sent_by_the_clock_of_both(rig, guardian, age, trusted):
     now = time.monotonic()
     rig.clock.now = lambda: now
     guardian.link.send(encode(msgspec.structs.replace(FEEDBACK, at=None if age is None else now - age)))
     await rig.until(lambda: rig.feedback)
     assert rig.times == [pytest.approx(now - age if trusted else now, abs=1e-6)]
-    guardian.close()
 
 
-async def test_feedback_that_waited_while_the_agent_was_late_keeps_its_times_and_so_all_odometry(rig):
-    guardian = Guardian(rig.path)
-    await guardian.accept()
+async def test_feedback_that_waited_while_the_agent_was_late_keeps_its_times_and_so_all_odometry(rig, guardian):
     now = time.monotonic()
     rig.clock.now = lambda: now
     ages = [0.05 * count for count in range(16, -1, -1)]
@@ -213,24 +214,18 @@ async def test_feedback_that_waited_while_the_agent_was_late_keeps_its_times_and
         odometry.add(at, 0.015 * number, 0.0, 0.0)
     assert odometry.pose(now - 0.4).x == pytest.approx(0.015 * 8, abs=1e-6)
     assert odometry.twist()[0] == pytest.approx(0.3, abs=1e-3)
-    guardian.close()
 
 
-async def test_times_of_feedback_never_go_back_even_when_another_clock_shows_late(rig):
-    guardian = Guardian(rig.path)
-    await guardian.accept()
+async def test_times_of_feedback_never_go_back_even_when_another_clock_shows_late(rig, guardian):
     now = time.monotonic()
     rig.clock.now = lambda: now
     for age in (0.2, 0.3, -5.0, 0.1):
         guardian.link.send(encode(msgspec.structs.replace(FEEDBACK, at=now - age)))
     await rig.until(lambda: len(rig.times) == 4)
     assert rig.times == pytest.approx([now - 0.2, now - 0.2, now, now], abs=1e-6)
-    guardian.close()
 
 
-async def test_a_flood_of_feedback_does_not_block_the_stream(rig):
-    guardian = Guardian(rig.path)
-    await guardian.accept()
+async def test_a_flood_of_feedback_does_not_block_the_stream(rig, guardian):
     await rig.until(lambda: rig.client.send(command()))
     sent = 0
     try:
@@ -243,7 +238,6 @@ async def test_a_flood_of_feedback_does_not_block_the_stream(rig):
     rig.client.receive()
     assert len(rig.feedback) == 64
     await rig.until(lambda: len(rig.feedback) == sent)
-    guardian.close()
 
 
 async def test_refusal_by_the_guardian_is_the_reason_and_the_agent_asks_again(rig):
@@ -277,12 +271,9 @@ async def test_reset_without_a_guardian_is_passed_on_soon_after_or_expires(rig):
     guardian.close()
 
 
-async def test_a_guardian_that_does_not_read_never_blocks_the_agent(rig):
-    guardian = Guardian(rig.path)
-    await guardian.accept()
+async def test_a_guardian_that_does_not_read_never_blocks_the_agent(rig, guardian):
     await rig.until(lambda: rig.client.send(command()))
     sent = 0
     while rig.client.send(command()):
         sent += 1
         assert sent < 100_000
-    guardian.close()

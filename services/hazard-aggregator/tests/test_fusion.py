@@ -328,16 +328,6 @@ def test_each_area_is_unknown_after_the_silence_that_its_own_policy_allows(limit
     assert "silent for more than 3 s" in unknown["a3"][2]
 
 
-def test_only_consecutive_clear_readings_clear_an_area_that_silence_kept_impassable():
-    rig = Rig(site("n1"))
-    rig.read(0.8, 3.0, times=5)
-    rig.wait(4.0)
-    rig.read(3.0, 3.0, times=4)
-    assert rig.hazard.penalty == 254
-    rig.read(3.0, 3.0)
-    assert (rig.hazard.state, rig.hazard.penalty) == ("clear", 0)
-
-
 @pytest.mark.parametrize(
     ("ranges", "state", "cause"),
     [
@@ -730,15 +720,6 @@ def test_one_blocked_node_blocks_an_area_and_only_all_nodes_clear_it():
     rig.read(0.8, 3.0, node="n2", times=5)
     assert rig.hazard.state == "blocked"
     assert rig.hazard.nodes == {"n1": "clear", "n2": "blocked"}
-
-
-def test_second_silence_discards_the_readings_before_it_as_the_first_did():
-    rig = Rig(site("n1"))
-    rig.read(0.8, 3.0, times=5)
-    for _ in range(3):
-        rig.wait(3.5)
-        rig.read(3.0, 3.0, times=4)
-    assert (rig.hazard.state, rig.hazard.penalty) == ("unknown", 254)
 
 
 def test_silent_node_beside_a_clear_one_makes_the_area_unknown():

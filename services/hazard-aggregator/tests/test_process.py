@@ -59,11 +59,17 @@ async def connected_node(fog):
         yield node, zenoh
 
 
-@pytest.mark.smoke
-async def test_echoes_block_an_area_and_free_readings_clear_it(fog, until):
+@asynccontextmanager
+async def aggregator_and_node(fog):
     fog.start("hazard_aggregator")
     await fog.ready("hazard_aggregator")
-    async with connected_node(fog) as (node, _):
+    async with connected_node(fog) as connected:
+        yield connected
+
+
+@pytest.mark.smoke
+async def test_echoes_block_an_area_and_free_readings_clear_it(fog, until):
+    async with aggregator_and_node(fog) as (node, _):
         await until(lambda: node.definitions and node.hazards and node.configs, "retained messages")
         assert node.hazards[0].state == "unknown"
         assert node.configs[0].range_limit_m == [1.5, 1.5]
@@ -77,9 +83,7 @@ async def test_echoes_block_an_area_and_free_readings_clear_it(fog, until):
 
 
 async def test_restarted_aggregator_restores_the_blocked_area(fog, until):
-    fog.start("hazard_aggregator")
-    await fog.ready("hazard_aggregator")
-    async with connected_node(fog) as (node, _):
+    async with aggregator_and_node(fog) as (node, _):
         await node.read(0.8, 5)
         await until(lambda: node.state == "blocked", "blocked")
         epoch = node.hazards[-1].epoch
@@ -121,9 +125,7 @@ async def test_blocked_period_lasts_from_its_first_announcement_whenever_the_agg
 
 
 async def test_danger_that_redis_never_had_survives_an_aggregator_that_is_killed_twice(fog, until):
-    fog.start("hazard_aggregator")
-    await fog.ready("hazard_aggregator")
-    async with connected_node(fog) as (node, _):
+    async with aggregator_and_node(fog) as (node, _):
         await until(lambda: node.hazards, "first hazard")
         os.kill(fog.redis.pid, signal.SIGSTOP)
         await node.read(0.8, 5)
@@ -140,9 +142,7 @@ async def test_danger_that_redis_never_had_survives_an_aggregator_that_is_killed
 
 
 async def test_broker_that_lost_its_data_gets_everything_again(fog, until):
-    fog.start("hazard_aggregator")
-    await fog.ready("hazard_aggregator")
-    async with connected_node(fog) as (node, _):
+    async with aggregator_and_node(fog) as (node, _):
         await node.read(0.8, 5)
         await until(lambda: node.state == "blocked", "blocked")
         fog.mosquitto.kill()
@@ -176,9 +176,7 @@ async def test_without_redis_danger_is_announced_and_relief_waits(fog, until):
 
 
 async def test_aggregator_started_without_redis_restores_the_blocked_area_later(fog, until):
-    fog.start("hazard_aggregator")
-    await fog.ready("hazard_aggregator")
-    async with connected_node(fog) as (node, _):
+    async with aggregator_and_node(fog) as (node, _):
         await node.read(0.8, 5)
         await until(lambda: node.state == "blocked", "blocked")
         await blockage_is_stored(fog)
@@ -202,9 +200,7 @@ async def blockage_is_stored(fog) -> None:
 
 
 async def test_robot_in_the_cone_does_not_block_the_area(fog, until):
-    fog.start("hazard_aggregator")
-    await fog.ready("hazard_aggregator")
-    async with connected_node(fog) as (node, zenoh):
+    async with aggregator_and_node(fog) as (node, zenoh):
         await node.read(3.0, 8)
         await until(lambda: node.state == "clear", "clear")
         robot = RobotPose(

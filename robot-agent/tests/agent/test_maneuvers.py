@@ -12,7 +12,6 @@ from little_world import AGENT
 from fog_contracts.messages import PlanReply, Refusal
 from robot_agent.agent.maneuvers import Egress, Maneuvers, Straight, Turning
 from robot_agent.agent.path_driving import PathDriving
-from robot_agent.hardware import BaseStatus
 from robot_agent.localization.localizer import Localizer
 from robot_agent.localization.pose import Pose2
 from robot_agent.safety.gate import SafetyOutputs, SafetyState
@@ -48,23 +47,6 @@ def test_robot_turns_by_0_7_rad_to_the_left_to_the_right_and_back():
     assert theta == pytest.approx(3.0, abs=0.04)
     assert headings == pytest.approx([3.7, 2.3], abs=0.05)
     assert turn.remaining(facing(theta)) == 0.0
-
-
-@pytest.mark.parametrize(("theta", "reached"), [(0.65, False), (0.665, True), (0.735, True), (0.75, False)])
-def test_heading_is_reached_within_0_04_rad(theta, reached):
-    turn = turning()
-    assert turn.remaining(facing(0.0)) == pytest.approx(0.7 + 1.4 + 0.7)
-    turn.advance(facing(theta))
-    left = (theta + 0.7) + 0.7 if reached else abs(0.7 - theta) + 1.4 + 0.7
-    assert turn.remaining(facing(theta)) == pytest.approx(left)
-
-
-@pytest.mark.parametrize(
-    ("lacking", "rate"), [(0.7, 0.4), (0.21, 0.4), (0.19, 0.38), (0.1, 0.2), (0.041, 0.082), (0.03, 0.08), (-0.1, -0.2)]
-)
-def test_turn_slows_down_before_its_heading_but_not_to_rest(lacking, rate):
-    left, right = turning().wheels(facing(0.7 - lacking))
-    assert (left, right) == pytest.approx((-rate * 0.1, rate * 0.1))
 
 
 @pytest.mark.parametrize("rate", [0.2, 0.3])
@@ -304,14 +286,6 @@ def test_gate_is_told_how_much_of_a_straight_way_is_left_and_what_stops_it(maneu
     assert maneuvers.inputs(state(kind), None, None, 4.0).remaining == pytest.approx(length), "it begins anew"
 
 
-def test_way_back_that_the_gate_is_told_counts_from_where_a_rolling_robot_turns_round(maneuvers, localizer):
-    maneuvers.inputs(state("back_off"), None, None, 1.0)
-    localizer.odom = Pose2(0.03, 0.0, 0.0)
-    assert maneuvers.inputs(state("back_off"), None, None, 1.1).remaining == pytest.approx(0.09)
-    localizer.odom = ORIGIN
-    assert maneuvers.inputs(state("back_off"), None, None, 1.5).remaining == pytest.approx(0.06)
-
-
 def test_gate_is_told_how_far_a_turn_has_to_go_and_what_stops_it(maneuvers, localizer):
     begun = maneuvers.inputs(state("turn"), None, None, 1.0)
     assert (begun.remaining, begun.problem) == (pytest.approx(2.8), "a chair")
@@ -404,19 +378,6 @@ def test_base_is_watched_for_what_the_lidar_sees_at_the_speeds_that_its_wheels_t
     maneuvers.docking._ordered_at = 1.0
     assert maneuvers.inputs(state(), None, None, 1.0).dock_problem == "something, False"
     assert maneuvers.inputs(state("dock"), None, None, 1.0).remaining == math.inf
-
-
-def test_low_battery_is_looked_at_once_the_base_tells_it(maneuvers):
-    seen = []
-    driving = PathDriving(AGENT)
-    maneuvers.docking.order_if_low = lambda status, *_: seen.append(status.battery)
-    assert not maneuvers.may_seek_dock(state(), None, driving, 1.0)
-    assert seen == []
-    feedback = SimpleNamespace(status=BaseStatus(battery=0.2))
-    assert not maneuvers.may_seek_dock(state(), feedback, driving, 1.0)
-    assert seen == [0.2]
-    maneuvers.docking.is_due = lambda *_, at_rest: at_rest
-    assert maneuvers.may_seek_dock(state(), feedback, driving, 1.0)
 
 
 END = Pose2(1.0, 0.0, 0.0)

@@ -9,7 +9,6 @@ import pytest
 from fog_contracts.messages import Pose, Reason, ReasonCode, Refusal, RobotGoal, RobotPath
 from robot_agent.agent.mission import Mission
 from robot_agent.agent.path_monitor import ProgressMonitor
-from robot_agent.config import MotionConfig
 from robot_agent.safety.gate import SafetyOutputs
 
 GOAL = RobotGoal(goal_id="g1", pose=Pose(x=5.0, y=1.0, theta=0.0))
@@ -71,18 +70,10 @@ def stuck(rig):
     return rig
 
 
-def test_robots_of_any_configuration_hold_after_ten_seconds():
-    assert MotionConfig.__dataclass_fields__["stuck_after"].default == 10.0
-
-
 def test_ten_seconds_without_progress_are_a_problem_and_not_a_moment_less(rig):
     assert rig.run(9.95) is None
     assert rig.bar == []
     assert rig.run(0.1) == SENTENCE
-
-
-def test_problem_tells_what_hinders_the_wheels(rig):
-    assert rig.run(10.1, NEAR) == f"{SENTENCE}: an obstacle is so near that no arc is free"
 
 
 def test_problem_tells_what_hindered_the_wheels_last_and_nothing_from_before(rig):

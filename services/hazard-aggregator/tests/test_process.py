@@ -90,9 +90,9 @@ async def test_restarted_aggregator_restores_the_blocked_area(fog, until):
         fog.kill("hazard_aggregator")
         fog.start("hazard_aggregator")
         await until(lambda: node.hazards[-1].epoch > epoch, "restarted", lambda: fog.log("hazard_aggregator"))
-        assert next(hazard for hazard in node.hazards if hazard.epoch > epoch).state == "blocked"
+        # A busy machine may start it so late that its node is silent by then.
         await until(lambda: node.state == "unknown", "unknown because its node is silent")
-        assert node.hazards[-1].penalty == 254
+        assert {hazard.penalty for hazard in node.hazards if hazard.epoch > epoch} == {254}
 
 
 async def test_blocked_period_lasts_from_its_first_announcement_whenever_the_aggregator_is_killed(fog, until):

@@ -6,10 +6,8 @@ The world lives in a thread; the robot's three processes are the real ones.
 from __future__ import annotations
 
 import asyncio
-import json
 import math
 import os
-import subprocess
 import threading
 import time
 import urllib.error
@@ -20,7 +18,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 import programs
-from guardian_rig import DEADLINE_S, Base, Watchdog
+from guardian_rig import DEADLINE_S, Base, Process, Watchdog
 from little_world import KEY, L_PATH, L_ROOMS, grid_of
 
 from fog_contracts import channels as ch
@@ -204,8 +202,10 @@ class Fog:
         return await self.edge.query(ch.ROBOT_COMMAND, self.sent, CommandReply, 3.0, robot=ROBOT)
 
 
-class AgentProcess:
+class AgentProcess(Process):
     """The agent, as `python -m robot_agent` starts it."""
+
+    ends_within_s = 10.0
 
     def __init__(
         self, folder: Path, router: LockedRouter, watchdog: Watchdog, body: Body, further=None, start=(2.0, 2.0, 0.0)
@@ -236,24 +236,10 @@ class AgentProcess:
             "FOGNAV_INPUT_LOG": str(self.input_log),
             **(further or {}),
         }
-        self.process: programs.Program | None = None
-
-    def __enter__(self):
-        self.start()
-        return self
 
     def start(self) -> None:
         self._port_file.unlink(missing_ok=True)
         self.process = programs.start("robot_agent", self._environment, self.log_file)
-
-    def __exit__(self, *_):
-        if self.process.poll() is None:
-            self.process.terminate()
-        try:
-            self.process.wait(10.0)
-        except subprocess.TimeoutExpired:
-            self.process.kill()
-            self.process.wait()
 
     @property
     def port(self) -> int:
@@ -270,10 +256,6 @@ class AgentProcess:
                 return error.code, error.read().decode()
         except (OSError, ValueError):
             return 0, ""
-
-    @property
-    def events(self) -> list[dict]:
-        return [json.loads(line) for line in self.log_file.read_text().splitlines() if line.startswith("{")]
 
 
 async def until(condition, expected: str, deadline_s: float = DEADLINE_S):

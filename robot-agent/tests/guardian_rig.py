@@ -135,7 +135,35 @@ class Base:
                 self.stopped_at = now
 
 
-class Watchdog:
+class Process:
+    """A program with a log, in a `with` block; a subclass starts it."""
+
+    log_file: Path
+    process = None
+    ends_within_s = 5.0
+
+    def start(self) -> None:
+        raise NotImplementedError
+
+    def __enter__(self):
+        self.start()
+        return self
+
+    def __exit__(self, *_):
+        if self.process.poll() is None:
+            self.process.terminate()
+        try:
+            self.process.wait(self.ends_within_s)
+        except subprocess.TimeoutExpired:
+            self.process.kill()
+            self.process.wait()
+
+    @property
+    def events(self) -> list[dict]:
+        return [json.loads(line) for line in self.log_file.read_text().splitlines() if line.startswith("{")]
+
+
+class Watchdog(Process):
     """`python -m robot_agent.guardian.watchdog` and its log."""
 
     def __init__(self, folder: Path, base_port: Path) -> None:
@@ -146,11 +174,6 @@ class Watchdog:
             "FOGNAV_BASE_PORT": str(base_port),
             "FOGNAV_GUARDIAN_SOCKET": str(self.socket),
         }
-        self.process: subprocess.Popen[bytes] | None = None
-
-    def __enter__(self):
-        self.start()
-        return self
 
     def start(self) -> None:
         with self.log_file.open("ab") as log:
@@ -158,19 +181,6 @@ class Watchdog:
                 command(sys.executable, "-m", "robot_agent.guardian.watchdog"), env=self.environment, stderr=log,
                 stdout=log,
             )  # fmt: skip
-
-    def __exit__(self, *_):
-        if self.process.poll() is None:
-            self.process.terminate()
-        try:
-            self.process.wait(5.0)
-        except subprocess.TimeoutExpired:
-            self.process.kill()
-            self.process.wait()
-
-    @property
-    def events(self) -> list[dict]:
-        return [json.loads(line) for line in self.log_file.read_text().splitlines() if line.startswith("{")]
 
     def count(self, event: str) -> int:
         return sum(line["event"] == event for line in self.events)

@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Final, NamedTuple
 
 import numpy as np
 
-from robot_agent.localization.fit import Fit, confirms, evaluate_fit
+from robot_agent.localization.fit import Fit, confirms, evaluate_fit, shows_place, tells_place
 from robot_agent.localization.pose import Pose2, wrap
 from robot_agent.localization.scans import match_scan
 
@@ -24,6 +24,7 @@ if TYPE_CHECKING:
 
     from robot_agent.localization.map_fields import MapFields
     from robot_agent.localization.scans import DeskewedScan
+    from robot_agent.safety.conditions import Localization
 
 _AMBIGUOUS: Final = 0.85
 """A second place that explains the scans this well, as a share of the best, leaves the search ambiguous."""
@@ -43,6 +44,11 @@ _NEWS_RAD: Final = 0.2
 _PLACES_MAX: Final = 48
 _MATCH_COVARIANCE: Final = np.diag(np.square((0.2, 0.2, 0.1)))
 _BEAMS: Final = 180
+_FOLLOWED_M: Final = 5.0
+"""A pose that was good for so long a way is kept against places that explain the scans better, while each scan shows
+what the one before it did: nobody carried the robot, opened doors are more likely than such a way to a wrong place."""
+_NEAR_M: Final = 2.5
+"""So far from where its pose was good last a robot may be that was pushed or turned, or whose wheel was held."""
 
 
 class Near(NamedTuple):
@@ -55,6 +61,69 @@ class Near(NamedTuple):
     def holds(self, pose: Pose2) -> bool:
         """Whether the robot may have come to a pose, as it does that slips, or is pushed or turned."""
         return math.hypot(pose.x - self.x, pose.y - self.y) <= self.radius
+
+
+class History:
+    """How the pose was come by: what says more of it than the newest scan does, or less."""
+
+    def __init__(self) -> None:
+        self.tracked = False
+        """Whether the pose was good once, or was given, and was followed by wheels and scans since."""
+        self.saved = False
+        """Whether the pose is a saved one that was not good yet, ..."""
+        self.contested = False
+        """... and whether a search has found a better place."""
+        self.continuous = False
+        """Whether the newest scan shows what the one before it did."""
+        self.followed_m = 0.0
+        """How far the robot has driven with a good pose, while each scan showed what the one before it did."""
+        self.near: Near | None = None
+        """Where the robot may have come to by itself since its pose was good; None before that."""
+        self._last_odom: Pose2 | None = None
+
+    def restart(self) -> None:
+        """Forget the pose before this one, which was given, or saved."""
+        self.saved = self.contested = False
+        self.restart_at_found()
+
+    def restart_at_found(self) -> None:
+        """Forget the pose before this one, which a search has found."""
+        self.tracked = False
+        self.followed_m = 0.0
+        self.near = None
+
+    def follow(self, odom: Pose2, status: Localization, *, shaken: bool) -> None:
+        """Follow the pose to the newest scan, with the status before it; `shaken`: it is not the same pose any more."""
+        good = status == "good"
+        self.tracked = not shaken and (self.tracked or good)
+        if not self.tracked or not self.continuous:
+            self.followed_m = 0.0
+        elif good:
+            self.followed_m += self._way(odom)
+
+    def judge(self, pose: Pose2, odom: Pose2, status: Localization) -> None:
+        """Take note of what the newest scan, which ended at `odom`, makes of the pose."""
+        if status == "good":
+            self.near = Near(pose.x, pose.y, _NEAR_M)
+            self.saved = self.contested = False
+        else:
+            self.come(self._way(odom))
+        self._last_odom = odom
+
+    def come(self, distance: float) -> None:
+        """Take note that the robot may have come so far (m) by itself."""
+        if self.near is not None:
+            self.near = self.near._replace(radius=self.near.radius + distance)
+
+    def keeps(self, fit: Fit) -> bool:
+        """Whether the way from a good pose to this one says more than a place that explains the scans better."""
+        return self.tracked and (tells_place(fit) or (shows_place(fit) and self.followed_m > _FOLLOWED_M))
+
+    def _way(self, odom: Pose2) -> float:
+        if self._last_odom is None:
+            return 0.0
+        step = odom.relative_to(self._last_odom)
+        return math.hypot(step.x, step.y)
 
 
 @dataclass(frozen=True, slots=True)

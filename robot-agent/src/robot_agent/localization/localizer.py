@@ -23,10 +23,9 @@ from robot_agent.localization.fit import (
     confirms,
     differs_by_doors,
     evaluate_fit,
-    shows_place,
     tells_place,
 )
-from robot_agent.localization.hypotheses import Near, apart
+from robot_agent.localization.hypotheses import History, apart
 from robot_agent.localization.map_fields import MapFields, map_fields
 from robot_agent.localization.odometry import OdometryBuffer
 from robot_agent.localization.particle_filter import ParticleFilter
@@ -56,11 +55,6 @@ _LOCAL_SIGMAS: Final = (1.0, 0.5)
 """Standard deviations (m, rad) within which a lost robot is looked for first."""
 _VERIFY_EVERY_S: Final = 5.0
 """Least time between two searches of the whole map that only confirm the pose, as while a door stands open."""
-_FOLLOWED_M: Final = 5.0
-"""A pose that was good for so long a way is kept against places that explain the scans better, while each scan shows
-what the one before it did: nobody carried the robot, opened doors are more likely than such a way to a wrong place."""
-_NEAR_M: Final = 2.5
-"""So far from where its pose was good last a robot may be that was pushed or turned, or whose wheel was held."""
 _TURNED_RAD: Final = 0.5
 _SAVED_OR_FOUND: Final = (
     "the scan fits the saved pose but for a few beams, as beside an opened door, and another place better: let the "
@@ -87,17 +81,7 @@ class Localizer:
         self._verify_again_at = -math.inf
         self._fit = NO_FIT
         """Of the newest scan at the pose."""
-        self._tracked = False
-        """Whether the pose was good once, or was given, and was followed by wheels and scans since."""
-        self._saved = self._contested = False
-        """Whether the pose is a saved one that was not good yet, and whether a search has found a better place."""
-        self._continuous = False
-        """Whether the newest scan shows what the one before it did."""
-        self._followed_m = 0.0
-        """How far the robot has driven with a good pose, while each scan showed what the one before it did."""
-        self._near: Near | None = None
-        """Where the robot may have come to by itself since its pose was good; None before that."""
-        self._last_odom: Pose2 | None = None
+        self._history = History()
         self.scan: DeskewedScan | None = None
         """The newest scan, without its skew."""
 
@@ -131,9 +115,9 @@ class Localizer:
         odom = self._odometry.latest()
         if odom is not None and self._filter.has_pose:
             self._filter.widen(odom, distance, angle)
-            self._come(distance)
+            self._history.come(distance)
             self._scale.forget_anchor()
-            self._tracked = False
+            self._history.tracked = False
             self._monitor.doubt(detail)
 
     def on_absolute_observation(self, observation: AbsoluteObservation) -> bool:
@@ -150,14 +134,14 @@ class Localizer:
         if not self._filter.observe(observation.pose, observation.covariance, odom):
             self._monitor.begin("checking the pose that was measured")
             self._doubt.restart()
-            self._tracked = False
-            self._near = None
+            self._history.tracked = False
+            self._history.near = None
         return True
 
     def on_scan(self, scan: LaserScan, now: float) -> None:
         """Process a whole scan: correct the pose when the robot has moved, and evaluate the fit."""
         before, self.scan = self.scan, deskew(scan, self._odometry, self._config)
-        self._continuous = before is not None and self.scan is not None and follows(self.scan, before)
+        self._history.continuous = before is not None and self.scan is not None and follows(self.scan, before)
         if self.scan is None or self._fields is None:
             return
         if self._filter.has_pose:
@@ -165,7 +149,7 @@ class Localizer:
             self._evaluate(self.scan, self._fields, now)
         if self._relocalization.active:
             shaken = self._monitor.shaken
-            self._relocalization.on_scan(self.scan, self._fields, self._near, shaken=shaken)
+            self._relocalization.on_scan(self.scan, self._fields, self._history.near, shaken=shaken)
             self._settle(self.scan, self._fields, now)
         elif not self._filter.has_pose and self._may_search(self.scan, now):
             self.global_localization()
@@ -176,27 +160,27 @@ class Localizer:
         The next scan narrows them in the directions that it observes.
         """
         self._start(Pose2(x, y, theta), sigma_xy, sigma_theta)
-        self._tracked = True  # an operator's pose, too, says more than an opened door does
+        self._history.tracked = True  # an operator's pose, too, says more than an opened door does
         self._monitor.begin("checking the given pose")
 
     def restore(self, saved: SavedPose) -> None:
         """Start at a saved pose with larger deviations; if the next scans don't fit it, search the whole map."""
         pose = Pose2(saved.x, saved.y, saved.theta)
         self._start(pose, max(0.3, 2.0 * saved.sigma_xy), max(0.2, 2.0 * saved.sigma_theta))
-        self._saved = True
+        self._history.saved = True
         self._monitor.begin(_SAVED, _TRIAL_SCANS)
 
     def follow_saved(self) -> None:
         """Trust a saved pose that no scan has tried yet like one that was followed: somebody has watched the robot."""
         if self._monitor.on_trial:
-            self._tracked = True
+            self._history.tracked = True
             self._monitor.begin(_SAVED)
 
     def global_localization(self) -> bool:
         """Search the whole map, a share with each scan, keeping the estimate; False: no map or no scan yet."""
         if self._fields is None or self.scan is None:
             return False
-        if not self._relocalization.begin(self.scan, self._fields, self._near):
+        if not self._relocalization.begin(self.scan, self._fields, self._history.near):
             return False
         self._monitor.begin_search()
         return True
@@ -293,9 +277,7 @@ class Localizer:
     def _start(self, pose: Pose2, sigma_xy: float, sigma_theta: float) -> None:
         self._relocalization.cancel()
         self._local_scans = 0
-        self._tracked = self._saved = self._contested = False
-        self._followed_m = 0.0
-        self._near = None
+        self._history.restart()
         self._doubt.restart()
         odom = self._odometry.latest() or Pose2(0.0, 0.0, 0.0)
         self._scale.forget_anchor()
@@ -308,15 +290,12 @@ class Localizer:
         fit = evaluate_fit(fields, pose, scan.beams(_FIT_BEAMS), self._config.range_max)
         self._fit = fit
         shaken = self._filter.jumped or self._monitor.shaken
-        self._tracked = not shaken and (self._tracked or self._monitor.status == "good")
-        rivalled = not self._tracked and len(self._relocalization.places) > 1
+        self._history.follow(scan.odom, self._monitor.status, shaken=shaken)
+        rivalled = not self._history.tracked and len(self._relocalization.places) > 1
         self._doubt.add(fit, scan.odom, jumped=self._filter.jumped, rivalled=rivalled)
-        self._follow_way(scan.odom, shaken=shaken)
-        self._monitor.add(fit, self._filter.uncertainty, doubt=self._doubt.reason, kept=self._is_kept)
-        self._follow(pose, scan.odom)
-        if self._monitor.status == "good":
-            self._saved = self._contested = False
-        elif self._contested and differs_by_doors(self._fit):
+        self._monitor.add(fit, self._filter.uncertainty, doubt=self._doubt.reason, kept=self._history.keeps(fit))
+        self._history.judge(pose, scan.odom, self._monitor.status)
+        if self._history.contested and differs_by_doors(fit):
             self._monitor.lose(_SAVED_OR_FOUND)
             return
         if self._monitor.status == "lost":
@@ -334,33 +313,7 @@ class Localizer:
             if not self._doubt.to_verify:
                 self._relocalization.cancel()
             elif self._may_verify(now):
-                self._relocalization.begin(scan, fields, self._near, verifies=True)
-
-    def _follow(self, pose: Pose2, odom: Pose2) -> None:
-        """Follow where the robot may have come to, by the pose at the newest scan."""
-        if self._monitor.status == "good":
-            self._near = Near(pose.x, pose.y, _NEAR_M)
-        elif self._last_odom is not None:
-            step = odom.relative_to(self._last_odom)
-            self._come(math.hypot(step.x, step.y))
-        self._last_odom = odom
-
-    def _follow_way(self, odom: Pose2, *, shaken: bool) -> None:
-        """Measure the way on which a good pose was followed without a break."""
-        if shaken or not self._tracked or not self._continuous:
-            self._followed_m = 0.0
-        elif self._monitor.status == "good" and self._last_odom is not None:
-            step = odom.relative_to(self._last_odom)
-            self._followed_m += math.hypot(step.x, step.y)
-
-    @property
-    def _is_kept(self) -> bool:
-        """Whether the way from a good pose to this one says more than a place that explains the scans better."""
-        return self._tracked and (tells_place(self._fit) or (shows_place(self._fit) and self._followed_m > _FOLLOWED_M))
-
-    def _come(self, distance: float) -> None:
-        if self._near is not None:
-            self._near = self._near._replace(radius=self._near.radius + distance)
+                self._relocalization.begin(scan, fields, self._history.near, verifies=True)
 
     def _look_nearby(self, scan: DeskewedScan, now: float) -> None:
         """Look for a lost robot near its last pose, since most slipped or were pushed; then on the whole map."""
@@ -370,7 +323,7 @@ class Localizer:
             self._scale.forget_anchor()
             self._monitor.restart()
             self._doubt.begin(scan.odom)
-            self._tracked = False
+            self._history.tracked = False
         elif self._local_scans > _LOCAL_SCANS and not self._relocalization.active and self._may_search(scan, now):
             self.global_localization()
 
@@ -401,9 +354,9 @@ class Localizer:
         if pose is not None and self._keeps(pose, outcome, now, fits_again=fits_again):
             return
         weighed = pose is not None and any(not apart(pose, other) for other in outcome.beaten)
-        if fits_again and confirms(self._fit) and self._near is not None and not weighed:
+        if fits_again and confirms(self._fit) and self._history.near is not None and not weighed:
             # A door stood open, or people hid the walls, when the search left out the place that the scan confirms now.
-            self._relocalization.begin(scan, fields, self._near, verifies=True)
+            self._relocalization.begin(scan, fields, self._history.near, verifies=True)
             return
         if fits_again:
             self._monitor.lose("the robot was found elsewhere on the map: it was carried, or its pose was wrong")
@@ -416,9 +369,9 @@ class Localizer:
         """Whether the pose is not given up for the place that was found."""
         assert outcome.pose is not None
         same = not apart(pose, outcome.pose)
-        if self._saved and differs_by_doors(self._fit) and outcome.by_one_scan and not same:
+        if self._history.saved and differs_by_doors(self._fit) and outcome.by_one_scan and not same:
             # A door was opened beside a robot that only started again; or somebody has carried it.
-            self._contested = True
+            self._history.contested = True
             self._relocalization.cancel()
             self._monitor.lose(_SAVED_OR_FOUND)
             return True
@@ -426,7 +379,7 @@ class Localizer:
             return False
         if same:
             self._doubt.verify()
-        if same or self._is_kept:
+        if same or self._history.keeps(self._fit):
             # Where a door was opened, a place without that door elsewhere explains every scan better than the
             # robot's own. Wheels that have counted all the way say more than that.
             self._relocalization.cancel()
@@ -437,9 +390,7 @@ class Localizer:
     def _start_at_found(self, pose: Pose2, odom: Pose2, scan: DeskewedScan, fields: MapFields, now: float) -> None:
         self._doubt.restart()
         self._local_scans = 1
-        self._tracked = False
-        self._followed_m = 0.0
-        self._near = None
+        self._history.restart_at_found()
         self._scale.forget_anchor()
         self._filter.start(pose, odom, *_FOUND_SIGMAS)
         self._filter.add(scan, fields)
@@ -451,7 +402,7 @@ class Localizer:
         Whoever turned it by hand did no more than one who pushed it. Far places that look alike are less likely: with
         those the robot drives on, slowly.
         """
-        pose = None if self._is_kept else self._filter.pose(odom)
+        pose = None if self._history.keeps(self._fit) else self._filter.pose(odom)
         return pose is not None and any(
             place.near and abs(wrap(place.pose.theta - pose.theta)) > _TURNED_RAD
             for place in self._relocalization.places

@@ -27,7 +27,7 @@ import zenoh
 from fog_contracts import channels as ch
 from fog_contracts.codec import decode, encode
 from fog_contracts.messages import MapDelta, NodeReading, RobotPose
-from fog_runtime.credentials import NOBODY, Credentials
+from fog_runtime.credentials import Credentials
 from fog_runtime.transports.mqtt_connection import Broker
 from fog_runtime.transports.zenoh_edge import session_config
 from fognav.output import FailedError
@@ -99,7 +99,7 @@ class _Fog:
         return answer.body
 
 
-async def measure(  # noqa: PLR0913  # what is measured
+async def measure(  # what is measured
     folder: Path,
     *,
     nodes: int,
@@ -107,14 +107,10 @@ async def measure(  # noqa: PLR0913  # what is measured
     robots: int,
     seconds: float,
     on_phase: Callable[[str], object],
-    locked: bool = True,
 ) -> dict[str, Any]:
-    """Return the figures; times in ms, None when no hazard reached the map. `folder` is empty.
-
-    `locked`: broker, Redis and router encrypt, and ask everybody for a password.
-    """
+    """Return the figures; times in ms, None when no hazard reached the map. `folder` is empty."""
     write_nodes(folder, nodes)
-    doors = Doors(site=SITE, unrestricted=(_BENCH,)) if locked else None
+    doors = Doors(site=SITE, unrestricted=(_BENCH,))
     config = StackConfig(site_dir=folder, robot="none", extra={"HAZARDS_WAIT_S": "0"}, doors=doors)
     async with Stack(config) as stack:
         on_phase("starting broker, Redis, router, aggregator and map-service")
@@ -123,7 +119,7 @@ async def measure(  # noqa: PLR0913  # what is measured
             stack.supervisor.start(name)
         await stack.supervisor.wait_ready([*SERVERS, AGGREGATOR, MAP_SERVICE], _READY_S)
         fog, traces = _Fog(stack), _Traces()
-        own = stack.doors.credentials(_BENCH) if locked else NOBODY
+        own = stack.doors.credentials(_BENCH)
         with zenoh.open(session_config("client", connect=[stack.zenoh_endpoint], credentials=own)) as session:
             session.declare_subscriber(ch.MAP_DELTA.key(site=SITE), traces.on_delta)
             async with _load(stack, nodes, rate, robots, seconds) as load:
@@ -180,9 +176,8 @@ def _free_corners(floor: StaticMap) -> list[tuple[float, float]]:
 @asynccontextmanager
 async def _load(stack: Stack, nodes: int, rate: float, robots: int, seconds: float) -> AsyncIterator[Process]:
     """Run the load generator, which measures once it is told to."""
-    options = [SITE, stack.mqtt_url, stack.zenoh_endpoint, str(nodes), str(rate), str(robots), str(seconds)]
-    if (credentials := stack.doors.file(_BENCH)) is not None:
-        options.append(str(credentials))
+    asked = [nodes, rate, robots, seconds, stack.doors.file(_BENCH)]
+    options = [SITE, stack.mqtt_url, stack.zenoh_endpoint, *map(str, asked)]
     pipe = asyncio.subprocess.PIPE
     load = await asyncio.create_subprocess_exec(
         sys.executable, "-m", "fognav_experiments.bench.pipeline", *options, stdin=pipe, stdout=pipe, stderr=pipe
@@ -243,12 +238,16 @@ _BATCH: Final = 20
 
 
 def main() -> None:
-    """Publish as the command line says."""
+    """Publish as the command line says: SITE MQTT_URL ZENOH_ENDPOINT NODES RATE ROBOTS SECONDS CREDENTIALS.
+
+    From the first line of standard input on, so many seconds are measured: nodes see obstacles, in turn. At the end it
+    writes what it has sent as one JSON object. CREDENTIALS is the file of a user who may publish all of it.
+    """
     site, url, endpoint = sys.argv[1:4]
     nodes, robots, rate, seconds = int(sys.argv[4]), int(sys.argv[6]), float(sys.argv[5]), float(sys.argv[7])
     stop, begun = threading.Event(), threading.Event()
     threading.Thread(target=_await_line, args=(begun,), daemon=True).start()
-    own = Credentials.read(Path(sys.argv[8]) if len(sys.argv) > 8 else None)
+    own = Credentials.read(Path(sys.argv[8]))
     with (
         _connected(url, own) as broker,
         zenoh.open(session_config("client", connect=[endpoint], credentials=own)) as session,
@@ -277,12 +276,10 @@ def _connected(url: str, credentials: Credentials) -> socket.socket:
     server = Broker.of(url, credentials)
     broker = socket.create_connection((server.host, server.port), timeout=30.0)
     broker.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
-    if server.tls:
-        broker = credentials.tls_context().wrap_socket(broker, server_hostname=server.host)
-    login = [text.encode() for text in (server.user, server.password) if text is not None]
-    flags = (0x02 | 0xC0 * bool(login)).to_bytes()  # a clean session; user and password follow
-    words = b"".join(len(text).to_bytes(2, "big") + text for text in (b"fognav-bench", *login))
-    variable = b"\x00\x04MQTT\x04" + flags + b"\x00\x00" + words
+    broker = credentials.tls_context().wrap_socket(broker, server_hostname=server.host)
+    login = [text.encode() for text in ("fognav-bench", server.user, server.password) if text is not None]
+    words = b"".join(len(text).to_bytes(2, "big") + text for text in login)
+    variable = b"\x00\x04MQTT\x04\xc2\x00\x00" + words  # a clean session; user and password follow
     broker.sendall(b"\x10" + _length(len(variable)) + variable)
     if (answer := broker.recv(4)) != b"\x20\x02\x00\x00":
         raise SystemExit(f"the broker at {url} refuses the connection: {answer.hex()}")

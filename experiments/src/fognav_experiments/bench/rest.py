@@ -293,7 +293,10 @@ class _Connection:
 
 
 def main() -> None:
-    """Listen as the command line says, until standard input ends."""
+    """Listen as the command line says, until standard input ends: SITE ENDPOINT CREDENTIALS_FILE.
+
+    Each line on standard input ends a measurement, whose gaps (s) are written as one JSON list.
+    """
     site, endpoint, own = sys.argv[1:]
     config = session_config("client", connect=[endpoint], credentials=Credentials.read(Path(own)))
     times: list[float] = []

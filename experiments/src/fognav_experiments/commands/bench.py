@@ -268,7 +268,6 @@ def pipeline_command(
     rate: Annotated[float, typer.Option("--rate", metavar="HZ", min=1.0, max=50.0, help="Readings per second.")] = 20.0,
     robots: Annotated[int, typer.Option("--robots", metavar="N", min=0, max=200, help="Robots with poses.")] = 50,
     seconds: Annotated[float, typer.Option("--seconds", metavar="S", min=4.0, help="How long they publish.")] = 30.0,
-    open_: Annotated[bool, typer.Option("--open", help="Without encryption and passwords.")] = False,
     json: JsonOption = False,
 ) -> None:
     """Measure the way from readings to the map.
@@ -282,12 +281,9 @@ def pipeline_command(
     kernels.warm_cache(print_line)
     with exit_codes(), TemporaryDirectory(prefix="fognav-") as folder:
         figures = asyncio.run(
-            pipeline.measure(
-                Path(folder), nodes=nodes, rate=rate, robots=robots, seconds=seconds, locked=not open_,
-                on_phase=print_line,
-            )
-        )  # fmt: skip
-    asked = {"nodes": nodes, "rate": rate, "robots": robots, "seconds": seconds, "locked": not open_}
+            pipeline.measure(Path(folder), nodes=nodes, rate=rate, robots=robots, seconds=seconds, on_phase=print_line)
+        )
+    asked = {"nodes": nodes, "rate": rate, "robots": robots, "seconds": seconds}
     _show("pipeline", asked, figures, json=json)
 
 

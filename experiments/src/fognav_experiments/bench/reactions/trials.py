@@ -237,6 +237,7 @@ async def try_fault(rig: Rig, fault: Fault) -> float | None:
 
 
 async def _work(seed: int) -> None:
+    """Try the faults that lines of standard input name; one line out, of JSON, has the time, or why there is none."""
     faults = {fault.name: fault for fault in FAULTS}
     names = asyncio.Queue[str]()
     asyncio.get_running_loop().add_reader(sys.stdin, lambda: names.put_nowait(sys.stdin.readline().strip()))

@@ -62,17 +62,12 @@ def test_missing_compiler_is_the_reason() -> None:
 class Installer:
     """Stands for the system's packages: links the real compiler into the PATH, or fails."""
 
-    name = "installer"
-
     def __init__(self, folder: Path, *, fails: bool) -> None:
         self.folder, self.fails, self.asked_for = folder, fails, [""]
         self.compiler = shutil.which("g++")
 
     def available(self) -> bool:
         return True
-
-    def command(self, tools: Sequence[system.Tool]) -> str:
-        return " ".join(["install", *(tool.package for tool in tools)])
 
     def install(self, tools: Sequence[system.Tool]) -> None:
         self.asked_for = [tool.package for tool in tools]
@@ -98,7 +93,7 @@ def test_missing_compiler_is_installed_if_the_user_agrees_and_else_nodes_run_a_m
     installer, lines = Installer(tmp_path, fails=fails), list[str]()
     request.getfixturevalue("no_compiler")
     monkeypatch.delenv("CI", raising=False)
-    monkeypatch.setattr(system, "PROVIDERS", [installer])
+    monkeypatch.setattr(system, "APT", installer)
     monkeypatch.setattr("fognav_sim.nodes.build_library", lambda _: nodes.find_compiler())
     monkeypatch.setattr(system, "find", lambda tool: shutil.which(tool.executables[0]))
     system.prepare_node_code(lines.append, yes=agreed)

@@ -6,15 +6,13 @@ import pytest
 from fog_supervisor import servers
 from fognav import system
 from fognav.demo.options import embedded_servers
-from fognav.system import AptProvider, MissingToolsError, Tool, ensure
+from fognav.system import Apt, MissingToolsError, Tool, ensure
 
 GHOST = Tool("ghost", ("fognav-ghost",), "ghost-package", "nothing")
 
 
-class FakeProvider:
-    """A provider that writes the program into a folder of the PATH."""
-
-    name = "fake"
+class FakeApt:
+    """What writes the program into a folder of the PATH."""
 
     def __init__(self, folder: Path, *, works: bool = True) -> None:
         self.folder = folder
@@ -23,9 +21,6 @@ class FakeProvider:
 
     def available(self) -> bool:
         return self.works
-
-    def command(self, tools: Sequence[Tool]) -> str:
-        return "fake install " + " ".join(tool.package for tool in tools)
 
     def install(self, tools: Sequence[Tool]) -> None:
         for tool in tools:
@@ -36,10 +31,10 @@ class FakeProvider:
 
 
 @pytest.fixture
-def provider(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> FakeProvider:
+def apt(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> FakeApt:
     monkeypatch.setenv("PATH", str(tmp_path), prepend=":")
     monkeypatch.delenv("CI", raising=False)
-    return FakeProvider(tmp_path)
+    return FakeApt(tmp_path)
 
 
 def never_ask(question: str) -> bool:
@@ -50,39 +45,30 @@ def ignore(_: str) -> None:
     pass
 
 
-def test_installed_program_is_found_without_asking(provider: FakeProvider) -> None:
-    provider.install([GHOST])
-    found = ensure([GHOST], yes=False, print_line=ignore, ask=never_ask, providers=[])
-    assert found == {"ghost": provider.folder / "fognav-ghost"}
+def test_installed_program_is_found_without_asking(apt: FakeApt) -> None:
+    apt.install([GHOST])
+    found = ensure([GHOST], yes=False, print_line=ignore, ask=never_ask, apt=FakeApt(Path(), works=False))
+    assert found == {"ghost": apt.folder / "fognav-ghost"}
 
 
-def test_without_consent_nothing_is_installed_and_the_error_names_the_command(provider: FakeProvider) -> None:
-    with pytest.raises(MissingToolsError, match=r"missing: ghost.*fake install ghost-package.*--yes"):
-        ensure([GHOST], yes=False, print_line=ignore, ask=lambda _: False, providers=[provider])
-    assert provider.installed == []
+def test_without_consent_nothing_is_installed_and_the_error_names_the_command(apt: FakeApt) -> None:
+    with pytest.raises(MissingToolsError, match=r"missing: ghost.*apt-get install .*ghost-package.*--yes"):
+        ensure([GHOST], yes=False, print_line=ignore, ask=lambda _: False, apt=apt)
+    assert apt.installed == []
 
 
-def test_yes_and_ci_are_consent(provider: FakeProvider, monkeypatch: pytest.MonkeyPatch) -> None:
-    assert (
-        ensure([GHOST], yes=True, print_line=ignore, ask=never_ask, providers=[provider])["ghost"].name
-        == "fognav-ghost"
-    )
-    (provider.folder / "fognav-ghost").unlink()
+def test_yes_and_ci_are_consent(apt: FakeApt, monkeypatch: pytest.MonkeyPatch) -> None:
+    assert ensure([GHOST], yes=True, print_line=ignore, ask=never_ask, apt=apt)["ghost"].name == "fognav-ghost"
+    (apt.folder / "fognav-ghost").unlink()
     monkeypatch.setenv("CI", "true")
-    ensure([GHOST], yes=False, print_line=ignore, ask=never_ask, providers=[provider])
-    assert provider.installed == ["ghost", "ghost"]
+    ensure([GHOST], yes=False, print_line=ignore, ask=never_ask, apt=apt)
+    assert apt.installed == ["ghost", "ghost"]
 
 
-def test_first_available_provider_is_used(provider: FakeProvider, tmp_path: Path) -> None:
-    broken = FakeProvider(tmp_path, works=False)
-    ensure([GHOST], yes=True, print_line=ignore, ask=never_ask, providers=[broken, provider])
-    assert (broken.installed, provider.installed) == ([], ["ghost"])
-
-
-def test_without_a_provider_the_error_names_the_command(provider: FakeProvider) -> None:
+def test_without_apt_the_error_names_the_command(apt: FakeApt) -> None:
     with pytest.raises(MissingToolsError, match=r"sudo apt-get install .*ghost-package"):
-        ensure([GHOST], yes=True, print_line=ignore, ask=never_ask, providers=[])
-    assert provider.installed == []
+        ensure([GHOST], yes=True, print_line=ignore, ask=never_ask, apt=FakeApt(Path(), works=False))
+    assert apt.installed == []
 
 
 def test_apt_updates_its_lists_first_and_reports_its_error(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -96,7 +82,7 @@ def test_apt_updates_its_lists_first_and_reports_its_error(monkeypatch: pytest.M
     monkeypatch.setattr(system.shutil, "which", lambda name: f"/usr/bin/{name}")
     monkeypatch.setattr(system.os, "geteuid", lambda: 0)
     with pytest.raises(MissingToolsError, match="Unable to locate package ghost-package"):
-        AptProvider(run).install([GHOST])
+        Apt(run).install([GHOST])
     assert [call[1] for call in calls] == ["update", "install"]
     assert calls[1][-1] == "ghost-package"
 
@@ -104,13 +90,13 @@ def test_apt_updates_its_lists_first_and_reports_its_error(monkeypatch: pytest.M
 def test_apt_without_root_needs_sudo_without_a_password(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(system.shutil, "which", lambda name: f"/usr/bin/{name}")
     monkeypatch.setattr(system.os, "geteuid", lambda: 1000)
-    assert not AptProvider(lambda *_: (1, "a password is required")).available()
-    assert AptProvider(lambda *_: (0, "")).available()
+    assert not Apt(lambda *_: (1, "a password is required")).available()
+    assert Apt(lambda *_: (0, "")).available()
 
 
 def no_server(monkeypatch: pytest.MonkeyPatch, *present: str) -> None:
     monkeypatch.setattr(system, "find", lambda tool: Path("/usr/sbin") / tool.name if tool.name in present else None)
-    monkeypatch.setattr(system, "PROVIDERS", [])
+    monkeypatch.setattr(system, "APT", FakeApt(Path(), works=False))
 
 
 def test_missing_servers_are_replaced_by_packages_whose_limits_are_told(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -1,12 +1,13 @@
 """Output of the command: answers on standard output, one JSON object for scripts; progress and errors beside it."""
 
+import datetime as dt
 import json
 import os
 import sys
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Final, NoReturn
+from typing import Final, NoReturn, TypeVar
 
 import typer
 from rich.console import Console
@@ -17,6 +18,8 @@ from fog_runtime.token_file import TokensError
 from fog_supervisor.servers import ServerError
 from fog_supervisor.supervisor import NotReadyError
 from fognav import __version__
+
+T = TypeVar("T")
 
 SCHEMA: Final = 1
 """Version of the JSON objects; incremented when a key changes its meaning or is removed."""
@@ -81,13 +84,41 @@ def print_json(values: Mapping[str, object]) -> None:
     sys.stdout.flush()
 
 
+def local_time(stamp: float) -> str:
+    """Return a Unix time (s) as people of this computer write it."""
+    return dt.datetime.fromtimestamp(stamp, dt.UTC).astimezone().isoformat(" ", "seconds")
+
+
+def print_result(
+    values: Mapping[str, object], *lines: str, json: bool, write: Callable[[str], None] = print_answer
+) -> None:
+    """Tell what a command has done: by the JSON object of this command, or to people by lines."""
+    if json:
+        print_json(values)
+        return
+    for line in lines:
+        write(line)
+
+
+def print_list(name: str, found: Sequence[T], line: Callable[[T], str], *, json: bool) -> None:
+    """Write what was asked for to standard output: a list in the JSON object, or a line for each, for people."""
+    print_result({name: found}, *(map(line, found) if found else [f"no {name}"]), json=json)
+
+
+@contextmanager
+def writing(path: Path, remedy: str = "Name another file") -> Iterator[None]:
+    """Turn an error of writing a file into `WrongUseError` with the remedy."""
+    try:
+        yield
+    except OSError as error:
+        raise WrongUseError(f"{path} can't be written: {error.strerror}. {remedy}") from error
+
+
 def write_report(path: Path, values: Mapping[str, object]) -> None:
     """Write the JSON object to a file; raises `WrongUseError` if the file can't be written."""
-    try:
+    with writing(path):
         path.parent.mkdir(parents=True, exist_ok=True)
         path.write_text(to_json(values) + "\n", encoding="utf-8")
-    except OSError as error:
-        raise WrongUseError(f"the report can't be written to {path}: {error.strerror}. Name another file") from error
 
 
 def check_writable(path: Path | None) -> None:

@@ -7,7 +7,7 @@ import sys
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Final, Protocol
+from typing import Final
 
 from fog_supervisor.servers import find_program
 from fognav.output import FailedError
@@ -54,21 +54,6 @@ class NoAttemptError(MissingToolsError):
     """Nobody tried to install the missing programs: there is no consent, or no way to install them."""
 
 
-class Provider(Protocol):
-    """A way to install missing programs; tried in the order of `PROVIDERS`."""
-
-    name: str
-
-    def available(self) -> bool:
-        """Whether it works on this system, for this user."""
-
-    def command(self, tools: Sequence[Tool]) -> str:
-        """Return the command that installs them, for the user."""
-
-    def install(self, tools: Sequence[Tool]) -> None:
-        """Install them; raises `MissingToolsError` with the reason."""
-
-
 def _run(arguments: Sequence[str], environment: Mapping[str, str]) -> tuple[int, str]:
     done = subprocess.run(
         arguments,
@@ -83,10 +68,8 @@ def _run(arguments: Sequence[str], environment: Mapping[str, str]) -> tuple[int,
     return done.returncode, done.stdout
 
 
-class AptProvider:
+class Apt:
     """The distribution's packages by apt-get, as root or by sudo without a password."""
-
-    name = "apt-get"
 
     def __init__(self, run: Callable[[Sequence[str], Mapping[str, str]], tuple[int, str]] = _run) -> None:
         self._run = run
@@ -104,12 +87,8 @@ class AptProvider:
         """Whether apt-get is installed and this user may use it."""
         return self._prefix() is not None
 
-    def command(self, tools: Sequence[Tool]) -> str:
-        """Return the command line."""
-        return "apt-get install --no-install-recommends " + " ".join(tool.package for tool in tools)
-
     def install(self, tools: Sequence[Tool]) -> None:
-        """Update the package lists, then install the packages."""
+        """Update the package lists, then install the packages; raises `MissingToolsError` with the reason."""
         prefix = self._prefix()
         if prefix is None:
             raise MissingToolsError("apt-get can't be used here: it needs root, or sudo without a password")
@@ -122,10 +101,10 @@ class AptProvider:
             )
         if code != 0:
             last = "\n".join(output.strip().splitlines()[-8:])
-            raise MissingToolsError(f"{self.command(tools)} failed with code {code}:\n{last}")
+            raise MissingToolsError(f"{install_command(tools)} failed with code {code}:\n{last}")
 
 
-PROVIDERS: Final[list[Provider]] = [AptProvider()]
+APT: Final = Apt()
 
 
 def find_uv(root: Path | None) -> Path | None:
@@ -142,7 +121,7 @@ def find(tool: Tool) -> Path | None:
 
 def install_command(tools: Sequence[Tool]) -> str:
     """Return the command that installs the programs."""
-    return AptProvider().command(tools)
+    return "apt-get install --no-install-recommends " + " ".join(tool.package for tool in tools)
 
 
 def has_consent(yes: bool) -> bool:  # noqa: FBT001  # its only argument
@@ -164,25 +143,23 @@ def ensure(
     yes: bool,
     print_line: Callable[[str], None],
     ask: Callable[[str], bool] = _ask_user,
-    providers: Sequence[Provider] | None = None,
+    apt: Apt | None = None,
 ) -> dict[str, Path]:
-    """Return the path of each program, after installing the missing ones with the first available provider.
+    """Return the path of each program, after installing the missing ones by apt-get.
 
-    Raises `NoAttemptError` with the missing programs and the command to install them, without consent or provider, and
-    `MissingToolsError` if their installation fails.
+    Raises `NoAttemptError` with the missing programs and the command to install them, without consent or where it can't
+    be used, and `MissingToolsError` if their installation fails.
     """
     missing = [tool for tool in tools if find(tool) is None]
     if missing:
-        names = " and ".join(tool.name for tool in missing)
-        provider = next((p for p in (PROVIDERS if providers is None else providers) if p.available()), None)
-        if provider is None:
-            raise NoAttemptError(f"missing: {names}. Install with: sudo {install_command(missing)}")
-        if not (has_consent(yes) or ask(f"Missing: {names}. Run '{provider.command(missing)}' now?")):
-            raise NoAttemptError(
-                f"missing: {names}. Install with: {provider.command(missing)}  (or run again with --yes)"
-            )
-        print_line(f"installing {names} ({provider.name})")
-        provider.install(missing)
+        names, command = " and ".join(tool.name for tool in missing), install_command(missing)
+        apt = apt or APT
+        if not apt.available():
+            raise NoAttemptError(f"missing: {names}. Install with: sudo {command}")
+        if not (has_consent(yes) or ask(f"Missing: {names}. Run '{command}' now?")):
+            raise NoAttemptError(f"missing: {names}. Install with: {command}  (or run again with --yes)")
+        print_line(f"installing {names} (apt-get)")
+        apt.install(missing)
     paths = {tool.name: find(tool) for tool in tools}
     if still := [name for name, path in paths.items() if path is None]:
         raise MissingToolsError(f"{' and '.join(still)} can't be found although the installation succeeded")

@@ -19,7 +19,7 @@ from fognav import checkout
 from fognav.locking import LocksOption, locks_errors, locks_folder, named_folder, open_locks, own_hosts
 from fognav.operate.fog import find_fog
 from fognav.operate.options import JsonOption
-from fognav.output import NOT_TRUE, FailedError, WrongUseError, exit_codes, print_answer, print_json
+from fognav.output import NOT_TRUE, FailedError, WrongUseError, exit_codes, print_answer, print_json, print_result
 
 token_app = typer.Typer(help="Create, list and revoke tokens of the REST APIs.", no_args_is_help=True)
 
@@ -62,14 +62,10 @@ def token_create(
         if out is not None:
             text = to_toml(name, authority=authority, passwords={}, token=token)
             atomic_write(out, text.encode())
-            if json:
-                print_json({"name": name, "role": role, "credentials": str(out)})
-            else:
-                print_answer(f"wrote {out}: give it to {name}, who names it in FOGNAV_CREDENTIALS_FILE")
-        elif json:
-            print_json({"name": name, "role": role, "token": token})
+            line = f"wrote {out}: give it to {name}, who names it in FOGNAV_CREDENTIALS_FILE"
+            print_result({"name": name, "role": role, "credentials": str(out)}, line, json=json)
         else:
-            typer.echo(token)
+            print_result({"name": name, "role": role, "token": token}, token, json=json)
 
 
 @token_app.command("list", epilog="Example: fognav token list --json")
@@ -77,12 +73,9 @@ def token_list(*, file: FileOption = None, json: JsonOption = False) -> None:
     """List who has a token, in which role."""
     with exit_codes():
         entries = read_tokens(_tokens_file(file))
-        if json:
-            tokens = [{"name": entry.name, "role": entry.role, "created": entry.created} for entry in entries]
-            print_json({"tokens": tokens})
-            return
-        for entry in entries:
-            print_answer(f"{entry.name}: {entry.role}" + (f", since {entry.created}" if entry.created else ""))
+        tokens = [{"name": entry.name, "role": entry.role, "created": entry.created} for entry in entries]
+        lines = [f"{each.name}: {each.role}" + (f", since {each.created}" if each.created else "") for each in entries]
+        print_result({"tokens": tokens}, *lines, json=json)
 
 
 @token_app.command("revoke", epilog="Example: fognav token revoke anna")
@@ -90,10 +83,7 @@ def token_revoke(name: NameArgument, *, file: FileOption = None, json: JsonOptio
     """Revoke a token: the services refuse it from their next request on."""
     with exit_codes():
         revoke_token(_tokens_file(file), name)
-        if json:
-            print_json({"name": name, "revoked": True})
-        else:
-            print_answer(f"the token of {name} is revoked")
+        print_result({"name": name, "revoked": True}, f"the token of {name} is revoked", json=json)
 
 
 def _tokens_file(given: Path | None) -> Path:

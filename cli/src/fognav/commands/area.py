@@ -1,7 +1,6 @@
 """`fognav area` and `fognav alert`: watched areas of a running system, and what there needs somebody's attention."""
 
 from collections.abc import Mapping
-from datetime import UTC, datetime
 from typing import Annotated, Any, Literal
 
 import typer
@@ -9,7 +8,7 @@ import typer
 from fognav.operate.fog import find_fog
 from fognav.operate.options import FogOption, JsonOption, duration
 from fognav.operate.systems import AGGREGATOR
-from fognav.output import WrongUseError, exit_codes, print_answer, print_json
+from fognav.output import WrongUseError, exit_codes, local_time, print_list, print_result
 
 area_app = typer.Typer(help="List the watched areas and their history, and override one.", no_args_is_help=True)
 
@@ -18,14 +17,7 @@ area_app = typer.Typer(help="List the watched areas and their history, and overr
 def area_list(*, fog: FogOption = None, json: JsonOption = False) -> None:
     """List the watched areas with their state, and who overrides it."""
     with exit_codes():
-        areas = find_fog(fog).get(AGGREGATOR, "/api/v1/areas")
-        if json:
-            print_json({"areas": areas})
-            return
-        for area in areas:
-            print_answer(_line(area))
-        if not areas:
-            print_answer("no areas")
+        print_list("areas", find_fog(fog).get(AGGREGATOR, "/api/v1/areas"), _line, json=json)
 
 
 @area_app.command("override", epilog="Example: fognav area override z1 --state blocked --for 2h --reason 'wet floor'")
@@ -61,10 +53,7 @@ def area_override(  # noqa: PLR0913  # each option is an argument
             body = {"state": state, "ttl_s": duration(length, "--for"), "reason": reason}
             override = find_fog(fog).send("PUT", AGGREGATOR, path, body)
             line = f"area {area} is overridden: {_override(override)}"
-        if json:
-            print_json({"area": area, "override": override})
-        else:
-            print_answer(line)
+        print_result({"area": area, "override": override}, line, json=json)
 
 
 @area_app.command("history", epilog="Example: fognav area history z1 --limit 20")
@@ -78,16 +67,8 @@ def area_history(
     """List the latest states of an area, newest first, and how long each lasted, restarts included."""
     with exit_codes():
         periods = find_fog(fog).get(AGGREGATOR, f"/api/v1/areas/{area}/history?limit={limit}")
-        if json:
-            print_json({"area": area, "periods": periods})
-            return
-        for view in periods:
-            period = view["period"]
-            began = datetime.fromtimestamp(period["began"], UTC).astimezone().isoformat(" ", "seconds")
-            lasted = ("for " if view["ended"] is not None else "until now, for ") + _length(view["lasted_s"])
-            print_answer(f"{began}: {period['state']} {lasted}, {period['cause']}")
-        if not periods:
-            print_answer(f"area {area} has no history yet")
+        lines = map(_period, periods) if periods else [f"area {area} has no history yet"]
+        print_result({"area": area, "periods": periods}, *lines, json=json)
 
 
 def _line(area: Mapping[str, Any]) -> str:
@@ -95,6 +76,12 @@ def _line(area: Mapping[str, Any]) -> str:
     label = f" ({definition['label']})" if definition["label"] else ""
     state = f"{hazard['state']}, {hazard['cause']}" if hazard else "nothing announced yet"
     return f"{definition['id']}{label}: {state}" + (f" [{_override(override)}]" if override else "")
+
+
+def _period(view: Mapping[str, Any]) -> str:
+    period = view["period"]
+    lasted = ("for " if view["ended"] is not None else "until now, for ") + _length(view["lasted_s"])
+    return f"{local_time(period['began'])}: {period['state']} {lasted}, {period['cause']}"
 
 
 def _override(override: Mapping[str, Any]) -> str:
@@ -120,16 +107,7 @@ alert_app = typer.Typer(help="List and acknowledge alerts of areas and nodes.", 
 def alert_list(*, fog: FogOption = None, json: JsonOption = False) -> None:
     """List areas that are unknown or blocked for long, and nodes that are unknown for long."""
     with exit_codes():
-        alerts = find_fog(fog).get(AGGREGATOR, "/api/v1/alerts")
-        if json:
-            print_json({"alerts": alerts})
-            return
-        for alert in alerts:
-            since = datetime.fromtimestamp(alert["since"], UTC).astimezone().isoformat(" ", "seconds")
-            seen = f" [{alert['acknowledged_by']} looks after it]" if alert["acknowledged_by"] else ""
-            print_answer(f"{alert['id']}: since {since}, {alert['reason']}{seen}")
-        if not alerts:
-            print_answer("no alerts")
+        print_list("alerts", find_fog(fog).get(AGGREGATOR, "/api/v1/alerts"), _alert, json=json)
 
 
 @alert_app.command("acknowledge", epilog="Example: fognav alert acknowledge area-unknown.z1")
@@ -142,7 +120,9 @@ def alert_acknowledge(
     """Tell others that you look after an alert. It stays until its cause ends."""
     with exit_codes():
         seen = find_fog(fog).send("PUT", AGGREGATOR, f"/api/v1/alerts/{alert}/acknowledgement")
-        if json:
-            print_json({"alert": seen})
-        else:
-            print_answer(f"{alert} is acknowledged by {seen['acknowledged_by']}")
+        print_result({"alert": seen}, f"{alert} is acknowledged by {seen['acknowledged_by']}", json=json)
+
+
+def _alert(alert: Mapping[str, Any]) -> str:
+    seen = f" [{alert['acknowledged_by']} looks after it]" if alert["acknowledged_by"] else ""
+    return f"{alert['id']}: since {local_time(alert['since'])}, {alert['reason']}{seen}"

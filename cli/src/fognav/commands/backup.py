@@ -22,7 +22,7 @@ from fognav.output import (
     check_writable,
     exit_codes,
     print_answer,
-    print_json,
+    print_result,
 )
 
 FileArgument = Annotated[Path, typer.Argument(metavar="FILE", help="The backup, a tar.gz that only you can read.")]
@@ -116,11 +116,7 @@ def store_status(*, fog: FogOption = None, json: JsonOption = False) -> None:
     """
     with exit_codes():
         found = _statuses(find_fog(fog), None)
-        if json:
-            print_json({"services": found})
-        else:
-            for service, status in found.items():
-                print_answer(_line(service, status))
+        print_result({"services": found}, *(_line(*each) for each in found.items()), json=json)
     if any(status["lost"] is not False for status in found.values()):
         raise typer.Exit(NOT_TRUE)
 

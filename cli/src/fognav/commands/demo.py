@@ -11,7 +11,7 @@ from fog_runtime.configuration import parts
 from fog_runtime.configuration.site import load_site
 from fognav import checkout, kernels, recording, system
 from fognav.operate.options import JsonOption, YesOption
-from fognav.output import NOT_TRUE, OK, check_writable, exit_codes, print_json, print_line, write_report
+from fognav.output import NOT_TRUE, OK, check_writable, exit_codes, print_json, print_line, print_result, write_report
 from fognav_sim import emulators
 
 
@@ -120,10 +120,8 @@ def record_command(
     with exit_codes():
         check_writable(file)
         recorded = asyncio.run(recording.record(file, mqtt_url=mqtt, zenoh_endpoint=zenoh, site=site, seconds=seconds))
-    if json:
-        print_json(recorded)
-    else:
-        print_line(f"wrote {file}: {recorded['seconds']} s, {recorded['messages']}")
+    line = f"wrote {file}: {recorded['seconds']} s, {recorded['messages']}"
+    print_result(recorded, line, json=json, write=print_line)
 
 
 def replay_command(
@@ -142,10 +140,5 @@ def replay_command(
     logs.configure("replay", "error", "text")  # the command itself reports errors
     with exit_codes():
         sent = asyncio.run(recording.play(file, mqtt_url=mqtt, zenoh_endpoint=zenoh, site=site, speed=speed))
-    if json:
-        print_json(sent)
-    else:
-        lost = (
-            f"; the file is cut off: {sent['bytes_lost']} bytes at its end are incomplete" if sent["bytes_lost"] else ""
-        )
-        print_line(f"published {sent['sent']} messages of {file}{lost}")
+    lost = f"; the file is cut off: {sent['bytes_lost']} bytes at its end are incomplete" if sent["bytes_lost"] else ""
+    print_result(sent, f"published {sent['sent']} messages of {file}{lost}", json=json, write=print_line)

@@ -13,7 +13,7 @@ from fog_runtime.configuration.maps import save_map
 from fognav.operate.fog import find_fog
 from fognav.operate.options import FogOption, JsonOption, LogFormat, RangeMax, Scans
 from fognav.operate.systems import MAP_SERVICE
-from fognav.output import WrongUseError, exit_codes, print_answer, print_json
+from fognav.output import exit_codes, print_result, writing
 
 map_app = typer.Typer(help="Make maps of buildings; show the hazards on the fog's map.", no_args_is_help=True)
 
@@ -26,13 +26,8 @@ def map_hazards(*, fog: FogOption = None, json: JsonOption = False) -> None:
     """
     with exit_codes():
         hazards = find_fog(fog).get(MAP_SERVICE, "/api/v1/hazards")
-        if json:
-            print_json({"hazards": hazards})
-            return
-        for view in sorted(hazards, key=lambda view: str(view["hazard"]["area"])):
-            print_answer(_line(view))
-        if not hazards:
-            print_answer("no watched areas")
+        lines = map(_line, sorted(hazards, key=lambda view: str(view["hazard"]["area"])))
+        print_result({"hazards": hazards}, *(lines if hazards else ["no watched areas"]), json=json)
 
 
 def _line(view: Mapping[str, Any]) -> str:
@@ -66,15 +61,11 @@ def map_from_log(  # noqa: PLR0913  # each option is an argument
 
     with exit_codes():
         map_ = build_map(read_log(log_file, log_format).select(scans), resolution, range_max)
-        try:
+        with writing(Path(f"{out}.yaml"), "Name another --out"):
             save_map(out, map_)
-        except OSError as error:
-            raise WrongUseError(f"{out}.yaml can't be written: {error.strerror}. Name another --out") from error
         found = describe(map_)
-    if json:
-        print_json({"file": f"{out}.yaml", **found})
-    else:
-        print_answer(f"wrote {out}.yaml: {found['width']} x {found['height']} cells, {found['occupied']} occupied")
+    line = f"wrote {out}.yaml: {found['width']} x {found['height']} cells, {found['occupied']} occupied"
+    print_result({"file": f"{out}.yaml", **found}, line, json=json)
 
 
 def describe(map_: StaticMap) -> dict[str, object]:

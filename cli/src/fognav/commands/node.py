@@ -12,7 +12,7 @@ import msgspec
 import typer
 
 from fog_contracts import channels as ch
-from fog_contracts.messages import Id, NodeCalibration, NodeReading, NodeUpdate
+from fog_contracts.messages import NodeCalibration, NodeReading, NodeUpdate
 from fog_contracts.site import NodeSite, Sonar, learned_share
 from fog_runtime.configuration.site import LoadedSite, load_site
 from fog_runtime.credentials import Credentials
@@ -21,9 +21,18 @@ from fognav.locking import own_credentials
 from fognav.nodes import on_broker
 from fognav.nodes.board_settings import SITE, BoardOptions, SiteOption, credentials_in, node_in, with_board_options
 from fognav.operate.fog import Fog, find_fog
-from fognav.operate.options import NUMBERS, FogOption, JsonOption
+from fognav.operate.options import NUMBERS, FogOption, JsonOption, checked_id, numbers
 from fognav.operate.systems import AGGREGATOR, BROKER
-from fognav.output import FailedError, WrongUseError, exit_codes, print_answer, print_json, print_line
+from fognav.output import (
+    FailedError,
+    WrongUseError,
+    exit_codes,
+    print_answer,
+    print_json,
+    print_line,
+    print_list,
+    print_result,
+)
 
 node_app = typer.Typer(help="Add, watch, calibrate and simulate sensor nodes.", no_args_is_help=True)
 
@@ -36,6 +45,7 @@ BrokerOption = Annotated[
     str | None,
     typer.Option("--broker", metavar="URL", help="mqtt:// or mqtts:// address; default: that of the running demo."),
 ]
+SiteIdOption = Annotated[str | None, typer.Option("--site-id", metavar="ID", help="Default: the running system's.")]
 
 
 @node_app.command(
@@ -102,14 +112,7 @@ def node_replace(name: NameArgument, *, board: BoardOptions) -> None:
 def node_list(*, fog: FogOption = None, json: JsonOption = False) -> None:
     """List the nodes with what they say, and since when."""
     with exit_codes():
-        nodes = find_fog(fog).get(AGGREGATOR, "/api/v1/nodes")
-        if json:
-            print_json({"nodes": nodes})
-            return
-        for node in nodes:
-            print_answer(_line(node))
-        if not nodes:
-            print_answer("no nodes")
+        print_list("nodes", find_fog(fog).get(AGGREGATOR, "/api/v1/nodes"), _line, json=json)
 
 
 @node_app.command("watch", epilog="Example: fognav node watch n1 --count 20")
@@ -118,7 +121,7 @@ def node_watch(
     *,
     count: Annotated[int | None, typer.Option("--count", metavar="N", min=1, help="End after N readings.")] = None,
     broker: BrokerOption = None,
-    site: Annotated[str | None, typer.Option("--site-id", metavar="ID", help="Default: the running system's.")] = None,
+    site: SiteIdOption = None,
     fog: FogOption = None,
     json: JsonOption = False,
 ) -> None:
@@ -127,7 +130,7 @@ def node_watch(
     With --json each is one line on standard output.
     """
     with exit_codes():
-        _run(_watch(_on(fog, broker, site), _checked(name), count, json=json))
+        _run(_watch(_on(fog, broker, site), checked_id(name), count, json=json))
 
 
 @node_app.command("calibrate", epilog="Example: fognav node calibrate n1 --site sites/floor")
@@ -142,7 +145,7 @@ def node_calibrate(  # noqa: PLR0913  # each option is an argument
     ] = None,
     force: Annotated[bool, typer.Option("--force", help="Write them even if the map's walls are elsewhere.")] = False,
     broker: BrokerOption = None,
-    site: Annotated[str | None, typer.Option("--site-id", metavar="ID", help="Default: the running system's.")] = None,
+    site: SiteIdOption = None,
     fog: FogOption = None,
     json: JsonOption = False,
 ) -> None:
@@ -158,7 +161,7 @@ def node_calibrate(  # noqa: PLR0913  # each option is an argument
         url, site_id, own = _on(fog, broker, site if loaded is None else loaded.site.id)
         command = ch.LEARN_NO_ECHO if no_echo else ch.CALIBRATE
         print_line(f"node {name} measures for about {'10' if no_echo else '40'} s: keep the way in front of it free")
-        learned = _run(on_broker.learn(url, site_id, _checked(name), command, own))
+        learned = _run(on_broker.learn(url, site_id, checked_id(name), command, own))
         failed = [
             f"sonar {index + 1} {_RESULTS[result]}" for index, result in enumerate(learned.result) if result != "done"
         ]
@@ -223,7 +226,7 @@ def node_update(  # noqa: PLR0913  # each option is an argument
     ] = None,
     seconds: Annotated[float, typer.Option("--seconds", metavar="S", min=1.0, help="How long to wait.")] = 300.0,
     broker: BrokerOption = None,
-    site: Annotated[str | None, typer.Option("--site-id", metavar="ID", help="Default: the running system's.")] = None,
+    site: SiteIdOption = None,
     fog: FogOption = None,
     json: JsonOption = False,
 ) -> None:
@@ -240,13 +243,12 @@ def node_update(  # noqa: PLR0913  # each option is an argument
                 offer = msgspec.convert(on_broker.signed_offer(data, number, board, key, image_at.url), NodeUpdate)
             except msgspec.ValidationError as error:
                 raise WrongUseError(f"the offer is not valid: {error}") from error
-            reading = _run(on_broker.update(url, site_id, _checked(name), offer, own, seconds=seconds))
+            reading = _run(on_broker.update(url, site_id, checked_id(name), offer, own, seconds=seconds))
         if not image_at.fetched:
             raise FailedError(f"node {name} has restarted without fetching the image: look at its power, and try again")
-        if json:
-            print_json({"node": name, "number": number, "sha256": offer.sha256, "fw": reading.fw, "boot": reading.boot})
-        else:
-            print_line(f"node {name} has started anew, with firmware {reading.fw or 'that does not tell its name'}")
+        values = {"node": name, "number": number, "sha256": offer.sha256, "fw": reading.fw, "boot": reading.boot}
+        line = f"node {name} has started anew, with firmware {reading.fw or 'that does not tell its name'}"
+        print_result(values, line, json=json, write=print_line)
 
 
 @node_app.command(
@@ -286,7 +288,7 @@ def node_sim(  # noqa: PLR0913  # each option is an argument
         node = site_files.node_of(loaded, name)
         if every_reading is not None:
             node = msgspec.structs.replace(node, every_reading=every_reading)
-        persons = [_numbers("--person", text, 2) for text in person or ()]
+        persons = [numbers(text, (2,), "X,Y") for text in person or ()]
         own = own_credentials() if board is None else credentials_in(board, name)
         url, _, _ = _on(fog, broker, loaded.site.id)
         kernels.warm_cache(print_line)
@@ -354,25 +356,8 @@ def _on(fog: str | None, broker: str | None, site: str | None) -> tuple[str, str
     return url, site or found.site, found.credentials
 
 
-def _checked(name: str) -> str:
-    try:
-        return msgspec.convert(name, Id)
-    except msgspec.ValidationError as error:
-        raise WrongUseError(f"{name}: an id has only a to z, 0 to 9 and -, at most 32") from error
-
-
-def _numbers(option: str, text: str, length: int) -> list[float]:
-    try:
-        values = [float(part) for part in text.split(",")]
-    except ValueError:
-        values = []
-    if len(values) != length or not all(map(math.isfinite, values)):
-        raise WrongUseError(f"{option} {text}: give {length} numbers with commas between them")
-    return values
-
-
 def _pose(text: str) -> tuple[float, float, float]:
-    x, y, theta = _numbers("--pose", text, 3)
+    x, y, theta = numbers(text, (3,), "X,Y,THETA")
     if abs(theta) > math.tau:
         raise WrongUseError(
             f"--pose {text}: its direction is in radians, and {theta:g} is more than a turn. {theta:g} degrees are "

@@ -27,6 +27,7 @@ from fognav.output import (
     print_answer,
     print_json,
     print_line,
+    print_result,
 )
 
 robot_app = typer.Typer(help="Send, stop and watch robots; describe a new one.", no_args_is_help=True)
@@ -257,10 +258,8 @@ async def _cancel(fog: Fog, robot: str) -> Outcome:
 
 def _report(outcome: Outcome, *, json: bool) -> None:
     """Print what became of a command and end it: with exit code 1 if it was refused."""
-    if json:
-        print_json(msgspec.to_builtins(outcome))
-    else:
-        print_answer(f"{'accepted' if outcome.accepted else 'refused'}: {outcome.reason} (mode {outcome.mode})")
+    line = f"{'accepted' if outcome.accepted else 'refused'}: {outcome.reason} (mode {outcome.mode})"
+    print_result(msgspec.to_builtins(outcome), line, json=json)
     raise typer.Exit(0 if outcome.accepted else NOT_TRUE)
 
 

@@ -4,19 +4,26 @@ import os
 from pathlib import Path
 from typing import Annotated
 
-import msgspec
 import typer
 
 from fog_contracts.costs import ROBOT_RADIUS
 from fog_contracts.generate.robot_toml import robot_toml, setting_text
-from fog_contracts.messages import Id
 from fog_runtime.configuration.parts import DEFAULT_BASE, DEFAULT_LIDAR
 from fog_runtime.configuration.robot_file import ROBOT_FILE, RobotFile, default_robot, describe_robot, load_robot
 from fog_runtime.configuration.settings import SettingsError
 from fog_runtime.files import SHARED, atomic_write
 from fognav.locking import LocksOption, locks_errors, open_locks
-from fognav.operate.options import JsonOption
-from fognav.output import NOT_TRUE, WrongUseError, exit_codes, fail, print_answer, print_json, print_line
+from fognav.operate.options import JsonOption, checked_id
+from fognav.output import (
+    NOT_TRUE,
+    WrongUseError,
+    exit_codes,
+    fail,
+    print_json,
+    print_line,
+    print_result,
+    writing,
+)
 from robot_agent import registry
 from robot_agent.agent.settings import read_footprint, refuse_body, refuse_contradictions, remarks
 from robot_agent.footprint import Footprint
@@ -37,19 +44,16 @@ def robot_add(
     """
     with exit_codes(), locks_errors():
         opened = open_locks(locks)
-        try:
-            msgspec.convert(robot, Id)
-        except msgspec.ValidationError as error:
-            raise WrongUseError(f"{robot!r}: an id has only a to z, 0 to 9 and -, at most 32") from error
-        file = None if remove else opened.add_robot(robot)
+        file = None if remove else opened.add_robot(checked_id(robot))
         if remove and not opened.remove(robot):
             raise WrongUseError(f"there is no robot {robot}. Known are: {', '.join(sorted(opened.users()))}")
-        if json:
-            print_json({"robot": robot, "credentials": None if file is None else str(file)})
-        elif file is None:
-            print_line(f"the router refuses {robot} once it was restarted")
-        else:
-            print_line(f"wrote {file}: copy it to the robot, for its owner only, and delete it here")
+        line = (
+            f"the router refuses {robot} once it was restarted"
+            if file is None
+            else f"wrote {file}: copy it to the robot, for its owner only, and delete it here"
+        )
+        values = {"robot": robot, "credentials": None if file is None else str(file)}
+        print_result(values, line, json=json, write=print_line)
 
 
 def robot_new(
@@ -66,17 +70,11 @@ def robot_new(
     with exit_codes():
         if out.exists():
             raise WrongUseError(f"{out} already exists: name another file with --out, or remove it")
-        try:
-            text = robot_text(default_robot(base, lidar))
+        text = robot_text(default_robot(base, lidar))
+        with writing(out, "Name another file with --out"):
             atomic_write(out, text.encode(), mode=SHARED)
-        except SettingsError as error:
-            raise WrongUseError(str(error)) from error
-        except OSError as error:
-            raise WrongUseError(f"{out} can't be written: {error.strerror}. Name another file with --out") from error
-        if json:
-            print_json({"file": str(out), "base": base, "lidar": lidar})
-        else:
-            print_line(f"wrote {out}: set the ports in it, then check it with: fognav robot check {out}")
+        line = f"wrote {out}: set the ports in it, then check it with: fognav robot check {out}"
+        print_result({"file": str(out), "base": base, "lidar": lidar}, line, json=json, write=print_line)
 
 
 def robot_check(
@@ -98,14 +96,8 @@ def robot_check(
             print_json({"ok": False, "setting": error.setting, "problem": str(error)})
             raise typer.Exit(NOT_TRUE) from error
         fail(str(error))
-    if json:
-        print_json({"ok": True, "remarks": remarks, **values})
-        return
-
-    for name, value in values.items():
-        print_answer(f"{name} = {setting_text(value)}")
-    for remark in remarks:
-        print_answer(remark)
+    lines = [f"{name} = {setting_text(value)}" for name, value in values.items()]
+    print_result({"ok": True, "remarks": remarks, **values}, *lines, *remarks, json=json)
 
 
 def check_ports(robot: RobotFile) -> list[str]:

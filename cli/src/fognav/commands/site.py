@@ -9,7 +9,7 @@ from fognav import checkout, kernels, site_files
 from fognav.commands import installed
 from fognav.hosting.compose_floors import OVERRIDE
 from fognav.operate.options import JsonOption
-from fognav.output import NOT_TRUE, exit_codes, fail, print_json, print_line
+from fognav.output import NOT_TRUE, exit_codes, fail, print_json, print_line, print_result
 
 site_app = typer.Typer(cls=installed.SiteCommands, help="Create and check sites.", no_args_is_help=True)
 
@@ -85,7 +85,5 @@ def site_compose(
         root = checkout.root()
         sites = [checkout.site_folder(folder) for folder in folders or []]
         made = site_files.compose_floors(sites, root, out or root / OVERRIDE)
-    if json:
-        print_json(made)
-    else:
-        print_line(f"{made['file']} has {len(sites)} further floors: docker compose up -d --remove-orphans")
+    line = f"{made['file']} has {len(sites)} further floors: docker compose up -d --remove-orphans"
+    print_result(made, line, json=json, write=print_line)

@@ -5,12 +5,12 @@ from typing import Annotated, Any
 import msgspec
 import typer
 
-from fog_contracts.messages import AreaDefinition, Id, Limits, Source
+from fog_contracts.messages import AreaDefinition, Limits, Source
 from fognav.locking import LocksOption, locks_errors, open_locks
 from fognav.operate.fog import Fog, find_fog
-from fognav.operate.options import FogOption, JsonOption
+from fognav.operate.options import FogOption, JsonOption, checked_id
 from fognav.operate.systems import AGGREGATOR
-from fognav.output import FailedError, WrongUseError, exit_codes, print_answer, print_json
+from fognav.output import FailedError, WrongUseError, exit_codes, print_list, print_result
 from hazard_aggregator.source_values import PROFILES
 
 source_app = typer.Typer(help="Use sensors that speak MQTT as evidence for an area.", no_args_is_help=True)
@@ -73,10 +73,8 @@ def source_add(  # noqa: PLR0913  # each option is an argument
         old = _area(found, area)
         changed = [*(other for other in old.sources if other.id != name), source]
         _put(found, old, changed)
-        if json:
-            print_json({"area": area, "source": msgspec.to_builtins(source)})
-        else:
-            print_answer(f"source {name} watches area {area}")
+        values = {"area": area, "source": msgspec.to_builtins(source)}
+        print_result(values, f"source {name} watches area {area}", json=json)
 
 
 @source_app.command("remove", epilog="Example: fognav source remove fire-door --area z1")
@@ -96,10 +94,7 @@ def source_remove(
             names = ", ".join(source.id for source in old.sources) or "none"
             raise FailedError(f"area {area} has no source {name} (it has: {names})")
         _put(found, old, kept)
-        if json:
-            print_json({"area": area, "removed": name})
-        else:
-            print_answer(f"source {name} no longer watches area {area}")
+        print_result({"area": area, "removed": name}, f"source {name} no longer watches area {area}", json=json)
 
 
 @source_app.command("list", epilog="Example: fognav source list --json")
@@ -113,14 +108,7 @@ def source_list(*, fog: FogOption = None, json: JsonOption = False) -> None:
             for view in found.get(AGGREGATOR, "/api/v1/areas")
             for source in view["definition"].get("sources", [])
         ]
-        if json:
-            print_json({"sources": rows})
-            return
-        for row in rows:
-            state = f"{row['health']['state']}, {row['health']['reason']}" if row["health"] else "not known yet"
-            print_answer(f"{row['area']}/{row['id']}: {state}")
-        if not rows:
-            print_answer("no sources")
+        print_list("sources", rows, _line, json=json)
 
 
 @source_app.command("user", epilog="Example: fognav source user zigbee2mqtt --topic 'zigbee2mqtt/#' --credentials DIR")
@@ -133,27 +121,28 @@ def source_user(
 ) -> None:
     """Let a sensor, or the gateway of many, use a broker with passwords: these topics and no other."""
     with exit_codes(), locks_errors():
-        try:
-            msgspec.convert(name, Id)
-        except msgspec.ValidationError as error:
-            raise WrongUseError(f"{name!r}: a user has only a to z, 0 to 9 and -, at most 32") from error
-        file = open_locks(locks).add_device(name, topic)
-        if json:
-            print_json({"user": name, "topics": topic, "credentials": str(file)})
-        else:
-            print_answer(f"wrote {file}: its user, password and certificate are what {name} needs; then delete it here")
-            print_answer("the broker knows it once it has read its lists again (SIGHUP)")
+        file = open_locks(locks).add_device(checked_id(name), topic)
+        print_result(
+            {"user": name, "topics": topic, "credentials": str(file)},
+            f"wrote {file}: its user, password and certificate are what {name} needs; then delete it here",
+            "the broker knows it once it has read its lists again (SIGHUP)",
+            json=json,
+        )
 
 
 @source_app.command("profiles", epilog="Example: fognav source profiles")
 def source_profiles(*, json: JsonOption = False) -> None:
     """List the ready-made profiles with their topics."""
-    if json:
-        print_json({"profiles": {name: msgspec.to_builtins(source) for name, source in PROFILES.items()}})
-        return
-    for name, source in PROFILES.items():
-        needs = "" if source.blocked else " (needs --above or --below)"
-        print_answer(f"{name}: {source.topic}{needs}")
+    lines = [
+        f"{name}: {source.topic}" + ("" if source.blocked else " (needs --above or --below)")
+        for name, source in PROFILES.items()
+    ]
+    print_result({"profiles": msgspec.to_builtins(PROFILES)}, *lines, json=json)
+
+
+def _line(row: dict[str, Any]) -> str:
+    state = f"{row['health']['state']}, {row['health']['reason']}" if row["health"] else "not known yet"
+    return f"{row['area']}/{row['id']}: {state}"
 
 
 def _decoded(text: str | None) -> dict[str, Any]:

@@ -1,6 +1,5 @@
 """`fognav zone`: draw, list, show, switch and remove the zones of a running system."""
 
-import datetime as dt
 import secrets
 from collections.abc import Mapping, Sequence
 from typing import Annotated, Any, Final, Literal
@@ -10,7 +9,7 @@ import typer
 from fognav.operate.fog import find_fog
 from fognav.operate.options import FogOption, JsonOption, duration, moment, numbers, points, weekly
 from fognav.operate.systems import MAP_SERVICE
-from fognav.output import WrongUseError, exit_codes, print_answer, print_json
+from fognav.output import WrongUseError, exit_codes, local_time, print_result
 
 zone_app = typer.Typer(help="Draw, list, show, switch and remove zones.", no_args_is_help=True)
 
@@ -78,7 +77,8 @@ def zone_add(  # noqa: PLR0913  # each option is an argument
         optional = {"factor": factor, "speed": speed, "enabled": False if disabled else None, **times}
         body |= {name: value for name, value in optional.items() if value is not None}
         method, path = ("PUT", f"{_ZONES}/{identifier}") if replace else ("POST", _ZONES)
-        _report(find_fog(fog).send(method, MAP_SERVICE, path, body), json=json)
+        made = find_fog(fog).send(method, MAP_SERVICE, path, body)
+        print_result(made, _line(made), json=json)
 
 
 @zone_app.command("list", epilog="Example: fognav zone list --json")
@@ -86,20 +86,18 @@ def zone_list(*, fog: FogOption = None, json: JsonOption = False) -> None:
     """List all zones."""
     with exit_codes():
         found = find_fog(fog).get(MAP_SERVICE, _ZONES)
-        if json:
-            print_json(found)
-            return
-        for zone in found["zones"]:
-            print_answer(_line(zone) + ("" if zone["id"] in found["active"] else " (has no effect now)"))
-        if not found["zones"]:
-            print_answer("no zones")
+        lines = [
+            _line(zone) + ("" if zone["id"] in found["active"] else " (has no effect now)") for zone in found["zones"]
+        ]
+        print_result(found, *(lines or ["no zones"]), json=json)
 
 
 @zone_app.command("show", epilog="Example: fognav zone show z-1a2b3c4d")
 def zone_show(zone: ZoneId, *, fog: FogOption = None, json: JsonOption = False) -> None:
     """Show one zone."""
     with exit_codes():
-        _report(find_fog(fog).get(MAP_SERVICE, f"{_ZONES}/{zone}"), json=json)
+        found = find_fog(fog).get(MAP_SERVICE, f"{_ZONES}/{zone}")
+        print_result(found, _line(found), json=json)
 
 
 @zone_app.command("enable", epilog="Example: fognav zone enable z-1a2b3c4d")
@@ -119,10 +117,7 @@ def zone_remove(zone: ZoneId, *, fog: FogOption = None, json: JsonOption = False
     """Remove a zone."""
     with exit_codes():
         find_fog(fog).send("DELETE", MAP_SERVICE, f"{_ZONES}/{zone}")
-        if json:
-            print_json({"id": zone, "removed": True})
-        else:
-            print_answer(f"removed zone {zone}")
+        print_result({"id": zone, "removed": True}, f"removed zone {zone}", json=json)
 
 
 def _switch(zone: str, address: str | None, *, enabled: bool, json: bool) -> None:
@@ -133,7 +128,8 @@ def _switch(zone: str, address: str | None, *, enabled: bool, json: bool) -> Non
         if body.get("ttl_s") is not None:
             del body["expires_at"]  # follows from it
         changed = {"If-Match": f'"{known["version"]}"'}  # not over what another operator has changed meanwhile
-        _report(fog.send("PUT", MAP_SERVICE, f"{_ZONES}/{zone}", {**body, "enabled": enabled}, changed), json=json)
+        made = fog.send("PUT", MAP_SERVICE, f"{_ZONES}/{zone}", {**body, "enabled": enabled}, changed)
+        print_result(made, _line(made), json=json)
 
 
 def _times(
@@ -171,13 +167,6 @@ def _shape(
     return {"type": "corridor", "line": points(str(corridor), 2, "a corridor"), "width": width}
 
 
-def _report(zone: Mapping[str, Any], *, json: bool) -> None:
-    if json:
-        print_json(zone)
-    else:
-        print_answer(_line(zone))
-
-
 def _line(zone: Mapping[str, Any]) -> str:
     parts = [f"{zone['id']}: {zone['kind']} {zone['shape']['type']}"]
     if zone["factor"] is not None:
@@ -190,14 +179,10 @@ def _line(zone: Mapping[str, Any]) -> str:
     if not zone["enabled"]:
         parts.append("disabled")
     if zone["starts_at"] is not None:
-        parts.append(f"from {_time(zone['starts_at'])}")
+        parts.append(f"from {local_time(zone['starts_at'])}")
     if (schedule := zone.get("schedule")) is not None:
         windows = "; ".join(f"{','.join(each['days'])} {each['begin']}-{each['end']}" for each in schedule["times"])
         parts.append(f"each {windows} ({schedule['time_zone']})")
     if zone["expires_at"] is not None:
-        parts.append(f"until {_time(zone['expires_at'])}")
+        parts.append(f"until {local_time(zone['expires_at'])}")
     return ", ".join(parts)
-
-
-def _time(stamp: float) -> str:
-    return dt.datetime.fromtimestamp(stamp).astimezone().isoformat(" ", "seconds")

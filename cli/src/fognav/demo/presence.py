@@ -3,8 +3,7 @@
 import os
 import shlex
 from pathlib import Path
-from types import TracebackType
-from typing import Final, Self
+from typing import Final
 
 from fog_supervisor import net
 from fognav import checkout
@@ -20,24 +19,15 @@ _SLOW_ZONE: Final = (1.0, 0.1)
 """Radius (m) and speed limit (m/s) of the proposed zone: it is seen to work, and fails no drive."""
 
 
-class Presence:
+class Presence(Registration):
     """The entry of one attempt's system, from `update` to the end of the context."""
 
     def __init__(self, plan: DrivePlan, scene: Scene, stack: Stack) -> None:
+        super().__init__(self.system)
         self._plan = plan
         self._scene = scene
         self._stack = stack
-        self._registration = Registration(self.system)
         self._usable = True
-
-    def __enter__(self) -> Self:
-        self._registration.__enter__()
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        self._registration.__exit__(kind, error, trace)
 
     def system(self) -> System:
         """Return the system as it is now: a restarted process has another port and process id."""
@@ -65,7 +55,7 @@ class Presence:
         if not self._usable:
             return
         try:
-            self._registration.update()
+            super().update()
         except FailedError as error:
             self._usable = False
             self._scene.log_event(f"other commands can't find this demo: {error}")

@@ -5,9 +5,10 @@ import math
 import re
 from typing import Annotated, Final, Literal
 
+import msgspec
 import typer
 
-from fog_contracts.messages import WEEKDAYS
+from fog_contracts.messages import WEEKDAYS, Id
 from fognav.output import WrongUseError
 
 Format = Literal["auto", "intel", "jsonl", "carmen", "rosbag2"]
@@ -52,6 +53,14 @@ def numbers(text: str, count: tuple[int, ...], form: str) -> list[float]:
     if len(found) not in count or not all(math.isfinite(value) for value in found):
         raise WrongUseError(f"{text!r} is not {form}, such as {_example(form)}; metres, separated by commas")
     return found
+
+
+def checked_id(text: str) -> str:
+    """Return the id of a robot, node or user; raises `WrongUseError` for what can be none."""
+    try:
+        return msgspec.convert(text, Id)
+    except msgspec.ValidationError as error:
+        raise WrongUseError(f"{text!r}: an id has only a to z, 0 to 9 and -, at most 32") from error
 
 
 _UNITS: Final = {"s": 1.0, "m": 60.0, "h": 3600.0, "d": 86_400.0}

@@ -1,5 +1,6 @@
-"""How `fognav test` calls pytest, which tests share a worker, and its summary."""
+"""`fognav test`, `check` and `channels`: how pytest is called, and what is checked and generated."""
 
+import asyncio
 import importlib.util
 import os
 import pty
@@ -9,9 +10,56 @@ from pathlib import Path
 from types import ModuleType, SimpleNamespace
 
 import pytest
+from typer.testing import CliRunner
 
-from fognav import checkout
+from fog_contracts.generate.acl import mqtt_acl, zenoh_acl
+from fog_contracts.generate.header import firmware_header
+from fognav import checkout, generated
+from fognav.__main__ import app
 from fognav.commands import develop
+from fognav.commands.develop import CHECKS, Check, CheckResult, run_checks
+
+
+def python(name: str, code: str) -> Check:
+    return Check(name, (sys.executable, "-S", "-c", code), f"correct {name}")
+
+
+def run(folder: Path, *checks: Check, cores: int = 2) -> tuple[list[CheckResult], list[str]]:
+    ended: list[str] = []
+    results = asyncio.run(run_checks(checks, folder, lambda result: ended.append(result.check.name), cores))
+    return results, ended
+
+
+def test_failed_check_does_not_stop_the_others(tmp_path: Path) -> None:
+    bad = python("bad", "print('line 3 is wrong'); raise SystemExit(2)")
+    results, ended = run(tmp_path, bad, Check("missing", ("/nowhere/tool",), ""), python("good", "print('fine')"))
+    assert [(r.check.name, r.ok, r.output) for r in results] == [
+        ("bad", False, "line 3 is wrong"),
+        ("missing", False, "/nowhere/tool can't be started: No such file or directory"),
+        ("good", True, "fine"),
+    ]
+    assert sorted(ended) == ["bad", "good", "missing"]
+
+
+def test_checks_run_in_parallel_in_the_checkout(tmp_path: Path) -> None:
+    wait = "import pathlib, time\npathlib.Path('{0}').touch()\nwhile not pathlib.Path('{1}').exists(): time.sleep(0.01)"
+    results, _ = run(tmp_path, python("one", wait.format("a", "b")), python("two", wait.format("b", "a")))
+    assert all(result.ok for result in results)
+
+
+def test_at_most_one_check_per_core_runs_at_once(tmp_path: Path) -> None:
+    exclusive = "import pathlib\np = pathlib.Path('busy')\np.touch(exist_ok=False)\np.unlink()"
+    results, ended = run(tmp_path, *(python(name, exclusive) for name in "abc"), cores=1)
+    assert all(result.ok for result in results)
+    assert ended == ["a", "b", "c"]
+
+
+def test_every_check_has_a_tool_and_a_remedy() -> None:
+    for check in CHECKS:
+        assert (checkout.root() / check.command[0]).exists(), check.name
+        assert check.remedy
+    assert len({check.name for check in CHECKS}) == len(CHECKS)
+
 
 TESTS = """
 import pytest
@@ -82,7 +130,7 @@ def test_tests_run_on_all_cores_unless_the_arguments_choose_otherwise() -> None:
     ("arguments", "tier"),
     [
         ([], "quick"), (["-q", "-x"], "quick"), (["--all"], "all"), (["--rest", "-q"], "rest"), (["--long"], "long"),
-        (["-k", "replica"], "all"), (["-m", "claim"], "all"), (["cli/tests/test_testing.py::test_x"], "all"),
+        (["-k", "replica"], "all"), (["-m", "claim"], "all"), (["cli/tests/test_develop.py::test_x"], "all"),
     ],
 )  # fmt: skip
 def test_quick_tests_run_unless_all_are_asked_for_or_some_by_name(arguments: list[str], tier: str) -> None:
@@ -180,3 +228,63 @@ def test_no_test_times_out_that_was_told_to_try_more(tmp_path):
         environment = {**alone, "FOGNAV_HISTORIES": histories, "PYTHONPATH": str(root)}
         done = subprocess.run(command, env=environment, cwd=tmp_path, capture_output=True, text=True, check=False)
         assert done.returncode == code, done.stdout
+
+
+runner = CliRunner()
+
+
+@pytest.mark.parametrize("name", generated.FILES)
+def test_generated_file_is_up_to_date(name: str) -> None:
+    committed = (checkout.root() / name).read_text("utf-8")
+    assert committed == generated.FILES[name](), f"{name} is out of date. Run: {generated.WRITE}"
+
+
+def test_routes_of_all_services_are_in_the_document() -> None:
+    text = generated.markdown()
+    for route in ("PUT /api/v1/areas/{area_id}", "POST /api/v1/zones", "PUT /api/v1/robots/{robot}/goal"):
+        assert text.count(f"| `{route}` |") == 1
+
+
+def test_printed_formats_equal_the_generated_files() -> None:
+    assert runner.invoke(app, ["channels", "--format", "header"]).stdout == firmware_header()
+    assert runner.invoke(app, ["channels", "--format", "acl"]).stdout == mqtt_acl() + zenoh_acl()
+    assert runner.invoke(app, ["channels", "--format", "acl", "--broker", "mqtt"]).stdout == mqtt_acl()
+    assert runner.invoke(app, ["channels"]).stdout == generated.markdown()
+
+
+def test_lists_for_a_site_name_it_and_its_robots() -> None:
+    done = runner.invoke(app, ["channels", "--format", "acl", "--broker", "zenoh", "--site", "estig"])
+    assert done.exit_code == 0
+    assert done.stdout == zenoh_acl("estig", ["r1"])
+
+
+@pytest.mark.parametrize(
+    "arguments", [["--broker", "mqtt"], ["--format", "header", "--site", "estig"], ["--format", "acl", "--site", "x/y"]]
+)
+def test_options_that_do_not_match_the_format_are_wrong_use(arguments: list[str]) -> None:
+    assert runner.invoke(app, ["channels", *arguments]).exit_code == 2
+
+
+def test_stale_file_is_listed_by_check_and_updated_by_write(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(checkout, "root", lambda: tmp_path)
+    monkeypatch.setattr(generated, "FILES", {"a/acl": mqtt_acl, "b/header.h": firmware_header})
+    assert runner.invoke(app, ["channels", "--check"]).exit_code == 1
+    assert "a/acl, b/header.h" in runner.invoke(app, ["channels", "--write"]).output
+    assert runner.invoke(app, ["channels", "--check"]).exit_code == 0
+    (tmp_path / "a" / "acl").write_text("# by hand\n")
+    done = runner.invoke(app, ["channels", "--check"])
+    assert done.exit_code == 1
+    assert "a/acl: out of date. Run: ./fognav channels --write" in done.output
+    assert "up to date" not in runner.invoke(app, ["channels", "--write"]).output
+    assert (tmp_path / "a" / "acl").read_text() == mqtt_acl()
+    assert "up to date" in runner.invoke(app, ["channels", "--write"]).output
+
+
+@pytest.mark.parametrize("seed", ["1", "2"])
+@pytest.mark.drive
+def test_generated_files_do_not_depend_on_the_hash_seed(seed: str) -> None:
+    done = subprocess.run(
+        [sys.executable, "-m", "fognav", "channels", "--check"],
+        env={**os.environ, "PYTHONHASHSEED": seed}, capture_output=True, text=True, check=False,
+    )  # fmt: skip
+    assert done.returncode == 0, done.stdout + done.stderr

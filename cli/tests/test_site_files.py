@@ -1,7 +1,11 @@
+"""A site as files: proposed on any map, checked, and written as text that is read as the same site."""
+
 import math
 import shutil
+import tomllib
 from pathlib import Path
 
+import msgspec
 import numpy as np
 import pytest
 from numpy.typing import NDArray
@@ -10,20 +14,31 @@ from fog_contracts.costs import DEFAULT_INFLATION
 from fog_contracts.grid import GridGeometry, StaticMap
 from fog_contracts.messages import SimObstacle
 from fog_contracts.shapes import rasterize
-from fog_contracts.site import AreaSite, Site
+from fog_contracts.site import AreaSite, Place, Site
 from fog_kernels.astar import Planner
 from fog_kernels.inflation import inflate, inflation_table
 from fog_kernels.raycast import cast
 from fog_runtime.configuration.maps import load_map, save_map
 from fog_runtime.configuration.site import load_site
 from fognav.output import WrongUseError
-from fognav.site_files import check_site, identifier, new_site
+from fognav.site_files import check_site, identifier, new_site, to_toml
 from fognav.site_proposal import NoSiteError, propose
 from fognav_sim.barrier import barrier_across
 from fognav_sim.drive.hazard import draw_hazard
 from fognav_sim.floor import Floor
 from fognav_sim.node import classify, default_config
 from fognav_sim.sensors import Noise, Robot, Sonars
+
+SQUARE = [(0.0, 0.0), (1.0, 0.0), (1.0, 1.0)]
+
+
+@pytest.mark.parametrize("text", ["Hall", 'the "blue" door', "C:\\new", "two\nlines\tand\x00\x7f", "Büro 🏢"])
+@pytest.mark.parametrize("number", [None, 0, 4])
+def test_name_labels_and_number_of_a_written_site_are_read_as_they_were(text, number):
+    area = AreaSite(id="z1", label=text, polygon=SQUARE, number=number)
+    site = Site(id="office", name=text, map="map.yaml", places={"a": Place(x=1.0, y=2.0, label=text)}, areas=[area])
+    assert msgspec.convert(tomllib.loads(to_toml(site)), Site) == site
+
 
 RESOLUTION = 0.05
 

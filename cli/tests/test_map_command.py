@@ -5,7 +5,7 @@ from types import SimpleNamespace
 
 from typer.testing import CliRunner
 
-from fognav.commands import map as map_command
+from fognav.commands import area
 from fognav.operate.systems import MAP_SERVICE
 
 
@@ -28,6 +28,6 @@ def test_hazards_are_listed_with_their_meaning_for_a_robot_and_whether_they_are_
         fog = SimpleNamespace(
             get=lambda service, path, found=found: {MAP_SERVICE: {"/api/v1/hazards": found}}[service][path]
         )
-        monkeypatch.setattr(map_command, "find_fog", lambda _, fog=fog: fog)
-        assert CliRunner().invoke(map_command.map_app, ["hazards"]).output.splitlines() == printed
-        assert json.loads(CliRunner().invoke(map_command.map_app, ["hazards", "--json"]).stdout)["hazards"] == found
+        monkeypatch.setattr(area, "find_fog", lambda _, fog=fog: fog)
+        assert CliRunner().invoke(area.map_app, ["hazards"]).output.splitlines() == printed
+        assert json.loads(CliRunner().invoke(area.map_app, ["hazards", "--json"]).stdout)["hazards"] == found

@@ -16,8 +16,8 @@ from fog_contracts.grid import GridGeometry, StaticMap
 from fog_kernels.raycast import cast
 from fog_runtime.configuration.maps import load_map, save_map
 from fognav.__main__ import app
-from fognav.lidar_logs import read_log
 from fognav.output import WrongUseError
+from fognav_experiments.lidar_logs.logs import read_log
 from fognav_experiments.localization_trials import _kidnapped, is_falsely_good, track, with_noise
 from robot_agent.config import LocalizationConfig
 from robot_agent.localization.map_fields import map_fields

@@ -9,11 +9,10 @@ import typer
 from fognav import __version__
 from fognav.commands import installed
 from fognav.commands.access import ca_app, token_app
-from fognav.commands.area import alert_app, area_app
+from fognav.commands.area import alert_app, area_app, map_app
 from fognav.commands.backup import backup_command, restore_command, store_app
 from fognav.commands.demo import demo_command, record_command, replay_command
 from fognav.commands.develop import channels_command, check_command, docs_command, run_tests
-from fognav.commands.map import map_app
 from fognav.commands.node import node_app
 from fognav.commands.robot import robot_app
 from fognav.commands.robot_file import robot_add, robot_check, robot_new

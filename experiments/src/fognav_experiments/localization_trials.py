@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from fog_contracts.grid import StaticMap
-    from fognav.lidar_logs import LogScan
+    from fognav_experiments.lidar_logs.logs import LogScan
     from robot_agent.config import LocalizationConfig
     from robot_agent.localization.map_fields import MapFields
 

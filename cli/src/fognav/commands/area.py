@@ -1,13 +1,15 @@
-"""`fognav area` and `fognav alert`: watched areas of a running system, and what there needs somebody's attention."""
+"""`fognav area`, `alert` and `map`: the watched areas, what there needs attention, and how the map has them."""
 
 from collections.abc import Mapping
 from typing import Annotated, Any, Literal
 
 import typer
 
+from fog_contracts.costs import INSCRIBED
+from fognav.commands import installed
 from fognav.operate.fog import find_fog
 from fognav.operate.options import FogOption, JsonOption, duration
-from fognav.operate.systems import AGGREGATOR
+from fognav.operate.systems import AGGREGATOR, MAP_SERVICE
 from fognav.output import WrongUseError, exit_codes, local_time, print_list, print_result
 
 area_app = typer.Typer(help="List the watched areas and their history, and override one.", no_args_is_help=True)
@@ -126,3 +128,30 @@ def alert_acknowledge(
 def _alert(alert: Mapping[str, Any]) -> str:
     seen = f" [{alert['acknowledged_by']} looks after it]" if alert["acknowledged_by"] else ""
     return f"{alert['id']}: since {local_time(alert['since'])}, {alert['reason']}{seen}"
+
+
+map_app = typer.Typer(
+    cls=installed.MapCommands, help="Make maps of buildings; show the hazards on the fog's map.", no_args_is_help=True
+)
+
+
+@map_app.command("hazards", epilog="Example: fognav map hazards --json")
+def map_hazards(*, fog: FogOption = None, json: JsonOption = False) -> None:
+    """List the watched areas as the map has them: robots plan around those that are impassable.
+
+    The map's own picture is /api/v1/costmap.png of the map-service.
+    """
+    with exit_codes():
+        hazards = find_fog(fog).get(MAP_SERVICE, "/api/v1/hazards")
+        lines = map(_on_map, sorted(hazards, key=lambda view: str(view["hazard"]["area"])))
+        print_result({"hazards": hazards}, *(lines if hazards else ["no watched areas"]), json=json)
+
+
+def _on_map(view: Mapping[str, Any]) -> str:
+    """Return a hazard of the map-service as a line."""
+    hazard = view["hazard"]
+    cost = hazard["penalty"]
+    costly = f"cost {cost}" if 0 < cost < INSCRIBED else "impassable" if cost else "passable"
+    cause = f" ({hazard['cause']})" if hazard["cause"] else ""
+    doubt = "" if view["confirmed"] else ", not confirmed: the hazard-aggregator is silent"
+    return f"{hazard['area']}: {hazard['state']}, {costly}{cause}{doubt}"

@@ -80,6 +80,12 @@ class Commands(TyperGroup):
         self.commands.update(get_group(added).commands)
 
 
+class MapCommands(Commands):
+    """The same for `fognav map`."""
+
+    entry_points: ClassVar = "fognav.commands.map"
+
+
 class SiteCommands(Commands):
     """The same for `fognav site`."""
 

@@ -3,24 +3,13 @@
 import datetime as dt
 import math
 import re
-from typing import Annotated, Final, Literal
+from typing import Annotated, Final
 
 import msgspec
 import typer
 
 from fog_contracts.messages import WEEKDAYS, Id
 from fognav.output import WrongUseError
-
-Format = Literal["auto", "intel", "jsonl", "carmen", "rosbag2"]
-Selection = Literal["all", "odd", "even"]
-LogFormat = Annotated[
-    Format, typer.Option("--format", help="Format of the log; intel is JSON lines, auto looks at the file.")
-]
-Scans = Annotated[Selection, typer.Option("--scans", help="Scans to use: all, or those with odd or even numbers.")]
-RangeMax = Annotated[
-    float, typer.Option("--range-max", metavar="M", min=1.0, max=200.0, help="Longer ranges are not used (m).")
-]
-
 
 FogOption = Annotated[
     str | None,

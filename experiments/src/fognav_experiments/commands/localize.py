@@ -1,33 +1,87 @@
-"""`fognav localize`: evaluate the localization on a recorded log."""
+"""`fognav localize` and `map from-log`: evaluate the localization on a recorded log, and make the map for it."""
 
 from __future__ import annotations
 
-from pathlib import Path  # noqa: TC003  # Typer reads annotations at run time
+from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
+import numpy as np
 import typer
 from rich.progress import Progress
 
+from fog_contracts.costs import FREE, LETHAL, UNKNOWN
+from fog_runtime.configuration.maps import MapFileError, load_map, save_map
 from fognav import kernels
 from fognav.commands.installed import MEASURE
-from fognav.operate.options import (  # noqa: TC001  # same
-    JsonOption,  # same
-    LogFormat,
-    RangeMax,
-    Scans,
+from fognav.operate.options import JsonOption  # noqa: TC001  # Typer reads annotations at run time
+from fognav.output import (
+    NOT_TRUE,
+    WrongUseError,
+    check_writable,
+    console,
+    exit_codes,
+    print_answer,
+    print_json,
+    print_result,
+    writing,
 )
-from fognav.output import NOT_TRUE, WrongUseError, check_writable, console, exit_codes, print_answer, print_json
+from fognav_experiments.lidar_logs import LogFormat, RangeMax, Scans  # noqa: TC001  # same
 
 if TYPE_CHECKING:
     from fog_contracts.grid import StaticMap
-    from fognav.lidar_logs import LidarLog, LogScan
-    from fognav.operate.options import Selection
+    from fognav_experiments.lidar_logs import Selection
+    from fognav_experiments.lidar_logs.logs import LidarLog, LogScan
 
 
 def add_to(app: typer.Typer) -> None:
     """Add the command to `fognav`."""
     epilog = "Example: fognav localize --map floor.yaml --log drive.log.gz --scans even --json"
     app.command("localize", epilog=epilog, rich_help_panel=MEASURE)(localize_command)
+
+
+def add_to_map(app: typer.Typer) -> None:
+    """Add the command that makes a map of a log to `fognav map`."""
+    app.command("from-log", epilog="Example: fognav map from-log drive.log.gz --out floor --scans odd")(map_from_log)
+
+
+def map_from_log(  # noqa: PLR0913  # each option is an argument
+    log_file: Annotated[Path, typer.Argument(metavar="LOG", help="Log with reference poses: JSON lines or CARMEN.")],
+    *,
+    out: Annotated[Path, typer.Option("--out", metavar="PREFIX", help="PREFIX.yaml and PREFIX.pgm are written.")],
+    log_format: LogFormat = "auto",
+    scans: Scans = "all",
+    resolution: Annotated[
+        float, typer.Option("--resolution", metavar="M", min=0.01, max=1.0, help="Size of a cell (m).")
+    ] = 0.05,
+    range_max: RangeMax = 30.0,
+    json: JsonOption = False,
+) -> None:
+    """Build a map from a log's scans at their reference poses.
+
+    Each beam clears the cells that it passes and marks the one where it ends.
+    """
+    from fognav_experiments.lidar_logs.logs import build_map, read_log  # noqa: PLC0415  # keeps the other commands fast
+
+    with exit_codes():
+        map_ = build_map(read_log(log_file, log_format).select(scans), resolution, range_max)
+        with writing(Path(f"{out}.yaml"), "Name another --out"):
+            save_map(out, map_)
+        found = _described(map_)
+    line = f"wrote {out}.yaml: {found['width']} x {found['height']} cells, {found['occupied']} occupied"
+    print_result({"file": f"{out}.yaml", **found}, line, json=json)
+
+
+def _described(map_: StaticMap) -> dict[str, object]:
+    """Return size, resolution and origin of a map, and how many of its cells are free, occupied and unknown."""
+    geometry = map_.geometry
+    names = {"free": FREE, "occupied": LETHAL, "unknown": UNKNOWN}
+    return {
+        "width": geometry.width,
+        "height": geometry.height,
+        "resolution": geometry.resolution,
+        "origin": [geometry.origin_x, geometry.origin_y, 0.0],
+        **{name: int(np.count_nonzero(map_.cells == value)) for name, value in names.items()},
+    }
 
 
 def localize_command(  # noqa: PLR0913  # each option is an argument
@@ -55,8 +109,8 @@ def localize_command(  # noqa: PLR0913  # each option is an argument
     exit code is 1 if no pose was found, or one that is wrong. With --trials starts without a pose (--global) or robots
     that are carried away unnoticed (--kidnap) are counted, and it is 1 if any pose was wrong while it was good.
     """
-    from fognav.lidar_logs import read_log  # noqa: PLC0415  # keeps the other commands fast
     from fognav_experiments import localization_trials as tried  # noqa: PLC0415  # same
+    from fognav_experiments.lidar_logs.logs import read_log  # noqa: PLC0415  # keeps the other commands fast
     from robot_agent.config import LocalizationConfig  # noqa: PLC0415  # same
     from robot_agent.localization.map_fields import map_fields  # noqa: PLC0415  # same
 
@@ -98,8 +152,6 @@ def localize_command(  # noqa: PLR0913  # each option is an argument
 
 
 def _load_map(file: Path) -> StaticMap:
-    from fog_runtime.configuration.maps import MapFileError, load_map  # noqa: PLC0415  # keeps the other commands fast
-
     try:
         return load_map(file)
     except MapFileError as error:

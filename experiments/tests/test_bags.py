@@ -12,8 +12,8 @@ import pytest
 from rosbags.rosbag2 import StoragePlugin, Writer
 from rosbags.typesys import Stores, get_typestore
 
-from fognav.lidar_logs import read_log
 from fognav.output import WrongUseError
+from fognav_experiments.lidar_logs.logs import read_log
 from robot_agent.localization.pose import Pose2
 
 if TYPE_CHECKING:

@@ -18,9 +18,9 @@ import numpy as np
 
 from fog_contracts.costs import FREE, LETHAL, UNKNOWN
 from fog_contracts.grid import GridGeometry, StaticMap
-from fognav.lidar_logs.bags import is_bag, read_bag
-from fognav.operate.options import Format, Selection
 from fognav.output import WrongUseError
+from fognav_experiments.lidar_logs import Format, Selection
+from fognav_experiments.lidar_logs.bags import is_bag, read_bag
 from robot_agent.localization.pose import Pose2
 
 if TYPE_CHECKING:

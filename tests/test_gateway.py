@@ -12,7 +12,7 @@ import httpx
 import pytest
 
 from fog_supervisor import child, net
-from fognav.generated import rest_routes
+from fognav.documentation import rest_routes
 
 CADDYFILE: Final = (Path(__file__).parents[1] / "deploy" / "gateway" / "Caddyfile").read_text("utf-8")
 EACH: Final = ("/api/v1/store", "/healthz", "/readyz", "/metrics")

@@ -14,7 +14,7 @@ from typer.testing import CliRunner
 
 from fog_contracts.generate.acl import mqtt_acl, zenoh_acl
 from fog_contracts.generate.header import firmware_header
-from fognav import checkout, generated
+from fognav import checkout, documentation
 from fognav.__main__ import app
 from fognav.commands import develop
 from fognav.commands.develop import CHECKS, Check, CheckResult, run_checks
@@ -76,6 +76,10 @@ def test_that_fails():
 """
 
 
+ENVIRONMENT = {**os.environ, "PYTHONPATH": str(checkout.root())}
+"""The progress is in the checkout's tests; pytest begins there, but in these tests."""
+
+
 @pytest.fixture
 def folder(tmp_path: Path) -> Path:
     (tmp_path / "test_some.py").write_text(TESTS)
@@ -88,7 +92,7 @@ def command(*, terminal: bool = False) -> list[str]:
 
 
 def test_skipped_tests_are_summarized_once_per_reason(folder: Path) -> None:
-    done = subprocess.run(command(), cwd=folder, capture_output=True, text=True, check=False)
+    done = subprocess.run(command(), cwd=folder, env=ENVIRONMENT, capture_output=True, text=True, check=False)
     assert done.returncode == 1
     assert done.stdout.count("no sonar") == 1
     assert "3 skipped: no sonar: plug one in" in done.stdout
@@ -98,7 +102,7 @@ def test_skipped_tests_are_summarized_once_per_reason(folder: Path) -> None:
 
 def test_bar_on_a_terminal_shows_progress_and_failures_at_once(folder: Path) -> None:
     master, slave = pty.openpty()
-    environment = {**os.environ, "TERM": "xterm", "COLUMNS": "100"}
+    environment = {**ENVIRONMENT, "TERM": "xterm", "COLUMNS": "100"}
     process = subprocess.Popen(command(terminal=True), cwd=folder, stdout=slave, stderr=slave, env=environment)
     os.close(slave)
     output = b""
@@ -143,7 +147,7 @@ def test_quick_tests_run_unless_all_are_asked_for_or_some_by_name(arguments: lis
 def test_each_test_belongs_to_the_quick_ones_or_to_the_rest_and_the_last_line_tells_how_many_are_left_out() -> None:
     def ids(tier: str) -> tuple[set[str], str]:
         module = "services/planner/tests/test_process.py"
-        collect = ["-m", "pytest", "-p", "fognav.pytest_progress", "--collect-only", "-q", f"--tier={tier}", module]
+        collect = ["-m", "pytest", "-p", "tests.support.progress", "--collect-only", "-q", f"--tier={tier}", module]
         alone = {name: value for name, value in os.environ.items() if not name.startswith("PYTEST_XDIST")}
         done = subprocess.run(
             [sys.executable, *collect], cwd=checkout.root(), env=alone, capture_output=True, text=True, check=True
@@ -233,14 +237,14 @@ def test_no_test_times_out_that_was_told_to_try_more(tmp_path):
 runner = CliRunner()
 
 
-@pytest.mark.parametrize("name", generated.FILES)
+@pytest.mark.parametrize("name", documentation.FILES)
 def test_generated_file_is_up_to_date(name: str) -> None:
     committed = (checkout.root() / name).read_text("utf-8")
-    assert committed == generated.FILES[name](), f"{name} is out of date. Run: {generated.WRITE}"
+    assert committed == documentation.FILES[name](), f"{name} is out of date. Run: {documentation.WRITE}"
 
 
 def test_routes_of_all_services_are_in_the_document() -> None:
-    text = generated.markdown()
+    text = documentation.markdown()
     for route in ("PUT /api/v1/areas/{area_id}", "POST /api/v1/zones", "PUT /api/v1/robots/{robot}/goal"):
         assert text.count(f"| `{route}` |") == 1
 
@@ -249,7 +253,7 @@ def test_printed_formats_equal_the_generated_files() -> None:
     assert runner.invoke(app, ["channels", "--format", "header"]).stdout == firmware_header()
     assert runner.invoke(app, ["channels", "--format", "acl"]).stdout == mqtt_acl() + zenoh_acl()
     assert runner.invoke(app, ["channels", "--format", "acl", "--broker", "mqtt"]).stdout == mqtt_acl()
-    assert runner.invoke(app, ["channels"]).stdout == generated.markdown()
+    assert runner.invoke(app, ["channels"]).stdout == documentation.markdown()
 
 
 def test_lists_for_a_site_name_it_and_its_robots() -> None:
@@ -267,7 +271,7 @@ def test_options_that_do_not_match_the_format_are_wrong_use(arguments: list[str]
 
 def test_stale_file_is_listed_by_check_and_updated_by_write(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(checkout, "root", lambda: tmp_path)
-    monkeypatch.setattr(generated, "FILES", {"a/acl": mqtt_acl, "b/header.h": firmware_header})
+    monkeypatch.setattr(documentation, "FILES", {"a/acl": mqtt_acl, "b/header.h": firmware_header})
     assert runner.invoke(app, ["channels", "--check"]).exit_code == 1
     assert "a/acl, b/header.h" in runner.invoke(app, ["channels", "--write"]).output
     assert runner.invoke(app, ["channels", "--check"]).exit_code == 0

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from fognav import documentation, generated
+from fognav import documentation
 from fognav.documentation import rest_page
 
 ROOT = Path(__file__).parents[2]
@@ -90,7 +90,7 @@ def test_link_that_leads_nowhere_is_named_with_its_place(small: Path, tmp_path: 
 @needs_builder
 @pytest.mark.timeout(600)  # 15 s of computing, on a busy machine
 def test_site_of_this_checkout_is_built_strictly_and_loads_nothing_from_elsewhere(tmp_path: Path) -> None:
-    documentation.write(ROOT, tmp_path, generated.rest_routes())
+    documentation.write(ROOT, tmp_path, documentation.rest_routes())
     assert documentation.build(BUILDER, tmp_path) == ""
     pages = [file.read_text("utf-8") for file in (tmp_path / "site").rglob("*.html")]
     assert len(pages) > 100

@@ -23,7 +23,7 @@ from fog_runtime.locks.site_locks import SiteLocks
 from fog_runtime.stores.redis_connection import RedisConnection
 from fog_supervisor.supervisor import Program, Supervisor
 from fognav.__main__ import app
-from fognav.hosting import backups, fog_node, folders, local_nodes, log_files
+from fognav.hosting import backups, fog_node, folders, local_nodes
 from fognav.hosting.fog_node import LocalNode, LockChanges, NodeConfig
 from fognav.hosting.folders import FORMAT, NodeFolder, default_data, hosted_sites
 from fognav.locking import locks_errors
@@ -96,13 +96,13 @@ def test_log_is_bounded_and_followed_across_its_cut(tmp_path):
     file = tmp_path / "planner.log"
     with file.open("a", buffering=1) as program:
         program.write("one\ntwo\n")
-        tail = log_files.Tail(file, 1)
+        tail = local_nodes.Tail(file, 1)
         assert tail.first() == ["two"]
         program.write("three\nfou")
         assert tail.added() == ["three"]
         program.write("r\n")
         assert tail.added() == ["four"]
-        log_files.bound(file, limit=10)
+        local_nodes.bound_log(file, limit=10)
         assert tail.added() == []
         program.write("five\n")
         assert tail.added() == ["five"]
@@ -158,7 +158,7 @@ async def test_bookkeeping_that_fails_is_told_once_and_ends_nothing(node, tmp_pa
         (keys / name).unlink()
     log = node.config.folder.log("planner")
     with log.open("wb") as file:
-        file.truncate(log_files.LIMIT_BYTES)
+        file.truncate(local_nodes.LIMIT_BYTES)
     before = log.with_name(log.name + ".before")
     before.mkdir()
 
@@ -180,7 +180,7 @@ async def test_bookkeeping_that_fails_is_told_once_and_ends_nothing(node, tmp_pa
             before.unlink()
             before.mkdir()
             with log.open("wb") as file:
-                file.truncate(log_files.LIMIT_BYTES)
+                file.truncate(local_nodes.LIMIT_BYTES)
             await until(lambda: len(told) == 3)  # it is told again after it has worked
             assert not attending.done()
         finally:
@@ -222,10 +222,10 @@ def test_log_is_cut_without_a_copy_on_a_full_disk(tmp_path):
     file.write_text("0123456789")
     before.symlink_to("/dev/full")
     with pytest.raises(OSError, match="No space left"):
-        log_files.bound(file, limit=10)
+        local_nodes.bound_log(file, limit=10)
     assert file.stat().st_size == 0
     assert not before.is_symlink()
-    log_files.bound(file, limit=10)
+    local_nodes.bound_log(file, limit=10)
 
 
 def test_error_without_a_file_is_told_without_one():

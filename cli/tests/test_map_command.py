@@ -5,6 +5,7 @@ from types import SimpleNamespace
 
 from typer.testing import CliRunner
 
+from fognav.__main__ import app
 from fognav.commands import area
 from fognav.operate.systems import MAP_SERVICE
 
@@ -29,5 +30,5 @@ def test_hazards_are_listed_with_their_meaning_for_a_robot_and_whether_they_are_
             get=lambda service, path, found=found: {MAP_SERVICE: {"/api/v1/hazards": found}}[service][path]
         )
         monkeypatch.setattr(area, "find_fog", lambda _, fog=fog: fog)
-        assert CliRunner().invoke(area.map_app, ["hazards"]).output.splitlines() == printed
-        assert json.loads(CliRunner().invoke(area.map_app, ["hazards", "--json"]).stdout)["hazards"] == found
+        assert CliRunner().invoke(app, ["map", "hazards"]).output.splitlines() == printed
+        assert json.loads(CliRunner().invoke(app, ["map", "hazards", "--json"]).stdout)["hazards"] == found

@@ -3,7 +3,6 @@
 import json
 import re
 import tomllib
-from collections.abc import Sequence
 from pathlib import Path
 from typing import Final
 
@@ -11,7 +10,6 @@ from fog_contracts.site import AreaSite, DemoPlan, NodeSite, Place, RobotSite, S
 from fog_runtime.configuration.maps import MapFileError, load_map, save_map
 from fog_runtime.configuration.site import SITE_FILE, LoadedSite, SiteError, load_site
 from fog_runtime.files import SHARED, atomic_write
-from fognav.hosting.compose_floors import BASE, HEADER, override
 from fognav.output import FailedError, WrongUseError
 
 
@@ -280,20 +278,6 @@ def new_site(map_file: Path, out: Path, seed: int) -> dict[str, object]:
         "why_no_areas": why,
         "places": {name: [place.x, place.y] for name, place in site.places.items()},
     }
-
-
-def compose_floors(folders: Sequence[Path], root: Path, out: Path) -> dict[str, object]:
-    """Write the override of a checkout's compose file for further floors; without folders, remove it.
-
-    Raises `WrongUseError` as `override`, and for a file that this command has not written.
-    """
-    if out.exists() and not out.read_text("utf-8").startswith(HEADER):
-        raise WrongUseError(f"{out} is not by this command: move it, or name another file with --out")
-    if folders:
-        atomic_write(out, override(folders, (root / BASE).read_text("utf-8")).encode(), mode=SHARED)
-    else:
-        out.unlink(missing_ok=True)
-    return {"file": str(out), "sites": [str(folder) for folder in folders]}
 
 
 def check_site(folder: Path) -> dict[str, object]:

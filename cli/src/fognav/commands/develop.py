@@ -69,7 +69,7 @@ def pytest_command(arguments: Sequence[str], *, terminal: bool | None = None) ->
     if tier is None:
         tier = "all" if _selects(arguments) else "quick"
     arguments = [argument for argument in arguments if argument not in _TIERS]
-    command = [sys.executable, "-m", "pytest", "-p", "fognav.pytest_progress", "-r", "fE", f"--tier={tier}"]
+    command = [sys.executable, "-m", "pytest", "-p", "tests.support.progress", "-r", "fE", f"--tier={tier}"]
     if sys.stderr.isatty() if terminal is None else terminal:
         command += ["-o", "console_output_style=classic"]  # the bar shows the progress
     if not any(argument.startswith(_OVERRIDES) for argument in arguments):
@@ -230,7 +230,7 @@ def docs_command(
 
     The first time this installs what builds it. The site is in .fognav/docs/site, and loads nothing from elsewhere.
     """
-    from fognav import documentation, generated  # noqa: PLC0415  # keeps the other commands fast
+    from fognav import documentation  # noqa: PLC0415  # keeps the other commands fast
 
     root = checkout.root()
     folder = root / ".fognav" / "docs"
@@ -238,7 +238,7 @@ def docs_command(
         print_line("installing what builds the documentation (once)")
         builder = documentation.install_builder(root)
     started = time.monotonic()
-    routes = generated.rest_routes()
+    routes = documentation.rest_routes()
     documentation.write(root, folder, routes)
     if wrong := documentation.build(builder, folder):
         raise FailedError(f"{wrong}\ncorrect the documents named above")
@@ -284,23 +284,23 @@ def channels_command(
 
 
 def _print_or_write(format: str, broker: str | None, site: Path | None, *, write: bool, check: bool) -> None:  # noqa: A002  # same
-    from fognav import generated  # noqa: PLC0415  # same
+    from fognav import documentation  # noqa: PLC0415  # same
 
     if format != "acl" and (broker or site):
         raise WrongUseError(f"--broker and --site apply only to --format acl, not to {format}")
     if write:
-        names = generated.write(checkout.root())
+        names = documentation.write_generated(checkout.root())
         console.print(f"wrote {', '.join(names)}" if names else "all generated files are up to date", markup=False)
     elif check:
-        if names := generated.stale(checkout.root()):
-            console.print(f"{', '.join(names)}: out of date. Run: {generated.WRITE}", markup=False, style="red")
+        if names := documentation.stale_generated(checkout.root()):
+            console.print(f"{', '.join(names)}: out of date. Run: {documentation.WRITE}", markup=False, style="red")
             raise typer.Exit(NOT_TRUE)
     elif format == "markdown":
-        _print(generated.markdown())
+        _print(documentation.markdown())
     elif format == "header":
         _print(firmware_header())
     else:
-        mqtt, zenoh = generated.acls(checkout.site_folder(site) if site else None)
+        mqtt, zenoh = documentation.acls(checkout.site_folder(site) if site else None)
         for name, text in (("mqtt", mqtt), ("zenoh", zenoh)):
             if broker in (None, name):
                 _print(text)

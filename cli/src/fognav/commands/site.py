@@ -7,7 +7,7 @@ import typer
 
 from fognav import checkout, kernels, site_files
 from fognav.commands import installed
-from fognav.hosting.compose_floors import OVERRIDE
+from fognav.hosting.compose_floors import OVERRIDE, write_override
 from fognav.operate.options import JsonOption
 from fognav.output import NOT_TRUE, exit_codes, fail, print_json, print_line, print_result
 
@@ -84,6 +84,6 @@ def site_compose(
     with exit_codes():
         root = checkout.root()
         sites = [checkout.site_folder(folder) for folder in folders or []]
-        made = site_files.compose_floors(sites, root, out or root / OVERRIDE)
+        made = write_override(sites, root, out or root / OVERRIDE)
     line = f"{made['file']} has {len(sites)} further floors: docker compose up -d --remove-orphans"
     print_result(made, line, json=json, write=print_line)

@@ -8,7 +8,7 @@ from typing import Annotated, Final
 import typer
 
 from fognav import checkout, kernels, system
-from fognav.hosting import log_files
+from fognav.hosting import local_nodes
 from fognav.hosting.fog_node import NodeConfig, run_node
 from fognav.hosting.folders import NodeFolder, default_data, hosted_sites, remember, settings_of
 from fognav.hosting.local_nodes import UNIT, end_node, named_node, write_unit
@@ -114,7 +114,7 @@ def logs_command(
         if not shown:
             raise FailedError(f"{folder} has no logs: start a fog node (fognav up), or name its folder with --data")
         try:
-            log_files.show(shown, lines, follow=follow)
+            local_nodes.show_logs(shown, lines, follow=follow)
         except KeyboardInterrupt:
             return
 

@@ -16,7 +16,9 @@ from typing import Any, Final
 
 import yaml  # type: ignore[import-untyped]  # PyYAML ships no types
 
+from fog_runtime.files import SHARED, atomic_write
 from fognav.hosting.folders import PORT_STEP, load_sites
+from fognav.output import WrongUseError
 
 BASE: Final = "docker-compose.yml"
 OVERRIDE: Final = "docker-compose.override.yml"
@@ -32,6 +34,20 @@ _PORT: Final = re.compile(r"\$\{(FOGNAV_\w+_PORT):-(\d+)\}")
 _OUT: Final = "/out/floors"
 
 _Part = dict[str, Any]
+
+
+def write_override(folders: Sequence[Path], root: Path, out: Path) -> dict[str, object]:
+    """Write the override of a checkout's compose file for further floors; without folders, remove it.
+
+    Raises `WrongUseError` as `override`, and for a file that this command has not written.
+    """
+    if out.exists() and not out.read_text("utf-8").startswith(HEADER):
+        raise WrongUseError(f"{out} is not by this command: move it, or name another file with --out")
+    if folders:
+        atomic_write(out, override(folders, (root / BASE).read_text("utf-8")).encode(), mode=SHARED)
+    else:
+        out.unlink(missing_ok=True)
+    return {"file": str(out), "sites": [str(folder) for folder in folders]}
 
 
 def override(folders: Sequence[Path], compose: str) -> str:

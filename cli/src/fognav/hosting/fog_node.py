@@ -28,7 +28,7 @@ from fog_runtime.locks.site_locks import CERTIFICATE, KEY, SiteLocks
 from fog_runtime.machine import ServiceManager
 from fog_supervisor import net
 from fog_supervisor.supervisor import Event, Supervisor
-from fognav.hosting import log_files
+from fognav.hosting import local_nodes
 from fognav.hosting.folders import REDIS_PORT, HostedSite, NodeFolder
 from fognav.hosting.local_nodes import KIND, UP
 from fognav.operate.systems import MQTTS_PORT, ZENOH_PORT, Registration, System, port
@@ -378,7 +378,7 @@ async def attend(
                 each.update()
         for name in node.supervisor.names:
             with troubles.told(f"the log of {name} could not be kept and begun anew"):
-                await asyncio.to_thread(log_files.bound, node.config.folder.log(name))
+                await asyncio.to_thread(local_nodes.bound_log, node.config.folder.log(name))
         manager.alive()
         await asyncio.sleep(PERIOD_S)
 

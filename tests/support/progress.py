@@ -31,7 +31,7 @@ def pytest_deselected(items: list[pytest.Item]) -> None:
 
 
 @pytest.hookimpl(optionalhook=True)
-def pytest_testnodedown(node: Any) -> None:  # noqa: ANN401  # a worker of pytest-xdist, which has no types
+def pytest_testnodedown(node: Any) -> None:  # a worker of pytest-xdist, which has no types
     """Take over a worker's count; each has left out the same tests."""
     vars(node.config)[_LEFT_OUT] = node.workeroutput.get(_LEFT_OUT, 0)
 

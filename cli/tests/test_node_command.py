@@ -164,8 +164,8 @@ def test_site_file_is_never_written_with_a_text_that_makes_the_site_invalid(floo
         ("33.2,38.15,1.5708", {"area": "nowhere"}, "no area 'nowhere'"),
         ("33.2,37.0,1.5708", {}, "in a wall"),
         ("-50,0,0", {}, "not on the map"),
-        ("33.2,38.15", {}, "give 3 numbers"),
-        ("33.2,38.15,nan", {}, "give 3 numbers"),
+        ("33.2,38.15", {}, "is not X,Y,THETA"),
+        ("33.2,38.15,nan", {}, "is not X,Y,THETA"),
     ],
 )
 def test_node_that_would_be_of_no_use_is_refused_and_nothing_is_written(floor, pose, options, says) -> None:

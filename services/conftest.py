@@ -27,7 +27,7 @@ from fog_contracts.grid import GridGeometry, StaticMap
 from fog_runtime.clock import SystemClock
 from fog_runtime.configuration.maps import save_map
 from fog_runtime.credentials import Credentials
-from fog_runtime.locks.site_locks import SiteLocks
+from fog_runtime.security.site_security import SiteSecurity
 from fog_runtime.transports.mqtt_edge import MqttEdge
 from fog_runtime.transports.zenoh_edge import ZenohEdge
 from fog_supervisor.servers import Server, start_mosquitto, start_redis, start_router
@@ -62,12 +62,14 @@ class Servers:
     """Broker, Redis and router of the site, and the files by which they admit its users (if `locked`)."""
 
     def __init__(self, folder: Path, *, locked: bool = True) -> None:
-        self.locks = locks = SiteLocks(folder / "locks", "test", unrestricted=["test"]) if locked else None
-        if locks is not None:
-            locks.make(["127.0.0.1", "localhost"], nodes=["n1"])
-        self.mosquitto: Server = start_mosquitto(folder / "mosquitto", locks=locks and locks.folder("mosquitto"))
-        self.redis: Server = start_redis(folder / "redis", locks=locks and locks.folder("redis"))
-        self.router: Server = start_router(folder / "router", locks=locks and locks.folder("zenoh"))
+        self.security = security = SiteSecurity(folder / "locks", "test", unrestricted=["test"]) if locked else None
+        if security is not None:
+            security.make(["127.0.0.1", "localhost"], nodes=["n1"])
+        self.mosquitto: Server = start_mosquitto(
+            folder / "mosquitto", security=security and security.folder("mosquitto")
+        )
+        self.redis: Server = start_redis(folder / "redis", security=security and security.folder("redis"))
+        self.router: Server = start_router(folder / "router", security=security and security.folder("zenoh"))
         self._began = self._state()
 
     def all(self) -> tuple[Server, ...]:
@@ -75,9 +77,9 @@ class Servers:
 
     def redis_options(self) -> dict[str, object]:
         """Return how a client of Redis that may do everything connects."""
-        if self.locks is None:
+        if self.security is None:
             return {"port": self.redis.port}
-        own = Credentials.read(self.locks.credentials("administrator"))
+        own = Credentials.read(self.security.credentials("administrator"))
         return {
             "port": self.redis.port, "ssl": True, "ssl_ca_data": own.authority, "username": own.user,
             "password": own.passwords["redis"],
@@ -102,8 +104,8 @@ class Servers:
         end = f"end-of-test/{secrets.token_hex(8)}"
         retained: list[str] = []
         client = paho.Client(paho.CallbackAPIVersion.VERSION2)
-        if self.locks is not None:
-            own = Credentials.read(self.locks.credentials("test"))
+        if self.security is not None:
+            own = Credentials.read(self.security.credentials("test"))
             client.tls_set_context(own.tls_context())
             client.username_pw_set(own.user, own.passwords["mqtt"])
         ended = threading.Semaphore(0)
@@ -169,7 +171,7 @@ class Fog:
     def __init__(self, folder: Path, servers: Servers) -> None:
         self.folder = folder
         self.servers = servers
-        self.locks = servers.locks
+        self.security = servers.security
         self.mosquitto, self.redis, self.router = servers.all()
         self.site = folder / "site"
         self.site.mkdir()
@@ -216,7 +218,7 @@ class Fog:
 
     def credentials_file(self, user: str) -> Path | None:
         """Return the file of a user's credentials; None behind open doors."""
-        return None if self.locks is None else self.locks.credentials(user)
+        return None if self.security is None else self.security.credentials(user)
 
     @property
     def test_credentials(self) -> Credentials:

@@ -6,7 +6,7 @@ from typing import Any
 
 import yaml
 
-from fog_runtime.locks.__main__ import OWNERS, SIMULATION
+from fog_runtime.security.__main__ import OWNERS, SIMULATION
 
 ROOT = Path(__file__).parents[1]
 COMPOSE = yaml.safe_load((ROOT / "docker-compose.yml").read_text("utf-8"))

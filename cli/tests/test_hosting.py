@@ -19,14 +19,14 @@ from typer.testing import CliRunner
 from fog_runtime import backup
 from fog_runtime.backup import STAMP, BackupError
 from fog_runtime.credentials import Credentials
-from fog_runtime.locks.site_locks import SiteLocks
+from fog_runtime.security.site_security import SiteSecurity
 from fog_runtime.stores.redis_connection import RedisConnection
 from fog_supervisor.supervisor import Program, Supervisor
 from fognav.__main__ import app
 from fognav.hosting import backups, fog_node, folders, local_nodes
 from fognav.hosting.fog_node import LocalNode, LockChanges, NodeConfig
 from fognav.hosting.folders import FORMAT, NodeFolder, default_data, hosted_sites
-from fognav.locking import locks_errors
+from fognav.locking import security_errors
 from fognav.operate.systems import Registration, System, registered
 from fognav.output import FailedError, WrongUseError
 
@@ -74,16 +74,16 @@ def test_default_data_follows_the_base_directories(tmp_path, monkeypatch):
 def test_site_keeps_its_place_and_ports_whatever_the_order(tmp_path, upstairs, monkeypatch):
     for name in ("FOGNAV_AGGREGATOR_PORT", "FOGNAV_MAP_PORT", "FOGNAV_PLANNER_PORT"):
         monkeypatch.delenv(name, raising=False)
-    hosts, locks = ["localhost"], tmp_path / "locks"
-    (alone,), _ = hosted_sites([ESTIG], locks, hosts)
-    both, made = hosted_sites([upstairs, ESTIG], locks, hosts)
+    hosts, security = ["localhost"], tmp_path / "locks"
+    (alone,), _ = hosted_sites([ESTIG], security, hosts)
+    both, made = hosted_sites([upstairs, ESTIG], security, hosts)
     found = {site.id: site for site in both}
     assert alone.ports == found["estig"].ports == {"hazard-aggregator": 8001, "map-service": 8002, "planner": 8003}
     assert sorted(found["upstairs"].ports.values()) == [8011, 8012, 8013]
     assert found["estig"].name("planner") == "planner"
     assert found["upstairs"].name("planner") == "upstairs.planner"
     assert (found["upstairs"].node_credentials(made) / "n1.toml").exists()
-    (later,), _ = hosted_sites([upstairs], locks, hosts)
+    (later,), _ = hosted_sites([upstairs], security, hosts)
     assert later.ports == found["upstairs"].ports
 
 
@@ -131,8 +131,8 @@ async def until(condition: Callable[[], object]) -> None:
 def node(tmp_path: Path) -> LocalNode:
     """A fog node of which nothing runs yet."""
     folder = NodeFolder(tmp_path / "data")
-    sites, locks = hosted_sites([ESTIG], folder.locks, ["localhost", "127.0.0.1"])
-    return LocalNode(NodeConfig(folder=folder, sites=sites, locks=locks, address="127.0.0.2"), lambda _: None)
+    sites, security = hosted_sites([ESTIG], folder.security, ["localhost", "127.0.0.1"])
+    return LocalNode(NodeConfig(folder=folder, sites=sites, security=security, address="127.0.0.2"), lambda _: None)
 
 
 @pytest.mark.skipif(shutil.which("systemd-analyze") is None, reason="needs systemd-analyze")
@@ -203,7 +203,7 @@ async def test_check_that_a_signal_ends_has_failed(node, tmp_path, monkeypatch):
 
 async def test_locks_that_change_while_the_node_starts_come_into_force(node, tmp_path, monkeypatch):
     async def start(started: LocalNode, _: float) -> None:
-        started.config.locks.add_robot("r7")
+        started.config.security.add_robot("r7")
 
     monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path))
     monkeypatch.setattr(fog_node, "PERIOD_S", 0.01)
@@ -229,7 +229,7 @@ def test_log_is_cut_without_a_copy_on_a_full_disk(tmp_path):
 
 
 def test_error_without_a_file_is_told_without_one():
-    with pytest.raises(FailedError, match="a file can't be used: No space left on device"), locks_errors():
+    with pytest.raises(FailedError, match="a file can't be used: No space left on device"), security_errors():
         raise OSError(errno.ENOSPC, "No space left on device")
 
 
@@ -250,7 +250,7 @@ def connected(place: backup.Place) -> RedisConnection:
 async def test_backup_of_each_floor_is_restored_on_an_empty_machine(tmp_path, upstairs):
     floors = {"estig": shutil.copytree(ESTIG, tmp_path / "site"), "upstairs": upstairs}
     folder = NodeFolder(tmp_path / "data")
-    hosted_sites(list(floors.values()), folder.locks, ["localhost", "127.0.0.1"])
+    hosted_sites(list(floors.values()), folder.security, ["localhost", "127.0.0.1"])
     folders.remember(folder.path, folders.settings_of(floors, "127.0.0.1", [], simulate=False))
     tokens = {}
     for floor, directory in floors.items():
@@ -263,8 +263,8 @@ async def test_backup_of_each_floor_is_restored_on_an_empty_machine(tmp_path, up
     with pytest.raises(WrongUseError, match="name one of the sites"):
         await backups.create(tmp_path / "both.tar.gz", folder, None)
     assert (folder.data("upstairs.map-service") / STAMP).exists()
-    authority = (folder.locks / "authority.pem").read_bytes()
-    robot = (folder.locks / "credentials" / "upstairs" / "r1.toml").read_bytes()
+    authority = (folder.security / "authority.pem").read_bytes()
+    robot = (folder.security / "credentials" / "upstairs" / "r1.toml").read_bytes()
 
     empty = NodeFolder(tmp_path / "empty")
     for floor, original in floors.items():
@@ -278,8 +278,8 @@ async def test_backup_of_each_floor_is_restored_on_an_empty_machine(tmp_path, up
             redis = connected(place)
             assert await redis.read("GET", f"fog:{floor}:zones") == f"wet floor of {floor}".encode()
             await redis.aclose()
-    assert (empty.locks / "authority.pem").read_bytes() == authority
-    assert (empty.locks / "credentials" / "upstairs" / "r1.toml").read_bytes() == robot
+    assert (empty.security / "authority.pem").read_bytes() == authority
+    assert (empty.security / "credentials" / "upstairs" / "r1.toml").read_bytes() == robot
     with pytest.raises(BackupError, match="nothing was changed"):
         await backups.restore(tmp_path / "estig.tar.gz", empty, tmp_path / "restored" / "estig", replace=False)
 
@@ -287,19 +287,19 @@ async def test_backup_of_each_floor_is_restored_on_an_empty_machine(tmp_path, up
 async def test_older_backup_of_one_floor_locks_nobody_out_who_was_added_since(tmp_path, upstairs):
     estig = shutil.copytree(ESTIG, tmp_path / "site")
     folder, hosts = NodeFolder(tmp_path / "data"), ["localhost", "127.0.0.1"]
-    hosted_sites([estig], folder.locks, hosts)
+    hosted_sites([estig], folder.security, hosts)
     folder.keys("estig")
-    SiteLocks.open(folder.locks).add_robot("sold")
+    SiteSecurity.open(folder.security).add_robot("sold")
     folders.remember(folder.path, folders.settings_of({"estig": estig}, "127.0.0.1", [], simulate=False))
     await backups.create(tmp_path / "older.tar.gz", folder, estig)
-    hosted_sites([estig, upstairs], folder.locks, hosts)
-    SiteLocks.open(folder.locks).add_robot("r7")
-    SiteLocks.open(folder.locks).remove("sold")
-    before = SiteLocks.open(folder.locks).users()
+    hosted_sites([estig, upstairs], folder.security, hosts)
+    SiteSecurity.open(folder.security).add_robot("r7")
+    SiteSecurity.open(folder.security).remove("sold")
+    before = SiteSecurity.open(folder.security).users()
     made, refused, _ = await backups.restore(tmp_path / "older.tar.gz", folder, estig, replace=True)
     assert (sorted(made.folders), refused) == (["recordings", "secrets", "site"], ["sold"])
-    assert SiteLocks.open(folder.locks).users() == before
-    service = Credentials.read(SiteLocks.open(folder.locks).credentials("upstairs.map-service"))
+    assert SiteSecurity.open(folder.security).users() == before
+    service = Credentials.read(SiteSecurity.open(folder.security).credentials("upstairs.map-service"))
     async with backups.redis_of(folder, "estig", estig) as place:
         redis = RedisConnection(place.redis_url, timeout_s=10.0, credentials=service)
         assert await redis.read("PING")
@@ -308,7 +308,7 @@ async def test_older_backup_of_one_floor_locks_nobody_out_who_was_added_since(tm
 
 def test_backup_of_a_node_takes_a_site_by_its_name(tmp_path):
     folder = NodeFolder(tmp_path / "data")
-    hosted_sites([ESTIG], folder.locks, ["localhost", "127.0.0.1"])
+    hosted_sites([ESTIG], folder.security, ["localhost", "127.0.0.1"])
     folder.keys("estig")
     folders.remember(folder.path, folders.settings_of({"estig": ESTIG}, "127.0.0.1", [], simulate=False))
     file = tmp_path / "estig.tar.gz"
@@ -322,7 +322,7 @@ def test_backup_of_a_node_takes_a_site_by_its_name(tmp_path):
 @pytest.mark.parametrize("command", ["backup", "restore"])
 def test_mistyped_node_or_site_leaves_nothing_behind(tmp_path, command):
     folder = NodeFolder(tmp_path / "data")
-    hosted_sites([ESTIG], folder.locks, ["localhost", "127.0.0.1"])
+    hosted_sites([ESTIG], folder.security, ["localhost", "127.0.0.1"])
     folder.keys("estig")
     folders.remember(folder.path, folders.settings_of({"estig": ESTIG}, "127.0.0.1", [], simulate=False))
     file, wrong = tmp_path / "estig.tar.gz", tmp_path / "dta"
@@ -353,29 +353,29 @@ async def test_locks_of_another_authority_are_replaced_by_those_of_the_backup(tm
     estig, hosts = shutil.copytree(ESTIG, tmp_path / "site"), ["localhost", "127.0.0.1"]
     for name in ("data", "fresh"):
         folder = NodeFolder(tmp_path / name)
-        hosted_sites([estig], folder.locks, hosts)
+        hosted_sites([estig], folder.security, hosts)
         folder.keys("estig")
         folders.remember(folder.path, folders.settings_of({"estig": estig}, "127.0.0.1", [], simulate=False))
     original = NodeFolder(tmp_path / "data")
     await backups.create(tmp_path / "older.tar.gz", original, estig)
     made, *_ = await backups.restore(tmp_path / "older.tar.gz", folder, estig, replace=True)
-    assert backups.LOCKS in made.folders
-    assert (folder.locks / "authority.pem").read_bytes() == (original.locks / "authority.pem").read_bytes()
+    assert backups.SECURITY in made.folders
+    assert (folder.security / "authority.pem").read_bytes() == (original.security / "authority.pem").read_bytes()
 
 
 async def test_locks_of_another_site_are_never_replaced_by_those_of_a_backup(tmp_path, upstairs):
     for name, site, directory in (("data", "estig", ESTIG), ("other", "upstairs", upstairs)):
         folder = NodeFolder(tmp_path / name)
-        hosted_sites([directory], folder.locks, ["localhost", "127.0.0.1"])
+        hosted_sites([directory], folder.security, ["localhost", "127.0.0.1"])
         folder.keys(site)
         folders.remember(folder.path, folders.settings_of({site: directory}, "127.0.0.1", [], simulate=False))
     await backups.create(tmp_path / "estig.tar.gz", NodeFolder(tmp_path / "data"), ESTIG)
-    before = (folder.locks / "authority.pem").read_bytes()
+    before = (folder.security / "authority.pem").read_bytes()
     with pytest.raises(
         BackupError, match="has the credentials of upstairs too, and the backup's are of another authority"
     ):
         await backups.restore(tmp_path / "estig.tar.gz", folder, tmp_path / "restored", replace=True)
-    assert (folder.locks / "authority.pem").read_bytes() == before
+    assert (folder.security / "authority.pem").read_bytes() == before
     assert not (tmp_path / "restored").exists()
 
 

@@ -10,7 +10,7 @@ import pytest
 from typer.testing import CliRunner
 
 from fog_runtime.credentials import Credentials
-from fog_runtime.locks.site_locks import SiteLocks
+from fog_runtime.security.site_security import SiteSecurity
 from fog_runtime.token_file import create_token
 from fognav import doctor
 from fognav.__main__ import app
@@ -20,11 +20,11 @@ ROOT = Path(__file__).parents[2]
 
 
 @pytest.fixture
-def locks(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> SiteLocks:
+def security(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> SiteSecurity:
     monkeypatch.setenv(VARIABLE, str(tmp_path / "locks"))
     done = run("ca", "create", "--site", "estig", "--host", "fog.local", "--host", "127.0.0.1", "--json")
     assert set(done["credentials"]) >= {"map-service", "planner", "hazard-aggregator", "console", "r1", "n1"}
-    return SiteLocks.open(tmp_path / "locks")
+    return SiteSecurity.open(tmp_path / "locks")
 
 
 def invoke(*words: str):
@@ -37,24 +37,24 @@ def run(*words: str) -> dict:
     return json.loads(done.stdout)
 
 
-def test_authority_is_shown_rotated_and_finished_by_commands(locks: SiteLocks) -> None:
+def test_authority_is_shown_rotated_and_finished_by_commands(security: SiteSecurity) -> None:
     assert run("ca", "show", "--json")["rotating"] is False
-    before = Credentials.read(locks.credentials("r1")).authority
+    before = Credentials.read(security.credentials("r1")).authority
     assert run("ca", "rotate", "--json")["rotating"] is True
-    overlap = Credentials.read(locks.credentials("r1")).authority
+    overlap = Credentials.read(security.credentials("r1")).authority
     assert before.strip() in overlap
     assert "not finished" in invoke("ca", "rotate").output.replace("\n", " ")
     assert run("ca", "rotate", "--finish", "--json")["rotating"] is False
-    assert before.strip() not in Credentials.read(locks.credentials("r1")).authority
+    assert before.strip() not in Credentials.read(security.credentials("r1")).authority
     assert "nothing to finish" in invoke("ca", "rotate", "--finish").output.replace("\n", " ")
 
 
-def test_certificates_that_expire_soon_are_named_by_show_and_doctor(locks: SiteLocks) -> None:
+def test_certificates_that_expire_soon_are_named_by_show_and_doctor(security: SiteSecurity) -> None:
     check = doctor.check_certificates()
     assert check is not None
     assert check.state == "ok"
-    soon = locks.authority.issue("redis", ["fog"], now=dt.datetime.now(dt.UTC), days=5)
-    (locks.folder("redis") / "server.pem").write_bytes(soon.chain)
+    soon = security.authority.issue("redis", ["fog"], now=dt.datetime.now(dt.UTC), days=5)
+    (security.folder("redis") / "server.pem").write_bytes(soon.chain)
     shown = invoke("ca", "show", "--json")
     assert shown.exit_code == 1
     assert json.loads(shown.stdout)["expiring"] == ["redis"]
@@ -75,14 +75,14 @@ def test_doctor_names_locks_that_can_not_be_read(tmp_path: Path, monkeypatch: py
     assert "fognav ca create" in check.found
 
 
-def test_added_robot_gets_one_file_and_a_removed_one_is_unknown(locks: SiteLocks) -> None:
+def test_added_robot_gets_one_file_and_a_removed_one_is_unknown(security: SiteSecurity) -> None:
     file = Path(run("robot", "add", "r9", "--json")["credentials"])
     assert Credentials.read(file).user == "r9"
     assert set(Credentials.read(file).passwords) == {"zenoh"}
     assert stat.S_IMODE(file.stat().st_mode) == 0o600
-    assert "r9" in locks.users()
+    assert "r9" in security.users()
     run("robot", "add", "r9", "--remove", "--json")
-    assert "r9" not in locks.users()
+    assert "r9" not in security.users()
     for words, reason in (
         (("r9", "--remove"), "there is no robot r9"), (("R 9",), "an id has only"), (("planner",), "name of a part"),
     ):  # fmt: skip
@@ -91,19 +91,19 @@ def test_added_robot_gets_one_file_and_a_removed_one_is_unknown(locks: SiteLocks
         assert reason in done.output.replace("\n", " ")
 
 
-def test_added_node_s_board_gets_the_password_and_the_authority(locks: SiteLocks, tmp_path: Path) -> None:
+def test_added_node_s_board_gets_the_password_and_the_authority(security: SiteSecurity, tmp_path: Path) -> None:
     floor = Path(shutil.copytree(ROOT / "sites" / "estig", tmp_path / "floor"))
     network = ("--wifi", "Lab", "--wifi-password", "secret12", "--fog-host", "192.168.7.1")
     words = ("--area", "z4", "--pose", "33.20,38.15,1.5708", *network, "--site", str(floor))
     run("node", "add", "n8", *words, "--out", str(tmp_path / "board"), "--json")
     board = json.loads((tmp_path / "board" / "node.json").read_text())
     assert (board["user"], board["tls"]) == ("n8", True)
-    assert (tmp_path / "board" / "ca.pem").read_text().strip() == locks.authority.trusted.strip()
-    assert "n8" in locks.users()
-    assert not locks.credentials("n8").exists()
+    assert (tmp_path / "board" / "ca.pem").read_text().strip() == security.authority.trusted.strip()
+    assert "n8" in security.users()
+    assert not security.credentials("n8").exists()
 
 
-def test_token_is_handed_out_as_one_file_with_the_authority(locks: SiteLocks, tmp_path: Path) -> None:
+def test_token_is_handed_out_as_one_file_with_the_authority(security: SiteSecurity, tmp_path: Path) -> None:
     tokens = tmp_path / "tokens.toml"
     tokens.write_text("")
     create_token(tokens, "first", "admin")
@@ -111,7 +111,7 @@ def test_token_is_handed_out_as_one_file_with_the_authority(locks: SiteLocks, tm
     run("token", "create", "anna", "--role", "operator", "--file", str(tokens), "--out", str(out), "--json")
     credentials = Credentials.read(out)
     assert (credentials.user, len(credentials.token) > 30, credentials.passwords) == ("anna", True, {})
-    assert credentials.authority.strip() == locks.authority.trusted.strip()
+    assert credentials.authority.strip() == security.authority.trusted.strip()
     assert credentials.token not in tokens.read_text()
     again = invoke("token", "create", "bob", "--file", str(tokens), "--out", str(out))
     assert "already exists" in again.output.replace("\n", " ")

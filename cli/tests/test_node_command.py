@@ -27,7 +27,7 @@ from fog_contracts import channels as ch
 from fog_contracts.messages import NodeCalibration, NodeConfig, NodeReading
 from fog_contracts.site import NodeSite, Sonar
 from fog_runtime.configuration.site import load_site
-from fog_runtime.locks.site_locks import SiteLocks
+from fog_runtime.security.site_security import SiteSecurity
 from fog_supervisor.servers import start_mosquitto
 from fognav import site_files
 from fognav.commands import node as node_command
@@ -178,8 +178,8 @@ def test_node_that_would_be_of_no_use_is_refused_and_nothing_is_written(floor, p
 
 
 @pytest.fixture
-def locks(tmp_path: Path) -> Path:
-    made = SiteLocks(tmp_path / "locks", "estig")
+def security(tmp_path: Path) -> Path:
+    made = SiteSecurity(tmp_path / "locks", "estig")
     made.make(["fog.example", "192.168.7.1"])
     return made.directory
 
@@ -219,9 +219,11 @@ def new_board(floor: Path, *words: str) -> Result:
         ),
     ],
 )
-def test_settings_by_which_no_board_could_connect_are_refused_and_nothing_is_written(floor, locks, words, says) -> None:
+def test_settings_by_which_no_board_could_connect_are_refused_and_nothing_is_written(
+    floor, security, words, says
+) -> None:
     before = (floor / "site.toml").read_bytes()
-    done = new_board(floor, *(str(locks) if word == "LOCKS" else word for word in words))
+    done = new_board(floor, *(str(security) if word == "LOCKS" else word for word in words))
     assert done.exit_code == 2
     assert says in " ".join(done.stderr.split())
     assert (floor / "site.toml").read_bytes() == before
@@ -251,9 +253,9 @@ def test_what_is_missing_is_asked_for_on_a_terminal(floor: Path) -> None:
 
 
 @pytest.mark.parametrize("host", ["192.168.7.1", "192.168.7.9", "fog.example"])
-def test_board_behind_locks_gets_a_password_and_whom_to_trust(floor: Path, locks: Path, host: str) -> None:
+def test_board_behind_locks_gets_a_password_and_whom_to_trust(floor: Path, security: Path, host: str) -> None:
     """An address need not be in the certificate: the firmware compares a name that is."""
-    done = new_board(floor, "--wifi-password", "", "--fog-host", host, "--locks", str(locks))
+    done = new_board(floor, "--wifi-password", "", "--fog-host", host, "--locks", str(security))
     assert done.exit_code == 0, done.stderr
     written = json.loads((floor / "board" / "node.json").read_bytes())
     assert (written["broker"], written["port"], written["tls"]) == (host, 8883, True)
@@ -266,8 +268,8 @@ def test_board_behind_locks_gets_a_password_and_whom_to_trust(floor: Path, locks
 
 
 @pytest.mark.parametrize("profile", ["standard", "thesis"])
-def test_board_for_esphome_gets_all_that_its_configuration_reads(floor: Path, locks: Path, profile: str) -> None:
-    words = ("--wifi-password", "a'b\"cdefg", "--locks", str(locks), "--firmware", "esphome", "--profile", profile)
+def test_board_for_esphome_gets_all_that_its_configuration_reads(floor: Path, security: Path, profile: str) -> None:
+    words = ("--wifi-password", "a'b\"cdefg", "--locks", str(security), "--firmware", "esphome", "--profile", profile)
     done = new_board(floor, "--fog-host", "192.168.7.1", *words)
     assert done.exit_code == 0, done.stderr
     assert "esphome run" in done.stderr
@@ -293,8 +295,8 @@ def test_configuration_for_esphome_uses_the_topics_and_fields_of_the_contract() 
 
 
 @pytest.mark.skipif("FOGNAV_ESPHOME" not in os.environ, reason="FOGNAV_ESPHOME names no `esphome` to check with")
-def test_esphome_finds_the_configuration_valid(floor: Path, locks: Path) -> None:
-    words = ("--wifi-password", "secret12", "--locks", str(locks), "--firmware", "esphome")
+def test_esphome_finds_the_configuration_valid(floor: Path, security: Path) -> None:
+    words = ("--wifi-password", "secret12", "--locks", str(security), "--firmware", "esphome")
     assert new_board(floor, "--fog-host", "192.168.7.1", *words).exit_code == 0
     command = [os.environ["FOGNAV_ESPHOME"], "config", str(floor / "board" / "fognav-node.yaml")]
     done = subprocess.run(command, capture_output=True, text=True, check=False, env={**os.environ, "HOME": str(floor)})

@@ -80,7 +80,7 @@ def test_file_that_can_not_be_read_is_named_in_the_index(tmp_path):
 
 def test_backup_is_restored_on_an_empty_machine_and_tells_which_recordings_are_gone(data, tmp_path):
     folder, site = NodeFolder(data), shutil.copytree(ESTIG, tmp_path / "site")
-    hosted_sites([site], folder.locks, ["localhost", "127.0.0.1"])
+    hosted_sites([site], folder.security, ["localhost", "127.0.0.1"])
     token = (folder.keys("estig") / "admin.token").read_text()
     folders.remember(folder.path, folders.settings_of({"estig": site}, "127.0.0.1", [], simulate=False))
     file = tmp_path / "fog.tar.gz"
@@ -113,7 +113,7 @@ def test_backup_is_restored_on_an_empty_machine_and_tells_which_recordings_are_g
 
 def test_index_that_can_not_be_written_is_told_and_the_rest_is_backed_up(data, tmp_path):
     folder, site = NodeFolder(data), shutil.copytree(ESTIG, tmp_path / "site")
-    hosted_sites([site], folder.locks, ["localhost", "127.0.0.1"])
+    hosted_sites([site], folder.security, ["localhost", "127.0.0.1"])
     token = (folder.keys("estig") / "admin.token").read_bytes()
     folders.remember(folder.path, folders.settings_of({"estig": site}, "127.0.0.1", [], simulate=False))
     backups.index_folder(folder.path).write_text("a file in the place of the folder")
@@ -134,7 +134,7 @@ def test_index_that_can_not_be_written_is_told_and_the_rest_is_backed_up(data, t
 
 def test_recordings_of_a_later_backup_are_named_though_another_floor_s_index_is_there(data, tmp_path):
     folder, site = NodeFolder(data), shutil.copytree(ESTIG, tmp_path / "site")
-    hosted_sites([site], folder.locks, ["localhost", "127.0.0.1"])
+    hosted_sites([site], folder.security, ["localhost", "127.0.0.1"])
     folder.keys("estig")
     folders.remember(folder.path, folders.settings_of({"estig": site}, "127.0.0.1", [], simulate=False))
     asyncio.run(backups.create(tmp_path / "fog.tar.gz", folder, None))

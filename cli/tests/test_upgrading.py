@@ -55,7 +55,7 @@ def add_version(tmp_path: Path) -> Callable[..., str]:
 @pytest.fixture
 def folder(tmp_path: Path) -> NodeFolder:
     made = NodeFolder(tmp_path / "data")
-    hosted_sites([ESTIG], made.locks, ["localhost", "127.0.0.1"])
+    hosted_sites([ESTIG], made.security, ["localhost", "127.0.0.1"])
     made.keys("estig")
     folders.remember(made.path, folders.settings_of({"estig": ESTIG}, "127.0.0.1", [], simulate=False))
     return made

@@ -10,7 +10,7 @@ from cryptography.hazmat.primitives.serialization import Encoding, PublicFormat
 
 from fog_contracts.channels import BROKER_NAME
 from fog_runtime.credentials import Credentials
-from fog_runtime.locks.site_locks import AUTHORITY, SiteLocks
+from fog_runtime.security.site_security import AUTHORITY, SiteSecurity
 from fog_supervisor.servers import start_mosquitto
 
 BAD_SERVER_NAME = 56
@@ -30,15 +30,15 @@ def probe(firmware, compiler, tmp_path_factory):
 
 
 @pytest.fixture(scope="module")
-def locks(tmp_path_factory):
-    made = SiteLocks(tmp_path_factory.mktemp("locks"), "lab")
+def security(tmp_path_factory):
+    made = SiteSecurity(tmp_path_factory.mktemp("locks"), "lab")
     made.make(["127.0.0.1", "fog.lan"], nodes=["n1"])
     return made
 
 
 @pytest.fixture(scope="module")
-def broker(locks, tmp_path_factory):
-    with start_mosquitto(tmp_path_factory.mktemp("broker"), locks=locks.folder("mosquitto")) as server:
+def broker(security, tmp_path_factory):
+    with start_mosquitto(tmp_path_factory.mktemp("broker"), security=security.folder("mosquitto")) as server:
         yield server
 
 
@@ -49,13 +49,13 @@ def hello(user, password):
     return bytes([0x10, len(body)]) + body
 
 
-def answer(probe, firmware, broker, locks, name):
+def answer(probe, firmware, broker, security, name):
     """Return what the library says after connecting with the sizes that the firmware has."""
     text = (firmware / "src" / "broker_transport.cpp").read_text()
     sizes = [re.search(rf"{each} = (\d+);", text)[1] for each in ("kReceiveSize", "kSendSize")]
-    authority = x509.load_pem_x509_certificate((locks.folder("mosquitto").parent / AUTHORITY).read_bytes())
+    authority = x509.load_pem_x509_certificate((security.folder("mosquitto").parent / AUTHORITY).read_bytes())
     point = authority.public_key().public_bytes(Encoding.X962, PublicFormat.UncompressedPoint)
-    own = Credentials.read(locks.credentials("n1"))
+    own = Credentials.read(security.credentials("n1"))
     words = [str(broker.port), name, authority.subject.public_bytes().hex(), point.hex(), *sizes]
     packet = hello("n1", own.passwords["mqtt"]).hex()
     return subprocess.run([probe, *words, packet], check=True, capture_output=True, text=True, timeout=60).stdout
@@ -63,17 +63,17 @@ def answer(probe, firmware, broker, locks, name):
 
 @pytest.mark.live
 @pytest.mark.parametrize("name", [BROKER_NAME, "fog.lan"])
-def test_broker_lets_a_node_in_whose_buffers_fit_into_an_esp8266(probe, firmware, broker, locks, name):
-    assert answer(probe, firmware, broker, locks, name) == "20020000\n"  # CONNACK, accepted
+def test_broker_lets_a_node_in_whose_buffers_fit_into_an_esp8266(probe, firmware, broker, security, name):
+    assert answer(probe, firmware, broker, security, name) == "20020000\n"  # CONNACK, accepted
 
 
 @pytest.mark.live
-def test_address_of_the_broker_is_no_name_in_its_certificate(probe, firmware, broker, locks):
-    assert f"error {BAD_SERVER_NAME}" in answer(probe, firmware, broker, locks, "127.0.0.1")
+def test_address_of_the_broker_is_no_name_in_its_certificate(probe, firmware, broker, security):
+    assert f"error {BAD_SERVER_NAME}" in answer(probe, firmware, broker, security, "127.0.0.1")
 
 
 @pytest.mark.live
-def test_broker_of_another_authority_is_not_trusted(probe, firmware, broker, locks, tmp_path):
-    stranger = SiteLocks(tmp_path / "stranger", "lab")
+def test_broker_of_another_authority_is_not_trusted(probe, firmware, broker, security, tmp_path):
+    stranger = SiteSecurity(tmp_path / "stranger", "lab")
     stranger.make(["127.0.0.1"], nodes=["n1"])
     assert f"error {NOT_TRUSTED}" in answer(probe, firmware, broker, stranger, BROKER_NAME)

@@ -52,7 +52,7 @@ async def test_fog_node_comes_back_on_an_empty_machine(fog, tokens, tmp_path, mo
         fog.kill("map_service")
         for folder in (fog.site, fog.folder / "data", secrets):
             shutil.rmtree(folder)
-        with start_redis(tmp_path / "new-redis", locks=fog.locks.folder("redis")) as redis:
+        with start_redis(tmp_path / "new-redis", security=fog.security.folder("redis")) as redis:
             assert "restored site test" in await run("restore", file, *places[:-1], redis.url)
             fog.start("map_service", FOGNAV_REDIS_URL=redis.url, FOGNAV_TOKENS_FILE=str(secrets / "tokens.toml"))
             url = await fog.ready("map_service")

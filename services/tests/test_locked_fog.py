@@ -6,7 +6,7 @@ import httpx
 import pytest
 
 from fog_runtime.credentials import Credentials
-from fog_runtime.locks.site_locks import SiteLocks
+from fog_runtime.security.site_security import SiteSecurity
 
 pytestmark = pytest.mark.live
 
@@ -15,7 +15,7 @@ SERVICES = {"hazard_aggregator": "hazard-aggregator", "map_service": "map-servic
 
 
 async def test_services_work_over_https_with_their_own_credentials(fog):
-    http = fog.locks.folder("http")
+    http = fog.security.folder("http")
     certificate = {
         "FOGNAV_HTTP_CERTIFICATE_FILE": str(http / "server.pem"),
         "FOGNAV_HTTP_KEY_FILE": str(http / "server.key"),
@@ -23,7 +23,7 @@ async def test_services_work_over_https_with_their_own_credentials(fog):
     for module in SERVICES:
         fog.start(module, **certificate)
     async with httpx.AsyncClient(
-        verify=Credentials.read(fog.locks.credentials("console")).tls_context(), timeout=60
+        verify=Credentials.read(fog.security.credentials("console")).tls_context(), timeout=60
     ) as client:
         for module, user in SERVICES.items():
             url = (await fog.url(module)).replace("http:", "https:")
@@ -34,7 +34,7 @@ async def test_services_work_over_https_with_their_own_credentials(fog):
             with pytest.raises(httpx.HTTPError):
                 await client.get(f"{url.replace('https:', 'http:')}/healthz")
             assert '"url": "https://' in fog.log(module)
-            for secret in Credentials.read(fog.locks.credentials(user)).passwords.values():
+            for secret in Credentials.read(fog.security.credentials(user)).passwords.values():
                 assert secret not in fog.log(module)
 
 
@@ -49,8 +49,8 @@ async def test_service_without_credentials_gets_in_nowhere(fog, until):
 
 
 async def test_service_whose_certificate_is_unusable_says_which_file(fog):
-    key = fog.locks.folder("http") / "server.key"
-    other = SiteLocks(fog.folder / "other", "test")
+    key = fog.security.folder("http") / "server.key"
+    other = SiteSecurity(fog.folder / "other", "test")
     other.make(["127.0.0.1"])
     certificate = other.folder("http") / "server.pem"
     fog.start("planner", FOGNAV_HTTP_CERTIFICATE_FILE=str(certificate), FOGNAV_HTTP_KEY_FILE=str(key))

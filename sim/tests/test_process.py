@@ -19,7 +19,7 @@ from fog_contracts.grid import GridGeometry, StaticMap
 from fog_contracts.messages import CommandReply, NodeReading, Pose, SimCommand, SimObstacle, SimTruth
 from fog_runtime.clock import SystemClock
 from fog_runtime.configuration.maps import save_map
-from fog_runtime.locks.site_locks import CREDENTIALS
+from fog_runtime.security.site_security import CREDENTIALS
 from fog_runtime.transports.mqtt_edge import MqttEdge
 from fog_runtime.transports.zenoh_edge import ZenohEdge
 
@@ -71,7 +71,7 @@ class Rig:
             "MQTT_URL": self.mqtt_url,
             "ZENOH_CONNECT": self.zenoh,
             "SPEED": speed,
-            "NODE_CREDENTIALS_DIR": self.site.locks.directory / CREDENTIALS,
+            "NODE_CREDENTIALS_DIR": self.site.security.directory / CREDENTIALS,
         }
         environment = os.environ | self.site.environment("sim") | {f"FOGNAV_{key}": str(v) for key, v in values.items()}
         return programs.start("fognav_sim", environment, self.folder / "sim.log")

@@ -21,7 +21,7 @@ from PIL import Image
 
 from fog_contracts.costs import LETHAL
 from fog_runtime.configuration.site import load_site
-from fog_runtime.locks.site_locks import SiteLocks
+from fog_runtime.security.site_security import SiteSecurity
 from fog_supervisor import child, net
 from fog_supervisor.servers import start_mosquitto, start_redis, start_router
 
@@ -54,9 +54,9 @@ class Lab:
             start_router(folder / "zenoh"),
         ]
         broker, redis, router = self.servers
-        # A board gets its password from locks; the broker of this test lets in everybody.
-        self.locks = folder / "locks"
-        SiteLocks(self.locks, "estig").make(["fog.example"])
+        # A board gets its password from credentials; the broker of this test lets in everybody.
+        self.security = folder / "locks"
+        SiteSecurity(self.security, "estig").make(["fog.example"])
         self.port, self.map_port = net.free_port(), net.free_port()
         runtime = folder / "runtime"
         runtime.mkdir(mode=0o700)
@@ -98,7 +98,7 @@ class Lab:
     def words(self, command: str) -> list[str]:
         """The command with the page's folders in the test's, run by this interpreter."""
         inside = {name: str(self.folder / name) for name in ("floor", "board", "coverage.png")}
-        inside["~/.local/share/fognav/locks"] = str(self.locks)
+        inside["~/.local/share/fognav/locks"] = str(self.security)
         words = [inside.get(word, word) for word in shlex.split(command)]
         return [sys.executable, "-m", "fognav", *words[1:]] if words[0] == "./fognav" else words
 

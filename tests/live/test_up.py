@@ -136,10 +136,10 @@ def require_new_node_and_robot_admitted(node: Node, folder: Path) -> None:
     """Add a node and a robot to a running fog node, of which only the router may notice."""
     site, board = shutil.copytree(ROOT / "sites" / "estig", folder / "site"), folder / "board"
     before = node.systems()["estig"]["pids"]
-    locks = ("--locks", str(node.data / "locks"))
+    security = ("--locks", str(node.data / "locks"))
     place = ("--area", "z1", "--pose", "40.0,26.95,1.5708")
     network = ("--wifi", "Lab", "--wifi-password", "secret12", "--fog-host", "192.168.7.1")
-    node.run("node", "add", "n8", *place, *network, "--site", str(site), "--out", str(board), *locks)
+    node.run("node", "add", "n8", *place, *network, "--site", str(site), "--out", str(board), *security)
     node.wait(lambda: "changed: mosquitto uses" in node.printed.read_text(), "the broker knows the node")
     password = json.loads((board / "node.json").read_bytes())["password"]
     port = int(node.environment["FOGNAV_MQTT_PORT"])
@@ -147,7 +147,7 @@ def require_new_node_and_robot_admitted(node: Node, folder: Path) -> None:
     assert not admitted(port, "n8", "wrong")
     assert node.systems()["estig"]["pids"] == before
 
-    node.run("robot", "add", "r2", *locks)
+    node.run("robot", "add", "r2", *security)
     node.wait(lambda: "changed: zenoh-router uses" in node.printed.read_text(), "the router knows the robot")
     node.wait(lambda: "planner/estig" in (node.systems()["estig"]["connected"] or []), "it is connected again")
     after = node.systems()["estig"]["pids"]

@@ -132,7 +132,7 @@ ON_REST = ATTACKS | {
 
 @pytest.mark.parametrize("name", ON_REST)
 async def test_rest_stops_robots_while_strangers_fill_its_connections(site, tmp_path, capfd, name):
-    folder = site.locks.folder("http")
+    folder = site.security.folder("http")
     certificate = ServerCertificate(folder / "server.pem", folder / "server.key")
     with few_files():
         fronts = running_front(small_app, tmp_path, certificate=certificate)
@@ -246,7 +246,7 @@ async def test_client_of_one_user_ends_no_connection_of_another_by_its_id(site, 
 async def test_router_to_which_no_session_can_be_opened_ends_and_is_started_again(site, tmp_path):
     """As when something in it hangs: its process runs, and its port accepts connections, for nothing."""
     folder = SystemFolder(tmp_path)
-    program = router_program(net.free_port(), locks=site.locks.folder("zenoh"))
+    program = router_program(net.free_port(), security=site.security.folder("zenoh"))
     async with Supervisor(lambda _: None) as supervisor:
         ProgramSet(supervisor, folder, {}).add_server(program)
         supervisor.start(program.name)

@@ -13,7 +13,7 @@ from fog_contracts import channels as ch
 from fog_contracts import messages as m
 from fog_runtime.clock import SystemClock
 from fog_runtime.credentials import Credentials
-from fog_runtime.locks.site_locks import SiteLocks
+from fog_runtime.security.site_security import SiteSecurity
 from fog_runtime.stores.redis_connection import RedisConnection, StoreError
 from fog_runtime.transports.mqtt_connection import Broker
 from fog_runtime.transports.zenoh_edge import ZenohEdge
@@ -29,8 +29,8 @@ MQTT_CONNECT = b"\x10\x0f\x00\x04MQTT\x05\x02\x00\x0a\x00\x00\x02me"
 
 
 @pytest.fixture(scope="module")
-def locks(tmp_path_factory):
-    made = SiteLocks(tmp_path_factory.mktemp("locks"), "lab")
+def security(tmp_path_factory):
+    made = SiteSecurity(tmp_path_factory.mktemp("locks"), "lab")
     made.make(HOSTS, robots=["r1", "r2"], nodes=["n1", "n2"])
     made.add_floor("attic", robots=["r1"], nodes=["n1"])
     made.add_device("zigbee2mqtt", ["zigbee2mqtt/#"])
@@ -38,12 +38,12 @@ def locks(tmp_path_factory):
 
 
 @pytest.fixture(scope="module")
-def servers(locks, tmp_path_factory):
+def servers(security, tmp_path_factory):
     folder = tmp_path_factory.mktemp("servers")
     with (
-        start_mosquitto(folder / "mosquitto", locks=locks.folder("mosquitto")) as broker,
-        start_redis(folder / "redis", locks=locks.folder("redis")) as redis,
-        start_router(folder / "router", locks=locks.folder("zenoh")) as router,
+        start_mosquitto(folder / "mosquitto", security=security.folder("mosquitto")) as broker,
+        start_redis(folder / "redis", security=security.folder("redis")) as redis,
+        start_router(folder / "router", security=security.folder("zenoh")) as router,
     ):
         yield {"mosquitto": broker, "redis": redis, "zenoh": router}
 
@@ -59,8 +59,8 @@ def test_server_answers_nobody_who_does_not_encrypt(servers, program, said):
     assert not answer.startswith((b"\x20", b"+PONG", b"-NOAUTH")), answer
 
 
-def test_broker_refuses_who_gives_no_name(servers, locks):
-    context = Credentials.read(locks.credentials("n1")).tls_context()
+def test_broker_refuses_who_gives_no_name(servers, security):
+    context = Credentials.read(security.credentials("n1")).tls_context()
     with socket.create_connection(("127.0.0.1", servers["mosquitto"].port), timeout=WAIT_S) as connection:
         encrypted = context.wrap_socket(connection, server_hostname="localhost")
         encrypted.sendall(MQTT_CONNECT)
@@ -71,9 +71,9 @@ def test_broker_refuses_who_gives_no_name(servers, locks):
 
 
 @pytest.mark.parametrize("program", ["mosquitto", "redis", "zenoh"])
-def test_certificate_proves_the_server_s_name_and_no_other(servers, locks, program):
+def test_certificate_proves_the_server_s_name_and_no_other(servers, security, program):
     """Who can redirect a connection, but has no key of the server, is noticed."""
-    context = Credentials.read(locks.credentials("planner")).tls_context()
+    context = Credentials.read(security.credentials("planner")).tls_context()
     for name, accepted in (("localhost", True), ("127.0.0.1", True), ("fog.example", False)):
         with socket.create_connection(("127.0.0.1", servers[program].port), timeout=WAIT_S) as connection:
             if accepted:
@@ -105,19 +105,19 @@ def publish_results(server, credentials, topics):
         client.loop_stop()
 
 
-def test_node_publishes_as_itself_and_neither_as_another_nor_as_a_service(servers, locks):
+def test_node_publishes_as_itself_and_neither_as_another_nor_as_a_service(servers, security):
     topics = [
         ch.NODE_READING.key(site="lab", node="n1"),
         ch.NODE_READING.key(site="lab", node="n2"),
         ch.AREA_HAZARD.key(site="lab", area="hall"),
         ch.NODE_UPDATE.key(site="lab", node="n1"),
     ]
-    own, *others = publish_results(servers["mosquitto"], Credentials.read(locks.credentials("n1")), topics)
+    own, *others = publish_results(servers["mosquitto"], Credentials.read(security.credentials("n1")), topics)
     assert own in {"Success", "No matching subscribers"}
     assert others == ["Not authorized"] * 3
 
 
-def test_nodes_and_services_of_a_floor_publish_nothing_on_another(servers, locks):
+def test_nodes_and_services_of_a_floor_publish_nothing_on_another(servers, security):
     """The same ids on two floors of one broker are two users, and the thesis's topics belong to the first floor."""
     reading = {site: ch.NODE_READING.key(site=site, node="n1") for site in ("lab", "attic")}
     hazard = {site: ch.AREA_HAZARD.key(site=site, area="hall") for site in ("lab", "attic")}
@@ -127,16 +127,18 @@ def test_nodes_and_services_of_a_floor_publish_nothing_on_another(servers, locks
         ("hazard-aggregator", [hazard["lab"], "WSN"], [hazard["attic"]]),
         ("attic.hazard-aggregator", [hazard["attic"]], [hazard["lab"], "WSN"]),
     ):
-        answers = publish_results(servers["mosquitto"], Credentials.read(locks.credentials(user)), [*allowed, *refused])
+        answers = publish_results(
+            servers["mosquitto"], Credentials.read(security.credentials(user)), [*allowed, *refused]
+        )
         assert set(answers[: len(allowed)]) <= {"Success", "No matching subscribers"}, user
         assert answers[len(allowed) :] == ["Not authorized"] * len(refused), user
 
 
-async def test_robot_is_heard_on_its_own_floor_only(servers, locks):
+async def test_robot_is_heard_on_its_own_floor_only(servers, security):
     clock = SystemClock()
 
     def opened(user, role, site):
-        own = Credentials.read(locks.credentials(user))
+        own = Credentials.read(security.credentials(user))
         return ZenohEdge.open(
             connect=[servers["zenoh"].url], clock=clock, role=role, id=user.rpartition(".")[2], site=site,
             credentials=own,
@@ -166,8 +168,8 @@ async def test_robot_is_heard_on_its_own_floor_only(servers, locks):
     assert heard == {"lab": {1.0}, "attic": {2.0}}
 
 
-async def test_service_stores_nothing_for_another_floor(servers, locks):
-    own = Credentials.read(locks.credentials("attic.map-service"))
+async def test_service_stores_nothing_for_another_floor(servers, security):
+    own = Credentials.read(security.credentials("attic.map-service"))
     redis = RedisConnection(servers["redis"].url, timeout_s=WAIT_S, credentials=own)
     try:
         await redis.write(("HSET", "fog:attic:zones", "a", "b"))
@@ -177,13 +179,13 @@ async def test_service_stores_nothing_for_another_floor(servers, locks):
         await redis.aclose()
 
 
-def test_locks_that_are_made_again_keep_the_floors(locks):
-    before = {user: locks.credentials(user).read_text() for user in ("attic.n1", "attic.planner", "n1")}
-    again = SiteLocks(locks.directory, "lab")
+def test_locks_that_are_made_again_keep_the_floors(security):
+    before = {user: security.credentials(user).read_text() for user in ("attic.n1", "attic.planner", "n1")}
+    again = SiteSecurity(security.directory, "lab")
     again.make(HOSTS, robots=["r1", "r2"], nodes=["n1", "n2"])
     assert again.sites == ["lab", "attic"]
     assert {user: again.credentials(user).read_text() for user in before} == before
-    assert "user attic.n1" in (locks.folder("mosquitto") / "access").read_text()
+    assert "user attic.n1" in (security.folder("mosquitto") / "access").read_text()
 
 
 @pytest.mark.parametrize(
@@ -193,18 +195,18 @@ def test_locks_that_are_made_again_keep_the_floors(locks):
         ("thesis-node", ch.THESIS_AREA.key(number="3"), ch.THESIS_WSN.key()),
     ],
 )
-def test_sensors_of_others_publish_on_their_own_topics_only(servers, locks, user, own, of_others):
+def test_sensors_of_others_publish_on_their_own_topics_only(servers, security, user, own, of_others):
     topics = [own, of_others, ch.AREA_HAZARD.key(site="lab", area="hall"), ch.NODE_READING.key(site="lab", node="n1")]
-    done, *refused = publish_results(servers["mosquitto"], Credentials.read(locks.credentials(user)), topics)
+    done, *refused = publish_results(servers["mosquitto"], Credentials.read(security.credentials(user)), topics)
     assert done in {"Success", "No matching subscribers"}
     assert refused == ["Not authorized"] * 3
 
 
-async def test_home_assistant_discovers_the_areas_of_all_floors_and_its_states_are_sources_there(servers, locks):
+async def test_home_assistant_discovers_the_areas_of_all_floors_and_its_states_are_sources_there(servers, security):
     """It has one connection: for discovery, its birth and will messages, and `mqtt_statestream`."""
 
     def client(user):
-        own = Credentials.read(locks.credentials(user))
+        own = Credentials.read(security.credentials(user))
         return Broker.of(servers["mosquitto"].url, own).client(user, None)
 
     async def topics(connection, number):
@@ -239,15 +241,15 @@ async def test_home_assistant_discovers_the_areas_of_all_floors_and_its_states_a
         for connection in (lab, up):
             assert await topics(connection, 2) == {state, "homeassistant/status"}
     refused = [ch.HOME_ASSISTANT_AREA.key(site="lab", area="hall"), ch.AREA_HAZARD.key(site="lab", area="hall"), "door"]
-    own = Credentials.read(locks.credentials("home-assistant"))
+    own = Credentials.read(security.credentials("home-assistant"))
     assert publish_results(servers["mosquitto"], own, refused) == ["Not authorized"] * len(refused)
 
 
-async def test_robot_neither_changes_the_map_nor_speaks_for_another_robot(servers, locks):
+async def test_robot_neither_changes_the_map_nor_speaks_for_another_robot(servers, security):
     clock = SystemClock()
 
     def opened(user, role):
-        own = Credentials.read(locks.credentials(user))
+        own = Credentials.read(security.credentials(user))
         return ZenohEdge.open(
             connect=[servers["zenoh"].url], clock=clock, role=role, id=user, site="lab", credentials=own
         )

@@ -1,4 +1,4 @@
-"""Servers behind the locks of a site, as in the field: what is off in tests is broken there."""
+"""Servers behind the credentials of a site, as in the field: what is off in tests is broken there."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ from contextlib import contextmanager
 from typing import TYPE_CHECKING, Final
 
 from fog_runtime.credentials import VARIABLE, Credentials
-from fog_runtime.locks.site_locks import SiteLocks
+from fog_runtime.security.site_security import SiteSecurity
 from fog_supervisor.servers import Server, start_mosquitto, start_redis, start_router
 
 if TYPE_CHECKING:
@@ -18,37 +18,37 @@ TESTER: Final = "test"
 
 
 class LockedSite:
-    """The locks of a site in a folder, and its servers."""
+    """The credentials of a site in a folder, and its servers."""
 
     def __init__(self, folder: Path, site: str, *, robots: Sequence[str] = (), nodes: Sequence[str] = ()) -> None:
-        """Make the locks for these robots and nodes."""
+        """Make the credentials for these robots and nodes."""
         self._folder = folder
-        self.locks = SiteLocks(folder / "locks", site, unrestricted=[TESTER])
-        self.locks.make(["127.0.0.1", "localhost"], robots=robots, nodes=nodes)
+        self.security = SiteSecurity(folder / "locks", site, unrestricted=[TESTER])
+        self.security.make(["127.0.0.1", "localhost"], robots=robots, nodes=nodes)
 
     def environment(self, user: str) -> dict[str, str]:
         """Return the variable by which a process is this user."""
-        return {VARIABLE: str(self.locks.credentials(user))}
+        return {VARIABLE: str(self.security.credentials(user))}
 
     def credentials(self, user: str = TESTER) -> Credentials:
         """Return a user's credentials."""
-        return Credentials.read(self.locks.credentials(user))
+        return Credentials.read(self.security.credentials(user))
 
     def mosquitto(self) -> Server:
         """Start the broker."""
-        return start_mosquitto(self._folder / "mosquitto", locks=self.locks.folder("mosquitto"))
+        return start_mosquitto(self._folder / "mosquitto", security=self.security.folder("mosquitto"))
 
     def redis(self) -> Server:
         """Start Redis."""
-        return start_redis(self._folder / "redis", locks=self.locks.folder("redis"))
+        return start_redis(self._folder / "redis", security=self.security.folder("redis"))
 
     def router(self) -> Server:
         """Start the router."""
-        return start_router(self._folder / "router", locks=self.locks.folder("zenoh"))
+        return start_router(self._folder / "router", security=self.security.folder("zenoh"))
 
 
 class LockedRouter:
-    """A running router, and the locks of its site."""
+    """A running router, and the credentials of its site."""
 
     def __init__(self, server: Server, site: LockedSite) -> None:
         self.url = server.url
@@ -57,7 +57,7 @@ class LockedRouter:
 
 @contextmanager
 def locked_router(folder: Path, site: str, *, robots: Sequence[str] = ()) -> Iterator[LockedRouter]:
-    """Run a router with locks for these robots."""
+    """Run a router with credentials for these robots."""
     locked = LockedSite(folder, site, robots=robots)
     with locked.router() as server:
         yield LockedRouter(server, locked)

@@ -17,8 +17,8 @@ import typer
 from rich.table import Table
 
 from fognav import checkout, kernels, system
-from fognav.locking import VARIABLE as LOCKS_VARIABLE
-from fognav.locking import locks_errors, locks_folder, open_locks
+from fognav.locking import VARIABLE as CREDENTIALS_DIR_VARIABLE
+from fognav.locking import credentials_folder, open_security, security_errors
 from fognav.operate.options import JsonOption
 from fognav.output import NOT_TRUE, OK, FailedError, WrongUseError, answers, print_json
 
@@ -109,15 +109,15 @@ def check_kernels() -> Check:
 
 def check_certificates() -> Check | None:
     """Check until when the certificates are valid that FOGNAV_CREDENTIALS_DIR names; None without any."""
-    folder = locks_folder(None)
+    folder = credentials_folder(None)
     if folder is None:
         return None
     try:
-        with locks_errors():
-            locks = open_locks(folder)
-            expiring, first = locks.expiring(), min(locks.expiries().values())
+        with security_errors():
+            security = open_security(folder)
+            expiring, first = security.expiring(), min(security.expiries().values())
     except FailedError as error:
-        return Check("certificates", "missing", str(error), f"correct {LOCKS_VARIABLE}, or restore a backup")
+        return Check("certificates", "missing", str(error), f"correct {CREDENTIALS_DIR_VARIABLE}, or restore a backup")
     found = f"the first expires on {first:%Y-%m-%d} ({folder})"
     if not expiring:
         return Check("certificates", "ok", found)

@@ -12,14 +12,14 @@ import typer
 
 from fog_runtime.credentials import VARIABLE as CREDENTIALS_VARIABLE
 from fog_runtime.credentials import Credentials, CredentialsError
-from fog_runtime.locks.authority import AuthorityError
-from fog_runtime.locks.site_locks import SiteLocks
-from fog_runtime.locks.users import LocksError
+from fog_runtime.security.authority import AuthorityError
+from fog_runtime.security.site_security import SiteSecurity
+from fog_runtime.security.users import SecurityError
 from fognav.output import FailedError, WrongUseError
 
 VARIABLE: Final = "FOGNAV_CREDENTIALS_DIR"
 _FORMER_VARIABLE: Final = "FOGNAV_LOCKS_DIR"
-LocksOption = Annotated[
+CredentialsOption = Annotated[
     Path | None,
     typer.Option(
         "--credentials",
@@ -30,7 +30,7 @@ LocksOption = Annotated[
 ]
 
 
-def locks_folder(given: Path | None) -> Path | None:
+def credentials_folder(given: Path | None) -> Path | None:
     """Return the folder that an option or the environment names, or None."""
     named = os.environ.get(VARIABLE) or os.environ.get(_FORMER_VARIABLE)
     return given or (Path(named) if named else None)
@@ -38,18 +38,18 @@ def locks_folder(given: Path | None) -> Path | None:
 
 def named_folder(given: Path | None) -> Path:
     """Return the folder that an option or the environment names; raises `WrongUseError` without one."""
-    folder = locks_folder(given)
+    folder = credentials_folder(given)
     if folder is None:
         raise WrongUseError(f"name the folder of the site's certificates and users with --credentials or {VARIABLE}")
     return folder
 
 
-def open_locks(given: Path | None) -> SiteLocks:
+def open_security(given: Path | None) -> SiteSecurity:
     """Open the certificates and users in the folder that an option or the environment names.
 
-    Raises `WrongUseError` without one, and `LocksError`.
+    Raises `WrongUseError` without one, and `SecurityError`.
     """
-    return SiteLocks.open(named_folder(given))
+    return SiteSecurity.open(named_folder(given))
 
 
 def own_credentials(default: str | None = None) -> Credentials:
@@ -65,11 +65,11 @@ def own_credentials(default: str | None = None) -> Credentials:
 
 
 @contextmanager
-def locks_errors() -> Iterator[None]:
+def security_errors() -> Iterator[None]:
     """Turn errors of certificates and users into those of commands."""
     try:
         yield
-    except (AuthorityError, LocksError) as error:
+    except (AuthorityError, SecurityError) as error:
         raise FailedError(str(error)) from error
     except OSError as error:
         if error.filename is None:

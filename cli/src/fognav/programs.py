@@ -42,8 +42,8 @@ MODULES: Final[Mapping[str, str]] = {
     AGENT: "robot_agent",
 }
 """The Python module of each program that is ours."""
-LOCKS: Final[Mapping[str, str]] = {BROKER: "mosquitto", REDIS: "redis", ROUTER: "zenoh"}
-"""The folder of each server's locks (`fog_runtime.locks.site_locks`)."""
+SECURITY: Final[Mapping[str, str]] = {BROKER: "mosquitto", REDIS: "redis", ROUTER: "zenoh"}
+"""The folder of each server's credentials (`fog_runtime.security.site_security`)."""
 _FOLDERS: Final = ("logs", "ports", "data")
 
 Ready = Callable[[], Awaitable[str | None]]
@@ -86,24 +86,24 @@ class SystemFolder:
 def server_programs(
     folder: SystemFolder,
     ports: ServerPorts,
-    locks: Callable[[str], Path | None],
+    security: Callable[[str], Path | None],
     embedded: Collection[str] = (),
 ) -> Sequence[ServerProgram]:
-    """Return broker, store and router, configured in the folder; `locks` gives the folder of each one's locks, if any.
+    """Return broker, store and router, configured in the folder; `security` gives the folder of each one's.
 
     Those named in `embedded` are Python packages instead (`servers.STAND_INS`). Raises `ServerError` when one is
     not installed.
     """
-    at = {name: locks(LOCKS[name]) for name in SERVERS}
+    at = {name: security(SECURITY[name]) for name in SERVERS}
     if BROKER in embedded:
-        broker = servers.embedded_broker_program(ports.mqtt, address=ports.address, locks=at[BROKER])
+        broker = servers.embedded_broker_program(ports.mqtt, address=ports.address, security=at[BROKER])
     else:
-        broker = servers.mosquitto_program(folder.data(BROKER), ports.mqtt, address=ports.address, locks=at[BROKER])
+        broker = servers.mosquitto_program(folder.data(BROKER), ports.mqtt, address=ports.address, security=at[BROKER])
     store = servers.embedded_redis_program if REDIS in embedded else servers.redis_program
     return (
         broker,
-        store(folder.data(REDIS), ports.redis, locks=at[REDIS]),
-        servers.router_program(ports.zenoh, address=ports.address, locks=at[ROUTER]),
+        store(folder.data(REDIS), ports.redis, security=at[REDIS]),
+        servers.router_program(ports.zenoh, address=ports.address, security=at[ROUTER]),
     )
 
 

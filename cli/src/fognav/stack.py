@@ -13,7 +13,7 @@ from fog_contracts.site import Site
 from fog_runtime.configuration.parts import DEFAULT_BASE, DEFAULT_LIDAR
 from fog_runtime.credentials import NOBODY, Credentials
 from fog_runtime.keys import ADMIN_TOKEN, OPERATOR_KEY, TOKENS, make_keys, read_operator_key
-from fog_runtime.locks.site_locks import CREDENTIALS, SiteLocks
+from fog_runtime.security.site_security import CREDENTIALS, SiteSecurity
 from fog_supervisor import net
 from fog_supervisor.supervisor import Event, Supervisor
 from fognav.programs import (
@@ -65,30 +65,30 @@ class StackDoors:
     """The doors of a stack in its folder; without `Doors` they stand open, and nobody has credentials."""
 
     def __init__(self, folder: Path, doors: Doors | None) -> None:
-        self._locks: SiteLocks | None = None
+        self._security: SiteSecurity | None = None
         if doors is not None:
-            self._locks = SiteLocks(folder / FOLDER, doors.site, unrestricted=doors.unrestricted)
-            self._locks.make([net.LOOPBACK, "localhost"], robots=doors.robots, nodes=doors.nodes)
+            self._security = SiteSecurity(folder / FOLDER, doors.site, unrestricted=doors.unrestricted)
+            self._security.make([net.LOOPBACK, "localhost"], robots=doors.robots, nodes=doors.nodes)
 
     def of(self, program: str) -> Path | None:
-        """Return the folder with the locks of a server program."""
-        return None if self._locks is None else self._locks.folder(program)
+        """Return the folder with the credentials of a server program."""
+        return None if self._security is None else self._security.folder(program)
 
     def file(self, user: str) -> Path | None:
         """Return the file of a user's credentials."""
-        return None if self._locks is None else self._locks.credentials(user)
+        return None if self._security is None else self._security.credentials(user)
 
     def credentials(self, user: str) -> Credentials:
         """Read a user's credentials."""
-        return NOBODY if self._locks is None else Credentials.read(self._locks.credentials(user))
+        return NOBODY if self._security is None else Credentials.read(self._security.credentials(user))
 
     def settings(self, user: str) -> Mapping[str, str]:
         """Return the settings of a process that is this user."""
-        return {} if self._locks is None else {"CREDENTIALS_FILE": str(self._locks.credentials(user))}
+        return {} if self._security is None else {"CREDENTIALS_FILE": str(self._security.credentials(user))}
 
     def node_settings(self) -> Mapping[str, str]:
         """Return the settings of a process that is every sensor node."""
-        return {} if self._locks is None else {"NODE_CREDENTIALS_DIR": str(self._locks.directory / CREDENTIALS)}
+        return {} if self._security is None else {"NODE_CREDENTIALS_DIR": str(self._security.directory / CREDENTIALS)}
 
 
 _SOCKET_PATH_LIMIT: Final = 80

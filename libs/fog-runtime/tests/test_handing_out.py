@@ -1,4 +1,4 @@
-"""The locks of a fog node in containers: each program gets its own, and nothing of the others."""
+"""The credentials of a fog node in containers: each program gets its own, and nothing of the others."""
 
 import os
 from pathlib import Path
@@ -7,9 +7,9 @@ import pytest
 
 from fog_runtime.credentials import Credentials
 from fog_runtime.keys import ADMIN_TOKEN, OPERATOR_KEY, TOKENS
-from fog_runtime.locks import __main__ as command
-from fog_runtime.locks.__main__ import OWNERS, SIMULATION
-from fog_runtime.locks.site_locks import SiteLocks
+from fog_runtime.security import __main__ as command
+from fog_runtime.security.__main__ import OWNERS, SIMULATION
+from fog_runtime.security.site_security import SiteSecurity
 from fog_runtime.token_file import token_hash
 
 SITE = Path(__file__).parents[3] / "sites" / "estig"
@@ -21,13 +21,13 @@ class FogNode:
     """The folders of a fog node's containers, and the command that fills them."""
 
     def __init__(self, folder: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
-        self.locks = folder / "locks"
+        self.security = folder / "locks"
         self.out = folder / "out"
         for program in OWNERS.keys() - {SIMULATION}:
             (self.out / program).mkdir(parents=True)
         self._capsys = capsys
         monkeypatch.setenv("FOGNAV_SITE_DIR", str(SITE))
-        monkeypatch.setenv("FOGNAV_LOCKS_DIR", str(self.locks))
+        monkeypatch.setenv("FOGNAV_LOCKS_DIR", str(self.security))
         monkeypatch.setenv("FOGNAV_HANDED_OUT_DIR", str(self.out))
         monkeypatch.setenv("FOGNAV_HOSTS", "fog.local, 192.168.7.1")
 
@@ -54,7 +54,7 @@ def node(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.Capture
     fog_node = FogNode(tmp_path, monkeypatch, capsys)
     if os.geteuid() != 0:
         own = dict.fromkeys(OWNERS, os.geteuid())
-        monkeypatch.setattr("fog_runtime.locks.__main__.OWNERS", own)
+        monkeypatch.setattr("fog_runtime.security.__main__.OWNERS", own)
     fog_node.run()
     return fog_node
 
@@ -69,11 +69,13 @@ def test_each_program_gets_its_own_files(node):
 
 
 def test_no_program_has_a_secret_of_another(node):
-    assert node.holders((node.locks / OPERATOR_KEY).read_text().strip()) == {"planner"}
-    assert node.holders((node.locks / ADMIN_TOKEN).read_text().strip()) == set()
-    assert node.holders((node.locks / "authority.pem").read_text()[:200]) == set()
+    assert node.holders((node.security / OPERATOR_KEY).read_text().strip()) == {"planner"}
+    assert node.holders((node.security / ADMIN_TOKEN).read_text().strip()) == set()
+    assert node.holders((node.security / "authority.pem").read_text()[:200]) == set()
     for service in SERVICES:
-        for server, password in Credentials.read(SiteLocks.open(node.locks).credentials(service)).passwords.items():
+        for server, password in Credentials.read(
+            SiteSecurity.open(node.security).credentials(service)
+        ).passwords.items():
             # The router compares passwords as they are; broker and Redis have hashes.
             assert node.holders(password) == ({service, "zenoh"} if server == "zenoh" else {service})
 
@@ -115,11 +117,11 @@ def test_new_token_is_printed_even_if_it_can_not_be_handed_out(node, capsys):
     assert command.main(["token", "create", "ann", "operator"]) == 1
     printed = capsys.readouterr()
     assert TOKENS in printed.err
-    assert token_hash(printed.out.strip()) in (node.locks / TOKENS).read_text("utf-8")
+    assert token_hash(printed.out.strip()) in (node.security / TOKENS).read_text("utf-8")
 
 
 def test_simulated_robot_gets_secrets_only_where_one_is_wanted(node):
-    assert SIMULATION not in (node.locks / TOKENS).read_text()
+    assert SIMULATION not in (node.security / TOKENS).read_text()
     (node.out / SIMULATION).mkdir()
     node.run()
     token = (node.out / SIMULATION / "token").read_text()
@@ -138,7 +140,7 @@ def test_token_of_the_simulated_robot_that_was_lost_is_replaced(node):
     (node.out / SIMULATION / "token").unlink()
     node.run()
     assert (node.out / SIMULATION / "token").read_text() != lost
-    assert (node.locks / TOKENS).read_text().count(f'name = "{SIMULATION}"') == 1
+    assert (node.security / TOKENS).read_text().count(f'name = "{SIMULATION}"') == 1
 
 
 def test_rotated_authority_reaches_servers_and_services(node):
@@ -159,7 +161,7 @@ def test_certificate_of_the_authority_is_shown_without_its_key(node):
 
 
 def test_administrator_reads_a_file_of_the_locks_and_nothing_else(node):
-    assert node.run("show", ADMIN_TOKEN) == (node.locks / ADMIN_TOKEN).read_text()
+    assert node.run("show", ADMIN_TOKEN) == (node.security / ADMIN_TOKEN).read_text()
     assert "there are: " in node.refused("show", "../out/planner/operator.key").lower()
 
 
@@ -225,7 +227,7 @@ def test_locks_of_another_site_are_refused(node, tmp_path, monkeypatch):
 
 
 def test_locks_of_a_version_that_did_not_check_the_router_get_its_password(node):
-    file = SiteLocks.open(node.locks).credentials("health")
+    file = SiteSecurity.open(node.security).credentials("health")
     text = file.read_text()
     file.write_text("".join(line for line in text.splitlines(keepends=True) if not line.startswith("zenoh = ")))
     node.run()
@@ -234,7 +236,7 @@ def test_locks_of_a_version_that_did_not_check_the_router_get_its_password(node)
 
 
 def test_rights_in_redis_are_those_of_this_version(node):
-    users = node.locks / "redis" / "users"
+    users = node.security / "redis" / "users"
     text = users.read_text()
     users.write_text(text.replace(" +hincrby", ""))
     node.run()

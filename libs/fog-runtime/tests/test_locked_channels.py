@@ -1,4 +1,4 @@
-"""Every channel through the locks: what the table lets a role publish reaches every role that the table lets receive.
+"""Every channel with TLS and passwords: what a role may publish reaches every role that may receive it.
 
 The sessions are opened, subscribed and served as the processes do it (a robot for itself, the fog for all robots), with
 the credentials and lists that `fognav ca create` makes. A publisher that learned of no subscription is silent, but not
@@ -19,7 +19,7 @@ from fog_contracts import channels as ch
 from fog_contracts import messages as m
 from fog_runtime.clock import SystemClock
 from fog_runtime.credentials import Credentials
-from fog_runtime.locks.site_locks import SiteLocks
+from fog_runtime.security.site_security import SiteSecurity
 from fog_runtime.transports.mqtt_edge import MqttEdge
 from fog_runtime.transports.zenoh_edge import ZenohEdge
 from fog_supervisor.servers import start_mosquitto, start_router
@@ -31,26 +31,26 @@ LARGE = 300_000
 ZENOH = [row for row in ch.CHANNELS.values() if row.transport == "zenoh" and row.kind == "pub"]
 QUERIES = [row for row in ch.CHANNELS.values() if row.kind == "query"]
 MQTT = [row for row in ch.CHANNELS.values() if row.transport == "mqtt"]
-WITHOUT_LOCKS = {"thesis-node", "thesis-robot"}
+WITHOUT_CREDENTIALS = {"thesis-node", "thesis-robot"}
 """Roles of devices that can neither encrypt nor give a name."""
 
 
 @pytest.fixture(scope="module")
-def locks(tmp_path_factory):
-    made = SiteLocks(tmp_path_factory.mktemp("locks"), "lab", unrestricted=[TESTER])
+def security(tmp_path_factory):
+    made = SiteSecurity(tmp_path_factory.mktemp("locks"), "lab", unrestricted=[TESTER])
     made.make(["127.0.0.1"], robots=ROBOTS, nodes=NODES)
     return made
 
 
 @pytest.fixture(scope="module")
-def router(locks, tmp_path_factory):
-    with start_router(tmp_path_factory.mktemp("router"), locks=locks.folder("zenoh")) as server:
+def router(security, tmp_path_factory):
+    with start_router(tmp_path_factory.mktemp("router"), security=security.folder("zenoh")) as server:
         yield server
 
 
 @pytest.fixture(scope="module")
-def broker(locks, tmp_path_factory):
-    with start_mosquitto(tmp_path_factory.mktemp("broker"), locks=locks.folder("mosquitto")) as server:
+def broker(security, tmp_path_factory):
+    with start_mosquitto(tmp_path_factory.mktemp("broker"), security=security.folder("mosquitto")) as server:
         yield server
 
 
@@ -66,14 +66,14 @@ TOOLS = [Process(role, role) for role in (ch.CONSOLE, "recorder", ch.SIM)] + [
 class Sessions:
     """The zenoh sessions of several processes."""
 
-    def __init__(self, locks, router, stack, traffic):
-        self._locks, self._router, self._stack, self.traffic = locks, router, stack, traffic
+    def __init__(self, security, router, stack, traffic):
+        self._security, self._router, self._stack, self.traffic = security, router, stack, traffic
         self.edges = {}
 
     async def open(self, processes, *, subscribed=True):
         """Connect these processes, and subscribe each to whatever it may receive."""
         for process in processes:
-            own = Credentials.read(self._locks.credentials(process.user))
+            own = Credentials.read(self._security.credentials(process.user))
             opened = ZenohEdge.open(
                 connect=[self._router.url], clock=SystemClock(), role=process.role, id=process.user, site="lab",
                 credentials=own,
@@ -95,10 +95,10 @@ class Sessions:
 
 
 @pytest.fixture
-async def sessions(locks, router):
+async def sessions(security, router):
     router.start()
     async with contextlib.AsyncExitStack() as stack:
-        yield Sessions(locks, router, stack, Traffic())
+        yield Sessions(security, router, stack, Traffic())
 
 
 async def test_every_channel_of_the_router_arrives_also_from_a_copy_that_takes_over_and_after_a_restart(
@@ -220,15 +220,15 @@ MQTT_TOOLS = [Process(role, role) for role in (ch.CONSOLE, "recorder", "home-ass
 class Connections:
     """The MQTT connections of several processes."""
 
-    def __init__(self, locks, broker, traffic):
-        self._locks, self._broker, self.traffic = locks, broker, traffic
+    def __init__(self, security, broker, traffic):
+        self._security, self._broker, self.traffic = security, broker, traffic
         self.edges = {}
         self._running = []
 
     async def open(self, processes):
         """Connect these processes, and subscribe each to whatever it may receive."""
         for process in processes:
-            own = Credentials.read(self._locks.credentials(process.user))
+            own = Credentials.read(self._security.credentials(process.user))
             name = f"{process.user} {process.copy}"
             edge = self.edges[process] = MqttEdge(self._broker.url, name, SystemClock(), site="lab", credentials=own)
             for row, _ in process.subscriptions(MQTT):
@@ -256,9 +256,9 @@ class Connections:
 
 
 @pytest.fixture
-async def connections(locks, broker):
+async def connections(security, broker):
     broker.start()
-    made = Connections(locks, broker, Traffic())
+    made = Connections(security, broker, Traffic())
     yield made
     await made.close()
 
@@ -267,7 +267,7 @@ async def test_every_topic_arrives_also_after_a_restart_of_the_broker(connection
     everybody = [*copies("first"), *DEVICES, *MQTT_TOOLS]
     everybody = [process for process in everybody if process.role != ch.PLANNER]
     await connections.open(everybody)
-    rows = [row for row in MQTT if not WITHOUT_LOCKS.intersection(row.publishers)]
+    rows = [row for row in MQTT if not WITHOUT_CREDENTIALS.intersection(row.publishers)]
     arrived = await connections.traffic.until_all_arrive(everybody, everybody, connections.publish, rows)
     assert arrived == {row.name for row in rows}
     broker.restart()
@@ -279,7 +279,7 @@ async def test_late_subscriber_gets_what_the_broker_retains_and_nothing_else(con
     publishers = [*copies("first")[:2], *DEVICES, Process(ch.CONSOLE, ch.CONSOLE)]
     late = [*copies("late")[:2], *(dataclasses.replace(each, copy="late") for each in [*MQTT_TOOLS, *DEVICES])]
     await connections.open(publishers)
-    rows = [row for row in MQTT if not WITHOUT_LOCKS.intersection(row.publishers)]
+    rows = [row for row in MQTT if not WITHOUT_CREDENTIALS.intersection(row.publishers)]
     sent = [(process, row, ids) for process in publishers for row, ids in process.publications(rows)]
     for process, row, ids in sent:
         await connections.edges[process].publish(row, sample_of(row), wait=True, **ids)

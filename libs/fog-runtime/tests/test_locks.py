@@ -13,11 +13,11 @@ from redis.asyncio import Redis
 from fog_runtime.clock import SystemClock
 from fog_runtime.credentials import NOBODY, Credentials, CredentialsError, to_toml
 from fog_runtime.leadership import LeaseStore
-from fog_runtime.locks import users
-from fog_runtime.locks.authority import Authority, AuthorityError
-from fog_runtime.locks.site_locks import SiteLocks
-from fog_runtime.locks.users import LocksError
-from fog_runtime.router import RouterLocks, RouterLocksError
+from fog_runtime.router import RouterSecurity, RouterSecurityError
+from fog_runtime.security import users
+from fog_runtime.security.authority import Authority, AuthorityError
+from fog_runtime.security.site_security import SiteSecurity
+from fog_runtime.security.users import SecurityError
 from fog_runtime.stores.redis_connection import RedisConnection, StoreError
 from fog_runtime.stores.redis_store import RedisStore
 from fog_runtime.transports.mqtt_connection import Broker
@@ -35,8 +35,8 @@ NOW = dt.datetime.now(dt.UTC)
 
 
 @pytest.fixture(scope="module")
-def locks(tmp_path_factory):
-    made = SiteLocks(tmp_path_factory.mktemp("locks"), "lab", unrestricted=["test"])
+def security(tmp_path_factory):
+    made = SiteSecurity(tmp_path_factory.mktemp("locks"), "lab", unrestricted=["test"])
     made.make(HOSTS, robots=["r1", "r2"], nodes=["n1"])
     return made
 
@@ -44,31 +44,31 @@ def locks(tmp_path_factory):
 @pytest.fixture(scope="module")
 def stranger(tmp_path_factory):
     """Return credentials for the same names from another authority."""
-    made = SiteLocks(tmp_path_factory.mktemp("stranger"), "lab")
+    made = SiteSecurity(tmp_path_factory.mktemp("stranger"), "lab")
     made.make(HOSTS, robots=["r1"], nodes=["n1"])
     return made
 
 
 @pytest.fixture(scope="module")
-def broker(locks, tmp_path_factory):
-    with start_mosquitto(tmp_path_factory.mktemp("broker"), locks=locks.folder("mosquitto")) as server:
+def broker(security, tmp_path_factory):
+    with start_mosquitto(tmp_path_factory.mktemp("broker"), security=security.folder("mosquitto")) as server:
         yield server
 
 
 @pytest.fixture(scope="module")
-def router(locks, tmp_path_factory):
-    with start_router(tmp_path_factory.mktemp("router"), locks=locks.folder("zenoh")) as server:
+def router(security, tmp_path_factory):
+    with start_router(tmp_path_factory.mktemp("router"), security=security.folder("zenoh")) as server:
         yield server
 
 
 @pytest.fixture(scope="module")
-def redis(locks, tmp_path_factory):
-    with start_redis(tmp_path_factory.mktemp("redis"), locks=locks.folder("redis")) as server:
+def redis(security, tmp_path_factory):
+    with start_redis(tmp_path_factory.mktemp("redis"), security=security.folder("redis")) as server:
         yield server
 
 
-def of(locks, user):
-    return Credentials.read(locks.credentials(user))
+def of(security, user):
+    return Credentials.read(security.credentials(user))
 
 
 def changed(credentials, **other):
@@ -109,8 +109,8 @@ def wrong(credentials, server):
 
 
 @pytest.mark.live
-async def test_broker_admits_users_of_its_site_and_nobody_else(broker, locks, stranger):
-    node = of(locks, "n1")
+async def test_broker_admits_users_of_its_site_and_nobody_else(broker, security, stranger):
+    node = of(security, "n1")
     assert await reaches_broker(broker.url, node)
     for refused in (wrong(node, "mqtt"), of(stranger, "n1"), changed(node, authority=of(stranger, "n1").authority)):
         assert not await reaches_broker(broker.url, refused)
@@ -118,8 +118,8 @@ async def test_broker_admits_users_of_its_site_and_nobody_else(broker, locks, st
 
 
 @pytest.mark.live
-async def test_router_admits_users_of_its_site_and_nobody_else(router, locks, stranger):
-    robot = of(locks, "r1")
+async def test_router_admits_users_of_its_site_and_nobody_else(router, security, stranger):
+    robot = of(security, "r1")
     assert await reaches_router(router.url, robot)
     plain = router.url.replace("tls/", "tcp/")
     for refused in (wrong(robot, "zenoh"), of(stranger, "r1"), changed(robot, authority=of(stranger, "r1").authority)):
@@ -129,8 +129,8 @@ async def test_router_admits_users_of_its_site_and_nobody_else(router, locks, st
 
 
 @pytest.mark.live
-async def test_redis_admits_services_to_their_own_keys_and_nobody_else(redis, locks, stranger):
-    planner = of(locks, "planner")
+async def test_redis_admits_services_to_their_own_keys_and_nobody_else(redis, security, stranger):
+    planner = of(security, "planner")
     assert await redis_says(redis.url, planner, "HSET", "fog:lab:goals", "a", "b") == 1
     for key in ("fog:lab:zones", "fog:lab:areas", "fog:lab:map-service:epoch", "fog:other:goals", "else"):
         assert "permission" in await redis_says(redis.url, planner, "HSET", key, "a", "b"), key
@@ -145,11 +145,11 @@ async def test_redis_admits_services_to_their_own_keys_and_nobody_else(redis, lo
 
 @pytest.mark.live
 async def test_locked_redis_has_after_a_restart_what_it_acknowledged_before(tmp_path):
-    locks = SiteLocks(tmp_path / "locks", "lab")
-    locks.make(HOSTS)
-    planner = of(locks, "planner")
+    security = SiteSecurity(tmp_path / "locks", "lab")
+    security.make(HOSTS)
+    planner = of(security, "planner")
     script = "redis.call('HSET', KEYS[1], 'a', '1') redis.call('HSET', KEYS[1], 'b', '2') return 1"
-    with start_redis(tmp_path / "redis", locks=locks.folder("redis")) as server:
+    with start_redis(tmp_path / "redis", security=security.folder("redis")) as server:
         assert await redis_says(server.url, planner, "EVAL", script, 1, "fog:lab:goals") == 1
         server.kill()
         server.start()
@@ -160,8 +160,8 @@ async def test_locked_redis_has_after_a_restart_what_it_acknowledged_before(tmp_
 
 
 @pytest.mark.live
-async def test_store_and_lease_need_no_more_than_a_service_may(redis, locks):
-    own = of(locks, "planner")
+async def test_store_and_lease_need_no_more_than_a_service_may(redis, security):
+    own = of(security, "planner")
     async with (
         RedisStore(redis.url, "lab", service="planner", credentials=own, timeout_s=5.0) as store,
         LeaseStore(redis.url, "lab", "planner", credentials=own) as keeper,
@@ -170,7 +170,7 @@ async def test_store_and_lease_need_no_more_than_a_service_may(redis, locks):
         assert await store.durability_warning() == ""
         assert (await store.audit()).entries == []
         assert keeper is not None
-    administrator = of(locks, "administrator")
+    administrator = of(security, "administrator")
     async with Redis(
         port=redis.port, ssl=True, ssl_ca_data=administrator.authority,
         username="administrator", password=administrator.passwords["redis"],
@@ -184,25 +184,25 @@ async def test_store_and_lease_need_no_more_than_a_service_may(redis, locks):
 
 @pytest.mark.live
 async def test_authority_is_replaced_without_a_moment_of_distrust(tmp_path):
-    locks = SiteLocks(tmp_path / "locks", "lab")
-    locks.make(HOSTS, robots=["r1"], nodes=["n1"])
-    before = of(locks, "n1")
-    authority = locks.authority
+    security = SiteSecurity(tmp_path / "locks", "lab")
+    security.make(HOSTS, robots=["r1"], nodes=["n1"])
+    before = of(security, "n1")
+    authority = security.authority
     authority.rotate(now=dt.datetime.now(dt.UTC))
-    locks.trust_again()
-    overlap = of(locks, "n1")
-    with start_mosquitto(tmp_path / "broker", locks=locks.folder("mosquitto")) as broker:
+    security.trust_again()
+    overlap = of(security, "n1")
+    with start_mosquitto(tmp_path / "broker", security=security.folder("mosquitto")) as broker:
         assert await reaches_broker(broker.url, before)
         assert await reaches_broker(broker.url, overlap), "a new client and a server with the old certificate"
-        assert locks.renew(HOSTS, only_due=False) == ["mosquitto", "redis", "zenoh", "http"]
+        assert security.renew(HOSTS, only_due=False) == ["mosquitto", "redis", "zenoh", "http"]
         broker.restart()
         assert await reaches_broker(broker.url, before), "a client of before and a server with the new certificate"
         assert await reaches_broker(broker.url, overlap)
-        locks.authority.finish()
-        locks.trust_again()
-        after = of(locks, "n1")
+        security.authority.finish()
+        security.trust_again()
+        after = of(security, "n1")
         assert await reaches_broker(broker.url, after)
-        locks.renew(HOSTS, only_due=False)
+        security.renew(HOSTS, only_due=False)
         broker.restart()
         assert await reaches_broker(broker.url, after)
         assert not await reaches_broker(broker.url, before), "the overlap has ended"
@@ -231,127 +231,127 @@ def test_rotation_can_neither_be_repeated_nor_finished_twice_and_survives_reopen
 
 
 def test_certificates_are_valid_for_a_computer_whose_clock_was_never_set(tmp_path):
-    locks = SiteLocks(tmp_path, "lab")
-    locks.make(HOSTS)
-    locks.authority.rotate(now=NOW)
-    locks.renew(only_due=False)
-    chain = (locks.folder("redis") / "server.pem").read_bytes() + locks.authority.trusted.encode()
+    security = SiteSecurity(tmp_path, "lab")
+    security.make(HOSTS)
+    security.authority.rotate(now=NOW)
+    security.renew(only_due=False)
+    chain = (security.folder("redis") / "server.pem").read_bytes() + security.authority.trusted.encode()
     begins = {each.not_valid_before_utc for each in x509.load_pem_x509_certificates(chain)}
     assert begins == {dt.datetime(1970, 1, 1, tzinfo=dt.UTC)}
 
 
 def test_certificates_that_expire_soon_are_renewed_and_others_stay(tmp_path):
-    locks = SiteLocks(tmp_path, "lab")
-    locks.make(HOSTS)
-    chain = locks.folder("redis") / "server.pem"
+    security = SiteSecurity(tmp_path, "lab")
+    security.make(HOSTS)
+    chain = security.folder("redis") / "server.pem"
     kept = chain.read_bytes()
-    chain_of_broker = locks.folder("mosquitto") / "server.pem"
-    chain_of_broker.write_bytes(locks.authority.issue("mosquitto", HOSTS, now=NOW, days=10).chain)
-    assert locks.renew(HOSTS, only_due=True) == ["mosquitto"]
+    chain_of_broker = security.folder("mosquitto") / "server.pem"
+    chain_of_broker.write_bytes(security.authority.issue("mosquitto", HOSTS, now=NOW, days=10).chain)
+    assert security.renew(HOSTS, only_due=True) == ["mosquitto"]
     assert chain.read_bytes() == kept
-    assert locks.expiries()["mosquitto"] > NOW + dt.timedelta(days=700)
+    assert security.expiries()["mosquitto"] > NOW + dt.timedelta(days=700)
 
 
 def test_making_locks_again_changes_no_password_even_of_a_robot_whose_file_was_handed_out(tmp_path):
-    locks = SiteLocks(tmp_path, "lab")
-    locks.make(HOSTS, robots=["r1"])
-    locks.credentials("r1").unlink()
-    before = (locks.folder("zenoh") / "users").read_text()
-    locks.make(HOSTS, robots=["r1"])
-    assert (locks.folder("zenoh") / "users").read_text() == before
-    assert not locks.credentials("r1").exists()
+    security = SiteSecurity(tmp_path, "lab")
+    security.make(HOSTS, robots=["r1"])
+    security.credentials("r1").unlink()
+    before = (security.folder("zenoh") / "users").read_text()
+    security.make(HOSTS, robots=["r1"])
+    assert (security.folder("zenoh") / "users").read_text() == before
+    assert not security.credentials("r1").exists()
 
 
 def test_users_whom_the_servers_lists_lack_are_admitted_again_with_the_passwords_of_their_credentials(tmp_path):
-    locks = SiteLocks(tmp_path, "lab")
-    locks.make(HOSTS)
-    older = {program: (locks.folder(program) / "users").read_text() for program in ("mosquitto", "redis", "zenoh")}
-    locks.add_floor("upstairs", robots=["r1"])
-    service = Credentials.read(locks.credentials("upstairs.map-service")).passwords
-    robot = Credentials.read(locks.credentials("upstairs.r1")).passwords
+    security = SiteSecurity(tmp_path, "lab")
+    security.make(HOSTS)
+    older = {program: (security.folder(program) / "users").read_text() for program in ("mosquitto", "redis", "zenoh")}
+    security.add_floor("upstairs", robots=["r1"])
+    service = Credentials.read(security.credentials("upstairs.map-service")).passwords
+    robot = Credentials.read(security.credentials("upstairs.r1")).passwords
     for program, text in older.items():
-        (locks.folder(program) / "users").write_text(text)
-    locks.make(HOSTS)
-    locks.add_floor("upstairs", robots=["r1"])
-    listed = (locks.folder("zenoh") / "users").read_text().splitlines()
+        (security.folder(program) / "users").write_text(text)
+    security.make(HOSTS)
+    security.add_floor("upstairs", robots=["r1"])
+    listed = (security.folder("zenoh") / "users").read_text().splitlines()
     assert f"upstairs.map-service:{service['zenoh']}" in listed
     assert f"upstairs.r1:{robot['zenoh']}" in listed
     for program in ("mosquitto", "redis"):
-        assert "upstairs.map-service" in (locks.folder(program) / "users").read_text()
-    assert Credentials.read(locks.credentials("upstairs.map-service")).passwords == service
+        assert "upstairs.map-service" in (security.folder(program) / "users").read_text()
+    assert Credentials.read(security.credentials("upstairs.map-service")).passwords == service
 
 
 def test_hashes_of_an_earlier_version_are_replaced_by_such_as_the_broker_checks_quickly(tmp_path, monkeypatch):
     def listed():
-        lines = (locks.folder("mosquitto") / "users").read_text().splitlines()
+        lines = (security.folder("mosquitto") / "users").read_text().splitlines()
         return {user: hashed.split("$") for user, _, hashed in (line.partition(":") for line in lines)}
 
-    locks = SiteLocks(tmp_path, "lab")
+    security = SiteSecurity(tmp_path, "lab")
     with monkeypatch.context() as earlier:
         earlier.setattr(users, "_ITERATIONS", 20_000)
-        locks.make(HOSTS, nodes=["n1"])
+        security.make(HOSTS, nodes=["n1"])
     before = listed()
-    locks.credentials("n1").unlink()  # its board alone knows its password
-    locks.make(HOSTS, nodes=["n1"])
+    security.credentials("n1").unlink()  # its board alone knows its password
+    security.make(HOSTS, nodes=["n1"])
     after = listed()
     assert after.keys() == before.keys()
     assert after.pop("n1") == before["n1"]
     for user, (_, kind, iterations, salt, hashed) in after.items():
         assert (kind, iterations) == ("7", "101")
-        password = Credentials.read(locks.credentials(user)).passwords["mqtt"].encode()
+        password = Credentials.read(security.credentials(user)).passwords["mqtt"].encode()
         expected = hashlib.pbkdf2_hmac("sha512", password, base64.b64decode(salt), 101)
         assert base64.b64decode(hashed) == expected
 
 
 def test_a_robot_is_added_replaced_and_removed(tmp_path):
-    locks = SiteLocks(tmp_path, "lab")
-    locks.make(HOSTS)
-    first = Credentials.read(locks.add_robot("r7"))
-    assert '"fog/lab/robots/r7/pose"' in (locks.folder("zenoh") / "access.json5").read_text()
-    second = Credentials.read(locks.add_robot("r7"))
-    users = (locks.folder("zenoh") / "users").read_text().splitlines()
+    security = SiteSecurity(tmp_path, "lab")
+    security.make(HOSTS)
+    first = Credentials.read(security.add_robot("r7"))
+    assert '"fog/lab/robots/r7/pose"' in (security.folder("zenoh") / "access.json5").read_text()
+    second = Credentials.read(security.add_robot("r7"))
+    users = (security.folder("zenoh") / "users").read_text().splitlines()
     assert [line for line in users if line.startswith("r7:")] == [f"r7:{second.passwords['zenoh']}"]
     assert first.passwords != second.passwords
-    assert locks.remove("r7")
-    assert not locks.remove("r7")
-    assert "r7" not in (locks.folder("zenoh") / "access.json5").read_text()
-    with pytest.raises(LocksError, match="name of a part"):
-        locks.add_robot("planner")
+    assert security.remove("r7")
+    assert not security.remove("r7")
+    assert "r7" not in (security.folder("zenoh") / "access.json5").read_text()
+    with pytest.raises(SecurityError, match="name of a part"):
+        security.add_robot("planner")
 
 
 def test_a_device_keeps_its_topics_when_locks_are_made_again_and_loses_them_with_its_user(tmp_path):
-    locks = SiteLocks(tmp_path / "locks", "lab")
-    locks.make(["localhost"], nodes=["n1"])
-    locks.add_device("z2m", ["zigbee2mqtt/#"])
-    access = locks.folder("mosquitto") / "access"
-    SiteLocks(tmp_path / "locks", "lab").make(["fog.local"])
-    SiteLocks.open(tmp_path / "locks").add_node("n2")
+    security = SiteSecurity(tmp_path / "locks", "lab")
+    security.make(["localhost"], nodes=["n1"])
+    security.add_device("z2m", ["zigbee2mqtt/#"])
+    access = security.folder("mosquitto") / "access"
+    SiteSecurity(tmp_path / "locks", "lab").make(["fog.local"])
+    SiteSecurity.open(tmp_path / "locks").add_node("n2")
     assert "user z2m\ntopic readwrite zigbee2mqtt/#\n" in access.read_text()
-    assert SiteLocks.open(tmp_path / "locks").remove("z2m")
+    assert SiteSecurity.open(tmp_path / "locks").remove("z2m")
     assert "z2m" not in access.read_text()
 
 
 @pytest.mark.parametrize("name", ["default", "planner", "administrator", "health"])
 def test_no_part_of_fognav_is_removed_and_redis_goes_on_to_refuse_who_gives_no_name(tmp_path, name):
-    locks = SiteLocks(tmp_path / "locks", "lab")
-    locks.make(["localhost"])
-    with pytest.raises(LocksError, match=f"{name} is the name of a part"):
-        locks.remove(name)
-    with pytest.raises(LocksError, match=f"{name} is the name of a part"):
-        locks.make(["localhost"], robots=[name])
-    file = locks.folder("redis") / "users"
+    security = SiteSecurity(tmp_path / "locks", "lab")
+    security.make(["localhost"])
+    with pytest.raises(SecurityError, match=f"{name} is the name of a part"):
+        security.remove(name)
+    with pytest.raises(SecurityError, match=f"{name} is the name of a part"):
+        security.make(["localhost"], robots=[name])
+    file = security.folder("redis") / "users"
     file.write_text("".join(line for line in file.read_text().splitlines(keepends=True) if "default" not in line))
-    locks.make(["localhost"])
+    security.make(["localhost"])
     assert file.read_text().splitlines().count(users.REDIS_NOBODY) == 1
 
 
 def test_robot_and_node_of_the_same_id_are_refused_before_one_of_them_loses_its_password(tmp_path):
-    locks = SiteLocks(tmp_path / "locks", "lab")
-    with pytest.raises(LocksError, match=r"^x1: a robot, a node and a device of one site need different ids"):
-        locks.make(["localhost"], robots=["x1", "r1"], nodes=["x1"])
-    locks.make(["localhost"], robots=["x1"])
-    with pytest.raises(LocksError, match=r"^x1: a robot"):
-        locks.add_node("x1")
+    security = SiteSecurity(tmp_path / "locks", "lab")
+    with pytest.raises(SecurityError, match=r"^x1: a robot, a node and a device of one site need different ids"):
+        security.make(["localhost"], robots=["x1", "r1"], nodes=["x1"])
+    security.make(["localhost"], robots=["x1"])
+    with pytest.raises(SecurityError, match=r"^x1: a robot"):
+        security.add_node("x1")
 
 
 @pytest.mark.parametrize(
@@ -363,27 +363,27 @@ def test_robot_and_node_of_the_same_id_are_refused_before_one_of_them_loses_its_
     ],
 )  # fmt: skip
 def test_a_device_gets_no_name_and_no_topic_of_others(tmp_path, name, topic):
-    locks = SiteLocks(tmp_path / "locks", "lab")
-    locks.make(["localhost"], nodes=["n1"])
-    before = (locks.folder("mosquitto") / "access").read_text()
-    with pytest.raises(LocksError, match=name):
-        locks.add_device(name, [topic])
-    assert (locks.folder("mosquitto") / "access").read_text() == before
-    locks.add_device("lidar-gate", ["gate/+/state"])
-    with pytest.raises(LocksError, match=r"^lidar-gate: a robot"):
-        locks.add_node("lidar-gate")
+    security = SiteSecurity(tmp_path / "locks", "lab")
+    security.make(["localhost"], nodes=["n1"])
+    before = (security.folder("mosquitto") / "access").read_text()
+    with pytest.raises(SecurityError, match=name):
+        security.add_device(name, [topic])
+    assert (security.folder("mosquitto") / "access").read_text() == before
+    security.add_device("lidar-gate", ["gate/+/state"])
+    with pytest.raises(SecurityError, match=r"^lidar-gate: a robot"):
+        security.add_node("lidar-gate")
 
 
-def test_no_file_holds_a_password_that_another_server_accepts(locks):
+def test_no_file_holds_a_password_that_another_server_accepts(security):
     """A server that was broken into gives away no password for another one."""
-    planner = of(locks, "planner")
+    planner = of(security, "planner")
     assert len(set(planner.passwords.values())) == 2
-    router = (locks.folder("zenoh") / "users").read_text()
+    router = (security.folder("zenoh") / "users").read_text()
     assert planner.passwords["zenoh"] in router
     assert planner.passwords["redis"] not in router
     for program in ("mosquitto", "redis"):
-        text = (locks.folder(program) / "users").read_text()
-        assert not any(password in text for password in of(locks, "map-service").passwords.values())
+        text = (security.folder(program) / "users").read_text()
+        assert not any(password in text for password in of(security, "map-service").passwords.values())
 
 
 @pytest.mark.parametrize(
@@ -406,8 +406,8 @@ def test_unusable_credentials_are_named_with_the_remedy(tmp_path, text, expected
     assert "Copy it from the fog node" in str(raised.value)
 
 
-def test_credentials_are_read_as_they_were_written(tmp_path, locks):
-    authority = locks.authority.trusted
+def test_credentials_are_read_as_they_were_written(tmp_path, security):
+    authority = security.authority.trusted
     file = tmp_path / "x.toml"
     file.write_text(to_toml('a "b"', authority=authority, passwords={"mqtt": "p'\"\\"}, token="t"))
     found = Credentials.read(file)
@@ -434,5 +434,5 @@ async def test_no_password_leaves_this_computer_unencrypted():
 
 
 def test_router_names_a_file_that_is_missing(tmp_path):
-    with pytest.raises(RouterLocksError, match="users does not exist"):
-        RouterLocks(users=tmp_path / "users").config(["tcp/127.0.0.1:1"], [])
+    with pytest.raises(RouterSecurityError, match="users does not exist"):
+        RouterSecurity(users=tmp_path / "users").config(["tcp/127.0.0.1:1"], [])

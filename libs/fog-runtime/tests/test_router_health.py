@@ -12,8 +12,8 @@ import httpx
 import pytest
 
 from fog_runtime.credentials import NOBODY, Credentials, to_toml
-from fog_runtime.locks.site_locks import SiteLocks
 from fog_runtime.router import AGAIN_S, ANSWERS, OPEN_S, RouterHealth
+from fog_runtime.security.site_security import SiteSecurity
 
 ROOT = Path(__file__).parents[3]
 LISTENING = re.compile(r'"url": "(http://127\.0\.0\.1:\d+)"')
@@ -22,21 +22,21 @@ CHECK_S = 2.0
 
 
 @pytest.fixture(scope="module")
-def locks(tmp_path_factory):
-    made = SiteLocks(tmp_path_factory.mktemp("locks"), "lab")
+def security(tmp_path_factory):
+    made = SiteSecurity(tmp_path_factory.mktemp("locks"), "lab")
     made.make(["localhost"])
     return made
 
 
 @pytest.fixture(scope="module")
-def router(locks, tmp_path_factory):
+def router(security, tmp_path_factory):
     """A locked router that checks itself: its process, and where it says how it is."""
-    known = Credentials.read(locks.credentials("health"))
+    known = Credentials.read(security.credentials("health"))
     own = tmp_path_factory.mktemp("own") / "health.toml"
     own.write_text(to_toml("health", authority=known.authority, passwords={"zenoh": known.passwords["zenoh"]}))
     with socket.create_server(("127.0.0.1", 0)) as free:
         port = free.getsockname()[1]
-    folder = locks.folder("zenoh")
+    folder = security.folder("zenoh")
     files = {"certificate": "server.pem", "key": "server.key", "users": "users", "access": "access.json5"}
     process = subprocess.Popen(
         [
@@ -82,16 +82,16 @@ def test_port_that_accepts_connections_and_says_nothing_is_not_ready():
     assert f"no session within {OPEN_S:g} s" in report["parts"][ANSWERS]["detail"]
 
 
-def test_router_that_refuses_the_check_s_password_is_not_ready(router, locks):
+def test_router_that_refuses_the_check_s_password_is_not_ready(router, security):
     _, _, endpoint = router
-    authority = Credentials.read(locks.credentials("health")).authority
+    authority = Credentials.read(security.credentials("health")).authority
     wrong = Credentials("health", passwords={"zenoh": "wrong"}, authority=authority)
     assert not RouterHealth(endpoint, wrong).report()["ready"]
 
 
-def test_answer_is_good_for_a_while_and_none_is_asked_for_again(router, locks):
+def test_answer_is_good_for_a_while_and_none_is_asked_for_again(router, security):
     _, _, endpoint = router
-    health = RouterHealth(endpoint, Credentials.read(locks.credentials("health")))
+    health = RouterHealth(endpoint, Credentials.read(security.credentials("health")))
     assert health.report()["ready"]
     with socket.create_server(("127.0.0.1", 0)) as silent:
         health._config = RouterHealth(f"tcp/127.0.0.1:{silent.getsockname()[1]}", NOBODY)._config

@@ -18,7 +18,7 @@ from redis.exceptions import RedisError
 
 from fog_contracts.messages import Message
 from fog_runtime.credentials import Credentials
-from fog_runtime.locks.site_locks import SiteLocks
+from fog_runtime.security.site_security import SiteSecurity
 from fog_runtime.stores.redis_connection import RedisAddress, RedisConnection, StoreError, parse_address
 from fog_runtime.stores.redis_store import Audit, RedisStore, Table
 from fog_supervisor import configurations
@@ -184,8 +184,8 @@ LOCKED_SENTINEL = """
 port 0
 tls-port {port}
 bind 127.0.0.1
-tls-cert-file {locks}/server.pem
-tls-key-file {locks}/server.key
+tls-cert-file {security}/server.pem
+tls-key-file {security}/server.key
 tls-ca-cert-file {authority}
 tls-auth-clients no
 tls-replication yes
@@ -200,15 +200,15 @@ sentinel auth-pass fognav {password}
 @pytest.fixture
 def locked_cluster(tmp_path):
     """A locked Redis and one Sentinel: the address, whom services are there, and the authority of nobody there."""
-    locks = SiteLocks(tmp_path / "locks", "lab")
-    locks.make([LOOPBACK, "localhost"])
-    own, administrator = (Credentials.read(locks.credentials(user)) for user in ("map-service", "administrator"))
+    security = SiteSecurity(tmp_path / "locks", "lab")
+    security.make([LOOPBACK, "localhost"])
+    own, administrator = (Credentials.read(security.credentials(user)) for user in ("map-service", "administrator"))
     authority = tmp_path / "authority.pem"
-    authority.write_text(locks.authority.trusted)
-    with start_redis(tmp_path, locks=locks.folder("redis")) as redis:
+    authority.write_text(security.authority.trusted)
+    with start_redis(tmp_path, security=security.folder("redis")) as redis:
         home, port = tmp_path / "sentinel", free_port({redis.port})
         text = LOCKED_SENTINEL.format(
-            port=port, locks=locks.folder("redis"), authority=authority, folder=home, primary=redis.port,
+            port=port, security=security.folder("redis"), authority=authority, folder=home, primary=redis.port,
             password=administrator.passwords["redis"],
         )  # fmt: skip
         encrypted = dataclasses.replace(program("sentinel", home, port, text, "--sentinel"), encrypted=True)
@@ -238,7 +238,7 @@ async def test_sentinels_and_their_primary_are_reached_by_tls(locked_cluster):
 
 async def test_sentinels_of_another_authority_are_not_believed(locked_cluster, tmp_path):
     address, own = locked_cluster
-    stranger = SiteLocks(tmp_path / "stranger", "lab")
+    stranger = SiteSecurity(tmp_path / "stranger", "lab")
     stranger.make([LOOPBACK])
     other = Credentials(own.user, passwords=own.passwords, authority=stranger.authority.trusted)
     connection = RedisConnection(f"rediss+sentinel://{address}", timeout_s=5.0, credentials=other)

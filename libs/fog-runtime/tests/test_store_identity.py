@@ -2,7 +2,7 @@
 
 import pytest
 
-from fog_runtime.locks.users import SERVICES, redis_line
+from fog_runtime.security.users import SERVICES, redis_line
 from fog_runtime.stores import store_scripts
 from fog_runtime.stores.audit import KINDS
 from fog_runtime.stores.redis_connection import LOST, StoreError, StoreIdentity, StoreLostError

@@ -36,9 +36,9 @@ def test_stale_configuration_is_reported_with_the_remedy(tmp_path: Path, capsys:
 
 def test_private_servers_have_the_limits_durability_and_locks_of_deployed_ones(tmp_path: Path) -> None:
     deployed = configurations.deployed()
-    locks = Path(configurations.DEPLOYED_LOCKS)
-    mosquitto_program(tmp_path, 1, locks=locks)
-    redis_program(tmp_path, 1, locks=locks)
+    security = Path(configurations.DEPLOYED_SECURITY)
+    mosquitto_program(tmp_path, 1, security=security)
+    redis_program(tmp_path, 1, security=security)
     for name in ("mosquitto", "redis"):
         private = (tmp_path / f"{name}.conf").read_text()
         assert shared_lines(private) == shared_lines(deployed[f"{name}/{name}.conf"])
@@ -48,8 +48,8 @@ def test_private_servers_have_the_limits_durability_and_locks_of_deployed_ones(t
 def test_compose_starts_the_relay_of_the_broker_with_the_arguments_of_a_private_one(tmp_path: Path) -> None:
     service = yaml.safe_load((ROOT / "docker-compose.yml").read_text())["services"]["mosquitto-relay"]
     assert service["entrypoint"] == ["python", "-m", broker.__name__]
-    locks = Path(configurations.DEPLOYED_LOCKS)
-    private = mosquitto_program(tmp_path, 8883, address="0.0.0.0", locks=locks).command
+    security = Path(configurations.DEPLOYED_SECURITY)
+    private = mosquitto_program(tmp_path, 8883, address="0.0.0.0", security=security).command
     given = [text for argument in service["command"] for text in argument.split("=", 1)]
     assert given[: given.index("--to")] == list(private[3 : private.index("--configuration")])
     (listener,) = re.findall(r"^listener (.*)$", configurations.deployed()["mosquitto/mosquitto.conf"], re.MULTILINE)
@@ -60,14 +60,14 @@ def test_compose_starts_the_router_with_the_arguments_of_a_private_one() -> None
     service = yaml.safe_load((ROOT / "docker-compose.yml").read_text())["services"]["zenoh"]
     given = [tuple(argument.split("=", 1)) for argument in service["command"]]
     endpoint = dict(given)["--listen"]
-    locks = configurations.DEPLOYED_LOCKS
+    security = configurations.DEPLOYED_SECURITY
     # Only in a container somebody asks the process itself whether it is well.
     routing = [pair for pair in given if not pair[0].startswith("--health-")]
     assert len(routing) == len(given) - 2
-    assert [text for pair in routing for text in pair] == configurations.router_arguments(endpoint, locks=locks)
+    assert [text for pair in routing for text in pair] == configurations.router_arguments(endpoint, security=security)
     assert service["build"]["args"]["MODULE"] == router.__name__
-    private = router_program(7447, locks=Path(locks))
-    arguments = configurations.router_arguments(private.url, locks=locks)
+    private = router_program(7447, security=Path(security))
+    arguments = configurations.router_arguments(private.url, security=security)
     assert list(private.command[1:]) == ["-m", router.__name__, *arguments]
 
 

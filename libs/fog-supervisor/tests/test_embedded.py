@@ -1,4 +1,4 @@
-"""The servers that stand in where nothing can be installed: with the same locks they keep the same doors."""
+"""The servers that stand in where nothing can be installed: with the same credentials they keep the same doors."""
 
 import asyncio
 import contextlib
@@ -16,7 +16,7 @@ from redis.asyncio import Redis
 from redis.exceptions import AuthenticationError, NoPermissionError
 
 from fog_runtime.credentials import Credentials
-from fog_runtime.locks.site_locks import SiteLocks
+from fog_runtime.security.site_security import SiteSecurity
 from fog_supervisor.embedded_broker import AccessList, Passwords, matches
 from fog_supervisor.servers import (
     Server,
@@ -90,22 +90,22 @@ def test_hash_that_can_not_be_read_admits_nobody():
 
 
 @pytest.fixture
-def locks(tmp_path: Path) -> SiteLocks:
-    made = SiteLocks(tmp_path / "locks", "estig")
+def security(tmp_path: Path) -> SiteSecurity:
+    made = SiteSecurity(tmp_path / "locks", "estig")
     made.make(["localhost", "127.0.0.1"], robots=["r1"], nodes=["n1", "n2"])
     return made
 
 
-def stand_in(folder: Path, locks: SiteLocks) -> Server:
-    return Server(embedded_broker_program(free_port(), locks=locks.folder("mosquitto")), folder)
+def stand_in(folder: Path, security: SiteSecurity) -> Server:
+    return Server(embedded_broker_program(free_port(), security=security.folder("mosquitto")), folder)
 
 
-def mosquitto(folder: Path, locks: SiteLocks) -> Server:
-    return Server(mosquitto_program(folder, free_port(), locks=locks.folder("mosquitto")), folder)
+def mosquitto(folder: Path, security: SiteSecurity) -> Server:
+    return Server(mosquitto_program(folder, free_port(), security=security.folder("mosquitto")), folder)
 
 
-def client(broker: Server, locks: SiteLocks, user: str, **changes: object) -> aiomqtt.Client:
-    own = Credentials.read(locks.credentials(user))
+def client(broker: Server, security: SiteSecurity, user: str, **changes: object) -> aiomqtt.Client:
+    own = Credentials.read(security.credentials(user))
     tls = ssl.create_default_context(cadata=own.authority)
     options = {"username": user, "password": own.passwords["mqtt"], "tls_context": tls, "timeout": WAIT_S, **changes}
     return aiomqtt.Client("127.0.0.1", broker.port, protocol=aiomqtt.ProtocolVersion.V311, **options)
@@ -126,9 +126,11 @@ def packet(kind: int, body: bytes) -> bytes:
 
 
 @contextlib.contextmanager
-def cut_connection(broker: Server, locks: SiteLocks, user: str, will: tuple[str, str]) -> Iterator[Callable[..., None]]:
+def cut_connection(
+    broker: Server, security: SiteSecurity, user: str, will: tuple[str, str]
+) -> Iterator[Callable[..., None]]:
     """Yield how to publish; the connection ends without a word (MQTT 3.1.1, sections 3.1, 3.3)."""
-    own = Credentials.read(locks.credentials(user))
+    own = Credentials.read(security.credentials(user))
     tls = ssl.create_default_context(cadata=own.authority)
     body = text("MQTT") + struct.pack(">BBH", 4, 0xC6 | 0x28, 30) + text(user) + text(will[0]) + text(will[1])
     with (
@@ -147,33 +149,33 @@ def cut_connection(broker: Server, locks: SiteLocks, user: str, will: tuple[str,
 @pytest.mark.live
 @pytest.mark.parametrize("start", [mosquitto, stand_in])
 async def test_brokers_admit_and_refuse_the_same(
-    start: Callable[[Path, SiteLocks], Server], tmp_path: Path, locks: SiteLocks
+    start: Callable[[Path, SiteSecurity], Server], tmp_path: Path, security: SiteSecurity
 ) -> None:
     prefix = "fog/v1/estig"
-    with start(tmp_path, locks) as broker:
+    with start(tmp_path, security) as broker:
         for changes in ({"password": "wrong"}, {"username": "n3"}, {"tls_context": None, "timeout": 1.0}):
             with pytest.raises(aiomqtt.MqttError):
-                async with client(broker, locks, "n1", **changes):
+                async with client(broker, security, "n1", **changes):
                     pass
-        async with client(broker, locks, "hazard-aggregator") as aggregator:
+        async with client(broker, security, "hazard-aggregator") as aggregator:
             await aggregator.subscribe(f"{prefix}/nodes/+/reading", qos=0)
             await aggregator.subscribe(f"{prefix}/nodes/+/availability", qos=1)
             await aggregator.publish(f"{prefix}/areas/z1/hazard", "blocked", qos=1, retain=True)
-            with cut_connection(broker, locks, "n1", will=(f"{prefix}/nodes/n1/availability", "offline")) as publish:
+            with cut_connection(broker, security, "n1", will=(f"{prefix}/nodes/n1/availability", "offline")) as publish:
                 publish(f"{prefix}/nodes/n2/reading", "in the name of another")
                 publish(f"{prefix}/areas/z1/hazard", "clear", retain=True)
                 publish(f"{prefix}/nodes/n1/reading", "own")
                 assert await next_of(aggregator) == (f"{prefix}/nodes/n1/reading", b"own")
             assert await next_of(aggregator) == (f"{prefix}/nodes/n1/availability", b"offline")
-        async with client(broker, locks, "map-service") as later:
+        async with client(broker, security, "map-service") as later:
             await later.subscribe(f"{prefix}/areas/+/hazard", qos=1)
             assert await next_of(later) == (f"{prefix}/areas/z1/hazard", b"blocked")
 
 
 @pytest.mark.live
-async def test_stand_in_for_redis_admits_its_users_to_their_keys(tmp_path: Path, locks: SiteLocks) -> None:
-    program = embedded_redis_program(tmp_path, free_port(), locks=locks.folder("redis"))
-    password = Credentials.read(locks.credentials("map-service")).passwords["redis"]
+async def test_stand_in_for_redis_admits_its_users_to_their_keys(tmp_path: Path, security: SiteSecurity) -> None:
+    program = embedded_redis_program(tmp_path, free_port(), security=security.folder("redis"))
+    password = Credentials.read(security.credentials("map-service")).passwords["redis"]
     with Server(program, tmp_path) as server:
         async with Redis.from_url(program.url, username="map-service", password=password) as own:
             await own.set("fog:estig:zones", "wet floor")

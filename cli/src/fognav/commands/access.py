@@ -13,10 +13,17 @@ import typer
 from fog_runtime.configuration.site import load_site
 from fog_runtime.credentials import to_toml
 from fog_runtime.files import atomic_write
-from fog_runtime.locks.site_locks import SiteLocks
+from fog_runtime.security.site_security import SiteSecurity
 from fog_runtime.token_file import Role, create_token, read_tokens, revoke_token
 from fognav import checkout
-from fognav.locking import LocksOption, locks_errors, locks_folder, named_folder, open_locks, own_hosts
+from fognav.locking import (
+    CredentialsOption,
+    credentials_folder,
+    named_folder,
+    open_security,
+    own_hosts,
+    security_errors,
+)
 from fognav.operate.fog import find_fog
 from fognav.operate.options import JsonOption
 from fognav.output import NOT_TRUE, FailedError, WrongUseError, exit_codes, print_answer, print_json, print_result
@@ -47,17 +54,17 @@ def token_create(
         Path | None,
         typer.Option("--out", metavar="FILE", help="Write it there, as credentials (FOGNAV_CREDENTIALS_FILE)."),
     ] = None,
-    locks: LocksOption = None,
+    security: CredentialsOption = None,
     json: JsonOption = False,
 ) -> None:
     """Create a token and print it, or write it to a file.
 
     Only its hash is stored: it can't be shown again. The running services accept it at once.
     """
-    with exit_codes(), locks_errors():
+    with exit_codes(), security_errors():
         if out is not None and out.exists():
             raise WrongUseError(f"{out} already exists: name another file with --out, or remove it")
-        authority = open_locks(locks).authority.trusted if locks_folder(locks) is not None else ""
+        authority = open_security(security).authority.trusted if credentials_folder(security) is not None else ""
         token = create_token(_tokens_file(file), name, role)
         if out is not None:
             text = to_toml(name, authority=authority, passwords={}, token=token)
@@ -120,16 +127,16 @@ def ca_create(
         _SITE
     ),
     host: HostOption = None,
-    locks: LocksOption = None,
+    security: CredentialsOption = None,
     json: JsonOption = False,
 ) -> None:
     """Create a site's certificate authority, its servers' certificates, and a file of credentials for each user.
 
     Users are the services, the tools, and the robots and nodes of the site. What is there already stays.
     """
-    with exit_codes(), locks_errors():
+    with exit_codes(), security_errors():
         loaded = load_site(checkout.site_folder(site)).site
-        made = SiteLocks(named_folder(locks), loaded.id)
+        made = SiteSecurity(named_folder(security), loaded.id)
         made.make(
             host or own_hosts(),
             robots=[robot.id for robot in loaded.robots],
@@ -139,10 +146,10 @@ def ca_create(
 
 
 @ca_app.command("issue", epilog="Example: fognav ca issue --host fog.local --host 192.168.7.1")
-def ca_issue(*, host: HostOption = None, locks: LocksOption = None, json: JsonOption = False) -> None:
+def ca_issue(*, host: HostOption = None, security: CredentialsOption = None, json: JsonOption = False) -> None:
     """Issue new certificates for all servers, for the names and addresses of before or those given."""
-    with exit_codes(), locks_errors():
-        opened = open_locks(locks)
+    with exit_codes(), security_errors():
+        opened = open_security(security)
         opened.renew(host, only_due=False)
         _show(opened, json=json)
 
@@ -151,7 +158,7 @@ def ca_issue(*, host: HostOption = None, locks: LocksOption = None, json: JsonOp
 def ca_rotate(
     *,
     finish: Annotated[bool, typer.Option("--finish", help="Trust the authority before no longer.")] = False,
-    locks: LocksOption = None,
+    security: CredentialsOption = None,
     json: JsonOption = False,
 ) -> None:
     """Replace the certificate authority, while everything runs.
@@ -159,8 +166,8 @@ def ca_rotate(
     Until --finish both are trusted, and who knows only the old one accepts the new certificates, too: hand out the
     credentials again (robots, nodes, people) at any time before.
     """
-    with exit_codes(), locks_errors():
-        opened = open_locks(locks)
+    with exit_codes(), security_errors():
+        opened = open_security(security)
         if finish:
             opened.authority.finish()
         else:
@@ -171,31 +178,31 @@ def ca_rotate(
 
 
 @ca_app.command("show", epilog="Example: fognav ca show --json")
-def ca_show(*, locks: LocksOption = None, json: JsonOption = False) -> None:
+def ca_show(*, security: CredentialsOption = None, json: JsonOption = False) -> None:
     """Show until when the authority and the servers' certificates are valid; the exit code is 1 if one expires soon."""
-    with exit_codes(), locks_errors():
-        opened = open_locks(locks)
+    with exit_codes(), security_errors():
+        opened = open_security(security)
         _show(opened, json=json)
         if opened.expiring():
             raise typer.Exit(NOT_TRUE)
 
 
-def _show(locks: SiteLocks, *, json: bool) -> None:
-    expiries = locks.expiries()
+def _show(security: SiteSecurity, *, json: bool) -> None:
+    expiries = security.expiries()
     if json:
         print_json(
             {
-                "locks": str(locks.directory),
-                "rotating": locks.authority.rotating,
+                "locks": str(security.directory),
+                "rotating": security.authority.rotating,
                 "valid_until": {name: until.isoformat() for name, until in expiries.items()},
-                "expiring": locks.expiring(),
-                "credentials": sorted(locks.users()),
+                "expiring": security.expiring(),
+                "credentials": sorted(security.users()),
             }
         )
         return
     for name, until in expiries.items():
-        print_answer(f"{name:10} valid until {until:%Y-%m-%d}" + (", renew it" if name in locks.expiring() else ""))
-    if locks.authority.rotating:
+        print_answer(f"{name:10} valid until {until:%Y-%m-%d}" + (", renew it" if name in security.expiring() else ""))
+    if security.authority.rotating:
         print_answer("the authority before is still trusted: fognav ca rotate --finish ends that")
-    print_answer(f"credentials in {locks.directory}/credentials: {', '.join(sorted(locks.users()))}")
+    print_answer(f"credentials in {security.directory}/credentials: {', '.join(sorted(security.users()))}")
     print_answer(_RELOAD)

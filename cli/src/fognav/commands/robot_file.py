@@ -12,7 +12,7 @@ from fog_runtime.configuration.parts import DEFAULT_BASE, DEFAULT_LIDAR
 from fog_runtime.configuration.robot_file import ROBOT_FILE, RobotFile, default_robot, describe_robot, load_robot
 from fog_runtime.configuration.settings import SettingsError
 from fog_runtime.files import SHARED, atomic_write
-from fognav.locking import LocksOption, locks_errors, open_locks
+from fognav.locking import CredentialsOption, open_security, security_errors
 from fognav.operate.options import JsonOption, checked_id
 from fognav.output import (
     NOT_TRUE,
@@ -33,7 +33,7 @@ from robot_agent.serial_port import PortNameError, check_port_name
 def robot_add(
     robot: Annotated[str, typer.Argument(metavar="ROBOT", help="The robot's id: a to z, 0 to 9 and -.")],
     *,
-    locks: LocksOption = None,
+    security: CredentialsOption = None,
     remove: Annotated[bool, typer.Option("--remove", help="Let it in no longer.")] = False,
     json: JsonOption = False,
 ) -> None:
@@ -42,8 +42,8 @@ def robot_add(
     The robot needs it as FOGNAV_CREDENTIALS_FILE.
     For a robot that is known already they are new ones, and those of before are worth nothing any more.
     """
-    with exit_codes(), locks_errors():
-        opened = open_locks(locks)
+    with exit_codes(), security_errors():
+        opened = open_security(security)
         file = None if remove else opened.add_robot(checked_id(robot))
         if remove and not opened.remove(robot):
             raise WrongUseError(f"there is no robot {robot}. Known are: {', '.join(sorted(opened.users()))}")

@@ -6,7 +6,7 @@ import msgspec
 import typer
 
 from fog_contracts.messages import AreaDefinition, Limits, Source
-from fognav.locking import LocksOption, locks_errors, open_locks
+from fognav.locking import CredentialsOption, open_security, security_errors
 from fognav.operate.fog import Fog, find_fog
 from fognav.operate.options import FogOption, JsonOption, checked_id
 from fognav.operate.systems import AGGREGATOR
@@ -116,12 +116,12 @@ def source_user(
     name: Annotated[str, typer.Argument(metavar="USER", help="The user's name: a to z, 0 to 9 and -.")],
     *,
     topic: Annotated[list[str], typer.Option("--topic", metavar="T", help="What it may publish and read; repeatable.")],
-    locks: LocksOption = None,
+    security: CredentialsOption = None,
     json: JsonOption = False,
 ) -> None:
     """Let a sensor, or the gateway of many, use a broker with passwords: these topics and no other."""
-    with exit_codes(), locks_errors():
-        file = open_locks(locks).add_device(checked_id(name), topic)
+    with exit_codes(), security_errors():
+        file = open_security(security).add_device(checked_id(name), topic)
         print_result(
             {"user": name, "topics": topic, "credentials": str(file)},
             f"wrote {file}: its user, password and certificate are what {name} needs; then delete it here",

@@ -12,7 +12,7 @@ from fognav.hosting import local_nodes
 from fognav.hosting.fog_node import NodeConfig, run_node
 from fognav.hosting.folders import NodeFolder, default_data, hosted_sites, remember, settings_of
 from fognav.hosting.local_nodes import UNIT, end_node, named_node, write_unit
-from fognav.locking import locks_errors, own_hosts
+from fognav.locking import own_hosts, security_errors
 from fognav.output import FailedError, exit_codes, print_line
 
 SitesOption = Annotated[
@@ -47,7 +47,7 @@ def up_command(  # noqa: PLR0913  # each option is an argument
     It has broker, Redis, router, and the services of each site. Everything uses TLS and passwords. Data stays in one
     folder, and is used again by the next start.
     """
-    with exit_codes(), locks_errors():
+    with exit_codes(), security_errors():
         folders = [checkout.site_folder(each) for each in site] if site else [checkout.site_folder(None)]
         path = (data or default_data()).absolute()
         if systemd:
@@ -67,8 +67,8 @@ def up_command(  # noqa: PLR0913  # each option is an argument
 
 def _run(folders: list[Path], folder: NodeFolder, bind: str, hosts: list[str], *, sim: bool, check: bool) -> None:
 
-    sites, locks = hosted_sites(folders, folder.locks, [*own_hosts(), *hosts])
-    config = NodeConfig(folder=folder, sites=sites, locks=locks, address=bind, simulate=sim)
+    sites, security = hosted_sites(folders, folder.security, [*own_hosts(), *hosts])
+    config = NodeConfig(folder=folder, sites=sites, security=security, address=bind, simulate=sim)
     remember(folder.path, settings_of({site.id: site.directory for site in sites}, bind, hosts, simulate=sim))
     asyncio.run(run_node(config, print_line, check=check))
 

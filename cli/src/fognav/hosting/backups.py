@@ -1,4 +1,4 @@
-"""Backs up and restores a fog node of `fognav up`: one file for each site, with the locks of all.
+"""Backs up and restores a fog node of `fognav up`: one file for each site, with the credentials of all.
 
 A backup may be made while the node runs. It is restored while the node is down, on an empty machine, too; only its
 Redis runs meanwhile. Recordings are large, and kept elsewhere; a backup has an index of what lies in `recordings/` of
@@ -24,13 +24,13 @@ from fog_runtime.backup import Backup, BackupError, File, read_archive
 from fog_runtime.configuration.site import SiteError
 from fog_runtime.credentials import Credentials, CredentialsError
 from fog_runtime.files import PRIVATE, atomic_write
-from fog_runtime.locks.site_locks import AUTHORITY, SiteLocks
-from fog_runtime.locks.users import ANYBODY, REDIS_ADMINISTRATOR, USERS, on_floor, user_of
+from fog_runtime.security.site_security import AUTHORITY, SiteSecurity
+from fog_runtime.security.users import ANYBODY, REDIS_ADMINISTRATOR, USERS, on_floor, user_of
 from fog_supervisor import net, servers
 from fog_supervisor.supervisor import Event, Supervisor
 from fognav import checkout
-from fognav.hosting.folders import LOCKS_FILE, REDIS_PORT, NodeFolder, recall, require_node
-from fognav.locking import locks_errors, own_credentials
+from fognav.hosting.folders import REDIS_PORT, SECURITY_FILE, NodeFolder, recall, require_node
+from fognav.locking import own_credentials, security_errors
 from fognav.output import FailedError, WrongUseError, print_line
 from fognav.programs import MAP_SERVICE, REDIS, ProgramSet
 
@@ -123,7 +123,7 @@ def _statistics(stream: IO[bytes], size: int) -> Statistics | None:
     return summary.statistics if summary is not None else None
 
 
-LOCKS: Final = "locks"
+SECURITY: Final = "locks"
 _READY_S: Final = 60.0
 
 
@@ -137,7 +137,7 @@ class Created(NamedTuple):
 class Restored(NamedTuple):
     """What a restore has done.
 
-    `refused` are those whom the backup's locks would have admitted besides, and `missing` the recordings of the
+    `refused` are those whom the backup's credentials would have admitted besides, and `missing` the recordings of the
     backup's index that are not there.
     """
 
@@ -147,7 +147,7 @@ class Restored(NamedTuple):
 
 
 class _Sites(msgspec.Struct):
-    """What the description of locks says of their sites."""
+    """What the description of credentials says of their sites."""
 
     site: str
     floors: list[str] = []
@@ -191,44 +191,44 @@ async def create(file: Path, folder: NodeFolder, directory: Path | None) -> Crea
 async def restore(file: Path, folder: NodeFolder, directory: Path, *, replace: bool) -> Restored:
     """Restore a backup of one site, whose folder is to be `directory`, while the node is down.
 
-    With `replace`, locks of the same authority stay: they are those of all sites, and newer. Raises `FailedError` while
-    the node runs, `BackupError`, and as `redis_of`.
+    With `replace`, credentials of the same authority stay: they are those of all sites, and newer. Raises `FailedError`
+    while the node runs, `BackupError`, and as `redis_of`.
     """
     with folder.in_use():
         archive = await asyncio.to_thread(read_archive, file)
-        if not (folder.locks / LOCKS_FILE).exists():
+        if not (folder.security / SECURITY_FILE).exists():
             # Redis needs them to start; where there are none, nothing is replaced.
-            for name, content in archive.folders.get(LOCKS, {}).items():
-                atomic_write(folder.locks / name, content.data, mode=content.mode)
-        stay = replace and _same_authority(archive, folder.locks)
+            for name, content in archive.folders.get(SECURITY, {}).items():
+                atomic_write(folder.security / name, content.data, mode=content.mode)
+        stay = replace and _same_authority(archive, folder.security)
         if replace and not stay:
-            _require_same_sites(archive, folder.locks)
-        refused = sorted(_users(archive) - SiteLocks.open(folder.locks).users()) if stay else []
+            _require_same_sites(archive, folder.security)
+        refused = sorted(_users(archive) - SiteSecurity.open(folder.security).users()) if stay else []
         # Another floor's backup has brought one of another moment: it stays, and the next backup writes a new one.
         indexed = not replace and index_folder(folder.path).exists()
-        keep = ({LOCKS} if stay else set()) | ({RECORDINGS} if indexed else set())
+        keep = ({SECURITY} if stay else set()) | ({RECORDINGS} if indexed else set())
         async with redis_of(folder, archive.site, directory) as place:
             made = await backup.restore(file, place, replace=replace, keep=keep)
         return Restored(made, refused, missing_recordings(folder.path, archive.folders.get(RECORDINGS, {})))
 
 
-def _same_authority(archive: Backup, locks: Path) -> bool:
-    """Whether somebody who trusts the backup's servers may trust those of the locks here, too."""
-    file, own = archive.folders.get(LOCKS, {}).get(AUTHORITY), locks / AUTHORITY
+def _same_authority(archive: Backup, security: Path) -> bool:
+    """Whether somebody who trusts the backup's servers may trust those of the credentials here, too."""
+    file, own = archive.folders.get(SECURITY, {}).get(AUTHORITY), security / AUTHORITY
     return (
         file is not None and own.exists() and not _certificates(file.data).isdisjoint(_certificates(own.read_bytes()))
     )
 
 
-def _require_same_sites(archive: Backup, locks: Path) -> None:
-    """Raise `BackupError` if the locks of a backup, of another authority, would lock out a site of these locks."""
-    file = archive.folders.get(LOCKS, {}).get(LOCKS_FILE)
+def _require_same_sites(archive: Backup, security: Path) -> None:
+    """Raise `BackupError` if credentials of a backup, of another authority, would shut out a site of these."""
+    file = archive.folders.get(SECURITY, {}).get(SECURITY_FILE)
     if file is None:
         return
     theirs = msgspec.json.decode(file.data, type=_Sites)
-    if others := set(SiteLocks.open(locks).sites) - {theirs.site, *theirs.floors}:
+    if others := set(SiteSecurity.open(security).sites) - {theirs.site, *theirs.floors}:
         raise BackupError(
-            f"{locks} has the credentials of {', '.join(sorted(others))} too, and the backup's are of another "
+            f"{security} has the credentials of {', '.join(sorted(others))} too, and the backup's are of another "
             "authority, which nobody there would trust: nothing was changed. Name another folder with --up"
         )
 
@@ -238,8 +238,8 @@ def _certificates(authority: bytes) -> set[bytes]:
 
 
 def _users(archive: Backup) -> set[str]:
-    """Return everybody whom a server of the backup's locks admits."""
-    lists = [file.data.decode() for name, file in archive.folders[LOCKS].items() if Path(name).name == USERS]
+    """Return everybody whom a server of the backup's credentials admits."""
+    lists = [file.data.decode() for name, file in archive.folders[SECURITY].items() if Path(name).name == USERS]
     return {user_of(line) for text in lists for line in text.splitlines()} - {ANYBODY}
 
 
@@ -259,10 +259,10 @@ async def _redis(folder: NodeFolder, site: str, directory: Path) -> AsyncIterato
 async def redis_of(folder: NodeFolder, site: str, directory: Path) -> AsyncIterator[backup.Place]:
     """Run the Redis of a fog node that is down; yield the place of a site of it, whose folder is `directory`.
 
-    Raises `LocksError` without the node's locks, `CredentialsError`, `ServerError` and `NotReadyError`.
+    Raises `SecurityError` without the node's credentials, `CredentialsError`, `ServerError` and `NotReadyError`.
     """
     program = servers.redis_program(
-        folder.data(REDIS), net.free_port(), locks=SiteLocks.open(folder.locks).folder("redis")
+        folder.data(REDIS), net.free_port(), security=SiteSecurity.open(folder.security).folder("redis")
     )
     supervisor = Supervisor(_ignore)
     ProgramSet(supervisor, folder, {}).add_server(program)
@@ -273,15 +273,15 @@ async def redis_of(folder: NodeFolder, site: str, directory: Path) -> AsyncItera
 
 
 def _place(folder: NodeFolder, site: str, directory: Path, redis: str) -> backup.Place:
-    locks = SiteLocks.open(folder.locks)
-    credentials = Credentials.read(locks.credentials(REDIS_ADMINISTRATOR))
+    security = SiteSecurity.open(folder.security)
+    credentials = Credentials.read(security.credentials(REDIS_ADMINISTRATOR))
     folders = {
         backup.SITE: directory,
         backup.SECRETS: folder.path / "keys" / site,
-        LOCKS: folder.locks,
+        SECURITY: folder.security,
         RECORDINGS: index_folder(folder.path),
     }
-    service = MAP_SERVICE if site == locks.sites[0] else on_floor(site, MAP_SERVICE)
+    service = MAP_SERVICE if site == security.sites[0] else on_floor(site, MAP_SERVICE)
     return backup.Place(redis, site, folders, folder.data(service), credentials)
 
 
@@ -292,7 +292,7 @@ def _ignore(_: Event) -> None:
 @contextmanager
 def backup_errors() -> Iterator[None]:
     """Turn errors of backups into those of commands."""
-    with locks_errors():
+    with security_errors():
         try:
             yield
         except WrongUseError:
@@ -320,7 +320,7 @@ def restore_into_node(file: Path, up: Path, site: Path, *, replace: bool) -> Bac
     directory = _named(site) or site
     backup.require_same_site(read_archive(file), directory)  # before the node's folder is made
     made, refused, gone = asyncio.run(restore(file, NodeFolder(up), directory, replace=replace))
-    if LOCKS not in made.folders:
+    if SECURITY not in made.folders:
         print_line(f"the credentials in {up} stay: they have the same authority, and what was added since")
     if refused:
         print_line(f"they do not admit {', '.join(refused)}, whom the backup has: add them again, if they shall be")

@@ -1,9 +1,9 @@
 """The programs of a fog node on this machine: as they are run until a signal, and as other commands see them.
 
-Changes of the locks come into force while it runs: new robots and nodes, new certificates. Mosquitto reads its files
-again on a signal. Redis, the router and the services read them at their start only, so each is started again, one at a
-time, when its own files have changed: what else is connected goes on meanwhile, and what was connected to it connects
-again.
+Changes of the credentials come into force while it runs: new robots and nodes, new certificates. Mosquitto reads its
+files again on a signal. Redis, the router and the services read them at their start only, so each is started again, one
+at a time, when its own files have changed: what else is connected goes on meanwhile, and what was connected to it
+connects again.
 """
 
 import asyncio
@@ -24,8 +24,8 @@ from typing import Final
 from fog_runtime import machine
 from fog_runtime.configuration.parts import DEFAULT_BASE, DEFAULT_LIDAR
 from fog_runtime.keys import ADMIN_TOKEN, OPERATOR_KEY, TOKENS
-from fog_runtime.locks.site_locks import CERTIFICATE, KEY, SiteLocks
 from fog_runtime.machine import ServiceManager
+from fog_runtime.security.site_security import CERTIFICATE, KEY, SiteSecurity
 from fog_supervisor import net
 from fog_supervisor.supervisor import Event, Supervisor
 from fognav.hosting import local_nodes
@@ -36,11 +36,11 @@ from fognav.output import FailedError, WrongUseError
 from fognav.programs import (
     AGENT,
     BROKER,
-    LOCKS,
     MODULES,
     PLANNER,
     REDIS,
     ROUTER,
+    SECURITY,
     SERVERS,
     SERVICES,
     SIMULATOR,
@@ -60,7 +60,7 @@ _RESTARTED_S: Final = 180.0
 
 
 class LockChanges:
-    """Watches the files of each program's locks; `round` is called once a second."""
+    """Watches the files of each program's credentials; `round` is called once a second."""
 
     def __init__(self, supervisor: Supervisor, files: Mapping[str, Sequence[Path]]) -> None:
         """Watch these files, or all in these folders, by the program that reads them; servers come first."""
@@ -126,7 +126,7 @@ class NodeConfig:
 
     folder: NodeFolder
     sites: Sequence[HostedSite]
-    locks: SiteLocks
+    security: SiteSecurity
     address: str
     simulate: bool = False
 
@@ -145,7 +145,7 @@ class LocalNode:
         ports = ServerPorts(
             mqtt=port(MQTTS_PORT), redis=port(REDIS_PORT), zenoh=port(ZENOH_PORT), address=config.address
         )
-        self.server_set = server_programs(config.folder, ports, config.locks.folder)
+        self.server_set = server_programs(config.folder, ports, config.security.folder)
         self._urls = {program.name: program.url for program in self.server_set}
         common = {
             "MQTT_URL": self._urls[BROKER],
@@ -186,23 +186,23 @@ class LocalNode:
             await self.supervisor.wait_ready(names, timeout_s)
 
     def lock_changes(self) -> LockChanges:
-        """Watch the files of every program's locks, those of simulated nodes and robots, too."""
-        locks = self.config.locks
-        servers: dict[str, list[Path]] = {name: [locks.folder(folder)] for name, folder in LOCKS.items()}
+        """Watch the files of every program's credentials, those of simulated nodes and robots, too."""
+        security = self.config.security
+        servers: dict[str, list[Path]] = {name: [security.folder(folder)] for name, folder in SECURITY.items()}
         services = {
-            site.name(service): [locks.folder("http"), locks.credentials(site.name(service))]
+            site.name(service): [security.folder("http"), security.credentials(site.name(service))]
             for site in self.config.sites
             for service in SERVICES
         }
-        robots = {} if not self.config.simulate else self._robot_locks()
+        robots = {} if not self.config.simulate else self._robot_credentials()
         return LockChanges(self.supervisor, servers | services | robots)
 
-    def _robot_locks(self) -> dict[str, list[Path]]:
+    def _robot_credentials(self) -> dict[str, list[Path]]:
         files: dict[str, list[Path]] = {}
         for site in self.config.sites:
             nodes = [node.id for node in site.loaded.site.nodes]
             for program, users in ((SIMULATOR, ["sim", *nodes]), (AGENT, [site.loaded.site.robots[0].id])):
-                files[site.name(program)] = [self.config.locks.credentials(site.name(user)) for user in users]
+                files[site.name(program)] = [self.config.security.credentials(site.name(user)) for user in users]
         return files
 
     def system(self, site: HostedSite) -> System:
@@ -222,7 +222,7 @@ class LocalNode:
             },
             pids={UP: os.getpid(), **{name: pid for name, pid in found.items() if pid is not None}},
             token_file=str(keys / ADMIN_TOKEN),
-            credentials_file=str(self.config.locks.credentials(site.name("console"))),
+            credentials_file=str(self.config.security.credentials(site.name("console"))),
             robots=[robot.id for robot in site.loaded.site.robots],
             data=str(folder.path),
         )
@@ -242,10 +242,10 @@ class LocalNode:
         )
 
     def _credentials(self, site: HostedSite, user: str) -> dict[str, str]:
-        return {"CREDENTIALS_FILE": str(self.config.locks.credentials(site.name(user)))}
+        return {"CREDENTIALS_FILE": str(self.config.security.credentials(site.name(user)))}
 
     def _add_services(self, site: HostedSite) -> None:
-        keys, http = self._keys[site.id], self.config.locks.folder("http")
+        keys, http = self._keys[site.id], self.config.security.folder("http")
         for service in SERVICES:
             settings = {
                 "TOKENS_FILE": str(keys / TOKENS),
@@ -270,7 +270,7 @@ class LocalNode:
         simulator = {
             **simulator_settings(folder, _HARDWARE),
             "ROBOT": robot,
-            "NODE_CREDENTIALS_DIR": str(site.node_credentials(self.config.locks)),
+            "NODE_CREDENTIALS_DIR": str(site.node_credentials(self.config.security)),
             **self._credentials(site, "sim"),
         }
         self._add(site, SIMULATOR, simulator)

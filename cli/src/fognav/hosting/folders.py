@@ -1,7 +1,7 @@
 """The data of a fog node on this machine: one folder, which survives restarts and upgrades; its settings and sites.
 
-`locks/` has certificates, users and credentials (`fog_runtime.locks`), `keys/SITE/` the tokens and the key of a site,
-`up.json` how the node was last started, by which other commands back it up and start it, and the rest is as in
+`locks/` has certificates, users and credentials (`fog_runtime.security`), `keys/SITE/` the tokens and the key of a
+site, `up.json` how the node was last started, by which other commands back it up and start it, and the rest is as in
 `fognav.programs`. `format` is the version of this layout. Each site has its services and ports; all share broker, store
 and router.
 """
@@ -20,8 +20,8 @@ import msgspec
 from fog_runtime.configuration.site import LoadedSite, load_site
 from fog_runtime.files import PRIVATE, atomic_write
 from fog_runtime.keys import make_keys
-from fog_runtime.locks.site_locks import CREDENTIALS, SiteLocks
-from fog_runtime.locks.users import on_floor
+from fog_runtime.security.site_security import CREDENTIALS, SiteSecurity
+from fog_runtime.security.users import on_floor
 from fognav.operate.systems import MQTTS_PORT, SERVICE_PORTS, ZENOH_PORT, port
 from fognav.output import FailedError, WrongUseError
 from fognav.programs import SystemFolder
@@ -30,8 +30,8 @@ FORMAT: Final = 1
 """Incremented when an older `fognav up` could not use what a newer one has written."""
 _FORMAT_FILE: Final = "format"
 _LOCK: Final = "in-use"
-LOCKS_FILE: Final = "locks.json"
-"""What the folder of locks has once they were made."""
+SECURITY_FILE: Final = "locks.json"
+"""What the folder of credentials has once they were made."""
 
 
 def default_data() -> Path:
@@ -57,8 +57,8 @@ class NodeFolder(SystemFolder):
             ) from error
 
     @property
-    def locks(self) -> Path:
-        """The folder of the site's locks."""
+    def security(self) -> Path:
+        """The folder of the site's credentials."""
         return self.path / "locks"
 
     def keys(self, site: str) -> Path:
@@ -209,21 +209,23 @@ class HostedSite:
         """The port of each service's REST API: those of the compose file, on each further floor 10 higher."""
         return {service: port(setting) + PORT_STEP * self.index for service, setting in SERVICE_PORTS.items()}
 
-    def node_credentials(self, locks: SiteLocks) -> Path:
+    def node_credentials(self, security: SiteSecurity) -> Path:
         """Return the folder with the credentials of its sensor nodes."""
-        return locks.directory / CREDENTIALS / ("" if self.index == 0 else self.id)
+        return security.directory / CREDENTIALS / ("" if self.index == 0 else self.id)
 
 
-def hosted_sites(folders: Sequence[Path], locks: Path, hosts: Sequence[str]) -> tuple[list[HostedSite], SiteLocks]:
-    """Return the sites in these folders, and the locks at `locks` with everybody of them, made where they are missing.
+def hosted_sites(
+    folders: Sequence[Path], security: Path, hosts: Sequence[str]
+) -> tuple[list[HostedSite], SiteSecurity]:
+    """Return the sites in these folders, and their credentials at `security`, made where they are missing.
 
-    A site keeps its place, and so its ports, for as long as the locks exist. Raises `LocksError` or `AuthorityError`,
-    and as `load_sites`.
+    A site keeps its place, and so its ports, for as long as the credentials exist. Raises `SecurityError` or
+    `AuthorityError`, and as `load_sites`.
     """
     loaded = load_sites(folders)
     first = next(iter(loaded))
-    known = SiteLocks.open(locks).sites if (locks / LOCKS_FILE).exists() else [first]
-    made = SiteLocks(locks, known[0])
+    known = SiteSecurity.open(security).sites if (security / SECURITY_FILE).exists() else [first]
+    made = SiteSecurity(security, known[0])
     own = loaded.get(known[0])
     made.make(hosts, robots=_robots(own), nodes=_nodes(own))
     for site, each in loaded.items():

@@ -23,9 +23,9 @@ from fog_contracts.site import NodeSite
 from fog_runtime.configuration.site import LoadedSite
 from fog_runtime.credentials import Credentials
 from fog_runtime.files import PRIVATE, atomic_write
-from fog_runtime.locks.site_locks import SiteLocks
+from fog_runtime.security.site_security import SiteSecurity
 from fognav import checkout
-from fognav.locking import LocksOption, locks_errors, locks_folder, open_locks
+from fognav.locking import CredentialsOption, credentials_folder, open_security, security_errors
 from fognav.operate.options import JsonOption
 from fognav.output import WrongUseError, print_json, print_line
 
@@ -135,12 +135,12 @@ def provision(file: Path, members: dict[str, Any], passwords: Path | None) -> No
         raise
 
 
-def let_in(locks: SiteLocks, node: str) -> tuple[str, str]:
-    """Let a node in by a site's locks; return its new password, and the authorities that its board shall trust (PEM).
+def let_in(security: SiteSecurity, node: str) -> tuple[str, str]:
+    """Let a node in by a site's credentials; return its new password, and what its board shall trust (PEM).
 
-    Raises `LocksError` or `AuthorityError`.
+    Raises `SecurityError` or `AuthorityError`.
     """
-    file = locks.add_node(node)
+    file = security.add_node(node)
     credentials = Credentials.read(file)
     file.unlink()  # the board has it: nobody else needs it
     return credentials.passwords["mqtt"], credentials.authority
@@ -226,7 +226,7 @@ class BoardOptions:
         Path | None,
         typer.Option("--passwords", metavar="F", help="Mosquitto's password file, which gets the node's password."),
     ] = None
-    locks: LocksOption = None
+    security: CredentialsOption = None
     firmware: Annotated[
         Literal["fognav", "esphome"],
         typer.Option("--firmware", help="What will run on the board; esphome: on a D1 mini 32, with two HC-SR04."),
@@ -298,7 +298,7 @@ class BoardOptions:
                     "--no-tls: the configuration for ESPHome speaks TLS only. Give --credentials instead"
                 )
             return
-        folder = locks_folder(self.locks)
+        folder = credentials_folder(self.security)
         if folder is None:
             if not self._authority.exists():
                 raise WrongUseError(
@@ -310,8 +310,8 @@ class BoardOptions:
         # The firmware compares a name as it is given, but of an address a name that is in the certificate anyway.
         if self.firmware == "fognav" and _address(host) is not None:
             return
-        with locks_errors():
-            known = open_locks(folder).hosts
+        with security_errors():
+            known = open_security(folder).hosts
         if host not in known:
             raise WrongUseError(
                 f"--fog-host {host} is not in the broker's certificate, so the board would not trust it: it is for "
@@ -323,18 +323,18 @@ class BoardOptions:
         return self.out / AUTHORITY_FILE
 
     def provision(self, loaded: LoadedSite, node: NodeSite) -> None:
-        """Write a board's settings with a new password, and let it in where `locks` or `passwords` say so.
+        """Write a board's settings with a new password, and let it in where `security` or `passwords` say so.
 
-        Raises `WrongUseError`, and `FailedError` for locks that can't be used.
+        Raises `WrongUseError`, and `FailedError` for credentials that can't be used.
         """
         if self.wifi_password is None or self.fog_host is None:
             raise TypeError("these options are not complete: see `completed`")
         port = _TLS_PORT if self.tls else _OPEN_PORT
         access = Access(self.wifi, self.wifi_password, self.fog_host, port, self.tls)
         members = settings(loaded.site.id, node, access, new_password(), self.profile)
-        if (folder := locks_folder(self.locks)) is not None:
-            with locks_errors():
-                members["password"], authority = let_in(open_locks(folder), node.id)
+        if (folder := credentials_folder(self.security)) is not None:
+            with security_errors():
+                members["password"], authority = let_in(open_security(folder), node.id)
             write_authority(self._authority, authority)
         if self.firmware == "esphome":
             members = esphome_secrets(members, self._authority)

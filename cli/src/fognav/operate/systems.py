@@ -226,7 +226,8 @@ def _setting(process: psutil.Process, name: str) -> str:
 def _fog_node(processes: list[tuple[str, psutil.Process]]) -> System | None:
     """Return the fog node whose REST APIs are at this machine's published ports.
 
-    One with locks is asked by HTTPS, if the environment names credentials. Raises `WrongUseError` for unusable ones.
+    One with credentials is asked by HTTPS, if the environment names credentials. Raises `WrongUseError` for unusable
+    ones.
     """
     own = own_credentials()
     tls = own.tls_context() if own.authority else None

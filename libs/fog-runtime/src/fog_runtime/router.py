@@ -93,7 +93,7 @@ DEAF_S: Final = 40.0
 HANGS_S: Final = 60.0
 """After how long without such a look it is ended: its loop, or the interpreter, hangs."""
 
-_LOCKS = {
+_SECURITY = {
     "--certificate": "its certificate, for --listen tls/ADDRESS:PORT",
     "--key": "the certificate's private key",
     "--users": "who is admitted: name:password by line",
@@ -102,12 +102,12 @@ _LOCKS = {
 }
 
 
-class RouterLocksError(ValueError):
-    """A file of the router's locks can't be used; the message names the file and the remedy."""
+class RouterSecurityError(ValueError):
+    """A file of the router's credentials can't be used; the message names the file and the remedy."""
 
 
 @dataclass(frozen=True, kw_only=True)
-class RouterLocks:
+class RouterSecurity:
     """Whom a router admits, and what for: files with its certificate and key (PEM), users (`name:password` by line).
 
     `access` is zenoh's `access_control` (JSON5), as `fognav channels --format acl` writes it; `credentials` are those
@@ -121,16 +121,16 @@ class RouterLocks:
     credentials: Path | None = None
 
     def tls(self) -> ssl.SSLContext:
-        """Return what its clients encrypt by; raises `RouterLocksError` or `CertificateError`."""
+        """Return what its clients encrypt by; raises `RouterSecurityError` or `CertificateError`."""
         if self.certificate is None or self.key is None:
-            raise RouterLocksError("--listen tls/… needs --certificate and --key, or write tcp/…")
+            raise RouterSecurityError("--listen tls/… needs --certificate and --key, or write tcp/…")
         return server_tls(self.certificate, self.key)
 
     def config(self, listen: Sequence[str], connect: Sequence[str]) -> zenoh.Config:
-        """Return the router's configuration; raises `RouterLocksError` or `CredentialsError`."""
+        """Return the router's configuration; raises `RouterSecurityError` or `CredentialsError`."""
         for file in (self.certificate, self.key, self.users, self.access):
             if file is not None and not file.is_file():
-                raise RouterLocksError(f"{file} does not exist: create it (fognav ca create), or correct its name")
+                raise RouterSecurityError(f"{file} does not exist: create it (fognav ca create), or correct its name")
         own = Credentials.read(self.credentials)
         config = session_config("router", listen=listen, connect=connect, credentials=own)
         if self.access is not None:
@@ -172,16 +172,16 @@ class HealthPort:
 async def run_router(
     listen: Sequence[str],
     connect: Sequence[str] = (),
-    locks: RouterLocks | None = None,
+    security: RouterSecurity | None = None,
     health_port: HealthPort | None = None,
 ) -> None:
     """Route between the clients of the endpoints `listen`, and those of the routers `connect`, until cancelled.
 
-    Routers at `connect` need not be up yet. Without `locks` everybody is admitted. Raises `OSError` if an endpoint of
-    `listen` or the port of its health is taken, `RouterDeafError` when its clients can't reach it any more, and as
-    `RouterLocks.config`.
+    Routers at `connect` need not be up yet. Without `security` everybody is admitted. Raises `OSError` if an endpoint
+    of `listen` or the port of its health is taken, `RouterDeafError` when its clients can't reach it any more, and as
+    `RouterSecurity.config`.
     """
-    locks = locks or RouterLocks()
+    security = security or RouterSecurity()
     health = None if health_port is None else health_port.health(listen[0])
     machine.raise_limit()
     with contextlib.ExitStack() as stack:
@@ -190,10 +190,10 @@ async def run_router(
         relays, listeners = [], []
         for endpoint in listen:
             encrypts = endpoint.startswith("tls/")
-            tls = locks.tls() if encrypts else None
+            tls = security.tls() if encrypts else None
             relays.append(Relay(to_socket(own), ZenohOpening, tls))
             listeners.append(stack.enter_context(admission.listen(*place_of(endpoint))))
-        session = await asyncio.to_thread(zenoh.open, locks.config([f"unixsock-stream/{own}"], connect))
+        session = await asyncio.to_thread(zenoh.open, security.config([f"unixsock-stream/{own}"], connect))
         try:
             _log.info("listening", endpoints=list(listen), zid=str(session.zid()))
             if health_port is not None and health is not None and health_port.port is not None:
@@ -228,7 +228,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument(
         "--connect", action="append", default=[], metavar="tcp/ADDRESS:PORT", help="another router of the same site"
     )
-    for option, what in _LOCKS.items():
+    for option, what in _SECURITY.items():
         parser.add_argument(option, type=Path, metavar="FILE", help=what)
     parser.add_argument("--health-port", type=int, metavar="PORT", help="of this computer, where /readyz is served")
     parser.add_argument(
@@ -240,11 +240,13 @@ def main(arguments: Sequence[str] | None = None) -> None:
     logs.configure("router", options.log_level, options.log_format)
     if (options.certificate is None) != (options.key is None):
         parser.error("--certificate and --key belong together")
-    locks = RouterLocks(**{option.removeprefix("--"): getattr(options, option.removeprefix("--")) for option in _LOCKS})
+    security = RouterSecurity(
+        **{option.removeprefix("--"): getattr(options, option.removeprefix("--")) for option in _SECURITY}
+    )
     health = None
     if options.health_port is not None or options.health_credentials is not None or options.users is None:
         health = HealthPort(port=options.health_port, credentials=options.health_credentials)
-    process.run(lambda: run_router(options.listen, options.connect, locks, health))
+    process.run(lambda: run_router(options.listen, options.connect, security, health))
 
 
 if __name__ == "__main__":

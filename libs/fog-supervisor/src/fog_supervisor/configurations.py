@@ -15,8 +15,8 @@ MQTT_PACKET_LIMIT: Final = 256 * 1024
 """Largest MQTT packet (bytes): above every MQTT channel's limit, small enough not to exhaust the memory."""
 MQTT_QUEUE_LIMIT: Final = 10_000
 """Messages that the broker queues for a slow or disconnected client."""
-DEPLOYED_LOCKS: Final = "/run/locks"
-"""Where each server's container has its part of the locks."""
+DEPLOYED_SECURITY: Final = "/run/locks"
+"""Where each server's container has its part of the credentials."""
 REDIS_PORT: Final = 6379
 
 
@@ -40,8 +40,8 @@ connection_messages false
 """
 _MOSQUITTO_LOCKED: Final = """\
 allow_anonymous false
-password_file {locks}/users
-acl_file {locks}/access
+password_file {security}/users
+acl_file {security}/access
 """
 _REDIS: Final = f"""\
 {_NOTE}
@@ -60,48 +60,50 @@ maxmemory-policy noeviction
 _REDIS_LOCKED: Final = """\
 port 0
 tls-port {port}
-tls-cert-file {locks}/server.pem
-tls-key-file {locks}/server.key
+tls-cert-file {security}/server.pem
+tls-key-file {security}/server.key
 tls-auth-clients no
-aclfile {locks}/users
+aclfile {security}/users
 """
 _REDIS_ADMITTING: Final = """\
 port {port}
-aclfile {locks}/users
+aclfile {security}/users
 """
 
 
-def mosquitto(listener: str, data: str, *, locks: str | None = None, extra: Sequence[str] = ()) -> str:
+def mosquitto(listener: str, data: str, *, security: str | None = None, extra: Sequence[str] = ()) -> str:
     """Return a `mosquitto.conf`.
 
     `listener` is a port and an address, and empty where `fog_runtime.broker` adds it; `data` the folder of the broker's
-    database; `locks` that with its users and access list (`fog_runtime.locks`), without which it admits everybody: with
-    them it is behind a relay, which encrypts. The `extra` lines are appended.
+    database; `security` that with its users and access list (`fog_runtime.security`), without which it admits
+    everybody: with them it is behind a relay, which encrypts. The `extra` lines are appended.
     """
-    doors = "allow_anonymous true\n" if locks is None else _MOSQUITTO_LOCKED.format(locks=locks)
+    doors = "allow_anonymous true\n" if security is None else _MOSQUITTO_LOCKED.format(security=security)
     listens = f"listener {listener}\n" if listener else ""
     return _MOSQUITTO.format(listener=listens, data=data, doors=doors) + "".join(f"{line}\n" for line in extra)
 
 
-def redis(bind: str, data: str, *, port: int = REDIS_PORT, locks: str | None = None, encrypted: bool = True) -> str:
+def redis(bind: str, data: str, *, port: int = REDIS_PORT, security: str | None = None, encrypted: bool = True) -> str:
     """Return a `redis.conf` of a server whose acknowledged writes survive a crash.
 
-    `bind` is the address on which it listens, `data` the folder of its append-only file; `locks` as for `mosquitto`,
+    `bind` is the address on which it listens, `data` the folder of its append-only file; `security` as for `mosquitto`,
     but with `encrypted` False only the users count.
     """
     locked = _REDIS_LOCKED if encrypted else _REDIS_ADMITTING
-    doors = f"port {port}\n" if locks is None else locked.format(port=port, locks=locks)
+    doors = f"port {port}\n" if security is None else locked.format(port=port, security=security)
     return _REDIS.format(bind=bind, data=data, doors=doors)
 
 
-def router_arguments(endpoint: str, *, locks: str | None = None) -> list[str]:
+def router_arguments(endpoint: str, *, security: str | None = None) -> list[str]:
     """Return the arguments with which `python -m fog_runtime.router` listens on a zenoh endpoint.
 
-    `locks` as for `mosquitto`.
+    `security` as for `mosquitto`.
     """
     files = {"certificate": "server.pem", "key": "server.key", "users": "users", "access": "access.json5"}
     options = (
-        [] if locks is None else [text for name, file in files.items() for text in (f"--{name}", f"{locks}/{file}")]
+        []
+        if security is None
+        else [text for name, file in files.items() for text in (f"--{name}", f"{security}/{file}")]
     )
     return ["--listen", endpoint, *options]
 
@@ -109,8 +111,8 @@ def router_arguments(endpoint: str, *, locks: str | None = None) -> list[str]:
 def deployed() -> dict[str, str]:
     """Return the files that the compose file mounts into its servers, by their paths below `deploy/`."""
     return {
-        "mosquitto/mosquitto.conf": mosquitto("1883 127.0.0.1", "/mosquitto/data", locks=DEPLOYED_LOCKS),
-        "redis/redis.conf": redis("0.0.0.0", "/data", locks=DEPLOYED_LOCKS),  # noqa: S104  # inside a container; compose publishes no port
+        "mosquitto/mosquitto.conf": mosquitto("1883 127.0.0.1", "/mosquitto/data", security=DEPLOYED_SECURITY),
+        "redis/redis.conf": redis("0.0.0.0", "/data", security=DEPLOYED_SECURITY),  # noqa: S104  # inside a container; compose publishes no port
     }
 
 

@@ -1,9 +1,9 @@
-"""An MQTT broker in Python: `python -m fog_supervisor.embedded_broker --listen 127.0.0.1:8883 --locks FOLDER`.
+"""An MQTT broker in Python: `python -m fog_supervisor.embedded_broker --listen 127.0.0.1:8883 --security FOLDER`.
 
-With the locks that Mosquitto would have (`fog_runtime.locks`) it encrypts, and admits only their users, each to its own
-topics: `acl_file` and `password_file` are evaluated as Mosquitto does. Of an `acl_file` only what Fognav writes: a
-right in each line, `%u` as the only variable of a `pattern`, and a name for everybody who is admitted. Without locks,
-it admits everybody, unencrypted.
+With the credentials that Mosquitto would have (`fog_runtime.security`) it encrypts, and admits only their users, each
+to its own topics: `acl_file` and `password_file` are evaluated as Mosquitto does. Of an `acl_file` only what Fognav
+writes: a right in each line, `%u` as the only variable of a `pattern`, and a name for everybody who is admitted.
+Without credentials, it admits everybody, unencrypted.
 """
 
 import argparse
@@ -147,17 +147,17 @@ _REMEMBERED: Final = 10_000
 
 
 class Users(BaseAuthPlugin):
-    """Admits who knows the password of a user in the locks."""
+    """Admits who knows the password of a user in the credentials."""
 
     @dataclass
     class Config(BaseAuthPlugin.Config):
-        """The folder of the locks."""
+        """The folder of the credentials."""
 
-        locks: str = ""
+        security: str = ""
 
     def __init__(self, context: BaseContext) -> None:
         super().__init__(context)
-        self._passwords = Passwords.parse((Path(self.config.locks) / _USERS).read_text("utf-8"))
+        self._passwords = Passwords.parse((Path(self.config.security) / _USERS).read_text("utf-8"))
 
     async def authenticate(self, *, session: Session) -> bool:
         """Whether this user has this password; off the loop, for the hash takes milliseconds."""
@@ -165,17 +165,17 @@ class Users(BaseAuthPlugin):
 
 
 class Topics(BaseTopicPlugin):
-    """Lets each user publish and receive what the locks allow."""
+    """Lets each user publish and receive what the credentials allow."""
 
     @dataclass
     class Config(BaseTopicPlugin.Config):
-        """The folder of the locks."""
+        """The folder of the credentials."""
 
-        locks: str = ""
+        security: str = ""
 
     def __init__(self, context: BaseContext) -> None:
         super().__init__(context)
-        access = AccessList.parse((Path(self.config.locks) / _ACCESS).read_text("utf-8"))
+        access = AccessList.parse((Path(self.config.security) / _ACCESS).read_text("utf-8"))
         self._allows = lru_cache(_REMEMBERED)(access.allows)
 
     async def topic_filtering(
@@ -199,28 +199,28 @@ class _Broker(Broker):
             await super()._publish_retained_messages_for_subscription(subscription, session)
 
 
-def configuration(listen: str, locks: Path | None) -> BrokerConfig:
+def configuration(listen: str, security: Path | None) -> BrokerConfig:
     """Return the broker's configuration."""
-    if locks is None:
+    if security is None:
         return BrokerConfig(
             listeners={"default": ListenerConfig(bind=listen)},
             plugins={"amqtt.plugins.authentication.AnonymousAuthPlugin": {"allow_anonymous": True}},
         )
-    own: dict[str, Any] = {"locks": str(locks)}
+    own: dict[str, Any] = {"security": str(security)}
     return BrokerConfig(
         listeners={
-            "default": ListenerConfig(bind=listen, ssl=True, certfile=locks / _CERTIFICATE, keyfile=locks / _KEY)
+            "default": ListenerConfig(bind=listen, ssl=True, certfile=security / _CERTIFICATE, keyfile=security / _KEY)
         },
         plugins={f"{_MODULE}.{plugin.__name__}": own for plugin in (Users, Topics)},
     )
 
 
-async def serve(listen: str, locks: Path | None) -> None:
+async def serve(listen: str, security: Path | None) -> None:
     """Serve until SIGTERM or SIGINT; raises `BrokerError` if the address is taken."""
     stop = asyncio.Event()
     for number in (signal.SIGTERM, signal.SIGINT):
         asyncio.get_running_loop().add_signal_handler(number, stop.set)
-    broker = _Broker(configuration(listen, locks))
+    broker = _Broker(configuration(listen, security))
     await broker.start()
     await stop.wait()
     await broker.shutdown()
@@ -230,10 +230,10 @@ def main(arguments: Sequence[str] | None = None) -> None:
     """Run the broker until a signal."""
     parser = argparse.ArgumentParser(prog="fog_supervisor.embedded_broker", description="Run an MQTT broker.")
     parser.add_argument("--listen", required=True, metavar="ADDRESS:PORT")
-    parser.add_argument("--locks", type=Path, metavar="DIR", help="Mosquitto's certificate, users and access list")
+    parser.add_argument("--security", type=Path, metavar="DIR", help="Mosquitto's certificate, users and access list")
     options = parser.parse_args(arguments)
     logging.basicConfig(stream=sys.stderr, level=logging.WARNING, format="%(levelname)s %(name)s: %(message)s")
-    asyncio.run(serve(options.listen, options.locks))
+    asyncio.run(serve(options.listen, options.security))
 
 
 if __name__ == "__main__":

@@ -115,25 +115,32 @@ def _installed(name: str, package: str) -> str:
 
 
 def mosquitto_program(
-    folder: Path, port: int, *, address: str = LOOPBACK, locks: Path | None = None, extra: str = ""
+    folder: Path, port: int, *, address: str = LOOPBACK, security: Path | None = None, extra: str = ""
 ) -> ServerProgram:
     """Return an MQTT broker that listens on `address`, configured in `folder`; `extra` is added to its configuration.
 
-    With the folder of its `locks` (`fog_runtime.locks`) a relay before it encrypts (`fog_runtime.broker`), and only the
-    users there are admitted, else everybody. Raises `ServerError` when it is not installed.
+    With the folder of its `security` (`fog_runtime.security`) a relay before it encrypts (`fog_runtime.broker`), and
+    only the users there are admitted, else everybody. Raises `ServerError` when it is not installed.
     """
     program = _installed("mosquitto", "mosquitto")
     # As root, Mosquitto switches to another user, who may have no access to a private folder.
     lines = [*(["user root"] if os.geteuid() == 0 else []), *extra.splitlines()]
     file = folder / "mosquitto.conf"
-    listener = f"{port} {address}" if locks is None else ""
-    file.write_text(configurations.mosquitto(listener, str(folder), locks=_text(locks), extra=lines), "utf-8")
+    listener = f"{port} {address}" if security is None else ""
+    file.write_text(configurations.mosquitto(listener, str(folder), security=_text(security), extra=lines), "utf-8")
     command: tuple[str, ...] = (program, "-c", str(file))
-    if locks is not None:
-        files = ("--certificate", f"{locks}/server.pem", "--key", f"{locks}/server.key", "--configuration", str(file))
+    if security is not None:
+        files = (
+            "--certificate",
+            f"{security}/server.pem",
+            "--key",
+            f"{security}/server.key",
+            "--configuration",
+            str(file),
+        )
         listen = f"tls/{address}:{port}"
         command = (sys.executable, "-m", "fog_runtime.broker", "--listen", listen, *files, "--program", program)
-    scheme = "mqtt" if locks is None else "mqtts"
+    scheme = "mqtt" if security is None else "mqtts"
     return ServerProgram(
         name="mosquitto", port=port, address=address, url=f"{scheme}://{reachable(address)}:{port}", command=command
     )
@@ -152,18 +159,18 @@ def _valkey_server() -> Path | None:
     return next(iter(sorted(Path(found.origin).parent.glob("_binaries/*/valkey-server"))), None)
 
 
-def embedded_broker_program(port: int, *, address: str = LOOPBACK, locks: Path | None = None) -> ServerProgram:
-    """Return what stands in for Mosquitto where it is not installed; `address` and `locks` as for that."""
-    locked = [] if locks is None else ["--locks", str(locks)]
+def embedded_broker_program(port: int, *, address: str = LOOPBACK, security: Path | None = None) -> ServerProgram:
+    """Return what stands in for Mosquitto where it is not installed; `address` and `security` as for that."""
+    locked = [] if security is None else ["--security", str(security)]
     module = "fog_supervisor.embedded_broker"
-    scheme = "mqtt" if locks is None else "mqtts"
+    scheme = "mqtt" if security is None else "mqtts"
     return ServerProgram(
         name="mosquitto", port=port, address=address, url=f"{scheme}://{reachable(address)}:{port}",
         command=(sys.executable, "-m", module, "--listen", f"{address}:{port}", *locked),
     )  # fmt: skip
 
 
-def embedded_redis_program(folder: Path, port: int, *, locks: Path | None = None) -> ServerProgram:
+def embedded_redis_program(folder: Path, port: int, *, security: Path | None = None) -> ServerProgram:
     """Return what stands in for Redis where it is not installed; as `redis_program`, but it never encrypts.
 
     Raises `ServerError` when its package has no program for this computer.
@@ -172,24 +179,24 @@ def embedded_redis_program(folder: Path, port: int, *, locks: Path | None = None
     if program is None:
         raise ServerError(f"{_STAND_IN_STORE} has no server for this computer: install redis-server")
     file = folder / "redis.conf"
-    text = configurations.redis(LOOPBACK, str(folder), port=port, locks=_text(locks), encrypted=False)
+    text = configurations.redis(LOOPBACK, str(folder), port=port, security=_text(security), encrypted=False)
     file.write_text(text, "utf-8")
     return ServerProgram(
         name="redis", port=port, url=f"redis://{LOOPBACK}:{port}/0", command=(str(program), str(file)),
-        probe=b"PING\r\n", reply=b"+PONG" if locks is None else b"-NOAUTH",
+        probe=b"PING\r\n", reply=b"+PONG" if security is None else b"-NOAUTH",
     )  # fmt: skip
 
 
-def redis_program(folder: Path, port: int, *, locks: Path | None = None) -> ServerProgram:
-    """Return a Redis with durable writes, configured in `folder`; `locks` as for `mosquitto_program`.
+def redis_program(folder: Path, port: int, *, security: Path | None = None) -> ServerProgram:
+    """Return a Redis with durable writes, configured in `folder`; `security` as for `mosquitto_program`.
 
     Raises `ServerError` when it is not installed.
     """
     program = _installed("redis-server", "redis-server")
     file = folder / "redis.conf"
-    file.write_text(configurations.redis(LOOPBACK, str(folder), port=port, locks=_text(locks)), "utf-8")
+    file.write_text(configurations.redis(LOOPBACK, str(folder), port=port, security=_text(security)), "utf-8")
     command = (program, str(file))
-    locked = locks is not None
+    locked = security is not None
     return ServerProgram(
         name="redis",
         port=port,
@@ -201,11 +208,11 @@ def redis_program(folder: Path, port: int, *, locks: Path | None = None) -> Serv
     )
 
 
-def router_program(port: int, *, address: str = LOOPBACK, locks: Path | None = None) -> ServerProgram:
-    """Return a zenoh router; `address` and `locks` as for `mosquitto_program`."""
-    scheme = "tcp" if locks is None else "tls"
-    arguments = configurations.router_arguments(f"{scheme}/{address}:{port}", locks=_text(locks))
-    if locks is not None and (health := locks.parent / "credentials" / "health.toml").is_file():
+def router_program(port: int, *, address: str = LOOPBACK, security: Path | None = None) -> ServerProgram:
+    """Return a zenoh router; `address` and `security` as for `mosquitto_program`."""
+    scheme = "tcp" if security is None else "tls"
+    arguments = configurations.router_arguments(f"{scheme}/{address}:{port}", security=_text(security))
+    if security is not None and (health := security.parent / "credentials" / "health.toml").is_file():
         arguments += ["--health-credentials", str(health)]
     command = (sys.executable, "-m", "fog_runtime.router", *arguments)
     url = f"{scheme}/{reachable(address)}:{port}"
@@ -335,16 +342,16 @@ def _start(folder: Path, port: int, program: Callable[[Path, int], ServerProgram
     return Server(program(folder, free_port(taken)), folder)
 
 
-def start_mosquitto(folder: Path, port: int = 0, *, locks: Path | None = None, extra: str = "") -> Server:
-    """Start an MQTT broker; `locks` and `extra` as for `mosquitto_program`. Port 0: any free port."""
-    return _start(folder, port, lambda folder, port: mosquitto_program(folder, port, locks=locks, extra=extra))
+def start_mosquitto(folder: Path, port: int = 0, *, security: Path | None = None, extra: str = "") -> Server:
+    """Start an MQTT broker; `security` and `extra` as for `mosquitto_program`. Port 0: any free port."""
+    return _start(folder, port, lambda folder, port: mosquitto_program(folder, port, security=security, extra=extra))
 
 
-def start_redis(folder: Path, port: int = 0, *, locks: Path | None = None) -> Server:
-    """Start a Redis whose acknowledged writes survive a crash; `locks` as above. Port 0: any free port."""
-    return _start(folder, port, lambda folder, port: redis_program(folder, port, locks=locks))
+def start_redis(folder: Path, port: int = 0, *, security: Path | None = None) -> Server:
+    """Start a Redis whose acknowledged writes survive a crash; `security` as above. Port 0: any free port."""
+    return _start(folder, port, lambda folder, port: redis_program(folder, port, security=security))
 
 
-def start_router(folder: Path, port: int = 0, *, locks: Path | None = None) -> Server:
-    """Start a zenoh router (`python -m fog_runtime.router`); `locks` as above. Port 0: any free port."""
-    return _start(folder, port, lambda _, port: router_program(port, locks=locks))
+def start_router(folder: Path, port: int = 0, *, security: Path | None = None) -> Server:
+    """Start a zenoh router (`python -m fog_runtime.router`); `security` as above. Port 0: any free port."""
+    return _start(folder, port, lambda _, port: router_program(port, security=security))

@@ -1,9 +1,9 @@
-"""The locks of a fog node in containers: `python -m fog_runtime.locks [make | COMMAND …]`.
+"""The credentials of a fog node in containers: `python -m fog_runtime.security [make | COMMAND …]`.
 
 `make` creates what is missing, and hands out to each program what is its own; every other command does
 so afterwards. With `FOGNAV_FLOORS_DIR`, a folder with one of each further floor's site, these get theirs, too; `--floor
 SITE` names one in the other commands. Where the command `fognav` is installed, `fognav ca`, `robot add`, `node add`
-and `token` do the same in the folder of the locks.
+and `token` do the same in the folder of the credentials.
 
 Each program gets a folder of its own, which only it can read:
 
@@ -36,10 +36,10 @@ from fog_runtime.configuration.site import SiteError, load_site
 from fog_runtime.credentials import Credentials, CredentialsError, to_toml
 from fog_runtime.files import atomic_write
 from fog_runtime.keys import OPERATOR_KEY, TOKENS, make_keys
-from fog_runtime.locks import users
-from fog_runtime.locks.authority import AuthorityError
-from fog_runtime.locks.site_locks import CREDENTIALS, SiteLocks
-from fog_runtime.locks.users import LocksError, on_floor
+from fog_runtime.security import users
+from fog_runtime.security.authority import AuthorityError
+from fog_runtime.security.site_security import CREDENTIALS, SiteSecurity
+from fog_runtime.security.users import SecurityError, on_floor
 from fog_runtime.token_file import ROLES, TokensError, create_token, read_tokens, revoke_token, token_hash
 
 if TYPE_CHECKING:
@@ -49,7 +49,7 @@ if TYPE_CHECKING:
 
 SIMULATION: Final = "simulation"
 FLOORS: Final = "floors"
-"""The folder of what further floors have of their own, among the locks and among what is handed out."""
+"""The folder of what further floors have of their own, among the credentials and among what is handed out."""
 TOKEN: Final = "token"  # noqa: S105  # a file's name
 _FOGNAV_UID: Final = 10001
 """The user of our images (deploy/images)."""
@@ -71,57 +71,59 @@ _BROKER_CHECK: Final = """\
 
 
 def hand_out(
-    locks: SiteLocks, out: Path, *, robots: Sequence[str], nodes: Sequence[str], seen_as: str = "/run/locks"
+    security: SiteSecurity, out: Path, *, robots: Sequence[str], nodes: Sequence[str], seen_as: str = "/run/locks"
 ) -> list[Path]:
     """Bring the programs' folders in `out` up to date; return the files that changed.
 
-    The locks' folder also has the site's keys (`fog_runtime.keys`); `seen_as` is a folder's path in its container.
-    Raises `OSError`, and `CredentialsError` or `TokensError` for files that can't be used.
+    The credentials' folder also has the site's keys (`fog_runtime.keys`); `seen_as` is a folder's path in its
+    container. Raises `OSError`, and `CredentialsError` or `TokensError` for files that can't be used.
     """
-    return _write(out, _servers(locks, seen_as)) + _hand_out_keys(locks, out, "", robots, nodes)
+    return _write(out, _servers(security, seen_as)) + _hand_out_keys(security, out, "", robots, nodes)
 
 
 def hand_out_on_floor(
-    locks: SiteLocks, out: Path, floor: str, *, robots: Sequence[str], nodes: Sequence[str]
+    security: SiteSecurity, out: Path, floor: str, *, robots: Sequence[str], nodes: Sequence[str]
 ) -> list[Path]:
     """Do the same for what a further floor has of its own, in `out/floors/SITE`; its keys are in `keys_of`."""
-    return _hand_out_keys(locks, out / FLOORS / floor, floor, robots, nodes)
+    return _hand_out_keys(security, out / FLOORS / floor, floor, robots, nodes)
 
 
-def keys_of(locks: Path, floor: str) -> Path:
+def keys_of(security: Path, floor: str) -> Path:
     """Return the folder of a site's tokens and operators' key; without `floor`, the first site's."""
-    return locks / FLOORS / floor if floor else locks
+    return security / FLOORS / floor if floor else security
 
 
-def _hand_out_keys(locks: SiteLocks, out: Path, floor: str, robots: Sequence[str], nodes: Sequence[str]) -> list[Path]:
+def _hand_out_keys(
+    security: SiteSecurity, out: Path, floor: str, robots: Sequence[str], nodes: Sequence[str]
+) -> list[Path]:
     """Write what each site has for itself: its services' files, and those of a simulated robot."""
-    keys = keys_of(locks.directory, floor)
+    keys = keys_of(security.directory, floor)
     if (out / SIMULATION).is_dir():
         _make_token(keys / TOKENS, out / SIMULATION / TOKEN)
     named = partial(users.on_floor, floor) if floor else str
     tokens, key = (keys / TOKENS).read_bytes(), (keys / OPERATOR_KEY).read_bytes()
     found = {
-        service: {"credentials.toml": locks.credentials(named(service)).read_bytes(), TOKENS: tokens}
+        service: {"credentials.toml": security.credentials(named(service)).read_bytes(), TOKENS: tokens}
         for service in users.SERVICES
     }
     found["planner"][OPERATOR_KEY] = key
     # Those of robots and nodes may have been handed out already, and removed here.
-    known = (locks.credentials(named(user)) for user in ("console", "sim", *robots, *nodes))
+    known = (security.credentials(named(user)) for user in ("console", "sim", *robots, *nodes))
     simulated = {f"{CREDENTIALS}/{file.name}": file.read_bytes() for file in known if file.exists()}
     return _write(out, {**found, SIMULATION: {OPERATOR_KEY: key, **simulated}})
 
 
-def _servers(locks: SiteLocks, seen_as: str) -> dict[str, dict[str, bytes]]:
+def _servers(security: SiteSecurity, seen_as: str) -> dict[str, dict[str, bytes]]:
     """Return the files of what all sites share, by their names."""
-    trusted = locks.authority.trusted.encode()
-    health = Credentials.read(locks.credentials(users.HEALTH)).passwords
+    trusted = security.authority.trusted.encode()
+    health = Credentials.read(security.credentials(users.HEALTH)).passwords
     check = _BROKER_CHECK.format(folder=seen_as, user=users.HEALTH, password=health["mqtt"])
     router_check = to_toml(users.HEALTH, authority=trusted.decode(), passwords={"zenoh": health["zenoh"]})
     return {
-        "mosquitto": {**_folder(locks, "mosquitto"), "authority.pem": trusted, "mosquitto_sub": check.encode()},
-        "redis": {**_folder(locks, "redis"), "authority.pem": trusted, "health": health["redis"].encode()},
-        "zenoh": {**_folder(locks, "zenoh"), "health.toml": router_check.encode()},
-        "gateway": _folder(locks, "http"),
+        "mosquitto": {**_folder(security, "mosquitto"), "authority.pem": trusted, "mosquitto_sub": check.encode()},
+        "redis": {**_folder(security, "redis"), "authority.pem": trusted, "health": health["redis"].encode()},
+        "zenoh": {**_folder(security, "zenoh"), "health.toml": router_check.encode()},
+        "gateway": _folder(security, "http"),
     }
 
 
@@ -139,8 +141,8 @@ def _write(out: Path, contents: Mapping[str, Mapping[str, bytes]]) -> list[Path]
     return changed
 
 
-def _folder(locks: SiteLocks, program: str) -> dict[str, bytes]:
-    return {file.name: file.read_bytes() for file in sorted(locks.folder(program).iterdir()) if file.is_file()}
+def _folder(security: SiteSecurity, program: str) -> dict[str, bytes]:
+    return {file.name: file.read_bytes() for file in sorted(security.folder(program).iterdir()) if file.is_file()}
 
 
 def _make_token(tokens: Path, file: Path) -> None:
@@ -159,7 +161,7 @@ _SERVERS: Final = ("mosquitto", "redis", "zenoh", "gateway", "localhost", "127.0
 
 
 class Settings(msgspec.Struct, frozen=True, kw_only=True):
-    """Where the locks are, and for which site and hosts."""
+    """Where the credentials are, and for which site and hosts."""
 
     site_dir: Path
     locks_dir: Path
@@ -176,49 +178,49 @@ def _floors(settings: Settings) -> list[Site]:
     return [load_site(folder).site for folder in folders]
 
 
-def _make(settings: Settings, site: Site, floors: Sequence[Site]) -> SiteLocks:
+def _make(settings: Settings, site: Site, floors: Sequence[Site]) -> SiteSecurity:
     """Create what is missing."""
-    locks = SiteLocks(settings.locks_dir, site.id)
+    security = SiteSecurity(settings.locks_dir, site.id)
     hosts = [host for host in (part.strip() for part in settings.hosts.split(",")) if host]
-    locks.make(
+    security.make(
         [*_SERVERS, *hosts], robots=[robot.id for robot in site.robots], nodes=[node.id for node in site.nodes]
     )  # fmt: skip
     make_keys(settings.locks_dir)
     for index, floor in enumerate(floors):
         if floor.id in {site.id, *(each.id for each in floors[:index])}:
-            raise LocksError(f"two floors have the same id {floor.id!r}: give one of them another in its site.toml")
-        locks.add_floor(
+            raise SecurityError(f"two floors have the same id {floor.id!r}: give one of them another in its site.toml")
+        security.add_floor(
             floor.id, robots=[robot.id for robot in floor.robots], nodes=[node.id for node in floor.nodes]
         )  # fmt: skip
         make_keys(keys_of(settings.locks_dir, floor.id))
-    return locks
+    return security
 
 
-def _carry_out(options: argparse.Namespace, locks: SiteLocks) -> str:
-    """Carry out a command; return what it prints. Raises `LocksError`, `AuthorityError`, `TokensError`, `OSError`."""
+def _carry_out(options: argparse.Namespace, security: SiteSecurity) -> str:
+    """Carry out a command; return its answer. Raises `SecurityError`, `AuthorityError`, `TokensError`, `OSError`."""
     match options.command:
         case "robot" | "node" | "device":
-            return _added(options, locks).read_text("utf-8")
+            return _added(options, security).read_text("utf-8")
         case "remove":
-            if not locks.remove(_named(options)):
-                raise LocksError(f"{options.id} is unknown. Known are: {', '.join(sorted(locks.users()))}")
+            if not security.remove(_named(options)):
+                raise SecurityError(f"{options.id} is unknown. Known are: {', '.join(sorted(security.users()))}")
         case "certificate":
-            return locks.authority.trusted
+            return security.authority.trusted
         case "show":
-            return _shown(locks, options.file)
+            return _shown(security, options.file)
         case "token":
-            return _change_tokens(options, keys_of(locks.directory, options.floor) / TOKENS)
+            return _change_tokens(options, keys_of(security.directory, options.floor) / TOKENS)
         case "rotate":
-            _rotate(locks, finish=options.finish)
+            _rotate(security, finish=options.finish)
     return ""
 
 
-def _added(options: argparse.Namespace, locks: SiteLocks) -> Path:
+def _added(options: argparse.Namespace, security: SiteSecurity) -> Path:
     _id(options.id)
     name = _named(options)
     if options.command == "device":
-        return locks.add_device(name, options.topic)
-    return locks.add_robot(name) if options.command == "robot" else locks.add_node(name)
+        return security.add_device(name, options.topic)
+    return security.add_robot(name) if options.command == "robot" else security.add_node(name)
 
 
 def _named(options: argparse.Namespace) -> str:
@@ -235,34 +237,34 @@ def _change_tokens(options: argparse.Namespace, file: Path) -> str:
     return "".join(f"{entry.name}: {entry.role}\n" for entry in read_tokens(file))
 
 
-def _rotate(locks: SiteLocks, *, finish: bool) -> None:
+def _rotate(security: SiteSecurity, *, finish: bool) -> None:
     if finish:
-        locks.authority.finish()
+        security.authority.finish()
     else:
-        locks.authority.rotate(now=dt.datetime.now(dt.UTC))
-    locks.trust_again()
-    locks.renew(only_due=False)
+        security.authority.rotate(now=dt.datetime.now(dt.UTC))
+    security.trust_again()
+    security.renew(only_due=False)
 
 
-def _require_floor(floor: str, locks: SiteLocks) -> None:
-    _, *known = locks.sites
+def _require_floor(floor: str, security: SiteSecurity) -> None:
+    _, *known = security.sites
     if floor and floor not in known:
-        raise LocksError(f"{floor} is no further floor of this fog node. There are: {', '.join(known) or 'none'}")
+        raise SecurityError(f"{floor} is no further floor of this fog node. There are: {', '.join(known) or 'none'}")
 
 
 def _id(text: str) -> None:
     try:
         msgspec.convert(text, Id)
     except msgspec.ValidationError as error:
-        raise LocksError(f"{text} is no id: use only a to z, 0 to 9 and -, at most 32") from error
+        raise SecurityError(f"{text} is no id: use only a to z, 0 to 9 and -, at most 32") from error
 
 
-def _shown(locks: SiteLocks, name: str) -> str:
-    file = (locks.directory / name).resolve()
-    if not file.is_relative_to(locks.directory.resolve()) or not file.is_file():
-        files = sorted(path for path in locks.directory.rglob("*") if path.is_file())
-        names = ", ".join(path.relative_to(locks.directory).as_posix() for path in files)
-        raise LocksError(f"there is no file {name}. There are: {names}")
+def _shown(security: SiteSecurity, name: str) -> str:
+    file = (security.directory / name).resolve()
+    if not file.is_relative_to(security.directory.resolve()) or not file.is_file():
+        files = sorted(path for path in security.directory.rglob("*") if path.is_file())
+        names = ", ".join(path.relative_to(security.directory).as_posix() for path in files)
+        raise SecurityError(f"there is no file {name}. There are: {names}")
     return file.read_text("utf-8")
 
 
@@ -308,26 +310,26 @@ def main(arguments: Sequence[str] | None = None) -> int:
     try:
         settings = load(Settings, environ=os.environ)
         site, floors = load_site(settings.site_dir).site, _floors(settings)
-        locks = _make(settings, site, floors)
-        _require_floor(options.floor, locks)
+        security = _make(settings, site, floors)
+        _require_floor(options.floor, security)
         # At once: what is printed only once must not be lost when handing out fails.
-        sys.stdout.write(_carry_out(options, locks))
+        sys.stdout.write(_carry_out(options, security))
         _keep_owner(settings.locks_dir)
         changed = hand_out(
-            locks,
+            security,
             settings.handed_out_dir,
             robots=[robot.id for robot in site.robots],
             nodes=[node.id for node in site.nodes],
         )
         for floor in floors:
             changed += hand_out_on_floor(
-                locks,
+                security,
                 settings.handed_out_dir,
                 floor.id,
                 robots=[robot.id for robot in floor.robots],
                 nodes=[node.id for node in floor.nodes],
             )
-    except (AuthorityError, CredentialsError, LocksError, SettingsError, SiteError, TokensError, OSError) as error:
+    except (AuthorityError, CredentialsError, SecurityError, SettingsError, SiteError, TokensError, OSError) as error:
         sys.stderr.write(f"{error}\n")
         return 1
     for file in changed:

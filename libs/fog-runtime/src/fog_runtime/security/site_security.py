@@ -1,4 +1,4 @@
-"""The locks of a site in one folder: an authority, a certificate and lists for each server, credentials for each user.
+"""The security of a site in one folder: an authority, a certificate and lists for each server, credentials of users.
 
     locks.json                                    for which site and hosts they were made
     authority.pem                                 stays on the fog node, and is read by nothing that runs
@@ -25,9 +25,9 @@ from fog_contracts.channels import BROKER_NAME
 from fog_contracts.generate.acl import mqtt_acl, zenoh_acl
 from fog_runtime.credentials import SERVERS, Credentials, Server, to_toml
 from fog_runtime.files import PRIVATE, atomic_write
-from fog_runtime.locks import users
-from fog_runtime.locks.authority import SERVER_DAYS, Authority, expiry
-from fog_runtime.locks.users import ANYBODY, LocksError, Members, ServerFiles, require_own_topics, user_of
+from fog_runtime.security import users
+from fog_runtime.security.authority import SERVER_DAYS, Authority, expiry
+from fog_runtime.security.users import ANYBODY, Members, SecurityError, ServerFiles, require_own_topics, user_of
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping, Sequence
@@ -52,8 +52,8 @@ class _Plan(msgspec.Struct, frozen=True):
     devices: dict[str, list[str]] = {}
 
 
-class SiteLocks:
-    """The locks in a folder. Its methods may be repeated: what is there already stays."""
+class SiteSecurity:
+    """The credentials in a folder. Its methods may be repeated: what is there already stays."""
 
     def __init__(self, folder: Path, site: str, *, unrestricted: Sequence[str] = (), mode: int = PRIVATE) -> None:
         """Take a folder, which `make` fills; `mode` are the permissions of what the servers read.
@@ -65,28 +65,28 @@ class SiteLocks:
 
     @classmethod
     def open(cls, folder: Path) -> Self:
-        """Open the locks that `make` has made in a folder; raises `LocksError`."""
+        """Open the credentials that `make` has made in a folder; raises `SecurityError`."""
         try:
             opened = cls(folder, "")
             opened._plan = _read_plan(folder)
         except OSError as error:
-            raise LocksError(
+            raise SecurityError(
                 f"{folder} has no certificates and users of a site ({error.strerror}). Create them "
                 f"(fognav ca create --credentials {folder})"
             ) from error
         except msgspec.DecodeError as error:
-            raise LocksError(f"{folder / _PLAN}: {error}. Restore it from a backup") from error
+            raise SecurityError(f"{folder / _PLAN}: {error}. Restore it from a backup") from error
         return opened
 
     def make(self, hosts: Sequence[str], *, robots: Sequence[str] = (), nodes: Sequence[str] = ()) -> None:
         """Create what is missing: the authority, servers' certificates, the services' and tools' users, these robots'.
 
         `hosts` are the names and addresses by which clients reach the servers, besides those of before. Certificates
-        that expire soon, or lack one of them, are renewed. Raises `LocksError` or `AuthorityError`.
+        that expire soon, or lack one of them, are renewed. Raises `SecurityError` or `AuthorityError`.
         """
         before = _read_plan(self._folder) if (self._folder / _PLAN).exists() else self._plan
         if before.site != self._plan.site:
-            raise LocksError(
+            raise SecurityError(
                 f"{self._folder} has the credentials of site {before.site}, not of {self._plan.site}: name a folder "
                 "(or volume) of its own for each site"
             )
@@ -101,7 +101,7 @@ class SiteLocks:
         own[users.REDIS_ADMINISTRATOR] = ("redis",)
         own[users.HEALTH] = SERVERS
         own |= dict.fromkeys(self._plan.unrestricted, ("mqtt", "zenoh"))
-        self._set_users(_locked_out(own, self._files, self.credentials) | self._not_yet_admitted(robots, nodes))
+        self._set_users(_shut_out(own, self._files, self.credentials) | self._not_yet_admitted(robots, nodes))
         self._write_rights_in_redis()
         self._write_hashes_of_mqtt()
         self._write_access()
@@ -116,7 +116,7 @@ class SiteLocks:
             self._save(msgspec.structs.replace(self._plan, floors=[*self._plan.floors, site]))
         own = {users.on_floor(site, name): servers for name, servers in {**users.SERVICES, **users.TOOLS}.items()}
         members = ([users.on_floor(site, each) for each in kind] for kind in (robots, nodes))
-        self._set_users(_locked_out(own, self._files, self.credentials) | self._not_yet_admitted(*members))
+        self._set_users(_shut_out(own, self._files, self.credentials) | self._not_yet_admitted(*members))
         self._write_access()
 
     def _not_yet_admitted(self, robots: Sequence[str], nodes: Sequence[str]) -> dict[str, Sequence[Server]]:
@@ -144,7 +144,7 @@ class SiteLocks:
 
     @property
     def sites(self) -> list[str]:
-        """The site for which the locks were made, then its further floors, in the order in which they were added."""
+        """The site for which they were made, then its further floors, in the order in which they were added."""
         return [self._plan.site, *self._plan.floors]
 
     def users(self) -> set[str]:
@@ -171,31 +171,31 @@ class SiteLocks:
         return Authority.open(self._folder / AUTHORITY)
 
     def add_robot(self, robot: str) -> Path:
-        """Let a robot in, or give it a new password; return its credentials. Raises `LocksError`."""
+        """Let a robot in, or give it a new password; return its credentials. Raises `SecurityError`."""
         self._members.require_different_ids([robot], [])
         return self._add(robot, ("zenoh",))
 
     def add_node(self, node: str) -> Path:
-        """Let a sensor node in, or give it a new password; return its credentials. Raises `LocksError`."""
+        """Let a sensor node in, or give it a new password; return its credentials. Raises `SecurityError`."""
         self._members.require_different_ids([], [node])
         return self._add(node, ("mqtt",))
 
     def add_device(self, device: str, topics: Sequence[str]) -> Path:
         """Let a sensor or gateway of others use these MQTT topics (wildcards below the first level) and no other.
 
-        One that is known gets a new password and these topics. Returns its credentials. Raises `LocksError`.
+        One that is known gets a new password and these topics. Returns its credentials. Raises `SecurityError`.
         """
         require_own_topics(device, topics)
         self._members.require_free_name(device)
         if device in self.users() - set(self._plan.devices):
-            raise LocksError(f"{device} is a robot or node already: give the device another name")
+            raise SecurityError(f"{device} is a robot or node already: give the device another name")
         self._save(msgspec.structs.replace(self._plan, devices={**self._plan.devices, device: list(topics)}))
         return self._add(device, ("mqtt",))
 
     def remove(self, user: str) -> bool:
         """Refuse a robot, node or device from now on, once the servers have read their lists again.
 
-        Returns whether there was one. Raises `LocksError` for a part of Fognav.
+        Returns whether there was one. Raises `SecurityError` for a part of Fognav.
         """
         self._members.require_free_name(user)
         found = False
@@ -325,7 +325,7 @@ def _read_plan(folder: Path) -> _Plan:
     return msgspec.json.decode((folder / _PLAN).read_bytes(), type=_Plan)
 
 
-def _locked_out(
+def _shut_out(
     own: Mapping[str, Sequence[Server]], files: ServerFiles, file_of: Callable[[str], Path]
 ) -> dict[str, Sequence[Server]]:
     """Return who of these lacks a password, or a place in a server's list.

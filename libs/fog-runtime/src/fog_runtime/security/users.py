@@ -183,8 +183,8 @@ _DEVICE_TOPIC: Final = re.compile(r"(?!fog/)[\w.-]+/(?:(?:[\w.-]+|\+)/)*(?:[\w.-
 """No topic of one level, such as the thesis's, and none of Fognav's own."""
 
 
-class LocksError(ValueError):
-    """Locks can't be made or changed so; the message names the file and the remedy."""
+class SecurityError(ValueError):
+    """Credentials can't be made or changed so; the message names the file and the remedy."""
 
 
 class Members:
@@ -207,26 +207,26 @@ class Members:
         return of_floor(user)[1] in parts or user in self._unrestricted
 
     def require_free_name(self, user: str) -> None:
-        """Raise `LocksError` if the name belongs to a part of Fognav."""
+        """Raise `SecurityError` if the name belongs to a part of Fognav."""
         if self.is_reserved(user):
-            raise LocksError(f"{user} is the name of a part of Fognav: give the robot, node or device another id")
+            raise SecurityError(f"{user} is the name of a part of Fognav: give the robot, node or device another id")
 
     def require_different_ids(self, robots: Sequence[str], nodes: Sequence[str]) -> None:
-        """Raise `LocksError` if one of these robots has the name of a node or device, or the other way round."""
+        """Raise `SecurityError` if one of these robots has the name of a node or device, or the other way round."""
         known_nodes, known_robots = (set(self._files.members(each)) for each in ("mosquitto", "zenoh"))
         taken = set(robots) & ({*nodes} | known_nodes) | set(nodes) & (known_robots | {*self._devices})
         if taken := {user for user in taken if not self.is_reserved(user)}:
-            raise LocksError(
+            raise SecurityError(
                 f"{', '.join(sorted(taken))}: a robot, a node and a device of one site need different ids, since each "
                 "is a user of its servers: rename one of them"
             )
 
 
 def require_own_topics(device: str, topics: Sequence[str]) -> None:
-    """Raise `LocksError` if a sensor or gateway of others can't have one of these MQTT topics (with wildcards)."""
+    """Raise `SecurityError` if a sensor or gateway of others can't have one of these MQTT topics (with wildcards)."""
     for topic in topics:
         if not _DEVICE_TOPIC.fullmatch(topic):
-            raise LocksError(
+            raise SecurityError(
                 f"{device} can't have the topic {topic!r}: name one of its own with two levels at least, such as "
                 "zigbee2mqtt/#, of letters, digits, '_', '.' and '-', and none below fog/"
             )

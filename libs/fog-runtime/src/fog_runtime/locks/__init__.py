@@ -1,1 +1,0 @@
-"""The locks of a site's servers: certificates, users, and what each user may do. Needs the extra `locks`."""

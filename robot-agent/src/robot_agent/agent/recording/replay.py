@@ -9,9 +9,10 @@ import argparse
 import hashlib
 import sys
 from collections import Counter
+from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Final
+from typing import TYPE_CHECKING, Any, Final
 
 import msgspec
 
@@ -24,8 +25,9 @@ from robot_agent.agent.recording import input_log as log
 from robot_agent.motion.local_planner import decide
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator, Sequence
+    from collections.abc import Callable, Iterator, Mapping, Sequence
 
+    from robot_agent.agent.core import AgentCore
     from robot_agent.motion.local_planner import Job
     from robot_agent.profiles import Found
 
@@ -100,6 +102,43 @@ def _entries(path: Path) -> Iterator[tuple[log.Entry, bytes]]:
             ) from error
 
 
+def _receive(agent: AgentCore, entry: log.MessageReceived) -> None:
+    channel, at = CHANNELS[entry.channel], Moment(entry.now, entry.stamp)
+    agent.handlers()[channel](entry.ids, msgspec.convert(entry.message, channel.message), at)
+
+
+def _ask(agent: AgentCore, entry: log.QueryReceived) -> None:
+    channel, at = CHANNELS[entry.channel], Moment(entry.now, entry.stamp)
+    request = None if channel.message is None else msgspec.convert(entry.request, channel.message)
+    agent.query_handlers()[channel](entry.ids, request, at)
+
+
+def _load(agent: AgentCore, entry: log.SnapshotLoaded) -> None:
+    with suppress(MapError):  # it was refused in the recorded run too, or later outputs will differ
+        agent.load(entry.snapshot, entry.now)
+
+
+_PASSED_ON: Final[Mapping[type[log.Entry], Callable[[AgentCore, Any], object]]] = {
+    log.PoseRestored: lambda agent, entry: agent.restore(entry.pose),
+    log.SnapshotLoaded: _load,
+    log.MessageReceived: _receive,
+    log.QueryReceived: _ask,
+    log.BaseReceived: lambda agent, entry: agent.on_base(entry.feedback, entry.now),
+    log.BaseLost: lambda agent, entry: agent.on_base_lost(entry.now, entry.reason),
+    log.LidarSamplesReceived: lambda agent, entry: agent.on_lidar_samples(entry.samples(), entry.now),
+    log.ScanReceived: lambda agent, entry: agent.on_scan(entry.scan(), entry.now),
+    log.SuspensionNoticed: lambda agent, entry: agent.on_suspension(entry.seconds),
+    log.PoseObserved: lambda agent, entry: agent.on_absolute_observation(entry.observation()),
+    log.EgressAsked: lambda agent, entry: agent.egress_request(entry.now),
+    log.EgressReplied: lambda agent, entry: agent.on_egress_reply(entry.request, entry.reply, entry.now),
+    log.LoopHealthReceived: lambda agent, entry: agent.on_loop_health(entry.health),
+    log.StreamCycle: lambda agent, entry: agent.stream(entry.now, entry.stamp),
+    log.Tick: lambda agent, entry: agent.tick(Moment(entry.now, entry.stamp)),
+    log.StorageCheck: lambda agent, entry: agent.pose_to_store(entry.now),
+}
+"""What the core gets of each input that depends on nothing which the replay computes."""
+
+
 class _Run:
     """A core under replay, and its outputs since the last input."""
 
@@ -146,66 +185,6 @@ class _Run:
         self.count += 1
         self._result.inputs[type(entry).__name__] += 1
         match entry:
-            case log.MessageReceived() | log.QueryReceived():
-                self._from_channel(entry)
-            case log.SnapshotLoaded() | log.PoseRestored():
-                self._load(entry)
-            case log.BaseReceived() | log.BaseLost() | log.LidarSamplesReceived() | log.ScanReceived():
-                self._from_hardware(entry)
-            case log.SuspensionNoticed():
-                self._agent.on_suspension(entry.seconds)
-            case log.PoseObserved():
-                self._agent.on_absolute_observation(entry.observation())
-            case log.EgressAsked() | log.EgressReplied() | log.LoopHealthReceived():
-                self._from_process(entry)
-            case log.SearchCycle() | log.SearchEnded():
-                self._search(entry)
-            case log.ControlCycle() | log.DecisionMade() | log.StreamCycle() | log.Tick() | log.StorageCheck():
-                self._cycle(entry)
-            case _:
-                raise ReplayError(f"input {self.count}: a log can't continue with {type(entry).__name__}")
-
-    def _from_channel(self, entry: log.MessageReceived | log.QueryReceived) -> None:
-        channel, at = CHANNELS[entry.channel], Moment(entry.now, entry.stamp)
-        if isinstance(entry, log.MessageReceived):
-            self._agent.handlers()[channel](entry.ids, msgspec.convert(entry.message, channel.message), at)
-        else:
-            request = None if channel.message is None else msgspec.convert(entry.request, channel.message)
-            self._agent.query_handlers()[channel](entry.ids, request, at)
-
-    def _from_process(self, entry: log.EgressAsked | log.EgressReplied | log.LoopHealthReceived) -> None:
-        match entry:
-            case log.EgressAsked():
-                self._agent.egress_request(entry.now)
-            case log.EgressReplied():
-                self._agent.on_egress_reply(entry.request, entry.reply, entry.now)
-            case log.LoopHealthReceived():
-                self._agent.on_loop_health(entry.health)
-
-    def _load(self, entry: log.SnapshotLoaded | log.PoseRestored) -> None:
-        if isinstance(entry, log.PoseRestored):
-            self._agent.restore(entry.pose)
-            return
-        try:
-            self._agent.load(entry.snapshot, entry.now)
-        except MapError:
-            return  # it was refused in the recorded run too, or later outputs will differ
-
-    def _from_hardware(
-        self, entry: log.BaseReceived | log.BaseLost | log.LidarSamplesReceived | log.ScanReceived
-    ) -> None:
-        match entry:
-            case log.BaseReceived():
-                self._agent.on_base(entry.feedback, entry.now)
-            case log.BaseLost():
-                self._agent.on_base_lost(entry.now, entry.reason)
-            case log.LidarSamplesReceived():
-                self._agent.on_lidar_samples(entry.samples(), entry.now)
-            case log.ScanReceived():
-                self._agent.on_scan(entry.scan(), entry.now)
-
-    def _search(self, entry: log.SearchCycle | log.SearchEnded) -> None:
-        match entry:
             case log.SearchCycle():
                 search = self._agent.search(entry.now)
                 self._found = None if search is None else search.run()
@@ -213,21 +192,14 @@ class _Run:
                 if self._found is None:
                     raise ReplayError(f"input {self.count}: a search ended that the replay has not begun")
                 self._agent.on_found(self._found, Moment(entry.now, entry.stamp))
-
-    def _cycle(
-        self, entry: log.ControlCycle | log.DecisionMade | log.StreamCycle | log.Tick | log.StorageCheck
-    ) -> None:
-        match entry:
             case log.ControlCycle():
                 self._job = self._agent.control_job(entry.now)
             case log.DecisionMade():
                 self._decide(entry)
-            case log.StreamCycle():
-                self._agent.stream(entry.now, entry.stamp)
-            case log.Tick():
-                self._agent.tick(Moment(entry.now, entry.stamp))
-            case log.StorageCheck():
-                self._agent.pose_to_store(entry.now)
+            case _ if type(entry) in _PASSED_ON:
+                _PASSED_ON[type(entry)](self._agent, entry)
+            case _:
+                raise ReplayError(f"input {self.count}: a log can't continue with {type(entry).__name__}")
 
     def _decide(self, entry: log.DecisionMade) -> None:
         recorded = msgspec.json.encode(entry.decision)

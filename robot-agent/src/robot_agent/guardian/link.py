@@ -43,11 +43,10 @@ class BaseFeedback(Struct, frozen=True, kw_only=True):
     """The newest reading of the base.
 
     `fault`: the guardian's latched fault, or the silence of a base that has not moved yet (None: none), `fault_code`
-    its identifier. `stopped`: why
-    the guardian keeps the wheels at zero whatever the agent requests (None: it does not). `corrupted`: damaged frames
-    of the base so far. `bumped`: the fault is a pressed bumper, from which the robot may back off. `passing`: it is the
-    silence of a base that has not moved yet, and ends with it. `at`: when it was sent, s of the monotonic clock that
-    agent and guardian share (None: unknown).
+    its identifier. `stopped`: why the guardian keeps the wheels at zero whatever the agent requests (None: it does
+    not). `corrupted`: damaged frames of the base so far. `bumped`: the fault is a pressed bumper, from which the robot
+    may back off. `passing`: it is the silence of a base that has not moved yet, and ends with it. `at`: when it was
+    sent, s of the monotonic clock that agent and guardian share (None: unknown).
     """
 
     seq: Count

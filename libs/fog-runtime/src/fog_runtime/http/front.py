@@ -1,5 +1,9 @@
 """The process that receives requests, so that requests delay the core as little as possible (ADR 24).
 
+What it is worth: with 32 clients that ask for what costs most, the heartbeats (100 ms) of a map-service that received
+requests itself had gaps of 257 ms (p99), and of 1,540 ms beside other work; with this process they have 124 ms on a
+quiet machine, 154 ms at a load of 3. Robots slow down after 1 s.
+
 It is forked from the core's process before that has threads and connections, and reads, checks and limits requests:
 sizes, tokens, JSON, types. What is well-formed it passes on over a link; the core's process runs the route's handler on
 its event loop, and returns the response.

@@ -51,7 +51,7 @@ from hazard_aggregator.registry import find_rule
 from map_service.core import MapCore
 from map_service.registry import make_layers
 from planner.core import PlannerCore
-from planner.robot_commands import CommandError
+from planner.robot_operator import CommandError
 from planner.store import Order
 from robot_agent.agent.core import AgentCore
 from robot_agent.agent.recording import input_log as log

@@ -48,7 +48,7 @@ from fog_runtime.http import (
 from fog_runtime.stores.redis_connection import StoreError
 from fog_runtime.stores.redis_store import IdempotencyError
 from planner.query_queue import BusyError
-from planner.robot_commands import CommandError, RobotOperator
+from planner.robot_operator import CommandError, RobotOperator
 from planner.service import Service
 from planner.store import NO_MISSION, MissionConflictError, Order, StoredGoal
 

@@ -30,7 +30,7 @@ from planner.map_keeper import MapKeeper
 from planner.plan_records import PathRecord, PlanMetrics
 from planner.query_queue import BusyError, QueryQueue, Threads
 from planner.refusals import busy
-from planner.robot_commands import RobotOperator
+from planner.robot_operator import RobotOperator
 from planner.store import DockKeeper, MissionKeeper
 
 if TYPE_CHECKING:

@@ -23,7 +23,7 @@ from fog_runtime.stores.redis_connection import StoreError
 from fog_runtime.token_file import TokenEntry, token_hash
 from planner.api import make_api
 from planner.core import PlannerCore
-from planner.robot_commands import OTHERS, PERIOD_S, REMEMBERED_S, SENDERS, CommandError, DoubledRobots, StopRecords
+from planner.robot_operator import OTHERS, PERIOD_S, REMEMBERED_S, SENDERS, CommandError, DoubledRobots, StopRecords
 from planner.service import Service
 
 if TYPE_CHECKING:

@@ -8,6 +8,8 @@ here. `./fognav check` runs it.
 _.age_s  # api: age of an area's last reading
 _.charge_ah  # messages: of a robot's battery
 _.capacity_ah
+_.translation_deviation_m  # report: of a trajectory, in `map from-log --json`
+_.rotation_worst_deg
 _.after_input  # the agent's replay: where a recording and its replay differ
 _.control_p99_s  # messages: how regular the agent's loops are
 _.stream_p99_s

@@ -159,7 +159,9 @@ def test_log_of_another_building_is_never_good(folder, tmp_path):
 
 @pytest.mark.parametrize("log", ["drive.jsonl.gz", "drive.log"])
 def test_map_of_a_log_shows_the_walls_where_they_are(folder, tmp_path, log):
-    _, found = run("map", "from-log", folder / log, "--out", tmp_path / "built", "--scans", "odd")
+    _, found = run(
+        "map", "from-log", folder / log, "--out", tmp_path / "built", "--scans", "odd", "--poses", "reference"
+    )
     built = load_map(tmp_path / "built.yaml")
     assert (found["width"], found["height"]) == (built.geometry.width, built.geometry.height)
     assert found["free"] + found["occupied"] + found["unknown"] == built.cells.size
@@ -168,6 +170,35 @@ def test_map_of_a_log_shows_the_walls_where_they_are(folder, tmp_path, log):
     near = FLOOR.geometry.sample(_grown_walls(), built.geometry.centres(np.argwhere(built.cells == 254)[:, ::-1]), 0)
     assert near.mean() > 0.99
     assert found["occupied"] > 500
+
+
+def test_map_without_a_reference_is_found_by_matching_and_can_be_looked_at(folder, tmp_path):
+    words = ("map", "from-log", folder / "drive.jsonl.gz", "--out", tmp_path / "built")
+    code, found = run(*words, "--png", tmp_path / "loops.png", "--trajectory", tmp_path / "way.txt")
+    assert code == 0
+    assert found["absolute_error_m"] < 0.05
+    assert found["relations"]["1 m"]["translation_m"] < 0.03
+    rows = np.loadtxt(tmp_path / "way.txt")
+    assert rows.shape == (found["scans"], 4)
+    assert (np.diff(rows[:, 0]) > 0.0).all()
+    with Image.open(tmp_path / "loops.png") as picture:
+        assert picture.size == (found["width"], found["height"])
+    assert load_map(tmp_path / "built.yaml").cells.shape == (found["height"], found["width"])
+
+
+@pytest.mark.parametrize(
+    ("option", "problem"),
+    [
+        (("--without-loop", "7"), "takes the name of a loop in the list"),
+        (("--without-loop", "1-99999"), "scan 99999 is not among those used"),
+        (("--png", "missing/loops.png"), "there is no folder"),
+    ],
+)
+def test_map_that_can_not_be_made_says_why(folder, tmp_path, option, problem):
+    words = ["map", "from-log", str(folder / "drive.jsonl.gz"), "--out", str(tmp_path / "built"), *option]
+    done = CliRunner().invoke(app, words)
+    assert done.exit_code == 2
+    assert problem in " ".join(done.output.split())
 
 
 def _grown_walls() -> np.ndarray:
@@ -231,7 +262,7 @@ def test_recorded_floor_with_real_odometry_meets_its_targets(data_dir, tmp_path)
     log = data_dir / "lidar_logs" / "intel_odom_ref_scan.jsonl.gz"
     if not log.is_file():
         pytest.skip(f"{log} does not exist")
-    run("map", "from-log", log, "--out", tmp_path / "intel", "--scans", "odd")
+    run("map", "from-log", log, "--out", tmp_path / "intel", "--scans", "odd", "--poses", "reference")
     code, found = run("localize", "--map", tmp_path / "intel.yaml", "--log", log, "--scans", "even")
     assert code == 0
     assert found["odometry"] == "measured"
@@ -255,7 +286,7 @@ def test_robot_carried_away_on_a_recorded_floor_is_never_good_elsewhere(data_dir
     log = data_dir / "lidar_logs" / name
     if not log.is_file():
         pytest.skip(f"{log} does not exist")
-    run("map", "from-log", log, "--out", tmp_path / "floor", "--scans", "odd")
+    run("map", "from-log", log, "--out", tmp_path / "floor", "--scans", "odd", "--poses", "reference")
     for seed in (1, 2, 3):
         _, found = run(
             "localize", "--map", tmp_path / "floor.yaml", "--log", log, "--scans", "even", "--kidnap", "--seed", seed
@@ -270,7 +301,7 @@ def test_robot_carried_between_places_that_look_alike_is_not_good_where_suddenly
     log = data_dir / "lidar_logs" / "intel_odom_ref_scan.jsonl.gz"
     if not log.is_file():
         pytest.skip(f"{log} does not exist")
-    run("map", "from-log", log, "--out", tmp_path / "floor", "--scans", "odd")
+    run("map", "from-log", log, "--out", tmp_path / "floor", "--scans", "odd", "--poses", "reference")
     before, after = (read_log(log).select("even")[part] for part in (slice(48, 68), slice(402, 427)))
     last, first = before[-1], after[0]
     carried = [
@@ -295,7 +326,7 @@ def test_robot_carried_to_where_half_of_its_beams_agree_is_not_good_there_after_
     log = data_dir / "lidar_logs" / "seattle-corrected.log.gz"
     if not log.is_file():
         pytest.skip(f"{log} does not exist")
-    run("map", "from-log", log, "--out", tmp_path / "floor", "--scans", "odd")
+    run("map", "from-log", log, "--out", tmp_path / "floor", "--scans", "odd", "--poses", "reference")
     floor, config = load_map(tmp_path / "floor.yaml"), LocalizationConfig(range_max=30.0)
     fields = map_fields(floor.cells, floor.geometry, config)
     seed, rng = 1, np.random.default_rng(1)
@@ -315,7 +346,7 @@ def test_robot_whose_place_is_not_among_those_that_a_search_keeps_is_not_good_at
     log = data_dir / "lidar_logs" / "infinite-corridor-corrected.log.gz"
     if not log.is_file():
         pytest.skip(f"{log} does not exist")
-    run("map", "from-log", log, "--out", tmp_path / "floor", "--scans", "odd")
+    run("map", "from-log", log, "--out", tmp_path / "floor", "--scans", "odd", "--poses", "reference")
     floor, config = load_map(tmp_path / "floor.yaml"), LocalizationConfig(range_max=30.0)
     fields = map_fields(floor.cells, floor.geometry, config)
     start = with_noise(read_log(log).select("even"), 1)[239:249]
@@ -330,7 +361,7 @@ def test_robot_at_rest_among_people_is_at_no_place_that_its_scan_does_not_confir
     log = data_dir / "lidar_logs" / "fhw-corrected.log.gz"
     if not log.is_file():
         pytest.skip(f"{log} does not exist")
-    run("map", "from-log", log, "--out", tmp_path / "floor", "--scans", "odd")
+    run("map", "from-log", log, "--out", tmp_path / "floor", "--scans", "odd", "--poses", "reference")
     floor, config = load_map(tmp_path / "floor.yaml"), LocalizationConfig(range_max=30.0)
     fields = map_fields(floor.cells, floor.geometry, config)
     seen = read_log(log).select("even")

@@ -1,16 +1,14 @@
-"""`fognav localize` and `map from-log`: evaluate the localization on a recorded log, and make the map for it."""
+"""`fognav localize`: evaluate the localization on a recorded log."""
 
 from __future__ import annotations
 
-from pathlib import Path
+from pathlib import Path  # noqa: TC003  # Typer reads annotations at run time
 from typing import TYPE_CHECKING, Annotated
 
-import numpy as np
 import typer
 from rich.progress import Progress
 
-from fog_contracts.costs import FREE, LETHAL, UNKNOWN
-from fog_runtime.configuration.maps import MapFileError, load_map, save_map
+from fog_runtime.configuration.maps import MapFileError, load_map
 from fognav import kernels
 from fognav.commands.installed import MEASURE
 from fognav.operate.options import JsonOption  # noqa: TC001  # Typer reads annotations at run time
@@ -22,8 +20,6 @@ from fognav.output import (
     exit_codes,
     print_answer,
     print_json,
-    print_result,
-    writing,
 )
 from fognav_experiments.lidar_logs import LogFormat, RangeMax, Scans  # noqa: TC001  # same
 
@@ -37,51 +33,6 @@ def add_to(app: typer.Typer) -> None:
     """Add the command to `fognav`."""
     epilog = "Example: fognav localize --map floor.yaml --log drive.log.gz --scans even --json"
     app.command("localize", epilog=epilog, rich_help_panel=MEASURE)(localize_command)
-
-
-def add_to_map(app: typer.Typer) -> None:
-    """Add the command that makes a map of a log to `fognav map`."""
-    app.command("from-log", epilog="Example: fognav map from-log drive.log.gz --out floor --scans odd")(map_from_log)
-
-
-def map_from_log(  # noqa: PLR0913  # each option is an argument
-    log_file: Annotated[Path, typer.Argument(metavar="LOG", help="Log with reference poses: JSON lines or CARMEN.")],
-    *,
-    out: Annotated[Path, typer.Option("--out", metavar="PREFIX", help="PREFIX.yaml and PREFIX.pgm are written.")],
-    log_format: LogFormat = "auto",
-    scans: Scans = "all",
-    resolution: Annotated[
-        float, typer.Option("--resolution", metavar="M", min=0.01, max=1.0, help="Size of a cell (m).")
-    ] = 0.05,
-    range_max: RangeMax = 30.0,
-    json: JsonOption = False,
-) -> None:
-    """Build a map from a log's scans at their reference poses.
-
-    Each beam clears the cells that it passes and marks the one where it ends.
-    """
-    from fognav_experiments.lidar_logs.logs import build_map, read_log  # noqa: PLC0415  # keeps the other commands fast
-
-    with exit_codes():
-        map_ = build_map(read_log(log_file, log_format).select(scans), resolution, range_max)
-        with writing(Path(f"{out}.yaml"), "Name another --out"):
-            save_map(out, map_)
-        found = _described(map_)
-    line = f"wrote {out}.yaml: {found['width']} x {found['height']} cells, {found['occupied']} occupied"
-    print_result({"file": f"{out}.yaml", **found}, line, json=json)
-
-
-def _described(map_: StaticMap) -> dict[str, object]:
-    """Return size, resolution and origin of a map, and how many of its cells are free, occupied and unknown."""
-    geometry = map_.geometry
-    names = {"free": FREE, "occupied": LETHAL, "unknown": UNKNOWN}
-    return {
-        "width": geometry.width,
-        "height": geometry.height,
-        "resolution": geometry.resolution,
-        "origin": [geometry.origin_x, geometry.origin_y, 0.0],
-        **{name: int(np.count_nonzero(map_.cells == value)) for name, value in names.items()},
-    }
 
 
 def localize_command(  # noqa: PLR0913  # each option is an argument

@@ -8,6 +8,7 @@ import typer
 
 Format = Literal["auto", "intel", "jsonl", "carmen", "rosbag2"]
 Selection = Literal["all", "odd", "even"]
+Poses = Literal["matched", "reference"]
 LogFormat = Annotated[
     Format, typer.Option("--format", help="Format of the log; intel is JSON lines, auto looks at the file.")
 ]

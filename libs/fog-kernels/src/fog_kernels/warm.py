@@ -53,6 +53,7 @@ PROFILES: dict[str, tuple[str, ...]] = {
     ),
     "map": ("distance", "inflation", "spans"),
     "sim": ("distance", "emulation", "raycast"),
+    "mapping": ("matching",),
     "all": (
         "amcl",
         "astar",
@@ -69,6 +70,7 @@ PROFILES: dict[str, tuple[str, ...]] = {
         "inflation",
         "lidar",
         "lines",
+        "matching",
         "raycast",
         "scans",
         "spans",

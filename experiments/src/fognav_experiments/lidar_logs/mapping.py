@@ -1,0 +1,205 @@
+"""A map of a log: its scans put where they were taken, the loops that this rests on, and both as a picture."""
+
+from __future__ import annotations
+
+import os
+import resource
+import time
+from contextlib import contextmanager
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Final
+
+import numpy as np
+from PIL import Image, ImageDraw
+from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn, TimeElapsedColumn
+
+from fog_contracts.costs import FREE, LETHAL
+from fog_mapping.building import draw, find_trajectory
+from fog_mapping.loops import grouped
+from fog_mapping.relations import absolute_error, relation_errors
+from fog_mapping.scans import keep_moved, scan_of
+from fognav.output import WrongUseError, console
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Iterator, Sequence
+    from pathlib import Path
+
+    from numpy.typing import NDArray
+
+    from fog_contracts.grid import StaticMap
+    from fog_mapping.loops import LoopGroup
+    from fognav_experiments.lidar_logs import Poses
+    from fognav_experiments.lidar_logs.logs import LogScan
+
+_COLOURS: Final = {FREE: (255, 255, 255), LETHAL: (0, 0, 0)}
+_UNKNOWN_COLOUR: Final = (205, 205, 205)
+_WAY_COLOUR: Final = (70, 130, 220)
+_KEPT_COLOUR: Final = (30, 150, 60)
+_REFUSED_COLOUR: Final = (220, 40, 40)
+
+
+@dataclass(frozen=True, kw_only=True, slots=True, eq=False)
+class MadeMap:
+    """A map, the poses (n, 3; m, rad) of the `used` scans, and the loops; `reference` (n, 3) if the log has one."""
+
+    map: StaticMap
+    used: Sequence[LogScan]
+    poses: NDArray[np.float64]
+    reference: NDArray[np.float64] | None
+    loops: Sequence[LoopGroup]
+    ambiguous: int
+    seconds: float
+
+    def figures(self) -> dict[str, object]:
+        """Return what the command prints as JSON, beside the map's own figures."""
+        found: dict[str, object] = {
+            "scans": len(self.used),
+            "loops": [
+                {"loop": group.name, "pairs": group.pairs, "kept": group.kept, "score": round(group.score, 3),
+                 "residual_m": round(group.residual, 4), "at": [round(value, 2) for value in self._place(group)]}
+                for group in self.loops
+            ],
+            "ambiguous": self.ambiguous,
+            "seconds": round(self.seconds, 2),
+            "rss_mb": round(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024.0),
+        }  # fmt: skip
+        if self.reference is not None:
+            errors = relation_errors(self.poses, self.reference)
+            found["absolute_error_m"] = round(absolute_error(self.poses, self.reference), 4)
+            found["relations"] = {name: error._asdict() for name, error in errors.items()}
+            if errors:
+                pairs = sum(error.pairs for error in errors.values())
+                moved = sum(error.pairs * error.translation_m for error in errors.values())
+                turned = sum(error.pairs * error.rotation_deg for error in errors.values())
+                found["translation_error_m"], found["rotation_error_deg"] = (
+                    round(moved / pairs, 4),
+                    round(turned / pairs, 4),
+                )
+        return found
+
+    def lines(self) -> Iterator[str]:
+        """Yield what the command prints: the loops with their evidence, and what could not be joined."""
+        for group in self.loops:
+            x, y = self._place(group)
+            verdict = "" if group.kept else ": left out, it contradicts the others"
+            yield (
+                f"loop {group.name} at ({x:.1f}, {y:.1f}): {group.pairs} matches, score {group.score:.2f}, "
+                f"{1000.0 * group.residual:.0f} mm rms{verdict}"
+            )
+        if self.ambiguous:
+            yield (
+                f"{self.ambiguous} pairs of places fit each other in more than one way: they were not joined. Where "
+                "the map is doubled, drive this part again with something that stands out, such as a box"
+            )
+
+    def draw(self, file: Path) -> None:
+        """Draw the map, the way and the loops, each with its name; raises `WrongUseError`."""
+        geometry, cells = self.map.geometry, self.map.cells
+        pixels = np.full((*cells.shape, 3), _UNKNOWN_COLOUR, np.uint8)
+        for value, colour in _COLOURS.items():
+            pixels[cells == value] = colour
+        picture = Image.fromarray(pixels[::-1])
+        pen = ImageDraw.Draw(picture)
+        corner = np.array((geometry.origin_x, geometry.origin_y))
+        at = (self.poses[:, :2] - corner) / geometry.resolution
+        at[:, 1] = geometry.height - at[:, 1]
+        places = [(float(x), float(y)) for x, y in at]
+        pen.line(places, fill=_WAY_COLOUR)
+        for group in self.loops:
+            colour = _KEPT_COLOUR if group.kept else _REFUSED_COLOUR
+            pen.line((places[group.first], places[group.second]), fill=colour, width=3)
+            pen.text(places[group.first], group.name, fill=colour)
+        try:
+            picture.save(file)
+        except (OSError, ValueError) as error:
+            raise WrongUseError(f"the picture can't be written to {file}: {error}. Name another .png") from error
+
+    def write_trajectory(self, file: Path) -> None:
+        """Write a line `stamp x y theta` (s, m, rad) for each used scan; raises `WrongUseError`."""
+        rows = (
+            f"{scan.stamp:.6f} {x:.4f} {y:.4f} {t:.5f}\n" for scan, (x, y, t) in zip(self.used, self.poses, strict=True)
+        )
+        try:
+            file.write_text("".join(rows), encoding="ascii")
+        except OSError as error:
+            raise WrongUseError(f"{file} can't be written: {error.strerror}. Name another file") from error
+
+    def _place(self, group: LoopGroup) -> tuple[float, float]:
+        x, y, _ = self.poses[group.first]
+        return float(x), float(y)
+
+
+def map_log(
+    log: Sequence[LogScan], poses: Poses, without: Sequence[str], resolution: float, range_max: float
+) -> MadeMap:
+    """Return the map of a log's scans, at poses that are found by matching or at the log's reference.
+
+    without: names of loops that are none; resolution: m per cell; range_max: m, beams beyond it are not used. Raises
+    `WrongUseError`.
+    """
+    refused = [_pair(name) for name in without]
+    started = time.process_time()
+    if poses == "reference":
+        return _at_reference(log, resolution, range_max)
+    try:
+        scans = keep_moved(
+            scan
+            for number, one in enumerate(log)
+            if (scan := scan_of(number, one.angles, one.ranges, one.odom, range_max)) is not None
+        )
+        place_of = {scan.number: index for index, scan in enumerate(scans)}
+        pairs = [(_index(first, place_of), _index(second, place_of)) for first, second in refused]
+        with _bar() as show:
+            found = find_trajectory(scans, jobs=os.cpu_count() or 1, without=pairs, on_progress=show)
+        built = draw(((pose, scan.points) for pose, scan in zip(found.poses, scans, strict=True)), resolution)
+    except ValueError as error:
+        raise WrongUseError(str(error)) from error
+    used = [log[scan.number] for scan in scans]
+    references = [one.reference for one in used if one.reference is not None]
+    return MadeMap(
+        map=built, used=used, poses=found.poses,
+        reference=np.array(references, np.float64) if len(references) == len(used) else None,
+        loops=grouped(found.loops, found.poses, [scan.number for scan in scans]), ambiguous=found.ambiguous,
+        seconds=time.process_time() - started,
+    )  # fmt: skip
+
+
+def _at_reference(log: Sequence[LogScan], resolution: float, range_max: float) -> MadeMap:
+    used = [scan for scan in log if scan.reference is not None]
+    if not used:
+        raise WrongUseError("the log has no reference poses. Leave --poses away: they are found by matching")
+    poses = np.array([scan.reference for scan in used], np.float64)
+    rays = []
+    for pose, scan in zip(poses, used, strict=True):
+        near = np.isfinite(scan.ranges) & (scan.ranges <= range_max)
+        ranges, angles = scan.ranges[near], scan.angles[near]
+        rays.append((pose, np.column_stack((ranges * np.cos(angles), ranges * np.sin(angles)))))
+    try:
+        built = draw(rays, resolution)
+    except ValueError as error:
+        raise WrongUseError(str(error)) from error
+    return MadeMap(map=built, used=used, poses=poses, reference=None, loops=(), ambiguous=0, seconds=0.0)
+
+
+def _pair(name: str) -> tuple[int, int]:
+    first, _, second = name.partition("-")
+    if not (first.isdecimal() and second.isdecimal()):
+        raise WrongUseError(f"--without-loop takes the name of a loop in the list, such as 12-834, not {name!r}")
+    return int(first), int(second)
+
+
+def _index(number: int, place_of: dict[int, int]) -> int:
+    if number not in place_of:
+        raise WrongUseError(
+            f"--without-loop: scan {number} is not among those used. Take a name from the list of loops"
+        )
+    return place_of[number]
+
+
+@contextmanager
+def _bar() -> Iterator[Callable[[str, float], None]]:
+    """Yield what shows the progress: as a bar on a terminal, and nowhere else."""
+    columns = TextColumn("{task.description}"), BarColumn(), TaskProgressColumn(), TimeElapsedColumn()
+    with Progress(*columns, console=console, transient=True, disable=not console.is_terminal) as progress:
+        task = progress.add_task("reading", total=1.0)
+        yield lambda what, share: progress.update(task, description=what, completed=share)

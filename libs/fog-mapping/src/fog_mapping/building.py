@@ -1,0 +1,106 @@
+"""From scans to a map: the trajectory, its loops, the graph that agrees with both, and the grid that all scans show."""
+
+from __future__ import annotations
+
+from functools import partial
+from typing import TYPE_CHECKING, Final, NamedTuple
+
+import numpy as np
+
+from fog_contracts.costs import FREE, LETHAL, UNKNOWN
+from fog_contracts.grid import GridGeometry, StaticMap
+from fog_kernels.matching import BeamCounts
+from fog_mapping.loops import LoopSearch
+from fog_mapping.pose_graph import solve
+from fog_mapping.poses import place
+from fog_mapping.trajectory import match_in_order, settle
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Iterable, Sequence
+
+    from numpy.typing import NDArray
+
+    from fog_mapping.loops import Loop
+    from fog_mapping.pose_graph import Edge
+    from fog_mapping.scans import Scan
+
+_CERTAIN_M: Final = (2.0, 2.0, 4.0, 8.0, 16.0, 30.0)
+"""What is certain to so much (m) is looked for, round by round."""
+_REFUSED: Final = 0.5
+_MARGIN_M: Final = 1.0
+_OCCUPIED_SHARE: Final = 0.3
+"""A cell is occupied if this share of the scans that reached it ended there: walls are grazed by many others."""
+_MAX_CELLS: Final = 40_000_000
+
+
+class Trajectory(NamedTuple):
+    """Poses (n, 3; m, rad) of scans, the first at the origin, and what they rest on.
+
+    loops: those found, with how much each counts in the end (0: it contradicts the rest). ambiguous: pairs of
+    stretches that fit at several places, so that none counts.
+    """
+
+    poses: NDArray[np.float64]
+    loops: list[tuple[Loop, float]]
+    ambiguous: int
+
+    @property
+    def kept(self) -> int:
+        """How many loops count."""
+        return sum(weight >= _REFUSED for _, weight in self.loops)
+
+
+def find_trajectory(
+    scans: Sequence[Scan],
+    *,
+    jobs: int = 1,
+    without: Sequence[tuple[int, int]] = (),
+    extra: Sequence[Edge] = (),
+    on_progress: Callable[[str, float], None] = lambda *_: None,
+) -> Trajectory:
+    """Return where scans were taken; the same for the same arguments, whatever `jobs` (threads).
+
+    without: pairs of scans (by their place in `scans`) that are no loop. extra: further edges. `on_progress` is called
+    with what is done now, and the share of it. Raises `ValueError` for fewer than two scans.
+    """
+    if len(scans) < 2:
+        raise ValueError(f"a map needs two scans or more between which the robot has moved, not {len(scans)}")
+    poses, edges = match_in_order(scans, lambda done: on_progress("matching scans", done / len(scans)))
+    edges.extend(extra)
+    weights = np.ones(len(edges))
+    search = LoopSearch(scans, poses, without, jobs)
+    loops: list[Loop] = []
+    ambiguous = 0
+    for number, most in enumerate(_CERTAIN_M):
+        what = f"looking for loops, round {number + 1}"
+        found = search.search(poses, edges, weights, most, partial(on_progress, what))
+        loops.extend(found.loops)
+        edges.extend(found.edges)
+        ambiguous += found.ambiguous
+        if found.edges:
+            poses, weights, _ = solve(poses, edges)
+    poses = settle(scans, poses)
+    counted = weights[len(edges) - len(loops) :] if loops else weights[:0]
+    return Trajectory(poses, list(zip(loops, counted.tolist(), strict=True)), ambiguous)
+
+
+def draw(rays: Iterable[tuple[NDArray[np.float64], NDArray[np.float64]]], resolution: float) -> StaticMap:
+    """Return the map that scans show: their poses (3,), and where their beams end as seen from these (n, 2; m).
+
+    Each scan counts once in a cell. What most scans look through was no wall: people and things that have moved are
+    left out. Raises `ValueError` for a map that is too large.
+    """
+    placed = [(pose, place(pose, points)) for pose, points in rays]
+    everything = np.concatenate([points for _, points in placed] + [np.array([pose[:2] for pose, _ in placed])])
+    low = np.floor((everything.min(axis=0) - _MARGIN_M) / resolution) * resolution
+    width, height = np.ceil((everything.max(axis=0) + _MARGIN_M - low) / resolution).astype(int).tolist()
+    if width * height > _MAX_CELLS:
+        raise ValueError(f"the map would have {width} x {height} cells. Choose a coarser --resolution")
+    counts = BeamCounts((height, width), resolution, float(low[0]), float(low[1]))
+    for pose, points in placed:
+        counts.add(float(pose[0]), float(pose[1]), points)
+    cells = np.full((height, width), UNKNOWN, np.uint8)
+    seen = counts.hits + counts.passes
+    cells[seen > 0] = FREE
+    cells[counts.hits >= np.maximum(1.0, _OCCUPIED_SHARE * seen)] = LETHAL
+    return StaticMap(GridGeometry(width, height, resolution, float(low[0]), float(low[1])), cells)

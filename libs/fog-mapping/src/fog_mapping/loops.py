@@ -1,0 +1,280 @@
+"""Loops: places to which the robot has come again, found by matching a stretch of its way to an earlier one.
+
+A wrong loop is worse than none. A stretch is looked for no farther away than the way between may be wrong by now; it
+must fit well, and where a second place fits nearly as well, none counts: along a corridor without features two places
+look the same, and a fold would be drawn. What is certain is closed first, which makes the rest more certain.
+"""
+
+from __future__ import annotations
+
+import heapq
+import math
+from concurrent.futures import ThreadPoolExecutor
+from typing import TYPE_CHECKING, Final, NamedTuple
+
+import numpy as np
+
+from fog_kernels.matching import Excluded
+from fog_mapping.pose_graph import Edge
+from fog_mapping.poses import between, path_lengths
+from fog_mapping.scans import cloud, reference_of, thinned
+from fog_mapping.trajectory import GATES, independent
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Iterator, Sequence
+
+    from numpy.typing import NDArray
+
+    from fog_mapping.scans import Scan
+
+_PLACE_EVERY_M: Final = 5.0
+_PLACE_HALF_M: Final = 5.0
+_STRETCH_EVERY_M: Final = 2.5
+_STRETCH_HALF_M: Final = 2.5
+_LEAST_WAY_M: Final = 12.0
+"""Two stretches of the way must be so far apart along it to be a loop, between their middles."""
+_NEAR_M: Final = 3.0
+_SIGMAS: Final = 3.0
+_LEAST_M: Final = 0.5
+_LEAST_RAD: Final = math.radians(5.0)
+_MOST_RAD: Final = math.radians(40.0)
+_TURN_STEP: Final = math.radians(1.0)
+_THIN_M: Final = 0.15
+_LEAST_SCORE: Final = 0.5
+_LEAST_SHARE: Final = 0.75
+_MOST_RESIDUAL_M: Final = 0.05
+_ALIKE: Final = 0.85
+"""A second place whose score is so near to the best one's fits nearly as well."""
+_SAME_M: Final = 0.6
+_SAME_RAD: Final = math.radians(12.0)
+_EXPLAINED: Final = 200.0
+"""The second place is the same one if the best one's own uncertainty explains it, in squared deviations."""
+_REPEATED: Final = 0.7
+_KEPT: Final = 0.3
+"""A loop that counts less than this says nothing about what is certain."""
+_FLOOR: Final = 1e-3
+
+
+class Stretch(NamedTuple):
+    """Scans `first` to `last` around the one in the `middle`, whose frame they are seen in."""
+
+    middle: int
+    first: int
+    last: int
+
+
+class Loop(NamedTuple):
+    """Scan `second` was found at the place around scan `first`; score and share of points are 0 to 1, the rms in m."""
+
+    first: int
+    second: int
+    score: float
+    share: float
+    residual: float
+
+
+class LoopGroup(NamedTuple):
+    """Loops whose ends are near each other along the way: one for people. The best one's scans, score and rms (m).
+
+    name: the numbers of its scans in the log; pairs: how many matches it has; kept: whether most of them count.
+    """
+
+    name: str
+    first: int
+    second: int
+    pairs: int
+    kept: bool
+    score: float
+    residual: float
+
+
+def grouped(loops: Sequence[tuple[Loop, float]], poses: NDArray[np.float64], numbers: Sequence[int]) -> list[LoopGroup]:
+    """Return the groups of loops with their weights, in the order of the way; `numbers`: of the scans in the log."""
+    way = path_lengths(poses)
+    groups: list[list[tuple[Loop, float]]] = []
+    for loop, weight in sorted(loops, key=lambda each: _ends(each[0])):
+        at = way[list(_ends(loop))]
+        for group in groups:
+            if all(abs(at - way[list(_ends(group[-1][0]))]) < _LEAST_WAY_M):
+                group.append((loop, weight))
+                break
+        else:
+            groups.append([(loop, weight)])
+    found = []
+    for group in groups:
+        best = max(group, key=lambda each: each[0].score)[0]
+        first, second = _ends(best)
+        counting = sum(weight >= 0.5 for _, weight in group)
+        found.append(
+            LoopGroup(
+                f"{numbers[first]}-{numbers[second]}", first, second, len(group), 2 * counting >= len(group),
+                best.score, best.residual,
+            )
+        )  # fmt: skip
+    return found
+
+
+def _ends(loop: Loop) -> tuple[int, int]:
+    return min(loop.first, loop.second), max(loop.first, loop.second)
+
+
+class Searched(NamedTuple):
+    """What a round found: edges with the loops that they are, and how many pairs fitted several places."""
+
+    edges: list[Edge]
+    loops: list[Loop]
+    ambiguous: int
+    tried: int
+
+
+class LoopSearch:
+    """Looks for loops, round by round, as the trajectory gets better."""
+
+    def __init__(
+        self, scans: Sequence[Scan], poses: NDArray[np.float64], without: Sequence[tuple[int, int]], jobs: int
+    ) -> None:
+        """`without`: pairs of scans (by their place in `scans`) that are no loop, nor are those near them."""
+        self._scans = scans
+        self._way = path_lengths(poses)
+        self._places = list(_stretches(self._way, _PLACE_EVERY_M, _PLACE_HALF_M))
+        self._queries = list(_stretches(self._way, _STRETCH_EVERY_M, _STRETCH_HALF_M))
+        self._without = [(self._way[first], self._way[second]) for first, second in without]
+        self._tried: dict[tuple[int, int], float] = {}
+        self._jobs = jobs
+
+    def search(
+        self,
+        poses: NDArray[np.float64],
+        edges: Sequence[Edge],
+        weights: NDArray[np.float64],
+        most: float,
+        on_progress: Callable[[float], object] = lambda _: None,
+    ) -> Searched:
+        """Look for what may be a loop and is certain to `most` (m); the same for the same arguments."""
+        neighbours = _neighbours(len(self._scans), edges, weights)
+        found = Searched([], [], 0, 0)
+        ambiguous = tried = done = 0
+        with ThreadPoolExecutor(self._jobs) as pool:
+            rounds = pool.map(lambda k: self._search_place(k, poses, neighbours, most), range(len(self._places)))
+            for place_edges, loops, unsure, looked_at in rounds:
+                found.edges.extend(place_edges)
+                found.loops.extend(loops)
+                ambiguous += unsure
+                tried += looked_at
+                done += 1
+                on_progress(done / len(self._places))
+        return Searched(found.edges, found.loops, ambiguous, tried)
+
+    def _search_place(
+        self, number: int, poses: NDArray[np.float64], neighbours: list[list[_Neighbour]], most: float
+    ) -> tuple[list[Edge], list[Loop], int, int]:
+        place = self._places[number]
+        wanted = list(self._candidates(number, poses, *_uncertainty(neighbours, place.middle), most))
+        edges: list[Edge] = []
+        loops: list[Loop] = []
+        ambiguous = 0
+        if not wanted:
+            return edges, loops, ambiguous, 0
+        reference = reference_of(self._scans, poses, range(place.first, place.last + 1), poses[place.middle])
+        for query, half, half_turn in wanted:
+            points, lines = thinned(
+                *cloud(self._scans, poses, range(query.first, query.last + 1), poses[query.middle]), _THIN_M
+            )
+            guess = tuple(between(poses[place.middle], poses[query.middle]))
+            best = reference.search(points, guess, half, half_turn, _TURN_STEP, _LEAST_SCORE)
+            if best is None:
+                continue
+            fit = reference.align(points, lines, best.pose, best.pose, np.eye(3), GATES)
+            if fit.share < _LEAST_SHARE or fit.residual > _MOST_RESIDUAL_M:
+                continue
+            information = independent(fit.information)
+            other = reference.search(
+                points, guess, half, half_turn, _TURN_STEP, _ALIKE * best.score,
+                Excluded(best.pose, _SAME_M, _SAME_RAD),
+            )  # fmt: skip
+            step = np.array(fit.pose)
+            if other is not None:
+                off = between(step, np.array(other.pose))
+                if off @ information @ off > _EXPLAINED:
+                    ambiguous += 1
+                    continue
+            edges.append(Edge(place.middle, query.middle, step, information + _FLOOR * np.eye(3), loop=True))
+            loops.append(Loop(place.middle, query.middle, best.score, fit.share, fit.residual))
+        return edges, loops, ambiguous, len(wanted)
+
+    def _candidates(
+        self, number: int, poses: NDArray[np.float64], variance: list[float], turn_variance: list[float], most: float
+    ) -> Iterator[tuple[Stretch, float, float]]:
+        """Yield the stretches that may be at a place, with how far and how far turned to look."""
+        place = self._places[number]
+        for index, query in enumerate(self._queries):
+            if query.first <= place.last and place.first <= query.last:
+                continue
+            if abs(self._way[query.middle] - self._way[place.middle]) < _LEAST_WAY_M:
+                continue
+            off = _SIGMAS * math.sqrt(variance[query.middle])
+            away = math.hypot(*(poses[query.middle] - poses[place.middle])[:2])
+            if off > most or away > _NEAR_M + off or self._is_refused(place, query):
+                continue
+            half = max(_LEAST_M, off)
+            # Looked for again once it is clearly more certain where.
+            if half >= _REPEATED * self._tried.get((number, index), math.inf):
+                continue
+            self._tried[number, index] = half
+            turn = _SIGMAS * math.sqrt(turn_variance[query.middle])
+            yield query, half, min(max(_LEAST_RAD, turn), _MOST_RAD)
+
+    def _is_refused(self, place: Stretch, query: Stretch) -> bool:
+        ends = sorted((self._way[place.middle], self._way[query.middle]))
+        return any(
+            abs(ends[0] - min(pair)) < _LEAST_WAY_M and abs(ends[1] - max(pair)) < _LEAST_WAY_M
+            for pair in self._without
+        )
+
+
+class _Neighbour(NamedTuple):
+    node: int
+    variance: float
+    turn_variance: float
+    square: float
+
+
+def _stretches(way: NDArray[np.float64], every: float, half: float) -> Iterator[Stretch]:
+    for at in np.arange(0.0, way[-1] + every, every):
+        inside = np.nonzero(np.abs(way - at) <= half)[0]
+        if len(inside) >= 3:
+            yield Stretch(int(np.argmin(np.abs(way - at))), int(inside[0]), int(inside[-1]))
+
+
+def _neighbours(count: int, edges: Sequence[Edge], weights: NDArray[np.float64]) -> list[list[_Neighbour]]:
+    neighbours: list[list[_Neighbour]] = [[] for _ in range(count)]
+    for edge, weight in zip(edges, weights, strict=True):
+        if edge.loop and weight < _KEPT:
+            continue
+        covariance = np.linalg.inv(edge.information + 1e-6 * np.eye(3))
+        figures = (
+            float(covariance[0, 0] + covariance[1, 1]),
+            float(covariance[2, 2]),
+            float(edge.step[0] ** 2 + edge.step[1] ** 2),
+        )
+        neighbours[edge.first].append(_Neighbour(edge.second, *figures))
+        neighbours[edge.second].append(_Neighbour(edge.first, *figures))
+    return neighbours
+
+
+def _uncertainty(neighbours: list[list[_Neighbour]], source: int) -> tuple[list[float], list[float]]:
+    """Return upper bounds of the variances (m^2, rad^2) of all poses as seen from one, along the surest way."""
+    variance, turn_variance = [math.inf] * len(neighbours), [math.inf] * len(neighbours)
+    variance[source] = turn_variance[source] = 0.0
+    waiting = [(0.0, source)]
+    while waiting:
+        reached, node = heapq.heappop(waiting)
+        if reached > variance[node]:
+            continue
+        for other, added, turned, square in neighbours[node]:
+            turn = turn_variance[node] + turned
+            total = reached + added + turn * square
+            if total < variance[other]:
+                variance[other], turn_variance[other] = total, turn
+                heapq.heappush(waiting, (total, other))
+    return variance, turn_variance

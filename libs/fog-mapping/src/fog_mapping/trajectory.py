@@ -1,0 +1,100 @@
+"""The way that scans tell by themselves: each is matched to those before it, near where odometry says that it is."""
+
+from __future__ import annotations
+
+import math
+from typing import TYPE_CHECKING, Final
+
+import numpy as np
+
+from fog_mapping.pose_graph import Edge
+from fog_mapping.poses import between, compose
+from fog_mapping.scans import reference_of
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Sequence
+
+    from numpy.typing import NDArray
+
+    from fog_mapping.scans import Scan
+
+GATES: Final = np.array([0.45] * 3 + [0.3] * 3 + [0.2] * 4 + [0.12] * 5)
+"""How far (m) the line of a point may be, step by step of a refinement."""
+_INDEPENDENT: Final = 0.1
+"""The returns of a scan err together (a lidar's bias, a wall that is not straight): so much of them is independent."""
+_SPURIOUS: Final = 0.02
+"""Normals err by some degrees, so that plain walls seem to say this share of what they say across also along."""
+_WINDOW: Final = 12
+_SPREAD_M: Final = 8.0
+_TURN_STEP: Final = math.radians(1.0)
+_SEARCHED_SIGMAS: Final = 2.5
+_MOST_M: Final = 0.6
+_MOST_RAD: Final = 0.5
+_DOUBT: Final = 0.05
+_ODOMETRY_SHARE: Final = 0.5
+"""Odometry counts for as much less than its deviations say: they are those of a bad one."""
+
+
+def independent(information: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return what the lines of a scan really say (3, 3): less, as they err together, and nothing along plain walls."""
+    (least, most), axes = np.linalg.eigh(information[:2, :2])
+    said = information @ np.array((*axes[:, 0], 0.0))
+    share = 1.0 if least <= _SPURIOUS * most else _SPURIOUS * most / least
+    kept: NDArray[np.float64] = _INDEPENDENT * (information - share * np.outer(said, said) / max(least, 1e-9))
+    return kept
+
+
+def match_in_order(
+    scans: Sequence[Scan], on_progress: Callable[[int], None] = lambda _: None
+) -> tuple[NDArray[np.float64], list[Edge]]:
+    """Return the poses (n, 3) of the scans by matching, the first at the origin, and the edges between them.
+
+    `on_progress` is called with the number of scans that are matched.
+    """
+    poses = np.zeros((len(scans), 3))
+    edges: list[Edge] = []
+    for i in range(1, len(scans)):
+        step = between(scans[i - 1].odometry, scans[i].odometry)
+        guess = compose(poses[i - 1], step)
+        near = [j for j in range(max(0, i - _WINDOW), i) if math.hypot(*(poses[j] - guess)[:2]) < _SPREAD_M]
+        before = reference_of(scans, poses, near or [i - 1])
+        moved, turned = math.hypot(step[0], step[1]), abs(float(step[2]))
+        deviation = 0.05 + 0.1 * moved + 0.05 * turned
+        turn_deviation = 0.02 + 0.05 * moved + 0.12 * turned
+        prior = np.diag((deviation**-2, deviation**-2, turn_deviation**-2))
+        found = before.search(
+            scans[i].points,
+            tuple(guess),
+            min(_MOST_M, _SEARCHED_SIGMAS * deviation),
+            min(_MOST_RAD, _SEARCHED_SIGMAS * turn_deviation),
+            _TURN_STEP,
+            0.0,
+            doubt=_DOUBT,
+        )
+        start = tuple(guess) if found is None else found.pose
+        aligned = before.align(scans[i].points, scans[i].normals, start, tuple(guess), prior, GATES)
+        poses[i] = aligned.pose
+        information = independent(aligned.information) + _ODOMETRY_SHARE * prior
+        edges.append(Edge(i - 1, i, between(poses[i - 1], poses[i]), information))
+        on_progress(i + 1)
+    return poses, edges
+
+
+def settle(scans: Sequence[Scan], poses: NDArray[np.float64], sweeps: int = 2) -> NDArray[np.float64]:
+    """Return poses at which each scan fits all those around it, whenever taken: a graph leaves walls blurred."""
+    settled = poses.copy()
+    gates = np.array((0.2, 0.2, 0.12, 0.12, 0.08, 0.08))
+    stay = np.diag((100.0, 100.0, 400.0))
+    for _ in range(sweeps):
+        for i in range(1, len(scans)):
+            away = np.hypot(*(settled[:, :2] - settled[i, :2]).T)
+            nearest = np.argsort(away, kind="stable")[:_AROUND]
+            around = [int(j) for j in nearest if j != i and away[j] < 0.5 * _SPREAD_M]
+            if around:
+                others = reference_of(scans, settled, around)
+                pose = tuple(settled[i])
+                settled[i] = others.align(scans[i].points, scans[i].normals, pose, pose, stay, gates).pose
+    return settled
+
+
+_AROUND: Final = 40

@@ -1,0 +1,173 @@
+"""Maps of simulated buildings: walls where they are, loops that are true, none that folds a corridor, nobody in it."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+
+from fog_contracts.costs import FREE, LETHAL
+from fog_kernels.distance import squared_distance_capped
+from fog_kernels.raycast import cast
+from fog_mapping.building import draw, find_trajectory
+from fog_mapping.poses import between, compose, place
+from fog_mapping.relations import absolute_error, relation_errors
+from fog_mapping.scans import Scan, keep_moved, scan_of
+
+CELL = 0.05
+BEAMS = np.radians(np.arange(240) * 1.5 - 180.0)
+RANGE_M = 8.0
+
+
+class Building:
+    """Rectangles (left, bottom, right, top; m) of free space, and boxes in it."""
+
+    def __init__(self, rooms: list[tuple[float, ...]], boxes: list[tuple[float, ...]]) -> None:
+        right, top = (max(room[k] for room in rooms) + 1.0 for k in (2, 3))
+        self.solid = np.ones((round(top / CELL), round(right / CELL)), np.uint8)
+        for value, rectangles in ((0, rooms), (1, boxes)):
+            for left, bottom, end, upper in rectangles:
+                self.solid[self.cells(bottom, upper), self.cells(left, end)] = value
+
+    @staticmethod
+    def cells(start: float, end: float) -> slice:
+        return slice(round(start / CELL), round(end / CELL))
+
+    def drive(
+        self, corners: list[tuple[float, float]], seed: int, scale: float = 1.05, people: float = 0.0
+    ) -> tuple[list[Scan], np.ndarray]:
+        """Return scans along corners with an odometry that is off, and the true poses of those that are used.
+
+        scale: of the odometry's ways; people: share of the scans in which somebody stands 1.5 m before the robot.
+        """
+        rng = np.random.default_rng(seed)
+        truth = [np.array((*corners[0], math.atan2(corners[1][1] - corners[0][1], corners[1][0] - corners[0][0])))]
+        for corner in corners[1:]:
+            while math.dist(truth[-1][:2], corner) > 0.2:
+                x, y, theta = truth[-1]
+                turn = math.remainder(math.atan2(corner[1] - y, corner[0] - x) - theta, math.tau)
+                step = (0.0, 0.0, max(-0.3, min(0.3, turn))) if abs(turn) > 0.05 else (0.25, 0.0, turn)
+                truth.append(compose(truth[-1], np.array(step)))
+        odometry, scans = np.zeros(3), []
+        for number, pose in enumerate(truth):
+            if number:
+                step = between(truth[number - 1], pose)
+                noise = rng.standard_normal(2) * (0.02 * step[0], 0.004 + 0.03 * abs(step[2]))
+                odometry = compose(odometry, step * (scale, 1.0, 1.03) + (noise[0], 0.0, noise[1]))
+            ranges = cast(self.solid, CELL, 0.0, 0.0, pose[0], pose[1], BEAMS + pose[2], RANGE_M)
+            ranges = ranges + 0.01 * rng.standard_normal(len(BEAMS))
+            ranges[~np.isfinite(ranges) | (rng.random(len(BEAMS)) < 0.03)] = np.nan
+            if rng.random() < people:
+                before = np.abs(BEAMS) < 0.1
+                ranges[before] = np.fmin(ranges[before], 1.5)
+            scan = scan_of(number, BEAMS, ranges, odometry, RANGE_M)
+            if scan is not None:
+                scans.append(scan)
+        kept = keep_moved(scans)
+        return kept, np.array([truth[scan.number] for scan in kept])
+
+
+FLOOR = Building(
+    [(1, 1, 19, 3), (1, 1, 3, 13), (1, 11, 19, 13), (17, 1, 19, 13), (3, 6, 17, 7.6), (5, 3, 8, 5), (12, 3, 15, 5.2),
+     (6, 7.6, 10, 10)],
+    [(4.0, 1.0, 4.4, 1.4), (9.0, 2.6, 9.8, 3.0), (2.7, 8, 3, 8.6), (13.5, 12.7, 14.6, 13), (17, 9, 17.3, 10),
+     (11.2, 11, 11.5, 11.4), (12, 7.2, 12.8, 7.6)],
+)  # fmt: skip
+ROUND: list[tuple[float, float]] = [
+    (2, 2), (18, 2), (18, 12), (2, 12), (2, 6.8), (16.5, 6.8), (18, 6.8), (18, 2), (2, 2), (2, 12), (17, 12),
+]  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def mapped():
+    scans, truth = FLOOR.drive(ROUND, seed=1)
+    return scans, truth, find_trajectory(scans, jobs=2)
+
+
+def drawn(scans: list[Scan], poses: np.ndarray, truth: np.ndarray, value: int) -> np.ndarray:
+    """Return the centres of the map's cells with a value, in the frame of the building."""
+    built = draw(((pose, scan.points) for pose, scan in zip(poses, scans, strict=True)), CELL)
+    origin = compose(truth[0], between(poses[0], np.zeros(3)))
+    return place(origin, built.geometry.centres(np.argwhere(built.cells == value)[:, ::-1].astype(np.int64)))
+
+
+def test_walls_are_where_they_are_in_the_building(mapped):
+    scans, truth, found = mapped
+    solid = FLOOR.solid
+    inner = np.all([np.roll(solid, shift, axis) for shift in (1, -1) for axis in (0, 1)], axis=0)
+    away = np.sqrt(squared_distance_capped(solid & ~inner, 40)) * CELL
+
+    def at(field: np.ndarray, value: int) -> np.ndarray:
+        cells = np.floor(drawn(scans, found.poses, truth, value) / CELL).astype(int)
+        cells = cells.clip(0, np.array(solid.shape[::-1]) - 1)
+        return field[cells[:, 1], cells[:, 0]]
+
+    walls = at(away, LETHAL)
+    assert len(walls) > 1500
+    assert (walls <= 0.05).mean() > 0.95
+    assert (at(solid, FREE) == 0).mean() > 0.99
+
+
+def test_loops_are_found_all_true_and_join_what_odometry_tore_apart(mapped):
+    scans, truth, found = mapped
+    odometry = np.array([scan.odometry for scan in scans])
+    assert absolute_error(odometry, truth) > 1.0
+    assert absolute_error(found.poses, truth) < 0.05
+    assert relation_errors(found.poses, truth)["loops"].translation_m < 0.05
+    assert found.kept > 10
+    for loop, weight in found.loops:
+        if weight > 0.5:
+            assert math.dist(truth[loop.first][:2], truth[loop.second][:2]) < 6.0
+
+
+def test_map_is_the_same_however_many_threads_make_it(mapped):
+    scans, _, found = mapped
+    again = find_trajectory(scans, jobs=1)
+    assert (again.poses == found.poses).all()
+    assert again.loops == found.loops
+
+
+def test_loop_that_is_refused_is_not_closed(mapped):
+    scans, truth, found = mapped
+    refused = [(loop.first, loop.second) for loop, _ in found.loops]
+    without = find_trajectory(scans, without=refused)
+    assert without.loops == []
+    assert absolute_error(without.poses, truth) < 0.5, "what is left is the way that scans tell one by one"
+
+
+@pytest.mark.parametrize("scale", [0.85, 1.15])
+def test_odometry_that_is_15_percent_off_still_makes_the_map(scale):
+    scans, truth = FLOOR.drive(ROUND, seed=2, scale=scale)
+    found = find_trajectory(scans, jobs=2)
+    assert absolute_error(found.poses, truth) < 0.08
+
+
+def test_corridor_without_features_is_neither_folded_nor_shortened():
+    hall = Building([(1, 1, 41, 3), (1, 3, 4, 5), (37, 3, 41, 5)], [])
+    scans, truth = hall.drive([(2, 2), (40, 2), (39, 4), (40, 2), (3, 2), (2.5, 4), (2, 2), (30, 2)], seed=3)
+    found = find_trajectory(scans, jobs=2)
+    odometry = np.array([scan.odometry for scan in scans])
+    assert absolute_error(odometry, truth) > 1.0
+    assert absolute_error(found.poses, truth) < 0.5
+    # Nothing along it tells how long it is: odometry says so, which is 5 % long.
+    assert 0.98 < np.ptp(found.poses[:, 0]) / np.ptp(truth[:, 0]) < 1.06
+
+
+def test_people_who_walk_by_leave_no_walls():
+    scans, truth = FLOOR.drive([(2.0, 2.0), (18.0, 2.0), (2.0, 2.0)], seed=4, people=0.3)
+    found = find_trajectory(scans)
+    occupied = drawn(scans, found.poses, truth, LETHAL)
+    middle = (np.abs(occupied[:, 1] - 2.0) < 0.4) & (occupied[:, 0] > 5.0) & (occupied[:, 0] < 16.0)
+    assert middle.sum() <= 3
+
+
+def test_fewer_than_two_scans_are_refused_in_words():
+    with pytest.raises(ValueError, match="two scans or more between which the robot has moved, not 0"):
+        find_trajectory([])
+
+
+def test_scan_that_shows_little_is_left_out_and_one_without_odometry_refused():
+    assert scan_of(3, BEAMS, np.full(len(BEAMS), np.nan), (0.0, 0.0, 0.0), RANGE_M) is None
+    with pytest.raises(ValueError, match="scan 3: the odometry must be x, y and theta, finite"):
+        scan_of(3, BEAMS, np.full(len(BEAMS), 1.0), (0.0, math.nan, 0.0), RANGE_M)

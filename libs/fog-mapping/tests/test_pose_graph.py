@@ -1,0 +1,77 @@
+"""The pose graph: what was measured exactly is found exactly, and wrong loops change nothing."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from fog_mapping.pose_graph import Edge, solve
+from fog_mapping.poses import between, compose
+
+SIGMAS = np.array((0.02, 0.02, 0.006))
+INFORMATION = np.diag(SIGMAS**-2.0)
+
+
+def rounds(count: int = 240) -> np.ndarray:
+    """Poses three times round a square of 15 m, 0.75 m apart."""
+    poses = [np.zeros(3)]
+    for i in range(1, count):
+        poses.append(compose(poses[-1], np.array((0.75, 0.0, np.pi / 2 if i % 20 == 0 else 0.0))))
+    return np.array(poses)
+
+
+def graph(truth: np.ndarray, rng: np.random.Generator, false_share: float) -> list[Edge]:
+    def measured(first: int, second: int) -> np.ndarray:
+        return between(truth[first], truth[second]) + SIGMAS * rng.standard_normal(3)
+
+    edges = [Edge(i - 1, i, measured(i - 1, i), INFORMATION) for i in range(1, len(truth))]
+    loops = [
+        Edge(first, second, measured(first, second), INFORMATION, loop=True)
+        for first in range(0, 80, 4) for second in (first + 80, first + 159)
+    ]  # fmt: skip
+    for i in rng.choice(len(loops), round(false_share * len(loops)), replace=False):
+        wrong = rng.uniform((1.0, -5.0, -0.6), (5.0, -1.0, 0.6))
+        loops[i] = loops[i]._replace(step=loops[i].step + wrong)
+    return edges + loops
+
+
+def dead_reckoned(edges: list[Edge], count: int) -> np.ndarray:
+    poses = [np.zeros(3)]
+    for edge in edges[: count - 1]:
+        poses.append(compose(poses[-1], edge.step))
+    return np.array(poses)
+
+
+def rms(poses: np.ndarray, truth: np.ndarray) -> float:
+    return float(np.sqrt(((poses - truth)[:, :2] ** 2).sum(axis=1).mean()))
+
+
+@pytest.mark.parametrize("seed", range(5))
+@pytest.mark.parametrize("false_share", [0.05, 0.2])
+def test_wrong_loops_are_found_out_and_change_nothing(seed, false_share):
+    truth = rounds()
+    right = graph(truth, np.random.default_rng(seed), 0.0)
+    start = dead_reckoned(right, len(truth))
+    good = solve(start, right)
+    assert rms(good.poses, truth) < 0.5 * rms(start, truth)
+    edges = graph(truth, np.random.default_rng(seed), false_share)
+    found = solve(dead_reckoned(edges, len(truth)), edges)
+    wrong = np.array(
+        [edge.loop and np.abs(between(truth[edge.first], truth[edge.second]) - edge.step).max() > 0.5 for edge in edges]
+    )
+    assert wrong.any()
+    assert found.weights[wrong].max() < 0.05
+    assert (found.weights[~wrong] > 0.25).mean() > 0.97
+    assert np.abs(found.poses - good.poses)[:, :2].max() < 0.15
+
+
+def test_exact_measurements_give_exact_poses():
+    truth = rounds(60)
+    edges = [Edge(i - 1, i, between(truth[i - 1], truth[i]), INFORMATION) for i in range(1, 60)]
+    found = solve(truth + 0.01 * np.sin(np.arange(180.0)).reshape(60, 3) * (np.arange(60) > 0)[:, None], edges)
+    assert np.abs(found.poses - truth).max() < 1e-6
+
+
+def test_pose_that_nothing_reaches_is_an_error():
+    with pytest.raises(RuntimeError, match="singular"):
+        solve(np.zeros((3, 3)), [Edge(0, 1, np.array((1.0, 0.0, 0.0)), INFORMATION)])

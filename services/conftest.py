@@ -59,10 +59,10 @@ DEADLINE_S = 60.0
 
 
 class Servers:
-    """Broker, Redis and router of the site, and the files by which they admit its users (if `locked`)."""
+    """Broker, Redis and router of the site, and the files by which they admit its users (if `secured`)."""
 
-    def __init__(self, folder: Path, *, locked: bool = True) -> None:
-        self.security = security = SiteSecurity(folder / "locks", "test", unrestricted=["test"]) if locked else None
+    def __init__(self, folder: Path, *, secured: bool = True) -> None:
+        self.security = security = SiteSecurity(folder / "locks", "test", unrestricted=["test"]) if secured else None
         if security is not None:
             security.make(["127.0.0.1", "localhost"], nodes=["n1"])
         self.mosquitto: Server = start_mosquitto(
@@ -437,7 +437,7 @@ def shared_fog(tmp_path_factory: pytest.TempPathFactory, servers_pool: ServersPo
 @pytest.fixture(scope="module")
 def shared_open_fog(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Fog]:
     """Yield as `shared_fog` one whose servers admit everybody, unencrypted: for tests that change what they send."""
-    servers = Servers(tmp_path_factory.mktemp("servers"), locked=False)
+    servers = Servers(tmp_path_factory.mktemp("servers"), secured=False)
     running = Fog(tmp_path_factory.mktemp("fog"), servers)
     try:
         running.start("map_service")

@@ -69,7 +69,7 @@ def test_services_of_one_image_are_built_alike():
     assert [image for image, found in builds.items() if any(build != found[0] for build in found)] == []
 
 
-def test_each_program_mounts_its_own_locks_and_no_other_s():
+def test_each_program_mounts_its_own_credentials_and_no_other_s():
     readers: dict[str, set[str]] = {}
     for name in SERVICES.keys() - HANDS_OUT:
         for source in mounts(name).values():

@@ -23,10 +23,10 @@ from fog_runtime.security.site_security import SiteSecurity
 from fog_runtime.stores.redis_connection import RedisConnection
 from fog_supervisor.supervisor import Program, Supervisor
 from fognav.__main__ import app
+from fognav.credentials import security_errors
 from fognav.hosting import backups, fog_node, folders, local_nodes
-from fognav.hosting.fog_node import LocalNode, LockChanges, NodeConfig
+from fognav.hosting.fog_node import CredentialChanges, LocalNode, NodeConfig
 from fognav.hosting.folders import FORMAT, NodeFolder, default_data, hosted_sites
-from fognav.locking import security_errors
 from fognav.operate.systems import Registration, System, registered
 from fognav.output import FailedError, WrongUseError
 
@@ -165,7 +165,7 @@ async def test_bookkeeping_that_fails_is_told_once_and_ends_nothing(node, tmp_pa
     told: list[str] = []
     site = node.config.sites[0]
     with Registration(lambda: node.system(site)) as registration:
-        attending = asyncio.create_task(fog_node.attend(node, [registration], node.lock_changes(), told.append))
+        attending = asyncio.create_task(fog_node.attend(node, [registration], node.credential_changes(), told.append))
         try:
             await until(lambda: len(told) >= 2)
             assert "site estig" in told[0]
@@ -201,7 +201,7 @@ async def test_check_that_a_signal_ends_has_failed(node, tmp_path, monkeypatch):
     await fog_node.run_node(node.config, lambda _: None)
 
 
-async def test_locks_that_change_while_the_node_starts_come_into_force(node, tmp_path, monkeypatch):
+async def test_credentials_that_change_while_the_node_starts_come_into_force(node, tmp_path, monkeypatch):
     async def start(started: LocalNode, _: float) -> None:
         started.config.security.add_robot("r7")
 
@@ -284,7 +284,7 @@ async def test_backup_of_each_floor_is_restored_on_an_empty_machine(tmp_path, up
         await backups.restore(tmp_path / "estig.tar.gz", empty, tmp_path / "restored" / "estig", replace=False)
 
 
-async def test_older_backup_of_one_floor_locks_nobody_out_who_was_added_since(tmp_path, upstairs):
+async def test_older_backup_of_one_floor_shuts_nobody_out_who_was_added_since(tmp_path, upstairs):
     estig = shutil.copytree(ESTIG, tmp_path / "site")
     folder, hosts = NodeFolder(tmp_path / "data"), ["localhost", "127.0.0.1"]
     hosted_sites([estig], folder.security, hosts)
@@ -349,7 +349,7 @@ def test_backup_into_a_device_is_refused(tmp_path):
     assert "it is a folder or a device. Name another file" in " ".join(done.output.split())
 
 
-async def test_locks_of_another_authority_are_replaced_by_those_of_the_backup(tmp_path):
+async def test_credentials_of_another_authority_are_replaced_by_those_of_the_backup(tmp_path):
     estig, hosts = shutil.copytree(ESTIG, tmp_path / "site"), ["localhost", "127.0.0.1"]
     for name in ("data", "fresh"):
         folder = NodeFolder(tmp_path / name)
@@ -363,7 +363,7 @@ async def test_locks_of_another_authority_are_replaced_by_those_of_the_backup(tm
     assert (folder.security / "authority.pem").read_bytes() == (original.security / "authority.pem").read_bytes()
 
 
-async def test_locks_of_another_site_are_never_replaced_by_those_of_a_backup(tmp_path, upstairs):
+async def test_credentials_of_another_site_are_never_replaced_by_those_of_a_backup(tmp_path, upstairs):
     for name, site, directory in (("data", "estig", ESTIG), ("other", "upstairs", upstairs)):
         folder = NodeFolder(tmp_path / name)
         hosted_sites([directory], folder.security, ["localhost", "127.0.0.1"])
@@ -417,7 +417,7 @@ def test_start_of_a_node_is_remembered_with_its_options_and_ports(tmp_path, monk
         folders.recall(tmp_path)
 
 
-async def test_changed_locks_reach_their_program_alone_and_once(tmp_path):
+async def test_changed_credentials_reach_their_program_alone_and_once(tmp_path):
     shell = 'trap "echo told" HUP; echo started; while :; do sleep 0.02; done'
     folders = {name: tmp_path / name for name in ("mosquitto", "zenoh-router", "planner")}
     logs = {name: tmp_path / f"{name}.log" for name in folders}
@@ -428,7 +428,7 @@ async def test_changed_locks_reach_their_program_alone_and_once(tmp_path):
             supervisor.add(Program(name=name, arguments=("/bin/sh", "-c", shell), log=logs[name]))
             supervisor.start(name)
         await until(lambda: all(log.exists() and log.read_text() for log in logs.values()))
-        changes = LockChanges(supervisor, {name: [folder] for name, folder in folders.items()})
+        changes = CredentialChanges(supervisor, {name: [folder] for name, folder in folders.items()})
         assert await changes.round() is None
         (folders["mosquitto"] / "users").write_text("n8")
         (folders["zenoh-router"] / "users").write_text("r2")
@@ -456,7 +456,7 @@ async def test_program_that_stays_unready_is_told_once_and_holds_no_other_back(t
             supervisor.add(Program(name=name, arguments=program, log=tmp_path / f"{name}.log", ready=never))
             supervisor.start(name)
         await until(lambda: all(supervisor.pid(name) for name in folders))
-        changes = LockChanges(supervisor, {name: [folder] for name, folder in folders.items()})
+        changes = CredentialChanges(supervisor, {name: [folder] for name, folder in folders.items()})
         for folder in folders.values():
             (folder / "users").write_text("r2")
         assert [await changes.round() for _ in range(3)] == [None, "zenoh-router", None]

@@ -253,7 +253,7 @@ def test_what_is_missing_is_asked_for_on_a_terminal(floor: Path) -> None:
 
 
 @pytest.mark.parametrize("host", ["192.168.7.1", "192.168.7.9", "fog.example"])
-def test_board_behind_locks_gets_a_password_and_whom_to_trust(floor: Path, security: Path, host: str) -> None:
+def test_board_with_credentials_gets_a_password_and_whom_to_trust(floor: Path, security: Path, host: str) -> None:
     """An address need not be in the certificate: the firmware compares a name that is."""
     done = new_board(floor, "--wifi-password", "", "--fog-host", host, "--locks", str(security))
     assert done.exit_code == 0, done.stderr

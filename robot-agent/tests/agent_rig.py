@@ -48,7 +48,7 @@ from robot_agent.lidars.rplidar_a1.emulator import RplidarEmulator
 if TYPE_CHECKING:
     from pathlib import Path
 
-    from locked_servers import LockedRouter
+    from secured_servers import SecuredRouter
 
     from fog_runtime.concurrency import Slot
 
@@ -208,7 +208,7 @@ class AgentProcess(Process):
     ends_within_s = 10.0
 
     def __init__(
-        self, folder: Path, router: LockedRouter, watchdog: Watchdog, body: Body, further=None, start=(2.0, 2.0, 0.0)
+        self, folder: Path, router: SecuredRouter, watchdog: Watchdog, body: Body, further=None, start=(2.0, 2.0, 0.0)
     ) -> None:
         self.log_file = folder / "agent.log"
         self.data = folder / "data"
@@ -275,7 +275,7 @@ def is_by_delay(reason: str) -> bool:
 class Robot:
     """The whole robot, started; `fog` is None until `async with`."""
 
-    def __init__(self, folder: Path, router: LockedRouter, **further: str) -> None:
+    def __init__(self, folder: Path, router: SecuredRouter, **further: str) -> None:
         """Prepare; `further` variables configure the agent."""
         self.body = Body(folder)
         self.watchdog = Watchdog(folder, self.body.link)

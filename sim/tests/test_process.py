@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 import programs
 import pytest
-from locked_servers import LockedSite
+from secured_servers import SecuredSite
 
 from fog_contracts import channels as ch
 from fog_contracts.grid import GridGeometry, StaticMap
@@ -95,7 +95,7 @@ def write_site(folder):
 @contextlib.asynccontextmanager
 async def simulator(folder: Path, speed=1):
     write_site(folder / "site")
-    site = LockedSite(folder, "lab", robots=["r1"], nodes=["n1"])
+    site = SecuredSite(folder, "lab", robots=["r1"], nodes=["n1"])
     with site.mosquitto() as broker, site.router() as router:
         rig = Rig(folder, broker.url, router.url, site)
         clock = SystemClock()

@@ -47,7 +47,7 @@ class Building(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     wall: Positive
 
 
-class Doors(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+class StackUsers(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """Size (m) of the recess of a closed door."""
 
     width: Positive
@@ -71,7 +71,7 @@ class Corridor(msgspec.Struct, frozen=True, forbid_unknown_fields=True, rename={
     doors_left: list[float] = []
     doors_right: list[float] = []
 
-    def boxes(self, doors: Doors) -> list[tuple[Point, Point]]:
+    def boxes(self, doors: StackUsers) -> list[tuple[Point, Point]]:
         """Return the corridor (it ends half a width beyond the line) and its recesses as rectangles."""
         (x0, y0), (x1, y1) = self.start, self.end
         length = math.hypot(x1 - x0, y1 - y0)
@@ -101,7 +101,7 @@ class Floor(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """The description of the floor (floor.toml)."""
 
     building: Building
-    doors: Doors
+    doors: StackUsers
     corridors: list[Corridor]
     halls: list[Box]
     obstacles: list[Box]

@@ -29,7 +29,7 @@ from fognav.demo.machine import children
 from fognav.demo.operator import Operator
 from fognav.demo.scene import Scene
 from fognav.programs import AGENT, MAP_SERVICE, PLANNER, WATCHDOG
-from fognav.stack import Stack, StackConfig, doors_of
+from fognav.stack import Stack, StackConfig, users_of
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -91,7 +91,7 @@ class LiveSystem:
             base=base,
             lidar=lidar,
             extra={"TRUTH_LOG": str(self._truth_log)},
-            doors=doors_of(self._site.site),
+            users=users_of(self._site.site),
         )
         self.stack = Stack(config, self.events.append)
         self.clock = SystemClock()
@@ -110,11 +110,11 @@ class LiveSystem:
                     role="console",
                     id="test",
                     site=self._site.site.id,
-                    credentials=self.stack.doors.credentials("console"),
+                    credentials=self.stack.security.credentials("console"),
                 )
             )
             self.operator = Operator(edge, self.stack, self.scene, self.clock)
-            console = self.stack.doors.credentials("console")
+            console = self.stack.security.credentials("console")
             mqtt = MqttEdge(self.stack.mqtt_url, "live-test", self.clock, site=self._site.site.id, credentials=console)
             mqtt.on(ch.NODE_READING, self._on_reading, NodeReading)
             listening = asyncio.create_task(mqtt.run())

@@ -214,7 +214,7 @@ async def test_garbage_on_mqtt_and_on_the_serial_line_stops_no_process(system: L
     ids = itertools.count()
 
     def client(user: str) -> aiomqtt.Client:
-        broker = Broker.of(system.stack.mqtt_url, system.stack.doors.credentials(user))
+        broker = Broker.of(system.stack.mqtt_url, system.stack.security.credentials(user))
         return broker.client(f"test-{next(ids)}", None)
 
     async with client("console") as listener:

@@ -64,7 +64,7 @@ from fognav.demo.scene import Scene
 from fognav.output import WrongUseError
 from fognav.programs import AGENT, MAP_SERVICE, SERVERS, SERVICES, SIMULATOR, WATCHDOG
 from fognav.recording import recording, summary
-from fognav.stack import Stack, StackConfig, doors_of
+from fognav.stack import Stack, StackConfig, users_of
 from fognav_sim.drive.hazard import entry_distance
 from robot_agent.agent.recording.replay import replay
 
@@ -174,10 +174,10 @@ async def record(path: Path) -> tuple[MapSnapshot, str]:
 
     # The default memory for obstacles would make the recording too long.
     extra = {"OBSTACLE_MEMORY_S": "10", "INPUT_LOG": str(input_log(path))}
-    doors = doors_of(site.site, unrestricted=("test",))
-    config = StackConfig(site_dir=SITE, robot=plan.robot, seed=1, speed=SPEED, extra=extra, doors=doors)
+    users = users_of(site.site, unrestricted=("test",))
+    config = StackConfig(site_dir=SITE, robot=plan.robot, seed=1, speed=SPEED, extra=extra, users=users)
     async with Stack(config) as stack:
-        supervisor, own = stack.supervisor, stack.doors.credentials("test")
+        supervisor, own = stack.supervisor, stack.security.credentials("test")
         for name in SERVERS:
             supervisor.start(name)
         await supervisor.wait_ready(SERVERS, READY_TIMEOUT_S)

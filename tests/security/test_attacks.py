@@ -14,8 +14,8 @@ import psutil
 import pytest
 from attacks import ATTACKS, LIMIT_S, Attack, few_files, running
 from fronts import running_front
-from locked_servers import LockedSite
 from paho.mqtt.enums import CallbackAPIVersion
+from secured_servers import SecuredSite
 
 from fog_contracts import channels as ch
 from fog_contracts import messages as m
@@ -43,10 +43,10 @@ LOG_BYTES = 20_000
 
 @pytest.fixture(scope="module")
 def site(tmp_path_factory):
-    return LockedSite(tmp_path_factory.mktemp("attacked"), "lab", robots=["r1"], nodes=["n1", "n2"])
+    return SecuredSite(tmp_path_factory.mktemp("attacked"), "lab", robots=["r1"], nodes=["n1", "n2"])
 
 
-def opened(site: LockedSite, url: str, user: str, role: str):
+def opened(site: SecuredSite, url: str, user: str, role: str):
     return ZenohEdge.open(
         connect=[url], clock=SystemClock(), role=role, id=user, site="lab", credentials=site.credentials(user)
     )
@@ -99,7 +99,7 @@ async def test_robot_goes_on_and_another_connects_while_strangers_fill_the_route
         assert server.log.stat().st_size < LOG_BYTES, server.log.read_text()[-2000:]
 
 
-async def connects_after(site: LockedSite, url: str) -> float:
+async def connects_after(site: SecuredSite, url: str) -> float:
     """Return how long a client with a credential takes until it has a session."""
     begun = time.monotonic()
     async with asyncio.timeout(LIMIT_S):
@@ -173,7 +173,7 @@ ON_MQTT = ATTACKS | {
 }
 
 
-def mqtt_client(site: LockedSite, user: str, client_id: str, protocol: int = paho.MQTTv5) -> paho.Client:
+def mqtt_client(site: SecuredSite, user: str, client_id: str, protocol: int = paho.MQTTv5) -> paho.Client:
     client = paho.Client(CallbackAPIVersion.VERSION2, client_id, protocol=protocol)
     own = site.credentials(user)
     client.username_pw_set(own.user, own.passwords["mqtt"])

@@ -17,8 +17,8 @@ import typer
 from rich.table import Table
 
 from fognav import checkout, kernels, system
-from fognav.locking import VARIABLE as CREDENTIALS_DIR_VARIABLE
-from fognav.locking import credentials_folder, open_security, security_errors
+from fognav.credentials import VARIABLE as CREDENTIALS_DIR_VARIABLE
+from fognav.credentials import credentials_folder, open_security, security_errors
 from fognav.operate.options import JsonOption
 from fognav.output import NOT_TRUE, OK, FailedError, WrongUseError, answers, print_json
 

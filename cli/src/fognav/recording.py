@@ -15,7 +15,7 @@ from fog_runtime.credentials import NOBODY, Credentials
 from fog_runtime.record import Recorder, RecordError, bytes_lost, read, record_all, replay
 from fog_runtime.transports.mqtt_edge import MqttEdge
 from fog_runtime.transports.zenoh_edge import ZenohEdge
-from fognav.locking import own_credentials
+from fognav.credentials import own_credentials
 from fognav.output import WrongUseError
 
 _SIGNALS: Final = (signal.SIGINT, signal.SIGTERM)

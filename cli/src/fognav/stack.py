@@ -41,8 +41,8 @@ FOLDER: Final = "locks"
 
 
 @dataclass(frozen=True, kw_only=True)
-class Doors:
-    """For whom the servers are to be locked: the site's id, and its robots and sensor nodes by id."""
+class StackUsers:
+    """Whom the servers admit: the site's id, and its robots and sensor nodes by id."""
 
     site: str
     robots: tuple[str, ...] = ()
@@ -51,9 +51,9 @@ class Doors:
     """Users who may do everything on broker and router, for tests."""
 
 
-def doors_of(site: Site, *, unrestricted: tuple[str, ...] = ()) -> Doors:
-    """Return the doors of a site for its robots and nodes."""
-    return Doors(
+def users_of(site: Site, *, unrestricted: tuple[str, ...] = ()) -> StackUsers:
+    """Return the users of a stack: robots and nodes of a site."""
+    return StackUsers(
         site=site.id,
         robots=tuple(robot.id for robot in site.robots),
         nodes=tuple(node.id for node in site.nodes),
@@ -61,14 +61,14 @@ def doors_of(site: Site, *, unrestricted: tuple[str, ...] = ()) -> Doors:
     )
 
 
-class StackDoors:
-    """The doors of a stack in its folder; without `Doors` they stand open, and nobody has credentials."""
+class StackSecurity:
+    """The security of a stack in its folder; without `StackUsers` everybody is admitted, and nobody has credentials."""
 
-    def __init__(self, folder: Path, doors: Doors | None) -> None:
+    def __init__(self, folder: Path, users: StackUsers | None) -> None:
         self._security: SiteSecurity | None = None
-        if doors is not None:
-            self._security = SiteSecurity(folder / FOLDER, doors.site, unrestricted=doors.unrestricted)
-            self._security.make([net.LOOPBACK, "localhost"], robots=doors.robots, nodes=doors.nodes)
+        if users is not None:
+            self._security = SiteSecurity(folder / FOLDER, users.site, unrestricted=users.unrestricted)
+            self._security.make([net.LOOPBACK, "localhost"], robots=users.robots, nodes=users.nodes)
 
     def of(self, program: str) -> Path | None:
         """Return the folder with the credentials of a server program."""
@@ -100,7 +100,7 @@ class StackConfig:
     """Configuration of a stack.
 
     `robot` is the id of the site's robot, `base` and `lidar` name its hardware, and `robot_file` has its settings, of
-    which the ports do not count; `extra` contains further FOGNAV_ settings for every process. With `doors` the servers
+    which the ports do not count; `extra` contains further FOGNAV_ settings for every process. With `users` the servers
     encrypt, and admit only those users; without, everybody on this machine. The servers named in `embedded` are Python
     packages (`servers.STAND_INS`).
     """
@@ -113,7 +113,7 @@ class StackConfig:
     seed: int = 1
     speed: float = 1.0
     extra: Mapping[str, str] | None = None
-    doors: Doors | None = None
+    users: StackUsers | None = None
     embedded: frozenset[str] = frozenset()
 
 
@@ -144,7 +144,7 @@ class Stack:
         self.operator_key = read_operator_key(self.key_file)
         taken: set[int] = set()
         self.mqtt_port, self.redis_port, self.zenoh_port = (net.free_port(taken) for _ in range(3))
-        self.doors = StackDoors(self.folder, config.doors)
+        self.security = StackSecurity(self.folder, config.users)
         self._urls: dict[str, str] = {}
         self.supervisor = Supervisor(on_event)
         self._prepare()
@@ -219,7 +219,7 @@ class Stack:
 
     def _prepare(self) -> None:
         ports = ServerPorts(mqtt=self.mqtt_port, redis=self.redis_port, zenoh=self.zenoh_port)
-        server_set = server_programs(self.files, ports, self.doors.of, self.config.embedded)
+        server_set = server_programs(self.files, ports, self.security.of, self.config.embedded)
         self._urls = {program.name: program.url for program in server_set}
         programs = ProgramSet(
             self.supervisor,
@@ -238,14 +238,14 @@ class Stack:
             programs.add_server(program)
         robot_file = {"ROBOT_FILE": str(self.config.robot_file)} if self.config.robot_file else {}
         hardware = {"BASE": self.config.base, "LIDAR": self.config.lidar, **robot_file}
-        simulator = {**simulator_settings(self.folder, hardware), **self.doors.node_settings()}
-        programs.add_python(SIMULATOR, MODULES[SIMULATOR], {**simulator, **self.doors.settings("sim")})
+        simulator = {**simulator_settings(self.folder, hardware), **self.security.node_settings()}
+        programs.add_python(SIMULATOR, MODULES[SIMULATOR], {**simulator, **self.security.settings("sim")})
         key = {"OPERATOR_KEY_FILE": str(self.key_file)}
         for name in SERVICES:
             own = {"TOKENS_FILE": str(self.folder / TOKENS), **(key if name == PLANNER else {})}
-            programs.add_python(name, MODULES[name], {**own, **self.doors.settings(name)})
+            programs.add_python(name, MODULES[name], {**own, **self.security.settings(name)})
         robot = self.config.robot
         wires = simulated_robot_settings(self.folder, robot, hardware)
         ready = partial(exists, Path(wires["GUARDIAN_SOCKET"]))
         programs.add_python(WATCHDOG, MODULES[WATCHDOG], wires, ready=ready, rank=2)
-        programs.add_python(AGENT, MODULES[AGENT], {**wires, **key, **self.doors.settings(robot)}, rank=2)
+        programs.add_python(AGENT, MODULES[AGENT], {**wires, **key, **self.security.settings(robot)}, rank=2)

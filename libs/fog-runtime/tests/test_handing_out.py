@@ -160,7 +160,7 @@ def test_certificate_of_the_authority_is_shown_without_its_key(node):
     assert "PRIVATE" not in shown
 
 
-def test_administrator_reads_a_file_of_the_locks_and_nothing_else(node):
+def test_administrator_reads_a_file_of_the_credentials_and_nothing_else(node):
     assert node.run("show", ADMIN_TOKEN) == (node.security / ADMIN_TOKEN).read_text()
     assert "there are: " in node.refused("show", "../out/planner/operator.key").lower()
 
@@ -221,7 +221,7 @@ def test_two_floors_of_the_same_id_are_refused(node, upstairs, tmp_path):
     assert "two floors have the same id 'upstairs'" in node.refused()
 
 
-def test_locks_of_another_site_are_refused(node, tmp_path, monkeypatch):
+def test_credentials_of_another_site_are_refused(node, tmp_path, monkeypatch):
     monkeypatch.setenv("FOGNAV_SITE_DIR", str(renamed(tmp_path / "site", "annex")))
     assert "has the credentials of site estig, not of annex" in node.refused()
 

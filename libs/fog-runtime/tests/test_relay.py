@@ -128,9 +128,9 @@ async def test_relay_knows_as_whom_zenoh_has_let_each_client_in(tmp_path, monkey
         made.insert_json5("transport/auth/usrpwd", json.dumps({"user": user, "password": password}))
         return made
 
-    locked = config("router", "router", "x", listen=[f"unixsock-stream/{tmp_path}/zenoh"])
-    locked.insert_json5("transport/auth/usrpwd/dictionary_file", json.dumps(str(tmp_path / "users")))
-    router = await asyncio.to_thread(zenoh.open, locked)
+    secured = config("router", "router", "x", listen=[f"unixsock-stream/{tmp_path}/zenoh"])
+    secured.insert_json5("transport/auth/usrpwd/dictionary_file", json.dumps(str(tmp_path / "users")))
+    router = await asyncio.to_thread(zenoh.open, secured)
     async with relaying(relay.to_socket(tmp_path / "zenoh"), relay.ZenohOpening) as port:
         for user, password in users.items():
             opened = await asyncio.to_thread(

@@ -180,7 +180,7 @@ def test_addresses():
             parse_address(url)
 
 
-LOCKED_SENTINEL = """
+SECURED_SENTINEL = """
 port 0
 tls-port {port}
 bind 127.0.0.1
@@ -198,7 +198,7 @@ sentinel auth-pass fognav {password}
 
 
 @pytest.fixture
-def locked_cluster(tmp_path):
+def secured_cluster(tmp_path):
     """A locked Redis and one Sentinel: the address, whom services are there, and the authority of nobody there."""
     security = SiteSecurity(tmp_path / "locks", "lab")
     security.make([LOOPBACK, "localhost"])
@@ -207,7 +207,7 @@ def locked_cluster(tmp_path):
     authority.write_text(security.authority.trusted)
     with start_redis(tmp_path, security=security.folder("redis")) as redis:
         home, port = tmp_path / "sentinel", free_port({redis.port})
-        text = LOCKED_SENTINEL.format(
+        text = SECURED_SENTINEL.format(
             port=port, security=security.folder("redis"), authority=authority, folder=home, primary=redis.port,
             password=administrator.passwords["redis"],
         )  # fmt: skip
@@ -231,13 +231,13 @@ async def store_once(url, credentials):
         await connection.aclose()
 
 
-async def test_sentinels_and_their_primary_are_reached_by_tls(locked_cluster):
-    address, own = locked_cluster
+async def test_sentinels_and_their_primary_are_reached_by_tls(secured_cluster):
+    address, own = secured_cluster
     assert await store_once(f"rediss+sentinel://{address}", own) == [1]
 
 
-async def test_sentinels_of_another_authority_are_not_believed(locked_cluster, tmp_path):
-    address, own = locked_cluster
+async def test_sentinels_of_another_authority_are_not_believed(secured_cluster, tmp_path):
+    address, own = secured_cluster
     stranger = SiteSecurity(tmp_path / "stranger", "lab")
     stranger.make([LOOPBACK])
     other = Credentials(own.user, passwords=own.passwords, authority=stranger.authority.trusted)

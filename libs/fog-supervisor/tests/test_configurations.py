@@ -34,7 +34,7 @@ def test_stale_configuration_is_reported_with_the_remedy(tmp_path: Path, capsys:
     assert "redis.conf is stale: run python -m fog_supervisor.configurations --write" in capsys.readouterr().out
 
 
-def test_private_servers_have_the_limits_durability_and_locks_of_deployed_ones(tmp_path: Path) -> None:
+def test_private_servers_have_the_limits_durability_and_security_of_deployed_ones(tmp_path: Path) -> None:
     deployed = configurations.deployed()
     security = Path(configurations.DEPLOYED_SECURITY)
     mosquitto_program(tmp_path, 1, security=security)

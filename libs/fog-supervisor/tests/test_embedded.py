@@ -1,4 +1,4 @@
-"""The servers that stand in where nothing can be installed: with the same credentials they keep the same doors."""
+"""The servers that stand in where nothing can be installed: with the same users they admit the same."""
 
 import asyncio
 import contextlib

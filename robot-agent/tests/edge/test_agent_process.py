@@ -11,7 +11,7 @@ import msgspec
 import pytest
 from agent_rig import ROBOT, SITE, AgentProcess, Robot, is_by_delay, until
 from guardian_rig import DEADLINE_S, STOP_S
-from locked_servers import locked_router
+from secured_servers import secured_router
 
 from fog_contracts import channels as ch
 from fog_contracts.grid import Window
@@ -25,7 +25,7 @@ pytestmark = [pytest.mark.live, pytest.mark.reaction, pytest.mark.timeout(150)]
 
 @pytest.fixture(scope="module")
 def router(tmp_path_factory):
-    with locked_router(tmp_path_factory.mktemp("router"), SITE, robots=[ROBOT]) as running:
+    with secured_router(tmp_path_factory.mktemp("router"), SITE, robots=[ROBOT]) as running:
         yield running
 
 

@@ -14,7 +14,7 @@ from pathlib import Path
 
 import pytest
 from agent_rig import ROBOT, SITE, Robot, until
-from locked_servers import locked_router
+from secured_servers import secured_router
 
 from fog_runtime.machine import run_in_real_time
 from fog_supervisor import child
@@ -29,7 +29,7 @@ pytestmark = [pytest.mark.live, pytest.mark.reaction, pytest.mark.timeout(150 + 
 
 @pytest.fixture
 def router(tmp_path_factory):
-    with locked_router(tmp_path_factory.mktemp("router"), SITE, robots=[ROBOT]) as running:
+    with secured_router(tmp_path_factory.mktemp("router"), SITE, robots=[ROBOT]) as running:
         yield running
 
 

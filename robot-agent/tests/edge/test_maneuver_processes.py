@@ -11,7 +11,7 @@ import pytest
 from agent_rig import ROBOT, SITE, Robot, is_by_delay, until
 from guardian_rig import DEADLINE_S, STOP_S, lateness
 from little_world import grid_of
-from locked_servers import locked_router
+from secured_servers import secured_router
 
 pytestmark = [pytest.mark.live, pytest.mark.reaction, pytest.mark.timeout(180)]
 
@@ -27,7 +27,7 @@ The site says that the robot starts in the first one, with a heading that fits n
 
 @pytest.fixture(scope="module")
 def router(tmp_path_factory):
-    with locked_router(tmp_path_factory.mktemp("router"), SITE, robots=[ROBOT]) as running:
+    with secured_router(tmp_path_factory.mktemp("router"), SITE, robots=[ROBOT]) as running:
         yield running
 
 

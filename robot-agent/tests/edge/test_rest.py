@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 from agent_rig import ROBOT, SITE, Robot, until
-from locked_servers import locked_router
+from secured_servers import secured_router
 
 pytestmark = [pytest.mark.live, pytest.mark.timeout(150)]
 
@@ -20,7 +20,7 @@ rest_after_s = 3.0
 
 async def test_idle_robot_rests_stays_ready_and_drives_after_its_enable_without_a_stop(tmp_path):
     (tmp_path / "robot.toml").write_text(POWER)
-    with locked_router(tmp_path / "router", SITE, robots=[ROBOT]) as router:
+    with secured_router(tmp_path / "router", SITE, robots=[ROBOT]) as router:
         async with Robot(tmp_path, router, FOGNAV_ROBOT_FILE=str(tmp_path / "robot.toml")) as robot:
             await robot.localized()
             resting = "at rest to save power, without its lidar: a goal or an operator's command wakes it"

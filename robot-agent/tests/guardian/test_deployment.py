@@ -142,7 +142,7 @@ def test_a_second_installation_keeps_what_was_changed_on_the_robot(installed):
     assert toml.read_text() == before
 
 
-def test_a_second_installation_with_credentials_lets_the_robot_through_a_locked_router(installed, tmp_path):
+def test_a_second_installation_with_credentials_lets_the_robot_through_a_secured_router(installed, tmp_path):
     env, credentials = installed / "etc/fognav/robot.env", tmp_path / "r1.toml"
     env.write_text(env.read_text() + "FOGNAV_SEED=9\n")
     credentials.write_text("")

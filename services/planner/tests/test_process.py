@@ -12,7 +12,7 @@ import msgspec
 import numpy as np
 import programs
 import pytest
-from locked_servers import LockedSite
+from secured_servers import SecuredSite
 
 from fog_contracts import channels as ch
 from fog_contracts.commands import CommandGate
@@ -106,7 +106,7 @@ class Environment:
         router: Server,
         redis: Server,
         edge: ZenohEdge,
-        site: LockedSite,
+        site: SecuredSite,
         further: dict[str, str] | None = None,
     ) -> None:
         self.further = {**site.environment("planner"), **(further or {})}
@@ -195,7 +195,7 @@ class Environment:
 @asynccontextmanager
 async def running_planner(folder: Path, **further: str) -> AsyncIterator[Environment]:
     write_site(folder / "site")
-    site = LockedSite(folder, "test", robots=["r1"])
+    site = SecuredSite(folder, "test", robots=["r1"])
     with site.router() as router, site.redis() as redis:
         opened = ZenohEdge.open(
             connect=[router.endpoint],

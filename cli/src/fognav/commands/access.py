@@ -16,7 +16,7 @@ from fog_runtime.files import atomic_write
 from fog_runtime.security.site_security import SiteSecurity
 from fog_runtime.token_file import Role, create_token, read_tokens, revoke_token
 from fognav import checkout
-from fognav.locking import (
+from fognav.credentials import (
     CredentialsOption,
     credentials_folder,
     named_folder,

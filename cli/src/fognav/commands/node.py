@@ -17,7 +17,7 @@ from fog_contracts.site import NodeSite, Sonar, learned_share
 from fog_runtime.configuration.site import LoadedSite, load_site
 from fog_runtime.credentials import Credentials
 from fognav import checkout, kernels, site_files, system
-from fognav.locking import own_credentials
+from fognav.credentials import own_credentials
 from fognav.nodes import on_broker
 from fognav.nodes.board_settings import SITE, BoardOptions, SiteOption, credentials_in, node_in, with_board_options
 from fognav.operate.fog import Fog, find_fog

@@ -12,7 +12,7 @@ from fog_runtime.configuration.parts import DEFAULT_BASE, DEFAULT_LIDAR
 from fog_runtime.configuration.robot_file import ROBOT_FILE, RobotFile, default_robot, describe_robot, load_robot
 from fog_runtime.configuration.settings import SettingsError
 from fog_runtime.files import SHARED, atomic_write
-from fognav.locking import CredentialsOption, open_security, security_errors
+from fognav.credentials import CredentialsOption, open_security, security_errors
 from fognav.operate.options import JsonOption, checked_id
 from fognav.output import (
     NOT_TRUE,

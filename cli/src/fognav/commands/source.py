@@ -6,7 +6,7 @@ import msgspec
 import typer
 
 from fog_contracts.messages import AreaDefinition, Limits, Source
-from fognav.locking import CredentialsOption, open_security, security_errors
+from fognav.credentials import CredentialsOption, open_security, security_errors
 from fognav.operate.fog import Fog, find_fog
 from fognav.operate.options import FogOption, JsonOption, checked_id
 from fognav.operate.systems import AGGREGATOR

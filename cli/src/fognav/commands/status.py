@@ -9,7 +9,7 @@ import msgspec
 from fog_runtime.clock import SystemClock
 from fog_runtime.credentials import Credentials
 from fog_runtime.transports.zenoh_edge import ZenohEdge
-from fognav.locking import own_credentials
+from fognav.credentials import own_credentials
 from fognav.operate.fog import FOG, Fog, find_fog
 from fognav.operate.options import FogOption, JsonOption
 from fognav.operate.systems import ROUTER, SERVICE_PORTS, System, find_systems

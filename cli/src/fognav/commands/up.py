@@ -8,11 +8,11 @@ from typing import Annotated, Final
 import typer
 
 from fognav import checkout, kernels, system
+from fognav.credentials import own_hosts, security_errors
 from fognav.hosting import local_nodes
 from fognav.hosting.fog_node import NodeConfig, run_node
 from fognav.hosting.folders import NodeFolder, default_data, hosted_sites, remember, settings_of
 from fognav.hosting.local_nodes import UNIT, end_node, named_node, write_unit
-from fognav.locking import own_hosts, security_errors
 from fognav.output import FailedError, exit_codes, print_line
 
 SitesOption = Annotated[

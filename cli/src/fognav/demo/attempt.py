@@ -26,7 +26,7 @@ from fognav.operate.systems import Registration, System, registered
 from fognav.output import FailedError, WrongUseError
 from fognav.programs import AGENT, BROKER, ROBOT, ROUTER, SERVICES, WATCHDOG
 from fognav.recording import recording
-from fognav.stack import Stack, StackConfig, doors_of
+from fognav.stack import Stack, StackConfig, users_of
 from fognav_sim.barrier import BarrierError
 from fognav_sim.drive.drive import Drive, DriveOutcome, DriveSummary
 from fognav_sim.drive.hazard import HazardSchedule, PlannedHazard
@@ -54,7 +54,7 @@ class Presence(Registration):
         urls |= {BROKER: stack.mqtt_url, ROUTER: stack.zenoh_endpoint}
         if self._scene.page_url:
             urls[PAGE] = self._scene.page_url
-        credentials = stack.doors.file("console")
+        credentials = stack.security.file("console")
         return System(
             name=f"demo-{os.getpid()}",
             kind="demo",
@@ -194,7 +194,7 @@ class Attempt:
             seed=options.seed,
             speed=self.scene.speed,
             extra=options.settings,
-            doors=doors_of(self.plan.site.site),
+            users=users_of(self.plan.site.site),
             embedded=options.embedded,
         )
         async with Stack(config, self._on_process) as stack, self._keeping_logs(stack):
@@ -234,7 +234,7 @@ class Attempt:
                 zenoh=edge,
                 clock=clock,
                 numbers=numbers,
-                credentials=stack.doors.credentials("recorder"),
+                credentials=stack.security.credentials("recorder"),
             ),
         ):
             yield
@@ -264,7 +264,7 @@ class Attempt:
             role="console",
             id=name,
             site=self.plan.site.site.id,
-            credentials=stack.doors.credentials(user),
+            credentials=stack.security.credentials(user),
         )
 
     def _on_process(self, event: Event) -> None:

@@ -29,8 +29,8 @@ from fog_runtime.security.users import ANYBODY, REDIS_ADMINISTRATOR, USERS, on_f
 from fog_supervisor import net, servers
 from fog_supervisor.supervisor import Event, Supervisor
 from fognav import checkout
+from fognav.credentials import own_credentials, security_errors
 from fognav.hosting.folders import REDIS_PORT, SECURITY_FILE, NodeFolder, recall, require_node
-from fognav.locking import own_credentials, security_errors
 from fognav.output import FailedError, WrongUseError, print_line
 from fognav.programs import MAP_SERVICE, REDIS, ProgramSet
 

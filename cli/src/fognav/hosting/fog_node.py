@@ -59,7 +59,7 @@ _RESTARTED_S: Final = 180.0
 """How long a restarted program may take before the others are brought up to date without it."""
 
 
-class LockChanges:
+class CredentialChanges:
     """Watches the files of each program's credentials; `round` is called once a second."""
 
     def __init__(self, supervisor: Supervisor, files: Mapping[str, Sequence[Path]]) -> None:
@@ -185,7 +185,7 @@ class LocalNode:
                 self.supervisor.start(name)
             await self.supervisor.wait_ready(names, timeout_s)
 
-    def lock_changes(self) -> LockChanges:
+    def credential_changes(self) -> CredentialChanges:
         """Watch the files of every program's credentials, those of simulated nodes and robots, too."""
         security = self.config.security
         servers: dict[str, list[Path]] = {name: [security.folder(folder)] for name, folder in SECURITY.items()}
@@ -195,7 +195,7 @@ class LocalNode:
             for service in SERVICES
         }
         robots = {} if not self.config.simulate else self._robot_credentials()
-        return LockChanges(self.supervisor, servers | services | robots)
+        return CredentialChanges(self.supervisor, servers | services | robots)
 
     def _robot_credentials(self) -> dict[str, list[Path]]:
         files: dict[str, list[Path]] = {}
@@ -335,7 +335,7 @@ async def run_node(config: NodeConfig, print_line: Callable[[str], None], *, che
         require_free_ports(node)
         async with node.supervisor:
             with _registered(node) as registrations:
-                changes = node.lock_changes()  # before the start: programs may have read what changes during it
+                changes = node.credential_changes()  # before the start: programs may have read what changes during it
                 await node.start(READY_S)
                 _announce(node, print_line)
                 if not check:
@@ -363,7 +363,7 @@ def _registered(node: LocalNode) -> Iterator[list[Registration]]:
 
 
 async def attend(
-    node: LocalNode, registrations: list[Registration], changes: LockChanges, print_line: Callable[[str], None]
+    node: LocalNode, registrations: list[Registration], changes: CredentialChanges, print_line: Callable[[str], None]
 ) -> None:
     """Keep the register and the service manager informed, and the logs bounded; robots need none of that to drive."""
     manager = ServiceManager()

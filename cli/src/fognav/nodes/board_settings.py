@@ -25,7 +25,7 @@ from fog_runtime.credentials import Credentials
 from fog_runtime.files import PRIVATE, atomic_write
 from fog_runtime.security.site_security import SiteSecurity
 from fognav import checkout
-from fognav.locking import CredentialsOption, credentials_folder, open_security, security_errors
+from fognav.credentials import CredentialsOption, credentials_folder, open_security, security_errors
 from fognav.operate.options import JsonOption
 from fognav.output import WrongUseError, print_json, print_line
 

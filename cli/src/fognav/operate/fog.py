@@ -15,7 +15,7 @@ import msgspec
 from fog_contracts.messages import Id, Mode
 from fog_runtime.credentials import Credentials
 from fog_supervisor import net
-from fognav.locking import own_credentials
+from fognav.credentials import own_credentials
 from fognav.operate.systems import FOG_NODE, MAP_SERVICE, PLANNER, ROUTER, System, addresses, find_systems, registered
 from fognav.output import FailedError, WrongUseError
 
@@ -168,7 +168,7 @@ def _fog_node(name: str) -> System:
         )
     host = net.LOOPBACK if name == FOG_NODE else name
     return System(
-        name=name, kind="fog node", site="", urls=addresses(host, locked=bool(own_credentials().authority)), pids={}
+        name=name, kind="fog node", site="", urls=addresses(host, secured=bool(own_credentials().authority)), pids={}
     )
 
 

@@ -23,7 +23,7 @@ import psutil
 from fog_runtime.configuration.site import SITE_FILE
 from fog_runtime.files import atomic_write
 from fog_supervisor import net
-from fognav.locking import own_credentials
+from fognav.credentials import own_credentials
 from fognav.output import FailedError
 
 PRIVATE: Final = 0o700
@@ -178,12 +178,12 @@ def port(setting: tuple[str, int]) -> int:
     return int(os.environ.get(variable) or default)
 
 
-def addresses(host: str, *, locked: bool = False) -> dict[str, str]:
+def addresses(host: str, *, secured: bool = False) -> dict[str, str]:
     """Return the addresses of a fog node's REST APIs, router and broker on a host; those of a locked one encrypt."""
     shown = f"[{host}]" if ":" in host else host  # IPv6
-    http_scheme, zenoh_scheme, mqtt_scheme = ("https", "tls", "mqtts") if locked else ("http", "tcp", "mqtt")
+    http_scheme, zenoh_scheme, mqtt_scheme = ("https", "tls", "mqtts") if secured else ("http", "tcp", "mqtt")
     urls = {name: f"{http_scheme}://{shown}:{port(setting)}" for name, setting in SERVICE_PORTS.items()}
-    mqtt_port = port(MQTTS_PORT if locked else MQTT_PORT)
+    mqtt_port = port(MQTTS_PORT if secured else MQTT_PORT)
     return {
         **urls,
         ROUTER: f"{zenoh_scheme}/{shown}:{port(ZENOH_PORT)}",
@@ -231,7 +231,7 @@ def _fog_node(processes: list[tuple[str, psutil.Process]]) -> System | None:
     """
     own = own_credentials()
     tls = own.tls_context() if own.authority else None
-    urls = addresses(net.LOOPBACK, locked=tls is not None)
+    urls = addresses(net.LOOPBACK, secured=tls is not None)
     titles = {name: f"Fognav {name}" for name in SERVICE_PORTS}
     answering = {name for name, setting in SERVICE_PORTS.items() if _title(port(setting), tls) == titles[name]}
     if not answering:

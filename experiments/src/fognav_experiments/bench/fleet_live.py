@@ -30,7 +30,7 @@ from fog_runtime.transports.zenoh_edge import ZenohEdge, session_config
 from fog_supervisor.supervisor import NotReadyError, log_tail
 from fognav.output import FailedError
 from fognav.programs import PLANNER, REDIS, ROUTER
-from fognav.stack import Doors, Stack, StackConfig
+from fognav.stack import Stack, StackConfig, StackUsers
 from fognav_experiments.bench.common import SITE, ask, following, in_background, standing, write_site
 from fognav_experiments.bench.fleet import closures, hazard_message, percentile
 
@@ -167,8 +167,8 @@ async def _planner(map_: FleetMap, fleet: Mapping[str, Trip], quiet_s: float) ->
     """Run a planner with its servers, all on the loopback address, and the stand-ins; end them with the context."""
     with TemporaryDirectory(prefix="fognav-") as folder:
         write_site(Path(folder), map_.floor)
-        doors = Doors(site=SITE, unrestricted=(_BENCH,))
-        async with Stack(StackConfig(site_dir=Path(folder), robot="none", doors=doors)) as stack:
+        users = StackUsers(site=SITE, unrestricted=(_BENCH,))
+        async with Stack(StackConfig(site_dir=Path(folder), robot="none", users=users)) as stack:
             for name in (REDIS, ROUTER):
                 stack.supervisor.start(name)
             await stack.supervisor.wait_ready([REDIS, ROUTER], _READY_S)
@@ -186,7 +186,7 @@ async def _stand_ins(
     stack: Stack, map_: FleetMap, fleet: Mapping[str, Trip], quiet_s: float
 ) -> AsyncIterator[StandIns]:
     """Run map-service and robots on two sessions of the router: what the planner sees, and what reaches the robots."""
-    endpoint, own = stack.zenoh_endpoint, stack.doors.credentials(_BENCH)
+    endpoint, own = stack.zenoh_endpoint, stack.security.credentials(_BENCH)
     config = session_config("client", connect=[endpoint], credentials=own)
     with await asyncio.to_thread(zenoh.open, config) as session:
         receivers = Receivers(session, SITE, list(fleet))

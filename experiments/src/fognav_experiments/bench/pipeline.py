@@ -32,7 +32,7 @@ from fog_runtime.transports.mqtt_connection import Broker
 from fog_runtime.transports.zenoh_edge import session_config
 from fognav.output import FailedError
 from fognav.programs import AGGREGATOR, MAP_SERVICE, SERVERS
-from fognav.stack import Doors, Stack, StackConfig
+from fognav.stack import Stack, StackConfig, StackUsers
 from fognav_experiments.bench.common import SITE, ask, make_office, write_site
 
 if TYPE_CHECKING:
@@ -110,8 +110,8 @@ async def measure(  # what is measured
 ) -> dict[str, Any]:
     """Return the figures; times in ms, None when no hazard reached the map. `folder` is empty."""
     write_nodes(folder, nodes)
-    doors = Doors(site=SITE, unrestricted=(_BENCH,))
-    config = StackConfig(site_dir=folder, robot="none", extra={"HAZARDS_WAIT_S": "0"}, doors=doors)
+    users = StackUsers(site=SITE, unrestricted=(_BENCH,))
+    config = StackConfig(site_dir=folder, robot="none", extra={"HAZARDS_WAIT_S": "0"}, users=users)
     async with Stack(config) as stack:
         on_phase("starting broker, Redis, router, aggregator and map-service")
         await stack.start_servers(_READY_S)
@@ -119,7 +119,7 @@ async def measure(  # what is measured
             stack.supervisor.start(name)
         await stack.supervisor.wait_ready([*SERVERS, AGGREGATOR, MAP_SERVICE], _READY_S)
         fog, traces = _Fog(stack), _Traces()
-        own = stack.doors.credentials(_BENCH)
+        own = stack.security.credentials(_BENCH)
         with zenoh.open(session_config("client", connect=[stack.zenoh_endpoint], credentials=own)) as session:
             session.declare_subscriber(ch.MAP_DELTA.key(site=SITE), traces.on_delta)
             async with _load(stack, nodes, rate, robots, seconds) as load:
@@ -176,7 +176,7 @@ def _free_corners(floor: StaticMap) -> list[tuple[float, float]]:
 @asynccontextmanager
 async def _load(stack: Stack, nodes: int, rate: float, robots: int, seconds: float) -> AsyncIterator[Process]:
     """Run the load generator, which measures once it is told to."""
-    asked = [nodes, rate, robots, seconds, stack.doors.file(_BENCH)]
+    asked = [nodes, rate, robots, seconds, stack.security.file(_BENCH)]
     options = [SITE, stack.mqtt_url, stack.zenoh_endpoint, *map(str, asked)]
     pipe = asyncio.subprocess.PIPE
     load = await asyncio.create_subprocess_exec(

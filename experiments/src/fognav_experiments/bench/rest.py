@@ -29,7 +29,7 @@ from fog_runtime.stores.redis_store import Audit
 from fog_runtime.transports.zenoh_edge import session_config
 from fog_supervisor.net import LOOPBACK
 from fognav.programs import MAP_SERVICE, PLANNER, SERVERS
-from fognav.stack import Doors, Stack, StackConfig
+from fognav.stack import Stack, StackConfig, StackUsers
 from fognav_experiments.bench.common import SITE
 from fognav_experiments.bench.cores import random_zones, worst_shapes
 from map_service.store import Store
@@ -55,7 +55,7 @@ async def measure(
     to list them over REST, and until the costliest zone is stored and on the map. `folder` holds a site
     (`office.write_site`) of this floor; `zones` are stored before.
     """
-    config = StackConfig(site_dir=folder, robot="none", extra={"HAZARDS_WAIT_S": "0"}, doors=Doors(site=SITE))
+    config = StackConfig(site_dir=folder, robot="none", extra={"HAZARDS_WAIT_S": "0"}, users=StackUsers(site=SITE))
     async with _map_service(config, random_zones(floor, zones)) as (stack, started):
         pid, port = stack.pids()[MAP_SERVICE], stack.port(MAP_SERVICE)
         assert port is not None
@@ -101,7 +101,7 @@ async def _map_service(config: StackConfig, zones: list[Zone]) -> AsyncIterator[
     loop = asyncio.get_running_loop()
     async with Stack(config) as stack:
         await stack.start_servers(_READY_S)
-        async with Store(stack.redis_url, SITE, credentials=stack.doors.credentials(MAP_SERVICE)) as store:
+        async with Store(stack.redis_url, SITE, credentials=stack.security.credentials(MAP_SERVICE)) as store:
             await store.restore(zones, Audit(0.0, "bench", "restore"))
             begun = loop.time()
             await store.zones()
@@ -116,7 +116,7 @@ async def _map_service(config: StackConfig, zones: list[Zone]) -> AsyncIterator[
 def _listener(stack: Stack) -> Iterator[subprocess.Popen[bytes]]:
     command = (
         sys.executable, "-m", "fognav_experiments.bench.rest", SITE, stack.zenoh_endpoint,
-        str(stack.doors.file(PLANNER)),
+        str(stack.security.file(PLANNER)),
     )  # fmt: skip
     with subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE) as process:
         _gaps(process)  # once it listens

@@ -26,7 +26,7 @@ from fog_supervisor import net
 from fog_supervisor.net import put_goal
 from fognav.output import WrongUseError
 from fognav.programs import AGENT, PLANNER, ROBOT, WATCHDOG
-from fognav.stack import Doors, Stack, StackConfig
+from fognav.stack import Stack, StackConfig, StackUsers
 from fognav_experiments.bench.common import RunningSystem, corridor_rows, first_child, make_office
 from fognav_sim.drive.operator import OperatorPolicy
 
@@ -137,8 +137,8 @@ class RobotSystem(RunningSystem):
         contexts = self._contexts
         folder = Path(contexts.enter_context(TemporaryDirectory(prefix="fognav-bench-")))
         site = await asyncio.to_thread(write_site, folder, make_office(*FLOOR_M))
-        doors = Doors(site=_SITE, robots=(NAME,))
-        config = StackConfig(site_dir=site, robot=NAME, extra=self._settings, doors=doors)
+        users = StackUsers(site=_SITE, robots=(NAME,))
+        config = StackConfig(site_dir=site, robot=NAME, extra=self._settings, users=users)
         self.stack = await contexts.enter_async_context(Stack(config, self._on_event))
         await self.stack.start()
         edge = await contexts.enter_async_context(
@@ -148,7 +148,7 @@ class RobotSystem(RunningSystem):
                 role="console",
                 id="bench",
                 site=_SITE,
-                credentials=self.stack.doors.credentials("console"),
+                credentials=self.stack.security.credentials("console"),
             )
         )
         self._commands = RobotCommands(edge, operator="bench", key=self.stack.operator_key)

@@ -25,7 +25,7 @@ from fog_supervisor.supervisor import NotReadyError, log_tail
 from fognav.nodes.simulated import StillFloor
 from fognav.output import FailedError
 from fognav.programs import AGGREGATOR, MAP_SERVICE, PLANNER, SERVERS, SERVICES
-from fognav.stack import Stack, StackConfig, doors_of
+from fognav.stack import Stack, StackConfig, users_of
 from fognav_experiments.bench.common import ask, following, in_background, standing
 from fognav_sim.barrier import BarrierError, barrier_across
 from fognav_sim.drive.hazard import draw_hazard, entry_distance
@@ -133,8 +133,8 @@ async def measure(
     floor = StillFloor(loaded, (), SystemClock(), world=_WatchedWorld)
     assert isinstance(floor.world, _WatchedWorld)
     extra = {"DEBOUNCE": rule, "HAZARDS_WAIT_S": "0"}
-    doors = doors_of(site, unrestricted=(_BENCH,))
-    config = StackConfig(site_dir=loaded.directory, robot="none", extra=extra, doors=doors)
+    users = users_of(site, unrestricted=(_BENCH,))
+    config = StackConfig(site_dir=loaded.directory, robot="none", extra=extra, users=users)
     async with Stack(config) as stack:
         await stack.start_servers(_READY_S)
         for name in SERVICES:
@@ -144,7 +144,7 @@ async def measure(
         except NotReadyError as error:
             raise FailedError(f"{error}\n{log_tail(stack.log(PLANNER))}") from error
         async with _nodes(stack, loaded, floor):
-            own = stack.doors.credentials(_BENCH)
+            own = stack.security.credentials(_BENCH)
             settings = session_config("client", connect=[stack.zenoh_endpoint], credentials=own)
             with await asyncio.to_thread(zenoh.open, settings) as session:
                 trial = _Trials(stack, loaded, floor.world, session, seed)
@@ -170,7 +170,7 @@ async def _nodes(stack: Stack, loaded: LoadedSite, floor: StillFloor) -> AsyncIt
     clock = SystemClock()
     nodes = [
         VirtualNode(
-            sensor, floor, stack.mqtt_url, clock, loaded.site.id, stack.doors.credentials(sensor.node.id)
+            sensor, floor, stack.mqtt_url, clock, loaded.site.id, stack.security.credentials(sensor.node.id)
         )
         for sensor in make_nodes(loaded.site.nodes, int(time.time()), clock.now(), "firmware", apart=0.025)
     ]  # fmt: skip

@@ -25,7 +25,7 @@ _MOSQUITTO: Final = f"""\
 {_NOTE}
 # The broker of the sensor nodes. The aggregator publishes all retained messages again after each reconnect, so a lost
 # database does no harm.
-{{listener}}{{doors}}persistence true
+{{listener}}{{access}}persistence true
 persistence_location {{data}}/
 autosave_interval 30
 # Larger than any message of the contracts, small enough not to exhaust the memory.
@@ -38,7 +38,7 @@ log_type warning
 log_type notice
 connection_messages false
 """
-_MOSQUITTO_LOCKED: Final = """\
+_MOSQUITTO_SECURED: Final = """\
 allow_anonymous false
 password_file {security}/users
 acl_file {security}/access
@@ -48,7 +48,7 @@ _REDIS: Final = f"""\
 # Stores zones, areas, missions and the audit log. With `always` no acknowledged write was lost over hundreds of kills,
 # with `everysec` some were.
 bind {{bind}}
-{{doors}}protected-mode no
+{{access}}protected-mode no
 appendonly yes
 appendfsync always
 save ""
@@ -57,7 +57,7 @@ maxmemory-policy noeviction
 """
 
 
-_REDIS_LOCKED: Final = """\
+_REDIS_SECURED: Final = """\
 port 0
 tls-port {port}
 tls-cert-file {security}/server.pem
@@ -78,9 +78,9 @@ def mosquitto(listener: str, data: str, *, security: str | None = None, extra: S
     database; `security` that with its users and access list (`fog_runtime.security`), without which it admits
     everybody: with them it is behind a relay, which encrypts. The `extra` lines are appended.
     """
-    doors = "allow_anonymous true\n" if security is None else _MOSQUITTO_LOCKED.format(security=security)
+    access = "allow_anonymous true\n" if security is None else _MOSQUITTO_SECURED.format(security=security)
     listens = f"listener {listener}\n" if listener else ""
-    return _MOSQUITTO.format(listener=listens, data=data, doors=doors) + "".join(f"{line}\n" for line in extra)
+    return _MOSQUITTO.format(listener=listens, data=data, access=access) + "".join(f"{line}\n" for line in extra)
 
 
 def redis(bind: str, data: str, *, port: int = REDIS_PORT, security: str | None = None, encrypted: bool = True) -> str:
@@ -89,9 +89,9 @@ def redis(bind: str, data: str, *, port: int = REDIS_PORT, security: str | None 
     `bind` is the address on which it listens, `data` the folder of its append-only file; `security` as for `mosquitto`,
     but with `encrypted` False only the users count.
     """
-    locked = _REDIS_LOCKED if encrypted else _REDIS_ADMITTING
-    doors = f"port {port}\n" if security is None else locked.format(port=port, security=security)
-    return _REDIS.format(bind=bind, data=data, doors=doors)
+    secured = _REDIS_SECURED if encrypted else _REDIS_ADMITTING
+    access = f"port {port}\n" if security is None else secured.format(port=port, security=security)
+    return _REDIS.format(bind=bind, data=data, access=access)
 
 
 def router_arguments(endpoint: str, *, security: str | None = None) -> list[str]:

@@ -161,12 +161,12 @@ def _valkey_server() -> Path | None:
 
 def embedded_broker_program(port: int, *, address: str = LOOPBACK, security: Path | None = None) -> ServerProgram:
     """Return what stands in for Mosquitto where it is not installed; `address` and `security` as for that."""
-    locked = [] if security is None else ["--security", str(security)]
+    secured = [] if security is None else ["--security", str(security)]
     module = "fog_supervisor.embedded_broker"
     scheme = "mqtt" if security is None else "mqtts"
     return ServerProgram(
         name="mosquitto", port=port, address=address, url=f"{scheme}://{reachable(address)}:{port}",
-        command=(sys.executable, "-m", module, "--listen", f"{address}:{port}", *locked),
+        command=(sys.executable, "-m", module, "--listen", f"{address}:{port}", *secured),
     )  # fmt: skip
 
 
@@ -196,15 +196,15 @@ def redis_program(folder: Path, port: int, *, security: Path | None = None) -> S
     file = folder / "redis.conf"
     file.write_text(configurations.redis(LOOPBACK, str(folder), port=port, security=_text(security)), "utf-8")
     command = (program, str(file))
-    locked = security is not None
+    secured = security is not None
     return ServerProgram(
         name="redis",
         port=port,
-        url=f"{'rediss' if locked else 'redis'}://{LOOPBACK}:{port}/0",
+        url=f"{'rediss' if secured else 'redis'}://{LOOPBACK}:{port}/0",
         command=command,
         probe=b"PING\r\n",
-        reply=b"-NOAUTH" if locked else b"+PONG",
-        encrypted=locked,
+        reply=b"-NOAUTH" if secured else b"+PONG",
+        encrypted=secured,
     )
 
 

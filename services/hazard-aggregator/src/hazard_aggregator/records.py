@@ -184,10 +184,10 @@ class Records:
         if not self._reload_due:
             return
         async with self.lock:
-            await self.reload_locked()
+            await self.reload_holding_lock()
         await self.subscribe()
 
-    async def reload_locked(self) -> None:
+    async def reload_holding_lock(self) -> None:
         """Do the same for a caller that holds `lock`, who calls `subscribe` then."""
         if not self._reload_due:
             return
@@ -216,7 +216,7 @@ class Records:
     async def load_again(self) -> None:
         """Put the stored records into force whether or not they may differ, for a caller that holds `lock`."""
         self._reload_due = True
-        await self.reload_locked()
+        await self.reload_holding_lock()
 
     async def subscribe(self) -> None:
         """Subscribe to the thesis's topics of all areas, and to their sources' own."""

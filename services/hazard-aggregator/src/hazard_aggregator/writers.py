@@ -92,7 +92,7 @@ class AreaWriter:
     async def _known(self, area: str, attempt: Attempt | None) -> AreaDefinition | _Earlier | None:
         """Return the area as it is stored, or the result of an earlier attempt, which is in force then."""
         with self._records.uncertain_write():
-            await self._records.reload_locked()
+            await self._records.reload_holding_lock()
             if (earlier := await self._store.earlier_result(attempt)) is not None:
                 await self._records.load_again()
                 return _Earlier(earlier)
@@ -156,7 +156,7 @@ class OverrideWriter:
         async with self._records.lock:
             for _ in range(ATTEMPTS):
                 with self._records.uncertain_write():
-                    await self._records.reload_locked()
+                    await self._records.reload_holding_lock()
                     if (earlier := await self._store.earlier_override(attempt)) is not None:
                         await self._records.load_again()
                         return earlier
@@ -191,7 +191,7 @@ class OverrideWriter:
         async with self._records.lock:
             with self._records.uncertain_write():
                 # A deletion whose reply was lost may have been done.
-                await self._records.reload_locked()
+                await self._records.reload_holding_lock()
             override = self._core.overrides.get(area)
             if override is None:
                 return False

@@ -17,7 +17,7 @@ TESTER: Final = "test"
 """A user who may do everything on broker and router: it stands for all processes that a test does not run."""
 
 
-class LockedSite:
+class SecuredSite:
     """The credentials of a site in a folder, and its servers."""
 
     def __init__(self, folder: Path, site: str, *, robots: Sequence[str] = (), nodes: Sequence[str] = ()) -> None:
@@ -47,17 +47,17 @@ class LockedSite:
         return start_router(self._folder / "router", security=self.security.folder("zenoh"))
 
 
-class LockedRouter:
+class SecuredRouter:
     """A running router, and the credentials of its site."""
 
-    def __init__(self, server: Server, site: LockedSite) -> None:
+    def __init__(self, server: Server, site: SecuredSite) -> None:
         self.url = server.url
         self.site = site
 
 
 @contextmanager
-def locked_router(folder: Path, site: str, *, robots: Sequence[str] = ()) -> Iterator[LockedRouter]:
+def secured_router(folder: Path, site: str, *, robots: Sequence[str] = ()) -> Iterator[SecuredRouter]:
     """Run a router with credentials for these robots."""
-    locked = LockedSite(folder, site, robots=robots)
-    with locked.router() as server:
-        yield LockedRouter(server, locked)
+    secured = SecuredSite(folder, site, robots=robots)
+    with secured.router() as server:
+        yield SecuredRouter(server, secured)

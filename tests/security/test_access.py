@@ -179,7 +179,7 @@ async def test_service_stores_nothing_for_another_floor(servers, security):
         await redis.aclose()
 
 
-def test_locks_that_are_made_again_keep_the_floors(security):
+def test_credentials_that_are_made_again_keep_the_floors(security):
     before = {user: security.credentials(user).read_text() for user in ("attic.n1", "attic.planner", "n1")}
     again = SiteSecurity(security.directory, "lab")
     again.make(HOSTS, robots=["r1", "r2"], nodes=["n1", "n2"])

@@ -12,8 +12,8 @@ import time
 
 import pytest
 from channel_traffic import NODES, NUMBER, ONE_ROBOT, PAUSE_S, ROBOTS, WAIT_S, Process, Traffic, copies, frozen, until
-from locked_servers import TESTER
 from sample_messages import sample, sample_of
+from secured_servers import TESTER
 
 from fog_contracts import channels as ch
 from fog_contracts import messages as m

@@ -144,7 +144,7 @@ async def test_redis_admits_services_to_their_own_keys_and_nobody_else(redis, se
 
 
 @pytest.mark.live
-async def test_locked_redis_has_after_a_restart_what_it_acknowledged_before(tmp_path):
+async def test_secured_redis_has_after_a_restart_what_it_acknowledged_before(tmp_path):
     security = SiteSecurity(tmp_path / "locks", "lab")
     security.make(HOSTS)
     planner = of(security, "planner")
@@ -319,7 +319,7 @@ def test_a_robot_is_added_replaced_and_removed(tmp_path):
         security.add_robot("planner")
 
 
-def test_a_device_keeps_its_topics_when_locks_are_made_again_and_loses_them_with_its_user(tmp_path):
+def test_a_device_keeps_its_topics_when_credentials_are_made_again_and_loses_them_with_its_user(tmp_path):
     security = SiteSecurity(tmp_path / "locks", "lab")
     security.make(["localhost"], nodes=["n1"])
     security.add_device("z2m", ["zigbee2mqtt/#"])

@@ -14,7 +14,7 @@ from fog_runtime.security.site_security import SiteSecurity
 from fog_runtime.token_file import create_token
 from fognav import doctor
 from fognav.__main__ import app
-from fognav.locking import VARIABLE
+from fognav.credentials import VARIABLE
 
 ROOT = Path(__file__).parents[2]
 
@@ -65,7 +65,7 @@ def test_certificates_that_expire_soon_are_named_by_show_and_doctor(security: Si
     assert run("ca", "show", "--json")["expiring"] == []
 
 
-def test_doctor_names_locks_that_can_not_be_read(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_doctor_names_credentials_that_can_not_be_read(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.delenv(VARIABLE, raising=False)
     assert doctor.check_certificates() is None
     monkeypatch.setenv(VARIABLE, str(tmp_path / "nowhere"))

@@ -13,7 +13,7 @@ import paho.mqtt.client as paho
 import psutil
 import pytest
 from attacks import ATTACKS, LIMIT_S, Attack, few_files, running
-from fronts import running_front
+from http_processes import running_http_process
 from paho.mqtt.enums import CallbackAPIVersion
 from secured_servers import SecuredSite
 
@@ -135,8 +135,8 @@ async def test_rest_stops_robots_while_strangers_fill_its_connections(site, tmp_
     folder = site.security.folder("http")
     certificate = ServerCertificate(folder / "server.pem", folder / "server.key")
     with few_files():
-        fronts = running_front(small_app, tmp_path, certificate=certificate)
-        url = (await fronts.__aenter__()).replace("http:", "https:")
+        http_processes = running_http_process(small_app, tmp_path, certificate=certificate)
+        url = (await http_processes.__aenter__()).replace("http:", "https:")
     trust = site.credentials("console").tls_context()
     try:
 
@@ -145,8 +145,8 @@ async def test_rest_stops_robots_while_strangers_fill_its_connections(site, tmp_
             assert (await client.post("/robots/r1/stop")).json() == "r1"
             return time.monotonic() - begun
 
-        front = psutil.Process().children()[-1]
-        before = front.memory_info().rss  # much of it the test's own: it is forked
+        http_process = psutil.Process().children()[-1]
+        before = http_process.memory_info().rss  # much of it the test's own: it is forked
         # From the attackers' own address a handshake may be displaced, and is tried again.
         transport = httpx.AsyncHTTPTransport(verify=trust, retries=5)
         async with httpx.AsyncClient(base_url=url, transport=transport, timeout=LIMIT_S) as client:
@@ -155,10 +155,10 @@ async def test_rest_stops_robots_while_strangers_fill_its_connections(site, tmp_
             after = await stop(client)
         assert during < SERVED_S
         assert after < SERVED_S
-        assert front.memory_info().rss - before < MEMORY_BYTES
+        assert http_process.memory_info().rss - before < MEMORY_BYTES
         assert len(capfd.readouterr().err) < LOG_BYTES
     finally:
-        await fronts.__aexit__(None, None, None)
+        await http_processes.__aexit__(None, None, None)
 
 
 def connect_packet(user: str, password: str) -> bytes:

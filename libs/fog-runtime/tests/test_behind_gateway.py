@@ -4,11 +4,11 @@ import asyncio
 
 import httpx
 import pytest
-from fronts import running_front
+from http_processes import running_http_process
 
 from fog_runtime.health import Health
 from fog_runtime.http import ClientHost, Routes, Tokens, make_app
-from fog_runtime.http.front import AGAIN_S, KNOWN_S, BehindGateway, addresses_of
+from fog_runtime.http.http_process import AGAIN_S, KNOWN_S, BehindGateway, addresses_of
 
 CLIENT, LIAR = "192.0.2.7", "198.51.100.9"
 
@@ -37,7 +37,7 @@ def telling_app():
 )
 async def test_service_believes_its_gateway_only(tmp_path, gateway, said, believed):
     headers = {} if said is None else {"X-Forwarded-For": said}
-    async with running_front(telling_app, tmp_path, gateway=gateway) as url, httpx.AsyncClient() as client:
+    async with running_http_process(telling_app, tmp_path, gateway=gateway) as url, httpx.AsyncClient() as client:
         assert (await client.get(f"{url}/who", headers=headers)).json() == believed
 
 

@@ -4,7 +4,7 @@ from typing import Annotated
 
 import httpx
 import pytest
-from fronts import running_front
+from http_processes import running_http_process
 from pydantic import BaseModel, Field
 
 from fog_contracts.messages import Zone
@@ -12,8 +12,8 @@ from fog_runtime.health import Health
 from fog_runtime.http import (
     Answer,
     Body,
-    Front,
     HttpProblem,
+    HttpProcess,
     IfMatch,
     Operator,
     ProblemCode,
@@ -97,7 +97,10 @@ async def client(tokens, tmp_path):
     async def bug() -> None:
         raise RuntimeError("inner detail")
 
-    async with running_front(lambda: app, tmp_path) as url, httpx.AsyncClient(base_url=url, timeout=60.0) as http:
+    async with (
+        running_http_process(lambda: app, tmp_path) as url,
+        httpx.AsyncClient(base_url=url, timeout=60.0) as http,
+    ):
         http.health = health
         yield http
 
@@ -257,7 +260,7 @@ async def test_oversized_bodies_are_refused_with_and_without_content_length(clie
 async def test_port_in_use_raises(client):
     port = client.base_url.port
     with pytest.raises(OSError, match="in use"):
-        Front.fork(lambda: make_app("x", Health(), load_tokens(None)), port=port)
+        HttpProcess.fork(lambda: make_app("x", Health(), load_tokens(None)), port=port)
 
 
 @pytest.mark.parametrize(

@@ -80,7 +80,7 @@ async def measure(
         return {
             **changes.figures(),
             "rss_mb": round(planner.process.memory_info().rss / 1e6, 1),
-            "front_rss_mb": round(sum(front.memory_full_info().uss for front in planner.process.children()) / 1e6, 1),
+            "front_rss_mb": round(sum(child.memory_full_info().uss for child in planner.process.children()) / 1e6, 1),
             "goal_fields_mb": round(await planner.field_bytes() / 1e6, 1),
             "bytes_per_robot": changes.bytes_per_robot(),
             "steady_bytes_per_robot_s": round(steady),

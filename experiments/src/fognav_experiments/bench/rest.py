@@ -64,7 +64,7 @@ async def measure(
         with _listener(stack) as listener:
             await asyncio.sleep(idle_s)
             idle = _gaps(listener)
-            service, *fronts = psutil.Process(pid), *psutil.Process(pid).children()
+            service, *http_processes = psutil.Process(pid), *psutil.Process(pid).children()
             begun = service.cpu_times()
             await load.run(clients, seconds)
             loaded = _gaps(listener)
@@ -77,7 +77,7 @@ async def measure(
             "requests": dict(sorted(load.answers.items())),
             "cpu_s": round(sum(ended[:2]) - sum(begun[:2]), 1),
             "rss_mb": round(service.memory_info().rss / 1e6, 1),
-            "front_rss_mb": round(sum(_own_bytes(front) for front in fronts) / 1e6, 1),
+            "front_rss_mb": round(sum(_own_bytes(http_process) for http_process in http_processes) / 1e6, 1),
         }
 
 

@@ -12,7 +12,7 @@ from fog_runtime.clock import SystemClock, WallClock, WallClockSource, boot_id
 from fog_runtime.configuration.settings import InflationSettings, describe, load
 from fog_runtime.configuration.site import load_site
 from fog_runtime.health import Health
-from fog_runtime.http import Front, load_tokens, unused
+from fog_runtime.http import HttpProcess, load_tokens, unused
 from fog_runtime.leadership import Leadership, LeaseStore, process_id
 from fog_runtime.process import release_startup_memory
 from fog_runtime.transports.mqtt_edge import MqttEdge
@@ -51,7 +51,7 @@ async def main() -> None:
     metrics.watch_backup(settings.data_dir / STAMP)
     tokens = load_tokens(settings.tokens_file)
     own = settings.credentials()
-    front = Front.fork(
+    http_process = HttpProcess.fork(
         lambda: make_api(unused(), loaded.site, clock, health, tokens),
         settings.http_host, settings.http_port, settings.http_certificate(), settings.http_gateway,
     )  # fmt: skip
@@ -91,7 +91,7 @@ async def main() -> None:
                 tasks.create_task(service.store_loop(), name="store")
                 tasks.create_task(service.tick_loop(), name="tick")
                 tasks.create_task(service.publisher.commit_loop(), name="commit")
-                tasks.create_task(front.serve(app, settings.port_file), name="http")
+                tasks.create_task(http_process.serve(app, settings.port_file), name="http")
 
 
 if __name__ == "__main__":

@@ -11,7 +11,7 @@ from fog_runtime.clock import SystemClock
 from fog_runtime.configuration.settings import InflationSettings, SettingsError, describe, load
 from fog_runtime.configuration.site import load_site
 from fog_runtime.health import Health
-from fog_runtime.http import Front, load_tokens, unused
+from fog_runtime.http import HttpProcess, load_tokens, unused
 from fog_runtime.keys import OperatorKeyError, read_operator_key
 from fog_runtime.leadership import Leadership, LeaseStore
 from fog_runtime.process import release_startup_memory, release_when
@@ -63,7 +63,7 @@ async def main() -> None:
     tokens = load_tokens(settings.tokens_file)
     key = read_key(settings.operator_key_file)
     own = settings.credentials()
-    front = Front.fork(
+    http_process = HttpProcess.fork(
         lambda: make_api(unused(), described, health, tokens),
         settings.http_host, settings.http_port, settings.http_certificate(), settings.http_gateway,
     )  # fmt: skip
@@ -93,7 +93,7 @@ async def main() -> None:
                 tasks.create_task(service.snapshot_loop(), name="snapshot")
                 tasks.create_task(service.tick_loop(), name="tick")
                 tasks.create_task(service.plan_loop(), name="plan")
-                tasks.create_task(front.serve(app, settings.port_file), name="http")
+                tasks.create_task(http_process.serve(app, settings.port_file), name="http")
                 tasks.create_task(release_when(lambda: health.ready), name="memory")
         finally:
             service.close()

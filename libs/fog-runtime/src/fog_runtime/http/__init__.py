@@ -1,7 +1,7 @@
 """The REST interface of all services: problem documents (RFC 9457), tokens with roles, health, metrics, limits."""
 
 from fog_runtime.http.app import make_app
-from fog_runtime.http.front import Front, FrontError, unused
+from fog_runtime.http.http_process import HttpProcess, HttpProcessError, unused
 from fog_runtime.http.problems import RETRY_AFTER, HttpProblem, ProblemCode, ProblemError
 from fog_runtime.http.routes import (
     Answer,
@@ -35,9 +35,9 @@ __all__ = [
     "Caller",
     "ClientHost",
     "Encoded",
-    "Front",
-    "FrontError",
     "HttpProblem",
+    "HttpProcess",
+    "HttpProcessError",
     "IdempotencyKey",
     "IfMatch",
     "IfNoneMatch",

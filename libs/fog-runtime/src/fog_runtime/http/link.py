@@ -50,7 +50,7 @@ class Stop(msgspec.Struct, frozen=True, tag=True):
     """Accept no more connections; end once the open requests are answered."""
 
 
-_ToFront = Reply | Start | Stop
+_ToHttpProcess = Reply | Start | Stop
 
 
 class _Messages:
@@ -74,7 +74,7 @@ class _Messages:
         except (asyncio.IncompleteReadError, ConnectionError):
             return None
 
-    async def write(self, message: Call | _ToFront) -> None:
+    async def write(self, message: Call | _ToHttpProcess) -> None:
         """Send a message, and wait while the other end is slow; one for an end that is closed is lost."""
         data = msgspec.msgpack.encode(message)
         async with self._writing:
@@ -106,12 +106,12 @@ class CoreLink:
     async def started(self) -> bool:
         """Wait for the start; return whether it came, and not the end of the core's process."""
         data = await self._messages.read()
-        return data is not None and isinstance(msgspec.msgpack.decode(data, type=_ToFront), Start)
+        return data is not None and isinstance(msgspec.msgpack.decode(data, type=_ToHttpProcess), Start)
 
     async def run(self, stop: Callable[[], object]) -> None:
         """Pass replies to those who called, and call `stop` when the core's process says so; return when it ends."""
         while (data := await self._messages.read()) is not None:
-            message = msgspec.msgpack.decode(data, type=_ToFront)
+            message = msgspec.msgpack.decode(data, type=_ToHttpProcess)
             if isinstance(message, Reply):
                 called = self._open.get(message.id)
                 if called is not None and not called.done():
@@ -146,7 +146,7 @@ def _core_ended() -> ProblemError:
     return ProblemError(HttpProblem.RESTARTED, "the service has ended, and is started again", headers=RETRY_AFTER)
 
 
-class FrontLink:
+class HttpLink:
     """The process that receives requests as seen by the core's."""
 
     def __init__(self, messages: _Messages) -> None:
@@ -154,7 +154,7 @@ class FrontLink:
         self._tasks: set[asyncio.Task[None]] = set()
 
     @classmethod
-    async def over(cls, end: socket.socket) -> FrontLink:
+    async def over(cls, end: socket.socket) -> HttpLink:
         """Open this end of the link."""
         return cls(await _Messages.over(end))
 

@@ -118,8 +118,8 @@ class Routes:
     `Response`.
     The first `status` is the usual one; those of a route that may create something are (200, 201), for example.
     `raises` lists exceptions that become problem documents as registered by `Routes.raises`; `problems` lists further
-    documents. In a service, FastAPI runs in another process than the handlers (`fog_runtime.http.front`), and their
-    arguments, which must be of types that msgspec knows, are passed on by name.
+    documents. In a service, FastAPI runs in another process than the handlers (`fog_runtime.http.http_process`), and
+    their arguments, which must be of types that msgspec knows, are passed on by name.
     """
 
     def __init__(self, app: FastAPI, tag: str) -> None:

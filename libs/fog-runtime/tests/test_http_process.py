@@ -20,8 +20,8 @@ from fog_runtime.http import (
     Body,
     ClientHost,
     Encoded,
-    Front,
-    FrontError,
+    HttpProcess,
+    HttpProcessError,
     ProblemCode,
     ProblemError,
     Routes,
@@ -30,17 +30,17 @@ from fog_runtime.http import (
     make_app,
     unused,
 )
-from fog_runtime.http.link import CoreLink, FrontLink
+from fog_runtime.http.link import CoreLink, HttpLink
 
 pytestmark = pytest.mark.live
 DEADLINE_S = 60.0
 ALONE = """
 import asyncio, pathlib, sys
 from fog_runtime.health import Health
-from fog_runtime.http import Front, Tokens, make_app
+from fog_runtime.http import HttpProcess, Tokens, make_app
 async def main():
     make = lambda: make_app("Test", Health(), Tokens())
-    await Front.fork(make).serve(make(), pathlib.Path(sys.argv[1]))
+    await HttpProcess.fork(make).serve(make(), pathlib.Path(sys.argv[1]))
 asyncio.run(main())
 """
 
@@ -57,10 +57,10 @@ class Service:
         self.called = asyncio.Event()
         self.release = asyncio.Event()
         self.pids: set[int] = set()
-        self.front = Front.fork(lambda: self.make(unused()))
+        self.http_process = HttpProcess.fork(lambda: self.make(unused()))
         self.app = self.make(self)
         self.port_file = folder / "port"
-        self.task = asyncio.create_task(self.front.serve(self.app, self.port_file))
+        self.task = asyncio.create_task(self.http_process.serve(self.app, self.port_file))
 
     @staticmethod
     def make(service):
@@ -241,8 +241,8 @@ async def test_client_that_ends_none_of_its_requests_takes_no_place(tmp_path, mo
 
 
 async def test_stop_is_begun_before_whatever_waits_in_the_core():
-    core, front = socket.socketpair()
-    calling, answering = await CoreLink.over(front), await FrontLink.over(core)
+    core, http_process = socket.socketpair()
+    calling, answering = await CoreLink.over(http_process), await HttpLink.over(core)
     begun = []
 
     async def answer(route: str, _: bytes) -> Response:
@@ -284,17 +284,17 @@ async def test_request_that_never_ends_does_not_hold_up_the_end(tmp_path):
         assert isinstance(outcome, httpx.HTTPError) or outcome.status_code == 500
 
 
-async def test_end_of_the_front_ends_the_service_with_an_error(tmp_path):
+async def test_end_of_the_http_process_ends_the_service_with_an_error(tmp_path):
     async with serving(tmp_path) as (service, client):
         await client.get("/encoded")
-        os.kill(service.front._pid, signal.SIGKILL)
-        with pytest.raises(FrontError, match="has ended"):
+        os.kill(service.http_process._pid, signal.SIGKILL)
+        with pytest.raises(HttpProcessError, match="has ended"):
             await service.task
 
 
 async def test_calls_to_a_core_that_has_ended_are_to_be_repeated():
-    core, front = socket.socketpair()
-    link = await CoreLink.over(front)
+    core, http_process = socket.socketpair()
+    link = await CoreLink.over(http_process)
     running = asyncio.create_task(link.run(lambda: None))
     calling = asyncio.create_task(link.call("GET /slow", b""))
     await asyncio.to_thread(core.recv, 1)
@@ -306,7 +306,7 @@ async def test_calls_to_a_core_that_has_ended_are_to_be_repeated():
         await running
 
 
-def test_front_ends_with_a_killed_core(tmp_path):
+def test_http_process_ends_with_a_killed_core(tmp_path):
     with subprocess.Popen([sys.executable, "-c", ALONE, str(tmp_path / "port")]) as core:
         deadline = time.monotonic() + DEADLINE_S
         while not (tmp_path / "port").exists():
@@ -321,4 +321,4 @@ def test_front_ends_with_a_killed_core(tmp_path):
             except ConnectionRefusedError:
                 break
             time.sleep(0.01)
-        assert time.monotonic() < deadline, "its front listens still"
+        assert time.monotonic() < deadline, "its HTTP process listens still"

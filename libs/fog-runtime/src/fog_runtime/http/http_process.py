@@ -32,7 +32,7 @@ from fog_runtime import logs, machine
 from fog_runtime.admission import BACKLOG, Admission, Visitor
 from fog_runtime.credentials import ServerCertificate
 from fog_runtime.files import write_port_file
-from fog_runtime.http.link import CoreLink, FrontLink
+from fog_runtime.http.link import CoreLink, HttpLink
 from fog_runtime.http.routes import answer_call, rank_of
 
 Scope = MutableMapping[str, Any]
@@ -118,15 +118,15 @@ def unused() -> Any:  # noqa: ANN401  # it stands for anything
     return _Unused()
 
 
-class FrontError(Exception):
+class HttpProcessError(Exception):
     """The process that receives requests has ended by itself."""
 
 
-class Front:
+class HttpProcess:
     """The HTTP process as the core's process sees it."""
 
     def __init__(self, pid: int, link: socket.socket, scheme: str, host: str, port: int) -> None:
-        """Use `Front.fork`."""
+        """Use `HttpProcess.fork`."""
         self._pid = pid
         self._link = link
         self._scheme = scheme
@@ -146,7 +146,7 @@ class Front:
 
         `make_app` is called there: the handlers of its routes are never called, and need nothing behind them. With a
         `certificate` it speaks HTTPS. The host `gateway`, and no other, is believed for whom it asks. Fork before this
-        process has threads and connections. The front ends with this process.
+        process has threads and connections. It ends with this process.
         """
         family = socket.AF_INET6 if ":" in host else socket.AF_INET
         with socket.create_server((host, port), family=family, backlog=BACKLOG) as listener:
@@ -154,17 +154,17 @@ class Front:
             with theirs:
                 pid = os.fork()
                 if pid == 0:
-                    _become_front(lambda: _behind(gateway, make_app()), listener, theirs, certificate)
+                    _become_http_process(lambda: _behind(gateway, make_app()), listener, theirs, certificate)
             scheme = "http" if certificate is None else "https"
             return cls(pid, ours, scheme, host, int(listener.getsockname()[1]))
 
     async def serve(self, app: FastAPI, port_file: Path | None = None) -> None:
         """Answer what the HTTP process passes on with the routes of `app`, until cancelled.
 
-        The port is logged as `listening` and written to `port_file`. Open requests get 2 s to end. Raises `FrontError`
-        when the front ends by itself.
+        The port is logged as `listening` and written to `port_file`. Open requests get 2 s to end. Raises
+        `HttpProcessError` when the HTTP process ends by itself.
         """
-        link = await FrontLink.over(self._link)
+        link = await HttpLink.over(self._link)
         answering = asyncio.ensure_future(
             link.answer_calls(lambda route, data: answer_call(app, route, data), lambda route: rank_of(app, route))
         )
@@ -173,7 +173,7 @@ class Front:
             _log.info("listening", url=f"{self._scheme}://{self._host}:{self._port}", port=self._port)
             write_port_file(port_file, self._port)
             await asyncio.shield(answering)
-            raise FrontError("the process that receives requests has ended; its own log says why")
+            raise HttpProcessError("the process that receives requests has ended; its own log says why")
         finally:
             await link.stop()
             await asyncio.wait({answering}, timeout=END_S)
@@ -257,7 +257,7 @@ class _Sparing(logging.Filter):
         return True
 
 
-def _become_front(
+def _become_http_process(
     make_app: Callable[[], FastAPI],
     listener: socket.socket,
     link: socket.socket,
@@ -274,8 +274,8 @@ def _become_front(
         os.nice(NICENESS)
         asyncio.run(_receive(make_app(), listener, link, certificate))
         status = 0
-    except Exception as error:  # noqa: BLE001  # the last place that can log why the front ends
-        _log.error("front_crashed", error=error)
+    except Exception as error:  # noqa: BLE001  # the last place that can log why it ends
+        _log.error("http_process_crashed", error=error)
     finally:
         os._exit(status)
 

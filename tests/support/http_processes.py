@@ -1,16 +1,16 @@
-"""A REST API that is served by a front of its own while a test runs."""
+"""A REST API that is served by an HTTP process of its own while a test runs."""
 
 import asyncio
 import contextlib
 
-from fog_runtime.http import Front
+from fog_runtime.http import HttpProcess
 
 
 @contextlib.asynccontextmanager
-async def running_front(make_app, folder, **options):
-    """Serve what `make_app` makes, here and in the front's process; yield its address. It must end when cancelled."""
+async def running_http_process(make_app, folder, **options):
+    """Serve what `make_app` makes, here and in its HTTP process; yield its address. It must end when cancelled."""
     port = folder / "port"
-    task = asyncio.create_task(Front.fork(make_app, **options).serve(make_app(), port))
+    task = asyncio.create_task(HttpProcess.fork(make_app, **options).serve(make_app(), port))
     try:
         async with asyncio.timeout(60):
             while not port.exists():

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import multiprocessing
 import os
 import platform
@@ -18,7 +19,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Final, TypeVar
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator, Sequence
+    from collections.abc import Callable, Iterable, Iterator
     from multiprocessing.connection import Connection
 
 T = TypeVar("T")
@@ -135,17 +136,22 @@ def open_pool(jobs: int) -> Iterator[ProcessPoolExecutor]:
             raise
 
 
-def results(drive: Callable[[T], R], tasks: Sequence[T], jobs: int) -> Iterator[R]:
-    """Drive tasks, so many at a time, and yield what each gives once it ends; one at a time in this process."""
+def results(drive: Callable[[T], R], tasks: Iterable[T], jobs: int) -> Iterator[R]:
+    """Drive tasks, so many at a time, and yield what each gives once it ends; one at a time in this process.
+
+    A task is taken only when it can begin: whoever gives them may end by the clock.
+    """
     if jobs == 1:
         yield from map(drive, tasks)
         return
+    left = iter(tasks)
     with open_pool(jobs) as pool:
-        waiting = {pool.submit(drive, task) for task in tasks}
+        waiting = {pool.submit(drive, task) for task in itertools.islice(left, jobs)}
         while waiting:
             done, waiting = futures.wait(waiting, return_when=futures.FIRST_COMPLETED)
             for future in done:
                 yield future.result()
+                waiting |= {pool.submit(drive, task) for task in itertools.islice(left, 1)}
 
 
 def _begin(interrupted: Connection) -> None:

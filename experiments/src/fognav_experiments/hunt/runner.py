@@ -7,9 +7,9 @@ first, instead of the hundreds of small ones of a general shrinker.
 
 from __future__ import annotations
 
+import itertools
 import time
 from collections import Counter
-from concurrent.futures import FIRST_COMPLETED, Future, wait
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
@@ -18,11 +18,11 @@ from msgspec.structs import asdict, replace
 
 from fog_runtime.configuration.parts import DEFAULT_BASE, DEFAULT_LIDAR
 from fog_runtime.files import SHARED, atomic_write
-from fognav_experiments import machine
 from fognav_experiments.hunt.draw import draw_on_map, draw_world
 from fognav_experiments.hunt.oracle import Figures, Rule
 from fognav_experiments.hunt.play import Hunted, build_world, hunt, load_recorded, write_world
 from fognav_experiments.hunt.world import HuntWorld, Mounting, Sensors
+from fognav_experiments.machine import results
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Iterator, Sequence
@@ -92,25 +92,18 @@ def run(  # noqa: PLR0913  # the options of a hunt
     until = time.monotonic() + 60.0 * minutes
     known = {record.number for record in read_records(folder) if record.seed == seed}
     maps = sorted({str(file.relative_to(base)) for base in folders for file in base.rglob("*.yaml") if _is_map(file)})
-    numbers = (number for number in range(1, 10**9) if number not in known)
 
-    def task() -> Task:
-        return Task(
-            seed=seed, number=next(numbers), commit=commit, maps=maps, folders=list(map(str, folders)), tries=tries
-        )
+    def tasks() -> Iterator[Task]:
+        for number in itertools.count(1):
+            if time.monotonic() >= until:
+                return
+            if number not in known:
+                yield Task(
+                    seed=seed, number=number, commit=commit, maps=maps, folders=list(map(str, folders)), tries=tries
+                )
 
-    if jobs == 1:
-        while time.monotonic() < until:
-            yield _keep(folder, drive(task()))
-        return
-    with machine.open_pool(jobs) as pool:
-        waiting: set[Future[Found]] = {pool.submit(drive, task()) for _ in range(jobs)}
-        while waiting:
-            done, waiting = wait(waiting, return_when=FIRST_COMPLETED)
-            for future in done:
-                yield _keep(folder, future.result())
-                if time.monotonic() < until:
-                    waiting.add(pool.submit(drive, task()))
+    for found in results(drive, tasks(), jobs):
+        yield _keep(folder, found)
 
 
 def drive(task: Task) -> Found:

@@ -18,6 +18,8 @@ from fog_contracts.messages import (
     AreaDefinition,
     AreaHazard,
     HazardOverride,
+    NodeCode,
+    Reason,
 )
 from hazard_aggregator.alert_keeper import NodeMetrics
 from hazard_aggregator.alerts import LISTED, AlertError, Alerts, NodeReport
@@ -34,7 +36,8 @@ def hazard(state, **fields) -> AreaHazard:
     return AreaHazard(area="hall", state=state, **values)
 
 
-def report(state, penalty=None, reason="it flaps") -> NodeReport:
+def report(state, penalty=None, code=NodeCode.FLAPS) -> NodeReport:
+    reason = Reason(code, code.says)
     return NodeReport("n1", "hall", state, reason, online=True, age=0.1, received=9, ignored=0, penalty=penalty)
 
 
@@ -67,11 +70,11 @@ def test_area_that_is_unknown_or_blocked_for_long_is_an_alert_until_it_is_clear(
 
 def test_node_that_is_unknown_is_an_alert_with_its_newest_reason():
     rig = Rig()
-    rig.step(hazard("clear"), report("unknown", reason="it has been silent for more than 3 s"))
-    raised = rig.step(hazard("clear"), report("unknown", reason="it went offline"), seconds=5.0)
+    rig.step(hazard("clear"), report("unknown", code=NodeCode.SILENT))
+    raised = rig.step(hazard("clear"), report("unknown", code=NodeCode.OFFLINE), seconds=5.0)
     assert raised == ["raise node-unknown.hall.n1"]
-    assert rig.step(hazard("clear"), report("unknown", reason="it flaps")) == []
-    assert [alert.reason for alert in rig.alerts.active()] == ["it flaps"]
+    assert rig.step(hazard("clear"), report("unknown", code=NodeCode.FLAPS)) == []
+    assert [(alert.code, alert.reason) for alert in rig.alerts.active()] == [("flaps", "it changes too often")]
     assert rig.step(hazard("clear"), report("clear")) == ["end node-unknown.hall.n1"]
 
 
@@ -119,7 +122,7 @@ def test_message_of_very_many_alerts_fits_its_channel_and_lists_unseen_ones_firs
         Alert(
             id=f"node-unknown.{'a' * 32}.{number:032}", kind="node-unknown", area="a" * 32, node=f"{number:032}",
             reason=wide * 200, since=9e9 + 0.123456, raised=float(number), acknowledged_at=9e9 + 0.123456,
-            acknowledged_by=None if number == 499 else wide * 100,
+            code=max(NodeCode, key=len), acknowledged_by=None if number == 499 else wide * 100,
         )
         for number in range(500)
     )  # fmt: skip
@@ -192,7 +195,8 @@ async def test_alert_is_published_acknowledged_kept_over_a_kill_and_in_the_audit
 
 
 def node_report(node, state="clear", age=0.1, *, flapping=False) -> NodeReport:
-    return NodeReport(node, "hall", state, "", online=True, age=age, received=9, ignored=0, flapping=flapping)
+    reason = Reason(NodeCode.REPORTED, "")
+    return NodeReport(node, "hall", state, reason, online=True, age=age, received=9, ignored=0, flapping=flapping)
 
 
 def metric(name: str, node: str) -> float | None:

@@ -159,6 +159,7 @@ async def test_more_areas_of_site_and_store_than_a_heartbeat_lists_are_told_unti
 async def test_nodes_report_their_health(client):
     (node,) = (await client.get("/api/v1/nodes")).json()
     assert (node["id"], node["area"], node["state"], node["age_s"]) == ("n1", "hall", "unknown", None)
+    assert node["code"] == "not_heard"
     described = (await client.get("/openapi.json")).json()
     assert {"/api/v1/areas", "/api/v1/areas/{area_id}", "/api/v1/nodes"} <= set(described["paths"])
 

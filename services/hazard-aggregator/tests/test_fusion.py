@@ -561,7 +561,7 @@ def test_robot_that_says_that_it_stands_where_an_echo_comes_from_keeps_an_area_c
     assert rig.hazard.state == "unknown"
     report = rig.core.node_reports(rig.now)[0]
     assert report.state == "unknown"  # which is an alert after a while
-    assert report.reason == "robot r1 has stood before it for more than 7 s, by its pose: it sees nothing else"
+    assert report.reason.code == "robot_stays"
     read_beside_robot(rig, pose(-3.0, 0.5), (0.83, 3.0), times=5)
     assert rig.hazard.state == "blocked"
 

@@ -144,7 +144,8 @@ class AlertKeeper:
         self._nodes.show(reports)
         events = self._alerts.update(self._core.definitions(), self._core.announced(), reports, at)
         for event in events:
-            _log.info(f"alert_{event.action}", alert=event.alert.id, reason=event.alert.reason)
+            alert = event.alert
+            _log.info(f"alert_{event.action}", alert=alert.id, code=alert.code, reason=alert.reason)
         self._events += events
         if self._alerts.active() != before or self._epoch != self._core.epoch:
             self._epoch = self._core.epoch

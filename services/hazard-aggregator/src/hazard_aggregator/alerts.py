@@ -13,7 +13,7 @@ if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator, Mapping
 
     from fog_contracts.handlers import Moment
-    from fog_contracts.messages import AlertKind, AreaDefinition, AreaHazard, AreaState
+    from fog_contracts.messages import AlertKind, AreaDefinition, AreaHazard, AreaState, Reason
     from hazard_aggregator.areas import WatchedArea
 
 
@@ -28,7 +28,7 @@ class NodeReport:
     id: str
     area: str
     state: AreaState
-    reason: str
+    reason: Reason
     online: bool | None
     age: float | None
     received: int
@@ -88,6 +88,7 @@ class _Condition(NamedTuple):
     node: str | None
     reason: str
     after_s: float
+    code: str = ""
 
 
 class Alerts:
@@ -139,7 +140,8 @@ class Alerts:
         for name, condition in present.items():
             active, (began, stamp) = self._active.get(name), self._began[name]
             if active is not None:
-                self._active[name] = structs.replace(active, reason=condition.reason[:_REASON_MAX])
+                reason = condition.reason[:_REASON_MAX]
+                self._active[name] = structs.replace(active, reason=reason, code=condition.code)
             elif at.now - began >= condition.after_s:
                 alert = self._active[name] = Alert(
                     id=name,
@@ -149,6 +151,7 @@ class Alerts:
                     reason=condition.reason[:_REASON_MAX],
                     since=stamp,
                     raised=at.stamp,
+                    code=condition.code,
                 )
                 yield AlertEvent("raise", alert)
 
@@ -175,4 +178,4 @@ def _conditions(
     for report in reports:
         after_s = definitions[report.area].alerts.node_after_s if report.area in definitions else 0
         if report.state == "unknown" and after_s > 0:
-            yield _Condition("node-unknown", report.area, report.id, report.reason, after_s)
+            yield _Condition("node-unknown", report.area, report.id, report.reason, after_s, report.reason.code)

@@ -19,6 +19,7 @@ from fog_contracts.messages import (
     AreaHazard,
     AreaState,
     Author,
+    Code,
     Count,
     FusionPolicy,
     Id,
@@ -275,12 +276,16 @@ class AreaView(Message, frozen=True, kw_only=True):
 
 
 class NodeView(Message, frozen=True, kw_only=True):
-    """Health of a node or source; `age_s` is the time since its last message, null before the first one."""
+    """Health of a node or source; `age_s` is the time since its last message, null before the first one.
+
+    `code` identifies the reason (`NodeCode`).
+    """
 
     id: str
     area: str
     state: AreaState
     reason: str
+    code: Code
     online: bool | None
     age_s: float | None
     received: int
@@ -390,7 +395,8 @@ def _add_nodes(routes: Routes, service: Service, clock: Clock) -> None:
                 id=node.id,
                 area=node.area,
                 state=node.state,
-                reason=node.reason,
+                reason=str(node.reason),
+                code=node.reason.code,
                 online=node.online,
                 age_s=node.age,
                 received=node.received,

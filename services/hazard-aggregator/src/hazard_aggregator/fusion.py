@@ -10,6 +10,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 from fog_contracts.channels import BLOCKED, CLEAR
+from fog_contracts.messages import NodeCode, Reason
 from hazard_aggregator.alerts import node_reports
 from hazard_aggregator.areas import THESIS_NODE, Members, WatchedArea
 from hazard_aggregator.debounce import DEFAULT_RULE
@@ -148,7 +149,9 @@ class AreaFusion:
             if node is None:
                 node = area.nodes[name] = self._members.thesis_node(area.definition)
             reported: AreaState = BLOCKED if state == BLOCKED else CLEAR if state == CLEAR else "unknown"
-            reason = f"it reports {reported}" if reported != "unknown" else f"it reports neither {BLOCKED} nor {CLEAR}"
+            reason = Reason(NodeCode.REPORTED, f"it reports {reported}")
+            if reported == "unknown":
+                reason = Reason(NodeCode.NOT_UNDERSTOOD, f"it reports neither {BLOCKED} nor {CLEAR}")
             node.apply(Classification(reported, reason), now, stamp)
             changed += self._evaluate(area, stamp)
         return changed
@@ -175,7 +178,7 @@ class AreaFusion:
         for area, node in self._by_node.get(node_id, ()):
             node.online = online
             if not online and node.state != "unknown":
-                node.invalidate("it went offline")
+                node.invalidate(Reason(NodeCode.OFFLINE, "it went offline"))
                 node.last_confirmed = now
                 changed += self._evaluate(area, stamp)
         for area in () if online else self._sources.on_node_offline(node_id):
@@ -316,5 +319,7 @@ def _is_undefined(area: WatchedArea, node: str) -> bool:
 
 def _classified(site: NodeSite | None, reading: NodeReading, poses: RobotPoses, taken_at: float) -> Classification:
     if site is None:
-        return Classification(reading.state, f"the node reports {reading.state} (the site does not define it)")
+        code = NodeCode.REPORTS_UNKNOWN if reading.state == "unknown" else NodeCode.REPORTED
+        sentence = f"the node reports {reading.state} (the site does not define it)"
+        return Classification(reading.state, Reason(code, sentence))
     return classify_reading(site, reading, poses.at(taken_at))

@@ -7,7 +7,7 @@ from collections import deque
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Final
 
-from fog_contracts.messages import UnknownPolicy
+from fog_contracts.messages import NodeCode, Reason, UnknownPolicy
 
 if TYPE_CHECKING:
     from fog_contracts.messages import AreaState, Availability, NodeReading, Source
@@ -58,6 +58,9 @@ _PERIODS: Final = 3
 """A source is silent after so many of its periods."""
 
 
+_NOT_HEARD: Final = Reason(NodeCode.NOT_HEARD, "no reading received yet")
+
+
 @dataclass
 class NodeState:
     """One node of one area; a node of the thesis has no `site`."""
@@ -68,7 +71,7 @@ class NodeState:
     last_reading: float | None = None
     last_confirmed: float = 0.0
     state: AreaState = "unknown"
-    reason: str = "no reading received yet"
+    reason: Reason = _NOT_HEARD
     online: bool | None = None
     ever_received: bool = False
     unconfirmed: bool = True  # no state was confirmed since the last invalidation
@@ -106,7 +109,7 @@ class NodeState:
             self.last_reading = self.last_confirmed = now
         return now - self.last_reading
 
-    def invalidate(self, reason: str) -> None:
+    def invalidate(self, reason: Reason) -> None:
         """Set the state to unknown until readings confirm another one."""
         self.state = "unknown"
         self.reason = reason
@@ -119,18 +122,18 @@ class NodeState:
     def take_back(self, robot: str) -> None:
         """Set the state to unknown: what blocked it was this robot, whose poses came late."""
         self.taken_back += 1
-        self.invalidate(f"it saw the robot {robot}, whose pose came late")
+        self.invalidate(Reason(NodeCode.POSE_LATE, f"it saw the robot {robot}, whose pose came late"))
 
     def flap(self) -> None:
         """Set the state to unknown until it is steady."""
         reason = f"it flaps: it changed more than {self.flaps.max_changes} times within a minute"
         if self.reason != reason:
-            self.invalidate(reason)
+            self.invalidate(Reason(NodeCode.FLAPS, reason))
 
     def restore_blocked(self) -> None:
         """Set the state in which an earlier run left the node's area."""
         self.state = "blocked"
-        self.reason = "the area was blocked before the restart"
+        self.reason = Reason(NodeCode.BLOCKED_BEFORE, "the area was blocked before the restart")
 
     def check_silence(self, limit: float, now: float) -> None:
         """Invalidate the state of a node that was silent, or confirmed nothing, for longer than `limit` (s)."""
@@ -138,9 +141,9 @@ class NodeState:
             reason = f"it has been silent for more than {limit:g} s"
             # A few readings since an earlier silence confirmed nothing, and do not count after this one.
             if self.state != "unknown" or self.reason != reason or self.run_state is not None:
-                self.invalidate(reason)
+                self.invalidate(Reason(NodeCode.SILENT, reason))
         elif now - self.last_confirmed > limit and self.state != "unknown":
-            self.invalidate("its readings contradict one another")
+            self.invalidate(Reason(NodeCode.CONTRADICTORY, "its readings contradict one another"))
 
     def receive(self, taken_at: float) -> None:
         """Record a sign of life (s, the receiver's clock)."""
@@ -206,7 +209,7 @@ class NodeState:
             return
         reason = f"robot {robot} has stood before it for more than {EXPLAINED_S:g} s, by its pose: it sees nothing else"
         if self.reason != reason or self.state != "unknown":
-            self.invalidate(reason)
+            self.invalidate(Reason(NodeCode.ROBOT_STAYS, reason))
 
     def _explained_too_long(self, taken_at: float) -> bool:
         return taken_at - self.explained_at <= _EXPLAINED_PAUSE_S and taken_at - self.explained_since > EXPLAINED_S
@@ -247,12 +250,16 @@ class SourceState(NodeState):
         return self.source is None or self.source.period_s is None
 
     @property
-    def doubt(self) -> str | None:
+    def doubt(self) -> Reason | None:
         """Why it may clear nothing now; None: its sensor is connected, or is known to be by its period alone."""
         if self.availabilities and not self.online:
             named = [each.topic for each in self.availabilities if not self.said.get(each.topic)]
-            return f"it reports clear, but {' and '.join(named)} must say first that it is connected"
-        return "its gateway has just started, and may repeat what it knew before" if self.recalled else None
+            sentence = f"it reports clear, but {' and '.join(named)} must say first that it is connected"
+            return Reason(NodeCode.NOT_CONNECTED_YET, sentence)
+        if not self.recalled:
+            return None
+        sentence = "its gateway has just started, and may repeat what it knew before"
+        return Reason(NodeCode.NOT_CONNECTED_YET, sentence)
 
     def say(self, topic: str, *, online: bool) -> None:
         """Record whether an availability topic says that its sensor is connected."""
@@ -277,7 +284,7 @@ class SourceState(NodeState):
         period = None if self.source is None else self.source.period_s
         return math.inf if period is None else _PERIODS * period
 
-    def invalidate(self, reason: str) -> None:
+    def invalidate(self, reason: Reason) -> None:
         """Set the state to unknown until messages confirm another one."""
         super().invalidate(reason)
         self.misread = False

@@ -12,7 +12,7 @@ from fog_contracts.channels import NODE_READING
 from fog_contracts.cones import SONAR_HALF_CONE
 from fog_contracts.costs import ROBOT_RADIUS
 from fog_contracts.liveness import DelayEstimator
-from fog_contracts.messages import Pose
+from fog_contracts.messages import NodeCode, Pose, Reason
 from fog_contracts.site import RobotSite
 from hazard_aggregator.debounce import Observation, SonarSample
 
@@ -199,16 +199,20 @@ MIN_RANGE: Final = 0.02
 """Below this range (m) an HC-SR04 measures its own ringing (datasheet: 2 cm to 4 m)."""
 LIMIT_TOLERANCE: Final = 0.01
 """A range this close (m) to the limit may be classified either way: node and aggregator round differently."""
-_SILENT: Final = "no sonar of the node hears anything, as if they were dead or covered"
+_SILENT: Final = Reason(NodeCode.NO_ECHO, "no sonar of the node hears anything, as if they were dead or covered")
 NODE_HYSTERESIS: Final = 0.05
 """A node that is blocked stays so until its echo is this far (m) beyond the limit (the firmware's `kHysteresisMm`)."""
+
+
+_Classified = tuple["AreaState", Reason]
+"""What one sonar shows, and why."""
 
 
 class Classification(NamedTuple):
     """The state that a reading shows, and why; `explained_by` is the robot that causes all of its blocking echoes."""
 
     state: AreaState
-    reason: str
+    reason: Reason
     explained_by: str | None = None
     sonars: tuple[SonarSample, ...] = ()
 
@@ -218,36 +222,39 @@ class Classification(NamedTuple):
         return Observation(self.state, self.sonars)
 
 
-def classify_sonar(sonar: Sonar, status: str, measured: float | None, shift: float = 0.0) -> tuple[AreaState, str]:
+def classify_sonar(sonar: Sonar, status: str, measured: float | None, shift: float = 0.0) -> _Classified:
     """Return what one sonar shows: an echo nearer than its limit is `blocked`, an implausible value `unknown`.
 
     `shift` (m) moves the limit, for readings that are within rounding of it.
     """
     if status == "stuck":
-        return "unknown", "the echo line is stuck"
+        return "unknown", Reason(NodeCode.ECHO_STUCK, "the echo line is stuck")
     if status == "no_echo":
         return _classify_no_echo(sonar, measured)
     if measured is None:
-        return "unknown", "it reports an echo without a range"
+        return "unknown", Reason(NodeCode.IMPLAUSIBLE, "it reports an echo without a range")
     return _classify_echo(sonar, measured, shift)
 
 
-def _classify_echo(sonar: Sonar, measured: float, shift: float) -> tuple[AreaState, str]:
+def _classify_echo(sonar: Sonar, measured: float, shift: float) -> _Classified:
     if measured < MIN_RANGE:
-        return "unknown", f"{measured:.3f} m is nearer than a sonar can measure"
+        near = f"{measured:.3f} m is nearer than a sonar can measure"
+        return "unknown", Reason(NodeCode.IMPLAUSIBLE, near)
     if measured < sonar.range_limit + shift:
-        return "blocked", f"something at {measured:.2f} m, nearer than {sonar.range_limit:.2f} m"
+        near = f"something at {measured:.2f} m, nearer than {sonar.range_limit:.2f} m"
+        return "blocked", Reason(NodeCode.SOMETHING_NEAR, near)
     if sonar.range_max is not None and measured > sonar.range_max:
-        return "unknown", f"an echo from {measured:.2f} m: the free area gives none from beyond {sonar.range_max:.2f} m"
-    return "clear", f"nothing nearer than {sonar.range_limit:.2f} m"
+        far = f"an echo from {measured:.2f} m: the free area gives none from beyond {sonar.range_max:.2f} m"
+        return "unknown", Reason(NodeCode.IMPLAUSIBLE, far)
+    return "clear", Reason(NodeCode.NOTHING_NEAR, f"nothing nearer than {sonar.range_limit:.2f} m")
 
 
-def _classify_no_echo(sonar: Sonar, measured: float | None) -> tuple[AreaState, str]:
+def _classify_no_echo(sonar: Sonar, measured: float | None) -> _Classified:
     if measured is not None:
-        return "unknown", f"it reports no echo and yet a range of {measured:.2f} m"
+        return "unknown", Reason(NodeCode.IMPLAUSIBLE, f"it reports no echo and yet a range of {measured:.2f} m")
     if sonar.no_echo_is_clear:
-        return "clear", "no echo, as calibrated"
-    return "unknown", "no echo where the opposite wall should echo"
+        return "clear", Reason(NodeCode.NOTHING_NEAR, "no echo, as calibrated")
+    return "unknown", Reason(NodeCode.NO_ECHO, "no echo where the opposite wall should echo")
 
 
 def expected_range(site: NodeSite, sonar: Sonar, pose: RobotPose, away: float = 0.0) -> float | None:
@@ -294,7 +301,8 @@ def classify_reading(site: NodeSite, reading: NodeReading, robots: Iterable[Wher
     blocking echoes.
     """
     if len(reading.range_m) != len(site.sonars):
-        return Classification("unknown", f"it reports {len(reading.range_m)} sonars, the site has {len(site.sonars)}")
+        differ = f"it reports {len(reading.range_m)} sonars, the site has {len(site.sonars)}"
+        return Classification("unknown", Reason(NodeCode.SONARS_DIFFER, differ))
     classified, fused = _fuse(site, reading, 0.0)
     if fused != reading.state:
         for shift in (LIMIT_TOLERANCE, -LIMIT_TOLERANCE, NODE_HYSTERESIS + LIMIT_TOLERANCE):
@@ -307,11 +315,11 @@ def classify_reading(site: NodeSite, reading: NodeReading, robots: Iterable[Wher
     if fused == "blocked":
         return _classify_blocked(site, reading, classified, list(robots))
     index = next(i for i, (state, _) in enumerate(classified) if state == fused)
-    return Classification(fused, f"sonar {index}: {classified[index][1]}", sonars=_samples(site, reading, classified))
+    return Classification(fused, _of_sonar(index, classified), sonars=_samples(site, reading, classified))
 
 
 def _classify_blocked(
-    site: NodeSite, reading: NodeReading, classified: list[tuple[AreaState, str]], known: list[Whereabouts]
+    site: NodeSite, reading: NodeReading, classified: list[_Classified], known: list[Whereabouts]
 ) -> Classification:
     """Return what a reading with blocking echoes shows: it is explained if robots explain all of them."""
     blocking = [i for i, (state, _) in enumerate(classified) if state == "blocked"]
@@ -320,15 +328,21 @@ def _classify_blocked(
     samples = _samples(site, reading, classified, explained)
     for index in blocking:
         if robots[index] is None:
-            return Classification("blocked", f"sonar {index}: {classified[index][1]}", sonars=samples)
+            return Classification("blocked", _of_sonar(index, classified), sonars=samples)
     first = blocking[0]
-    return Classification("blocked", f"sonar {first} sees the robot {robots[first]}", robots[first], samples)
+    seen = Reason(NodeCode.SEES_ROBOT, f"sonar {first} sees the robot {robots[first]}")
+    return Classification("blocked", seen, robots[first], samples)
+
+
+def _of_sonar(index: int, classified: list[_Classified]) -> Reason:
+    reason = classified[index][1]
+    return Reason(reason.code, f"sonar {index}: {reason}")
 
 
 def _samples(
     site: NodeSite,
     reading: NodeReading,
-    classified: list[tuple[AreaState, str]],
+    classified: list[_Classified],
     explained: Container[int] = (),
 ) -> tuple[SonarSample, ...]:
     return tuple(
@@ -339,7 +353,7 @@ def _samples(
     )
 
 
-def _fuse(site: NodeSite, reading: NodeReading, shift: float) -> tuple[list[tuple[AreaState, str]], AreaState]:
+def _fuse(site: NodeSite, reading: NodeReading, shift: float) -> tuple[list[_Classified], AreaState]:
     """Classify every sonar with its limit moved by `shift` (m), and fuse the results."""
     classified = [
         classify_sonar(sonar, status, measured, shift)
@@ -352,11 +366,10 @@ def _fuse(site: NodeSite, reading: NodeReading, shift: float) -> tuple[list[tupl
     return classified, "blocked" if "blocked" in states else "unknown" if "unknown" in states else "clear"
 
 
-def _contradiction(reading: NodeReading, classified: list[tuple[AreaState, str]], fused: AreaState) -> Classification:
+def _contradiction(reading: NodeReading, classified: list[_Classified], fused: AreaState) -> Classification:
     """Return why the node's reported state contradicts its ranges."""
     index = next(i for i, (state, _) in enumerate(classified) if state == fused)
     if reading.state == "unknown":
-        return Classification("unknown", "the node reports unknown")
-    return Classification(
-        "unknown", f"the node reports {reading.state}, but sonar {index} shows: {classified[index][1]}"
-    )
+        return Classification("unknown", Reason(NodeCode.REPORTS_UNKNOWN, "the node reports unknown"))
+    sentence = f"the node reports {reading.state}, but sonar {index} shows: {classified[index][1]}"
+    return Classification("unknown", Reason(NodeCode.CONTRADICTORY, sentence))

@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any, Final
 import msgspec
 from msgspec import structs
 
-from fog_contracts.messages import Availability, Source
+from fog_contracts.messages import Availability, NodeCode, Reason, Source
 from hazard_aggregator.area_size import AreaError
 from hazard_aggregator.readings import Classification
 
@@ -66,41 +66,48 @@ class SourceReader:
                 return self._classify_number(number, source.number)
             for state, meaning in (("blocked", source.blocked), ("clear", source.clear)):
                 if is_one_of(value, meaning):
-                    return Classification(state, f"it reports {_quoted(value)}")  # type: ignore[arg-type]  # a literal
+                    reported = Reason(NodeCode.REPORTED, f"it reports {_quoted(value)}")
+                    return Classification(state, reported)  # type: ignore[arg-type]  # a literal
         except _FormatError as error:
             if source.number is not None and isinstance(error, _NoValueError):
                 return self._without_value(str(error))
-            return Classification("unknown", f"its format has changed: {error}")
-        return Classification("unknown", f"{_quoted(value)} means neither blocked nor clear")
+            return _unknown(NodeCode.NOT_UNDERSTOOD, f"its format has changed: {error}")
+        return _unknown(NodeCode.NOT_UNDERSTOOD, f"{_quoted(value)} means neither blocked nor clear")
 
     def classify_value(self, value: float) -> Classification:
         """Return what a number means that came as such, from a node of Fognav."""
         limits = self._source.number
-        return Classification("unknown", "it has no limits") if limits is None else self._classify_number(value, limits)
+        if limits is None:
+            return _unknown(NodeCode.NO_LIMITS, "it has no limits")
+        return self._classify_number(value, limits)
 
     def _without_value(self, problem: str) -> Classification:
         """Return what it means that nothing was measured; a sensor that never did may be one that is not there."""
         meaning = self._source.no_value
         if meaning == "clear" and not self._measured:
-            return Classification("unknown", f"it has measured nothing yet: {problem}")
+            return _unknown(NodeCode.MEASURES_NOTHING, f"it has measured nothing yet: {problem}")
         self._exceeded = None if meaning == "unknown" else meaning == "blocked"
-        return Classification(meaning, f"it measures nothing: {problem}")
+        return Classification(meaning, Reason(NodeCode.MEASURES_NOTHING, f"it measures nothing: {problem}"))
 
     def _classify_number(self, value: float, limits: Limits) -> Classification:
         if not _within(value, limits.minimum, limits.maximum):
             self._exceeded = None
             bounds = f"{_bound(limits.minimum, 'at least')}{_bound(limits.maximum, 'at most')}".removesuffix(", ")
-            return Classification("unknown", f"{value:g} is implausible: it should be {bounds}")
+            return _unknown(NodeCode.IMPLAUSIBLE, f"{value:g} is implausible: it should be {bounds}")
         # Within the hysteresis a number stays on its side; one that has none yet counts as a danger.
         margin = 0.0 if self._exceeded is False else limits.hysteresis
         above = limits.above is not None and value > limits.above - margin
         below = limits.below is not None and value < limits.below + margin
         self._exceeded = above or below
         if above:
-            return Classification("blocked", f"{value:g} is above {limits.above:g}")
+            return Classification("blocked", Reason(NodeCode.BEYOND_LIMITS, f"{value:g} is above {limits.above:g}"))
         if below:
-            return Classification("blocked", f"{value:g} is below {limits.below:g}")
-        return Classification("clear", f"{value:g} is within its limits")
+            return Classification("blocked", Reason(NodeCode.BEYOND_LIMITS, f"{value:g} is below {limits.below:g}"))
+        return Classification("clear", Reason(NodeCode.WITHIN_LIMITS, f"{value:g} is within its limits"))
+
+
+def _unknown(code: NodeCode, sentence: str) -> Classification:
+    return Classification("unknown", Reason(code, sentence))
 
 
 def is_online(availability: Availability, payload: bytes | None) -> bool | None:

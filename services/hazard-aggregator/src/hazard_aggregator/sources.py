@@ -5,6 +5,7 @@ from __future__ import annotations
 from itertools import chain
 from typing import TYPE_CHECKING, Final, NamedTuple
 
+from fog_contracts.messages import NodeCode, Reason
 from hazard_aggregator.node_state import SourceState
 from hazard_aggregator.readings import Classification
 from hazard_aggregator.source_values import is_online
@@ -89,7 +90,7 @@ class Sources:
     def on_node_offline(self, node: str) -> list[WatchedArea]:
         """Forget what a node measured that is no longer connected; return the areas of that."""
         for _, source in self._quantities.get(node, ()):
-            source.invalidate("it went offline")
+            source.invalidate(Reason(NodeCode.OFFLINE, "it went offline"))
             source.online = False
         return [area for area, _ in self._quantities.get(node, ())]
 
@@ -102,7 +103,8 @@ class Sources:
         for area, source, _ in chain.from_iterable(self._by_topic.values()):
             if source.publishes_on_change:
                 source.forget()
-                source.invalidate("the connection to the broker was lost, and it tells only changes")
+                sentence = "the connection to the broker was lost, and it tells only changes"
+                source.invalidate(Reason(NodeCode.CONNECTION_LOST, sentence))
                 areas.add(area.definition.id)
         return areas
 
@@ -149,7 +151,8 @@ def _apply_availability(
         source.pending = None
         reason = "it went offline" if online is False else f"{availability.topic} says neither online nor offline"
         if source.state != "unknown" or was_online:
-            source.invalidate(reason)
+            code = NodeCode.OFFLINE if online is False else NodeCode.NOT_UNDERSTOOD
+            source.invalidate(Reason(code, reason))
     elif source.online and not was_online:
         pending, source.pending = source.pending, None
         if pending is not None and not source.recalled:

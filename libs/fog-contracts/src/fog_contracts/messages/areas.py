@@ -8,7 +8,9 @@ from msgspec import Meta, field
 from fog_contracts.messages.basics import (
     AreaState,
     Author,
+    Code,
     Count,
+    Described,
     Finite,
     Hash,
     Id,
@@ -248,6 +250,37 @@ def hazards_digest(hazards: Iterable[AreaHazard]) -> int:
     return int.from_bytes(whole, "big") >> (64 - _HASH_BITS)
 
 
+class NodeCode(Described):
+    """Why a node or source of an area is blocked, clear or unknown."""
+
+    # what it measures
+    SOMETHING_NEAR = "something_near", "an echo is nearer than its limit"
+    NOTHING_NEAR = "nothing_near", "no echo is nearer than its limit"
+    SEES_ROBOT = "sees_robot", "its echo is a robot's, by the robot's pose"
+    REPORTED = "reported", "it reports its state itself"
+    BEYOND_LIMITS = "beyond_limits", "its number is beyond its limits"
+    WITHIN_LIMITS = "within_limits", "its number is within its limits"
+    MEASURES_NOTHING = "measures_nothing", "it measures nothing, which has the meaning that its settings say"
+    BLOCKED_BEFORE = "blocked_before", "the area was blocked before the restart"
+    # why nobody knows
+    NOT_HEARD = "not_heard", "no reading was received yet"
+    SILENT = "silent", "it has been silent for too long"
+    OFFLINE = "offline", "it went offline"
+    CONNECTION_LOST = "connection_lost", "the connection to the broker was lost, and it tells only changes"
+    NOT_CONNECTED_YET = "not_connected_yet", "it reports clear, and nobody says yet that it is connected"
+    FLAPS = "flaps", "it changes too often"
+    CONTRADICTORY = "contradictory", "its readings contradict one another, or its state its ranges"
+    POSE_LATE = "pose_late", "it saw a robot whose pose came late"
+    ROBOT_STAYS = "robot_stays", "a robot has stood before it for too long"
+    REPORTS_UNKNOWN = "reports_unknown", "it reports unknown"
+    ECHO_STUCK = "echo_stuck", "the echo line of a sonar is stuck"
+    NO_ECHO = "no_echo", "no echo where there should be one, as if it were dead or covered"
+    IMPLAUSIBLE = "implausible", "what it measures can't be"
+    SONARS_DIFFER = "sonars_differ", "it has other sonars than the site says"
+    NOT_UNDERSTOOD = "not_understood", "its message is not in its format, or means neither blocked nor clear"
+    NO_LIMITS = "no_limits", "it has no limits for its number"
+
+
 AlertKind = Literal["area-unknown", "area-blocked", "node-unknown"]
 
 
@@ -255,7 +288,7 @@ class Alert(Message, frozen=True, kw_only=True):
     """A condition of an area, or of a node or source in it, that has lasted for as long as the area's policy allows.
 
     It lasts since `since` and was raised at `raised`, or acknowledged by an operator at `acknowledged_at`. `reason` is
-    the newest one.
+    the newest one, `code` its identifier if it is a node's (`NodeCode`).
     """
 
     id: Annotated[str, Meta(max_length=100)]
@@ -267,6 +300,7 @@ class Alert(Message, frozen=True, kw_only=True):
     raised: Stamp
     acknowledged_by: Author | None = None
     acknowledged_at: Stamp | None = None
+    code: Code = ""
 
 
 class AlertList(Message, frozen=True, kw_only=True):

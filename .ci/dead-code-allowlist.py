@@ -101,7 +101,6 @@ _.get_info
 _.get_sample_rate
 
 # --- For tests, of this repository and of packages that build on it. ---
-_.ManualClock
 _.start_mosquitto  # private servers
 _.start_redis
 _.start_router

@@ -9,12 +9,12 @@ from typing import TYPE_CHECKING, Any, cast
 import msgspec
 import pytest
 import ring_site as ring
+from manual_clock import ManualClock
 
 from fog_contracts import channels as ch
 from fog_contracts.bus import Bus
 from fog_contracts.handlers import Publication
 from fog_contracts.messages import CommandReply, RobotGoal, SimCommand, SimTruth
-from fog_runtime.clock import ManualClock
 from fognav.demo.attempt import Attempt
 from fognav.demo.operator import Operator
 from fognav.demo.options import DrivePlan, Options

@@ -6,8 +6,9 @@ import sys
 import time
 
 import pytest
+from manual_clock import ManualClock
 
-from fog_runtime.clock import ManualClock, Phase, SystemClock, Ticker, ticker
+from fog_runtime.clock import Phase, SystemClock, Ticker, ticker
 
 
 async def run_ticker(clock: ManualClock, bodies: list[float], period: float = 0.1) -> list[float]:

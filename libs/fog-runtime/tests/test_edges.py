@@ -1,13 +1,13 @@
 """A table of handlers wired to transports that only record calls."""
 
 import pytest
+from manual_clock import ManualClock
 
 from fog_contracts import channels as ch
 from fog_contracts import messages as m
 from fog_contracts.codec import encode
 from fog_contracts.handlers import Moment, Publication
 from fog_runtime import metrics
-from fog_runtime.clock import ManualClock
 from fog_runtime.transports.edges import Edges
 
 POSE = m.RobotPose(x=1.0, y=2.0, theta=0.0, covariance=[0.0] * 9, v=0.0, w=0.0, radius=0.2, height=0.3, stamp=1.0)

@@ -14,12 +14,12 @@ from hypothesis import settings
 from hypothesis import strategies as st
 from hypothesis.stateful import RuleBasedStateMachine, invariant, rule
 from lease_model import LeaseModel
+from manual_clock import ManualClock
 
 from fog_contracts import channels as ch
 from fog_contracts.handlers import Fence, Publication, RefusedMessageError
 from fog_contracts.messages import Leader, MapHeartbeat, RobotState, ZoneSet
 from fog_runtime import leadership
-from fog_runtime.clock import ManualClock
 from fog_runtime.health import Health
 from fog_runtime.leadership import Leadership
 from fog_runtime.stores.redis_connection import StoreError

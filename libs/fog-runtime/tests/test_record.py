@@ -4,11 +4,12 @@ import time
 
 import msgspec
 import pytest
+from manual_clock import ManualClock
 from mcap.reader import make_reader
 
 from fog_contracts import channels as ch
 from fog_contracts import messages as m
-from fog_runtime.clock import ManualClock, SystemClock
+from fog_runtime.clock import SystemClock
 from fog_runtime.record import Recorder, RecordError, read, read_entries, record_all, replay
 from fog_runtime.transports.mqtt_edge import MqttEdge
 from fog_runtime.transports.zenoh_edge import ZenohEdge

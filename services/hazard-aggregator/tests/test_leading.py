@@ -6,11 +6,11 @@ import asyncio
 from typing import TYPE_CHECKING, Any, cast
 
 import pytest
+from manual_clock import ManualClock
 
 from fog_contracts import channels as ch
 from fog_contracts.handlers import Moment
 from fog_contracts.messages import AreaDefinition, AreaHazard
-from fog_runtime.clock import ManualClock
 from fog_runtime.health import Health
 from fog_runtime.stores.redis_store import Audit
 from fog_supervisor.servers import start_redis

@@ -6,12 +6,12 @@ from typing import TYPE_CHECKING, Any, cast
 
 import httpx
 import pytest
+from manual_clock import ManualClock
 from msgspec import structs
 
 from fog_contracts.grid import GridGeometry
 from fog_contracts.handlers import Moment
 from fog_contracts.messages import AreaDefinition
-from fog_runtime.clock import ManualClock
 from fog_runtime.health import Health
 from fog_runtime.http import Tokens, token_hash
 from fog_runtime.stores.redis_connection import StoreError

@@ -10,13 +10,13 @@ from typing import TYPE_CHECKING, Any, cast
 
 import httpx
 import numpy as np
+from manual_clock import ManualClock
 from prometheus_client import REGISTRY
 
 from fog_contracts import channels as ch
 from fog_contracts.grid import GridGeometry
 from fog_contracts.handlers import Moment
 from fog_contracts.messages import AreaDefinition, HazardArea, Message, ZoneSet
-from fog_runtime.clock import ManualClock
 from fog_runtime.health import Health
 from fog_runtime.http import Tokens
 from map_service import api

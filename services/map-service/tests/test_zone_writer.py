@@ -8,11 +8,11 @@ from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
 import pytest
+from manual_clock import ManualClock
 from msgspec import structs
 
 from fog_contracts.grid import GridGeometry
 from fog_contracts.messages import CircleShape, Message, Zone
-from fog_runtime.clock import ManualClock
 from fog_runtime.health import Health
 from fog_runtime.stores.redis_connection import StoreError
 from fog_runtime.stores.redis_store import Attempt

@@ -7,11 +7,11 @@ import time
 
 import pytest
 from lateness import Lateness
+from manual_clock import ManualClock
 
 from fog_contracts import channels as ch
 from fog_contracts.handlers import Publication
 from fog_contracts.messages import RobotRelease
-from fog_runtime.clock import ManualClock
 from fog_runtime.health import Health
 from fog_runtime.leadership import Leadership, LeaseStore
 from fog_supervisor.servers import start_redis

@@ -6,9 +6,9 @@ import asyncio
 import threading
 from typing import TYPE_CHECKING, Any, cast
 
+from manual_clock import ManualClock
 from ring_map import RingMap
 
-from fog_runtime.clock import ManualClock
 from fog_runtime.health import Health
 from planner import map_keeper, planning_map
 from planner.core import PlannerCore

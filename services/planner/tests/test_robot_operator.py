@@ -11,12 +11,12 @@ import msgspec
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from manual_clock import ManualClock
 
 from fog_contracts import channels as ch
 from fog_contracts.commands import CommandGate
 from fog_contracts.messages import CommandReply, Reason, ReasonCode, RefusalCode, RobotCommand, RobotState
 from fog_contracts.site import Place
-from fog_runtime.clock import ManualClock
 from fog_runtime.health import Health
 from fog_runtime.http import Tokens
 from fog_runtime.stores.redis_connection import StoreError

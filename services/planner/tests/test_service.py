@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any, cast
 
 import httpx
 import pytest
+from manual_clock import ManualClock
 from prometheus_client import REGISTRY
 from ring_map import LEFT, RIGHT, RingMap, goal, pose
 
@@ -19,7 +20,6 @@ import planner.service
 from fog_contracts import channels as ch
 from fog_contracts.handlers import Moment, Publication, RefusedMessageError
 from fog_contracts.messages import EgressRequest, PlanRequest, Pose, RobotGoal, RobotPath
-from fog_runtime.clock import ManualClock
 from fog_runtime.health import Health
 from fog_runtime.http import Tokens
 from fog_runtime.transports.zenoh_declarations import ASKER

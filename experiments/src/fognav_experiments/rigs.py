@@ -45,7 +45,7 @@ from map_service.core import MapCore
 from map_service.registry import make_layers
 from planner.core import PlannerCore
 from robot_agent.agent.core import AgentCore
-from robot_agent.agent.pose_keeper import start_pose
+from robot_agent.agent.pose_persistence import start_pose
 from robot_agent.config import agent_config
 from robot_agent.guardian import link
 from robot_agent.guardian.core import GuardianCore

@@ -99,16 +99,16 @@ async def test_writer_whose_epoch_is_not_the_granted_one_is_refused(redis: Serve
     async with (
         RedisStore(redis.url, "test", service="map") as old,
         RedisStore(redis.url, "test", service="map") as new,
-        LeaseStore(redis.url, "test", "map") as keeper,
+        LeaseStore(redis.url, "test", "map") as leases,
     ):
         request = Request(epoch=0, floor=0, confirmed=False, sent_at=0.0)
-        granted = await keeper.acquire("a", request)
+        granted = await leases.acquire("a", request)
         assert granted is not None
         old.epoch = granted.epoch
         assert await old._swap(THINGS, "a", Thing(label="x"), ABSENT, AUDIT) == "ok"
         await old._write_records("things", {"b": Thing(label="y")})
-        await keeper.release("a")
-        taken = await keeper.acquire("b", request)
+        await leases.release("a")
+        taken = await leases.acquire("b", request)
         assert taken is not None
         new.epoch = taken.epoch
         assert await new._swap(THINGS, "c", Thing(label="z"), ABSENT, AUDIT) == "ok"

@@ -164,12 +164,12 @@ async def test_store_and_lease_need_no_more_than_a_service_may(redis, security):
     own = of(security, "planner")
     async with (
         RedisStore(redis.url, "lab", service="planner", credentials=own, timeout_s=5.0) as store,
-        LeaseStore(redis.url, "lab", "planner", credentials=own) as keeper,
+        LeaseStore(redis.url, "lab", "planner", credentials=own) as leases,
     ):
         await store.check()
         assert await store.durability_warning() == ""
         assert (await store.audit()).entries == []
-        assert keeper is not None
+        assert leases is not None
     administrator = of(security, "administrator")
     async with Redis(
         port=redis.port, ssl=True, ssl_ca_data=administrator.authority,

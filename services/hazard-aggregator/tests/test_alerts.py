@@ -21,7 +21,7 @@ from fog_contracts.messages import (
     NodeCode,
     Reason,
 )
-from hazard_aggregator.alert_keeper import NodeMetrics
+from hazard_aggregator.alert_persistence import NodeMetrics
 from hazard_aggregator.alerts import LISTED, AlertError, Alerts, NodeReport
 
 SQUARE = [(0.0, 0.0), (2.0, 0.0), (2.0, 1.0), (0.0, 1.0)]

@@ -10,7 +10,7 @@ from fog_contracts.messages import Pose, Refusal, RobotGoal, RobotState
 from fog_contracts.site import RobotSite, Site
 from fog_runtime.stores.redis_connection import StoreError
 from planner.missions import DockGoals
-from planner.store import NO_MISSION, DockKeeper, MissionConflictError
+from planner.store import NO_MISSION, DockMissions, MissionConflictError
 
 FRONT = Pose(x=1.0, y=2.0, theta=0.5)
 
@@ -72,8 +72,8 @@ async def test_operator_who_was_faster_is_not_overruled() -> None:
         orders.append(order)
         raise MissionConflictError("r1", None)
 
-    keeper, elsewhere = DockKeeper({"r1": FRONT}, send), goal(Pose(x=9.0, y=9.0, theta=0.0))
-    keeper.on_state("r1", state(goal_id="g"), elsewhere, 5.0)
+    dock_missions, elsewhere = DockMissions({"r1": FRONT}, send), goal(Pose(x=9.0, y=9.0, theta=0.0))
+    dock_missions.on_state("r1", state(goal_id="g"), elsewhere, 5.0)
     await asyncio.sleep(0)
     await asyncio.sleep(0)
     assert [order.expected for order in orders] == ["g"]
@@ -89,11 +89,11 @@ async def test_refused_or_lost_goal_ends_nothing_and_is_tried_again(outcome: obj
             raise outcome
         return outcome
 
-    keeper = DockKeeper({"r1": FRONT}, send)
-    keeper.on_state("r1", state(), None, 5.0)
+    dock_missions = DockMissions({"r1": FRONT}, send)
+    dock_missions.on_state("r1", state(), None, 5.0)
     await asyncio.sleep(0)
     await asyncio.sleep(0)
-    keeper.on_state("r1", state(), None, 7.0)
+    dock_missions.on_state("r1", state(), None, 7.0)
     await asyncio.sleep(0)
     await asyncio.sleep(0)
     assert [(order.robot, order.pose, order.any_heading, order.expected) for order in orders] == [

@@ -14,7 +14,7 @@ from fog_runtime.lease import Request
 from fog_runtime.stores.redis_connection import StoreError
 from fog_runtime.stores.redis_store import Attempt, Audit, IdempotencyError, RecoveryError
 from fog_supervisor.servers import Server, start_redis
-from planner.store import MissionKeeper, Store, StoredGoal
+from planner.store import MissionPersistence, Store, StoredGoal
 
 pytestmark = pytest.mark.live
 AUDIT = Audit(1.0, "anna", "goal")
@@ -77,12 +77,12 @@ async def test_mission_that_was_stored_although_its_request_failed_can_be_cancel
     ):
         granted = await leases.acquire("p1", Request(epoch=0, floor=0, confirmed=False, sent_at=0.0))
         assert granted is not None
-        keeper = MissionKeeper(Mock(), store, SystemClock(), Health(), lambda _change: None)
+        persistence = MissionPersistence(Mock(), store, SystemClock(), Health(), lambda _change: None)
         with pytest.raises(StoreError, match="not loaded yet"):
-            await keeper.cancel("r1", "anna")
-        await keeper.lead(granted.epoch, confirmed=True)
-        assert not await keeper.cancel("r1", "anna")
+            await persistence.cancel("r1", "anna")
+        await persistence.lead(granted.epoch, confirmed=True)
+        assert not await persistence.cancel("r1", "anna")
         await store.put("r1", goal("unacknowledged"), AUDIT)
-        keeper._reload = True  # as after any write that failed
-        assert await keeper.cancel("r1", "anna")
+        persistence._reload = True  # as after any write that failed
+        assert await persistence.cancel("r1", "anna")
         assert await store.goals() == {}

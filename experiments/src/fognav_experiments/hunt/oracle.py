@@ -42,10 +42,10 @@ if TYPE_CHECKING:
 Rule = Literal[
     "contact", "blocked", "speed", "stop", "pose", "version", "write", "hazard", "cleared", "barrier", "late"
 ]
-Word = Literal["fog", "map-service", "aggregator", "planner", "agent", "lidar", "new turns", "base", "floor"]
+Source = Literal["fog", "map-service", "aggregator", "planner", "agent", "lidar", "new turns", "base", "floor"]
 """What may be lost: all messages to the robot, a process of the fog, its own agent (which may hang), its lidar, or new
 turns of it, what its base sends, the floor before its front wheel."""
-_MAP: Final[frozenset[Word]] = frozenset({"fog", "map-service"})
+_MAP: Final[frozenset[Source]] = frozenset({"fog", "map-service"})
 """Without one of these a robot does not learn what changes on the map."""
 
 _STANDING: Final = 0.02
@@ -68,7 +68,7 @@ _RAMP_S: Final = 0.8
 """0.5 s of a ramp, and what states and truth, ten times a second, come late."""
 _REACTION_S: Final = 1.0
 """From the announcement of what is blocked to a robot that knows: a map's version, a path."""
-_STOP_S: Final[dict[Word, float]] = {
+_STOP_S: Final[dict[Source, float]] = {
     "fog": 4.0, "map-service": 4.0, "agent": 0.4, "lidar": 0.6, "new turns": 1.4, "base": 0.6, "floor": 0.4,
 }  # fmt: skip
 """Wheels are zero so long after a source is lost: 3.5, 0.3 and 0.5 s by the documents, three turns and a ramp, 0.3 s
@@ -78,7 +78,7 @@ _BUMPED_S: Final = 0.4
 """And so long after the bumper touched something."""
 _SEEN_M: Final = 0.25
 """What is lower no lidar sees: only the bumper finds it."""
-_HAZARDS: Final[frozenset[Word]] = frozenset({"map-service", "aggregator"})
+_HAZARDS: Final[frozenset[Source]] = frozenset({"map-service", "aggregator"})
 """Without one of these no hazard is announced."""
 _SLOW_S: Final = 2.0
 """So long after an acknowledged write or a lost fog a robot that does not know better is slow."""
@@ -182,8 +182,8 @@ class Oracle:
         """Areas that are blocked, or unknown and as costly: nobody has seen them free since."""
         self._zones: dict[str, _Known] = {}
         self._limits: dict[str, _Known] = {}
-        self._lost: dict[Word, float] = {}
-        self._restored: dict[Word, float] = {}
+        self._lost: dict[Source, float] = {}
+        self._restored: dict[Source, float] = {}
         self._path: list[Point] = []
         self._newest: dict[str, tuple[int, ...]] = {}
         self._writes: dict[tuple[str, int], float] = {}
@@ -204,14 +204,14 @@ class Oracle:
 
     # --- what the world does -----------------------------------------------------------------------------------------
 
-    def on_lost(self, word: Word, now: float) -> None:
+    def on_lost(self, source: Source, now: float) -> None:
         """Note that from now on the robot does not get this."""
-        self._lost.setdefault(word, now)
+        self._lost.setdefault(source, now)
 
-    def on_restored(self, word: Word, now: float) -> None:
+    def on_restored(self, source: Source, now: float) -> None:
         """Note that the robot gets this again."""
-        if self._lost.pop(word, None) is not None:
-            self._restored[word] = now
+        if self._lost.pop(source, None) is not None:
+            self._restored[source] = now
 
     def on_fallen(self, now: float) -> None:
         """Note that its middle is over a hole, which it was told to back off from at most."""
@@ -397,9 +397,9 @@ class Oracle:
             return False
         return self._now - self._back(_MAP) > self._reaction_s + _REACTION_S
 
-    def _back(self, words: frozenset[Word]) -> float:
+    def _back(self, words: frozenset[Source]) -> float:
         """Return when the last of these was there again; it may have been lost all the time, too."""
-        return max(self._now if word in self._lost else self._restored.get(word, -math.inf) for word in words)
+        return max(self._now if source in self._lost else self._restored.get(source, -math.inf) for source in words)
 
     def _check_blocked(self) -> None:
         x, y = self._place
@@ -414,14 +414,14 @@ class Oracle:
             )  # fmt: skip
 
     def _check_stop(self) -> None:
-        for word, limit in _STOP_S.items():
-            seconds = self._now - self._lost.get(word, self._now)
-            late = seconds > limit + (self._world.late_s if word == "fog" else 0.0)
+        for source, limit in _STOP_S.items():
+            seconds = self._now - self._lost.get(source, self._now)
+            late = seconds > limit + (self._world.late_s if source == "fog" else 0.0)
             # An operator who tells it to turn or to drive out needs no map.
-            told = self._is_told if word == "floor" else word in _MAP and (self._is_told or self._mode == "EGRESS")
+            told = self._is_told if source == "floor" else source in _MAP and (self._is_told or self._mode == "EGRESS")
             moves = self._moves and not told
-            values = f"wheels turn {seconds:.1f} s after it lost the {word}"
-            self._lasts("stop", word, late and moves, values, self._world.wrong_s)
+            values = f"wheels turn {seconds:.1f} s after it lost the {source}"
+            self._lasts("stop", source, late and moves, values, self._world.wrong_s)
         seconds = self._now - self._bumped
         if not self._moves or self._is_told:
             self._bumped = math.inf

@@ -19,7 +19,7 @@ from fognav_experiments.hunt.oracle import Figures, Oracle, Violation
 from fognav_experiments.hunt.world import Built, HuntWorld, build, to_map
 from fognav_experiments.lockstep import LockstepDrive, release_drives
 from fognav_experiments.rigs import STAMP
-from fognav_experiments.scenarios.stage import Stage, Word
+from fognav_experiments.scenarios.stage import Source, Stage
 from fognav_sim.barrier import BarrierError
 from fognav_sim.drive.drive import DriveOutcome
 from fognav_sim.drive.hazard import HazardSchedule
@@ -164,8 +164,8 @@ class _WatchedStage(Stage):
             self._fallen = True
             self._oracle.on_fallen(self._run.now)
 
-    def on_lost(self, word: Word, *, lost: bool) -> None:
-        (self._oracle.on_lost if lost else self._oracle.on_restored)(word, self._run.now)
+    def on_lost(self, source: Source, *, lost: bool) -> None:
+        (self._oracle.on_lost if lost else self._oracle.on_restored)(source, self._run.now)
 
     def on_acknowledged(self, zone: Zone) -> None:
         self._oracle.on_acknowledged(zone, self._run.now)

@@ -54,7 +54,7 @@ if TYPE_CHECKING:
     from fognav_sim.world import World
 
 
-Word = Literal["fog", "map-service", "aggregator", "planner", "agent", "lidar", "new turns", "base", "floor"]
+Source = Literal["fog", "map-service", "aggregator", "planner", "agent", "lidar", "new turns", "base", "floor"]
 """What may be lost: messages to the robot, a process of the fog, agent, lidar, its new turns, base, floor ahead."""
 _REPEAT_STEPS: Final = 10
 _PERSON_M: Final = 0.2
@@ -88,7 +88,7 @@ class Stage:
         self._steps = 0
         self._random = random.Random(seed)  # noqa: S311  # repeatable, not a secret
 
-    def on_lost(self, word: Word, *, lost: bool) -> None:
+    def on_lost(self, source: Source, *, lost: bool) -> None:
         """Note that the robot does not get this from now on, or gets it again."""
 
     def on_acknowledged(self, zone: Zone) -> None:

@@ -228,7 +228,7 @@ class Member(Protocol):
         """Forget what only a leader may do; another process leads."""
 
 
-class LeaseKeeper(Protocol):
+class LeaseBackend(Protocol):
     """Where leases are granted (`lease_store.LeaseStore`)."""
 
     async def acquire(self, holder: str, request: Request) -> Reply:
@@ -253,7 +253,7 @@ class Leadership:
     def __init__(
         self,
         service: Role,
-        keeper: LeaseKeeper,
+        leases: LeaseBackend,
         zenoh: ZenohEdge,
         health: Health,
         *,
@@ -267,7 +267,7 @@ class Leadership:
         """
         self.holder = process_id(service)
         self._service = service
-        self._keeper = keeper
+        self._leases = leases
         self._zenoh = zenoh
         self._health = health
         self._connected = connected
@@ -363,7 +363,7 @@ class Leadership:
                     await asyncio.sleep(_TICK_S)
         finally:
             self._lease.give_up()
-            await self._keeper.release(self.holder)
+            await self._leases.release(self.holder)
 
     async def _request_loop(self) -> None:
         while True:
@@ -371,7 +371,7 @@ class Leadership:
             if request is None:
                 await asyncio.sleep(_TICK_S / 2)
                 continue
-            reply = await self._keeper.acquire(self.holder, request)
+            reply = await self._leases.acquire(self.holder, request)
             self._lease.on_reply(request, reply, time.monotonic())
             with self._sending:
                 if self._lease.permission(time.monotonic()) == "granted" and self._term[0] == self._lease.epoch:

@@ -34,7 +34,7 @@ from robot_agent.agent.navigation import Navigation, PreparedMap, prepare_map
 from robot_agent.agent.obstacle_reporter import WAY_M, ObstacleReporter
 from robot_agent.agent.operator_commands import OperatorCommands, initial_pose_refusal
 from robot_agent.agent.path_driving import PathDriving
-from robot_agent.agent.pose_keeper import PoseKeeper
+from robot_agent.agent.pose_persistence import PosePersistence
 from robot_agent.agent.power import IdleScans, RestPolicy
 from robot_agent.agent.reports import PublishingPolicy, hindrances, robot_pose, robot_state
 from robot_agent.agent.safety_supervisor import BaseSource, LidarSource, SafetySupervisor, safety_inputs
@@ -86,7 +86,7 @@ class AgentCore:
         self._odometry = Odometry(config.drive_train)
         self._lidar = LidarSource()
         self._localizer = Localizer(config.localization, seed)
-        self._pose_keeper = PoseKeeper(self._localizer)
+        self._pose_persistence = PosePersistence(self._localizer)
         self._fence = Fence()
         self._map = MapFollower()
         self._driving = PathDriving(config)
@@ -139,7 +139,7 @@ class AgentCore:
             raise MapError(f"the snapshot has epoch {prepared.snapshot.epoch}, which no {ch.MAP} can have yet")
         self._map.on_snapshot(prepared.decoded, now)
         self._fence.raise_to(ch.MAP, prepared.snapshot.epoch)
-        self._pose_keeper.load_map(prepared.snapshot.site, prepared.fields)
+        self._pose_persistence.load_map(prepared.snapshot.site, prepared.fields)
         self._navigation.on_map_loaded(now)
 
     # --- base and lidar ---
@@ -150,7 +150,7 @@ class AgentCore:
         self._base.on_feedback(feedback, now)
         if slept and not self._base.asleep:
             self._localizer.on_unmeasured_motion(*POSSIBLE_WHILE_SUSPENDED, "the base was asleep")
-        self._pose_keeper.on_base(feedback)
+        self._pose_persistence.on_base(feedback)
         motion = self._odometry.update(feedback.odometry, now)
         if isinstance(motion, EncoderFault):
             return
@@ -314,7 +314,7 @@ class AgentCore:
         feedback = self._base.feedback
         # A wheel that has dropped: somebody may carry the robot.
         lifted = feedback is not None and feedback.status.wheel_drop
-        self._pose_keeper.search(self.safety.mode, at.now, at_rest=self._driving.wheels.at_rest and not lifted)
+        self._pose_persistence.search(self.safety.mode, at.now, at_rest=self._driving.wheels.at_rest and not lifted)
         return self._publishing.due(
             partial(self.pose, at),
             self.state(at),
@@ -370,11 +370,11 @@ class AgentCore:
 
     def restore(self, saved: SavedPose) -> None:
         """Start at a stored pose as soon as the map of its site is loaded; the lidar verifies it."""
-        self._pose_keeper.restore(saved, self.replica.site)
+        self._pose_persistence.restore(saved, self.replica.site)
 
     def pose_to_store(self, now: float) -> SavedPose | None:
         """Return the pose if it is trusted and differs from the last one returned, so that it is worth a write."""
-        return self._pose_keeper.to_store(self.replica.site, now)
+        return self._pose_persistence.to_store(self.replica.site, now)
 
     # --- read-only views ---
 

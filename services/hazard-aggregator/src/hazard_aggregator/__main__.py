@@ -63,7 +63,7 @@ async def main() -> None:
         Store(
             settings.redis_url, site, service="hazard-aggregator", data_dir=settings.data_dir, credentials=own
         ) as store,
-        LeaseStore(settings.redis_url, site, "hazard-aggregator", credentials=own) as keeper,
+        LeaseStore(settings.redis_url, site, "hazard-aggregator", credentials=own) as leases,
     ):
         stored, loaded_from_store = await load_at_start(store)
         nodes = {node.id: node for node in loaded.site.nodes}
@@ -83,7 +83,7 @@ async def main() -> None:
             connect=settings.zenoh_endpoints, clock=clock, role="hazard-aggregator", id=site, site=site, credentials=own
         ) as zenoh:
             leadership = Leadership(
-                "hazard-aggregator", keeper, zenoh, health, connected=lambda: zenoh.connected or mqtt.connected
+                "hazard-aggregator", leases, zenoh, health, connected=lambda: zenoh.connected or mqtt.connected
             )
             core = Aggregator(fusion, complete=loaded_from_store)
             boot = boot_id()

@@ -63,7 +63,7 @@ _QUEUE: Final = 10_000
 _PERIOD_S: Final = 0.5
 
 
-class HistoryKeeper:
+class HistoryPersistence:
     """The queue of published hazards that begin periods; Redis refuses those that it has already."""
 
     def __init__(self, core: Aggregator, store: Store, leading: asyncio.Event) -> None:
@@ -127,7 +127,7 @@ class Publisher:
     Home Assistant is told of the areas of this `site`; without its id, of none.
     """
 
-    def __init__(self, core: Aggregator, edges: Edges, history: HistoryKeeper, site: str) -> None:
+    def __init__(self, core: Aggregator, edges: Edges, history: HistoryPersistence, site: str) -> None:
         metrics.expect_stages(["debounce"])
         self._site = site
         self.write_pending = asyncio.Event()

@@ -11,9 +11,9 @@ from fog_runtime import logs
 from fog_runtime.clock import ticker
 from fog_runtime.stores.redis_connection import StoreError, StoreLostError
 from fog_runtime.transports.edges import Edges
-from hazard_aggregator.alert_keeper import AlertKeeper
+from hazard_aggregator.alert_persistence import AlertPersistence
 from hazard_aggregator.area_size import excess
-from hazard_aggregator.publisher import Availability, HistoryKeeper, Publisher
+from hazard_aggregator.publisher import Availability, HistoryPersistence, Publisher
 from hazard_aggregator.records import Records
 from hazard_aggregator.writers import AreaWriter, OverrideWriter
 
@@ -75,9 +75,9 @@ class Service:
         self._health = health
         self._edges = Edges(clock, mqtt=mqtt, zenoh=zenoh, gate=gate)
         self._leading = asyncio.Event()
-        self.history = HistoryKeeper(core, store, self._leading)
+        self.history = HistoryPersistence(core, store, self._leading)
         self._availability = Availability(self._edges, self._leading)
-        self.alerts = AlertKeeper(core, store, self._edges, clock, self._leading)
+        self.alerts = AlertPersistence(core, store, self._edges, clock, self._leading)
         self._publisher = Publisher(core, self._edges, self.history, site)
         self.records = Records(core, store, self._publisher, mqtt, self._edges, clock, health, boot)
         self.areas = AreaWriter(core, store, self.records, self._publisher, self._edges, clock)

@@ -57,7 +57,7 @@ async def main() -> None:
     )  # fmt: skip
     async with (
         Store(settings.redis_url, site, service="map-service", data_dir=settings.data_dir, credentials=own) as store,
-        LeaseStore(settings.redis_url, site, "map-service", credentials=own) as keeper,
+        LeaseStore(settings.redis_url, site, "map-service", credentials=own) as leases,
     ):
         core = MapCore(
             site,
@@ -72,7 +72,7 @@ async def main() -> None:
             connect=settings.zenoh_endpoints, clock=clock, role="map-service", id=site, site=site, credentials=own
         ) as zenoh:
             leadership = Leadership(
-                "map-service", keeper, zenoh, health,
+                "map-service", leases, zenoh, health,
                 connected=lambda: zenoh.connected, epochs=lambda: {ch.AGGREGATOR: core.aggregator.epoch or 0},
             )  # fmt: skip
             # A clock of another speed tells no time of day.

@@ -14,7 +14,7 @@ from fog_runtime.clock import ticker
 from fog_runtime.stores.redis_connection import StoreError, StoreLostError
 from fog_runtime.transports.edges import Edges
 from map_service.publisher import Publisher
-from map_service.zone_writer import TimesKeeper, ZoneWriter
+from map_service.zone_writer import ZoneTimesPersistence, ZoneWriter
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
@@ -75,7 +75,7 @@ class Service:
         """
         self.core = core
         self._synchronized = synchronized
-        self._times = TimesKeeper(core, store, boot)
+        self._times = ZoneTimesPersistence(core, store, boot)
         self._store = store
         self._mqtt = mqtt
         self._clock = clock

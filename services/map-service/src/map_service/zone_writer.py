@@ -37,7 +37,7 @@ PERIOD_S: Final = 30.0
 _log = logs.get("map")
 
 
-class TimesKeeper:
+class ZoneTimesPersistence:
     """Stores the times of zones: at once when one starts or ends, else periodically; `boot` is `clock.boot_id`."""
 
     def __init__(self, core: MapCore, store: Store, boot: str) -> None:
@@ -111,7 +111,7 @@ class ZoneWriter:
         self,
         core: MapCore,
         store: Store,
-        times: TimesKeeper,
+        times: ZoneTimesPersistence,
         publisher: Publisher,
         health: Health,
         now: Callable[[], Moment],

@@ -70,14 +70,14 @@ async def main() -> None:
     config = PlannerConfig(inflation=settings.inflation, release_length=settings.release_m)
     async with (
         Store(settings.redis_url, site, service="planner", data_dir=settings.data_dir, credentials=own) as store,
-        LeaseStore(settings.redis_url, site, "planner", credentials=own) as keeper,
+        LeaseStore(settings.redis_url, site, "planner", credentials=own) as leases,
         ZenohEdge.open(
             connect=settings.zenoh_endpoints, clock=clock, role="planner", id=site, site=site, credentials=own
         ) as zenoh,
     ):
         core = PlannerCore(config=config)
         leadership = Leadership(
-            "planner", keeper, zenoh, health, connected=lambda: zenoh.connected, epochs=lambda: core.fence.epochs
+            "planner", leases, zenoh, health, connected=lambda: zenoh.connected, epochs=lambda: core.fence.epochs
         )
         service = Service(core, store, zenoh, clock, health, leadership, key=key, staging=described.staging)
         service.subscribe()

@@ -3,7 +3,7 @@
 The core runs on a thread of its own, one cycle after another (`Cycle`), so that a search never delays the event loop,
 and nothing but searches of robots' paths runs there: distance fields are computed on a second thread; plans on
 request, reasons of refusals and snapshots of the map on a third (`query_queue`). Missions are kept by `store`,
-the map by `map_keeper`. Inputs are timestamped on arrival, even while the previous cycle runs.
+the map by `snapshot_fetcher`. Inputs are timestamped on arrival, even while the previous cycle runs.
 """
 
 from __future__ import annotations
@@ -26,12 +26,12 @@ from fog_runtime import logs, metrics
 from fog_runtime.clock import ticker
 from fog_runtime.transports.edges import Edges
 from fog_runtime.transports.zenoh_declarations import ASKER
-from planner.map_keeper import MapKeeper
 from planner.plan_records import PathRecord, PlanMetrics
 from planner.query_queue import BusyError, QueryQueue, Threads
 from planner.refusals import busy
 from planner.robot_operator import RobotOperator
-from planner.store import DockKeeper, MissionKeeper
+from planner.snapshot_fetcher import SnapshotFetcher
+from planner.store import DockMissions, MissionPersistence
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -208,10 +208,10 @@ class Service:
         self._threads = Threads()
         self._queue = QueryQueue(self._threads, on_idle=core.answerer.release)
         self._cycle = Cycle(core, zenoh)
-        self.missions = MissionKeeper(core, store, clock, health, self._change_goal)
-        self._map = MapKeeper(core, zenoh, clock, health, self._queue, on_loaded=self._wake.set)
+        self.missions = MissionPersistence(core, store, clock, health, self._change_goal)
+        self._map = SnapshotFetcher(core, zenoh, clock, health, self._queue, on_loaded=self._wake.set)
         self.operator = RobotOperator(zenoh, store, clock, key)
-        self._docks = DockKeeper(staging, self.send)
+        self._docks = DockMissions(staging, self.send)
         self._jobs: set[asyncio.Task[None]] = set()
         self._metrics = PlanMetrics()
         self.poses: dict[str, RobotPose] = {}
@@ -234,7 +234,7 @@ class Service:
         """Give a robot a mission; returns a refusal for an unreachable goal.
 
         An attempt that succeeded before returns its mission again and changes nothing. Raises `IdempotencyError` for
-        another request's attempt, and as `MissionKeeper.send`.
+        another request's attempt, and as `MissionPersistence.send`.
         """
         earlier = await self.missions.earlier_result(order.attempt)
         if earlier is not None:

@@ -111,7 +111,7 @@ class MissionConflictError(Exception):
         super().__init__(f"robot {robot} has {has}, and not the one that was expected: read it again, then retry")
 
 
-class MissionKeeper:
+class MissionPersistence:
     """Keeps the missions of store and core equal; `change_core` passes a change to the core's thread."""
 
     def __init__(
@@ -323,7 +323,7 @@ class MissionKeeper:
         self._change_core(partial(self._core.set_goal, robot, stored.goal, any_heading=stored.any_heading))
 
 
-class DockKeeper:
+class DockMissions:
     """Gives missions for docks, one at a time for each robot."""
 
     def __init__(self, staging: Mapping[str, Pose], send: Send) -> None:

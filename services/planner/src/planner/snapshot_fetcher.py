@@ -32,7 +32,7 @@ SNAPSHOTS = Counter("fognav_planner_snapshots_total", "Queries for a snapshot of
 _log = logs.get("planner")
 
 
-class MapKeeper:
+class SnapshotFetcher:
     """Keeps the core's map complete; `on_loaded` is called when there is a new one."""
 
     def __init__(

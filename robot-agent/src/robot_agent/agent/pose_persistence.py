@@ -31,7 +31,7 @@ _START_SIGMA_RAD: Final = 0.15
 """Standard deviations of a robot that was put on its start pose by hand."""
 
 
-class PoseKeeper:
+class PosePersistence:
     """Starts the localizer from a stored pose or by a global search, and selects the poses to store."""
 
     def __init__(self, localizer: Localizer) -> None:

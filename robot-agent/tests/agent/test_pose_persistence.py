@@ -5,7 +5,7 @@ import math
 import msgspec
 import pytest
 
-from robot_agent.agent.pose_keeper import SEARCH_AGAIN_S, PoseKeeper
+from robot_agent.agent.pose_persistence import SEARCH_AGAIN_S, PosePersistence
 from robot_agent.guardian.link import BaseFeedback
 from robot_agent.hardware import BaseStatus, WheelOdometry
 from robot_agent.localization.pose import SavedPose
@@ -62,51 +62,51 @@ def localizer():
 
 
 @pytest.fixture
-def keeper(localizer):
-    return PoseKeeper(localizer)
+def persistence(localizer):
+    return PosePersistence(localizer)
 
 
-def test_search_begins_without_a_pose_and_not_again_before_the_interval(keeper, localizer):
-    assert keeper.search("INIT", 0.0, at_rest=True)
-    assert not keeper.search("INIT", SEARCH_AGAIN_S, at_rest=True)
-    assert keeper.search("INIT", SEARCH_AGAIN_S + 0.1, at_rest=True)
+def test_search_begins_without_a_pose_and_not_again_before_the_interval(persistence, localizer):
+    assert persistence.search("INIT", 0.0, at_rest=True)
+    assert not persistence.search("INIT", SEARCH_AGAIN_S, at_rest=True)
+    assert persistence.search("INIT", SEARCH_AGAIN_S + 0.1, at_rest=True)
     assert localizer.searches == 2
 
 
-def test_search_that_could_not_begin_is_retried_immediately(keeper, localizer):
+def test_search_that_could_not_begin_is_retried_immediately(persistence, localizer):
     localizer.can_search = False
-    assert not keeper.search("INIT", 0.0, at_rest=True)
+    assert not persistence.search("INIT", 0.0, at_rest=True)
     localizer.can_search = True
-    assert keeper.search("INIT", 0.1, at_rest=True)
+    assert persistence.search("INIT", 0.1, at_rest=True)
 
 
 @pytest.mark.parametrize("change", [{"status": "lost"}, {"searching": True}, {"known": (1.0, 2.0, 0.0)}])
-def test_no_search_begins_while_there_is_a_pose_or_a_search(keeper, localizer, change):
+def test_no_search_begins_while_there_is_a_pose_or_a_search(persistence, localizer, change):
     for name, value in change.items():
         setattr(localizer, name, value)
-    assert not keeper.search("INIT", 0.0, at_rest=True)
+    assert not persistence.search("INIT", 0.0, at_rest=True)
 
 
-def test_search_begins_while_the_robot_has_a_fault(keeper):
-    assert keeper.search("FAULT", 0.0, at_rest=True)
+def test_search_begins_while_the_robot_has_a_fault(persistence):
+    assert persistence.search("FAULT", 0.0, at_rest=True)
 
 
 @pytest.mark.parametrize(("mode", "at_rest"), [("NORMAL", True), ("HOLD", True), ("INIT", False), ("FAULT", False)])
-def test_no_search_begins_while_the_robot_is_enabled_or_moves(keeper, mode, at_rest):
-    assert not keeper.search(mode, 0.0, at_rest=at_rest)
+def test_no_search_begins_while_the_robot_is_enabled_or_moves(persistence, mode, at_rest):
+    assert not persistence.search(mode, 0.0, at_rest=at_rest)
 
 
 @pytest.mark.parametrize(("site", "restored"), [("lab", [POSE]), ("office", [])])
-def test_a_stored_pose_waits_for_the_map_of_its_site(keeper, localizer, site, restored):
-    keeper.restore(POSE, "")
+def test_a_stored_pose_waits_for_the_map_of_its_site(persistence, localizer, site, restored):
+    persistence.restore(POSE, "")
     assert localizer.restored == []
-    keeper.load_map(site, FIELDS)
-    keeper.load_map("lab", FIELDS)
+    persistence.load_map(site, FIELDS)
+    persistence.load_map("lab", FIELDS)
     assert localizer.restored == restored
 
 
-def test_stored_pose_is_restored_immediately_on_the_map_of_its_site(keeper, localizer):
-    keeper.restore(POSE, "lab")
+def test_stored_pose_is_restored_immediately_on_the_map_of_its_site(persistence, localizer):
+    persistence.restore(POSE, "lab")
     assert localizer.restored == [POSE]
 
 
@@ -117,11 +117,11 @@ def test_stored_pose_is_restored_immediately_on_the_map_of_its_site(keeper, loca
     ids=["same guardian", "another guardian", "the wheels have turned", "it was lifted"],
 )
 def test_stored_pose_is_followed_if_one_guardian_has_watched_the_robot_since(
-    keeper, localizer, first, followed, base_first
+    persistence, localizer, first, followed, base_first
 ):
-    keeper.on_base(feedback(6, 2.0))
-    stored = keeper.to_store("lab", 0.0)
-    successor = PoseKeeper(localizer)
+    persistence.on_base(feedback(6, 2.0))
+    stored = persistence.to_store("lab", 0.0)
+    successor = PosePersistence(localizer)
     if base_first:
         successor.on_base(feedback(*first))
     successor.restore(stored, "lab")
@@ -142,11 +142,11 @@ def test_stored_pose_is_followed_if_one_guardian_has_watched_the_robot_since(
         ({"sigma_theta": 0.04}, True),
     ],
 )
-def test_only_a_pose_that_differs_is_stored(keeper, localizer, change, stored):
-    assert keeper.to_store("lab", 0.0) == POSE
-    assert keeper.to_store("lab", 1.0) is None
+def test_only_a_pose_that_differs_is_stored(persistence, localizer, change, stored):
+    assert persistence.to_store("lab", 0.0) == POSE
+    assert persistence.to_store("lab", 1.0) is None
     localizer.trusted = msgspec.structs.replace(POSE, **change)
-    assert (keeper.to_store("lab", 2.0) is not None) == stored
+    assert (persistence.to_store("lab", 2.0) is not None) == stored
 
 
 @pytest.mark.parametrize("moving", [(0.3, 0.0), (0.0, 0.5)])
@@ -154,16 +154,16 @@ def test_only_a_pose_that_differs_is_stored(keeper, localizer, change, stored):
     ("change", "stored"),
     [({"x": 1.4}, False), ({"x": 1.51}, True), ({"theta": 3.45}, False), ({"theta": 3.52}, True)],
 )
-def test_while_it_moves_a_pose_is_stored_less_often_and_again_at_rest(keeper, localizer, moving, change, stored):
-    assert keeper.to_store("lab", 0.0) == POSE
+def test_while_it_moves_a_pose_is_stored_less_often_and_again_at_rest(persistence, localizer, moving, change, stored):
+    assert persistence.to_store("lab", 0.0) == POSE
     localizer.moving = moving
     localizer.trusted = msgspec.structs.replace(POSE, **change)
-    assert (keeper.to_store("lab", 1.0) is not None) == stored
+    assert (persistence.to_store("lab", 1.0) is not None) == stored
     localizer.moving = (0.0, 0.0)
-    assert (keeper.to_store("lab", 2.0) is None) == stored
+    assert (persistence.to_store("lab", 2.0) is None) == stored
 
 
-def test_a_pose_that_is_not_trusted_or_of_no_site_is_not_stored(keeper, localizer):
-    assert keeper.to_store("", 0.0) is None
+def test_a_pose_that_is_not_trusted_or_of_no_site_is_not_stored(persistence, localizer):
+    assert persistence.to_store("", 0.0) is None
     localizer.trusted = None
-    assert keeper.to_store("lab", 0.0) is None
+    assert persistence.to_store("lab", 0.0) is None

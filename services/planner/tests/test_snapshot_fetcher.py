@@ -10,10 +10,10 @@ from manual_clock import ManualClock
 from ring_map import RingMap
 
 from fog_runtime.health import Health
-from planner import map_keeper, planning_map
+from planner import planning_map, snapshot_fetcher
 from planner.core import PlannerCore
-from planner.map_keeper import MapKeeper
 from planner.query_queue import QueryQueue, Threads
+from planner.snapshot_fetcher import SnapshotFetcher
 
 if TYPE_CHECKING:
     import pytest
@@ -41,13 +41,13 @@ async def test_snapshot_is_decoded_and_inflated_beside_the_core_s_thread(monkeyp
         return prepare(snapshot, inflation)
 
     # The core prepares by itself what it gets unprepared.
-    for module in (map_keeper, planning_map):
+    for module in (snapshot_fetcher, planning_map):
         monkeypatch.setattr(module, "prepare_map", recording)
     core, clock, threads, loaded = PlannerCore(epoch=1), ManualClock(1.0), Threads(), asyncio.Event()
     queue = QueryQueue(threads)
-    keeper = MapKeeper(core, cast("Any", MapService()), clock, Health(), queue, on_loaded=loaded.set)
-    assert not keeper.loaded
-    running = asyncio.create_task(keeper.snapshot_loop())
+    fetcher = SnapshotFetcher(core, cast("Any", MapService()), clock, Health(), queue, on_loaded=loaded.set)
+    assert not fetcher.loaded
+    running = asyncio.create_task(fetcher.snapshot_loop())
     try:
         async with asyncio.timeout(60):
             await loaded.wait()
@@ -56,6 +56,6 @@ async def test_snapshot_is_decoded_and_inflated_beside_the_core_s_thread(monkeyp
         await asyncio.gather(running, return_exceptions=True)
         queue.close()
         threads.close()
-    assert keeper.loaded
+    assert fetcher.loaded
     assert not core.wants_snapshot(clock.now())
     assert [name.rpartition("_")[0] for name in used] == ["planner query"]

@@ -74,7 +74,7 @@ _QUEUE: Final = 10_000
 ALERTS = Gauge("fognav_alerts", "Alerts of areas and nodes that an operator has acknowledged, or not", ["kind", "seen"])
 
 
-class AlertKeeper:
+class AlertPersistence:
     """The alerts of the aggregator that leads; one that stands by has none."""
 
     def __init__(self, core: Aggregator, store: Store, edges: Edges, clock: Clock, leading: asyncio.Event) -> None:

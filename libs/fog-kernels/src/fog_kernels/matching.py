@@ -344,7 +344,7 @@ def _align(
 @njit(
     void(
         _arrays.F64_GRID, float64, float64, float64, float64, float64, int64, _arrays.I32_GRID_OUT,
-        _arrays.I32_GRID_OUT, types.Array(types.int64, 2, "C"),
+        _arrays.I32_GRID_OUT, _arrays.I32_GRID_OUT,
     ),
     cache=True,
     nogil=True,
@@ -478,7 +478,7 @@ class BeamCounts:
     def __init__(self, shape: tuple[int, int], resolution: float, left: float, bottom: float) -> None:
         """`shape`: rows and columns; `left` and `bottom`: the grid's corner (m)."""
         self.hits, self.passes = np.zeros(shape, np.int32), np.zeros(shape, np.int32)
-        self._latest = np.full(shape, -1, np.int64)
+        self._latest = np.full(shape, -1, np.int32)
         self._grid = resolution, left, bottom
         self._scans = 0
 

@@ -1,6 +1,6 @@
 """A fog for each test: its site and the processes under test, beside broker, Redis and router on loopback ports.
 
-The servers of a test go on to the next one of this pytest process, emptied, unless the test killed or changed one.
+The servers of a test go on to the next one of this pytest process, emptied, unless it left other settings in Redis.
 """
 
 import asyncio
@@ -70,7 +70,7 @@ class Servers:
         )
         self.redis: Server = start_redis(folder / "redis", security=security and security.folder("redis"))
         self.router: Server = start_router(folder / "router", security=security and security.folder("zenoh"))
-        self._began = self._state()
+        self._began_with = self._settings()
 
     def all(self) -> tuple[Server, ...]:
         return self.mosquitto, self.redis, self.router
@@ -85,14 +85,15 @@ class Servers:
             "password": own.passwords["redis"],
         }  # fmt: skip
 
-    def _state(self) -> tuple[object, ...]:
-        """Return what tells whether a test has restarted a server, or changed a setting of Redis."""
+    def _settings(self) -> object:
         with redis.Redis(**self.redis_options()) as client:
-            return *(server.pid for server in self.all()), client.config_get("*")
+            return client.config_get("*")
 
     def empty(self) -> bool:
         """Remove everything that is stored; return whether they are as good as new."""
-        if not all(server.running() for server in self.all()) or self._state() != self._began:
+        for server in self.all():
+            server.start()  # unless it runs
+        if self._settings() != self._began_with:
             return False
         with redis.Redis(**self.redis_options()) as client:
             client.flushall()

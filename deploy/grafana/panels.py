@@ -406,7 +406,7 @@ SENSORS: Final = Dashboard(
                     needs="a node with implausible or late readings",
                 ),
                 Panel(
-                    "Age of the aggregator's word",
+                    "Age of the aggregator's heartbeat",
                     f"Above {AGGREGATOR_HEARTBEAT.max_age_s:g} s no area counts as clear.",
                     (("fognav_aggregator_heartbeat_age_seconds", "age"),),
                     unit="s",

@@ -1,4 +1,4 @@
-"""A robot goes to its dock on an operator's word, charges, and leaves it for a goal: all cores together."""
+"""A robot goes to its dock on an operator's command, charges, and leaves it for a goal: all cores together."""
 
 import itertools
 import math
@@ -173,7 +173,7 @@ def test_robot_that_something_separates_from_its_dock_does_not_let_its_base_look
 
 
 @pytest.mark.parametrize(("kind", "words"), [("disable", None), ("cancel", "its goal was cancelled")])
-def test_robot_goes_to_its_dock_by_no_older_word(kind, words):
+def test_robot_goes_to_its_dock_by_no_older_command(kind, words):
     run = Run(site=site_with_dock(Pose(x=1.5, y=2.6, theta=-math.pi / 2)))
     assert run.robot.command("dock").accepted
     run.run(2.0)

@@ -67,7 +67,7 @@ def test_distances_are_exact_at_the_centres_of_cells(seed, outline):
     assert found.distance == pytest.approx(np.minimum(expected, max(cap, 0.55)), abs=1e-5)
 
 
-def test_places_are_graded_by_distance_and_the_map_has_the_last_word():
+def test_places_are_graded_by_distance_and_the_map_decides():
     cost = np.zeros((SIDE, SIDE), np.uint8)
     cost[30, 39], cost[24, 24], cost[25, 25], cost[36, 24] = 254, 255, 253, 200
     found = around(cost, [], ORIGIN[0] + 1.5, ORIGIN[1] + 1.5, cover(ROUND))

@@ -165,7 +165,7 @@ def test_reset_is_passed_on_once():
     assert [control.command(outputs(), free, step * DT).reset for step in range(3)] == [True, False, False]
 
 
-def test_guard_has_the_last_word_on_decisions_and_ramps(driving):
+def test_guard_limits_decisions_and_ramps_last(driving):
     driving.decision = decision(1.0)
     asked = []
 

@@ -1,4 +1,4 @@
-"""What a robot does on an operator's word, by its real processes on ptys: back off from a bump, and look around."""
+"""What a robot does on an operator's command, by its real processes on ptys: back off from a bump, and look around."""
 
 from __future__ import annotations
 

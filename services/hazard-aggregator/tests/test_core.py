@@ -178,7 +178,7 @@ def test_removed_area_is_published_as_removed_and_leaves_nothing_to_store():
     assert (rig.core.to_store(), rig.core.announced(), rig.core.thesis_numbers()) == ([], {}, [])
 
 
-# --- The aggregator's own word on the broker --------------------------------------------------------------------------
+# --- The aggregator's own messages on the broker ---------------------------------------------------------------------
 
 
 def heartbeats(publications: list[Publication]) -> list[AggregatorHeartbeat]:
@@ -228,7 +228,7 @@ def test_own_messages_that_the_broker_returns_are_not_foreign():
 
 @pytest.mark.parametrize("epoch", [5, 77])
 @pytest.mark.parametrize("state", ["clear", "blocked"])
-def test_aggregator_goes_above_a_foreign_hazard_and_publishes_its_own_word_again(epoch, state):
+def test_aggregator_goes_above_a_foreign_hazard_and_publishes_its_own_message_again(epoch, state):
     rig = Rig()
     rig.read(0.8)
     own = rig.core.announced()["hall"]
@@ -264,7 +264,7 @@ def test_foreign_heartbeat_with_a_higher_epoch_outranks_and_a_lower_one_does_not
     assert rig.core.outranked_by == 8
 
 
-def test_own_word_is_published_again_over_a_foreign_one_with_a_lower_epoch():
+def test_own_message_is_published_again_over_a_foreign_one_with_a_lower_epoch():
     rig = Rig()
     rig.read(0.8)
     rig.published.clear()

@@ -92,6 +92,6 @@ async def test_areas_are_discovered_and_the_aggregators_end_is_told_also_by_a_co
         await until(lambda: available[-1] == "offline", "an orderly end", lambda: fog.log("hazard_aggregator"))
         fog.start("hazard_aggregator", "second")
         await until(lambda: available[-1] == "online", "online again", lambda: fog.log("second"))
-        # A copy that stands by ends: the one that leads corrects the word.
+        # A copy that stands by ends: the one that leads corrects the state.
         await mqtt.publish(ch.AGGREGATOR_AVAILABILITY, "offline", wait=True)
         await until(lambda: available[-2:] == ["offline", "online"], "corrected", lambda: fog.log("second"))

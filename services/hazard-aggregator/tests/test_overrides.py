@@ -297,7 +297,7 @@ class OverriddenArea(RuleBasedStateMachine):
             self.until = None if state == "clear" or left == 0.0 else (state, self.rig.now + left)
 
     @invariant()
-    def operators_word_counts_and_the_nodes_go_on_underneath(self):
+    def operators_override_counts_and_the_nodes_go_on_underneath(self):
         hazard, plain = self.rig.hazard, self.plain.hazard
         if self.until is None:
             assert hazard.override is None

@@ -188,7 +188,7 @@ def test_disconnected_sensor_is_unknown_until_it_is_connected_and_has_said_somet
 
 
 @pytest.mark.parametrize("profile", ["esphome-binary", "home-assistant", "shelly-door-gen2"])
-def test_value_that_comes_shortly_before_the_word_that_its_sensor_is_connected_waits_for_it(profile):
+def test_value_that_comes_shortly_before_the_message_that_its_sensor_is_connected_waits_for_it(profile):
     """Home Assistant publishes states while it starts, and that it runs once it has started."""
     rig, topic, _, clear = of_profile(profile)
     ((availability, (online, offline)),) = AVAILABILITY[profile].items()
@@ -282,7 +282,7 @@ def test_availability_is_understood_as_text_where_json_is_expected():
     assert rig.send(f"{HALL}/availability", "offline") == "unknown"
 
 
-def test_message_of_a_sensor_is_no_word_that_it_is_connected():
+def test_message_of_a_sensor_does_not_say_that_it_is_connected():
     rig, topic, _, clear = of_profile(OCCUPANCY)
     rig.send(topic, clear)
     (report,) = rig.fusion.node_reports(rig.now)

@@ -1,4 +1,4 @@
-"""How long an area stays clear on a robot's map after the aggregator's word has stopped, whatever stopped it.
+"""How long an area stays clear on a robot's map after the aggregator's heartbeat has stopped, whatever stopped it.
 
 Real processes, one fault after another; each test begins and ends with a clear area. The time is measured from the
 fault to the moment at which the map-service, by its own clock, took the area for unknown.
@@ -35,7 +35,7 @@ _log = logging.getLogger("live")
 """Logs measured times (`pytest --log-cli-level=info`)."""
 DISTURBED: Final = "tests.support.disturbed_aggregator"
 LIMIT_S: Final = 1.5
-"""No area is clear for longer without the aggregator's word: a heartbeat's maximum age, a tick and a new map."""
+"""No area is clear for longer without the aggregator's heartbeat: a heartbeat's maximum age, a tick and a new map."""
 BUSY_S: Final = 0.4
 """How much later a tick may come on a busy machine."""
 FAULT_S: Final = 3.0

@@ -218,7 +218,7 @@ def test_changed_definition_does_not_prolong_an_admins_clearance():
     assert fog.state() == ("unknown", 254), "10 s are over, and nobody lives that would end it"
 
 
-def test_retained_word_of_an_operator_that_an_area_is_clear_does_not_count():
+def test_retained_override_of_an_operator_that_an_area_is_clear_does_not_count():
     fog = Fog()
     fog.hear(declared_clear(3))
     assert fog.state() == ("unknown", 254)

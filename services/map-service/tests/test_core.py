@@ -337,7 +337,7 @@ def test_no_area_is_clear_while_the_aggregator_is_lost():
     assert cost_and_speed(rig, 0.75, 0.75) == (0, 0)
 
 
-def test_aggregator_that_knows_all_areas_has_the_last_word_on_them_though_its_versions_begin_anew():
+def test_aggregator_that_knows_all_areas_decides_on_them_though_its_versions_begin_anew():
     # Redis lost the areas, an administrator accepted that, and the aggregator started again.
     rig = make_rig()
     rig.on_definition(definition(version=5, epoch=1), 0.0)

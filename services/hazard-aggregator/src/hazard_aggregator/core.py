@@ -361,7 +361,7 @@ class Aggregator:
         """Hear what the broker distributes as our message: it must be ours.
 
         A hazard that an earlier run left retained is restored, so that a danger survives a restart without Redis. Our
-        own word is published again over every other one; against a higher epoch it needs a new epoch (`outranked_by`).
+        own message is published again over every other one; a higher epoch needs a new one of ours (`outranked_by`).
         """
         if hazard.area != ids["area"]:
             raise RefusedMessageError(f"it is about another area, {hazard.area}")

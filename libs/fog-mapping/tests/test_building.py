@@ -14,6 +14,7 @@ from fog_mapping.building import draw, find_trajectory
 from fog_mapping.poses import between, compose, place
 from fog_mapping.relations import absolute_error, relation_errors
 from fog_mapping.scans import Scan, keep_moved, scan_of
+from fog_mapping.trajectory import refuse_mirrored
 
 CELL = 0.05
 BEAMS = np.radians(np.arange(240) * 1.5 - 180.0)
@@ -152,6 +153,16 @@ def test_corridor_without_features_is_neither_folded_nor_shortened():
     assert absolute_error(found.poses, truth) < 0.5
     # Nothing along it tells how long it is: odometry says so, which is 5 % long.
     assert 0.98 < np.ptp(found.poses[:, 0]) / np.ptp(truth[:, 0]) < 1.06
+
+
+def test_lidar_on_its_head_is_noticed_and_one_that_stands_right_is_not():
+    scans, _ = FLOOR.drive(ROUND[:5], seed=5)
+    refuse_mirrored(scans)
+    flipped = [
+        scan._replace(points=scan.points[::-1] * (1, -1), normals=scan.normals[::-1] * (1, -1)) for scan in scans
+    ]
+    with pytest.raises(ValueError, match="The lidar stands on its head: mirror its angles"):
+        find_trajectory(flipped)
 
 
 def test_people_who_walk_by_leave_no_walls():

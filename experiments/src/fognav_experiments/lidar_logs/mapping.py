@@ -40,13 +40,16 @@ _REFUSED_COLOUR: Final = (220, 40, 40)
 
 @dataclass(frozen=True, kw_only=True, slots=True, eq=False)
 class MadeMap:
-    """A map, the poses (n, 3; m, rad) of the `used` scans, and the loops; `reference` (n, 3) if the log has one."""
+    """A map, the poses (n, 3; m, rad) of the `used` scans, and `reference` (n, 3) if the log has one.
+
+    loops: None if the poses are the reference.
+    """
 
     map: StaticMap
     used: Sequence[LogScan]
     poses: NDArray[np.float64]
     reference: NDArray[np.float64] | None
-    loops: Sequence[LoopGroup]
+    loops: list[LoopGroup] | None
     ambiguous: int
     seconds: float
 
@@ -57,7 +60,7 @@ class MadeMap:
             "loops": [
                 {"loop": group.name, "pairs": group.pairs, "kept": group.kept, "score": round(group.score, 3),
                  "residual_m": round(group.residual, 4), "at": [round(value, 2) for value in self._place(group)]}
-                for group in self.loops
+                for group in self.loops or ()
             ],
             "ambiguous": self.ambiguous,
             "seconds": round(self.seconds, 2),
@@ -79,13 +82,15 @@ class MadeMap:
 
     def lines(self) -> Iterator[str]:
         """Yield what the command prints: the loops with their evidence, and what could not be joined."""
-        for group in self.loops:
+        for group in self.loops or ():
             x, y = self._place(group)
             verdict = "" if group.kept else ": left out, it contradicts the others"
             yield (
                 f"loop {group.name} at ({x:.1f}, {y:.1f}): {group.pairs} matches, score {group.score:.2f}, "
                 f"{1000.0 * group.residual:.0f} mm rms{verdict}"
             )
+        if self.loops == []:
+            yield "no place was visited twice: nothing confirms the shape of this map. Drive back to where you began"
         if self.ambiguous:
             yield (
                 f"{self.ambiguous} pairs of places fit each other in more than one way: they were not joined. Where "
@@ -105,7 +110,7 @@ class MadeMap:
         at[:, 1] = geometry.height - at[:, 1]
         places = [(float(x), float(y)) for x, y in at]
         pen.line(places, fill=_WAY_COLOUR)
-        for group in self.loops:
+        for group in self.loops or ():
             colour = _KEPT_COLOUR if group.kept else _REFUSED_COLOUR
             pen.line((places[group.first], places[group.second]), fill=colour, width=3)
             pen.text(places[group.first], group.name, fill=colour)
@@ -178,7 +183,7 @@ def _at_reference(log: Sequence[LogScan], resolution: float, range_max: float) -
         built = draw(rays, resolution)
     except ValueError as error:
         raise WrongUseError(str(error)) from error
-    return MadeMap(map=built, used=used, poses=poses, reference=None, loops=(), ambiguous=0, seconds=0.0)
+    return MadeMap(map=built, used=used, poses=poses, reference=None, loops=None, ambiguous=0, seconds=0.0)
 
 
 def _pair(name: str) -> tuple[int, int]:

@@ -13,7 +13,7 @@ from fog_kernels.matching import BeamCounts
 from fog_mapping.loops import LoopSearch
 from fog_mapping.pose_graph import solve
 from fog_mapping.poses import place
-from fog_mapping.trajectory import match_in_order, settle
+from fog_mapping.trajectory import match_in_order, refuse_mirrored, settle
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Sequence
@@ -61,10 +61,11 @@ def find_trajectory(
     """Return where scans were taken; the same for the same arguments, whatever `jobs` (threads).
 
     without: pairs of scans (by their place in `scans`) that are no loop. extra: further edges. `on_progress` is called
-    with what is done now, and the share of it. Raises `ValueError` for fewer than two scans.
+    with what is done now, and the share of it. Raises `ValueError` for fewer than two scans, and for mirrored ones.
     """
     if len(scans) < 2:
         raise ValueError(f"a map needs two scans or more between which the robot has moved, not {len(scans)}")
+    refuse_mirrored(scans)
     poses, edges = match_in_order(scans, lambda done: on_progress("matching scans", done / len(scans)))
     edges.extend(extra)
     weights = np.ones(len(edges))

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
+from fog_kernels.matching import Reference
 from fog_mapping.pose_graph import Edge
 from fog_mapping.poses import between, compose
 from fog_mapping.scans import reference_of
@@ -31,6 +33,9 @@ _SEARCHED_SIGMAS: Final = 2.5
 _MOST_M: Final = 0.6
 _MOST_RAD: Final = 0.5
 _DOUBT: Final = 0.05
+_CLEAR_TURN_RAD: Final = 0.12
+_TURNS_CHECKED: Final = 40
+_MIRRORED_SHARE: Final = 0.75
 _ODOMETRY_SHARE: Final = 0.5
 """Odometry counts for as much less than its deviations say: they are those of a bad one."""
 
@@ -78,6 +83,28 @@ def match_in_order(
         edges.append(Edge(i - 1, i, between(poses[i - 1], poses[i]), information))
         on_progress(i + 1)
     return poses, edges
+
+
+def refuse_mirrored(scans: Sequence[Scan]) -> None:
+    """Raise `ValueError` if scans turn one way where the odometry turns the other: no map could come of it."""
+    mirrored = checked = 0
+    for before, scan in itertools.pairwise(scans):
+        x, y, turned = between(before.odometry, scan.odometry)
+        if abs(turned) < _CLEAR_TURN_RAD or checked == _TURNS_CHECKED:
+            continue
+        checked += 1
+        reference = Reference(before.points, before.normals)
+        scores = []
+        for turn in (turned, -turned):
+            guess = float(x), float(y), float(turn)
+            found = reference.search(scan.points, guess, 0.3, 0.3 * abs(turned), _TURN_STEP, 0.0)
+            scores.append(0.0 if found is None else found.score)
+        mirrored += scores[1] > scores[0]
+    if checked >= _TURNS_CHECKED // 4 and mirrored > _MIRRORED_SHARE * checked:
+        raise ValueError(
+            f"the scans turn left where the odometry turns right, in {mirrored} of {checked} turns. The lidar stands "
+            "on its head: mirror its angles (`mirrored` in robot.toml), or the odometry's, and record again"
+        )
 
 
 def settle(scans: Sequence[Scan], poses: NDArray[np.float64], sweeps: int = 2) -> NDArray[np.float64]:

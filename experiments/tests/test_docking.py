@@ -188,14 +188,6 @@ def test_robot_goes_to_its_dock_by_no_older_command(kind, words):
     assert not run.state.wants_dock
 
 
-def test_site_without_a_dock_and_a_robot_that_is_not_enabled_refuse():
-    run = Run(site=ring.ring_site())
-    assert "no dock" in run.robot.command("dock").reason
-    run = Run()
-    run.robot.command("disable")
-    assert "enable it first" in run.robot.command("dock").reason
-
-
 # --- a low battery ---
 
 
@@ -299,7 +291,3 @@ def test_robot_does_not_back_off_into_what_its_lidar_sees_behind_it():
     run.until(lambda: run.state.mode == "FAULT", 6.0)
     assert run.world.contacts == 0
     assert run.world.clearance() > 0.01
-
-
-def test_robot_without_a_bump_does_not_back_off():
-    assert "bumped into nothing" in Run().system.robot.command("back_off").reason

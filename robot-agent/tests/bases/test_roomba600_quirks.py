@@ -351,8 +351,8 @@ def test_a_robot_on_its_dock_is_left_in_passive_mode_and_comes_up_when_it_is_tak
 @pytest.mark.live
 @pytest.mark.parametrize(
     "quirks",
-    [QUIRKS["all at once"], Quirks(baud=19200), Quirks(baud=19200, keeps_baud=True)],
-    ids=["all quirks of the stream at once", "19200 baud", "19200 baud for good"],
+    [QUIRKS["all at once"], Quirks(baud=19200)],
+    ids=["all quirks of the stream at once", "19200 baud"],
 )
 def test_the_processes_drive_a_robot_with_quirks(tmp_path, quirks):
     with rigs.Rig(tmp_path, robot=RoombaEmulator(quirks=quirks)) as rig:

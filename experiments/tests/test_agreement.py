@@ -9,7 +9,6 @@ import msgspec
 import pytest
 
 from fognav_experiments import figures
-from fognav_experiments.comparison.document import to_markdown
 from fognav_experiments.comparison.drives import MeasuredDrive
 from fognav_experiments.comparison.records import Folder, FolderError, Record
 from fognav_experiments.comparison.repeated import (
@@ -21,6 +20,7 @@ from fognav_experiments.comparison.repeated import (
     resources,
 )
 from fognav_experiments.comparison.report import build
+from fognav_experiments.figures import to_markdown
 
 SHARED = {
     "setup": "fog", "run": 2, "route": "ab", "seed": 7, "area": "z4", "moment": "before", "trigger_m": 0.0,

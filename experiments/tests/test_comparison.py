@@ -17,13 +17,12 @@ from hypothesis import strategies as st
 
 from fog_runtime.configuration.site import load_site
 from fognav_experiments.comparison import runner
-from fognav_experiments.comparison.document import Table
 from fognav_experiments.comparison.drives import ExperimentSpec, RouteSpec, draw
 from fognav_experiments.comparison.limits import RouteGeometry, Saving, allowed_savings
 from fognav_experiments.comparison.live_drive import write_route
 from fognav_experiments.comparison.records import MOVE_BASE, Asked, Folder, FolderError
 from fognav_experiments.comparison.report import paired, publish
-from fognav_experiments.figures import compare, estimate, t_cdf, t_quantile
+from fognav_experiments.figures import Table, compare, estimate, t_cdf, t_quantile
 from fognav_experiments.machine import CpuMeter
 from fognav_experiments.rigs import System
 

@@ -1,6 +1,7 @@
-"""Means with confidence intervals, tests of paired differences, and plots. The same input gives the same bytes.
+"""What reports consist of: means with confidence intervals, tests of paired differences, plots, and pages as Markdown.
 
-Student's t (Gosset 1908), the paired t test, and the sign-flip test (Fisher 1935), which assumes no distribution.
+The same input gives the same bytes. Student's t (Gosset 1908), the paired t test, and the sign-flip test (Fisher 1935),
+which assumes no distribution.
 """
 
 from __future__ import annotations
@@ -8,11 +9,12 @@ from __future__ import annotations
 import io
 import itertools
 import math
+from dataclasses import dataclass
 from functools import cache
 from itertools import chain
 from math import nan
 from textwrap import fill
-from typing import TYPE_CHECKING, Final, NamedTuple
+from typing import TYPE_CHECKING, Any, Final, NamedTuple
 
 import numpy as np
 from matplotlib import rc_context
@@ -263,3 +265,73 @@ def _svg(figure: Figure) -> str:
         figure.savefig(data, format="svg", metadata={"Date": None, "Creator": None, "Format": None, "Type": None})
     text = " ".join(data.getvalue().split()).replace("> <", "><")
     return text[text.index("<svg") :] + "\n"
+
+
+@dataclass(frozen=True, slots=True)
+class Heading:
+    """A heading; level 1 is the title."""
+
+    text: str
+    level: int = 2
+
+
+@dataclass(frozen=True, slots=True)
+class Paragraph:
+    """A paragraph of plain text."""
+
+    text: str
+
+
+@dataclass(frozen=True, slots=True)
+class Code:
+    """Lines to be typed, or read as they are."""
+
+    text: str
+
+
+@dataclass(frozen=True, slots=True)
+class Table:
+    """A table of plain text."""
+
+    header: Sequence[str]
+    rows: Sequence[Sequence[str]]
+
+
+@dataclass(frozen=True, slots=True)
+class Picture:
+    """A figure as SVG, with the name of its file and a caption."""
+
+    file: str
+    svg: str
+    caption: str
+
+
+Block = Heading | Paragraph | Code | Table | Picture
+
+
+def to_markdown(blocks: Sequence[Block]) -> str:
+    """Return the document as Markdown, with its figures as files beside it."""
+    return "\n\n".join(_markdown(block) for block in blocks) + "\n"
+
+
+def _markdown(block: Block) -> str:
+    match block:
+        case Heading():
+            return f"{'#' * block.level} {block.text}"
+        case Paragraph():
+            return block.text
+        case Code():
+            return f"```\n{block.text}\n```"
+        case Table():
+            rows = [block.header, ["---"] * len(block.header), *block.rows]
+            return "\n".join(f"| {' | '.join(cell.replace('|', chr(92) + '|') for cell in row)} |" for row in rows)
+        case Picture():
+            return f"![{block.caption}]({block.file})\n\n*{block.caption}*"
+
+
+def flat(values: Mapping[str, Any], prefix: str = "") -> list[tuple[str, Any]]:
+    """Return nested values as pairs of a name and a value."""
+    found = []
+    for name, value in values.items():
+        found += flat(value, f"{prefix}{name} ") if isinstance(value, dict) else [(f"{prefix}{name}", value)]
+    return found

@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, Any, Final, NamedTuple
 import numpy as np
 
 from fog_contracts.site import learned_share
-from fognav_experiments.figures import curves, write_png
+from fognav_experiments.figures import Table, curves, to_markdown, write_png
 from hazard_aggregator.debounce import Observation, SonarSample, make_rule
 from hazard_aggregator.registry import find_rule
 
@@ -178,9 +178,8 @@ def measure(
 def table(rows: Sequence[Mapping[str, Any]]) -> list[str]:
     """Return the rows as a table in Markdown."""
     names = list(rows[0])
-    lines = [[name.replace("_", " ") for name in names], ["---"] * len(names)]
-    lines += [[str(row[name]) for name in names] for row in rows]
-    return [f"| {' | '.join(line)} |" for line in lines]
+    cells = [[str(row[name]) for name in names] for row in rows]
+    return to_markdown([Table([name.replace("_", " ") for name in names], cells)]).splitlines()
 
 
 def calibrate(recording: Recording, rate: float, rng: np.random.Generator) -> float:

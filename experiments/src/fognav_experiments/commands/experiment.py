@@ -217,7 +217,7 @@ def scenarios_command(
     ends in another way.
     """
     from fog_runtime.files import SHARED, atomic_write  # noqa: PLC0415  # keeps the other commands fast
-    from fognav_experiments.comparison.document import flat  # noqa: PLC0415  # same
+    from fognav_experiments.figures import flat  # noqa: PLC0415  # same
     from fognav_experiments.scenarios.play import ScenarioError, markdown_page, play, read_scenario  # noqa: PLC0415  # same
 
     with exit_codes():

@@ -19,8 +19,7 @@ from fog_kernels.astar import Planner
 from fog_kernels.inflation import inflate, inflation_table
 from fog_kernels.raycast import cast
 from fog_kernels.spans import raise_costs
-from fognav_experiments.comparison.document import Block, Paragraph, Table
-from fognav_experiments.figures import estimate
+from fognav_experiments.figures import Block, Paragraph, Table, estimate
 from fognav_experiments.onboard.navigator import Search
 from fognav_sim.barrier import barrier_across
 from fognav_sim.drive.hazard import PlannedHazard, is_clear_of_robot, remaining

@@ -10,9 +10,8 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Final, NamedTuple
 
 from fognav_experiments import figures
-from fognav_experiments.comparison.document import Block, Figure, Heading, Paragraph, Table
 from fognav_experiments.comparison.drives import KINDS, ROBOTS_PROCESSES, route_ends
-from fognav_experiments.figures import Estimate, estimate
+from fognav_experiments.figures import Block, Estimate, Heading, Paragraph, Picture, Table, estimate
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
@@ -245,7 +244,7 @@ def memory(measured: Sequence[MeasuredDrive]) -> list[Block]:
     )
     rows = [[name, *(_text(series[setup][number]) for setup in setups)] for number, name in enumerate(titles)]
     return [
-        Figure(MEMORY_FILE, figures.bars(title, "MB", titles, series), caption),
+        Picture(MEMORY_FILE, figures.bars(title, "MB", titles, series), caption),
         Table([f"{title}, MB", *setups], rows),
     ]
 
@@ -284,7 +283,7 @@ def _charts(kind: Kind, pairs: Sequence[Compared]) -> list[Block]:
             f"{quantity.title.lower()} in lockstep and by {_BY[kind][0]}, with 95 % confidence intervals."
         )
         svg = figures.bars(f"{quantity.title}, lockstep and {kind}", quantity.unit, groups, series)
-        blocks.append(Figure(f"{kind}-{quantity.file}.svg", svg, caption))
+        blocks.append(Picture(f"{kind}-{quantity.file}.svg", svg, caption))
         columns += [[str(found) for found in values] for values in series.values()]
         columns.append([
             str(estimate([quantity.value(pair.live) - quantity.value(pair.lockstep) for pair in drives]))

@@ -13,16 +13,6 @@ from fog_runtime.configuration.site import load_site
 from fog_runtime.files import SHARED, atomic_write
 from fognav_experiments import figures
 from fognav_experiments.comparison import limits, repeated, runner
-from fognav_experiments.comparison.document import (
-    Block,
-    Code,
-    Figure,
-    Heading,
-    Paragraph,
-    Table,
-    flat,
-    to_markdown,
-)
 from fognav_experiments.comparison.drives import KINDS, draw, route_ends
 from fognav_experiments.comparison.limits import RouteGeometry
 from fognav_experiments.comparison.records import (
@@ -39,7 +29,19 @@ from fognav_experiments.comparison.records import (
 )
 from fognav_experiments.comparison.repeated import SETUPS
 from fognav_experiments.comparison.thesis import QUANTITIES, Drives, beside_thesis, paired, places
-from fognav_experiments.figures import Estimate, compare, estimate
+from fognav_experiments.figures import (
+    Block,
+    Code,
+    Estimate,
+    Heading,
+    Paragraph,
+    Picture,
+    Table,
+    compare,
+    estimate,
+    flat,
+    to_markdown,
+)
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
@@ -194,7 +196,7 @@ def _routes(pairs: Sequence[Drives], setups: Sequence[ProfileName]) -> list[Bloc
         ]
         groups = [route_ends(route) for route in routes]
         svg = figures.bars(quantity.title, quantity.unit, groups, series)
-        blocks.append(Figure(f"{quantity.file}.svg", svg, quantity.caption))
+        blocks.append(Picture(f"{quantity.file}.svg", svg, quantity.caption))
         blocks.append(Table([f"{quantity.title}, {quantity.unit}", *setups], rows))
     return blocks
 
@@ -276,7 +278,7 @@ def _tracks(pairs: Sequence[Drives], setups: Sequence[ProfileName], site: Site |
     caption = (
         f"As figures 6.1 and 6.2: run {record.run}, {route_ends(record.route)}, {record.area} is blocked: {lengths}."
     )
-    return [Figure("tracks.svg", svg, caption)]
+    return [Picture("tracks.svg", svg, caption)]
 
 
 def _ends(record: Record, site: Site) -> tuple[Sequence[tuple[float, float]], dict[str, tuple[float, float]]]:
@@ -354,7 +356,7 @@ def publish(folder: Folder, target: Path, site: Path | None = None) -> list[Path
     texts = {
         "README.md": to_markdown(blocks),
         "summary.csv": summary.getvalue(),
-        **{block.file: block.svg for block in blocks if isinstance(block, Figure)},
+        **{block.file: block.svg for block in blocks if isinstance(block, Picture)},
     }
     for name, text in texts.items():
         atomic_write(target / name, text.encode(), mode=SHARED)

@@ -17,18 +17,20 @@ import msgspec
 
 from fog_contracts.messages import NodeConfig
 from fog_runtime.files import SHARED, atomic_write
-from fognav_experiments.comparison.document import (
+from fognav_experiments.comparison.drives import DrivenRoute, start_of
+from fognav_experiments.figures import (
     Block,
     Code,
-    Figure,
+    Estimate,
     Heading,
     Paragraph,
+    Picture,
     Table,
+    estimate,
     flat,
+    heat_map,
     to_markdown,
 )
-from fognav_experiments.comparison.drives import DrivenRoute, start_of
-from fognav_experiments.figures import Estimate, estimate, heat_map
 from fognav_experiments.lockstep import release_drives, run_lockstep
 from fognav_experiments.machine import results
 from fognav_experiments.rigs import Tuning
@@ -250,7 +252,7 @@ def publish(
         blocks.append(Table(["drive", "outcome"], [[drive.name, drive.outcome] for drive in failed]))
     texts = {
         "README.md": to_markdown(blocks),
-        **{block.file: block.svg for block in blocks if isinstance(block, Figure)},
+        **{block.file: block.svg for block in blocks if isinstance(block, Picture)},
     }
     for name, content in texts.items():
         atomic_write(target / name, content.encode(), mode=SHARED)
@@ -282,7 +284,7 @@ def _plane(drives: Sequence[SweptDrive], plane: Plane) -> list[Block]:
     ]  # fmt: skip
     return [
         Heading(f"{plane.x.quantity} and {plane.y.quantity}"),
-        Figure(
+        Picture(
             f"{name}.svg",
             heat_map(
                 "What the fog saves per route",

@@ -9,10 +9,9 @@ from collections import defaultdict
 from typing import TYPE_CHECKING, Final, NamedTuple
 
 from fognav_experiments.comparison import repeated
-from fognav_experiments.comparison.document import Block, Paragraph, Table
 from fognav_experiments.comparison.records import MOVE_BASE, ON_ROBOT
 from fognav_experiments.comparison.repeated import SETUPS
-from fognav_experiments.figures import Estimate, compare, estimate
+from fognav_experiments.figures import Block, Estimate, Paragraph, Table, compare, estimate
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence

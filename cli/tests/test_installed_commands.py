@@ -24,7 +24,7 @@ def app(monkeypatch: pytest.MonkeyPatch) -> typer.Typer:
     monkeypatch.setattr(parts, "_points", lambda *_: metadata.EntryPoints(points))
     monkeypatch.setattr(metadata.EntryPoint, "load", lambda _: add_to)
     LOADED.clear()
-    app = typer.Typer(cls=installed.Commands, rich_markup_mode=None)
+    app = typer.Typer(name=installed.PROGRAM, cls=installed.Commands, rich_markup_mode=None)
     app.callback()(lambda: None)  # else the only command would take no name
     app.command("own")(lambda: typer.echo("done"))
     return app

@@ -7,7 +7,7 @@ from typer.testing import CliRunner
 
 from fognav.__main__ import app
 from fognav.commands import area
-from fognav.operate.systems import MAP_SERVICE
+from fognav.programs import MAP_SERVICE
 
 
 def view(area, state, penalty, cause, **more):

@@ -10,8 +10,7 @@ from typer.testing import CliRunner
 from fognav import kernels, system
 from fognav.__main__ import app
 from fognav.demo import view
-from fognav.nodes import simulated
-from fognav_sim import nodes
+from fognav_sim import live, nodes
 from fognav_sim.nodes import why_model
 
 
@@ -25,7 +24,7 @@ def no_work(monkeypatch: pytest.MonkeyPatch) -> None:
         raise ReachedError
 
     monkeypatch.setattr(kernels, "warm_cache", lambda _: None)
-    for module, name in ((view, "run_demo"), (simulated, "run")):
+    for module, name in ((view, "run_demo"), (live, "StillFloor")):
         monkeypatch.setattr(module, name, reached)
 
 

@@ -33,8 +33,8 @@ from fognav import site_files
 from fognav.commands import node as node_command
 from fognav.commands.node import node_app
 from fognav.nodes import board_settings, on_broker
-from fognav.operate.systems import AGGREGATOR
 from fognav.output import FailedError, WrongUseError
+from fognav.programs import AGGREGATOR
 from fognav_sim.nodes import Core, FirmwareError, build_library, find_compiler
 from hazard_aggregator.debounce.evidence import Options, learned_rates
 
@@ -450,7 +450,7 @@ def test_calibration_warns_of_a_sonar_that_hears_more_than_the_rule_takes_into_a
     said = " ".join(done.stderr.split())
     assert "warning: sonar 2 hears something in 10 % of the readings" in said
     assert "warning: sonar 1" not in said
-    assert pytest.approx(learned_rates(Options())[1], abs=5e-4) == node_command.LIKELIEST_FALSE_ECHOES
+    assert pytest.approx(learned_rates(Options())[1], abs=5e-4) == on_broker.LIKELIEST_FALSE_ECHOES
 
 
 def test_board_with_another_number_of_sonars_is_told_and_not_written(monkeypatch, floor: Path) -> None:

@@ -14,11 +14,11 @@ from fog_contracts.site import NodeSite, Sonar
 from fog_runtime.clock import SystemClock
 from fog_runtime.configuration.site import load_site
 from fognav import checkout
-from fognav.nodes.simulated import StillFloor
 from fognav.output import FailedError, WrongUseError
 from fognav_experiments.bench import false_echoes, warning
 from fognav_experiments.bench.false_echoes import Asked, FalseEchoes, calibrated
 from fognav_experiments.bench.warning import Arrived
+from fognav_sim.live import StillFloor
 
 needs_compiler = pytest.mark.skipif(
     shutil.which("g++") is None, reason="the firmware's code needs a C++ compiler (g++)"

@@ -25,7 +25,7 @@ from fognav.doctor import doctor_command
 from fognav.output import OK
 
 app = typer.Typer(
-    name="fognav",
+    name=installed.PROGRAM,
     cls=installed.Commands,
     help="Keep a small indoor robot out of danger that it can't see yet.",
     no_args_is_help=True,

@@ -10,7 +10,7 @@ from fog_contracts.site import AreaSite, DemoPlan, NodeSite, Place, RobotSite, S
 from fog_runtime.configuration.maps import MapFileError, load_map, save_map
 from fog_runtime.configuration.site import SITE_FILE, LoadedSite, SiteError, load_site
 from fog_runtime.files import SHARED, atomic_write
-from fognav.output import FailedError, WrongUseError
+from fognav.output import FailedError, WrongUseError, writing
 
 
 def _number(value: float) -> str:
@@ -215,10 +215,8 @@ def _check(folder: Path, text: str) -> None:
 def write(loaded: LoadedSite, text: str) -> None:
     """Replace the site's file by a text that was found valid; raises `WrongUseError`."""
     file = loaded.directory / SITE_FILE
-    try:
+    with writing(file, "Run this as its owner"):
         atomic_write(file, text.encode(), mode=SHARED)
-    except OSError as error:
-        raise WrongUseError(f"{file} can't be written: {error.strerror}") from error
 
 
 _ID_LENGTH = 32
@@ -260,12 +258,10 @@ def new_site(map_file: Path, out: Path, seed: int) -> dict[str, object]:
         site, why = propose(identifier(out.resolve().name), map_name, static.geometry, static.cells, seed)
     except (MapFileError, NoSiteError) as error:
         raise WrongUseError(str(error)) from error
-    try:
+    with writing(target, "Name another folder with --out"):
         if copied is not None:
             save_map(copied.with_suffix(""), static)
         atomic_write(target, to_toml(site).encode(), mode=SHARED)
-    except OSError as error:
-        raise WrongUseError(f"{target} can't be written: {error.strerror}. Name another folder with --out") from error
     try:
         load_site(out)
     except SiteError:

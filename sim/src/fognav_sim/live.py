@@ -3,39 +3,49 @@
 from __future__ import annotations
 
 import asyncio
+import math
 import time
 from collections import deque
 from contextlib import ExitStack
 from typing import TYPE_CHECKING, Final, Protocol, Self
 
 import msgspec
+import numpy as np
 from prometheus_client import Gauge
 
 from fog_contracts import channels as ch
+from fog_contracts.costs import FREE
 from fog_contracts.geometry import GeometryError
-from fog_contracts.messages import CommandReply, NodeConfig, Reason, SimCommand, SimRefusal
+from fog_contracts.messages import CommandReply, NodeConfig, Pose, Reason, SimCommand, SimObstacle, SimRefusal
+from fog_contracts.site import RobotSite
 from fog_runtime import logs
 from fog_runtime.clock import Ticker
 from fog_runtime.credentials import NOBODY, Credentials
 from fog_runtime.transports.mqtt_edge import MqttEdge, Will
+from fognav_sim.floor import Floor
 from fognav_sim.hardware import STEP_S
 from fognav_sim.pty_port import PtyPort
+from fognav_sim.world import World
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping
+    from collections.abc import Mapping, Sequence
     from pathlib import Path
     from types import TracebackType
 
+    from fog_contracts.geometry import Point
     from fog_runtime.clock import Clock
+    from fog_runtime.configuration.site import LoadedSite
     from fog_runtime.transports.zenoh_edge import ZenohEdge
     from fognav_sim.hardware import Hardware
     from fognav_sim.nodes import SensorNode
-    from fognav_sim.world import World
 
 LOG_S: Final = 0.01
 CATCH_UP_S: Final = 0.25
 """A simulation that is further behind than this skips the time; its sustained speed then drops."""
 _SPEED_OVER_S: Final = 5.0
+PERSON_RADIUS_M: Final = 0.25
+_MITE_M: Final = 0.01
+_MITE_AXLE_M: Final = 0.235
 
 _log = logs.get("sim")
 _SUSTAINED = Gauge("fognav_sim_sustained_speed", "Simulated seconds per wall second, over the last 5 s")
@@ -183,6 +193,35 @@ class MeasuredFloor(Protocol):
     @property
     def now(self) -> float:
         """The time up to which the world has been simulated (s of the clock)."""
+
+
+class StillFloor:
+    """A floor on which nothing moves: what virtual nodes measure to try a site before it is built."""
+
+    def __init__(
+        self, loaded: LoadedSite, persons: Sequence[Point], clock: Clock, *, world: type[World] = World
+    ) -> None:
+        """Put persons on the site's floor, a `world`; raises `ValueError` for one that does not stand on it."""
+        self._clock = clock
+        self.silent_nodes: frozenset[str] = frozenset()
+        # A world has a robot: here one that lies below every sensor's cone.
+        x, y = loaded.map.geometry.centre(*np.argwhere(loaded.map.cells == FREE)[0][::-1].tolist())
+        mite = RobotSite(id="mite", start=Pose(x=x, y=y, theta=0.0), radius=_MITE_M, height=_MITE_M)
+        self.world = world(Floor(loaded.map.geometry, loaded.map.cells), mite, seed=1, axle_m=_MITE_AXLE_M)
+        for index, (x, y) in enumerate(persons):
+            if not loaded.map.geometry.contains(x, y):
+                raise ValueError(f"{x:g},{y:g} is not on the map")
+            angles = np.linspace(0.0, math.tau, 16, endpoint=False)
+            ring = [(x + PERSON_RADIUS_M * math.cos(a), y + PERSON_RADIUS_M * math.sin(a)) for a in angles]
+            try:
+                self.world.place(SimObstacle(id=f"person-{index + 1}", polygon=ring, height=1.7))
+            except (GeometryError, ValueError) as error:
+                raise ValueError(f"{x:g},{y:g}: {error}") from error
+
+    @property
+    def now(self) -> float:
+        """The time at which the floor is measured (s)."""
+        return self._clock.now()
 
 
 class VirtualNode:

@@ -9,8 +9,8 @@ from fog_contracts.costs import INSCRIBED
 from fognav.commands import installed
 from fognav.operate.fog import find_fog
 from fognav.operate.options import FogOption, JsonOption, duration
-from fognav.operate.systems import AGGREGATOR, MAP_SERVICE
 from fognav.output import WrongUseError, exit_codes, local_time, print_list, print_result
+from fognav.programs import AGGREGATOR, MAP_SERVICE
 
 area_app = typer.Typer(help="List the watched areas and their history, and override one.", no_args_is_help=True)
 
@@ -131,7 +131,7 @@ def _alert(alert: Mapping[str, Any]) -> str:
 
 
 map_app = typer.Typer(
-    cls=installed.MapCommands, help="Make maps of buildings; show the hazards on the fog's map.", no_args_is_help=True
+    cls=installed.Commands, help="Make maps of buildings; show the hazards on the fog's map.", no_args_is_help=True
 )
 
 

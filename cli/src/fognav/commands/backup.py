@@ -14,7 +14,6 @@ import typer
 from fog_runtime.configuration.site import load_site
 from fognav.operate.fog import Fog, find_fog
 from fognav.operate.options import FogOption, JsonOption
-from fognav.operate.systems import AGGREGATOR, MAP_SERVICE, PLANNER
 from fognav.output import (
     NOT_TRUE,
     FailedError,
@@ -24,6 +23,7 @@ from fognav.output import (
     print_answer,
     print_result,
 )
+from fognav.programs import AGGREGATOR, MAP_SERVICE, PLANNER
 
 FileArgument = Annotated[Path, typer.Argument(metavar="FILE", help="The backup, a tar.gz that only you can read.")]
 RedisOption = Annotated[str, typer.Option("--redis", envvar="FOGNAV_REDIS_URL", help="Redis of the fog node.")]

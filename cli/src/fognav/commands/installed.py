@@ -11,7 +11,7 @@ An entry is a function that gets a `typer.Typer` and adds to it; the `rich_help_
 from __future__ import annotations
 
 from types import FunctionType
-from typing import TYPE_CHECKING, Any, ClassVar, Final
+from typing import TYPE_CHECKING, Any, Final
 
 import typer
 from typer.core import TyperGroup
@@ -22,6 +22,10 @@ from fognav.output import fail
 
 if TYPE_CHECKING:
     from collections.abc import Callable
+
+PROGRAM: Final = "fognav"
+ENTRY_POINTS: Final = "fognav.commands"
+"""Of the command line; those of `fognav site` are in `fognav.commands.site`, and so on."""
 
 TRY_IT: Final = "Try it"
 OPERATE: Final = "Operate"
@@ -35,9 +39,11 @@ GROUPS: Final = (TRY_IT, OPERATE, SET_UP, RUN, MEASURE, DEVELOP, OTHERS)
 
 
 class Commands(TyperGroup):
-    """The command line; others are loaded only when it does not know a command itself, and to list all."""
+    """The command line, or one of its commands that has others.
 
-    entry_points: ClassVar = "fognav.commands"
+    Those of packages are loaded only when it does not know a command itself, and to list all.
+    """
+
     _loaded = False
 
     def list_commands(self, ctx: Any) -> list[str]:  # noqa: ANN401  # typer's class is private
@@ -71,22 +77,11 @@ class Commands(TyperGroup):
             return
         self._loaded = True
         added = typer.Typer(rich_markup_mode=self.rich_markup_mode)
+        group = ENTRY_POINTS if self.name == PROGRAM else f"{ENTRY_POINTS}.{self.name}"
         try:
-            for name in parts.names(self.entry_points):
-                add_to: Callable[[typer.Typer], None] = parts.load(self.entry_points, name, FunctionType)
+            for name in parts.names(group):
+                add_to: Callable[[typer.Typer], None] = parts.load(group, name, FunctionType)
                 add_to(added)
         except parts.PartError as error:
             fail(str(error))
         self.commands.update(get_group(added).commands)
-
-
-class MapCommands(Commands):
-    """The same for `fognav map`."""
-
-    entry_points: ClassVar = "fognav.commands.map"
-
-
-class SiteCommands(Commands):
-    """The same for `fognav site`."""
-
-    entry_points: ClassVar = "fognav.commands.site"

@@ -13,7 +13,8 @@ import typer
 
 from fog_contracts import channels as ch
 from fog_contracts.messages import NodeCalibration, NodeReading, NodeUpdate
-from fog_contracts.site import NodeSite, Sonar, learned_share
+from fog_contracts.site import NodeSite
+from fog_runtime.clock import SystemClock
 from fog_runtime.configuration.site import LoadedSite, load_site
 from fog_runtime.credentials import Credentials
 from fognav import checkout, kernels, site_files, system
@@ -22,7 +23,6 @@ from fognav.nodes import on_broker
 from fognav.nodes.board_settings import SITE, BoardOptions, SiteOption, credentials_in, node_in, with_board_options
 from fognav.operate.fog import Fog, find_fog
 from fognav.operate.options import NUMBERS, FogOption, JsonOption, checked_id, numbers
-from fognav.operate.systems import AGGREGATOR, BROKER
 from fognav.output import (
     FailedError,
     WrongUseError,
@@ -33,12 +33,11 @@ from fognav.output import (
     print_list,
     print_result,
 )
+from fognav.programs import AGGREGATOR, BROKER
 
 node_app = typer.Typer(help="Add, watch, calibrate and simulate sensor nodes.", no_args_is_help=True)
 
 T = TypeVar("T")
-LIKELIEST_FALSE_ECHOES: Final = 0.035
-"""A rate of false echoes counts as no more by the default options of the rule `evidence`, as a test compares."""
 
 NameArgument = Annotated[str, typer.Argument(metavar="NODE", help="The node's id: a to z, 0 to 9 and -.")]
 BrokerOption = Annotated[
@@ -167,7 +166,7 @@ def node_calibrate(  # noqa: PLR0913  # each option is an argument
         ]
         unlike: list[str] = []
         if loaded is not None and node is not None and not failed and not no_echo:
-            with_limits = _with_limits(node, learned)
+            with_limits = on_broker.with_limits(node, learned)
             unlike = [] if force else _unlike_the_map(loaded, node, learned)
             if not unlike:
                 site_files.replace(loaded, with_limits)
@@ -178,10 +177,10 @@ def node_calibrate(  # noqa: PLR0913  # each option is an argument
                 silent = ", no echo is clear" if learned.no_echo_is_clear[index] else ""
                 print_line(
                     f"sonar {index + 1}: {_RESULTS[learned.result[index]]}; blocked below {limit:.2f} m{silent}"
-                    f"{_free_space(learned, index)}"
+                    f"{on_broker.free_space(learned, index)}"
                 )
         for index in range(len(learned.samples)):
-            if warning := _hears_too_much(learned, index):
+            if warning := on_broker.hears_too_much(learned, index):
                 print_line(warning)
         if failed:
             raise FailedError(f"node {name} keeps its old limits: {', '.join(failed)}")
@@ -281,7 +280,8 @@ def node_sim(  # noqa: PLR0913  # each option is an argument
     A broker with passwords lets it in by its board's settings (--board), or by the credentials that the environment
     names.
     """
-    from fognav.nodes import simulated  # noqa: PLC0415  # the simulator's imports are slow
+    from fognav_sim.live import StillFloor, VirtualNode, run_nodes  # noqa: PLC0415  # the simulator's imports are slow
+    from fognav_sim.nodes import make_nodes  # noqa: PLC0415  # same
 
     with exit_codes():
         loaded = load_site(checkout.site_folder(site))
@@ -293,7 +293,13 @@ def node_sim(  # noqa: PLR0913  # each option is an argument
         url, _, _ = _on(fog, broker, loaded.site.id)
         kernels.warm_cache(print_line)
         system.prepare_node_code(print_line)
-        _run(_bounded(simulated.run(loaded, node, url, own, [(x, y) for x, y in persons]), seconds))
+        clock = SystemClock()
+        try:
+            floor = StillFloor(loaded, [(x, y) for x, y in persons], clock)
+        except ValueError as error:
+            raise WrongUseError(f"--person {error}") from error
+        (sonars,) = make_nodes([node], int(time.time()), clock.now())
+        _run(_bounded(run_nodes([VirtualNode(sonars, floor, url, clock, loaded.site.id, own)], clock), seconds))
 
 
 _RESULTS: Final = {
@@ -415,53 +421,6 @@ def _unlike_the_map(loaded: LoadedSite, node: NodeSite, learned: NodeCalibration
         return unlike_the_map(loaded.map, node, learned)
     except PlacingError as error:
         return [f"node {node.id}: {error}"]
-
-
-def _with_limits(node: NodeSite, learned: NodeCalibration) -> NodeSite:
-    if len(node.sonars) != len(learned.range_limit_m):
-        raise FailedError(
-            f"node {node.id} has learned {len(learned.range_limit_m)} limits, and has {len(node.sonars)} sonars in the "
-            "site: make site.toml and the board's settings agree"
-        )
-    sonars = [_calibrated(sonar, learned, index) for index, sonar in enumerate(node.sonars)]
-    return msgspec.structs.replace(node, sonars=sonars)
-
-
-def _calibrated(sonar: Sonar, learned: NodeCalibration, index: int) -> Sonar:
-    """Return a sonar with what its node has learned of it; an older firmware does not count false echoes."""
-    counted = index < min(len(learned.samples), len(learned.false_echoes)) and learned.samples[index] > 0
-    rate = sonar.false_echo_rate
-    if counted:
-        rate = round(learned_share(learned.false_echoes[index], learned.samples[index]), 4)
-    return msgspec.structs.replace(
-        sonar,
-        range_limit=min(4.0, learned.range_limit_m[index]),
-        range_max=(learned.range_max_m[index] or None) if index < len(learned.range_max_m) else sonar.range_max,
-        no_echo_is_clear=learned.no_echo_is_clear[index],
-        false_echo_rate=rate,
-    )
-
-
-def _free_space(learned: NodeCalibration, index: int) -> str:
-    """Return what a calibration says of the samples of free space, if anything."""
-    if index >= min(len(learned.samples), len(learned.false_echoes), len(learned.no_echoes)):
-        return ""
-    near, none, samples = learned.false_echoes[index], learned.no_echoes[index], learned.samples[index]
-    return f"; of {samples} samples {near} echoed from nearer, {none} not at all" if samples else ""
-
-
-def _hears_too_much(learned: NodeCalibration, index: int) -> str:
-    """Return a warning of a sonar with more false echoes than the rule `evidence` takes into account, if it has."""
-    if not learned.samples[index] or index >= len(learned.false_echoes):
-        return ""
-    rate = learned_share(learned.false_echoes[index], learned.samples[index])
-    if rate <= LIKELIEST_FALSE_ECHOES:
-        return ""
-    return (
-        f"warning: sonar {index + 1} hears something in {100 * rate:.0f} % of the readings of its free area, and "
-        f"false alarms are likely from {100 * LIKELIEST_FALSE_ECHOES:.1f} % on: turn it away from what it hears (an "
-        "edge, the floor, another sonar) and calibrate it again"
-    )
 
 
 def _line(node: dict[str, Any]) -> str:

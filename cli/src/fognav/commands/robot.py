@@ -17,7 +17,6 @@ from fog_runtime import logs
 from fognav.operate import robot_commands
 from fognav.operate.fog import Fog, Outcome, RefusedError, find_fog
 from fognav.operate.options import NUMBERS, FogOption, JsonOption, RobotOption, numbers
-from fognav.operate.systems import MAP_SERVICE, PLANNER
 from fognav.output import (
     NOT_TRUE,
     FailedError,
@@ -29,6 +28,7 @@ from fognav.output import (
     print_line,
     print_result,
 )
+from fognav.programs import MAP_SERVICE, PLANNER
 
 robot_app = typer.Typer(help="Send, stop and watch robots; describe a new one.", no_args_is_help=True)
 

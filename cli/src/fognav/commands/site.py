@@ -11,7 +11,7 @@ from fognav.hosting.compose_floors import OVERRIDE, write_override
 from fognav.operate.options import JsonOption
 from fognav.output import NOT_TRUE, exit_codes, fail, print_json, print_line, print_result
 
-site_app = typer.Typer(cls=installed.SiteCommands, help="Create and check sites.", no_args_is_help=True)
+site_app = typer.Typer(cls=installed.Commands, help="Create and check sites.", no_args_is_help=True)
 
 
 @site_app.command(

@@ -9,8 +9,8 @@ from fog_contracts.messages import AreaDefinition, Limits, Source
 from fognav.credentials import CredentialsOption, open_security, security_errors
 from fognav.operate.fog import Fog, find_fog
 from fognav.operate.options import FogOption, JsonOption, checked_id
-from fognav.operate.systems import AGGREGATOR
 from fognav.output import FailedError, WrongUseError, exit_codes, print_list, print_result
+from fognav.programs import AGGREGATOR
 from hazard_aggregator.source_values import PROFILES
 
 source_app = typer.Typer(help="Use sensors that speak MQTT as evidence for an area.", no_args_is_help=True)

@@ -12,8 +12,9 @@ from fog_runtime.transports.zenoh_edge import ZenohEdge
 from fognav.credentials import own_credentials
 from fognav.operate.fog import FOG, Fog, find_fog
 from fognav.operate.options import FogOption, JsonOption
-from fognav.operate.systems import ROUTER, SERVICE_PORTS, System, find_systems
+from fognav.operate.systems import SERVICE_PORTS, System, find_systems
 from fognav.output import FailedError, exit_codes, fail, print_answer, print_json
+from fognav.programs import ROUTER
 
 
 def status_command(*, fog: FogOption = None, json: JsonOption = False) -> None:

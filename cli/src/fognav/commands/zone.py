@@ -8,8 +8,8 @@ import typer
 
 from fognav.operate.fog import find_fog
 from fognav.operate.options import FogOption, JsonOption, duration, moment, numbers, points, weekly
-from fognav.operate.systems import MAP_SERVICE
 from fognav.output import WrongUseError, exit_codes, local_time, print_result
+from fognav.programs import MAP_SERVICE
 
 zone_app = typer.Typer(help="Draw, list, show, switch and remove zones.", no_args_is_help=True)
 

@@ -27,7 +27,7 @@ from fog_runtime.security.site_security import SiteSecurity
 from fognav import checkout
 from fognav.credentials import CredentialsOption, credentials_folder, open_security, security_errors
 from fognav.operate.options import JsonOption
-from fognav.output import WrongUseError, print_json, print_line
+from fognav.output import WrongUseError, print_json, print_line, writing
 
 SETTINGS_FILE: Final = "node.json"
 AUTHORITY_FILE: Final = "ca.pem"
@@ -177,13 +177,11 @@ def _hashed(password: str) -> str:
 
 def _write(file: Path, data: bytes, like: os.stat_result | None = None) -> None:
     """Write a file with the owner, group and permissions of `like`; None: for the caller only."""
-    try:
+    with writing(file):
         file.parent.mkdir(parents=True, exist_ok=True)
         atomic_write(file, data, mode=PRIVATE if like is None else stat.S_IMODE(like.st_mode))
         if like is not None:
             os.chown(file, like.st_uid, like.st_gid)
-    except OSError as error:
-        raise WrongUseError(f"{file} can't be written: {error.strerror}") from error
 
 
 SITE: Final = Path("estig")

@@ -15,6 +15,7 @@ from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from typing import TYPE_CHECKING, Final
 
 import aiomqtt
+import msgspec
 from cryptography.exceptions import UnsupportedAlgorithm
 from cryptography.hazmat.primitives.asymmetric import ec
 from cryptography.hazmat.primitives.hashes import SHA256
@@ -29,11 +30,12 @@ from cryptography.hazmat.primitives.serialization import (
 from fog_contracts import channels as ch
 from fog_contracts.codec import ContractError, decode, decode_text, encode, encode_text
 from fog_contracts.messages import NodeCalibration, NodeReading, NodeUpdate
+from fog_contracts.site import NodeSite, Sonar, learned_share
 from fog_runtime.credentials import NOBODY, Credentials
 from fog_runtime.files import PRIVATE, atomic_write
 from fog_runtime.health import reachable_address
 from fog_runtime.transports.mqtt_connection import Broker
-from fognav.output import FailedError, WrongUseError
+from fognav.output import FailedError, WrongUseError, writing
 
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator, Iterator
@@ -55,12 +57,9 @@ def make_key(file: Path) -> str:
     """
     if not file.exists():
         key = ec.generate_private_key(ec.SECP256R1())
-        try:
-            atomic_write(
-                file, key.private_bytes(Encoding.PEM, PrivateFormat.TraditionalOpenSSL, NoEncryption()), mode=PRIVATE
-            )
-        except OSError as error:
-            raise WrongUseError(f"{file} can't be written: {error.strerror}") from error
+        text = key.private_bytes(Encoding.PEM, PrivateFormat.TraditionalOpenSSL, NoEncryption())
+        with writing(file):
+            atomic_write(file, text, mode=PRIVATE)
     return _key(file).public_key().public_bytes(Encoding.X962, PublicFormat.UncompressedPoint).hex()
 
 
@@ -143,6 +142,8 @@ def _key(file: Path) -> ec.EllipticCurvePrivateKey:
     return key
 
 
+LIKELIEST_FALSE_ECHOES: Final = 0.035
+"""A rate of false echoes counts as no more by the default options of the rule `evidence`, as a test compares."""
 CALIBRATION_S: Final = 180.0
 """A node with two sonars measures for some 40 s, one with eight for two minutes; without an answer after this it is not
 there, or its firmware is too old."""
@@ -263,3 +264,51 @@ def _answer(keys: dict[Channel, str], message: aiomqtt.Message) -> NodeCalibrati
 
 def _bytes(message: aiomqtt.Message) -> bytes:
     return bytes(message.payload)
+
+
+def with_limits(node: NodeSite, learned: NodeCalibration) -> NodeSite:
+    """Return a node of the site with what it has learned; raises `FailedError` for another number of sonars."""
+    if len(node.sonars) != len(learned.range_limit_m):
+        raise FailedError(
+            f"node {node.id} has learned {len(learned.range_limit_m)} limits, and has {len(node.sonars)} sonars in the "
+            "site: make site.toml and the board's settings agree"
+        )
+    sonars = [_calibrated(sonar, learned, index) for index, sonar in enumerate(node.sonars)]
+    return msgspec.structs.replace(node, sonars=sonars)
+
+
+def _calibrated(sonar: Sonar, learned: NodeCalibration, index: int) -> Sonar:
+    """Return a sonar with what its node has learned of it; an older firmware does not count false echoes."""
+    counted = index < min(len(learned.samples), len(learned.false_echoes)) and learned.samples[index] > 0
+    rate = sonar.false_echo_rate
+    if counted:
+        rate = round(learned_share(learned.false_echoes[index], learned.samples[index]), 4)
+    return msgspec.structs.replace(
+        sonar,
+        range_limit=min(4.0, learned.range_limit_m[index]),
+        range_max=(learned.range_max_m[index] or None) if index < len(learned.range_max_m) else sonar.range_max,
+        no_echo_is_clear=learned.no_echo_is_clear[index],
+        false_echo_rate=rate,
+    )
+
+
+def free_space(learned: NodeCalibration, index: int) -> str:
+    """Return what a calibration says of the samples of free space, if anything."""
+    if index >= min(len(learned.samples), len(learned.false_echoes), len(learned.no_echoes)):
+        return ""
+    near, none, samples = learned.false_echoes[index], learned.no_echoes[index], learned.samples[index]
+    return f"; of {samples} samples {near} echoed from nearer, {none} not at all" if samples else ""
+
+
+def hears_too_much(learned: NodeCalibration, index: int) -> str:
+    """Return a warning of a sonar with more false echoes than the rule `evidence` takes into account, if it has."""
+    if not learned.samples[index] or index >= len(learned.false_echoes):
+        return ""
+    rate = learned_share(learned.false_echoes[index], learned.samples[index])
+    if rate <= LIKELIEST_FALSE_ECHOES:
+        return ""
+    return (
+        f"warning: sonar {index + 1} hears something in {100 * rate:.0f} % of the readings of its free area, and "
+        f"false alarms are likely from {100 * LIKELIEST_FALSE_ECHOES:.1f} % on: turn it away from what it hears (an "
+        "edge, the floor, another sonar) and calibrate it again"
+    )

@@ -16,8 +16,9 @@ from fog_contracts.messages import Id, Mode
 from fog_runtime.credentials import Credentials
 from fog_supervisor import net
 from fognav.credentials import own_credentials
-from fognav.operate.systems import FOG_NODE, MAP_SERVICE, PLANNER, ROUTER, System, addresses, find_systems, registered
+from fognav.operate.systems import FOG_NODE, System, addresses, find_systems, registered
 from fognav.output import FailedError, WrongUseError
+from fognav.programs import MAP_SERVICE, PLANNER, ROUTER
 
 FOG: Final = "FOGNAV_FOG"
 TOKEN: Final = "FOGNAV_TOKEN"  # noqa: S105  # a variable's name

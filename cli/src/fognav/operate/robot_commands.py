@@ -26,8 +26,8 @@ from fog_runtime.clock import SystemClock
 from fog_runtime.robot_commands import REPLY_TIMEOUT_S, RobotCommands
 from fog_runtime.transports.zenoh_edge import ZenohEdge
 from fognav.operate.fog import Fog, Outcome, RefusedError, router
-from fognav.operate.systems import PLANNER
 from fognav.output import FailedError, WrongUseError
+from fognav.programs import PLANNER
 
 STATE_TIMEOUT_S: Final = 3.0
 """Real seconds to wait for a robot's state, which comes once a second of its clock, and on change; at a simulated speed

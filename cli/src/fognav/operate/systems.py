@@ -25,6 +25,7 @@ from fog_runtime.files import atomic_write
 from fog_supervisor import net
 from fognav.credentials import own_credentials
 from fognav.output import FailedError
+from fognav.programs import AGGREGATOR, BROKER, MAP_SERVICE, PLANNER, ROUTER
 
 PRIVATE: Final = 0o700
 
@@ -140,11 +141,6 @@ def _runs(entry: _Entry) -> bool:
 
 FOG_NODE: Final = "fog-node"
 """Name of the fog node of this machine."""
-AGGREGATOR: Final = "hazard-aggregator"
-MAP_SERVICE: Final = "map-service"
-PLANNER: Final = "planner"
-ROUTER: Final = "zenoh-router"
-BROKER: Final = "mosquitto"
 
 SERVICE_PORTS: Final = {
     AGGREGATOR: ("FOGNAV_AGGREGATOR_PORT", 8001),

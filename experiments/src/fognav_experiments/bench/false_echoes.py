@@ -16,9 +16,9 @@ from fog_contracts import channels as ch
 from fog_contracts.site import learned_share
 from fog_runtime.clock import SystemClock
 from fog_runtime.configuration.parts import PartError
-from fognav.nodes.simulated import StillFloor
 from fognav.output import FailedError, WrongUseError
 from fognav_sim.barrier import BarrierError, barrier_across
+from fognav_sim.live import StillFloor
 from fognav_sim.nodes import make_nodes
 from fognav_sim.world import World
 from hazard_aggregator.fusion import AreaFusion

@@ -22,14 +22,13 @@ from fog_contracts.messages import MapDelta, RobotPath
 from fog_runtime.clock import SystemClock, ticker
 from fog_runtime.transports.zenoh_edge import session_config
 from fog_supervisor.supervisor import NotReadyError, log_tail
-from fognav.nodes.simulated import StillFloor
 from fognav.output import FailedError
 from fognav.programs import AGGREGATOR, MAP_SERVICE, PLANNER, SERVERS, SERVICES
 from fognav.stack import Stack, StackConfig, users_of
 from fognav_experiments.bench.common import ask, following, in_background, standing
 from fognav_sim.barrier import BarrierError, barrier_across
 from fognav_sim.drive.hazard import draw_hazard, entry_distance
-from fognav_sim.live import VirtualNode, run_nodes
+from fognav_sim.live import StillFloor, VirtualNode, run_nodes
 from fognav_sim.nodes import make_nodes
 from fognav_sim.world import World
 

@@ -14,8 +14,8 @@ from fognav import __version__
 from fognav.operate import robot_commands
 from fognav.operate.fog import RefusedError
 from fognav.operate.robot_commands import connect
-from fognav.operate.systems import PLANNER
 from fognav.output import FailedError, WrongUseError
+from fognav.programs import PLANNER
 from fognav_experiments.comparison.drives import GuidedDrive, stands_at, start_of, where_to_place
 from fognav_sim.drive.drive import DriveOutcome
 from fognav_sim.drive.hazard import HazardRequest, HazardSchedule

@@ -212,29 +212,6 @@ async def test_p99_of_few_ticks_is_the_largest_lateness():
     assert loop_ticker.late == 0
 
 
-async def test_sleepers_wake_in_the_order_of_their_wake_times():
-    clock, woken = ManualClock(10.0), []
-
-    async def sleeper(name: str, seconds: float) -> None:
-        await clock.sleep(seconds)
-        woken.append(name)
-
-    tasks = [asyncio.create_task(sleeper("b", 2.0)), asyncio.create_task(sleeper("a", 1.0))]
-    await asyncio.sleep(0)
-    clock.advance(0.5)
-    await asyncio.sleep(0)
-    assert woken == []
-    clock.advance(5.0)
-    await asyncio.gather(*tasks)
-    assert woken == ["a", "b"]
-    assert clock.now() == clock.stamp() == 15.5
-
-
-def test_manual_clock_refuses_to_go_backwards():
-    with pytest.raises(ValueError, match="backwards"):
-        ManualClock().advance(-0.1)
-
-
 async def test_fast_clock_scales_time_and_timeouts():
     clock = SystemClock(10.0)
     began, real = clock.now(), time.monotonic()

@@ -59,6 +59,8 @@ type_cells  # numba: a name that compiled signatures close over
 _.FACTORY  # bases, lidars, debounce rules and cost layers are found by their entry points
 _.DEFAULT  # same: profiles
 _.add_to  # same: commands
+_.add_localize
+_.add_from_log
 _.add_to_map  # same: commands
 _.list_commands  # typer asks for them
 _.get_command

@@ -7,10 +7,10 @@ from pathlib import Path
 
 import pytest
 
-from fog_runtime import usage
 from fog_runtime.configuration.site import load_site
 from fognav.output import WrongUseError
 from fognav_experiments.bench import common, robot
+from robot_agent.agent.edges import exporter
 
 
 def write_thread(proc: Path, pid: int, thread: int, name: str, nanoseconds: int, switches: int) -> None:
@@ -26,11 +26,11 @@ def write_thread(proc: Path, pid: int, thread: int, name: str, nanoseconds: int,
 def test_usage_sums_threads_of_one_name_and_counts_new_ones_from_zero(tmp_path: Path) -> None:
     write_thread(tmp_path, 5, 5, "main", 1_000_000_000, 10)
     write_thread(tmp_path, 5, 6, "rx", 500_000_000, 0)
-    before = usage.sample(5, tmp_path)
+    before = exporter.sample(5, tmp_path)
     write_thread(tmp_path, 5, 5, "main", 1_030_000_000, 30)
     write_thread(tmp_path, 5, 6, "rx", 510_000_000, 4)
     write_thread(tmp_path, 5, 7, "rx", 20_000_000, 6)
-    used = usage.usage(before, usage.sample(5, tmp_path), 2.0)
+    used = exporter.usage(before, exporter.sample(5, tmp_path), 2.0)
     assert used.cpu_percent == pytest.approx(3.0)
     assert used.wakeups_per_s == pytest.approx(15.0)
     assert used.threads == pytest.approx({"main": 1.5, "rx": 1.5})
@@ -42,27 +42,27 @@ def test_usage_of_a_real_thread_is_its_cpu_time_and_an_ended_process_has_none() 
     waits.start()
     identifier = waits.native_id
     assert identifier is not None
-    before = usage.sample(os.getpid())
+    before = exporter.sample(os.getpid())
     begun = time.thread_time()
     while time.thread_time() - begun < 0.05:
         pass
-    after = usage.sample(os.getpid())
+    after = exporter.sample(os.getpid())
     ends.set()
     waits.join()
     main = threading.main_thread().native_id
     assert main is not None
     assert after[main].cpu_s - before[main].cpu_s >= 0.05
     assert after[identifier].cpu_s - before[identifier].cpu_s < 0.05
-    assert usage.sample(2**30) == {}
-    assert usage.memory_mb(2**30) == 0.0
-    assert usage.memory_mb(os.getpid()) > 10.0
+    assert exporter.sample(2**30) == {}
+    assert exporter.memory_mb(2**30) == 0.0
+    assert exporter.memory_mb(os.getpid()) > 10.0
 
 
 def test_figures_add_up_the_processes_and_name_each() -> None:
-    idle = {"a": usage.ProcessUsage(1.0, 40.0, {"main": 1.0}), "b": usage.ProcessUsage(0.5, 10.0, {"x": 0.5})}
+    idle = {"a": exporter.ProcessUsage(1.0, 40.0, {"main": 1.0}), "b": exporter.ProcessUsage(0.5, 10.0, {"x": 0.5})}
     driving = {
-        "a": usage.ProcessUsage(2.5, 60.0, {"main": 2.0, "rx": 0.5}),
-        "b": usage.ProcessUsage(0.75, 10.0, {"x": 0.75}),
+        "a": exporter.ProcessUsage(2.5, 60.0, {"main": 2.0, "rx": 0.5}),
+        "b": exporter.ProcessUsage(0.75, 10.0, {"x": 0.75}),
     }
     figures = robot.figures(idle, driving, {"a": 200.0, "b": 20.0})
     processes = figures.pop("processes")

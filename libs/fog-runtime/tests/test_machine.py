@@ -8,7 +8,6 @@ import socket
 import subprocess
 import sys
 import threading
-from concurrent.futures import ThreadPoolExecutor
 from functools import cache
 from typing import TYPE_CHECKING
 
@@ -17,7 +16,6 @@ import pytest
 from fog_runtime import machine, process
 from fog_runtime.health import reachable_address
 from fog_runtime.machine import ServiceManager, SuspensionMonitor
-from fog_runtime.usage import name_thread, sample
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -105,18 +103,6 @@ def test_suspension_is_the_growth_of_boot_time_over_monotonic_time():
 def test_running_computer_is_not_suspended():
     monitor = SuspensionMonitor()
     assert monitor.suspended() == 0.0
-
-
-def test_named_thread_is_listed_by_its_name_among_the_threads_of_its_process():
-    before = {thread.name for thread in sample(os.getpid()).values()}
-    with ThreadPoolExecutor(1, initializer=name_thread, initargs=("decide-7",)) as pool:
-        names = pool.submit(lambda: [thread.name for thread in sample(os.getpid()).values()]).result()
-    assert "decide-7" not in before
-    assert names.count("decide-7") == 1
-
-
-def test_thread_keeps_its_name_where_the_list_can_not_be_written(tmp_path):
-    name_thread("decide", tmp_path)
 
 
 class Cycle:

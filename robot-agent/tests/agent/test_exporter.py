@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import os
+from concurrent.futures import ThreadPoolExecutor
 
 import pytest
 from prometheus_client import CollectorRegistry, generate_latest
 
 from fog_contracts.messages import LoopHealth, Power, RobotState
-from robot_agent.agent.edges.exporter import Observed, RobotCollector, parent
+from robot_agent.agent.edges.exporter import Observed, RobotCollector, name_thread, parent, sample
 from robot_agent.localization.pose import Uncertainty
 
 
@@ -144,3 +145,15 @@ def test_parent_of_a_process_is_known_while_it_runs(tmp_path):
     assert parent(2**30) is None
     write(tmp_path, "proc/9/stat", "9 (a) b) S 4 9 9 0")
     assert parent(9, tmp_path) == 4
+
+
+def test_named_thread_is_listed_by_its_name_among_the_threads_of_its_process():
+    before = {thread.name for thread in sample(os.getpid()).values()}
+    with ThreadPoolExecutor(1, initializer=name_thread, initargs=("decide-7",)) as pool:
+        names = pool.submit(lambda: [thread.name for thread in sample(os.getpid()).values()]).result()
+    assert "decide-7" not in before
+    assert names.count("decide-7") == 1
+
+
+def test_thread_keeps_its_name_where_the_list_can_not_be_written(tmp_path):
+    name_thread("decide", tmp_path)

@@ -21,7 +21,6 @@ from fog_runtime.clock import SystemClock
 from fog_runtime.configuration.maps import save_map
 from fog_runtime.robot_commands import RobotCommands
 from fog_runtime.transports.zenoh_edge import ZenohEdge
-from fog_runtime.usage import ProcessUsage, memory_mb, sample, usage
 from fog_supervisor import net
 from fog_supervisor.net import put_goal
 from fognav.output import WrongUseError
@@ -29,6 +28,7 @@ from fognav.programs import AGENT, PLANNER, ROBOT, WATCHDOG
 from fognav.stack import Stack, StackConfig, StackUsers
 from fognav_experiments.bench.common import RunningSystem, corridor_rows, first_child, make_office
 from fognav_sim.drive.operator import OperatorPolicy
+from robot_agent.agent.edges.exporter import ProcessUsage, memory_mb, sample, usage
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Mapping

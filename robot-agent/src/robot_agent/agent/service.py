@@ -25,9 +25,8 @@ from fog_runtime.machine import ServiceManager, SuspensionMonitor, run_in_real_t
 from fog_runtime.process import release_startup_memory
 from fog_runtime.transports.edges import Edges
 from fog_runtime.transports.zenoh_edge import ZenohEdge, use_one_thread
-from fog_runtime.usage import name_thread
 from robot_agent import registry
-from robot_agent.agent.edges.exporter import Observed, RobotCollector, parent
+from robot_agent.agent.edges.exporter import Observed, RobotCollector, name_thread, parent
 from robot_agent.agent.edges.map_loader import MapLoader, Store
 from robot_agent.agent.recording.input_writer import open_core
 from robot_agent.agent.settings import remarks

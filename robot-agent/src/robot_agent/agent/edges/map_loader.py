@@ -22,7 +22,7 @@ from fog_contracts.replica import MapError
 from fog_runtime import logs
 from fog_runtime.clock import Ticker
 from fog_runtime.files import atomic_write
-from fog_runtime.usage import name_thread
+from robot_agent.agent.edges.exporter import name_thread
 from robot_agent.agent.pose_persistence import start_pose
 from robot_agent.localization.pose import SavedPose
 

@@ -7,7 +7,7 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from fog_runtime.stores.audit import KINDS, PAGE_BYTES, read_page
+from fog_runtime.stores.records import KINDS, PAGE_BYTES, read_page
 from fog_runtime.stores.redis_connection import RedisConnection
 from fog_supervisor.servers import start_redis
 

@@ -10,7 +10,7 @@ from redis.asyncio import Redis
 from fog_contracts.handlers import Moment
 from fog_contracts.messages import AreaDefinition, AreaHazard
 from fog_runtime.health import Health
-from fog_runtime.stores.audit import CursorError
+from fog_runtime.stores.records import CursorError
 from fog_runtime.stores.redis_connection import StoreError
 from fog_runtime.stores.redis_store import Audit
 from fog_supervisor.servers import Server, start_redis

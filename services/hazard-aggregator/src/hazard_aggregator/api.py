@@ -59,7 +59,7 @@ from fog_runtime.http import (
     must_be_new,
     next_page,
 )
-from fog_runtime.stores.audit import CursorError
+from fog_runtime.stores.records import CursorError
 from fog_runtime.stores.redis_connection import StoreError
 from fog_runtime.stores.redis_store import IdempotencyError
 from hazard_aggregator.alerts import AlertError

@@ -10,8 +10,8 @@ from msgspec import structs
 
 from fog_contracts.messages import AreaDefinition, AreaHazard, Count, Id, Message, Ring
 from fog_runtime import logs
-from fog_runtime.stores import store_scripts
-from fog_runtime.stores.audit import CursorError
+from fog_runtime.stores import records
+from fog_runtime.stores.records import CursorError
 from fog_runtime.stores.redis_connection import StoreError
 from fog_runtime.stores.redis_store import Audit, Outcome, RedisStore, Table
 from hazard_aggregator.alerts import StoredAlerts
@@ -33,13 +33,13 @@ if TYPE_CHECKING:
     from fog_runtime.stores.redis_store import Attempt
     from hazard_aggregator.alerts import AlertEvent
 
-_AREAS: Final = Table(store_scripts.AREAS, "area")
-_HAZARDS: Final = store_scripts.HAZARDS
-_OVERRIDES: Final = Table(store_scripts.OVERRIDES, "override")
-_RESTS: Final = store_scripts.OVERRIDE_RESTS
-_ALERTS: Final = store_scripts.ALERTS
+_AREAS: Final = Table(records.AREAS, "area")
+_HAZARDS: Final = records.HAZARDS
+_OVERRIDES: Final = Table(records.OVERRIDES, "override")
+_RESTS: Final = records.OVERRIDE_RESTS
+_ALERTS: Final = records.ALERTS
 _ALL: Final = "all"
-_HISTORY: Final = store_scripts.HISTORY
+_HISTORY: Final = records.HISTORY
 _CURSOR: Final = re.compile(r"[0-9]{1,15}-[0-9]{1,15}")
 
 _log = logs.get("store")
@@ -152,7 +152,7 @@ class Store(RedisStore):
             "oldest": period.began - RETENTION_S,
             "entries": MAX_PERIODS,
         }
-        await self._run(store_scripts.PERIOD, keys, _HISTORY, arguments, msgspec.json.encode(period))
+        await self._run(records.PERIOD, keys, _HISTORY, arguments, msgspec.json.encode(period))
 
     async def history(self, area: str, *, cursor: str | None, limit: int, at: Moment) -> HistoryPage:
         """Return a page of an area's history at this moment; raises `CursorError` and `StoreError`."""

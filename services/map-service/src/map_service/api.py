@@ -58,7 +58,7 @@ from fog_runtime.http import (
     next_page,
 )
 from fog_runtime.http.routes import InvalidBodyError
-from fog_runtime.stores.audit import KINDS, AuditEntry, CursorError
+from fog_runtime.stores.records import KINDS, AuditEntry, CursorError
 from fog_runtime.stores.redis_connection import StoreError
 from fog_runtime.stores.redis_store import Attempt, IdempotencyError
 from map_service.core import ScrapeTarget

@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     from fog_contracts.handlers import Moment
     from fog_runtime.clock import Clock
     from fog_runtime.health import Health
-    from fog_runtime.stores.audit import AuditPage
+    from fog_runtime.stores.records import AuditPage
     from fog_runtime.transports.edges import Gate
     from fog_runtime.transports.mqtt_edge import MqttEdge
     from fog_runtime.transports.zenoh_edge import ZenohEdge

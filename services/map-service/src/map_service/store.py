@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Final
 from msgspec import structs
 
 from fog_contracts.messages import Message, Zone
-from fog_runtime.stores import store_scripts
+from fog_runtime.stores import records
 from fog_runtime.stores.redis_store import ANY, Audit, Outcome, RedisStore, Table
 from map_service.zone_times import Progress
 
@@ -16,9 +16,9 @@ if TYPE_CHECKING:
 
     from fog_runtime.stores.redis_store import Attempt
 
-_ZONES: Final = Table(store_scripts.ZONES, "zone")
+_ZONES: Final = Table(records.ZONES, "zone")
 
-_TIMES: Final = store_scripts.ZONE_TIMES
+_TIMES: Final = records.ZONE_TIMES
 _ALL: Final = "all"
 
 

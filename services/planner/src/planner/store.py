@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Final, NamedTuple
 
 from fog_contracts.messages import Message, Refusal, RobotGoal
 from fog_runtime import logs
-from fog_runtime.stores import store_scripts
+from fog_runtime.stores import records
 from fog_runtime.stores.redis_connection import StoreError, StoreLostError, StoreRefusedError
 from fog_runtime.stores.redis_store import ANY, Audit, Outcome, RecoveryError, RedisStore, Table
 from planner.missions import DockGoals
@@ -28,7 +28,7 @@ if TYPE_CHECKING:
     Send = Callable[["Order"], Awaitable["StoredGoal | Refusal"]]
     """Gives a robot a mission, or returns why there is none; may raise `StoreError`."""
 
-_GOALS: Final = Table(store_scripts.GOALS, "mission", version="goal.goal_id")
+_GOALS: Final = Table(records.GOALS, "mission", version="goal.goal_id")
 
 _log = logs.get("planner")
 

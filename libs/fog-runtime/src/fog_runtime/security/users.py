@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Final
 from fog_contracts.channels import ROLES
 from fog_runtime.credentials import SERVERS, Server
 from fog_runtime.files import atomic_write
-from fog_runtime.stores import store_scripts
+from fog_runtime.stores import records
 
 if TYPE_CHECKING:
     from collections.abc import Collection, Iterable, Mapping, Sequence
@@ -103,8 +103,8 @@ def redis_line(user: str, password: str, site: str) -> str:
     It may read the whole audit trail. Raises `KeyError` for a user that is no service.
     """
     _, service = of_floor(user)
-    audited = (f"audit:{kind}" for kind in store_scripts.AUDITED[service])
-    own = [*store_scripts.OWN[service], *store_scripts.BOOKKEEPING, *audited, f"{service}:*"]
+    audited = (f"audit:{kind}" for kind in records.AUDITED[service])
+    own = [*records.OWN[service], *records.BOOKKEEPING, *audited, f"{service}:*"]
     keys = " ".join([*(f"~fog:{site}:{name}" for name in own), f"%R~fog:{site}:audit:*"])
     return f"user {user} on {_redis_secret(password)} resetchannels -@all {_COMMANDS} {keys}"
 

@@ -19,8 +19,7 @@ from prometheus_client import Gauge
 from fog_contracts.messages import Message
 from fog_runtime import logs
 from fog_runtime.credentials import NOBODY
-from fog_runtime.stores import store_scripts
-from fog_runtime.stores.audit import KINDS, AuditPage, read_page
+from fog_runtime.stores.records import AUDIT_ENTRIES, KINDS, SWAP, WRITE, AuditPage, read_page
 from fog_runtime.stores.redis_connection import (
     RedisConnection,
     StoreError,
@@ -243,7 +242,7 @@ class RedisStore:
         """Write records durably, overwriting what is stored, without audit entries."""
         encoded = [part for name, record in records.items() for part in (name, msgspec.json.encode(record))]
         keys = [self._key(name) for name in ("generation", "writes", table, self._epoch_key)]
-        await self._run(store_scripts.WRITE, keys, table, {}, *encoded)
+        await self._run(WRITE, keys, table, {}, *encoded)
 
     async def _adopt(self, tables: Mapping[str, Mapping[str, Message]], audit: Audit) -> None:
         """Use the store that Redis has now, and replace these tables in it by the given records, in one step."""
@@ -260,7 +259,7 @@ class RedisStore:
                 commands.append(("HSET", self._key(table), *encoded))
         entry = {"at": f"{audit.at:.3f}", "who": audit.who, "action": audit.action, "id": self._service}
         fields = [text for pair in {**entry, "before": "", "after": ""}.items() for text in pair]
-        trail = (self._key("audit:store"), "MAXLEN", "~", store_scripts.AUDIT_ENTRIES, "*")
+        trail = (self._key("audit:store"), "MAXLEN", "~", AUDIT_ENTRIES, "*")
         *_, generation, writes = await self._redis.write(*commands, ("XADD", *trail, *fields), *self._read_identity())
         self._identity.adopt(_text(generation), _pairs(writes))
         _log.warning("store_recovered", action=audit.action, who=audit.who, generation=self._identity.generation)
@@ -295,7 +294,7 @@ class RedisStore:
         }
         result = b"" if attempt is None else msgspec.json.encode(attempt.result(data))
         outcome, details = await self._run(
-            store_scripts.SWAP, keys, table.name, arguments, data,
+            SWAP, keys, table.name, arguments, data,
             b"" if before is None else msgspec.json.encode(before), result,
         )  # fmt: skip
         if outcome == "replay" and attempt is not None:
@@ -308,7 +307,7 @@ class RedisStore:
         """Add an entry of a kind (`KINDS`) to the audit trail, of something that is not stored; `after` is JSON."""
         entry = {"at": f"{audit.at:.3f}", "who": audit.who, "action": audit.action, "id": name, "before": ""}
         fields = [text for pair in entry.items() for text in pair]
-        trail = (self._key(f"audit:{subject}"), "MAXLEN", "~", store_scripts.AUDIT_ENTRIES, "*")
+        trail = (self._key(f"audit:{subject}"), "MAXLEN", "~", AUDIT_ENTRIES, "*")
         await self._redis.write(("XADD", *trail, *fields, "after", after))
 
     def _floor(self, table: str) -> int:

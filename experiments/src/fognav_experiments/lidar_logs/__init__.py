@@ -6,7 +6,7 @@ from typing import Annotated, Literal
 
 import typer
 
-Format = Literal["auto", "intel", "jsonl", "carmen", "rosbag2"]
+Format = Literal["auto", "intel", "jsonl", "carmen", "rosbag2", "fognav"]
 Selection = Literal["all", "odd", "even"]
 Poses = Literal["matched", "reference"]
 LogFormat = Annotated[

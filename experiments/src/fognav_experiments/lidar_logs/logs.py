@@ -1,7 +1,8 @@
 """Recorded logs of a robot with a planar lidar: scans with odometry, and reference poses where the log has them.
 
 Formats: JSON lines (one object with `odom`, `ref` and `ranges` per scan after one with `meta`, gzipped or not), CARMEN
-(`FLASER` messages; see the CARMEN toolkit's message formats), and rosbag2 (`bags`). `mapping` makes maps of them.
+(`FLASER` messages; see the CARMEN toolkit's message formats), rosbag2 (`bags`), and logs of Fognav's own
+robots (`robot_logs`). `mapping` makes maps of them.
 """
 
 from __future__ import annotations
@@ -18,6 +19,7 @@ import numpy as np
 from fognav.output import WrongUseError
 from fognav_experiments.lidar_logs import Format, Selection
 from fognav_experiments.lidar_logs.bags import is_bag, read_bag
+from fognav_experiments.lidar_logs.robot_logs import is_robot_log, read_robot_log
 from robot_agent.localization.pose import Pose2
 
 if TYPE_CHECKING:
@@ -69,6 +71,11 @@ def read_log(path: Path, log_format: Format = "auto") -> LidarLog:
     """Read a log; raises `WrongUseError` with file, line and remedy when it can't be used."""
     if log_format not in get_args(Format):
         raise WrongUseError(f"the format must be one of {', '.join(get_args(Format))}, not {log_format!r}")
+    if log_format == "fognav" or (log_format == "auto" and is_robot_log(path)):
+        scans = [LogScan(scan.stamp, scan.odom, None, scan.angles, scan.ranges) for scan in read_robot_log(path)]
+        if not scans:
+            raise WrongUseError(f"{path} has no scan of a lidar whose wheels were read. Log an agent that drives")
+        return _finished(scans, coded=False)
     if log_format == "rosbag2" or (log_format == "auto" and is_bag(path)):
         return _finished([LogScan(*scan) for scan in read_bag(path)], coded=False)  # they say which returns count
     first = next(_lines(path), (0, ""))[1]

@@ -29,14 +29,14 @@ from fog_runtime.configuration.parts import DEFAULT_BASE, DEFAULT_LIDAR
 from fog_runtime.configuration.robot_file import default_robot
 from fog_runtime.configuration.site import load_site
 from fognav_experiments.processes import Measure, unmeasured
-from fognav_experiments.rigs import STAMP, System
+from fognav_experiments.rigs import AGENT, STAMP, System
 from fognav_sim.barrier import BarrierError
 from fognav_sim.drive.drive import Drive, DriveOutcome, DriveSummary
 from fognav_sim.drive.hazard import HazardRequest, HazardSchedule
 from fognav_sim.drive.operator import OperatorPolicy
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
+    from collections.abc import Callable, Sequence
 
     from fog_contracts.bus import Bus
     from fog_contracts.handlers import Ids, Moment
@@ -60,6 +60,8 @@ if TYPE_CHECKING:
     from fognav_experiments.rigs import Tuning
     from fognav_sim.floor import Floor
     from fognav_sim.sensors import Noise
+    from robot_agent.agent.core import AgentCore
+    from robot_agent.config import AgentConfig
 
 WARM_UP_S: Final = 30.0
 """Time within which all areas must be known, the robot localized and enabled."""
@@ -124,6 +126,7 @@ class LockstepDrive:
         measure: Measure = unmeasured,
         tuning: Tuning | None = None,
         ground: Floor | None = None,
+        make_agent: Callable[[AgentConfig, int], AgentCore] = AGENT,
     ) -> None:
         """`watched`: whether the site has areas and nodes, or what it has instead. `ground`: if it is not the map's."""
         robot = msgspec.structs.replace(site.site.robots[0], start=start)
@@ -133,7 +136,7 @@ class LockstepDrive:
         floor = dataclasses.replace(site, site=with_nodes)
         self.system = System(
             floor, robot, seed, noise=noise, mounted=mounted, bus=bus, measure=measure, tuning=tuning,
-            floor=ground,
+            floor=ground, make_agent=make_agent,
         )  # fmt: skip
         self.world = self.system.world
         self.robot = self.system.robot

@@ -17,6 +17,7 @@ from fog_contracts.handlers import Moment
 from fog_contracts.messages import (
     MAX_CELLS,
     MapDelta,
+    PlanRefusal,
     PointXY,
     RectangleShape,
     Refusal,
@@ -129,7 +130,7 @@ def test_change_behind_the_robot_does_not_affect_its_path() -> None:
 
 
 def test_refused_robot_is_replanned_once_it_has_moved() -> None:
-    refused = Plan(1, None, refuse(208, "cut"), [], planned_from=(1.0, 1.0))
+    refused = Plan(1, None, refuse(208, PlanRefusal.CUT_OFF, "cut"), [], planned_from=(1.0, 1.0))
     assert reason_from_pose(refused, pose(1.9, 1.0), CONFIG) is None
     assert reason_from_pose(refused, pose(2.1, 1.0), CONFIG) == "refused"
 
@@ -161,9 +162,11 @@ def test_blocked_path_is_replaced_and_a_refusal_is_kept_while_it_is_the_same() -
     planning_map = current(make_tracker(RingMap()))
     through_the_wall = plan((1.0, 6.0), (19.0, 6.0))
     assert not is_kept(through_the_wall, found(1e9), "map", planning_map, CONFIG)
-    refused = Plan(1, None, refuse(208, "cut by z1"), [], planned_from=LEFT)
-    assert is_kept(refused, found(refusal=refuse(208, "cut by z1")), "map", planning_map, CONFIG)
-    assert not is_kept(refused, found(refusal=refuse(208, "cut by z2")), "map", planning_map, CONFIG)
+    refused = Plan(1, None, refuse(208, PlanRefusal.CUT_OFF, "cut by z1"), [], planned_from=LEFT)
+    assert is_kept(refused, found(refusal=refuse(208, PlanRefusal.CUT_OFF, "cut by z1")), "map", planning_map, CONFIG)
+    assert not is_kept(
+        refused, found(refusal=refuse(208, PlanRefusal.CUT_OFF, "cut by z2")), "map", planning_map, CONFIG
+    )
     assert not is_kept(refused, found(100.0), "map", planning_map, CONFIG)
 
 

@@ -229,7 +229,9 @@ async def test_operator_without_a_key_enables_a_robot_through_the_planner_and_th
 
         def answer(_ids: object, command: RobotCommand) -> CommandReply:
             refusal = gate.refusal(command, env.clock.now())
-            return CommandReply(accepted=refusal is None, reason=refusal or f"{command.operator} may {command.kind}")
+            if refusal is not None:
+                return CommandReply.refused(refusal)
+            return CommandReply(accepted=True, reason=f"{command.operator} may {command.kind}")
 
         env.edge.serve(ch.ROBOT_COMMAND, answer, robot="r1")
         state = RobotState(

@@ -44,7 +44,7 @@ _NEWS_RAD: Final = 0.2
 _PLACES_MAX: Final = 48
 _MATCH_COVARIANCE: Final = np.diag(np.square((0.2, 0.2, 0.1)))
 _BEAMS: Final = 180
-_FOLLOWED_M: Final = 5.0
+_FOLLOWED_M: Final = 2.0
 """A pose that was good for so long a way is kept against places that explain the scans better, while each scan shows
 what the one before it did: nobody carried the robot, opened doors are more likely than such a way to a wrong place."""
 _NEAR_M: Final = 2.5

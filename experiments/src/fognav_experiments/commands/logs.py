@@ -141,7 +141,7 @@ def map_from_log(  # noqa: PLR0913  # each option is an argument
     resolution: Annotated[
         float, typer.Option("--resolution", metavar="M", min=0.01, max=1.0, help="Size of a cell (m).")
     ] = 0.05,
-    range_max: RangeMax = 20.0,
+    range_max: RangeMax = 30.0,
     seed: Annotated[int, typer.Option("--seed", metavar="N", min=0, help="Seed of noise that is added.")] = 1,
     png: Annotated[
         Path | None, typer.Option("--png", metavar="FILE", help="Draw the map, the way and its loops.")

@@ -56,8 +56,8 @@ class Rig:
         for opcode, argument in commands(output.data):
             latched = self.latched is not None or self.core.latched is not None
             if opcode == 131:
-                # Twice each time, 0.3 s after the first 0.05 s; meanwhile it may have fallen silent.
-                retaken = self.now - self.away_at <= 0.36 or self.now - self.heard_at > 0.3
+                # Twice each time, 0.05 s apart, and again 0.3 s later; meanwhile it may have fallen silent.
+                retaken = self.now - self.away_at <= 0.41 or self.now - self.heard_at > 0.3
                 assert self.resetting or not latched or retaken, "disturbed although it stands in Safe mode"
             if opcode == 128:
                 assert self.resetting or not self.moved or latched, "woken although it has moved and has no fault"

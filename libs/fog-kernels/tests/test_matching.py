@@ -6,6 +6,7 @@ import math
 
 import numpy as np
 import pytest
+from compiler import compiled_only
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -35,6 +36,7 @@ def seen_from(pose: tuple[float, float, float]) -> tuple[np.ndarray, np.ndarray]
     return (ROOM[0] - (x, y)) @ turn, ROOM[1] @ turn
 
 
+@compiled_only  # tens of thousands of poses
 @settings(max_examples=25, deadline=None)
 @given(st.floats(-0.9, 0.9), st.floats(-0.9, 0.9), st.integers(-4, 4), st.integers(0, 2**32 - 1), st.floats(0.2, 1.0))
 def test_search_finds_the_best_of_all_poses_in_its_window(x, y, turn, seed, half):

@@ -13,7 +13,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from redis.asyncio import Redis
-from redis.exceptions import AuthenticationError, NoPermissionError
+from redis.asyncio.retry import Retry
+from redis.backoff import ConstantBackoff
+from redis.exceptions import AuthenticationError, BusyLoadingError, NoPermissionError
 
 from fog_runtime.credentials import Credentials
 from fog_runtime.security.site_security import SiteSecurity
@@ -187,5 +189,6 @@ async def test_stand_in_for_redis_admits_its_users_to_their_keys(tmp_path: Path,
                 await stranger.get("fog:estig:zones")
         server.kill()
         server.start()
-        async with Redis.from_url(program.url, username="map-service", password=password) as own:
+        loading = {"retry": Retry(ConstantBackoff(0.1), 100), "retry_on_error": [BusyLoadingError]}
+        async with Redis.from_url(program.url, username="map-service", password=password, **loading) as own:
             assert await own.get("fog:estig:zones") == b"wet floor"

@@ -14,7 +14,7 @@ driver = "roomba600"
 [lidar]
 driver = "rplidar-a1"
 [power]
-rest_after_s = 3.0
+rest_after_s = 6.0
 """
 
 

@@ -135,7 +135,7 @@ def _sum_at(tables: Any, level: int, cells: Any, angle: int, dx: int, dy: int) -
     for i in range(count):
         x, y = cells[angle, i] + dx, cells[angle, count + i] + dy
         if 0 <= x < width and 0 <= y < height:
-            total += tables[level, y, x]
+            total += int(tables[level, y, x])
     return total
 
 

@@ -16,6 +16,7 @@ from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn, T
 from fog_contracts.costs import FREE, LETHAL
 from fog_mapping.building import draw, find_trajectory
 from fog_mapping.loops import grouped
+from fog_mapping.poses import between
 from fog_mapping.relations import absolute_error, relation_errors
 from fog_mapping.scans import keep_moved, scan_of
 from fognav.output import WrongUseError, console
@@ -59,7 +60,8 @@ class MadeMap:
             "scans": len(self.used),
             "loops": [
                 {"loop": group.name, "pairs": group.pairs, "kept": group.kept, "score": round(group.score, 3),
-                 "residual_m": round(group.residual, 4), "at": [round(value, 2) for value in self._place(group)]}
+                 "residual_m": round(group.residual, 4), "at": [round(value, 2) for value in self._place(group)],
+                 "off_reference_m": self._off_reference(group)}
                 for group in self.loops or ()
             ],
             "ambiguous": self.ambiguous,
@@ -128,6 +130,13 @@ class MadeMap:
             file.write_text("".join(rows), encoding="ascii")
         except OSError as error:
             raise WrongUseError(f"{file} can't be written: {error.strerror}. Name another file") from error
+
+    def _off_reference(self, group: LoopGroup) -> float | None:
+        """Return how far (m) the second scan of a loop is, as seen from its first, from where the reference has it."""
+        if self.reference is None:
+            return None
+        ours, theirs = (between(poses[group.first], poses[group.second]) for poses in (self.poses, self.reference))
+        return round(float(np.hypot(*(ours - theirs)[:2])), 3)
 
     def _place(self, group: LoopGroup) -> tuple[float, float]:
         x, y, _ = self.poses[group.first]

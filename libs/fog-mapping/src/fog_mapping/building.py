@@ -21,12 +21,10 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from fog_mapping.loops import Loop
-    from fog_mapping.pose_graph import Edge
     from fog_mapping.scans import Scan
 
 _CERTAIN_M: Final = (2.0, 2.0, 4.0, 8.0, 16.0, 30.0)
 """What is certain to so much (m) is looked for, round by round."""
-_REFUSED: Final = 0.5
 _MARGIN_M: Final = 1.0
 _OCCUPIED_SHARE: Final = 0.3
 """A cell is occupied if this share of the scans that reached it ended there: walls are grazed by many others."""
@@ -44,30 +42,23 @@ class Trajectory(NamedTuple):
     loops: list[tuple[Loop, float]]
     ambiguous: int
 
-    @property
-    def kept(self) -> int:
-        """How many loops count."""
-        return sum(weight >= _REFUSED for _, weight in self.loops)
-
 
 def find_trajectory(
     scans: Sequence[Scan],
     *,
     jobs: int = 1,
     without: Sequence[tuple[int, int]] = (),
-    extra: Sequence[Edge] = (),
     on_progress: Callable[[str, float], None] = lambda *_: None,
 ) -> Trajectory:
     """Return where scans were taken; the same for the same arguments, whatever `jobs` (threads).
 
-    without: pairs of scans (by their place in `scans`) that are no loop. extra: further edges. `on_progress` is called
+    without: pairs of scans (by their place in `scans`) that are no loop. `on_progress` is called
     with what is done now, and the share of it. Raises `ValueError` for fewer than two scans, and for mirrored ones.
     """
     if len(scans) < 2:
         raise ValueError(f"a map needs two scans or more between which the robot has moved, not {len(scans)}")
     refuse_mirrored(scans)
     poses, edges = match_in_order(scans, lambda done: on_progress("matching scans", done / len(scans)))
-    edges.extend(extra)
     weights = np.ones(len(edges))
     search = LoopSearch(scans, poses, without, jobs)
     loops: list[Loop] = []

@@ -50,6 +50,8 @@ _SAME_RAD: Final = math.radians(12.0)
 _EXPLAINED: Final = 200.0
 """The second place is the same one if the best one's own uncertainty explains it, in squared deviations."""
 _REPEATED: Final = 0.7
+_COUNTS: Final = 0.5
+"""A loop that counts less than this contradicts the rest."""
 _KEPT: Final = 0.3
 """A loop that counts less than this says nothing about what is certain."""
 _FLOOR: Final = 1e-3
@@ -104,7 +106,7 @@ def grouped(loops: Sequence[tuple[Loop, float]], poses: NDArray[np.float64], num
     for group in groups:
         best = max(group, key=lambda each: each[0].score)[0]
         first, second = _ends(best)
-        counting = sum(weight >= 0.5 for _, weight in group)
+        counting = sum(weight >= _COUNTS for _, weight in group)
         found.append(
             LoopGroup(
                 f"{numbers[first]}-{numbers[second]}", first, second, len(group), 2 * counting >= len(group),
@@ -119,12 +121,11 @@ def _ends(loop: Loop) -> tuple[int, int]:
 
 
 class Searched(NamedTuple):
-    """What a round found: edges with the loops that they are, and how many pairs fitted several places."""
+    """What was found: edges with the loops that they are, and how many pairs fitted several places."""
 
     edges: list[Edge]
     loops: list[Loop]
     ambiguous: int
-    tried: int
 
 
 class LoopSearch:
@@ -152,29 +153,28 @@ class LoopSearch:
     ) -> Searched:
         """Look for what may be a loop and is certain to `most` (m); the same for the same arguments."""
         neighbours = _neighbours(len(self._scans), edges, weights)
-        found = Searched([], [], 0, 0)
-        ambiguous = tried = done = 0
+        edges: list[Edge] = []
+        loops: list[Loop] = []
+        ambiguous = 0
         with ThreadPoolExecutor(self._jobs) as pool:
-            rounds = pool.map(lambda k: self._search_place(k, poses, neighbours, most), range(len(self._places)))
-            for place_edges, loops, unsure, looked_at in rounds:
-                found.edges.extend(place_edges)
-                found.loops.extend(loops)
-                ambiguous += unsure
-                tried += looked_at
-                done += 1
+            places = pool.map(lambda k: self._search_place(k, poses, neighbours, most), range(len(self._places)))
+            for done, found in enumerate(places, 1):
+                edges.extend(found.edges)
+                loops.extend(found.loops)
+                ambiguous += found.ambiguous
                 on_progress(done / len(self._places))
-        return Searched(found.edges, found.loops, ambiguous, tried)
+        return Searched(edges, loops, ambiguous)
 
     def _search_place(
         self, number: int, poses: NDArray[np.float64], neighbours: list[list[_Neighbour]], most: float
-    ) -> tuple[list[Edge], list[Loop], int, int]:
+    ) -> Searched:
         place = self._places[number]
         wanted = list(self._candidates(number, poses, *_uncertainty(neighbours, place.middle), most))
         edges: list[Edge] = []
         loops: list[Loop] = []
         ambiguous = 0
         if not wanted:
-            return edges, loops, ambiguous, 0
+            return Searched(edges, loops, ambiguous)
         reference = reference_of(self._scans, poses, range(place.first, place.last + 1), poses[place.middle])
         for query, half, half_turn in wanted:
             points, lines = thinned(
@@ -200,7 +200,7 @@ class LoopSearch:
                     continue
             edges.append(Edge(place.middle, query.middle, step, information + _FLOOR * np.eye(3), loop=True))
             loops.append(Loop(place.middle, query.middle, best.score, fit.share, fit.residual))
-        return edges, loops, ambiguous, len(wanted)
+        return Searched(edges, loops, ambiguous)
 
     def _candidates(
         self, number: int, poses: NDArray[np.float64], variance: list[float], turn_variance: list[float], most: float

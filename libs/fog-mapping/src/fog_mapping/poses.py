@@ -6,6 +6,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from fog_kernels.scans import out_of_frame
+
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
@@ -38,14 +40,12 @@ def between(origin: NDArray[np.float64], pose: NDArray[np.float64]) -> NDArray[n
 
 def rotate(pose: NDArray[np.float64], vectors: NDArray[np.float64]) -> NDArray[np.float64]:
     """Return vectors (n, 2) that are given in the frame of a pose (3,) in the frame that the pose itself is in."""
-    cos, sin = np.cos(pose[2]), np.sin(pose[2])
-    return np.column_stack((cos * vectors[:, 0] - sin * vectors[:, 1], sin * vectors[:, 0] + cos * vectors[:, 1]))
+    return out_of_frame(vectors, 0.0, 0.0, float(pose[2]))
 
 
 def place(pose: NDArray[np.float64], points: NDArray[np.float64]) -> NDArray[np.float64]:
     """As `rotate`, for points (n, 2; m)."""
-    placed: NDArray[np.float64] = rotate(pose, points) + pose[:2]
-    return placed
+    return out_of_frame(points, float(pose[0]), float(pose[1]), float(pose[2]))
 
 
 def path_lengths(poses: NDArray[np.float64]) -> NDArray[np.float64]:

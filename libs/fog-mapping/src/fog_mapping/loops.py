@@ -153,17 +153,17 @@ class LoopSearch:
     ) -> Searched:
         """Look for what may be a loop and is certain to `most` (m); the same for the same arguments."""
         neighbours = _neighbours(len(self._scans), edges, weights)
-        edges: list[Edge] = []
+        joined: list[Edge] = []
         loops: list[Loop] = []
         ambiguous = 0
         with ThreadPoolExecutor(self._jobs) as pool:
             places = pool.map(lambda k: self._search_place(k, poses, neighbours, most), range(len(self._places)))
             for done, found in enumerate(places, 1):
-                edges.extend(found.edges)
+                joined.extend(found.edges)
                 loops.extend(found.loops)
                 ambiguous += found.ambiguous
                 on_progress(done / len(self._places))
-        return Searched(edges, loops, ambiguous)
+        return Searched(joined, loops, ambiguous)
 
     def _search_place(
         self, number: int, poses: NDArray[np.float64], neighbours: list[list[_Neighbour]], most: float

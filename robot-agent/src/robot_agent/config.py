@@ -49,6 +49,13 @@ class SafetyConfig:
     speed_degraded: float = DEGRADED_SPEED / 100
     speed_egress: float = 0.10
     speed_back_off: float = 0.05
+    speed_teleop: float = 0.15
+    turn_teleop: float = 1.0
+    """rad/s. Slower is better while a map is recorded."""
+    hand_fresh: float = 0.15
+    """A speed given by hand counts for this long: three of its messages."""
+    hand_silent: float = 3.0
+    """Without a word of who drives it by hand for this long, the robot is disabled."""
     relax_after: float = 2.0
     map_late: float = MAP_HEARTBEAT.max_age_s
     map_lost: float = 3.0
@@ -284,6 +291,8 @@ def _with_motion(config: AgentConfig, motion: MotionSettings) -> AgentConfig:
         speed_normal=motion.speed_m_s,
         speed_degraded=motion.degraded_speed_m_s,
         speed_egress=creep,
+        speed_teleop=min(config.safety.speed_teleop, motion.degraded_speed_m_s),
+        turn_teleop=min(config.safety.turn_teleop, motion.turn_rad_s),
         # What is left of the way does not shrink while it turns.
         egress_stall=config.safety.egress_stall + max(0.0, math.pi / motion.turn_rad_s - _TURNED_BACK_S),
         undock_max=config.safety.undock_max * longer,

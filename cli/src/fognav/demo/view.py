@@ -32,6 +32,7 @@ _MODE_STYLES = {
     "INIT": "bold cyan",
     "HOLD": "bold yellow",
     "EGRESS": "bold magenta",
+    "TELEOP": "bold magenta",
     "DOCK": "bold magenta",
 }
 _STATE_STYLES = {"blocked": "bold red", "clear": "green", "unknown": "yellow"}

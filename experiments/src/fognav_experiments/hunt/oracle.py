@@ -58,6 +58,7 @@ _MODE_SPEED: Final[dict[Mode, float]] = {
     "PROTECTIVE_STOP": 0.0,
     "FAULT": 0.10,  # backing off on a command
     "EGRESS": 0.10,
+    "TELEOP": 0.15,
     "DOCK": 0.30,
 }
 _TOLD: Final[frozenset[Mode]] = frozenset({"INIT", "FAULT"})

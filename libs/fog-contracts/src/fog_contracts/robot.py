@@ -72,9 +72,16 @@ class BodySettings(_Table, frozen=True, kw_only=True):
         Annotated[list[_Vertex], Meta(max_length=64)],
         Meta(
             description="corners of the body's outline on the floor, as [x, y], counter-clockwise, convex; none: the "
-            "circle of the site's `radius`"
+            "circle of `radius_m`"
         ),
     ] = field(default_factory=list)
+    radius_m: Annotated[
+        Annotated[float, Meta(ge=0.0, le=2.0)],
+        Meta(
+            description="how far the body reaches from the point between its driven wheels; 0: the site's `radius`. A "
+            "robot without a fog, and so without a site, needs it or `footprint`"
+        ),
+    ] = 0.0
 
 
 class OdometrySettings(_Table, frozen=True, kw_only=True):

@@ -26,8 +26,9 @@ from msgspec.structs import replace
 from fog_contracts import channels as ch
 from fog_contracts.follower import MapFollower
 from fog_contracts.handlers import Fence
-from fog_contracts.messages import LoopHealth
+from fog_contracts.messages import SENTENCE_MAX, LoopHealth
 from fog_contracts.replica import MapError
+from robot_agent.agent.hand_driving import HandBack, HandReply, Steer, TakeOver, Watch
 from robot_agent.agent.maneuvers import Maneuvers
 from robot_agent.agent.motion_guard import MotionGuard
 from robot_agent.agent.navigation import Navigation, PreparedMap, prepare_map
@@ -61,6 +62,7 @@ if TYPE_CHECKING:
         Trace,
     )
     from fog_contracts.replica import Replica
+    from robot_agent.agent.hand_driving import HandRequest
     from robot_agent.config import AgentConfig
     from robot_agent.guardian.link import BaseFeedback, WheelCommand
     from robot_agent.hardware import LaserScan, LidarSamples
@@ -279,6 +281,37 @@ class AgentCore:
         if request == "reset" and outputs.refusal is None:
             self._driving.wheels.pass_reset()
         return outputs
+
+    @property
+    def by_hand(self) -> bool:
+        """Whether somebody drives the robot by hand."""
+        maneuver = self._safety.state.maneuver
+        return maneuver is not None and maneuver.kind == "teleop"
+
+    def on_hand(self, request: HandRequest, now: float) -> HandReply | None:
+        """Handle the word of an operator at the robot; the reply is None for one that steers or watches."""
+        self._rest.wake()
+        wanted: Request = "teleop" if isinstance(request, TakeOver) else "reset"
+        match request:
+            case Steer():
+                self._maneuvers.hand.steer(request.v, request.w, now)
+                return None
+            case Watch():
+                return None
+            case HandBack():
+                self._maneuvers.hand.end("the link to who drove it broke" if request.lost else "it was handed back")
+                return HandReply(accepted=True, reason="the robot stands, and waits to be enabled")
+        self._looked_at = self._ticked_at = -math.inf
+        goes_on = wanted == "teleop" and self.by_hand
+        refusal = None if goes_on else self.request(wanted, now).refusal
+        if refusal is not None:
+            return HandReply(
+                accepted=False, reason=refusal[:SENTENCE_MAX], code=refusal.code, causes=list(refusal.causes)
+            )
+        if wanted == "teleop":
+            self._maneuvers.hand.begin(now)
+            return HandReply(accepted=True, reason="drive it by hand; watch it")
+        return HandReply(accepted=True, reason="the fault is reset")
 
     def order_dock(self, now: float) -> Reason | None:
         """Let the robot go to its dock; return why it does not, None if it does."""

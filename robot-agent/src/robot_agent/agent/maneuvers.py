@@ -17,6 +17,7 @@ import numpy as np
 
 from fog_contracts.geometry import PATH_SPACING_M, sampled
 from fog_contracts.messages import EgressRequest, Pose
+from robot_agent.agent.hand_driving import HandDriving
 from robot_agent.agent.power import Docking
 from robot_agent.agent.safety_supervisor import ManeuverInputs
 from robot_agent.hardware import Twist
@@ -250,6 +251,7 @@ class Maneuvers:
         self._drive = config.drive_train
         self.egress = Egress(config)
         self.docking = Docking(config, localizer)
+        self.hand = HandDriving(config)
         self._turning = Turning(config.drive_train.axle_m, config.motion.limits.w_max)
         self._straight: dict[ManeuverKind, Straight] = {
             "undock": Straight(-UNDOCK_M, config.safety.speed_egress),
@@ -262,7 +264,7 @@ class Maneuvers:
         """Prepare for an operator's request."""
         if request == "egress" and state.maneuver is None:
             self.egress.begin()
-        if request in {"disable", "reset", "egress", "undock", "turn", "advance"}:
+        if request in {"disable", "reset", "egress", "undock", "turn", "advance", "teleop"}:
             self.docking.give_up()
 
     def may_seek_dock(
@@ -301,7 +303,8 @@ class Maneuvers:
         if kind == "dock" or self.docking.ordered:
             return ManeuverInputs(dock_problem=self._dock_problem(replica, now, running=kind == "dock"))
         if kind != "egress":
-            return ManeuverInputs()  # what is left of an earlier way out must not end a maneuver that begins now
+            # What is left of an earlier way out must not end a maneuver that begins now.
+            return ManeuverInputs(hand_over=self.hand.over(now) if kind == "teleop" else None)
         self.egress.advance(trusted, now)
         return ManeuverInputs(self.egress.remaining, self.egress.problem(self._guard.reason))
 
@@ -330,6 +333,8 @@ class Maneuvers:
                 return 0.0, 0.0
             case "turn":
                 return self._turning.wheels(self._localizer.odom_at(now))
+            case "teleop":
+                return self.hand.wheels(now)
             case _:
                 return self._straight[kind].wheels
 

@@ -96,13 +96,14 @@ class ManeuverInputs(NamedTuple):
     """How the maneuver goes, and why the base must not seek its dock.
 
     remaining: m to its end, rad of a turn. problem: what keeps the robot from it. blind_behind: why it would not drive
-    back.
+    back. hand_over: why nobody drives it by hand any more.
     """
 
     remaining: float = math.inf
     problem: str | None = None
     dock_problem: Reason | None = None
     blind_behind: Reason | None = None
+    hand_over: str | None = None
 
 
 class SafetySupervisor:
@@ -179,6 +180,7 @@ def safety_inputs(  # noqa: PLR0913  # the gate weighs every source of the agent
         maneuver_problem=maneuver.problem,
         dock_problem=maneuver.dock_problem,
         blind_behind=maneuver.blind_behind,
+        hand_over=maneuver.hand_over,
         caution=caution,
         resting=resting,
     )

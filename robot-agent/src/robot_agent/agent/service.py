@@ -27,7 +27,10 @@ from fog_runtime.transports.edges import Edges
 from fog_runtime.transports.zenoh_edge import ZenohEdge, use_one_thread
 from robot_agent import registry
 from robot_agent.agent.edges.exporter import Observed, RobotCollector, name_thread, parent
+from robot_agent.agent.edges.local_tools import LocalTools
 from robot_agent.agent.edges.map_loader import MapLoader, Store
+from robot_agent.agent.local_link import socket_beside
+from robot_agent.agent.recording.input_log import LOG_KEY, BaseReceived, Published, ScanReceived, Started
 from robot_agent.agent.recording.input_writer import open_core
 from robot_agent.agent.settings import remarks
 from robot_agent.config import agent_config
@@ -115,6 +118,8 @@ class Service:
         self._find_metrics_address = metrics_address
         self._metrics_address = ""
         self._was_connected = False
+        self.tools: LocalTools | None = None
+        """Tools on this computer, which watch what the robot measures."""
 
     def _ticker(self, period: float, offset: float = 0.0) -> Ticker:
         return Ticker(self._clock, period, self.phase, offset)
@@ -192,6 +197,8 @@ class Service:
         self._last_feedback_at = now
         self._corrupted["base"] = feedback.corrupted
         self._core.on_base(feedback, now)
+        if self.tools is not None and self.tools.watched:
+            self.tools.publish(BaseReceived(feedback=feedback, now=now))
 
     def on_base_lost(self, now: float, reason: str) -> None:
         """Pass the loss of the guardian, or of its base, to the core."""
@@ -203,6 +210,8 @@ class Service:
         self._last_scan_at = now
         SCANS.inc()
         self._core.on_scan(scan, now)
+        if self.tools is not None and self.tools.watched:
+            self.tools.publish(ScanReceived.of(scan, now))
 
     async def stream_loop(self, guardian: GuardianClient, lidar: LidarEdge) -> None:
         """Stream wheel commands at 20 Hz, at rest at 10 Hz, each on the newest of base and lidar unless it repeats."""
@@ -343,6 +352,9 @@ class Service:
                 publication = replace(publication, message=state)  # noqa: PLW2901  # the same one, completed
                 self._state = state
                 self._report_mode(state)
+                if self.tools is not None and self.tools.watched:
+                    channel, ids = publication.channel.name, dict(publication.ids)
+                    self.tools.publish(Published(channel=channel, ids=ids, message=state))
             self._edges.publish(publication)
 
     def _loop_health(self) -> LoopHealth:
@@ -383,8 +395,8 @@ async def run(settings: Settings, robot: RobotFile, given: Given, clock: SystemC
     use_one_thread()
     health = Health("map", "pose", "lidar", "base")
     async with ZenohEdge.open(
-        connect=settings.zenoh_endpoints, clock=clock, role="robot-agent", id=settings.robot, site=site,
-        credentials=given.credentials,
+        connect=settings.zenoh_endpoints if settings.fog else (), clock=clock, role="robot-agent", id=settings.robot,
+        site=site, credentials=given.credentials,
     ) as zenoh:  # fmt: skip
         with (
             open_core(config, settings.seed, settings.input_log) as core,
@@ -397,6 +409,8 @@ async def run(settings: Settings, robot: RobotFile, given: Given, clock: SystemC
             map_loader.begin()
             guardian.begin(agent.on_feedback, agent.on_base_lost)
             lidar.on_samples = core.on_lidar_samples
+            started = Started(config=replace(config, operator_key=LOG_KEY), seed=settings.seed)
+            agent.tools = LocalTools(socket_beside(settings.guardian_socket), started, core, clock)
             agent.subscribe()
             REGISTRY.register(agent.collector)
             zenoh.declare_liveliness("robot-agent", settings.robot)
@@ -412,6 +426,7 @@ async def run(settings: Settings, robot: RobotFile, given: Given, clock: SystemC
                 tasks.create_task(agent.control_loop(), name="control")
                 tasks.create_task(map_loader.run(body), name="map")
                 tasks.create_task(agent.publish_loop(), name="publish")
+                tasks.create_task(agent.tools.run(), name="local tools")
                 tasks.create_task(agent.housekeeping_loop(lidar, guardian), name="housekeeping")
 
 

@@ -7,6 +7,7 @@ numpy: the agent looks at them before it loads that.
 from __future__ import annotations
 
 import math
+import secrets
 import tomllib
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Final, NamedTuple
@@ -15,10 +16,11 @@ import msgspec
 from msgspec import Meta
 
 from fog_contracts.commands import KEY_BYTES
-from fog_contracts.messages import Id
-from fog_contracts.site import Site
+from fog_contracts.messages import Id, Pose
+from fog_contracts.site import RobotSite, Site
 from fog_runtime.configuration.robot_file import VARIABLES
 from fog_runtime.configuration.settings import CommonSettings, SettingsError
+from fog_runtime.credentials import NOBODY
 from fog_runtime.keys import OperatorKeyError
 from fog_runtime.keys import read_operator_key as read_key
 from robot_agent import registry
@@ -28,12 +30,12 @@ from robot_agent.hardware import DockingDriver, SleepingDriver
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from fog_contracts.site import RobotSite
     from fog_runtime.configuration.robot_file import RobotFile
     from fog_runtime.credentials import Credentials
     from robot_agent.hardware import BaseDriver, LidarTraits
 
 SITE_FILE: Final = "site.toml"
+NO_SITE: Final = "none"
 _BODY_TOLERANCE_M: Final = 0.02
 _ADD_RADIUS: Final = "Add how far (m) the robot's body reaches from the point between its driven wheels"
 
@@ -46,6 +48,9 @@ class Settings(CommonSettings, frozen=True, kw_only=True):
 
     `obstacle_memory_s`: how long (s) a reported obstacle counts while no lidar looks there again.
 
+    `fog`: whether there is a fog node. Without one the robot knows no site and no map, nobody can enable it, and it
+    moves by hand only: for its bring-up, and until its building has a map.
+
     `site_dir` has the `site.toml` that the fog node has: this robot's entry says how large it is, where it starts, and
     where its dock is. The map itself comes from the map-service.
 
@@ -54,6 +59,7 @@ class Settings(CommonSettings, frozen=True, kw_only=True):
 
     robot: Id
     guardian_socket: Path
+    fog: bool = True
     site_dir: Path = Path()
     seed: Annotated[int, Meta(ge=0)] = 0
     input_log: Path | None = None
@@ -81,12 +87,12 @@ def read_given(settings: Settings, robot: RobotFile) -> Given:
 
     """
     footprint, base = read_footprint(robot), registry.make_base(robot)
-    site, body = read_site(settings)
+    site, body = read_site(settings) if settings.fog else without_site(settings.robot, robot, footprint)
     refuse_contradictions(robot, base)
     refuse_body(robot, base, footprint or Footprint.circle(body.radius))
     if footprint is not None and footprint.circumscribed_radius > body.radius + _BODY_TOLERANCE_M:
         raise robot.error(
-            "body.footprint",
+            "body.footprint" if robot.settings.body.footprint else "body.radius_m",
             f"it reaches {footprint.circumscribed_radius:.2f} m from the point between the driven wheels, and the "
             f"`radius` in {settings.site_dir / SITE_FILE}, by which the fog node knows this robot's echoes, is "
             f"{body.radius:g} m",
@@ -95,8 +101,8 @@ def read_given(settings: Settings, robot: RobotFile) -> Given:
     return Given(
         site=site,
         body=body,
-        operator_key=read_operator_key(settings.operator_key_file),
-        credentials=settings.credentials(),
+        operator_key=read_operator_key(settings.operator_key_file) if settings.fog else secrets.token_bytes(KEY_BYTES),
+        credentials=settings.credentials() if settings.fog else NOBODY,
         footprint=footprint,
         base=base,
     )
@@ -131,10 +137,22 @@ def read_site(settings: Settings) -> tuple[str, RobotSite]:
     raise SettingsError(f"{file}: robots: there is no {settings.robot!r} (known: {known}). Add it, or set FOGNAV_ROBOT")
 
 
+def without_site(name: str, robot: RobotFile, footprint: Footprint | None) -> tuple[str, RobotSite]:
+    """Return what stands for the site's id and entry of a robot without a fog; raises `SettingsError`."""
+    if footprint is None:
+        raise robot.error(
+            "body.radius_m",
+            "there is no fog, so no site says how large the robot is",
+            "Set it to how far the body reaches from the point between its driven wheels, or set `footprint`",
+        )
+    return NO_SITE, RobotSite(id=name, start=Pose(x=0.0, y=0.0, theta=0.0), radius=footprint.circumscribed_radius)
+
+
 def read_footprint(robot: RobotFile) -> Footprint | None:
     """Return the footprint of the robot's settings, None for the site's circle; raises `SettingsError`."""
     if not robot.settings.body.footprint:
-        return None
+        radius = robot.settings.body.radius_m
+        return Footprint.circle(radius) if radius else None
     try:
         return Footprint(tuple(robot.settings.body.footprint))
     except FootprintError as error:

@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from robot_agent.config import SafetyConfig
 
 Localization = Literal["good", "weak", "lost", "none"]
-Request = Literal["enable", "disable", "reset", "egress", "dock", "undock", "back_off", "turn", "advance"]
+Request = Literal["enable", "disable", "reset", "egress", "dock", "undock", "back_off", "turn", "advance", "teleop"]
 
 
 class Level(IntEnum):
@@ -49,7 +49,8 @@ class SafetyInputs(msgspec.Struct, frozen=True, kw_only=True):
     base_stopped: why the guardian keeps the wheels at zero. bumped: the fault that it has latched is a bump.
     docked_for: s for which the robot has been on its dock, None off it. late_age: since this computer last ran the
     agent too late, by `late_by`. resting: why the lidar stands still on purpose, or is being started. blind_behind: why
-    a robot that shall drive back would not move.
+    a robot that shall drive back would not move. hand_over: why nobody drives it by hand any more, None while somebody
+    does.
     """
 
     map_loaded: bool = False
@@ -84,6 +85,7 @@ class SafetyInputs(msgspec.Struct, frozen=True, kw_only=True):
     blind_behind: Reason | None = None
     caution: Reason | None = None
     resting: str | None = None
+    hand_over: str | None = None
     late_age: float = math.inf
     late_by: float = 0.0
     request: Request | None = None

@@ -32,9 +32,9 @@ MODE_OF: Final[dict[Level, Mode]] = {
     Level.FAULT: "FAULT",
 }
 STOPPED_MODES: Final[frozenset[Mode]] = frozenset({"INIT", "HOLD", "PROTECTIVE_STOP", "FAULT"})
-"""Modes in which no wheel turns (in HOLD after a ramp). EGRESS and DOCK drive slowly."""
+"""Modes in which no wheel turns (in HOLD after a ramp). EGRESS, DOCK and TELEOP drive slowly."""
 IMMEDIATE_STOP_MODES: Final[frozenset[Mode]] = frozenset({"INIT", "PROTECTIVE_STOP", "FAULT"})
-MANEUVERS: Final[frozenset[Mode]] = frozenset({"EGRESS", "DOCK"})
+MANEUVERS: Final[frozenset[Mode]] = frozenset({"EGRESS", "DOCK", "TELEOP"})
 _NEVER: Final = -math.inf
 _PLAN_AWAITED: Final = Reason(ReasonCode.PLAN_AWAITED, "waiting for a plan on the fresh map")
 _NOT_ENABLED: Final = Reason(ReasonCode.NOT_ENABLED, "waiting for an operator to enable")
@@ -197,7 +197,7 @@ def _apply_request(
             return _interrupted(replace(state, enabled=False)), None
         case "reset":
             return _reset(state, inputs, config)
-        case "egress" | "dock" | "undock" | "back_off" | "turn" | "advance" as kind:
+        case "egress" | "dock" | "undock" | "back_off" | "turn" | "advance" | "teleop" as kind:
             return _begin(kind, state, inputs, now, config)
     return _enable(state, inputs, findings)
 

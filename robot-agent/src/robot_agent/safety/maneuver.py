@@ -5,6 +5,7 @@
 - Undocking: straight back off the dock.
 - A back-off: straight back by a few centimetres from what the robot has bumped into.
 - A turn in place, or some centimetres straight ahead, of a robot that does not know its place: scans may tell it then.
+- Driving by hand: an operator at the robot steers it, with or without a map, a place and a fog.
 
 Each suspends the conditions that it is made for, and ends for good with anything else that would stop the robot. One
 table, `RULES`, says what it suspends, what refuses it, and when it is over.
@@ -27,7 +28,7 @@ if TYPE_CHECKING:
     from robot_agent.config import SafetyConfig
     from robot_agent.safety.conditions import Finding, SafetyInputs
 
-ManeuverKind = Literal["egress", "dock", "undock", "back_off", "turn", "advance"]
+ManeuverKind = Literal["egress", "dock", "undock", "back_off", "turn", "advance", "teleop"]
 
 
 _POSE_WORDS: Final[Mapping[str, str]] = {"weak": "uncertain", "lost": "unknown", "none": "unknown"}
@@ -170,6 +171,31 @@ def _looking_around_end(inputs: SafetyInputs, _: SafetyConfig) -> tuple[str, boo
     return f"it is done, and the pose is {_POSE_WORDS[inputs.localization]}{detail}", True
 
 
+def _relevant_to_teleop(inputs: SafetyInputs) -> SafetyInputs:
+    # Who steers sees the robot, and answers for where it goes: base, lidar and stop field guard it, in any building.
+    return replace(
+        inputs,
+        localization="good",
+        inside_blocked=None,
+        near_blocked=None,
+        map_loaded=True,
+        map_age=0.0,
+        map_gap=0.0,
+        mission=False,
+        caution=None,
+    )
+
+
+def _refuses_teleop(inputs: SafetyInputs) -> Reason | None:
+    if inputs.docked_for is not None:
+        return Reason(ReasonCode.ON_DOCK, "the robot is on its dock: undock it, or pull it off")
+    return None
+
+
+def _teleop_end(inputs: SafetyInputs, _: SafetyConfig) -> tuple[str, bool] | None:
+    return None if inputs.hand_over is None else (inputs.hand_over, True)
+
+
 RULES: Final[Mapping[ManeuverKind, Rules]] = {
     "egress": Rules(
         "EGRESS",
@@ -234,6 +260,16 @@ RULES: Final[Mapping[ManeuverKind, Rules]] = {
         lambda c: c.advance_max,
         lambda c: c.speed_egress,
     ),
+    "teleop": Rules(
+        "TELEOP",
+        "driving by hand",
+        "an operator at the robot drives it by hand",
+        _relevant_to_teleop,
+        _refuses_teleop,
+        _teleop_end,
+        lambda _: float("inf"),
+        lambda c: c.speed_teleop,
+    ),
 }
 """Every maneuver; the mode EGRESS also stands for the back-off, the turn and the advance, DOCK for both ways."""
 
@@ -296,8 +332,8 @@ def proceed(
 
 def _progress(maneuver: Maneuver, inputs: SafetyInputs, now: float, config: SafetyConfig) -> Maneuver | End:
     remaining = inputs.maneuver_remaining
-    if maneuver.kind == "dock":
-        return maneuver  # the base's own program finds its way
+    if maneuver.kind in {"dock", "teleop"}:
+        return maneuver  # the base's own program finds its way, and so does a person
     if not remaining <= maneuver.best + config.egress_back:
         return End(f"the robot moved away from the end of {RULES[maneuver.kind].name}")
     if remaining < maneuver.best - config.egress_step:

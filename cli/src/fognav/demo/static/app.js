@@ -226,7 +226,7 @@ function put(id, text) {
 }
 
 const metres = (value, digits = 1) => (value === null || value === undefined ? "–" : `${value.toFixed(digits)} m`);
-const TONES = { NORMAL: "good", DEGRADED: "caution", INIT: "caution", HOLD: "caution", EGRESS: "caution", DOCK: "caution" };
+const TONES = { NORMAL: "good", DEGRADED: "caution", INIT: "caution", HOLD: "caution", EGRESS: "caution", DOCK: "caution", TELEOP: "caution" };
 
 function bars() {
   const longest = Math.max(1, ...Object.values(latest.stages));

@@ -188,7 +188,7 @@ class RobotPose(Message, frozen=True, kw_only=True):
     clock: Seconds = 0.0
 
 
-Mode = Literal["INIT", "NORMAL", "DEGRADED", "HOLD", "PROTECTIVE_STOP", "FAULT", "EGRESS", "DOCK"]
+Mode = Literal["INIT", "NORMAL", "DEGRADED", "HOLD", "PROTECTIVE_STOP", "FAULT", "EGRESS", "DOCK", "TELEOP"]
 
 
 class LoopHealth(Message, frozen=True, kw_only=True):
@@ -316,6 +316,8 @@ class RefusalCode(Described):
     # goal, pose and profile
     NO_GOAL = "no_goal", "there is no goal to cancel"
     DRIVING = "driving", "the robot must stand for that"
+    HAND_TAKEN = "hand_taken", "somebody else drives the robot by hand"
+    NOT_BY_HAND = "not_by_hand", "it does not drive by hand: take it over first"
     POSE_MISSING = "pose_missing", "the command carries no pose"
     POSE_OFF_MAP = "pose_off_map", "the pose is off the map"
     POSE_IN_WALL = "pose_in_wall", "the pose is in a wall"

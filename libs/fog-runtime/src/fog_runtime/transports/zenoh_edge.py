@@ -144,13 +144,15 @@ class ZenohEdge:
     ) -> AsyncIterator["ZenohEdge"]:
         """Open a session as a client of one of the routers `connect`; while none is reachable it keeps trying.
 
+        Without any, nothing is ever sent or received.
+
         `role` and `id` identify the process in logs; `site` is filled into every key. Raises
         `CredentialsError` if an endpoint would reveal the password in the `credentials`.
         """
         edge = cls(clock, site=site, role=role, name=id, connect=connect, credentials=credentials)
         connecting: asyncio.Task[None] | None = None
         try:
-            if not await edge._try_connect():
+            if connect and not await edge._try_connect():
                 connecting = asyncio.create_task(edge._connect_when_possible(), name="zenoh connect")
             yield edge
         finally:

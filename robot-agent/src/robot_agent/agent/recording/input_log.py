@@ -24,6 +24,7 @@ from fog_contracts.commands import sign
 from fog_contracts.handlers import completed
 from fog_contracts.messages import EgressRequest, LoopHealth, MapSnapshot, Mode, PlanReply, RobotCommand
 from robot_agent.agent.core import AgentCore
+from robot_agent.agent.hand_driving import HandRequest
 from robot_agent.agent.navigation import PreparedMap
 from robot_agent.config import AgentConfig
 from robot_agent.guardian.link import BaseFeedback, WheelCommand
@@ -38,6 +39,7 @@ if TYPE_CHECKING:
     from fog_contracts.channels import Channel
     from fog_contracts.handlers import Handler, Ids, Moment, Publication, QueryHandler
     from fog_contracts.messages import Message
+    from robot_agent.agent.hand_driving import HandReply
     from robot_agent.motion.local_planner import Job
     from robot_agent.profiles import FindProfile, Found, Search
 
@@ -127,6 +129,13 @@ class PoseObserved(Input, frozen=True, kw_only=True):
     def observation(self) -> AbsoluteObservation:
         """Return the observation."""
         return AbsoluteObservation(Pose2(*self.pose), np.array(self.covariance).reshape(3, 3), self.observed_at)
+
+
+class HandReceived(Input, frozen=True, kw_only=True):
+    """The word of an operator at the robot, who drives it by hand."""
+
+    request: HandRequest
+    now: float
 
 
 class LidarSamplesReceived(Input, frozen=True, kw_only=True):
@@ -295,9 +304,9 @@ class EntriesLost(Entry, frozen=True, kw_only=True):
 
 _KINDS: Final[tuple[type[Entry], ...]] = (
     Started, PoseRestored, SnapshotLoaded, MessageReceived, QueryReceived, BaseReceived, BaseLost, SuspensionNoticed,
-    PoseObserved, LidarSamplesReceived, ScanReceived, LoopHealthReceived, SearchCycle, SearchEnded, ControlCycle,
-    DecisionMade, StreamCycle, Tick, StorageCheck, EgressAsked, EgressReplied, WheelsCommanded, Published, Answered,
-    PoseStored, EntriesLost,
+    PoseObserved, HandReceived, LidarSamplesReceived, ScanReceived, LoopHealthReceived, SearchCycle, SearchEnded,
+    ControlCycle, DecisionMade, StreamCycle, Tick, StorageCheck, EgressAsked, EgressReplied, WheelsCommanded, Published,
+    Answered, PoseStored, EntriesLost,
 )  # fmt: skip
 ENTRY_OF_TOPIC: Final[Mapping[str, type[Entry]]] = {f"agent/{kind.__name__}": kind for kind in _KINDS}
 TOPIC_OF_ENTRY: Final[Mapping[type[Entry], str]] = {kind: topic for topic, kind in ENTRY_OF_TOPIC.items()}
@@ -377,6 +386,14 @@ class LoggedAgent(AgentCore):
         covariance = tuple(float(value) for value in observation.covariance.ravel())
         self._write(PoseObserved(pose=pose, covariance=covariance, observed_at=observation.stamp))
         return super().on_absolute_observation(observation)
+
+    def on_hand(self, request: HandRequest, now: float) -> HandReply | None:
+        """Log the word of an operator at the robot, and the reply, and handle it."""
+        self._write(HandReceived(request=request, now=now))
+        reply = super().on_hand(request, now)
+        if reply is not None:
+            self._write(Answered(reply=reply))
+        return reply
 
     def on_lidar_samples(self, samples: LidarSamples, now: float) -> None:
         """Log the samples and handle them."""

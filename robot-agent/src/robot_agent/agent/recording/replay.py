@@ -125,6 +125,7 @@ _PASSED_ON: Final[Mapping[type[log.Entry], Callable[[AgentCore, Any], object]]] 
     log.QueryReceived: _ask,
     log.BaseReceived: lambda agent, entry: agent.on_base(entry.feedback, entry.now),
     log.BaseLost: lambda agent, entry: agent.on_base_lost(entry.now, entry.reason),
+    log.HandReceived: lambda agent, entry: agent.on_hand(entry.request, entry.now),
     log.LidarSamplesReceived: lambda agent, entry: agent.on_lidar_samples(entry.samples(), entry.now),
     log.ScanReceived: lambda agent, entry: agent.on_scan(entry.scan(), entry.now),
     log.SuspensionNoticed: lambda agent, entry: agent.on_suspension(entry.seconds),

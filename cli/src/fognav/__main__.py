@@ -19,6 +19,7 @@ from fognav.commands.robot_file import robot_add, robot_check, robot_new
 from fognav.commands.site import site_app
 from fognav.commands.source import source_app
 from fognav.commands.status import status_command
+from fognav.commands.teleop import teleop_command
 from fognav.commands.up import down_command, logs_command, up_command, upgrade_command
 from fognav.commands.zone import zone_app
 from fognav.doctor import doctor_command
@@ -51,6 +52,7 @@ for group, name, command, example in (
     (installed.TRY_IT, "demo", demo_command, "demo --headless --report report.json --seed 7"),
     (installed.TRY_IT, "doctor", doctor_command, "doctor --json"),
     (installed.OPERATE, "status", status_command, "status --json"),
+    (installed.OPERATE, "teleop", teleop_command, "teleop --page --bind 192.168.7.20"),
     (installed.RUN, "up", up_command, "up --site sites/estig --site sites/floor2"),
     (installed.RUN, "down", down_command, "down"),
     (installed.RUN, "logs", logs_command, "logs map-service -f"),

@@ -39,13 +39,15 @@ class LocalRobot:
             self._link.close()
             raise LocalRobotError(f"{path}: {_remedy(error)}") from error
 
-    def entries(self, timeout: float | None = None) -> Iterator[Any]:
+    def entries(self, timeout: float) -> Iterator[Any]:
         """Yield entries (`agent.recording.input_log`) and `Missed`, until none has come for `timeout` s.
 
         The first is `Started`, with the robot's configuration. Raises `LocalRobotError` when the link breaks.
         """
-        while (entry := self._next(timeout)) is not None:
-            yield entry
+        while (what := self._waiting.pop(0) if self._waiting else self._receive(timeout)) is not None:
+            if isinstance(what, HandReply):
+                raise LocalRobotError(f"{self.path}: {what.reason}")
+            yield what
 
     def take_over(self) -> HandReply:
         """Begin to drive by hand, and return whether the robot agrees; raises `LocalRobotError`."""
@@ -62,14 +64,26 @@ class LocalRobot:
     def steer(self, v: float, w: float) -> None:
         """Drive at v (m/s) and turn at w (rad/s) for the next 0.15 s; call it 20 times a second.
 
-        Never blocks: what does not fit into the socket is not worth waiting for. Raises `LocalRobotError`.
+        Never blocks. Raises `LocalRobotError`.
         """
+        self.send(Steer(v=v, w=w))
+
+    def send(self, request: HandRequest) -> None:
+        """Say something without waiting for its reply, which `poll` returns; raises `LocalRobotError`."""
+        self._link.settimeout(0.0)
         try:
-            self._link.send(encode_request(Steer(v=v, w=w)), socket.MSG_DONTWAIT)
+            self._link.send(encode_request(request))
         except BlockingIOError:
-            return
+            return  # what does not fit into the socket is not worth waiting for: the agent does not read
         except OSError as error:
             raise LocalRobotError(f"{self.path}: {_remedy(error)}") from error
+
+    def poll(self) -> list[Any]:
+        """Return all that has come, replies too, without waiting; raises `LocalRobotError` when the link breaks."""
+        come, self._waiting = self._waiting, []
+        while (what := self._receive(0.0)) is not None:
+            come.append(what)
+        return come
 
     def fileno(self) -> int:
         """Return the socket's number, for `select`."""
@@ -80,11 +94,7 @@ class LocalRobot:
         self._link.close()
 
     def _ask(self, request: HandRequest) -> HandReply:
-        try:
-            self._link.settimeout(REPLY_S)
-            self._link.send(encode_request(request))
-        except OSError as error:
-            raise LocalRobotError(f"{self.path}: {_remedy(error)}") from error
+        self.send(request)
         until = time.monotonic() + REPLY_S
         while (left := until - time.monotonic()) > 0.0:
             what = self._receive(left)
@@ -94,35 +104,26 @@ class LocalRobot:
                 self._waiting.append(what)
         raise LocalRobotError(f"{self.path}: the agent does not answer within {REPLY_S:g} s: restart it")
 
-    def _next(self, timeout: float | None) -> Any:  # noqa: ANN401  # an `Entry`, or `Missed`
-        if self._waiting:
-            return self._waiting.pop(0)
-        until = None if timeout is None else time.monotonic() + timeout
-        while until is None or time.monotonic() <= until:
-            what = self._receive(None if until is None else max(0.0, until - time.monotonic()))
-            if isinstance(what, HandReply):
-                raise LocalRobotError(f"{self.path}: {what.reason}")
+    def _receive(self, timeout: float) -> Any:  # noqa: ANN401  # what a packet holds
+        """Return what the next packet of a kind that this version knows holds; None if none comes in time (s)."""
+        until = time.monotonic() + timeout
+        while True:
+            self._link.settimeout(max(0.0, until - time.monotonic()))
+            try:
+                packet = self._link.recv(PACKET_LIMIT)
+            except (TimeoutError, BlockingIOError):
+                return None
+            except OSError as error:
+                raise LocalRobotError(f"{self.path}: {_remedy(error)}") from error
+            if not packet:
+                raise LocalRobotError(f"{self.path}: the agent has closed the link: see its log")
+            try:
+                what = decode(packet)
+            except msgspec.DecodeError as error:
+                reason = f"the agent is of another version ({error}): install the same"
+                raise LocalRobotError(f"{self.path}: {reason}") from error
             if what is not None:
                 return what
-        return None
-
-    def _receive(self, timeout: float | None) -> Any:  # noqa: ANN401  # what a packet holds
-        """Return what the next packet holds, None if none came in time or its kind is unknown."""
-        self._link.settimeout(timeout)
-        try:
-            packet = self._link.recv(PACKET_LIMIT)
-        except (TimeoutError, BlockingIOError):
-            return None
-        except OSError as error:
-            raise LocalRobotError(f"{self.path}: {_remedy(error)}") from error
-        if not packet:
-            raise LocalRobotError(f"{self.path}: the agent has closed the link: see its log")
-        try:
-            return decode(packet)
-        except msgspec.DecodeError as error:
-            raise LocalRobotError(
-                f"{self.path}: the agent is of another version ({error}): install the same"
-            ) from error
 
     def __enter__(self) -> Self:
         return self

@@ -1,0 +1,237 @@
+"""`fognav teleop`: drive the robot on whose computer this runs by hand, by keyboard, game pad or a page."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import os
+import select
+import struct
+import sys
+import termios
+import time
+import tty
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Final, Protocol
+
+import typer
+
+from fognav.output import FailedError, WrongUseError, exit_codes, print_line
+from fognav.robot_page.server import LocalRobotErrors, serve
+from fognav.robot_page.view import RobotView, default_socket
+from robot_agent.agent.hand_driving import HandReply
+from robot_agent.local_client import LocalRobot
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+
+_PERIOD_S: Final = 0.05
+_KEY_S: Final = 0.15
+"""A terminal tells no release of a key: one that is not repeated for this long is released."""
+_HEALTHY_S: Final = 5.0
+"""For so long a robot is asked again that must not move: its lidar may have to start."""
+_MOVES: Final = {
+    "i": (1, 0), "o": (1, -1), "j": (0, 1), "l": (0, -1), "u": (1, 1), ",": (-1, 0), ".": (-1, 1), "m": (-1, -1),
+}  # fmt: skip
+_FASTER: Final = {"q": (1.1, 1.1), "z": (0.9, 0.9), "w": (1.1, 1), "x": (0.9, 1), "e": (1, 1.1), "c": (1, 0.9)}
+_HELP: Final = """\
+hold a key to drive:   u i o      q/z faster/slower: both
+                       j k l      w/x only ahead and back
+                       m , .      e/c only turning
+k or space stops, r resets a fault, Ctrl-C ends. Letting go stops the robot."""
+
+SocketOption = Annotated[
+    Path | None, typer.Option("--socket", metavar="FILE", help="The agent's socket, if not found by itself.")
+]
+
+
+class _Steering(Protocol):
+    """Something that is held to drive."""
+
+    def fileno(self) -> int:
+        """Return what `select` waits for."""
+
+    def read(self, now: float) -> str:
+        """Take in what has come; return "stop", "reset" or nothing. Raises `FailedError` when it is gone."""
+
+    def motion(self, now: float) -> tuple[float, float]:
+        """Return v (m/s) and w (rad/s)."""
+
+
+class Keyboard:
+    """Keys as in ROS's teleop_twist_keyboard."""
+
+    def __init__(self, speed: float, turn: float) -> None:
+        self._speed, self._turn = speed, turn
+        self._held, self._held_at = (0, 0), 0.0
+
+    def fileno(self) -> int:
+        """Return the terminal's number."""
+        return sys.stdin.fileno()
+
+    def read(self, now: float) -> str:
+        """Take in the keys that were pressed."""
+        keys = os.read(self.fileno(), 64).decode(errors="ignore")
+        if not keys:
+            raise FailedError("the terminal is gone: the robot stands")
+        for key in keys:
+            if key in _MOVES:
+                self._held, self._held_at = _MOVES[key], now
+            elif key in _FASTER:
+                ahead, turning = _FASTER[key]
+                self._speed, self._turn = min(self._speed * ahead, 0.15), min(self._turn * turning, 1.0)
+                print_line(f"{self._speed:.2f} m/s, {self._turn:.2f} rad/s\r")
+            elif key == "r":
+                return "reset"
+            else:
+                self._held = (0, 0)
+        return ""
+
+    def motion(self, now: float) -> tuple[float, float]:
+        """Return the motion of the key that is held."""
+        ahead, left = self._held if now - self._held_at <= _KEY_S else (0, 0)
+        return ahead * self._speed, left * self._turn
+
+
+class GamePad:
+    """A game pad by Linux's joystick interface: a shoulder button is held, the left stick steers."""
+
+    _EVENT = struct.Struct("<IhBB")
+    _BUTTON, _AXIS, _FIRST = 0x01, 0x02, 0x80
+    _SHOULDERS = frozenset({4, 5})
+
+    def __init__(self, device: Path, speed: float, turn: float) -> None:
+        """Open it; raises `WrongUseError`."""
+        self._device, self._speed, self._turn = device, speed, turn
+        self._axes: dict[int, float] = {}
+        self._held: set[int] = set()
+        try:
+            self._file = os.open(device, os.O_RDONLY | os.O_NONBLOCK)
+        except OSError as error:
+            raise WrongUseError(
+                f"{device}: {error.strerror}. Name the game pad, as /dev/input/js0, which the group `input` may read"
+            ) from error
+
+    def fileno(self) -> int:
+        """Return the device's number."""
+        return self._file
+
+    def read(self, now: float) -> str:
+        """Take in what has changed."""
+        del now
+        try:
+            data = os.read(self._file, 64 * self._EVENT.size)
+        except BlockingIOError:
+            return ""
+        except OSError as error:
+            raise FailedError(f"{self._device}: {error.strerror}: the robot stands") from error
+        if not data:
+            raise FailedError(f"{self._device}: the game pad is gone: the robot stands")
+        for _, value, kind, number in self._EVENT.iter_unpack(data[: len(data) // self._EVENT.size * self._EVENT.size]):
+            if kind & self._AXIS:
+                self._axes[number] = value / 32767.0
+            elif kind & self._BUTTON and number in self._SHOULDERS:
+                # What is held when the device is opened is not the word of somebody who looks.
+                (self._held.add if value and not kind & self._FIRST else self._held.discard)(number)
+        return ""
+
+    def motion(self, now: float) -> tuple[float, float]:
+        """Return the motion of the stick while a shoulder button is held."""
+        del now
+        if not self._held:
+            return 0.0, 0.0
+        ahead, left = -self._axes.get(1, 0.0), -self._axes.get(0, 0.0)
+        return ahead * self._speed, left * self._turn
+
+
+def teleop_command(  # noqa: PLR0913  # one parameter for each option
+    *,
+    page: Annotated[bool, typer.Option("--page", help="Serve a page with a pad for touch, mouse and keys.")] = False,
+    bind: Annotated[
+        list[str] | None,
+        typer.Option("--bind", metavar="ADDRESS", help="Serve the page there, too, for other devices."),
+    ] = None,
+    port: Annotated[int, typer.Option(min=0, max=65535, help="The page's port; 0: any free one.")] = 0,
+    gamepad: Annotated[
+        Path | None, typer.Option("--gamepad", metavar="DEVICE", help="Drive by a game pad, such as /dev/input/js0.")
+    ] = None,
+    speed: Annotated[float, typer.Option(min=0.01, max=0.15, help="m/s.")] = 0.1,
+    turn: Annotated[float, typer.Option(min=0.1, max=1.0, help="rad/s; more than 0.5 blurs a map.")] = 0.5,
+    socket: SocketOption = None,
+) -> None:
+    """Drive this computer's robot by hand, with or without a map and a fog.
+
+    Run it on the robot's computer. Letting go, losing the link and ending the command stop the robot within 0.3 s.
+    """
+    path = socket or default_socket()
+    with exit_codes():
+        if page:
+            with contextlib.suppress(KeyboardInterrupt):
+                asyncio.run(serve(path, ["127.0.0.1", *(bind or [])], port))
+        elif gamepad is not None:
+            drive(path, GamePad(gamepad, speed, turn))
+        elif not sys.stdin.isatty():
+            raise WrongUseError("there is no terminal to read keys from: use --page or --gamepad")
+        else:
+            with _raw_terminal():
+                print_line(_HELP.replace("\n", "\r\n") + "\r")
+                drive(path, Keyboard(speed, turn))
+
+
+def drive(path: Path, steering: _Steering) -> None:
+    """Drive the robot at this socket until Ctrl-C; raises `FailedError`."""
+    with LocalRobotErrors(), LocalRobot(path) as robot:
+        view = RobotView()
+        _take_over(robot)
+        told, driven = "", False
+        due = time.monotonic()
+        with contextlib.suppress(KeyboardInterrupt):
+            while True:
+                ready, _, _ = select.select(
+                    [steering.fileno(), robot.fileno()], [], [], max(0.0, due - time.monotonic())
+                )
+                now = time.monotonic()
+                word = steering.read(now) if steering.fileno() in ready else ""
+                for entry in robot.poll():
+                    if isinstance(entry, HandReply):
+                        print_line(entry.reason + "\r")
+                    else:
+                        view.take(entry)
+                if word == "reset":
+                    print_line(robot.reset().reason + "\r")
+                    _take_over(robot)
+                driven = driven or view.state.get("mode") == "TELEOP"
+                told = _tell(view, told)
+                if now >= due:
+                    robot.steer(*steering.motion(now))
+                    due = max(due + _PERIOD_S, now)
+        robot.hand_back()
+
+
+def _take_over(robot: LocalRobot) -> None:
+    """Take the robot over, as soon as it may move; raises `FailedError` with its reason if it may not."""
+    until = time.monotonic() + _HEALTHY_S
+    while not (reply := robot.take_over()).accepted:
+        if reply.code != "must_not_move" or time.monotonic() > until:
+            raise FailedError(f"the robot refuses to be driven by hand: {reply.reason}")
+        time.sleep(_PERIOD_S)
+
+
+def _tell(view: RobotView, before: str) -> str:
+    """Print mode and reasons when they change; return them."""
+    state = view.state
+    text = f"{state.get('mode', '')}: {'; '.join(state.get('reasons', []))}" if state else before
+    if text != before:
+        print_line(text + "\r")
+    return text
+
+
+@contextlib.contextmanager
+def _raw_terminal() -> Iterator[None]:
+    """Read single keys while the context is open, unechoed."""
+    before = termios.tcgetattr(sys.stdin)
+    try:
+        tty.setcbreak(sys.stdin)
+        yield
+    finally:
+        termios.tcsetattr(sys.stdin, termios.TCSADRAIN, before)

@@ -1,0 +1,179 @@
+"""Serves the page of a robot's own computer: its scan and state live, and a pad to drive it by hand.
+
+Each page is a client of the agent of its own. What it says is passed on as it comes, and nothing is said that it did
+not say: the agent's dead man's switch is the only one, so a link to the page that breaks stops the robot.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import hmac
+import secrets
+import socket
+from pathlib import Path
+from typing import TYPE_CHECKING, Final
+
+import msgspec
+import uvicorn
+from fastapi import FastAPI, Response, WebSocket, WebSocketDisconnect
+from fastapi.responses import FileResponse
+
+from fognav.output import FailedError, WrongUseError, print_line
+from fognav.robot_page.view import RobotView
+from robot_agent.agent.hand_driving import HandReply, HandRequest
+from robot_agent.local_client import LocalRobot, LocalRobotError
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+_STATIC: Final = Path(__file__).parent / "static"
+_FILES: Final = {"": "index.html", "page.js": "page.js", "page.css": "page.css"}
+_POLICY: Final = "default-src 'none'; connect-src 'self'; style-src 'self'; script-src 'self'; img-src 'self'"
+_REFUSED: Final = 4401
+_PAGES_MAX: Final = 4
+_LOOPBACK: Final = frozenset({"127.0.0.1", "::1"})
+
+_requests = msgspec.json.Decoder(HandRequest)
+
+
+def make_app(path: Path, token: str) -> FastAPI:
+    """Return the page's application for the agent at this socket; who has no `token` sees and drives nothing."""
+    app = FastAPI(title="Fognav robot", docs_url=None, redoc_url=None, openapi_url=None)
+    open_pages: set[WebSocket] = set()
+
+    @app.websocket("/live")
+    async def live(page: WebSocket) -> None:
+        await page.accept()
+        known = hmac.compare_digest(page.query_params.get("token", "").encode(), token.encode())
+        if not known or len(open_pages) >= _PAGES_MAX:
+            reason = "too many pages are open" if known else "open the address that the command printed"
+            await page.close(_REFUSED, reason)
+            return
+        open_pages.add(page)
+        try:
+            await _Session(page, path).run()
+        finally:
+            open_pages.discard(page)
+
+    @app.get("/{name:path}")
+    async def static(name: str) -> Response:
+        file = _FILES.get(name)
+        if file is None:
+            return Response(f"there is no page {name}", status_code=404, media_type="text/plain")
+        headers = {"Content-Security-Policy": _POLICY, "Cache-Control": "no-cache", "Referrer-Policy": "no-referrer"}
+        return FileResponse(_STATIC / file, headers=headers)
+
+    return app
+
+
+class _Session:
+    """One page, and its link to the agent."""
+
+    def __init__(self, page: WebSocket, path: Path) -> None:
+        self._page = page
+        self._path = path
+        self._view = RobotView()
+        self._replies: list[HandReply] = []
+        self._news = asyncio.Event()
+        self._error = ""
+
+    async def run(self) -> None:
+        """Pass on what either says, until one ends."""
+        try:
+            robot = LocalRobot(self._path)
+        except LocalRobotError as error:
+            await self._page.send_json({"error": str(error)})
+            await self._page.close()
+            return
+        loop = asyncio.get_running_loop()
+        with robot:
+            loop.add_reader(robot.fileno(), self._on_readable, robot)
+            showing = asyncio.create_task(self._show())
+            hearing = asyncio.create_task(self._hear(robot))
+            try:
+                await asyncio.wait({showing, hearing}, return_when=asyncio.FIRST_COMPLETED)
+            finally:
+                loop.remove_reader(robot.fileno())
+                for task in (showing, hearing):
+                    task.cancel()
+                await asyncio.gather(showing, hearing, return_exceptions=True)
+
+    def _on_readable(self, robot: LocalRobot) -> None:
+        try:
+            for what in robot.poll():
+                if isinstance(what, HandReply):
+                    self._replies.append(what)
+                    self._news.set()
+                elif self._view.take(what):
+                    self._news.set()
+        except LocalRobotError as error:
+            asyncio.get_running_loop().remove_reader(robot.fileno())
+            self._error = str(error)
+            self._news.set()
+
+    async def _show(self) -> None:
+        """Send the newest whenever there is any; a slow page gets fewer, never older ones."""
+        while not self._error:
+            await self._news.wait()
+            self._news.clear()
+            replies, self._replies = self._replies, []
+            await self._page.send_json({**self._view.as_json(), "replies": [msgspec.to_builtins(r) for r in replies]})
+        await self._page.send_json({"error": self._error})
+
+    async def _hear(self, robot: LocalRobot) -> None:
+        with contextlib.suppress(WebSocketDisconnect, LocalRobotError):
+            while True:
+                try:
+                    request = _requests.decode(await self._page.receive_text())
+                except msgspec.DecodeError as error:
+                    await self._page.send_json({"error": f"the page sent what is no request: {error}"})
+                    return
+                robot.send(request)
+
+
+async def serve(path: Path, hosts: Sequence[str], port: int) -> None:
+    """Serve the page at these addresses until cancelled; prints where it is. Raises `WrongUseError`."""
+    with LocalRobotErrors():
+        LocalRobot(path).close()
+    token = secrets.token_urlsafe(12)
+    listening = [_listen(host, port) for host in hosts]
+    for host, bound in zip(hosts, listening, strict=True):
+        shown = f"[{host}]" if ":" in host else host
+        print_line(f"the robot's page: http://{shown}:{bound.getsockname()[1]}/?token={token}")
+    if any(host not in _LOOPBACK for host in hosts):
+        print_line("whoever has this address drives the robot, and the link is not encrypted: use a network you trust")
+    config = uvicorn.Config(
+        make_app(path, token), log_level="warning", access_log=False, lifespan="off", ws_max_size=4096,
+        ws_max_queue=8, ws_ping_interval=1.0, ws_ping_timeout=2.0, timeout_graceful_shutdown=1,
+    )  # fmt: skip
+    server = uvicorn.Server(config)
+    server.capture_signals = contextlib.nullcontext  # type: ignore[method-assign,assignment]  # the command's are its own
+    task = asyncio.create_task(server.serve(listening))
+    try:
+        await asyncio.shield(task)
+    finally:
+        server.should_exit = True
+        await asyncio.gather(task, return_exceptions=True)
+
+
+class LocalRobotErrors(contextlib.AbstractContextManager[None]):
+    """Turns the errors of a link to the agent into those of a command."""
+
+    def __exit__(self, _kind: object, error: BaseException | None, _trace: object) -> None:
+        """Raise `FailedError` for a `LocalRobotError`."""
+        if isinstance(error, LocalRobotError):
+            raise FailedError(str(error)) from error
+
+
+def _listen(host: str, port: int) -> socket.socket:
+    listening = socket.socket(socket.AF_INET6 if ":" in host else socket.AF_INET)
+    listening.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+    try:
+        listening.bind((host, port))
+    except OSError as error:
+        listening.close()
+        raise WrongUseError(
+            f"the page can't be served on {host}, port {port} ({error.strerror}): choose another by --bind or --port"
+        ) from error
+    return listening

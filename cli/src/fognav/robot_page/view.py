@@ -1,0 +1,77 @@
+"""The newest of what the agent tells on its socket, as a page or a terminal shows it."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Final
+
+import numpy as np
+
+from robot_agent.agent.local_link import SOCKET, Missed
+from robot_agent.agent.recording.input_log import BaseReceived, Published, ScanReceived, Started
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    from robot_agent.config import AgentConfig
+
+INSTALLED: Final = Path("/run/fognav")
+
+
+def default_socket() -> Path:
+    """Return where the agent of this computer serves its tools, by its environment or as installed."""
+    guardian = os.environ.get("FOGNAV_GUARDIAN_SOCKET")
+    return (Path(guardian).parent if guardian else INSTALLED) / SOCKET
+
+
+class RobotView:
+    """The robot as far as it has told."""
+
+    def __init__(self) -> None:
+        self.config: AgentConfig | None = None
+        self.state: dict[str, Any] = {}
+        self.base: BaseReceived | None = None
+        self.scan: ScanReceived | None = None
+        self.missed = 0
+
+    def take(self, entry: Any) -> bool:  # noqa: ANN401  # an entry, or `Missed`
+        """Take an entry in; return whether it is a new scan or state."""
+        match entry:
+            case Started():
+                self.config = entry.config
+            case BaseReceived():
+                self.base = entry
+            case ScanReceived():
+                self.scan = entry
+            case Published():
+                self.state = entry.message
+            case Missed():
+                self.missed += entry.count
+        return isinstance(entry, (ScanReceived, Published))
+
+    def points(self) -> NDArray[np.float64]:
+        """Return the newest scan's returns (n, 2; m) in the robot's frame: x ahead, y to the left."""
+        if self.scan is None or self.config is None:
+            return np.zeros((0, 2))
+        scan, lidar = self.scan.scan(), self.config.localization
+        seen = (scan.ranges_m >= lidar.range_min) & (scan.ranges_m <= lidar.range_max)
+        angles = scan.angles_rad[seen] + lidar.lidar_yaw
+        x = lidar.lidar_x + scan.ranges_m[seen] * np.cos(angles)
+        return np.stack([x, lidar.lidar_y + scan.ranges_m[seen] * np.sin(angles)], axis=1)
+
+    def as_json(self) -> dict[str, Any]:
+        """Return what a page draws."""
+        status = self.base.feedback.status if self.base else None
+        return {
+            "mode": self.state.get("mode", ""),
+            "reasons": self.state.get("reasons", []),
+            "codes": self.state.get("codes", []),
+            "battery": status.battery if status else None,
+            "bumper": status.bumper if status else False,
+            "cliff": status.cliff if status else False,
+            "wheel_drop": status.wheel_drop if status else False,
+            "points": np.round(self.points(), 2).tolist(),
+            "footprint": [list(corner) for corner in self.config.footprint.vertices] if self.config else [],
+            "missed": self.missed,
+        }

@@ -1,0 +1,241 @@
+"""`fognav teleop` as an operator uses it: keys in a terminal, a game pad, and a page; the robot's processes are real.
+
+The robot has no fog, no site and no map; the building is simulated.
+"""
+
+from __future__ import annotations
+
+import fcntl
+import os
+import pty
+import re
+import select
+import shutil
+import struct
+import subprocess
+import sys
+import termios
+import threading
+import time
+from contextlib import ExitStack, contextmanager
+from functools import partial
+from pathlib import Path
+
+import programs
+import pytest
+from playwright.sync_api import expect, sync_playwright
+
+from robot_agent.agent.recording.input_log import BaseReceived, Published
+from robot_agent.local_client import LocalRobot
+
+pytestmark = [pytest.mark.live, pytest.mark.timeout(120)]
+
+ESTIG = Path(__file__).parents[2] / "sites" / "estig"
+SETTINGS = '[base]\ndriver = "roomba600"\n[lidar]\ndriver = "rplidar-a1"\n[body]\nradius_m = 0.17\n'
+SETTLED_S = 0.6
+"""After this time a robot that has to stop within 0.3 s stands, on a busy machine too."""
+
+
+@contextmanager
+def robot_without_fog(folder: Path):
+    """Run simulator, watchdog and agent; yields the agent's socket."""
+    wires = folder / "sim"
+    wires.mkdir()
+    (folder / "robot.toml").write_text(SETTINGS, "utf-8")
+    common = {
+        **os.environ,
+        "FOGNAV_ROBOT_FILE": str(folder / "robot.toml"),
+        "FOGNAV_ROBOT": "r1",
+        "FOGNAV_BASE_PORT": str(wires / "base"),
+        "FOGNAV_LIDAR_PORT": str(wires / "lidar"),
+        "FOGNAV_GUARDIAN_SOCKET": str(folder / "guardian.sock"),
+        "FOGNAV_ZENOH_CONNECT": "tcp/127.0.0.1:9",
+        "FOGNAV_MQTT_URL": "mqtt://127.0.0.1:9",
+    }
+    simulator = {"FOGNAV_SITE_DIR": str(ESTIG), "FOGNAV_RUN_DIR": str(wires), "FOGNAV_NODES": "model"}
+    with ExitStack() as stack:
+        for module, own in (
+            ("fognav_sim", simulator),
+            ("robot_agent.guardian.watchdog", {}),
+            ("robot_agent", {"FOGNAV_FOG": "false"}),
+        ):
+            data = folder / f"{module}.data"
+            data.mkdir()
+            log = folder / f"{module}.log"
+            program = programs.start(module, {**common, **own, "FOGNAV_DATA_DIR": str(data)}, log)
+            stack.callback(program.wait, 10.0)
+            stack.callback(program.terminate)
+            if module == "fognav_sim":
+                wait_for((wires / "lidar").exists, "the simulator's devices")
+        socket = folder / "agent.sock"
+        wait_for(socket.exists, "the agent's socket")
+        yield socket
+
+
+def wait_for(condition, expected: str, seconds: float = 30.0):
+    until = time.monotonic() + seconds
+    while time.monotonic() < until:
+        if value := condition():
+            return value
+        time.sleep(0.02)
+    raise AssertionError(f"not within {seconds:g} s: {expected}")
+
+
+class Watcher:
+    """Knows the robot's mode and how far each wheel has rolled."""
+
+    def __init__(self, path: Path) -> None:
+        self.mode = ""
+        self.wheels = (0.0, 0.0)
+        self._robot = LocalRobot(path)
+        self._ends = threading.Event()
+        self._thread = threading.Thread(target=self._run, daemon=True)
+
+    def __enter__(self):
+        self._thread.start()
+        wait_for(lambda: self.mode and self.wheels != (0.0, 0.0), "the robot speaks")
+        return self
+
+    def __exit__(self, *_):
+        self._ends.set()
+        self._thread.join()
+        self._robot.close()
+
+    def _run(self) -> None:
+        while not self._ends.is_set():
+            for entry in self._robot.entries(0.1):
+                if isinstance(entry, Published):
+                    self.mode = entry.message["mode"]
+                elif isinstance(entry, BaseReceived):
+                    self.wheels = (entry.feedback.odometry.left_m, entry.feedback.odometry.right_m)
+                if self._ends.is_set():
+                    return
+
+    def rolled(self, seconds: float) -> tuple[float, float]:
+        """Return how far (m) the wheels roll during the next seconds."""
+        before = self.wheels
+        time.sleep(seconds)
+        return self.wheels[0] - before[0], self.wheels[1] - before[1]
+
+
+@pytest.fixture(scope="module")
+def robot(tmp_path_factory):
+    with robot_without_fog(tmp_path_factory.mktemp("robot")) as socket, Watcher(socket) as watcher:
+        yield socket, watcher
+
+
+def start(*arguments: str, **streams) -> subprocess.Popen:
+    return subprocess.Popen([sys.executable, "-m", "fognav", "teleop", *arguments], start_new_session=True, **streams)
+
+
+@contextmanager
+def ended(process: subprocess.Popen):
+    with process:
+        try:
+            yield
+        finally:
+            process.terminate()
+            process.wait(10.0)
+
+
+def test_a_held_key_drives_and_a_released_one_stops(robot):
+    socket, watcher = robot
+    terminal, theirs = pty.openpty()
+    own_terminal = partial(fcntl.ioctl, 0, termios.TIOCSCTTY, 0)  # Ctrl-C reaches it
+    process = start(
+        "--socket", str(socket), stdin=theirs, stdout=theirs, stderr=theirs, preexec_fn=own_terminal
+    )  # fmt: skip
+    os.close(theirs)
+    with ended(process):
+        wait_for(lambda: watcher.mode == "TELEOP", "it has taken the robot over")
+        before = watcher.wheels
+        for _ in range(40):  # as a terminal repeats a key that is held
+            os.write(terminal, b"j")
+            time.sleep(0.033)
+        turned = (watcher.wheels[0] - before[0], watcher.wheels[1] - before[1])
+        assert turned[0] < -0.03, "to the left, the left wheel turns back"
+        assert turned[1] > 0.03
+        time.sleep(SETTLED_S)
+        assert watcher.rolled(0.3) == pytest.approx((0.0, 0.0), abs=1e-3), "nobody holds a key"
+        os.write(terminal, b"\x03")
+        wait_for(lambda: watcher.mode == "INIT", "Ctrl-C hands the robot back")
+        text = b""
+        while select.select([terminal], [], [], 0.2)[0]:
+            try:
+                text += os.read(terminal, 4096)
+            except OSError:
+                break
+        assert b"hold a key to drive" in text
+        assert process.wait(5.0) == 0
+    os.close(terminal)
+
+
+def test_a_game_pad_drives_only_while_its_shoulder_button_is_held_and_stops_when_unplugged(robot, tmp_path):
+    socket, watcher = robot
+    event = struct.Struct("<IhBB")  # time, value, kind (1: button, 2: axis, 128: as it is at the start), number
+    device = tmp_path / "js0"
+    os.mkfifo(device)
+    keeper = os.open(device, os.O_RDWR)  # a pipe in the pad's place: this machine has none
+    process = start("--socket", str(socket), "--gamepad", str(device), stderr=subprocess.PIPE)
+    with ended(process):
+        os.write(keeper, event.pack(0, 1, 1 | 128, 4) + event.pack(1, -32767, 2, 0))
+        wait_for(lambda: watcher.mode == "TELEOP", "it has taken the robot over")
+        assert watcher.rolled(0.5) == pytest.approx((0.0, 0.0), abs=1e-3), "the stick alone drives nothing"
+        os.write(keeper, event.pack(2, 1, 1, 4))
+        left, right = watcher.rolled(0.8)
+        assert left < -0.015 < 0.015 < right
+        writer = os.open(device, os.O_WRONLY)
+        os.close(keeper)
+        os.close(writer)  # unplugged
+        wait_for(lambda: watcher.mode == "INIT", "the robot stands")
+        assert b"the game pad is gone" in process.stderr.read()
+        assert process.wait(5.0) == 1
+
+
+def test_without_an_agent_the_command_names_socket_and_remedy(tmp_path):
+    process = start("--socket", str(tmp_path / "agent.sock"), "--page", stderr=subprocess.PIPE)
+    _, error = process.communicate(timeout=30.0)
+    assert process.returncode == 1
+    assert f"{tmp_path}/agent.sock: no robot's agent runs here".encode() in error
+
+
+@pytest.mark.browser
+def test_the_page_shows_the_scan_drives_while_its_pad_is_held_and_stops_when_it_is_closed(robot):
+    socket, watcher = robot
+    process = start("--socket", str(socket), "--page", stderr=subprocess.PIPE)
+    with ended(process), sync_playwright() as playwright:
+        address = re.search(rb"http://\S+", process.stderr.readline())[0].decode()
+        browser = playwright.chromium.launch(
+            executable_path=shutil.which("chromium"),
+            args=["--no-sandbox", "--disable-gpu", "--disable-background-networking"],
+        )
+        stranger = browser.new_page()
+        stranger.goto(address.partition("?")[0])
+        expect(stranger.locator("#reasons")).to_contain_text("open the address that the command printed")
+        stranger.close()
+        page = browser.new_page(viewport={"width": 390, "height": 844}, has_touch=True)
+        problems = []
+        page.on("pageerror", lambda error: problems.append(str(error)))
+        page.goto(address)
+        expect(page.locator("#sensors")).to_contain_text(re.compile("[0-9]{3} returns"), timeout=20_000)
+        page.get_by_role("button", name="Drive by hand").click()
+        expect(page.locator("#mode")).to_have_text("TELEOP")
+        box = page.locator("#pad").bounding_box()
+        middle = (box["x"] + box["width"] / 2, box["y"] + box["height"] / 2)
+        page.mouse.move(*middle)
+        page.mouse.down()
+        page.mouse.move(middle[0] - box["width"] / 2 + 4, middle[1])
+        left, right = watcher.rolled(1.0)
+        assert left < -0.02 < 0.02 < right, "held to the left it turns to the left"
+        page.mouse.up()
+        time.sleep(SETTLED_S)
+        assert watcher.rolled(0.3) == pytest.approx((0.0, 0.0), abs=1e-3)
+        if picture := os.environ.get("FOGNAV_PICTURE"):
+            page.screenshot(path=picture)
+        page.mouse.down()
+        wait_for(lambda: watcher.rolled(0.3)[1] > 0.005, "it turns again")
+        page.close()
+        time.sleep(SETTLED_S)
+        assert watcher.rolled(0.3) == pytest.approx((0.0, 0.0), abs=1e-3), "a closed page drives nothing"
+        wait_for(lambda: watcher.mode == "INIT", "the robot waits to be enabled")
+        assert problems == []

@@ -169,3 +169,14 @@ def test_any_bytes_in_any_pieces_have_the_same_effect_and_never_raise(data, size
         at += size
     cut.receive(data[at:], 0.0)
     assert whole.outgoing(0.05) == cut.outgoing(0.05)
+
+
+def test_a_lidar_that_freezes_with_the_first_node_of_a_turn_goes_on():
+    lidar, now = RplidarEmulator(box), 0.0
+    for _ in range(400):  # a turn has fewer nodes: one of these scans begins with its first
+        lidar.frozen = False
+        lidar.receive(b"\xa5\x20", now)
+        lidar.outgoing(now)
+        lidar.outgoing(now := now + 0.00051)
+        lidar.frozen = True
+        assert nodes_of(lidar.outgoing(now := now + 0.0011)).size

@@ -197,7 +197,8 @@ class RplidarEmulator:
         begin = 0
         for boundary in start.nonzero()[0].tolist():
             self._revolution += raw[begin:boundary].tobytes()
-            self._last_revolutions.append(bytes(self._revolution))
+            if self._revolution:  # a scan that begins with its first node has none behind it
+                self._last_revolutions.append(bytes(self._revolution))
             self._revolution.clear()
             self._replayed = 0
             begin = boundary

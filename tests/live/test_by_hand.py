@@ -6,11 +6,14 @@ The robot has no fog, no site and no map; the building is simulated.
 from __future__ import annotations
 
 import fcntl
+import json
 import os
 import pty
 import re
+import resource
 import select
 import shutil
+import signal
 import struct
 import subprocess
 import sys
@@ -21,10 +24,16 @@ from contextlib import ExitStack, contextmanager
 from functools import partial
 from pathlib import Path
 
+import numpy as np
 import programs
 import pytest
 from playwright.sync_api import expect, sync_playwright
+from scipy.ndimage import distance_transform_edt
 
+from fog_contracts.costs import LETHAL
+from fog_mapping.poses import place
+from fog_runtime.configuration.maps import load_map
+from fognav_experiments.lidar_logs.robot_logs import read_robot_log
 from robot_agent.agent.recording.input_log import BaseReceived, Published
 from robot_agent.local_client import LocalRobot
 
@@ -53,6 +62,7 @@ def robot_without_fog(folder: Path):
         "FOGNAV_MQTT_URL": "mqtt://127.0.0.1:9",
     }
     simulator = {"FOGNAV_SITE_DIR": str(ESTIG), "FOGNAV_RUN_DIR": str(wires), "FOGNAV_NODES": "model"}
+    simulator["FOGNAV_TRUTH_LOG"] = str(folder / "truth.jsonl")
     with ExitStack() as stack:
         for module, own in (
             ("fognav_sim", simulator),
@@ -197,6 +207,66 @@ def test_without_an_agent_the_command_names_socket_and_remedy(tmp_path):
     _, error = process.communicate(timeout=30.0)
     assert process.returncode == 1
     assert f"{tmp_path}/agent.sock: no robot's agent runs here".encode() in error
+
+
+def test_a_recording_of_a_drive_by_hand_becomes_a_map_of_what_it_saw(robot, tmp_path):
+    socket, _ = robot
+    file = tmp_path / "drive.mcap"
+    fognav = [sys.executable, "-m", "fognav", "map"]
+    process = subprocess.Popen(
+        [*fognav, "record", str(file), "--socket", str(socket), "--json"], stdout=subprocess.PIPE
+    )
+    with ended(process), LocalRobot(socket) as driver:
+        wait_for(file.exists, "it records")
+        wait_for(lambda: driver.take_over().accepted, "it may be driven")
+        began_at = true_pose(socket.parent)
+        until = time.monotonic() + 14.0
+        while (left := until - time.monotonic()) > 0.0:
+            driver.steer(*((0.15, 0.0) if left > 7.0 else (0.0, 0.5) if left > 3.0 else (0.15, 0.2)))
+            time.sleep(0.05)
+        driver.hand_back()
+        process.send_signal(signal.SIGINT)
+        told = json.loads(process.communicate(timeout=20.0)[0])
+    assert told["scans"] > 50
+    assert (told["missed"], told["gaps"]) == (0, 0)
+    subprocess.run([*fognav, "from-log", str(file), "--out", str(tmp_path / "floor")], check=True, timeout=60.0)
+    assert share_on_walls(tmp_path / "floor.yaml", began_at) > 0.95
+    # What a loss of power leaves behind can be read up to its last whole chunk.
+    cut = tmp_path / "cut.mcap"
+    for share in (0.5, 0.77, 0.999):
+        cut.write_bytes(file.read_bytes()[: int(share * file.stat().st_size)])
+        assert len(list(read_robot_log(cut))) > 0.8 * share * told["scans"] - 10
+
+
+def test_a_full_disk_ends_a_recording_and_what_was_written_can_be_read(robot, tmp_path):
+    socket, _ = robot
+    file = tmp_path / "drive.mcap"
+    limit = partial(resource.setrlimit, resource.RLIMIT_FSIZE, (300_000, 300_000))
+    process = subprocess.run(
+        [sys.executable, "-m", "fognav", "map", "record", str(file), "--socket", str(socket), "--no-preview"],
+        check=False, stderr=subprocess.PIPE, preexec_fn=limit, timeout=90.0,
+    )  # fmt: skip
+    assert process.returncode == 1
+    assert b"File too large. What was recorded until now can be read: make room" in process.stderr
+    assert len(list(read_robot_log(file))) > 10
+
+
+def true_pose(folder: Path) -> tuple[float, float, float]:
+    """Return where the robot is in its building (x, y in m, theta in rad)."""
+    line = json.loads((folder / "truth.jsonl").read_bytes().splitlines()[-2])
+    return line["x"], line["y"], line["theta"]
+
+
+def share_on_walls(map_file: Path, start) -> float:
+    """Return the share of a map's walls that lie within 0.1 m of one of estig; its origin is the robot's start."""
+    made, real = load_map(map_file), load_map(ESTIG / "map.yaml")
+    rows, columns = np.nonzero(made.cells == LETHAL)
+    points = np.stack((columns, rows), axis=1) + 0.5
+    points = points * made.geometry.resolution + (made.geometry.origin_x, made.geometry.origin_y)
+    placed = place(np.array(start), points)
+    walls = distance_transform_edt(real.cells != LETHAL) * real.geometry.resolution
+    cells = np.floor((placed - (real.geometry.origin_x, real.geometry.origin_y)) / real.geometry.resolution).astype(int)
+    return float((walls[cells[:, 1], cells[:, 0]] <= 0.1).mean())
 
 
 @pytest.mark.browser

@@ -16,10 +16,10 @@ from fognav.commands.develop import channels_command, check_command, docs_comman
 from fognav.commands.node import node_app
 from fognav.commands.robot import robot_app
 from fognav.commands.robot_file import robot_add, robot_check, robot_new
+from fognav.commands.robot_tools import map_record, teleop_command
 from fognav.commands.site import site_app
 from fognav.commands.source import source_app
 from fognav.commands.status import status_command
-from fognav.commands.teleop import teleop_command
 from fognav.commands.up import down_command, logs_command, up_command, upgrade_command
 from fognav.commands.zone import zone_app
 from fognav.doctor import doctor_command
@@ -82,6 +82,7 @@ app.command(
     rich_help_panel=installed.DEVELOP,
 )(run_tests)
 app.command("check", epilog="Example: fognav check --json", rich_help_panel=installed.DEVELOP)(check_command)
+map_app.command("record", epilog="Example: fognav map record floor.mcap")(map_record)
 robot_app.command("add", epilog="Example: fognav robot add r2 --credentials DIR")(robot_add)
 robot_app.command("new", epilog="Example: fognav robot new --base roomba600 --lidar rplidar-a1 --out robot.toml")(
     robot_new

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from fog_mapping.pose_graph import Edge, solve
-from fog_mapping.poses import between, compose
+from fog_mapping.pose_graph import solve
+from fog_mapping.poses import Edge, between, compose
 
 SIGMAS = np.array((0.02, 0.02, 0.006))
 INFORMATION = np.diag(SIGMAS**-2.0)

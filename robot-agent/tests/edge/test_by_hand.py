@@ -191,6 +191,7 @@ def test_a_reader_that_reads_nothing_is_told_what_it_missed_and_delays_nobody(ri
     with LocalRobot(agent.socket) as slow, Watcher(agent.socket) as watcher:
         wait_for(lambda: len(watcher.seen.get(ScanReceived, ())) > 60, "the other one gets more than a socket holds")
         assert Missed not in watcher.seen
+        assert slow.hand_back().code == "not_by_hand", "a reply is never missed"
         kinds = []
         for entry in slow.entries(1.0):
             kinds.append(type(entry))

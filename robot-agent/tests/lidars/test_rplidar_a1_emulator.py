@@ -179,4 +179,5 @@ def test_a_lidar_that_freezes_with_the_first_node_of_a_turn_goes_on():
         lidar.outgoing(now)
         lidar.outgoing(now := now + 0.00051)
         lidar.frozen = True
-        assert nodes_of(lidar.outgoing(now := now + 0.0011)).size
+        now += 0.0011
+        assert nodes_of(lidar.outgoing(now)).size

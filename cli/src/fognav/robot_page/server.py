@@ -19,8 +19,8 @@ import uvicorn
 from fastapi import FastAPI, Response, WebSocket, WebSocketDisconnect
 from fastapi.responses import FileResponse
 
-from fognav.output import FailedError, WrongUseError, print_line
-from fognav.robot_page.view import RobotView
+from fognav.output import WrongUseError, print_line
+from fognav.robot_page.view import LocalRobotErrors, RobotView
 from robot_agent.agent.hand_driving import HandReply, HandRequest
 from robot_agent.local_client import LocalRobot, LocalRobotError
 
@@ -155,15 +155,6 @@ async def serve(path: Path, hosts: Sequence[str], port: int) -> None:
     finally:
         server.should_exit = True
         await asyncio.gather(task, return_exceptions=True)
-
-
-class LocalRobotErrors(contextlib.AbstractContextManager[None]):
-    """Turns the errors of a link to the agent into those of a command."""
-
-    def __exit__(self, _kind: object, error: BaseException | None, _trace: object) -> None:
-        """Raise `FailedError` for a `LocalRobotError`."""
-        if isinstance(error, LocalRobotError):
-            raise FailedError(str(error)) from error
 
 
 def _listen(host: str, port: int) -> socket.socket:

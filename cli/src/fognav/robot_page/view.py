@@ -2,27 +2,20 @@
 
 from __future__ import annotations
 
-import os
-from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final
+import contextlib
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from robot_agent.agent.local_link import SOCKET, Missed
+from fognav.output import FailedError
+from robot_agent.agent.local_link import Missed
 from robot_agent.agent.recording.input_log import BaseReceived, Published, ScanReceived, Started
+from robot_agent.local_client import LocalRobotError
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from robot_agent.config import AgentConfig
-
-INSTALLED: Final = Path("/run/fognav")
-
-
-def default_socket() -> Path:
-    """Return where the agent of this computer serves its tools, by its environment or as installed."""
-    guardian = os.environ.get("FOGNAV_GUARDIAN_SOCKET")
-    return (Path(guardian).parent if guardian else INSTALLED) / SOCKET
 
 
 class RobotView:
@@ -75,3 +68,12 @@ class RobotView:
             "footprint": [list(corner) for corner in self.config.footprint.vertices] if self.config else [],
             "missed": self.missed,
         }
+
+
+class LocalRobotErrors(contextlib.AbstractContextManager[None]):
+    """Turns the errors of a link to the agent into those of a command."""
+
+    def __exit__(self, _kind: object, error: BaseException | None, _trace: object) -> None:
+        """Raise `FailedError` for a `LocalRobotError`."""
+        if isinstance(error, LocalRobotError):
+            raise FailedError(str(error)) from error

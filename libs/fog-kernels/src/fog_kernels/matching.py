@@ -18,6 +18,7 @@ from typing import TYPE_CHECKING, Any, Final, NamedTuple
 import numpy as np
 from numba import float64, int64, njit, types, void
 
+from fog_contracts.costs import FREE, LETHAL, UNKNOWN
 from fog_kernels import _arrays
 
 if TYPE_CHECKING:
@@ -36,6 +37,9 @@ _PARALLEL: Final = 0.8
 """Cosine of the angle up to which the lines of two points may be one wall."""
 _CAUCHY: Final = 3.0
 """Residuals of so many deviations have half the weight."""
+
+_OCCUPIED_SHARE: Final = 0.3
+"""A cell is a wall if this share of the scans that reached it ended there: walls are grazed by many others."""
 
 _F64_GRID_OUT = types.Array(types.float64, 2, "C")
 _TABLES = types.Array(types.uint8, 3, "C", readonly=True)
@@ -481,6 +485,21 @@ class BeamCounts:
         self._latest = np.full(shape, -1, np.int32)
         self._grid = resolution, left, bottom
         self._scans = 0
+
+    def cells(self) -> NDArray[np.uint8]:
+        """Return the map that the scans show: free, wall or unknown."""
+        seen = self.hits + self.passes
+        cells = np.full(seen.shape, UNKNOWN, np.uint8)
+        cells[seen > 0] = FREE
+        cells[self.hits >= np.maximum(1.0, _OCCUPIED_SHARE * seen)] = LETHAL
+        return cells
+
+    def take(self, others: BeamCounts, row: int, column: int) -> None:
+        """Count all that a smaller grid has counted, whose first cell lies at this row and column of this one."""
+        height, width = others.hits.shape
+        inside = np.s_[row : row + height, column : column + width]
+        self.hits[inside] += others.hits
+        self.passes[inside] += others.passes
 
     def add(self, x: float, y: float, ends: NDArray[np.float64]) -> None:
         """Count a scan from (x, y), whose beams end at `ends` (n, 2; m): each cell once, as hit if any ended in it."""

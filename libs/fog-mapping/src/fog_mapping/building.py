@@ -7,7 +7,6 @@ from typing import TYPE_CHECKING, Final, NamedTuple
 
 import numpy as np
 
-from fog_contracts.costs import FREE, LETHAL, UNKNOWN
 from fog_contracts.grid import GridGeometry, StaticMap
 from fog_kernels.matching import BeamCounts
 from fog_mapping.loops import LoopSearch
@@ -26,8 +25,6 @@ if TYPE_CHECKING:
 _CERTAIN_M: Final = (2.0, 2.0, 4.0, 8.0, 16.0, 30.0)
 """What is certain to so much (m) is looked for, round by round."""
 _MARGIN_M: Final = 1.0
-_OCCUPIED_SHARE: Final = 0.3
-"""A cell is occupied if this share of the scans that reached it ended there: walls are grazed by many others."""
 _MAX_CELLS: Final = 40_000_000
 
 
@@ -91,8 +88,4 @@ def draw(rays: Iterable[tuple[NDArray[np.float64], NDArray[np.float64]]], resolu
     counts = BeamCounts((height, width), resolution, float(low[0]), float(low[1]))
     for pose, points in placed:
         counts.add(float(pose[0]), float(pose[1]), points)
-    cells = np.full((height, width), UNKNOWN, np.uint8)
-    seen = counts.hits + counts.passes
-    cells[seen > 0] = FREE
-    cells[counts.hits >= np.maximum(1.0, _OCCUPIED_SHARE * seen)] = LETHAL
-    return StaticMap(GridGeometry(width, height, resolution, float(low[0]), float(low[1])), cells)
+    return StaticMap(GridGeometry(width, height, resolution, float(low[0]), float(low[1])), counts.cells())

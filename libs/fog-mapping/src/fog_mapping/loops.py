@@ -15,8 +15,7 @@ from typing import TYPE_CHECKING, Final, NamedTuple
 import numpy as np
 
 from fog_kernels.matching import Excluded
-from fog_mapping.pose_graph import Edge
-from fog_mapping.poses import between, path_lengths
+from fog_mapping.poses import Edge, between, path_lengths
 from fog_mapping.scans import cloud, reference_of, thinned
 from fog_mapping.trajectory import GATES, independent
 

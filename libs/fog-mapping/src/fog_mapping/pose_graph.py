@@ -20,21 +20,13 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
+    from fog_mapping.poses import Edge
+
 _CHI_SQUARE: Final = 11.3
 """99 % of right measurements with 3 degrees of freedom are below."""
 _PATIENCE_STEP: Final = 1.6
 _CONVERGED: Final = 1e-5
 _STEPS: Final = 12
-
-
-class Edge(NamedTuple):
-    """`second` was measured at `step` (3,) as seen from `first`, with an information (3, 3); a loop may be wrong."""
-
-    first: int
-    second: int
-    step: NDArray[np.float64]
-    information: NDArray[np.float64]
-    loop: bool = False
 
 
 class Solution(NamedTuple):

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
@@ -51,3 +51,13 @@ def place(pose: NDArray[np.float64], points: NDArray[np.float64]) -> NDArray[np.
 def path_lengths(poses: NDArray[np.float64]) -> NDArray[np.float64]:
     """Return how far (m) the robot has driven at each of its poses (n, 3)."""
     return np.concatenate(((0.0,), np.cumsum(np.hypot(*np.diff(poses[:, :2], axis=0).T))))
+
+
+class Edge(NamedTuple):
+    """`second` was measured at `step` (3,) as seen from `first`, with an information (3, 3); a loop may be wrong."""
+
+    first: int
+    second: int
+    step: NDArray[np.float64]
+    information: NDArray[np.float64]
+    loop: bool = False

@@ -59,12 +59,15 @@ def keep_moved(scans: Iterable[Scan]) -> list[Scan]:
     """Return the first scan and each one after which the robot has moved or turned on by its odometry."""
     kept: list[Scan] = []
     for scan in scans:
-        if kept:
-            x, y, turn = between(kept[-1].odometry, scan.odometry)
-            if np.hypot(x, y) < _STEP_M and abs(turn) < _TURN_RAD:
-                continue
-        kept.append(scan)
+        if not kept or has_moved(kept[-1], scan):
+            kept.append(scan)
     return kept
+
+
+def has_moved(before: Scan, scan: Scan) -> bool:
+    """Return whether the robot has moved or turned enough between two scans, by its odometry, for both to count."""
+    x, y, turn = between(before.odometry, scan.odometry)
+    return bool(np.hypot(x, y) >= _STEP_M or abs(turn) >= _TURN_RAD)
 
 
 def cloud(

@@ -9,8 +9,7 @@ from typing import TYPE_CHECKING, Final
 import numpy as np
 
 from fog_kernels.matching import Reference
-from fog_mapping.pose_graph import Edge
-from fog_mapping.poses import between, compose
+from fog_mapping.poses import Edge, between, compose
 from fog_mapping.scans import reference_of
 
 if TYPE_CHECKING:
@@ -26,7 +25,8 @@ _INDEPENDENT: Final = 0.1
 """The returns of a scan err together (a lidar's bias, a wall that is not straight): so much of them is independent."""
 _SPURIOUS: Final = 0.02
 """Normals err by some degrees, so that plain walls seem to say this share of what they say across also along."""
-_WINDOW: Final = 12
+WINDOW: Final = 12
+"""Scans before it that one is matched to."""
 _SPREAD_M: Final = 8.0
 _TURN_STEP: Final = math.radians(1.0)
 _SEARCHED_SIGMAS: Final = 2.5
@@ -59,30 +59,36 @@ def match_in_order(
     poses = np.zeros((len(scans), 3))
     edges: list[Edge] = []
     for i in range(1, len(scans)):
-        step = between(scans[i - 1].odometry, scans[i].odometry)
-        guess = compose(poses[i - 1], step)
-        near = [j for j in range(max(0, i - _WINDOW), i) if math.hypot(*(poses[j] - guess)[:2]) < _SPREAD_M]
-        before = reference_of(scans, poses, near or [i - 1])
-        moved, turned = math.hypot(step[0], step[1]), abs(float(step[2]))
-        deviation = 0.05 + 0.1 * moved + 0.05 * turned
-        turn_deviation = 0.02 + 0.05 * moved + 0.12 * turned
-        prior = np.diag((deviation**-2, deviation**-2, turn_deviation**-2))
-        found = before.search(
-            scans[i].points,
-            tuple(guess),
-            min(_MOST_M, _SEARCHED_SIGMAS * deviation),
-            min(_MOST_RAD, _SEARCHED_SIGMAS * turn_deviation),
-            _TURN_STEP,
-            0.0,
-            doubt=_DOUBT,
-        )
-        start = tuple(guess) if found is None else found.pose
-        aligned = before.align(scans[i].points, scans[i].normals, start, tuple(guess), prior, GATES)
-        poses[i] = aligned.pose
-        information = independent(aligned.information) + _ODOMETRY_SHARE * prior
+        poses[i], information = match_next(scans, poses, i)
         edges.append(Edge(i - 1, i, between(poses[i - 1], poses[i]), information))
         on_progress(i + 1)
     return poses, edges
+
+
+def match_next(
+    scans: Sequence[Scan], poses: NDArray[np.float64], i: int
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Return the pose (3,) of scan `i` by those before it, whose poses (n, 3) are known, and its information (3, 3)."""
+    step = between(scans[i - 1].odometry, scans[i].odometry)
+    guess = compose(poses[i - 1], step)
+    near = [j for j in range(max(0, i - WINDOW), i) if math.hypot(*(poses[j] - guess)[:2]) < _SPREAD_M]
+    before = reference_of(scans, poses, near or [i - 1])
+    moved, turned = math.hypot(step[0], step[1]), abs(float(step[2]))
+    deviation = 0.05 + 0.1 * moved + 0.05 * turned
+    turn_deviation = 0.02 + 0.05 * moved + 0.12 * turned
+    prior = np.diag((deviation**-2, deviation**-2, turn_deviation**-2))
+    found = before.search(
+        scans[i].points,
+        tuple(guess),
+        min(_MOST_M, _SEARCHED_SIGMAS * deviation),
+        min(_MOST_RAD, _SEARCHED_SIGMAS * turn_deviation),
+        _TURN_STEP,
+        0.0,
+        doubt=_DOUBT,
+    )
+    start = tuple(guess) if found is None else found.pose
+    aligned = before.align(scans[i].points, scans[i].normals, start, tuple(guess), prior, GATES)
+    return np.array(aligned.pose), independent(aligned.information) + _ODOMETRY_SHARE * prior
 
 
 def refuse_mirrored(scans: Sequence[Scan]) -> None:

@@ -112,6 +112,11 @@ class Recorder:
             )
         )
 
+    def secure(self) -> None:
+        """Let the disk have all complete chunks: a loss of power takes only what came after. Raises `OSError`."""
+        self._file.flush()
+        os.fsync(self._file.fileno())
+
     def close(self) -> None:
         """Write the index and close the file, even when the disk has no room for the index (`OSError`)."""
         try:

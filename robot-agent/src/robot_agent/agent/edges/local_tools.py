@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import asyncio
 import socket
+from collections import deque
 from typing import TYPE_CHECKING, Final
 
 import msgspec
@@ -28,6 +29,7 @@ if TYPE_CHECKING:
 CLIENTS_MAX: Final = 8
 _WATCH_S: Final = 1.0
 _MODE: Final = 0o660
+_REPLIES_MAX: Final = 8
 
 _log = logs.get("local_tools")
 
@@ -36,16 +38,27 @@ class _Client:
     def __init__(self, link: socket.socket) -> None:
         self.link = link
         self.missed = 0
+        self._replies: deque[bytes] = deque(maxlen=_REPLIES_MAX)
 
     def send(self, packet: bytes) -> None:
-        """Send a packet if there is room for it; raises `ConnectionError`."""
+        """Send an entry if there is room for it; raises `ConnectionError`."""
         try:
+            while self._replies:
+                self.link.send(self._replies[0])
+                self._replies.popleft()
             if self.missed:
                 self.link.send(encode(Missed(count=self.missed)))
                 self.missed = 0
             self.link.send(packet)
         except BlockingIOError:
             self.missed += 1
+
+    def reply(self, packet: bytes) -> None:
+        """Send a reply, or before the next entry for which there is room; raises `ConnectionError`."""
+        try:
+            self.link.send(packet)
+        except BlockingIOError:
+            self._replies.append(packet)
 
 
 class LocalTools:
@@ -126,7 +139,7 @@ class LocalTools:
         if reply is not None:
             if not (isinstance(request, TakeOver) and not reply.accepted):  # tools ask until the robot agrees
                 _log.info("by_hand", request=type(request).__name__, accepted=reply.accepted, reason=reply.reason)
-            self._send(client, encode(reply))
+            self._send(client, encode(reply), is_reply=True)
 
     def _on_request(self, request: HandRequest) -> HandReply | None:
         return self._core.on_hand(request, self._clock.now())
@@ -150,9 +163,9 @@ class LocalTools:
             self._driver = None
         return reply
 
-    def _send(self, client: _Client, packet: bytes) -> None:
+    def _send(self, client: _Client, packet: bytes, *, is_reply: bool = False) -> None:
         try:
-            client.send(packet)
+            (client.reply if is_reply else client.send)(packet)
         except OSError:
             self._drop(client)
 

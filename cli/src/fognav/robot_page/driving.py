@@ -1,8 +1,7 @@
-"""`fognav teleop`: drive the robot on whose computer this runs by hand, by keyboard, game pad or a page."""
+"""Driving by hand by what is held: keys of a terminal, or a game pad."""
 
 from __future__ import annotations
 
-import asyncio
 import contextlib
 import os
 import select
@@ -11,19 +10,16 @@ import sys
 import termios
 import time
 import tty
-from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Final, Protocol
+from typing import TYPE_CHECKING, Final, Protocol
 
-import typer
-
-from fognav.output import FailedError, WrongUseError, exit_codes, print_line
-from fognav.robot_page.server import LocalRobotErrors, serve
-from fognav.robot_page.view import RobotView, default_socket
+from fognav.output import FailedError, WrongUseError, print_line
+from fognav.robot_page.view import LocalRobotErrors, RobotView
 from robot_agent.agent.hand_driving import HandReply
 from robot_agent.local_client import LocalRobot
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
+    from pathlib import Path
 
 _PERIOD_S: Final = 0.05
 _KEY_S: Final = 0.15
@@ -34,15 +30,11 @@ _MOVES: Final = {
     "i": (1, 0), "o": (1, -1), "j": (0, 1), "l": (0, -1), "u": (1, 1), ",": (-1, 0), ".": (-1, 1), "m": (-1, -1),
 }  # fmt: skip
 _FASTER: Final = {"q": (1.1, 1.1), "z": (0.9, 0.9), "w": (1.1, 1), "x": (0.9, 1), "e": (1, 1.1), "c": (1, 0.9)}
-_HELP: Final = """\
+HELP: Final = """\
 hold a key to drive:   u i o      q/z faster/slower: both
                        j k l      w/x only ahead and back
                        m , .      e/c only turning
 k or space stops, r resets a fault, Ctrl-C ends. Letting go stops the robot."""
-
-SocketOption = Annotated[
-    Path | None, typer.Option("--socket", metavar="FILE", help="The agent's socket, if not found by itself.")
-]
 
 
 class _Steering(Protocol):
@@ -144,40 +136,6 @@ class GamePad:
         return ahead * self._speed, left * self._turn
 
 
-def teleop_command(  # noqa: PLR0913  # one parameter for each option
-    *,
-    page: Annotated[bool, typer.Option("--page", help="Serve a page with a pad for touch, mouse and keys.")] = False,
-    bind: Annotated[
-        list[str] | None,
-        typer.Option("--bind", metavar="ADDRESS", help="Serve the page there, too, for other devices."),
-    ] = None,
-    port: Annotated[int, typer.Option(min=0, max=65535, help="The page's port; 0: any free one.")] = 0,
-    gamepad: Annotated[
-        Path | None, typer.Option("--gamepad", metavar="DEVICE", help="Drive by a game pad, such as /dev/input/js0.")
-    ] = None,
-    speed: Annotated[float, typer.Option(min=0.01, max=0.15, help="m/s.")] = 0.1,
-    turn: Annotated[float, typer.Option(min=0.1, max=1.0, help="rad/s; more than 0.5 blurs a map.")] = 0.5,
-    socket: SocketOption = None,
-) -> None:
-    """Drive this computer's robot by hand, with or without a map and a fog.
-
-    Run it on the robot's computer. Letting go, losing the link and ending the command stop the robot within 0.3 s.
-    """
-    path = socket or default_socket()
-    with exit_codes():
-        if page:
-            with contextlib.suppress(KeyboardInterrupt):
-                asyncio.run(serve(path, ["127.0.0.1", *(bind or [])], port))
-        elif gamepad is not None:
-            drive(path, GamePad(gamepad, speed, turn))
-        elif not sys.stdin.isatty():
-            raise WrongUseError("there is no terminal to read keys from: use --page or --gamepad")
-        else:
-            with _raw_terminal():
-                print_line(_HELP.replace("\n", "\r\n") + "\r")
-                drive(path, Keyboard(speed, turn))
-
-
 def drive(path: Path, steering: _Steering) -> None:
     """Drive the robot at this socket until Ctrl-C; raises `FailedError`."""
     with LocalRobotErrors(), LocalRobot(path) as robot:
@@ -227,7 +185,7 @@ def _tell(view: RobotView, before: str) -> str:
 
 
 @contextlib.contextmanager
-def _raw_terminal() -> Iterator[None]:
+def raw_terminal() -> Iterator[None]:
     """Read single keys while the context is open, unechoed."""
     before = termios.tcgetattr(sys.stdin)
     try:

@@ -1,0 +1,107 @@
+"""`fognav teleop` and `fognav map record`: tools that speak to the agent of the robot on whose computer they run."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import os
+import sys
+import time
+from pathlib import Path
+from typing import Annotated, Any, Final
+
+import typer
+
+from fognav.operate.options import JsonOption  # noqa: TC001  # Typer reads annotations at run time
+from fognav.output import FailedError, WrongUseError, exit_codes, print_answer, print_json, print_line
+
+_INSTALLED: Final = Path("/run/fognav/agent.sock")
+
+SocketOption = Annotated[
+    Path | None, typer.Option("--socket", metavar="FILE", help="The agent's socket, if not found by itself.")
+]
+
+
+def _default_socket() -> Path:
+    """Return where the agent of this computer serves its tools, by its environment or as installed."""
+    guardian = os.environ.get("FOGNAV_GUARDIAN_SOCKET")
+    return Path(guardian).with_name(_INSTALLED.name) if guardian else _INSTALLED
+
+
+def teleop_command(  # noqa: PLR0913  # one parameter for each option
+    *,
+    page: Annotated[bool, typer.Option("--page", help="Serve a page with a pad for touch, mouse and keys.")] = False,
+    bind: Annotated[
+        list[str] | None,
+        typer.Option("--bind", metavar="ADDRESS", help="Serve the page there, too, for other devices."),
+    ] = None,
+    port: Annotated[int, typer.Option(min=0, max=65535, help="The page's port; 0: any free one.")] = 0,
+    gamepad: Annotated[
+        Path | None, typer.Option("--gamepad", metavar="DEVICE", help="Drive by a game pad, such as /dev/input/js0.")
+    ] = None,
+    speed: Annotated[float, typer.Option(min=0.01, max=0.15, help="m/s.")] = 0.1,
+    turn: Annotated[float, typer.Option(min=0.1, max=1.0, help="rad/s; more than 0.5 blurs a map.")] = 0.5,
+    socket: SocketOption = None,
+) -> None:
+    """Drive this computer's robot by hand, with or without a map and a fog.
+
+    Run it on the robot's computer. Letting go, losing the link and ending the command stop the robot within 0.3 s.
+    """
+    from fognav.robot_page.driving import HELP, GamePad, Keyboard, drive, raw_terminal  # noqa: PLC0415  # loads kernels
+    from fognav.robot_page.server import serve  # noqa: PLC0415  # same
+
+    path = socket or _default_socket()
+    with exit_codes():
+        if page:
+            with contextlib.suppress(KeyboardInterrupt):
+                asyncio.run(serve(path, ["127.0.0.1", *(bind or [])], port))
+        elif gamepad is not None:
+            drive(path, GamePad(gamepad, speed, turn))
+        elif not sys.stdin.isatty():
+            raise WrongUseError("there is no terminal to read keys from: use --page or --gamepad")
+        else:
+            with raw_terminal():
+                print_line(HELP.replace("\n", "\r\n") + "\r")
+                drive(path, Keyboard(speed, turn))
+
+
+def map_record(
+    out: Annotated[Path, typer.Argument(metavar="FILE.mcap", help="The recording, for `fognav map from-log`.")],
+    *,
+    seconds: Annotated[float | None, typer.Option(min=1.0, help="End by itself; else with Ctrl-C.")] = None,
+    no_preview: Annotated[bool, typer.Option("--no-preview", help="Draw no map: it takes some of a core.")] = False,
+    socket: SocketOption = None,
+    json: JsonOption = False,
+) -> None:
+    """Record what this computer's robot measures while it is driven (`fognav teleop`), and watch its map grow.
+
+    The map shown closes no loops: what `fognav map from-log` makes of the recording does, and is better. A recording
+    that a loss of power or a full disk cut short can be read up to there.
+    """
+    from fognav.robot_page.recording import Recording  # noqa: PLC0415  # as above
+    from fognav.robot_page.recording_view import shown, until_told  # noqa: PLC0415  # same
+
+    with exit_codes():
+        if out.exists():
+            raise WrongUseError(f"{out} exists: name another file, or remove it")
+        recording = Recording(out, preview=not no_preview)
+        begun = time.monotonic()
+        with until_told(seconds) as ends, shown(recording, begun) as show:
+            recording.run(socket or _default_socket(), show, ends)
+        if not recording.scans:
+            raise FailedError(f"{out} has no scan: {recording.advice or 'the lidar tells nothing'}")
+        figures: dict[str, Any] = {
+            "file": str(out),
+            "seconds": round(time.monotonic() - begun, 1),
+            "scans": recording.scans,
+            "megabytes": round(recording.megabytes, 2),
+            "missed": recording.view.missed,
+            "gaps": recording.gaps,
+        }
+        if json:
+            print_json(figures)
+        else:
+            print_answer(f"{out}: {figures['scans']} scans in {figures['seconds']} s, {figures['megabytes']} MB")
+            if recording.view.missed or recording.gaps:
+                print_answer(f"{recording.view.missed} entries were missed, the link broke {recording.gaps} times")
+            print_answer(f"next: fognav map from-log {out} --out floor --png floor-loops.png")

@@ -13,6 +13,8 @@ from fognav.commands.area import alert_app, area_app, map_app
 from fognav.commands.backup import backup_command, restore_command, store_app
 from fognav.commands.demo import demo_command, record_command, replay_command
 from fognav.commands.develop import channels_command, check_command, docs_command, run_tests
+from fognav.commands.map_clean import map_clean
+from fognav.commands.map_files import map_check, map_convert, map_info
 from fognav.commands.node import node_app
 from fognav.commands.robot import robot_app
 from fognav.commands.robot_file import robot_add, robot_check, robot_new
@@ -23,6 +25,7 @@ from fognav.commands.status import status_command
 from fognav.commands.up import down_command, logs_command, up_command, upgrade_command
 from fognav.commands.zone import zone_app
 from fognav.doctor import doctor_command
+from fognav.operate.options import NUMBERS
 from fognav.output import OK
 
 app = typer.Typer(
@@ -83,6 +86,12 @@ app.command(
 )(run_tests)
 app.command("check", epilog="Example: fognav check --json", rich_help_panel=installed.DEVELOP)(check_command)
 map_app.command("record", epilog="Example: fognav map record floor.mcap")(map_record)
+map_app.command("check", epilog="Example: fognav map check floor.yaml --radius 0.17")(map_check)
+map_app.command("clean", context_settings=NUMBERS, epilog="Example: fognav map clean floor.yaml erase 3.0 1.0 4.0 2.0")(
+    map_clean
+)
+map_app.command("info", epilog="Example: fognav map info floor.yaml --json")(map_info)
+map_app.command("convert", epilog="Example: fognav map convert floor.yaml floor.png --resolution 0.1")(map_convert)
 robot_app.command("add", epilog="Example: fognav robot add r2 --credentials DIR")(robot_add)
 robot_app.command("new", epilog="Example: fognav robot new --base roomba600 --lidar rplidar-a1 --out robot.toml")(
     robot_new

@@ -17,12 +17,13 @@ from typing import TYPE_CHECKING, Final, NamedTuple
 
 import numpy as np
 
-from fog_contracts.costs import DEFAULT_INFLATION, FREE, INSCRIBED, LETHAL, NEUTRAL_WEIGHT
+from fog_contracts.costs import DEFAULT_INFLATION, INSCRIBED, LETHAL, NEUTRAL_WEIGHT
 from fog_kernels.astar import Planner
 from fog_kernels.components import Components
 from fog_kernels.inflation import inflate, inflation_table
 from fog_kernels.steps import STRAIGHT
 from fog_kernels.tiles import TilePatterns
+from fog_runtime.configuration.map_text import MapTextError, read_map_text
 from fog_runtime.configuration.maps import load_map
 from fognav_experiments.bench.common import make_office
 from fognav_experiments.bench.fleet import percentile
@@ -46,10 +47,6 @@ _ALONG: Final = (0.3, 0.7)
 _NEAR_GOAL: Final = (0.9, 0.95)
 """... and where it lies near the goal."""
 _PATTERN_BYTES: Final = 200_000_000
-
-
-class MapTextError(ValueError):
-    """A file is no map or scenario of the MovingAI benchmarks; the text names file and remedy."""
 
 
 class Query(NamedTuple):
@@ -87,15 +84,11 @@ def floor_of(static: StaticMap) -> Floor:
 
 
 def read_movingai(path: Path) -> Floor:
-    """Return the floor of a `.map` of the MovingAI benchmarks (Sturtevant 2012), without margins, as its lengths are.
+    """Return the floor of a `.map` of the MovingAI benchmarks, without margins, as its lengths are.
 
     Raises `MapTextError` and `OSError`.
     """
-    lines = path.read_text("utf-8", errors="replace").splitlines()
-    rows = [row for row in lines[lines.index("map") + 1 :] if row] if "map" in lines else []
-    if not rows or len({len(row) for row in rows}) != 1:
-        raise MapTextError(f"{path}: needs a line `map` and rows of equal length after it, as MovingAI's maps have")
-    raw = np.array([[FREE if cell in ".GS" else LETHAL for cell in row] for row in rows], np.uint8)
+    raw = read_map_text(path)
     return Floor(raw, raw.copy(), np.copy)
 
 

@@ -224,6 +224,7 @@ def planner_command(
     """
     import numpy as np  # noqa: PLC0415  # keeps the other commands fast
 
+    from fog_runtime.configuration.map_text import MapTextError  # noqa: PLC0415  # same
     from fog_runtime.configuration.maps import MapFileError  # noqa: PLC0415  # same
     from fognav_experiments.bench import planner  # noqa: PLC0415  # same
 
@@ -233,7 +234,7 @@ def planner_command(
         try:
             floor = planner.load_floor(map_file, seed)
             asked = planner.read_scenario(scenario, queries) if scenario else None
-        except (planner.MapTextError, MapFileError, OSError) as error:
+        except (MapTextError, MapFileError, OSError) as error:
             raise WrongUseError(str(error)) from error
         asked = asked or planner.long_queries(floor.costmap, queries, rng)
         task = progress.add_task("queries", total=len(asked))

@@ -8,10 +8,10 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 from rich.progress import Progress
 
-from fog_contracts.costs import FREE, LETHAL, UNKNOWN
 from fog_runtime.configuration.maps import MapFileError, load_map, save_map
 from fognav import kernels
 from fognav.commands.installed import MEASURE
+from fognav.map_files import described, provenance
 from fognav.operate.options import JsonOption  # noqa: TC001  # Typer reads annotations at run time
 from fognav.output import (
     NOT_TRUE,
@@ -171,12 +171,12 @@ def map_from_log(  # noqa: PLR0913  # each option is an argument
             with_noise(used, seed) if is_noisy else used, poses, without_loop or [], resolution, range_max
         )
         with writing(Path(f"{out}.yaml"), "Name another --out"):
-            save_map(out, made.map)
+            save_map(out, made.map, provenance(log_file))
         if png is not None:
             made.draw(png)
         if trajectory is not None:
             made.write_trajectory(trajectory)
-        found = _described(made.map)
+        found = described(made.map)
     if json:
         odometry = "reference with noise" if is_noisy else "measured"
         print_json({"file": f"{out}.yaml", **found, "odometry": odometry, **made.figures()})
@@ -184,16 +184,3 @@ def map_from_log(  # noqa: PLR0913  # each option is an argument
     for line in made.lines():
         print_answer(line)
     print_answer(f"wrote {out}.yaml: {found['width']} x {found['height']} cells, {found['occupied']} occupied")
-
-
-def _described(map_: StaticMap) -> dict[str, object]:
-    """Return size, resolution and origin of a map, and how many of its cells are free, occupied and unknown."""
-    geometry = map_.geometry
-    names = {"free": FREE, "occupied": LETHAL, "unknown": UNKNOWN}
-    return {
-        "width": geometry.width,
-        "height": geometry.height,
-        "resolution": geometry.resolution,
-        "origin": [geometry.origin_x, geometry.origin_y, 0.0],
-        **{name: int((map_.cells == value).sum()) for name, value in names.items()},
-    }

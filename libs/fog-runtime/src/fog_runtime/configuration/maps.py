@@ -11,7 +11,7 @@ a coloured one 7: it is decoded as a whole, but converted band by band.
 import io
 import math
 import warnings
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -25,9 +25,17 @@ from PIL import Image, UnidentifiedImageError
 from fog_contracts.costs import FREE, LETHAL, UNKNOWN
 from fog_contracts.grid import GridGeometry, StaticMap
 from fog_contracts.messages import MAX_CELLS
+from fog_contracts.resampling import resampled
 from fog_runtime.files import SHARED, atomic_write
 
 Mode = Literal["trinary", "scale", "raw"]
+ImageFormat = Literal["pgm", "png"]
+
+PROVENANCE_KEY: Final = "fognav"
+"""The key of a map's file that says where it came from."""
+_KEYS: Final = {
+    "image", "resolution", "origin", "negate", "mode", "occupied_thresh", "free_thresh", PROVENANCE_KEY,
+}  # fmt: skip
 
 OCCUPIED_PERCENT: Final = 100
 UNKNOWN_PERCENT: Final = -1
@@ -105,7 +113,8 @@ def _yaml_problem(error: yaml.YAMLError | UnicodeDecodeError) -> tuple[str, str]
     return "is not a text file", "A map is a YAML file that names an image: name that file, not the image"
 
 
-def _read_metadata(file: Path) -> _Metadata:
+def read_keys(file: Path) -> dict[str, Any]:
+    """Return the keys and values of a map's file, whatever they are; raises `MapFileError`."""
     try:
         data = yaml.safe_load(file.read_text("utf-8"))
     except OSError as error:
@@ -117,6 +126,11 @@ def _read_metadata(file: Path) -> _Metadata:
         raise MapFileError(
             file, "file", "is not a mapping of keys to values", "Write `image: ...`, `resolution: ...` and so on"
         )
+    return data
+
+
+def _read_metadata(file: Path) -> _Metadata:
+    data = read_keys(file)
     name = data.get("image")
     if not isinstance(name, str) or not name:
         raise MapFileError(file, "image", "missing", "Name the image file, relative to this file")
@@ -271,56 +285,66 @@ def load_map(yaml_path: Path) -> StaticMap:
         cells[rows] = table[cells[rows]]
     if occupancy.yaw == 0.0:
         return StaticMap(occupancy.geometry, cells)
-    return _rotated(StaticMap(occupancy.geometry, cells), occupancy.yaw)
+    return resampled(StaticMap(occupancy.geometry, cells), occupancy.yaw)
 
 
-def _rotated(original: StaticMap, yaw: float) -> StaticMap:
-    """Rotate a grid counter-clockwise about its origin and resample it by nearest neighbour on the frame's axes."""
-    old = original.geometry
-    cos, sin = math.cos(yaw), math.sin(yaw)
-    wide, high = old.width * old.resolution, old.height * old.resolution
-    corners = [(x * cos - y * sin, x * sin + y * cos) for x, y in ((0.0, 0.0), (wide, 0.0), (0.0, high), (wide, high))]
-    left, bottom = min(x for x, _ in corners), min(y for _, y in corners)
-    right, top = max(x for x, _ in corners), max(y for _, y in corners)
-    # The tolerance keeps quarter turns exact: rounding must not add an empty row.
-    width = max(1, math.ceil((right - left) / old.resolution - 1e-6))
-    height = max(1, math.ceil((top - bottom) / old.resolution - 1e-6))
-    new = GridGeometry(width, height, old.resolution, old.origin_x + left, old.origin_y + bottom)
+def save_map(
+    path_prefix: Path, static: StaticMap, provenance: Mapping[str, object] | None = None, image: ImageFormat = "pgm"
+) -> None:
+    """Write PREFIX.pgm (or .png) and PREFIX.yaml so that `load_map` returns the same cells, each file atomically.
 
-    cells = np.full((height, width), UNKNOWN, dtype=np.uint8)
-    for rows in _bands(height, width):
-        x, y = np.meshgrid(
-            left + (np.arange(width) + 0.5) * old.resolution,
-            bottom + (np.arange(rows.start, rows.stop) + 0.5) * old.resolution,
-        )
-        column = np.floor((x * cos + y * sin) / old.resolution).astype(np.int64)
-        row = np.floor((-x * sin + y * cos) / old.resolution).astype(np.int64)
-        inside = (column >= 0) & (column < old.width) & (row >= 0) & (row < old.height)
-        cells[rows][inside] = original.cells[row[inside], column[inside]]
-
-    # An occupied cell may contain none of the new centres: mark also the cell that contains its own centre.
-    for band in _bands(*old.shape):
-        occupied_rows, columns = np.nonzero(original.cells[band] == LETHAL)
-        px, py = (columns + 0.5) * old.resolution, (occupied_rows + band.start + 0.5) * old.resolution
-        new_column = np.floor((px * cos - py * sin - left) / old.resolution).astype(np.int64)
-        new_row = np.floor((px * sin + py * cos - bottom) / old.resolution).astype(np.int64)
-        cells[np.clip(new_row, 0, height - 1), np.clip(new_column, 0, width - 1)] = LETHAL
-    return StaticMap(new, cells)
+    provenance: see `read_provenance`.
+    """
+    percents = np.full(256, UNKNOWN_PERCENT, dtype=np.int8)
+    percents[[FREE, LETHAL]] = 0, OCCUPIED_PERCENT
+    plain = Occupancy(static.geometry, 0.0, percents[static.cells], "trinary", _WRITTEN_OCCUPIED, _WRITTEN_FREE)
+    save_occupancy(path_prefix, plain, provenance, image)
 
 
-def save_map(path_prefix: Path, static: StaticMap) -> None:
-    """Write PREFIX.pgm and PREFIX.yaml so that `load_map` returns the same cells; each file is replaced atomically."""
-    shades = np.full(256, _SHADES[UNKNOWN], dtype=np.uint8)
-    for cost, shade in _SHADES.items():
-        shades[cost] = shade
-    image = io.BytesIO()
-    Image.fromarray(np.ascontiguousarray(shades[static.cells][::-1])).save(image, format="PPM")
-    image_file = path_prefix.with_name(f"{path_prefix.name}.pgm")
-    atomic_write(image_file, image.getvalue(), mode=SHARED)
-    g = static.geometry
+def save_occupancy(
+    path_prefix: Path, occupancy: Occupancy, provenance: Mapping[str, object] | None = None, image: ImageFormat = "pgm"
+) -> None:
+    """Write PREFIX.pgm (or .png) and PREFIX.yaml so that `load_occupancy` returns the same values, each atomically.
+
+    Grades between free and occupied are written in the mode raw, with thresholds by which `load_map` returns the same.
+    """
+    percents = np.arange(256, dtype=np.uint8).view(np.int8)
+    graded = bool(((occupancy.values > 0) & (occupancy.values < OCCUPIED_PERCENT)).any()) or occupancy.mode == "raw"
+    if graded:
+        shades = np.where(percents < 0, 255, percents).astype(np.uint8)
+        only = occupancy.mode == "scale"
+        occupied, free = (0.99, 0.01) if only else (occupancy.occupied_thresh, occupancy.free_thresh)
+    else:
+        shades = np.full(256, _SHADES[UNKNOWN], dtype=np.uint8)
+        shades[percents == 0], shades[percents == OCCUPIED_PERCENT] = _SHADES[FREE], _SHADES[LETHAL]
+        occupied, free = _WRITTEN_OCCUPIED, _WRITTEN_FREE
+    pixels = np.ascontiguousarray(shades[occupancy.values.view(np.uint8)][::-1])
+    data = io.BytesIO()
+    Image.fromarray(pixels).save(data, format="PNG" if image == "png" else "PPM")
+    image_file = path_prefix.with_name(f"{path_prefix.name}.{image}")
+    atomic_write(image_file, data.getvalue(), mode=SHARED)
+    g = occupancy.geometry
     text = (
-        f"image: {image_file.name}\nmode: trinary\nresolution: {g.resolution!r}\n"
-        f"origin: [{g.origin_x!r}, {g.origin_y!r}, 0.0]\nnegate: 0\n"
-        f"occupied_thresh: {_WRITTEN_OCCUPIED}\nfree_thresh: {_WRITTEN_FREE}\n"
+        f"image: {image_file.name}\nmode: {'raw' if graded else 'trinary'}\nresolution: {g.resolution!r}\n"
+        f"origin: [{g.origin_x!r}, {g.origin_y!r}, {occupancy.yaw!r}]\nnegate: 0\n"
+        f"occupied_thresh: {occupied}\nfree_thresh: {free}\n"
     )
+    if provenance:
+        size = {"image_size": [g.width, g.height]}
+        text += yaml.safe_dump({PROVENANCE_KEY: {**provenance, **size}}, sort_keys=False, allow_unicode=True)
     atomic_write(path_prefix.with_name(f"{path_prefix.name}.yaml"), text.encode(), mode=SHARED)
+
+
+def read_provenance(yaml_path: Path) -> dict[str, Any]:
+    """Return where a map came from, as it was given to `save_map`; empty for a map that doesn't say so.
+
+    It stands in the map's file under PROVENANCE_KEY. Nav2 and ROS 1 ask for their keys by name and see no others.
+    Raises `MapFileError`.
+    """
+    found = read_keys(yaml_path).get(PROVENANCE_KEY)
+    return found if isinstance(found, dict) else {}
+
+
+def unknown_keys(yaml_path: Path) -> list[str]:
+    """Return the keys of a map's file that nobody reads, such as misspelt ones; raises `MapFileError`."""
+    return [str(key) for key in read_keys(yaml_path) if key not in _KEYS]

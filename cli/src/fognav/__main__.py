@@ -18,7 +18,7 @@ from fognav.commands.map_files import map_check, map_convert, map_info
 from fognav.commands.node import node_app
 from fognav.commands.robot import robot_app
 from fognav.commands.robot_file import robot_add, robot_check, robot_new
-from fognav.commands.robot_tools import map_record, teleop_command
+from fognav.commands.robot_tools import calibrate_command, map_record, teleop_command
 from fognav.commands.site import site_app
 from fognav.commands.source import source_app
 from fognav.commands.status import status_command
@@ -56,6 +56,7 @@ for group, name, command, example in (
     (installed.TRY_IT, "doctor", doctor_command, "doctor --json"),
     (installed.OPERATE, "status", status_command, "status --json"),
     (installed.OPERATE, "teleop", teleop_command, "teleop --page --bind 192.168.7.20"),
+    (installed.SET_UP, "calibrate", calibrate_command, "calibrate --write --robot-file robot.toml"),
     (installed.RUN, "up", up_command, "up --site sites/estig --site sites/floor2"),
     (installed.RUN, "down", down_command, "down"),
     (installed.RUN, "logs", logs_command, "logs map-service -f"),

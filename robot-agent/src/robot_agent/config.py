@@ -317,6 +317,7 @@ def _with_settings(config: AgentConfig, settings: RobotSettings, *, can_rest: bo
     stop_field = replace(config.stop_field, memory=config.stop_field.memory + lidar.latency_s)
     return replace(
         config,
+        drive_train=replace(config.drive_train, wheel_ratio=settings.odometry.wheel_ratio),
         localization=localization,
         stop_field=stop_field,
         battery_low=settings.power.low_fraction,

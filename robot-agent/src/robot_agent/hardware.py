@@ -102,13 +102,20 @@ class DriveTrain:
 
     `axle_m`: distance between the wheels. `wheel_speed_max_m_s`: top speed of a wheel. `travel_wrap_m`: the travel at
     which the encoders' counters wrap (infinite: never). `deceleration_m_s2`: how fast a wheel that is commanded to zero
-    comes to rest, at least, with the heaviest load on the smoothest floor.
+    comes to rest, at least, with the heaviest load on the smoothest floor. `wheel_ratio`: how far the right wheel rolls
+    where the left one rolls 1 by its counter.
     """
 
     axle_m: float
     wheel_speed_max_m_s: float
     travel_wrap_m: float = math.inf
     deceleration_m_s2: float = 1.0
+    wheel_ratio: float = 1.0
+
+    @property
+    def shares(self) -> tuple[float, float]:
+        """How far the left and the right wheel roll, as a share of what their counters and speeds say; 1 on average."""
+        return 2.0 / (1.0 + self.wheel_ratio), 2.0 * self.wheel_ratio / (1.0 + self.wheel_ratio)
 
     def twist(self, left_m_s: float, right_m_s: float) -> Twist:
         """Return the body's motion at these wheel speeds."""

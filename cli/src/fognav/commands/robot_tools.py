@@ -1,4 +1,4 @@
-"""`fognav teleop` and `fognav map record`: tools that speak to the agent of the robot on whose computer they run."""
+"""`fognav teleop`, `calibrate` and `map record`: tools that speak to the agent of the robot that they run on."""
 
 from __future__ import annotations
 
@@ -105,3 +105,61 @@ def map_record(
             if recording.view.missed or recording.gaps:
                 print_answer(f"{recording.view.missed} entries were missed, the link broke {recording.gaps} times")
             print_answer(f"next: fognav map from-log {out} --out floor --png floor-loops.png")
+
+
+def calibrate_command(  # noqa: PLR0913  # one parameter for each option
+    log: Annotated[
+        Path | None, typer.Argument(metavar="LOG", help="A recording; without one the robot is recorded now.")
+    ] = None,
+    *,
+    robot_file: Annotated[
+        Path | None, typer.Option("--robot-file", metavar="FILE", help="The robot's settings, robot.toml.")
+    ] = None,
+    write: Annotated[bool, typer.Option("--write", help="Write the result into the robot's settings.")] = False,
+    accept: Annotated[
+        list[Path] | None,
+        typer.Option("--accept", metavar="LOG", help="Another drive that ends where it began: it must agree."),
+    ] = None,
+    out: Annotated[Path, typer.Option("--out", metavar="FILE.mcap", help="Where a drive is recorded.")] = Path(
+        "calibration.mcap"
+    ),
+    seconds: Annotated[float | None, typer.Option(min=1.0, help="End recording by itself; else with Ctrl-C.")] = None,
+    socket: SocketOption = None,
+    json: JsonOption = False,
+) -> None:
+    """Find out how a robot's wheels and lidar really are, by driving it around in any room for some minutes.
+
+    Drive by `fognav teleop` in a second terminal, slowly, with walls within reach of the lidar and nobody walking by:
+    turn once to each side, drive straight ahead and back, and arcs to both sides. It says what is missing yet.
+    """
+    from fognav.robot_page import calibrating  # noqa: PLC0415  # loads kernels
+
+    with exit_codes():
+        if write and robot_file is None:
+            raise WrongUseError("--write needs the robot's settings file: add --robot-file robot.toml")
+        if log is None and out.exists():
+            raise WrongUseError(
+                f"{out} exists: name another file with --out, or calibrate by it: fognav calibrate {out}"
+            )
+        recorded = (
+            calibrating.record(socket or _default_socket(), out, seconds) if log is None else calibrating.read(log)
+        )
+        found, changed = calibrating.solve(recorded, robot_file)
+        accepted: dict[str, float] = {}
+        for other in accept or []:
+            accepted |= calibrating.refuse_disagreement(found, other)
+        if write and robot_file is not None:
+            calibrating.write(robot_file, changed, calibrating.hash_of(log or out))
+        if json:
+            print_json(calibrating.as_json(found, changed, accepted))
+            return
+        for change in changed:
+            half = "" if change.half is None else f" +- {change.half:.5f}"
+            print_answer(f"{change.setting:32} {change.before!s:>10} -> {change.now}{half}")
+        print_answer(
+            f"by {found.steps} pairs of scans; rms {1000 * found.residual_m:.1f} mm, {found.residual_rad:.4f} rad"
+        )
+        for name, value in accepted.items():
+            print_answer(f"{name:32} {value}")
+        if not write:
+            print_answer("nothing was written: add --write --robot-file robot.toml")

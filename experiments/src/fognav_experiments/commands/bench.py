@@ -244,6 +244,22 @@ def planner_command(
     _show("planner", what, figures, json=json)
 
 
+@bench_app.command("calibration", epilog="Example: fognav bench calibration --seeds 20 --json")
+def calibration_command(
+    *,
+    seeds: Annotated[int, typer.Option("--seeds", metavar="N", min=1, help="Robots, each with its own room.")] = 20,
+    json: JsonOption = False,
+) -> None:
+    """Calibrate simulated robots whose wheels, axle and lidar are up to 15 % wrong, and compare with the truth."""
+    from fognav_experiments.bench.calibration import measure  # noqa: PLC0415  # same
+
+    kernels.warm_cache(print_line)
+    with exit_codes(), Progress(console=console, disable=not console.is_terminal) as progress:
+        task = progress.add_task("calibrating", total=seeds)
+        figures = measure(seeds, lambda done: progress.update(task, completed=done))
+    _show("calibration", {}, figures, json=json)
+
+
 @bench_app.command("dwa", epilog="Example: fognav bench dwa --repeats 2000 --json")
 def dwa_command(
     *,

@@ -94,6 +94,10 @@ class OdometrySettings(_Table, frozen=True, kw_only=True):
             "rotation by translation, of translation by translation, of translation by rotation"
         ),
     ] = (0.05, 0.05, 0.01, 0.05)
+    wheel_ratio: Annotated[
+        Annotated[float, Meta(ge=0.8, le=1.25)],
+        Meta(description="how far the right wheel rolls where the left one rolls 1 by its counter (fognav calibrate)"),
+    ] = 1.0
 
 
 class MotionSettings(_Table, frozen=True, kw_only=True):

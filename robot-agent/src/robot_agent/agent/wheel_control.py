@@ -121,7 +121,12 @@ class WheelControl:
     def _next(self) -> WheelCommand:
         self._seq += 1
         reset, self._reset_pending = self._reset_pending, False
-        return WheelCommand(seq=self._seq, left=self.speeds[0], right=self.speeds[1], reset=reset)
+        # The base turns each wheel by its counter. Divided by the larger share of both: neither gets faster by it.
+        left, right = self._config.drive_train.shares
+        least = min(left, right)
+        return WheelCommand(
+            seq=self._seq, left=self.speeds[0] * least / left, right=self.speeds[1] * least / right, reset=reset
+        )
 
     def _usable_decision(self, now: float) -> Decision | None:
         """Return the newest decision; None when it is too old, or one of its speeds is no number."""

@@ -117,8 +117,9 @@ def _step(old: Reading, new: Reading, drive: DriveTrain) -> tuple[float, float, 
     if possible > drive.travel_wrap_m / 4:
         # The counter may have wrapped during the gap: the step is ambiguous.
         possible = -1.0
-    wrap = drive.travel_wrap_m
-    return wheel_travel(new.left_m, old.left_m, wrap), wheel_travel(new.right_m, old.right_m, wrap), possible
+    wrap, (left, right) = drive.travel_wrap_m, drive.shares
+    left_m, right_m = wheel_travel(new.left_m, old.left_m, wrap), wheel_travel(new.right_m, old.right_m, wrap)
+    return left * left_m, right * right_m, possible
 
 
 _UNMEASURED_M: Final = (0.1, 2.0)

@@ -1,0 +1,186 @@
+"""`fognav calibrate`: from a log, or live while somebody drives; what it found, and writing it into robot.toml."""
+
+from __future__ import annotations
+
+import contextlib
+import datetime as dt
+import hashlib
+import math
+import os
+import time
+from typing import TYPE_CHECKING, Any, Final
+
+import msgspec
+import numpy as np
+import tomlkit
+from tomlkit.exceptions import TOMLKitError
+
+from fog_runtime.configuration.robot_file import ROBOT_FILE, load_robot, parse_robot
+from fog_runtime.files import SHARED, atomic_write
+from fog_runtime.record import Recorder, RecordError, read_entries
+from fognav.output import FailedError, WrongUseError, print_line, writing
+from fognav.robot_page.recording_view import until_told
+from fognav.robot_page.view import LocalRobotErrors
+from robot_agent import registry
+from robot_agent.agent.recording.input_log import ENTRY_OF_TOPIC, TOPIC_OF_ENTRY, BaseReceived, ScanReceived, Started
+from robot_agent.calibration import WANTED, Calibration, CalibrationError, Calibrator, Changed, changes
+from robot_agent.local_client import LocalRobot
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+_USED: Final = (Started, BaseReceived, ScanReceived)
+_TOLD_S: Final = 5.0
+
+
+def read(log: Path) -> Calibrator:
+    """Return what a recording holds; raises `WrongUseError`."""
+    calibrator = Calibrator()
+    try:
+        for _, topic, data in read_entries(log):
+            kind = ENTRY_OF_TOPIC.get(topic)
+            if kind in _USED:
+                calibrator.take(msgspec.json.decode(data, type=kind))
+    except (OSError, RecordError, msgspec.DecodeError) as error:
+        raise WrongUseError(f"{log}: {error}. Name a file that `fognav map record` wrote") from error
+    return calibrator
+
+
+def record(socket: Path, log: Path, seconds: float | None) -> Calibrator:
+    """Record while somebody drives, into `log` too, and say what must be driven yet; raises `FailedError`."""
+    calibrator, told, said = Calibrator(), -math.inf, ""
+    with (
+        LocalRobotErrors(),
+        LocalRobot(socket) as robot,
+        contextlib.closing(Recorder(log)) as recorder,
+        until_told(seconds) as ends,
+    ):
+        print_line(
+            "drive by hand (fognav teleop): turn both ways, straight ahead and back, arcs to both sides; Ctrl-C ends"
+        )
+        while not ends():
+            for entry in robot.entries(0.2):
+                if isinstance(entry, _USED):
+                    calibrator.take(entry)
+                    recorder.write_entry(TOPIC_OF_ENTRY[type(entry)], entry, time.time_ns())
+                if isinstance(entry, ScanReceived):
+                    break
+            if time.monotonic() - told > _TOLD_S:
+                told = time.monotonic()
+                if (now := _progress(calibrator)) != said:
+                    print_line(said := now)
+    return calibrator
+
+
+def _progress(calibrator: Calibrator) -> str:
+    """Return what must be driven yet; once all is, how certain each figure is already."""
+    if missing := calibrator.driven().missing():
+        return "; ".join(missing)
+    try:
+        found = calibrator.solve()
+    except CalibrationError as error:
+        return str(error)
+    bars = []
+    for (name, figure), wanted in zip(found.figures.items(), WANTED, strict=True):
+        half = figure.half / figure.value if name == "axle" else figure.half
+        filled = min(10, math.floor(10.0 * wanted / max(half, 1e-9)))
+        bars.append(f"{name} {'#' * filled}{'.' * (10 - filled)}")
+    return "  ".join(bars)
+
+
+def solve(calibrator: Calibrator, robot_file: Path | None) -> tuple[Calibration, list[Changed]]:
+    """Return what was found, and what it changes in a robot's settings; raises `FailedError`."""
+    environ = {**os.environ, **({ROBOT_FILE: str(robot_file)} if robot_file else {})}
+    try:
+        found = calibrator.solve()
+    except CalibrationError as error:
+        raise FailedError(str(error)) from error
+    robot = load_robot(environ)
+    diameter = getattr(registry.options(robot)[0], "wheel_diameter_m", None)
+    if diameter is None:
+        raise robot.error("base.options", "this base has no `wheel_diameter_m`", "Use the figures of --json by hand")
+    assert calibrator.config is not None
+    return found, changes(found, calibrator.config, robot.settings, diameter)
+
+
+def refuse_disagreement(found: Calibration, log: Path) -> dict[str, float]:
+    """Return how far the wheels were off at the end of another drive, before and now; raises `FailedError`.
+
+    It is independent: what was found does not know it. It must be better than before, or within 1 % of its way.
+    """
+    other = read(log)
+    values = np.array([figure.value for figure in found.figures.values()])
+    try:
+        before, _, way = other.end_error(other.start, mirrored=found.mirrored)
+        now, turned, _ = other.end_error(values, mirrored=found.mirrored)
+    except CalibrationError as error:
+        raise FailedError(f"{log}: {error}") from error
+    figures = {
+        "end_error_before_m": round(before, 4),
+        "end_error_m": round(now, 4),
+        "end_turn_deg": round(math.degrees(turned), 2),
+        "way_m": round(way, 2),
+    }
+    if now > before and now > 0.01 * way:
+        raise FailedError(
+            f"{log} contradicts it: at its end the wheels were {before:.3f} m off before, {now:.3f} m now"
+        )
+    return figures
+
+
+def write(robot_file: Path, changed: list[Changed], source: str) -> None:
+    """Write new values into a robot's file, the old ones beside them as comments; raises `WrongUseError`.
+
+    A file that `robot check` would refuse is not written.
+    """
+    try:
+        text = robot_file.read_text("utf-8")
+        document = tomlkit.parse(text)
+    except (OSError, UnicodeDecodeError, TOMLKitError) as error:
+        raise WrongUseError(f"{robot_file}: {error}. Name the robot's settings file") from error
+    today = dt.datetime.now(tz=dt.UTC).date().isoformat()
+    for change in changed:
+        *tables, key = change.setting.split(".")
+        table: Any = document
+        for name in tables:
+            if name not in table:
+                table[name] = tomlkit.table()
+            table = table[name]
+        before = table[key].as_string() if key in table and hasattr(table[key], "as_string") else change.before
+        table[key] = change.now
+        table[key].comment(f"calibrated {today} ({source}), before: {str(before).lower()}")
+    changed_text = tomlkit.dumps(document)
+    parse_robot(changed_text, robot_file, {})
+    with writing(robot_file, "Name another file"):
+        atomic_write(robot_file, changed_text.encode(), mode=SHARED)
+
+
+def hash_of(log: Path) -> str:
+    """Return the beginning of a log's hash, by which its result can be traced."""
+    return f"{log.name} {hashlib.sha256(log.read_bytes()).hexdigest()[:12]}"
+
+
+def as_json(found: Calibration, changed: list[Changed], accepted: dict[str, float]) -> dict[str, Any]:
+    """Return what the command prints as JSON."""
+    by_name = {change.setting: change for change in changed}
+    diameter = float(by_name["base.options.wheel_diameter_m"].before)
+
+    def figure(name: str, factor: float = 1.0) -> dict[str, Any]:
+        value, half = found.figures[name]
+        return {
+            "value": round(factor * value, 5),
+            "interval": [round(factor * (value - half), 5), round(factor * (value + half), 5)],
+        }
+
+    return {
+        "wheel_left_mm": figure("left", 1000.0 * diameter),
+        "wheel_right_mm": figure("right", 1000.0 * diameter),
+        "axle_m": figure("axle"),
+        "lidar": {"x_m": figure("x"), "y_m": figure("y"), "yaw_rad": figure("yaw"), "mirrored": found.mirrored},
+        "latency_s": figure("latency"),
+        "steps": found.steps,
+        "residual_m": round(found.residual_m, 4),
+        "residual_rad": round(found.residual_rad, 5),
+        "changes": {change.setting: [change.before, change.now] for change in changed},
+        **accepted,
+    }

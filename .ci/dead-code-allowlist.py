@@ -60,6 +60,7 @@ _.FACTORY  # bases, lidars, debounce rules and cost layers are found by their en
 _.DEFAULT  # same: profiles
 _.add_to  # same: commands
 _.add_localize
+_.add_diff
 _.add_from_log
 _.add_to_map  # same: commands
 _.list_commands  # typer asks for them

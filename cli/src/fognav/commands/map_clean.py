@@ -58,7 +58,7 @@ def map_clean(
         prefix = map_file.with_name(f"{map_file.stem}-clean") if out is None else out
         check_writable(Path(f"{prefix}.yaml"))
         static = loaded(map_file)
-        text = _text(file, map_file, static)
+        text = begun(file, map_file, static)
         if command:
             text = with_lines(text, [" ".join(command)])
         read = _read(file, text)
@@ -82,7 +82,7 @@ def map_clean(
         print_result(values, *lines, json=json)
 
 
-def _text(file: Path, map_file: Path, static: StaticMap) -> str:
+def begun(file: Path, map_file: Path, static: StaticMap) -> str:
     """Return the text of a file of commands, or how one for a map begins; raises `WrongUseError`."""
     from fog_mapping.cleaning import fingerprint  # noqa: PLC0415  # keeps the other commands fast
 

@@ -29,6 +29,7 @@ if TYPE_CHECKING:
 
     from fog_contracts.grid import StaticMap
     from fog_mapping.loops import LoopGroup
+    from fog_mapping.scans import Scan
     from fognav_experiments.lidar_logs import Poses
     from fognav_experiments.lidar_logs.logs import LogScan
 
@@ -156,14 +157,10 @@ def map_log(
     if poses == "reference":
         return _at_reference(log, resolution, range_max)
     try:
-        scans = keep_moved(
-            scan
-            for number, one in enumerate(log)
-            if (scan := scan_of(number, one.angles, one.ranges, one.odom, range_max)) is not None
-        )
+        scans = scans_of(log, range_max)
         place_of = {scan.number: index for index, scan in enumerate(scans)}
         pairs = [(_index(first, place_of), _index(second, place_of)) for first, second in refused]
-        with _bar() as show:
+        with progress_bar() as show:
             found = find_trajectory(scans, jobs=os.cpu_count() or 1, without=pairs, on_progress=show)
         built = draw(((pose, scan.points) for pose, scan in zip(found.poses, scans, strict=True)), resolution)
     except ValueError as error:
@@ -176,6 +173,15 @@ def map_log(
         loops=grouped(found.loops, found.poses, [scan.number for scan in scans]), ambiguous=found.ambiguous,
         seconds=time.process_time() - started,
     )  # fmt: skip
+
+
+def scans_of(log: Sequence[LogScan], range_max: float) -> list[Scan]:
+    """Return the scans of a log between which the robot has moved; raises `ValueError` for odometry that is none."""
+    return keep_moved(
+        scan
+        for number, one in enumerate(log)
+        if (scan := scan_of(number, one.angles, one.ranges, one.odom, range_max)) is not None
+    )
 
 
 def _at_reference(log: Sequence[LogScan], resolution: float, range_max: float) -> MadeMap:
@@ -211,7 +217,7 @@ def _index(number: int, place_of: dict[int, int]) -> int:
 
 
 @contextmanager
-def _bar() -> Iterator[Callable[[str, float], None]]:
+def progress_bar() -> Iterator[Callable[[str, float], None]]:
     """Yield what shows the progress: as a bar on a terminal, and nowhere else."""
     columns = TextColumn("{task.description}"), BarColumn(), TaskProgressColumn(), TimeElapsedColumn()
     with Progress(*columns, console=console, transient=True, disable=not console.is_terminal) as progress:

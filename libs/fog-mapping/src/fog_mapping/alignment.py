@@ -26,8 +26,9 @@ _SPREAD_CELLS: Final = 3
 _GATES: Final = np.array([0.5] * 4 + [0.3] * 4 + [0.15] * 6)
 _LEAST_SHARE: Final = 0.7
 """Of the walls that both maps could see, so many must lie on each other ..."""
-_MOST_RESIDUAL_M: Final = 0.06
-"""... so well, or by a cell of a coarse map."""
+_MOST_RESIDUAL_M: Final = 0.075
+"""... so well, or by a cell of a coarse map. At random it would be 0.087."""
+_ON_WALL_M: Final = 0.15
 _LEAST_POINTS: Final = 60
 _RIVAL: Final = 0.97
 """Another place that fits by this share of the best leaves it open which is right."""
@@ -119,7 +120,7 @@ def _judged(static: StaticMap, onto: StaticMap, pose: tuple[float, float, float]
         _distances(static, turned),
     ]
     away = np.concatenate(near)
-    close = away <= 0.15
+    close = away <= _ON_WALL_M
     return Alignment(pose, float(close.mean()), float(np.sqrt(np.mean(away[close] ** 2))) if close.any() else math.inf)
 
 

@@ -186,6 +186,22 @@ def test_map_without_a_reference_is_found_by_matching_and_can_be_looked_at(folde
     assert load_map(tmp_path / "built.yaml").cells.shape == (found["height"], found["width"])
 
 
+def test_benchmark_of_mapping_measures_time_memory_and_errors_of_a_log(folder):
+    code, found = run("bench", "mapping", "--log", folder / "drive.jsonl.gz")
+    assert code == 0
+    assert found["log"] == "drive.jsonl.gz"
+    assert 0.0 < found["seconds"] < 60.0
+    assert 50 < found["rss_mb"] < 4000
+    assert found["relations"]["1 m"]["translation_m"] < 0.03
+
+
+def test_benchmark_of_mapping_says_where_recordings_were_looked_for(tmp_path, monkeypatch):
+    monkeypatch.setenv("FOGNAV_DATA", str(tmp_path))
+    done = CliRunner().invoke(app, ["bench", "mapping"])
+    assert done.exit_code == 2
+    assert "Let FOGNAV_DATA name the folder of recordings" in " ".join(done.output.split())
+
+
 @pytest.mark.parametrize(
     ("option", "problem"),
     [

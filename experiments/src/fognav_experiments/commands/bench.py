@@ -17,6 +17,7 @@ from fognav.commands.installed import MEASURE
 from fognav.operate.options import JsonOption  # noqa: TC001  # Typer reads annotations at run time
 from fognav.output import NOT_TRUE, WrongUseError, check_writable, console, exit_codes, print_json, print_line
 from fognav_experiments import machine
+from fognav_experiments.commands import logs
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -26,6 +27,7 @@ bench_app = typer.Typer(help="Measure parts of the system on this machine.", no_
 
 def add_to(app: typer.Typer) -> None:
     """Add the command to `fognav`."""
+    logs.add_bench(bench_app)
     app.add_typer(bench_app, name="bench", rich_help_panel=MEASURE)
 
 

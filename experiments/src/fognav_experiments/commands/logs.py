@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
+import os
+import time
 from pathlib import Path  # Typer reads annotations at run time
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Final
 
 import typer
 from rich.progress import Progress
 
 from fog_runtime.configuration.maps import MapFileError, load_map, save_map
-from fognav import kernels
+from fognav import checkout, kernels
 from fognav.commands.installed import MEASURE
 from fognav.map_files import described, provenance
 from fognav.operate.options import JsonOption  # noqa: TC001  # Typer reads annotations at run time
@@ -29,6 +31,9 @@ if TYPE_CHECKING:
     from fog_contracts.grid import StaticMap
     from fognav_experiments.lidar_logs import Selection
     from fognav_experiments.lidar_logs.logs import LidarLog, LogScan
+
+
+INTEL: Final = "intel_odom_ref_scan.jsonl.gz"
 
 
 def add_localize(app: typer.Typer) -> None:
@@ -116,6 +121,56 @@ def _with_references(log: LidarLog, scans: Selection, first: int, count: int | N
     if len(used) < 2:
         raise WrongUseError(f"{file} has fewer than two such scans with a reference pose. Name a corrected log")
     return used
+
+
+def add_bench(app: typer.Typer) -> None:
+    """Add the command to `fognav bench`."""
+    app.command("mapping", epilog="Example: fognav bench mapping --json")(bench_mapping)
+
+
+def bench_mapping(
+    *,
+    log_file: Annotated[
+        Path | None, typer.Option("--log", metavar="LOG", help="Another log than that of the Intel Research Lab.")
+    ] = None,
+    json: JsonOption = False,
+) -> None:
+    """Make a map of a recorded floor: the time, the memory, and how far it is off the log's reference.
+
+    The log is looked for in the folder that FOGNAV_DATA names, or else in shared/data beside the checkout. `seconds`
+    run on the clock, from the log in memory to the map; `cpu_seconds` are those of all cores; `rss_mb` is the most
+    that the process had.
+    """
+    from fognav_experiments import machine  # noqa: PLC0415  # keeps the other commands fast
+    from fognav_experiments.lidar_logs import mapping  # noqa: PLC0415  # same
+    from fognav_experiments.lidar_logs.logs import read_log  # noqa: PLC0415  # same
+    from fognav_experiments.localization_trials import with_noise  # noqa: PLC0415  # same
+
+    with exit_codes():
+        file = log_file or recordings() / "lidar_logs" / INTEL
+        log = read_log(file)
+        kernels.warm_cache(lambda text: console.print(text, markup=False))
+        used = log.scans if log.odometry_measured else with_noise(log.scans, 1)
+        started = time.monotonic()
+        made = mapping.map_log(used, "matched", (), 0.05, 30.0)
+        seconds = time.monotonic() - started
+    found = made.figures()
+    found |= {"seconds": round(seconds, 2), "cpu_seconds": found["seconds"], "loops": len(made.loops or ())}
+    if json:
+        print_json({"bench": "mapping", "log": file.name, **found, **machine.describe()})
+        return
+    for name, value in found.items():
+        print_answer(f"{name:20} {value}")
+
+
+def recordings() -> Path:
+    """Return the folder of recordings: FOGNAV_DATA, or that beside the checkout; raises `WrongUseError`."""
+    folder = Path(os.environ.get("FOGNAV_DATA") or checkout.root().parent / "shared" / "data")
+    if not (folder / "lidar_logs" / INTEL).is_file():
+        raise WrongUseError(
+            f"{folder} has no lidar_logs/{INTEL}. Let FOGNAV_DATA name the folder of recordings, or name a --log"
+        )
+    return folder
 
 
 def add_from_log(app: typer.Typer) -> None:

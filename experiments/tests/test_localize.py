@@ -186,6 +186,28 @@ def test_map_without_a_reference_is_found_by_matching_and_can_be_looked_at(folde
     assert load_map(tmp_path / "built.yaml").cells.shape == (found["height"], found["width"])
 
 
+def test_stamps_that_go_back_and_missing_scans_are_said_and_lose_nothing(folder, tmp_path):
+    with gzip.open(folder / "drive.jsonl.gz", "rt") as file:
+        lines = file.read().splitlines()
+    scans = [json.loads(line) for line in lines if "ranges" in line]
+    other = [line for line in lines if "ranges" not in line]
+    at = np.array([scan["odom"][:2] for scan in scans])
+    start = next(i for i in range(len(at)) if np.hypot(*(at[i] - at[0])) > 1.0)
+    end = next(i for i in range(start, len(at)) if np.hypot(*(at[i] - at[start])) > 2.2)
+    kept = scans[: start + 1] + scans[end:]
+    kept[3]["t"], kept[5]["t"] = kept[1]["t"], kept[4]["t"]
+    (tmp_path / "bad.jsonl").write_text("\n".join([*other, *map(json.dumps, kept)]) + "\n")
+    _, found = run("map", "from-log", tmp_path / "bad.jsonl", "--out", tmp_path / "built")
+    assert found["stamps_mended"] == 2
+    assert len(found["gaps"]) == 1
+    assert found["gaps"][0][2] > 2.0
+    assert len(read_log(tmp_path / "bad.jsonl").scans) == len(kept)
+    done = CliRunner().invoke(app, ["map", "from-log", str(tmp_path / "bad.jsonl"), "--out", str(tmp_path / "built")])
+    said = " ".join(done.output.split())
+    assert f"2 of {len(kept)} stamps go back, repeat or leap" in said
+    assert "no scan tells the way: look at the map there" in said
+
+
 def test_benchmark_of_mapping_measures_time_memory_and_errors_of_a_log(folder):
     code, found = run("bench", "mapping", "--log", folder / "drive.jsonl.gz")
     assert code == 0

@@ -6,11 +6,13 @@ import math
 
 import numpy as np
 import pytest
+from scipy import ndimage
 
 from fog_contracts.costs import FREE, LETHAL
 from fog_kernels.distance import squared_distance_capped
 from fog_kernels.raycast import cast
 from fog_mapping.building import draw, find_trajectory
+from fog_mapping.loops import LoopSearch
 from fog_mapping.poses import between, compose, place
 from fog_mapping.relations import absolute_error, relation_errors
 from fog_mapping.scans import Scan, keep_moved, scan_of
@@ -127,6 +129,56 @@ def test_map_is_the_same_however_many_threads_make_it(mapped):
     again = find_trajectory(scans, jobs=1)
     assert (again.poses == found.poses).all()
     assert again.loops == found.loops
+
+
+@pytest.mark.parametrize(
+    "share", [pytest.param(0.05, marks=pytest.mark.drive), pytest.param(0.1, marks=pytest.mark.drive), 0.2]
+)
+def test_wrong_loops_among_those_found_change_the_map_by_less_than_a_cell(mapped, monkeypatch, share):
+    """Of the matches that each round finds, so many more are wrong: of places that are 2 to 6 m from each other."""
+    scans, truth, found = mapped
+    rng, wrong, search = np.random.default_rng(7), [], LoopSearch.search
+
+    def deceived(self, *given, **named):
+        result = search(self, *given, **named)
+        for i in rng.choice(len(result.edges), math.ceil(share * len(result.edges)), replace=False):
+            away = rng.uniform(2.0, 6.0) * np.array((math.cos(i), math.sin(i)))
+            edge = result.edges[i]
+            result.edges.append(edge._replace(step=np.add(edge.step, (*away, rng.uniform(-0.5, 0.5)))))
+            result.loops.append(result.loops[i]._replace(score=-1.0))
+            wrong.append(i)
+        return result
+
+    monkeypatch.setattr(LoopSearch, "search", deceived)
+    again = find_trajectory(scans, jobs=2)
+    assert len(wrong) >= share * sum(loop.score > 0.0 for loop, _ in again.loops)
+    assert max(weight for loop, weight in again.loops if loop.score < 0.0) < 0.05
+    assert min(weight for loop, weight in again.loops if loop.score > 0.0) > 0.25
+    assert np.abs(again.poses - found.poses)[:, :2].max() < CELL
+    assert absolute_error(again.poses, truth) < 0.05
+
+
+@pytest.mark.drive
+def test_ten_drives_with_other_noise_join_the_same_places_and_rooms():
+    """The topology: no loop is false, all visits of a place agree, and the same rooms are reached from the start."""
+    maps = []
+    for seed in range(10):
+        scans, truth = FLOOR.drive([*ROUND[:4], ROUND[0], ROUND[1]], seed=20 + seed)
+        found = find_trajectory(scans, jobs=2)
+        free = drawn(scans, found.poses, truth, FREE)
+        cells = np.floor(free / 0.2).astype(int)
+        grid = np.zeros(cells.max(axis=0) + 1, bool)
+        grid[tuple(cells[(cells >= 0).all(axis=1)].T)] = True
+        labels, _ = ndimage.label(grid)
+        rooms = ((2, 2), (18, 2), (18, 12), (2, 12), (6, 4), (13, 4))
+        spots = [labels[int(x / 0.2), int(y / 0.2)] for x, y in rooms]
+        maps.append([spot == spots[0] != 0 for spot in spots])
+        joined = [loop for loop, weight in found.loops if weight > 0.5]
+        assert joined, seed
+        assert all(math.dist(truth[loop.first][:2], truth[loop.second][:2]) < 6.0 for loop in joined), seed
+        assert relation_errors(found.poses, truth)["loops"].translation_m < 0.05, seed
+    assert all(reached == maps[0] for reached in maps), maps
+    assert all(maps[0]), "every room of the floor is open to the corridor"
 
 
 def test_loop_that_is_refused_is_not_closed(mapped):

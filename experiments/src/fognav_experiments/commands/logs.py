@@ -234,8 +234,14 @@ def map_from_log(  # noqa: PLR0913  # each option is an argument
         found = described(made.map)
     if json:
         odometry = "reference with noise" if is_noisy else "measured"
-        print_json({"file": f"{out}.yaml", **found, "odometry": odometry, **made.figures()})
+        print_json({"file": f"{out}.yaml", **found, "odometry": odometry,
+                    "stamps_mended": log.stamps_mended, **made.figures()})  # fmt: skip
         return
+    if log.stamps_mended:
+        print_answer(
+            f"{log.stamps_mended} of {len(log.scans)} stamps go back, repeat or leap: the order of the scans in the "
+            "file was believed instead. No scan was left out"
+        )
     for line in made.lines():
         print_answer(line)
     print_answer(f"wrote {out}.yaml: {found['width']} x {found['height']} cells, {found['occupied']} occupied")

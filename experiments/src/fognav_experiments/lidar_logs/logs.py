@@ -12,6 +12,7 @@ import json
 import math
 import zlib
 from dataclasses import dataclass, replace
+from functools import lru_cache
 from typing import IO, TYPE_CHECKING, Final, cast, get_args
 
 import numpy as np
@@ -55,11 +56,13 @@ class LogScan:
 class LidarLog:
     """The scans of a log in order of time.
 
-    odometry_measured: False if the log's odometry is its reference, so that it has no error of its own.
+    odometry_measured: False if the log's odometry is its reference, so that it has no error of its own. stamps_mended:
+    how many stamps went back, repeated or leapt, and were replaced.
     """
 
     scans: tuple[LogScan, ...]
     odometry_measured: bool
+    stamps_mended: int = 0
 
     def select(self, selection: Selection) -> tuple[LogScan, ...]:
         """Return all scans, or those with odd or even numbers, counted from 0."""
@@ -125,8 +128,12 @@ def _pose(values: Sequence[float] | Sequence[str]) -> Pose2:
     return Pose2(x, y, theta)
 
 
+@lru_cache(maxsize=8)
 def beam_angles(count: int, field_of_view: float = _FIELD_OF_VIEW) -> NDArray[np.float64]:
-    """Return the angles (rad) of `count` beams over a field of view, symmetric if odd, else without the last one."""
+    """Return the angles (rad) of `count` beams over a field of view, symmetric if odd, else without the last one.
+
+    The array is shared by all scans, so that a long log fits into memory: it must not be written to.
+    """
     if count < 2:
         raise ValueError(f"a scan must have two beams or more, not {count}")
     step = field_of_view / (count - 1 if count % 2 else count)
@@ -171,18 +178,18 @@ def _finished(scans: list[LogScan], *, coded: bool = True) -> LidarLog:
     code = _no_return_code(scans) if coded else math.inf
     start, last = scans[0].stamp, -math.inf
     finished: list[LogScan] = []
-    steady = _median_period(scans)
+    steady, mended = _median_period(scans), 0
     for scan in scans:
         stamp = scan.stamp - start
         if not last < stamp < last + 60.0 * steady and finished:
-            stamp = last + steady  # constant, coarse or wrapped stamps
+            stamp, mended = last + steady, mended + 1  # constant, coarse or wrapped stamps
         last = stamp
         ranges = np.where((scan.ranges > 0.0) & (scan.ranges < code), scan.ranges, math.nan)
         finished.append(replace(scan, stamp=stamp, ranges=ranges))
     moved = [scan for scan in finished if scan.reference is not None and _offset(scan) != _offset(finished[0])]
     if finished[0].reference is not None and not any(_differs(finished[0], scan) for scan in moved):
-        return LidarLog(tuple(finished), odometry_measured=False)
-    return LidarLog(tuple(finished), odometry_measured=True)
+        return LidarLog(tuple(finished), odometry_measured=False, stamps_mended=mended)
+    return LidarLog(tuple(finished), odometry_measured=True, stamps_mended=mended)
 
 
 def _offset(scan: LogScan) -> Pose2:

@@ -33,6 +33,8 @@ if TYPE_CHECKING:
     from fognav_experiments.lidar_logs import Poses
     from fognav_experiments.lidar_logs.logs import LogScan
 
+_GAP_M: Final = 2.0
+"""Farther on, little of what a scan shows need be what the one before it showed."""
 _COLOURS: Final = {FREE: (255, 255, 255), LETHAL: (0, 0, 0)}
 _UNKNOWN_COLOUR: Final = (205, 205, 205)
 _WAY_COLOUR: Final = (70, 130, 220)
@@ -66,6 +68,7 @@ class MadeMap:
                 for group in self.loops or ()
             ],
             "ambiguous": self.ambiguous,
+            "gaps": [[round(value, 2) for value in gap] for gap in self._gaps()],
             "seconds": round(self.seconds, 2),
             "rss_mb": round(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024.0),
         }  # fmt: skip
@@ -91,6 +94,11 @@ class MadeMap:
             yield (
                 f"loop {group.name} at ({x:.1f}, {y:.1f}): {group.pairs} matches, score {group.score:.2f}, "
                 f"{1000.0 * group.residual:.0f} mm rms{verdict}"
+            )
+        for before, after, moved in self._gaps():
+            yield (
+                f"between scans at {before:.1f} s and {after:.1f} s the odometry goes on by {moved:.1f} m: no scan "
+                "tells the way: look at the map there, or drive this part again"
             )
         if self.loops == []:
             yield "no place was visited twice: nothing confirms the shape of this map. Drive back to where you began"
@@ -138,6 +146,15 @@ class MadeMap:
             return None
         ours, theirs = (between(poses[group.first], poses[group.second]) for poses in (self.poses, self.reference))
         return round(float(np.hypot(*(ours - theirs)[:2])), 3)
+
+    def _gaps(self) -> list[tuple[float, float, float]]:
+        """Return where scans are missing: the stamps (s) around it, and how far (m) the odometry goes on meanwhile."""
+        at = np.array([scan.odom[:2] for scan in self.used], np.float64)
+        moved = np.hypot(*np.diff(at, axis=0).T)
+        return [
+            (self.used[i].stamp, self.used[i + 1].stamp, float(moved[i]))
+            for i in np.nonzero(moved > _GAP_M)[0].tolist()
+        ]
 
     def _place(self, group: LoopGroup) -> tuple[float, float]:
         x, y, _ = self.poses[group.first]

@@ -121,8 +121,9 @@ def settle(scans: Sequence[Scan], poses: NDArray[np.float64], sweeps: int = 2) -
     for _ in range(sweeps):
         for i in range(1, len(scans)):
             away = np.hypot(*(settled[:, :2] - settled[i, :2]).T)
-            nearest = np.argsort(away, kind="stable")[:_AROUND]
-            around = [int(j) for j in nearest if j != i and away[j] < 0.5 * _SPREAD_M]
+            near = np.nonzero(away < 0.5 * _SPREAD_M)[0]
+            nearest = near[np.argsort(away[near], kind="stable")[:_AROUND]]
+            around = [int(j) for j in nearest if j != i]
             if around:
                 others = reference_of(scans, settled, around)
                 pose = tuple(settled[i])

@@ -48,8 +48,8 @@ def test_wheels_axle_and_lidar_of_wrong_bodies_are_found():
 
 @pytest.mark.drive
 @pytest.mark.timeout(300)
-def test_twelve_bodies_up_to_15_percent_wrong_are_found_and_intervals_are_honest():
-    found = measure(12)
+def test_eight_bodies_up_to_15_percent_wrong_are_found_and_intervals_are_honest():
+    found = measure(8)
     assert found["mirrored_wrong"] == 0
     assert max(found["worst"][name] for name in ("left", "right", "axle")) < 0.0035
     assert max(found["worst"][name] for name in ("x", "y")) < 0.005

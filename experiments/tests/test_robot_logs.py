@@ -66,5 +66,5 @@ def test_walls_of_the_map_stand_where_those_of_the_building_stand(logged):
 
 def test_recording_that_is_no_log_of_an_agent_is_refused(tmp_path):
     (tmp_path / "other.mcap").write_bytes(b"nothing")
-    with pytest.raises(WrongUseError, match="Name the file that an agent wrote with FOGNAV_INPUT_LOG"):
+    with pytest.raises(WrongUseError, match=r"not an MCAP file.*Name the file that `fognav map record` wrote"):
         read_log(tmp_path / "other.mcap")

@@ -28,6 +28,9 @@ if TYPE_CHECKING:
     from fog_contracts.robot import RobotSettings
     from robot_agent.config import AgentConfig
 
+    _Track = tuple[NDArray[np.float64], NDArray[np.float64]]
+    """Poses of odometry, shape (n, 3), and their times (s)."""
+
 NAMES: Final = ("left", "right", "axle", "x", "y", "yaw", "latency")
 """What is found: each wheel's travel as a share of what its counter says, the axle (m), the lidar (m, m, rad), and how
 much older (s) scans are than the counters that arrive with them."""
@@ -230,7 +233,7 @@ class Calibrator:
 
     # --- odometry by a set of parameters ---
 
-    def _track(self, values: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    def _track(self, values: NDArray[np.float64]) -> _Track:
         """Return the poses (n, 3) of the robot at the times of the counters, and these times as scans have them."""
         left, right = values[0] * np.diff(self._left), values[1] * np.diff(self._right)
         turned, ahead = (right - left) / values[2], 0.5 * (left + right)
@@ -241,11 +244,11 @@ class Calibrator:
         return np.column_stack((x, y, theta)), np.array(self._times) + values[6]
 
     @staticmethod
-    def _at(track: tuple[NDArray[np.float64], NDArray[np.float64]], times: NDArray[np.float64]) -> NDArray[np.float64]:
+    def _at(track: _Track, times: NDArray[np.float64]) -> NDArray[np.float64]:
         poses, stamps = track
         return np.column_stack([np.interp(times, stamps, poses[:, column]) for column in range(3)])
 
-    def _scan(self, laser: _Laser, track: Any, mount: NDArray[np.float64], *, mirrored: bool) -> Scan | None:  # noqa: ANN401
+    def _scan(self, laser: _Laser, track: _Track, mount: NDArray[np.float64], *, mirrored: bool) -> Scan | None:
         """Return a scan without skew, in the lidar's frame at its end; None if it shows little."""
         count = len(laser.angles)
         times = laser.started_at + (laser.ended_at - laser.started_at) * np.arange(1, count + 1) / count
@@ -264,7 +267,7 @@ class Calibrator:
 
     # --- the lidar's own motions ---
 
-    def _pairs(self, track: Any) -> list[tuple[int, int]]:  # noqa: ANN401
+    def _pairs(self, track: _Track) -> list[tuple[int, int]]:
         ends = np.array([scan.ended_at for scan in self._scans])
         inside = (ends > self._times[0] + 0.5) & (ends < self._times[-1])
         poses = self._at(track, ends)

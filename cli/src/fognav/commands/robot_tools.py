@@ -43,9 +43,10 @@ def teleop_command(  # noqa: PLR0913  # one parameter for each option
     turn: Annotated[float, typer.Option(min=0.1, max=1.0, help="rad/s; more than 0.5 blurs a map.")] = 0.5,
     socket: SocketOption = None,
 ) -> None:
-    """Drive this computer's robot by hand, with or without a map and a fog.
+    """Drive this computer's robot by hand.
 
-    Run it on the robot's computer. Letting go, losing the link and ending the command stop the robot within 0.3 s.
+    It needs neither a map nor a fog. Run it on the robot's computer. Letting go, losing the link and ending the
+    command stop the robot within 0.3 s.
     """
     from fognav.robot_page.driving import HELP, GamePad, Keyboard, drive, raw_terminal  # noqa: PLC0415  # loads kernels
     from fognav.robot_page.server import serve  # noqa: PLC0415  # same
@@ -127,10 +128,11 @@ def calibrate_command(  # noqa: PLR0913  # one parameter for each option
     socket: SocketOption = None,
     json: JsonOption = False,
 ) -> None:
-    """Find out how a robot's wheels and lidar really are, by driving it around in any room for some minutes.
+    """Measure wheels and lidar by driving around.
 
-    Drive by `fognav teleop` in a second terminal, slowly, with walls within reach of the lidar and nobody walking by:
-    turn once to each side, drive straight ahead and back, and arcs to both sides. It says what is missing yet.
+    Some minutes in any room do. Drive by `fognav teleop` in a second terminal, slowly, with walls within reach of the
+    lidar and nobody walking by: turn once to each side, drive straight ahead and back, and arcs to both sides. It says
+    what is missing yet.
     """
     from fognav.robot_page import calibrating  # noqa: PLC0415  # loads kernels
 

@@ -34,4 +34,4 @@ def read_robot_log(path: Path) -> Iterator[RobotScan]:
                 if scan is not None:
                     yield scan
     except (RecordError, msgspec.DecodeError) as error:
-        raise WrongUseError(f"{path}: {error}. Name the file that `fognav map record` wrote") from error
+        raise WrongUseError(f"{error}. Name the file that `fognav map record` wrote") from error

@@ -96,6 +96,60 @@ def test_nodes_are_on_a_wall_and_their_limits_end_before_the_opposite_wall(seed:
             assert sonar.range_limit < echoes.min()
 
 
+def random_floor(seed: int) -> tuple[GridGeometry, NDArray[np.uint8]]:
+    """A building of 24 m x 18 m as a robot might map it: corridors, shut rooms, furniture, and what it never saw."""
+    dice = np.random.default_rng(seed)
+    resolution = float(dice.choice([0.05, 0.1]))
+    geometry = GridGeometry(
+        round(24 / resolution), round(18 / resolution), resolution, *dice.uniform(-9, 9, 2).tolist()
+    )
+    cells = np.full(geometry.shape, dice.choice([254, 255]), dtype=np.uint8)
+
+    def fill(x: float, y: float, width: float, height: float, value: int) -> None:
+        left, bottom, right, top = (round(side / resolution) for side in (x, y, x + width, y + height))
+        cells[max(bottom, 2) : min(top, geometry.height - 2), max(left, 2) : min(right, geometry.width - 2)] = value
+
+    for y in (1.0, dice.uniform(5, 9), dice.uniform(12, 15)):
+        fill(1.0, y, 22.0, dice.uniform(1.2, 2.6), 0)
+    for x in (1.0, dice.uniform(8, 14), 20.0):
+        fill(x, 1.0, dice.uniform(1.2, 2.6), 15.0, 0)
+    for value in (0, 0, 0, 254, 254, 254, 255):
+        fill(*dice.uniform(1, [22, 16]).tolist(), *dice.uniform(0.2, 1.5 + 1.5 * (value == 0), 2).tolist(), value)
+    return geometry, cells
+
+
+@pytest.mark.parametrize("seed", range(12))
+def test_nothing_proposed_on_a_random_floor_lies_in_a_wall(tmp_path: Path, seed: int) -> None:
+    geometry, cells = random_floor(seed)
+    save_map(tmp_path / "floor", StaticMap(geometry, cells))
+    new_site(tmp_path / "floor.yaml", tmp_path / "site", seed, whole_floor=True)
+    assert check_site(tmp_path / "site")["ok"] is True
+    site, floor = load_site(tmp_path / "site").site, Floor(geometry, np.where(cells == 0, cells, np.uint8(254)))
+    assert len(site.places) >= 3
+    for place in (*site.places.values(), *(robot.start for robot in site.robots)):
+        assert floor.nearest(place.x, place.y)[0] > 0.4
+    for node in site.nodes:
+        column, row = geometry.cell(node.x, node.y)
+        assert cells[row, column] == 0
+    for area in site.areas:
+        window, mask = rasterize(area.polygon, geometry)
+        assert (cells[window.rows, window.columns][mask] == 0).mean() > 0.8
+    assert set(states(site, cells, geometry)) <= {"clear"}
+
+
+def test_places_and_nodes_are_proposed_all_over_the_floor() -> None:
+    geometry, cells = ring_of_corridors()
+    little = propose("ring", "map.yaml", geometry, cells).site
+    site = propose("ring", "map.yaml", geometry, cells, whole_floor=True).site
+    assert len(site.places) > len(little.places) == 2
+    assert len(site.nodes) > len(little.nodes)
+    assert site.demo == little.demo
+    left, bottom, right, top = geometry.bounds
+    quarters = {(place.x > (left + right) / 2, place.y > (bottom + top) / 2) for place in site.places.values()}
+    assert len(quarters) == 4
+    assert len({area.number for area in site.areas}) == len(site.areas) == len(site.nodes)
+
+
 @pytest.mark.drive
 def test_map_without_a_second_path_gets_a_demo_without_areas() -> None:
     geometry = GridGeometry(600, 48, RESOLUTION, 0.0, 0.0)

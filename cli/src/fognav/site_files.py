@@ -4,10 +4,10 @@ import json
 import re
 import tomllib
 from pathlib import Path
-from typing import Final
+from typing import Any, Final
 
 from fog_contracts.site import AreaSite, DemoPlan, NodeSite, Place, RobotSite, Site
-from fog_runtime.configuration.maps import MapFileError, load_map, save_map
+from fog_runtime.configuration.maps import MapFileError, load_map, read_provenance, save_map
 from fog_runtime.configuration.site import SITE_FILE, LoadedSite, SiteError, load_site
 from fog_runtime.files import SHARED, atomic_write
 from fognav.output import FailedError, WrongUseError, writing
@@ -243,8 +243,11 @@ def _map_in(out: Path, map_file: Path) -> str:
     return _MAP
 
 
-def new_site(map_file: Path, out: Path, seed: int) -> dict[str, object]:
-    """Write `out`/site.toml for a map, and copy the map there; raises `WrongUseError`, and then writes nothing."""
+def new_site(map_file: Path, out: Path, seed: int, *, whole_floor: bool = False) -> dict[str, Any]:
+    """Write `out`/site.toml for a map, and copy the map there; raises `WrongUseError`, and then writes nothing.
+
+    `whole_floor`: see `site_proposal.propose`.
+    """
     # Checking a site must not wait for the kernels, which only a proposal needs.
     from fognav.site_proposal import NoSiteError, propose  # noqa: PLC0415  # see above
 
@@ -255,12 +258,13 @@ def new_site(map_file: Path, out: Path, seed: int) -> dict[str, object]:
     copied = None if (out / map_name).exists() else out / map_name
     try:
         static = load_map(map_file)
-        site, why = propose(identifier(out.resolve().name), map_name, static.geometry, static.cells, seed)
+        name = identifier(out.resolve().name)
+        site, why = propose(name, map_name, static.geometry, static.cells, seed, whole_floor=whole_floor)
     except (MapFileError, NoSiteError) as error:
         raise WrongUseError(str(error)) from error
     with writing(target, "Name another folder with --out"):
         if copied is not None:
-            save_map(copied.with_suffix(""), static)
+            save_map(copied.with_suffix(""), static, read_provenance(map_file))
         atomic_write(target, to_toml(site).encode(), mode=SHARED)
     try:
         load_site(out)
@@ -271,6 +275,7 @@ def new_site(map_file: Path, out: Path, seed: int) -> dict[str, object]:
         "file": str(target),
         "site": site.id,
         "areas": len(site.areas),
+        "nodes": len(site.nodes),
         "why_no_areas": why,
         "places": {name: [place.x, place.y] for name, place in site.places.items()},
     }

@@ -12,6 +12,7 @@ from itertools import pairwise
 from typing import Final, NamedTuple
 
 import numpy as np
+from msgspec import structs
 from numpy.typing import NDArray
 
 from fog_contracts.cones import SONAR_HALF_CONE
@@ -22,6 +23,7 @@ from fog_contracts.messages import AreaState, Pose
 from fog_contracts.shapes import rasterize
 from fog_contracts.site import AreaSite, DemoPlan, NodeSite, Place, RobotSite, Site, Sonar
 from fog_kernels.astar import Planner
+from fog_kernels.components import Components
 from fog_kernels.distance import squared_distance_capped
 from fog_kernels.inflation import inflate, inflation_table
 from fog_kernels.raycast import cast
@@ -52,6 +54,15 @@ _DRIVES: Final = 100
 _PAIRS: Final = 3000
 """How many pairs of ends are drawn for them: on a large or branched floor most have no path of a suitable length."""
 _HEADINGS: Final = 36
+_PLACES_APART_M: Final = 6.0
+_MOST_PLACES: Final = 8
+_MOST_AREAS: Final = 12
+_NEIGHBOURS: Final = 2
+"""From each place the ways to so many of its nearest ones are watched, ..."""
+_NODES_APART_M: Final = 10.0
+"""... by nodes that are so far apart."""
+_BLOCK_M: Final = 1.0
+"""A place is the widest spot in a square of this side."""
 _BARRIERS: Final = 8
 _UNSEEN: Final = "have walls from which a sonar opposite does not get a clear echo, or too near for one"
 
@@ -104,10 +115,19 @@ class _Drive:
     length: float
 
 
-def propose(name: str, map_path: str, geometry: GridGeometry, cells: NDArray[np.uint8], seed: int = 1) -> Proposal:
+def propose(  # a map, and what is wanted on it
+    name: str,
+    map_path: str,
+    geometry: GridGeometry,
+    cells: NDArray[np.uint8],
+    seed: int = 1,
+    *,
+    whole_floor: bool = False,
+) -> Proposal:
     """Return a site on the map (`cells`: 0 free, 254 occupied, 255 unknown); raises `NoSiteError`.
 
     With any one of the demo's areas blocked there is another path. A map without such areas gets a demo without areas.
+    `whole_floor`: with places all over the floor that the robot can reach, and areas on the ways to them, too.
     """
     floor = _floor(geometry, cells)
     best: _Drive | None = None
@@ -127,18 +147,74 @@ def propose(name: str, map_path: str, geometry: GridGeometry, cells: NDArray[np.
         "a": Place(x=best.start.x, y=best.start.y, label="A"),
         "b": Place(x=best.goal[0], y=best.goal[1], label="B"),
     }
-    areas = [area for area, _ in best.areas]
+    watched = list(best.areas)
+    if whole_floor:
+        further = _places(floor, [(place.x, place.y) for place in places.values()])
+        for letter, (x, y) in zip("cdefgh", further, strict=False):
+            places[letter] = Place(x=x, y=y, label=letter.upper())
+        watched = _on_the_ways(floor, watched, [(place.x, place.y) for place in places.values()], reasons)
+    areas = [area for area, _ in watched]
     site = Site(
         id=name,
         name=name,
         map=map_path,
         places=places,
         areas=areas,
-        nodes=[node for _, node in best.areas],
+        nodes=[node for _, node in watched],
         robots=[RobotSite(id="r1", start=best.start, radius=ROBOT_RADIUS)],
-        demo=DemoPlan(start="a", goal="b", areas=[area.id for area in areas]),
+        demo=DemoPlan(start="a", goal="b", areas=[area.id for area, _ in best.areas]),
     )
     return Proposal(site, "" if areas else _why(drives, reasons))
+
+
+def _places(floor: _Floor, known: list[Point]) -> list[Point]:
+    """Return more places, each the widest spot of its surroundings, and as far as can be from all others.
+
+    All can be reached from the known ones. Farthest point sampling (Gonzalez 1985).
+    """
+    geometry, side = floor.geometry, max(1, round(_BLOCK_M / floor.geometry.resolution))
+    components = Components(floor.cost)
+    home = components.of(*geometry.cell(*known[0]))
+    spots: list[Point] = []
+    for y in range(0, geometry.height, side):
+        for x in range(0, geometry.width, side):
+            block = floor.clearance[y : y + side, x : x + side]
+            row, column = divmod(int(np.argmax(block)), block.shape[1])
+            if block[row, column] >= PLACE_CLEARANCE_M and components.of(x + column, y + row) == home:
+                spots.append(geometry.centre(x + column, y + row))
+    found: list[Point] = []
+    while spots and len(known) + len(found) < _MOST_PLACES:
+        away = [min(math.dist(spot, other) for other in (*known, *found)) for spot in spots]
+        farthest = max(range(len(spots)), key=away.__getitem__)
+        if away[farthest] < _PLACES_APART_M:
+            break
+        found.append((round(spots[farthest][0], 3), round(spots[farthest][1], 3)))
+    return found
+
+
+def _on_the_ways(
+    floor: _Floor, watched: list[tuple[AreaSite, NodeSite]], places: list[Point], reasons: Counter[str]
+) -> list[tuple[AreaSite, NodeSite]]:
+    """Return the watched areas, and more on the paths from each place to its nearest ones, apart from all others."""
+    planner = Planner(floor.geometry.width, floor.geometry.height)
+    found = list(watched)
+    ways = {
+        tuple(sorted((place, other)))
+        for place in places
+        for other in sorted(places, key=lambda other, place=place: math.dist(place, other))[1 : 1 + _NEIGHBOURS]  # type: ignore[misc]  # mypy does not see that the lambda has a default
+    }
+    for ends in sorted(ways):
+        start, goal = (floor.geometry.cell(*end) for end in ends)
+        route = planner.plan(floor.cost, start, goal)
+        path = [(x, y) for x, y in floor.geometry.centres(route.cells).tolist()] if route.found else []
+        for area, node in _areas(floor, planner, path, _length(path), start, goal, reasons):
+            apart = min((math.dist((node.x, node.y), (other.x, other.y)) for _, other in found), default=math.inf)
+            if apart < _NODES_APART_M or len(found) == _MOST_AREAS:
+                continue
+            name = f"z{len(found) + 1}"
+            area = structs.replace(area, id=name, label=name.upper(), number=len(found) + 1)  # noqa: PLW2901  # same one
+            found.append((area, structs.replace(node, id=f"node-{len(found) + 1}", area=name)))
+    return found
 
 
 def _why(drives: int, reasons: Counter[str]) -> str:

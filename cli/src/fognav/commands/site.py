@@ -14,29 +14,57 @@ from fognav.output import NOT_TRUE, exit_codes, fail, print_json, print_line, pr
 site_app = typer.Typer(cls=installed.Commands, help="Create and check sites.", no_args_is_help=True)
 
 
+OutOption = Annotated[Path, typer.Option("--out", metavar="DIR", help="Folder to create, without a site in it.")]
+SeedOption = Annotated[int, typer.Option("--seed", metavar="N", min=0, help="Each seed proposes other places.")]
+
+
 @site_app.command(
     "new", epilog="Example: fognav site new --map floor.yaml --out sites/floor && fognav demo --site sites/floor"
 )
 def site_new(
     *,
     map_file: Annotated[Path, typer.Option("--map", metavar="MAP.yaml", help="map_server YAML; it is copied to DIR.")],
-    out: Annotated[Path, typer.Option("--out", metavar="DIR", help="Folder to create, without a site in it.")],
-    seed: Annotated[int, typer.Option("--seed", metavar="N", min=0, help="Each seed proposes other places.")] = 1,
+    out: OutOption,
+    seed: SeedOption = 1,
     json: JsonOption = False,
 ) -> None:
     """Propose a site on any map_server map, ready for a demo.
 
     This writes a commented DIR/site.toml with places, a robot and watched areas, as a starting point.
     """
+    _propose(map_file, out, seed, whole_floor=False, json=json)
+
+
+@site_app.command(
+    "from-map", epilog="Example: fognav site from-map floor.yaml --out sites/floor && fognav site coverage sites/floor"
+)
+def site_from_map(
+    map_file: Annotated[Path, typer.Argument(metavar="MAP.yaml", help="As fognav map from-log writes it.")],
+    *,
+    out: OutOption,
+    seed: SeedOption = 1,
+    json: JsonOption = False,
+) -> None:
+    """Make a site of a building's map, for a fog and for a demo.
+
+    It proposes places all over the floor that a robot can reach, and areas with their nodes where something in the way
+    leaves another way. Each node is sure, on this map, that its area is clear. The map is copied to DIR.
+    """
+    _propose(map_file, out, seed, whole_floor=True, json=json)
+
+
+def _propose(map_file: Path, out: Path, seed: int, *, whole_floor: bool, json: bool) -> None:
     with exit_codes():
         kernels.warm_cache(print_line)
-        made = site_files.new_site(map_file, out, seed)
+        made = site_files.new_site(map_file, out, seed, whole_floor=whole_floor)
     if json:
         print_json(made)
-    else:
-        print_line(f"wrote {made['file']}: {made['areas']} watched areas. Try it: fognav demo --site {out}")
-        if made["why_no_areas"]:
-            print_line(f"no watched areas, so that a demo shows no hazard: {made['why_no_areas']}")
+        return
+    places = ", ".join(f"{name} ({x:.2f}, {y:.2f})" for name, (x, y) in made["places"].items())
+    print_line(f"wrote {made['file']}: {made['areas']} watched areas. Try it: fognav demo --site {out}")
+    print_line(f"places: {places}")
+    if made["why_no_areas"]:
+        print_line(f"no watched areas, so that a demo shows no hazard: {made['why_no_areas']}")
 
 
 @site_app.command("check", epilog="Example: fognav site check sites/estig")

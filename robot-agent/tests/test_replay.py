@@ -19,13 +19,18 @@ from fog_contracts import channels as ch
 from fog_contracts.commands import sign
 from fog_contracts.messages import AreaHazard, HazardArea, PolygonShape, RobotCommand, Zone, ZoneSet
 from fog_contracts.replica import MapError
+from fog_contracts.site import MarkerSite
 from fog_runtime.record import Recorder, read_entries
 from robot_agent.agent.core import AgentCore
 from robot_agent.agent.hand_driving import HandBack, Steer, TakeOver
 from robot_agent.agent.recording import input_log as log
 from robot_agent.agent.recording.replay import ReplayError, main, replay
+from robot_agent.localization.markers import Sighting
 from robot_agent.localization.pose import AbsoluteObservation, Pose2
 from robot_agent.registry import profile
+
+MARKER = MarkerSite(id=7, x=3.5, y=4.4, theta=-math.pi / 2)
+SEEING = replace(AGENT, localization=replace(AGENT.localization, markers=(MARKER,)))
 
 
 def write(path, entries):
@@ -64,6 +69,8 @@ def drive_through_most_situations(world):
     world.agent.on_suspension(2.0)
     observation = AbsoluteObservation(Pose2(world.x, world.y, world.theta), np.diag([0.01, 0.01, 0.01]), world.now)
     assert world.agent.on_absolute_observation(observation)
+    seen = Pose2(MARKER.x, MARKER.y, MARKER.theta).relative_to(Pose2(world.x, world.y, world.theta))
+    world.agent.on_sighting(Sighting(MARKER.id, seen, np.diag([1e-4, 1e-4, 1e-4]), world.now), world.now)
     world.run(1.0)
     assert world.agent.pose_to_store(world.now) is not None
     world.heartbeats_on = False
@@ -113,7 +120,9 @@ def drive(tmp_path_factory):
     """A logged drive: where its log is, and the world at its end."""
     path = tmp_path_factory.mktemp("log") / "drive.mcap"
     entries = []
-    world = LittleWorld(seed=4, start_agent=lambda config, seed: log.LoggedAgent(config, seed, entries.append, profile))
+    world = LittleWorld(
+        seed=4, config=SEEING, start_agent=lambda config, seed: log.LoggedAgent(config, seed, entries.append, profile)
+    )
     drive_through_most_situations(world)
     plan_on_the_robot(world)
     drive_by_hand(world)
@@ -153,7 +162,7 @@ def test_replays_in_other_processes_with_other_hash_seeds_give_the_same_outputs(
 
 
 def test_logging_changes_no_decision(drive):
-    plain = LittleWorld(seed=4, start_agent=partial(AgentCore, find_profile=profile))
+    plain = LittleWorld(config=SEEING, seed=4, start_agent=partial(AgentCore, find_profile=profile))
     drive_through_most_situations(plain)
     plan_on_the_robot(plain)
     drive_by_hand(plain)

@@ -295,6 +295,7 @@ def check_site(folder: Path) -> dict[str, object]:
         "nodes": len(site.nodes),
         "places": len(site.places),
         "robots": len(site.robots),
+        "markers": len(site.markers),
         "demo": site.demo is not None,
         "unbounded_nodes": [node.id for node in site.nodes if any(each.range_max is None for each in node.sonars)],
     }

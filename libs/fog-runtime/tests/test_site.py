@@ -121,6 +121,34 @@ def test_invalid_site_is_refused_by_file_and_field_with_a_remedy(folder, old, ne
     assert remedy in text, text
 
 
+MARKER = "[[markers]]\nid = 7\nx = 1.0\ny = 1.93\ntheta = -1.5708\n"
+
+
+def test_marker_on_a_wall_that_looks_at_free_floor_is_part_of_the_site(folder):
+    (folder / "site.toml").write_text(SITE + MARKER)
+    (marker,) = load_site(folder).site.markers
+    assert (marker.id, marker.x, marker.y, marker.theta, marker.size) == (7, 1.0, 1.93, -1.5708, 0.16)
+
+
+@pytest.mark.parametrize(
+    ("markers", "field", "problem"),
+    [
+        (MARKER + MARKER, "markers.id", "7 is used twice"),
+        (MARKER.replace("-1.5708", "1.5708"), "markers[0] (7)", "looks at (1.00, 2.08), which is a wall or unknown"),
+        (MARKER.replace("1.93", "2.2"), "markers[0] (7)", "off the map"),
+        (MARKER.replace("x = 1.0", "x = 3.95"), "markers[0] (7)", "is a wall or unknown"),
+        (MARKER.replace("id = 7", "id = 587"), "markers[0].id", "586"),
+    ],
+    ids=["doubled id", "faces its wall", "off the map", "beside the floor", "no such pattern"],
+)
+def test_marker_that_no_camera_would_see_and_a_doubled_one_are_named(folder, markers, field, problem):
+    (folder / "site.toml").write_text(SITE + markers)
+    with pytest.raises(SiteError) as error:
+        load_site(folder)
+    assert error.value.field == field
+    assert problem in str(error.value)
+
+
 def test_area_that_is_the_cone_of_a_node_has_the_place_that_the_node_sees(folder):
     text = SITE.replace(POLYGON, 'cone_of = "n1"').replace("y = 1.95", "y = 1.85")
     (folder / "site.toml").write_text(text)

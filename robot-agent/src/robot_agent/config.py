@@ -14,11 +14,14 @@ from fog_contracts.channels import MAP_HEARTBEAT, ROBOT_RELEASE
 from fog_contracts.costs import DEFAULT_INFLATION, DEGRADED_SPEED, ROBOT_RADIUS, Inflation
 from fog_contracts.messages import Pose  # noqa: TC001  # read at run time, when a configuration is decoded
 from fog_contracts.robot import MotionSettings
+from fog_contracts.site import MarkerSite  # noqa: TC001  # read at run time, when a configuration is decoded
 from fog_kernels.dwa import DwaLimits, DwaSettings
 from robot_agent.footprint import BLIND_SHARE, TRAVEL_HALF_RAD, Footprint
 from robot_agent.hardware import DriveTrain  # noqa: TC001  # read at run time, when a configuration is decoded
 
 if TYPE_CHECKING:
+    from collections.abc import Sequence
+
     from fog_contracts.robot import RobotSettings
     from fog_contracts.site import RobotSite
     from robot_agent.hardware import LidarTraits
@@ -160,6 +163,8 @@ class LocalizationConfig:
     lidar_x: float = 0.0
     lidar_y: float = 0.0
     lidar_yaw: float = 0.0
+    markers: tuple[MarkerSite, ...] = ()
+    """The markers of the site; without any, sightings change nothing."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -239,6 +244,7 @@ def agent_config(  # noqa: PLR0913  # what the process knows about its robot
     footprint: Footprint | None = None,
     settings: RobotSettings | None = None,
     finds_dock: bool = False,
+    markers: Sequence[MarkerSite] = (),
 ) -> AgentConfig:
     """Return the configuration of a robot with this id, base and lidar, and the radius and height that its site gives.
 
@@ -247,6 +253,7 @@ def agent_config(  # noqa: PLR0913  # what the process knows about its robot
     footprint: outline of the body; None for the circle of the site's radius.
     settings: the robot's own settings; None for the defaults.
     finds_dock: whether the base drives into its dock by itself.
+    markers: those of the site, by which a robot with a camera knows its place.
     """
     limits = DwaLimits(axle=drive_train.axle_m, wheel_max=min(_WHEEL_SPEED_MAX, drive_train.wheel_speed_max_m_s))
     scan_lost = max(SafetyConfig().scan_lost, _LOST_AFTER_REVOLUTIONS * lidar.scan_period_s)
@@ -256,7 +263,9 @@ def agent_config(  # noqa: PLR0913  # what the process knows about its robot
         boot=boot,
         drive_train=drive_train,
         motion=MotionConfig(limits=limits),
-        localization=LocalizationConfig(range_min=lidar.range_min_m, range_max=lidar.range_max_m),
+        localization=LocalizationConfig(
+            range_min=lidar.range_min_m, range_max=lidar.range_max_m, markers=tuple(markers)
+        ),
         safety=SafetyConfig(scan_lost=scan_lost),
         stop_field=StopFieldConfig(memory=max(StopFieldConfig().memory, _REMEMBERED_REVOLUTIONS * lidar.scan_period_s)),
     )

@@ -79,7 +79,8 @@ def site_check(
     if json:
         print_json(found)
     elif found["ok"]:
-        print_line(f"{folder}: ok ({found['areas']} areas, {found['nodes']} nodes, {found['places']} places)")
+        counts = ", ".join(f"{found[each]} {each}" for each in ("areas", "nodes", "places", "markers"))
+        print_line(f"{folder}: ok ({counts})")
         if found["unbounded_nodes"]:
             print_line(
                 f"nodes with a sonar without range_max: {found['unbounded_nodes']}. To it an echo from behind the wall "

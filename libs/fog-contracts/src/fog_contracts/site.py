@@ -1,4 +1,4 @@
-"""A site as `site.toml` describes it: map, places, areas, nodes and robots; lengths in m, angles in rad."""
+"""A site as `site.toml` describes it: map, places, areas, nodes, robots and markers; lengths in m, angles in rad."""
 
 import math
 from collections.abc import Mapping
@@ -165,6 +165,20 @@ class RobotSite(Message, frozen=True, kw_only=True):
         return Pose(x=x - STAGING_M * math.cos(theta), y=y - STAGING_M * math.sin(theta), theta=theta)
 
 
+class MarkerSite(Message, frozen=True, kw_only=True):
+    """A marker on a wall, by whose picture a robot with a camera knows where it is: an AprilTag of the family 36h11.
+
+    id: what its pattern encodes. x, y: its centre on the wall's face; theta: where its face looks, away from the wall.
+    size: the side of its black square.
+    """
+
+    id: Annotated[int, Meta(ge=0, le=586)]
+    x: Metres
+    y: Metres
+    theta: Radians
+    size: Annotated[float, Meta(ge=0.02, le=1.0)] = 0.16
+
+
 class DemoPlan(Message, frozen=True, kw_only=True):
     """The drive that the demo shows here: from one place to another, and the areas that may become blocked."""
 
@@ -188,6 +202,7 @@ class Site(Message, frozen=True, kw_only=True):
     nodes: list[NodeSite] = field(default_factory=list)
     sources: list[SourceSite] = field(default_factory=list)
     robots: list[RobotSite] = field(default_factory=list)
+    markers: list[MarkerSite] = field(default_factory=list)
     layers: list[str | dict[str, Any]] = field(default_factory=list)
     demo: DemoPlan | None = None
 

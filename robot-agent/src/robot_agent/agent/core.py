@@ -66,6 +66,7 @@ if TYPE_CHECKING:
     from robot_agent.config import AgentConfig
     from robot_agent.guardian.link import BaseFeedback, WheelCommand
     from robot_agent.hardware import LaserScan, LidarSamples
+    from robot_agent.localization.markers import Sighting
     from robot_agent.localization.pose import AbsoluteObservation, SavedPose
     from robot_agent.motion.local_planner import Decision, Job
     from robot_agent.profiles import FindProfile, Found, Profile, Search
@@ -152,6 +153,8 @@ class AgentCore:
         self._base.on_feedback(feedback, now)
         if slept and not self._base.asleep:
             self._localizer.on_unmeasured_motion(*POSSIBLE_WHILE_SUSPENDED, "the base was asleep")
+        if feedback.status.wheel_drop:
+            self._localizer.markers.forget_support()  # somebody may carry it to a place that looks alike
         self._pose_persistence.on_base(feedback)
         motion = self._odometry.update(feedback.odometry, now)
         if isinstance(motion, EncoderFault):
@@ -171,6 +174,10 @@ class AgentCore:
     def on_absolute_observation(self, observation: AbsoluteObservation) -> bool:
         """Handle a pose that was measured without the lidar (dock, marker); False when it is too old to be used."""
         return self._localizer.on_absolute_observation(observation)
+
+    def on_sighting(self, sighting: Sighting, now: float) -> None:
+        """Handle a marker that the camera has seen; `now` is when it is known."""
+        self._localizer.on_sighting(sighting, now)
 
     def on_base_lost(self, now: float, reason: str) -> None:
         """Record that the link to the guardian broke."""
@@ -383,7 +390,10 @@ class AgentCore:
             mission,
             self.replica.version,
             self._base.feedback,
-            hindrances=hindrances(driven, self._driving.wheels.decision, self._guard.reason),
+            hindrances=[
+                *hindrances(driven, self._driving.wheels.decision, self._guard.reason),
+                *self._localizer.markers.problems.values(),
+            ],
             battery_low=self._config.battery_low,
             traces=self._driving.traces.recent,
             loop=self._loop_health,

@@ -11,6 +11,7 @@ read in one class.
 from __future__ import annotations
 
 import math
+from functools import partial
 from typing import TYPE_CHECKING, Final
 
 import numpy as np
@@ -27,6 +28,7 @@ from robot_agent.localization.fit import (
 )
 from robot_agent.localization.hypotheses import History, apart
 from robot_agent.localization.map_fields import MapFields, map_fields
+from robot_agent.localization.markers import Found, Fused, Markers, Place, place_by_scan
 from robot_agent.localization.odometry import OdometryBuffer
 from robot_agent.localization.particle_filter import ParticleFilter
 from robot_agent.localization.pose import Pose2, SavedPose, wrap
@@ -41,6 +43,7 @@ if TYPE_CHECKING:
     from fog_kernels.scans import Track
     from robot_agent.hardware import LaserScan
     from robot_agent.localization.hypotheses import Hypothesis
+    from robot_agent.localization.markers import Sighting
     from robot_agent.localization.pose import AbsoluteObservation, Uncertainty
     from robot_agent.localization.relocalization import Outcome
     from robot_agent.safety.conditions import Localization
@@ -75,6 +78,8 @@ class Localizer:
         self._monitor = FitMonitor()
         self._fields: MapFields | None = None
         self._relocalization = Relocalization(self._config)
+        self.markers = Markers(self._config.markers)
+        """What the markers on the walls have said."""
         self._local_scans = 0
         """Scans since a lost robot was looked for near its last pose; 0 while it is not lost."""
         self._doubt = Doubt()
@@ -115,6 +120,7 @@ class Localizer:
         odom = self._odometry.latest()
         if odom is not None and self._filter.has_pose:
             self._filter.widen(odom, distance, angle)
+            self.markers.forget_support()
             self._history.come(distance)
             self._scale.forget_anchor()
             self._history.tracked = False
@@ -137,6 +143,31 @@ class Localizer:
             self._history.tracked = False
             self._history.near = None
         return True
+
+    def on_sighting(self, sighting: Sighting, now: float) -> None:
+        """Weigh what a marker says of the pose; one from before the odometry, or that no scan can check, is dropped."""
+        scan, fields = self.scan, self._fields
+        odom = self._odometry.pose(sighting.stamp)
+        if scan is None or fields is None or odom is None or not self._odometry.reaches_back_to(sighting.stamp):
+            return
+        pose, good = self._filter.pose(odom), self.status == "good"
+        known = None if pose is None or self.status not in {"good", "weak"} else Place(pose, self._filter.covariance)
+        step, reach = scan.odom.relative_to(odom), self._config.range_max
+        confirmed = partial(place_by_scan, step=step, scan=scan, fields=fields, range_max=reach)
+        word = self.markers.weigh(sighting, odom, known, confirmed, good=good)
+        if isinstance(word, Fused):
+            if word.place is not None:
+                self._scale.forget_anchor()
+                self._filter.observe(*word.place, odom)
+            self._doubt.verify()
+        elif isinstance(word, Found):
+            self._relocalization.cancel()
+            if known is not None:
+                self._monitor.lose("a marker shows that the robot is elsewhere: it was carried, or its pose was wrong")
+                self._monitor.restart()
+            else:
+                self._monitor.begin("a marker shows where the robot is: the next scans have to prove it")
+            self._start_at_found(word.pose, scan.odom, now, word.sigmas)
 
     def on_scan(self, scan: LaserScan, now: float) -> None:
         """Process a whole scan: correct the pose when the robot has moved, and evaluate the fit."""
@@ -276,6 +307,7 @@ class Localizer:
 
     def _start(self, pose: Pose2, sigma_xy: float, sigma_theta: float) -> None:
         self._relocalization.cancel()
+        self.markers.forget_support()
         self._local_scans = 0
         self._history.restart()
         self._doubt.restart()
@@ -320,6 +352,7 @@ class Localizer:
         self._local_scans += 1
         if self._local_scans == 1:
             self._filter.widen(scan.odom, *_LOCAL_SIGMAS)
+            self.markers.forget_support()
             self._scale.forget_anchor()
             self._monitor.restart()
             self._doubt.begin(scan.odom)
@@ -363,7 +396,7 @@ class Localizer:
             self._monitor.restart()
         else:
             self._monitor.begin_found()
-        self._start_at_found(outcome.pose, outcome.odom, scan, fields, now)
+        self._start_at_found(outcome.pose, outcome.odom, now)
 
     def _keeps(self, pose: Pose2, outcome: Outcome, now: float, *, fits_again: bool) -> bool:
         """Whether the pose is not given up for the place that was found."""
@@ -387,12 +420,18 @@ class Localizer:
             return True
         return False
 
-    def _start_at_found(self, pose: Pose2, odom: Pose2, scan: DeskewedScan, fields: MapFields, now: float) -> None:
+    def _start_at_found(
+        self, pose: Pose2, odom: Pose2, now: float, sigmas: tuple[float, float] = _FOUND_SIGMAS
+    ) -> None:
+        scan, fields = self.scan, self._fields
+        assert scan is not None
+        assert fields is not None
         self._doubt.restart()
+        self.markers.forget_support()
         self._local_scans = 1
         self._history.restart_at_found()
         self._scale.forget_anchor()
-        self._filter.start(pose, odom, *_FOUND_SIGMAS)
+        self._filter.start(pose, odom, *sigmas)
         self._filter.add(scan, fields)
         self._evaluate(scan, fields, now)
 

@@ -255,6 +255,7 @@ class ReasonCode(StrEnum):
     POSITION_WIDE = "position_wide"
     MAY_BE_BLOCKED = "may_be_blocked"
     IN_BLOCKED = "in_blocked"
+    MARKER_MISPLACED = "marker_misplaced"
     # map
     MAP_MISSING = "map_missing"
     MAP_LATE = "map_late"

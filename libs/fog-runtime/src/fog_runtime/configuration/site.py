@@ -1,5 +1,6 @@
 """Loading of a site's folder: `site.toml` and its map, validated as a whole."""
 
+import math
 import re
 import tomllib
 from collections.abc import Iterable
@@ -15,7 +16,7 @@ from fog_contracts.costs import is_traversable
 from fog_contracts.geometry import GeometryError, normalized_polygon
 from fog_contracts.grid import StaticMap
 from fog_contracts.messages import AREAS_MAX
-from fog_contracts.site import AreaSite, NodeSite, Place, Site
+from fog_contracts.site import AreaSite, MarkerSite, NodeSite, Place, Site
 from fog_runtime.configuration.maps import MapFileError, load_map
 
 SITE_FILE: Final = "site.toml"
@@ -23,6 +24,8 @@ _MEANING: Final = {"radius": ", how far (m) the robot's body reaches from the po
 """Of fields that files of an earlier version need not have."""
 _BORDER: Final = 1e-6
 """Metres by which a vertex may lie off the map: the rounding error of a polygon drawn along the map's edge."""
+_BEFORE_MARKER_M: Final = (0.15, 0.3)
+"""So far in front of a marker the floor is free. It hangs on the face of a wall, whose cells may reach past it."""
 
 
 class SiteError(ValueError):
@@ -51,7 +54,7 @@ def load_site(directory: Path, text: str | None = None) -> LoadedSite:
     """Read and validate a site's folder, or what it would be with this `text` in its file; raises `SiteError`.
 
     Ids are unique and every referenced id exists; areas are simple polygons on the map (counter-clockwise in the
-    result), nodes lie on the map, places and start poses on free cells.
+    result), nodes lie on the map, places and start poses on free cells. Markers look at free floor.
     """
     file = directory / SITE_FILE
     site = _read(file, text)
@@ -67,6 +70,8 @@ def load_site(directory: Path, text: str | None = None) -> LoadedSite:
         _check_free(file, f"places.{name}", place.x, place.y, static)
     for index, robot in enumerate(site.robots):
         _check_free(file, f"robots[{index}].start ({robot.id})", robot.start.x, robot.start.y, static)
+    for index, marker in enumerate(site.markers):
+        _check_seen(file, f"markers[{index}] ({marker.id})", marker, static)
     return LoadedSite(msgspec.structs.replace(site, areas=areas), static, directory)
 
 
@@ -140,6 +145,7 @@ def _check_ids(file: Path, site: Site) -> None:
     _check_unique(file, "areas.number", (area.number for area in site.areas if area.number is not None))
     _check_unique(file, "nodes.id", (node.id for node in site.nodes))
     _check_unique(file, "robots.id", (robot.id for robot in site.robots))
+    _check_unique(file, "markers.id", (marker.id for marker in site.markers))
     for kind, ids in (("nodes", (node.id for node in site.nodes)), ("robots", (robot.id for robot in site.robots))):
         for index, name in enumerate(ids):
             if name in ROLES:
@@ -202,8 +208,22 @@ def _check_on_map(file: Path, field: str, x: float, y: float, static: StaticMap)
 
 def _check_free(file: Path, field: str, x: float, y: float, static: StaticMap) -> None:
     _check_on_map(file, field, x, y, static)
-    column, row = static.geometry.cell(x, y)
-    free = static.geometry.contains_cell(column, row) and is_traversable(int(static.cells[row, column]))
-    if not free:
+    if not _is_free(x, y, static):
         problem = f"({x:g}, {y:g}) lies on a cell of the map that is occupied or unknown"
         raise SiteError(file, field, problem, "Move it to a free cell")
+
+
+def _is_free(x: float, y: float, static: StaticMap) -> bool:
+    column, row = static.geometry.cell(x, y)
+    return static.geometry.contains_cell(column, row) and is_traversable(int(static.cells[row, column]))
+
+
+def _check_seen(file: Path, field: str, marker: MarkerSite, static: StaticMap) -> None:
+    """Raise `SiteError` for a marker off the map, in a wall, or that looks into one: no camera ever sees it."""
+    _check_on_map(file, field, marker.x, marker.y, static)
+    for ahead in _BEFORE_MARKER_M:
+        x, y = marker.x + ahead * math.cos(marker.theta), marker.y + ahead * math.sin(marker.theta)
+        if not _is_free(x, y, static):
+            problem = f"({marker.x:g}, {marker.y:g}) looks at ({x:.2f}, {y:.2f}), which is a wall or unknown"
+            remedy = "Put it on the face of its wall; `theta` points away from the wall, to those who see the marker"
+            raise SiteError(file, field, problem, remedy)

@@ -29,6 +29,7 @@ from robot_agent.agent.navigation import PreparedMap
 from robot_agent.config import AgentConfig
 from robot_agent.guardian.link import BaseFeedback, WheelCommand
 from robot_agent.hardware import LaserScan, LidarSamples
+from robot_agent.localization.markers import Sighting
 from robot_agent.localization.pose import AbsoluteObservation, Pose2, SavedPose
 from robot_agent.motion.local_planner import Decision
 from robot_agent.profiles import fog_only
@@ -129,6 +130,23 @@ class PoseObserved(Input, frozen=True, kw_only=True):
     def observation(self) -> AbsoluteObservation:
         """Return the observation."""
         return AbsoluteObservation(Pose2(*self.pose), np.array(self.covariance).reshape(3, 3), self.observed_at)
+
+
+class MarkerSighted(Input, frozen=True, kw_only=True):
+    """A marker in a picture of the camera: its pose in frame `base` with its covariance by rows, and when it was seen.
+
+    `now`: when the agent learned of it.
+    """
+
+    marker: int
+    pose: tuple[float, float, float]
+    covariance: tuple[float, ...]
+    seen_at: float
+    now: float
+
+    def sighting(self) -> Sighting:
+        """Return the sighting."""
+        return Sighting(self.marker, Pose2(*self.pose), np.array(self.covariance).reshape(3, 3), self.seen_at)
 
 
 class HandReceived(Input, frozen=True, kw_only=True):
@@ -304,9 +322,9 @@ class EntriesLost(Entry, frozen=True, kw_only=True):
 
 _KINDS: Final[tuple[type[Entry], ...]] = (
     Started, PoseRestored, SnapshotLoaded, MessageReceived, QueryReceived, BaseReceived, BaseLost, SuspensionNoticed,
-    PoseObserved, HandReceived, LidarSamplesReceived, ScanReceived, LoopHealthReceived, SearchCycle, SearchEnded,
-    ControlCycle, DecisionMade, StreamCycle, Tick, StorageCheck, EgressAsked, EgressReplied, WheelsCommanded, Published,
-    Answered, PoseStored, EntriesLost,
+    PoseObserved, MarkerSighted, HandReceived, LidarSamplesReceived, ScanReceived, LoopHealthReceived, SearchCycle,
+    SearchEnded, ControlCycle, DecisionMade, StreamCycle, Tick, StorageCheck, EgressAsked, EgressReplied,
+    WheelsCommanded, Published, Answered, PoseStored, EntriesLost,
 )  # fmt: skip
 ENTRY_OF_TOPIC: Final[Mapping[str, type[Entry]]] = {f"agent/{kind.__name__}": kind for kind in _KINDS}
 TOPIC_OF_ENTRY: Final[Mapping[type[Entry], str]] = {kind: topic for topic, kind in ENTRY_OF_TOPIC.items()}
@@ -386,6 +404,16 @@ class LoggedAgent(AgentCore):
         covariance = tuple(float(value) for value in observation.covariance.ravel())
         self._write(PoseObserved(pose=pose, covariance=covariance, observed_at=observation.stamp))
         return super().on_absolute_observation(observation)
+
+    def on_sighting(self, sighting: Sighting, now: float) -> None:
+        """Log the sighting and handle it."""
+        covariance = tuple(float(value) for value in sighting.covariance.ravel())
+        self._write(
+            MarkerSighted(
+                marker=sighting.marker, pose=sighting.pose, covariance=covariance, seen_at=sighting.stamp, now=now
+            )
+        )
+        super().on_sighting(sighting, now)
 
     def on_hand(self, request: HandRequest, now: float) -> HandReply | None:
         """Log the word of an operator at the robot, and the reply, and handle it."""

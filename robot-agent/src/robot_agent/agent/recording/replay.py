@@ -130,6 +130,7 @@ _PASSED_ON: Final[Mapping[type[log.Entry], Callable[[AgentCore, Any], object]]] 
     log.ScanReceived: lambda agent, entry: agent.on_scan(entry.scan(), entry.now),
     log.SuspensionNoticed: lambda agent, entry: agent.on_suspension(entry.seconds),
     log.PoseObserved: lambda agent, entry: agent.on_absolute_observation(entry.observation()),
+    log.MarkerSighted: lambda agent, entry: agent.on_sighting(entry.sighting(), entry.now),
     log.EgressAsked: lambda agent, entry: agent.egress_request(entry.now),
     log.EgressReplied: lambda agent, entry: agent.on_egress_reply(entry.request, entry.reply, entry.now),
     log.LoopHealthReceived: lambda agent, entry: agent.on_loop_health(entry.health),

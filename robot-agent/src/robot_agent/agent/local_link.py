@@ -35,7 +35,28 @@ class Missed(Struct, frozen=True, kw_only=True):
     count: Count
 
 
-_OTHERS: Final[dict[str, type[Struct]]] = {"local/reply": HandReply, "local/missed": Missed}
+class Equipment(Struct, frozen=True, kw_only=True):
+    """What the agent runs with, as far as no measurement tells it: said at once, and once a second.
+
+    `version`: of its code. `processes`: ids of the robot's processes, by name. `base`, `lidar`: why nothing is heard of
+    it; empty while something is. `damaged`: frames of each device so far that came damaged. `mirrored`, `masks`: how
+    the lidar is mounted by the settings that this agent has read (`fog_contracts.robot.LidarSettings`).
+    """
+
+    version: str
+    processes: dict[str, int] = {}
+    base: str = ""
+    lidar: str = ""
+    damaged: dict[str, int] = {}
+    mirrored: bool = False
+    masks: list[tuple[float, float]] = []
+
+
+_OTHERS: Final[dict[str, type[Struct]]] = {
+    "local/reply": HandReply,
+    "local/missed": Missed,
+    "local/equipment": Equipment,
+}
 _TOPICS: Final[dict[type, str]] = {kind: topic for topic, kind in _OTHERS.items()} | dict(TOPIC_OF_ENTRY)
 _KINDS: Final[dict[str, type[Struct]]] = _OTHERS | dict(ENTRY_OF_TOPIC)
 _envelope = msgspec.msgpack.Decoder(tuple[str, msgspec.Raw])
@@ -43,12 +64,12 @@ _requests: msgspec.msgpack.Decoder[HandRequest] = msgspec.msgpack.Decoder(HandRe
 encode_request = msgspec.msgpack.Encoder().encode
 
 
-def encode(what: Entry | HandReply | Missed) -> bytes:
+def encode(what: Entry | HandReply | Missed | Equipment) -> bytes:
     """Return the packet of an entry or a reply."""
     return msgspec.msgpack.encode((_TOPICS[type(what)], what))
 
 
-def decode(packet: bytes) -> Any:  # noqa: ANN401  # an `Entry`, a `HandReply` or `Missed`
+def decode(packet: bytes) -> Any:  # noqa: ANN401  # an `Entry`, or one of the above
     """Return what a packet holds; None for a kind that this version does not know. Raises `msgspec.DecodeError`."""
     topic, data = _envelope.decode(packet)
     kind = _KINDS.get(topic)

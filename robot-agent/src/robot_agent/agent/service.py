@@ -25,11 +25,12 @@ from fog_runtime.machine import ServiceManager, SuspensionMonitor, run_in_real_t
 from fog_runtime.process import release_startup_memory
 from fog_runtime.transports.edges import Edges
 from fog_runtime.transports.zenoh_edge import ZenohEdge, use_one_thread
+from fog_runtime.version import VERSION
 from robot_agent import registry
 from robot_agent.agent.edges.exporter import Observed, RobotCollector, name_thread, parent
 from robot_agent.agent.edges.local_tools import LocalTools
 from robot_agent.agent.edges.map_loader import MapLoader, Store
-from robot_agent.agent.local_link import socket_beside
+from robot_agent.agent.local_link import Equipment, socket_beside
 from robot_agent.agent.recording.input_log import LOG_KEY, BaseReceived, Published, ScanReceived, Started
 from robot_agent.agent.recording.input_writer import open_core
 from robot_agent.agent.settings import remarks
@@ -43,6 +44,7 @@ if TYPE_CHECKING:
 
     from fog_contracts.handlers import Ids, Later, Moment, Publication, QueryHandler
     from fog_contracts.messages import EgressRequest, Message
+    from fog_contracts.robot import LidarSettings
     from fog_runtime.clock import Clock, SystemClock
     from fog_runtime.configuration.robot_file import RobotFile
     from robot_agent.agent.core import AgentCore
@@ -189,6 +191,14 @@ class Service:
             uncertainty=None if localizer.pose(now) is None else localizer.uncertainty,
             corrupted={**self._corrupted, "lidar": lidar.corrupted},
         )
+
+    def equipment(self, lidar: LidarEdge, mounted: LidarSettings) -> Equipment:
+        """Return what tools on this computer are told beside what the robot measures."""
+        return Equipment(
+            version=VERSION, processes=dict(self.collector.pids), lidar=str(lidar.problem), masks=mounted.masks,
+            base="" if self._clock.now() - self._last_feedback_at < HOUSEKEEPING_S else self._base_reason,
+            damaged={**self._corrupted, "lidar": lidar.corrupted}, mirrored=mounted.mirrored,
+        )  # fmt: skip
 
     # --- Base and lidar ---------------------------------------------------------------------------------------------
 
@@ -410,7 +420,8 @@ async def run(settings: Settings, robot: RobotFile, given: Given, clock: SystemC
             guardian.begin(agent.on_feedback, agent.on_base_lost)
             lidar.on_samples = core.on_lidar_samples
             started = Started(config=replace(config, operator_key=LOG_KEY), seed=settings.seed)
-            agent.tools = LocalTools(socket_beside(settings.guardian_socket), started, core, clock)
+            equipment = partial(agent.equipment, lidar, robot.settings.lidar)
+            agent.tools = LocalTools(socket_beside(settings.guardian_socket), started, equipment, core, clock)
             agent.subscribe()
             REGISTRY.register(agent.collector)
             zenoh.declare_liveliness("robot-agent", settings.robot)

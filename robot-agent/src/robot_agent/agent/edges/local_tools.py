@@ -19,11 +19,13 @@ from robot_agent.agent.hand_driving import HandBack, HandReply, Steer, TakeOver,
 from robot_agent.agent.local_link import REQUEST_LIMIT, Missed, decode_request, encode
 
 if TYPE_CHECKING:
+    from collections.abc import Callable
     from pathlib import Path
 
     from fog_runtime.clock import Clock
     from robot_agent.agent.core import AgentCore
     from robot_agent.agent.hand_driving import HandRequest
+    from robot_agent.agent.local_link import Equipment
     from robot_agent.agent.recording.input_log import Entry, Started
 
 CLIENTS_MAX: Final = 8
@@ -64,10 +66,13 @@ class _Client:
 class LocalTools:
     """Serves the socket until cancelled; all of it on the loop's thread."""
 
-    def __init__(self, path: Path, started: Started, core: AgentCore, clock: Clock) -> None:
-        """Prepare; each client gets `started` first, and the core what one says."""
+    def __init__(
+        self, path: Path, started: Started, equipment: Callable[[], Equipment], core: AgentCore, clock: Clock
+    ) -> None:
+        """Prepare; each client gets `started` first, then `equipment`, and the core what one says."""
         self._path = path
         self._started = started
+        self._equipment = equipment
         self._core = core
         self._clock = clock
         self._clients: dict[int, _Client] = {}
@@ -78,7 +83,7 @@ class LocalTools:
         """Whether somebody is connected: only then `publish` has to be called."""
         return bool(self._clients)
 
-    def publish(self, entry: Entry) -> None:
+    def publish(self, entry: Entry | Equipment) -> None:
         """Send an entry to whoever is connected; never blocks."""
         if self._clients:
             packet = encode(entry)
@@ -98,6 +103,7 @@ class LocalTools:
             while True:
                 if self._clients:
                     self._on_request(Watch())
+                    self.publish(self._equipment())
                 await asyncio.sleep(_WATCH_S)
         finally:
             loop.remove_reader(listener)
@@ -122,6 +128,7 @@ class LocalTools:
         asyncio.get_running_loop().add_reader(link, self._read, client)
         self._on_request(Watch())
         self._send(client, encode(self._started))
+        self._send(client, encode(self._equipment()))
 
     def _read(self, client: _Client) -> None:
         try:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import datetime as dt
 import hashlib
 import math
 import os
@@ -12,13 +11,11 @@ from typing import TYPE_CHECKING, Any, Final
 
 import msgspec
 import numpy as np
-import tomlkit
-from tomlkit.exceptions import TOMLKitError
 
-from fog_runtime.configuration.robot_file import ROBOT_FILE, load_robot, parse_robot
-from fog_runtime.files import SHARED, atomic_write
+from fog_runtime.configuration.robot_file import ROBOT_FILE, load_robot
 from fog_runtime.record import Recorder, RecordError, read_entries
-from fognav.output import FailedError, WrongUseError, print_line, writing
+from fognav.output import FailedError, WrongUseError, print_line
+from fognav.robot_page import settings_file
 from fognav.robot_page.recording_view import until_told
 from fognav.robot_page.view import LocalRobotErrors
 from robot_agent import registry
@@ -129,30 +126,8 @@ def refuse_disagreement(found: Calibration, log: Path) -> dict[str, float]:
 
 
 def write(robot_file: Path, changed: list[Changed], source: str) -> None:
-    """Write new values into a robot's file, the old ones beside them as comments; raises `WrongUseError`.
-
-    A file that `robot check` would refuse is not written.
-    """
-    try:
-        text = robot_file.read_text("utf-8")
-        document = tomlkit.parse(text)
-    except (OSError, UnicodeDecodeError, TOMLKitError) as error:
-        raise WrongUseError(f"{robot_file}: {error}. Name the robot's settings file") from error
-    today = dt.datetime.now(tz=dt.UTC).date().isoformat()
-    for change in changed:
-        *tables, key = change.setting.split(".")
-        table: Any = document
-        for name in tables:
-            if name not in table:
-                table[name] = tomlkit.table()
-            table = table[name]
-        before = table[key].as_string() if key in table and hasattr(table[key], "as_string") else change.before
-        table[key] = change.now
-        table[key].comment(f"calibrated {today} ({source}), before: {str(before).lower()}")
-    changed_text = tomlkit.dumps(document)
-    parse_robot(changed_text, robot_file, {})
-    with writing(robot_file, "Name another file"):
-        atomic_write(robot_file, changed_text.encode(), mode=SHARED)
+    """Write new values into a robot's file, the old ones beside them as comments; raises `WrongUseError`."""
+    settings_file.write(robot_file, [(c.setting, c.before, c.now) for c in changed], "calibrated", source)
 
 
 def hash_of(log: Path) -> str:

@@ -69,6 +69,7 @@ def _warm_kernels(monkeypatch: pytest.MonkeyPatch) -> None:
                 "cancel",
                 "status",
                 "watch",
+                "bringup",
             )
         ),
     ],

@@ -18,7 +18,7 @@ from fognav.commands.map_files import map_check, map_convert, map_info
 from fognav.commands.node import node_app
 from fognav.commands.robot import robot_app
 from fognav.commands.robot_file import robot_add, robot_check, robot_new
-from fognav.commands.robot_tools import calibrate_command, map_record, teleop_command
+from fognav.commands.robot_tools import calibrate_command, map_record, robot_bringup, teleop_command
 from fognav.commands.site import site_app
 from fognav.commands.source import source_app
 from fognav.commands.status import status_command
@@ -97,6 +97,7 @@ robot_app.command("add", epilog="Example: fognav robot add r2 --credentials DIR"
 robot_app.command("new", epilog="Example: fognav robot new --base roomba600 --lidar rplidar-a1 --out robot.toml")(
     robot_new
 )
+robot_app.command("bringup", epilog="Example: fognav robot bringup --page --robot-file robot.toml")(robot_bringup)
 robot_app.command("check", epilog="Example: fognav robot check robot.toml")(robot_check)
 
 

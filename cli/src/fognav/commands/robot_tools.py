@@ -1,4 +1,4 @@
-"""`fognav teleop`, `calibrate` and `map record`: tools that speak to the agent of the robot that they run on."""
+"""`fognav robot bringup`, `teleop`, `calibrate` and `map record`: tools that speak to the agent on their computer."""
 
 from __future__ import annotations
 
@@ -13,10 +13,27 @@ from typing import Annotated, Any, Final
 import typer
 
 from fognav.operate.options import JsonOption  # noqa: TC001  # Typer reads annotations at run time
-from fognav.output import FailedError, WrongUseError, exit_codes, print_answer, print_json, print_line
+from fognav.output import (
+    NOT_TRUE,
+    FailedError,
+    WrongUseError,
+    answers,
+    exit_codes,
+    print_answer,
+    print_json,
+    print_line,
+)
 
 _INSTALLED: Final = Path("/run/fognav/agent.sock")
 
+PageOption = Annotated[bool, typer.Option("--page", help="Serve a page with a pad for touch, mouse and keys.")]
+BindOption = Annotated[
+    list[str] | None, typer.Option("--bind", metavar="ADDRESS", help="Serve the page there, too, for other devices.")
+]
+PortOption = Annotated[int, typer.Option(min=0, max=65535, help="The page's port; 0: any free one.")]
+RobotFileOption = Annotated[
+    Path | None, typer.Option("--robot-file", metavar="FILE", help="The robot's settings, robot.toml.")
+]
 SocketOption = Annotated[
     Path | None, typer.Option("--socket", metavar="FILE", help="The agent's socket, if not found by itself.")
 ]
@@ -28,14 +45,47 @@ def _default_socket() -> Path:
     return Path(guardian).with_name(_INSTALLED.name) if guardian else _INSTALLED
 
 
+def robot_bringup(  # noqa: PLR0913  # one parameter for each option
+    *,
+    page: PageOption = False,
+    bind: BindOption = None,
+    port: PortOption = 0,
+    robot_file: RobotFileOption = None,
+    seconds: Annotated[float, typer.Option(min=1.0, help="How long --json watches the robot.")] = 5.0,
+    socket: SocketOption = None,
+    json: JsonOption = False,
+) -> None:
+    """Judge this computer's robot, and set its lidar's yaw by looking.
+
+    Run it on the robot's computer, without a fog. In a terminal it shows findings and scan until Ctrl-C. On the page
+    you turn, mirror and mask the scan, write that into robot.toml, and drive by held keys; nothing else moves.
+    With --json, or without a terminal, it says the findings once, and exits with 1 if something needed is bad.
+    """
+    from fognav.robot_page import bringup, findings  # noqa: PLC0415  # loads kernels
+    from fognav.robot_page.server import serve  # noqa: PLC0415  # same
+
+    path, place = socket or _default_socket(), bringup.Place(robot_file)
+    with exit_codes():
+        if page:
+            with contextlib.suppress(KeyboardInterrupt):
+                asyncio.run(serve(path, ["127.0.0.1", *(bind or [])], port, lambda: bringup.BringupView(place)))
+            return
+        view = bringup.BringupView(place)
+        live = sys.stdout.isatty() and not json
+        found = bringup.show(path, view) if live else bringup.watch(path, view, seconds)
+        if json:
+            print_json(findings.as_json(found))
+        else:
+            answers.print(bringup.table(found))
+        if any(finding.state == "bad" for finding in found):
+            raise typer.Exit(NOT_TRUE)
+
+
 def teleop_command(  # noqa: PLR0913  # one parameter for each option
     *,
-    page: Annotated[bool, typer.Option("--page", help="Serve a page with a pad for touch, mouse and keys.")] = False,
-    bind: Annotated[
-        list[str] | None,
-        typer.Option("--bind", metavar="ADDRESS", help="Serve the page there, too, for other devices."),
-    ] = None,
-    port: Annotated[int, typer.Option(min=0, max=65535, help="The page's port; 0: any free one.")] = 0,
+    page: PageOption = False,
+    bind: BindOption = None,
+    port: PortOption = 0,
     gamepad: Annotated[
         Path | None, typer.Option("--gamepad", metavar="DEVICE", help="Drive by a game pad, such as /dev/input/js0.")
     ] = None,
@@ -113,9 +163,7 @@ def calibrate_command(  # noqa: PLR0913  # one parameter for each option
         Path | None, typer.Argument(metavar="LOG", help="A recording; without one the robot is recorded now.")
     ] = None,
     *,
-    robot_file: Annotated[
-        Path | None, typer.Option("--robot-file", metavar="FILE", help="The robot's settings, robot.toml.")
-    ] = None,
+    robot_file: RobotFileOption = None,
     write: Annotated[bool, typer.Option("--write", help="Write the result into the robot's settings.")] = False,
     accept: Annotated[
         list[Path] | None,

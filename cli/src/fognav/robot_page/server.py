@@ -1,4 +1,4 @@
-"""Serves the page of a robot's own computer: its scan and state live, and a pad to drive it by hand.
+"""Serves the page of a robot's own computer: its scan and state live, a pad to drive it by hand, and its bring-up.
 
 Each page is a client of the agent of its own. What it says is passed on as it comes, and nothing is said that it did
 not say: the agent's dead man's switch is the only one, so a link to the page that breaks stops the robot.
@@ -20,25 +20,29 @@ from fastapi import FastAPI, Response, WebSocket, WebSocketDisconnect
 from fastapi.responses import FileResponse
 
 from fognav.output import WrongUseError, print_line
+from fognav.robot_page.bringup import BringupView, Mount
 from fognav.robot_page.view import LocalRobotErrors, RobotView
 from robot_agent.agent.hand_driving import HandReply, HandRequest
 from robot_agent.local_client import LocalRobot, LocalRobotError
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
+    from collections.abc import Callable, Sequence
 
 _STATIC: Final = Path(__file__).parent / "static"
-_FILES: Final = {"": "index.html", "page.js": "page.js", "page.css": "page.css"}
+_FILES: Final = {"": "index.html", **{name: name for name in ("page.js", "bringup.js", "page.css")}}
 _POLICY: Final = "default-src 'none'; connect-src 'self'; style-src 'self'; script-src 'self'; img-src 'self'"
 _REFUSED: Final = 4401
 _PAGES_MAX: Final = 4
 _LOOPBACK: Final = frozenset({"127.0.0.1", "::1"})
 
-_requests = msgspec.json.Decoder(HandRequest)
+_requests = msgspec.json.Decoder(HandRequest | Mount)
 
 
-def make_app(path: Path, token: str) -> FastAPI:
-    """Return the page's application for the agent at this socket; who has no `token` sees and drives nothing."""
+def make_app(path: Path, token: str, view: Callable[[], RobotView] = RobotView) -> FastAPI:
+    """Return the page's application for the agent at this socket; who has no `token` sees and drives nothing.
+
+    view: makes what each page sees.
+    """
     app = FastAPI(title="Fognav robot", docs_url=None, redoc_url=None, openapi_url=None)
     open_pages: set[WebSocket] = set()
 
@@ -52,7 +56,7 @@ def make_app(path: Path, token: str) -> FastAPI:
             return
         open_pages.add(page)
         try:
-            await _Session(page, path).run()
+            await _Session(page, path, view()).run()
         finally:
             open_pages.discard(page)
 
@@ -70,10 +74,10 @@ def make_app(path: Path, token: str) -> FastAPI:
 class _Session:
     """One page, and its link to the agent."""
 
-    def __init__(self, page: WebSocket, path: Path) -> None:
+    def __init__(self, page: WebSocket, path: Path, view: RobotView) -> None:
         self._page = page
         self._path = path
-        self._view = RobotView()
+        self._view = view
         self._replies: list[HandReply] = []
         self._news = asyncio.Event()
         self._error = ""
@@ -83,7 +87,9 @@ class _Session:
         try:
             robot = LocalRobot(self._path)
         except LocalRobotError as error:
-            await self._page.send_json({"error": str(error)})
+            if isinstance(self._view, BringupView):
+                self._view.problem = str(error)
+            await self._page.send_json({**self._view.as_json(), "error": str(error)})
             await self._page.close()
             return
         loop = asyncio.get_running_loop()
@@ -129,13 +135,21 @@ class _Session:
                 except msgspec.DecodeError as error:
                     await self._page.send_json({"error": f"the page sent what is no request: {error}"})
                     return
-                robot.send(request)
+                if not isinstance(request, Mount):
+                    robot.send(request)
+                elif isinstance(self._view, BringupView):
+                    self._replies.append(await asyncio.to_thread(self._view.place.write, request))
+                    self._news.set()
 
 
-async def serve(path: Path, hosts: Sequence[str], port: int) -> None:
-    """Serve the page at these addresses until cancelled; prints where it is. Raises `WrongUseError`."""
-    with LocalRobotErrors():
-        LocalRobot(path).close()
+async def serve(path: Path, hosts: Sequence[str], port: int, view: Callable[[], RobotView] | None = None) -> None:
+    """Serve the page at these addresses until cancelled; prints where it is. Raises `WrongUseError`.
+
+    view: makes what each page sees; without one it only drives, for which there must be an agent.
+    """
+    if view is None:
+        with LocalRobotErrors():
+            LocalRobot(path).close()
     token = secrets.token_urlsafe(12)
     listening = [_listen(host, port) for host in hosts]
     for host, bound in zip(hosts, listening, strict=True):
@@ -144,8 +158,8 @@ async def serve(path: Path, hosts: Sequence[str], port: int) -> None:
     if any(host not in _LOOPBACK for host in hosts):
         print_line("whoever has this address drives the robot, and the link is not encrypted: use a network you trust")
     config = uvicorn.Config(
-        make_app(path, token), log_level="warning", access_log=False, lifespan="off", ws_max_size=4096,
-        ws_max_queue=8, ws_ping_interval=1.0, ws_ping_timeout=2.0, timeout_graceful_shutdown=1,
+        make_app(path, token, view or RobotView), log_level="warning", access_log=False, lifespan="off",
+        ws_max_size=4096, ws_max_queue=8, ws_ping_interval=1.0, ws_ping_timeout=2.0, timeout_graceful_shutdown=1,
     )  # fmt: skip
     server = uvicorn.Server(config)
     server.capture_signals = contextlib.nullcontext  # type: ignore[method-assign,assignment]  # the command's are its own

@@ -1,6 +1,8 @@
 // The robot's page: draws what the agent tells, and says what the operator wants. A speed is said 20 times a second and
 // counts for 0.15 s on the robot, so that letting go, hiding the page or losing the link stops it.
 
+import * as bringup from "./bringup.js";
+
 const SAY_MS = 50;
 const KEEP_MS = 1000; // a driver who says nothing for 3 s drives no more
 const KEYS = {
@@ -31,6 +33,7 @@ function say(request) {
 }
 
 function show(told) {
+  bringup.show(told.bringup);
   if (told.error) {
     element("reply").textContent = told.error;
     return;
@@ -62,7 +65,9 @@ function draw() {
   const ink = getComputedStyle(document.documentElement);
   const colour = (name) => ink.getPropertyValue(name).trim();
   const g = canvas.getContext("2d");
-  const reach = Math.min(8, Math.max(1.5, ...view.points.map(([x, y]) => Math.hypot(x, y)).sort((a, b) => a - b).slice(0, Math.ceil(0.9 * view.points.length))));
+  const points = view.points.map(bringup.placed);
+  const far = Math.max(1.5, ...points.map(([x, y]) => Math.hypot(x, y)).sort((a, b) => a - b).slice(0, Math.ceil(0.9 * points.length)));
+  const reach = bringup.reach() ?? Math.min(8, far);
   const metre = (0.47 * Math.min(width, height)) / reach;
   const at = ([x, y]) => [width / 2 - y * metre, height / 2 - x * metre]; // ahead is up, left is left
   g.setTransform(scale, 0, 0, scale, 0, 0);
@@ -77,7 +82,7 @@ function draw() {
     g.fillText(`${ring} m`, width / 2 + 3, height / 2 - ring * metre - 3);
   }
   g.fillStyle = colour("--ink");
-  for (const point of view.points) {
+  for (const point of points) {
     const [x, y] = at(point);
     g.fillRect(x - 1.5, y - 1.5, 3, 3);
   }
@@ -89,6 +94,7 @@ function draw() {
   g.moveTo(...at([0, 0]));
   g.lineTo(...at([0.25, 0]));
   g.stroke();
+  bringup.draw(g, at, colour);
 }
 
 function wanted() {
@@ -131,7 +137,7 @@ pad.addEventListener("pointermove", (event) => { if (wish) point(event); });
 for (const name of ["pointerup", "pointercancel", "lostpointercapture"]) pad.addEventListener(name, letGo);
 pad.addEventListener("contextmenu", (event) => event.preventDefault());
 window.addEventListener("keydown", (event) => {
-  if (!(event.code in KEYS) || event.target.tagName === "INPUT" || event.ctrlKey || event.metaKey) return;
+  if (!(event.code in KEYS) || ["INPUT", "SELECT"].includes(event.target.tagName) || event.ctrlKey || event.metaKey) return;
   event.preventDefault();
   held.add(event.code);
 });
@@ -150,4 +156,5 @@ for (const [id, unit] of [["speed", "m/s"], ["turn", "rad/s"]]) {
 }
 window.addEventListener("resize", draw);
 setInterval(steer, SAY_MS);
+bringup.begin(say, draw);
 connect();

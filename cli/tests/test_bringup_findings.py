@@ -76,6 +76,8 @@ def test_each_finding_about_a_part_tells_well_from_ill_and_both_from_unknown():
     blocked = structs.replace(FEEDBACK, fault="a wheel motor draws too much current", fault_code="motor_blocked")
     both, on, off = frozenset({True, False}), frozenset({True}), frozenset({False})
     judged = {
+        "no settings": (findings.settings(None, in_use=True), "warn"),
+        "settings that were not read yet": (findings.settings(Path("robot.toml"), in_use=False), "warn"),
         "other version": (findings.versions("1.0", "1.1"), "bad"),
         "untold version": (findings.versions("1.0", None), "unknown"),
         "no port": (findings.port("base", "roomba600", "", exists=False, known=[]), "bad"),

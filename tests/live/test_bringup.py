@@ -96,8 +96,13 @@ def test_a_lidar_that_is_mounted_turned_and_mirrored_is_set_by_looking_and_its_r
         drag_a_quarter_turn(page)
         expect(page.get_by_label("Yaw in degrees")).to_have_value("90")
         page.locator("#proposed").get_by_role("button", name="Mask it").click()
+        page.get_by_role("button", name="Drag a mask").click()
+        drag_a_quarter_turn(page)
+        expect(page.locator("#masks")).to_contain_text("0° to 90°")
+        page.locator("#masks li", has_text="0° to 90°").get_by_role("button", name="Remove").click()
         page.get_by_role("button", name="Write robot.toml").click()
         expect(page.locator("#reply")).to_contain_text("wrote lidar.yaw_rad, lidar.mirrored, lidar.masks")
+        expect(page.locator("[data-name=settings]")).to_contain_text("the agent runs with another mounting")
         assert watcher.rolled(0.3) == pytest.approx((0.0, 0.0), abs=1e-3), "a page that only looks moves nothing"
         assert watcher.mode == "INIT"
         page.keyboard.down("w")
@@ -120,7 +125,7 @@ def test_a_lidar_that_is_mounted_turned_and_mirrored_is_set_by_looking_and_its_r
 
 
 def drag_a_quarter_turn(page) -> None:
-    """Drag the scan round the robot, from ahead to the left."""
+    """Drag round the robot, from ahead to the left."""
     box = page.locator("#scan").bounding_box()
     middle, far = (box["x"] + box["width"] / 2, box["y"] + box["height"] / 2), 200
     page.mouse.move(middle[0], middle[1] - far)

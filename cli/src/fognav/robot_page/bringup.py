@@ -37,6 +37,8 @@ from robot_agent.localization.odometry import wheel_travel
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
 
+    from fog_contracts.robot import LidarSettings
+    from fognav.robot_page.mounting import Sector
     from robot_agent.hardware import BaseStatus
 
 INSTALLED_FILE: Final = Path("/etc/fognav/robot.toml")
@@ -131,6 +133,7 @@ class BringupView(RobotView):
         self._load_v: float | None = None
         self._judged: list[Finding] = []
         self._judged_at = -math.inf
+        self._proposed: list[Sector] = []
 
     def take(self, entry: Any) -> bool:  # noqa: ANN401  # as its parent
         """Take an entry in; return whether there is something new to show."""
@@ -198,7 +201,7 @@ class BringupView(RobotView):
         try:
             robot: RobotFile | None = self.place.robot()
             assert robot is not None
-            found = [_settings(self.place.file)]
+            found = [findings.settings(self.place.file, in_use=self._in_use(robot.settings.lidar))]
             found += _ports(robot)
             rated = 1.0 / registry.make_lidar(robot).traits.scan_period_s
             base, lidar, low = (
@@ -217,6 +220,14 @@ class BringupView(RobotView):
         found += self._judge_lidar(lidar, rated, told or Equipment(version=""))
         found += self._judge_base(base, low, counts, told.base if told else "")
         return found
+
+    def _in_use(self, lidar: LidarSettings) -> bool:
+        """Return whether the agent has the lidar where the file says that it is; True while it has not told."""
+        if self.config is None or self.equipment is None:
+            return True
+        has, told = self.config.localization, self.equipment
+        agents = (has.lidar_x, has.lidar_y, has.lidar_yaw, told.mirrored, told.masks)
+        return agents == (lidar.x_m, lidar.y_m, lidar.yaw_rad, lidar.mirrored, lidar.masks)
 
     def _judge_lidar(self, driver: str, rated: float | None, told: Equipment) -> list[Finding]:
         silent = max(0.0, self._now - max(self._scanned_at, self._heard_from))
@@ -239,7 +250,7 @@ class BringupView(RobotView):
     def _judge_base(self, driver: str, low: float, counts: float | None, problem: str) -> list[Finding]:
         feedback = self.base.feedback if self.base else None
         found = [findings.base(driver, problem, feedback)]
-        if feedback is None:
+        if feedback is None or problem:
             return found
         status = feedback.status
         found += [findings.switch(n, self._seen[n], now=bool(getattr(status, n))) for n in _SWITCHES]
@@ -252,6 +263,7 @@ class BringupView(RobotView):
         """Return what the page draws, and the findings."""
         if (now := time.monotonic()) - self._judged_at > _JUDGED_S:
             self._judged, self._judged_at = self.findings(), now
+            self._proposed = self._own.sectors() if self._own else []
         lidar = self.config.localization if self.config else None
         mounted = {
             "x": lidar.lidar_x, "y": lidar.lidar_y, "yaw": lidar.lidar_yaw,
@@ -260,17 +272,10 @@ class BringupView(RobotView):
         more = {
             "findings": [finding._asdict() for finding in self._judged],
             "mounted": mounted,
-            "proposed": self._own.sectors() if self._own else [],
+            "proposed": self._proposed,
             "file": str(self.place.file) if self.place.file else None,
         }
         return {**super().as_json(), "bringup": more}
-
-
-def _settings(file: Path | None) -> Finding:
-    if file is not None:
-        return Finding("settings", "ok", str(file))
-    remedy = "fognav robot new --out robot.toml, then name it by --robot-file"
-    return Finding("settings", "warn", "no robot.toml is known: defaults are taken", remedy)
 
 
 def _wrong(error: SettingsError) -> Finding:

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Final, Literal, NamedTuple
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
+    from pathlib import Path
 
     from fog_contracts.messages import Power
     from robot_agent.guardian.link import BaseFeedback
@@ -42,6 +43,17 @@ class Finding(NamedTuple):
     state: State
     text: str
     remedy: str = ""
+
+
+def settings(file: Path | None, *, in_use: bool) -> Finding:
+    """Judge whether there is a settings file, and whether the agent has the lidar as it says."""
+    if file is None:
+        remedy = "fognav robot new --out robot.toml, then name it by --robot-file"
+        return Finding("settings", "warn", "no robot.toml is known: defaults are taken", remedy)
+    if not in_use:
+        remedy = "restart the agent: systemctl restart fognav-agent"
+        return Finding("settings", "warn", f"{file}: the agent runs with another mounting of the lidar", remedy)
+    return Finding("settings", "ok", str(file))
 
 
 def agent(problem: str) -> Finding:
@@ -158,7 +170,8 @@ def base(driver: str, problem: str, feedback: BaseFeedback | None) -> Finding:
     """Judge whether the base speaks and obeys; `problem`: why nothing is heard of it."""
     if feedback is None or problem:
         text = f"{driver}: {problem or 'nothing was heard of it yet'}"
-        return Finding("base", "bad", text, "its cable and its battery; a Roomba that sleeps: press CLEAN")
+        remedy = "its cable and its battery; a Roomba that sleeps: press CLEAN; systemctl status fognav-watchdog"
+        return Finding("base", "bad", text, remedy)
     status = feedback.status
     if feedback.fault is not None:
         tried = feedback.fault_code in _PRESSED

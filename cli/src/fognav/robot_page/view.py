@@ -64,7 +64,7 @@ class RobotView:
             "bumper": status.bumper if status else False,
             "cliff": status.cliff if status else False,
             "wheel_drop": status.wheel_drop if status else False,
-            "points": np.round(self.points(), 2).tolist(),
+            "points": np.round(self.points(), 3).tolist(),
             "footprint": [list(corner) for corner in self.config.footprint.vertices] if self.config else [],
             "missed": self.missed,
         }

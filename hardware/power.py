@@ -1,9 +1,10 @@
-"""What a sensor node draws at 5 V, and how long a power bank lasts, for both ways to publish.
+"""What a sensor node and a robot's electronics draw at 5 V, and how long a power bank lasts.
 
-Run: python hardware/power.py. Estimated from data sheets; nothing here was measured. Put a USB meter between supply and
-node before you rely on it.
+Run: python hardware/power.py [robot]. Estimated from data sheets; nothing here was measured. Put a USB meter between
+supply and node or robot before you rely on it.
 """
 
+import sys
 from dataclasses import dataclass
 from typing import Final
 
@@ -118,5 +119,49 @@ def _lines(mode: Mode) -> list[str]:
     ]
 
 
+@dataclass(frozen=True)
+class Load:
+    """What a part of the robot draws at 5 V (mA): while the robot drives, while it rests, and at most."""
+
+    name: str
+    driving: float
+    resting: float
+    most: float
+
+
+ROBOT: Final = (
+    # Raspberry Pi's documentation: a bare Pi 4 typically draws 600 mA while active. At most: 7.2 W, which a published
+    # test measured at the wall with all four cores busy; with its supply's loss the board has less.
+    Load("Raspberry Pi 4, Wi-Fi on", 600.0, 540.0, 1440.0),
+    # RPLIDAR A1M8 data sheet: core 300 typical and 350 at most, 600 when it starts, 80 asleep.
+    Load("RPLidar A1, core", 300.0, 80.0, 600.0),
+    # The same: 100 typical. A motor draws more until it turns: twice that is an estimate.
+    Load("RPLidar A1, motor", 100.0, 0.0, 200.0),
+    # FT232R data sheet: 15 in use; the lidar's adapter is estimated like it.
+    Load("two USB serial adapters", 30.0, 30.0, 40.0),
+)
+"""What the power bank of a robot feeds. A resting Pi still runs all programs: a tenth less is an estimate."""
+BANK_OF_ROBOT_MAH: Final = 20_000
+
+
+def robot_table() -> str:
+    """Return the robot's loads, their sum, and the hours of a full power bank, as a Markdown table."""
+    rows = [*ROBOT, Load("**together**", *(sum(getattr(load, of) for load in ROBOT) for of in _STATES))]
+    hours = [
+        BANK_OF_ROBOT_MAH * CELL_V / SUPPLY_V * CONVERTER / value for value in (rows[-1].driving, rows[-1].resting)
+    ]
+    return "\n".join([
+        "| part | drives | rests | at most |",
+        "|---|---|---|---|",
+        *(f"| {row.name} | {row.driving:.0f} mA | {row.resting:.0f} mA | {row.most:.0f} mA |" for row in rows),
+        (
+            f"| {BANK_OF_ROBOT_MAH:,} mAh power bank | {hours[0]:.0f} h | {hours[1]:.0f} h | "
+            f"{rows[-1].most * SUPPLY_V / 1000:.0f} W |"
+        ),
+    ])  # fmt: skip
+
+
+_STATES: Final = ("driving", "resting", "most")
+
 if __name__ == "__main__":
-    print(f"{table()}\n\n{arithmetic()}")
+    print(robot_table() if sys.argv[1:] == ["robot"] else f"{table()}\n\n{arithmetic()}")

@@ -1,4 +1,4 @@
-"""Draws the wiring of a sensor node and of the robot's cut-off as SVG files in `docs/images`.
+"""Draws the wiring of a sensor node, of a robot and of its cut-off as SVG files in `docs/images`.
 
 Run: python hardware/wiring.py [--check]. With --check nothing is written, and the exit code is 1 if a file is out of
 date.
@@ -65,6 +65,11 @@ class Drawing:
         for y, name in ys:
             self.parts.append(f'<circle cx="{x:g}" cy="{y:g}" r="3" fill="#fff" stroke="#566573"/>')
             self.text(x - 8 if right else x + 8, y + 4, name, anchor="end" if right else "start")
+
+    def contact(self, x: float, y: float, radius: float, number: str = "") -> None:
+        """Draw a round contact, or with a large radius a plug's rim, and its number."""
+        self.parts.append(f'<circle cx="{x:g}" cy="{y:g}" r="{radius:g}" fill="#fff" stroke="#566573"/>')
+        self.text(x, y + 5, number, anchor="middle", bold=True)
 
     def svg(self) -> str:
         """Return the file."""
@@ -181,7 +186,105 @@ def cut_off() -> str:
     return drawing.svg()
 
 
-FILES: Final = {"node-wiring.svg": node("standard"), "node-wiring-thesis.svg": node("thesis"), "cut-off.svg": cut_off()}
+MINI_DIN: Final = {1: "Vpwr", 2: "Vpwr", 3: "RXD", 4: "TXD", 5: "BRC", 6: "GND", 7: "GND"}
+"""The pins of a Roomba's socket (Open Interface specification)."""
+_FACE: Final = {7: (-34, -26), 6: (0, -38), 5: (34, -26), 4: (-44, 8), 3: (44, 8), 2: (-16, 36), 1: (16, 36)}
+"""Where they are as one looks into the socket, the row of three above, in pixels from its middle."""
+FTDI: Final = {"GND": ("black", 6), "TXD": ("orange", 3), "RXD": ("yellow", 4), "RTS": ("green", 5)}
+"""The wires of a TTL-232R-5V cable and the socket's pins that they lead to; red (5 V) and brown (CTS) stay free."""
+_KINDS: Final = {"GND": "ground", "TXD": "trigger", "RXD": "echo", "RTS": "logic"}
+
+
+def robot() -> str:
+    """Return the wiring of a robot with serial adapters at USB: power bank, Raspberry Pi, Roomba and lidar."""
+    drawing = Drawing(960, 560, "Wiring of a robot: power bank, Raspberry Pi, Roomba 600 and RPLidar A1")
+    drawing.text(40, 30, "Robot: everything by USB", bold=True)
+    drawing.box(40, 90, 150, 120, "power bank")
+    drawing.text(56, 132, "5 V, 3 A, USB-C")
+    drawing.pins(190, [(175, "output")], right=True)
+    drawing.box(290, 60, 170, 300, "Raspberry Pi 4")
+    drawing.pins(290, [(175, "USB-C")], right=False)
+    drawing.pins(460, [(140, "USB"), (305, "USB")], right=True)
+    drawing.wire("power", (190, 175), (290, 175))
+    drawing.text(240, 166, "5 V", anchor="middle")
+    drawing.box(530, 60, 160, 190, "TTL-232R-5V cable")
+    drawing.pins(530, [(140, "USB")], right=False)
+    drawing.wire("logic", (460, 140), (530, 140))
+    heights = dict(zip(FTDI, (110, 145, 180, 215), strict=True))
+    drawing.pins(690, [(heights[name], f"{name} {colour}") for name, (colour, _) in FTDI.items()], right=True)
+    drawing.box(790, 60, 140, 300, "Roomba 600")
+    rows = {pin: 110 + 35 * place for place, pin in enumerate((6, 3, 4, 5, 7, 1, 2))}
+    drawing.pins(790, [(y, f"{pin} {MINI_DIN[pin]}") for pin, y in rows.items()], right=False)
+    for name, (_, pin) in FTDI.items():
+        drawing.wire(_KINDS[name], (690, heights[name]), (790, rows[pin]))
+    drawing.text(782, rows[1] + 4, "leave free", anchor="end")
+    drawing.text(782, rows[2] + 4, "leave free", anchor="end")
+    drawing.wire("logic", (460, 305), (500, 305), (500, 440), (530, 440))
+    drawing.box(530, 390, 160, 90, "adapter of the kit")
+    drawing.pins(530, [(440, "micro USB")], right=False)
+    drawing.pins(690, [(440, "7 pins")], right=True)
+    drawing.wire("logic", (690, 440), (790, 440))
+    drawing.box(790, 390, 140, 90, "RPLidar A1")
+    drawing.pins(790, [(440, "cable")], right=False)
+    drawing.text(40, 390, "Red (5 V) and brown (CTS) of the cable:", bold=True)
+    drawing.text(40, 408, "cut off and insulated. The grounds of robot")
+    drawing.text(40, 426, "and power bank are one by the black wire.")
+    drawing.text(
+        40, 510, "Blue: commands to the robot. Orange: its frames. Green to BRC: a low pulse of 1.2 s wakes it."
+    )
+    drawing.text(
+        40,
+        528,
+        "The lidar takes its 5 V for core and motor from the Pi's USB socket: use a short cable, at most 0.5 m.",
+    )
+    return drawing.svg()
+
+
+def robot_port() -> str:
+    """Return the face of the robot's socket, and how a Raspberry Pi's own serial port is wired to it."""
+    drawing = Drawing(960, 420, "A Roomba's serial socket, and a Raspberry Pi's own serial port at it")
+    drawing.text(40, 30, "The robot's socket, seen from outside", bold=True)
+    middle = (150, 150)
+    drawing.contact(*middle, 78)
+    for pin, (x, y) in _FACE.items():
+        drawing.contact(middle[0] + x, middle[1] + y, 11, str(pin))
+    for line, text in enumerate((
+        "1, 2 Vpwr: the battery, 13 to 17 V, unregulated,",
+        "200 mA at most: not for a Pi or a lidar",
+        "3 RXD: to the robot, 5 V",
+        "4 TXD: from the robot, 5 V",
+        "5 BRC: low for 1 s wakes it; three pulses of",
+        "50 to 500 ms change its rate to 19200",
+        "6, 7 GND",
+    )):  # fmt: skip
+        drawing.text(40, 262 + 20 * line, text)
+    drawing.text(430, 30, "Without a USB cable: by a level shifter, never directly", bold=True)
+    drawing.box(430, 60, 150, 250, "Raspberry Pi")
+    pi = {"3V3": 110, "5V": 145, "GPIO14": 180, "GPIO15": 215, "GND": 250}
+    names = {"3V3": "1  3.3 V", "5V": "2  5 V", "GPIO14": "8  TXD", "GPIO15": "10  RXD", "GND": "6  GND"}
+    drawing.pins(580, [(y, names[pin]) for pin, y in pi.items()], right=True)
+    drawing.box(650, 60, 130, 250, "level shifter")
+    drawing.pins(650, [(110, "LV"), (180, "LV1"), (215, "LV2"), (250, "GND")], right=False)
+    drawing.pins(780, [(110, "HV"), (180, "HV1"), (215, "HV2"), (250, "GND")], right=True)
+    drawing.box(840, 60, 100, 250, "Roomba")
+    drawing.pins(840, [(180, "3 RXD"), (215, "4 TXD"), (250, "6 GND")], right=False)
+    drawing.wire("power", (580, pi["3V3"]), (650, 110))
+    drawing.wire("power", (580, pi["5V"]), (615, pi["5V"]), (615, 340), (810, 340), (810, 110), (780, 110))
+    for kind, y in (("trigger", 180), ("echo", 215), ("ground", 250)):
+        drawing.wire(kind, (580, y), (650, y))
+        drawing.wire(kind, (780, y), (840, y))
+    drawing.text(430, 372, 'With BSS138 or alike. BRC stays free (brc = "none"): CLEAN wakes the robot.')
+    drawing.text(430, 392, 'port = "/dev/ttyAMA0", after dtoverlay=disable-bt, without a console on it.')
+    return drawing.svg()
+
+
+FILES: Final = {
+    "node-wiring.svg": node("standard"),
+    "node-wiring-thesis.svg": node("thesis"),
+    "cut-off.svg": cut_off(),
+    "robot-wiring.svg": robot(),
+    "robot-port.svg": robot_port(),
+}
 """The text of each file, by its name in `docs/images`."""
 
 

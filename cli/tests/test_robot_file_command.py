@@ -54,7 +54,7 @@ def test_check_prints_the_effective_settings_or_the_line_of_a_mistake(tmp_path):
     text = robot_text(default_robot("diffdrive", "ld19"))
     file.write_text(text.replace("x_m = 0.0", "x_m = 0.12"))
     values = json.loads(run(app, ["robot", "check", str(file), "--json"]).stdout)
-    assert (values["ok"], values["lidar.x_m"], values["base.options.axle_m"]) == (True, 0.12, 0.28)
+    assert (values["ok"], values["lidar.x_m"], values["base.options.axle_m"]) == (False, 0.12, 0.28)
     file.write_text(text.replace("axle_m = 0.28", "axle_m = 28"))
     result = run(app, ["robot", "check", str(file), "--json"])
     line = text.splitlines().index("axle_m = 0.28") + 1
@@ -98,7 +98,7 @@ def test_check_prints_what_a_file_may_say_and_names_the_ports_that_are_not_set(t
     file = tmp_path / "robot.toml"
     file.write_text(robot_text(default_robot()).replace('port = ""', 'port = "/dev/serial/by-id/a"', 1))
     result = run(app, ["robot", "check", str(file)])
-    assert result.exit_code == 0
+    assert result.exit_code == 1
     printed = result.output.splitlines()
     assert 'base.driver = "roomba600"' in printed
     assert "lidar.mirrored = false" in printed
@@ -136,7 +136,7 @@ def test_check_remarks_what_the_sites_radius_decides(tmp_path):
     file = tmp_path / "robot.toml"
     file.write_text(robot_text(default_robot()).replace("x_m = 0.0", "x_m = 0.2"))
     result = run(app, ["robot", "check", str(file)])
-    assert result.exit_code == 0
+    assert result.exit_code == 1
     assert "unless the site gives this robot a larger `radius` than 0.17 m: " in result.output
     *_, told = json.loads(run(app, ["robot", "check", str(file), "--json"]).stdout)["remarks"]
     place = line_of(file, "[lidar]", "x_m = ")

@@ -9,6 +9,7 @@ import shutil
 import signal
 import subprocess
 import sys
+import tomllib
 from pathlib import Path
 
 import guardian_rig as rigs
@@ -22,7 +23,8 @@ from robot_agent.agent.settings import Settings, read_given
 from robot_agent.config import agent_config
 from robot_agent.registry import make_lidar
 
-DEPLOY = Path(__file__).parents[3] / "deploy/robot"
+ROOT = Path(__file__).parents[3]
+DEPLOY = ROOT / "deploy/robot"
 UNITS = ["fognav-watchdog.service", "fognav-agent.service"]
 PYTHON = "/opt/fognav/venv/bin/python"
 
@@ -161,7 +163,8 @@ class Update:
         self.log, self.wheels, commands = home / "log", home / "wheels", home / "bin"
         shutil.copytree(DEPLOY, home / "deploy/robot")
         script = home / "deploy/robot/install"
-        script.write_text(re.sub(r"(?<!here)/(opt|etc|var)/", rf"{home}/\1/", script.read_text()))
+        script.write_text(re.sub(r"(?<!here)/(opt|etc|var|usr/local)/", rf"{home}/\1/", script.read_text()))
+        (home / "usr/local/bin").mkdir(parents=True)
         for folder in (commands, self.wheels, home / "opt/fognav/venv/bin"):
             folder.mkdir(parents=True)
         answers = {
@@ -209,8 +212,45 @@ def test_an_update_that_fails_says_that_the_robot_is_stopped(tmp_path):
 def test_wheels_replace_packages_of_the_same_version(tmp_path):
     update = Update(tmp_path)
     dependencies, members = update.steps[2:]
-    assert dependencies.endswith(f"--find-links {update.wheels} --upgrade robot-agent")
-    assert "--no-deps --force-reinstall fog-contracts fog-kernels fog-runtime robot-agent" in members
+    assert dependencies.endswith(f"--find-links {update.wheels} --upgrade fognav-cli")
+    assert sorted(members.partition("--force-reinstall ")[2].split()) == sorted(needed_by("cli"))
+
+
+def needed_by(member) -> set[str]:
+    """The members that one needs without its extras, itself among them."""
+    files = [file for pattern in ("libs/*", "services/*", "*") for file in ROOT.glob(f"{pattern}/pyproject.toml")]
+    projects = {file.parent.name: tomllib.loads(file.read_text())["project"] for file in files}
+    of_name = {project["name"]: project for project in projects.values()}
+    found, left = set(), [projects[member]["name"]]
+    while left:
+        name = left.pop()
+        found.add(name)
+        needs = (re.match(r"[\w-]+", need)[0] for need in of_name[name]["dependencies"])
+        left += [need for need in needs if need in of_name and need not in found]
+    return found
+
+
+def test_installer_builds_every_member_that_a_robots_computer_needs():
+    built = re.search(r"for folder in (.*)\n", (DEPLOY / "install").read_text())[1].split()
+    assert {Path(folder).name if folder != "cli" else "fognav-cli" for folder in built} == needed_by("cli")
+
+
+def test_a_robot_without_a_fog_is_installed_with_its_settings_only_and_joins_a_fog_later(tmp_path, site_file):
+    root, toml = tmp_path / "bare", tmp_path / "bare.toml"
+    toml.write_text('[base]\ndriver = "roomba600"\n[lidar]\ndriver = "rplidar-a1"\n[body]\nradius_m = 0.21\n')
+    command = [DEPLOY / "install", "--robot", "r1", "--root", str(root), "--robot-file", str(toml)]
+    subprocess.run([*command, "--fog", "none"], check=True)
+    environ = environment_below(root)
+    assert "FOGNAV_ZENOH_CONNECT" not in environ
+    given = read_given(load(Settings, environ=environ), load_robot(environ))
+    assert given.body.radius == pytest.approx(0.21, rel=0.01)
+    install(root)
+    joined = environment(root)
+    assert joined["FOGNAV_ZENOH_CONNECT"] == "tcp/fog.local:7447"
+    assert "FOGNAV_FOG" not in joined
+    refused = subprocess.run([*command, "--fog", "none", "--site", site_file], check=False, capture_output=True)
+    assert refused.returncode == 1
+    assert b"name it by --fog" in refused.stderr
 
 
 @pytest.mark.parametrize(

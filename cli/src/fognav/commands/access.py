@@ -1,4 +1,4 @@
-"""`fognav token` and `fognav ca`: who may use the REST APIs, and the certificate authority of a site.
+"""`fognav token`, `ca` and `robot add`: who may use the REST APIs, a site's authority, and a robot's credentials.
 
 With the authority come the users and access lists of the servers.
 """
@@ -25,8 +25,17 @@ from fognav.credentials import (
     security_errors,
 )
 from fognav.operate.fog import find_fog
-from fognav.operate.options import JsonOption
-from fognav.output import NOT_TRUE, FailedError, WrongUseError, exit_codes, print_answer, print_json, print_result
+from fognav.operate.options import JsonOption, checked_id
+from fognav.output import (
+    NOT_TRUE,
+    FailedError,
+    WrongUseError,
+    exit_codes,
+    print_answer,
+    print_json,
+    print_line,
+    print_result,
+)
 
 token_app = typer.Typer(help="Create, list and revoke tokens of the REST APIs.", no_args_is_help=True)
 
@@ -206,3 +215,29 @@ def _show(security: SiteSecurity, *, json: bool) -> None:
         print_answer("the authority before is still trusted: fognav ca rotate --finish ends that")
     print_answer(f"credentials in {security.directory}/credentials: {', '.join(sorted(security.users()))}")
     print_answer(_RELOAD)
+
+
+def robot_add(
+    robot: Annotated[str, typer.Argument(metavar="ROBOT", help="The robot's id: a to z, 0 to 9 and -.")],
+    *,
+    security: CredentialsOption = None,
+    remove: Annotated[bool, typer.Option("--remove", help="Let it in no longer.")] = False,
+    json: JsonOption = False,
+) -> None:
+    """Let a robot into a site's fog, with a file of credentials.
+
+    The robot needs it as FOGNAV_CREDENTIALS_FILE.
+    For a robot that is known already they are new ones, and those of before are worth nothing any more.
+    """
+    with exit_codes(), security_errors():
+        opened = open_security(security)
+        file = None if remove else opened.add_robot(checked_id(robot))
+        if remove and not opened.remove(robot):
+            raise WrongUseError(f"there is no robot {robot}. Known are: {', '.join(sorted(opened.users()))}")
+        line = (
+            f"the router refuses {robot} once it was restarted"
+            if file is None
+            else f"wrote {file}: copy it to the robot, for its owner only, and delete it here"
+        )
+        values = {"robot": robot, "credentials": None if file is None else str(file)}
+        print_result(values, line, json=json, write=print_line)

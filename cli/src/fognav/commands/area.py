@@ -6,7 +6,7 @@ from typing import Annotated, Any, Literal
 import typer
 
 from fog_contracts.costs import INSCRIBED
-from fognav.commands import installed
+from fognav.commands.map_files import map_app
 from fognav.operate.fog import find_fog
 from fognav.operate.options import FogOption, JsonOption, duration
 from fognav.output import WrongUseError, exit_codes, local_time, print_list, print_result
@@ -128,11 +128,6 @@ def alert_acknowledge(
 def _alert(alert: Mapping[str, Any]) -> str:
     seen = f" [{alert['acknowledged_by']} looks after it]" if alert["acknowledged_by"] else ""
     return f"{alert['id']}: since {local_time(alert['since'])}, {alert['reason']}{seen}"
-
-
-map_app = typer.Typer(
-    cls=installed.Commands, help="Make maps of buildings; show the hazards on the fog's map.", no_args_is_help=True
-)
 
 
 @map_app.command("hazards", epilog="Example: fognav map hazards --json")

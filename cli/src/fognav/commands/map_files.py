@@ -22,6 +22,7 @@ from fog_runtime.configuration.maps import (
     save_occupancy,
     unknown_keys,
 )
+from fognav.commands import installed
 from fognav.map_files import described, loaded, provenance
 from fognav.operate.options import JsonOption  # noqa: TC001  # Typer reads annotations at run time
 from fognav.output import NOT_TRUE, WrongUseError, check_writable, exit_codes, print_result, writing
@@ -31,6 +32,10 @@ if TYPE_CHECKING:
 
     from fog_mapping.checking import Finding
     from fog_runtime.configuration.maps import ImageFormat
+
+map_app = typer.Typer(
+    cls=installed.Commands, help="Make maps of buildings; show the hazards on the fog's map.", no_args_is_help=True
+)
 
 MapArgument = Annotated[Path, typer.Argument(metavar="MAP.yaml", help="File of map_server, which names an image.")]
 

@@ -14,6 +14,7 @@ import typer
 from fog_contracts.commands import PROFILE_OF
 from fog_contracts.messages import CommandKind, Id, Mode, Pose, ProfileName
 from fog_runtime import logs
+from fognav.commands.robot_file import robot_app
 from fognav.operate import robot_commands
 from fognav.operate.fog import Fog, Outcome, RefusedError, find_fog
 from fognav.operate.options import NUMBERS, FogOption, JsonOption, RobotOption, numbers
@@ -29,8 +30,6 @@ from fognav.output import (
     print_result,
 )
 from fognav.programs import MAP_SERVICE, PLANNER
-
-robot_app = typer.Typer(help="Send, stop and watch robots; describe a new one.", no_args_is_help=True)
 
 _WAITS_FOR: Final[Mapping[Mode | None, str]] = {
     "INIT": "; it waits to be enabled (fognav robot enable)",

@@ -1,4 +1,4 @@
-"""`fognav robot add`, `new` and `check`: a robot's credentials, and its commented file and the settings it gives."""
+"""`fognav robot new` and `check`: a robot's commented file, and the settings that it gives."""
 
 import os
 from pathlib import Path
@@ -12,8 +12,7 @@ from fog_runtime.configuration.parts import DEFAULT_BASE, DEFAULT_LIDAR
 from fog_runtime.configuration.robot_file import ROBOT_FILE, RobotFile, default_robot, describe_robot, load_robot
 from fog_runtime.configuration.settings import SettingsError
 from fog_runtime.files import SHARED, atomic_write
-from fognav.credentials import CredentialsOption, open_security, security_errors
-from fognav.operate.options import JsonOption, checked_id
+from fognav.operate.options import JsonOption
 from fognav.output import (
     NOT_TRUE,
     WrongUseError,
@@ -29,31 +28,7 @@ from robot_agent.agent.settings import read_footprint, refuse_body, refuse_contr
 from robot_agent.footprint import Footprint
 from robot_agent.serial_port import PortNameError, check_port_name
 
-
-def robot_add(
-    robot: Annotated[str, typer.Argument(metavar="ROBOT", help="The robot's id: a to z, 0 to 9 and -.")],
-    *,
-    security: CredentialsOption = None,
-    remove: Annotated[bool, typer.Option("--remove", help="Let it in no longer.")] = False,
-    json: JsonOption = False,
-) -> None:
-    """Let a robot into a site's fog, with a file of credentials.
-
-    The robot needs it as FOGNAV_CREDENTIALS_FILE.
-    For a robot that is known already they are new ones, and those of before are worth nothing any more.
-    """
-    with exit_codes(), security_errors():
-        opened = open_security(security)
-        file = None if remove else opened.add_robot(checked_id(robot))
-        if remove and not opened.remove(robot):
-            raise WrongUseError(f"there is no robot {robot}. Known are: {', '.join(sorted(opened.users()))}")
-        line = (
-            f"the router refuses {robot} once it was restarted"
-            if file is None
-            else f"wrote {file}: copy it to the robot, for its owner only, and delete it here"
-        )
-        values = {"robot": robot, "credentials": None if file is None else str(file)}
-        print_result(values, line, json=json, write=print_line)
+robot_app = typer.Typer(help="Send, stop and watch robots; describe a new one.", no_args_is_help=True)
 
 
 def robot_new(
@@ -84,12 +59,14 @@ def robot_check(
 ) -> None:
     """Check a robot's settings file, and print what it sets.
 
-    FOGNAV_ variables that override single settings count, as they do for the robot's processes.
+    FOGNAV_ variables that override single settings count, as they do for the robot's processes. The exit code is 1
+    while something is wrong, or a port is missing.
     """
     try:
         robot = load_robot({**os.environ, ROBOT_FILE: str(file)})
         values = effective(robot)
-        remarks = [f"{name} is not set: a robot needs it, a demo does not" for name in check_ports(robot)]
+        missing = check_ports(robot)
+        remarks = [f"{name} is not set: a robot needs it, a demo does not" for name in missing]
         remarks += contradictions(robot)
     except SettingsError as error:
         if json:
@@ -97,7 +74,9 @@ def robot_check(
             raise typer.Exit(NOT_TRUE) from error
         fail(str(error))
     lines = [f"{name} = {setting_text(value)}" for name, value in values.items()]
-    print_result({"ok": True, "remarks": remarks, **values}, *lines, *remarks, json=json)
+    print_result({"ok": not missing, "remarks": remarks, **values}, *lines, *remarks, json=json)
+    if missing:
+        raise typer.Exit(NOT_TRUE)
 
 
 def check_ports(robot: RobotFile) -> list[str]:

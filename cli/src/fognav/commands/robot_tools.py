@@ -187,6 +187,8 @@ def calibrate_command(  # noqa: PLR0913  # one parameter for each option
     with exit_codes():
         if write and robot_file is None:
             raise WrongUseError("--write needs the robot's settings file: add --robot-file robot.toml")
+        if write and robot_file is not None and not os.access(robot_file.parent, os.W_OK):
+            raise WrongUseError(f"{robot_file} can't be written by you: run the same command by sudo")
         if log is None and out.exists():
             raise WrongUseError(
                 f"{out} exists: name another file with --out, or calibrate by it: fognav calibrate {out}"

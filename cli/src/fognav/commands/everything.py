@@ -1,0 +1,64 @@
+"""The commands of a fog node and of a checkout, which a robot's computer does not have."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from fognav.commands import installed, robot  # noqa: F401  # it adds to `fognav robot`
+from fognav.commands.access import ca_app, robot_add, token_app
+from fognav.commands.area import alert_app, area_app
+from fognav.commands.backup import backup_command, restore_command, store_app
+from fognav.commands.demo import demo_command, record_command, replay_command
+from fognav.commands.develop import channels_command, check_command, docs_command, run_tests
+from fognav.commands.node import node_app
+from fognav.commands.robot_file import robot_app
+from fognav.commands.site import site_app
+from fognav.commands.source import source_app
+from fognav.commands.status import status_command
+from fognav.commands.up import down_command, logs_command, up_command, upgrade_command
+from fognav.commands.zone import zone_app
+from fognav.doctor import doctor_command
+
+if TYPE_CHECKING:
+    import typer
+
+
+def add_to(app: typer.Typer) -> None:
+    """Add them, each with an example."""
+    for group, name, added in (
+        (installed.OPERATE, "zone", zone_app),
+        (installed.OPERATE, "area", area_app),
+        (installed.OPERATE, "alert", alert_app),
+        (installed.SET_UP, "site", site_app),
+        (installed.SET_UP, "node", node_app),
+        (installed.SET_UP, "source", source_app),
+        (installed.RUN, "store", store_app),
+        (installed.RUN, "token", token_app),
+        (installed.RUN, "ca", ca_app),
+    ):
+        app.add_typer(added, name=name, rich_help_panel=group)
+    backup = "fog.tar.gz --site sites/estig --secrets keys --data /var/lib/fognav"
+    for group, name, command, example in (
+        (installed.TRY_IT, "demo", demo_command, "demo --headless --report report.json --seed 7"),
+        (installed.TRY_IT, "doctor", doctor_command, "doctor --json"),
+        (installed.OPERATE, "status", status_command, "status --json"),
+        (installed.RUN, "up", up_command, "up --site sites/estig --site sites/floor2"),
+        (installed.RUN, "down", down_command, "down"),
+        (installed.RUN, "logs", logs_command, "logs map-service -f"),
+        (installed.RUN, "upgrade", upgrade_command, "upgrade --check"),
+        (installed.RUN, "backup", backup_command, f"backup {backup}"),
+        (installed.RUN, "restore", restore_command, f"restore {backup}"),
+        (installed.MEASURE, "record", record_command, "record drive.mcap --seconds 60"),
+        (installed.MEASURE, "replay", replay_command, "replay drive.mcap --speed 2"),
+        (installed.DEVELOP, "docs", docs_command, "docs --serve"),
+        (installed.DEVELOP, "channels", channels_command, "channels --format acl --broker mqtt"),
+        (installed.DEVELOP, "check", check_command, "check --json"),
+    ):
+        app.command(name, epilog=f"Example: fognav {example}", rich_help_panel=group)(command)
+    app.command(
+        "test",
+        context_settings={"allow_extra_args": True, "ignore_unknown_options": True},
+        epilog="Example: fognav test --yes -k replica",
+        rich_help_panel=installed.DEVELOP,
+    )(run_tests)
+    robot_app.command("add", epilog="Example: fognav robot add r2 --credentials DIR")(robot_add)

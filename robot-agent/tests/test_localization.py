@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from dataclasses import replace
 
+import msgspec
 import numpy as np
 import pytest
 from hypothesis import given
@@ -46,9 +47,9 @@ def measure_scan(pose_at, begin, end, *, solid=SOLID, noise=0.0, seed=0, repeats
     )
 
 
-def standing(pose, *, scans=8, localizer=None, solid=SOLID, start=0.0, prepare=None):
+def standing(pose, *, scans=8, localizer=None, solid=SOLID, start=0.0, prepare=None, on=(STATIC, GEOMETRY)):  # noqa: PLR0913  # each has a default
     localizer = localizer or Localizer(seed=3)
-    localizer.load_map(localizer.fields_of(STATIC, GEOMETRY))
+    localizer.load_map(localizer.fields_of(*on))
     for i in range(scans):
         begin = start + 0.18 * i
         for j in range(5):
@@ -125,6 +126,33 @@ def test_global_localization_finds_the_robot_anywhere(place):
     xy, theta = error_of(localizer, now, place)
     assert xy < 0.08
     assert theta < 0.04
+
+
+def test_pose_counts_as_unknown_on_a_new_map_until_scans_fit_there():
+    localizer, now = standing(PLACES[0], prepare=lambda one: one.initial_pose(*PLACES[0]))
+    assert localizer.status == "good"
+    static = STATIC.copy()
+    column, row = GEOMETRY.cell(8.0, 2.5)
+    assert static[row, column] == 0
+    static[row, column] = 254  # a new pillar, in the frame of before
+    localizer.load_map(localizer.fields_of(static, GEOMETRY))
+    assert (localizer.status, "map is a new one" in localizer.detail) == ("none", True)
+    _, now = standing(PLACES[0], localizer=localizer, start=now, scans=4, on=(static, GEOMETRY))
+    assert localizer.status == "good"
+    assert error_of(localizer, now, PLACES[0])[0] < 0.06
+
+
+def test_robot_finds_itself_on_a_new_map_that_lies_elsewhere():
+    localizer, now = standing(PLACES[0], prepare=lambda one: one.initial_pose(*PLACES[0]))
+    moved = msgspec.structs.replace(GEOMETRY, origin_x=GEOMETRY.origin_x + 3.0, origin_y=GEOMETRY.origin_y - 2.0)
+    statuses = []
+    for _ in range(40):
+        _, now = standing(PLACES[0], localizer=localizer, start=now, scans=1, on=(STATIC, moved))
+        statuses.append(localizer.status)
+    assert "good" not in statuses[:2]
+    assert statuses[-1] == "good"
+    x, y, theta = PLACES[0]
+    assert error_of(localizer, now, Pose2(x + 3.0, y - 2.0, theta))[0] < 0.08
 
 
 def test_global_localization_fails_when_places_look_alike():

@@ -56,7 +56,9 @@ class BlockedPlaces:
         self._hazards: dict[str, HazardArea] = {}
         self._zones: list[Zone] = []
         self._spans: dict[str, Spans] = {}
-        """Cells of what was closed last: outlines are rasterized once."""
+        """Cells of what was closed last: outlines are rasterized once ..."""
+        self._geometry: GridGeometry | None = None
+        """... on each map."""
 
     def handlers(self) -> Mapping[ch.Channel, Handler]:
         """Return the handlers of the channels that carry areas and zones."""
@@ -91,6 +93,8 @@ class BlockedPlaces:
     def closed(self, geometry: GridGeometry) -> dict[str, Spans]:
         """Return the cells of each blocked area and no-go zone, by a name that changes with them."""
         closed: dict[str, Spans] = {}
+        if geometry != self._geometry:
+            self._geometry, self._spans = geometry, {}
         for name, outline in self._outlines():
             if name not in self._spans:
                 self._spans[name] = shape_spans(outline, geometry)

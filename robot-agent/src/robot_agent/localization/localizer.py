@@ -52,6 +52,9 @@ _FIT_BEAMS: Final = 120
 _SAVED: Final = "checking the saved pose"
 _TRIAL_SCANS: Final = 8
 """A saved pose must become good within so many scans."""
+_NEW_MAP: Final = "the map is a new one: checking the pose on it"
+_SAVED_SIGMAS: Final = (0.3, 0.2)
+"""Least standard deviations (m, rad) of a saved pose."""
 _FOUND_SIGMAS: Final = (0.2, 0.1)
 """Standard deviations (m, rad) of a place that a search found, which the next scan narrows."""
 _LOCAL_SIGMAS: Final = (1.0, 0.5)
@@ -103,10 +106,21 @@ class Localizer:
         return map_fields(static, geometry, self._config)
 
     def load_map(self, fields: MapFields) -> None:
-        """Load a static map by its fields; the pose is kept."""
-        if fields is not self._fields:
-            self._fields = fields
-            self._relocalization.cancel()
+        """Load a static map by its fields.
+
+        After another map the pose is no more than a saved one: its frame may lie elsewhere in the building. If the next
+        scans don't fit it, the whole map is searched.
+        """
+        if fields is self._fields:
+            return
+        changed, self._fields = self._fields is not None, fields
+        self._relocalization.cancel()
+        odom = self._odometry.latest()
+        pose = None if odom is None else self._filter.pose(odom)
+        if changed and pose is not None:
+            self._start(pose, *_SAVED_SIGMAS)
+            self._history.saved = True
+            self._monitor.begin(_NEW_MAP, _TRIAL_SCANS)
 
     def on_odometry(self, timestamp: float, x: float, y: float, theta: float) -> None:
         """Add the pose in `odom` (m, rad; theta not wrapped) that arrived at `timestamp` (s)."""
@@ -197,7 +211,8 @@ class Localizer:
     def restore(self, saved: SavedPose) -> None:
         """Start at a saved pose with larger deviations; if the next scans don't fit it, search the whole map."""
         pose = Pose2(saved.x, saved.y, saved.theta)
-        self._start(pose, max(0.3, 2.0 * saved.sigma_xy), max(0.2, 2.0 * saved.sigma_theta))
+        xy, theta = _SAVED_SIGMAS
+        self._start(pose, max(xy, 2.0 * saved.sigma_xy), max(theta, 2.0 * saved.sigma_theta))
         self._history.saved = True
         self._monitor.begin(_SAVED, _TRIAL_SCANS)
 

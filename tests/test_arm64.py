@@ -29,7 +29,8 @@ import yaml
 from fog_supervisor import net
 
 ROOT: Final = Path(__file__).parents[1]
-PLATFORM: Final = "aarch64-unknown-linux-gnu"
+PLATFORM: Final = "aarch64-manylinux_2_36"
+"""Debian 12, of which Raspberry Pi OS is made."""
 EMULATOR: Final = "qemu-aarch64-static"
 ARM64: Final = os.environ.get("FOGNAV_ARM64_ROOT", "")
 SERVICES: Final = yaml.safe_load((ROOT / "docker-compose.yml").read_text("utf-8"))["services"]
@@ -37,7 +38,7 @@ IMAGES: Final = {
     service["build"]["args"]["NAME"]: service["build"]["args"] for service in SERVICES.values() if "build" in service
 }
 """What each of our images is built of, by the name of its pins."""
-PINS: Final = sorted({*IMAGES, "robot-agent", "fognav-cli", "build", "sbom"})
+PINS: Final = sorted({*IMAGES, "robot-agent", "robot-camera", "fognav-cli", "build", "sbom"})
 """What a Raspberry Pi installs: in containers, as a robot, without containers."""
 
 

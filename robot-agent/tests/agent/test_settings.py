@@ -48,7 +48,7 @@ def settings(tmp_path, **more):
 
 def test_site_folder_gives_id_start_pose_and_radius(tmp_path):
     (tmp_path / "site.toml").write_text(SITE)
-    site, body = read_site(settings(tmp_path, site_dir=tmp_path))
+    site, body, _ = read_site(settings(tmp_path, site_dir=tmp_path))
     assert (site, body.start.x, body.radius) == ("lab", 1.0, 0.2)
     with pytest.raises(
         SettingsError, match=r"FOGNAV_SITE is 'other', but .*site.toml describes 'lab'.* remove FOGNAV_"
@@ -230,6 +230,27 @@ def test_power_settings_that_the_base_can_not_follow_are_refused():
     refused("8: power.rest_base", "rest_after_s = 0 the robot never rests", more=never, options='brc = "dtr"')
     words = "0.3, but a diffdrive does not drive into a dock by itself"
     refused("8: power.dock_below", words, base="diffdrive", more="dock_below = 0.3")
+
+
+def test_camera_without_its_focal_length_or_with_half_of_its_centre_is_refused():
+    source = 'source = "/dev/video0"'
+    refused("7: camera.focal_px", r"0, so .* or to 640 / \(2 tan", table="camera", more=source)
+    refused("9: camera.centre_px", "one number", table="camera", more="focal_px = 590.0\ncentre_px = [320.0]")
+    checked(robot(table="camera", more=f"{source}\nfocal_px = 590.0"))
+
+
+def test_agent_names_what_a_camera_needs_and_what_is_not_installed(tmp_path, monkeypatch):
+    (tmp_path / "site.toml").write_text(SITE)
+    (tmp_path / "key").write_text("ab" * 32)
+    given = settings(tmp_path, site_dir=tmp_path, operator_key_file=tmp_path / "key")
+    seeing = robot(table="camera", more='focal_px = 590.0\nsource = "/dev/video0"')
+    assert read_given(given, seeing).markers == []
+    monkeypatch.setattr("robot_agent.agent.settings.CAMERA_LIBRARIES", ("numpy", "no_such_library"))
+    with pytest.raises(
+        SettingsError, match=r"a camera needs no_such_library, .* Install requirements/robot-camera.txt"
+    ):
+        read_given(given, seeing)
+    assert read_given(given, robot()).markers == []
 
 
 def test_a_larger_body_may_carry_its_lidar_farther_out():

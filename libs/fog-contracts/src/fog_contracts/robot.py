@@ -65,6 +65,46 @@ class LidarSettings(_Table, frozen=True, kw_only=True):
     options: Annotated[dict[str, Any], Meta(description="the driver's own options")] = field(default_factory=dict)
 
 
+class CameraSettings(_Table, frozen=True, kw_only=True):
+    """The camera that sees markers on the walls, if the robot has one: level sideways, and how its lens maps them."""
+
+    source: Annotated[
+        str,
+        Meta(
+            description="where its pictures come from: a V4L2 device by a name that stays (/dev/v4l/by-id/...), or a "
+            "named pipe with grey pictures (PGM, one after another); none: there is no camera"
+        ),
+    ] = ""
+    width_px: Annotated[Annotated[int, Meta(ge=160, le=4096)], Meta(description="width of its pictures")] = 640
+    height_px: Annotated[Annotated[int, Meta(ge=120, le=4096)], Meta(description="height of its pictures")] = 480
+    focal_px: Annotated[
+        Annotated[float, Meta(ge=0.0, le=20_000.0)],
+        Meta(description="focal length: how many pixels wide a thing of 1 m is from 1 m away; a camera needs it"),
+    ] = 0.0
+    centre_px: Annotated[
+        Annotated[list[Annotated[float, Meta(ge=0.0, le=4096.0)]], Meta(max_length=2)],
+        Meta(description="where the lens's axis meets the picture, as [right, down]; none: its middle"),
+    ] = field(default_factory=list)
+    distortion: Annotated[
+        tuple[Annotated[float, Meta(ge=-2.0, le=2.0)], Annotated[float, Meta(ge=-2.0, le=2.0)]],
+        Meta(description="the lens's radial distortion, k1 and k2 of a calibration by OpenCV or ROS"),
+    ] = (0.0, 0.0)
+    x_m: Annotated[_Offset, Meta(description="the lens, ahead of the point between the driven wheels")] = 0.0
+    y_m: Annotated[_Offset, Meta(description="the lens, to the left of that point")] = 0.0
+    yaw_rad: Annotated[
+        _Bearing, Meta(description="direction in which it looks in the robot's frame, left positive")
+    ] = 0.0
+    pitch_rad: Annotated[
+        Annotated[float, Meta(ge=-1.2, le=1.2)], Meta(description="how far it looks up from the horizontal")
+    ] = 0.0
+    latency_s: Annotated[
+        Annotated[float, Meta(ge=0.0, le=1.0)], Meta(description="time between a picture and its arrival")
+    ] = 0.05
+    rate_hz: Annotated[
+        Annotated[float, Meta(ge=0.2, le=10.0)], Meta(description="pictures a second in which markers are looked for")
+    ] = 2.0
+
+
 class BodySettings(_Table, frozen=True, kw_only=True):
     """The robot's body."""
 
@@ -167,6 +207,7 @@ class RobotSettings(_Table, frozen=True, kw_only=True):
 
     base: BaseSettings
     lidar: LidarSettings
+    camera: CameraSettings = CameraSettings()
     body: BodySettings = BodySettings()
     odometry: OdometrySettings = OdometrySettings()
     motion: MotionSettings = MotionSettings()

@@ -27,6 +27,7 @@ from fog_runtime.transports.edges import Edges
 from fog_runtime.transports.zenoh_edge import ZenohEdge, use_one_thread
 from fog_runtime.version import VERSION
 from robot_agent import registry
+from robot_agent.agent.edges.camera_edge import CameraEdge
 from robot_agent.agent.edges.exporter import Observed, RobotCollector, name_thread, parent
 from robot_agent.agent.edges.local_tools import LocalTools
 from robot_agent.agent.edges.map_loader import MapLoader, Store
@@ -395,6 +396,7 @@ async def run(settings: Settings, robot: RobotFile, given: Given, clock: SystemC
         footprint=given.footprint,
         settings=robot.settings,
         finds_dock=isinstance(given.base, DockingDriver),
+        markers=given.markers,
     )
     source = "radius of site.toml" if given.footprint is None else "footprint of robot.toml"
     inscribed = round(config.footprint.inscribed_radius, 3)
@@ -438,6 +440,9 @@ async def run(settings: Settings, robot: RobotFile, given: Given, clock: SystemC
                 tasks.create_task(map_loader.run(body), name="map")
                 tasks.create_task(agent.publish_loop(), name="publish")
                 tasks.create_task(agent.tools.run(), name="local tools")
+                if robot.settings.camera.source:
+                    camera = CameraEdge(robot.settings.camera, given.markers, clock, core.on_sighting)
+                    tasks.create_task(camera.run(), name="camera")
                 tasks.create_task(agent.housekeeping_loop(lidar, guardian), name="housekeeping")
 
 

@@ -6,6 +6,7 @@ numpy: the agent looks at them before it loads that.
 
 from __future__ import annotations
 
+import importlib.util
 import math
 import secrets
 import tomllib
@@ -17,7 +18,7 @@ from msgspec import Meta
 
 from fog_contracts.commands import KEY_BYTES
 from fog_contracts.messages import Id, Pose
-from fog_contracts.site import RobotSite, Site
+from fog_contracts.site import MarkerSite, RobotSite, Site
 from fog_runtime.configuration.robot_file import VARIABLES
 from fog_runtime.configuration.settings import CommonSettings, SettingsError
 from fog_runtime.credentials import NOBODY
@@ -37,6 +38,7 @@ if TYPE_CHECKING:
 SITE_FILE: Final = "site.toml"
 NO_SITE: Final = "none"
 _BODY_TOLERANCE_M: Final = 0.02
+CAMERA_LIBRARIES: Final = ("pyapriltags", "linuxpy")
 _ADD_RADIUS: Final = "Add how far (m) the robot's body reaches from the point between its driven wheels"
 
 
@@ -72,6 +74,7 @@ class Given(NamedTuple):
 
     site: str
     body: RobotSite
+    markers: list[MarkerSite]
     operator_key: bytes
     credentials: Credentials
     footprint: Footprint | None
@@ -87,8 +90,12 @@ def read_given(settings: Settings, robot: RobotFile) -> Given:
 
     """
     footprint, base = read_footprint(robot), registry.make_base(robot)
-    site, body = read_site(settings) if settings.fog else without_site(settings.robot, robot, footprint)
+    if settings.fog:
+        site, body, markers = read_site(settings)
+    else:
+        site, body, markers = *without_site(settings.robot, robot, footprint), []
     refuse_contradictions(robot, base)
+    _refuse_missing_libraries(robot)
     refuse_body(robot, base, footprint or Footprint.circle(body.radius))
     if footprint is not None and footprint.circumscribed_radius > body.radius + _BODY_TOLERANCE_M:
         raise robot.error(
@@ -101,6 +108,7 @@ def read_given(settings: Settings, robot: RobotFile) -> Given:
     return Given(
         site=site,
         body=body,
+        markers=markers,
         operator_key=read_operator_key(settings.operator_key_file) if settings.fog else secrets.token_bytes(KEY_BYTES),
         credentials=settings.credentials() if settings.fog else NOBODY,
         footprint=footprint,
@@ -108,8 +116,11 @@ def read_given(settings: Settings, robot: RobotFile) -> Given:
     )
 
 
-def read_site(settings: Settings) -> tuple[str, RobotSite]:
-    """Return the site's id and its entry of this robot, without which the body is not known; raises `SettingsError`."""
+def read_site(settings: Settings) -> tuple[str, RobotSite, list[MarkerSite]]:
+    """Return the site's id, its entry of this robot, without which the body is not known, and its markers.
+
+    Raises `SettingsError`.
+    """
     file = settings.site_dir / SITE_FILE
     if settings.site_dir == Path() and not file.is_file():
         raise SettingsError(
@@ -132,7 +143,7 @@ def read_site(settings: Settings) -> tuple[str, RobotSite]:
         )
     for robot in site.robots:
         if robot.id == settings.robot:
-            return site.id, robot
+            return site.id, robot, site.markers
     known = ", ".join(robot.id for robot in site.robots) or "none"
     raise SettingsError(f"{file}: robots: there is no {settings.robot!r} (known: {known}). Add it, or set FOGNAV_ROBOT")
 
@@ -194,6 +205,7 @@ def refuse_contradictions(robot: RobotFile, base: BaseDriver) -> None:
     _refuse_masks(robot)
     _refuse_speed(robot, base)
     _refuse_power(robot, base)
+    _refuse_camera(robot)
 
 
 def refuse_body(robot: RobotFile, base: BaseDriver, footprint: Footprint) -> None:
@@ -287,6 +299,28 @@ def _refuse_speed(robot: RobotFile, base: BaseDriver) -> None:
             "motion.speed_m_s",
             f"{speed:g} m/s is more than the base's wheels can do, {top:g} m/s",
             f"Set it to {top:g} or less, or correct the top speed in [base.options]",
+        )
+
+
+def _refuse_camera(robot: RobotFile) -> None:
+    camera = robot.settings.camera
+    if camera.source and camera.focal_px == 0.0:
+        raise robot.error(
+            "camera.focal_px",
+            "0, so the camera's pictures tell neither distances nor directions",
+            f"Set it as its calibration says, or to {camera.width_px} / (2 tan(half of its horizontal angle of view))",
+        )
+    if len(camera.centre_px) == 1:
+        raise robot.error("camera.centre_px", "it has one number", "Give [right, down] in pixels, or [] for the middle")
+
+
+def _refuse_missing_libraries(robot: RobotFile) -> None:
+    missing = [name for name in CAMERA_LIBRARIES if importlib.util.find_spec(name) is None]
+    if robot.settings.camera.source and missing:
+        raise robot.error(
+            "camera.source",
+            f"a camera needs {' and '.join(missing)}, which are not installed",
+            "Install requirements/robot-camera.txt (docs/robot-setup.md), or remove `source`",
         )
 
 

@@ -211,10 +211,10 @@ async def test_credentials_that_change_while_the_node_starts_come_into_force(nod
     monkeypatch.setattr(LocalNode, "start", start)
     told: list[str] = []
     running_node = asyncio.create_task(fog_node.run_node(node.config, told.append))
-    await until(lambda: "credentials have changed: zenoh-router uses the new ones" in told or running_node.done())
+    await until(lambda: "files have changed: zenoh-router uses the new ones" in told or running_node.done())
     running_node.cancel()
     await asyncio.wait({running_node})
-    assert "credentials have changed: zenoh-router uses the new ones" in told
+    assert "files have changed: zenoh-router uses the new ones" in told
 
 
 def test_log_is_cut_without_a_copy_on_a_full_disk(tmp_path):

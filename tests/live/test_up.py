@@ -22,8 +22,10 @@ from attacks import ATTACKS, few_files, running
 from floor_ports import floor_ports
 
 from fog_contracts import channels as ch
+from fog_contracts.grid import StaticMap
 from fog_contracts.messages import RobotPose, RobotState
 from fog_runtime.clock import SystemClock
+from fog_runtime.configuration.maps import load_map, save_map
 from fog_runtime.credentials import Credentials
 from fog_runtime.transports.zenoh_edge import ZenohEdge
 from fog_supervisor import child, net
@@ -219,6 +221,60 @@ def test_zone_survives_a_killed_service_and_a_restart_of_the_node(node, tmp_path
     assert "wet floor" in zones
     assert "after the backup" not in zones
     node.down()
+
+
+def walled(source: Path, target: Path, left: float, bottom: float, right: float, top: float) -> Path:
+    """Write a map with one more wall (m); return its file."""
+    static = load_map(source)
+    cells, window = static.cells.copy(), static.geometry.window_around(left, bottom, right, top)
+    cells[window.rows, window.columns] = 254
+    save_map(target, StaticMap(static.geometry, cells))
+    return target.with_suffix(".yaml")
+
+
+def test_running_fog_gets_another_map_on_which_a_robot_plans_and_the_way_back(tmp_path):
+    site = shutil.copytree(ROOT / "sites" / "estig", tmp_path / "site")
+    node = Node(tmp_path, "--sim", "--site", str(site))
+    change = ("map", "change", "--site", str(site))
+    try:
+        node.up()
+
+        def planned(epoch: int) -> str:
+            """Send the robot to B, and return the path's length (m) once it drives on a map of this epoch."""
+            node.run("robot", "enable")
+            node.run("robot", "goal", "b")
+            node.wait(lambda: robot()["state"]["goal_distance"] is not None, "the robot has a path")
+            node.wait(lambda: robot()["plan"] is not None and robot()["plan"]["map_epoch"] == epoch, "it is a new one")
+            return robot()["state"]["goal_distance"]
+
+        def robot() -> dict[str, Any]:
+            return node.json("robot", "status")
+
+        node.wait(lambda: (robot()["pose"] or {}).get("localized"), "the robot knows where it is")
+        in_wall = walled(site / "map.yaml", tmp_path / "in-wall", 58.0, 43.5, 60.0, 44.5)
+        with pytest.raises(AssertionError, match=r"place b at \(59\.00, 44\.00\) lies in a wall"):
+            node.run(*change, str(in_wall))
+        shut = walled(site / "map.yaml", tmp_path / "shut", 50.0, 38.0, 50.5, 41.0)  # the upper corridor
+        preview = node.json(*change, str(shut), "--preview")
+        assert (preview["findings"], preview["changed"]) == ([], False)
+        first = node.json(*change, str(shut), "--preview")["fog"]
+        assert first == "fog-estig"
+
+        before = {name: node.systems()["estig"]["pids"][name] for name in ("map-service", "planner", "mosquitto")}
+        changed = node.json(*change, str(shut))
+        assert changed["epoch"] > changed["epoch_before"]
+        assert changed["localized"]["r1"] is not None
+        after = node.systems()["estig"]["pids"]
+        assert {name for name, pid in before.items() if after[name] != pid} == {"map-service", "planner"}
+        around = planned(changed["epoch"])
+
+        back = node.json(*change, "--back")
+        assert back["epoch"] > changed["epoch"]
+        assert "its mission to b has ended" in back["robots"]["r1"]
+        assert robot()["state"]["enabled"] is False
+        assert planned(back["epoch"]) < around - 5.0
+    finally:
+        node.end()
 
 
 def second_floor(folder: Path) -> Path:

@@ -133,6 +133,7 @@ def _quoted(text: str) -> str:
 
 
 _TABLE = re.compile(r"^\s*\[")
+_MAP_LINE = re.compile(r"^\s*map\s*=")
 _NODE_TABLE = re.compile(r"^\s*\[\[\s*nodes\s*\]\]")
 
 
@@ -179,6 +180,18 @@ def replaced(text: str, node: NodeSite) -> str | None:
         return None
     new = "\n".join(node_lines(node)).rstrip("\n") + "\n"
     return "".join(lines[:begin]) + new + "".join(lines[end:])
+
+
+def with_map(loaded: LoadedSite, map_name: str) -> str:
+    """Return the text of the site's file with another map; raises `WrongUseError` if that makes the site invalid."""
+    lines = _read(loaded.directory).splitlines(keepends=True)
+    tables = next((index for index, line in enumerate(lines) if _TABLE.match(line)), len(lines))
+    known = next((index for index in range(tables) if _MAP_LINE.match(lines[index])), None)
+    # A site whose file names no map has map.yaml.
+    lines[slice(0, 0) if known is None else slice(known, known + 1)] = [f"map = {_quoted(map_name)}\n"]
+    text = "".join(lines)
+    _check(loaded.directory, text)
+    return text
 
 
 def _table_of(lines: list[str], name: str) -> tuple[int, int]:

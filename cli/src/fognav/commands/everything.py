@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from fognav.commands import installed, robot  # noqa: F401  # it adds to `fognav robot`
+from fognav.commands import installed, map_change, robot  # noqa: F401  # they add to `fognav map` and `fognav robot`
 from fognav.commands.access import ca_app, robot_add, token_app
 from fognav.commands.area import alert_app, area_app
 from fognav.commands.backup import backup_command, restore_command, store_app

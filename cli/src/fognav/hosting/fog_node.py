@@ -1,6 +1,6 @@
 """The programs of a fog node on this machine: as they are run until a signal, and as other commands see them.
 
-Changes of the credentials come into force while it runs: new robots and nodes, new certificates. Mosquitto reads its
+Changes of the credentials and of a site's map (`fognav map change`) come into force while it runs. Mosquitto reads its
 files again on a signal. Redis, the router and the services read them at their start only, so each is started again, one
 at a time, when its own files have changed: what else is connected goes on meanwhile, and what was connected to it
 connects again.
@@ -60,7 +60,7 @@ _RESTARTED_S: Final = 180.0
 
 
 class CredentialChanges:
-    """Watches the files of each program's credentials; `round` is called once a second."""
+    """Watches the files of each program's credentials, and the order to read a map; `round` is called once a second."""
 
     def __init__(self, supervisor: Supervisor, files: Mapping[str, Sequence[Path]]) -> None:
         """Watch these files, or all in these folders, by the program that reads them; servers come first."""
@@ -190,7 +190,11 @@ class LocalNode:
         security = self.config.security
         servers: dict[str, list[Path]] = {name: [security.folder(folder)] for name, folder in SECURITY.items()}
         services = {
-            site.name(service): [security.folder("http"), security.credentials(site.name(service))]
+            site.name(service): [
+                security.folder("http"),
+                security.credentials(site.name(service)),
+                self.config.folder.map_order(site.id),
+            ]
             for site in self.config.sites
             for service in SERVICES
         }
@@ -370,9 +374,9 @@ async def attend(
     manager.ready()
     troubles = Troubles(print_line)
     while True:
-        with troubles.told("changed credentials are not in force"):
+        with troubles.told("changed files are not in force"):
             if (changed := await changes.round()) is not None:
-                print_line(f"credentials have changed: {changed} uses the new ones")
+                print_line(f"files have changed: {changed} uses the new ones")
         for site, each in zip(node.config.sites, registrations, strict=True):
             with troubles.told(f"the entry of site {site.id} in the register is not current"):
                 each.update()

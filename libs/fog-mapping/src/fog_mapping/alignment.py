@@ -24,7 +24,7 @@ _TURN_STEP: Final = math.radians(1.0)
 _POINTS: Final = 1500
 _SPREAD_CELLS: Final = 3
 _GATES: Final = np.array([0.5] * 4 + [0.3] * 4 + [0.15] * 6)
-_LEAST_SHARE: Final = 0.7
+LEAST_SHARE: Final = 0.7
 """Of the walls that both maps could see, so many must lie on each other ..."""
 _MOST_RESIDUAL_M: Final = 0.075
 """... so well, or by a cell of a coarse map. At random it would be 0.087."""
@@ -93,13 +93,13 @@ def align(static: StaticMap, onto: StaticMap) -> Alignment:
     x, y, theta = refined.pose
     shift = place(np.array((x, y, theta)), -centre[None])[0]
     pose = float(shift[0]), float(shift[1]), theta
-    result = _judged(static, onto, pose)
+    result = judged(static, onto, pose)
     most = max(_MOST_RESIDUAL_M, static.geometry.resolution, onto.geometry.resolution)
-    if result.share < _LEAST_SHARE or result.residual > most:
+    if result.share < LEAST_SHARE or result.residual > most:
         raise MisfitError(
             f"the maps do not fit: at the best place ({pose[0]:.2f}, {pose[1]:.2f}, {math.degrees(theta):.1f} degrees) "
             f"{result.share:.0%} of the walls lie on each other, {1000 * result.residual:.0f} mm rms; "
-            f"{_LEAST_SHARE:.0%} and {1000 * most:.0f} mm are needed. Name maps of the same floor"
+            f"{LEAST_SHARE:.0%} and {1000 * most:.0f} mm are needed. Name maps of the same floor"
         )
     if rival is not None:
         raise MisfitError(
@@ -109,7 +109,7 @@ def align(static: StaticMap, onto: StaticMap) -> Alignment:
     return result
 
 
-def _judged(static: StaticMap, onto: StaticMap, pose: tuple[float, float, float]) -> Alignment:
+def judged(static: StaticMap, onto: StaticMap, pose: tuple[float, float, float]) -> Alignment:
     """Return how well a map lies on another: its walls where the other knows, and the other's where it knows."""
     moved = np.array(pose)
     points, _ = wall_points(static)
@@ -121,7 +121,9 @@ def _judged(static: StaticMap, onto: StaticMap, pose: tuple[float, float, float]
     ]
     away = np.concatenate(near)
     close = away <= _ON_WALL_M
-    return Alignment(pose, float(close.mean()), float(np.sqrt(np.mean(away[close] ** 2))) if close.any() else math.inf)
+    if not close.any():
+        return Alignment(pose, 0.0, math.inf)
+    return Alignment(pose, float(close.mean()), float(np.sqrt(np.mean(away[close] ** 2))))
 
 
 def _distances(static: StaticMap, points: NDArray[np.float64]) -> NDArray[np.float64]:

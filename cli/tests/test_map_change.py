@@ -12,7 +12,7 @@ from typer.testing import CliRunner
 from fog_contracts.grid import GridGeometry, StaticMap
 from fog_contracts.messages import CircleShape, Pose, Zone
 from fog_contracts.resampling import resampled
-from fog_contracts.site import AreaSite, NodeSite, Place, RobotSite, Site, Sonar
+from fog_contracts.site import AreaSite, MarkerSite, NodeSite, Place, RobotSite, Site, Sonar
 from fog_runtime.configuration.maps import load_map, save_map
 from fog_runtime.configuration.site import load_site
 from fognav.__main__ import app
@@ -42,6 +42,7 @@ SITE = Site(
             sonars=[Sonar(angle=angle, range_limit=1.6, range_max=2.3) for angle in (-0.2, 0.2)],
         )
     ],
+    markers=[MarkerSite(id=7, x=5.1, y=2.0, theta=math.pi / 2)],
     robots=[
         RobotSite(id="r1", start=Pose(x=2.0, y=6.0, theta=0.0), dock=Pose(x=0.8, y=6.0, theta=math.pi), radius=0.17)
     ],
@@ -62,6 +63,7 @@ SITE = Site(
             (2.9, 4.4, 3.4, 4.9),
             {"zone wet lies in a wall", "robot r7 stands where the new map says: it lies in a wall"},
         ),
+        ((5.0, 2.1, 5.2, 2.4), {"marker 7 looks into a wall"}),
         ((0.6, 0.6, 0.8, 0.8), set()),
     ],
 )

@@ -13,6 +13,7 @@ from fog_contracts.shapes import ShapeError, rasterize, rasterize_shape
 from fog_kernels.components import Components
 from fog_kernels.distance import squared_distance_capped
 from fog_mapping.alignment import LEAST_SHARE, Alignment, align, judged, laid_onto
+from fog_runtime.configuration.site import BEFORE_MARKER_M
 from fognav.nodes.placing import heard
 from fognav_sim.floor import Floor
 from fognav_sim.node import classify, default_config
@@ -152,6 +153,7 @@ def findings(
         *_of_points(site, old, new),
         *_of_docks(site, old, new),
         *_of_nodes(site, old, new),
+        *_of_markers(site, new),
         *_of_areas(site, old, new, zones),
         *(
             Finding("robot", name, x, y, f"stands where the new map says: it {problem}")
@@ -194,6 +196,18 @@ def _of_nodes(site: Site, old: _Ground, new: _Ground) -> Iterator[Finding]:
         elif old.reported(node) == "clear" and (state := new.reported(node)) != "clear":
             problem = f"would report {state} with nothing there: by this map its walls are elsewhere"
             yield Finding("node", node.id, node.x, node.y, problem)
+
+
+def _of_markers(site: Site, new: _Ground) -> Iterator[Finding]:
+    for marker in site.markers:
+        seen_from = [
+            (marker.x + ahead * math.cos(marker.theta), marker.y + ahead * math.sin(marker.theta))
+            for ahead in BEFORE_MARKER_M
+        ]
+        if not new.holds(marker.x, marker.y) or any(new.trouble(*point) for point in seen_from):
+            yield Finding(
+                "marker", str(marker.id), marker.x, marker.y, "looks into a wall, or off the map", refused=True
+            )
 
 
 def _of_areas(site: Site, old: _Ground, new: _Ground, zones: Iterable[Zone]) -> Iterator[Finding]:

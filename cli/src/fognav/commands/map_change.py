@@ -93,7 +93,12 @@ def map_change(  # noqa: PLR0913  # each option is an argument
                 made = {**read_provenance(map_file), _KEY: {**provenance(map_file), "previous": present.site.map}}
                 with writing(present.directory / name, "Run this as the folder's owner"):
                     save_map((present.directory / name).with_suffix(""), static, made)
-            values |= _change(present, name, running)
+            try:
+                values |= _change(present, name, running)
+            except (WrongUseError, FailedError):
+                for suffix in (".yaml", ".pgm") if map_file is not None else ():
+                    (present.directory / name).with_suffix(suffix).unlink(missing_ok=True)
+                raise
             lines += _changed(present, values, running)
         elif refused:
             lines.append(_refusal(present, found))

@@ -24,7 +24,7 @@ _MEANING: Final = {"radius": ", how far (m) the robot's body reaches from the po
 """Of fields that files of an earlier version need not have."""
 _BORDER: Final = 1e-6
 """Metres by which a vertex may lie off the map: the rounding error of a polygon drawn along the map's edge."""
-_BEFORE_MARKER_M: Final = (0.15, 0.3)
+BEFORE_MARKER_M: Final = (0.15, 0.3)
 """So far in front of a marker the floor is free. It hangs on the face of a wall, whose cells may reach past it."""
 
 
@@ -221,7 +221,7 @@ def _is_free(x: float, y: float, static: StaticMap) -> bool:
 def _check_seen(file: Path, field: str, marker: MarkerSite, static: StaticMap) -> None:
     """Raise `SiteError` for a marker off the map, in a wall, or that looks into one: no camera ever sees it."""
     _check_on_map(file, field, marker.x, marker.y, static)
-    for ahead in _BEFORE_MARKER_M:
+    for ahead in BEFORE_MARKER_M:
         x, y = marker.x + ahead * math.cos(marker.theta), marker.y + ahead * math.sin(marker.theta)
         if not _is_free(x, y, static):
             problem = f"({marker.x:g}, {marker.y:g}) looks at ({x:.2f}, {y:.2f}), which is a wall or unknown"

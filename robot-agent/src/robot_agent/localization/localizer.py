@@ -160,14 +160,12 @@ class Localizer:
 
     def on_sighting(self, sighting: Sighting, now: float) -> None:
         """Weigh what a marker says of the pose; one from before the odometry, or that no scan can check, is dropped."""
-        scan, fields = self.scan, self._fields
-        odom = self._odometry.pose(sighting.stamp)
+        scan, fields, odom = self.scan, self._fields, self._odometry.pose(sighting.stamp)
         if scan is None or fields is None or odom is None or not self._odometry.reaches_back_to(sighting.stamp):
             return
         pose, good = self._filter.pose(odom), self.status == "good"
         known = None if pose is None or self.status not in {"good", "weak"} else Place(pose, self._filter.covariance)
-        step, reach = scan.odom.relative_to(odom), self._config.range_max
-        confirmed = partial(place_by_scan, step=step, scan=scan, fields=fields, range_max=reach)
+        confirmed = partial(place_by_scan, odom=odom, scan=scan, fields=fields, range_max=self._config.range_max)
         word = self.markers.weigh(sighting, odom, known, confirmed, good=good)
         if isinstance(word, Fused):
             if word.place is not None:
@@ -340,7 +338,9 @@ class Localizer:
         self._history.follow(scan.odom, self._monitor.status, shaken=shaken)
         rivalled = not self._history.tracked and len(self._relocalization.places) > 1
         self._doubt.add(fit, scan.odom, jumped=self._filter.jumped, rivalled=rivalled)
-        self._monitor.add(fit, self._filter.uncertainty, doubt=self._doubt.reason, kept=self._history.keeps(fit))
+        self._monitor.add(
+            fit, self._filter.uncertainty, doubt=self._doubt.reason or self.markers.doubt, kept=self._history.keeps(fit)
+        )
         self._history.judge(pose, scan.odom, self._monitor.status)
         if self._history.contested and differs_by_doors(fit):
             self._monitor.lose(_SAVED_OR_FOUND)

@@ -112,11 +112,12 @@ def narrows(place: Place, known: Place) -> bool:
     return bool(np.linalg.eigvals(np.linalg.solve(place.covariance, known.covariance)).real.max() > 1.0)
 
 
-def place_by_scan(place: Place, step: Pose2, scan: DeskewedScan, fields: MapFields, range_max: float) -> Pose2 | None:
+def place_by_scan(place: Place, odom: Pose2, scan: DeskewedScan, fields: MapFields, range_max: float) -> Pose2 | None:
     """Return the pose around a place that a scan confirms, at the scan's time; None if it confirms none.
 
-    step: the robot's way from the sighting to the scan, by the odometry. range_max: the lidar's rated range (m).
+    odom: what the odometry said at the place's time. range_max: the lidar's rated range (m).
     """
+    step = scan.odom.relative_to(odom)
     values, vectors = np.linalg.eigh(place.covariance)
     axes = (vectors * np.sqrt(np.maximum(values, 0.0))).T[::-1]
     shifts = np.array([np.array(by) @ axes for by in itertools.product(*_STEPS)])
@@ -128,12 +129,17 @@ def place_by_scan(place: Place, step: Pose2, scan: DeskewedScan, fields: MapFiel
 
 
 class _Rival(NamedTuple):
-    """A place other than that of the pose, when the odometry said `odom`, and the markers that tell of it."""
+    """A place other than that of the pose, when the odometry said `odom`, and the markers that tell of it.
+
+    markers: with where the pose says that each hangs. far: nobody can have moved a marker so that it tells this place
+    but to one that looks the same.
+    """
 
     pose: Pose2
     odom: Pose2
-    markers: frozenset[int] = frozenset()
+    markers: dict[int, Pose2]
     sightings: int = 0
+    far: bool = False
 
 
 class Markers:
@@ -155,6 +161,15 @@ class Markers:
         """Take notice that the robot may have been carried, or that its pose is another one."""
         self._support.clear()
 
+    @property
+    def doubt(self) -> str:
+        """Why the pose is not good though scans fit it; empty if no marker speaks against it."""
+        rival = self._rival
+        if rival is None or not rival.far or rival.sightings < _SIGHTINGS:
+            return ""
+        named = " and ".join(map(str, sorted(rival.markers)))
+        return f"marker {named} tells of another place that looks like this one: another marker has to decide"
+
     def weigh(
         self, sighting: Sighting, odom: Pose2, known: Place | None, confirmed: Confirmed, *, good: bool
     ) -> Fused | Found | None:
@@ -171,10 +186,11 @@ class Markers:
         if known is not None and _within(place.pose, known.pose, _APART):
             return None
         found = confirmed(place)
-        if found is not None and self._moves(sighting.marker, place, known, found, odom):
+        far = known is None or not _within(place.pose, known.pose, _NEAR)
+        if found is not None and self._moves(sighting, known, found, odom, far=far):
             sigmas = _sigma_xy(place), math.sqrt(place.covariance[2, 2])
             return Found(found, (max(sigmas[0], _FOUND_SIGMAS[0]), max(sigmas[1], _FOUND_SIGMAS[1])))
-        if known is not None and good:
+        if known is not None and good and (found is None or not far):
             self._contradict(sighting, known.pose, odom)
         return None
 
@@ -188,6 +204,10 @@ class Markers:
 
     def _agree(self, marker: int) -> bool:
         """Take notice of a sighting that agrees with the pose; return whether the marker is believed."""
+        rival = self._rival
+        if marker not in self.problems and rival is not None and self.doubt:
+            for one, seen in rival.markers.items():
+                self._report(one, seen)
         if marker in self.problems:
             return False
         self._support.add(marker)
@@ -196,21 +216,23 @@ class Markers:
         self._rival = None
         return True
 
-    def _moves(self, marker: int, place: Place, known: Place | None, found: Pose2, odom: Pose2) -> bool:
+    def _moves(self, sighting: Sighting, known: Place | None, found: Pose2, odom: Pose2, *, far: bool) -> bool:
         """Return whether the robot is where a marker says, which does not agree with its pose or knows it first.
 
         The other place is followed by the odometry of the pictures: that of the scans but for some centimetres.
         """
         rival = self._rival
         if rival is None or apart(rival.pose.compose(odom.relative_to(rival.odom)), found):
-            rival = _Rival(found, odom)
-        self._rival = rival = _Rival(found, odom, rival.markers | {marker}, rival.sightings + 1)
-        needed = 2 if known is not None and (self._support or _within(place.pose, known.pose, _NEAR)) else 1
+            rival = _Rival(found, odom, {})
+        seen = (found if known is None else known.pose).compose(sighting.pose)
+        markers = rival.markers | {sighting.marker: seen}
+        needed = 2 if known is not None and (self._support or not far) else 1
+        self._rival = rival = _Rival(found, odom, markers, rival.sightings + 1, far and needed > 1)
         # One that was found to hang elsewhere counts only beside another one, which says that it hangs right after all.
-        believed = rival.markers if needed > 1 else rival.markers - self.problems.keys()
+        believed = markers.keys() if needed > 1 else markers.keys() - self.problems.keys()
         if rival.sightings < _SIGHTINGS or len(believed) < needed:
             return False
-        for one in rival.markers:
+        for one in markers:
             self.problems.pop(one, None)
             self._against.pop(one, None)
         self._rival = None
@@ -218,14 +240,17 @@ class Markers:
 
     def _contradict(self, sighting: Sighting, pose: Pose2, odom: Pose2) -> None:
         """Take notice that a sighting contradicts a good pose, when the odometry said `odom`."""
-        marker = sighting.marker
-        against = self._against.setdefault(marker, [])
-        if marker in self.problems or (against and _within(odom, against[-1], _NEWS)):
+        against = self._against.setdefault(sighting.marker, [])
+        if not against or not _within(odom, against[-1], _NEWS):
+            against.append(odom)
+        if len(against) >= _REPORT_AFTER:
+            self._report(sighting.marker, pose.compose(sighting.pose))
+
+    def _report(self, marker: int, seen: Pose2) -> None:
+        """Believe a marker no more, which was seen at a place of the map where it does not hang."""
+        if marker in self.problems:
             return
-        against.append(odom)
-        if len(against) < _REPORT_AFTER:
-            return
-        seen, hung = pose.compose(sighting.pose), self._hung[marker]
+        hung = self._hung[marker]
         where = f"was seen at ({seen.x:.1f}, {seen.y:.1f})"
         twice = ", and at its own place before: there are two of it, or it was moved" if marker in self._agreed else ""
         self.problems[marker] = Reason(

@@ -28,7 +28,8 @@ from fog_contracts.messages import (
     Zone,
     ZoneSet,
 )
-from fog_contracts.replica import MapError
+from fog_contracts.replica import MapError, MasterMap
+from fog_kernels.inflation import inflate
 from robot_agent.agent.core import AgentCore
 from robot_agent.motion.local_planner import decide
 from robot_agent.scan_builder import Mounting
@@ -231,6 +232,22 @@ def test_snapshot_with_an_epoch_that_no_map_service_can_have_is_refused_and_the_
         driving.agent.load(msgspec.structs.replace(driving.master.snapshot(), epoch=2**53), driving.now)
     driving.run(2.0)
     assert driving.state().mode == "NORMAL"
+
+
+def test_new_map_in_another_frame_stops_a_driving_robot_until_it_is_found_there_and_enabled(driving):
+    moved = msgspec.structs.replace(driving.geometry, origin_x=driving.geometry.origin_x + 3.0)
+    cost = inflate(driving.raw, driving.table)
+    driving.master = MasterMap("lab", moved, driving.static, cost, epoch=8)
+    driving.agent.load(driving.master.snapshot(), driving.now)
+    assert driving.run(1.0, lambda w: w.state().mode == "PROTECTIVE_STOP")
+    assert "pose_unknown" in driving.state().codes
+    seconds_to_rest(driving)
+    assert driving.run(20.0, lambda w: w.agent.localizer.status == "good")
+    pose = driving.agent.localizer.pose(driving.now)
+    assert math.hypot(pose.x - driving.x - 3.0, pose.y - driving.y) < 0.1
+    driving.run(3.0)
+    assert driving.state().mode == "PROTECTIVE_STOP"
+    assert driving.command("enable").accepted
 
 
 def test_late_deltas_do_not_make_the_map_fresh_while_newer_ones_are_missing(driving):

@@ -20,6 +20,7 @@ import psutil
 import pytest
 from attacks import ATTACKS, few_files, running
 from floor_ports import floor_ports
+from typer.testing import CliRunner
 
 from fog_contracts import channels as ch
 from fog_contracts.grid import StaticMap
@@ -29,6 +30,8 @@ from fog_runtime.configuration.maps import load_map, save_map
 from fog_runtime.credentials import Credentials
 from fog_runtime.transports.zenoh_edge import ZenohEdge
 from fog_supervisor import child, net
+from fognav.__main__ import app
+from fognav.commands import map_change
 from fognav.hosting.upgrading import Versions
 from fognav.output import FailedError, WrongUseError
 
@@ -232,20 +235,27 @@ def walled(source: Path, target: Path, left: float, bottom: float, right: float,
     return target.with_suffix(".yaml")
 
 
-def test_running_fog_gets_another_map_on_which_a_robot_plans_and_the_way_back(tmp_path):
+def test_running_fog_gets_another_map_on_which_a_robot_plans_and_the_way_back(tmp_path, monkeypatch):
     site = shutil.copytree(ROOT / "sites" / "estig", tmp_path / "site")
     node = Node(tmp_path, "--sim", "--site", str(site))
     change = ("map", "change", "--site", str(site))
     try:
         node.up()
 
-        def planned(epoch: int) -> str:
-            """Send the robot to B, and return the path's length (m) once it drives on a map of this epoch."""
+        def planned(epoch: int) -> float:
+            """Send the robot to B; return the path's length (m) once it drives there on the map of this epoch."""
             node.run("robot", "enable")
             node.run("robot", "goal", "b")
-            node.wait(lambda: robot()["state"]["goal_distance"] is not None, "the robot has a path")
-            node.wait(lambda: robot()["plan"] is not None and robot()["plan"]["map_epoch"] == epoch, "it is a new one")
-            return robot()["state"]["goal_distance"]
+            found: dict[str, Any] = {}
+
+            def on_its_way() -> bool:
+                found.update(robot())
+                state, goal, plan = found["state"], found["goal"], found["plan"]
+                known = goal is not None and plan is not None and state["goal_id"] == goal["goal_id"]
+                return known and plan["map_epoch"] == epoch and state["goal_distance"] is not None
+
+            node.wait(on_its_way, "the robot has a path on the new map")
+            return float(found["state"]["goal_distance"])
 
         def robot() -> dict[str, Any]:
             return node.json("robot", "status")
@@ -257,8 +267,7 @@ def test_running_fog_gets_another_map_on_which_a_robot_plans_and_the_way_back(tm
         shut = walled(site / "map.yaml", tmp_path / "shut", 50.0, 38.0, 50.5, 41.0)  # the upper corridor
         preview = node.json(*change, str(shut), "--preview")
         assert (preview["findings"], preview["changed"]) == ([], False)
-        first = node.json(*change, str(shut), "--preview")["fog"]
-        assert first == "fog-estig"
+        assert preview["fog"] == "fog-estig"
 
         before = {name: node.systems()["estig"]["pids"][name] for name in ("map-service", "planner", "mosquitto")}
         changed = node.json(*change, str(shut))
@@ -273,6 +282,14 @@ def test_running_fog_gets_another_map_on_which_a_robot_plans_and_the_way_back(tm
         assert "its mission to b has ended" in back["robots"]["r1"]
         assert robot()["state"]["enabled"] is False
         assert planned(back["epoch"]) < around - 5.0
+
+        # One that is not in force in time is taken back.
+        before_it = {file.name: file.read_bytes() for file in site.iterdir() if file.is_file()}
+        monkeypatch.setenv("XDG_RUNTIME_DIR", node.environment["XDG_RUNTIME_DIR"])
+        monkeypatch.setattr(map_change, "_IN_FORCE_S", 0.1)
+        failed = CliRunner().invoke(app, [*change, str(shut)])
+        assert (failed.exit_code, "names map.yaml again" in failed.output) == (1, True)
+        assert {file.name: file.read_bytes() for file in site.iterdir() if file.is_file()} == before_it
     finally:
         node.end()
 

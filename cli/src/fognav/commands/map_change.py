@@ -207,7 +207,7 @@ class _Node:
         system = self.fog.system
         found = [each for each in registered() if (each.name, each.data) == (system.name, system.data)]
         if not found:
-            raise FailedError(f"the fog node {system.name} has ended; its next start uses the map in {SITE_FILE}")
+            raise FailedError(f"the fog node {system.name} has ended")
         names = {name.rpartition(".")[2]: pid for name, pid in found[0].pids.items()}
         return {service: names[service] for service in SERVICES if service in names}
 
@@ -256,7 +256,8 @@ def _change(present: LoadedSite, name: str, running: Fog | None) -> dict[str, An
         site_files.write(present, site_files.with_map(present, present.site.map))
         node.order(present.site.map)
         raise FailedError(
-            f"{error}. {present.directory / SITE_FILE} names {present.site.map} again, and the services start with it"
+            f"{error}. {present.directory / SITE_FILE} names {present.site.map} again, and the services start with "
+            "that; their logs say more (fognav logs map-service)"
         ) from error
     return {"epoch_before": epoch, "epoch": reached, "robots": robots, "localized": _localized(running, reached)}
 

@@ -10,6 +10,8 @@ from fognav.commands.area import alert_app, area_app
 from fognav.commands.backup import backup_command, restore_command, store_app
 from fognav.commands.demo import demo_command, record_command, replay_command
 from fognav.commands.develop import channels_command, check_command, docs_command, run_tests
+from fognav.commands.map_files import map_app
+from fognav.commands.map_plan import FORWARDED, map_from_plan
 from fognav.commands.node import node_app
 from fognav.commands.robot_file import robot_app
 from fognav.commands.site import site_app
@@ -62,3 +64,8 @@ def add_to(app: typer.Typer) -> None:
         rich_help_panel=installed.DEVELOP,
     )(run_tests)
     robot_app.command("add", epilog="Example: fognav robot add r2 --credentials DIR")(robot_add)
+    map_app.command(
+        "from-plan",
+        context_settings=FORWARDED,
+        epilog="Example: fognav map from-plan plan.png --points 120,80 980,80 --metres 21.5 --out floor",
+    )(map_from_plan)

@@ -42,6 +42,12 @@ def map_clean(
     commands: Annotated[
         Path | None, typer.Option("--commands", metavar="FILE", help="The commands; default: MAP.clean.")
     ] = None,
+    onto: Annotated[
+        Path | None,
+        typer.Option(
+            "--onto", metavar="OTHER.yaml", help="Lay the map onto another, such as a plan's, and clean it so."
+        ),
+    ] = None,
     out: Annotated[
         Path | None, typer.Option("--out", metavar="PREFIX", help="PREFIX.yaml and .pgm are written: MAP-clean.")
     ] = None,
@@ -54,15 +60,19 @@ def map_clean(
     matching of walls, and refused if it doesn't fit (exit code 1).
     """
     with exit_codes():
-        file = commands_file(map_file) if commands is None else commands
+        if onto is not None and commands is not None:
+            raise WrongUseError(
+                "--onto and --commands: the file of commands names the map that it is laid onto. Give one"
+            )
+        file = commands_file(onto or map_file) if commands is None else commands
         prefix = map_file.with_name(f"{map_file.stem}-clean") if out is None else out
         check_writable(Path(f"{prefix}.yaml"))
         static = loaded(map_file)
-        text = begun(file, map_file, static)
+        text = begun(file, map_file, static) if onto is None else begun(file, onto, loaded(onto))
         if command:
             text = with_lines(text, [" ".join(command)])
         read = _read(file, text)
-        if not read.commands:
+        if not read.commands and onto is None:
             raise WrongUseError(f"{file} has no commands: add one, as in fognav map clean {map_file} straighten")
         done = _cleaned(file, read, static)
         if command or not file.exists():

@@ -1,201 +1,23 @@
-"""Every condition in every mode: which mode follows, when it is left, and who must act. All limits are literal here."""
+"""Every condition (`gate_rows`) in every mode: which mode follows, when it is left, and who must act."""
 
 from __future__ import annotations
 
+import itertools
 import math
 import re
 from pathlib import Path
-from typing import NamedTuple
 
 import pytest
+from gate_rows import CAP, RANK, ROWS, STOP, TO, Gate, inputs
 
 from fog_contracts.messages import ReasonCode
 from robot_agent.bases.diffdrive.driver import DiffDriveFault
 from robot_agent.bases.roomba600.driver import RoombaFault
 from robot_agent.config import SafetyConfig
 from robot_agent.guardian.base import FaultCode
-from robot_agent.safety.conditions import CONDITIONS, Finding, Level, SafetyInputs, collect_findings
+from robot_agent.safety.conditions import CONDITIONS, Finding, Level, collect_findings
 from robot_agent.safety.gate import MODE_OF, SafetyState, step
-
-DT = 0.05
-HEALTHY = {
-    "map_loaded": True, "map_age": 0.1, "localization": "good", "lidar_age": 0.02, "scan_age": 0.1, "base_age": 0.02,
-    "mission": True, "plan_age": 0.1, "released_remaining": 5.0,
-}  # fmt: skip
-
-
-class Row(NamedTuple):
-    """A condition: inputs at which it holds, inputs at which it just does not, and what follows."""
-
-    name: str
-    holds: dict
-    mode: str
-    words: str
-    not_yet: dict | None = None
-    left: str = "alone"
-    """By whom a robot in this mode is released: by an operator, or alone."""
-
-
-ROWS = [
-    Row(
-        "position too uncertain",
-        {"localization": "weak", "position_sigma": 0.81},
-        "HOLD",
-        "the robot may be 1.6 m from where it believes to be",
-        not_yet={"position_sigma": 0.81},
-    ),
-    Row(
-        "may be in a blocked place",
-        {"near_blocked": "the no-go zone wet", "position_sigma": 0.4},
-        "HOLD",
-        "the robot may already be in the no-go zone wet: it may be 0.8 m farther",
-    ),
-    Row("base fault", {"base_fault": "OI mode"}, "FAULT", "base: OI mode", left="operator"),
-    Row("bumper", {"bumper": True}, "FAULT", "the bumper is pressed", left="operator"),
-    Row("cliff", {"cliff": True}, "FAULT", "a cliff sensor sees no floor", left="operator"),
-    Row("wheel drop", {"wheel_drop": True}, "FAULT", "a wheel has dropped", left="operator"),
-    Row("guardian lost", {"guardian_lost": "closed"}, "PROTECTIVE_STOP", "the guardian is not connected: closed"),
-    Row(
-        "guardian silent",
-        {"base_age": 0.301},
-        "PROTECTIVE_STOP",
-        "no message from the guardian for 0.3 s",
-        not_yet={"base_age": 0.3},
-    ),
-    Row(
-        "guardian never heard",
-        {"base_age": math.inf},
-        "PROTECTIVE_STOP",
-        "no message from the guardian for as long as the agent runs",
-    ),
-    Row(
-        "wheels held",
-        {"base_stopped": "no fresh command"},
-        "PROTECTIVE_STOP",
-        "the guardian holds the wheels: no fresh command",
-    ),
-    Row("on its dock", {"docked_for": 0.0, "mission": False}, "HOLD", "the robot is on its dock"),
-    Row(
-        "on its dock, charging",
-        {"docked_for": 5.0, "base_stopped": "the base is on its charger, where it does not drive", "mission": False},
-        "HOLD",
-        "the robot is on its dock",
-    ),
-    Row(
-        "wheels held on the dock",
-        {"docked_for": 5.0, "base_stopped": "not ready"},
-        "PROTECTIVE_STOP",
-        "the guardian holds the wheels: not ready",
-    ),
-    Row(
-        "lidar silent",
-        {"lidar_age": 0.301},
-        "PROTECTIVE_STOP",
-        "the lidar has been silent for 0.3 s",
-        not_yet={"lidar_age": 0.3},
-    ),
-    Row(
-        "scan lost",
-        {"scan_age": 0.451},
-        "PROTECTIVE_STOP",
-        "no complete scan of the lidar for 0.5 s",
-        not_yet={"scan_age": 0.45},
-    ),
-    Row(
-        "scans repeat",
-        {"identical_scans": 3},
-        "PROTECTIVE_STOP",
-        "the lidar repeats itself",
-        not_yet={"identical_scans": 2},
-    ),
-    Row("at rest", {"resting": "at rest"}, "HOLD", "at rest"),
-    Row("pose unknown", {"localization": "none"}, "PROTECTIVE_STOP", "the pose is not known yet", left="operator"),
-    Row(
-        "pose lost",
-        {"localization": "lost", "localization_detail": "no fit"},
-        "PROTECTIVE_STOP",
-        "the pose is lost: no fit",
-        left="operator",
-    ),
-    Row("pose weak", {"localization": "weak"}, "DEGRADED", "the pose is uncertain"),
-    Row(
-        "in a zone", {"inside_blocked": "the zone x"}, "PROTECTIVE_STOP", "the robot is in the zone x", left="operator"
-    ),
-    Row("map lost", {"map_age": 3.01}, "HOLD", "the map is 3.0 s old", not_yet={"map_age": 0.99}),
-    Row("map late", {"map_age": 1.01}, "DEGRADED", "the map is 1.0 s old", not_yet={"map_age": 1.0}),
-    Row("map still late", {"map_age": 3.0}, "DEGRADED", "the map is 3.0 s old"),
-    Row(
-        "map gap", {"map_gap": 1.01}, "HOLD", "changes of the map have been missing for 1.0 s", not_yet={"map_gap": 1.0}
-    ),
-    Row("caution", {"caution": "area z4 is unknown"}, "DEGRADED", "area z4 is unknown"),
-    Row(
-        "path problem",
-        {"path_problem": "goal blocked"},
-        "HOLD",
-        "goal blocked",
-        not_yet={"path_problem": "goal blocked", "mission": False},
-    ),
-    Row(
-        "no progress",
-        {"path_problem": "no progress along the path for 10 s: an obstacle is near"},
-        "HOLD",
-        "no progress along the path for 10 s: an obstacle is near",
-        not_yet={"path_problem": None},
-    ),
-    Row(
-        "planner late",
-        {"plan_age": 1.51},
-        "DEGRADED",
-        "the planner has been silent for 1.5 s",
-        not_yet={"plan_age": 1.5},
-    ),
-    Row(
-        "planner late before the end",
-        {"plan_age": 2.0, "released_remaining": 0.151},
-        "DEGRADED",
-        "the planner has been silent for 2.0 s",
-    ),
-    Row(
-        "planner lost",
-        {"plan_age": 1.51, "released_remaining": 0.15},
-        "HOLD",
-        "and no released path is left",
-        not_yet={"plan_age": 1.51, "released_remaining": 0.15, "mission": False},
-    ),
-]
-RANK = {"NORMAL": 0, "DEGRADED": 1, "HOLD": 2, "PROTECTIVE_STOP": 3, "FAULT": 4}
-CAP = {"INIT": 0.0, "NORMAL": 0.30, "DEGRADED": 0.15, "HOLD": 0.0, "PROTECTIVE_STOP": 0.0, "FAULT": 0.0}
-STOP = {"INIT": "immediate", "NORMAL": "none", "DEGRADED": "none", "HOLD": "ramp", "PROTECTIVE_STOP": "immediate",
-        "FAULT": "immediate"}  # fmt: skip
-TO = {
-    "INIT": None, "NORMAL": {}, "DEGRADED": {"localization": "weak"}, "HOLD": {"path_problem": "x"},
-    "PROTECTIVE_STOP": {"lidar_age": 9.0}, "FAULT": {"bumper": True},
-}  # fmt: skip
-
-
-def inputs(**changes):
-    return SafetyInputs(**{**HEALTHY, **changes})
-
-
-class Gate:
-    def __init__(self, mode="NORMAL"):
-        self.state, self.now, self.out = SafetyState(), 100.0, None
-        if mode == "INIT":
-            self.run()
-            return
-        self.run(request="enable")
-        self.run(2.2)
-        assert self.out.mode == "NORMAL"
-        if TO[mode]:
-            self.run(**TO[mode])
-        assert self.out.mode == mode
-
-    def run(self, seconds=DT, **changes):
-        for _ in range(max(1, round(seconds / DT))):
-            self.now += DT
-            self.state, self.out = step(self.state, inputs(**changes), self.now)
-            changes.pop("request", None)
-        return self.out
+from robot_agent.safety.maneuver import RULES
 
 
 def test_every_row_of_the_table_is_listed_here():
@@ -386,6 +208,88 @@ def test_enabled_again_after_a_reset_the_old_fault_counts_no_more():
     assert gate.run(2.0).mode == "NORMAL"
 
 
+# --- driving by hand ---
+
+
+def mode_by_hand(*rows) -> str:
+    """Return the mode of a robot that is driven by hand, while these conditions hold."""
+    names = {row.name for row in rows}
+    if "bumper" in names and any("docked_for" in row.holds for row in rows):
+        return "INIT" if any(row.name != "bumper" and row.by_hand == "ends" for row in rows) else "TELEOP"
+    if "at rest" in names and all(row.by_hand != "ends" or row.name in OF_REST for row in rows):
+        return "waits"  # for its lidar: it rests
+    if any(row.mode == "FAULT" for row in rows):
+        return "FAULT"
+    return "INIT" if any(row.by_hand == "ends" for row in rows) else "TELEOP"
+
+
+OF_REST = {"lidar silent", "scan lost", "scans repeat", "wheels held", "wheels held on the dock"}
+
+
+def pairs_of_conditions():
+    """Yield each condition alone, and each two that can hold at once."""
+    for one, other in itertools.combinations_with_replacement(ROWS, 2):
+        if all(other.holds.get(name, value) == value for name, value in one.holds.items()):
+            yield one, other
+
+
+def test_driving_by_hand_heeds_base_and_lidar_alone_and_never_leads_to_a_drive_by_itself():
+    tried = 0
+    for one, other in pairs_of_conditions():
+        expected, gate = mode_by_hand(one, other), Gate("TELEOP")
+        out = gate.run(**one.holds, **{name: v for name, v in other.holds.items() if name not in one.holds})
+        mode = "INIT" if expected == "waits" else expected
+        case = f"{one.name}, {other.name}: {out.reasons}"
+        assert (out.mode, out.cap, out.stop) == (mode, CAP[mode], STOP[mode]), case
+        assert (gate.state.maneuver is not None) == (expected in {"TELEOP", "waits"}), case
+        if expected == "INIT":
+            assert any(reason.startswith("driving by hand ended: ") for reason in out.reasons), case
+        # The conditions end: whoever drove drives on, or the robot waits for an operator.
+        assert gate.run(5.0).mode == ("TELEOP" if expected == "waits" else mode), case
+        assert not gate.state.enabled, case
+        tried += 1
+    assert tried > 400
+
+
+@pytest.mark.parametrize("row", ROWS, ids=[row.name for row in ROWS])
+@pytest.mark.parametrize("before", ["INIT", "NORMAL", "DEGRADED", "HOLD", "PROTECTIVE_STOP", "FAULT"])
+def test_take_over_in_every_mode_is_refused_by_conditions_that_would_end_it_and_by_no_other(before, row):
+    gate = Gate(before)
+    out = gate.run(request="teleop", **row.holds)
+    if before == "FAULT":
+        assert (out.mode, out.refusal.code) == ("FAULT", "fault_latched")
+    elif row.by_hand in {"ends", "not begun"}:
+        assert out.refusal.code == ("on_dock" if "docked_for" in row.holds else "must_not_move")
+        assert "docked_for" in row.holds or row.words in out.refusal
+        assert out.mode != "TELEOP"
+        assert gate.state.maneuver is None
+    else:
+        assert (out.refusal, out.mode) == (None, "INIT" if row.by_hand == "waits" else "TELEOP")
+        assert not gate.state.enabled
+
+
+@pytest.mark.parametrize(
+    ("request_", "code"),
+    [("enable", "maneuver_runs"), ("reset", "no_fault"), *[(kind, "maneuver_runs") for kind in RULES]],
+)
+def test_request_while_the_robot_is_driven_by_hand_is_refused_and_changes_nothing(request_, code):
+    gate = Gate("TELEOP")
+    out = gate.run(request=request_)
+    assert (out.mode, out.refusal.code) == ("TELEOP", code)
+    assert gate.run(1.0).mode == "TELEOP"
+
+
+@pytest.mark.parametrize("ends", [{"request": "disable"}, {"hand_over": "it was handed back"}])
+def test_robot_that_is_handed_back_waits_in_init_for_an_enable_whatever_it_did_before(ends):
+    gate = Gate("TELEOP")
+    assert not gate.out.mission_may_drive
+    out = gate.run(**ends)
+    assert (out.mode, out.stop, out.cap) == ("INIT", "immediate", 0.0)
+    assert gate.run(60.0).mode == "INIT"
+    assert gate.run(request="enable").refusal is None
+    assert gate.run(2.2).mode == "NORMAL"
+
+
 # --- durations ---
 
 
@@ -435,7 +339,7 @@ def test_longer_protective_stop_counts_once():
 def test_hold_for_the_map_waits_for_a_plan_that_is_newer_than_the_map():
     gate = Gate()
     gate.run(1.0, map_gap=2.0)
-    assert gate.run(DT, plan_age=0.06).reasons[0] == "waiting for a plan on the fresh map"
+    assert gate.run(plan_age=0.06).reasons[0] == "waiting for a plan on the fresh map"
     assert gate.run(5.0, plan_age=1.4 + 5.0).mode == "HOLD"
     assert gate.run(2.1, plan_age=0.0).mode == "NORMAL"
     gate.run(1.0, map_gap=2.0)

@@ -18,6 +18,7 @@ import subprocess
 import sys
 import termios
 import time
+from contextlib import contextmanager
 from functools import partial
 from typing import TYPE_CHECKING
 
@@ -173,13 +174,40 @@ def share_on_walls(map_file: Path, start) -> float:
     return float((walls[cells[:, 1], cells[:, 0]] <= 0.1).mean())
 
 
-@pytest.mark.browser
-def test_the_page_shows_the_scan_drives_while_its_pad_is_held_and_stops_when_it_is_closed(robot):
-    socket, watcher = robot
+@contextmanager
+def served_page(socket: Path):
+    """Serve the robot's page; yields a browser and the address that the command prints."""
     process = start("--socket", str(socket), "--page", stderr=subprocess.PIPE)
     with ended(process), sync_playwright() as playwright:
         address = re.search(rb"http://\S+", process.stderr.readline())[0].decode()
-        browser = chromium(playwright)
+        yield chromium(playwright), address
+
+
+def hold_left(page) -> None:
+    """Hold the page's pad to the left."""
+    box = page.locator("#pad").bounding_box()
+    middle = (box["x"] + box["width"] / 2, box["y"] + box["height"] / 2)
+    page.mouse.move(*middle)
+    page.mouse.down()
+    page.mouse.move(middle[0] - box["width"] / 2 + 4, middle[1])
+
+
+HIDDEN = """() => {
+  Object.defineProperty(document, "hidden", { value: true });
+  document.dispatchEvent(new Event("visibilitychange"));
+}"""
+"""As a telephone's browser tells a page that is not shown; a browser without a screen shows all of its pages."""
+
+
+def take_over(page) -> None:
+    page.get_by_role("button", name="Drive by hand").click(timeout=20_000)
+    expect(page.locator("#pad")).not_to_have_class("off", timeout=20_000)
+
+
+@pytest.mark.browser
+def test_the_page_shows_the_scan_drives_while_its_pad_is_held_and_stops_when_it_is_closed(robot):
+    socket, watcher = robot
+    with served_page(socket) as (browser, address):
         stranger = browser.new_page()
         stranger.goto(address.partition("?")[0])
         expect(stranger.locator("#reasons")).to_contain_text("open the address that the command printed")
@@ -189,13 +217,8 @@ def test_the_page_shows_the_scan_drives_while_its_pad_is_held_and_stops_when_it_
         page.on("pageerror", lambda error: problems.append(str(error)))
         page.goto(address)
         expect(page.locator("#sensors")).to_contain_text(re.compile("[0-9]{3} returns"), timeout=20_000)
-        page.get_by_role("button", name="Drive by hand").click()
-        expect(page.locator("#mode")).to_have_text("TELEOP")
-        box = page.locator("#pad").bounding_box()
-        middle = (box["x"] + box["width"] / 2, box["y"] + box["height"] / 2)
-        page.mouse.move(*middle)
-        page.mouse.down()
-        page.mouse.move(middle[0] - box["width"] / 2 + 4, middle[1])
+        take_over(page)
+        hold_left(page)
         left, right = watcher.rolled(1.0)
         assert left < -0.02 < 0.02 < right, "held to the left it turns to the left"
         page.mouse.up()
@@ -210,3 +233,58 @@ def test_the_page_shows_the_scan_drives_while_its_pad_is_held_and_stops_when_it_
         assert watcher.rolled(0.3) == pytest.approx((0.0, 0.0), abs=1e-3), "a closed page drives nothing"
         wait_for(lambda: watcher.mode == "INIT", "the robot waits to be enabled")
         assert problems == []
+
+
+@pytest.mark.browser
+def test_a_page_that_is_hidden_or_behind_another_drives_nothing(robot):
+    socket, watcher = robot
+    with served_page(socket) as (browser, address):
+        context = browser.new_context()
+        page, other = context.new_page(), context.new_page()
+        page.goto(address)
+        page.bring_to_front()
+        devtools = context.new_cdp_session(page)
+        devtools.send("Emulation.setFocusEmulationEnabled", {"enabled": False})  # each page believes to be in front
+        take_over(page)
+        hold_left(page)
+        wait_for(lambda: watcher.rolled(0.3)[1] > 0.005, "it turns")
+        other.bring_to_front()
+        assert not page.evaluate("document.hasFocus()")
+        time.sleep(SETTLED_S)
+        assert watcher.rolled(0.3) == pytest.approx((0.0, 0.0), abs=1e-3), "nobody sees the page"
+        page.bring_to_front()
+        page.mouse.up()
+        hold_left(page)
+        wait_for(lambda: watcher.rolled(0.3)[1] > 0.005, "it turns again")
+        page.evaluate(HIDDEN)
+        time.sleep(SETTLED_S)
+        assert watcher.rolled(0.3) == pytest.approx((0.0, 0.0), abs=1e-3), "nobody sees the page"
+        wait_for(lambda: watcher.mode == "INIT", "the robot waits to be enabled")
+
+
+@pytest.mark.browser
+def test_of_two_pages_one_drives_and_the_other_is_told_so_until_the_first_hands_back(robot):
+    socket, watcher = robot
+    with served_page(socket) as (browser, address):
+        first, second = browser.new_page(), browser.new_page()
+        for page in (first, second):
+            page.goto(address)
+        take_over(first)
+        expect(second.locator("#mode")).to_have_text("TELEOP")
+        second.get_by_role("button", name="Drive by hand").click()
+        expect(second.locator("#reply")).to_contain_text("somebody else drives the robot by hand")
+        expect(second.locator("#pad")).to_have_class("off")
+        hold_left(second)
+        assert watcher.rolled(0.5) == pytest.approx((0.0, 0.0), abs=1e-3), "the second drives nothing"
+        hold_left(first)
+        assert watcher.rolled(1.0)[1] > 0.02, "the first still drives"
+        first.mouse.up()
+        first.get_by_role("button", name="Hand back").click()
+        expect(second.locator("#mode")).to_have_text("INIT")
+        second.mouse.up()
+        take_over(second)
+        expect(first.locator("#pad")).to_have_class("off")
+        hold_left(first)
+        assert watcher.rolled(0.5) == pytest.approx((0.0, 0.0), abs=1e-3), "it was handed back"
+        hold_left(second)
+        assert watcher.rolled(1.0)[1] > 0.02

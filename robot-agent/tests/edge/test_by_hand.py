@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import asyncio
 import os
 import signal
+import stat
 import subprocess
 import sys
 import threading
@@ -11,8 +13,9 @@ import time
 
 import programs
 import pytest
-from agent_rig import Body
+from agent_rig import ROBOT, SITE, Body, Robot, until
 from guardian_rig import Process, Watchdog, lateness, wait_for
+from secured_servers import secured_router
 
 from robot_agent.agent.local_link import Missed
 from robot_agent.agent.recording.input_log import BaseReceived, Published, ScanReceived, Started
@@ -20,6 +23,7 @@ from robot_agent.local_client import LocalRobot, LocalRobotError
 
 pytestmark = [pytest.mark.live, pytest.mark.reaction, pytest.mark.timeout(120)]
 
+NOBODY = 65534
 STOP_S = 0.3
 """Within this time of a released key or a lost link the wheels stand."""
 
@@ -205,3 +209,40 @@ def test_a_reader_that_reads_nothing_is_told_what_it_missed_and_delays_nobody(ri
 def test_a_socket_without_an_agent_says_what_to_do(tmp_path):
     with pytest.raises(LocalRobotError, match="no robot's agent runs here: start it"):
         LocalRobot(tmp_path / "agent.sock")
+
+
+def test_a_socket_of_another_user_is_refused_with_the_group_to_join(rig):
+    _, agent = rig
+    assert stat.S_IMODE(agent.socket.stat().st_mode) == 0o660, "its group may open it, others may not"
+    own = os.geteuid()
+    os.seteuid(NOBODY) if own == 0 else agent.socket.chmod(0)
+    try:
+        with pytest.raises(LocalRobotError, match=r"you may not open it: .* join its group \(usermod -aG fognav YOU\)"):
+            LocalRobot(agent.socket)
+    finally:
+        os.seteuid(own)
+        agent.socket.chmod(0o660)
+
+
+async def test_a_robot_on_a_mission_that_was_driven_by_hand_waits_with_its_mission_for_an_enable(tmp_path):
+    with secured_router(tmp_path, SITE, robots=[ROBOT]) as router:
+        async with Robot(tmp_path, router) as robot:
+            await robot.localized()
+            fog, path = robot.fog, robot.watchdog.socket.with_name("agent.sock")
+            fog.send_robot_to_the_corner()
+            assert (await fog.command("enable")).accepted
+            await until(lambda: fog.state.mode == "NORMAL" and max(robot.body.speeds) > 0.1, "it is on its way")
+            link = await asyncio.to_thread(taken_over, path)
+            with link:
+                await until(lambda: fog.state.mode == "TELEOP", "its fog is told")
+                assert (await asyncio.to_thread(link.hand_back)).accepted
+            await until(lambda: fog.state.mode == "INIT" and not robot.body.moving, "it stands")
+            # It is healthy for longer than any other stop would need to be left, and its mission is there.
+            before, stood_at = len(fog.states), fog.state.clock
+            await until(lambda: fog.state.clock - stood_at > 2.5, "time passes")
+            assert {state.mode for state in fog.states[before:]} == {"INIT"}
+            assert fog.state.goal_id == "g1"
+            assert "not_enabled" in fog.state.codes
+            assert not robot.body.moving
+            assert (await fog.command("enable")).accepted
+            await until(lambda: fog.state.mode == "NORMAL" and max(robot.body.speeds) > 0.1, "it goes on")

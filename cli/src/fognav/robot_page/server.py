@@ -11,6 +11,7 @@ import contextlib
 import hmac
 import secrets
 import socket
+from collections import deque
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
@@ -22,7 +23,7 @@ from fastapi.responses import FileResponse
 from fognav.output import WrongUseError, print_line
 from fognav.robot_page.bringup import BringupView, Mount
 from fognav.robot_page.view import LocalRobotErrors, RobotView
-from robot_agent.agent.hand_driving import HandReply, HandRequest
+from robot_agent.agent.hand_driving import HandBack, HandReply, HandRequest, ResetFault, TakeOver
 from robot_agent.local_client import LocalRobot, LocalRobotError
 
 if TYPE_CHECKING:
@@ -79,6 +80,8 @@ class _Session:
         self._path = path
         self._view = view
         self._replies: list[HandReply] = []
+        self._asked: deque[HandRequest] = deque()
+        self._mine = self._by_hand = False
         self._news = asyncio.Event()
         self._error = ""
 
@@ -110,13 +113,24 @@ class _Session:
             for what in robot.poll():
                 if isinstance(what, HandReply):
                     self._replies.append(what)
+                    self._on_reply(what)
                     self._news.set()
                 elif self._view.take(what):
+                    ended, self._by_hand = self._by_hand, self._view.state.get("mode") == "TELEOP"
+                    self._mine = self._mine and (self._by_hand or not ended)
                     self._news.set()
         except LocalRobotError as error:
             asyncio.get_running_loop().remove_reader(robot.fileno())
             self._error = str(error)
             self._news.set()
+
+    def _on_reply(self, reply: HandReply) -> None:
+        """Note whether it is this page that drives: the agent answers in turn, and tells all pages the same mode."""
+        match self._asked.popleft() if self._asked else None:
+            case TakeOver():
+                self._mine = reply.accepted
+            case HandBack():
+                self._mine = False
 
     async def _show(self) -> None:
         """Send the newest whenever there is any; a slow page gets fewer, never older ones."""
@@ -124,7 +138,8 @@ class _Session:
             await self._news.wait()
             self._news.clear()
             replies, self._replies = self._replies, []
-            await self._page.send_json({**self._view.as_json(), "replies": [msgspec.to_builtins(r) for r in replies]})
+            told = {"mine": self._mine, "replies": [msgspec.to_builtins(reply) for reply in replies]}
+            await self._page.send_json({**self._view.as_json(), **told})
         await self._page.send_json({"error": self._error})
 
     async def _hear(self, robot: LocalRobot) -> None:
@@ -137,6 +152,8 @@ class _Session:
                     return
                 if not isinstance(request, Mount):
                     robot.send(request)
+                    if isinstance(request, TakeOver | HandBack | ResetFault):
+                        self._asked.append(request)
                 elif isinstance(self._view, BringupView):
                     self._replies.append(await asyncio.to_thread(self._view.place.write, request))
                     self._news.set()

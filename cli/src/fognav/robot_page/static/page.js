@@ -14,7 +14,7 @@ const pad = element("pad");
 const held = new Set();
 let wish = null; // [ahead, left], -1 to 1, while the pad is held
 let link = null;
-let view = { mode: "", points: [], footprint: [] };
+let view = { mode: "", mine: false, points: [], footprint: [] };
 let said = 0;
 
 function connect() {
@@ -23,9 +23,13 @@ function connect() {
   link.onmessage = (event) => show(JSON.parse(event.data));
   link.onclose = (event) => {
     letGo();
-    show({ mode: "not connected", reasons: [event.reason || "the link to the robot is broken"], points: [], footprint: [] });
+    show({ mode: "not connected", mine: false, reasons: [event.reason || "the link to the robot is broken"], points: [], footprint: [] });
     if (event.code !== 4401) setTimeout(connect, 1000);
   };
+}
+
+function drives() {
+  return view.mode === "TELEOP" && view.mine; // another page, or a terminal, may be the one that drives
 }
 
 function say(request) {
@@ -39,7 +43,6 @@ function show(told) {
     return;
   }
   view = { ...view, ...told };
-  const byHand = view.mode === "TELEOP";
   element("mode").textContent = view.mode;
   element("reasons").textContent = (view.reasons ?? []).join("; ");
   document.querySelector("header").classList.toggle("alarm", ["FAULT", "PROTECTIVE_STOP", "not connected"].includes(view.mode));
@@ -47,10 +50,10 @@ function show(told) {
   const battery = view.battery == null ? "" : `battery ${Math.round(100 * view.battery)} %`;
   const missed = view.missed ? `${view.missed} messages missed` : "";
   element("sensors").textContent = [battery, ...alarms, `${view.points.length} returns`, missed].filter(Boolean).join(" · ");
-  element("take").disabled = byHand;
-  element("back").disabled = !byHand;
+  element("take").disabled = drives();
+  element("back").disabled = !drives();
   element("reset").disabled = view.mode !== "FAULT";
-  pad.classList.toggle("off", !byHand);
+  pad.classList.toggle("off", !drives());
   for (const reply of told.replies ?? []) element("reply").textContent = reply.reason;
   draw();
 }
@@ -111,7 +114,7 @@ function steer() {
   pad.classList.toggle("on", Boolean(motion));
   const [ahead, left] = motion ?? [0, 0];
   element("knob").style.transform = `translate(${-left * 70}%, ${-ahead * 70}%)`;
-  if (view.mode !== "TELEOP" || document.hidden || (!motion && now - said < KEEP_MS)) return;
+  if (!drives() || document.hidden || (!motion && now - said < KEEP_MS)) return;
   said = now;
   const backwards = ahead < 0 ? -1 : 1; // as one steers: to the left is to the left, backwards too
   say({ type: "steer", v: ahead * element("speed").value, w: backwards * left * element("turn").value });
@@ -121,7 +124,7 @@ function letGo() {
   const drove = wish || held.size;
   wish = null;
   held.clear();
-  if (drove && view.mode === "TELEOP") say({ type: "steer", v: 0, w: 0 });
+  if (drove && drives()) say({ type: "steer", v: 0, w: 0 });
 }
 
 function point(event) {
@@ -142,7 +145,7 @@ window.addEventListener("keydown", (event) => {
   held.add(event.code);
 });
 window.addEventListener("keyup", (event) => {
-  if (held.delete(event.code) && !held.size && view.mode === "TELEOP") say({ type: "steer", v: 0, w: 0 });
+  if (held.delete(event.code) && !held.size && drives()) say({ type: "steer", v: 0, w: 0 });
 });
 window.addEventListener("blur", letGo);
 document.addEventListener("visibilitychange", letGo);

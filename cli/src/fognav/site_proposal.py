@@ -62,7 +62,9 @@ _NEIGHBOURS: Final = 2
 _NODES_APART_M: Final = 10.0
 """... by nodes that are so far apart."""
 _BLOCK_M: Final = 1.0
-"""A place is the widest spot in a square of this side."""
+"""A place is the widest spot in a square of this side, ..."""
+_MOST_BLOCKS: Final = 300
+"""... or of a larger one, where a map has more of them along a side."""
 _BARRIERS: Final = 8
 _UNSEEN: Final = "have walls from which a sonar opposite does not get a clear echo, or too near for one"
 
@@ -172,7 +174,8 @@ def _places(floor: _Floor, known: list[Point]) -> list[Point]:
 
     All can be reached from the known ones. Farthest point sampling (Gonzalez 1985).
     """
-    geometry, side = floor.geometry, max(1, round(_BLOCK_M / floor.geometry.resolution))
+    geometry = floor.geometry
+    side = max(1, round(_BLOCK_M / geometry.resolution), max(geometry.width, geometry.height) // _MOST_BLOCKS)
     components = Components(floor.cost)
     home = components.of(*geometry.cell(*known[0]))
     spots: list[Point] = []

@@ -156,6 +156,18 @@ def test_marker_that_was_moved_to_the_same_place_of_the_equal_corridor_casts_dou
     assert max(worst) < 0.2
 
 
+def test_doubt_that_a_moved_marker_casts_ends_where_the_other_place_looks_otherwise():
+    moved = MarkerSite(id=2, x=7.0, y=1.0, theta=UP)
+    rooms = [*TWINS["rooms"], (1.2, 3.0, 2.2, 3.8)]
+    robot = Seeing((12.0, 2.0, math.pi), hang=[moved, MARKERS[3]], rooms=rooms).begin(12.0, 2.0, math.pi)
+    robot.world.drive_to([(12.0, 2.0), (2.0, 2.0)])
+    assert robot.run(60.0, lambda: any("tells of another place" in reason for reason in robot.reasons))
+    assert robot.run(60.0, robot.problems)
+    assert robot.world.x > 2.0
+    assert robot.run(2.0, lambda: robot.status == "good")
+    assert robot.world.error()[0] < 0.2
+
+
 def test_robot_that_was_switched_on_where_two_places_look_alike_is_found_by_a_marker():
     robot = Seeing((5.5, 6.0, 0.0))
     robot.world.agent.load(robot.world.master.snapshot(), robot.world.now)

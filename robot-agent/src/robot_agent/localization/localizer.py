@@ -334,6 +334,8 @@ class Localizer:
         assert pose is not None
         fit = evaluate_fit(fields, pose, scan.beams(_FIT_BEAMS), self._config.range_max)
         self._fit = fit
+        if self.markers.doubt and confirms(fit):
+            self.markers.try_other_place(scan, fields, self._config.range_max)
         shaken = self._filter.jumped or self._monitor.shaken
         self._history.follow(scan.odom, self._monitor.status, shaken=shaken)
         rivalled = not self._history.tracked and len(self._relocalization.places) > 1

@@ -47,6 +47,9 @@ _NEWS: Final = (0.2, 0.2)
 """A marker that contradicts a good pose from so many places, so far (m, rad) apart, hangs elsewhere."""
 _FOUND_SIGMAS: Final = (0.2, 0.1)
 """Least standard deviations (m, rad) of a place that was found, which the next scan narrows."""
+_MISFITS: Final = 5
+"""A place that so many scans in a row do not confirm, while they confirm the pose, is not the robot's."""
+_FOLLOWED_COVARIANCE: Final = np.diag(np.square((0.2, 0.2, 0.1)))
 _CHECKED_BEAMS: Final = 120
 _MATCHED_BEAMS: Final = 60
 _STEPS: Final = (np.linspace(-2.0, 2.0, 9), np.linspace(-1.5, 1.5, 5), np.linspace(-1.5, 1.5, 3))
@@ -131,8 +134,8 @@ def place_by_scan(place: Place, odom: Pose2, scan: DeskewedScan, fields: MapFiel
 class _Rival(NamedTuple):
     """A place other than that of the pose, when the odometry said `odom`, and the markers that tell of it.
 
-    markers: with where the pose says that each hangs. far: nobody can have moved a marker so that it tells this place
-    but to one that looks the same.
+    markers: with where the pose says that each hangs. far: the robot was carried there, or a marker was moved to where
+    it tells of a place that looks the same. misfits: scans in a row that confirm the pose, and not this place.
     """
 
     pose: Pose2
@@ -140,6 +143,7 @@ class _Rival(NamedTuple):
     markers: dict[int, Pose2]
     sightings: int = 0
     far: bool = False
+    misfits: int = 0
 
 
 class Markers:
@@ -168,7 +172,9 @@ class Markers:
         if rival is None or not rival.far or rival.sightings < _SIGHTINGS:
             return ""
         named = " and ".join(map(str, sorted(rival.markers)))
-        return f"marker {named} tells of another place that looks like this one: another marker has to decide"
+        return (
+            f"marker {named} tells of another place that looks like this one: another marker or the way has to decide"
+        )
 
     def weigh(
         self, sighting: Sighting, odom: Pose2, known: Place | None, confirmed: Confirmed, *, good: bool
@@ -194,6 +200,21 @@ class Markers:
             self._contradict(sighting, known.pose, odom)
         return None
 
+    def try_other_place(self, scan: DeskewedScan, fields: MapFields, range_max: float) -> None:
+        """Let a scan that confirms the pose try the other place, of which a doubt tells; range_max: the lidar's (m).
+
+        That place follows the odometry and the scans, as a hypothesis does.
+        """
+        rival = self._rival
+        if rival is None or not self.doubt or _within(scan.odom, rival.odom, _NEWS):
+            return
+        points, followed = scan.beams(_CHECKED_BEAMS), rival.pose.compose(scan.odom.relative_to(rival.odom))
+        pose = match_scan(fields, followed, _FOLLOWED_COVARIANCE, points).pose
+        misfits = 0 if confirms(evaluate_fit(fields, pose, points, range_max)) else rival.misfits + 1
+        self._rival = rival._replace(pose=pose, odom=scan.odom, misfits=misfits)
+        if misfits >= _MISFITS:
+            self._report_rival()
+
     def _place(self, sighting: Sighting) -> Place | None:
         """Return the robot's place by a sighting; None for an unknown marker, or one that is seen too badly."""
         hung = self._hung.get(sighting.marker)
@@ -204,10 +225,8 @@ class Markers:
 
     def _agree(self, marker: int) -> bool:
         """Take notice of a sighting that agrees with the pose; return whether the marker is believed."""
-        rival = self._rival
-        if marker not in self.problems and rival is not None and self.doubt:
-            for one, seen in rival.markers.items():
-                self._report(one, seen)
+        if marker not in self.problems and self.doubt:
+            self._report_rival()
         if marker in self.problems:
             return False
         self._support.add(marker)
@@ -227,7 +246,7 @@ class Markers:
         seen = (found if known is None else known.pose).compose(sighting.pose)
         markers = rival.markers | {sighting.marker: seen}
         needed = 2 if known is not None and (self._support or not far) else 1
-        self._rival = rival = _Rival(found, odom, markers, rival.sightings + 1, far and needed > 1)
+        self._rival = rival = _Rival(found, odom, markers, rival.sightings + 1, far and needed > 1, rival.misfits)
         # One that was found to hang elsewhere counts only beside another one, which says that it hangs right after all.
         believed = markers.keys() if needed > 1 else markers.keys() - self.problems.keys()
         if rival.sightings < _SIGHTINGS or len(believed) < needed:
@@ -245,6 +264,13 @@ class Markers:
             against.append(odom)
         if len(against) >= _REPORT_AFTER:
             self._report(sighting.marker, pose.compose(sighting.pose))
+
+    def _report_rival(self) -> None:
+        """Believe no more what tells of another place, which is none."""
+        if self._rival is not None:
+            for marker, seen in self._rival.markers.items():
+                self._report(marker, seen)
+        self._rival = None
 
     def _report(self, marker: int, seen: Pose2) -> None:
         """Believe a marker no more, which was seen at a place of the map where it does not hang."""

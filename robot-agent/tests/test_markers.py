@@ -224,6 +224,19 @@ def test_marker_of_another_site_and_one_that_is_seen_too_badly_change_nothing():
     assert (agent.localizer.pose(now), agent.localizer.covariance().tolist()) == before
 
 
+def test_sighting_changes_nothing_while_no_scan_can_check_it():
+    robot = Seeing((5.5, 6.0, 0.0)).begin(5.5, 2.0, 0.0)
+    robot.world.lidar_on = False
+    robot.world.run(2.0)
+    robot.run(2.0)
+    assert len(robot.seen) == 4
+    assert robot.world.error()[0] == pytest.approx(4.0, abs=0.1)
+    robot.world.lidar_on = True
+    robot.world.run(0.5)
+    robot.run(1.0)
+    assert robot.world.error()[0] < 0.2
+
+
 def test_sightings_are_in_the_input_log_and_come_back_exactly():
     entries = []
     robot = Seeing((4.5, 2.0, 0.0), start_agent=lambda config, seed: log.LoggedAgent(config, seed, entries.append))

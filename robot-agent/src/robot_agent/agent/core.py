@@ -172,7 +172,7 @@ class AgentCore:
         )
 
     def on_absolute_observation(self, observation: AbsoluteObservation) -> bool:
-        """Handle a pose that was measured without the lidar (dock, marker); False when it is too old to be used."""
+        """Handle a pose that was measured without the lidar (dock); False when it is too old to be used."""
         return self._localizer.on_absolute_observation(observation)
 
     def on_sighting(self, sighting: Sighting, now: float) -> None:

@@ -66,6 +66,8 @@ _SAVED_OR_FOUND: Final = (
     "the scan fits the saved pose but for a few beams, as beside an opened door, and another place better: let the "
     "robot advance (`fognav robot advance`), or give the initial pose"
 )
+_CHECKED_WITHIN_S: Final = 1.0
+"""A scan that was made so much earlier or later checks no sighting: a resting robot may have been carried meanwhile."""
 _LOCAL_SCANS: Final = 5
 """After this many scans that do not fit there either, the whole map is searched."""
 
@@ -162,6 +164,8 @@ class Localizer:
         """Weigh what a marker says of the pose; one from before the odometry, or that no scan can check, is dropped."""
         scan, fields, odom = self.scan, self._fields, self._odometry.pose(sighting.stamp)
         if scan is None or fields is None or odom is None or not self._odometry.reaches_back_to(sighting.stamp):
+            return
+        if abs(sighting.stamp - scan.timestamp) > _CHECKED_WITHIN_S:
             return
         pose, good = self._filter.pose(odom), self.status == "good"
         known = None if pose is None or self.status not in {"good", "weak"} else Place(pose, self._filter.covariance)

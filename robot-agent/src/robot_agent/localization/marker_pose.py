@@ -33,6 +33,8 @@ _MOUNTING: Final = (0.01, 0.01, 0.02)
 """Standard deviations of what the settings say: of the place (m, and of 1 by the distance) and the direction (rad)."""
 _TURNED_RAD: Final = 0.7
 _ROUNDS: Final = 12
+_CONVERGED: Final = 1e-4
+"""Changes (m, rad) that are a fiftieth of what a corner's noise makes."""
 _STEP: Final = 1e-5
 _DAMPING: Final = 1e-6
 _TURN_MAX_RAD: Final = 0.3
@@ -128,6 +130,8 @@ def _fitted(
         values = values - change
         if not np.isfinite(values).all() or values[0] < _NEAREST_M:
             return None
+        if np.abs(change).max() < _CONVERGED:
+            break
     jacobian, errors = _jacobian(residuals, values), residuals(values)
     covariance = np.linalg.pinv(jacobian.T @ jacobian, hermitian=True).astype(np.float64)
     return _Fit(values, covariance, float(errors @ errors))

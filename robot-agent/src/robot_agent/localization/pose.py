@@ -77,11 +77,10 @@ def uncertainty(covariance: NDArray[np.float64]) -> Uncertainty:
 class AbsoluteObservation:
     """Where `base` was in `map`, with the covariance (3, 3) over (x, y, theta) (m, rad), at `stamp` (s).
 
-    Observed by whatever measures the pose without the lidar (`AgentCore.on_absolute_observation`): the contacts of the
-    dock, a fiducial marker, a person with a tape measure. A camera that sees a marker whose place in `map` is known
-    would compose that place with the measured one, rotate its covariance into `map`, and stamp both with the time of
-    the picture. The pose is fused with the estimate at the odometry of that time, so a picture may be as late as
-    odometry is kept (`OdometryBuffer`).
+    Observed by what measures the pose without the lidar and is believed (`AgentCore.on_absolute_observation`): the
+    contacts of the dock, a person with a tape measure. A marker may hang elsewhere: its sightings are weighed first
+    (`markers`). The pose is fused with the estimate at the odometry of that time, so it may be as late as odometry is
+    kept (`OdometryBuffer`).
 
     `stamp` is on the clock of odometry and scans. Raises ValueError for a covariance that is none.
     """

@@ -161,9 +161,11 @@ def test_pictures_of_another_format_or_size_are_refused_with_what_is_expected(tm
     assert problem in str(error.value)
 
 
-def test_camera_that_is_not_plugged_in_is_named_with_a_remedy():
+def test_camera_that_is_not_plugged_in_or_none_is_named_with_a_remedy():
     with pytest.raises(CameraError, match="/dev/v4l/by-id/none does not exist: plug the camera in"):
         list(pictures(CameraSettings(source="/dev/v4l/by-id/none", focal_px=500.0)))
+    with pytest.raises(CameraError, match=r"/dev/null gives no pictures: .*, or name another device"):
+        list(pictures(CameraSettings(source="/dev/null", focal_px=500.0)))
 
 
 @pytest.fixture

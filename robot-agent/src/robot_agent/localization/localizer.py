@@ -155,6 +155,7 @@ class Localizer:
         self._scale.forget_anchor()
         if not self._filter.observe(observation.pose, observation.covariance, odom):
             self._monitor.begin("checking the pose that was measured")
+            self.markers.forget_support()
             self._doubt.restart()
             self._history.tracked = False
             self._history.near = None

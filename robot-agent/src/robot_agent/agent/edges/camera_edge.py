@@ -182,8 +182,10 @@ def _from_device(settings: CameraSettings) -> Iterator[Picture]:
                 for frame in capture:
                     rows = np.frombuffer(frame.data, np.uint8)[: form.size].reshape(form.height, -1)
                     yield np.ascontiguousarray(rows[:, : step * form.width : step])
-    except V4L2Error as error:
-        raise CameraError(f"{settings.source} is no camera that can be used: {error}. Name another device") from error
+    except (V4L2Error, OSError) as error:
+        raise CameraError(
+            f"{settings.source} gives no pictures: {error}. Plug it in, end what else uses it, or name another device"
+        ) from error
 
 
 def _check_size(width: int, height: int, settings: CameraSettings) -> None:

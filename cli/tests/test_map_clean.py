@@ -70,6 +70,16 @@ def test_another_floor_and_another_first_map_are_refused(map_file, tmp_path):
     assert "was made for another floor.yaml" in refused.output
 
 
+def test_map_that_the_commands_begin_with_is_never_replaced(map_file, tmp_path):
+    before = map_file.read_text(), map_file.with_suffix(".pgm").read_bytes()
+    save_map(tmp_path / "second", OFFICE)
+    assert clean(map_file, "wall", 5, 1, 5, 3, "--out", tmp_path / "floor").exit_code == 2
+    assert clean(map_file, "wall", 5, 1, 5, 3).exit_code == 0
+    replaced = clean(tmp_path / "second.yaml", "--commands", tmp_path / "floor.clean", "--out", tmp_path / "floor")
+    assert (replaced.exit_code, "Name another --out" in replaced.output) == (2, True)
+    assert (map_file.read_text(), map_file.with_suffix(".pgm").read_bytes()) == before
+
+
 @pytest.mark.parametrize("words", [["brush", "1"], ["erase", "1", "2", "3"], ["erase", "90", "90", "91", "91"]])
 def test_command_that_is_wrong_is_refused_with_its_line_and_not_kept(map_file, words):
     assert clean(map_file, "wall", 5, 1, 5, 3).exit_code == 0

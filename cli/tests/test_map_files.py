@@ -41,6 +41,13 @@ def test_map_in_order_passes_and_is_described_with_where_it_came_from(floor):
     assert info["provenance"]["command"] == "fognav map from-log drive.mcap"
 
 
+def test_yaw_of_a_map_is_told_beside_the_cells_that_are_turned_by_it(floor):
+    floor.write_text(floor.read_text().replace("2.0, 0.0]", "2.0, 1.0]"))
+    info = json.loads(run("info", floor, "--json").stdout)
+    assert (info["yaw"], info["width"] > 100) == (1.0, True)
+    assert "1 rad in the file" in run("info", floor).stdout
+
+
 @pytest.mark.parametrize(
     ("change", "kind"),
     [

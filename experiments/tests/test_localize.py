@@ -224,6 +224,12 @@ def test_benchmark_of_mapping_says_where_recordings_were_looked_for(tmp_path, mo
     assert "Let FOGNAV_DATA name the folder of recordings" in " ".join(done.output.split())
 
 
+@pytest.mark.parametrize("name", ["gone.mcap", "gone.jsonl", "gone"])
+def test_log_that_is_not_there_is_named_as_such(tmp_path, name):
+    done = CliRunner().invoke(app, ["map", "from-log", str(tmp_path / name), "--out", str(tmp_path / "built")])
+    assert (done.exit_code, f"there is no file {tmp_path / name}" in " ".join(done.output.split())) == (2, True)
+
+
 @pytest.mark.parametrize(
     ("option", "problem"),
     [

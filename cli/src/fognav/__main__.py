@@ -9,11 +9,9 @@ import typer
 
 from fognav import __version__
 from fognav.commands import installed
-from fognav.commands.map_clean import map_clean
-from fognav.commands.map_files import map_app, map_check, map_convert, map_info
+from fognav.commands.map_files import map_app, map_convert, map_info
 from fognav.commands.robot_file import robot_app, robot_check, robot_new
 from fognav.commands.robot_tools import calibrate_command, map_record, robot_bringup, teleop_command
-from fognav.operate.options import NUMBERS
 from fognav.output import OK
 
 app = typer.Typer(
@@ -38,10 +36,6 @@ for group, name, command, example in (
 ):
     app.command(name, epilog=f"Example: fognav {example}", rich_help_panel=group)(command)
 map_app.command("record", epilog="Example: fognav map record floor.mcap")(map_record)
-map_app.command("check", epilog="Example: fognav map check floor.yaml --radius 0.17")(map_check)
-map_app.command("clean", context_settings=NUMBERS, epilog="Example: fognav map clean floor.yaml erase 3.0 1.0 4.0 2.0")(
-    map_clean
-)
 map_app.command("info", epilog="Example: fognav map info floor.yaml --json")(map_info)
 map_app.command("convert", epilog="Example: fognav map convert floor.yaml floor.png --resolution 0.1")(map_convert)
 robot_app.command("new", epilog="Example: fognav robot new --base roomba600 --lidar rplidar-a1 --out robot.toml")(

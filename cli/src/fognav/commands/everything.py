@@ -10,7 +10,8 @@ from fognav.commands.area import alert_app, area_app
 from fognav.commands.backup import backup_command, restore_command, store_app
 from fognav.commands.demo import demo_command, record_command, replay_command
 from fognav.commands.develop import channels_command, check_command, docs_command, run_tests
-from fognav.commands.map_files import map_app
+from fognav.commands.map_clean import map_clean
+from fognav.commands.map_files import map_app, map_check
 from fognav.commands.map_plan import FORWARDED, map_from_plan
 from fognav.commands.node import node_app
 from fognav.commands.robot_file import robot_app
@@ -20,6 +21,7 @@ from fognav.commands.status import status_command
 from fognav.commands.up import down_command, logs_command, up_command, upgrade_command
 from fognav.commands.zone import zone_app
 from fognav.doctor import doctor_command
+from fognav.operate.options import NUMBERS
 
 if TYPE_CHECKING:
     import typer
@@ -64,6 +66,10 @@ def add_to(app: typer.Typer) -> None:
         rich_help_panel=installed.DEVELOP,
     )(run_tests)
     robot_app.command("add", epilog="Example: fognav robot add r2 --credentials DIR")(robot_add)
+    map_app.command("check", epilog="Example: fognav map check floor.yaml --radius 0.17")(map_check)
+    map_app.command(
+        "clean", context_settings=NUMBERS, epilog="Example: fognav map clean floor.yaml erase 3.0 1.0 4.0 2.0"
+    )(map_clean)
     map_app.command(
         "from-plan",
         context_settings=FORWARDED,

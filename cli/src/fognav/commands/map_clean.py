@@ -66,12 +66,19 @@ def map_clean(
             )
         file = commands_file(onto or map_file) if commands is None else commands
         prefix = map_file.with_name(f"{map_file.stem}-clean") if out is None else out
-        check_writable(Path(f"{prefix}.yaml"))
+        for suffix in (".yaml", ".pgm"):
+            check_writable(Path(f"{prefix}{suffix}"))
         static = loaded(map_file)
         text = begun(file, map_file, static) if onto is None else begun(file, onto, loaded(onto))
         if command:
             text = with_lines(text, [" ".join(command)])
         read = _read(file, text)
+        kept = [map_file, *([] if read.first is None else [file.parent / read.first[0]])]
+        if Path(f"{prefix}.yaml").resolve() in [one.resolve() for one in kept]:
+            raise WrongUseError(
+                f"{prefix}.yaml would be replaced by what the commands make of it, and they could not be applied "
+                "again. Name another --out"
+            )
         if not read.commands and onto is None:
             raise WrongUseError(f"{file} has no commands: add one, as in fognav map clean {map_file} straighten")
         done = _cleaned(file, read, static)

@@ -126,8 +126,11 @@ def map_info(map_file: MapArgument, *, json: JsonOption = False) -> None:
     """Show a map's size, resolution, origin and cells, and where it came from."""
     with exit_codes():
         values = described(loaded(map_file))
-        origin = read_provenance(map_file)
+        origin, yaw = read_provenance(map_file), load_occupancy(map_file).yaw
         lines = [f"{name:12} {value}" for name, value in values.items()]
+        if yaw:
+            lines.append(f"{'yaw':12} {yaw:g} rad in the file; what is above is of the cells after that turn")
+            values["yaw"] = yaw
         lines += [f"{name:12} {value}" for name, value in origin.items()] or ["provenance   not said in this file"]
         print_result({"map": str(map_file), **values, "provenance": origin or None}, *lines, json=json)
 

@@ -74,6 +74,8 @@ def read_log(path: Path, log_format: Format = "auto") -> LidarLog:
     """Read a log; raises `WrongUseError` with file, line and remedy when it can't be used."""
     if log_format not in get_args(Format):
         raise WrongUseError(f"the format must be one of {', '.join(get_args(Format))}, not {log_format!r}")
+    if not path.exists():
+        raise WrongUseError(f"there is no file {path}. Name a log, or the folder of a recording of ROS 2")
     if log_format == "fognav" or (log_format == "auto" and is_robot_log(path)):
         scans = [LogScan(scan.stamp, scan.odom, None, scan.angles, scan.ranges) for scan in read_robot_log(path)]
         if not scans:

@@ -24,6 +24,8 @@ _TURN_STEP: Final = math.radians(1.0)
 _POINTS: Final = 1500
 _SPREAD_CELLS: Final = 3
 _GATES: Final = np.array([0.5] * 4 + [0.3] * 4 + [0.15] * 6)
+_LEAST_SCORE: Final = 0.2
+"""A map may show so much less of a floor; to look for less takes minutes, and finds chance."""
 LEAST_SHARE: Final = 0.7
 """Of the walls that both maps could see, so many must lie on each other ..."""
 _MOST_RESIDUAL_M: Final = 0.075
@@ -81,12 +83,12 @@ def align(static: StaticMap, onto: StaticMap) -> Alignment:
     coarse = Reference(walls, wall_lines, _COARSE_M)
     few, _ = thinned(points, lines, _COARSE_M)
     few = np.ascontiguousarray(few[:: max(1, len(few) // _POINTS)])
-    found = coarse.search(few, (float(middle[0]), float(middle[1]), 0.0), half, math.pi, _TURN_STEP, 0.0)
+    found = coarse.search(few, (float(middle[0]), float(middle[1]), 0.0), half, math.pi, _TURN_STEP, _LEAST_SCORE)
     if found is None:
-        raise MisfitError("the maps have no wall in common. Name maps of the same floor")
-    rival = coarse.search(
-        few, found.pose, half, math.pi, _TURN_STEP, _RIVAL * found.score, Excluded(found.pose, *_ELSEWHERE)
-    )
+        raise MisfitError(
+            "the maps do not fit: nowhere as much as a fifth of the walls lie on each other. "
+            "Name maps of the same floor"
+        )
     fine = Reference(walls, wall_lines)
     weak = np.diag((1e-3, 1e-3, 1e-3))
     refined = fine.align(points, lines, found.pose, found.pose, weak, _GATES, sigma=0.05)
@@ -101,6 +103,9 @@ def align(static: StaticMap, onto: StaticMap) -> Alignment:
             f"{result.share:.0%} of the walls lie on each other, {1000 * result.residual:.0f} mm rms; "
             f"{LEAST_SHARE:.0%} and {1000 * most:.0f} mm are needed. Name maps of the same floor"
         )
+    rival = coarse.search(
+        few, found.pose, half, math.pi, _TURN_STEP, _RIVAL * found.score, Excluded(found.pose, *_ELSEWHERE)
+    )
     if rival is not None:
         raise MisfitError(
             f"the maps fit in two ways, turned by {math.degrees(theta):.0f} and {math.degrees(rival.pose[2]):.0f} "

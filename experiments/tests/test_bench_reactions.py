@@ -104,6 +104,13 @@ def test_page_that_is_written_again_keeps_its_remarks(tmp_path: Path, monkeypatc
     assert trials.remarks((checkout.root() / "docs" / "reaction-times.md").read_text("utf-8"))
 
 
+def test_only_some_kinds_of_faults_are_tried_and_make_no_page(tmp_path: Path) -> None:
+    with pytest.raises(WrongUseError, match="no faults of kind wheel: name one of process, device"):
+        trials.run(1, 1, 1, None, None, print, ["key", "wheel"])
+    with pytest.raises(WrongUseError, match="leave out --only or --write"):
+        trials.run(1, 1, 1, None, tmp_path / "page.md", print, ["key"])
+
+
 def test_documented_limits_are_those_that_are_judged_by() -> None:
     text = (checkout.root() / "docs" / "reaction-times.md").read_text("utf-8")
     for fault in FAULTS:
@@ -133,7 +140,7 @@ def test_every_limit_is_the_sum_of_the_parts_that_its_row_names() -> None:
 @pytest.mark.reaction
 @pytest.mark.timeout(180)
 async def test_real_robot_stops_and_drives_again_after_faults(tmp_path: Path) -> None:
-    names = ["guardian killed", "bumper pressed", "zone over the robot"]
+    names = ["guardian killed", "bumper pressed", "zone over the robot", "key released", "page closed"]
     log = tmp_path / "log"
     wanted = due({}, lambda fault: int(fault.name in names))
     found = await asyncio.wait_for(measure(wanted, 1, log, print), 170.0)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import math
 import os
 import select
 import struct
@@ -49,6 +50,10 @@ class _Steering(Protocol):
     def motion(self, now: float) -> tuple[float, float]:
         """Return v (m/s) and w (rad/s)."""
 
+    @property
+    def lapses_at(self) -> float:
+        """When what is held counts as released by itself (s, monotonic); infinite if it does not."""
+
 
 class Keyboard:
     """Keys as in ROS's teleop_twist_keyboard."""
@@ -81,13 +86,21 @@ class Keyboard:
 
     def motion(self, now: float) -> tuple[float, float]:
         """Return the motion of the key that is held."""
-        ahead, left = self._held if now - self._held_at <= _KEY_S else (0, 0)
+        if now >= self.lapses_at:
+            self._held = (0, 0)
+        ahead, left = self._held
         return ahead * self._speed, left * self._turn
+
+    @property
+    def lapses_at(self) -> float:
+        """When the key that is held counts as released."""
+        return math.inf if self._held == (0, 0) else self._held_at + _KEY_S
 
 
 class GamePad:
     """A game pad by Linux's joystick interface: a shoulder button is held, the left stick steers."""
 
+    lapses_at = math.inf
     _EVENT = struct.Struct("<IhBB")
     _BUTTON, _AXIS, _FIRST = 0x01, 0x02, 0x80
     _SHOULDERS = frozenset({4, 5})
@@ -140,14 +153,13 @@ def drive(path: Path, steering: _Steering) -> None:
     """Drive the robot at this socket until Ctrl-C; raises `FailedError`."""
     with LocalRobotErrors(), LocalRobot(path) as robot:
         view = RobotView()
-        _take_over(robot)
-        told, driven = "", False
+        take_over(robot)
+        told, said = "", (0.0, 0.0)
         due = time.monotonic()
         with contextlib.suppress(KeyboardInterrupt):
             while True:
-                ready, _, _ = select.select(
-                    [steering.fileno(), robot.fileno()], [], [], max(0.0, due - time.monotonic())
-                )
+                wait = max(0.0, min(due, steering.lapses_at) - time.monotonic())
+                ready, _, _ = select.select([steering.fileno(), robot.fileno()], [], [], wait)
                 now = time.monotonic()
                 word = steering.read(now) if steering.fileno() in ready else ""
                 for entry in robot.poll():
@@ -157,16 +169,16 @@ def drive(path: Path, steering: _Steering) -> None:
                         view.take(entry)
                 if word == "reset":
                     print_line(robot.reset().reason + "\r")
-                    _take_over(robot)
-                driven = driven or view.state.get("mode") == "TELEOP"
+                    take_over(robot)
                 told = _tell(view, told)
-                if now >= due:
-                    robot.steer(*steering.motion(now))
-                    due = max(due + _PERIOD_S, now)
+                motion = steering.motion(now)
+                if now >= due or (motion == (0.0, 0.0) != said):  # who lets go is not made to wait
+                    robot.steer(*motion)
+                    due, said = max(due + _PERIOD_S, now), motion
         robot.hand_back()
 
 
-def _take_over(robot: LocalRobot) -> None:
+def take_over(robot: LocalRobot) -> None:
     """Take the robot over, as soon as it may move; raises `FailedError` with its reason if it may not."""
     until = time.monotonic() + _HEALTHY_S
     while not (reply := robot.take_over()).accepted:

@@ -402,7 +402,7 @@ def debounce_command(
 
 
 @bench_app.command("reactions", epilog="Example: fognav bench reactions --trials 200 --write docs/reaction-times.md")
-def reactions_command(
+def reactions_command(  # noqa: PLR0913  # one parameter for each option
     *,
     trials: Annotated[
         int, typer.Option("--trials", metavar="N", min=1, help="Trials of each process or pair that dies or hangs.")
@@ -418,13 +418,17 @@ def reactions_command(
         Path | None,
         typer.Option("--write", metavar="FILE", help="Write the tables to a Markdown file; its remarks stay."),
     ] = None,
+    only: Annotated[
+        list[str] | None,
+        typer.Option("--only", metavar="KIND", help="Only process, device, fog, operator, key or page; repeatable."),
+    ] = None,
     json: JsonOption = False,
 ) -> None:
     """Measure how soon the wheels stop.
 
     Processes of driving robots are killed or stopped, one by one and in pairs; sensors, lidar, map, planner and network
-    fail; an operator stops the robot. The time ends when the emulated base's wheels are commanded to stand, or to be
-    slow. A trial takes some five seconds. Exit code 1: a trial was beyond its limit.
+    fail; an operator stops the robot, or drives it by hand and lets go. The time ends when the emulated base's wheels
+    are commanded to stand, or to be slow. A trial takes some five seconds. Exit code 1: one was beyond its limit.
     """
     from fognav_experiments.bench.reactions import trials as reactions  # noqa: PLC0415  # keeps the other commands fast
 
@@ -433,7 +437,7 @@ def reactions_command(
     with exit_codes():
         check_writable(log)
         check_writable(write)
-        rows = reactions.run(trials, other, robots, log, write, print_line)
+        rows = reactions.run(trials, other, robots, log, write, print_line, only or ())
     if json:
         print_json({"bench": "reactions", "trials": trials, "others": other, "rows": rows, **machine.describe()})
     else:

@@ -322,8 +322,13 @@ class Maneuvers:
             return None
         kind = state.maneuver.kind
         wheels = self._wheels(kind, now)
-        command = driving.command_directly(wheels, safety=safety, guard=self._guard.limit, now=now)
+        guard = self._stand if kind == "teleop" and wheels == (0.0, 0.0) else self._guard.limit
+        command = driving.command_directly(wheels, safety=safety, guard=guard, now=now)
         return msgspec.structs.replace(command, maneuver=_BY_GUARDIAN.get(kind))
+
+    def _stand(self, _wheels: Wheels, now: float) -> Wheels:
+        """Stand at once: who lets go of a key wants no gentle end."""
+        return self._guard.limit((0.0, 0.0), now)
 
     def _wheels(self, kind: ManeuverKind, now: float) -> Wheels:
         match kind:

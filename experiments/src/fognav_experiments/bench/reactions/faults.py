@@ -9,6 +9,7 @@ from functools import partial
 from typing import TYPE_CHECKING, Final, Literal, NamedTuple
 
 from fog_contracts.messages import SimObstacle
+from fognav_experiments.bench.reactions.hand import Hand
 from fognav_experiments.bench.reactions.rig import AGENT, GUARDIAN, ROUTER, WATCHDOG
 
 if TYPE_CHECKING:
@@ -16,7 +17,7 @@ if TYPE_CHECKING:
 
     from fognav_experiments.bench.reactions.rig import Rig
 
-Kind = Literal["process", "device", "fog", "operator"]
+Kind = Literal["process", "device", "fog", "operator", "key", "page"]
 
 PROCESS_LIMIT_S: Final = 0.3
 """Longest time that the design allows for stopping the wheels after the end of a process."""
@@ -42,6 +43,7 @@ _BOX: Final = "box"
 class Fault(NamedTuple):
     """One fault. `limit_s` is None where only hardware could stop the wheels; `design` says what the limit consists of.
 
+    kind: a robot of the kinds "key" and "page" is driven by hand, by a terminal or a page, at 0.15 m/s.
     `begin` makes it happen, `end` undoes it. `speed`: the wheels must be commanded at most this fast (m/s), 0: they
     stand. `observed_s`: how long to look.
     """
@@ -175,6 +177,14 @@ async def _enable(rig: Rig) -> None:
     rig.fog.operator_silent = False
 
 
+def _by_hand(name: str, kind: Kind, begin: Callable[[Hand], None]) -> Fault:
+    def begins(rig: Rig) -> None:
+        assert rig.hand is not None
+        begin(rig.hand)
+
+    return Fault(name, kind, PROCESS_LIMIT_S, "0.3", begins, _nothing)
+
+
 KILL, HANG = signal.SIGKILL, signal.SIGSTOP
 FAULTS: Final = (
     _process("agent killed", (AGENT,), KILL),
@@ -295,5 +305,10 @@ FAULTS: Final = (
     Fault("zone over the robot", "fog", _CYCLE_S, "0.1", partial(_zone, ahead_m=0.0), _no_zone),
     Fault("zone on the path", "fog", _RAMP_S + _CYCLE_S, "ramp 0.5 + 0.1", partial(_zone, ahead_m=2.0), _no_zone),
     Fault("unsigned stop", "operator", _CYCLE_S, "0.1", _disable, _enable),
+    _by_hand("key released", "key", Hand.let_go),
+    _by_hand("teleop killed", "key", partial(Hand.signal, number=KILL)),
+    _by_hand("teleop hangs", "key", partial(Hand.signal, number=HANG)),
+    _by_hand("page falls silent", "page", Hand.let_go),
+    _by_hand("page closed", "page", Hand.close_page),
 )
 """A watchdog that hangs alone is none: the wheels keep obeying guardian and agent."""

@@ -35,6 +35,8 @@ from fog_supervisor.servers import router_program
 from fog_supervisor.supervisor import Program, Supervisor
 from fognav_experiments.bench.common import RunningSystem, corridor_rows, first_child, make_office
 from fognav_experiments.bench.reactions.body import BASE, LIDAR, Body
+from fognav_experiments.bench.reactions.hand import SPEED_M_S, Hand
+from robot_agent.agent.local_link import socket_beside
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -49,7 +51,9 @@ GUARDIAN: Final = "guardian"
 _FLOOR_M: Final = (70.0, 18.0)
 _START_X_M: Final = 6.0
 _READY_S: Final = 90.0
+_HAND_READY_S: Final = 20.0
 _FAST_M_S: Final = 0.28
+_HAND_M_S: Final = SPEED_M_S - 0.01
 _STEADY_S: Final = 0.4
 _STRAIGHT_M_S: Final = 0.03
 
@@ -63,6 +67,8 @@ class Rig(RunningSystem):
         self._seed = seed
         self._clock = SystemClock()
         self._signalled: list[int] = []
+        self.hand: Hand | None = None
+        """Who drives it by hand."""
 
     async def _start(self) -> None:
         contexts = self._contexts
@@ -90,6 +96,7 @@ class Rig(RunningSystem):
         contexts.callback(running.cancel)
         await self._start_program(WATCHDOG)
         await self._start_program(AGENT)
+        contexts.push_async_callback(self.let_go)
 
     def _add_programs(self, folder: Path, site: Path) -> str:
         port = net.free_port()
@@ -97,6 +104,7 @@ class Rig(RunningSystem):
         ready = partial(net.server_problem, router.port, router.probe, router.reply)
         self._supervisor.add(Program(name=ROUTER, arguments=router.command, log=folder / "router.log", ready=ready))
         socket = folder / "guardian.sock"
+        self._tools = socket_beside(socket)
         settings = {
             "BASE": BASE, "BASE_PORT": self.body.base_link, "LIDAR": LIDAR, "LIDAR_PORT": self.body.lidar_link,
             "GUARDIAN_SOCKET": socket, "ROBOT": ROBOT, "SITE_DIR": site, "DATA_DIR": folder / "data",
@@ -149,13 +157,31 @@ class Rig(RunningSystem):
         """Wait until the robot drives straight on at full speed, and then for a random moment of its cycles."""
         await self.fog.until(lambda: self.fog.pose is not None, _READY_S, "the robot knows its pose")
         self.fog.send_on()
+        await self._steady("NORMAL", _FAST_M_S, _READY_S)
+
+    async def wait_driving_by_hand(self, *, page: bool) -> None:
+        """Drive it by hand, by a page or a terminal, until it drives straight on; the operator of its fog waits."""
+        await self.fog.until(lambda: self.fog.pose is not None, _READY_S, "the robot knows its pose")
+        self.fog.operator_silent = True
+        self.hand = Hand(self._tools)
+        await (self.hand.hold_page() if page else self.hand.hold_key())
+        await self._steady("TELEOP", _HAND_M_S, _HAND_READY_S)
+
+    async def let_go(self) -> None:
+        """End driving by hand, if somebody does."""
+        if self.hand is not None:
+            await self.hand.end()
+            self.hand, self.fog.operator_silent = None, False
+
+    async def _steady(self, mode: str, fast: float, timeout_s: float) -> None:
+        """Wait until it drives straight on in a mode, faster than this (m/s); raises `TimeoutError`."""
         steady_since: float | None = None
-        deadline = self._clock.now() + _READY_S
+        deadline = self._clock.now() + timeout_s
         while steady_since is None or self._clock.now() - steady_since < _STEADY_S:
             left, right = self.body.wheels
-            driving = min(left, right) > _FAST_M_S and abs(left - right) < _STRAIGHT_M_S
+            driving = min(left, right) > fast and abs(left - right) < _STRAIGHT_M_S
             state = self.fog.state
-            driving = driving and state is not None and state.mode == "NORMAL"
+            driving = driving and state is not None and state.mode == mode
             steady_since = (steady_since or self._clock.now()) if driving else None
             if self._clock.now() > deadline:
                 await self.fog.until(lambda: False, 0.0, "the robot drives straight on")

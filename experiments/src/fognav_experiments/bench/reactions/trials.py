@@ -28,6 +28,7 @@ if TYPE_CHECKING:
     from pathlib import Path
 
 
+BY_HAND: Final = frozenset({"key", "page"})
 _WORKER: Final = "fognav_experiments.bench.reactions.trials"
 _PROBLEMS_MAX: Final = 20
 """Robots that did not drive (again), after which the machine or the robot is to blame."""
@@ -35,15 +36,30 @@ _PROBLEMS_MAX: Final = 20
 Times = dict[str, list[float | None]]
 
 
-def run(  # how often, on how many robots, and where to
-    processes: int, others: int, robots: int, log: Path | None, page: Path | None, tell: Callable[[str], object]
+def run(  # noqa: PLR0913  # how often, on how many robots, which, and where to
+    processes: int,
+    others: int,
+    robots: int,
+    log: Path | None,
+    page: Path | None,
+    tell: Callable[[str], object],
+    kinds: Sequence[str] = (),
 ) -> list[dict[str, object]]:
     """Try each fault of processes so often, with the trials of the log, and each other one; return a row for each.
 
-    Writes the page; what people remarked on it stays. Raises as `measure` and `read_log` do.
+    kinds: only faults of these kinds, if there are any. Writes the page; what people remarked on it stays. Raises as
+    `measure` and `read_log` do, and `WrongUseError` for kinds that there are not.
     """
     times = read_log(log)
-    waiting = due(times, lambda fault: processes if fault.kind == "process" else others)
+    if unknown := set(kinds) - set(_TITLES):
+        raise WrongUseError(f"there are no faults of kind {min(unknown)}: name one of {', '.join(_TITLES)}")
+    if kinds and page is not None:
+        raise WrongUseError("a page has the faults of all kinds: leave out --only or --write")
+
+    def wanted(fault: Fault) -> int:
+        return 0 if kinds and fault.kind not in kinds else processes if fault.kind == "process" else others
+
+    waiting = due(times, wanted)
     found = asyncio.run(measure(waiting, robots, log, tell))
     rows = [row(fault, every) for fault in FAULTS if (every := times.get(fault.name, []) + found.get(fault.name, []))]
     if page is not None:
@@ -148,10 +164,10 @@ def row(fault: Fault, times: list[float | None]) -> dict[str, object]:
 
 _PAGE: Final = """# Reaction times
 
-How long the wheels of a robot that drives at 0.3 m/s turn on after a fault: the time until the emulated base was last
-commanded to turn a wheel, or, where a fault only slows the robot, to exceed 0.15 m/s. Watchdog, guardian and agent are
-the real processes, on ptys to a byte-exact emulated base and lidar in a simulated corridor; map, planner and operator
-speak to them over a real zenoh router. Written by
+How long the wheels of a robot that drives at 0.3 m/s, or at 0.15 m/s by hand, turn on after a fault: the time until
+the emulated base was last commanded to turn a wheel, or, where a fault only slows the robot, to exceed 0.15 m/s.
+Watchdog, guardian and agent are the real processes, on ptys to a byte-exact emulated base and lidar in a simulated
+corridor; map, planner and operator speak to them over a real zenoh router. Written by
 
 ```sh
 {command}
@@ -180,6 +196,8 @@ _TITLES: Final = {
     "device": "Base and lidar",
     "fog": "Map, planner and network",
     "operator": "Operator",
+    "key": "Driven by hand, by a held key of `fognav teleop`",
+    "page": "Driven by hand, by a held page of `fognav teleop --page`",
 }
 
 
@@ -224,12 +242,16 @@ async def _finished(result: Awaitable[object] | None) -> None:
 
 async def try_fault(rig: Rig, fault: Fault) -> float | None:
     """Return how long (s) after the fault the wheels were still too fast; None if they are in the end."""
-    await rig.wait_driving()
+    if fault.kind in BY_HAND:
+        await rig.wait_driving_by_hand(page=fault.kind == "page")
+    else:
+        await rig.wait_driving()
     begun = time.monotonic()
     await _finished(fault.begin(rig))
     await asyncio.sleep(max(0.0, begun + fault.observed_s - time.monotonic()))
     found = rig.body.slower_after(begun, fault.speed)
     await _finished(fault.end(rig))
+    await rig.let_go()
     await rig.revive()
     await asyncio.sleep(_BETWEEN_S)
     await rig.disable()

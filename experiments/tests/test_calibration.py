@@ -12,7 +12,10 @@ import pytest
 
 from fog_runtime.configuration.robot_file import parse_robot
 from fog_runtime.record import Recorder
-from fognav_experiments.bench.calibration import Body, measure, random_body, recording
+from fognav.output import WrongUseError
+from fognav.robot_page.by_itself import SPEED_M_S, SquareDrive
+from fognav.robot_page.view import RobotView
+from fognav_experiments.bench.calibration import Body, driven, measure, random_body, recording
 from robot_agent.agent.recording.input_log import TOPIC_OF_ENTRY
 from robot_agent.calibration import CalibrationError, Calibrator
 
@@ -122,3 +125,71 @@ def test_a_square_of_another_robot_contradicts_and_nothing_is_written(tmp_path):
     assert run.returncode == 1
     assert b"contradicts it" in run.stderr
     assert settings.read_text("utf-8") == TOML
+
+
+# --- by itself ---
+
+
+def config_of(body):
+    return next(recording(body, np.random.default_rng(1))).config
+
+
+def by_itself(config) -> list[tuple[float, float, float]]:
+    """Return what a robot that calibrates itself is told (m/s, rad/s, s): its wheels follow within 0.1 s, and count."""
+    plan, now, walk = SquareDrive(config), 0.0, [(0.0, 0.0, 1.0)]
+    speeds, rolled, half = np.zeros(2), np.zeros(2), 0.5 * config.drive_train.axle_m
+    while not plan.done:
+        plan.on_counters(*rolled)
+        assert plan.problem(now) == ""
+        v, w = plan.motion(now)
+        walk.append((v, w, 0.05))
+        for _ in range(10):
+            speeds = speeds + (np.array((v - w * half, v + w * half)) - speeds) * 0.05
+            rolled = rolled + speeds * 0.005
+        now += 0.05
+    return [*walk, (0.0, 0.0, 1.0)]
+
+
+@pytest.mark.parametrize("off", [0.86, 1.15])
+def test_a_robot_that_drives_by_itself_stays_in_its_square_and_tells_all_however_wrong_its_wheels_are(off):
+    body = Body(left=off, right=off * 1.01, axle=2.0 - off, x=0.05, y=-0.03, yaw=0.1, latency=0.01, mirrored=False)
+    walk = by_itself(config_of(body))
+    assert max(abs(v) for v, _, _ in walk) <= SPEED_M_S
+    poses, _ = driven(body, np.random.default_rng(3), walk)
+    assert np.abs(poses[:, :2]).max() + 0.17 < 0.6, "no part of it leaves the square"
+    assert math.hypot(*poses[-1, :2]) < 0.1, "each movement is undone"
+    found = calibrator_of(walk, body).solve().figures
+    assert found["left"].value == pytest.approx(body.left, rel=0.006)
+    assert found["right"].value == pytest.approx(body.right, rel=0.006)
+    assert found["axle"].value == pytest.approx(0.235 * body.axle, rel=0.006)
+    assert found["yaw"].value == pytest.approx(0.1, abs=math.radians(0.5))
+
+
+def test_a_robot_without_free_and_seen_floor_around_it_does_not_drive_by_itself():
+    body = Body(left=1.0, right=1.0, axle=1.0, x=0.0, y=0.0, yaw=0.0, latency=0.0, mirrored=False)
+    view = RobotView()
+    for entry in recording(body, np.random.default_rng(3), [(0.0, 0.0, 2.0)]):
+        view.take(entry)
+    points, plan = view.points(), SquareDrive(config_of(body))
+    assert plan.unfit(points) == ""
+    near = np.concatenate((points, [[0.0, -0.5]]))
+    assert "something stands 0.50 m from it, 90 degrees to the right: 0.65 m must be free" in plan.unfit(near)
+    assert "in 18 of 36 directions only" in plan.unfit(points[points[:, 1] > 0.0])
+    assert "in 0 of 36 directions only" in plan.unfit(points[:0])
+    with pytest.raises(WrongUseError, match=r"too small .*: it needs --square 1.2 at least"):
+        SquareDrive(config_of(body), 1.1)
+
+
+def test_a_robot_that_drives_by_itself_stops_for_who_comes_near_for_slipping_and_for_standing_wheels():
+    body = Body(left=1.0, right=1.0, axle=1.0, x=0.0, y=0.0, yaw=0.0, latency=0.0, mirrored=False)
+    plan = SquareDrive(config_of(body))
+    plan.on_counters(0.0, 0.0)
+    walls = np.array([[2.0, y / 10.0] for y in range(-20, 20)])
+    foot = np.array([[0.1, 0.4], [0.1, 0.41], [0.1, 0.42]])
+    assert plan.intruder(walls) == ""
+    assert plan.intruder(np.concatenate((walls, foot))) == "something has come near"
+    assert plan.motion(0.0) == (SPEED_M_S, 0.0)
+    assert plan.problem(1.9) == ""
+    assert plan.problem(2.1) == "its wheels have not turned for 2 s"
+    plan.on_counters(0.6, 0.6)
+    assert "it is 0.60 m from where it stood" in plan.problem(2.2)

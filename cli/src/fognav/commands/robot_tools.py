@@ -173,6 +173,13 @@ def calibrate_command(  # noqa: PLR0913  # one parameter for each option
         "calibration.mcap"
     ),
     seconds: Annotated[float | None, typer.Option(min=1.0, help="End recording by itself; else with Ctrl-C.")] = None,
+    by_itself: Annotated[
+        bool, typer.Option("--by-itself", help="The robot drives by itself, in a free square around it.")
+    ] = False,
+    square: Annotated[
+        float, typer.Option("--square", metavar="M", min=0.5, max=4.0, help="Side of that square.")
+    ] = 1.2,
+    yes: Annotated[bool, typer.Option("--yes", help="Let it drive by itself without asking.")] = False,
     socket: SocketOption = None,
     json: JsonOption = False,
 ) -> None:
@@ -180,38 +187,54 @@ def calibrate_command(  # noqa: PLR0913  # one parameter for each option
 
     Some minutes in any room do. Drive by `fognav teleop` in a second terminal, slowly, with walls within reach of the
     lidar and nobody walking by: turn once to each side, drive straight ahead and back, and arcs to both sides. It says
-    what is missing yet.
+    what is missing yet. With --by-itself the robot drives alone, after you agree, and Ctrl-C stops it at once.
     """
-    from fognav.robot_page import calibrating  # noqa: PLC0415  # loads kernels
+    from fognav.robot_page import by_itself as alone  # noqa: PLC0415  # loads kernels
+    from fognav.robot_page import calibrating  # noqa: PLC0415  # same
 
     with exit_codes():
         if write and robot_file is None:
             raise WrongUseError("--write needs the robot's settings file: add --robot-file robot.toml")
         if write and robot_file is not None and not os.access(robot_file.parent, os.W_OK):
             raise WrongUseError(f"{robot_file} can't be written by you: run the same command by sudo")
-        if log is None and out.exists():
-            raise WrongUseError(
-                f"{out} exists: name another file with --out, or calibrate by it: fognav calibrate {out}"
-            )
-        recorded = (
-            calibrating.record(socket or _default_socket(), out, seconds) if log is None else calibrating.read(log)
-        )
+        if log is not None:
+            if by_itself:
+                raise WrongUseError("--by-itself records a drive: leave out the log")
+            recorded = calibrating.read(log)
+        else:
+            path, log = socket or _default_socket(), _new_recording(out)
+            if by_itself and not yes:
+                _ask_to_drive(square)
+            recorded = alone.drive(path, log, square, seconds) if by_itself else calibrating.record(path, log, seconds)
         found, changed = calibrating.solve(recorded, robot_file)
         accepted: dict[str, float] = {}
         for other in accept or []:
             accepted |= calibrating.refuse_disagreement(found, other)
         if write and robot_file is not None:
-            calibrating.write(robot_file, changed, calibrating.hash_of(log or out))
+            calibrating.write(robot_file, changed, calibrating.hash_of(log))
         if json:
             print_json(calibrating.as_json(found, changed, accepted))
-            return
-        for change in changed:
-            half = "" if change.half is None else f" +- {change.half:.5f}"
-            print_answer(f"{change.setting:32} {change.before!s:>10} -> {change.now}{half}")
-        print_answer(
-            f"by {found.steps} pairs of scans; rms {1000 * found.residual_m:.1f} mm, {found.residual_rad:.4f} rad"
+        else:
+            calibrating.tell(found, changed, accepted, written=write)
+
+
+def _new_recording(out: Path) -> Path:
+    """Return where a drive is recorded; raises `WrongUseError` if there is a file already."""
+    if out.exists():
+        raise WrongUseError(f"{out} exists: name another file with --out, or calibrate by it: fognav calibrate {out}")
+    return out
+
+
+def _ask_to_drive(square: float) -> None:
+    """Let the operator agree that the robot drives by itself; raises `WrongUseError` if nobody does."""
+    print_line(
+        f"the robot will drive by itself for 3 to 10 minutes, at 0.12 m/s at most, in the {square:g} m square around "
+        "it. Stand beside it, and keep people, animals and cables away. Ctrl-C, its bumper, and what its lidar sees "
+        "come near stop it; stairs are its cliff sensors' alone."
+    )
+    if not sys.stdin.isatty():
+        raise WrongUseError(
+            "nobody can be asked here whether the robot may drive by itself: stand beside it, add --yes"
         )
-        for name, value in accepted.items():
-            print_answer(f"{name:32} {value}")
-        if not write:
-            print_answer("nothing was written: add --write --robot-file robot.toml")
+    if not typer.confirm("Let it drive?", err=True):
+        raise WrongUseError("nothing has moved")

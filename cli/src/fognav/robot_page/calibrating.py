@@ -14,7 +14,7 @@ import numpy as np
 
 from fog_runtime.configuration.robot_file import ROBOT_FILE, load_robot
 from fog_runtime.record import Recorder, RecordError, read_entries
-from fognav.output import FailedError, WrongUseError, print_line
+from fognav.output import FailedError, WrongUseError, print_answer, print_line
 from fognav.robot_page import settings_file
 from fognav.robot_page.recording_view import until_told
 from fognav.robot_page.view import LocalRobotErrors
@@ -26,7 +26,8 @@ from robot_agent.local_client import LocalRobot
 if TYPE_CHECKING:
     from pathlib import Path
 
-_USED: Final = (Started, BaseReceived, ScanReceived)
+USED: Final = (Started, BaseReceived, ScanReceived)
+"""Entries that a calibration is made of."""
 _TOLD_S: Final = 5.0
 
 
@@ -36,7 +37,7 @@ def read(log: Path) -> Calibrator:
     try:
         for _, topic, data in read_entries(log):
             kind = ENTRY_OF_TOPIC.get(topic)
-            if kind in _USED:
+            if kind in USED:
                 calibrator.take(msgspec.json.decode(data, type=kind))
     except (OSError, RecordError, msgspec.DecodeError) as error:
         raise WrongUseError(f"{log}: {error}. Name a file that `fognav map record` wrote") from error
@@ -57,7 +58,7 @@ def record(socket: Path, log: Path, seconds: float | None) -> Calibrator:
         )
         while not ends():
             for entry in robot.entries(0.2):
-                if isinstance(entry, _USED):
+                if isinstance(entry, USED):
                     calibrator.take(entry)
                     recorder.write_entry(TOPIC_OF_ENTRY[type(entry)], entry, time.time_ns())
                 if isinstance(entry, ScanReceived):
@@ -77,12 +78,21 @@ def _progress(calibrator: Calibrator) -> str:
         found = calibrator.solve()
     except CalibrationError as error:
         return str(error)
-    bars = []
+    return bars(found)
+
+
+def bars(found: Calibration) -> str:
+    """Return a bar for each figure, which is full once it is known well enough."""
+    return "  ".join(f"{name} {'#' * min(10, int(10.0 * share)):.<10}" for name, share in known(found))
+
+
+def known(found: Calibration) -> list[tuple[str, float]]:
+    """Return how well each figure is known, by name: 1 is well enough."""
+    shares = []
     for (name, figure), wanted in zip(found.figures.items(), WANTED, strict=True):
         half = figure.half / figure.value if name == "axle" else figure.half
-        filled = min(10, math.floor(10.0 * wanted / max(half, 1e-9)))
-        bars.append(f"{name} {'#' * filled}{'.' * (10 - filled)}")
-    return "  ".join(bars)
+        shares.append((name, wanted / max(half, 1e-9)))
+    return shares
 
 
 def solve(calibrator: Calibrator, robot_file: Path | None) -> tuple[Calibration, list[Changed]]:
@@ -133,6 +143,18 @@ def write(robot_file: Path, changed: list[Changed], source: str) -> None:
 def hash_of(log: Path) -> str:
     """Return the beginning of a log's hash, by which its result can be traced."""
     return f"{log.name} {hashlib.sha256(log.read_bytes()).hexdigest()[:12]}"
+
+
+def tell(found: Calibration, changed: list[Changed], accepted: dict[str, float], *, written: bool) -> None:
+    """Print what was found, and what became of it."""
+    for change in changed:
+        half = "" if change.half is None else f" +- {change.half:.5f}"
+        print_answer(f"{change.setting:32} {change.before!s:>10} -> {change.now}{half}")
+    print_answer(f"by {found.steps} pairs of scans; rms {1000 * found.residual_m:.1f} mm, {found.residual_rad:.4f} rad")
+    for name, value in accepted.items():
+        print_answer(f"{name:32} {value}")
+    if not written:
+        print_answer("nothing was written: add --write --robot-file robot.toml")
 
 
 def as_json(found: Calibration, changed: list[Changed], accepted: dict[str, float]) -> dict[str, Any]:

@@ -81,7 +81,7 @@ def recording(
     site = RobotSite(id="r1", start=Pose(x=0.0, y=0.0, theta=0.0), radius=0.17)
     yield Started(config=agent_config("r1", LOG_KEY, drive, lidar, site, boot="b"), seed=0)
     walls = _room(rng)
-    poses, ticks = _driven(body, rng, walk)
+    poses, ticks = driven(body, rng, walk)
     stamps = np.arange(len(poses), dtype=np.float64) * _DT
     per_tick = math.pi * _DIAMETER_M / _TICKS
     due, scan_at, number, seq = 0.0, 0.3, 0, 0
@@ -114,10 +114,10 @@ def _room(rng: np.random.Generator) -> NDArray[np.float64]:
     return np.array(walls)
 
 
-def _driven(
+def driven(
     body: Body, rng: np.random.Generator, walk: Sequence[tuple[float, float, float]]
 ) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
-    """Return the body's poses (n, 3) and its counters (n, 2), every 5 ms."""
+    """Return the body's poses (n, 3; m, m, rad) and its counters (n, 2), every 5 ms of a walk (m/s, rad/s, s)."""
     commands = np.concatenate([np.tile((v, w), (round(seconds / _DT), 1)) for v, w, seconds in walk])
     asked = np.column_stack(
         (commands[:, 0] - commands[:, 1] * _AXLE_M / 2, commands[:, 0] + commands[:, 1] * _AXLE_M / 2)

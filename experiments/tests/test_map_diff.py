@@ -87,6 +87,16 @@ def test_what_a_later_drive_no_longer_sees_is_forgotten(folder, logs):
     assert back["changes"] == []
 
 
+def test_map_that_others_were_laid_onto_takes_over_what_has_stood(folder, logs):
+    save_map(folder / "plan", MAP)
+    save_map(folder / "recorded", NOW)
+    assert run("clean", folder / "recorded.yaml", "--onto", folder / "plan.yaml").exit_code == 0
+    taken = run("diff", folder / "plan.yaml", logs[0], "--take-over", "--drives", 1)
+    assert (taken.exit_code, "to " + str(folder / "plan.clean") in taken.output) == (0, True), taken.output
+    # From then on the map that the commands make is the one to compare with.
+    assert run("diff", folder / "plan.yaml", logs[0], "--take-over").exit_code == 2
+
+
 def test_drive_through_another_building_is_refused(folder):
     elsewhere = drive(folder, "elsewhere", 5, floor((1, 1, 14, 3.5), (1, 1, 4, 9), (8, 1, 14, 9)))
     refused = run("diff", folder / "floor.yaml", elsewhere)

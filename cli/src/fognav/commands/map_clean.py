@@ -72,7 +72,7 @@ def map_clean(
         text = begun(file, map_file, static) if onto is None else begun(file, onto, loaded(onto))
         if command:
             text = with_lines(text, [" ".join(command)])
-        read = _read(file, text)
+        read = read_commands(file, text)
         kept = [map_file, *([] if read.first is None else [file.parent / read.first[0]])]
         if Path(f"{prefix}.yaml").resolve() in [one.resolve() for one in kept]:
             raise WrongUseError(
@@ -126,7 +126,8 @@ def save_commands(file: Path, text: str) -> None:
         atomic_write(file, text.encode(), mode=SHARED)
 
 
-def _read(file: Path, text: str) -> Cleaning:
+def read_commands(file: Path, text: str) -> Cleaning:
+    """Return the commands in the text of a file; raises `WrongUseError`."""
     from fog_mapping.cleaning import CommandError, read  # noqa: PLC0415  # keeps the other commands fast
 
     try:

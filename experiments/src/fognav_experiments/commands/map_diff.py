@@ -14,7 +14,7 @@ from fog_contracts.costs import FREE, LETHAL, UNKNOWN
 from fog_runtime.configuration.maps import read_provenance
 from fog_runtime.files import SHARED, atomic_write
 from fognav import kernels
-from fognav.commands.map_clean import begun, commands_file, save_commands, with_lines
+from fognav.commands.map_clean import begun, commands_file, read_commands, save_commands, with_lines
 from fognav.commands.map_files import MapArgument  # noqa: TC001  # Typer reads annotations at run time
 from fognav.map_files import file_hash, loaded
 from fognav.operate.options import JsonOption  # noqa: TC001  # same
@@ -120,7 +120,8 @@ def _commands(map_file: Path, static: StaticMap) -> tuple[Path, str]:
             raise WrongUseError(f"{map_file} was cleaned by {file}, which is not there. Put it there again")
     else:
         file = commands_file(map_file)
-        if file.exists():
+        # One without commands names the map that others were laid onto.
+        if file.exists() and read_commands(file, begun(file, map_file, static)).commands:
             raise WrongUseError(
                 f"{file} has commands, which {map_file} does not show. Compare with the cleaned map: fognav map clean "
                 f"{map_file} writes it"

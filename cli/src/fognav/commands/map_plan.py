@@ -80,7 +80,8 @@ def map_from_plan(  # noqa: PLR0913  # each option is an argument
             x, y = _point("--inside", inside, picture.size)
             place = x * pixel_m, (picture.height - y) * pixel_m
         try:
-            made = map_of_plan(_sampled(picture, pixel_m / size), size, doors=doors, inside=place, wall=wall)
+            pixels = _sampled(picture, pixel_m / size)
+            made = map_of_plan(pixels, size, finest=pixel_m, doors=doors, inside=place, wall=wall)
         except PlanError as error:
             raise WrongUseError(f"{plan}: {error}") from error
         x, y, theta = made.pose

@@ -57,6 +57,8 @@ _THICKNESSES: Final = np.geomspace(0.03, 0.8, 42)
 _LEAST_SHARE: Final = 0.1
 """Of the length of all strokes, so much is of walls, or of lines."""
 _SURELY_WALL_M: Final = 0.09
+_LINE_PIXELS: Final = 2.5
+"""A line of one pixel of a scan is up to so many thick."""
 _SAMPLES: Final = 8000
 _FARTHEST_PIXELS: Final = 24
 _DOOR_M: Final = 1.3
@@ -93,12 +95,14 @@ def map_of_plan(
     pixels: NDArray[np.uint8],
     size: float,
     *,
+    finest: float = 0.0,
     doors: Doors = "open",
     inside: tuple[float, float] | None = None,
     wall: float | None = None,
 ) -> Plan:
     """Return the map of a drawing: pixels (height, width, 3; RGB) of `size` (m), of which a cell's side has two.
 
+    finest: the side (m) of a pixel of the picture, where it was finer or coarser: its thinnest lines are no thinner.
     doors: what openings become that are no wider than doors. inside: a place (m, from the picture's lower-left corner)
     on the floor that is kept, without what no way joins to it; None keeps all floors. wall: the least thickness (m) of
     a wall; None finds it in the drawing. Raises `PlanError`.
@@ -109,7 +113,7 @@ def map_of_plan(
     turn = -askew if 0.5 / max(ink.shape) < abs(askew) <= _MOST_TURN else 0.0
     if turn:
         dark = _turned(dark, turn)
-    walls, least = _walls(_inked(dark), size, wall)
+    walls, least = _walls(_inked(dark), size, wall, max(_SURELY_WALL_M, _LINE_PIXELS * finest))
     rows, columns = (np.flatnonzero(walls.any(axis=axis)) for axis in (1, 0))
     if len(rows) < 2 or len(columns) < 2:
         raise PlanError(
@@ -189,18 +193,18 @@ def _turned(dark: Grey, turn: float) -> Grey:
     return turned
 
 
-def _walls(inked: Grey, size: float, least: float | None) -> tuple[Mask, float | None]:
+def _walls(inked: Grey, size: float, least: float | None, sure: float) -> tuple[Mask, float | None]:
     """Return the walls, and from which thickness (m) on a stroke is one; None where one pen has drawn all."""
     strokes = _without_symbols(inked > 0.5, size)
     # Hatched walls are solid only after their gaps are closed, which would blur the corners of others.
     for gap in (0.0, _HATCH_M / size):
         solid = strokes | _bridged(strokes, gap, 0) | _bridged(strokes, gap, 1) if gap else strokes
-        thickness = least if least is not None else _valley(_thicknesses(_soft(inked, solid), solid) * size)
+        thickness = least if least is not None else _valley(_thicknesses(_soft(inked, solid), solid) * size, sure)
         # A line beside a wall, such as of a dimension, is no side of a hollow one.
         thick = None if thickness is None else _thick(_soft(inked, solid), solid, thickness, size)
         solid = solid | _strips(solid if thick is None else solid & ~_grown(thick, 3.0), size)
         if thickness is None:
-            thickness = _valley(_thicknesses(_soft(inked, solid), solid) * size)
+            thickness = _valley(_thicknesses(_soft(inked, solid), solid) * size, sure)
         if thickness is not None:
             return _thick(_soft(inked, solid), solid, thickness, size), thickness
     return _straight(strokes, size), None
@@ -301,24 +305,27 @@ def _thicknesses(soft: Grey, solid: Mask) -> NDArray[np.float64]:
     return rng.choice(shortest, _SAMPLES, p=(1.0 / shortest) / (1.0 / shortest).sum())
 
 
-def _valley(found: NDArray[np.float64]) -> float | None:
-    """Return the thickness (m) between that of lines and walls; half of it if all are walls, None if all are lines."""
+def _valley(found: NDArray[np.float64], sure: float) -> float | None:
+    """Return the thickness (m) between that of lines and walls; half of it if all are walls, None if all are lines.
+
+    sure: no lines are so thick.
+    """
     if not len(found):
         return None
     counts, edges = np.histogram(np.clip(found, _THICKNESSES[0], _THICKNESSES[-1]), _THICKNESSES)
-    share = ndimage.gaussian_filter1d(counts / counts.sum(), 2.0)
+    share = ndimage.gaussian_filter1d(counts / counts.sum(), 1.0)
     below = np.cumsum(share)
     least = float(np.median(found))
     for i in range(1, len(share) - 1):
         low = 0.5 * min(share[:i].max(), share[i + 1 :].max())
         if share[i] <= min(low, share[i + 1]) and _LEAST_SHARE <= below[i] <= 1.0 - _LEAST_SHARE:
             least = float(np.median(found[found < edges[i]]))
-            if least < _SURELY_WALL_M:
+            if least < sure:
                 # The middle of the valley, as far as it is about as deep.
                 floor = np.flatnonzero(share[i:] > 0.5 * (share[i] + low))[0]
                 return float(math.sqrt(edges[i] * edges[i + floor]))
             break
-    return 0.5 * least if least >= _SURELY_WALL_M else None
+    return 0.5 * least if least >= sure else None
 
 
 def _thick(soft: Grey, solid: Mask, thickness: float, size: float) -> Mask:

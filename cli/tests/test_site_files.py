@@ -3,6 +3,7 @@
 import math
 import shutil
 import tomllib
+from itertools import combinations
 from pathlib import Path
 
 import msgspec
@@ -10,7 +11,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from fog_contracts.costs import DEFAULT_INFLATION
+from fog_contracts.costs import DEFAULT_INFLATION, FREE, LETHAL
 from fog_contracts.grid import GridGeometry, StaticMap
 from fog_contracts.messages import SimObstacle
 from fog_contracts.shapes import rasterize
@@ -176,7 +177,7 @@ def test_areas_are_found_on_a_floor_most_of_which_is_closed_rooms() -> None:
 
 def test_map_without_free_floor_is_refused() -> None:
     geometry = GridGeometry(100, 100, RESOLUTION, 0.0, 0.0)
-    with pytest.raises(NoSiteError, match="no path of 15 m"):
+    with pytest.raises(NoSiteError, match="no path of 4 m"):
         propose("dark", "map.yaml", geometry, np.full(geometry.shape, 255, dtype=np.uint8))
 
 
@@ -292,3 +293,13 @@ def test_problem_of_an_invalid_site_names_its_field(tmp_path: Path) -> None:
 )
 def test_any_folder_name_gives_a_valid_id(name: str, expected: str) -> None:
     assert identifier(name) == expected
+
+
+def test_a_flat_without_a_way_of_15_m_gets_a_site_with_nearer_places() -> None:
+    cells = np.full((100, 140), LETHAL, np.uint8)
+    cells[10:90, 10:130] = FREE
+    cells[45:55, 10:90] = LETHAL
+    made, _ = propose("flat", "map.yaml", GridGeometry(140, 100, 0.05, 0.0, 0.0), cells, whole_floor=True)
+    spots = [(place.x, place.y) for place in made.places.values()]
+    assert len(spots) >= 3
+    assert min(math.dist(a, b) for a, b in combinations(spots, 2)) >= 1.5

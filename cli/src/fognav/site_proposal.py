@@ -7,7 +7,7 @@ import math
 import random
 from collections import Counter
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import pairwise
 from typing import Final, NamedTuple
 
@@ -37,6 +37,8 @@ DRIVE_M: Final = (15.0, 60.0)
 """Length of the demo's path: long enough for a hazard ahead, short enough to watch."""
 _ENDS_M: Final = (8.0, 3.0)
 """Minimum distances along the path from the start to an area and from an area to the goal."""
+_SCALES: Final = (1.0, 0.5, 0.25)
+"""Where no path is as long, these shares of the distances do: a flat has no corridor of 15 m."""
 _CORRIDOR_M: Final = (0.9, 4.2)
 _AREA_LENGTH_M: Final = 2.4
 _SONAR_ANGLES: Final = (-0.13, 0.13)
@@ -95,6 +97,8 @@ class _Floor:
     clearance: NDArray[np.float64]
     echoing: Floor
     """What a sonar would meet: only what the map shows as occupied echoes, unknown cells do not."""
+    scale: float = 1.0
+    """Share of the usual distances between places and areas: a flat is smaller than an office floor."""
 
     def inflated(self, raw: NDArray[np.uint8]) -> NDArray[np.uint8]:
         table = inflation_table(self.geometry.resolution, DEFAULT_INFLATION)
@@ -131,19 +135,23 @@ def propose(  # a map, and what is wanted on it
     With any one of the demo's areas blocked there is another path. A map without such areas gets a demo without areas.
     `whole_floor`: with places all over the floor that the robot can reach, and areas on the ways to them, too.
     """
-    floor = _floor(geometry, cells)
+    whole = _floor(geometry, cells)
     best: _Drive | None = None
-    drives, reasons = 0, Counter[str]()
-    for drive in _drives(floor, random.Random(seed), reasons):  # noqa: S311  # repeatable, not a secret
-        drives += 1
-        if best is None or _rank(drive) > _rank(best):
-            best = drive
-        if len(best.areas) >= 2:  # enough for the demo to choose from
+    for scale in _SCALES:
+        floor = replace(whole, scale=scale)
+        drives, reasons = 0, Counter[str]()
+        for drive in _drives(floor, random.Random(seed), reasons):  # noqa: S311  # repeatable, not a secret
+            drives += 1
+            if best is None or _rank(drive) > _rank(best):
+                best = drive
+            if len(best.areas) >= 2:  # enough for the demo to choose from
+                break
+        if best is not None:
             break
-    if best is None:
+    else:
         raise NoSiteError(
-            f"no path of {DRIVE_M[0]:.0f} m or more was found between two points with {PLACE_CLEARANCE_M} m of "
-            "clearance. Check the map's resolution and thresholds"
+            f"no path of {_SCALES[-1] * DRIVE_M[0]:.0f} m or more was found between two points with "
+            f"{PLACE_CLEARANCE_M} m of clearance. Check the map's resolution and thresholds"
         )
     places = {
         "a": Place(x=best.start.x, y=best.start.y, label="A"),
@@ -166,7 +174,7 @@ def propose(  # a map, and what is wanted on it
         robots=[RobotSite(id="r1", start=best.start, radius=ROBOT_RADIUS)],
         demo=DemoPlan(start="a", goal="b", areas=[area.id for area, _ in best.areas]),
     )
-    return Proposal(site, "" if areas else _why(drives, reasons))
+    return Proposal(site, "" if areas else _why(drives, reasons, floor.scale))
 
 
 def _places(floor: _Floor, known: list[Point]) -> list[Point]:
@@ -189,7 +197,7 @@ def _places(floor: _Floor, known: list[Point]) -> list[Point]:
     while spots and len(known) + len(found) < _MOST_PLACES:
         away = [min(math.dist(spot, other) for other in (*known, *found)) for spot in spots]
         farthest = max(range(len(spots)), key=away.__getitem__)
-        if away[farthest] < _PLACES_APART_M:
+        if away[farthest] < floor.scale * _PLACES_APART_M:
             break
         found.append((round(spots[farthest][0], 3), round(spots[farthest][1], 3)))
     return found
@@ -212,7 +220,7 @@ def _on_the_ways(
         path = [(x, y) for x, y in floor.geometry.centres(route.cells).tolist()] if route.found else []
         for area, node in _areas(floor, planner, path, _length(path), start, goal, reasons):
             apart = min((math.dist((node.x, node.y), (other.x, other.y)) for _, other in found), default=math.inf)
-            if apart < _NODES_APART_M or len(found) == _MOST_AREAS:
+            if apart < floor.scale * _NODES_APART_M or len(found) == _MOST_AREAS:
                 continue
             name = f"z{len(found) + 1}"
             area = structs.replace(area, id=name, label=name.upper(), number=len(found) + 1)  # noqa: PLW2901  # same one
@@ -220,13 +228,14 @@ def _on_the_ways(
     return found
 
 
-def _why(drives: int, reasons: Counter[str]) -> str:
+def _why(drives: int, reasons: Counter[str], scale: float) -> str:
     """Return why no spot on any path was good for a watched area, the most frequent reason first."""
     tried = sum(reasons.values())
     if not tried:
+        first, both = scale * _ENDS_M[0], scale * sum(_ENDS_M)
         return (
-            f"{drives} paths were looked at, and none goes on for more than {sum(_ENDS_M):.0f} m: areas are proposed "
-            f"{_ENDS_M[0]:.0f} m behind the start at the earliest. Write your own areas into it, see docs/operations.md"
+            f"{drives} paths were looked at, and none goes on for more than {both:.0f} m: areas are proposed "
+            f"{first:.0f} m behind the start at the earliest. Write your own areas into it, see docs/operations.md"
         )
     found = "; ".join(f"{count} {reason}" for reason, count in reasons.most_common())
     return (
@@ -263,14 +272,14 @@ def _drives(floor: _Floor, generator: random.Random, reasons: Counter[str]) -> I
         i, j = generator.randrange(rows.size), generator.randrange(rows.size)
         start, goal = (int(columns[i]), int(rows[i])), (int(columns[j]), int(rows[j]))
         apart = math.dist(start, goal) * floor.geometry.resolution
-        if not DRIVE_M[0] / 2 <= apart <= DRIVE_M[1]:
+        if not floor.scale * DRIVE_M[0] / 2 <= apart <= DRIVE_M[1]:
             continue
         found = planner.plan(floor.cost, start, goal)
         if not found.found:
             continue
         path = [(x, y) for x, y in floor.geometry.centres(found.cells).tolist()]
         length = _length(path)
-        if not DRIVE_M[0] <= length <= DRIVE_M[1]:
+        if not floor.scale * DRIVE_M[0] <= length <= DRIVE_M[1]:
             continue
         drives += 1
         areas = _areas(floor, planner, path, length, start, goal, reasons)
@@ -295,13 +304,14 @@ def _areas(  # noqa: PLR0913  # a path with its ends, and what it lies on
 ) -> list[tuple[AreaSite, NodeSite]]:
     """Return watched areas along the path, each of which has a detour; count in `reasons` why others were not taken."""
     found: list[tuple[AreaSite, NodeSite]] = []
-    travelled, last, next_at = 0.0, -math.inf, _ENDS_M[0]
+    behind, before = (floor.scale * end for end in _ENDS_M)
+    travelled, last, next_at = 0.0, -math.inf, behind
     for previous, point in pairwise(path):
         travelled += math.dist(previous, point)
         if travelled < next_at:
             continue
         next_at = travelled + _CANDIDATE_STEP_M
-        if travelled > length - _ENDS_M[1] or travelled - last < _AREA_SPACING_M:
+        if travelled > length - before or travelled - last < _AREA_SPACING_M:
             continue
         try:
             candidate = _area_at(floor, point, len(found) + 1)

@@ -75,3 +75,23 @@ def test_exact_measurements_give_exact_poses():
 def test_pose_that_nothing_reaches_is_an_error():
     with pytest.raises(RuntimeError, match="singular"):
         solve(np.zeros((3, 3)), [Edge(0, 1, np.array((1.0, 0.0, 0.0)), INFORMATION)])
+
+
+def test_the_least_squares_are_those_that_gtsam_finds():
+    """Another solver, by other people: `uv pip install gtsam` (4.3 or later) for this test."""
+    gtsam = pytest.importorskip("gtsam", reason="gtsam is not installed")
+    truth, rng = rounds(), np.random.default_rng(1)
+    edges = [edge._replace(loop=False) for edge in graph(truth, rng, 0.0)]
+    start = dead_reckoned(edges, len(truth))
+    found = solve(start, edges)
+    factors, values = gtsam.NonlinearFactorGraph(), gtsam.Values()
+    factors.add(gtsam.PriorFactorPose2(0, gtsam.Pose2(*start[0]), gtsam.noiseModel.Isotropic.Sigma(3, 1e-9)))
+    noise = gtsam.noiseModel.Diagonal.Sigmas(SIGMAS)
+    for edge in edges:
+        factors.add(gtsam.BetweenFactorPose2(edge.first, edge.second, gtsam.Pose2(*edge.step), noise))
+    for i, pose in enumerate(start):
+        values.insert(i, gtsam.Pose2(*pose))
+    theirs = gtsam.LevenbergMarquardtOptimizer(factors, values).optimize()
+    poses = np.array([(p.x(), p.y(), p.theta()) for p in map(theirs.atPose2, range(len(truth)))])
+    assert np.abs(found.poses - poses)[:, :2].max() < 1e-3
+    assert found.squares.sum() == pytest.approx(2.0 * factors.error(theirs), rel=1e-3)

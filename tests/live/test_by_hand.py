@@ -156,45 +156,6 @@ def test_a_full_disk_ends_a_recording_and_what_was_written_can_be_read(robot, tm
     assert len(list(read_robot_log(file))) > 10
 
 
-def calibrates_itself(socket: Path, out: Path, *arguments: str) -> subprocess.Popen:
-    command = [sys.executable, "-m", "fognav", "calibrate", "--by-itself", "--socket", str(socket), "--out", str(out)]
-    return subprocess.Popen([*command, *arguments], stderr=subprocess.PIPE, stdin=subprocess.DEVNULL)
-
-
-@pytest.mark.parametrize("way", [signal.SIGINT, signal.SIGKILL])
-def test_a_robot_that_calibrates_itself_stops_when_its_tool_is_ended(robot, tmp_path, way):
-    socket, watcher = robot
-    process = calibrates_itself(socket, tmp_path / "drive.mcap", "--yes")
-    with ended(process):
-        wait_for(lambda: watcher.mode == "TELEOP" and watcher.rolled(0.3)[0] > 0.01, "it drives by itself")
-        process.send_signal(way)
-        time.sleep(SETTLED_S)
-        assert watcher.rolled(0.3) == pytest.approx((0.0, 0.0), abs=1e-3)
-        wait_for(lambda: watcher.mode == "INIT", "the robot waits to be enabled")
-        error = process.stderr.read()
-    if way == signal.SIGINT:
-        assert b"this can't be told yet: turn in place to the left" in error
-        assert len(list(read_robot_log(tmp_path / "drive.mcap"))) > 0
-
-
-@pytest.mark.parametrize(
-    ("arguments", "words"),
-    [
-        ([], b"nobody can be asked here whether the robot may drive by itself"),
-        (["--yes", "--square", "4"], b"the robot does not drive by itself: something stands"),
-    ],
-)
-def test_a_robot_does_not_calibrate_itself_unasked_or_without_free_floor(robot, tmp_path, arguments, words):
-    socket, watcher = robot
-    before = watcher.wheels
-    process = calibrates_itself(socket, tmp_path / "drive.mcap", *arguments)
-    with ended(process):
-        assert words in process.communicate(timeout=60.0)[1]
-        assert process.returncode != 0
-    assert (watcher.wheels, watcher.mode) == (before, "INIT")
-    assert not (tmp_path / "drive.mcap").exists(), "the next try may have its name"
-
-
 def true_pose(folder: Path) -> tuple[float, float, float]:
     """Return where the robot is in its building (x, y in m, theta in rad)."""
     line = json.loads((folder / "truth.jsonl").read_bytes().splitlines()[-2])

@@ -224,6 +224,26 @@ def test_a_socket_of_another_user_is_refused_with_the_group_to_join(rig):
         agent.socket.chmod(0o660)
 
 
+def test_a_bump_ends_a_robot_that_calibrates_itself_and_its_tool_says_so(rig, tmp_path):
+    body, agent = rig
+    command = [sys.executable, "-m", "fognav", "calibrate", "--by-itself", "--yes", "--socket", str(agent.socket)]
+    tool = subprocess.Popen([*command, "--out", str(tmp_path / "drive.mcap")], stderr=subprocess.PIPE)
+    try:
+        wait_for(lambda: max(body.speeds) > 0.1, "it drives by itself")
+        body.robot.world.bump_left = True
+        assert tool.wait(30.0) == 1
+        assert b"the robot has stopped: " in (error := tool.stderr.read())
+        assert b"bumper" in error
+        assert body.speeds == (0.0, 0.0)
+    finally:
+        body.robot.world.bump_left = False
+        tool.kill()
+        tool.wait()
+        tool.stderr.close()
+    with LocalRobot(agent.socket) as robot:
+        wait_for(lambda: robot.reset().accepted, "it is reset once the cause is gone")
+
+
 async def test_a_robot_on_a_mission_that_was_driven_by_hand_waits_with_its_mission_for_an_enable(tmp_path):
     with secured_router(tmp_path, SITE, robots=[ROBOT]) as router:
         async with Robot(tmp_path, router) as robot:

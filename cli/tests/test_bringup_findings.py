@@ -191,6 +191,19 @@ def test_what_is_set_by_looking_is_written_with_the_old_values_beside_it(tmp_pat
     )
 
 
+def test_a_calibration_since_the_agents_start_is_not_undone_by_looking(tmp_path):
+    file = tmp_path / "robot.toml"
+    file.write_text(FILE)
+    place, running = Place(file, {}), (0.0, False, ((1.0, 1.2),))
+    assert place.write(Mount(yaw_rad=0.1, mirrored=False, masks=[(1.0, 1.2)]), running).accepted
+    assert place.write(Mount(yaw_rad=0.2, mirrored=False, masks=[(1.0, 1.2)]), running).accepted, "its own change"
+    calibrating.write(file, [Changed("lidar.yaw_rad", before=0.2, now=0.21, half=None)], "drive.mcap 0123456789ab")
+    refused = place.write(Mount(yaw_rad=0.2, mirrored=False, masks=[]), running)
+    assert not refused.accepted
+    assert "restart the agent" in refused.reason
+    assert "yaw_rad = 0.21" in file.read_text()
+
+
 def test_masks_that_would_hide_what_is_ahead_are_refused_and_nothing_is_written(tmp_path):
     file = tmp_path / "robot.toml"
     file.write_text(FILE)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import os
+import pty
 import signal
 import stat
 import subprocess
@@ -266,3 +267,30 @@ async def test_a_robot_on_a_mission_that_was_driven_by_hand_waits_with_its_missi
             assert not robot.body.moving
             assert (await fog.command("enable")).accepted
             await until(lambda: fog.state.mode == "NORMAL" and max(robot.body.speeds) > 0.1, "it goes on")
+
+
+def test_teleop_begun_while_a_fault_is_latched_says_so_and_drives_after_its_reset(rig):
+    body, agent = rig
+    with LocalRobot(agent.socket) as robot:
+        body.robot.world.bump_left = True
+        wait_for(lambda: robot.reset().code == "cause_remains", "the bump is a fault")
+        body.robot.world.bump_left = False
+    ours, theirs = pty.openpty()
+    command = [sys.executable, "-m", "fognav", "teleop", "--socket", str(agent.socket)]
+    tool = subprocess.Popen(command, stdin=theirs, stdout=theirs, stderr=theirs)
+    os.close(theirs)
+    said = b""
+    try:
+        while b"r resets a fault whose cause is gone" not in said:
+            said += os.read(ours, 4096)
+        os.write(ours, b"r")
+
+        def turns() -> bool:
+            os.write(ours, b"j")
+            return body.speeds[1] > 0.01
+
+        wait_for(turns, "it is driven by hand")
+    finally:
+        tool.send_signal(signal.SIGINT)
+        tool.wait(10.0)
+        os.close(ours)

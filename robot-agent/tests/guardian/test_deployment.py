@@ -119,7 +119,7 @@ def test_installed_files_have_no_placeholder_left_and_are_not_writable_by_others
     for path in files:
         assert not re.search(r"@[A-Z]+@", path.read_text()), path
         assert not path.stat().st_mode & 0o022
-    assert (installed / "etc/fognav/operator.key").stat().st_mode & 0o007 == 0
+    assert (installed / "etc/fognav/operator.key").stat().st_mode & 0o077 == 0, "nor by who drives by hand"
     # A fallback with others behind it: the fog node need not serve time, and must not replace a server that does.
     servers = entries(installed / "etc/systemd/timesyncd.conf.d/fognav.conf", "FallbackNTP")[0].split()
     assert servers[0] == "fog.local"
@@ -251,6 +251,9 @@ def test_a_robot_without_a_fog_is_installed_with_its_settings_only_and_joins_a_f
     refused = subprocess.run([*command, "--fog", "none", "--site", site_file], check=False, capture_output=True)
     assert refused.returncode == 1
     assert b"name it by --fog" in refused.stderr
+    refused = subprocess.run([*command, "--fog", "none"], check=False, capture_output=True)
+    assert refused.returncode == 1
+    assert b"this robot has a fog by" in refused.stderr
 
 
 @pytest.mark.parametrize(

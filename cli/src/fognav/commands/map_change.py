@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 import time
+import tomllib
 from dataclasses import dataclass
 from pathlib import Path  # Typer reads annotations at run time
 from typing import TYPE_CHECKING, Annotated, Any, Final
@@ -96,8 +97,9 @@ def map_change(  # noqa: PLR0913  # each option is an argument
             try:
                 values |= _change(present, name, running)
             except (WrongUseError, FailedError):
-                for suffix in (".yaml", ".pgm") if map_file is not None else ():
-                    (present.directory / name).with_suffix(suffix).unlink(missing_ok=True)
+                if map_file is not None and _named(present) != name:
+                    for suffix in (".yaml", ".pgm"):
+                        (present.directory / name).with_suffix(suffix).unlink(missing_ok=True)
                 raise
             lines += _changed(present, values, running)
         elif refused:
@@ -262,11 +264,19 @@ def _change(present: LoadedSite, name: str, running: Fog | None) -> dict[str, An
     return {"epoch_before": epoch, "epoch": reached, "robots": robots, "localized": _localized(running, reached)}
 
 
+def _named(present: LoadedSite) -> str:
+    """Return the map that the site's file names now."""
+    return str(tomllib.loads((present.directory / SITE_FILE).read_text("utf-8"))["map"])
+
+
 def _localized(fog: Fog, epoch: int) -> dict[str, list[float] | None]:
     """Return where each robot that answers has found itself on the map of an epoch; None: not yet."""
     deadline = time.monotonic() + _LOCALIZED_S
     while True:
-        views = [view for view in fog.get(PLANNER, "/api/v1/robots") if view["state"] is not None]
+        try:
+            views = [view for view in fog.get(PLANNER, "/api/v1/robots") if view["state"] is not None]
+        except FailedError:  # the map is in force, whether the planner answers or not
+            views = []
         found = {
             view["id"]: [round(view["pose"]["x"], 2), round(view["pose"]["y"], 2)]
             if view["state"]["map_epoch"] >= epoch and view["pose"] is not None and view["pose"]["localized"]

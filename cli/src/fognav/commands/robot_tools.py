@@ -230,7 +230,8 @@ def _ask_to_drive(square: float) -> None:
     print_line(
         f"the robot will drive by itself for 3 to 10 minutes, at 0.12 m/s at most, in the {square:g} m square around "
         "it. Stand beside it, and keep people, animals and cables away. Ctrl-C, its bumper, and what its lidar sees "
-        "come near stop it; stairs are its cliff sensors' alone."
+        "come near stop it; stairs are its cliff sensors' alone. Over a network that stalls, Ctrl-C comes late: keep a "
+        "hand at the battery's cut-off."
     )
     if not sys.stdin.isatty():
         raise WrongUseError(

@@ -56,6 +56,10 @@ _SHOWN_M: Final = 3.0
 _STYLES: Final = {"ok": "green", "warn": "yellow", "bad": "red", "unknown": "cyan"}
 
 
+Mounting = tuple[float, bool, tuple[tuple[float, ...], ...]]
+"""Yaw (rad), whether mirrored, and masks in the robot's frame, rounded as in the file."""
+
+
 class Mount(Struct, frozen=True, tag="mount", kw_only=True):
     """Write how the lidar is mounted into robot.toml; masks in the robot's frame; answered."""
 
@@ -79,6 +83,7 @@ class Place:
         self._looked_at = -math.inf
         self._future = self._thread.submit(list[Finding])
         self._found: list[Finding] = []
+        self._written: Mounting | None = None
 
     def robot(self) -> RobotFile:
         """Return the settings as they are now; raises `SettingsError`."""
@@ -95,17 +100,29 @@ class Place:
             self._found = self._future.result()
         return self._found
 
-    def write(self, mount: Mount) -> HandReply:
-        """Write what a person has set by looking; the reply says what was done, or why it was not."""
+    def write(self, mount: Mount, running: Mounting | None = None) -> HandReply:
+        """Write what a person has set by looking; the reply says what was done, or why it was not.
+
+        running: how the agent takes the lidar to be mounted, from which the person began.
+        """
         if self.file is None:
             reason = "no settings file is known: start this with --robot-file robot.toml (fognav robot new makes one)"
             return HandReply(accepted=False, reason=reason)
         try:
             lidar = self.robot().settings.lidar
+            if running and _mounting(lidar.yaw_rad, lidar.masks, mirrored=lidar.mirrored) not in {
+                running,
+                self._written,
+            }:
+                # What was begun before a calibration would undo it.
+                reason = f"{self.file} was changed since the agent has read it: restart the agent, then look again"
+                return HandReply(accepted=False, reason=reason)
             changed = changes(lidar, mount.yaw_rad, mount.masks, mirrored=mount.mirrored)
             if not changed:
                 return HandReply(accepted=True, reason=f"{self.file} has this already")
             settings_file.write(self.file, changed, "set", "by looking: fognav robot bringup")
+            lidar = self.robot().settings.lidar
+            self._written = _mounting(lidar.yaw_rad, lidar.masks, mirrored=lidar.mirrored)
         except (WrongUseError, SettingsError) as error:
             return HandReply(accepted=False, reason=str(error)[:400])
         names = ", ".join(setting for setting, _, _ in changed)
@@ -259,6 +276,14 @@ class BringupView(RobotView):
         found.append(findings.voltage(status.power, self._rest_v, self._load_v))
         return found
 
+    def write(self, mount: Mount) -> HandReply:
+        """Write what a person has set by looking at the scan of this view."""
+        lidar = self.config.localization if self.config else None
+        if lidar is None or self.equipment is None:
+            return self.place.write(mount, None)
+        running = _mounting(lidar.lidar_yaw, self.equipment.masks, mirrored=self.equipment.mirrored)
+        return self.place.write(mount, running)
+
     def as_json(self) -> dict[str, Any]:
         """Return what the page draws, and the findings."""
         if (now := time.monotonic()) - self._judged_at > _JUDGED_S:
@@ -276,6 +301,10 @@ class BringupView(RobotView):
             "file": str(self.place.file) if self.place.file else None,
         }
         return {**super().as_json(), "bringup": more}
+
+
+def _mounting(yaw: float, masks: Sequence[Sequence[float]], *, mirrored: bool) -> Mounting:
+    return round(yaw, 4), mirrored, tuple(tuple(round(end, 4) for end in mask) for mask in masks)
 
 
 def _wrong(error: SettingsError) -> Finding:

@@ -253,6 +253,8 @@ def _ready(heard: _Recorded, ends: Callable[[], bool]) -> AgentConfig | None:
 def _rounds(robot: LocalRobot, heard: _Recorded, plan: SquareDrive, ends: Callable[[], bool]) -> None:
     """Drive rounds until the figures are known well; raises `FailedError` when the robot has to stop."""
     for number in range(1, ROUNDS + 1):
+        if number > 1:
+            _look_again(heard, plan)
         take_over(robot)
         _drive_round(robot, heard, plan, ends)
         robot.hand_back()  # solving takes a while, and who drives must not be silent
@@ -267,6 +269,19 @@ def _rounds(robot: LocalRobot, heard: _Recorded, plan: SquareDrive, ends: Callab
             if all(share >= 1.0 for _, share in known(found)):
                 return
         plan.again()
+
+
+def _look_again(heard: _Recorded, plan: SquareDrive) -> None:
+    """Raise `FailedError` where a scan of now has something in the square: it stood a while, and may look finished."""
+    heard.poll()
+    before, until = heard.view.scan, time.monotonic() + _READY_S
+    while heard.view.scan is before:
+        if time.monotonic() > until:
+            raise FailedError(f"the robot has stopped: no scan comes within {_READY_S:g} s")
+        time.sleep(_PERIOD_S)
+        heard.poll()
+    if reason := plan.unfit(heard.view.points()):
+        raise FailedError(f"the robot does not drive on by itself: {reason}")
 
 
 def _drive_round(robot: LocalRobot, heard: _Recorded, plan: SquareDrive, ends: Callable[[], bool]) -> None:

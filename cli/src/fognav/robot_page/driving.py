@@ -38,6 +38,10 @@ hold a key to drive:   u i o      q/z faster/slower: both
 k or space stops, r resets a fault, Ctrl-C ends. Letting go stops the robot."""
 
 
+class MustNotMoveError(FailedError):
+    """The robot's state keeps it from being driven, such as a fault that is latched."""
+
+
 class _Steering(Protocol):
     """Something that is held to drive."""
 
@@ -153,7 +157,7 @@ def drive(path: Path, steering: _Steering) -> None:
     """Drive the robot at this socket until Ctrl-C; raises `FailedError`."""
     with LocalRobotErrors(), LocalRobot(path) as robot:
         view = RobotView()
-        take_over(robot)
+        _take_over_or_wait(robot, steering)
         told, said = "", (0.0, 0.0)
         due = time.monotonic()
         with contextlib.suppress(KeyboardInterrupt):
@@ -169,7 +173,7 @@ def drive(path: Path, steering: _Steering) -> None:
                         view.take(entry)
                 if word == "reset":
                     print_line(robot.reset().reason + "\r")
-                    take_over(robot)
+                    _take_over_or_wait(robot, steering)
                 told = _tell(view, told)
                 motion = steering.motion(now)
                 if now >= due or (motion == (0.0, 0.0) != said):  # who lets go is not made to wait
@@ -178,12 +182,26 @@ def drive(path: Path, steering: _Steering) -> None:
         robot.hand_back()
 
 
+def _take_over_or_wait(robot: LocalRobot, steering: _Steering) -> None:
+    """Take the robot over; who has a key that resets its fault is told why it must not move yet."""
+    try:
+        take_over(robot)
+    except MustNotMoveError as error:
+        if not isinstance(steering, Keyboard):
+            raise
+        print_line(f"{error}. r resets a fault whose cause is gone, and tries again\r")
+
+
 def take_over(robot: LocalRobot) -> None:
-    """Take the robot over, as soon as it may move; raises `FailedError` with its reason if it may not."""
+    """Take the robot over, as soon as it may move; raises `FailedError` with its reason if it may not.
+
+    Of these, `MustNotMoveError` says that it will when its state allows.
+    """
     until = time.monotonic() + _HEALTHY_S
     while not (reply := robot.take_over()).accepted:
         if reply.code != "must_not_move" or time.monotonic() > until:
-            raise FailedError(f"the robot refuses to be driven by hand: {reply.reason}")
+            kind = MustNotMoveError if reply.code in {"must_not_move", "fault_latched"} else FailedError
+            raise kind(f"the robot refuses to be driven by hand: {reply.reason}")
         time.sleep(_PERIOD_S)
 
 

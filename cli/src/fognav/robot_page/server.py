@@ -155,7 +155,7 @@ class _Session:
                     if isinstance(request, TakeOver | HandBack | ResetFault):
                         self._asked.append(request)
                 elif isinstance(self._view, BringupView):
-                    self._replies.append(await asyncio.to_thread(self._view.place.write, request))
+                    self._replies.append(await asyncio.to_thread(self._view.write, request))
                     self._news.set()
 
 

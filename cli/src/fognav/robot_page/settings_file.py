@@ -13,7 +13,7 @@ from fog_runtime.configuration.robot_file import parse_robot
 from fog_runtime.files import SHARED, atomic_write
 from fognav.output import WrongUseError, writing
 from robot_agent import registry
-from robot_agent.agent.settings import refuse_contradictions
+from robot_agent.agent.settings import read_footprint, refuse_body, refuse_contradictions
 
 if TYPE_CHECKING:
     from collections.abc import Iterable
@@ -52,6 +52,9 @@ def write(robot_file: Path, changed: Iterable[Change], verb: str, source: str) -
         table[key] = value
     changed_text = tomlkit.dumps(document)
     robot = parse_robot(changed_text, robot_file, {})
-    refuse_contradictions(robot, registry.make_base(robot))
+    base, footprint = registry.make_base(robot), read_footprint(robot)
+    refuse_contradictions(robot, base)
+    if footprint is not None:
+        refuse_body(robot, base, footprint)
     with writing(robot_file, "Name another file"):
         atomic_write(robot_file, changed_text.encode(), mode=SHARED)

@@ -354,7 +354,7 @@ def _listen(path: str) -> socket.socket:
         # A guardian that was killed leaves its socket behind.
         Path(path).unlink(missing_ok=True)
         listener.bind(path)
-        Path(path).chmod(0o660)
+        Path(path).chmod(0o600)
     except OSError as error:
         listener.close()
         reason = error.strerror or error

@@ -94,9 +94,9 @@ class CameraEdge:
             try:
                 for sighting in self.sightings(detector):
                     tell(sighting)
-            except (CameraError, OSError) as error:
+            except Exception as error:  # noqa: BLE001  # whatever one picture does, the next ones count
                 if str(error) != self._last_logged:
-                    _log.warning("camera_problem", source=self._settings.source, reason=str(error))
+                    _log.warning("camera_problem", source=self._settings.source, reason=str(error) or repr(error))
                 self._last_logged = str(error)
             self._ends.wait(self._clock.real(_REOPEN_S))
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import asyncio
 import json
-import math
 import os
 import re
 import shutil
@@ -17,17 +16,12 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 import msgspec
-import numpy as np
 import psutil
 import pytest
 
 from fog_contracts import channels as ch
-from fog_contracts.grid import GridGeometry
 from fog_contracts.messages import MapHeartbeat, SimTruth
-from fog_kernels.raycast import cast
-from fog_mapping.building import draw
 from fog_runtime.clock import SystemClock
-from fog_runtime.configuration.maps import save_map
 from fog_runtime.credentials import Credentials
 from fog_runtime.record import read
 from fog_runtime.transports.zenoh_edge import ZenohEdge
@@ -261,35 +255,3 @@ async def test_killed_demo_on_embedded_servers_leaves_files_but_no_process(start
     assert processes_of(folder) == []
     # The last thread of a killed process may close its sockets after the process counts as dead.
     await until(lambda: not any(listens(port) for port in ports), 60, lambda: f"none of {sorted(ports)} is open")
-
-
-def mapped_building(file: Path) -> None:
-    """Write the map that scans of a building make: 20 m x 14 m of corridors around two blocks."""
-    geometry = GridGeometry(420, 300, 0.05, 0.0, 0.0)
-    walls = np.ones(geometry.shape, np.uint8)
-    walls[10:290, 10:410] = 0
-    walls[50:250, 50:190] = walls[50:250, 230:370] = 1
-    angles = np.linspace(-math.pi, math.pi, 720, endpoint=False)
-    dice, rays = np.random.default_rng(1), []
-    ways = [(x, y) for y in (1.5, 13.5) for x in np.arange(1.5, 20.0, 1.0)]
-    ways += [(x, y) for x in (1.5, 10.5, 19.5) for y in np.arange(1.5, 14.0, 1.0)]
-    for x, y in ways:
-        ranges = cast(walls, 0.05, 0.0, 0.0, x, y, angles, 30.0) + dice.normal(0.0, 0.01, len(angles))
-        rays.append((np.array([x, y, 0.0]), ranges[:, None] * np.column_stack((np.cos(angles), np.sin(angles)))))
-    save_map(file, draw(rays, 0.05))
-
-
-@pytest.mark.drive
-async def test_site_made_of_a_mapped_building_is_valid_and_a_demo_drives_on_it(tmp_path, start_demo):
-    await asyncio.to_thread(mapped_building, tmp_path / "built")
-    site = tmp_path / "site"
-    for words in (("from-map", tmp_path / "built.yaml", "--out", site), ("check", site)):
-        done = await asyncio.to_thread(
-            subprocess.run, [sys.executable, "-m", "fognav", "site", *map(str, words), "--json"],
-            capture_output=True, text=True, check=True,
-        )  # fmt: skip
-    assert json.loads(done.stdout)["areas"] >= 2
-    demo = start_demo("driven", "--site", str(site), "--speed", "3")
-    assert await demo.wait_end(START_TIMEOUT_S) == 0, demo.output
-    report = json.loads(demo.report.read_text("utf-8"))
-    assert (report["outcome"], report["success"]) == ("reached", True)

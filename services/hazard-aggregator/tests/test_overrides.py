@@ -276,7 +276,12 @@ class OverriddenArea(RuleBasedStateMachine):
 
     @rule()
     def restart(self):
-        if self.until is not None and self.rig.stored["hall"].boot != self.rig.boot:
+        rest = self.rig.rests.get("hall")
+        of_this_boot = self.until is not None and self.rig.boot in {
+            self.rig.stored["hall"].boot,
+            rest.boot if rest and rest.version == self.rig.stored["hall"].version else "",
+        }
+        if not of_this_boot:
             self.expect_the_stored_rest()  # its deadline is still that of an earlier boot
         for each in (self.rig, self.plain):
             each.start()

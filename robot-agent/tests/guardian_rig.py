@@ -29,6 +29,8 @@ if TYPE_CHECKING:
 DEADLINE_S = 60.0
 STOP_S = 0.3
 """Longest time that the robot's design allows for stopping the wheels."""
+LATE_S = 0.02
+"""A base whose thread comes later than this sees a command later than its wheels would."""
 
 
 def wait_for(condition, expected: str, deadline_s: float = DEADLINE_S):
@@ -61,6 +63,8 @@ class Base:
         self.robot = robot or RoombaEmulator()
         self.lock = threading.Lock()
         self.stopped_at: float | None = time.monotonic()
+        self.late_s = 0.0
+        """How long its thread came late in all: another thread of the test held Python's lock, or there was no core."""
         self.send_in_pieces = False
         """Pass on a few bytes at a time, as adapters with a short latency timer do."""
         self._port: PtyPort | None = None
@@ -104,14 +108,15 @@ class Base:
 
         What a busy machine let this process and its programs wait meanwhile does not count.
         """
-        late = lateness()
+        late, own = lateness(), self.late_s
         stopped = wait_for(lambda: self.stopped_at, "the wheels stop")
-        return stopped - begun - late.seconds()
+        return stopped - begun - late.seconds() - (self.late_s - own)
 
     def _run(self) -> None:
         before = time.monotonic()
         while not self._ends.wait(0.004):
             now = time.monotonic()
+            self.late_s += max(0.0, now - before - LATE_S)
             with self.lock:
                 if self._port is not None:
                     # At another rate than the host's a device gets garbage, here nothing, and so does the host.

@@ -140,7 +140,7 @@ class Extension(Message, frozen=True, kw_only=True):
 '''),
     Edit(MAP_API, r'^    @routes\.delete\("/api/v1/zones/', before='''\
     @routes.post(
-        "/api/v1/zones/{zone_id}/extension", raises=[ZoneError, ConflictError, StoreError], problems=_NO_SUCH_ZONE
+        "/api/v1/zones/{zone_id}/extension", raises=[ZoneError, ConflictError, StoreError], problems=NO_SUCH_ZONE
     )
     async def extend_zone(zone_id: str, body: Body[Extension], caller: Operator) -> Answer[Zone]:
         """Let a zone hold for so many more minutes."""

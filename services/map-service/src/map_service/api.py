@@ -3,21 +3,15 @@
 Reading needs no token, except for the audit log; writing needs the role operator.
 """
 
-import asyncio
-import io
 import secrets
 from collections.abc import Callable
 from typing import Annotated, Final, Literal
 
 import msgspec
-import numpy as np
-from fastapi import FastAPI, Response
-from PIL import Image
+from fastapi import FastAPI
 
 from fog_contracts.messages import (
-    HazardArea,
     Id,
-    MapGeometry,
     Message,
     PenaltyFactor,
     Sentence,
@@ -28,12 +22,11 @@ from fog_contracts.messages import (
     Zone,
     ZoneKind,
 )
-from fog_contracts.site import Place, Site
+from fog_contracts.site import Site
 from fog_runtime.clock import Clock
-from fog_runtime.concurrency import BusyError, Worker
+from fog_runtime.concurrency import BusyError
 from fog_runtime.health import Health
 from fog_runtime.http import (
-    RETRY_AFTER,
     Answer,
     Body,
     Encoded,
@@ -43,7 +36,6 @@ from fog_runtime.http import (
     IfNoneMatch,
     Operator,
     PageSize,
-    ProblemCode,
     ProblemError,
     Routes,
     Tokens,
@@ -57,40 +49,19 @@ from fog_runtime.http import (
     must_be_new,
     next_page,
 )
-from fog_runtime.http.routes import InvalidBodyError
 from fog_runtime.stores.records import KINDS, AuditEntry, CursorError
 from fog_runtime.stores.redis_connection import StoreError
 from fog_runtime.stores.redis_store import Attempt, IdempotencyError
+from map_service.api_views import add_views
 from map_service.core import ScrapeTarget
-from map_service.costmap import LayeredCostmap
-from map_service.layers.base import Grid
+from map_service.problems import NO_SUCH_ZONE, ZONES_NOT_LOADED, MapProblem, add_errors, require_zones
 from map_service.service import Service
 from map_service.zone_writer import ConflictError
 from map_service.zones import ZoneError
 
 AuditKind = Literal["alert", "area", "mission", "override", "robot", "stop", "store", "zone"]
 
-Image.preinit()  # the first picture would load PIL's formats, while the map is served
-
-_PNG: Final = "image/png"
-_MAX_PICTURES: Final = 4
-"""Most pictures that are being encoded or wait for it."""
 _REFUSALS: Final = (ZoneError, BusyError, IdempotencyError, StoreError)
-
-
-class MapProblem(ProblemCode):
-    """Problems of the map-service."""
-
-    NO_ZONE = "no_zone", 404, "No zone has this id"
-    ZONE_EXISTS = "zone_exists", 409, "A zone with this id exists already"
-    ZONE_CHANGED = "zone_changed", 412, "The zone is not as the request expects: somebody else changed or added it"
-    ZONE_INVALID = "zone_invalid", 422, "The zone is invalid, or one too many: `errors` names its fields"
-    ZONES_NOT_LOADED = "zones_not_loaded", 503, "The stored zones are not loaded yet"
-    BUSY = "busy", 503, "Too many requests wait for a calculation: `Retry-After` says when to try again"
-
-
-_ZONES_NOT_LOADED: Final = (MapProblem.ZONES_NOT_LOADED,)
-_NO_SUCH_ZONE: Final = (MapProblem.NO_ZONE, MapProblem.ZONES_NOT_LOADED)
 
 
 class ZoneBody(Message, frozen=True, kw_only=True):
@@ -125,26 +96,17 @@ class UnusableZone(Message, frozen=True, kw_only=True):
     reason: str
 
 
-class MapInfo(Message, frozen=True, kw_only=True):
-    """The map's geometry and version; its images have the geometry's size, and their first row is the map's top."""
-
-    site: str
-    geometry: MapGeometry
-    epoch: int
-    seq: int
-
-
 def make_api(  # the process's parts
     service: Service, site: Site, clock: Clock, health: Health, tokens: Tokens, standby: Callable[[], str] = str
 ) -> FastAPI:
     """Return the app over a running service; while `standby` returns a reason, nothing can be written."""
     app = make_app("Fognav map-service", health, tokens, standby=standby)
     zones = Routes(app, "zones")
-    _add_errors(zones)
+    add_errors(zones)
     _add_zone_reads(zones, service)
     _add_zone_writes(zones, service, clock)
     _add_audit(zones, service)
-    _add_views(Routes(app, "map"), service, site)
+    add_views(Routes(app, "map"), service, site)
     _add_scrape_targets(Routes(app, "robots"), service, clock)
     recovery = Routes(app, "store")
     add_store_errors(recovery)
@@ -155,19 +117,19 @@ def make_api(  # the process's parts
 def _add_zone_reads(routes: Routes, service: Service) -> None:
     listing = _ZoneListing(service)
 
-    @routes.get("/api/v1/zones", problems=_ZONES_NOT_LOADED)
+    @routes.get("/api/v1/zones", problems=ZONES_NOT_LOADED)
     async def list_zones() -> Encoded[ZoneList]:
         """List all zones with the map version that contains them."""
-        _require_zones(service)
+        require_zones(service)
         return listing.current()
 
-    @routes.get("/api/v1/unusable-zones", problems=_ZONES_NOT_LOADED)
+    @routes.get("/api/v1/unusable-zones", problems=ZONES_NOT_LOADED)
     async def list_unusable_zones() -> list[UnusableZone]:
         """List the stored zones that are left out of the map because their records are invalid: DELETE them."""
-        _require_zones(service)
+        require_zones(service)
         return [UnusableZone(id=name, reason=reason) for name, reason in service.zones.unusable.reasons.items()]
 
-    @routes.get("/api/v1/zones/{zone_id}", problems=_NO_SUCH_ZONE)
+    @routes.get("/api/v1/zones/{zone_id}", problems=NO_SUCH_ZONE)
     async def get_zone(zone_id: str) -> Answer[Zone]:
         """Return one zone with its ETag."""
         zone = _find_zone(service, zone_id)
@@ -175,20 +137,18 @@ def _add_zone_reads(routes: Routes, service: Service) -> None:
 
 
 def _add_zone_writes(routes: Routes, service: Service, clock: Clock) -> None:
-    @routes.post("/api/v1/zones", status=201, raises=[*_REFUSALS, ConflictError], problems=_ZONES_NOT_LOADED)
+    @routes.post("/api/v1/zones", status=201, raises=[*_REFUSALS, ConflictError], problems=ZONES_NOT_LOADED)
     async def create_zone(
         body: Body[ZoneBody], caller: Operator, idempotency_key: IdempotencyKey = None
     ) -> Answer[Zone]:
         """Add a zone; replies once it is durably stored and on the map."""
-        _require_zones(service)
+        require_zones(service)
         attempt = attempt_of(idempotency_key, caller, "POST /api/v1/zones", body)
         zone = _zone_from_body(body, body.id or f"z-{secrets.token_hex(4)}", caller.name, clock.stamp())
         zone = await service.zones.create(zone, caller.name, attempt)
         return Answer(zone, {**etag(zone.version), "Location": f"/api/v1/zones/{zone.id}"})
 
-    @routes.put(
-        "/api/v1/zones/{zone_id}", status=(200, 201), raises=[*_REFUSALS, ConflictError], problems=_NO_SUCH_ZONE
-    )
+    @routes.put("/api/v1/zones/{zone_id}", status=(200, 201), raises=[*_REFUSALS, ConflictError], problems=NO_SUCH_ZONE)
     async def put_zone(  # headers are parameters
         zone_id: str,
         body: Body[ZoneBody],
@@ -214,7 +174,7 @@ def _add_zone_writes(routes: Routes, service: Service, clock: Clock) -> None:
         zone = await service.zones.replace(zone, expected_version(if_match), caller.name, attempt)
         return Answer(zone, etag(zone.version))
 
-    @routes.delete("/api/v1/zones/{zone_id}", raises=[ConflictError, StoreError], problems=_NO_SUCH_ZONE)
+    @routes.delete("/api/v1/zones/{zone_id}", raises=[ConflictError, StoreError], problems=NO_SUCH_ZONE)
     async def delete_zone(zone_id: str, caller: Operator, if_match: IfMatch = None) -> None:
         """Delete a zone; with If-Match, only if it is unchanged."""
         await service.zones.reload_after_uncertain_write()
@@ -233,61 +193,6 @@ def _add_audit(routes: Routes, service: Service) -> None:
         """Return the audit trail of all services, newest first; the Link header has the next page's address."""
         page = await service.audit(KINDS if kind is None else (kind,), cursor, limit)
         return Answer(page.entries, next_page("/api/v1/audit", page.next, limit, kind=kind))
-
-
-def _add_errors(routes: Routes) -> None:
-    """Register the problem document of each exception that the service raises."""
-    routes.raises(
-        ZoneError,
-        [MapProblem.ZONE_INVALID],
-        lambda error: ProblemError(MapProblem.ZONE_INVALID, error.message, field=f"body.{error.field}"),
-    )
-    add_store_errors(routes)
-    routes.raises(
-        CursorError,
-        [HttpProblem.REQUEST_INVALID],
-        lambda error: ProblemError(HttpProblem.REQUEST_INVALID, str(error), field="query.cursor"),
-    )
-    _add_busy_error(routes)
-    routes.raises(
-        ConflictError,
-        [MapProblem.ZONE_EXISTS, MapProblem.ZONE_CHANGED],
-        _conflict,
-    )
-    routes.raises(InvalidBodyError, [], _with_remedies)
-
-
-def _conflict(error: ConflictError) -> ProblemError:
-    if error.outcome == "exists":
-        detail = f"zone {error.zone} exists already: choose another id, or PUT it"
-        return ProblemError(MapProblem.ZONE_EXISTS, detail)
-    if error.outcome == "missing":
-        return ProblemError(MapProblem.NO_ZONE, f"there is no zone {error.zone} any more: POST it to add it again")
-    detail = f"zone {error.zone} was changed by somebody else: read it again, then retry"
-    return ProblemError(MapProblem.ZONE_CHANGED, detail)
-
-
-def _with_remedies(error: InvalidBodyError) -> InvalidBodyError:
-    """Add a remedy to the errors about shapes with too few points."""
-    remedies = {
-        "body.shape.points": "a polygon needs at least three corners: add one",
-        "body.shape.line": "a corridor needs at least two points: add one",
-    }
-    errors = [
-        {**entry, "problem": f"{entry['problem']}; {remedies[entry['field']]}"}
-        if entry["field"] in remedies and "length" in entry["problem"]
-        else entry
-        for entry in error.errors
-    ]
-    return InvalidBodyError(errors)
-
-
-def _add_busy_error(routes: Routes) -> None:
-    routes.raises(
-        BusyError,
-        [MapProblem.BUSY],
-        lambda error: ProblemError(MapProblem.BUSY, f"{error}: try again", headers=RETRY_AFTER),
-    )
 
 
 class _ZoneListing:
@@ -309,60 +214,6 @@ class _ZoneListing:
         return Encoded(msgspec.json.encode(parts))
 
 
-class _Pictures:
-    """PNGs whose pixel values are the cells', encoded on a thread of their own, once per version for all who ask."""
-
-    def __init__(self, costmap: LayeredCostmap) -> None:
-        self._costmap = costmap
-        self._worker = Worker("pictures", limit=_MAX_PICTURES)
-        self._latest: dict[str, tuple[object, asyncio.Future[bytes]]] = {}
-
-    async def response(self, name: str, cells: Grid, palette: bytes) -> Response:
-        """Return the picture of the current version; raises `BusyError` while too many are being encoded."""
-        version, picture = self._latest.get(name, (None, None))
-        if picture is None or version != self._costmap.version or (picture.done() and picture.exception()):
-            # Copied before the event loop can change the map.
-            picture = asyncio.ensure_future(self._worker.run(_png, cells.copy(), palette))
-            self._latest[name] = self._costmap.version, picture
-        return Response(await asyncio.shield(picture), media_type=_PNG, headers={"Cache-Control": "no-cache"})
-
-
-def _add_views(routes: Routes, service: Service, site: Site) -> None:
-    _add_busy_error(routes)
-    core, costmap = service.core, service.core.costmap
-    pictures = _Pictures(costmap)
-
-    @routes.get("/api/v1/hazards")
-    async def hazards() -> list[HazardArea]:
-        """Return every area with its hazard as on the map."""
-        return core.hazards()
-
-    @routes.get("/api/v1/places")
-    async def places() -> dict[str, Place]:
-        """Return the site's named poses."""
-        return site.places
-
-    @routes.get("/api/v1/map")
-    async def map_info() -> MapInfo:
-        """Return the map's geometry and version."""
-        g = costmap.geometry
-        geometry = MapGeometry(
-            width=g.width, height=g.height, resolution=g.resolution, origin_x=g.origin_x, origin_y=g.origin_y
-        )
-        return MapInfo(site=site.id, geometry=geometry, epoch=costmap.version.epoch, seq=costmap.version.seq)
-
-    @routes.get("/api/v1/map.png", media_type=_PNG, raises=[BusyError])
-    async def map_png() -> Response:
-        """Return the floor plan: white is free, black occupied, grey unknown."""
-        return await pictures.response("map", costmap.static, _PLAN)
-
-    @routes.get("/api/v1/costmap.png", media_type=_PNG, raises=[BusyError], problems=_ZONES_NOT_LOADED)
-    async def costmap_png() -> Response:
-        """Return the master costmap; a pixel's palette index is the cell's cost."""
-        _require_zones(service)
-        return await pictures.response("cost", costmap.cost, _COSTS)
-
-
 def _add_scrape_targets(routes: Routes, service: Service, clock: Clock) -> None:
     @routes.get("/api/v1/prometheus/robots")
     async def scrape_targets() -> list[ScrapeTarget]:
@@ -370,15 +221,9 @@ def _add_scrape_targets(routes: Routes, service: Service, clock: Clock) -> None:
         return service.core.robots.targets(clock.now())
 
 
-def _require_zones(service: Service) -> None:
-    if not service.core.zones_loaded:
-        detail = "the stored zones are not loaded yet: try again once /readyz reports ready"
-        raise ProblemError(MapProblem.ZONES_NOT_LOADED, detail, headers=RETRY_AFTER)
-
-
 async def _put_new(service: Service, zone: Zone, who: str, attempt: Attempt | None) -> Answer[Zone]:
     """Add a zone whose id comes from the path, if there is none."""
-    _require_zones(service)
+    require_zones(service)
     try:
         msgspec.convert(zone.id, Id)
     except msgspec.ValidationError as error:
@@ -393,7 +238,7 @@ async def _put_new(service: Service, zone: Zone, who: str, attempt: Attempt | No
 
 
 def _find_zone(service: Service, zone_id: str) -> Zone:
-    _require_zones(service)
+    require_zones(service)
     entry = service.core.zones.get(zone_id)
     if entry is None:
         detail = f"there is no zone {zone_id}: GET /api/v1/zones lists those that there are"
@@ -426,24 +271,3 @@ def _zone_from_body(body: ZoneBody, zone_id: str, author: str, stamp: float) -> 
         schedule=body.schedule,
         enabled=body.enabled,
     )
-
-
-def _png(cells: Grid, palette: bytes) -> bytes:
-    """Return a PNG whose palette indices are the cells; the image's first row is the grid's last."""
-    image = Image.fromarray(np.ascontiguousarray(cells[::-1]))
-    image.putpalette(palette)
-    data = io.BytesIO()
-    image.save(data, "PNG", compress_level=1)
-    return data.getvalue()
-
-
-def _palette(special: dict[int, tuple[int, int, int]]) -> bytes:
-    """Return a palette of 256 colours: graded costs from near white to orange, other costs as in `special`."""
-    colours = [(255, 250 - cost // 2, 240 - cost * 220 // 252) for cost in range(253)] + [(0, 0, 0)] * 3
-    for cost, colour in special.items():
-        colours[cost] = colour
-    return bytes(channel for colour in colours for channel in colour)
-
-
-_PLAN: Final = _palette({0: (255, 255, 255), 254: (0, 0, 0), 255: (205, 205, 205)})
-_COSTS: Final = _palette({0: (255, 255, 255), 253: (90, 160, 220), 254: (150, 0, 40), 255: (205, 205, 205)})

@@ -1,0 +1,89 @@
+"""The map-service's problem documents: one for each exception that it raises, and those of its routes."""
+
+from typing import Final
+
+from fog_runtime.concurrency import BusyError
+from fog_runtime.http import RETRY_AFTER, HttpProblem, ProblemCode, ProblemError, Routes, add_store_errors
+from fog_runtime.http.routes import InvalidBodyError
+from fog_runtime.stores.records import CursorError
+from map_service.service import Service
+from map_service.zone_writer import ConflictError
+from map_service.zones import ZoneError
+
+
+class MapProblem(ProblemCode):
+    """Problems of the map-service."""
+
+    NO_ZONE = "no_zone", 404, "No zone has this id"
+    ZONE_EXISTS = "zone_exists", 409, "A zone with this id exists already"
+    ZONE_CHANGED = "zone_changed", 412, "The zone is not as the request expects: somebody else changed or added it"
+    ZONE_INVALID = "zone_invalid", 422, "The zone is invalid, or one too many: `errors` names its fields"
+    ZONES_NOT_LOADED = "zones_not_loaded", 503, "The stored zones are not loaded yet"
+    BUSY = "busy", 503, "Too many requests wait for a calculation: `Retry-After` says when to try again"
+
+
+ZONES_NOT_LOADED: Final = (MapProblem.ZONES_NOT_LOADED,)
+NO_SUCH_ZONE: Final = (MapProblem.NO_ZONE, MapProblem.ZONES_NOT_LOADED)
+
+
+def add_errors(routes: Routes) -> None:
+    """Register the problem document of each exception that the service raises."""
+    routes.raises(
+        ZoneError,
+        [MapProblem.ZONE_INVALID],
+        lambda error: ProblemError(MapProblem.ZONE_INVALID, error.message, field=f"body.{error.field}"),
+    )
+    add_store_errors(routes)
+    routes.raises(
+        CursorError,
+        [HttpProblem.REQUEST_INVALID],
+        lambda error: ProblemError(HttpProblem.REQUEST_INVALID, str(error), field="query.cursor"),
+    )
+    add_busy_error(routes)
+    routes.raises(
+        ConflictError,
+        [MapProblem.ZONE_EXISTS, MapProblem.ZONE_CHANGED],
+        _conflict,
+    )
+    routes.raises(InvalidBodyError, [], _with_remedies)
+
+
+def _conflict(error: ConflictError) -> ProblemError:
+    if error.outcome == "exists":
+        detail = f"zone {error.zone} exists already: choose another id, or PUT it"
+        return ProblemError(MapProblem.ZONE_EXISTS, detail)
+    if error.outcome == "missing":
+        return ProblemError(MapProblem.NO_ZONE, f"there is no zone {error.zone} any more: POST it to add it again")
+    detail = f"zone {error.zone} was changed by somebody else: read it again, then retry"
+    return ProblemError(MapProblem.ZONE_CHANGED, detail)
+
+
+def _with_remedies(error: InvalidBodyError) -> InvalidBodyError:
+    """Add a remedy to the errors about shapes with too few points."""
+    remedies = {
+        "body.shape.points": "a polygon needs at least three corners: add one",
+        "body.shape.line": "a corridor needs at least two points: add one",
+    }
+    errors = [
+        {**entry, "problem": f"{entry['problem']}; {remedies[entry['field']]}"}
+        if entry["field"] in remedies and "length" in entry["problem"]
+        else entry
+        for entry in error.errors
+    ]
+    return InvalidBodyError(errors)
+
+
+def add_busy_error(routes: Routes) -> None:
+    """Answer requests for which there is no room with 503."""
+    routes.raises(
+        BusyError,
+        [MapProblem.BUSY],
+        lambda error: ProblemError(MapProblem.BUSY, f"{error}: try again", headers=RETRY_AFTER),
+    )
+
+
+def require_zones(service: Service) -> None:
+    """Raise a `ProblemError` while the stored zones are not loaded."""
+    if not service.core.zones_loaded:
+        detail = "the stored zones are not loaded yet: try again once /readyz reports ready"
+        raise ProblemError(MapProblem.ZONES_NOT_LOADED, detail, headers=RETRY_AFTER)

@@ -1,16 +1,18 @@
 """The gateway passes each request to the service that has its route."""
 
+import json
 import re
 import shutil
 import subprocess
 import time
 from fnmatch import fnmatchcase
 from pathlib import Path
-from typing import Final
+from typing import Any, Final
 
 import httpx
 import pytest
 
+from fog_runtime.http.openapi import merged
 from fog_supervisor import child, net
 from fognav.documentation import rest_routes
 
@@ -48,6 +50,46 @@ def test_services_have_no_route_in_common_but_what_the_gateway_keeps_apart():
                 common.append((path, seen[path], service))
             seen[path] = service
     assert common == []
+
+
+def described(schema: dict[str, object], **others: dict[str, object]) -> dict[str, object]:
+    """Return a document with one route that answers with the schema `Part`."""
+    answer = {"content": {"application/json": {"schema": {"$ref": "#/components/schemas/Part"}}}}
+    path = {"get": {"operationId": "part", "responses": {"200": answer}}}
+    components = {"schemas": {"Part": schema, **others}}
+    return {"openapi": "3.1.0", "info": {"version": "1"}, "paths": {"/readyz": path}, "components": components}
+
+
+def schema_of(document: dict[str, Any], path: str) -> str:
+    answer = document["paths"][path]["get"]["responses"]["200"]["content"]["application/json"]["schema"]
+    return str(answer["$ref"].rpartition("/")[2])
+
+
+def test_schemas_of_one_name_that_differ_have_distinct_names_in_the_merged_document():
+    number, text = {"type": "number"}, {"type": "string"}
+    document = merged({"map-service": described(number), "planner": described(text), "aggregator": described(text)})
+    assert document["components"]["schemas"] == {
+        "AggregatorPart": text, "MapServicePart": number, "PlannerPart": text,
+    }  # fmt: skip
+    assert schema_of(document, "/map-service/readyz") == "MapServicePart"
+    assert schema_of(document, "/planner/readyz") == "PlannerPart"
+    same = merged({"map-service": described(text), "planner": described(text)})
+    assert same["components"]["schemas"] == {"Part": text}
+    nested = {"anyOf": [{"$ref": "#/components/schemas/Inner"}]}
+    document = merged({"a": described(nested, Inner=number), "b": described(nested, Inner=text)})
+    assert document["components"]["schemas"]["BPart"] == {"anyOf": [{"$ref": "#/components/schemas/BInner"}]}
+
+
+def test_merged_document_has_every_route_once_and_names_only_schemas_that_it_has():
+    services = rest_routes()
+    document = merged(services)
+    assert document == merged(dict(reversed(services.items())))
+    count = sum(len(operations) for api in services.values() for operations in api["paths"].values())
+    operations = [operation for path in document["paths"].values() for operation in path.values()]
+    assert len(operations) == count == len({operation["operationId"] for operation in operations})
+    named = re.findall(r'"#/components/schemas/([^"]+)"', json.dumps(document))
+    assert set(named) == set(document["components"]["schemas"])
+    assert document["x-problems"].keys() == {code for api in services.values() for code in api["x-problems"]}
 
 
 @pytest.mark.skipif(shutil.which("caddy") is None, reason="caddy is not installed")

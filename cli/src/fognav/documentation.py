@@ -27,6 +27,7 @@ from fog_runtime.configuration.robot_file import default_robot
 from fog_runtime.configuration.site import load_site
 from fog_runtime.health import Health
 from fog_runtime.http import Tokens, unused
+from fog_runtime.http.openapi import merged
 from fognav import checkout, system
 from fognav.output import FailedError
 from robot_agent import registry
@@ -53,6 +54,11 @@ def rest_routes() -> dict[str, OpenApi]:
         "map-service": make_map(service, loaded.site, clock, health, tokens).openapi(),
         "planner": make_planner(service, loaded.site, health, tokens).openapi(),
     }
+
+
+def openapi() -> str:
+    """Return the OpenAPI document of all services, as `/api/v1/openapi.json` of a running system has it."""
+    return json.dumps(merged(rest_routes()), indent=2) + "\n"
 
 
 def markdown() -> str:

@@ -263,7 +263,7 @@ def _serve(builder: Path, folder: Path, port: int, update: Callable[[], None]) -
 def channels_command(
     *,
     format: Annotated[  # noqa: A002  # the name of the option
-        Literal["markdown", "acl", "header"], typer.Option("--format", help="What to print.")
+        Literal["markdown", "acl", "header", "openapi"], typer.Option("--format", help="What to print.")
     ] = "markdown",
     broker: Annotated[
         Literal["mqtt", "zenoh"] | None, typer.Option("--broker", help="For acl: only this broker's list.")
@@ -277,7 +277,8 @@ def channels_command(
 ) -> None:
     """Print what the channel table generates.
 
-    This is the document of all messages and routes, the brokers' access control lists, or the firmware's header.
+    This is the document of all messages and routes, the brokers' access control lists, the firmware's header, or the
+    OpenAPI document of all services, from which a client's types can be made.
     """
     with exit_codes():
         _print_or_write(format, broker, site, write=write, check=check)
@@ -299,6 +300,8 @@ def _print_or_write(format: str, broker: str | None, site: Path | None, *, write
         _print(documentation.markdown())
     elif format == "header":
         _print(firmware_header())
+    elif format == "openapi":
+        _print(documentation.openapi())
     else:
         mqtt, zenoh = documentation.acls(checkout.site_folder(site) if site else None)
         for name, text in (("mqtt", mqtt), ("zenoh", zenoh)):

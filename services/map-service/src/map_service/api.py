@@ -5,7 +5,7 @@ Reading needs no token, except for the audit log; writing needs the role operato
 
 import secrets
 from collections.abc import Callable
-from typing import Annotated, Final, Literal
+from typing import Final, Literal
 
 import msgspec
 from fastapi import FastAPI
@@ -13,14 +13,7 @@ from fastapi import FastAPI
 from fog_contracts.messages import (
     Id,
     Message,
-    PenaltyFactor,
-    Sentence,
-    Shape,
-    Stamp,
-    TimeToLive,
-    WeeklySchedule,
     Zone,
-    ZoneKind,
 )
 from fog_contracts.site import Site
 from fog_runtime.clock import Clock
@@ -56,28 +49,13 @@ from map_service.api_views import add_views
 from map_service.core import ScrapeTarget
 from map_service.problems import NO_SUCH_ZONE, ZONES_NOT_LOADED, MapProblem, add_errors, require_zones
 from map_service.service import Service
+from map_service.zone_bodies import ZoneBody, zone_from_body
 from map_service.zone_writer import ConflictError
 from map_service.zones import ZoneError
 
 AuditKind = Literal["alert", "area", "mission", "override", "robot", "stop", "store", "zone"]
 
 _REFUSALS: Final = (ZoneError, BusyError, IdempotencyError, StoreError)
-
-
-class ZoneBody(Message, frozen=True, kw_only=True):
-    """A zone that an operator draws; without `id` one is generated; `ttl_s` (s from its start) or `expires_at`."""
-
-    id: Id | None = None
-    kind: ZoneKind
-    shape: Shape
-    factor: PenaltyFactor | None = None
-    speed: Annotated[float, msgspec.Meta(ge=0.01, le=2.54)] | None = None
-    reason: Sentence = ""
-    starts_at: Stamp | None = None
-    expires_at: Stamp | None = None
-    ttl_s: TimeToLive | None = None
-    schedule: WeeklySchedule | None = None
-    enabled: bool = True
 
 
 class ZoneList(Message, frozen=True, kw_only=True):
@@ -144,7 +122,7 @@ def _add_zone_writes(routes: Routes, service: Service, clock: Clock) -> None:
         """Add a zone; replies once it is durably stored and on the map."""
         require_zones(service)
         attempt = attempt_of(idempotency_key, caller, "POST /api/v1/zones", body)
-        zone = _zone_from_body(body, body.id or f"z-{secrets.token_hex(4)}", caller.name, clock.stamp())
+        zone = zone_from_body(body, body.id or f"z-{secrets.token_hex(4)}", caller.name, clock.stamp())
         zone = await service.zones.create(zone, caller.name, attempt)
         return Answer(zone, {**etag(zone.version), "Location": f"/api/v1/zones/{zone.id}"})
 
@@ -166,7 +144,7 @@ def _add_zone_writes(routes: Routes, service: Service, clock: Clock) -> None:
         # Before the condition, which the first attempt may have made false.
         if (earlier := await service.zones.earlier_result(attempt)) is not None:
             return Answer(earlier, etag(earlier.version), status=201 if new else None)
-        zone = _zone_from_body(body, zone_id, caller.name, clock.stamp())
+        zone = zone_from_body(body, zone_id, caller.name, clock.stamp())
         if new:
             return await _put_new(service, zone, caller.name, attempt)
         await service.zones.reload_after_uncertain_write()
@@ -251,23 +229,3 @@ def _require_matching(service: Service, zone_id: str, if_match: str | None) -> N
     if expected_version(if_match) not in (None, zone.version):
         detail = f"zone {zone_id} is at version {zone.version}, not {if_match}: read it again, then retry"
         raise ProblemError(MapProblem.ZONE_CHANGED, detail)
-
-
-def _zone_from_body(body: ZoneBody, zone_id: str, author: str, stamp: float) -> Zone:
-    if body.ttl_s is not None and body.expires_at is not None:
-        detail = "give either ttl_s or expires_at, not both"
-        raise ProblemError(HttpProblem.REQUEST_INVALID, detail, field="body.ttl_s")
-    return Zone(
-        id=zone_id,
-        kind=body.kind,
-        shape=body.shape,
-        factor=body.factor,
-        speed=body.speed,
-        reason=body.reason,
-        author=author,
-        starts_at=body.starts_at,
-        expires_at=body.expires_at if body.ttl_s is None else max(stamp, body.starts_at or 0.0) + body.ttl_s,
-        ttl_s=body.ttl_s,
-        schedule=body.schedule,
-        enabled=body.enabled,
-    )

@@ -103,6 +103,10 @@ _.model
 _.get_info
 _.get_sample_rate
 
+# --- The console-service forwards requests to them. ---
+_.aggregator_url
+_.map_url
+
 # --- For tests, of this repository and of packages that build on it. ---
 _.start_mosquitto  # private servers
 _.start_redis

@@ -12,7 +12,7 @@ ROOT = Path(__file__).parents[1]
 COMPOSE = yaml.safe_load((ROOT / "docker-compose.yml").read_text("utf-8"))
 SERVICES: dict[str, dict[str, Any]] = COMPOSE["services"]
 HANDS_OUT = {"credentials", "sim-credentials"}
-BEHIND = {"hazard-aggregator", "map-service", "planner"}
+BEHIND = {"hazard-aggregator", "map-service", "planner", "console-service"}
 PI_MIB = 4096
 """Memory of the Raspberry Pi on which a fog node is to run."""
 

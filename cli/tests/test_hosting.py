@@ -72,14 +72,15 @@ def test_default_data_follows_the_base_directories(tmp_path, monkeypatch):
 
 
 def test_site_keeps_its_place_and_ports_whatever_the_order(tmp_path, upstairs, monkeypatch):
-    for name in ("FOGNAV_AGGREGATOR_PORT", "FOGNAV_MAP_PORT", "FOGNAV_PLANNER_PORT"):
+    for name in ("FOGNAV_AGGREGATOR_PORT", "FOGNAV_MAP_PORT", "FOGNAV_PLANNER_PORT", "FOGNAV_CONSOLE_PORT"):
         monkeypatch.delenv(name, raising=False)
     hosts, security = ["localhost"], tmp_path / "locks"
     (alone,), _ = hosted_sites([ESTIG], security, hosts)
     both, made = hosted_sites([upstairs, ESTIG], security, hosts)
     found = {site.id: site for site in both}
-    assert alone.ports == found["estig"].ports == {"hazard-aggregator": 8001, "map-service": 8002, "planner": 8003}
-    assert sorted(found["upstairs"].ports.values()) == [8011, 8012, 8013]
+    expected = {"hazard-aggregator": 8001, "map-service": 8002, "planner": 8003, "console-service": 8004}
+    assert alone.ports == found["estig"].ports == expected
+    assert sorted(found["upstairs"].ports.values()) == [8011, 8012, 8013, 8014]
     assert found["estig"].name("planner") == "planner"
     assert found["upstairs"].name("planner") == "upstairs.planner"
     assert (found["upstairs"].node_credentials(made) / "n1.toml").exists()

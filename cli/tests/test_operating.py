@@ -87,7 +87,7 @@ class Service:
 def runtime(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """A register of its own, and a machine without a fog node."""
     monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path))
-    for name in ("AGGREGATOR_PORT", "MAP_PORT", "PLANNER_PORT"):
+    for name in ("AGGREGATOR_PORT", "MAP_PORT", "PLANNER_PORT", "CONSOLE_PORT"):
         monkeypatch.setenv(f"FOGNAV_{name}", "1")
     for name in ("FOG", "TOKEN", "TOKEN_FILE", "TOKENS_FILE"):
         monkeypatch.delenv(f"FOGNAV_{name}", raising=False)
@@ -242,7 +242,7 @@ def test_status_of_a_fog_node_that_does_not_answer_fails() -> None:
 
 
 def test_fog_node_elsewhere_is_found_by_its_address_and_asked_with_the_token(service, monkeypatch) -> None:
-    for name in ("AGGREGATOR_PORT", "MAP_PORT", "PLANNER_PORT"):
+    for name in ("AGGREGATOR_PORT", "MAP_PORT", "PLANNER_PORT", "CONSOLE_PORT"):
         monkeypatch.setenv(f"FOGNAV_{name}", str(service.server.server_port))
     monkeypatch.setenv("FOGNAV_FOG", "localhost")
     monkeypatch.setenv("FOGNAV_TOKEN", "mine")

@@ -33,7 +33,7 @@ if TYPE_CHECKING:
 
 ROOT: Final = Path(__file__).parents[2]
 STAND_INS: Final = ROOT / "tests" / "compose" / "stand_ins.sh"
-SERVICES: Final = ("hazard-aggregator", "map-service", "planner")
+SERVICES: Final = ("hazard-aggregator", "map-service", "planner", "console-service")
 FOG: Final = {*SERVICES, "zenoh", "mosquitto", "mosquitto-relay", "redis", "prometheus", "gateway"}
 ONCE: Final = {"credentials", "kernels", "sim-credentials"}
 """The containers that do something and end."""
@@ -42,6 +42,7 @@ PORTS: Final = {
     "FOGNAV_AGGREGATOR_PORT": ("gateway", 8001),
     "FOGNAV_MAP_PORT": ("gateway", 8002),
     "FOGNAV_PLANNER_PORT": ("gateway", 8003),
+    "FOGNAV_CONSOLE_PORT": ("gateway", 8004),
     "FOGNAV_ZENOH_PORT": ("zenoh", 7447),
     "FOGNAV_MQTT_PORT": ("mosquitto", 8883),
 }
@@ -52,7 +53,14 @@ BUILD_S: Final = 2400.0
 COMMAND_S: Final = 300.0
 """All other commands, and an answer of the gateway: the same."""
 ENGINE: Final = {"dockerd", "containerd", "containerd-shim", "docker-proxy"}
-MEGABYTES: Final = {"planner": 600, "map-service": 600, "sim-robot": 600, "hazard-aggregator": 300, "zenoh": 300}
+MEGABYTES: Final = {
+    "planner": 600,
+    "map-service": 600,
+    "sim-robot": 600,
+    "hazard-aggregator": 300,
+    "console-service": 330,
+    "zenoh": 300,
+}
 """How large our images may be: those with numba, and those without."""
 FAKETIME: Final = sorted(Path("/usr/lib").glob("*/faketime/libfaketime.so.1"))
 CAP_SYS_RESOURCE: Final = 1 << 24

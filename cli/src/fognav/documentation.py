@@ -42,7 +42,8 @@ WRITE: Final = "./fognav channels --write"
 def rest_routes() -> dict[str, OpenApi]:
     """Return each service's OpenAPI description by the service's name."""
     # The services import kernels and web frameworks, which takes time: only this function needs them.
-    from hazard_aggregator.api import make_api as make_aggregator  # noqa: PLC0415  # see above
+    from console_service.api import make_api as make_console  # noqa: PLC0415  # see above
+    from hazard_aggregator.api import make_api as make_aggregator  # noqa: PLC0415  # same
     from map_service.api import make_api as make_map  # noqa: PLC0415  # same
     from planner.api import make_api as make_planner  # noqa: PLC0415  # same
 
@@ -53,6 +54,7 @@ def rest_routes() -> dict[str, OpenApi]:
         "hazard-aggregator": make_aggregator(service, loaded.map.geometry, clock, health, tokens).openapi(),
         "map-service": make_map(service, loaded.site, clock, health, tokens).openapi(),
         "planner": make_planner(service, loaded.site, health, tokens).openapi(),
+        "console-service": make_console(service, health, tokens).openapi(),
     }
 
 

@@ -25,23 +25,27 @@ ROUTER: Final = "zenoh-router"
 AGGREGATOR: Final = "hazard-aggregator"
 MAP_SERVICE: Final = "map-service"
 PLANNER: Final = "planner"
+CONSOLE: Final = "console-service"
 SIMULATOR: Final = "simulator"
 WATCHDOG: Final = "robot-watchdog"
 AGENT: Final = "robot-agent"
 
 SERVERS: Final = (BROKER, REDIS, ROUTER)
-SERVICES: Final = (AGGREGATOR, MAP_SERVICE, PLANNER)
+SERVICES: Final = (AGGREGATOR, MAP_SERVICE, PLANNER, CONSOLE)
 ROBOT: Final = (WATCHDOG, AGENT)
 
 MODULES: Final[Mapping[str, str]] = {
     AGGREGATOR: "hazard_aggregator",
     MAP_SERVICE: "map_service",
     PLANNER: "planner",
+    CONSOLE: "console_service",
     SIMULATOR: "fognav_sim",
     WATCHDOG: "robot_agent.guardian.watchdog",
     AGENT: "robot_agent",
 }
 """The Python module of each program that is ours."""
+URLS: Final[Mapping[str, str]] = {AGGREGATOR: "AGGREGATOR_URL", MAP_SERVICE: "MAP_URL", PLANNER: "PLANNER_URL"}
+"""The console-service's settings for the addresses of the services behind it."""
 SECURITY: Final[Mapping[str, str]] = {BROKER: "mosquitto", REDIS: "redis", ROUTER: "zenoh"}
 """The folder of each server's credentials (`fog_runtime.security.site_security`)."""
 _FOLDERS: Final = ("logs", "ports", "data")

@@ -19,6 +19,7 @@ from fog_supervisor.supervisor import Event, Supervisor
 from fognav.programs import (
     AGENT,
     BROKER,
+    CONSOLE,
     MODULES,
     PLANNER,
     REDIS,
@@ -27,6 +28,7 @@ from fognav.programs import (
     SERVERS,
     SERVICES,
     SIMULATOR,
+    URLS,
     WATCHDOG,
     ProgramSet,
     ServerPorts,
@@ -241,8 +243,15 @@ class Stack:
         simulator = {**simulator_settings(self.folder, hardware), **self.security.node_settings()}
         programs.add_python(SIMULATOR, MODULES[SIMULATOR], {**simulator, **self.security.settings("sim")})
         key = {"OPERATOR_KEY_FILE": str(self.key_file)}
+        taken = {self.mqtt_port, self.redis_port, self.zenoh_port}
+        http = {name: net.free_port(taken) for name in SERVICES}  # the console-service must know the others'
+        behind = {setting: f"http://{net.LOOPBACK}:{http[name]}" for name, setting in URLS.items()}
         for name in SERVICES:
-            own = {"TOKENS_FILE": str(self.folder / TOKENS), **(key if name == PLANNER else {})}
+            own = {
+                "TOKENS_FILE": str(self.folder / TOKENS),
+                "HTTP_PORT": str(http[name]),
+                **(key if name == PLANNER else behind if name == CONSOLE else {}),
+            }
             programs.add_python(name, MODULES[name], {**own, **self.security.settings(name)})
         robot = self.config.robot
         wires = simulated_robot_settings(self.folder, robot, hardware)

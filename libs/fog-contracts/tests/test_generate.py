@@ -72,8 +72,8 @@ def test_document_lists_every_channel_and_describes_every_linked_message():
 def test_document_row_shows_the_channels_properties():
     line = next(line for line in channels_markdown({}).splitlines() if "map/heartbeat`" in line)
     assert line == (
-        "| `fog/<site>/map/heartbeat` | [MapHeartbeat](#mapheartbeat) | map-service → planner, robot-agent "
-        "| `volatile` | 10 Hz | 1 s | 256 B |"
+        "| `fog/<site>/map/heartbeat` | [MapHeartbeat](#mapheartbeat) | map-service → planner, robot-agent, "
+        "console-service | `volatile` | 10 Hz | 1 s | 256 B |"
     )
 
 

@@ -13,7 +13,7 @@ from fog_runtime.security.site_security import SiteSecurity
 from fog_runtime.token_file import token_hash
 
 SITE = Path(__file__).parents[3] / "sites" / "estig"
-SERVICES = {"hazard-aggregator", "map-service", "planner"}
+SERVICES = {"hazard-aggregator", "map-service", "planner", "console-service"}
 needs_root = pytest.mark.skipif(os.geteuid() != 0, reason="only root gives files to other users")
 
 

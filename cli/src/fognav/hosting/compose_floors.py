@@ -32,6 +32,8 @@ _OUTSIDE: Final = "outside"
 _SITE: Final = re.compile(r"^\$\{FOGNAV_SITE:-[^}]*\}:/site")
 _PORT: Final = re.compile(r"\$\{(FOGNAV_\w+_PORT):-(\d+)\}")
 _OUT: Final = "/out/floors"
+_PROGRAMS: Final = ("hazard-aggregator", "map-service", "planner", "console-service")
+"""Those that have credentials of their own on each floor."""
 
 _Part = dict[str, Any]
 
@@ -135,7 +137,7 @@ def _service(base: Mapping[str, Any], name: str, own: Sequence[str], floor: _Flo
 
 def _add_credentials(services: _Part, floor: _Floor) -> None:
     """Let the containers that hand out credentials know the floor, and give them a place for each of its programs."""
-    places = {service: f"{service}-locks-{floor.site}" for service in ("hazard-aggregator", "map-service", "planner")}
+    places = {service: f"{service}-locks-{floor.site}" for service in _PROGRAMS}
     for name in ("credentials", "sim-credentials"):
         own = places | ({"simulation": f"sim-locks-{floor.site}"} if name == "sim-credentials" else {})
         services[name]["volumes"] += [

@@ -36,6 +36,7 @@ from fognav.output import FailedError, WrongUseError
 from fognav.programs import (
     AGENT,
     BROKER,
+    CONSOLE,
     MODULES,
     PLANNER,
     REDIS,
@@ -44,6 +45,7 @@ from fognav.programs import (
     SERVERS,
     SERVICES,
     SIMULATOR,
+    URLS,
     WATCHDOG,
     ProgramSet,
     Ready,
@@ -250,6 +252,8 @@ class LocalNode:
 
     def _add_services(self, site: HostedSite) -> None:
         keys, http = self._keys[site.id], self.config.security.folder("http")
+        host = net.reachable(self.config.address)
+        behind = {name: f"https://{host}:{site.ports[service]}" for service, name in URLS.items()}
         for service in SERVICES:
             settings = {
                 "TOKENS_FILE": str(keys / TOKENS),
@@ -259,6 +263,7 @@ class LocalNode:
                 "HTTP_KEY_FILE": str(http / KEY),
                 **self._credentials(site, service),
                 **({"OPERATOR_KEY_FILE": str(keys / OPERATOR_KEY)} if service == PLANNER else {}),
+                **(behind if service == CONSOLE else {}),
             }
             self._add(site, service, settings)
 

@@ -25,7 +25,7 @@ from fog_runtime.files import atomic_write
 from fog_supervisor import net
 from fognav.credentials import own_credentials
 from fognav.output import FailedError
-from fognav.programs import AGGREGATOR, BROKER, MAP_SERVICE, PLANNER, ROUTER
+from fognav.programs import AGGREGATOR, BROKER, CONSOLE, MAP_SERVICE, PLANNER, ROUTER
 
 PRIVATE: Final = 0o700
 
@@ -146,13 +146,19 @@ SERVICE_PORTS: Final = {
     AGGREGATOR: ("FOGNAV_AGGREGATOR_PORT", 8001),
     MAP_SERVICE: ("FOGNAV_MAP_PORT", 8002),
     PLANNER: ("FOGNAV_PLANNER_PORT", 8003),
+    CONSOLE: ("FOGNAV_CONSOLE_PORT", 8004),
 }
 """The ports of a fog node's REST APIs: the variables that docker-compose.yml reads, and its defaults."""
 ZENOH_PORT: Final = ("FOGNAV_ZENOH_PORT", 7447)
 MQTT_PORT: Final = ("FOGNAV_MQTT_PORT", 1883)
 MQTTS_PORT: Final = ("FOGNAV_MQTT_PORT", 8883)
 
-_FOG_MODULES: Final = {"hazard_aggregator": AGGREGATOR, "map_service": MAP_SERVICE, "planner": PLANNER}
+_FOG_MODULES: Final = {
+    "hazard_aggregator": AGGREGATOR,
+    "map_service": MAP_SERVICE,
+    "planner": PLANNER,
+    "console_service": CONSOLE,
+}
 _ROBOT_MODULES: Final = {
     "robot_agent": "robot-agent",
     "robot_agent.guardian": "robot-guardian",

@@ -19,7 +19,7 @@ Encoding = Literal["json", "msgpack", "text"]
 Durability = Literal["volatile", "latest", "recovered"]
 Role = Literal[
     "node", "thesis-node", "thesis-robot", "home-assistant", "hazard-aggregator", "map-service", "planner",
-    "robot-agent", "console", "sim", "recorder",
+    "robot-agent", "console-service", "console", "sim", "recorder",
 ]  # fmt: skip
 
 ROLES: Final[Mapping[Role, str]] = {
@@ -31,6 +31,7 @@ ROLES: Final[Mapping[Role, str]] = {
     "map-service": "maintains the costmap",
     "planner": "plans paths and stores missions",
     "robot-agent": "a robot's agent",
+    "console-service": "shows the state of everything to people's browsers, and changes nothing",
     "console": "operators' tools: the `fognav` command, the demo and its page, the simulated robot's operator",
     "sim": "the simulated world",
     "recorder": "`fognav record`: subscribes to everything and publishes nothing",
@@ -163,6 +164,7 @@ MAP: Final = "map-service"
 PLANNER: Final = "planner"
 ROBOT: Final = "robot-agent"
 CONSOLE: Final = "console"
+WEB: Final = "console-service"
 SIM: Final = "sim"
 
 VOLATILE: Final = "volatile"
@@ -186,7 +188,7 @@ _live = partial(Channel, transport="zenoh", kind="liveliness", encoding="msgpack
 # fmt: off
 # Sensor nodes and areas: MQTT, JSON or text
 NODE_AVAILABILITY = _text( "node_availability", V1 + "nodes/{node}/availability",                       limit=16,
-    publishers=(NODE,),          subscribers=(AGGREGATOR, CONSOLE), durability=LATEST,   qos=1,
+    publishers=(NODE,),          subscribers=(AGGREGATOR, CONSOLE, WEB), durability=LATEST,   qos=1,
     values=(ONLINE, OFFLINE), about="whether a node is connected; `offline` is its last will")
 NODE_READING      = _mqtt( "node_reading",      V1 + "nodes/{node}/reading",          m.NodeReading,    limit=KIB,
     publishers=(NODE,),          subscribers=(AGGREGATOR, CONSOLE), durability=VOLATILE, qos=0, rate_hz=10,
@@ -206,10 +208,10 @@ NODE_PROBLEM      = _text( "node_problem",      V1 + "nodes/{node}/problem",    
     publishers=(NODE,),          subscribers=(CONSOLE,),          durability=LATEST,   qos=1,
     about="why a node refused its latest configuration, command or update, in words; empty: nothing refused")
 AREA_HAZARD       = _mqtt( "area_hazard",       V1 + "areas/{area}/hazard",           m.AreaHazard,     limit=16 * KIB,
-    publishers=(AGGREGATOR,),    subscribers=(AGGREGATOR, MAP, "home-assistant"), durability=LATEST, qos=1,
+    publishers=(AGGREGATOR,),    subscribers=(AGGREGATOR, MAP, "home-assistant", WEB), durability=LATEST, qos=1,
     epoch="epoch")
 AREA_DEFINITION   = _mqtt( "area_definition",   V1 + "areas/{area}/definition",       m.AreaDefinition, limit=32 * KIB,
-    publishers=(AGGREGATOR,),    subscribers=(MAP,),              durability=LATEST,   qos=1, epoch="epoch")
+    publishers=(AGGREGATOR,),    subscribers=(MAP, WEB),          durability=LATEST,   qos=1, epoch="epoch")
 AGGREGATOR_HEARTBEAT = _mqtt("aggregator_heartbeat", V1 + "aggregator/heartbeat", m.AggregatorHeartbeat,
     limit=64 * KIB,
     publishers=(AGGREGATOR,),    subscribers=(AGGREGATOR, MAP),   durability=VOLATILE, qos=0, rate_hz=5,
@@ -218,7 +220,7 @@ AGGREGATOR_AVAILABILITY = _text("aggregator_availability", V1 + "aggregator/avai
     publishers=(AGGREGATOR,),    subscribers=(AGGREGATOR, "home-assistant"), durability=LATEST, qos=1,
     values=(ONLINE, OFFLINE), about="whether the aggregator is connected; `offline` is its last will")
 AGGREGATOR_ALERTS = _mqtt( "aggregator_alerts", V1 + "aggregator/alerts",             m.AlertList,      limit=64 * KIB,
-    publishers=(AGGREGATOR,),    subscribers=("home-assistant",), durability=LATEST,   qos=1, epoch="epoch")
+    publishers=(AGGREGATOR,),    subscribers=("home-assistant", WEB), durability=LATEST,   qos=1, epoch="epoch")
 AGGREGATOR_REQUEST = _text("aggregator_request", V1 + "aggregator/request",                             limit=16,
     publishers=(MAP,),           subscribers=(AGGREGATOR,),       durability=VOLATILE, qos=0,
     values=(REPUBLISH,), about="asks the aggregator to publish all areas again: a subscriber has missed some")
@@ -237,15 +239,15 @@ HOME_ASSISTANT_AREA = _text("home_assistant_area", "homeassistant/device/{site}/
 
 # The map, and the hazards and zones in it: zenoh, msgpack
 MAP_DELTA         = _pub(  "map_delta",         FOG + "map/delta",      m.MapDelta,     limit=DELTA_LIMIT,
-    publishers=(MAP,), subscribers=(PLANNER, ROBOT), durability=RECOVERED, epoch="epoch")
+    publishers=(MAP,), subscribers=(PLANNER, ROBOT, WEB), durability=RECOVERED, epoch="epoch")
 MAP_HEARTBEAT     = _pub(  "map_heartbeat",     FOG + "map/heartbeat",  m.MapHeartbeat, limit=256,
-    publishers=(MAP,), subscribers=(PLANNER, ROBOT), durability=VOLATILE, rate_hz=10, max_age_s=1, epoch="epoch")
+    publishers=(MAP,), subscribers=(PLANNER, ROBOT, WEB), durability=VOLATILE, rate_hz=10, max_age_s=1, epoch="epoch")
 MAP_SNAPSHOT      = _query("map_snapshot",      FOG + "map/snapshot",   None,           limit=0,
-    publishers=(MAP,), subscribers=(PLANNER, ROBOT), reply=m.MapSnapshot, reply_limit=64 * MIB)
+    publishers=(MAP,), subscribers=(PLANNER, ROBOT, WEB), reply=m.MapSnapshot, reply_limit=64 * MIB)
 HAZARD            = _pub(  "hazard",            FOG + "hazards/{area}", m.HazardArea,   limit=64 * KIB,
     publishers=(MAP,), subscribers=(PLANNER, ROBOT, CONSOLE), durability=LATEST, epoch="epoch")
 ZONES             = _pub(  "zones",             FOG + "zones",          m.ZoneSet,      limit=4 * MIB,
-    publishers=(MAP,), subscribers=(PLANNER, ROBOT), durability=LATEST, epoch="epoch")
+    publishers=(MAP,), subscribers=(PLANNER, ROBOT, WEB), durability=LATEST, epoch="epoch")
 
 # Planner and robots: zenoh, msgpack
 PLANNER_PLAN      = _query("planner_plan",      FOG + "planner/plan",             m.PlanRequest,    limit=KIB,
@@ -253,19 +255,19 @@ PLANNER_PLAN      = _query("planner_plan",      FOG + "planner/plan",           
 PLANNER_EGRESS    = _query("planner_egress",    FOG + "planner/egress",           m.EgressRequest,  limit=KIB,
     publishers=(PLANNER,), subscribers=(ROBOT,),           reply=m.PlanReply, reply_limit=4 * MIB)
 ROBOT_GOAL        = _pub(  "robot_goal",        FOG + "robots/{robot}/goal",      m.RobotGoal,      limit=KIB,
-    publishers=(PLANNER,), subscribers=(ROBOT, CONSOLE),   durability=VOLATILE, rate_hz=0.2, epoch="planner_epoch")
+    publishers=(PLANNER,), subscribers=(ROBOT, CONSOLE, WEB), durability=VOLATILE, rate_hz=0.2, epoch="planner_epoch")
 ROBOT_PATH        = _pub(  "robot_path",        FOG + "robots/{robot}/path",      m.RobotPath,      limit=MIB,
-    publishers=(PLANNER,), subscribers=(ROBOT, CONSOLE),   durability=LATEST, epoch="planner_epoch")
+    publishers=(PLANNER,), subscribers=(ROBOT, CONSOLE, WEB), durability=LATEST, epoch="planner_epoch")
 ROBOT_RELEASE     = _pub(  "robot_release",     FOG + "robots/{robot}/release",   m.RobotRelease,   limit=128,
-    publishers=(PLANNER,), subscribers=(ROBOT, CONSOLE),   durability=VOLATILE, rate_hz=2, max_age_s=1.5,
+    publishers=(PLANNER,), subscribers=(ROBOT, CONSOLE, WEB), durability=VOLATILE, rate_hz=2, max_age_s=1.5,
     epoch="planner_epoch")
 ROBOT_POSE        = _pub(  "robot_pose",        FOG + "robots/{robot}/pose",      m.RobotPose,      limit=KIB,
-    publishers=(ROBOT,), subscribers=(AGGREGATOR, MAP, PLANNER, CONSOLE), durability=VOLATILE, rate_hz=10,
+    publishers=(ROBOT,), subscribers=(AGGREGATOR, MAP, PLANNER, CONSOLE, WEB), durability=VOLATILE, rate_hz=10,
     idle_hz=2.5, max_age_s=1)
 ROBOT_STATE       = _pub(  "robot_state",       FOG + "robots/{robot}/state",     m.RobotState,     limit=16 * KIB,
-    publishers=(ROBOT,), subscribers=(MAP, PLANNER, CONSOLE), durability=VOLATILE, rate_hz=1, max_age_s=3)
+    publishers=(ROBOT,), subscribers=(MAP, PLANNER, CONSOLE, WEB), durability=VOLATILE, rate_hz=1, max_age_s=3)
 ROBOT_OBSTACLES   = _pub(  "robot_obstacles",   FOG + "robots/{robot}/obstacles", m.RobotObstacles, limit=64 * KIB,
-    publishers=(ROBOT,),   subscribers=(MAP, CONSOLE),     durability=VOLATILE, rate_hz=1)
+    publishers=(ROBOT,),   subscribers=(MAP, CONSOLE, WEB), durability=VOLATILE, rate_hz=1)
 ROBOT_COMMAND     = _query("robot_command",     FOG + "robots/{robot}/command",   m.RobotCommand,   limit=KIB,
     publishers=(ROBOT,),   subscribers=(PLANNER, CONSOLE), reply=m.CommandReply, reply_limit=2 * KIB)
 LEADER            = _pub(  "leader",            FOG + "leaders/{role}", m.Leader, limit=KIB,

@@ -1,7 +1,7 @@
 """The REST interface of all services: problem documents (RFC 9457), tokens with roles, health, metrics, limits."""
 
 from fog_runtime.http.app import make_app
-from fog_runtime.http.http_process import HttpProcess, HttpProcessError, unused
+from fog_runtime.http.http_process import HttpProcess, HttpProcessError, serve_here, unused
 from fog_runtime.http.problems import RETRY_AFTER, HttpProblem, ProblemCode, ProblemError
 from fog_runtime.http.routes import (
     Answer,
@@ -59,6 +59,7 @@ __all__ = [
     "make_app",
     "must_be_new",
     "next_page",
+    "serve_here",
     "token_hash",
     "unused",
 ]

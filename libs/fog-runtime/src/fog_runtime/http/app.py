@@ -216,11 +216,12 @@ def _add_health(routes: Routes, health: Health) -> None:
 
 
 def make_app(
-    title: str, health: Health, tokens: Tokens, *, body_limit: int = BODY_LIMIT, standby: Callable[[], str] = str
-) -> FastAPI:
+    title: str, health: Health, tokens: Tokens, *, body_limit: int = BODY_LIMIT, standby: Callable[[], str] = str,
+    first_page: bool = True,
+) -> FastAPI:  # fmt: skip
     """Build an app with health, metrics, problem documents, roles and a body limit; OpenAPI is at /openapi.json.
 
-    While `standby` returns a reason, routes that write answer 503 with it.
+    While `standby` returns a reason, routes that write answer 503 with it. Without `first_page`, `/` is the caller's.
     """
     # FastAPI's interactive pages would load scripts from the internet.
     app = FastAPI(title=title, version=VERSION, docs_url=None, redoc_url=None)
@@ -234,10 +235,12 @@ def make_app(
     add_problem_handlers(app)
     _add_health(Routes(app, "health"), health)
 
-    @app.get("/", include_in_schema=False)
-    async def first_page() -> Response:  # for people who open the address
-        about = f"{title}. Its routes: /openapi.json; is it ready: /readyz; its measurements: /metrics\n"
-        return Response(about, media_type="text/plain")
+    async def about() -> Response:  # for people who open the address
+        text = f"{title}. Its routes: /openapi.json; is it ready: /readyz; its measurements: /metrics\n"
+        return Response(text, media_type="text/plain")
+
+    if first_page:
+        app.get("/", include_in_schema=False)(about)
 
     app.add_middleware(OpenLimit, urgent=app.state.urgent)
     app.add_middleware(_BodyLimit, limit=body_limit)  # before it: who sends no whole body takes no place

@@ -148,15 +148,13 @@ class HttpProcess:
         `certificate` it speaks HTTPS. The host `gateway`, and no other, is believed for whom it asks. Fork before this
         process has threads and connections. It ends with this process.
         """
-        family = socket.AF_INET6 if ":" in host else socket.AF_INET
-        with socket.create_server((host, port), family=family, backlog=BACKLOG) as listener:
+        with _listener(host, port) as listener:
             ours, theirs = socket.socketpair()
             with theirs:
                 pid = os.fork()
                 if pid == 0:
                     _become_http_process(lambda: _behind(gateway, make_app()), listener, theirs, certificate)
-            scheme = "http" if certificate is None else "https"
-            return cls(pid, ours, scheme, host, int(listener.getsockname()[1]))
+            return cls(pid, ours, _scheme(certificate), host, int(listener.getsockname()[1]))
 
     async def serve(self, app: FastAPI, port_file: Path | None = None) -> None:
         """Answer what the HTTP process passes on with the routes of `app`, until cancelled.
@@ -181,6 +179,43 @@ class HttpProcess:
             answering.cancel()
             os.kill(self._pid, signal.SIGKILL)  # it has ended, or hangs
             await asyncio.to_thread(os.waitpid, self._pid, 0)
+
+
+def _listener(host: str, port: int) -> socket.socket:
+    family = socket.AF_INET6 if ":" in host else socket.AF_INET
+    return socket.create_server((host, port), family=family, backlog=BACKLOG)
+
+
+def _scheme(certificate: ServerCertificate | None) -> str:
+    return "http" if certificate is None else "https"
+
+
+async def serve_here(  # what `HttpProcess.fork` takes, too
+    app: FastAPI,
+    host: str = "127.0.0.1",
+    port: int = 0,
+    certificate: ServerCertificate | None = None,
+    gateway: str = "",
+    port_file: Path | None = None,
+) -> None:
+    """Serve an app in this process until cancelled, where no robot waits for what else the process does.
+
+    Otherwise as `HttpProcess`. Raises `OSError` when the port is taken.
+    """
+    with _listener(host, port) as listener:
+        machine.raise_limit()
+        logging.getLogger("uvicorn.error").addFilter(_Sparing())
+        server = _Server(_config(_behind(gateway, app), certificate))
+        serving = asyncio.ensure_future(server.serve(sockets=[listener]))
+        number = int(listener.getsockname()[1])
+        _log.info("listening", url=f"{_scheme(certificate)}://{host}:{number}", port=number)
+        write_port_file(port_file, number)
+        try:
+            await asyncio.shield(serving)
+        finally:
+            server.accept_no_more()
+            server.should_exit = True
+            await asyncio.wait({serving}, timeout=END_S)
 
 
 def _behind(gateway: str, app: FastAPI) -> FastAPI:
@@ -291,6 +326,20 @@ def _leave_files(kept: Collection[int]) -> None:
                 os.dup2(null, number)
 
 
+def _config(app: FastAPI, certificate: ServerCertificate | None) -> uvicorn.Config:
+    return uvicorn.Config(
+        app,
+        log_config=None,
+        access_log=False,
+        lifespan="off",
+        timeout_graceful_shutdown=2,
+        server_header=False,
+        proxy_headers=False,  # it would believe everybody on this computer
+        ssl_certfile=None if certificate is None else certificate.file,
+        ssl_keyfile=None if certificate is None else certificate.key,
+    )
+
+
 async def _receive(
     app: FastAPI, listener: socket.socket, end: socket.socket, certificate: ServerCertificate | None
 ) -> None:
@@ -301,19 +350,7 @@ async def _receive(
     app.state.core = link
     machine.raise_limit()
     logging.getLogger("uvicorn.error").addFilter(_Sparing())
-    server = _Server(
-        uvicorn.Config(
-            app,
-            log_config=None,
-            access_log=False,
-            lifespan="off",
-            timeout_graceful_shutdown=2,
-            server_header=False,
-            proxy_headers=False,  # it would believe everybody on this computer
-            ssl_certfile=None if certificate is None else certificate.file,
-            ssl_keyfile=None if certificate is None else certificate.key,
-        )
-    )
+    server = _Server(_config(app, certificate))
 
     def stop() -> None:
         server.should_exit = True

@@ -11,7 +11,8 @@ Each program gets a folder of its own, which only it can read:
     redis/      server.pem server.key users authority.pem health                   as above
     zenoh/      server.pem server.key users access.json5 health.toml               the last one: as above
     gateway/    server.pem server.key
-    hazard-aggregator/, map-service/, planner/    credentials.toml tokens.toml, the planner also operator.key
+    hazard-aggregator/, map-service/, planner/, console-service/    credentials.toml tokens.toml, the planner also
+                operator.key
     simulation/ operator.key token credentials/NAME.toml                           of a simulated robot and its nodes
     floors/SITE/    the services' and simulation's of each further floor
 

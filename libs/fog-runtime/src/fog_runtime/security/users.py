@@ -31,6 +31,7 @@ SERVICES: Final[Mapping[str, Sequence[Server]]] = {
     "hazard-aggregator": SERVERS,
     "map-service": SERVERS,
     "planner": ("zenoh", "redis"),
+    "console-service": SERVERS,
 }
 """Which servers each service uses."""
 TOOLS: Final[Mapping[str, Sequence[Server]]] = {
@@ -49,6 +50,7 @@ _COMMANDS: Final = (
     "+get +set +setrange +del +hget +hset +hdel +hgetall +hlen +hincrby +xadd +xdel +xrange +xrevrange +pttl"
     " +eval +multi +exec +wait +ping +config|get +client|setname +client|id +hello +auth +select"
 )
+_READING: Final = "+xrange +xrevrange +ping +client|setname +client|id +hello +auth +select"
 
 
 def new_password() -> str:
@@ -100,12 +102,15 @@ def zenoh_line(user: str, password: str) -> str:
 def redis_line(user: str, password: str, site: str) -> str:
     """Return a line of Redis's `aclfile` for a service: its own tables, the audit trail of what it may do, its lease.
 
-    It may read the whole audit trail. Raises `KeyError` for a user that is no service.
+    It may read the whole audit trail; the console-service only reads. Raises `KeyError` for a user that is no service.
     """
     _, service = of_floor(user)
+    read = " ".join(f"%R~fog:{site}:{name}" for name in ("audit:*", *records.READ.get(service, ())))
+    if service in records.READ:
+        return f"user {user} on {_redis_secret(password)} resetchannels -@all {_READING} {read}"
     audited = (f"audit:{kind}" for kind in records.AUDITED[service])
     own = [*records.OWN[service], *records.BOOKKEEPING, *audited, f"{service}:*"]
-    keys = " ".join([*(f"~fog:{site}:{name}" for name in own), f"%R~fog:{site}:audit:*"])
+    keys = " ".join([*(f"~fog:{site}:{name}" for name in own), read])
     return f"user {user} on {_redis_secret(password)} resetchannels -@all {_COMMANDS} {keys}"
 
 

@@ -43,6 +43,8 @@ OWN: Final[Mapping[str, Sequence[str]]] = {
     "planner": (GOALS,),
 }
 """The keys of each service's own records, as patterns."""
+READ: Final[Mapping[str, Sequence[str]]] = {"console-service": (f"{HISTORY}:*",)}
+"""Others' records that a service reads, as patterns."""
 AUDITED: Final[Mapping[str, Sequence[str]]] = {
     "hazard-aggregator": ("alert", "area", "override", "store"),
     "map-service": ("zone", "store"),

@@ -393,6 +393,7 @@ def test_data_of_an_older_version_is_used_by_this_one(node, tmp_path):
     assert area["override"]["reason"] == "box"
     assert node.run("area", "history", "z1").count("blocked") >= 1
     assert before == {name: (node.data / name).read_bytes() for name in kept}
+    assert (node.data / "keys/estig/session.key").exists(), "which the older version may not have had"
     node.run("zone", "add", "--circle", "80,20,1", "--reason", "dry soon")
     node.down()
 

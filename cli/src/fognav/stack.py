@@ -12,7 +12,7 @@ from typing import Final, Self
 from fog_contracts.site import Site
 from fog_runtime.configuration.parts import DEFAULT_BASE, DEFAULT_LIDAR
 from fog_runtime.credentials import NOBODY, Credentials
-from fog_runtime.keys import ADMIN_TOKEN, OPERATOR_KEY, TOKENS, make_keys, read_operator_key
+from fog_runtime.keys import ADMIN_TOKEN, OPERATOR_KEY, SESSION_KEY, TOKENS, make_keys, read_operator_key
 from fog_runtime.security.site_security import CREDENTIALS, SiteSecurity
 from fog_supervisor import net
 from fog_supervisor.supervisor import Event, Supervisor
@@ -249,6 +249,7 @@ class Stack:
         for name in SERVICES:
             own = {
                 "TOKENS_FILE": str(self.folder / TOKENS),
+                "SESSION_KEY_FILE": str(self.folder / SESSION_KEY),
                 "HTTP_PORT": str(http[name]),
                 **(key if name == PLANNER else behind if name == CONSOLE else {}),
             }

@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 
 from fog_runtime.credentials import Credentials
-from fog_runtime.keys import ADMIN_TOKEN, OPERATOR_KEY, TOKENS
+from fog_runtime.keys import ADMIN_TOKEN, OPERATOR_KEY, SESSION_KEY, TOKENS
 from fog_runtime.security import __main__ as command
 from fog_runtime.security.__main__ import OWNERS, SIMULATION
 from fog_runtime.security.site_security import SiteSecurity
@@ -14,6 +14,7 @@ from fog_runtime.token_file import token_hash
 
 SITE = Path(__file__).parents[3] / "sites" / "estig"
 SERVICES = {"hazard-aggregator", "map-service", "planner", "console-service"}
+OF_SERVICE = {"credentials.toml", TOKENS, SESSION_KEY}
 needs_root = pytest.mark.skipif(os.geteuid() != 0, reason="only root gives files to other users")
 
 
@@ -64,12 +65,13 @@ def test_each_program_gets_its_own_files(node):
     assert node.files("redis") == {"server.pem", "server.key", "users", "authority.pem", "health"}
     assert node.files("zenoh") == {"server.pem", "server.key", "users", "access.json5", "health.toml"}
     assert node.files("gateway") == {"server.pem", "server.key"}
-    assert node.files("map-service") == node.files("hazard-aggregator") == {"credentials.toml", "tokens.toml"}
-    assert node.files("planner") == {"credentials.toml", "tokens.toml", "operator.key"}
+    assert node.files("map-service") == node.files("hazard-aggregator") == OF_SERVICE
+    assert node.files("planner") == OF_SERVICE | {"operator.key"}
 
 
 def test_no_program_has_a_secret_of_another(node):
     assert node.holders((node.security / OPERATOR_KEY).read_text().strip()) == {"planner"}
+    assert node.holders((node.security / SESSION_KEY).read_text().strip()) == SERVICES
     assert node.holders((node.security / ADMIN_TOKEN).read_text().strip()) == set()
     assert node.holders((node.security / "authority.pem").read_text()[:200]) == set()
     for service in SERVICES:
@@ -189,10 +191,10 @@ def upstairs(node, tmp_path, monkeypatch):
 
 
 def test_further_floor_has_users_tokens_and_key_of_its_own(node, upstairs):
-    assert {each.name for each in (upstairs / "planner").iterdir()} == {"credentials.toml", TOKENS, OPERATOR_KEY}
+    assert {each.name for each in (upstairs / "planner").iterdir()} == OF_SERVICE | {OPERATOR_KEY}
     assert Credentials.read(upstairs / "map-service" / "credentials.toml").user == "upstairs.map-service"
     assert Credentials.read(upstairs / SIMULATION / "credentials" / "r1.toml").user == "upstairs.r1"
-    for name in (OPERATOR_KEY, TOKENS):
+    for name in (OPERATOR_KEY, SESSION_KEY, TOKENS):
         assert (upstairs / "planner" / name).read_text() != (node.out / "planner" / name).read_text()
     lists = [node.out / "mosquitto" / "users", node.out / "zenoh" / "users", node.out / "redis" / "users"]
     assert all("upstairs.hazard-aggregator" in file.read_text() for file in lists)

@@ -64,7 +64,7 @@ def test_invalid_file_changes_nothing_and_a_missing_one_admits_nobody(file):
     [
         ("anna", "viewer", "anna has a token already. Revoke it first"),
         ('a"\n', "viewer", "a name has up to 100 letters"),
-        ("bert", "king", "the roles are viewer, operator, admin"),
+        ("bert", "king", "the roles are guest, viewer, operator, admin"),
         ("", "viewer", "a name has up to 100 letters"),
     ],
 )
@@ -122,7 +122,7 @@ def test_metrics_name_version_and_revision(revision, shown):
 
 def test_admin_token_is_accepted_by_its_tokens_file(tmp_path):
     created = make_keys(tmp_path / "keys")
-    assert sorted(file.name for file in created) == ["admin.token", "operator.key", "tokens.toml"]
+    assert sorted(file.name for file in created) == ["admin.token", "operator.key", "session.key", "tokens.toml"]
     token = (tmp_path / "keys" / "admin.token").read_text().strip()
     caller = load_tokens(tmp_path / "keys" / "tokens.toml").caller(token)
     assert caller is not None

@@ -56,7 +56,8 @@ def token_create(
     name: NameArgument,
     *,
     role: Annotated[
-        Role, typer.Option("--role", help="viewer reads, operator writes, admin also recovers.")
+        Role,
+        typer.Option("--role", help="guest may log in, viewer reads, operator writes, admin also recovers."),
     ] = "viewer",
     file: FileOption = None,
     out: Annotated[

@@ -23,7 +23,7 @@ from typing import Final
 
 from fog_runtime import machine
 from fog_runtime.configuration.parts import DEFAULT_BASE, DEFAULT_LIDAR
-from fog_runtime.keys import ADMIN_TOKEN, OPERATOR_KEY, TOKENS
+from fog_runtime.keys import ADMIN_TOKEN, OPERATOR_KEY, SESSION_KEY, TOKENS
 from fog_runtime.machine import ServiceManager
 from fog_runtime.security.site_security import CERTIFICATE, KEY, SiteSecurity
 from fog_supervisor import net
@@ -257,6 +257,7 @@ class LocalNode:
         for service in SERVICES:
             settings = {
                 "TOKENS_FILE": str(keys / TOKENS),
+                "SESSION_KEY_FILE": str(keys / SESSION_KEY),
                 "HTTP_HOST": self.config.address,
                 "HTTP_PORT": str(site.ports[service]),
                 "HTTP_CERTIFICATE_FILE": str(http / CERTIFICATE),

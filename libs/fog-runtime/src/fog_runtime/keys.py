@@ -2,6 +2,7 @@
 
 - `admin.token`: a bearer token for REST writes; `tokens.toml`: its hash, for the services (FOGNAV_TOKENS_FILE).
 - `operator.key`: the key that signs commands to robots (FOGNAV_OPERATOR_KEY_FILE), hexadecimal.
+- `session.key`: the key that signs sessions of the console (FOGNAV_SESSION_KEY_FILE), hexadecimal.
 """
 
 from __future__ import annotations
@@ -19,6 +20,7 @@ if TYPE_CHECKING:
 ADMIN_TOKEN: Final = "admin.token"  # noqa: S105  # a file's name
 TOKENS: Final = "tokens.toml"
 OPERATOR_KEY: Final = "operator.key"
+SESSION_KEY: Final = "session.key"
 
 
 def _write_new(file: Path, text: str, mode: int) -> None:
@@ -35,7 +37,7 @@ def make_keys(directory: Path, *, mode: int = 0o600) -> list[Path]:
     """
     directory.mkdir(parents=True, exist_ok=True)
     created: list[Path] = []
-    token_file, tokens_file, key_file = (directory / name for name in (ADMIN_TOKEN, TOKENS, OPERATOR_KEY))
+    token_file, tokens_file = directory / ADMIN_TOKEN, directory / TOKENS
     if token_file.exists() and not tokens_file.exists():
         raise FileExistsError(f"{token_file} exists, but {tokens_file} does not: remove the one or restore the other")
     if not tokens_file.exists():
@@ -43,28 +45,41 @@ def make_keys(directory: Path, *, mode: int = 0o600) -> list[Path]:
         _write_new(token_file, token + "\n", mode)
         _write_new(tokens_file, f'[[tokens]]\nname = "admin"\nrole = "admin"\nsha256 = "{token_hash(token)}"\n', mode)
         created += [token_file, tokens_file]
-    if not key_file.exists():
-        _write_new(key_file, secrets.token_hex(KEY_BYTES) + "\n", mode)
-        created.append(key_file)
+    for key_file in (directory / OPERATOR_KEY, directory / SESSION_KEY):
+        if not key_file.exists():
+            _write_new(key_file, secrets.token_hex(KEY_BYTES) + "\n", mode)
+            created.append(key_file)
     return created
 
 
-class OperatorKeyError(ValueError):
-    """A file is no operators' key; the message names the file and the remedy."""
+class KeyFileError(ValueError):
+    """A file is no key; the message names the file and the remedy."""
 
 
 def read_operator_key(file: Path) -> bytes:
     """Return the key that signs commands to robots from a file with its hexadecimal digits (`operator.key`).
 
-    Raises `OperatorKeyError`.
+    Raises `KeyFileError`.
     """
+    return _read_key(file, "operators' key")
+
+
+def read_session_key(file: Path) -> bytes:
+    """Return the key that signs sessions from a file with its hexadecimal digits (`session.key`).
+
+    Raises `KeyFileError`.
+    """
+    return _read_key(file, "key of sessions")
+
+
+def _read_key(file: Path, what: str) -> bytes:
     remedy = f"Write {2 * KEY_BYTES} or more hexadecimal digits into it (openssl rand -hex {KEY_BYTES})"
     try:
         key = bytes.fromhex(file.read_text("ascii").strip())
     except OSError as error:
-        raise OperatorKeyError(f"the operators' key {file} can't be read: {error.strerror}. {remedy}") from error
+        raise KeyFileError(f"the {what} {file} can't be read: {error.strerror}. {remedy}") from error
     except ValueError as error:
-        raise OperatorKeyError(f"the operators' key {file} is not hexadecimal. {remedy}") from error
+        raise KeyFileError(f"the {what} {file} is not hexadecimal. {remedy}") from error
     if len(key) < KEY_BYTES:
-        raise OperatorKeyError(f"the operators' key {file} is only {len(key)} bytes long. {remedy}")
+        raise KeyFileError(f"the {what} {file} is only {len(key)} bytes long. {remedy}")
     return key

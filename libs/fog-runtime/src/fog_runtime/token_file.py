@@ -23,7 +23,7 @@ import msgspec
 
 from fog_runtime.files import atomic_write
 
-Role = Literal["viewer", "operator", "admin"]
+Role = Literal["guest", "viewer", "operator", "admin"]
 ROLES: Final = get_args(Role)
 """From the fewest rights to the most."""
 TOKEN_BYTES: Final = 32

@@ -22,7 +22,7 @@ from fog_contracts.site import MarkerSite, RobotSite, Site
 from fog_runtime.configuration.robot_file import VARIABLES
 from fog_runtime.configuration.settings import CommonSettings, SettingsError
 from fog_runtime.credentials import NOBODY
-from fog_runtime.keys import OperatorKeyError
+from fog_runtime.keys import KeyFileError
 from fog_runtime.keys import read_operator_key as read_key
 from robot_agent import registry
 from robot_agent.footprint import BLIND_SHARE, SECTORS, TRAVEL_HALF_RAD, Footprint, FootprintError
@@ -186,7 +186,7 @@ def read_operator_key(file: Path | None) -> bytes:
         )
     try:
         return read_key(file)
-    except OperatorKeyError as error:
+    except KeyFileError as error:
         raise SettingsError(str(error)) from error
 
 

@@ -45,7 +45,7 @@ async def main() -> None:
     site = settings.site or load_site(settings.site_dir).site.id
     clock = SystemClock(settings.speed)
     health = Health("mqtt", "zenoh")
-    tokens = load_tokens(settings.tokens_file)
+    tokens = load_tokens(settings.tokens_file, settings.session_key_file)
     own = settings.credentials()
     mqtt = MqttEdge(settings.mqtt_url, process_id("console-service"), clock, site=site, credentials=own)
     async with ZenohEdge.open(

@@ -53,7 +53,7 @@ async def main() -> None:
     site = settings.site or loaded.site.id
     clock = SystemClock(settings.speed)
     health = Health("store", "mqtt")
-    tokens = load_tokens(settings.tokens_file)
+    tokens = load_tokens(settings.tokens_file, settings.session_key_file)
     own = settings.credentials()
     http_process = HttpProcess.fork(
         lambda: make_api(unused(), loaded.map.geometry, clock, health, tokens),

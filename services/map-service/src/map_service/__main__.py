@@ -49,7 +49,7 @@ async def main() -> None:
     health = Health("store", "zones", "mqtt", "map")
     metrics.watch_disk(settings.data_dir)
     metrics.watch_backup(settings.data_dir / STAMP)
-    tokens = load_tokens(settings.tokens_file)
+    tokens = load_tokens(settings.tokens_file, settings.session_key_file)
     own = settings.credentials()
     http_process = HttpProcess.fork(
         lambda: make_api(unused(), loaded.site, clock, health, tokens),

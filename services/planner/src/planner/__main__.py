@@ -12,7 +12,7 @@ from fog_runtime.configuration.settings import InflationSettings, SettingsError,
 from fog_runtime.configuration.site import load_site
 from fog_runtime.health import Health
 from fog_runtime.http import HttpProcess, load_tokens, unused
-from fog_runtime.keys import OperatorKeyError, read_operator_key
+from fog_runtime.keys import KeyFileError, read_operator_key
 from fog_runtime.leadership import Leadership, LeaseStore
 from fog_runtime.process import release_startup_memory, release_when
 from fog_runtime.transports.zenoh_edge import ZenohEdge
@@ -46,7 +46,7 @@ def read_key(file: Path | None) -> bytes | None:
         return None
     try:
         return read_operator_key(file)
-    except OperatorKeyError as error:
+    except KeyFileError as error:
         raise SettingsError(str(error)) from error
 
 
@@ -60,7 +60,7 @@ async def main() -> None:
     site = settings.site or described.id
     clock = SystemClock(settings.speed)
     health = Health("store", "goals", "map", "zenoh")
-    tokens = load_tokens(settings.tokens_file)
+    tokens = load_tokens(settings.tokens_file, settings.session_key_file)
     key = read_key(settings.operator_key_file)
     own = settings.credentials()
     http_process = HttpProcess.fork(

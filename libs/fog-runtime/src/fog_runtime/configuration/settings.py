@@ -83,6 +83,8 @@ class CommonSettings(msgspec.Struct, frozen=True, kw_only=True):
     credentials_file: Path | None = None
     """Who this process is, and whom it trusts (`fog_runtime.credentials`); without one it is nobody."""
     operator_key_file: Path | None = None
+    session_key_file: Path | None = None
+    """The key that signs sessions of the console; without it only tokens are accepted."""
 
     @property
     def zenoh_endpoints(self) -> list[str]:

@@ -14,6 +14,7 @@ from fog_runtime.http.routes import (
     expected_tag,
     expected_version,
 )
+from fog_runtime.http.sessions import add_session_routes
 from fog_runtime.http.store_routes import (
     IdempotencyKey,
     IfNoneMatch,
@@ -24,7 +25,7 @@ from fog_runtime.http.store_routes import (
     must_be_new,
     next_page,
 )
-from fog_runtime.http.tokens import Admin, Caller, Operator, Tokens, Viewer, load_tokens
+from fog_runtime.http.tokens import Admin, Caller, Guest, Operator, Tokens, Viewer, load_tokens
 from fog_runtime.token_file import TokensError, token_hash
 
 __all__ = [
@@ -35,6 +36,7 @@ __all__ = [
     "Caller",
     "ClientHost",
     "Encoded",
+    "Guest",
     "HttpProblem",
     "HttpProcess",
     "HttpProcessError",
@@ -50,6 +52,7 @@ __all__ = [
     "TokensError",
     "Viewer",
     "add_recovery",
+    "add_session_routes",
     "add_store_errors",
     "attempt_of",
     "etag",

@@ -12,6 +12,7 @@ its event loop, and returns the response.
 import asyncio
 import contextlib
 import gc
+import hmac
 import logging
 import math
 import os
@@ -46,6 +47,9 @@ KNOWN_S: Final = 10.0
 AGAIN_S: Final = 1.0
 """How soon the name is looked up again for somebody who is not the gateway."""
 _HEADER: Final = b"x-forwarded-for"
+_SCHEME: Final = b"x-forwarded-proto"
+PROOF: Final = b"x-fognav-gateway"
+"""The header by which the console-service, where it is the gateway, proves that (`Tokens.gateway_proof`)."""
 
 _log = logs.get("http")
 
@@ -63,26 +67,36 @@ class BehindGateway:
     """Gives the app the gateway's client instead of the gateway.
 
     Nobody but the gateway is believed, for others could pretend to be many clients, or another one. It is known by its
-    name: in a network of containers its address changes with each start.
+    name: in a network of containers its address changes with each start. The console-service has no address of its own
+    where it is the gateway of this machine, and proves itself by the key of sessions.
     """
 
-    def __init__(self, app: App, gateway: str, resolve: Resolve = addresses_of) -> None:
-        """`gateway` is its name or address; `resolve` looks a name up."""
+    def __init__(self, app: App, gateway: str, resolve: Resolve = addresses_of, *, proof: bytes = b"") -> None:
+        """`gateway` is its name or address; `resolve` looks a name up. `proof` (if any) is as good as the address."""
         self._app = app
         self._gateway = gateway
         self._resolve = resolve
+        self._proof = proof
         self._addresses: set[str] = set()
         self._looked_up = -math.inf
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         """Pass a request on."""
         peer = scope.get("client")
-        named = _named(scope["headers"]) if scope["type"] == "http" else ""
-        if named and peer and await self._is_gateway(peer[0]):
+        named = _last(scope["headers"], _HEADER) if scope["type"] == "http" else ""
+        if named and peer and (self._is_proven(scope["headers"]) or await self._is_gateway(peer[0])):
             scope = {**scope, "client": (named, 0)}
+            if (scheme := _last(scope["headers"], _SCHEME)) in ("http", "https"):
+                scope["scheme"] = scheme
         await self._app(scope, receive, send)
 
+    def _is_proven(self, headers: Iterable[tuple[bytes, bytes]]) -> bool:
+        sent = next((value for name, value in headers if name == PROOF), b"")
+        return bool(self._proof) and hmac.compare_digest(sent, self._proof)
+
     async def _is_gateway(self, address: str) -> bool:
+        if not self._gateway:
+            return False
         age = asyncio.get_running_loop().time() - self._looked_up
         if age > (KNOWN_S if address in self._addresses else AGAIN_S):
             self._looked_up = asyncio.get_running_loop().time()
@@ -90,9 +104,9 @@ class BehindGateway:
         return address in self._addresses
 
 
-def _named(headers: Iterable[tuple[bytes, bytes]]) -> str:
-    """Return the client that the gateway itself has seen: the last one, after those that the client claims."""
-    values = [value for name, value in headers if name == _HEADER]
+def _last(headers: Iterable[tuple[bytes, bytes]], header: bytes) -> str:
+    """Return what the gateway itself has seen: the last value, after those that the client claims."""
+    values = [value for name, value in headers if name == header]
     return values[-1].decode("latin-1").rpartition(",")[2].strip() if values else ""
 
 
@@ -219,8 +233,9 @@ async def serve_here(  # what `HttpProcess.fork` takes, too
 
 
 def _behind(gateway: str, app: FastAPI) -> FastAPI:
-    if gateway:
-        app.add_middleware(BehindGateway, gateway=gateway)
+    proof = app.state.tokens.gateway_proof
+    if gateway or proof:
+        app.add_middleware(BehindGateway, gateway=gateway, proof=proof)
     return app
 
 

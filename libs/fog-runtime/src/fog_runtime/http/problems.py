@@ -42,6 +42,8 @@ class HttpProblem(ProblemCode):
 
     TOKEN_MISSING = "token_missing", 401, "The request has no token"
     TOKEN_UNKNOWN = "token_unknown", 401, "The token is unknown"
+    SESSION_ENDED = "session_ended", 401, "The session has ended, or its token was revoked"
+    FOREIGN_ORIGIN = "foreign_origin", 403, "A session changes things from the console's own page only"
     ROLE_TOO_LOW = "role_too_low", 403, "The token's role does not allow this"
     NO_ROUTE = "no_route", 404, "The service has no such route"
     METHOD_NOT_ALLOWED = "method_not_allowed", 405, "The route has no such method: `Allow` has those that it has"

@@ -16,6 +16,7 @@ import inspect
 import re
 from collections.abc import Awaitable, Callable, Mapping, Sequence
 from dataclasses import dataclass, field
+from http import HTTPStatus
 from typing import (
     TYPE_CHECKING,
     Annotated,
@@ -190,7 +191,7 @@ class Routes:
                 status_code=statuses[0],
                 response_model=None,
                 response_class=Response,
-                responses=self._responses(path, signature, statuses, media_type, own),
+                responses=self._responses(method, path, signature, statuses, media_type, own),
                 openapi_extra=self._body(signature),
             )
             return handler
@@ -205,6 +206,7 @@ class Routes:
 
     def _responses(
         self,
+        method: str,
         path: str,
         signature: "_Signature",
         statuses: Sequence[int],
@@ -224,7 +226,7 @@ class Routes:
             status: {"description": _ANSWERS.get(status, "The answer"), **({"content": content} if content else {})}
             for status in statuses
         }
-        for code in dict.fromkeys([*own, *_shared_problems(path, signature)]):
+        for code in dict.fromkeys([*own, *_shared_problems(method, path, signature)]):
             self._app.state.problems.add(code)
             text = f"{code.says} (`{code}`)"
             response = responses.get(code.status)
@@ -236,13 +238,14 @@ class Routes:
         return responses
 
 
-def _shared_problems(path: str, signature: "_Signature") -> list[ProblemCode]:
+def _shared_problems(method: str, path: str, signature: "_Signature") -> list[ProblemCode]:
     """Return what any route of this signature may answer with."""
     found: list[ProblemCode] = [HttpProblem.FAILED, HttpProblem.RESTARTED]
     if path not in ALWAYS_SERVED:
         found.append(HttpProblem.OVERLOADED)
     if signature.needs_token:
-        found += [HttpProblem.TOKEN_MISSING, HttpProblem.TOKEN_UNKNOWN, HttpProblem.ROLE_TOO_LOW]
+        found += [HttpProblem.TOKEN_MISSING, HttpProblem.TOKEN_UNKNOWN, HttpProblem.SESSION_ENDED]
+        found += [HttpProblem.ROLE_TOO_LOW, *([HttpProblem.FOREIGN_ORIGIN] if method != "GET" else [])]
     if signature.has_parameters or signature.body is not None:
         found.append(HttpProblem.REQUEST_INVALID)
     if signature.body is not None:
@@ -318,8 +321,9 @@ def _handling(
         answer = await handler(**arguments)
         if isinstance(answer, Response):
             return answer
-        if answer is None:
-            return Response(status_code=status)
+        if answer is None or status == HTTPStatus.NO_CONTENT:
+            headers = dict(answer.headers) if isinstance(answer, Answer) else None
+            return Response(status_code=status, headers=headers)
         if isinstance(answer, Encoded):
             return Response(answer.data, status, media_type="application/json")
         full: Answer[object] = answer if isinstance(answer, Answer) else Answer(answer)

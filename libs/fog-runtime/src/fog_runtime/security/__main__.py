@@ -11,8 +11,8 @@ Each program gets a folder of its own, which only it can read:
     redis/      server.pem server.key users authority.pem health                   as above
     zenoh/      server.pem server.key users access.json5 health.toml               the last one: as above
     gateway/    server.pem server.key
-    hazard-aggregator/, map-service/, planner/, console-service/    credentials.toml tokens.toml, the planner also
-                operator.key
+    hazard-aggregator/, map-service/, planner/, console-service/    credentials.toml tokens.toml session.key, the
+                planner also operator.key
     simulation/ operator.key token credentials/NAME.toml                           of a simulated robot and its nodes
     floors/SITE/    the services' and simulation's of each further floor
 
@@ -36,7 +36,7 @@ from fog_runtime.configuration.settings import SettingsError, load
 from fog_runtime.configuration.site import SiteError, load_site
 from fog_runtime.credentials import Credentials, CredentialsError, to_toml
 from fog_runtime.files import atomic_write
-from fog_runtime.keys import OPERATOR_KEY, TOKENS, make_keys
+from fog_runtime.keys import OPERATOR_KEY, SESSION_KEY, TOKENS, make_keys
 from fog_runtime.security import users
 from fog_runtime.security.authority import AuthorityError
 from fog_runtime.security.site_security import CREDENTIALS, SiteSecurity
@@ -102,9 +102,13 @@ def _hand_out_keys(
     if (out / SIMULATION).is_dir():
         _make_token(keys / TOKENS, out / SIMULATION / TOKEN)
     named = partial(users.on_floor, floor) if floor else str
-    tokens, key = (keys / TOKENS).read_bytes(), (keys / OPERATOR_KEY).read_bytes()
+    tokens, key, sessions = ((keys / name).read_bytes() for name in (TOKENS, OPERATOR_KEY, SESSION_KEY))
     found = {
-        service: {"credentials.toml": security.credentials(named(service)).read_bytes(), TOKENS: tokens}
+        service: {
+            "credentials.toml": security.credentials(named(service)).read_bytes(),
+            TOKENS: tokens,
+            SESSION_KEY: sessions,
+        }
         for service in users.SERVICES
     }
     found["planner"][OPERATOR_KEY] = key

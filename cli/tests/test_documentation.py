@@ -7,11 +7,11 @@ from pathlib import Path
 
 import pytest
 
-from fognav import documentation
+from fognav import documentation, system
 from fognav.documentation import rest_page
 
 ROOT = Path(__file__).parents[2]
-BUILDER = documentation.find_builder(ROOT)
+BUILDER = system.find_tool(ROOT, "docs", "zensical")
 needs_builder = pytest.mark.skipif(BUILDER is None, reason="./fognav docs installs what builds the documentation")
 
 

@@ -11,7 +11,6 @@ import os
 import re
 import shutil
 import subprocess
-import sys
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from functools import partial
 from importlib.metadata import distribution
@@ -28,8 +27,7 @@ from fog_runtime.configuration.site import load_site
 from fog_runtime.health import Health
 from fog_runtime.http import Tokens, unused
 from fog_runtime.http.openapi import merged
-from fognav import checkout, system
-from fognav.output import FailedError
+from fognav import checkout
 from robot_agent import registry
 
 if TYPE_CHECKING:
@@ -316,28 +314,6 @@ def write(root: Path, folder: Path, services: Mapping[str, Described]) -> None:
     if not checkout.is_symlink() or checkout.readlink() != root:
         checkout.unlink(missing_ok=True)
         checkout.symlink_to(root)
-
-
-def find_builder(root: Path) -> Path | None:
-    """Return the program that builds the site, if it is installed as pinned."""
-    stamp = root / ".fognav" / "docs" / "venv" / "requirements.txt"
-    current = stamp.is_file() and stamp.read_bytes() == (root / "requirements" / "docs.txt").read_bytes()
-    return stamp.parent / "bin" / "zensical" if current else None
-
-
-def install_builder(root: Path) -> Path:
-    """Install the program that builds the site into an environment of its own, and return it; raises `FailedError`."""
-    if (uv := system.find_uv(root)) is None:
-        raise FailedError("uv, which installs what builds the documentation, is not found: python3 -m pip install uv")
-    venv, pins = root / ".fognav" / "docs" / "venv", root / "requirements" / "docs.txt"
-    create: list[str | Path] = ["venv", "--clear", "--no-project", "--python", sys.executable, venv]
-    install = ["pip", "install", "--python", venv / "bin" / "python", "--require-hashes", "-r", pins]
-    for step in (create, install):
-        done = subprocess.run([uv, "--quiet", *step], check=False, capture_output=True, text=True)
-        if done.returncode != 0:
-            raise FailedError(f"what builds the documentation could not be installed: {done.stderr.strip()}")
-    shutil.copyfile(pins, venv / "requirements.txt")
-    return venv / "bin" / "zensical"
 
 
 def build(builder: Path, folder: Path) -> str:

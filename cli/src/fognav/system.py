@@ -200,3 +200,28 @@ def _lacks_compiler() -> bool:
     except FirmwareError:
         return True
     return False
+
+
+def find_tool(root: Path, pins: str, program: str) -> Path | None:
+    """Return a program of the environment of requirements/`pins`.txt, if it is installed as pinned."""
+    stamp = root / ".fognav" / pins / "venv" / "requirements.txt"
+    current = stamp.is_file() and stamp.read_bytes() == (root / "requirements" / f"{pins}.txt").read_bytes()
+    return stamp.parent / "bin" / program if current else None
+
+
+def install_tool(root: Path, pins: str, program: str) -> Path:
+    """Install what requirements/`pins`.txt names into an environment of its own; return a program of it.
+
+    Raises `FailedError`.
+    """
+    if (uv := find_uv(root)) is None:
+        raise FailedError(f"uv, which installs {program}, is not found: python3 -m pip install uv")
+    venv, wanted = root / ".fognav" / pins / "venv", root / "requirements" / f"{pins}.txt"
+    create: list[str | Path] = ["venv", "--clear", "--no-project", "--python", sys.executable, venv]
+    install = ["pip", "install", "--python", venv / "bin" / "python", "--require-hashes", "-r", wanted]
+    for step in (create, install):
+        done = subprocess.run([uv, "--quiet", *step], check=False, capture_output=True, text=True)
+        if done.returncode != 0:
+            raise FailedError(f"{program} could not be installed: {done.stderr.strip()}")
+    shutil.copyfile(wanted, venv / "requirements.txt")
+    return venv / "bin" / program

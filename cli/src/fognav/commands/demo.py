@@ -9,7 +9,7 @@ import typer
 from fog_runtime import logs
 from fog_runtime.configuration import parts
 from fog_runtime.configuration.site import load_site
-from fognav import checkout, kernels, recording, system
+from fognav import checkout, console_page, kernels, recording, system
 from fognav.operate.options import JsonOption, YesOption
 from fognav.output import NOT_TRUE, OK, check_writable, exit_codes, print_json, print_line, print_result, write_report
 from fognav_sim import emulators
@@ -84,6 +84,8 @@ def demo_command(  # noqa: PLR0913  # each option is an argument
         packages = embedded_servers(forced=embedded, yes=yes, print_line=print_line)
         system.prepare_node_code(print_line, yes=yes)
         kernels.warm_cache(print_line)
+        if not headless:
+            console_page.build_in_background(checkout.root(), print_line)
         options = Options(
             seed=seed,
             speed=speed,

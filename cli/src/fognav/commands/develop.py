@@ -119,6 +119,9 @@ class CheckResult:
 _TOOLS: Final = Path(sys.executable).parent
 CHECKS: Final = (
     # The longest first: the others run beside it.
+    Check(
+        "console", (sys.executable, "-m", "fognav.console_page", "--check"), "correct what is listed above in console/"
+    ),
     Check("types", (str(_TOOLS / "mypy"),), "correct the types listed above"),
     Check("import contracts", (str(_TOOLS / "lint-imports"),), "import inwards only: [tool.importlinter]"),
     Check(
@@ -234,9 +237,9 @@ def docs_command(
 
     root = checkout.root()
     folder = root / ".fognav" / "docs"
-    if (builder := documentation.find_builder(root)) is None:
+    if (builder := system.find_tool(root, "docs", "zensical")) is None:
         print_line("installing what builds the documentation (once)")
-        builder = documentation.install_builder(root)
+        builder = system.install_tool(root, "docs", "zensical")
     started = time.monotonic()
     routes = documentation.rest_routes()
     documentation.write(root, folder, routes)

@@ -7,7 +7,7 @@ from typing import Annotated, Final
 
 import typer
 
-from fognav import checkout, kernels, system
+from fognav import checkout, console_page, kernels, system
 from fognav.credentials import own_hosts, security_errors
 from fognav.hosting import local_nodes
 from fognav.hosting.fog_node import NodeConfig, run_node
@@ -60,6 +60,7 @@ def up_command(  # noqa: PLR0913  # each option is an argument
             return
         system.ensure([system.MOSQUITTO, system.REDIS], yes=yes, print_line=print_line)
         kernels.warm_cache(print_line)
+        console_page.build_in_background(checkout.root(), print_line)
         folder = NodeFolder(path)
         with folder.in_use():
             _run(folders, folder, bind, host or [], sim=sim, check=check)

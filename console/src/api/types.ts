@@ -1,0 +1,93 @@
+// The messages of REST and of the stream of events, by the names that the services' OpenAPI document gives them.
+import type { components } from "./schema";
+
+type Schemas = components["schemas"];
+
+export type Alert = Schemas["Alert"];
+export type AreaState = "blocked" | "clear" | "unknown";
+export type AreaView = Schemas["AreaView"];
+export type AuditEntry = Schemas["AuditEntry"];
+export type CommandBody = Schemas["CommandBody"];
+export type CommandOutcome = Schemas["CommandOutcome"];
+export type GoalBody = Schemas["GoalBody"];
+export type GoalView = Schemas["GoalView"];
+export type MapGeometry = Schemas["MapGeometry"];
+export type MapInfo = Schemas["MapInfo"];
+export type Place = Schemas["Place"];
+export type PlanReply = Schemas["PlanReply"];
+export type PlanView = Schemas["PlanView"];
+export type Pose = Schemas["Pose"];
+export type RobotPose = Schemas["RobotPose"];
+export type RobotState = Schemas["RobotState"];
+export type Shape = Schemas["Zone"]["shape"];
+export type Zone = Schemas["Zone"];
+export type ZoneBody = Schemas["ZoneBody"];
+
+/** A point of the floor in metres: x to the right, y up. */
+export type Point = readonly [number, number];
+
+export type Role = "viewer" | "operator" | "admin" | "guest";
+
+/** Who is logged in. */
+export interface Session {
+  readonly name: string;
+  readonly role: Role;
+}
+
+/** A sensor node's or source's health; with a place on the floor if the site says where it hangs. */
+export type NodeValue = Schemas["NodeView"] & {
+  readonly x?: number;
+  readonly y?: number;
+  readonly theta?: number;
+  readonly sonars?: readonly { readonly angle: number; readonly range_limit: number }[];
+};
+
+export interface PathValue {
+  readonly points: readonly Point[];
+  readonly released_length: number;
+  readonly plan_id: number;
+}
+
+/** A robot's view of what its lidar sees and the map does not contain. */
+export interface ObstaclesValue {
+  readonly points: readonly Point[];
+  readonly stamp: number;
+}
+
+/** The last turn of a robot's lidar: points of the floor (m). */
+export interface ScanValue {
+  readonly points: readonly Point[];
+}
+
+/** What the stream has under an id, by the event's name. */
+export interface Values {
+  zone: Zone & { readonly active: boolean };
+  area: AreaView;
+  node: NodeValue;
+  alert: Alert;
+  place: Place;
+  robot: Omit<Schemas["RobotView"], "pose">;
+  pose: RobotPose;
+  path: PathValue;
+  obstacles: ObstaclesValue;
+  scan: ScanValue;
+}
+
+export type Kind = keyof Values;
+
+/** A window of the costmap: `row` counts from the map's lower edge, `png` is grey in base64, its first row the top. */
+export interface Tile {
+  readonly epoch: number;
+  readonly seq: number;
+  readonly column: number;
+  readonly row: number;
+  readonly width: number;
+  readonly height: number;
+  readonly png: string;
+}
+
+export interface Hello {
+  readonly run: string;
+  readonly fresh: boolean;
+  readonly site: string;
+}

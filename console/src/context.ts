@@ -1,0 +1,64 @@
+// What every view can use: the live state, who is logged in, the map, and messages to the user.
+import { createContext } from "preact";
+import { useContext, useEffect, useReducer } from "preact/hooks";
+import type { Session } from "./api/types";
+import type { Live, Topic } from "./live/live";
+import type { Floor } from "./map/floor";
+
+export interface Console {
+  readonly live: Live;
+  readonly session: Session;
+  /** The map; null until it is drawn for the first time. */
+  readonly floor: Floor | null;
+  /** The robot that stop button and commands are for; null: none is known. */
+  readonly robot: string | null;
+  readonly chooseRobot: (id: string) => void;
+  /** Say something in the live region: a result of what the user did, or a change that matters. */
+  readonly say: (text: string, kind?: "done" | "failed") => void;
+  readonly logOut: () => void;
+}
+
+export const ConsoleContext = createContext<Console | null>(null);
+
+export function useConsole(): Console {
+  const found = useContext(ConsoleContext);
+  if (!found) throw new Error("used outside of the console");
+  return found;
+}
+
+export function mayOperate(session: Session): boolean {
+  return session.role === "operator" || session.role === "admin";
+}
+
+const PERIOD_MS = 250;
+
+/** Draw the component anew when something in these topics changes, at most four times a second. */
+export function useLive(topics: readonly Topic[]): Live {
+  const { live } = useConsole();
+  const [, redraw] = useReducer((count: number) => count + 1, 0);
+  const key = topics.join(" ");
+  useEffect(() => {
+    let timer: ReturnType<typeof setTimeout> | undefined;
+    const off = live.on(key.split(" ") as Topic[], () => {
+      timer ??= setTimeout(() => {
+        timer = undefined;
+        redraw(0);
+      }, PERIOD_MS);
+    });
+    redraw(0);
+    return () => {
+      off();
+      clearTimeout(timer);
+    };
+  }, [live, key]);
+  return live;
+}
+
+/** Draw the component anew once a second, for ages and what becomes old. */
+export function useSeconds(): void {
+  const [, redraw] = useReducer((count: number) => count + 1, 0);
+  useEffect(() => {
+    const timer = setInterval(() => redraw(0), 1000);
+    return () => clearInterval(timer);
+  }, []);
+}

@@ -1,0 +1,61 @@
+import { expect, test } from "vitest";
+import { Live } from "./live";
+import { EventParser, waitBefore } from "./stream";
+
+const stream = [
+  "event: hello\nid: run:1\ndata: {\"run\":\"a\",\"fresh\":true,\"site\":\"estig\"}\n\n",
+  ": comment\r\nevent: zone\r\nid: run:2\r\ndata: {\"id\":\"wet\",\r\ndata: \"value\":null}\r\n\r\n",
+  "event: time\ndata: {\"stamp\":1}\n\n",
+].join("");
+
+test("events are the same, wherever the network cuts the stream", () => {
+  const whole = new EventParser().push(stream);
+  expect(whole.map(({ event, id }) => [event, id])).toEqual([["hello", "run:1"], ["zone", "run:2"], ["time", null]]);
+  expect(JSON.parse(whole[1]?.data ?? "")).toEqual({ id: "wet", value: null });
+  for (let cut = 1; cut < stream.length; cut++) {
+    const parser = new EventParser();
+    expect([...parser.push(stream.slice(0, cut)), ...parser.push(stream.slice(cut))]).toEqual(whole);
+  }
+});
+
+test("tries to connect come less and less often, and never further apart than five seconds", () => {
+  expect(waitBefore(0, 1)).toBeLessThanOrEqual(500);
+  expect(waitBefore(50, 1)).toBeLessThanOrEqual(5_000);
+  expect(waitBefore(3, 0)).toBeGreaterThan(waitBefore(0, 0));
+});
+
+const say = (live: Live, event: string, data: unknown): void =>
+  live.take({ event, data: JSON.stringify(data), id: null });
+
+test("a fresh stream replaces all that was known, a resumed one adds to it", () => {
+  const live = new Live("", () => 0);
+  say(live, "hello", { run: "a", fresh: true, site: "estig" });
+  say(live, "zone", { id: "wet", value: { id: "wet" } });
+  say(live, "hello", { run: "a", fresh: false, site: "estig" });
+  expect([...live.of.zone.keys()]).toEqual(["wet"]);
+  say(live, "zone", { id: "wet", value: null });
+  expect(live.of.zone.size).toBe(0);
+  say(live, "zone", { id: "dry", value: { id: "dry" } });
+  say(live, "hello", { run: "b", fresh: true, site: "estig" });
+  expect(live.of.zone.size).toBe(0);
+});
+
+test("a robot of which nothing came for two seconds is old, and so is everything once the server is silent", () => {
+  let now = 0;
+  const live = new Live("", () => now);
+  say(live, "hello", { run: "a", fresh: true, site: "estig" });
+  say(live, "pose", { id: "r1", value: {} });
+  expect(live.oldRobot("r1")).toBe(false);
+  now = 2_500;
+  say(live, "time", { stamp: 2.5 });
+  expect([live.old, live.oldRobot("r1")]).toEqual([false, true]);
+  say(live, "pose", { id: "r1", value: {} });
+  expect(live.oldRobot("r1")).toBe(false);
+  now = 5_000;
+  expect([live.old, live.oldRobot("r1")]).toEqual([true, true]);
+});
+
+test("an event that only a newer server knows is passed over", () => {
+  const live = new Live("", () => 0);
+  expect(() => say(live, "weather", { sun: true })).not.toThrow();
+});

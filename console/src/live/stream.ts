@@ -1,0 +1,156 @@
+// Server-sent events by `fetch`: unlike `EventSource`, it says when the login has ended, and keeps the last id across
+// connections that were refused.
+
+export interface StreamEvent {
+  readonly event: string;
+  readonly data: string;
+  readonly id: string | null;
+}
+
+/** Splits a stream's text into events (WHATWG HTML, 9.2.6); pieces may end anywhere. */
+export class EventParser {
+  private rest = "";
+  private event = "";
+  private data: string[] = [];
+  private id: string | null = null;
+
+  /** Take a piece of the stream; return the events that it completes. */
+  push(piece: string): StreamEvent[] {
+    const found: StreamEvent[] = [];
+    const lines = (this.rest + piece).split(/\r\n|\n|\r(?!$)/);
+    this.rest = lines.pop() ?? "";
+    for (const line of lines) {
+      if (line === "") {
+        if (this.data.length > 0) found.push({ event: this.event || "message", data: this.data.join("\n"), id: this.id });
+        this.event = "";
+        this.data = [];
+        this.id = null;
+        continue;
+      }
+      const colon = line.indexOf(":");
+      if (colon === 0) continue;
+      const field = colon < 0 ? line : line.slice(0, colon);
+      const value = colon < 0 ? "" : line.slice(colon + 1).replace(/^ /, "");
+      if (field === "event") this.event = value;
+      else if (field === "data") this.data.push(value);
+      else if (field === "id") this.id = value;
+    }
+    return found;
+  }
+}
+
+export type Connection = "connecting" | "open" | "lost" | "refused";
+
+export interface StreamHandlers {
+  readonly onEvent: (event: StreamEvent) => void;
+  /** `refused`: the login has ended, and only a new one helps. */
+  readonly onConnection: (connection: Connection) => void;
+}
+
+const FIRST_WAIT_MS = 500;
+const LONGEST_WAIT_MS = 5_000;
+/** Each second there is an event `time`: after so long without any, the connection is dead, whatever TCP says. */
+const SILENCE_MS = 6_000;
+
+/** Return how long to wait before the next try (ms): doubled each time, and spread, so that not all come at once. */
+export function waitBefore(attempt: number, random: number): number {
+  return Math.min(LONGEST_WAIT_MS, FIRST_WAIT_MS * 2 ** attempt) * (0.5 + random / 2);
+}
+
+/** Reads the stream until it is closed, and connects again, from the last id, whenever it ends. */
+export class Stream {
+  private lastId: string | null = null;
+  private closed = false;
+  private attempt = 0;
+  private reading: AbortController | null = null;
+  private wake: (() => void) | null = null;
+  private query = "";
+
+  constructor(
+    private readonly address: string,
+    private readonly handlers: StreamHandlers,
+  ) {}
+
+  start(): void {
+    void this.run();
+  }
+
+  /** Ask for other events, such as the scan of a robot: connects anew from the last id. */
+  ask(query: string): void {
+    if (query === this.query) return;
+    this.query = query;
+    this.attempt = 0;
+    this.reading?.abort();
+    this.wake?.();
+  }
+
+  close(): void {
+    this.closed = true;
+    this.reading?.abort();
+    this.wake?.();
+  }
+
+  private async run(): Promise<void> {
+    while (!this.closed) {
+      const query = this.query;
+      this.handlers.onConnection("connecting");
+      if (!(await this.readOnce())) {
+        this.closed = true;
+        this.handlers.onConnection("refused");
+        return;
+      }
+      if (this.closed) return;
+      if (query !== this.query) continue;
+      this.handlers.onConnection("lost");
+      await this.pause(waitBefore(this.attempt++, Math.random()));
+    }
+  }
+
+  private pause(ms: number): Promise<void> {
+    return new Promise((resolve) => {
+      const timer = setTimeout(resolve, ms);
+      this.wake = () => {
+        clearTimeout(timer);
+        resolve();
+      };
+    });
+  }
+
+  /** Read one connection to its end; false if it was refused for want of a login. */
+  private async readOnce(): Promise<boolean> {
+    const reading = new AbortController();
+    this.reading = reading;
+    let silence = setTimeout(() => reading.abort(), SILENCE_MS);
+    try {
+      const headers: Record<string, string> = { Accept: "text/event-stream" };
+      if (this.lastId !== null) headers["Last-Event-ID"] = this.lastId;
+      const response = await fetch(this.address + this.query, {
+        headers,
+        signal: reading.signal,
+        cache: "no-store",
+        credentials: "same-origin",
+      });
+      if (response.status === 401 || response.status === 403) return false;
+      if (!response.ok || response.body === null) return true;
+      const reader = response.body.pipeThrough(new TextDecoderStream()).getReader();
+      const parser = new EventParser();
+      this.handlers.onConnection("open");
+      for (;;) {
+        const { value, done } = await reader.read();
+        if (done) return true;
+        clearTimeout(silence);
+        silence = setTimeout(() => reading.abort(), SILENCE_MS);
+        this.attempt = 0;
+        for (const event of parser.push(value)) {
+          this.handlers.onEvent(event);
+          // An event without an id (`time`) leaves the last one as it is.
+          if (event.id !== null) this.lastId = event.id;
+        }
+      }
+    } catch {
+      return true; // broken, or silent for too long: the caller connects again
+    } finally {
+      clearTimeout(silence);
+    }
+  }
+}

@@ -1,0 +1,200 @@
+// The map of the floor: Leaflet on a plane of metres (latitude is y, longitude is x), with the layers of the console.
+import L from "leaflet";
+import type { Point } from "../api/types";
+import type { Live } from "../live/live";
+import { CostLayer } from "./cost-layer";
+import { FixedLayer } from "./fixed-layer";
+import { box } from "./geometry";
+import { MovingLayer } from "./moving-layer";
+
+export interface FloorHandlers {
+  readonly onRobot: (id: string) => void;
+  readonly onZone: (id: string) => void;
+}
+
+/** What a click on the floor means while somebody picks or draws, instead of a choice of what lies there. */
+export type Pick = (point: Point) => void;
+
+const REDRAWING = ["robot", "pose", "path", "obstacles", "scan", "time", "connection"] as const;
+const HIT_PX = 24;
+/** Below so many pixels a metre labels are short (Leaflet's zoom is the binary logarithm). */
+const NEARBY_ZOOM = Math.log2(20);
+
+export class Floor {
+  readonly map: L.Map;
+  readonly moving: MovingLayer;
+  readonly fixed: FixedLayer;
+  private plan: CostLayer | null = null;
+  private costs: CostLayer | null = null;
+  private shownMap = "";
+  private readonly stops: (() => void)[] = [];
+  private pick: Pick | null = null;
+  private follows = false;
+  private costsShown = true;
+  private fitted = false;
+
+  constructor(
+    readonly element: HTMLElement,
+    private readonly live: Live,
+    private readonly handlers: FloorHandlers,
+  ) {
+    this.map = L.map(element, {
+      crs: L.CRS.Simple,
+      attributionControl: false,
+      // Layers are drawn at once in their new place: nothing to wait for, and nothing that moves by itself.
+      zoomAnimation: false,
+      fadeAnimation: false,
+      inertia: false,
+      zoomSnap: 0.25,
+      zoomDelta: 0.5,
+      wheelPxPerZoomLevel: 120,
+      minZoom: 0,
+      maxZoom: 9,
+      zoomControl: false,
+      boxZoom: false,
+    });
+    this.map.createPane("plan").classList.add("below");
+    this.map.createPane("costs").classList.add("below");
+    this.map.setView([0, 0], 3);
+    this.moving = new MovingLayer(live).addTo(this.map);
+    this.fixed = new FixedLayer(this.map, live, handlers.onZone);
+    this.map.on("click", (event) => this.click(event));
+    const distance = (): void => void element.classList.toggle("afar", this.map.getZoom() < NEARBY_ZOOM);
+    this.map.on("zoomend", distance);
+    distance();
+    this.map.on("dragstart", () => this.follow(false));
+    this.stops.push(
+      live.on(REDRAWING, () => {
+        this.moving.redraw();
+        if (this.follows) this.centre();
+      }),
+      live.on(["map"], () => this.takeMap()),
+      live.on(["costmap"], (key) => this.takeTile(key)),
+      live.on(["ready"], () => this.fitOnce()),
+    );
+    const resize = new ResizeObserver(() => {
+      this.map.invalidateSize({ animate: false });
+      this.fitOnce();
+    });
+    resize.observe(element);
+    this.stops.push(() => resize.disconnect());
+    this.takeMap();
+    for (const key of live.tiles.keys()) this.takeTile(key);
+  }
+
+  remove(): void {
+    for (const stop of this.stops) stop();
+    this.fixed.remove();
+    this.map.remove();
+  }
+
+  /** Take over the theme's colours. */
+  recolour(): void {
+    this.plan?.recolour();
+    this.costs?.recolour();
+    this.moving.readColours();
+  }
+
+  select(robot: string | null): void {
+    this.moving.selected = robot;
+    this.moving.redraw();
+    if (this.follows) this.centre();
+  }
+
+  follow(follows: boolean): void {
+    if (this.follows === follows) return;
+    this.follows = follows;
+    this.element.dispatchEvent(new Event("followchange"));
+    if (follows) this.centre();
+  }
+
+  get following(): boolean {
+    return this.follows;
+  }
+
+  showCosts(shown: boolean): void {
+    this.costsShown = shown;
+    this.costs?.show(shown);
+  }
+
+  /** Show a path that is not sent yet; none with an empty one. */
+  preview(points: readonly Point[]): void {
+    this.moving.preview = points;
+    this.moving.redraw();
+  }
+
+  /** Send clicks to `pick` until it is set to null. */
+  setPick(pick: Pick | null): void {
+    this.pick = pick;
+    this.element.classList.toggle("picking", pick !== null);
+  }
+
+  /** Show the whole map. */
+  fit(): void {
+    const geometry = this.live.map?.geometry;
+    if (!geometry) return;
+    const { origin_x: x, origin_y: y, width, height, resolution } = geometry;
+    this.map.fitBounds([[y, x], [y + height * resolution, x + width * resolution]], { animate: false, padding: [8, 8] });
+  }
+
+  /** Show points with some margin. */
+  show(points: readonly Point[]): void {
+    if (points.length === 0) return;
+    const [left, bottom, right, top] = box(points);
+    this.map.fitBounds([[bottom, left], [top, right]], { animate: false, maxZoom: 5, padding: [60, 60] });
+  }
+
+  private fitOnce(): void {
+    const { x, y } = this.map.getSize();
+    if (this.fitted || !this.live.map || x === 0 || y === 0) return;
+    this.fitted = true;
+    this.fit();
+  }
+
+  private centre(): void {
+    const pose = this.moving.selected === null ? undefined : this.live.of.pose.get(this.moving.selected);
+    if (pose) this.map.panTo([pose.y, pose.x], { animate: false });
+  }
+
+  private click(event: L.LeafletMouseEvent): void {
+    const point: Point = [event.latlng.lng, event.latlng.lat];
+    if (this.pick) {
+      this.pick(point);
+      return;
+    }
+    let nearest: string | null = null;
+    let least = HIT_PX;
+    for (const [id, pose] of this.live.of.pose) {
+      const distance = this.map.latLngToContainerPoint([pose.y, pose.x]).distanceTo(event.containerPoint);
+      if (distance <= least) [nearest, least] = [id, distance];
+    }
+    if (nearest !== null) this.handlers.onRobot(nearest);
+  }
+
+  /** Begin with another map: its plan is one picture, everything after comes in tiles. */
+  private takeMap(): void {
+    const info = this.live.map;
+    if (!info) return;
+    const { geometry } = info;
+    const key = JSON.stringify([info.site, info.epoch, geometry]);
+    if (key === this.shownMap) return;
+    this.shownMap = key;
+    this.plan?.remove();
+    this.costs?.remove();
+    this.plan = new CostLayer(this.map, geometry, "plan");
+    this.costs = new CostLayer(this.map, geometry, "costs");
+    this.costs.show(this.costsShown);
+    const { plan } = this;
+    void fetch("api/v1/map.png", { cache: "no-cache" })
+      .then((response) => (response.ok ? response.blob() : Promise.reject(new Error(`HTTP ${response.status}`))))
+      .then((png) => plan.draw(png, 0, 0))
+      .catch((error: unknown) => console.warn("the plan can't be shown:", error));
+    for (const tile of this.live.tiles.keys()) this.takeTile(tile);
+    this.fitOnce();
+  }
+
+  private takeTile(key: string): void {
+    const tile = this.live.tiles.get(key);
+    if (tile && this.costs) void this.costs.patch(tile);
+  }
+}

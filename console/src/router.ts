@@ -1,0 +1,49 @@
+// Which view is shown stands behind the address's #, so that it can be bookmarked and the browser's "back" works.
+import { useEffect, useState } from "preact/hooks";
+
+export const VIEWS = ["map", "zones", "robots", "sensors", "timeline"] as const;
+export type View = (typeof VIEWS)[number];
+
+export interface Route {
+  readonly view: View;
+  /** What of the view is chosen, such as a robot or a zone; empty: nothing. */
+  readonly chosen: string;
+}
+
+export function parseRoute(hash: string): Route {
+  const [view = "", ...rest] = hash.replace(/^#\/?/, "").split("/");
+  const found = VIEWS.find((name) => name === view) ?? "map";
+  let chosen = rest.join("/");
+  try {
+    chosen = decodeURIComponent(chosen);
+  } catch {
+    // Not encoded by us: taken as it is.
+  }
+  return { view: found, chosen };
+}
+
+export function routeHash(view: View, chosen = ""): string {
+  return `#/${view}${chosen === "" ? "" : `/${encodeURIComponent(chosen)}`}`;
+}
+
+export function go(view: View, chosen = ""): void {
+  location.hash = routeHash(view, chosen);
+}
+
+export function useRoute(): Route {
+  const [route, setRoute] = useState(() => parseRoute(location.hash));
+  useEffect(() => {
+    const changed = (): void => setRoute(parseRoute(location.hash));
+    addEventListener("hashchange", changed);
+    return () => removeEventListener("hashchange", changed);
+  }, []);
+  return route;
+}
+
+/** Take the one-time login out of the address, so that neither history nor a shared screen keeps it. */
+export function takeLogin(): string | null {
+  const found = /^#login=(.+)$/.exec(location.hash);
+  if (!found?.[1]) return null;
+  history.replaceState(null, "", `${location.pathname}${location.search}#/map`);
+  return decodeURIComponent(found[1]);
+}

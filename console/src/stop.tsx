@@ -1,0 +1,73 @@
+// The stop: at the same place on every view, without a dialog, and by key; it works without a login, too.
+import { useEffect, useState } from "preact/hooks";
+import { Problem, request, robotPath } from "./api/client";
+import type { CommandOutcome } from "./api/types";
+import { t } from "./i18n/i18n";
+
+const STORED = "fognav.robots";
+
+/** Remember the robots' ids, so that they can be stopped before a login. */
+export function rememberRobots(ids: readonly string[]): void {
+  localStorage.setItem(STORED, JSON.stringify(ids));
+}
+
+export function rememberedRobots(): string[] {
+  try {
+    const found: unknown = JSON.parse(localStorage.getItem(STORED) ?? "[]");
+    return Array.isArray(found) ? found.filter((id): id is string => typeof id === "string") : [];
+  } catch {
+    return [];
+  }
+}
+
+/** Return a problem's sentence for people. */
+export function sentence(error: unknown): string {
+  if (!(error instanceof Problem)) return String(error);
+  return error.code === "unreachable" ? t("error.unreachable") : error.detail;
+}
+
+interface Props {
+  readonly robot: string | null;
+  readonly robots: readonly string[];
+  readonly say: (text: string, kind?: "done" | "failed") => void;
+}
+
+export function StopBar({ robot, robots, say }: Props): preact.JSX.Element {
+  const [stopping, setStopping] = useState<readonly string[]>([]);
+
+  const stop = async (id: string): Promise<void> => {
+    setStopping((now) => [...now, id]);
+    try {
+      await request<CommandOutcome>("POST", robotPath(id, "stop"), { timeout: 5_000 });
+      say(t("stop.done", { robot: id }), "done");
+    } catch (error) {
+      say(t("stop.failed", { robot: id, reason: sentence(error) }), "failed");
+    } finally {
+      setStopping((now) => now.filter((other) => other !== id));
+    }
+  };
+  const stopAll = (): void => robots.forEach((id) => void stop(id));
+
+  useEffect(() => {
+    const pressed = (event: KeyboardEvent): void => {
+      if (event.key !== "F9" || event.repeat) return;
+      event.preventDefault();
+      if (event.shiftKey) stopAll();
+      else if (robot !== null) void stop(robot);
+    };
+    addEventListener("keydown", pressed);
+    return () => removeEventListener("keydown", pressed);
+  });
+
+  return (
+    <section class="stopbar" aria-label={t("stop.bar")} title={t("stop.keys")}>
+      <button class="stop" disabled={robot === null} aria-keyshortcuts="F9" onClick={() => robot !== null && void stop(robot)}>
+        <span class="octagon" aria-hidden="true" />
+        {robot === null ? t("stop.none") : stopping.includes(robot) ? t("stop.sending") : t("stop.robot", { robot })}
+      </button>
+      <button class="stop all" disabled={robots.length === 0} aria-keyshortcuts="Shift+F9" onClick={stopAll}>
+        {t("stop.all")}
+      </button>
+    </section>
+  );
+}

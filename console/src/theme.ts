@@ -1,0 +1,32 @@
+// Light or dark: as the system says, unless the user chose.
+export type Theme = "auto" | "light" | "dark";
+
+const STORED = "fognav.theme";
+
+export function theme(): Theme {
+  const stored = localStorage.getItem(STORED);
+  return stored === "light" || stored === "dark" ? stored : "auto";
+}
+
+export function setTheme(to: Theme): void {
+  if (to === "auto") localStorage.removeItem(STORED);
+  else localStorage.setItem(STORED, to);
+  startTheme();
+  dispatchEvent(new Event("themechange"));
+}
+
+/** Take over the stored choice. */
+export function startTheme(): void {
+  document.documentElement.dataset.theme = theme();
+}
+
+/** Call `listener` when other colours are shown; returns how to stop that. */
+export function onTheme(listener: () => void): () => void {
+  const system = matchMedia("(prefers-color-scheme: dark)");
+  system.addEventListener("change", listener);
+  addEventListener("themechange", listener);
+  return () => {
+    system.removeEventListener("change", listener);
+    removeEventListener("themechange", listener);
+  };
+}

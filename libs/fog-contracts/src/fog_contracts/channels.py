@@ -254,6 +254,8 @@ PLANNER_PLAN      = _query("planner_plan",      FOG + "planner/plan",           
     publishers=(PLANNER,), subscribers=(CONSOLE,),         reply=m.PlanReply, reply_limit=4 * MIB)
 PLANNER_EGRESS    = _query("planner_egress",    FOG + "planner/egress",           m.EgressRequest,  limit=KIB,
     publishers=(PLANNER,), subscribers=(ROBOT,),           reply=m.PlanReply, reply_limit=4 * MIB)
+PLANNER_DRY_RUN   = _query("planner_dry_run",   FOG + "planner/dry_run",          m.DryRunRequest,  limit=MIB,
+    publishers=(PLANNER,), subscribers=(MAP,),             reply=m.DryRunReply, reply_limit=4 * MIB)
 ROBOT_GOAL        = _pub(  "robot_goal",        FOG + "robots/{robot}/goal",      m.RobotGoal,      limit=KIB,
     publishers=(PLANNER,), subscribers=(ROBOT, CONSOLE, WEB), durability=VOLATILE, rate_hz=0.2, epoch="planner_epoch")
 ROBOT_PATH        = _pub(  "robot_path",        FOG + "robots/{robot}/path",      m.RobotPath,      limit=MIB,

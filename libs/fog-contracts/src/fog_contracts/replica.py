@@ -45,13 +45,15 @@ class MapError(ValueError):
     """Cells or a version that do not fit the map; the message says what does not fit."""
 
 
-def _pack(cells: Grid) -> tuple[Packing, bytes]:
+def pack(cells: Grid) -> tuple[Packing, bytes]:
+    """Return cells as bytes, row by row, compressed where that makes them smaller."""
     raw = cells.tobytes()
     packed = zlib.compress(raw, 1)
     return ("zlib", packed) if len(packed) < len(raw) else ("raw", raw)
 
 
-def _unpack(packing: Packing, data: bytes, shape: tuple[int, int], subject: str) -> Grid:
+def unpack(packing: Packing, data: bytes, shape: tuple[int, int], subject: str) -> Grid:
+    """Return the cells (height, width) of `pack`; raises `MapError`, which names the subject, for damaged ones."""
     size = shape[0] * shape[1]
     if packing == "zlib":
         unpacker = zlib.decompressobj()
@@ -247,7 +249,7 @@ class MasterMap:
         )
 
     def _split(self, layer: Layer, grid: Grid, window: Window) -> list[tuple[Layer, Window, Packing, bytes]]:
-        packing, data = _pack(grid[window.rows, window.columns])
+        packing, data = pack(grid[window.rows, window.columns])
         if len(data) <= DELTA_LIMIT - _HEADROOM:
             return [(layer, window, packing, data)]
         if window.height >= window.width:
@@ -297,10 +299,10 @@ def decode_map(snapshot: MapSnapshot) -> DecodedMap:
     g = snapshot.geometry
     geometry = GridGeometry(g.width, g.height, g.resolution, g.origin_x, g.origin_y)
     layers: dict[Layer, Grid] = {
-        "cost": _writable(_unpack("zlib", snapshot.cost, geometry.shape, "the cost layer")),
-        "speed": _writable(_unpack("zlib", snapshot.speed, geometry.shape, "the speed layer")),
+        "cost": _writable(unpack("zlib", snapshot.cost, geometry.shape, "the cost layer")),
+        "speed": _writable(unpack("zlib", snapshot.speed, geometry.shape, "the speed layer")),
     }
-    static = _unpack("zlib", snapshot.static, geometry.shape, "the static layer")
+    static = unpack("zlib", snapshot.static, geometry.shape, "the static layer")
     hashes = TileHashes(layers, plan_hash(geometry, static))
     if hashes.value != snapshot.hash:
         raise MapError("the snapshot's cells don't have its hash: it was damaged in transit")
@@ -389,7 +391,7 @@ class Replica:
             if self.geometry.clip(window) != window:
                 return self._reject()
             try:
-                cells = _unpack(part.packing, part.cells, (part.h, part.w), "a delta")
+                cells = unpack(part.packing, part.cells, (part.h, part.w), "a delta")
             except MapError:
                 # Damaged cells are handled like lost ones.
                 return self._reject()

@@ -11,6 +11,7 @@ from msgspec import structs
 
 from fog_contracts.costs import LETHAL
 from fog_contracts.messages import (
+    PASSABLE_PENALTY,
     SEVERITY,
     AreaHazard,
     Author,
@@ -117,10 +118,6 @@ def _threshold(members: Iterable[str], policy: FusionPolicy) -> float:
 
 def _weight(name: str, policy: FusionPolicy) -> float:
     return policy.weights.get(name, 1.0) if policy.rule == "weighted" else 1.0
-
-
-PASSABLE_PENALTY: Final = 200
-"""The highest cost of an area that an operator declared clear: robots prefer other ways, but can pass."""
 
 
 class _Measured(NamedTuple):

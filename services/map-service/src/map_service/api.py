@@ -45,6 +45,7 @@ from fog_runtime.http import (
 from fog_runtime.stores.records import KINDS, AuditEntry, CursorError
 from fog_runtime.stores.redis_connection import StoreError
 from fog_runtime.stores.redis_store import Attempt, IdempotencyError
+from map_service.api_dry_run import add_dry_runs
 from map_service.api_views import add_views
 from map_service.core import ScrapeTarget
 from map_service.problems import NO_SUCH_ZONE, ZONES_NOT_LOADED, MapProblem, add_errors, require_zones
@@ -83,6 +84,7 @@ def make_api(  # the process's parts
     add_errors(zones)
     _add_zone_reads(zones, service)
     _add_zone_writes(zones, service, clock)
+    add_dry_runs(zones, service, site, clock)
     _add_audit(zones, service)
     add_views(Routes(app, "map"), service, site)
     _add_scrape_targets(Routes(app, "robots"), service, clock)

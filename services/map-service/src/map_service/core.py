@@ -16,7 +16,8 @@ from fog_contracts import channels as ch
 from fog_contracts.costs import DEFAULT_INFLATION
 from fog_contracts.handlers import Moment, Publication
 from fog_contracts.messages import HazardArea, Message, ZoneSet
-from map_service.costmap import LayeredCostmap
+from map_service.costmap import COMMIT_CELLS, LayeredCostmap
+from map_service.dry_run import Hypothesis
 from map_service.layers.hazards import HazardsLayer
 from map_service.layers.zones import ZonesLayer
 from map_service.zone_times import StoredState
@@ -28,9 +29,10 @@ if TYPE_CHECKING:
     from fog_contracts.costs import Inflation
     from fog_contracts.grid import StaticMap
     from fog_contracts.handlers import Handler, Ids, Later, QueryHandler
-    from fog_contracts.messages import AreaDefinition, MapSnapshot, RobotState, Zone
+    from fog_contracts.messages import AreaDefinition, MapSnapshot, RobotState, Target, Zone
     from fog_contracts.shapes import Spans
     from map_service.aggregator_monitor import AggregatorMonitor
+    from map_service.dry_run import Change
     from map_service.layers.base import CostLayer
     from map_service.zone_times import Progress
     from map_service.zones import ZoneCatalog
@@ -69,8 +71,6 @@ class RobotDirectory:
 L = TypeVar("L", bound="CostLayer")
 
 NOTHING_STORED: Final = StoredState()
-COMMIT_CELLS: Final = 128 * 1024
-"""About how many cells one commit recomputes, so that the next heartbeat, hazard or request need not wait for long."""
 MANY_ZONES: Final = 200
 MANY_ZONES_PERIOD_S: Final = 0.5
 """More zones than MANY_ZONES are published at most once in this time: they are a message of up to 4 MiB."""
@@ -219,6 +219,10 @@ class MapCore:
         """Remove a zone that is not stored any more."""
         self._zones.remove(zone_id)
         return self._commit([], at)
+
+    def hypothesis(self, change: Change, targets: Sequence[Target] = ()) -> Hypothesis:
+        """Return the map after a change that nobody makes; raises `RefusedMessageError` for an unknown area."""
+        return Hypothesis(self.costmap, self._zones, self._hazards, change, targets)
 
     def continue_commit(self, at: Moment) -> list[Publication]:
         """Put the next portion of a large change on the map; call it while there is one (`pending`)."""

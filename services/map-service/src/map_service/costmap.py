@@ -26,8 +26,11 @@ if TYPE_CHECKING:
     from fog_contracts.handlers import Later
     from fog_contracts.messages import Cause, Layer, MapDelta, MapHeartbeat, MapSnapshot
     from fog_contracts.replica import Version
+    from fog_kernels.inflation import InflationTable
     from map_service.layers.base import CostLayer, Grid, UpdatedBounds
 
+COMMIT_CELLS: Final = 128 * 1024
+"""About how many cells are recomputed at a time, so that the next heartbeat, hazard or request need not wait long."""
 TILE: Final = 64
 """Cells per side of the tiles by which large changes are remembered."""
 MAX_WINDOWS: Final = 64
@@ -131,17 +134,17 @@ class InflationLayer:
     """Holds the inflated map of a grid of this resolution (m per cell)."""
 
     def __init__(self, raw: Grid, resolution: float, inflation: Inflation) -> None:
-        self._table = inflation_table(resolution, inflation)
-        self.cost = inflate(raw, self._table)
+        self.table = inflation_table(resolution, inflation)
+        self.cost = inflate(raw, self.table)
 
     def update(self, raw: Grid, windows: Iterable[Window]) -> list[Window]:
         """Update the inflation around windows in which `raw` changed; return the windows of `cost` that it rewrote."""
-        rewritten = (Window(*inflate_window(raw, self._table, *window, self.cost)) for window in windows)
+        rewritten = (Window(*inflate_window(raw, self.table, *window, self.cost)) for window in windows)
         return [window for window in rewritten if not window.empty]
 
     def inflate_all(self, raw: Grid) -> Grid:
         """Return the inflation of a whole map, computed from scratch."""
-        return inflate(raw, self._table)
+        return inflate(raw, self.table)
 
 
 class LayeredCostmap:
@@ -181,6 +184,21 @@ class LayeredCostmap:
     def speed(self) -> Grid:
         """The speed layer, uint8 (height, width), cm/s, 0 = no limit."""
         return self._master.layers["speed"]
+
+    @property
+    def layers(self) -> Sequence[CostLayer]:
+        """The layers, bottom first."""
+        return self._layers
+
+    @property
+    def raw(self) -> Grid:
+        """The combined layers before the inflation, uint8 (height, width)."""
+        return self._raw
+
+    @property
+    def inflation_table(self) -> InflationTable:
+        """The inflation of this map."""
+        return self._inflation.table
 
     @property
     def static(self) -> Grid:

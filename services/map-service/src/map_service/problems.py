@@ -19,6 +19,10 @@ class MapProblem(ProblemCode):
     ZONE_CHANGED = "zone_changed", 412, "The zone is not as the request expects: somebody else changed or added it"
     ZONE_INVALID = "zone_invalid", 422, "The zone is invalid, or one too many: `errors` names its fields"
     ZONES_NOT_LOADED = "zones_not_loaded", 503, "The stored zones are not loaded yet"
+    UNKNOWN_ZONE = "unknown_zone", 422, "The request names a zone that there is not"
+    UNKNOWN_AREA = "unknown_area", 422, "The request names an area that there is not"
+    DRY_RUN_REFUSED = "dry_run_refused", 422, "The change is too large to be computed at once"
+    PLANNER_AWAY = "planner_away", 503, "The planner has no answer: `Retry-After` says when to try again"
     BUSY = "busy", 503, "Too many requests wait for a calculation: `Retry-After` says when to try again"
 
 

@@ -80,6 +80,8 @@ class Service:
         self._mqtt = mqtt
         self._clock = clock
         self._health = health
+        self.zenoh = zenoh
+        """For questions to the planner."""
         self._edges = Edges(clock, mqtt=mqtt, zenoh=zenoh, gate=gate)
         self.publisher = Publisher(core, self._edges, self._now)
         self.zones = ZoneWriter(core, store, self._times, self.publisher, health, self._now)

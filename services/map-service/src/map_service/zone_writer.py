@@ -225,6 +225,10 @@ class ZoneWriter:
                 )
         await self.load()
 
+    async def prepare(self, zone: Zone) -> PreparedZone:
+        """Return a valid zone with its cells, and change nothing; raises `ZoneError` and `BusyError` as a write."""
+        return await self._prepare(zone)
+
     # --- Loading ----------------------------------------------------------------------------------------------------
 
     async def load(self) -> None:

@@ -5,8 +5,7 @@ from collections.abc import Callable
 from fastapi import FastAPI
 
 from fog_contracts.messages import (
-    CommandKind,
-    CommandReply,
+    GoalOutcome,
     Id,
     Message,
     Metres,
@@ -32,7 +31,6 @@ from fog_runtime.http import (
     IfMatch,
     IfNoneMatch,
     Operator,
-    ProblemCode,
     ProblemError,
     Routes,
     Tokens,
@@ -47,121 +45,12 @@ from fog_runtime.http import (
 )
 from fog_runtime.stores.redis_connection import StoreError
 from fog_runtime.stores.redis_store import IdempotencyError
+from planner.api_commands import add_commands
+from planner.problems import PlannerProblem
 from planner.query_queue import BusyError
-from planner.robot_operator import CommandError, RobotOperator
+from planner.robot_operator import CommandError
 from planner.service import Service
 from planner.store import NO_MISSION, MissionConflictError, Order, StoredGoal
-
-
-class PlannerProblem(ProblemCode):
-    """Problems of the planner."""
-
-    NO_ROBOT = "no_robot", 404, "No robot has this id"
-    NO_MISSION = "no_mission", 404, "The robot has no mission"
-    NO_PLACE = "no_place", 422, "The site has no such place"
-    GOAL_REFUSED = (
-        "goal_refused",
-        422,
-        "The goal can never be reached: `refusal`, and Nav2's `code` and `name`, say why",
-    )
-    MISSION_CHANGED = "mission_changed", 412, "The robot has another mission than the request expects, or has one"
-    ROBOT_DOUBLED = "robot_doubled", 409, "Two agents use this robot's id"
-    COMMAND_REFUSED = "command_refused", 409, "The robot refuses: `refusal` and `causes` identify why"
-    COMMAND_LOST = "command_lost", 504, "The robot does not answer, or this service has no operators' key"
-    BUSY = "busy", 503, "Too many plans wait, or of this client: `Retry-After` says when to try again"
-
-
-class StartPose(Message, frozen=True, kw_only=True):
-    """Where a robot stands: m and rad, frame `map`."""
-
-    x: Metres
-    y: Metres
-    theta: Radians
-
-
-class CommandBody(Message, frozen=True, kw_only=True):
-    """A command; `initial_pose` comes with a pose, or with the id of a place that has a heading."""
-
-    kind: CommandKind
-    pose: StartPose | None = None
-    place: Id | None = None
-
-
-class CommandOutcome(Message, frozen=True, kw_only=True):
-    """An accepted command: what the robot says of it, and the robot's mode before it."""
-
-    accepted: bool
-    reason: str
-    mode: Mode | None
-
-
-def add_commands(
-    routes: Routes,
-    operator: RobotOperator,
-    site: Site,
-    *,
-    check: Callable[[str], None],
-    mode: Callable[[str], Mode | None],
-) -> None:
-    """Add the routes; `check` raises a `ProblemError` for an unknown robot, `mode` returns a robot's mode."""
-    routes.raises(
-        CommandError,
-        [PlannerProblem.COMMAND_LOST],
-        lambda error: ProblemError(PlannerProblem.COMMAND_LOST, str(error)),
-    )
-
-    def outcome(robot: str, reply: CommandReply) -> CommandOutcome:
-        if not reply.accepted:
-            raise ProblemError(
-                PlannerProblem.COMMAND_REFUSED,
-                reply.reason,
-                mode=mode(robot),
-                refusal=reply.code,
-                causes=reply.causes,
-            )
-        return CommandOutcome(accepted=True, reason=reply.reason, mode=mode(robot))
-
-    @routes.post(
-        "/api/v1/robots/{robot}/commands",
-        raises=[CommandError, StoreError],
-        problems=[PlannerProblem.NO_ROBOT, PlannerProblem.COMMAND_REFUSED, PlannerProblem.NO_PLACE],
-    )
-    async def post_command(robot: str, body: Body[CommandBody], caller: Operator) -> CommandOutcome:
-        """Command a robot; the robot itself accepts or refuses."""
-        check(robot)
-        return outcome(robot, await operator.send(body.kind, robot, caller.name, _pose(body, site)))
-
-    routes.urgent("/api/v1/robots/{robot}/stop")
-
-    @routes.post(
-        "/api/v1/robots/{robot}/stop",
-        raises=[CommandError],
-        problems=[PlannerProblem.NO_ROBOT, PlannerProblem.COMMAND_REFUSED],
-    )
-    async def stop(robot: str, client: ClientHost) -> CommandOutcome:
-        """Stop a robot at once. Anybody may: this needs no token. An operator must enable it again."""
-        check(robot)
-        return outcome(robot, await operator.stop(robot, f"stop from {client or 'an unknown address'}"))
-
-
-def _pose(body: CommandBody, site: Site) -> Pose | None:
-    """Return the pose of a command; raises a `ProblemError` for one that does not belong to it, or lacks."""
-    if body.kind != "initial_pose":
-        if body.pose is not None or body.place is not None:
-            detail = f"{body.kind} takes neither pose nor place: leave them out"
-            raise ProblemError(HttpProblem.REQUEST_INVALID, detail, field="body.pose")
-        return None
-    if (body.pose is None) == (body.place is None):
-        detail = "give either a pose or a place, and not both"
-        raise ProblemError(HttpProblem.REQUEST_INVALID, detail, field="body.pose")
-    if body.pose is not None:
-        return Pose(x=body.pose.x, y=body.pose.y, theta=body.pose.theta)
-    place = site.places.get(body.place or "")
-    if place is None or place.theta is None:
-        known = ", ".join(sorted(name for name, found in site.places.items() if found.theta is not None)) or "none"
-        detail = f"there is no place {body.place} with a heading; places that have one: {known}"
-        raise ProblemError(PlannerProblem.NO_PLACE, detail, field="body.place")
-    return Pose(x=place.x, y=place.y, theta=place.theta)
 
 
 class GoalPose(Message, frozen=True, kw_only=True):
@@ -305,7 +194,7 @@ def make_api(service: Service, site: Site, health: Health, tokens: Tokens, stand
     add_commands(routes, service.operator, site, check=robots.check, mode=robots.mode)
     _add_views(routes, service, robots)
     _add_orders(routes, service, robots, site)
-    _add_plan(Routes(app, "plan"), service)
+    _add_plan(Routes(app, "plan"), service, robots, site)
     recovery = Routes(app, "store")
     add_store_errors(recovery)
     add_recovery(recovery, service.missions)
@@ -413,7 +302,7 @@ def _add_orders(routes: Routes, service: Service, robots: _Robots, site: Site) -
             raise _without_mission(robot)
 
 
-def _add_plan(routes: Routes, service: Service) -> None:
+def _add_plan(routes: Routes, service: Service, robots: _Robots, site: Site) -> None:
     routes.raises(
         BusyError,
         [PlannerProblem.BUSY],
@@ -426,3 +315,18 @@ def _add_plan(routes: Routes, service: Service) -> None:
     async def preview(client: ClientHost, body: Body[PlanRequest]) -> PlanReply:
         """Plan a path without side effects; the reply may be a refusal."""
         return await service.preview(body, client)
+
+    @routes.post(
+        "/api/v1/robots/{robot}/goal/dry-run",
+        raises=[BusyError],
+        problems=[PlannerProblem.NO_ROBOT, PlannerProblem.NO_PLACE, PlannerProblem.NO_POSE],
+    )
+    async def dry_run_goal(robot: str, body: Body[GoalBody], caller: Viewer) -> GoalOutcome:
+        """Return the path that a robot would get to a goal from where it stands, and do nothing; or the refusal."""
+        robots.check(robot)
+        pose, _ = _goal_pose(body, site)
+        outcome = await service.dry_runs.goal(robot, pose.x, pose.y, f"person {caller.name}")
+        if outcome is None:
+            detail = f"it is not known where robot {robot} is: switch it on and localize it, then try again"
+            raise ProblemError(PlannerProblem.NO_POSE, detail)
+        return outcome

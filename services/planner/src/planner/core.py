@@ -19,6 +19,7 @@ from fog_contracts import channels as ch
 from fog_contracts.handlers import Fence, Publication
 from fog_contracts.replica import MapError
 from planner.config import PlannerConfig
+from planner.dry_run import State, run
 from planner.heuristics import DeadEndsJob, FieldJob, GoalFields
 from planner.missions import Missions
 from planner.planning_map import MapTracker, PreparedMap
@@ -33,6 +34,8 @@ if TYPE_CHECKING:
 
     from fog_contracts.handlers import Handler, Ids, Moment, QueryHandler
     from fog_contracts.messages import (
+        DryRunReply,
+        DryRunRequest,
         EgressRequest,
         MapDelta,
         MapHeartbeat,
@@ -286,16 +289,28 @@ class PlannerCore:
         sources = self._regions.sources
         return View(planning_map, sources, self._regions.revision, partial(cover, sources), self._fields.fields)
 
+    def state(self) -> State | None:
+        """Return what dry runs are computed on, by any thread; None before the first map."""
+        view = self.view()
+        return None if view is None else State.of(view, self._map.speed(), dict(self.missions.items()))
+
     def answers(self) -> Mapping[ch.Channel, Callable[[View | None, Any], PlanReply]]:
         """Return what answers each query on a view, to be called on the thread of the `answerer`."""
         return {ch.PLANNER_PLAN: self.answerer.plan, ch.PLANNER_EGRESS: self.answerer.egress}
 
     def query_handlers(self) -> Mapping[ch.Channel, QueryHandler]:
         """Return the handler of every query that the planner answers, where everything runs on one thread."""
-        return {ch.PLANNER_PLAN: self._answer_plan, ch.PLANNER_EGRESS: self._answer_egress}
+        return {
+            ch.PLANNER_PLAN: self._answer_plan,
+            ch.PLANNER_EGRESS: self._answer_egress,
+            ch.PLANNER_DRY_RUN: self._answer_dry_run,
+        }
 
     def _answer_plan(self, _ids: Ids, request: PlanRequest, _at: Moment) -> PlanReply:
         return self.answerer.plan(self.view(), request)
+
+    def _answer_dry_run(self, _ids: Ids, request: DryRunRequest, _at: Moment) -> DryRunReply:
+        return run(self.state(), request, self.config)
 
     def _answer_egress(self, _ids: Ids, request: EgressRequest, _at: Moment) -> PlanReply:
         return self.answerer.egress(self.view(), request)

@@ -185,7 +185,7 @@ class PathSearch:
         impossible = impossible or goal_out_of_reach(planning_map, goal)
         if impossible is not None:
             return refused(impossible)
-        free = self._free_start(planning_map, covers, first)
+        free = self.free_start(planning_map, covers, first)
         if free is None:
             return refused(start_occupied(start), Question("start", start, goal, first, last))
         if planning_map.cost[last[1], last[0]] >= INSCRIBED:
@@ -258,7 +258,7 @@ class PathSearch:
             cells[0] = exact_start
         return geometry.centres(cells)
 
-    def _free_start(self, planning_map: PlanningMap, covers: Covers, start: Cell) -> Cell | None:
+    def free_start(self, planning_map: PlanningMap, covers: Covers, start: Cell) -> Cell | None:
         """Return the start's cell, or the nearest one where a robot may be; None when it is in a hazard, zone or wall.
 
         The line to it may cross inscribed cells and lidar obstacles, but no wall and no blocked region.

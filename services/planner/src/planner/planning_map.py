@@ -203,6 +203,10 @@ class MapTracker:
                 self._copy.__dict__["components"] = current.components  # of the same cells
         return self._copy
 
+    def speed(self) -> Grid:
+        """Return a copy of the speed layer (cm/s, 0 = no limit) of the newest version."""
+        return self._follower.replica.speed.copy()
+
     def wants_snapshot(self, now: float) -> bool:
         """Whether a snapshot is needed to follow the map."""
         return self._follower.wants_snapshot(now)

@@ -54,7 +54,7 @@ class Answerer:
             return PlanReply(refusal=no_map())
         start, goal = (request.start.x, request.start.y), (request.goal.x, request.goal.y)
         field = view.fields.get(view.planning_map.geometry.cell(*goal))
-        found = self._path_search(view).find(view.planning_map, view.covers, start, goal, field)
+        found = self.search(view).find(view.planning_map, view.covers, start, goal, field)
         explained = None if found.question is None else self.explain(view, found.question)
         return _reply(found, explained, view.planning_map)
 
@@ -63,9 +63,7 @@ class Answerer:
         if view is None:
             return PlanReply(refusal=no_map())
         start = (request.pose.x, request.pose.y)
-        found = find_egress(
-            view.planning_map, self._regions_on(view), start, self._config, self._path_search(view).planner
-        )
+        found = find_egress(view.planning_map, self._regions_on(view), start, self._config, self.search(view).planner)
         return _reply(found, None, view.planning_map)
 
     def release(self) -> None:
@@ -90,7 +88,8 @@ class Answerer:
         cut = self._cuts_on(view).between(start, goal)
         return no_path(nearest_reachable(planning_map, start, goal), cut)
 
-    def _path_search(self, view: View) -> PathSearch:
+    def search(self, view: View) -> PathSearch:
+        """Return what searches paths on a view's map."""
         geometry = view.planning_map.geometry
         if self._search is None or self._search.geometry != geometry:
             self._search = PathSearch(self._config, geometry)
@@ -107,7 +106,7 @@ class Answerer:
             geometry = view.planning_map.geometry
             regions = self._regions.of(geometry, view.sources)
             reach = self._config.inflation.inscribed_radius / geometry.resolution
-            cuts = Cuts(view.planning_map, regions, lambda: self._path_search(view).planner, reach)
+            cuts = Cuts(view.planning_map, regions, lambda: self.search(view).planner, reach)
             self._cuts = view.planning_map, view.revision, cuts
         return self._cuts[2]
 

@@ -39,15 +39,17 @@ class Threads:
             thread.shutdown(wait=False, cancel_futures=True)
 
 
-Kind = Literal["map", "egress", "explanation", "plan"]
+Kind = Literal["map", "egress", "explanation", "plan", "dry_run"]
 
-PRIORITY: Final[dict[Kind, int]] = {"map": 0, "egress": 1, "explanation": 2, "plan": 3}
+PRIORITY: Final[dict[Kind, int]] = {"map": 0, "egress": 1, "explanation": 2, "plan": 3, "dry_run": 4}
 """The order of answers: a robot that wants out comes before people who want to know."""
-WAITING: Final[dict[Kind, int]] = {"map": 1, "egress": 64, "explanation": 1, "plan": 16}
+WAITING: Final[dict[Kind, int]] = {"map": 1, "egress": 64, "explanation": 1, "plan": 16, "dry_run": 8}
 """How many may be in the queue, with the one that runs."""
-PER_ASKER: Final[dict[Kind, int]] = {"map": 1, "egress": 2, "explanation": 1, "plan": 4}
+PER_ASKER: Final[dict[Kind, int]] = {"map": 1, "egress": 2, "explanation": 1, "plan": 4, "dry_run": 1}
 """How many of them may be of one asker."""
 RETRY_AFTER_S: Final = 1.0
+BUSY_PAUSE_S: Final = 0.25
+"""Who is refused by REST is told so after a pause: clients that ask again at once would keep the event loop busy."""
 
 REFUSED = Counter(
     "fognav_planner_queries_refused_total", "Queries refused because too many were waiting, by kind", ["kind"]

@@ -148,6 +148,11 @@ def overlap(a: Window, b: Window) -> tuple[Slices, Slices] | None:
     return inside(a), inside(b)
 
 
+def is_closing(hazard: HazardArea) -> bool:
+    """Whether a hazard makes its area impassable."""
+    return hazard.hazard.penalty == LETHAL
+
+
 class BlockedRegions:
     """All published hazards and zones; nothing is rasterized here, because that takes long for many zones."""
 
@@ -170,7 +175,7 @@ class BlockedRegions:
         """
         if self._sources is None:
             hazards = (self._hazards[area] for area in sorted(self._hazards))
-            closing = [hazard for hazard in hazards if hazard.hazard.penalty == LETHAL]
+            closing = [hazard for hazard in hazards if is_closing(hazard)]
             self._sources = (*closing, *(_no_go_zones(self._zones) if self._zones else ()))
         return self._sources
 

@@ -26,8 +26,9 @@ from fog_runtime import logs, metrics
 from fog_runtime.clock import ticker
 from fog_runtime.transports.edges import Edges
 from fog_runtime.transports.zenoh_declarations import ASKER
+from planner.dry_run_queue import DryRuns
 from planner.plan_records import PathRecord, PlanMetrics
-from planner.query_queue import BusyError, QueryQueue, Threads
+from planner.query_queue import BUSY_PAUSE_S, BusyError, QueryQueue, Threads
 from planner.refusals import busy
 from planner.robot_operator import RobotOperator
 from planner.snapshot_fetcher import SnapshotFetcher
@@ -38,7 +39,7 @@ if TYPE_CHECKING:
 
     from fog_contracts.channels import Channel
     from fog_contracts.handlers import Handler, Ids, Moment, Publication
-    from fog_contracts.messages import EgressRequest, Message, PlanRequest, Pose, Refusal
+    from fog_contracts.messages import DryRunReply, DryRunRequest, EgressRequest, Message, PlanRequest, Pose, Refusal
     from fog_runtime.clock import Clock
     from fog_runtime.health import Health
     from fog_runtime.transports.edges import Gate
@@ -174,7 +175,6 @@ def _run_all(queued: deque[Callable[[], T]]) -> list[T]:
 
 
 TICK_S: Final = 0.1
-BUSY_PAUSE_S: Final = 0.25
 RECORDED_AT_ONCE: Final = 8
 """Of so many publications the record is made without a pause for jobs, messages and the next cycle."""
 
@@ -207,6 +207,7 @@ class Service:
         self._wake = asyncio.Event()
         self._threads = Threads()
         self._queue = QueryQueue(self._threads, on_idle=core.answerer.release)
+        self.dry_runs = DryRuns(core, self._queue)
         self._cycle = Cycle(core, zenoh)
         self.missions = MissionPersistence(core, store, clock, health, self._change_goal)
         self._map = SnapshotFetcher(core, zenoh, clock, health, self._queue, on_loaded=self._wake.set)
@@ -261,6 +262,7 @@ class Service:
         self._edges.subscribe(handlers, self._publish)
         self._zenoh.serve(ch.PLANNER_PLAN, self._serve_plan)
         self._zenoh.serve(ch.PLANNER_EGRESS, self._serve_egress)
+        self._zenoh.serve(ch.PLANNER_DRY_RUN, self._serve_dry_run)
 
     def _queued(self, channel: ch.Channel, handler: Handler) -> Handler:
         """Return a handler that queues its message, with its time of arrival, for the core's next cycle."""
@@ -305,6 +307,9 @@ class Service:
             return await self._queue.run("egress", f"zenoh {ASKER.get()}", answer)
         except BusyError as error:
             return PlanReply(refusal=busy(str(error)), retry_after=error.retry_after)
+
+    async def _serve_dry_run(self, _ids: Ids, request: DryRunRequest) -> DryRunReply | None:
+        return await self.dry_runs.change(request, f"zenoh {ASKER.get()}") if self._answers else None
 
     async def _answer(self, channel: ch.Channel, request: Message) -> PlanReply:
         """Answer a query on what the core knows now, which the core's thread only copies."""

@@ -168,6 +168,8 @@ class AreaDefinition(Message, frozen=True, kw_only=True):
 
 SEVERITY: Final = {"clear": 0, "unknown": 1, "unknown_after_blocked": 2, "blocked": 3}
 """Severity of an area's hazard by its state; an area that was blocked before it became unknown ranks higher."""
+PASSABLE_PENALTY: Final = 200
+"""The highest cost of an area that an operator declared clear: robots prefer other ways, but can pass."""
 AREAS_MAX: Final = 1000
 """Areas of a site: so many fit into one heartbeat of the aggregator, whatever their ids."""
 

@@ -193,10 +193,19 @@ class HazardsLayer(CostLayer):
     def update_costs(self, window: Window, cost: Grid, speed: Grid) -> None:
         """Write the penalties, and the speed limit of unknown areas."""
         for area in self._areas.values():
-            if area.shown.penalty > 0:
-                write_cost(area.mask, window, cost, area.shown.penalty)
-            if area.shown.state == "unknown":
-                write_speed_limit(area.mask, window, speed, DEGRADED_SPEED)
+            _write(area, area.shown, window, cost, speed)
+
+    def with_changes(self, shown: Mapping[str, AreaHazard]) -> CostLayer:
+        """Return a layer that shows these hazards instead of the areas' own, for a dry run; use it before a change."""
+        return _ChangedHazards(self._areas, shown)
+
+    def window(self, area: str) -> Window:
+        """Return the window of a known area."""
+        return self._areas[area].mask.window
+
+    def unknown_penalty(self, area: str) -> int:
+        """Return the penalty of a known area while it is unknown."""
+        return self._areas[area].definition.unknown.penalty
 
     # --- Inside -----------------------------------------------------------------------------------------------------
 
@@ -248,6 +257,27 @@ class HazardsLayer(CostLayer):
         if (area.shown.state, area.shown.cause) == (unknown.state, unknown.cause):
             unknown = structs.replace(unknown, since=area.shown.since)
         area.shown = unknown
+
+
+class _ChangedHazards(CostLayer):
+    """Areas as they would be."""
+
+    def __init__(self, areas: Mapping[str, _Area], shown: Mapping[str, AreaHazard]) -> None:
+        super().__init__()
+        self._areas = areas
+        self._shown = shown
+
+    def update_costs(self, window: Window, cost: Grid, speed: Grid) -> None:
+        """Write the areas' hazards as they would be."""
+        for name, area in self._areas.items():
+            _write(area, self._shown.get(name, area.shown), window, cost, speed)
+
+
+def _write(area: _Area, hazard: AreaHazard, window: Window, cost: Grid, speed: Grid) -> None:
+    if hazard.penalty > 0:
+        write_cost(area.mask, window, cost, hazard.penalty)
+    if hazard.state == "unknown":
+        write_speed_limit(area.mask, window, speed, DEGRADED_SPEED)
 
 
 def _declares_clear(hazard: AreaHazard) -> bool:

@@ -13,13 +13,14 @@ from map_service.zone_times import Progress, StoredState, ZoneTimes
 from map_service.zones import ZoneCatalog, ZoneEntry, named_spans
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable, Mapping
+    from collections.abc import Collection, Iterable, Mapping, Sequence
 
     from fog_contracts.grid import GridGeometry, Window
     from fog_contracts.handlers import Moment, Publication
     from fog_contracts.messages import Zone
     from fog_contracts.shapes import Spans
     from map_service.layers.base import Grid
+    from map_service.zones import PreparedZone
 
 
 def speed_layer_value(speed: float) -> int:
@@ -87,11 +88,14 @@ class ZonesLayer(CostLayer):
 
     def update_costs(self, window: Window, cost: Grid, speed: Grid) -> None:
         """Write the active zones."""
-        zones = self.catalog.active_in(window)
-        costs = [(entry.spans, value) for entry in zones if (value := _cost_of(entry.zone)) is not None]
-        raise_costs(costs, window.x, window.y, cost)
-        limits = [(entry.spans, speed_layer_value(limit)) for entry in zones if (limit := entry.zone.speed) is not None]
-        lower_speeds(limits, window.x, window.y, speed)
+        _write([(entry.zone, entry.spans) for entry in self.catalog.active_in(window)], window, cost, speed)
+
+    def with_changes(self, put: Sequence[PreparedZone], without: Collection[str]) -> CostLayer:
+        """Return a layer that shows these zones in force, and none of the names in `without`, for a dry run.
+
+        It reads this layer, and is to be used before that changes.
+        """
+        return _ChangedZones(self.catalog, put, without)
 
     def _known_spans(self, zone: Zone, given: Mapping[str, Spans]) -> Spans | None:
         old = self.catalog.get(zone.id)
@@ -111,6 +115,30 @@ class ZonesLayer(CostLayer):
 
     def _mark(self, entry: ZoneEntry, state: str) -> None:
         self.mark_updated(entry.spans.window, Cause(kind="zone", id=entry.zone.id, state=state))
+
+
+class _ChangedZones(CostLayer):
+    """Zones as they would be."""
+
+    def __init__(self, catalog: ZoneCatalog, put: Sequence[PreparedZone], without: Collection[str]) -> None:
+        super().__init__()
+        self._catalog = catalog
+        self._put = put
+        self._without = without
+
+    def update_costs(self, window: Window, cost: Grid, speed: Grid) -> None:
+        """Write the zones that would be in force."""
+        kept = [e for e in self._catalog.active_in(window) if e.zone.id not in self._without]
+        zones = [(entry.zone, entry.spans) for entry in kept]
+        zones += [(zone, spans) for zone, spans in self._put if not spans.window.intersection(window).empty]
+        _write(zones, window, cost, speed)
+
+
+def _write(zones: Sequence[tuple[Zone, Spans]], window: Window, cost: Grid, speed: Grid) -> None:
+    costs = [(spans, value) for zone, spans in zones if (value := _cost_of(zone)) is not None]
+    raise_costs(costs, window.x, window.y, cost)
+    limits = [(spans, speed_layer_value(limit)) for zone, spans in zones if (limit := zone.speed) is not None]
+    lower_speeds(limits, window.x, window.y, speed)
 
 
 def _cost_of(zone: Zone) -> int | None:

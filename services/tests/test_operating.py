@@ -1,0 +1,135 @@
+"""What an operator sees before and after a change, against all running services and one robot's messages."""
+
+from __future__ import annotations
+
+import asyncio
+from contextlib import asynccontextmanager
+from typing import TYPE_CHECKING
+
+import httpx
+import pytest
+
+from fog_contracts import channels as ch
+from fog_contracts.messages import RobotPose, RobotState
+
+if TYPE_CHECKING:
+    from collections.abc import AsyncIterator
+
+pytestmark = pytest.mark.live
+
+SERVICES = ("hazard_aggregator", "map_service", "planner")
+
+
+class Operator:
+    """Sends requests to the service that has the route; the robot reports the map version `applied`."""
+
+    def __init__(self, client: httpx.AsyncClient, urls: dict[str, str], tokens: dict[str, dict[str, str]]) -> None:
+        self._client = client
+        self._urls = urls
+        self._tokens = tokens
+        self.applied = (0, 0)
+
+    async def ask(
+        self, method: str, path: str, body: object = None, *, role: str = "operator", **headers: str
+    ) -> httpx.Response:
+        part = path.split("/")[3].partition("?")[0]
+        service = {"areas": "hazard_aggregator", "robots": "planner", "plan": "planner"}.get(part, "map_service")
+        url = f"{self._urls[service]}{path}"
+        return await self._client.request(method, url, json=body, headers={**self._tokens[role], **headers})
+
+
+@pytest.fixture
+async def operator(all_services, tokens) -> AsyncIterator[Operator]:
+    urls = {service: await all_services.ready(service) for service in SERVICES}
+    async with all_services.edges() as (_, zenoh, _), httpx.AsyncClient(timeout=60.0) as client:
+        made = Operator(client, urls, tokens)
+        async with robot(zenoh, made):
+            async with asyncio.timeout(60):
+                while (  # noqa: ASYNC110  # another process changes it
+                    await made.ask("POST", "/api/v1/robots/r1/goal/dry-run", place(7.0))
+                ).status_code != 200:
+                    await asyncio.sleep(0.05)
+            yield made
+
+
+@asynccontextmanager
+async def robot(zenoh, operator: Operator) -> AsyncIterator[None]:
+    """Publish what a robot says that stands at (1, 3)."""
+    pose = RobotPose(
+        x=1.0, y=3.0, theta=0.0, covariance=[0.0] * 9, v=0.0, w=0.0, radius=0.17, height=0.3, stamp=0.0
+    )  # fmt: skip
+
+    async def publish() -> None:
+        while True:
+            epoch, seq = operator.applied
+            state = RobotState(
+                mode="HOLD", reasons=[], enabled=False, battery=None, goal_id=None, map_epoch=epoch, map_seq=seq,
+                plan_id=None,
+            )  # fmt: skip
+            zenoh.publish(ch.ROBOT_POSE, pose, robot="r1")
+            zenoh.publish(ch.ROBOT_STATE, state, robot="r1")
+            await asyncio.sleep(0.1)
+
+    publishing = asyncio.create_task(publish())
+    try:
+        yield
+    finally:
+        publishing.cancel()
+
+
+def place(x: float, y: float = 3.0) -> dict[str, object]:
+    return {"pose": {"x": x, "y": y}}
+
+
+def rectangle(left: float, bottom: float, right: float, top: float, **more: object) -> dict[str, object]:
+    shape = {"type": "rectangle", "corner": [left, bottom], "opposite": [right, top]}
+    return {"kind": "BLOCKED", "shape": shape, **more}
+
+
+async def test_dry_runs_by_rest_tell_of_a_robot_what_a_zone_would_do_to_its_way_and_where_a_goal_leads(operator):
+    goal = (await operator.ask("POST", "/api/v1/robots/r1/goal/dry-run", place(7.0), role="viewer")).json()
+    assert goal["path"]["length_m"] >= 6.0
+    assert goal["path"]["seconds"] >= 20.0
+    assert goal["points"][0] == pytest.approx([1.0, 3.0])
+    assert (await operator.ask("PUT", "/api/v1/robots/r1/goal", place(7.0))).status_code == 201
+    body = {"zones": [rectangle(5.0, 0.0, 5.4, 6.0, id="wall")]}
+    async with asyncio.timeout(60):
+        while True:
+            answer = await operator.ask("POST", "/api/v1/dry-run", body, role="viewer")
+            assert answer.status_code == 200, answer.text
+            robots = answer.json()["robots"]
+            if robots and robots[0]["before"]:
+                break
+            await asyncio.sleep(0.05)  # until the planner has planned
+    assert robots[0]["before"]["length_m"] >= 6.0
+    assert robots[0]["after"]["refusal"]["kind"] == "cut_by_places"
+    assert robots[0]["after"]["refusal"]["causes"] == [{"kind": "zone", "id": "wall", "state": "BLOCKED"}]
+    assert (await operator.ask("GET", "/api/v1/zones")).json()["zones"] == []
+    closed = await operator.ask("POST", "/api/v1/dry-run", {"overrides": {"hall": "blocked"}})
+    assert closed.json()["robots"][0]["extra_m"] > 0.0
+    assert (await operator.ask("DELETE", "/api/v1/robots/r1/goal")).status_code == 204
+
+
+async def test_dry_run_names_what_is_wrong_with_its_request(operator):
+    for body, field in (
+        ({"zones": [rectangle(90.0, 90.0, 91.0, 91.0)]}, "body.zones.0.shape"),
+        ({"removed_zones": ["none"]}, "body.removed_zones.0"),
+        ({"overrides": {"none": "blocked"}}, "body.overrides.none"),
+    ):
+        answer = await operator.ask("POST", "/api/v1/dry-run", body)
+        assert (answer.status_code, answer.json()["errors"][0]["field"]) == (422, field)
+    unknown = await operator.ask("POST", "/api/v1/robots/r9/goal/dry-run", place(7.0))
+    assert unknown.status_code == 404
+
+
+async def test_second_dry_run_of_a_caller_is_refused_while_the_first_is_computed(operator):
+    zones = [rectangle(0.1, 0.1, 7.9, 5.9, id=f"z{number}") for number in range(40)]
+    answers = await asyncio.gather(
+        *(
+            operator.ask("POST", "/api/v1/dry-run", {"zones": zones}, role=role)
+            for role in ("viewer", "viewer", "admin")
+        )
+    )
+    assert sorted(answer.status_code for answer in answers) == [200, 200, 503]
+    refused = next(answer for answer in answers if answer.status_code == 503)
+    assert refused.headers["retry-after"] == "1"

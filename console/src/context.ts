@@ -1,6 +1,6 @@
 // What every view can use: the live state, who is logged in, the map, and messages to the user.
 import { createContext } from "preact";
-import { useContext, useEffect, useReducer } from "preact/hooks";
+import { useContext, useEffect, useReducer, useRef } from "preact/hooks";
 import type { Session } from "./api/types";
 import type { Live, Topic } from "./live/live";
 import type { Floor } from "./map/floor";
@@ -61,4 +61,14 @@ export function useSeconds(): void {
     const timer = setInterval(() => redraw(0), 1000);
     return () => clearInterval(timer);
   }, []);
+}
+
+/** Bring a panel into view when it opens, with the focus in its first field. */
+export function useShown(): preact.RefObject<HTMLFormElement | null> {
+  const element = useRef<HTMLFormElement>(null);
+  useEffect(() => {
+    element.current?.querySelector<HTMLElement>("select, input")?.focus({ preventScroll: true });
+    element.current?.scrollIntoView({ block: "nearest" });
+  }, []);
+  return element;
 }

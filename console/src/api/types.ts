@@ -3,13 +3,16 @@ import type { components } from "./schema";
 
 type Schemas = components["schemas"];
 
+/** What is sent: only what has no default must be given. */
+type Sent<T, Needed extends keyof T = never> = Pick<T, Needed> & Partial<T>;
+
 export type Alert = Schemas["Alert"];
 export type AreaState = "blocked" | "clear" | "unknown";
 export type AreaView = Schemas["AreaView"];
 export type AuditEntry = Schemas["AuditEntry"];
-export type CommandBody = Schemas["CommandBody"];
+export type CommandBody = Sent<Schemas["CommandBody"], "kind">;
 export type CommandOutcome = Schemas["CommandOutcome"];
-export type GoalBody = Schemas["GoalBody"];
+export type GoalBody = Sent<Schemas["GoalBody"]>;
 export type GoalView = Schemas["GoalView"];
 export type MapGeometry = Schemas["MapGeometry"];
 export type MapInfo = Schemas["MapInfo"];
@@ -21,7 +24,7 @@ export type RobotPose = Schemas["RobotPose"];
 export type RobotState = Schemas["RobotState"];
 export type Shape = Schemas["Zone"]["shape"];
 export type Zone = Schemas["Zone"];
-export type ZoneBody = Schemas["ZoneBody"];
+export type ZoneBody = Sent<Schemas["ZoneBody"], "kind" | "shape">;
 
 /** A point of the floor in metres: x to the right, y up. */
 export type Point = readonly [number, number];

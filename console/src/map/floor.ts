@@ -15,6 +15,9 @@ export interface FloorHandlers {
 /** What a click on the floor means while somebody picks or draws, instead of a choice of what lies there. */
 export type Pick = (point: Point) => void;
 
+/** A drag on the floor, from where it began to where it is; a click is one that ends where it began. */
+export type Drag = (from: Point, to: Point, done: boolean) => void;
+
 const REDRAWING = ["robot", "pose", "path", "obstacles", "scan", "time", "connection"] as const;
 const HIT_PX = 24;
 /** Below so many pixels a metre labels are short (Leaflet's zoom is the binary logarithm). */
@@ -29,6 +32,7 @@ export class Floor {
   private shownMap = "";
   private readonly stops: (() => void)[] = [];
   private pick: Pick | null = null;
+  private endDrag: (() => void) | null = null;
   private follows = false;
   private costsShown = true;
   private fitted = false;
@@ -123,10 +127,56 @@ export class Floor {
     this.moving.redraw();
   }
 
+  /** Show a pose that is not sent yet; none with null. */
+  previewPose(at: Point | null, theta = 0): void {
+    this.moving.previewPose = at && { at, theta };
+    this.moving.redraw();
+  }
+
   /** Send clicks to `pick` until it is set to null. */
   setPick(pick: Pick | null): void {
     this.pick = pick;
     this.element.classList.toggle("picking", pick !== null);
+  }
+
+  /** Send drags and clicks to `drag`, instead of moving the map, until it is set to null. */
+  setDrag(drag: Drag | null): void {
+    this.endDrag?.();
+    this.endDrag = null;
+    this.element.classList.toggle("picking", drag !== null);
+    if (!drag) return;
+    const { element, map } = this;
+    let from: Point | null = null;
+    const point = (event: PointerEvent): Point => {
+      const { lat, lng } = map.mouseEventToLatLng(event);
+      return [lng, lat];
+    };
+    const down = (event: PointerEvent): void => {
+      if (!event.isPrimary || event.button !== 0) return;
+      from = point(event);
+      element.setPointerCapture(event.pointerId);
+      drag(from, from, false);
+    };
+    const move = (event: PointerEvent): void => {
+      if (from && event.isPrimary) drag(from, point(event), false);
+    };
+    const up = (event: PointerEvent): void => {
+      if (!from || !event.isPrimary) return;
+      drag(from, point(event), true);
+      from = null;
+    };
+    map.dragging.disable();
+    element.addEventListener("pointerdown", down);
+    element.addEventListener("pointermove", move);
+    element.addEventListener("pointerup", up);
+    this.pick = () => undefined;
+    this.endDrag = () => {
+      element.removeEventListener("pointerdown", down);
+      element.removeEventListener("pointermove", move);
+      element.removeEventListener("pointerup", up);
+      map.dragging.enable();
+      this.pick = null;
+    };
   }
 
   /** Show the whole map. */

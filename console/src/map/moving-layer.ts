@@ -18,6 +18,8 @@ export function tone(mode: string | undefined): "good" | "caution" | "stopped" {
 export class MovingLayer extends L.Layer {
   /** A path that is not sent yet. */
   preview: readonly Point[] = [];
+  /** A pose that is not sent yet. */
+  previewPose: { readonly at: Point; readonly theta: number } | null = null;
   selected: string | null = null;
   private readonly canvas = document.createElement("canvas");
   private readonly context = this.canvas.getContext("2d");
@@ -82,6 +84,7 @@ export class MovingLayer extends L.Layer {
       this.line(this.preview, "card", 7, []);
       this.line(this.preview, "goal", 4, [2, 6]);
     }
+    if (this.previewPose) this.arrow(this.previewPose.at, this.previewPose.theta);
     for (const [robot, { goal }] of of.robot) if (goal) this.goal([goal.pose.x, goal.pose.y], robot);
     for (const id of of.pose.keys()) this.robot(id);
   }
@@ -117,6 +120,29 @@ export class MovingLayer extends L.Layer {
     const name = this.live.oldRobot(robot) ? "robot-old" : "path";
     this.line(points, name, 2, [3, 6]);
     this.line(firstMetres(points, released), name, robot === this.selected ? 5 : 3.5, []);
+  }
+
+  /** An arrow of a size that can be seen at any zoom. */
+  private arrow(at: Point, theta: number): void {
+    const { context, colours } = this;
+    if (!context) return;
+    const { x, y } = this.pixel(at);
+    context.save();
+    context.translate(x, y);
+    context.rotate(-theta);
+    context.beginPath();
+    context.arc(0, 0, 10, 0, 2 * Math.PI);
+    context.moveTo(10, 0);
+    context.lineTo(44, 0);
+    context.moveTo(32, -9);
+    context.lineTo(44, 0);
+    context.lineTo(32, 9);
+    for (const [width, name] of [[8, "card"], [4, "goal"]] as const) {
+      context.lineWidth = width;
+      context.strokeStyle = colours[name] ?? "";
+      context.stroke();
+    }
+    context.restore();
   }
 
   private goal(at: Point, robot: string): void {

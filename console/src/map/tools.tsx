@@ -35,10 +35,28 @@ export function MapTools(): preact.JSX.Element {
       {robot !== null && (
         <button aria-pressed={follows} onClick={() => floor?.follow(!follows)}>{t("map.follow", { robot })}</button>
       )}
-      <button aria-pressed={costs} onClick={() => setCosts(!costs)}>{t("map.costs")}</button>
-      {robot !== null && (
-        <button aria-pressed={scan} onClick={() => setScan(!scan)}>{t("map.scan", { robot })}</button>
-      )}
+      <details class="layers">
+        <summary>{t("map.layers")}</summary>
+        <div class="card">
+          <label><input type="checkbox" checked={costs} onChange={() => setCosts(!costs)} /> {t("map.costs")}</label>
+          {robot !== null && (
+            <label><input type="checkbox" checked={scan} onChange={() => setScan(!scan)} /> {t("map.scan", { robot })}</label>
+          )}
+          <Legend />
+        </div>
+      </details>
     </div>
+  );
+}
+
+const LEGEND = ["robot", "path", "obstacle", "blocked", "unknown", "clear", "zone"] as const;
+
+function Legend(): preact.JSX.Element {
+  return (
+    <ul class="rows legend" aria-label={t("map.legend")}>
+      {LEGEND.map((name) => (
+        <li key={name} class="row"><span class={`swatch ${name}`} aria-hidden="true" /><span>{t(`legend.${name}`)}</span></li>
+      ))}
+    </ul>
   );
 }

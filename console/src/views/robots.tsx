@@ -1,17 +1,165 @@
 // The robots, and all that can be done with the chosen one.
-import { useConsole, useLive } from "../context";
+import { useEffect, useState } from "preact/hooks";
+import { Problem, request, robotPath } from "../api/client";
+import type { CommandBody, CommandOutcome, RobotState, Values } from "../api/types";
+import { mayOperate, useConsole, useLive, useSeconds } from "../context";
+import { Confirm } from "../dialog";
 import { t } from "../i18n/i18n";
+import { useRoute } from "../router";
+import { sentence } from "../stop";
+import { decimal, duration, metres, percent } from "../text";
+import { headline, whys } from "../why";
+import { GoalPanel } from "./goal-panel";
+import { PosePanel } from "./pose-panel";
 import { RobotCard } from "./robot-card";
 
+type Kind = CommandBody["kind"];
+
 export function RobotsView(): preact.JSX.Element {
-  const { robot } = useConsole();
-  const live = useLive(["robot"]);
-  const robots = [...live.of.robot.keys()].sort();
+  const { robot, chooseRobot } = useConsole();
+  const { chosen } = useRoute();
+  const live = useLive(["robot", "pose"]);
+  const robots = [...new Set([...live.of.robot.keys(), ...live.of.pose.keys()])].sort();
+  useEffect(() => {
+    if (chosen !== "" && chosen !== robot) chooseRobot(chosen);
+  }, [chosen]);
   return (
     <>
       <h2>{t("view.robots")}</h2>
       {robots.length === 0 && <p class="muted">{t("robots.none")}</p>}
-      <ul class="cards">{robots.map((id) => <li key={id}><RobotCard id={id} chosen={id === robot} /></li>)}</ul>
+      {robots.length > 1 && (
+        <ul class="cards">{robots.map((id) => <li key={id}><RobotCard id={id} chosen={id === robot} /></li>)}</ul>
+      )}
+      {robot !== null && robots.includes(robot) && <Details key={robot} id={robot} />}
+    </>
+  );
+}
+
+function Details({ id }: { readonly id: string }): preact.JSX.Element {
+  const { session } = useConsole();
+  const live = useLive(["robot", "pose", "place"]);
+  useSeconds();
+  const robot = live.of.robot.get(id);
+  const state = robot?.state ?? null;
+  const old = live.oldRobot(id);
+  const reasons = state ? whys(state) : [];
+  return (
+    <section aria-labelledby="robot-title">
+      <h2 id="robot-title"><bdi>{id}</bdi></h2>
+      <div class={old ? "card stale" : "card"}>
+        <p class="lead">{headline(state, robot?.goal ?? null)}</p>
+        {old && <p class="problem">{t("robot.old")}</p>}
+        {reasons.length > 1 && (
+          <>
+            <h3>{t("robot.why")}</h3>
+            <ul class="rows">
+              {reasons.map(({ says, remedy }) => <li key={says} class="row">{says}{remedy !== "" && <span class="value">{remedy}</span>}</li>)}
+            </ul>
+          </>
+        )}
+        <Facts id={id} robot={robot} />
+      </div>
+      {mayOperate(session) ? <Commands id={id} state={state} goal={robot?.goal != null} />
+        : <p class="muted">{t("error.role", { role: t(`role.${session.role}`) })}</p>}
+    </section>
+  );
+}
+
+function Facts({ id, robot }: { readonly id: string; readonly robot: Values["robot"] | undefined }): preact.JSX.Element {
+  const { live } = useConsole();
+  const pose = live.of.pose.get(id);
+  const state = robot?.state ?? null;
+  const place = robot?.goal?.place ?? null;
+  const goal = robot?.goal
+    ? place !== null ? live.of.place.get(place)?.label || place
+      : t("goal.position", { x: decimal(robot.goal.pose.x, 1), y: decimal(robot.goal.pose.y, 1) })
+    : t("robot.noGoal");
+  const power = state?.power ?? null;
+  const charging = state?.docked || (power?.charging != null && power.charging !== "no" && power.charging !== "fault");
+  return (
+    <dl class="facts">
+      <dt>{t("robot.mode")}</dt><dd>{state ? t(`mode.${state.mode}`) : "–"}</dd>
+      <dt>{t("robot.goal")}</dt><dd><bdi>{goal}</bdi></dd>
+      <dt>{t("robot.rest")}</dt><dd>{robot?.goal ? metres(state?.goal_distance) : "–"}</dd>
+      <dt>{t("robot.speed")}</dt><dd>{pose ? `${decimal(pose.v, 2)} m/s` : "–"}</dd>
+      <dt>{t("robot.position")}</dt>
+      <dd>{pose ? `${decimal(pose.x, 2)}, ${decimal(pose.y, 2)}` : "–"}{pose && !pose.localized && ` · ${t("robot.notLocalized")}`}</dd>
+      <dt>{t("robot.battery")}</dt>
+      <dd>{percent(state?.battery)}{power?.voltage_v != null && ` · ${decimal(power.voltage_v, 1)} V`}{charging && ` · ${t("robot.charging")}`}</dd>
+      <dt>{t("robot.profile")}</dt><dd>{state?.profile ?? "–"}</dd>
+      <dt>{t("robot.heard")}</dt><dd>{heard(Math.min(live.age("robot", id), live.age("pose", id)))}</dd>
+    </dl>
+  );
+}
+
+const heard = (age: number): string => (age === Infinity ? "–" : t("ago", { age: duration(age / 1000) }));
+
+interface CommandsProps {
+  readonly id: string;
+  readonly state: RobotState | null;
+  readonly goal: boolean;
+}
+
+/** Which panel is open beneath the commands. */
+type Open = "goal" | "pose" | null;
+
+function Commands({ id, state, goal }: CommandsProps): preact.JSX.Element {
+  const { say } = useConsole();
+  const [asked, setAsked] = useState<"enable" | "reset" | null>(null);
+  const [open, setOpen] = useState<Open>(null);
+  const [waiting, setWaiting] = useState<Kind | null>(null);
+
+  const run = async (kind: Kind): Promise<void> => {
+    const command = t(`command.${kind as "enable"}`);
+    setWaiting(kind);
+    try {
+      if (kind === "cancel") await request("DELETE", robotPath(id, "goal"));
+      else {
+        const body: CommandBody = { kind };
+        const { value } = await request<CommandOutcome>("POST", robotPath(id, "commands"), { body });
+        say(t("command.done", { robot: id, command, reason: value.reason }));
+        return;
+      }
+      say(t("command.done", { robot: id, command, reason: t("robot.noGoal") }));
+    } catch (error) {
+      const refused = error instanceof Problem && error.code === "command_refused";
+      say(t(refused ? "command.refused" : "command.failed", { robot: id, command, reason: sentence(error) }), "failed");
+    } finally {
+      setWaiting(null);
+    }
+  };
+  const button = (kind: Kind, primary = false): preact.JSX.Element => (
+    <button class={primary ? "primary" : ""} disabled={waiting !== null} onClick={() => void run(kind)}>
+      {t(`command.${kind as "enable"}`)}
+    </button>
+  );
+  const codes: readonly string[] = state?.codes ?? [];
+  const fault = state?.mode === "FAULT";
+  return (
+    <>
+      <h3>{t("robot.actions")}</h3>
+      <div class="actions">
+        <button class={state && !state.enabled && !fault ? "primary" : ""} onClick={() => setAsked("enable")}>{t("command.enable")}</button>
+        {fault && <button class="primary" onClick={() => setAsked("reset")}>{t("command.reset")}</button>}
+        {codes.includes("in_blocked") && button("egress", true)}
+        {(codes.includes("bumper") || fault) && button("back_off")}
+        <button aria-expanded={open === "goal"} onClick={() => setOpen(open === "goal" ? null : "goal")}>{t("command.goal")}</button>
+        {goal && button("cancel")}
+        {state?.docked ? button("undock") : button("dock")}
+        {!codes.includes("in_blocked") && button("egress")}
+        <button aria-expanded={open === "pose"} onClick={() => setOpen(open === "pose" ? null : "pose")}>{t("command.initial_pose")}</button>
+      </div>
+      {open === "goal" && <GoalPanel id={id} onClose={() => setOpen(null)} />}
+      {open === "pose" && <PosePanel id={id} onClose={() => setOpen(null)} />}
+      {asked !== null && (
+        <Confirm
+          title={t(`${asked}.title`, { robot: id })}
+          text={t(`${asked}.text`, { reason: state?.reasons[0] ?? "" })}
+          what={t(`command.${asked}`)}
+          onYes={() => void run(asked)}
+          onClose={() => setAsked(null)}
+        />
+      )}
     </>
   );
 }

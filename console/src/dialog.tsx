@@ -1,0 +1,30 @@
+// A question before something that can't be taken back.
+import { useEffect, useRef } from "preact/hooks";
+import { t } from "./i18n/i18n";
+
+interface Props {
+  readonly title: string;
+  readonly text: string;
+  /** What the button says that does it. */
+  readonly what: string;
+  readonly onYes: () => void;
+  readonly onClose: () => void;
+}
+
+export function Confirm({ title, text, what, onYes, onClose }: Props): preact.JSX.Element {
+  const dialog = useRef<HTMLDialogElement>(null);
+  useEffect(() => dialog.current?.showModal(), []);
+  return (
+    <dialog ref={dialog} aria-labelledby="confirm-title" aria-describedby="confirm-text" onClose={onClose}>
+      <h2 id="confirm-title">{title}</h2>
+      <p id="confirm-text">{text}</p>
+      <div class="actions">
+        <button onClick={() => dialog.current?.close()}>{t("cancel")}</button>
+        <button class="primary" onClick={() => {
+          onYes();
+          dialog.current?.close();
+        }}>{t("confirm", { what })}</button>
+      </div>
+    </dialog>
+  );
+}

@@ -133,3 +133,117 @@ async def test_second_dry_run_of_a_caller_is_refused_while_the_first_is_computed
     assert sorted(answer.status_code for answer in answers) == [200, 200, 503]
     refused = next(answer for answer in answers if answer.status_code == 503)
     assert refused.headers["retry-after"] == "1"
+
+
+async def latest_entry(operator: Operator, kind: str) -> dict:
+    return (await operator.ask("GET", f"/api/v1/audit?kind={kind}&limit=1")).json()[0]
+
+
+async def undo(operator: Operator, path: str, kind: str, **options: str) -> httpx.Response:
+    """Undo the latest change of a kind."""
+    entry = (await latest_entry(operator, kind))["entry"]
+    return await operator.ask("POST", f"{path}/undo", {"entry": entry}, **options)
+
+
+async def test_zone_is_undone_and_redone_from_its_creation_to_its_deletion(operator):
+    path, wet, slow = "/api/v1/zones/wet", rectangle(1.0, 1.0, 2.0, 2.0), rectangle(1.0, 1.0, 3.0, 3.0, reason="mop")
+    assert (await operator.ask("PUT", path, wet, **{"If-None-Match": "*"})).status_code == 201
+    assert (await undo(operator, path, "zone")).json() == {"kind": "zone", "id": "wet", "value": None}
+    assert (await operator.ask("GET", path)).status_code == 404
+    assert (await undo(operator, path, "zone")).json()["value"]["id"] == "wet", "redone"
+    assert (await operator.ask("PUT", path, slow)).status_code == 200
+    assert (await undo(operator, path, "zone")).status_code == 200
+    assert (await operator.ask("GET", path)).json()["shape"]["opposite"] == [2.0, 2.0]
+    assert (await undo(operator, path, "zone")).json()["value"]["reason"] == "mop"
+    assert (await operator.ask("DELETE", path)).status_code == 204
+    assert (await undo(operator, path, "zone")).json()["value"]["reason"] == "mop"
+    entry = await latest_entry(operator, "zone")
+    assert (entry["who"], entry["action"], entry["before"]) == ("anna", "undo", None)
+    assert (await operator.ask("DELETE", path)).status_code == 204
+
+
+async def test_undo_is_refused_once_somebody_else_has_changed_the_zone_and_names_who(operator):
+    path = "/api/v1/zones/edge"
+    assert (await operator.ask("PUT", path, rectangle(1.0, 1.0, 2.0, 2.0), **{"If-None-Match": "*"})).status_code == 201
+    mine = (await latest_entry(operator, "zone"))["entry"]
+    assert (await operator.ask("PUT", path, rectangle(1.0, 1.0, 2.0, 2.5), role="admin")).status_code == 200
+    refused = await operator.ask("POST", f"{path}/undo", {"entry": mine})
+    problem = refused.json()
+    assert (refused.status_code, problem["type"], problem["by"]) == (409, "urn:fognav:changed_since", "ada")
+    assert "ada has changed edge since (replace, " in problem["detail"]
+    later = await operator.ask("POST", f"{path}/undo", {"entry": problem["entry"]})
+    assert later.status_code == 200
+    assert (await operator.ask("POST", f"{path}/undo", {"entry": mine})).json()["by"] == "anna", "by the undo itself"
+    assert (await operator.ask("POST", "/api/v1/zones/other/undo", {"entry": mine})).status_code == 404
+    assert (await operator.ask("POST", f"{path}/undo", {"entry": mine}, role="viewer")).status_code == 403
+    assert (await operator.ask("DELETE", path)).status_code == 204
+
+
+async def test_zone_with_a_time_to_live_comes_back_with_the_rest_of_it(operator):
+    path = "/api/v1/zones/short"
+    body = rectangle(1.0, 1.0, 2.0, 2.0, ttl_s=600.0)
+    made = (await operator.ask("PUT", path, body, **{"If-None-Match": "*"})).json()
+    assert (await operator.ask("DELETE", path)).status_code == 204
+    back = (await undo(operator, path, "zone")).json()["value"]
+    assert back["ttl_s"] < 600.0
+    assert back["expires_at"] == made["expires_at"]
+    assert (await operator.ask("DELETE", path)).status_code == 204
+
+
+async def test_override_of_an_area_and_the_area_itself_are_undone(operator):
+    path = "/api/v1/areas/hall"
+    first, second = ({"state": state, "reason": "test", "ttl_s": 600.0} for state in ("blocked", "clear"))
+    assert (await operator.ask("PUT", f"{path}/override", first)).status_code == 201
+    assert (await operator.ask("PUT", f"{path}/override", second, role="admin")).status_code == 200
+    back = (await undo(operator, path, "override")).json()["value"]
+    assert (back["state"], back["author"]) == ("blocked", "anna")
+    assert back["ttl_s"] <= 600.0
+    refused = await undo(operator, path, "override")
+    assert refused.json()["type"] == "urn:fognav:clear_needs_admin", "to redo declares the area clear"
+    assert (await operator.ask("DELETE", f"{path}/override")).status_code == 204
+    assert (await undo(operator, path, "override")).json()["value"]["state"] == "blocked"
+    assert (await undo(operator, path, "override")).json()["value"] is None, "redone"
+    area = (await operator.ask("GET", path)).json()["definition"]
+    changed = {"polygon": area["polygon"], "nodes": area["nodes"], "label": "the other hall"}
+    assert (await operator.ask("PUT", path, changed)).status_code == 200
+    assert (await undo(operator, path, "area")).json()["value"]["label"] == "the hall"
+    assert (await operator.ask("PUT", "/api/v1/areas/new", changed)).status_code == 201
+    assert (await undo(operator, "/api/v1/areas/new", "area")).json()["value"] is None
+    assert (await operator.ask("GET", "/api/v1/areas/new")).status_code == 404
+    assert (await undo(operator, "/api/v1/areas/new", "area")).json()["value"]["label"] == "the other hall"
+
+
+async def test_missions_are_undone_and_commands_are_not(operator):
+    path = "/api/v1/robots/r1"
+    assert (await operator.ask("PUT", f"{path}/goal", place(3.0))).status_code == 201
+    assert (await operator.ask("PUT", f"{path}/goal", place(6.0))).status_code == 200
+    assert (await undo(operator, path, "mission")).json()["value"]["goal"]["pose"]["x"] == 3.0
+    assert (await operator.ask("GET", f"{path}/goal")).json()["pose"]["x"] == 3.0
+    assert (await operator.ask("DELETE", f"{path}/goal")).status_code == 204
+    assert (await undo(operator, path, "mission")).status_code == 200
+    assert (await operator.ask("GET", f"{path}/goal")).json()["pose"]["x"] == 3.0
+    assert (await undo(operator, path, "mission")).json()["value"] is None, "redone"
+    await operator.ask("POST", f"{path}/stop")  # nobody answers it, but it is recorded
+    refused = await undo(operator, path, "stop")
+    assert (refused.status_code, refused.json()["type"]) == (409, "urn:fognav:not_undoable")
+    assert "commands can't be undone" in refused.json()["detail"]
+
+
+async def test_change_is_applied_by_a_robot_once_that_reports_a_map_which_contains_it(operator):
+    body = rectangle(5.0, 1.0, 5.5, 1.5, id="seen")
+    assert (await operator.ask("POST", "/api/v1/zones", body)).status_code == 201
+
+    async def robots() -> tuple[dict, dict]:
+        change = (await operator.ask("GET", "/api/v1/applied?kind=zone&id=seen", role="viewer")).json()[0]
+        return change, {robot["robot"]: robot for robot in change["robots"]}
+
+    change, found = await robots()
+    assert (change["state"], found["r1"]["applied"], found["r1"]["since"]) == ("active", False, change["at"])
+    operator.applied = change["epoch"], change["seq"]
+    async with asyncio.timeout(60):
+        while not (await robots())[1]["r1"]["applied"]:  # noqa: ASYNC110  # another process changes it
+            await asyncio.sleep(0.05)
+    assert (await robots())[1]["r1"]["since"] >= change["at"]
+    assert (await operator.ask("DELETE", "/api/v1/zones/seen")).status_code == 204
+    change, found = await robots()
+    assert (change["state"], found["r1"]["applied"]) == ("removed", False)

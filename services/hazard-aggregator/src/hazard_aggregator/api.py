@@ -18,20 +18,13 @@ from fog_contracts.messages import (
     AreaDefinition,
     AreaHazard,
     AreaState,
-    Author,
     Code,
-    Count,
     FusionPolicy,
     Id,
     Message,
-    OverrideReason,
-    OverrideState,
     Penalty,
     Ring,
-    Seconds,
     Source,
-    Stamp,
-    TimeToLive,
     UnknownPolicy,
 )
 from fog_runtime.clock import Clock
@@ -39,14 +32,12 @@ from fog_runtime.health import Health
 from fog_runtime.http import (
     Answer,
     Body,
-    Caller,
     HttpProblem,
     IdempotencyKey,
     IfMatch,
     IfNoneMatch,
     Operator,
     PageSize,
-    ProblemCode,
     ProblemError,
     Routes,
     Tokens,
@@ -63,25 +54,13 @@ from fog_runtime.stores.records import CursorError
 from fog_runtime.stores.redis_connection import StoreError
 from fog_runtime.stores.redis_store import IdempotencyError
 from hazard_aggregator.alerts import AlertError
+from hazard_aggregator.api_overrides import OverrideView, add_overrides, override_view
 from hazard_aggregator.area_size import AreaError, TooManyAreasError, check_size
-from hazard_aggregator.areas import LONGEST_S, AreaOverride
 from hazard_aggregator.history import PeriodView
+from hazard_aggregator.problems import AreaProblem, no_such_area
 from hazard_aggregator.service import Service
+from hazard_aggregator.undo import add_undo
 from hazard_aggregator.writers import ConflictError
-
-
-class AreaProblem(ProblemCode):
-    """Problems of the hazard-aggregator."""
-
-    NO_AREA = "no_area", 404, "No area has this id"
-    NO_OVERRIDE = "no_override", 404, "The area has no override"
-    NO_ALERT = "no_alert", 404, "There is no such alert"
-    CLEAR_NEEDS_ADMIN = "clear_needs_admin", 403, "Only an admin may declare an area clear"
-    AREA_CHANGED = "area_changed", 412, "The area is not as the request expects: somebody else changed or added it"
-    AREA_INVALID = "area_invalid", 422, "The area is invalid: `errors` names its fields"
-    TOO_MANY_AREAS = "too_many_areas", 422, "The site has as many areas as it may have"
-    NO_NODE = "no_node", 422, "The site has no such node"
-    OVERRIDE_TOO_LONG = "override_too_long", 422, "An area can't be overridden for so long"
 
 
 def add_alerts(routes: Routes, service: Service) -> None:
@@ -121,126 +100,6 @@ def add_history(routes: Routes, service: Service, clock: Clock) -> None:
             raise no_such_area(area_id)
         page = await service.history.page(area_id, cursor, limit, Moment(clock.now(), clock.stamp(), clock=clock.id))
         return Answer(page.periods, next_page(f"/api/v1/areas/{area_id}/history", page.next, limit))
-
-
-class OverrideBody(Message, frozen=True, kw_only=True):
-    """What an operator says of an area instead of its nodes, why, and for how long (`ttl_s`).
-
-    `blocked` for 30 days at most; `clear`, which needs an admin's token, for 15 minutes at most.
-    """
-
-    state: OverrideState
-    reason: OverrideReason
-    ttl_s: TimeToLive
-
-
-class OverrideView(Message, frozen=True, kw_only=True):
-    """An override in force; `rest_s` is the time until it ends."""
-
-    state: OverrideState
-    author: Author
-    reason: OverrideReason
-    set_at: Stamp
-    ttl_s: TimeToLive
-    rest_s: Seconds
-    version: Count
-
-
-def override_view(service: Service, area: str, now: float) -> OverrideView | None:
-    """Return the override of an area that is in force."""
-    override = service.core.overrides.get(area)
-    return None if override is None else _view(override, service.core.overrides.rest_s(area, now))
-
-
-def add_overrides(routes: Routes, service: Service, clock: Clock) -> None:
-    """Add the routes that set and remove overrides; `routes` knows the errors of areas and of the store."""
-
-    @routes.get("/api/v1/areas/{area_id}/override", problems=[AreaProblem.NO_AREA, AreaProblem.NO_OVERRIDE])
-    async def get_override(area_id: str) -> Answer[OverrideView]:
-        """Return an area's override with its ETag."""
-        _require_area(service, area_id)
-        view = override_view(service, area_id, clock.now())
-        if view is None:
-            raise _without_override(area_id)
-        return Answer(view, etag(view.version))
-
-    @routes.put(
-        "/api/v1/areas/{area_id}/override",
-        status=(200, 201),
-        raises=[ConflictError, IdempotencyError, StoreError],
-        problems=[AreaProblem.NO_AREA, AreaProblem.CLEAR_NEEDS_ADMIN, AreaProblem.OVERRIDE_TOO_LONG],
-    )
-    async def put_override(
-        area_id: str,
-        body: Body[OverrideBody],
-        caller: Operator,
-        if_match: IfMatch = None,
-        idempotency_key: IdempotencyKey = None,
-    ) -> Answer[OverrideView]:
-        """Override an area for a time; replies once it is durably stored.
-
-        Robots avoid a `blocked` area whatever its nodes measure. They may pass a `clear` one, at half speed.
-        """
-        _require_area(service, area_id)
-        _require_allowed(body, caller)
-        new = service.core.overrides.get(area_id) is None
-        override = await service.overrides.put(
-            area_id,
-            body.state,
-            body.reason,
-            body.ttl_s,
-            caller.name,
-            expected=expected_version(if_match),
-            attempt=attempt_of(idempotency_key, caller, f"PUT /api/v1/areas/{area_id}/override", body),
-        )
-        rest_s = max(0.0, override.deadline - clock.now())
-        return Answer(_view(override, rest_s), etag(override.version), status=201 if new else 200)
-
-    @routes.delete(
-        "/api/v1/areas/{area_id}/override",
-        raises=[ConflictError, StoreError],
-        problems=[AreaProblem.NO_AREA, AreaProblem.NO_OVERRIDE],
-    )
-    async def delete_override(area_id: str, caller: Operator, if_match: IfMatch = None) -> None:
-        """End an area's override, with If-Match only if it is unchanged: its nodes count again."""
-        if not await service.overrides.remove(area_id, caller.name, expected_version(if_match)):
-            raise _without_override(area_id)
-
-
-def no_such_area(area: str) -> ProblemError:
-    """Return the problem of a request about an area that does not exist."""
-    return ProblemError(AreaProblem.NO_AREA, f"there is no area {area}: GET /api/v1/areas lists those that there are")
-
-
-def _without_override(area: str) -> ProblemError:
-    detail = f"area {area} has no override: its nodes and sources decide; PUT one first"
-    return ProblemError(AreaProblem.NO_OVERRIDE, detail)
-
-
-def _require_area(service: Service, area: str) -> None:
-    if not any(known.id == area and not known.removed for known in service.core.definitions()):
-        raise no_such_area(area)
-
-
-def _require_allowed(body: OverrideBody, caller: Caller) -> None:
-    if body.state == "clear" and caller.role != "admin":
-        detail = f"to declare an area clear needs the role admin; {caller.name} has the role {caller.role}"
-        raise ProblemError(AreaProblem.CLEAR_NEEDS_ADMIN, detail)
-    if body.ttl_s > (longest := LONGEST_S[body.state]):
-        detail = f"an area can be overridden as {body.state} for {longest:g} s at most"
-        raise ProblemError(AreaProblem.OVERRIDE_TOO_LONG, detail, field="body.ttl_s")
-
-
-def _view(override: AreaOverride, rest_s: float) -> OverrideView:
-    return OverrideView(
-        state=override.state,
-        author=override.author,
-        reason=override.reason,
-        set_at=override.set_at,
-        ttl_s=override.ttl_s,
-        rest_s=rest_s,
-        version=override.version,
-    )
 
 
 class AreaBody(Message, frozen=True, kw_only=True):
@@ -308,6 +167,7 @@ def make_api(
     areas = Routes(app, "areas")
     _add_areas(areas, service, geometry, clock)
     add_history(areas, service, clock)
+    add_undo(areas, service, clock)
     _add_nodes(Routes(app, "nodes"), service, clock)
     add_alerts(Routes(app, "alerts"), service)
     recovery = Routes(app, "store")

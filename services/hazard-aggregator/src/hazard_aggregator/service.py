@@ -23,6 +23,7 @@ if TYPE_CHECKING:
     from fog_contracts.handlers import Publication
     from fog_runtime.clock import Clock
     from fog_runtime.health import Health
+    from fog_runtime.stores.records import AuditEntry
     from fog_runtime.transports.edges import Gate
     from fog_runtime.transports.mqtt_edge import MqttEdge
     from fog_runtime.transports.zenoh_edge import ZenohEdge
@@ -142,6 +143,10 @@ class Service:
                     continue
                 self._health.set("store", ok=True)
                 self._publisher.announce(self.core.mark_stored(unstored))
+
+    async def undoable(self, entry: str, record: str, kinds: Sequence[str]) -> AuditEntry:
+        """Return an entry of the audit trail that may be undone; raises `UndoError` and `StoreError`."""
+        return await self._store.undoable(entry, record, kinds)
 
     async def store_loop(self) -> None:
         """Monitor Redis; load its records as soon as it answers, before any write."""

@@ -61,6 +61,7 @@ class AreaWriter:
         expected: int | None = None,
         must_be_new: bool = False,
         attempt: Attempt | None = None,
+        action: str = "put",
     ) -> AreaDefinition:
         """Store an area as its next version, then put it into force; with `expected`, only if that is its version.
 
@@ -80,7 +81,7 @@ class AreaWriter:
                     raise ConflictError(definition.id)
                 check_count(definition, self._core.definitions())
                 stored = structs.replace(definition, version=1 if old is None else old.version + 1)
-                if await self._is_stored(stored, old, Audit(self._clock.stamp(), who, "put", attempt)):
+                if await self._is_stored(stored, old, Audit(self._clock.stamp(), who, action, attempt)):
                     self._publisher.announce(self._core.put_area(stored, self._edges.now()))
                     break
                 self._records.request_reload()
@@ -146,10 +147,11 @@ class OverrideWriter:
         *,
         expected: int | None = None,
         attempt: Attempt | None = None,
+        action: str = "override",
     ) -> AreaOverride:
         """Store an override instead of the area's former one, then put it into force.
 
-        With `expected`, only if that is the former one's version; else it replaces whatever is stored. An `attempt`
+        With `expected`, only if that is the former one's version (0: none); else whatever is stored. An `attempt`
         that succeeded before returns its override again. Raises `ConflictError`, `IdempotencyError`, and `StoreError`:
         then it may be stored or not.
         """
@@ -161,7 +163,7 @@ class OverrideWriter:
                         await self._records.load_again()
                         return earlier
                 old = self._core.overrides.known(area)
-                if expected is not None and (old is None or old.version != expected):
+                if expected is not None and (0 if old is None else old.version) != expected:
                     raise ConflictError(area, OVERRIDE_CHANGED)
                 override = AreaOverride(
                     area=area,
@@ -174,7 +176,7 @@ class OverrideWriter:
                     deadline=self._clock.now() + ttl_s,
                     version=0 if old is None else old.version,
                 )
-                audit = Audit(override.set_at, who, "override", attempt)
+                audit = Audit(override.set_at, who, action, attempt)
                 with self._records.uncertain_write():
                     outcome, override = await self._store.put_override(override, audit)
                 if outcome == "ok":
@@ -183,7 +185,7 @@ class OverrideWriter:
                 self._records.request_reload()
         raise ConflictError(area, OVERRIDE_CHANGED)
 
-    async def remove(self, area: str, who: str, expected: int | None = None) -> bool:
+    async def remove(self, area: str, who: str, expected: int | None = None, *, action: str = "remove") -> bool:
         """Delete an area's override, and let its nodes count again; return whether there was one.
 
         With `expected`, only this version. Raises `ConflictError` and `StoreError`.
@@ -197,7 +199,7 @@ class OverrideWriter:
                 return False
             if expected not in (None, override.version):
                 raise ConflictError(area, OVERRIDE_CHANGED)
-            await self._delete(override, Audit(self._clock.stamp(), who, "remove"))
+            await self._delete(override, Audit(self._clock.stamp(), who, action))
         return True
 
     async def keep(self) -> None:

@@ -5,6 +5,7 @@ Reading needs no token, except for the audit log; writing needs the role operato
 
 import secrets
 from collections.abc import Callable
+from itertools import islice
 from typing import Final, Literal
 
 import msgspec
@@ -47,9 +48,11 @@ from fog_runtime.stores.redis_connection import StoreError
 from fog_runtime.stores.redis_store import Attempt, IdempotencyError
 from map_service.api_dry_run import add_dry_runs
 from map_service.api_views import add_views
+from map_service.applied import AppliedChange, ChangeKind
 from map_service.core import ScrapeTarget
 from map_service.problems import NO_SUCH_ZONE, ZONES_NOT_LOADED, MapProblem, add_errors, require_zones
 from map_service.service import Service
+from map_service.undo import add_undo
 from map_service.zone_bodies import ZoneBody, zone_from_body
 from map_service.zone_writer import ConflictError
 from map_service.zones import ZoneError
@@ -85,6 +88,8 @@ def make_api(  # the process's parts
     _add_zone_reads(zones, service)
     _add_zone_writes(zones, service, clock)
     add_dry_runs(zones, service, site, clock)
+    add_undo(zones, service, clock)
+    _add_applied(zones, service, clock)
     _add_audit(zones, service)
     add_views(Routes(app, "map"), service, site)
     _add_scrape_targets(Routes(app, "robots"), service, clock)
@@ -163,6 +168,18 @@ def _add_zone_writes(routes: Routes, service: Service, clock: Clock) -> None:
             return
         _require_matching(service, zone_id, if_match)
         await service.zones.delete(zone_id, expected_version(if_match), caller.name)
+
+
+def _add_applied(routes: Routes, service: Service, clock: Clock) -> None:
+    @routes.get("/api/v1/applied")
+    async def applied(
+        _caller: Viewer,
+        limit: PageSize,
+        kind: ChangeKind | None = None,
+        id: str | None = None,  # noqa: A002  # the parameter's name
+    ) -> list[AppliedChange]:
+        """Return the latest change of each zone and area, newest first, and which robots drive by a map with it."""
+        return list(islice(service.core.applied.changes(clock.now(), kind, id), limit))
 
 
 def _add_audit(routes: Routes, service: Service) -> None:

@@ -15,7 +15,8 @@ from msgspec import structs
 from fog_contracts import channels as ch
 from fog_contracts.costs import DEFAULT_INFLATION
 from fog_contracts.handlers import Moment, Publication
-from fog_contracts.messages import HazardArea, Message, ZoneSet
+from fog_contracts.messages import HazardArea, MapDelta, Message, ZoneSet
+from map_service.applied import Applied
 from map_service.costmap import COMMIT_CELLS, LayeredCostmap
 from map_service.dry_run import Hypothesis
 from map_service.layers.hazards import HazardsLayer
@@ -102,6 +103,7 @@ class MapCore:
             self._hazards.define(definition, Moment(0.0, 0.0))
         self.costmap = LayeredCostmap(site, static, layers, inflation, epoch)
         self.robots = RobotDirectory()
+        self.applied = Applied()
         self._zones_loaded = False
         self._hazards_wait_s = hazards_wait_s
         self._serving = False
@@ -192,6 +194,7 @@ class MapCore:
     def lead(self, epoch: int) -> list[Publication]:
         """Continue with this epoch; return hazards and zones again. Readers fetch the map itself."""
         self.costmap.set_epoch(epoch)
+        self.applied.restart(self.costmap.version)
         return self._everything() if self._serving else []
 
     # --- Inputs without a channel -----------------------------------------------------------------------------------
@@ -239,6 +242,7 @@ class MapCore:
     def _on_state(self, ids: Ids, state: RobotState, at: Moment) -> list[Publication]:
         """Note that the robot is alive; the epochs that it received are passed on by the edges."""
         self.robots.heard(ids["robot"], state, at.now)
+        self.applied.heard(ids["robot"], state, at)
         return []
 
     def _commit(self, publications: list[Publication], at: Moment) -> list[Publication]:
@@ -248,10 +252,23 @@ class MapCore:
         """
         cells = COMMIT_CELLS if self._serving else None
         deltas = [Publication(ch.MAP_DELTA, delta) for delta in self.costmap.update(at.stamp, cells)]
+        self._note_changes(deltas, at.stamp)
         if not self._serving:
             self._zones.pop_changed()
             return []
         return [*deltas, *self._with_epoch(publications), *self._changed_zones(at.now)]
+
+    def _note_changes(self, deltas: Sequence[Publication], stamp: float) -> None:
+        """Note which changes are completely on the map now; a zone may have changed without changing any cell."""
+        causes = [
+            c for p in deltas if isinstance(p.message, MapDelta) and p.message.part == 0 for c in p.message.causes
+        ]
+        for cause in causes:
+            if cause.kind == "hazard":
+                self.applied.changed("hazard", cause.id, cause.state, self.costmap.version, stamp)
+        if not self.costmap.pending:
+            for name, state in self.zones.pop_touched().items():
+                self.applied.changed("zone", name, state, self.costmap.version, stamp)
 
     def _changed_zones(self, now: float) -> list[Publication]:
         """Return the publication of the zones when they changed and are on the map; many of them not too often."""

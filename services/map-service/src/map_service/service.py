@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     from fog_contracts.handlers import Moment
     from fog_runtime.clock import Clock
     from fog_runtime.health import Health
-    from fog_runtime.stores.records import AuditPage
+    from fog_runtime.stores.records import AuditEntry, AuditPage
     from fog_runtime.transports.edges import Gate
     from fog_runtime.transports.mqtt_edge import MqttEdge
     from fog_runtime.transports.zenoh_edge import ZenohEdge
@@ -147,6 +147,10 @@ class Service:
     async def audit(self, kinds: Sequence[str], cursor: str | None, limit: int) -> AuditPage:
         """Return a page of the site's audit trail; raises `CursorError` and `StoreError`."""
         return await self._store.audit(kinds=kinds, cursor=cursor, limit=limit)
+
+    async def undoable(self, entry: str, record: str, kinds: Sequence[str]) -> AuditEntry:
+        """Return an entry of the audit trail that may be undone; raises `UndoError` and `StoreError`."""
+        return await self._store.undoable(entry, record, kinds)
 
     async def store_loop(self) -> None:
         """Load the zones, retrying until the store answers; then monitor it, and reload after an uncertain write.

@@ -131,7 +131,7 @@ class ZoneWriter:
 
     # --- Changes ----------------------------------------------------------------------------------------------------
 
-    async def create(self, zone: Zone, who: str, attempt: Attempt | None = None) -> Zone:
+    async def create(self, zone: Zone, who: str, attempt: Attempt | None = None, *, action: str = "create") -> Zone:
         """Store a new zone and put it on the map; raises `ZoneError`, `ConflictError` (exists), `StoreError`.
 
         An `attempt` that succeeded before returns its zone again; raises `IdempotencyError` for another request's.
@@ -143,7 +143,7 @@ class ZoneWriter:
                 # The store would treat an identical zone as a repeated attempt.
                 raise ConflictError("exists", zone.id)
             prepared = await self._prepare(zone)
-            audit = Audit(self._now().stamp, who, "create", attempt)
+            audit = Audit(self._now().stamp, who, action, attempt)
             with self._uncertain_write():
                 outcome, zone = await self._store.create(prepared.zone, audit)
             if (earlier := await self._unless_ok(outcome, zone.id, attempt)) is not None:
@@ -152,7 +152,9 @@ class ZoneWriter:
         await self._publisher.all_on_map()
         return zone
 
-    async def replace(self, zone: Zone, expected: int | None, who: str, attempt: Attempt | None = None) -> Zone:
+    async def replace(
+        self, zone: Zone, expected: int | None, who: str, attempt: Attempt | None = None, *, action: str = "replace"
+    ) -> Zone:
         """Store a new version of a zone; with `expected`, only if that is its version. `attempt` as in `create`.
 
         Raises `ZoneError`, `ConflictError` (stale, missing), and `StoreError`.
@@ -163,7 +165,7 @@ class ZoneWriter:
             # The store would treat an identical zone as a repeated attempt.
             old = self._require(zone.id, expected)
             prepared = await self._prepare(structs.replace(zone, version=old.version + 1))
-            audit = Audit(self._now().stamp, who, "replace", attempt)
+            audit = Audit(self._now().stamp, who, action, attempt)
             with self._uncertain_write():
                 outcome = await self._store.replace(prepared.zone, expected=old.version, audit=audit)
             if (earlier := await self._unless_ok(outcome, zone.id, attempt)) is not None:
@@ -172,12 +174,12 @@ class ZoneWriter:
         await self._publisher.all_on_map()
         return prepared.zone
 
-    async def delete(self, zone_id: str, expected: int | None, who: str) -> None:
+    async def delete(self, zone_id: str, expected: int | None, who: str, *, action: str = "delete") -> None:
         """Delete a zone; with `expected`, only this version. Raises `ConflictError` (stale, missing), `StoreError`."""
         async with self._lock:
             zone = self._require(zone_id, expected)
             with self._uncertain_write():
-                outcome = await self._store.delete(zone, Audit(self._now().stamp, who, "delete"))
+                outcome = await self._store.delete(zone, Audit(self._now().stamp, who, action))
             await self._unless_ok(outcome, zone_id)
             self._publisher.publish(self._core.remove_zone(zone_id, self._now()))
         await self._publisher.all_on_map()

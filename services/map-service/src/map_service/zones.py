@@ -71,6 +71,7 @@ class ZoneCatalog:
         self._zones: _Ordered[Zone] = _Ordered()
         self._active: _Ordered[str] = _Ordered()
         self._places = _Places()
+        self._touched: dict[str, str] = {}
         self.cells = 0
         """How many cells all zones cover in sum."""
         self.size = 0
@@ -118,12 +119,14 @@ class ZoneCatalog:
             self._timed[name] = entry
         if entry.active:
             self._activate(entry)
+        self._touched[name] = "active" if entry.active else "inactive"
 
     def remove(self, zone_id: str) -> ZoneEntry | None:
         """Remove a zone; return its entry, None if there was none."""
         entry = self._entries.pop(zone_id, None)
         if entry is None:
             return None
+        self._touched[zone_id] = "removed"
         self._zones.remove(zone_id)
         self._timed.pop(zone_id, None)
         self.cells -= entry.cells
@@ -139,6 +142,12 @@ class ZoneCatalog:
         elif entry.active and not active:
             self._deactivate(entry)
         entry.active = active
+        self._touched[entry.zone.id] = "active" if active else "inactive"
+
+    def pop_touched(self) -> dict[str, str]:
+        """Return the zones that have changed since the last call, each with what has become of it."""
+        touched, self._touched = self._touched, {}
+        return touched
 
     def _activate(self, entry: ZoneEntry) -> None:
         self._active.put(entry.zone.id, entry.zone.id)

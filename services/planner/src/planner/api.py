@@ -51,6 +51,7 @@ from planner.query_queue import BusyError
 from planner.robot_operator import CommandError
 from planner.service import Service
 from planner.store import NO_MISSION, MissionConflictError, Order, StoredGoal
+from planner.undo import add_undo
 
 
 class GoalPose(Message, frozen=True, kw_only=True):
@@ -194,6 +195,7 @@ def make_api(service: Service, site: Site, health: Health, tokens: Tokens, stand
     add_commands(routes, service.operator, site, check=robots.check, mode=robots.mode)
     _add_views(routes, service, robots)
     _add_orders(routes, service, robots, site)
+    add_undo(routes, service, robots.check)
     _add_plan(Routes(app, "plan"), service, robots, site)
     recovery = Routes(app, "store")
     add_store_errors(recovery)

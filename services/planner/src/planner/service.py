@@ -42,6 +42,7 @@ if TYPE_CHECKING:
     from fog_contracts.messages import DryRunReply, DryRunRequest, EgressRequest, Message, PlanRequest, Pose, Refusal
     from fog_runtime.clock import Clock
     from fog_runtime.health import Health
+    from fog_runtime.stores.records import AuditEntry
     from fog_runtime.transports.edges import Gate
     from fog_runtime.transports.zenoh_edge import ZenohEdge
     from planner.core import Job, PlannerCore
@@ -199,6 +200,7 @@ class Service:
         staging: by robot, the pose in front of its dock.
         """
         self._core = core
+        self._store = store
         self._zenoh = zenoh
         self._gate = gate
         self._edges = Edges(clock, zenoh=zenoh, gate=gate)
@@ -242,6 +244,10 @@ class Service:
             return earlier
         refusal = await self._threads.run("core", lambda: self._core.check_goal(order.pose.x, order.pose.y))
         return refusal if refusal is not None else await self.missions.send(order)
+
+    async def undoable(self, entry: str, record: str, kinds: Sequence[str]) -> AuditEntry:
+        """Return an entry of the audit trail that may be undone; raises `UndoError` and `StoreError`."""
+        return await self._store.undoable(entry, record, kinds)
 
     async def preview(self, request: PlanRequest, asker: str) -> PlanReply:
         """Plan a path without side effects; raises `BusyError` when too many queries are waiting, or of this asker.

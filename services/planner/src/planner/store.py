@@ -91,7 +91,7 @@ class Order(NamedTuple):
     """A mission as an operator orders it, and the conditions of the order.
 
     `any_heading`: ignore the pose's theta. `expected` is the id of the mission that it replaces, or `NO_MISSION`; None
-    replaces any.
+    replaces any. `action` is the audit trail's word for it.
     """
 
     robot: str
@@ -101,6 +101,7 @@ class Order(NamedTuple):
     any_heading: bool = False
     attempt: Attempt | None = None
     expected: str | None = None
+    action: str = "goal"
 
 
 class MissionConflictError(Exception):
@@ -182,12 +183,12 @@ class MissionPersistence:
             stamp, place, pose = self._clock.stamp(), order.place, order.pose
             goal = RobotGoal(goal_id=secrets.token_hex(8), pose=pose, place=place, stamp=stamp)
             stored = StoredGoal(goal=goal, any_heading=order.any_heading)
-            await self._store_mission(order, stored, Audit(stamp, order.who, "goal", order.attempt))
+            await self._store_mission(order, stored, Audit(stamp, order.who, order.action, order.attempt))
             self._begin(order.robot, stored)
         _log.info("goal_accepted", robot=order.robot, goal=goal.goal_id, x=pose.x, y=pose.y, place=place, who=order.who)
         return stored
 
-    async def cancel(self, robot: str, who: str, expected: str | None = None) -> bool:
+    async def cancel(self, robot: str, who: str, expected: str | None = None, *, action: str = "cancel") -> bool:
         """End a robot's mission; False when it has none. With `expected`, only the mission of that id.
 
         Raises `MissionConflictError` and `StoreError`.
@@ -203,7 +204,7 @@ class MissionPersistence:
             if expected not in (None, stored.goal.goal_id):
                 raise MissionConflictError(robot, stored)
             with self._uncertain_write():
-                await self._store.delete(robot, stored.goal.goal_id, Audit(self._clock.stamp(), who, "cancel"))
+                await self._store.delete(robot, stored.goal.goal_id, Audit(self._clock.stamp(), who, action))
             self._cancel(robot)
         _log.info("goal_cancelled", robot=robot, goal=stored.goal.goal_id, who=who)
         return True

@@ -19,11 +19,15 @@ from fog_runtime.http.store_routes import (
     IdempotencyKey,
     IfNoneMatch,
     PageSize,
+    UndoBody,
+    Undone,
     add_recovery,
     add_store_errors,
+    add_undo_errors,
     attempt_of,
     must_be_new,
     next_page,
+    undone,
 )
 from fog_runtime.http.tokens import Admin, Caller, Guest, Operator, Tokens, Viewer, load_tokens
 from fog_runtime.token_file import TokensError, token_hash
@@ -50,10 +54,13 @@ __all__ = [
     "Routes",
     "Tokens",
     "TokensError",
+    "UndoBody",
+    "Undone",
     "Viewer",
     "add_recovery",
     "add_session_routes",
     "add_store_errors",
+    "add_undo_errors",
     "attempt_of",
     "etag",
     "expected_tag",
@@ -64,5 +71,6 @@ __all__ = [
     "next_page",
     "serve_here",
     "token_hash",
+    "undone",
     "unused",
 ]

@@ -3,6 +3,7 @@
 from typing import Annotated, Any, Literal, Protocol
 from urllib.parse import urlencode
 
+import msgspec
 from fastapi import Depends, Header, Query
 
 from fog_contracts.messages import Message
@@ -11,6 +12,7 @@ from fog_runtime.http.routes import Body, Routes
 from fog_runtime.http.tokens import Admin, Caller, Viewer
 from fog_runtime.stores.redis_connection import StoreError, StoreRefusedError
 from fog_runtime.stores.redis_store import Attempt, IdempotencyError, RecoveryError, StoreStatus
+from fog_runtime.stores.undo import UndoError
 
 
 def _page_size(
@@ -85,6 +87,41 @@ def add_store_errors(routes: Routes) -> None:
         [HttpProblem.KEY_REUSED],
         lambda error: ProblemError(HttpProblem.KEY_REUSED, str(error), field="header.Idempotency-Key"),
     )
+
+
+class UndoBody(Message, frozen=True, kw_only=True):
+    """Which change is to be undone: the name of its entry in the audit trail."""
+
+    entry: Annotated[str, msgspec.Meta(pattern=r"^[0-9]{1,16}-[0-9]{1,16}\.[a-z]+$(?!\n)")]
+
+
+class Undone(Message, frozen=True, kw_only=True):
+    """A record after an undo; `value` is null if there is none any more."""
+
+    kind: str
+    id: str
+    value: msgspec.Raw
+
+
+def add_undo_errors(routes: Routes) -> None:
+    """Register the problem documents of changes that can't be undone."""
+    codes = {code.value: code for code in (HttpProblem.NO_ENTRY, HttpProblem.NOT_UNDOABLE, HttpProblem.CHANGED_SINCE)}
+
+    def convert(error: UndoError) -> ProblemError:
+        later = error.later
+        if later is None:
+            return ProblemError(codes[error.code], str(error), field="body.entry")
+        return ProblemError(
+            codes[error.code], str(error), field="body.entry",
+            by=later.who, action=later.action, at=later.at, entry=later.entry,
+        )  # fmt: skip
+
+    routes.raises(UndoError, list(codes.values()), convert)
+
+
+def undone(kind: str, name: str, value: Message | None) -> Undone:
+    """Return the answer to an undo: the record as it is now, None if it was removed."""
+    return Undone(kind=kind, id=name, value=msgspec.Raw(msgspec.json.encode(value)))
 
 
 def add_recovery(routes: Routes, service: Recoverable) -> None:

@@ -22,7 +22,7 @@ import msgspec
 from fog_contracts.messages import Message
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping, Sequence
+    from collections.abc import AsyncIterator, Mapping, Sequence
 
     from fog_runtime.stores.redis_connection import RedisConnection
 
@@ -186,7 +186,7 @@ class CursorError(ValueError):
 class AuditEntry(Message, frozen=True, kw_only=True):
     """A change: when (s since the epoch), by whom, what, of which record; `before` and `after` are the record's values.
 
-    They are null where there was none before, or is none any more.
+    They are null where there was none before, or is none any more. `entry` is its name, by which it can be undone.
     """
 
     at: float
@@ -196,6 +196,7 @@ class AuditEntry(Message, frozen=True, kw_only=True):
     id: str
     before: msgspec.Raw
     after: msgspec.Raw
+    entry: str = ""
 
 
 class AuditPage(NamedTuple):
@@ -279,6 +280,7 @@ def _entry(kind: str, entry_id: bytes, fields: Any) -> _Placed:  # noqa: ANN401 
     pairs = fields.items() if isinstance(fields, dict) else zip(fields[::2], fields[1::2], strict=True)
     values = {name.decode(): value for name, value in pairs}
     ms, _, number = entry_id.decode().partition("-")
+    position = _Position(int(ms), int(number), kind)
     entry = AuditEntry(
         at=float(values["at"]),
         who=values["who"].decode(),
@@ -287,5 +289,28 @@ def _entry(kind: str, entry_id: bytes, fields: Any) -> _Placed:  # noqa: ANN401 
         id=values["id"].decode(),
         before=msgspec.Raw(values["before"] or b"null"),
         after=msgspec.Raw(values["after"] or b"null"),
+        entry=str(position),
     )
-    return _Placed(_Position(int(ms), int(number), kind), entry)
+    return _Placed(position, entry)
+
+
+async def entry_at(redis: RedisConnection, prefix: str, name: str) -> AuditEntry | None:
+    """Return the entry of this name, None without one; raises `StoreError`."""
+    if _CURSOR.fullmatch(name) is None:
+        return None
+    place, _, kind = name.rpartition(".")
+    reply = await redis.read("XRANGE", f"{prefix}{kind}", place, place)
+    return _entry(kind, *reply[0]).entry if reply else None
+
+
+async def newer_entries(redis: RedisConnection, prefix: str, name: str) -> AsyncIterator[AuditEntry]:
+    """Yield the entries of a kind from the newest on, the one of this name last; raises `StoreError`."""
+    place, _, kind = name.rpartition(".")
+    end = "+"
+    while True:
+        reply = await redis.read("XREVRANGE", f"{prefix}{kind}", end, place, "COUNT", _AT_ONCE)
+        for entry_id, fields in reply:
+            yield _entry(kind, entry_id, fields).entry
+        if len(reply) < _AT_ONCE:
+            return
+        end = f"({reply[-1][0].decode()}"

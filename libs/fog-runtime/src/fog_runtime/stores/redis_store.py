@@ -19,7 +19,7 @@ from prometheus_client import Gauge
 from fog_contracts.messages import Message
 from fog_runtime import logs
 from fog_runtime.credentials import NOBODY
-from fog_runtime.stores.records import AUDIT_ENTRIES, KINDS, SWAP, WRITE, AuditPage, read_page
+from fog_runtime.stores.records import AUDIT_ENTRIES, KINDS, SWAP, WRITE, AuditEntry, AuditPage, read_page
 from fog_runtime.stores.redis_connection import (
     RedisConnection,
     StoreError,
@@ -27,6 +27,7 @@ from fog_runtime.stores.redis_connection import (
     StoreLostError,
     StoreRefusedError,
 )
+from fog_runtime.stores.undo import undoable
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
@@ -206,6 +207,10 @@ class RedisStore:
     async def audit(self, *, kinds: Sequence[str] = KINDS, cursor: str | None = None, limit: int = 100) -> AuditPage:
         """Return a page of the audit trail that all services of the site share; raises `CursorError` too."""
         return await read_page(self._redis, self._key("audit:"), kinds=kinds, cursor=cursor, limit=limit)
+
+    async def undoable(self, entry: str, record: str, kinds: Sequence[str]) -> AuditEntry:
+        """Return an entry of the audit trail, of this record, that may be undone; raises `UndoError`."""
+        return await undoable(self._redis, self._key("audit:"), entry, record, kinds)
 
     async def status(self, in_memory: Mapping[str, int]) -> StoreStatus:
         """Return what Redis has of the service's tables, beside what the service has in memory."""

@@ -1,0 +1,55 @@
+"""Undoes an operator's order, by its entry in the audit trail: a mission that was given or cancelled."""
+
+from collections.abc import Callable
+from typing import Final
+
+from fog_contracts.messages import Refusal
+from fog_runtime.http import Body, Operator, ProblemError, Routes, UndoBody, Undone, add_undo_errors, undone
+from fog_runtime.stores.redis_connection import StoreError
+from fog_runtime.stores.redis_store import IdempotencyError
+from fog_runtime.stores.undo import ACTION, UndoError, values
+from planner.problems import PlannerProblem
+from planner.service import Service
+from planner.store import NO_MISSION, MissionConflictError, Order, StoredGoal
+
+_KINDS: Final = ("mission",)
+
+
+def add_undo(routes: Routes, service: Service, check: Callable[[str], None]) -> None:
+    """Add the route; `routes` knows the errors of missions and of the store; `check` raises for an unknown robot."""
+    add_undo_errors(routes)
+
+    @routes.post(
+        "/api/v1/robots/{robot}/undo",
+        raises=[UndoError, IdempotencyError, MissionConflictError, StoreError],
+        problems=[PlannerProblem.NO_ROBOT, PlannerProblem.GOAL_REFUSED],
+    )
+    async def undo_order(robot: str, body: Body[UndoBody], caller: Operator) -> Undone:
+        """Undo an order to a robot, if it has no other one since. An undo can be undone, too.
+
+        Only missions that were given or cancelled: commands (enable, reset, stop) can't be undone.
+        """
+        check(robot)
+        before, after = values(await service.undoable(body.entry, robot, _KINDS), StoredGoal)
+        return undone("mission", robot, await _undo(service, robot, before, after, caller.name))
+
+
+async def _undo(
+    service: Service, robot: str, before: StoredGoal | None, after: StoredGoal | None, who: str
+) -> StoredGoal | None:
+    """Give the robot the mission that it had before; return it, None if it has none now."""
+    expected = NO_MISSION if after is None else after.goal.goal_id
+    if before is None or before.goal.pose is None:
+        if after is None:
+            raise UndoError("not_undoable", "there was no mission before, and none after: there is nothing to undo")
+        await service.missions.cancel(robot, who, expected, action=ACTION)
+        return None
+    goal = before.goal
+    assert goal.pose is not None
+    order = Order(
+        robot, goal.pose, who, place=goal.place, any_heading=before.any_heading, expected=expected, action=ACTION
+    )
+    sent = await service.send(order)
+    if isinstance(sent, Refusal):
+        raise ProblemError(PlannerProblem.GOAL_REFUSED, sent.reason, refusal=sent.kind, code=sent.code, name=sent.name)
+    return sent

@@ -187,6 +187,8 @@ class Fog:
             digest = hashlib.sha256(token.encode()).hexdigest()
             lines += ["[[tokens]]", f'name = "{name}"', f'role = "{role}"', f'sha256 = "{digest}"']
         tokens.write_text("\n".join(lines))
+        session_key = folder / "session.key"
+        session_key.write_text("ab" * 32)
         self.environment = {
             **os.environ,
             "FOGNAV_SITE_DIR": str(self.site),
@@ -195,6 +197,7 @@ class Fog:
             "FOGNAV_REDIS_URL": self.redis.url,
             "FOGNAV_ZENOH_CONNECT": self.router.endpoint,
             "FOGNAV_TOKENS_FILE": str(tokens),
+            "FOGNAV_SESSION_KEY_FILE": str(session_key),
             # Short, because many tests start no aggregator.
             "FOGNAV_HAZARDS_WAIT_S": "0.3",
         }

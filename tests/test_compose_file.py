@@ -59,7 +59,7 @@ def test_a_plain_up_shows_the_robots_cpu_by_grafana_and_by_prometheus_itself():
     assert "--web.console.templates=/etc/prometheus/consoles" in prometheus["command"]
     assert (ROOT / mounts("prometheus")["/etc/prometheus"] / "consoles" / "robots.html").is_file()
     links = re.findall(r'href="(/[^"]*)"', (ROOT / "deploy" / "gateway" / "Caddyfile").read_text("utf-8"))
-    assert links[0] == "/prometheus/consoles/robots.html"
+    assert "/prometheus/consoles/robots.html" in links
 
 
 def test_services_of_one_image_are_built_alike():

@@ -402,6 +402,7 @@ def _announce(node: LocalNode, print_line: Callable[[str], None]) -> None:
     for site in node.config.sites:
         system = node.system(site)
         print_line(f"site {site.id} is up: " + ", ".join(f"{name} {url}" for name, url in system.urls.items()))
+        print_line(f"  console: {system.urls[CONSOLE]}/, where people log in with a token")
         print_line(f"  token in {system.token_file}; operate it from another terminal: fognav status")
 
 
@@ -416,5 +417,5 @@ def require_free_ports(node: LocalNode) -> None:
                 raise FailedError(
                     f"{name} can't listen on {address} port {number}: {error.strerror}. End the program that does, or "
                     "choose other ports (FOGNAV_MQTT_PORT, FOGNAV_REDIS_PORT, FOGNAV_ZENOH_PORT, "
-                    "FOGNAV_AGGREGATOR_PORT, FOGNAV_MAP_PORT, FOGNAV_PLANNER_PORT)"
+                    "FOGNAV_AGGREGATOR_PORT, FOGNAV_MAP_PORT, FOGNAV_PLANNER_PORT, FOGNAV_CONSOLE_PORT)"
                 ) from error

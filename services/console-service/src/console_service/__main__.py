@@ -8,6 +8,7 @@ from pathlib import Path
 
 from console_service.api import make_api
 from console_service.core import ConsoleCore
+from console_service.forward import AGGREGATOR, MAP_SERVICE, PLANNER, Forward
 from console_service.service import Service
 from fog_runtime import logs, process
 from fog_runtime.clock import SystemClock
@@ -48,12 +49,16 @@ async def main() -> None:
     tokens = load_tokens(settings.tokens_file, settings.session_key_file)
     own = settings.credentials()
     mqtt = MqttEdge(settings.mqtt_url, process_id("console-service"), clock, site=site, credentials=own)
-    async with ZenohEdge.open(
-        connect=settings.zenoh_endpoints, clock=clock, role="console-service", id=site, site=site, credentials=own
-    ) as zenoh:
+    urls = {AGGREGATOR: settings.aggregator_url, MAP_SERVICE: settings.map_url, PLANNER: settings.planner_url}
+    async with (
+        Forward(urls, proof=tokens.gateway_proof, trusted=own.tls_context()) as forward,
+        ZenohEdge.open(
+            connect=settings.zenoh_endpoints, clock=clock, role="console-service", id=site, site=site, credentials=own
+        ) as zenoh,
+    ):
         service = Service(ConsoleCore(), mqtt, zenoh, clock, health)
         service.subscribe()
-        app = make_api(service, health, tokens, page=settings.page_dir)
+        app = make_api(service, health, tokens, forward=forward, page=settings.page_dir)
         async with asyncio.TaskGroup() as tasks:
             tasks.create_task(mqtt.run(), name="mqtt")
             tasks.create_task(service.tick_loop(), name="tick")

@@ -130,7 +130,7 @@ def problem(
     return JSONResponse(body, status, headers, media_type=PROBLEM)
 
 
-def _allowed_methods(request: Request) -> list[str]:
+def allowed_methods(request: Request) -> list[str]:
     """Return the methods of every route of the request's path: Starlette names only those of the first."""
     matching = (route for route in request.app.routes if route.matches(request.scope)[0] is not Match.NONE)
     return sorted({method for route in matching if isinstance(route, Route) for method in route.methods or ()})
@@ -154,7 +154,7 @@ def add_problem_handlers(app: FastAPI) -> None:
             detail = f"{request.method} {request.url.path}: {detail.lower()}"
         headers = dict(error.headers or {})
         if error.status_code == HTTPStatus.METHOD_NOT_ALLOWED:
-            headers["Allow"] = ", ".join(_allowed_methods(request))
+            headers["Allow"] = ", ".join(allowed_methods(request))
         return problem(_BY_STATUS.get(error.status_code, error.status_code), detail, headers=headers)
 
     @app.exception_handler(RequestValidationError)

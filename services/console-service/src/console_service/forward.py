@@ -1,0 +1,183 @@
+"""Passes requests to the services behind the console's address: the gateway of a system without containers.
+
+In containers it is Caddy that does so (deploy/gateway/Caddyfile), by the same table; a test compares them. Each service
+checks the caller itself: what is passed on has the caller's own token or session, and no right of this service.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import re
+from typing import TYPE_CHECKING, Final, Self
+
+import httpx
+import msgspec
+from starlette.requests import Request
+from starlette.responses import StreamingResponse
+
+from fog_runtime.http.http_process import PROOF
+from fog_runtime.http.openapi import merged
+from fog_runtime.http.problems import RETRY_AFTER, HttpProblem, ProblemCode, ProblemError, allowed_methods
+
+if TYPE_CHECKING:
+    import ssl
+    from collections.abc import AsyncIterator, Mapping
+
+    from starlette.types import Receive, Scope, Send
+
+AGGREGATOR, MAP_SERVICE, PLANNER, CONSOLE = "hazard-aggregator", "map-service", "planner", "console-service"
+ROUTES: Final[Mapping[str, tuple[str, ...]]] = {
+    AGGREGATOR: ("areas", "nodes", "alerts"),
+    PLANNER: ("robots", "plan"),
+    CONSOLE: ("session", "events", "openapi.json"),
+}
+"""Which routes each service has, by what follows /api/v1/; the map-service has all others."""
+URGENT: Final = ("/api/v1/robots/{robot}/stop",)
+"""Routes with places of their own in their service, and so here."""
+_API: Final = "/api/v1/"
+_TIMEOUT: Final = httpx.Timeout(30.0, connect=2.0)
+"""As patient as Caddy: a service that hangs must not keep its clients."""
+_KEPT: Final = httpx.Limits(max_connections=None, max_keepalive_connections=32, keepalive_expiry=30.0)
+"""The app limits the requests; a service ends connections that are idle for a minute."""
+_ONE_HOP: Final = frozenset(
+    {b"connection", b"keep-alive", b"proxy-authenticate", b"proxy-authorization", b"proxy-connection", b"te"}
+    | {b"trailer", b"transfer-encoding", b"upgrade"}
+)
+"""Headers of one connection (RFC 9110, section 7.6.1)."""
+_OURS: Final = frozenset({b"forwarded", b"x-forwarded-for", b"x-forwarded-host", b"x-forwarded-proto", PROOF})
+"""What a client may claim, and only the gateway knows."""
+_ANEW_ASKED: Final = _OURS | {b"content-length", b"expect"}
+_ANEW_ANSWERED: Final = frozenset({b"date", b"server"})
+"""What this server says of a message anew."""
+
+
+class ForwardProblem(ProblemCode):
+    """Problems of what is passed on."""
+
+    SERVICE_AWAY = "service_away", 502, "A service does not run: `detail` names it"
+    SERVICE_SILENT = "service_silent", 504, "A service did not answer in time, or broke off: `detail` names it"
+
+
+def service_of(path: str) -> str:
+    """Return the service that has a route of the API, by its path."""
+    first = path.removeprefix(_API).partition("/")[0]
+    return next((service for service, names in ROUTES.items() if first in names), MAP_SERVICE)
+
+
+class Forward:
+    """The services behind this one, as an ASGI app that has all their routes."""
+
+    def __init__(self, urls: Mapping[str, str], *, proof: bytes = b"", trusted: ssl.SSLContext | None = None) -> None:
+        """`urls` are the services' addresses by their names; `proof` lets them believe for whom we ask."""
+        self._urls = urls
+        self._proof = proof
+        self._merged: tuple[list[bytes], bytes] | None = None
+        self._client = httpx.AsyncClient(
+            verify=True if trusted is None else trusted, timeout=_TIMEOUT, limits=_KEPT, trust_env=False
+        )
+
+    async def __aenter__(self) -> Self:
+        """Return this."""
+        return self
+
+    async def __aexit__(self, *_: object) -> None:
+        """Close the connections."""
+        await self._client.aclose()
+
+    @property
+    def names(self) -> list[str]:
+        """The services behind this one."""
+        return list(self._urls)
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        """Pass a request on, and its answer back. Raises `ProblemError`, which the app answers."""
+        if scope["type"] != "http":
+            return
+        request = Request({**scope, "root_path": ""}, receive)
+        named = scope["path"].split("/")[1]
+        if named in self._urls:
+            service, prefix = named, f"/{named}".encode()
+        else:
+            service, prefix = service_of(scope["path"]), b""
+        raw: bytes = scope["raw_path"]
+        if service not in self._urls or not raw.startswith(prefix):
+            raise _no_route(request)
+        if re.fullmatch(r"/api/v1/store(/.*)?", scope["path"]):
+            each = ", ".join(f"/{name}/api/v1/store" for name in self._urls)
+            raise ProblemError(HttpProblem.NO_ROUTE, f"each service has a store of its own: ask {each}")
+        target = raw.removeprefix(prefix) or b"/"
+        if scope["query_string"]:
+            target += b"?" + scope["query_string"]
+        answer = await self._send(service, request, target, await request.body())
+        dropped = _of_connection(answer.headers) | _ANEW_ANSWERED
+        response = StreamingResponse(_parts(answer), answer.status_code)
+        response.raw_headers = [(n.lower(), value) for n, value in answer.headers.raw if n.lower() not in dropped]
+        await response(scope, receive, send)
+
+    async def _send(self, service: str, request: Request, target: bytes, body: bytes) -> httpx.Response:
+        host = request.client.host if request.client else ""
+        dropped = _of_connection(request.headers) | _ANEW_ASKED
+        headers = [(name, value) for name, value in request.headers.raw if name not in dropped]
+        headers += [
+            (b"x-forwarded-for", host.encode("latin-1")),
+            (b"x-forwarded-proto", request.scope["scheme"].encode()),
+        ]
+        if self._proof:
+            headers.append((PROOF, self._proof))
+        if body or request.method in ("POST", "PUT", "PATCH"):
+            headers.append((b"content-length", str(len(body)).encode()))
+        made = httpx.Request(
+            request.method, self._urls[service], headers=headers, stream=httpx.ByteStream(body),
+            extensions={"target": target, "timeout": _TIMEOUT.as_dict()},
+        )  # fmt: skip
+        try:
+            return await self._client.send(made, stream=True)
+        except (httpx.ConnectError, httpx.ConnectTimeout) as error:
+            detail = (
+                f"the {service} does not run, so nothing was changed ({str(error) or 'no connection'}). Try again once "
+                f"it does: `fognav status` shows it, `fognav logs {service}` says why it ended"
+            )
+            raise ProblemError(ForwardProblem.SERVICE_AWAY, detail, headers=RETRY_AFTER, service=service) from error
+        except httpx.TransportError as error:
+            detail = (
+                f"the {service} gave no answer ({str(error) or 'it took too long'}): look whether the change was made "
+                "before you repeat it"
+            )
+            raise ProblemError(ForwardProblem.SERVICE_SILENT, detail, headers=RETRY_AFTER, service=service) from error
+
+    async def openapi(self, own: Mapping[str, object]) -> bytes:
+        """Return the document of all services, `own` among them. Raises `ProblemError` naming one that does not run."""
+        described = await asyncio.gather(*(self._openapi(service) for service in self._urls))
+        if self._merged is None or self._merged[0] != described:
+            services = dict(zip(self._urls, map(msgspec.json.decode, described), strict=True))
+            self._merged = described, msgspec.json.encode(merged({**services, CONSOLE: own}))
+        return self._merged[1]
+
+    async def _openapi(self, service: str) -> bytes:
+        try:
+            return (await self._client.get(f"{self._urls[service]}/openapi.json")).raise_for_status().content
+        except httpx.HTTPError as error:
+            detail = f"the {service} does not describe its routes ({error}): try again once it runs (`fognav status`)"
+            raise ProblemError(ForwardProblem.SERVICE_AWAY, detail, headers=RETRY_AFTER, service=service) from error
+
+
+def _no_route(request: Request) -> ProblemError:
+    """Return what to say of a request to this service itself, none of whose routes has taken it."""
+    if methods := allowed_methods(request):
+        detail = f"{request.url.path} has no {request.method}: use one of {', '.join(methods)}"
+        return ProblemError(HttpProblem.METHOD_NOT_ALLOWED, detail, headers={"Allow": ", ".join(methods)})
+    return ProblemError(HttpProblem.NO_ROUTE, f"there is no {request.url.path}: /api/v1/openapi.json has all routes")
+
+
+def _of_connection(headers: Mapping[str, str]) -> frozenset[bytes]:
+    """Return which of a message's headers are for this connection only."""
+    named = headers.get("connection", "").lower().split(",")
+    return _ONE_HOP | {name.strip().encode("latin-1") for name in named}
+
+
+async def _parts(answer: httpx.Response) -> AsyncIterator[bytes]:
+    try:
+        async for part in answer.aiter_raw():
+            yield part
+    finally:
+        await answer.aclose()

@@ -4,12 +4,17 @@ from __future__ import annotations
 
 import asyncio
 import os
+import secrets
 from pathlib import Path
+from typing import get_args
+
+import msgspec
 
 from console_service.api import make_api
-from console_service.core import ConsoleCore
+from console_service.core import ConsoleCore, Fetched
 from console_service.forward import AGGREGATOR, MAP_SERVICE, PLANNER, Forward
 from console_service.service import Service
+from console_service.sources import Sources
 from fog_runtime import logs, process
 from fog_runtime.clock import SystemClock
 from fog_runtime.configuration.settings import CommonSettings, describe, load
@@ -18,6 +23,7 @@ from fog_runtime.health import Health
 from fog_runtime.http import load_tokens, serve_here
 from fog_runtime.leadership import process_id
 from fog_runtime.process import release_startup_memory
+from fog_runtime.stores.redis_connection import RedisConnection
 from fog_runtime.transports.mqtt_edge import MqttEdge
 from fog_runtime.transports.zenoh_edge import ZenohEdge
 
@@ -43,7 +49,8 @@ async def main() -> None:
     _log.info("settings_loaded", **describe(settings))
     os.nice(NICENESS)
     release_startup_memory()
-    site = settings.site or load_site(settings.site_dir).site.id
+    described = load_site(settings.site_dir).site
+    site = settings.site or described.id
     clock = SystemClock(settings.speed)
     health = Health("mqtt", "zenoh")
     tokens = load_tokens(settings.tokens_file, settings.session_key_file)
@@ -56,23 +63,41 @@ async def main() -> None:
             connect=settings.zenoh_endpoints, clock=clock, role="console-service", id=site, site=site, credentials=own
         ) as zenoh,
     ):
-        service = Service(ConsoleCore(), mqtt, zenoh, clock, health)
+        core = ConsoleCore(
+            site,
+            secrets.token_hex(4),
+            robots=[robot.id for robot in described.robots],
+            nodes={node.id: msgspec.to_builtins(node) for node in described.nodes},
+        )
+        core.on_places(described.places, clock.now())
+        service = Service(core, mqtt, zenoh, clock, health)
         service.subscribe()
+        redis = RedisConnection(settings.redis_url, credentials=own)
+        sources = Sources(
+            core, clock, aggregator_url=settings.aggregator_url, redis=redis, credentials=own,
+            on_news=service.readers.wake,
+        )  # fmt: skip
         app = make_api(service, health, tokens, forward=forward, page=settings.page_dir)
-        async with asyncio.TaskGroup() as tasks:
-            tasks.create_task(mqtt.run(), name="mqtt")
-            tasks.create_task(service.tick_loop(), name="tick")
-            tasks.create_task(
-                serve_here(
-                    app,
-                    settings.http_host,
-                    settings.http_port,
-                    settings.http_certificate(),
-                    settings.http_gateway,
-                    settings.port_file,
-                ),
-                name="http",
-            )
+        serving = serve_here(
+            app, settings.http_host, settings.http_port, settings.http_certificate(), settings.http_gateway,
+            settings.port_file,
+        )  # fmt: skip
+        try:
+            async with asyncio.TaskGroup() as tasks:
+                tasks.create_task(mqtt.run(), name="mqtt")
+                tasks.create_task(service.tick_loop(), name="tick")
+                tasks.create_task(service.map_loop(), name="map")
+                tasks.create_task(service.tile_loop(), name="tiles")
+                for event in get_args(Fetched):
+                    tasks.create_task(sources.fetch_loop(event), name=f"{event}s")
+                tasks.create_task(sources.record_loop(), name="records")
+                tasks.create_task(service.readers.run(), name="readers")
+                tasks.create_task(service.readers.tell_time(clock.stamp), name="time")
+                tasks.create_task(serving, name="http")
+        finally:
+            service.close()
+            await sources.aclose()
+            await redis.aclose()
 
 
 if __name__ == "__main__":

@@ -1,23 +1,351 @@
-"""Turns what the fog says into events: the state of everything as a compacted log. Pure."""
+"""Turns what the fog says into events: the state of everything as a compacted log. Pure.
+
+What channels tell is taken from them. What only the hazard-aggregator's REST has (areas with their overrides, the
+health of nodes, all alerts) is fetched by the service, soon after a message that says that it has changed: `wanted`.
+"""
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+import math
+from collections import deque
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, Final, Literal
+
+import msgspec
+
+from console_service.log import CompactedLog
+from console_service.tiles import TiledMap
+from console_service.views import MapView, PathView, RobotView, Thing, ZoneView, goal_view, plan_view
+from fog_contracts import channels as ch
+from fog_contracts.handlers import Fence
+from fog_contracts.messages.maps import MapGeometry
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping, Sequence
+    from collections.abc import Collection, Mapping, Sequence
 
-    from fog_contracts.channels import Channel
-    from fog_contracts.handlers import Handler, Moment, Publication
+    from console_service.tiles import TileJob
+    from fog_contracts.handlers import Handler, Ids, Moment, Publication
+    from fog_contracts.messages import (
+        AlertList,
+        AreaDefinition,
+        AreaHazard,
+        MapDelta,
+        MapHeartbeat,
+        RobotGoal,
+        RobotObstacles,
+        RobotPath,
+        RobotPose,
+        RobotRelease,
+        RobotState,
+        ZoneSet,
+    )
+    from fog_contracts.replica import DecodedMap
+
+Fetched = Literal["area", "node", "alert"]
+
+POSE_PERIOD_S: Final = 0.1
+"""The shortest time between two poses of a robot."""
+_EARLY_S: Final = 0.02
+"""How much earlier one may come: robots send as often themselves."""
+REFRESH_S: Final = 10.0
+"""How often what always changes (`VOLATILE`) is told when nothing else does."""
+VOLATILE: Final[Mapping[str, Sequence[str]]] = {"area": ("rest_s",), "node": ("age_s", "received", "ignored")}
+FORGET_S: Final = 600.0
+"""A robot that is not of the site is forgotten after so long without a message."""
+RECORDS: Final = 200
+"""Entries of the audit trail that a new reader gets."""
+FAULTS: Final = 2_000
+"""Faults of robots, and their ends, that are remembered."""
+
+
+@dataclass
+class _Robot:
+    configured: bool
+    state: RobotState | None = None
+    goal: RobotGoal | None = None
+    path: RobotPath | None = None
+    pending: RobotPose | None = None
+    pose_at: float = -math.inf
+    heard: float = -math.inf
+
+
+class Fault(msgspec.Struct, frozen=True):
+    """A robot's fault began or ended (`began`): when (s since the epoch), which, and why in words."""
+
+    at: float
+    robot: str
+    began: bool
+    reasons: list[str]
 
 
 class ConsoleCore:
-    """What is known of the site."""
+    """Messages in; the state of everything, in `log`, out."""
 
-    def handlers(self) -> Mapping[Channel, Handler]:
+    def __init__(
+        self, site: str, run: str, *, robots: Collection[str] = (), nodes: Mapping[str, Mapping[str, Any]] | None = None
+    ) -> None:
+        """Begin with these robots, of which nothing is known; `run` as in `CompactedLog`.
+
+        nodes: by id, what the site says of them (JSON): where they hang, and their sonars.
+        """
+        self.site = site
+        self._nodes = nodes or {}
+        self.log = CompactedLog(run)
+        self.faults: deque[Fault] = deque(maxlen=FAULTS)
+        self.wanted: dict[Fetched, None] = {}
+        """What is to be fetched soon; whoever fetches it removes it first."""
+        self._fence = Fence()
+        self._map = TiledMap()
+        self._robots: dict[str, _Robot] = {}
+        self._fetched: dict[Fetched, dict[str, Any]] = {"area": {}, "node": {}, "alert": {}}
+        self._refreshed: dict[tuple[str, str], tuple[bytes, float]] = {}
+        self._records: deque[str] = deque()
+        for robot in robots:
+            self._robots[robot] = _Robot(configured=True)
+            self._put_robot(robot)
+
+    def handlers(self) -> Mapping[ch.Channel, Handler]:
         """Return the handler of every channel that the console-service subscribes to."""
-        return {}
+        return self._fence.guarded(
+            {
+                ch.MAP_DELTA: self._on_delta,
+                ch.MAP_HEARTBEAT: self._on_heartbeat,
+                ch.ZONES: self._on_zones,
+                ch.ROBOT_GOAL: self._on_goal,
+                ch.ROBOT_PATH: self._on_path,
+                ch.ROBOT_RELEASE: self._on_release,
+                ch.ROBOT_POSE: self._on_pose,
+                ch.ROBOT_STATE: self._on_state,
+                ch.ROBOT_OBSTACLES: self._on_obstacles,
+                ch.AREA_HAZARD: self._on_hazard,
+                ch.AREA_DEFINITION: self._on_definition,
+                ch.NODE_AVAILABILITY: self._on_availability,
+                ch.AGGREGATOR_ALERTS: self._on_alerts,
+            }
+        )
 
-    def tick(self, at: Moment) -> Sequence[Publication]:  # noqa: ARG002  # as every core's
+    def tick(self, at: Moment) -> Sequence[Publication]:
         """Advance to `at`; nothing is ever published."""
+        for robot, known in list(self._robots.items()):
+            if known.pending is not None and at.now - known.pose_at >= POSE_PERIOD_S:
+                self._put_pose(robot, known, known.pending, at.now)
+            if not known.configured and at.now - known.heard > FORGET_S:
+                del self._robots[robot]
+                for event in ("robot", "pose", "path", "obstacles"):
+                    self._remove(event, robot, at.now)
+        self.log.prune(at.now)
         return ()
+
+    # --- The map ----------------------------------------------------------------------------------------------------
+
+    def _on_delta(self, _ids: Ids, delta: MapDelta, at: Moment) -> Sequence[Publication]:
+        self._map.on_delta(delta, at.now)
+        self._put_map()
+        return ()
+
+    def _on_heartbeat(self, _ids: Ids, heartbeat: MapHeartbeat, at: Moment) -> Sequence[Publication]:
+        self._map.on_heartbeat(heartbeat, at.now)
+        self._put_map()
+        return ()
+
+    def wants_snapshot(self, now: float) -> bool:
+        """Whether a snapshot of the map is needed."""
+        return self._map.wants_snapshot(now)
+
+    def load(self, decoded: DecodedMap, now: float) -> None:
+        """Load a snapshot of the map; raises `MapError` and changes nothing when it is outdated."""
+        if gone := self._map.load(decoded, now):
+            for column, row in gone:
+                self.log.forget("costmap", f"{column},{row}")
+            self.log.begin_anew()
+        self._fence.raise_to(ch.MAP, decoded.version.epoch)
+        self._put_map()
+
+    def tile_jobs(self, most: int) -> list[TileJob]:
+        """Return up to `most` tiles to be encoded: run each on any thread, then `add_tile` it."""
+        return self._map.jobs(most)
+
+    def add_tile(self, job: TileJob) -> None:
+        """Take over a tile that was encoded."""
+        if self._map.add(job) and job.data is not None:
+            column, row = job.tile
+            self.log.put("costmap", f"{column},{row}", job.data)
+
+    def _put_map(self) -> None:
+        version, g = self._map.version, self._map.geometry
+        if version is not None and g is not None:
+            geometry = MapGeometry(
+                width=g.width, height=g.height, resolution=g.resolution, origin_x=g.origin_x, origin_y=g.origin_y
+            )
+            view = MapView(site=self.site, geometry=geometry, epoch=version.epoch, seq=version.seq)
+            self.log.put("map", "", msgspec.json.encode(view))
+
+    # --- Zones ------------------------------------------------------------------------------------------------------
+
+    def _on_zones(self, _ids: Ids, zones: ZoneSet, at: Moment) -> Sequence[Publication]:
+        active = set(zones.active)
+        found = {
+            zone.id: ZoneView(**{n: getattr(zone, n) for n in zone.__struct_fields__}, active=zone.id in active)
+            for zone in zones.zones
+        }
+        self._put_all("zone", found, at.now)
+        return ()
+
+    # --- Robots -----------------------------------------------------------------------------------------------------
+
+    def _robot(self, ids: Ids, at: Moment) -> tuple[str, _Robot]:
+        robot = ids["robot"]
+        known = self._robots.setdefault(robot, _Robot(configured=False))
+        known.heard = at.now
+        return robot, known
+
+    def _on_pose(self, ids: Ids, pose: RobotPose, at: Moment) -> Sequence[Publication]:
+        robot, known = self._robot(ids, at)
+        if at.now - known.pose_at >= POSE_PERIOD_S - _EARLY_S:
+            self._put_pose(robot, known, pose, at.now)
+        else:
+            known.pending = pose
+        return ()
+
+    def _put_pose(self, robot: str, known: _Robot, pose: RobotPose, now: float) -> None:
+        known.pending, known.pose_at = None, now
+        self._put("pose", robot, pose)
+
+    def _on_state(self, ids: Ids, state: RobotState, at: Moment) -> Sequence[Publication]:
+        robot, known = self._robot(ids, at)
+        before = known.state is not None and known.state.mode == "FAULT"
+        if (state.mode == "FAULT") != before:
+            self.faults.append(Fault(at.stamp, robot, not before, [] if before else list(state.reasons)))
+        known.state = state
+        self._put_robot(robot)
+        return ()
+
+    def _on_goal(self, ids: Ids, goal: RobotGoal, at: Moment) -> Sequence[Publication]:
+        robot, known = self._robot(ids, at)
+        known.goal = goal
+        if goal.pose is None:
+            known.path = None
+            self._remove("path", robot, at.now)
+        self._put_robot(robot)
+        return ()
+
+    def _on_path(self, ids: Ids, path: RobotPath, at: Moment) -> Sequence[Publication]:
+        robot, known = self._robot(ids, at)
+        known.path = path
+        view = PathView(plan_id=path.plan_id, points=path.points, released_length=path.released_length)
+        self._put("path", robot, view)
+        self._put_robot(robot)
+        return ()
+
+    def _on_release(self, ids: Ids, release: RobotRelease, at: Moment) -> Sequence[Publication]:
+        robot, known = self._robot(ids, at)
+        if known.path is not None:
+            known.path = known.path.after(release)
+            self._put_robot(robot)
+        return ()
+
+    def _on_obstacles(self, ids: Ids, obstacles: RobotObstacles, at: Moment) -> Sequence[Publication]:
+        robot, _ = self._robot(ids, at)
+        self._put("obstacles", robot, obstacles)
+        return ()
+
+    def _put_robot(self, robot: str) -> None:
+        known = self._robots[robot]
+        view = RobotView(
+            id=robot,
+            configured=known.configured,
+            state=known.state,
+            goal=goal_view(robot, known.goal),
+            plan=plan_view(known.path),
+        )
+        self._put("robot", robot, view)
+
+    # --- Areas, nodes, alerts: fetched, and told at once where a message has it --------------------------------------
+
+    def _on_hazard(self, ids: Ids, hazard: AreaHazard, at: Moment) -> Sequence[Publication]:
+        area = self._fetched["area"].get(ids["area"])
+        if area is not None:
+            area["hazard"] = msgspec.to_builtins(hazard)
+            self._put_fetched("area", ids["area"], area, at.now)
+        self.wanted.update(dict.fromkeys(("area", "node")))
+        return ()
+
+    def _on_definition(self, _ids: Ids, _definition: AreaDefinition, _at: Moment) -> Sequence[Publication]:
+        self.wanted["area"] = None
+        return ()
+
+    def _on_availability(self, _ids: Ids, _text: str, _at: Moment) -> Sequence[Publication]:
+        self.wanted["node"] = None
+        return ()
+
+    def _on_alerts(self, _ids: Ids, _alerts: AlertList, _at: Moment) -> Sequence[Publication]:
+        self.wanted["alert"] = None
+        return ()
+
+    @property
+    def areas(self) -> list[str]:
+        """The ids of all areas."""
+        return list(self._fetched["area"])
+
+    def on_fetched(self, event: Fetched, found: Mapping[str, Any], now: float) -> None:
+        """Take over all things of one kind by their ids, as REST has them, without those that are gone."""
+        known = self._fetched[event]
+        if event == "node":
+            found = {thing: {**self._nodes.get(value["id"], {}), **value} for thing, value in found.items()}
+        elif event == "area":
+            for area, value in found.items():
+                value["hazard"] = _newer(value.get("hazard"), known.get(area, {}).get("hazard"))
+        for thing in known.keys() - found.keys():
+            self._remove(event, thing, now)
+            self._refreshed.pop((event, thing), None)
+        self._fetched[event] = dict(found)
+        for thing, value in found.items():
+            self._put_fetched(event, thing, value, now)
+
+    def _put_fetched(self, event: Fetched, thing: str, value: Any, now: float) -> None:  # noqa: ANN401  # JSON
+        """Tell a thing if it has changed, or if what always changes in it was told long ago."""
+        lasting = msgspec.json.encode(_without(value, VOLATILE.get(event, ())))
+        before, told_at = self._refreshed.get((event, thing), (b"", -math.inf))
+        if lasting != before or (event in VOLATILE and now - told_at >= REFRESH_S):
+            self._refreshed[event, thing] = lasting, now
+            self._put(event, thing, value)
+
+    # --- Places and the audit trail ---------------------------------------------------------------------------------
+
+    def on_places(self, places: Mapping[str, Any], now: float) -> None:
+        """Take over all places."""
+        self._put_all("place", places, now)
+
+    def on_record(self, position: str, record: msgspec.Struct) -> None:
+        """Take over the next entry of the audit trail; `position` names it."""
+        self.log.put("record", position, msgspec.json.encode(record))
+        self._records.append(position)
+        if len(self._records) > RECORDS:
+            self.log.forget("record", self._records.popleft())
+
+    # --- The log ----------------------------------------------------------------------------------------------------
+
+    def _put(self, event: str, thing: str, value: Any) -> None:  # noqa: ANN401  # whatever becomes JSON
+        self.log.put(event, thing, msgspec.json.encode(Thing(id=thing, value=value)))
+
+    def _put_all(self, event: str, found: Mapping[str, Any], now: float) -> None:
+        for thing in [each for each in self.log.things(event) if each not in found]:
+            self._remove(event, thing, now)
+        for thing, value in found.items():
+            self._put(event, thing, value)
+
+    def _remove(self, event: str, thing: str, now: float) -> None:
+        self.log.remove(event, thing, msgspec.json.encode(Thing(id=thing, value=None)), now)
+
+
+def _newer(found: Any, known: Any) -> Any:  # noqa: ANN401  # JSON
+    """Return the later one of an area's hazards: the answer of REST may be older than a message."""
+    if found is None or known is None:
+        return found
+    return known if (known["epoch"], known["seq"]) > (found["epoch"], found["seq"]) else found
+
+
+def _without(value: Any, names: Sequence[str]) -> Any:  # noqa: ANN401  # JSON
+    if not isinstance(value, dict):
+        return value
+    return {name: _without(part, names) for name, part in value.items() if name not in names}

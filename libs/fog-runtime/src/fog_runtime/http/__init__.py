@@ -29,7 +29,7 @@ from fog_runtime.http.store_routes import (
     next_page,
     undone,
 )
-from fog_runtime.http.tokens import Admin, Caller, Guest, Operator, Tokens, Viewer, load_tokens
+from fog_runtime.http.tokens import Admin, Caller, Guest, Operator, Tokens, Viewer, load_tokens, still_admits
 from fog_runtime.token_file import TokensError, token_hash
 
 __all__ = [
@@ -70,6 +70,7 @@ __all__ = [
     "must_be_new",
     "next_page",
     "serve_here",
+    "still_admits",
     "token_hash",
     "undone",
     "unused",

@@ -4,7 +4,7 @@ import asyncio
 import re
 import sys
 from collections import Counter
-from collections.abc import Awaitable, Callable, Iterator, Mapping, MutableMapping
+from collections.abc import Awaitable, Callable, Collection, Iterator, Mapping, MutableMapping
 from contextlib import contextmanager
 from typing import Any, Final, Literal
 
@@ -73,17 +73,18 @@ class OpenLimit:
     each robot's its own: nobody keeps one from being stopped by stopping others, which may not answer.
     """
 
-    def __init__(self, app: App, urgent: Mapping[str, re.Pattern[str]]) -> None:
-        """`urgent` are the paths of requests with places of their own."""
+    def __init__(self, app: App, urgent: Mapping[str, re.Pattern[str]], lasting: Collection[str] = ()) -> None:
+        """`urgent` are the paths of requests with places of their own; their routes count those in `lasting`."""
         self._app = app
         self._urgent_paths = urgent
+        self._lasting = lasting
         self._usual = Places(MAX_OPEN, MAX_OF_CLIENT, "of your requests")
         self._urgent = Places(MAX_URGENT, MAX_URGENT_OF_PATH, "such requests")
         self._health = Places(sys.maxsize, MAX_HEALTH_OF_CLIENT, "of your requests")
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         """Serve a request, or refuse it."""
-        if scope["type"] != "http":
+        if scope["type"] != "http" or scope["path"] in self._lasting:
             await self._app(scope, receive, send)
             return
         path, whose = scope["path"], _client(scope)
@@ -231,6 +232,7 @@ def make_app(
     app.state.endpoints = {}
     app.state.core = None
     app.state.urgent = {}
+    app.state.lasting = set()
     app.state.problems = {HttpProblem.NO_ROUTE, HttpProblem.METHOD_NOT_ALLOWED}
     add_problem_handlers(app)
     _add_health(Routes(app, "health"), health)
@@ -242,7 +244,7 @@ def make_app(
     if first_page:
         app.get("/", include_in_schema=False)(about)
 
-    app.add_middleware(OpenLimit, urgent=app.state.urgent)
+    app.add_middleware(OpenLimit, urgent=app.state.urgent, lasting=app.state.lasting)
     app.add_middleware(_BodyLimit, limit=body_limit)  # before it: who sends no whole body takes no place
     generate = app.openapi
 

@@ -110,6 +110,8 @@ def _last(headers: Iterable[tuple[bytes, bytes]], header: bytes) -> str:
     return values[-1].decode("latin-1").rpartition(",")[2].strip() if values else ""
 
 
+TRANSPORT: Final = "fognav.transport"
+"""Where a request's scope has the connection's transport."""
 NICENESS: Final = 5
 """The HTTP process gets a third of the processor time of a core that wants some, too."""
 END_S: Final = 3.0
@@ -249,6 +251,8 @@ class _Connection(H11Protocol):
     def handle_events(self) -> None:
         super().handle_events()
         begun: RequestResponseCycle | None = self.cycle  # whatever uvicorn's own type says
+        if begun is not None:
+            begun.scope[TRANSPORT] = self.transport  # type: ignore[typeddict-unknown-key]  # ours, for what streams
         if begun is not None and not begun.more_body and not begun.response_complete:
             self._visitor.admit()
 

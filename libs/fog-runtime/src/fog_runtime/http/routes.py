@@ -144,6 +144,10 @@ class Routes:
         """Give requests to this path places of their own, which no other requests take (`fog_runtime.http.app`)."""
         self._app.state.urgent[path] = compile_path(path)[0]
 
+    def lasting(self, path: str) -> None:
+        """Let requests to this path last for as long as they like: they take no places, their route counts them."""
+        self._app.state.lasting.add(path)
+
     def get(self, path: str, **options: Any) -> Callable[[Handler], Handler]:
         """Add a route that reads."""
         return self._route("GET", path, **options)

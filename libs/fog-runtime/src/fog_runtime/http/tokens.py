@@ -204,6 +204,17 @@ def require(role: Role) -> Callable[..., Caller]:
     return check
 
 
+def still_admits(request: Request, role: Role) -> bool:
+    """Whether the caller of a request that lasts would be admitted now: a token may be revoked, a session may end."""
+    scheme, _, token = request.headers.get("authorization", "").partition(" ")
+    bearer = HTTPAuthorizationCredentials(scheme=scheme, credentials=token) if scheme.lower() == "bearer" else None
+    try:
+        require(role)(request, bearer)
+    except ProblemError:
+        return False
+    return True
+
+
 _CHALLENGE: Final = {"WWW-Authenticate": "Bearer"}
 
 

@@ -176,6 +176,8 @@ PAGE_BYTES: Final = 256 * 1024
 """A page ends with the entry that reaches this size: what changed may be a shape of 500 corners, twice."""
 _AT_ONCE: Final = 8
 """How many entries are read at a time, so that whoever asks for a thousand delays the event loop by milliseconds."""
+_NEWER: Final = 50
+"""How many new entries of a kind are read at once."""
 _CURSOR: Final = re.compile(r"([0-9]{1,16})-([0-9]{1,16})\.([a-z]+)")
 
 
@@ -274,6 +276,23 @@ async def read_page(
         trail.take()
         entries.append(entry)
         last, size = str(position), size + len(bytes(entry.before)) + len(bytes(entry.after))
+
+
+async def read_newer(redis: RedisConnection, prefix: str, after: dict[str, str]) -> list[tuple[str, AuditEntry]]:
+    """Return the entries since the last call with `after`, oldest first, each with what names it; at first the newest.
+
+    The streams' keys begin with `prefix`. Some may be left for the next call. Raises `StoreError`.
+    """
+    found: list[_Placed] = []
+    for kind in KINDS:
+        key = f"{prefix}{kind}"
+        if kind in after:
+            reply = await redis.read("XRANGE", key, f"({after[kind]}", "+", "COUNT", _NEWER)
+        else:
+            reply = list(reversed(await redis.read("XREVRANGE", key, "+", "-", "COUNT", _NEWER)))
+        found += [_entry(kind, entry_id, fields) for entry_id, fields in reply]
+        after[kind] = reply[-1][0].decode() if reply else after.get(kind, "0-0")
+    return [(str(placed.position), placed.entry) for placed in sorted(found)]
 
 
 def _entry(kind: str, entry_id: bytes, fields: Any) -> _Placed:  # noqa: ANN401  # as redis gives them

@@ -174,7 +174,8 @@ def test_map_of_a_log_shows_the_walls_where_they_are(folder, tmp_path, log):
 
 def test_map_without_a_reference_is_found_by_matching_and_can_be_looked_at(folder, tmp_path):
     words = ("map", "from-log", folder / "drive.jsonl.gz", "--out", tmp_path / "built")
-    code, found = run(*words, "--png", tmp_path / "loops.png", "--trajectory", tmp_path / "way.txt")
+    code, found = run(*words, "--png", tmp_path / "loops.png", "--trajectory", tmp_path / "way.txt",
+                      "--film", tmp_path / "grown.gif")  # fmt: skip
     assert code == 0
     assert found["absolute_error_m"] < 0.05
     assert found["relations"]["1 m"]["translation_m"] < 0.03
@@ -183,6 +184,13 @@ def test_map_without_a_reference_is_found_by_matching_and_can_be_looked_at(folde
     assert (np.diff(rows[:, 0]) > 0.0).all()
     with Image.open(tmp_path / "loops.png") as picture:
         assert picture.size == (found["width"], found["height"])
+    with Image.open(tmp_path / "grown.gif") as film:
+        seen = []
+        for number in range(film.n_frames):
+            film.seek(number)
+            seen.append((np.asarray(film.convert("L")) > 250).mean())
+    assert seen[0] < 0.5 * seen[-1]
+    assert seen[-1] == pytest.approx(found["free"] / found["width"] / found["height"], abs=0.05)
     assert load_map(tmp_path / "built.yaml").cells.shape == (found["height"], found["width"])
 
 

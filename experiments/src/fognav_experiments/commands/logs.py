@@ -201,6 +201,9 @@ def map_from_log(  # noqa: PLR0913  # each option is an argument
     png: Annotated[
         Path | None, typer.Option("--png", metavar="FILE", help="Draw the map, the way and its loops.")
     ] = None,
+    film: Annotated[
+        Path | None, typer.Option("--film", metavar="GIF", help="Show how the map grew, and what became of it.")
+    ] = None,
     trajectory: Annotated[
         Path | None, typer.Option("--trajectory", metavar="FILE", help="Write `stamp x y theta` for each used scan.")
     ] = None,
@@ -217,7 +220,7 @@ def map_from_log(  # noqa: PLR0913  # each option is an argument
     from fognav_experiments.localization_trials import with_noise  # noqa: PLC0415  # same
 
     with exit_codes():
-        for file in (Path(f"{out}.yaml"), png, trajectory):
+        for file in (Path(f"{out}.yaml"), png, film, trajectory):
             check_writable(file)
         log = read_log(log_file, log_format)
         used, is_noisy = log.select(scans), poses == "matched" and not log.odometry_measured
@@ -229,6 +232,8 @@ def map_from_log(  # noqa: PLR0913  # each option is an argument
             save_map(out, made.map, provenance(log_file))
         if png is not None:
             made.draw(png)
+        if film is not None:
+            made.film(film, range_max)
         if trajectory is not None:
             made.write_trajectory(trajectory)
         found = described(made.map)

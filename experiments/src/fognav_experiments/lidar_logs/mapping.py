@@ -15,6 +15,7 @@ from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn, T
 
 from fog_contracts.costs import FREE, LETHAL
 from fog_mapping.building import draw, find_trajectory
+from fog_mapping.live import LiveMap
 from fog_mapping.loops import grouped
 from fog_mapping.poses import between
 from fog_mapping.relations import absolute_error, relation_errors
@@ -33,6 +34,12 @@ if TYPE_CHECKING:
     from fognav_experiments.lidar_logs import Poses
     from fognav_experiments.lidar_logs.logs import LogScan
 
+_FILM_PICTURES: Final = 100
+_FILM_MS: Final = 80
+_FILM_LAST_MS: Final = 4000
+_FILM_PX: Final = 640
+"""Width and height of a film at most."""
+_FILM_ROBOT_M: Final = 0.17
 _GAP_M: Final = 2.0
 """Farther on, little of what a scan shows need be what the one before it showed."""
 _COLOURS: Final = {FREE: (255, 255, 255), LETHAL: (0, 0, 0)}
@@ -110,16 +117,9 @@ class MadeMap:
 
     def draw(self, file: Path) -> None:
         """Draw the map, the way and the loops, each with its name; raises `WrongUseError`."""
-        geometry, cells = self.map.geometry, self.map.cells
-        pixels = np.full((*cells.shape, 3), _UNKNOWN_COLOUR, np.uint8)
-        for value, colour in _COLOURS.items():
-            pixels[cells == value] = colour
-        picture = Image.fromarray(pixels[::-1])
+        picture = _picture(self.map)
         pen = ImageDraw.Draw(picture)
-        corner = np.array((geometry.origin_x, geometry.origin_y))
-        at = (self.poses[:, :2] - corner) / geometry.resolution
-        at[:, 1] = geometry.height - at[:, 1]
-        places = [(float(x), float(y)) for x, y in at]
+        places = _pixels(self.map, self.poses)
         pen.line(places, fill=_WAY_COLOUR)
         for group in self.loops or ():
             colour = _KEPT_COLOUR if group.kept else _REFUSED_COLOUR
@@ -129,6 +129,45 @@ class MadeMap:
             picture.save(file)
         except (OSError, ValueError) as error:
             raise WrongUseError(f"the picture can't be written to {file}: {error}. Name another .png") from error
+
+    def film(self, file: Path, range_max: float) -> None:
+        """Write a GIF: the map as it grew while the robot drove, without loops, then this one.
+
+        range_max: m, as the map was made with. Raises `WrongUseError`.
+        """
+        live, moments, way = LiveMap(self.map.geometry.resolution), [], []
+        every = max(1, len(self.used) // _FILM_PICTURES)
+        for number, one in enumerate(self.used):
+            scan = scan_of(number, one.angles, one.ranges, one.odom, range_max)
+            if scan is not None and live.add(scan):
+                way.append(live.pose)
+            if number % every == 0 and (grown := live.map()) is not None:
+                moments.append((grown, np.array(way)))
+        moments.append((self.map, self.poses))
+        # All in the frame of the first scan, whose pose both maps begin with; the picture is as large as the last map.
+        left, _, _, top = self.map.geometry.bounds
+        cell, size = self.map.geometry.resolution, (self.map.geometry.width, self.map.geometry.height)
+        larger = max(1, _FILM_PX // max(size))
+        pictures = []
+        for grown, at in moments:
+            shown = _picture(grown)
+            pen, places = ImageDraw.Draw(shown), _pixels(grown, at)
+            pen.line(places, fill=_WAY_COLOUR)
+            (x, y), r = places[-1], _FILM_ROBOT_M / cell
+            pen.ellipse((x - r, y - r, x + r, y + r), fill=_WAY_COLOUR)
+            picture = Image.new("RGB", size, _UNKNOWN_COLOUR)
+            begins, _, _, ends = grown.geometry.bounds
+            picture.paste(shown, (round((begins - left) / cell), round((top - ends) / cell)))
+            if larger > 1:
+                picture = picture.resize((size[0] * larger, size[1] * larger), Image.Resampling.NEAREST)
+            else:
+                picture.thumbnail((_FILM_PX, _FILM_PX))
+            pictures.append(picture.quantize(16))
+        shown_ms = [_FILM_MS] * (len(pictures) - 1) + [_FILM_LAST_MS]
+        try:
+            pictures[0].save(file, save_all=True, append_images=pictures[1:], duration=shown_ms, loop=0)
+        except (OSError, ValueError) as error:
+            raise WrongUseError(f"the film can't be written to {file}: {error}. Name another .gif") from error
 
     def write_trajectory(self, file: Path) -> None:
         """Write a line `stamp x y theta` (s, m, rad) for each used scan; raises `WrongUseError`."""
@@ -159,6 +198,20 @@ class MadeMap:
     def _place(self, group: LoopGroup) -> tuple[float, float]:
         x, y, _ = self.poses[group.first]
         return float(x), float(y)
+
+
+def _picture(made: StaticMap) -> Image.Image:
+    pixels = np.full((*made.cells.shape, 3), _UNKNOWN_COLOUR, np.uint8)
+    for value, colour in _COLOURS.items():
+        pixels[made.cells == value] = colour
+    return Image.fromarray(pixels[::-1])
+
+
+def _pixels(made: StaticMap, poses: NDArray[np.float64]) -> list[tuple[float, float]]:
+    """Return where poses are in the map's picture."""
+    geometry = made.geometry
+    at = (poses[:, :2] - (geometry.origin_x, geometry.origin_y)) / geometry.resolution
+    return [(float(x), float(geometry.height - y)) for x, y in at]
 
 
 def map_log(

@@ -49,6 +49,9 @@ _SAME_RAD: Final = math.radians(12.0)
 _EXPLAINED: Final = 200.0
 """The second place is the same one if the best one's own uncertainty explains it, in squared deviations."""
 _REPEATED: Final = 0.7
+_MOST_TRIED: Final = 8
+"""So many stretches, the nearest ones, are looked for at a place in a round: a robot that drives its rounds for hours
+comes to each place again and again, and each time joined to each other would take the square of the time."""
 _COUNTS: Final = 0.5
 """A loop that counts less than this contradicts the rest."""
 _KEPT: Final = 0.3
@@ -168,14 +171,17 @@ class LoopSearch:
         self, number: int, poses: NDArray[np.float64], neighbours: list[list[_Neighbour]], most: float
     ) -> Searched:
         place = self._places[number]
-        wanted = list(self._candidates(number, poses, *_uncertainty(neighbours, place.middle), most))
+        wanted = sorted(self._candidates(number, poses, *_uncertainty(neighbours, place.middle), most))[:_MOST_TRIED]
+        for _, index, half, _ in wanted:
+            self._tried[number, index] = half
         edges: list[Edge] = []
         loops: list[Loop] = []
         ambiguous = 0
         if not wanted:
             return Searched(edges, loops, ambiguous)
         reference = reference_of(self._scans, poses, range(place.first, place.last + 1), poses[place.middle])
-        for query, half, half_turn in wanted:
+        for _, index, half, half_turn in wanted:
+            query = self._queries[index]
             points, lines = thinned(
                 *cloud(self._scans, poses, range(query.first, query.last + 1), poses[query.middle]), _THIN_M
             )
@@ -203,8 +209,8 @@ class LoopSearch:
 
     def _candidates(
         self, number: int, poses: NDArray[np.float64], variance: list[float], turn_variance: list[float], most: float
-    ) -> Iterator[tuple[Stretch, float, float]]:
-        """Yield the stretches that may be at a place, with how far and how far turned to look."""
+    ) -> Iterator[tuple[float, int, float, float]]:
+        """Yield the stretches that may be at a place: how far off they seem, number, how far and turned to look."""
         place = self._places[number]
         for index, query in enumerate(self._queries):
             if query.first <= place.last and place.first <= query.last:
@@ -219,9 +225,8 @@ class LoopSearch:
             # Looked for again once it is clearly more certain where.
             if half >= _REPEATED * self._tried.get((number, index), math.inf):
                 continue
-            self._tried[number, index] = half
             turn = _SIGMAS * math.sqrt(turn_variance[query.middle])
-            yield query, half, min(max(_LEAST_RAD, turn), _MOST_RAD)
+            yield away, index, half, min(max(_LEAST_RAD, turn), _MOST_RAD)
 
     def _is_refused(self, place: Stretch, query: Stretch) -> bool:
         ends = sorted((self._way[place.middle], self._way[query.middle]))

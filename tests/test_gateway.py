@@ -100,6 +100,14 @@ def test_merged_document_has_every_route_once_and_names_only_schemas_that_it_has
     assert document["x-problems"].keys() == {code for api in services.values() for code in api["x-problems"]}
 
 
+def test_each_problem_says_what_to_do() -> None:
+    problems = {
+        (service, code): each for service, api in rest_routes().items() for code, each in api["x-problems"].items()
+    }
+    assert len(problems) > 50
+    assert [known for known, problem in problems.items() if len(problem["remedy"]) < 10] == []
+
+
 class Service(BaseHTTPRequestHandler):
     """Tells the name of the service, and what it was asked."""
 

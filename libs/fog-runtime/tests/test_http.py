@@ -35,8 +35,8 @@ class BusyError(Exception):
 
 
 class OwnProblem(ProblemCode):
-    BUSY = "busy", 503, "It is busy"
-    THERE = "there", 409, "It is there"
+    BUSY = "busy", 503, "It is busy", "Wait"
+    THERE = "there", 409, "It is there", "Take it"
     STALE = "stale", 412, "It has changed"
 
 
@@ -155,6 +155,7 @@ async def test_route_responds_by_its_signature_and_exceptions(client):
     assert made.json()["version"] == 3
     busy = await client.post("/zones", json={**zone, "reason": "lunch"}, headers=headers)
     assert is_problem(busy, 503)["detail"] == "busy: lunch"
+    assert busy.json()["remedy"] == "Wait"
     gone = await client.delete("/zones/z1", headers=headers)
     assert (gone.status_code, gone.content) == (204, b"")
     # Who may not call is told so before the body is looked at.
@@ -170,7 +171,7 @@ def test_if_match_header_gives_a_version_or_any_or_an_invalid_one(header, versio
 
 async def test_openapi_describes_responses_errors_and_tokens_by_the_signature(client):
     described = (await client.get("/openapi.json")).json()
-    assert described["x-problems"]["there"] == {"status": 409, "says": "It is there"}
+    assert described["x-problems"]["there"] == {"status": 409, "says": "It is there", "remedy": "Take it"}
     assert set(HttpProblem) > described["x-problems"].keys() - set(OwnProblem) > {"failed", "token_missing"}
     paths = described["paths"]
     post = paths["/zones"]["post"]

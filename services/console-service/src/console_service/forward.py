@@ -54,8 +54,14 @@ _ANEW_ANSWERED: Final = frozenset({b"date", b"server"})
 class ForwardProblem(ProblemCode):
     """Problems of what is passed on."""
 
-    SERVICE_AWAY = "service_away", 502, "A service does not run: `detail` names it"
-    SERVICE_SILENT = "service_silent", 504, "A service did not answer in time, or broke off: `detail` names it"
+    SERVICE_AWAY = (
+        "service_away", 502, "A service does not run: `detail` names it",
+        "Try again once it runs: `fognav status` shows it",
+    )  # fmt: skip
+    SERVICE_SILENT = (
+        "service_silent", 504, "A service did not answer in time, or broke off: `detail` names it",
+        "Look whether the change was made before you repeat it",
+    )  # fmt: skip
 
 
 def service_of(path: str) -> str:

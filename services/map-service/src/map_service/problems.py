@@ -14,16 +14,31 @@ from map_service.zones import ZoneError
 class MapProblem(ProblemCode):
     """Problems of the map-service."""
 
-    NO_ZONE = "no_zone", 404, "No zone has this id"
-    ZONE_EXISTS = "zone_exists", 409, "A zone with this id exists already"
-    ZONE_CHANGED = "zone_changed", 412, "The zone is not as the request expects: somebody else changed or added it"
-    ZONE_INVALID = "zone_invalid", 422, "The zone is invalid, or one too many: `errors` names its fields"
-    ZONES_NOT_LOADED = "zones_not_loaded", 503, "The stored zones are not loaded yet"
-    UNKNOWN_ZONE = "unknown_zone", 422, "The request names a zone that there is not"
-    UNKNOWN_AREA = "unknown_area", 422, "The request names an area that there is not"
-    DRY_RUN_REFUSED = "dry_run_refused", 422, "The change is too large to be computed at once"
-    PLANNER_AWAY = "planner_away", 503, "The planner has no answer: `Retry-After` says when to try again"
-    BUSY = "busy", 503, "Too many requests wait for a calculation: `Retry-After` says when to try again"
+    NO_ZONE = "no_zone", 404, "No zone has this id", "Choose one of GET /api/v1/zones, or POST a new one"
+    ZONE_EXISTS = "zone_exists", 409, "A zone with this id exists already", "Choose another id, or change that zone"
+    ZONE_CHANGED = (
+        "zone_changed", 412, "The zone is not as the request expects: somebody else changed or added it",
+        "Read the zone again, then decide anew",
+    )  # fmt: skip
+    ZONE_INVALID = (
+        "zone_invalid", 422, "The zone is invalid, or one too many: `errors` names its fields",
+        "Correct the fields that `errors` names, or remove another zone",
+    )  # fmt: skip
+    ZONES_NOT_LOADED = (
+        "zones_not_loaded", 503, "The stored zones are not loaded yet",
+        "Try again in a moment: /readyz says when they are",
+    )  # fmt: skip
+    UNKNOWN_ZONE = "unknown_zone", 422, "The request names a zone that there is not", "Choose one of GET /api/v1/zones"
+    UNKNOWN_AREA = "unknown_area", 422, "The request names an area that there is not", "Choose one of GET /api/v1/areas"
+    DRY_RUN_REFUSED = "dry_run_refused", 422, "The change is too large to be computed at once", "Try a smaller change"
+    PLANNER_AWAY = (
+        "planner_away", 503, "The planner has no answer: `Retry-After` says when to try again",
+        "Wait as long as `Retry-After` says",
+    )  # fmt: skip
+    BUSY = (
+        "busy", 503, "Too many requests wait for a calculation: `Retry-After` says when to try again",
+        "Wait as long as `Retry-After` says",
+    )  # fmt: skip
 
 
 ZONES_NOT_LOADED: Final = (MapProblem.ZONES_NOT_LOADED,)

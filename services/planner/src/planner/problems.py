@@ -6,17 +6,31 @@ from fog_runtime.http import ProblemCode
 class PlannerProblem(ProblemCode):
     """Problems of the planner."""
 
-    NO_ROBOT = "no_robot", 404, "No robot has this id"
-    NO_MISSION = "no_mission", 404, "The robot has no mission"
-    NO_PLACE = "no_place", 422, "The site has no such place"
-    NO_POSE = "no_pose", 409, "The planner does not know where the robot is, or has no map yet"
+    NO_ROBOT = "no_robot", 404, "No robot has this id", "Choose one of GET /api/v1/robots"
+    NO_MISSION = "no_mission", 404, "The robot has no mission", "Send it to a goal first"
+    NO_PLACE = "no_place", 422, "The site has no such place", "Choose one of GET /api/v1/places"
+    NO_POSE = (
+        "no_pose", 409, "The planner does not know where the robot is, or has no map yet",
+        "Give the robot its pose, or wait for the map",
+    )  # fmt: skip
     GOAL_REFUSED = (
-        "goal_refused",
-        422,
-        "The goal can never be reached: `refusal`, and Nav2's `code` and `name`, say why",
-    )
-    MISSION_CHANGED = "mission_changed", 412, "The robot has another mission than the request expects, or has one"
-    ROBOT_DOUBLED = "robot_doubled", 409, "Two agents use this robot's id"
-    COMMAND_REFUSED = "command_refused", 409, "The robot refuses: `refusal` and `causes` identify why"
-    COMMAND_LOST = "command_lost", 504, "The robot does not answer, or this service has no operators' key"
-    BUSY = "busy", 503, "Too many plans wait, or of this client: `Retry-After` says when to try again"
+        "goal_refused", 422, "The goal can never be reached: `refusal`, and Nav2's `code` and `name`, say why",
+        "Choose another goal, such as `nearest`, or remove what is in the way",
+    )  # fmt: skip
+    MISSION_CHANGED = (
+        "mission_changed", 412, "The robot has another mission than the request expects, or has one",
+        "Read the mission again, then decide anew",
+    )  # fmt: skip
+    ROBOT_DOUBLED = "robot_doubled", 409, "Two agents use this robot's id", "End one of them, or give it another id"
+    COMMAND_REFUSED = (
+        "command_refused", 409, "The robot refuses: `refusal` and `causes` identify why",
+        "Do what `causes` ask for, then repeat it",
+    )  # fmt: skip
+    COMMAND_LOST = (
+        "command_lost", 504, "The robot does not answer, or this service has no operators' key",
+        "Look whether the robot is on and connected, then repeat it",
+    )  # fmt: skip
+    BUSY = (
+        "busy", 503, "Too many plans wait, or of this client: `Retry-After` says when to try again",
+        "Wait as long as `Retry-After` says",
+    )  # fmt: skip

@@ -169,8 +169,11 @@ def _routes(services: Mapping[str, OpenApi]) -> str:
 
 
 def _problems(described: Mapping[str, Any]) -> str:
-    rows = ([f"`{code}`", str(text["status"]), text["says"].replace("|", "\\|")] for code, text in described.items())
-    return _table(["identifier", "status", "says"], rows)
+    rows = (
+        [f"`{code}`", str(text["status"]), *(text[part].replace("|", "\\|") for part in ("says", "remedy"))]
+        for code, text in described.items()
+    )
+    return _table(["identifier", "status", "says", "what to do"], rows)
 
 
 def _route(method: str, path: str, operation: Mapping[str, Any]) -> list[str]:

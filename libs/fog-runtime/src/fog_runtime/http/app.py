@@ -253,7 +253,8 @@ def make_app(
             described = generate()
             described.setdefault("components", {}).setdefault("schemas", {}).update(app.state.schemas)
             described["x-problems"] = {
-                code: {"status": code.status, "says": code.says} for code in sorted(app.state.problems)
+                code: {"status": code.status, "says": code.says, "remedy": code.remedy}
+                for code in sorted(app.state.problems)
             }
             app.openapi_schema = described
         return app.openapi_schema

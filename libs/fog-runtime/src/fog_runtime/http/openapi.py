@@ -110,5 +110,6 @@ def _add_problem(problems: dict[str, OpenApi], code: str, problem: OpenApi) -> N
             f"two services have the problem {code}, with the statuses {known['status']} and {problem['status']}: "
             "give one of them another identifier"
         )
-    if problem["says"] not in known["says"].split("; or: "):
-        known["says"] += f"; or: {problem['says']}"
+    for part in ("says", "remedy"):
+        if problem[part] not in known[part].split("; or: "):
+            known[part] += f"; or: {problem[part]}"

@@ -22,45 +22,90 @@ _log = logs.get("http")
 
 
 class ProblemCode(StrEnum):
-    """Base of identifiers of problems, each with its status and what it says, of which OpenAPI is made.
+    """Base of identifiers of problems, each with its status, what it says, and what to do; OpenAPI is made of them.
 
     Each service has its own; those that all services share are `HttpProblem`.
     """
 
     status: int
     says: str
+    remedy: str
 
-    def __new__(cls, code: str, status: int, says: str) -> Self:
-        """Return an identifier with its status and what it says."""
+    def __new__(cls, code: str, status: int, says: str, remedy: str = "") -> Self:
+        """Return an identifier with its status, what it says, and what to do then, whatever else `detail` names."""
         member = str.__new__(cls, code)
-        member._value_, member.status, member.says = code, status, says
+        member._value_, member.status, member.says, member.remedy = code, status, says, remedy
         return member
 
 
 class HttpProblem(ProblemCode):
     """Problems of any service."""
 
-    TOKEN_MISSING = "token_missing", 401, "The request has no token"
-    TOKEN_UNKNOWN = "token_unknown", 401, "The token is unknown"
-    SESSION_ENDED = "session_ended", 401, "The session has ended, or its token was revoked"
-    FOREIGN_ORIGIN = "foreign_origin", 403, "A session changes things from the console's own page only"
-    ROLE_TOO_LOW = "role_too_low", 403, "The token's role does not allow this"
-    NO_ROUTE = "no_route", 404, "The service has no such route"
-    METHOD_NOT_ALLOWED = "method_not_allowed", 405, "The route has no such method: `Allow` has those that it has"
-    BODY_SLOW = "body_slow", 408, "The body did not arrive in time"
-    BODY_TOO_LARGE = "body_too_large", 413, "The body is too large"
-    REQUEST_INVALID = "request_invalid", 422, "Body, parameter or header is invalid: `errors` names the fields"
-    KEY_REUSED = "key_reused", 422, "The Idempotency-Key was used for another request"
-    NO_ENTRY = "no_entry", 404, "The audit trail has no such entry of this record"
-    NOT_UNDOABLE = "not_undoable", 409, "The change can't be undone"
-    CHANGED_SINCE = "changed_since", 409, "Somebody has changed the record since: `by`, `action`, `at`, `entry`"
-    NOTHING_LOST = "nothing_lost", 409, "There is nothing to recover"
-    FAILED = "failed", 500, "The service failed: its log names the reason"
-    STANDS_BY = "stands_by", 503, "This process stands by: another one leads"
-    RESTARTED = "restarted", 503, "The service is started again: `Retry-After` says when to try again"
-    OVERLOADED = "overloaded", 503, "The service serves too many requests: `Retry-After` says when to try again"
-    STORE_AWAY = "store_away", 503, "The store does not answer, or refuses writes; nothing was changed"
-    STORE_UNCERTAIN = "store_uncertain", 503, "The store fell silent: the change may be stored; repeat the request"
+    TOKEN_MISSING = (
+        "token_missing", 401, "The request has no token",
+        "Log in on the console, or send `Authorization: Bearer TOKEN`",
+    )  # fmt: skip
+    TOKEN_UNKNOWN = (
+        "token_unknown", 401, "The token is unknown",
+        "Use one of the site's tokens: `fognav token list` shows whose there are",
+    )  # fmt: skip
+    SESSION_ENDED = "session_ended", 401, "The session has ended, or its token was revoked", "Log in again"
+    FOREIGN_ORIGIN = (
+        "foreign_origin", 403, "A session changes things from the console's own page only",
+        "Repeat it on the console's own page, or send a token",
+    )  # fmt: skip
+    ROLE_TOO_LOW = (
+        "role_too_low", 403, "The token's role does not allow this",
+        "Use a token with the role that `detail` names, or ask who has one",
+    )  # fmt: skip
+    NO_ROUTE = "no_route", 404, "The service has no such route", "Look for the route in /openapi.json"
+    METHOD_NOT_ALLOWED = (
+        "method_not_allowed", 405, "The route has no such method: `Allow` has those that it has",
+        "Use a method that `Allow` has",
+    )  # fmt: skip
+    BODY_SLOW = "body_slow", 408, "The body did not arrive in time", "Send it again, at once"
+    BODY_TOO_LARGE = "body_too_large", 413, "The body is too large", "Send less at once"
+    REQUEST_INVALID = (
+        "request_invalid", 422, "Body, parameter or header is invalid: `errors` names the fields",
+        "Correct the fields that `errors` names",
+    )  # fmt: skip
+    KEY_REUSED = (
+        "key_reused",
+        422,
+        "The Idempotency-Key was used for another request",
+        "Use a new Idempotency-Key for each change",
+    )
+    NO_ENTRY = "no_entry", 404, "The audit trail has no such entry of this record", "Choose one of GET /api/v1/audit"
+    NOT_UNDOABLE = "not_undoable", 409, "The change can't be undone", "Make the change that you want instead"
+    CHANGED_SINCE = (
+        "changed_since", 409, "Somebody has changed the record since: `by`, `action`, `at`, `entry`",
+        "Look at the later change; undo that first, or make yours anew",
+    )  # fmt: skip
+    NOTHING_LOST = (
+        "nothing_lost", 409, "There is nothing to recover",
+        "Do nothing: GET /api/v1/store says how the store is",
+    )  # fmt: skip
+    FAILED = (
+        "failed", 500, "The service failed: its log names the reason",
+        "Look into the log (`fognav logs`), then try again",
+    )  # fmt: skip
+    STANDS_BY = "stands_by", 503, "This process stands by: another one leads", "Send the request to the one that leads"
+    RESTARTED = (
+        "restarted", 503, "The service is started again: `Retry-After` says when to try again",
+        "Wait as long as `Retry-After` says",
+    )  # fmt: skip
+    OVERLOADED = (
+        "overloaded", 503, "The service serves too many requests: `Retry-After` says when to try again",
+        "Wait as long as `Retry-After` says, and send fewer at once",
+    )  # fmt: skip
+    STORE_AWAY = (
+        "store_away", 503, "The store does not answer, or refuses writes; nothing was changed",
+        "Try again once Redis runs: /readyz says when",
+    )  # fmt: skip
+    STORE_UNCERTAIN = (
+        "store_uncertain", 503, "The store fell silent: the change may be stored; repeat the request",
+        "Repeat it, with the Idempotency-Key if it had one",
+    )  # fmt: skip
 
 
 class FieldProblem(msgspec.Struct, frozen=True):
@@ -77,6 +122,7 @@ class Problem(msgspec.Struct, frozen=True):
     title: str
     status: int
     detail: str
+    remedy: str = ""
     errors: list[FieldProblem] = []
 
 
@@ -123,6 +169,7 @@ def problem(
         "title": HTTPStatus(status).phrase if isinstance(code, int) else code.says,
         "status": status,
         "detail": detail,
+        **({} if isinstance(code, int) else {"remedy": code.remedy}),
         **extra,
     }
     if errors:

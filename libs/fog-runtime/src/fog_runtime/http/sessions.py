@@ -25,8 +25,14 @@ _log = logs.get("sessions")
 class SessionProblem(ProblemCode):
     """Problems of logging in."""
 
-    TOO_MANY_ATTEMPTS = "too_many_attempts", 429, "Too many unknown tokens: `Retry-After` says when to try again"
-    NO_SESSIONS = "no_sessions", 503, "This service has no key of sessions"
+    TOO_MANY_ATTEMPTS = (
+        "too_many_attempts", 429, "Too many unknown tokens: `Retry-After` says when to try again",
+        "Wait as long as `Retry-After` says, and copy the token anew",
+    )  # fmt: skip
+    NO_SESSIONS = (
+        "no_sessions", 503, "This service has no key of sessions",
+        "Set FOGNAV_SESSION_KEY_FILE of each service to the site's session.key",
+    )  # fmt: skip
 
 
 class Login(Message, frozen=True, kw_only=True):

@@ -7,11 +7,14 @@ type Schemas = components["schemas"];
 type Sent<T, Needed extends keyof T = never> = Pick<T, Needed> & Partial<T>;
 
 export type Alert = Schemas["Alert"];
+export type AppliedChange = Schemas["AppliedChange"];
 export type AreaState = "blocked" | "clear" | "unknown";
 export type AreaView = Schemas["AreaView"];
 export type AuditEntry = Schemas["AuditEntry"];
 export type CommandBody = Sent<Schemas["CommandBody"], "kind">;
 export type CommandOutcome = Schemas["CommandOutcome"];
+export type DryRunBody = Omit<Sent<Schemas["DryRunBody"]>, "zones"> & { readonly zones?: readonly ZoneBody[] };
+export type DryRunOutcome = Schemas["DryRunOutcome"];
 export type GoalBody = Sent<Schemas["GoalBody"]>;
 export type GoalView = Schemas["GoalView"];
 export type MapGeometry = Schemas["MapGeometry"];

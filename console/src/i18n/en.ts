@@ -1,4 +1,7 @@
+import { enZones } from "./en-zones";
+
 export const en = {
+  ...enZones,
   "app.name": "Fognav",
   "skip": "Skip to the content",
   "view.map": "Map",

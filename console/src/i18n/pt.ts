@@ -1,6 +1,8 @@
 import type { en } from "./en";
+import { ptZones } from "./pt-zones";
 
 export const pt: Readonly<Record<keyof typeof en, string>> = {
+  ...ptZones,
   "app.name": "Fognav",
   "skip": "Saltar para o conteúdo",
   "view.map": "Mapa",

@@ -1,0 +1,64 @@
+// The times of the week in which a zone is in force.
+import { t } from "../i18n/i18n";
+import { DAYS, type Schedule } from "./draft";
+
+interface Props {
+  readonly schedule: Schedule | null;
+  readonly onChange: (schedule: Schedule | null) => void;
+}
+
+type Times = Schedule["times"];
+const WORKDAYS: Times[number] = { days: ["mon", "tue", "wed", "thu", "fri"], begin: "08:00", end: "18:00" };
+
+export function ScheduleFields({ schedule, onChange }: Props): preact.JSX.Element {
+  const zone = Intl.DateTimeFormat().resolvedOptions().timeZone;
+  if (schedule === null) {
+    return <button type="button" onClick={() => onChange({ time_zone: zone, times: [WORKDAYS] })}>{t("schedule.add")}</button>;
+  }
+  const set = (times: Times): void => onChange(times.length === 0 ? null : { ...schedule, times });
+  const change = (index: number, to: Partial<Times[number]>): void =>
+    set(schedule.times.map((time, i) => (i === index ? { ...time, ...to } : time)));
+  return (
+    <>
+      {schedule.times.map((time, index) => (
+        <fieldset class="times" key={index}>
+          <legend class="muted">{t("schedule.window", { number: index + 1 })}</legend>
+          <div class="days">
+            {DAYS.map((day) => (
+              <label key={day}>
+                <input type="checkbox" checked={time.days.includes(day)} onChange={(event) => {
+                  const days = DAYS.filter((other) => (other === day ? event.currentTarget.checked : time.days.includes(other)));
+                  // A window on no day would be refused.
+                  if (days.length > 0) change(index, { days });
+                  else event.currentTarget.checked = true;
+                }} />
+                {t(`day.${day}`)}
+              </label>
+            ))}
+          </div>
+          <div class="fields">
+            <label>{t("schedule.begin")}
+              <input type="time" required value={time.begin} onChange={(event) => event.currentTarget.value && change(index, { begin: event.currentTarget.value })} />
+            </label>
+            <label>{t("schedule.end")}
+              <input type="time" required value={time.end} onChange={(event) => event.currentTarget.value && change(index, { end: event.currentTarget.value })} />
+            </label>
+            <button type="button" class="low" aria-label={t("schedule.remove", { number: index + 1 })} onClick={() => set(schedule.times.filter((_, i) => i !== index))}>✕</button>
+          </div>
+        </fieldset>
+      ))}
+      <div class="fields">
+        <label>{t("schedule.zone")}
+          <input value={schedule.time_zone} maxLength={64} spellcheck={false} onChange={(event) => onChange({ ...schedule, time_zone: event.currentTarget.value })} />
+        </label>
+        <button type="button" class="low" disabled={schedule.times.length >= 20} onClick={() => set([...schedule.times, WORKDAYS])}>{t("schedule.another")}</button>
+      </div>
+    </>
+  );
+}
+
+/** Return a schedule in one line. */
+export function scheduleText(schedule: Schedule): string {
+  const windows = schedule.times.map(({ days, begin, end }) => `${days.map((day) => t(`day.${day}`)).join(" ")} ${begin}–${end}`);
+  return `${windows.join("; ")} (${schedule.time_zone})`;
+}

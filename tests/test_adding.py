@@ -35,6 +35,8 @@ MAKE_POLYGONS = {
     "experiments/src/fognav_experiments/scenarios/stage.py", "robot-agent/src/robot_agent/agent/navigation.py"
 }  # fmt: skip
 """They make a shape of a list of corners, whatever other kinds there are."""
+GEOJSON = "services/map-service/src/map_service/geojson.py"
+"""It writes other kinds of shapes, too, but without a geometry that other programs show."""
 ORACLE = "experiments/src/fognav_experiments/hunt/oracle.py"
 """It computes for itself where zones are: an error in the shapes must not be its own, too."""
 DRAWING_COMMANDS = {
@@ -130,6 +132,9 @@ from hazard_aggregator.publications import node_config
 )  # fmt: skip
 
 ROUTE = (
+    Edit(MAP_API, r"^from typing import ", before="""\
+from typing import Annotated
+"""),
     Edit(MAP_API, r"^class ZoneList\(", before='''\
 class Extension(Message, frozen=True, kw_only=True):
     """For how much longer a zone holds, from now on."""
@@ -285,7 +290,7 @@ def test_only_messages_shapes_and_the_commands_that_draw_them_distinguish_kinds_
     asking = re.compile(rf"\b({'|'.join(names)})\b|\btype\b\W+({'|'.join(tags)})\b")
     files = [file for source in SOURCES for suffix in ("py", "js") for file in source.parent.rglob(f"*.{suffix}")]
     found = {str(file.relative_to(ROOT)) for file in files if asking.search(file.read_text("utf-8"))}
-    assert found == {f"{MESSAGES}/maps.py", SHAPES, *DRAWING_COMMANDS, *MAKE_POLYGONS, ORACLE}
+    assert found == {f"{MESSAGES}/maps.py", SHAPES, *DRAWING_COMMANDS, *MAKE_POLYGONS, GEOJSON, ORACLE}
 
 
 # --- The document ---------------------------------------------------------------------------------------------------

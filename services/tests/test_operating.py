@@ -247,3 +247,61 @@ async def test_change_is_applied_by_a_robot_once_that_reports_a_map_which_contai
     assert (await operator.ask("DELETE", "/api/v1/zones/seen")).status_code == 204
     change, found = await robots()
     assert (change["state"], found["r1"]["applied"]) == ("removed", False)
+
+
+async def test_zones_leave_and_come_back_as_geojson(operator):
+    shapes = [
+        {"type": "rectangle", "corner": [1.0, 1.0], "opposite": [2.0, 2.5]},
+        {"type": "polygon", "points": [[1.0, 1.0], [2.0, 1.0], [1.5, 2.0]]},
+        {"type": "circle", "centre": [6.0, 1.5], "radius": 0.5},
+        {"type": "corridor", "line": [[5.0, 5.0], [6.0, 5.0]], "width": 0.4},
+    ]
+    for number, shape in enumerate(shapes):
+        body = {"kind": "PENALTY", "factor": 2.0, "shape": shape, "id": f"g{number}", "reason": "<b>wet</b>"}
+        body |= {"ttl_s": 900.0} if number == 3 else {}
+        assert (await operator.ask("POST", "/api/v1/zones", body)).status_code == 201
+    answer = await operator.ask("GET", "/api/v1/zones.geojson")
+    assert answer.headers["content-type"] == "application/geo+json"
+    collection, before = answer.json(), (await operator.ask("GET", "/api/v1/zones")).json()["zones"]
+    assert collection["fognav"] == {"site": "test", "frame": "map", "unit": "m"}
+    same = await operator.ask("POST", "/api/v1/zones.geojson", collection)
+    assert {zone["outcome"] for zone in same.json()} == {"unchanged"}
+    for zone in before:
+        assert (await operator.ask("DELETE", f"/api/v1/zones/{zone['id']}")).status_code == 204
+    added = await operator.ask("POST", "/api/v1/zones.geojson", collection)
+    assert {zone["outcome"] for zone in added.json()} == {"added"}
+    after = (await operator.ask("GET", "/api/v1/zones")).json()["zones"]
+    ours = {"version": 0, "ttl_s": None}
+    assert [{**zone, **ours} for zone in after] == [{**zone, **ours} for zone in before]
+    collection["features"][0]["properties"]["reason"] = "dry"
+    changed = await operator.ask("POST", "/api/v1/zones.geojson", collection)
+    assert [zone["outcome"] for zone in changed.json()] == ["replaced", "unchanged", "unchanged", "unchanged"]
+
+
+async def test_geojson_with_wrong_features_changes_nothing_and_names_each_of_them(operator):
+    def feature(geometry: object, **properties: object) -> dict[str, object]:
+        return {"type": "Feature", "geometry": geometry, "properties": {"kind": "BLOCKED", **properties}}
+
+    ring = [[1.0, 1.0], [2.0, 1.0], [2.0, 2.0], [1.0, 1.0]]
+    features = [
+        feature({"type": "Polygon", "coordinates": [ring]}, id="fine"),
+        feature({"type": "Polygon", "coordinates": [ring, ring]}),
+        feature({"type": "Point", "coordinates": [1.0, 1.0]}),
+        feature({"type": "Polygon", "coordinates": [ring]}, kind="PENALTY", factor=9),
+        feature({"type": "Polygon", "coordinates": [[[-9.1, 38.7], [-9.0, 38.7], [-9.0, 38.8], [-9.1, 38.7]]]}),
+        feature({"type": "Polygon", "coordinates": [ring]}, id="No Id"),
+        feature({"type": "LineString", "coordinates": [[1.0, 1.0]]}, width=1.0),
+    ]
+    before = (await operator.ask("GET", "/api/v1/zones")).json()["zones"]
+    answer = await operator.ask("POST", "/api/v1/zones.geojson", {"type": "FeatureCollection", "features": features})
+    errors = {error["field"]: error["problem"] for error in answer.json()["errors"]}
+    assert answer.status_code == 422
+    assert list(errors) == [
+        "body.features.1.geometry", "body.features.2.properties.radius", "body.features.3.properties.factor",
+        "body.features.4.geometry", "body.features.5.id", "body.features.6.geometry",
+    ]  # fmt: skip
+    assert "not longitude and latitude" in errors["body.features.4.geometry"]
+    assert (await operator.ask("GET", "/api/v1/zones")).json()["zones"] == before
+    unknown = feature({"type": "MultiPoint", "coordinates": []})
+    answer = await operator.ask("POST", "/api/v1/zones.geojson", {"type": "FeatureCollection", "features": [unknown]})
+    assert answer.json()["errors"][0]["field"] == "body.features.0.geometry.type"

@@ -50,6 +50,7 @@ from map_service.api_dry_run import add_dry_runs
 from map_service.api_views import add_views
 from map_service.applied import AppliedChange, ChangeKind
 from map_service.core import ScrapeTarget
+from map_service.geojson import add_geojson
 from map_service.problems import NO_SUCH_ZONE, ZONES_NOT_LOADED, MapProblem, add_errors, require_zones
 from map_service.service import Service
 from map_service.undo import add_undo
@@ -88,6 +89,7 @@ def make_api(  # the process's parts
     _add_zone_reads(zones, service)
     _add_zone_writes(zones, service, clock)
     add_dry_runs(zones, service, site, clock)
+    add_geojson(zones, service, site, clock)
     add_undo(zones, service, clock)
     _add_applied(zones, service, clock)
     _add_audit(zones, service)

@@ -91,7 +91,7 @@ export function ConsoleApp({ session, onExpired, onLogOut }: Props): preact.JSX.
   useEffect(() => floor?.select(robot), [floor, robot]);
 
   const value: Console = {
-    live, session, floor, robot, say, logOut: onLogOut,
+    live, session, floor, robot, robots, say, logOut: onLogOut,
     chooseRobot: setChosen,
   };
   const Panel = PANELS[route.view];
@@ -120,7 +120,7 @@ export function ConsoleApp({ session, onExpired, onLogOut }: Props): preact.JSX.
           {floor && <MapTools />}
         </section>
         <main id="content" tabIndex={-1} aria-label={t(`view.${route.view}`)}><Panel /></main>
-        <p class={`said ${said.kind}`} role="status" aria-live="polite">{said.text}</p>
+        <p class={`said ${said.kind}`} role="status" aria-live="polite"><span>{said.text}</span></p>
         <StopBar robot={robot} robots={robots} say={say} />
       </div>
     </ConsoleContext.Provider>

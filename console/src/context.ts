@@ -12,6 +12,8 @@ export interface Console {
   readonly floor: Floor | null;
   /** The robot that stop button and commands are for; null: none is known. */
   readonly robot: string | null;
+  /** All robots, sorted. */
+  readonly robots: readonly string[];
   readonly chooseRobot: (id: string) => void;
   /** Say something in the live region: a result of what the user did, or a change that matters. */
   readonly say: (text: string, kind?: "done" | "failed") => void;
@@ -30,27 +32,38 @@ export function mayOperate(session: Session): boolean {
   return session.role === "operator" || session.role === "admin";
 }
 
-const PERIOD_MS = 250;
+const PERIOD_MS = 300;
 
-/** Draw the component anew when something in these topics changes, at most four times a second. */
-export function useLive(topics: readonly Topic[]): Live {
+const waiting = new Set<() => void>();
+let timer: ReturnType<typeof setTimeout> | undefined;
+
+/** Draw components anew together, at most about three times a second: a person reads no faster. */
+function redrawSoon(redraw: () => void): void {
+  waiting.add(redraw);
+  timer ??= setTimeout(() => {
+    timer = undefined;
+    const due = [...waiting];
+    waiting.clear();
+    for (const each of due) each();
+  }, PERIOD_MS);
+}
+
+/** Draw the component anew when something in these topics changes; with `only`, when what has this id does. */
+export function useLive(topics: readonly Topic[], only?: string): Live {
   const { live } = useConsole();
-  const [, redraw] = useReducer((count: number) => count + 1, 0);
+  const [, count] = useReducer((before: number) => before + 1, 0);
   const key = topics.join(" ");
   useEffect(() => {
-    let timer: ReturnType<typeof setTimeout> | undefined;
-    const off = live.on(key.split(" ") as Topic[], () => {
-      timer ??= setTimeout(() => {
-        timer = undefined;
-        redraw(0);
-      }, PERIOD_MS);
+    const redraw = (): void => count(0);
+    const off = live.on(key.split(" ") as Topic[], (id) => {
+      if (only === undefined || id === only || id === "") redrawSoon(redraw);
     });
-    redraw(0);
+    redrawSoon(redraw);
     return () => {
       off();
-      clearTimeout(timer);
+      waiting.delete(redraw);
     };
-  }, [live, key]);
+  }, [live, key, only]);
   return live;
 }
 

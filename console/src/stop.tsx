@@ -63,10 +63,10 @@ export function StopBar({ robot, robots, say }: Props): preact.JSX.Element {
     <section class="stopbar" aria-label={t("stop.bar")} title={t("stop.keys")}>
       <button class="stop" disabled={robot === null} aria-keyshortcuts="F9" onClick={() => robot !== null && void stop(robot)}>
         <span class="octagon" aria-hidden="true" />
-        {robot === null ? t("stop.none") : stopping.includes(robot) ? t("stop.sending") : t("stop.robot", { robot })}
+        <span>{robot === null ? t("stop.none") : stopping.includes(robot) ? t("stop.sending") : t("stop.robot", { robot })}</span>
       </button>
       <button class="stop all" disabled={robots.length === 0} aria-keyshortcuts="Shift+F9" onClick={stopAll}>
-        {t("stop.all")}
+        <span>{t("stop.all")}</span>
       </button>
     </section>
   );

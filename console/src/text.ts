@@ -1,6 +1,8 @@
 // Numbers and times as text, in the user's language.
 import { language } from "./i18n/i18n";
 
+const formats = new Map<string, Intl.NumberFormat>();
+
 /** Return the time of day of a stamp (s since the epoch), with the day if it is not today. */
 export function clockTime(stamp: number, now: number = Date.now()): string {
   const date = new Date(stamp * 1000);
@@ -13,7 +15,12 @@ export function clockTime(stamp: number, now: number = Date.now()): string {
 
 /** Return a number with a fixed number of decimals. */
 export function decimal(value: number, digits: number): string {
-  return value.toLocaleString(language(), { minimumFractionDigits: digits, maximumFractionDigits: digits });
+  // A format is expensive to make, and used many times a second.
+  const key = `${language()} ${digits}`;
+  const known = formats.get(key)
+    ?? new Intl.NumberFormat(language(), { minimumFractionDigits: digits, maximumFractionDigits: digits });
+  formats.set(key, known);
+  return known.format(value);
 }
 
 export function metres(value: number | null | undefined, digits = 1): string {

@@ -132,7 +132,8 @@ export class Stream {
       });
       if (response.status === 401 || response.status === 403) return false;
       if (!response.ok || response.body === null) return true;
-      const reader = response.body.pipeThrough(new TextDecoderStream()).getReader();
+      const reader = response.body.getReader();
+      const decoder = new TextDecoder();
       const parser = new EventParser();
       this.handlers.onConnection("open");
       for (;;) {
@@ -141,7 +142,7 @@ export class Stream {
         clearTimeout(silence);
         silence = setTimeout(() => reading.abort(), SILENCE_MS);
         this.attempt = 0;
-        for (const event of parser.push(value)) {
+        for (const event of parser.push(decoder.decode(value, { stream: true }))) {
           this.handlers.onEvent(event);
           // An event without an id (`time`) leaves the last one as it is.
           if (event.id !== null) this.lastId = event.id;

@@ -3,8 +3,8 @@ import L from "leaflet";
 import type { MapGeometry, Tile } from "../api/types";
 import { costColours } from "./palette";
 
-/** Cells on an edge of one canvas: larger ones are refused by some phones. */
-const BLOCK = 1024;
+/** Cells on an edge of one canvas: a change hands over all of its canvas. */
+const BLOCK = 512;
 
 /** A canvas on the map, scaled with it. */
 class CanvasOverlay extends L.ImageOverlay {
@@ -26,7 +26,9 @@ class CanvasOverlay extends L.ImageOverlay {
 }
 
 interface Block {
-  readonly context: CanvasRenderingContext2D;
+  readonly context: OffscreenCanvasRenderingContext2D;
+  /** What is seen: pictures are handed to it whole, since a canvas that is drawn on is copied for every frame. */
+  readonly shown: ImageBitmapRenderingContext;
   readonly overlay: L.ImageOverlay;
   /** The costs, row 0 at the top, for another theme's colours. */
   readonly costs: Uint8Array;
@@ -39,6 +41,8 @@ export class CostLayer {
   private readonly blocks = new Map<string, Block>();
   private colours = costColours();
   private shown = true;
+  private readonly changed = new Set<Block>();
+  private pending = 0;
   private readonly scratch = document.createElement("canvas");
 
   constructor(
@@ -104,6 +108,15 @@ export class CostLayer {
       }
     }
     block.context.putImageData(image, left, top);
+    this.changed.add(block);
+    if (this.pending === 0) this.pending = requestAnimationFrame(() => void this.present());
+  }
+
+  private async present(): Promise<void> {
+    this.pending = 0;
+    const changed = [...this.changed];
+    this.changed.clear();
+    for (const block of changed) block.shown.transferFromImageBitmap(await createImageBitmap(block.context.canvas));
   }
 
   private block(x: number, y: number): Block {
@@ -115,8 +128,9 @@ export class CostLayer {
     const canvas = document.createElement("canvas");
     canvas.width = width;
     canvas.height = height;
-    const context = canvas.getContext("2d");
-    if (!context) throw new Error("the browser has no canvas");
+    const context = new OffscreenCanvas(width, height).getContext("2d");
+    const shown = canvas.getContext("bitmaprenderer");
+    if (!context || !shown) throw new Error("the browser has no canvas");
     const { resolution, origin_x, origin_y } = this.geometry;
     const topEdge = origin_y + (this.geometry.height - y) * resolution;
     const leftEdge = origin_x + x * resolution;
@@ -126,7 +140,7 @@ export class CostLayer {
     );
     const overlay = new CanvasOverlay(canvas, bounds, this.pane);
     if (this.shown) overlay.addTo(this.map);
-    const block = { context, overlay, costs: new Uint8Array(width * height).fill(255), width, height };
+    const block = { context, shown, overlay, costs: new Uint8Array(width * height).fill(255), width, height };
     this.blocks.set(key, block);
     return block;
   }

@@ -5,7 +5,7 @@ import type { Live } from "../live/live";
 import { CostLayer } from "./cost-layer";
 import { FixedLayer } from "./fixed-layer";
 import { box } from "./geometry";
-import { MovingLayer } from "./moving-layer";
+import { RobotLayer } from "./robot-layer";
 
 export interface FloorHandlers {
   readonly onRobot: (id: string) => void;
@@ -18,14 +18,12 @@ export type Pick = (point: Point) => void;
 /** A drag on the floor, from where it began to where it is; a click is one that ends where it began. */
 export type Drag = (from: Point, to: Point, done: boolean) => void;
 
-const REDRAWING = ["robot", "pose", "path", "obstacles", "scan", "time", "connection"] as const;
-const HIT_PX = 24;
 /** Below so many pixels a metre labels are short (Leaflet's zoom is the binary logarithm). */
 const NEARBY_ZOOM = Math.log2(20);
 
 export class Floor {
   readonly map: L.Map;
-  readonly moving: MovingLayer;
+  readonly robots: RobotLayer;
   readonly fixed: FixedLayer;
   private plan: CostLayer | null = null;
   private costs: CostLayer | null = null;
@@ -33,6 +31,7 @@ export class Floor {
   private readonly stops: (() => void)[] = [];
   private pick: Pick | null = null;
   private endDrag: (() => void) | null = null;
+  private selected: string | null = null;
   private follows = false;
   private costsShown = true;
   private fitted = false;
@@ -40,7 +39,7 @@ export class Floor {
   constructor(
     readonly element: HTMLElement,
     private readonly live: Live,
-    private readonly handlers: FloorHandlers,
+    handlers: FloorHandlers,
   ) {
     this.map = L.map(element, {
       crs: L.CRS.Simple,
@@ -60,7 +59,7 @@ export class Floor {
     this.map.createPane("plan").classList.add("below");
     this.map.createPane("costs").classList.add("below");
     this.map.setView([0, 0], 3);
-    this.moving = new MovingLayer(live).addTo(this.map);
+    this.robots = new RobotLayer(this.map, live, handlers.onRobot);
     this.fixed = new FixedLayer(this.map, live, handlers.onZone);
     this.map.on("click", (event) => this.click(event));
     const distance = (): void => void element.classList.toggle("afar", this.map.getZoom() < NEARBY_ZOOM);
@@ -68,13 +67,15 @@ export class Floor {
     distance();
     this.map.on("dragstart", () => this.follow(false));
     this.stops.push(
-      live.on(REDRAWING, () => {
-        this.moving.redraw();
-        if (this.follows) this.centre();
+      live.on(["pose"], (id) => {
+        if (this.follows && id === this.selected) this.centre();
       }),
       live.on(["map"], () => this.takeMap()),
       live.on(["costmap"], (key) => this.takeTile(key)),
-      live.on(["ready"], () => this.fitOnce()),
+      live.on(["ready"], () => {
+        this.fitOnce();
+        this.showCells();
+      }),
     );
     const resize = new ResizeObserver(() => {
       this.map.invalidateSize({ animate: false });
@@ -89,6 +90,7 @@ export class Floor {
   remove(): void {
     for (const stop of this.stops) stop();
     this.fixed.remove();
+    this.robots.remove();
     this.map.remove();
   }
 
@@ -96,12 +98,11 @@ export class Floor {
   recolour(): void {
     this.plan?.recolour();
     this.costs?.recolour();
-    this.moving.readColours();
   }
 
   select(robot: string | null): void {
-    this.moving.selected = robot;
-    this.moving.redraw();
+    this.selected = robot;
+    this.robots.select(robot);
     if (this.follows) this.centre();
   }
 
@@ -118,19 +119,17 @@ export class Floor {
 
   showCosts(shown: boolean): void {
     this.costsShown = shown;
-    this.costs?.show(shown);
+    this.showCells();
   }
 
   /** Show a path that is not sent yet; none with an empty one. */
   preview(points: readonly Point[]): void {
-    this.moving.preview = points;
-    this.moving.redraw();
+    this.robots.preview(points);
   }
 
   /** Show a pose that is not sent yet; none with null. */
   previewPose(at: Point | null, theta = 0): void {
-    this.moving.previewPose = at && { at, theta };
-    this.moving.redraw();
+    this.robots.previewPose(at, theta);
   }
 
   /** Send clicks to `pick` until it is set to null. */
@@ -202,23 +201,12 @@ export class Floor {
   }
 
   private centre(): void {
-    const pose = this.moving.selected === null ? undefined : this.live.of.pose.get(this.moving.selected);
+    const pose = this.selected === null ? undefined : this.live.of.pose.get(this.selected);
     if (pose) this.map.panTo([pose.y, pose.x], { animate: false });
   }
 
   private click(event: L.LeafletMouseEvent): void {
-    const point: Point = [event.latlng.lng, event.latlng.lat];
-    if (this.pick) {
-      this.pick(point);
-      return;
-    }
-    let nearest: string | null = null;
-    let least = HIT_PX;
-    for (const [id, pose] of this.live.of.pose) {
-      const distance = this.map.latLngToContainerPoint([pose.y, pose.x]).distanceTo(event.containerPoint);
-      if (distance <= least) [nearest, least] = [id, distance];
-    }
-    if (nearest !== null) this.handlers.onRobot(nearest);
+    this.pick?.([event.latlng.lng, event.latlng.lat]);
   }
 
   /** Begin with another map: its plan is one picture, everything after comes in tiles. */
@@ -233,7 +221,7 @@ export class Floor {
     this.costs?.remove();
     this.plan = new CostLayer(this.map, geometry, "plan");
     this.costs = new CostLayer(this.map, geometry, "costs");
-    this.costs.show(this.costsShown);
+    this.showCells();
     const { plan } = this;
     void fetch("api/v1/map.png", { cache: "no-cache" })
       .then((response) => (response.ok ? response.blob() : Promise.reject(new Error(`HTTP ${response.status}`))))
@@ -241,6 +229,13 @@ export class Floor {
       .catch((error: unknown) => console.warn("the plan can't be shown:", error));
     for (const tile of this.live.tiles.keys()) this.takeTile(tile);
     this.fitOnce();
+  }
+
+  /** The costmap shows the plan, too: only one of them is there to be painted. */
+  private showCells(): void {
+    const costs = this.costsShown && this.live.tiles.size > 0;
+    this.costs?.show(costs);
+    this.plan?.show(!costs);
   }
 
   private takeTile(key: string): void {

@@ -9,15 +9,14 @@ import { RobotCard } from "./robot-card";
 const RANK = { blocked: 0, unknown: 1, clear: 2 } as const;
 
 export function MapView(): preact.JSX.Element {
-  const { robot } = useConsole();
-  const live = useLive(["zone", "area", "alert", "robot", "pose"]);
+  const { robot, robots } = useConsole();
+  const live = useLive(["zone", "area", "alert"]);
   const areas = [...live.of.area.values()].sort(
     (a, b) => RANK[a.hazard?.state ?? "unknown"] - RANK[b.hazard?.state ?? "unknown"]
       || (a.definition.label || a.definition.id).localeCompare(b.definition.label || b.definition.id),
   );
   const zones = [...live.of.zone.values()].filter((zone) => zone.active);
   const alerts = [...live.of.alert.values()];
-  const robots = [...live.of.robot.keys()].sort();
   return (
     <>
       <h2>{t("view.robots")}</h2>

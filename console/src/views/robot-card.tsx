@@ -1,7 +1,7 @@
 // A robot in a few lines: mode, why it stands, battery.
-import { useConsole, useLive } from "../context";
+import { useConsole, useLive, useSeconds } from "../context";
 import { t } from "../i18n/i18n";
-import { tone } from "../map/moving-layer";
+import { tone } from "../map/robot-layer";
 import { go } from "../router";
 import { decimal, percent } from "../text";
 import { headline } from "../why";
@@ -13,15 +13,15 @@ interface Props {
 
 export function RobotCard({ id, chosen }: Props): preact.JSX.Element {
   const { chooseRobot } = useConsole();
-  const live = useLive(["robot", "pose", "time"]);
+  const live = useLive(["robot", "pose"], id);
+  useSeconds(); // it becomes old without any event
   const robot = live.of.robot.get(id);
   const pose = live.of.pose.get(id);
   const state = robot?.state ?? null;
   const old = live.oldRobot(id);
   return (
     <button
-      class={`card robot ${old ? "stale" : ""}`} aria-pressed={chosen} aria-label={t("robot.choose", { robot: id })}
-      aria-describedby={`robot-${id}`}
+      class={`card robot ${old ? "stale" : ""}`} aria-pressed={chosen}
       onClick={() => {
         chooseRobot(id);
         go("robots", id);
@@ -32,7 +32,7 @@ export function RobotCard({ id, chosen }: Props): preact.JSX.Element {
         <span class={`badge ${old ? "" : tone(state?.mode)}`}>{state ? t(`mode.${state.mode}`) : "–"}</span>
         <span class="value">{percent(state?.battery)} · {pose ? `${decimal(pose.v, 2)} m/s` : "–"}</span>
       </span>
-      <span id={`robot-${id}`} class="why">{old ? t("robot.old") : headline(state, robot?.goal ?? null)}</span>
+      <span class="why">{old ? t("robot.old") : headline(state, robot?.goal ?? null)}</span>
     </button>
   );
 }

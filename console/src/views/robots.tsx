@@ -16,10 +16,8 @@ import { RobotCard } from "./robot-card";
 type Kind = CommandBody["kind"];
 
 export function RobotsView(): preact.JSX.Element {
-  const { robot, chooseRobot } = useConsole();
+  const { robot, robots, chooseRobot } = useConsole();
   const { chosen } = useRoute();
-  const live = useLive(["robot", "pose"]);
-  const robots = [...new Set([...live.of.robot.keys(), ...live.of.pose.keys()])].sort();
   useEffect(() => {
     if (chosen !== "" && chosen !== robot) chooseRobot(chosen);
   }, [chosen]);
@@ -37,7 +35,7 @@ export function RobotsView(): preact.JSX.Element {
 
 function Details({ id }: { readonly id: string }): preact.JSX.Element {
   const { session } = useConsole();
-  const live = useLive(["robot", "pose", "place"]);
+  const live = useLive(["robot", "pose"], id);
   useSeconds();
   const robot = live.of.robot.get(id);
   const state = robot?.state ?? null;

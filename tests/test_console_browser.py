@@ -1,0 +1,275 @@
+"""The console in a real Chromium: what it shows, whom it stops, how it reconnects, and whether everybody can use it."""
+
+import asyncio
+import json
+from collections.abc import AsyncIterator
+from pathlib import Path
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+from console_stream import TOKEN, ConsoleStream, robot_pose, robot_state, serve
+from msgspec import to_builtins
+from playwright.async_api import Page, async_playwright, expect
+
+from fog_contracts.messages import PlanReply, PolygonShape, Zone
+from fog_runtime.configuration.site import load_site
+from fognav import console_page, system
+
+pytestmark = pytest.mark.browser
+
+ROOT = Path(__file__).parents[1]
+FLAGS = ["--no-sandbox", "--disable-gpu", "--disable-dev-shm-usage", "--disable-background-networking"]
+HOSTILE = "<script>alert(1)</script>\u202eevil" + "x" * 10_000
+PHONE = {"viewport": {"width": 390, "height": 844}, "has_touch": True, "is_mobile": True}
+WIDE = {"viewport": {"width": 1440, "height": 900}}
+VIEWS = ("map", "zones", "robots", "sensors", "timeline")
+AXE = ROOT / "console/node_modules/axe-core/axe.min.js"
+
+
+@pytest.fixture(scope="module", autouse=True)
+def page_is_built() -> None:
+    if system.find(system.CHROMIUM) is None:
+        pytest.skip(f"no Chromium: {system.install_command([system.CHROMIUM])}, or ./fognav test --yes as root")
+    console_page.build(ROOT)
+
+
+@pytest.fixture
+async def stream() -> ConsoleStream:
+    stream = ConsoleStream(load_site(ROOT / "sites" / "estig"))
+    for number, name in enumerate(("r1", "r2")):
+        stream.tell("pose", name, robot_pose(10.0 + 5 * number, 26.0, 0.0))
+        stream.robot(name, robot_state())
+    return stream
+
+
+@pytest.fixture
+async def console(stream: ConsoleStream) -> AsyncIterator[SimpleNamespace]:
+    """Opens the console in contexts of one browser; the test fails for an error in any page, or a request elsewhere."""
+    problems: list[str] = []
+    async with serve(stream) as url, async_playwright() as playwright:
+        browser = await playwright.chromium.launch(executable_path=str(system.find(system.CHROMIUM)), args=FLAGS)
+
+        async def opened(view: str = "map", **context: object) -> Page:
+            page = await (await browser.new_context(**{**WIDE, "locale": "en-GB", **context})).new_page()
+            page.on("pageerror", lambda error: problems.append(str(error)))
+            page.on("request", lambda r: None if r.url.startswith((url, "data:", "blob:")) else problems.append(r.url))
+            await page.goto(f"{url}#login={TOKEN}")
+            await expect(page.get_by_text("Live", exact=True)).to_be_visible()
+            await page.evaluate("view => { location.hash = `#/${view}` }", view)
+            return page
+
+        yield SimpleNamespace(open=opened, url=url, browser=browser)
+        await browser.close()
+    assert problems == []
+
+
+def requests(stream: ConsoleStream, method: str) -> list[str]:
+    return [name for name, _ in stream.requests if name.startswith(method) and not name.endswith("session")]
+
+
+async def test_one_time_login_leaves_no_trace_in_the_address(console: SimpleNamespace) -> None:
+    page = await console.open()
+    assert TOKEN not in page.url
+    assert TOKEN not in json.dumps(await page.evaluate("[history.state, {...localStorage}, {...sessionStorage}]"))
+
+
+async def test_person_logs_in_by_token_and_out_again(console: SimpleNamespace) -> None:
+    page = await console.browser.new_page()
+    await page.goto(console.url)
+    await page.get_by_label("Token").fill("wrong")
+    await page.keyboard.press("Enter")
+    await expect(page.get_by_role("alert")).to_contain_text("Nobody has this token")
+    await page.get_by_label("Token").fill(TOKEN)
+    await page.keyboard.press("Enter")
+    await expect(page.get_by_text("Live", exact=True)).to_be_visible()
+    await page.get_by_text("Settings").click()
+    await page.get_by_role("button", name="Log out").click()
+    await expect(page.get_by_label("Token")).to_be_visible()
+    # A robot that was known can be stopped by who is not logged in.
+    await expect(page.get_by_role("button", name="Stop all")).to_be_enabled()
+
+
+@pytest.mark.parametrize("device", [WIDE, PHONE], ids=["wide", "phone"])
+async def test_stop_is_on_every_view_at_the_same_place_and_needs_one_press(
+    console: SimpleNamespace, stream: ConsoleStream, device: dict[str, object]
+) -> None:
+    page = await console.open(**device)
+    places = set()
+    for number, view in enumerate(VIEWS, 1):
+        await page.evaluate("view => { location.hash = `#/${view}` }", view)
+        await expect(page.locator(f"[data-view={view}]")).to_be_visible()
+        button = page.get_by_role("button", name="Stop r1")
+        places.add(json.dumps(await button.bounding_box()))
+        await button.click()
+        await expect(page.locator(".said")).to_have_text("r1 stops.")
+        assert requests(stream, "POST") == ["POST robots/r1/stop"] * number
+    assert len(places) == 1
+    stream.requests.clear()
+    await page.keyboard.press("Shift+F9")
+    async with asyncio.timeout(30):
+        while len(requests(stream, "POST")) < 2:  # noqa: ASYNC110  # the page says it for the last one only
+            await asyncio.sleep(0.05)
+    assert sorted(requests(stream, "POST")) == ["POST robots/r1/stop", "POST robots/r2/stop"]
+
+
+async def test_stop_that_fails_says_so_and_what_to_do(console: SimpleNamespace, stream: ConsoleStream) -> None:
+    stream.answers["POST robots/r1/stop"] = (504, {"type": "urn:fognav:command_lost", "detail": "r1 does not answer."})
+    page = await console.open()
+    await page.keyboard.press("F9")
+    await expect(page.locator(".said.failed")).to_have_text("r1 was not stopped: r1 does not answer. Stop it by hand.")
+
+
+async def test_enable_asks_first_and_a_refusal_is_said(console: SimpleNamespace, stream: ConsoleStream) -> None:
+    stream.robot("r1", robot_state("HOLD", enabled=False, reasons=["not enabled"], codes=["not_enabled"]))
+    refusal = {"type": "urn:fognav:command_refused", "status": 409, "detail": "a fault must be reset first"}
+    stream.answers["POST robots/r1/commands"] = (409, refusal)
+    page = await console.open("robots")
+    await expect(page.locator(".lead")).to_have_text("not enabled. Enable it.")
+    await page.get_by_role("button", name="Enable", exact=True).click()
+    await page.keyboard.press("Escape")
+    assert requests(stream, "POST") == []
+    await page.get_by_role("button", name="Enable", exact=True).click()
+    await page.get_by_role("button", name="Yes, Enable").click()
+    await expect(page.locator(".said.failed")).to_contain_text("a fault must be reset first")
+    assert stream.requests[-1] == ("POST robots/r1/commands", {"kind": "enable"})
+
+
+async def test_goal_by_click_shows_its_path_before_it_is_sent(console: SimpleNamespace, stream: ConsoleStream) -> None:
+    path = PlanReply(points=[(10.0, 26.0), (30.0, 26.0)], length=20.0)
+    stream.answers["POST plan"] = (200, to_builtins(path))
+    page = await console.open("robots")
+    await page.get_by_role("button", name="Send to a goal").click()
+    await page.locator(".floor").click(position={"x": 400, "y": 300})
+    await expect(page.get_by_text("The path is 20.0 m long.")).to_be_visible()
+    assert requests(stream, "PUT") == []
+    await page.get_by_role("button", name="Send", exact=True).click()
+    await expect(page.locator(".said")).to_contain_text("r1 drives to")
+    name, body = stream.requests[-1]
+    assert name == "PUT robots/r1/goal"
+    assert body["pose"]["theta"] is None
+
+
+async def test_pose_is_given_by_a_drag_or_by_two_clicks(console: SimpleNamespace, stream: ConsoleStream) -> None:
+    page = await console.open("robots")
+    await page.get_by_role("button", name="Say where it is").click()
+    form = page.get_by_role("form", name="Where r1 stands")
+    box = await page.locator(".floor").bounding_box()
+    assert box is not None
+    x, y = box["x"] + 300, box["y"] + 300
+    await page.mouse.move(x, y)
+    await page.mouse.down()
+    await page.mouse.move(x, y - 60, steps=3)
+    await page.mouse.up()
+    await expect(form.get_by_label("Heading (°)")).to_have_value("90")
+    dragged = await form.get_by_label("x (m)").input_value()
+    await page.mouse.click(x + 100, y)
+    await expect(form.get_by_text("Now click where it looks.")).to_be_visible()
+    await page.mouse.click(x + 20, y)
+    await expect(form.get_by_label("Heading (°)")).to_have_value("180")
+    assert await form.get_by_label("x (m)").input_value() != dragged
+    await form.get_by_role("button", name="Set").click()
+    await expect(page.locator(".said")).to_contain_text("r1 knows its position")
+    assert stream.requests[-1][1]["kind"] == "initial_pose"
+
+
+async def test_tile_changes_its_cells_of_the_costmap_and_no_others(
+    console: SimpleNamespace, stream: ConsoleStream
+) -> None:
+    page = await console.open()
+    geometry = stream.site.map.geometry
+    hashes = """() => Promise.all([...document.querySelectorAll('.leaflet-costs-pane canvas')].map(async canvas => {
+        const copy = new OffscreenCanvas(canvas.width, canvas.height).getContext('2d');
+        copy.drawImage(canvas, 0, 0);
+        return copy.getImageData(0, 0, canvas.width, canvas.height).data.reduce((sum, byte) => (sum * 31 + byte) % 1e9);
+    }))"""
+    await page.wait_for_function("() => document.querySelectorAll('.leaflet-costs-pane canvas').length === 12")
+    await page.wait_for_timeout(1000)  # the tiles of the beginning are drawn within some frames
+    before = await page.evaluate(hashes)
+    cells = np.full((16, 16), 254, dtype=np.uint8)
+    cells[0, 15] = 0  # the lower right corner of the map becomes free
+    stream.tile(geometry.width - 16, 0, cells)
+    await page.wait_for_function(
+        f"async before => (await ({hashes})()).join() !== before", arg=",".join(map(str, before))
+    )
+    assert sum(old != new for old, new in zip(before, await page.evaluate(hashes), strict=True)) == 1
+
+
+async def test_page_goes_on_where_a_broken_connection_ended(console: SimpleNamespace, stream: ConsoleStream) -> None:
+    page = await console.open()
+    stream.cut()
+    stream.hazard("z2", "blocked")
+    await expect(page.locator("main")).to_contain_text("blocked since")
+    assert stream.resumed_from[0] is None
+    assert (stream.resumed_from[-1] or "").startswith("first-")
+    # Another run of the server knows other things, and the page forgets what it had.
+    stream.run = "second"
+    stream.log.pop(("robot", "r2"))
+    stream.log.pop(("pose", "r2"))
+    stream.cut()
+    await expect(page.get_by_role("button", name="Choose r2")).to_have_count(0)
+
+
+async def test_what_is_older_than_two_seconds_is_grey_and_says_so(
+    console: SimpleNamespace, stream: ConsoleStream
+) -> None:
+    page = await console.open()
+    stream.silent = True
+    await expect(page.get_by_text("What you see is old.")).to_be_visible()
+    await expect(page.locator("button.robot.stale").first).to_contain_text("No word for more than 2 s")
+    grey = "() => getComputedStyle(document.querySelector('.stage')).filter.includes('grayscale')"
+    assert await page.evaluate(grey)
+    stream.silent = False
+    stream.tell("pose", "r1", robot_pose(1.0, 1.0, 0.0))
+    await expect(page.get_by_text("Live", exact=True)).to_be_visible()
+    assert not await page.evaluate(grey)
+
+
+async def test_hostile_names_are_text_everywhere(console: SimpleNamespace, stream: ConsoleStream) -> None:
+    stream.tell("zone", HOSTILE, _zone(HOSTILE, HOSTILE))
+    stream.robot(HOSTILE, robot_state("HOLD", reasons=[HOSTILE], codes=["x"]))
+    stream.tell("place", HOSTILE, {"x": 12.0, "y": 30.0, "theta": None, "label": HOSTILE})
+    for device in (WIDE, PHONE):
+        page = await console.open(**device)
+        for view in VIEWS:
+            await page.evaluate("view => { location.hash = `#/${view}` }", view)
+            await expect(page.locator(f"[data-view={view}]")).to_be_visible()
+            assert await page.evaluate("document.querySelectorAll('script').length") == 1
+            assert await page.evaluate("document.documentElement.scrollWidth <= innerWidth")
+            await expect(page.get_by_role("button", name="Stop all")).to_be_in_viewport(ratio=1.0)
+
+
+def _zone(name: str, reason: str) -> dict[str, object]:
+    shape = PolygonShape(points=[(10.0, 25.0), (14.0, 25.0), (14.0, 28.0)])
+    return {**to_builtins(Zone(id="z", kind="BLOCKED", shape=shape)), "id": name, "reason": reason, "active": True}
+
+
+@pytest.mark.parametrize("device", [WIDE, PHONE], ids=["wide", "phone"])
+@pytest.mark.parametrize("scheme", ["light", "dark"])
+async def test_every_view_keeps_the_rules_of_wcag_that_a_program_can_check(
+    console: SimpleNamespace, stream: ConsoleStream, device: dict[str, object], scheme: str
+) -> None:
+    stream.tell("zone", "wet", _zone("wet", "wet floor"))
+    stream.hazard("z2", "blocked")
+    stream.robot("r1", robot_state("FAULT", reasons=["bumper pressed"], codes=["bumper"]))
+    page = await console.open(**device, color_scheme=scheme, reduced_motion="reduce", bypass_csp=True)
+    found = []
+    for view in VIEWS:
+        await page.evaluate("view => { location.hash = `#/${view}` }", view)
+        await expect(page.locator(f"[data-view={view}]")).to_be_visible()
+        if view == "robots":
+            await page.get_by_role("button", name="Send to a goal").click()
+        found += await violations(page, view)
+    await page.get_by_text("Settings").click()
+    found += await violations(page, "settings")
+    assert found == []
+
+
+async def violations(page: Page, where: str) -> list[str]:
+    await page.evaluate(AXE.read_text("utf-8"))
+    tags = ["wcag2a", "wcag2aa", "wcag21a", "wcag21aa", "wcag22aa", "best-practice"]
+    result = await page.evaluate("tags => axe.run({ runOnly: { type: 'tag', values: tags } })", tags)
+    return [
+        f"{where}: {each['id']}: {each['nodes'][0]['html'][:120]} {each['nodes'][0]['failureSummary'][:300]}"
+        for each in result["violations"]
+    ]

@@ -64,7 +64,7 @@ class Servers:
     def __init__(self, folder: Path, *, secured: bool = True) -> None:
         self.security = security = SiteSecurity(folder / "locks", "test", unrestricted=["test"]) if secured else None
         if security is not None:
-            security.make(["127.0.0.1", "localhost"], nodes=["n1"])
+            security.make(["127.0.0.1", "localhost"], nodes=["n1", "cleaning"])
         self.mosquitto: Server = start_mosquitto(
             folder / "mosquitto", security=security and security.folder("mosquitto")
         )

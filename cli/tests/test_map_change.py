@@ -10,9 +10,9 @@ import pytest
 from typer.testing import CliRunner
 
 from fog_contracts.grid import GridGeometry, StaticMap
-from fog_contracts.messages import CircleShape, Pose, Zone
+from fog_contracts.messages import CircleShape, Place, Pose, Zone
 from fog_contracts.resampling import resampled
-from fog_contracts.site import AreaSite, MarkerSite, NodeSite, Place, RobotSite, Site, Sonar
+from fog_contracts.site import AreaSite, MarkerSite, NodeSite, RobotSite, Site, Sonar
 from fog_runtime.configuration.maps import load_map, save_map
 from fog_runtime.configuration.site import load_site
 from fognav.__main__ import app
@@ -64,12 +64,13 @@ SITE = Site(
             {"zone wet lies in a wall", "robot r7 stands where the new map says: it lies in a wall"},
         ),
         ((5.0, 2.1, 5.2, 2.4), {"marker 7 looks into a wall"}),
+        ((2.3, 4.5, 2.7, 4.9), {"operators' place sofa lies in a wall"}),
         ((0.6, 0.6, 0.8, 0.8), set()),
     ],
 )
 def test_each_thing_that_does_not_fit_the_new_map_is_named(wall, named):
     zones = [Zone(id="wet", kind="BLOCKED", shape=CircleShape(centre=(3.15, 4.65), radius=0.1))]
-    found = findings(SITE, office(), office(wall), zones, {"r7": (3.2, 4.6)})
+    found = findings(SITE, office(), office(wall), zones, {"r7": (3.2, 4.6)}, {"sofa": Place(x=2.5, y=4.7)})
     told = [f"{one.kind} {one.id} {one.problem}" for one in found]
     assert len(told) == len(named), told
     assert all(any(one.startswith(name) for one in told) for name in named), told

@@ -337,6 +337,20 @@ def test_zone_is_switched_off_and_on_without_a_change_of_anything_else(demo: Ser
     assert demo.requests[-1][2]["enabled"] is True
 
 
+def test_set_of_zones_is_added_and_switched_with_what_it_has(demo: Service) -> None:
+    made = {"id": "night", "name": "at night", "schedule": None, "version": 3, "on": False, "zones": ["z-1"]}
+    demo.answers["GET", "/api/v1/zone-sets"] = (200, [made])
+    for name in ("night", "fair"):
+        demo.answers["PUT", f"/api/v1/zone-sets/{name}"] = (200, made)
+    assert run("zone", "set", "night", "off") == "set night is off; its zones: z-1"
+    assert demo.requests[-1][2] == {"name": "at night", "schedule": None, "enabled": False}
+    run("zone", "set", "fair", "on")
+    assert demo.requests[-1][2] == {"enabled": True}
+    demo.answers["POST", "/api/v1/zones"] = (201, ZONE | {"sets": ["night"]})
+    assert "in night" in run("zone", "add", "--circle", "1,2,3", "--set", "night")
+    assert demo.requests[-1][2]["sets"] == ["night"]
+
+
 def test_zones_are_listed_shown_and_removed(demo: Service) -> None:
     demo.answers["GET", "/api/v1/zones"] = (200, {"zones": [ZONE], "active": [], "epoch": 1, "seq": 1})
     demo.answers["GET", "/api/v1/zones/z-1"] = (200, ZONE)

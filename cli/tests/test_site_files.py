@@ -13,9 +13,9 @@ from numpy.typing import NDArray
 
 from fog_contracts.costs import DEFAULT_INFLATION, FREE, LETHAL
 from fog_contracts.grid import GridGeometry, StaticMap
-from fog_contracts.messages import SimObstacle
+from fog_contracts.messages import Place, SimObstacle
 from fog_contracts.shapes import rasterize
-from fog_contracts.site import AreaSite, Place, Site
+from fog_contracts.site import AreaSite, Site
 from fog_kernels.astar import Planner
 from fog_kernels.inflation import inflate, inflation_table
 from fog_kernels.raycast import cast

@@ -17,6 +17,7 @@ from fog_contracts.grid import GridGeometry, StaticMap
 from fog_contracts.messages import (
     AreaHazard,
     HazardArea,
+    Place,
     Pose,
     RobotGoal,
     RobotPath,
@@ -26,7 +27,7 @@ from fog_contracts.messages import (
     SimTruth,
     Trace,
 )
-from fog_contracts.site import AreaSite, DemoPlan, NodeSite, Place, RobotSite, Site, Sonar
+from fog_contracts.site import AreaSite, DemoPlan, NodeSite, RobotSite, Site, Sonar
 from fog_runtime.configuration.site import LoadedSite, load_site
 from fog_supervisor import net
 from fognav import system

@@ -7,8 +7,8 @@ import numpy as np
 import ring_site as ring
 
 from fog_contracts.grid import GridGeometry, StaticMap
-from fog_contracts.messages import Pose
-from fog_contracts.site import Place, RobotSite, Site
+from fog_contracts.messages import Place, Pose
+from fog_contracts.site import RobotSite, Site
 from fog_runtime.configuration.site import LoadedSite
 
 ROOMS = [(1.0, 1.0, 4.5, 4.0), (6.0, 1.0, 9.5, 4.0), (7.6, 4.0, 8.4, 4.3)]

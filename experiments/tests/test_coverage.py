@@ -9,8 +9,8 @@ import pytest
 from PIL import Image
 
 from fog_contracts.cones import SONAR_HALF_CONE
-from fog_contracts.messages import SimObstacle
-from fog_contracts.site import Place, Site
+from fog_contracts.messages import Place, SimObstacle
+from fog_contracts.site import Site
 from fog_runtime.configuration.maps import save_map
 from fog_runtime.configuration.site import LoadedSite, load_site
 from fognav_experiments.coverage import OBSTACLE_RADIUS_M, Coverage, coverage

@@ -32,7 +32,7 @@ from map_service.registry import make_layers
 from planner.core import PlannerCore
 
 if TYPE_CHECKING:
-    from fog_contracts.site import Place
+    from fog_contracts.messages import Place
 
 PATH_LIMIT = 1536
 CHANGE_LIMIT = 2048

@@ -9,8 +9,8 @@ import numpy as np
 
 from fog_contracts import channels as ch
 from fog_contracts.grid import GridGeometry, StaticMap
-from fog_contracts.messages import Pose, RobotGoal
-from fog_contracts.site import AreaSite, DemoPlan, NodeSite, Place, RobotSite, Site, Sonar
+from fog_contracts.messages import Place, Pose, RobotGoal
+from fog_contracts.site import AreaSite, DemoPlan, NodeSite, RobotSite, Site, Sonar
 from fog_runtime.configuration.site import LoadedSite
 from fognav_experiments.rigs import System
 

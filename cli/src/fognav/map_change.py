@@ -21,12 +21,13 @@ from fognav_sim.node import classify, default_config
 if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator, Mapping
 
-    from fog_contracts.messages import Zone
+    from fog_contracts.messages import Place, Zone
     from fog_contracts.shapes import ShapeMask
     from fog_contracts.site import NodeSite, Site
 
 _EDGE_M: Final = 1e-6
 _MARGIN_M: Final = 1.0
+_MOVED: Final = "operators' place"
 _IN_PLACE: Final = (0.0, 0.0, 0.0)
 
 
@@ -142,15 +143,17 @@ def findings(
     after: StaticMap,
     zones: Iterable[Zone] = (),
     poses: Mapping[str, tuple[float, float]] | None = None,
+    places: Mapping[str, Place] | None = None,
 ) -> list[Finding]:
     """Return what of the site does not fit the new map, and did fit the one before.
 
-    `poses`: where robots stand (m, frame of the map before).
+    `poses`: where robots stand (m, frame of the map before). `places`: those of a running fog, which operators may
+    have changed.
     """
     radius = max((robot.radius for robot in site.robots), default=ROBOT_RADIUS)
     old, new = _Ground(before, radius), _Ground(after, radius)
     return [
-        *_of_points(site, old, new),
+        *_of_points(site, places or {}, old, new),
         *_of_docks(site, old, new),
         *_of_nodes(site, old, new),
         *_of_markers(site, new),
@@ -163,13 +166,15 @@ def findings(
     ]
 
 
-def _of_points(site: Site, old: _Ground, new: _Ground) -> Iterator[Finding]:
+def _of_points(site: Site, running: Mapping[str, Place], old: _Ground, new: _Ground) -> Iterator[Finding]:
     points = [("place", name, place.x, place.y) for name, place in site.places.items()]
+    known = {point[1:] for point in points}
+    points += [(_MOVED, *put) for name, place in running.items() if (put := (name, place.x, place.y)) not in known]
     points += [("start of robot", robot.id, robot.start.x, robot.start.y) for robot in site.robots]
     home = (site.robots[0].start.x, site.robots[0].start.y) if site.robots else None
     for kind, name, x, y in points:
         if problem := new.trouble(x, y):
-            yield Finding(kind, name, x, y, problem, refused=True)
+            yield Finding(kind, name, x, y, problem, refused=kind != _MOVED)
         elif (problem := new.tightness(x, y)) and not old.tightness(x, y):
             yield Finding(kind, name, x, y, problem)
         elif (

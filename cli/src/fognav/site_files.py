@@ -6,7 +6,8 @@ import tomllib
 from pathlib import Path
 from typing import Any, Final
 
-from fog_contracts.site import AreaSite, DemoPlan, NodeSite, Place, RobotSite, Site
+from fog_contracts.messages import Place
+from fog_contracts.site import AreaSite, DemoPlan, NodeSite, RobotSite, Site
 from fog_runtime.configuration.maps import MapFileError, load_map, read_provenance, save_map
 from fog_runtime.configuration.site import SITE_FILE, LoadedSite, SiteError, load_site
 from fog_runtime.files import SHARED, atomic_write
@@ -59,6 +60,7 @@ def _place_lines(identifier: str, place: Place) -> list[str]:
         f"x = {_number(place.x)}",
         f"y = {_number(place.y)}",
         "# theta = 0.0   # without it any heading is accepted",
+        *(["public = true"] if place.public else []),
         "",
     ]
 

@@ -19,9 +19,9 @@ from fog_contracts.cones import SONAR_HALF_CONE
 from fog_contracts.costs import DEFAULT_INFLATION, FREE, LETHAL, ROBOT_RADIUS
 from fog_contracts.geometry import Point
 from fog_contracts.grid import GridGeometry, StaticMap
-from fog_contracts.messages import AreaState, Pose
+from fog_contracts.messages import AreaState, Place, Pose
 from fog_contracts.shapes import rasterize
-from fog_contracts.site import AreaSite, DemoPlan, NodeSite, Place, RobotSite, Site, Sonar
+from fog_contracts.site import AreaSite, DemoPlan, NodeSite, RobotSite, Site, Sonar
 from fog_kernels.astar import Planner
 from fog_kernels.components import Components
 from fog_kernels.distance import squared_distance_capped

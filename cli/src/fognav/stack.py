@@ -54,11 +54,11 @@ class StackUsers:
 
 
 def users_of(site: Site, *, unrestricted: tuple[str, ...] = ()) -> StackUsers:
-    """Return the users of a stack: robots and nodes of a site."""
+    """Return the users of a stack: robots, nodes and sources of zones of a site."""
     return StackUsers(
         site=site.id,
         robots=tuple(robot.id for robot in site.robots),
-        nodes=tuple(node.id for node in site.nodes),
+        nodes=tuple(site.senders),
         unrestricted=unrestricted,
     )
 

@@ -4,7 +4,8 @@ import { bodyOf, draftOf, fieldsOf, merged, nextHour, stateOf, suggested } from 
 
 const zone = (more: Partial<Zone> = {}): Zone => ({
   id: "wet", kind: "BLOCKED", shape: { type: "circle", centre: [1, 2], radius: 1 }, factor: null, speed: null, reason: "wet floor",
-  author: "ana", starts_at: null, expires_at: null, ttl_s: null, schedule: null, enabled: true, version: 3, ...more,
+  author: "ana", starts_at: null, expires_at: null, ttl_s: null, schedule: null, sets: [], source: null,
+  enabled: true, version: 3, ...more,
 });
 
 test("a zone that nobody changed is sent back as it was", () => {

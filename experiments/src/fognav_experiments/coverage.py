@@ -30,7 +30,8 @@ if TYPE_CHECKING:
 
     from fog_contracts.geometry import Point
     from fog_contracts.grid import StaticMap
-    from fog_contracts.site import AreaSite, NodeSite, Place, Site
+    from fog_contracts.messages import Place
+    from fog_contracts.site import AreaSite, NodeSite, Site
 
 OBSTACLE_RADIUS_M: Final = 0.25
 """Half the width of a person, or of a box that is worth a detour."""

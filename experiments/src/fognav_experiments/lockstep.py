@@ -44,6 +44,7 @@ if TYPE_CHECKING:
         AreaState,
         CommandKind,
         HazardArea,
+        Place,
         Pose,
         ProfileName,
         RobotPath,
@@ -53,7 +54,6 @@ if TYPE_CHECKING:
         SimTruth,
         Trace,
     )
-    from fog_contracts.site import Place
     from fog_runtime.configuration.robot_file import RobotFile
     from fog_runtime.configuration.site import LoadedSite
     from fognav_experiments.machine import CpuMeter

@@ -11,6 +11,7 @@ LED = {ch.AGGREGATOR, ch.MAP, ch.PLANNER}
 WITHOUT_EPOCH = {
     "leader",  # the announcement itself
     "node_config",  # constant, from the site's files
+    "zone_request",  # of others; the map-service only deletes what the broker retains of it
 }
 
 

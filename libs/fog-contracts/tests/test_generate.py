@@ -151,6 +151,10 @@ def test_mqtt_acl_gives_each_role_the_rights_of_its_channels():
         ("read", "fog/v1/lab/areas/+/definition"),
         ("read", "fog/v1/lab/aggregator/heartbeat"),
         ("write", "fog/v1/lab/aggregator/request"),
+        ("write", "fog/v1/lab/zone-sources/+/zones/+"),
+        ("read", "fog/v1/lab/zone-sources/+/zones/+"),
+        ("read", "fog/v1/lab/zone-sources/+/sets/+"),
+        ("write", "fog/v1/lab/zone-sources/+/problem"),
     ]
     assert {access for access, _ in rights["recorder"]} == {"read"}
     assert rights["thesis-node"] == [("write", "+"), ("deny", "WSN")]

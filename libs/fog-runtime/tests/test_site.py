@@ -97,6 +97,8 @@ def test_site_loads_with_its_map_and_counter_clockwise_areas(folder):
         ('goal = "desk"', 'goal = "roof"', "demo.goal", "one of: desk, door"),
         ('areas = ["a1"]', 'areas = ["a7"]', "demo.areas[0]", "one of: a1"),
         ('id = "n1"', 'id = "planner"', "nodes[0].id", "name of a role"),
+        ("[demo]", '[[zone_sources]]\nid = "console"\n[demo]', "zone_sources[0].id", "name of a role"),
+        ("[demo]", '[[zone_sources]]\nid = "n1"\n[demo]', "nodes.id and zone_sources.id", "twice"),
         (
             "[demo]",
             '[[robots]]\nid = "r1"\nstart = { x = 1, y = 1, theta = 0 }\nradius = 1\n[demo]',

@@ -451,7 +451,7 @@ def test_nothing_is_published_before_the_zones_are_loaded():
     core.load_zones([zone("stored")], moment(100.1))
     first = core.tick(moment(100.2))
     assert core.serving
-    assert (channel_names(first), core.missing()) == (["hazard", "hazard", "zones", "map_heartbeat"], "")
+    assert (channel_names(first), core.missing()) == (["hazard", "hazard", "zones", "places", "map_heartbeat"], "")
     assert [z.id for z in first[2].message.zones] == ["stored"]
     assert first[-1].message == MapHeartbeat(
         epoch=3, seq=core.costmap.version.seq, hash=core.costmap.version.hash, sent=(0, 100.2)

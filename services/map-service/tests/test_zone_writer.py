@@ -18,10 +18,11 @@ from fog_runtime.stores.redis_connection import StoreError
 from fog_runtime.stores.redis_store import Attempt
 from fog_supervisor.servers import start_redis
 from map_service.core import MapCore
+from map_service.record_writer import ConflictError
 from map_service.registry import make_layers
 from map_service.service import Service
 from map_service.store import Store
-from map_service.zone_writer import KEPT_S, ConflictError
+from map_service.zone_writer import KEPT_S
 
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator

@@ -15,8 +15,7 @@ from manual_clock import ManualClock
 
 from fog_contracts import channels as ch
 from fog_contracts.commands import CommandGate
-from fog_contracts.messages import CommandReply, Reason, ReasonCode, RefusalCode, RobotCommand, RobotState
-from fog_contracts.site import Place
+from fog_contracts.messages import CommandReply, Place, Reason, ReasonCode, RefusalCode, RobotCommand, RobotState
 from fog_runtime.health import Health
 from fog_runtime.http import Tokens
 from fog_runtime.stores.redis_connection import StoreError

@@ -150,7 +150,7 @@ def ca_create(
         made.make(
             host or own_hosts(),
             robots=[robot.id for robot in loaded.robots],
-            nodes=[node.id for node in loaded.nodes],
+            nodes=loaded.senders,
         )
         _show(made, json=json)
 

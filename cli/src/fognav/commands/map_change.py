@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Final
 import msgspec
 import typer
 
-from fog_contracts.messages import Zone
+from fog_contracts.messages import Place, Zone
 from fog_runtime.configuration.maps import read_provenance, save_map
 from fog_runtime.configuration.site import SITE_FILE, load_site
 from fog_runtime.files import PRIVATE, atomic_write
@@ -73,8 +73,8 @@ def map_change(  # noqa: PLR0913  # each option is an argument
         present = load_site(checkout.site_folder(site))
         name, static, alignment = _new_map(present, map_file, as_it_is=as_it_is)
         running = _running(present, fog)
-        zones, poses = ([], {}) if running is None else (_zones(running), _poses(running))
-        found = change.findings(present.site, present.map, static, zones, poses)
+        zones, poses, places = ([], {}, {}) if running is None else _known(running)
+        found = change.findings(present.site, present.map, static, zones, poses, places)
         values: dict[str, Any] = {
             "site": present.site.id,
             "map": name,
@@ -164,14 +164,12 @@ def _running(present: LoadedSite, address: str | None) -> Fog | None:
     return None
 
 
-def _zones(fog: Fog) -> list[Zone]:
-    return msgspec.convert(fog.get(MAP_SERVICE, "/api/v1/zones")["zones"], list[Zone])
-
-
-def _poses(fog: Fog) -> dict[str, tuple[float, float]]:
-    """Return where each robot stands that knows it."""
+def _known(fog: Fog) -> tuple[list[Zone], dict[str, tuple[float, float]], dict[str, Place]]:
+    """Return the zones, where each robot stands that knows it, and the places."""
+    zones = msgspec.convert(fog.get(MAP_SERVICE, "/api/v1/zones")["zones"], list[Zone])
+    places = msgspec.convert(fog.get(MAP_SERVICE, "/api/v1/places"), dict[str, Place])
     views = [view for view in fog.get(PLANNER, "/api/v1/robots") if view["pose"] and view["pose"]["localized"]]
-    return {view["id"]: (view["pose"]["x"], view["pose"]["y"]) for view in views}
+    return zones, {view["id"]: (view["pose"]["x"], view["pose"]["y"]) for view in views}, places
 
 
 def _stop_robots(fog: Fog) -> dict[str, str]:

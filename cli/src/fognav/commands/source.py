@@ -115,15 +115,21 @@ def source_list(*, fog: FogOption = None, json: JsonOption = False) -> None:
 def source_user(
     name: Annotated[str, typer.Argument(metavar="USER", help="The user's name: a to z, 0 to 9 and -.")],
     *,
-    topic: Annotated[list[str], typer.Option("--topic", metavar="T", help="What it may publish and read; repeatable.")],
+    topic: Annotated[
+        list[str] | None, typer.Option("--topic", metavar="T", help="What it may publish and read; repeatable.")
+    ] = None,
     security: CredentialsOption = None,
     json: JsonOption = False,
 ) -> None:
-    """Let a sensor, or the gateway of many, use a broker with passwords: these topics and no other."""
+    """Let a sensor, or the gateway of many, use a broker with passwords: these topics and no other.
+
+    Without --topic: a source of zones, which may use its own topics.
+    """
     with exit_codes(), security_errors():
-        file = open_security(security).add_device(checked_id(name), topic)
+        made = open_security(security)
+        file = made.add_device(checked_id(name), topic) if topic else made.add_node(checked_id(name))
         print_result(
-            {"user": name, "topics": topic, "credentials": str(file)},
+            {"user": name, "topics": topic or [], "credentials": str(file)},
             f"wrote {file}: its user, password and certificate are what {name} needs; then delete it here",
             "the broker knows it once it has read its lists again (SIGHUP)",
             json=json,

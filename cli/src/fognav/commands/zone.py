@@ -7,13 +7,14 @@ from typing import Annotated, Any, Final, Literal
 import typer
 
 from fognav.operate.fog import find_fog
-from fognav.operate.options import FogOption, JsonOption, duration, moment, numbers, points, weekly
+from fognav.operate.options import FogOption, JsonOption, checked_id, duration, moment, numbers, points, weekly
 from fognav.output import WrongUseError, exit_codes, local_time, print_result
 from fognav.programs import MAP_SERVICE
 
 zone_app = typer.Typer(help="Draw, list, show, switch and remove zones.", no_args_is_help=True)
 
 _ZONES: Final = "/api/v1/zones"
+_SETS: Final = "/api/v1/zone-sets"
 Kind = Literal["blocked", "penalty", "speed-limit"]
 ZoneId = Annotated[str, typer.Argument(metavar="ID", help="The zone's id, as fognav zone list shows it.")]
 
@@ -50,6 +51,9 @@ def zone_add(  # noqa: PLR0913  # each option is an argument
     time_zone: Annotated[
         str | None, typer.Option("--time-zone", metavar="NAME", help="Of --each, such as Europe/Lisbon.")
     ] = None,
+    sets: Annotated[
+        list[str] | None, typer.Option("--set", metavar="ID", help="A set that it is switched with; repeatable.")
+    ] = None,
     disabled: Annotated[
         bool, typer.Option("--disabled", help="Without an effect until fognav zone enable ID.")
     ] = False,
@@ -74,7 +78,13 @@ def zone_add(  # noqa: PLR0913  # each option is an argument
             "shape": shape,
             "reason": reason,
         }
-        optional = {"factor": factor, "speed": speed, "enabled": False if disabled else None, **times}
+        optional = {
+            "factor": factor,
+            "speed": speed,
+            "enabled": False if disabled else None,
+            "sets": sets or None,
+            **times,
+        }
         body |= {name: value for name, value in optional.items() if value is not None}
         method, path = ("PUT", f"{_ZONES}/{identifier}") if replace else ("POST", _ZONES)
         made = find_fog(fog).send(method, MAP_SERVICE, path, body)
@@ -118,6 +128,25 @@ def zone_remove(zone: ZoneId, *, fog: FogOption = None, json: JsonOption = False
     with exit_codes():
         find_fog(fog).send("DELETE", MAP_SERVICE, f"{_ZONES}/{zone}")
         print_result({"id": zone, "removed": True}, f"removed zone {zone}", json=json)
+
+
+@zone_app.command("set", epilog="Example: fognav zone set night off")
+def zone_set(
+    name: Annotated[str, typer.Argument(metavar="SET", help="Id of the set: a to z, 0 to 9 and -.")],
+    state: Annotated[Literal["on", "off"], typer.Argument(help="Whether its zones may be in force.")],
+    *,
+    fog: FogOption = None,
+    json: JsonOption = False,
+) -> None:
+    """Switch all zones of a set at once; a set that is new is added."""
+    with exit_codes():
+        found, path = find_fog(fog), f"{_SETS}/{checked_id(name)}"
+        known = next((one for one in found.get(MAP_SERVICE, _SETS) if one["id"] == name), None)
+        body = {key: known[key] for key in ("name", "schedule")} if known else {}
+        condition = {"If-None-Match": "*"} if known is None else {"If-Match": f'"{known["version"]}"'}
+        made = found.send("PUT", MAP_SERVICE, path, {**body, "enabled": state == "on"}, condition)
+        effect = "on" if made["on"] else "off" if state == "off" else "off by its schedule"
+        print_result(made, f"set {name} is {effect}; its zones: {', '.join(made['zones']) or 'none'}", json=json)
 
 
 def _switch(zone: str, address: str | None, *, enabled: bool, json: bool) -> None:
@@ -178,6 +207,8 @@ def _line(zone: Mapping[str, Any]) -> str:
     parts.append(f"by {zone['author']}")
     if not zone["enabled"]:
         parts.append("disabled")
+    if zone.get("sets"):
+        parts.append(f"in {', '.join(zone['sets'])}")
     if zone["starts_at"] is not None:
         parts.append(f"from {local_time(zone['starts_at'])}")
     if (schedule := zone.get("schedule")) is not None:

@@ -5,8 +5,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Final
 
-from fog_contracts.messages import ProfileName
-from fog_contracts.site import Place
+from fog_contracts.messages import Place, ProfileName
 from fog_runtime.configuration import parts
 from fog_runtime.configuration.parts import DEFAULT_BASE, DEFAULT_LIDAR
 from fog_runtime.configuration.robot_file import ROBOT_FILE, default_robot, load_robot

@@ -257,4 +257,4 @@ def _robots(loaded: LoadedSite | None) -> list[str]:
 
 
 def _nodes(loaded: LoadedSite | None) -> list[str]:
-    return [] if loaded is None else [node.id for node in loaded.site.nodes]
+    return [] if loaded is None else loaded.site.senders

@@ -32,7 +32,7 @@ from fognav.programs import MAP_SERVICE, PLANNER, SERVERS
 from fognav.stack import Stack, StackConfig, StackUsers
 from fognav_experiments.bench.common import SITE
 from fognav_experiments.bench.cores import random_zones, worst_shapes
-from map_service.store import Store
+from map_service.store import ZONES, Store
 
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator, Awaitable, Callable, Iterator, Sequence
@@ -102,7 +102,7 @@ async def _map_service(config: StackConfig, zones: list[Zone]) -> AsyncIterator[
     async with Stack(config) as stack:
         await stack.start_servers(_READY_S)
         async with Store(stack.redis_url, SITE, credentials=stack.security.credentials(MAP_SERVICE)) as store:
-            await store.restore(zones, Audit(0.0, "bench", "restore"))
+            await store.restore({ZONES.name: {zone.id: zone for zone in zones}}, Audit(0.0, "bench", "restore"))
             begun = loop.time()
             await store.zones()
             read_s = loop.time() - begun

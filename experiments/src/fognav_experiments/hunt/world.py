@@ -15,8 +15,8 @@ import numpy as np
 from msgspec import Meta
 
 from fog_contracts.grid import GridGeometry, StaticMap
-from fog_contracts.messages import Id, PointXY, Pose, Seconds
-from fog_contracts.site import AreaSite, DemoPlan, NodeSite, Place, RobotSite, Site, Sonar
+from fog_contracts.messages import Id, Place, PointXY, Pose, Seconds
+from fog_contracts.site import AreaSite, DemoPlan, NodeSite, RobotSite, Site, Sonar
 from fog_kernels.components import Components
 from fog_kernels.distance import squared_distance_capped
 from fog_runtime.configuration.parts import DEFAULT_BASE, DEFAULT_LIDAR

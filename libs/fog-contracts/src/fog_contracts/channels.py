@@ -18,14 +18,15 @@ Kind = Literal["pub", "query", "liveliness"]
 Encoding = Literal["json", "msgpack", "text"]
 Durability = Literal["volatile", "latest", "recovered"]
 Role = Literal[
-    "node", "thesis-node", "thesis-robot", "home-assistant", "hazard-aggregator", "map-service", "planner",
-    "robot-agent", "console-service", "console", "sim", "recorder",
+    "node", "thesis-node", "thesis-robot", "zone-source", "home-assistant", "hazard-aggregator", "map-service",
+    "planner", "robot-agent", "console-service", "console", "sim", "recorder",
 ]  # fmt: skip
 
 ROLES: Final[Mapping[Role, str]] = {
     "node": "a sensor node",
     "thesis-node": "a sensor node that publishes on the thesis's topics",
     "thesis-robot": "a robot that subscribes to the thesis's topic",
+    "zone-source": "a system of others that puts zones on the map",
     "home-assistant": "Home Assistant, which discovers nodes and areas",
     "hazard-aggregator": "turns readings into the state of each area",
     "map-service": "maintains the costmap",
@@ -166,6 +167,7 @@ ROBOT: Final = "robot-agent"
 CONSOLE: Final = "console"
 WEB: Final = "console-service"
 SIM: Final = "sim"
+ZONE_SOURCE: Final = "zone-source"
 
 VOLATILE: Final = "volatile"
 LATEST: Final = "latest"
@@ -175,6 +177,8 @@ ONLINE: Final = "online"
 OFFLINE: Final = "offline"
 BLOCKED: Final = "blocked"
 CLEAR: Final = "clear"
+ON: Final = "on"
+OFF: Final = "off"
 REPUBLISH: Final = "republish"
 CALIBRATE: Final = "calibrate"
 LEARN_NO_ECHO: Final = "learn-no-echo"
@@ -224,6 +228,15 @@ AGGREGATOR_ALERTS = _mqtt( "aggregator_alerts", V1 + "aggregator/alerts",       
 AGGREGATOR_REQUEST = _text("aggregator_request", V1 + "aggregator/request",                             limit=16,
     publishers=(MAP,),           subscribers=(AGGREGATOR,),       durability=VOLATILE, qos=0,
     values=(REPUBLISH,), about="asks the aggregator to publish all areas again: a subscriber has missed some")
+ZONE_REQUEST      = _mqtt( "zone_request",      V1 + "zone-sources/{source}/zones/{zone}", m.ZoneRequest,
+    limit=16 * KIB,
+    publishers=(ZONE_SOURCE, MAP), subscribers=(MAP,),            durability=LATEST,   qos=1)
+ZONE_SET_SWITCH   = _text( "zone_set_switch",   V1 + "zone-sources/{source}/sets/{set}",                limit=16,
+    publishers=(ZONE_SOURCE,),   subscribers=(MAP,),              durability=VOLATILE, qos=1,
+    values=(ON, OFF), about="switches a set of zones that `site.toml` names for the source")
+ZONE_SOURCE_PROBLEM = _text("zone_source_problem", V1 + "zone-sources/{source}/problem",                limit=KIB,
+    publishers=(MAP,),           subscribers=(ZONE_SOURCE, CONSOLE), durability=LATEST, qos=1,
+    about="why the map-service refused the source's latest message, in words; empty: it did not")
 THESIS_AREA       = _text( "thesis_area",       "area {number}",                                        limit=16,
     publishers=("thesis-node",), subscribers=(AGGREGATOR,),       durability=VOLATILE, qos=0,
     values=(BLOCKED, CLEAR), about="state of a thesis node's area")
@@ -248,6 +261,9 @@ HAZARD            = _pub(  "hazard",            FOG + "hazards/{area}", m.Hazard
     publishers=(MAP,), subscribers=(PLANNER, ROBOT, CONSOLE), durability=LATEST, epoch="epoch")
 ZONES             = _pub(  "zones",             FOG + "zones",          m.ZoneSet,      limit=4 * MIB,
     publishers=(MAP,), subscribers=(PLANNER, ROBOT, WEB), durability=LATEST, epoch="epoch")
+
+PLACES            = _pub(  "places",            FOG + "places",         m.PlaceSet,     limit=MIB,
+    publishers=(MAP,), subscribers=(PLANNER, WEB), durability=LATEST, epoch="epoch")
 
 # Planner and robots: zenoh, msgpack
 PLANNER_PLAN      = _query("planner_plan",      FOG + "planner/plan",             m.PlanRequest,    limit=KIB,

@@ -16,11 +16,14 @@ from fog_contracts.messages import (
     Message,
     Metres,
     Penalty,
+    Place,
     Pose,
     Radians,
     Ring,
     Source,
+    TimeToLive,
     UnknownPolicy,
+    ZoneKind,
 )
 
 Options = TypeVar("Options", bound=msgspec.Struct)
@@ -59,15 +62,6 @@ def learned_share(seen: int, samples: int) -> float:
     taken for too high than for too low, by which what was rare in a short time would count as impossible.
     """
     return (seen + 2) / (samples + 4)
-
-
-class Place(Message, frozen=True, kw_only=True):
-    """A named pose; without `theta` any heading is accepted."""
-
-    x: Metres
-    y: Metres
-    theta: Radians | None = None
-    label: str = ""
 
 
 class Sonar(Message, frozen=True, kw_only=True):
@@ -142,6 +136,23 @@ class SourceSite(Source, frozen=True, kw_only=True):
         return Source(**{name: value for name, value in asdict(self).items() if name != "area"})
 
 
+class ZoneSourceSite(Message, frozen=True, kw_only=True):
+    """A system of others that may put zones on the map over MQTT, as the broker's user `id`, and what it may at most.
+
+    `max_area`: of each zone (m²); `max_ttl_s`: how long each may last from now on; `per_minute`: messages. It may
+    switch the sets of zones in `sets`.
+    """
+
+    id: Id
+    label: str = ""
+    kinds: list[ZoneKind] = field(default_factory=lambda: ["BLOCKED", "PENALTY", "SPEED_LIMIT"])
+    max_zones: Annotated[int, Meta(ge=0, le=500)] = 10
+    max_area: Annotated[float, Meta(gt=0.0, le=1e6)] = 50.0
+    max_ttl_s: TimeToLive = 3600.0
+    per_minute: Annotated[int, Meta(ge=1, le=600)] = 30
+    sets: list[Id] = field(default_factory=list)
+
+
 class RobotSite(Message, frozen=True, kw_only=True):
     """A robot of this site: its start pose, and the radius and height of its body.
 
@@ -201,6 +212,7 @@ class Site(Message, frozen=True, kw_only=True):
     areas: list[AreaSite] = field(default_factory=list)
     nodes: list[NodeSite] = field(default_factory=list)
     sources: list[SourceSite] = field(default_factory=list)
+    zone_sources: list[ZoneSourceSite] = field(default_factory=list)
     robots: list[RobotSite] = field(default_factory=list)
     markers: list[MarkerSite] = field(default_factory=list)
     layers: list[str | dict[str, Any]] = field(default_factory=list)
@@ -210,6 +222,11 @@ class Site(Message, frozen=True, kw_only=True):
     def staging(self) -> dict[str, Pose]:
         """By robot, the pose in front of its dock; robots without a dock are left out."""
         return {robot.id: pose for robot in self.robots if (pose := robot.staging) is not None}
+
+    @property
+    def senders(self) -> list[str]:
+        """The users of the broker that the site has besides roles: its nodes, and the sources of zones."""
+        return [*(node.id for node in self.nodes), *(source.id for source in self.zone_sources)]
 
     def definitions(self) -> list[AreaDefinition]:
         """Return the areas as the aggregator publishes them, each with the nodes that watch it."""

@@ -31,6 +31,7 @@ if TYPE_CHECKING:
         AreaHazard,
         MapDelta,
         MapHeartbeat,
+        PlaceSet,
         RobotGoal,
         RobotObstacles,
         RobotPath,
@@ -111,6 +112,7 @@ class ConsoleCore:
                 ch.MAP_DELTA: self._on_delta,
                 ch.MAP_HEARTBEAT: self._on_heartbeat,
                 ch.ZONES: self._on_zones,
+                ch.PLACES: self._on_places,
                 ch.ROBOT_GOAL: self._on_goal,
                 ch.ROBOT_PATH: self._on_path,
                 ch.ROBOT_RELEASE: self._on_release,
@@ -315,6 +317,10 @@ class ConsoleCore:
     def on_places(self, places: Mapping[str, Any], now: float) -> None:
         """Take over all places."""
         self._put_all("place", places, now)
+
+    def _on_places(self, _ids: Ids, heard: PlaceSet, at: Moment) -> Sequence[Publication]:
+        self.on_places(heard.places, at.now)
+        return ()
 
     def on_record(self, position: str, record: msgspec.Struct) -> None:
         """Take over the next entry of the audit trail; `position` names it."""

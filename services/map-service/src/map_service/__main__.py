@@ -5,6 +5,8 @@ from __future__ import annotations
 import asyncio
 import os
 
+from msgspec.structs import replace
+
 from fog_contracts import channels as ch
 from fog_runtime import logs, metrics, process
 from fog_runtime.backup import STAMP
@@ -78,8 +80,9 @@ async def main() -> None:
             # A clock of another speed tells no time of day.
             synchronized = WallClock(settings.wall_clock if settings.speed == 1.0 else "trusted").synchronized
             service = Service(
-                core, store, mqtt, zenoh, clock, health, leadership, synchronized=synchronized, boot=boot_id()
-            )
+                core, store, mqtt, zenoh, clock, health, leadership,
+                site=replace(loaded.site, id=site), synchronized=synchronized, boot=boot_id(),
+            )  # fmt: skip
             service.subscribe()
             leadership.subscribe()
             zenoh.declare_liveliness("map-service", site)
@@ -90,6 +93,7 @@ async def main() -> None:
                 tasks.create_task(leadership.run(service, needs), name="lease")
                 tasks.create_task(service.store_loop(), name="store")
                 tasks.create_task(service.tick_loop(), name="tick")
+                tasks.create_task(service.zone_sources.run(), name="zone-sources")
                 tasks.create_task(service.publisher.commit_loop(), name="commit")
                 tasks.create_task(http_process.serve(app, settings.port_file), name="http")
 

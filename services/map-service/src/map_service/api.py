@@ -6,7 +6,7 @@ Reading needs no token, except for the audit log; writing needs the role operato
 import secrets
 from collections.abc import Callable
 from itertools import islice
-from typing import Final, Literal
+from typing import Annotated, Final, Literal
 
 import msgspec
 from fastapi import FastAPI
@@ -30,6 +30,8 @@ from fog_runtime.http import (
     IfNoneMatch,
     Operator,
     PageSize,
+    Patch,
+    PatchOf,
     ProblemError,
     Routes,
     Tokens,
@@ -42,23 +44,28 @@ from fog_runtime.http import (
     make_app,
     must_be_new,
     next_page,
+    patched,
 )
 from fog_runtime.stores.records import KINDS, AuditEntry, CursorError
 from fog_runtime.stores.redis_connection import StoreError
 from fog_runtime.stores.redis_store import Attempt, IdempotencyError
 from map_service.api_dry_run import add_dry_runs
+from map_service.api_places import add_places
+from map_service.api_sets import add_sets, add_sources
 from map_service.api_views import add_views
 from map_service.applied import AppliedChange, ChangeKind
 from map_service.core import ScrapeTarget
 from map_service.geojson import add_geojson
 from map_service.problems import NO_SUCH_ZONE, ZONES_NOT_LOADED, MapProblem, add_errors, require_zones
+from map_service.record_writer import ConflictError
 from map_service.service import Service
-from map_service.undo import add_undo
-from map_service.zone_bodies import ZoneBody, zone_from_body
-from map_service.zone_writer import ConflictError
+from map_service.undo import add_record_undo, add_undo
+from map_service.zone_bodies import ZoneBody, body_of_zone, zone_from_body
 from map_service.zones import ZoneError
 
-AuditKind = Literal["alert", "area", "mission", "override", "robot", "stop", "store", "zone"]
+AuditKind = Literal[
+    "alert", "area", "mission", "override", "place", "robot", "set", "source", "stop", "store", "zone",
+]  # fmt: skip
 
 _REFUSALS: Final = (ZoneError, BusyError, IdempotencyError, StoreError)
 
@@ -92,7 +99,14 @@ def make_api(  # the process's parts
     add_geojson(zones, service, site, clock)
     add_undo(zones, service, clock)
     _add_applied(zones, service, clock)
+    _add_zone_patch(zones, service, clock)
     _add_audit(zones, service)
+    add_sets(zones, service)
+    add_sources(zones, service)
+    places = Routes(app, "places")
+    add_errors(places)
+    add_places(places, service)
+    add_record_undo(places, service)
     add_views(Routes(app, "map"), service, site)
     _add_scrape_targets(Routes(app, "robots"), service, clock)
     recovery = Routes(app, "store")
@@ -145,9 +159,7 @@ def _add_zone_writes(routes: Routes, service: Service, clock: Clock) -> None:
         idempotency_key: IdempotencyKey = None,
     ) -> Answer[Zone]:
         """Replace a zone; with If-Match, only if it is unchanged. With `If-None-Match: *`, add it if it is new."""
-        if body.id not in (None, zone_id):
-            detail = f"the path names zone {zone_id}: leave the id out, or give the same id"
-            raise ProblemError(HttpProblem.REQUEST_INVALID, detail, field="body.id")
+        _same_id(body, zone_id)
         attempt = attempt_of(idempotency_key, caller, f"PUT /api/v1/zones/{zone_id}", body)
         new = must_be_new(if_none_match)
         # Before the condition, which the first attempt may have made false.
@@ -168,8 +180,35 @@ def _add_zone_writes(routes: Routes, service: Service, clock: Clock) -> None:
         if zone_id in service.zones.unusable.reasons:
             await service.zones.delete_unusable(zone_id, caller.name)
             return
-        _require_matching(service, zone_id, if_match)
+        zone = _require_matching(service, zone_id, if_match)
         await service.zones.delete(zone_id, expected_version(if_match), caller.name)
+        service.zone_sources.forget(zone)
+
+
+def _add_zone_patch(routes: Routes, service: Service, clock: Clock) -> None:
+    @routes.patch("/api/v1/zones/{zone_id}", raises=[*_REFUSALS, ConflictError], problems=NO_SUCH_ZONE)
+    async def patch_zone(
+        zone_id: str,
+        patch: Annotated[Patch, PatchOf(ZoneBody)],
+        caller: Operator,
+        if_match: IfMatch = None,
+        idempotency_key: IdempotencyKey = None,
+    ) -> Answer[Zone]:
+        """Change fields of a zone; with If-Match, only if it is unchanged. Its time goes on unless the patch has one.
+
+        A source's zone becomes an operator's by it, as by PUT.
+        """
+        attempt = attempt_of(idempotency_key, caller, f"PATCH /api/v1/zones/{zone_id}", patch)
+        if (earlier := await service.zones.earlier_result(attempt)) is not None:
+            return Answer(earlier, etag(earlier.version))
+        await service.zones.reload_after_uncertain_write()
+        old = _require_matching(service, zone_id, if_match)
+        rest_s = service.core.zones[zone_id].times.progress("", clock.now()).rest_s
+        body = patched(body_of_zone(old, patch, rest_s), patch)
+        zone = zone_from_body(body, _same_id(body, zone_id), caller.name, clock.stamp())
+        # The fields that stay are those that were read here.
+        zone = await service.zones.replace(zone, old.version, caller.name, attempt)
+        return Answer(zone, etag(zone.version))
 
 
 def _add_applied(routes: Routes, service: Service, clock: Clock) -> None:
@@ -245,8 +284,16 @@ def _find_zone(service: Service, zone_id: str) -> Zone:
     return entry.zone
 
 
-def _require_matching(service: Service, zone_id: str, if_match: str | None) -> None:
+def _same_id(body: ZoneBody, zone_id: str) -> str:
+    if body.id not in (None, zone_id):
+        detail = f"the path names zone {zone_id}: leave the id out, or give the same id"
+        raise ProblemError(HttpProblem.REQUEST_INVALID, detail, field="body.id")
+    return zone_id
+
+
+def _require_matching(service: Service, zone_id: str, if_match: str | None) -> Zone:
     zone = _find_zone(service, zone_id)
     if expected_version(if_match) not in (None, zone.version):
         detail = f"zone {zone_id} is at version {zone.version}, not {if_match}: read it again, then retry"
         raise ProblemError(MapProblem.ZONE_CHANGED, detail)
+    return zone

@@ -1,7 +1,7 @@
 """REST of dry runs: what a change of zones or of areas' overrides would do, computed with the planner's help."""
 
 import asyncio
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from typing import Annotated, Final
 
@@ -10,7 +10,7 @@ import msgspec
 from fog_contracts import channels as ch
 from fog_contracts.codec import ContractError
 from fog_contracts.handlers import RefusedMessageError
-from fog_contracts.messages import DryRunOutcome, DryRunReply, Id, Message, OverrideState, Target
+from fog_contracts.messages import DryRunOutcome, DryRunReply, Id, Message, OverrideState, Place, Target
 from fog_contracts.site import Site
 from fog_runtime.clock import Clock
 from fog_runtime.concurrency import BusyError, Worker
@@ -107,9 +107,9 @@ async def _combined(hypothesis: Hypothesis) -> bool:
     return hypothesis.is_current
 
 
-def targets_of(site: Site) -> list[Target]:
+def targets_of(known: Mapping[str, Place], site: Site) -> list[Target]:
     """Return the places that robots are sent to, and the fronts of their docks."""
-    places = [Target(kind="place", id=name, at=(place.x, place.y)) for name, place in sorted(site.places.items())]
+    places = [Target(kind="place", id=name, at=(place.x, place.y)) for name, place in sorted(known.items())]
     docks = [Target(kind="dock", id=robot, at=(pose.x, pose.y)) for robot, pose in sorted(site.staging.items())]
     return [*places, *docks]
 
@@ -155,6 +155,6 @@ def add_dry_runs(routes: Routes, service: Service, site: Site, clock: Clock) -> 
                     raise ZoneError(f"zones.{index}.{error.field}".rstrip("."), error.message) from error
             change = Change(zones=prepared, removed=body.removed_zones, overrides=body.overrides)
             try:
-                return await dry_runs.outcome(change, targets_of(site))
+                return await dry_runs.outcome(change, targets_of(service.core.places, site))
             except RefusedMessageError as error:  # it was removed meanwhile
                 raise ProblemError(MapProblem.UNKNOWN_AREA, str(error)) from error

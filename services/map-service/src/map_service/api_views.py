@@ -9,7 +9,7 @@ from fastapi import Response
 from PIL import Image
 
 from fog_contracts.messages import HazardArea, MapGeometry, Message
-from fog_contracts.site import Place, Site
+from fog_contracts.site import Site
 from fog_runtime.concurrency import BusyError, Worker
 from fog_runtime.http import Routes
 from map_service.costmap import LayeredCostmap
@@ -61,11 +61,6 @@ def add_views(routes: Routes, service: Service, site: Site) -> None:
     async def hazards() -> list[HazardArea]:
         """Return every area with its hazard as on the map."""
         return core.hazards()
-
-    @routes.get("/api/v1/places")
-    async def places() -> dict[str, Place]:
-        """Return the site's named poses."""
-        return site.places
 
     @routes.get("/api/v1/map")
     async def map_info() -> MapInfo:

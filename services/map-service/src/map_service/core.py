@@ -15,7 +15,7 @@ from msgspec import structs
 from fog_contracts import channels as ch
 from fog_contracts.costs import DEFAULT_INFLATION
 from fog_contracts.handlers import Moment, Publication
-from fog_contracts.messages import HazardArea, MapDelta, Message, ZoneSet
+from fog_contracts.messages import HazardArea, MapDelta, Message, PlaceSet, ZoneSet
 from map_service.applied import Applied
 from map_service.costmap import COMMIT_CELLS, LayeredCostmap
 from map_service.dry_run import Hypothesis
@@ -30,11 +30,12 @@ if TYPE_CHECKING:
     from fog_contracts.costs import Inflation
     from fog_contracts.grid import StaticMap
     from fog_contracts.handlers import Handler, Ids, Later, QueryHandler
-    from fog_contracts.messages import AreaDefinition, MapSnapshot, RobotState, Target, Zone
+    from fog_contracts.messages import AreaDefinition, MapSnapshot, Place, RobotState, Target, Zone
     from fog_contracts.shapes import Spans
     from map_service.aggregator_monitor import AggregatorMonitor
     from map_service.dry_run import Change
     from map_service.layers.base import CostLayer
+    from map_service.zone_sets import SetOfZones, SetSwitches
     from map_service.zone_times import Progress
     from map_service.zones import ZoneCatalog
 
@@ -72,6 +73,8 @@ class RobotDirectory:
 L = TypeVar("L", bound="CostLayer")
 
 NOTHING_STORED: Final = StoredState()
+SWITCHED_CELLS: Final = 16 * COMMIT_CELLS
+"""Sets of zones are switched in one version of the map as long as their zones' windows have no more cells in all."""
 MANY_ZONES: Final = 200
 MANY_ZONES_PERIOD_S: Final = 0.5
 """More zones than MANY_ZONES are published at most once in this time: they are a message of up to 4 MiB."""
@@ -104,6 +107,8 @@ class MapCore:
         self.costmap = LayeredCostmap(site, static, layers, inflation, epoch)
         self.robots = RobotDirectory()
         self.applied = Applied()
+        self.places: Mapping[str, Place] = {}
+        """All places by id (`put_places`)."""
         self._zones_loaded = False
         self._hazards_wait_s = hazards_wait_s
         self._serving = False
@@ -227,6 +232,21 @@ class MapCore:
         """Return the map after a change that nobody makes; raises `RefusedMessageError` for an unknown area."""
         return Hypothesis(self.costmap, self._zones, self._hazards, change, targets)
 
+    @property
+    def zone_sets(self) -> SetSwitches:
+        """The sets of zones, and which of them are off."""
+        return self._zones.switches
+
+    def put_zone_sets(self, sets: Mapping[str, SetOfZones], at: Moment) -> list[Publication]:
+        """Replace the sets of zones; those that they switch change the map in one version (`SWITCHED_CELLS`)."""
+        self._zones.put_sets(sets, at)
+        return self._commit([], at)
+
+    def put_places(self, places: Mapping[str, Place]) -> list[Publication]:
+        """Replace the places."""
+        self.places = places
+        return [self._place_set()] if self._serving else []
+
     def continue_commit(self, at: Moment) -> list[Publication]:
         """Put the next portion of a large change on the map; call it while there is one (`pending`)."""
         return self._commit([], at)
@@ -250,7 +270,8 @@ class MapCore:
 
         A large change is made in several versions; zones are published when the last one is made.
         """
-        cells = COMMIT_CELLS if self._serving else None
+        together = 0 < self._zones.pop_switched() <= SWITCHED_CELLS
+        cells = COMMIT_CELLS if self._serving and not together else None
         deltas = [Publication(ch.MAP_DELTA, delta) for delta in self.costmap.update(at.stamp, cells)]
         self._note_changes(deltas, at.stamp)
         if not self._serving:
@@ -279,7 +300,11 @@ class MapCore:
         return [Publication(ch.ZONES, self.zone_set())]
 
     def _everything(self) -> list[Publication]:
-        return [*self._with_epoch(self._hazards.publications()), Publication(ch.ZONES, self.zone_set())]
+        hazards = self._with_epoch(self._hazards.publications())
+        return [*hazards, Publication(ch.ZONES, self.zone_set()), self._place_set()]
+
+    def _place_set(self) -> Publication:
+        return Publication(ch.PLACES, PlaceSet(epoch=self.costmap.version.epoch, places=dict(self.places)))
 
     def _with_epoch(self, publications: Iterable[Publication]) -> list[Publication]:
         """Return the layers' publications with the map's epoch."""

@@ -6,8 +6,8 @@ from fog_runtime.concurrency import BusyError
 from fog_runtime.http import RETRY_AFTER, HttpProblem, ProblemCode, ProblemError, Routes, add_store_errors
 from fog_runtime.http.routes import InvalidBodyError
 from fog_runtime.stores.records import CursorError
+from map_service.record_writer import ConflictError
 from map_service.service import Service
-from map_service.zone_writer import ConflictError
 from map_service.zones import ZoneError
 
 
@@ -23,6 +23,40 @@ class MapProblem(ProblemCode):
     ZONE_INVALID = (
         "zone_invalid", 422, "The zone is invalid, or one too many: `errors` names its fields",
         "Correct the fields that `errors` names, or remove another zone",
+    )  # fmt: skip
+    NO_ZONE_SET = (
+        "no_zone_set",
+        404,
+        "No set of zones has this id",
+        "Choose one of GET /api/v1/zone-sets, or PUT a new one",
+    )
+    ZONE_SET_CHANGED = (
+        "zone_set_changed", 412, "The set of zones is not as the request expects: somebody else changed or added it",
+        "Read the set again, then decide anew",
+    )  # fmt: skip
+    ZONE_SET_USED = (
+        "zone_set_used", 409, "Zones name the set, so that it can't be removed",
+        "Take the zones out of the set, or remove them, first",
+    )  # fmt: skip
+    ZONE_SET_INVALID = (
+        "zone_set_invalid", 422, "The set of zones is invalid, or one too many",
+        "Correct the fields that `errors` names, or remove another set",
+    )  # fmt: skip
+    NO_ZONE_SOURCE = (
+        "no_zone_source", 404, "`site.toml` names no such source of zones", "Choose one of GET /api/v1/zone-sources"
+    )  # fmt: skip
+    ZONE_SOURCE_CHANGED = (
+        "zone_source_changed", 412, "The source is not as the request expects: somebody else changed it",
+        "Read the source again, then decide anew",
+    )  # fmt: skip
+    NO_SUCH_PLACE = "no_such_place", 404, "No place has this id", "Choose one of GET /api/v1/places, or PUT a new one"
+    PLACE_CHANGED = (
+        "place_changed", 412, "The place is not as the request expects: somebody else changed or added it",
+        "Read the place again, then decide anew",
+    )  # fmt: skip
+    PLACE_INVALID = (
+        "place_invalid", 422, "The place lies off the map or in a wall, or is one too many",
+        "Move it to a free cell of the map, or remove another place",
     )  # fmt: skip
     ZONES_NOT_LOADED = (
         "zones_not_loaded", 503, "The stored zones are not loaded yet",
@@ -68,13 +102,18 @@ def add_errors(routes: Routes) -> None:
 
 
 def _conflict(error: ConflictError) -> ProblemError:
-    if error.outcome == "exists":
-        detail = f"zone {error.zone} exists already: choose another id, or PUT it"
+    what, missing, changed = {
+        "zones": ("zone", MapProblem.NO_ZONE, MapProblem.ZONE_CHANGED),
+        "zone_sets": ("set of zones", MapProblem.NO_ZONE_SET, MapProblem.ZONE_SET_CHANGED),
+        "zone_sources": ("source", MapProblem.NO_ZONE_SOURCE, MapProblem.ZONE_SOURCE_CHANGED),
+        "places": ("place", MapProblem.NO_SUCH_PLACE, MapProblem.PLACE_CHANGED),
+    }[error.table]
+    if error.outcome == "exists" and missing is MapProblem.NO_ZONE:
+        detail = f"zone {error.id} exists already: choose another id, or PUT it"
         return ProblemError(MapProblem.ZONE_EXISTS, detail)
     if error.outcome == "missing":
-        return ProblemError(MapProblem.NO_ZONE, f"there is no zone {error.zone} any more: POST it to add it again")
-    detail = f"zone {error.zone} was changed by somebody else: read it again, then retry"
-    return ProblemError(MapProblem.ZONE_CHANGED, detail)
+        return ProblemError(missing, f"there is no {what} {error.id} any more: add it again")
+    return ProblemError(changed, f"{what} {error.id} was changed by somebody else: read it again, then retry")
 
 
 def _with_remedies(error: InvalidBodyError) -> InvalidBodyError:

@@ -9,11 +9,17 @@ from msgspec import structs
 from prometheus_client import Counter, Gauge
 
 from fog_contracts import channels as ch
+from fog_contracts.site import Site
 from fog_runtime import logs
 from fog_runtime.clock import ticker
 from fog_runtime.stores.redis_connection import StoreError, StoreLostError
 from fog_runtime.transports.edges import Edges
+from map_service.places import StoredPlace, combined
 from map_service.publisher import Publisher
+from map_service.record_writer import RecordWriter
+from map_service.store import PLACES, ZONE_SETS, ZONE_SOURCES
+from map_service.zone_sets import MutedSource, SetOfZones
+from map_service.zone_sources import ZoneSources
 from map_service.zone_writer import ZoneTimesPersistence, ZoneWriter
 
 if TYPE_CHECKING:
@@ -66,11 +72,13 @@ class Service:
         health: Health,
         gate: Gate | None = None,
         *,
+        site: Site | None = None,
         synchronized: Callable[[], bool] = lambda: True,
         boot: str = "",
     ) -> None:
         """Prepare; `gate` decides whether this process leads or stands by.
 
+        `site` gives the initial places, and the sources of zones.
         `synchronized` tells whether the time of day is right; `boot` is `clock.boot_id`.
         """
         self.core = core
@@ -85,6 +93,20 @@ class Service:
         self._edges = Edges(clock, mqtt=mqtt, zenoh=zenoh, gate=gate)
         self.publisher = Publisher(core, self._edges, self._now)
         self.zones = ZoneWriter(core, store, self._times, self.publisher, health, self._now)
+        self._site = site or Site(id="site")
+        publish, places = self.publisher.publish, self._site.places
+        self.initial_places = places
+        """Those of `site.toml`."""
+        self.sets = RecordWriter(
+            ZONE_SETS, SetOfZones, store, self.zones, lambda sets: publish(core.put_zone_sets(sets, self._now()))
+        )
+        self.places = RecordWriter(
+            PLACES, StoredPlace, store, self.zones, lambda stored: publish(core.put_places(combined(places, stored)))
+        )
+        self.muted = RecordWriter(ZONE_SOURCES, MutedSource, store, self.zones, lambda _: None)
+        self.zones.beside = (self.sets, self.places, self.muted)
+        core.put_places(combined(places, {}))
+        self.zone_sources = ZoneSources(self._site, core, self.zones, self.sets, self.muted, self.publisher.publish)
         self._leading = False
         self._serving_queries = False
         self._aggregator_alive = False
@@ -130,12 +152,13 @@ class Service:
                 raise
             self.zones.must_reload = True
         await self.publisher.all_on_map()
-        self._leading = True
+        self._leading = self.zone_sources.leading = True
         self.publisher.publish(self.core.lead(epoch))
+        await self.zone_sources.listen(self._mqtt)
 
     def stand_by(self) -> None:
         """Follow the inputs, and the stored zones, which another process changes now."""
-        self._leading = False
+        self._leading = self.zone_sources.leading = False
         self._store.epoch = 0
 
     async def serves(self) -> bool:

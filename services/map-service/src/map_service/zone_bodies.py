@@ -1,6 +1,6 @@
 """Zones as REST takes them."""
 
-from typing import Annotated
+from typing import Annotated, Final
 
 import msgspec
 
@@ -15,8 +15,13 @@ from fog_contracts.messages import (
     WeeklySchedule,
     Zone,
     ZoneKind,
+    ZoneSets,
 )
-from fog_runtime.http import HttpProblem, ProblemError
+from fog_runtime.http import HttpProblem, Patch, ProblemError
+
+_SHORTEST_S: Final = 0.001
+"""The time to live of a zone that was about to end when something else of it was changed."""
+_SENT: Final = ("kind", "shape", "factor", "speed", "reason", "starts_at", "schedule", "sets", "enabled")
 
 
 class ZoneBody(Message, frozen=True, kw_only=True):
@@ -32,6 +37,7 @@ class ZoneBody(Message, frozen=True, kw_only=True):
     expires_at: Stamp | None = None
     ttl_s: TimeToLive | None = None
     schedule: WeeklySchedule | None = None
+    sets: ZoneSets = msgspec.field(default_factory=list)
     enabled: bool = True
 
 
@@ -52,5 +58,20 @@ def zone_from_body(body: ZoneBody, zone_id: str, author: str, stamp: float) -> Z
         expires_at=body.expires_at if body.ttl_s is None else max(stamp, body.starts_at or 0.0) + body.ttl_s,
         ttl_s=body.ttl_s,
         schedule=body.schedule,
+        sets=body.sets,
         enabled=body.enabled,
     )
+
+
+def body_of_zone(zone: Zone, patch: Patch, rest_s: float | None) -> ZoneBody:
+    """Return a zone as it is sent, for a patch of it; `rest_s` is what remains of its time to live, if that is known.
+
+    What remains is sent, unless the patch gives the zone another start or end: its time goes on.
+    """
+    ttl_s = zone.ttl_s
+    if patch.get("expires_at") is not None:
+        ttl_s = None
+    elif ttl_s is not None and rest_s is not None and not patch.keys() & {"ttl_s", "starts_at"}:
+        ttl_s = max(rest_s, _SHORTEST_S)
+    fields = {name: getattr(zone, name) for name in _SENT}
+    return ZoneBody(**fields, ttl_s=ttl_s, expires_at=zone.expires_at if zone.ttl_s is None else None)

@@ -61,13 +61,11 @@ class ZoneTimes:
 
     def __init__(self, zone: Zone, progress: Progress | None = None, *, boot: str = "", now: float = 0.0) -> None:
         self._zone = zone
-        self._schedule = None if zone.schedule is None else _Windows(zone.schedule)
+        self._schedule = None if zone.schedule is None else ScheduleTimes(zone.schedule)
         self._started = self._ended = False
         self._deadline: float | None = None
         """When it ends at the earliest, by the monotonic clock; None while that is not known."""
         self._over_since = math.inf
-        self._window_deadline = -math.inf
-        """Until when the schedule's latest window lasts at least, by the monotonic clock."""
         if progress is not None and progress.version == zone.version:
             self._restore(progress, boot, now)
 
@@ -95,7 +93,7 @@ class ZoneTimes:
             return not at.synchronized
         if self._end(at):
             return False
-        return self._schedule is None or self._is_scheduled(self._schedule, at)
+        return self._schedule is None or self._schedule.includes(at)
 
     def progress(self, boot: str, now: float) -> Progress:
         """Return what is to be stored."""
@@ -144,13 +142,23 @@ class ZoneTimes:
         end = self._zone.expires_at if self._zone.ttl_s is None else None
         return end is not None and at.synchronized and end <= at.stamp
 
-    def _is_scheduled(self, windows: _Windows, at: Moment) -> bool:
+
+class ScheduleTimes:
+    """Follows a weekly schedule through time. While the time of day is not known, a window lasts."""
+
+    def __init__(self, schedule: WeeklySchedule) -> None:
+        self._windows = _Windows(schedule)
+        self._deadline = -math.inf
+        """Until when the latest window lasts at least, by the monotonic clock."""
+
+    def includes(self, at: Moment) -> bool:
+        """Advance to `at`; return whether it is in a window."""
         if not at.synchronized:
             return True
-        end = windows.end_of_current(at.stamp)
+        end = self._windows.end_of_current(at.stamp)
         if end is not None:
-            self._window_deadline = max(self._window_deadline, at.now + end - at.stamp)
-        return end is not None or at.now < self._window_deadline
+            self._deadline = max(self._deadline, at.now + end - at.stamp)
+        return end is not None or at.now < self._deadline
 
 
 class _Windows:

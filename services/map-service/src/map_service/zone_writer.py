@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import asyncio
 from contextlib import contextmanager, suppress
-from typing import TYPE_CHECKING, Final
+from typing import TYPE_CHECKING, Any, Final
 
 from msgspec import structs
 from prometheus_client import Counter, Gauge
@@ -14,8 +14,10 @@ from fog_runtime import logs
 from fog_runtime.concurrency import Worker
 from fog_runtime.stores.redis_connection import StoreError
 from fog_runtime.stores.redis_store import Audit, RecoveryError
+from map_service.record_writer import ConflictError
+from map_service.store import ZONES
 from map_service.zone_times import StoredState
-from map_service.zones import check_list_size, check_room, list_size, prepare_zone, zones_spans
+from map_service.zones import check_list_size, check_room, check_sets, list_size, prepare_zone, zones_spans
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Mapping
@@ -27,6 +29,7 @@ if TYPE_CHECKING:
     from fog_runtime.stores.redis_store import Attempt, Outcome, StoreStatus
     from map_service.core import MapCore
     from map_service.publisher import Publisher
+    from map_service.record_writer import RecordWriter
     from map_service.store import Store
     from map_service.zone_times import Progress
     from map_service.zones import PreparedZone
@@ -95,15 +98,6 @@ MAX_PREPARING = 64
 """Most zones that are validated or wait for it; further requests are answered with 503."""
 
 
-class ConflictError(Exception):
-    """A zone has another version than the writer expected, or exists already."""
-
-    def __init__(self, outcome: Outcome, zone_id: str) -> None:
-        super().__init__(f"zone {zone_id}: {outcome}")
-        self.outcome = outcome
-        self.zone = zone_id
-
-
 class ZoneWriter:
     """Changes zones one after another: none is on the map before it is stored."""
 
@@ -122,10 +116,12 @@ class ZoneWriter:
         self._times = times
         self._publisher = publisher
         self._health = health
-        self._now = now
-        self._lock = asyncio.Lock()
+        self.now = now
+        self.lock = asyncio.Lock()
         self._worker = Worker("zones", limit=MAX_PREPARING)
         self.unusable = UnusableZones()
+        self.beside: tuple[RecordWriter[Any], ...] = ()
+        """What is stored beside zones, and loaded before them."""
         self.must_reload = False
         """Whether stored zones may differ from those on the map: after a write whose outcome is unknown."""
 
@@ -136,19 +132,19 @@ class ZoneWriter:
 
         An `attempt` that succeeded before returns its zone again; raises `IdempotencyError` for another request's.
         """
-        async with self._lock:
+        async with self.lock:
             if (earlier := await self._earlier_result(attempt)) is not None:
                 return earlier
             if self._core.zones.get(zone.id) is not None:
                 # The store would treat an identical zone as a repeated attempt.
                 raise ConflictError("exists", zone.id)
             prepared = await self._prepare(zone)
-            audit = Audit(self._now().stamp, who, action, attempt)
-            with self._uncertain_write():
+            audit = Audit(self.now().stamp, who, action, attempt)
+            with self.uncertain_write():
                 outcome, zone = await self._store.create(prepared.zone, audit)
             if (earlier := await self._unless_ok(outcome, zone.id, attempt)) is not None:
                 return earlier
-            self._publisher.publish(self._core.put_zone(zone, self._now(), prepared.spans))
+            self._publisher.publish(self._core.put_zone(zone, self.now(), prepared.spans))
         await self._publisher.all_on_map()
         return zone
 
@@ -159,55 +155,56 @@ class ZoneWriter:
 
         Raises `ZoneError`, `ConflictError` (stale, missing), and `StoreError`.
         """
-        async with self._lock:
+        async with self.lock:
             if (earlier := await self._earlier_result(attempt)) is not None:
                 return earlier
             # The store would treat an identical zone as a repeated attempt.
             old = self._require(zone.id, expected)
             prepared = await self._prepare(structs.replace(zone, version=old.version + 1))
-            audit = Audit(self._now().stamp, who, action, attempt)
-            with self._uncertain_write():
+            audit = Audit(self.now().stamp, who, action, attempt)
+            with self.uncertain_write():
                 outcome = await self._store.replace(prepared.zone, expected=old.version, audit=audit)
             if (earlier := await self._unless_ok(outcome, zone.id, attempt)) is not None:
                 return earlier
-            self._publisher.publish(self._core.put_zone(prepared.zone, self._now(), prepared.spans))
+            self._publisher.publish(self._core.put_zone(prepared.zone, self.now(), prepared.spans))
         await self._publisher.all_on_map()
         return prepared.zone
 
     async def delete(self, zone_id: str, expected: int | None, who: str, *, action: str = "delete") -> None:
         """Delete a zone; with `expected`, only this version. Raises `ConflictError` (stale, missing), `StoreError`."""
-        async with self._lock:
+        async with self.lock:
             zone = self._require(zone_id, expected)
-            with self._uncertain_write():
-                outcome = await self._store.delete(zone, Audit(self._now().stamp, who, action))
+            with self.uncertain_write():
+                outcome = await self._store.delete(zone, Audit(self.now().stamp, who, action))
             await self._unless_ok(outcome, zone_id)
-            self._publisher.publish(self._core.remove_zone(zone_id, self._now()))
+            self._publisher.publish(self._core.remove_zone(zone_id, self.now()))
         await self._publisher.all_on_map()
 
     async def delete_ended(self) -> None:
         """Delete zones that have been over for an hour; the audit trail keeps them. Raises `StoreError`."""
-        for zone in self._core.zones_over(KEPT_S, self._now().now)[:_DELETED_AT_ONCE]:
+        for zone in self._core.zones_over(KEPT_S, self.now().now)[:_DELETED_AT_ONCE]:
             with suppress(ConflictError):  # somebody has changed it meanwhile
                 await self.delete(zone.id, zone.version, "map-service")
 
     async def delete_unusable(self, zone_id: str, who: str) -> None:
         """Delete a zone that is left out because its record is invalid; raises `StoreError`."""
-        async with self._lock:
-            with self._uncertain_write():
-                await self._store.delete_unusable(zone_id, Audit(self._now().stamp, who, "delete"))
-            await self._load()
+        async with self.lock:
+            with self.uncertain_write():
+                await self._store.delete_unusable(zone_id, Audit(self.now().stamp, who, "delete"))
+            await self.load_while_locked()
 
     async def earlier_result(self, attempt: Attempt | None) -> Zone | None:
         """Return the zone that an earlier attempt stored, once it is on the map; None for a first attempt.
 
         Raises `IdempotencyError` for another request's attempt, and `StoreError`.
         """
-        async with self._lock:
+        async with self.lock:
             return await self._earlier_result(attempt)
 
     async def store_status(self) -> StoreStatus:
         """Return what Redis and this process have; raises `StoreError`."""
-        return await self._store.status({"zones": len(self._core.zones)} if self._core.zones_loaded else {})
+        beside = {records.table.name: len(records.records) for records in self.beside}
+        return await self._store.status({"zones": len(self._core.zones), **beside} if self._core.zones_loaded else {})
 
     async def recover_store(self, action: Literal["restore", "accept"], who: str) -> None:
         """Restore the zones from memory, or accept those in Redis, after Redis lost records.
@@ -215,12 +212,14 @@ class ZoneWriter:
         Raises `RecoveryError` and `StoreError`.
         """
         await self._store.require_loss()
-        async with self._lock:
-            audit = Audit(self._now().stamp, who, action)
+        async with self.lock:
+            audit = Audit(self.now().stamp, who, action)
             if action == "accept":
                 await self._store.accept_loss(audit)
             elif self._core.zones_loaded:
-                await self._store.restore(self._core.zones.zones(), audit)
+                tables = {records.table.name: records.records for records in self.beside}
+                tables[ZONES.name] = {zone.id: zone for zone in self._core.zones.zones()}
+                await self._store.restore(tables, audit)
             else:
                 raise RecoveryError(
                     "this service was started after the loss and has no zones: restore a backup of Redis, or accept"
@@ -235,8 +234,8 @@ class ZoneWriter:
 
     async def load(self) -> None:
         """Replace the map's zones by the stored ones, where they differ; raises `StoreError`."""
-        async with self._lock:
-            await self._load()
+        async with self.lock:
+            await self.load_while_locked()
 
     async def reload_after_uncertain_write(self) -> None:
         """Load the zones if a failed write may have been stored, so that what is missing here is missing there, too.
@@ -246,8 +245,11 @@ class ZoneWriter:
         if self._core.zones_loaded and self.must_reload:
             await self.load()
 
-    async def _load(self) -> None:
+    async def load_while_locked(self) -> None:
+        """Do as `load` while the lock is held."""
         core = self._core
+        for records in self.beside:
+            await records.load()
         zones, unreadable = await self._store.zones()
         known = {zone.id: zone for zone in core.zones.zones()}
         changed = [zone for zone in zones if zone.id not in known or known[zone.id].shape != zone.shape]
@@ -256,7 +258,7 @@ class ZoneWriter:
         zones = [zone for zone in zones if zone.id not in invalid]
         if not core.zones_loaded or {zone.id: zone for zone in zones} != known:
             stored = StoredState(spans=spans, progress=await self._times.load(), boot=self._times.boot)
-            self._publisher.publish(core.load_zones(zones, self._now(), stored))
+            self._publisher.publish(core.load_zones(zones, self.now(), stored))
         self.must_reload = False
         detail = f"{len(zones)} loaded{self.unusable.detail()}"
         if (excess := list_size(core.zones.size) - ch.ZONES.limit) > 0:
@@ -271,13 +273,14 @@ class ZoneWriter:
         """Return the zone that an earlier attempt stored, once it is on the map."""
         earlier = await self._store.earlier_result(attempt)
         if earlier is not None and self.must_reload:
-            await self._load()
+            await self.load_while_locked()
         return earlier
 
     async def _prepare(self, zone: Zone) -> PreparedZone:
         """Validate and rasterize a zone on the worker thread; raises `ZoneError`, and `BusyError` if too many wait."""
-        at, zones, geometry = self._now(), self._core.zones, self._core.costmap.geometry
+        at, zones, geometry = self.now(), self._core.zones, self._core.costmap.geometry
         stamp = at.stamp if at.synchronized else 0.0
+        check_sets(zone, self._core.zone_sets.sets)
         prepared = await self._worker.run(prepare_zone, zone, geometry, stamp)
         old = zones.get(zone.id)
         count, cells, size = (0, 0, 0) if old is None else (1, old.cells, old.size)
@@ -286,7 +289,7 @@ class ZoneWriter:
         return prepared
 
     @contextmanager
-    def _uncertain_write(self) -> Iterator[None]:
+    def uncertain_write(self) -> Iterator[None]:
         """Reload the zones after a failure: they may have been written although the reply was lost."""
         try:
             yield

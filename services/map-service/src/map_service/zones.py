@@ -68,6 +68,7 @@ class ZoneCatalog:
     def __init__(self) -> None:
         self._entries: dict[str, ZoneEntry] = {}
         self._timed: dict[str, ZoneEntry] = {}
+        self._in_sets: dict[str, ZoneEntry] = {}
         self._zones: _Ordered[Zone] = _Ordered()
         self._active: _Ordered[str] = _Ordered()
         self._places = _Places()
@@ -103,6 +104,10 @@ class ZoneCatalog:
         """Return the entries of the zones that begin or end by themselves."""
         return self._timed.values()
 
+    def in_sets(self) -> Collection[ZoneEntry]:
+        """Return the entries of the zones that are switched together with others."""
+        return self._in_sets.values()
+
     def active_in(self, window: Window) -> list[ZoneEntry]:
         """Return the entries of the zones in force whose windows overlap this one."""
         return [self._entries[name] for name in self._places.overlapping(window)]
@@ -117,6 +122,8 @@ class ZoneCatalog:
         self.size += entry.size
         if entry.timed:
             self._timed[name] = entry
+        if entry.zone.sets:
+            self._in_sets[name] = entry
         if entry.active:
             self._activate(entry)
         self._touched[name] = "active" if entry.active else "inactive"
@@ -129,6 +136,7 @@ class ZoneCatalog:
         self._touched[zone_id] = "removed"
         self._zones.remove(zone_id)
         self._timed.pop(zone_id, None)
+        self._in_sets.pop(zone_id, None)
         self.cells -= entry.cells
         self.size -= entry.size
         if entry.active:
@@ -278,6 +286,14 @@ def prepare_zone(zone: Zone, geometry: GridGeometry, stamp: float) -> PreparedZo
             " move it onto the map",
         )
     return PreparedZone(structs.replace(zone, shape=shape), spans)
+
+
+def check_sets(zone: Zone, known: Collection[str]) -> None:
+    """Raise `ZoneError` for a set that the zone names and nobody has added."""
+    for index, name in enumerate(zone.sets):
+        if name not in known:
+            problem = f"there is no set of zones {name}: PUT /api/v1/zone-sets/{name} first"
+            raise ZoneError(f"sets.{index}", problem)
 
 
 def check_room(prepared: PreparedZone, count: int, cells: int, geometry: GridGeometry) -> None:

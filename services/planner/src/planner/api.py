@@ -1,6 +1,7 @@
 """REST under /api/v1: robots with their missions, plans on request, and operators' commands to robots."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
+from functools import partial
 
 from fastapi import FastAPI
 
@@ -10,6 +11,7 @@ from fog_contracts.messages import (
     Message,
     Metres,
     Mode,
+    Place,
     PlanReply,
     PlanRequest,
     Pose,
@@ -45,7 +47,7 @@ from fog_runtime.http import (
 )
 from fog_runtime.stores.redis_connection import StoreError
 from fog_runtime.stores.redis_store import IdempotencyError
-from planner.api_commands import add_commands
+from planner.api_commands import KnownPlaces, add_commands
 from planner.problems import PlannerProblem
 from planner.query_queue import BusyError
 from planner.robot_operator import CommandError
@@ -171,19 +173,24 @@ class _Robots:
         )
 
 
-def _goal_pose(body: GoalBody, site: Site) -> tuple[Pose, bool]:
+def _goal_pose(body: GoalBody, places: Mapping[str, Place]) -> tuple[Pose, bool]:
     """Return the pose of a goal, and whether any heading will do; raises a `ProblemError` for an invalid goal."""
     if (body.place is None) == (body.pose is None):
         raise ProblemError(HttpProblem.REQUEST_INVALID, "give either a place or a pose, and not both", field="body")
     if body.pose is not None:
         theta = body.pose.theta
         return Pose(x=body.pose.x, y=body.pose.y, theta=theta or 0.0), theta is None
-    place = site.places.get(body.place or "")
+    place = places.get(body.place or "")
     if place is None:
-        names = ", ".join(sorted(site.places)) or "none"
+        names = ", ".join(sorted(places)) or "none"
         detail = f"there is no place {body.place}; known places: {names}"
         raise ProblemError(PlannerProblem.NO_PLACE, detail, field="body.place")
     return Pose(x=place.x, y=place.y, theta=place.theta or 0.0), place.theta is None
+
+
+def _places(service: Service, site: Site) -> Mapping[str, Place]:
+    """Return the places by id: those of `site.toml` until the map-service has told how operators have changed them."""
+    return site.places if service.places is None else service.places
 
 
 def make_api(service: Service, site: Site, health: Health, tokens: Tokens, standby: Callable[[], str] = str) -> FastAPI:
@@ -192,11 +199,12 @@ def make_api(service: Service, site: Site, health: Health, tokens: Tokens, stand
     robots = _Robots(service, site)
     routes = Routes(app, "robots")
     add_store_errors(routes)
-    add_commands(routes, service.operator, site, check=robots.check, mode=robots.mode)
+    places = partial(_places, service, site)
+    add_commands(routes, service.operator, places, check=robots.check, mode=robots.mode)
     _add_views(routes, service, robots)
-    _add_orders(routes, service, robots, site)
+    _add_orders(routes, service, robots, places)
     add_undo(routes, service, robots.check)
-    _add_plan(Routes(app, "plan"), service, robots, site)
+    _add_plan(Routes(app, "plan"), service, robots, places)
     recovery = Routes(app, "store")
     add_store_errors(recovery)
     add_recovery(recovery, service.missions)
@@ -232,7 +240,7 @@ def _add_views(routes: Routes, service: Service, robots: _Robots) -> None:
         return _goal_answer(robot, stored)
 
 
-def _add_orders(routes: Routes, service: Service, robots: _Robots, site: Site) -> None:
+def _add_orders(routes: Routes, service: Service, robots: _Robots, places: KnownPlaces) -> None:
     """Add the routes that send and stop robots."""
     routes.raises(
         MissionConflictError,
@@ -267,7 +275,7 @@ def _add_orders(routes: Routes, service: Service, robots: _Robots, site: Site) -
         if service.operator.is_doubled(robot):
             detail = f"two agents use the id of robot {robot}: switch one off, or give it another id, then try again"
             raise ProblemError(PlannerProblem.ROBOT_DOUBLED, detail)
-        pose, any_heading = _goal_pose(body, site)
+        pose, any_heading = _goal_pose(body, places())
         order = Order(
             robot,
             pose,
@@ -304,7 +312,7 @@ def _add_orders(routes: Routes, service: Service, robots: _Robots, site: Site) -
             raise _without_mission(robot)
 
 
-def _add_plan(routes: Routes, service: Service, robots: _Robots, site: Site) -> None:
+def _add_plan(routes: Routes, service: Service, robots: _Robots, places: KnownPlaces) -> None:
     routes.raises(
         BusyError,
         [PlannerProblem.BUSY],
@@ -326,7 +334,7 @@ def _add_plan(routes: Routes, service: Service, robots: _Robots, site: Site) -> 
     async def dry_run_goal(robot: str, body: Body[GoalBody], caller: Viewer) -> GoalOutcome:
         """Return the path that a robot would get to a goal from where it stands, and do nothing; or the refusal."""
         robots.check(robot)
-        pose, _ = _goal_pose(body, site)
+        pose, _ = _goal_pose(body, places())
         outcome = await service.dry_runs.goal(robot, pose.x, pose.y, f"person {caller.name}")
         if outcome is None:
             detail = f"it is not known where robot {robot} is: switch it on and localize it, then try again"

@@ -1,13 +1,15 @@
 """REST of operators' commands to robots."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 
-from fog_contracts.messages import CommandKind, CommandReply, Id, Message, Metres, Mode, Pose, Radians
-from fog_contracts.site import Site
+from fog_contracts.messages import CommandKind, CommandReply, Id, Message, Metres, Mode, Place, Pose, Radians
 from fog_runtime.http import Body, ClientHost, HttpProblem, Operator, ProblemError, Routes
 from fog_runtime.stores.redis_connection import StoreError
 from planner.problems import PlannerProblem
 from planner.robot_operator import CommandError, RobotOperator
+
+KnownPlaces = Callable[[], Mapping[str, Place]]
+"""Returns the places that there are now, by id."""
 
 
 class StartPose(Message, frozen=True, kw_only=True):
@@ -37,7 +39,7 @@ class CommandOutcome(Message, frozen=True, kw_only=True):
 def add_commands(
     routes: Routes,
     operator: RobotOperator,
-    site: Site,
+    places: KnownPlaces,
     *,
     check: Callable[[str], None],
     mode: Callable[[str], Mode | None],
@@ -68,7 +70,7 @@ def add_commands(
     async def post_command(robot: str, body: Body[CommandBody], caller: Operator) -> CommandOutcome:
         """Command a robot; the robot itself accepts or refuses."""
         check(robot)
-        return outcome(robot, await operator.send(body.kind, robot, caller.name, _pose(body, site)))
+        return outcome(robot, await operator.send(body.kind, robot, caller.name, _pose(body, places())))
 
     routes.urgent("/api/v1/robots/{robot}/stop")
 
@@ -83,7 +85,7 @@ def add_commands(
         return outcome(robot, await operator.stop(robot, f"stop from {client or 'an unknown address'}"))
 
 
-def _pose(body: CommandBody, site: Site) -> Pose | None:
+def _pose(body: CommandBody, places: Mapping[str, Place]) -> Pose | None:
     """Return the pose of a command; raises a `ProblemError` for one that does not belong to it, or lacks."""
     if body.kind != "initial_pose":
         if body.pose is not None or body.place is not None:
@@ -95,9 +97,9 @@ def _pose(body: CommandBody, site: Site) -> Pose | None:
         raise ProblemError(HttpProblem.REQUEST_INVALID, detail, field="body.pose")
     if body.pose is not None:
         return Pose(x=body.pose.x, y=body.pose.y, theta=body.pose.theta)
-    place = site.places.get(body.place or "")
+    place = places.get(body.place or "")
     if place is None or place.theta is None:
-        known = ", ".join(sorted(name for name, found in site.places.items() if found.theta is not None)) or "none"
+        known = ", ".join(sorted(name for name, found in places.items() if found.theta is not None)) or "none"
         detail = f"there is no place {body.place} with a heading; places that have one: {known}"
         raise ProblemError(PlannerProblem.NO_PLACE, detail, field="body.place")
     return Pose(x=place.x, y=place.y, theta=place.theta)

@@ -40,6 +40,8 @@ if TYPE_CHECKING:
         MapDelta,
         MapHeartbeat,
         MapSnapshot,
+        Place,
+        PlaceSet,
         PlanReply,
         PlanRequest,
         Refusal,
@@ -75,6 +77,8 @@ class PlannerCore:
         self._regions = BlockedRegions()
         self._fields = GoalFields(self.config.goal_fields_bytes)
         self.missions = Missions()
+        self.places: Mapping[str, Place] | None = None
+        """All places by id, as the map-service has them; None until it has told them."""
         self.replanner = Replanner(self.config, self._fields)
         self.answerer = Answerer(self.config)
         """Used by the thread that runs jobs for "query" and answers queries."""
@@ -93,6 +97,7 @@ class PlannerCore:
                 **self._regions.handlers(),
                 ch.ROBOT_POSE: self._on_pose,
                 ch.ROBOT_STATE: self._on_state,
+                ch.PLACES: self._on_places,
             }
         )
 
@@ -137,6 +142,10 @@ class PlannerCore:
             self.missions.reach(ids["robot"], state.goal_id)
         elif state.goal_id is not None and self._knows_missions:
             self.missions.of(ids["robot"]).end_unknown(state.goal_id)
+        return ()
+
+    def _on_places(self, _ids: Ids, places: PlaceSet, _at: Moment) -> Sequence[Publication]:
+        self.places = places.places
         return ()
 
     # --- Leading and standing by: one of several planners leads, the others follow all inputs -----------------------

@@ -39,7 +39,16 @@ if TYPE_CHECKING:
 
     from fog_contracts.channels import Channel
     from fog_contracts.handlers import Handler, Ids, Moment, Publication
-    from fog_contracts.messages import DryRunReply, DryRunRequest, EgressRequest, Message, PlanRequest, Pose, Refusal
+    from fog_contracts.messages import (
+        DryRunReply,
+        DryRunRequest,
+        EgressRequest,
+        Message,
+        Place,
+        PlanRequest,
+        Pose,
+        Refusal,
+    )
     from fog_runtime.clock import Clock
     from fog_runtime.health import Health
     from fog_runtime.stores.records import AuditEntry
@@ -227,6 +236,11 @@ class Service:
     def goals(self) -> dict[str, StoredGoal]:
         """The missions by robot."""
         return self.missions.goals
+
+    @property
+    def places(self) -> Mapping[str, Place] | None:
+        """All places by id; None until the map-service has told them."""
+        return self._core.places
 
     def path(self, robot: str) -> RobotPath | None:
         """Return the last published path or refusal for the robot's current goal, as last released."""

@@ -11,7 +11,7 @@ import re
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Final, Literal
 
-from fog_contracts.channels import AGGREGATOR, CHANNELS, NODE, ROBOT, ROLES, Channel, Role
+from fog_contracts.channels import AGGREGATOR, CHANNELS, NODE, ROBOT, ROLES, ZONE_SOURCE, Channel, Role
 from fog_contracts.generate import NOTE
 
 if TYPE_CHECKING:
@@ -19,14 +19,17 @@ if TYPE_CHECKING:
 
 Access = Literal["read", "write"]
 
+_BY_NAME: Final[Mapping[Role, str]] = {NODE: "node", ZONE_SOURCE: "source"}
+"""Roles whose users have names of their own, and the variable part of topics that is this name."""
+
 _HOME_ASSISTANTS_OWN: Final = ("homeassistant/status", "homeassistant/+/+/state")
 """Its birth and will messages, and the states of its entities (`mqtt_statestream` with the base `homeassistant`)."""
 _MQTT_HEAD: Final = f"""\
 # Who may publish and receive what through the MQTT broker: Mosquitto's `acl_file`.
 # {NOTE}
 #
-# A sensor node's user name is the node's id, any other user name is a role. Topics that no line allows are denied.
-# A `pattern` line holds for every user, with the user name for %u, so no node's id may be a role's name.
+# The user name of a sensor node, or a source of zones, is its id, any other user name is a role. Topics that no line
+# allows are denied. A `pattern` line holds for every user, with the user name for %u, so no id may be a role's name.
 # Mosquitto 2.0 accepts every subscription and checks each message when it is delivered.
 """
 
@@ -46,15 +49,16 @@ def mqtt_acl(
     `devices` are sensors and gateways of others with the topics that they may use.
     """
     sections = [_MQTT_HEAD]
-    sections += [_section(role, site, floors or {}) for role in ROLES if role != NODE and _lines(role, site)]
+    roles = [role for role in ROLES if role not in _BY_NAME]
+    sections += [_section(role, site, floors or {}) for role in roles if _lines(role, site)]
     sections += [f"user {user}\ntopic readwrite #\ntopic read $SYS/#\n" for user in unrestricted]
     for device, topics in (devices or {}).items():
         lines = [f"topic readwrite {topic}" for topic in topics]
         sections.append("\n".join(["# A device of others: only its own topics", f"user {device}", *lines, ""]))
     for floor, nodes in (floors or {}).items():
-        sections += [_floor_section(role, floor) for role in ROLES if role != NODE and _floor_lines(role, floor)]
-        sections += [_floor_node(floor, node) for node in nodes]
-    sections.append(_nodes(site))
+        sections += [_floor_section(role, floor) for role in roles if _floor_lines(role, floor)]
+        sections += [_floor_member(floor, name) for name in nodes]
+    sections += [_pattern(role, site) for role in _BY_NAME]
     return "\n".join(sections)
 
 
@@ -76,20 +80,23 @@ def _floor_section(role: Role, floor: str) -> str:
     return "\n".join([f"# {ROLES[role]} ({floor})", f"user {floor}.{role}", *(f"topic {line}" for line in lines), ""])
 
 
-def _floor_node(floor: str, node: str) -> str:
+def _floor_member(floor: str, name: str) -> str:
+    rights = [(*right, part) for role, part in _BY_NAME.items() for right in _mqtt_rights(role)]
     lines = [
-        f"topic {access:5} {_topic(row, floor, node)}" for access, row in _mqtt_rights(NODE) if "site" in row.fields
+        f"topic {access:5} {_topic(row, floor, **{part: name})}" for access, row, part in rights if "site" in row.fields
     ]
-    return "\n".join([f"# {ROLES[NODE]} ({floor})", f"user {floor}.{node}", *lines, ""])
+    about = " or ".join(ROLES[role] for role in _BY_NAME)
+    return "\n".join([f"# {about} ({floor})", f"user {floor}.{name}", *lines, ""])
 
 
 def _floor_lines(role: Role, floor: str) -> list[str]:
     return [f"{access:5} {_topic(row, floor)}" for access, row in _mqtt_rights(role) if "site" in row.fields]
 
 
-def _nodes(site: str) -> str:
-    lines = [f"pattern {access} {_topic(row, site, '%u')}" for access, row in _mqtt_rights(NODE)]
-    return "\n".join([f"# {ROLES[NODE]}: only its own topics", *lines, ""])
+def _pattern(role: Role, site: str) -> str:
+    own = {_BY_NAME[role]: "%u"}
+    lines = [f"pattern {access} {_topic(row, site, **own)}" for access, row in _mqtt_rights(role)]
+    return "\n".join([f"# {ROLES[role]}: only its own topics", *lines, ""])
 
 
 def _lines(role: Role, site: str) -> list[str]:
@@ -116,10 +123,10 @@ def _mqtt_rights(role: Role) -> list[tuple[Access, Channel]]:
     return rights
 
 
-def _topic(row: Channel, site: str, node: str = "+") -> str:
+def _topic(row: Channel, site: str, **own: str) -> str:
     if "number" in row.fields:
         return "+"
-    return row.template.format(**{name: {"site": site, "node": node}.get(name, "+") for name in row.fields})
+    return row.template.format(**{name: {"site": site, **own}.get(name, "+") for name in row.fields})
 
 
 Flow = Literal["ingress", "egress"]

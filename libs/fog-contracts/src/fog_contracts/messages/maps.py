@@ -14,6 +14,7 @@ from fog_contracts.messages.basics import (
     Message,
     Metres,
     PointXY,
+    Radians,
     Ring,
     Sent,
     Sentence,
@@ -166,11 +167,15 @@ class WeeklySchedule(Message, frozen=True, kw_only=True):
     times: Annotated[list[WeeklyTime], Meta(min_length=1, max_length=20)]
 
 
+ZoneSets = Annotated[list[Id], Meta(max_length=8)]
+
+
 class Zone(Message, frozen=True, kw_only=True):
     """An operator's zone: shape, effect (factor for PENALTY, m/s for SPEED_LIMIT), reason, author and validity.
 
     With `ttl_s` (s from its start) the zone ends by a monotonic clock, and `expires_at` only says when that will be.
-    With a `schedule` it is in force in the schedule's windows only.
+    With a `schedule` it is in force in the schedule's windows only, and never while one of its `sets` is off.
+    `source`: which source of zones put it, over MQTT; null: an operator did.
     """
 
     id: Id
@@ -184,8 +189,46 @@ class Zone(Message, frozen=True, kw_only=True):
     expires_at: Stamp | None = None
     ttl_s: TimeToLive | None = None
     schedule: WeeklySchedule | None = None
+    sets: ZoneSets = []
+    source: Id | None = None
     enabled: bool = True
     version: Count = 1
+
+
+class ZoneRequest(Message, frozen=True, kw_only=True):
+    """A zone that a source puts on the map for a limited time: `ttl_s`, or `expires_at`, and not both.
+
+    An empty message removes it. A retained message needs `expires_at`: nobody knows how old it is.
+    """
+
+    kind: ZoneKind
+    shape: Shape
+    factor: PenaltyFactor | None = None
+    speed: Annotated[float, Meta(ge=0.01, le=2.54, extra={"unit": "m/s"})] | None = None
+    reason: Sentence = ""
+    ttl_s: TimeToLive | None = None
+    expires_at: Stamp | None = None
+
+
+class Place(Message, frozen=True, kw_only=True):
+    """A named pose; without `theta` any heading is accepted. Visitors may send robots to those that are `public`."""
+
+    x: Metres
+    y: Metres
+    theta: Radians | None = None
+    label: Annotated[str, Meta(max_length=100)] = ""
+    public: bool = False
+
+
+PLACES_MAX: Final = 1_000
+"""Most places of a site."""
+
+
+class PlaceSet(Message, frozen=True, kw_only=True):
+    """All places by id: those of `site.toml` as operators have changed them since; `epoch` is the map-service's."""
+
+    epoch: Count
+    places: dict[Id, Place]
 
 
 class ZoneSet(Message, frozen=True, kw_only=True):

@@ -15,8 +15,8 @@ from fog_contracts.cones import ConeError, node_cone
 from fog_contracts.costs import is_traversable
 from fog_contracts.geometry import GeometryError, normalized_polygon
 from fog_contracts.grid import StaticMap
-from fog_contracts.messages import AREAS_MAX
-from fog_contracts.site import AreaSite, MarkerSite, NodeSite, Place, Site
+from fog_contracts.messages import AREAS_MAX, Place
+from fog_contracts.site import AreaSite, MarkerSite, NodeSite, Site
 from fog_runtime.configuration.maps import MapFileError, load_map
 
 SITE_FILE: Final = "site.toml"
@@ -146,12 +146,20 @@ def _check_ids(file: Path, site: Site) -> None:
     _check_unique(file, "nodes.id", (node.id for node in site.nodes))
     _check_unique(file, "robots.id", (robot.id for robot in site.robots))
     _check_unique(file, "markers.id", (marker.id for marker in site.markers))
-    for kind, ids in (("nodes", (node.id for node in site.nodes)), ("robots", (robot.id for robot in site.robots))):
+    users = {
+        "nodes": [node.id for node in site.nodes],
+        "robots": [robot.id for robot in site.robots],
+        "zone_sources": [source.id for source in site.zone_sources],
+    }
+    for kind, ids in users.items():
         for index, name in enumerate(ids):
             if name in ROLES:
                 remedy = "Rename it: the brokers would give it that role's rights"
                 raise SiteError(file, f"{kind}[{index}].id", f"{name!r} is the name of a role", remedy)
     _check_unique(file, "nodes.id and sources.id", [*(n.id for n in site.nodes), *(s.id for s in site.sources)])
+    # Each is a user of the broker or the router, which know them by their names alone.
+    _check_unique(file, "nodes.id and zone_sources.id", site.senders)
+    _check_unique(file, "robots.id and zone_sources.id", [*users["robots"], *users["zone_sources"]])
     areas = [area.id for area in site.areas]
     for kind, watched in (("nodes", [n.area for n in site.nodes]), ("sources", [s.area for s in site.sources])):
         for index, area in enumerate(watched):

@@ -9,10 +9,13 @@ from fog_runtime.http.routes import (
     ClientHost,
     Encoded,
     IfMatch,
+    Patch,
+    PatchOf,
     Routes,
     etag,
     expected_tag,
     expected_version,
+    patched,
 )
 from fog_runtime.http.sessions import add_session_routes
 from fog_runtime.http.store_routes import (
@@ -49,6 +52,8 @@ __all__ = [
     "IfNoneMatch",
     "Operator",
     "PageSize",
+    "Patch",
+    "PatchOf",
     "ProblemCode",
     "ProblemError",
     "Routes",
@@ -69,6 +74,7 @@ __all__ = [
     "make_app",
     "must_be_new",
     "next_page",
+    "patched",
     "serve_here",
     "still_admits",
     "token_hash",

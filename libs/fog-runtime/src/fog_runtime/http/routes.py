@@ -57,6 +57,20 @@ class _BodyMarker:
 Body = Annotated[T, _BodyMarker()]
 """A parameter that receives the JSON body, decoded and validated as this msgspec type."""
 
+MERGE_PATCH: Final = "application/merge-patch+json"
+
+
+@dataclass(frozen=True, slots=True)
+class PatchOf(_BodyMarker):
+    """Marks the parameter that receives a JSON merge patch (RFC 7396) of a body of this type, to be `patched`."""
+
+    kind: type[msgspec.Struct]
+
+
+Patch = dict[str, Any]
+"""A parameter with `PatchOf` gets this: the fields to be replaced, null for those to be left out."""
+
+
 IfMatch = Annotated[
     str | None,
     Header(alias="If-Match", description="The ETag that was read: refuse the request if the record has changed since"),
@@ -160,6 +174,10 @@ class Routes:
         """Add a route that writes."""
         return self._route("PUT", path, **options)
 
+    def patch(self, path: str, **options: Any) -> Callable[[Handler], Handler]:
+        """Add a route that changes fields of a record."""
+        return self._route("PATCH", path, **options)
+
     def delete(self, path: str, **options: Any) -> Callable[[Handler], Handler]:
         """Add a route that deletes."""
         return self._route("DELETE", path, **options)
@@ -205,7 +223,11 @@ class Routes:
     def _body(self, signature: "_Signature") -> dict[str, Any] | None:
         if signature.body is None:
             return None
-        content = {"application/json": {"schema": schema(self._app, signature.body[1])}}
+        if signature.patched is None:
+            content = {"application/json": {"schema": schema(self._app, signature.body[1])}}
+        else:
+            described = {"schema": _patch_schema(self._app, signature.patched)}
+            content = {MERGE_PATCH: described, "application/json": described}
         return {"requestBody": {"required": True, "content": content}}
 
     def _responses(
@@ -263,6 +285,7 @@ class _Signature:
     def __init__(self, handler: Callable[..., object]) -> None:
         hints = get_type_hints(handler, include_extras=True)
         self.body: tuple[str, Any] | None = None
+        self.patched: type[msgspec.Struct] | None = None
         first: list[inspect.Parameter] = []
         others: list[inspect.Parameter] = []
         fields: list[tuple[str, Any]] = []
@@ -272,6 +295,7 @@ class _Signature:
             fields.append((name, arguments[0]))
             if any(isinstance(mark, _BodyMarker) for mark in arguments[1:]):
                 self.body = (name, arguments[0])
+                self.patched = next((mark.kind for mark in arguments[1:] if isinstance(mark, PatchOf)), None)
                 kind = Annotated[arguments[0], Depends(_reader(arguments[0]))]
             # Keyword-only, so that a parameter without a default may follow one with a default.
             replaced = parameter.replace(annotation=kind, kind=inspect.Parameter.KEYWORD_ONLY)
@@ -401,6 +425,41 @@ async def read_body(request: Request, kind: type[T]) -> T:
         raise InvalidBodyError(
             [{"field": "body", "problem": "lists or objects inside one another, too deep"}]
         ) from error
+
+
+def patched(record: T, patch: Patch) -> T:
+    """Return a record of a body's type with a merge patch applied; raises as an invalid body does."""
+    try:
+        return msgspec.convert(_merged(msgspec.to_builtins(record), patch), type(record))
+    except msgspec.ValidationError as error:
+        raise InvalidBodyError([_error_of(error)]) from error
+
+
+def _merged(target: object, patch: object) -> object:
+    """Apply a merge patch as RFC 7396 defines it; the body's decoder has limited how deep it is."""
+    if not isinstance(patch, dict):
+        return patch
+    merged = dict(target) if isinstance(target, dict) else {}
+    for name, value in patch.items():
+        if value is None:
+            merged.pop(name, None)
+        else:
+            merged[name] = _merged(merged.get(name), value)
+    return merged
+
+
+def _patch_schema(app: FastAPI, kind: type[msgspec.Struct]) -> dict[str, Any]:
+    """Return the schema of a merge patch: no field is required, each may be null, and objects may have some fields."""
+    schema(app, kind)
+    whole: dict[str, Any] = app.state.schemas[kind.__name__]
+    fields = {
+        name: {} if "$ref" in str(field) else {"anyOf": [field, {"type": "null"}]}
+        for name, field in whole["properties"].items()
+    }
+    name = f"{kind.__name__.removesuffix('Body')}Patch"
+    about = f"A JSON merge patch (RFC 7396) of {kind.__name__}: what is null is left out, what is missing stays."
+    app.state.schemas[name] = {"title": name, "type": "object", "description": about, "properties": fields}
+    return {"$ref": _SCHEMAS.format(name=name)}
 
 
 def schema(app: FastAPI, kind: Any) -> dict[str, Any]:

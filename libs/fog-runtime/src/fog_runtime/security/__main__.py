@@ -188,14 +188,14 @@ def _make(settings: Settings, site: Site, floors: Sequence[Site]) -> SiteSecurit
     security = SiteSecurity(settings.locks_dir, site.id)
     hosts = [host for host in (part.strip() for part in settings.hosts.split(",")) if host]
     security.make(
-        [*_SERVERS, *hosts], robots=[robot.id for robot in site.robots], nodes=[node.id for node in site.nodes]
+        [*_SERVERS, *hosts], robots=[robot.id for robot in site.robots], nodes=site.senders
     )  # fmt: skip
     make_keys(settings.locks_dir)
     for index, floor in enumerate(floors):
         if floor.id in {site.id, *(each.id for each in floors[:index])}:
             raise SecurityError(f"two floors have the same id {floor.id!r}: give one of them another in its site.toml")
         security.add_floor(
-            floor.id, robots=[robot.id for robot in floor.robots], nodes=[node.id for node in floor.nodes]
+            floor.id, robots=[robot.id for robot in floor.robots], nodes=floor.senders
         )  # fmt: skip
         make_keys(keys_of(settings.locks_dir, floor.id))
     return security
@@ -324,7 +324,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
             security,
             settings.handed_out_dir,
             robots=[robot.id for robot in site.robots],
-            nodes=[node.id for node in site.nodes],
+            nodes=site.senders,
         )
         for floor in floors:
             changed += hand_out_on_floor(
@@ -332,7 +332,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
                 settings.handed_out_dir,
                 floor.id,
                 robots=[robot.id for robot in floor.robots],
-                nodes=[node.id for node in floor.nodes],
+                nodes=floor.senders,
             )
     except (AuthorityError, CredentialsError, SecurityError, SettingsError, SiteError, TokensError, OSError) as error:
         sys.stderr.write(f"{error}\n")

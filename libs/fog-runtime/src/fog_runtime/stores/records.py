@@ -35,11 +35,14 @@ HISTORY: Final = "history"
 """Of each area: `history:AREA`."""
 ZONES: Final = "zones"
 ZONE_TIMES: Final = "zone_times"
+ZONE_SETS: Final = "zone_sets"
+ZONE_SOURCES: Final = "zone_sources"
+PLACES: Final = "places"
 GOALS: Final = "goals"
 
 OWN: Final[Mapping[str, Sequence[str]]] = {
     "hazard-aggregator": (AREAS, HAZARDS, OVERRIDES, OVERRIDE_RESTS, ALERTS, f"{HISTORY}:*"),
-    "map-service": (ZONES, ZONE_TIMES),
+    "map-service": (ZONES, ZONE_TIMES, ZONE_SETS, ZONE_SOURCES, PLACES),
     "planner": (GOALS,),
 }
 """The keys of each service's own records, as patterns."""
@@ -47,7 +50,7 @@ READ: Final[Mapping[str, Sequence[str]]] = {"console-service": (f"{HISTORY}:*",)
 """Others' records that a service reads, as patterns."""
 AUDITED: Final[Mapping[str, Sequence[str]]] = {
     "hazard-aggregator": ("alert", "area", "override", "store"),
-    "map-service": ("zone", "store"),
+    "map-service": ("place", "set", "source", "zone", "store"),
     "planner": ("mission", "robot", "stop", "store"),
 }
 """The kinds of records whose audit trail (`audit:KIND`) each service writes."""
@@ -165,11 +168,14 @@ newer than the last one is known.
 """
 
 
-KINDS: Final = ("alert", "area", "mission", "override", "robot", "stop", "store", "zone")
+KINDS: Final = (
+    "alert", "area", "mission", "override", "place", "robot", "set", "source", "stop", "store", "zone",
+)  # fmt: skip
 """The kinds of records that have an audit trail.
 
 `alert`: alerts that began, ended or were acknowledged; `store`: what an administrator decided after a loss; `robot`:
-operators' commands to robots; `stop`: stops without a token, of which anybody may send any number.
+operators' commands to robots; `set`: sets of zones; `source`: muted sources of zones; `stop`: stops without a
+token, of which anybody may send any number.
 """
 
 PAGE_BYTES: Final = 256 * 1024

@@ -9,6 +9,7 @@ from fog_contracts.messages import Cause
 from fog_contracts.shapes import shape_spans
 from fog_kernels.spans import lower_speeds, raise_costs
 from map_service.layers.base import CostLayer, LayerFactory, NoOptions
+from map_service.zone_sets import SetOfZones, SetSwitches
 from map_service.zone_times import Progress, StoredState, ZoneTimes
 from map_service.zones import ZoneCatalog, ZoneEntry, named_spans
 
@@ -35,7 +36,9 @@ class ZonesLayer(CostLayer):
         super().__init__()
         self._geometry = geometry
         self.catalog = ZoneCatalog()
+        self.switches = SetSwitches()
         self._changed = False
+        self._switched_cells = 0
 
     def put(self, zone: Zone, at: Moment, spans: Spans | None = None) -> None:
         """Add or replace a zone, whose cells may be given; raises `ShapeError` for an invalid shape."""
@@ -63,6 +66,16 @@ class ZonesLayer(CostLayer):
             times = ZoneTimes(zone, stored.progress.get(zone.id), boot=stored.boot, now=at.now)
             self._put(zone, cells, times, at)
 
+    def put_sets(self, sets: Mapping[str, SetOfZones], at: Moment) -> None:
+        """Replace the sets of zones, and put into force or end what they switch."""
+        self.switches.replace_all(sets)
+        self.tick(at)
+
+    def pop_switched(self) -> int:
+        """Return how many cells the windows of zones have that sets have switched since the last call."""
+        cells, self._switched_cells = self._switched_cells, 0
+        return cells
+
     def progress(self, boot: str, now: float) -> dict[str, Progress]:
         """Return, by id, what must be stored of the zones that begin or end."""
         return {entry.zone.id: entry.times.progress(boot, now) for entry in self.catalog.timed()}
@@ -77,10 +90,14 @@ class ZonesLayer(CostLayer):
         return changed
 
     def tick(self, at: Moment) -> list[Publication]:
-        """Activate and end zones by their times."""
-        for entry in self.catalog.timed():
-            active = entry.times.is_active(at)
+        """Activate and end zones by their times and sets."""
+        switched = self.switches.advance(at)
+        entries = dict.fromkeys([*self.catalog.timed(), *(self.catalog.in_sets() if switched else ())])
+        for entry in entries:
+            active = self._is_active(entry.zone, entry.times, at)
             if active != entry.active:
+                if switched and entry.zone.sets:
+                    self._switched_cells += entry.spans.window.width * entry.spans.window.height
                 self.catalog.set_active(entry, active)
                 self._changed = True
                 self._mark(entry, "active" if active else "inactive")
@@ -97,6 +114,10 @@ class ZonesLayer(CostLayer):
         """
         return _ChangedZones(self.catalog, put, without)
 
+    def _is_active(self, zone: Zone, times: ZoneTimes, at: Moment) -> bool:
+        in_time = times.is_active(at)  # whatever its sets are: time goes on
+        return in_time and self.switches.off.isdisjoint(zone.sets)
+
     def _known_spans(self, zone: Zone, given: Mapping[str, Spans]) -> Spans | None:
         old = self.catalog.get(zone.id)
         return old.spans if old is not None and old.zone.shape == zone.shape else given.get(zone.id)
@@ -105,7 +126,7 @@ class ZonesLayer(CostLayer):
         old = self.catalog.get(zone.id)
         if old is not None and old.zone == zone:
             return
-        entry = ZoneEntry.of(zone, spans, times, active=times.is_active(at))
+        entry = ZoneEntry.of(zone, spans, times, active=self._is_active(zone, times, at))
         self.catalog.put(entry)
         self._changed = True
         if old is not None and old.active:

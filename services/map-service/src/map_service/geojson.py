@@ -30,9 +30,9 @@ from fog_runtime.http import Body, Operator, Routes
 from fog_runtime.http.routes import InvalidBodyError
 from fog_runtime.stores.redis_connection import StoreError
 from map_service.problems import ZONES_NOT_LOADED, require_zones
+from map_service.record_writer import ConflictError
 from map_service.service import Service
 from map_service.zone_bodies import ZoneBody, zone_from_body
-from map_service.zone_writer import ConflictError
 from map_service.zones import ZoneError
 
 GEOJSON: Final = "application/geo+json"

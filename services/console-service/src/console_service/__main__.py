@@ -70,9 +70,9 @@ async def main() -> None:
             nodes={node.id: msgspec.to_builtins(node) for node in described.nodes},
         )
         core.on_places(described.places, clock.now())
-        service = Service(core, mqtt, zenoh, clock, health)
-        service.subscribe()
         redis = RedisConnection(settings.redis_url, credentials=own)
+        service = Service(core, mqtt, zenoh, redis, clock, health)
+        service.subscribe()
         sources = Sources(
             core, clock, aggregator_url=settings.aggregator_url, redis=redis, credentials=own,
             on_news=service.readers.wake,
@@ -91,6 +91,7 @@ async def main() -> None:
                 for event in get_args(Fetched):
                     tasks.create_task(sources.fetch_loop(event), name=f"{event}s")
                 tasks.create_task(sources.record_loop(), name="records")
+                tasks.create_task(service.recording_loop(), name="recording")
                 tasks.create_task(service.readers.run(), name="readers")
                 tasks.create_task(service.readers.tell_time(clock.stamp), name="time")
                 tasks.create_task(serving, name="http")

@@ -1,19 +1,41 @@
 """REST under /api/v1 and the page: nothing here changes anything but who is logged in."""
 
 import hashlib
+import math
 from pathlib import Path
-from typing import Annotated, Any, Final
+from typing import Annotated, Any, Final, Literal
+from urllib.parse import urlencode
 
+import msgspec
 from fastapi import FastAPI, Header, Query, Request, Response
 
 from console_service.forward import CONSOLE, URGENT, Forward, ForwardProblem
 from console_service.page_files import PageFiles
 from console_service.readers import EventStream
+from console_service.recording import STEP_S, Shown
 from console_service.service import Service
-from fog_contracts.messages import Id
+from console_service.timeline import ALL_KINDS, TimelineEntry
+from fog_contracts.messages import Id, Message
 from fog_runtime.clock import SystemClock
 from fog_runtime.health import Health
-from fog_runtime.http import ClientHost, Encoded, Routes, Tokens, Viewer, add_session_routes, make_app, still_admits
+from fog_runtime.http import (
+    Answer,
+    ClientHost,
+    Encoded,
+    HttpProblem,
+    PageSize,
+    ProblemError,
+    Routes,
+    Tokens,
+    Viewer,
+    add_session_routes,
+    add_store_errors,
+    make_app,
+    next_page,
+    still_admits,
+)  # fmt: skip
+from fog_runtime.stores.records import CursorError
+from fog_runtime.stores.redis_connection import StoreError
 
 PAGE: Final = Path(__file__).with_name("page")
 """Where a wheel or an image has the built page."""
@@ -42,6 +64,7 @@ def make_api(
     session = Routes(app, "session")
     add_session_routes(session, tokens, SystemClock())
     _add_events(Routes(app, "events"), service)
+    _add_past(Routes(app, "past"), service)
     forward = forward or Forward({})
 
     @session.get("/api/v1/openapi.json", problems=[ForwardProblem.SERVICE_AWAY])
@@ -77,3 +100,71 @@ def _add_events(routes: Routes, service: Service) -> None:
             service.readers, caller.name, f"{client} {session}", last_event_id, scan,
             lambda: still_admits(request, "viewer"),
         )  # fmt: skip
+
+
+Kinds = Annotated[
+    list[Literal[ALL_KINDS]],  # type: ignore[valid-type]  # values that are made elsewhere
+    Query(default_factory=list, alias="kind", description="Only these kinds; without any all"),
+]
+Begin = Annotated[float, Query(alias="from", description="s since the epoch")]
+End = Annotated[float | None, Query(alias="to", description="s since the epoch; now without it")]
+
+
+class Moments(Message, frozen=True, kw_only=True):
+    """What was changed at a time (s since the epoch): events as the stream of events has them."""
+
+    stamp: float
+    events: list[dict[str, Any]]
+
+
+class RecordingView(Message, frozen=True, kw_only=True):
+    """What there was: the first frame is the state of its time, each further one what changed until then.
+
+    The recording goes from `begin` to `end` (s since the epoch; null: there is none yet), with a frame every `step_s`.
+    `next`: ask from there on for the frames that did not fit.
+    """
+
+    begin: float | None
+    end: float | None
+    step_s: float
+    next: float | None
+    frames: list[Moments]
+
+
+def _add_past(routes: Routes, service: Service) -> None:
+    add_store_errors(routes)
+    routes.raises(
+        CursorError,
+        [HttpProblem.REQUEST_INVALID],
+        lambda error: ProblemError(HttpProblem.REQUEST_INVALID, str(error), field="query.cursor"),
+    )
+
+    @routes.get("/api/v1/timeline", raises=[CursorError, StoreError])
+    async def timeline(
+        _caller: Viewer, kind: Kinds, limit: PageSize, begin: Begin = 0.0, end: End = None, cursor: str | None = None
+    ) -> Answer[list[TimelineEntry]]:
+        """Return what happened, newest first; the Link header has the next page's address.
+
+        Operators' changes, commands, missions and alerts (as in the audit trail), hazards of areas, and those faults of
+        robots that this service has seen since its start.
+        """
+        page = await service.timeline(kind or ALL_KINDS, begin, end, cursor, limit)
+        given = [("kind", each) for each in kind] + [("from", begin)] + ([] if end is None else [("to", end)])
+        address = f"/api/v1/timeline?{urlencode(given)}&" if page.next else ""
+        link = next_page("/api/v1/timeline", page.next, limit)
+        if link and address:
+            link = {"Link": link["Link"].replace("/api/v1/timeline?", address, 1)}
+        return Answer(page.entries, link)
+
+    @routes.get("/api/v1/recording")
+    async def recording(
+        _caller: Viewer, begin: Annotated[float | None, Query(alias="from")] = None, end: End = None
+    ) -> Encoded[RecordingView]:
+        """Return what the events showed from `from` to `to`, within the last hour; without `from` only how far it goes.
+
+        It is kept in memory, and begins anew with the service and with another map.
+        """
+        shown, frames = (Shown([], None), b"") if begin is None else await service.show(begin, end or math.inf)
+        first, last = service.recording.span or (None, None)
+        head = RecordingView(begin=first, end=last, step_s=STEP_S, next=shown.next, frames=[])
+        return Encoded(msgspec.json.encode(head).removesuffix(b"[]}") + b"[" + frames + b"]}")

@@ -322,10 +322,10 @@ class ConsoleCore:
         self.on_places(heard.places, at.now)
         return ()
 
-    def on_record(self, position: str, record: msgspec.Struct) -> None:
-        """Take over the next entry of the audit trail; `position` names it."""
-        self.log.put("record", position, msgspec.json.encode(record))
-        self._records.append(position)
+    def on_record(self, name: str, record: msgspec.Struct) -> None:
+        """Take over the next entry of the audit trail, by its name."""
+        self.log.put("record", name, msgspec.json.encode(record))
+        self._records.append(name)
         if len(self._records) > RECORDS:
             self.log.forget("record", self._records.popleft())
 

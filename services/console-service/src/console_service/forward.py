@@ -29,7 +29,7 @@ AGGREGATOR, MAP_SERVICE, PLANNER, CONSOLE = "hazard-aggregator", "map-service", 
 ROUTES: Final[Mapping[str, tuple[str, ...]]] = {
     AGGREGATOR: ("areas", "nodes", "alerts"),
     PLANNER: ("robots", "plan"),
-    CONSOLE: ("session", "events", "openapi.json"),
+    CONSOLE: ("session", "events", "timeline", "recording", "openapi.json"),
 }
 """Which routes each service has, by what follows /api/v1/; the map-service has all others."""
 URGENT: Final = ("/api/v1/robots/{robot}/stop",)

@@ -58,6 +58,8 @@ class CompactedLog:
         self._entries: dict[Key, Entry] = {}
         """In the order of their revisions."""
         self._removed: dict[Key, None] = {}
+        self.begun = 0
+        """How often the log began anew."""
         self._pruned = 0
         """The highest revision of an entry that was forgotten after its removal."""
 
@@ -84,6 +86,7 @@ class CompactedLog:
 
     def begin_anew(self) -> None:
         """Have every reader drop what it has: what was forgotten is wrong from now on."""
+        self.begun += 1
         self.revision += 1
         self._pruned = self.revision
 

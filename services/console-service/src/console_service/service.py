@@ -7,7 +7,11 @@ from concurrent.futures import ThreadPoolExecutor
 from functools import partial
 from typing import TYPE_CHECKING, Final, TypeVar
 
+from prometheus_client import Gauge
+
 from console_service.readers import Readers
+from console_service.recording import STEP_S, Frame, Recording, as_json, pack
+from console_service.timeline import read_timeline
 from fog_contracts import channels as ch
 from fog_contracts.codec import ContractError
 from fog_contracts.messages import MapDelta, MapSnapshot
@@ -17,17 +21,24 @@ from fog_runtime.clock import ticker
 from fog_runtime.transports.edges import Edges
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
+    from collections.abc import Collection, Sequence
 
     from console_service.core import ConsoleCore
+    from console_service.recording import Shown
     from console_service.tiles import TileJob
+    from console_service.timeline import TimelinePage
     from fog_contracts.handlers import Handler, Ids, Moment, Publication
     from fog_runtime.clock import Clock
     from fog_runtime.health import Health
+    from fog_runtime.stores.redis_connection import RedisConnection
     from fog_runtime.transports.mqtt_edge import MqttEdge
     from fog_runtime.transports.zenoh_edge import ZenohEdge
 
 T = TypeVar("T")
+
+AHEAD_S: Final = 60.0
+"""How far ahead the clock of a service or of Redis may be."""
+RECORDING_BYTES = Gauge("fognav_console_recording_bytes", "Memory of what the last hour was")
 
 TICK_S: Final = 0.1
 SNAPSHOT_TIMEOUT_S: Final = 3.0
@@ -38,8 +49,18 @@ TILES_AT_ONCE: Final = 8
 class Service:
     """The running console-service; its loops are tasks of the process."""
 
-    def __init__(self, core: ConsoleCore, mqtt: MqttEdge, zenoh: ZenohEdge, clock: Clock, health: Health) -> None:
+    def __init__(  # the process's parts
+        self,
+        core: ConsoleCore,
+        mqtt: MqttEdge,
+        zenoh: ZenohEdge,
+        redis: RedisConnection,
+        clock: Clock,
+        health: Health,
+    ) -> None:
         self.core = core
+        self.redis = redis
+        self.recording = Recording()
         self.readers = Readers(core.log, core.site)
         self._mqtt = mqtt
         self._zenoh = zenoh
@@ -100,6 +121,40 @@ class Service:
                 for job in jobs:
                     self.core.add_tile(job)
                 self.readers.wake()
+
+    async def recording_loop(self) -> None:
+        """Keep what changes, for those who look back."""
+        async for _ in ticker(self._clock, STEP_S):
+            changes = self.recording.changes(self.core.log)
+            packed = await self._in_thread(partial(pack, changes))
+            self.recording.add(Frame(self._clock.stamp(), packed))
+            RECORDING_BYTES.set(self.recording.size)
+
+    async def show(self, begin: float, end: float) -> tuple[Shown, bytes]:
+        """Return what was from `begin` to `end` (s since the epoch), and its frames as JSON."""
+        copied = self.recording.copy()
+
+        def made() -> tuple[Shown, bytes]:
+            shown = copied.show(begin, end)
+            return shown, b"".join(as_json(shown))
+
+        return await self._in_thread(partial(made))
+
+    async def timeline(
+        self, kinds: Collection[str], begin: float, end: float | None, cursor: str | None, limit: int
+    ) -> TimelinePage:
+        """Return what happened; raises as `read_timeline`."""
+        return await read_timeline(
+            self.redis,
+            self.core.site,
+            kinds=kinds,
+            areas=self.core.areas,
+            faults=list(self.core.faults),
+            begin=begin,
+            end=self._clock.stamp() + AHEAD_S if end is None else end,
+            cursor=cursor,
+            limit=limit,
+        )
 
     async def _in_thread(self, work: partial[T]) -> T:
         return await asyncio.get_running_loop().run_in_executor(self._thread, work)

@@ -100,8 +100,8 @@ class Sources:
         """Read what is new in the audit trail."""
         while True:
             try:
-                for position, entry in await read_newer(self._redis, f"fog:{self._core.site}:audit:", self._positions):
-                    self._core.on_record(position, entry)
+                for entry in await read_newer(self._redis, f"fog:{self._core.site}:audit:", self._positions):
+                    self._core.on_record(entry.entry, entry)
                 self._tell("record")
                 self._on_news()
             except StoreError as error:

@@ -284,8 +284,8 @@ async def read_page(
         last, size = str(position), size + len(bytes(entry.before)) + len(bytes(entry.after))
 
 
-async def read_newer(redis: RedisConnection, prefix: str, after: dict[str, str]) -> list[tuple[str, AuditEntry]]:
-    """Return the entries since the last call with `after`, oldest first, each with what names it; at first the newest.
+async def read_newer(redis: RedisConnection, prefix: str, after: dict[str, str]) -> list[AuditEntry]:
+    """Return the entries since the last call with `after`, oldest first; at first the newest.
 
     The streams' keys begin with `prefix`. Some may be left for the next call. Raises `StoreError`.
     """
@@ -298,7 +298,18 @@ async def read_newer(redis: RedisConnection, prefix: str, after: dict[str, str])
             reply = list(reversed(await redis.read("XREVRANGE", key, "+", "-", "COUNT", _NEWER)))
         found += [_entry(kind, entry_id, fields) for entry_id, fields in reply]
         after[kind] = reply[-1][0].decode() if reply else after.get(kind, "0-0")
-    return [(str(placed.position), placed.entry) for placed in sorted(found)]
+    return [placed.entry for placed in sorted(found, key=lambda placed: placed.position)]
+
+
+async def trail(redis: RedisConnection, key: str, kind: str, last_ms: int) -> AsyncIterator[tuple[int, AuditEntry]]:
+    """Yield the entries of one kind with the times (ms) of Redis's clock, newest first, from `last_ms` on.
+
+    Raises `StoreError`.
+    """
+    found = _Trail(redis, key, kind, _Position(last_ms + 1, 0, ""))
+    while (placed := await found.first()) is not None:
+        found.take()
+        yield placed.position.ms, placed.entry
 
 
 def _entry(kind: str, entry_id: bytes, fields: Any) -> _Placed:  # noqa: ANN401  # as redis gives them

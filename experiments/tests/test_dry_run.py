@@ -34,6 +34,7 @@ from map_service.dry_run import Change
 from map_service.zones import prepare_zone
 from planner.config import PlannerConfig
 from planner.core import PlannerCore
+from planner.dry_run import goal_outcome
 
 ESTIG = Path(__file__).parents[2] / "sites" / "estig"
 STEP_S = 0.1
@@ -217,6 +218,29 @@ def test_request_for_a_map_that_has_changed_is_stale():
     request, _ = floor.predict(zones=[zone("wet", across(9.0, 0.4, 9.6, 2.6))])
     floor.make(zones=[zone("other", CircleShape(centre=(9.3, 1.5), radius=0.3))])
     assert floor.bus.query(ch.PLANNER_DRY_RUN, request, DryRunReply, floor.at) == DryRunReply(stale=True)
+
+
+@settings(max_examples=15, deadline=None)
+@given(st.floats(-1.0, 16.0), st.floats(-1.0, 9.0))
+def test_random_goals_lead_where_their_dry_runs_said(x, y):
+    floor = ring_floor(watched=True)
+    floor.make(zones=[zone("a", across(9.0, 0.4, 9.6, 2.6))])
+    outcome = goal_outcome(floor.planner.state(floor.now), "r3", (x, y), floor.planner.config)
+    floor.send("r3", x, y)
+    floor.run(1.5)
+    plan = floor.planner.missions.of("r3").plan
+    if plan.route is None:
+        assert (outcome.path.refusal.kind, outcome.points) == (plan.refusal.kind, [])
+    else:
+        assert outcome.path.length_m == pytest.approx(plan.route.length, abs=1e-3)
+        assert outcome.points == plan.route.corner_points
+        assert outcome.path.seconds >= outcome.path.length_m / 0.3 - 0.01
+
+
+def test_robot_that_has_been_silent_for_a_minute_is_left_out():
+    floor = ring_floor()
+    assert "r1" in floor.planner.state(floor.now + 59.0).missions
+    assert "r1" not in floor.planner.state(floor.now + 61.0).missions
 
 
 SHAPES = st.one_of(

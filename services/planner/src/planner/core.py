@@ -298,10 +298,10 @@ class PlannerCore:
         sources = self._regions.sources
         return View(planning_map, sources, self._regions.revision, partial(cover, sources), self._fields.fields)
 
-    def state(self) -> State | None:
+    def state(self, now: float) -> State | None:
         """Return what dry runs are computed on, by any thread; None before the first map."""
         view = self.view()
-        return None if view is None else State.of(view, self._map.speed(), dict(self.missions.items()))
+        return None if view is None else State.of(view, self._map.speed(), dict(self.missions.items()), now)
 
     def answers(self) -> Mapping[ch.Channel, Callable[[View | None, Any], PlanReply]]:
         """Return what answers each query on a view, to be called on the thread of the `answerer`."""
@@ -318,8 +318,8 @@ class PlannerCore:
     def _answer_plan(self, _ids: Ids, request: PlanRequest, _at: Moment) -> PlanReply:
         return self.answerer.plan(self.view(), request)
 
-    def _answer_dry_run(self, _ids: Ids, request: DryRunRequest, _at: Moment) -> DryRunReply:
-        return run(self.state(), request, self.config)
+    def _answer_dry_run(self, _ids: Ids, request: DryRunRequest, at: Moment) -> DryRunReply:
+        return run(self.state(at.now), request, self.config)
 
     def _answer_egress(self, _ids: Ids, request: EgressRequest, _at: Moment) -> PlanReply:
         return self.answerer.egress(self.view(), request)

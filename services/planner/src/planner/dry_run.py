@@ -52,6 +52,8 @@ if TYPE_CHECKING:
 
 USUAL_SPEED: Final = 2 * DEGRADED_SPEED / 100
 """Speed (m/s) of a robot where nothing limits it, by which times are estimated; turns in place are not counted."""
+KNOWN_S: Final = 60.0
+"""A robot whose last pose is older is left out: nobody knows where it is."""
 NAMED_PLACES: Final = 50
 """Most other places that are named for one place; the rest is counted."""
 
@@ -69,9 +71,14 @@ class State:
     missions: Mapping[str, Mission]
 
     @classmethod
-    def of(cls, view: View, speed: Grid, missions: Mapping[str, Mission]) -> State:
-        """Return the state with copies of the missions that have a pose."""
-        return cls(view, speed, {robot: _copied(mission) for robot, mission in missions.items() if mission.pose})
+    def of(cls, view: View, speed: Grid, missions: Mapping[str, Mission], now: float) -> State:
+        """Return the state with copies of the missions of robots whose pose is known at `now` (s, monotonic)."""
+        located = {
+            robot: _copied(mission)
+            for robot, mission in missions.items()
+            if mission.pose is not None and now - mission.pose_received <= KNOWN_S
+        }
+        return cls(view, speed, located)
 
 
 def _copied(mission: Mission) -> Mission:

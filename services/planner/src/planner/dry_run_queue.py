@@ -33,8 +33,9 @@ MOST_DRY_RUNS: Final = WAITING["dry_run"]
 class DryRuns:
     """Answers what a change, or a goal, would do; one at a time for each who asks."""
 
-    def __init__(self, core: PlannerCore, queue: QueryQueue) -> None:
+    def __init__(self, core: PlannerCore, queue: QueryQueue, now: Callable[[], float]) -> None:
         self._core = core
+        self._now = now
         self._queue = queue
         self._askers: set[str] = set()
 
@@ -43,7 +44,7 @@ class DryRuns:
 
         Raises `BusyError`, after a pause (`BUSY_PAUSE_S`), when too many wait, or one of this asker.
         """
-        state = await self._queue.threads.run("core", self._core.state)
+        state = await self._queue.threads.run("core", partial(self._core.state, self._now()))
         if state is None or robot not in state.missions:
             return None
         search = partial(goal_outcome, state, robot, (x, y), self._core.config)
@@ -59,7 +60,7 @@ class DryRuns:
 
         Raises `ContractError` for cells that are damaged.
         """
-        state = await self._queue.threads.run("core", self._core.state)
+        state = await self._queue.threads.run("core", partial(self._core.state, self._now()))
         if state is None:
             return DryRunReply(refusal=no_map())
         dry_run, until = DryRun(state, request, self._core.config), time.monotonic() + DRY_RUN_S

@@ -218,7 +218,7 @@ class Service:
         self._wake = asyncio.Event()
         self._threads = Threads()
         self._queue = QueryQueue(self._threads, on_idle=core.answerer.release)
-        self.dry_runs = DryRuns(core, self._queue)
+        self.dry_runs = DryRuns(core, self._queue, clock.now)
         self._cycle = Cycle(core, zenoh)
         self.missions = MissionPersistence(core, store, clock, health, self._change_goal)
         self._map = SnapshotFetcher(core, zenoh, clock, health, self._queue, on_loaded=self._wake.set)

@@ -31,6 +31,7 @@ from fognav_experiments.processes import Fog
 from fognav_experiments.rigs import STAMP, make_aggregator, make_map
 from hazard_aggregator.areas import AreaOverride
 from map_service.dry_run import Change
+from map_service.zone_sets import SetOfZones
 from map_service.zones import prepare_zone
 from planner.config import PlannerConfig
 from planner.core import PlannerCore
@@ -119,12 +120,16 @@ class Floor:
             name for name, number in label.items() if number < 0
         }
 
-    def try_and_make(self, **change):
-        """Predict a change, make it, and compare; return the outcome that was predicted."""
+    def try_and_make(self, make=None, **change):
+        """Predict a change, make it, or what comes to the same, and compare; return the outcome that was predicted."""
         pairs, closed = self.connected()
         request, outcome = self.predict(**change)
         layers = self.patched(request)
-        self.make(**change)
+        if make is None:
+            self.make(**change)
+        else:
+            make()
+            self.run(1.5)
         for layer, cells in layers.items():
             assert np.array_equal(getattr(self.map.costmap, layer), cells), layer
         missions = dict(self.planner.missions.items())
@@ -218,6 +223,25 @@ def test_request_for_a_map_that_has_changed_is_stale():
     request, _ = floor.predict(zones=[zone("wet", across(9.0, 0.4, 9.6, 2.6))])
     floor.make(zones=[zone("other", CircleShape(centre=(9.3, 1.5), radius=0.3))])
     assert floor.bus.query(ch.PLANNER_DRY_RUN, request, DryRunReply, floor.at) == DryRunReply(stale=True)
+
+
+def test_dry_run_of_a_switch_does_what_the_switch_does():
+    floor = ring_floor()
+    sets = {name: SetOfZones(id=name) for name in ("cleaning", "night")}
+    closed = across(9.0, 0.4, 9.6, 2.6)
+    floor.make(zones=[
+        zone("a", closed, sets=["cleaning"]), zone("b", across(9.0, 5.4, 9.6, 7.6), sets=["cleaning", "night"]),
+        zone("later", closed, sets=["night"], starts_at=STAMP + 900.0),
+    ])  # fmt: skip
+    for switched, effects in (("night", (0, 1)), ("cleaning", (0, 0)), ("night", (0, 0)), ("cleaning", (1, 0))):
+        on = not sets[switched].enabled
+        sets[switched] = structs.replace(sets[switched], enabled=on)
+        begin, end = floor.map.switched({switched: on}, floor.at)
+        change = {"zones": [each.zone for each in begin], "removed": end}
+        outcome = floor.try_and_make(
+            make=lambda: floor.bus.publish(floor.map.put_zone_sets(dict(sets), floor.at)), **change
+        )
+        assert (min(1, len(outcome.cut_off)), min(1, len(outcome.connected))) == effects, (switched, on)
 
 
 @settings(max_examples=15, deadline=None)

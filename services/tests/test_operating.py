@@ -114,6 +114,7 @@ async def test_dry_run_names_what_is_wrong_with_its_request(operator):
     for body, field in (
         ({"zones": [rectangle(90.0, 90.0, 91.0, 91.0)]}, "body.zones.0.shape"),
         ({"removed_zones": ["none"]}, "body.removed_zones.0"),
+        ({"sets": {"none": True}}, "body.sets.none"),
         ({"overrides": {"none": "blocked"}}, "body.overrides.none"),
     ):
         answer = await operator.ask("POST", "/api/v1/dry-run", body)

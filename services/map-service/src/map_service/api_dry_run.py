@@ -30,13 +30,15 @@ TIMEOUT_S: Final = 10.0
 
 
 class DryRunBody(Message, frozen=True, kw_only=True):
-    """A change that nobody makes: zones to add or replace, ids of zones to remove, and overrides of areas (null: end).
+    """A change that nobody makes: zones to add or replace, ids of zones to remove, sets of zones to switch on or off.
 
-    Zones count as in force, whatever their times say, unless they are not enabled.
+    And overrides of areas (null: end). `zones` count as in force, whatever their times and sets say, unless they are
+    not enabled; those of `sets` as far as their times say so.
     """
 
     zones: Annotated[list[ZoneBody], msgspec.Meta(max_length=100)] = msgspec.field(default_factory=list)
     removed_zones: Annotated[list[Id], msgspec.Meta(max_length=100)] = msgspec.field(default_factory=list)
+    sets: Annotated[dict[Id, bool], msgspec.Meta(max_length=100)] = msgspec.field(default_factory=dict)
     overrides: Annotated[dict[Id, OverrideState | None], msgspec.Meta(max_length=100)] = msgspec.field(
         default_factory=dict
     )
@@ -124,6 +126,7 @@ def add_dry_runs(routes: Routes, service: Service, site: Site, clock: Clock) -> 
         problems=[
             MapProblem.ZONES_NOT_LOADED,
             MapProblem.UNKNOWN_ZONE,
+            MapProblem.UNKNOWN_ZONE_SET,
             MapProblem.UNKNOWN_AREA,
             MapProblem.PLANNER_AWAY,
             MapProblem.DRY_RUN_REFUSED,
@@ -135,26 +138,50 @@ def add_dry_runs(routes: Routes, service: Service, site: Site, clock: Clock) -> 
         Times are estimates: lengths by the speeds that apply. One dry run at a time for each caller.
         """
         require_zones(service)
-        for index, name in enumerate(body.removed_zones):
-            if service.core.zones.get(name) is None:
-                detail = f"there is no zone {name}: GET /api/v1/zones lists those that there are"
-                raise ProblemError(MapProblem.UNKNOWN_ZONE, detail, field=f"body.removed_zones.{index}")
-        areas = {area.hazard.area for area in service.core.hazards()}
-        for name in body.overrides:
-            if name not in areas:
-                detail = f"there is no area {name}: GET /api/v1/hazards lists those that there are"
-                raise ProblemError(MapProblem.UNKNOWN_AREA, detail, field=f"body.overrides.{name}")
+        _require_known(service, body)
         with dry_runs.admitted(caller.name):
-            prepared = []
-            for index, zone in enumerate(body.zones):
-                name = zone.id or f"new-{index}"
-                try:
-                    made = zone_from_body(zone, name, caller.name, clock.stamp())
-                    prepared.append(await service.zones.prepare(made))
-                except ZoneError as error:
-                    raise ZoneError(f"zones.{index}.{error.field}".rstrip("."), error.message) from error
-            change = Change(zones=prepared, removed=body.removed_zones, overrides=body.overrides)
+            change = await _change(service, body, caller.name, clock.stamp())
             try:
                 return await dry_runs.outcome(change, targets_of(service.core.places, site))
             except RefusedMessageError as error:  # it was removed meanwhile
                 raise ProblemError(MapProblem.UNKNOWN_AREA, str(error)) from error
+
+
+def _require_known(service: Service, body: DryRunBody) -> None:
+    """Raise a `ProblemError` when a body names something that there is not."""
+    areas = {area.hazard.area for area in service.core.hazards()}
+    zones = {f"removed_zones.{index}": name for index, name in enumerate(body.removed_zones)}
+    unknown = [
+        *((MapProblem.UNKNOWN_ZONE, f, "zone", n, "zones") for f, n in zones.items() if not service.core.zones.get(n)),
+        *(
+            (MapProblem.UNKNOWN_ZONE_SET, f"sets.{name}", "set of zones", name, "zone-sets")
+            for name in body.sets
+            if name not in service.core.zone_sets.sets
+        ),
+        *(
+            (MapProblem.UNKNOWN_AREA, f"overrides.{name}", "area", name, "hazards")
+            for name in body.overrides
+            if name not in areas
+        ),
+    ]
+    for code, field, what, name, route in unknown[:1]:
+        detail = f"there is no {what} {name}: GET /api/v1/{route} lists those that there are"
+        raise ProblemError(code, detail, field=f"body.{field}")
+
+
+async def _change(service: Service, body: DryRunBody, author: str, stamp: float) -> Change:
+    """Return the change that a body describes; raises `ZoneError` and `BusyError`."""
+    prepared = []
+    for index, zone in enumerate(body.zones):
+        try:
+            made = zone_from_body(zone, zone.id or f"new-{index}", author, stamp)
+            prepared.append(await service.zones.prepare(made))
+        except ZoneError as error:
+            raise ZoneError(f"zones.{index}.{error.field}".rstrip("."), error.message) from error
+    begin, end = service.core.switched(body.sets, service.zones.now()) if body.sets else ([], [])
+    named = {*body.removed_zones, *(each.zone.id for each in prepared)}
+    return Change(
+        zones=[*prepared, *(each for each in begin if each.zone.id not in named)],
+        removed=[*body.removed_zones, *(name for name in end if name not in named)],
+        overrides=body.overrides,
+    )

@@ -37,7 +37,7 @@ if TYPE_CHECKING:
     from map_service.layers.base import CostLayer
     from map_service.zone_sets import SetOfZones, SetSwitches
     from map_service.zone_times import Progress
-    from map_service.zones import ZoneCatalog
+    from map_service.zones import PreparedZone, ZoneCatalog
 
 ALIVE_S: Final = 15.0
 """How long a robot counts as alive after its last state: three scrapes, so that a short gap of the Wi-Fi hides none."""
@@ -227,6 +227,10 @@ class MapCore:
         """Remove a zone that is not stored any more."""
         self._zones.remove(zone_id)
         return self._commit([], at)
+
+    def switched(self, sets: Mapping[str, bool], at: Moment) -> tuple[list[PreparedZone], list[str]]:
+        """Return which zones would come into force, and which would end, if sets of zones were switched on or off."""
+        return self._zones.switched(sets, at)
 
     def hypothesis(self, change: Change, targets: Sequence[Target] = ()) -> Hypothesis:
         """Return the map after a change that nobody makes; raises `RefusedMessageError` for an unknown area."""

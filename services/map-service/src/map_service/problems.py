@@ -63,6 +63,10 @@ class MapProblem(ProblemCode):
         "Try again in a moment: /readyz says when they are",
     )  # fmt: skip
     UNKNOWN_ZONE = "unknown_zone", 422, "The request names a zone that there is not", "Choose one of GET /api/v1/zones"
+    UNKNOWN_ZONE_SET = (
+        "unknown_zone_set", 422, "The request names a set of zones that there is not",
+        "Choose one of GET /api/v1/zone-sets",
+    )  # fmt: skip
     UNKNOWN_AREA = "unknown_area", 422, "The request names an area that there is not", "Choose one of GET /api/v1/areas"
     DRY_RUN_REFUSED = "dry_run_refused", 422, "The change is too large to be computed at once", "Try a smaller change"
     PLANNER_AWAY = (

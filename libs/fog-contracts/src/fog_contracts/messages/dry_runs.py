@@ -45,8 +45,8 @@ class DryRunRequest(Message, frozen=True, kw_only=True):
     """
 
     patches: Annotated[list[MapPatch], Meta(max_length=128)] = []
-    zones: Annotated[list[Zone], Meta(max_length=100)] = []
-    removed: Annotated[list[Id], Meta(max_length=200)] = []
+    zones: Annotated[list[Zone], Meta(max_length=5_000)] = []
+    removed: Annotated[list[Id], Meta(max_length=5_000)] = []
     hazards: Annotated[list[HazardArea], Meta(max_length=100)] = []
     targets: Annotated[list[Target], Meta(max_length=2_000)] = []
 

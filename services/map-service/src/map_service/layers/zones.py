@@ -11,7 +11,7 @@ from fog_kernels.spans import lower_speeds, raise_costs
 from map_service.layers.base import CostLayer, LayerFactory, NoOptions
 from map_service.zone_sets import SetOfZones, SetSwitches
 from map_service.zone_times import Progress, StoredState, ZoneTimes
-from map_service.zones import ZoneCatalog, ZoneEntry, named_spans
+from map_service.zones import PreparedZone, ZoneCatalog, ZoneEntry, named_spans
 
 if TYPE_CHECKING:
     from collections.abc import Collection, Iterable, Mapping, Sequence
@@ -21,7 +21,6 @@ if TYPE_CHECKING:
     from fog_contracts.messages import Zone
     from fog_contracts.shapes import Spans
     from map_service.layers.base import Grid
-    from map_service.zones import PreparedZone
 
 
 def speed_layer_value(speed: float) -> int:
@@ -113,6 +112,22 @@ class ZonesLayer(CostLayer):
         It reads this layer, and is to be used before that changes.
         """
         return _ChangedZones(self.catalog, put, without)
+
+    def switched(self, sets: Mapping[str, bool], at: Moment) -> tuple[list[PreparedZone], list[str]]:
+        """Return which zones would come into force, and which would end, if sets were switched, for a dry run.
+
+        `sets`: by id, whether it would be on. A zone whose time has not come stays out of force.
+        """
+        off = (self.switches.off - sets.keys()) | {name for name, on in sets.items() if not on}
+        begin: list[PreparedZone] = []
+        end: list[str] = []
+        for entry in self.catalog.in_sets():
+            active = entry.times.is_active(at) and off.isdisjoint(entry.zone.sets)
+            if active and not entry.active:
+                begin.append(PreparedZone(entry.zone, entry.spans))
+            elif entry.active and not active:
+                end.append(entry.zone.id)
+        return begin, end
 
     def _is_active(self, zone: Zone, times: ZoneTimes, at: Moment) -> bool:
         in_time = times.is_active(at)  # whatever its sets are: time goes on

@@ -32,7 +32,9 @@ def test_relative_links_point_to_existing_files(document: Path) -> None:
 
 def test_operations_names_every_metric_and_none_that_nobody_exports() -> None:
     sources = [
-        path for part in ("libs", "services", "robot-agent", "sim") for path in (ROOT / part).rglob("src/**/*.py")
+        path
+        for part in ("libs", "services", "bridges", "robot-agent", "sim")
+        for path in (ROOT / part).rglob("src/**/*.py")
     ]
     defined = {name for path in sources for name in re.findall(r'"(fognav_[a-z0-9_]+)",', path.read_text("utf-8"))} - {
         "fognav_build"

@@ -38,7 +38,8 @@ def matches(pattern, key):
 
 @given(data=st.data(), channel=st.sampled_from(list(CHANNELS.values())))
 def test_matching_a_key_returns_the_ids_that_it_was_made_from(data, channel):
-    channel_ids = {name: data.draw(numbers if name == "number" else ids) for name in channel.fields}
+    drawn = {"number": numbers, "robot_device": ids.map("robot_{}".format)}
+    channel_ids = {name: data.draw(drawn.get(name, ids)) for name in channel.fields}
     key = channel.key(**channel_ids)
     assert channel.match(key) == channel_ids
     assert find_channel(channel.transport, key) == (channel, channel_ids)

@@ -19,7 +19,7 @@ Encoding = Literal["json", "msgpack", "text"]
 Durability = Literal["volatile", "latest", "recovered"]
 Role = Literal[
     "node", "thesis-node", "thesis-robot", "zone-source", "home-assistant", "hazard-aggregator", "map-service",
-    "planner", "robot-agent", "console-service", "console", "sim", "recorder",
+    "planner", "robot-agent", "console-service", "bridge", "console", "sim", "recorder",
 ]  # fmt: skip
 
 ROLES: Final[Mapping[Role, str]] = {
@@ -27,12 +27,13 @@ ROLES: Final[Mapping[Role, str]] = {
     "thesis-node": "a sensor node that publishes on the thesis's topics",
     "thesis-robot": "a robot that subscribes to the thesis's topic",
     "zone-source": "a system of others that puts zones on the map",
-    "home-assistant": "Home Assistant, which discovers nodes and areas",
+    "home-assistant": "Home Assistant, which discovers nodes, areas and robots",
     "hazard-aggregator": "turns readings into the state of each area",
     "map-service": "maintains the costmap",
     "planner": "plans paths and stores missions",
     "robot-agent": "a robot's agent",
     "console-service": "shows the state of everything to people's browsers, and changes nothing",
+    "bridge": "`python -m fog_bridges`: tells other systems of robots, and takes orders from them",
     "console": "operators' tools: the `fognav` command, the demo and its page, the simulated robot's operator",
     "sim": "the simulated world",
     "recorder": "`fognav record`: subscribes to everything and publishes nothing",
@@ -60,7 +61,7 @@ The TLS library of the ESP8266 compares names only, never addresses.
 ID_MAX: Final = 32
 """Characters of the longest id."""
 _ID: Final = rf"[a-z0-9][a-z0-9-]{{0,{ID_MAX - 1}}}"
-_FIELDS: Final[Mapping[str, str]] = {"number": r"[0-9]{1,4}"}
+_FIELDS: Final[Mapping[str, str]] = {"number": r"[0-9]{1,4}", "robot_device": f"robot_{_ID}"}
 
 
 @dataclass(frozen=True, eq=False)
@@ -166,6 +167,7 @@ PLANNER: Final = "planner"
 ROBOT: Final = "robot-agent"
 CONSOLE: Final = "console"
 WEB: Final = "console-service"
+BRIDGE: Final = "bridge"
 SIM: Final = "sim"
 ZONE_SOURCE: Final = "zone-source"
 
@@ -249,6 +251,29 @@ HOME_ASSISTANT    = _text( "home_assistant",    "homeassistant/device/{node}/con
 HOME_ASSISTANT_AREA = _text("home_assistant_area", "homeassistant/device/{site}/{area}/config",         limit=8 * KIB,
     publishers=(AGGREGATOR,),    subscribers=("home-assistant",), durability=LATEST,   qos=1,
     about="Home Assistant's device discovery of an area (JSON)")
+
+# Robots and the map for Home Assistant: MQTT, text
+HOME_ASSISTANT_ROBOT = _text("home_assistant_robot", "homeassistant/device/{site}/{robot_device}/config", limit=8 * KIB,
+    publishers=(BRIDGE,),        subscribers=("home-assistant",), durability=LATEST,   qos=1,
+    about="Home Assistant's device discovery of a robot, `robot_` and its id (JSON)")
+ROBOT_REPORT      = _text( "robot_report",      V1 + "robots/{robot}/report",                           limit=2 * KIB,
+    publishers=(BRIDGE,),        subscribers=("home-assistant",), durability=LATEST,   qos=1,
+    about="what a robot does, why it stands, its battery and goal (JSON)")
+ROBOT_ORDER       = _text( "robot_order",       V1 + "robots/{robot}/order",                            limit=64,
+    publishers=("home-assistant",), subscribers=(BRIDGE,),        durability=VOLATILE, qos=1,
+    about="`stop`, `cancel`, `return_to_base`, or `goal ` and a place's id")
+ROBOT_REFUSAL     = _text( "robot_refusal",     V1 + "robots/{robot}/refusal",                          limit=KIB,
+    publishers=(BRIDGE,),        subscribers=("home-assistant",), durability=LATEST,   qos=1,
+    about="why the robot's latest order was refused, in words; empty: it was not")
+MAP_PICTURE       = _text( "map_picture",       V1 + "map/picture",                                     limit=192 * KIB,
+    publishers=(BRIDGE,),        subscribers=("home-assistant",), durability=LATEST,   qos=1,
+    about="the floor with what is blocked and the robots on it (PNG in base64)")
+MAP_PICTURE_PLACE = _text( "map_picture_place", V1 + "map/picture/place",                               limit=KIB,
+    publishers=(BRIDGE,),        subscribers=("home-assistant",), durability=LATEST,   qos=1,
+    about="where the picture's pixels lie on the floor (JSON)")
+BRIDGE_AVAILABILITY = _text("bridge_availability", V1 + "bridge/availability",                          limit=16,
+    publishers=(BRIDGE,),        subscribers=("home-assistant",), durability=LATEST,   qos=1,
+    values=(ONLINE, OFFLINE), about="whether the bridge knows the floor's state; `offline` is its last will")
 
 # The map, and the hazards and zones in it: zenoh, msgpack
 MAP_DELTA         = _pub(  "map_delta",         FOG + "map/delta",      m.MapDelta,     limit=DELTA_LIMIT,

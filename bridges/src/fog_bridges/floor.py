@@ -1,0 +1,101 @@
+"""A floor as its console shows it: the stream of events, and the REST that operators use, by a token of its own."""
+
+from __future__ import annotations
+
+import asyncio
+from typing import TYPE_CHECKING, Any, Final, NamedTuple
+
+import httpx
+import msgspec
+
+from fog_runtime import logs
+
+if TYPE_CHECKING:
+    import ssl
+    from collections.abc import AsyncIterator, Callable
+
+RETRY_S: Final = 2.0
+SILENT_S: Final = 5.0
+"""A stream that says nothing for so long is lost: the console tells the time each second."""
+REQUEST_S: Final = 10.0
+_log = logs.get("floor")
+
+
+class Request(NamedTuple):
+    """A request to the floor's REST; `body` is sent as JSON, None: without one."""
+
+    method: str
+    path: str
+    body: dict[str, Any] | None = None
+
+
+class Floor:
+    """Reads the events of one floor, again and again from where it was, and sends requests."""
+
+    def __init__(self, url: str, token: str, trusted: ssl.SSLContext | bool) -> None:  # noqa: FBT001  # httpx's `verify`
+        """`url` is the console's address, `trusted` whose certificates it may have."""
+        self._client = httpx.AsyncClient(
+            base_url=url, headers={"Authorization": f"Bearer {token}"}, timeout=REQUEST_S, verify=trusted
+        )
+        self._last_id = ""
+        self.problem = "not connected yet"
+        """Why the events are not up to date; empty while they are."""
+
+    async def aclose(self) -> None:
+        """Close the connections."""
+        await self._client.aclose()
+
+    async def send(self, request: Request) -> str:
+        """Send a request; return why it was refused, in the floor's words, empty if it was not."""
+        try:
+            answer = await self._client.request(request.method, request.path, json=request.body)
+        except httpx.HTTPError as error:
+            return f"the floor can't be reached: {error!r}"
+        if answer.is_success:
+            return ""
+        try:
+            return str(answer.json()["detail"])
+        except (ValueError, KeyError, TypeError):
+            return f"{answer.status_code} {answer.reason_phrase}"
+
+    async def follow(self, on_event: Callable[[str, dict[str, Any]], object], on_lost: Callable[[], object]) -> None:
+        """Pass on each event with its data; `on_lost` is called when the state is not known any more. Never returns."""
+        while True:
+            try:
+                async with self._client.stream(
+                    "GET", "/api/v1/events", headers=self._resumed(), timeout=SILENT_S
+                ) as lines:
+                    if not lines.is_success:
+                        await lines.aread()
+                    lines.raise_for_status()
+                    async for name, data in self._events(lines):
+                        self.problem = ""
+                        on_event(name, data)
+                problem = "the console ended the stream"
+            except (httpx.HTTPError, msgspec.MsgspecError) as error:
+                problem = f"{self._client.base_url}api/v1/events: {error!r}"
+            if not self.problem or self.problem != problem:
+                _log.warning("floor_lost", reason=problem)
+            self.problem = problem
+            on_lost()
+            await asyncio.sleep(RETRY_S)
+
+    def _resumed(self) -> dict[str, str]:
+        return {"Last-Event-ID": self._last_id} if self._last_id else {}
+
+    async def _events(self, lines: httpx.Response) -> AsyncIterator[tuple[str, dict[str, Any]]]:
+        """Yield events (server-sent, WHATWG HTML 9.2; the console's data have one line)."""
+        name, data, position = "message", "", ""
+        async for line in lines.aiter_lines():
+            field, _, value = line.partition(":")
+            value = value.removeprefix(" ")
+            if field == "id":
+                position = value
+            elif field == "event":
+                name = value
+            elif field == "data":
+                data = value
+            elif not line and data:
+                yield name, msgspec.json.decode(data, type=dict[str, Any])
+                self._last_id = position or self._last_id
+                name, data, position = "message", "", ""

@@ -1,0 +1,182 @@
+"""Each robot as a device of Home Assistant, by MQTT discovery: a vacuum with battery, mission, goals, stop and map.
+
+Home Assistant may stop a robot, end its mission, send it to a place or to its dock. It may not enable or reset one:
+whoever does that has looked at the robot, and an automation has not. Topics: Home Assistant's documentation of
+`vacuum.mqtt`, `select.mqtt`, `button.mqtt`, `image.mqtt` and "MQTT discovery". Pure.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any, Final
+
+import msgspec
+
+from fog_bridges.floor import Request
+from fog_contracts import channels as ch
+from fog_contracts.handlers import Publication
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator, Mapping, Sequence
+
+STOP: Final = "stop"
+CANCEL: Final = "cancel"
+DOCK: Final = "return_to_base"
+GOAL: Final = "goal "
+"""What Home Assistant sends: a place's id follows."""
+_NO_GOAL: Final = "none"
+_ERRORS: Final = ("FAULT", "PROTECTIVE_STOP")
+_CHARGING: Final = ("reconditioning", "bulk", "trickle")
+_MOST: Final = 255
+"""Characters of a state in Home Assistant."""
+
+
+class HomeAssistant:
+    """What Home Assistant is told of one floor, and what it may ask for."""
+
+    def __init__(self, site: str) -> None:
+        self._site = site
+        self._robots: dict[str, dict[str, Any]] = {}
+        self._places: list[str] = []
+        self._told: dict[str, tuple[str, str]] = {}
+        """The description and state of each robot that Home Assistant has."""
+
+    def on_event(self, name: str, data: dict[str, Any]) -> Sequence[Publication]:
+        """Take in an event of the floor; return what Home Assistant has to know."""
+        if name == "hello" and data["fresh"]:
+            self._robots, self._places = {}, []
+        elif name == "robot":
+            if data["value"] is None:
+                self._robots.pop(data["id"], None)
+            else:
+                self._robots[data["id"]] = data["value"]
+        elif name == "place":
+            known = {*self._places, data["id"]} - ({data["id"]} if data["value"] is None else set())
+            self._places = sorted(known)
+        elif name != "ready":
+            return ()
+        # Between `hello` and `ready` things are missing that are not gone.
+        return () if name == "hello" else list(self._news())
+
+    def on_command(self, robot: str, text: str) -> Request | str:
+        """Return the request of a command to a robot, or why there is none, in words."""
+        path = f"/api/v1/robots/{robot}"
+        if robot not in self._robots:
+            return f"there is no robot {robot}; there are: {', '.join(sorted(self._robots)) or 'none'}"
+        if text == STOP:
+            return Request("POST", f"{path}/stop")
+        if text == CANCEL or text == GOAL + _NO_GOAL:
+            return Request("DELETE", f"{path}/goal")
+        if text == DOCK:
+            return Request("POST", f"{path}/commands", {"kind": "dock"})
+        place = text.removeprefix(GOAL)
+        if text.startswith(GOAL) and place in self._places:
+            return Request("PUT", f"{path}/goal", {"place": place})
+        known = f"{STOP}, {CANCEL}, {DOCK}, or {GOAL}with one of {', '.join(self._places) or 'no place'}"
+        return f"{text[:40]!r} is no command: send {known}"
+
+    def everything(self) -> Sequence[Publication]:
+        """Return all that Home Assistant has to know, again: the broker may have lost it."""
+        self._told.clear()
+        return list(self._news())
+
+    def _news(self) -> Iterator[Publication]:
+        for robot in sorted(self._told.keys() - self._robots.keys()):
+            del self._told[robot]
+            yield Publication(ch.HOME_ASSISTANT_ROBOT, None, {"robot_device": f"robot_{robot}"})
+            for channel in (ch.ROBOT_REPORT, ch.ROBOT_REFUSAL):
+                yield Publication(channel, None, {"robot": robot})
+        for robot, view in sorted(self._robots.items()):
+            now = discovery(self._site, robot, self._places), report(view)
+            before = self._told.get(robot, ("", ""))
+            self._told[robot] = now
+            if before[0] != now[0]:
+                yield Publication(ch.HOME_ASSISTANT_ROBOT, now[0], {"robot_device": f"robot_{robot}"})
+            if before[1] != now[1]:
+                yield Publication(ch.ROBOT_REPORT, now[1], {"robot": robot})
+
+
+def report(view: Mapping[str, Any]) -> str:
+    """Return what is told of a robot (JSON), from what the console tells of it: fields of `discovery`'s templates."""
+    state, goal = view["state"] or {}, view["goal"] or {}
+    mode, power = state.get("mode"), state.get("power") or {}
+    battery = state.get("battery")
+    reasons = "; ".join(state.get("reasons", ()))
+    found = {
+        "state": activity(state, under_way=bool(goal)),
+        "mode": mode or "unknown",
+        "why": (reasons or ("no state was received yet" if mode is None else "nothing keeps it"))[:_MOST],
+        "battery": None if battery is None else round(100.0 * battery),
+        "charging": "ON" if power.get("charging") in _CHARGING else "OFF",
+        "problem": "ON" if mode in _ERRORS else "OFF",
+        "goal": goal.get("place") or (_NO_GOAL if not goal else "a point"),
+        "waits_for_operator": "ON" if state.get("awaits_operator") else "OFF",
+    }
+    return msgspec.json.encode(found).decode()
+
+
+def activity(state: Mapping[str, Any], *, under_way: bool) -> str:
+    """Return a robot's state in the words that Home Assistant has for a vacuum."""
+    if state.get("mode") in _ERRORS:
+        return "error"
+    if state.get("docked"):
+        return "docked"
+    if not state:
+        return "idle"
+    if state.get("wants_dock") or state.get("mode") == "DOCK":
+        return "returning"
+    if not under_way or state.get("goal_reached"):
+        return "idle"
+    return "cleaning" if state.get("mode") in ("NORMAL", "DEGRADED", "EGRESS") else "paused"
+
+
+def discovery(site: str, robot: str, places: Sequence[str]) -> str:
+    """Return the description (JSON) of a robot as a device."""
+    device = f"fognav-{site}-robot-{robot}"
+    command = ch.ROBOT_ORDER.key(site=site, robot=robot)
+    components: dict[str, dict[str, Any]] = {
+        "vacuum": {
+            "p": "vacuum", "name": None, "supported_features": ["stop", "return_home", "status"],
+            "command_topic": command, "payload_stop": STOP, "payload_return_to_base": DOCK,
+        },
+        "battery": {
+            "p": "sensor", "name": "battery", "device_class": "battery", "unit_of_measurement": "%",
+            "value_template": "{{ value_json.battery }}",
+        },
+        "charging": {
+            "p": "binary_sensor", "name": "charging", "device_class": "battery_charging",
+            "value_template": "{{ value_json.charging }}",
+        },
+        "problem": {
+            "p": "binary_sensor", "name": "problem", "device_class": "problem",
+            "value_template": "{{ value_json.problem }}",
+        },
+        "waits": {
+            "p": "binary_sensor", "name": "waits for an operator",
+            "value_template": "{{ value_json.waits_for_operator }}",
+        },
+        "mode": {"p": "sensor", "name": "mode", "value_template": "{{ value_json.mode }}"},
+        "why": {"p": "sensor", "name": "why it stands", "value_template": "{{ value_json.why }}"},
+        "refusal": {"p": "sensor", "name": "refused order", "value_template": "{{ value[:255] }}"},
+        "goal": {
+            "p": "select", "name": "goal", "options": [_NO_GOAL, *places], "command_topic": command,
+            "command_template": GOAL + "{{ value }}", "value_template": "{{ value_json.goal }}",
+        },
+        "stop": {"p": "button", "name": "stop", "command_topic": command, "payload_press": STOP},
+        "cancel": {"p": "button", "name": "end the mission", "command_topic": command, "payload_press": CANCEL},
+        "map": {
+            "p": "image", "name": "map", "image_topic": ch.MAP_PICTURE.key(site=site), "image_encoding": "b64",
+            "content_type": "image/png", "json_attributes_topic": ch.MAP_PICTURE_PLACE.key(site=site),
+        },
+    }  # fmt: skip
+    for name, component in components.items():
+        component["unique_id"] = f"{device}-{name}"
+        if "value_template" in component or name == "vacuum":
+            channel = ch.ROBOT_REFUSAL if name == "refusal" else ch.ROBOT_REPORT
+            component["state_topic"] = channel.key(site=site, robot=robot)
+    description = {
+        "dev": {"ids": device, "name": robot, "mf": "Fognav", "mdl": "robot"},
+        "o": {"name": "fognav"},
+        "cmps": components,
+        "availability_topic": ch.BRIDGE_AVAILABILITY.key(site=site),
+    }
+    return msgspec.json.encode(description).decode()

@@ -1,0 +1,89 @@
+"""Connects Home Assistant's core to the broker and to the floor."""
+
+from __future__ import annotations
+
+import asyncio
+from typing import TYPE_CHECKING, Any, Final
+
+from prometheus_client import Counter
+
+from fog_bridges.picture import Picture
+from fog_contracts import channels as ch
+from fog_runtime import logs
+from fog_runtime.clock import ticker
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping, Sequence
+
+    from fog_bridges.floor import Floor
+    from fog_bridges.home_assistant import HomeAssistant
+    from fog_contracts.handlers import Publication
+    from fog_runtime.clock import Clock
+    from fog_runtime.transports.mqtt_edge import MqttEdge
+
+PICTURE_S: Final = 2.0
+"""How often the map is drawn at most."""
+ORDERS_AT_ONCE: Final = 100
+ORDERS = Counter("fognav_bridge_orders_total", "Orders of other systems, by what became of them", ["system", "result"])
+_log = logs.get("bridge")
+
+
+class HomeAssistantBridge:
+    """The running bridge; its loops are tasks of the process."""
+
+    def __init__(self, core: HomeAssistant, floor: Floor, mqtt: MqttEdge) -> None:
+        self._core = core
+        self._floor = floor
+        self._mqtt = mqtt
+        self._picture = Picture()
+        self._orders: asyncio.Queue[tuple[str, str]] = asyncio.Queue(ORDERS_AT_ONCE)
+        self._is_known = False
+        mqtt.on(ch.ROBOT_ORDER, self._on_order)
+        mqtt.on_connect(self._tell_everything)
+
+    def on_event(self, name: str, data: dict[str, Any]) -> None:
+        """Pass on an event of the floor."""
+        self._picture.on_event(name, data)
+        self._publish(self._core.on_event(name, data))
+        if name == "ready":
+            self._tell_availability(known=True)
+
+    def on_lost(self) -> None:
+        """Say that nobody knows the floor's state."""
+        self._tell_availability(known=False)
+
+    async def order_loop(self) -> None:
+        """Carry out orders, one after the other; what a robot refuses is told where the order came from."""
+        while True:
+            robot, text = await self._orders.get()
+            request = self._core.on_command(robot, text)
+            refusal = request if isinstance(request, str) else await self._floor.send(request)
+            ORDERS.labels("home-assistant", "refused" if refusal else "accepted").inc()
+            _log.info("order", robot=robot, order=text, refusal=refusal)
+            await self._mqtt.publish(ch.ROBOT_REFUSAL, refusal[:250], robot=robot)
+
+    async def picture_loop(self, clock: Clock) -> None:
+        """Draw the map when it or a robot on it has changed."""
+        async for _ in ticker(clock, PICTURE_S):
+            if self._picture.changed and (drawn := await asyncio.to_thread(self._picture.draw)) is not None:
+                for channel, text in zip((ch.MAP_PICTURE, ch.MAP_PICTURE_PLACE), drawn, strict=True):
+                    await self._mqtt.publish(channel, text)
+
+    def _on_order(self, ids: Mapping[str, str], text: str) -> None:
+        try:
+            self._orders.put_nowait((ids["robot"], text))
+        except asyncio.QueueFull:
+            ORDERS.labels("home-assistant", "dropped").inc()
+            _log.warning("order_dropped", robot=ids["robot"], order=text, reason=f"{ORDERS_AT_ONCE} wait already")
+
+    async def _tell_everything(self) -> None:
+        self._publish(self._core.everything())
+        self._tell_availability(known=self._is_known)
+
+    def _tell_availability(self, *, known: bool) -> None:
+        self._is_known = known
+        self._mqtt.publish_nowait(ch.BRIDGE_AVAILABILITY, ch.ONLINE if known else ch.OFFLINE)
+
+    def _publish(self, publications: Sequence[Publication]) -> None:
+        for channel, message, ids in ((each.channel, each.message, each.ids) for each in publications):
+            self._mqtt.publish_nowait(channel, message, **ids)

@@ -1,0 +1,169 @@
+"""Robots as devices of Home Assistant: the running bridge, with a real broker, router and console behind it."""
+
+from __future__ import annotations
+
+import asyncio
+import base64
+import io
+import json
+import time
+from contextlib import asynccontextmanager
+
+import pytest
+from PIL import Image
+
+from fog_bridges.floor import Request
+from fog_bridges.home_assistant import HomeAssistant, activity, discovery, report
+from fog_contracts import channels as ch
+from fog_contracts.messages import RobotState
+from fog_runtime.clock import SystemClock
+from fog_runtime.credentials import Credentials
+from fog_runtime.transports.mqtt_edge import MqttEdge
+
+
+class Home:
+    """Home Assistant, as far as MQTT goes: what it was told last on each topic."""
+
+    def __init__(self) -> None:
+        self.told: dict[tuple[str, str], str] = {}
+
+    def of(self, channel: ch.Channel, robot: str = "r1") -> str:
+        return self.told.get((channel.name, robot), "")
+
+    def report(self) -> dict[str, object]:
+        return json.loads(self.of(ch.ROBOT_REPORT) or "{}")
+
+
+@asynccontextmanager
+async def home_of(fog):
+    """Connect with Home Assistant's own user and rights."""
+    own = Credentials.read(fog.security.credentials("home-assistant"))
+    mqtt = MqttEdge(fog.mosquitto.url, "home-assistant", SystemClock(), site="test", credentials=own)
+    home = Home()
+    channels = (ch.HOME_ASSISTANT_ROBOT, ch.ROBOT_REPORT, ch.ROBOT_REFUSAL, ch.MAP_PICTURE, ch.MAP_PICTURE_PLACE,
+                ch.BRIDGE_AVAILABILITY)  # fmt: skip
+    for channel in channels:
+
+        def take(ids, text, channel=channel) -> None:
+            home.told[channel.name, ids.get("robot", ids.get("robot_device", "").removeprefix("robot_"))] = text
+
+        mqtt.on(channel, take)
+    running = asyncio.create_task(mqtt.run())
+    await mqtt.wait_connected()
+    yield home, mqtt
+    running.cancel()
+    await asyncio.gather(running, return_exceptions=True)
+
+
+@pytest.fixture
+async def bridge(all_services, tokens, tmp_path):
+    """Run console-service and bridge over the services; yield the fog."""
+    ports = {
+        name: await all_services.ready(module)
+        for name, module in (("AGGREGATOR", "hazard_aggregator"), ("MAP", "map_service"), ("PLANNER", "planner"))
+    }
+    all_services.start("console_service", **{f"FOGNAV_{name}_URL": url for name, url in ports.items()})
+    token = tmp_path / "home-assistant.toml"
+    token.write_text(f'user = "anna"\ntoken = "{tokens["operator"]["Authorization"].removeprefix("Bearer ")}"\n')
+    all_services.start(
+        "fog_bridges",
+        FOGNAV_CONSOLE_URL=await all_services.ready("console_service"),
+        FOGNAV_TOKEN_FILE=str(token),
+        FOGNAV_CREDENTIALS_FILE=str(all_services.security.credentials("bridge")),
+    )
+    await all_services.ready("fog_bridges")
+    yield all_services
+    for module in ("fog_bridges", "console_service"):
+        all_services.kill(module)
+
+
+@pytest.mark.live
+async def test_robot_is_a_device_with_state_map_and_orders_and_refusals_are_told(bridge, until):
+    async with bridge.edges() as (_, zenoh, _connect), home_of(bridge) as (home, mqtt):
+        state = RobotState(
+            mode="HOLD", reasons=["waiting for an operator to enable"], enabled=False, battery=0.63, goal_id=None,
+            map_epoch=0, map_seq=0, plan_id=None, awaits_operator=True, stamp=time.time(),
+        )  # fmt: skip
+
+        async def publish() -> None:
+            while True:
+                zenoh.publish(ch.ROBOT_STATE, state, robot="r1")
+                await asyncio.sleep(0.2)
+
+        publishing = asyncio.create_task(publish())
+        try:
+            await until(lambda: home.report().get("battery") == 63, "its battery is known")
+            await until(lambda: home.of(ch.HOME_ASSISTANT_ROBOT), "its device is known", lambda: str(home.told.keys()))
+            assert home.report()["why"] == "waiting for an operator to enable"
+            assert home.report()["waits_for_operator"] == "ON"
+            device = json.loads(home.of(ch.HOME_ASSISTANT_ROBOT))
+            assert device["availability_topic"] == "fog/v1/test/bridge/availability"
+            assert home.of(ch.BRIDGE_AVAILABILITY, "") == "online"
+            topics = {part["command_topic"] for part in device["cmps"].values() if "command_topic" in part}
+            assert topics == {"fog/v1/test/robots/r1/order"}
+            await until(lambda: home.of(ch.MAP_PICTURE_PLACE, ""), "the map is there")
+            with Image.open(io.BytesIO(base64.b64decode(home.of(ch.MAP_PICTURE, "")))) as picture:
+                assert picture.size == (160, 120)
+            corner = json.loads(home.of(ch.MAP_PICTURE_PLACE, ""))["calibration_points"][0]
+            assert corner == {"vacuum": {"x": 0.0, "y": 6.0}, "map": {"x": 0, "y": 0}}
+            for order, words in (
+                ("stop", "r1"),  # the robot of this test does not answer
+                ("goal moon", "is no command"),
+                ("enable", "is no command"),
+            ):
+                home.told.pop((ch.ROBOT_REFUSAL.name, "r1"), None)
+                await mqtt.publish(ch.ROBOT_ORDER, order, robot="r1")
+                await until(lambda words=words: words in home.of(ch.ROBOT_REFUSAL), f"{order} is refused: {words}")
+        finally:
+            publishing.cancel()
+        bridge.kill("console_service")
+        await until(lambda: home.of(ch.BRIDGE_AVAILABILITY, "") == "offline", "nobody knows the floor's state")
+        bridge.start("console_service")
+
+
+def view(**state: object) -> dict[str, object]:
+    return {"state": {"mode": "NORMAL", "reasons": [], "battery": 0.5, **state}, "goal": None}
+
+
+@pytest.mark.parametrize(
+    ("state", "under_way", "said"),
+    [
+        ({}, False, "idle"), ({"mode": "FAULT", "docked": True}, True, "error"), ({"docked": True}, False, "docked"),
+        ({"mode": "DOCK"}, False, "returning"), ({"mode": "NORMAL"}, True, "cleaning"),
+        ({"mode": "HOLD"}, True, "paused"), ({"mode": "NORMAL", "goal_reached": True}, True, "idle"),
+    ],
+)  # fmt: skip
+def test_state_has_home_assistants_word(state, under_way, said):
+    assert activity(state, under_way=under_way) == said
+
+
+def test_orders_become_requests_of_operators_and_nothing_enables():
+    core = HomeAssistant("lab")
+    for name, data in (("hello", {"fresh": True}), ("place", {"id": "b", "value": {}}),
+                       ("robot", {"id": "r1", "value": view()})):  # fmt: skip
+        core.on_event(name, data)
+    assert core.on_command("r1", "stop") == Request("POST", "/api/v1/robots/r1/stop")
+    assert core.on_command("r1", "goal b") == Request("PUT", "/api/v1/robots/r1/goal", {"place": "b"})
+    assert core.on_command("r1", "goal none") == core.on_command("r1", "cancel")
+    assert core.on_command("r1", "return_to_base").body == {"kind": "dock"}
+    for robot, text in (("r1", "enable"), ("r1", "reset"), ("r1", "goal ../x"), ("r2", "stop"), ("r1", "")):
+        assert isinstance(core.on_command(robot, text), str), text
+
+
+def test_robot_that_is_gone_is_forgotten_and_a_broker_that_lost_everything_is_told_again():
+    core = HomeAssistant("lab")
+    core.on_event("hello", {"fresh": True})
+    first = core.on_event("robot", {"id": "r1", "value": view()})
+    assert core.on_event("robot", {"id": "r1", "value": view()}) == []
+    assert list(core.everything()) == list(first)
+    gone = core.on_event("robot", {"id": "r1", "value": None})
+    assert {(each.channel, each.message) for each in gone} == {
+        (channel, None) for channel in (ch.HOME_ASSISTANT_ROBOT, ch.ROBOT_REPORT, ch.ROBOT_REFUSAL)
+    }
+
+
+def test_words_of_a_robot_and_many_places_keep_the_limits_of_their_topics():
+    long = view(reasons=["x" * 500] * 8)
+    assert len(report(long)) <= ch.ROBOT_REPORT.limit
+    assert len(json.loads(report(long))["why"]) == 255
+    assert len(discovery("s" * 32, "r" * 32, [f"place-{n:026}" for n in range(100)])) <= ch.HOME_ASSISTANT_ROBOT.limit

@@ -13,6 +13,7 @@ from fog_supervisor.servers import ServerError
 from fog_supervisor.supervisor import NotReadyError
 from fognav.__main__ import app
 from fognav_experiments.bench import common, cores, fleet, fleet_live, pipeline, planner, rest
+from fognav_experiments.bench import console as console_events
 from fognav_experiments.bench import floor as floor_bench
 
 
@@ -161,6 +162,17 @@ def test_system_that_does_not_start_is_a_sentence_and_no_traceback(monkeypatch, 
     monkeypatch.setattr(rest, "measure", measure)
     done = CliRunner().invoke(app, ["bench", "rest"])
     assert (done.exit_code, f"fognav: {error}" in done.output) == (1, True)
+
+
+@pytest.mark.live
+@pytest.mark.drive
+async def test_readers_of_events_all_get_poses_and_hazards(tmp_path: Path) -> None:
+    figures = await console_events.measure(tmp_path, readers=30, robots=2, seconds=3.0, on_phase=print)
+    assert figures["lost_readers"] == 0
+    assert figures["poses"] > 0
+    assert figures["areas"] > 0
+    assert 0 < figures["pose_p50_ms"] <= figures["pose_p99_ms"]
+    assert figures["heartbeat_gap_p50_ms"] > 0
 
 
 def test_localization_figures_are_there_and_the_search_and_match_ran() -> None:

@@ -44,7 +44,7 @@ if TYPE_CHECKING:
 
 LARGEST_AREA: Final = 130
 """Nodes of one area, at most a third of all; the others share theirs with three more."""
-_BENCH: Final = "bench"
+BENCH: Final = "bench"
 """The user who stands for all nodes and robots."""
 _AREA: Final = 4
 _SIDE: Final = 1.0
@@ -56,7 +56,7 @@ _STILL: Final = 3
 MB: Final = 1e6
 
 
-class _Fog:
+class Fog:
     """The running processes of one measurement."""
 
     def __init__(self, stack: Stack) -> None:
@@ -110,7 +110,7 @@ async def measure(  # what is measured
 ) -> dict[str, Any]:
     """Return the figures; times in ms, None when no hazard reached the map. `folder` is empty."""
     write_nodes(folder, nodes)
-    users = StackUsers(site=SITE, unrestricted=(_BENCH,))
+    users = StackUsers(site=SITE, unrestricted=(BENCH,))
     config = StackConfig(site_dir=folder, robot="none", extra={"HAZARDS_WAIT_S": "0"}, users=users)
     async with Stack(config) as stack:
         on_phase("starting broker, Redis, router, aggregator and map-service")
@@ -118,17 +118,17 @@ async def measure(  # what is measured
         for name in (AGGREGATOR, MAP_SERVICE):
             stack.supervisor.start(name)
         await stack.supervisor.wait_ready([*SERVERS, AGGREGATOR, MAP_SERVICE], _READY_S)
-        fog, traces = _Fog(stack), _Traces()
-        own = stack.security.credentials(_BENCH)
+        fog, traces = Fog(stack), _Traces()
+        own = stack.security.credentials(BENCH)
         with zenoh.open(session_config("client", connect=[stack.zenoh_endpoint], credentials=own)) as session:
             session.declare_subscriber(ch.MAP_DELTA.key(site=SITE), traces.on_delta)
-            async with _load(stack, nodes, rate, robots, seconds) as load:
+            async with load_generator(stack, nodes, rate, robots, seconds) as load:
                 # Kernels are loaded just then, and each node's first readings change its area.
                 on_phase(f"{nodes} nodes at {rate:g} Hz, until all are clear")
                 await fog.wait_clear()
                 on_phase(f"the same with hazards for {seconds:g} s")
                 cpu, memory = fog.cpu_s(), fog.rss_mb()
-                sent = await _ended(load, seconds)
+                sent = await ended(load, seconds)
                 cpu = {name: used - cpu[name] for name, used in fog.cpu_s().items()}
                 received = await fog.all_received()
         return {
@@ -174,9 +174,9 @@ def _free_corners(floor: StaticMap) -> list[tuple[float, float]]:
 
 
 @asynccontextmanager
-async def _load(stack: Stack, nodes: int, rate: float, robots: int, seconds: float) -> AsyncIterator[Process]:
+async def load_generator(stack: Stack, nodes: int, rate: float, robots: int, seconds: float) -> AsyncIterator[Process]:
     """Run the load generator, which measures once it is told to."""
-    asked = [nodes, rate, robots, seconds, stack.security.file(_BENCH)]
+    asked = [nodes, rate, robots, seconds, stack.security.file(BENCH)]
     options = [SITE, stack.mqtt_url, stack.zenoh_endpoint, *map(str, asked)]
     pipe = asyncio.subprocess.PIPE
     load = await asyncio.create_subprocess_exec(
@@ -190,7 +190,7 @@ async def _load(stack: Stack, nodes: int, rate: float, robots: int, seconds: flo
             await load.wait()
 
 
-async def _ended(load: Process, seconds: float) -> dict[str, Any]:
+async def ended(load: Process, seconds: float) -> dict[str, Any]:
     """Let the load generator measure; return what it sent. Raises `FailedError`."""
     async with asyncio.timeout(4 * seconds + 60):
         out, err = await load.communicate(b"begin\n")

@@ -61,19 +61,19 @@ async def measure(
         assert port is not None
         load = Load(port, stack.token, worst_shapes(floor))
         alone = await load.alone()
-        with _listener(stack) as listener:
+        with heartbeat_listener(stack) as listener:
             await asyncio.sleep(idle_s)
-            idle = _gaps(listener)
+            idle = gaps_of(listener)
             service, *http_processes = psutil.Process(pid), *psutil.Process(pid).children()
             begun = service.cpu_times()
             await load.run(clients, seconds)
-            loaded = _gaps(listener)
+            loaded = gaps_of(listener)
             ended = service.cpu_times()
         return {
             **started,
             **{name: round(seconds * 1000.0, 1) for name, seconds in alone.items()},
-            **_figures("idle_heartbeat_gap", idle),
-            **_figures("heartbeat_gap", loaded),
+            **figures_of("idle_heartbeat_gap", idle),
+            **figures_of("heartbeat_gap", loaded),
             "requests": dict(sorted(load.answers.items())),
             "cpu_s": round(sum(ended[:2]) - sum(begun[:2]), 1),
             "rss_mb": round(service.memory_info().rss / 1e6, 1),
@@ -86,7 +86,8 @@ def _own_bytes(process: psutil.Process) -> int:
     return int(process.memory_full_info().uss)
 
 
-def _figures(name: str, gaps: list[float]) -> dict[str, float]:
+def figures_of(name: str, gaps: list[float]) -> dict[str, float]:
+    """Return median, 99th percentile and the longest of gaps (s) in ms."""
     p50, p99 = np.percentile(gaps, [50, 99])
     return {
         f"{name}_p50_ms": round(float(p50) * 1000.0, 1),
@@ -113,18 +114,19 @@ async def _map_service(config: StackConfig, zones: list[Zone]) -> AsyncIterator[
 
 
 @contextmanager
-def _listener(stack: Stack) -> Iterator[subprocess.Popen[bytes]]:
+def heartbeat_listener(stack: Stack) -> Iterator[subprocess.Popen[bytes]]:
+    """Run a process that times the map's heartbeat: see `gaps_of`."""
     command = (
         sys.executable, "-m", "fognav_experiments.bench.rest", SITE, stack.zenoh_endpoint,
         str(stack.security.file(PLANNER)),
     )  # fmt: skip
     with subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE) as process:
-        _gaps(process)  # once it listens
+        gaps_of(process)  # once it listens
         yield process
         process.terminate()
 
 
-def _gaps(listener: subprocess.Popen[bytes]) -> list[float]:
+def gaps_of(listener: subprocess.Popen[bytes]) -> list[float]:
     """Return the gaps (s) since the last call."""
     assert listener.stdin is not None
     assert listener.stdout is not None

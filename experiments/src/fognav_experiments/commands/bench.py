@@ -181,6 +181,31 @@ def rest_command(
     _show("rest", asked, figures, json=json)
 
 
+@bench_app.command("console", epilog="Example: fognav bench console --readers 1000 --seconds 20 --json")
+def console_command(
+    *,
+    readers: Annotated[int, typer.Option("--readers", metavar="N", min=1, max=1024, help="Readers of events.")] = 1000,
+    robots: Annotated[int, typer.Option("--robots", metavar="N", min=1, max=100, help="Robots that drive.")] = 10,
+    seconds: Annotated[float, typer.Option("--seconds", metavar="S", min=1.0, help="Of each measurement.")] = 20.0,
+    json: JsonOption = False,
+) -> None:
+    """Measure the console's events with many readers.
+
+    Robots send poses ten times a second, and hazards come and go. Times are in ms, from the publication of a pose, or
+    the confirmation of a hazard, to one of ten readers among all; processor time and memory are the console-service's,
+    the heartbeat (100 ms) is the map-service's, without readers (`idle_`) and with them.
+    """
+    from fognav_experiments.bench import console as events  # noqa: PLC0415  # keeps the other commands fast
+
+    kernels.warm_cache(print_line)
+    with exit_codes(), TemporaryDirectory(prefix="fognav-") as folder:
+        figures = asyncio.run(
+            events.measure(Path(folder), readers=readers, robots=robots, seconds=seconds, on_phase=print_line)
+        )
+    asked = {"readers": readers, "robots": robots, "seconds": seconds}
+    _show("console", asked, figures, json=json)
+
+
 @bench_app.command("localization", epilog="Example: fognav bench localization --json")
 def localization_command(
     *,

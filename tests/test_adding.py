@@ -32,7 +32,8 @@ MESSAGES = "libs/fog-contracts/src/fog_contracts/messages"
 CHANNELS = "libs/fog-contracts/src/fog_contracts/channels.py"
 SHAPES = "libs/fog-contracts/src/fog_contracts/shapes.py"
 MAKE_POLYGONS = {
-    "experiments/src/fognav_experiments/scenarios/stage.py", "robot-agent/src/robot_agent/agent/navigation.py"
+    "experiments/src/fognav_experiments/scenarios/stage.py", "robot-agent/src/robot_agent/agent/navigation.py",
+    "services/map-service/src/map_service/api_masks.py",
 }  # fmt: skip
 """They make a shape of a list of corners, whatever other kinds there are."""
 GEOJSON = "services/map-service/src/map_service/geojson.py"

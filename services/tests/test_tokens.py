@@ -19,6 +19,7 @@ PUBLIC = {
     "/api/v1/areas/{area_id}/override", "/api/v1/nodes",
     "/api/v1/hazards", "/api/v1/map", "/api/v1/map.png", "/api/v1/costmap.png", "/api/v1/places",
     "/api/v1/zones", "/api/v1/zones/{zone_id}", "/api/v1/zones.geojson", "/api/v1/unusable-zones",
+    "/api/v1/masks/keepout.png", "/api/v1/masks/keepout.yaml", "/api/v1/masks/speed.png", "/api/v1/masks/speed.yaml",
     "/api/v1/places/{place}", "/api/v1/zone-sets", "/api/v1/zone-sets/{set_id}",
 }  # fmt: skip
 """Reads for everybody on the floor (docs/security.md); whatever else is read tells about people."""

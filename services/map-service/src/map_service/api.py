@@ -50,6 +50,7 @@ from fog_runtime.stores.records import KINDS, AuditEntry, CursorError
 from fog_runtime.stores.redis_connection import StoreError
 from fog_runtime.stores.redis_store import Attempt, IdempotencyError
 from map_service.api_dry_run import add_dry_runs
+from map_service.api_masks import add_masks
 from map_service.api_places import add_places
 from map_service.api_sets import add_sets, add_sources
 from map_service.api_views import add_views
@@ -101,6 +102,7 @@ def make_api(  # the process's parts
     _add_applied(zones, service, clock)
     _add_zone_patch(zones, service, clock)
     _add_audit(zones, service)
+    add_masks(zones, service, clock)
     add_sets(zones, service)
     add_sources(zones, service)
     places = Routes(app, "places")

@@ -34,7 +34,7 @@ if TYPE_CHECKING:
     from fog_contracts.shapes import Spans
     from map_service.aggregator_monitor import AggregatorMonitor
     from map_service.dry_run import Change
-    from map_service.layers.base import CostLayer
+    from map_service.layers.base import CostLayer, Grid
     from map_service.zone_sets import SetOfZones, SetSwitches
     from map_service.zone_times import Progress
     from map_service.zones import PreparedZone, ZoneCatalog
@@ -235,6 +235,10 @@ class MapCore:
     def hypothesis(self, change: Change, targets: Sequence[Target] = ()) -> Hypothesis:
         """Return the map after a change that nobody makes; raises `RefusedMessageError` for an unknown area."""
         return Hypothesis(self.costmap, self._zones, self._hazards, change, targets)
+
+    def write_zones(self, cost: Grid, speed: Grid) -> None:
+        """Combine the zones in force into grids of the map's size."""
+        self._zones.update_costs(self.costmap.geometry.whole, cost, speed)
 
     @property
     def zone_sets(self) -> SetSwitches:

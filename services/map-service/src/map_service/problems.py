@@ -58,6 +58,10 @@ class MapProblem(ProblemCode):
         "place_invalid", 422, "The place lies off the map or in a wall, or is one too many",
         "Move it to a free cell of the map, or remove another place",
     )  # fmt: skip
+    MASK_INVALID = (
+        "mask_invalid", 422, "The mask can't become zones: `detail` says why",
+        "Paint fewer, larger parts in few shades, on the picture of GET /api/v1/masks/keepout.png",
+    )  # fmt: skip
     ZONES_NOT_LOADED = (
         "zones_not_loaded", 503, "The stored zones are not loaded yet",
         "Try again in a moment: /readyz says when they are",

@@ -252,6 +252,8 @@ async def test_every_view_keeps_the_rules_of_wcag_that_a_program_can_check(
     stream.tell("zone", "wet", _zone("wet", "wet floor"))
     stream.hazard("z2", "blocked")
     stream.robot("r1", robot_state("FAULT", reasons=["bumper pressed"], codes=["bumper"]))
+    dry_run = {"map_epoch": 1, "map_seq": 1, "robots": [], "cut_off": [], "connected": [], "unfinished": []}
+    stream.answers["POST dry-run"] = (200, dry_run)
     page = await console.open(**device, color_scheme=scheme, reduced_motion="reduce", bypass_csp=True)
     found = []
     for view in VIEWS:
@@ -260,6 +262,15 @@ async def test_every_view_keeps_the_rules_of_wcag_that_a_program_can_check(
         if view == "robots":
             await page.get_by_role("button", name="Send to a goal").click()
         found += await violations(page, view)
+        if view == "zones":
+            await page.get_by_role("button", name="Corridor").click()
+            await page.get_by_role("button", name="Put it in the middle").click()
+            found += await violations(page, "a zone that is drawn")
+        elif view == "sensors":
+            await page.get_by_role("link", name="Middle corridor").first.click()
+            found += await violations(page, "an area")
+            await page.get_by_role("button", name="Place", exact=True).click()
+            found += await violations(page, "an area that is placed")
     await page.get_by_text("Settings").click()
     found += await violations(page, "settings")
     assert found == []

@@ -61,7 +61,8 @@ class ConsoleStream:
         self.log: dict[tuple[str, str], tuple[int, str, Any]] = {}
         self.requests: list[tuple[str, Any]] = []
         self.answers: dict[str, tuple[int, Any]] = {}
-        """What a request `METHOD path` is answered, with its status; any other one gets 200 and what commands get."""
+        """What a request `METHOD path` is answered, with its status; any other one gets 200 and what commands get, or
+        an empty list."""
         self.resumed_from: list[str | None] = []
         self.silent = False
         self._revisions = itertools.count(1)
@@ -168,7 +169,7 @@ class ConsoleStream:
             if path == "session":
                 return self._session(request, body, refused)
             outcome = {"accepted": True, "reason": "it does", "mode": "NORMAL"}
-            status, answer = self.answers.get(name, (200, outcome))
+            status, answer = self.answers.get(name, (200, [] if request.method == "GET" else outcome))
             return Response(json.dumps(answer), status, media_type="application/json")
 
         app.mount("/", PageFiles(PAGE))

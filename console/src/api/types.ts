@@ -8,6 +8,7 @@ type Sent<T, Needed extends keyof T = never> = Pick<T, Needed> & Partial<T>;
 
 export type Alert = Schemas["Alert"];
 export type AppliedChange = Schemas["AppliedChange"];
+export type AreaBody = Sent<Schemas["AreaBody"]>;
 export type AreaState = "blocked" | "clear" | "unknown";
 export type AreaView = Schemas["AreaView"];
 export type AuditEntry = Schemas["AuditEntry"];
@@ -19,6 +20,8 @@ export type GoalBody = Sent<Schemas["GoalBody"]>;
 export type GoalView = Schemas["GoalView"];
 export type MapGeometry = Schemas["MapGeometry"];
 export type MapInfo = Schemas["MapInfo"];
+export type OverrideBody = Schemas["OverrideBody"];
+export type PeriodView = Schemas["PeriodView"];
 export type Place = Schemas["PlaceView"];
 export type PlanReply = Schemas["PlanReply"];
 export type PlanView = Schemas["PlanView"];
@@ -26,6 +29,7 @@ export type Pose = Schemas["Pose"];
 export type RobotPose = Schemas["RobotPose"];
 export type RobotState = Schemas["RobotState"];
 export type Shape = Schemas["Zone"]["shape"];
+export type TimelineEntry = Schemas["TimelineEntry"];
 export type Zone = Schemas["Zone"];
 export type ZoneBody = Sent<Schemas["ZoneBody"], "kind" | "shape">;
 

@@ -1,10 +1,86 @@
+// What happened, newest first, by whom; and the last hour on a map.
+import { useEffect, useState } from "preact/hooks";
+import { request } from "../api/client";
+import type { TimelineEntry } from "../api/types";
+import { mayOperate, useConsole } from "../context";
 import { t } from "../i18n/i18n";
+import { entryText, KINDS, undoable } from "../past/entries";
+import { Replay } from "../past/replay";
+import { sentence } from "../stop";
+import { clockTime } from "../text";
+import { undoEntry } from "../zones/requests";
+import "../zones/zones.css";
+
+const PAGE = 50;
+const MOST = 500;
+const AGAIN_MS = 10_000;
+const SOON_MS = 500;
 
 export function TimelineView(): preact.JSX.Element {
+  const { live, session, say } = useConsole();
+  const [kind, setKind] = useState("");
+  const [limit, setLimit] = useState(PAGE);
+  const [entries, setEntries] = useState<readonly TimelineEntry[] | null>(null);
+  const [problem, setProblem] = useState("");
+  const [replays, setReplays] = useState(false);
+  const query = `limit=${limit}${kind === "" ? "" : `&kind=${kind}`}`;
+
+  useEffect(() => {
+    let wanted = true;
+    let soon: ReturnType<typeof setTimeout> | undefined;
+    const read = (): void => void request<TimelineEntry[]>("GET", `timeline?${query}`).then(({ value }) => {
+      if (wanted) [setEntries(value), setProblem("")];
+    }, (error: unknown) => wanted && setProblem(sentence(error)));
+    read();
+    const timer = setInterval(read, AGAIN_MS);
+    const off = live.on(["record"], () => {
+      clearTimeout(soon);
+      soon = setTimeout(read, SOON_MS);
+    });
+    return () => {
+      wanted = false;
+      off();
+      clearInterval(timer);
+      clearTimeout(soon);
+    };
+  }, [live, query]);
+
+  const undone = undoable(entries ?? []);
+  const undo = (entry: TimelineEntry): void => {
+    const service = undone.get(entry.entry);
+    if (!service) return;
+    void undoEntry(service, entry.id, entry.entry).then(
+      () => say(t("timeline.undone", { what: entryText(entry) })),
+      (error: unknown) => say(t("timeline.notUndone", { reason: sentence(error) }), "failed"),
+    );
+  };
   return (
     <>
       <h2>{t("view.timeline")}</h2>
-      <p class="muted">{t("view.coming", { command: "./fognav area history" })}</p>
+      <div class="choices"><button aria-pressed={replays} onClick={() => setReplays(!replays)}>{t("replay.title")}</button></div>
+      {replays && <Replay />}
+      <label class="field">{t("timeline.filter")}
+        <select value={kind} onChange={(event) => setKind(event.currentTarget.value)}>
+          <option value="">{t("timeline.all")}</option>
+          {KINDS.map((each) => <option key={each} value={each}>{t(`filter.${each}`)}</option>)}
+        </select>
+      </label>
+      {problem !== "" && <p class="problem" role="alert">{problem}</p>}
+      {entries?.length === 0 && <p class="muted">{t("timeline.none")}</p>}
+      <ol class="rows timeline">
+        {(entries ?? []).map((entry, index) => (
+          <li key={entry.entry || `${entry.kind} ${entry.id} ${entry.at} ${index}`} class="row">
+            <time dateTime={new Date(entry.at * 1000).toISOString()} class="muted">{clockTime(entry.at)}</time>
+            <span class="happened"><bdi>{entryText(entry)}</bdi></span>
+            {entry.who !== "" && <span class="muted"><bdi>{entry.who}</bdi></span>}
+            {undone.has(entry.entry) && mayOperate(session) && (
+              <button aria-label={t("timeline.undoOf", { what: entryText(entry) })} onClick={() => undo(entry)}>{t("undo")}</button>
+            )}
+            {entry.text !== "" && <span class="why clipped"><bdi>{entry.text}</bdi></span>}
+          </li>
+        ))}
+      </ol>
+      {entries && entries.length >= limit && limit < MOST && <button onClick={() => setLimit(limit + PAGE)}>{t("timeline.more")}</button>}
     </>
   );
 }

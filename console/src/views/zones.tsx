@@ -7,7 +7,7 @@ import { outline } from "../map/geometry";
 import { go, routeHash, useRoute } from "../router";
 import { sentence } from "../stop";
 import { shapeText } from "../zones/conflict";
-import { bodyOf, copyOf, draftOf, newDraft, stateOf } from "../zones/draft";
+import { copyOf, draftOf, newDraft, stateOf } from "../zones/draft";
 import { EditLayer } from "../zones/edit-layer";
 import { editor } from "../zones/editor";
 import { applied, type Change, remove, save, undo } from "../zones/requests";
@@ -26,7 +26,7 @@ const COPY_M = 0.5;
 let last: Change | null = null;
 
 export function ZonesView(): preact.JSX.Element {
-  const { floor, session, say } = useConsole();
+  const { floor, live, session, say } = useConsole();
   const { chosen } = useRoute();
   const [, redraw] = useReducer((count: number) => count + 1, 0);
   useEffect(() => editor.on(() => redraw(0)), []);
@@ -61,7 +61,7 @@ export function ZonesView(): preact.JSX.Element {
     }, (error: unknown) => failed(error, zone.id)),
     toggle: (zone) => {
       const draft = draftOf(zone);
-      void save({ ...draft, fields: { ...draft.fields, enabled: !zone.enabled } }).then((saved) => {
+      void save({ ...draft, fields: { ...draft.fields, enabled: !zone.enabled } }, live.serverTime || Date.now() / 1000).then((saved) => {
         if ("zone" in saved) made({ id: zone.id, before: zone, after: saved.zone }, t(saved.zone.enabled ? "zones.on" : "zones.off", { zone: zone.id }));
         else say(t("zones.overtaken", { zone: zone.id }), "failed");
       }, (error: unknown) => failed(error, zone.id));
@@ -202,7 +202,7 @@ function ZoneCard({ id, actions }: { readonly id: string; readonly actions: Acti
 
 function Facts({ zone, now }: { readonly zone: Values["zone"]; readonly now: number }): preact.JSX.Element {
   const { end } = draftOf(zone).fields;
-  const { factor, speed } = bodyOf(draftOf(zone), zone.shape);
+  const { factor, speed } = zone;
   return (
     <>
       <h2 class="named"><bdi>{zone.id}</bdi></h2>

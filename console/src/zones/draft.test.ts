@@ -10,12 +10,21 @@ const zone = (more: Partial<Zone> = {}): Zone => ({
 
 test("a zone that nobody changed is sent back as it was", () => {
   const before = zone({ starts_at: 5, expires_at: 99 });
-  const { author: _author, version: _version, ...rest } = before;
-  expect(bodyOf(draftOf(before), before.shape)).toEqual(rest);
+  const { author: _author, version: _version, source: _source, ...rest } = before;
+  expect(bodyOf(draftOf(before), before.shape, 50)).toEqual(rest);
 });
 
-test("the end of a zone with a time to live stays where it is, though something else of it changes", () => {
-  expect(bodyOf(draftOf(zone({ ttl_s: 600, expires_at: 700 })), zone().shape)).toMatchObject({ ttl_s: null, expires_at: 700 });
+test("a zone with a time to live keeps the rest of it, though something else of it changes", () => {
+  const body = bodyOf(draftOf(zone({ ttl_s: 600, expires_at: 700 })), zone().shape, 300);
+  expect(body).toMatchObject({ ttl_s: 400, expires_at: null });
+});
+
+test("a chosen time is sent as the time until then, so that the zone ends though the server's clock is not synchronized", () => {
+  const draft = draftOf(zone());
+  const chosen = { ...draft, fields: { ...draft.fields, end: { type: "at" as const, stamp: 1000 } } };
+  expect(bodyOf(chosen, zone().shape, 400)).toMatchObject({ ttl_s: 600, expires_at: null });
+  // A time in the past is for the service to refuse.
+  expect(bodyOf(chosen, zone().shape, 2000)).toMatchObject({ ttl_s: null, expires_at: 1000 });
 });
 
 test("of two operators' changes each field begins with the value of the one who changed it", () => {

@@ -71,10 +71,10 @@ export function fieldsOf(zone: Zone): Fields {
   };
 }
 
-/** Return what is sent for a draft that has a shape. */
-export function bodyOf({ base, id, fields }: Draft, shape: Shape): ZoneBody {
+/** Return what is sent for a draft that has a shape, at `now` (s since the epoch, the server's). */
+export function bodyOf({ base, id, fields }: Draft, shape: Shape, now: number): ZoneBody {
   // Fields that this page does not edit go back as they came.
-  const { author: _author, version: _version, active: _active, ...kept } = { ...base } as Zone & { active?: boolean };
+  const { author: _author, version: _version, source: _source, active: _active, ...kept } = { ...base } as Zone & { active?: boolean };
   return {
     ...kept,
     id: id === "" ? null : id,
@@ -84,11 +84,21 @@ export function bodyOf({ base, id, fields }: Draft, shape: Shape): ZoneBody {
     speed: fields.kind === "SPEED_LIMIT" ? fields.speed : null,
     reason: fields.reason,
     starts_at: base?.starts_at ?? null,
-    expires_at: fields.end.type === "at" ? fields.end.stamp : null,
-    ttl_s: fields.end.type === "after" ? fields.end.seconds : null,
+    ...endOf(base, fields.end, now),
     schedule: fields.schedule,
     enabled: fields.enabled,
   };
+}
+
+/** Return how an end is sent: as the time that is left, which needs no correct clock, unless it was a moment before. */
+function endOf(base: Zone | null, end: End, now: number): Pick<ZoneBody, "expires_at" | "ttl_s"> {
+  if (end.type === "never") return { expires_at: null, ttl_s: null };
+  if (end.type === "after") return { expires_at: null, ttl_s: end.seconds };
+  const asBefore = base !== null && base.ttl_s === null && base.expires_at === end.stamp;
+  const toCome = (base?.starts_at ?? 0) > now;
+  return asBefore || toCome || end.stamp <= now
+    ? { expires_at: end.stamp, ttl_s: null }
+    : { expires_at: null, ttl_s: Math.round((end.stamp - now) * 10) / 10 };
 }
 
 export type FieldName = keyof Fields;

@@ -3,7 +3,7 @@ import L from "leaflet";
 import type { Point, Shape } from "../api/types";
 import { t } from "../i18n/i18n";
 import type { Floor } from "../map/floor";
-import { outline } from "../map/geometry";
+import { box, outline } from "../map/geometry";
 import type { Editor } from "./editor";
 import { gaps, hasCorners, middle, shapeOf, shapePoints, WHOLE } from "./shapes";
 
@@ -22,6 +22,9 @@ export class EditLayer {
   private readonly handles = new Map<string, L.Marker>();
   private readonly stops: (() => void)[] = [];
   private dragged = "";
+  /** How far the handle of the whole is from the shape's middle while it is dragged. */
+  private grip: Point = [0, 0];
+  private readonly size = matchMedia("(pointer: coarse)").matches ? 44 : 24;
   private readonly map: L.Map;
 
   constructor(private readonly floor: Floor, private readonly editor: Editor) {
@@ -98,17 +101,40 @@ export class EditLayer {
     (shape ? L.polygon(points, options) : L.polyline(points, options)).addTo(this.rubber);
   }
 
-  private drawHandles(shape: Shape | null): void {
+  /** Return where which handles are. No two cover each other, however small the shape is on the screen. */
+  private handlesOf(shape: Shape): Map<string, Point> {
     const wanted = new Map<string, Point>();
-    if (shape) {
-      const points = shapePoints(shape);
-      gaps(shape).forEach((at, i) => {
-        const [a, b] = [points[i], points[(i + 1) % points.length]];
-        if (a && b && this.pixels(a, b) > GAP_PX) wanted.set(`gap ${i}`, at);
-      });
-      if (shape.type !== "circle") wanted.set("whole", middle(shape));
-      points.forEach((at, i) => wanted.set(`point ${i}`, at));
+    const points = shapePoints(shape);
+    const selected = points[this.editor.selected];
+    const kept: Point[] = selected ? [selected] : [];
+    const free = (at: Point): boolean => kept.every((other) => this.pixels(other, at) >= this.size);
+    gaps(shape).forEach((at, i) => {
+      const [a, b] = [points[i], points[(i + 1) % points.length]];
+      if (a && b && this.pixels(a, b) > GAP_PX) wanted.set(`gap ${i}`, at);
+    });
+    points.forEach((at, i) => {
+      if (at !== selected && !free(at)) return;
+      wanted.set(`point ${i}`, at);
+      kept.push(at);
+    });
+    if (shape.type !== "circle") {
+      const others = [...wanted.values()];
+      const clear = others.every((other) => this.pixels(other, middle(shape)) >= this.size);
+      wanted.set("whole", clear ? middle(shape) : this.below(shape));
     }
+    return wanted;
+  }
+
+  /** Return a point below a shape, away from its handles. */
+  private below(shape: Shape): Point {
+    const [, bottom] = box(shapePoints(shape));
+    const at = this.map.latLngToLayerPoint([bottom, middle(shape)[0]]);
+    return toPoint(this.map.layerPointToLatLng(at.add([0, this.size * 1.2])));
+  }
+
+  private drawHandles(shape: Shape | null): void {
+    const wanted = shape ? this.handlesOf(shape) : new Map<string, Point>();
+    if (this.dragged !== "") wanted.set(this.dragged, wanted.get(this.dragged) ?? [0, 0]);
     for (const [name, handle] of this.handles) {
       if (wanted.has(name)) continue;
       const focused = handle.getElement() === document.activeElement;
@@ -130,9 +156,8 @@ export class EditLayer {
 
   private makeHandle(name: string, at: Point): L.Marker {
     const kind = name.split(" ")[0] ?? "";
-    const size = matchMedia("(pointer: coarse)").matches ? 44 : 24;
     const handle = L.marker(toLatLng(at), {
-      icon: L.divIcon({ className: `handle ${kind}`, iconSize: [size, size] }),
+      icon: L.divIcon({ className: `handle ${kind}`, iconSize: [this.size, this.size] }),
       draggable: kind !== "gap",
       keyboard: true,
       zIndexOffset: { point: 2000, whole: 1000 }[kind] ?? 0,
@@ -142,11 +167,17 @@ export class EditLayer {
     handle.on("click", () => (kind === "gap" ? this.editor.addCorner(index) : this.editor.select(index)));
     handle.on("dragstart", () => {
       this.dragged = name;
+      const [from, shape] = [toPoint(handle.getLatLng()), this.editor.shape];
+      const [x, y] = kind === "whole" && shape ? middle(shape) : from;
+      this.grip = [from[0] - x, from[1] - y];
       this.editor.select(index);
       // The whole drag is one step to take back.
       this.editor.set({});
     });
-    handle.on("drag", () => this.editor.movePoint(index, toPoint(handle.getLatLng()), true));
+    handle.on("drag", () => {
+      const [x, y] = toPoint(handle.getLatLng());
+      this.editor.movePoint(index, [x - this.grip[0], y - this.grip[1]], true);
+    });
     handle.on("dragend", () => {
       this.dragged = "";
       this.draw();

@@ -13,13 +13,12 @@ const tag = (version: number): string => `"${version}"`;
 /** What a save came to: stored, or somebody else was faster (their version; null: the zone is gone). */
 export type Saved = { readonly zone: Zone } | { readonly theirs: Zone | null };
 
-let lastBody = "";
-let lastKey = "";
+let last: { readonly content: string; readonly body: unknown; readonly key: string } | null = null;
 
-/** Return the Idempotency-Key of a request: the same one as before if it is the same request again. */
-export function keyOf(body: string, random: () => string = randomKey): string {
-  if (body !== lastBody) [lastBody, lastKey] = [body, random()];
-  return lastKey;
+/** Return what to send, with an Idempotency-Key: the very same as before if what it is made of is the same. */
+export function attemptOf<T>(content: string, body: () => T): { readonly body: T; readonly key: string } {
+  if (last?.content !== content) last = { content, body: body(), key: randomKey() };
+  return last as { readonly content: string; readonly body: T; readonly key: string };
 }
 
 // `crypto.randomUUID` exists in secure contexts only, and a floor's address may have no certificate.
@@ -27,13 +26,13 @@ function randomKey(): string {
   return [...crypto.getRandomValues(new Uint8Array(16))].map((byte) => byte.toString(16).padStart(2, "0")).join("");
 }
 
-/** Store a draft; throws a `Problem` if it is refused or nobody answers. */
-export async function save(draft: Draft): Promise<Saved> {
+/** Store a draft, at `now` (s since the epoch, the server's); throws a `Problem` if it is refused or nobody answers. */
+export async function save(draft: Draft, now: number): Promise<Saved> {
   const { shape } = draft.fields;
   if (!shape) throw new Error("a draft without a shape can't be saved");
-  const body = bodyOf(draft, shape);
   const version = draft.base ? tag(draft.base.version) : "";
-  const headers = { "Idempotency-Key": keyOf(`${version} ${JSON.stringify(body)}`) };
+  const { body, key } = attemptOf(JSON.stringify(draft), () => bodyOf(draft, shape, now));
+  const headers = { "Idempotency-Key": key };
   let zone: Zone;
   try {
     if (draft.base) {
@@ -47,7 +46,7 @@ export async function save(draft: Draft): Promise<Saved> {
     return { theirs: await read(draft.id) };
   }
   // The next save is another request, even if it says the same.
-  lastBody = "";
+  last = null;
   return { zone };
 }
 
@@ -103,7 +102,7 @@ export async function tryOut(body: DryRunBody, isWanted: () => boolean): Promise
       return (await request<DryRunOutcome>("POST", "dry-run", { body })).value;
     } catch (error) {
       // One of one's own is still being computed, or others' are.
-      const busy = error instanceof Problem && error.status === 503;
+      const busy = error instanceof Problem && error.code === "busy";
       if (!busy || attempt >= BUSY_TRIES) throw error;
       await new Promise((done) => setTimeout(done, BUSY_WAIT_MS));
     }

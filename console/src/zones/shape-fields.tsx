@@ -3,9 +3,10 @@ import { useReducer } from "preact/hooks";
 import type { Point } from "../api/types";
 import { useConsole } from "../context";
 import { t } from "../i18n/i18n";
+import { outline } from "../map/geometry";
 import { pointName } from "./edit-layer";
 import type { ClickMode, Editor } from "./editor";
-import { hasCorners, middle, SHAPE_TYPES, shapeAt, shapePoints, WHOLE } from "./shapes";
+import { hasCorners, middle, SHAPE_TYPES, shapeAt, shapePoints, type ShapeType, WHOLE } from "./shapes";
 
 const STEPS = [0.05, 0.25, 1] as const;
 const MODES: readonly ClickMode[] = ["add", "move", "none"];
@@ -16,7 +17,7 @@ interface Props {
 }
 
 /** What is drawn, and what a click on the map does. */
-export function DrawingFields({ editor }: Props): preact.JSX.Element | null {
+export function DrawingFields({ editor, types = SHAPE_TYPES }: Props & { readonly types?: readonly ShapeType[] }): preact.JSX.Element | null {
   const { draft, shape, sketch, mode } = editor;
   const { floor } = useConsole();
   if (!draft) return null;
@@ -29,7 +30,7 @@ export function DrawingFields({ editor }: Props): preact.JSX.Element | null {
     <fieldset class="shape-fields">
       <legend>{t("edit.shape")}</legend>
       <div class="choices" role="group" aria-label={t("edit.shape")}>
-        {SHAPE_TYPES.map((type) => (
+        {types.length > 1 && types.map((type) => (
           <button type="button" key={type} aria-pressed={draft.type === type} onClick={() => draft.type !== type && editor.redraw(type)}>
             {t(`shape.${type}`)}
           </button>
@@ -47,7 +48,11 @@ export function DrawingFields({ editor }: Props): preact.JSX.Element | null {
       <div class="choices">
         {mode !== "none" && <button type="button" onClick={() => editor.click(centre())}>{t("edit.atCrosshair")}</button>}
         {shape === null && sketch.length === 0 && (
-          <button type="button" onClick={() => editor.place(shapeAt(draft.type, centre()))}>{t("edit.place")}</button>
+          <button type="button" onClick={() => {
+            const placed = shapeAt(draft.type, centre());
+            editor.place(placed);
+            floor?.show(outline(placed));
+          }}>{t("edit.place")}</button>
         )}
         <button type="button" disabled={!editor.canUndo} onClick={() => editor.undo()}>{t("edit.undoStep")}</button>
       </div>

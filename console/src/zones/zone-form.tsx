@@ -27,7 +27,7 @@ interface Props {
 function trialOf(draft: Draft | null): DryRunBody | null {
   const shape = draft?.fields.shape;
   if (!draft || !shape) return null;
-  const body = bodyOf(draft, shape);
+  const body = bodyOf(draft, shape, 0);
   // An end in the past or a wrong schedule is told when it is saved; here only the place counts.
   const zone = { ...body, starts_at: null, expires_at: null, ttl_s: null, schedule: null, reason: "" };
   return { zones: [zone] };
@@ -52,7 +52,7 @@ export function ZoneForm({ editor, onSaved, onCancel }: Props): preact.JSX.Eleme
     setSaving(true);
     setProblem("");
     try {
-      const saved = await save(now);
+      const saved = await save(now, live.serverTime || Date.now() / 1000);
       if ("zone" in saved) {
         onSaved({ id: saved.zone.id, before: now.base, after: saved.zone });
         return;
@@ -163,7 +163,7 @@ function EndFields({ end, now, onChange }: EndProps): preact.JSX.Element {
         ))}
       </div>
       <label class="field">{t("end.own")}
-        <input type="datetime-local" value={end.type === "at" ? localTime(end.stamp) : ""} onChange={(event) => {
+        <input type="datetime-local" step="1" value={end.type === "at" ? localTime(end.stamp) : ""} onChange={(event) => {
           const stamp = new Date(event.currentTarget.value).getTime() / 1000;
           onChange(Number.isFinite(stamp) ? { type: "at", stamp } : { type: "never" });
         }} />
@@ -177,5 +177,5 @@ function EndFields({ end, now, onChange }: EndProps): preact.JSX.Element {
 function localTime(stamp: number): string {
   const date = new Date(stamp * 1000);
   const two = (value: number): string => String(value).padStart(2, "0");
-  return `${date.getFullYear()}-${two(date.getMonth() + 1)}-${two(date.getDate())}T${two(date.getHours())}:${two(date.getMinutes())}`;
+  return `${date.getFullYear()}-${two(date.getMonth() + 1)}-${two(date.getDate())}T${two(date.getHours())}:${two(date.getMinutes())}:${two(date.getSeconds())}`;
 }

@@ -1,0 +1,34 @@
+// Entries of the timeline: in words, and which of them can be undone.
+import type { TimelineEntry } from "../api/types";
+import { maybe, t } from "../i18n/i18n";
+
+export const KINDS = ["zone", "hazard", "override", "area", "mission", "robot", "stop", "fault", "alert", "store"] as const;
+
+/** Whose service undoes a change, by the kind of its record. */
+const UNDONE_BY: Readonly<Record<string, "zones" | "areas" | "robots">> = {
+  zone: "zones", area: "areas", override: "areas", mission: "robots",
+};
+/** Nobody decided these. */
+const BY_ITSELF = new Set(["reached", "end"]);
+
+/** Return the entries that can be undone, with whose service does it: of each record the latest change that somebody decided. */
+export function undoable(entries: readonly TimelineEntry[]): Map<string, "zones" | "areas" | "robots"> {
+  const found = new Map<string, "zones" | "areas" | "robots">();
+  const seen = new Set<string>();
+  for (const { kind, id, entry, action } of entries) {
+    const service = UNDONE_BY[kind];
+    const record = `${kind} ${id}`;
+    if (service === undefined || entry === "" || seen.has(record)) continue;
+    seen.add(record);
+    if (!BY_ITSELF.has(action)) found.set(entry, service);
+  }
+  return found;
+}
+
+/** Return what happened, in words. */
+export function entryText({ kind, id, action }: TimelineEntry): string {
+  const what = maybe(`kind.${kind}`) ?? kind;
+  const state = kind === "hazard" ? maybe(`state.${action}`) : null;
+  const done = state ?? maybe(`action.${action}`) ?? action;
+  return t("timeline.entry", { what, id, done });
+}

@@ -108,8 +108,6 @@ _.get_sample_rate
 # --- The console-service forwards requests to them. ---
 _.aggregator_url
 _.map_url
-_.scans_wanted
-_.on_scan
 
 # --- For tests, of this repository and of packages that build on it. ---
 _.start_mosquitto  # private servers

@@ -7,16 +7,18 @@ import json
 import socket
 import time
 from collections.abc import AsyncIterator
-from contextlib import asynccontextmanager
+from contextlib import AsyncExitStack, asynccontextmanager
 
 import httpx
 import numpy as np
 import pytest
 from PIL import Image
 
+from console_service.readers import MOST_OF_SESSION
 from fog_contracts import channels as ch
 from fog_contracts.costs import LETHAL
-from fog_contracts.messages import NodeReading, RobotObstacles, RobotPose
+from fog_contracts.messages import NodeReading, RobotObstacles, RobotPose, View
+from fog_runtime.token_file import create_token, revoke_token
 
 pytestmark = pytest.mark.live
 ZONE = {"kind": "BLOCKED", "shape": {"type": "circle", "centre": [2.0, 3.0], "radius": 0.5}, "reason": "wet"}
@@ -169,6 +171,57 @@ async def test_hazard_of_a_node_and_a_robots_pose_reach_the_page(all_services, c
             assert time.monotonic() - began >= 20 * 0.08, "20 poses a second came, and 10 are told at most"
         finally:
             publishing.cancel()
+
+
+async def test_scan_of_a_robot_comes_to_who_asks_for_it_and_to_nobody_else(all_services, console):
+    url, _, viewer = console
+    asking, other = Page(), Page()
+    async with (
+        all_services.edges() as (_, zenoh, _connect),
+        reading(url, viewer, asking, "?scan=r1") as read,
+        reading(url, viewer, other) as read_other,
+    ):
+        reach = bytes([20 if sector < 45 else 0 for sector in range(180)])  # 1 m, in the first quarter
+
+        async def publish() -> None:
+            while True:
+                view = View(x=2.0, y=3.0, reach=reach)
+                zenoh.publish(ch.ROBOT_OBSTACLES, RobotObstacles(points=[], stamp=1.0, ttl=60.0, view=view), robot="r1")
+                await asyncio.sleep(0.1)
+
+        publishing = asyncio.create_task(publish())
+        try:
+            await read(lambda: "scan" in asking.got)
+            await read_other(lambda: "obstacles" in other.got and other.got.count("time") >= 2)
+        finally:
+            publishing.cancel()
+        points = asking.things["scan"]["r1"]["points"]
+        assert len(points) == 45
+        assert all(x > 2.0 and y > 3.0 and abs((x - 2.0) ** 2 + (y - 3.0) ** 2 - 1.0) < 0.01 for x, y in points)
+        assert "scan" not in other.got
+
+
+async def test_one_login_has_eight_streams_and_a_revoked_token_ends_its_own(all_services, console):
+    url = console[0]
+    tokens = all_services.folder / "tokens.toml"
+    before = tokens.read_text()
+    token = create_token(tokens, "wall", "viewer")
+    wall = {"Authorization": f"Bearer {token}"}
+    try:
+        async with AsyncExitStack() as stack:
+            pages = [Page() for _ in range(MOST_OF_SESSION)]
+            reads = [await stack.enter_async_context(reading(url, wall, page)) for page in pages]
+            for page, read in zip(pages, reads, strict=True):
+                await read(lambda page=page: "hello" in page.got)
+            async with httpx.AsyncClient() as client:
+                refused = await client.get(f"{url}/api/v1/events", headers=wall)
+            assert (refused.status_code, refused.headers["retry-after"]) == (503, "1")
+            revoke_token(tokens, "wall")
+            for read in reads:
+                with pytest.raises(StopAsyncIteration):
+                    await read(lambda: False)
+    finally:
+        tokens.write_text(before)
 
 
 @pytest.mark.parametrize("headers", [{}, {"Authorization": "Bearer nobody"}], ids=["none", "unknown"])

@@ -15,7 +15,7 @@ import msgspec
 
 from console_service.log import CompactedLog
 from console_service.tiles import TiledMap
-from console_service.views import MapView, PathView, RobotView, Thing, ZoneView, goal_view, plan_view
+from console_service.views import MapView, PathView, RobotView, Thing, ZoneView, goal_view, plan_view, scan_view
 from fog_contracts import channels as ch
 from fog_contracts.handlers import Fence
 from fog_contracts.messages.maps import MapGeometry
@@ -65,6 +65,7 @@ class _Robot:
     state: RobotState | None = None
     goal: RobotGoal | None = None
     path: RobotPath | None = None
+    obstacles: RobotObstacles | None = None
     pending: RobotPose | None = None
     pose_at: float = -math.inf
     heard: float = -math.inf
@@ -247,9 +248,18 @@ class ConsoleCore:
         return ()
 
     def _on_obstacles(self, ids: Ids, obstacles: RobotObstacles, at: Moment) -> Sequence[Publication]:
-        robot, _ = self._robot(ids, at)
+        robot, known = self._robot(ids, at)
+        known.obstacles = obstacles
         self._put("obstacles", robot, obstacles)
         return ()
+
+    def scan(self, robot: str) -> bytes | None:
+        """Return what a robot's lidar sees by its last report, as an event's data; None if it told no view."""
+        known = self._robots.get(robot)
+        if known is None or known.obstacles is None or known.obstacles.view is None:
+            return None
+        view = scan_view(known.obstacles.view, known.obstacles.stamp)
+        return msgspec.json.encode(Thing(id=robot, value=view))
 
     def _put_robot(self, robot: str) -> None:
         known = self._robots[robot]

@@ -14,7 +14,7 @@ from console_service.recording import STEP_S, Frame, Recording, as_json, pack
 from console_service.timeline import read_timeline
 from fog_contracts import channels as ch
 from fog_contracts.codec import ContractError
-from fog_contracts.messages import MapDelta, MapSnapshot
+from fog_contracts.messages import MapDelta, MapSnapshot, RobotObstacles
 from fog_contracts.replica import MapError, decode_map
 from fog_runtime import logs
 from fog_runtime.clock import ticker
@@ -82,9 +82,15 @@ class Service:
             self.readers.wake()
             if isinstance(message, MapDelta):
                 self._changed.set()
+            elif isinstance(message, RobotObstacles):
+                self._tell_scan(ids["robot"])
             return publications
 
         return handle
+
+    def _tell_scan(self, robot: str) -> None:
+        if robot in self.readers.scans_wanted and (scan := self.core.scan(robot)) is not None:
+            self.readers.on_scan(robot, scan)
 
     async def tick_loop(self) -> None:
         """Advance the core ten times a second."""

@@ -2,15 +2,19 @@
 
 from __future__ import annotations
 
+import math
 from typing import Any
 
 from fog_contracts.messages import (
+    REACH_UNIT_M,
+    VIEW_SECTORS,
     Message,
     Pose,
     Refusal,
     RobotGoal,
     RobotPath,
     RobotState,
+    View,
     Zone,
 )
 from fog_contracts.messages.maps import MapGeometry
@@ -84,6 +88,27 @@ class PathView(Message, frozen=True, kw_only=True):
     plan_id: int
     points: list[tuple[float, float]]
     released_length: float
+
+
+class ScanView(Message, frozen=True, kw_only=True):
+    """What a robot's lidar sees: the nearest point (m, frame `map`) in each sector of 2 degrees that has one."""
+
+    points: list[tuple[float, float]]
+    stamp: float
+
+
+def scan_view(view: View, stamp: float) -> ScanView:
+    """Return the points of a robot's view, in the middle of their sectors."""
+    width = math.tau / VIEW_SECTORS
+    points = [
+        (
+            round(view.x + reach * REACH_UNIT_M * math.cos((sector + 0.5) * width), 3),
+            round(view.y + reach * REACH_UNIT_M * math.sin((sector + 0.5) * width), 3),
+        )
+        for sector, reach in enumerate(view.reach)
+        if reach
+    ]
+    return ScanView(points=points, stamp=stamp)
 
 
 def goal_view(robot: str, goal: RobotGoal | None) -> GoalView | None:

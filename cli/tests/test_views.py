@@ -3,14 +3,12 @@
 import asyncio
 import io
 import json
-from collections.abc import AsyncIterator
 from pathlib import Path
+from urllib.parse import urlsplit
 
 import numpy as np
 import pytest
 from msgspec import structs
-from PIL import Image
-from playwright.async_api import Page, async_playwright
 from rich.console import Console
 
 from fog_contracts.grid import GridGeometry, StaticMap
@@ -30,9 +28,8 @@ from fog_contracts.messages import (
 from fog_contracts.site import AreaSite, DemoPlan, NodeSite, RobotSite, Site, Sonar
 from fog_runtime.configuration.site import LoadedSite, load_site
 from fog_supervisor import net
-from fognav import system
 from fognav.demo.options import Options
-from fognav.demo.page import map_png, serve
+from fognav.demo.page import SCENARIO, serve
 from fognav.demo.run import Demo
 from fognav.demo.scene import Scene
 from fognav.demo.view import render
@@ -56,18 +53,6 @@ def test_states_of_areas_are_never_truncated(width):
     text = console.export_text()
     for state in ("clear", "blocked", "unknown", "no state"):
         assert state in text
-
-
-FLAGS = [
-    "--no-sandbox",
-    "--disable-gpu",
-    "--disable-quic",
-    "--no-first-run",
-    "--disable-background-networking",
-    "--disable-component-update",
-    "--disable-sync",
-    "--disable-dev-shm-usage",
-]
 
 
 def loaded_site() -> LoadedSite:
@@ -126,28 +111,40 @@ def demo() -> Demo:
     return demo
 
 
-def test_map_image_encodes_free_occupied_and_unknown_with_the_top_row_first(demo: Demo) -> None:
-    static = demo.site.map
-    with Image.open(io.BytesIO(map_png(static))) as image:
-        kinds = np.asarray(image)
-    assert kinds.shape == static.cells.shape
-    assert set(np.unique(kinds)) == {0, 1, 2}
-    column, row = static.geometry.cell(3.0, 1.5)
-    assert kinds[static.geometry.height - 1 - row, column] == 0
-
-
-async def test_page_serves_only_its_own_files(demo: Demo) -> None:
+async def test_only_the_address_that_the_demo_printed_leads_to_its_console(demo: Demo) -> None:
     async with serve(demo) as url:
-        port = int(url.rstrip("/").rsplit(":", 1)[1])
-        for path, status in (("/", 200), ("/app.js", 200), ("/style.css", 200), ("/map.png", 200), ("/app.py", 404)):
-            assert (await asyncio.to_thread(net.request, "GET", port, path)).status == status, path
-        outside = await asyncio.to_thread(net.request, "GET", port, "/..%2fapp.py")
-        assert outside.status == 404
+        address = urlsplit(url)
+        assert address.port is not None
+
+        async def get(path: str) -> net.Response:
+            return await asyncio.to_thread(net.request, "GET", address.port, path)
+
+        assert (await get("/")).status == 404
+        assert (await get("/..%2fapp.py")).status == 404
+        starting = await get(address.path)
+        assert (starting.status, "is starting" in starting.body) == (200, True)
+        demo.attempt.console_login = lambda: "http://127.0.0.1:9/#login=token&scenario"
+        assert (await get(address.path)).status == 303
+
+
+async def test_scenario_tells_of_the_trail_what_the_page_does_not_have(demo: Demo) -> None:
+    async with serve(demo) as url:
+        port = urlsplit(url).port
+        assert port is not None
+
+        async def trail(after: int) -> tuple[int, int]:
+            answer = await asyncio.to_thread(net.request, "GET", port, f"{SCENARIO}?trail={after}")
+            found = answer.body
+            return found["trail_from"], len(found["trail"])
+
+        assert await trail(0) == (0, 1)
+        assert await trail(1) == (1, 0)
+        assert await trail(7) == (0, 1)  # that of an attempt before
 
 
 async def test_port_in_use_is_refused_with_the_remedy(demo: Demo) -> None:
     async with serve(demo) as url:
-        port = int(url.rstrip("/").rsplit(":", 1)[1])
+        port = urlsplit(url).port
         with pytest.raises(
             WrongUseError, match=rf"port {port} \(Address already in use\): choose another with --page-"
         ):
@@ -155,10 +152,8 @@ async def test_port_in_use_is_refused_with_the_remedy(demo: Demo) -> None:
                 pass
 
 
-def test_scene_is_valid_json_before_any_message() -> None:
-    scene = Demo(loaded_site(), Options()).scene
-    json.dumps(scene.static_view(), allow_nan=False)
-    json.dumps(scene.live_view(), allow_nan=False)
+def test_scenario_is_valid_json_before_any_message() -> None:
+    json.dumps(Demo(loaded_site(), Options()).scene.scenario_view(), allow_nan=False)
 
 
 def test_terminal_shows_mode_reason_hazard_and_latency(demo: Demo) -> None:
@@ -169,81 +164,10 @@ def test_terminal_shows_mode_reason_hazard_and_latency(demo: Demo) -> None:
         assert expected in text
 
 
-def test_terminal_and_page_mark_areas_that_no_living_aggregator_confirms(demo: Demo) -> None:
-    assert demo.scene.live_view()["unconfirmed"] == []
+def test_terminal_marks_areas_that_no_living_aggregator_confirms(demo: Demo) -> None:
     demo.scene.hazards["z1"] = structs.replace(demo.scene.hazards["z1"], confirmed=False)
-    assert demo.scene.live_view()["unconfirmed"] == ["z1"]
     console = Console(width=140, record=True, file=io.StringIO())
     console.print(render(demo.scene, 40))
     text = console.export_text()
     assert "blocked?" in text
     assert "not confirmed" in text
-
-
-@pytest.fixture
-async def page(demo: Demo) -> AsyncIterator[Page]:
-    chromium = system.find(system.CHROMIUM)
-    if chromium is None:
-        pytest.skip(f"no Chromium: {system.install_command([system.CHROMIUM])}, or ./fognav test --yes as root")
-    async with serve(demo) as url, async_playwright() as playwright:
-        browser = await playwright.chromium.launch(executable_path=str(chromium), args=FLAGS)
-        opened = await browser.new_page(viewport={"width": 1200, "height": 800})
-        problems: list[str] = []
-        opened.on("pageerror", lambda error: problems.append(str(error)))
-        opened.on("console", lambda message: problems.append(message.text) if message.type == "error" else None)
-        opened.on("request", lambda r: None if r.url.startswith((url, "data:")) else problems.append(r.url))
-        await opened.goto(url)
-        yield opened
-        await browser.close()
-    assert problems == []
-
-
-async def pixel(page: Page, x: float, y: float) -> list[int]:
-    """Colour on the canvas at a point in metres."""
-    found: list[int] = await page.evaluate(
-        """([x, y]) => { const r = devicePixelRatio;
-        return [...context.getImageData(Math.round(px(x) * r), Math.round(py(y) * r), 1, 1).data].slice(0, 3); }""",
-        [x, y],
-    )
-    return found
-
-
-@pytest.mark.browser
-async def test_browser_shows_robot_hazard_and_latency(page: Page) -> None:
-    await page.wait_for_selector("#events li")
-    assert await page.inner_text("#mode") == "HOLD"
-    assert await page.inner_text("#reasons") == "the map is 3.2 s old"
-    assert "plan 4, 12.0 m" in await page.inner_text("#events")
-    assert "504 ms" in await page.inner_text("#total")
-    assert "planner" in await page.inner_text("#processes")
-    await page.wait_for_function("() => latest && floorImage && !drawPending")
-    free, wall, hazard, barrier = [await pixel(page, *at) for at in ((1.0, 1.0), (-1.8, 5.0), (6.3, 0.6), (7.7, 1.0))]
-    assert free == [255, 255, 255]
-    assert sum(wall) < 300
-    assert hazard[0] > hazard[1] + 40
-    assert barrier[0] > barrier[1] + 40
-    assert barrier != hazard
-
-
-@pytest.mark.browser
-async def test_page_updates_mode_and_events(page: Page, demo: Demo) -> None:
-    await page.wait_for_selector("#events li")
-    state = demo.scene.state
-    assert state is not None
-    demo.scene.state = RobotState(
-        mode="NORMAL", reasons=[], enabled=True, battery=None, goal_id="g", map_epoch=1, map_seq=2, plan_id=4
-    )
-    demo.scene.log_event("a new event")
-    await page.wait_for_function("() => document.getElementById('mode').textContent === 'NORMAL'")
-    await page.wait_for_function("() => document.getElementById('events').textContent.includes('a new event')")
-
-
-@pytest.mark.browser
-async def test_map_can_be_zoomed_and_fitted_again(page: Page) -> None:
-    await page.wait_for_function("() => view !== null")
-    before = await page.evaluate("view.scale")
-    await page.mouse.move(400, 300)
-    await page.mouse.wheel(0, -400)
-    await page.wait_for_function("before => view.scale > before * 1.5", arg=before)
-    await page.click("#fit")
-    await page.wait_for_function("before => Math.abs(view.scale - before) < 1e-6", arg=before)

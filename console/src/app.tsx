@@ -7,12 +7,14 @@ import { Live } from "./live/live";
 import { Floor } from "./map/floor";
 import { Patterns } from "./map/patterns";
 import { MapTools } from "./map/tools";
-import { go, routeHash, useRoute, type View, VIEWS } from "./router";
+import { go, ofDemo, routeHash, useRoute, type View, VIEWS } from "./router";
+import { useScenario } from "./scenario";
 import { rememberRobots, StopBar } from "./stop";
 import { duration } from "./text";
 import { onTheme, setTheme, theme, type Theme } from "./theme";
 import { MapView } from "./views/map";
 import { RobotsView } from "./views/robots";
+import { ScenarioView } from "./views/scenario";
 import { SensorsView } from "./views/sensors";
 import { TimelineView } from "./views/timeline";
 import { ZonesView } from "./views/zones";
@@ -23,6 +25,7 @@ const PANELS: Readonly<Record<View, () => preact.JSX.Element>> = {
   robots: RobotsView,
   sensors: SensorsView,
   timeline: TimelineView,
+  scenario: ScenarioView,
 };
 
 interface Props {
@@ -90,8 +93,9 @@ export function ConsoleApp({ session, onExpired, onLogOut }: Props): preact.JSX.
 
   useEffect(() => floor?.select(robot), [floor, robot]);
 
+  const scenario = useScenario(floor);
   const value: Console = {
-    live, session, floor, robot, robots, say, logOut: onLogOut,
+    live, session, floor, robot, robots, scenario, say, logOut: onLogOut,
     chooseRobot: setChosen,
   };
   const Panel = PANELS[route.view];
@@ -109,7 +113,7 @@ export function ConsoleApp({ session, onExpired, onLogOut }: Props): preact.JSX.
           <Settings onLanguage={setSpoken} />
         </header>
         <nav aria-label={t("app.name")}>
-          {VIEWS.map((view) => (
+          {VIEWS.filter((view) => view !== "scenario" || ofDemo()).map((view) => (
             <a key={view} href={routeHash(view)} aria-current={view === route.view ? "page" : undefined}>
               <span class={`icon ${view}`} aria-hidden="true" />{t(`view.${view}`)}
             </a>

@@ -4,6 +4,7 @@ import { useContext, useEffect, useReducer, useRef } from "preact/hooks";
 import type { Session } from "./api/types";
 import type { Live, Topic } from "./live/live";
 import type { Floor } from "./map/floor";
+import type { Scenario } from "./scenario";
 
 export interface Console {
   readonly live: Live;
@@ -15,6 +16,8 @@ export interface Console {
   /** All robots, sorted. */
   readonly robots: readonly string[];
   readonly chooseRobot: (id: string) => void;
+  /** What a demo does; null in a real system. */
+  readonly scenario: Scenario | null;
   /** Say something in the live region: a result of what the user did, or a change that matters. */
   readonly say: (text: string, kind?: "done" | "failed") => void;
   readonly logOut: () => void;

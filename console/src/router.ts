@@ -1,7 +1,7 @@
 // Which view is shown stands behind the address's #, so that it can be bookmarked and the browser's "back" works.
 import { useEffect, useState } from "preact/hooks";
 
-export const VIEWS = ["map", "zones", "robots", "sensors", "timeline"] as const;
+export const VIEWS = ["map", "zones", "robots", "sensors", "timeline", "scenario"] as const;
 export type View = (typeof VIEWS)[number];
 
 export interface Route {
@@ -40,10 +40,16 @@ export function useRoute(): Route {
   return route;
 }
 
+const SCENARIO = "fognav.scenario";
+
+/** Whether this browser's tab was opened by a demo, which has a scenario to show. */
+export const ofDemo = (): boolean => sessionStorage.getItem(SCENARIO) !== null;
+
 /** Take the one-time login out of the address, so that neither history nor a shared screen keeps it. */
 export function takeLogin(): string | null {
-  const found = /^#login=(.+)$/.exec(location.hash);
+  const found = /^#login=([^&]+)(&scenario)?$/.exec(location.hash);
   if (!found?.[1]) return null;
+  if (found[2]) sessionStorage.setItem(SCENARIO, "");
   history.replaceState(null, "", `${location.pathname}${location.search}#/map`);
   return decodeURIComponent(found[1]);
 }

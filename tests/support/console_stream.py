@@ -159,7 +159,8 @@ class ConsoleStream:
 
         @app.get("/api/v1/map.png")
         async def plan() -> Response:
-            return Response(png(self.site.map.cells), media_type="image/png")
+            greys = np.array([255, *[205] * 253, 0, 205], dtype=np.uint8)[self.site.map.cells]
+            return Response(png(greys), media_type="image/png")
 
         @app.api_route("/api/v1/{path:path}", methods=["GET", "POST", "PUT", "DELETE"])
         async def rest(path: str, request: Request) -> Response:

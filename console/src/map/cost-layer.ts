@@ -1,7 +1,7 @@
 // The plan and the costmap as canvases of one pixel per cell, which the browser scales; a tile changes its cells only.
 import L from "leaflet";
 import type { MapGeometry, Tile } from "../api/types";
-import { costColours } from "./palette";
+import { costColours, FREE, LETHAL, UNKNOWN } from "./palette";
 
 /** Cells on an edge of one canvas: a change hands over all of its canvas. */
 const BLOCK = 512;
@@ -58,8 +58,13 @@ export class CostLayer {
     await this.draw(new Blob([bytes], { type: "image/png" }), tile.column, top);
   }
 
+  /** Draw the plan's picture: white is free, black occupied, grey unknown. */
+  async drawPlan(png: Blob): Promise<void> {
+    await this.draw(png, 0, 0, (grey) => (grey > 250 ? FREE : grey < 5 ? LETHAL : UNKNOWN));
+  }
+
   /** Draw a grey PNG whose first pixel is the cell (column, top), counted from the map's upper edge. */
-  async draw(png: Blob, column: number, top: number): Promise<void> {
+  private async draw(png: Blob, column: number, top: number, cost?: (grey: number) => number): Promise<void> {
     const image = await createImageBitmap(png, { colorSpaceConversion: "none", premultiplyAlpha: "none" });
     const { width, height } = image;
     this.scratch.width = width;
@@ -69,6 +74,7 @@ export class CostLayer {
     context.drawImage(image, 0, 0);
     image.close();
     const pixels = context.getImageData(0, 0, width, height).data;
+    if (cost) for (let i = 0; i < pixels.length; i += 4) pixels[i] = cost(pixels[i] ?? 0);
     for (let y = top - (top % BLOCK); y < top + height; y += BLOCK) {
       for (let x = column - (column % BLOCK); x < column + width; x += BLOCK) {
         this.fill(pixels, width, { left: column, top, right: column + width, bottom: top + height }, x, y);

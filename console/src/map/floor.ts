@@ -225,7 +225,7 @@ export class Floor {
     const { plan } = this;
     void fetch("api/v1/map.png", { cache: "no-cache" })
       .then((response) => (response.ok ? response.blob() : Promise.reject(new Error(`HTTP ${response.status}`))))
-      .then((png) => plan.draw(png, 0, 0))
+      .then((png) => plan.drawPlan(png))
       .catch((error: unknown) => console.warn("the plan can't be shown:", error));
     for (const tile of this.live.tiles.keys()) this.takeTile(tile);
     this.fitOnce();
@@ -241,5 +241,6 @@ export class Floor {
   private takeTile(key: string): void {
     const tile = this.live.tiles.get(key);
     if (tile && this.costs) void this.costs.patch(tile);
+    if (this.live.tiles.size === 1) this.showCells();
   }
 }

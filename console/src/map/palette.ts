@@ -16,9 +16,10 @@ function rgba(css: string): readonly [number, number, number, number] {
   return [r, g, b, a];
 }
 
-const LETHAL = 254;
+export const FREE = 0;
+export const LETHAL = 254;
 const INSCRIBED = 253;
-const UNKNOWN = 255;
+export const UNKNOWN = 255;
 
 /** Return the colour of each of the 256 costs, as pixels of an `ImageData` read as 32-bit numbers. */
 export function costColours(): Uint32Array {

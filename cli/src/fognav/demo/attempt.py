@@ -24,7 +24,7 @@ from fognav.demo.preparation import Background, Preparation
 from fognav.demo.scene import Scene
 from fognav.operate.systems import Registration, System, registered
 from fognav.output import FailedError, WrongUseError
-from fognav.programs import AGENT, BROKER, ROBOT, ROUTER, SERVICES, WATCHDOG
+from fognav.programs import AGENT, BROKER, CONSOLE, ROBOT, ROUTER, SERVICES, WATCHDOG
 from fognav.recording import recording
 from fognav.stack import Stack, StackConfig, users_of
 from fognav_sim.barrier import BarrierError
@@ -193,7 +193,7 @@ class Attempt:
             robot_file=options.robot_file,
             seed=options.seed,
             speed=self.scene.speed,
-            extra=options.settings,
+            extra={**options.settings, "DEMO_URL": self.scene.page_url.rpartition("/")[0]},
             users=users_of(self.plan.site.site),
             embedded=options.embedded,
         )
@@ -293,6 +293,14 @@ class Attempt:
             self.usage.sample(pids)
             self.scene.usage = self.usage.recent()
             await asyncio.sleep(_SAMPLE_S)
+
+    def console_login(self) -> str | None:
+        """Return the address that opens the console, logged in by the part that no server sees; None before it runs."""
+        stack = self._stack
+        port = stack.port(CONSOLE) if stack is not None else None
+        if stack is None or port is None:
+            return None
+        return f"http://{net.LOOPBACK}:{port}/#login={stack.token}&scenario"
 
     # --- the drive ---
 

@@ -12,7 +12,7 @@ import msgspec
 
 from console_service.api import make_api
 from console_service.core import ConsoleCore, Fetched
-from console_service.forward import AGGREGATOR, MAP_SERVICE, PLANNER, Forward
+from console_service.forward import AGGREGATOR, DEMO, MAP_SERVICE, PLANNER, Forward
 from console_service.service import Service
 from console_service.sources import Sources
 from fog_runtime import logs, process
@@ -34,12 +34,16 @@ _log = logs.get("console-service")
 
 
 class Settings(CommonSettings, frozen=True, kw_only=True):
-    """Where the other services serve REST, and the folder of the built page (empty: that of the package)."""
+    """Where the other services serve REST, and the folder of the built page (empty: that of the package).
+
+    `demo_url`: where a demo tells about its scenario.
+    """
 
     aggregator_url: str = "http://127.0.0.1:8001"
     map_url: str = "http://127.0.0.1:8002"
     planner_url: str = "http://127.0.0.1:8003"
     page_dir: Path | None = None
+    demo_url: str = ""
 
 
 async def main() -> None:
@@ -57,6 +61,8 @@ async def main() -> None:
     own = settings.credentials()
     mqtt = MqttEdge(settings.mqtt_url, process_id("console-service"), clock, site=site, credentials=own)
     urls = {AGGREGATOR: settings.aggregator_url, MAP_SERVICE: settings.map_url, PLANNER: settings.planner_url}
+    if settings.demo_url:
+        urls[DEMO] = settings.demo_url
     async with (
         Forward(urls, proof=tokens.gateway_proof, trusted=own.tls_context()) as forward,
         ZenohEdge.open(

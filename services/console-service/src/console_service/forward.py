@@ -26,10 +26,13 @@ if TYPE_CHECKING:
     from starlette.types import Receive, Scope, Send
 
 AGGREGATOR, MAP_SERVICE, PLANNER, CONSOLE = "hazard-aggregator", "map-service", "planner", "console-service"
+DEMO: Final = "demo"
+"""A demo, which tells the page about its scenario."""
 ROUTES: Final[Mapping[str, tuple[str, ...]]] = {
     AGGREGATOR: ("areas", "nodes", "alerts"),
     PLANNER: ("robots", "plan"),
     CONSOLE: ("session", "events", "timeline", "recording", "openapi.json"),
+    DEMO: ("scenario",),
 }
 """Which routes each service has, by what follows /api/v1/; the map-service has all others."""
 URGENT: Final = ("/api/v1/robots/{robot}/stop",)
@@ -153,10 +156,11 @@ class Forward:
 
     async def openapi(self, own: Mapping[str, object]) -> bytes:
         """Return the document of all services, `own` among them. Raises `ProblemError` naming one that does not run."""
-        described = await asyncio.gather(*(self._openapi(service) for service in self._urls))
+        services = [service for service in self._urls if service != DEMO]
+        described = await asyncio.gather(*(self._openapi(service) for service in services))
         if self._merged is None or self._merged[0] != described:
-            services = dict(zip(self._urls, map(msgspec.json.decode, described), strict=True))
-            self._merged = described, msgspec.json.encode(merged({**services, CONSOLE: own}))
+            documents = dict(zip(services, map(msgspec.json.decode, described), strict=True))
+            self._merged = described, msgspec.json.encode(merged({**documents, CONSOLE: own}))
         return self._merged[1]
 
     async def _openapi(self, service: str) -> bytes:

@@ -36,7 +36,10 @@ _HEADERS: Final = {
 }
 _COMPRESSED: Final = re.compile(r"\.(css|html|js|json|map|svg|txt|webmanifest)$")
 NOT_BUILT: Final = """\
-Fognav console: the page is not built here. The REST interface and the events work: /openapi.json, /api/v1/events.
+Fognav console: the page is not built here (yet). In a checkout `./fognav demo` and `./fognav up` build it once, in the
+background, of npm's packages: try again in a minute. If it stays away, this says why:
+    .venv/bin/python -m fognav.console_page
+The commands (./fognav --help) and REST (/openapi.json, /api/v1/events) work without it.
 """
 
 

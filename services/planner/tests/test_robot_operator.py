@@ -15,7 +15,17 @@ from manual_clock import ManualClock
 
 from fog_contracts import channels as ch
 from fog_contracts.commands import CommandGate
-from fog_contracts.messages import CommandReply, Place, Reason, ReasonCode, RefusalCode, RobotCommand, RobotState
+from fog_contracts.handlers import Moment
+from fog_contracts.messages import (
+    CommandReply,
+    Place,
+    PlaceSet,
+    Reason,
+    ReasonCode,
+    RefusalCode,
+    RobotCommand,
+    RobotState,
+)
 from fog_runtime.health import Health
 from fog_runtime.http import Tokens
 from fog_runtime.stores.redis_connection import StoreError
@@ -87,7 +97,8 @@ class Rig:
     def __init__(self, *, key: bytes | None = KEY) -> None:
         self.robot = Robot()
         session = cast("Any", self.robot)
-        service = Service(PlannerCore(epoch=1), session, session, self.robot.clock, Health(), key=key)
+        self.core = PlannerCore(epoch=1)
+        service = Service(self.core, session, session, self.robot.clock, Health(), key=key)
         service.subscribe()
         self.operator = service.operator
         tokens = Tokens([
@@ -132,6 +143,16 @@ async def test_initial_pose_is_a_pose_or_a_place_with_a_heading(rig: Rig) -> Non
         assert (await rig.command({"kind": "initial_pose", **body})).status_code == 422
     assert (await rig.command({"kind": "enable", "pose": pose})).status_code == 422
     assert len(rig.robot.received) == 2
+
+
+async def test_places_are_those_that_the_map_service_tells_as_soon_as_it_has(rig: Rig) -> None:
+    moved = {"b": Place(x=3.0, y=2.0, theta=1.0)}
+    assert (await rig.command({"kind": "initial_pose", "place": "b"})).status_code == 422
+    rig.core.handlers()[ch.PLACES]({}, PlaceSet(epoch=1, places=moved), Moment(1.0, 1.0))
+    assert (await rig.command({"kind": "initial_pose", "place": "b"})).status_code == 200
+    assert (rig.robot.received[-1].pose.x, rig.robot.received[-1].pose.theta) == (3.0, 1.0)
+    removed = await rig.command({"kind": "initial_pose", "place": "dock"})
+    assert (removed.status_code, removed.json()["type"]) == (422, "urn:fognav:no_place")
 
 
 async def test_robots_refusal_is_a_problem_with_its_reason_identifiers_and_mode(rig: Rig) -> None:

@@ -184,4 +184,4 @@ def _line(service: str, status: Mapping[str, Any]) -> str:
 
 
 def _counts(tables: Mapping[str, int]) -> str:
-    return ", ".join(f"{count} {name}" for name, count in tables.items())
+    return ", ".join(f"{count} {name.replace('_', ' ')}" for name, count in tables.items())

@@ -3,12 +3,13 @@
 import asyncio
 import socket
 import threading
-from contextlib import closing, contextmanager
+from contextlib import closing, contextmanager, suppress
 
 import httpx
 import pytest
 
 from fog_runtime.credentials import Credentials
+from fog_runtime.http.app import MAX_OF_CLIENT
 from fog_runtime.token_file import create_token, revoke_token
 
 pytestmark = pytest.mark.live
@@ -132,20 +133,20 @@ async def test_services_are_asked_encrypted_where_they_have_certificates(fog, to
 def service_that(answers):
     """Listen as a service that reads each request's head and sends what `answers` returns for it."""
     heads = []
-    with closing(socket.create_server(("127.0.0.1", 0))) as listener:
+    with closing(socket.create_server(("127.0.0.1", 0), backlog=256)) as listener:
+
+        def answer(connection):
+            with connection:
+                head = b""
+                while b"\r\n\r\n" not in head:
+                    head += connection.recv(65536)
+                heads.append(head)
+                connection.sendall(answers(head))
 
         def serve():
-            while True:
-                try:
-                    connection, _ = listener.accept()
-                except OSError:
-                    return
-                with connection:
-                    head = b""
-                    while b"\r\n\r\n" not in head:
-                        head += connection.recv(65536)
-                    heads.append(head)
-                    connection.sendall(answers(head))
+            with suppress(OSError):
+                while True:
+                    threading.Thread(target=answer, args=listener.accept()[:1], daemon=True).start()
 
         threading.Thread(target=serve, daemon=True).start()
         yield f"http://127.0.0.1:{listener.getsockname()[1]}", heads
@@ -180,6 +181,33 @@ async def test_service_that_breaks_off_leaves_open_whether_it_has_made_the_chang
             answer = await browser.put("/api/v1/robots/r1/goal", json={"place": "a"})
     assert (answer.status_code, answer.json()["type"]) == (504, "urn:fognav:service_silent")
     assert "look whether the change was made" in answer.json()["detail"]
+
+
+async def test_robot_is_stopped_while_a_service_hangs_and_its_requests_take_all_places(fog, until):
+    hangs = threading.Event()
+
+    def answers(_):
+        hangs.wait()
+        return b"HTTP/1.1 204 No Content\r\nConnection: close\r\n\r\n"
+
+    stopped = b"HTTP/1.1 204 No Content\r\nConnection: close\r\n\r\n"
+    with service_that(answers) as (slow, waiting), service_that(lambda _: stopped) as (planner, _):
+        fog.start("console_service", FOGNAV_MAP_URL=slow, FOGNAV_PLANNER_URL=planner)
+        async with httpx.AsyncClient(
+            base_url=await fog.ready("console_service"), timeout=60.0, limits=httpx.Limits(max_connections=200)
+        ) as browser:
+            requests: list[asyncio.Task[httpx.Response]] = []
+
+            def all_arrived() -> bool:
+                return len(waiting) == len(requests)
+
+            while len(requests) < MAX_OF_CLIENT:  # not all at once: admission lets 50 wait
+                requests += [asyncio.create_task(browser.get("/api/v1/zones")) for _ in range(MAX_OF_CLIENT // 4)]
+                await until(all_arrived, "the service has them")
+            assert (await browser.get("/api/v1/robots")).json()["type"] == "urn:fognav:overloaded"
+            assert (await browser.post("/api/v1/robots/r1/stop")).status_code == 204
+            hangs.set()
+            assert {answer.status_code for answer in await asyncio.gather(*requests)} == {204}
 
 
 async def test_body_that_is_too_large_reaches_no_service(fog):

@@ -240,6 +240,28 @@ async def test_hostile_names_are_text_wherever_zones_are_and_come_back_as_they_w
     assert (await operators.zones())["wet"]["reason"] == HOSTILE
 
 
+async def test_set_of_zones_is_made_filled_switched_off_and_the_switch_undone(operators: Operators) -> None:
+    await operators.draw("wet")
+    page = await operators.page("anna")
+    await page.get_by_text("New set").click()
+    sets = page.get_by_role("region", name="Sets of zones")
+    await sets.get_by_label("Name").fill("cleaning")
+    await sets.get_by_role("button", name="Add").click()
+    await expect(sets.get_by_role("button", name="Switch off the set cleaning")).to_be_visible()
+    await page.get_by_role("button", name="Edit wet").click()
+    await page.get_by_text("Name, schedule, switched on").click()
+    await page.get_by_label("cleaning").check()
+    await page.get_by_role("button", name="Save").click()
+    await expect(page.locator("dd.state")).to_have_text("in force")
+    await show(page, "zones")
+    await sets.get_by_role("button", name="Switch off the set cleaning").click()
+    await expect(page.locator(".zone-row .state")).to_contain_text("not in force")
+    await show(page, "timeline")
+    await page.get_by_role("button", name="Undo Set of zones cleaning").first.click()
+    await show(page, "zones")
+    await expect(page.locator(".zone-row .state")).to_have_text("in force")
+
+
 @pytest.mark.parametrize("seed", range(2))
 async def test_whatever_two_pages_do_at_the_same_time_both_show_what_the_server_has(
     operators: Operators, seed: int

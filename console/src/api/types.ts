@@ -28,6 +28,7 @@ export type PlanView = Schemas["PlanView"];
 export type Pose = Schemas["Pose"];
 export type RobotPose = Schemas["RobotPose"];
 export type RobotState = Schemas["RobotState"];
+export type SetView = Schemas["SetView"];
 export type Shape = Schemas["Zone"]["shape"];
 export type TimelineEntry = Schemas["TimelineEntry"];
 export type Zone = Schemas["Zone"];

@@ -1,19 +1,20 @@
 // Entries of the timeline: in words, and which of them can be undone.
 import type { TimelineEntry } from "../api/types";
 import { maybe, t } from "../i18n/i18n";
+import type { Undoing } from "../zones/requests";
 
-export const KINDS = ["zone", "hazard", "override", "area", "mission", "robot", "stop", "fault", "alert", "store"] as const;
+export const KINDS = ["zone", "set", "source", "place", "hazard", "override", "area", "mission", "robot", "stop", "fault", "alert", "store"] as const;
 
-/** Whose service undoes a change, by the kind of its record. */
-const UNDONE_BY: Readonly<Record<string, "zones" | "areas" | "robots">> = {
-  zone: "zones", area: "areas", override: "areas", mission: "robots",
+/** Under which path a change is undone, by the kind of its record. */
+const UNDONE_BY: Readonly<Record<string, Undoing>> = {
+  zone: "zones", set: "zone-sets", place: "places", area: "areas", override: "areas", mission: "robots",
 };
 /** Nobody decided these. */
 const BY_ITSELF = new Set(["reached", "end"]);
 
-/** Return the entries that can be undone, with whose service does it: of each record the latest change that somebody decided. */
-export function undoable(entries: readonly TimelineEntry[]): Map<string, "zones" | "areas" | "robots"> {
-  const found = new Map<string, "zones" | "areas" | "robots">();
+/** Return the entries that can be undone, with the path for it: of each record the latest change that somebody decided. */
+export function undoable(entries: readonly TimelineEntry[]): Map<string, Undoing> {
+  const found = new Map<string, Undoing>();
   const seen = new Set<string>();
   for (const { kind, id, entry, action } of entries) {
     const service = UNDONE_BY[kind];

@@ -12,6 +12,7 @@ import { EditLayer } from "../zones/edit-layer";
 import { editor } from "../zones/editor";
 import { applied, type Change, remove, save, undo } from "../zones/requests";
 import { scheduleText } from "../zones/schedule";
+import { SetList } from "../zones/sets";
 import { nudged, SHAPE_TYPES, WHOLE } from "../zones/shapes";
 import { appliedText, endText, stateText } from "../zones/words";
 import { ZoneForm } from "../zones/zone-form";
@@ -164,6 +165,7 @@ function ZoneList({ actions }: { readonly actions: Actions }): preact.JSX.Elemen
         ))}
       </ul>
       {zones.length > SHOWN_MAX && <p class="muted">{t("zones.others", { number: zones.length - SHOWN_MAX })}</p>}
+      <SetList />
     </>
   );
 }
@@ -215,6 +217,8 @@ function Facts({ zone, now }: { readonly zone: Values["zone"]; readonly now: num
         <dt>{t("field.author")}</dt><dd><bdi>{zone.author || "–"}</bdi></dd>
         <dt>{t("field.end")}</dt><dd>{endText(end)}</dd>
         {zone.schedule && <><dt>{t("field.schedule")}</dt><dd>{scheduleText(zone.schedule)}</dd></>}
+        {zone.sets.length > 0 && <><dt>{t("field.sets")}</dt><dd><bdi>{zone.sets.join(", ")}</bdi></dd></>}
+        {zone.source !== null && <><dt>{t("field.source")}</dt><dd><bdi>{zone.source}</bdi></dd></>}
         <dt>{t("field.shape")}</dt><dd>{shapeText(zone.shape)}</dd>
       </dl>
     </>

@@ -107,6 +107,8 @@ function fieldText(name: FieldName, fields: Fields): string {
       return endText(fields.end);
     case "schedule":
       return fields.schedule ? scheduleText(fields.schedule) : t("schedule.none");
+    case "sets":
+      return fields.sets.join(", ") || "–";
     case "enabled":
       return t(fields.enabled ? "state.on" : "state.off");
   }

@@ -20,6 +20,8 @@ export interface Fields {
   readonly reason: string;
   readonly end: End;
   readonly schedule: Schedule | null;
+  /** Ids of the sets with which it is switched. */
+  readonly sets: readonly string[];
   readonly enabled: boolean;
 }
 
@@ -37,7 +39,7 @@ const SPEED = 0.1;
 
 export function newDraft(type: ShapeType): Draft {
   const fields: Fields = {
-    kind: "BLOCKED", shape: null, factor: FACTOR, speed: SPEED, reason: "", end: { type: "never" }, schedule: null, enabled: true,
+    kind: "BLOCKED", shape: null, factor: FACTOR, speed: SPEED, reason: "", end: { type: "never" }, schedule: null, sets: [], enabled: true,
   };
   return { base: null, id: "", type, fields };
 }
@@ -67,6 +69,7 @@ export function fieldsOf(zone: Zone): Fields {
     end: zone.expires_at !== null ? { type: "at", stamp: zone.expires_at }
       : zone.ttl_s !== null ? { type: "after", seconds: zone.ttl_s } : { type: "never" },
     schedule: zone.schedule,
+    sets: zone.sets,
     enabled: zone.enabled,
   };
 }
@@ -86,6 +89,7 @@ export function bodyOf({ base, id, fields }: Draft, shape: Shape, now: number): 
     starts_at: base?.starts_at ?? null,
     ...endOf(base, fields.end, now),
     schedule: fields.schedule,
+    sets: [...fields.sets],
     enabled: fields.enabled,
   };
 }
@@ -102,7 +106,7 @@ function endOf(base: Zone | null, end: End, now: number): Pick<ZoneBody, "expire
 }
 
 export type FieldName = keyof Fields;
-const NAMES: readonly FieldName[] = ["kind", "shape", "factor", "speed", "reason", "end", "schedule", "enabled"];
+const NAMES: readonly FieldName[] = ["kind", "shape", "factor", "speed", "reason", "end", "schedule", "sets", "enabled"];
 
 const same = (a: unknown, b: unknown): boolean => JSON.stringify(a) === JSON.stringify(b);
 

@@ -82,8 +82,11 @@ export async function undo({ id, before, after }: Change): Promise<void> {
   await undoEntry("zones", id, own.entry);
 }
 
-/** Undo a change by its entry in the audit trail; `of`: whose service has the record. */
-export async function undoEntry(of: "zones" | "areas" | "robots", id: string, entry: string): Promise<void> {
+/** What records are called in the paths of their undo. */
+export type Undoing = "zones" | "zone-sets" | "places" | "areas" | "robots";
+
+/** Undo a change by its entry in the audit trail. */
+export async function undoEntry(of: Undoing, id: string, entry: string): Promise<void> {
   await request("POST", `${of}/${encodeURIComponent(id)}/undo`, { body: { entry } });
 }
 

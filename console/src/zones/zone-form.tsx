@@ -11,6 +11,7 @@ import type { Editor } from "./editor";
 import { Effects, useTrial } from "./effects";
 import { type Change, read, save } from "./requests";
 import { ScheduleFields } from "./schedule";
+import { SetChoice } from "./sets";
 import { DrawingFields, Metres, PointFields } from "./shape-fields";
 import { endText } from "./words";
 
@@ -29,7 +30,7 @@ function trialOf(draft: Draft | null): DryRunBody | null {
   if (!draft || !shape) return null;
   const body = bodyOf(draft, shape, 0);
   // An end in the past or a wrong schedule is told when it is saved; here only the place counts.
-  const zone = { ...body, starts_at: null, expires_at: null, ttl_s: null, schedule: null, reason: "" };
+  const zone = { ...body, starts_at: null, expires_at: null, ttl_s: null, schedule: null, sets: [], reason: "" };
   return { zones: [zone] };
 }
 
@@ -116,6 +117,7 @@ export function ZoneForm({ editor, onSaved, onCancel }: Props): preact.JSX.Eleme
           </label>
         )}
         <label class="check"><input type="checkbox" checked={fields.enabled} onChange={(event) => set({ enabled: event.currentTarget.checked })} /> {t("edit.enabled")}</label>
+        <SetChoice chosen={fields.sets} onChange={(sets) => set({ sets })} />
         <h3>{t("field.schedule")}</h3>
         <ScheduleFields schedule={fields.schedule} onChange={(schedule) => set({ schedule })} />
       </details>

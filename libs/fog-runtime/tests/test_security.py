@@ -144,6 +144,23 @@ async def test_redis_admits_services_to_their_own_keys_and_nobody_else(redis, se
 
 
 @pytest.mark.live
+async def test_console_service_reads_the_past_in_redis_and_changes_nothing(redis, security):
+    planner, console = of(security, "planner"), of(security, "console-service")
+    assert isinstance(await redis_says(redis.url, planner, "XADD", "fog:lab:audit:robot", "*", "who", "anna"), bytes)
+    ((_, found),) = await redis_says(redis.url, console, "XRANGE", "fog:lab:audit:robot", "-", "+")
+    assert b"anna" in (found.values() if isinstance(found, dict) else found)
+    assert await redis_says(redis.url, console, "XRANGE", "fog:lab:history:hall", "-", "+") == []
+    for command in (
+        ("XADD", "fog:lab:audit:robot", "*", "who", "nobody"),
+        ("XRANGE", "fog:other:audit:robot", "-", "+"),
+        ("HGETALL", "fog:lab:zones"),
+        ("SET", "fog:lab:console-service:any", "1"),
+        ("EVAL", "return 1", 0),
+    ):
+        assert "permission" in await redis_says(redis.url, console, *command), command
+
+
+@pytest.mark.live
 async def test_secured_redis_has_after_a_restart_what_it_acknowledged_before(tmp_path):
     security = SiteSecurity(tmp_path / "locks", "lab")
     security.make(HOSTS)

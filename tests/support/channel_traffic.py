@@ -27,6 +27,7 @@ MANY: Final = 30
 PAUSE_S: Final = 0.02
 ROBOTS: Final = ("r1", "r2")
 NODES: Final = ("n1", "n2")
+SOURCES: Final = ("cleaning", "doors")
 AREAS: Final = ("hall", "lift")
 NUMBER: Final = "3"
 """Of an area on the thesis's topics."""
@@ -59,6 +60,9 @@ class Process:
         values: dict[str, Sequence[str]] = {
             "robot": (self.user,) if self.role == ch.ROBOT else ROBOTS,
             "node": (self.user,) if self.role == ch.NODE else NODES,
+            "source": (self.user,) if self.role == ch.ZONE_SOURCE else SOURCES,
+            "zone": ("wet",),
+            "set": ("night",),
             "area": AREAS,
             "role": (self.role,),
             "number": (NUMBER,),
@@ -82,6 +86,8 @@ class Process:
     def receives(self, row: Channel, ids: Ids) -> bool:
         """Whether something published with these ids is for this process."""
         if self.role == ch.NODE and ids.get("node", self.user) != self.user:
+            return False
+        if self.role == ch.ZONE_SOURCE and ids.get("source", self.user) != self.user:
             return False
         return any(row == each and own.items() <= ids.items() for each, own in self.subscriptions([row]))
 

@@ -31,7 +31,8 @@ def sample_of(channel: Channel) -> Message | str:
 
 
 def _struct(kind: Any) -> dict[str, Any]:
-    return {field.encode_name: _value(field.type) for field in kind.fields if field.required}
+    tag = {} if kind.tag_field is None else {kind.tag_field: kind.tag}
+    return {**tag, **{field.encode_name: _value(field.type) for field in kind.fields if field.required}}
 
 
 def _number(kind: Any) -> Any:

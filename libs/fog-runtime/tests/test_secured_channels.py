@@ -11,7 +11,20 @@ import dataclasses
 import time
 
 import pytest
-from channel_traffic import NODES, NUMBER, ONE_ROBOT, PAUSE_S, ROBOTS, WAIT_S, Process, Traffic, copies, frozen, until
+from channel_traffic import (
+    NODES,
+    NUMBER,
+    ONE_ROBOT,
+    PAUSE_S,
+    ROBOTS,
+    SOURCES,
+    WAIT_S,
+    Process,
+    Traffic,
+    copies,
+    frozen,
+    until,
+)
 from sample_messages import sample, sample_of
 from secured_servers import TESTER
 
@@ -38,7 +51,7 @@ WITHOUT_CREDENTIALS = {"thesis-node", "thesis-robot"}
 @pytest.fixture(scope="module")
 def security(tmp_path_factory):
     made = SiteSecurity(tmp_path_factory.mktemp("locks"), "lab", unrestricted=[TESTER])
-    made.make(["127.0.0.1"], robots=ROBOTS, nodes=NODES)
+    made.make(["127.0.0.1"], robots=ROBOTS, nodes=[*NODES, *SOURCES])
     return made
 
 
@@ -118,7 +131,7 @@ async def test_every_channel_of_the_router_arrives_also_from_a_copy_that_takes_o
 
 
 KEPT = [row for row in ZENOH if row.durability != "volatile"]
-NUMBERED = {"map_delta": "seq", "zones": "seq", "robot_path": "plan_id", "hazard": "epoch"}
+NUMBERED = {"map_delta": "seq", "zones": "seq", "places": "epoch", "robot_path": "plan_id", "hazard": "epoch"}
 """By which field the messages of a kept channel are told apart here."""
 STORED = 20
 
@@ -213,7 +226,10 @@ async def test_console_sees_who_is_there_also_after_a_restart(sessions, router):
 
 # --- MQTT -----------------------------------------------------------------------------------------------------------
 
-DEVICES = [Process(ch.NODE, node) for node in NODES]
+DEVICES = [
+    *(Process(ch.NODE, node) for node in NODES),
+    *(Process(ch.ZONE_SOURCE, source) for source in SOURCES),
+]
 MQTT_TOOLS = [Process(role, role) for role in (ch.CONSOLE, "recorder", "home-assistant")]
 
 

@@ -237,7 +237,7 @@ ZONE_SET_SWITCH   = _text( "zone_set_switch",   V1 + "zone-sources/{source}/sets
     publishers=(ZONE_SOURCE,),   subscribers=(MAP,),              durability=VOLATILE, qos=1,
     values=(ON, OFF), about="switches a set of zones that `site.toml` names for the source")
 ZONE_SOURCE_PROBLEM = _text("zone_source_problem", V1 + "zone-sources/{source}/problem",                limit=KIB,
-    publishers=(MAP,),           subscribers=(ZONE_SOURCE, CONSOLE), durability=LATEST, qos=1,
+    publishers=(MAP,),           subscribers=(ZONE_SOURCE,),      durability=LATEST,   qos=1,
     about="why the map-service refused the source's latest message, in words; empty: it did not")
 THESIS_AREA       = _text( "thesis_area",       "area {number}",                                        limit=16,
     publishers=("thesis-node",), subscribers=(AGGREGATOR,),       durability=VOLATILE, qos=0,

@@ -185,6 +185,9 @@ class MemoryStore:
     async def zones(self) -> tuple[list[Any], dict[str, str]]:
         return [], {}
 
+    async def read(self, _table: Any, _kind: Any) -> dict[str, Any]:
+        return {}
+
     async def zone_times(self) -> dict[str, Any]:
         return {}
 

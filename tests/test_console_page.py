@@ -3,6 +3,9 @@
 import gzip
 import json
 import re
+import subprocess
+import sys
+import zipfile
 from pathlib import Path
 
 import pytest
@@ -27,6 +30,15 @@ def test_whole_page_is_small_and_holds_nothing_inline(page: Path) -> None:
     assert sum(len(gzip.compress(data, 9)) for data in sent.values()) <= SIZE_MAX
     index = (page / "index.html").read_text("utf-8")
     assert not re.search(r"<style|style=|<script(?![^>]*\ssrc=)|https?://", index)
+
+
+def test_wheel_of_the_service_carries_the_page(page: Path, tmp_path: Path) -> None:
+    build = [sys.executable, "-m", "hatchling", "build", "-t", "wheel", "-d", str(tmp_path)]
+    subprocess.run(build, cwd=page.parents[2], check=True, capture_output=True)
+    (wheel,) = tmp_path.glob("*.whl")
+    with zipfile.ZipFile(wheel) as archive:
+        carried = {name.removeprefix("console_service/page/") for name in archive.namelist() if "/page/" in name}
+    assert carried == {str(file.relative_to(page)) for file in page.rglob("*") if file.is_file()}
 
 
 def test_lock_file_names_packages_by_their_hash_and_no_registry() -> None:

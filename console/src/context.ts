@@ -35,12 +35,12 @@ export function mayOperate(session: Session): boolean {
   return session.role === "operator" || session.role === "admin";
 }
 
-const PERIOD_MS = 300;
+const PERIOD_MS = 400;
 
 const waiting = new Set<() => void>();
 let timer: ReturnType<typeof setTimeout> | undefined;
 
-/** Draw components anew together, at most about three times a second: a person reads no faster. */
+/** Draw components anew together, at most twice or three times a second: a person reads no faster. */
 function redrawSoon(redraw: () => void): void {
   waiting.add(redraw);
   timer ??= setTimeout(() => {
@@ -72,10 +72,14 @@ export function useLive(topics: readonly Topic[], only?: string): Live {
 
 /** Draw the component anew once a second, for ages and what becomes old. */
 export function useSeconds(): void {
-  const [, redraw] = useReducer((count: number) => count + 1, 0);
+  const [, count] = useReducer((before: number) => before + 1, 0);
   useEffect(() => {
-    const timer = setInterval(() => redraw(0), 1000);
-    return () => clearInterval(timer);
+    const redraw = (): void => count(0);
+    const every = setInterval(() => redrawSoon(redraw), 1000);
+    return () => {
+      clearInterval(every);
+      waiting.delete(redraw);
+    };
   }, []);
 }
 

@@ -126,10 +126,10 @@ class ConsoleStream:
             ready, timed = False, 0.0
             while not cut.is_set():
                 changed.clear()
-                for revision, event, data in sorted(self.log.values(), key=lambda entry: entry[0]):
-                    if revision > seen and not self.silent:
-                        seen = revision
-                        yield _event(event, data, f"{self.run}-{revision}")
+                newer = sorted((entry for entry in self.log.values() if entry[0] > seen), key=lambda entry: entry[0])
+                if newer and not self.silent:
+                    seen = newer[-1][0]
+                    yield "".join(_event(event, data, f"{self.run}-{number}") for number, event, data in newer)
                 if not ready:
                     ready = True
                     yield _event("ready", {})

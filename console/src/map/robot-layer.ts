@@ -1,7 +1,7 @@
 // Robots, their paths, obstacles and scans. A pose moves an element and draws nothing: ten robots at 10 Hz cost a browser
 // little, while a canvas over the whole map would be copied for each frame.
 import L from "leaflet";
-import type { Point } from "../api/types";
+import type { PathValue, Point } from "../api/types";
 import type { Live } from "../live/live";
 import { firstMetres } from "./geometry";
 
@@ -45,6 +45,8 @@ class RobotDrawing {
   private readonly scan: L.Polyline;
   private readonly goal: L.CircleMarker;
   private look = "";
+  private drawnPath: PathValue | undefined;
+  private drawnLength = 0;
 
   constructor(
     private readonly map: L.Map,
@@ -94,8 +96,14 @@ class RobotDrawing {
   path(): void {
     const path = this.live.of.path.get(this.id);
     const points = path?.points ?? [];
-    this.rest.setLatLngs(points.map(toLatLng));
-    this.released.setLatLngs(firstMetres(points, path?.released_length ?? 0).map(toLatLng));
+    if (path !== this.drawnPath) this.rest.setLatLngs(points.map(toLatLng));
+    // What is released grows without a new path: then the robot's plan has it.
+    const plan = this.live.of.robot.get(this.id)?.plan;
+    const length = plan && plan.plan_id === path?.plan_id ? plan.released_length : path?.released_length ?? 0;
+    if (path === this.drawnPath && length === this.drawnLength) return;
+    this.drawnPath = path;
+    this.drawnLength = length;
+    this.released.setLatLngs(firstMetres(points, length).map(toLatLng));
   }
 
   points(): void {
@@ -218,7 +226,7 @@ export class RobotLayer {
         this.drawings.set(id, drawn);
       }
       if (parts.has("pose")) drawn.pose();
-      if (parts.has("path")) drawn.path();
+      if (parts.has("path") || parts.has("robot")) drawn.path();
       if (parts.has("obstacles") || parts.has("scan")) drawn.points();
       if (parts.has("robot")) drawn.state(id === this.selected);
     }

@@ -12,7 +12,7 @@ from console_stream import TOKEN, ConsoleStream, robot_pose, robot_state, serve
 from msgspec import to_builtins
 from playwright.async_api import Page, async_playwright, expect
 
-from fog_contracts.messages import PlanReply, PolygonShape, Zone
+from fog_contracts.messages import PlanReply, PolygonShape, Trace, Zone
 from fog_runtime.configuration.site import load_site
 from fognav import console_page, system
 
@@ -251,7 +251,8 @@ async def test_every_view_keeps_the_rules_of_wcag_that_a_program_can_check(
 ) -> None:
     stream.tell("zone", "wet", _zone("wet", "wet floor"))
     stream.hazard("z2", "blocked")
-    stream.robot("r1", robot_state("FAULT", reasons=["bumper pressed"], codes=["bumper"]))
+    traces = [Trace(area="z2", epoch=1, seq=1, first_reading=1.0, confirmed=1.5)]
+    stream.robot("r1", robot_state("FAULT", reasons=["bumper pressed"], codes=["bumper"], traces=traces))
     dry_run = {"map_epoch": 1, "map_seq": 1, "robots": [], "cut_off": [], "connected": [], "unfinished": []}
     stream.answers["POST dry-run"] = (200, dry_run)
     page = await console.open(**device, color_scheme=scheme, reduced_motion="reduce", bypass_csp=True)

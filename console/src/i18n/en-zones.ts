@@ -282,4 +282,13 @@ export const enZones = {
   "sets.failed": "The set {set} was not changed: {reason}",
   "sets.new": "New set",
   "sets.add": "Add",
+
+  "latency.title": "From a hazard to the wheels (s)",
+  "latency.what": "Area, robot",
+  "latency.debounce": "Confirmed",
+  "latency.costmap": "Map",
+  "latency.plan": "Path",
+  "latency.deliver": "Sent",
+  "latency.command": "Wheels",
+  "latency.total": "All",
 } as const;

@@ -283,4 +283,13 @@ export const ptZones: Readonly<Record<keyof typeof enZones, string>> = {
   "sets.failed": "O conjunto {set} não foi alterado: {reason}",
   "sets.new": "Novo conjunto",
   "sets.add": "Criar",
+
+  "latency.title": "De um perigo às rodas (s)",
+  "latency.what": "Área, robô",
+  "latency.debounce": "Confirmado",
+  "latency.costmap": "Mapa",
+  "latency.plan": "Percurso",
+  "latency.deliver": "Enviado",
+  "latency.command": "Rodas",
+  "latency.total": "Tudo",
 };

@@ -8,6 +8,7 @@ import { toPoint } from "../map/geometry";
 import { go, routeHash, useRoute } from "../router";
 import { AreaForm } from "../sensors/area-form";
 import { History } from "../sensors/history";
+import { Latency } from "../sensors/latency";
 import { Override } from "../sensors/override";
 import { duration } from "../text";
 import "../zones/zones.css";
@@ -54,6 +55,7 @@ export function SensorsView(): preact.JSX.Element {
           <NodeRow key={`${node.area}/${node.id}`} node={node} onShow={node.x === undefined ? null : () => floor?.show([[node.x ?? 0, node.y ?? 0]])} />
         ))}
       </ul>
+      <Latency />
     </>
   );
 }

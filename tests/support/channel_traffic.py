@@ -66,6 +66,7 @@ class Process:
             "area": AREAS,
             "role": (self.role,),
             "number": (NUMBER,),
+            "robot_device": ("robot_r1",),
         }
         ids: list[Ids] = [{}]
         for field in row.fields:

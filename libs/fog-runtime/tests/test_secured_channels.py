@@ -70,7 +70,7 @@ def broker(security, tmp_path_factory):
 # --- zenoh ----------------------------------------------------------------------------------------------------------
 
 ROBOT_PROCESSES = [Process(ch.ROBOT, robot) for robot in ROBOTS]
-TOOLS = [Process(role, role) for role in (ch.CONSOLE, "recorder", ch.SIM)] + [
+TOOLS = [Process(role, role) for role in (ch.CONSOLE, "recorder", ch.SIM, ch.WEB)] + [
     Process(ch.CONSOLE, ch.CONSOLE, ONE_ROBOT),
     Process("recorder", TESTER),
 ]
@@ -230,7 +230,7 @@ DEVICES = [
     *(Process(ch.NODE, node) for node in NODES),
     *(Process(ch.ZONE_SOURCE, source) for source in SOURCES),
 ]
-MQTT_TOOLS = [Process(role, role) for role in (ch.CONSOLE, "recorder", "home-assistant")]
+MQTT_TOOLS = [Process(role, role) for role in (ch.CONSOLE, "recorder", "home-assistant", ch.WEB, ch.BRIDGE)]
 
 
 class Connections:
@@ -292,7 +292,7 @@ async def test_every_topic_arrives_also_after_a_restart_of_the_broker(connection
 
 
 async def test_late_subscriber_gets_what_the_broker_retains_and_nothing_else(connections):
-    publishers = [*copies("first")[:2], *DEVICES, Process(ch.CONSOLE, ch.CONSOLE)]
+    publishers = [*copies("first")[:2], *DEVICES, *(Process(role, role) for role in (ch.CONSOLE, ch.BRIDGE))]
     late = [*copies("late")[:2], *(dataclasses.replace(each, copy="late") for each in [*MQTT_TOOLS, *DEVICES])]
     await connections.open(publishers)
     rows = [row for row in MQTT if not WITHOUT_CREDENTIALS.intersection(row.publishers)]

@@ -175,7 +175,7 @@ async def test_undo_is_refused_once_somebody_else_has_changed_the_zone_and_names
     later = await operator.ask("POST", f"{path}/undo", {"entry": problem["entry"]})
     assert later.status_code == 200
     assert (await operator.ask("POST", f"{path}/undo", {"entry": mine})).json()["by"] == "anna", "by the undo itself"
-    assert (await operator.ask("POST", "/api/v1/zones/other/undo", {"entry": mine})).status_code == 404
+    assert (await operator.ask("POST", "/api/v1/zones/other/undo", {"entry": mine})).status_code == 422
     assert (await operator.ask("POST", f"{path}/undo", {"entry": mine}, role="viewer")).status_code == 403
     assert (await operator.ask("DELETE", path)).status_code == 204
 

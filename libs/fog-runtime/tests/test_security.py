@@ -146,7 +146,8 @@ async def test_redis_admits_services_to_their_own_keys_and_nobody_else(redis, se
 @pytest.mark.live
 async def test_console_service_reads_the_past_in_redis_and_changes_nothing(redis, security):
     planner, console = of(security, "planner"), of(security, "console-service")
-    assert isinstance(await redis_says(redis.url, planner, "XADD", "fog:lab:audit:robot", "*", "who", "anna"), bytes)
+    added = await redis_says(redis.url, planner, "XADD", "fog:lab:audit:robot", "*", "who", "anna")
+    assert isinstance(added, bytes)
     ((_, found),) = await redis_says(redis.url, console, "XRANGE", "fog:lab:audit:robot", "-", "+")
     assert b"anna" in (found.values() if isinstance(found, dict) else found)
     assert await redis_says(redis.url, console, "XRANGE", "fog:lab:history:hall", "-", "+") == []
@@ -158,6 +159,8 @@ async def test_console_service_reads_the_past_in_redis_and_changes_nothing(redis
         ("EVAL", "return 1", 0),
     ):
         assert "permission" in await redis_says(redis.url, console, *command), command
+    # The next test has the same server, and reads whole entries.
+    assert await redis_says(redis.url, planner, "XDEL", "fog:lab:audit:robot", added) == 1
 
 
 @pytest.mark.live

@@ -156,7 +156,7 @@ async def test_operator_takes_a_sources_zone_for_good_and_mutes_it(fog, until, t
         fog.kill("map_service")
         fog.start("map_service", FOGNAV_WALL_CLOCK="trusted")
         async with httpx.AsyncClient(base_url=await fog.ready("map_service"), timeout=60) as again:
-            await source.send("zones/late", lasting)
+            await source.send("zones/late", lasting, retain=True)
             assert (await until_zones(again, "late", "mop"))["mop"]["version"] < 3, (
                 "told again by the broker, and the same"
             )

@@ -75,7 +75,7 @@ class HttpProblem(ProblemCode):
         "The Idempotency-Key was used for another request",
         "Use a new Idempotency-Key for each change",
     )
-    NO_ENTRY = "no_entry", 404, "The audit trail has no such entry of this record", "Choose one of GET /api/v1/audit"
+    NO_ENTRY = "no_entry", 422, "The audit trail has no such entry of this record", "Choose one of GET /api/v1/audit"
     NOT_UNDOABLE = "not_undoable", 409, "The change can't be undone", "Make the change that you want instead"
     CHANGED_SINCE = (
         "changed_since", 409, "Somebody has changed the record since: `by`, `action`, `at`, `entry`",

@@ -140,7 +140,7 @@ def test_state_has_home_assistants_word(state, under_way, said):
 def test_orders_become_requests_of_operators_and_nothing_enables():
     core = HomeAssistant("lab")
     for name, data in (("hello", {"fresh": True}), ("place", {"id": "b", "value": {}}),
-                       ("robot", {"id": "r1", "value": view()})):  # fmt: skip
+                       ("robot", {"id": "r1", "value": view()}), ("ready", {})):  # fmt: skip
         core.on_event(name, data)
     assert core.on_command("r1", "stop") == Request("POST", "/api/v1/robots/r1/stop")
     assert core.on_command("r1", "goal b") == Request("PUT", "/api/v1/robots/r1/goal", {"place": "b"})
@@ -150,16 +150,32 @@ def test_orders_become_requests_of_operators_and_nothing_enables():
         assert isinstance(core.on_command(robot, text), str), text
 
 
-def test_robot_that_is_gone_is_forgotten_and_a_broker_that_lost_everything_is_told_again():
+def devices(core: HomeAssistant, *events: tuple[str, dict[str, object]]) -> list[tuple[str, bool]]:
+    """Return whose descriptions are published (True) and deleted (False) by events."""
+    found = [publication for name, data in events for publication in core.on_event(name, data)]
+    return [
+        (each.ids["robot_device"], each.message is not None)
+        for each in found
+        if each.channel is ch.HOME_ASSISTANT_ROBOT
+    ]
+
+
+def test_robot_that_is_gone_is_forgotten_and_one_that_a_new_run_has_not_told_of_yet_is_not():
     core = HomeAssistant("lab")
-    core.on_event("hello", {"fresh": True})
-    first = core.on_event("robot", {"id": "r1", "value": view()})
-    assert core.on_event("robot", {"id": "r1", "value": view()}) == []
-    assert list(core.everything()) == list(first)
-    gone = core.on_event("robot", {"id": "r1", "value": None})
-    assert {(each.channel, each.message) for each in gone} == {
-        (channel, None) for channel in (ch.HOME_ASSISTANT_ROBOT, ch.ROBOT_REPORT, ch.ROBOT_REFUSAL)
-    }
+    robots = [("robot", {"id": name, "value": view()}) for name in ("r1", "r2")]
+    begin, end = ("hello", {"fresh": True}), ("ready", {})
+    assert devices(core, begin, *robots, end) == [("robot_r1", True), ("robot_r2", True)]
+    assert devices(core, *robots, begin, *robots, end) == []
+    assert devices(core, ("robot", {"id": "r2", "value": None})) == [("robot_r2", False)]
+    assert devices(core, begin, end) == [("robot_r1", False)], "another run of the console does not know it"
+
+
+def test_broker_that_lost_everything_is_told_again():
+    core = HomeAssistant("lab")
+    events = ("hello", {"fresh": True}), ("robot", {"id": "r1", "value": view()}), ("ready", {})
+    first = [each for name, data in events for each in core.on_event(name, data)]
+    assert len(first) == 2
+    assert list(core.everything()) == first
 
 
 def test_words_of_a_robot_and_many_places_keep_the_limits_of_their_topics():

@@ -37,13 +37,19 @@ class HomeAssistant:
         self._site = site
         self._robots: dict[str, dict[str, Any]] = {}
         self._places: list[str] = []
+        self._is_complete = False
+        """Whether what is not there is gone: between `hello` and `ready` it may only not have been told yet."""
         self._told: dict[str, tuple[str, str]] = {}
         """The description and state of each robot that Home Assistant has."""
 
     def on_event(self, name: str, data: dict[str, Any]) -> Sequence[Publication]:
         """Take in an event of the floor; return what Home Assistant has to know."""
-        if name == "hello" and data["fresh"]:
-            self._robots, self._places = {}, []
+        if name == "hello":
+            self._is_complete = False
+            if data["fresh"]:
+                self._robots, self._places = {}, []
+        elif name == "ready":
+            self._is_complete = True
         elif name == "robot":
             if data["value"] is None:
                 self._robots.pop(data["id"], None)
@@ -52,10 +58,9 @@ class HomeAssistant:
         elif name == "place":
             known = {*self._places, data["id"]} - ({data["id"]} if data["value"] is None else set())
             self._places = sorted(known)
-        elif name != "ready":
+        else:
             return ()
-        # Between `hello` and `ready` things are missing that are not gone.
-        return () if name == "hello" else list(self._news())
+        return list(self._news())
 
     def on_command(self, robot: str, text: str) -> Request | str:
         """Return the request of a command to a robot, or why there is none, in words."""
@@ -76,10 +81,12 @@ class HomeAssistant:
 
     def everything(self) -> Sequence[Publication]:
         """Return all that Home Assistant has to know, again: the broker may have lost it."""
-        self._told.clear()
+        self._told = dict.fromkeys(self._told, ("", ""))
         return list(self._news())
 
     def _news(self) -> Iterator[Publication]:
+        if not self._is_complete:
+            return
         for robot in sorted(self._told.keys() - self._robots.keys()):
             del self._told[robot]
             yield Publication(ch.HOME_ASSISTANT_ROBOT, None, {"robot_device": f"robot_{robot}"})

@@ -15,10 +15,10 @@ import msgspec
 
 from console_service.log import CompactedLog
 from console_service.tiles import TiledMap
-from console_service.views import MapView, PathView, RobotView, Thing, ZoneView, goal_view, plan_view, scan_view
+from console_service.views import PathView, Thing, ZoneView, scan_view
 from fog_contracts import channels as ch
 from fog_contracts.handlers import Fence
-from fog_contracts.messages.maps import MapGeometry
+from fog_contracts.messages import GoalView, MapGeometry, MapInfo, PlanView, RobotSummary
 
 if TYPE_CHECKING:
     from collections.abc import Collection, Mapping, Sequence
@@ -180,7 +180,7 @@ class ConsoleCore:
             geometry = MapGeometry(
                 width=g.width, height=g.height, resolution=g.resolution, origin_x=g.origin_x, origin_y=g.origin_y
             )
-            view = MapView(site=self.site, geometry=geometry, epoch=version.epoch, seq=version.seq)
+            view = MapInfo(site=self.site, geometry=geometry, epoch=version.epoch, seq=version.seq)
             self.log.put("map", "", msgspec.json.encode(view))
 
     # --- Zones ------------------------------------------------------------------------------------------------------
@@ -263,12 +263,12 @@ class ConsoleCore:
 
     def _put_robot(self, robot: str) -> None:
         known = self._robots[robot]
-        view = RobotView(
+        view = RobotSummary(
             id=robot,
             configured=known.configured,
             state=known.state,
-            goal=goal_view(robot, known.goal),
-            plan=plan_view(known.path),
+            goal=GoalView.of(robot, known.goal),
+            plan=PlanView.of(known.path),
         )
         self._put("robot", robot, view)
 

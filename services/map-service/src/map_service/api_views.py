@@ -8,7 +8,7 @@ import numpy as np
 from fastapi import Response
 from PIL import Image
 
-from fog_contracts.messages import HazardArea, MapGeometry, Message
+from fog_contracts.messages import HazardArea, MapGeometry, MapInfo
 from fog_contracts.site import Site
 from fog_runtime.concurrency import BusyError, Worker
 from fog_runtime.http import Routes
@@ -22,15 +22,6 @@ Image.preinit()  # the first picture would load PIL's formats, while the map is 
 _PNG: Final = "image/png"
 _MAX_PICTURES: Final = 4
 """Most pictures that are being encoded or wait for it."""
-
-
-class MapInfo(Message, frozen=True, kw_only=True):
-    """The map's geometry and version; its images have the geometry's size, and their first row is the map's top."""
-
-    site: str
-    geometry: MapGeometry
-    epoch: int
-    seq: int
 
 
 class _Pictures:

@@ -4,9 +4,11 @@ from collections.abc import Callable, Mapping
 from functools import partial
 
 from fastapi import FastAPI
+from msgspec import structs
 
 from fog_contracts.messages import (
     GoalOutcome,
+    GoalView,
     Id,
     Message,
     Metres,
@@ -14,13 +16,12 @@ from fog_contracts.messages import (
     Place,
     PlanReply,
     PlanRequest,
+    PlanView,
     Pose,
     Radians,
     Refusal,
-    RobotGoal,
-    RobotPath,
     RobotPose,
-    RobotState,
+    RobotSummary,
 )
 from fog_contracts.site import Site
 from fog_runtime.health import Health
@@ -71,50 +72,16 @@ class GoalBody(Message, frozen=True, kw_only=True):
     pose: GoalPose | None = None
 
 
-class GoalView(Message, frozen=True, kw_only=True):
-    """A mission; `any_heading`: the robot may arrive with any heading."""
-
-    robot: str
-    goal_id: str
-    pose: Pose
-    place: str | None
-    any_heading: bool
-    stamp: float
-
-
-class PlanView(Message, frozen=True, kw_only=True):
-    """The current plan: version, number of corners, released length (m), or refusal."""
-
-    plan_id: int
-    map_epoch: int
-    map_seq: int
-    points: int
-    released_length: float
-    refusal: Refusal | None
-
-
-class RobotView(Message, frozen=True, kw_only=True):
+class RobotView(RobotSummary, frozen=True, kw_only=True):
     """A robot with its latest pose, state, goal and plan."""
 
-    id: str
-    configured: bool
     pose: RobotPose | None
-    state: RobotState | None
-    goal: GoalView | None
-    plan: PlanView | None
 
 
 def _goal_view(robot: str, stored: StoredGoal) -> GoalView:
-    goal: RobotGoal = stored.goal
-    assert goal.pose is not None
-    return GoalView(
-        robot=robot,
-        goal_id=goal.goal_id,
-        pose=goal.pose,
-        place=goal.place,
-        any_heading=stored.any_heading,
-        stamp=goal.stamp,
-    )
+    view = GoalView.of(robot, structs.replace(stored.goal, any_heading=stored.any_heading))
+    assert view is not None  # what is stored has a pose
+    return view
 
 
 def _goal_answer(robot: str, stored: StoredGoal, status: int = 200) -> Answer[GoalView]:
@@ -123,17 +90,6 @@ def _goal_answer(robot: str, stored: StoredGoal, status: int = 200) -> Answer[Go
 
 def _without_mission(robot: str) -> ProblemError:
     return ProblemError(PlannerProblem.NO_MISSION, f"robot {robot} has no mission: PUT one first")
-
-
-def _plan_view(path: RobotPath) -> PlanView:
-    return PlanView(
-        plan_id=path.plan_id,
-        map_epoch=path.map_epoch,
-        map_seq=path.map_seq,
-        points=len(path.points),
-        released_length=path.released_length,
-        refusal=path.refusal,
-    )
 
 
 class _Robots:
@@ -169,7 +125,7 @@ class _Robots:
             pose=service.poses.get(robot),
             state=service.states.get(robot),
             goal=_goal_view(robot, service.goals[robot]) if robot in service.goals else None,
-            plan=_plan_view(path) if (path := service.path(robot)) else None,
+            plan=PlanView.of(service.path(robot)),
         )
 
 

@@ -10,3 +10,4 @@ from fog_contracts.messages.maps import *
 from fog_contracts.messages.nodes import *
 from fog_contracts.messages.robots import *
 from fog_contracts.messages.simulation import *
+from fog_contracts.messages.views import *

@@ -84,7 +84,7 @@ class Person:
         runtime = folder / "runtime"
         runtime.mkdir(mode=0o700)
         inherited = {key: value for key, value in os.environ.items() if not key.startswith("FOGNAV_")}
-        ports = floor_ports(("MQTT", "REDIS", "ZENOH", "AGGREGATOR", "MAP", "PLANNER"))
+        ports = floor_ports()
         self.environment = {
             **inherited,
             **ports,

@@ -23,7 +23,6 @@ pytestmark = [pytest.mark.live, pytest.mark.timeout(900)]
 
 ROOT = Path(__file__).parents[2]
 PAGE = (ROOT / "docs" / "operations.md").read_text("utf-8")
-PORTS = ("MQTT", "REDIS", "ZENOH", "AGGREGATOR", "MAP", "PLANNER")
 
 
 def block(beginning: str) -> str:
@@ -61,7 +60,7 @@ class Machine:
         }  # fmt: skip
         self._environment = {
             **inherited,
-            **floor_ports(PORTS),
+            **floor_ports(),
             "FOGNAV_BIND": "127.0.0.1",
             "HOME": str(self.home),
             "USER": "pi",

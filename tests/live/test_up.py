@@ -41,7 +41,6 @@ ROOT = Path(__file__).parents[2]
 START_S = 180.0
 FIRST_START_S = 1200.0
 """Of a version that may have to compile its kernels first."""
-PORTS = ("MQTT", "REDIS", "ZENOH", "AGGREGATOR", "MAP", "PLANNER")
 
 
 class Node:
@@ -55,7 +54,7 @@ class Node:
         (folder / "runtime").mkdir(mode=0o700)
         self.printed = folder / "up.txt"
         inherited = {key: value for key, value in os.environ.items() if not key.startswith("FOGNAV_")}
-        self.environment = {**inherited, **floor_ports(PORTS), "XDG_RUNTIME_DIR": str(folder / "runtime")}
+        self.environment = {**inherited, **floor_ports(), "XDG_RUNTIME_DIR": str(folder / "runtime")}
         self.process: subprocess.Popen[bytes] | None = None
 
     def up(self) -> None:

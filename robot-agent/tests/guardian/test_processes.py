@@ -110,11 +110,22 @@ def wakeups(pid: int) -> int:
 
 
 def wakeups_per_feedback(rig, messages: int) -> float:
-    """Wake-ups of the guardian for each message that the agent receives: a busy machine delays both."""
-    guardian, first = rig.watchdog.guardian(), rig.agent.feedback.seq
-    before = wakeups(guardian)
-    wait_for(lambda: rig.agent.feedback.seq >= first + messages, "the guardian reports")
-    return (wakeups(guardian) - before) / (rig.agent.feedback.seq - first)
+    """Wake-ups of the guardian for each message that the agent receives: a busy machine delays both.
+
+    One that the machine delays too much, the watchdog replaces: it is another process then, and counted anew.
+    """
+    for _ in range(5):
+        guardian, first = rig.watchdog.guardian(), rig.agent.feedback.seq
+        before = wakeups(guardian)
+
+        def enough(guardian=guardian, first=first) -> bool:
+            return rig.watchdog.guardian() != guardian or rig.agent.feedback.seq >= first + messages
+
+        wait_for(enough, "the guardian reports")
+        if rig.watchdog.guardian() == guardian:
+            return (wakeups(guardian) - before) / (rig.agent.feedback.seq - first)
+        wait_for(lambda: rig.watchdog.guardian() and rig.base.speeds == rig.agent.wheels, "another guardian commands")
+    raise AssertionError("no guardian lasts for a second")
 
 
 def test_guardian_is_woken_for_whole_frames_while_driving_and_by_the_agent_alone_at_rest(rig):

@@ -338,6 +338,54 @@ async def test_invalid_goals_are_refused_with_a_reason_and_all_goals_without_the
         await env.until(lambda: env.goals[-1].pose is None)
 
 
+async def test_operator_takes_a_robot_out_of_service_which_ends_its_mission_and_outlasts_a_restart(
+    tmp_path: Path,
+) -> None:
+    async with running_planner(tmp_path) as env:
+        url, goal = "/api/v1/robots/r1/out-of-service", {"place": "right"}
+        async with env.ready() as client:
+            assert (await client.put("/api/v1/robots/r1/goal", json=goal, headers=OPERATOR)).status_code == 201
+            assert (await client.put(url, json={"reason": "worn wheel"}, headers=VIEWER)).status_code == 403
+            assert (await client.put(url, json={"reason": "worn wheel"})).status_code == 401
+            assert (await client.put(url, json={"reason": ""}, headers=OPERATOR)).status_code == 422
+            assert (await client.delete(url, headers=OPERATOR)).json()["type"] == "urn:fognav:in_service"
+            held = await client.put(url, json={"reason": "worn wheel"}, headers=OPERATOR)
+            assert (held.status_code, held.json()["by"]) == (200, "operator")
+            await env.until(lambda: env.goals[-1].pose is None and env.goals[-1].out_of_service is not None)
+            assert env.stop() == 0
+        env.start()
+        async with env.ready() as client:
+            for method, path, body in (
+                ("PUT", "/api/v1/robots/r1/goal", goal),
+                ("POST", "/api/v1/robots/r1/commands", {"kind": "dock"}),
+            ):
+                refused = await client.request(method, path, json=body, headers=OPERATOR)
+                assert (refused.status_code, refused.json()["type"]) == (409, "urn:fognav:out_of_service")
+                assert "worn wheel" in refused.json()["detail"]
+            assert (await client.get("/api/v1/robots/r1", headers=VIEWER)).json()["out_of_service"] == held.json()
+
+            async def undo_latest() -> object:
+                redis = RedisConnection(env.redis.url, credentials=env.site.credentials("administrator"))
+                ((latest, _),) = await redis.read("XREVRANGE", "fog:test:audit:service", "+", "-", "COUNT", 1)
+                await redis.aclose()
+                entry = {"entry": f"{latest.decode()}.service"}
+                answer = await client.post("/api/v1/robots/r1/undo", json=entry, headers=OPERATOR)
+                assert (answer.status_code, answer.json()["kind"]) == (200, "service")
+                return answer.json()["value"]
+
+            assert await undo_latest() is None
+            assert (await client.get("/api/v1/robots/r1", headers=VIEWER)).json()["out_of_service"] is None
+            assert await undo_latest() == held.json()
+            assert (await client.delete(url, headers=OPERATOR)).status_code == 204
+            await env.until(lambda: env.goals[-1].out_of_service is None)
+            before = len(env.goals)
+            assert (await client.put(url, json={"reason": "dusty", "ttl_s": 0.5}, headers=OPERATOR)).status_code == 200
+            await env.until(lambda: any(goal.out_of_service for goal in env.goals[before:]))
+            await env.until(lambda: env.goals[-1].out_of_service is None)
+            assert (await client.put("/api/v1/robots/r1/goal", json=goal, headers=OPERATOR)).status_code == 201
+            assert env.stop() == 0
+
+
 async def test_mission_is_replaced_or_cancelled_only_if_it_is_the_one_that_was_read(tmp_path: Path) -> None:
     async with running_planner(tmp_path) as env, env.ready() as client:
         url = "/api/v1/robots/r1/goal"

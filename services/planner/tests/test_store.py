@@ -1,12 +1,13 @@
 """Missions in a real Redis: repeated requests, deletions of older missions, a loss."""
 
+import random
 from pathlib import Path
 from unittest.mock import Mock
 
 import pytest
 from redis.asyncio import Redis
 
-from fog_contracts.messages import Pose, RobotGoal
+from fog_contracts.messages import OutOfService, Pose, RobotGoal
 from fog_runtime.clock import SystemClock
 from fog_runtime.health import Health
 from fog_runtime.leadership import LeaseStore
@@ -14,7 +15,8 @@ from fog_runtime.lease import Request
 from fog_runtime.stores.redis_connection import StoreError
 from fog_runtime.stores.redis_store import Attempt, Audit, IdempotencyError, RecoveryError
 from fog_supervisor.servers import Server, start_redis
-from planner.store import MissionPersistence, Store, StoredGoal
+from planner.core import PlannerCore
+from planner.store import MissionPersistence, Order, OutOfServiceError, Store, StoredGoal
 
 pytestmark = pytest.mark.live
 AUDIT = Audit(1.0, "anna", "goal")
@@ -64,7 +66,7 @@ async def test_restore_replaces_what_redis_has_and_later_writes_are_accepted(red
                 with pytest.raises(StoreError, match="Redis "):
                     await attempt
         await store.require_loss()
-        await store.restore({"r1": goal("first")}, Audit(2.0, "ada", "restore"))
+        await store.restore({"r1": goal("first")}, {}, Audit(2.0, "ada", "restore"))
         assert await store.goals() == {"r1": goal("first")}
         assert await store.put("r1", goal("second"), AUDIT) == "ok"
         assert [entry.action for entry in (await store.audit()).entries] == ["goal", "restore"]
@@ -86,3 +88,57 @@ async def test_mission_that_was_stored_although_its_request_failed_can_be_cancel
         persistence._reload = True  # as after any write that failed
         assert await persistence.cancel("r1", "anna")
         assert await store.goals() == {}
+
+
+async def test_no_goal_is_accepted_or_begun_while_a_robot_is_out_of_service_whatever_is_ordered_or_restarted(
+    redis: Server,
+):
+    rng, order = random.Random(7), Order("r1", Pose(x=1.0, y=2.0, theta=0.0), "anna")
+    async with (
+        Store(redis.url, "test", service="planner") as store,
+        LeaseStore(redis.url, "test", "planner") as leases,
+    ):
+        granted = await leases.acquire("p1", Request(epoch=0, floor=0, confirmed=False, sent_at=0.0))
+        assert granted is not None
+
+        async def start() -> tuple[PlannerCore, MissionPersistence]:
+            core = PlannerCore()
+            persistence = MissionPersistence(core, store, SystemClock(), Health(), lambda change: change())
+            await persistence.lead(granted.epoch, confirmed=True)
+            return core, persistence
+
+        core, missions = await start()
+        out = False
+        for number in range(60):
+            match rng.choice(("goal", "goal", "out", "in", "restart", "cancel")):
+                case "goal" if out:
+                    with pytest.raises(OutOfServiceError, match="worn wheel"):
+                        await missions.send(order)
+                case "goal":
+                    await missions.send(order)
+                case "out":
+                    record = OutOfService(id=f"{number}", reason="worn wheel", by="anna", since=1.0)
+                    out = await missions.take_out("r1", record, "anna")
+                case "in":
+                    assert await missions.put_back("r1", "anna") == out
+                    out = False
+                case "restart":
+                    core, missions = await start()
+                case "cancel":
+                    await missions.cancel("r1", "anna")
+            assert (missions.out_of_service("r1") is not None) == out
+            assert (core.missions.of("r1").out_of_service is not None) == out
+            if out:
+                assert core.missions.goal("r1") is None
+                assert (missions.goals, await store.goals()) == ({}, {})
+
+
+async def test_goal_of_a_robot_whose_record_of_service_cannot_be_read_is_refused(redis: Server):
+    async with Store(redis.url, "test") as store, Redis.from_url(redis.url) as raw:
+        await store.put("r1", goal("first"), AUDIT)
+        await raw.hset("fog:test:out_of_service", "r1", b"{half")
+        core = PlannerCore()
+        missions = MissionPersistence(core, store, SystemClock(), Health(), lambda change: change())
+        await missions.lead(-1, confirmed=True)
+        assert core.missions.goal("r1") is None
+        assert missions.out_of_service("r1") is not None

@@ -17,7 +17,7 @@ from fog_runtime import logs
 from fognav.commands.robot_file import robot_app
 from fognav.operate import robot_commands
 from fognav.operate.fog import Fog, Outcome, RefusedError, find_fog
-from fognav.operate.options import NUMBERS, FogOption, JsonOption, RobotOption, numbers
+from fognav.operate.options import NUMBERS, FogOption, JsonOption, RobotOption, duration, numbers
 from fognav.output import (
     NOT_TRUE,
     FailedError,
@@ -209,6 +209,34 @@ def robot_cancel(*, robot: RobotOption = None, fog: FogOption = None, json: Json
         )
 
 
+@robot_app.command("take-out", epilog='Example: fognav robot take-out --reason "worn wheel" --for 2h')
+def robot_take_out(
+    *,
+    reason: Annotated[str, typer.Option("--reason", help="What whoever asks for it is told.")],
+    length: Annotated[
+        str | None, typer.Option("--for", help="For how long, such as 30m or 2h; else until put-back.")
+    ] = None,
+    robot: RobotOption = None,
+    fog: FogOption = None,
+    json: JsonOption = False,
+) -> None:
+    """Take a robot out of service: nobody can send it.
+
+    Its mission ends. That holds until `fognav robot put-back`, after restarts, too. It is no stop: the robot stays
+    enabled.
+    """
+    with exit_codes():
+        body = {"reason": reason, **({} if length is None else {"ttl_s": duration(length, "--for")})}
+        _service(find_fog(fog), robot, "PUT", body, f"out of service: {reason}", json=json)
+
+
+@robot_app.command("put-back", epilog="Example: fognav robot put-back --robot r1")
+def robot_put_back(*, robot: RobotOption = None, fog: FogOption = None, json: JsonOption = False) -> None:
+    """Put a robot back into service, so that it can be sent again."""
+    with exit_codes():
+        _service(find_fog(fog), robot, "DELETE", None, "in service", json=json)
+
+
 @robot_app.command("status", epilog="Example: fognav robot status --json")
 def robot_status(*, robot: RobotOption = None, fog: FogOption = None, json: JsonOption = False) -> None:
     """Show a robot's mode, pose, mission and plan."""
@@ -219,6 +247,11 @@ def robot_status(*, robot: RobotOption = None, fog: FogOption = None, json: Json
             print_json({"mode": mode, "reasons": view["state"]["reasons"] if view["state"] else [], **view})
             return
         print_answer(f"{view['id']}: {_describe(view['state'], view['pose'])}")
+        if (out := view.get("out_of_service")) is not None:
+            until = (
+                "" if out["until"] is None else time.strftime(", until %Y-%m-%d %H:%M", time.localtime(out["until"]))
+            )
+            print_answer(f"  out of service: {out['reason']} ({out['by']}{until}); fognav robot put-back ends that")
         if (goal := view["goal"]) is not None:
             print_answer(f"  goal: {goal['place'] or _position(goal['pose'])}")
         if (plan := view["plan"]) is not None and plan["refusal"] is not None:
@@ -265,6 +298,17 @@ def _report(outcome: Outcome, *, json: bool) -> None:
 def _refused(error: RefusedError, mode: Mode | None) -> Outcome:
     code = error.problem.get("refusal") or error.code
     return Outcome(accepted=False, reason=str(error), mode=mode, code=code)
+
+
+def _service(found: Fog, robot: str | None, method: str, body: object, became: str, *, json: bool) -> None:
+    """Take a robot out of service, or put it back, and report what it is then."""
+    chosen = found.robot(robot)
+    mode = _view(found, chosen)[1]
+    try:
+        found.send(method, PLANNER, f"/api/v1/robots/{chosen}/out-of-service", body)
+    except RefusedError as error:
+        _report(_refused(error, mode), json=json)
+    _report(Outcome(accepted=True, reason=f"robot {chosen} is {became}", mode=mode), json=json)
 
 
 def _end_mission(fog: Fog, robot: str | None) -> str:

@@ -297,7 +297,7 @@ PLANNER_EGRESS    = _query("planner_egress",    FOG + "planner/egress",         
     publishers=(PLANNER,), subscribers=(ROBOT,),           reply=m.PlanReply, reply_limit=4 * MIB)
 PLANNER_DRY_RUN   = _query("planner_dry_run",   FOG + "planner/dry_run",          m.DryRunRequest,  limit=MIB,
     publishers=(PLANNER,), subscribers=(MAP,),             reply=m.DryRunReply, reply_limit=4 * MIB)
-ROBOT_GOAL        = _pub(  "robot_goal",        FOG + "robots/{robot}/goal",      m.RobotGoal,      limit=KIB,
+ROBOT_GOAL        = _pub(  "robot_goal",        FOG + "robots/{robot}/goal",      m.RobotGoal,      limit=2 * KIB,
     publishers=(PLANNER,), subscribers=(ROBOT, CONSOLE, WEB), durability=VOLATILE, rate_hz=0.2, epoch="planner_epoch")
 ROBOT_PATH        = _pub(  "robot_path",        FOG + "robots/{robot}/path",      m.RobotPath,      limit=MIB,
     publishers=(PLANNER,), subscribers=(ROBOT, CONSOLE, WEB), durability=LATEST, epoch="planner_epoch")

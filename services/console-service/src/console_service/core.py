@@ -269,6 +269,7 @@ class ConsoleCore:
             state=known.state,
             goal=GoalView.of(robot, known.goal),
             plan=PlanView.of(known.path),
+            out_of_service=None if known.goal is None else known.goal.out_of_service,
         )
         self._put("robot", robot, view)
 

@@ -1,5 +1,6 @@
 """REST under /api/v1: robots with their missions, plans on request, and operators' commands to robots."""
 
+import secrets
 from collections.abc import Callable, Mapping
 from functools import partial
 
@@ -13,6 +14,7 @@ from fog_contracts.messages import (
     Message,
     Metres,
     Mode,
+    OutOfService,
     Place,
     PlanReply,
     PlanRequest,
@@ -22,6 +24,8 @@ from fog_contracts.messages import (
     Refusal,
     RobotPose,
     RobotSummary,
+    ServiceReason,
+    TimeToLive,
 )
 from fog_contracts.site import Site
 from fog_runtime.health import Health
@@ -53,7 +57,7 @@ from planner.problems import PlannerProblem
 from planner.query_queue import BusyError
 from planner.robot_operator import CommandError
 from planner.service import Service
-from planner.store import NO_MISSION, MissionConflictError, Order, StoredGoal
+from planner.store import NO_MISSION, MissionConflictError, Order, OutOfServiceError, StoredGoal
 from planner.undo import add_undo
 
 
@@ -70,6 +74,13 @@ class GoalBody(Message, frozen=True, kw_only=True):
 
     place: Id | None = None
     pose: GoalPose | None = None
+
+
+class ServiceBody(Message, frozen=True, kw_only=True):
+    """Why a robot is out of service, and for how long (s); without `ttl_s` until somebody puts it back."""
+
+    reason: ServiceReason
+    ttl_s: TimeToLive | None = None
 
 
 class RobotView(RobotSummary, frozen=True, kw_only=True):
@@ -126,6 +137,7 @@ class _Robots:
             state=service.states.get(robot),
             goal=_goal_view(robot, service.goals[robot]) if robot in service.goals else None,
             plan=PlanView.of(service.path(robot)),
+            out_of_service=service.missions.out_of_service(robot),
         )
 
 
@@ -156,8 +168,15 @@ def make_api(service: Service, site: Site, health: Health, tokens: Tokens, stand
     routes = Routes(app, "robots")
     add_store_errors(routes)
     places = partial(_places, service, site)
-    add_commands(routes, service.operator, places, check=robots.check, mode=robots.mode)
+    routes.raises(
+        OutOfServiceError,
+        [PlannerProblem.OUT_OF_SERVICE],
+        lambda error: ProblemError(PlannerProblem.OUT_OF_SERVICE, str(error)),
+    )
+    may_go = service.missions.require_in_service
+    add_commands(routes, service.operator, places, check=robots.check, may_go=may_go, mode=robots.mode)
     _add_views(routes, service, robots)
+    _add_service(routes, service, robots)
     _add_orders(routes, service, robots, places)
     add_undo(routes, service, robots.check)
     _add_plan(Routes(app, "plan"), service, robots, places)
@@ -207,7 +226,7 @@ def _add_orders(routes: Routes, service: Service, robots: _Robots, places: Known
     @routes.put(
         "/api/v1/robots/{robot}/goal",
         status=(200, 201),
-        raises=[IdempotencyError, MissionConflictError, StoreError],
+        raises=[IdempotencyError, MissionConflictError, OutOfServiceError, StoreError],
         problems=[
             PlannerProblem.NO_ROBOT,
             PlannerProblem.ROBOT_DOUBLED,
@@ -266,6 +285,34 @@ def _add_orders(routes: Routes, service: Service, robots: _Robots, places: Known
         robots.check(robot)
         if not await service.missions.cancel(robot, caller.name, expected_tag(if_match)):
             raise _without_mission(robot)
+
+
+def _add_service(routes: Routes, service: Service, robots: _Robots) -> None:
+    """Add the routes by which operators take robots out of service, and put them back."""
+
+    @routes.put("/api/v1/robots/{robot}/out-of-service", raises=[StoreError], problems=[PlannerProblem.NO_ROBOT])
+    async def put_out_of_service(robot: str, body: Body[ServiceBody], caller: Operator) -> OutOfService:
+        """Take a robot out of service: its mission ends, and it gets none until it is put back, or `ttl_s` ends.
+
+        That holds for everybody's goals, and after restarts. It is no stop: stop the robot first if it must not move.
+        """
+        robots.check(robot)
+        now = service.stamp()
+        until = None if body.ttl_s is None else now + body.ttl_s
+        out = OutOfService(id=secrets.token_hex(8), reason=body.reason, by=caller.name, since=now, until=until)
+        await service.missions.take_out(robot, out, caller.name)
+        return out
+
+    @routes.delete(
+        "/api/v1/robots/{robot}/out-of-service",
+        raises=[StoreError],
+        problems=[PlannerProblem.NO_ROBOT, PlannerProblem.IN_SERVICE],
+    )
+    async def delete_out_of_service(robot: str, caller: Operator) -> None:
+        """Put a robot back into service. It stays where it is until somebody sends it."""
+        robots.check(robot)
+        if not await service.missions.put_back(robot, caller.name):
+            raise ProblemError(PlannerProblem.IN_SERVICE, f"robot {robot} is in service")
 
 
 def _add_plan(routes: Routes, service: Service, robots: _Robots, places: KnownPlaces) -> None:

@@ -7,6 +7,7 @@ from fog_runtime.http import Body, ClientHost, HttpProblem, Operator, ProblemErr
 from fog_runtime.stores.redis_connection import StoreError
 from planner.problems import PlannerProblem
 from planner.robot_operator import CommandError, RobotOperator
+from planner.store import OutOfServiceError
 
 KnownPlaces = Callable[[], Mapping[str, Place]]
 """Returns the places that there are now, by id."""
@@ -42,9 +43,13 @@ def add_commands(
     places: KnownPlaces,
     *,
     check: Callable[[str], None],
+    may_go: Callable[[str], None],
     mode: Callable[[str], Mode | None],
 ) -> None:
-    """Add the routes; `check` raises a `ProblemError` for an unknown robot, `mode` returns a robot's mode."""
+    """Add the routes; `check` raises a `ProblemError` for an unknown robot, `mode` returns a robot's mode.
+
+    `may_go` raises `OutOfServiceError` for a robot that gets no goal, such as its dock.
+    """
     routes.raises(
         CommandError,
         [PlannerProblem.COMMAND_LOST],
@@ -64,12 +69,14 @@ def add_commands(
 
     @routes.post(
         "/api/v1/robots/{robot}/commands",
-        raises=[CommandError, StoreError],
+        raises=[CommandError, OutOfServiceError, StoreError],
         problems=[PlannerProblem.NO_ROBOT, PlannerProblem.COMMAND_REFUSED, PlannerProblem.NO_PLACE],
     )
     async def post_command(robot: str, body: Body[CommandBody], caller: Operator) -> CommandOutcome:
         """Command a robot; the robot itself accepts or refuses."""
         check(robot)
+        if body.kind == "dock":
+            may_go(robot)
         return outcome(robot, await operator.send(body.kind, robot, caller.name, _pose(body, places())))
 
     routes.urgent("/api/v1/robots/{robot}/stop")

@@ -40,6 +40,7 @@ if TYPE_CHECKING:
         MapDelta,
         MapHeartbeat,
         MapSnapshot,
+        OutOfService,
         Place,
         PlaceSet,
         PlanReply,
@@ -201,6 +202,13 @@ class PlannerCore:
     def cancel(self, robot: str) -> None:
         """End a robot's mission; the next `tick` publishes that."""
         self.missions.of(robot).end()
+
+    def set_service(self, robot: str, out: OutOfService | None) -> None:
+        """Take a robot out of service, or put it back (None); the next `tick` publishes that.
+
+        Whoever sets goals sees to it that it has none meanwhile.
+        """
+        self.missions.of(robot).set_service(out)
 
     # --- Planning and publishing -----------------------------------------------------------------------------------
 

@@ -15,7 +15,7 @@ if TYPE_CHECKING:
 
     from fog_contracts.grid import GridGeometry
     from fog_contracts.handlers import Moment
-    from fog_contracts.messages import Pose, RobotState
+    from fog_contracts.messages import OutOfService, Pose, RobotState
     from fog_contracts.replica import Version
     from planner.config import PlannerConfig
     from planner.path_search import Question, Route
@@ -87,6 +87,8 @@ class Mission:
     """The last goal; its pose is None once it has ended."""
     any_heading: bool = False
     """Whether the robot may arrive with any heading: the goal's theta is ignored."""
+    out_of_service: OutOfService | None = None
+    """Why the robot gets no goal, which is published with its goal."""
     plan: Plan | None = None
     replan: ReplanReason | None = None
     traces: list[Trace] = field(default_factory=list)
@@ -131,6 +133,14 @@ class Mission:
         self.goal = structs.replace(self.goal, pose=None)
         self._reset(None)
         self.goal_sent = -math.inf
+
+    def set_service(self, out: OutOfService | None) -> None:
+        """Tell the robot, and whoever listens, that it is out of service, or in service again (None)."""
+        if out == self.out_of_service:
+            return
+        self.out_of_service, self.goal_sent = out, -math.inf
+        if self.goal is None:
+            self.goal = RobotGoal(goal_id="", pose=None)
 
     def _reset(self, reason: ReplanReason | None) -> None:
         self.plan, self.replan, self.traces, self.danger = None, reason, [], math.inf
@@ -191,7 +201,7 @@ class Mission:
 
     def drop(self) -> None:
         """Forget the goal and its plan, without telling the robot."""
-        self.goal = self.plan = self.replan = None
+        self.goal = self.plan = self.replan = self.out_of_service = None
         self.traces = []
 
     def publish_all_now(self) -> None:
@@ -208,7 +218,13 @@ class Mission:
         if at.now < self.goal_sent + (config.goal_repeat_s if has_it else config.goal_retry_s):
             return None
         self.goal_sent = at.now
-        return structs.replace(self.goal, any_heading=self.any_heading, stamp=at.stamp, planner_epoch=epoch)
+        return structs.replace(
+            self.goal,
+            any_heading=self.any_heading,
+            out_of_service=self.out_of_service,
+            stamp=at.stamp,
+            planner_epoch=epoch,
+        )
 
     def due_path(self, at: Moment, config: PlannerConfig, epoch: int, version: Version) -> RobotPath | None:
         """Return the path or refusal when it is new, has changed, or its robot has not received it for a while.

@@ -22,6 +22,11 @@ class PlannerProblem(ProblemCode):
         "Read the mission again, then decide anew",
     )  # fmt: skip
     ROBOT_DOUBLED = "robot_doubled", 409, "Two agents use this robot's id", "End one of them, or give it another id"
+    IN_SERVICE = "in_service", 404, "The robot is in service", "Send it to a goal, or take another one out of service"
+    OUT_OF_SERVICE = (
+        "out_of_service", 409, "An operator keeps the robot out of service: `detail` says why and till when",
+        "Put it back into service, or send another robot",
+    )  # fmt: skip
     COMMAND_REFUSED = (
         "command_refused", 409, "The robot refuses: `refusal` and `causes` identify why",
         "Do what `causes` ask for, then repeat it",

@@ -242,6 +242,10 @@ class Service:
         """All places by id; None until the map-service has told them."""
         return self._core.places
 
+    def stamp(self) -> float:
+        """Return the time, s since the epoch."""
+        return self._clock.stamp()
+
     def path(self, robot: str) -> RobotPath | None:
         """Return the last published path or refusal for the robot's current goal, as last released."""
         path, stored = self._record.paths.get(robot), self.goals.get(robot)
@@ -251,7 +255,7 @@ class Service:
         """Give a robot a mission; returns a refusal for an unreachable goal.
 
         An attempt that succeeded before returns its mission again and changes nothing. Raises `IdempotencyError` for
-        another request's attempt, and as `MissionPersistence.send`.
+        another request's attempt, and as `MissionPersistence.send`, `OutOfServiceError` among others.
         """
         earlier = await self.missions.earlier_result(order.attempt)
         if earlier is not None:

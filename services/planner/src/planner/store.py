@@ -5,10 +5,11 @@ from __future__ import annotations
 import asyncio
 import secrets
 from contextlib import contextmanager
+from datetime import UTC, datetime
 from functools import partial
 from typing import TYPE_CHECKING, Final, NamedTuple
 
-from fog_contracts.messages import Message, Refusal, RobotGoal
+from fog_contracts.messages import Message, OutOfService, Refusal, RobotGoal
 from fog_runtime import logs
 from fog_runtime.stores import records
 from fog_runtime.stores.redis_connection import StoreError, StoreLostError, StoreRefusedError
@@ -29,6 +30,7 @@ if TYPE_CHECKING:
     """Gives a robot a mission, or returns why there is none; may raise `StoreError`."""
 
 _GOALS: Final = Table(records.GOALS, "mission", version="goal.goal_id")
+_SERVICE: Final = Table(records.OUT_OF_SERVICE, "service", version="id")
 
 _log = logs.get("planner")
 
@@ -43,7 +45,7 @@ class StoredGoal(Message, frozen=True, kw_only=True):
 class Store(RedisStore):
     """The planner's keys."""
 
-    tables = (_GOALS.name,)
+    tables = (_GOALS.name, _SERVICE.name)
 
     async def goals(self) -> dict[str, StoredGoal]:
         """Return all stored missions by robot; an unreadable one is left out and logged.
@@ -63,6 +65,21 @@ class Store(RedisStore):
         """Delete a mission durably if it is still this one: a newer one stays."""
         await self._swap(_GOALS, robot, None, goal_id, audit)
 
+    async def out_of_service(self) -> dict[str, OutOfService]:
+        """Return all robots that are out of service; one whose record can't be read is, too."""
+        found, unreadable = await self._decoded(_SERVICE.name, OutOfService)
+        for robot, reason in unreadable.items():
+            _log.error("unreadable_record", kind="OutOfService", key=self._key(_SERVICE.name), id=robot, reason=reason)
+            found[robot] = OutOfService(id="", reason="why is stored, but can't be read", by="unknown", since=0.0)
+        return found
+
+    async def put_service(self, robot: str, out: OutOfService | None, audit: Audit, *, expected: str = ANY) -> Outcome:
+        """Take a robot out of service durably, or put it back (None), if the record's id is `expected`.
+
+        `0`: it is in service.
+        """
+        return await self._swap(_SERVICE, robot, out, expected, audit)
+
     async def record_command(self, robot: str, command: bytes, audit: Audit) -> None:
         """Record an operator's command to a robot (JSON) in the audit trail."""
         await self._record("robot", robot, command, audit)
@@ -75,9 +92,9 @@ class Store(RedisStore):
         """Return the mission that an earlier attempt with the same idempotency key stored."""
         return await self.recall(attempt, StoredGoal)
 
-    async def restore(self, goals: Mapping[str, StoredGoal], audit: Audit) -> None:
-        """Replace the stored missions by these, on an administrator's decision after Redis lost them."""
-        await self._adopt({_GOALS.name: goals}, audit)
+    async def restore(self, goals: Mapping[str, StoredGoal], out: Mapping[str, OutOfService], audit: Audit) -> None:
+        """Replace the stored missions, and robots out of service, on an administrator's decision after a loss."""
+        await self._adopt({_GOALS.name: goals, _SERVICE.name: out}, audit)
 
 
 STORE_PERIOD_S = 0.5
@@ -112,6 +129,16 @@ class MissionConflictError(Exception):
         super().__init__(f"robot {robot} has {has}, and not the one that was expected: read it again, then retry")
 
 
+class OutOfServiceError(Exception):
+    """A robot gets no goal: an operator keeps it out of service; the message says why, and till when."""
+
+    def __init__(self, robot: str, out: OutOfService) -> None:
+        until = "an operator puts it back"
+        if out.until is not None:
+            until = f"{datetime.fromtimestamp(out.until, UTC):%Y-%m-%d %H:%M UTC}"
+        super().__init__(f"robot {robot} is out of service until {until}: {out.reason} ({out.by})")
+
+
 class MissionPersistence:
     """Keeps the missions of store and core equal; `change_core` passes a change to the core's thread."""
 
@@ -135,6 +162,7 @@ class MissionPersistence:
         self._reached: dict[str, str] = {}
         self.goals: dict[str, StoredGoal] = {}
         """The missions by robot."""
+        self._out: dict[str, OutOfService] = {}
 
     async def lead(self, epoch: int, *, confirmed: bool) -> None:
         """Load the stored missions and continue with this epoch; raises `StoreError` for a confirmed one.
@@ -158,6 +186,7 @@ class MissionPersistence:
         self._store.epoch = 0
         self._loaded.clear()
         self.goals.clear()
+        self._out.clear()
         self._reached.clear()
         self._change_core(self._core.stand_by)
         self._health.set("goals", ok=True, detail="loaded when this process leads")
@@ -177,9 +206,14 @@ class MissionPersistence:
     async def send(self, order: Order) -> StoredGoal:
         """Give a robot a mission.
 
-        Raises `MissionConflictError`, and `StoreError`, after which the mission may or may not be stored.
+        Raises `OutOfServiceError`, `MissionConflictError`, and `StoreError`, after which the mission may or may not be
+        stored.
         """
         async with self._lock:
+            with self._uncertain_write():
+                if self._reload:
+                    await self._load()  # the robot may be out of service although the request for it failed
+            self.require_in_service(order.robot)
             stamp, place, pose = self._clock.stamp(), order.place, order.pose
             goal = RobotGoal(goal_id=secrets.token_hex(8), pose=pose, place=place, stamp=stamp)
             stored = StoredGoal(goal=goal, any_heading=order.any_heading)
@@ -203,15 +237,54 @@ class MissionPersistence:
                 return False
             if expected not in (None, stored.goal.goal_id):
                 raise MissionConflictError(robot, stored)
-            with self._uncertain_write():
-                await self._store.delete(robot, stored.goal.goal_id, Audit(self._clock.stamp(), who, action))
-            self._cancel(robot)
-        _log.info("goal_cancelled", robot=robot, goal=stored.goal.goal_id, who=who)
+            await self._end(robot, stored, who, action)
         return True
+
+    def out_of_service(self, robot: str) -> OutOfService | None:
+        """Return why the robot gets no goal; None when it is in service."""
+        out = self._out.get(robot)
+        return out if out is not None and out.holds(self._clock.stamp()) else None
+
+    def require_in_service(self, robot: str) -> None:
+        """Raise `OutOfServiceError` for a robot that is out of service."""
+        out = self.out_of_service(robot)
+        if out is not None:
+            raise OutOfServiceError(robot, out)
+
+    async def take_out(
+        self, robot: str, out: OutOfService, who: str, *, expected: str = ANY, action: str = "out"
+    ) -> bool:
+        """End a robot's mission, and keep it out of service; False if its record is not `expected` (id; `0`: none).
+
+        Raises `StoreError`: then it may or may not be out of service, and its mission may be ended.
+        """
+        async with self._lock:
+            with self._uncertain_write():
+                if self._reload:
+                    await self._load()
+            if (stored := self.goals.get(robot)) is not None:
+                await self._end(robot, stored, who, "cancel")
+            with self._uncertain_write():
+                audit = Audit(self._clock.stamp(), who, action)
+                done = await self._store.put_service(robot, out, audit, expected=expected) == "ok"
+            if done:
+                self._set_service(robot, out)
+        return done
+
+    async def put_back(self, robot: str, who: str, *, expected: str = ANY, action: str = "in") -> bool:
+        """Put a robot back into service; False if it is, or if its record is not `expected`. Raises `StoreError`."""
+        async with self._lock:
+            with self._uncertain_write():
+                audit = Audit(self._clock.stamp(), who, action)
+                outcome = await self._store.put_service(robot, None, audit, expected=expected)
+            if outcome in {"ok", "missing"}:
+                self._set_service(robot, None)
+        return outcome == "ok"
 
     async def store_status(self) -> StoreStatus:
         """Return what Redis and this process have; raises `StoreError`."""
-        return await self._store.status({"goals": len(self.goals)} if self._loaded.is_set() else {})
+        known = {"goals": len(self.goals), "out_of_service": len(self._out)}
+        return await self._store.status(known if self._loaded.is_set() else {})
 
     async def recover_store(self, action: Literal["restore", "accept"], who: str) -> None:
         """Restore the missions from memory, or accept those in Redis, after Redis lost records.
@@ -225,7 +298,7 @@ class MissionPersistence:
                 await self._store.accept_loss(audit)
                 self._reload = True
             elif self._loaded.is_set():
-                await self._store.restore(self.goals, audit)
+                await self._store.restore(self.goals, self._out, audit)
             else:
                 raise RecoveryError(
                     "this service was started after the loss and has no missions: restore a backup of Redis, or accept"
@@ -251,6 +324,9 @@ class MissionPersistence:
                     await self._store.delete(robot, goal_id, Audit(self._clock.stamp(), robot, "reached"))
                     if self._reached.get(robot) == goal_id:
                         del self._reached[robot]
+                for robot, out in list(self._out.items()):
+                    if self._leading and not out.holds(self._clock.stamp()):
+                        await self.put_back(robot, "planner", expected=out.id, action="end")
                 await self._store.check()
                 self._health.set("store", ok=True)
             except StoreError as error:
@@ -304,16 +380,36 @@ class MissionPersistence:
 
         Raises `StoreError`.
         """
-        stored = await self._store.goals()
-        for robot in [robot for robot in self.goals if robot not in stored]:
+        stored, out = await self._store.goals(), await self._store.out_of_service()
+        for robot in {*self._out, *out}:
+            self._set_service(robot, out.get(robot))
+        for robot in [robot for robot in self.goals if robot not in stored or self.out_of_service(robot) is not None]:
             self._cancel(robot)
         for robot, mission in stored.items():
             # One that is reached may still be stored, until its deletion succeeds.
-            if mission != self.goals.get(robot) and mission.goal.goal_id != self._reached.get(robot):
+            ended = mission.goal.goal_id == self._reached.get(robot) or self.out_of_service(robot) is not None
+            if mission != self.goals.get(robot) and not ended:
                 self._begin(robot, mission)
         self._reload = False
         self._loaded.set()
         self._health.set("goals", ok=True, detail=f"{len(self.goals)} loaded")
+
+    def _set_service(self, robot: str, out: OutOfService | None) -> None:
+        if out == self._out.get(robot):
+            return
+        if out is None:
+            del self._out[robot]
+        else:
+            self._out[robot] = out
+        self._change_core(partial(self._core.set_service, robot, out))
+        _log.info("robot_service", robot=robot, out=out is not None, reason=out.reason if out else "")
+
+    async def _end(self, robot: str, stored: StoredGoal, who: str, action: str) -> None:
+        """Delete the robot's mission, and end it; hold the lock. Raises `StoreError`."""
+        with self._uncertain_write():
+            await self._store.delete(robot, stored.goal.goal_id, Audit(self._clock.stamp(), who, action))
+        self._cancel(robot)
+        _log.info("goal_cancelled", robot=robot, goal=stored.goal.goal_id, who=who)
 
     def _cancel(self, robot: str) -> None:
         del self.goals[robot]
@@ -345,8 +441,8 @@ class DockMissions:
     async def _give(self, robot: str, pose: Pose, replaced: str) -> None:
         try:
             outcome = await self._send(Order(robot, pose, f"robot {robot}, to its dock", expected=replaced))
-        except MissionConflictError:
-            return  # an operator was faster
+        except (MissionConflictError, OutOfServiceError):
+            return  # an operator was faster, or keeps it where it is
         except StoreError as error:
             _log.error("dock_goal_failed", robot=robot, reason=str(error))
             return

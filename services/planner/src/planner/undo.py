@@ -1,18 +1,18 @@
-"""Undoes an operator's order, by its entry in the audit trail: a mission that was given or cancelled."""
+"""Undoes an operator's order, by its entry in the audit trail: a mission given or cancelled, or a robot's service."""
 
 from collections.abc import Callable
 from typing import Final
 
-from fog_contracts.messages import Refusal
+from fog_contracts.messages import OutOfService, Refusal
 from fog_runtime.http import Body, Operator, ProblemError, Routes, UndoBody, Undone, add_undo_errors, undone
 from fog_runtime.stores.redis_connection import StoreError
 from fog_runtime.stores.redis_store import IdempotencyError
-from fog_runtime.stores.undo import ACTION, UndoError, values
+from fog_runtime.stores.undo import ACTION, UndoError, require_rest, values
 from planner.problems import PlannerProblem
 from planner.service import Service
-from planner.store import NO_MISSION, MissionConflictError, Order, StoredGoal
+from planner.store import NO_MISSION, MissionConflictError, Order, OutOfServiceError, StoredGoal
 
-_KINDS: Final = ("mission",)
+_KINDS: Final = ("mission", "service")
 
 
 def add_undo(routes: Routes, service: Service, check: Callable[[str], None]) -> None:
@@ -21,17 +21,38 @@ def add_undo(routes: Routes, service: Service, check: Callable[[str], None]) -> 
 
     @routes.post(
         "/api/v1/robots/{robot}/undo",
-        raises=[UndoError, IdempotencyError, MissionConflictError, StoreError],
+        raises=[UndoError, IdempotencyError, MissionConflictError, OutOfServiceError, StoreError],
         problems=[PlannerProblem.NO_ROBOT, PlannerProblem.GOAL_REFUSED],
     )
     async def undo_order(robot: str, body: Body[UndoBody], caller: Operator) -> Undone:
         """Undo an order to a robot, if it has no other one since. An undo can be undone, too.
 
-        Only missions that were given or cancelled: commands (enable, reset, stop) can't be undone.
+        Only missions that were given or cancelled, and robots that were taken out of service or put back: commands
+        (enable, reset, stop) can't be undone.
         """
         check(robot)
-        before, after = values(await service.undoable(body.entry, robot, _KINDS), StoredGoal)
+        entry = await service.undoable(body.entry, robot, _KINDS)
+        if entry.kind == "service":
+            was, now = values(entry, OutOfService)
+            return undone("service", robot, await _undo_service(service, robot, was, now, caller.name))
+        before, after = values(entry, StoredGoal)
         return undone("mission", robot, await _undo(service, robot, before, after, caller.name))
+
+
+async def _undo_service(
+    service: Service, robot: str, before: OutOfService | None, after: OutOfService | None, who: str
+) -> OutOfService | None:
+    """Put a robot back into service, or out of it as it was before; return why it is out of service now."""
+    missions, expected = service.missions, "0" if after is None else after.id
+    if before is None:
+        done = await missions.put_back(robot, who, expected=expected, action=ACTION)
+    else:
+        if before.until is not None:
+            require_rest(before.until, service.stamp(), f"that robot {robot} is out of service")
+        done = await missions.take_out(robot, before, who, expected=expected, action=ACTION)
+    if not done:
+        raise UndoError("changed_since", f"somebody has changed meanwhile whether robot {robot} is in service")
+    return before
 
 
 async def _undo(

@@ -30,6 +30,7 @@ from fog_contracts.messages.basics import (
     Stamp,
     Trace,
 )
+from fog_contracts.messages.fleet import OutOfService
 from fog_contracts.messages.maps import Cause
 
 PLAN_CODES = {
@@ -111,13 +112,15 @@ class PlanReply(Message, frozen=True, kw_only=True):
 class RobotGoal(Message, frozen=True, kw_only=True):
     """The mission of a robot; `pose` is null when it has none (cancelled or reached).
 
-    `any_heading`: the robot may arrive with any heading, that of `pose` does not count.
+    `any_heading`: the robot may arrive with any heading, that of `pose` does not count. `out_of_service`: why it gets
+    no mission; then `pose` is null, and `goal_id` empty if it never had one.
     """
 
     goal_id: Annotated[str, Meta(max_length=64)]
     pose: Pose | None
     any_heading: bool = False
     place: Id | None = None
+    out_of_service: OutOfService | None = None
     stamp: Stamp = 0.0
     planner_epoch: Count = 0
 

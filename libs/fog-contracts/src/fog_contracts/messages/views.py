@@ -1,6 +1,7 @@
 """What several services tell people of a map and of robots: answers of REST and events of the console, defined once."""
 
 from fog_contracts.messages.basics import Message, Pose
+from fog_contracts.messages.fleet import OutOfService
 from fog_contracts.messages.maps import MapGeometry
 from fog_contracts.messages.robots import Refusal, RobotGoal, RobotPath, RobotState
 
@@ -65,10 +66,11 @@ class PlanView(Message, frozen=True, kw_only=True):
 
 
 class RobotSummary(Message, frozen=True, kw_only=True):
-    """A robot with its latest state, goal and plan."""
+    """A robot with its latest state, goal and plan; `out_of_service`: why it gets no goal."""
 
     id: str
     configured: bool
     state: RobotState | None
     goal: GoalView | None
     plan: PlanView | None
+    out_of_service: OutOfService | None = None

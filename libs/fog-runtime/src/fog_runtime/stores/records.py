@@ -39,11 +39,12 @@ ZONE_SETS: Final = "zone_sets"
 ZONE_SOURCES: Final = "zone_sources"
 PLACES: Final = "places"
 GOALS: Final = "goals"
+OUT_OF_SERVICE: Final = "out_of_service"
 
 OWN: Final[Mapping[str, Sequence[str]]] = {
     "hazard-aggregator": (AREAS, HAZARDS, OVERRIDES, OVERRIDE_RESTS, ALERTS, f"{HISTORY}:*"),
     "map-service": (ZONES, ZONE_TIMES, ZONE_SETS, ZONE_SOURCES, PLACES),
-    "planner": (GOALS,),
+    "planner": (GOALS, OUT_OF_SERVICE),
 }
 """The keys of each service's own records, as patterns."""
 READ: Final[Mapping[str, Sequence[str]]] = {"console-service": (f"{HISTORY}:*",)}
@@ -51,7 +52,7 @@ READ: Final[Mapping[str, Sequence[str]]] = {"console-service": (f"{HISTORY}:*",)
 AUDITED: Final[Mapping[str, Sequence[str]]] = {
     "hazard-aggregator": ("alert", "area", "override", "store"),
     "map-service": ("place", "set", "source", "zone", "store"),
-    "planner": ("mission", "robot", "stop", "store"),
+    "planner": ("mission", "robot", "service", "stop", "store"),
 }
 """The kinds of records whose audit trail (`audit:KIND`) each service writes."""
 BOOKKEEPING: Final = ("probe", "generation", "writes", "floors", "no-attempt", "idempotency:*")
@@ -169,13 +170,14 @@ newer than the last one is known.
 
 
 KINDS: Final = (
-    "alert", "area", "mission", "override", "place", "robot", "set", "source", "stop", "store", "zone",
+    "alert", "area", "mission", "override", "place", "robot", "service", "set", "source", "stop", "store",
+    "zone",
 )  # fmt: skip
 """The kinds of records that have an audit trail.
 
 `alert`: alerts that began, ended or were acknowledged; `store`: what an administrator decided after a loss; `robot`:
-operators' commands to robots; `set`: sets of zones; `source`: muted sources of zones; `stop`: stops without a
-token, of which anybody may send any number.
+operators' commands to robots; `service`: robots that are out of service; `set`: sets of zones; `source`: muted sources
+of zones; `stop`: stops without a token, of which anybody may send any number.
 """
 
 PAGE_BYTES: Final = 256 * 1024

@@ -1,0 +1,28 @@
+"""What people keep of a robot beside its missions: whether it is in service at all."""
+
+from typing import Annotated
+
+from msgspec import Meta
+
+from fog_contracts.messages.basics import Author, Message, Stamp
+
+ServiceReason = Annotated[str, Meta(min_length=1, max_length=120)]
+
+
+class OutOfService(Message, frozen=True, kw_only=True):
+    """An operator keeps a robot out of service: it gets no goal from anybody until it is put back.
+
+    It is no safety condition: a robot that is out of service may be enabled, driven by hand, and leave a blocked area
+    on an operator's command. `id` is the record's version; `until` (s since the epoch) is when it ends by itself, None:
+    when somebody ends it.
+    """
+
+    id: Annotated[str, Meta(max_length=64)]
+    reason: ServiceReason
+    by: Author
+    since: Stamp
+    until: Stamp | None = None
+
+    def holds(self, stamp: float) -> bool:
+        """Whether it is in force at a time (s since the epoch)."""
+        return self.until is None or stamp < self.until

@@ -6,12 +6,13 @@ from typing import Any
 
 import yaml
 
-from fog_runtime.security.__main__ import OWNERS, SIMULATION
+from fog_runtime.security.__main__ import BRIDGE, OWNERS, SIMULATION
 
 ROOT = Path(__file__).parents[1]
 COMPOSE = yaml.safe_load((ROOT / "docker-compose.yml").read_text("utf-8"))
 SERVICES: dict[str, dict[str, Any]] = COMPOSE["services"]
-HANDS_OUT = {"credentials", "sim-credentials"}
+OPTIONAL = {"sim-credentials": SIMULATION, "bridge-credentials": BRIDGE}
+HANDS_OUT = {"credentials", *OPTIONAL}
 BEHIND = {"hazard-aggregator", "map-service", "planner", "console-service"}
 PI_MIB = 4096
 """Memory of the Raspberry Pi on which a fog node is to run."""
@@ -83,10 +84,10 @@ def test_each_program_mounts_its_own_credentials_and_no_other_s():
 def test_whoever_hands_out_secrets_has_no_network_and_a_place_for_each_program():
     for name in HANDS_OUT:
         assert SERVICES[name]["network_mode"] == "none"
-    assert {f"/out/{program}" for program in OWNERS} == {
-        path for path in mounts("sim-credentials") if path[:5] == "/out/"
-    }
-    assert {path: mounts("sim-credentials")[path] for path in mounts("credentials")} == mounts("credentials")
+    for name, program in OPTIONAL.items():
+        expected = {f"/out/{each}" for each in (OWNERS.keys() - {*OPTIONAL.values()}) | {program}}
+        assert {path for path in mounts(name) if path[:5] == "/out/"} == expected
+        assert {path: mounts(name)[path] for path in mounts("credentials")} == mounts("credentials")
 
 
 def test_no_secret_is_in_an_environment_or_a_command():
@@ -110,7 +111,7 @@ def test_services_believe_the_gateway_and_nobody_else_for_whom_it_asks():
 def test_memory_limits_leave_room_on_a_raspberry_pi():
     assert [name for name, service in SERVICES.items() if "mem_limit" not in service] == []
     always = {name: service for name, service in SERVICES.items() if service.get("restart") != "no"}
-    total = sum(mebibytes(service["mem_limit"]) for name, service in always.items() if name != "sim-robot")
+    total = sum(mebibytes(service["mem_limit"]) for service in always.values() if "profiles" not in service)
     assert total < PI_MIB * 3 / 4
 
 

@@ -44,7 +44,7 @@ def test_written_file_names_the_command_that_writes_it_again(tmp_path, monkeypat
 
 def test_each_floor_has_every_container_but_the_shared_ones(made):
     base = yaml.safe_load(COMPOSE)["services"]
-    shared = {*SERVERS, "mosquitto-relay", "credentials", "sim-credentials", "kernels"}
+    shared = {*SERVERS, "mosquitto-relay", "credentials", "bridge-credentials", "sim-credentials", "kernels"}
     expected = {f"{name}-{site}" for name in base.keys() - shared for site in ("attic", "first-floor")}
     assert made["services"].keys() - shared == expected
 

@@ -6,8 +6,11 @@ import asyncio
 import base64
 import io
 import json
+import os
 import time
 from contextlib import asynccontextmanager
+from pathlib import Path
+from urllib.parse import urlsplit
 
 import pytest
 from PIL import Image
@@ -16,6 +19,7 @@ from fog_bridges.floor import Request
 from fog_bridges.home_assistant import HomeAssistant, activity, discovery, report
 from fog_contracts import channels as ch
 from fog_contracts.messages import RobotState
+from fog_contracts.messages.basics import SENTENCE_MAX
 from fog_runtime.clock import SystemClock
 from fog_runtime.credentials import Credentials
 from fog_runtime.transports.mqtt_edge import MqttEdge
@@ -32,6 +36,28 @@ class Home:
 
     def report(self) -> dict[str, object]:
         return json.loads(self.of(ch.ROBOT_REPORT) or "{}")
+
+
+HOSTILE = "<script>alert(1)</script>{{ states }}\u202e".ljust(SENTENCE_MAX, "x")
+
+
+@asynccontextmanager
+async def robot_state(zenoh):
+    """Publish a robot that waits, with a hostile reason."""
+    state = RobotState(
+        mode="HOLD", reasons=[HOSTILE] * 2, enabled=False, battery=0.63, goal_id=None,
+        map_epoch=0, map_seq=0, plan_id=None, awaits_operator=True, stamp=time.time(),
+    )  # fmt: skip
+
+    async def publish() -> None:
+        while True:
+            zenoh.publish(ch.ROBOT_STATE, state, robot="r1")
+            await asyncio.sleep(0.2)
+
+    publishing = asyncio.create_task(publish())
+    yield
+    publishing.cancel()
+    await asyncio.gather(publishing, return_exceptions=True)
 
 
 @asynccontextmanager
@@ -63,10 +89,11 @@ async def bridge(all_services, tokens, tmp_path):
         for name, module in (("AGGREGATOR", "hazard_aggregator"), ("MAP", "map_service"), ("PLANNER", "planner"))
     }
     all_services.start("console_service", **{f"FOGNAV_{name}_URL": url for name, url in ports.items()})
-    token = tmp_path / "home-assistant.toml"
-    token.write_text(f'user = "anna"\ntoken = "{tokens["operator"]["Authorization"].removeprefix("Bearer ")}"\n')
+    token = tmp_path / "bridge.token"
+    token.write_text(tokens["operator"]["Authorization"].removeprefix("Bearer "))
     all_services.start(
         "fog_bridges",
+        FOGNAV_ADAPTERS="home-assistant",
         FOGNAV_CONSOLE_URL=await all_services.ready("console_service"),
         FOGNAV_TOKEN_FILE=str(token),
         FOGNAV_CREDENTIALS_FILE=str(all_services.security.credentials("bridge")),
@@ -77,24 +104,89 @@ async def bridge(all_services, tokens, tmp_path):
         all_services.kill(module)
 
 
+PYTHON = os.environ.get("FOGNAV_HOME_ASSISTANT", "")
+PEER = Path(__file__).parents[2] / "tests" / "support" / "home_assistant.py"
+
+
+class HomeItself:
+    """Home Assistant's own integration, in a process of its Python (`tests/support/home_assistant.py`)."""
+
+    @classmethod
+    @asynccontextmanager
+    async def of(cls, fog, folder: Path):
+        own, at = Credentials.read(fog.security.credentials("home-assistant")), urlsplit(fog.mosquitto.url)
+        broker = {
+            "broker": at.hostname, "port": at.port, "username": own.user, "password": own.passwords["mqtt"],
+            **({"certificate": own.authority} if at.scheme == "mqtts" else {}),
+        }  # fmt: skip
+        command = (PYTHON, str(PEER), str(folder), json.dumps(broker))
+        process = await asyncio.create_subprocess_exec(
+            *command, stdin=asyncio.subprocess.PIPE, stdout=asyncio.subprocess.PIPE, limit=1 << 22
+        )
+        try:
+            yield cls(process)
+        finally:
+            process.kill()
+            await process.wait()
+
+    def __init__(self, process: asyncio.subprocess.Process) -> None:
+        self._process = process
+
+    async def ask(self, question: str):
+        assert self._process.stdin is not None
+        assert self._process.stdout is not None
+        self._process.stdin.write(f"{question}\n".encode())
+        return json.loads(await self._process.stdout.readline())
+
+    async def wait(self, entity: str, part: str) -> dict[str, list]:
+        """Wait until an entity's state has this part; return those of all."""
+        async with asyncio.timeout(60.0):
+            while part not in (found := await self.ask("states")).get(entity, [""])[0]:  # noqa: ASYNC110  # a program is asked
+                await asyncio.sleep(0.2)
+        return found
+
+
+@pytest.mark.live
+@pytest.mark.skipif(
+    not PYTHON,
+    reason="needs Home Assistant: uv venv --python 3.13 H, uv pip install --python H homeassistant paho-mqtt, "
+    "FOGNAV_HOME_ASSISTANT=H/bin/python",
+)
+async def test_home_assistant_itself_shows_all_of_a_robot_and_its_services_reach_the_floor(bridge, tmp_path):
+    async with bridge.edges() as (_, zenoh, _connect), robot_state(zenoh), HomeItself.of(bridge, tmp_path) as home:
+        found = await home.wait("sensor.r1_battery", "63")
+        expected = {
+            "vacuum.r1": "idle", "sensor.r1_mode": "HOLD", "sensor.r1_why_it_stands": f"{HOSTILE}; {HOSTILE}"[:255],
+            "binary_sensor.r1_charging": "off", "binary_sensor.r1_problem": "off",
+            "binary_sensor.r1_waits_for_an_operator": "on", "select.r1_goal": "no goal",
+        }  # fmt: skip
+        assert {entity: found[entity][0] for entity in expected} == expected
+        assert {
+            "button.r1_stop",
+            "button.r1_end_the_mission",
+            "sensor.r1_refused_order",
+            "image.r1_map",
+        } <= found.keys()
+        assert len(found["image.r1_map"][1]["calibration_points"]) == 3
+        for order, reason in (  # the robot of this test does not answer
+            ('button press {"entity_id": "button.r1_stop"}', "r1 did not answer"),
+            ('vacuum return_to_base {"entity_id": "vacuum.r1"}', "has no dock"),
+        ):
+            await home.ask(f"call {order}")
+            await home.wait("sensor.r1_refused_order", reason)
+        assert await home.ask("log") == []
+        bridge.kill("console_service")
+        await home.wait("vacuum.r1", "unavailable")
+        bridge.start("console_service")
+
+
 @pytest.mark.live
 async def test_robot_is_a_device_with_state_map_and_orders_and_refusals_are_told(bridge, until):
     async with bridge.edges() as (_, zenoh, _connect), home_of(bridge) as (home, mqtt):
-        state = RobotState(
-            mode="HOLD", reasons=["waiting for an operator to enable"], enabled=False, battery=0.63, goal_id=None,
-            map_epoch=0, map_seq=0, plan_id=None, awaits_operator=True, stamp=time.time(),
-        )  # fmt: skip
-
-        async def publish() -> None:
-            while True:
-                zenoh.publish(ch.ROBOT_STATE, state, robot="r1")
-                await asyncio.sleep(0.2)
-
-        publishing = asyncio.create_task(publish())
-        try:
+        async with robot_state(zenoh):
             await until(lambda: home.report().get("battery") == 63, "its battery is known")
             await until(lambda: home.of(ch.HOME_ASSISTANT_ROBOT), "its device is known", lambda: str(home.told.keys()))
-            assert home.report()["why"] == "waiting for an operator to enable"
+            assert home.report()["why"] == f"{HOSTILE}; {HOSTILE}"[:255]
             assert home.report()["waits_for_operator"] == "ON"
             device = json.loads(home.of(ch.HOME_ASSISTANT_ROBOT))
             assert device["availability_topic"] == "fog/v1/test/bridge/availability"
@@ -114,8 +206,6 @@ async def test_robot_is_a_device_with_state_map_and_orders_and_refusals_are_told
                 home.told.pop((ch.ROBOT_REFUSAL.name, "r1"), None)
                 await mqtt.publish(ch.ROBOT_ORDER, order, robot="r1")
                 await until(lambda words=words: words in home.of(ch.ROBOT_REFUSAL), f"{order} is refused: {words}")
-        finally:
-            publishing.cancel()
         bridge.kill("console_service")
         await until(lambda: home.of(ch.BRIDGE_AVAILABILITY, "") == "offline", "nobody knows the floor's state")
         bridge.start("console_service")
@@ -144,7 +234,7 @@ def test_orders_become_requests_of_operators_and_nothing_enables():
         core.on_event(name, data)
     assert core.on_command("r1", "stop") == Request("POST", "/api/v1/robots/r1/stop")
     assert core.on_command("r1", "goal b") == Request("PUT", "/api/v1/robots/r1/goal", {"place": "b"})
-    assert core.on_command("r1", "goal none") == core.on_command("r1", "cancel")
+    assert core.on_command("r1", "goal no goal") == core.on_command("r1", "cancel")
     assert core.on_command("r1", "return_to_base").body == {"kind": "dock"}
     for robot, text in (("r1", "enable"), ("r1", "reset"), ("r1", "goal ../x"), ("r2", "stop"), ("r1", "")):
         assert isinstance(core.on_command(robot, text), str), text
@@ -180,6 +270,6 @@ def test_broker_that_lost_everything_is_told_again():
 
 def test_words_of_a_robot_and_many_places_keep_the_limits_of_their_topics():
     long = view(reasons=["x" * 500] * 8)
-    assert len(report(long)) <= ch.ROBOT_REPORT.limit
-    assert len(json.loads(report(long))["why"]) == 255
+    assert len(report(long, ())) <= ch.ROBOT_REPORT.limit
+    assert len(json.loads(report(long, ()))["why"]) == 255
     assert len(discovery("s" * 32, "r" * 32, [f"place-{n:026}" for n in range(100)])) <= ch.HOME_ASSISTANT_ROBOT.limit

@@ -28,6 +28,7 @@ from fog_contracts.messages import RobotPose, RobotState
 from fog_runtime.clock import SystemClock
 from fog_runtime.configuration.maps import load_map, save_map
 from fog_runtime.credentials import Credentials
+from fog_runtime.transports.mqtt_connection import Broker
 from fog_runtime.transports.zenoh_edge import ZenohEdge
 from fog_supervisor import child, net
 from fognav.__main__ import app
@@ -223,6 +224,35 @@ def test_zone_survives_a_killed_service_and_a_restart_of_the_node(node, tmp_path
     assert "wet floor" in zones
     assert "after the backup" not in zones
     node.down()
+
+
+async def told_home_assistant(node: Node, word: str) -> None:
+    """Wait until the bridge tells Home Assistant, by its own user, that it knows the floor, or that it does not."""
+    own = Credentials.read(node.data / "locks" / "credentials" / "home-assistant.toml")
+    broker = Broker.of(f"mqtts://127.0.0.1:{node.environment['FOGNAV_MQTT_PORT']}", own)
+    async with asyncio.timeout(START_S), broker.client("home-assistant", None) as client:
+        await client.subscribe(ch.BRIDGE_AVAILABILITY.key(site="estig"))
+        async for message in client.messages:
+            if message.payload == word.encode():
+                return
+
+
+def test_bridge_to_home_assistant_is_kept_running(tmp_path):
+    settings = tmp_path / "bridge.toml"
+    settings.write_text('adapters = "home-assistant"\n')
+    node = Node(tmp_path, "--bridge", str(settings))
+    try:
+        node.up()
+        asyncio.run(told_home_assistant(node, ch.ONLINE))
+        bridge = node.systems()["estig"]["pids"]["bridge"]
+        os.kill(bridge, signal.SIGKILL)
+        node.wait(lambda: node.systems()["estig"]["pids"].get("bridge", bridge) != bridge, "it is started again")
+        asyncio.run(told_home_assistant(node, ch.ONLINE))
+        assert node.run("logs", "bridge", "-n", "1000").count("settings_loaded") == 2
+        assert "bridge: operator" in node.run("token", "list")
+        node.down()
+    finally:
+        node.end()
 
 
 def walled(source: Path, target: Path, left: float, bottom: float, right: float, top: float) -> Path:

@@ -1,10 +1,18 @@
-"""The bridges: `python -m fog_bridges`, configured by FOGNAV_* variables. A floor runs without it."""
+"""The bridges: `python -m fog_bridges`, configured by FOGNAV_* variables and a file. A floor runs without them.
+
+`--check` only says whether the settings can be used.
+"""
 
 from __future__ import annotations
 
 import asyncio
 import os
+import sys
 from pathlib import Path
+from typing import TYPE_CHECKING, Final
+from urllib.parse import urlsplit
+
+import msgspec
 
 from fog_bridges.floor import Floor
 from fog_bridges.home_assistant import HomeAssistant
@@ -13,47 +21,118 @@ from fog_contracts import channels as ch
 from fog_runtime import logs, process
 from fog_runtime.clock import SystemClock, ticker
 from fog_runtime.configuration.settings import CommonSettings, SettingsError, describe, load
-from fog_runtime.configuration.site import load_site
-from fog_runtime.credentials import Credentials
+from fog_runtime.configuration.site import SiteError, load_site
+from fog_runtime.credentials import Credentials, CredentialsError
 from fog_runtime.health import Health
 from fog_runtime.http import make_app, serve_here
 from fog_runtime.http.tokens import Tokens
 from fog_runtime.leadership import process_id
 from fog_runtime.transports.mqtt_edge import MqttEdge, Will
 
+if TYPE_CHECKING:
+    from collections.abc import Callable, Mapping
+
+    from fog_runtime.clock import Clock
+
+FILE: Final = "FOGNAV_BRIDGE_FILE"
+"""Names the file of settings; paths in it are relative to its folder."""
 _log = logs.get("bridge")
 
 
 class Settings(CommonSettings, frozen=True, kw_only=True):
-    """The console's address, and the file of a token for it, as `fognav token create --out` writes it."""
+    """What to connect with what; `site_dir` is needed without `site` only, and `data_dir` never."""
 
+    site_dir: Path = Path()
+    data_dir: Path = Path()
+    adapters: str
+    """Which systems are told of robots: names of `ADAPTERS`, comma separated."""
     console_url: str
-    token_file: Path
+    token_file: Path | None = None
+    """A file with an operator's token for the console; None: the token in `credentials_file`."""
+    home_assistant_mqtt_url: str = ""
+    """Home Assistant's broker; empty: Fognav's own, with the bridge's user there."""
+    home_assistant_credentials_file: Path | None = None
+    """User, password and authority of Home Assistant's broker, as `credentials_file` has those of Fognav's."""
+    home_assistant_unencrypted: bool = False
+    """Whether that password may cross the network readable for everybody in it."""
+
+    @property
+    def names(self) -> list[str]:
+        """The adapters; raises `SettingsError` for one that is unknown, and without any."""
+        names = [part.strip() for part in self.adapters.split(",") if part.strip()]
+        if unknown := [name for name in names if name not in ADAPTERS] or ([] if names else [""]):
+            raise SettingsError(f"adapters: {unknown[0]!r} is none. Name one or several of: {', '.join(ADAPTERS)}")
+        return names
+
+    def token(self) -> str:
+        """Read the token for the console; raises `SettingsError`, `CredentialsError`."""
+        try:
+            text = self.credentials().token if self.token_file is None else self.token_file.read_text("ascii").strip()
+        except (OSError, UnicodeDecodeError) as error:
+            raise SettingsError(f"the token file {self.token_file} can't be read: {error}. {_MAKE_TOKEN}") from error
+        if not text:
+            where = self.token_file or self.credentials_file or "no credentials (FOGNAV_CREDENTIALS_FILE is not set)"
+            raise SettingsError(f"there is no token in {where}. {_MAKE_TOKEN}")
+        return text
+
+
+_FILES: Final = ("credentials_file", "token_file", "home_assistant_credentials_file")
+_MAKE_TOKEN: Final = "Make one: fognav token create bridge --role operator --file TOKENS > FILE"  # noqa: S105  # no token
+
+
+def _home_assistant(settings: Settings, site: str, clock: Clock) -> HomeAssistantBridge:
+    url = settings.home_assistant_mqtt_url
+    if not url:
+        url, own = settings.mqtt_url, settings.credentials()
+    elif urlsplit(url.partition(",")[0]).username:
+        raise SettingsError(
+            "home_assistant_mqtt_url has a user: name user and password in home_assistant_credentials_file, "
+            "which no log shows"
+        )
+    else:
+        file = settings.home_assistant_credentials_file
+        own = Credentials.read(file, readable=settings.home_assistant_unencrypted)
+    will = Will(ch.BRIDGE_AVAILABILITY, ch.OFFLINE)
+    try:
+        mqtt = MqttEdge(url, process_id("bridge"), clock, site=site, will=will, credentials=own)
+    except CredentialsError as error:
+        raise SettingsError(f"{error}. Or say that it may: home_assistant_unencrypted = true") from error
+    except ValueError as error:
+        raise SettingsError(f"home_assistant_mqtt_url: {error}") from error
+    return HomeAssistantBridge(HomeAssistant(site), mqtt)
+
+
+ADAPTERS: Final[Mapping[str, Callable[[Settings, str, Clock], HomeAssistantBridge]]] = {
+    "home-assistant": _home_assistant
+}
+
+
+def read_settings() -> Settings:
+    """Read the settings from the environment and its file; raises `SettingsError`."""
+    named = os.environ.get(FILE)
+    settings = load(Settings, file=Path(named) if named else None, environ=os.environ)
+    files = {name: getattr(settings, name) for name in _FILES}
+    folder = Path(named).parent if named else Path()
+    return msgspec.structs.replace(settings, **{name: folder / file for name, file in files.items() if file})
 
 
 async def main() -> None:
     """Connect, then serve until cancelled."""
-    settings = load(Settings, environ=os.environ)
+    settings = read_settings()
     logs.configure("bridge", settings.log_level, settings.log_format)
     _log.info("settings_loaded", **describe(settings))
     site = settings.site or load_site(settings.site_dir).site.id
-    own, caller = settings.credentials(), Credentials.read(settings.token_file)
-    if not caller.token:
-        raise SettingsError(
-            f"{settings.token_file} has no token. Make one: fognav token create home-assistant --role operator "
-            "--file TOKENS --credentials DIR --out FILE"
-        )
-    clock, health = SystemClock(settings.speed), Health("floor", "mqtt")
-    will = Will(ch.BRIDGE_AVAILABILITY, ch.OFFLINE)
-    mqtt = MqttEdge(settings.mqtt_url, process_id("bridge"), clock, site=site, will=will, credentials=own)
-    encrypted = settings.console_url.startswith("https:")
-    floor = Floor(settings.console_url, caller.token, caller.tls_context() if encrypted else True)
-    bridge = HomeAssistantBridge(HomeAssistant(site), floor, mqtt)
+    clock = SystemClock(settings.speed)
+    adapters = [ADAPTERS[name](settings, site, clock) for name in settings.names]
+    health = Health("floor", *(each.name for each in adapters))
+    trusted = settings.credentials().tls_context() if settings.console_url.startswith("https:") else True
+    floor = Floor(settings.console_url, settings.token(), trusted)
 
     async def health_loop() -> None:
         async for _ in ticker(clock, 0.2):
-            health.set("mqtt", ok=mqtt.connected, detail="" if mqtt.connected else "not connected")
             health.set("floor", ok=not floor.problem, detail=floor.problem)
+            for each in adapters:
+                health.set(each.name, ok=not each.problem, detail=each.problem)
 
     app = make_app("Fognav bridges", health, Tokens())
     serving = serve_here(
@@ -62,15 +141,27 @@ async def main() -> None:
     )  # fmt: skip
     try:
         async with asyncio.TaskGroup() as tasks:
-            tasks.create_task(mqtt.run(), name="mqtt")
-            tasks.create_task(floor.follow(bridge.on_event, bridge.on_lost), name="floor")
-            tasks.create_task(bridge.order_loop(), name="orders")
-            tasks.create_task(bridge.picture_loop(clock), name="picture")
+            for each in adapters:
+                tasks.create_task(each.run(floor, clock), name=each.name)
+            tasks.create_task(floor.follow(adapters), name="floor")
             tasks.create_task(health_loop(), name="health")
             tasks.create_task(serving, name="http")
     finally:
         await floor.aclose()
 
 
+async def _check() -> None:
+    """Raise as `main` would for settings that can't be used."""
+    settings = read_settings()
+    for name in settings.names:
+        ADAPTERS[name](settings, settings.site or "check", SystemClock())
+
+
 if __name__ == "__main__":
-    process.run(main)
+    if sys.argv[1:] == ["--check"]:
+        try:
+            asyncio.run(_check())
+        except (SettingsError, CredentialsError, SiteError) as problem:
+            sys.exit(str(problem))
+    else:
+        process.run(main)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import asyncio
-from typing import TYPE_CHECKING, Any, Final, NamedTuple
+from typing import TYPE_CHECKING, Any, Final, NamedTuple, Protocol
 
 import httpx
 import msgspec
@@ -12,7 +12,7 @@ from fog_runtime import logs
 
 if TYPE_CHECKING:
     import ssl
-    from collections.abc import AsyncIterator, Callable
+    from collections.abc import AsyncIterator, Sequence
 
 RETRY_S: Final = 2.0
 SILENT_S: Final = 5.0
@@ -27,6 +27,16 @@ class Request(NamedTuple):
     method: str
     path: str
     body: dict[str, Any] | None = None
+
+
+class Adapter(Protocol):
+    """Who tells another system of the floor."""
+
+    def on_event(self, name: str, data: dict[str, Any]) -> object:
+        """Take in an event of the floor."""
+
+    def on_lost(self) -> object:
+        """Take in that nobody knows the floor's state."""
 
 
 class Floor:
@@ -58,8 +68,8 @@ class Floor:
         except (ValueError, KeyError, TypeError):
             return f"{answer.status_code} {answer.reason_phrase}"
 
-    async def follow(self, on_event: Callable[[str, dict[str, Any]], object], on_lost: Callable[[], object]) -> None:
-        """Pass on each event with its data; `on_lost` is called when the state is not known any more. Never returns."""
+    async def follow(self, adapters: Sequence[Adapter]) -> None:
+        """Pass each event on to all adapters, and when the state is not known any more, that. Never returns."""
         while True:
             try:
                 async with self._client.stream(
@@ -70,14 +80,16 @@ class Floor:
                     lines.raise_for_status()
                     async for name, data in self._events(lines):
                         self.problem = ""
-                        on_event(name, data)
+                        for each in adapters:
+                            each.on_event(name, data)
                 problem = "the console ended the stream"
             except (httpx.HTTPError, msgspec.MsgspecError) as error:
                 problem = f"{self._client.base_url}api/v1/events: {error!r}"
             if not self.problem or self.problem != problem:
                 _log.warning("floor_lost", reason=problem)
             self.problem = problem
-            on_lost()
+            for each in adapters:
+                each.on_lost()
             await asyncio.sleep(RETRY_S)
 
     def _resumed(self) -> dict[str, str]:

@@ -16,14 +16,15 @@ from fog_contracts import channels as ch
 from fog_contracts.handlers import Publication
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator, Mapping, Sequence
+    from collections.abc import Collection, Iterator, Mapping, Sequence
 
 STOP: Final = "stop"
 CANCEL: Final = "cancel"
 DOCK: Final = "return_to_base"
 GOAL: Final = "goal "
 """What Home Assistant sends: a place's id follows."""
-_NO_GOAL: Final = "none"
+_NO_GOAL: Final = "no goal"
+"""No place's id has a space, and Home Assistant takes "none" for an unknown choice."""
 _ERRORS: Final = ("FAULT", "PROTECTIVE_STOP")
 _CHARGING: Final = ("reconditioning", "bulk", "trickle")
 _MOST: Final = 255
@@ -93,7 +94,7 @@ class HomeAssistant:
             for channel in (ch.ROBOT_REPORT, ch.ROBOT_REFUSAL):
                 yield Publication(channel, None, {"robot": robot})
         for robot, view in sorted(self._robots.items()):
-            now = discovery(self._site, robot, self._places), report(view)
+            now = discovery(self._site, robot, self._places), report(view, self._places)
             before = self._told.get(robot, ("", ""))
             self._told[robot] = now
             if before[0] != now[0]:
@@ -102,7 +103,7 @@ class HomeAssistant:
                 yield Publication(ch.ROBOT_REPORT, now[1], {"robot": robot})
 
 
-def report(view: Mapping[str, Any]) -> str:
+def report(view: Mapping[str, Any], places: Collection[str]) -> str:
     """Return what is told of a robot (JSON), from what the console tells of it: fields of `discovery`'s templates."""
     state, goal = view["state"] or {}, view["goal"] or {}
     mode, power = state.get("mode"), state.get("power") or {}
@@ -115,7 +116,8 @@ def report(view: Mapping[str, Any]) -> str:
         "battery": None if battery is None else round(100.0 * battery),
         "charging": "ON" if power.get("charging") in _CHARGING else "OFF",
         "problem": "ON" if mode in _ERRORS else "OFF",
-        "goal": goal.get("place") or (_NO_GOAL if not goal else "a point"),
+        # A choice that is not among the options is an error there: a point on the floor is none of them.
+        "goal": _NO_GOAL if not goal else goal.get("place") if goal.get("place") in places else None,
         "waits_for_operator": "ON" if state.get("awaits_operator") else "OFF",
     }
     return msgspec.json.encode(found).decode()
@@ -142,7 +144,7 @@ def discovery(site: str, robot: str, places: Sequence[str]) -> str:
     command = ch.ROBOT_ORDER.key(site=site, robot=robot)
     components: dict[str, dict[str, Any]] = {
         "vacuum": {
-            "p": "vacuum", "name": None, "supported_features": ["stop", "return_home", "status"],
+            "p": "vacuum", "name": None, "supported_features": ["stop", "return_home"],
             "command_topic": command, "payload_stop": STOP, "payload_return_to_base": DOCK,
         },
         "battery": {

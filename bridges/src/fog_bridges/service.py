@@ -29,17 +29,30 @@ _log = logs.get("bridge")
 
 
 class HomeAssistantBridge:
-    """The running bridge; its loops are tasks of the process."""
+    """The adapter for Home Assistant, at its broker or Fognav's."""
 
-    def __init__(self, core: HomeAssistant, floor: Floor, mqtt: MqttEdge) -> None:
+    name: Final = "home-assistant"
+
+    def __init__(self, core: HomeAssistant, mqtt: MqttEdge) -> None:
         self._core = core
-        self._floor = floor
         self._mqtt = mqtt
         self._picture = Picture()
         self._orders: asyncio.Queue[tuple[str, str]] = asyncio.Queue(ORDERS_AT_ONCE)
         self._is_known = False
         mqtt.on(ch.ROBOT_ORDER, self._on_order)
         mqtt.on_connect(self._tell_everything)
+
+    @property
+    def problem(self) -> str:
+        """Why Home Assistant is told nothing; empty while it is."""
+        return "" if self._mqtt.connected else "its broker is not connected"
+
+    async def run(self, floor: Floor, clock: Clock) -> None:
+        """Connect, and do all until cancelled."""
+        async with asyncio.TaskGroup() as tasks:
+            tasks.create_task(self._mqtt.run(), name="mqtt")
+            tasks.create_task(self._order_loop(floor), name="orders")
+            tasks.create_task(self._picture_loop(clock), name="picture")
 
     def on_event(self, name: str, data: dict[str, Any]) -> None:
         """Pass on an event of the floor."""
@@ -52,17 +65,17 @@ class HomeAssistantBridge:
         """Say that nobody knows the floor's state."""
         self._tell_availability(known=False)
 
-    async def order_loop(self) -> None:
+    async def _order_loop(self, floor: Floor) -> None:
         """Carry out orders, one after the other; what a robot refuses is told where the order came from."""
         while True:
             robot, text = await self._orders.get()
             request = self._core.on_command(robot, text)
-            refusal = request if isinstance(request, str) else await self._floor.send(request)
-            ORDERS.labels("home-assistant", "refused" if refusal else "accepted").inc()
+            refusal = request if isinstance(request, str) else await floor.send(request)
+            ORDERS.labels(self.name, "refused" if refusal else "accepted").inc()
             _log.info("order", robot=robot, order=text, refusal=refusal)
             await self._mqtt.publish(ch.ROBOT_REFUSAL, refusal[:250], robot=robot)
 
-    async def picture_loop(self, clock: Clock) -> None:
+    async def _picture_loop(self, clock: Clock) -> None:
         """Draw the map when it or a robot on it has changed."""
         async for _ in ticker(clock, PICTURE_S):
             if self._picture.changed and (drawn := await asyncio.to_thread(self._picture.draw)) is not None:
@@ -73,7 +86,7 @@ class HomeAssistantBridge:
         try:
             self._orders.put_nowait((ids["robot"], text))
         except asyncio.QueueFull:
-            ORDERS.labels("home-assistant", "dropped").inc()
+            ORDERS.labels(self.name, "dropped").inc()
             _log.warning("order_dropped", robot=ids["robot"], order=text, reason=f"{ORDERS_AT_ONCE} wait already")
 
     async def _tell_everything(self) -> None:

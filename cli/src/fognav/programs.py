@@ -26,6 +26,7 @@ AGGREGATOR: Final = "hazard-aggregator"
 MAP_SERVICE: Final = "map-service"
 PLANNER: Final = "planner"
 CONSOLE: Final = "console-service"
+BRIDGE: Final = "bridge"
 SIMULATOR: Final = "simulator"
 WATCHDOG: Final = "robot-watchdog"
 AGENT: Final = "robot-agent"
@@ -39,6 +40,7 @@ MODULES: Final[Mapping[str, str]] = {
     MAP_SERVICE: "map_service",
     PLANNER: "planner",
     CONSOLE: "console_service",
+    BRIDGE: "fog_bridges",
     SIMULATOR: "fognav_sim",
     WATCHDOG: "robot_agent.guardian.watchdog",
     AGENT: "robot_agent",

@@ -8,6 +8,7 @@ from fognav.commands import installed, map_change, robot  # noqa: F401  # they a
 from fognav.commands.access import ca_app, robot_add, token_app
 from fognav.commands.area import alert_app, area_app
 from fognav.commands.backup import backup_command, restore_command, store_app
+from fognav.commands.bridge import bridge_command
 from fognav.commands.demo import demo_command, record_command, replay_command
 from fognav.commands.develop import channels_command, check_command, docs_command, run_tests
 from fognav.commands.map_clean import map_clean
@@ -49,6 +50,7 @@ def add_to(app: typer.Typer) -> None:
         (installed.RUN, "up", up_command, "up --site sites/estig --site sites/floor2"),
         (installed.RUN, "down", down_command, "down"),
         (installed.RUN, "logs", logs_command, "logs map-service -f"),
+        (installed.RUN, "bridge", bridge_command, "bridge bridge.toml"),
         (installed.RUN, "upgrade", upgrade_command, "upgrade --check"),
         (installed.RUN, "backup", backup_command, f"backup {backup}"),
         (installed.RUN, "restore", restore_command, f"restore {backup}"),

@@ -8,6 +8,7 @@ from typing import Annotated, Final
 import typer
 
 from fognav import checkout, console_page, kernels, system
+from fognav.commands.bridge import require_bridge
 from fognav.credentials import own_hosts, security_errors
 from fognav.hosting import local_nodes
 from fognav.hosting.fog_node import NodeConfig, run_node
@@ -37,6 +38,10 @@ def up_command(  # noqa: PLR0913  # each option is an argument
         list[str] | None,
         typer.Option("--host", metavar="NAME", help="Another name of this computer, for its certificates."),
     ] = None,
+    bridge: Annotated[
+        Path | None,
+        typer.Option("--bridge", metavar="FILE", help="Tell other systems of robots: settings (docs/interop.md)."),
+    ] = None,
     sim: Annotated[bool, typer.Option("--sim", help="Simulate each site's first robot and its sensor nodes.")] = False,
     check: Annotated[bool, typer.Option("--check", help="End it as soon as everything is ready.")] = False,
     systemd: Annotated[bool, typer.Option("--systemd", help="Write a unit for systemd instead of running.")] = False,
@@ -50,10 +55,14 @@ def up_command(  # noqa: PLR0913  # each option is an argument
     with exit_codes(), security_errors():
         folders = [checkout.site_folder(each) for each in site] if site else [checkout.site_folder(None)]
         path = (data or default_data()).absolute()
+        if bridge is not None:
+            bridge = bridge.absolute()
+            require_bridge(bridge)
         if systemd:
             options = [word for each in folders for word in ("--site", str(each))]
             options += ["--data", str(path), "--bind", bind, *(["--sim"] if sim else [])]
             options += [word for each in host or [] for word in ("--host", each)]
+            options += ["--bridge", str(bridge)] if bridge else []
             print_line(f"wrote {write_unit(['up', *options])}. Start it now and at each boot:")
             print_line(f"  systemctl --user daemon-reload && systemctl --user enable --now {UNIT}")
             print_line(f"  loginctl enable-linger {os.environ.get('USER', '$USER')}")
@@ -63,15 +72,13 @@ def up_command(  # noqa: PLR0913  # each option is an argument
         console_page.build_in_background(checkout.root(), print_line)
         folder = NodeFolder(path)
         with folder.in_use():
-            _run(folders, folder, bind, host or [], sim=sim, check=check)
-
-
-def _run(folders: list[Path], folder: NodeFolder, bind: str, hosts: list[str], *, sim: bool, check: bool) -> None:
-
-    sites, security = hosted_sites(folders, folder.security, [*own_hosts(), *hosts])
-    config = NodeConfig(folder=folder, sites=sites, security=security, address=bind, simulate=sim)
-    remember(folder.path, settings_of({site.id: site.directory for site in sites}, bind, hosts, simulate=sim))
-    asyncio.run(run_node(config, print_line, check=check))
+            sites, security = hosted_sites(folders, folder.security, [*own_hosts(), *(host or [])])
+            config = NodeConfig(
+                folder=folder, sites=sites, security=security, address=bind, simulate=sim, bridge=bridge
+            )
+            directories = {each.id: each.directory for each in sites}
+            remember(folder.path, settings_of(directories, bind, host or [], simulate=sim, bridge=bridge))
+            asyncio.run(run_node(config, print_line, check=check))
 
 
 def down_command(

@@ -24,9 +24,9 @@ BASE: Final = "docker-compose.yml"
 OVERRIDE: Final = "docker-compose.override.yml"
 """What compose reads besides, without being told."""
 HEADER: Final = "# Written by `fognav site compose"
-_SHARED: Final = frozenset(
-    {"credentials", "sim-credentials", "kernels", "mosquitto", "mosquitto-relay", "redis", "zenoh"}
-)
+_OPTIONAL: Final = {"sim-credentials": {"simulation": "sim-locks"}, "bridge-credentials": {"bridge": "bridge-locks"}}
+"""Who hands out what not every fog node has: each program's volume."""
+_SHARED: Final = frozenset({"credentials", *_OPTIONAL, "kernels", "mosquitto", "mosquitto-relay", "redis", "zenoh"})
 _OUTSIDE: Final = "outside"
 """The gateways' way out, which has no names that could be mixed up."""
 _SITE: Final = re.compile(r"^\$\{FOGNAV_SITE:-[^}]*\}:/site")
@@ -60,7 +60,7 @@ def override(folders: Sequence[Path], compose: str) -> str:
     base = yaml.safe_load(compose)
     services: _Part = {name: {"networks": {}} for name in ("mosquitto", "redis", "zenoh")}
     services["credentials"] = {"environment": {"FOGNAV_FLOORS_DIR": "/floors"}, "volumes": []}
-    services["sim-credentials"] = copy.deepcopy(services["credentials"])
+    services |= {name: copy.deepcopy(services["credentials"]) for name in _OPTIONAL}
     made: _Part = {"services": services, "networks": {}, "volumes": {}}
     for index, (site, folder) in enumerate(zip(load_sites(folders), folders, strict=True), start=1):
         _add(made, base, _Floor(site, folder, index))
@@ -138,8 +138,8 @@ def _service(base: Mapping[str, Any], name: str, own: Sequence[str], floor: _Flo
 def _add_credentials(services: _Part, floor: _Floor) -> None:
     """Let the containers that hand out credentials know the floor, and give them a place for each of its programs."""
     places = {service: f"{service}-locks-{floor.site}" for service in _PROGRAMS}
-    for name in ("credentials", "sim-credentials"):
-        own = places | ({"simulation": f"sim-locks-{floor.site}"} if name == "sim-credentials" else {})
+    for name in ("credentials", *_OPTIONAL):
+        own = places | {program: f"{volume}-{floor.site}" for program, volume in _OPTIONAL.get(name, {}).items()}
         services[name]["volumes"] += [
             f"{floor.folder}:/floors/{floor.site}:ro",
             *(f"{volume}:{_OUT}/{floor.site}/{program}" for program, volume in own.items()),

@@ -23,9 +23,10 @@ from typing import Final
 
 from fog_runtime import machine
 from fog_runtime.configuration.parts import DEFAULT_BASE, DEFAULT_LIDAR
-from fog_runtime.keys import ADMIN_TOKEN, OPERATOR_KEY, SESSION_KEY, TOKENS
+from fog_runtime.keys import ADMIN_TOKEN, BRIDGE_TOKEN, OPERATOR_KEY, SESSION_KEY, TOKENS
 from fog_runtime.machine import ServiceManager
 from fog_runtime.security.site_security import CERTIFICATE, KEY, SiteSecurity
+from fog_runtime.token_file import keep_token
 from fog_supervisor import net
 from fog_supervisor.supervisor import Event, Supervisor
 from fognav.hosting import local_nodes
@@ -35,6 +36,7 @@ from fognav.operate.systems import MQTTS_PORT, ZENOH_PORT, Registration, System,
 from fognav.output import FailedError, WrongUseError
 from fognav.programs import (
     AGENT,
+    BRIDGE,
     BROKER,
     CONSOLE,
     MODULES,
@@ -131,6 +133,8 @@ class NodeConfig:
     security: SiteSecurity
     address: str
     simulate: bool = False
+    bridge: Path | None = None
+    """Settings of each site's bridge to other systems; None: it has none."""
 
 
 class LocalNode:
@@ -159,6 +163,8 @@ class LocalNode:
             self._programs.add_server(program)
         for site in config.sites:
             self._add_services(site)
+            if config.bridge is not None:
+                self._add_bridge(site, config.bridge)
             if config.simulate:
                 self._add_robot(site)
 
@@ -179,13 +185,16 @@ class LocalNode:
     async def start(self, timeout_s: float) -> None:
         """Start everything, servers first, and wait until each program is ready; raises `NotReadyError`."""
         # Services before nodes and robots, so that no message is missed; the simulator makes the robot's devices.
-        robot_parts = [name for name in self.supervisor.names if name not in {*SERVERS, *self.service_names}]
+        bridges = [site.name(BRIDGE) for site in self.config.sites if self.config.bridge is not None]
+        robot_parts = [name for name in self.supervisor.names if name not in {*SERVERS, *self.service_names, *bridges}]
         simulators = [name for name in robot_parts if name.endswith(SIMULATOR)]
         agents = [name for name in robot_parts if name not in simulators]
         for names in (SERVERS, self.service_names, simulators, agents):
             for name in names:
                 self.supervisor.start(name)
             await self.supervisor.wait_ready(names, timeout_s)
+        for name in bridges:
+            self.supervisor.start(name)
 
     def credential_changes(self) -> CredentialChanges:
         """Watch the files of every program's credentials, those of simulated nodes and robots, too."""
@@ -201,7 +210,12 @@ class LocalNode:
             for service in SERVICES
         }
         robots = {} if not self.config.simulate else self._robot_credentials()
-        return CredentialChanges(self.supervisor, servers | services | robots)
+        bridges = {
+            site.name(BRIDGE): [security.credentials(site.name(BRIDGE)), self.config.bridge]
+            for site in self.config.sites
+            if self.config.bridge is not None
+        }
+        return CredentialChanges(self.supervisor, servers | services | bridges | robots)
 
     def _robot_credentials(self) -> dict[str, list[Path]]:
         files: dict[str, list[Path]] = {}
@@ -267,6 +281,19 @@ class LocalNode:
                 **(behind if service == CONSOLE else {}),
             }
             self._add(site, service, settings)
+
+    def _add_bridge(self, site: HostedSite, file: Path) -> None:
+        token = self._keys[site.id] / BRIDGE_TOKEN
+        keep_token(token.with_name(TOKENS), BRIDGE, "operator", token)
+        settings = {
+            "BRIDGE_FILE": str(file),
+            "CONSOLE_URL": f"https://{net.reachable(self.config.address)}:{site.ports[CONSOLE]}",
+            "TOKEN_FILE": str(token),
+            **self._credentials(site, BRIDGE),
+        }
+        # Whether it is connected is not asked: other systems may be away for days.
+        ready = partial(exists, self.config.folder.port_file(site.name(BRIDGE)))
+        self._add(site, BRIDGE, settings, ready=ready)
 
     def _add_robot(self, site: HostedSite) -> None:
         robots = site.loaded.site.robots

@@ -125,12 +125,16 @@ _PORTS: Final = (MQTTS_PORT, REDIS_PORT, ZENOH_PORT, *SERVICE_PORTS.values())
 
 
 class NodeSettings(msgspec.Struct, frozen=True, kw_only=True):
-    """The options of `fognav up`: `sites` are folders by their sites' ids, and `ports` are by their variables."""
+    """The options of `fognav up`: `sites` are folders by their sites' ids, and `ports` are by their variables.
+
+    `bridge` is the file of the bridges' settings, empty without any.
+    """
 
     sites: dict[str, str]
     address: str
     hosts: list[str]
     simulate: bool = False
+    bridge: str = ""
     ports: dict[str, int]
 
     @property
@@ -138,7 +142,8 @@ class NodeSettings(msgspec.Struct, frozen=True, kw_only=True):
         """The options again, without the data folder."""
         sites = [word for folder in self.sites.values() for word in ("--site", folder)]
         hosts = [word for host in self.hosts for word in ("--host", host)]
-        return [*sites, "--bind", self.address, *hosts, *(["--sim"] if self.simulate else [])]
+        bridge = ["--bridge", self.bridge] if self.bridge else []
+        return [*sites, "--bind", self.address, *hosts, *bridge, *(["--sim"] if self.simulate else [])]
 
     @property
     def environment(self) -> dict[str, str]:
@@ -152,13 +157,16 @@ class NodeSettings(msgspec.Struct, frozen=True, kw_only=True):
         return shlex.join([*lacking, "./fognav", "up", *self.arguments, "--data", str(data)])
 
 
-def settings_of(sites: dict[str, Path], address: str, hosts: Sequence[str], *, simulate: bool) -> NodeSettings:
+def settings_of(
+    sites: dict[str, Path], address: str, hosts: Sequence[str], *, simulate: bool, bridge: Path | None = None
+) -> NodeSettings:
     """Return the settings of a node that is started from this shell."""
     return NodeSettings(
         sites={site: str(folder) for site, folder in sites.items()},
         address=address,
         hosts=list(hosts),
         simulate=simulate,
+        bridge=str(bridge or ""),
         ports=_ports(),
     )
 

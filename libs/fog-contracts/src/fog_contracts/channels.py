@@ -33,7 +33,7 @@ ROLES: Final[Mapping[Role, str]] = {
     "planner": "plans paths and stores missions",
     "robot-agent": "a robot's agent",
     "console-service": "shows the state of everything to people's browsers, and changes nothing",
-    "bridge": "`python -m fog_bridges`: tells other systems of robots, and takes orders from them",
+    "bridge": "`fognav bridge`: tells other systems of robots, and takes orders from them",
     "console": "operators' tools: the `fognav` command, the demo and its page, the simulated robot's operator",
     "sim": "the simulated world",
     "recorder": "`fognav record`: subscribes to everything and publishes nothing",

@@ -46,10 +46,11 @@ class Credentials:
 
     def __init__(
         self, user: str = "", *, passwords: dict[Server, str] | None = None, authority: str = "", token: str = "",
-        file: Path | None = None,
+        file: Path | None = None, readable: bool = False,
     ) -> None:  # fmt: skip
         """Take over values; `authority` are certificates (PEM), without any those that the operating system trusts.
 
+        `readable`: passwords may leave this computer unencrypted, since somebody has said so.
         Raises `CredentialsError` for certificates that can't be used.
         """
         self.user = user
@@ -57,11 +58,12 @@ class Credentials:
         self.token = token
         self.passwords = passwords or {}
         self._file = file
+        self._readable = readable
         if authority:
             self.tls_context()
 
     @classmethod
-    def read(cls, file: Path | None) -> Self:
+    def read(cls, file: Path | None, *, readable: bool = False) -> Self:
         """Return the credentials in a file; without one, those of nobody. Raises `CredentialsError`."""
         if file is None:
             return cls()
@@ -76,7 +78,8 @@ class Credentials:
         except msgspec.ValidationError as error:
             raise CredentialsError(f"the credentials {file}: {error}. {_REMEDY}") from error
         return cls(
-            found.user, passwords=found.passwords, authority=found.authority, token=found.token, file=file
+            found.user, passwords=found.passwords, authority=found.authority, token=found.token, file=file,
+            readable=readable,
         )  # fmt: skip
 
     @property
@@ -106,7 +109,7 @@ class Credentials:
         password = self.passwords.get(server)
         if password is None:
             return None
-        if not encrypted and not _is_this_computer(host):
+        if not encrypted and not self._readable and not _is_this_computer(host):
             raise CredentialsError(
                 f"{address} is not encrypted, so everybody in the network could read the password in {self.origin}. "
                 f"Use {_ENCRYPTED[server]}"

@@ -18,6 +18,8 @@ if TYPE_CHECKING:
     from pathlib import Path
 
 ADMIN_TOKEN: Final = "admin.token"  # noqa: S105  # a file's name
+BRIDGE_TOKEN: Final = "bridge.token"  # noqa: S105  # same
+"""That of the bridge to other systems, where one runs (`fog_runtime.token_file.keep_token`)."""
 TOKENS: Final = "tokens.toml"
 OPERATOR_KEY: Final = "operator.key"
 SESSION_KEY: Final = "session.key"

@@ -104,6 +104,16 @@ def revoke_token(file: Path, name: str) -> None:
     _change(file, remove, action="revoke", name=name)
 
 
+def keep_token(tokens: Path, name: str, role: Role, file: Path, *, owner: int | None = None) -> None:
+    """Give a program a token of its own in `file`, unless the one there is valid; raises `TokensError`, `OSError`."""
+    known = [entry for entry in read_tokens(tokens) if entry.name == name]
+    if known:
+        if file.exists() and token_hash(file.read_text("ascii").strip()) == known[0].sha256:
+            return
+        revoke_token(tokens, name)
+    atomic_write(file, f"{create_token(tokens, name, role)}\n".encode(), owner=owner)
+
+
 def _change(file: Path, change: Callable[[list[TokenEntry]], list[TokenEntry]], *, action: str, **changed: str) -> None:
     """Replace the entries under a lock; the audit entry is written first, so that no change goes without one."""
     at = dt.datetime.now(dt.UTC).isoformat(timespec="seconds")

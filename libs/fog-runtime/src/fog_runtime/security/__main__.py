@@ -11,10 +11,11 @@ Each program gets a folder of its own, which only it can read:
     redis/      server.pem server.key users authority.pem health                   as above
     zenoh/      server.pem server.key users access.json5 health.toml               the last one: as above
     gateway/    server.pem server.key
+    bridge/     credentials.toml token                                             of the bridges to other systems
     hazard-aggregator/, map-service/, planner/, console-service/    credentials.toml tokens.toml session.key, the
                 planner also operator.key
     simulation/ operator.key token credentials/NAME.toml                           of a simulated robot and its nodes
-    floors/SITE/    the services' and simulation's of each further floor
+    floors/SITE/    the services', bridge's and simulation's of each further floor
 
 A folder that does not exist is left out: containers get one each, as a volume.
 """
@@ -41,7 +42,7 @@ from fog_runtime.security import users
 from fog_runtime.security.authority import AuthorityError
 from fog_runtime.security.site_security import CREDENTIALS, SiteSecurity
 from fog_runtime.security.users import SecurityError, on_floor
-from fog_runtime.token_file import ROLES, TokensError, create_token, read_tokens, revoke_token, token_hash
+from fog_runtime.token_file import ROLES, TokensError, create_token, keep_token, read_tokens, revoke_token
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
@@ -49,6 +50,7 @@ if TYPE_CHECKING:
     from fog_contracts.site import Site
 
 SIMULATION: Final = "simulation"
+BRIDGE: Final = "bridge"
 FLOORS: Final = "floors"
 """The folder of what further floors have of their own, among the credentials and among what is handed out."""
 TOKEN: Final = "token"  # noqa: S105  # a file's name
@@ -59,7 +61,7 @@ OWNERS: Final[Mapping[str, int]] = {
     "redis": 999,
     "zenoh": _FOGNAV_UID,
     "gateway": 10002,
-    **dict.fromkeys([*users.SERVICES, SIMULATION], _FOGNAV_UID),
+    **dict.fromkeys([*users.SERVICES, BRIDGE, SIMULATION], _FOGNAV_UID),
 }
 """As which user each program runs in its container: those of the images, and of docker-compose.yml."""
 _BROKER_CHECK: Final = """\
@@ -99,8 +101,9 @@ def _hand_out_keys(
 ) -> list[Path]:
     """Write what each site has for itself: its services' files, and those of a simulated robot."""
     keys = keys_of(security.directory, floor)
-    if (out / SIMULATION).is_dir():
-        _make_token(keys / TOKENS, out / SIMULATION / TOKEN)
+    for program in (BRIDGE, SIMULATION):
+        if (out / program).is_dir():
+            keep_token(keys / TOKENS, program, "operator", out / program / TOKEN, owner=OWNERS[program])
     named = partial(users.on_floor, floor) if floor else str
     tokens, key, sessions = ((keys / name).read_bytes() for name in (TOKENS, OPERATOR_KEY, SESSION_KEY))
     found = {
@@ -112,6 +115,7 @@ def _hand_out_keys(
         for service in users.SERVICES
     }
     found["planner"][OPERATOR_KEY] = key
+    found[BRIDGE] = {"credentials.toml": security.credentials(named(BRIDGE)).read_bytes()}
     # Those of robots and nodes may have been handed out already, and removed here.
     known = (security.credentials(named(user)) for user in ("console", "sim", *robots, *nodes))
     simulated = {f"{CREDENTIALS}/{file.name}": file.read_bytes() for file in known if file.exists()}
@@ -148,17 +152,6 @@ def _write(out: Path, contents: Mapping[str, Mapping[str, bytes]]) -> list[Path]
 
 def _folder(security: SiteSecurity, program: str) -> dict[str, bytes]:
     return {file.name: file.read_bytes() for file in sorted(security.folder(program).iterdir()) if file.is_file()}
-
-
-def _make_token(tokens: Path, file: Path) -> None:
-    """Give the simulated robot's operator a token of its own, if it has none that is valid."""
-    known = [entry for entry in read_tokens(tokens) if entry.name == SIMULATION]
-    if known:
-        if file.exists() and token_hash(file.read_text("ascii").strip()) == known[0].sha256:
-            return
-        revoke_token(tokens, SIMULATION)
-    token = create_token(tokens, SIMULATION, "operator")
-    atomic_write(file, f"{token}\n".encode(), owner=OWNERS[SIMULATION])
 
 
 _SERVERS: Final = ("mosquitto", "redis", "zenoh", "gateway", "localhost", "127.0.0.1")

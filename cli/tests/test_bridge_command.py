@@ -1,0 +1,56 @@
+"""`fognav bridge` and `fognav up --bridge`: what can't be used is refused before anything starts, with the remedy."""
+
+import pytest
+from typer.testing import CliRunner
+
+from fognav.__main__ import app
+from fognav.commands import bridge
+
+HOME = 'adapters = "home-assistant"\nhome_assistant_credentials_file = "ha.toml"\n'
+NETWORK = 'home_assistant_mqtt_url = "mqtt://ha.local"\n'
+
+
+def checked(tmp_path, text: str, *command: str) -> tuple[int, str]:
+    file = tmp_path / "bridge.toml"
+    file.write_text(text)
+    (tmp_path / "ha.toml").write_text('user = "fognav"\n[passwords]\nmqtt = "secret"\n')
+    done = CliRunner().invoke(app, [*(command or ("bridge", "--check")), str(file)])
+    return done.exit_code, done.output
+
+
+@pytest.mark.parametrize(
+    ("text", "reason"),
+    [
+        ("", "setting adapters is missing"),
+        ('adapters = "home-asistant"', "'home-asistant' is none. Name one or several of: home-assistant"),
+        ('adapters = "home-assistant"\nurl = "x"', "unknown setting 'url'"),
+        (HOME + NETWORK, "everybody in the network could read the password"),
+        (HOME + NETWORK.replace("//", "//fognav:secret@"), "which no log shows"),
+        (HOME.replace("ha.toml", "other.toml") + NETWORK, "other.toml can't be read"),
+    ],
+)
+def test_settings_that_can_not_be_used_are_refused_with_the_remedy(tmp_path, text, reason):
+    code, said = checked(tmp_path, text)
+    assert (code, reason in said.replace("\n", " ")) == (2, True), said
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        'adapters = "home-assistant"',
+        HOME + NETWORK.replace("mqtt:", "mqtts:"),
+        HOME + NETWORK + "home_assistant_unencrypted = true",
+    ],
+)
+def test_password_leaves_this_computer_encrypted_or_where_somebody_has_said_that_it_may_be_read(tmp_path, text):
+    code, said = checked(tmp_path, text)
+    assert code == 0, said
+
+
+def test_nothing_starts_with_a_bridge_that_can_not_run(tmp_path, monkeypatch):
+    code, said = checked(tmp_path, "", "up", "--data", str(tmp_path / "data"), "--bridge")
+    assert (code, "adapters is missing" in said) == (2, True), said
+    assert not (tmp_path / "data").exists()
+    monkeypatch.setattr(bridge, "find_spec", lambda _: None)
+    code, said = checked(tmp_path, HOME)
+    assert (code, "install the package fog-bridges" in said) == (1, True), said

@@ -9,7 +9,7 @@ import asyncio
 import os
 import sys
 from pathlib import Path
-from typing import TYPE_CHECKING, Final
+from typing import TYPE_CHECKING, Annotated, Final
 from urllib.parse import urlsplit
 
 import msgspec
@@ -32,6 +32,7 @@ from fog_runtime.transports.mqtt_edge import MqttEdge, Will
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping
 
+    from fog_bridges.floor import Adapter
     from fog_runtime.clock import Clock
 
 FILE: Final = "FOGNAV_BRIDGE_FILE"
@@ -55,6 +56,12 @@ class Settings(CommonSettings, frozen=True, kw_only=True):
     """User, password and authority of Home Assistant's broker, as `credentials_file` has those of Fognav's."""
     home_assistant_unencrypted: bool = False
     """Whether that password may cross the network readable for everybody in it."""
+    ros2_router: str = "tcp/127.0.0.1:7447"
+    """Where rmw_zenoh's router (`rmw_zenohd`) listens."""
+    ros2_domain: Annotated[int, msgspec.Meta(ge=0, le=232)] = 0
+    """ROS_DOMAIN_ID of the robots."""
+    ros2_session_config: Path | None = None
+    """A file as ZENOH_SESSION_CONFIG_URI names one, with TLS, say; then `ros2_router` is not used."""
 
     @property
     def names(self) -> list[str]:
@@ -76,11 +83,11 @@ class Settings(CommonSettings, frozen=True, kw_only=True):
         return text
 
 
-_FILES: Final = ("credentials_file", "token_file", "home_assistant_credentials_file")
+_FILES: Final = ("credentials_file", "token_file", "home_assistant_credentials_file", "ros2_session_config")
 _MAKE_TOKEN: Final = "Make one: fognav token create bridge --role operator --file TOKENS > FILE"  # noqa: S105  # no token
 
 
-def _home_assistant(settings: Settings, site: str, clock: Clock) -> HomeAssistantBridge:
+def _home_assistant(settings: Settings, site: str, clock: Clock) -> Adapter:
     url = settings.home_assistant_mqtt_url
     if not url:
         url, own = settings.mqtt_url, settings.credentials()
@@ -102,8 +109,21 @@ def _home_assistant(settings: Settings, site: str, clock: Clock) -> HomeAssistan
     return HomeAssistantBridge(HomeAssistant(site), mqtt)
 
 
-ADAPTERS: Final[Mapping[str, Callable[[Settings, str, Clock], HomeAssistantBridge]]] = {
-    "home-assistant": _home_assistant
+def _ros2(settings: Settings, site: str, _: Clock) -> Adapter:
+    try:
+        from fog_bridges.ros2.bridge import Ros2Bridge, ros_config  # noqa: PLC0415  # an extra
+    except ImportError as error:
+        raise SettingsError(f"the adapter ros2 needs more ({error}): pip install 'fog-bridges[ros2]'") from error
+    try:
+        config = ros_config(settings.ros2_session_config or settings.ros2_router)
+    except ValueError as error:
+        raise SettingsError(str(error)) from error
+    return Ros2Bridge(site, config, settings.ros2_domain, settings.zenoh_endpoints, settings.credentials())
+
+
+ADAPTERS: Final[Mapping[str, Callable[[Settings, str, Clock], Adapter]]] = {
+    "home-assistant": _home_assistant,
+    "ros2": _ros2,
 }
 
 

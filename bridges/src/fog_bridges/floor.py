@@ -14,6 +14,8 @@ if TYPE_CHECKING:
     import ssl
     from collections.abc import AsyncIterator, Sequence
 
+    from fog_runtime.clock import Clock
+
 RETRY_S: Final = 2.0
 SILENT_S: Final = 5.0
 """A stream that says nothing for so long is lost: the console tells the time each second."""
@@ -31,6 +33,17 @@ class Request(NamedTuple):
 
 class Adapter(Protocol):
     """Who tells another system of the floor."""
+
+    @property
+    def name(self) -> str:
+        """Which system, as settings and logs name it."""
+
+    @property
+    def problem(self) -> str:
+        """Why the other system is told nothing; empty while it is."""
+
+    async def run(self, floor: Floor, clock: Clock) -> None:
+        """Connect, and do all until cancelled."""
 
     def on_event(self, name: str, data: dict[str, Any]) -> object:
         """Take in an event of the floor."""

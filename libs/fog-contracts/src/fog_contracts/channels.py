@@ -277,15 +277,16 @@ BRIDGE_AVAILABILITY = _text("bridge_availability", V1 + "bridge/availability",  
 
 # The map, and the hazards and zones in it: zenoh, msgpack
 MAP_DELTA         = _pub(  "map_delta",         FOG + "map/delta",      m.MapDelta,     limit=DELTA_LIMIT,
-    publishers=(MAP,), subscribers=(PLANNER, ROBOT, WEB), durability=RECOVERED, epoch="epoch")
+    publishers=(MAP,), subscribers=(PLANNER, ROBOT, WEB, BRIDGE), durability=RECOVERED, epoch="epoch")
 MAP_HEARTBEAT     = _pub(  "map_heartbeat",     FOG + "map/heartbeat",  m.MapHeartbeat, limit=256,
-    publishers=(MAP,), subscribers=(PLANNER, ROBOT, WEB), durability=VOLATILE, rate_hz=10, max_age_s=1, epoch="epoch")
+    publishers=(MAP,), subscribers=(PLANNER, ROBOT, WEB, BRIDGE), durability=VOLATILE, rate_hz=10, max_age_s=1,
+    epoch="epoch")
 MAP_SNAPSHOT      = _query("map_snapshot",      FOG + "map/snapshot",   None,           limit=0,
-    publishers=(MAP,), subscribers=(PLANNER, ROBOT, WEB), reply=m.MapSnapshot, reply_limit=64 * MIB)
+    publishers=(MAP,), subscribers=(PLANNER, ROBOT, WEB, BRIDGE), reply=m.MapSnapshot, reply_limit=64 * MIB)
 HAZARD            = _pub(  "hazard",            FOG + "hazards/{area}", m.HazardArea,   limit=64 * KIB,
-    publishers=(MAP,), subscribers=(PLANNER, ROBOT, CONSOLE), durability=LATEST, epoch="epoch")
+    publishers=(MAP,), subscribers=(PLANNER, ROBOT, CONSOLE, BRIDGE), durability=LATEST, epoch="epoch")
 ZONES             = _pub(  "zones",             FOG + "zones",          m.ZoneSet,      limit=4 * MIB,
-    publishers=(MAP,), subscribers=(PLANNER, ROBOT, WEB), durability=LATEST, epoch="epoch")
+    publishers=(MAP,), subscribers=(PLANNER, ROBOT, WEB, BRIDGE), durability=LATEST, epoch="epoch")
 
 PLACES            = _pub(  "places",            FOG + "places",         m.PlaceSet,     limit=MIB,
     publishers=(MAP,), subscribers=(PLANNER, WEB), durability=LATEST, epoch="epoch")
@@ -300,15 +301,15 @@ PLANNER_DRY_RUN   = _query("planner_dry_run",   FOG + "planner/dry_run",        
 ROBOT_GOAL        = _pub(  "robot_goal",        FOG + "robots/{robot}/goal",      m.RobotGoal,      limit=2 * KIB,
     publishers=(PLANNER,), subscribers=(ROBOT, CONSOLE, WEB), durability=VOLATILE, rate_hz=0.2, epoch="planner_epoch")
 ROBOT_PATH        = _pub(  "robot_path",        FOG + "robots/{robot}/path",      m.RobotPath,      limit=MIB,
-    publishers=(PLANNER,), subscribers=(ROBOT, CONSOLE, WEB), durability=LATEST, epoch="planner_epoch")
+    publishers=(PLANNER,), subscribers=(ROBOT, CONSOLE, WEB, BRIDGE), durability=LATEST, epoch="planner_epoch")
 ROBOT_RELEASE     = _pub(  "robot_release",     FOG + "robots/{robot}/release",   m.RobotRelease,   limit=128,
     publishers=(PLANNER,), subscribers=(ROBOT, CONSOLE, WEB), durability=VOLATILE, rate_hz=2, max_age_s=1.5,
     epoch="planner_epoch")
 ROBOT_POSE        = _pub(  "robot_pose",        FOG + "robots/{robot}/pose",      m.RobotPose,      limit=KIB,
-    publishers=(ROBOT,), subscribers=(AGGREGATOR, MAP, PLANNER, CONSOLE, WEB), durability=VOLATILE, rate_hz=10,
-    idle_hz=2.5, max_age_s=1)
+    publishers=(ROBOT,), subscribers=(AGGREGATOR, MAP, PLANNER, CONSOLE, WEB, BRIDGE), durability=VOLATILE,
+    rate_hz=10, idle_hz=2.5, max_age_s=1)
 ROBOT_STATE       = _pub(  "robot_state",       FOG + "robots/{robot}/state",     m.RobotState,     limit=16 * KIB,
-    publishers=(ROBOT,), subscribers=(MAP, PLANNER, CONSOLE, WEB), durability=VOLATILE, rate_hz=1, max_age_s=3)
+    publishers=(ROBOT,), subscribers=(MAP, PLANNER, CONSOLE, WEB, BRIDGE), durability=VOLATILE, rate_hz=1, max_age_s=3)
 ROBOT_OBSTACLES   = _pub(  "robot_obstacles",   FOG + "robots/{robot}/obstacles", m.RobotObstacles, limit=64 * KIB,
     publishers=(ROBOT,),   subscribers=(MAP, CONSOLE, WEB), durability=VOLATILE, rate_hz=1)
 ROBOT_COMMAND     = _query("robot_command",     FOG + "robots/{robot}/command",   m.RobotCommand,   limit=KIB,

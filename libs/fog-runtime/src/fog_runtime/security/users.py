@@ -39,7 +39,7 @@ TOOLS: Final[Mapping[str, Sequence[Server]]] = {
     "recorder": ("mqtt", "zenoh"),
     "sim": ("zenoh",),
     "home-assistant": ("mqtt",),
-    "bridge": ("mqtt",),
+    "bridge": ("mqtt", "zenoh"),
 }
 """The same for the tools of the fog node's administrator, and for a simulated world."""
 THESIS: Final[Mapping[str, Sequence[Server]]] = {"thesis-node": ("mqtt",), "thesis-robot": ("mqtt",)}

@@ -1,0 +1,278 @@
+"""What a floor tells, as messages of ROS 2 (REP 103 and 105: metres, radians, frame `map`). Pure."""
+
+from __future__ import annotations
+
+import math
+from typing import TYPE_CHECKING, Final
+
+import numpy as np
+
+from fog_bridges.ros2.wire import TYPES, RosMessage
+from fog_contracts.costs import LETHAL, UNKNOWN
+from fog_contracts.messages import CircleShape, CorridorShape, Power, RectangleShape
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable, Iterator, Mapping, Sequence
+
+    from numpy.typing import NDArray
+
+    from fog_contracts.grid import GridGeometry
+    from fog_contracts.messages import HazardArea, RobotPath, RobotPose, RobotState, Shape, Zone
+
+MAP_FRAME: Final = "map"
+KEEPOUT: Final = 0
+SPEED: Final = 2
+"""Kinds of Nav2's costmap filters: keepout, and speed limits in m/s."""
+SPEED_STEP: Final = 0.01
+"""What one unit of a speed mask is (m/s)."""
+FULL: Final = 100
+_LINE_STRIP: Final = 4
+_TEXT: Final = 9
+_DELETE_ALL: Final = 3
+_LINE_WIDTH: Final = 0.08
+_TEXT_HEIGHT: Final = 0.4
+_COLOURS: Final = {
+    "blocked": (0.84, 0.15, 0.16),
+    "unknown": (1.0, 0.6, 0.0),
+    "BLOCKED": (0.55, 0.1, 0.55),
+    "PENALTY": (0.3, 0.45, 0.75),
+    "SPEED_LIMIT": (0.2, 0.6, 0.6),
+}
+_CIRCLE_CORNERS: Final = 24
+_NEVER: Final = float("nan")
+_CHARGING: Final = {"no": 2, "waiting": 3, "bulk": 1, "trickle": 1, "reconditioning": 1}
+"""Fognav's words for what a charger does, as power supply status of sensor_msgs."""
+
+
+def message(kind: str, **fields: object) -> RosMessage:
+    """Return a message of a type such as `nav_msgs/msg/Path`, whose package may be left out for a nested one."""
+    made: RosMessage = TYPES.types[kind]
+    return made(**fields)
+
+
+def ros_name(name: str) -> str:
+    """Return an id as a part of a topic: without hyphens, which ROS does not allow, and not beginning with a digit."""
+    found = name.replace("-", "_")
+    return f"_{found}" if found[:1].isdigit() else found
+
+
+def header(stamp: float, frame: str = MAP_FRAME) -> RosMessage:
+    """Return a header; `stamp` in s since 1970."""
+    seconds = math.floor(stamp)
+    time = message("builtin_interfaces/msg/Time", sec=seconds, nanosec=int((stamp - seconds) * 1e9))
+    return message("std_msgs/msg/Header", stamp=time, frame_id=frame)
+
+
+def pose(x: float, y: float, theta: float, z: float = 0.0) -> RosMessage:
+    """Return a pose in the plane."""
+    return message(
+        "geometry_msgs/msg/Pose",
+        position=message("geometry_msgs/msg/Point", x=x, y=y, z=z),
+        orientation=_turned(theta),
+    )
+
+
+def _turned(theta: float) -> RosMessage:
+    return message("geometry_msgs/msg/Quaternion", x=0.0, y=0.0, z=math.sin(theta / 2.0), w=math.cos(theta / 2.0))
+
+
+def heading(orientation: RosMessage) -> float | None:
+    """Return the yaw of a quaternion (rad), None for one that is none (all zero, say: no heading is asked for)."""
+    x, y, z, w = orientation.x, orientation.y, orientation.z, orientation.w
+    if not 0.9 < math.hypot(x, y, z, w) < 1.1:
+        return None
+    return math.atan2(2.0 * (w * z + x * y), 1.0 - 2.0 * (y * y + z * z))
+
+
+# --- The map and the masks of Nav2's costmap filters ------------------------------------------------------------------
+
+
+def grid(values: NDArray[np.int8], geometry: GridGeometry, stamp: float) -> RosMessage:
+    """Return an OccupancyGrid of values (height, width), row 0 at the bottom, as in ROS."""
+    told = header(stamp)
+    info = message(
+        "nav_msgs/msg/MapMetaData",
+        map_load_time=told.stamp,
+        resolution=geometry.resolution,
+        width=geometry.width,
+        height=geometry.height,
+        origin=pose(geometry.origin_x, geometry.origin_y, 0.0),
+    )
+    return message("nav_msgs/msg/OccupancyGrid", header=told, info=info, data=values.ravel())
+
+
+def map_values(static: NDArray[np.uint8]) -> NDArray[np.int8]:
+    """Return the floor plan as occupancy: 100 a wall, 0 free, -1 unknown."""
+    values = np.where(static == LETHAL, FULL, 0).astype(np.int8)
+    values[static == UNKNOWN] = -1
+    return values
+
+
+def keepout_values(cost: NDArray[np.uint8], static: NDArray[np.uint8]) -> NDArray[np.int8]:
+    """Return the mask of what is lethal on the costmap and no wall of the plan: 100 there, 0 elsewhere.
+
+    The robot's own costmap knows the walls, and has to inflate the mask by its own radius.
+    """
+    lethal: NDArray[np.int8] = ((cost == LETHAL) & (static != LETHAL)).view(np.int8) * np.int8(FULL)
+    return lethal
+
+
+def speed_values(speed: NDArray[np.uint8], limit: float | None = None) -> NDArray[np.int8]:
+    """Return the mask of speed limits (`SPEED_STEP`): those of a layer in cm/s, 0 none; `limit` (m/s) holds everywhere.
+
+    A limit of more than 1 m/s counts as 1 m/s: a mask's values end at 100.
+    """
+    values = np.minimum(speed, FULL)
+    if limit is not None:
+        everywhere = np.uint8(round(limit / SPEED_STEP))
+        values = np.where(values == 0, everywhere, np.minimum(values, everywhere))
+    return values.astype(np.int8)
+
+
+def filter_info(kind: int, mask_topic: str, stamp: float) -> RosMessage:
+    """Return what a costmap filter must know of its mask."""
+    return message(
+        "nav2_msgs/msg/CostmapFilterInfo",
+        header=header(stamp),
+        type=kind,
+        filter_mask_topic=f"/{mask_topic}",
+        base=0.0,
+        multiplier=1.0 if kind == KEEPOUT else SPEED_STEP,
+    )
+
+
+# --- Markers ----------------------------------------------------------------------------------------------------------
+
+
+def markers(hazards: Mapping[str, HazardArea], zones: Sequence[Zone], stamp: float) -> RosMessage:
+    """Return the hazards and the zones in force as outlines with words; replaces all markers before."""
+    found = [_marker("all", 0, _DELETE_ALL, stamp)]
+    for area, hazard in sorted(hazards.items()):
+        if hazard.hazard.state in _COLOURS:
+            words = f"{hazard.label or area}: {hazard.hazard.state}"
+            found += _outline("hazards", len(found), hazard.polygon, hazard.hazard.state, words, stamp)
+    for zone in zones:
+        words = f"{zone.id}: {zone.reason}" if zone.reason else zone.id
+        found += _outline("zones", len(found), _corners(zone.shape), zone.kind, words, stamp)
+    return message("visualization_msgs/msg/MarkerArray", markers=found)
+
+
+def _corners(shape: Shape) -> list[tuple[float, float]]:
+    """Return what is drawn of a zone: its outline, of a corridor its middle and back again."""
+    match shape:
+        case RectangleShape(corner=(x, y), opposite=(far_x, far_y)):
+            return [(x, y), (far_x, y), (far_x, far_y), (x, far_y)]
+        case CircleShape(centre=(x, y), radius=radius):
+            angles = np.linspace(0.0, 2.0 * math.pi, _CIRCLE_CORNERS, endpoint=False)
+            return [(x + radius * math.cos(angle), y + radius * math.sin(angle)) for angle in angles]
+        case CorridorShape(line=line):
+            return [*line, *line[-2:0:-1]]
+        case _:
+            return list(shape.points)
+
+
+def _outline(
+    namespace: str, number: int, ring: Iterable[Sequence[float]], colour: str, words: str, stamp: float
+) -> Iterator[RosMessage]:
+    corners = [(float(x), float(y)) for x, y in ring]
+    line = _marker(namespace, number, 0, stamp, kind=_LINE_STRIP, colour=_COLOURS[colour])
+    line.points = [message("geometry_msgs/msg/Point", x=x, y=y, z=0.0) for x, y in (*corners, corners[0])]
+    yield line
+    x, y = np.mean(corners, axis=0)
+    yield _marker(
+        namespace, number + 1, 0, stamp, kind=_TEXT, colour=_COLOURS[colour], at=(float(x), float(y)), text=words
+    )
+
+
+def _marker(  # noqa: PLR0913  # what markers differ in
+    namespace: str, number: int, action: int, stamp: float, *, kind: int = 0,
+    colour: tuple[float, float, float] = (0.0, 0.0, 0.0), at: tuple[float, float] = (0.0, 0.0), text: str = "",
+) -> RosMessage:  # fmt: skip
+    red, green, blue = colour
+    size = _TEXT_HEIGHT if kind == _TEXT else _LINE_WIDTH
+    empty = np.zeros(0, dtype=np.uint8)
+    stopped = message("builtin_interfaces/msg/Time", sec=0, nanosec=0)
+    return message(
+        "visualization_msgs/msg/Marker",
+        header=header(stamp), ns=namespace, id=number, type=kind, action=action,
+        pose=pose(*at, 0.0, z=0.1), scale=message("geometry_msgs/msg/Vector3", x=size, y=size, z=size),
+        color=message("std_msgs/msg/ColorRGBA", r=red, g=green, b=blue, a=1.0),
+        lifetime=message("builtin_interfaces/msg/Duration", sec=0, nanosec=0), frame_locked=False, points=[], colors=[],
+        texture_resource="",
+        texture=message(
+            "sensor_msgs/msg/CompressedImage",
+            header=message("std_msgs/msg/Header", stamp=stopped, frame_id=""), format="", data=empty,
+        ),
+        uv_coordinates=[], text=text,
+        mesh_resource="", mesh_file=message("visualization_msgs/msg/MeshFile", filename="", data=empty),
+        mesh_use_embedded_materials=False,
+    )  # fmt: skip
+
+
+# --- Robots -----------------------------------------------------------------------------------------------------------
+
+
+def robot_pose(told: RobotPose) -> RosMessage:
+    """Return a robot's pose with its covariance (x, y, z, roll, pitch, yaw)."""
+    covariance = np.zeros((6, 6))
+    covariance[np.ix_((0, 1, 5), (0, 1, 5))] = np.reshape(told.covariance, (3, 3))
+    return message(
+        "geometry_msgs/msg/PoseWithCovarianceStamped",
+        header=header(told.stamp),
+        pose=message(
+            "geometry_msgs/msg/PoseWithCovariance",
+            pose=pose(told.x, told.y, told.theta),
+            covariance=covariance.ravel(),
+        ),
+    )
+
+
+def transform(told: RobotPose, robot: str) -> RosMessage:
+    """Return the transform of a robot's base in the frame `map`."""
+    return message(
+        "tf2_msgs/msg/TFMessage",
+        transforms=[
+            message(
+                "geometry_msgs/msg/TransformStamped",
+                header=header(told.stamp),
+                child_frame_id=f"{ros_name(robot)}/base_footprint",
+                transform=message(
+                    "geometry_msgs/msg/Transform",
+                    translation=message("geometry_msgs/msg/Vector3", x=told.x, y=told.y, z=0.0),
+                    rotation=_turned(told.theta),
+                ),
+            )
+        ],
+    )
+
+
+def path(told: RobotPath, stamp: float) -> RosMessage:
+    """Return a robot's path by its corners, each turned towards the next; empty while there is none."""
+    points = told.points
+    poses = []
+    for index, (x, y) in enumerate(points):
+        begin, end = (points[index], points[index + 1]) if index + 1 < len(points) else points[-2:] or (points[0],) * 2
+        theta = math.atan2(end[1] - begin[1], end[0] - begin[0])
+        if index + 1 == len(points) and told.goal_theta is not None:
+            theta = told.goal_theta
+        poses.append(message("geometry_msgs/msg/PoseStamped", header=header(stamp), pose=pose(x, y, theta)))
+    return message("nav_msgs/msg/Path", header=header(stamp), poses=poses)
+
+
+def battery(told: RobotState, stamp: float) -> RosMessage:
+    """Return a robot's battery (what is not measured is NaN, as sensor_msgs says)."""
+    nothing = np.zeros(0, dtype=np.float32)
+    known = told.power or Power()
+
+    def measured(value: float | None) -> float:
+        return _NEVER if value is None else value
+
+    return message(
+        "sensor_msgs/msg/BatteryState",
+        header=header(stamp, ""),
+        voltage=measured(known.voltage_v), temperature=measured(known.temperature_c),
+        current=measured(known.current_a), charge=measured(known.charge_ah), capacity=measured(known.capacity_ah),
+        design_capacity=_NEVER, percentage=measured(told.battery),
+        power_supply_status=_CHARGING.get(known.charging or "", 0), power_supply_health=0, power_supply_technology=0,
+        present=True, cell_voltage=nothing, cell_temperature=nothing, location="", serial_number="",
+    )  # fmt: skip

@@ -1,0 +1,146 @@
+"""How rmw_zenoh puts topics and their messages on zenoh: keys, tokens of presence, attachments and payloads. Pure.
+
+Source: the design document of ros2/rmw_zenoh, for Jazzy from 0.2.4 on, Kilted and later. A topic's key ends with the
+hash of its type (REP 2016): who was built with another definition of the message has another key, and hears nothing.
+"""
+
+from __future__ import annotations
+
+import itertools
+import struct
+from dataclasses import dataclass
+from typing import Any, Final, NamedTuple
+
+import xxhash
+from rosbags.typesys import Stores, get_types_from_msg, get_typestore
+
+RosMessage = Any
+"""A message: rosbags makes the classes at run time, from the definitions."""
+_DEFINITIONS: Final = {
+    "nav2_msgs/msg/CostmapFilterInfo": (
+        "std_msgs/Header header\nuint8 type\nstring filter_mask_topic\nfloat32 base\nfloat32 multiplier\n"
+    ),
+}
+"""Messages that rosbags does not know, by their fields alone: a hash covers these."""
+TYPES: Final = get_typestore(Stores.ROS2_JAZZY)
+for _name, _fields in _DEFINITIONS.items():
+    TYPES.register(get_types_from_msg(_fields, _name))
+
+_ATTACHMENT: Final = struct.Struct("<qqB")
+_GID_BYTES: Final = 16
+_OLD_ATTACHMENT: Final = 77
+"""Bytes of Jazzy's attachment before 0.2.4, with a name before each field."""
+LATCHED: Final = ":1:,1:,:,:,,"
+"""Quality of service of what a late subscriber is given at once: reliable, transient local, the last one."""
+PLAIN: Final = "::,7:,:,:,,"
+
+
+class WireError(ValueError):
+    """What a peer sent can't be read; the text says why."""
+
+
+def dds_type(name: str) -> str:
+    """Return a type's name in keys: `nav_msgs::msg::dds_::Path_` for `nav_msgs/msg/Path`."""
+    package, kind, message = name.split("/")
+    return f"{package}::{kind}::dds_::{message}_"
+
+
+def type_hash(name: str) -> str:
+    """Return the hash of a message's type, `RIHS01_` and 64 digits."""
+    return str(TYPES.hash_rihs01(name))
+
+
+class Topic(NamedTuple):
+    """A topic by its name without a leading slash, and the type of its messages."""
+
+    name: str
+    type: str
+    latched: bool = False
+
+    def key(self, domain: int) -> str:
+        """Return the key of its messages."""
+        return f"{self.any_hash(domain)[:-1]}{type_hash(self.type)}"
+
+    def any_hash(self, domain: int) -> str:
+        """Return the key expression of messages of this name, whatever definition their sender was built with."""
+        return f"{domain}/{self.name}/{dds_type(self.type)}/*"
+
+
+class Attachment(NamedTuple):
+    """What rmw_zenoh sends beside each message: its number from 1 on, when it was sent (ns since 1970), by whom."""
+
+    number: int
+    sent_ns: int
+    gid: bytes
+
+    def encoded(self) -> bytes:
+        """Return its bytes; a peer drops a message without them."""
+        return _ATTACHMENT.pack(self.number, self.sent_ns, len(self.gid)) + self.gid
+
+    @classmethod
+    def decoded(cls, data: bytes) -> Attachment:
+        """Read one, of the form before April 2025 too; raises `WireError`."""
+        if len(data) == _OLD_ATTACHMENT:
+            # Each of its three fields follows its name and what counts the name's letters.
+            data = data[16:24] + data[41:49] + data[60:]
+        if len(data) != _ATTACHMENT.size + _GID_BYTES:
+            raise WireError(f"an attachment of {len(data)} bytes, and rmw_zenoh's have {_ATTACHMENT.size + _GID_BYTES}")
+        number, sent_ns, length = _ATTACHMENT.unpack_from(data)
+        if length != _GID_BYTES:
+            raise WireError(f"an attachment whose sender's id has {length} bytes, and not {_GID_BYTES}")
+        return cls(number, sent_ns, data[_ATTACHMENT.size :])
+
+
+@dataclass
+class Node:
+    """What a node of ROS tells of itself, so that `ros2 topic list` and `ros2 topic info` show it."""
+
+    domain: int
+    zid: str
+    name: str
+
+    def __post_init__(self) -> None:
+        self._ids = itertools.count()
+        self._id = next(self._ids)
+
+    @property
+    def token(self) -> str:
+        """The node's own token."""
+        return self._token(self._id, "NN")
+
+    def entity(self, kind: str, topic: Topic) -> str:
+        """Return the token of a new publisher (`MP`) or subscriber (`MS`)."""
+        name = "%" + topic.name.replace("/", "%")
+        quality = LATCHED if topic.latched else PLAIN
+        return f"{self._token(next(self._ids), kind)}/{name}/{dds_type(topic.type)}/{type_hash(topic.type)}/{quality}"
+
+    def _token(self, entity: int, kind: str) -> str:
+        return f"@ros2_lv/{self.domain}/{self.zid}/{self._id}/{entity}/{kind}/%/%/{self.name}"
+
+
+def gid(token: str) -> bytes:
+    """Return the id of a publisher or subscriber: XXH3-128 of its token."""
+    value = xxhash.xxh3_128_intdigest(token.encode())
+    return struct.pack("<QQ", value & (1 << 64) - 1, value >> 64)
+
+
+class Writer:
+    """Numbers the messages of one publisher."""
+
+    def __init__(self, topic: Topic, token: str) -> None:
+        self.topic = topic
+        self._gid = gid(token)
+        self._numbers = itertools.count(1)
+
+    def encoded(self, message: object, sent_ns: int) -> tuple[bytes, bytes]:
+        """Return a message's payload (CDR, little-endian, after its header) and attachment."""
+        payload = bytes(TYPES.serialize_cdr(message, self.topic.type))
+        return payload, Attachment(next(self._numbers), sent_ns, self._gid).encoded()
+
+
+def decoded(topic: Topic, payload: bytes) -> RosMessage:
+    """Return the message of a payload; raises `WireError` for one that is cut off or is none."""
+    try:
+        return TYPES.deserialize_cdr(payload, topic.type)
+    except Exception as error:  # rosbags raises what its generated code stumbles over
+        raise WireError(f"no {topic.type}: {error!r}") from error

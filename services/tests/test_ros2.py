@@ -1,0 +1,272 @@
+"""Robots of ROS 2 hear of a floor's hazards and zones over rmw_zenoh's wire, and send goals."""
+
+import asyncio
+import json
+import struct
+import threading
+import time
+from contextlib import suppress
+from functools import partial
+from typing import Self
+
+import httpx
+import numpy as np
+import pytest
+import zenoh
+import zenoh.ext as ze
+from hypothesis import given
+from hypothesis import strategies as st
+from rosbags.typesys import Stores, get_typestore
+
+from fog_bridges.ros2 import messages as ros
+from fog_bridges.ros2.wire import Attachment, Node, Topic, WireError, Writer, decoded, type_hash
+from fog_contracts import channels as ch
+from fog_contracts.messages import RobotPath, RobotPose, RobotState
+from fog_supervisor import net
+
+DOMAIN = 7
+STORE = get_typestore(Stores.ROS2_JAZZY)
+GRID = "nav_msgs::msg::dds_::OccupancyGrid_/RIHS01_8d348150c12913a31ee0ec170fbf25089e4745d17035792a1ba94d6f0bc0cfc7"
+GOAL = "geometry_msgs::msg::dds_::PoseStamped_/RIHS01_10f3786d7d40fd2b54367835614bff85d4ad3b5dab62bf8bca0cc232d73b4cd8"
+PEERS = "FOGNAV_ROS2_PEERS"
+
+# --- The wire ---------------------------------------------------------------------------------------------------------
+
+
+def test_keys_and_tokens_are_those_of_rmw_zenoh():
+    topic = Topic("fognav/lab/keepout_mask", "nav_msgs/msg/OccupancyGrid", latched=True)
+    assert topic.key(0) == f"0/fognav/lab/keepout_mask/{GRID}"
+    assert topic.any_hash(0) == "0/fognav/lab/keepout_mask/nav_msgs::msg::dds_::OccupancyGrid_/*"
+    assert type_hash("std_msgs/msg/String") == (
+        "RIHS01_df668c740482bbd48fb39d76a70dfd4bd59db1288021743503259e948f6b1a18"
+    ), "as rmw_zenoh's design document has it"
+    assert type_hash("nav2_msgs/msg/CostmapFilterInfo") == (
+        "RIHS01_61ce391bf7690f76a331c01c9d5ce8ca71e6c99273b9fb75e48380f05c6dfdc8"
+    )
+    node = Node(0, "aac3178e146ba6f1fc6e6a4085e77f21", "fognav_lab")
+    assert node.token == "@ros2_lv/0/aac3178e146ba6f1fc6e6a4085e77f21/0/0/NN/%/%/fognav_lab"
+    assert node.entity("MP", topic) == (
+        f"@ros2_lv/0/aac3178e146ba6f1fc6e6a4085e77f21/0/1/MP/%/%/fognav_lab/%fognav%lab%keepout_mask/{GRID}/:1:,1:,:,:,,"
+    )
+
+
+@given(st.integers(1, 2**62), st.integers(0, 2**62), st.binary(min_size=16, max_size=16))
+def test_attachment_is_read_again_in_both_forms(number, sent_ns, sender):
+    attachment = Attachment(number, sent_ns, sender)
+    assert attachment.encoded() == struct.pack("<qqB", number, sent_ns, 16) + sender
+    assert Attachment.decoded(attachment.encoded()) == attachment
+    named = (b"sequence_number", attachment.encoded()[:8]), (b"source_timestamp", attachment.encoded()[8:16])
+    older = b"".join(bytes([len(name)]) + name + value for name, value in named)
+    assert Attachment.decoded(older + b"\x0asource_gid\x10" + sender) == attachment
+
+
+@given(st.binary(max_size=200))
+def test_bytes_that_are_no_message_are_refused_by_one_kind_of_error(data):
+    topic = Topic("r1/goal_pose", "geometry_msgs/msg/PoseStamped")
+    for read in (Attachment.decoded, lambda payload: decoded(topic, payload)):
+        with suppress(WireError):
+            read(data)
+
+
+# --- Messages ---------------------------------------------------------------------------------------------------------
+
+
+def test_mask_blocks_what_the_costmap_does_and_the_plan_does_not():
+    static = np.zeros((4, 5), np.uint8)
+    static[0], static[3] = 254, 255
+    cost = static.copy()
+    cost[1, 2:4], cost[1, 1], cost[2] = 254, 253, 80
+    mask = ros.keepout_values(cost, static)
+    assert mask.tolist() == [[0] * 5, [0, 0, 100, 100, 0], [0] * 5, [0] * 5]
+    assert ros.map_values(static).tolist() == [[100] * 5, [0] * 5, [0] * 5, [-1] * 5]
+
+
+def test_speed_mask_has_the_lower_of_its_limits_everywhere():
+    speed = np.array([[0, 10, 50, 120]], np.uint8)
+    assert ros.speed_values(speed).tolist() == [[0, 10, 50, 100]]
+    assert ros.speed_values(speed, limit=0.15).tolist() == [[15, 10, 15, 15]]
+
+
+def test_path_battery_and_markers_can_be_sent():
+    path = RobotPath(
+        plan_id=1, planner_epoch=1, goal_id="g", points=[(0.0, 0.0), (1.0, 0.0), (1.0, 2.0)], map_epoch=1, map_seq=1,
+        released_length=3.0,
+    )  # fmt: skip
+    told = sent("r1/plan", "nav_msgs/msg/Path", ros.path(path, 5.5))
+    assert [(pose.pose.position.x, pose.pose.position.y) for pose in told.poses] == path.points
+    assert [ros.heading(pose.pose.orientation) for pose in told.poses] == pytest.approx([0.0, np.pi / 2, np.pi / 2])
+    assert (told.header.stamp.sec, told.header.stamp.nanosec) == (5, 500_000_000)
+    state = RobotState(
+        mode="HOLD", reasons=[], enabled=False, battery=0.63, goal_id=None, map_epoch=0, map_seq=0, plan_id=None
+    )
+    battery = sent("r1/battery_state", "sensor_msgs/msg/BatteryState", ros.battery(state, 1.0))
+    assert (round(battery.percentage, 2), bool(np.isnan(battery.voltage))) == (0.63, True)
+    assert len(sent("h", "visualization_msgs/msg/MarkerArray", ros.markers({}, [], 1.0)).markers) == 1
+
+
+def sent(name: str, kind: str, message):
+    """Return a message as another store of types reads what was sent."""
+    payload, _ = Writer(Topic(name, kind), "token").encoded(message, 1)
+    return STORE.deserialize_cdr(payload, kind)
+
+
+# --- With real services -----------------------------------------------------------------------------------------------
+
+
+class Peer:
+    """A node of ROS, as far as zenoh goes: the latest messages of each topic, late joiner included."""
+
+    def __init__(self, port: int) -> None:
+        config = zenoh.Config()
+        for key, value in (("mode", "peer"), ("connect/endpoints", [f"tcp/127.0.0.1:{port}"]),
+                           ("listen/endpoints", []), ("scouting/multicast/enabled", False)):  # fmt: skip
+            config.insert_json5(key, json.dumps(value))
+        self.session = zenoh.open(config)
+        self.told: dict[str, object] = {}
+        self._lock = threading.Lock()
+        self._held: list[object] = []
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.session.close()
+
+    def hear(self, name: str, kind: str, key: str) -> None:
+        def on_sample(sample: zenoh.Sample) -> None:
+            assert len(sample.attachment.to_bytes()) == 33
+            with self._lock:
+                self.told[name] = STORE.deserialize_cdr(sample.payload.to_bytes(), kind)
+
+        self._held.append(
+            ze.declare_advanced_subscriber(
+                self.session, f"{DOMAIN}/{name}/{key}", on_sample, subscriber_detection=True,
+                history=ze.HistoryConfig(detect_late_publishers=True, max_samples=1),
+                recovery=ze.RecoveryConfig(heartbeat=True),
+            )
+        )  # fmt: skip
+
+    def mask(self, name: str = "fognav/test/keepout_mask"):
+        grid = self.told.get(name)
+        return None if grid is None else grid.data.reshape(grid.info.height, grid.info.width)
+
+    def send(self, name: str, key: str, payload: bytes, attachment: bytes | None) -> None:
+        self.session.put(f"{DOMAIN}/{name}/{key}", payload, attachment=attachment)
+
+
+@pytest.fixture
+def ros_router():
+    """A router as ROS 2 users start one; yields its port."""
+    port = net.free_port()
+    config = zenoh.Config()
+    for key, value in (("mode", "router"), ("listen/endpoints", [f"tcp/127.0.0.1:{port}"]),
+                       ("scouting/multicast/enabled", False)):  # fmt: skip
+        config.insert_json5(key, json.dumps(value))
+    with zenoh.open(config):
+        yield port
+
+
+@pytest.fixture
+async def ros2(all_services, tokens, ros_router):
+    """Run the console-service and the bridge to ROS 2; yield the fog and the port of ROS's router."""
+    urls = {
+        f"FOGNAV_{name}_URL": await all_services.ready(module)
+        for name, module in (("AGGREGATOR", "hazard_aggregator"), ("MAP", "map_service"), ("PLANNER", "planner"))
+    }
+    all_services.start("console_service", **urls)
+    token = all_services.folder / "ros2-token"
+    token.write_text(tokens["operator"]["Authorization"].removeprefix("Bearer "))
+    all_services.start(
+        "fog_bridges",
+        FOGNAV_ADAPTERS="ros2",
+        FOGNAV_ROS2_ROUTER=f"tcp/127.0.0.1:{ros_router}",
+        FOGNAV_ROS2_DOMAIN=str(DOMAIN),
+        FOGNAV_CONSOLE_URL=await all_services.ready("console_service"),
+        FOGNAV_TOKEN_FILE=str(token),
+        FOGNAV_CREDENTIALS_FILE=str(all_services.security.credentials("bridge")),
+    )
+    await all_services.ready("fog_bridges")
+    yield all_services, ros_router
+    for module in ("fog_bridges", "console_service"):
+        all_services.kill(module)
+
+
+@pytest.mark.live
+async def test_zone_is_on_the_mask_of_a_late_joiner_and_goes_again_and_goals_reach_the_planner(ros2, tokens, until):
+    fog, port = ros2
+    operator, zone = tokens["operator"], "/api/v1/zones/box"
+    async with httpx.AsyncClient(base_url=await fog.ready("map_service"), timeout=30) as client, fog.edges() as edges:
+        body = {
+            "id": "box",
+            "kind": "BLOCKED",
+            "shape": {"type": "rectangle", "corner": [2.0, 2.0], "opposite": [3.0, 3.0]},
+        }
+        assert (await client.post("/api/v1/zones", json=body, headers=operator)).is_success
+        with Peer(port) as peer:
+            for name in ("keepout_mask", "map"):
+                peer.hear(f"fognav/test/{name}", "nav_msgs/msg/OccupancyGrid", GRID)
+            await until(lambda: len(peer.told) == 2 and peer.mask()[50, 50] == 100, "the zone is on the mask")
+            assert 400 <= (peer.mask() == 100).sum() <= 484, "20 x 20 cells, and those that its outline touches"
+            assert peer.mask("fognav/test/map")[0].tolist() == [100] * 160, "the wall is on the map"
+            assert peer.told["fognav/test/map"].info.resolution == pytest.approx(0.05)
+            assert (await client.delete(zone, headers=operator)).is_success
+            await until(lambda: not peer.mask().any(), "the zone is gone")
+
+            zenoh_edge = edges[1]
+            pose = RobotPose(
+                x=1.0, y=1.0, theta=0.0, covariance=[0.01] * 9, v=0.0, w=0.0, radius=0.17, height=0.2, stamp=time.time()
+            )
+            state = RobotState(
+                mode="HOLD", reasons=[], enabled=False, battery=0.5, goal_id=None, map_epoch=0, map_seq=0, plan_id=None
+            )
+            peer.hear("r_1/pose", "geometry_msgs/msg/PoseWithCovarianceStamped", "*/*")
+
+            async def publish() -> None:
+                while True:
+                    zenoh_edge.publish(ch.ROBOT_STATE, state, robot="r-1")
+                    zenoh_edge.publish(ch.ROBOT_POSE, pose, robot="r-1")
+                    await asyncio.sleep(0.1)
+
+            publishing = asyncio.create_task(publish())
+            planner = httpx.AsyncClient(base_url=await fog.ready("planner"), timeout=30)
+            try:
+                await until(lambda: "r_1/pose" in peer.told, "the robot's pose is told")
+                goal = ros.message(
+                    "geometry_msgs/msg/PoseStamped", header=ros.header(time.time()), pose=ros.pose(4.0, 3.0, 1.0)
+                )
+                payload, attachment = Writer(Topic("r_1/goal_pose", "geometry_msgs/msg/PoseStamped"), "t").encoded(
+                    goal, 1
+                )
+                for damaged in ((payload[:20], attachment), (payload, None), (payload, b"x"), (b"", attachment)):
+                    peer.send("r_1/goal_pose", GOAL, *damaged)
+                peer.send("r_1/goal_pose", "geometry_msgs::msg::dds_::PoseStamped_/RIHS01_other", payload, attachment)
+                peer.send("r_1/goal_pose", GOAL, payload, attachment)
+                mission = partial(planner.get, "/api/v1/robots/r-1/goal", headers=operator)
+                async with asyncio.timeout(60.0):
+                    while not (answer := await mission()).is_success:  # noqa: ASYNC110  # of another process
+                        await asyncio.sleep(0.1)
+                assert answer.json()["pose"] == {"x": 4.0, "y": 3.0, "theta": pytest.approx(1.0)}
+                metrics = (await planner.get(f"{await fog.url('fog_bridges')}/metrics")).text
+                assert 'refused_messages_total{reason="malformed",system="ros2"} 4.0' in metrics
+                assert 'refused_messages_total{reason="type_hash",system="ros2"} 1.0' in metrics
+            finally:
+                publishing.cancel()
+                await planner.aclose()
+
+
+@pytest.mark.live
+async def test_whole_floor_becomes_slow_while_nobody_confirms_the_map(ros2, until):
+    fog, port = ros2
+    with Peer(port) as peer:
+        peer.hear("fognav/test/speed_mask", "nav_msgs/msg/OccupancyGrid", GRID)
+
+        def slow() -> float:
+            """The share of the floor with a limit as in the mode DEGRADED; none without a mask."""
+            mask = peer.mask("fognav/test/speed_mask")
+            return float("nan") if mask is None else float((mask == 15).mean())
+
+        await until(lambda: slow() < 1.0, "most of the floor has no limit", lambda: fog.log("fog_bridges")[-2000:])
+        fog.kill("map_service")
+        await until(lambda: slow() == 1.0, "the floor is slow")
+        fog.start("map_service")
+        await until(lambda: slow() < 1.0, "most of the floor has no limit")

@@ -6,19 +6,27 @@ import { useEffect, useState } from "preact/hooks";
 import { Problem } from "./api/client";
 import type { Session } from "./api/types";
 import { ConsoleApp } from "./app";
+import { mayOperate } from "./context";
 import { startLanguage, t } from "./i18n/i18n";
 import { currentSession, logIn, logOut, Login } from "./login";
-import { takeLogin } from "./router";
+import { takeLogin, usePage } from "./router";
 import { rememberedRobots, StopBar } from "./stop";
 import { startTheme } from "./theme";
+import { CodesPage } from "./visit/codes";
+import { NoCode, VisitApp } from "./visit/visit";
 
 /** Begin with a one-time login, else with the session that the browser has; null: nobody is logged in. */
-async function begin(token: string | null): Promise<Session | null> {
+async function begin(token: string | null, ofCode: boolean): Promise<Session | null> {
   try {
+    // Who scans another code keeps their session: a new one would not know of their visit.
+    if (ofCode) {
+      const known = await begin(null, false);
+      if (known !== null) return known;
+    }
     return token === null ? await currentSession() : await logIn(token);
   } catch (error) {
     // A one-time login that was used before: the browser may still have its session.
-    if (token !== null && error instanceof Problem && error.status === 401) return begin(null);
+    if (token !== null && error instanceof Problem && error.status === 401) return begin(null, false);
     return null;
   }
 }
@@ -27,12 +35,17 @@ function Root({ token }: { readonly token: string | null }): preact.JSX.Element 
   const [session, setSession] = useState<Session | null | undefined>(undefined);
   const [notice, setNotice] = useState("");
   const [said, setSaid] = useState("");
-  useEffect(() => void begin(token).then(setSession), [token]);
+  const page = usePage();
+  useEffect(() => void begin(token, page.name === "visit").then(setSession), [token]);
   if (session === undefined) return null;
   const leave = (why: string): void => {
     setNotice(why);
     setSession(null);
   };
+  if (page.name === "visit" || session?.role === "guest") {
+    return session === null ? <NoCode /> : <VisitApp place={page.place} onExpired={() => leave("")} />;
+  }
+  if (page.name === "codes" && session !== null && mayOperate(session)) return <CodesPage />;
   if (session !== null) {
     return (
       <ConsoleApp

@@ -40,6 +40,31 @@ export function useRoute(): Route {
   return route;
 }
 
+/** What fills the page: the console, a visit that starts at a place, or the codes that are printed for visits. */
+export interface Page {
+  readonly name: "console" | "visit" | "codes";
+  readonly place: string;
+}
+
+export function parsePage(hash: string): Page {
+  const found = /^#\/(visit|codes)(?:\/([^?]*))?/.exec(hash);
+  if (!found) return { name: "console", place: "" };
+  return { name: found[1] as "visit" | "codes", place: found[2] ?? "" };
+}
+
+export function usePage(): Page {
+  const [page, setPage] = useState(() => parsePage(location.hash));
+  useEffect(() => {
+    const changed = (): void => setPage(parsePage(location.hash));
+    addEventListener("hashchange", changed);
+    return () => removeEventListener("hashchange", changed);
+  }, []);
+  return page;
+}
+
+/** Return the address of the visits from a place that a code has: what is behind the # reaches no server's log. */
+export const visitHash = (place: string, token: string): string => `#/visit/${place}?login=${encodeURIComponent(token)}`;
+
 const SCENARIO = "fognav.scenario";
 
 /** Whether this browser's tab was opened by a demo, which has a scenario to show. */
@@ -47,9 +72,9 @@ export const ofDemo = (): boolean => sessionStorage.getItem(SCENARIO) !== null;
 
 /** Take the one-time login out of the address, so that neither history nor a shared screen keeps it. */
 export function takeLogin(): string | null {
-  const found = /^#login=([^&]+)(&scenario)?$/.exec(location.hash);
-  if (!found?.[1]) return null;
-  if (found[2]) sessionStorage.setItem(SCENARIO, "");
-  history.replaceState(null, "", `${location.pathname}${location.search}#/map`);
-  return decodeURIComponent(found[1]);
+  const found = /^#(\/visit\/[^?]*)?\??login=([^&]+)(&scenario)?$/.exec(location.hash);
+  if (!found?.[2]) return null;
+  if (found[3]) sessionStorage.setItem(SCENARIO, "");
+  history.replaceState(null, "", `#${found[1] ?? "/map"}`);
+  return decodeURIComponent(found[2]);
 }

@@ -296,7 +296,7 @@ class LiveServices:
         )  # fmt: skip
         self.planner_core = PlannerCore(1)
         self.planner = PlannerService(
-            self.planner_core, MemoryStore(), edges["planner"], clock, Health(), staging=loaded.site.staging
+            self.planner_core, MemoryStore(), edges["planner"], clock, Health(), site=loaded.site
         )
         self.agent_core = AgentCore(config, seed, find_profile=profile)
         store = MemoryStore()

@@ -26,11 +26,14 @@ export type Place = Schemas["PlaceView"];
 export type PlanReply = Schemas["PlanReply"];
 export type PlanView = Schemas["PlanView"];
 export type Pose = Schemas["Pose"];
+export type PublicPlace = Schemas["PublicPlace"];
 export type RobotPose = Schemas["RobotPose"];
 export type RobotState = Schemas["RobotState"];
 export type SetView = Schemas["SetView"];
 export type Shape = Schemas["Zone"]["shape"];
 export type TimelineEntry = Schemas["TimelineEntry"];
+export type Visit = Schemas["VisitView"];
+export type VisitBody = Schemas["VisitBody"];
 export type Zone = Schemas["Zone"];
 export type ZoneBody = Sent<Schemas["ZoneBody"], "kind" | "shape">;
 

@@ -259,6 +259,8 @@ export const enZones = {
   "action.began": "began",
   "action.ended": "ended",
   "action.stop": "stopped",
+  "action.visit": "sent for a visitor",
+  "action.visit_ended": "visit over",
 
   "replay.title": "The last hour",
   "replay.map": "Map as it was at {time}",

@@ -1,7 +1,9 @@
+import { enVisits } from "./en-visits";
 import { enZones } from "./en-zones";
 
 export const en = {
   ...enZones,
+  ...enVisits,
   "app.name": "Fognav",
   "skip": "Skip to the content",
   "view.map": "Map",

@@ -259,6 +259,8 @@ export const ptZones: Readonly<Record<keyof typeof enZones, string>> = {
   "action.end": "o tempo acabou",
   "action.began": "começou",
   "action.ended": "acabou",
+  "action.visit": "enviado para um visitante",
+  "action.visit_ended": "visita terminada",
   "action.stop": "parado",
 
   "replay.title": "A última hora",

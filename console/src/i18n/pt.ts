@@ -1,8 +1,10 @@
 import type { en } from "./en";
+import { ptVisits } from "./pt-visits";
 import { ptZones } from "./pt-zones";
 
 export const pt: Readonly<Record<keyof typeof en, string>> = {
   ...ptZones,
+  ...ptVisits,
   "app.name": "Fognav",
   "skip": "Saltar para o conteúdo",
   "view.map": "Mapa",

@@ -198,6 +198,12 @@ class DemoPlan(Message, frozen=True, kw_only=True):
     areas: list[Id] = field(default_factory=list)
 
 
+class VisitorsSite(Message, frozen=True, kw_only=True):
+    """What visitors may use: `robots` lead them to public places; without any there are no visits."""
+
+    robots: list[Id] = field(default_factory=list)
+
+
 class Site(Message, frozen=True, kw_only=True):
     """A site as `site.toml` describes it.
 
@@ -215,6 +221,7 @@ class Site(Message, frozen=True, kw_only=True):
     zone_sources: list[ZoneSourceSite] = field(default_factory=list)
     robots: list[RobotSite] = field(default_factory=list)
     markers: list[MarkerSite] = field(default_factory=list)
+    visitors: VisitorsSite = VisitorsSite()
     layers: list[str | dict[str, Any]] = field(default_factory=list)
     demo: DemoPlan | None = None
 

@@ -30,7 +30,7 @@ DEMO: Final = "demo"
 """A demo, which tells the page about its scenario."""
 ROUTES: Final[Mapping[str, tuple[str, ...]]] = {
     AGGREGATOR: ("areas", "nodes", "alerts"),
-    PLANNER: ("robots", "plan"),
+    PLANNER: ("robots", "plan", "visits"),
     CONSOLE: ("session", "events", "timeline", "recording", "openapi.json"),
     DEMO: ("scenario",),
 }

@@ -79,7 +79,7 @@ async def main() -> None:
         leadership = Leadership(
             "planner", leases, zenoh, health, connected=lambda: zenoh.connected, epochs=lambda: core.fence.epochs
         )
-        service = Service(core, store, zenoh, clock, health, leadership, key=key, staging=described.staging)
+        service = Service(core, store, zenoh, clock, health, leadership, key=key, site=described)
         service.subscribe()
         leadership.subscribe()
         zenoh.declare_liveliness("planner", site)
@@ -93,6 +93,7 @@ async def main() -> None:
                 tasks.create_task(service.snapshot_loop(), name="snapshot")
                 tasks.create_task(service.tick_loop(), name="tick")
                 tasks.create_task(service.plan_loop(), name="plan")
+                tasks.create_task(service.visiting.run(), name="visits")
                 tasks.create_task(http_process.serve(app, settings.port_file), name="http")
                 tasks.create_task(release_when(lambda: health.ready), name="memory")
         finally:

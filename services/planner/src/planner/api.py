@@ -53,6 +53,7 @@ from fog_runtime.http import (
 from fog_runtime.stores.redis_connection import StoreError
 from fog_runtime.stores.redis_store import IdempotencyError
 from planner.api_commands import KnownPlaces, add_commands
+from planner.api_visits import add_visits
 from planner.problems import PlannerProblem
 from planner.query_queue import BusyError
 from planner.robot_operator import CommandError
@@ -179,6 +180,7 @@ def make_api(service: Service, site: Site, health: Health, tokens: Tokens, stand
     _add_service(routes, service, robots)
     _add_orders(routes, service, robots, places)
     add_undo(routes, service, robots.check)
+    add_visits(Routes(app, "visits"), lambda: service.visiting, standby)
     _add_plan(Routes(app, "plan"), service, robots, places)
     recovery = Routes(app, "store")
     add_store_errors(recovery)

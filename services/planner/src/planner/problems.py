@@ -35,6 +35,19 @@ class PlannerProblem(ProblemCode):
         "command_lost", 504, "The robot does not answer, or this service has no operators' key",
         "Look whether the robot is on and connected, then repeat it",
     )  # fmt: skip
+    VISITS_OFF = "visits_off", 409, "No robot serves visitors", "Name some in [visitors] of site.toml, and restart"
+    PLACE_NOT_PUBLIC = (
+        "place_not_public",
+        422,
+        "Visitors can't choose this place",
+        "Choose one of GET /api/v1/visits/places",
+    )
+    VISIT_SAME_PLACE = "visit_same_place", 422, "The visitor is at this place already", "Choose another place"
+    VISIT_OTHER = "visit_other", 409, "This browser has another visit, which is not over", "End it, then ask again"
+    VISITS_FULL = "visits_full", 503, "Too many visitors wait", "Wait as long as `Retry-After` says"
+    VISITS_TOO_OFTEN = "visits_too_often", 429, "Too many visits were asked for", "Wait as long as `Retry-After` says"
+    NO_VISIT = "no_visit", 404, "This browser has no visit, or it was over for minutes", "Ask for one"
+    VISIT_NOT_READY = "visit_not_ready", 409, "The robot does not wait for the visitor", "Wait until `state` is `ready`"
     BUSY = (
         "busy", 503, "Too many plans wait, or of this client: `Retry-After` says when to try again",
         "Wait as long as `Retry-After` says",

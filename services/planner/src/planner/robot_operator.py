@@ -23,7 +23,7 @@ from fog_runtime.stores.redis_connection import StoreError
 from fog_runtime.stores.redis_store import Audit
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping
+    from collections.abc import Callable, Mapping
 
     from fog_contracts.messages import CommandKind, CommandReply, Pose, RobotState
     from fog_runtime.clock import Clock
@@ -168,6 +168,8 @@ class RobotOperator:
         self._changed: dict[str, asyncio.Event] = {}
         self._stops = StopRecords()
         self._doubled = DoubledRobots()
+        self.overruled: Callable[[str], object] = lambda _robot: None
+        """Called for a robot that somebody commands or stops, before the robot hears of it."""
 
     def on_state(self, robot: str, state: RobotState, now: float) -> None:
         """Record a robot's state, which arrived at `now` (s, monotonic)."""
@@ -208,6 +210,7 @@ class RobotOperator:
         It is recorded in the audit trail first, a stop afterwards. Raises `CommandError`, and `StoreError` for a
         command that could not be recorded and was not sent.
         """
+        self.overruled(robot)
         if kind in STOPS:
             try:
                 return await self._deliver(kind, robot, who)
@@ -223,6 +226,7 @@ class RobotOperator:
 
         Raises `CommandError`.
         """
+        self.overruled(robot)
         try:
             return await self._deliver("disable", robot, sender)
         finally:
@@ -266,10 +270,15 @@ class RobotOperator:
                 "this planner has no operators' key, so it can only stop robots: set FOGNAV_OPERATOR_KEY_FILE to the"
                 " site's operator.key, and restart it"
             )
-        found = self._states.get(robot)
-        if found is None or self._age(found[1]) > STATE_MAX_AGE_S:
+        state = self.heard(robot)
+        if state is None:
             raise CommandError(_silent(robot))
-        return found[0]
+        return state
+
+    def heard(self, robot: str) -> RobotState | None:
+        """Return a robot's latest state, None if it is old or there is none."""
+        found = self._states.get(robot)
+        return found[0] if found is not None and self._age(found[1]) <= STATE_MAX_AGE_S else None
 
     def _age(self, received_at: float) -> float:
         return self._clock.now() - received_at

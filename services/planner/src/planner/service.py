@@ -14,7 +14,6 @@ from collections import deque
 from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import partial
-from types import MappingProxyType
 from typing import TYPE_CHECKING, Final, TypeVar
 
 from prometheus_client import Histogram
@@ -22,17 +21,20 @@ from prometheus_client import Histogram
 from fog_contracts import channels as ch
 from fog_contracts.handlers import RefusedMessageError
 from fog_contracts.messages import PlanReply, RobotPath, RobotPose, RobotState
+from fog_contracts.site import Site
 from fog_runtime import logs, metrics
 from fog_runtime.clock import ticker
 from fog_runtime.transports.edges import Edges
 from fog_runtime.transports.zenoh_declarations import ASKER
+from planner.dock_missions import DockMissions
 from planner.dry_run_queue import DryRuns
 from planner.plan_records import PathRecord, PlanMetrics
 from planner.query_queue import BUSY_PAUSE_S, BusyError, QueryQueue, Threads
 from planner.refusals import busy
 from planner.robot_operator import RobotOperator
 from planner.snapshot_fetcher import SnapshotFetcher
-from planner.store import DockMissions, MissionPersistence
+from planner.store import MissionPersistence
+from planner.visiting import Visiting
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -46,7 +48,6 @@ if TYPE_CHECKING:
         Message,
         Place,
         PlanRequest,
-        Pose,
         Refusal,
     )
     from fog_runtime.clock import Clock
@@ -202,12 +203,9 @@ class Service:
         gate: Gate | None = None,
         *,
         key: bytes | None = None,
-        staging: Mapping[str, Pose] = MappingProxyType({}),
+        site: Site = Site(id="none"),  # noqa: B008  # frozen
     ) -> None:
-        """Prepare; `gate` decides whether this process leads or stands by, `key` signs commands to robots.
-
-        staging: by robot, the pose in front of its dock.
-        """
+        """Prepare; `gate` decides whether this process leads, `key` signs commands, `site` has docks and visitors."""
         self._core = core
         self._store = store
         self._zenoh = zenoh
@@ -223,7 +221,8 @@ class Service:
         self.missions = MissionPersistence(core, store, clock, health, self._change_goal)
         self._map = SnapshotFetcher(core, zenoh, clock, health, self._queue, on_loaded=self._wake.set)
         self.operator = RobotOperator(zenoh, store, clock, key)
-        self._docks = DockMissions(staging, self.send)
+        self._docks = DockMissions(site.staging, self.send)
+        self.visiting = Visiting(self, site, clock)
         self._jobs: set[asyncio.Task[None]] = set()
         self._metrics = PlanMetrics()
         self.poses: dict[str, RobotPose] = {}
@@ -302,6 +301,7 @@ class Service:
                 if self._answers:
                     stored = self.goals.get(ids["robot"])
                     self._docks.on_state(ids["robot"], message, stored.goal if stored else None, at.now)
+                    self.visiting.on_state(ids["robot"], message)
             self._cycle.queue_message(channel, handler, ids, message, at)
             if channel in self._core.URGENT:
                 self._wake.set()
@@ -349,6 +349,7 @@ class Service:
     def stand_by(self) -> None:
         """Follow all inputs, without missions."""
         self.missions.stand_by()
+        self.visiting.visits.clear()
 
     async def core_answers(self) -> bool:
         """Return True once the core's thread has ended a search, or all that it does; one that hangs never does.

@@ -9,25 +9,21 @@ from datetime import UTC, datetime
 from functools import partial
 from typing import TYPE_CHECKING, Final, NamedTuple
 
-from fog_contracts.messages import Message, OutOfService, Refusal, RobotGoal
+from fog_contracts.messages import Message, OutOfService, RobotGoal
 from fog_runtime import logs
 from fog_runtime.stores import records
 from fog_runtime.stores.redis_connection import StoreError, StoreLostError, StoreRefusedError
 from fog_runtime.stores.redis_store import ANY, Audit, Outcome, RecoveryError, RedisStore, Table
-from planner.missions import DockGoals
 
 if TYPE_CHECKING:
-    from collections.abc import Awaitable, Callable, Iterator, Mapping
+    from collections.abc import Callable, Iterator, Mapping
     from typing import Literal
 
-    from fog_contracts.messages import Pose, RobotState
+    from fog_contracts.messages import Pose
     from fog_runtime.clock import Clock
     from fog_runtime.health import Health
     from fog_runtime.stores.redis_store import Attempt, StoreStatus
     from planner.core import PlannerCore
-
-    Send = Callable[["Order"], Awaitable["StoredGoal | Refusal"]]
-    """Gives a robot a mission, or returns why there is none; may raise `StoreError`."""
 
 _GOALS: Final = Table(records.GOALS, "mission", version="goal.goal_id")
 _SERVICE: Final = Table(records.OUT_OF_SERVICE, "service", version="id")
@@ -36,10 +32,11 @@ _log = logs.get("planner")
 
 
 class StoredGoal(Message, frozen=True, kw_only=True):
-    """A mission as it is stored; `any_heading`: ignore the goal's theta."""
+    """A mission as it is stored; `any_heading`: ignore the goal's theta. `visit`: it belongs to a visit (ADR 69)."""
 
     goal: RobotGoal
     any_heading: bool = False
+    visit: bool = False
 
 
 class Store(RedisStore):
@@ -98,6 +95,8 @@ class Store(RedisStore):
 
 
 STORE_PERIOD_S = 0.5
+VISIT_ENDED: Final = "visit_ended"
+"""The audit trail's word for the end of a visit's mission."""
 NO_MISSION: Final = ""
 """Instead of a mission's id: expect that a robot has none."""
 _ATTEMPTS: Final = 2
@@ -119,6 +118,7 @@ class Order(NamedTuple):
     attempt: Attempt | None = None
     expected: str | None = None
     action: str = "goal"
+    visit: bool = False
 
 
 class MissionConflictError(Exception):
@@ -163,6 +163,8 @@ class MissionPersistence:
         self.goals: dict[str, StoredGoal] = {}
         """The missions by robot."""
         self._out: dict[str, OutOfService] = {}
+        self.overruled: Callable[[str], object] = lambda _robot: None
+        """Called for a robot whose mission, or service, somebody else than a visit has changed."""
 
     async def lead(self, epoch: int, *, confirmed: bool) -> None:
         """Load the stored missions and continue with this epoch; raises `StoreError` for a confirmed one.
@@ -216,7 +218,7 @@ class MissionPersistence:
             self.require_in_service(order.robot)
             stamp, place, pose = self._clock.stamp(), order.place, order.pose
             goal = RobotGoal(goal_id=secrets.token_hex(8), pose=pose, place=place, stamp=stamp)
-            stored = StoredGoal(goal=goal, any_heading=order.any_heading)
+            stored = StoredGoal(goal=goal, any_heading=order.any_heading, visit=order.visit)
             await self._store_mission(order, stored, Audit(stamp, order.who, order.action, order.attempt))
             self._begin(order.robot, stored)
         _log.info("goal_accepted", robot=order.robot, goal=goal.goal_id, x=pose.x, y=pose.y, place=place, who=order.who)
@@ -388,8 +390,15 @@ class MissionPersistence:
         for robot, mission in stored.items():
             # One that is reached may still be stored, until its deletion succeeds.
             ended = mission.goal.goal_id == self._reached.get(robot) or self.out_of_service(robot) is not None
-            if mission != self.goals.get(robot) and not ended:
+            if mission == self.goals.get(robot) or ended:
+                continue
+            if not mission.visit:
                 self._begin(robot, mission)
+                continue
+            # Its visit was in the memory of a process that is gone: nobody waits for the robot.
+            if robot in self.goals:
+                self._cancel(robot)
+            await self._store.delete(robot, mission.goal.goal_id, Audit(self._clock.stamp(), robot, VISIT_ENDED))
         self._reload = False
         self._loaded.set()
         self._health.set("goals", ok=True, detail=f"{len(self.goals)} loaded")
@@ -401,6 +410,7 @@ class MissionPersistence:
             del self._out[robot]
         else:
             self._out[robot] = out
+        self.overruled(robot)
         self._change_core(partial(self._core.set_service, robot, out))
         _log.info("robot_service", robot=robot, out=out is not None, reason=out.reason if out else "")
 
@@ -409,6 +419,8 @@ class MissionPersistence:
         with self._uncertain_write():
             await self._store.delete(robot, stored.goal.goal_id, Audit(self._clock.stamp(), who, action))
         self._cancel(robot)
+        if action != VISIT_ENDED:
+            self.overruled(robot)
         _log.info("goal_cancelled", robot=robot, goal=stored.goal.goal_id, who=who)
 
     def _cancel(self, robot: str) -> None:
@@ -417,34 +429,6 @@ class MissionPersistence:
 
     def _begin(self, robot: str, stored: StoredGoal) -> None:
         self.goals[robot] = stored
+        if not stored.visit:
+            self.overruled(robot)
         self._change_core(partial(self._core.set_goal, robot, stored.goal, any_heading=stored.any_heading))
-
-
-class DockMissions:
-    """Gives missions for docks, one at a time for each robot."""
-
-    def __init__(self, staging: Mapping[str, Pose], send: Send) -> None:
-        """`staging`: by robot, the pose in front of its dock."""
-        self._goals = DockGoals(staging)
-        self._send = send
-        self._tasks: set[asyncio.Task[None]] = set()
-
-    def on_state(self, robot: str, state: RobotState, goal: RobotGoal | None, now: float) -> None:
-        """Send the robot, which has just published its state, in front of its dock if it wants to and is not sent."""
-        pose = self._goals.due(robot, state, goal, now)
-        if pose is not None:
-            replaced = NO_MISSION if goal is None else goal.goal_id
-            task = asyncio.get_running_loop().create_task(self._give(robot, pose, replaced), name="dock")
-            self._tasks.add(task)
-            task.add_done_callback(self._tasks.discard)
-
-    async def _give(self, robot: str, pose: Pose, replaced: str) -> None:
-        try:
-            outcome = await self._send(Order(robot, pose, f"robot {robot}, to its dock", expected=replaced))
-        except (MissionConflictError, OutOfServiceError):
-            return  # an operator was faster, or keeps it where it is
-        except StoreError as error:
-            _log.error("dock_goal_failed", robot=robot, reason=str(error))
-            return
-        if isinstance(outcome, Refusal):
-            _log.warning("dock_goal_refused", robot=robot, reason=outcome.reason)

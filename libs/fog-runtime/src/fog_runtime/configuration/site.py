@@ -164,6 +164,8 @@ def _check_ids(file: Path, site: Site) -> None:
     for kind, watched in (("nodes", [n.area for n in site.nodes]), ("sources", [s.area for s in site.sources])):
         for index, area in enumerate(watched):
             _check_known(file, f"{kind}[{index}].area", area, areas)
+    for index, robot in enumerate(site.visitors.robots):
+        _check_known(file, f"visitors.robots[{index}]", robot, users["robots"])
     if site.demo:
         _check_known(file, "demo.start", site.demo.start, site.places)
         _check_known(file, "demo.goal", site.demo.goal, site.places)

@@ -10,6 +10,7 @@ import binascii
 import hashlib
 import hmac
 import os
+import secrets
 import time
 from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
@@ -35,16 +36,21 @@ _log = logs.get("tokens")
 
 
 class Caller(msgspec.Struct, frozen=True):
-    """The owner of a valid token; the name appears in the audit log. `until` is when a session ends (s, Unix time)."""
+    """The owner of a valid token; the name appears in the audit log. `until` is when a session ends (s, Unix time).
+
+    `session` tells apart the browsers that are logged in by the same token; empty without a session.
+    """
 
     name: str
     role: Role
     until: float | None = None
+    session: str = ""
 
 
 class _Session(msgspec.Struct, frozen=True, array_like=True):
     name: str
     until: float
+    id: str = ""
 
 
 class Tokens:
@@ -95,7 +101,7 @@ class Tokens:
         if self._key is None or sha256 is None:
             return None
         until = self._now() + SESSION_S
-        payload = msgspec.msgpack.encode(_Session(owner.name, until))
+        payload = msgspec.msgpack.encode(_Session(owner.name, until, owner.session or secrets.token_hex(8)))
         value = f"{_text(payload)}.{_text(self._signature(self._key, payload, sha256))}"
         return value, msgspec.structs.replace(owner, until=until)
 
@@ -114,7 +120,7 @@ class Tokens:
             if caller.name == session.name:
                 expected = self._signature(self._key, payload, sha256)
                 if hmac.compare_digest(signature, expected) and self._now() < session.until:
-                    return msgspec.structs.replace(caller, until=session.until)
+                    return msgspec.structs.replace(caller, until=session.until, session=session.id)
         return None
 
     @staticmethod

@@ -1,0 +1,113 @@
+"""REST of visits: all that a guest may see and do. Nothing here tells of other visits, robots or places."""
+
+from collections.abc import Callable
+
+from fog_contracts.messages import Id, Message
+from fog_runtime.admission import source_of
+from fog_runtime.http import Answer, Body, Caller, ClientHost, Guest, HttpProblem, ProblemError, Routes
+from planner.problems import PlannerProblem
+from planner.visiting import Visiting
+from planner.visits import Visit, VisitEnd, VisitError, VisitState
+
+_REFUSALS = [
+    PlannerProblem.VISITS_OFF, PlannerProblem.PLACE_NOT_PUBLIC, PlannerProblem.VISIT_SAME_PLACE,
+    PlannerProblem.VISIT_OTHER, PlannerProblem.VISITS_FULL, PlannerProblem.VISITS_TOO_OFTEN,
+    PlannerProblem.NO_VISIT, PlannerProblem.VISIT_NOT_READY,
+]  # fmt: skip
+
+
+class PublicPlace(Message, frozen=True, kw_only=True):
+    """A place that visitors may choose."""
+
+    id: Id
+    label: str
+
+
+class VisitBody(Message, frozen=True, kw_only=True):
+    """Where the visitor stands, and where to go: ids of public places."""
+
+    start: Id
+    goal: Id
+
+
+class VisitView(Message, frozen=True, kw_only=True):
+    """A visit. `state`: waiting (for a robot), coming, ready (for "go"), leading, arrived; or ended: `end` says why.
+
+    `ahead`: how many wait before. `distance_m`: what the robot still has to drive; `seconds`: for how long, or how long
+    it still waits. Null: not known.
+    """
+
+    start: Id
+    goal: Id
+    state: VisitState
+    end: VisitEnd | None
+    ahead: int
+    robot: Id | None
+    distance_m: float | None
+    seconds: float | None
+
+
+def _owner(caller: Caller) -> str:
+    return f"{caller.name} {caller.session}"
+
+
+def add_visits(routes: Routes, visiting: Callable[[], Visiting], standby: Callable[[], str]) -> None:
+    """Add the routes; `visiting` returns the visits of the service that runs."""
+    routes.raises(VisitError, _REFUSALS, _problem)
+
+    def view(visit: Visit) -> VisitView:
+        distance, seconds = visiting().rest(visit)
+        return VisitView(
+            start=visit.start,
+            goal=visit.goal,
+            state=visit.state,
+            end=visit.end,
+            ahead=visiting().visits.ahead(visit) if visit.state == "waiting" else 0,
+            robot=visit.robot,
+            distance_m=distance,
+            seconds=seconds,
+        )
+
+    @routes.get("/api/v1/visits/places")
+    async def list_public_places(_caller: Guest) -> list[PublicPlace]:
+        """List the places that visitors may choose."""
+        return [PublicPlace(id=name, label=place.label) for name, place in sorted(visiting().places.items())]
+
+    @routes.post("/api/v1/visits", status=(200, 201), raises=[VisitError])
+    async def ask(body: Body[VisitBody], caller: Guest, client: ClientHost) -> Answer[VisitView]:
+        """Let a robot come to a public place and lead to another one. The same request again changes nothing (200)."""
+        runner, source = visiting(), source_of(client) if client else ""
+        before = runner.visits.of(_owner(caller), runner.now())
+        ends = (body.start, body.goal)
+        visit = runner.visits.ask(_owner(caller), source, ends, runner.places, runner.now())
+        runner.step()
+        return Answer(view(visit), status=200 if visit is before else 201)
+
+    @routes.get("/api/v1/visits/mine", raises=[VisitError], problems=[HttpProblem.STANDS_BY])
+    async def get_visit(caller: Guest) -> VisitView:
+        """Return the visit of this session. Who waits and does not ask for a minute gives up the place."""
+        if reason := standby():
+            raise ProblemError(HttpProblem.STANDS_BY, f"{reason}; send the request there")
+        visit = visiting().visits.of(_owner(caller), visiting().now())
+        if visit is None:
+            raise ProblemError(PlannerProblem.NO_VISIT, "this browser has no visit: ask for one")
+        return view(visit)
+
+    @routes.post("/api/v1/visits/mine/go", raises=[VisitError])
+    async def follow(caller: Guest) -> VisitView:
+        """Let the robot lead on: the visitor stands beside it."""
+        visit = visiting().visits.go(_owner(caller), visiting().now())
+        visiting().step()
+        return view(visit)
+
+    @routes.delete("/api/v1/visits/mine", raises=[VisitError])
+    async def cancel(caller: Guest) -> None:
+        """End the visit; its robot stops."""
+        visiting().visits.cancel(_owner(caller), visiting().now())
+        visiting().step()
+
+
+def _problem(error: VisitError) -> ProblemError:
+    headers = {"Retry-After": f"{max(1.0, error.retry_s):.0f}"} if error.retry_s else None
+    code = next(each for each in _REFUSALS if each == str(error.code))
+    return ProblemError(code, str(error), headers=headers)

@@ -2,6 +2,7 @@
 
 import json
 import math
+import re
 from pathlib import Path
 
 import msgspec
@@ -13,10 +14,10 @@ from fog_contracts.grid import GridGeometry, StaticMap
 from fog_contracts.messages import CircleShape, Place, Pose, Zone
 from fog_contracts.resampling import resampled
 from fog_contracts.site import AreaSite, MarkerSite, NodeSite, RobotSite, Site, Sonar
+from fog_mapping.another_map import agreement, findings
 from fog_runtime.configuration.maps import load_map, save_map
 from fog_runtime.configuration.site import load_site
 from fognav.__main__ import app
-from fognav.map_change import findings
 from fognav.site_files import check_site, to_toml
 
 GEOMETRY = GridGeometry(240, 160, 0.05, 0.0, 0.0)
@@ -61,7 +62,7 @@ SITE = Site(
         ((6.0, 3.0, 7.5, 3.2), {"node n1 would report blocked with nothing there"}),
         (
             (2.9, 4.4, 3.4, 4.9),
-            {"zone wet lies in a wall", "robot r7 stands where the new map says: it lies in a wall"},
+            {"zone wet lies in a wall", "robot r7 lies in a wall", "goal of robot r7 lies in a wall"},
         ),
         ((5.0, 2.1, 5.2, 2.4), {"marker 7 looks into a wall"}),
         ((2.3, 4.5, 2.7, 4.9), {"operators' place sofa lies in a wall"}),
@@ -70,10 +71,17 @@ SITE = Site(
 )
 def test_each_thing_that_does_not_fit_the_new_map_is_named(wall, named):
     zones = [Zone(id="wet", kind="BLOCKED", shape=CircleShape(centre=(3.15, 4.65), radius=0.1))]
-    found = findings(SITE, office(), office(wall), zones, {"r7": (3.2, 4.6)}, {"sofa": Place(x=2.5, y=4.7)})
-    told = [f"{one.kind} {one.id} {one.problem}" for one in found]
+    robot = {"r7": (3.2, 4.6)}
+    found = findings(SITE, office(), office(wall), zones, robot, {"sofa": Place(x=2.5, y=4.7)}, robot)
+    told = [re.sub(r" at \(.*?\)", "", str(one)) for one in found]
     assert len(told) == len(named), told
     assert all(any(one.startswith(name) for one in told) for name in named), told
+
+
+def test_walls_of_one_floor_agree_and_those_of_another_do_not():
+    other = StaticMap(GEOMETRY, np.ascontiguousarray(office().cells[:, ::-1]))
+    assert agreement(office(), office((0.6, 0.6, 0.8, 0.8))) > 0.95
+    assert agreement(office(), other) < 0.6
 
 
 def run(*words: object) -> tuple[int, dict]:

@@ -19,6 +19,7 @@ from fog_contracts.site import AreaSite, Site
 from fog_kernels.astar import Planner
 from fog_kernels.inflation import inflate, inflation_table
 from fog_kernels.raycast import cast
+from fog_kernels.sonar import classify, default_config
 from fog_runtime.configuration.maps import load_map, save_map
 from fog_runtime.configuration.site import load_site
 from fognav.output import WrongUseError
@@ -27,7 +28,6 @@ from fognav.site_proposal import NoSiteError, propose
 from fognav_sim.barrier import barrier_across
 from fognav_sim.drive.hazard import draw_hazard
 from fognav_sim.floor import Floor
-from fognav_sim.node import classify, default_config
 from fognav_sim.sensors import Noise, Robot, Sonars
 
 SQUARE = [(0.0, 0.0), (1.0, 0.0), (1.0, 1.0)]

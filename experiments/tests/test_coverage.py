@@ -11,11 +11,11 @@ from PIL import Image
 from fog_contracts.cones import SONAR_HALF_CONE
 from fog_contracts.messages import Place, SimObstacle
 from fog_contracts.site import Site
+from fog_kernels.sonar import classify, default_config
 from fog_runtime.configuration.maps import save_map
 from fog_runtime.configuration.site import LoadedSite, load_site
 from fognav_experiments.coverage import OBSTACLE_RADIUS_M, Coverage, coverage
 from fognav_sim.floor import Floor
-from fognav_sim.node import classify, default_config
 from fognav_sim.sensors import Noise, Robot, Sonars
 
 ROOT = Path(__file__).parents[2]

@@ -8,6 +8,7 @@ from pathlib import Path
 import pytest
 import ring_site as ring
 
+from fog_kernels.sonar import default_config
 from fog_runtime.configuration.site import load_site
 from fognav_experiments.comparison import runner
 from fognav_experiments.comparison.drives import ExperimentSpec, RouteSpec, draw
@@ -25,7 +26,6 @@ from fognav_experiments.comparison.sensitivity import (
     unwarned,
     varied_site,
 )
-from fognav_sim.node import default_config
 
 ESTIG = Path(__file__).parents[2] / "sites" / "estig"
 pytestmark = pytest.mark.timeout(900)

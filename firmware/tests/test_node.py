@@ -13,7 +13,8 @@ from fog_contracts.channels import NODE_READING
 from fog_contracts.codec import decode, encode
 from fog_contracts.messages import NodeCalibration, NodeConfig, NodeReading
 from fog_contracts.site import NodeSite, Sonar
-from fognav_sim.node import SonarNode, classify, default_config
+from fog_kernels.sonar import classify, default_config
+from fognav_sim.node import SonarNode
 from fognav_sim.nodes import STEP_US, FirmwareNode
 
 SITE = NodeSite(id="n1", area="z1", x=0.0, y=0.0, theta=0.0, sonars=[Sonar(range_limit=2.0), Sonar(range_limit=2.5)])

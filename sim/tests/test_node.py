@@ -4,7 +4,8 @@ import pytest
 
 from fog_contracts.messages import NodeConfig
 from fog_contracts.site import NodeSite, Sonar
-from fognav_sim.node import SonarNode, classify, default_config
+from fog_kernels.sonar import classify, default_config
+from fognav_sim.node import SonarNode
 
 SONARS = [Sonar(range_limit=2.0), Sonar(range_limit=2.5)]
 SITE = NodeSite(id="n1", area="z1", x=0.0, y=0.0, theta=0.0, sonars=SONARS, every_reading=True)

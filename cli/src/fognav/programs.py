@@ -149,7 +149,13 @@ class ProgramSet:
     ) -> None:
         """Add a Python program, which is ready when its `/readyz` or `ready` says so."""
         port_file = self._folder.port_file(name)
-        own = {**self._common, "PORT_FILE": str(port_file), "DATA_DIR": str(self._folder.data(name)), **settings}
+        own = {
+            **self._common,
+            "PORT_FILE": str(port_file),
+            "DATA_DIR": str(self._folder.data(name)),
+            "MAPS_DIR": str(self._folder.data("maps")),
+            **settings,
+        }
         self._supervisor.add(
             Program(
                 name=name,

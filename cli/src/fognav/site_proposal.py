@@ -27,10 +27,10 @@ from fog_kernels.components import Components
 from fog_kernels.distance import squared_distance_capped
 from fog_kernels.inflation import inflate, inflation_table
 from fog_kernels.raycast import cast
+from fog_kernels.sonar import classify, default_config
 from fognav.nodes.placing import bounded, heard
 from fognav_sim.barrier import BarrierError, barrier_across
 from fognav_sim.floor import Floor
-from fognav_sim.node import classify, default_config
 
 PLACE_CLEARANCE_M: Final = 0.45
 DRIVE_M: Final = (15.0, 60.0)

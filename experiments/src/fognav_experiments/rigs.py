@@ -19,6 +19,7 @@ from fog_contracts.commands import signed_command
 from fog_contracts.cones import node_cones
 from fog_contracts.handlers import Moment, Publication
 from fog_contracts.messages import CommandReply, NodeConfig
+from fog_kernels.sonar import default_config
 from fog_runtime.configuration.robot_file import RobotFile, default_robot
 from fognav_experiments.computers import ComputerClock
 from fognav_experiments.processes import (
@@ -34,7 +35,6 @@ from fognav_experiments.processes import (
 from fognav_sim import devices
 from fognav_sim.floor import Floor
 from fognav_sim.hardware import STEP_S, Hardware
-from fognav_sim.node import default_config
 from fognav_sim.nodes import make_nodes
 from fognav_sim.sensors import LidarPlace
 from fognav_sim.world import World

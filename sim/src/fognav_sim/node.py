@@ -10,6 +10,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Final
 
 from fog_contracts.messages import AreaState, NodeConfig, NodeReading, SonarStatus
+from fog_kernels.sonar import classify, classify_sonars, default_config
 from fognav_sim.sensors import SOUND_M_S
 
 if TYPE_CHECKING:
@@ -62,39 +63,6 @@ NO_ECHO_S: Final = 0.036
 ECHO_DECAY_S: Final = 0.055
 """From a trigger to the next: the mean of the firmware's, which vary."""
 FIRMWARE: Final = "sim-1"
-
-
-def default_config(node: NodeSite) -> NodeConfig:
-    """Return the configuration that a node is flashed with: the calibration of its site."""
-    return NodeConfig(
-        version=0,
-        range_limit_m=[sonar.range_limit for sonar in node.sonars],
-        range_max_m=[sonar.range_max or 0.0 for sonar in node.sonars],
-        no_echo_is_clear=[sonar.no_echo_is_clear for sonar in node.sonars],
-    )
-
-
-def classify_sonars(ranges: list[float | None], config: NodeConfig) -> list[AreaState]:
-    """Classify the range (m; None for no echo) of each sonar, without the firmware's hysteresis."""
-    states: list[AreaState] = []
-    farthest = config.range_max_m or [0.0] * len(ranges)
-    limits = zip(ranges, config.range_limit_m, farthest, config.no_echo_is_clear, strict=True)
-    for measured, limit, most, silent in limits:
-        if measured is None:
-            states.append("clear" if silent else "unknown")
-        elif measured < limit:
-            states.append("blocked")
-        else:
-            states.append("unknown" if most and measured > most else "clear")
-    return states
-
-
-def classify(ranges: list[float | None], config: NodeConfig) -> AreaState:
-    """Classify ranges (m) as the firmware does: one near echo means blocked; clear takes every sonar, and an echo."""
-    states = classify_sonars(ranges, config)
-    if "blocked" in states:
-        return "blocked"
-    return "clear" if set(states) == {"clear"} and any(measured is not None for measured in ranges) else "unknown"
 
 
 class SonarNode:

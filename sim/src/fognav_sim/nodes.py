@@ -18,8 +18,9 @@ from typing import TYPE_CHECKING, Final, Literal, Protocol
 import msgspec
 
 from fog_contracts.messages import NodeCalibration, NodeReading
+from fog_kernels.sonar import default_config
 from fog_runtime import logs
-from fognav_sim.node import SonarNode, default_config
+from fognav_sim.node import SonarNode
 from fognav_sim.sensors import SOUND_M_S
 
 if TYPE_CHECKING:

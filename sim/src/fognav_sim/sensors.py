@@ -16,12 +16,14 @@ import numpy as np
 
 from fog_contracts.cones import SONAR_HALF_CONE
 from fog_kernels.emulation import Beams, Drawn, RecordedErrors, disturb, disturb_as_recorded
+from fog_kernels.sonar import SONAR_MAX_INCIDENCE, SONAR_MAX_M, SONAR_MIN_M, wall_fan
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from fog_contracts.robot import LidarSettings
     from fog_contracts.site import NodeSite
+    from fog_kernels.sonar import Beam, Fan
     from fognav_sim.floor import Floor
 
 LIDAR_MIN_M: Final = 0.15
@@ -84,11 +86,6 @@ class LidarFaults:
 
 SOUND_M_S: Final = 343.0
 """Speed of sound in air at 20 degrees Celsius."""
-SONAR_MIN_M: Final = 0.02
-SONAR_MAX_M: Final = 4.0
-SONAR_RAYS: Final = 16
-SONAR_MAX_INCIDENCE: Final = math.radians(45.0)
-"""Smooth surfaces reflect ultrasound like a mirror: beyond this angle of incidence no echo returns."""
 LIDAR_HEIGHT_M: Final = 0.25
 
 
@@ -213,20 +210,6 @@ def measure_lidar(
     return ranges
 
 
-_Beam = tuple[float, float, float, float]
-"""A sonar's node (x, y, theta) and its own angle on it: m and rad."""
-
-
-class _Fan(NamedTuple):
-    """The rays of a sonar's cone from (x, y), the walls that they meet, and those of them that echo."""
-
-    x: float
-    y: float
-    directions: NDArray[np.float64]
-    walls: NDArray[np.float64]
-    echoes: NDArray[np.float64]
-
-
 class _Heard(NamedTuple):
     """The range (m) of the nearest wall or obstacle that echoes, and what hides what is behind it, for each ray."""
 
@@ -244,8 +227,8 @@ class Sonars:
 
     def __init__(self, floor: Floor) -> None:
         self._floor = floor
-        self._fans: dict[_Beam, _Fan] = {}
-        self._obstacles: dict[tuple[_Beam, float], _Heard] = {}
+        self._fans: dict[Beam, Fan] = {}
+        self._obstacles: dict[tuple[Beam, float], _Heard] = {}
         self._as_of = floor.changes
 
     def measure(
@@ -268,16 +251,12 @@ class Sonars:
         """How far in front of its node a sonar begins: the node's own cell may be part of its wall."""
         return self._floor.geometry.resolution
 
-    def _fan(self, beam: _Beam) -> _Fan:
+    def _fan(self, beam: Beam) -> Fan:
         if beam not in self._fans:
-            node_x, node_y, theta, angle = beam
-            directions = theta + angle + np.linspace(-SONAR_HALF_CONE, SONAR_HALF_CONE, SONAR_RAYS)
-            x, y = node_x + self._ahead_m * math.cos(theta), node_y + self._ahead_m * math.sin(theta)
-            walls = self._floor.wall_ranges(x, y, directions, SONAR_MAX_M)
-            self._fans[beam] = _Fan(x, y, directions, walls, _echo_ranges(walls, directions))
+            self._fans[beam] = wall_fan(beam, self._ahead_m, self._floor.wall_ranges)
         return self._fans[beam]
 
-    def _nearest_standing(self, beam: _Beam, fan: _Fan, height: float) -> _Heard:
+    def _nearest_standing(self, beam: Beam, fan: Fan, height: float) -> _Heard:
         """Return the range (m) of the nearest wall or obstacle that echoes, infinite for none."""
         if self._as_of != self._floor.changes:
             self._as_of = self._floor.changes
@@ -286,7 +265,7 @@ class Sonars:
             self._obstacles[beam, height] = self._search_obstacles(fan, height)
         return self._obstacles[beam, height]
 
-    def _search_obstacles(self, fan: _Fan, height: float) -> _Heard:
+    def _search_obstacles(self, fan: Fan, height: float) -> _Heard:
         hidden, standing = fan.walls, []
         for obstacle, ranges, squareness in self._floor.obstacle_ranges(fan.x, fan.y, fan.directions, SONAR_MAX_M):
             met = np.where(_in_cone(obstacle.height, height, ranges), ranges, np.inf)
@@ -301,7 +280,7 @@ class Sonars:
         return _Heard(nearest, hidden)
 
 
-def _nearest_of_robot(fan: _Fan, hidden: NDArray[np.float64], robot: Robot, node: NodeSite) -> float:
+def _nearest_of_robot(fan: Fan, hidden: NDArray[np.float64], robot: Robot, node: NodeSite) -> float:
     """Return the range (m) at which a robot echoes, infinite if it does not."""
     if math.hypot(robot.x - fan.x, robot.y - fan.y) - robot.radius > SONAR_MAX_M:
         return math.inf
@@ -314,16 +293,6 @@ def _in_cone(top: float, node_height: float, ranges: NDArray[np.float64]) -> NDA
     """Whether an obstacle of height `top` (m) reaches up into the cone at its range."""
     reach = np.where(np.isfinite(ranges), ranges, 0.0) * math.tan(SONAR_HALF_CONE)
     return np.asarray(top >= node_height - reach)
-
-
-def _echo_ranges(ranges: NDArray[np.float64], directions: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Keep the ranges of a fan where the angle of incidence, estimated from neighbouring rays, gives an echo."""
-    finite = np.where(np.isfinite(ranges), ranges, 1e3)
-    x, y = finite * np.cos(directions), finite * np.sin(directions)
-    dx, dy = np.gradient(x), np.gradient(y)
-    # The surface runs along (dx, dy); the incidence is zero where the ray is at a right angle to it.
-    along = np.abs(dx * np.cos(directions) + dy * np.sin(directions)) / np.maximum(np.hypot(dx, dy), 1e-9)
-    return np.where(np.isfinite(ranges) & (along <= math.sin(SONAR_MAX_INCIDENCE)), ranges, np.inf)
 
 
 def _circle_ranges(

@@ -2,42 +2,39 @@
 
 from __future__ import annotations
 
+import base64
 import re
+import tempfile
 import time
-import tomllib
-from dataclasses import dataclass
 from pathlib import Path  # Typer reads annotations at run time
 from typing import TYPE_CHECKING, Annotated, Any, Final
 
 import msgspec
 import typer
 
-from fog_contracts.messages import Place, Zone
 from fog_runtime.configuration.maps import read_provenance, save_map
 from fog_runtime.configuration.site import SITE_FILE, load_site
-from fog_runtime.files import PRIVATE, atomic_write
 from fognav import checkout, kernels, site_files
 from fognav.commands.map_files import map_app
-from fognav.hosting.folders import NodeFolder, recall
+from fognav.hosting.folders import recall
 from fognav.hosting.local_nodes import KIND
 from fognav.map_files import described, loaded, provenance
 from fognav.operate.fog import Fog, find_fog
 from fognav.operate.options import FogOption, JsonOption  # noqa: TC001  # Typer reads annotations at run time
-from fognav.operate.robot_commands import stop_by_planner
 from fognav.operate.systems import registered
 from fognav.output import NOT_TRUE, FailedError, WrongUseError, exit_codes, print_line, print_result, writing
-from fognav.programs import MAP_SERVICE, PLANNER, SERVICES
+from fognav.programs import MAP_SERVICE, PLANNER
 
 if TYPE_CHECKING:
     from fog_contracts.grid import StaticMap
     from fog_mapping.alignment import Alignment
+    from fog_mapping.another_map import Finding
     from fog_runtime.configuration.site import LoadedSite
-    from fognav.map_change import Finding
 
 _KEY: Final = "site"
 """In a map's provenance: what this command did."""
 _IN_FORCE_S: Final = 240.0
-"""For three services, one after another, on a Raspberry Pi."""
+"""For three services on a Raspberry Pi."""
 _LOCALIZED_S: Final = 20.0
 _POLL_S: Final = 0.2
 
@@ -62,48 +59,45 @@ def map_change(  # noqa: PLR0913  # each option is an argument
 
     Everything on the site is looked up on the new map first: what lies in a wall there, or off the map, is named, and
     then nothing is changed (exit code 1). The new map is laid onto the present one, so that all coordinates stay
-    right. Robots are stopped and lose their missions; each finds itself on the new map, and waits to be enabled.
+    right. A fog that runs gets it by REST, as from the console; without one the site's folder does. Robots are
+    stopped and lose their missions; each finds itself on the new map, and waits to be enabled.
     """
-    from fognav import map_change as change  # noqa: PLC0415  # keeps the other commands fast
+    from fog_mapping import another_map  # noqa: PLC0415  # keeps the other commands fast
 
     with exit_codes():
         if (map_file is None) is not back:
             raise WrongUseError("name either the new map, or --back")
         kernels.warm_cache(print_line)
         present = load_site(checkout.site_folder(site))
-        name, static, alignment = _new_map(present, map_file, as_it_is=as_it_is)
         running = _running(present, fog)
-        zones, poses, places = ([], {}, {}) if running is None else _known(running)
-        found = change.findings(present.site, present.map, static, zones, poses, places)
-        values: dict[str, Any] = {
-            "site": present.site.id,
-            "map": name,
-            "previous": present.site.map,
-            "alignment": None if alignment is None else alignment._asdict(),
-            **described(static),
-            **change.changed_area(present.map, static),
-            "findings": change.as_values(found),
-            "fog": None if running is None else running.system.name,
-            "changed": False,
-        }
-        lines = _preview(present, values, found, running)
-        refused = any(one.refused for one in found) or (bool(found) and not accept)
-        if not preview and not refused:
-            values["changed"] = True
-            if map_file is not None:
-                made = {**read_provenance(map_file), _KEY: {**provenance(map_file), "previous": present.site.map}}
-                with writing(present.directory / name, "Run this as the folder's owner"):
-                    save_map((present.directory / name).with_suffix(""), static, made)
-            try:
-                values |= _change(present, name, running)
-            except (WrongUseError, FailedError):
-                if map_file is not None and _named(present) != name:
-                    for suffix in (".yaml", ".pgm"):
-                        (present.directory / name).with_suffix(suffix).unlink(missing_ok=True)
-                raise
+        values: dict[str, Any] = {"site": present.site.id, "fog": None if running is None else running.system.name}
+        static: StaticMap | None = None
+        if running is not None:
+            values |= _looked_up(running, present, map_file, as_it_is=as_it_is)
+        else:
+            name, static, alignment = _new_map(present, map_file, as_it_is=as_it_is)
+            found = another_map.findings(present.site, present.map, static)
+            values |= {
+                "map": name,
+                "previous": present.site.map,
+                "alignment": None if alignment is None else alignment._asdict(),
+                **described(static),
+                **msgspec.to_builtins(another_map.changed_area(present.map, static)),
+                "findings": msgspec.to_builtins(found),
+                "refused": any(one.refused for one in found),
+                "accepted": not found,
+            }
+        lines = _preview(values, [msgspec.convert(one, another_map.Finding) for one in values["findings"]])
+        refused = values["refused"] or not (values["accepted"] or accept)
+        values["changed"] = not preview and not refused
+        if values["changed"]:
+            if running is not None:
+                values |= _change(running, values["preview"])
+            else:
+                _write(present, map_file, values["map"], static)
             lines += _changed(present, values, running)
         elif refused:
-            lines.append(_refusal(present, found))
+            lines.append(_refusal(values))
         print_result(values, *lines, json=json)
         if refused:
             raise typer.Exit(NOT_TRUE)
@@ -114,9 +108,6 @@ def _new_map(present: LoadedSite, map_file: Path | None, *, as_it_is: bool) -> t
 
     None: its frame is taken for the present one's.
     """
-    from fog_mapping.alignment import MisfitError  # noqa: PLC0415  # keeps the other commands fast
-    from fognav.map_change import in_frame_of  # noqa: PLC0415  # same
-
     folder = present.directory
     if map_file is None:
         before = read_provenance(folder / present.site.map).get(_KEY)
@@ -127,20 +118,41 @@ def _new_map(present: LoadedSite, map_file: Path | None, *, as_it_is: bool) -> t
                 "command. Name a map instead of --back"
             )
         return name, loaded(folder / name), None
-    static, alignment = loaded(map_file), None
-    try:
-        if not as_it_is:
-            static, alignment = in_frame_of(static, present.map)
-    except MisfitError as error:
-        raise FailedError(
-            f"{map_file} can't be laid onto {folder / present.site.map}: {error}. If it has the same frame, "
-            "say so: --as-it-is"
-        ) from error
+    static, alignment = _laid(present, map_file, as_it_is=as_it_is)
     stem = re.sub(r"-\d+$", "", Path(present.site.map).stem)
     number = 2
     while any((folder / f"{stem}-{number}{suffix}").exists() for suffix in (".yaml", ".pgm")):
         number += 1
     return f"{stem}-{number}.yaml", static, alignment
+
+
+def _laid(present: LoadedSite, map_file: Path, *, as_it_is: bool) -> tuple[StaticMap, Alignment | None]:
+    """Return a map in the present one's frame, and how it was laid there."""
+    from fog_mapping.alignment import MisfitError, in_frame_of  # noqa: PLC0415  # keeps the other commands fast
+
+    static = loaded(map_file)
+    try:
+        return (static, None) if as_it_is else in_frame_of(static, present.map)
+    except MisfitError as error:
+        raise FailedError(
+            f"{map_file} can't be laid onto {present.directory / present.site.map}: {error}. If it has the same frame, "
+            "say so: --as-it-is"
+        ) from error
+
+
+def _write(present: LoadedSite, map_file: Path | None, name: str, static: StaticMap | None) -> None:
+    """Write the map beside the present one, and its name into the site's file."""
+    if map_file is not None and static is not None:
+        made = {**read_provenance(map_file), _KEY: {**provenance(map_file), "previous": present.site.map}}
+        with writing(present.directory / name, "Run this as the folder's owner"):
+            save_map((present.directory / name).with_suffix(""), static, made)
+    try:
+        site_files.write(present, site_files.with_map(present, name))
+    except (WrongUseError, FailedError):
+        if map_file is not None:
+            for suffix in (".yaml", ".pgm"):
+                (present.directory / name).with_suffix(suffix).unlink(missing_ok=True)
+        raise
 
 
 # --- the fog of the site -------------------------------------------------------------------------------------------
@@ -164,107 +176,51 @@ def _running(present: LoadedSite, address: str | None) -> Fog | None:
     return None
 
 
-def _known(fog: Fog) -> tuple[list[Zone], dict[str, tuple[float, float]], dict[str, Place]]:
-    """Return the zones, where each robot stands that knows it, and the places."""
-    zones = msgspec.convert(fog.get(MAP_SERVICE, "/api/v1/zones")["zones"], list[Zone])
-    places = msgspec.convert(fog.get(MAP_SERVICE, "/api/v1/places"), dict[str, Place])
-    views = [view for view in fog.get(PLANNER, "/api/v1/robots") if view["pose"] and view["pose"]["localized"]]
-    return zones, {view["id"]: (view["pose"]["x"], view["pose"]["y"]) for view in views}, places
+def _looked_up(fog: Fog, present: LoadedSite, map_file: Path | None, *, as_it_is: bool) -> dict[str, Any]:
+    """Return what the fog says of a map, or of the one before its own; raises `FailedError`."""
+    alignment: Alignment | None = None
+    body: dict[str, object] = {"back": True}
+    if map_file is not None:
+        static, alignment = _laid(present, map_file, as_it_is=as_it_is)
+        body = {"upload": _uploaded(static)}
+    seen = fog.send("POST", MAP_SERVICE, "/api/v1/map/preview", body)
+    area = seen.pop("area")
+    return {
+        **seen,
+        **area,
+        "preview": seen.pop("id"),
+        "map": seen["name"] or present.site.map,
+        "previous": fog.get(MAP_SERVICE, "/api/v1/map/state")["name"] or present.site.map,
+        "alignment": None if alignment is None else alignment._asdict(),
+    }
 
 
-def _stop_robots(fog: Fog) -> dict[str, str]:
-    """Stop every robot, and end its mission; return what became of each."""
-    told = {}
-    for view in fog.get(PLANNER, "/api/v1/robots"):
-        robot = view["id"]
-        if view["state"] is None:
-            told[robot] = "has not been heard of"
-            continue
+def _uploaded(static: StaticMap) -> dict[str, str]:
+    with tempfile.TemporaryDirectory() as folder:
+        prefix = Path(folder) / "map"
+        save_map(prefix, static, image="png")
+        image = base64.b64encode(prefix.with_suffix(".png").read_bytes()).decode("ascii")
+        return {"yaml": prefix.with_suffix(".yaml").read_text("utf-8"), "image": image}
+
+
+def _change(fog: Fog, preview: str) -> dict[str, Any]:
+    """Put a map into force that was looked at, and wait until it is; return what was reached. Raises `FailedError`."""
+    epoch = int(fog.get(MAP_SERVICE, "/api/v1/map")["epoch"])
+    fog.send("PUT", MAP_SERVICE, "/api/v1/map", {"preview": preview, "accept": True})
+    deadline, trouble, reached = time.monotonic() + _IN_FORCE_S, "it still has the map before", epoch
+    while reached <= epoch:
+        if time.monotonic() > deadline:
+            raise FailedError(
+                f"the new map was not in force after {_IN_FORCE_S:.0f} s: {trouble}. fognav logs map-service says more"
+            )
+        time.sleep(_POLL_S)
         try:
-            stop_by_planner(fog, robot)
-            told[robot] = "stopped"
+            reached = int(fog.get(MAP_SERVICE, "/api/v1/map")["epoch"])
+            fog.get(MAP_SERVICE, "/readyz")
+            fog.get(PLANNER, "/readyz")
         except FailedError as error:
-            # It looks at the new map by itself as soon as it hears of that, and holds meanwhile.
-            told[robot] = f"did not answer ({error})"
-        if view["goal"] is not None:
-            fog.send("DELETE", PLANNER, f"/api/v1/robots/{robot}/goal")
-            told[robot] += f", its mission to {view['goal']['place'] or 'a position'} has ended"
-    return told
-
-
-@dataclass(frozen=True)
-class _Node:
-    """A fog node of `fognav up`, whose services can be told to read their map anew."""
-
-    fog: Fog
-    data: Path
-
-    def epoch(self) -> int:
-        return int(self.fog.get(MAP_SERVICE, "/api/v1/map")["epoch"])
-
-    def pids(self) -> dict[str, int]:
-        """Return the processes of the site's services, as the register has them."""
-        system = self.fog.system
-        found = [each for each in registered() if (each.name, each.data) == (system.name, system.data)]
-        if not found:
-            raise FailedError(f"the fog node {system.name} has ended")
-        names = {name.rpartition(".")[2]: pid for name, pid in found[0].pids.items()}
-        return {service: names[service] for service in SERVICES if service in names}
-
-    def order(self, map_name: str) -> None:
-        """Let the services start anew, one at a time."""
-        file = NodeFolder(self.data).map_order(self.fog.system.site)
-        file.parent.mkdir(mode=0o700, exist_ok=True)
-        atomic_write(file, f"{map_name} {time.time_ns()}\n".encode(), mode=PRIVATE)
-
-    def wait(self, before: dict[str, int], epoch: int) -> int:
-        """Wait until all of them run anew and are ready; return the map's epoch. Raises `FailedError`."""
-        deadline, trouble = time.monotonic() + _IN_FORCE_S, ""
-        while time.monotonic() < deadline:
-            now = self.pids()
-            old = [service for service in SERVICES if now.get(service, before.get(service)) == before.get(service)]
-            trouble = f"{', '.join(old)} still has the map before" if old else ""
-            try:
-                if not old:
-                    for service in SERVICES:
-                        self.fog.get(service, "/readyz")
-                    if (reached := self.epoch()) > epoch:
-                        return reached
-            except FailedError as error:
-                trouble = str(error)
-            time.sleep(_POLL_S)
-        raise FailedError(f"the new map was not in force after {_IN_FORCE_S:.0f} s: {trouble}")
-
-
-def _change(present: LoadedSite, name: str, running: Fog | None) -> dict[str, Any]:
-    """Put the map into the site's file, and into force where the fog runs here; return what was reached."""
-    text = site_files.with_map(present, name)
-    if running is None:
-        site_files.write(present, text)
-        return {}
-    robots = _stop_robots(running)
-    if running.system.data is None:
-        site_files.write(present, text)
-        return {"robots": robots}
-    node = _Node(running, Path(running.system.data))
-    before, epoch = node.pids(), node.epoch()
-    site_files.write(present, text)
-    node.order(name)
-    try:
-        reached = node.wait(before, epoch)
-    except FailedError as error:
-        site_files.write(present, site_files.with_map(present, present.site.map))
-        node.order(present.site.map)
-        raise FailedError(
-            f"{error}. {present.directory / SITE_FILE} names {present.site.map} again, and the services start with "
-            "that; their logs say more (fognav logs map-service)"
-        ) from error
-    return {"epoch_before": epoch, "epoch": reached, "robots": robots, "localized": _localized(running, reached)}
-
-
-def _named(present: LoadedSite) -> str:
-    """Return the map that the site's file names now."""
-    return str(tomllib.loads((present.directory / SITE_FILE).read_text("utf-8"))["map"])
+            trouble, reached = str(error), epoch
+    return {"epoch_before": epoch, "epoch": reached, "localized": _localized(fog, reached)}
 
 
 def _localized(fog: Fog, epoch: int) -> dict[str, list[float] | None]:
@@ -289,7 +245,7 @@ def _localized(fog: Fog, epoch: int) -> dict[str, list[float] | None]:
 # --- what is told ----------------------------------------------------------------------------------------------------
 
 
-def _preview(present: LoadedSite, values: dict[str, Any], found: list[Finding], running: Fog | None) -> list[str]:
+def _preview(values: dict[str, Any], found: list[Finding]) -> list[str]:
     where = "its frame is taken for that of the present map"
     if (alignment := values["alignment"]) is not None:
         (x, y, theta), share, residual = alignment.values()
@@ -301,35 +257,33 @@ def _preview(present: LoadedSite, values: dict[str, Any], found: list[Finding], 
         f"{values['floor_to_wall_m2']} m2; newly known {values['newly_known_m2']} m2, no longer known "
         f"{values['no_longer_known_m2']} m2"
     )
-    lines = [f"site {present.site.id}: {present.site.map} becomes {values['map']}, {where}", floor]
+    lines = [f"site {values['site']}: {values['previous']} becomes {values['map']}, {where}", floor]
     lines += [f"  {one}" + (" [can't be accepted]" if one.refused else "") for one in found]
-    if running is None:
+    if values["fog"] is None:
         lines.append("  no fog node of this site runs here: its zones, and where its robots stand, were not looked up")
+    elif not values["robots"]:
+        lines.append("  the planner did not answer: where robots stand, and are sent, was not looked up")
     return lines
 
 
-def _refusal(present: LoadedSite, found: list[Finding]) -> str:
-    fixed = [f"{one.kind} {one.id}" for one in found if one.refused]
+def _refusal(values: dict[str, Any]) -> str:
+    fixed = [f"{one['kind']} {one['id']}" for one in values["findings"] if one["refused"]]
     if fixed:
-        file = present.directory / SITE_FILE
-        return f"nothing was changed: move {', '.join(fixed)} in {file} to where both maps allow it"
+        return f"nothing was changed: move {', '.join(fixed)} in {SITE_FILE} to where both maps allow it"
     return "nothing was changed: move what was named, or take it as it is with --accept"
 
 
 def _changed(present: LoadedSite, values: dict[str, Any], running: Fog | None) -> list[str]:
-    lines = [f"changed: {present.directory / SITE_FILE} names {values['map']}"]
-    lines += [f"  robot {name}: {told}" for name, told in values.get("robots", {}).items()]
-    if "epoch" in values:
-        lines.append(f"  in force: the map's epoch is {values['epoch']}, and was {values['epoch_before']}")
+    if running is None:
+        lines = [f"changed: {present.directory / SITE_FILE} names {values['map']}"]
+        if read_provenance(present.directory / values["map"]).get(_KEY) is None:
+            file = present.directory / present.site.map
+            return [*lines, f"the other one is still there: fognav map change {file} --site {present.directory}"]
+    else:
+        lines = [f"changed, and in force: the map's epoch is {values['epoch']}, and was {values['epoch_before']}"]
         for name, place in values["localized"].items():
-            there = (
-                "has not found itself on it yet" if place is None else f"is at ({place[0]:.2f}, {place[1]:.2f}) on it"
-            )
-            lines.append(f"  robot {name} {there}; fognav robot enable --robot {name}")
-    elif running is not None:
-        services = " ".join(SERVICES)
-        lines.append(f"  the services read it at their start: there, docker compose restart {services}")
-    there = "back: fognav map change --back"
-    if read_provenance(present.directory / values["map"]).get(_KEY) is None:
-        there = f"the other one is still there: fognav map change {present.directory / present.site.map}"
-    return [*lines, f"{there} --site {present.directory}"]
+            there = "has not found itself on it yet"
+            if place is not None:
+                there = f"is at ({place[0]:.2f}, {place[1]:.2f}) on it"
+            lines.append(f"  robot {name} was stopped, and {there}; fognav robot enable --robot {name}")
+    return [*lines, f"back: fognav map change --back --site {present.directory}"]

@@ -1,9 +1,8 @@
 """The programs of a fog node on this machine: as they are run until a signal, and as other commands see them.
 
-Changes of the credentials and of a site's map (`fognav map change`) come into force while it runs. Mosquitto reads its
-files again on a signal. Redis, the router and the services read them at their start only, so each is started again, one
-at a time, when its own files have changed: what else is connected goes on meanwhile, and what was connected to it
-connects again.
+Changes of the credentials come into force while it runs. Mosquitto reads its files again on a signal. Redis, the router
+and the services read them at their start only, so each is started again, one at a time, when its own files have
+changed: what else is connected goes on meanwhile, and what was connected to it connects again.
 """
 
 import asyncio
@@ -64,7 +63,7 @@ _RESTARTED_S: Final = 180.0
 
 
 class CredentialChanges:
-    """Watches the files of each program's credentials, and the order to read a map; `round` is called once a second."""
+    """Watches the files of each program's credentials; `round` is called once a second."""
 
     def __init__(self, supervisor: Supervisor, files: Mapping[str, Sequence[Path]]) -> None:
         """Watch these files, or all in these folders, by the program that reads them; servers come first."""
@@ -204,7 +203,6 @@ class LocalNode:
             site.name(service): [
                 security.folder("http"),
                 security.credentials(site.name(service)),
-                self.config.folder.map_order(site.id),
             ]
             for site in self.config.sites
             for service in SERVICES
@@ -422,7 +420,7 @@ async def attend(
 
 def _tell(event: Event, print_line: Callable[[str], None]) -> None:
     if event.kind == "exited":
-        print_line(f"{event.program} died ({event.detail})")
+        print_line(f"{event.program} {'ended' if event.detail.startswith('exit code 0') else 'died'} ({event.detail})")
 
 
 def _announce(node: LocalNode, print_line: Callable[[str], None]) -> None:

@@ -70,10 +70,6 @@ class NodeFolder(SystemFolder):
             raise FailedError(str(error)) from error
         return folder
 
-    def map_order(self, site: str) -> Path:
-        """Return the file whose change lets the services of a site read their map anew."""
-        return self.path / "maps" / site
-
     def used(self) -> bool:
         """Whether a fog node runs with this data now."""
         with (self.path / _LOCK).open("w") as file:

@@ -13,8 +13,9 @@ from fog_contracts.costs import FREE
 from fog_contracts.shapes import rasterize
 from fog_contracts.site import NodeSite, Sonar
 from fog_kernels.raycast import cast
+from fog_kernels.sonar import SONAR_MAX_M
 from fognav_sim.floor import Floor
-from fognav_sim.sensors import SONAR_MAX_M, Noise, Robot, Sonars
+from fognav_sim.sensors import Noise, Robot, Sonars
 
 if TYPE_CHECKING:
     from collections.abc import Sequence

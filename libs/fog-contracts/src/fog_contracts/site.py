@@ -176,6 +176,10 @@ class RobotSite(Message, frozen=True, kw_only=True):
         return Pose(x=x - STAGING_M * math.cos(theta), y=y - STAGING_M * math.sin(theta), theta=theta)
 
 
+BEFORE_MARKER_M: Final = (0.15, 0.3)
+"""So far in front of a marker the floor is free. It hangs on the face of a wall, whose cells may reach past it."""
+
+
 class MarkerSite(Message, frozen=True, kw_only=True):
     """A marker on a wall, by whose picture a robot with a camera knows where it is: an AprilTag of the family 36h11.
 

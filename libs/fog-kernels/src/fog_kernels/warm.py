@@ -51,7 +51,7 @@ PROFILES: dict[str, tuple[str, ...]] = {
         "lines",
         "tiles",
     ),
-    "map": ("distance", "inflation", "spans"),
+    "map": ("components", "distance", "inflation", "raycast", "spans"),
     "sim": ("distance", "emulation", "raycast"),
     "mapping": ("matching",),
     "all": (

@@ -8,7 +8,8 @@ from typing import TYPE_CHECKING, Final, NamedTuple
 import numpy as np
 from scipy import ndimage
 
-from fog_contracts.costs import FREE, LETHAL
+from fog_contracts.costs import FREE, LETHAL, UNKNOWN
+from fog_contracts.grid import GridGeometry, StaticMap, Window
 from fog_contracts.resampling import resampled
 from fog_kernels.matching import Excluded, Reference
 from fog_mapping.poses import place, rotate
@@ -16,8 +17,6 @@ from fog_mapping.scans import thinned
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
-
-    from fog_contracts.grid import StaticMap
 
 _COARSE_M: Final = 0.15
 _TURN_STEP: Final = math.radians(1.0)
@@ -36,6 +35,8 @@ _RIVAL: Final = 0.97
 """Another place that fits by this share of the best leaves it open which is right."""
 _ELSEWHERE: Final = 1.0, 0.2
 """m and rad: farther than that is another place."""
+_MARGIN_M: Final = 1.0
+_IN_PLACE: Final = (0.0, 0.0, 0.0)
 
 
 class MisfitError(ValueError):
@@ -147,3 +148,32 @@ def laid_onto(static: StaticMap, onto: StaticMap, pose: tuple[float, float, floa
     g = static.geometry
     corner = place(np.array(pose), np.array(((g.origin_x, g.origin_y),)))[0]
     return resampled(static, pose[2], (float(corner[0]), float(corner[1])), aligned_to=onto.geometry)
+
+
+def in_frame_of(new: StaticMap, present: StaticMap) -> tuple[StaticMap, Alignment]:
+    """Return a map in the frame of the present one, and where its own frame lies there, by matching of the walls.
+
+    One that lies well as it is stays as it is. Raises `MisfitError` for one that fits nowhere, or in two ways.
+    """
+    found = judged(new, present, _IN_PLACE)
+    if found.share >= LEAST_SHARE and found.residual <= present.geometry.resolution:
+        return new, found
+    found = align(new, present)
+    return _trimmed(laid_onto(new, present, found.pose), present), found
+
+
+def _trimmed(static: StaticMap, present: StaticMap) -> StaticMap:
+    """Return a map without what is far from all that it knows, and off the present one.
+
+    One that was turned has wide empty corners.
+    """
+    rows, columns = np.nonzero(static.cells != UNKNOWN)
+    g, margin = static.geometry, math.ceil(_MARGIN_M / static.geometry.resolution)
+    x, y, size = int(columns.min()), int(rows.min()), g.resolution
+    known = Window(x, y, int(columns.max()) - x + 1, int(rows.max()) - y + 1).grown(margin)
+    window = g.clip(known.union(g.window_around(*present.geometry.bounds)))
+    origin = g.origin_x + window.x * size, g.origin_y + window.y * size
+    return StaticMap(
+        GridGeometry(window.width, window.height, size, *origin),
+        np.ascontiguousarray(static.cells[window.rows, window.columns]),
+    )

@@ -83,6 +83,10 @@ def _unchanged_parts(smaps: str) -> list[tuple[int, int]]:
     return found
 
 
+class AgainError(Exception):
+    """The process ends in order to be started again by what supervises it, with what it reads at its start only."""
+
+
 ENDING_S: Final = 9.0
 """How long an orderly end may take: less than container engines and service managers wait before they kill."""
 
@@ -154,7 +158,8 @@ async def _supervise(main: Callable[[], Awaitable[None]]) -> None:
 def run(main: Callable[[], Awaitable[None]]) -> None:
     """Run `main` until it returns, or until a signal of `signals.ENDING` cancels it; all end the process with status 0.
 
-    An exception from `main` is logged as one event, and the process exits with status 1. A second signal ends the
+    `AgainError` does so, too. Another exception from `main` is logged as one event, and the process exits with status
+    1. A second signal ends the
     process at once, except a second hang-up. An end that takes longer than `ENDING_S` is cut short: the stacks of all
     threads are written to standard error, and the process exits with status 1.
     """
@@ -162,6 +167,10 @@ def run(main: Callable[[], Awaitable[None]]) -> None:
         asyncio.run(_supervise(main))
     except Exception as error:  # noqa: BLE001  # the last place that can log why the process ends
         causes = _leaves(error)
+        if all(isinstance(cause, AgainError) for cause in causes):
+            _log.info("starting_again", reason=str(causes[0]))
+            _leave(0)
+            return
         _log.error("crashed", error=error, reason="; ".join(f"{type(c).__name__}: {c}" for c in causes))
         _leave(1)
         raise SystemExit(1) from None

@@ -19,6 +19,7 @@ from fog_contracts.messages import Id, Message
 from fog_runtime.clock import SystemClock
 from fog_runtime.health import Health
 from fog_runtime.http import (
+    MAP_UPLOADS,
     Answer,
     ClientHost,
     Encoded,
@@ -60,7 +61,7 @@ def make_api(
     `forward` passes on what other services have (None: there are none), `page` is the folder of the built page (None:
     that of the package).
     """
-    app = make_app("Fognav console-service", health, tokens, first_page=False)
+    app = make_app("Fognav console-service", health, tokens, first_page=False, large=MAP_UPLOADS)
     session = Routes(app, "session")
     add_session_routes(session, tokens, SystemClock())
     _add_events(Routes(app, "events"), service)

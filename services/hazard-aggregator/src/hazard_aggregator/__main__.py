@@ -12,7 +12,7 @@ from fog_contracts.handlers import Moment
 from fog_runtime import logs, process
 from fog_runtime.clock import SystemClock, boot_id
 from fog_runtime.configuration.settings import CommonSettings, describe, load
-from fog_runtime.configuration.site import load_site
+from fog_runtime.configuration.uploaded_maps import UploadedMaps
 from fog_runtime.health import Health
 from fog_runtime.http import HttpProcess, load_tokens, unused
 from fog_runtime.leadership import Leadership, LeaseStore, process_id
@@ -49,7 +49,7 @@ async def main() -> None:
     logs.configure("hazard-aggregator", settings.log_level, settings.log_format)
     _log.info("settings_loaded", **describe(settings))
     release_startup_memory()
-    loaded = load_site(settings.site_dir)
+    loaded, maps = UploadedMaps.load(settings.maps_folder, settings.site_dir, settings.site)
     site = settings.site or loaded.site.id
     clock = SystemClock(settings.speed)
     health = Health("store", "mqtt")
@@ -106,6 +106,7 @@ async def main() -> None:
                 tasks.create_task(service.store_loop(), name="store")
                 tasks.create_task(service.history.run(), name="history")
                 tasks.create_task(service.alerts.run(), name="alerts")
+                tasks.create_task(maps.until_changed(), name="another-map")
                 tasks.create_task(http_process.serve(app, settings.port_file), name="http")
 
 

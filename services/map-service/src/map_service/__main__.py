@@ -12,7 +12,7 @@ from fog_runtime import logs, metrics, process
 from fog_runtime.backup import STAMP
 from fog_runtime.clock import SystemClock, WallClock, WallClockSource, boot_id
 from fog_runtime.configuration.settings import InflationSettings, describe, load
-from fog_runtime.configuration.site import load_site
+from fog_runtime.configuration.uploaded_maps import UploadedMaps
 from fog_runtime.health import Health
 from fog_runtime.http import HttpProcess, load_tokens, unused
 from fog_runtime.leadership import Leadership, LeaseStore, process_id
@@ -45,7 +45,7 @@ async def main() -> None:
     logs.configure("map-service", settings.log_level, settings.log_format)
     _log.info("settings_loaded", **describe(settings))
     release_startup_memory()
-    loaded = load_site(settings.site_dir)
+    loaded, maps = UploadedMaps.load(settings.maps_folder, settings.site_dir, settings.site)
     site = settings.site or loaded.site.id
     clock = SystemClock(settings.speed)
     health = Health("store", "zones", "mqtt", "map")
@@ -81,12 +81,14 @@ async def main() -> None:
             synchronized = WallClock(settings.wall_clock if settings.speed == 1.0 else "trusted").synchronized
             service = Service(
                 core, store, mqtt, zenoh, clock, health, leadership,
-                site=replace(loaded.site, id=site), synchronized=synchronized, boot=boot_id(),
+                site=replace(loaded.site, id=site), maps=maps, synchronized=synchronized, boot=boot_id(),
             )  # fmt: skip
             service.subscribe()
             leadership.subscribe()
             zenoh.declare_liveliness("map-service", site)
-            app = make_api(service, loaded.site, clock, health, tokens, leadership.standby_reason)
+            app = make_api(
+                service, loaded.site, clock, health, tokens, leadership.standby_reason, site_dir=settings.site_dir
+            )
             async with asyncio.TaskGroup() as tasks:
                 tasks.create_task(mqtt.run(), name="mqtt")
                 needs = {"mqtt": mqtt.broker_answers, "zenoh": zenoh.router_answers, "map": service.serves}
@@ -95,6 +97,7 @@ async def main() -> None:
                 tasks.create_task(service.tick_loop(), name="tick")
                 tasks.create_task(service.zone_sources.run(), name="zone-sources")
                 tasks.create_task(service.publisher.commit_loop(), name="commit")
+                tasks.create_task(maps.until_changed(), name="another-map")
                 tasks.create_task(http_process.serve(app, settings.port_file), name="http")
 
 

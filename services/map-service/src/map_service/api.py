@@ -6,6 +6,7 @@ Reading needs no token, except for the audit log; writing needs the role operato
 import secrets
 from collections.abc import Callable
 from itertools import islice
+from pathlib import Path
 from typing import Annotated, Final, Literal
 
 import msgspec
@@ -21,6 +22,7 @@ from fog_runtime.clock import Clock
 from fog_runtime.concurrency import BusyError
 from fog_runtime.health import Health
 from fog_runtime.http import (
+    MAP_UPLOADS,
     Answer,
     Body,
     Encoded,
@@ -50,6 +52,7 @@ from fog_runtime.stores.records import KINDS, AuditEntry, CursorError
 from fog_runtime.stores.redis_connection import StoreError
 from fog_runtime.stores.redis_store import Attempt, IdempotencyError
 from map_service.api_dry_run import add_dry_runs
+from map_service.api_map_change import add_map_change
 from map_service.api_masks import add_masks
 from map_service.api_places import add_places
 from map_service.api_sets import add_sets, add_sources
@@ -65,7 +68,7 @@ from map_service.zone_bodies import ZoneBody, body_of_zone, zone_from_body
 from map_service.zones import ZoneError
 
 AuditKind = Literal[
-    "alert", "area", "mission", "override", "place", "robot", "set", "source", "stop", "store", "zone",
+    "alert", "area", "map", "mission", "override", "place", "robot", "set", "source", "stop", "store", "zone",
 ]  # fmt: skip
 
 _REFUSALS: Final = (ZoneError, BusyError, IdempotencyError, StoreError)
@@ -87,11 +90,21 @@ class UnusableZone(Message, frozen=True, kw_only=True):
     reason: str
 
 
-def make_api(  # the process's parts
-    service: Service, site: Site, clock: Clock, health: Health, tokens: Tokens, standby: Callable[[], str] = str
+def make_api(  # noqa: PLR0913  # the process's parts
+    service: Service,
+    site: Site,
+    clock: Clock,
+    health: Health,
+    tokens: Tokens,
+    standby: Callable[[], str] = str,
+    *,
+    site_dir: Path = Path(),
 ) -> FastAPI:
-    """Return the app over a running service; while `standby` returns a reason, nothing can be written."""
-    app = make_app("Fognav map-service", health, tokens, standby=standby)
+    """Return the app over a running service; while `standby` returns a reason, nothing can be written.
+
+    `site_dir` is the site's folder, whose map an upload replaces.
+    """
+    app = make_app("Fognav map-service", health, tokens, standby=standby, large=MAP_UPLOADS)
     zones = Routes(app, "zones")
     add_errors(zones)
     _add_zone_reads(zones, service)
@@ -109,7 +122,10 @@ def make_api(  # the process's parts
     add_errors(places)
     add_places(places, service)
     add_record_undo(places, service)
-    add_views(Routes(app, "map"), service, site)
+    maps = Routes(app, "map")
+    add_views(maps, service, site)
+    add_errors(maps)
+    add_map_change(maps, service, site_dir)
     _add_scrape_targets(Routes(app, "robots"), service, clock)
     recovery = Routes(app, "store")
     add_store_errors(recovery)

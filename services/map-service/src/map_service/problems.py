@@ -62,6 +62,23 @@ class MapProblem(ProblemCode):
         "mask_invalid", 422, "The mask can't become zones: `detail` says why",
         "Paint fewer, larger parts in few shades, on the picture of GET /api/v1/masks/keepout.png",
     )  # fmt: skip
+    MAP_INVALID = (
+        "map_invalid", 422, "The upload is no map, or one too large: `detail` says why",
+        "Upload the YAML file and the picture (PGM or PNG) that map_server writes",
+    )  # fmt: skip
+    NO_MAP_PREVIEW = "no_map_preview", 404, "There is no such preview of a map", "Upload the map, and look at it, again"
+    NO_MAP_BEFORE = "no_map_before", 404, "There is no map before the one in force", "Upload the map that you want"
+    MAP_NOT_SEEN = (
+        "map_not_seen", 412, "The map would not do any more what its preview says",
+        "Look at the preview again, then decide",
+    )  # fmt: skip
+    MAP_CHANGED = (
+        "map_changed", 412, "Somebody else has changed the map", "Look at the preview again, then decide anew"
+    )  # fmt: skip
+    MAP_DOES_NOT_FIT = (
+        "map_does_not_fit", 422, "Something would lie in a wall of the map or off it, or its walls are others",
+        "Move what `detail` names, or accept it",
+    )  # fmt: skip
     ZONES_NOT_LOADED = (
         "zones_not_loaded", 503, "The stored zones are not loaded yet",
         "Try again in a moment: /readyz says when they are",
@@ -115,6 +132,7 @@ def _conflict(error: ConflictError) -> ProblemError:
         "zone_sets": ("set of zones", MapProblem.NO_ZONE_SET, MapProblem.ZONE_SET_CHANGED),
         "zone_sources": ("source", MapProblem.NO_ZONE_SOURCE, MapProblem.ZONE_SOURCE_CHANGED),
         "places": ("place", MapProblem.NO_SUCH_PLACE, MapProblem.PLACE_CHANGED),
+        "site_maps": ("change", MapProblem.MAP_CHANGED, MapProblem.MAP_CHANGED),
     }[error.table]
     if error.outcome == "exists" and missing is MapProblem.NO_ZONE:
         detail = f"zone {error.id} exists already: choose another id, or PUT it"

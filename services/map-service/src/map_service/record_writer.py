@@ -14,11 +14,12 @@ if TYPE_CHECKING:
     from fog_contracts.handlers import Moment
     from fog_runtime.stores.redis_store import Attempt, Outcome, Table
     from map_service.places import StoredPlace
+    from map_service.site_map import StoredMap
     from map_service.store import Store
     from map_service.zone_sets import MutedSource, SetOfZones
 
 
-R = TypeVar("R", bound="SetOfZones | StoredPlace | MutedSource")
+R = TypeVar("R", bound="SetOfZones | StoredPlace | MutedSource | StoredMap")
 
 
 class ConflictError(Exception):

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import asyncio
+from functools import partial
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 from msgspec import structs
@@ -12,12 +14,14 @@ from fog_contracts import channels as ch
 from fog_contracts.site import Site
 from fog_runtime import logs
 from fog_runtime.clock import ticker
+from fog_runtime.configuration.uploaded_maps import UploadedMaps
 from fog_runtime.stores.redis_connection import StoreError, StoreLostError
 from fog_runtime.transports.edges import Edges
 from map_service.places import StoredPlace, combined
 from map_service.publisher import Publisher
 from map_service.record_writer import RecordWriter
-from map_service.store import PLACES, ZONE_SETS, ZONE_SOURCES
+from map_service.site_map import StoredMap, put_into_force
+from map_service.store import PLACES, SITE_MAPS, ZONE_SETS, ZONE_SOURCES
 from map_service.zone_sets import MutedSource, SetOfZones
 from map_service.zone_sources import ZoneSources
 from map_service.zone_writer import ZoneTimesPersistence, ZoneWriter
@@ -73,12 +77,13 @@ class Service:
         gate: Gate | None = None,
         *,
         site: Site | None = None,
+        maps: UploadedMaps | None = None,
         synchronized: Callable[[], bool] = lambda: True,
         boot: str = "",
     ) -> None:
         """Prepare; `gate` decides whether this process leads or stands by.
 
-        `site` gives the initial places, and the sources of zones.
+        `site` gives the initial places, and the sources of zones; `maps` are those that it was given by REST.
         `synchronized` tells whether the time of day is right; `boot` is `clock.boot_id`.
         """
         self.core = core
@@ -104,7 +109,9 @@ class Service:
             PLACES, StoredPlace, store, self.zones, lambda stored: publish(core.put_places(combined(places, stored)))
         )
         self.muted = RecordWriter(ZONE_SOURCES, MutedSource, store, self.zones, lambda _: None)
-        self.zones.beside = (self.sets, self.places, self.muted)
+        self.maps = maps or UploadedMaps(Path("maps"))
+        self.site_map = RecordWriter(SITE_MAPS, StoredMap, store, self.zones, partial(put_into_force, self.maps))
+        self.zones.beside = (self.sets, self.places, self.muted, self.site_map)
         core.put_places(combined(places, {}))
         self.zone_sources = ZoneSources(self._site, core, self.zones, self.sets, self.muted, self.publisher.publish)
         self._leading = False

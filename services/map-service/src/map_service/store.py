@@ -1,4 +1,4 @@
-"""The map-service's records in Redis: zones, sets of zones, places, muted sources, with optimistic versioning."""
+"""The map-service's records in Redis: zones, their sets, places, muted sources, the map; with optimistic versioning."""
 
 from __future__ import annotations
 
@@ -22,6 +22,7 @@ ZONES: Final = Table(records.ZONES, "zone")
 ZONE_SETS: Final = Table(records.ZONE_SETS, "set")
 ZONE_SOURCES: Final = Table(records.ZONE_SOURCES, "source")
 PLACES: Final = Table(records.PLACES, "place")
+SITE_MAPS: Final = Table(records.SITE_MAPS, "map")
 
 _TIMES: Final = records.ZONE_TIMES
 _ALL: Final = "all"
@@ -34,7 +35,7 @@ class _AllTimes(Message, frozen=True, kw_only=True):
 class Store(RedisStore):
     """The map-service's keys."""
 
-    tables = (ZONES.name, ZONE_SETS.name, ZONE_SOURCES.name, PLACES.name)
+    tables = (ZONES.name, ZONE_SETS.name, ZONE_SOURCES.name, PLACES.name, SITE_MAPS.name)
 
     async def zones(self) -> tuple[list[Zone], dict[str, str]]:
         """Return all stored zones, and, by id, why others are unreadable."""

@@ -56,7 +56,7 @@ def add_record_undo(routes: Routes, service: Service) -> None:
         require_zones(service)
         entry = await service.undoable(body.entry, set_id, ("set",))
         before, after = values(entry, SetOfZones)
-        record = await _bring_back(service.sets, before, after, caller.name, lambda: check_unused(service, set_id))
+        record = await bring_back(service.sets, before, after, caller.name, lambda: check_unused(service, set_id))
         await service.publisher.all_on_map()
         return undone("set", set_id, record)
 
@@ -72,11 +72,11 @@ def add_record_undo(routes: Routes, service: Service) -> None:
         before, after = values(entry, StoredPlace)
         if before is not None and not before.removed:
             check_place(place, before, service.core)  # the map may be another one
-        await _bring_back(service.places, before, after, caller.name)
+        await bring_back(service.places, before, after, caller.name)
         return undone("place", place, service.core.places.get(place))
 
 
-async def _bring_back(
+async def bring_back(
     writer: RecordWriter[R], before: R | None, after: R | None, who: str, check: Callable[[], object] = lambda: None
 ) -> R | None:
     """Store what was before; `check` may refuse to delete a record. Return it, None if that was none."""

@@ -10,6 +10,7 @@ from fog_runtime import logs, process
 from fog_runtime.clock import SystemClock
 from fog_runtime.configuration.settings import InflationSettings, SettingsError, describe, load
 from fog_runtime.configuration.site import load_site
+from fog_runtime.configuration.uploaded_maps import UploadedMaps
 from fog_runtime.health import Health
 from fog_runtime.http import HttpProcess, load_tokens, unused
 from fog_runtime.keys import KeyFileError, read_operator_key
@@ -58,6 +59,7 @@ async def main() -> None:
     release_startup_memory()
     described = load_site(settings.site_dir).site  # without the map, which comes from the map-service
     site = settings.site or described.id
+    maps = UploadedMaps(settings.maps_folder / site)
     clock = SystemClock(settings.speed)
     health = Health("store", "goals", "map", "zenoh")
     tokens = load_tokens(settings.tokens_file, settings.session_key_file)
@@ -93,7 +95,11 @@ async def main() -> None:
                 tasks.create_task(service.snapshot_loop(), name="snapshot")
                 tasks.create_task(service.tick_loop(), name="tick")
                 tasks.create_task(service.plan_loop(), name="plan")
+<<<<<<< HEAD
                 tasks.create_task(service.visiting.run(), name="visits")
+=======
+                tasks.create_task(maps.until_changed(service.stop_robots), name="another-map")
+>>>>>>> d262a988 (WIP another map by REST)
                 tasks.create_task(http_process.serve(app, settings.port_file), name="http")
                 tasks.create_task(release_when(lambda: health.ready), name="memory")
         finally:

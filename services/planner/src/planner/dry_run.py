@@ -147,6 +147,8 @@ class DryRun:
         pose = mission.pose
         assert pose is not None
         outcome = RobotOutcome(robot=robot) if mission.target is None else self._path_after(robot, mission, pose)
+        goal = None if mission.target is None else (mission.target.x, mission.target.y)
+        outcome = structs.replace(outcome, at=(pose.x, pose.y), goal=goal)
         inside = self._closing(pose)
         if inside is not None:
             start = (pose.x, pose.y)

@@ -234,6 +234,17 @@ class RobotOperator:
             if alone and not await self._record_stop(robot, {"kind": "disable"}, sender, "stop", anybody=True):
                 self._stops.unrecorded(robot, sender)
 
+    async def stop_all(self, who: str) -> None:
+        """Stop all robots that were ever heard; one that does not answer is logged."""
+
+        async def stop(robot: str) -> None:
+            try:
+                await self.send("disable", robot, who)
+            except CommandError as error:
+                _log.warning("robot_not_stopped", robot=robot, who=who, reason=str(error))
+
+        await asyncio.gather(*(stop(robot) for robot in self._states))
+
     async def record_loop(self) -> None:
         """Record, from time to time, how often stops without a token were repeated."""
         async for _ in ticker(self._clock, _RECORDS_PERIOD_S):

@@ -64,10 +64,12 @@ class RobotOutcome(Message, frozen=True, kw_only=True):
 
     `replanned`: it would get another path. `extra_m` and `extra_s` are the differences where there is a path before and
     after. `inside` names what would close the place where it stands, and `way_out` is its path out of it; it stays
-    there until an operator sends it out (`egress`).
+    there until an operator sends it out (`egress`). `at` is where it stands, `goal` where it is sent.
     """
 
     robot: Id
+    at: PointXY | None = None
+    goal: PointXY | None = None
     before: PathOutcome | None = None
     after: PathOutcome | None = None
     replanned: bool = False

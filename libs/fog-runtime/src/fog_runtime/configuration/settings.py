@@ -60,6 +60,8 @@ class CommonSettings(msgspec.Struct, frozen=True, kw_only=True):
     data_dir: Path
     site: str = ""
     """Id of the site; empty: that of `site.toml`."""
+    maps_dir: Path | None = None
+    """Folder of the maps that the fog was given by REST, the same for all services of a site; None: in `data_dir`."""
     speed: float = 1.0
     """How many times faster than real time the clock runs (simulation only)."""
     mqtt_url: str = "mqtt://127.0.0.1:1883"
@@ -90,6 +92,11 @@ class CommonSettings(msgspec.Struct, frozen=True, kw_only=True):
     def zenoh_endpoints(self) -> list[str]:
         """The endpoints in `zenoh_connect`."""
         return [part.strip() for part in self.zenoh_connect.split(",") if part.strip()]
+
+    @property
+    def maps_folder(self) -> Path:
+        """The folder of the maps that the fog was given."""
+        return self.data_dir / "maps" if self.maps_dir is None else self.maps_dir
 
     def credentials(self) -> Credentials:
         """Read the process's credentials; raises `CredentialsError`."""

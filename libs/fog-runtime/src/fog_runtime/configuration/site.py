@@ -16,7 +16,7 @@ from fog_contracts.costs import is_traversable
 from fog_contracts.geometry import GeometryError, normalized_polygon
 from fog_contracts.grid import StaticMap
 from fog_contracts.messages import AREAS_MAX, Place
-from fog_contracts.site import AreaSite, MarkerSite, NodeSite, Site
+from fog_contracts.site import BEFORE_MARKER_M, AreaSite, MarkerSite, NodeSite, Site
 from fog_runtime.configuration.maps import MapFileError, load_map
 
 SITE_FILE: Final = "site.toml"
@@ -24,8 +24,6 @@ _MEANING: Final = {"radius": ", how far (m) the robot's body reaches from the po
 """Of fields that files of an earlier version need not have."""
 _BORDER: Final = 1e-6
 """Metres by which a vertex may lie off the map: the rounding error of a polygon drawn along the map's edge."""
-BEFORE_MARKER_M: Final = (0.15, 0.3)
-"""So far in front of a marker the floor is free. It hangs on the face of a wall, whose cells may reach past it."""
 
 
 class SiteError(ValueError):
@@ -50,8 +48,10 @@ class LoadedSite:
     directory: Path
 
 
-def load_site(directory: Path, text: str | None = None) -> LoadedSite:
+def load_site(directory: Path, text: str | None = None, *, map_file: Path | None = None) -> LoadedSite:
     """Read and validate a site's folder, or what it would be with this `text` in its file; raises `SiteError`.
+
+    A `map_file` takes the place of the map that the file names.
 
     Ids are unique and every referenced id exists; areas are simple polygons on the map (counter-clockwise in the
     result), nodes lie on the map, places and start poses on free cells. Markers look at free floor.
@@ -60,9 +60,12 @@ def load_site(directory: Path, text: str | None = None) -> LoadedSite:
     site = _read(file, text)
     _check_ids(file, site)
     try:
-        static = load_map(directory / site.map)
+        static = load_map(directory / site.map if map_file is None else map_file)
     except MapFileError as error:
-        raise SiteError(file, "map", str(error), f"`map` is {site.map!r}, relative to {directory}") from error
+        remedy = f"`map` is {site.map!r}, relative to {directory}"
+        if map_file is not None:
+            remedy = "It was uploaded: restore the file from a backup, or upload the map again"
+        raise SiteError(file, "map", str(error), remedy) from error
     for index, node in enumerate(site.nodes):
         _check_on_map(file, f"nodes[{index}] ({node.id})", node.x, node.y, static)
     areas = [_checked_area(file, site, index, static) for index in range(len(site.areas))]

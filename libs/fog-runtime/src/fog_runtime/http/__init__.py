@@ -1,6 +1,6 @@
 """The REST interface of all services: problem documents (RFC 9457), tokens with roles, health, metrics, limits."""
 
-from fog_runtime.http.app import make_app
+from fog_runtime.http.app import MAP_UPLOAD, MAP_UPLOADS, make_app
 from fog_runtime.http.http_process import HttpProcess, HttpProcessError, serve_here, unused
 from fog_runtime.http.problems import RETRY_AFTER, HttpProblem, ProblemCode, ProblemError
 from fog_runtime.http.routes import (
@@ -36,6 +36,8 @@ from fog_runtime.http.tokens import Admin, Caller, Guest, Operator, Tokens, View
 from fog_runtime.token_file import TokensError, token_hash
 
 __all__ = [
+    "MAP_UPLOAD",
+    "MAP_UPLOADS",
     "RETRY_AFTER",
     "Admin",
     "Answer",

@@ -9,7 +9,7 @@ from contextlib import contextmanager
 from typing import Any, Final, Literal
 
 import msgspec
-from fastapi import FastAPI, Response
+from fastapi import FastAPI, Request, Response
 
 from fog_contracts.messages import Message
 from fog_runtime import metrics
@@ -17,7 +17,7 @@ from fog_runtime.admission import source_of
 from fog_runtime.health import Health
 from fog_runtime.http.problems import RETRY_AFTER, HttpProblem, add_problem_handlers, problem
 from fog_runtime.http.routes import ALWAYS_SERVED, Answer, Routes
-from fog_runtime.http.tokens import Tokens
+from fog_runtime.http.tokens import Tokens, still_admits
 from fog_runtime.version import VERSION
 
 Scope = MutableMapping[str, Any]
@@ -111,29 +111,53 @@ def _client(scope: Scope) -> str:
 
 
 BODY_LIMIT: Final = 1024 * 1024
-_DRAIN_FACTOR: Final = 16
-"""A body is read and discarded up to this many times the limit."""
+MAP_UPLOAD: Final = "/api/v1/map/preview"
+MAP_UPLOADS: Final[Mapping[str, int]] = {MAP_UPLOAD: 8 * 1024 * 1024}
+"""A map's picture in base64 needs more than other bodies. What passes requests on lets as much through."""
+_DRAINED: Final = 16 * BODY_LIMIT
+"""So much of a body beyond the limit is read and discarded."""
 
 BODY_S: Final = 10.0
-"""How long a body may take to arrive."""
+"""How long a body may take to arrive ..."""
+LARGE_BODY_S: Final = 60.0
+"""... and one on a route for large ones."""
+_LARGE_AT_ONCE: Final = 2
 
 
 class _BodyLimit:
-    """Reads a request's body, up to the limit, before the app runs, so that no handler has to hold more."""
+    """Reads a request's body, up to the limit, before the app runs, so that no handler has to hold more.
 
-    def __init__(self, app: App, limit: int) -> None:
+    Routes for large bodies take them of administrators only, and few at the same time.
+    """
+
+    def __init__(self, app: App, limit: int, large: Mapping[str, int]) -> None:
         self._app = app
         self._limit = limit
+        self._large = large
+        self._places = Places(_LARGE_AT_ONCE, 1, "of your large requests")
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         if scope["type"] != "http":
             await self._app(scope, receive, send)
             return
+        limit = self._large.get(scope["path"], 0)
+        if not limit or scope["method"] != "POST" or not still_admits(Request(scope), "admin"):
+            await self._limited(scope, receive, send, self._limit, BODY_S)
+        elif refusal := self._places.refusal(whose := _client(scope)):
+            headers = {**RETRY_AFTER, "Connection": "close"}
+            await problem(HttpProblem.OVERLOADED, refusal, headers=headers)(scope, receive, send)
+        else:
+            with self._places.taken(whose):
+                await self._limited(scope, receive, send, limit, LARGE_BODY_S)
+
+    async def _limited(  # an ASGI app's arguments, and the limits
+        self, scope: Scope, receive: Receive, send: Send, limit: int, seconds: float
+    ) -> None:
         try:
-            async with asyncio.timeout(BODY_S):
-                body, refusal = await self._read(receive)
+            async with asyncio.timeout(seconds):
+                body, refusal = await _read(receive, limit)
         except TimeoutError:
-            detail = f"the body did not arrive within {BODY_S:.0f} s"
+            detail = f"the body did not arrive within {seconds:.0f} s"
             slow = problem(HttpProblem.BODY_SLOW, detail, headers={"Connection": "close"})
             await slow(scope, receive, send)
             return
@@ -153,27 +177,28 @@ class _BodyLimit:
 
         await self._app(scope, replay, send)
 
-    async def _read(self, receive: Receive) -> tuple[bytes | None, Response | None]:
-        """Return the body, or None when the client disconnected, or the answer to one that is too large."""
-        body = bytearray()
-        size = 0
-        more = True
-        # The excess of a body is read for a while and discarded: a client whose connection is closed while it sends
-        # sees a reset connection instead of the response.
-        while more and size <= _DRAIN_FACTOR * self._limit:
-            message = await receive()
-            if message["type"] != "http.request":
-                return None, None
-            part = message.get("body", b"")
-            size += len(part)
-            more = message.get("more_body", False)
-            if size <= self._limit:
-                body += part
-        if size > self._limit:
-            headers = {"Connection": "close"} if more else None
-            detail = f"the body has more than {self._limit} bytes"
-            return None, problem(HttpProblem.BODY_TOO_LARGE, detail, headers=headers)
-        return bytes(body), None
+
+async def _read(receive: Receive, limit: int) -> tuple[bytes | None, Response | None]:
+    """Return the body, or None when the client disconnected, or the answer to one that is too large."""
+    body = bytearray()
+    size = 0
+    more = True
+    # The excess of a body is read for a while and discarded: a client whose connection is closed while it sends
+    # sees a reset connection instead of the response.
+    while more and size <= limit + _DRAINED:
+        message = await receive()
+        if message["type"] != "http.request":
+            return None, None
+        part = message.get("body", b"")
+        size += len(part)
+        more = message.get("more_body", False)
+        if size <= limit:
+            body += part
+    if size > limit:
+        headers = {"Connection": "close"} if more else None
+        detail = f"the body has more than {limit} bytes"
+        return None, problem(HttpProblem.BODY_TOO_LARGE, detail, headers=headers)
+    return bytes(body), None
 
 
 class Alive(Message, frozen=True, kw_only=True):
@@ -216,13 +241,14 @@ def _add_health(routes: Routes, health: Health) -> None:
         return Response(text, media_type=kind)
 
 
-def make_app(
+def make_app(  # noqa: PLR0913  # what apps have in common, each by name
     title: str, health: Health, tokens: Tokens, *, body_limit: int = BODY_LIMIT, standby: Callable[[], str] = str,
-    first_page: bool = True,
+    first_page: bool = True, large: Mapping[str, int] | None = None,
 ) -> FastAPI:  # fmt: skip
     """Build an app with health, metrics, problem documents, roles and a body limit; OpenAPI is at /openapi.json.
 
     While `standby` returns a reason, routes that write answer 503 with it. Without `first_page`, `/` is the caller's.
+    `large` are the paths to which administrators POST larger bodies, with their limits.
     """
     # FastAPI's interactive pages would load scripts from the internet.
     app = FastAPI(title=title, version=VERSION, docs_url=None, redoc_url=None)
@@ -245,7 +271,8 @@ def make_app(
         app.get("/", include_in_schema=False)(about)
 
     app.add_middleware(OpenLimit, urgent=app.state.urgent, lasting=app.state.lasting)
-    app.add_middleware(_BodyLimit, limit=body_limit)  # before it: who sends no whole body takes no place
+    # Before it: who sends no whole body takes no place.
+    app.add_middleware(_BodyLimit, limit=body_limit, large=large or {})
     generate = app.openapi
 
     def openapi() -> dict[str, Any]:

@@ -38,12 +38,13 @@ ZONE_TIMES: Final = "zone_times"
 ZONE_SETS: Final = "zone_sets"
 ZONE_SOURCES: Final = "zone_sources"
 PLACES: Final = "places"
+SITE_MAPS: Final = "site_maps"
 GOALS: Final = "goals"
 OUT_OF_SERVICE: Final = "out_of_service"
 
 OWN: Final[Mapping[str, Sequence[str]]] = {
     "hazard-aggregator": (AREAS, HAZARDS, OVERRIDES, OVERRIDE_RESTS, ALERTS, f"{HISTORY}:*"),
-    "map-service": (ZONES, ZONE_TIMES, ZONE_SETS, ZONE_SOURCES, PLACES),
+    "map-service": (ZONES, ZONE_TIMES, ZONE_SETS, ZONE_SOURCES, PLACES, SITE_MAPS),
     "planner": (GOALS, OUT_OF_SERVICE),
 }
 """The keys of each service's own records, as patterns."""
@@ -51,7 +52,7 @@ READ: Final[Mapping[str, Sequence[str]]] = {"console-service": (f"{HISTORY}:*",)
 """Others' records that a service reads, as patterns."""
 AUDITED: Final[Mapping[str, Sequence[str]]] = {
     "hazard-aggregator": ("alert", "area", "override", "store"),
-    "map-service": ("place", "set", "source", "zone", "store"),
+    "map-service": ("map", "place", "set", "source", "zone", "store"),
     "planner": ("mission", "robot", "service", "stop", "store"),
 }
 """The kinds of records whose audit trail (`audit:KIND`) each service writes."""
@@ -170,7 +171,7 @@ newer than the last one is known.
 
 
 KINDS: Final = (
-    "alert", "area", "mission", "override", "place", "robot", "service", "set", "source", "stop", "store",
+    "alert", "area", "map", "mission", "override", "place", "robot", "service", "set", "source", "stop", "store",
     "zone",
 )  # fmt: skip
 """The kinds of records that have an audit trail.

@@ -134,3 +134,7 @@ _.also_on  # verified when an archive is read; the folder keeps the description 
 _.pause_writing  # asyncio calls its protocols
 _.resume_writing
 _.num_tickets  # ssl reads it
+_.wall_to_floor_m2  # what a map changes, for people who read the answer
+_.floor_to_wall_m2
+_.newly_known_m2
+_.no_longer_known_m2

@@ -15,14 +15,17 @@ export function setTheme(to: Theme): void {
   dispatchEvent(new Event("themechange"));
 }
 
-/** Take over the stored choice. */
+const system = matchMedia("(prefers-color-scheme: dark)");
+system.addEventListener("change", startTheme);
+
+/** Take over the stored choice, or the system's. */
 export function startTheme(): void {
-  document.documentElement.dataset.theme = theme();
+  const chosen = theme();
+  document.documentElement.dataset.theme = chosen === "auto" ? (system.matches ? "dark" : "light") : chosen;
 }
 
 /** Call `listener` when other colours are shown; returns how to stop that. */
 export function onTheme(listener: () => void): () => void {
-  const system = matchMedia("(prefers-color-scheme: dark)");
   system.addEventListener("change", listener);
   addEventListener("themechange", listener);
   return () => {

@@ -65,6 +65,7 @@ class ConsoleStream:
         an empty list."""
         self.resumed_from: list[str | None] = []
         self.silent = False
+        self.role = "operator"
         self._revisions = itertools.count(1)
         self._readers: set[asyncio.Event] = set()
         self._cut = asyncio.Event()
@@ -171,13 +172,14 @@ class ConsoleStream:
                 return self._session(request, body, refused)
             outcome = {"accepted": True, "reason": "it does", "mode": "NORMAL"}
             status, answer = self.answers.get(name, (200, [] if request.method == "GET" else outcome))
+            if isinstance(answer, bytes):
+                return Response(answer, status, media_type="image/png")
             return Response(json.dumps(answer), status, media_type="application/json")
 
         app.mount("/", PageFiles(PAGE))
         return app
 
-    @staticmethod
-    def _session(request: Request, body: Any, refused: dict[str, Any]) -> Response:
+    def _session(self, request: Request, body: Any, refused: dict[str, Any]) -> Response:
         if request.method == "POST":
             if body["token"] != TOKEN:
                 return Response(json.dumps({**refused, "type": "urn:fognav:token_unknown"}), 401)
@@ -190,7 +192,7 @@ class ConsoleStream:
             return answer
         if "session" not in request.cookies:
             return Response(json.dumps(refused), 401)
-        return Response(json.dumps({"name": "ana", "role": "operator", "until": None}))
+        return Response(json.dumps({"name": "ana", "role": self.role, "until": None}))
 
 
 def _event(event: str, data: Any, number: str = "") -> str:

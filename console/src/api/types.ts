@@ -20,6 +20,8 @@ export type GoalBody = Sent<Schemas["GoalBody"]>;
 export type GoalView = Schemas["GoalView"];
 export type MapGeometry = Schemas["MapGeometry"];
 export type MapInfo = Schemas["MapInfo"];
+export type MapPreview = Schemas["MapPreview"];
+export type MapState = Schemas["MapState"];
 export type OverrideBody = Schemas["OverrideBody"];
 export type PeriodView = Schemas["PeriodView"];
 export type Place = Schemas["PlaceView"];
@@ -35,6 +37,7 @@ export type TimelineEntry = Schemas["TimelineEntry"];
 export type Visit = Schemas["VisitView"];
 export type VisitBody = Schemas["VisitBody"];
 export type Zone = Schemas["Zone"];
+export type ZoneSourceView = Schemas["ZoneSourceView"];
 export type ZoneBody = Sent<Schemas["ZoneBody"], "kind" | "shape">;
 
 /** A point of the floor in metres: x to the right, y up. */

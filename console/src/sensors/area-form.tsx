@@ -1,7 +1,7 @@
 // Where an area is: drawn on the map as a polygon, or what a sensor node sees; and which nodes watch it.
 import { useEffect, useReducer, useState } from "preact/hooks";
 import { Problem, request } from "../api/client";
-import type { AreaBody, AreaView } from "../api/types";
+import type { AreaBody, AreaView, AuditEntry } from "../api/types";
 import { useConsole } from "../context";
 import { t } from "../i18n/i18n";
 import { sentence } from "../stop";
@@ -41,6 +41,8 @@ export function AreaForm({ area, nodes, onDone }: Props): preact.JSX.Element {
   const [watching, setWatching] = useState<readonly string[]>(area?.definition.nodes ?? []);
   const [coneOf, setConeOf] = useState(area?.definition.cone_of ?? "");
   const [problem, setProblem] = useState("");
+  /** What somebody else has made of the area meanwhile. */
+  const [theirs, setTheirs] = useState<Theirs | null>(null);
   const [, redraw] = useReducer((count: number) => count + 1, 0);
   useEffect(() => editor.on(() => redraw(0)), [editor]);
   useEffect(() => {
@@ -53,8 +55,9 @@ export function AreaForm({ area, nodes, onDone }: Props): preact.JSX.Element {
   const polygon = coneOf === "" && shape?.type === "polygon" ? shape.points : null;
   const complete = id !== "" && (coneOf !== "" || polygon !== null);
   const save = async (): Promise<void> => {
-    const body = areaBody(area, { label, nodes: [...watching], cone_of: coneOf === "" ? null : coneOf, polygon });
-    const condition: Record<string, string> = area ? { "If-Match": `"${area.definition.version}"` } : { "If-None-Match": "*" };
+    const base = theirs?.area ?? area;
+    const body = areaBody(base, { label, nodes: [...watching], cone_of: coneOf === "" ? null : coneOf, polygon });
+    const condition: Record<string, string> = base ? { "If-Match": `"${base.definition.version}"` } : { "If-None-Match": "*" };
     try {
       const { key } = attemptOf(JSON.stringify([id, condition, body]), () => body);
       const headers = { ...condition, "Idempotency-Key": key };
@@ -64,6 +67,7 @@ export function AreaForm({ area, nodes, onDone }: Props): preact.JSX.Element {
     } catch (error) {
       const overtaken = error instanceof Problem && error.status === 412;
       setProblem(overtaken ? t("sensors.overtaken") : sentence(error));
+      if (overtaken) await readTheirs(id).then(setTheirs, () => undefined);
     }
   };
   const toggle = (node: string, on: boolean): void => {
@@ -98,6 +102,9 @@ export function AreaForm({ area, nodes, onDone }: Props): preact.JSX.Element {
       </label>
       {coneOf === "" && <DrawingFields editor={editor} types={["polygon"]} />}
       {coneOf === "" && <PointFields editor={editor} />}
+      {theirs && (
+        <SideBySide theirs={theirs} mine={{ label, nodes: watching, cone_of: coneOf === "" ? null : coneOf, polygon: polygon ?? [] }} onTheirs={() => onDone(id)} />
+      )}
       <div class="sticky">
         <p class="problem" role="alert">{problem}</p>
         <div class="actions">
@@ -106,5 +113,54 @@ export function AreaForm({ area, nodes, onDone }: Props): preact.JSX.Element {
         </div>
       </div>
     </form>
+  );
+}
+
+interface Theirs {
+  readonly area: AreaView;
+  readonly who: string;
+}
+
+async function readTheirs(id: string): Promise<Theirs> {
+  const { value: area } = await request<AreaView>("GET", `areas/${encodeURIComponent(id)}`);
+  const { value: entries } = await request<AuditEntry[]>("GET", "audit?kind=area&limit=200");
+  return { area, who: entries.find((entry) => entry.id === id)?.who ?? "?" };
+}
+
+type Edited = Pick<AreaView["definition"], "label" | "cone_of"> & { readonly nodes: readonly string[]; readonly polygon: readonly unknown[] };
+
+interface SideProps {
+  readonly mine: Edited;
+  readonly theirs: Theirs;
+  readonly onTheirs: () => void;
+}
+
+/** Both versions of an area beside each other; saving now replaces theirs by mine. */
+function SideBySide({ mine, theirs, onTheirs }: SideProps): preact.JSX.Element {
+  const other = theirs.area.definition;
+  const place = (of: Edited): string => (of.cone_of ? t("sensors.byCone", { node: of.cone_of }) : t("shape.corners", { number: of.polygon.length }));
+  const rows = [
+    [t("sensors.label"), mine.label, other.label],
+    [t("sensors.watching"), mine.nodes.join(", "), (other.nodes ?? []).join(", ")],
+    [t("sensors.placeBy"), place(mine), place({ ...other, nodes: other.nodes ?? [] })],
+  ] as const;
+  return (
+    <section class="conflict card" role="alertdialog" aria-label={t("conflict.title")}>
+      <h3>{t("conflict.title")}</h3>
+      <table>
+        <thead>
+          <tr><th scope="col">{t("conflict.field")}</th><th scope="col">{t("conflict.mine")}</th><th scope="col">{t("conflict.theirs", { who: theirs.who })}</th></tr>
+        </thead>
+        <tbody>
+          {rows.map(([field, own, their]) => (
+            <tr key={field}><th scope="row">{field}</th><td><bdi>{own || "–"}</bdi></td><td><bdi>{their || "–"}</bdi></td></tr>
+          ))}
+        </tbody>
+      </table>
+      <div class="actions">
+        <button class="primary">{t("sensors.saveMine")}</button>
+        <button type="button" onClick={onTheirs}>{t("sensors.keepTheirs")}</button>
+      </div>
+    </section>
   );
 }

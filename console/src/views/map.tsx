@@ -1,6 +1,7 @@
 // What is going on, in words: the same that the map shows.
 import { useConsole, useLive } from "../context";
 import { t } from "../i18n/i18n";
+import { MapChange } from "../map/change";
 import { areaText } from "../map/fixed-layer";
 import { routeHash } from "../router";
 import { clockTime } from "../text";
@@ -9,7 +10,7 @@ import { RobotCard } from "./robot-card";
 const RANK = { blocked: 0, unknown: 1, clear: 2 } as const;
 
 export function MapView(): preact.JSX.Element {
-  const { robot, robots } = useConsole();
+  const { robot, robots, session } = useConsole();
   const live = useLive(["zone", "area", "alert"]);
   const areas = [...live.of.area.values()].sort(
     (a, b) => RANK[a.hazard?.state ?? "unknown"] - RANK[b.hazard?.state ?? "unknown"]
@@ -55,6 +56,7 @@ export function MapView(): preact.JSX.Element {
           </li>
         ))}
       </ul>
+      {session.role === "admin" && <MapChange />}
     </>
   );
 }

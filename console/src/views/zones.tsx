@@ -12,7 +12,7 @@ import { EditLayer } from "../zones/edit-layer";
 import { editor } from "../zones/editor";
 import { applied, type Change, remove, save, undo } from "../zones/requests";
 import { scheduleText } from "../zones/schedule";
-import { SetList } from "../zones/sets";
+import { SetList, SourceList } from "../zones/sets";
 import { nudged, SHAPE_TYPES, WHOLE } from "../zones/shapes";
 import { appliedText, endText, stateText } from "../zones/words";
 import { ZoneForm } from "../zones/zone-form";
@@ -166,6 +166,7 @@ function ZoneList({ actions }: { readonly actions: Actions }): preact.JSX.Elemen
       </ul>
       {zones.length > SHOWN_MAX && <p class="muted">{t("zones.others", { number: zones.length - SHOWN_MAX })}</p>}
       <SetList />
+      <SourceList />
     </>
   );
 }

@@ -83,11 +83,13 @@ export async function undo({ id, before, after }: Change): Promise<void> {
 }
 
 /** What records are called in the paths of their undo. */
-export type Undoing = "zones" | "zone-sets" | "places" | "areas" | "robots";
+export type Undoing = "zones" | "zone-sets" | "places" | "areas" | "robots" | "map";
 
 /** Undo a change by its entry in the audit trail. */
 export async function undoEntry(of: Undoing, id: string, entry: string): Promise<void> {
-  await request("POST", `${of}/${encodeURIComponent(id)}/undo`, { body: { entry } });
+  // There is one map.
+  const record = of === "map" ? of : `${of}/${encodeURIComponent(id)}`;
+  await request("POST", `${record}/undo`, { body: { entry } });
 }
 
 /** Return which robots drive by a map with the latest change of a zone; null if nobody knows any more. */

@@ -1,25 +1,26 @@
 // Sets of zones that are switched together.
 import { useEffect, useState } from "preact/hooks";
 import { request } from "../api/client";
-import type { SetView } from "../api/types";
+import type { SetView, ZoneSourceView } from "../api/types";
 import { mayOperate, useConsole } from "../context";
 import { t } from "../i18n/i18n";
 import { sentence } from "../stop";
-import { scheduleText } from "./schedule";
+import type { Schedule } from "./draft";
+import { ScheduleFields, scheduleText } from "./schedule";
 
 const SOON_MS = 500;
 const path = (id: string): string => `zone-sets/${encodeURIComponent(id)}`;
 
-/** Return the sets as they are, read again whenever a zone or a record changes; null before they are known. */
-export function useSets(): readonly SetView[] | null {
+/** Return a list as it is, read again whenever a zone or a record changes; null before it is known. */
+function useList<T>(list: string): readonly T[] | null {
   const { live } = useConsole();
-  const [sets, setSets] = useState<readonly SetView[] | null>(null);
+  const [found, setFound] = useState<readonly T[] | null>(null);
   useEffect(() => {
     let wanted = true;
     let soon: ReturnType<typeof setTimeout> | undefined;
     const read = (): void => {
       soon = undefined;
-      void request<SetView[]>("GET", "zone-sets").then(({ value }) => wanted && setSets(value), () => undefined);
+      void request<T[]>("GET", list).then(({ value }) => wanted && setFound(value), () => undefined);
     };
     read();
     const off = live.on(["zone", "record", "ready"], () => void (soon ??= setTimeout(read, SOON_MS)));
@@ -28,9 +29,11 @@ export function useSets(): readonly SetView[] | null {
       off();
       clearTimeout(soon);
     };
-  }, [live]);
-  return sets;
+  }, [live, list]);
+  return found;
 }
+
+export const useSets = (): readonly SetView[] | null => useList<SetView>("zone-sets");
 
 /** The sets with their switches, and a new one. */
 export function SetList(): preact.JSX.Element | null {
@@ -41,10 +44,12 @@ export function SetList(): preact.JSX.Element | null {
   if (sets === null || (sets.length === 0 && !operates)) return null;
   const send = (set: string, what: Promise<unknown>, done: string): void => void what.then(() => say(done), (error: unknown) =>
     say(t("sets.failed", { set, reason: sentence(error) }), "failed"));
-  const toggle = (set: SetView): void => {
-    const body = { name: set.name, enabled: !set.enabled, schedule: set.schedule };
-    send(set.id, request("PUT", path(set.id), { body, headers: { "If-Match": `"${set.version}"` } }), t(set.enabled ? "sets.nowOff" : "sets.nowOn", { set: set.id }));
+  const change = (set: SetView, to: Partial<SetView>, done: string): void => {
+    const body = { name: set.name, enabled: set.enabled, schedule: set.schedule, ...to };
+    send(set.id, request("PUT", path(set.id), { body, headers: { "If-Match": `"${set.version}"` } }), done);
   };
+  const toggle = (set: SetView): void =>
+    change(set, { enabled: !set.enabled }, t(set.enabled ? "sets.nowOff" : "sets.nowOn", { set: set.id }));
   const add = (): void => {
     send(id, request("PUT", path(id), { body: {}, headers: { "If-None-Match": "*" } }), t("sets.added", { set: id }));
     setId("");
@@ -62,6 +67,7 @@ export function SetList(): preact.JSX.Element | null {
               <button aria-label={t(set.enabled ? "sets.offOf" : "sets.onOf", { set: set.id })} onClick={() => toggle(set)}>{t(set.enabled ? "zones.switchOff" : "zones.switchOn")}</button>
             )}
             {set.schedule && <span class="why">{scheduleText(set.schedule)}</span>}
+            {operates && <SetTimes key={set.version} set={set} onSave={(schedule) => change(set, { schedule }, t("sets.timesSaved", { set: set.id }))} />}
           </li>
         ))}
       </ul>
@@ -74,6 +80,54 @@ export function SetList(): preact.JSX.Element | null {
           <button disabled={id === ""} onClick={add}>{t("sets.add")}</button>
         </details>
       )}
+    </section>
+  );
+}
+
+interface TimesProps {
+  readonly set: SetView;
+  readonly onSave: (schedule: Schedule | null) => void;
+}
+
+/** The times of the week in which a set is on. */
+function SetTimes({ set, onSave }: TimesProps): preact.JSX.Element {
+  const [schedule, setSchedule] = useState(set.schedule);
+  return (
+    <details class="times-of">
+      <summary aria-label={t("sets.timesOf", { set: set.id })}>{t("sets.times")}</summary>
+      <ScheduleFields schedule={schedule} onChange={setSchedule} />
+      <button disabled={schedule === set.schedule} onClick={() => onSave(schedule)}>{t("edit.save")}</button>
+    </details>
+  );
+}
+
+/** The sources that put zones over MQTT, which an operator can mute. */
+export function SourceList(): preact.JSX.Element | null {
+  const { session, say } = useConsole();
+  const sources = useList<ZoneSourceView>("zone-sources") ?? [];
+  if (sources.length === 0) return null;
+  const mute = (source: ZoneSourceView): void => void request("PUT", `zone-sources/${encodeURIComponent(source.id)}`, {
+    body: { muted: !source.muted }, headers: { "If-Match": `"${source.version}"` },
+  }).then(
+    () => say(t(source.muted ? "sources.nowHeard" : "sources.nowMuted", { source: source.id })),
+    (error: unknown) => say(t("sources.failed", { source: source.id, reason: sentence(error) }), "failed"),
+  );
+  return (
+    <section aria-label={t("sources.title")}>
+      <h2>{t("sources.title")}</h2>
+      <ul class="rows">
+        {sources.map((source) => (
+          <li key={source.id} class="row">
+            <b><bdi>{source.label || source.id}</bdi></b>
+            <span class="muted">{source.zones.join(", ") || t("sources.none")}</span>
+            <span class="value">{t(source.muted ? "sources.muted" : "sources.heard")}</span>
+            {mayOperate(session) && (
+              <button aria-label={t(source.muted ? "sources.hearOf" : "sources.muteOf", { source: source.id })} onClick={() => mute(source)}>{t(source.muted ? "sources.hear" : "sources.mute")}</button>
+            )}
+            {source.problem !== "" && <span class="why"><bdi>{source.problem}</bdi></span>}
+          </li>
+        ))}
+      </ul>
     </section>
   );
 }

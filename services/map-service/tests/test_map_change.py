@@ -12,7 +12,6 @@ import httpx
 import numpy as np
 import pytest
 from PIL import Image
-from text_file import replace_text
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -59,11 +58,13 @@ def raw(image: bytes, yaml: str = YAML) -> dict[str, Any]:
 
 def png_header(width: int, height: int) -> bytes:
     """A PNG that says to be of this size and has all its pixels in some bytes, as a bomb has."""
+
     def chunk(kind: bytes, data: bytes) -> bytes:
         return len(data).to_bytes(4, "big") + kind + data + zlib.crc32(kind + data).to_bytes(4, "big")
 
     header = width.to_bytes(4, "big") + height.to_bytes(4, "big") + b"\x08\x00\x00\x00\x00"
-    return b"\x89PNG\r\n\x1a\n" + chunk(b"IHDR", header) + chunk(b"IDAT", zlib.compress(bytes(10_000))) + chunk(b"IEND", b"")
+    parts = [chunk(b"IHDR", header), chunk(b"IDAT", zlib.compress(bytes(10_000))), chunk(b"IEND", b"")]
+    return b"\x89PNG\r\n\x1a\n" + b"".join(parts)
 
 
 async def start(fog) -> httpx.AsyncClient:
@@ -139,7 +140,8 @@ async def test_what_would_lie_in_a_wall_is_named_and_the_accepted_map_is_in_forc
         plan = await client.get("/api/v1/map.png")
         with Image.open(io.BytesIO(plan.content)) as shown:
             assert shown.convert("RGB").getpixel((120, 120 - 60)) == (255, 255, 255)
-        assert (await client.get("/api/v1/map/state", headers=admin)).json() == {"name": None, "version": 0, "back": False}
+        state = (await client.get("/api/v1/map/state", headers=admin)).json()
+        assert state == {"name": None, "version": 0, "back": False}
 
 
 async def test_only_an_administrator_changes_the_map_and_nobody_applies_what_he_did_not_see(site, until, tokens):
@@ -150,7 +152,7 @@ async def test_only_an_administrator_changes_the_map_and_nobody_applies_what_he_
             headers = {} if role is None else tokens[role]
             for method, path, sent in (
                 ("POST", PREVIEW, body),
-                ("PUT", "/api/v1/map", {"preview": "site-0123456789ab"}),
+                ("PUT", "/api/v1/map", {"preview": "site-0-0123456789ab"}),
                 ("POST", "/api/v1/map/undo", {"entry": "1-1.map"}),
             ):
                 answer = await client.request(method, path, json=sent, headers=headers)
@@ -167,7 +169,7 @@ async def test_only_an_administrator_changes_the_map_and_nobody_applies_what_he_
         assert sorted(answer.status_code for answer in answers) == [200, 412], [each.text for each in answers]
     await ends(site, until)
     async with await start(site) as client:
-        unknown = await client.put("/api/v1/map", json={"preview": f"{'a' * 16}-{'b' * 12}"}, headers=admin)
+        unknown = await client.put("/api/v1/map", json={"preview": f"{'a' * 16}-1-{'b' * 12}"}, headers=admin)
         assert (unknown.status_code, unknown.json()["type"]) == (404, "urn:fognav:no_map_preview")
         # Whoever lets site.toml name another map later means that one.
         (site.site / "map.pgm").write_bytes(base64.b64decode(upload(pixels((7.0, 1.0, 7.5, 1.5)))["upload"]["image"]))
@@ -186,7 +188,7 @@ async def test_each_bad_upload_is_refused_with_the_field_and_what_to_do(site, to
     own = YAML + "fognav:\n  image_size: [100, 90]\n"
     cases = [
         (raw(base64.b64decode(upload(room)["upload"]["image"])[:5000]), "image", "can't be decoded"),
-        (raw(b"GIF89a" + bytes(50)), "image", "save it as PGM or PNG"),
+        (raw(b"GIF89a" + bytes(50)), "image", "no PGM or PNG: save it as one"),
         (raw(png_header(20_000, 20_000)), "image", "more than 16000000 pixels"),
         (raw(png_header(4_000, 4_000)), "image", "can't be decoded"),
         (upload(room, own), "image", "160 x 120 pixels, and the YAML file is of one of [100, 90]"),

@@ -35,6 +35,8 @@ _KEY: Final = "site"
 """In a map's provenance: what this command did."""
 _IN_FORCE_S: Final = 240.0
 """For three services on a Raspberry Pi."""
+_LOOKED_AT_S: Final = 40.0
+"""The service itself gives up after 28 s."""
 _LOCALIZED_S: Final = 20.0
 _POLL_S: Final = 0.2
 
@@ -183,7 +185,7 @@ def _looked_up(fog: Fog, present: LoadedSite, map_file: Path | None, *, as_it_is
     if map_file is not None:
         static, alignment = _laid(present, map_file, as_it_is=as_it_is)
         body = {"upload": _uploaded(static)}
-    seen = fog.send("POST", MAP_SERVICE, "/api/v1/map/preview", body)
+    seen = fog.send("POST", MAP_SERVICE, "/api/v1/map/preview", body, timeout_s=_LOOKED_AT_S)
     area = seen.pop("area")
     return {
         **seen,
@@ -206,7 +208,7 @@ def _uploaded(static: StaticMap) -> dict[str, str]:
 def _change(fog: Fog, preview: str) -> dict[str, Any]:
     """Put a map into force that was looked at, and wait until it is; return what was reached. Raises `FailedError`."""
     epoch = int(fog.get(MAP_SERVICE, "/api/v1/map")["epoch"])
-    fog.send("PUT", MAP_SERVICE, "/api/v1/map", {"preview": preview, "accept": True})
+    fog.send("PUT", MAP_SERVICE, "/api/v1/map", {"preview": preview, "accept": True}, timeout_s=_LOOKED_AT_S)
     deadline, trouble, reached = time.monotonic() + _IN_FORCE_S, "it still has the map before", epoch
     while reached <= epoch:
         if time.monotonic() > deadline:

@@ -280,6 +280,7 @@ def _place(folder: NodeFolder, site: str, directory: Path, redis: str) -> backup
         backup.SECRETS: folder.path / "keys" / site,
         SECURITY: folder.security,
         RECORDINGS: index_folder(folder.path),
+        backup.MAPS: folder.data("maps") / site,
     }
     service = MAP_SERVICE if site == security.sites[0] else on_floor(site, MAP_SERVICE)
     return backup.Place(redis, site, folders, folder.data(service), credentials)
@@ -331,7 +332,7 @@ def restore_into_node(file: Path, up: Path, site: Path, *, replace: bool) -> Bac
 
 def place_of(redis: str, name: str, site: Path, secrets: Path | None, data: Path) -> backup.Place:
     """Return the place of a fog node that is not by `fognav up`: whoever has its folders may back it up."""
-    folders = {backup.SITE: site, **({backup.SECRETS: secrets} if secrets else {})}
+    folders = {backup.SITE: site, backup.MAPS: data / "maps" / name, **({backup.SECRETS: secrets} if secrets else {})}
     return backup.Place(redis, name, folders, data, own_credentials(None))
 
 

@@ -103,8 +103,14 @@ class Fog:
         """Return the JSON answer of a service; raises `FailedError`, or `RefusedError` with the service's reason."""
         return self.send("GET", service, path)
 
-    def send(
-        self, method: str, service: str, path: str, body: object = None, headers: Mapping[str, str] | None = None
+    def send(  # the parts of a request
+        self,
+        method: str,
+        service: str,
+        path: str,
+        body: object = None,
+        headers: Mapping[str, str] | None = None,
+        timeout_s: float = net.HTTP_TIMEOUT_S,
     ) -> Any:  # noqa: ANN401  # JSON
         """Send a request to a service and return its JSON answer; raises as `get`."""
         url = self.system.urls.get(service)
@@ -121,6 +127,7 @@ class Fog:
                 headers=headers,
                 host=parts.hostname or net.LOOPBACK,
                 tls=self.credentials.tls_context() if parts.scheme == "https" else None,
+                timeout_s=timeout_s,
             )
         except (OSError, http.client.HTTPException) as error:
             raise FailedError(

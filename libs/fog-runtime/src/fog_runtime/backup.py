@@ -2,8 +2,8 @@
 
 Configured like the services: FOGNAV_REDIS_URL, FOGNAV_SITE_DIR, FOGNAV_TOKENS_FILE (whose folder has the secrets) and
 FOGNAV_DATA_DIR, where the time of the last backup is noted for the metrics. What is backed up: the site's keys of
-Redis, the site's folder and the secrets. A backup may be made while everything runs; restore one while the services
-are stopped.
+Redis, the site's folder, the maps that were uploaded, and the secrets. A backup may be made while everything runs;
+restore one while the services are stopped.
 
 The file is a `tar.gz`, with a hash of each part in its manifest. It holds secrets (tokens' hashes, the key that signs
 commands), so only its owner reads it:
@@ -164,6 +164,8 @@ def _content(archive: tarfile.TarFile, member: tarfile.TarInfo) -> File:
 
 SITE: Final = "site"
 SECRETS: Final = "secrets"
+MAPS: Final = "maps"
+"""Maps that were uploaded: a folder that may be missing."""
 _TIMEOUT_S: Final = 30.0
 _SHORT_LIVED_MS: Final = 10_000
 """Keys that end sooner, such as leases, are not backed up."""
@@ -188,7 +190,8 @@ async def create(file: Path, place: Place, now: float) -> Backup:
         raise BackupError(str(error)) from error
     finally:
         await redis.aclose()
-    folders = {name: await asyncio.to_thread(read_folder, folder) for name, folder in place.folders.items()}
+    there = {name: folder for name, folder in place.folders.items() if name != MAPS or folder.is_dir()}
+    folders = {name: await asyncio.to_thread(read_folder, folder) for name, folder in there.items()}
     backup = Backup(place.site, VERSION, now, keys, folders)
     await asyncio.to_thread(write_archive, file, backup)
     try:
@@ -322,7 +325,7 @@ async def _restore_keys(redis: RedisConnection, keys: Sequence[Key], found: Sequ
 
 def place_of(settings: CommonSettings, site: str) -> Place:
     """Return the fog node of this site that the settings describe."""
-    folders = {SITE: settings.site_dir}
+    folders = {SITE: settings.site_dir, MAPS: settings.maps_folder / site}
     if settings.tokens_file is not None:
         folders[SECRETS] = settings.tokens_file.parent
     return Place(settings.redis_url, site, folders, settings.data_dir, settings.credentials())

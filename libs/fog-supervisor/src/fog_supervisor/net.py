@@ -72,6 +72,7 @@ def request(  # noqa: PLR0913  # the parts of a request
     headers: Mapping[str, str] | None = None,
     host: str = LOOPBACK,
     tls: ssl.SSLContext | None = None,
+    timeout_s: float = HTTP_TIMEOUT_S,
 ) -> Response:
     """Send a request to a server on the loopback address or a `host`, by HTTPS with `tls`.
 
@@ -85,9 +86,9 @@ def request(  # noqa: PLR0913  # the parts of a request
     if token is not None:
         sent_headers["Authorization"] = f"Bearer {token}"
     if tls is None:
-        connection = http.client.HTTPConnection(host, port, timeout=HTTP_TIMEOUT_S)
+        connection = http.client.HTTPConnection(host, port, timeout=timeout_s)
     else:
-        connection = http.client.HTTPSConnection(host, port, timeout=HTTP_TIMEOUT_S, context=tls)
+        connection = http.client.HTTPSConnection(host, port, timeout=timeout_s, context=tls)
     try:
         connection.request(method, path, body=data, headers=sent_headers)
         response = connection.getresponse()

@@ -68,7 +68,8 @@ from map_service.zone_bodies import ZoneBody, body_of_zone, zone_from_body
 from map_service.zones import ZoneError
 
 AuditKind = Literal[
-    "alert", "area", "map", "mission", "override", "place", "robot", "set", "source", "stop", "store", "zone",
+    "alert", "area", "map", "mission", "override", "place", "robot", "service", "set", "source", "stop", "store",
+    "zone",
 ]  # fmt: skip
 
 _REFUSALS: Final = (ZoneError, BusyError, IdempotencyError, StoreError)

@@ -34,6 +34,7 @@ from fog_runtime.http import (
     undone,
 )
 from fog_runtime.stores.redis_connection import StoreError
+from fog_runtime.stores.redis_store import Attempt
 from fog_runtime.stores.undo import UndoError, values
 from map_service.map_check import MapReport, MapUpload, Outcome, Task, picture_file
 from map_service.problems import ZONES_NOT_LOADED, MapProblem, require_zones
@@ -44,10 +45,12 @@ from map_service.site_map import MAP_ID, StoredMap
 from map_service.undo import bring_back
 
 LEAST_AGREEMENT: Final = 0.7
-_CHECK_S: Final = 60.0
+_CHECK_S: Final = 28.0
+"""A gateway waits for an answer for 30 s."""
 _ROBOTS_S: Final = 4.0
 _WAITING: Final = 3
 _NAMED: Final = 5
+_KINDS: Final = (b"\x89PNG", b"P2", b"P5")
 _KEPT: Final = 4
 """Uploads that are kept beside the maps that are, or were, in force."""
 
@@ -72,7 +75,8 @@ class MapPreview(MapReport, frozen=True, kw_only=True):
     robots: bool
 
 
-_ID: Final = r"^([0-9a-f]{16}|site)-[0-9a-f]{12}$(?!\n)"
+_ID: Final = r"^([0-9a-f]{16}|site)-([0-9]{1,9})-[0-9a-f]{12}$(?!\n)"
+"""The map, the version of the record that its preview was made for, and what was seen."""
 PreviewId = Annotated[str, msgspec.Meta(pattern=_ID)]
 
 
@@ -100,6 +104,7 @@ class _Checks:
     def __init__(self, service: Service, site_dir: Path) -> None:
         self._service, self._site_dir = service, site_dir
         self.maps = service.maps
+        self.applying = asyncio.Lock()
         self._lock = asyncio.Lock()
         self._waiting = 0
 
@@ -122,6 +127,23 @@ class _Checks:
         finally:
             self._waiting -= 1
 
+    async def apply(self, change: MapChangeBody, who: str, attempt: Attempt | None) -> StoredMap:
+        """Put a map into force; raises `ProblemError` if it does not do what was seen, and as `look` and a write."""
+        name, version = _parts(change.preview)
+        if version != self.version:
+            raise ConflictError("stale", MAP_ID, self._service.site_map.table.name)
+        if name is not None and not self.maps.file(name).is_file():
+            raise _no_preview(change.preview)
+        preview = await self.look(name=name)
+        if preview.id != change.preview:
+            detail = f"this is not what you have seen: {_told(preview.findings)}. Look at the preview again"
+            raise ProblemError(MapProblem.MAP_NOT_SEEN, detail)
+        if preview.refused or not (preview.accepted or change.accept):
+            raise ProblemError(MapProblem.MAP_DOES_NOT_FIT, _why(preview))
+        before = None if self.stored is None else self.stored.name
+        record = StoredMap(id=MAP_ID, name=preview.name, over=preview.over, previous=before)
+        return await self._service.site_map.put(record, version, who, attempt, action="replace")
+
     async def _looked(self, upload: MapUpload | None, name: MapName | None) -> MapPreview:
         core, robots = self._service.core, await self._robots()
         task = Task(
@@ -142,13 +164,13 @@ class _Checks:
         assert outcome.report is not None
         report = outcome.report
         await asyncio.to_thread(self._forget_old, report.name)
-        refused = any(one.refused for one in report.findings)
+        refused = bool(report.trouble) or any(one.refused for one in report.findings)
         seen = [(one.kind, one.id, one.code) for one in report.findings]
-        same = repr((self.version, report.agreement >= LEAST_AGREEMENT, seen)).encode()
+        same = repr((report.agreement >= LEAST_AGREEMENT, seen)).encode()
         return MapPreview(
             **{name: getattr(report, name) for name in MapReport.__struct_fields__},
-            id=f"{report.name or 'site'}-{hashlib.sha256(same).hexdigest()[:12]}",
-            accepted=not report.findings and report.agreement >= LEAST_AGREEMENT,
+            id=f"{report.name or 'site'}-{self.version}-{hashlib.sha256(same).hexdigest()[:12]}",
+            accepted=not refused and not report.findings and report.agreement >= LEAST_AGREEMENT,
             refused=refused,
             robots=robots is not None,
         )
@@ -226,13 +248,16 @@ def add_map_change(routes: Routes, service: Service, site_dir: Path) -> None:  #
         if body.upload is None:
             detail = "send `upload` with the map, or `back`"
             raise ProblemError(MapProblem.MAP_INVALID, detail, field="body.upload")
+        if not body.upload.image.startswith(_KINDS):  # what is no picture at all needs no process of its own
+            detail = "the picture is no PGM or PNG: save it as one"
+            raise ProblemError(MapProblem.MAP_INVALID, detail, field="body.upload.image")
         return await checks.look(upload=body.upload)
 
     @routes.get("/api/v1/map/previews/{preview}.png", media_type="image/png", problems=[MapProblem.NO_MAP_PREVIEW])
     async def preview_picture(preview: str, _caller: Admin) -> Response:
         """Return the plan of a map that was looked at: red are walls that come, blue those that go."""
         try:
-            data = await asyncio.to_thread(picture_file(maps, _name_in(preview)).read_bytes)
+            data = await asyncio.to_thread(picture_file(maps, _parts(preview)[0]).read_bytes)
         except FileNotFoundError:
             raise _no_preview(preview) from None
         return Response(data, media_type="image/png", headers={"Cache-Control": "no-store"})
@@ -256,21 +281,8 @@ def add_map_change(routes: Routes, service: Service, site_dir: Path) -> None:  #
         attempt = attempt_of(idempotency_key, caller, "PUT /api/v1/map", body)
         if (earlier := await service.site_map.earlier_result(attempt)) is not None:
             return _answer(earlier)
-        version, before = checks.version, checks.stored
-        name = _name_in(body.preview)
-        if name is not None and not maps.file(name).is_file():
-            raise _no_preview(body.preview)
-        preview = await checks.look(name=name)
-        if preview.id != body.preview:
-            raise ProblemError(
-                MapProblem.MAP_NOT_SEEN,
-                f"this is not what you have seen: {_told(preview.findings)}. Look at the preview again",
-            )
-        if preview.refused or (not preview.accepted and not body.accept):
-            raise ProblemError(MapProblem.MAP_DOES_NOT_FIT, _why(preview))
-        now = None if before is None else before.name
-        record = StoredMap(id=MAP_ID, name=preview.name, over=preview.over, previous=now)
-        return _answer(await service.site_map.put(record, version, caller.name, attempt, action="replace"))
+        async with checks.applying:
+            return _answer(await checks.apply(body, caller.name, attempt))
 
     @routes.post(
         "/api/v1/map/undo",
@@ -280,19 +292,20 @@ def add_map_change(routes: Routes, service: Service, site_dir: Path) -> None:  #
     async def undo_map(body: Body[UndoBody], caller: Admin) -> Undone:
         """Undo the latest change of the map: the one before comes back, if services can start with it."""
         require_zones(service)
-        before, after = values(await service.undoable(body.entry, MAP_ID, ("map",)), StoredMap)
-        preview = await checks.look(name=None if before is None else before.name)
-        if preview.refused:
-            raise ProblemError(MapProblem.MAP_DOES_NOT_FIT, _why(preview))
-        return undone("map", MAP_ID, await bring_back(service.site_map, before, after, caller.name))
+        async with checks.applying:
+            before, after = values(await service.undoable(body.entry, MAP_ID, ("map",)), StoredMap)
+            preview = await checks.look(name=None if before is None else before.name)
+            if preview.refused:
+                raise ProblemError(MapProblem.MAP_DOES_NOT_FIT, _why(preview))
+            return undone("map", MAP_ID, await bring_back(service.site_map, before, after, caller.name))
 
 
-def _name_in(preview: str) -> MapName | None:
-    """Return which map a preview is of; raises `ProblemError`."""
+def _parts(preview: str) -> tuple[MapName | None, int]:
+    """Return which map a preview is of, and for which version; raises `ProblemError`."""
     found = re.fullmatch(_ID, preview)
     if found is None:
         raise _no_preview(preview)
-    return None if found[1] == "site" else found[1]
+    return None if found[1] == "site" else found[1], int(found[2])
 
 
 def _no_preview(preview: str) -> ProblemError:
@@ -312,7 +325,8 @@ def _told(found: list[Finding]) -> str:
 def _why(preview: MapPreview) -> str:
     if preview.refused:
         fixed = [one for one in preview.findings if one.refused]
-        return f"the services would not start: {_told(fixed)}. Move that in site.toml to where both maps allow it"
+        trouble = _told(fixed) if fixed else preview.trouble
+        return f"the services would not start: {trouble}. Move that in site.toml to where both maps allow it"
     if preview.findings:
         return f"{_told(preview.findings)}. Move what was named, or send `accept`"
     share = f"only {preview.agreement:.0%} of the walls of both maps lie on each other"

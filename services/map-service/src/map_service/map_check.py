@@ -24,7 +24,7 @@ from fog_contracts.costs import FREE, LETHAL, UNKNOWN
 from fog_contracts.messages import MapGeometry, Message, Place, PointXY, Zone
 from fog_mapping.another_map import ChangedArea, Finding, agreement, changed_area, findings
 from fog_runtime.configuration.maps import PROVENANCE_KEY, MapFileError, load_map, save_map
-from fog_runtime.configuration.site import load_site
+from fog_runtime.configuration.site import SiteError, load_site
 from fog_runtime.configuration.uploaded_maps import MapName, UploadedMaps, fingerprint
 from fog_runtime.files import SHARED, atomic_write
 
@@ -69,7 +69,8 @@ class MapReport(Message, frozen=True, kw_only=True):
     """What a map would change. `name` is null for that of `site.toml`, `over` is the fingerprint of that one.
 
     `agreement`: which share of the walls of both maps lie on each other; below 0.7 it is another floor, or has another
-    frame. `findings`: what would lie in a wall or off the map, and did not before.
+    frame. `findings`: what would lie in a wall or off the map, and did not before. `trouble`: why services would not
+    start with it, empty if they would.
     """
 
     name: MapName | None
@@ -79,6 +80,7 @@ class MapReport(Message, frozen=True, kw_only=True):
     area: ChangedArea
     agreement: float
     findings: list[Finding]
+    trouble: str = ""
 
 
 class BadMap(Message, frozen=True, kw_only=True):
@@ -205,7 +207,17 @@ def check(task: Task) -> MapReport:
         area=changed_area(loaded.map, after),
         agreement=round(agreement(loaded.map, after), 3),
         findings=findings(loaded.site, loaded.map, after, task.zones, task.poses, task.places, task.goals),
+        trouble="" if name is None else _trouble(Path(task.site_dir), maps.file(name)),
     )
+
+
+def _trouble(site_dir: Path, file: Path) -> str:
+    """Return why a service would not start with a map; empty if it would."""
+    try:
+        load_site(site_dir, map_file=file)
+    except SiteError as error:
+        return str(error).replace(f"{site_dir}/", "")
+    return ""
 
 
 def main() -> None:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import os
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Final
 
 from fog_runtime import logs, process
 from fog_runtime.clock import SystemClock
@@ -25,6 +25,9 @@ from planner.store import Store
 
 if TYPE_CHECKING:
     from pathlib import Path
+
+MAP_CHANGE: Final = "map-change"
+"""Who stops robots, in the audit trail, when another map comes."""
 
 _log = logs.get("planner")
 
@@ -85,6 +88,11 @@ async def main() -> None:
         service.subscribe()
         leadership.subscribe()
         zenoh.declare_liveliness("planner", site)
+
+        async def stop_robots() -> None:
+            if leadership.answers():
+                await service.operator.stop_all(service.missions, MAP_CHANGE)
+
         app = make_api(service, described, health, tokens, leadership.standby_reason)
         try:
             async with asyncio.TaskGroup() as tasks:
@@ -95,11 +103,8 @@ async def main() -> None:
                 tasks.create_task(service.snapshot_loop(), name="snapshot")
                 tasks.create_task(service.tick_loop(), name="tick")
                 tasks.create_task(service.plan_loop(), name="plan")
-<<<<<<< HEAD
                 tasks.create_task(service.visiting.run(), name="visits")
-=======
-                tasks.create_task(maps.until_changed(service.stop_robots), name="another-map")
->>>>>>> d262a988 (WIP another map by REST)
+                tasks.create_task(maps.until_changed(stop_robots), name="another-map")
                 tasks.create_task(http_process.serve(app, settings.port_file), name="http")
                 tasks.create_task(release_when(lambda: health.ready), name="memory")
         finally:

@@ -28,7 +28,7 @@ if TYPE_CHECKING:
     from fog_contracts.messages import CommandKind, CommandReply, Pose, RobotState
     from fog_runtime.clock import Clock
     from fog_runtime.transports.zenoh_edge import ZenohEdge
-    from planner.store import Store
+    from planner.store import MissionPersistence, Store
 
 RETURNS: Final = 3
 """How often the states must change back to an earlier run: a late one after a restart changes back to it, and again."""
@@ -234,8 +234,13 @@ class RobotOperator:
             if alone and not await self._record_stop(robot, {"kind": "disable"}, sender, "stop", anybody=True):
                 self._stops.unrecorded(robot, sender)
 
-    async def stop_all(self, who: str) -> None:
-        """Stop all robots that were ever heard; one that does not answer is logged."""
+    async def stop_all(self, missions: MissionPersistence, who: str) -> None:
+        """End all missions, and stop all robots that were ever heard; what does not succeed is logged."""
+        for robot in list(missions.goals):
+            try:
+                await missions.cancel(robot, who)
+            except StoreError as error:
+                _log.warning("mission_not_ended", robot=robot, who=who, reason=str(error))
 
         async def stop(robot: str) -> None:
             try:

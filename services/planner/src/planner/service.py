@@ -62,8 +62,6 @@ if TYPE_CHECKING:
 
 T = TypeVar("T")
 
-MAP_CHANGE: Final = "map-change"
-"""Who stops robots, in the audit trail, when another map comes."""
 MOST_SEARCHING_S: Final = 0.05
 """After so long the searches that are left wait for the next cycle, if an urgent message has come meanwhile ..."""
 LONGEST_SEARCHING_S: Final = 0.1
@@ -263,12 +261,6 @@ class Service:
             return earlier
         refusal = await self._threads.run("core", lambda: self._core.check_goal(order.pose.x, order.pose.y))
         return refusal if refusal is not None else await self.missions.send(order)
-
-    async def stop_robots(self) -> None:
-        """Stop all robots and end their missions, because another map comes."""
-        if self._answers:
-            await self.missions.cancel_all(MAP_CHANGE)
-            await self.operator.stop_all(MAP_CHANGE)
 
     async def undoable(self, entry: str, record: str, kinds: Sequence[str]) -> AuditEntry:
         """Return an entry of the audit trail that may be undone; raises `UndoError` and `StoreError`."""

@@ -224,14 +224,6 @@ class MissionPersistence:
         _log.info("goal_accepted", robot=order.robot, goal=goal.goal_id, x=pose.x, y=pose.y, place=place, who=order.who)
         return stored
 
-    async def cancel_all(self, who: str) -> None:
-        """End all missions; one that the store does not let go of is logged."""
-        for robot in list(self.goals):
-            try:
-                await self.cancel(robot, who)
-            except StoreError as error:
-                _log.warning("mission_not_ended", robot=robot, who=who, reason=str(error))
-
     async def cancel(self, robot: str, who: str, expected: str | None = None, *, action: str = "cancel") -> bool:
         """End a robot's mission; False when it has none. With `expected`, only the mission of that id.
 

@@ -139,6 +139,54 @@ async def test_enable_asks_first_and_a_refusal_is_said(console: SimpleNamespace,
     assert stream.requests[-1] == ("POST robots/r1/commands", {"kind": "enable"})
 
 
+async def test_robot_is_taken_out_of_service_and_put_back_and_says_why_it_gets_no_goal(
+    console: SimpleNamespace, stream: ConsoleStream
+) -> None:
+    page = await console.open("robots")
+    await page.get_by_role("button", name="Take out of service").click()
+    form = page.get_by_role("form", name="Service of r1")
+    await form.get_by_label("Reason").fill("worn wheel")
+    await form.get_by_role("button", name="1.0 h").or_(form.get_by_role("button", name="60 min")).click()
+    await form.get_by_role("button", name="Take out of service").click()
+    await expect(page.locator(".said")).to_have_text("r1 is out of service.")
+    assert stream.requests[-1] == ("PUT robots/r1/out-of-service", {"reason": "worn wheel", "ttl_s": 3600})
+    out = {"id": "1", "reason": "worn wheel", "by": "ana", "since": 1.0, "until": None}
+    stream.robot("r1", robot_state(), out_of_service=out)
+    says = "Out of service: worn wheel (ana). Put it back into service, then send it."
+    await expect(page.locator(".lead")).to_have_text(says)
+    await expect(page.get_by_role("button", name="Send to a goal")).to_be_disabled()
+    stream.robot("r1", robot_state("FAULT", reasons=["bumper"], codes=["bumper"]), out_of_service=out)
+    await expect(page.locator(".lead")).to_contain_text("bumper")
+    await expect(page.get_by_text(says, exact=True)).to_be_visible()
+    await page.get_by_role("button", name="Put back into service").click()
+    await page.get_by_role("form", name="Service of r1").get_by_role("button", name="Put back into service").click()
+    await expect(page.locator(".said")).to_have_text("r1 is in service.")
+    assert stream.requests[-1] == ("DELETE robots/r1/out-of-service", None)
+
+
+async def test_robot_shows_cpu_beside_that_of_one_that_drives_alone_and_its_wifi(
+    console: SimpleNamespace, stream: ConsoleStream
+) -> None:
+    def vitals(stamp: float, agent: float, wifi: float | None) -> dict[str, object]:
+        return {
+            "stamp": stamp, "cpu": {"agent": agent, "guardian": 1.0}, "wifi_dbm": wifi, "battery": 0.7
+        }  # fmt: skip
+
+    stream.answers["GET vitals/r1"] = (200, [vitals(1000.0 + 2 * n, 3.0, -50.0) for n in range(30)])
+    page = await console.open("robots")
+    stream.tell("vitals", "r1", vitals(1060.0, 4.2, -61.0))
+    shown = page.get_by_role("region", name="Its computer, the last ten minutes")
+    await expect(shown.get_by_text("5.2 %")).to_be_visible()
+    await expect(shown.get_by_text("-61 dBm")).to_be_visible()
+    await expect(shown.get_by_text("Dashed: 7.4 % of a core, what a robot took that drove alone")).to_be_visible()
+    await expect(shown.get_by_role("img", name="4.0 % to 5.2 %")).to_be_visible()
+    line = await shown.locator("svg path:not(.baseline)").first.get_attribute("d")
+    assert line.count("L") == 30, "one line through what was kept and what came"
+    assert await shown.locator("path.baseline").count() == 1
+    stream.tell("vitals", "r2", vitals(1060.0, 2.0, None))
+    await expect(page.get_by_role("button", name="r2")).to_contain_text("CPU 3.0 % · no Wi-Fi")
+
+
 async def test_goal_by_click_shows_its_path_before_it_is_sent(console: SimpleNamespace, stream: ConsoleStream) -> None:
     path = PlanReply(points=[(10.0, 26.0), (30.0, 26.0)], length=20.0)
     stream.answers["POST plan"] = (200, to_builtins(path))

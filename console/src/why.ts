@@ -1,7 +1,8 @@
 // Why a robot stands or drives slowly, in one sentence, and what to do about it.
-import type { GoalView, RobotState } from "./api/types";
+import type { GoalView, OutOfService, RobotState } from "./api/types";
 import { language, t } from "./i18n/i18n";
 import { REASONS } from "./reasons";
+import { clockTime } from "./text";
 
 export interface Why {
   /** What is the matter. */
@@ -21,8 +22,16 @@ export function whys(state: RobotState): Why[] {
   });
 }
 
+/** Return that a robot is out of service, by whom, why and till when, and what ends that. */
+export function outOfService({ reason, by, until }: OutOfService): string {
+  const end = until === null ? "" : t("service.until", { time: clockTime(until) });
+  return `${t("service.is", { reason, by, end })} ${t("service.remedy")}`;
+}
+
 /** Return one sentence about what a robot does, or why not. */
-export function headline(state: RobotState | null, goal: GoalView | null): string {
+export function headline(state: RobotState | null, goal: GoalView | null, out: OutOfService | null = null): string {
+  // Whoever asks why it gets no goal must not read that it has none.
+  if (out && (!state || state.mode === "NORMAL" || state.mode === "INIT")) return outOfService(out);
   if (!state) return t("robot.noState");
   const [first] = whys(state);
   if (first && state.mode !== "NORMAL") return first.remedy === "" ? first.says : `${first.says}. ${first.remedy}`;

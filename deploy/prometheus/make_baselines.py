@@ -1,5 +1,7 @@
 """Writes the recorded CPU of robots in the setups `default`, `full` and `fog` as Prometheus's recording rules.
 
+And what all of a robot's processes took alone and with the fog, for the console.
+
 The figures come from the report of an experiment (`fognav experiment report`): from its `drives.csv`, and the machine
 from its `README.md`, which also says what the robot's processes took in drives by real processes (`fognav experiment
 --live`). Dashboards show them beside what robots take now.
@@ -14,6 +16,7 @@ of date.
 
 import argparse
 import csv
+import json
 import re
 from collections.abc import Mapping, Sequence
 from itertools import dropwhile, takewhile
@@ -23,6 +26,8 @@ from typing import Final
 
 ROOT: Final = Path(__file__).parents[2]
 FILE: Final = Path(__file__).parent / "rules" / "baselines.yml"
+PAGE: Final = ROOT / "console" / "src" / "views" / "baseline.json"
+"""What the console compares a robot's CPU with: percent of a core of all of its processes."""
 SETUPS: Final = ("default", "full", "fog")
 _COLUMN: Final = "cpu_move_base_percent"
 """Planning, layers and local planning: what one program did on the thesis's robot, and its figures 6.5 and 6.9 show."""
@@ -108,6 +113,18 @@ def processor(page: Path, text: str) -> str:
     return found[1]
 
 
+def for_page(folder: Path) -> str | None:
+    """Return the console's file; None for a report without drives of real processes alone and with the fog."""
+    readme = (folder / "README.md").read_text("utf-8")
+    real = processes(readme)
+    if not {(setup, name) for setup in ("default", "fog") for name in _PROCESSES} <= real.keys():
+        return None
+    alone, fog = (round(sum(100.0 * real[setup, name][0] for name in _PROCESSES), 2) for setup in ("default", "fog"))
+    drives = int(real["default", "agent"][1])
+    made = {"alone": alone, "withFog": fog, "drives": drives, "machine": processor(folder / "README.md", readme)}
+    return json.dumps(made, indent=2) + "\n"
+
+
 def rules(folder: Path) -> str:
     """Return the file of rules for a report's folder; raises `SystemExit` if that is no report."""
     try:
@@ -155,15 +172,18 @@ def main() -> int:
     parser.add_argument("folder", nargs="?", type=Path, default=ROOT / "docs" / "results" / "estig")
     parser.add_argument("--check", action="store_true", help="write nothing")
     options = parser.parse_args()
-    text = rules(options.folder)
-    if FILE.exists() and FILE.read_text("utf-8") == text:
-        return 0
-    if options.check:
-        print(f"{FILE.name} is out of date: run this without --check")
-        return 1
-    FILE.write_text(text, "utf-8")
-    print(f"wrote {FILE}")
-    return 0
+    made = {FILE: rules(options.folder), PAGE: for_page(options.folder)}
+    outdated = False
+    for file, text in made.items():
+        if text is None or (file.exists() and file.read_text("utf-8") == text):
+            continue
+        outdated = True
+        if options.check:
+            print(f"{file.name} is out of date: run this without --check")
+        else:
+            file.write_text(text, "utf-8")
+            print(f"wrote {file}")
+    return int(options.check and outdated)
 
 
 if __name__ == "__main__":

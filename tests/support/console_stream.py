@@ -79,8 +79,9 @@ class ConsoleStream:
     def tell(self, event: str, key: str, value: Any) -> None:
         self.say(event, key, {"id": key, "value": to_builtins(value)})
 
-    def robot(self, name: str, state: RobotState, goal: Any = None) -> None:
-        self.tell("robot", name, {"id": name, "configured": True, "state": state, "goal": goal, "plan": None})
+    def robot(self, name: str, state: RobotState, goal: Any = None, out_of_service: Any = None) -> None:
+        about = {"id": name, "configured": True, "state": state, "goal": goal, "plan": None}
+        self.tell("robot", name, {**about, "out_of_service": out_of_service})
 
     def hazard(self, area: str, state: str) -> None:
         found = next(each for each in self.site.site.areas if each.id == area)

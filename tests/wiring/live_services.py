@@ -179,6 +179,9 @@ class MemoryStore:
     async def earlier_result(self, _attempt: Any) -> None:
         return None
 
+    async def out_of_service(self) -> dict[str, Any]:
+        return {}
+
     async def durability_warning(self) -> str:
         return ""
 

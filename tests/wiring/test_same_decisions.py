@@ -152,7 +152,7 @@ class Run:
         return found
 
 
-TOLD_BY_SERVICES = (ch.AGGREGATOR_ALERTS, ch.AGGREGATOR_AVAILABILITY, ch.HOME_ASSISTANT_AREA)
+TOLD_BY_SERVICES = (ch.AGGREGATOR_ALERTS, ch.AGGREGATOR_AVAILABILITY, ch.HOME_ASSISTANT_AREA, ch.ROBOT_VITALS)
 
 
 def is_external(publication: Publication) -> bool:

@@ -22,6 +22,7 @@ export type MapGeometry = Schemas["MapGeometry"];
 export type MapInfo = Schemas["MapInfo"];
 export type MapPreview = Schemas["MapPreview"];
 export type MapState = Schemas["MapState"];
+export type OutOfService = Schemas["OutOfService"];
 export type OverrideBody = Schemas["OverrideBody"];
 export type PeriodView = Schemas["PeriodView"];
 export type Place = Schemas["PlaceView"];
@@ -31,11 +32,13 @@ export type Pose = Schemas["Pose"];
 export type PublicPlace = Schemas["PublicPlace"];
 export type RobotPose = Schemas["RobotPose"];
 export type RobotState = Schemas["RobotState"];
+export type ServiceBody = Sent<Schemas["ServiceBody"], "reason">;
 export type SetView = Schemas["SetView"];
 export type Shape = Schemas["Zone"]["shape"];
 export type TimelineEntry = Schemas["TimelineEntry"];
 export type Visit = Schemas["VisitView"];
 export type VisitBody = Schemas["VisitBody"];
+export type Vitals = Schemas["VitalsView"];
 export type Zone = Schemas["Zone"];
 export type ZoneSourceView = Schemas["ZoneSourceView"];
 export type ZoneBody = Sent<Schemas["ZoneBody"], "kind" | "shape">;
@@ -88,6 +91,7 @@ export interface Values {
   path: PathValue;
   obstacles: ObstaclesValue;
   scan: ScanValue;
+  vitals: Vitals;
 }
 
 export type Kind = keyof Values;

@@ -6,7 +6,7 @@ import { type Connection, Stream, type StreamEvent } from "./stream";
 export type Topic = Kind | "map" | "costmap" | "record" | "connection" | "time" | "ready";
 
 const KINDS: readonly Kind[] = [
-  "zone", "area", "node", "alert", "place", "robot", "pose", "path", "obstacles", "scan",
+  "zone", "area", "node", "alert", "place", "robot", "pose", "path", "obstacles", "scan", "vitals",
 ];
 const RECORDS_MAX = 500;
 
@@ -17,7 +17,7 @@ type Entries = { readonly [K in Kind]: Map<string, Values[K]> };
 
 const makeEntries = (): Entries => ({
   zone: new Map(), area: new Map(), node: new Map(), alert: new Map(), place: new Map(),
-  robot: new Map(), pose: new Map(), path: new Map(), obstacles: new Map(), scan: new Map(),
+  robot: new Map(), pose: new Map(), path: new Map(), obstacles: new Map(), scan: new Map(), vitals: new Map(),
 });
 
 export class Live {

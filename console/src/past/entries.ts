@@ -3,11 +3,12 @@ import type { TimelineEntry } from "../api/types";
 import { maybe, t } from "../i18n/i18n";
 import type { Undoing } from "../zones/requests";
 
-export const KINDS = ["zone", "set", "source", "place", "map", "hazard", "override", "area", "mission", "robot", "stop", "fault", "alert", "store"] as const;
+export const KINDS = ["zone", "set", "source", "place", "map", "hazard", "override", "area", "mission", "robot", "service", "stop", "fault", "alert", "store"] as const;
 
 /** Under which path a change is undone, by the kind of its record. */
 const UNDONE_BY: Readonly<Record<string, Undoing>> = {
   zone: "zones", set: "zone-sets", place: "places", map: "map", area: "areas", override: "areas", mission: "robots",
+  service: "robots",
 };
 /** Nobody decided these. */
 const BY_ITSELF = new Set(["reached", "end"]);

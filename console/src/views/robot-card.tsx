@@ -5,6 +5,7 @@ import { tone } from "../map/robot-layer";
 import { go } from "../router";
 import { decimal, percent } from "../text";
 import { headline } from "../why";
+import { vitalsText } from "./vitals";
 
 interface Props {
   readonly id: string;
@@ -13,10 +14,11 @@ interface Props {
 
 export function RobotCard({ id, chosen }: Props): preact.JSX.Element {
   const { chooseRobot } = useConsole();
-  const live = useLive(["robot", "pose"], id);
+  const live = useLive(["robot", "pose", "vitals"], id);
   useSeconds(); // it becomes old without any event
   const robot = live.of.robot.get(id);
   const pose = live.of.pose.get(id);
+  const vitals = live.of.vitals.get(id);
   const state = robot?.state ?? null;
   const old = live.oldRobot(id);
   return (
@@ -32,7 +34,13 @@ export function RobotCard({ id, chosen }: Props): preact.JSX.Element {
         <span class={`badge ${old ? "" : tone(state?.mode)}`}>{state ? t(`mode.${state.mode}`) : "–"}</span>
         <span class="value">{percent(state?.battery)} · {pose ? `${decimal(pose.v, 2)} m/s` : "–"}</span>
       </span>
-      <span class="why">{old ? t("robot.old") : headline(state, robot?.goal ?? null)}</span>
+      {(vitals || robot?.out_of_service) && (
+        <span class="head">
+          {robot?.out_of_service && <span class="badge">{t("service.badge")}</span>}
+          {vitals && <span class="muted">{vitalsText(vitals)}</span>}
+        </span>
+      )}
+      <span class="why">{old ? t("robot.old") : headline(state, robot?.goal ?? null, robot?.out_of_service)}</span>
     </button>
   );
 }

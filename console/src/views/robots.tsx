@@ -1,17 +1,19 @@
 // The robots, and all that can be done with the chosen one.
 import { useEffect, useState } from "preact/hooks";
 import { Problem, request, robotPath } from "../api/client";
-import type { CommandBody, CommandOutcome, RobotState, Values } from "../api/types";
+import type { CommandBody, CommandOutcome, OutOfService, RobotState, Values } from "../api/types";
 import { mayOperate, useConsole, useLive, useSeconds } from "../context";
 import { Confirm } from "../dialog";
 import { t } from "../i18n/i18n";
 import { useRoute } from "../router";
 import { sentence } from "../stop";
 import { decimal, duration, metres, percent } from "../text";
-import { headline, whys } from "../why";
+import { headline, outOfService, whys } from "../why";
 import { GoalPanel } from "./goal-panel";
 import { PosePanel } from "./pose-panel";
 import { RobotCard } from "./robot-card";
+import { ServicePanel } from "./service-panel";
+import { VitalsFacts } from "./vitals";
 
 type Kind = CommandBody["kind"];
 
@@ -45,7 +47,7 @@ function Details({ id }: { readonly id: string }): preact.JSX.Element {
     <section aria-labelledby="robot-title">
       <h2 id="robot-title"><bdi>{id}</bdi></h2>
       <div class={old ? "card stale" : "card"}>
-        <p class="lead">{headline(state, robot?.goal ?? null)}</p>
+        <p class="lead">{headline(state, robot?.goal ?? null, robot?.out_of_service)}</p>
         {old && <p class="problem">{t("robot.old")}</p>}
         {reasons.length > 1 && (
           <>
@@ -55,9 +57,12 @@ function Details({ id }: { readonly id: string }): preact.JSX.Element {
             </ul>
           </>
         )}
+        {/* What stops it now comes first; that it gets no goal either is said all the same. */}
+        {robot?.out_of_service && state && state.mode !== "NORMAL" && state.mode !== "INIT" && <p>{outOfService(robot.out_of_service)}</p>}
         <Facts id={id} robot={robot} />
+        <VitalsFacts id={id} />
       </div>
-      {mayOperate(session) ? <Commands id={id} state={state} goal={robot?.goal != null} />
+      {mayOperate(session) ? <Commands id={id} state={state} goal={robot?.goal != null} out={robot?.out_of_service ?? null} />
         : <p class="muted">{t("error.role", { role: t(`role.${session.role}`) })}</p>}
     </section>
   );
@@ -96,12 +101,13 @@ interface CommandsProps {
   readonly id: string;
   readonly state: RobotState | null;
   readonly goal: boolean;
+  readonly out: OutOfService | null;
 }
 
 /** Which panel is open beneath the commands. */
-type Open = "goal" | "pose" | null;
+type Open = "goal" | "pose" | "service" | null;
 
-function Commands({ id, state, goal }: CommandsProps): preact.JSX.Element {
+function Commands({ id, state, goal, out }: CommandsProps): preact.JSX.Element {
   const { say } = useConsole();
   const [asked, setAsked] = useState<"enable" | "reset" | null>(null);
   const [open, setOpen] = useState<Open>(null);
@@ -141,13 +147,17 @@ function Commands({ id, state, goal }: CommandsProps): preact.JSX.Element {
         {fault && <button class="primary" onClick={() => setAsked("reset")}>{t("command.reset")}</button>}
         {codes.includes("in_blocked") && button("egress", true)}
         {(codes.includes("bumper") || fault) && button("back_off")}
-        <button aria-expanded={open === "goal"} onClick={() => setOpen(open === "goal" ? null : "goal")}>{t("command.goal")}</button>
+        <button aria-expanded={open === "goal"} disabled={out !== null} onClick={() => setOpen(open === "goal" ? null : "goal")}>{t("command.goal")}</button>
         {goal && button("cancel")}
         {state?.docked ? button("undock") : button("dock")}
         {!codes.includes("in_blocked") && button("egress")}
+        <button aria-expanded={open === "service"} onClick={() => setOpen(open === "service" ? null : "service")}>
+          {t(out ? "service.in" : "command.disable")}
+        </button>
         <button aria-expanded={open === "pose"} onClick={() => setOpen(open === "pose" ? null : "pose")}>{t("command.initial_pose")}</button>
       </div>
       {open === "goal" && <GoalPanel id={id} onClose={() => setOpen(null)} />}
+      {open === "service" && <ServicePanel id={id} out={out} onClose={() => setOpen(null)} />}
       {open === "pose" && <PosePanel id={id} onClose={() => setOpen(null)} />}
       {asked !== null && (
         <Confirm

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import time
 from concurrent.futures import ThreadPoolExecutor
 
 import pytest
@@ -56,6 +57,24 @@ def names(collector):
     registry.register(collector)
     text = generate_latest(registry).decode()
     return {line.split()[2] for line in text.splitlines() if line.startswith("# TYPE")}
+
+
+def test_vitals_tell_each_process_s_share_of_a_core_and_the_wifi_that_there_is(collector, tmp_path):
+    own = os.getpid()
+    collector.pids = {"agent": own, "guardian": own}
+    assert collector.vitals(10.0, 1.0) is None, "there is nothing to compare with"
+    assert collector.vitals(11.0, 2.0) is None, "it is not due yet"
+    begun = time.process_time()
+    while time.process_time() - begun < 0.1:
+        pass
+    first = collector.vitals(12.0, 3.0)
+    assert first.cpu == {"agent": pytest.approx(5.0, abs=4.9), "guardian": first.cpu["agent"]}
+    assert first.cpu["agent"] >= 5.0, "0.1 s of 2 s"
+    assert first.wifi_dbm is None
+    write(tmp_path, "proc/net/wireless", "Inter-| sta\n face | tus\n wlan0: 0000   54.  -56.  -256\n")
+    collector.pids = {"agent": own, "watchdog": 2**22 + 1}
+    later = collector.vitals(14.0, 5.0)
+    assert (set(later.cpu), later.wifi_dbm, later.stamp) == ({"agent"}, -56.0, 5.0)
 
 
 def test_nothing_is_exported_that_does_not_exist(collector):

@@ -17,7 +17,7 @@ from PIL import Image
 from console_service.readers import MOST_OF_SESSION
 from fog_contracts import channels as ch
 from fog_contracts.costs import LETHAL
-from fog_contracts.messages import NodeReading, RobotObstacles, RobotPose, View
+from fog_contracts.messages import NodeReading, RobotObstacles, RobotPose, RobotVitals, View
 from fog_runtime.token_file import create_token, revoke_token
 
 pytestmark = pytest.mark.live
@@ -199,6 +199,33 @@ async def test_scan_of_a_robot_comes_to_who_asks_for_it_and_to_nobody_else(all_s
         assert len(points) == 45
         assert all(x > 2.0 and y > 3.0 and abs((x - 2.0) ** 2 + (y - 3.0) ** 2 - 1.0) < 0.01 for x, y in points)
         assert "scan" not in other.got
+
+
+async def test_vitals_of_a_robot_are_events_and_the_last_ten_minutes_of_them_are_kept(all_services, console):
+    url, _, viewer = console
+    page = Page()
+    async with all_services.edges() as (_, zenoh, _connect), reading(url, viewer, page) as read:
+
+        async def publish() -> None:
+            for number in range(10_000):
+                vitals = RobotVitals(cpu={"agent": 4.0, "guardian": 1.0 + number}, wifi_dbm=-56.0)
+                zenoh.publish(ch.ROBOT_VITALS, vitals, robot="r1")
+                await asyncio.sleep(0.05)
+
+        publishing = asyncio.create_task(publish())
+        try:
+            await read(lambda: page.got.count("vitals") >= 3)
+        finally:
+            publishing.cancel()
+        last = page.things["vitals"]["r1"]
+        assert (last["cpu"]["agent"], last["wifi_dbm"]) == (4.0, -56.0)
+        async with httpx.AsyncClient(base_url=url) as client:
+            kept = (await client.get("/api/v1/vitals/r1", headers=viewer)).json()
+            assert last in kept
+            assert 3 <= len(kept) <= 300
+            assert sorted(each["stamp"] for each in kept) == [each["stamp"] for each in kept]
+            assert (await client.get("/api/v1/vitals/r9", headers=viewer)).json() == []
+            assert (await client.get("/api/v1/vitals/r1")).status_code == 401
 
 
 async def test_one_login_has_eight_streams_and_a_revoked_token_ends_its_own(all_services, console):

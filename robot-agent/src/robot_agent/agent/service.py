@@ -16,6 +16,7 @@ from prometheus_client import REGISTRY, Counter, Gauge
 
 from fog_contracts import channels as ch
 from fog_contracts.codec import ContractError
+from fog_contracts.handlers import Publication
 from fog_contracts.messages import CommandReply, LoopHealth, PlanReply, RobotCommand, RobotState
 from fog_runtime import logs, metrics
 from fog_runtime.clock import Phase, Ticker
@@ -43,7 +44,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
     from concurrent.futures import Future
 
-    from fog_contracts.handlers import Ids, Later, Moment, Publication, QueryHandler
+    from fog_contracts.handlers import Ids, Later, Moment, QueryHandler
     from fog_contracts.messages import EgressRequest, Message
     from fog_contracts.robot import LidarSettings
     from fog_runtime.clock import Clock, SystemClock
@@ -182,6 +183,8 @@ class Service:
         watchdog = guardian.pid and parent(guardian.pid)
         pids = {"agent": os.getpid(), "guardian": guardian.pid, "watchdog": watchdog}
         self.collector.pids = {name: pid for name, pid in pids.items() if pid}
+        if (vitals := self.collector.vitals(self._clock.real(now), self._clock.stamp())) is not None:
+            self._edges.publish(Publication(ch.ROBOT_VITALS, vitals, {"robot": self._robot}))
         if self._state is None:
             return
         core, localizer = self._core, self._core.localizer

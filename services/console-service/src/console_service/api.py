@@ -15,6 +15,7 @@ from console_service.readers import EventStream
 from console_service.recording import STEP_S, Shown
 from console_service.service import Service
 from console_service.timeline import ALL_KINDS, TimelineEntry
+from console_service.views import VitalsView
 from fog_contracts.messages import Id, Message
 from fog_runtime.clock import SystemClock
 from fog_runtime.health import Health
@@ -156,6 +157,14 @@ def _add_past(routes: Routes, service: Service) -> None:
         if link and address:
             link = {"Link": link["Link"].replace("/api/v1/timeline?", address, 1)}
         return Answer(page.entries, link)
+
+    @routes.get("/api/v1/vitals/{robot}")
+    async def vitals(robot: str, _caller: Viewer) -> list[VitalsView]:
+        """Return how a robot did in the last ten minutes, oldest first: CPU, Wi-Fi, battery. Empty: nothing is known.
+
+        What comes later is in the events (`vitals`).
+        """
+        return service.core.vitals(robot)
 
     @routes.get("/api/v1/recording")
     async def recording(

@@ -8,14 +8,14 @@ from __future__ import annotations
 
 import math
 from collections import deque
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, Final, Literal
 
 import msgspec
 
 from console_service.log import CompactedLog
 from console_service.tiles import TiledMap
-from console_service.views import PathView, Thing, ZoneView, scan_view
+from console_service.views import PathView, Thing, VitalsView, ZoneView, scan_view
 from fog_contracts import channels as ch
 from fog_contracts.handlers import Fence
 from fog_contracts.messages import GoalView, MapGeometry, MapInfo, PlanView, RobotSummary
@@ -38,6 +38,7 @@ if TYPE_CHECKING:
         RobotPose,
         RobotRelease,
         RobotState,
+        RobotVitals,
         ZoneSet,
     )
     from fog_contracts.replica import DecodedMap
@@ -55,6 +56,8 @@ FORGET_S: Final = 600.0
 """A robot that is not of the site is forgotten after so long without a message."""
 RECORDS: Final = 200
 """Entries of the audit trail that a new reader gets."""
+VITALS: Final = 300
+"""Vitals of each robot that are kept: ten minutes of them."""
 FAULTS: Final = 2_000
 """Faults of robots, and their ends, that are remembered."""
 
@@ -69,6 +72,7 @@ class _Robot:
     pending: RobotPose | None = None
     pose_at: float = -math.inf
     heard: float = -math.inf
+    vitals: deque[VitalsView] = field(default_factory=lambda: deque(maxlen=VITALS))
 
 
 class Fault(msgspec.Struct, frozen=True):
@@ -120,6 +124,7 @@ class ConsoleCore:
                 ch.ROBOT_POSE: self._on_pose,
                 ch.ROBOT_STATE: self._on_state,
                 ch.ROBOT_OBSTACLES: self._on_obstacles,
+                ch.ROBOT_VITALS: self._on_vitals,
                 ch.AREA_HAZARD: self._on_hazard,
                 ch.AREA_DEFINITION: self._on_definition,
                 ch.NODE_AVAILABILITY: self._on_availability,
@@ -134,7 +139,7 @@ class ConsoleCore:
                 self._put_pose(robot, known, known.pending, at.now)
             if not known.configured and at.now - known.heard > FORGET_S:
                 del self._robots[robot]
-                for event in ("robot", "pose", "path", "obstacles"):
+                for event in ("robot", "pose", "path", "obstacles", "vitals"):
                     self._remove(event, robot, at.now)
         self.log.prune(at.now)
         return ()
@@ -252,6 +257,23 @@ class ConsoleCore:
         known.obstacles = obstacles
         self._put("obstacles", robot, obstacles)
         return ()
+
+    def _on_vitals(self, ids: Ids, vitals: RobotVitals, at: Moment) -> Sequence[Publication]:
+        robot, known = self._robot(ids, at)
+        view = VitalsView(
+            stamp=at.stamp,  # this service's clock, by which all robots and what is replayed can be compared
+            cpu=vitals.cpu,
+            wifi_dbm=vitals.wifi_dbm,
+            battery=None if known.state is None else known.state.battery,
+        )
+        known.vitals.append(view)
+        self._put("vitals", robot, view)
+        return ()
+
+    def vitals(self, robot: str) -> list[VitalsView]:
+        """Return how a robot did in the last ten minutes, oldest first."""
+        known = self._robots.get(robot)
+        return [] if known is None else list(known.vitals)
 
     def scan(self, robot: str) -> bytes | None:
         """Return what a robot's lidar sees by its last report, as an event's data; None if it told no view."""

@@ -43,6 +43,18 @@ class PathView(Message, frozen=True, kw_only=True):
     released_length: float
 
 
+class VitalsView(Message, frozen=True, kw_only=True):
+    """How a robot did at a time (s since the epoch): CPU of its processes in percent of a core, Wi-Fi in dBm.
+
+    `battery` is its charge, 0 to 1. Null: it does not measure that.
+    """
+
+    stamp: float
+    cpu: dict[str, float]
+    wifi_dbm: float | None
+    battery: float | None
+
+
 class ScanView(Message, frozen=True, kw_only=True):
     """What a robot's lidar sees: the nearest point (m, frame `map`) in each sector of 2 degrees that has one."""
 

@@ -1,10 +1,10 @@
-"""What people keep of a robot beside its missions: whether it is in service at all."""
+"""What people ask of a robot beside its missions: whether it is in service at all, and how its computer does."""
 
 from typing import Annotated
 
 from msgspec import Meta
 
-from fog_contracts.messages.basics import Author, Message, Stamp
+from fog_contracts.messages.basics import Author, Id, Message, Stamp
 
 ServiceReason = Annotated[str, Meta(min_length=1, max_length=120)]
 
@@ -26,3 +26,19 @@ class OutOfService(Message, frozen=True, kw_only=True):
     def holds(self, stamp: float) -> bool:
         """Whether it is in force at a time (s since the epoch)."""
         return self.until is None or stamp < self.until
+
+
+CpuPercent = Annotated[float, Meta(ge=0.0, le=100_000.0, extra={"unit": "% of a core"})]
+SignalLevel = Annotated[float, Meta(ge=-250.0, le=50.0, extra={"unit": "dBm"})]
+
+
+class RobotVitals(Message, frozen=True, kw_only=True):
+    """How a robot's computer does, once in two seconds.
+
+    `cpu`: what each of the robot's processes has taken since the last message, in percent of one core. `wifi_dbm`: how
+    strong its Wi-Fi is; null: it has none, or none that is connected.
+    """
+
+    cpu: Annotated[dict[Id, CpuPercent], Meta(max_length=8)]
+    wifi_dbm: SignalLevel | None = None
+    stamp: Stamp = 0.0

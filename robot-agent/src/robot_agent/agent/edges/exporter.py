@@ -7,7 +7,9 @@ not known.
 
 from __future__ import annotations
 
+import math
 import threading
+import time
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
@@ -16,7 +18,8 @@ from typing import TYPE_CHECKING, Final, NamedTuple
 from prometheus_client.core import CounterMetricFamily, GaugeMetricFamily
 from prometheus_client.registry import Collector
 
-from fog_contracts.messages import Power
+from fog_contracts import channels as ch
+from fog_contracts.messages import Power, RobotVitals
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Mapping
@@ -91,6 +94,18 @@ def usage(before: Samples, after: Samples, seconds: float) -> ProcessUsage:
     )
 
 
+def cpu_seconds(pid: int) -> float | None:
+    """Return the CPU time (s) of all threads of a process since its start; None if it has ended.
+
+    One system call, where `sample` reads three files for each thread. The clock's id is made of the process's: Linux,
+    clock_getcpuclockid(3).
+    """
+    try:
+        return time.clock_gettime(~pid << 3 | 2)
+    except OSError:
+        return None
+
+
 def memory_mb(pid: int, proc: Path = PROC) -> float:
     """Return the resident memory (MB) of a process; 0 if it has ended."""
     try:
@@ -108,6 +123,8 @@ def _status_field(file: Path, name: str) -> int:
 
 
 ROOT: Final = Path("/")
+VITALS_S: Final = ch.ROBOT_VITALS.period_s - 0.1
+"""Period of vitals; a little less, since the seconds at which they are asked for are not quite even."""
 _THROTTLED: Final = "sys/devices/platform/soc/soc:firmware/get_throttled"
 _CAUSES: Final = ("under_voltage", "frequency_capped", "throttled", "soft_temperature_limit")
 """Bits 0 to 3 of what the Raspberry Pi's firmware reports: what holds now. Source: its documentation of vcgencmd."""
@@ -180,6 +197,26 @@ class RobotCollector(Collector):
         self.observed: Observed | None = None
         self.pids: Mapping[str, int] = {}
         """Process ids by name: those of the robot's processes that run."""
+        self._used: dict[int, float] = {}
+        self._sampled_at = -math.inf
+
+    def vitals(self, now: float, stamp: float) -> RobotVitals | None:
+        """Return what the processes took since the last time, when that is due; None at first.
+
+        `now` is monotonic, in real seconds.
+        """
+        before, seconds = self._used, now - self._sampled_at
+        if seconds < VITALS_S:
+            return None
+        used = {pid: taken for pid in self.pids.values() if (taken := cpu_seconds(pid)) is not None}
+        self._used, self._sampled_at = used, now
+        cpu = {
+            name: round(100.0 * (used[pid] - before[pid]) / seconds, 2)
+            for name, pid in self.pids.items()
+            if pid in used and pid in before
+        }
+        levels = wifi_levels(self._root)
+        return RobotVitals(cpu=cpu, wifi_dbm=max(levels.values(), default=None), stamp=stamp) if cpu else None
 
     def describe(self) -> Iterable[Metric]:
         """Describe nothing, so that registering collects nothing."""

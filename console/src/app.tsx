@@ -68,7 +68,14 @@ export function ConsoleApp({ session, onExpired, onLogOut }: Props): preact.JSX.
       });
     };
     look();
-    return live.on(["robot", "pose"], look);
+    const known = (id: string): boolean => live.of.robot.has(id) || live.of.pose.has(id);
+    let before = "";
+    return live.on(["robot", "pose"], (id) => {
+      // A hundred poses a second are of robots that are known.
+      if (id !== "" && known(id) && before.includes(`\n${id}\n`)) return;
+      look();
+      before = `\n${[...live.of.robot.keys(), ...live.of.pose.keys()].join("\n")}\n`;
+    });
   }, [live]);
 
   const robot = chosen !== null && robots.includes(chosen) ? chosen : robots[0] ?? null;

@@ -2,6 +2,7 @@
 import { createContext } from "preact";
 import { useContext, useEffect, useReducer, useRef } from "preact/hooks";
 import type { Session } from "./api/types";
+import { drawInTurn } from "./frames";
 import type { Live, Topic } from "./live/live";
 import type { Floor } from "./map/floor";
 import type { Scenario } from "./scenario";
@@ -40,14 +41,18 @@ const PERIOD_MS = 400;
 const waiting = new Set<() => void>();
 let timer: ReturnType<typeof setTimeout> | undefined;
 
+function redrawNow(): void {
+  const due = [...waiting];
+  waiting.clear();
+  for (const each of due) each();
+}
+
 /** Draw components anew together, at most twice or three times a second: a person reads no faster. */
 function redrawSoon(redraw: () => void): void {
   waiting.add(redraw);
   timer ??= setTimeout(() => {
     timer = undefined;
-    const due = [...waiting];
-    waiting.clear();
-    for (const each of due) each();
+    drawInTurn("panels", redrawNow);
   }, PERIOD_MS);
 }
 

@@ -41,6 +41,8 @@ export class Floor {
     private readonly live: Live,
     handlers: FloorHandlers,
   ) {
+    // Positions in the plane: one in space gets a layer of its own, and each layer costs time in each frame.
+    (L.Browser as { ie3d: boolean }).ie3d = true;
     this.map = L.map(element, {
       crs: L.CRS.Simple,
       attributionControl: false,
@@ -240,7 +242,7 @@ export class Floor {
 
   private takeTile(key: string): void {
     const tile = this.live.tiles.get(key);
-    if (tile && this.costs) void this.costs.patch(tile);
+    if (tile) this.costs?.patch(tile);
     if (this.live.tiles.size === 1) this.showCells();
   }
 }

@@ -3,6 +3,7 @@
 import L from "leaflet";
 import type { PathValue, Point } from "../api/types";
 import type { Live } from "../live/live";
+import { drawInTurn, drawMoving, forgetDrawing } from "../frames";
 import { firstMetres } from "./geometry";
 
 const SVG = "http://www.w3.org/2000/svg";
@@ -35,6 +36,14 @@ function drawing(): { root: HTMLElement; body: SVGElement; caption: HTMLElement 
   return { root, body, caption };
 }
 
+/** A marker that keeps its place among the others: Leaflet sorts markers by their latitude at each move, for which the
+ * browser paints the whole page anew. */
+class MovingMarker extends L.Marker {
+  protected _updateZIndex(): void {
+    // Leaflet's hook; later ones lie above, a robot under the pointer by the style sheet.
+  }
+}
+
 /** One robot on the map. */
 class RobotDrawing {
   private readonly parts = drawing();
@@ -63,7 +72,7 @@ class RobotDrawing {
     this.released = line("path released");
     this.goal = L.circleMarker([0, 0], { renderer, className: "goal", radius: 7, interactive: false });
     const icon = L.divIcon({ html: this.parts.root, className: "robot-mark", iconSize: [0, 0] });
-    this.marker = L.marker([0, 0], { icon, keyboard: false, riseOnHover: true });
+    this.marker = new MovingMarker([0, 0], { icon, keyboard: false });
     this.marker.on("click", onChoose);
     this.parts.caption.textContent = id.slice(0, CAPTION_MAX);
     this.pose();
@@ -145,7 +154,6 @@ export class RobotLayer {
   private readonly previewArrow: L.Marker;
   private readonly arrow = document.createElement("div");
   private readonly stops: (() => void)[];
-  private pending = 0;
 
   constructor(
     private readonly map: L.Map,
@@ -190,7 +198,8 @@ export class RobotLayer {
   remove(): void {
     for (const stop of this.stops) stop();
     this.map.off("zoomend", this.scale, this);
-    cancelAnimationFrame(this.pending);
+    forgetDrawing(this.drawPoses);
+    forgetDrawing(this.drawMarks);
     for (const drawn of this.drawings.values()) drawn.remove();
   }
 
@@ -204,16 +213,25 @@ export class RobotLayer {
 
   /** Draw a part of a robot anew in the next frame; of all robots without an id. */
   private mark(part: Part, id: string): void {
+    if (part === "pose") drawMoving(this.drawPoses);
+    else drawInTurn("marks", this.drawMarks);
     const ids = id === "" ? new Set([...this.drawings.keys(), ...this.live.of.pose.keys()]) : [id];
     for (const each of ids) {
       const parts = this.dirty.get(each) ?? new Set();
       this.dirty.set(each, parts.add(part));
     }
-    if (this.pending === 0) this.pending = requestAnimationFrame(() => this.draw());
   }
 
-  private draw(): void {
-    this.pending = 0;
+  private readonly drawPoses = (): void => {
+    for (const [id, parts] of this.dirty) {
+      if (!parts.delete("pose")) continue;
+      const drawn = this.drawings.get(id);
+      if (drawn && this.live.of.pose.has(id)) drawn.pose();
+      else drawInTurn("marks", this.drawMarks); // it has come or gone
+    }
+  };
+
+  private readonly drawMarks = (): void => {
     for (const [id, parts] of this.dirty) {
       let drawn = this.drawings.get(id);
       if (!this.live.of.pose.has(id)) {
@@ -225,11 +243,10 @@ export class RobotLayer {
         drawn = new RobotDrawing(this.map, this.live, id, this.renderer, () => this.onRobot(id));
         this.drawings.set(id, drawn);
       }
-      if (parts.has("pose")) drawn.pose();
       if (parts.has("path") || parts.has("robot")) drawn.path();
       if (parts.has("obstacles") || parts.has("scan")) drawn.points();
       if (parts.has("robot")) drawn.state(id === this.selected);
     }
     this.dirty.clear();
-  }
+  };
 }

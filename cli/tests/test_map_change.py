@@ -14,11 +14,14 @@ from fog_contracts.grid import GridGeometry, StaticMap
 from fog_contracts.messages import CircleShape, Place, Pose, Zone
 from fog_contracts.resampling import resampled
 from fog_contracts.site import AreaSite, MarkerSite, NodeSite, RobotSite, Site, Sonar
+from fog_kernels.sonar import heard_on_map
 from fog_mapping.another_map import agreement, findings
 from fog_runtime.configuration.maps import load_map, save_map
 from fog_runtime.configuration.site import load_site
 from fognav.__main__ import app
+from fognav.nodes.placing import heard
 from fognav.site_files import check_site, to_toml
+from fognav_sim.floor import Floor
 
 GEOMETRY = GridGeometry(240, 160, 0.05, 0.0, 0.0)
 
@@ -76,6 +79,13 @@ def test_each_thing_that_does_not_fit_the_new_map_is_named(wall, named):
     told = [re.sub(r" at \(.*?\)", "", str(one)) for one in found]
     assert len(told) == len(named), told
     assert all(any(one.startswith(name) for one in told) for name in named), told
+
+
+def test_node_hears_of_a_map_what_its_simulated_sonars_do():
+    loaded = load_site(Path(__file__).parents[2] / "sites" / "estig")
+    floor = Floor(loaded.map.geometry, loaded.map.cells)
+    for node in loaded.site.nodes:
+        assert heard_on_map(loaded.map, node) == pytest.approx(heard(floor, node))
 
 
 def test_walls_of_one_floor_agree_and_those_of_another_do_not():

@@ -33,7 +33,7 @@ def other(tmp_path: Path):
 
 
 def place(folder: Path, redis: Server) -> backup.Place:
-    folders = {backup.SITE: folder / "site", backup.SECRETS: folder / "secrets"}
+    folders = {backup.SITE: folder / "site", backup.SECRETS: folder / "secrets", backup.MAPS: folder / "maps"}
     return backup.Place(redis.url, "test", folders, folder / "data")
 
 
@@ -69,6 +69,8 @@ async def content(redis: Server) -> dict[bytes, bytes]:
 async def test_empty_machine_gets_everything_of_the_site_back(tmp_path, here, redis, other):
     await fill(redis)
     file = tmp_path / "backup.tar.gz"
+    here.folders[backup.MAPS].mkdir()  # of a fog that was given another map
+    (here.folders[backup.MAPS] / "in-force.json").write_text("{}")
     await backup.create(file, here, NOW)
     assert stat.S_IMODE(file.stat().st_mode) == 0o600
     assert (here.data_dir / backup.STAMP).exists()
@@ -82,7 +84,7 @@ async def test_empty_machine_gets_everything_of_the_site_back(tmp_path, here, re
     async with Redis.from_url(other.url) as raw:
         assert 3_000_000 < await raw.pttl("fog:test:idempotency:1") <= 3_600_000
         assert await raw.xlen("fog:test:audit:zone") == 300
-    for name in ("site/site.toml", "site/maps/floor.pgm", "secrets/operator.key"):
+    for name in ("site/site.toml", "site/maps/floor.pgm", "secrets/operator.key", "maps/in-force.json"):
         assert (tmp_path / "there" / name).read_bytes() == (tmp_path / "here" / name).read_bytes()
     assert stat.S_IMODE((tmp_path / "there/secrets/operator.key").stat().st_mode) == 0o600
 

@@ -1,5 +1,8 @@
 """The REST base over a real socket."""
 
+import asyncio
+import json
+from collections.abc import AsyncIterator
 from typing import Annotated
 
 import httpx
@@ -10,6 +13,7 @@ from pydantic import BaseModel, Field
 from fog_contracts.messages import Zone
 from fog_runtime.health import Health
 from fog_runtime.http import (
+    Admin,
     Answer,
     Body,
     HttpProblem,
@@ -59,7 +63,7 @@ def tokens(tmp_path):
 @pytest.fixture
 async def client(tokens, tmp_path):
     health = Health("store")
-    app = make_app("Test", health, tokens, body_limit=1000)
+    app = make_app("Test", health, tokens, body_limit=1000, large={"/upload": 5000})
     app.state.health = health
 
     @app.post("/points")
@@ -83,6 +87,10 @@ async def client(tokens, tmp_path):
     @routes.delete("/zones/{zone}")
     async def delete_zone(zone: str, caller: Operator) -> None:
         """Delete a zone."""
+
+    @routes.post("/upload")
+    async def upload(body: Body[list[str]], caller: Admin) -> str:
+        return f"{len(body[0])} from {caller.name}"
 
     @routes.get("/secret")
     async def secret(caller: Operator) -> str:
@@ -288,3 +296,29 @@ def test_tokens_file_with_a_repeated_hash_is_refused(tmp_path):
         load_tokens(tmp_path / "t.toml")
     with pytest.raises(TokensError, match="can't be read"):
         load_tokens(tmp_path / "none.toml")
+
+
+async def test_large_body_is_taken_of_an_administrator_only_and_one_at_a_time_of_each_client(client):
+    def body(size: int) -> bytes:
+        return json.dumps(["a" * size]).encode()
+
+    admin = {"Authorization": "Bearer ad-token"}
+    assert (await client.post("/upload", content=body(4000), headers=admin)).json() == "4000 from ad"
+    for headers in ({}, {"Authorization": "Bearer op-token"}):
+        assert (await client.post("/upload", content=body(4000), headers=headers)).status_code == 413
+        assert (await client.post("/upload", content=body(10), headers=headers)).status_code in (401, 403)
+    assert (await client.post("/upload", content=body(6000), headers=admin)).status_code == 413
+    begun, go_on = asyncio.Event(), asyncio.Event()
+
+    async def slowly() -> AsyncIterator[bytes]:
+        yield body(3000)[:1000]
+        begun.set()
+        await go_on.wait()
+        yield body(3000)[1000:]
+
+    first = asyncio.create_task(client.post("/upload", content=slowly(), headers=admin))
+    await begun.wait()
+    second = await client.post("/upload", content=body(10), headers=admin)
+    assert (second.status_code, "large requests" in second.json()["detail"]) == (503, True)
+    go_on.set()
+    assert (await first).json() == "3000 from ad"

@@ -1,6 +1,7 @@
 """All services under the console's address, as a browser uses them: real services, and a service that misbehaves."""
 
 import asyncio
+import re
 import socket
 import threading
 from contextlib import closing, contextmanager, suppress
@@ -9,7 +10,7 @@ import httpx
 import pytest
 
 from fog_runtime.credentials import Credentials
-from fog_runtime.http.app import MAX_OF_CLIENT
+from fog_runtime.http.app import MAP_UPLOAD, MAX_OF_CLIENT
 from fog_runtime.token_file import create_token, revoke_token
 
 pytestmark = pytest.mark.live
@@ -141,6 +142,10 @@ def service_that(answers):
                 while b"\r\n\r\n" not in head:
                     head += connection.recv(65536)
                 heads.append(head)
+                length = re.search(rb"content-length: ([0-9]+)", head.lower())
+                rest = int(length[1]) - len(head.partition(b"\r\n\r\n")[2]) if length else 0
+                while rest > 0 and (part := connection.recv(65536)):
+                    rest -= len(part)
                 connection.sendall(answers(head))
 
         def serve():
@@ -210,9 +215,12 @@ async def test_robot_is_stopped_while_a_service_hangs_and_its_requests_take_all_
             assert {answer.status_code for answer in await asyncio.gather(*requests)} == {204}
 
 
-async def test_body_that_is_too_large_reaches_no_service(fog):
+async def test_body_that_is_too_large_reaches_no_service_and_a_map_does(fog, tokens):
     with service_that(lambda _: b"HTTP/1.1 204 No Content\r\n\r\n") as (url, heads):
         fog.start("console_service", FOGNAV_MAP_URL=url)
         async with httpx.AsyncClient(base_url=await fog.ready("console_service"), timeout=60.0) as browser:
             assert (await browser.post("/api/v1/zones", content=b"x" * 2_000_000)).status_code == 413
-    assert heads == []
+            assert (await browser.post(MAP_UPLOAD, content=b"x" * 2_000_000)).status_code == 413
+            assert heads == []
+            uploaded = await browser.post(MAP_UPLOAD, content=b"x" * 2_000_000, headers=tokens["admin"])
+            assert (uploaded.status_code, len(heads)) == (204, 1)

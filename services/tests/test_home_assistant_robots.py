@@ -7,6 +7,7 @@ import base64
 import io
 import json
 import os
+import re
 import time
 from contextlib import asynccontextmanager
 from pathlib import Path
@@ -140,9 +141,10 @@ class HomeItself:
 
     async def wait(self, entity: str, part: str) -> dict[str, list]:
         """Wait until an entity's state has this part; return those of all."""
-        async with asyncio.timeout(60.0):
-            while part not in (found := await self.ask("states")).get(entity, [""])[0]:  # noqa: ASYNC110  # a program is asked
-                await asyncio.sleep(0.2)
+        deadline = time.monotonic() + 60.0
+        while part not in (found := await self.ask("states")).get(entity, [""])[0]:
+            assert time.monotonic() < deadline, (entity, part, found, await self.ask("log"))
+            await asyncio.sleep(0.2)
         return found
 
 
@@ -152,9 +154,10 @@ class HomeItself:
     reason="needs Home Assistant: uv venv --python 3.13 H, uv pip install --python H homeassistant paho-mqtt, "
     "FOGNAV_HOME_ASSISTANT=H/bin/python",
 )
-async def test_home_assistant_itself_shows_all_of_a_robot_and_its_services_reach_the_floor(bridge, tmp_path):
+async def test_home_assistant_itself_shows_all_of_a_robot_and_its_services_reach_the_floor(bridge, tmp_path, until):
     async with bridge.edges() as (_, zenoh, _connect), robot_state(zenoh), HomeItself.of(bridge, tmp_path) as home:
-        found = await home.wait("sensor.r1_battery", "63")
+        await home.wait("sensor.r1_battery", "63")
+        found = await home.wait("image.r1_map", "20")  # the time of the picture
         expected = {
             "vacuum.r1": "idle", "sensor.r1_mode": "HOLD", "sensor.r1_why_it_stands": f"{HOSTILE}; {HOSTILE}"[:255],
             "binary_sensor.r1_charging": "off", "binary_sensor.r1_problem": "off",
@@ -168,12 +171,16 @@ async def test_home_assistant_itself_shows_all_of_a_robot_and_its_services_reach
             "image.r1_map",
         } <= found.keys()
         assert len(found["image.r1_map"][1]["calibration_points"]) == 3
-        for order, reason in (  # the robot of this test does not answer
-            ('button press {"entity_id": "button.r1_stop"}', "r1 did not answer"),
-            ('vacuum return_to_base {"entity_id": "vacuum.r1"}', "has no dock"),
+        for call, order in (
+            ('button press {"entity_id": "button.r1_stop"}', "stop"),
+            ('vacuum return_to_base {"entity_id": "vacuum.r1"}', "return_to_base"),
+            ('select select_option {"entity_id": "select.r1_goal", "option": "no goal"}', "goal no goal"),
         ):
-            await home.ask(f"call {order}")
-            await home.wait("sensor.r1_refused_order", reason)
+            await home.ask(f"call {call}")
+            said = re.compile(rf'"order": ?"{order}"')
+            await until(lambda said=said: said.search(bridge.log("fog_bridges")), f"the floor is asked: {order}")
+            if order == "stop":  # the robot of this test does not answer
+                await home.wait("sensor.r1_refused_order", "r1")
         assert await home.ask("log") == []
         bridge.kill("console_service")
         await home.wait("vacuum.r1", "unavailable")

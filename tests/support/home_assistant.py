@@ -9,6 +9,7 @@ Standard input has a line for each question, standard output a line of JSON for 
 import asyncio
 import json
 import logging
+import socket
 import sys
 from pathlib import Path
 
@@ -26,7 +27,7 @@ class Warnings(logging.Handler):
 
     def emit(self, record: logging.LogRecord) -> None:
         if record.name.startswith("homeassistant.components."):
-            self.lines.append(record.getMessage())
+            self.lines.append(self.format(record))
 
 
 async def start(folder: str, broker: dict[str, object]) -> core.HomeAssistant:
@@ -38,12 +39,16 @@ async def start(folder: str, broker: dict[str, object]) -> core.HomeAssistant:
     loader.async_setup(hass)
     await bootstrap.async_load_base_functionality(hass)
     hass.auth = await auth_manager_from_config(hass, [], [])
-    await async_setup_component(hass, "http", {"http": {"server_port": 0}})
+    with socket.create_server(("127.0.0.1", 0)) as free:
+        port = free.getsockname()[1]
+    # Of its web server, without which the integration does not start.
+    assert await async_setup_component(hass, "http", {"http": {"server_host": "127.0.0.1", "server_port": port}})
     entry = config_entries.ConfigEntry(
         domain="mqtt", data={"discovery": True, **broker}, options={}, title="mqtt", version=1, minor_version=2,
         source="user", unique_id=None, discovery_keys={}, subentries_data=None,
     )  # fmt: skip
     await hass.config_entries.async_add(entry)
+    assert entry.state is config_entries.ConfigEntryState.LOADED, entry.state
     hass.set_state(core.CoreState.running)
     return hass
 

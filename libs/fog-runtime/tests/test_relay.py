@@ -155,6 +155,19 @@ def test_client_that_names_two_users_is_refused():
         relay._user_of_open_syn(OPEN_SYN[:AUTHENTICATION_AT] + twice + OPEN_SYN[AUTHENTICATION_AT:])
 
 
+@pytest.mark.parametrize("size", [1, 2, 3, 7, 200, 10_000])
+def test_each_part_of_what_the_broker_says_ends_with_a_packet_or_within_the_first_one(size):
+    packets = [CONNACK, b"\x90\x03\x00\x01\x00", b"\x30\x80\x03" + b"x" * 384, b"\xd0\x00", b"\x30\x05\x00\x01tab"]
+    whole, opening = b"".join(packets), MqttOpening()
+    ends = {sum(map(len, packets[:count])) for count in range(len(packets) + 1)}
+    parts = [part for at in range(0, len(whole), size) for part in opening.parts(whole[at : at + size])]
+    assert b"".join(parts) == whole
+    begun = 0
+    for part in parts:
+        assert not any(begun < end < begun + len(part) for end in ends), part
+        begun += len(part)
+
+
 KNOWN = "192.168.7.9"
 
 

@@ -24,7 +24,7 @@ from fog_runtime.relay import Relay, place_of, server_tls, to_socket
 
 if TYPE_CHECKING:
     import ssl
-    from collections.abc import Callable, Sequence
+    from collections.abc import Callable, Iterator, Sequence
 
     from fog_runtime.relay import Connect
 
@@ -139,6 +139,8 @@ class MqttOpening:
         self._sent = bytearray()
         self._connected = False
         self._answered = bytearray()
+        self._head = bytearray()
+        self._left = 0
 
     def from_client(self, data: bytes) -> bytes:
         """Return what to pass on of the client's next bytes; raises `MalformedError`."""
@@ -157,6 +159,30 @@ class MqttOpening:
             return b""
         self._connected, self.user = True, user.decode(errors="replace")
         return bytes((_CONNECT,)) + _number(len(packet)) + packet + bytes(self._sent[reader.at :])
+
+    def parts(self, data: bytes) -> Iterator[bytes]:
+        """Yield the broker's next bytes, none of which follows the end of a packet in its part.
+
+        Of the packets in a TLS record paho reads the first, and the others only when more comes (its issue 131). What
+        uses it without knowing that, as Home Assistant does, would see what the broker has kept only after a change.
+        """
+        begin = at = 0
+        while at < len(data):
+            if self._left:
+                step = min(self._left, len(data) - at)
+                at, self._left = at + step, self._left - step
+            else:
+                self._head.append(data[at])
+                at += 1
+                if len(self._head) == 1 or (self._head[-1] & _CONTINUES and len(self._head) <= _NUMBER_BYTES):
+                    continue
+                self._left = sum((byte & ~_CONTINUES) << (7 * index) for index, byte in enumerate(self._head[1:]))
+                self._head.clear()
+            if not self._left:
+                yield data[begin:at]
+                begin = at
+        if begin < at:
+            yield data[begin:]
 
     def admits(self, data: bytes) -> bool:
         """Whether CONNACK with the code 0 has come, with these next bytes of the broker's."""

@@ -15,7 +15,7 @@ from fog_runtime.credentials import ServerCertificate
 
 if TYPE_CHECKING:
     import socket
-    from collections.abc import Awaitable, Callable, Iterator, Sequence
+    from collections.abc import Awaitable, Callable, Iterable, Iterator, Sequence
     from pathlib import Path
 
 Connect: TypeAlias = "Callable[[Callable[[], asyncio.Protocol]], Awaitable[tuple[asyncio.Transport, asyncio.Protocol]]]"
@@ -52,6 +52,9 @@ class Opening(Protocol):
     def admits(self, data: bytes) -> bool:
         """Whether it has, with these next bytes of the server's."""
 
+    def parts(self, data: bytes) -> Iterable[bytes]:
+        """Return the server's next bytes in the parts that the client gets each in a TLS record of its own."""
+
 
 class ZenohOpening:
     """A router sends InitAck, and OpenAck once the client has proved who it is, which says that in OpenSyn.
@@ -80,6 +83,10 @@ class ZenohOpening:
                 self._opened = True
                 self.user = _user_of_open_syn(message)
         return data
+
+    def parts(self, data: bytes) -> Iterable[bytes]:
+        """Return them as they are."""
+        return (data,)
 
     def admits(self, data: bytes) -> bool:
         """Whether OpenAck has come."""
@@ -239,12 +246,14 @@ class _Server(_End):
         self.other = client
         self._client = client
         self.opening: Opening | None = opening
+        self._parts = opening.parts
 
     def data_received(self, data: bytes) -> None:
         if self.opening is not None and self.opening.admits(data):
             user, self.opening = self.opening.user, None
             self._client.admit(user)
-        super().data_received(data)
+        for part in self._parts(data):
+            super().data_received(part)
 
 
 class Relay:

@@ -53,7 +53,11 @@ sonars = [{ range_limit = 1.5, no_echo_is_clear = true }, { angle = 0.2, range_l
 OPERATOR_TOKEN = "operator-token"
 VIEWER_TOKEN = "viewer-token"
 ADMIN_TOKEN = "admin-token"
-TOKENS = (("anna", "operator", OPERATOR_TOKEN), ("vera", "viewer", VIEWER_TOKEN), ("ada", "admin", ADMIN_TOKEN))
+GUEST_TOKEN = "for visitors"
+TOKENS = (
+    ("anna", "operator", OPERATOR_TOKEN), ("vera", "viewer", VIEWER_TOKEN), ("ada", "admin", ADMIN_TOKEN),
+    ("gil", "guest", GUEST_TOKEN),
+)  # fmt: skip
 DEADLINE_S = 60.0
 """For any wait, which ends with what it waits for: long, because a busy machine may be ten times slower."""
 

@@ -7,6 +7,7 @@ FOGNAV_SCHEMATHESIS_EXAMPLES=N adds N random requests to each route, and lengthe
 """
 
 import asyncio
+import json
 import os
 import re
 import subprocess
@@ -17,6 +18,7 @@ import httpx
 import pytest
 
 from console_service.forward import service_of
+from fog_runtime.credentials import Credentials
 
 pytestmark = [pytest.mark.live, pytest.mark.timeout(1800)]
 
@@ -80,3 +82,47 @@ def test_service_answers_as_the_merged_document_says(urls, tokens, tmp_path, ser
     done = run_schemathesis(urls[CONSOLE], paths, tokens["admin"]["Authorization"], tmp_path)
     assert done.returncode == 0, done.stdout
     assert httpx.get(f"{urls[service]}/readyz").json()["missing"] == [], "no request may end a service's readiness"
+
+
+ROLES = ("nobody", "guest", "viewer", "operator", "admin")
+DENIED = ("token_missing", "token_unknown", "role_too_low")
+
+
+def who_may() -> dict[str, str]:
+    """Return the lowest role that may use each route, by the table in docs/security.md."""
+    text = (Path(__file__).parents[2] / "docs" / "security.md").read_text("utf-8")
+    rows = re.findall(rf"^\| ({'|'.join(ROLES)}) \| (`.*`) \|$", text, re.MULTILINE)
+    routes = ((role, route.split()) for role, cell in rows for route in re.findall("`([^`]+)`", cell))
+    return {f"{method} {path}": role for role, (*methods, path) in routes for method in methods}
+
+
+def in_table(method: str, path: str) -> str:
+    """Return how the table writes a route: without /api/v1, and those that each service has once."""
+    return f"{method} {re.sub(r'^/[a-z-]+(?=/(api/v1/store|healthz|readyz|metrics))', '/SERVICE', path)}".replace(
+        "/api/v1", ""
+    )
+
+
+def is_denied(client: httpx.Client, method: str, path: str, headers: dict[str, str]) -> bool:
+    """Ask with ids that nothing has, and without a body: the role is looked at before both."""
+    with client.stream(method, re.sub(r"\{\w+\}", "nothing", path), headers=headers) as answer:
+        if answer.status_code not in {401, 403}:
+            return False
+        return json.loads(answer.read())["type"].rpartition(":")[2] in DENIED
+
+
+def test_each_route_is_open_to_whom_the_table_of_roles_names_and_to_nobody_else(urls, tokens, all_services):
+    document = httpx.get(f"{urls[CONSOLE]}/api/v1/openapi.json", timeout=60.0).json()
+    users = (all_services.security.directory / "credentials").rglob("*.toml")
+    passwords = [word for user in users for word in list(Credentials.read(user).passwords.values())[:1]]
+    assert len(passwords) >= 8
+    lowest = {}
+    with httpx.Client(base_url=urls[CONSOLE], timeout=60.0) as client:
+        for path, method in ((path, method.upper()) for path, found in document["paths"].items() for method in found):
+            let_in = [role for role in ROLES if not is_denied(client, method, path, tokens.get(role, {}))]
+            assert let_in == list(ROLES[-len(let_in) :]), f"{method} {path}: a higher role may less"
+            assert lowest.setdefault(in_table(method, path), let_in[0]) == let_in[0], "services differ"
+            if let_in[0] != "nobody":  # what lets a robot, a node or the bridge into the broker is no token
+                own = [{"Authorization": f"Bearer {password}"} for password in passwords]
+                assert all(is_denied(client, method, path, headers) for headers in own), (method, path)
+    assert lowest == who_may()

@@ -2,11 +2,13 @@
 
 import asyncio
 import json
+import os
 import struct
 import threading
 import time
 from contextlib import suppress
 from functools import partial
+from pathlib import Path
 from typing import Self
 
 import httpx
@@ -19,8 +21,10 @@ from hypothesis import strategies as st
 from rosbags.typesys import Stores, get_typestore
 
 from fog_bridges.ros2 import messages as ros
+from fog_bridges.ros2.bridge import GOAL_TYPE, MAP_TYPE, RosSession, ros_config
 from fog_bridges.ros2.wire import Attachment, Node, Topic, WireError, Writer, decoded, type_hash
 from fog_contracts import channels as ch
+from fog_contracts.grid import GridGeometry
 from fog_contracts.messages import RobotPath, RobotPose, RobotState
 from fog_supervisor import net
 
@@ -252,6 +256,33 @@ async def test_zone_is_on_the_mask_of_a_late_joiner_and_goes_again_and_goals_rea
             finally:
                 publishing.cancel()
                 await planner.aclose()
+
+
+@pytest.mark.live
+async def test_node_whose_protocol_code_is_not_ours_hears_the_mask_and_sends_a_goal(tmp_path, ros_router):
+    if PEERS not in os.environ:
+        pytest.skip(f"set {PEERS} to a Python that has zenoh-ros2-sdk: pip install zenoh-ros2-sdk==0.1.8")
+    loop, goals = asyncio.get_running_loop(), []
+    session = RosSession(zenoh.open(ros_config(f"tcp/127.0.0.1:{ros_router}")), DOMAIN, "fognav_test")
+    try:
+        session.subscribe(Topic("r1/goal_pose", GOAL_TYPE), goals.append)
+        script = Path(__file__).with_name("ros2_peer.py")
+        peer = await asyncio.create_subprocess_exec(
+            os.environ[PEERS], str(script), str(ros_router), str(DOMAIN), "test", "r1", str(tmp_path),
+            stdout=asyncio.subprocess.PIPE,
+        )  # fmt: skip
+        values = np.zeros((10, 12), np.int8)
+        values[2:4] = 100
+        mask = ros.grid(values, GridGeometry(12, 10, 0.05, 0.0, 0.0), 1.0)
+        heard, ends = asyncio.create_task(peer.stdout.read()), loop.time() + 60.0
+        while not heard.done():
+            assert loop.time() < ends
+            session.publish(Topic("fognav/test/keepout_mask", MAP_TYPE, latched=True), mask, 1.0)
+            await asyncio.wait([heard], timeout=0.5)
+        assert json.loads(heard.result()) == {"size": [12, 10], "blocked": 24}
+        assert [(goal.pose.position.x, goal.pose.position.y, goal.header.frame_id) for goal in goals] == [(4, 3, "map")]
+    finally:
+        session.close()
 
 
 @pytest.mark.live

@@ -20,7 +20,7 @@ from fog_runtime.configuration.site import load_site
 from fognav import console_page, system
 from map_service.map_check import MapUpload, Task, check
 
-pytestmark = pytest.mark.browser
+pytestmark = [pytest.mark.browser, pytest.mark.drive]
 
 ROOT = Path(__file__).parents[1]
 FLAGS = ["--no-sandbox", "--disable-gpu", "--disable-dev-shm-usage", "--disable-background-networking"]
@@ -78,6 +78,7 @@ async def test_one_time_login_leaves_no_trace_in_the_address(console: SimpleName
     assert TOKEN not in json.dumps(await page.evaluate("[history.state, {...localStorage}, {...sessionStorage}]"))
 
 
+@pytest.mark.smoke
 async def test_person_logs_in_by_token_and_out_again(console: SimpleNamespace) -> None:
     page = await console.browser.new_page()
     await page.goto(console.url)

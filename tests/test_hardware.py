@@ -105,12 +105,14 @@ def assert_one_closed_solid(done: subprocess.CompletedProcess[str]) -> None:
     assert "Volumes:         2" in done.stderr  # the space outside, and one solid
 
 
+@pytest.mark.drive
 @needs_openscad
 @pytest.mark.parametrize("bank", ["[0, 0, 0]", "[95, 25, 23]"])
 def test_boards_sonars_and_plug_fit_into_the_case(tmp_path: Path, bank: str) -> None:
     assert_nothing_there(openscad(CASE, "collisions", tmp_path / "part.stl", f"power_bank={bank}"))
 
 
+@pytest.mark.drive
 @needs_openscad
 @pytest.mark.parametrize("part", ["body", "plate"])
 @pytest.mark.parametrize("bank", ["[0, 0, 0]", "[95, 25, 23]"])

@@ -35,6 +35,7 @@ def imported() -> dict[str, set[str]]:
     return {program: {name for name in names if name in PROFILES["all"]} for program, *names in lines}
 
 
+@pytest.mark.drive
 @pytest.mark.parametrize("profile", PROGRAMS)
 def test_profile_contains_every_kernel_that_its_process_imports(profile: str, imported: dict[str, set[str]]) -> None:
     used = imported[PROGRAMS[profile]]

@@ -74,6 +74,7 @@ def test_table_in_the_documentation_is_what_its_command_gives(data_dir, monkeypa
     assert [line for line in written if line.startswith(f"| {rule} |")] == debounce.table(rows)[2:]
 
 
+@pytest.mark.drive
 @pytest.mark.data
 def test_calibrated_sonar_with_false_echoes_raises_no_more_alarms_than_one_that_was_not(data_dir):
     found = debounce.recordings_in(data_dir / "hcsr04")
@@ -91,6 +92,7 @@ def test_calibrated_sonar_with_false_echoes_raises_no_more_alarms_than_one_that_
     assert alarms[debounce.CALIBRATED] <= alarms["evidence"]
 
 
+@pytest.mark.drive
 @pytest.mark.data
 def test_default_rule_beats_five_in_a_row_at_every_share_of_echoes(data_dir):
     found = debounce.recordings_in(data_dir / "hcsr04")

@@ -39,6 +39,7 @@ def write(file, body, seed, walk=None) -> None:
             recorder.write_entry(TOPIC_OF_ENTRY[type(entry)], entry, number)
 
 
+@pytest.mark.drive
 def test_wheels_axle_and_lidar_of_wrong_bodies_are_found():
     found = measure(2)
     assert found["mirrored_wrong"] == 0
@@ -83,6 +84,7 @@ def test_a_drive_in_an_empty_hall_is_refused(monkeypatch):
         calibrator_of([STRAIGHT, BACK, LEFT, RIGHT]).solve()
 
 
+@pytest.mark.drive
 def test_the_command_writes_what_an_independent_square_agrees_with_and_keeps_the_old_values(tmp_path):
     body = Body(left=1.04, right=1.05, axle=1.09, x=0.04, y=-0.02, yaw=0.1, latency=0.0, mirrored=False)
     log, square, settings = tmp_path / "drive.mcap", tmp_path / "square.mcap", tmp_path / "robot.toml"
@@ -150,6 +152,7 @@ def by_itself(config) -> list[tuple[float, float, float]]:
     return [*walk, (0.0, 0.0, 1.0)]
 
 
+@pytest.mark.drive
 @pytest.mark.parametrize("off", [0.86, 1.15])
 def test_a_robot_that_drives_by_itself_stays_in_its_square_and_tells_all_however_wrong_its_wheels_are(off):
     body = Body(left=off, right=off * 1.01, axle=2.0 - off, x=0.05, y=-0.03, yaw=0.1, latency=0.01, mirrored=False)

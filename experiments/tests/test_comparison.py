@@ -202,6 +202,7 @@ def test_a_run_that_was_killed_goes_on_where_it_was(short_run):
     assert known == {record.setup: record for record in records}
 
 
+@pytest.mark.drive
 def test_robots_that_the_fog_warns_drive_less_than_one_that_finds_out_by_itself(short_run):
     default, full, fog = short_run[1]
     assert all(record.success for record in (default, full, fog)), [record.reason for record in short_run[1]]

@@ -118,6 +118,7 @@ def guide(robot, person, files, *tasks):
     asyncio.run(run())
 
 
+@pytest.mark.drive
 def test_a_person_is_told_where_to_put_robot_and_barrier_and_the_drive_is_recorded(tmp_path):
     robot, files = LockstepRobot(), Folder(tmp_path).measured("hardware")
     barrier = barrier_across(SITE.site.areas[0], SITE.site, SITE.map, DRAWN.seed)

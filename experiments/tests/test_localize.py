@@ -172,6 +172,7 @@ def test_map_of_a_log_shows_the_walls_where_they_are(folder, tmp_path, log):
     assert found["occupied"] > 500
 
 
+@pytest.mark.drive
 def test_map_without_a_reference_is_found_by_matching_and_can_be_looked_at(folder, tmp_path):
     words = ("map", "from-log", folder / "drive.jsonl.gz", "--out", tmp_path / "built")
     code, found = run(*words, "--png", tmp_path / "loops.png", "--trajectory", tmp_path / "way.txt",
@@ -194,6 +195,7 @@ def test_map_without_a_reference_is_found_by_matching_and_can_be_looked_at(folde
     assert load_map(tmp_path / "built.yaml").cells.shape == (found["height"], found["width"])
 
 
+@pytest.mark.drive
 def test_stamps_that_go_back_and_missing_scans_are_said_and_lose_nothing(folder, tmp_path):
     with gzip.open(folder / "drive.jsonl.gz", "rt") as file:
         lines = file.read().splitlines()
@@ -309,6 +311,7 @@ def test_damaged_log_is_refused_with_its_file_and_line(tmp_path, damage):
         read_log(tmp_path / "bad.jsonl.gz")
 
 
+@pytest.mark.drive
 @pytest.mark.data
 def test_recorded_floor_with_real_odometry_meets_its_targets(data_dir, tmp_path):
     log = data_dir / "lidar_logs" / "intel_odom_ref_scan.jsonl.gz"

@@ -46,6 +46,7 @@ def logged(tmp_path_factory):
     return file, np.array((start.x, start.y, start.theta)), site.map
 
 
+@pytest.mark.drive
 def test_walls_of_the_map_stand_where_those_of_the_building_stand(logged):
     file, start, building = logged
     made = map_log(read_log(file).scans, "matched", [], 0.05, 12.0)

@@ -146,6 +146,7 @@ def test_a_replay_repeats_every_command_mode_publication_and_answer(drive):
     }
 
 
+@pytest.mark.drive
 def test_replays_in_other_processes_with_other_hash_seeds_give_the_same_outputs(drive):
     path, _ = drive
 

@@ -35,6 +35,7 @@ def test_configuration_is_valid_and_names_files_that_exist() -> None:
     assert "3 rule files found" in promtool("check", "config", str(DEPLOYED / "prometheus.yml"))
 
 
+@pytest.mark.drive
 @needs_promtool
 @pytest.mark.timeout(LIMIT_S + 60)
 def test_each_alert_fires_when_it_must_and_not_before() -> None:

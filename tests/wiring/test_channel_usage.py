@@ -71,6 +71,7 @@ def test_simulated_nodes_use_channels_that_the_table_gives_to_nodes():
     assert ("node_reading", "publishers", "node") in found
 
 
+@pytest.mark.drive
 def test_exactly_the_services_that_the_table_names_declare_liveliness_and_read_it():
     declaring = {role for role, folder in SERVICES.items() if usage.liveliness_declared(folder) == {role}}
     assert declaring == set(ch.LIVE.publishers)
@@ -80,6 +81,7 @@ def test_exactly_the_services_that_the_table_names_declare_liveliness_and_read_i
     assert set(ch.LIVE.subscribers) == {"console", "map-service", "planner"}
 
 
+@pytest.mark.drive
 def test_every_session_is_opened_in_the_role_of_its_program():
     opened = {folder: usage.session_roles(folder) for folder in (*SERVICES.values(), *TOOLS)}
     assert {role: set(opened[folder].values()) for role, folder in SERVICES.items()} == {r: {r} for r in SERVICES}

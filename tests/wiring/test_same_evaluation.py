@@ -147,6 +147,7 @@ async def test_demo_and_lockstep_evaluate_the_same_messages_alike(*, strays: boo
     assert [obstacle.id for command in edge.sim_commands for obstacle in command.place] == ["barrier"]
 
 
+@pytest.mark.drive
 async def test_the_last_line_of_a_demo_without_a_hazard_says_so() -> None:
     site: LoadedSite = ring.ring_site()
     result, observations = drive_in_lockstep(site, strays=False)

@@ -83,6 +83,7 @@ def kept(package: Path) -> set[str]:
     return {file.name for file in (package / "__pycache__").glob("*.nb[ic]*")}
 
 
+@pytest.mark.drive
 @compiled_only
 def test_kernel_is_compiled_anew_when_what_it_calls_or_a_constant_of_another_module_changes(package: Path) -> None:
     assert run(package) == (20, 2)
@@ -93,6 +94,7 @@ def test_kernel_is_compiled_anew_when_what_it_calls_or_a_constant_of_another_mod
     assert run(package) == (300, 0)
 
 
+@pytest.mark.drive
 @compiled_only
 def test_process_that_dies_while_it_saves_a_kernel_leaves_no_old_one_in_its_place(package: Path) -> None:
     assert run(package) == (20, 2)
@@ -102,6 +104,7 @@ def test_process_that_dies_while_it_saves_a_kernel_leaves_no_old_one_in_its_plac
     assert run(package) == (30, 0)
 
 
+@pytest.mark.drive
 @compiled_only
 def test_warming_removes_kernels_of_older_sources_and_nothing_else(package: Path) -> None:
     assert run(package) == (20, 2)

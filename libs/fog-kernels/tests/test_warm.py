@@ -79,6 +79,7 @@ def python(*arguments: str) -> str:
     ).stdout.strip()
 
 
+@pytest.mark.drive
 def test_process_that_calls_every_kernel_compiles_nothing_after_warming() -> None:
     python("-m", "fog_kernels.warm")
     assert python("-c", RUN_ALL) == "0"
@@ -124,6 +125,7 @@ def test_unknown_profile_is_refused_with_the_known_ones() -> None:
         warm.warm("toaster")
 
 
+@pytest.mark.drive
 def test_progress_reports_every_kernel_once_by_name(tmp_path):
     cold = {**os.environ, "NUMBA_CACHE_DIR": str(tmp_path)}
     command = [sys.executable, "-m", "fog_kernels.warm", "sim"]

@@ -124,6 +124,7 @@ def test_loops_are_found_all_true_and_join_what_odometry_tore_apart(mapped):
             assert math.dist(truth[loop.first][:2], truth[loop.second][:2]) < 6.0
 
 
+@pytest.mark.drive
 def test_map_is_the_same_however_many_threads_make_it(mapped):
     scans, _, found = mapped
     again = find_trajectory(scans, jobs=1)
@@ -189,6 +190,7 @@ def test_loop_that_is_refused_is_not_closed(mapped):
     assert absolute_error(without.poses, truth) < 0.5, "what is left is the way that scans tell one by one"
 
 
+@pytest.mark.drive
 @pytest.mark.parametrize("scale", [0.85, 1.15])
 def test_odometry_that_is_15_percent_off_still_makes_the_map(scale):
     scans, truth = FLOOR.drive(ROUND, seed=2, scale=scale)
@@ -196,6 +198,7 @@ def test_odometry_that_is_15_percent_off_still_makes_the_map(scale):
     assert absolute_error(found.poses, truth) < 0.08
 
 
+@pytest.mark.drive
 def test_corridor_without_features_is_neither_folded_nor_shortened():
     hall = Building([(1, 1, 41, 3), (1, 3, 4, 5), (37, 3, 41, 5)], [])
     scans, truth = hall.drive([(2, 2), (40, 2), (39, 4), (40, 2), (3, 2), (2.5, 4), (2, 2), (30, 2)], seed=3)

@@ -57,6 +57,7 @@ def test_area_that_no_barrier_can_close_is_refused_with_the_reason() -> None:
         draw_hazard(site(("z1", 12.0)), PATH, 1, no_barrier)
 
 
+@pytest.mark.drive
 @given(seed=st.integers(0, 10_000))
 def test_hazard_is_the_same_for_the_same_seed_and_appears_early_enough(seed: int) -> None:
     plan = site(("z1", 9.0), ("z2", 20.0), ("z3", 40.0))
@@ -108,6 +109,7 @@ def there_and_back(x: float) -> list[tuple[float, float]]:
     return [(0.0, 2.0), (40.0, 2.0), (40.0, 0.0), (x, 0.0)]
 
 
+@pytest.mark.drive
 @given(seed=st.integers(0, 10_000))
 def test_barrier_appears_before_the_last_place_that_is_away_from_its_area(seed: int) -> None:
     plan = site(("z1", 6.0))

@@ -6,6 +6,8 @@ import importlib.util
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+import pytest
+
 from fog_contracts import channels as ch
 
 if TYPE_CHECKING:

@@ -78,6 +78,17 @@ async def test_one_time_login_leaves_no_trace_in_the_address(console: SimpleName
     assert TOKEN not in json.dumps(await page.evaluate("[history.state, {...localStorage}, {...sessionStorage}]"))
 
 
+async def test_page_that_is_shown_keeps_its_login(console: SimpleNamespace, stream: ConsoleStream) -> None:
+    page = await console.browser.new_page()
+    await page.clock.install()
+    await page.goto(f"{console.url}#login={TOKEN}")
+    await expect(page.get_by_text("Live", exact=True)).to_be_visible()
+    asked = [name for name, _ in stream.requests].count("GET session")
+    async with page.expect_response(lambda answer: answer.url.endswith("/session")):
+        await page.clock.fast_forward(3_600_000)
+    assert [name for name, _ in stream.requests].count("GET session") == asked + 1
+
+
 @pytest.mark.smoke
 async def test_person_logs_in_by_token_and_out_again(console: SimpleNamespace) -> None:
     page = await console.browser.new_page()

@@ -15,6 +15,9 @@ import { startTheme } from "./theme";
 import { CodesPage } from "./visit/codes";
 import { NoCode, VisitApp } from "./visit/visit";
 
+/** How often a page that is shown, such as a tablet on a wall, keeps its login alive. */
+const KEEP_MS = 3_600_000;
+
 /** Begin with a one-time login, else with the session that the browser has; null: nobody is logged in. */
 async function begin(token: string | null, ofCode: boolean): Promise<Session | null> {
   try {
@@ -37,6 +40,12 @@ function Root({ token }: { readonly token: string | null }): preact.JSX.Element 
   const [said, setSaid] = useState("");
   const page = usePage();
   useEffect(() => void begin(token, page.name === "visit").then(setSession), [token]);
+  useEffect(() => {
+    if (!session) return undefined;
+    // Each time it is asked for, a session lasts twelve hours more; what else the page asks says when it has ended.
+    const timer = setInterval(() => void currentSession().catch(() => undefined), KEEP_MS);
+    return () => clearInterval(timer);
+  }, [session]);
   if (session === undefined) return null;
   const leave = (why: string): void => {
     setNotice(why);

@@ -142,6 +142,15 @@ async def test_revoked_token_ends_its_sessions_at_once_and_another_of_the_same_n
         assert code(await browser.get("/robots")) == (401, "session_ended")
 
 
+def test_browsers_of_one_token_are_told_apart_and_stay_the_same_when_their_sessions_are_renewed():
+    tokens = Tokens([entry("lobby", "guest")], session_key=KEY)
+    first, second = (tokens.caller_of_session(session(tokens, "lobby"), encrypted=False) for _ in range(2))
+    assert len({"", first.session, second.session}) == 3
+    value, _ = tokens.new_session(first)
+    renewed = tokens.caller_of_session({tokens.cookie_name(encrypted=False): value}, encrypted=False)
+    assert renewed.session == first.session
+
+
 async def test_guest_logs_in_and_may_do_nothing_else(site):
     async with site.served() as browser:
         await log_in(browser, site.guest)

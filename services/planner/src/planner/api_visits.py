@@ -88,10 +88,7 @@ def add_visits(routes: Routes, visiting: Callable[[], Visiting], standby: Callab
         """Return the visit of this session. Who waits and does not ask for a minute gives up the place."""
         if reason := standby():
             raise ProblemError(HttpProblem.STANDS_BY, f"{reason}; send the request there")
-        visit = visiting().visits.of(_owner(caller), visiting().now())
-        if visit is None:
-            raise ProblemError(PlannerProblem.NO_VISIT, "this browser has no visit: ask for one")
-        return view(visit)
+        return view(visiting().visits.known(_owner(caller), visiting().now()))
 
     @routes.post("/api/v1/visits/mine/go", raises=[VisitError])
     async def follow(caller: Guest) -> VisitView:
@@ -109,5 +106,4 @@ def add_visits(routes: Routes, visiting: Callable[[], Visiting], standby: Callab
 
 def _problem(error: VisitError) -> ProblemError:
     headers = {"Retry-After": f"{max(1.0, error.retry_s):.0f}"} if error.retry_s else None
-    code = next(each for each in _REFUSALS if each == str(error.code))
-    return ProblemError(code, str(error), headers=headers)
+    return ProblemError(error.code, str(error), headers=headers)

@@ -18,6 +18,7 @@ from enum import StrEnum
 from typing import TYPE_CHECKING, Final, Literal, NamedTuple
 
 from fog_contracts.messages import ReasonCode
+from planner.problems import PlannerProblem
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
@@ -67,23 +68,10 @@ class VisitEnd(StrEnum):
     """The mission could not be stored."""
 
 
-class VisitRefusal(StrEnum):
-    """Why there is no visit; the planner's problems have the same identifiers."""
-
-    OFF = "visits_off"
-    NOT_PUBLIC = "place_not_public"
-    SAME_PLACE = "visit_same_place"
-    OTHER_VISIT = "visit_other"
-    FULL = "visits_full"
-    TOO_OFTEN = "visits_too_often"
-    NO_VISIT = "no_visit"
-    NOT_READY = "visit_not_ready"
-
-
 class VisitError(Exception):
-    """A refused request; the message is for the visitor's helper, pages have texts of their own for `code`."""
+    """A refused request; the message is for programs, the page has texts of its own for `code`."""
 
-    def __init__(self, code: VisitRefusal, message: str, retry_s: float = 0.0) -> None:
+    def __init__(self, code: PlannerProblem, message: str, retry_s: float = 0.0) -> None:
         super().__init__(message)
         self.code = code
         self.retry_s = retry_s
@@ -177,7 +165,7 @@ class Visits:
         if known is not None and not known.is_over:
             if (known.start, known.goal) == ends:
                 return known
-            raise VisitError(VisitRefusal.OTHER_VISIT, "this browser has another visit: end that one first")
+            raise VisitError(PlannerProblem.VISIT_OTHER, "this browser has another visit: end that one first")
         self._check_limits(source, now)
         visit = Visit(secrets.token_hex(8), owner, source, *ends, since=now, seen_at=now)
         self._visits = [other for other in self._visits if other is not known] + [visit]
@@ -186,21 +174,25 @@ class Visits:
     def _check_places(self, ends: tuple[str, str], public: Mapping[str, Place]) -> None:
         if not self._robots:
             detail = "no robot serves visitors: name some as `robots` of [visitors] in site.toml, and restart"
-            raise VisitError(VisitRefusal.OFF, detail)
+            raise VisitError(PlannerProblem.VISITS_OFF, detail)
         for end in ends:
             if end not in public:
-                raise VisitError(VisitRefusal.NOT_PUBLIC, f"no place {end} is public: choose one that visitors may see")
+                raise VisitError(
+                    PlannerProblem.PLACE_NOT_PUBLIC, f"no place {end} is public: choose one that visitors may see"
+                )
         if ends[0] == ends[1]:
-            raise VisitError(VisitRefusal.SAME_PLACE, "the visitor is there already: choose another place")
+            raise VisitError(PlannerProblem.VISIT_SAME_PLACE, "the visitor is there already: choose another place")
 
     def _check_limits(self, source: str, now: float) -> None:
         open_ones = [visit for visit in self._visits if not visit.is_over]
         if len(open_ones) >= WAITING_MAX or sum(visit.source == source for visit in open_ones) >= PER_SOURCE:
-            raise VisitError(VisitRefusal.FULL, "too many visitors wait: try again in a minute", 60.0)
+            raise VisitError(PlannerProblem.VISITS_FULL, "too many visitors wait: try again in a minute", 60.0)
         asked = self._asked.setdefault(source, deque(maxlen=ASKED_MAX))
         if len(asked) == ASKED_MAX and now - asked[0] < ASKED_S:
             wait = ASKED_S - (now - asked[0])
-            raise VisitError(VisitRefusal.TOO_OFTEN, f"too many visits at once: try again in {wait:.0f} s", wait)
+            raise VisitError(
+                PlannerProblem.VISITS_TOO_OFTEN, f"too many visits at once: try again in {wait:.0f} s", wait
+            )
         asked.append(now)
         self._asked = {each: times for each, times in self._asked.items() if now - times[-1] < ASKED_S}
 
@@ -213,21 +205,22 @@ class Visits:
 
     def go(self, owner: str, now: float) -> Visit:
         """Let the robot lead on; a second "go" changes nothing. Raises `VisitError`."""
-        visit = self._known(owner, now)
+        visit = self.known(owner, now)
         if visit.state == "ready":
             self._enter(visit, "leading", now)
         elif visit.state != "leading":
-            raise VisitError(VisitRefusal.NOT_READY, f"the robot does not wait for the visitor: {visit.state}")
+            raise VisitError(PlannerProblem.VISIT_NOT_READY, f"the robot does not wait for the visitor: {visit.state}")
         return visit
 
     def cancel(self, owner: str, now: float) -> None:
         """End a visit in the visitor's name; raises `VisitError` if there is none."""
-        self._end(self._known(owner, now), VisitEnd.CANCELLED, now)
+        self._end(self.known(owner, now), VisitEnd.CANCELLED, now)
 
-    def _known(self, owner: str, now: float) -> Visit:
+    def known(self, owner: str, now: float) -> Visit:
+        """Return the latest visit of a session, whose page looks at it now; raises `VisitError` without one."""
         visit = self.of(owner, now)
         if visit is None:
-            raise VisitError(VisitRefusal.NO_VISIT, "this browser has no visit: ask for one")
+            raise VisitError(PlannerProblem.NO_VISIT, "this browser has no visit: ask for one")
         return visit
 
     def ahead(self, visit: Visit) -> int:

@@ -14,7 +14,7 @@ from msgspec import to_builtins
 from playwright.async_api import Page, async_playwright, expect
 
 from fog_contracts.grid import StaticMap
-from fog_contracts.messages import AreaDefinition, Place, PlanReply, PolygonShape, Trace, Zone
+from fog_contracts.messages import AreaDefinition, CircleShape, Place, PlanReply, PolygonShape, Trace, Zone
 from fog_runtime.configuration.maps import save_map
 from fog_runtime.configuration.site import load_site
 from fognav import console_page, system
@@ -197,6 +197,28 @@ async def test_robot_shows_cpu_beside_that_of_one_that_drives_alone_and_its_wifi
     assert await shown.locator("path.baseline").count() == 1
     stream.tell("vitals", "r2", vitals(1060.0, 2.0, None))
     await expect(page.get_by_role("button", name="r2")).to_contain_text("CPU 3.0 % · no Wi-Fi")
+
+
+async def test_what_is_typed_stays_while_others_change_things_and_counts_when_the_field_is_left(
+    console: SimpleNamespace, stream: ConsoleStream
+) -> None:
+    circle = CircleShape(centre=(5.0, 6.0), radius=1.0)
+    zone = to_builtins(Zone(id="wet", kind="BLOCKED", shape=circle, version=1, reason="wet floor"))
+    stream.tell("zone", "wet", {**zone, "active": True})
+    page = await console.open("zones")
+    await page.get_by_role("button", name="Edit wet").click()
+    for version, (label, typed) in enumerate((("Reason", "paint"), ("Radius (m)", "2.5")), 2):
+        await page.get_by_label(label).press("Control+a")
+        await page.keyboard.type(typed)
+        # Somebody else's change draws the form anew, and is told in it.
+        stream.tell("zone", "wet", {**zone, "version": version, "author": f"anna{version}", "active": True})
+        await expect(page.get_by_text(f"anna{version} has changed this zone meanwhile.")).to_be_visible()
+        await expect(page.get_by_label(label)).to_have_value(typed)
+    stream.answers["PUT zones/wet"] = (200, {**zone, "version": 4})
+    await page.get_by_role("button", name="Save").click()
+    await expect(page.locator(".said")).to_contain_text("is saved")
+    _, body = next(request for request in stream.requests if request[0] == "PUT zones/wet")
+    assert (body["reason"], body["shape"]["radius"]) == ("paint", 2.5)
 
 
 async def test_goal_by_click_shows_its_path_before_it_is_sent(console: SimpleNamespace, stream: ConsoleStream) -> None:

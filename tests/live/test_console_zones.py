@@ -183,16 +183,8 @@ async def test_two_operators_see_both_versions_and_choose_field_by_field(operato
     await bruno.get_by_role("button", name="closed").click()
     versions = bruno.get_by_role("alertdialog", name="Two versions")
     reason = versions.get_by_role("row", name="Reason")
-    said: list[str] = []
-    for _ in range(4):  # a busy service may refuse a first attempt, which the page says
-        await bruno.get_by_role("button", name="Save").click()
-        try:
-            await expect(reason.get_by_role("cell")).to_have_text(["wet floor", "paint"], timeout=10_000)
-            break
-        except AssertionError:
-            said += await bruno.locator("form, .said").all_inner_texts()
-    else:
-        raise AssertionError(f"no versions were shown: {said}")
+    await bruno.get_by_role("button", name="Save").click()
+    await expect(reason.get_by_role("cell")).to_have_text(["wet floor", "paint"])
     await expect(reason.get_by_role("radio").nth(1)).to_be_checked()  # bruno has not changed it
     await expect(versions.get_by_role("row", name="Effect").get_by_role("radio").nth(0)).to_be_checked()
     await versions.get_by_role("button", name="Save what is chosen").click()

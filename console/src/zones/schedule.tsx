@@ -1,5 +1,6 @@
 // The times of the week in which a zone is in force.
 import { t } from "../i18n/i18n";
+import { Typed } from "../typed";
 import { DAYS, type Schedule } from "./draft";
 
 interface Props {
@@ -38,10 +39,14 @@ export function ScheduleFields({ schedule, onChange }: Props): preact.JSX.Elemen
           </div>
           <div class="fields">
             <label>{t("schedule.begin")}
-              <input type="time" required value={time.begin} onChange={(event) => event.currentTarget.value && change(index, { begin: event.currentTarget.value })} />
+              <Typed value={time.begin} onTyped={({ value }) => value && change(index, { begin: value })}>
+                {(typed) => <input type="time" required {...typed} />}
+              </Typed>
             </label>
             <label>{t("schedule.end")}
-              <input type="time" required value={time.end} onChange={(event) => event.currentTarget.value && change(index, { end: event.currentTarget.value })} />
+              <Typed value={time.end} onTyped={({ value }) => value && change(index, { end: value })}>
+                {(typed) => <input type="time" required {...typed} />}
+              </Typed>
             </label>
             <button type="button" class="low" aria-label={t("schedule.remove", { number: index + 1 })} onClick={() => set(schedule.times.filter((_, i) => i !== index))}>✕</button>
           </div>
@@ -49,7 +54,9 @@ export function ScheduleFields({ schedule, onChange }: Props): preact.JSX.Elemen
       ))}
       <div class="fields">
         <label>{t("schedule.zone")}
-          <input value={schedule.time_zone} maxLength={64} spellcheck={false} onChange={(event) => onChange({ ...schedule, time_zone: event.currentTarget.value })} />
+          <Typed value={schedule.time_zone} onTyped={({ value }) => onChange({ ...schedule, time_zone: value })}>
+            {(typed) => <input maxLength={64} spellcheck={false} {...typed} />}
+          </Typed>
         </label>
         <button type="button" class="low" disabled={schedule.times.length >= 20} onClick={() => set([...schedule.times, WORKDAYS])}>{t("schedule.another")}</button>
       </div>

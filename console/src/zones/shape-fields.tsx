@@ -1,8 +1,8 @@
 // The shape in numbers and buttons: all that a drag on the map does can be done here by single clicks and by keys.
-import { useReducer } from "preact/hooks";
 import type { Point } from "../api/types";
 import { useConsole } from "../context";
 import { t } from "../i18n/i18n";
+import { Typed } from "../typed";
 import { outline } from "../map/geometry";
 import { pointName } from "./edit-layer";
 import type { ClickMode, Editor } from "./editor";
@@ -167,16 +167,14 @@ interface MetresProps {
 
 /** A number in metres, which counts once it is complete; what is no number goes back to what it was. */
 export function Metres({ value, label, min = -COORDINATE_MAX, max = COORDINATE_MAX, onValue }: MetresProps): preact.JSX.Element {
-  const [, anew] = useReducer((count: number) => count + 1, 0);
   return (
-    <input
-      type="number" inputMode="decimal" step="0.01" min={min} max={max} aria-label={label} value={value.toFixed(2)}
-      onChange={(event) => {
-        const typed = event.currentTarget.valueAsNumber;
+    <Typed
+      value={value.toFixed(2)}
+      onTyped={({ valueAsNumber: typed }) => {
         if (Number.isFinite(typed) && typed >= min && typed <= max) onValue(typed);
-        else event.currentTarget.value = value.toFixed(2);
-        anew(0);
       }}
-    />
+    >
+      {(typed) => <input type="number" inputMode="decimal" step="0.01" min={min} max={max} aria-label={label} {...typed} />}
+    </Typed>
   );
 }

@@ -5,6 +5,7 @@ import type { DryRunBody, Zone } from "../api/types";
 import { useConsole, useLive } from "../context";
 import { t } from "../i18n/i18n";
 import { sentence } from "../stop";
+import { Typed } from "../typed";
 import { Conflict } from "./conflict";
 import { bodyOf, type Draft, type End, type Fields, nextHour } from "./draft";
 import type { Editor } from "./editor";
@@ -104,7 +105,9 @@ export function ZoneForm({ editor, onSaved, onCancel }: Props): preact.JSX.Eleme
         )}
       </fieldset>
       <label class="field">{t("field.reason")}
-        <input dir="auto" maxLength={500} value={fields.reason} onChange={(event) => set({ reason: event.currentTarget.value })} />
+        <Typed value={fields.reason} onTyped={({ value: reason }) => set({ reason })}>
+          {(typed) => <input dir="auto" maxLength={500} {...typed} />}
+        </Typed>
       </label>
       <EndFields end={fields.end} now={live.serverTime || Date.now() / 1000} onChange={(end) => set({ end })} />
       <PointFields editor={editor} />
@@ -165,10 +168,12 @@ function EndFields({ end, now, onChange }: EndProps): preact.JSX.Element {
         ))}
       </div>
       <label class="field">{t("end.own")}
-        <input type="datetime-local" step="1" value={end.type === "at" ? localTime(end.stamp) : ""} onChange={(event) => {
-          const stamp = new Date(event.currentTarget.value).getTime() / 1000;
+        <Typed value={end.type === "at" ? localTime(end.stamp) : ""} onTyped={({ value }) => {
+          const stamp = new Date(value).getTime() / 1000;
           onChange(Number.isFinite(stamp) ? { type: "at", stamp } : { type: "never" });
-        }} />
+        }}>
+          {(typed) => <input type="datetime-local" step="1" {...typed} />}
+        </Typed>
       </label>
       <p class="muted">{endText(end)}</p>
     </fieldset>

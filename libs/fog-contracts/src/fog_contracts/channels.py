@@ -313,7 +313,7 @@ ROBOT_STATE       = _pub(  "robot_state",       FOG + "robots/{robot}/state",   
 ROBOT_OBSTACLES   = _pub(  "robot_obstacles",   FOG + "robots/{robot}/obstacles", m.RobotObstacles, limit=64 * KIB,
     publishers=(ROBOT,),   subscribers=(MAP, CONSOLE, WEB), durability=VOLATILE, rate_hz=1)
 ROBOT_VITALS      = _pub(  "robot_vitals",      FOG + "robots/{robot}/vitals",    m.RobotVitals,    limit=512,
-    publishers=(ROBOT,),   subscribers=(CONSOLE, WEB), durability=VOLATILE, rate_hz=0.5, max_age_s=6)
+    publishers=(ROBOT,),   subscribers=(WEB,), durability=VOLATILE, rate_hz=0.5, max_age_s=6)
 ROBOT_COMMAND     = _query("robot_command",     FOG + "robots/{robot}/command",   m.RobotCommand,   limit=KIB,
     publishers=(ROBOT,),   subscribers=(PLANNER, CONSOLE), reply=m.CommandReply, reply_limit=2 * KIB)
 LEADER            = _pub(  "leader",            FOG + "leaders/{role}", m.Leader, limit=KIB,

@@ -14,7 +14,17 @@ from msgspec import to_builtins
 from playwright.async_api import Page, async_playwright, expect
 
 from fog_contracts.grid import StaticMap
-from fog_contracts.messages import AreaDefinition, CircleShape, Place, PlanReply, PolygonShape, Trace, Zone
+from fog_contracts.messages import (
+    Alert,
+    AreaDefinition,
+    AreaHazard,
+    CircleShape,
+    Place,
+    PlanReply,
+    PolygonShape,
+    Trace,
+    Zone,
+)
 from fog_runtime.configuration.maps import save_map
 from fog_runtime.configuration.site import load_site
 from fognav import console_page, system
@@ -315,11 +325,27 @@ async def test_hostile_names_are_text_everywhere(console: SimpleNamespace, strea
     stream.tell("zone", HOSTILE, _zone(HOSTILE, HOSTILE))
     stream.robot(HOSTILE, robot_state("HOLD", reasons=[HOSTILE], codes=["x"]))
     stream.tell("place", HOSTILE, {"x": 12.0, "y": 30.0, "theta": None, "label": HOSTILE})
+    definition = AreaDefinition(id="z1", label=HOSTILE, polygon=[(10.0, 25.0), (14.0, 25.0), (14.0, 28.0)])
+    hazard = AreaHazard(area="z1", state="blocked", severity=0, penalty=0, since=1.0, seq=1, epoch=1, cause=HOSTILE)
+    override = {"state": "blocked", "until": 4e9, "by": HOSTILE, "reason": HOSTILE}
+    stream.tell("area", "z1", {"definition": definition, "hazard": hazard, "withheld": False, "override": override})
+    node = stream.log["node", "n1"][2]["value"]
+    stream.tell("node", "n1", {**node, "reason": HOSTILE, "online": False})
+    alert = Alert(id=HOSTILE, kind="node-unknown", area="z1", reason=HOSTILE, since=1.0, raised=2.0)
+    stream.tell("alert", HOSTILE, alert)
+    entry = {"at": 1.0, "who": HOSTILE, "id": HOSTILE, "before": None, "after": {"id": HOSTILE, "reason": HOSTILE}}
+    kinds = ("zone", "place", "override", "mission", "robot", "stop", "set", "hazard", "fault", "alert")
+    stream.answers["GET timeline"] = (
+        200, [{**entry, "kind": kind, "action": "put", "text": HOSTILE, "entry": f"{kind}-1"} for kind in kinds],
+    )  # fmt: skip
     for device in (WIDE, PHONE):
         page = await console.open(**device)
         for view in VIEWS:
             await page.evaluate("view => { location.hash = `#/${view}` }", view)
             await expect(page.locator(f"[data-view={view}]")).to_be_visible()
+            if view == "timeline":
+                await expect(page.locator("ol.timeline > li")).to_have_count(len(kinds))
+            assert await page.evaluate("document.querySelectorAll('main script, main img[src=x]').length") == 0
             assert await page.evaluate("document.querySelectorAll('script').length") == 1
             assert await page.evaluate("document.documentElement.scrollWidth <= innerWidth")
             await expect(page.get_by_role("button", name="Stop all")).to_be_in_viewport(ratio=1.0)

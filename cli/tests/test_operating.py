@@ -360,9 +360,10 @@ def test_zones_are_listed_shown_and_removed(demo: Service) -> None:
     assert json.loads(run("zone", "remove", "z-1", "--json"))["removed"] is True
 
 
-def test_refusal_gives_the_reason_of_the_problem_document(demo: Service) -> None:
-    demo.answers["GET", "/api/v1/zones/nix"] = (404, {"detail": "there is no zone nix"})
-    assert "the map-service refused it: there is no zone nix" in run("zone", "show", "nix", code=1)
+def test_refusal_gives_reason_and_remedy_of_the_problem_document(demo: Service) -> None:
+    problem = {"detail": "there is no zone nix", "remedy": "List the zones"}
+    demo.answers["GET", "/api/v1/zones/nix"] = (404, problem)
+    assert "the map-service refused it: there is no zone nix. List the zones" in run("zone", "show", "nix", code=1)
     demo.answers["DELETE", "/api/v1/zones/z-1"] = (401, {"detail": "the token is unknown"})
     assert "the token is unknown. Set FOGNAV_TOKEN to an operator's token" in run("zone", "remove", "z-1", code=1)
 

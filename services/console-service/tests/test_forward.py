@@ -88,6 +88,7 @@ async def test_merged_document_has_the_routes_of_all_services_as_they_are_under_
     async with httpx.AsyncClient(base_url=await start_console(fog, *SERVICES), timeout=60.0) as browser:
         document = (await browser.get("/api/v1/openapi.json")).json()
         assert {"/api/v1/zones", "/api/v1/areas", "/api/v1/robots", "/api/v1/session"} <= document["paths"].keys()
+        assert {"502", "504"} <= document["paths"]["/api/v1/robots"]["get"]["responses"].keys()
         for path, operations in document["paths"].items():
             if "get" in operations and "{" not in path and "events" not in path:
                 answer = await browser.get(path)

@@ -134,8 +134,10 @@ class Fog:
                 f"the {service} does not answer at {url}: {error}. Check that it runs there (fognav status)"
             ) from error
         if response.status >= http.client.BAD_REQUEST:
-            remedy = f". {_GIVE_TOKEN}" if response.status == http.client.UNAUTHORIZED else ""
-            raise RefusedError(f"the {service} refused it: {response.reason}{remedy}", response.status, response.body)
+            problem = response.body if isinstance(response.body, dict) else {}
+            remedy = _GIVE_TOKEN if response.status == http.client.UNAUTHORIZED else str(problem.get("remedy", ""))
+            words = ". ".join(part for part in (f"the {service} refused it: {response.reason}", remedy) if part)
+            raise RefusedError(words, response.status, response.body)
         return response.body
 
 

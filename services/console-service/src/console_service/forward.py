@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import asyncio
 import re
-from typing import TYPE_CHECKING, Final, Self
+from typing import TYPE_CHECKING, Any, Final, Self
 
 import httpx
 import msgspec
@@ -159,7 +159,8 @@ class Forward:
         services = [service for service in self._urls if service != DEMO]
         described = await asyncio.gather(*(self._openapi(service) for service in services))
         if self._merged is None or self._merged[0] != described:
-            documents = dict(zip(services, map(msgspec.json.decode, described), strict=True))
+            forwarded = (_forwarded(msgspec.json.decode(each, type=dict[str, Any])) for each in described)
+            documents = dict(zip(services, forwarded, strict=True))
             self._merged = described, msgspec.json.encode(merged({**documents, CONSOLE: own}))
         return self._merged[1]
 
@@ -169,6 +170,15 @@ class Forward:
         except httpx.HTTPError as error:
             detail = f"the {service} does not describe its routes ({error}): try again once it runs (`fognav status`)"
             raise ProblemError(ForwardProblem.SERVICE_AWAY, detail, headers=RETRY_AFTER, service=service) from error
+
+
+def _forwarded(described: dict[str, Any]) -> dict[str, Any]:
+    """Return a service's document with what this one may answer in its place."""
+    for operation in (each for operations in described["paths"].values() for each in operations.values()):
+        answers = operation["responses"]
+        for problem in ForwardProblem:
+            answers.setdefault(str(problem.status), {**answers["500"], "description": problem.says})
+    return described
 
 
 def _no_route(request: Request) -> ProblemError:

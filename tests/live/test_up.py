@@ -307,6 +307,7 @@ def test_running_fog_gets_another_map_on_which_a_robot_plans_and_the_way_back(tm
         stopped = robot()
         state = stopped["state"]
         assert (state["mode"] in ("HOLD", "INIT"), state["enabled"], stopped["goal"]) == (True, False, None), stopped
+        assert state["goal_id"] is None
         assert (state["map_epoch"], bool(state["reasons"])) == (back["epoch"], True)
         assert planned(back["epoch"]) < around - 5.0
 

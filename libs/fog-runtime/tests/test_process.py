@@ -66,6 +66,18 @@ def test_crash_is_logged_once_and_exits_with_status_one():
     assert json.loads(line)["reason"] == "ValueError: the reason"
 
 
+def test_process_that_is_to_be_started_again_ends_in_order_unless_something_else_went_wrong():
+    again = "process.AgainError('another map')"
+    with start(f"raise ExceptionGroup('many', [{again}])", seconds=0.0) as child:
+        _, err = child.communicate(timeout=60)
+    assert (child.returncode, json.loads(err)["event"], json.loads(err)["reason"]) == (
+        0, "starting_again", "another map",
+    )  # fmt: skip
+    with start(f"raise ExceptionGroup('many', [{again}, ValueError('the reason')])", seconds=0.0) as child:
+        child.communicate(timeout=60)
+    assert child.returncode == 1
+
+
 def test_hang_up_ends_no_process_that_nohup_started():
     with subprocess.Popen(
         ["nohup", sys.executable, "-c", PROGRAM.format(body="pass", seconds=60.0)],

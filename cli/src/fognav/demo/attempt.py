@@ -271,7 +271,8 @@ class Attempt:
         self._tell_of_robot(event)
         if event.kind == "exited":
             self.restarts[event.program] = self.restarts.get(event.program, 0) + 1
-            self.scene.log_event(f"{event.program} died ({event.detail})")
+            what = "ended" if event.detail.startswith("exit code 0") else "died"
+            self.scene.log_event(f"{event.program} {what} ({event.detail})")
         elif event.kind == "started" and event.program in self.restarts:
             self.scene.log_event(f"{event.program} was restarted")
 

@@ -93,6 +93,8 @@ export class Floor {
     for (const stop of this.stops) stop();
     this.fixed.remove();
     this.robots.remove();
+    this.plan?.remove();
+    this.costs?.remove();
     this.map.remove();
   }
 

@@ -267,6 +267,28 @@ def test_robot_that_is_gone_is_forgotten_and_one_that_a_new_run_has_not_told_of_
     assert devices(core, begin, end) == [("robot_r1", False)], "another run of the console does not know it"
 
 
+EVERY = {"p", "name", "unique_id", "state_topic"}
+KEYS = {
+    "vacuum": EVERY | {"supported_features", "command_topic", "payload_stop", "payload_return_to_base"},
+    "sensor": EVERY | {"device_class", "unit_of_measurement", "value_template"},
+    "binary_sensor": EVERY | {"device_class", "value_template"},
+    "select": EVERY | {"options", "command_topic", "command_template", "value_template"},
+    "button": EVERY - {"state_topic"} | {"command_topic", "payload_press"},
+    "image": EVERY - {"state_topic"} | {"image_topic", "image_encoding", "content_type", "json_attributes_topic"},
+}
+"""Of the keys that Home Assistant knows, those that we use (home-assistant/core 2026.2.3, `components/mqtt/*.py` and
+`abbreviations.py`). Others it leaves out without a word."""
+
+
+def test_description_of_a_robot_has_keys_only_that_home_assistant_knows():
+    found = json.loads(discovery("lab", "r1", ["b"]))
+    assert found.keys() == {"dev", "o", "cmps", "availability_topic"}
+    assert found["dev"].keys() <= {"ids", "name", "mf", "mdl"}
+    for component in found["cmps"].values():
+        assert component.keys() <= KEYS[component["p"]], component
+        assert set(component.get("supported_features", ())) <= {"start", "pause", "stop", "return_home", "locate"}
+
+
 def test_broker_that_lost_everything_is_told_again():
     core = HomeAssistant("lab")
     events = ("hello", {"fresh": True}), ("robot", {"id": "r1", "value": view()}), ("ready", {})

@@ -67,12 +67,14 @@ def test_each_program_gets_its_own_files(node):
     assert node.files("gateway") == {"server.pem", "server.key"}
     assert node.files("map-service") == node.files("hazard-aggregator") == OF_SERVICE
     assert node.files("planner") == OF_SERVICE | {"operator.key"}
+    assert node.files("bridge") == {"credentials.toml", "token"}
 
 
 def test_no_program_has_a_secret_of_another(node):
     assert node.holders((node.security / OPERATOR_KEY).read_text().strip()) == {"planner"}
     assert node.holders((node.security / SESSION_KEY).read_text().strip()) == SERVICES
     assert node.holders((node.security / ADMIN_TOKEN).read_text().strip()) == set()
+    assert node.holders((node.out / "bridge" / "token").read_text().strip()) == {"bridge"}
     assert node.holders((node.security / "authority.pem").read_text()[:200]) == set()
     for service in SERVICES:
         for server, password in Credentials.read(

@@ -14,11 +14,11 @@ from fog_runtime.keys import BRIDGE_TOKEN, TOKENS
 from fog_runtime.token_file import keep_token
 from fognav.operate.fog import find_fog
 from fognav.output import FailedError, WrongUseError, exit_codes, print_line
-from fognav.programs import BRIDGE, BROKER, CONSOLE, MODULES, inherited_environment
+from fognav.programs import BRIDGE, BROKER, CONSOLE, MODULES, ROUTER, inherited_environment
 
 _FILE: Final = "FOGNAV_BRIDGE_FILE"
 _COMMAND: Final = (sys.executable, "-m", MODULES[BRIDGE])
-_OF_FOG: Final = ("console_url", "mqtt_url", "site", "token_file", "credentials_file")
+_OF_FOG: Final = ("console_url", "mqtt_url", "zenoh_connect", "site", "token_file", "credentials_file")
 """Settings that a system on this machine answers by itself."""
 
 
@@ -63,14 +63,15 @@ def _of_this_machine() -> dict[str, str]:
     system = find_fog(None).system
     if system.token_file is None or system.credentials_file is None or CONSOLE not in system.urls:
         raise WrongUseError(
-            f"{system.name} has no secrets for this user: set console_url, mqtt_url, site, token_file and "
-            "credentials_file, or in containers run `docker compose --profile bridges up` (docs/interop.md)"
+            f"{system.name} has no secrets for this user: set {', '.join(_OF_FOG)}, or in containers run "
+            "`docker compose --profile bridges up` (docs/interop.md)"
         )
     token = Path(system.token_file).with_name(BRIDGE_TOKEN)
     keep_token(token.with_name(TOKENS), BRIDGE, "operator", token)
     found = {
         "console_url": system.urls[CONSOLE],
         "mqtt_url": system.urls[BROKER],
+        "zenoh_connect": system.urls[ROUTER],
         "site": find_fog(None).site,
         "token_file": str(token),
         "credentials_file": str(Path(system.credentials_file).with_name(f"{BRIDGE}.toml")),

@@ -73,7 +73,7 @@ def test_document_row_shows_the_channels_properties():
     line = next(line for line in channels_markdown({}).splitlines() if "map/heartbeat`" in line)
     assert line == (
         "| `fog/<site>/map/heartbeat` | [MapHeartbeat](#mapheartbeat) | map-service → planner, robot-agent, "
-        "console-service | `volatile` | 10 Hz | 1 s | 256 B |"
+        "console-service, bridge | `volatile` | 10 Hz | 1 s | 256 B |"
     )
 
 

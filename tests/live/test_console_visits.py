@@ -82,6 +82,8 @@ async def test_guest_scans_waits_follows_and_arrives_and_a_stop_ends_the_next_vi
         await codes_are_made_of_a_guests_token_only(building, anna)
         await guest_is_led(building, guest)
         await guest.get_by_role("button", name="New visit").click()
+        await guest_is_where_the_robot_is_and_changes_their_mind(guest)
+        await guest.get_by_role("button", name="New visit").click()
         await operator_stops_the_next_visit(building, guest, anna)
         expect.set_options(timeout=None)
         await browser.close()
@@ -136,6 +138,16 @@ async def guest_is_led(building: Building, guest: Page) -> None:
     x, y = PLACES["lab"]
     assert abs(building.live.truth.x - x) + abs(building.live.truth.y - y) < 0.6
     await building.look(guest, "arrived")
+
+
+async def guest_is_where_the_robot_is_and_changes_their_mind(guest: Page) -> None:
+    await guest.get_by_role("button", name="I am elsewhere").click()
+    await guest.get_by_role("button", name="Lab").click()
+    await expect(guest.get_by_text("You are at Lab")).to_be_visible()
+    await guest.get_by_role("button", name="Hall").click()
+    await expect(guest.get_by_role("heading", level=1)).to_have_text(f"{ROBOT} is here")
+    await guest.get_by_role("button", name="End the visit").click()
+    await expect(guest.get_by_text("You have ended it.")).to_be_visible()
 
 
 async def operator_stops_the_next_visit(building: Building, guest: Page, anna: Page) -> None:

@@ -22,10 +22,15 @@ export function VisitApp({ place, onExpired }: Props): preact.JSX.Element {
   const redraw = useRedraw();
   useEffect(() => setHere(place), [place]);
   const name = (id: string): string => places.find((each) => each.id === id)?.label || id;
+  // The next visitor at a tablet stands where it hangs.
+  const leave = (): void => {
+    setHere(place);
+    forget();
+  };
   const over = visit?.state === "arrived" || visit?.state === "ended";
   useEffect(() => {
     if (!over) return undefined;
-    const timer = setTimeout(forget, LEAVE_MS);
+    const timer = setTimeout(leave, LEAVE_MS);
     return () => clearTimeout(timer);
   }, [over]);
   const known = places.some((each) => each.id === here);
@@ -44,7 +49,7 @@ export function VisitApp({ place, onExpired }: Props): preact.JSX.Element {
       {visit && !over && (
         <button class="danger" onClick={end}>{t(visit.state === "leading" ? "visit.stop" : "visit.cancel")}</button>
       )}
-      {visit && over && <button class="primary" onClick={forget}>{t("visit.again")}</button>}
+      {visit && over && <button class="primary" onClick={leave}>{t("visit.again")}</button>}
       <p class="problem" role="alert">{problem === "" ? "" : maybe(`visit.problem.${problem}`) ?? t("visit.end.failed")}</p>
     </Frame>
   );

@@ -36,7 +36,7 @@ MAKE_POLYGONS = {
     "services/map-service/src/map_service/api_masks.py",
 }  # fmt: skip
 """They make a shape of a list of corners, whatever other kinds there are."""
-GEOJSON = "services/map-service/src/map_service/geojson.py"
+GEOJSON = "services/map-service/src/map_service/formats/geojson.py"
 """It writes other kinds of shapes, too, but without a geometry that other programs show."""
 ORACLE = "experiments/src/fognav_experiments/hunt/oracle.py"
 """It computes for itself where zones are: an error in the shapes must not be its own, too."""

@@ -31,7 +31,7 @@ from fognav_experiments.processes import Fog
 from fognav_experiments.rigs import STAMP, make_aggregator, make_map
 from hazard_aggregator.areas import AreaOverride
 from map_service.dry_run import Change
-from map_service.zone_sets import SetOfZones
+from map_service.zone_times import SetOfZones
 from map_service.zones import prepare_zone
 from planner.config import PlannerConfig
 from planner.core import PlannerCore

@@ -25,7 +25,7 @@ from fog_bridges.ros2.bridge import GOAL_TYPE, MAP_TYPE, RosSession, ros_config
 from fog_bridges.ros2.wire import Attachment, Node, Topic, WireError, Writer, decoded, type_hash
 from fog_contracts import channels as ch
 from fog_contracts.grid import GridGeometry
-from fog_contracts.messages import RobotPath, RobotPose, RobotState
+from fog_contracts.messages import CircleShape, RobotPath, RobotPose, RobotState, Zone
 from fog_supervisor import net
 
 DOMAIN = 7
@@ -105,7 +105,11 @@ def test_path_battery_and_markers_can_be_sent():
     )
     battery = sent("r1/battery_state", "sensor_msgs/msg/BatteryState", ros.battery(state, 1.0))
     assert (round(battery.percentage, 2), bool(np.isnan(battery.voltage))) == (0.63, True)
-    assert len(sent("h", "visualization_msgs/msg/MarkerArray", ros.markers({}, [], 1.0)).markers) == 1
+    zone = Zone(id="wet", kind="BLOCKED", shape=CircleShape(centre=(1.0, 1.0), radius=0.5), reason="mopped")
+    drawn = ros.markers({}, [zone], GridGeometry(60, 60, 0.05, 0.0, 0.0), 1.0)
+    everything, stripes, words = sent("h", "visualization_msgs/msg/MarkerArray", drawn).markers
+    assert (everything.action, words.text) == (3, "wet: mopped")
+    assert all(abs((point.x - 1.0) ** 2 + (point.y - 1.0) ** 2 - 0.25) < 0.09 for point in stripes.points)
 
 
 def sent(name: str, kind: str, message):

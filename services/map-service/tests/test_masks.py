@@ -16,7 +16,7 @@ from PIL import Image
 from fog_contracts.grid import GridGeometry
 from fog_contracts.shapes import polygon_spans
 from fog_runtime.configuration.maps import load_occupancy
-from map_service.masks import MaskError, factor_of, keepout_values, parts_of
+from map_service.formats.masks import MaskError, factor_of, keepout_values, parts_of
 
 SIZE = 0.05
 SHADES = arrays(np.int8, array_shapes(min_dims=2, max_dims=2, max_side=24), elements=st.sampled_from([0, 0, 30, 100]))

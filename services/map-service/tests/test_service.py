@@ -19,7 +19,7 @@ from fog_contracts.handlers import Moment
 from fog_contracts.messages import AreaDefinition, HazardArea, Message, ZoneSet
 from fog_runtime.health import Health
 from fog_runtime.http import Tokens
-from map_service import api, api_views
+from map_service import api
 from map_service.core import MapCore
 from map_service.registry import make_layers
 from map_service.service import Service
@@ -117,7 +117,7 @@ async def test_picture_is_refused_with_the_time_to_retry_while_pictures_of_four_
         free.wait(60.0)
         return b"picture"
 
-    monkeypatch.setattr(api_views, "_png", slowly)
+    monkeypatch.setattr(api, "_png", slowly)
     site = cast("Any", SimpleNamespace(id="test", places={}))
     app = api.make_api(service, site, ManualClock(1.0), Health(), Tokens())
     try:

@@ -317,6 +317,7 @@ class Relay:
             self._geometry, self._told, self._is_dirty = replica.geometry, {}, True
             told = ros.grid(ros.map_values(replica.static), replica.geometry, stamp)
             self._session.publish(self._map, told, stamp)
+            self._tell_markers()
         is_slow = self.map_age_s > SILENT_S
         if is_slow != self._is_slow:
             self._is_slow, self._is_dirty = is_slow, True
@@ -365,7 +366,7 @@ class Relay:
     def _tell_markers(self) -> None:
         in_force = [zone for zone in self._zones.zones if zone.id in set(self._zones.active)]
         stamp = self._stamp()
-        self._session.publish(self._markers, ros.markers(self._hazards, in_force, stamp), stamp)
+        self._session.publish(self._markers, ros.markers(self._hazards, in_force, self._geometry, stamp), stamp)
 
     def _on_state(self, ids: Mapping[str, str], state: RobotState) -> None:
         robot = ids["robot"]

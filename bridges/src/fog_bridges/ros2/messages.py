@@ -9,10 +9,11 @@ import numpy as np
 
 from fog_bridges.ros2.wire import TYPES, RosMessage
 from fog_contracts.costs import LETHAL, UNKNOWN
-from fog_contracts.messages import CircleShape, CorridorShape, Power, RectangleShape
+from fog_contracts.messages import Power
+from fog_contracts.shapes import shape_spans
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable, Iterator, Mapping, Sequence
+    from collections.abc import Iterator, Mapping, Sequence
 
     from numpy.typing import NDArray
 
@@ -27,6 +28,7 @@ SPEED_STEP: Final = 0.01
 """What one unit of a speed mask is (m/s)."""
 FULL: Final = 100
 _LINE_STRIP: Final = 4
+_LINE_LIST: Final = 5
 _TEXT: Final = 9
 _DELETE_ALL: Final = 3
 _LINE_WIDTH: Final = 0.08
@@ -38,7 +40,7 @@ _COLOURS: Final = {
     "PENALTY": (0.3, 0.45, 0.75),
     "SPEED_LIMIT": (0.2, 0.6, 0.6),
 }
-_CIRCLE_CORNERS: Final = 24
+_STRIPE_ROWS: Final = 4
 _NEVER: Final = float("nan")
 _CHARGING: Final = {"no": 2, "waiting": 3, "bulk": 1, "trickle": 1, "reconditioning": 1}
 """Fognav's words for what a charger does, as power supply status of sensor_msgs."""
@@ -144,41 +146,45 @@ def filter_info(kind: int, mask_topic: str, stamp: float) -> RosMessage:
 # --- Markers ----------------------------------------------------------------------------------------------------------
 
 
-def markers(hazards: Mapping[str, HazardArea], zones: Sequence[Zone], stamp: float) -> RosMessage:
-    """Return the hazards and the zones in force as outlines with words; replaces all markers before."""
+def markers(
+    hazards: Mapping[str, HazardArea], zones: Sequence[Zone], geometry: GridGeometry | None, stamp: float
+) -> RosMessage:
+    """Return the hazards as outlines and the zones in force as stripes, with words; replaces all markers before.
+
+    Zones are drawn by their cells, of whatever shape they are, once the map's `geometry` is known.
+    """
     found = [_marker("all", 0, _DELETE_ALL, stamp)]
     for area, hazard in sorted(hazards.items()):
-        if hazard.hazard.state in _COLOURS:
-            words = f"{hazard.label or area}: {hazard.hazard.state}"
-            found += _outline("hazards", len(found), hazard.polygon, hazard.hazard.state, words, stamp)
+        if (state := hazard.hazard.state) in _COLOURS:
+            ring = [(float(x), float(y)) for x, y in (*hazard.polygon, hazard.polygon[0])]
+            found += _drawn("hazards", len(found), ring, state, f"{hazard.label or area}: {state}", stamp)
     for zone in zones:
-        words = f"{zone.id}: {zone.reason}" if zone.reason else zone.id
-        found += _outline("zones", len(found), _corners(zone.shape), zone.kind, words, stamp)
+        if geometry is not None and (lines := _stripes(zone.shape, geometry)):
+            words = f"{zone.id}: {zone.reason}" if zone.reason else zone.id
+            found += _drawn("zones", len(found), lines, zone.kind, words, stamp)
     return message("visualization_msgs/msg/MarkerArray", markers=found)
 
 
-def _corners(shape: Shape) -> list[tuple[float, float]]:
-    """Return what is drawn of a zone: its outline, of a corridor its middle and back again."""
-    match shape:
-        case RectangleShape(corner=(x, y), opposite=(far_x, far_y)):
-            return [(x, y), (far_x, y), (far_x, far_y), (x, far_y)]
-        case CircleShape(centre=(x, y), radius=radius):
-            angles = np.linspace(0.0, 2.0 * math.pi, _CIRCLE_CORNERS, endpoint=False)
-            return [(x + radius * math.cos(angle), y + radius * math.sin(angle)) for angle in angles]
-        case CorridorShape(line=line):
-            return [*line, *line[-2:0:-1]]
-        case _:
-            return list(shape.points)
+def _stripes(shape: Shape, geometry: GridGeometry) -> list[tuple[float, float]]:
+    """Return the begins and ends of lines through a shape's cells."""
+    spans, size = shape_spans(shape, geometry), geometry.resolution
+    lines: list[tuple[float, float]] = []
+    for row, start, stop in zip(spans.rows, spans.starts, spans.stops, strict=True):
+        if (row - spans.window.y) % _STRIPE_ROWS == 0:
+            y = geometry.origin_y + (float(row) + 0.5) * size
+            lines += [(geometry.origin_x + float(column) * size, y) for column in (start, stop)]
+    return lines
 
 
-def _outline(
-    namespace: str, number: int, ring: Iterable[Sequence[float]], colour: str, words: str, stamp: float
+def _drawn(
+    namespace: str, number: int, points: Sequence[tuple[float, float]], colour: str, words: str, stamp: float
 ) -> Iterator[RosMessage]:
-    corners = [(float(x), float(y)) for x, y in ring]
-    line = _marker(namespace, number, 0, stamp, kind=_LINE_STRIP, colour=_COLOURS[colour])
-    line.points = [message("geometry_msgs/msg/Point", x=x, y=y, z=0.0) for x, y in (*corners, corners[0])]
+    """Yield lines, those of hazards in one piece, and words in their middle."""
+    kind = _LINE_STRIP if namespace == "hazards" else _LINE_LIST
+    line = _marker(namespace, number, 0, stamp, kind=kind, colour=_COLOURS[colour])
+    line.points = [message("geometry_msgs/msg/Point", x=x, y=y, z=0.0) for x, y in points]
     yield line
-    x, y = np.mean(corners, axis=0)
+    x, y = np.mean(points, axis=0)
     yield _marker(
         namespace, number + 1, 0, stamp, kind=_TEXT, colour=_COLOURS[colour], at=(float(x), float(y)), text=words
     )

@@ -3,6 +3,8 @@
 Reading needs no token, except for the audit log; writing needs the role operator.
 """
 
+import asyncio
+import io
 import secrets
 from collections.abc import Callable
 from itertools import islice
@@ -10,16 +12,21 @@ from pathlib import Path
 from typing import Annotated, Final, Literal
 
 import msgspec
-from fastapi import FastAPI
+import numpy as np
+from fastapi import FastAPI, Response
+from PIL import Image
 
 from fog_contracts.messages import (
+    HazardArea,
     Id,
+    MapGeometry,
+    MapInfo,
     Message,
     Zone,
 )
 from fog_contracts.site import Site
 from fog_runtime.clock import Clock
-from fog_runtime.concurrency import BusyError
+from fog_runtime.concurrency import BusyError, Worker
 from fog_runtime.health import Health
 from fog_runtime.http import (
     MAP_UPLOADS,
@@ -56,16 +63,19 @@ from map_service.api_map_change import add_map_change
 from map_service.api_masks import add_masks
 from map_service.api_places import add_places
 from map_service.api_sets import add_sets, add_sources
-from map_service.api_views import add_views
 from map_service.applied import AppliedChange, ChangeKind
 from map_service.core import ScrapeTarget
-from map_service.geojson import add_geojson
-from map_service.problems import NO_SUCH_ZONE, ZONES_NOT_LOADED, MapProblem, add_errors, require_zones
+from map_service.costmap import LayeredCostmap
+from map_service.formats.geojson import add_geojson
+from map_service.layers.base import Grid
+from map_service.problems import NO_SUCH_ZONE, ZONES_NOT_LOADED, MapProblem, add_busy_error, add_errors, require_zones
 from map_service.record_writer import ConflictError
 from map_service.service import Service
 from map_service.undo import add_record_undo, add_undo
 from map_service.zone_bodies import ZoneBody, body_of_zone, zone_from_body
 from map_service.zones import ZoneError
+
+Image.preinit()  # the first picture would load PIL's formats, while the map is served
 
 AuditKind = Literal[
     "alert", "area", "map", "mission", "override", "place", "robot", "service", "set", "source", "stop", "store",
@@ -124,7 +134,7 @@ def make_api(  # noqa: PLR0913  # the process's parts
     add_places(places, service)
     add_record_undo(places, service)
     maps = Routes(app, "map")
-    add_views(maps, service, site)
+    _add_views(maps, service, site)
     add_errors(maps)
     add_map_change(maps, service, site_dir)
     _add_scrape_targets(Routes(app, "robots"), service, clock)
@@ -316,3 +326,80 @@ def _require_matching(service: Service, zone_id: str, if_match: str | None) -> Z
         detail = f"zone {zone_id} is at version {zone.version}, not {if_match}: read it again, then retry"
         raise ProblemError(MapProblem.ZONE_CHANGED, detail)
     return zone
+
+
+# --- What the map shows: hazards, geometry, and pictures of the floor plan and the costmap ----------------------------
+
+_PNG: Final = "image/png"
+_MAX_PICTURES: Final = 4
+"""Most pictures that are being encoded or wait for it."""
+
+
+class _Pictures:
+    """PNGs whose pixel values are the cells', encoded on a thread of their own, once per version for all who ask."""
+
+    def __init__(self, costmap: LayeredCostmap) -> None:
+        self._costmap = costmap
+        self._worker = Worker("pictures", limit=_MAX_PICTURES)
+        self._latest: dict[str, tuple[object, asyncio.Future[bytes]]] = {}
+
+    async def response(self, name: str, cells: Grid, palette: bytes) -> Response:
+        """Return the picture of the current version; raises `BusyError` while too many are being encoded."""
+        version, picture = self._latest.get(name, (None, None))
+        if picture is None or version != self._costmap.version or (picture.done() and picture.exception()):
+            # Copied before the event loop can change the map.
+            picture = asyncio.ensure_future(self._worker.run(_png, cells.copy(), palette))
+            self._latest[name] = self._costmap.version, picture
+        return Response(await asyncio.shield(picture), media_type=_PNG, headers={"Cache-Control": "no-cache"})
+
+
+def _add_views(routes: Routes, service: Service, site: Site) -> None:
+    add_busy_error(routes)
+    core, costmap = service.core, service.core.costmap
+    pictures = _Pictures(costmap)
+
+    @routes.get("/api/v1/hazards")
+    async def hazards() -> list[HazardArea]:
+        """Return every area with its hazard as on the map."""
+        return core.hazards()
+
+    @routes.get("/api/v1/map")
+    async def map_info() -> MapInfo:
+        """Return the map's geometry and version."""
+        g = costmap.geometry
+        geometry = MapGeometry(
+            width=g.width, height=g.height, resolution=g.resolution, origin_x=g.origin_x, origin_y=g.origin_y
+        )
+        return MapInfo(site=site.id, geometry=geometry, epoch=costmap.version.epoch, seq=costmap.version.seq)
+
+    @routes.get("/api/v1/map.png", media_type=_PNG, raises=[BusyError])
+    async def map_png() -> Response:
+        """Return the floor plan: white is free, black occupied, grey unknown."""
+        return await pictures.response("map", costmap.static, _PLAN)
+
+    @routes.get("/api/v1/costmap.png", media_type=_PNG, raises=[BusyError], problems=ZONES_NOT_LOADED)
+    async def costmap_png() -> Response:
+        """Return the master costmap; a pixel's palette index is the cell's cost."""
+        require_zones(service)
+        return await pictures.response("cost", costmap.cost, _COSTS)
+
+
+def _png(cells: Grid, palette: bytes) -> bytes:
+    """Return a PNG whose palette indices are the cells; the image's first row is the grid's last."""
+    image = Image.fromarray(np.ascontiguousarray(cells[::-1]))
+    image.putpalette(palette)
+    data = io.BytesIO()
+    image.save(data, "PNG", compress_level=1)
+    return data.getvalue()
+
+
+def _palette(special: dict[int, tuple[int, int, int]]) -> bytes:
+    """Return a palette of 256 colours: graded costs from near white to orange, other costs as in `special`."""
+    colours = [(255, 250 - cost // 2, 240 - cost * 220 // 252) for cost in range(253)] + [(0, 0, 0)] * 3
+    for cost, colour in special.items():
+        colours[cost] = colour
+    return bytes(channel for colour in colours for channel in colour)
+
+
+_PLAN: Final = _palette({0: (255, 255, 255), 254: (0, 0, 0), 255: (205, 205, 205)})
+_COSTS: Final = _palette({0: (255, 255, 255), 253: (90, 160, 220), 254: (150, 0, 40), 255: (205, 205, 205)})

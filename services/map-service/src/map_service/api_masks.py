@@ -19,7 +19,7 @@ from fog_runtime.concurrency import BusyError, Worker
 from fog_runtime.configuration.maps import MapFileError, Occupancy, load_occupancy
 from fog_runtime.http import Body, Operator, ProblemError, Routes
 from fog_runtime.stores.redis_connection import StoreError
-from map_service import masks
+from map_service.formats import masks
 from map_service.layers.base import Grid
 from map_service.problems import ZONES_NOT_LOADED, MapProblem, require_zones
 from map_service.record_writer import ConflictError

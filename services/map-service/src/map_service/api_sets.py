@@ -22,9 +22,8 @@ from fog_runtime.http import (
 from map_service.problems import ZONES_NOT_LOADED, MapProblem, require_zones
 from map_service.record_requests import WRITES, Conditions, check_id, missing
 from map_service.service import Service
-from map_service.zone_sets import MutedSource, SetOfZones
 from map_service.zone_sources import ZoneSourceView
-from map_service.zone_times import is_time_zone
+from map_service.zone_times import MutedSource, SetOfZones, is_time_zone
 
 MAX_SETS: Final = 200
 """Most sets of zones of a site."""

@@ -35,8 +35,7 @@ if TYPE_CHECKING:
     from map_service.aggregator_monitor import AggregatorMonitor
     from map_service.dry_run import Change
     from map_service.layers.base import CostLayer, Grid
-    from map_service.zone_sets import SetOfZones, SetSwitches
-    from map_service.zone_times import Progress
+    from map_service.zone_times import Progress, SetOfZones, SetSwitches
     from map_service.zones import PreparedZone, ZoneCatalog
 
 ALIVE_S: Final = 15.0
@@ -83,9 +82,9 @@ MANY_ZONES_PERIOD_S: Final = 0.5
 class MapCore:
     """The map-service's core; nothing is published before the map is complete (`serving`).
 
-    `layers` are bottom first and include a `HazardsLayer` and a `ZonesLayer` (`map_service.registry`). `definitions` is
-    a list of the site's areas, which are unknown until the aggregator publishes their hazards. `hazards_wait_s` is how
-    long the map waits, from the first tick on, for the hazards of all areas.
+    `layers` are bottom first and include a `HazardsLayer` and a `ZonesLayer` (`map_service.registry`).
+    `definitions` is a list of the site's areas, which are unknown until the aggregator publishes their hazards.
+    `hazards_wait_s` is how long the map waits, from the first tick on, for the hazards of all areas.
     """
 
     def __init__(  # noqa: PLR0913  # everything that the map consists of, by name

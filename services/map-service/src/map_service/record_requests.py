@@ -12,7 +12,7 @@ from map_service.places import StoredPlace
 from map_service.problems import ZONES_NOT_LOADED, MapProblem
 from map_service.record_writer import ConflictError, RecordWriter
 from map_service.site_map import StoredMap
-from map_service.zone_sets import MutedSource, SetOfZones
+from map_service.zone_times import MutedSource, SetOfZones
 
 WRITES: Final = (IdempotencyError, ConflictError, StoreError)
 """What writes of records raise."""

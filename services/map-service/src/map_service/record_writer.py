@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from map_service.places import StoredPlace
     from map_service.site_map import StoredMap
     from map_service.store import Store
-    from map_service.zone_sets import MutedSource, SetOfZones
+    from map_service.zone_times import MutedSource, SetOfZones
 
 
 R = TypeVar("R", bound="SetOfZones | StoredPlace | MutedSource | StoredMap")

@@ -22,8 +22,8 @@ from map_service.publisher import Publisher
 from map_service.record_writer import RecordWriter
 from map_service.site_map import StoredMap, put_into_force
 from map_service.store import PLACES, SITE_MAPS, ZONE_SETS, ZONE_SOURCES
-from map_service.zone_sets import MutedSource, SetOfZones
 from map_service.zone_sources import ZoneSources
+from map_service.zone_times import MutedSource, SetOfZones
 from map_service.zone_writer import ZoneTimesPersistence, ZoneWriter
 
 if TYPE_CHECKING:

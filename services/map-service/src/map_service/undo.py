@@ -17,7 +17,7 @@ from map_service.problems import NO_SUCH_ZONE, MapProblem, require_zones
 from map_service.record_requests import R, missing
 from map_service.record_writer import ConflictError, RecordWriter
 from map_service.service import Service
-from map_service.zone_sets import SetOfZones
+from map_service.zone_times import SetOfZones
 from map_service.zones import ZoneError
 
 _KINDS: Final = ("zone",)

@@ -32,7 +32,7 @@ if TYPE_CHECKING:
     from fog_runtime.transports.mqtt_edge import MqttEdge
     from map_service.core import MapCore
     from map_service.record_writer import RecordWriter
-    from map_service.zone_sets import MutedSource, SetOfZones
+    from map_service.zone_times import MutedSource, SetOfZones
     from map_service.zone_writer import ZoneWriter
 
 RETRY_S: Final = 0.5

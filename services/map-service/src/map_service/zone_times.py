@@ -1,10 +1,12 @@
-"""When a zone is in force: its start, its end, its time to live and its weekly schedule (ADR 14). Pure.
+"""When a zone is in force: its start, its end, its time to live, its weekly schedule (ADR 14) and its sets. Pure.
 
 The clock on the wall may be wrong, and is set while the process runs. It only names moments for people: what it says
 counts while the time is synchronized, and nothing ends by it alone. A zone that has started stays started, and ends
 once as much time has passed by the monotonic clock as remained when its end became known; while the time is not known,
 the zone is in force, which is the safe side. Only what was in force ends for good, and not before its start has come: a
 clock that is wrong for a moment takes no zone from the future.
+
+A zone is in force only while each set that it names is on, too.
 """
 
 from __future__ import annotations
@@ -16,7 +18,7 @@ from datetime import UTC, date, datetime, time, timedelta
 from typing import TYPE_CHECKING, Final
 from zoneinfo import ZoneInfo, ZoneInfoNotFoundError
 
-from fog_contracts.messages import WEEKDAYS, Message, WeeklySchedule, Zone
+from fog_contracts.messages import WEEKDAYS, Count, Id, Message, Sentence, WeeklySchedule, Zone
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -226,3 +228,48 @@ def is_time_zone(name: str) -> bool:
     except (ZoneInfoNotFoundError, ValueError, OSError):
         return False
     return True
+
+
+# --- Sets of zones that are switched together, and sources that are muted ---------------------------------------------
+
+
+class SetOfZones(Message, frozen=True, kw_only=True):
+    """A set: it is on while it is enabled and, with a `schedule`, inside one of the schedule's windows."""
+
+    id: Id
+    name: Sentence = ""
+    enabled: bool = True
+    schedule: WeeklySchedule | None = None
+    version: Count = 1
+
+
+class MutedSource(Message, frozen=True, kw_only=True):
+    """Whether an operator has muted a source of zones: then its messages are refused."""
+
+    id: Id
+    muted: bool
+    version: Count = 1
+
+
+class SetSwitches:
+    """All sets, and which of them are off. A set that nobody knows counts as on, which is the safe side."""
+
+    def __init__(self) -> None:
+        self.sets: Mapping[str, SetOfZones] = {}
+        """The sets by id; the same mapping until they change."""
+        self.off: frozenset[str] = frozenset()
+        self._times: dict[str, ScheduleTimes] = {}
+
+    def replace_all(self, sets: Mapping[str, SetOfZones]) -> None:
+        """Replace the sets; call `advance` then."""
+        changed = {name for name, one in sets.items() if self.sets.get(name) != one}
+        kept = {name: times for name, times in self._times.items() if name in sets and name not in changed}
+        new = {name: ScheduleTimes(each) for name in changed if (each := sets[name].schedule) is not None}
+        self.sets, self._times = sets, {**kept, **new}
+
+    def advance(self, at: Moment) -> bool:
+        """Switch the sets by their schedules; return whether one is on that was off before, or the other way round."""
+        scheduled_off = {name for name, times in self._times.items() if not times.includes(at)}
+        off = frozenset(name for name, one in self.sets.items() if not one.enabled or name in scheduled_off)
+        changed, self.off = off != self.off, off
+        return changed

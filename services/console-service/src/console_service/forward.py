@@ -31,7 +31,7 @@ DEMO: Final = "demo"
 ROUTES: Final[Mapping[str, tuple[str, ...]]] = {
     AGGREGATOR: ("areas", "nodes", "alerts"),
     PLANNER: ("robots", "plan", "visits"),
-    CONSOLE: ("session", "events", "timeline", "recording", "openapi.json"),
+    CONSOLE: ("session", "events", "timeline", "recording", "vitals", "openapi.json"),
     DEMO: ("scenario",),
 }
 """Which routes each service has, by what follows /api/v1/; the map-service has all others."""

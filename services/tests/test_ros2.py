@@ -9,7 +9,7 @@ import time
 from contextlib import suppress
 from functools import partial
 from pathlib import Path
-from typing import Self
+from typing import Any, Self, cast
 
 import httpx
 import numpy as np
@@ -18,14 +18,16 @@ import zenoh
 import zenoh.ext as ze
 from hypothesis import given
 from hypothesis import strategies as st
+from manual_clock import ManualClock
 from rosbags.typesys import Stores, get_typestore
 
 from fog_bridges.ros2 import messages as ros
-from fog_bridges.ros2.bridge import GOAL_TYPE, MAP_TYPE, RosSession, ros_config
+from fog_bridges.ros2.bridge import GOAL_TYPE, MAP_TYPE, Relay, RosSession, ros_config
 from fog_bridges.ros2.wire import Attachment, Node, Topic, WireError, Writer, decoded, type_hash
 from fog_contracts import channels as ch
 from fog_contracts.grid import GridGeometry
-from fog_contracts.messages import CircleShape, RobotPath, RobotPose, RobotState, Zone
+from fog_contracts.messages import CircleShape, MapSnapshot, RobotPath, RobotPose, RobotState, Zone
+from fog_contracts.replica import MasterMap
 from fog_supervisor import net
 
 DOMAIN = 7
@@ -116,6 +118,77 @@ def sent(name: str, kind: str, message):
     """Return a message as another store of types reads what was sent."""
     payload, _ = Writer(Topic(name, kind), "token").encoded(message, 1)
     return STORE.deserialize_cdr(payload, kind)
+
+
+# --- The map ----------------------------------------------------------------------------------------------------------
+
+
+class Floor:
+    """A floor's channels and a node of ROS: what was told on each topic."""
+
+    site = "test"
+
+    def __init__(self) -> None:
+        self.clock = ManualClock(100.0)
+        self.hear: dict[ch.Channel, Any] = {}
+        self.snapshot: MapSnapshot | None = None
+        """The answer to who asks for the map; None: none comes."""
+        self.told: dict[str, list[Any]] = {}
+        self.relay = Relay(cast("Any", self), cast("Any", self), cast("Any", None), self.clock)
+        self.relay.subscribe()
+
+    def subscribe(self, channel: ch.Channel, _kind: type, handler: Any) -> None:
+        self.hear[channel] = handler
+
+    async def query(self, *_: object) -> MapSnapshot:
+        if self.snapshot is None:
+            await asyncio.Event().wait()
+        assert self.snapshot is not None
+        return self.snapshot
+
+    def publish(self, topic: Topic, message: Any, _stamp: float) -> None:
+        self.told.setdefault(topic.name.removeprefix("fognav/test/"), []).append(message)
+
+    async def pass_s(self, seconds: float) -> None:
+        for _ in range(round(10 * seconds)):
+            self.clock.advance(0.1)
+            await asyncio.sleep(0.01)
+
+
+def plan(wall: int, epoch: int) -> MasterMap:
+    """A map of 4 x 5 cells, of which a column is a wall."""
+    static = np.zeros((4, 5), np.uint8)
+    static[:, wall] = 254
+    return MasterMap("test", GridGeometry(5, 4, 0.05, 0.0, 0.0), static, static, epoch)
+
+
+async def test_another_map_of_the_same_size_is_told_once():
+    floor = Floor()
+    for epoch, wall in ((1, 0), (2, 0), (3, 4)):
+        floor.snapshot = plan(wall, epoch).snapshot()
+        await floor.relay._load()
+        floor.relay._tell_masks()
+    walls = [grid.data.reshape(4, 5)[0].tolist().index(100) for grid in floor.told["map"]]
+    assert walls == [0, 4], "robots must not drive by the walls of the map before"
+
+
+async def test_floor_becomes_slow_also_while_a_snapshot_is_waited_for():
+    floor, master = Floor(), plan(0, 1)
+    floor.snapshot = master.snapshot()
+    loops = [asyncio.create_task(loop()) for loop in (floor.relay.snapshot_loop, floor.relay.map_loop)]
+    try:
+        async with asyncio.timeout(10.0):
+            while "speed_mask" not in floor.told or floor.told["speed_mask"][-1].data.any():
+                floor.hear[ch.MAP_HEARTBEAT]({}, master.heartbeat(floor.clock.now()))
+                await floor.pass_s(0.1)
+        floor.snapshot = None
+        master.write([("cost", master.geometry.whole, np.full((4, 5), 254, np.uint8))], [], [])  # its delta is lost
+        floor.hear[ch.MAP_HEARTBEAT]({}, master.heartbeat(floor.clock.now()))
+        await floor.pass_s(3.0)
+        assert (floor.told["speed_mask"][-1].data == 15).all()
+    finally:
+        for loop in loops:
+            loop.cancel()
 
 
 # --- With real services -----------------------------------------------------------------------------------------------

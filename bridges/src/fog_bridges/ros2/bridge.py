@@ -206,6 +206,7 @@ class Ros2Bridge:
             async with opened as fog, asyncio.TaskGroup() as tasks:
                 relay = Relay(fog, session, floor, clock)
                 relay.subscribe()
+                tasks.create_task(relay.snapshot_loop(), name="snapshot")
                 tasks.create_task(relay.map_loop(), name="map")
                 tasks.create_task(relay.goal_loop(), name="goals")
                 async for _ in ticker(clock, TICK_S):
@@ -253,6 +254,7 @@ class Relay:
         }
         self._follower = MapFollower()
         self._geometry: GridGeometry | None = None
+        self._static: NDArray[np.uint8] = np.zeros((0, 0), np.uint8)
         self._told: dict[Topic, NDArray[np.int8]] = {}
         self._told_at = 0.0
         self._is_dirty = False
@@ -275,11 +277,15 @@ class Relay:
         for kind, (topic, mask) in self._infos.items():
             self._session.publish(topic, ros.filter_info(kind, mask, self._stamp()), self._stamp())
 
-    async def map_loop(self) -> None:
-        """Follow the map, and tell what has changed."""
+    async def snapshot_loop(self) -> None:
+        """Fetch the map whenever its deltas alone do not lead to the newest one."""
         async for now in ticker(self._clock, TICK_S):
             if self._follower.wants_snapshot(now):
                 await self._load()
+
+    async def map_loop(self) -> None:
+        """Tell what has changed, and what has become old: also while a snapshot is waited for."""
+        async for _ in ticker(self._clock, TICK_S):
             self._tell_masks()
 
     async def goal_loop(self) -> None:
@@ -313,11 +319,14 @@ class Relay:
         replica, now, stamp = self._follower.replica, self._now(), self._stamp()
         if replica.geometry is None:
             return
-        if replica.geometry != self._geometry:
-            self._geometry, self._told, self._is_dirty = replica.geometry, {}, True
-            told = ros.grid(ros.map_values(replica.static), replica.geometry, stamp)
-            self._session.publish(self._map, told, stamp)
-            self._tell_markers()
+        if replica.static is not self._static:  # a snapshot was loaded: another map may have the same geometry
+            same = replica.geometry == self._geometry and np.array_equal(replica.static, self._static)
+            self._static = replica.static
+            if not same:
+                self._geometry, self._told, self._is_dirty = replica.geometry, {}, True
+                told = ros.grid(ros.map_values(replica.static), replica.geometry, stamp)
+                self._session.publish(self._map, told, stamp)
+                self._tell_markers()
         is_slow = self.map_age_s > SILENT_S
         if is_slow != self._is_slow:
             self._is_slow, self._is_dirty = is_slow, True

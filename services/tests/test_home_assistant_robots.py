@@ -18,6 +18,7 @@ from PIL import Image
 
 from fog_bridges.floor import Request
 from fog_bridges.home_assistant import HomeAssistant, activity, discovery, report
+from fog_bridges.service import HomeAssistantBridge
 from fog_contracts import channels as ch
 from fog_contracts.messages import RobotState
 from fog_contracts.messages.basics import SENTENCE_MAX
@@ -265,6 +266,58 @@ def test_robot_that_is_gone_is_forgotten_and_one_that_a_new_run_has_not_told_of_
     assert devices(core, *robots, begin, *robots, end) == []
     assert devices(core, ("robot", {"id": "r2", "value": None})) == [("robot_r2", False)]
     assert devices(core, begin, end) == [("robot_r1", False)], "another run of the console does not know it"
+
+
+class Slow:
+    """A broker's connection and a floor whose robot r2 answers no command until it is `released`."""
+
+    connected = True
+
+    def __init__(self) -> None:
+        self.order, self.released = None, asyncio.Event()
+        self.sent: list[tuple[str, str]] = []
+        self.told: list[tuple[str, str]] = []
+
+    def on(self, _channel, handler) -> None:
+        self.order = handler
+
+    def on_connect(self, _callback) -> None: ...
+    def publish_nowait(self, *_, **__) -> None: ...
+
+    async def run(self) -> None:
+        await asyncio.Event().wait()
+
+    async def publish(self, _channel, text, robot) -> None:
+        self.told.append((robot, text))
+
+    async def send(self, request: Request) -> str:
+        self.sent.append((request.method, request.path.removeprefix("/api/v1/robots/")))
+        if request.path.endswith("commands"):
+            await self.released.wait()
+        return "it has no mission" if request.method == "DELETE" else ""
+
+
+async def test_stop_waits_for_no_other_order_ends_the_mission_and_no_earlier_order_sends_the_robot_again():
+    floor, core = Slow(), HomeAssistant("lab")
+    adapter = HomeAssistantBridge(core, floor)
+    for name, data in (("hello", {"fresh": True}), ("place", {"id": "b", "value": {}}), ("ready", {}),
+                       *(("robot", {"id": robot, "value": view()}) for robot in ("r1", "r2"))):  # fmt: skip
+        core.on_event(name, data)
+    running = asyncio.create_task(adapter.run(floor, SystemClock()))
+    await asyncio.sleep(0)
+    for robot, text in (("r2", "return_to_base"), ("r1", "goal b"), ("r1", "stop")):
+        floor.order({"robot": robot}, text)
+    await asyncio.sleep(0.05)
+    assert sorted(floor.sent) == [("DELETE", "r1/goal"), ("POST", "r1/stop"), ("POST", "r2/commands")]
+    assert floor.told == [("r1", "")]
+    floor.released.set()
+    floor.order({"robot": "r1"}, "goal b")
+    await asyncio.sleep(0.05)
+    assert floor.sent[3:] == [("PUT", "r1/goal")], "the one that was given after the stop"
+    stopped = "'goal b' was not carried out: robot r1 was stopped meanwhile"
+    assert floor.told[1:] == [("r2", ""), ("r1", stopped), ("r1", "")]
+    running.cancel()
+    await asyncio.gather(running, return_exceptions=True)
 
 
 EVERY = {"p", "name", "unique_id", "state_topic"}

@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import asyncio
+from collections import Counter as Counts
 from typing import TYPE_CHECKING, Any, Final
 
 from prometheus_client import Counter
 
+from fog_bridges.home_assistant import CANCEL, STOP
 from fog_bridges.picture import Picture
 from fog_contracts import channels as ch
 from fog_runtime import logs
@@ -37,7 +39,11 @@ class HomeAssistantBridge:
         self._core = core
         self._mqtt = mqtt
         self._picture = Picture()
-        self._orders: asyncio.Queue[tuple[str, str]] = asyncio.Queue(ORDERS_AT_ONCE)
+        self._orders: asyncio.Queue[tuple[str, str, int]] = asyncio.Queue(ORDERS_AT_ONCE)
+        """Robot, order, and how often the robot was stopped before it."""
+        self._stops: Counts[str] = Counts()
+        self._tasks: asyncio.TaskGroup | None = None
+        self._floor: Floor | None = None
         self._is_known = False
         mqtt.on(ch.ROBOT_ORDER, self._on_order)
         mqtt.on_connect(self._tell_everything)
@@ -50,6 +56,7 @@ class HomeAssistantBridge:
     async def run(self, floor: Floor, clock: Clock) -> None:
         """Connect, and do all until cancelled."""
         async with asyncio.TaskGroup() as tasks:
+            self._tasks, self._floor = tasks, floor
             tasks.create_task(self._mqtt.run(), name="mqtt")
             tasks.create_task(self._order_loop(floor), name="orders")
             tasks.create_task(self._picture_loop(clock), name="picture")
@@ -68,12 +75,24 @@ class HomeAssistantBridge:
     async def _order_loop(self, floor: Floor) -> None:
         """Carry out orders, one after the other; what a robot refuses is told where the order came from."""
         while True:
-            robot, text = await self._orders.get()
+            robot, text, stops = await self._orders.get()
             request = self._core.on_command(robot, text)
-            refusal = request if isinstance(request, str) else await floor.send(request)
-            ORDERS.labels(self.name, "refused" if refusal else "accepted").inc()
-            _log.info("order", robot=robot, order=text, refusal=refusal)
-            await self._mqtt.publish(ch.ROBOT_REFUSAL, refusal[:250], robot=robot)
+            if stops != self._stops[robot]:
+                request = f"{text!r} was not carried out: robot {robot} was stopped meanwhile"
+            await self._tell(robot, text, request if isinstance(request, str) else await floor.send(request))
+
+    async def _stop(self, floor: Floor, robot: str) -> None:
+        """Stop a robot, and end its mission: else it would go on with that once somebody enables it."""
+        stop, cancel = (self._core.on_command(robot, text) for text in (STOP, CANCEL))
+        refusal = stop if isinstance(stop, str) else await floor.send(stop)
+        if not isinstance(cancel, str):
+            await floor.send(cancel)  # that there is no mission is no reason to complain
+        await self._tell(robot, STOP, refusal)
+
+    async def _tell(self, robot: str, order: str, refusal: str) -> None:
+        ORDERS.labels(self.name, "refused" if refusal else "accepted").inc()
+        _log.info("order", robot=robot, order=order, refusal=refusal)
+        await self._mqtt.publish(ch.ROBOT_REFUSAL, refusal[:250], robot=robot)
 
     async def _picture_loop(self, clock: Clock) -> None:
         """Draw the map when it or a robot on it has changed."""
@@ -83,11 +102,17 @@ class HomeAssistantBridge:
                     await self._mqtt.publish(channel, text)
 
     def _on_order(self, ids: Mapping[str, str], text: str) -> None:
+        robot = ids["robot"]
+        if text == STOP and self._tasks is not None and self._floor is not None:
+            # It waits for no other order: each may wait for a robot that does not answer.
+            self._stops[robot] += 1
+            self._tasks.create_task(self._stop(self._floor, robot), name="stop")
+            return
         try:
-            self._orders.put_nowait((ids["robot"], text))
+            self._orders.put_nowait((robot, text, self._stops[robot]))
         except asyncio.QueueFull:
             ORDERS.labels(self.name, "dropped").inc()
-            _log.warning("order_dropped", robot=ids["robot"], order=text, reason=f"{ORDERS_AT_ONCE} wait already")
+            _log.warning("order_dropped", robot=robot, order=text, reason=f"{ORDERS_AT_ONCE} wait already")
 
     async def _tell_everything(self) -> None:
         self._publish(self._core.everything())

@@ -52,8 +52,8 @@ class World:
         )
         self.service.subscribe()
         entries = [
-            TokenEntry(name=role, role=cast("Any", role), sha256=token_hash(role))
-            for role in ("guest", "viewer", "operator")
+            TokenEntry(name=name, role=cast("Any", role), sha256=token_hash(role))
+            for name, role in (("hall tablet", "guest"), ("viewer", "viewer"), ("anna", "operator"))
         ]
         app = make_api(self.service, SITE, Health(), Tokens(entries))
         self.http = httpx.AsyncClient(transport=httpx.ASGITransport(app), base_url="http://planner")
@@ -156,7 +156,7 @@ async def test_guest_is_led_from_place_to_place(world: World) -> None:
     assert (world.stored["r1"].goal.place, world.stored["r1"].any_heading) == ("lab", False)
     world.robot(arrived=True)
     assert await world.mine() == ("arrived", None)
-    assert world.records == [("visitor guest", "visit")] * 2
+    assert world.records == [("visitor hall tablet", "visit")] * 2
 
 
 @pytest.mark.claim

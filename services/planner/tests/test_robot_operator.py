@@ -237,6 +237,17 @@ async def test_planner_without_a_key_says_so_and_still_stops() -> None:
     assert rig.robot.records == [("r1", "operator", b'{"kind":"disable"}')]
 
 
+async def test_stop_of_all_robots_does_not_wait_for_the_store_to_end_missions(rig: Rig) -> None:
+    stopped_before: list[int] = []
+
+    async def cancel(_robot: str, _who: str) -> None:
+        stopped_before.append(len(rig.robot.received))
+
+    missions = cast("Any", SimpleNamespace(goals={"r1": None, "r2": None}, cancel=cancel))
+    await rig.operator.stop_all(missions, "map-change")
+    assert ([command.kind for command in rig.robot.received], stopped_before) == (["disable"], [1, 1])
+
+
 async def test_goal_of_an_id_that_two_agents_use_is_refused_until_one_is_gone(rig: Rig) -> None:
     state = msgspec.structs.replace(rig.operator._states["r1"][0])
     for number in range(6):

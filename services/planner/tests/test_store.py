@@ -133,6 +133,17 @@ async def test_no_goal_is_accepted_or_begun_while_a_robot_is_out_of_service_what
                 assert (missions.goals, await store.goals()) == ({}, {})
 
 
+async def test_refused_undo_of_a_robots_service_ends_no_mission(redis: Server):
+    async with Store(redis.url, "test") as store:
+        missions = MissionPersistence(PlannerCore(), store, SystemClock(), Health(), lambda change: change())
+        await missions.lead(-1, confirmed=True)
+        given = await missions.send(Order("r1", Pose(x=1.0, y=2.0, theta=0.0), "anna"))
+        before = OutOfService(id="1", reason="worn wheel", by="anna", since=1.0)
+        assert not await missions.take_out("r1", before, "anna", expected="2", action="undo")
+        assert (missions.goals, await store.goals()) == ({"r1": given}, {"r1": given})
+        assert missions.out_of_service("r1") is None
+
+
 async def test_goal_of_a_robot_whose_record_of_service_cannot_be_read_is_refused(redis: Server):
     async with Store(redis.url, "test") as store, Redis.from_url(redis.url) as raw:
         await store.put("r1", goal("first"), AUDIT)

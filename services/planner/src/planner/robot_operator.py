@@ -235,12 +235,10 @@ class RobotOperator:
                 self._stops.unrecorded(robot, sender)
 
     async def stop_all(self, missions: MissionPersistence, who: str) -> None:
-        """End all missions, and stop all robots that were ever heard; what does not succeed is logged."""
-        for robot in list(missions.goals):
-            try:
-                await missions.cancel(robot, who)
-            except StoreError as error:
-                _log.warning("mission_not_ended", robot=robot, who=who, reason=str(error))
+        """Stop all robots that were ever heard, and end all missions; what does not succeed is logged.
+
+        No stop waits for the store.
+        """
 
         async def stop(robot: str) -> None:
             try:
@@ -248,7 +246,14 @@ class RobotOperator:
             except CommandError as error:
                 _log.warning("robot_not_stopped", robot=robot, who=who, reason=str(error))
 
-        await asyncio.gather(*(stop(robot) for robot in self._states))
+        async def end_missions() -> None:
+            for robot in list(missions.goals):
+                try:
+                    await missions.cancel(robot, who)
+                except StoreError as error:
+                    _log.warning("mission_not_ended", robot=robot, who=who, reason=str(error))
+
+        await asyncio.gather(*(stop(robot) for robot in list(self._states)), end_missions())
 
     async def record_loop(self) -> None:
         """Record, from time to time, how often stops without a token were repeated."""

@@ -264,6 +264,9 @@ class MissionPersistence:
             with self._uncertain_write():
                 if self._reload:
                     await self._load()
+            known = self._out.get(robot)
+            if expected not in (ANY, "0" if known is None else known.id):
+                return False  # before its mission ends: what is refused changes nothing
             if (stored := self.goals.get(robot)) is not None:
                 await self._end(robot, stored, who, "cancel")
             with self._uncertain_write():

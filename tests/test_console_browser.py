@@ -86,6 +86,10 @@ async def test_one_time_login_leaves_no_trace_in_the_address(console: SimpleName
     page = await console.open()
     assert TOKEN not in page.url
     assert TOKEN not in json.dumps(await page.evaluate("[history.state, {...localStorage}, {...sessionStorage}]"))
+    # Nor one that is opened where the page is shown already, as a code may be: nothing is loaded anew then.
+    await page.evaluate("location.hash = '#login=another'")
+    await page.wait_for_url(f"{console.url}#/map")
+    await expect(page.get_by_text("Live", exact=True)).to_be_visible()
 
 
 async def test_page_that_is_shown_keeps_its_login(console: SimpleNamespace, stream: ConsoleStream) -> None:

@@ -34,12 +34,22 @@ async function begin(token: string | null, ofCode: boolean): Promise<Session | n
   }
 }
 
-function Root({ token }: { readonly token: string | null }): preact.JSX.Element | null {
+function Root({ first }: { readonly first: string | null }): preact.JSX.Element | null {
+  const [login, setLogin] = useState({ token: first });
   const [session, setSession] = useState<Session | null | undefined>(undefined);
   const [notice, setNotice] = useState("");
   const [said, setSaid] = useState("");
   const page = usePage();
-  useEffect(() => void begin(token, page.name === "visit").then(setSession), [token]);
+  useEffect(() => void begin(login.token, page.name === "visit").then((found) => setSession((before) => found ?? before ?? null)), [login]);
+  useEffect(() => {
+    // A code that is opened where the page is shown already changes only what is behind the #.
+    const changed = (): void => {
+      const token = takeLogin();
+      if (token !== null) setLogin({ token });
+    };
+    addEventListener("hashchange", changed);
+    return () => removeEventListener("hashchange", changed);
+  }, []);
   useEffect(() => {
     if (!session) return undefined;
     // Each time it is asked for, a session lasts twelve hours more; what else the page asks says when it has ended.
@@ -77,4 +87,4 @@ function Root({ token }: { readonly token: string | null }): preact.JSX.Element 
 startLanguage();
 startTheme();
 const root = document.getElementById("app");
-if (root) render(<Root token={takeLogin()} />, root);
+if (root) render(<Root first={takeLogin()} />, root);

@@ -126,6 +126,7 @@ async def guest_is_led(building: Building, guest: Page) -> None:
     await expect(guest.get_by_text(" to go, about ")).to_be_visible()
     # Whoever scans again, or reloads the page, still has the visit.
     await guest.goto(f"{building.url}/#/visit/hall?login={building.guest}")
+    await guest.wait_for_url(f"{building.url}/#/visit/hall")
     await guest.reload()
     await expect(title).to_have_text(f"{ROBOT} is here")
     await building.look(guest, "ready")

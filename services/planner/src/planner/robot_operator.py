@@ -210,7 +210,7 @@ class RobotOperator:
         It is recorded in the audit trail first, a stop afterwards. Raises `CommandError`, and `StoreError` for a
         command that could not be recorded and was not sent.
         """
-        self.overruled(robot)
+        self._overrule(robot)
         if kind in STOPS:
             try:
                 return await self._deliver(kind, robot, who)
@@ -226,13 +226,20 @@ class RobotOperator:
 
         Raises `CommandError`.
         """
-        self.overruled(robot)
+        self._overrule(robot)
         try:
             return await self._deliver("disable", robot, sender)
         finally:
             alone = self._stops.count(robot, sender, self._clock.now())
             if alone and not await self._record_stop(robot, {"kind": "disable"}, sender, "stop", anybody=True):
                 self._stops.unrecorded(robot, sender)
+
+    def _overrule(self, robot: str) -> None:
+        try:
+            self.overruled(robot)
+        except Exception as error:  # noqa: BLE001  # a stop comes first
+            # Whatever is wrong with a visit keeps no stop from the robot.
+            _log.error("not_overruled", robot=robot, reason=repr(error))
 
     async def stop_all(self, missions: MissionPersistence, who: str) -> None:
         """Stop all robots that were ever heard, and end all missions; what does not succeed is logged.

@@ -24,6 +24,8 @@ PUBLIC = {
 }  # fmt: skip
 """Reads for everybody on the floor (docs/security.md); whatever else is read tells about people."""
 
+ADMINS = {"/api/v1/map/previews/{preview}.png"}
+
 
 @pytest.fixture(scope="module")
 def urls(all_services) -> dict[str, str]:
@@ -85,7 +87,8 @@ def test_every_read_that_tells_about_people_needs_a_token(urls, tokens):
             without = httpx.get(address).status_code
             if (without == 401) == (path in PUBLIC):
                 wrong.append(f"{path} without a token: {without}")
-            if httpx.get(address, headers=tokens["viewer"]).status_code in (401, 403):
-                wrong.append(f"{path} is refused to a viewer")
+            role = "admin" if path in ADMINS else "viewer"
+            if httpx.get(address, headers=tokens[role]).status_code in (401, 403):
+                wrong.append(f"{path} is refused to the role {role}")
     assert wrong == []
     assert seen > PUBLIC - {"/openapi.json"}

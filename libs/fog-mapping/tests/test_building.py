@@ -160,6 +160,7 @@ def test_wrong_loops_among_those_found_change_the_map_by_less_than_a_cell(mapped
 
 
 @pytest.mark.drive
+@pytest.mark.timeout(600)
 def test_ten_drives_with_other_noise_join_the_same_places_and_rooms():
     """The topology: no loop is false, all visits of a place agree, and the same rooms are reached from the start."""
     maps = []

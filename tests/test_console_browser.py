@@ -160,6 +160,10 @@ async def test_enable_asks_first_and_a_refusal_is_said(console: SimpleNamespace,
     await page.keyboard.press("Escape")
     assert requests(stream, "POST") == []
     await page.get_by_role("button", name="Enable", exact=True).click()
+    await page.get_by_role("button", name="Stop r1").click()  # while the question stands there
+    await expect(page.locator(".said")).to_have_text("r1 stops.")
+    await page.get_by_role("button", name="Cancel", exact=True).click()
+    await page.get_by_role("button", name="Enable", exact=True).click()
     await page.get_by_role("button", name="Yes, Enable").click()
     await expect(page.locator(".said.failed")).to_contain_text("a fault must be reset first")
     assert stream.requests[-1] == ("POST robots/r1/commands", {"kind": "enable"})

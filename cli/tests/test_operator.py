@@ -131,6 +131,19 @@ async def test_robot_is_not_enabled_while_enabling_is_paused(rig: RouterRig) -> 
     assert rig.commands == []
 
 
+async def test_robot_that_somebody_has_stopped_waits_for_them_and_one_that_was_reset_does_not(rig: RouterRig) -> None:
+    await rig.publish_state("NORMAL")
+    await rig.publish_state("INIT", WAITING)
+    await until(lambda: any("somebody has stopped" in text for text in rig.event_texts), "it is noticed")
+    await asyncio.sleep(1.0)  # ten seconds of the operator's clock
+    assert rig.commands == []
+    await rig.publish_state("NORMAL")
+    await rig.publish_state("FAULT", BUMPED)
+    await until(lambda: "reset" in rig.commands, "it is reset")
+    await rig.publish_state("INIT", WAITING)
+    await until(lambda: "enable" in rig.commands, "it is enabled")
+
+
 async def test_refused_enable_is_reported_once_with_its_reason(rig: RouterRig) -> None:
     silent = Reason(ReasonCode.LIDAR_SILENT, "the lidar has been silent for 9.0 s")
     remains = Reason(RefusalCode.CAUSE_REMAINS, f"the cause is still there: {silent}", [silent.code])

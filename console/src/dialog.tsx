@@ -1,4 +1,4 @@
-// A question before something that can't be taken back.
+// A question before something that can't be taken back. It is not modal: the stop stays within reach.
 import { useEffect, useRef } from "preact/hooks";
 import { t } from "./i18n/i18n";
 
@@ -13,9 +13,10 @@ interface Props {
 
 export function Confirm({ title, text, what, onYes, onClose }: Props): preact.JSX.Element {
   const dialog = useRef<HTMLDialogElement>(null);
-  useEffect(() => dialog.current?.showModal(), []);
+  useEffect(() => dialog.current?.show(), []);
   return (
-    <dialog ref={dialog} aria-labelledby="confirm-title" aria-describedby="confirm-text" onClose={onClose}>
+    <dialog ref={dialog} aria-labelledby="confirm-title" aria-describedby="confirm-text" onClose={onClose}
+      onKeyDown={(event) => { if (event.key === "Escape") dialog.current?.close(); }}>
       <h2 id="confirm-title">{title}</h2>
       <p id="confirm-text">{text}</p>
       <div class="actions">

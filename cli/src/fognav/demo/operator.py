@@ -60,6 +60,8 @@ class Operator:
         self._unconfirmed = False
         self._last_refusal: tuple[str, ...] = ()
         self._enabled_once = False
+        self._is_stopped = False
+        """Whether somebody else has disabled the robot: who does that enables it again."""
         robot = {"robot": self._robot}
         edge.subscribe(ch.ROBOT_POSE, RobotPose, self._on_pose, **robot)
         edge.subscribe(ch.ROBOT_STATE, RobotState, self._on_state, **robot)
@@ -96,6 +98,12 @@ class Operator:
             self._mode = state.mode
             self._told_reasons = set() if first else set(state.codes[:2])
         self._policy.on_state(state, now)
+        before = self._scene.state
+        if state.enabled or state.mode != "INIT" or (before is not None and before.boot != state.boot):
+            self._is_stopped = False
+        elif before is not None and before.enabled and before.mode not in ("INIT", "FAULT"):
+            self._is_stopped = True
+            self._scene.log_event("operator: somebody has stopped the robot, who will enable it again")
         self._scene.state = state
         self._scene.traces.update(state.traces)
         if self.drive is not None:
@@ -185,7 +193,9 @@ class Operator:
     def _due(self) -> CommandKind | None:
         # After the drive the robot is left to whoever uses the demo: nobody undoes their commands.
         drive_over = self._scene.outcome is not None
-        return None if self.enabling_paused or drive_over else self._policy.command_due(self._clock.now())
+        if self.enabling_paused or self._is_stopped or drive_over:
+            return None
+        return self._policy.command_due(self._clock.now())
 
     async def _send(self, kind: CommandKind) -> None:
         reply = await self.command(kind)

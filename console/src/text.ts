@@ -20,7 +20,7 @@ export function decimal(value: number, digits: number): string {
   const known = formats.get(key)
     ?? new Intl.NumberFormat(language(), { minimumFractionDigits: digits, maximumFractionDigits: digits });
   formats.set(key, known);
-  return known.format(value);
+  return known.format(Math.abs(value) < 0.5 * 10 ** -digits ? 0 : value);  // no minus zero
 }
 
 export function metres(value: number | null | undefined, digits = 1): string {

@@ -1,5 +1,5 @@
 // Zones: the list is what everybody can use, the map beside it shows the same. One zone is looked at or edited at a time.
-import { useEffect, useReducer, useState } from "preact/hooks";
+import { useEffect, useReducer, useRef, useState } from "preact/hooks";
 import type { AppliedChange, Values, Zone } from "../api/types";
 import { mayOperate, useConsole, useLive, useSeconds } from "../context";
 import { t } from "../i18n/i18n";
@@ -22,6 +22,8 @@ import "../zones/zones.css";
 const DRAFT = "+draft";
 const SHOWN_MAX = 200;
 const COPY_M = 0.5;
+/** Within how many milliseconds the stream tells of a change that was made here. */
+const TOLD_WITHIN_MS = 3_000;
 
 /** The last change of this page, kept while the user looks at other views. */
 let last: Change | null = null;
@@ -178,6 +180,11 @@ function ZoneCard({ id, actions }: { readonly id: string; readonly actions: Acti
   const zone = live.of.zone.get(id);
   const now = live.serverTime || Date.now() / 1000;
   const known = zone !== undefined;
+  // A zone that was saved just now is told a moment later.
+  const opened = useRef(Date.now());
+  const wasKnown = useRef(false);
+  wasKnown.current ||= known;
+  const isGone = live.ready && (wasKnown.current || Date.now() - opened.current > TOLD_WITHIN_MS);
   // Whoever comes by a link sees where it is.
   useEffect(() => {
     if (zone && floor) actions.show(zone);
@@ -185,7 +192,7 @@ function ZoneCard({ id, actions }: { readonly id: string; readonly actions: Acti
   return (
     <>
       <p><a href={routeHash("zones")}>{t("zones.all")}</a></p>
-      {zone ? <Facts zone={zone} now={now} /> : <p>{live.ready ? t("zones.gone", { zone: id }) : t("connection.loading")}</p>}
+      {zone ? <Facts zone={zone} now={now} /> : <p>{isGone ? t("zones.gone", { zone: id }) : t("connection.loading")}</p>}
       {zone && (
         <div class="actions">
           <button onClick={() => actions.show(zone)}>{t("zones.show")}</button>

@@ -80,7 +80,9 @@ async def test_each_asker_has_one_dry_run_at_a_time_and_all_together_a_few(
     queue: QueryQueue, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(dry_run_queue, "BUSY_PAUSE_S", 0.0)
+    monkeypatch.setattr(dry_run_queue, "DRY_RUN_S", 60.0)
     dry_runs = DryRuns(core_with_robots(), queue, lambda: 0.0)
+    assert await dry_runs.goal("r1", *RIGHT, "first") is not None, "kernels that are not loaded yet make others wait"
     askers = ["map", "map", *(f"person {number}" for number in range(MOST_DRY_RUNS))]
     asked = [dry_runs.goal("r1", *RIGHT, asker) for asker in askers]
     answers = await asyncio.gather(*asked, return_exceptions=True)

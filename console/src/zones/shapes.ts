@@ -8,7 +8,8 @@ export const SHAPE_TYPES: readonly ShapeType[] = ["rectangle", "polygon", "circl
 /** Stands for the whole shape where a number stands for one of its points. */
 export const WHOLE = -1;
 
-const DEFAULT_WIDTH = 1.5;
+/** Of a new corridor: as usual corridors are wide. A strip that leaves a gap beside it closes nothing. */
+const DEFAULT_WIDTH = 3;
 const DEFAULT_SIZE = 2;
 const LEAST_SIZE = 0.1;
 const FEWEST: Readonly<Record<ShapeType, number>> = { rectangle: 2, polygon: 3, circle: 2, corridor: 2 };

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import asyncio
+from contextlib import suppress
 from typing import TYPE_CHECKING, Any, cast
+from unittest.mock import AsyncMock
 
 import httpx
 import pytest
@@ -14,6 +16,7 @@ from fog_contracts.messages import Place, Pose, RobotGoal, RobotPose, RobotState
 from fog_contracts.site import RobotSite, Site, VisitorsSite
 from fog_runtime.health import Health
 from fog_runtime.http import Tokens
+from fog_runtime.stores.redis_connection import StoreError
 from fog_runtime.token_file import TokenEntry, token_hash
 from planner.api import make_api
 from planner.core import PlannerCore
@@ -230,5 +233,13 @@ async def test_restarted_planner_ends_missions_of_visits_before_the_robot_hears_
     await world.service.lead(2, confirmed=True)
     assert list(world.service.goals) == list(world.stored) == ["r2"]
     assert world.records == [("r1", "visit_ended")]
+    await world.http.aclose()
+    world.service.close()
+
+    world = World({"r1": stored("lab", visit=True), "r2": stored("office", visit=False)})
+    world.delete = AsyncMock(side_effect=StoreError("read only"))
+    with suppress(StoreError):
+        await world.service.lead(2, confirmed=True)
+    assert list(world.service.goals) == ["r2"], "what can't be deleted keeps nobody else waiting"
     await world.http.aclose()
     world.service.close()

@@ -390,6 +390,7 @@ class MissionPersistence:
             self._set_service(robot, out.get(robot))
         for robot in [robot for robot in self.goals if robot not in stored or self.out_of_service(robot) is not None]:
             self._cancel(robot)
+        orphans: dict[str, str] = {}
         for robot, mission in stored.items():
             # One that is reached may still be stored, until its deletion succeeds.
             ended = mission.goal.goal_id == self._reached.get(robot) or self.out_of_service(robot) is not None
@@ -399,9 +400,12 @@ class MissionPersistence:
                 self._begin(robot, mission)
                 continue
             # Its visit was in the memory of a process that is gone: nobody waits for the robot.
+            orphans[robot] = mission.goal.goal_id
             if robot in self.goals:
                 self._cancel(robot)
-            await self._store.delete(robot, mission.goal.goal_id, Audit(self._clock.stamp(), robot, VISIT_ENDED))
+        # Last: a store that can't be written to must not keep the other robots from their missions.
+        for robot, goal_id in orphans.items():
+            await self._store.delete(robot, goal_id, Audit(self._clock.stamp(), robot, VISIT_ENDED))
         self._reload = False
         self._loaded.set()
         self._health.set("goals", ok=True, detail=f"{len(self.goals)} loaded")

@@ -23,6 +23,8 @@ def checked(tmp_path, text: str, *command: str) -> tuple[int, str]:
     [
         ("", "setting adapters is missing"),
         ('adapters = "home-asistant"', "'home-asistant' is none. Name one or several of: home-assistant"),
+        ('adapters = "ros2"', "ros2_router names where `rmw_zenohd` listens"),
+        ('adapters = "ros2"\nros2_router = "here"', "here can't be used to reach ROS's router"),
         ('adapters = "home-assistant"\nurl = "x"', "unknown setting 'url'"),
         (HOME + NETWORK, "everybody in the network could read the password"),
         (HOME + NETWORK.replace("//", "//fognav:secret@"), "which no log shows"),

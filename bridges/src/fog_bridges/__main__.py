@@ -56,8 +56,8 @@ class Settings(CommonSettings, frozen=True, kw_only=True):
     """User, password and authority of Home Assistant's broker, as `credentials_file` has those of Fognav's."""
     home_assistant_unencrypted: bool = False
     """Whether that password may cross the network readable for everybody in it."""
-    ros2_router: str = "tcp/127.0.0.1:7447"
-    """Where rmw_zenoh's router (`rmw_zenohd`) listens."""
+    ros2_router: str = ""
+    """Where rmw_zenoh's router (`rmw_zenohd`) listens; on a fog node its usual port is Fognav's own router's."""
     ros2_domain: Annotated[int, msgspec.Meta(ge=0, le=232)] = 0
     """ROS_DOMAIN_ID of the robots."""
     ros2_session_config: Path | None = None
@@ -114,6 +114,8 @@ def _ros2(settings: Settings, site: str, _: Clock) -> Adapter:
         from fog_bridges.ros2.bridge import Ros2Bridge, ros_config  # noqa: PLC0415  # an extra
     except ImportError as error:
         raise SettingsError(f"the adapter ros2 needs more ({error}): pip install 'fog-bridges[ros2]'") from error
+    if settings.ros2_session_config is None and not settings.ros2_router:
+        raise SettingsError("ros2_router names where `rmw_zenohd` listens: tcp/192.168.7.5:7447, say")
     try:
         config = ros_config(settings.ros2_session_config or settings.ros2_router)
     except ValueError as error:

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import asyncio
+import threading
 from functools import partial
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import pytest
 from ring_map import LEFT, RIGHT, RingMap, goal, pose
@@ -21,6 +22,7 @@ from planner.query_queue import BusyError, QueryQueue, Threads
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
+    from fog_contracts.messages import GoalOutcome
     from planner.missions import Mission
 
 ROBOTS = [f"r{number}" for number in range(12)]
@@ -82,9 +84,17 @@ async def test_each_asker_has_one_dry_run_at_a_time_and_all_together_a_few(
     monkeypatch.setattr(dry_run_queue, "BUSY_PAUSE_S", 0.0)
     monkeypatch.setattr(dry_run_queue, "DRY_RUN_S", 60.0)
     dry_runs = DryRuns(core_with_robots(), queue, lambda: 0.0)
-    assert await dry_runs.goal("r1", *RIGHT, "first") is not None, "kernels that are not loaded yet make others wait"
+    all_asked, search = threading.Event(), dry_run_queue.goal_outcome
+
+    def search_when_all_asked(*arguments: Any) -> GoalOutcome | None:
+        assert all_asked.wait(60.0)
+        return search(*arguments)
+
+    monkeypatch.setattr(dry_run_queue, "goal_outcome", search_when_all_asked)
     askers = ["map", "map", *(f"person {number}" for number in range(MOST_DRY_RUNS))]
-    asked = [dry_runs.goal("r1", *RIGHT, asker) for asker in askers]
+    asked = [asyncio.ensure_future(dry_runs.goal("r1", *RIGHT, asker)) for asker in askers]
+    await asyncio.wait([asked[1], asked[-1]], timeout=60.0)
+    all_asked.set()
     answers = await asyncio.gather(*asked, return_exceptions=True)
     assert [isinstance(answer, BusyError) for answer in answers] == [False, True, *[False] * 7, True]
     assert await dry_runs.goal("r1", *RIGHT, "map") is not None, "there is room again"

@@ -176,7 +176,7 @@ async def serve(path: Path, hosts: Sequence[str], port: int, view: Callable[[], 
         print_line("whoever has this address drives the robot, and the link is not encrypted: use a network you trust")
     config = uvicorn.Config(
         make_app(path, token, view or RobotView), log_level="warning", access_log=False, lifespan="off",
-        ws_max_size=4096, ws_max_queue=8, ws_ping_interval=1.0, ws_ping_timeout=2.0, timeout_graceful_shutdown=1,
+        ws_max_size=4096, ws_max_queue=8, ws_ping_interval=5.0, ws_ping_timeout=10.0, timeout_graceful_shutdown=1,
     )  # fmt: skip
     server = uvicorn.Server(config)
     server.capture_signals = contextlib.nullcontext  # type: ignore[method-assign,assignment]  # the command's are its own

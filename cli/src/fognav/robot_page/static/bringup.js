@@ -11,6 +11,7 @@ let told = null;
 let draft = null; // { yaw, mirrored, masks }; masks in the lidar's frame, in which its scans come, so that they turn along
 let began = ""; // what the agent ran with when the draft began
 let shown = "";
+let listed = "";
 let masking = false;
 let held = null; // { bearing, sweep } while the canvas is dragged
 let redraw = () => {};
@@ -80,12 +81,16 @@ export function show(news) {
   }
   element("write").disabled = !draft || !news.file;
   element("write").textContent = news.file ? `Write ${news.file.split("/").pop()}` : "No robot.toml is known";
-  const now = JSON.stringify([news.findings, news.proposed, draft]);
+  if (draft) list();
+  const now = JSON.stringify(news.findings);
   if (now === shown) return;
   shown = now;
   const found = [...news.findings].sort((a, b) => ORDER.indexOf(a.state) - ORDER.indexOf(b.state));
   element("findings").replaceChildren(...found.map(item));
-  if (draft) list();
+}
+
+export function disconnect() {
+  element("write").disabled = true;
 }
 
 function item({ name, state, text, remedy }) {
@@ -98,6 +103,9 @@ function item({ name, state, text, remedy }) {
 }
 
 function list() {
+  const now = JSON.stringify([proposed(), draft]);
+  if (now === listed) return; // a button that is replaced while it is pressed does nothing
+  listed = now;
   const lines = (sectors, label, act) => sectors.map((sector) => {
     const line = document.createElement("li");
     const [from, to] = inRobot(sector).map((angle) => Math.round(degrees(angle)));
@@ -106,7 +114,7 @@ function list() {
     line.append(`${from}° to ${to}° `, button);
     return line;
   });
-  element("masks").replaceChildren(...lines(draft.masks, "Remove", (sector) => { draft.masks = draft.masks.filter((mask) => mask !== sector); }));
+  element("masks").replaceChildren(...lines(draft.masks, "Remove", (sector) => { draft.masks = draft.masks.filter((mask) => String(mask) !== String(sector)); }));
   element("proposed").replaceChildren(...lines(proposed(), "Mask it", (sector) => draft.masks.push(sector)));
 }
 

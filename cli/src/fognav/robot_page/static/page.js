@@ -23,6 +23,7 @@ function connect() {
   link.onmessage = (event) => show(JSON.parse(event.data));
   link.onclose = (event) => {
     letGo();
+    bringup.disconnect();
     show({ mode: "not connected", mine: false, reasons: [event.reason || "the link to the robot is broken"], points: [], footprint: [] });
     if (event.code !== 4401) setTimeout(connect, 1000);
   };
@@ -34,6 +35,7 @@ function drives() {
 
 function say(request) {
   if (link?.readyState === WebSocket.OPEN) link.send(JSON.stringify(request));
+  else if (request.type !== "steer") element("reply").textContent = "not done: the link to the robot is broken; press again when it is back";
 }
 
 function show(told) {
@@ -50,7 +52,7 @@ function show(told) {
   const battery = view.battery == null ? "" : `battery ${Math.round(100 * view.battery)} %`;
   const missed = view.missed ? `${view.missed} messages missed` : "";
   element("sensors").textContent = [battery, ...alarms, `${view.points.length} returns`, missed].filter(Boolean).join(" · ");
-  element("take").disabled = drives();
+  element("take").disabled = drives() || view.mode === "not connected";
   element("back").disabled = !drives();
   element("reset").disabled = view.mode !== "FAULT";
   pad.classList.toggle("off", !drives());

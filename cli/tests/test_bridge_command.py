@@ -1,5 +1,7 @@
 """`fognav bridge` and `fognav up --bridge`: what can't be used is refused before anything starts, with the remedy."""
 
+import sys
+
 import pytest
 from typer.testing import CliRunner
 
@@ -56,3 +58,9 @@ def test_nothing_starts_with_a_bridge_that_can_not_run(tmp_path, monkeypatch):
     monkeypatch.setattr(bridge, "find_spec", lambda _: None)
     code, said = checked(tmp_path, HOME)
     assert (code, "install the package fog-bridges" in said) == (1, True), said
+
+
+def test_bridges_that_end_without_a_word_are_told_of_with_how_they_ended(tmp_path, monkeypatch):
+    monkeypatch.setattr(bridge, "_COMMAND", (sys.executable, "-c", "import os; os.kill(os.getpid(), 9)"))
+    code, said = checked(tmp_path, HOME)
+    assert (code, "ended without a word, by signal 9 (Killed)" in said.replace("\n", " ")) == (1, True), said

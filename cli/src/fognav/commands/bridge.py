@@ -1,6 +1,8 @@
 """`fognav bridge`: the bridges to other systems, by themselves; and what `fognav up` has to know of them."""
 
 import os
+import shlex
+import signal
 import subprocess
 import sys
 import tomllib
@@ -55,7 +57,17 @@ def require_bridge(file: Path) -> None:
     environment = {**inherited_environment(), _FILE: str(file.absolute()), "FOGNAV_CONSOLE_URL": "https://localhost"}
     done = subprocess.run([*_COMMAND, "--check"], env=environment, capture_output=True, text=True, check=False)
     if done.returncode != 0:
-        raise WrongUseError(f"{file} can't be used: {done.stderr.strip().splitlines()[-1]}")
+        says = done.stderr.strip().splitlines()
+        if not says:
+            raise FailedError(
+                f"{file} was not checked: the bridges ended without a word, {_ended(done.returncode)}. Look why: "
+                f"{_FILE}={shlex.quote(str(file))} {shlex.join(_COMMAND)}"
+            )
+        raise WrongUseError(f"{file} can't be used: {says[-1]}")
+
+
+def _ended(code: int) -> str:
+    return f"with exit code {code}" if code >= 0 else f"by signal {-code} ({signal.strsignal(-code)})"
 
 
 def _of_this_machine() -> dict[str, str]:

@@ -172,13 +172,16 @@ class Attempt:
         self.usage = Usage()
         self.restarts: dict[str, int] = {}
         """How often each process died and was restarted."""
+        self.taken_over = False
+        """Somebody sent the robot elsewhere: the system is theirs from then on."""
         self._stack: Stack | None = None
 
     # --- the system ---
 
     async def run(self, stop: asyncio.Event) -> None:
-        """Start everything, drive, and end everything; with `keep_running` wait for `stop` before the end.
+        """Start everything, drive, and end everything.
 
+        With `keep_running`, or once somebody sent the robot elsewhere, wait for `stop` before the end.
         Raises `NotReadyError` or `TimeoutError` if the system or the robot does not become ready, `TooFastError` if
         the machine can't sustain the speed, and `WrongUseError` if the site is not suitable.
         """
@@ -214,8 +217,11 @@ class Attempt:
                 presence.announce()
                 async with Background(operator.keep_enabled(), self._sample(stack, presence)) as background:
                     await self.run_drive(operator, clock, background)
-                    if options.keep_running:
+                    if self.taken_over:
+                        self.scene.log_event("the system keeps running for whom sent the robot: end it with Ctrl-C")
+                    elif options.keep_running:
                         self.scene.log_event("the system keeps running: end it with Ctrl-C")
+                    if self.taken_over or options.keep_running:
                         await stop.wait()
 
     @contextlib.asynccontextmanager
@@ -342,6 +348,7 @@ class Attempt:
         while (outcome := drive.outcome(clock.now())) is None:
             background.check()
             if (taken := self._taken_over(drive)) is not None:
+                self.taken_over = True
                 self.end(taken)
                 return
             await placement.place_if_due()

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from console_stream import TOKEN, ConsoleStream, robot_pose, robot_state, serve
+from console_stream import FLAGS, TOKEN, ConsoleStream, robot_pose, robot_state, serve
 from playwright.async_api import CDPSession, async_playwright, expect
 
 from fog_runtime.configuration.site import load_site
@@ -17,7 +17,6 @@ pytestmark = [pytest.mark.browser, pytest.mark.drive]
 
 ROOT = Path(__file__).parents[1]
 ROBOTS, RATE_HZ, SECONDS = 10, 10.0, 12.0
-FLAGS = ["--no-sandbox", "--disable-gpu", "--disable-dev-shm-usage", "--disable-background-networking"]
 
 
 @pytest.fixture(scope="module", autouse=True)

@@ -1,7 +1,7 @@
 // The console once somebody is logged in: tabs, the map, the panel of the view, messages and the stop bar.
 import { useCallback, useEffect, useMemo, useRef, useState } from "preact/hooks";
 import type { Session } from "./api/types";
-import { type Console, ConsoleContext, mayOperate } from "./context";
+import { type Console, ConsoleContext, mayOperate, type Say } from "./context";
 import { type Language, language, setLanguage, t } from "./i18n/i18n";
 import { Live } from "./live/live";
 import { Floor } from "./map/floor";
@@ -37,7 +37,14 @@ interface Props {
 interface Said {
   readonly text: string;
   readonly kind: "done" | "failed";
+  readonly holds?: (() => boolean) | undefined;
 }
+
+const NOTHING: Said = { text: "", kind: "done" };
+/** How long a message stays. */
+const STAYS_MS = { done: 20_000, failed: 60_000 } as const;
+/** The stream tells a moment later what a request has changed: only then is it seen whether a message holds. */
+const TOLD_MS = 3_000;
 
 export function ConsoleApp({ session, onExpired, onLogOut }: Props): preact.JSX.Element {
   const route = useRoute();
@@ -45,7 +52,7 @@ export function ConsoleApp({ session, onExpired, onLogOut }: Props): preact.JSX.
   const [floor, setFloor] = useState<Floor | null>(null);
   const [chosen, setChosen] = useState<string | null>(null);
   const [robots, setRobots] = useState<readonly string[]>([]);
-  const [said, setSaid] = useState<Said>({ text: "", kind: "done" });
+  const [said, setSaid] = useState<Said>(NOTHING);
   const [, setSpoken] = useState<Language>(language);
   const element = useRef<HTMLDivElement>(null);
 
@@ -79,7 +86,16 @@ export function ConsoleApp({ session, onExpired, onLogOut }: Props): preact.JSX.
   }, [live]);
 
   const robot = chosen !== null && robots.includes(chosen) ? chosen : robots[0] ?? null;
-  const say = useCallback((text: string, kind: Said["kind"] = "done") => setSaid({ text, kind }), []);
+  const say = useCallback<Say>((text, kind = "done", holds) => setSaid({ text, kind, holds }), []);
+  useEffect(() => {
+    if (said.text === "") return undefined;
+    const since = performance.now();
+    const timer = setInterval(() => {
+      const age = performance.now() - since;
+      if (age > STAYS_MS[said.kind] || (age > TOLD_MS && said.holds?.() === false)) setSaid(NOTHING);
+    }, 500);
+    return () => clearInterval(timer);
+  }, [said]);
 
   useEffect(() => {
     if (!element.current) return;
@@ -132,7 +148,7 @@ export function ConsoleApp({ session, onExpired, onLogOut }: Props): preact.JSX.
         </section>
         <main id="content" tabIndex={-1} aria-label={t(`view.${route.view}`)}><Panel /></main>
         <p class={`said ${said.kind}`} role="status" aria-live="polite"><span>{said.text}</span></p>
-        <StopBar robot={robot} robots={robots} say={say} />
+        <StopBar robot={robot} robots={robots} say={say} isStopped={(id) => live.of.robot.get(id)?.state?.enabled === false} />
       </div>
     </ConsoleContext.Provider>
   );

@@ -7,6 +7,12 @@ import type { Live, Topic } from "./live/live";
 import type { Floor } from "./map/floor";
 import type { Scenario } from "./scenario";
 
+/**
+ * Say something in the live region: a result of what the user did, or a change that matters. It goes after a while, and
+ * once what it speaks of does not hold any more; the timeline keeps it.
+ */
+export type Say = (text: string, kind?: "done" | "failed", holds?: () => boolean) => void;
+
 export interface Console {
   readonly live: Live;
   readonly session: Session;
@@ -19,8 +25,7 @@ export interface Console {
   readonly chooseRobot: (id: string) => void;
   /** What a demo does; null in a real system. */
   readonly scenario: Scenario | null;
-  /** Say something in the live region: a result of what the user did, or a change that matters. */
-  readonly say: (text: string, kind?: "done" | "failed") => void;
+  readonly say: Say;
   readonly logOut: () => void;
 }
 

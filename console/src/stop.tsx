@@ -2,6 +2,7 @@
 import { useEffect, useState } from "preact/hooks";
 import { Problem, request, robotPath } from "./api/client";
 import type { CommandOutcome } from "./api/types";
+import type { Say } from "./context";
 import { t } from "./i18n/i18n";
 
 const STORED = "fognav.robots";
@@ -29,19 +30,21 @@ export function sentence(error: unknown): string {
 interface Props {
   readonly robot: string | null;
   readonly robots: readonly string[];
-  readonly say: (text: string, kind?: "done" | "failed") => void;
+  readonly say: Say;
+  /** Whether a robot waits to be enabled; without it nobody knows. */
+  readonly isStopped?: (id: string) => boolean;
 }
 
-export function StopBar({ robot, robots, say }: Props): preact.JSX.Element {
+export function StopBar({ robot, robots, say, isStopped }: Props): preact.JSX.Element {
   const [stopping, setStopping] = useState<readonly string[]>([]);
 
   const stop = async (id: string): Promise<void> => {
     setStopping((now) => [...now, id]);
     try {
       await request<CommandOutcome>("POST", robotPath(id, "stop"), { timeout: 5_000 });
-      say(t("stop.done", { robot: id }), "done");
+      say(t("stop.done", { robot: id }), "done", isStopped && (() => isStopped(id)));
     } catch (error) {
-      say(t("stop.failed", { robot: id, reason: sentence(error) }), "failed");
+      say(t("stop.failed", { robot: id, reason: sentence(error) }), "failed", isStopped && (() => !isStopped(id)));
     } finally {
       setStopping((now) => now.filter((other) => other !== id));
     }

@@ -1,5 +1,5 @@
 // Why a robot stands or drives slowly, in one sentence, and what to do about it.
-import type { GoalView, OutOfService, RobotState } from "./api/types";
+import type { AuditEntry, GoalView, OutOfService, RobotState } from "./api/types";
 import { language, t } from "./i18n/i18n";
 import { REASONS } from "./reasons";
 import { clockTime } from "./text";
@@ -11,10 +11,27 @@ export interface Why {
   readonly remedy: string;
 }
 
+export type Stopped = Pick<AuditEntry, "who" | "at">;
+
+/** Return by whom and when a robot was stopped last, unless somebody has enabled it since; null: nobody has. */
+export function stoppedBy(records: readonly AuditEntry[], robot: string): Stopped | null {
+  const stops = ["stop", "disable"];
+  let last: AuditEntry | null = null;
+  for (const entry of records) {
+    const counts = entry.id === robot && (entry.kind === "stop" || entry.kind === "robot") && [...stops, "enable"].includes(entry.action);
+    if (counts && (last === null || entry.at > last.at)) last = entry;
+  }
+  return last !== null && stops.includes(last.action) ? last : null;
+}
+
 /** Return the robot's reasons, the most important first. A newer robot may have some that the console does not know. */
-export function whys(state: RobotState): Why[] {
+export function whys(state: RobotState, stopped: Stopped | null = null): Why[] {
   return state.reasons.map((sentence, i) => {
-    const known = REASONS[state.codes?.[i] ?? ""];
+    const code = state.codes?.[i] ?? "";
+    const known = REASONS[code];
+    if (code === "not_enabled" && stopped) {
+      return { says: t("why.stopped", { who: stopped.who, time: clockTime(stopped.at) }), remedy: t("why.enable") };
+    }
     // The robot's own sentences are English, and have figures.
     return language() === "pt" && known
       ? { says: known.pt, remedy: known.remedyPt }
@@ -29,12 +46,12 @@ export function outOfService({ reason, by, until }: OutOfService): string {
 }
 
 /** Return one sentence about what a robot does, or why not. */
-export function headline(state: RobotState | null, goal: GoalView | null, out: OutOfService | null = null): string {
+export function headline(state: RobotState | null, goal: GoalView | null, out: OutOfService | null = null, stopped: Stopped | null = null): string {
   // Whoever asks why it gets no goal must not read that it has none.
   if (out && (!state || state.mode === "NORMAL" || state.mode === "INIT")) return outOfService(out);
   if (!state) return t("robot.noState");
-  const [first] = whys(state);
-  if (first && state.mode !== "NORMAL") return first.remedy === "" ? first.says : `${first.says}. ${first.remedy}`;
+  const [first] = whys(state, stopped);
+  if (first && state.mode !== "NORMAL") return first.remedy === "" ? first.says : `${first.says.replace(/\.$/, "")}. ${first.remedy}`;
   if (state.goal_reached) return t("robot.arrived");
   if (!goal && state.goal_id === null) return t("robot.idle");
   return first ? first.says : t("robot.allWell");

@@ -25,7 +25,7 @@ def test_operator_stops_a_robot_sees_why_it_stands_and_sends_it_on_from_a_phone(
     console_page.build(ROOT)
     runtime = tmp_path / "runtime"
     runtime.mkdir(mode=0o700)
-    command = child.command(sys.executable, "-m", "fognav", "demo", "--no-hazard", "--keep-running")
+    command = child.command(sys.executable, "-m", "fognav", "demo", "--no-hazard")
     environment = {**os.environ, "XDG_RUNTIME_DIR": str(runtime)}
     with (
         subprocess.Popen(command, cwd=ROOT, env=environment, stderr=subprocess.PIPE, text=True) as demo,
@@ -43,7 +43,7 @@ def test_operator_stops_a_robot_sees_why_it_stands_and_sends_it_on_from_a_phone(
             expect(robot.locator(".badge")).to_have_text("driving", timeout=START_MS)
             assert "login" not in page.url
             expect(page.locator(".leaflet-costs-pane canvas").first).to_be_attached()
-            # Somebody else's goal ends the demo's drive: from then on nobody enables the robot again.
+            # Somebody else's goal ends the demo's drive: from then on the system is theirs, nobody enables the robot.
             page.evaluate("location.hash = '#/robots'")
             page.get_by_role("button", name="Send to a goal").tap()
             page.get_by_label("Place").select_option("d")

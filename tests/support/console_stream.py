@@ -33,6 +33,10 @@ if TYPE_CHECKING:
 
 TILE = 128
 TOKEN = "a-token"
+FLAGS = ["--no-sandbox", "--disable-gpu", "--disable-dev-shm-usage", "--disable-background-networking"]
+PHONE = {"viewport": {"width": 390, "height": 844}, "has_touch": True, "is_mobile": True}
+WIDE = {"viewport": {"width": 1440, "height": 900}}
+VIEWS = ("map", "zones", "robots", "sensors", "timeline")
 
 
 def png(cells: np.ndarray) -> bytes:
@@ -79,9 +83,13 @@ class ConsoleStream:
     def tell(self, event: str, key: str, value: Any) -> None:
         self.say(event, key, {"id": key, "value": to_builtins(value)})
 
-    def robot(self, name: str, state: RobotState, goal: Any = None, out_of_service: Any = None) -> None:
+    def robot(self, name: str, state: RobotState, goal: Any = None, **fields: Any) -> None:
         about = {"id": name, "configured": True, "state": state, "goal": goal, "plan": None}
-        self.tell("robot", name, {**about, "out_of_service": out_of_service})
+        self.tell("robot", name, {**about, "out_of_service": None, "start": None, "dock": None, **fields})
+
+    def asked(self, method: str) -> list[str]:
+        """Return the requests of this method, without those of the session."""
+        return [name for name, _ in self.requests if name.startswith(method) and not name.endswith("session")]
 
     def hazard(self, area: str, state: str) -> None:
         found = next(each for each in self.site.site.areas if each.id == area)

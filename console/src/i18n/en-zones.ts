@@ -266,6 +266,8 @@ export const enZones = {
   "action.end": "time is over",
   "action.began": "began",
   "action.ended": "ended",
+  "action.disable": "stopped",
+  "timeline.repeats": "{count} times more within {time}: {who}",
   "action.stop": "stopped",
   "action.visit": "sent for a visitor",
   "action.visit_ended": "visit over",

@@ -269,6 +269,8 @@ export const ptZones: Readonly<Record<keyof typeof enZones, string>> = {
   "action.ended": "acabou",
   "action.visit": "enviado para um visitante",
   "action.visit_ended": "visita terminada",
+  "action.disable": "parado",
+  "timeline.repeats": "mais {count} vezes em {time}: {who}",
   "action.stop": "parado",
 
   "replay.title": "A última hora",

@@ -197,6 +197,13 @@ export class Floor {
     this.map.fitBounds([[bottom, left], [top, right]], { animate: false, maxZoom: 5, padding: [60, 60] });
   }
 
+  /** Show points as `show` does, unless all of them are seen already: then the map stays where the person looks. */
+  reveal(points: readonly Point[]): void {
+    if (points.length === 0) return;
+    const [left, bottom, right, top] = box(points);
+    if (!this.map.getBounds().contains([[bottom, left], [top, right]])) this.show(points);
+  }
+
   private fitOnce(): void {
     const { x, y } = this.map.getSize();
     if (this.fitted || !this.live.map || x === 0 || y === 0) return;

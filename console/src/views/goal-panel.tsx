@@ -2,8 +2,9 @@
 import { useEffect, useState } from "preact/hooks";
 import { Problem, request, robotPath } from "../api/client";
 import type { GoalBody, GoalView, PlanReply } from "../api/types";
-import { useConsole, useLive, useShown } from "../context";
+import { type Say, useConsole, useLive, useShown } from "../context";
 import { t } from "../i18n/i18n";
+import type { Live } from "../live/live";
 import { toPoint } from "../map/geometry";
 import { sentence } from "../stop";
 import { decimal, metres } from "../text";
@@ -67,7 +68,7 @@ export function GoalPanel({ id, onClose }: Props): preact.JSX.Element {
       const shown = await plan({ x: pose.x, y: pose.y, theta: pose.theta }, goal);
       if (!current) return;
       floor?.preview(shown.points);
-      if (shown.points.length > 1) floor?.show(shown.points);
+      if (shown.points.length > 1) floor?.reveal(shown.points);
       setPreview(shown.preview);
     };
     const timer = setTimeout(() => void look(), PAUSE_MS);
@@ -82,11 +83,10 @@ export function GoalPanel({ id, onClose }: Props): preact.JSX.Element {
     if (x === null || y === null) return;
     const body: GoalBody = place ? { place: target.place }
       : { pose: { x, y, theta: heading === null ? null : radians(heading) } };
-    const name = place ? place.label || target.place : t("goal.position", { x: decimal(x, 1), y: decimal(y, 1) });
+    const name = place ? place.label || target.place : nameOf(x, y);
     setSending(true);
     try {
-      await request<GoalView>("PUT", robotPath(id, "goal"), { body });
-      say(t("goal.sent", { robot: id, goal: name }));
+      await sendTo(live, say, id, body, name);
       onClose();
     } catch (error) {
       const nearest = error instanceof Problem ? error.extra.nearest : null;
@@ -94,7 +94,6 @@ export function GoalPanel({ id, onClose }: Props): preact.JSX.Element {
         text: sentence(error), refused: true,
         nearest: Array.isArray(nearest) ? [Number(nearest[0]), Number(nearest[1])] : null,
       });
-      say(t("goal.failed", { robot: id, reason: sentence(error) }), "failed");
       setSending(false);
     }
   };
@@ -130,6 +129,33 @@ export function GoalPanel({ id, onClose }: Props): preact.JSX.Element {
       </div>
     </form>
   );
+}
+
+const nameOf = (x: number, y: number): string => t("goal.position", { x: decimal(x, 1), y: decimal(y, 1) });
+
+/** Send a robot, and say so, or why not; throws what went wrong. */
+export async function sendTo(live: Live, say: Say, id: string, body: GoalBody, name: string): Promise<void> {
+  try {
+    const { value } = await request<GoalView>("PUT", robotPath(id, "goal"), { body });
+    const waits = live.of.robot.get(id)?.state?.enabled === false;
+    say(t(waits ? "goal.waits" : "goal.sent", { robot: id, goal: name }), "done", () => live.of.robot.get(id)?.goal?.goal_id === value.goal_id);
+  } catch (error) {
+    say(t("goal.failed", { robot: id, reason: sentence(error) }), "failed");
+    throw error;
+  }
+}
+
+/** A place is where a robot begins if it is so near to it (m). */
+const HOME_M = 0.5;
+
+/** Return where a robot is at home: the place `home`, else where it begins by the site's file; null: it has a dock, or none. */
+export function homeOf({ of }: Live, id: string): { readonly body: GoalBody; readonly name: string } | null {
+  const robot = of.robot.get(id);
+  const start = robot?.start;
+  const found = of.place.has("home") ? "home"
+    : !start || robot.dock ? undefined : [...of.place].find(([, { x, y }]) => Math.hypot(x - start.x, y - start.y) <= HOME_M)?.[0];
+  if (found !== undefined) return { body: { place: found }, name: of.place.get(found)?.label || found };
+  return start && !robot.dock ? { body: { pose: start }, name: nameOf(start.x, start.y) } : null;
 }
 
 interface Position {

@@ -4,7 +4,7 @@ import { t } from "../i18n/i18n";
 import { tone } from "../map/robot-layer";
 import { go } from "../router";
 import { decimal, percent } from "../text";
-import { headline } from "../why";
+import { headline, stoppedBy } from "../why";
 import { vitalsText } from "./vitals";
 
 interface Props {
@@ -14,7 +14,7 @@ interface Props {
 
 export function RobotCard({ id, chosen }: Props): preact.JSX.Element {
   const { chooseRobot } = useConsole();
-  const live = useLive(["robot", "pose", "vitals"], id);
+  const live = useLive(["robot", "pose", "vitals", "record"], id);
   useSeconds(); // it becomes old without any event
   const robot = live.of.robot.get(id);
   const pose = live.of.pose.get(id);
@@ -40,7 +40,7 @@ export function RobotCard({ id, chosen }: Props): preact.JSX.Element {
           {vitals && <span class="muted">{vitalsText(vitals)}</span>}
         </span>
       )}
-      <span class="why">{old ? t("robot.old") : headline(state, robot?.goal ?? null, robot?.out_of_service)}</span>
+      <span class="why">{old ? t("robot.old") : headline(state, robot?.goal ?? null, robot?.out_of_service, stoppedBy(live.records, id))}</span>
     </button>
   );
 }

@@ -1,15 +1,15 @@
 // The robots, and all that can be done with the chosen one.
 import { useEffect, useState } from "preact/hooks";
 import { Problem, request, robotPath } from "../api/client";
-import type { CommandBody, CommandOutcome, OutOfService, RobotState, Values } from "../api/types";
+import type { CommandBody, CommandOutcome, Values } from "../api/types";
 import { mayOperate, useConsole, useLive, useSeconds } from "../context";
 import { Confirm } from "../dialog";
 import { t } from "../i18n/i18n";
 import { useRoute } from "../router";
 import { sentence } from "../stop";
 import { decimal, duration, metres, percent } from "../text";
-import { headline, outOfService, whys } from "../why";
-import { GoalPanel } from "./goal-panel";
+import { headline, outOfService, stoppedBy, whys } from "../why";
+import { GoalPanel, homeOf, sendTo } from "./goal-panel";
 import { PosePanel } from "./pose-panel";
 import { RobotCard } from "./robot-card";
 import { ServicePanel } from "./service-panel";
@@ -37,17 +37,18 @@ export function RobotsView(): preact.JSX.Element {
 
 function Details({ id }: { readonly id: string }): preact.JSX.Element {
   const { session } = useConsole();
-  const live = useLive(["robot", "pose"], id);
+  const live = useLive(["robot", "pose", "record"], id);
   useSeconds();
   const robot = live.of.robot.get(id);
   const state = robot?.state ?? null;
   const old = live.oldRobot(id);
-  const reasons = state ? whys(state) : [];
+  const stopped = stoppedBy(live.records, id);
+  const reasons = state ? whys(state, stopped) : [];
   return (
     <section aria-labelledby="robot-title">
       <h2 id="robot-title"><bdi>{id}</bdi></h2>
       <div class={old ? "card stale" : "card"}>
-        <p class="lead">{headline(state, robot?.goal ?? null, robot?.out_of_service)}</p>
+        <p class="lead">{headline(state, robot?.goal ?? null, robot?.out_of_service, stopped)}</p>
         {old && <p class="problem">{t("robot.old")}</p>}
         {reasons.length > 1 && (
           <>
@@ -59,11 +60,14 @@ function Details({ id }: { readonly id: string }): preact.JSX.Element {
         )}
         {/* What stops it now comes first; that it gets no goal either is said all the same. */}
         {robot?.out_of_service && state && state.mode !== "NORMAL" && state.mode !== "INIT" && <p>{outOfService(robot.out_of_service)}</p>}
+      </div>
+      {/* What one comes to do stands before what one may read. */}
+      {mayOperate(session) ? <Commands id={id} robot={robot} />
+        : <p class="muted">{t("error.role", { role: t(`role.${session.role}`) })}</p>}
+      <div class={old ? "card stale" : "card"}>
         <Facts id={id} robot={robot} />
         <VitalsFacts id={id} />
       </div>
-      {mayOperate(session) ? <Commands id={id} state={state} goal={robot?.goal != null} out={robot?.out_of_service ?? null} />
-        : <p class="muted">{t("error.role", { role: t(`role.${session.role}`) })}</p>}
     </section>
   );
 }
@@ -99,16 +103,16 @@ const heard = (age: number): string => (age === Infinity ? "–" : t("ago", { ag
 
 interface CommandsProps {
   readonly id: string;
-  readonly state: RobotState | null;
-  readonly goal: boolean;
-  readonly out: OutOfService | null;
+  readonly robot: Values["robot"] | undefined;
 }
 
 /** Which panel is open beneath the commands. */
 type Open = "goal" | "pose" | "service" | null;
 
-function Commands({ id, state, goal, out }: CommandsProps): preact.JSX.Element {
-  const { say } = useConsole();
+function Commands({ id, robot }: CommandsProps): preact.JSX.Element {
+  const { live, say } = useConsole();
+  const state = robot?.state ?? null;
+  const out = robot?.out_of_service ?? null;
   const [asked, setAsked] = useState<"enable" | "reset" | null>(null);
   const [open, setOpen] = useState<Open>(null);
   const [waiting, setWaiting] = useState<Kind | null>(null);
@@ -132,6 +136,13 @@ function Commands({ id, state, goal, out }: CommandsProps): preact.JSX.Element {
       setWaiting(null);
     }
   };
+  const goHome = async (): Promise<void> => {
+    const home = homeOf(live, id);
+    if (home === null) return;
+    setWaiting("dock");
+    await sendTo(live, say, id, home.body, home.name).catch(() => undefined);  // it has said so
+    setWaiting(null);
+  };
   const button = (kind: Kind, primary = false): preact.JSX.Element => (
     <button class={primary ? "primary" : ""} disabled={waiting !== null} onClick={() => void run(kind)}>
       {t(`command.${kind as "enable"}`)}
@@ -147,9 +158,11 @@ function Commands({ id, state, goal, out }: CommandsProps): preact.JSX.Element {
         {fault && <button class="primary" onClick={() => setAsked("reset")}>{t("command.reset")}</button>}
         {codes.includes("in_blocked") && button("egress", true)}
         {(codes.includes("bumper") || fault) && button("back_off")}
+        {homeOf(live, id) && <button disabled={out !== null || waiting !== null} onClick={() => void goHome()}>{t("command.home")}</button>}
+        {robot?.dock && !state?.docked && button("dock")}
         <button aria-expanded={open === "goal"} disabled={out !== null} onClick={() => setOpen(open === "goal" ? null : "goal")}>{t("command.goal")}</button>
-        {goal && button("cancel")}
-        {state?.docked ? button("undock") : button("dock")}
+        {robot?.goal && button("cancel")}
+        {state?.docked && button("undock")}
         {!codes.includes("in_blocked") && button("egress")}
         <button aria-expanded={open === "service"} onClick={() => setOpen(open === "service" ? null : "service")}>
           {t(out ? "service.in" : "command.disable")}

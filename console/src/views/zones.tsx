@@ -27,6 +27,8 @@ const TOLD_WITHIN_MS = 3_000;
 
 /** The last change of this page, kept while the user looks at other views. */
 let last: Change | null = null;
+/** The zone that was saved just now: the map stays where the person looked while drawing it. */
+let saved = "";
 
 export function ZonesView(): preact.JSX.Element {
   const { floor, live, session, say } = useConsole();
@@ -51,7 +53,7 @@ export function ZonesView(): preact.JSX.Element {
     show,
     edit: (zone) => {
       editor.start(draftOf(zone));
-      show(zone);
+      floor?.reveal(outline(zone.shape));
       go("zones", DRAFT);
     },
     copy: (zone) => {
@@ -82,6 +84,7 @@ export function ZonesView(): preact.JSX.Element {
         editor={editor}
         onSaved={(change) => {
           editor.end();
+          saved = change.id;
           made(change, t("zones.saved", { zone: change.id }));
           go("zones", change.id);
         }}
@@ -121,6 +124,7 @@ function ZoneList({ actions }: { readonly actions: Actions }): preact.JSX.Elemen
   const live = useLive(["zone", "ready"]);
   useSeconds();
   const [filter, setFilter] = useState("");
+  useEffect(() => void (saved = ""), []);
   const now = live.serverTime || Date.now() / 1000;
   const wanted = filter.trim().toLowerCase();
   const zones = [...live.of.zone.values()]
@@ -187,7 +191,7 @@ function ZoneCard({ id, actions }: { readonly id: string; readonly actions: Acti
   const isGone = live.ready && (wasKnown.current || Date.now() - opened.current > TOLD_WITHIN_MS);
   // Whoever comes by a link sees where it is.
   useEffect(() => {
-    if (zone && floor) actions.show(zone);
+    if (zone && saved !== id) floor?.reveal(outline(zone.shape));
   }, [id, known, floor]);
   return (
     <>

@@ -53,8 +53,11 @@ export function useVisit(onExpired: () => void): Visiting {
 
   const act = (method: "POST" | "DELETE", path: string, body?: VisitBody): void => {
     setProblem("");
-    setLeft(false);
-    void request(method, path, body ? { body } : {}).then(look, failed);
+    // What is over stays left until the answer is known: the visit before must not be shown as the new one.
+    void request(method, path, body ? { body } : {}).then(async () => {
+      await look();
+      setLeft(false);
+    }, failed);
   };
   return {
     visit: left && visit && isOver(visit) ? null : visit,

@@ -42,7 +42,7 @@ KEY = b"k" * 32
 OPERATOR = {"Authorization": "Bearer operator-token"}
 VIEWER = {"Authorization": "Bearer viewer-token"}
 SITE = cast("Any", SimpleNamespace(
-    robots=[SimpleNamespace(id="r1")],
+    robots=[SimpleNamespace(id="r1", start=None, dock=None)],
     places={"dock": Place(x=1.0, y=2.0, theta=0.5), "b": Place(x=1.0, y=2.0, theta=None)},
 ))  # fmt: skip
 
@@ -200,6 +200,19 @@ async def test_flood_of_stops_without_a_token_stops_each_time_and_fills_no_audit
     await rig.operator.record_repeated_stops()
     sender = rig.robot.received[0].operator
     assert rig.robot.stops[1:] == [("r1", sender, {"kind": "disable", "repeats": {sender: 299}, "period_s": 600.0})]
+
+
+async def test_each_stop_of_an_operator_is_an_entry_with_the_name_and_a_wrong_token_stops_all_the_same(
+    rig: Rig,
+) -> None:
+    for token in (OPERATOR, OPERATOR, VIEWER, VIEWER, {"Authorization": "Bearer nobody's"}):
+        assert (await rig.client.post("/api/v1/robots/r1/stop", headers=token)).status_code == 200
+    assert [sender.partition(" from ")[0] for _, sender, _ in rig.robot.stops] == [
+        "operator",
+        "operator",
+        "viewer",
+        "stop",
+    ]
 
 
 async def test_stop_that_could_not_be_recorded_is_told_of_later(rig: Rig) -> None:

@@ -72,7 +72,7 @@ async def main() -> None:
         core = ConsoleCore(
             site,
             secrets.token_hex(4),
-            robots=[robot.id for robot in described.robots],
+            robots=described.robots,
             nodes={node.id: msgspec.to_builtins(node) for node in described.nodes},
         )
         core.on_places(described.places, clock.now())

@@ -42,6 +42,7 @@ if TYPE_CHECKING:
         ZoneSet,
     )
     from fog_contracts.replica import DecodedMap
+    from fog_contracts.site import RobotSite
 
 Fetched = Literal["area", "node", "alert"]
 
@@ -64,7 +65,7 @@ FAULTS: Final = 2_000
 
 @dataclass
 class _Robot:
-    configured: bool
+    described: RobotSite | None = None
     state: RobotState | None = None
     goal: RobotGoal | None = None
     path: RobotPath | None = None
@@ -88,9 +89,14 @@ class ConsoleCore:
     """Messages in; the state of everything, in `log`, out."""
 
     def __init__(
-        self, site: str, run: str, *, robots: Collection[str] = (), nodes: Mapping[str, Mapping[str, Any]] | None = None
+        self,
+        site: str,
+        run: str,
+        *,
+        robots: Collection[RobotSite] = (),
+        nodes: Mapping[str, Mapping[str, Any]] | None = None,
     ) -> None:
-        """Begin with these robots, of which nothing is known; `run` as in `CompactedLog`.
+        """Begin with these robots of the site, of which nothing was heard yet; `run` as in `CompactedLog`.
 
         nodes: by id, what the site says of them (JSON): where they hang, and their sonars.
         """
@@ -107,8 +113,8 @@ class ConsoleCore:
         self._refreshed: dict[tuple[str, str], tuple[bytes, float]] = {}
         self._records: deque[str] = deque()
         for robot in robots:
-            self._robots[robot] = _Robot(configured=True)
-            self._put_robot(robot)
+            self._robots[robot.id] = _Robot(described=robot)
+            self._put_robot(robot.id)
 
     def handlers(self) -> Mapping[ch.Channel, Handler]:
         """Return the handler of every channel that the console-service subscribes to."""
@@ -137,7 +143,7 @@ class ConsoleCore:
         for robot, known in list(self._robots.items()):
             if known.pending is not None and at.now - known.pose_at >= POSE_PERIOD_S:
                 self._put_pose(robot, known, known.pending, at.now)
-            if not known.configured and at.now - known.heard > FORGET_S:
+            if known.described is None and at.now - known.heard > FORGET_S:
                 del self._robots[robot]
                 for event in ("robot", "pose", "path", "obstacles", "vitals"):
                     self._remove(event, robot, at.now)
@@ -203,7 +209,7 @@ class ConsoleCore:
 
     def _robot(self, ids: Ids, at: Moment) -> tuple[str, _Robot]:
         robot = ids["robot"]
-        known = self._robots.setdefault(robot, _Robot(configured=False))
+        known = self._robots.setdefault(robot, _Robot())
         known.heard = at.now
         return robot, known
 
@@ -287,11 +293,13 @@ class ConsoleCore:
         known = self._robots[robot]
         view = RobotSummary(
             id=robot,
-            configured=known.configured,
+            configured=known.described is not None,
             state=known.state,
             goal=GoalView.of(robot, known.goal),
             plan=PlanView.of(known.path),
             out_of_service=None if known.goal is None else known.goal.out_of_service,
+            start=None if known.described is None else known.described.start,
+            dock=None if known.described is None else known.described.dock,
         )
         self._put("robot", robot, view)
 

@@ -109,7 +109,7 @@ class _Robots:
 
     def __init__(self, service: Service, site: Site) -> None:
         self._service = service
-        self._configured = {robot.id for robot in site.robots}
+        self._configured = {robot.id: robot for robot in site.robots}
 
     def ids(self) -> list[str]:
         """Return the ids of all known robots, sorted."""
@@ -130,15 +130,17 @@ class _Robots:
 
     def view(self, robot: str) -> RobotView:
         """Return a known robot with pose, state, mission and plan."""
-        service = self._service
+        service, described = self._service, self._configured.get(robot)
         return RobotView(
             id=robot,
-            configured=robot in self._configured,
+            configured=described is not None,
             pose=service.poses.get(robot),
             state=service.states.get(robot),
             goal=_goal_view(robot, service.goals[robot]) if robot in service.goals else None,
             plan=PlanView.of(service.path(robot)),
             out_of_service=service.missions.out_of_service(robot),
+            start=None if described is None else described.start,
+            dock=None if described is None else described.dock,
         )
 
 

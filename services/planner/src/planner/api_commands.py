@@ -3,7 +3,7 @@
 from collections.abc import Callable, Mapping
 
 from fog_contracts.messages import CommandKind, CommandReply, Id, Message, Metres, Mode, Place, Pose, Radians
-from fog_runtime.http import Body, ClientHost, HttpProblem, Operator, ProblemError, Routes
+from fog_runtime.http import Anybody, Body, ClientHost, HttpProblem, Operator, ProblemError, Routes
 from fog_runtime.stores.redis_connection import StoreError
 from planner.problems import PlannerProblem
 from planner.robot_operator import CommandError, RobotOperator
@@ -86,10 +86,12 @@ def add_commands(
         raises=[CommandError],
         problems=[PlannerProblem.NO_ROBOT, PlannerProblem.COMMAND_REFUSED],
     )
-    async def stop(robot: str, client: ClientHost) -> CommandOutcome:
+    async def stop(robot: str, client: ClientHost, caller: Anybody) -> CommandOutcome:
         """Stop a robot at once. Anybody may: this needs no token. An operator must enable it again."""
         check(robot)
-        return outcome(robot, await operator.stop(robot, f"stop from {client or 'an unknown address'}"))
+        sender = f"stop from {client or 'an unknown address'}" if caller is None else caller.name
+        commands = caller is not None and caller.role in ("operator", "admin")
+        return outcome(robot, await operator.stop(robot, sender, each=commands))
 
 
 def _pose(body: CommandBody, places: Mapping[str, Place]) -> Pose | None:

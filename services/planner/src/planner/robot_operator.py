@@ -114,12 +114,12 @@ class StopRecords:
         if sender not in period.senders and len(period.senders) < SENDERS:
             period.senders.add(sender)
             return True
-        self.unrecorded(robot, sender)
+        self.unrecorded(robot, sender, now)
         return False
 
-    def unrecorded(self, robot: str, sender: str) -> None:
-        """Count a stop that has no entry of its own, because it is a repetition or could not be recorded."""
-        period = self._periods[robot]
+    def unrecorded(self, robot: str, sender: str, now: float) -> None:
+        """Count a stop at `now` that has no entry of its own: it is a repetition, or could not be recorded."""
+        period = self._periods.setdefault(robot, _Period(now))
         period.repeats[sender if sender in period.senders else OTHERS] += 1
 
     def due(self, now: float) -> dict[str, Mapping[str, int]]:
@@ -221,18 +221,18 @@ class RobotOperator:
         await self._store.record_command(robot, msgspec.json.encode(detail), Audit(self._clock.stamp(), who, kind))
         return await self._deliver(kind, robot, who, state, pose)
 
-    async def stop(self, robot: str, sender: str) -> CommandReply:
-        """Stop a robot for somebody without a token; return its reply. Repetitions are recorded together.
+    async def stop(self, robot: str, sender: str, *, each: bool = False) -> CommandReply:
+        """Stop a robot for anybody, with a token or without; return its reply. Raises `CommandError`.
 
-        Raises `CommandError`.
+        Repetitions are recorded together, unless `each` of them is to be: those of who may command robots.
         """
         self._overrule(robot)
         try:
             return await self._deliver("disable", robot, sender)
         finally:
-            alone = self._stops.count(robot, sender, self._clock.now())
+            alone = each or self._stops.count(robot, sender, self._clock.now())
             if alone and not await self._record_stop(robot, {"kind": "disable"}, sender, "stop", anybody=True):
-                self._stops.unrecorded(robot, sender)
+                self._stops.unrecorded(robot, sender, self._clock.now())
 
     def _overrule(self, robot: str) -> None:
         try:

@@ -66,7 +66,10 @@ class PlanView(Message, frozen=True, kw_only=True):
 
 
 class RobotSummary(Message, frozen=True, kw_only=True):
-    """A robot with its latest state, goal and plan; `out_of_service`: why it gets no goal."""
+    """A robot with its latest state, goal and plan; `out_of_service`: why it gets no goal.
+
+    `start` and `dock` are where the site says that it begins, and stands on its dock; None: it says nothing.
+    """
 
     id: str
     configured: bool
@@ -74,3 +77,5 @@ class RobotSummary(Message, frozen=True, kw_only=True):
     goal: GoalView | None
     plan: PlanView | None
     out_of_service: OutOfService | None = None
+    start: Pose | None = None
+    dock: Pose | None = None

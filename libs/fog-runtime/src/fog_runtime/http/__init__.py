@@ -32,7 +32,7 @@ from fog_runtime.http.store_routes import (
     next_page,
     undone,
 )
-from fog_runtime.http.tokens import Admin, Caller, Guest, Operator, Tokens, Viewer, load_tokens, still_admits
+from fog_runtime.http.tokens import Admin, Anybody, Caller, Guest, Operator, Tokens, Viewer, load_tokens, still_admits
 from fog_runtime.token_file import TokensError, token_hash
 
 __all__ = [
@@ -41,6 +41,7 @@ __all__ = [
     "RETRY_AFTER",
     "Admin",
     "Answer",
+    "Anybody",
     "Body",
     "Caller",
     "ClientHost",

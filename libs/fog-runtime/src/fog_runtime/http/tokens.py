@@ -212,13 +212,20 @@ def require(role: Role) -> Callable[..., Caller]:
 
 def still_admits(request: Request, role: Role) -> bool:
     """Whether the caller of a request that lasts would be admitted now: a token may be revoked, a session may end."""
+    return _admitted(request, role) is not None
+
+
+def _admitted(request: Request, role: Role) -> Caller | None:
     scheme, _, token = request.headers.get("authorization", "").partition(" ")
     bearer = HTTPAuthorizationCredentials(scheme=scheme, credentials=token) if scheme.lower() == "bearer" else None
     try:
-        require(role)(request, bearer)
+        return require(role)(request, bearer)
     except ProblemError:
-        return False
-    return True
+        return None
+
+
+def _whoever(request: Request) -> Caller | None:
+    return _admitted(request, "guest")
 
 
 _CHALLENGE: Final = {"WWW-Authenticate": "Bearer"}
@@ -251,6 +258,8 @@ def _of_session(request: Request, tokens: Tokens) -> Caller:
     return caller
 
 
+Anybody = Annotated[Caller | None, Depends(_whoever)]
+"""A parameter of a route that needs no token: whose valid one the request has all the same, None for nobody's."""
 Guest = Annotated[Caller, Depends(require("guest"))]
 """A parameter of a route that everybody with a token may call."""
 Viewer = Annotated[Caller, Depends(require("viewer"))]

@@ -1,0 +1,186 @@
+"""Robots in the console, in a real Chromium: stopped, sent, enabled, taken out of service, and why they stand."""
+
+import asyncio
+import json
+import re
+from types import SimpleNamespace
+
+import pytest
+from console_stream import PHONE, VIEWS, WIDE, ConsoleStream, robot_state
+from msgspec import to_builtins
+from playwright.async_api import expect
+
+from fog_contracts.messages import PlanReply
+
+pytestmark = [pytest.mark.browser, pytest.mark.drive]
+
+
+@pytest.mark.parametrize("device", [WIDE, PHONE], ids=["wide", "phone"])
+async def test_stop_is_on_every_view_at_the_same_place_and_needs_one_press(
+    console: SimpleNamespace, stream: ConsoleStream, device: dict[str, object]
+) -> None:
+    page = await console.open(**device)
+    places = set()
+    for number, view in enumerate(VIEWS, 1):
+        await page.evaluate("view => { location.hash = `#/${view}` }", view)
+        await expect(page.locator(f"[data-view={view}]")).to_be_visible()
+        button = page.get_by_role("button", name="Stop r1")
+        places.add(json.dumps(await button.bounding_box()))
+        await button.click()
+        await expect(page.locator(".said")).to_have_text("r1 stops.")
+        assert stream.asked("POST") == ["POST robots/r1/stop"] * number
+    assert len(places) == 1
+    stream.requests.clear()
+    await page.keyboard.press("Shift+F9")
+    async with asyncio.timeout(30):
+        while len(stream.asked("POST")) < 2:  # noqa: ASYNC110  # the page says it for the last one only
+            await asyncio.sleep(0.05)
+    assert sorted(stream.asked("POST")) == ["POST robots/r1/stop", "POST robots/r2/stop"]
+
+
+async def test_stop_that_fails_says_so_and_what_to_do(console: SimpleNamespace, stream: ConsoleStream) -> None:
+    stream.answers["POST robots/r1/stop"] = (504, {"type": "urn:fognav:command_lost", "detail": "r1 does not answer."})
+    page = await console.open()
+    await page.keyboard.press("F9")
+    await expect(page.locator(".said.failed")).to_have_text("r1 was not stopped: r1 does not answer. Stop it by hand.")
+
+
+async def test_robot_tells_who_has_stopped_it_until_somebody_enables_it(
+    console: SimpleNamespace, stream: ConsoleStream
+) -> None:
+    def record(number: int, kind: str, who: str, action: str) -> None:
+        entry = {"at": 1000.0 + number, "who": who, "action": action, "kind": kind, "id": "r1", "entry": str(number)}
+        stream.say("record", str(number), {**entry, "before": None, "after": None})
+
+    waits = robot_state("HOLD", enabled=False, reasons=["waiting for an operator to enable"], codes=["not_enabled"])
+    record(1, "stop", "rui", "stop")
+    record(2, "robot", "ana", "enable")
+    stream.robot("r1", waits)
+    page = await console.open("robots")
+    await expect(page.locator(".lead")).to_have_text("waiting for an operator to enable. Enable it.")
+    record(3, "stop", "stop from 192.168.7.9", "stop")
+    record(4, "stop", "ana", "stop")
+    await expect(page.locator(".lead")).to_have_text(re.compile(r"^Stopped at .* \(ana\)\. Enable it\.$"))
+
+
+async def test_robot_is_sent_home_by_one_press_and_its_message_goes_when_it_has_another_goal(
+    console: SimpleNamespace, stream: ConsoleStream
+) -> None:
+    start = {"x": 5.0, "y": 25.4, "theta": 1.57}  # where the place a is
+    stream.robot("r1", robot_state(), start=start)
+    stream.answers["PUT robots/r1/goal"] = (200, {"goal_id": "home"})
+    page = await console.open("robots")
+    await expect(page.get_by_role("button", name="To the dock")).to_have_count(0)
+    await page.get_by_role("button", name="Send home").click()
+    await expect(page.locator(".said")).to_have_text("r1 drives to A, west entrance.")
+    assert stream.requests[-1] == ("PUT robots/r1/goal", {"place": "a"})
+    await expect(page.locator(".said")).to_be_empty()
+    stream.robot("r1", robot_state(), start=start, dock=start)
+    await page.get_by_role("button", name="To the dock").click()
+    assert stream.requests[-1] == ("POST robots/r1/commands", {"kind": "dock"})
+    await expect(page.get_by_role("button", name="Send home")).to_have_count(0)
+
+
+async def test_enable_asks_first_and_a_refusal_is_said(console: SimpleNamespace, stream: ConsoleStream) -> None:
+    stream.robot("r1", robot_state("HOLD", enabled=False, reasons=["not enabled"], codes=["not_enabled"]))
+    refusal = {"type": "urn:fognav:command_refused", "status": 409, "detail": "a fault must be reset first"}
+    stream.answers["POST robots/r1/commands"] = (409, refusal)
+    page = await console.open("robots")
+    await expect(page.locator(".lead")).to_have_text("not enabled. Enable it.")
+    await page.get_by_role("button", name="Enable", exact=True).click()
+    await page.keyboard.press("Escape")
+    assert stream.asked("POST") == []
+    await page.get_by_role("button", name="Enable", exact=True).click()
+    await page.get_by_role("button", name="Stop r1").click()  # while the question stands there
+    await expect(page.locator(".said")).to_have_text("r1 stops.")
+    await page.get_by_role("button", name="Cancel", exact=True).click()
+    await page.get_by_role("button", name="Enable", exact=True).click()
+    await page.get_by_role("button", name="Yes, Enable").click()
+    await expect(page.locator(".said.failed")).to_contain_text("a fault must be reset first")
+    assert stream.requests[-1] == ("POST robots/r1/commands", {"kind": "enable"})
+
+
+async def test_robot_is_taken_out_of_service_and_put_back_and_says_why_it_gets_no_goal(
+    console: SimpleNamespace, stream: ConsoleStream
+) -> None:
+    page = await console.open("robots")
+    await page.get_by_role("button", name="Take out of service").click()
+    form = page.get_by_role("form", name="Service of r1")
+    await form.get_by_label("Reason").fill("worn wheel")
+    await form.get_by_role("button", name="1.0 h").or_(form.get_by_role("button", name="60 min")).click()
+    await form.get_by_role("button", name="Take out of service").click()
+    await expect(page.locator(".said")).to_have_text("r1 is out of service.")
+    assert stream.requests[-1] == ("PUT robots/r1/out-of-service", {"reason": "worn wheel", "ttl_s": 3600})
+    out = {"id": "1", "reason": "worn wheel", "by": "ana", "since": 1.0, "until": None}
+    stream.robot("r1", robot_state(), out_of_service=out)
+    says = "Out of service: worn wheel (ana). Put it back into service, then send it."
+    await expect(page.locator(".lead")).to_have_text(says)
+    await expect(page.get_by_role("button", name="Send to a goal")).to_be_disabled()
+    stream.robot("r1", robot_state("FAULT", reasons=["bumper"], codes=["bumper"]), out_of_service=out)
+    await expect(page.locator(".lead")).to_contain_text("bumper")
+    await expect(page.get_by_text(says, exact=True)).to_be_visible()
+    await page.get_by_role("button", name="Put back into service").click()
+    await page.get_by_role("form", name="Service of r1").get_by_role("button", name="Put back into service").click()
+    await expect(page.locator(".said")).to_have_text("r1 is in service.")
+    assert stream.requests[-1] == ("DELETE robots/r1/out-of-service", None)
+
+
+async def test_robot_shows_cpu_beside_that_of_one_that_drives_alone_and_its_wifi(
+    console: SimpleNamespace, stream: ConsoleStream
+) -> None:
+    def vitals(stamp: float, agent: float, wifi: float | None) -> dict[str, object]:
+        return {
+            "stamp": stamp, "cpu": {"agent": agent, "guardian": 1.0}, "wifi_dbm": wifi, "battery": 0.7
+        }  # fmt: skip
+
+    stream.answers["GET vitals/r1"] = (200, [vitals(1000.0 + 2 * n, 3.0, -50.0) for n in range(30)])
+    page = await console.open("robots")
+    stream.tell("vitals", "r1", vitals(1060.0, 4.2, -61.0))
+    shown = page.get_by_role("region", name="Its computer, the last ten minutes")
+    await expect(shown.get_by_text("5.2 %")).to_be_visible()
+    await expect(shown.get_by_text("-61 dBm")).to_be_visible()
+    await expect(shown.get_by_text("Dashed: 7.4 % of a core, what a robot took that drove alone")).to_be_visible()
+    await expect(shown.get_by_role("img", name="4.0 % to 5.2 %")).to_be_visible()
+    line = await shown.locator("svg path:not(.baseline)").first.get_attribute("d")
+    assert line.count("L") == 30, "one line through what was kept and what came"
+    assert await shown.locator("path.baseline").count() == 1
+    stream.tell("vitals", "r2", vitals(1060.0, 2.0, None))
+    await expect(page.get_by_role("button", name="r2")).to_contain_text("CPU 3.0 % · no Wi-Fi")
+
+
+async def test_goal_by_click_shows_its_path_before_it_is_sent(console: SimpleNamespace, stream: ConsoleStream) -> None:
+    path = PlanReply(points=[(10.0, 26.0), (30.0, 26.0)], length=20.0)
+    stream.answers["POST plan"] = (200, to_builtins(path))
+    page = await console.open("robots")
+    await page.get_by_role("button", name="Send to a goal").click()
+    await page.locator(".floor").click(position={"x": 400, "y": 300})
+    await expect(page.get_by_text("The path is 20.0 m long.")).to_be_visible()
+    assert stream.asked("PUT") == []
+    await page.get_by_role("button", name="Send", exact=True).click()
+    await expect(page.locator(".said")).to_contain_text("r1 drives to")
+    name, body = stream.requests[-1]
+    assert name == "PUT robots/r1/goal"
+    assert body["pose"]["theta"] is None
+
+
+async def test_pose_is_given_by_a_drag_or_by_two_clicks(console: SimpleNamespace, stream: ConsoleStream) -> None:
+    page = await console.open("robots")
+    await page.get_by_role("button", name="Say where it is").click()
+    form = page.get_by_role("form", name="Where r1 stands")
+    box = await page.locator(".floor").bounding_box()
+    assert box is not None
+    x, y = box["x"] + 300, box["y"] + 300
+    await page.mouse.move(x, y)
+    await page.mouse.down()
+    await page.mouse.move(x, y - 60, steps=3)
+    await page.mouse.up()
+    await expect(form.get_by_label("Heading (°)")).to_have_value("90")
+    dragged = await form.get_by_label("x (m)").input_value()
+    await page.mouse.click(x + 100, y)
+    await expect(form.get_by_text("Now click where it looks.")).to_be_visible()
+    await page.mouse.click(x + 20, y)
+    await expect(form.get_by_label("Heading (°)")).to_have_value("180")
+    assert await form.get_by_label("x (m)").input_value() != dragged
+    await form.get_by_role("button", name="Set").click()
+    await expect(page.locator(".said")).to_contain_text("r1 knows its position")
+    assert stream.requests[-1][1]["kind"] == "initial_pose"

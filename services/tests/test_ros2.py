@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Any, Self, cast
 
 import httpx
+import msgspec
 import numpy as np
 import pytest
 import zenoh
@@ -22,12 +23,29 @@ from manual_clock import ManualClock
 from rosbags.typesys import Stores, get_typestore
 
 from fog_bridges.ros2 import messages as ros
-from fog_bridges.ros2.bridge import GOAL_TYPE, MAP_TYPE, Relay, RosSession, ros_config
+from fog_bridges.ros2.bridge import GOAL_TYPE, MAP_TYPE, POSE_TYPE, Relay
+from fog_bridges.ros2.others import Others, robot_radii
+from fog_bridges.ros2.session import RosSession, ros_config
 from fog_bridges.ros2.wire import Attachment, Node, Topic, WireError, Writer, decoded, type_hash
 from fog_contracts import channels as ch
+from fog_contracts.costs import penalty_cost
 from fog_contracts.grid import GridGeometry
-from fog_contracts.messages import CircleShape, MapSnapshot, RobotPath, RobotPose, RobotState, Zone
-from fog_contracts.replica import MasterMap
+from fog_contracts.messages import (
+    AreaHazard,
+    CircleShape,
+    HazardArea,
+    MapSnapshot,
+    RectangleShape,
+    Reported,
+    RobotPath,
+    RobotPose,
+    RobotState,
+    View,
+    Zone,
+    ZoneSet,
+)
+from fog_contracts.replica import MasterMap, decode_map
+from fog_runtime.clock import SystemClock
 from fog_supervisor import net
 
 DOMAIN = 7
@@ -130,15 +148,17 @@ class Floor:
 
     def __init__(self) -> None:
         self.clock = ManualClock(100.0)
-        self.hear: dict[ch.Channel, Any] = {}
+        self.hear: dict[Any, Any] = {}
+        self.reported: list[tuple[str, Reported]] = []
         self.snapshot: MapSnapshot | None = None
         """The answer to who asks for the map; None: none comes."""
         self.told: dict[str, list[Any]] = {}
-        self.relay = Relay(cast("Any", self), cast("Any", self), cast("Any", None), self.clock)
+        self.relay = Relay(cast("Any", self), cast("Any", self), cast("Any", None), self.clock, Others({"tb4": 0.2}))
         self.relay.subscribe()
 
-    def subscribe(self, channel: ch.Channel, _kind: type, handler: Any) -> None:
-        self.hear[channel] = handler
+    def subscribe(self, what: Any, second: Any, third: Any = None) -> None:
+        """A channel of the floor, its type and handler; or a topic of ROS, its handler and its limit of age."""
+        self.hear[what.name if isinstance(what, Topic) else what] = second if isinstance(what, Topic) else third
 
     async def query(self, *_: object) -> MapSnapshot:
         if self.snapshot is None:
@@ -146,8 +166,17 @@ class Floor:
         assert self.snapshot is not None
         return self.snapshot
 
-    def publish(self, topic: Topic, message: Any, _stamp: float) -> None:
-        self.told.setdefault(topic.name.removeprefix("fognav/test/"), []).append(message)
+    def publish(self, topic: Any, message: Any, _stamp: float = 0.0, *, thing: str = "") -> None:
+        if topic is ch.REPORTED:
+            self.reported.append((thing, message))
+        else:
+            self.told.setdefault(topic.name.removeprefix("fognav/test/"), []).append(message)
+
+    async def show(self, master: MasterMap) -> None:
+        """Let the relay have a map, and tell its masks."""
+        self.snapshot = master.snapshot()
+        await self.relay._load()
+        self.relay._tell_masks()
 
     async def pass_s(self, seconds: float) -> None:
         for _ in range(round(10 * seconds)):
@@ -165,9 +194,7 @@ def plan(wall: int, epoch: int) -> MasterMap:
 async def test_another_map_of_the_same_size_is_told_once():
     floor = Floor()
     for epoch, wall in ((1, 0), (2, 0), (3, 4)):
-        floor.snapshot = plan(wall, epoch).snapshot()
-        await floor.relay._load()
-        floor.relay._tell_masks()
+        await floor.show(plan(wall, epoch))
     walls = [grid.data.reshape(4, 5)[0].tolist().index(100) for grid in floor.told["map"]]
     assert walls == [0, 4], "robots must not drive by the walls of the map before"
 
@@ -189,6 +216,174 @@ async def test_floor_becomes_slow_also_while_a_snapshot_is_waited_for():
     finally:
         for loop in loops:
             loop.cancel()
+
+
+async def test_penalty_zone_is_a_cost_on_the_keepout_mask():
+    floor, master = Floor(), plan(0, 1)
+    shape = RectangleShape(corner=(0.11, 0.01), opposite=(0.24, 0.19))
+    zone = Zone(id="slow", kind="PENALTY", shape=shape, factor=3.0)
+    floor.hear[ch.ZONES]({}, ZoneSet(epoch=1, seq=1, zones=[zone], active=["slow"]))
+    await floor.show(master)
+    mask = floor.told["keepout_mask"][-1].data.reshape(4, 5)
+    assert round(int(mask[2, 3]) * 254 / 100) == pytest.approx(penalty_cost(3.0), abs=1), "as Nav2 computes a cost"
+    assert mask[2, 0] == 0
+    floor.clock.advance(1.0)
+    floor.hear[ch.ZONES]({}, ZoneSet(epoch=1, seq=2, zones=[zone], active=[]))
+    floor.relay._tell_masks()
+    assert not floor.told["keepout_mask"][-1].data.any()
+
+
+async def test_plan_is_cleared_when_the_mission_ends():
+    floor = Floor()
+    path = RobotPath(
+        plan_id=1, planner_epoch=1, goal_id="g", points=[(0.0, 0.0), (1.0, 0.0)], map_epoch=1, map_seq=1,
+        released_length=1.0,
+    )  # fmt: skip
+    state = RobotState(
+        mode="NORMAL", reasons=[], enabled=True, battery=None, goal_id=None, map_epoch=0, map_seq=0, plan_id=None
+    )
+    for told in (path, state, msgspec.structs.replace(state, goal_id="g"), state, state):
+        floor.hear[ch.ROBOT_PATH if told is path else ch.ROBOT_STATE]({"robot": "r-1"}, told)
+    lengths = [len(each.poses) for each in floor.told["r_1/plan"]]
+    assert lengths == [2, 0], "a state from before the robot had its goal clears nothing"
+    reached = msgspec.structs.replace(state, goal_id="g", goal_reached=True)
+    for told in (path, msgspec.structs.replace(state, goal_id="g"), reached):
+        floor.hear[ch.ROBOT_PATH if told is path else ch.ROBOT_STATE]({"robot": "r-1"}, told)
+    assert len(floor.told["r_1/plan"][-1].poses) == 0
+
+
+def test_what_a_lidar_sees_is_a_scan_turned_as_the_map_is():
+    reach = bytearray(180)
+    reach[45], reach[0] = 40, 255
+    told = sent("r1/scan", "sensor_msgs/msg/LaserScan", ros.scan(View(x=1.0, y=2.0, reach=bytes(reach)), "r1", 1.0))
+    assert told.header.frame_id == "r1/view"
+    assert told.ranges[45] == pytest.approx(2.0)
+    assert told.angle_min + 45 * told.angle_increment == pytest.approx(np.radians(91.0))
+    assert np.isnan(told.ranges).sum() == 178, "a sector without an echo says nothing"
+
+
+# --- Robots of others, and obstacles ----------------------------------------------------------------------------------
+
+
+def stamped(pose, frame: str = "map"):
+    return ros.message(
+        "geometry_msgs/msg/PoseWithCovarianceStamped", header=ros.header(1.0, frame),
+        pose=ros.message("geometry_msgs/msg/PoseWithCovariance", pose=pose, covariance=np.zeros(36)),
+    )  # fmt: skip
+
+
+def transforms(*links: tuple[str, str, float, float, float]):
+    """A message of transforms, each by parent, child, x, y, theta."""
+    made = []
+    for parent, child, *where in links:
+        (each,) = ros.transform(*where, child, 1.0).transforms
+        each.header.frame_id = parent
+        made.append(each)
+    return ros.message("tf2_msgs/msg/TFMessage", transforms=made)
+
+
+def test_robot_of_others_is_where_its_pose_or_its_transforms_say():
+    floor = Floor()
+    floor.hear["tb4/amcl_pose"](stamped(ros.pose(1.0, 2.0, 0.5)))
+    ((thing, told),) = floor.reported
+    assert (thing, told.kind, told.shape, told.theta) == (
+        "tb4", "robot", CircleShape(centre=(1.0, 2.0), radius=0.2), pytest.approx(0.5)
+    )  # fmt: skip
+    floor.clock.advance(1.0)
+    floor.hear["tb4/tf"](transforms(("map", "odom", 1.0, 0.0, np.pi / 2)))
+    assert len(floor.reported) == 1, "where the base is in `odom` is not known yet"
+    floor.hear["tb4/tf"](transforms(("tb4/odom", "tb4/base_link", 2.0, 0.0, 0.0)))
+    assert floor.reported[-1][1].shape.centre == pytest.approx((1.0, 2.0))
+    floor.hear["tb4/tf"](transforms(("odom", "base_link", 2.5, 0.0, 0.0)))
+    assert len(floor.reported) == 2, "at most five reports a second"
+    floor.clock.advance(4.0)
+    floor.hear["tb4/tf"](transforms(("odom", "base_link", 2.5, 0.0, 0.0)))
+    assert len(floor.reported) == 2, "its localization is silent"
+
+
+@pytest.mark.parametrize(
+    ("topic", "message", "reason"),
+    [
+        ("tb4/amcl_pose", stamped(ros.pose(1.0, 2.0, 0.0), "odom"), "frame"),
+        ("tb4/amcl_pose", stamped(ros.pose(float("nan"), 2.0, 0.0)), "malformed"),
+        ("tb4/tf", transforms(("map", "base_link", float("inf"), 0.0, 0.0)), "malformed"),
+        ("tb4/tf", transforms(*[("a", f"f{n}", 0.0, 0.0, 0.0) for n in range(201)]), "malformed"),
+    ],
+)
+def test_pose_that_is_none_is_refused(topic, message, reason):
+    floor = Floor()
+    with pytest.raises(WireError) as refused:
+        floor.hear[topic](message)
+    assert (refused.value.reason, floor.reported) == (reason, [])
+
+
+def test_transforms_that_lead_in_a_circle_lead_nowhere():
+    floor = Floor()
+    floor.hear["tb4/tf"](transforms(("base_link", "odom", 0.0, 0.0, 0.0), ("odom", "base_link", 0.0, 0.0, 0.0)))
+    assert floor.reported == []
+
+
+async def test_mask_leaves_out_a_robot_of_others_but_not_the_hazard_that_it_stands_in():
+    floor = Floor()
+    geometry = GridGeometry(40, 40, 0.05, 0.0, 0.0)
+    cost = np.zeros((40, 40), np.uint8)
+    cost[16:24, 16:24] = 254
+    ring = [(0.8, 0.8), (1.0, 0.8), (1.0, 1.2), (0.8, 1.2)]
+    hazard = AreaHazard(area="hall", state="blocked", severity=3, penalty=254, since=0.0, seq=1, epoch=1, cause="")
+    for blocked in (False, True):
+        floor.clock.advance(1.0)
+        floor.hear["tb4/amcl_pose"](stamped(ros.pose(1.0, 1.0, 0.0)))
+        if blocked:
+            floor.hear[ch.HAZARD]({"area": "hall"}, HazardArea(hazard=hazard, polygon=ring))
+        await floor.show(MasterMap("test", geometry, np.zeros((40, 40), np.uint8), cost, 1))
+        mask = floor.told["keepout_mask"][-1].data.reshape(40, 40)
+        assert (bool(mask[20, 17]), bool(mask[20, 22])) == (blocked, False)
+
+
+def obstacle(number: int, source: str = "camera", action: int = 1, size: float = 1.0, level: str = ""):
+    return ros.message(
+        "rmf_obstacle_msgs/msg/Obstacle", header=ros.header(1.0), id=number, source=source, level_name=level,
+        classification="box", data_resolution=0.0, data=np.zeros(0, np.int8), action=action,
+        bbox=ros.message(
+            "rmf_obstacle_msgs/msg/BoundingBox3D", center=ros.pose(2.0, 2.0, np.pi / 4),
+            size=ros.message("geometry_msgs/msg/Vector3", x=size, y=size, z=1.0),
+        ),
+        lifetime=ros.message("builtin_interfaces/msg/Duration", sec=5, nanosec=0),
+    )  # fmt: skip
+
+
+def obstacles(*found):
+    message = ros.message("rmf_obstacle_msgs/msg/Obstacles", header=ros.header(1.0), obstacles=list(found))
+    payload, _ = Writer(Topic("rmf_obstacles", "rmf_obstacle_msgs/msg/Obstacles"), "token").encoded(message, 1)
+    return decoded(Topic("rmf_obstacles", "rmf_obstacle_msgs/msg/Obstacles"), payload)
+
+
+def test_obstacles_of_others_are_reported_for_their_lifetime_and_deleted():
+    assert type_hash("rmf_obstacle_msgs/msg/Obstacles") == (
+        "RIHS01_7b96bbe6a33162d9ad6d751b8f08dbaa32c23c5b4a8942c78d5249f48443b701"
+    )
+    floor = Floor()
+    hear = floor.hear["rmf_obstacles"]
+    hear(obstacles(obstacle(3), obstacle(-4), obstacle(5, source="fognav test")))
+    first, second = floor.reported
+    assert first[1].shape.points[0] == pytest.approx((2.0, 2.0 - np.sqrt(0.5)))
+    assert (first[1].kind, first[1].ttl, first[0] != second[0]) == ("obstacle", 5.0, True)
+    hear(obstacles(obstacle(3, action=2), obstacle(0, action=3)))
+    assert [(thing, told.shape) for thing, told in floor.reported[2:]] == [(first[0], None), (second[0], None)]
+    for wrong in (obstacle(3, size=float("nan")), obstacle(3, size=50.0), obstacle(3, action=9)):
+        with pytest.raises(WireError):
+            hear(obstacles(wrong))
+    for number in range(200):
+        hear(obstacles(obstacle(number)))
+    with pytest.raises(WireError, match="200 obstacles"):
+        hear(obstacles(obstacle(200)))
+
+
+@pytest.mark.parametrize("text", ["tb4", "tb4:0", "tb4:3", "4b:0.2", "a/b:0.2", "tb_4:0.2,TB_4:0.3"])
+def test_robots_of_others_without_name_or_radius_are_refused(text):
+    with pytest.raises(ValueError, match="robot"):
+        robot_radii(text)
+    assert robot_radii(" tb4:0.2, Carter_1:0.35 ") == {"tb4": 0.2, "Carter_1": 0.35}
 
 
 # --- With real services -----------------------------------------------------------------------------------------------
@@ -235,6 +430,12 @@ class Peer:
         self.session.put(f"{DOMAIN}/{name}/{key}", payload, attachment=attachment)
 
 
+def encoded(name: str, kind: str, message: object) -> tuple[str, bytes, bytes]:
+    """Return key, payload and attachment of a message as it is sent."""
+    topic = Topic(name, kind)
+    return topic.key(0).removeprefix(f"0/{name}/"), *Writer(topic, "t").encoded(message, time.time_ns())
+
+
 @pytest.fixture
 def ros_router():
     """A router as ROS 2 users start one; yields its port."""
@@ -262,6 +463,7 @@ async def ros2(all_services, tokens, ros_router):
         FOGNAV_ADAPTERS="ros2",
         FOGNAV_ROS2_ROUTER=f"tcp/127.0.0.1:{ros_router}",
         FOGNAV_ROS2_DOMAIN=str(DOMAIN),
+        FOGNAV_ROS2_ROBOTS="tb4:0.2",
         FOGNAV_CONSOLE_URL=await all_services.ready("console_service"),
         FOGNAV_TOKEN_FILE=str(token),
         FOGNAV_CREDENTIALS_FILE=str(all_services.security.credentials("bridge")),
@@ -316,11 +518,13 @@ async def test_zone_is_on_the_mask_of_a_late_joiner_and_goes_again_and_goals_rea
                     "geometry_msgs/msg/PoseStamped", header=ros.header(time.time()), pose=ros.pose(4.0, 3.0, 1.0)
                 )
                 payload, attachment = Writer(Topic("r_1/goal_pose", "geometry_msgs/msg/PoseStamped"), "t").encoded(
-                    goal, 1
+                    goal, time.time_ns()
                 )
                 for damaged in ((payload[:20], attachment), (payload, None), (payload, b"x"), (b"", attachment)):
                     peer.send("r_1/goal_pose", GOAL, *damaged)
                 peer.send("r_1/goal_pose", "geometry_msgs::msg::dds_::PoseStamped_/RIHS01_other", payload, attachment)
+                old = Attachment(9, time.time_ns() - 60 * 10**9, bytes(16))
+                peer.send("r_1/goal_pose", GOAL, payload, old.encoded())
                 peer.send("r_1/goal_pose", GOAL, payload, attachment)
                 mission = partial(planner.get, "/api/v1/robots/r-1/goal", headers=operator)
                 async with asyncio.timeout(60.0):
@@ -330,9 +534,37 @@ async def test_zone_is_on_the_mask_of_a_late_joiner_and_goes_again_and_goals_rea
                 metrics = (await planner.get(f"{await fog.url('fog_bridges')}/metrics")).text
                 assert 'refused_messages_total{reason="malformed",system="ros2"} 4.0' in metrics
                 assert 'refused_messages_total{reason="type_hash",system="ros2"} 1.0' in metrics
+                assert 'refused_messages_total{reason="old",system="ros2"} 1.0' in metrics
             finally:
                 publishing.cancel()
                 await planner.aclose()
+
+
+@pytest.mark.live
+async def test_robot_and_obstacle_of_others_are_on_the_floors_map_and_the_robot_on_no_mask(ros2, until):
+    fog, port = ros2
+    rmf = "rmf_obstacles", "rmf_obstacle_msgs/msg/Obstacles"
+    async with fog.edges() as edges:
+        with Peer(port) as peer:
+            peer.hear("fognav/test/keepout_mask", "nav_msgs/msg/OccupancyGrid", GRID)
+
+            async def send() -> None:
+                while True:
+                    peer.send("tb4/amcl_pose", *encoded("tb4/amcl_pose", POSE_TYPE, stamped(ros.pose(5.0, 4.0, 0.0))))
+                    peer.send(rmf[0], *encoded(*rmf, obstacles(obstacle(1))))
+                    await asyncio.sleep(0.2)
+
+            sending = asyncio.create_task(send())
+            try:
+                await until(lambda: peer.told and peer.mask()[40, 40] == 100, "the obstacle of others is on the mask")
+                snapshot = await edges[1].query(ch.MAP_SNAPSHOT, None, MapSnapshot, 10.0)
+                assert snapshot is not None
+                costs = decode_map(snapshot).layers["cost"]
+                assert costs[80, 100] == 254, "the robot of others is on the floor's map"
+                assert peer.mask()[80, 100] == 0, "and on no mask, which it follows itself"
+            finally:
+                sending.cancel()
+            await until(lambda: not peer.mask().any(), "the obstacle's lifetime is over")
 
 
 @pytest.mark.live
@@ -340,7 +572,7 @@ async def test_node_whose_protocol_code_is_not_ours_hears_the_mask_and_sends_a_g
     if PEERS not in os.environ:
         pytest.skip(f"set {PEERS} to a Python that has zenoh-ros2-sdk: pip install zenoh-ros2-sdk==0.1.8")
     loop, goals = asyncio.get_running_loop(), []
-    session = RosSession(zenoh.open(ros_config(f"tcp/127.0.0.1:{ros_router}")), DOMAIN, "fognav_test")
+    session = RosSession(zenoh.open(ros_config(f"tcp/127.0.0.1:{ros_router}")), DOMAIN, "fognav_test", SystemClock())
     try:
         session.subscribe(Topic("r1/goal_pose", GOAL_TYPE), goals.append)
         script = Path(__file__).with_name("ros2_peer.py")

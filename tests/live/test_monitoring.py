@@ -63,7 +63,8 @@ class Prometheus:
         self.robots = folder / "robots"  # prometheus.yml names it relative to itself
         self.robots.mkdir()
         config["rule_files"] = [str(DEPLOYED / "prometheus" / "rules" / "*.yml")]
-        fog, robots = config["scrape_configs"]
+        fog, bridge, robots = config["scrape_configs"]
+        config["scrape_configs"].remove(bridge)  # the system has none
         # One machine instead of one host name per service.
         assert [target.split(":")[0] for target in fog["static_configs"][0]["targets"]] == list(SERVICES)
         del fog["relabel_configs"]

@@ -60,6 +60,8 @@ class Settings(CommonSettings, frozen=True, kw_only=True):
     """Where rmw_zenoh's router (`rmw_zenohd`) listens; on a fog node its usual port is Fognav's own router's."""
     ros2_domain: Annotated[int, msgspec.Meta(ge=0, le=232)] = 0
     """ROS_DOMAIN_ID of the robots."""
+    ros2_robots: str = ""
+    """Robots of others that become obstacles: their namespaces and radii (m), `tb4:0.2, carter:0.35`."""
     ros2_session_config: Path | None = None
     """A file as ZENOH_SESSION_CONFIG_URI names one, with TLS, say; then `ros2_router` is not used."""
 
@@ -111,16 +113,19 @@ def _home_assistant(settings: Settings, site: str, clock: Clock) -> Adapter:
 
 def _ros2(settings: Settings, site: str, _: Clock) -> Adapter:
     try:
-        from fog_bridges.ros2.bridge import Ros2Bridge, ros_config  # noqa: PLC0415  # an extra
+        from fog_bridges.ros2.bridge import Ros2Bridge  # noqa: PLC0415  # an extra
+        from fog_bridges.ros2.others import robot_radii  # noqa: PLC0415  # an extra
+        from fog_bridges.ros2.session import ros_config  # noqa: PLC0415  # an extra
     except ImportError as error:
         raise SettingsError(f"the adapter ros2 needs more ({error}): pip install 'fog-bridges[ros2]'") from error
     if settings.ros2_session_config is None and not settings.ros2_router:
         raise SettingsError("ros2_router names where `rmw_zenohd` listens: tcp/192.168.7.5:7447, say")
     try:
         config = ros_config(settings.ros2_session_config or settings.ros2_router)
+        others = robot_radii(settings.ros2_robots)
     except ValueError as error:
         raise SettingsError(str(error)) from error
-    return Ros2Bridge(site, config, settings.ros2_domain, settings.zenoh_endpoints, settings.credentials())
+    return Ros2Bridge(site, config, settings.ros2_domain, settings.zenoh_endpoints, settings.credentials(), others)
 
 
 ADAPTERS: Final[Mapping[str, Callable[[Settings, str, Clock], Adapter]]] = {

@@ -9,7 +9,17 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from fog_contracts.messages import AreaDefinition, AreaHazard, NodeReading, Pose, RobotPose, SonarStatus, UnknownPolicy
+from fog_contracts.messages import (
+    AreaDefinition,
+    AreaHazard,
+    CircleShape,
+    NodeReading,
+    Pose,
+    Reported,
+    RobotPose,
+    SonarStatus,
+    UnknownPolicy,
+)
 from fog_contracts.site import NodeSite, RobotSite, Sonar
 from hazard_aggregator.debounce import DebounceError, Observation, RuleFactory
 from hazard_aggregator.fusion import AreaFusion
@@ -502,6 +512,19 @@ def test_echo_of_a_robot_in_the_cone_does_not_block_a_clear_area():
     assert (rig.hazard.state, rig.hazard.explained_by) == ("clear", "r1")
     rig.read(3.0, 3.0, times=5)
     assert (rig.hazard.state, rig.hazard.explained_by) == ("clear", None)
+
+
+def test_echo_of_a_robot_of_others_does_not_block_a_clear_area_and_no_other_report_explains_one():
+    for kind, robot in (("robot", "tb4"), ("obstacle", "tb4"), ("robot", "r1")):
+        rig = Rig(site("n1"), robots=[RobotSite(id="r1", start=START, radius=0.17)])
+        told = Reported(kind=kind, shape=CircleShape(centre=(1.0, 0.5), radius=0.17), ttl=3.0)
+        rig.read(3.0, 3.0, times=5)
+        for _ in range(60):
+            rig.core.on_reported(robot, told, rig.now)
+            rig.read(0.83, 3.0)
+            rig.wait(0.0)
+        expected = ("clear", "tb4") if (kind, robot) == ("robot", "tb4") else ("blocked", None)
+        assert (rig.hazard.state, rig.hazard.explained_by) == expected
 
 
 def test_echo_of_a_robot_in_the_cone_does_not_clear_a_blocked_area():

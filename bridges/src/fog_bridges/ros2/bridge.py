@@ -7,19 +7,17 @@ once. A floor that falls silent becomes slow everywhere, as it does for the floo
 from __future__ import annotations
 
 import asyncio
-import json
 from functools import partial
-from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 import zenoh
-import zenoh.ext as ze
-from prometheus_client import Counter
 
 from fog_bridges.floor import Request
 from fog_bridges.ros2 import messages as ros
-from fog_bridges.ros2.wire import Attachment, Node, RosMessage, Topic, WireError, Writer, decoded, type_hash
+from fog_bridges.ros2.others import Others, thing_id
+from fog_bridges.ros2.session import RosSession
+from fog_bridges.ros2.wire import RosMessage, Topic, WireError
 from fog_contracts import channels as ch
 from fog_contracts.codec import ContractError
 from fog_contracts.costs import DEGRADED_SPEED
@@ -29,6 +27,7 @@ from fog_contracts.messages import (
     MapDelta,
     MapHeartbeat,
     MapSnapshot,
+    RobotObstacles,
     RobotPath,
     RobotPose,
     RobotState,
@@ -40,12 +39,13 @@ from fog_runtime.clock import ticker
 from fog_runtime.transports.zenoh_edge import ZenohEdge
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Mapping, Sequence
+    from collections.abc import Mapping, Sequence
 
     from numpy.typing import NDArray
 
     from fog_bridges.floor import Floor
     from fog_contracts.grid import GridGeometry
+    from fog_contracts.messages import Reported, Zone
     from fog_runtime.clock import Clock
     from fog_runtime.credentials import Credentials
 
@@ -56,123 +56,18 @@ SILENT_S: Final = 2.0
 TICK_S: Final = 0.1
 SNAPSHOT_TIMEOUT_S: Final = 3.0
 RETRY_S: Final = 1.0
-_RETRY: Final = {"period_init_ms": 200, "period_max_ms": 1000, "period_increase_factor": 1.5}
 _NO_ROUTER: Final = "ROS's router (`ros2 run rmw_zenoh_cpp rmw_zenohd`) is not connected"
 GOALS_AT_ONCE: Final = 20
+GOAL_MAX_AGE_S: Final = 10.0
+"""An older goal is refused: who sent it may have forgotten it."""
 MAP_TYPE: Final = "nav_msgs/msg/OccupancyGrid"
 INFO_TYPE: Final = "nav2_msgs/msg/CostmapFilterInfo"
 GOAL_TYPE: Final = "geometry_msgs/msg/PoseStamped"
+POSE_TYPE: Final = "geometry_msgs/msg/PoseWithCovarianceStamped"
+TF_TYPE: Final = "tf2_msgs/msg/TFMessage"
+OBSTACLES_TYPE: Final = "rmf_obstacle_msgs/msg/Obstacles"
 
-REFUSED = Counter(
-    "fognav_bridge_refused_messages_total", "Messages of other systems that were not understood", ["system", "reason"]
-)
 _log = logs.get("ros2")
-
-
-def ros_config(source: Path | str) -> zenoh.Config:
-    """Return the configuration of a session: that of a file, or that of a client of the router at an address.
-
-    rmw_zenoh's own sessions are peers, which a router connects with one another only where they can't be reached
-    directly; a client's messages always go by the router. Raises `ValueError`.
-    """
-    try:
-        if isinstance(source, Path):
-            return zenoh.Config.from_file(str(source))
-        config = zenoh.Config()
-        values = {
-            "mode": "client", "connect/endpoints": [source], "connect/retry": _RETRY,
-            "scouting/multicast/enabled": False, "timestamping/enabled": True,
-        }  # fmt: skip
-        for key, value in values.items():
-            config.insert_json5(key, json.dumps(value))
-    except zenoh.ZError as error:
-        raise ValueError(f"{source} can't be used to reach ROS's router: {error}") from error
-    return config
-
-
-class RosSession:
-    """A node of ROS on a zenoh session: publishers and subscribers with their tokens of presence.
-
-    Subscribers' handlers are called on the event loop's thread.
-    """
-
-    def __init__(self, session: zenoh.Session, domain: int, name: str) -> None:
-        """Introduce the node `name`."""
-        self._session = session
-        self._loop = asyncio.get_running_loop()
-        self._domain = domain
-        self._node = Node(domain, str(self._session.info.zid()), name)
-        self._held: list[object] = [self._session.liveliness().declare_token(self._node.token)]
-        self._writers: dict[Topic, tuple[Writer, Any]] = {}
-        self._limited = logs.RateLimited(_log)
-
-    @property
-    def connected(self) -> bool:
-        """Whether a router or a peer is connected."""
-        info = self._session.info
-        return bool(info.routers_zid() or info.peers_zid())
-
-    def publish(self, topic: Topic, message: object, stamp: float) -> None:
-        """Publish a message without waiting; `stamp` (s since 1970) is when."""
-        if topic not in self._writers:
-            self._writers[topic] = self._writer(topic)
-        writer, publisher = self._writers[topic]
-        payload, attachment = writer.encoded(message, int(stamp * 1e9))
-        try:
-            publisher.put(payload, attachment=attachment)
-        except zenoh.ZError as error:
-            self._limited.warning("message_dropped", topic.name, self._loop.time(), topic=topic.name, reason=str(error))
-
-    def _writer(self, topic: Topic) -> tuple[Writer, Any]:
-        token = self._node.entity("MP", topic)
-        key = topic.key(self._domain)
-        if topic.latched:
-            publisher: Any = ze.declare_advanced_publisher(
-                self._session, key, congestion_control=zenoh.CongestionControl.DROP, publisher_detection=True,
-                cache=ze.CacheConfig(max_samples=1),
-                sample_miss_detection=ze.MissDetectionConfig(heartbeat=None, sporadic_heartbeat=0.5),
-            )  # fmt: skip
-        else:
-            publisher = self._session.declare_publisher(key, congestion_control=zenoh.CongestionControl.DROP)
-        self._held.append(self._session.liveliness().declare_token(token))
-        return Writer(topic, token), publisher
-
-    def subscribe(self, topic: Topic, handler: Callable[[RosMessage], object]) -> None:
-        """Call a handler with each message; one of another definition of its type, or none, is counted and logged."""
-
-        def on_sample(sample: zenoh.Sample) -> None:
-            attachment = None if sample.attachment is None else sample.attachment.to_bytes()
-            arrived = (str(sample.key_expr), sample.payload.to_bytes(), attachment)
-            if not self._loop.is_closed():
-                self._loop.call_soon_threadsafe(self._on_sample, topic, handler, *arrived)
-
-        self._held.append(self._session.declare_subscriber(topic.any_hash(self._domain), on_sample))
-        self._held.append(self._session.liveliness().declare_token(self._node.entity("MS", topic)))
-
-    def _on_sample(
-        self, topic: Topic, handler: Callable[[RosMessage], object], key: str, payload: bytes, attachment: bytes | None
-    ) -> None:
-        own, theirs = type_hash(topic.type), key.rpartition("/")[2]
-        if theirs not in (own, "TypeHashNotSupported"):
-            self.refuse("type_hash", topic.name, f"the sender's {topic.type} is {theirs}, and ours is {own}: "
-                        "it was built with another version of the message's package")  # fmt: skip
-            return
-        try:
-            Attachment.decoded(attachment or b"")
-            message = decoded(topic, payload)
-        except WireError as error:
-            self.refuse("malformed", topic.name, str(error))
-            return
-        handler(message)
-
-    def refuse(self, reason: str, topic: str, words: str) -> None:
-        """Count and log a message that is not understood."""
-        REFUSED.labels("ros2", reason).inc()
-        self._limited.warning("message_refused", topic, self._loop.time(), topic=topic, reason=words)
-
-    def close(self) -> None:
-        """Close the session; its tokens go with it."""
-        self._session.close()  # type: ignore[no-untyped-call]  # zenoh's stub has no types for it
 
 
 class Ros2Bridge:
@@ -180,8 +75,15 @@ class Ros2Bridge:
 
     name: Final = "ros2"
 
-    def __init__(self, site: str, config: zenoh.Config, domain: int, connect: Sequence[str], own: Credentials) -> None:
-        """Serve the domain of the router that `config` connects to; `connect` are the floor's, for whom `own` are."""
+    def __init__(  # both sides that it connects
+        self, site: str, config: zenoh.Config, domain: int, connect: Sequence[str], own: Credentials,
+        others: Mapping[str, float],
+    ) -> None:  # fmt: skip
+        """Serve the domain of the router that `config` connects to; `connect` are the floor's, for whom `own` are.
+
+        `others` are the robots of others, each with its radius (m).
+        """
+        self._others = others
         self._site = site
         self._config = config
         self._domain = domain
@@ -198,13 +100,13 @@ class Ros2Bridge:
 
     async def run(self, floor: Floor, clock: Clock) -> None:
         """Connect, and do all until cancelled."""
-        session = RosSession(await self._opened(), self._domain, f"fognav_{ros.ros_name(self._site)}")
+        session = RosSession(await self._opened(), self._domain, f"fognav_{ros.ros_name(self._site)}", clock)
         opened = ZenohEdge.open(
             connect=self._connect, clock=clock, role=ch.BRIDGE, id=self._site, site=self._site, credentials=self._own
         )
         try:
             async with opened as fog, asyncio.TaskGroup() as tasks:
-                relay = Relay(fog, session, floor, clock)
+                relay = Relay(fog, session, floor, clock, Others(self._others))
                 relay.subscribe()
                 tasks.create_task(relay.snapshot_loop(), name="snapshot")
                 tasks.create_task(relay.map_loop(), name="map")
@@ -237,8 +139,10 @@ def _problem(fog: ZenohEdge, session: RosSession, relay: Relay) -> str:
 class Relay:
     """What is told between a floor and a node of ROS; its loops are tasks of the adapter."""
 
-    def __init__(self, fog: ZenohEdge, session: RosSession, floor: Floor, clock: Clock) -> None:
-        """Pass on what `fog` hears on `session`, and goals to `floor`."""
+    def __init__(  # both sides, and what they tell each other by
+        self, fog: ZenohEdge, session: RosSession, floor: Floor, clock: Clock, others: Others
+    ) -> None:
+        """Pass on what `fog` hears on `session`, goals to `floor`, and robots of others to the map."""
         self._fog = fog
         self._session = session
         self._floor = floor
@@ -261,8 +165,13 @@ class Relay:
         self._is_slow = False
         self._hazards: dict[str, HazardArea] = {}
         self._zones = ZoneSet(epoch=0, seq=0, zones=[], active=[])
-        self._robots: set[str] = set()
-        self._goals: asyncio.Queue[tuple[str, Request]] = asyncio.Queue(GOALS_AT_ONCE)
+        self._others = others
+        self._penalties: NDArray[np.int8] | None = None
+        """What the zones in force add to the keepout mask; None: to be computed anew, as is `_closed`."""
+        self._closed: NDArray[np.bool_] | None = None
+        self._driving: dict[str, str | None] = {}
+        """The goal that each robot has, by its last state."""
+        self._goals: asyncio.Queue[tuple[str, float, Request]] = asyncio.Queue(GOALS_AT_ONCE)
 
     def subscribe(self) -> None:
         """Register subscriptions, and tell what the masks are."""
@@ -274,6 +183,11 @@ class Relay:
         fog.subscribe(ch.ROBOT_STATE, RobotState, self._on_state)
         fog.subscribe(ch.ROBOT_POSE, RobotPose, self._on_pose)
         fog.subscribe(ch.ROBOT_PATH, RobotPath, self._on_path)
+        fog.subscribe(ch.ROBOT_OBSTACLES, RobotObstacles, self._on_view)
+        for name in self._others.radii:
+            self._session.subscribe(Topic(f"{name}/amcl_pose", POSE_TYPE), partial(self._on_other_pose, name))
+            self._session.subscribe(Topic(f"{name}/tf", TF_TYPE), partial(self._on_other_tf, name))
+        self._session.subscribe(Topic("rmf_obstacles", OBSTACLES_TYPE), self._on_obstacles)
         for kind, (topic, mask) in self._infos.items():
             self._session.publish(topic, ros.filter_info(kind, mask, self._stamp()), self._stamp())
 
@@ -291,8 +205,11 @@ class Relay:
     async def goal_loop(self) -> None:
         """Pass on goals, one after the other."""
         while True:
-            robot, request = await self._goals.get()
-            if refusal := await self._floor.send(request):
+            robot, arrived, request = await self._goals.get()
+            waited = self._now() - arrived
+            if waited > GOAL_MAX_AGE_S:
+                self._session.refuse("old", f"{robot}/goal_pose", f"it has waited for {waited:.0f} s: send it again")
+            elif refusal := await self._floor.send(request):
                 self._session.refuse("goal", f"{robot}/goal_pose", refusal)
 
     # --- The map ------------------------------------------------------------------------------------------------------
@@ -324,6 +241,7 @@ class Relay:
             self._static = replica.static
             if not same:
                 self._geometry, self._told, self._is_dirty = replica.geometry, {}, True
+                self._penalties = self._closed = None
                 told = ros.grid(ros.map_values(replica.static), replica.geometry, stamp)
                 self._session.publish(self._map, told, stamp)
                 self._tell_markers()
@@ -334,7 +252,7 @@ class Relay:
             return
         limit = DEGRADED_SPEED / 100.0 if is_slow else None
         fresh = {
-            self._keepout: ros.keepout_values(replica.cost, replica.static),
+            self._keepout: self._keepout_mask(replica.cost, replica.geometry),
             self._speed: ros.speed_values(replica.speed, limit),
         }
         changed = {topic: values for topic, values in fresh.items() if self._differs(topic, values)}
@@ -344,6 +262,16 @@ class Relay:
         for topic, values in changed.items():
             self._told[topic], self._told_at = values, now
             self._session.publish(topic, ros.grid(values, replica.geometry, stamp), stamp)
+
+    def _keepout_mask(self, cost: NDArray[np.uint8], geometry: GridGeometry) -> NDArray[np.int8]:
+        mask = ros.keepout_values(cost, self._static)
+        if self._others.radii:
+            if self._closed is None:
+                self._closed = ros.closed_cells(self._hazards.values(), self._in_force(), geometry)
+            mask = self._others.without_robots(mask, geometry, self._closed, self._now())
+        if self._penalties is None:
+            self._penalties = ros.penalty_values(self._in_force(), geometry)
+        return np.maximum(mask, self._penalties) if self._penalties.size else mask
 
     def _differs(self, topic: Topic, values: NDArray[np.int8]) -> bool:
         return topic not in self._told or not np.array_equal(self._told[topic], values)
@@ -366,32 +294,51 @@ class Relay:
 
     def _on_hazard(self, ids: Mapping[str, str], hazard: HazardArea) -> None:
         self._hazards[ids["area"]] = hazard
+        self._closed, self._is_dirty = None, True
         self._tell_markers()
 
     def _on_zones(self, _: Mapping[str, str], zones: ZoneSet) -> None:
         self._zones = zones
+        self._penalties, self._closed, self._is_dirty = None, None, True
         self._tell_markers()
 
+    def _in_force(self) -> list[Zone]:
+        active = set(self._zones.active)
+        return [zone for zone in self._zones.zones if zone.id in active]
+
     def _tell_markers(self) -> None:
-        in_force = [zone for zone in self._zones.zones if zone.id in set(self._zones.active)]
         stamp = self._stamp()
-        self._session.publish(self._markers, ros.markers(self._hazards, in_force, self._geometry, stamp), stamp)
+        self._session.publish(self._markers, ros.markers(self._hazards, self._in_force(), self._geometry, stamp), stamp)
 
     def _on_state(self, ids: Mapping[str, str], state: RobotState) -> None:
         robot = ids["robot"]
-        if robot not in self._robots:
-            self._robots.add(robot)
+        if robot not in self._driving:
             goal = Topic(f"{ros.ros_name(robot)}/goal_pose", GOAL_TYPE)
-            self._session.subscribe(goal, partial(self._on_goal, robot))
+            self._session.subscribe(goal, partial(self._on_goal, robot), GOAL_MAX_AGE_S)
+        goal_id = None if state.goal_reached else state.goal_id
+        if goal_id is None and self._driving.get(robot) is not None:
+            self._tell(robot, "plan", "nav_msgs/msg/Path", ros.path(None, self._stamp()))
+        self._driving[robot] = goal_id
         self._tell(robot, "battery_state", "sensor_msgs/msg/BatteryState", ros.battery(state, self._stamp()))
 
     def _on_pose(self, ids: Mapping[str, str], pose: RobotPose) -> None:
         robot = ids["robot"]
-        self._session.publish(Topic("tf", "tf2_msgs/msg/TFMessage"), ros.transform(pose, robot), self._stamp())
+        self._session.publish(
+            Topic("tf", "tf2_msgs/msg/TFMessage"),
+            ros.transform(pose.x, pose.y, pose.theta, f"{ros.ros_name(robot)}/base_footprint", pose.stamp),
+            self._stamp(),
+        )
         self._tell(robot, "pose", "geometry_msgs/msg/PoseWithCovarianceStamped", ros.robot_pose(pose))
 
     def _on_path(self, ids: Mapping[str, str], path: RobotPath) -> None:
         self._tell(ids["robot"], "plan", "nav_msgs/msg/Path", ros.path(path, self._stamp()))
+
+    def _on_view(self, ids: Mapping[str, str], seen: RobotObstacles) -> None:
+        if (view := seen.view) is not None:
+            robot, stamp = ids["robot"], self._stamp()
+            frame = ros.transform(view.x, view.y, 0.0, f"{ros.ros_name(robot)}/view", stamp)
+            self._session.publish(Topic("tf", TF_TYPE), frame, stamp)
+            self._tell(robot, "scan", "sensor_msgs/msg/LaserScan", ros.scan(view, robot, stamp))
 
     def _tell(self, robot: str, name: str, kind: str, message: object) -> None:
         self._session.publish(Topic(f"{ros.ros_name(robot)}/{name}", kind), message, self._stamp())
@@ -399,18 +346,33 @@ class Relay:
     def _on_goal(self, robot: str, goal: RosMessage) -> None:
         x, y = goal.pose.position.x, goal.pose.position.y
         theta = ros.heading(goal.pose.orientation)
-        topic = f"{robot}/goal_pose"
         if goal.header.frame_id not in ("", ros.MAP_FRAME):
             frame = goal.header.frame_id[:40]
-            self._session.refuse("frame", topic, f"a goal in the frame {frame!r}: send it in {ros.MAP_FRAME!r}")
-        elif not np.isfinite((x, y)).all():
-            self._session.refuse("malformed", topic, f"a goal at ({x}, {y})")
-        else:
-            pose = {"x": x, "y": y} | ({} if theta is None else {"theta": theta})
-            try:
-                self._goals.put_nowait((robot, Request("PUT", f"/api/v1/robots/{robot}/goal", {"pose": pose})))
-            except asyncio.QueueFull:
-                self._session.refuse("too_many", topic, f"{GOALS_AT_ONCE} goals wait already")
+            raise WireError(f"a goal in the frame {frame!r}: send it in {ros.MAP_FRAME!r}", "frame")
+        if not np.isfinite((x, y)).all():
+            raise WireError(f"a goal at ({x}, {y})")
+        pose = {"x": x, "y": y} | ({} if theta is None else {"theta": theta})
+        request = Request("PUT", f"/api/v1/robots/{robot}/goal", {"pose": pose})
+        try:
+            self._goals.put_nowait((robot, self._now(), request))
+        except asyncio.QueueFull:
+            raise WireError(f"{GOALS_AT_ONCE} goals wait already", "too_many") from None
+
+    # --- Robots of others, and obstacles ------------------------------------------------------------------------------
+
+    def _on_other_pose(self, name: str, told: RosMessage) -> None:
+        self._report(thing_id(name), self._others.on_pose(name, told, self._now()))
+
+    def _on_other_tf(self, name: str, told: RosMessage) -> None:
+        self._report(thing_id(name), self._others.on_transforms(name, told, self._now()))
+
+    def _on_obstacles(self, told: RosMessage) -> None:
+        for thing, report in self._others.on_obstacles(told, self._now()):
+            self._report(thing, report)
+
+    def _report(self, thing: str, report: Reported | None) -> None:
+        if report is not None:
+            self._fog.publish(ch.REPORTED, report, thing=thing)
 
     def _now(self) -> float:
         return self._clock.now()

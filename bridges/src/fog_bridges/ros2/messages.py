@@ -8,17 +8,18 @@ from typing import TYPE_CHECKING, Final
 import numpy as np
 
 from fog_bridges.ros2.wire import TYPES, RosMessage
-from fog_contracts.costs import LETHAL, UNKNOWN
-from fog_contracts.messages import Power
-from fog_contracts.shapes import shape_spans
+from fog_contracts.channels import ROBOT_OBSTACLES
+from fog_contracts.costs import LETHAL, UNKNOWN, penalty_cost
+from fog_contracts.messages import REACH_UNIT_M, VIEW_SECTORS, Power
+from fog_contracts.shapes import polygon_spans, shape_spans
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator, Mapping, Sequence
+    from collections.abc import Iterable, Iterator, Mapping, Sequence
 
     from numpy.typing import NDArray
 
     from fog_contracts.grid import GridGeometry
-    from fog_contracts.messages import HazardArea, RobotPath, RobotPose, RobotState, Shape, Zone
+    from fog_contracts.messages import HazardArea, RobotPath, RobotPose, RobotState, Shape, View, Zone
 
 MAP_FRAME: Final = "map"
 KEEPOUT: Final = 0
@@ -131,6 +132,30 @@ def speed_values(speed: NDArray[np.uint8], limit: float | None = None) -> NDArra
     return values.astype(np.int8)
 
 
+def penalty_values(zones: Iterable[Zone], geometry: GridGeometry) -> NDArray[np.int8]:
+    """Return what penalty zones cost (height, width) in the units of a keepout mask, which has costs below lethal, too.
+
+    Nav2 makes `value * 254 / 100` of a value, the cost that the zone has on Fognav's own map. Empty without any.
+    """
+    found = [zone for zone in zones if zone.kind == "PENALTY" and zone.factor is not None]
+    values = np.zeros(geometry.shape if found else (0, 0), np.int8)
+    for zone in found:
+        window, cells = shape_spans(zone.shape, geometry).to_mask()
+        part = values[window.rows, window.columns]
+        part[cells] = np.maximum(part[cells], round(penalty_cost(zone.factor or 1.0) * FULL / LETHAL))
+    return values
+
+
+def closed_cells(hazards: Iterable[HazardArea], zones: Iterable[Zone], geometry: GridGeometry) -> NDArray[np.bool_]:
+    """Return which cells (height, width) hazards and no-go zones close, whatever stands there."""
+    closed = np.zeros(geometry.shape, np.bool_)
+    spans = [polygon_spans(each.polygon, geometry) for each in hazards if each.hazard.penalty >= LETHAL]
+    spans += [shape_spans(zone.shape, geometry) for zone in zones if zone.kind == "BLOCKED"]
+    for window, cells in (each.to_mask() for each in spans):
+        closed[window.rows, window.columns] |= cells
+    return closed
+
+
 def filter_info(kind: int, mask_topic: str, stamp: float) -> RosMessage:
     """Return what a costmap filter must know of its mask."""
     return message(
@@ -233,33 +258,50 @@ def robot_pose(told: RobotPose) -> RosMessage:
     )
 
 
-def transform(told: RobotPose, robot: str) -> RosMessage:
-    """Return the transform of a robot's base in the frame `map`."""
+def transform(x: float, y: float, theta: float, child: str, stamp: float) -> RosMessage:
+    """Return the transform of a frame in `map`: of a robot's base, or where its lidar sees from."""
     return message(
         "tf2_msgs/msg/TFMessage",
         transforms=[
             message(
                 "geometry_msgs/msg/TransformStamped",
-                header=header(told.stamp),
-                child_frame_id=f"{ros_name(robot)}/base_footprint",
+                header=header(stamp),
+                child_frame_id=child,
                 transform=message(
                     "geometry_msgs/msg/Transform",
-                    translation=message("geometry_msgs/msg/Vector3", x=told.x, y=told.y, z=0.0),
-                    rotation=_turned(told.theta),
+                    translation=message("geometry_msgs/msg/Vector3", x=x, y=y, z=0.0),
+                    rotation=_turned(theta),
                 ),
             )
         ],
     )
 
 
-def path(told: RobotPath, stamp: float) -> RosMessage:
+def scan(view: View, robot: str, stamp: float) -> RosMessage:
+    """Return what a robot's lidar sees as a scan in the frame `ROBOT/view`, which is turned as the map is.
+
+    Each of its ranges is the nearest of a sector of 2 degrees; NaN: nothing is known of that direction.
+    """
+    width = 2.0 * math.pi / VIEW_SECTORS
+    units = np.frombuffer(view.reach, np.uint8)
+    return message(
+        "sensor_msgs/msg/LaserScan",
+        header=header(stamp, f"{ros_name(robot)}/view"),
+        angle_min=0.5 * width, angle_max=(VIEW_SECTORS - 0.5) * width, angle_increment=width,
+        time_increment=0.0, scan_time=ROBOT_OBSTACLES.period_s, range_min=0.0, range_max=255 * REACH_UNIT_M,
+        ranges=np.where(units > 0, REACH_UNIT_M * units, np.nan).astype(np.float32),
+        intensities=np.zeros(0, dtype=np.float32),
+    )  # fmt: skip
+
+
+def path(told: RobotPath | None, stamp: float) -> RosMessage:
     """Return a robot's path by its corners, each turned towards the next; empty while there is none."""
-    points = told.points
+    points = [] if told is None else told.points
     poses = []
     for index, (x, y) in enumerate(points):
         begin, end = (points[index], points[index + 1]) if index + 1 < len(points) else points[-2:] or (points[0],) * 2
         theta = math.atan2(end[1] - begin[1], end[0] - begin[0])
-        if index + 1 == len(points) and told.goal_theta is not None:
+        if told is not None and index + 1 == len(points) and told.goal_theta is not None:
             theta = told.goal_theta
         poses.append(message("geometry_msgs/msg/PoseStamped", header=header(stamp), pose=pose(x, y, theta)))
     return message("nav_msgs/msg/Path", header=header(stamp), poses=poses)

@@ -20,6 +20,18 @@ _DEFINITIONS: Final = {
     "nav2_msgs/msg/CostmapFilterInfo": (
         "std_msgs/Header header\nuint8 type\nstring filter_mask_topic\nfloat32 base\nfloat32 multiplier\n"
     ),
+    "rmf_obstacle_msgs/msg/BoundingBox3D": "geometry_msgs/Pose center\ngeometry_msgs/Vector3 size\n",
+    "rmf_obstacle_msgs/msg/Obstacle": (
+        "std_msgs/Header header\nint32 id\nstring source\nstring level_name\nstring classification\n"
+        "BoundingBox3D bbox\nfloat64 data_resolution\nint8[] data\nbuiltin_interfaces/Duration lifetime\nint32 action\n"
+        "int32 ACTION_ADD=1\nint32 ACTION_DELETE=2\nint32 ACTION_DELETEALL=3\n"
+    ),
+    "rmf_obstacle_msgs/msg/Obstacles": "std_msgs/Header header\nObstacle[] obstacles\n",
+    "rmf_fleet_msgs/msg/LaneRequest": "string fleet_name\nuint64[] open_lanes\nuint64[] close_lanes\n",
+    "rmf_fleet_msgs/msg/SpeedLimitedLane": "uint64 lane_index\nfloat64 speed_limit\n",
+    "rmf_fleet_msgs/msg/SpeedLimitRequest": (
+        "string fleet_name\nSpeedLimitedLane[] speed_limits\nuint64[] remove_limits\n"
+    ),
 }
 """Messages that rosbags does not know, by their fields alone: a hash covers these."""
 TYPES: Final = get_typestore(Stores.ROS2_JAZZY)
@@ -36,7 +48,11 @@ PLAIN: Final = "::,7:,:,:,,"
 
 
 class WireError(ValueError):
-    """What a peer sent can't be read; the text says why."""
+    """What a peer sent can't be used; the text says why, `reason` in a word, for the metric."""
+
+    def __init__(self, words: str, reason: str = "malformed") -> None:
+        super().__init__(words)
+        self.reason = reason
 
 
 def dds_type(name: str) -> str:

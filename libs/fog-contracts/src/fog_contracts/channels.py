@@ -291,7 +291,7 @@ ZONES             = _pub(  "zones",             FOG + "zones",          m.ZoneSe
 PLACES            = _pub(  "places",            FOG + "places",         m.PlaceSet,     limit=MIB,
     publishers=(MAP,), subscribers=(PLANNER, WEB), durability=LATEST, epoch="epoch")
 
-# Planner and robots: zenoh, msgpack
+# Planner and robots, and what other systems report: zenoh, msgpack
 PLANNER_PLAN      = _query("planner_plan",      FOG + "planner/plan",             m.PlanRequest,    limit=KIB,
     publishers=(PLANNER,), subscribers=(CONSOLE,),         reply=m.PlanReply, reply_limit=4 * MIB)
 PLANNER_EGRESS    = _query("planner_egress",    FOG + "planner/egress",           m.EgressRequest,  limit=KIB,
@@ -311,7 +311,7 @@ ROBOT_POSE        = _pub(  "robot_pose",        FOG + "robots/{robot}/pose",    
 ROBOT_STATE       = _pub(  "robot_state",       FOG + "robots/{robot}/state",     m.RobotState,     limit=16 * KIB,
     publishers=(ROBOT,), subscribers=(MAP, PLANNER, CONSOLE, WEB, BRIDGE), durability=VOLATILE, rate_hz=1, max_age_s=3)
 ROBOT_OBSTACLES   = _pub(  "robot_obstacles",   FOG + "robots/{robot}/obstacles", m.RobotObstacles, limit=64 * KIB,
-    publishers=(ROBOT,),   subscribers=(MAP, CONSOLE, WEB), durability=VOLATILE, rate_hz=1)
+    publishers=(ROBOT,),   subscribers=(MAP, CONSOLE, WEB, BRIDGE), durability=VOLATILE, rate_hz=1)
 ROBOT_VITALS      = _pub(  "robot_vitals",      FOG + "robots/{robot}/vitals",    m.RobotVitals,    limit=512,
     publishers=(ROBOT,),   subscribers=(WEB,), durability=VOLATILE, rate_hz=0.5, max_age_s=6)
 ROBOT_COMMAND     = _query("robot_command",     FOG + "robots/{robot}/command",   m.RobotCommand,   limit=KIB,
@@ -321,6 +321,9 @@ LEADER            = _pub(  "leader",            FOG + "leaders/{role}", m.Leader
     max_age_s=1.5)
 LIVE              = _live( "live",              FOG + "live/{role}/{id}", about="presence, no safety signal",
     publishers=(AGGREGATOR, MAP, PLANNER, ROBOT), subscribers=(MAP, PLANNER, CONSOLE))
+
+REPORTED          = _pub(  "reported",          FOG + "reported/{thing}",         m.Reported,       limit=16 * KIB,
+    publishers=(BRIDGE,), subscribers=(AGGREGATOR, MAP), durability=VOLATILE)
 
 # The simulated world: zenoh, msgpack
 SIM_TRUTH         = _pub(  "sim_truth",         FOG + "sim/{robot}/truth",   m.SimTruth,   limit=256 * KIB,

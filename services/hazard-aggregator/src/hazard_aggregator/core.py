@@ -25,7 +25,7 @@ if TYPE_CHECKING:
     from fog_contracts.channels import Channel
     from fog_contracts.geometry import Point
     from fog_contracts.handlers import Handler, Ids, Moment, QueryHandler
-    from fog_contracts.messages import AreaDefinition, AreaHazard, NodeReading, NodeValue, RobotPose
+    from fog_contracts.messages import AreaDefinition, AreaHazard, NodeReading, NodeValue, Reported, RobotPose
     from hazard_aggregator.alerts import NodeReport
     from hazard_aggregator.areas import AreaOverride
     from hazard_aggregator.fusion import AreaFusion
@@ -258,6 +258,7 @@ class Aggregator:
             ch.AGGREGATOR_HEARTBEAT: self._on_heartbeat,
             ch.AGGREGATOR_REQUEST: self._on_request,
             ch.ROBOT_POSE: self._on_pose,
+            ch.REPORTED: self._on_reported,
         }
 
     def query_handlers(self) -> Mapping[Channel, QueryHandler]:
@@ -395,6 +396,9 @@ class Aggregator:
 
     def _on_pose(self, ids: Ids, pose: RobotPose, at: Moment) -> Sequence[Publication]:
         return self._announce(self._fusion.on_pose(ids["robot"], pose, at.now))
+
+    def _on_reported(self, ids: Ids, thing: Reported, at: Moment) -> Sequence[Publication]:
+        return self._announce(self._fusion.on_reported(ids["thing"], thing, at.now))
 
     def _listed(self) -> list[str]:
         return [definition.id for definition in self.definitions() if not definition.removed]

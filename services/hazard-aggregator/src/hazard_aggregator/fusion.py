@@ -24,7 +24,15 @@ if TYPE_CHECKING:
     from typing import Final
 
     from fog_contracts.geometry import Point
-    from fog_contracts.messages import AreaDefinition, AreaHazard, AreaState, NodeReading, NodeValue, RobotPose
+    from fog_contracts.messages import (
+        AreaDefinition,
+        AreaHazard,
+        AreaState,
+        NodeReading,
+        NodeValue,
+        Reported,
+        RobotPose,
+    )
     from fog_contracts.site import NodeSite, RobotSite
     from hazard_aggregator.alerts import NodeReport
     from hazard_aggregator.areas import AreaOverride
@@ -188,6 +196,11 @@ class AreaFusion:
     def on_pose(self, robot: str, pose: RobotPose, now: float) -> list[AreaHazard]:
         """Record a robot's pose, which may explain later readings, and earlier ones if it comes late."""
         self._poses.add(robot, pose, now)
+        return []
+
+    def on_reported(self, thing: str, told: Reported, now: float) -> list[AreaHazard]:
+        """Record where a robot of others is, which explains readings as a robot's pose does."""
+        self._poses.add_reported(thing, told, now)
         return []
 
     def tick(self, now: float, stamp: float) -> list[AreaHazard]:

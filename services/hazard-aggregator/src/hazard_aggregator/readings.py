@@ -12,14 +12,14 @@ from fog_contracts.channels import NODE_READING
 from fog_contracts.cones import SONAR_HALF_CONE
 from fog_contracts.costs import ROBOT_RADIUS
 from fog_contracts.liveness import DelayEstimator
-from fog_contracts.messages import NodeCode, Pose, Reason
+from fog_contracts.messages import CircleShape, NodeCode, Pose, Reason, RobotPose
 from fog_contracts.site import RobotSite
 from hazard_aggregator.debounce import Observation, SonarSample
 
 if TYPE_CHECKING:
     from collections.abc import Container, Iterable, Iterator
 
-    from fog_contracts.messages import AreaState, NodeReading, RobotPose
+    from fog_contracts.messages import AreaState, NodeReading, Reported
     from fog_contracts.site import NodeSite, Sonar
 
 USABLE_S: Final = 3.0
@@ -30,6 +30,8 @@ SPEED_M_S: Final = 0.3
 MAX_SPEED_M_S: Final = 0.5
 """A robot may have begun to drive at the first speed since its pose; none drives faster than the second."""
 _POSES: Final = 200
+REPORTED_RADIUS_MAX: Final = 1.0
+"""No robot of others explains an echo farther (m) from its centre."""
 _ANY_ROBOT: Final = RobotSite(id="any", start=Pose(x=0.0, y=0.0, theta=0.0), radius=ROBOT_RADIUS)
 
 
@@ -74,6 +76,17 @@ class RobotPoses:
         """Record a robot's pose that arrives `now`."""
         body = self._robots.get(robot, _ANY_ROBOT)
         self._tracks.setdefault(robot, _Track()).add(structs.replace(pose, radius=body.radius, height=body.height), now)
+
+    def add_reported(self, thing: str, told: Reported, now: float) -> None:
+        """Record where a robot of others is; its body is what is reported, and it is none of the site's."""
+        if told.kind != "robot" or not isinstance(told.shape, CircleShape) or thing in self._robots:
+            return
+        x, y = told.shape.centre
+        pose = RobotPose(
+            x=x, y=y, theta=told.theta, v=told.v, w=0.0, covariance=[0.0] * 9, stamp=0.0, height=told.height,
+            radius=min(told.shape.radius, REPORTED_RADIUS_MAX),
+        )  # fmt: skip
+        self._tracks.setdefault(thing, _Track()).add(pose, now)
 
     def at(self, taken_at: float, *, settled: bool = False) -> Iterator[Whereabouts]:
         """Yield where the robots were at a time, of those that were localized; if `settled`, of those with later poses.

@@ -14,7 +14,7 @@ if TYPE_CHECKING:
     from fog_contracts.grid import StaticMap
 
 GROUP: Final = "fognav.cost_layers"
-DEFAULT_LAYERS: Final = ("static", "hazards", "zones", "obstacles")
+DEFAULT_LAYERS: Final = ("static", "hazards", "zones", "obstacles", "reported")
 """The layers of a site that configures none, bottom first."""
 
 

@@ -1,10 +1,11 @@
 """What people ask of a robot beside its missions: whether it is in service at all, and how its computer does."""
 
-from typing import Annotated
+from typing import Annotated, Literal
 
 from msgspec import Meta
 
-from fog_contracts.messages.basics import Author, Id, Message, Stamp
+from fog_contracts.messages.basics import Author, Id, Message, Radians, Speed, Stamp
+from fog_contracts.messages.maps import Shape
 
 ServiceReason = Annotated[str, Meta(min_length=1, max_length=120)]
 
@@ -42,3 +43,18 @@ class RobotVitals(Message, frozen=True, kw_only=True):
     cpu: Annotated[dict[Id, CpuPercent], Meta(max_length=8)]
     wifi_dbm: SignalLevel | None = None
     stamp: Stamp = 0.0
+
+
+class Reported(Message, frozen=True, kw_only=True):
+    """What another system says stands on the floor: a robot of others, where it is, or an obstacle; null: it is gone.
+
+    It holds for `ttl` s after its arrival, so whoever reports it repeats it. A robot is a circle, `theta` and `v` say
+    how it moves, and its body explains what sensor nodes see of it.
+    """
+
+    kind: Literal["robot", "obstacle"]
+    shape: Shape | None
+    ttl: Annotated[float, Meta(gt=0.0, le=60.0, extra={"unit": "s"})]
+    theta: Radians = 0.0
+    v: Speed = 0.0
+    height: Annotated[float, Meta(gt=0.0, le=3.0, extra={"unit": "m"})] = 0.35

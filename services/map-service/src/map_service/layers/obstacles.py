@@ -21,7 +21,7 @@ import numpy as np
 from fog_contracts import channels as ch
 from fog_contracts.costs import LETHAL
 from fog_contracts.grid import Window
-from fog_contracts.messages import REACH_UNIT_M, VIEW_SECTORS, Cause
+from fog_contracts.messages import REACH_UNIT_M, VIEW_SECTORS, Cause, CircleShape, RobotPose
 from fog_contracts.shapes import ShapeMask
 from map_service.layers.base import CostLayer, LayerFactory, NoOptions, write_cost
 
@@ -34,7 +34,7 @@ if TYPE_CHECKING:
     from fog_contracts.channels import Channel
     from fog_contracts.grid import GridGeometry
     from fog_contracts.handlers import Handler, Ids, Moment, Publication
-    from fog_contracts.messages import RobotObstacles, RobotPose, View
+    from fog_contracts.messages import Reported, RobotObstacles, View
     from map_service.layers.base import Grid
 
 MARGIN_M: Final = 0.2
@@ -49,6 +49,8 @@ _BESIDE: Final = 2
 _UNSEEN_M: Final = 1.0
 """Without an echo a view says nothing, and the robot may report what it could not pass, this near (m)."""
 _WHOLE_M: Final = REACH_UNIT_M * 255
+_REPORTED_RADIUS_MAX: Final = 1.0
+"""No robot of others explains what a lidar sees farther (m) from its centre."""
 
 
 def within(view: View | None, offsets: NDArray[np.float64]) -> NDArray[np.bool_]:
@@ -147,8 +149,12 @@ class ObstaclesLayer(CostLayer):
         self._disc_count = np.zeros(geometry.shape, dtype=np.int16)
 
     def handlers(self) -> Mapping[Channel, Handler]:
-        """Return the handlers of robots' obstacles and poses."""
-        return {ch.ROBOT_OBSTACLES: self._on_obstacles, ch.ROBOT_POSE: self._on_pose}
+        """Return the handlers of robots' obstacles and poses, and of where robots of others are."""
+        return {
+            ch.ROBOT_OBSTACLES: self._on_obstacles,
+            ch.ROBOT_POSE: self._on_pose,
+            ch.REPORTED: self._on_reported,
+        }
 
     def _on_obstacles(self, ids: Ids, seen: RobotObstacles, at: Moment) -> list[Publication]:
         robot, seen_until = ids["robot"], _Seen(at.now + seen.ttl, ids["robot"])
@@ -208,6 +214,18 @@ class ObstaclesLayer(CostLayer):
         near = np.hypot(*(self._geometry.centres(cells) - (pose.x, pose.y)).T) <= reach
         self._remove(self._numbers(cells[near]), Cause(kind="obstacle", id=robot, state="robot"))
         return []
+
+    def _on_reported(self, ids: Ids, told: Reported, at: Moment) -> list[Publication]:
+        """Take the position of a robot of others: what lidars see there is that robot, which has a layer of its own."""
+        if told.kind != "robot" or not isinstance(told.shape, CircleShape):
+            return []
+        x, y = told.shape.centre
+        pose = RobotPose(
+            x=x, y=y, theta=told.theta, v=told.v, w=0.0, covariance=[0.0] * 9, stamp=0.0, height=told.height,
+            radius=min(told.shape.radius, _REPORTED_RADIUS_MAX),
+        )  # fmt: skip
+        # No id of a robot has a blank: nobody speaks for a robot of ours.
+        return self._on_pose({"robot": f"other {ids['thing']}"}, pose, at)
 
     def tick(self, at: Moment) -> list[Publication]:
         """Remove expired cells, and forget old poses."""

@@ -1,0 +1,162 @@
+"""A node of ROS 2 on a zenoh session: what it says of itself, what it publishes, and what reaches it."""
+
+from __future__ import annotations
+
+import asyncio
+import json
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Final
+
+import zenoh
+import zenoh.ext as ze
+from prometheus_client import Counter
+
+from fog_bridges.ros2.wire import Attachment, Node, RosMessage, Topic, WireError, Writer, decoded, type_hash
+from fog_runtime import logs
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    from fog_runtime.clock import Clock
+
+_RETRY: Final = {"period_init_ms": 200, "period_max_ms": 1000, "period_increase_factor": 1.5}
+WAITING_MAX: Final = 1000
+"""Messages that wait to be read; further ones are counted, and lost."""
+BYTES_MAX: Final = 1024 * 1024
+"""A longer message is refused unread."""
+
+REFUSED = Counter(
+    "fognav_bridge_refused_messages_total", "Messages of other systems that were not understood", ["system", "reason"]
+)
+_log = logs.get("ros2")
+
+
+def ros_config(source: Path | str) -> zenoh.Config:
+    """Return the configuration of a session: that of a file, or that of a client of the router at an address.
+
+    rmw_zenoh's own sessions are peers, which a router connects with one another only where they can't be reached
+    directly; a client's messages always go by the router. Raises `ValueError`.
+    """
+    try:
+        if isinstance(source, Path):
+            return zenoh.Config.from_file(str(source))
+        config = zenoh.Config()
+        values = {
+            "mode": "client", "connect/endpoints": [source], "connect/retry": _RETRY,
+            "scouting/multicast/enabled": False, "timestamping/enabled": True,
+        }  # fmt: skip
+        for key, value in values.items():
+            config.insert_json5(key, json.dumps(value))
+    except zenoh.ZError as error:
+        raise ValueError(f"{source} can't be used to reach ROS's router: {error}") from error
+    return config
+
+
+class RosSession:
+    """A node of ROS on a zenoh session: publishers and subscribers with their tokens of presence.
+
+    Subscribers' handlers are called on the event loop's thread.
+    """
+
+    def __init__(self, session: zenoh.Session, domain: int, name: str, clock: Clock) -> None:
+        """Introduce the node `name`."""
+        self._session = session
+        self._clock = clock
+        self._waiting = 0
+        self._loop = asyncio.get_running_loop()
+        self._domain = domain
+        self._node = Node(domain, str(self._session.info.zid()), name)
+        self._held: list[object] = [self._session.liveliness().declare_token(self._node.token)]
+        self._writers: dict[Topic, tuple[Writer, Any]] = {}
+        self._limited = logs.RateLimited(_log)
+
+    @property
+    def connected(self) -> bool:
+        """Whether a router or a peer is connected."""
+        info = self._session.info
+        return bool(info.routers_zid() or info.peers_zid())
+
+    def publish(self, topic: Topic, message: object, stamp: float) -> None:
+        """Publish a message without waiting; `stamp` (s since 1970) is when."""
+        if topic not in self._writers:
+            self._writers[topic] = self._writer(topic)
+        writer, publisher = self._writers[topic]
+        payload, attachment = writer.encoded(message, int(stamp * 1e9))
+        try:
+            publisher.put(payload, attachment=attachment)
+        except zenoh.ZError as error:
+            self._limited.warning("message_dropped", topic.name, self._loop.time(), topic=topic.name, reason=str(error))
+
+    def _writer(self, topic: Topic) -> tuple[Writer, Any]:
+        token = self._node.entity("MP", topic)
+        key = topic.key(self._domain)
+        if topic.latched:
+            publisher: Any = ze.declare_advanced_publisher(
+                self._session, key, congestion_control=zenoh.CongestionControl.DROP, publisher_detection=True,
+                cache=ze.CacheConfig(max_samples=1),
+                sample_miss_detection=ze.MissDetectionConfig(heartbeat=None, sporadic_heartbeat=0.5),
+            )  # fmt: skip
+        else:
+            publisher = self._session.declare_publisher(key, congestion_control=zenoh.CongestionControl.DROP)
+        self._held.append(self._session.liveliness().declare_token(token))
+        return Writer(topic, token), publisher
+
+    def subscribe(self, topic: Topic, handler: Callable[[RosMessage], object], max_age_s: float | None = None) -> None:
+        """Call a handler with each message; one of another definition of its type, or none, is counted and logged.
+
+        So is one that was sent more than `max_age_s` ago, or that the handler refuses by a `WireError`.
+        """
+
+        def on_sample(sample: zenoh.Sample) -> None:
+            if self._loop.is_closed():
+                return
+            if self._waiting >= WAITING_MAX or len(sample.payload) > BYTES_MAX:
+                reason = "too_many" if self._waiting >= WAITING_MAX else "too_long"
+                self.refuse(reason, topic.name, f"more than {WAITING_MAX} messages wait, or one has over 1 MiB")
+                return
+            attachment = None if sample.attachment is None else sample.attachment.to_bytes()
+            arrived = (str(sample.key_expr), sample.payload.to_bytes(), attachment)
+            self._waiting += 1
+            self._loop.call_soon_threadsafe(self._on_sample, topic, handler, max_age_s, *arrived)
+
+        self._held.append(self._session.declare_subscriber(topic.any_hash(self._domain), on_sample))
+        self._held.append(self._session.liveliness().declare_token(self._node.entity("MS", topic)))
+
+    def _on_sample(  # what a sample consists of
+        self, topic: Topic, handler: Callable[[RosMessage], object], max_age_s: float | None,
+        key: str, payload: bytes, attachment: bytes | None,
+    ) -> None:  # fmt: skip
+        self._waiting -= 1
+        try:
+            _check_hash(topic.type, key.rpartition("/")[2])
+            sent = Attachment.decoded(attachment or b"")
+            if max_age_s is not None:
+                self._check_age(sent.sent_ns / 1e9, max_age_s)
+            handler(decoded(topic, payload))
+        except WireError as error:
+            self.refuse(error.reason, topic.name, str(error))
+
+    def _check_age(self, sent: float, max_age_s: float) -> None:
+        age = self._clock.stamp() - sent
+        if self._clock.speed == 1.0 and abs(age) > max_age_s:
+            raise WireError(
+                f"sent {age:.1f} s ago, and {max_age_s:g} s is the limit: it waited for too long, or the sender's "
+                "clock is not synchronized with this one (NTP)", "old",
+            )  # fmt: skip
+
+    def refuse(self, reason: str, topic: str, words: str) -> None:
+        """Count and log a message that is not understood."""
+        REFUSED.labels("ros2", reason).inc()
+        self._limited.warning("message_refused", f"{topic} {reason}", self._loop.time(), topic=topic, reason=words)
+
+    def close(self) -> None:
+        """Close the session; its tokens go with it."""
+        self._session.close()  # type: ignore[no-untyped-call]  # zenoh's stub has no types for it
+
+
+def _check_hash(kind: str, theirs: str) -> None:
+    if theirs not in (own := type_hash(kind), "TypeHashNotSupported"):
+        raise WireError(
+            f"the sender's {kind} is {theirs}, and ours is {own}: it was built with another version of the message's "
+            "package", "type_hash",
+        )  # fmt: skip

@@ -1,14 +1,15 @@
-// Spreads drawing over frames: what moves is drawn in each frame, everything else one kind a frame, in turn. So a frame
-// costs what moves and the dearest kind, and never the sum of all kinds; each comes about as soon.
+// Spreads drawing over frames: one kind a frame, what moves every other time at least, while the others take turns. So a
+// frame costs what the dearest kind costs, and never the sum of all; each comes about as soon.
 
 /** Kinds of drawing that take turns: lines and marks of the map, its cells, the panels beside it. */
 const KINDS = ["marks", "cells", "panels"] as const;
 export type DrawingKind = (typeof KINDS)[number];
 
 const moving = new Set<() => void>();
-const others: Record<DrawingKind, Set<() => void>> = { marks: new Set(), cells: new Set(), panels: new Set() };
+const waiting: Record<DrawingKind, Set<() => void>> = { marks: new Set(), cells: new Set(), panels: new Set() };
 let pending = 0;
 let turn = 0;
+let moved = false;
 
 /** Call `draw` in the next frame, once however often this is asked for until then. */
 export function drawMoving(draw: () => void): void {
@@ -18,14 +19,14 @@ export function drawMoving(draw: () => void): void {
 
 /** Call `draw` in one of the next frames, once however often this is asked for until then. */
 export function drawInTurn(kind: DrawingKind, draw: () => void): void {
-  others[kind].add(draw);
+  waiting[kind].add(draw);
   request();
 }
 
 /** Forget what was to be drawn. */
 export function forgetDrawing(draw: () => void): void {
   moving.delete(draw);
-  for (const kind of KINDS) others[kind].delete(draw);
+  for (const kind of KINDS) waiting[kind].delete(draw);
 }
 
 function request(): void {
@@ -34,12 +35,18 @@ function request(): void {
 
 function frame(): void {
   pending = 0;
-  run(moving);
+  const others = moved && runOther();
+  moved = !others && run(moving);
+  if (!others && !moved) runOther();
+  if (moving.size > 0 || KINDS.some((kind) => waiting[kind].size > 0)) request();
+}
+
+function runOther(): boolean {
   for (let looked = 0; looked < KINDS.length; looked++) {
     const kind = KINDS[turn++ % KINDS.length];
-    if (kind !== undefined && run(others[kind])) break;
+    if (kind !== undefined && run(waiting[kind])) return true;
   }
-  if (KINDS.some((kind) => others[kind].size > 0)) request();
+  return false;
 }
 
 function run(due: Set<() => void>): boolean {

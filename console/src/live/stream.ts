@@ -17,7 +17,8 @@ export class EventParser {
   /** Take a piece of the stream; return the events that it completes. */
   push(piece: string): StreamEvent[] {
     const found: StreamEvent[] = [];
-    const lines = (this.rest + piece).split(/\r\n|\n|\r(?!$)/);
+    const text = this.rest + piece;
+    const lines = text.includes("\r") ? text.split(/\r\n|\n|\r(?!$)/) : text.split("\n");
     this.rest = lines.pop() ?? "";
     for (const line of lines) {
       if (line === "") {

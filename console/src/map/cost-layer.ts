@@ -60,9 +60,8 @@ export class CostLayer {
 
   /** Draw a tile of the stream. */
   patch(tile: Tile): void {
-    const bytes = Uint8Array.from(atob(tile.png), (char) => char.charCodeAt(0));
     const top = this.geometry.height - tile.row - tile.height;
-    this.ask({ kind: "draw", png: new Blob([bytes], { type: "image/png" }), column: tile.column, top, costs: SAME });
+    this.ask({ kind: "draw", png: tile.png, column: tile.column, top, costs: SAME });
   }
 
   /** Draw the plan's picture: white is free, black occupied, grey unknown. */

@@ -5,7 +5,8 @@ export type Work =
   | { readonly kind: "colours"; readonly colours: Uint32Array }
   | {
     readonly kind: "draw";
-    readonly png: Blob;
+    /** In base64 as in the stream, or whole. */
+    readonly png: Blob | string;
     readonly column: number;
     readonly top: number;
     /** The cost that each grey of the picture means. */

@@ -60,7 +60,8 @@ async function work(asked: Work): Promise<void> {
 
 /** Draw a grey PNG whose first pixel is the cell (column, top), counted from the map's upper edge. */
 async function draw({ png, column, top, costs }: Extract<Work, { kind: "draw" }>): Promise<void> {
-  const image = await createImageBitmap(png, { colorSpaceConversion: "none", premultiplyAlpha: "none" });
+  const blob = typeof png === "string" ? new Blob([Uint8Array.from(atob(png), (char) => char.charCodeAt(0))]) : png;
+  const image = await createImageBitmap(blob, { colorSpaceConversion: "none", premultiplyAlpha: "none" });
   const { width, height } = image;
   scratch.width = width;
   scratch.height = height;

@@ -1,5 +1,5 @@
-// Robots, their paths, obstacles and scans. A pose moves an element and draws nothing: ten robots at 10 Hz cost a browser
-// little, while a canvas over the whole map would be copied for each frame.
+// Robots, their paths, obstacles and scans. A pose moves the points of some lines: unlike a style, they change without the
+// page's styles being computed anew, and a canvas over the whole map would be copied for each frame.
 import L from "leaflet";
 import type { PathValue, Point } from "../api/types";
 import type { Live } from "../live/live";
@@ -8,8 +8,16 @@ import { firstMetres } from "./geometry";
 
 const SVG = "http://www.w3.org/2000/svg";
 const PANE = "moving";
-const RADIUS_MIN_PX = 9;
+/** A target of 24 pixels at least. */
+const RADIUS_MIN_PX = 12;
 const CAPTION_MAX = 24;
+const CAPTION_PX = 3;
+const ANGLE_STEP = Math.PI / 60;
+const NOWHERE = L.point(NaN, NaN);
+const CAPTION_STAYS_PX = 2;
+const BORDER_PX = 5;
+/** The arrow that looks ahead, in a body of the radius 1. */
+const FRONT: readonly Point[] = [[0.6, 0], [-0.3, 0.42], [-0.3, -0.42]];
 
 const toLatLng = (point: Point): L.LatLngTuple => [point[1], point[0]];
 
@@ -20,34 +28,38 @@ export function tone(mode: string | undefined): "good" | "caution" | "stopped" {
   return "caution";
 }
 
-/** Return the drawing of a robot of the radius 10 that looks to the right. */
-function drawing(): { root: HTMLElement; body: SVGElement; caption: HTMLElement } {
-  const root = document.createElement("div");
-  const body = document.createElementNS(SVG, "svg");
-  body.setAttribute("viewBox", "-12 -12 24 24");
-  body.setAttribute("aria-hidden", "true");
-  const circle = document.createElementNS(SVG, "circle");
-  circle.setAttribute("r", "9.5");
-  const front = document.createElementNS(SVG, "path");
-  front.setAttribute("d", "M7 0 L-3.5 4.8 L-3.5 -4.8 Z");
-  body.append(circle, front);
-  const caption = document.createElement("bdi");
-  root.append(body, caption);
-  return { root, body, caption };
+/** A robot of two dots, which are lines without length and with round ends, one on the other, with an arrow in them. */
+interface Parts {
+  readonly root: SVGElement;
+  readonly edge: SVGElement;
+  readonly body: SVGElement;
+  readonly front: SVGElement;
+  readonly caption: SVGElement;
 }
 
-/** A marker that keeps its place among the others: Leaflet sorts markers by their latitude at each move, for which the
- * browser paints the whole page anew. */
-class MovingMarker extends L.Marker {
-  protected _updateZIndex(): void {
-    // Leaflet's hook; later ones lie above, a robot under the pointer by the style sheet.
-  }
+function makeParts(): Parts {
+  const make = (tag: "g" | "polygon" | "polyline" | "text", name: string): SVGElement => {
+    const made = document.createElementNS(SVG, tag);
+    made.setAttribute("class", name);
+    return made;
+  };
+  const parts = {
+    root: make("g", ""), edge: make("polyline", "edge"), body: make("polyline", "body"), front: make("polygon", "front"),
+    caption: make("text", ""),
+  };
+  parts.root.append(parts.edge, parts.body, parts.front, parts.caption);
+  return parts;
+}
+
+/** Return the corners of a shape as SVG writes them, turned by an angle (rad, against the clock) and drawn around a pixel. */
+function corners(shape: readonly Point[], at: L.Point, radius: number, angle: number): string {
+  const [ahead, aside] = [radius * Math.cos(angle), radius * Math.sin(angle)];
+  return shape.map(([x, y]) => `${(at.x + x * ahead - y * aside).toFixed(1)},${(at.y - x * aside - y * ahead).toFixed(1)}`).join(" ");
 }
 
 /** One robot on the map. */
 class RobotDrawing {
-  private readonly parts = drawing();
-  private readonly marker: L.Marker;
+  private readonly parts = makeParts();
   private readonly rest: L.Polyline;
   private readonly released: L.Polyline;
   private readonly obstacles: L.Polyline;
@@ -56,12 +68,17 @@ class RobotDrawing {
   private look = "";
   private drawnPath: PathValue | undefined;
   private drawnLength = 0;
+  private radius = RADIUS_MIN_PX;
+  private drawnAt = NOWHERE;
+  private drawnAngle = 0;
+  private drawnCaption = NOWHERE;
 
   constructor(
     private readonly map: L.Map,
     private readonly live: Live,
     private readonly id: string,
     renderer: L.Renderer,
+    private readonly bodies: SVGElement,
     onChoose: () => void,
   ) {
     const line = (className: string): L.Polyline =>
@@ -71,11 +88,16 @@ class RobotDrawing {
     this.rest = line("path rest");
     this.released = line("path released");
     this.goal = L.circleMarker([0, 0], { renderer, className: "goal", radius: 7, interactive: false });
-    const icon = L.divIcon({ html: this.parts.root, className: "robot-mark", iconSize: [0, 0] });
-    this.marker = new MovingMarker([0, 0], { icon, keyboard: false });
-    this.marker.on("click", onChoose);
-    this.parts.caption.textContent = id.slice(0, CAPTION_MAX);
-    this.pose();
+    const { root } = this.parts;
+    root.addEventListener("click", (event) => {
+      L.DomEvent.stop(event);
+      onChoose();
+    });
+    root.addEventListener("pointerenter", () => {
+      if (this.bodies.lastElementChild !== root) this.bodies.append(root); // above those that it overlaps
+    });
+    this.bodies.append(root);
+    this.scale();
     this.path();
     this.points();
     this.state(false);
@@ -83,23 +105,41 @@ class RobotDrawing {
 
   pose(): void {
     const pose = this.live.of.pose.get(this.id);
-    if (!pose) {
-      this.marker.remove();
-      return;
+    if (!pose) return;
+    const { edge, body, front } = this.parts;
+    const { x, y } = this.map.project([pose.y, pose.x]).subtract(this.map.getPixelOrigin());
+    // What nobody would see is not drawn: a robot on the map of a whole floor moves half a pixel in some tenths of a second.
+    const at = L.point(Math.round(2 * x) / 2, Math.round(2 * y) / 2);
+    const angle = Math.round(pose.theta / ANGLE_STEP) * ANGLE_STEP;
+    const moved = !at.equals(this.drawnAt);
+    if (moved) {
+      const dot = `${at.x},${at.y} ${at.x},${at.y}`;
+      edge.setAttribute("points", dot);
+      body.setAttribute("points", dot);
     }
-    this.marker.setLatLng([pose.y, pose.x]);
-    if (!this.marker.getElement()) {
-      this.marker.addTo(this.map);
-      this.scale();
-    }
-    this.parts.body.style.transform = `rotate(${-pose.theta}rad)`;
+    if (moved || angle !== this.drawnAngle) front.setAttribute("points", corners(FRONT, at, this.radius, angle));
+    [this.drawnAt, this.drawnAngle] = [at, angle];
+  }
+
+  /** Draw the name where the robot is: words are dear to lay out, so they come some frames later, and not for one pixel. */
+  caption(): void {
+    const { caption } = this.parts;
+    const at = L.point(Math.round(this.drawnAt.x), Math.round(this.drawnAt.y - this.radius - CAPTION_PX));
+    if (at.distanceTo(this.drawnCaption) <= CAPTION_STAYS_PX) return;
+    caption.setAttribute("x", String(at.x));
+    caption.setAttribute("y", String(at.y));
+    this.drawnCaption = at;
   }
 
   /** Take over the map's scale: a robot is drawn as large as it is, but never too small to be hit. */
   scale(): void {
     const metre = this.map.getZoomScale(this.map.getZoom(), 0);
-    const radius = Math.max(RADIUS_MIN_PX, (this.live.of.pose.get(this.id)?.radius ?? 0) * metre) * 1.2;
-    this.parts.root.style.setProperty("--radius", `${radius}px`);
+    this.radius = Math.max(RADIUS_MIN_PX, (this.live.of.pose.get(this.id)?.radius ?? 0) * metre * 1.2);
+    this.parts.edge.setAttribute("stroke-width", String(2 * this.radius));
+    this.parts.body.setAttribute("stroke-width", String(2 * this.radius - BORDER_PX));
+    this.drawnAt = this.drawnCaption = NOWHERE;
+    this.pose();
+    this.caption();
   }
 
   path(): void {
@@ -132,13 +172,15 @@ class RobotDrawing {
     const look = `${old ? "stale" : tone(robot?.state?.mode)}${selected ? " selected" : ""}${lost ? " lost" : ""}`;
     if (look === this.look) return;
     this.look = look;
-    this.parts.root.className = `robot-body ${look}`;
+    this.parts.root.setAttribute("class", `robot-body leaflet-interactive ${look}`);
+    this.parts.caption.textContent = this.id.slice(0, CAPTION_MAX) + (old || lost ? " ?" : "");
     for (const line of [this.rest, this.released]) line.getElement()?.classList.toggle("stale", old);
     for (const line of [this.released, this.goal]) line.getElement()?.classList.toggle("selected", selected);
   }
 
   remove(): void {
-    for (const layer of [this.marker, this.rest, this.released, this.obstacles, this.scan, this.goal]) layer.remove();
+    this.parts.root.remove();
+    for (const layer of [this.rest, this.released, this.obstacles, this.scan, this.goal]) layer.remove();
   }
 }
 
@@ -150,6 +192,7 @@ export class RobotLayer {
   private readonly drawings = new Map<string, RobotDrawing>();
   private readonly dirty = new Map<string, Set<Part>>();
   private readonly renderer: L.SVG;
+  private readonly bodies = document.createElementNS(SVG, "g");
   private readonly previewLines: readonly L.Polyline[];
   private readonly previewArrow: L.Marker;
   private readonly arrow = document.createElement("div");
@@ -161,13 +204,15 @@ export class RobotLayer {
     private readonly onRobot: (id: string) => void,
   ) {
     map.createPane(PANE);
-    this.renderer = L.svg({ pane: PANE });
+    this.renderer = L.svg({ pane: PANE }).addTo(map);
+    // Beside Leaflet's group of lines, above them: pixels are the same there.
+    this.renderer.getPane()?.querySelector("svg")?.append(this.bodies);
     this.previewLines = ["preview halo", "preview"].map((className) =>
       L.polyline([], { renderer: this.renderer, className, interactive: false }).addTo(map));
     this.arrow.className = "pose-arrow";
     const icon = L.divIcon({ html: this.arrow, className: "robot-mark", iconSize: [0, 0] });
     this.previewArrow = L.marker([0, 0], { icon, keyboard: false, interactive: false });
-    map.on("zoomend", this.scale, this);
+    map.on("zoomend viewreset", this.scale, this);
     this.stops = [
       ...PARTS.map((part) => live.on([part], (id) => this.mark(part, id))),
       live.on(["connection"], () => this.markStates()),
@@ -197,7 +242,7 @@ export class RobotLayer {
 
   remove(): void {
     for (const stop of this.stops) stop();
-    this.map.off("zoomend", this.scale, this);
+    this.map.off("zoomend viewreset", this.scale, this);
     forgetDrawing(this.drawPoses);
     forgetDrawing(this.drawMarks);
     for (const drawn of this.drawings.values()) drawn.remove();
@@ -227,7 +272,7 @@ export class RobotLayer {
       if (!parts.delete("pose")) continue;
       const drawn = this.drawings.get(id);
       if (drawn && this.live.of.pose.has(id)) drawn.pose();
-      else drawInTurn("marks", this.drawMarks); // it has come or gone
+      drawInTurn("marks", this.drawMarks); // it has come or gone, and its name follows it
     }
   };
 
@@ -240,9 +285,10 @@ export class RobotLayer {
         continue;
       }
       if (!drawn) {
-        drawn = new RobotDrawing(this.map, this.live, id, this.renderer, () => this.onRobot(id));
+        drawn = new RobotDrawing(this.map, this.live, id, this.renderer, this.bodies, () => this.onRobot(id));
         this.drawings.set(id, drawn);
       }
+      drawn.caption();
       if (parts.has("path") || parts.has("robot")) drawn.path();
       if (parts.has("obstacles") || parts.has("scan")) drawn.points();
       if (parts.has("robot")) drawn.state(id === this.selected);

@@ -131,6 +131,8 @@ async def test_what_would_lie_in_a_wall_is_named_and_the_accepted_map_is_in_forc
             assert shown.convert("RGB").getpixel((120, 120 - 60)) == (0, 0, 0)
         (entry,) = (await client.get("/api/v1/audit", params={"kind": "map"}, headers=admin)).json()
         assert (entry["who"], entry["action"], entry["after"]["name"]) == ("ada", "replace", done.json()["name"])
+        state = (await client.get("/api/v1/map/state", headers=tokens["viewer"])).json()
+        assert state == {"name": done.json()["name"], "version": 1, "back": True}
         back = await look(client, {"back": True}, admin)
         assert (back["name"], back["accepted"], back["area"]["wall_to_floor_m2"]) == (None, True, 1.04)
         undo = await client.post("/api/v1/map/undo", json={"entry": entry["entry"]}, headers=admin)

@@ -45,10 +45,9 @@ from map_service.site_map import MAP_ID, StoredMap
 from map_service.undo import bring_back
 
 LEAST_AGREEMENT: Final = 0.7
-_CHECK_S: Final = 28.0
-"""A gateway waits for an answer for 30 s."""
+_CHECK_S: Final = 24.0
 _ROBOTS_S: Final = 4.0
-_WAITING: Final = 3
+"""Both together: a gateway waits for an answer for 30 s."""
 _NAMED: Final = 5
 _KINDS: Final = (b"\x89PNG", b"P2", b"P5")
 _KEPT: Final = 4
@@ -105,8 +104,7 @@ class _Checks:
         self._service, self._site_dir = service, site_dir
         self.maps = service.maps
         self.applying = asyncio.Lock()
-        self._lock = asyncio.Lock()
-        self._waiting = 0
+        self._looking = False
 
     @property
     def stored(self) -> StoredMap | None:
@@ -118,14 +116,16 @@ class _Checks:
 
     async def look(self, *, upload: MapUpload | None = None, name: MapName | None = None) -> MapPreview:
         """Return what a map would change; raises `BusyError`, and `ProblemError` for what is no map."""
-        if self._waiting >= _WAITING:
-            raise BusyError(f"{self._waiting} maps are being looked at")
-        self._waiting += 1
+        if self._looking:
+            raise BusyError("another map is being looked at")
+        if name is not None and not self.maps.file(name).is_file():
+            detail = f"{self.maps.file(name)} is gone: upload that map again"
+            raise ProblemError(MapProblem.MAP_INVALID, detail, field="body")
+        self._looking = True
         try:
-            async with self._lock:
-                return await self._looked(upload, name)
+            return await self._looked(upload, name)
         finally:
-            self._waiting -= 1
+            self._looking = False
 
     async def apply(self, change: MapChangeBody, who: str, attempt: Attempt | None) -> StoredMap:
         """Put a map into force; raises `ProblemError` if it does not do what was seen, and as `look` and a write."""
@@ -186,6 +186,8 @@ class _Checks:
 
     def _forget_old(self, new: MapName | None) -> None:
         """Delete the oldest uploads that nobody has applied."""
+        if new is not None:  # it is the newest now, even if it was uploaded long ago: it may be put into force next
+            os.utime(self.maps.file(new))
         kept = {new, *(() if self.stored is None else (self.stored.name, self.stored.previous))}
         files = sorted(self.maps.folder.glob("*.yaml"), key=lambda file: file.stat().st_mtime, reverse=True)
         for file in [file for file in files if file.stem not in kept][_KEPT:]:
@@ -226,7 +228,8 @@ def add_map_change(routes: Routes, service: Service, site_dir: Path) -> None:  #
         """Return which map is in force, and whether there is one before it."""
         require_zones(service)
         stored = checks.stored
-        name = None if stored is None else stored.name
+        # Who lets site.toml name another map later means that one.
+        name = None if stored is None or stored.over != maps.site_map else stored.name
         return Answer(MapState(name=name, version=checks.version, back=stored is not None), etag(checks.version))
 
     @routes.post(

@@ -55,6 +55,8 @@ class UploadedMaps:
     def __init__(self, folder: Path) -> None:
         """Take what is in force now for what this process has read."""
         self.folder = folder
+        self.site_map: MapName | None = None
+        """The fingerprint of the map of `site.toml`, if that was loaded."""
         self._seen = self._state()
 
     @classmethod
@@ -65,11 +67,11 @@ class UploadedMaps:
         """
         loaded = load_site(directory)
         maps = cls(root / (site or loaded.site.id))
-        record = maps.in_force()
+        record, maps.site_map = maps.in_force(), fingerprint(loaded.map)
         if record is None or record.name is None:
             return loaded, maps
         file = maps.file(record.name)
-        if record.over != fingerprint(loaded.map):
+        if record.over != maps.site_map:
             _log.warning(
                 "uploaded_map_superseded", file=str(file), map=loaded.site.map,
                 remedy="site.toml names another map than when it was uploaded: that one is used. Upload it again",

@@ -7,7 +7,9 @@ from __future__ import annotations
 
 import asyncio
 import os
+import re
 import sys
+from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Final
 from urllib.parse import urlsplit
@@ -17,6 +19,8 @@ import msgspec
 from fog_bridges.floor import Floor
 from fog_bridges.home_assistant import HomeAssistant
 from fog_bridges.service import HomeAssistantBridge
+from fog_bridges.vda5050.bridge import SYSTEM, Setup, Vda5050Bridge
+from fog_bridges.vda5050.incoming import Version
 from fog_contracts import channels as ch
 from fog_runtime import logs, process
 from fog_runtime.clock import SystemClock, ticker
@@ -27,10 +31,11 @@ from fog_runtime.health import Health
 from fog_runtime.http import make_app, serve_here
 from fog_runtime.http.tokens import Tokens
 from fog_runtime.leadership import process_id
+from fog_runtime.transports.mqtt_connection import Broker
 from fog_runtime.transports.mqtt_edge import MqttEdge, Will
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Mapping
+    from collections.abc import Callable, Iterator, Mapping
 
     from fog_bridges.floor import Adapter
     from fog_runtime.clock import Clock
@@ -38,6 +43,10 @@ if TYPE_CHECKING:
 FILE: Final = "FOGNAV_BRIDGE_FILE"
 """Names the file of settings; paths in it are relative to its folder."""
 _log = logs.get("bridge")
+
+
+Level = Annotated[str, msgspec.Meta(pattern=r"^[^/+#$]{1,64}$(?!\n)")]
+"""A level of a topic of MQTT."""
 
 
 class Settings(CommonSettings, frozen=True, kw_only=True):
@@ -64,11 +73,25 @@ class Settings(CommonSettings, frozen=True, kw_only=True):
     """Robots of others that become obstacles: their namespaces and radii (m), `tb4:0.2, carter:0.35`."""
     ros2_session_config: Path | None = None
     """A file as ZENOH_SESSION_CONFIG_URI names one, with TLS, say; then `ros2_router` is not used."""
+    vda5050_mqtt_url: str = ""
+    """The fleet control's broker; `_credentials_file` and `_unencrypted` as for Home Assistant's."""
+    vda5050_credentials_file: Path | None = None
+    vda5050_unencrypted: bool = False
+    vda5050_version: Version = "3.0"
+    vda5050_interface: Level = "vda5050"
+    """The first level of its topics."""
+    vda5050_manufacturer: Level = "fognav"
+    vda5050_map: str = ""
+    """The floor's `mapId`; empty: the site's id."""
+    vda5050_robots: str = ""
+    """Fognav's robots that are under the fleet's control: their ids, comma separated."""
+    vda5050_zones: str = ""
+    """Robots of others that are told of hazards and zones: MANUFACTURER/SERIAL, comma separated."""
 
     @property
     def names(self) -> list[str]:
         """The adapters; raises `SettingsError` for one that is unknown, and without any."""
-        names = [part.strip() for part in self.adapters.split(",") if part.strip()]
+        names = _listed(self.adapters)
         if unknown := [name for name in names if name not in ADAPTERS] or ([] if names else [""]):
             raise SettingsError(f"adapters: {unknown[0]!r} is none. Name one or several of: {', '.join(ADAPTERS)}")
         return names
@@ -85,30 +108,70 @@ class Settings(CommonSettings, frozen=True, kw_only=True):
         return text
 
 
-_FILES: Final = ("credentials_file", "token_file", "home_assistant_credentials_file", "ros2_session_config")
+_FILES: Final = (
+    "credentials_file", "token_file", "home_assistant_credentials_file", "ros2_session_config",
+    "vda5050_credentials_file",
+)  # fmt: skip
 _MAKE_TOKEN: Final = "Make one: fognav token create bridge --role operator --file TOKENS > FILE"  # noqa: S105  # no token
 
 
+def _listed(text: str) -> list[str]:
+    return [part.strip() for part in text.split(",") if part.strip()]
+
+
+def _foreign(prefix: str, url: str, file: Path | None, *, unencrypted: bool) -> Credentials:
+    """Return who Fognav is at a broker of others; the settings' names begin with `prefix`. Raises `SettingsError`."""
+    if urlsplit(url.partition(",")[0]).username:
+        raise SettingsError(
+            f"{prefix}_mqtt_url has a user: name user and password in {prefix}_credentials_file, which no log shows"
+        )
+    return Credentials.read(file, readable=unencrypted)
+
+
+@contextmanager
+def _address(prefix: str) -> Iterator[None]:
+    """Raise `SettingsError` for a broker's address that can't be used."""
+    try:
+        yield
+    except CredentialsError as error:
+        raise SettingsError(f"{error}. Or say that it may: {prefix}_unencrypted = true") from error
+    except ValueError as error:
+        raise SettingsError(f"{prefix}_mqtt_url: {error}") from error
+
+
 def _home_assistant(settings: Settings, site: str, clock: Clock) -> Adapter:
-    url = settings.home_assistant_mqtt_url
+    prefix, url = "home_assistant", settings.home_assistant_mqtt_url
     if not url:
         url, own = settings.mqtt_url, settings.credentials()
-    elif urlsplit(url.partition(",")[0]).username:
-        raise SettingsError(
-            "home_assistant_mqtt_url has a user: name user and password in home_assistant_credentials_file, "
-            "which no log shows"
-        )
     else:
-        file = settings.home_assistant_credentials_file
-        own = Credentials.read(file, readable=settings.home_assistant_unencrypted)
+        file, readable = settings.home_assistant_credentials_file, settings.home_assistant_unencrypted
+        own = _foreign(prefix, url, file, unencrypted=readable)
     will = Will(ch.BRIDGE_AVAILABILITY, ch.OFFLINE)
-    try:
+    with _address(prefix):
         mqtt = MqttEdge(url, process_id("bridge"), clock, site=site, will=will, credentials=own)
-    except CredentialsError as error:
-        raise SettingsError(f"{error}. Or say that it may: home_assistant_unencrypted = true") from error
-    except ValueError as error:
-        raise SettingsError(f"home_assistant_mqtt_url: {error}") from error
     return HomeAssistantBridge(HomeAssistant(site), mqtt)
+
+
+def _vda5050(settings: Settings, site: str, _: Clock) -> Adapter:
+    prefix, url = SYSTEM, settings.vda5050_mqtt_url
+    if not url:
+        raise SettingsError("vda5050_mqtt_url names the fleet control's broker: mqtts://fleet.local:8883, say")
+    own = _foreign(prefix, url, settings.vda5050_credentials_file, unencrypted=settings.vda5050_unencrypted)
+    robots, zones = _listed(settings.vda5050_robots), _listed(settings.vda5050_zones)
+    if not robots and not zones:
+        raise SettingsError(
+            'vda5050_robots, or vda5050_zones, names who takes part: "r1, r2", or "MANUFACTURER/SERIAL"'
+        )
+    if wrong := next((each for each in zones if not re.fullmatch(r"[^/+#$]{1,64}/[A-Za-z0-9_.:-]{1,64}", each)), None):
+        raise SettingsError(f"vda5050_zones: {wrong[:80]!r} is not MANUFACTURER/SERIAL, as in the robot's topics")
+    with _address(prefix):
+        broker = Broker.of(url, own)
+    setup = Setup(
+        site=site, broker=broker, version=settings.vda5050_version, interface=settings.vda5050_interface,
+        manufacturer=settings.vda5050_manufacturer, map_id=settings.vda5050_map or site, robots=robots,
+        zones=[(each.partition("/")[0], each.partition("/")[2]) for each in zones],
+    )  # fmt: skip
+    return Vda5050Bridge(setup)
 
 
 def _ros2(settings: Settings, site: str, _: Clock) -> Adapter:
@@ -131,6 +194,7 @@ def _ros2(settings: Settings, site: str, _: Clock) -> Adapter:
 ADAPTERS: Final[Mapping[str, Callable[[Settings, str, Clock], Adapter]]] = {
     "home-assistant": _home_assistant,
     "ros2": _ros2,
+    "vda5050": _vda5050,
 }
 
 

@@ -29,6 +29,18 @@ class Request(NamedTuple):
     method: str
     path: str
     body: dict[str, Any] | None = None
+    headers: dict[str, str] | None = None
+
+
+class Answer(NamedTuple):
+    """What the floor answered: why it refused, in words (empty: it did not), the problem's identifier, and the body.
+
+    Without an identifier nobody knows whether the request was carried out.
+    """
+
+    refusal: str
+    problem: str = ""
+    body: dict[str, Any] = {}  # noqa: RUF012  # nobody changes it
 
 
 class Adapter(Protocol):
@@ -70,16 +82,23 @@ class Floor:
 
     async def send(self, request: Request) -> str:
         """Send a request; return why it was refused, in the floor's words, empty if it was not."""
+        return (await self.ask(request)).refusal
+
+    async def ask(self, request: Request) -> Answer:
+        """Send a request; return the answer."""
         try:
-            answer = await self._client.request(request.method, request.path, json=request.body)
+            answer = await self._client.request(
+                request.method, request.path, json=request.body, headers=request.headers
+            )
         except httpx.HTTPError as error:
-            return f"the floor can't be reached: {error!r}"
-        if answer.is_success:
-            return ""
+            return Answer(f"the floor can't be reached: {error!r}")
         try:
-            return str(answer.json()["detail"])
+            body = answer.json()
+            if answer.is_success:
+                return Answer("", body=body if isinstance(body, dict) else {})
+            return Answer(str(body["detail"]), str(body["type"]).removeprefix("urn:fognav:"), body)
         except (ValueError, KeyError, TypeError):
-            return f"{answer.status_code} {answer.reason_phrase}"
+            return Answer("" if answer.is_success else f"{answer.status_code} {answer.reason_phrase}")
 
     async def follow(self, adapters: Sequence[Adapter]) -> None:
         """Pass each event on to all adapters, and when the state is not known any more, that. Never returns."""

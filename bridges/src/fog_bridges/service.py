@@ -6,9 +6,8 @@ import asyncio
 from collections import Counter as Counts
 from typing import TYPE_CHECKING, Any, Final
 
-from prometheus_client import Counter
-
 from fog_bridges.home_assistant import CANCEL, STOP
+from fog_bridges.metrics import ORDERS
 from fog_bridges.picture import Picture
 from fog_contracts import channels as ch
 from fog_runtime import logs
@@ -26,7 +25,6 @@ if TYPE_CHECKING:
 PICTURE_S: Final = 2.0
 """How often the map is drawn at most."""
 ORDERS_AT_ONCE: Final = 100
-ORDERS = Counter("fognav_bridge_orders_total", "Orders of other systems, by what became of them", ["system", "result"])
 _log = logs.get("bridge")
 
 

@@ -9,8 +9,8 @@ from typing import TYPE_CHECKING, Any, Final
 
 import zenoh
 import zenoh.ext as ze
-from prometheus_client import Counter
 
+from fog_bridges.metrics import REFUSED
 from fog_bridges.ros2.wire import Attachment, Node, RosMessage, Topic, WireError, Writer, decoded, type_hash
 from fog_runtime import logs
 
@@ -25,9 +25,6 @@ WAITING_MAX: Final = 1000
 BYTES_MAX: Final = 1024 * 1024
 """A longer message is refused unread."""
 
-REFUSED = Counter(
-    "fognav_bridge_refused_messages_total", "Messages of other systems that were not understood", ["system", "reason"]
-)
 _log = logs.get("ros2")
 
 

@@ -1,0 +1,1 @@
+"""VDA 5050, versions 3.0 and 2.1: robots under a fleet control, and zones for other makers' robots."""

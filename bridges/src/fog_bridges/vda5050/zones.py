@@ -51,7 +51,7 @@ def _of_area(name: str, area: dict[str, Any], *, known: bool) -> Zone | None:
     if penalty >= LETHAL:
         words = f"area {name} is {state}"
         return Zone(zone_id=zone, zone_type="BLOCKED", zone_descriptor=words, vertices=ring)
-    if state == "unknown" or not known:
+    if state == "unknown" or (state == "clear" and not known):
         words = f"nobody knows whether area {name} is clear"
         return Zone(
             zone_id=zone, zone_type="SPEED_LIMIT", zone_descriptor=words, vertices=ring, maximum_speed=UNKNOWN_M_S

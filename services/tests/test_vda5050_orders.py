@@ -1,0 +1,225 @@
+"""A robot under a fleet control by VDA 5050: orders, instant actions, and whose word counts."""
+
+from __future__ import annotations
+
+import pytest
+from vda5050_floor import STATE, A, B, C, Floorplan, instant, node, order, read
+
+from fog_bridges.floor import Answer
+from fog_bridges.vda5050.robot import REFUSED_S
+
+# --- Orders -----------------------------------------------------------------------------------------------------------
+
+
+def test_robot_drives_from_node_to_node_and_its_state_says_what_lies_ahead():
+    floor = Floorplan()
+    assert floor.take(order(A, B, C)) == ""
+    assert floor.drive() == ["PUT 4 1"]
+    said = floor.said()
+    assert (said["orderId"], said["lastNodeId"]) == ("o1", "a")
+    assert [each["nodeId"] for each in said["nodeStates"]] == ["b", "c"]
+    assert [each["edgeId"] for each in said["edgeStates"]] == ["e1", "e3"]
+    floor.reach(4.0, 1.0)
+    assert floor.drive() == ["PUT 7 1"]
+    assert (floor.said()["lastNodeId"], floor.said()["lastNodeSequenceId"]) == ("b", 2)
+    floor.reach(7.0, 1.0)
+    assert floor.drive() == []
+    said = floor.said()
+    assert (said["nodeStates"], said["edgeStates"], said["lastNodeId"], said["errors"]) == ([], [], "c", [])
+    assert floor.take(order(node("c", 0, 7.0, 1.0), B, name="o2")) == "", "it is idle"
+
+
+def test_node_within_its_deviation_is_passed_without_a_stop_and_the_mission_is_replaced_only_if_it_is_the_fleets():
+    floor = Floorplan()
+    floor.take(order(A, node("b", 2, 4.0, 1.0, position={"allowedDeviationXY": {"a": 0.5, "b": 0.2, "theta": 0.0}}), C))
+    floor.drive()
+    floor.at(3.7, 1.25, v=0.3)
+    assert floor.drive() == [], "outside of the ellipse"
+    floor.at(3.6, 1.05, v=0.3)
+    assert floor.drive() == ["PUT 7 1"]
+    assert floor.asked[0].headers["If-None-Match"] == "*"
+    assert floor.asked[1].headers["If-Match"] == '"g1"'
+    assert floor.said()["lastNodeId"] == "b"
+
+
+def test_robot_waits_at_the_end_of_the_base_and_an_update_leads_on():
+    floor = Floorplan()
+    floor.take(order(A, B, C | {"released": False}))
+    floor.drive()
+    assert floor.said()["newBaseRequest"]
+    floor.reach(4.0, 1.0)
+    assert floor.drive() == []
+    assert [each["released"] for each in floor.said()["nodeStates"]] == [False]
+    assert floor.take(order(C, update=1)) == "VALIDATION_FAILURE", "it does not go on at the decision point"
+    other = node("d", 4, 4.0, 4.0)
+    assert floor.take(order(B, other, update=1)) == ""
+    assert floor.drive() == ["PUT 4 4"]
+    assert [each["nodeId"] for each in floor.said()["nodeStates"]] == ["d"], "the horizon is replaced"
+
+
+@pytest.mark.parametrize(
+    ("message", "error"),
+    [
+        (order(A, B, name="o2"), "OTHER_ORDER_ACTIVE"), (order(A, B, update=3), "OUTDATED_ORDER_UPDATE"),
+        (order(A, C | {"sequenceId": 2}, update=4), "SAME_ORDER_UPDATE_ID"),
+        (order(A, B, update=5), "VALIDATION_FAILURE"),
+        (order(B, C | {"actions": [{"actionType": "pick", "actionId": "x", "blockingType": "HARD"}]}, update=5),
+         "INVALID_ORDER_ACTION"),
+        (order(B, node("c", 4, 7.0, 1.0, position={"mapId": "moon"}), update=5), "UNKNOWN_MAP_ID"),
+        (order(B, C, update=5, edge={"trajectory": {"controlPoints": []}}), "UNSUPPORTED_PARAMETER"),
+        (order(B, C, update=5, edge={"maximumSpeed": 0.1}), "UNSUPPORTED_PARAMETER"),
+        (order(B, {k: v for k, v in C.items() if k != "nodePosition"}, update=5), "NO_ROUTE_TO_TARGET"),
+        (order(B, C, update=5, edge={"maximumSpeed": 1.5, "length": 3.0}), ""),
+    ],
+)  # fmt: skip
+def test_order_that_does_not_fit_the_active_one_is_rejected_by_the_norms_error_and_changes_nothing(message, error):
+    floor = Floorplan()
+    assert floor.take(order(A)) == ""
+    assert floor.take(order(A, B, C | {"released": False}, update=4)) == ""
+    assert floor.take(message) == error
+    if error:
+        assert floor.errors() == {error: "CRITICAL" if error == "UNSUPPORTED_PARAMETER" else "WARNING"}
+        assert floor.said()["orderUpdateId"] == 4
+        assert floor.take(order(B, C, update=6)) == ""
+    assert floor.errors() == {}, "until an order is accepted"
+
+
+def test_new_order_has_to_begin_where_the_robot_is():
+    floor = Floorplan()
+    assert floor.take(order(node("a", 0, 1.4, 1.0), B)) == "START_NODE_OUT_OF_RANGE"
+    wide = {"allowedDeviationXY": {"a": 0.5, "b": 0.5, "theta": 0.0}}
+    assert floor.take(order(node("a", 0, 1.4, 1.0, position=wide), B, update=2)) == "VALIDATION_FAILURE"
+    assert floor.take(order(node("a", 0, 1.4, 1.0, position=wide), B)) == ""
+
+
+def test_same_order_again_is_ignored():
+    floor = Floorplan()
+    floor.take(order(A, B))
+    assert floor.robot.orders.is_known(read(order(A, B)))
+    assert not floor.robot.orders.is_known(read(order(A, C | {"sequenceId": 2})))
+
+
+def test_node_that_gets_no_path_is_given_up_and_reported_until_the_fleet_decides():
+    floor = Floorplan()
+    floor.take(order(A, B))
+    floor.drive()
+    floor.more = {"plan": {"refusal": {"reason": "every path is blocked"}}}
+    floor.tell(1.0)
+    assert floor.drive() == []
+    floor.tell(REFUSED_S + 1.0)
+    assert floor.drive() == ["DELETE"]
+    assert floor.errors() == {"NODE_UNREACHABLE": "CRITICAL"}
+    floor.more = {}
+    assert floor.drive() == [], "the way is free again, and the fleet decides"
+    floor.robot.on_instant(instant("cancelOrder"), floor.now)
+    floor.tell()
+    assert floor.errors() == {}
+
+
+def test_mission_that_may_have_been_accepted_is_asked_for_again_by_the_same_key():
+    floor = Floorplan()
+    floor.take(order(A, B))
+    assert floor.drive(Answer("the floor can't be reached")) == ["PUT 4 1"]
+    floor.goal = {"goal_id": "g9"}
+    floor.tell(2.0)
+    assert floor.said()["operatingMode"] == "AUTOMATIC", "it may be the fleet's own"
+    assert floor.drive(Answer("", body=floor.goal)) == ["PUT 4 1"]
+    assert floor.asked[0] == floor.asked[1]
+    assert (floor.said()["operatingMode"], floor.robot.goal_node) == ("AUTOMATIC", "b")
+
+
+# --- Operators and instant actions ------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("mode", "state", "view"),
+    [
+        ("MANUAL", {"enabled": False, "mode": "HOLD"}, {}), ("MANUAL", {"awaits_operator": True, "mode": "FAULT"}, {}),
+        ("MANUAL", {"mode": "TELEOP"}, {}), ("MANUAL", {"wants_dock": True}, {}), ("STARTUP", {"mode": "INIT"}, {}),
+        ("SERVICE", {}, {"out_of_service": {"reason": "repair"}}), ("MANUAL", {}, {"goal": {"goal_id": "theirs"}}),
+        ("MANUAL", {}, {"goal": None}),
+    ],
+)  # fmt: skip
+def test_operators_word_ends_the_order_and_the_fleet_drives_over_none(mode, state, view):
+    floor = Floorplan()
+    floor.take(order(A, B))
+    floor.drive()
+    floor.at(2.0, 1.0, v=0.2)
+    floor.goal = view.pop("goal", floor.goal)
+    floor.more = view
+    floor.tell(**state)
+    said = floor.said()
+    assert (said["operatingMode"], said["nodeStates"], said["orderId"]) == (mode, [], "o1")
+    assert any(
+        "fleet" in each["infoDescriptor"] or each["infoType"] == "NOT_IN_CONTROL" for each in said["information"]
+    )
+    assert floor.take(order(node("s", 0, 2.0, 1.0), B, name="o2")) == "MOBILE_ROBOT_NOT_AVAILABLE"
+    assert all(request.headers.get("If-Match", '"g1"') == '"g1"' for request in floor.asked)
+    floor.drive()
+    assert [request.method for request in floor.asked][1:] in ([], ["DELETE"])
+    floor.state, floor.more, floor.goal = dict(STATE), {}, None
+    floor.tell(3.0)
+    assert floor.said()["operatingMode"] == "AUTOMATIC"
+    assert floor.drive() == [], "it stays where the operator left it"
+    assert floor.take(order(B, C, update=1)) == "ORDER_UPDATE_FOLLOWING_CANCEL"
+    assert floor.take(order(node("s", 0, 2.0, 1.0), B, name="o2")) == ""
+
+
+def test_hold_and_stops_are_shown_and_end_no_order():
+    floor = Floorplan()
+    floor.take(order(A, B))
+    floor.drive()
+    floor.tell(mode="HOLD", codes=["map_old", "path_awaited"], reasons=["the map is old", "a path is awaited"])
+    assert (floor.said()["operatingMode"], floor.errors()) == ("AUTOMATIC", {"MAP_OLD": "WARNING"})
+    floor.tell(mode="PROTECTIVE_STOP", codes=["obstacle_near"], reasons=["something is near"])
+    assert floor.said()["safetyState"] == {"activeEmergencyStop": "NONE", "fieldViolation": True}
+    assert [each["nodeId"] for each in floor.said()["nodeStates"]] == ["b"]
+    floor.tell(mode="FAULT", codes=["bumper"], reasons=["it has hit something"], awaits_operator=True)
+    assert floor.said()["safetyState"] == {"activeEmergencyStop": "MANUAL", "fieldViolation": True}
+    assert floor.errors()["BUMPER"] == "FATAL"
+
+
+def actions(floor: Floorplan) -> dict[str, str]:
+    return {each["actionId"]: each["actionStatus"] for each in floor.said()["instantActionStates"]}
+
+
+def test_cancelled_order_ends_the_mission_and_is_finished_once_the_robot_stands():
+    floor = Floorplan()
+    floor.robot.on_instant(instant("cancelOrder", "early"), floor.now)
+    assert (actions(floor), floor.errors()) == ({"early": "FAILED"}, {"NO_ORDER_TO_CANCEL": "WARNING"})
+    floor.take(order(A, B))
+    floor.drive()
+    floor.at(2.0, 1.0, v=0.3)
+    floor.robot.on_instant(instant("cancelOrder", "other", orderId="o7"), floor.now)
+    floor.robot.on_instant(instant("cancelOrder", "c", orderId="o1"), floor.now)
+    assert floor.drive() == ["DELETE"]
+    assert actions(floor) == {"early": "FAILED", "other": "FAILED", "c": "RUNNING"}
+    floor.at(2.1, 1.0)
+    floor.tell()
+    assert (actions(floor)["c"], floor.said()["nodeStates"], floor.said()["orderId"]) == ("FINISHED", [], "o1")
+    assert floor.take(order(B, C, update=1)) == "ORDER_UPDATE_FOLLOWING_CANCEL"
+
+
+def test_pause_ends_the_mission_but_not_the_order_and_its_end_leads_on():
+    floor = Floorplan()
+    floor.take(order(A, B))
+    floor.drive()
+    floor.at(2.0, 1.0, v=0.3)
+    floor.robot.on_instant(instant("startPause", "p"), floor.now)
+    assert floor.drive() == ["DELETE"]
+    floor.at(2.0, 1.0)
+    floor.tell()
+    assert (floor.said()["paused"], actions(floor), len(floor.said()["nodeStates"])) == (True, {"p": "FINISHED"}, 1)
+    floor.robot.on_instant(instant("stopPause", "q"), floor.now)
+    assert floor.drive() == ["PUT 4 1"]
+    assert (floor.said()["paused"], actions(floor)["q"]) == (False, "FINISHED")
+
+
+def test_requests_are_answered_and_unknown_actions_fail():
+    floor = Floorplan()
+    assert floor.robot.on_instant(instant("factsheetRequest", "f"), floor.now) == ["state", "factsheet"]
+    floor.robot.on_instant(instant("enableZoneSet", "z", zoneSetId="x"), floor.now)
+    assert (actions(floor), floor.errors()) == ({"f": "FINISHED", "z": "FAILED"}, {"INVALID_INSTANT_ACTION": "WARNING"})
+    for n in range(100):
+        floor.robot.on_instant(instant("stateRequest", f"s{n}"), floor.now)
+    assert (len(actions(floor)), floor.errors()) == (50, {})

@@ -1,0 +1,173 @@
+"""Messages of a fleet control by VDA 5050, and a robot of Fognav on a floor that takes missions as the planner does."""
+
+from __future__ import annotations
+
+import json
+import os
+from functools import cache
+from itertools import pairwise
+from pathlib import Path
+from typing import Any
+
+import jsonschema_rs
+import pytest
+
+from fog_bridges.floor import Answer, Request
+from fog_bridges.vda5050 import telling
+from fog_bridges.vda5050.bridge import Sender, Setup
+from fog_bridges.vda5050.incoming import RELEASES, InstantActions, decoded
+from fog_bridges.vda5050.robot import FleetRobot
+from fog_runtime.transports.mqtt_connection import Broker
+
+SCHEMAS = os.environ.get("FOGNAV_VDA5050_SCHEMAS", "")
+"""A checkout of VDA5050/VDA5050 with the schemas of 3.0 (its branch main: the tag 3.0.0 has no valid JSON), and in its
+`2.1.0` one of the tag 2.1.0."""
+VERSIONS = ("3.0", "2.1")
+
+
+@cache
+def schema(version: str, topic: str) -> jsonschema_rs.Validator:
+    """Return the published schema of a topic."""
+    if not SCHEMAS:
+        pytest.skip("needs the schemas: git clone github.com/VDA5050/VDA5050 V, FOGNAV_VDA5050_SCHEMAS=V "
+                    "(for 2.1 the tag 2.1.0 in V/2.1.0)")  # fmt: skip
+    folder = Path(SCHEMAS) / ("json_schemas" if version == "3.0" else "2.1.0/json_schemas")
+    return jsonschema_rs.validator_for(json.loads((folder / f"{topic}.schema").read_text("utf-8")))
+
+
+def header(version: str = "3.0") -> dict[str, Any]:
+    return {"headerId": 1, "timestamp": "2026-01-02T03:04:05.678Z", "version": RELEASES[version],
+            "manufacturer": "fognav", "serialNumber": "r1"}  # fmt: skip
+
+
+def node(name: str, sequence: int, x: float, y: float, *, released: bool = True, **more: Any) -> dict[str, Any]:
+    position = {"x": x, "y": y, "mapId": "lab"} | more.pop("position", {})
+    return {
+        "nodeId": name,
+        "sequenceId": sequence,
+        "released": released,
+        "actions": [],
+        "nodePosition": position,
+    } | more
+
+
+def order(*nodes: dict[str, Any], update: int = 0, name: str = "o1", edge: dict[str, Any] | None = None,
+          version: str = "3.0", **more: Any) -> dict[str, Any]:  # fmt: skip
+    edges = [
+        {"edgeId": f"e{a['sequenceId'] + 1}", "sequenceId": a["sequenceId"] + 1, "released": b["released"],
+         "actions": [], "startNodeId": a["nodeId"], "endNodeId": b["nodeId"], **(edge or {})}
+        for a, b in pairwise(nodes)
+    ]  # fmt: skip
+    return header(version) | {"orderId": name, "orderUpdateId": update, "nodes": list(nodes), "edges": edges} | more
+
+
+def read(message: dict[str, Any], topic: str = "order", version: str = "3.0") -> Any:
+    return decoded(topic, json.dumps(message).encode(), version, "r1")
+
+
+def instant(kind: str, name: str = "a1", **parameters: Any) -> InstantActions:
+    found = [{"key": key, "value": value} for key, value in parameters.items()]
+    action = {"actionType": kind, "actionId": name, "blockingType": "NONE", "actionParameters": found}
+    return read(header() | {"actions": [action]}, "instantActions")
+
+
+STATE = {"mode": "NORMAL", "enabled": True, "reasons": [], "codes": [], "battery": 0.5, "goal_id": None,
+         "goal_reached": False, "awaits_operator": False, "wants_dock": False, "power": {"charging": "no"}}  # fmt: skip
+
+
+class Floorplan:
+    """A robot on a floor that takes missions as the planner does."""
+
+    def __init__(self) -> None:
+        self.robot = FleetRobot("r1", "lab")
+        self.goal: dict[str, Any] | None = None
+        self.asked: list[Request] = []
+        self.state: dict[str, Any] = dict(STATE)
+        self.more: dict[str, Any] = {}
+        self.now = 100.0
+        self.at(1.0, 1.0)
+        self.tell()
+
+    def at(self, x: float, y: float, v: float = 0.0) -> None:
+        """Put the robot there."""
+        self.robot.on_pose(
+            {"x": x, "y": y, "theta": 0.0, "v": v, "w": 0.0, "covariance": [1e-4] * 9, "radius": 0.17, "height": 0.1,
+             "localized": True}, self.now,
+        )  # fmt: skip
+
+    def tell(self, seconds: float = 1.0, **state: Any) -> None:
+        """Let the robot tell its state, `seconds` later."""
+        self.now += seconds
+        self.state |= {"stamp": self.now, **state}
+        self.robot.on_robot({"state": dict(self.state), "goal": self.goal, **self.more}, self.now)
+
+    def drive(self, answer: Answer | None = None) -> list[str]:
+        """Let the floor answer all that is asked; return it: PUT with the goal, DELETE."""
+        first = len(self.asked)
+        while (request := self.robot.step(self.now)) is not None:
+            self.asked.append(request)
+            if answer is not None:
+                self.robot.on_answer(answer, self.now)
+                break
+            if request.method == "PUT":
+                self.goal = {"goal_id": f"g{len(self.asked)}"}
+                self.state |= {"goal_id": self.goal["goal_id"], "goal_reached": False}
+                self.robot.on_answer(Answer("", body=self.goal), self.now)
+            else:
+                self.goal = None
+                self.robot.on_answer(Answer(""), self.now)
+        self.tell(0.1)
+        bodies = [request.body["pose"] if request.body else None for request in self.asked[first:]]
+        return [request.method if body is None else f"{request.method} {body['x']:g} {body['y']:g}"
+                for request, body in zip(self.asked[first:], bodies, strict=True)]  # fmt: skip
+
+    def reach(self, x: float, y: float) -> None:
+        """Let the robot reach its goal, and the planner end the mission."""
+        self.at(x, y)
+        self.tell(goal_reached=True)
+        self.goal = None
+        self.tell(goal_id=None, goal_reached=False)
+
+    def take(self, message: dict[str, Any]) -> str:
+        """Give an order to the robot; return the error type by which it is rejected."""
+        found = read(message)
+        error = self.robot.checked(found, self.now)
+        if error is None:
+            self.robot.accept(found)
+        return "" if error is None else error.error_type
+
+    def said(self, version: str = "3.0") -> dict[str, Any]:
+        """Return the robot's state as it is published."""
+        state = telling.state(self.robot, self.now, 1.7e9)
+        setup = Setup(site="lab", broker=Broker.of("mqtt://localhost"), version=version, interface="vda5050",
+                      manufacturer="fognav", map_id="lab", robots=["r1"], zones=[])  # fmt: skip
+        return json.loads(Sender(setup, version, "fognav", "r1").message("state", state, 1.7e9))
+
+    def errors(self) -> dict[str, str]:
+        """Return the types and levels of the state's errors."""
+        return {each["errorType"]: each["errorLevel"] for each in self.said()["errors"]}
+
+
+A, B, C = node("a", 0, 1.0, 1.0), node("b", 2, 4.0, 1.0), node("c", 4, 7.0, 1.0)
+
+
+def driving() -> Floorplan:
+    """A robot under way, with a path, errors and actions."""
+    floor = Floorplan()
+    floor.take(order(A, node("b", 2, 4.0, 1.0, position={"theta": 1.0}), C | {"released": False}))
+    floor.drive()
+    floor.at(1.5, 1.1, v=0.3)
+    floor.robot.on_path([(1.0, 1.0), (3.0, 1.0), (4.0, 1.0)])
+    floor.robot.on_instant(instant("startPause", "p"), floor.now)
+    floor.robot.on_instant(instant("nonsense", "n"), floor.now)
+    floor.take(order(A, B, name="o2"))
+    floor.tell(0.1, codes=["battery_low"], reasons=["empty soon"], power={"voltage_v": 14.4, "current_a": -0.8})
+    return floor
+
+
+RING = [[1.0, 1.0], [2.0, 1.0], [2.0, 2.0]]
+
+
+def area(state: str | None, penalty: int = 0) -> dict[str, Any]:
+    hazard = None if state is None else {"state": state, "penalty": penalty}
+    return {"definition": {"polygon": RING, "unknown": {"penalty": 200}}, "hazard": hazard}

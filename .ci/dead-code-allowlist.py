@@ -36,6 +36,14 @@ _.path_received
 _.first_command
 HOME_ASSISTANT  # channels: rows of the table for other people's programs, which no service of ours uses yet
 NODE_UPDATE  # the firmware on a board subscribes to it
+# VDA 5050: what a fleet control sends beside what is used of it, and what it reads.
+(_.blocking_type, _.start_node_id, _.end_node_id, _.orientation_type, _.header_id)
+(_.node_states, _.edge_states, _.action_states, _.instant_action_states, _.action_result, _.last_node_sequence_id)
+(_.operating_mode, _.new_base_request, _.vx, _.vy, _.omega, _.deviation_range, _.reference_state_header_id)
+(_.control_points, _.knot_vector, _.degree, _.traversed_nodes, _.polyline, _.eta, _.penalty_factor, _.zone_descriptor)
+(_.error_level, _.error_references, _.error_hint, _.reference_key, _.reference_value)
+(_.info_type, _.info_level, _.info_descriptor, _.safety_state, _.active_emergency_stop, _.field_violation)
+(_.state_of_charge, _.battery_voltage, _.battery_current)
 _.ROLES
 _.DURABILITIES
 

@@ -9,6 +9,7 @@ from fognav.__main__ import app
 from fognav.commands import bridge
 
 HOME = 'adapters = "home-assistant"\nhome_assistant_credentials_file = "ha.toml"\n'
+FLEET = 'adapters = "vda5050"\nvda5050_mqtt_url = "mqtt://fleet.local"\n'
 NETWORK = 'home_assistant_mqtt_url = "mqtt://ha.local"\n'
 
 
@@ -27,6 +28,10 @@ def checked(tmp_path, text: str, *command: str) -> tuple[int, str]:
         ('adapters = "home-asistant"', "'home-asistant' is none. Name one or several of: home-assistant"),
         ('adapters = "ros2"', "ros2_router names where `rmw_zenohd` listens"),
         ('adapters = "ros2"\nros2_router = "here"', "here can't be used to reach ROS's router"),
+        ('adapters = "vda5050"', "vda5050_mqtt_url names the fleet control's broker"),
+        (FLEET, "names who takes part"),
+        (FLEET + 'vda5050_zones = "kit"', "'kit' is not MANUFACTURER/SERIAL"),
+        (FLEET + 'vda5050_robots = "r1"\nvda5050_credentials_file = "ha.toml"', "vda5050_unencrypted = true"),
         ('adapters = "home-assistant"\nurl = "x"', "unknown setting 'url'"),
         (HOME + NETWORK, "everybody in the network could read the password"),
         (HOME + NETWORK.replace("//", "//fognav:secret@"), "which no log shows"),

@@ -22,7 +22,6 @@ ID_MAX: Final = 200
 ACTIONS_MAX: Final = 20
 
 Text = Annotated[str, Meta(max_length=ID_MAX)]
-Words = Annotated[str, Meta(max_length=1000)]
 Number = Annotated[float, Meta(ge=-1e6, le=1e6)]
 Size = Annotated[float, Meta(ge=0.0, le=1e6)]
 Angle = Annotated[float, Meta(ge=-3.14159265359, le=3.14159265359)]

@@ -292,6 +292,7 @@ class ZoneLink(Connection):
         self.sets = ZoneSets(setup.site, setup.map_id)
         self._users = {key: ZoneUser(self.sets.prefix, setup.map_id) for key in setup.zones}
         self._senders = {key: Sender(setup, "3.0", *key) for key in setup.zones}
+        self._logged: dict[tuple[str, str], tuple[str, str]] = {}
         self._of_topic = {
             sender.topic(name): (key, name) for key, sender in self._senders.items() for name in ("state", "connection")
         }
@@ -321,7 +322,9 @@ class ZoneLink(Connection):
                 continue
             for key, user in self._users.items():
                 for kind, name in user.steps(current.zone_set_id, now):
-                    _log.info("zone_set", robot="/".join(key), step=kind, zone_set=name)
+                    if self._logged.get(key) != (kind, name):  # else it is sent again
+                        self._logged[key] = kind, name
+                        _log.info("zone_set", robot="/".join(key), step=kind, zone_set=name)
                     if kind == "zoneSet":
                         await self._send(client, key, "zoneSet", {"zoneSet": current})
                     else:

@@ -1,7 +1,7 @@
 // The console once somebody is logged in: tabs, the map, the panel of the view, messages and the stop bar.
 import { useCallback, useEffect, useMemo, useRef, useState } from "preact/hooks";
 import type { Session } from "./api/types";
-import { type Console, ConsoleContext, mayOperate, type Say } from "./context";
+import { type Console, ConsoleContext, type Say } from "./context";
 import { type Language, language, setLanguage, t } from "./i18n/i18n";
 import { Live } from "./live/live";
 import { Floor } from "./map/floor";
@@ -200,7 +200,6 @@ function Settings({ onLanguage }: { readonly onLanguage: (to: Language) => void 
               </select>
             </label>
             <p class="muted">{t("stop.keys")}</p>
-            {mayOperate(console.session) && <a class="button" href="#/codes">{t("codes.title")}</a>}
             <button onClick={console.logOut}>{t("logout")}</button>
           </div>
         </details>

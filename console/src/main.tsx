@@ -64,7 +64,7 @@ function Root({ first }: { readonly first: string | null }): preact.JSX.Element 
   if (page.name === "visit" || session?.role === "guest") {
     return session === null ? <NoCode /> : <VisitApp place={page.place} onExpired={() => leave("")} />;
   }
-  if (page.name === "codes" && session !== null && mayOperate(session)) return <CodesPage />;
+  if (page.name === "codes" && session !== null && mayOperate(session)) return <CodesPage own={session.role === "admin"} />;
   if (session !== null) {
     return (
       <ConsoleApp

@@ -3,6 +3,7 @@ import { useEffect, useState } from "preact/hooks";
 import { Problem, request, robotPath } from "./api/client";
 import type { CommandOutcome } from "./api/types";
 import type { Say } from "./context";
+import { saidProblem } from "./i18n/codes";
 import { t } from "./i18n/i18n";
 
 const STORED = "fognav.robots";
@@ -24,7 +25,7 @@ export function rememberedRobots(): string[] {
 /** Return a problem's sentence for people. */
 export function sentence(error: unknown): string {
   if (!(error instanceof Problem)) return String(error);
-  return error.code === "unreachable" ? t("error.unreachable") : error.detail;
+  return error.code === "unreachable" ? t("error.unreachable") : saidProblem(error);
 }
 
 interface Props {

@@ -78,6 +78,26 @@ async def test_tile_changes_its_cells_of_the_costmap_and_no_others(
     assert sum(old != new for old, new in zip(before, after, strict=True)) == 1
 
 
+async def test_labels_that_would_lie_over_more_important_ones_are_hidden(
+    console: SimpleNamespace, stream: ConsoleStream
+) -> None:
+    for number in range(4):
+        stream.tell("place", f"p{number}", {"x": 12.0, "y": 26.5, "theta": None, "label": f"Place {number}"})
+    stream.tell("zone", "wet", _zone("wet", "wet floor"))
+    page = await console.open(**PHONE)
+    shown = page.locator(".label:not(.covered)")
+    await expect(shown.filter(has_text="wet")).to_have_count(1)
+    overlapping = """labels => labels.filter((a, i) => labels.slice(i + 1).some(b => {
+        const [p, q] = [a.getBoundingClientRect(), b.getBoundingClientRect()];
+        return p.left < q.right && q.left < p.right && p.top < q.bottom && q.top < p.bottom;
+    })).length"""
+    assert await shown.evaluate_all(overlapping) == 0
+    for _ in range(6):
+        await page.get_by_role("button", name="Zoom in").click()
+    assert await shown.evaluate_all(overlapping) == 0
+    await expect(page.locator(".label.covered")).not_to_have_count(0)
+
+
 async def test_page_goes_on_where_a_broken_connection_ended(console: SimpleNamespace, stream: ConsoleStream) -> None:
     page = await console.open()
     stream.cut()
@@ -120,7 +140,15 @@ async def test_hostile_names_are_text_everywhere(console: SimpleNamespace, strea
     stream.tell("node", "n1", {**node, "reason": HOSTILE, "online": False})
     alert = Alert(id=HOSTILE, kind="node-unknown", area="z1", reason=HOSTILE, since=1.0, raised=2.0)
     stream.tell("alert", HOSTILE, alert)
-    entry = {"at": 1.0, "who": HOSTILE, "id": HOSTILE, "before": None, "after": {"id": HOSTILE, "reason": HOSTILE}}
+    told = {"codes": [HOSTILE], "decided_by": HOSTILE, "overridden": False}
+    entry = {
+        **told,
+        "at": 1.0,
+        "who": HOSTILE,
+        "id": HOSTILE,
+        "before": None,
+        "after": {"id": HOSTILE, "reason": HOSTILE},
+    }
     kinds = ("zone", "place", "override", "mission", "robot", "stop", "set", "hazard", "fault", "alert")
     stream.answers["GET timeline"] = (
         200, [{**entry, "kind": kind, "action": "put", "text": HOSTILE, "entry": f"{kind}-1"} for kind in kinds],

@@ -92,7 +92,6 @@ async def test_guest_scans_waits_follows_and_arrives_and_a_stop_ends_the_next_vi
 
 async def codes_are_made_of_a_guests_token_only(building: Building, anna: Page) -> None:
     await anna.goto(f"{building.url}#login={building.operator}")
-    await anna.get_by_text("Settings").click()
     await anna.get_by_role("link", name="Codes for visitors").click()
     await anna.get_by_label("Token of a guest").fill(building.operator)
     await anna.get_by_role("button", name="Show the codes").click()
@@ -151,10 +150,17 @@ async def guest_is_where_the_robot_is_and_changes_their_mind(guest: Page) -> Non
     await expect(guest.get_by_text("You have ended it.")).to_be_visible()
 
 
+async def operator_sees_the_visit(building: Building, anna: Page) -> None:
+    visits = anna.get_by_role("region", name="Visitors")
+    await expect(visits.get_by_role("listitem")).to_contain_text("lobby")
+    await building.look(anna, "visits")
+
+
 async def operator_stops_the_next_visit(building: Building, guest: Page, anna: Page) -> None:
     await guest.get_by_role("button", name="A, west entrance").click()
     title = guest.get_by_role("heading", level=1)
     await expect(title).to_have_text(f"{ROBOT} is coming to you")
+    await operator_sees_the_visit(building, anna)
     await building.live.stop_operator()
     await anna.get_by_role("button", name=f"Stop {ROBOT}").click()
     await expect(title).to_have_text("The visit is over")

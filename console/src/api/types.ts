@@ -22,6 +22,7 @@ export type MapGeometry = Schemas["MapGeometry"];
 export type MapInfo = Schemas["MapInfo"];
 export type MapPreview = Schemas["MapPreview"];
 export type MapState = Schemas["MapState"];
+export type OpenVisit = Schemas["OpenVisit"];
 export type OutOfService = Schemas["OutOfService"];
 export type OverrideBody = Schemas["OverrideBody"];
 export type PeriodView = Schemas["PeriodView"];

@@ -137,7 +137,7 @@ function previewLayer(seen: MapPreview): L.LayerGroup {
     const mark = L.circleMarker([one.y, one.x], { radius: 9, className: "finding", interactive: false });
     const text = document.createElement("bdi");
     text.textContent = one.id;
-    return mark.bindTooltip(text, { permanent: true, direction: "top", className: "label" });
+    return mark.bindTooltip(text, { permanent: true, direction: "top", className: "label draft" });
   });
   return L.layerGroup([plan, ...marks]);
 }

@@ -1,6 +1,7 @@
 // What stands still on the map: zones, areas with their hazards, sensor nodes and places.
 import L from "leaflet";
 import type { AreaView, NodeValue, Place, Point, Values } from "../api/types";
+import { said } from "../i18n/codes";
 import { t } from "../i18n/i18n";
 import type { Live, Topic } from "../live/live";
 import { clockTime } from "../text";
@@ -32,6 +33,16 @@ export function areaText(area: AreaView): string {
   return `${text} ${t("since", { time: clockTime(hazard.since) })}`;
 }
 
+/** Kinds of labels, the most important first: what keeps robots out, what may, where they are sent, what only is there. */
+const RANKS = ["draft", "zone active", "area blocked", "area unknown", "place", "area", "zone"] as const;
+
+function rankOf(classes: DOMTokenList): number {
+  const found = RANKS.findIndex((kinds) => kinds.split(" ").every((kind) => classes.contains(kind)));
+  return found < 0 ? RANKS.length : found;
+}
+
+const overlaps = (a: DOMRect, b: DOMRect): boolean => a.left < b.right && b.left < a.right && a.top < b.bottom && b.top < a.bottom;
+
 export class FixedLayer {
   private readonly shapes = new Map<string, L.LayerGroup>();
   private readonly dirty = new Set<string>();
@@ -46,7 +57,11 @@ export class FixedLayer {
     private readonly onZone: (id: string) => void,
   ) {
     const offs = TOPICS.map((topic) => live.on([topic], (key) => this.mark(topic, key)));
-    this.stop = () => offs.forEach((off) => off());
+    map.on("zoomend", this.declutter, this);
+    this.stop = () => {
+      offs.forEach((off) => off());
+      map.off("zoomend", this.declutter, this);
+    };
     this.redrawAll();
   }
 
@@ -86,6 +101,21 @@ export class FixedLayer {
       if (group) this.shapes.set(name, group.addTo(this.map));
     }
     this.dirty.clear();
+    this.declutter();
+  }
+
+  /** Hide labels that would lie over more important ones. A moved map moves all of them alike: only its scale counts. */
+  private declutter(): void {
+    const labels = [...this.map.getPane("tooltipPane")?.querySelectorAll<HTMLElement>(".label") ?? []];
+    for (const each of labels) each.classList.remove("covered");
+    // All are measured before the first is hidden: the browser lays the page out once.
+    const boxes = labels.map((each) => ({ each, rank: rankOf(each.classList), box: each.getBoundingClientRect() }));
+    boxes.sort((a, b) => a.rank - b.rank);
+    const kept: DOMRect[] = [];
+    for (const { each, box } of boxes) {
+      if (kept.some((other) => overlaps(box, other))) each.classList.add("covered");
+      else kept.push(box);
+    }
   }
 
   private make(name: string): L.LayerGroup | null {
@@ -152,7 +182,7 @@ export class FixedLayer {
       return L.polygon([toLatLng(at), ...edge], { className: `cone ${health}`, interactive: false });
     });
     const marker = L.circleMarker(toLatLng(at), { radius: 5, className: `node ${health}` });
-    marker.bindTooltip(label(node.id, "", node.reason));
+    marker.bindTooltip(label(node.id, "", said(node.code, node.reason)));
     return L.layerGroup([...cones, marker]);
   }
 

@@ -61,12 +61,13 @@ export class Floor {
     this.map.createPane("plan").classList.add("below");
     this.map.createPane("costs").classList.add("below");
     this.map.setView([0, 0], 3);
-    this.robots = new RobotLayer(this.map, live, handlers.onRobot);
-    this.fixed = new FixedLayer(this.map, live, handlers.onZone);
-    this.map.on("click", (event) => this.click(event));
+    // Before the layers: what their labels cover depends on how long they are.
     const distance = (): void => void element.classList.toggle("afar", this.map.getZoom() < NEARBY_ZOOM);
     this.map.on("zoomend", distance);
     distance();
+    this.robots = new RobotLayer(this.map, live, handlers.onRobot);
+    this.fixed = new FixedLayer(this.map, live, handlers.onZone);
+    this.map.on("click", (event) => this.click(event));
     this.map.on("dragstart", () => this.follow(false));
     this.stops.push(
       live.on(["pose"], (id) => {

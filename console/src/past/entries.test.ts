@@ -1,11 +1,14 @@
-import { expect, test } from "vitest";
+import { expect, test, vi } from "vitest";
+import { Problem } from "../api/client";
 import type { PeriodView, TimelineEntry } from "../api/types";
 import { piecesOf } from "../sensors/history";
 import { stagesOf } from "../sensors/latency";
-import { undoable } from "./entries";
+import { saidProblem } from "../i18n/codes";
+import { setLanguage } from "../i18n/i18n";
+import { detailText, undoable } from "./entries";
 
 const entry = (kind: string, id: string, action: string, name: string): TimelineEntry =>
-  ({ at: 0, kind, id, action, who: "ana", text: "", entry: name, before: null, after: null });
+  ({ at: 0, kind, id, action, who: "ana", text: "", codes: [], decided_by: null, overridden: false, entry: name, before: null, after: null });
 
 test("only the latest change of a record that somebody decided can be undone", () => {
   const found = undoable([
@@ -16,9 +19,24 @@ test("only the latest change of a record that somebody decided can be undone", (
   expect([...found]).toEqual([["8-0.zone", "zones"], ["7-0.override", "areas"]]);
 });
 
+test("what programs tell by an identifier is said in the user's language, and all else as they say it", () => {
+  const echo = { ...entry("hazard", "hall", "blocked", ""), text: "node n1: an echo at 0.86 m", codes: ["something_near"], decided_by: "n1" };
+  const fault = { ...entry("fault", "r1", "began", ""), text: "bumper pressed; it hums", codes: ["bumper", "newer_than_the_page"] };
+  const stops = { ...entry("stop", "r1", "stop", "1-0.stop"), after: { kind: "disable", repeats: { ana: 2, others: 1 }, period_s: 600 } };
+  const refused = new Problem(409, "command_refused", "a fault must be reset first", { refusal: "fault_latched", causes: ["bumper"] });
+  expect([echo, fault, stops].map(detailText)).toEqual([echo.text, fault.text, "3 times more within 10 min: ana 2, others 1"]);
+  expect(saidProblem(refused)).toBe("a fault must be reset first");
+  vi.stubGlobal("document", { documentElement: {} });
+  setLanguage("pt", false);
+  expect([echo, fault].map(detailText)).toEqual(["n1: há um eco mais perto do que o limite", fault.text]);
+  expect(saidProblem(refused)).toBe("É preciso repor primeiro a avaria: O para-choques está premido");
+  setLanguage("en", false);
+  vi.unstubAllGlobals();
+});
+
 test("a strip of an area's history shows what lies in its time, and nothing more", () => {
   const period = (began: number, ended: number | null): PeriodView =>
-    ({ period: { began, state: "clear", penalty: 0, cause: "", overridden: false }, ended, lasted_s: 1 });
+    ({ period: { began, state: "clear", penalty: 0, cause: "", overridden: false, code: "", decided_by: null }, ended, lasted_s: 1 });
   const pieces = piecesOf([period(950, null), period(850, 950), period(100, 850), period(10, 90)], 1000, 200);
   expect(pieces.map(({ from, share }) => [from, share])).toEqual([[0.75, 0.25], [0.25, 0.5], [0, 0.25]]);
 });

@@ -1,6 +1,8 @@
 // Entries of the timeline: in words, and which of them can be undone.
 import type { TimelineEntry } from "../api/types";
-import { maybe, t } from "../i18n/i18n";
+import { said, saidAll, saidCause } from "../i18n/codes";
+import { language, maybe, t } from "../i18n/i18n";
+import { duration } from "../text";
 import type { Undoing } from "../zones/requests";
 
 export const KINDS = ["zone", "set", "source", "place", "map", "hazard", "override", "area", "mission", "robot", "service", "stop", "fault", "alert", "store"] as const;
@@ -27,10 +29,31 @@ export function undoable(entries: readonly TimelineEntry[]): Map<string, Undoing
   return found;
 }
 
+/** Return the details of what happened, empty without any. */
+export function detailText({ kind, text, codes, decided_by: by, overridden, after }: TimelineEntry): string {
+  if (kind === "stop") return repeatsText(after);
+  if (kind === "alert") {
+    const { code, reason } = (after ?? {}) as { readonly code?: string; readonly reason?: string };
+    return said(code, reason ?? "");
+  }
+  if (kind !== "hazard") return saidAll(codes, text);
+  if (overridden) return language() === "en" ? text : t("area.overridden");
+  return saidCause(codes[0] ?? "", by, text);
+}
+
+/** Return how often stops were repeated, and by whom; empty for one that is told by itself. */
+function repeatsText(after: unknown): string {
+  const { repeats, period_s: period } = (after ?? {}) as { readonly repeats?: Readonly<Record<string, number>>; readonly period_s?: number };
+  if (repeats === undefined) return "";
+  const count = Object.values(repeats).reduce((sum, each) => sum + each, 0);
+  const who = Object.entries(repeats).map(([name, times]) => `${name} ${times}`).join(", ");
+  return t("timeline.repeats", { count, time: duration(period ?? 0), who });
+}
+
 /** Return what happened, in words. */
 export function entryText({ kind, id, action }: TimelineEntry): string {
   const what = maybe(`kind.${kind}`) ?? kind;
   const state = kind === "hazard" ? maybe(`state.${action}`) : null;
-  const done = state ?? maybe(`action.${action}`) ?? action;
+  const done = state ?? maybe(`action.${action}`) ?? maybe(`command.${action}`) ?? action;
   return t("timeline.entry", { what, id, done });
 }

@@ -2,6 +2,7 @@
 import { useEffect, useState } from "preact/hooks";
 import { request } from "../api/client";
 import type { PeriodView } from "../api/types";
+import { saidCause } from "../i18n/codes";
 import { t } from "../i18n/i18n";
 import { clockTime, duration } from "../text";
 
@@ -67,7 +68,7 @@ export function History({ area, since, now }: Props): preact.JSX.Element {
             <span class={`swatch ${period.state}`} aria-hidden="true" />
             <span>{t(`state.${period.state}`)}{period.overridden && ` (${t("area.overridden")})`}</span>
             <span class="value">{clockTime(period.began)} · {duration(lasted)}</span>
-            <span class="why clipped"><bdi>{period.cause}</bdi></span>
+            <span class="why clipped"><bdi>{saidCause(period.code, period.decided_by, period.cause)}</bdi></span>
           </li>
         ))}
       </ul>

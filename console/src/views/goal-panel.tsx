@@ -3,6 +3,7 @@ import { useEffect, useState } from "preact/hooks";
 import { Problem, request, robotPath } from "../api/client";
 import type { GoalBody, GoalView, PlanReply } from "../api/types";
 import { type Say, useConsole, useLive, useShown } from "../context";
+import { said } from "../i18n/codes";
 import { t } from "../i18n/i18n";
 import type { Live } from "../live/live";
 import { toPoint } from "../map/geometry";
@@ -171,7 +172,7 @@ async function plan(start: Position, goal: Position): Promise<{ points: [number,
     const { refusal } = value;
     if (refusal) {
       const nearest = refusal.nearest ? toPoint(refusal.nearest) : null;
-      return { points: [], preview: { text: t("goal.refused", { reason: refusal.reason }), nearest, refused: true } };
+      return { points: [], preview: { text: t("goal.refused", { reason: said(refusal.kind, refusal.reason) }), nearest, refused: true } };
     }
     const points = (value.points ?? []).map((pair): [number, number] => [...toPoint(pair)]);
     return { points, preview: { text: t("goal.length", { length: metres(value.length) }), nearest: null, refused: false } };

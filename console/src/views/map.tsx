@@ -1,10 +1,12 @@
 // What is going on, in words: the same that the map shows.
 import { useConsole, useLive } from "../context";
+import { said } from "../i18n/codes";
 import { t } from "../i18n/i18n";
 import { MapChange } from "../map/change";
 import { areaText } from "../map/fixed-layer";
 import { routeHash } from "../router";
 import { clockTime } from "../text";
+import { Places, Visits } from "./places";
 import { RobotCard } from "./robot-card";
 
 const RANK = { blocked: 0, unknown: 1, clear: 2 } as const;
@@ -25,12 +27,13 @@ export function MapView(): preact.JSX.Element {
       <ul class="cards">
         {robots.map((id) => <li key={id}><RobotCard id={id} chosen={id === robot} /></li>)}
       </ul>
+      <Visits />
       {alerts.length > 0 && (
         <>
           <h2>{t("map.alerts")}</h2>
           <ul class="rows">
             {alerts.map((alert) => (
-              <li key={alert.id} class="row alert"><b>{alert.area}</b> {alert.reason} <span class="muted">{t("since", { time: clockTime(alert.since) })}</span></li>
+              <li key={alert.id} class="row alert"><b>{alert.area}</b> {said(alert.code, alert.reason)} <span class="muted">{t("since", { time: clockTime(alert.since) })}</span></li>
             ))}
           </ul>
         </>
@@ -56,6 +59,7 @@ export function MapView(): preact.JSX.Element {
           </li>
         ))}
       </ul>
+      <Places />
       {session.role === "admin" && <MapChange />}
     </>
   );

@@ -10,6 +10,7 @@ import { sentence } from "../stop";
 import { decimal, duration, metres, percent } from "../text";
 import { headline, outOfService, stoppedBy, whys } from "../why";
 import { GoalPanel, homeOf, sendTo } from "./goal-panel";
+import { Visits } from "./places";
 import { PosePanel } from "./pose-panel";
 import { RobotCard } from "./robot-card";
 import { ServicePanel } from "./service-panel";
@@ -31,6 +32,7 @@ export function RobotsView(): preact.JSX.Element {
         <ul class="cards">{robots.map((id) => <li key={id}><RobotCard id={id} chosen={id === robot} /></li>)}</ul>
       )}
       {robot !== null && robots.includes(robot) && <Details key={robot} id={robot} />}
+      <Visits />
     </>
   );
 }

@@ -2,6 +2,7 @@
 import { useEffect, useState } from "preact/hooks";
 import type { AreaView, NodeValue } from "../api/types";
 import { mayOperate, useConsole, useLive, useSeconds } from "../context";
+import { said, saidCause } from "../i18n/codes";
 import { t } from "../i18n/i18n";
 import { areaText } from "../map/fixed-layer";
 import { toPoint } from "../map/geometry";
@@ -78,7 +79,7 @@ function NodeRow({ node, onShow }: RowProps): preact.JSX.Element {
       <b><bdi>{node.id}</bdi></b>
       <a href={routeHash("sensors", node.area)}><bdi>{node.area}</bdi></a>
       <span class="value">{health}{node.age_s !== null && ` · ${t("ago", { age: duration(node.age_s) })}`}</span>
-      <span class="why"><bdi>{node.reason}</bdi>{node.code !== "" && <code> {node.code}</code>}</span>
+      <span class="why"><bdi>{said(node.code, node.reason)}</bdi>{node.code !== "" && <code> {node.code}</code>}</span>
       {onShow && <button aria-label={t("zones.showOf", { zone: node.id })} onClick={onShow}>{t("zones.show")}</button>}
       <details>
         <summary>{t("sensors.care")}</summary>
@@ -108,7 +109,7 @@ function AreaCard({ area, nodes, onPlace }: CardProps): preact.JSX.Element {
       <h2 class="named"><bdi>{nameOf(area)}</bdi></h2>
       <dl class="facts">
         <dt>{t("field.state")}</dt><dd>{areaText(area)}{area.withheld && ` (${t("sensors.withheld")})`}</dd>
-        <dt>{t("sensors.cause")}</dt><dd><bdi>{hazard?.cause || "–"}</bdi></dd>
+        <dt>{t("sensors.cause")}</dt><dd><bdi>{hazard ? saidCause(hazard.code, hazard.decided_by, hazard.cause) : "–"}</bdi></dd>
         <dt>{t("sensors.placeBy")}</dt><dd>{definition.cone_of ? t("sensors.byCone", { node: definition.cone_of }) : t("shape.corners", { number: definition.polygon.length })}</dd>
       </dl>
       <div class="actions">

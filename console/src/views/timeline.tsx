@@ -4,7 +4,7 @@ import { request } from "../api/client";
 import type { TimelineEntry } from "../api/types";
 import { mayOperate, useConsole } from "../context";
 import { t } from "../i18n/i18n";
-import { entryText, KINDS, undoable } from "../past/entries";
+import { detailText, entryText, KINDS, undoable } from "../past/entries";
 import { Replay } from "../past/replay";
 import { sentence } from "../stop";
 import { clockTime } from "../text";
@@ -76,7 +76,7 @@ export function TimelineView(): preact.JSX.Element {
             {undone.has(entry.entry) && mayOperate(session) && (
               <button aria-label={t("timeline.undoOf", { what: entryText(entry) })} onClick={() => undo(entry)}>{t("undo")}</button>
             )}
-            {entry.text !== "" && <span class="why clipped"><bdi>{entry.text}</bdi></span>}
+            {detailText(entry) !== "" && <span class="why clipped"><bdi>{detailText(entry)}</bdi></span>}
           </li>
         ))}
       </ol>

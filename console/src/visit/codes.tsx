@@ -10,13 +10,22 @@ import "./visit.css";
 
 const LOOPBACK = /^(localhost|127\.|\[::1\])/;
 
-export function CodesPage(): preact.JSX.Element {
+interface Props {
+  /** Whether who looks at it has codes of their own, as admins do. */
+  readonly own: boolean;
+}
+
+export function CodesPage({ own }: Props): preact.JSX.Element {
   const [places, setPlaces] = useState<readonly PublicPlace[] | null>(null);
   const [token, setToken] = useState("");
   const [checked, setChecked] = useState("");
   const [problem, setProblem] = useState("");
   const failed = (error: unknown): void => setProblem(sentence(error));
   useEffect(() => void request<PublicPlace[]>("GET", "visits/places").then(({ value }) => setPlaces(value), failed), []);
+
+  useEffect(() => {
+    if (own) void request<{ readonly token: string }>("POST", "session/code").then(({ value }) => setChecked(value.token), failed);
+  }, [own]);
 
   // What hangs on a wall is everybody's: no other token than a guest's may get there.
   const check = async (event: Event): Promise<void> => {
@@ -39,6 +48,9 @@ export function CodesPage(): preact.JSX.Element {
       <p>{t("codes.how")}</p>
       {LOOPBACK.test(location.hostname) && <p class="problem">{t("codes.loopback", { host: location.hostname })}</p>}
       {places?.length === 0 && <p class="problem">{t("codes.none")}</p>}
+      {own && <p class="muted">{t("codes.own")}</p>}
+      <details open={!own}>
+      <summary>{t("codes.other")}</summary>
       <form onSubmit={(event) => void check(event)}>
         <label for="guest-token">{t("codes.token")}</label>
         <input
@@ -46,10 +58,11 @@ export function CodesPage(): preact.JSX.Element {
           value={token} onInput={(event) => setToken(event.currentTarget.value)}
         />
         <p id="guest-how" class="muted">{t("codes.tokenHow")}</p>
-        <p id="guest-wrong" class="problem" role="alert">{problem}</p>
-        <button class="primary">{t("codes.make")}</button>
+        <button class={own ? "" : "primary"}>{t("codes.make")}</button>
       </form>
-      {checked !== "" && <button onClick={() => print()}>{t("codes.print")}</button>}
+      </details>
+      <p id="guest-wrong" class="problem" role="alert">{problem}</p>
+      {checked !== "" && <button class="primary" onClick={() => print()}>{t("codes.print")}</button>}
       <a href="#/map">{t("codes.back")}</a>
       {checked !== "" && (
         <ul>

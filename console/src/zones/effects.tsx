@@ -4,6 +4,7 @@ import { useEffect, useState } from "preact/hooks";
 import { Problem } from "../api/client";
 import type { DryRunBody, DryRunOutcome, Point } from "../api/types";
 import { useConsole } from "../context";
+import { said } from "../i18n/codes";
 import { t } from "../i18n/i18n";
 import type { Live } from "../live/live";
 import { sentence } from "../stop";
@@ -42,10 +43,10 @@ function robotEffects({ robot, before, after, replanned, extra_m: extraM, extra_
   const add = (text: string, short: string, bad: boolean): void => void found.push({ text, short, bad, at: { robot } });
   if (inside.length > 0) {
     const refused = wayOut?.refusal;
-    add(refused ? t("effect.insideNoWay", { robot, reason: refused.reason }) : t("effect.inside", { robot }), t("effect.insideShort"), true);
+    add(refused ? t("effect.insideNoWay", { robot, reason: said(refused.kind, refused.reason) }) : t("effect.inside", { robot }), t("effect.insideShort"), true);
   }
   if (after?.refusal) {
-    if (!before?.refusal) add(t("effect.noPath", { robot, reason: after.refusal.reason }), t("effect.noPathShort"), true);
+    if (!before?.refusal) add(t("effect.noPath", { robot, reason: said(after.refusal.kind, after.refusal.reason) }), t("effect.noPathShort"), true);
   } else if (after && before?.refusal) {
     add(t("effect.pathAgain", { robot }), t("effect.pathShort"), false);
   } else if (extraM !== null && extraS !== null && (Math.abs(extraM) >= LEAST_M || Math.abs(extraS) >= LEAST_S)) {

@@ -159,6 +159,28 @@ async def test_guest_logs_in_and_may_do_nothing_else(site):
         assert code(await browser.put("/zones/wet", headers=OWN_PAGE)) == (403, "role_too_low")
 
 
+async def test_admins_guest_token_is_the_same_each_time_and_ends_with_the_admins_own(site):
+    admin = {"Authorization": f"Bearer {create_token(site.file, 'rui', 'admin')}"}
+    path = "/api/v1/session/code"
+    async with site.served() as browser:
+        for other in (site.guest, site.operator):
+            refused = await browser.post(path, headers={"Authorization": f"Bearer {other}"})
+            assert code(refused) == (403, "role_too_low")
+        token = (await browser.post(path, headers=admin)).json()["token"]
+        assert (await browser.post(path, headers=admin)).json()["token"] == token
+        assert token not in site.file.read_text()
+        await log_in(browser, token)
+        session = (await browser.get("/api/v1/session")).json()
+        assert (session["name"], session["role"]) == ("codes of rui", "guest")
+        assert code(await browser.get("/robots")) == (403, "role_too_low")
+        revoke_token(site.file, "rui")
+        assert code(await browser.get("/api/v1/session")) == (401, "session_ended")
+        assert code(await browser.get("/robots", headers={"Authorization": f"Bearer {token}"})) == (
+            401,
+            "token_unknown",
+        )
+
+
 async def test_service_without_a_key_accepts_tokens_and_no_cookie(site):
     without = Tokens(session_key=None)
     empty = Tokens([entry("anna", "admin")], session_key=b"")

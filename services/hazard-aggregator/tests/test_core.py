@@ -19,6 +19,7 @@ from fog_contracts.messages import (
 from fog_contracts.site import NodeSite, Sonar
 from hazard_aggregator.core import Aggregator, Outbox
 from hazard_aggregator.fusion import AreaFusion
+from hazard_aggregator.history import period_of
 from hazard_aggregator.publications import wsn_line
 from hazard_aggregator.registry import find_rule
 
@@ -97,6 +98,15 @@ def test_relief_is_published_once_it_is_stored():
     rig.published += rig.core.mark_stored(rig.core.to_store())
     assert (rig.states(), rig.lines()) == (["clear"], ["7,-999,-999"])
     assert (rig.core.to_store(), rig.core.withheld()) == ([], [])
+
+
+def test_hazard_and_its_period_name_the_node_that_decided_and_identify_why():
+    rig = Rig()
+    rig.read(0.8)
+    hazard = next(p.message for p in reversed(rig.published) if p.channel is ch.AREA_HAZARD)
+    assert (hazard.state, hazard.code, hazard.decided_by) == ("blocked", "something_near", "n1")
+    period = period_of(hazard, None)
+    assert (period.code, period.decided_by) == ("something_near", "n1")
 
 
 def test_availability_that_is_neither_online_nor_offline_is_refused():

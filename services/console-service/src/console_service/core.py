@@ -77,12 +77,13 @@ class _Robot:
 
 
 class Fault(msgspec.Struct, frozen=True):
-    """A robot's fault began or ended (`began`): when (s since the epoch), which, and why in words."""
+    """A robot's fault began or ended (`began`) at `at` (s since the epoch), and why, in words that `codes` identify."""
 
     at: float
     robot: str
     began: bool
     reasons: list[str]
+    codes: list[str]
 
 
 class ConsoleCore:
@@ -229,7 +230,8 @@ class ConsoleCore:
         robot, known = self._robot(ids, at)
         before = known.state is not None and known.state.mode == "FAULT"
         if (state.mode == "FAULT") != before:
-            self.faults.append(Fault(at.stamp, robot, not before, [] if before else list(state.reasons)))
+            why = ([], []) if before else (list(state.reasons), list(state.codes))
+            self.faults.append(Fault(at.stamp, robot, not before, *why))
         known.state = state
         self._put_robot(robot)
         return ()

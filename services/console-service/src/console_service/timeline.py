@@ -33,7 +33,8 @@ class TimelineEntry(Message, frozen=True, kw_only=True):
 
     kind: one of the audit trail's, `hazard` (`action`: the area's state from then on), or `fault` of a robot (`began`,
     `ended`). `entry` names an entry of the audit trail, by which it can be undone; `before` and `after` are its
-    record's values.
+    record's values. `codes` identify the sentences of `text`: robots' reasons (`ReasonCode`), or why an area has its
+    state by the node or source `decided_by` (`NodeCode`); `overridden` says that an operator decided.
     """
 
     at: float
@@ -42,6 +43,9 @@ class TimelineEntry(Message, frozen=True, kw_only=True):
     action: str
     who: str = ""
     text: str = ""
+    codes: list[str] = msgspec.field(default_factory=list)
+    decided_by: str | None = None
+    overridden: bool = False
     entry: str = ""
     before: msgspec.Raw
     after: msgspec.Raw
@@ -52,6 +56,8 @@ class _Period(msgspec.Struct):
     state: str
     cause: str
     overridden: bool
+    code: str = ""
+    decided_by: str | None = None
 
 
 class _Key(NamedTuple):
@@ -154,8 +160,10 @@ async def _history(
                     kind=HAZARD,
                     id=area,
                     action=period.state,
-                    who="an operator" if period.overridden else "",
                     text=period.cause,
+                    codes=[period.code] if period.code else [],
+                    decided_by=period.decided_by,
+                    overridden=period.overridden,
                     before=_NULL,
                     after=_NULL,
                 )
@@ -170,6 +178,13 @@ async def _faults(faults: Iterable[Fault], last_ms: int) -> AsyncIterator[tuple[
         if (ms := int(fault.at * 1000)) <= last_ms:
             action, text = "began" if fault.began else "ended", "; ".join(fault.reasons)
             entry = TimelineEntry(
-                at=fault.at, kind=FAULT, id=fault.robot, action=action, text=text, before=_NULL, after=_NULL
+                at=fault.at,
+                kind=FAULT,
+                id=fault.robot,
+                action=action,
+                text=text,
+                codes=fault.codes,
+                before=_NULL,
+                after=_NULL,
             )
             yield _Key(ms, f"{FAULT} {fault.robot} {number:06d}"), entry

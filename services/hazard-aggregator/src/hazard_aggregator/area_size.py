@@ -82,6 +82,8 @@ def check_size(definition: AreaDefinition) -> None:
             measured_penalty=254,
         ),
         trace=Trace(area=definition.id, epoch=_LARGEST, seq=_LARGEST, first_reading=_LATEST, confirmed=_LATEST),
+        code="x" * 32,
+        decided_by="x" * 32,
     )
     for channel, message in ((ch.AREA_DEFINITION, definition), (ch.AREA_HAZARD, hazard)):
         try:

@@ -214,6 +214,8 @@ class WatchedArea:
             explained_by=explained,
             override=told,
             trace=trace,
+            code="" if deciding is None else deciding.reason.code,
+            decided_by=None if deciding is None else deciding.id,
         )
         return self.hazard
 

@@ -24,7 +24,7 @@ MAX_PERIODS: Final = 10_000
 class Period(Message, frozen=True, kw_only=True):
     """A time in which an area had one state and penalty, and one operator's override or none (`overridden`).
 
-    `began` is s since the epoch, `cause` what was said then.
+    `began` is s since the epoch, `cause` what was said then, with `code` and `decided_by` as in `AreaHazard`.
     """
 
     began: float
@@ -32,6 +32,8 @@ class Period(Message, frozen=True, kw_only=True):
     penalty: int
     cause: str
     overridden: bool
+    code: str = ""
+    decided_by: str | None = None
 
 
 class StoredPeriod(Period, frozen=True, kw_only=True):
@@ -78,6 +80,8 @@ def period_of(hazard: AreaHazard, at: Moment | None) -> StoredPeriod:
         penalty=hazard.penalty,
         cause=hazard.cause,
         overridden=hazard.override is not None,
+        code=hazard.code,
+        decided_by=hazard.decided_by,
     )
 
 

@@ -1,10 +1,12 @@
-"""REST of visits: all that a guest may see and do. Nothing here tells of other visits, robots or places."""
+"""REST of visits: all that a guest may see and do, without other visits, robots or places; and the operators' list."""
 
 from collections.abc import Callable
+from typing import Any
 
 from fog_contracts.messages import Id, Message
+from fog_runtime import logs
 from fog_runtime.admission import source_of
-from fog_runtime.http import Answer, Body, Caller, ClientHost, Guest, HttpProblem, ProblemError, Routes
+from fog_runtime.http import Answer, Body, Caller, ClientHost, Guest, HttpProblem, Operator, ProblemError, Routes
 from planner.problems import PlannerProblem
 from planner.visiting import Visiting
 from planner.visits import Visit, VisitEnd, VisitError, VisitState
@@ -14,6 +16,9 @@ _REFUSALS = [
     PlannerProblem.VISIT_OTHER, PlannerProblem.VISITS_FULL, PlannerProblem.VISITS_TOO_OFTEN,
     PlannerProblem.NO_VISIT, PlannerProblem.VISIT_NOT_READY,
 ]  # fmt: skip
+
+
+_log = logs.get("planner")
 
 
 class PublicPlace(Message, frozen=True, kw_only=True):
@@ -47,6 +52,13 @@ class VisitView(Message, frozen=True, kw_only=True):
     seconds: float | None
 
 
+class OpenVisit(VisitView, frozen=True, kw_only=True):
+    """A visit that is not over, as operators see it: with its id, and whose token is on the code (`name`)."""
+
+    id: str
+    name: str
+
+
 def _owner(caller: Caller) -> str:
     return f"{caller.name} {caller.session}"
 
@@ -55,18 +67,21 @@ def add_visits(routes: Routes, visiting: Callable[[], Visiting], standby: Callab
     """Add the routes; `visiting` returns the visits of the service that runs."""
     routes.raises(VisitError, _REFUSALS, _problem)
 
-    def view(visit: Visit) -> VisitView:
+    def about(visit: Visit) -> dict[str, Any]:
         distance, seconds = visiting().rest(visit)
-        return VisitView(
-            start=visit.start,
-            goal=visit.goal,
-            state=visit.state,
-            end=visit.end,
-            ahead=visiting().visits.ahead(visit) if visit.state == "waiting" else 0,
-            robot=visit.robot,
-            distance_m=distance,
-            seconds=seconds,
-        )
+        return {
+            "start": visit.start,
+            "goal": visit.goal,
+            "state": visit.state,
+            "end": visit.end,
+            "ahead": visiting().visits.ahead(visit) if visit.state == "waiting" else 0,
+            "robot": visit.robot,
+            "distance_m": distance,
+            "seconds": seconds,
+        }
+
+    def view(visit: Visit) -> VisitView:
+        return VisitView(**about(visit))
 
     @routes.get("/api/v1/visits/places")
     async def list_public_places(_caller: Guest) -> list[PublicPlace]:
@@ -101,6 +116,30 @@ def add_visits(routes: Routes, visiting: Callable[[], Visiting], standby: Callab
     async def cancel(caller: Guest) -> None:
         """End the visit; its robot stops."""
         visiting().visits.cancel(_owner(caller), visiting().now())
+        visiting().step()
+
+    _add_operators(routes, visiting, standby, about)
+
+
+def _add_operators(
+    routes: Routes,
+    visiting: Callable[[], Visiting],
+    standby: Callable[[], str],
+    about: Callable[[Visit], dict[str, Any]],
+) -> None:
+    @routes.get("/api/v1/visits", problems=[HttpProblem.STANDS_BY])
+    async def list_visits(_caller: Operator) -> list[OpenVisit]:
+        """List the visits that are not over, oldest first."""
+        if reason := standby():
+            raise ProblemError(HttpProblem.STANDS_BY, f"{reason}; send the request there")
+        return [OpenVisit(**about(each), id=each.id, name=each.name) for each in visiting().visits.open]
+
+    # After the routes of a visitor's own visit, whose path it would take.
+    @routes.delete("/api/v1/visits/{visit}", raises=[VisitError])
+    async def end_visit(visit: str, caller: Operator) -> None:
+        """End a visit; its robot stops, and the visitor reads that the staff need it."""
+        visiting().visits.end(visit, visiting().now())
+        _log.info("visit_ended", visit=visit, who=caller.name)
         visiting().step()
 
 

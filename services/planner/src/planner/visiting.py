@@ -130,7 +130,7 @@ class Visiting:
         place = self.places.get(act.place)
         if place is None:
             return VisitEnd.PLACE
-        who, pose = f"visitor {visit.owner.rpartition(' ')[0]}", Pose(x=place.x, y=place.y, theta=place.theta or 0.0)
+        who, pose = f"visitor {visit.name}", Pose(x=place.x, y=place.y, theta=place.theta or 0.0)
         order = Order(
             act.robot, pose, who, place=act.place, any_heading=place.theta is None, expected=NO_MISSION,
             action="visit", visit=True,

@@ -102,6 +102,11 @@ class Visit:
     trouble_since: float | None = None
 
     @property
+    def name(self) -> str:
+        """The name of the token that it was begun with, without what tells browsers apart."""
+        return self.owner.rpartition(" ")[0]
+
+    @property
     def is_over(self) -> bool:
         """Whether it has arrived or ended."""
         return self.state in ("arrived", "ended")
@@ -184,7 +189,7 @@ class Visits:
             raise VisitError(PlannerProblem.VISIT_SAME_PLACE, "the visitor is there already: choose another place")
 
     def _check_limits(self, source: str, now: float) -> None:
-        open_ones = [visit for visit in self._visits if not visit.is_over]
+        open_ones = self.open
         if len(open_ones) >= WAITING_MAX or sum(visit.source == source for visit in open_ones) >= PER_SOURCE:
             raise VisitError(PlannerProblem.VISITS_FULL, "too many visitors wait: try again in a minute", 60.0)
         asked = self._asked.setdefault(source, deque(maxlen=ASKED_MAX))
@@ -228,6 +233,20 @@ class Visits:
         return sum(other.state == "waiting" for other in self._visits[: self._visits.index(visit)])
 
     # --- What operators and robots do -------------------------------------------------------------------------------
+
+    @property
+    def open(self) -> list[Visit]:
+        """The visits that are not over, oldest first."""
+        return [visit for visit in self._visits if not visit.is_over]
+
+    def end(self, visit: str, now: float) -> None:
+        """End a visit in an operator's name; raises `VisitError` if there is no such open one."""
+        found = next((each for each in self.open if each.id == visit), None)
+        if found is None:
+            raise VisitError(
+                PlannerProblem.NO_VISIT, f"there is no open visit {visit}: choose one of GET /api/v1/visits"
+            )
+        self._end(found, VisitEnd.OPERATOR, now)
 
     def commanded(self, robot: str, now: float) -> None:
         """End the visit of a robot that somebody has commanded or stopped, whatever becomes of the command."""

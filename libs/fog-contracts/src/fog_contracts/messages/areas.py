@@ -197,7 +197,8 @@ class AreaHazard(Message, frozen=True, kw_only=True):
     """State of one area; `seq` grows by one with each change, `epoch` with each start of the aggregator.
 
     With an `override` the state is not that of the nodes: `blocked`, or `unknown` and passable where an operator
-    declared the area clear, which nobody measures (ADR 16).
+    declared the area clear, which nobody measures (ADR 16). `code` identifies the `cause` (`NodeCode`) if it is that of
+    the node or source `decided_by`.
     """
 
     area: Id
@@ -212,6 +213,8 @@ class AreaHazard(Message, frozen=True, kw_only=True):
     explained_by: Id | None = None
     override: HazardOverride | None = None
     trace: Trace | None = None
+    code: Code = ""
+    decided_by: Id | None = None
 
 
 class AggregatorHeartbeat(Message, frozen=True, kw_only=True):

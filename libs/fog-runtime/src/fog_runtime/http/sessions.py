@@ -10,7 +10,7 @@ from fog_runtime.admission import KNOWN, source_of
 from fog_runtime.clock import Clock
 from fog_runtime.http.problems import HttpProblem, ProblemCode, ProblemError
 from fog_runtime.http.routes import Answer, Body, ClientHost, Routes
-from fog_runtime.http.tokens import SESSION_S, Caller, Guest, Tokens, comes_from_elsewhere, is_encrypted
+from fog_runtime.http.tokens import SESSION_S, Admin, Caller, Guest, Tokens, comes_from_elsewhere, is_encrypted
 from fog_runtime.token_file import Role
 
 PATH: Final = "/api/v1/session"
@@ -50,6 +50,12 @@ class Session(Message, frozen=True, kw_only=True):
     name: str
     role: Role
     until: float | None = None
+
+
+class Code(Message, frozen=True, kw_only=True):
+    """A guest's token for the codes that visitors scan."""
+
+    token: str
 
 
 class Attempts:
@@ -97,8 +103,7 @@ def add_session_routes(routes: Routes, tokens: Tokens, clock: Clock) -> None:
     def answer(caller: Caller, *, encrypted: bool) -> Answer[Session]:
         made = tokens.new_session(caller)
         if made is None:
-            detail = "set FOGNAV_SESSION_KEY_FILE of each service to the site's session.key, and restart them"
-            raise ProblemError(SessionProblem.NO_SESSIONS, detail)
+            raise _no_sessions()
         value, owner = made
         cookie = _cookie(tokens, value, SESSION_S, encrypted=encrypted)
         return Answer(Session(name=owner.name, role=owner.role, until=owner.until), _headers(cookie))
@@ -139,6 +144,23 @@ def add_session_routes(routes: Routes, tokens: Tokens, clock: Clock) -> None:
     async def log_out(encrypted: Encrypted) -> Answer[None]:
         """Log out this browser. To end a person's sessions everywhere, revoke the token."""
         return Answer(None, _headers(_cookie(tokens, "", 0, encrypted=encrypted)))
+
+    _add_code(routes, tokens)
+
+
+def _add_code(routes: Routes, tokens: Tokens) -> None:
+    @routes.post(f"{PATH}/code", problems=[SessionProblem.NO_SESSIONS])
+    async def code_for_visitors(caller: Admin) -> Code:
+        """Return the guest's token for the codes of visitors that this admin prints; it ends with the admin's token."""
+        token = tokens.code_of(caller)
+        if token is None:
+            raise _no_sessions()
+        return Code(token=token)
+
+
+def _no_sessions() -> ProblemError:
+    detail = "set FOGNAV_SESSION_KEY_FILE of each service to the site's session.key, and restart them"
+    return ProblemError(SessionProblem.NO_SESSIONS, detail)
 
 
 def _cookie(tokens: Tokens, value: str, seconds: float, *, encrypted: bool) -> str:

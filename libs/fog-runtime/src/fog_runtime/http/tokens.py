@@ -67,8 +67,8 @@ class Tokens:
         """Without a `session_key` there are no sessions; `now` is the time of day (s)."""
         self._file = file
         self._seen = _state(file)
-        self._callers = _callers(entries)
         self._key = session_key
+        self._callers = self._with_codes(entries)
         self._now = now
 
     def caller(self, token: str) -> Caller | None:
@@ -123,6 +123,25 @@ class Tokens:
                     return msgspec.structs.replace(caller, until=session.until, session=session.id)
         return None
 
+    def code_of(self, admin: Caller) -> str | None:
+        """Return the guest's token that belongs to an admin, for codes on walls; None without a key, or such an admin.
+
+        Nobody stores it: it is made of the key of sessions and of the admin's token, with which it ends.
+        """
+        self._read_again()
+        known = self._callers.items()
+        sha256 = next((key for key, each in known if (each.name, each.role) == (admin.name, "admin")), None)
+        return None if self._key is None or sha256 is None else _code(self._key, sha256)
+
+    def _with_codes(self, entries: Iterable[TokenEntry]) -> dict[str, Caller]:
+        """Return the callers by the hashes of their tokens, and the guests whose tokens belong to admins."""
+        found: dict[str, Caller] = {}
+        for entry in entries:
+            found[entry.sha256] = Caller(entry.name, entry.role)
+            if entry.role == "admin" and self._key is not None:
+                found[token_hash(_code(self._key, entry.sha256))] = Caller(f"codes of {entry.name}", "guest")
+        return found
+
     @staticmethod
     def _signature(key: bytes, payload: bytes, sha256: str) -> bytes:
         return hmac.digest(key, b"fognav session " + sha256.encode() + payload, "sha256")
@@ -134,7 +153,7 @@ class Tokens:
             return
         self._seen = state
         try:
-            callers = _callers(read_tokens(self._file)) if state is not None else {}
+            callers = self._with_codes(read_tokens(self._file)) if state is not None else {}
         except TokensError as error:
             _log.error("tokens_unusable", reason=str(error), kept=len(self._callers))
             return
@@ -147,8 +166,8 @@ class Tokens:
         )
 
 
-def _callers(entries: Iterable[TokenEntry]) -> dict[str, Caller]:
-    return {entry.sha256: Caller(entry.name, entry.role) for entry in entries}
+def _code(key: bytes, sha256: str) -> str:
+    return _text(hmac.digest(key, b"fognav code " + sha256.encode(), "sha256")).rstrip("=")
 
 
 def _text(data: bytes) -> str:

@@ -51,6 +51,9 @@ _.DURABILITIES
 _.__signature__  # inspect and typer: what a command takes
 _.__annotations__
 _.capture_signals  # uvicorn
+_.handshake_complete  # uvicorn
+_.keepalive_timeout  # uvicorn
+_.run_asgi  # uvicorn
 _.should_exit
 _.timeout_graceful_shutdown
 _.daemon_threads  # http.server

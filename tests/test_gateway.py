@@ -28,7 +28,12 @@ ROOT: Final = Path(__file__).parents[1]
 CADDYFILE: Final = (ROOT / "deploy" / "gateway" / "Caddyfile").read_text("utf-8")
 EACH: Final = ("/api/v1/store", "/healthz", "/readyz", "/metrics")
 """What every service has by itself, behind its own name."""
-NAMES: Final = {"aggregator": "hazard-aggregator", "planner": "planner", "console": "console-service"}
+NAMES: Final = {
+    "aggregator": "hazard-aggregator",
+    "planner": "planner",
+    "console": "console-service",
+    "bridge": "bridge",
+}
 """The Caddyfile's matchers."""
 
 

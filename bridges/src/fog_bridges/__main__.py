@@ -16,7 +16,7 @@ from urllib.parse import urlsplit
 
 import msgspec
 
-from fog_bridges.floor import Floor
+from fog_bridges.floor import Floor, ServesSockets
 from fog_bridges.home_assistant import HomeAssistant
 from fog_bridges.service import HomeAssistantBridge
 from fog_bridges.vda5050.bridge import SYSTEM, Setup, Vda5050Bridge
@@ -191,10 +191,21 @@ def _ros2(settings: Settings, site: str, _: Clock) -> Adapter:
     return Ros2Bridge(site, config, settings.ros2_domain, settings.zenoh_endpoints, settings.credentials(), others)
 
 
+def _foxglove(settings: Settings, site: str, _: Clock) -> Adapter:
+    try:
+        from fog_bridges.foxglove.bridge import FoxgloveBridge  # noqa: PLC0415  # an extra
+    except ImportError as error:
+        raise SettingsError(
+            f"the adapter foxglove needs more ({error}): pip install 'fog-bridges[foxglove]'"
+        ) from error
+    return FoxgloveBridge(site, settings.zenoh_endpoints, settings.credentials())
+
+
 ADAPTERS: Final[Mapping[str, Callable[[Settings, str, Clock], Adapter]]] = {
     "home-assistant": _home_assistant,
     "ros2": _ros2,
     "vda5050": _vda5050,
+    "foxglove": _foxglove,
 }
 
 
@@ -226,6 +237,10 @@ async def main() -> None:
                 health.set(each.name, ok=not each.problem, detail=each.problem)
 
     app = make_app("Fognav bridges", health, Tokens())
+    for each in adapters:
+        if isinstance(each, ServesSockets):
+            app.router.routes.extend(each.routes)
+            app.state.sockets = True
     serving = serve_here(
         app, settings.http_host, settings.http_port, settings.http_certificate(), settings.http_gateway,
         settings.port_file,

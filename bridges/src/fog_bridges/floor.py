@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import asyncio
-from typing import TYPE_CHECKING, Any, Final, NamedTuple, Protocol
+from typing import TYPE_CHECKING, Any, Final, NamedTuple, Protocol, runtime_checkable
 
 import httpx
 import msgspec
@@ -13,6 +13,8 @@ from fog_runtime import logs
 if TYPE_CHECKING:
     import ssl
     from collections.abc import AsyncIterator, Sequence
+
+    from starlette.routing import WebSocketRoute
 
     from fog_runtime.clock import Clock
 
@@ -64,6 +66,15 @@ class Adapter(Protocol):
         """Take in that nobody knows the floor's state."""
 
 
+@runtime_checkable
+class ServesSockets(Protocol):
+    """An adapter to which other systems connect."""
+
+    @property
+    def routes(self) -> Sequence[WebSocketRoute]:
+        """What the bridge serves of it."""
+
+
 class Floor:
     """Reads the events of one floor, again and again from where it was, and sends requests."""
 
@@ -99,6 +110,17 @@ class Floor:
             return Answer(str(body["detail"]), str(body["type"]).removeprefix("urn:fognav:"), body)
         except (ValueError, KeyError, TypeError):
             return Answer("" if answer.is_success else f"{answer.status_code} {answer.reason_phrase}")
+
+    async def role_of(self, token: str) -> str | None:
+        """Return the role of whoever has a token, empty for nobody's; None while the floor does not say."""
+        try:
+            answer = await self._client.get("/api/v1/session", headers={"Authorization": f"Bearer {token}"})
+            if answer.status_code == httpx.codes.UNAUTHORIZED:
+                return ""
+            return str(answer.raise_for_status().json()["role"])
+        except (httpx.HTTPError, ValueError, KeyError) as error:
+            _log.warning("caller_unknown", reason=repr(error))
+            return None
 
     async def follow(self, adapters: Sequence[Adapter]) -> None:
         """Pass each event on to all adapters, and when the state is not known any more, that. Never returns."""

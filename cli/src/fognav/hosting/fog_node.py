@@ -160,6 +160,10 @@ class LocalNode:
         self._programs = ProgramSet(self.supervisor, config.folder, common)
         for program in self.server_set:
             self._programs.add_server(program)
+        taken: set[int] = set()
+        bridged = config.sites if config.bridge is not None else []
+        self._bridge_ports = {site.id: net.free_port(taken) for site in bridged}
+        """Where each site's bridge serves the gateway."""
         for site in config.sites:
             self._add_services(site)
             if config.bridge is not None:
@@ -276,17 +280,26 @@ class LocalNode:
                 "HTTP_KEY_FILE": str(http / KEY),
                 **self._credentials(site, service),
                 **({"OPERATOR_KEY_FILE": str(keys / OPERATOR_KEY)} if service == PLANNER else {}),
-                **(behind if service == CONSOLE else {}),
+                **({**behind, **self._bridge_url(site)} if service == CONSOLE else {}),
             }
             self._add(site, service, settings)
+
+    def _bridge_url(self, site: HostedSite) -> dict[str, str]:
+        """Return where the console-service finds the bridge, if there is one."""
+        number = self._bridge_ports.get(site.id)
+        return {} if number is None else {"BRIDGE_URL": f"https://{net.LOOPBACK}:{number}"}
 
     def _add_bridge(self, site: HostedSite, file: Path) -> None:
         token = self._keys[site.id] / BRIDGE_TOKEN
         keep_token(token.with_name(TOKENS), BRIDGE, "operator", token)
+        http = self.config.security.folder("http")
         settings = {
             "BRIDGE_FILE": str(file),
             "CONSOLE_URL": f"https://{net.reachable(self.config.address)}:{site.ports[CONSOLE]}",
             "TOKEN_FILE": str(token),
+            "HTTP_PORT": str(self._bridge_ports[site.id]),
+            "HTTP_CERTIFICATE_FILE": str(http / CERTIFICATE),
+            "HTTP_KEY_FILE": str(http / KEY),
             **self._credentials(site, BRIDGE),
         }
         # Whether it is connected is not asked: other systems may be away for days.

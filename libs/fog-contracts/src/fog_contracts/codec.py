@@ -78,3 +78,11 @@ def decode_text(channel: Channel, data: bytes) -> str:
         return data.decode("utf-8")
     except UnicodeDecodeError as error:
         raise ContractError(channel.name, f"not UTF-8: {error}") from error
+
+
+def json_schema(kind: type[msgspec.Struct]) -> bytes:
+    """Return the JSON schema of a type, which is self-contained: readers of recordings have no other."""
+    (described,), components = msgspec.json.schema_components([kind], ref_template="#/$defs/{name}")
+    # Foxglove needs an object at the top level, not a reference to one.
+    root = components.pop(described["$ref"].rsplit("/", 1)[1]) if "$ref" in described else described
+    return msgspec.json.encode({**root, "$defs": components})

@@ -18,6 +18,7 @@ from mcap.stream_reader import MAGIC_SIZE
 from mcap.writer import Writer
 
 from fog_contracts.channels import CHANNELS, Channel
+from fog_contracts.codec import json_schema
 from fog_contracts.messages import Message
 from fog_runtime import logs
 
@@ -48,13 +49,6 @@ class _Text(Message, frozen=True, kw_only=True):
     """The stored form of a plain text message."""
 
     text: str
-
-
-def _schema(kind: type[msgspec.Struct]) -> bytes:
-    (described,), components = msgspec.json.schema_components([kind], ref_template="#/$defs/{name}")
-    # Foxglove needs an object at the top level, not a reference to one.
-    root = components.pop(described["$ref"].rsplit("/", 1)[1]) if "$ref" in described else described
-    return msgspec.json.encode({**root, "$defs": components})
 
 
 def _finish(writer: Any) -> None:  # noqa: ANN401  # mcap leaves the method untyped
@@ -104,7 +98,7 @@ class Recorder:
     def _register(self, topic: str, kind: type[msgspec.Struct], metadata: dict[str, str]) -> int:
         if kind not in self._schemas:
             self._schemas[kind] = self._writer.register_schema(
-                name=f"fognav.{kind.__name__.lstrip('_')}", encoding="jsonschema", data=_schema(kind)
+                name=f"fognav.{kind.__name__.lstrip('_')}", encoding="jsonschema", data=json_schema(kind)
             )
         return int(
             self._writer.register_channel(

@@ -36,7 +36,7 @@ _log = logs.get("console-service")
 class Settings(CommonSettings, frozen=True, kw_only=True):
     """Where the other services serve REST, and the folder of the built page (empty: that of the package).
 
-    `demo_url`: where a demo tells about its scenario.
+    `demo_url`: where a demo tells about its scenario. `bridge_url`: where the bridge serves WebSockets, if one runs.
     """
 
     aggregator_url: str = "http://127.0.0.1:8001"
@@ -44,6 +44,7 @@ class Settings(CommonSettings, frozen=True, kw_only=True):
     planner_url: str = "http://127.0.0.1:8003"
     page_dir: Path | None = None
     demo_url: str = ""
+    bridge_url: str = ""
 
 
 async def main() -> None:
@@ -64,7 +65,7 @@ async def main() -> None:
     if settings.demo_url:
         urls[DEMO] = settings.demo_url
     async with (
-        Forward(urls, proof=tokens.gateway_proof, trusted=own.tls_context()) as forward,
+        Forward(urls, bridge=settings.bridge_url, proof=tokens.gateway_proof, trusted=own.tls_context()) as forward,
         ZenohEdge.open(
             connect=settings.zenoh_endpoints, clock=clock, role="console-service", id=site, site=site, credentials=own
         ) as zenoh,

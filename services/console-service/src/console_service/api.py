@@ -63,6 +63,7 @@ def make_api(
     that of the package).
     """
     app = make_app("Fognav console-service", health, tokens, first_page=False, large=MAP_UPLOADS)
+    app.state.sockets = True
     session = Routes(app, "session")
     add_session_routes(session, tokens, SystemClock())
     _add_events(Routes(app, "events"), service)

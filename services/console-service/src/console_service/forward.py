@@ -14,10 +14,12 @@ import httpx
 import msgspec
 from starlette.requests import Request
 from starlette.responses import StreamingResponse
+from starlette.websockets import WebSocket
 
+from console_service.socket_relay import SocketRelay
 from fog_runtime.http.http_process import PROOF
 from fog_runtime.http.openapi import merged
-from fog_runtime.http.problems import RETRY_AFTER, HttpProblem, ProblemCode, ProblemError, allowed_methods
+from fog_runtime.http.problems import RETRY_AFTER, HttpProblem, ProblemCode, ProblemError, allowed_methods, problem
 
 if TYPE_CHECKING:
     import ssl
@@ -28,11 +30,14 @@ if TYPE_CHECKING:
 AGGREGATOR, MAP_SERVICE, PLANNER, CONSOLE = "hazard-aggregator", "map-service", "planner", "console-service"
 DEMO: Final = "demo"
 """A demo, which tells the page about its scenario."""
+BRIDGE: Final = "bridge"
+"""The bridge to other systems, where one runs: it has WebSockets."""
 ROUTES: Final[Mapping[str, tuple[str, ...]]] = {
     AGGREGATOR: ("areas", "nodes", "alerts"),
     PLANNER: ("robots", "plan", "visits"),
     CONSOLE: ("session", "events", "timeline", "recording", "vitals", "openapi.json"),
     DEMO: ("scenario",),
+    BRIDGE: ("foxglove",),
 }
 """Which routes each service has, by what follows /api/v1/; the map-service has all others."""
 URGENT: Final = ("/api/v1/robots/{robot}/stop",)
@@ -76,11 +81,24 @@ def service_of(path: str) -> str:
 class Forward:
     """The services behind this one, as an ASGI app that has all their routes."""
 
-    def __init__(self, urls: Mapping[str, str], *, proof: bytes = b"", trusted: ssl.SSLContext | None = None) -> None:
-        """`urls` are the services' addresses by their names; `proof` lets them believe for whom we ask."""
+    def __init__(
+        self,
+        urls: Mapping[str, str],
+        *,
+        bridge: str = "",
+        proof: bytes = b"",
+        trusted: ssl.SSLContext | None = None,
+    ) -> None:
+        """`urls` are the services' addresses by their names; `proof` lets them believe for whom we ask.
+
+        `bridge` is the address of the bridge, whose WebSockets are passed on, too; empty without one.
+        """
         self._urls = urls
         self._proof = proof
         self._merged: tuple[list[bytes], bytes] | None = None
+        self._sockets: SocketRelay | None = None
+        if bridge:
+            self._sockets = SocketRelay(bridge, trusted, ForwardProblem.SERVICE_AWAY)
         self._client = httpx.AsyncClient(
             verify=True if trusted is None else trusted, timeout=_TIMEOUT, limits=_KEPT, trust_env=False
         )
@@ -100,7 +118,8 @@ class Forward:
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         """Pass a request on, and its answer back. Raises `ProblemError`, which the app answers."""
-        if scope["type"] != "http":
+        if scope["type"] == "websocket":
+            await self._socket(scope, receive, send)
             return
         request = Request({**scope, "root_path": ""}, receive)
         named = scope["path"].split("/")[1]
@@ -122,6 +141,13 @@ class Forward:
         response = StreamingResponse(_parts(answer), answer.status_code)
         response.raw_headers = [(n.lower(), value) for n, value in answer.headers.raw if n.lower() not in dropped]
         await response(scope, receive, send)
+
+    async def _socket(self, scope: Scope, receive: Receive, send: Send) -> None:
+        if self._sockets is not None and service_of(scope["path"]) == BRIDGE:
+            await self._sockets(scope, receive, send)
+            return
+        detail = f"there is no WebSocket at {scope['path']}: only a fog node with a bridge has one, at /api/v1/foxglove"
+        await WebSocket(scope, receive, send).send_denial_response(problem(HttpProblem.NO_ROUTE, detail))
 
     async def _send(self, service: str, request: Request, target: bytes, body: bytes) -> httpx.Response:
         host = request.client.host if request.client else ""
@@ -176,8 +202,8 @@ def _forwarded(described: dict[str, Any]) -> dict[str, Any]:
     """Return a service's document with what this one may answer in its place."""
     for operation in (each for operations in described["paths"].values() for each in operations.values()):
         answers = operation["responses"]
-        for problem in ForwardProblem:
-            answers.setdefault(str(problem.status), {**answers["500"], "description": problem.says})
+        for code in ForwardProblem:
+            answers.setdefault(str(code.status), {**answers["500"], "description": code.says})
     return described
 
 

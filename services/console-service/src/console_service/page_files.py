@@ -61,6 +61,7 @@ class PageFiles:
         """Answer a request for a file."""
         path = scope["path"].removeprefix(scope.get("root_path", "")).lstrip("/")
         if scope["type"] != "http":
+            await send({"type": "websocket.close"})
             return
         if path.startswith("api/"):
             response: Response = problem(HttpProblem.NO_ROUTE, f"there is no route /{path}: /openapi.json lists them")

@@ -259,6 +259,7 @@ def make_app(  # noqa: PLR0913  # what apps have in common, each by name
     app.state.core = None
     app.state.urgent = {}
     app.state.lasting = set()
+    app.state.sockets = False
     app.state.problems = {HttpProblem.NO_ROUTE, HttpProblem.METHOD_NOT_ALLOWED}
     add_problem_handlers(app)
     _add_health(Routes(app, "health"), health)

@@ -22,6 +22,7 @@ import time
 from collections import Counter
 from collections.abc import Awaitable, Callable, Collection, Iterable, Iterator, MutableMapping
 from contextlib import contextmanager
+from functools import partial
 from pathlib import Path
 from typing import Any, Final, NoReturn, Self
 
@@ -50,6 +51,9 @@ _HEADER: Final = b"x-forwarded-for"
 _SCHEME: Final = b"x-forwarded-proto"
 PROOF: Final = b"x-fognav-gateway"
 """The header by which the console-service, where it is the gateway, proves that (`Tokens.gateway_proof`)."""
+
+MESSAGE_LIMIT: Final = 64 * 1024
+"""Most bytes of a message that a client sends on a WebSocket."""
 
 _log = logs.get("http")
 
@@ -247,6 +251,8 @@ class _Connection(H11Protocol):
     def __init__(self, visitor: Visitor, server: uvicorn.Server) -> None:
         super().__init__(server.config, server.server_state, server.lifespan.state)
         self._visitor = visitor
+        if self.ws_protocol_class is not None:
+            self.ws_protocol_class = partial(self.ws_protocol_class, visitor)  # type: ignore[assignment, call-arg]  # it is `sockets.Socket`, and only called
 
     def handle_events(self) -> None:
         super().handle_events()
@@ -346,8 +352,13 @@ def _leave_files(kept: Collection[int]) -> None:
 
 
 def _config(app: FastAPI, certificate: ServerCertificate | None) -> uvicorn.Config:
+    sockets: Any = "none"
+    if app.state.sockets:
+        from fog_runtime.http.sockets import Socket as sockets  # noqa: N813, PLC0415  # an extra
     return uvicorn.Config(
         app,
+        ws=sockets,
+        ws_max_size=MESSAGE_LIMIT,
         log_config=None,
         access_log=False,
         lifespan="off",

@@ -1,0 +1,1 @@
+"""Shows a floor live in Foxglove, over its WebSocket."""

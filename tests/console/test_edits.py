@@ -1,13 +1,14 @@
 """What people change in the console, in a real Chromium: zones and their sets, areas, places, the map."""
 
+import asyncio
 import base64
 from pathlib import Path
 from types import SimpleNamespace
 
 import pytest
-from console_stream import ConsoleStream
+from console_stream import TOKEN, ConsoleStream
 from msgspec import to_builtins
-from playwright.async_api import expect
+from playwright.async_api import Route, expect
 
 from fog_contracts.grid import StaticMap
 from fog_contracts.messages import AreaDefinition, CircleShape, Place, Zone
@@ -144,3 +145,49 @@ async def test_operator_sets_the_times_of_a_set_of_zones_and_mutes_a_source(
     assert sent["PUT zone-sources/door"] == {"muted": True}
     (window,) = sent["PUT zone-sets/night"]["schedule"]["times"]
     assert (window["begin"], window["end"]) == ("22:00", "06:00")
+
+
+async def test_admin_opens_a_place_to_visitors_and_prints_its_code_without_a_shell(
+    console: SimpleNamespace, stream: ConsoleStream
+) -> None:
+    stream.role = "admin"
+    place = {"x": 9.0, "y": 42.6, "theta": None, "label": "C, north-west office", "public": False}
+    stream.tell("place", "c", place)
+    stream.answers["GET places/c"] = (200, {**place, "version": 0, "warnings": []})
+    stream.answers["GET visits/places"] = (200, [{"id": "c", "label": place["label"]}])
+    stream.answers["POST session/code"] = (200, {"token": "of-a-guest"})
+    page = await console.open()
+    places = page.get_by_role("region", name="Places")
+    await places.get_by_label("for visitors: C, north-west office").click()
+    await expect(page.locator(".said")).to_have_text("Visitors may choose C, north-west office.")
+    assert stream.requests[-1] == ("PATCH places/c", {"public": True})
+    await places.get_by_role("link", name="Codes for visitors").click()
+    await expect(page.get_by_role("img", name="Code for visits from C, north-west office")).to_be_visible()
+
+
+async def test_visitor_who_asks_again_reads_nothing_of_the_visit_before(
+    console: SimpleNamespace, stream: ConsoleStream
+) -> None:
+    visit = {"start": "a", "goal": "b", "state": "arrived", "end": None, "ahead": 0, "robot": "r1"}
+    visit |= {"distance_m": None, "seconds": None}
+    stream.role = "guest"
+    stream.answers["GET visits/places"] = (200, [{"id": "a", "label": "Hall"}, {"id": "b", "label": "Lab"}])
+    stream.answers["GET visits/mine"] = (200, visit)
+    page = await (await console.browser.new_context(locale="en-GB")).new_page()
+    await page.goto(f"{console.url}#/visit/a?login={TOKEN}")
+    await page.get_by_role("button", name="New visit").click()
+    held = asyncio.Event()
+
+    async def hold(route: Route) -> None:
+        await held.wait()
+        await route.continue_()
+
+    await page.route("**/api/v1/visits", hold)
+    async with page.expect_request("**/api/v1/visits"):
+        await page.get_by_role("button", name="Lab").click()
+    # It is asked for each second: what it answers now is still the visit before.
+    await page.wait_for_event("response", lambda answer: answer.url.endswith("/visits/mine"))
+    await expect(page.get_by_role("heading", level=1)).to_have_text("Where do you want to go?")
+    stream.answers["GET visits/mine"] = (200, {**visit, "state": "coming"})
+    held.set()
+    await expect(page.get_by_role("heading", level=1)).to_have_text("r1 is coming to you")

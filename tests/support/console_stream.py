@@ -172,7 +172,7 @@ class ConsoleStream:
             greys = np.array([255, *[205] * 253, 0, 205], dtype=np.uint8)[self.site.map.cells]
             return Response(png(greys), media_type="image/png")
 
-        @app.api_route("/api/v1/{path:path}", methods=["GET", "POST", "PUT", "DELETE"])
+        @app.api_route("/api/v1/{path:path}", methods=["GET", "POST", "PUT", "PATCH", "DELETE"])
         async def rest(path: str, request: Request) -> Response:
             body = json.loads(await request.body() or "null")
             name = f"{request.method} {path}"

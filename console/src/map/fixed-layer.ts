@@ -33,6 +33,7 @@ export function areaText(area: AreaView): string {
   return `${text} ${t("since", { time: clockTime(hazard.since) })}`;
 }
 
+const DECLUTTER_MS = 1_000;
 /** Kinds of labels, the most important first: what keeps robots out, what may, where they are sent, what only is there. */
 const RANKS = ["draft", "zone active", "area blocked", "area unknown", "place", "area", "zone"] as const;
 
@@ -58,7 +59,9 @@ export class FixedLayer {
   ) {
     const offs = TOPICS.map((topic) => live.on([topic], (key) => this.mark(topic, key)));
     map.on("zoomend", this.declutter, this);
+    const timer = setInterval(() => this.declutter(), DECLUTTER_MS);
     this.stop = () => {
+      clearInterval(timer);
       offs.forEach((off) => off());
       map.off("zoomend", this.declutter, this);
     };
@@ -104,17 +107,17 @@ export class FixedLayer {
     this.declutter();
   }
 
-  /** Hide labels that would lie over more important ones. A moved map moves all of them alike: only its scale counts. */
+  /** Hide labels that would lie over more important ones, or under a robot's name; each second anew, as robots move. */
   private declutter(): void {
-    const labels = [...this.map.getPane("tooltipPane")?.querySelectorAll<HTMLElement>(".label") ?? []];
-    for (const each of labels) each.classList.remove("covered");
+    const found = [...this.map.getPane("tooltipPane")?.querySelectorAll<HTMLElement>(".label") ?? []];
     // All are measured before the first is hidden: the browser lays the page out once.
-    const boxes = labels.map((each) => ({ each, rank: rankOf(each.classList), box: each.getBoundingClientRect() }));
-    boxes.sort((a, b) => a.rank - b.rank);
-    const kept: DOMRect[] = [];
-    for (const { each, box } of boxes) {
-      if (kept.some((other) => overlaps(box, other))) each.classList.add("covered");
-      else kept.push(box);
+    const kept = [...this.map.getContainer().querySelectorAll(".robot-body text")].map((name) => name.getBoundingClientRect());
+    const labels = found.map((each) => ({ each, rank: rankOf(each.classList), box: each.getBoundingClientRect() }));
+    labels.sort((a, b) => a.rank - b.rank);
+    for (const { each, box } of labels) {
+      const covered = kept.some((other) => overlaps(box, other));
+      if (!covered) kept.push(box);
+      if (covered !== each.classList.contains("covered")) each.classList.toggle("covered", covered);
     }
   }
 

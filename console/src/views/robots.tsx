@@ -48,7 +48,7 @@ function Details({ id }: { readonly id: string }): preact.JSX.Element {
   const reasons = state ? whys(state, stopped) : [];
   return (
     <section aria-labelledby="robot-title">
-      <h2 id="robot-title"><bdi>{id}</bdi></h2>
+      <h2 id="robot-title" class="named"><bdi>{id}</bdi></h2>
       <div class={old ? "card stale" : "card"}>
         <p class="lead">{headline(state, robot?.goal ?? null, robot?.out_of_service, stopped)}</p>
         {old && <p class="problem">{t("robot.old")}</p>}

@@ -6,9 +6,11 @@ import os
 import struct
 import threading
 import time
+from collections import Counter
 from contextlib import suppress
 from functools import partial
 from pathlib import Path
+from random import Random
 from typing import Any, Self, cast
 
 import httpx
@@ -23,9 +25,9 @@ from manual_clock import ManualClock
 from rosbags.typesys import Stores, get_typestore
 
 from fog_bridges.ros2 import messages as ros
-from fog_bridges.ros2.bridge import GOAL_TYPE, MAP_TYPE, POSE_TYPE, Relay
+from fog_bridges.ros2.bridge import GOAL_TYPE, MAP_TYPE, OBSTACLES_TYPE, POSE_TYPE, TF_TYPE, Relay
 from fog_bridges.ros2.others import Others, robot_radii
-from fog_bridges.ros2.session import RosSession, ros_config
+from fog_bridges.ros2.session import REFUSED, RosSession, ros_config
 from fog_bridges.ros2.wire import Attachment, Node, Topic, WireError, Writer, decoded, type_hash
 from fog_contracts import channels as ch
 from fog_contracts.costs import penalty_cost
@@ -53,6 +55,7 @@ STORE = get_typestore(Stores.ROS2_JAZZY)
 GRID = "nav_msgs::msg::dds_::OccupancyGrid_/RIHS01_8d348150c12913a31ee0ec170fbf25089e4745d17035792a1ba94d6f0bc0cfc7"
 GOAL = "geometry_msgs::msg::dds_::PoseStamped_/RIHS01_10f3786d7d40fd2b54367835614bff85d4ad3b5dab62bf8bca0cc232d73b4cd8"
 PEERS = "FOGNAV_ROS2_PEERS"
+CLOCK = SystemClock()
 
 # --- The wire ---------------------------------------------------------------------------------------------------------
 
@@ -109,6 +112,13 @@ def test_speed_mask_has_the_lower_of_its_limits_everywhere():
     speed = np.array([[0, 10, 50, 120]], np.uint8)
     assert ros.speed_values(speed).tolist() == [[0, 10, 50, 100]]
     assert ros.speed_values(speed, limit=0.15).tolist() == [[15, 10, 15, 15]]
+
+
+def test_grid_is_sent_as_others_serialize_it():
+    values = np.arange(-1, 59, dtype=np.int8).reshape(6, 10)
+    grid = ros.grid(values, GridGeometry(10, 6, 0.05, -1.0, 2.0), 7.5)
+    payload, _ = Writer(Topic("m", "nav_msgs/msg/OccupancyGrid"), "token").encoded(grid, 1)
+    assert payload == bytes(STORE.serialize_cdr(grid, "nav_msgs/msg/OccupancyGrid"))
 
 
 def test_path_battery_and_markers_can_be_sent():
@@ -568,11 +578,57 @@ async def test_robot_and_obstacle_of_others_are_on_the_floors_map_and_the_robot_
 
 
 @pytest.mark.live
+async def test_malformed_messages_are_counted_one_by_one_and_crash_nothing(ros_router, until):
+    count = int(os.environ.get("FOGNAV_ROS2_MESSAGES", "600"))
+    floor, session = Floor(), RosSession(zenoh.open(ros_config(f"tcp/127.0.0.1:{ros_router}")), DOMAIN, "test", CLOCK)
+    kinds = {
+        "tb4/amcl_pose": (POSE_TYPE, stamped(ros.pose(5.0, 4.0, 0.0))),
+        "tb4/tf": (TF_TYPE, transforms(("map", "odom", 0.0, 0.0, 0.0), ("odom", "base_link", 1.0, 1.0, 0.0))),
+        "rmf_obstacles": (OBSTACLES_TYPE, obstacles(obstacle(1))),
+    }
+    taken = Counter()
+
+    def take(name: str, message: Any) -> None:
+        floor.hear[name](message)
+        taken["yes"] += 1
+
+    for name, (kind, _) in kinds.items():
+        session.subscribe(Topic(name, kind), partial(take, name))
+    before, random = refusals(), Random(1)
+    good = {name: encoded(name, *kinds[name]) for name in kinds}
+    try:
+        with Peer(ros_router) as peer:
+            for number in range(count):
+                name = list(kinds)[number % 3]
+                key, payload, attachment = good[name]
+                damaged = bytearray(payload)
+                for _ in range(random.randint(1, 8)):
+                    damaged[random.randrange(len(damaged))] = random.randrange(256)
+                end = random.choice((len(damaged), random.randrange(len(damaged))))
+                peer.session.put(
+                    f"{DOMAIN}/{name}/{key}", bytes(damaged[:end]), attachment=random.choice((attachment, b"", None)),
+                    congestion_control=zenoh.CongestionControl.BLOCK,
+                )  # fmt: skip
+                if number % 100 == 0:
+                    await asyncio.sleep(0)
+            await until(lambda: taken["yes"] + refusals() - before >= count, "all are taken or counted")
+        assert taken["yes"] + refusals() - before == count
+        assert refusals() - before > count / 2
+    finally:
+        session.close()
+
+
+def refusals() -> float:
+    """How many messages of ROS were refused so far."""
+    return sum(each.value for metric in REFUSED.collect() for each in metric.samples if each.name.endswith("_total"))
+
+
+@pytest.mark.live
 async def test_node_whose_protocol_code_is_not_ours_hears_the_mask_and_sends_a_goal(tmp_path, ros_router):
     if PEERS not in os.environ:
         pytest.skip(f"set {PEERS} to a Python that has zenoh-ros2-sdk: pip install zenoh-ros2-sdk==0.1.8")
     loop, goals = asyncio.get_running_loop(), []
-    session = RosSession(zenoh.open(ros_config(f"tcp/127.0.0.1:{ros_router}")), DOMAIN, "fognav_test", SystemClock())
+    session = RosSession(zenoh.open(ros_config(f"tcp/127.0.0.1:{ros_router}")), DOMAIN, "fognav_test", CLOCK)
     try:
         session.subscribe(Topic("r1/goal_pose", GOAL_TYPE), goals.append)
         script = Path(__file__).with_name("ros2_peer.py")

@@ -161,7 +161,8 @@ class Relay:
         self._static: NDArray[np.uint8] = np.zeros((0, 0), np.uint8)
         self._told: dict[Topic, NDArray[np.int8]] = {}
         self._told_at = 0.0
-        self._is_dirty = False
+        self._dirty: set[Topic] = set()
+        """The masks that may have changed."""
         self._is_slow = False
         self._hazards: dict[str, HazardArea] = {}
         self._zones = ZoneSet(epoch=0, seq=0, zones=[], active=[])
@@ -224,11 +225,11 @@ class Relay:
         except (MapError, ContractError) as error:
             _log.warning("map_refused", reason=str(error))
             return
-        self._is_dirty = True
+        self._dirty |= {self._keepout, self._speed}
 
     def _on_delta(self, _: Mapping[str, str], delta: MapDelta) -> None:
-        if self._follower.on_delta(delta, self._now()) is not None:
-            self._is_dirty = True
+        if (applied := self._follower.on_delta(delta, self._now())) is not None:
+            self._dirty |= {self._keepout if layer == "cost" else self._speed for layer, _ in applied.windows}
             self._tell_masks()
 
     def _tell_masks(self) -> None:
@@ -240,25 +241,28 @@ class Relay:
             same = replica.geometry == self._geometry and np.array_equal(replica.static, self._static)
             self._static = replica.static
             if not same:
-                self._geometry, self._told, self._is_dirty = replica.geometry, {}, True
+                self._geometry, self._told = replica.geometry, {}
+                self._dirty |= {self._keepout, self._speed}
                 self._penalties = self._closed = None
                 told = ros.grid(ros.map_values(replica.static), replica.geometry, stamp)
                 self._session.publish(self._map, told, stamp)
                 self._tell_markers()
         is_slow = self.map_age_s > SILENT_S
         if is_slow != self._is_slow:
-            self._is_slow, self._is_dirty = is_slow, True
-        if not self._is_dirty:
+            self._is_slow = is_slow
+            self._dirty.add(self._speed)
+        if not self._dirty:
             return
         limit = DEGRADED_SPEED / 100.0 if is_slow else None
-        fresh = {
-            self._keepout: self._keepout_mask(replica.cost, replica.geometry),
-            self._speed: ros.speed_values(replica.speed, limit),
-        }
+        fresh = {}
+        if self._keepout in self._dirty:
+            fresh[self._keepout] = self._keepout_mask(replica.cost, replica.geometry)
+        if self._speed in self._dirty:
+            fresh[self._speed] = ros.speed_values(replica.speed, limit)
         changed = {topic: values for topic, values in fresh.items() if self._differs(topic, values)}
         if now - self._told_at < CLEARING_S and not any(map(self._blocks_more, changed, changed.values())):
             return
-        self._is_dirty = False
+        self._dirty.clear()
         for topic, values in changed.items():
             self._told[topic], self._told_at = values, now
             self._session.publish(topic, ros.grid(values, replica.geometry, stamp), stamp)
@@ -294,12 +298,14 @@ class Relay:
 
     def _on_hazard(self, ids: Mapping[str, str], hazard: HazardArea) -> None:
         self._hazards[ids["area"]] = hazard
-        self._closed, self._is_dirty = None, True
+        self._closed = None
+        self._dirty.add(self._keepout)
         self._tell_markers()
 
     def _on_zones(self, _: Mapping[str, str], zones: ZoneSet) -> None:
         self._zones = zones
-        self._penalties, self._closed, self._is_dirty = None, None, True
+        self._penalties = self._closed = None
+        self._dirty.add(self._keepout)
         self._tell_markers()
 
     def _in_force(self) -> list[Zone]:

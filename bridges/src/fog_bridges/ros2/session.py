@@ -41,6 +41,7 @@ def ros_config(source: Path | str) -> zenoh.Config:
         values = {
             "mode": "client", "connect/endpoints": [source], "connect/retry": _RETRY,
             "scouting/multicast/enabled": False, "timestamping/enabled": True,
+            "transport/shared_memory/enabled": False,  # 16 MB, which only peers on this computer could use
         }  # fmt: skip
         for key, value in values.items():
             config.insert_json5(key, json.dumps(value))

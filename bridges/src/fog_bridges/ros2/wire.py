@@ -8,9 +8,10 @@ from __future__ import annotations
 
 import itertools
 import struct
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, Final, NamedTuple
 
+import numpy as np
 import xxhash
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
@@ -38,6 +39,8 @@ TYPES: Final = get_typestore(Stores.ROS2_JAZZY)
 for _name, _fields in _DEFINITIONS.items():
     TYPES.register(get_types_from_msg(_fields, _name))
 
+_GRID: Final = "nav_msgs/msg/OccupancyGrid"
+_NO_CELLS: Final = np.zeros(0, np.int8)
 _ATTACHMENT: Final = struct.Struct("<qqB")
 _GID_BYTES: Final = 16
 _OLD_ATTACHMENT: Final = 77
@@ -150,8 +153,17 @@ class Writer:
 
     def encoded(self, message: object, sent_ns: int) -> tuple[bytes, bytes]:
         """Return a message's payload (CDR, little-endian, after its header) and attachment."""
-        payload = bytes(TYPES.serialize_cdr(message, self.topic.type))
+        if self.topic.type == _GRID:
+            payload = _encoded_grid(message)
+        else:
+            payload = bytes(TYPES.serialize_cdr(message, self.topic.type))
         return payload, Attachment(next(self._numbers), sent_ns, self._gid).encoded()
+
+
+def _encoded_grid(grid: RosMessage) -> bytes:
+    """Return a grid's payload. Its cells are its last field, and are copied once: millions, while a robot waits."""
+    head = TYPES.serialize_cdr(replace(grid, data=_NO_CELLS), _GRID)
+    return b"".join((memoryview(head)[:-4], len(grid.data).to_bytes(4, "little"), grid.data))
 
 
 def decoded(topic: Topic, payload: bytes) -> RosMessage:

@@ -15,7 +15,7 @@ import socket
 import sys
 import threading
 import time
-from contextlib import asynccontextmanager
+from contextlib import AsyncExitStack, asynccontextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
@@ -34,12 +34,14 @@ from fognav.output import FailedError
 from fognav.programs import AGGREGATOR, MAP_SERVICE, SERVERS
 from fognav.stack import Stack, StackConfig, StackUsers
 from fognav_experiments.bench.common import SITE, ask, make_office, write_site
+from fognav_experiments.bench.foreign import foreign
 
 if TYPE_CHECKING:
     from asyncio.subprocess import Process
     from collections.abc import AsyncIterator, Callable
 
     from fog_contracts.grid import StaticMap
+    from fog_contracts.messages import PointXY, Trace
 
 
 LARGEST_AREA: Final = 130
@@ -99,17 +101,23 @@ class Fog:
         return answer.body
 
 
-async def measure(  # what is measured
+async def measure(  # noqa: PLR0913  # what is measured
     folder: Path,
     *,
     nodes: int,
     rate: float,
     robots: int,
     seconds: float,
+    size: tuple[float, float] = (60.0, 40.0),
+    stopped_peers: int | None = None,
     on_phase: Callable[[str], object],
 ) -> dict[str, Any]:
-    """Return the figures; times in ms, None when no hazard reached the map. `folder` is empty."""
-    write_nodes(folder, nodes)
+    """Return the figures; times in ms, None when no hazard reached the map. `folder` is empty.
+
+    The floor has the `size` (m). With `stopped_peers` there is a bridge to ROS 2, too, with one peer that reads, and so
+    many that have stopped.
+    """
+    floor, centres = write_nodes(folder, nodes, size)
     users = StackUsers(site=SITE, unrestricted=(BENCH,))
     config = StackConfig(site_dir=folder, robot="none", extra={"HAZARDS_WAIT_S": "0"}, users=users)
     async with Stack(config) as stack:
@@ -122,20 +130,31 @@ async def measure(  # what is measured
         own = stack.security.credentials(BENCH)
         with zenoh.open(session_config("client", connect=[stack.zenoh_endpoint], credentials=own)) as session:
             session.declare_subscriber(ch.MAP_DELTA.key(site=SITE), traces.on_delta)
-            async with load_generator(stack, nodes, rate, robots, seconds) as load:
+            async with AsyncExitStack() as contexts:
+                load = await contexts.enter_async_context(load_generator(stack, nodes, rate, robots, seconds))
                 # Kernels are loaded just then, and each node's first readings change its area.
                 on_phase(f"{nodes} nodes at {rate:g} Hz, until all are clear")
                 await fog.wait_clear()
+                ros2 = None
+                if stopped_peers is not None:
+                    on_phase(f"starting the bridge to ROS 2, and {stopped_peers} peers that stop reading")
+                    shape, cell = floor.cells.shape, floor.geometry.resolution
+                    ros2 = await contexts.enter_async_context(
+                        foreign(stack, SITE, centres, (shape[0], shape[1]), cell, stopped_peers)
+                    )
+                    ros2.begin()
                 on_phase(f"the same with hazards for {seconds:g} s")
                 cpu, memory = fog.cpu_s(), fog.rss_mb()
                 sent = await ended(load, seconds)
                 cpu = {name: used - cpu[name] for name, used in fog.cpu_s().items()}
                 received = await fog.all_received()
+                on_mask = {} if ros2 is None else ros2.figures(traces.found, seconds)
         return {
             "sent": sent["sent"],
             "lost": sent["sent"] - received,
             "load_late_s": sent["late_s"],
             **traces.figures(),
+            **on_mask,
             "aggregator_cpu_percent": round(100 * cpu[AGGREGATOR] / seconds, 1),
             "aggregator_us_per_reading": round(1e6 * cpu[AGGREGATOR] / (nodes * rate * seconds), 1),
             "map_cpu_percent": round(100 * cpu[MAP_SERVICE] / seconds, 1),
@@ -144,16 +163,23 @@ async def measure(  # what is measured
         }
 
 
-def write_nodes(folder: Path, nodes: int) -> None:
-    """Write a site with so many nodes: up to 130 of them watch one area, each four of the others another one."""
-    floor = make_office(60.0, 40.0, seed=1)
+def write_nodes(
+    folder: Path, nodes: int, size: tuple[float, float] = (60.0, 40.0)
+) -> tuple[StaticMap, dict[str, PointXY]]:
+    """Write a site with so many nodes: up to 130 of them watch one area, each four of the others another one.
+
+    Return its floor, and the middle of each area.
+    """
+    floor = make_office(*size, seed=1)
     write_site(folder, floor)
     corners = _free_corners(floor)
     lines: list[str] = []
+    centres: dict[str, PointXY] = {}
     first = min(LARGEST_AREA, max(1, nodes // 3))
     areas = ["z0"] * first + [f"z{1 + i // _AREA}" for i in range(nodes - first)]
     for index, area in enumerate(dict.fromkeys(areas)):
         x, y = corners[index % len(corners)]
+        centres[area] = (x + 0.5 * _SIDE, y + 0.5 * _SIDE)
         ring = [[x, y], [x + _SIDE, y], [x + _SIDE, y + _SIDE], [x, y + _SIDE]]
         lines += ["[[areas]]", f'id = "{area}"', f"polygon = {ring}", ""]
     for index, area in enumerate(areas):
@@ -161,6 +187,7 @@ def write_nodes(folder: Path, nodes: int) -> None:
         lines += ["theta = 1.57", "sonars = [{ range_limit = 2.65 }, { angle = 0.22, range_limit = 2.65 }]", ""]
     with (folder / "site.toml").open("a", encoding="utf-8") as file:
         file.write("\n".join(lines))
+    return floor, centres
 
 
 def _free_corners(floor: StaticMap) -> list[tuple[float, float]]:
@@ -204,15 +231,16 @@ class _Traces:
 
     def __init__(self) -> None:
         self._ages: list[tuple[float, float]] = []
+        self.found: list[Trace] = []
 
     def on_delta(self, sample: zenoh.Sample) -> None:
         """Note the hazards of a delta that has arrived; it is called on another thread."""
         now = time.time()
         delta = decode(ch.MAP_DELTA, sample.payload.to_bytes(), MapDelta)
         if delta.part == delta.parts - 1:
-            self._ages += [
-                (now - trace.first_reading, now - trace.confirmed) for trace in delta.traces if trace.confirmed > 0
-            ]
+            confirmed = [trace for trace in delta.traces if trace.confirmed > 0]
+            self.found += confirmed
+            self._ages += [(now - trace.first_reading, now - trace.confirmed) for trace in confirmed]
 
     def figures(self) -> dict[str, Any]:
         """Return how many hazards there were, and percentiles of their times (ms)."""

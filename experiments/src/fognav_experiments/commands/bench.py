@@ -306,28 +306,37 @@ def dwa_command(
 
 
 @bench_app.command("pipeline", epilog="Example: fognav bench pipeline --nodes 500 --rate 20 --seconds 30 --json")
-def pipeline_command(
+def pipeline_command(  # noqa: PLR0913  # the options of the command
     *,
     nodes: Annotated[int, typer.Option("--nodes", metavar="N", min=1, max=2000, help="Nodes that publish.")] = 500,
     rate: Annotated[float, typer.Option("--rate", metavar="HZ", min=1.0, max=50.0, help="Readings per second.")] = 20.0,
     robots: Annotated[int, typer.Option("--robots", metavar="N", min=0, max=200, help="Robots with poses.")] = 50,
     seconds: Annotated[float, typer.Option("--seconds", metavar="S", min=4.0, help="How long they publish.")] = 30.0,
+    width: Annotated[float, typer.Option("--width", metavar="M", min=20.0, help="Width of the floor.")] = 60.0,
+    height: Annotated[float, typer.Option("--height", metavar="M", min=20.0, help="Height of the floor.")] = 40.0,
+    ros2: Annotated[
+        int | None,
+        typer.Option("--ros2", metavar="N", min=0, max=20, help="Bridge to ROS 2, N of whose peers stopped reading."),
+    ] = None,
     json: JsonOption = False,
 ) -> None:
     """Measure the way from readings to the map.
 
     Broker, aggregator and map-service are real processes with TLS and passwords; so is the generator of the load.
     Readings that the aggregator did not get are lost; times are in ms, from the confirmation of a hazard to the map's
-    delta.
+    delta and, with --ros2, to the keepout mask at a peer of the bridge.
     """
     from fognav_experiments.bench import pipeline  # noqa: PLC0415  # keeps the other commands fast
 
     kernels.warm_cache(print_line)
     with exit_codes(), TemporaryDirectory(prefix="fognav-") as folder:
         figures = asyncio.run(
-            pipeline.measure(Path(folder), nodes=nodes, rate=rate, robots=robots, seconds=seconds, on_phase=print_line)
-        )
-    asked = {"nodes": nodes, "rate": rate, "robots": robots, "seconds": seconds}
+            pipeline.measure(
+                Path(folder), nodes=nodes, rate=rate, robots=robots, seconds=seconds, size=(width, height),
+                stopped_peers=ros2, on_phase=print_line,
+            )
+        )  # fmt: skip
+    asked = {"nodes": nodes, "rate": rate, "robots": robots, "seconds": seconds, "width": width, "height": height}
     _show("pipeline", asked, figures, json=json)
 
 

@@ -1,0 +1,165 @@
+"""A bridge to ROS 2 and robots of others who listen to it, for `fognav bench pipeline --ros2`.
+
+The bridge is a process of its own, and so is each peer that has stopped reading; ROS's router and the peer that reads
+are in this one, by zenoh's own code: of a message only the cells at its end are looked at.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import json
+import os
+import signal
+import sys
+import time
+from collections import defaultdict
+from contextlib import asynccontextmanager
+from typing import TYPE_CHECKING, Any, Final
+
+import numpy as np
+import psutil
+import zenoh
+
+from fog_supervisor import net
+from fognav.output import FailedError
+from fognav.programs import BRIDGE, MODULES, inherited_environment
+
+if TYPE_CHECKING:
+    from collections.abc import AsyncIterator, Iterator, Mapping, Sequence
+
+    from fog_contracts.messages import PointXY, Trace
+    from fognav.stack import Stack
+
+_READY_S: Final = 60.0
+_POLL_S: Final = 0.05
+_MB: Final = 1e6
+
+
+def _config(mode: str, port: int) -> zenoh.Config:
+    """Return the configuration of ROS's router, or of a peer as rmw_zenoh opens one."""
+    config = zenoh.Config()
+    listens = mode == "router"
+    values = {
+        "mode": mode, "scouting/multicast/enabled": False, "listen/endpoints": [f"tcp/127.0.0.1:{port}"] * listens,
+        "connect/endpoints": [f"tcp/127.0.0.1:{port}"] * (not listens),
+    }  # fmt: skip
+    for key, value in values.items():
+        config.insert_json5(key, json.dumps(value))
+    return config
+
+
+class Foreign:
+    """A peer that reads the keepout mask: when each area became blocked on it, by this machine's clock."""
+
+    def __init__(self, process: psutil.Process, cells: Mapping[str, int], size: int) -> None:
+        """`cells`: the number of a cell in the middle of each area, of a map of `size` cells."""
+        self._process = process
+        self._areas, self._cells = list(cells), np.array(list(cells.values()))
+        self._size = size
+        self._before = np.zeros(len(cells), np.bool_)
+        self.masks = 0
+        self._blocked: defaultdict[str, list[float]] = defaultdict(list)
+        self._cpu_s = 0.0
+
+    def on_mask(self, sample: zenoh.Sample) -> None:
+        """Note which areas a mask blocks that the one before did not; it is called on another thread."""
+        now = time.time()
+        values = np.frombuffer(sample.payload.to_bytes(), np.int8)[-self._size :]
+        blocked = values[self._cells] > 0
+        for index in np.flatnonzero(blocked & ~self._before):
+            self._blocked[self._areas[index]].append(now)
+        self._before = blocked
+        self.masks += 1
+
+    def begin(self) -> None:
+        """Begin to measure the bridge's processor time."""
+        self._cpu_s, self.masks = sum(self._process.cpu_times()[:2]), 0
+
+    def figures(self, traces: Sequence[Trace], seconds: float) -> dict[str, Any]:
+        """Return how many of these hazards reached the mask, percentiles of their times (ms), and the bridge's cost."""
+        ages = list(self._ages(traces))
+        figures: dict[str, Any] = {"masks": self.masks, "hazards_on_mask": len(ages)}
+        for p in (50, 99, 100):
+            figures[f"confirmed_to_mask_p{p}_ms"] = round(1000 * float(np.percentile(ages, p)), 1) if ages else None
+        cpu = sum(self._process.cpu_times()[:2]) - self._cpu_s
+        figures["bridge_cpu_percent"] = round(100 * cpu / seconds, 1)
+        figures["bridge_rss_mb"] = round(self._process.memory_info().rss / _MB, 1)
+        return figures
+
+    def _ages(self, traces: Sequence[Trace]) -> Iterator[float]:
+        """Yield how long (s) hazards took to their mask: each to the first time that its area became blocked."""
+        for trace in traces:
+            later = [at for at in self._blocked[trace.area] if at > trace.confirmed]
+            others = (each.confirmed for each in traces if each.area == trace.area)
+            if later and later[0] < min((at for at in others if at > trace.confirmed), default=float("inf")):
+                yield later[0] - trace.confirmed
+
+
+@asynccontextmanager
+async def foreign(
+    stack: Stack, site: str, centres: Mapping[str, PointXY], shape: tuple[int, int], resolution: float, stopped: int
+) -> AsyncIterator[Foreign]:
+    """Run a bridge to ROS 2 with one peer that reads, and `stopped` ones that do not any more; raises `FailedError`.
+
+    `centres` are those (m) of the areas, on a map of `shape` (rows, columns) from the origin on.
+    """
+    cells = {area: round(y / resolution) * shape[1] + round(x / resolution) for area, (x, y) in centres.items()}
+    port, key = net.free_port(), f"0/fognav/{site}/keepout_mask/**"
+    file = stack.security.file(BRIDGE)
+    environment = inherited_environment() | {
+        "FOGNAV_ADAPTERS": "ros2", "FOGNAV_ROS2_ROUTER": f"tcp/127.0.0.1:{port}", "FOGNAV_SITE": site,
+        "FOGNAV_CONSOLE_URL": "http://127.0.0.1:9", "FOGNAV_TOKEN_FILE": str(stack.token_file),
+        "FOGNAV_ZENOH_CONNECT": stack.zenoh_endpoint, "FOGNAV_MQTT_URL": stack.mqtt_url, "FOGNAV_HTTP_PORT": "0",
+        "FOGNAV_CREDENTIALS_FILE": str(file),
+    }  # fmt: skip
+    started: list[asyncio.subprocess.Process] = []
+    with (
+        zenoh.open(_config("router", port)),
+        zenoh.open(_config("peer", port)) as session,
+        (stack.folder / "bridge.log").open("wb") as log,
+    ):
+        bridge = await asyncio.create_subprocess_exec(
+            sys.executable, "-m", MODULES[BRIDGE], env=environment, stdout=log, stderr=log
+        )
+        started.append(bridge)
+        try:
+            found = Foreign(psutil.Process(bridge.pid), cells, shape[0] * shape[1])
+            session.declare_subscriber(key, found.on_mask)
+            for _ in range(stopped):
+                command = (sys.executable, "-m", "fognav_experiments.bench.foreign", str(port), key)
+                peer = await asyncio.create_subprocess_exec(*command, stdout=asyncio.subprocess.PIPE)
+                started.append(peer)
+                assert peer.stdout is not None
+                await peer.stdout.readline()
+                os.kill(peer.pid, signal.SIGSTOP)
+            await _until_told(found, bridge, stack)
+            yield found
+        finally:
+            for process in started:
+                if process.returncode is None:
+                    process.kill()
+                    await process.wait()
+
+
+async def _until_told(found: Foreign, bridge: asyncio.subprocess.Process, stack: Stack) -> None:
+    for _ in range(round(_READY_S / _POLL_S)):
+        if found.masks:
+            return
+        if bridge.returncode is not None:
+            break
+        await asyncio.sleep(_POLL_S)
+    log = (stack.folder / "bridge.log").read_text("utf-8", errors="replace")[-1000:]
+    raise FailedError(f"the bridge tells ROS 2 nothing: is {MODULES[BRIDGE]} installed with its extra ros2?\n{log}")
+
+
+def main() -> None:
+    """Subscribe to a key of ROS's router at a port until killed: PORT KEY. Says when it has begun."""
+    with zenoh.open(_config("peer", int(sys.argv[1]))) as session:
+        session.declare_subscriber(sys.argv[2], lambda _: None)
+        sys.stdout.write("reads\n")
+        sys.stdout.flush()
+        signal.pause()
+
+
+if __name__ == "__main__":
+    main()

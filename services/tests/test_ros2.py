@@ -24,11 +24,22 @@ from hypothesis import strategies as st
 from manual_clock import ManualClock
 from rosbags.typesys import Stores, get_typestore
 
+from fog_bridges.metrics import REFUSED
 from fog_bridges.ros2 import messages as ros
-from fog_bridges.ros2.bridge import GOAL_TYPE, MAP_TYPE, OBSTACLES_TYPE, POSE_TYPE, TF_TYPE, Relay
+from fog_bridges.ros2.bridge import (
+    GOAL_TYPE,
+    LANES_TYPE,
+    LIMITS_TYPE,
+    MAP_TYPE,
+    OBSTACLES_TYPE,
+    POSE_TYPE,
+    TF_TYPE,
+    Relay,
+)
 from fog_bridges.ros2.others import Others, robot_radii
-from fog_bridges.ros2.session import REFUSED, RosSession, ros_config
-from fog_bridges.ros2.wire import Attachment, Node, Topic, WireError, Writer, decoded, type_hash
+from fog_bridges.ros2.rmf import GraphError, Traffic, read_graph
+from fog_bridges.ros2.session import RosSession, ros_config
+from fog_bridges.ros2.wire import TYPES, Attachment, Node, Topic, WireError, Writer, decoded, type_hash
 from fog_contracts import channels as ch
 from fog_contracts.costs import penalty_cost
 from fog_contracts.grid import GridGeometry
@@ -48,7 +59,6 @@ from fog_contracts.messages import (
 )
 from fog_contracts.replica import MasterMap, decode_map
 from fog_runtime.clock import SystemClock
-from fog_supervisor import net
 
 DOMAIN = 7
 STORE = get_typestore(Stores.ROS2_JAZZY)
@@ -143,9 +153,9 @@ def test_path_battery_and_markers_can_be_sent():
 
 
 def sent(name: str, kind: str, message):
-    """Return a message as another store of types reads what was sent."""
+    """Return a message as another store of types reads what was sent, where that knows the type."""
     payload, _ = Writer(Topic(name, kind), "token").encoded(message, 1)
-    return STORE.deserialize_cdr(payload, kind)
+    return (STORE if kind in STORE.fielddefs else TYPES).deserialize_cdr(payload, kind)
 
 
 # --- The map ----------------------------------------------------------------------------------------------------------
@@ -389,6 +399,68 @@ def test_obstacles_of_others_are_reported_for_their_lifetime_and_deleted():
         hear(obstacles(obstacle(200)))
 
 
+GRAPH = """
+building_name: house
+levels:
+  L0: {vertices: [[0, 0, {}], [1, 0, {}]], lanes: [[0, 1, {}], [1, 0, {}]]}
+  L1:
+    vertices: [[0.5, 0.5, {name: a}], [1.5, 0.5, {}], [1.5, 1.5, {}]]
+    lanes: [[0, 1, {}], [1, 0, {}], [1, 2, {speed_limit: 0.5}]]
+"""
+
+
+def test_lanes_are_closed_slowed_and_opened_again_for_each_fleet(tmp_path):
+    (tmp_path / "0.yaml").write_text(GRAPH)
+    lanes = read_graph(tmp_path / "0.yaml", "L1")
+    assert [lane.number for lane in lanes] == [2, 3, 4], "numbered after those of the level before"
+    traffic, geometry = Traffic(lanes, ["tb", "carts"], "L1"), GridGeometry(40, 40, 0.05, 0.0, 0.0)
+    free = np.zeros((40, 40), np.int8)
+    closed, slow = free.copy(), free.copy()
+    closed[8:12, 18:20], slow[28:32, 28:32] = 100, 30
+    assert traffic.update(closed, slow, geometry, 1.0)
+    first, second = (sent("l", LANES_TYPE, each) for each in traffic.lane_requests())
+    assert (first.fleet_name, second.fleet_name) == ("tb", "carts")
+    assert (first.close_lanes.tolist(), first.open_lanes.tolist()) == ([2, 3], [])
+    (limit, _) = (sent("l", LIMITS_TYPE, each) for each in traffic.speed_requests())
+    assert [(each.lane_index, each.speed_limit) for each in limit.speed_limits] == [(4, 0.3)]
+    assert not traffic.update(closed, slow, geometry, 1.2)
+    assert traffic.update(closed, slow, geometry, 1.6), "told again, faster than once a second"
+    assert traffic.update(free, free, geometry, 1.7)
+    assert traffic.lane_requests()[0].open_lanes.tolist() == [2, 3]
+    assert traffic.speed_requests()[0].remove_limits.tolist() == [4]
+    assert traffic.update(free, free, geometry, 9.0)
+    assert traffic.lane_requests()[0].open_lanes.tolist() == [], "only lanes that it has closed are opened, for a while"
+    assert type_hash(LANES_TYPE) == "RIHS01_100c4069966b9c5f1643862c4cb47866144395cc30ec51b1a99f0b834c72158e"
+    assert type_hash(LIMITS_TYPE) == "RIHS01_a20aaa1e353b1cc0793dad24dfca43d7bd8369c4e5962fb3cc6280d0b6381017"
+
+
+@pytest.mark.parametrize(
+    "text", ["levels: [", "a: 1", "levels: {L2: {}}", "levels: {L1: {vertices: [[1]], lanes: []}}"]
+)
+def test_navigation_graph_that_is_none_is_refused_with_its_file(tmp_path, text):
+    (tmp_path / "0.yaml").write_text(text)
+    with pytest.raises(GraphError, match=r"0\.yaml"):
+        read_graph(tmp_path / "0.yaml", "L1")
+
+
+async def test_hazards_and_zones_are_obstacles_of_open_rmf_until_they_are_gone():
+    floor = Floor()
+    floor.relay._traffic = Traffic([], [], "L1")
+    ring = [(0.05, 0.0), (0.1, 0.0), (0.1, 0.1)]
+    hazard = AreaHazard(area="hall", state="blocked", severity=3, penalty=254, since=0.0, seq=1, epoch=1, cause="")
+    floor.hear[ch.HAZARD]({"area": "hall"}, HazardArea(hazard=hazard, polygon=ring))
+    await floor.show(plan(0, 1))
+    (told,) = sent("o", OBSTACLES_TYPE, floor.told["rmf_obstacles"][-1]).obstacles
+    assert (told.source, told.level_name, told.action, told.lifetime.sec) == ("fognav", "L1", 1, 3)
+    assert (told.bbox.center.position.x, told.bbox.size.x) == pytest.approx((0.075, 0.05))
+    clear = msgspec.structs.replace(hazard, state="clear", penalty=0)
+    floor.hear[ch.HAZARD]({"area": "hall"}, HazardArea(hazard=clear, polygon=ring))
+    floor.clock.advance(1.0)
+    floor.relay._tell_masks()
+    (gone,) = floor.told["rmf_obstacles"][-1].obstacles
+    assert (gone.id, gone.action) == (told.id, 2)
+
+
 @pytest.mark.parametrize("text", ["tb4", "tb4:0", "tb4:3", "4b:0.2", "a/b:0.2", "tb_4:0.2,TB_4:0.3"])
 def test_robots_of_others_without_name_or_radius_are_refused(text):
     with pytest.raises(ValueError, match="robot"):
@@ -444,18 +516,6 @@ def encoded(name: str, kind: str, message: object) -> tuple[str, bytes, bytes]:
     """Return key, payload and attachment of a message as it is sent."""
     topic = Topic(name, kind)
     return topic.key(0).removeprefix(f"0/{name}/"), *Writer(topic, "t").encoded(message, time.time_ns())
-
-
-@pytest.fixture
-def ros_router():
-    """A router as ROS 2 users start one; yields its port."""
-    port = net.free_port()
-    config = zenoh.Config()
-    for key, value in (("mode", "router"), ("listen/endpoints", [f"tcp/127.0.0.1:{port}"]),
-                       ("scouting/multicast/enabled", False)):  # fmt: skip
-        config.insert_json5(key, json.dumps(value))
-    with zenoh.open(config):
-        yield port
 
 
 @pytest.fixture

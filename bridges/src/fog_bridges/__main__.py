@@ -88,6 +88,17 @@ class Settings(CommonSettings, frozen=True, kw_only=True):
     vda5050_zones: str = ""
     """Robots of others that are told of hazards and zones: MANUFACTURER/SERIAL, comma separated."""
 
+    rmf_level: str = ""
+    """The floor's level in Open-RMF; with it, the adapter ros2 tells of hazards and no-go zones as obstacles."""
+    rmf_nav_graph: Path | None = None
+    """A navigation graph of Open-RMF: its lanes are closed and slowed; needs `rmf_level`."""
+    rmf_fleets: str = ""
+    """The fleets that drive on these lanes, comma separated."""
+    free_fleet_router: str = ""
+    """The zenoh router that Open-RMF's free_fleet adapter connects to."""
+    free_fleet_session_config: Path | None = None
+    """A zenoh configuration file, with TLS, say; then `free_fleet_router` is not used."""
+
     @property
     def names(self) -> list[str]:
         """The adapters; raises `SettingsError` for one that is unknown, and without any."""
@@ -110,7 +121,7 @@ class Settings(CommonSettings, frozen=True, kw_only=True):
 
 _FILES: Final = (
     "credentials_file", "token_file", "home_assistant_credentials_file", "ros2_session_config",
-    "vda5050_credentials_file",
+    "vda5050_credentials_file", "free_fleet_session_config", "rmf_nav_graph",
 )  # fmt: skip
 _MAKE_TOKEN: Final = "Make one: fognav token create bridge --role operator --file TOKENS > FILE"  # noqa: S105  # no token
 
@@ -178,6 +189,7 @@ def _ros2(settings: Settings, site: str, _: Clock) -> Adapter:
     try:
         from fog_bridges.ros2.bridge import Ros2Bridge  # noqa: PLC0415  # an extra
         from fog_bridges.ros2.others import robot_radii  # noqa: PLC0415  # an extra
+        from fog_bridges.ros2.rmf import Traffic, read_graph  # noqa: PLC0415  # an extra
         from fog_bridges.ros2.session import ros_config  # noqa: PLC0415  # an extra
     except ImportError as error:
         raise SettingsError(f"the adapter ros2 needs more ({error}): pip install 'fog-bridges[ros2]'") from error
@@ -186,9 +198,37 @@ def _ros2(settings: Settings, site: str, _: Clock) -> Adapter:
     try:
         config = ros_config(settings.ros2_session_config or settings.ros2_router)
         others = robot_radii(settings.ros2_robots)
+        graph, level = settings.rmf_nav_graph, settings.rmf_level
+        fleets = [name for name in map(str.strip, settings.rmf_fleets.split(",")) if name]
+        lanes = read_graph(graph, level) if graph is not None else []
     except ValueError as error:
         raise SettingsError(str(error)) from error
-    return Ros2Bridge(site, config, settings.ros2_domain, settings.zenoh_endpoints, settings.credentials(), others)
+    return Ros2Bridge(
+        site,
+        config,
+        settings.ros2_domain,
+        settings.zenoh_endpoints,
+        settings.credentials(),
+        others,
+        Traffic(lanes, fleets, level) if graph is not None or level else None,
+    )
+
+
+def _free_fleet(settings: Settings, site: str, _: Clock) -> Adapter:
+    try:
+        from fog_bridges.free_fleet import FreeFleetBridge  # noqa: PLC0415  # an extra
+        from fog_bridges.ros2.session import ros_config  # noqa: PLC0415  # an extra
+    except ImportError as error:
+        raise SettingsError(f"the adapter free-fleet needs more ({error}): pip install 'fog-bridges[ros2]'") from error
+    if settings.free_fleet_session_config is None and not settings.free_fleet_router:
+        raise SettingsError(
+            "free_fleet_router names the zenoh router of free_fleet's adapter: tcp/192.168.7.6:7447, say"
+        )
+    try:
+        config = ros_config(settings.free_fleet_session_config or settings.free_fleet_router)
+    except ValueError as error:
+        raise SettingsError(str(error)) from error
+    return FreeFleetBridge(site, config, settings.zenoh_endpoints, settings.credentials())
 
 
 def _foxglove(settings: Settings, site: str, _: Clock) -> Adapter:
@@ -206,6 +246,7 @@ ADAPTERS: Final[Mapping[str, Callable[[Settings, str, Clock], Adapter]]] = {
     "ros2": _ros2,
     "vda5050": _vda5050,
     "foxglove": _foxglove,
+    "free-fleet": _free_fleet,
 }
 
 

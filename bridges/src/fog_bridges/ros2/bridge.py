@@ -44,6 +44,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from fog_bridges.floor import Floor
+    from fog_bridges.ros2.rmf import Traffic
     from fog_contracts.grid import GridGeometry
     from fog_contracts.messages import Reported, Zone
     from fog_runtime.clock import Clock
@@ -66,6 +67,8 @@ GOAL_TYPE: Final = "geometry_msgs/msg/PoseStamped"
 POSE_TYPE: Final = "geometry_msgs/msg/PoseWithCovarianceStamped"
 TF_TYPE: Final = "tf2_msgs/msg/TFMessage"
 OBSTACLES_TYPE: Final = "rmf_obstacle_msgs/msg/Obstacles"
+LANES_TYPE: Final = "rmf_fleet_msgs/msg/LaneRequest"
+LIMITS_TYPE: Final = "rmf_fleet_msgs/msg/SpeedLimitRequest"
 
 _log = logs.get("ros2")
 
@@ -75,15 +78,15 @@ class Ros2Bridge:
 
     name: Final = "ros2"
 
-    def __init__(  # both sides that it connects
+    def __init__(  # noqa: PLR0913  # both sides that it connects
         self, site: str, config: zenoh.Config, domain: int, connect: Sequence[str], own: Credentials,
-        others: Mapping[str, float],
+        others: Mapping[str, float], traffic: Traffic | None = None,
     ) -> None:  # fmt: skip
         """Serve the domain of the router that `config` connects to; `connect` are the floor's, for whom `own` are.
 
-        `others` are the robots of others, each with its radius (m).
+        `others` are the robots of others, each with its radius (m); `traffic` has the lanes of Open-RMF's fleets.
         """
-        self._others = others
+        self._others, self._traffic = others, traffic
         self._site = site
         self._config = config
         self._domain = domain
@@ -106,7 +109,7 @@ class Ros2Bridge:
         )
         try:
             async with opened as fog, asyncio.TaskGroup() as tasks:
-                relay = Relay(fog, session, floor, clock, Others(self._others))
+                relay = Relay(fog, session, floor, clock, Others(self._others), self._traffic)
                 relay.subscribe()
                 tasks.create_task(relay.snapshot_loop(), name="snapshot")
                 tasks.create_task(relay.map_loop(), name="map")
@@ -140,7 +143,13 @@ class Relay:
     """What is told between a floor and a node of ROS; its loops are tasks of the adapter."""
 
     def __init__(  # both sides, and what they tell each other by
-        self, fog: ZenohEdge, session: RosSession, floor: Floor, clock: Clock, others: Others
+        self,
+        fog: ZenohEdge,
+        session: RosSession,
+        floor: Floor,
+        clock: Clock,
+        others: Others,
+        traffic: Traffic | None = None,
     ) -> None:
         """Pass on what `fog` hears on `session`, goals to `floor`, and robots of others to the map."""
         self._fog = fog
@@ -166,7 +175,7 @@ class Relay:
         self._is_slow = False
         self._hazards: dict[str, HazardArea] = {}
         self._zones = ZoneSet(epoch=0, seq=0, zones=[], active=[])
-        self._others = others
+        self._others, self._traffic = others, traffic
         self._penalties: NDArray[np.int8] | None = None
         """What the zones in force add to the keepout mask; None: to be computed anew, as is `_closed`."""
         self._closed: NDArray[np.bool_] | None = None
@@ -252,6 +261,7 @@ class Relay:
             self._is_slow = is_slow
             self._dirty.add(self._speed)
         if not self._dirty:
+            self._tell_traffic()
             return
         limit = DEGRADED_SPEED / 100.0 if is_slow else None
         fresh = {}
@@ -266,6 +276,20 @@ class Relay:
         for topic, values in changed.items():
             self._told[topic], self._told_at = values, now
             self._session.publish(topic, ros.grid(values, replica.geometry, stamp), stamp)
+        self._tell_traffic()
+
+    def _tell_traffic(self) -> None:
+        """Tell Open-RMF which lanes are closed or slow, by the masks that were told, and what stands there."""
+        traffic, geometry, now, stamp = self._traffic, self._geometry, self._now(), self._stamp()
+        if traffic is None or geometry is None or not {self._keepout, self._speed} <= self._told.keys():
+            return
+        if traffic.update(self._told[self._keepout], self._told[self._speed], geometry, now):
+            for request in traffic.lane_requests():
+                self._session.publish(Topic("lane_closure_requests", LANES_TYPE), request, stamp)
+            for request in traffic.speed_requests():
+                self._session.publish(Topic("speed_limit_requests", LIMITS_TYPE), request, stamp)
+            told = traffic.obstacles(self._hazards, self._in_force(), geometry, stamp)
+            self._session.publish(Topic("rmf_obstacles", OBSTACLES_TYPE), told, stamp)
 
     def _keepout_mask(self, cost: NDArray[np.uint8], geometry: GridGeometry) -> NDArray[np.int8]:
         mask = ros.keepout_values(cost, self._static)

@@ -33,6 +33,17 @@ _DEFINITIONS: Final = {
     "rmf_fleet_msgs/msg/SpeedLimitRequest": (
         "string fleet_name\nSpeedLimitedLane[] speed_limits\nuint64[] remove_limits\n"
     ),
+    # The parts of the action nav2_msgs/NavigateToPose and of action_msgs/CancelGoal, as they cross the wire.
+    "fognav_msgs/msg/SendGoal": "uint8[16] goal_id\ngeometry_msgs/PoseStamped pose\nstring behavior_tree\n",
+    "fognav_msgs/msg/GoalAccepted": "bool accepted\nbuiltin_interfaces/Time stamp\n",
+    "fognav_msgs/msg/GetResult": "uint8[16] goal_id\n",
+    "fognav_msgs/msg/GoalResult": "int8 status\n",
+    "fognav_msgs/msg/GoalInfo": "uint8[16] goal_id\nbuiltin_interfaces/Time stamp\n",
+    "fognav_msgs/msg/GoalsCanceled": "int8 return_code\nGoalInfo[] goals_canceling\n",
+    "fognav_msgs/msg/GoalFeedback": (
+        "uint8[16] goal_id\ngeometry_msgs/PoseStamped current_pose\nbuiltin_interfaces/Duration navigation_time\n"
+        "builtin_interfaces/Duration estimated_time_remaining\nint16 number_of_recoveries\nfloat32 distance_remaining\n"
+    ),
 }
 """Messages that rosbags does not know, by their fields alone: a hash covers these."""
 TYPES: Final = get_typestore(Stores.ROS2_JAZZY)
@@ -167,8 +178,13 @@ def _encoded_grid(grid: RosMessage) -> bytes:
 
 
 def decoded(topic: Topic, payload: bytes) -> RosMessage:
-    """Return the message of a payload; raises `WireError` for one that is cut off or is none."""
+    """Return the message of a topic's payload; raises `WireError` for one that is cut off or is none."""
+    return decoded_as(topic.type, payload)
+
+
+def decoded_as(kind: str, payload: bytes) -> RosMessage:
+    """Return the message of a payload of a type, likewise."""
     try:
-        return TYPES.deserialize_cdr(payload, topic.type)
+        return TYPES.deserialize_cdr(payload, kind)
     except Exception as error:  # rosbags raises what its generated code stumbles over
-        raise WireError(f"no {topic.type}: {error!r}") from error
+        raise WireError(f"no {kind}: {error!r}") from error

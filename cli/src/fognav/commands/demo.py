@@ -11,7 +11,17 @@ from fog_runtime.configuration import parts
 from fog_runtime.configuration.site import load_site
 from fognav import checkout, console_page, kernels, recording, system
 from fognav.operate.options import JsonOption, YesOption
-from fognav.output import NOT_TRUE, OK, check_writable, exit_codes, print_json, print_line, print_result, write_report
+from fognav.output import (
+    NOT_TRUE,
+    OK,
+    WrongUseError,
+    check_writable,
+    exit_codes,
+    print_json,
+    print_line,
+    print_result,
+    write_report,
+)
 from fognav_sim import emulators
 
 
@@ -57,6 +67,10 @@ def demo_command(  # noqa: PLR0913  # each option is an argument
     record: Annotated[
         Path | None, typer.Option("--record", metavar="F", help="Record every channel to this MCAP file.")
     ] = None,
+    with_: Annotated[
+        str | None,
+        typer.Option("--with", metavar="ros2", help="A robot of others follows, led by ROS 2's messages alone."),
+    ] = None,
     embedded: Annotated[
         bool,
         typer.Option("--embedded", help="Use Python packages instead of Mosquitto and Redis, as without them."),
@@ -74,8 +88,13 @@ def demo_command(  # noqa: PLR0913  # each option is an argument
     """
     from fognav.demo.options import Options, embedded_servers, hardware  # noqa: PLC0415  # kernels are slow
     from fognav.demo.view import run_demo  # noqa: PLC0415  # same
+    from fognav.ros2 import require_ros2  # noqa: PLC0415  # same
 
     with exit_codes():
+        if with_ is not None:
+            if with_ != "ros2":
+                raise WrongUseError(f"--with {with_}: no such system. Use: --with ros2")
+            require_ros2()
         loaded = load_site(checkout.site_folder(site))
         for file in (report, record):
             check_writable(file)
@@ -96,6 +115,7 @@ def demo_command(  # noqa: PLR0913  # each option is an argument
             keep_running=keep_running,
             record=record,
             embedded=packages,
+            ros2=with_ is not None,
         )
         values = asyncio.run(run_demo(loaded, options, headless=headless, page_port=page_port, print_line=print_line))
         if report is not None:

@@ -17,6 +17,7 @@ from fog_runtime.transports.zenoh_edge import ZenohEdge
 from fog_supervisor import net
 from fog_supervisor.supervisor import Event
 from fognav import checkout
+from fognav.demo.guest import GuestDrive
 from fognav.demo.machine import SpeedWatch, TooFastError, Usage, children
 from fognav.demo.operator import Operator
 from fognav.demo.options import DrivePlan
@@ -172,6 +173,8 @@ class Attempt:
         self.usage = Usage()
         self.restarts: dict[str, int] = {}
         """How often each process died and was restarted."""
+        self.guest: dict[str, object] | None = None
+        """The drive of a robot of others, where one was asked for."""
         self.taken_over = False
         """Somebody sent the robot elsewhere: the system is theirs from then on."""
         self._stack: Stack | None = None
@@ -216,13 +219,25 @@ class Attempt:
                 presence.update()
                 presence.announce()
                 async with Background(operator.keep_enabled(), self._sample(stack, presence)) as background:
+                    guest = None
+                    if options.ros2:
+                        guest = await ends.enter_async_context(GuestDrive(stack, self.plan))
+                        self.scene.log_event("scenario: a robot of others sets out 2 m behind, by ROS 2 alone")
                     await self.run_drive(operator, clock, background)
+                    if guest is not None and not self.taken_over:
+                        self.scene.log_event("scenario: waiting until the robot of others is there, too")
+                        self.guest = await guest.finish(self._barrier())
                     if self.taken_over:
                         self.scene.log_event("the system keeps running for whom sent the robot: end it with Ctrl-C")
                     elif options.keep_running:
                         self.scene.log_event("the system keeps running: end it with Ctrl-C")
                     if self.taken_over or options.keep_running:
                         await stop.wait()
+
+    def _barrier(self) -> list[tuple[float, float]] | None:
+        """Return the outline of the barrier that was placed; None without one."""
+        hazard = None if self.drive is None or not self.drive.hazard_met else self.drive.hazard
+        return None if hazard is None or hazard.planned is None else list(hazard.planned.barrier.polygon)
 
     @contextlib.asynccontextmanager
     async def _recording(self, stack: Stack, clock: SystemClock) -> AsyncIterator[None]:
@@ -416,4 +431,6 @@ class Attempt:
 
     def success(self) -> bool:
         """Whether the drive succeeded and, if a hazard was requested, met one."""
-        return self.summary().success
+        guest = self.guest
+        led = guest is None or (guest["reached"] is True and guest["touched_barrier"] is False)
+        return self.summary().success and led

@@ -45,6 +45,7 @@ def _drive(attempt: Attempt) -> dict[str, object]:
         "seed": options.seed,
         "hazard": attempt.plan.hazard,
         "stages_ms": durations_ms(trace),
+        **({} if attempt.guest is None else {"guest": attempt.guest, "success": attempt.success()}),
         "hazard_to_path_ms": hazard_to_path_ms(trace),
     }
 

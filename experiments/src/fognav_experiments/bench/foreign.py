@@ -7,13 +7,12 @@ are in this one, by zenoh's own code: of a message only the cells at its end are
 from __future__ import annotations
 
 import asyncio
-import json
 import os
 import signal
 import sys
 import time
 from collections import defaultdict
-from contextlib import asynccontextmanager
+from contextlib import AsyncExitStack, asynccontextmanager
 from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
@@ -21,8 +20,10 @@ import psutil
 import zenoh
 
 from fog_supervisor import net
+from fog_supervisor.supervisor import log_tail
 from fognav.output import FailedError
-from fognav.programs import BRIDGE, MODULES, inherited_environment
+from fognav.programs import BRIDGE, MODULES
+from fognav.ros2 import end, running_bridge, session_config
 
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator, Iterator, Mapping, Sequence
@@ -33,19 +34,6 @@ if TYPE_CHECKING:
 _READY_S: Final = 60.0
 _POLL_S: Final = 0.05
 _MB: Final = 1e6
-
-
-def _config(mode: str, port: int) -> zenoh.Config:
-    """Return the configuration of ROS's router, or of a peer as rmw_zenoh opens one."""
-    config = zenoh.Config()
-    listens = mode == "router"
-    values = {
-        "mode": mode, "scouting/multicast/enabled": False, "listen/endpoints": [f"tcp/127.0.0.1:{port}"] * listens,
-        "connect/endpoints": [f"tcp/127.0.0.1:{port}"] * (not listens),
-    }  # fmt: skip
-    for key, value in values.items():
-        config.insert_json5(key, json.dumps(value))
-    return config
 
 
 class Foreign:
@@ -105,40 +93,20 @@ async def foreign(
     """
     cells = {area: round(y / resolution) * shape[1] + round(x / resolution) for area, (x, y) in centres.items()}
     port, key = net.free_port(), f"0/fognav/{site}/keepout_mask/**"
-    file = stack.security.file(BRIDGE)
-    environment = inherited_environment() | {
-        "FOGNAV_ADAPTERS": "ros2", "FOGNAV_ROS2_ROUTER": f"tcp/127.0.0.1:{port}", "FOGNAV_SITE": site,
-        "FOGNAV_CONSOLE_URL": "http://127.0.0.1:9", "FOGNAV_TOKEN_FILE": str(stack.token_file),
-        "FOGNAV_ZENOH_CONNECT": stack.zenoh_endpoint, "FOGNAV_MQTT_URL": stack.mqtt_url, "FOGNAV_HTTP_PORT": "0",
-        "FOGNAV_CREDENTIALS_FILE": str(file),
-    }  # fmt: skip
-    started: list[asyncio.subprocess.Process] = []
-    with (
-        zenoh.open(_config("router", port)),
-        zenoh.open(_config("peer", port)) as session,
-        (stack.folder / "bridge.log").open("wb") as log,
-    ):
-        bridge = await asyncio.create_subprocess_exec(
-            sys.executable, "-m", MODULES[BRIDGE], env=environment, stdout=log, stderr=log
-        )
-        started.append(bridge)
-        try:
-            found = Foreign(psutil.Process(bridge.pid), cells, shape[0] * shape[1])
-            session.declare_subscriber(key, found.on_mask)
-            for _ in range(stopped):
-                command = (sys.executable, "-m", "fognav_experiments.bench.foreign", str(port), key)
-                peer = await asyncio.create_subprocess_exec(*command, stdout=asyncio.subprocess.PIPE)
-                started.append(peer)
-                assert peer.stdout is not None
-                await peer.stdout.readline()
-                os.kill(peer.pid, signal.SIGSTOP)
-            await _until_told(found, bridge, stack)
-            yield found
-        finally:
-            for process in started:
-                if process.returncode is None:
-                    process.kill()
-                    await process.wait()
+    async with AsyncExitStack() as contexts:
+        bridge = await contexts.enter_async_context(running_bridge(stack, site, port))
+        session = contexts.enter_context(zenoh.open(session_config("peer", port)))
+        found = Foreign(psutil.Process(bridge.pid), cells, shape[0] * shape[1])
+        session.declare_subscriber(key, found.on_mask)
+        for _ in range(stopped):
+            command = (sys.executable, "-m", "fognav_experiments.bench.foreign", str(port), key)
+            peer = await asyncio.create_subprocess_exec(*command, stdout=asyncio.subprocess.PIPE)
+            contexts.push_async_callback(end, peer)
+            assert peer.stdout is not None
+            await peer.stdout.readline()
+            os.kill(peer.pid, signal.SIGSTOP)
+        await _until_told(found, bridge, stack)
+        yield found
 
 
 async def _until_told(found: Foreign, bridge: asyncio.subprocess.Process, stack: Stack) -> None:
@@ -148,13 +116,13 @@ async def _until_told(found: Foreign, bridge: asyncio.subprocess.Process, stack:
         if bridge.returncode is not None:
             break
         await asyncio.sleep(_POLL_S)
-    log = (stack.folder / "bridge.log").read_text("utf-8", errors="replace")[-1000:]
+    log = log_tail(stack.log(BRIDGE))
     raise FailedError(f"the bridge tells ROS 2 nothing: is {MODULES[BRIDGE]} installed with its extra ros2?\n{log}")
 
 
 def main() -> None:
     """Subscribe to a key of ROS's router at a port until killed: PORT KEY. Says when it has begun."""
-    with zenoh.open(_config("peer", int(sys.argv[1]))) as session:
+    with zenoh.open(session_config("peer", int(sys.argv[1]))) as session:
         session.declare_subscriber(sys.argv[2], lambda _: None)
         sys.stdout.write("reads\n")
         sys.stdout.flush()

@@ -1,0 +1,271 @@
+"""Robots of Fognav as Open-RMF's free_fleet sees robots of Nav2: on the keys of zenoh-bridge-ros2dds, without ROS.
+
+Plain CDR, no attachment: `ROBOT/tf`, `ROBOT/battery_state`, and the action `ROBOT/navigate_to_pose/_action/...` with
+goal, result, cancellation and feedback. Source: free_fleet@002505fd, its adapter for Nav2 and its example programs.
+"""
+
+from __future__ import annotations
+
+import asyncio
+from dataclasses import dataclass
+from functools import partial
+from typing import TYPE_CHECKING, Any, Final
+
+import numpy as np
+import zenoh
+
+from fog_bridges.floor import Request
+from fog_bridges.metrics import REFUSED
+from fog_bridges.ros2 import messages as ros
+from fog_bridges.ros2.wire import TYPES, RosMessage, WireError, decoded_as
+from fog_contracts import channels as ch
+from fog_contracts.messages import RobotPose, RobotState
+from fog_runtime import logs
+from fog_runtime.clock import ticker
+from fog_runtime.transports.zenoh_edge import ZenohEdge
+
+if TYPE_CHECKING:
+    from collections.abc import Awaitable, Callable, Sequence
+
+    from fog_bridges.floor import Floor
+    from fog_runtime.clock import Clock
+    from fog_runtime.credentials import Credentials
+
+EXECUTING, SUCCEEDED, CANCELED, UNKNOWN = 2, 4, 5, 0
+"""States of a goal (action_msgs/GoalStatus)."""
+CANCEL_NONE, CANCEL_REJECTED, CANCEL_UNKNOWN_GOAL = 0, 1, 2
+"""Return codes of action_msgs/CancelGoal."""
+FEEDBACK_S: Final = 0.5
+SPEED_M_S: Final = 0.3
+"""What the remaining time is estimated by."""
+SEEN_S: Final = 5.0
+"""A mission that its robot has not heard of for so long counts as ended if the robot has none."""
+WAITING_MAX: Final = 50
+RETRY_S: Final = 1.0
+_NO_GOAL: Final = bytes(16)
+_NO_ROUTER: Final = "free_fleet's router is not connected"
+_ACTION: Final = "navigate_to_pose/_action"
+_log = logs.get("free_fleet")
+
+
+@dataclass
+class Mission:
+    """The latest goal that somebody gave a robot by this bridge; times are those of a monotonic clock (s)."""
+
+    goal: bytes
+    """Its id, 16 bytes that whoever sent it has drawn."""
+    mission: str
+    """Its id on the floor."""
+    begun: float
+    status: int = EXECUTING
+    is_seen: bool = False
+    """Whether the robot has it."""
+
+    def on_state(self, state: RobotState, now: float) -> None:
+        """Follow what the robot says of its goal."""
+        if self.status != EXECUTING:
+            return
+        if state.goal_id == self.mission:
+            self.is_seen = True
+            self.status = SUCCEEDED if state.goal_reached else EXECUTING
+        elif self.is_seen or (state.goal_id is None and now - self.begun > SEEN_S):
+            self.status = CANCELED  # by an operator, or for another goal
+
+
+class FreeFleetBridge:
+    """The adapter for free_fleet."""
+
+    name: Final = "free-fleet"
+
+    def __init__(self, site: str, config: zenoh.Config, connect: Sequence[str], own: Credentials) -> None:
+        """Serve robots on the router that `config` connects to; `connect` are the floor's, for whom `own` are."""
+        self._site, self._config, self._connect, self._own = site, config, connect, own
+        self.problem = "not connected yet"
+        """Why free_fleet is told nothing; empty while it is."""
+
+    def on_event(self, name: str, data: dict[str, Any]) -> None:
+        """Do nothing: the floor's own channels are faster than its console."""
+
+    def on_lost(self) -> None:
+        """Do nothing, likewise."""
+
+    async def run(self, floor: Floor, clock: Clock) -> None:
+        """Connect, and do all until cancelled."""
+        session = await self._opened()
+        opened = ZenohEdge.open(
+            connect=self._connect, clock=clock, role=ch.BRIDGE, id=f"{self._site}-fleet"[: ch.ID_MAX], site=self._site,
+            credentials=self._own,
+        )  # fmt: skip
+        try:
+            async with opened as fog, asyncio.TaskGroup() as tasks:
+                fleet = Fleet(session, floor, clock, tasks)
+                fog.subscribe(ch.ROBOT_STATE, RobotState, lambda ids, state: fleet.on_state(ids["robot"], state))
+                fog.subscribe(ch.ROBOT_POSE, RobotPose, lambda ids, pose: fleet.on_pose(ids["robot"], pose))
+                async for _ in ticker(clock, FEEDBACK_S):
+                    fleet.tell_feedback()
+                    info = session.info
+                    connected = bool(info.routers_zid() or info.peers_zid())
+                    self.problem = "" if connected else _NO_ROUTER
+                    if not fog.connected:
+                        self.problem = "the floor's router is not connected"
+        finally:
+            session.close()  # type: ignore[no-untyped-call]  # zenoh's stub has no types for it
+
+    async def _opened(self) -> zenoh.Session:
+        """Open a session once the router is there; afterwards it connects again by itself."""
+        while True:
+            try:
+                return await asyncio.to_thread(zenoh.open, self._config)
+            except zenoh.ZError as error:
+                self.problem = f"{_NO_ROUTER}: {error}"
+            await asyncio.sleep(RETRY_S)
+
+
+class Fleet:
+    """The robots that are served: each is from its first state on."""
+
+    def __init__(self, session: zenoh.Session, floor: Floor, clock: Clock, tasks: asyncio.TaskGroup) -> None:
+        """Serve robots on `session`, and pass their goals on to `floor`."""
+        self._session, self._floor, self._clock, self._tasks = session, floor, clock, tasks
+        self._loop = asyncio.get_running_loop()
+        self._limited = logs.RateLimited(_log)
+        self._held: dict[str, list[object]] = {}
+        self._poses: dict[str, RobotPose] = {}
+        self._states: dict[str, RobotState] = {}
+        self._missions: dict[str, Mission] = {}
+        self._waiting = 0
+
+    def on_pose(self, robot: str, pose: RobotPose) -> None:
+        """Tell where a robot is, in frames without its name: free_fleet adds that."""
+        self._poses[robot] = pose
+        told = ros.transform(pose.x, pose.y, pose.theta, "base_footprint", pose.stamp)
+        self._put(robot, "tf", told, "tf2_msgs/msg/TFMessage")
+
+    def on_state(self, robot: str, state: RobotState) -> None:
+        """Tell a robot's battery, and follow its mission."""
+        self._states[robot] = state
+        if robot not in self._held:
+            served: dict[str, Callable[[str, bytes], Awaitable[bytes]]] = {
+                "send_goal": self._send_goal, "get_result": self._get_result, "cancel_goal": self._cancel,
+            }  # fmt: skip
+            self._held[robot] = [
+                self._session.declare_queryable(
+                    f"{ros.ros_name(robot)}/{_ACTION}/{name}", partial(self._on_query, robot, name, answer)
+                )
+                for name, answer in served.items()
+            ]
+        if (mission := self._missions.get(robot)) is not None:
+            mission.on_state(state, self._clock.now())
+        self._put(robot, "battery_state", ros.battery(state, self._clock.stamp()), "sensor_msgs/msg/BatteryState")
+
+    def tell_feedback(self) -> None:
+        """Tell how far robots have to go."""
+        for robot, mission in self._missions.items():
+            state, pose = self._states.get(robot), self._poses.get(robot)
+            if mission.status != EXECUTING or state is None or pose is None or state.goal_distance is None:
+                continue
+            stamp = self._clock.stamp()
+            where = ros.message(
+                "geometry_msgs/msg/PoseStamped", header=ros.header(stamp), pose=ros.pose(pose.x, pose.y, pose.theta)
+            )
+            told = ros.message(
+                "fognav_msgs/msg/GoalFeedback", goal_id=np.frombuffer(mission.goal, np.uint8), current_pose=where,
+                navigation_time=_duration(self._clock.now() - mission.begun),
+                estimated_time_remaining=_duration(state.goal_distance / SPEED_M_S), number_of_recoveries=0,
+                distance_remaining=state.goal_distance,
+            )  # fmt: skip
+            self._put(robot, f"{_ACTION}/feedback", told, "fognav_msgs/msg/GoalFeedback")
+
+    def _put(self, robot: str, name: str, message: RosMessage, kind: str) -> None:
+        self._session.put(
+            f"{ros.ros_name(robot)}/{name}", bytes(TYPES.serialize_cdr(message, kind)),
+            congestion_control=zenoh.CongestionControl.DROP,
+        )  # fmt: skip
+
+    # --- Goals ------------------------------------------------------------------------------------------------------
+
+    def _on_query(
+        self, robot: str, name: str, answer: Callable[[str, bytes], Awaitable[bytes]], query: zenoh.Query
+    ) -> None:
+        """Take a request, on a thread of zenoh."""
+        payload = b"" if query.payload is None else query.payload.to_bytes()
+        if self._loop.is_closed():
+            return
+        if self._waiting >= WAITING_MAX:
+            self._refuse("too_many", robot, name, f"{WAITING_MAX} requests wait already")
+            query.reply_err(b"too many requests wait")
+            return
+        self._waiting += 1
+        self._loop.call_soon_threadsafe(self._begin, robot, name, answer, query, payload)
+
+    def _begin(
+        self, robot: str, name: str, answer: Callable[[str, bytes], Awaitable[bytes]], query: zenoh.Query, data: bytes
+    ) -> None:
+        async def reply() -> None:
+            try:
+                query.reply(query.key_expr, await answer(robot, data))
+            except WireError as error:
+                self._refuse(error.reason, robot, name, str(error))
+                query.reply_err(str(error).encode())
+            finally:
+                self._waiting -= 1
+
+        self._tasks.create_task(reply(), name=f"{robot} {name}")
+
+    def _refuse(self, reason: str, robot: str, name: str, words: str) -> None:
+        REFUSED.labels(FreeFleetBridge.name, reason).inc()
+        self._limited.warning("request_refused", f"{name} {reason}", self._clock.now(), robot=robot, request=name,
+                              reason=words)  # fmt: skip
+
+    async def _send_goal(self, robot: str, data: bytes) -> bytes:
+        """Send a robot to a pose; a goal that the floor refuses is not accepted."""
+        asked = decoded_as("fognav_msgs/msg/SendGoal", data)
+        x, y, frame = asked.pose.pose.position.x, asked.pose.pose.position.y, asked.pose.header.frame_id
+        if frame not in ("", ros.MAP_FRAME):
+            raise WireError(f"a goal in the frame {frame[:40]!r}: send it in {ros.MAP_FRAME!r}", "frame")
+        if not np.isfinite((x, y)).all():
+            raise WireError(f"a goal at ({x}, {y})")
+        theta = ros.heading(asked.pose.pose.orientation)
+        pose = {"x": x, "y": y} | ({} if theta is None else {"theta": theta})
+        told = await self._floor.ask(Request("PUT", f"/api/v1/robots/{robot}/goal", {"pose": pose}))
+        goal_id = None if told.refusal else told.body.get("goal_id")
+        if goal_id is None:
+            self._refuse("goal", robot, "send_goal", told.refusal or "the floor's answer names no mission")
+        else:
+            self._missions[robot] = Mission(bytes(asked.goal_id), str(goal_id), self._clock.now())
+        accepted = ros.message("fognav_msgs/msg/GoalAccepted", accepted=goal_id is not None, stamp=self._time())
+        return bytes(TYPES.serialize_cdr(accepted, "fognav_msgs/msg/GoalAccepted"))
+
+    async def _get_result(self, robot: str, data: bytes) -> bytes:
+        """Tell a goal's state at once: whoever asked would wait for nothing else meanwhile, and asks again."""
+        asked = bytes(decoded_as("fognav_msgs/msg/GetResult", data).goal_id)
+        mission = self._missions.get(robot)
+        status = CANCELED if mission is not None else UNKNOWN  # an earlier goal has given way to the latest
+        if mission is not None and mission.goal == asked:
+            status = mission.status
+        result = ros.message("fognav_msgs/msg/GoalResult", status=status)
+        return bytes(TYPES.serialize_cdr(result, "fognav_msgs/msg/GoalResult"))
+
+    async def _cancel(self, robot: str, data: bytes) -> bytes:
+        """End a robot's mission: the one that is named, or, with an id of zeros, whichever this bridge has begun."""
+        asked = bytes(decoded_as("fognav_msgs/msg/GoalInfo", data).goal_id)
+        mission, code, ended = self._missions.get(robot), CANCEL_NONE, []
+        if mission is None or mission.status != EXECUTING or asked not in (_NO_GOAL, mission.goal):
+            code = CANCEL_NONE if asked == _NO_GOAL else CANCEL_UNKNOWN_GOAL
+        elif refusal := await self._floor.send(Request("DELETE", f"/api/v1/robots/{robot}/goal")):
+            self._refuse("goal", robot, "cancel_goal", refusal)
+            code = CANCEL_REJECTED
+        else:
+            mission.status = CANCELED
+            goal = np.frombuffer(mission.goal, np.uint8)
+            ended = [ros.message("fognav_msgs/msg/GoalInfo", goal_id=goal, stamp=self._time())]
+        told = ros.message("fognav_msgs/msg/GoalsCanceled", return_code=code, goals_canceling=ended)
+        return bytes(TYPES.serialize_cdr(told, "fognav_msgs/msg/GoalsCanceled"))
+
+    def _time(self) -> RosMessage:
+        return ros.header(self._clock.stamp()).stamp
+
+
+def _duration(seconds: float) -> RosMessage:
+    whole = max(0, int(seconds))
+    return ros.message("builtin_interfaces/msg/Duration", sec=whole, nanosec=int(max(0.0, seconds - whole) * 1e9))

@@ -1,0 +1,73 @@
+"""A bridge to ROS 2 beside a running stack, and ROS's router in this process: for the demo and for measurements."""
+
+from __future__ import annotations
+
+import asyncio
+import json
+import sys
+from contextlib import asynccontextmanager
+from importlib.util import find_spec
+from typing import TYPE_CHECKING
+
+import zenoh
+
+from fog_supervisor import net
+from fognav.output import WrongUseError
+from fognav.programs import BRIDGE, CONSOLE, MODULES, inherited_environment
+
+if TYPE_CHECKING:
+    from collections.abc import AsyncIterator, Mapping
+
+    from fognav.stack import Stack
+
+
+def require_ros2() -> None:
+    """Raise `WrongUseError` if the bridge to ROS 2 is not installed."""
+    if any(find_spec(name) is None for name in (MODULES[BRIDGE], "rosbags", "xxhash")):
+        raise WrongUseError("the bridge to ROS 2 is not installed: pip install 'fog-bridges[ros2]' beside this command")
+
+
+def session_config(mode: str, port: int) -> zenoh.Config:
+    """Return the configuration of ROS's router (`router`), or of a session as rmw_zenoh opens one (`peer`)."""
+    config = zenoh.Config()
+    listens = mode == "router"
+    values = {
+        "mode": mode, "scouting/multicast/enabled": False,
+        "listen/endpoints": [f"tcp/{net.LOOPBACK}:{port}"] * listens,
+        "connect/endpoints": [f"tcp/{net.LOOPBACK}:{port}"] * (not listens),
+    }  # fmt: skip
+    for key, value in values.items():
+        config.insert_json5(key, json.dumps(value))
+    return config
+
+
+@asynccontextmanager
+async def running_bridge(
+    stack: Stack, site: str, port: int, settings: Mapping[str, str] | None = None
+) -> AsyncIterator[asyncio.subprocess.Process]:
+    """Run ROS's router at a port, and a bridge to it with further `settings` (FOGNAV_*, without that prefix)."""
+    known = {
+        "ADAPTERS": "ros2", "ROS2_ROUTER": f"tcp/{net.LOOPBACK}:{port}", "SITE": site,
+        "SPEED": repr(stack.config.speed), "HTTP_PORT": "0", "MQTT_URL": stack.mqtt_url,
+        "ZENOH_CONNECT": stack.zenoh_endpoint, "TOKEN_FILE": str(stack.token_file),
+        "CONSOLE_URL": f"http://{net.LOOPBACK}:{stack.port(CONSOLE) or net.free_port()}",
+    }  # fmt: skip
+    if (credentials := stack.security.file(BRIDGE)) is not None:
+        known["CREDENTIALS_FILE"] = str(credentials)
+    environment = {f"FOGNAV_{name}": value for name, value in (known | dict(settings or {})).items()}
+    command = (sys.executable, "-m", MODULES[BRIDGE])
+    with zenoh.open(session_config("router", port)), stack.log(BRIDGE).open("wb") as log:
+        bridge = await asyncio.create_subprocess_exec(
+            *command, env=inherited_environment() | environment, stdout=log, stderr=log
+        )
+        try:
+            yield bridge
+        finally:
+            await end(bridge)
+
+
+async def end(process: asyncio.subprocess.Process) -> None:
+    """End a process that may have ended."""
+    if process.returncode is None:
+        process.kill()
+        await process.wait()

@@ -1,0 +1,184 @@
+"""Open-RMF's free_fleet drives robots of Fognav as robots of Nav2, without ROS."""
+
+import asyncio
+import json
+import os
+import struct
+from pathlib import Path
+
+import pytest
+import zenoh
+
+from fog_bridges.floor import Answer, Request
+from fog_bridges.free_fleet import Fleet
+from fog_bridges.ros2.session import ros_config
+from fog_contracts.messages import RobotPose, RobotState
+from fog_runtime.clock import SystemClock
+
+pytestmark = pytest.mark.live
+PEERS = "FOGNAV_ROS2_PEERS"
+PROGRAMS = "FOGNAV_FREE_FLEET"
+"""A checkout of github.com/open-rmf/free_fleet; its programs need pycdr2 beside zenoh."""
+GOAL = bytes(range(16))
+POSE = RobotPose(x=1.0, y=1.0, theta=0.0, covariance=[0.0] * 9, v=0.0, w=0.0, radius=0.17, height=0.2, stamp=1.0)
+STATE = RobotState(
+    mode="NORMAL", reasons=[], enabled=True, battery=0.5, goal_id=None, map_epoch=0, map_seq=0, plan_id=None
+)  # fmt: skip
+
+
+class Floor:
+    """A floor that takes the first goal and refuses those beyond x = 100 m."""
+
+    def __init__(self) -> None:
+        self.asked: list[Request] = []
+
+    async def ask(self, request: Request) -> Answer:
+        self.asked.append(request)
+        if request.body is not None and request.body["pose"]["x"] > 100.0:
+            return Answer("the goal is off the map")
+        return Answer("", body={"goal_id": f"g{len(self.asked)}"})
+
+    async def send(self, request: Request) -> str:
+        return (await self.ask(request)).refusal
+
+
+class Rig:
+    """A fleet with one robot on a router, and who asks it."""
+
+    def __init__(self, port: int, tasks: asyncio.TaskGroup) -> None:
+        self.own, self.other = (zenoh.open(ros_config(f"tcp/127.0.0.1:{port}")) for _ in range(2))
+        self.floor = Floor()
+        self.fleet = Fleet(self.own, self.floor, SystemClock(), tasks)  # type: ignore[arg-type]  # all of a floor that it uses
+        self.fleet.on_pose("r-1", POSE)
+        self.fleet.on_state("r-1", STATE)
+
+    async def ask(self, name: str, payload: bytes) -> bytes:
+        """Return the answer to a request; empty for an error."""
+
+        def get() -> bytes:
+            for _ in range(50):  # until the queryables are known
+                replies = list(self.other.get(f"r_1/navigate_to_pose/_action/{name}", payload=payload, timeout=10.0))
+                if replies:
+                    return b"" if replies[0].ok is None else replies[0].ok.payload.to_bytes()
+            return b"none"
+
+        return await asyncio.to_thread(get)
+
+    def state(self, goal_id: str | None, *, reached: bool = False, distance: float | None = None) -> None:
+        self.fleet.on_state(
+            "r-1",
+            RobotState(
+                mode="NORMAL", reasons=[], enabled=True, battery=0.5, goal_id=goal_id, goal_reached=reached,
+                goal_distance=distance, map_epoch=0, map_seq=0, plan_id=None,
+            ),
+        )  # fmt: skip
+
+    def close(self) -> None:
+        for session in (self.own, self.other):
+            session.close()
+
+
+@pytest.fixture
+async def rig(ros_router):
+    async with asyncio.TaskGroup() as tasks:
+        made = Rig(ros_router, tasks)
+        yield made
+        made.close()
+
+
+def goal(x: float, frame: bytes = b"map") -> bytes:
+    """A request as CDR has it: goal id, header, pose, and the name of a behaviour tree."""
+    text = frame + b"\0"
+    head = b"\0\1\0\0" + GOAL + struct.pack("<iII", 0, 0, len(text)) + text
+    head += bytes(-(len(head) - 4) % 8)
+    return head + struct.pack("<7d", x, 3.0, 0.0, 0.0, 0.0, 0.0, 1.0) + struct.pack("<I", 1) + b"\0"
+
+
+def status(answer: bytes) -> int:
+    return answer[4]
+
+
+async def test_goal_is_driven_told_and_ends(rig):
+    accepted = await rig.ask("send_goal", goal(4.0))
+    assert accepted[4] == 1
+    assert rig.floor.asked == [Request("PUT", "/api/v1/robots/r-1/goal", {"pose": {"x": 4.0, "y": 3.0, "theta": 0.0}})]
+    asked = b"\0\1\0\0" + GOAL
+    rig.state("g1", distance=2.5)
+    assert status(await rig.ask("get_result", asked)) == 2
+    rig.state("g1", reached=True)
+    assert status(await rig.ask("get_result", asked)) == 4
+    assert status(await rig.ask("get_result", b"\0\1\0\0" + bytes(16))) == 5, "a goal that another one has replaced"
+
+
+async def test_refused_goal_is_not_accepted_and_malformed_requests_are_answered_by_an_error(rig):
+    assert (await rig.ask("send_goal", goal(200.0)))[4] == 0
+    for damaged in (goal(4.0)[:30], b"", goal(4.0, b"odom"), goal(float("nan"))):
+        assert await rig.ask("send_goal", damaged) == b""
+    assert len(rig.floor.asked) == 1
+
+
+async def test_cancellation_ends_the_mission_that_it_names_or_whichever_there_is(rig):
+    nobody, other = bytes(16), bytes([9] * 16)
+    cancel = [b"\0\1\0\0" + each + bytes(8) for each in (nobody, other, GOAL)]
+    assert (await rig.ask("cancel_goal", cancel[0]))[4] == 0
+    await rig.ask("send_goal", goal(4.0))
+    assert (await rig.ask("cancel_goal", cancel[1]))[4] == 2, "another's goal is unknown"
+    answer = await rig.ask("cancel_goal", cancel[2])
+    assert (answer[4], answer[8:12], answer[12:28]) == (0, b"\1\0\0\0", GOAL)
+    assert rig.floor.asked[-1].method == "DELETE"
+    assert status(await rig.ask("get_result", b"\0\1\0\0" + GOAL)) == 5
+
+
+async def test_mission_that_an_operator_ends_is_canceled(rig):
+    await rig.ask("send_goal", goal(4.0))
+    rig.state(None)
+    assert status(await rig.ask("get_result", b"\0\1\0\0" + GOAL)) == 2, "the robot has not heard of it yet"
+    rig.state("g1")
+    rig.state(None)
+    assert status(await rig.ask("get_result", b"\0\1\0\0" + GOAL)) == 5
+
+
+async def test_free_fleets_own_programs_drive_a_robot(rig, tmp_path, ros_router, until):
+    if PEERS not in os.environ or PROGRAMS not in os.environ:
+        pytest.skip(f"set {PROGRAMS} to a checkout of github.com/open-rmf/free_fleet, and {PEERS} to a Python that has "
+                    "eclipse-zenoh, numpy and pycdr2")  # fmt: skip
+    root, config = Path(os.environ[PROGRAMS]), tmp_path / "client.json"
+    programs = root / "free_fleet_examples" / "free_fleet_examples"
+    config.write_text(json.dumps({
+        "mode": "client", "connect": {"endpoints": [f"tcp/127.0.0.1:{ros_router}"]},
+        "scouting": {"multicast": {"enabled": False}},
+    }))  # fmt: skip
+    said: list[str] = []
+
+    async def run(name: str, *options: str) -> asyncio.subprocess.Process:
+        process = await asyncio.create_subprocess_exec(
+            os.environ[PEERS], "-u", str(programs / name), "-c", str(config),
+            "-n", "r_1", *options, stdout=asyncio.subprocess.PIPE, stderr=asyncio.subprocess.STDOUT,
+            env={**os.environ, "PYTHONPATH": str(root / "free_fleet")},
+        )  # fmt: skip
+
+        async def read() -> None:
+            assert process.stdout is not None
+            while line := await process.stdout.readline():
+                said.append(line.decode().strip())
+
+        reading.append(asyncio.create_task(read()))
+        return process
+
+    reading: list[asyncio.Task[None]] = []
+    sender = await run("nav2_send_navigate_to_pose.py", "-x", "4.0", "-y", "3.0")
+    try:
+        await until(lambda: rig.floor.asked, "the goal has arrived", lambda: "\n".join(said))
+        distance = 2.0
+        while "Distance remaining: 2.0" not in said or "Result: 2" not in said:
+            rig.state("g1", distance=distance)
+            rig.fleet.tell_feedback()
+            await asyncio.sleep(0.1)
+        canceler = await run("nav2_cancel_all_goals.py")
+        await until(lambda: "Return code: 0" in said, "the goal is canceled", lambda: "\n".join(said))
+        await until(lambda: "Result: 5" in said, "who sent the goal knows", lambda: "\n".join(said))
+        await canceler.wait()
+    finally:
+        sender.kill()
+        await sender.wait()
+        await asyncio.gather(*reading)

@@ -1,4 +1,4 @@
-"""The comparison of setups: its draws, its statistics, its files, and a short run of all three setups."""
+"""The comparison of setups: its draws, its statistics, its files, and a short run of all four setups."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ pytestmark = pytest.mark.timeout(900)
 ESTIG = Path(__file__).parents[2] / "sites" / "estig"
 SPEC = ExperimentSpec(routes=[RouteSpec(start="west", goal="east", areas=["z1"])])
 ASKED = Asked(site="ring", site_digest="0" * 16, seed=1)
-SETUPS = ["default", "full", "fog"]
+SETUPS = ["default", "lean", "full", "fog"]
 RUN = next(run for run in range(1, 100) if draw(SPEC, 1, run)[0].moment == "before")
 """The route is so short that an obstacle which appears under way would come too late."""
 
@@ -61,10 +61,11 @@ def test_each_run_can_be_drawn_alone_and_every_area_and_moment_comes():
 
 def test_setups_of_a_route_come_one_after_another_and_meet_the_same():
     asked = runner.tasks(SPEC, 1, [1, 2], SETUPS)
-    assert [task.name for task in asked[:4]] == [
-        "0001-westeast-default", "0001-westeast-full", "0001-westeast-fog", "0002-westeast-default",
+    assert [task.name for task in asked[:5]] == [
+        "0001-westeast-default", "0001-westeast-lean", "0001-westeast-full", "0001-westeast-fog",
+        "0002-westeast-default",
     ]  # fmt: skip
-    assert asked[0].drawn == asked[1].drawn == asked[2].drawn
+    assert asked[0].drawn == asked[1].drawn == asked[2].drawn == asked[3].drawn
 
 
 def test_an_experiment_that_the_site_does_not_fit_is_refused(tmp_path):
@@ -204,15 +205,22 @@ def test_a_run_that_was_killed_goes_on_where_it_was(short_run):
 
 @pytest.mark.drive
 def test_robots_that_the_fog_warns_drive_less_than_one_that_finds_out_by_itself(short_run):
-    default, full, fog = short_run[1]
-    assert all(record.success for record in (default, full, fog)), [record.reason for record in short_run[1]]
-    assert default.paths > 1
-    assert default.distance_m > fog.distance_m + 0.5
+    default, lean, full, fog = short_run[1]
+    assert all(record.success for record in short_run[1]), [record.reason for record in short_run[1]]
+    for alone in (default, lean):
+        assert alone.paths > 1
+        assert alone.distance_m > fog.distance_m + 0.5
     assert full.distance_m == pytest.approx(fog.distance_m, abs=1.0)
 
 
+def test_a_drive_begins_in_every_setup_when_the_robot_is_ready(short_run):
+    moves = [next(at for at, *_ in record.timeline.poses[1:]) for record in short_run[1]]
+    assert max(moves) - min(moves) < 0.6, moves
+
+
 def test_each_setup_computes_what_it_should(short_run):
-    default, full, fog = short_run[1]
+    default, lean, full, fog = short_run[1]
+    assert default.cpu_percent(MOVE_BASE) > lean.cpu_percent(MOVE_BASE), "it plans and controls less often"
     assert "global planning" not in fog.cpu_s
     assert default.cpu_s["global planning"] > full.cpu_s["global planning"] > 0.0
     assert default.cpu_percent(MOVE_BASE) > fog.cpu_percent(MOVE_BASE)
@@ -244,7 +252,7 @@ def test_a_film_finds_in_the_records_what_happened_and_when(short_run):
         assert seen.poses[-1][0] == pytest.approx(record.time_s, abs=1.0)
         assert bool(seen.paths) == (record.setup == "fog")
         blocked = [area for at, area, blocked in seen.areas if blocked and at > 0.0]
-        assert blocked == ([] if record.setup == "default" else ["z1"])
+        assert blocked == ([] if record.setup in ("default", "lean") else ["z1"])
     folder = short_run[0]
     assert [record.setup for record in folder.read_drives(RUN, "westeast", ["fog", "default"])] == ["fog", "default"]
     with pytest.raises(FolderError, match=f"no drive {RUN + 1:04}-westeast-fog: run"):

@@ -64,7 +64,7 @@ def robot_without_fog(folder: Path, truth: str = SETTINGS, **agents: str):
         yield socket
 
 
-def wait_for(condition, expected: str, seconds: float = 30.0):
+def wait_for(condition, expected: str, seconds: float = 60.0):
     until = time.monotonic() + seconds
     while time.monotonic() < until:
         if value := condition():

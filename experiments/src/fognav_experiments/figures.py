@@ -126,10 +126,10 @@ def _flip_test(differences: np.ndarray[tuple[int, ...], np.dtype[np.float64]]) -
 
 
 COLOURS: Final = {
-    "default": "#d9822b", "full": "#3b7dd8", "fog": "#2a9d5c", "lockstep": "#9a9a9a", "live": "#7a4fb5",
-    "hardware": "#444444",
+    "default": "#d9822b", "lean": "#8a6d3b", "full": "#3b7dd8", "fog": "#2a9d5c", "lockstep": "#9a9a9a",
+    "live": "#7a4fb5", "hardware": "#444444",
 }  # fmt: skip
-"""Colours of the setups, of which those of the first two are the thesis's, and of how a drive was made."""
+"""Colours of the setups, of which `default` and `full` are the thesis's, and of how a drive was made."""
 _SAVED: Final = LinearSegmentedColormap.from_list("saved", [COLOURS["default"], "white", COLOURS["fog"]])
 _FLOOR_PX: Final = 1600
 

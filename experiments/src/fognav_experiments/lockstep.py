@@ -287,6 +287,7 @@ class LockstepDrive:
             reply = self.robot.command(command)
             if not reply.accepted:
                 return reply.reason
+        self.state = None  # what it said before it was switched is not how it is now
         return self.warm_up()
 
     def start(self) -> Drive:

@@ -1,7 +1,7 @@
 """Profiles of navigation: what a robot computes itself, and what it gets from the fog.
 
 `fog` is Fognav as it is meant to be used. What it is compared with, from the same code and kernels, comes with
-`fognav-experiments`: `default` is a robot on its own with the usual rates of the ROS navigation stack, `full` the setup
+`fognav-experiments`: `default` is a robot on its own with the thesis's rates, `full` the setup
 of the thesis, on its own too, but with the fog's hazards and the rates that these allow (ADR 26). Their package
 registers them by name among the entry points `fognav.profiles`; `robot_agent.registry` finds them.
 """

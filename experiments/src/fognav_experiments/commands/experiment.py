@@ -20,9 +20,8 @@ from fognav.output import NOT_TRUE, WrongUseError, console, exit_codes, print_js
 if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
 
-    from fog_contracts.messages import ProfileName
     from fog_runtime.configuration.site import LoadedSite
-    from fognav_experiments.comparison.drives import MeasuredDrive, RouteDraw
+    from fognav_experiments.comparison.drives import MeasuredDrive, RouteDraw, Setup
     from fognav_experiments.comparison.live_drive import LiveOptions
     from fognav_experiments.comparison.records import DriveFiles, Folder, Record
     from fognav_experiments.comparison.runner import Task
@@ -40,18 +39,19 @@ def add_to(app: typer.Typer) -> None:
 
 
 _NOT_SWEPT: Final = "none"
-_SETUPS: Final[tuple[ProfileName, ...]] = ("default", "full", "fog")
 
 
 @experiment_app.callback(
     invoke_without_command=True,
-    epilog="Example: fognav experiment --setups default,full,fog --runs 50 --seed 1 --out results",
+    epilog="Example: fognav experiment --setups default,lean,full,fog --runs 50 --seed 1 --out results",
 )
 def experiment_command(  # noqa: PLR0913  # each option is an argument
     context: typer.Context,
     *,
     out: Annotated[Path | None, typer.Option("--out", metavar="DIR", help="Folder of the records.")] = None,
-    setups: Annotated[str, typer.Option("--setups", metavar="A,B", help="default, full, fog.")] = ",".join(_SETUPS),
+    setups: Annotated[
+        str | None, typer.Option("--setups", metavar="A,B", help="default, lean, full, fog; lean only in lockstep.")
+    ] = None,
     runs: Annotated[int, typer.Option("--runs", metavar="N", min=1, help="Runs of each setup.")] = 50,
     seed: Annotated[int, typer.Option("--seed", metavar="N", min=0, help="Seed of all draws.")] = 1,
     only: Annotated[int | None, typer.Option("--only", metavar="RUN", min=1, help="Only this run.")] = None,
@@ -99,7 +99,7 @@ def experiment_command(  # noqa: PLR0913  # each option is an argument
         try:
             loaded = load_site(place)
             spec, numbers = runner.read_spec(loaded, place), [only] if only else range(1, runs + 1)
-            asked = runner.tasks(spec, seed, numbers, _chosen(setups))
+            asked = runner.tasks(spec, seed, numbers, _setups(setups, lockstep=not live and not hardware))
             runner.check_barriers(loaded, [] if hardware else asked)  # a person finds a place
             folder, commit = Folder(out), checkout.revision()
             begun = runner.new(loaded, place, seed)
@@ -265,7 +265,7 @@ def film_command(
     ],
     run: Annotated[int, typer.Option("--run", metavar="N", min=1, help="Run of the experiment.")] = 2,
     route: Annotated[str | None, typer.Option("--route", metavar="R", help="Its route, as ab; default: first.")] = None,
-    setups: Annotated[str, typer.Option("--setups", metavar="A,B", help="default, full, fog.")] = "default,fog",
+    setups: Annotated[str, typer.Option("--setups", metavar="A,B", help="default, lean, full, fog.")] = "default,fog",
     site: Annotated[Path | None, typer.Option("--site", metavar="DIR", help="Site with experiment.toml.")] = None,
 ) -> None:
     """Film one route of an experiment in several setups, side by side: map, hazards, paths and tracks, as a GIF.
@@ -392,10 +392,20 @@ def _scenario_files(names: list[str]) -> list[Path]:
     return [known[name] for name in names or known]
 
 
-def _chosen(setups: str) -> list[ProfileName]:
-    chosen = [known for name in setups.split(",") for known in _SETUPS if known == name.strip()]
+def _setups(setups: str | None, *, lockstep: bool) -> list[Setup]:
+    """Return the setups to drive; real nodes can't be switched off, so `lean` is driven in lockstep only."""
+    chosen = _chosen(setups or ("default,lean,full,fog" if lockstep else "default,full,fog"))
+    if "lean" in chosen and not lockstep:
+        raise WrongUseError("--setups lean is driven in lockstep only: leave out --live and --hardware, or lean")
+    return chosen
+
+
+def _chosen(setups: str) -> list[Setup]:
+    from fognav_experiments.comparison.drives import PROFILE_OF_SETUP  # noqa: PLC0415  # keeps the other commands fast
+
+    chosen = [known for name in setups.split(",") for known in PROFILE_OF_SETUP if known == name.strip()]
     if len(chosen) != len(setups.split(",")):
-        raise WrongUseError(f"--setups {setups} names an unknown setup: choose of {', '.join(_SETUPS)}")
+        raise WrongUseError(f"--setups {setups} names an unknown setup: choose of {', '.join(PROFILE_OF_SETUP)}")
     return chosen
 
 

@@ -17,7 +17,7 @@ from fog_contracts import channels as ch
 from fog_contracts.messages import (
     Id,  # read at run time, when a file is decoded
     Pose,
-    ProfileName,  # read at run time, when a file is decoded
+    ProfileName,
     SimTruth,
 )
 from fognav_sim.drive.drive import Drive, DriveOutcome
@@ -38,6 +38,11 @@ UNDER_WAY_M: Final = (3.0, 25.0)
 """Range of the distance that the robot has driven when the obstacle appears, in the runs in which it does so late."""
 
 When = Literal["before", "under way"]
+Setup = Literal["default", "lean", "full", "fog"]
+PROFILE_OF_SETUP: Final[dict[Setup, ProfileName]] = {"default": "default", "lean": "full", "full": "full", "fog": "fog"}
+"""Setups, and the profile by which the robot drives in each."""
+ALONE: Final[frozenset[Setup]] = frozenset({"default", "lean"})
+"""Setups in which no sensor node tells the robot of an obstacle; `lean` has the rates of `full`."""
 
 
 class RouteSpec(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
@@ -109,7 +114,7 @@ class DrivenRoute(msgspec.Struct, frozen=True, kw_only=True):
     one that the folder was begun with.
     """
 
-    setup: ProfileName
+    setup: Setup
     run: int
     route: str
     seed: int
@@ -141,7 +146,7 @@ class ComparedDrive(DrivenRoute, frozen=True, kw_only=True):
     load: float = 0.0
 
 
-def facts(kind: type[ComparedDrive], drawn: RouteDraw, setup: ProfileName, summary: DriveSummary) -> dict[str, Any]:
+def facts(kind: type[ComparedDrive], drawn: RouteDraw, setup: Setup, summary: DriveSummary) -> dict[str, Any]:
     """Return the fields of a record of this `kind` that the draw and a drive's summary tell."""
     told = {name: getattr(summary, name) for name in kind.__struct_fields__ if name in summary.__struct_fields__}
     of_draw = {name: getattr(drawn, name) for name in ("run", "seed", "area", "moment", "trigger_m")}
@@ -222,7 +227,7 @@ class Timeline(msgspec.Struct, frozen=True, kw_only=True):
 class TimelineRecorder:
     """Listens to a drive's bus."""
 
-    def __init__(self, bus: Bus, setup: ProfileName) -> None:
+    def __init__(self, bus: Bus, setup: Setup) -> None:
         self._poses: list[tuple[float, float, float]] = []
         self._paths: list[tuple[float, list[tuple[float, float]]]] = []
         self._areas: list[tuple[float, str, bool]] = []
@@ -298,7 +303,7 @@ class GuidedDrive:
         self,
         site: SiteWithMap,
         drawn: RouteDraw,
-        setup: ProfileName,
+        setup: Setup,
         *,
         goal_id: str,
         pose: RobotPose,

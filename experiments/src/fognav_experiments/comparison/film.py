@@ -9,15 +9,16 @@ from typing import TYPE_CHECKING, Final, NamedTuple
 from PIL import Image, ImageDraw, ImageFont
 
 from fog_contracts.costs import FREE, LETHAL
+from fognav_experiments.comparison.drives import ALONE
 from fognav_sim.barrier import barrier_across
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
     from pathlib import Path
 
-    from fog_contracts.messages import PointXY, ProfileName
+    from fog_contracts.messages import PointXY
     from fog_runtime.configuration.site import LoadedSite
-    from fognav_experiments.comparison.drives import RouteDraw, Timeline
+    from fognav_experiments.comparison.drives import RouteDraw, Setup, Timeline
     from fognav_experiments.comparison.records import Record
 
 FRAME_S: Final = 4.0
@@ -27,8 +28,9 @@ SHOWN_S: Final = 0.1
 _LAST_S: Final = 4.0
 _WIDTH_PX: Final = 480
 _TITLE_PX: Final = 34
-_WORDS: Final[dict[ProfileName, str]] = {
+_WORDS: Final[dict[Setup, str]] = {
     "default": "on its own: it finds the obstacle by its lidar",
+    "lean": "on its own, at the rates of full",
     "full": "told of the obstacle, it plans itself",
     "fog": "Fognav: a sensor on the wall saw the obstacle",
 }
@@ -38,7 +40,7 @@ _PALETTE: Final = (
 )  # fmt: skip
 """White, walls, unknown, tracks of the setups, obstacle, blocked area, places."""
 _WHITE, _WALL, _UNKNOWN, _DEFAULT, _FOG, _FULL, _RED, _PINK, _GREY = range(len(_PALETTE))
-_COLOUR: Final[dict[ProfileName, int]] = {"default": _DEFAULT, "full": _FULL, "fog": _FOG}
+_COLOUR: Final[dict[Setup, int]] = {"default": _DEFAULT, "lean": _DEFAULT, "full": _FULL, "fog": _FOG}
 
 
 class UnfilmedDriveError(ValueError):
@@ -120,7 +122,7 @@ class Film:
         panel, seen = self._floor.copy(), drive.timeline
         draw = ImageDraw.Draw(panel)
         state = {area: blocked for at, area, blocked in seen.areas if at <= time_s}
-        if drive.record.setup != "default":
+        if drive.record.setup not in ALONE:
             for area in (name for name, blocked in state.items() if blocked):
                 draw.polygon([self._pixel(point) for point in self._areas[area].polygon], fill=_PINK)
         if seen.barrier_at is not None and time_s >= seen.barrier_at:

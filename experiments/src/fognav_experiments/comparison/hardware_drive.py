@@ -16,7 +16,7 @@ from fognav.operate.fog import RefusedError
 from fognav.operate.robot_commands import connect
 from fognav.output import FailedError, WrongUseError
 from fognav.programs import PLANNER
-from fognav_experiments.comparison.drives import GuidedDrive, stands_at, start_of, where_to_place
+from fognav_experiments.comparison.drives import PROFILE_OF_SETUP, GuidedDrive, stands_at, start_of, where_to_place
 from fognav_sim.drive.drive import DriveOutcome
 from fognav_sim.drive.hazard import HazardRequest, HazardSchedule
 
@@ -191,7 +191,7 @@ class HardwareRun:
             await self._bring_to_start(start_of(self._site, drawn), drawn.route.start)
             if drawn.moment == "before":
                 await self._ask(f"Block {where_to_place(planned)}.")
-            await self._make_ready(task.setup)
+            await self._make_ready(PROFILE_OF_SETUP[task.setup])
             goal_id = await self._robot.set_goal(drawn.route.goal)
             pose = self._robot.pose
             assert pose is not None

@@ -212,6 +212,7 @@ def allowed_savings(drives: Sequence[tuple[Saving, float, float]]) -> list[Block
 
 def computation(  # the same shares in each setup, and what real processes took
     default: Mapping[str, float],
+    lean: Mapping[str, float] | None,
     full: Mapping[str, float] | None,
     fog: Mapping[str, float],
     robot: tuple[float, float],
@@ -219,7 +220,7 @@ def computation(  # the same shares in each setup, and what real processes took
 ) -> Block:
     """Return why the ratio of computation is what it is, and what of it the fog does.
 
-    default, full, fog: mean share of a core (%) by component of what move_base held; full: None without such drives.
+    default, lean, full, fog: mean share of a core (%) by component of what move_base held; None without such drives.
     robot: that of the whole robot in `default` and `fog`; live: that of its real processes, None if nobody measured it.
     """
     before, after = sum(default.values()), sum(fog.values())
@@ -230,12 +231,21 @@ def computation(  # the same shares in each setup, and what real processes took
     if full is not None:
         between = sum(full.values())
         rates = (
-            f"most of it is not the fog's work: `default` plans and controls at the usual rates of the ROS navigation "
-            f"stack, `full` and `fog` at lower ones. `full`, which plans for itself at the rates of `fog`, takes "
+            f"most of it is not the fog's work: `default` plans and controls at the thesis's rates, "
+            f"`lean`, `full` and `fog` at lower ones. `full`, which plans for itself at the rates of `fog`, takes "
             f"{before / between:.1f} times less than `default`, and `fog` {between / after:.1f} times less than "
-            "`full`. A robot at these rates that knows of no obstacle before it sees it, which would tell the fog's "
-            "share apart, has not been driven yet. Here "
+            "`full`. "
         )
+        if lean is None:
+            rates += (
+                "A robot at these rates that knows of no obstacle before it sees it has not been driven here. Here "
+            )
+        else:
+            alone = sum(lean.values())
+            rates += (
+                f"`lean`, at these rates but without any sensor node, tells both apart: {before / alone:.1f} times "
+                f"less than `default` by its rates, and `fog` {alone / after:.1f} times less than `lean` by the fog. "
+            )
     processes = (
         "lockstep leaves out the input and output of its processes, which are the same in all setups"
         if live is None

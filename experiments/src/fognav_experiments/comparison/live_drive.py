@@ -13,7 +13,6 @@ from typing import Any, Final
 
 import msgspec
 
-from fog_contracts.messages import ProfileName
 from fog_contracts.site import DemoPlan, Site
 from fog_runtime import logs
 from fog_runtime.configuration.maps import save_map
@@ -24,7 +23,15 @@ from fognav.demo.options import Options
 from fognav.demo.run import Demo
 from fognav.output import FailedError
 from fognav_experiments.bench.robot import NORMAL_PRIORITY, cpu_quota
-from fognav_experiments.comparison.drives import MeasuredDrive, RouteDraw, drive_name, facts, start_of
+from fognav_experiments.comparison.drives import (
+    PROFILE_OF_SETUP,
+    MeasuredDrive,
+    RouteDraw,
+    Setup,
+    drive_name,
+    facts,
+    start_of,
+)
 from fognav_experiments.comparison.records import DriveFiles
 from fognav_experiments.comparison.runner import Task
 from fognav_sim.drive.hazard import HazardRequest
@@ -67,7 +74,7 @@ def live_drives(
 
 
 def drive_live(
-    site: LoadedSite, drawn: RouteDraw, setup: ProfileName, options: LiveOptions, on_event: Callable[[str], None]
+    site: LoadedSite, drawn: RouteDraw, setup: Setup, options: LiveOptions, on_event: Callable[[str], None]
 ) -> MeasuredDrive:
     """Drive a drawn route in a setup by real processes; blocks until all of them have ended.
 
@@ -84,7 +91,7 @@ def drive_live(
         asked = Options(
             seed=drawn.seed,
             speed=options.speed,
-            profile=setup,
+            profile=PROFILE_OF_SETUP[setup],
             request=HazardRequest(area=drawn.area, trigger_m=drawn.trigger_m),
             settings=settings,
             on_robot_start=on_robot,
@@ -153,7 +160,7 @@ def _signals(stop: asyncio.Event) -> Iterator[None]:
 
 
 def _record(
-    demo: Demo, report: Mapping[str, Any], drawn: RouteDraw, setup: ProfileName, options: LiveOptions
+    demo: Demo, report: Mapping[str, Any], drawn: RouteDraw, setup: Setup, options: LiveOptions
 ) -> MeasuredDrive:
     summary, processes, speed = demo.attempt.summary(), report["processes"], demo.scene.speed
     return MeasuredDrive(

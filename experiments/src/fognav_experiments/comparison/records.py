@@ -21,8 +21,7 @@ if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator, Mapping, Sequence
     from pathlib import Path
 
-    from fog_contracts.messages import ProfileName
-    from fognav_experiments.comparison.drives import Kind
+    from fognav_experiments.comparison.drives import Kind, Setup
 
 
 LOCKSTEP: Final = "drives"
@@ -33,8 +32,9 @@ ON_ROBOT: Final = (*MOVE_BASE, "localization", "safety and wheels", "messages", 
 ALIKE: Final = ("localization", "safety and wheels", "lidar driver", "guardian")
 """Components of a robot that do the same work in every setup."""
 ON_FOG: Final = ("aggregator", "map-service", "planner")
-OF_FOG: Final[dict[ProfileName, tuple[str, ...]]] = {
+OF_FOG: Final[dict[Setup, tuple[str, ...]]] = {
     "default": (),
+    "lean": (),
     "full": ("aggregator", "map-service"),
     "fog": ON_FOG,
 }
@@ -46,7 +46,8 @@ class Record(ComparedDrive, frozen=True, kw_only=True):
 
     `barrier_distance_m`: smallest distance between the obstacle and the robot's rim. `reaction_s`: from the obstacle's
     first reading to the first wheel command on a new path, where there was one. `jobs`: drives that this machine ran at
-    the same time. `timeline`: what a film shows.
+    the same time. `timeline`: what a film shows. `ready`: the robot was ready in its setup when the drive began; before
+    that was waited for, `default` and `full` began 2 s late.
     """
 
     planned_m: float
@@ -61,6 +62,7 @@ class Record(ComparedDrive, frozen=True, kw_only=True):
     wall_s: float
     track: list[tuple[float, float]] = msgspec.field(default_factory=list)
     timeline: Timeline | None = None
+    ready: bool | msgspec.UnsetType = msgspec.UNSET
 
     @property
     def name(self) -> str:
@@ -225,7 +227,7 @@ def _add(files: DriveFiles[N], others: DriveFiles[N]) -> int:
 
 def write_csv(path: Path, records: Sequence[Record]) -> None:
     """Write one row per drive; CPU as s by component, and as % of a core for what `move_base` held and in all."""
-    left_out = {"cpu_s", "track", "modes", "timeline"}
+    left_out = {"cpu_s", "track", "modes", "timeline", "ready"}
     fields = [field for field in Record.__struct_fields__ if field not in left_out]
     shares = {"move_base": MOVE_BASE, "robot": ON_ROBOT}
     header = [

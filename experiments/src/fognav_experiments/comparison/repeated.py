@@ -10,14 +10,13 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Final, NamedTuple
 
 from fognav_experiments import figures
-from fognav_experiments.comparison.drives import KINDS, ROBOTS_PROCESSES, route_ends
+from fognav_experiments.comparison.drives import KINDS, PROFILE_OF_SETUP, ROBOTS_PROCESSES, route_ends
 from fognav_experiments.figures import Block, Estimate, Heading, Paragraph, Picture, Table, estimate
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
 
-    from fog_contracts.messages import ProfileName
-    from fognav_experiments.comparison.drives import Kind, MeasuredDrive
+    from fognav_experiments.comparison.drives import Kind, MeasuredDrive, Setup
     from fognav_experiments.comparison.records import Record
 
 
@@ -195,7 +194,7 @@ def _listed(names: Sequence[str]) -> str:
     return ", ".join(names) or "none"
 
 
-SETUPS: Final[tuple[ProfileName, ...]] = ("default", "full", "fog")
+SETUPS: Final[tuple[Setup, ...]] = tuple(PROFILE_OF_SETUP)
 MEMORY_FILE: Final = "memory.svg"
 _MEMORY_UNKNOWN: Final = "only by real processes (fognav experiment --live): lockstep runs all setups in one"
 _REALITY_UNKNOWN: Final = "only by real processes (fognav experiment --live or --hardware)"

@@ -47,16 +47,17 @@ if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
     from pathlib import Path
 
-    from fog_contracts.messages import ProfileName
     from fog_contracts.site import Site
     from fog_runtime.configuration.site import LoadedSite
-    from fognav_experiments.comparison.drives import MeasuredDrive
+    from fognav_experiments.comparison.drives import MeasuredDrive, Setup
     from fognav_experiments.comparison.limits import Saving
     from fognav_experiments.comparison.records import Folder, Record
 
 
 TITLE: Final = "What the fog saves a robot: the thesis's experiment, repeated"
-PAIRS: Final[tuple[tuple[ProfileName, ProfileName], ...]] = (("default", "full"), ("default", "fog"), ("full", "fog"))
+PAIRS: Final[tuple[tuple[Setup, Setup], ...]] = (
+    ("default", "lean"), ("default", "full"), ("default", "fog"), ("lean", "full"), ("lean", "fog"), ("full", "fog"),
+)  # fmt: skip
 
 
 def build(
@@ -179,7 +180,7 @@ def _cost(measured: Sequence[MeasuredDrive]) -> list[Block]:
     return [Heading("What the robot's processes cost"), *cost] if cost else []
 
 
-def _routes(pairs: Sequence[Drives], setups: Sequence[ProfileName]) -> list[Block]:
+def _routes(pairs: Sequence[Drives], setups: Sequence[Setup]) -> list[Block]:
     routes = sorted({drives[setups[0]].route for drives in pairs})
     blocks: list[Block] = []
     for quantity in QUANTITIES:
@@ -201,7 +202,7 @@ def _routes(pairs: Sequence[Drives], setups: Sequence[ProfileName]) -> list[Bloc
     return blocks
 
 
-def _differences(pairs: Sequence[Drives], met: Sequence[Drives], setups: Sequence[ProfileName]) -> list[Block]:
+def _differences(pairs: Sequence[Drives], met: Sequence[Drives], setups: Sequence[Setup]) -> list[Block]:
     rows = []
     for before, after in PAIRS:
         if before not in setups or after not in setups:
@@ -228,9 +229,7 @@ def _differences(pairs: Sequence[Drives], met: Sequence[Drives], setups: Sequenc
     ]
 
 
-def _components(
-    pairs: Sequence[Drives], setups: Sequence[ProfileName], measured: Sequence[MeasuredDrive]
-) -> list[Block]:
+def _components(pairs: Sequence[Drives], setups: Sequence[Setup], measured: Sequence[MeasuredDrive]) -> list[Block]:
     rows = []
     for component in (*ON_ROBOT, *ON_FOG):
         cells = []
@@ -256,19 +255,21 @@ def _components(
         *limits.error([[drives[setup].cpu_percent(ALIKE) for setup in setups] for drives in pairs], setups),
     ]
     if "default" in setups and "fog" in setups:
-        default, full, fog = (
+        default, lean, full, fog = (
             {name: _share(pairs, setup, [name]) for name in MOVE_BASE} if setup in setups else {} for setup in SETUPS
         )
         whole = _share(pairs, "default", ON_ROBOT), _share(pairs, "fog", ON_ROBOT)
-        blocks.append(limits.computation(default, full or None, fog, whole, repeated.of_processes(measured)))
+        blocks.append(
+            limits.computation(default, lean or None, full or None, fog, whole, repeated.of_processes(measured))
+        )
     return blocks
 
 
-def _share(pairs: Sequence[Drives], setup: ProfileName, components: Sequence[str]) -> float:
+def _share(pairs: Sequence[Drives], setup: Setup, components: Sequence[str]) -> float:
     return estimate([drives[setup].cpu_percent(components) for drives in pairs]).mean
 
 
-def _tracks(pairs: Sequence[Drives], setups: Sequence[ProfileName], site: Site | None) -> list[Block]:
+def _tracks(pairs: Sequence[Drives], setups: Sequence[Setup], site: Site | None) -> list[Block]:
     first, last = setups[0], setups[-1]
     drives = max(pairs, key=lambda drives: drives[first].distance_m - drives[last].distance_m)
     record = drives[first]

@@ -15,7 +15,16 @@ import msgspec
 from fog_contracts.bus import Bus
 from fog_contracts.stages import TOTAL
 from fog_runtime.configuration.site import load_site
-from fognav_experiments.comparison.drives import ExperimentSpec, TimelineRecorder, draw, drive_name, facts, start_of
+from fognav_experiments.comparison.drives import (
+    ALONE,
+    PROFILE_OF_SETUP,
+    ExperimentSpec,
+    TimelineRecorder,
+    draw,
+    drive_name,
+    facts,
+    start_of,
+)
 from fognav_experiments.comparison.limits import RouteGeometry
 from fognav_experiments.comparison.records import Asked, Folder, FolderError, Record
 from fognav_experiments.lockstep import release_drives, run_lockstep
@@ -27,12 +36,11 @@ if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
     from pathlib import Path
 
-    from fog_contracts.messages import ProfileName
     from fog_runtime.configuration.site import LoadedSite
-    from fognav_experiments.comparison.drives import RouteDraw
+    from fognav_experiments.comparison.drives import RouteDraw, Setup
 
 
-def drive(site: LoadedSite, drawn: RouteDraw, setup: ProfileName, jobs: int = 1, commit: str = "") -> Record:
+def drive(site: LoadedSite, drawn: RouteDraw, setup: Setup, jobs: int = 1, commit: str = "") -> Record:
     """Drive a drawn route in a setup; the same but for CPU and wall time whenever it is repeated.
 
     `jobs` (drives that run at the same time on this machine) and `commit` are only recorded. Raises `BarrierError` for
@@ -47,8 +55,8 @@ def drive(site: LoadedSite, drawn: RouteDraw, setup: ProfileName, jobs: int = 1,
         site.site.places[drawn.route.goal],
         drawn.seed,
         HazardRequest(area=drawn.area, trigger_m=drawn.trigger_m),
-        watched=setup != "default",
-        profile=setup,
+        watched=setup not in ALONE,
+        profile=PROFILE_OF_SETUP[setup],
         cpu=cpu,
         bus=bus,
     )
@@ -59,6 +67,7 @@ def drive(site: LoadedSite, drawn: RouteDraw, setup: ProfileName, jobs: int = 1,
         | {
             "reaction_s": None if total is None else total / 1000.0,
             "cpu_s": {name: round(seconds, 4) for name, seconds in sorted(cpu.seconds.items())},
+            "ready": True,
             "jobs": jobs,
             "load": round(os.getloadavg()[0], 2),
             "wall_s": round(time.perf_counter() - begun, 1),
@@ -82,7 +91,7 @@ class Task(NamedTuple):
     """A drive to run."""
 
     drawn: RouteDraw
-    setup: ProfileName
+    setup: Setup
 
     @property
     def name(self) -> str:
@@ -113,7 +122,7 @@ def site_digest(folder: Path) -> str:
     return digest.hexdigest()[:16]
 
 
-def tasks(spec: ExperimentSpec, seed: int, runs: Sequence[int], setups: Sequence[ProfileName]) -> list[Task]:
+def tasks(spec: ExperimentSpec, seed: int, runs: Sequence[int], setups: Sequence[Setup]) -> list[Task]:
     """Return the drives of these runs, all setups of a route one after another: what is there is always comparable."""
     return [Task(drawn, setup) for run in runs for drawn in draw(spec, seed, run) for setup in setups]
 

@@ -17,7 +17,7 @@ import msgspec
 
 from fog_contracts.messages import NodeConfig
 from fog_runtime.files import SHARED, atomic_write
-from fognav_experiments.comparison.drives import DrivenRoute, start_of
+from fognav_experiments.comparison.drives import ALONE, PROFILE_OF_SETUP, DrivenRoute, start_of
 from fognav_experiments.figures import (
     Block,
     Code,
@@ -40,10 +40,9 @@ if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator, Mapping, Sequence
     from pathlib import Path
 
-    from fog_contracts.messages import ProfileName
     from fog_contracts.site import Site
     from fog_runtime.configuration.site import LoadedSite
-    from fognav_experiments.comparison.drives import RouteDraw
+    from fognav_experiments.comparison.drives import RouteDraw, Setup
     from fognav_experiments.comparison.records import DriveFiles
 
 
@@ -123,7 +122,7 @@ class SweepTask(NamedTuple):
     """A drive to run."""
 
     drawn: RouteDraw
-    setup: ProfileName
+    setup: Setup
     variation: Variation
 
     @property
@@ -204,8 +203,8 @@ def swept_drive(site: LoadedSite, commit: str, task: SweepTask) -> SweptDrive:
         site.site.places[drawn.route.goal],
         drawn.seed,
         HazardRequest(area=drawn.area, trigger_m=drawn.trigger_m),
-        watched=varied_site(site.site, variation, drawn.seed) if task.setup != "default" else False,
-        profile=task.setup,
+        watched=varied_site(site.site, variation, drawn.seed) if task.setup not in ALONE else False,
+        profile=PROFILE_OF_SETUP[task.setup],
         tuning=Tuning(pause_ms=variation.pause_ms, speed_m_s=variation.speed_m_s),
     )
     release_drives()

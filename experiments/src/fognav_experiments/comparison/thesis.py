@@ -16,8 +16,7 @@ from fognav_experiments.figures import Block, Estimate, Paragraph, Table, compar
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
 
-    from fog_contracts.messages import ProfileName
-    from fognav_experiments.comparison.drives import MeasuredDrive
+    from fognav_experiments.comparison.drives import MeasuredDrive, Setup
     from fognav_experiments.comparison.records import Record
 
 
@@ -80,7 +79,7 @@ PLACES: Final = (
 """The thesis's figures of chapter 6: what each shows, and where a report has the same."""
 
 
-Drives = dict["ProfileName", "Record"]
+Drives = dict["Setup", "Record"]
 
 
 class Quantity(NamedTuple):
@@ -141,7 +140,7 @@ def paired(records: Sequence[Record]) -> list[Drives]:
 def beside_thesis(
     pairs: Sequence[Drives],
     met: Sequence[Drives],
-    setups: Sequence[ProfileName],
+    setups: Sequence[Setup],
     measured: Sequence[MeasuredDrive],
     records: Sequence[Record],
 ) -> list[Block]:
@@ -152,9 +151,11 @@ def beside_thesis(
     if "default" in shares and "fog" in shares:
         whole = [_mean(pairs, setup, QUANTITIES[3]).mean for setup in ("default", "fog")]
         ours["6.5, 6.9"] += f": default / fog = {shares['default'].mean / shares['fog'].mean:.1f}"
-        if "full" in shares:
-            lower_rates = shares["default"].mean / shares["full"].mean
-            ours["6.5, 6.9"] += f", of which default / full, by lower rates above all, {lower_rates:.1f}"
+        for other in ("lean", "full"):
+            if other in shares:
+                lower_rates = shares["default"].mean / shares[other].mean
+                above_all = " above all" * (other == "full")
+                ours["6.5, 6.9"] += f", of which default / {other}, by lower rates{above_all}, {lower_rates:.1f}"
         ours["6.5, 6.9"] += f"; whole robot {whole[0]:.2f} % and {whole[1]:.2f} %: {whole[0] / whole[1]:.1f}"
         if (live := repeated.of_processes(measured)) is not None:
             ours["6.5, 6.9"] += f"; its real processes {live[0]:.2f} % and {live[1]:.2f} %: {live[0] / live[1]:.2f}"
@@ -176,17 +177,26 @@ def beside_thesis(
             f"{len(pairs)} drives here. The floor is another one, made in the manner of the thesis's. Its "
             f"figures 6.11 and 6.12 compare simulation and reality, {_reality(measured, records)}."
         ),
-        Paragraph(
-            "Times of `default` and `full`, and what `fog` saves of them, are about 2 s too large: in lockstep a robot "
-            "that plans for itself begins to drive that much after the start, for it has only just changed its setup. "
-            "Real processes wait for it first."
-        ),
+        *late(pairs),
         Paragraph(
             "The time from an echo to a wheel command is not comparable with the thesis's 3 s: lockstep has the "
             "waiting times (of measuring, debouncing and control), but no radio, no brokers and no time of "
             "computation, all of which the thesis's robot had. `fognav demo --report FILE` measures it over real "
             "processes."
         ),
+    ]
+
+
+def late(pairs: Sequence[Drives]) -> list[Block]:
+    """Return what is wrong with the times of drives that were recorded before a drive waited for a switched robot."""
+    if all(record.ready is True for drives in pairs for record in drives.values()):
+        return []
+    return [
+        Paragraph(
+            "Times of `default` and `full`, and what `fog` saves of them, are about 2 s too large: in lockstep a robot "
+            "that plans for itself began to drive that much after the start, for it had only just changed its setup. "
+            "Real processes wait for it first, as lockstep does since."
+        )
     ]
 
 
@@ -238,5 +248,5 @@ def places(measured: Sequence[MeasuredDrive], records: Sequence[Record]) -> list
     return [Table(["figure", "shows", "here"], rows), Paragraph(words)]
 
 
-def _mean(pairs: Sequence[Drives], setup: ProfileName, quantity: Quantity) -> Estimate:
+def _mean(pairs: Sequence[Drives], setup: Setup, quantity: Quantity) -> Estimate:
     return estimate([quantity.value(drives[setup]) for drives in pairs])

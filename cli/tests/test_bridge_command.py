@@ -30,6 +30,7 @@ def checked(tmp_path, text: str, *command: str) -> tuple[int, str]:
         ('adapters = "ros2"\nros2_router = "here"', "here can't be used to reach ROS's router"),
         ('adapters = "vda5050"', "vda5050_mqtt_url names the fleet control's broker"),
         (FLEET, "names who takes part"),
+        (FLEET + 'vda5050_robots = "r1, +"', "'+' is no robot's id"),
         (FLEET + 'vda5050_zones = "kit"', "'kit' is not MANUFACTURER/SERIAL"),
         (FLEET + 'vda5050_robots = "r1"\nvda5050_credentials_file = "ha.toml"', "vda5050_unencrypted = true"),
         ('adapters = "home-assistant"\nurl = "x"', "unknown setting 'url'"),

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 import msgspec
 import pytest
 from secured_servers import TESTER, SecuredSite
-from vda5050_floor import STATE, VERSIONS, A, B, C, Floorplan, area, driving, header, order, schema
+from vda5050_floor import SETUP, STATE, VERSIONS, A, B, C, Floorplan, area, driving, header, order, schema
 
 from fog_bridges.floor import Answer, Request
 from fog_bridges.vda5050 import telling
@@ -39,9 +39,7 @@ def test_all_that_is_told_fits_the_published_schemas(version):
     floor = driving()
     schema(version, "state").validate(floor.said(version))
     schema(version, "state").validate(Floorplan().said(version))
-    setup = Setup(site="lab", broker=Broker.of("mqtt://localhost"), version=version, interface="vda5050",
-                  manufacturer="fognav", map_id="lab", robots=["r1"], zones=[])  # fmt: skip
-    sender = Sender(setup, version, "fognav", "r1")
+    sender = Sender(SETUP, version, "fognav", "r1")
     told = [
         ("factsheet", telling.factsheet(floor.robot, version)),
         ("visualization", telling.visualization(floor.robot, 3, 1.7e9)),

@@ -2,10 +2,16 @@
 
 from __future__ import annotations
 
-import pytest
-from vda5050_floor import STATE, A, B, C, Floorplan, instant, node, order, read
+import asyncio
+import json
 
-from fog_bridges.floor import Answer
+import msgspec
+import pytest
+from manual_clock import ManualClock
+from vda5050_floor import SETUP, STATE, A, B, C, Floorplan, instant, node, order, read
+
+from fog_bridges.floor import Answer, Request
+from fog_bridges.vda5050.bridge import RobotLink
 from fog_bridges.vda5050.robot import REFUSED_S
 
 # --- Orders -----------------------------------------------------------------------------------------------------------
@@ -135,7 +141,8 @@ def test_mission_that_may_have_been_accepted_is_asked_for_again_by_the_same_key(
     ("mode", "state", "view"),
     [
         ("MANUAL", {"enabled": False, "mode": "HOLD"}, {}), ("MANUAL", {"awaits_operator": True, "mode": "FAULT"}, {}),
-        ("MANUAL", {"mode": "TELEOP"}, {}), ("MANUAL", {"wants_dock": True}, {}), ("STARTUP", {"mode": "INIT"}, {}),
+        ("MANUAL", {"mode": "TELEOP"}, {}), ("MANUAL", {"wants_dock": True}, {}),
+        ("MANUAL", {"docked": True}, {}), ("STARTUP", {"mode": "INIT"}, {}),
         ("SERVICE", {}, {"out_of_service": {"reason": "repair"}}), ("MANUAL", {}, {"goal": {"goal_id": "theirs"}}),
         ("MANUAL", {}, {"goal": None}),
     ],
@@ -223,3 +230,30 @@ def test_requests_are_answered_and_unknown_actions_fail():
     for n in range(100):
         floor.robot.on_instant(instant("stateRequest", f"s{n}"), floor.now)
     assert (len(actions(floor)), floor.errors()) == (50, {})
+
+
+@pytest.mark.parametrize("word", ["operator", "cancel"])
+async def test_order_whose_nodes_are_being_looked_for_gives_way_to_a_cancel_and_to_an_operator(word):
+    floor = Floorplan()
+
+    class Slow:
+        async def ask(self, _: Request) -> Answer:
+            if word == "cancel":
+                link.on_message("x/instantActions", msgspec.json.encode(instant("cancelOrder")))
+            else:
+                floor.tell(enabled=False)
+            return Answer("", body={"path": {"refusal": None}})
+
+    link = RobotLink(SETUP, "r1", Slow(), ManualClock())
+    link.core = floor.robot
+    link.on_message("x/order", json.dumps(order(A, B)).encode())
+    taking = asyncio.create_task(link.order_loop())
+    await asyncio.sleep(0)
+    await asyncio.sleep(0)
+    taking.cancel()
+    await asyncio.gather(taking, return_exceptions=True)
+    assert (floor.said()["orderId"], floor.drive()) == ("", [])
+    if word == "cancel":
+        assert actions(floor) == {"a1": "FINISHED"}
+    else:
+        assert floor.errors() == {"MOBILE_ROBOT_NOT_AVAILABLE": "WARNING"}

@@ -21,8 +21,8 @@ from fog_runtime.transports.mqtt_connection import Broker
 
 SCHEMAS = os.environ.get("FOGNAV_VDA5050_SCHEMAS", "")
 """A checkout of VDA5050/VDA5050 with the schemas of 3.0 (its branch main: the tag 3.0.0 has no valid JSON), and in its
-`2.1.0` one of the tag 2.1.0."""
-VERSIONS = ("3.0", "2.1")
+`2.1.0` and `2.0.0` those of these tags."""
+VERSIONS = ("3.0", "2.1", "2.0")
 
 
 @cache
@@ -30,9 +30,9 @@ def schema(version: str, topic: str) -> jsonschema_rs.Validator:
     """Return the published schema of a topic."""
     if not SCHEMAS:
         pytest.skip("needs the schemas: git clone github.com/VDA5050/VDA5050 V, FOGNAV_VDA5050_SCHEMAS=V "
-                    "(for 2.1 the tag 2.1.0 in V/2.1.0)")  # fmt: skip
-    folder = Path(SCHEMAS) / ("json_schemas" if version == "3.0" else "2.1.0/json_schemas")
-    return jsonschema_rs.validator_for(json.loads((folder / f"{topic}.schema").read_text("utf-8")))
+                    "(for 2.1 and 2.0 the tags 2.1.0 and 2.0.0 in V/2.1.0 and V/2.0.0)")  # fmt: skip
+    folder = Path(SCHEMAS) / ("" if version == "3.0" else RELEASES[version]) / "json_schemas"
+    return jsonschema_rs.validator_for(json.loads(next(folder.glob(f"{topic}.*")).read_text("utf-8")))
 
 
 def header(version: str = "3.0") -> dict[str, Any]:
@@ -71,6 +71,10 @@ def instant(kind: str, name: str = "a1", **parameters: Any) -> InstantActions:
     return read(header() | {"actions": [action]}, "instantActions")
 
 
+SETUP = Setup(
+    site="lab", broker=Broker.of("mqtt://localhost"), version="3.0", interface="vda5050", manufacturer="fognav",
+    map_id="lab", robots=["r1"], zones=[],
+)  # fmt: skip
 STATE = {"mode": "NORMAL", "enabled": True, "reasons": [], "codes": [], "battery": 0.5, "goal_id": None,
          "goal_reached": False, "awaits_operator": False, "wants_dock": False, "power": {"charging": "no"}}  # fmt: skip
 
@@ -139,9 +143,7 @@ class Floorplan:
     def said(self, version: str = "3.0") -> dict[str, Any]:
         """Return the robot's state as it is published."""
         state = telling.state(self.robot, self.now, 1.7e9)
-        setup = Setup(site="lab", broker=Broker.of("mqtt://localhost"), version=version, interface="vda5050",
-                      manufacturer="fognav", map_id="lab", robots=["r1"], zones=[])  # fmt: skip
-        return json.loads(Sender(setup, version, "fognav", "r1").message("state", state, 1.7e9))
+        return json.loads(Sender(SETUP, version, "fognav", "r1").message("state", state, 1.7e9))
 
     def errors(self) -> dict[str, str]:
         """Return the types and levels of the state's errors."""

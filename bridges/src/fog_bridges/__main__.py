@@ -173,6 +173,8 @@ def _vda5050(settings: Settings, site: str, _: Clock) -> Adapter:
         raise SettingsError(
             'vda5050_robots, or vda5050_zones, names who takes part: "r1, r2", or "MANUFACTURER/SERIAL"'
         )
+    if wrong := next((each for each in robots if not re.fullmatch(r"[a-z0-9][a-z0-9-]{0,31}", each)), None):
+        raise SettingsError(f"vda5050_robots: {wrong[:80]!r} is no robot's id: `fognav robot status` shows them")
     if wrong := next((each for each in zones if not re.fullmatch(r"[^/+#$]{1,64}/[A-Za-z0-9_.:-]{1,64}", each)), None):
         raise SettingsError(f"vda5050_zones: {wrong[:80]!r} is not MANUFACTURER/SERIAL, as in the robot's topics")
     with _address(prefix):

@@ -203,7 +203,8 @@ class RobotLink(Connection):
         for node, goal in core.goals(order)[:LOOKED_FOR]:
             refusal = await self._route(node, goal)
             if core.pending is not order:
-                return "dropped", "it was cancelled, or an operator has taken over, before it was taken over"
+                error = core.checked(order, self.clock.now())
+                return "dropped", "it was cancelled first" if error is None else error.error_description
             if refusal:
                 core.pending = None
                 core.reject_route(order, node, refusal)
@@ -363,6 +364,7 @@ class Vda5050Bridge:
         if self._clock is None:
             return "not started yet"
         found = [link.problem for link in self._links.values()]
+        found += [f"no robot {robot} is heard of" for robot, link in self._links.items() if not link.core.state]
         return next((each for each in found if each), "" if self._zones is None else self._zones.words)
 
     async def run(self, floor: Floor, clock: Clock) -> None:

@@ -1,4 +1,4 @@
-"""What VDA 5050 3.0 and 2.1 have a robot receive: orders and instant actions, checked. Pure.
+"""What VDA 5050 3.0, 2.1 and 2.0 have a robot receive: orders and instant actions, checked. Pure.
 
 Names and rules: "VDA 5050 - Interface for the Communication between Mobile Robots and a Fleet Control", version 3.0.0,
 section 7, and version 2.1.0, section 6. Lengths are in m, angles in rad, in the project's frame: Fognav's `map`.
@@ -12,8 +12,8 @@ from typing import Annotated, Any, Final, Literal
 import msgspec
 from msgspec import Meta
 
-Version = Literal["3.0", "2.1"]
-RELEASES: Final[dict[Version, str]] = {"3.0": "3.0.0", "2.1": "2.1.0"}
+Version = Literal["3.0", "2.1", "2.0"]
+RELEASES: Final[dict[Version, str]] = {"3.0": "3.0.0", "2.1": "2.1.0", "2.0": "2.0.0"}
 """What a header says of a version."""
 MESSAGE_MAX: Final = 256 * 1024
 """Bytes of the longest message that is read."""
@@ -65,7 +65,7 @@ Actions = Annotated[list[Action], Meta(max_length=ACTIONS_MAX)]
 
 
 class Ellipse(_In, frozen=True, kw_only=True):
-    """Half axes and direction of how far from a node a robot may be (3.0; 2.1 has a radius)."""
+    """Half axes and direction of how far from a node a robot may be (3.0; earlier versions have a radius)."""
 
     a: Size
     b: Size

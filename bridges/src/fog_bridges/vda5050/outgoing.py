@@ -1,6 +1,6 @@
-"""What VDA 5050 3.0 and 2.1 have a robot tell, and a fleet control of its zones. Pure.
+"""What VDA 5050 3.0, 2.1 and 2.0 have a robot tell, and a fleet control of its zones. Pure.
 
-Messages are made with the names of 3.0; `of_version` gives them those of 2.1. Rules and units as in `incoming`.
+Messages are made with the names of 3.0; `of_version` gives them those of 2.1 and 2.0. Rules and units as in `incoming`.
 """
 
 from __future__ import annotations
@@ -221,7 +221,13 @@ def timestamp(stamp: float) -> str:
 def of_version(topic: str, message: msgspec.Struct | dict[str, Any], version: Version) -> dict[str, Any]:
     """Return a message of 3.0 as JSON of a version."""
     content: dict[str, Any] = msgspec.to_builtins(message)
-    return content if version == "3.0" else _EARLIER.get(topic, dict)(content)
+    if version == "3.0":
+        return content
+    if version == "2.0":  # there a node that lies ahead has a heading, or no position
+        for node in content.get("nodeStates", ()):
+            if "theta" not in node.get("nodePosition", ()):
+                node.pop("nodePosition", None)
+    return _EARLIER.get(topic, dict)(content)
 
 
 def _renamed(content: dict[str, Any], names: dict[str, str]) -> dict[str, Any]:
@@ -229,7 +235,7 @@ def _renamed(content: dict[str, Any], names: dict[str, str]) -> dict[str, Any]:
 
 
 def _earlier_visualization(content: dict[str, Any]) -> dict[str, Any]:
-    """Return position and velocity: 2.1 tells no paths."""
+    """Return position and velocity: earlier versions tell no paths."""
     found = {name: content[name] for name in ("velocity",) if name in content}
     if "mobileRobotPosition" in content:
         found["agvPosition"] = _renamed(content["mobileRobotPosition"], {"localized": "positionInitialized"})
@@ -243,11 +249,11 @@ _ERRORS: Final = {
     "MOBILE_ROBOT_NOT_AVAILABLE": "orderError", "OUTDATED_ORDER_UPDATE": "orderUpdateError",
     "SAME_ORDER_UPDATE_ID": "orderUpdateError", "ORDER_UPDATE_FOLLOWING_CANCEL": "orderUpdateError",
 }  # fmt: skip
-"""What 2.1 calls errors of orders; it leaves others to the maker, who writes them in its style."""
+"""What 2.1 and 2.0 call errors of orders; they leave others to the maker, who writes them in its style."""
 
 
 def earlier_error(name: str) -> str:
-    """Return the error type of 2.1 for one of 3.0."""
+    """Return the error type of 2.1 and 2.0 for one of 3.0."""
     first, *rest = name.lower().split("_")
     return _ERRORS.get(name, first + "".join(part.title() for part in rest))
 

@@ -138,6 +138,7 @@ class FleetRobot:
             (state["mode"] == "INIT", "STARTUP", "it is starting, and does not know where it is"),
             (state["mode"] in _BY_HAND, "MANUAL", _BY_HAND.get(state["mode"], "")),
             (bool(state.get("wants_dock")), "MANUAL", "it is on its way to its dock"),
+            (bool(state.get("docked")), "MANUAL", "it stands on its dock: an operator of Fognav undocks it"),
             (
                 bool(state.get("awaits_operator")) or not state["enabled"],
                 "MANUAL",

@@ -8,7 +8,7 @@ import json
 import msgspec
 import pytest
 from manual_clock import ManualClock
-from vda5050_floor import SETUP, STATE, A, B, C, Floorplan, instant, node, order, read
+from vda5050_floor import SETUP, STATE, A, B, C, Floorplan, header, instant, node, order, read
 
 from fog_bridges.floor import Answer, Request
 from fog_bridges.vda5050.bridge import RobotLink
@@ -230,6 +230,13 @@ def test_requests_are_answered_and_unknown_actions_fail():
     for n in range(100):
         floor.robot.on_instant(instant("stateRequest", f"s{n}"), floor.now)
     assert (len(actions(floor)), floor.errors()) == (50, {})
+
+
+def test_instant_actions_of_2_0_have_two_names():
+    action = {"actionType": "stateRequest", "actionId": "a", "blockingType": "NONE"}
+    for name in ("actions", "instantActions"):
+        found = read(header("2.0") | {name: [action]}, "instantActions", "2.0")
+        assert [each.action_type for each in found.actions] == ["stateRequest"]
 
 
 @pytest.mark.parametrize("word", ["operator", "cancel"])

@@ -8,7 +8,7 @@ import os
 import shutil
 from contextlib import asynccontextmanager, suppress
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import pytest
 from secured_servers import TESTER, SecuredSite
@@ -17,6 +17,9 @@ from vda5050_floor import header, node, schema
 
 from fog_runtime.credentials import Credentials
 from fog_runtime.transports.mqtt_connection import Broker
+
+if TYPE_CHECKING:
+    import aiomqtt
 
 pytestmark = [pytest.mark.live, pytest.mark.drive, pytest.mark.timeout(600)]
 
@@ -34,7 +37,7 @@ async def fleet(tmp_path: Path, version: str):
         settings = tmp_path / "bridge.toml"
         settings.write_text(
             f'adapters = "vda5050"\nvda5050_mqtt_url = "{server.url}"\nvda5050_credentials_file = "{own}"\n'
-            f'vda5050_version = "{version}"\nvda5050_robots = "r1"\n'
+            f'vda5050_version = "{version}"\nvda5050_robots = "r1"\nvda5050_zones = "kit/0001"\n'
         )
         floor = Node(tmp_path, "--sim", "--bridge", str(settings))
         try:
@@ -64,7 +67,39 @@ def order(x: float, y: float, *ahead: float, name: str, version: str) -> dict[st
     return header(version) | {"orderId": name, "orderUpdateId": 0, "nodes": nodes, "edges": edges}
 
 
-async def test_order_drives_the_robot_from_node_to_node_and_an_operator_ends_it(tmp_path):
+async def check_zones(floor: Node, client: aiomqtt.Client) -> None:
+    """Check that a robot of others is told what is blocked and slow, as operators say."""
+    others = "vda5050/v3/kit/0001/"
+    await client.subscribe(others + "zoneSet")
+    await client.publish(others + "connection", '{"connectionState": "ONLINE"}', qos=1, retain=True)
+    await client.publish(others + "state", '{"zoneSets": []}')
+
+    async def zones(wanted: set[tuple[str, str]]) -> None:
+        found: Any = None
+        with suppress(TimeoutError):
+            async with asyncio.timeout(60.0):
+                async for message in client.messages:
+                    if message.topic.matches(others + "zoneSet"):
+                        found = {
+                            (zone["zoneId"], zone["zoneType"])
+                            for zone in json.loads(message.payload)["zoneSet"]["zones"]
+                        }
+                        if found == wanted:
+                            return
+        raise AssertionError(f"{found} instead of {wanted}")
+
+    await zones(set())
+    await asyncio.to_thread(
+        floor.run, "area", "override", "z2", "--state", "blocked", "--for", "10m", "--reason", "inspection"
+    )
+    await zones({("area-z2", "BLOCKED")})
+    await asyncio.to_thread(
+        floor.run, "zone", "add", "--id", "wet", "--rectangle", "32,38,36,40", "--kind", "speed-limit", "--speed", "0.1"
+    )
+    await zones({("area-z2", "BLOCKED"), ("zone-wet", "SPEED_LIMIT")})
+
+
+async def test_order_drives_the_robot_until_an_operator_ends_it_and_robots_of_others_hear_of_what_is_blocked(tmp_path):
     async with (
         fleet(tmp_path, "3.0") as (floor, url, own),
         Broker.of(url, own).client("fleet", None) as client,
@@ -111,6 +146,8 @@ async def test_order_drives_the_robot_from_node_to_node_and_an_operator_ends_it(
         out = await state(lambda s: s["operatingMode"] == "SERVICE", "an operator takes it out of service")
         assert out["nodeStates"] == []
         await state(lambda s: not s["driving"], "it stands")
+
+        await check_zones(floor, client)
 
 
 @pytest.mark.skipif(

@@ -30,8 +30,11 @@ async function main() {
   master.trackAgvs((agv, state) => say("connection", { state }));
   await master.initiateInstantActions(
     given.agv,
-    { instantActions: [], actions: [{ actionType: "factsheetRequest", actionId: "f1", blockingType: "NONE" }] },
-    { onActionStateChanged: (state) => say("action", { status: state.actionStatus }), onActionError: (error) => say("action", { error }) },
+    { instantActions: [{ actionType: "factsheetRequest", actionId: "f1", blockingType: "NONE" }] },
+    {
+      onActionStateChanged: (state) => say("action", { status: state.actionStatus }),
+      onActionError: (error) => say("action", { error: error.errorType }),
+    },
   );
   await master.assignOrder(given.agv, given.order, {
     onNodeTraversed: (node) => say("traversed", { node: node.nodeId }),

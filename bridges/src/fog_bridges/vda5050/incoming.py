@@ -159,6 +159,13 @@ class InstantActions(_Header, frozen=True, kw_only=True):
     actions: Actions
 
 
+class _EarlyActions(_Header, frozen=True, kw_only=True):
+    """Those of 2.0, whose schema and whose implementations (`vda-5050-lib` 1.4) name them differently."""
+
+    actions: Actions = []
+    instant_actions: Actions = []
+
+
 class ReportedZoneSet(_In, frozen=True, kw_only=True):
     """A zone set that a robot has."""
 
@@ -190,14 +197,21 @@ def decoded(topic: str, payload: bytes, version: Version, serial: str) -> Order 
     named = order[1].decode("utf-8", "replace") if order else "", int(update[1]) if update else None
     if len(payload) > MESSAGE_MAX:
         raise MessageError(f"{len(payload)} bytes are over the limit of {MESSAGE_MAX}", *named)
+    kind = _EarlyActions if (topic, version) == ("instantActions", "2.0") else _TOPICS[topic]
     try:
-        message = msgspec.json.decode(payload, type=_TOPICS[topic])
+        message = msgspec.json.decode(payload, type=kind)
     except (msgspec.MsgspecError, RecursionError, UnicodeDecodeError) as error:
         raise MessageError(str(error), *named) from error
     if message.version.partition(".")[0] != version.partition(".")[0]:
         raise MessageError(f"version {message.version[:20]!r} on a topic of {RELEASES[version]}", *named)
     if message.serial_number != serial:
         raise MessageError(f"serialNumber {message.serial_number[:40]!r} on the topic of {serial}", *named)
-    if not isinstance(message, Order | InstantActions):
+    if isinstance(message, Order | InstantActions):
+        return message
+    if not isinstance(message, _EarlyActions):
         raise TypeError(topic)
-    return message
+    return InstantActions(
+        header_id=message.header_id, timestamp=message.timestamp, version=message.version,
+        manufacturer=message.manufacturer, serial_number=message.serial_number,
+        actions=[*message.actions, *message.instant_actions],
+    )  # fmt: skip

@@ -366,7 +366,7 @@ class FleetRobot:
         self._asking = self._unsure = None
         if request is None:
             return
-        if request.method == "PUT" and not answer.refusal and node is not None:
+        if request.method == "PUT" and "goal_id" in answer.body and node is not None:
             self._goal, self._goal_node = answer.body["goal_id"], node.sequence_id
             self._own.append(self._goal)
             self._is_seen, self._refused_since = False, None

@@ -23,8 +23,11 @@ test("what programs tell by an identifier is said in the user's language, and al
   const echo = { ...entry("hazard", "hall", "blocked", ""), text: "node n1: an echo at 0.86 m", codes: ["something_near"], decided_by: "n1" };
   const fault = { ...entry("fault", "r1", "began", ""), text: "bumper pressed; it hums", codes: ["bumper", "newer_than_the_page"] };
   const stops = { ...entry("stop", "r1", "stop", "1-0.stop"), after: { kind: "disable", repeats: { ana: 2, others: 1 }, period_s: 600 } };
+  const sent = [{ place: "lab" }, { place: null, pose: { x: 1, y: 2.04, theta: 0 } }].map((goal) => ({ ...entry("mission", "r1", "goal", "2-0.mission"), after: { goal } }));
   const refused = new Problem(409, "command_refused", "a fault must be reset first", { refusal: "fault_latched", causes: ["bumper"] });
-  expect([echo, fault, stops].map(detailText)).toEqual([echo.text, fault.text, "3 times more within 10 min: ana 2, others 1"]);
+  expect([echo, fault, stops, ...sent, entry("mission", "r1", "cancel", "3-0.mission")].map(detailText)).toEqual(
+    [echo.text, fault.text, "3 times more within 10 min: ana 2, others 1", "lab", "1.0, 2.0", ""],
+  );
   expect(saidProblem(refused)).toBe("a fault must be reset first");
   vi.stubGlobal("document", { documentElement: {} });
   setLanguage("pt", false);

@@ -1,8 +1,8 @@
 // Entries of the timeline: in words, and which of them can be undone.
-import type { TimelineEntry } from "../api/types";
+import type { Pose, TimelineEntry } from "../api/types";
 import { said, saidAll, saidCause } from "../i18n/codes";
 import { language, maybe, t } from "../i18n/i18n";
-import { duration } from "../text";
+import { decimal, duration } from "../text";
 import type { Undoing } from "../zones/requests";
 
 export const KINDS = ["zone", "set", "source", "place", "map", "hazard", "override", "area", "mission", "robot", "service", "stop", "fault", "alert", "store"] as const;
@@ -32,6 +32,7 @@ export function undoable(entries: readonly TimelineEntry[]): Map<string, Undoing
 /** Return the details of what happened, empty without any. */
 export function detailText({ kind, text, codes, decided_by: by, overridden, after }: TimelineEntry): string {
   if (kind === "stop") return repeatsText(after);
+  if (kind === "mission") return goalText(after);
   if (kind === "alert") {
     const { code, reason } = (after ?? {}) as { readonly code?: string; readonly reason?: string };
     return said(code, reason ?? "");
@@ -39,6 +40,13 @@ export function detailText({ kind, text, codes, decided_by: by, overridden, afte
   if (kind !== "hazard") return saidAll(codes, text);
   if (overridden) return language() === "en" ? text : t("area.overridden");
   return saidCause(codes[0] ?? "", by, text);
+}
+
+/** Return where a robot was sent; empty for a mission that ended. */
+function goalText(after: unknown): string {
+  const { goal } = (after ?? {}) as { readonly goal?: { readonly place?: string | null; readonly pose?: Pose | null } };
+  if (goal?.place) return goal.place;
+  return goal?.pose ? t("goal.position", { x: decimal(goal.pose.x, 1), y: decimal(goal.pose.y, 1) }) : "";
 }
 
 /** Return how often stops were repeated, and by whom; empty for one that is told by itself. */

@@ -159,6 +159,7 @@ async def test_guest_logs_in_and_may_do_nothing_else(site):
         assert code(await browser.put("/zones/wet", headers=OWN_PAGE)) == (403, "role_too_low")
 
 
+@pytest.mark.claim
 async def test_admins_guest_token_is_the_same_each_time_and_ends_with_the_admins_own(site):
     admin = {"Authorization": f"Bearer {create_token(site.file, 'rui', 'admin')}"}
     path = "/api/v1/session/code"

@@ -12,12 +12,14 @@ from typing import TYPE_CHECKING, Any
 
 import msgspec
 import pytest
+from manual_clock import ManualClock
 from secured_servers import TESTER, SecuredSite
 from vda5050_floor import SETUP, STATE, VERSIONS, A, B, C, Floorplan, area, driving, header, order, schema
 
 from fog_bridges.floor import Answer, Request
+from fog_bridges.metrics import REFUSED
 from fog_bridges.vda5050 import telling
-from fog_bridges.vda5050.bridge import Sender, Setup, Vda5050Bridge
+from fog_bridges.vda5050.bridge import RobotLink, Sender, Setup, Vda5050Bridge
 from fog_bridges.vda5050.incoming import MessageError, Order, ReportedZoneSet, decoded
 from fog_bridges.vda5050.zones import AGAIN_S, ZoneSets, ZoneUser
 from fog_runtime.clock import SystemClock
@@ -88,26 +90,30 @@ def damaged(rng: random.Random, message: dict[str, Any]) -> bytes:
     return bytes(data[: rng.randrange(len(data))] if rng.random() < 0.1 else data)
 
 
-def test_damaged_orders_and_actions_are_rejected_one_by_one_and_none_ends_anything():
+async def test_damaged_orders_and_actions_are_counted_one_by_one_and_none_ends_anything():
     rng, floor, refused = random.Random(7), driving(), 0
+    links = [RobotLink(msgspec.structs.replace(SETUP, version=v), "r1", Planner(), ManualClock()) for v in VERSIONS]
     whole = order(A, B, C, edge={"maximumSpeed": 1.0, "orientation": 0.0}, zoneSetId="z")
     actions = header() | {"actions": [{"actionType": "cancelOrder", "actionId": "a", "blockingType": "NONE",
                                        "actionParameters": [{"key": "orderId", "value": "o1"}]}]}  # fmt: skip
+    counter, before = REFUSED.labels("vda5050", "malformed"), REFUSED.labels("vda5050", "malformed")._value.get()
+    for link in links:
+        link.core = floor.robot
     for n in range(DAMAGED):
         topic, message = ("order", whole) if n % 2 else ("instantActions", actions)
+        version, data = rng.randrange(len(VERSIONS)), damaged(rng, message)
+        links[version].on_message(f"vda5050/v3/fognav/r1/{topic}", data)
         try:
-            found = decoded(topic, damaged(rng, message), rng.choice(VERSIONS), "r1")
-        except MessageError as error:
+            found = decoded(topic, data, VERSIONS[version], "r1")
+        except MessageError:
             refused += 1
-            floor.robot.on_malformed(topic, error)
         else:
             if isinstance(found, Order):
                 floor.robot.checked(found, floor.now)
-            else:
-                floor.robot.on_instant(found, floor.now)
         if n % 100 == 0:
             floor.said(), floor.said("2.1")
     assert refused > DAMAGED * 0.6
+    assert counter._value.get() - before == refused
     assert len(floor.said()["errors"]) < 12, "the latest of each type"
 
 

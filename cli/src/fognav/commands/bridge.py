@@ -1,4 +1,4 @@
-"""`fognav bridge`: the bridges to other systems, by themselves; and what `fognav up` has to know of them."""
+"""`fognav bridge` and `fognav rosbag`: the bridges to other systems; and what `fognav up` has to know of them."""
 
 import os
 import shlex
@@ -7,6 +7,7 @@ import subprocess
 import sys
 import tomllib
 from importlib.util import find_spec
+from json import loads
 from pathlib import Path
 from typing import Annotated, Final
 
@@ -15,7 +16,8 @@ import typer
 from fog_runtime.keys import BRIDGE_TOKEN, TOKENS
 from fog_runtime.token_file import keep_token
 from fognav.operate.fog import find_fog
-from fognav.output import FailedError, WrongUseError, exit_codes, print_line
+from fognav.operate.options import JsonOption
+from fognav.output import FailedError, WrongUseError, exit_codes, print_line, print_result
 from fognav.programs import BRIDGE, BROKER, CONSOLE, MODULES, ROUTER, inherited_environment
 
 _FILE: Final = "FOGNAV_BRIDGE_FILE"
@@ -47,13 +49,38 @@ def bridge_command(
         os.execve(sys.executable, _COMMAND, environment)  # noqa: S606  # no shell is wanted
 
 
-def require_bridge(file: Path) -> None:
-    """Raise `FailedError` if the bridges are not installed, and `WrongUseError` for settings that can't be used."""
+def rosbag_command(
+    file: Annotated[Path, typer.Argument(metavar="FILE", help="MCAP file of a recording.")],
+    folder: Annotated[Path, typer.Argument(metavar="DIR", help="A new folder for the rosbag2.")],
+    *,
+    json: JsonOption = False,
+) -> None:
+    """Write a recording as a rosbag2, for tools of ROS 2.
+
+    `ros2 bag play DIR` plays it. Its topics are in docs/interop.md.
+    """
+    with exit_codes():
+        _require_installed()
+        command = [sys.executable, "-m", f"{MODULES[BRIDGE]}.ros2.rosbag2", str(file), str(folder)]
+        done = subprocess.run(command, capture_output=True, text=True, check=False)
+        if done.returncode != 0:
+            raise WrongUseError(f"{file} can't be converted: {done.stderr.strip().splitlines()[-1]}")
+        counts: dict[str, int] = loads(done.stdout)
+        lines = [f"{topic}: {count} messages" for topic, count in counts.items()]
+        print_result({"folder": str(folder), "messages": counts}, f"wrote {folder}", *lines, json=json)
+
+
+def _require_installed() -> None:
     if find_spec(MODULES[BRIDGE]) is None:
         raise FailedError(
             "the bridges are not installed: install the package fog-bridges beside this command (./fognav of a "
             "checkout has it), or leave them out: a floor runs without them"
         )
+
+
+def require_bridge(file: Path) -> None:
+    """Raise `FailedError` if the bridges are not installed, and `WrongUseError` for settings that can't be used."""
+    _require_installed()
     environment = {**inherited_environment(), _FILE: str(file.absolute()), "FOGNAV_CONSOLE_URL": "https://localhost"}
     done = subprocess.run([*_COMMAND, "--check"], env=environment, capture_output=True, text=True, check=False)
     if done.returncode != 0:

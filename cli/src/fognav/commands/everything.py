@@ -8,12 +8,13 @@ from fognav.commands import installed, map_change, robot  # noqa: F401  # they a
 from fognav.commands.access import ca_app, robot_add, token_app
 from fognav.commands.area import alert_app, area_app
 from fognav.commands.backup import backup_command, restore_command, store_app
-from fognav.commands.bridge import bridge_command
+from fognav.commands.bridge import bridge_command, rosbag_command
 from fognav.commands.demo import demo_command, record_command, replay_command
 from fognav.commands.develop import channels_command, check_command, docs_command, run_tests
 from fognav.commands.map_clean import map_clean
 from fognav.commands.map_files import map_app, map_check
 from fognav.commands.map_plan import FORWARDED, map_from_plan
+from fognav.commands.nav2_files import map_export, zone_import
 from fognav.commands.node import node_app
 from fognav.commands.robot_file import robot_app
 from fognav.commands.site import site_app
@@ -56,6 +57,7 @@ def add_to(app: typer.Typer) -> None:
         (installed.RUN, "restore", restore_command, f"restore {backup}"),
         (installed.MEASURE, "record", record_command, "record drive.mcap --seconds 60"),
         (installed.MEASURE, "replay", replay_command, "replay drive.mcap --speed 2"),
+        (installed.MEASURE, "rosbag", rosbag_command, "rosbag drive.mcap drive-bag"),
         (installed.DEVELOP, "docs", docs_command, "docs --serve"),
         (installed.DEVELOP, "channels", channels_command, "channels --format acl --broker mqtt"),
         (installed.DEVELOP, "check", check_command, "check --json"),
@@ -68,6 +70,8 @@ def add_to(app: typer.Typer) -> None:
         rich_help_panel=installed.DEVELOP,
     )(run_tests)
     robot_app.command("add", epilog="Example: fognav robot add r2 --credentials DIR")(robot_add)
+    map_app.command("export", epilog="Example: fognav map export nav2")(map_export)
+    zone_app.command("import", epilog="Example: fognav zone import keepout.yaml --save")(zone_import)
     map_app.command("check", epilog="Example: fognav map check floor.yaml --radius 0.17")(map_check)
     map_app.command(
         "clean", context_settings=NUMBERS, epilog="Example: fognav map clean floor.yaml erase 3.0 1.0 4.0 2.0"

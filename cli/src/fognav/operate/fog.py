@@ -113,6 +113,21 @@ class Fog:
         timeout_s: float = net.HTTP_TIMEOUT_S,
     ) -> Any:  # noqa: ANN401  # JSON
         """Send a request to a service and return its JSON answer; raises as `get`."""
+        return self._answer(method, service, path, body, headers, timeout_s).body
+
+    def fetch(self, service: str, path: str) -> bytes:
+        """Return what a service answers that is no JSON, such as a picture; raises as `get`."""
+        return self._answer("GET", service, path).data
+
+    def _answer(  # the parts of a request
+        self,
+        method: str,
+        service: str,
+        path: str,
+        body: object = None,
+        headers: Mapping[str, str] | None = None,
+        timeout_s: float = net.HTTP_TIMEOUT_S,
+    ) -> net.Response:
         url = self.system.urls.get(service)
         if url is None:
             raise FailedError(f"the {service} of {self.system.name} does not run: look at its log, then start it")
@@ -138,7 +153,7 @@ class Fog:
             remedy = _GIVE_TOKEN if response.status == http.client.UNAUTHORIZED else str(problem.get("remedy", ""))
             words = ". ".join(part for part in (f"the {service} refused it: {response.reason}", remedy) if part)
             raise RefusedError(words, response.status, response.body)
-        return response.body
+        return response
 
 
 def find_fog(address: str | None) -> Fog:

@@ -49,10 +49,11 @@ def read_port(path: Path) -> int | None:
 
 @dataclass(frozen=True)
 class Response:
-    """Status and JSON body of an HTTP response; a body that is not JSON is its text."""
+    """Status and JSON body of an HTTP response; a body that is not JSON is its text. `data` are its bytes."""
 
     status: int
     body: Any
+    data: bytes = b""
 
     @property
     def reason(self) -> str:
@@ -92,13 +93,14 @@ def request(  # noqa: PLR0913  # the parts of a request
     try:
         connection.request(method, path, body=data, headers=sent_headers)
         response = connection.getresponse()
-        text = response.read().decode("utf-8", "replace")
+        answer = response.read()
     finally:
         connection.close()
+    text = answer.decode("utf-8", "replace")
     try:
-        return Response(response.status, json.loads(text))
+        return Response(response.status, json.loads(text), answer)
     except json.JSONDecodeError:
-        return Response(response.status, text)
+        return Response(response.status, text, answer)
 
 
 def put_goal(planner_url: str, robot: str, place: str, token: str) -> Response:

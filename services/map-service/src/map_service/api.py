@@ -377,6 +377,17 @@ def _add_views(routes: Routes, service: Service, site: Site) -> None:
         """Return the floor plan: white is free, black occupied, grey unknown."""
         return await pictures.response("map", costmap.static, _PLAN)
 
+    @routes.get("/api/v1/map.yaml", media_type="application/yaml")
+    async def map_yaml() -> Response:
+        """Return what map_server needs beside the floor plan's picture."""
+        g = costmap.geometry
+        text = (
+            f"image: map.png\nmode: trinary\nresolution: {g.resolution!r}\n"
+            f"origin: [{g.origin_x!r}, {g.origin_y!r}, 0.0]\nnegate: 0\n"
+            "occupied_thresh: 0.65\nfree_thresh: 0.196\n"
+        )
+        return Response(text, media_type="application/yaml")
+
     @routes.get("/api/v1/costmap.png", media_type=_PNG, raises=[BusyError], problems=ZONES_NOT_LOADED)
     async def costmap_png() -> Response:
         """Return the master costmap; a pixel's palette index is the cell's cost."""

@@ -20,6 +20,7 @@ import psutil
 import pytest
 from attacks import ATTACKS, few_files, running
 from floor_ports import floor_ports
+from websockets.asyncio.client import connect
 
 from fog_contracts import channels as ch
 from fog_contracts.grid import StaticMap
@@ -234,9 +235,22 @@ async def told_home_assistant(node: Node, word: str) -> None:
                 return
 
 
-def test_bridge_to_home_assistant_is_kept_running(tmp_path):
+async def looked_on(node: Node) -> str:
+    """Look on at the floor through the console, as Foxglove does; return what is shown."""
+    own = Credentials.read(node.data / "locks" / "credentials" / "console.toml")
+    token = (node.data / "keys" / "estig" / "admin.token").read_text().strip()
+    address = f"wss://127.0.0.1:{node.environment['FOGNAV_CONSOLE_PORT']}/api/v1/foxglove"
+    headers = {"Authorization": f"Bearer {token}"}
+    async with (
+        asyncio.timeout(START_S),
+        connect(address, ssl=own.tls_context(), additional_headers=headers, subprotocols=["foxglove.sdk.v1"]) as viewer,
+    ):
+        return str(json.loads(await viewer.recv())["name"])
+
+
+def test_bridge_is_kept_running_and_the_console_leads_to_it(tmp_path):
     settings = tmp_path / "bridge.toml"
-    settings.write_text('adapters = "home-assistant"\n')
+    settings.write_text('adapters = "home-assistant, foxglove"\n')
     node = Node(tmp_path, "--bridge", str(settings))
     try:
         node.up()
@@ -245,6 +259,7 @@ def test_bridge_to_home_assistant_is_kept_running(tmp_path):
         os.kill(bridge, signal.SIGKILL)
         node.wait(lambda: node.systems()["estig"]["pids"].get("bridge", bridge) != bridge, "it is started again")
         asyncio.run(told_home_assistant(node, ch.ONLINE))
+        assert asyncio.run(looked_on(node)) == "Fognav estig"
         assert node.run("logs", "bridge", "-n", "1000").count("settings_loaded") == 2
         assert "bridge: operator" in node.run("token", "list")
         node.down()

@@ -295,7 +295,6 @@ async def main() -> None:
             tasks.create_task(floor.follow(adapters), name="floor")
             tasks.create_task(health_loop(), name="health")
             tasks.create_task(serving, name="http")
-            tasks.create_task(process.release_when(lambda: not floor.problem), name="release")
             tasks.create_task(process.release_when(lambda: all(not each.problem for each in adapters)), name="memory")
     finally:
         await floor.aclose()

@@ -36,6 +36,12 @@ MAKE_POLYGONS = {
     "services/map-service/src/map_service/api_masks.py",
 }  # fmt: skip
 """They make a shape of a list of corners, whatever other kinds there are."""
+ROBOTS_OF_OTHERS = {
+    "bridges/src/fog_bridges/ros2/others.py", "services/hazard-aggregator/src/hazard_aggregator/readings.py",
+    "services/map-service/src/map_service/layers/obstacles.py",
+    "services/map-service/src/map_service/layers/reported.py",
+}  # fmt: skip
+"""A robot of others is a circle, as Fognav's own robots are, whatever other kinds of shapes there are."""
 GEOJSON = "services/map-service/src/map_service/formats/geojson.py"
 """It writes other kinds of shapes, too, but without a geometry that other programs show."""
 ORACLE = "experiments/src/fognav_experiments/hunt/oracle.py"
@@ -294,7 +300,15 @@ def test_only_messages_shapes_and_the_commands_that_draw_them_distinguish_kinds_
         file for file in files if "console_service/page/" not in file.as_posix()
     ]  # built, of no interest to people
     found = {str(file.relative_to(ROOT)) for file in files if asking.search(file.read_text("utf-8"))}
-    assert found == {f"{MESSAGES}/maps.py", SHAPES, *DRAWING_COMMANDS, *MAKE_POLYGONS, GEOJSON, ORACLE}
+    assert found == {
+        f"{MESSAGES}/maps.py",
+        SHAPES,
+        *DRAWING_COMMANDS,
+        *MAKE_POLYGONS,
+        *ROBOTS_OF_OTHERS,
+        GEOJSON,
+        ORACLE,
+    }
 
 
 # --- The document ---------------------------------------------------------------------------------------------------

@@ -18,6 +18,7 @@ from typing import TYPE_CHECKING, Any, Final
 import numpy as np
 import psutil
 import zenoh
+import zenoh.ext
 
 from fog_supervisor import net
 from fog_supervisor.supervisor import log_tail
@@ -97,7 +98,11 @@ async def foreign(
         bridge = await contexts.enter_async_context(running_bridge(stack, site, port))
         session = contexts.enter_context(zenoh.open(session_config("peer", port)))
         found = Foreign(psutil.Process(bridge.pid), cells, shape[0] * shape[1])
-        session.declare_subscriber(key, found.on_mask)
+        heard = zenoh.ext.declare_advanced_subscriber(  # as rmw_zenoh has them for what is latched
+            session, key, found.on_mask, history=zenoh.ext.HistoryConfig(detect_late_publishers=True, max_samples=1),
+            recovery=zenoh.ext.RecoveryConfig(heartbeat=True),
+        )  # fmt: skip
+        assert heard is not None
         for _ in range(stopped):
             command = (sys.executable, "-m", "fognav_experiments.bench.foreign", str(port), key)
             peer = await asyncio.create_subprocess_exec(*command, stdout=asyncio.subprocess.PIPE)

@@ -161,6 +161,14 @@ def sent(name: str, kind: str, message):
 # --- The map ----------------------------------------------------------------------------------------------------------
 
 
+def whole(grid, height: int, width: int) -> np.ndarray:
+    """Return the values of a grid, which may have a part of the floor only, on the whole floor (height, width)."""
+    cells = np.zeros((height, width), np.int8)
+    x, y = (round(value / 0.05) for value in (grid.info.origin.position.x, grid.info.origin.position.y))
+    cells[y : y + grid.info.height, x : x + grid.info.width] = grid.data.reshape(grid.info.height, grid.info.width)
+    return cells
+
+
 class Floor:
     """A floor's channels and a node of ROS: what was told on each topic."""
 
@@ -238,13 +246,28 @@ async def test_floor_becomes_slow_also_while_a_snapshot_is_waited_for():
             loop.cancel()
 
 
+async def test_keepout_mask_has_what_was_ever_blocked_and_no_more_so_that_robots_clear_it_again():
+    floor, geometry = Floor(), GridGeometry(40, 40, 0.05, 0.0, 0.0)
+    sizes = []
+    for epoch, cells in enumerate([(), [(10, 20)], [(12, 22)], ()], 1):
+        cost = np.zeros((40, 40), np.uint8)
+        for row, column in cells:
+            cost[row, column] = 254
+        floor.clock.advance(1.0)
+        await floor.show(MasterMap("test", geometry, np.zeros((40, 40), np.uint8), cost, epoch))
+        grid = floor.told["keepout_mask"][-1]
+        sizes.append((grid.info.width, grid.info.height))
+        assert {(int(y), int(x)) for y, x in np.argwhere(whole(grid, 40, 40))} == set(cells)
+    assert sizes == [(1, 1), (1, 1), (3, 3), (3, 3)]
+
+
 async def test_penalty_zone_is_a_cost_on_the_keepout_mask():
     floor, master = Floor(), plan(0, 1)
     shape = RectangleShape(corner=(0.11, 0.01), opposite=(0.24, 0.19))
     zone = Zone(id="slow", kind="PENALTY", shape=shape, factor=3.0)
     floor.hear[ch.ZONES]({}, ZoneSet(epoch=1, seq=1, zones=[zone], active=["slow"]))
     await floor.show(master)
-    mask = floor.told["keepout_mask"][-1].data.reshape(4, 5)
+    mask = whole(floor.told["keepout_mask"][-1], 4, 5)
     assert round(int(mask[2, 3]) * 254 / 100) == pytest.approx(penalty_cost(3.0), abs=1), "as Nav2 computes a cost"
     assert mask[2, 0] == 0
     floor.clock.advance(1.0)
@@ -356,7 +379,7 @@ async def test_mask_leaves_out_a_robot_of_others_but_not_the_hazard_that_it_stan
         if blocked:
             floor.hear[ch.HAZARD]({"area": "hall"}, HazardArea(hazard=hazard, polygon=ring))
         await floor.show(MasterMap("test", geometry, np.zeros((40, 40), np.uint8), cost, 1))
-        mask = floor.told["keepout_mask"][-1].data.reshape(40, 40)
+        mask = whole(floor.told["keepout_mask"][-1], 40, 40)
         assert (bool(mask[20, 17]), bool(mask[20, 22])) == (blocked, False)
 
 
@@ -506,7 +529,7 @@ class Peer:
 
     def mask(self, name: str = "fognav/test/keepout_mask"):
         grid = self.told.get(name)
-        return None if grid is None else grid.data.reshape(grid.info.height, grid.info.width)
+        return None if grid is None else whole(grid, 120, 160)
 
     def send(self, name: str, key: str, payload: bytes, attachment: bytes | None) -> None:
         self.session.put(f"{DOMAIN}/{name}/{key}", payload, attachment=attachment)
@@ -558,7 +581,11 @@ async def test_zone_is_on_the_mask_of_a_late_joiner_and_goes_again_and_goals_rea
         with Peer(port) as peer:
             for name in ("keepout_mask", "map"):
                 peer.hear(f"fognav/test/{name}", "nav_msgs/msg/OccupancyGrid", GRID)
-            await until(lambda: len(peer.told) == 2 and peer.mask()[50, 50] == 100, "the zone is on the mask")
+            await until(
+                lambda: len(peer.told) == 2 and peer.mask()[50, 50] == 100,
+                "the zone is on the mask",
+                lambda: fog.log("fog_bridges")[-3000:],
+            )
             assert 400 <= (peer.mask() == 100).sum() <= 484, "20 x 20 cells, and those that its outline touches"
             assert peer.mask("fognav/test/map")[0].tolist() == [100] * 160, "the wall is on the map"
             assert peer.told["fognav/test/map"].info.resolution == pytest.approx(0.05)

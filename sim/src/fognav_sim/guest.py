@@ -40,6 +40,8 @@ KEEP_M: Final = 1.5
 ARRIVED_M: Final = 1.8
 """... and is at its goal this far from it: that robot is there already."""
 _CELL_M: Final = 0.2
+_LETHAL: Final = 100
+"""What Nav2 makes a lethal cell of."""
 _KEEP_OFF_M: Final = 0.3
 _STEP_S: Final = 0.1
 _CHANGED_M: Final = 0.6
@@ -100,8 +102,10 @@ def _encoded_pose(x: float, y: float, theta: float, now: float) -> bytes:
 def blocked_cells(floor: Grid, keepout: Grid | None) -> NDArray[np.bool_]:
     """Return which cells of `_CELL_M` the robot's centre must keep off: walls, unknown floor and what is kept out."""
     closed = floor.cells != 0
-    if keepout is not None and keepout.cells.shape == closed.shape:
-        closed = closed | (keepout.cells == 100)  # Nav2's lethal
+    if keepout is not None:  # its mask has a part of the floor only
+        row, column = (round((a - b) / floor.resolution) for a, b in ((keepout.y, floor.y), (keepout.x, floor.x)))
+        height, width = keepout.cells.shape
+        closed[row : row + height, column : column + width] |= keepout.cells == _LETHAL
     factor = round(_CELL_M / floor.resolution)
     rows, columns = (size // factor for size in closed.shape)
     coarse = closed[: rows * factor, : columns * factor].reshape(rows, factor, columns, factor).any(axis=(1, 3))

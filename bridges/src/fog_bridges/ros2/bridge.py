@@ -22,6 +22,7 @@ from fog_contracts import channels as ch
 from fog_contracts.codec import ContractError
 from fog_contracts.costs import DEGRADED_SPEED
 from fog_contracts.follower import MapFollower
+from fog_contracts.grid import Window
 from fog_contracts.messages import (
     HazardArea,
     MapDelta,
@@ -169,6 +170,8 @@ class Relay:
         self._geometry: GridGeometry | None = None
         self._static: NDArray[np.uint8] = np.zeros((0, 0), np.uint8)
         self._told: dict[Topic, NDArray[np.int8]] = {}
+        self._window: Window | None = None
+        """The part of the floor that keepout masks have: all that was ever blocked, so that a robot also clears it."""
         self._told_at = 0.0
         self._dirty: set[Topic] = set()
         """The masks that may have changed."""
@@ -250,7 +253,7 @@ class Relay:
             same = replica.geometry == self._geometry and np.array_equal(replica.static, self._static)
             self._static = replica.static
             if not same:
-                self._geometry, self._told = replica.geometry, {}
+                self._geometry, self._told, self._window = replica.geometry, {}, None
                 self._dirty |= {self._keepout, self._speed}
                 self._penalties = self._closed = None
                 told = ros.grid(ros.map_values(replica.static), replica.geometry, stamp)
@@ -275,8 +278,15 @@ class Relay:
         self._dirty.clear()
         for topic, values in changed.items():
             self._told[topic], self._told_at = values, now
-            self._session.publish(topic, ros.grid(values, replica.geometry, stamp), stamp)
+            self._session.publish(topic, ros.grid(values, replica.geometry, stamp, self._part(topic, values)), stamp)
         self._tell_traffic()
+
+    def _part(self, topic: Topic, values: NDArray[np.int8]) -> Window | None:
+        """Return which part of the floor a mask has; None: all of it."""
+        if topic != self._keepout:
+            return None
+        self._window = ros.covering(values, self._window)
+        return self._window or Window(0, 0, 1, 1)
 
     def _tell_traffic(self) -> None:
         """Tell Open-RMF which lanes are closed or slow, by the masks that were told, and what stands there."""

@@ -10,6 +10,7 @@ import numpy as np
 from fog_bridges.ros2.wire import TYPES, RosMessage
 from fog_contracts.channels import ROBOT_OBSTACLES
 from fog_contracts.costs import LETHAL, UNKNOWN, penalty_cost
+from fog_contracts.grid import Window
 from fog_contracts.messages import REACH_UNIT_M, VIEW_SECTORS, Power
 from fog_contracts.shapes import polygon_spans, shape_spans
 
@@ -90,18 +91,35 @@ def heading(orientation: RosMessage) -> float | None:
 # --- The map and the masks of Nav2's costmap filters ------------------------------------------------------------------
 
 
-def grid(values: NDArray[np.int8], geometry: GridGeometry, stamp: float) -> RosMessage:
-    """Return an OccupancyGrid of values (height, width), row 0 at the bottom, as in ROS."""
-    told = header(stamp)
+def grid(values: NDArray[np.int8], geometry: GridGeometry, stamp: float, window: Window | None = None) -> RosMessage:
+    """Return an OccupancyGrid of values (height, width), row 0 at the bottom, as in ROS; of a `window` of them only."""
+    told, part = header(stamp), geometry.whole if window is None else window
     info = message(
         "nav_msgs/msg/MapMetaData",
         map_load_time=told.stamp,
         resolution=geometry.resolution,
-        width=geometry.width,
-        height=geometry.height,
-        origin=pose(geometry.origin_x, geometry.origin_y, 0.0),
+        width=part.width,
+        height=part.height,
+        origin=pose(
+            geometry.origin_x + part.x * geometry.resolution, geometry.origin_y + part.y * geometry.resolution, 0.0
+        ),
     )
-    return message("nav_msgs/msg/OccupancyGrid", header=told, info=info, data=values.ravel())
+    return message("nav_msgs/msg/OccupancyGrid", header=told, info=info, data=values[part.rows, part.columns].ravel())
+
+
+def covering(values: NDArray[np.int8], window: Window | None) -> Window | None:
+    """Return the smallest window that has all of `window`, and all values (height, width) that are not 0."""
+    rows, columns = (np.flatnonzero(values.any(axis=axis)) for axis in (1, 0))
+    if not rows.size:
+        return window
+    x, y = int(columns[0]), int(rows[0])
+    found = Window(x, y, int(columns[-1]) + 1 - x, int(rows[-1]) + 1 - y)
+    if window is None:
+        return found
+    left, bottom = min(window.x, found.x), min(window.y, found.y)
+    right = max(window.x + window.width, found.x + found.width)
+    top = max(window.y + window.height, found.y + found.height)
+    return Window(left, bottom, right - left, top - bottom)
 
 
 def map_values(static: NDArray[np.uint8]) -> NDArray[np.int8]:

@@ -1,7 +1,7 @@
 """A bridge to ROS 2 and robots of others who listen to it, for `fognav bench pipeline --ros2`.
 
 The bridge is a process of its own, and so is each peer that has stopped reading; ROS's router and the peer that reads
-are in this one, by zenoh's own code: of a message only the cells at its end are looked at.
+are in this one, and read masks as the demo's robot of others does.
 """
 
 from __future__ import annotations
@@ -25,6 +25,7 @@ from fog_supervisor.supervisor import log_tail
 from fognav.output import FailedError
 from fognav.programs import BRIDGE, MODULES
 from fognav.ros2 import end, running_bridge, session_config
+from fognav_sim.guest import Grid
 
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator, Iterator, Mapping, Sequence
@@ -40,12 +41,10 @@ _MB: Final = 1e6
 class Foreign:
     """A peer that reads the keepout mask: when each area became blocked on it, by this machine's clock."""
 
-    def __init__(self, process: psutil.Process, cells: Mapping[str, int], size: int) -> None:
-        """`cells`: the number of a cell in the middle of each area, of a map of `size` cells."""
-        self._process = process
-        self._areas, self._cells = list(cells), np.array(list(cells.values()))
-        self._size = size
-        self._before = np.zeros(len(cells), np.bool_)
+    def __init__(self, process: psutil.Process, centres: Mapping[str, PointXY]) -> None:
+        """`centres`: the middle (m) of each area."""
+        self._process, self._centres = process, centres
+        self._before: set[str] = set()
         self.masks = 0
         self._blocked: defaultdict[str, list[float]] = defaultdict(list)
         self._cpu_s = 0.0
@@ -53,10 +52,10 @@ class Foreign:
     def on_mask(self, sample: zenoh.Sample) -> None:
         """Note which areas a mask blocks that the one before did not; it is called on another thread."""
         now = time.time()
-        values = np.frombuffer(sample.payload.to_bytes(), np.int8)[-self._size :]
-        blocked = values[self._cells] > 0
-        for index in np.flatnonzero(blocked & ~self._before):
-            self._blocked[self._areas[index]].append(now)
+        mask = Grid.decoded(sample.payload.to_bytes())
+        blocked = {area for area, centre in self._centres.items() if mask.at(centre) > 0}
+        for area in blocked - self._before:
+            self._blocked[area].append(now)
         self._before = blocked
         self.masks += 1
 
@@ -85,22 +84,19 @@ class Foreign:
 
 
 @asynccontextmanager
-async def foreign(
-    stack: Stack, site: str, centres: Mapping[str, PointXY], shape: tuple[int, int], resolution: float, stopped: int
-) -> AsyncIterator[Foreign]:
+async def foreign(stack: Stack, site: str, centres: Mapping[str, PointXY], stopped: int) -> AsyncIterator[Foreign]:
     """Run a bridge to ROS 2 with one peer that reads, and `stopped` ones that do not any more; raises `FailedError`.
 
-    `centres` are those (m) of the areas, on a map of `shape` (rows, columns) from the origin on.
+    `centres` are those (m) of the areas.
     """
-    cells = {area: round(y / resolution) * shape[1] + round(x / resolution) for area, (x, y) in centres.items()}
     port, key = net.free_port(), f"0/fognav/{site}/keepout_mask/**"
     async with AsyncExitStack() as contexts:
         bridge = await contexts.enter_async_context(running_bridge(stack, site, port))
         session = contexts.enter_context(zenoh.open(session_config("peer", port)))
-        found = Foreign(psutil.Process(bridge.pid), cells, shape[0] * shape[1])
+        found = Foreign(psutil.Process(bridge.pid), centres)
         heard = zenoh.ext.declare_advanced_subscriber(  # as rmw_zenoh has them for what is latched
             session, key, found.on_mask, history=zenoh.ext.HistoryConfig(detect_late_publishers=True, max_samples=1),
-            recovery=zenoh.ext.RecoveryConfig(heartbeat=True),
+            recovery=zenoh.ext.RecoveryConfig(periodic_queries=None, heartbeat=True),
         )  # fmt: skip
         assert heard is not None
         for _ in range(stopped):

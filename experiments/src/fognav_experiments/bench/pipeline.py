@@ -117,7 +117,7 @@ async def measure(  # noqa: PLR0913  # what is measured
     The floor has the `size` (m). With `stopped_peers` there is a bridge to ROS 2, too, with one peer that reads, and so
     many that have stopped.
     """
-    floor, centres = write_nodes(folder, nodes, size)
+    centres = write_nodes(folder, nodes, size)
     users = StackUsers(site=SITE, unrestricted=(BENCH,))
     config = StackConfig(site_dir=folder, robot="none", extra={"HAZARDS_WAIT_S": "0"}, users=users)
     async with Stack(config) as stack:
@@ -138,10 +138,7 @@ async def measure(  # noqa: PLR0913  # what is measured
                 ros2 = None
                 if stopped_peers is not None:
                     on_phase(f"starting the bridge to ROS 2, and {stopped_peers} peers that stop reading")
-                    shape, cell = floor.cells.shape, floor.geometry.resolution
-                    ros2 = await contexts.enter_async_context(
-                        foreign(stack, SITE, centres, (shape[0], shape[1]), cell, stopped_peers)
-                    )
+                    ros2 = await contexts.enter_async_context(foreign(stack, SITE, centres, stopped_peers))
                     ros2.begin()
                 on_phase(f"the same with hazards for {seconds:g} s")
                 cpu, memory = fog.cpu_s(), fog.rss_mb()
@@ -163,12 +160,10 @@ async def measure(  # noqa: PLR0913  # what is measured
         }
 
 
-def write_nodes(
-    folder: Path, nodes: int, size: tuple[float, float] = (60.0, 40.0)
-) -> tuple[StaticMap, dict[str, PointXY]]:
+def write_nodes(folder: Path, nodes: int, size: tuple[float, float] = (60.0, 40.0)) -> dict[str, PointXY]:
     """Write a site with so many nodes: up to 130 of them watch one area, each four of the others another one.
 
-    Return its floor, and the middle of each area.
+    Return the middle (m) of each area.
     """
     floor = make_office(*size, seed=1)
     write_site(folder, floor)
@@ -187,7 +182,7 @@ def write_nodes(
         lines += ["theta = 1.57", "sonars = [{ range_limit = 2.65 }, { angle = 0.22, range_limit = 2.65 }]", ""]
     with (folder / "site.toml").open("a", encoding="utf-8") as file:
         file.write("\n".join(lines))
-    return floor, centres
+    return centres
 
 
 def _free_corners(floor: StaticMap) -> list[tuple[float, float]]:

@@ -31,15 +31,19 @@ class Floor:
 
     def __init__(self) -> None:
         self.asked: list[Request] = []
+        self.answers: list[Answer] = []
+        """What it answers first."""
+        self.open = asyncio.Event()
+        self.open.set()
 
     async def ask(self, request: Request) -> Answer:
         self.asked.append(request)
+        await self.open.wait()
+        if self.answers:
+            return self.answers.pop(0)
         if request.body is not None and request.body["pose"]["x"] > 100.0:
-            return Answer("the goal is off the map")
+            return Answer("the goal is off the map", "goal_refused")
         return Answer("", body={"goal_id": f"g{len(self.asked)}"})
-
-    async def send(self, request: Request) -> str:
-        return (await self.ask(request)).refusal
 
 
 class Rig:
@@ -64,12 +68,14 @@ class Rig:
 
         return await asyncio.to_thread(get)
 
-    def state(self, goal_id: str | None, *, reached: bool = False, distance: float | None = None) -> None:
+    def state(
+        self, goal_id: str | None, *, reached: bool = False, distance: float | None = None, waits: bool = False
+    ) -> None:
         self.fleet.on_state(
             "r-1",
             RobotState(
                 mode="NORMAL", reasons=[], enabled=True, battery=0.5, goal_id=goal_id, goal_reached=reached,
-                goal_distance=distance, map_epoch=0, map_seq=0, plan_id=None,
+                goal_distance=distance, map_epoch=0, map_seq=0, plan_id=None, awaits_operator=waits,
             ),
         )  # fmt: skip
 
@@ -101,7 +107,10 @@ def status(answer: bytes) -> int:
 async def test_goal_is_driven_told_and_ends(rig):
     accepted = await rig.ask("send_goal", goal(4.0))
     assert accepted[4] == 1
-    assert rig.floor.asked == [Request("PUT", "/api/v1/robots/r-1/goal", {"pose": {"x": 4.0, "y": 3.0, "theta": 0.0}})]
+    (request,) = rig.floor.asked
+    assert (request.method, request.path) == ("PUT", "/api/v1/robots/r-1/goal")
+    assert request.body == {"pose": {"x": 4.0, "y": 3.0, "theta": 0.0}}
+    assert request.headers["If-None-Match"] == "*", "it takes no operator's mission away"
     asked = b"\0\1\0\0" + GOAL
     rig.state("g1", distance=2.5)
     assert status(await rig.ask("get_result", asked)) == 2
@@ -125,7 +134,7 @@ async def test_cancellation_ends_the_mission_that_it_names_or_whichever_there_is
     assert (await rig.ask("cancel_goal", cancel[1]))[4] == 2, "another's goal is unknown"
     answer = await rig.ask("cancel_goal", cancel[2])
     assert (answer[4], answer[8:12], answer[12:28]) == (0, b"\1\0\0\0", GOAL)
-    assert rig.floor.asked[-1].method == "DELETE"
+    assert (rig.floor.asked[-1].method, rig.floor.asked[-1].headers) == ("DELETE", {"If-Match": '"g1"'})
     assert status(await rig.ask("get_result", b"\0\1\0\0" + GOAL)) == 5
 
 
@@ -136,6 +145,55 @@ async def test_mission_that_an_operator_ends_is_canceled(rig):
     rig.state("g1")
     rig.state(None)
     assert status(await rig.ask("get_result", b"\0\1\0\0" + GOAL)) == 5
+
+
+async def test_robot_that_waits_for_an_operator_takes_no_goal(rig):
+    rig.state(None, waits=True)
+    assert (await rig.ask("send_goal", goal(4.0)))[4] == 0
+    assert rig.floor.asked == [], "it would drive off once an operator enables it for something else"
+
+
+async def test_cancellation_never_ends_an_operators_mission_and_says_so(rig):
+    everything = b"\0\1\0\0" + bytes(24)
+    rig.state("of-an-operator", distance=3.0)
+    assert (await rig.ask("cancel_goal", everything))[4] == 1
+    rig.state(None)
+    await rig.ask("send_goal", goal(4.0))
+    rig.floor.answers = [Answer("the robot has another mission", "mission_changed")]
+    assert (await rig.ask("cancel_goal", everything))[4] == 0
+    assert [request.method for request in rig.floor.asked] == ["PUT", "DELETE"]
+    assert status(await rig.ask("get_result", b"\0\1\0\0" + GOAL)) == 5
+
+
+async def test_goal_whose_answer_is_lost_is_sent_once_more_by_the_same_key(rig):
+    rig.floor.answers = [Answer("the floor can't be reached")]
+    assert (await rig.ask("send_goal", goal(4.0)))[4] == 1
+    first, second = rig.floor.asked
+    assert first.headers["Idempotency-Key"] == second.headers["Idempotency-Key"]
+
+
+async def test_cancellation_waits_for_the_goal_that_is_under_way(rig, until):
+    rig.floor.open.clear()
+    sent = asyncio.create_task(rig.ask("send_goal", goal(4.0)))
+    await until(lambda: rig.floor.asked, "the goal is under way", str)
+    canceled = asyncio.create_task(rig.ask("cancel_goal", b"\0\1\0\0" + bytes(24)))
+    await until(lambda: rig.fleet._waiting == 2, "the cancellation has arrived", str)
+    rig.floor.open.set()
+    assert (await sent)[4] == 1
+    answer = await canceled
+    assert (answer[4], answer[12:28]) == (0, GOAL)
+
+
+async def test_one_request_to_all_robots_and_one_of_many_bytes_are_refused(rig):
+    await rig.ask("send_goal", goal(4.0))
+
+    def ask(key: str, payload: bytes) -> list[bool]:
+        return [reply.ok is None for reply in rig.other.get(key, payload=payload, timeout=10.0)]
+
+    action = "navigate_to_pose/_action/send_goal"
+    assert all(await asyncio.to_thread(ask, f"*/{action}", goal(4.0)))
+    assert await asyncio.to_thread(ask, f"r_1/{action}", bytes(5000)) == [True]
+    assert len(rig.floor.asked) == 1
 
 
 async def test_free_fleets_own_programs_drive_a_robot(rig, tmp_path, ros_router, until):

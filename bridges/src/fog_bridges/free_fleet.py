@@ -2,6 +2,9 @@
 
 Plain CDR, no attachment: `ROBOT/tf`, `ROBOT/battery_state`, and the action `ROBOT/navigate_to_pose/_action/...` with
 goal, result, cancellation and feedback. Source: free_fleet@002505fd, its adapter for Nav2 and its example programs.
+
+What an operator of Fognav does wins: a robot that waits for one, or has a mission of one, takes no goal, and a
+cancellation ends missions of this bridge only.
 """
 
 from __future__ import annotations
@@ -10,6 +13,7 @@ import asyncio
 from dataclasses import dataclass
 from functools import partial
 from typing import TYPE_CHECKING, Any, Final
+from uuid import uuid4
 
 import numpy as np
 import zenoh
@@ -41,9 +45,15 @@ SPEED_M_S: Final = 0.3
 SEEN_S: Final = 5.0
 """A mission that its robot has not heard of for so long counts as ended if the robot has none."""
 WAITING_MAX: Final = 50
+REQUEST_MAX: Final = 4096
+"""A longer request (bytes) is refused unread."""
 RETRY_S: Final = 1.0
 _NO_GOAL: Final = bytes(16)
 _NO_ROUTER: Final = "free_fleet's router is not connected"
+_UNCERTAIN: Final = ("", "service_silent", "store_uncertain")
+"""Problems of requests that may have been carried out."""
+_GONE: Final = ("no_mission", "mission_changed")
+_SECONDS_MAX: Final = 2**31 - 1
 _ACTION: Final = "navigate_to_pose/_action"
 _log = logs.get("free_fleet")
 
@@ -68,7 +78,7 @@ class Mission:
         if state.goal_id == self.mission:
             self.is_seen = True
             self.status = SUCCEEDED if state.goal_reached else EXECUTING
-        elif self.is_seen or (state.goal_id is None and now - self.begun > SEEN_S):
+        elif self.is_seen or now - self.begun > SEEN_S:
             self.status = CANCELED  # by an operator, or for another goal
 
 
@@ -133,6 +143,8 @@ class Fleet:
         self._poses: dict[str, RobotPose] = {}
         self._states: dict[str, RobotState] = {}
         self._missions: dict[str, Mission] = {}
+        self._locks: dict[str, asyncio.Lock] = {}
+        """A robot's goals and cancellations are carried out one after the other."""
         self._waiting = 0
 
     def on_pose(self, robot: str, pose: RobotPose) -> None:
@@ -145,6 +157,7 @@ class Fleet:
         """Tell a robot's battery, and follow its mission."""
         self._states[robot] = state
         if robot not in self._held:
+            self._locks[robot] = asyncio.Lock()
             served: dict[str, Callable[[str, bytes], Awaitable[bytes]]] = {
                 "send_goal": self._send_goal, "get_result": self._get_result, "cancel_goal": self._cancel,
             }  # fmt: skip
@@ -177,10 +190,13 @@ class Fleet:
             self._put(robot, f"{_ACTION}/feedback", told, "fognav_msgs/msg/GoalFeedback")
 
     def _put(self, robot: str, name: str, message: RosMessage, kind: str) -> None:
-        self._session.put(
-            f"{ros.ros_name(robot)}/{name}", bytes(TYPES.serialize_cdr(message, kind)),
-            congestion_control=zenoh.CongestionControl.DROP,
-        )  # fmt: skip
+        try:
+            self._session.put(
+                f"{ros.ros_name(robot)}/{name}", bytes(TYPES.serialize_cdr(message, kind)),
+                congestion_control=zenoh.CongestionControl.DROP,
+            )  # fmt: skip
+        except zenoh.ZError as error:
+            self._limited.warning("message_dropped", name, self._clock.now(), robot=robot, reason=str(error))
 
     # --- Goals ------------------------------------------------------------------------------------------------------
 
@@ -188,9 +204,17 @@ class Fleet:
         self, robot: str, name: str, answer: Callable[[str, bytes], Awaitable[bytes]], query: zenoh.Query
     ) -> None:
         """Take a request, on a thread of zenoh."""
-        payload = b"" if query.payload is None else query.payload.to_bytes()
         if self._loop.is_closed():
             return
+        if "*" in str(query.key_expr):  # it asks every robot at once
+            self._refuse("wildcard", robot, name, f"{query.key_expr}: name one robot")
+            query.reply_err(b"name one robot")
+            return
+        if query.payload is not None and len(query.payload) > REQUEST_MAX:
+            self._refuse("too_long", robot, name, f"{len(query.payload)} bytes, and {REQUEST_MAX} is the limit")
+            query.reply_err(b"too long")
+            return
+        payload = b"" if query.payload is None else query.payload.to_bytes()
         if self._waiting >= WAITING_MAX:
             self._refuse("too_many", robot, name, f"{WAITING_MAX} requests wait already")
             query.reply_err(b"too many requests wait")
@@ -227,14 +251,31 @@ class Fleet:
             raise WireError(f"a goal at ({x}, {y})")
         theta = ros.heading(asked.pose.pose.orientation)
         pose = {"x": x, "y": y} | ({} if theta is None else {"theta": theta})
-        told = await self._floor.ask(Request("PUT", f"/api/v1/robots/{robot}/goal", {"pose": pose}))
+        async with self._locks[robot]:
+            refusal = await self._begin_mission(robot, bytes(asked.goal_id), pose)
+        if refusal:
+            self._refuse("goal", robot, "send_goal", refusal)
+        accepted = ros.message("fognav_msgs/msg/GoalAccepted", accepted=not refusal, stamp=self._time())
+        return bytes(TYPES.serialize_cdr(accepted, "fognav_msgs/msg/GoalAccepted"))
+
+    async def _begin_mission(self, robot: str, goal: bytes, pose: dict[str, float]) -> str:
+        """Begin a mission in the place of this bridge's own, never of another's; return why not, empty if it has."""
+        state, own = self._states[robot], self._missions.get(robot)
+        if not state.enabled or state.awaits_operator:
+            # It would wait, and drive off when an operator enables the robot for something else.
+            return "the robot waits for an operator of Fognav, who enables it: send the goal again then"
+        replaces = own is not None and own.status == EXECUTING
+        condition = {"If-Match": f'"{own.mission}"'} if own is not None and replaces else {"If-None-Match": "*"}
+        headers = condition | {"Idempotency-Key": uuid4().hex}
+        request = Request("PUT", f"/api/v1/robots/{robot}/goal", {"pose": pose}, headers)
+        told = await self._floor.ask(request)
+        if told.refusal and told.problem in _UNCERTAIN:
+            told = await self._floor.ask(request)  # by the same key: carried out once
         goal_id = None if told.refusal else told.body.get("goal_id")
         if goal_id is None:
-            self._refuse("goal", robot, "send_goal", told.refusal or "the floor's answer names no mission")
-        else:
-            self._missions[robot] = Mission(bytes(asked.goal_id), str(goal_id), self._clock.now())
-        accepted = ros.message("fognav_msgs/msg/GoalAccepted", accepted=goal_id is not None, stamp=self._time())
-        return bytes(TYPES.serialize_cdr(accepted, "fognav_msgs/msg/GoalAccepted"))
+            return told.refusal or "the floor's answer names no mission"
+        self._missions[robot] = Mission(goal, str(goal_id), self._clock.now())
+        return ""
 
     async def _get_result(self, robot: str, data: bytes) -> bytes:
         """Tell a goal's state at once: whoever asked would wait for nothing else meanwhile, and asks again."""
@@ -249,23 +290,35 @@ class Fleet:
     async def _cancel(self, robot: str, data: bytes) -> bytes:
         """End a robot's mission: the one that is named, or, with an id of zeros, whichever this bridge has begun."""
         asked = bytes(decoded_as("fognav_msgs/msg/GoalInfo", data).goal_id)
-        mission, code, ended = self._missions.get(robot), CANCEL_NONE, []
-        if mission is None or mission.status != EXECUTING or asked not in (_NO_GOAL, mission.goal):
-            code = CANCEL_NONE if asked == _NO_GOAL else CANCEL_UNKNOWN_GOAL
-        elif refusal := await self._floor.send(Request("DELETE", f"/api/v1/robots/{robot}/goal")):
-            self._refuse("goal", robot, "cancel_goal", refusal)
-            code = CANCEL_REJECTED
-        else:
-            mission.status = CANCELED
-            goal = np.frombuffer(mission.goal, np.uint8)
-            ended = [ros.message("fognav_msgs/msg/GoalInfo", goal_id=goal, stamp=self._time())]
+        async with self._locks[robot]:
+            code, ended = await self._end_mission(robot, asked)
         told = ros.message("fognav_msgs/msg/GoalsCanceled", return_code=code, goals_canceling=ended)
         return bytes(TYPES.serialize_cdr(told, "fognav_msgs/msg/GoalsCanceled"))
+
+    async def _end_mission(self, robot: str, asked: bytes) -> tuple[int, list[RosMessage]]:
+        """End the mission of this bridge that is meant; return a code of action_msgs/CancelGoal, and what has ended."""
+        mission, state = self._missions.get(robot), self._states[robot]
+        if mission is None or mission.status != EXECUTING or asked not in (_NO_GOAL, mission.goal):
+            if asked != _NO_GOAL:
+                return CANCEL_UNKNOWN_GOAL, []
+            if state.goal_id is None or state.goal_reached:
+                return CANCEL_NONE, []
+            self._refuse("goal", robot, "cancel_goal", "it drives for somebody else: an operator of Fognav ends that")
+            return CANCEL_REJECTED, []
+        condition = {"If-Match": f'"{mission.mission}"'}
+        told = await self._floor.ask(Request("DELETE", f"/api/v1/robots/{robot}/goal", headers=condition))
+        if told.refusal and told.problem not in _GONE:
+            self._refuse("goal", robot, "cancel_goal", told.refusal)
+            return CANCEL_REJECTED, []
+        mission.status = CANCELED
+        goal = np.frombuffer(mission.goal, np.uint8)
+        return CANCEL_NONE, [ros.message("fognav_msgs/msg/GoalInfo", goal_id=goal, stamp=self._time())]
 
     def _time(self) -> RosMessage:
         return ros.header(self._clock.stamp()).stamp
 
 
 def _duration(seconds: float) -> RosMessage:
-    whole = max(0, int(seconds))
-    return ros.message("builtin_interfaces/msg/Duration", sec=whole, nanosec=int(max(0.0, seconds - whole) * 1e9))
+    seconds = min(max(0.0, seconds), _SECONDS_MAX)
+    whole = int(seconds)
+    return ros.message("builtin_interfaces/msg/Duration", sec=whole, nanosec=int((seconds - whole) * 1e9))

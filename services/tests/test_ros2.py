@@ -36,7 +36,7 @@ from fog_bridges.ros2.bridge import (
     TF_TYPE,
     Relay,
 )
-from fog_bridges.ros2.others import Others, robot_radii
+from fog_bridges.ros2.others import OBSTACLES_MAX, Others, robot_radii
 from fog_bridges.ros2.rmf import GraphError, Traffic, read_graph
 from fog_bridges.ros2.session import RosSession, ros_config
 from fog_bridges.ros2.wire import TYPES, Attachment, Node, Topic, WireError, Writer, decoded, type_hash
@@ -174,14 +174,17 @@ class Floor:
 
     site = "test"
 
-    def __init__(self) -> None:
+    def __init__(self, level: str = "") -> None:
         self.clock = ManualClock(100.0)
         self.hear: dict[Any, Any] = {}
         self.reported: list[tuple[str, Reported]] = []
         self.snapshot: MapSnapshot | None = None
         """The answer to who asks for the map; None: none comes."""
         self.told: dict[str, list[Any]] = {}
-        self.relay = Relay(cast("Any", self), cast("Any", self), cast("Any", None), self.clock, Others({"tb4": 0.2}))
+        self.refused: list[str] = []
+        self.relay = Relay(
+            cast("Any", self), cast("Any", self), cast("Any", None), self.clock, Others({"tb4": 0.2}, level)
+        )
         self.relay.subscribe()
 
     def subscribe(self, what: Any, second: Any, third: Any = None) -> None:
@@ -199,6 +202,9 @@ class Floor:
             self.reported.append((thing, message))
         else:
             self.told.setdefault(topic.name.removeprefix("fognav/test/"), []).append(message)
+
+    def refuse(self, reason: str, _topic: str, words: str) -> None:
+        self.refused.append(f"{reason}: {words}")
 
     async def show(self, master: MasterMap) -> None:
         """Let the relay have a map, and tell its masks."""
@@ -414,12 +420,72 @@ def test_obstacles_of_others_are_reported_for_their_lifetime_and_deleted():
     hear(obstacles(obstacle(3, action=2), obstacle(0, action=3)))
     assert [(thing, told.shape) for thing, told in floor.reported[2:]] == [(first[0], None), (second[0], None)]
     for wrong in (obstacle(3, size=float("nan")), obstacle(3, size=50.0), obstacle(3, action=9)):
-        with pytest.raises(WireError):
-            hear(obstacles(wrong))
-    for number in range(200):
+        hear(obstacles(wrong))
+    assert (len(floor.refused), len(floor.reported)) == (3, 4)
+    for number in range(OBSTACLES_MAX):
         hear(obstacles(obstacle(number)))
-    with pytest.raises(WireError, match="200 obstacles"):
-        hear(obstacles(obstacle(200)))
+    hear(obstacles(obstacle(OBSTACLES_MAX)))
+    assert floor.refused[3:] == [f"too_many: {OBSTACLES_MAX} obstacles are there already"]
+    with pytest.raises(WireError, match="in one message"):
+        hear(obstacles(*[obstacle(number) for number in range(OBSTACLES_MAX + 1)]))
+
+
+def test_an_obstacle_that_is_none_hides_no_other_and_those_of_another_level_are_left_out():
+    floor = Floor(level="L1")
+    hear = floor.hear["rmf_obstacles"]
+    hear(obstacles(obstacle(1), obstacle(2, size=0.0), obstacle(3, level="L2"), obstacle(4, level="L1")))
+    assert (len(floor.reported), len(floor.refused)) == (2, 1)
+    hear(obstacles(obstacle(1, size=2.0)))
+    assert len(floor.reported) == 2, "five times a second each, at most"
+    floor.clock.advance(0.3)
+    hear(obstacles(obstacle(1, size=2.0)))
+    assert len(floor.reported) == 3
+
+
+def test_frames_that_nobody_speaks_of_any_more_leave_room_for_the_base():
+    floor = Floor()
+    floor.hear["tb4/tf"](transforms(*[("map", f"joint{number}", 0.0, 0.0, 0.0) for number in range(200)]))
+    base = transforms(("map", "base_link", 2.0, 1.0, 0.0))
+    floor.hear["tb4/tf"](base)
+    assert floor.reported == []
+    floor.clock.advance(4.0)
+    floor.hear["tb4/tf"](base)
+    assert floor.reported[0][1].shape.centre == (2.0, 1.0)
+    with pytest.raises(WireError, match="letters"):
+        floor.hear["tb4/tf"](transforms(("map", "j" * 500, 0.0, 0.0, 0.0)))
+
+
+async def test_what_stands_where_a_robot_of_others_was_is_on_the_mask_again():
+    floor = Floor()
+    geometry = GridGeometry(40, 40, 0.05, 0.0, 0.0)
+    cost = np.zeros((40, 40), np.uint8)
+    cost[16:24, 16:24] = 254
+    floor.hear["tb4/amcl_pose"](stamped(ros.pose(1.0, 1.0, 0.0)))
+    master = MasterMap("test", geometry, np.zeros((40, 40), np.uint8), cost, 1)
+    await floor.show(master)
+    assert whole(floor.told["keepout_mask"][-1], 40, 40)[20, 20] == 0
+    loop = asyncio.create_task(floor.relay.map_loop())
+    await floor.pass_s(5.0)
+    loop.cancel()
+    assert whole(floor.told["keepout_mask"][-1], 40, 40)[20, 20] == 100
+
+
+def test_robot_that_waits_for_an_operator_takes_no_goal():
+    floor = Floor()
+    state = RobotState(
+        mode="NORMAL", reasons=[], enabled=True, battery=None, goal_id=None, map_epoch=0, map_seq=0, plan_id=None
+    )
+    goal = ros.message("geometry_msgs/msg/PoseStamped", header=ros.header(1.0), pose=ros.pose(1.0, 1.0, 0.0))
+    floor.hear[ch.ROBOT_STATE]({"robot": "r-1"}, state)
+    floor.hear["r_1/goal_pose"](goal)
+    for stopped in (
+        msgspec.structs.replace(state, enabled=False),
+        msgspec.structs.replace(state, awaits_operator=True),
+    ):
+        floor.hear[ch.ROBOT_STATE]({"robot": "r-1"}, stopped)
+        with pytest.raises(WireError, match="enables it"):
+            floor.hear["r_1/goal_pose"](goal)
+    assert floor.relay._goals.qsize() == 1
 
 
 GRAPH = """
@@ -597,7 +663,7 @@ async def test_zone_is_on_the_mask_of_a_late_joiner_and_goes_again_and_goals_rea
                 x=1.0, y=1.0, theta=0.0, covariance=[0.01] * 9, v=0.0, w=0.0, radius=0.17, height=0.2, stamp=time.time()
             )
             state = RobotState(
-                mode="HOLD", reasons=[], enabled=False, battery=0.5, goal_id=None, map_epoch=0, map_seq=0, plan_id=None
+                mode="HOLD", reasons=[], enabled=True, battery=0.5, goal_id=None, map_epoch=0, map_seq=0, plan_id=None
             )
             peer.hear("r_1/pose", "geometry_msgs/msg/PoseWithCovarianceStamped", "*/*")
 

@@ -150,6 +150,8 @@ class Fleet:
     def on_pose(self, robot: str, pose: RobotPose) -> None:
         """Tell where a robot is, in frames without its name: free_fleet adds that."""
         self._poses[robot] = pose
+        if not pose.localized:
+            return  # no place is better than a wrong one
         told = ros.transform(pose.x, pose.y, pose.theta, "base_footprint", pose.stamp)
         self._put(robot, "tf", told, "tf2_msgs/msg/TFMessage")
 

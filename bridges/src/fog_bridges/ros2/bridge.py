@@ -59,6 +59,7 @@ TICK_S: Final = 0.1
 SNAPSHOT_TIMEOUT_S: Final = 3.0
 RETRY_S: Final = 1.0
 _NO_ROUTER: Final = "ROS's router (`ros2 run rmw_zenoh_cpp rmw_zenohd`) is not connected"
+_STOPPED: Final = "the robot waits for an operator of Fognav, who enables it: send the goal again then"
 GOALS_AT_ONCE: Final = 20
 GOAL_MAX_AGE_S: Final = 10.0
 """An older goal is refused: who sent it may have forgotten it."""
@@ -110,7 +111,8 @@ class Ros2Bridge:
         )
         try:
             async with opened as fog, asyncio.TaskGroup() as tasks:
-                relay = Relay(fog, session, floor, clock, Others(self._others), self._traffic)
+                level = "" if self._traffic is None else self._traffic.level
+                relay = Relay(fog, session, floor, clock, Others(self._others, level), self._traffic)
                 relay.subscribe()
                 tasks.create_task(relay.snapshot_loop(), name="snapshot")
                 tasks.create_task(relay.map_loop(), name="map")
@@ -184,6 +186,8 @@ class Relay:
         self._closed: NDArray[np.bool_] | None = None
         self._driving: dict[str, str | None] = {}
         """The goal that each robot has, by its last state."""
+        self._stopped: set[str] = set()
+        """Robots that wait for an operator: a goal would wait, too, and drive them off when somebody enables them."""
         self._goals: asyncio.Queue[tuple[str, float, Request]] = asyncio.Queue(GOALS_AT_ONCE)
 
     def subscribe(self) -> None:
@@ -213,6 +217,8 @@ class Relay:
     async def map_loop(self) -> None:
         """Tell what has changed, and what has become old: also while a snapshot is waited for."""
         async for _ in ticker(self._clock, TICK_S):
+            if self._others.moves_away(self._now()):
+                self._dirty.add(self._keepout)
             self._tell_masks()
 
     async def goal_loop(self) -> None:
@@ -222,6 +228,8 @@ class Relay:
             waited = self._now() - arrived
             if waited > GOAL_MAX_AGE_S:
                 self._session.refuse("old", f"{robot}/goal_pose", f"it has waited for {waited:.0f} s: send it again")
+            elif robot in self._stopped:
+                self._session.refuse("goal", f"{robot}/goal_pose", _STOPPED)
             elif refusal := await self._floor.send(request):
                 self._session.refuse("goal", f"{robot}/goal_pose", refusal)
 
@@ -306,7 +314,7 @@ class Relay:
         if self._others.radii:
             if self._closed is None:
                 self._closed = ros.closed_cells(self._hazards.values(), self._in_force(), geometry)
-            mask = self._others.without_robots(mask, geometry, self._closed, self._now())
+            mask = self._others.without_robots(mask, geometry, self._closed)
         if self._penalties is None:
             self._penalties = ros.penalty_values(self._in_force(), geometry)
         return np.maximum(mask, self._penalties) if self._penalties.size else mask
@@ -355,6 +363,7 @@ class Relay:
         if robot not in self._driving:
             goal = Topic(f"{ros.ros_name(robot)}/goal_pose", GOAL_TYPE)
             self._session.subscribe(goal, partial(self._on_goal, robot), GOAL_MAX_AGE_S)
+        (self._stopped.discard if state.enabled and not state.awaits_operator else self._stopped.add)(robot)
         goal_id = None if state.goal_reached else state.goal_id
         if goal_id is None and self._driving.get(robot) is not None:
             self._tell(robot, "plan", "nav_msgs/msg/Path", ros.path(None, self._stamp()))
@@ -363,6 +372,8 @@ class Relay:
 
     def _on_pose(self, ids: Mapping[str, str], pose: RobotPose) -> None:
         robot = ids["robot"]
+        if not pose.localized:
+            return  # no place is better than a wrong one
         self._session.publish(
             Topic("tf", "tf2_msgs/msg/TFMessage"),
             ros.transform(pose.x, pose.y, pose.theta, f"{ros.ros_name(robot)}/base_footprint", pose.stamp),
@@ -391,6 +402,8 @@ class Relay:
             raise WireError(f"a goal in the frame {frame!r}: send it in {ros.MAP_FRAME!r}", "frame")
         if not np.isfinite((x, y)).all():
             raise WireError(f"a goal at ({x}, {y})")
+        if robot in self._stopped:
+            raise WireError(_STOPPED, "goal")
         pose = {"x": x, "y": y} | ({} if theta is None else {"theta": theta})
         request = Request("PUT", f"/api/v1/robots/{robot}/goal", {"pose": pose})
         try:
@@ -407,7 +420,10 @@ class Relay:
         self._report(thing_id(name), self._others.on_transforms(name, told, self._now()))
 
     def _on_obstacles(self, told: RosMessage) -> None:
-        for thing, report in self._others.on_obstacles(told, self._now()):
+        def refuse(error: WireError) -> None:
+            self._session.refuse(error.reason, "rmf_obstacles", str(error))
+
+        for thing, report in self._others.on_obstacles(told, self._now(), refuse):
             self._report(thing, report)
 
     def _report(self, thing: str, report: Reported | None) -> None:

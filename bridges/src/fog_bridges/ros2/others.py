@@ -19,7 +19,7 @@ from fog_contracts.messages import CircleShape, PolygonShape, Reported
 from fog_contracts.shapes import shape_spans
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator, Mapping
+    from collections.abc import Callable, Iterator, Mapping
 
     import numpy as np
     from numpy.typing import NDArray
@@ -34,10 +34,12 @@ LIFETIME_S: Final = 60.0
 """An obstacle lasts for its lifetime, and so long at most: who still sees it sends it again."""
 SIZE_MAX_M: Final = 20.0
 RADIUS_MAX_M: Final = 1.0
-OBSTACLES_MAX: Final = 200
+OBSTACLES_MAX: Final = 150
+"""The map takes 200 things: some are left for robots."""
 OWN_SOURCE: Final = "fognav"
 """The source of the obstacles that this bridge tells others of."""
 _FRAMES_MAX: Final = 200
+_FRAME_NAME_MAX: Final = 200
 _DEPTH_MAX: Final = 8
 _BASES: Final = ("base_footprint", "base_link")
 _ADD, _DELETE, _DELETE_ALL = 1, 2, 3
@@ -80,6 +82,12 @@ class _Transform(NamedTuple):
     """When it arrived (s, monotonic)."""
 
 
+class _Obstacle(NamedTuple):
+    source: str
+    end: float
+    told: float
+
+
 class Others:
     """Robots of others by their namespaces, and obstacles; times are those of a monotonic clock (s)."""
 
@@ -90,8 +98,7 @@ class Others:
         self._frames: dict[str, dict[str, _Transform]] = {name: {} for name in radii}
         self._reported: dict[str, float] = {}
         self._trails: dict[str, deque[tuple[float, CircleShape]]] = {name: deque(maxlen=_TRAIL) for name in radii}
-        self._obstacles: dict[str, tuple[str, float]] = {}
-        """Source and end of each obstacle."""
+        self._obstacles: dict[str, _Obstacle] = {}
 
     # --- Robots -----------------------------------------------------------------------------------------------------
 
@@ -104,11 +111,16 @@ class Others:
     def on_transforms(self, name: str, told: RosMessage, now: float) -> Reported | None:
         """Return the report of a robot whose transforms lead from `map` to its base; None while they don't."""
         frames = self._frames[name]
+        if len(frames) + len(told.transforms) > _FRAMES_MAX:
+            frames = {child: found for child, found in frames.items() if now - found.at <= OTHERS_MAX_AGE_S}
+            self._frames[name] = frames
         if len(told.transforms) > _FRAMES_MAX:
             raise WireError(f"{len(told.transforms)} transforms in one message, and {_FRAMES_MAX} is the limit")
         for each in told.transforms:
             child, parent = _bare(each.child_frame_id, name), _bare(each.header.frame_id, name)
             moved, turned = each.transform.translation, heading(each.transform.rotation)
+            if max(len(child), len(parent)) > _FRAME_NAME_MAX:
+                raise WireError(f"a frame with a name of {max(len(child), len(parent))} letters")
             if turned is None or not _is_finite(moved.x, moved.y, turned):
                 raise WireError(f"the transform of {child[:40]!r} is none")
             if child in frames or len(frames) < _FRAMES_MAX:
@@ -138,15 +150,22 @@ class Others:
         self._trails[name].append((now, shape))
         return Reported(kind="robot", shape=shape, ttl=OTHERS_MAX_AGE_S, theta=theta)
 
+    def moves_away(self, now: float) -> bool:
+        """Forget where robots were when the map has forgotten it, too; return whether there was anything to forget."""
+        gone = False
+        for trail in self._trails.values():
+            while trail and now - trail[0][0] > OTHERS_MAX_AGE_S + 1.0:
+                trail.popleft()
+                gone = True
+        return gone
+
     def without_robots(
-        self, mask: NDArray[np.int8], geometry: GridGeometry, closed: NDArray[np.bool_], now: float
+        self, mask: NDArray[np.int8], geometry: GridGeometry, closed: NDArray[np.bool_]
     ) -> NDArray[np.int8]:
         """Return a mask without what is blocked by robots of others alone; hazards and zones (`closed`) stay."""
         result = mask
         for name, trail in self._trails.items():
-            for at, shape in trail:
-                if now - at > OTHERS_MAX_AGE_S + 1.0:
-                    continue
+            for _, shape in trail:
                 grown = CircleShape(centre=shape.centre, radius=self.radii[name] + _AROUND_M)
                 window, disc = shape_spans(grown, geometry).to_mask()
                 result = result.copy() if result is mask else result
@@ -156,30 +175,41 @@ class Others:
 
     # --- Obstacles --------------------------------------------------------------------------------------------------
 
-    def on_obstacles(self, told: RosMessage, now: float) -> Iterator[tuple[str, Reported]]:
-        """Yield the reports of obstacles with their ids; raises `WireError` at the first that is none."""
-        self._obstacles = {thing: (source, end) for thing, (source, end) in self._obstacles.items() if end > now}
+    def on_obstacles(
+        self, told: RosMessage, now: float, refuse: Callable[[WireError], object]
+    ) -> Iterator[tuple[str, Reported]]:
+        """Yield the reports of obstacles with their ids, and `refuse` those that are none; raises `WireError`."""
+        if len(told.obstacles) > OBSTACLES_MAX:
+            raise WireError(f"{len(told.obstacles)} obstacles in one message, and {OBSTACLES_MAX} is the limit")
+        self._obstacles = {thing: known for thing, known in self._obstacles.items() if known.end > now}
         for each in told.obstacles:
             if each.source.startswith(OWN_SOURCE) or (self._level and each.level_name not in ("", self._level)):
                 continue
             thing = f"rmf-{zlib.crc32(each.source.encode()):08x}-{each.id & 0xFFFF_FFFF}"
-            if each.action == _DELETE_ALL:
-                for known in [known for known, (source, _) in self._obstacles.items() if source == each.source]:
-                    yield known, self._gone(known)
-            elif each.action == _DELETE:
-                yield thing, self._gone(thing)
-            elif each.action == _ADD:
-                yield thing, self._added(thing, each, told.header.frame_id, now)
-            else:
-                raise WireError(f"an obstacle with the action {each.action}")
+            try:
+                if each.action == _DELETE_ALL:
+                    for known in [name for name, found in self._obstacles.items() if found.source == each.source]:
+                        yield known, self._gone(known)
+                elif each.action == _DELETE:
+                    yield thing, self._gone(thing)
+                elif each.action != _ADD:
+                    raise WireError(f"an obstacle with the action {each.action}")  # noqa: TRY301  # counted as the others
+                elif (added := self._added(thing, each, told.header.frame_id, now)) is not None:
+                    yield thing, added
+            except WireError as error:
+                refuse(error)
 
-    def _added(self, thing: str, told: RosMessage, frame: str, now: float) -> Reported:
+    def _added(self, thing: str, told: RosMessage, frame: str, now: float) -> Reported | None:
+        """Return the report of an obstacle, None if it is too early for one."""
         _check_frame(told.header.frame_id or frame)
         centre, size = told.bbox.center, told.bbox.size
         x, y, width, height = centre.position.x, centre.position.y, size.x, size.y
         if not _is_finite(x, y) or not (0.0 < width <= SIZE_MAX_M and 0.0 < height <= SIZE_MAX_M):
             raise WireError(f"an obstacle of {width} x {height} m at ({x}, {y})")
-        if thing not in self._obstacles and len(self._obstacles) >= OBSTACLES_MAX:
+        known = self._obstacles.get(thing)
+        if known is not None and now - known.told < PERIOD_S:
+            return None
+        if known is None and len(self._obstacles) >= OBSTACLES_MAX:
             raise WireError(f"{OBSTACLES_MAX} obstacles are there already", "too_many")
         theta = heading(centre.orientation) or 0.0
         cos, sin = math.cos(theta), math.sin(theta)
@@ -187,7 +217,7 @@ class Others:
         points = [(x + cos * dx - sin * dy, y + sin * dx + cos * dy) for dx, dy in corners]
         lifetime = told.lifetime.sec + told.lifetime.nanosec / 1e9
         ttl = min(lifetime, LIFETIME_S) if lifetime > 0.0 else LIFETIME_S
-        self._obstacles[thing] = told.source, now + ttl
+        self._obstacles[thing] = _Obstacle(told.source, now + ttl, now)
         return Reported(kind="obstacle", shape=PolygonShape(points=points), ttl=ttl)
 
     def _gone(self, thing: str) -> Reported:

@@ -60,6 +60,8 @@ def read_graph(file: Path, level: str) -> list[Lane]:
         first = 0
         for name, each in levels.items():
             if name == level:
+                if any(not 0 <= end < len(each["vertices"]) for lane in each["lanes"] for end in lane[:2]):
+                    raise GraphError(f"{file} is no navigation graph: a lane of {level!r} has an end that is no vertex")
                 points = [(float(vertex[0]), float(vertex[1])) for vertex in each["vertices"]]
                 return [Lane(first + i, points[lane[0]], points[lane[1]]) for i, lane in enumerate(each["lanes"])]
             first += len(each["lanes"])
@@ -77,7 +79,7 @@ class Traffic:
 
     def __init__(self, lanes: Sequence[Lane], fleets: Sequence[str], level: str) -> None:
         """`fleets` drive on these lanes, which are on the building's `level`."""
-        self.lanes, self.fleets, self._level = lanes, fleets, level
+        self.lanes, self.fleets, self.level = lanes, fleets, level
         self._geometry: GridGeometry | None = None
         self._cells: dict[int, NDArray[np.int64]] = {}
         self._closed: set[int] = set()
@@ -162,7 +164,7 @@ class Traffic:
         left, bottom, right, top = box
         return ros.message(
             "rmf_obstacle_msgs/msg/Obstacle", header=ros.header(stamp), id=number, source=OWN_SOURCE,
-            level_name=self._level, classification=kind, data_resolution=0.0, data=np.zeros(0, np.int8), action=action,
+            level_name=self.level, classification=kind, data_resolution=0.0, data=np.zeros(0, np.int8), action=action,
             bbox=ros.message(
                 "rmf_obstacle_msgs/msg/BoundingBox3D",
                 center=ros.pose(0.5 * (left + right), 0.5 * (bottom + top), 0.0, z=0.5),

@@ -22,8 +22,10 @@ if TYPE_CHECKING:
 _RETRY: Final = {"period_init_ms": 200, "period_max_ms": 1000, "period_increase_factor": 1.5}
 WAITING_MAX: Final = 1000
 """Messages that wait to be read; further ones are counted, and lost."""
-BYTES_MAX: Final = 1024 * 1024
-"""A longer message is refused unread."""
+WAITING_BYTES: Final = 4 * 1024 * 1024
+"""So do messages beyond so many bytes."""
+BYTES_MAX: Final = 64 * 1024
+"""A longer message is refused unread: to read one of 1 MiB would take 0.1 s, in which nothing else is done."""
 
 _log = logs.get("ros2")
 
@@ -60,7 +62,7 @@ class RosSession:
         """Introduce the node `name`."""
         self._session = session
         self._clock = clock
-        self._waiting = 0
+        self._waiting = self._waiting_bytes = 0
         self._loop = asyncio.get_running_loop()
         self._domain = domain
         self._node = Node(domain, str(self._session.info.zid()), name)
@@ -108,13 +110,16 @@ class RosSession:
         def on_sample(sample: zenoh.Sample) -> None:
             if self._loop.is_closed():
                 return
-            if self._waiting >= WAITING_MAX or len(sample.payload) > BYTES_MAX:
-                reason = "too_many" if self._waiting >= WAITING_MAX else "too_long"
-                self.refuse(reason, topic.name, f"more than {WAITING_MAX} messages wait, or one has over 1 MiB")
+            length = len(sample.payload)
+            if length > BYTES_MAX:
+                self.refuse("too_long", topic.name, f"{length} bytes, and {BYTES_MAX} is the limit")
+                return
+            if self._waiting >= WAITING_MAX or self._waiting_bytes + length > WAITING_BYTES:
+                self.refuse("too_many", topic.name, f"{self._waiting} messages wait")
                 return
             attachment = None if sample.attachment is None else sample.attachment.to_bytes()
             arrived = (str(sample.key_expr), sample.payload.to_bytes(), attachment)
-            self._waiting += 1
+            self._waiting, self._waiting_bytes = self._waiting + 1, self._waiting_bytes + length
             self._loop.call_soon_threadsafe(self._on_sample, topic, handler, max_age_s, *arrived)
 
         self._held.append(self._session.declare_subscriber(topic.any_hash(self._domain), on_sample))
@@ -124,7 +129,7 @@ class RosSession:
         self, topic: Topic, handler: Callable[[RosMessage], object], max_age_s: float | None,
         key: str, payload: bytes, attachment: bytes | None,
     ) -> None:  # fmt: skip
-        self._waiting -= 1
+        self._waiting, self._waiting_bytes = self._waiting - 1, self._waiting_bytes - len(payload)
         try:
             _check_hash(topic.type, key.rpartition("/")[2])
             sent = Attachment.decoded(attachment or b"")

@@ -63,7 +63,8 @@ def ros_name(name: str) -> str:
 def header(stamp: float, frame: str = MAP_FRAME) -> RosMessage:
     """Return a header; `stamp` in s since 1970."""
     seconds = math.floor(stamp)
-    time = message("builtin_interfaces/msg/Time", sec=seconds, nanosec=int((stamp - seconds) * 1e9))
+    # ROS's seconds have 31 bits; at another speed than 1 stamps count from no epoch, and may have more.
+    time = message("builtin_interfaces/msg/Time", sec=seconds % 2**31, nanosec=int((stamp - seconds) * 1e9))
     return message("std_msgs/msg/Header", stamp=time, frame_id=frame)
 
 

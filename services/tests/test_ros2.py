@@ -540,7 +540,7 @@ async def test_hazards_and_zones_are_obstacles_of_open_rmf_until_they_are_gone()
     floor.hear[ch.HAZARD]({"area": "hall"}, HazardArea(hazard=hazard, polygon=ring))
     await floor.show(plan(0, 1))
     (told,) = sent("o", OBSTACLES_TYPE, floor.told["rmf_obstacles"][-1]).obstacles
-    assert (told.source, told.level_name, told.action, told.lifetime.sec) == ("fognav", "L1", 1, 3)
+    assert (told.source, told.level_name, told.action, told.lifetime.sec) == ("fognav/L1", "L1", 1, 3)
     assert (told.bbox.center.position.x, told.bbox.size.x) == pytest.approx((0.075, 0.05))
     clear = msgspec.structs.replace(hazard, state="clear", penalty=0)
     floor.hear[ch.HAZARD]({"area": "hall"}, HazardArea(hazard=clear, polygon=ring))

@@ -78,7 +78,8 @@ class Traffic:
     """Which lanes are closed or slow, and what was told of it; times are those of a monotonic clock (s)."""
 
     def __init__(self, lanes: Sequence[Lane], fleets: Sequence[str], level: str) -> None:
-        """`fleets` drive on these lanes, which are on the building's `level`."""
+        """`fleets` drive on these lanes, which are on the building's `level`; each level has obstacles of its own."""
+        self._source = f"{OWN_SOURCE}/{level}"
         self.lanes, self.fleets, self.level = lanes, fleets, level
         self._geometry: GridGeometry | None = None
         self._cells: dict[int, NDArray[np.int64]] = {}
@@ -163,7 +164,7 @@ class Traffic:
     def _obstacle(self, number: int, box: Box, kind: str, action: int, stamp: float) -> RosMessage:
         left, bottom, right, top = box
         return ros.message(
-            "rmf_obstacle_msgs/msg/Obstacle", header=ros.header(stamp), id=number, source=OWN_SOURCE,
+            "rmf_obstacle_msgs/msg/Obstacle", header=ros.header(stamp), id=number, source=self._source,
             level_name=self.level, classification=kind, data_resolution=0.0, data=np.zeros(0, np.int8), action=action,
             bbox=ros.message(
                 "rmf_obstacle_msgs/msg/BoundingBox3D",

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Final
 from starlette.responses import Response
 from starlette.websockets import WebSocket, WebSocketDisconnect
 from websockets.asyncio.client import ClientConnection, connect
-from websockets.exceptions import ConnectionClosed, InvalidHandshake, InvalidStatus
+from websockets.exceptions import ConnectionClosed, InvalidHandshake, InvalidStatus, InvalidURI
 from websockets.typing import Subprotocol
 
 from fog_runtime.http.problems import RETRY_AFTER, ProblemCode, problem
@@ -52,6 +52,9 @@ class SocketRelay:
             answer = error.response
             kind = answer.headers.get("Content-Type")
             await socket.send_denial_response(Response(bytes(answer.body or b""), answer.status_code, media_type=kind))
+            return
+        except InvalidURI:  # its words have the whole address, in which may be a token
+            await socket.send_denial_response(Response("this is no address of the bridge's", 404))
             return
         except (OSError, TimeoutError, InvalidHandshake) as error:
             detail = (

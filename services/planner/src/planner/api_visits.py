@@ -135,9 +135,11 @@ def _add_operators(
         return [OpenVisit(**about(each), id=each.id, name=each.name) for each in visiting().visits.open]
 
     # After the routes of a visitor's own visit, whose path it would take.
-    @routes.delete("/api/v1/visits/{visit}", raises=[VisitError])
+    @routes.delete("/api/v1/visits/{visit}", raises=[VisitError], problems=[HttpProblem.STANDS_BY])
     async def end_visit(visit: str, caller: Operator) -> None:
         """End a visit; its robot stops, and the visitor reads that the staff need it."""
+        if reason := standby():
+            raise ProblemError(HttpProblem.STANDS_BY, f"{reason}; send the request there")
         visiting().visits.end(visit, visiting().now())
         _log.info("visit_ended", visit=visit, who=caller.name)
         visiting().step()

@@ -11,8 +11,8 @@ from manual_clock import ManualClock
 from vda5050_floor import SETUP, STATE, A, B, C, Floorplan, header, instant, node, order, read
 
 from fog_bridges.floor import Answer, Request
-from fog_bridges.vda5050.bridge import RobotLink
-from fog_bridges.vda5050.robot import REFUSED_S
+from fog_bridges.vda5050.bridge import RobotLink, Vda5050Bridge
+from fog_bridges.vda5050.robot import REFUSED_S, UNSEEN_S
 
 # --- Orders -----------------------------------------------------------------------------------------------------------
 
@@ -126,12 +126,182 @@ def test_mission_that_may_have_been_accepted_is_asked_for_again_by_the_same_key(
     floor = Floorplan()
     floor.take(order(A, B))
     assert floor.drive(Answer("the floor can't be reached")) == ["PUT 4 1"]
-    floor.goal = {"goal_id": "g9"}
+    floor.goal = {"goal_id": "g9", "pose": {"x": 4.0, "y": 1.0, "theta": 0.0}}
     floor.tell(2.0)
     assert floor.said()["operatingMode"] == "AUTOMATIC", "it may be the fleet's own"
     assert floor.drive(Answer("", body=floor.goal)) == ["PUT 4 1"]
     assert floor.asked[0] == floor.asked[1]
     assert (floor.said()["operatingMode"], floor.robot.goal_node) == ("AUTOMATIC", "b")
+
+
+GOAL_B = {"goal_id": "g9", "pose": {"x": 4.0, "y": 1.0, "theta": 0.0}}
+
+
+@pytest.mark.parametrize("word", ["cancel", "operator"])
+def test_mission_that_may_have_been_accepted_and_is_not_wanted_any_more_is_ended_when_it_appears(word):
+    floor = Floorplan()
+    floor.take(order(A, B))
+    assert floor.drive(Answer("the floor can't be reached")) == ["PUT 4 1"]
+    if word == "cancel":
+        floor.robot.on_instant(instant("cancelOrder", "c"), floor.now)
+    floor.tell(2.0, enabled=word == "cancel")
+    assert floor.drive() == [], "asking again might begin it"
+    floor.goal = GOAL_B
+    floor.tell(1.0)
+    assert floor.drive() == ["DELETE"]
+    assert floor.asked[-1].headers == {"If-Match": '"g9"'}
+    floor.tell()
+    assert word == "operator" or actions(floor) == {"c": "FINISHED"}
+
+
+def test_mission_that_may_have_been_accepted_and_never_appears_delays_the_next_order_only():
+    floor = Floorplan()
+    floor.take(order(A, B))
+    floor.drive(Answer("the floor can't be reached"))
+    floor.robot.on_instant(instant("cancelOrder"), floor.now)
+    assert floor.take(order(A, C | {"sequenceId": 2}, name="o2")) == ""
+    floor.tell(2.0)
+    assert floor.drive() == []
+    floor.tell(UNSEEN_S)
+    assert floor.drive() + floor.drive() == ["PUT 7 1"]
+
+
+def test_cancel_ends_the_mission_whose_replacement_may_have_been_accepted_at_once():
+    floor = Floorplan()
+    wide = {"allowedDeviationXY": {"a": 0.5, "b": 0.5, "theta": 0.0}}
+    floor.take(order(A, node("b", 2, 4.0, 1.0, position=wide), C))
+    floor.drive()
+    floor.at(3.8, 1.0, v=0.3)
+    assert floor.drive(Answer("the floor can't be reached")) == ["PUT 7 1"]
+    floor.robot.on_instant(instant("cancelOrder"), floor.now)
+    floor.tell(2.0)
+    assert floor.drive() == ["DELETE"]
+    assert floor.asked[-1].headers == {"If-Match": '"g1"'}
+
+
+def test_operators_mission_is_told_from_one_that_the_fleet_may_have_begun():
+    floor = Floorplan()
+    floor.take(order(A, B))
+    floor.drive(Answer("the floor can't be reached"))
+    floor.goal = {"goal_id": "theirs", "pose": {"x": 9.0, "y": 9.0, "theta": 0.0}}
+    floor.tell(2.0)
+    assert floor.said()["operatingMode"] == "MANUAL"
+    floor.tell(UNSEEN_S)
+    assert floor.drive() == []
+
+
+# --- What the floor tells late, or not at all -------------------------------------------------------------------------
+
+
+def test_mission_that_an_operator_ends_near_its_node_is_not_taken_for_reached():
+    floor = Floorplan()
+    floor.take(order(A, B, C))
+    floor.drive()
+    floor.at(3.8, 1.0)
+    floor.goal = None
+    floor.tell(goal_id=None)
+    assert floor.drive() == [], "the robot's word may come late"
+    floor.tell(UNSEEN_S)
+    assert floor.drive() == []
+    assert floor.errors() == {"ORDER_ENDED": "WARNING"}
+    said = floor.said()
+    assert (said["lastNodeId"], said["nodeStates"], said["operatingMode"]) == ("a", [], "MANUAL")
+
+
+@pytest.mark.parametrize("reached", [True, False])
+def test_end_of_a_mission_is_known_by_the_audit_trail_if_the_state_that_tells_it_was_left_out(reached):
+    floor = Floorplan()
+    floor.take(order(A, B, C))
+    floor.drive()
+    floor.at(3.9, 1.0)
+    floor.goal = None
+    floor.tell(goal_id=None)
+    floor.robot.on_end("g1", floor.now, reached=reached)
+    assert floor.drive() == (["PUT 7 1"] if reached else [])
+    assert floor.errors() == ({} if reached else {"ORDER_ENDED": "WARNING"})
+
+
+def test_order_outlives_a_restart_of_the_console_which_tells_of_the_mission_a_little_later():
+    floor = Floorplan()
+    floor.take(order(A, B, C))
+    floor.drive()
+    floor.now += 60.0
+    floor.robot.forget()
+    floor.robot.on_known(floor.now)
+    floor.robot.on_robot({"state": None, "goal": None}, floor.now)
+    floor.robot.advance(floor.now)
+    goal, floor.goal = floor.goal, None
+    floor.tell(1.0)
+    assert floor.drive() == []
+    floor.goal = goal
+    floor.at(2.0, 1.0)
+    floor.tell(1.0)
+    assert floor.drive() == []
+    assert (floor.errors(), floor.robot.goal_node) == ({}, "b")
+    floor.robot.on_instant(instant("cancelOrder"), floor.now)
+    assert floor.drive() == ["DELETE"]
+
+
+def test_nothing_is_concluded_while_the_floors_state_is_not_known():
+    floor = Floorplan()
+    floor.take(order(A, B))
+    floor.drive()
+    floor.robot.is_known = False
+    goal, floor.goal = floor.goal, None
+    floor.tell(60.0)
+    floor.goal = goal
+    floor.tell(1.0)
+    floor.robot.on_known(floor.now)
+    assert (floor.robot.goal_node, floor.robot.errors()) == ("b", [])
+    floor.robot.is_known = False
+    assert floor.take(order(A, B, name="o2")) == "MOBILE_ROBOT_NOT_AVAILABLE"
+
+
+def test_mission_of_the_fleet_that_was_taken_for_ended_is_ended_when_it_appears_again():
+    floor = Floorplan()
+    floor.take(order(A, B))
+    floor.drive()
+    goal, floor.goal = floor.goal, None
+    floor.tell(UNSEEN_S + 1.0)
+    assert floor.errors() == {"ORDER_ENDED": "WARNING"}
+    floor.goal = goal
+    floor.tell(3.0)
+    assert floor.drive() == ["DELETE"]
+    assert floor.asked[-1].headers == {"If-Match": '"g1"'}
+    floor.goal = goal
+    floor.tell(0.1)
+    assert floor.drive() == [], "it is over, and what is told is older"
+
+
+async def test_floor_that_begins_anew_takes_back_all_that_it_has_told():
+    bridge = Vda5050Bridge(SETUP)
+    running = asyncio.create_task(bridge.run(None, ManualClock(100.0)))
+    await asyncio.sleep(0)
+    robot = bridge._links["r1"].core
+    pose = {"x": 1.0, "y": 1.0, "theta": 0.0, "localized": True, "v": 0.0, "w": 0.0, "height": 0.1}
+    told = [("hello", {"fresh": True}), ("place", {"id": "old", "value": {"x": 4.0, "y": 1.0}}),
+            ("pose", {"id": "r1", "value": pose}),
+            ("robot", {"id": "r1", "value": {"state": STATE | {"stamp": 1.0}, "goal": None}}),
+            ("path", {"id": "r1", "value": {"points": [[1.0, 1.0], [4.0, 1.0]]}}), ("ready", {})]  # fmt: skip
+    for event in told:
+        bridge.on_event(*event)
+    to_place = read(order(A, {name: value for name, value in B.items() if name != "nodePosition"} | {"nodeId": "old"}))
+    assert robot.checked(to_place, 100.0) is None
+    robot.accept(to_place)
+    assert robot.step(100.0).method == "PUT"
+    robot.on_answer(Answer("", body={"goal_id": "g1"}), 100.0)
+    bridge.on_lost()
+    bridge.on_event("hello", {"fresh": True})
+    assert (robot.places, robot.at, robot.path, robot.state) == ({}, None, [], {})
+    for name, data in told[2:]:
+        bridge.on_event(name, data)
+    entry = {"kind": "mission", "id": "r1", "action": "reached", "before": {"goal": {"goal_id": "g1"}}, "after": None}
+    bridge.on_event("record", entry | {"kind": "place", "before": {"x": 1.0}})
+    assert robot.orders.last_node_id == "a"
+    bridge.on_event("record", entry)
+    assert robot.orders.last_node_id == "old"
+    running.cancel()
+    await asyncio.gather(running, return_exceptions=True)
 
 
 # --- Operators and instant actions ------------------------------------------------------------------------------------
@@ -154,7 +324,7 @@ def test_operators_word_ends_the_order_and_the_fleet_drives_over_none(mode, stat
     floor.at(2.0, 1.0, v=0.2)
     floor.goal = view.pop("goal", floor.goal)
     floor.more = view
-    floor.tell(**state)
+    floor.tell(UNSEEN_S + 0.1 if floor.goal is None else 1.0, **state)
     said = floor.said()
     assert (said["operatingMode"], said["nodeStates"], said["orderId"]) == (mode, [], "o1")
     assert any(

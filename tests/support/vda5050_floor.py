@@ -91,6 +91,7 @@ class Floorplan:
         self.now = 100.0
         self.at(1.0, 1.0)
         self.tell()
+        self.robot.on_known(self.now)
 
     def at(self, x: float, y: float, v: float = 0.0) -> None:
         """Put the robot there."""
@@ -114,7 +115,7 @@ class Floorplan:
                 self.robot.on_answer(answer, self.now)
                 break
             if request.method == "PUT":
-                self.goal = {"goal_id": f"g{len(self.asked)}"}
+                self.goal = {"goal_id": f"g{len(self.asked)}", "pose": request.body["pose"]}
                 self.state |= {"goal_id": self.goal["goal_id"], "goal_reached": False}
                 self.robot.on_answer(Answer("", body=self.goal), self.now)
             else:

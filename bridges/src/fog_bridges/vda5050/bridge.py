@@ -153,8 +153,6 @@ class RobotLink(Connection):
         self._orders: asyncio.Queue[Order] = asyncio.Queue(ORDERS_AT_ONCE)
         self._is_asked = False
         self._wants_factsheet = True
-        self.is_known = False
-        """Whether the floor's state is."""
         topics = [self._sender.topic(name) for name in ("order", "instantActions")]
         super().__init__(setup.broker, f"fognav-{setup.site}-{robot}", topics, clock)
 
@@ -229,7 +227,7 @@ class RobotLink(Connection):
         """Keep the robot's mission what the order needs."""
         async for now in ticker(self.clock, TICK_S):
             self.core.advance(now)
-            while self.is_known and (request := self.core.step(self.clock.now())) is not None:
+            while self.core.is_known and (request := self.core.step(self.clock.now())) is not None:
                 answer = await self._floor.ask(request)
                 if answer.refusal:
                     words = f"{request.method} {request.path}: {answer.refusal}"
@@ -259,7 +257,7 @@ class RobotLink(Connection):
         said, told, path, told_at, drawn_at = "", None, -1, 0.0, 0.0
         self._wants_factsheet = True
         async for now in ticker(self.clock, TICK_S):
-            word = "ONLINE" if self.is_known and self.core.is_there(now) else "CONNECTION_BROKEN"
+            word = "ONLINE" if self.core.is_known and self.core.is_there(now) else "CONNECTION_BROKEN"
             if word != said:
                 await client.publish(self._sender.topic("connection"), self._connection(word), qos=1, retain=True)
                 said, told = word, None
@@ -386,29 +384,39 @@ class Vda5050Bridge:
         """Take in an event of the floor."""
         if self._zones is not None:
             self._zones.sets.on_event(name, data)
-        if name == "ready":
+        now = 0.0 if self._clock is None else self._clock.now()
+        if name == "hello" and data["fresh"]:
+            self._places.clear()
             for link in self._links.values():
-                link.is_known = True
-            return
-        thing, value = data.get("id", ""), data.get("value")
-        if name == "place":
-            if value is None:
-                self._places.pop(thing, None)
+                link.core.forget()
+        elif name == "ready":
+            for link in self._links.values():
+                link.core.on_known(now)
+        elif name == "place":
+            if (value := data["value"]) is None:
+                self._places.pop(data["id"], None)
             else:
-                self._places[thing] = Where(value["x"], value["y"], value.get("theta"))
-        if self._clock is None or thing not in self._links:
-            return
-        core, now = self._links[thing].core, self._clock.now()
+                self._places[data["id"]] = Where(value["x"], value["y"], value.get("theta"))
+        elif (link_of := self._links.get(data.get("id", ""))) is not None:
+            self._on_robots_event(link_of.core, name, data, now)
+
+    @staticmethod
+    def _on_robots_event(core: FleetRobot, name: str, data: dict[str, Any], now: float) -> None:
+        value = data.get("value")
         if name == "robot" and value is not None:
             core.on_robot(value, now)
         elif name == "pose" and value is not None:
             core.on_pose(value, now)
         elif name == "path":
             core.on_path([] if value is None else [(x, y) for x, y in value["points"]])
+        elif name == "record" and data["kind"] == "mission":
+            before, after = (((data[each] or {}).get("goal") or {}).get("goal_id") for each in ("before", "after"))
+            if before and before != after:
+                core.on_end(before, now, reached=data["action"] == "reached")
 
     def on_lost(self) -> None:
         """Take in that nobody knows the floor's state."""
         for link in self._links.values():
-            link.is_known = False
+            link.core.is_known = False
         if self._zones is not None:
             self._zones.sets.on_lost()

@@ -8,12 +8,11 @@ control (6.6.6) until the robot is free for it again. Nothing of the fleet enabl
 from __future__ import annotations
 
 import math
-from collections import deque
 from typing import TYPE_CHECKING, Any, Final, Literal
 from uuid import uuid4
 
 from fog_bridges.floor import Request
-from fog_bridges.vda5050.orders import START_M, Orders, Situation, Where, about_error, goal_of, is_within, rejection
+from fog_bridges.vda5050.orders import Orders, Situation, Where, about_error, goal_of, is_within, rejection
 from fog_bridges.vda5050.outgoing import ActionState, Error, OperatingMode
 
 if TYPE_CHECKING:
@@ -28,7 +27,7 @@ SILENT_S: Final = 5.0
 """A robot that tells no state for so long is not there."""
 RETRY_S: Final = 1.0
 UNSEEN_S: Final = 5.0
-"""A mission that was accepted and is not told of for so long has ended already."""
+"""How long what became of a mission may be told late: without word that it was reached, it was ended then."""
 REFUSED_S: Final = 5.0
 """Without any path for so long, the robot gives up a node, as the norm wants: the fleet decides."""
 TAKEN_S: Final = 2.0
@@ -69,13 +68,18 @@ class FleetRobot:
         self._goal = ""
         """The fleet's mission, by its id; empty without one."""
         self._goal_node = -1
-        self._own: deque[str] = deque(maxlen=32)
-        self._is_seen = False
-        self._asked_at = -math.inf
+        self._own: dict[str, bool] = {}
+        """The fleet's latest missions, and whether they are certainly over."""
+        self._shown_at = -math.inf
+        """When its mission was last shown, asked for, or could be shown again."""
+        self._ends: dict[str, bool] = {}
+        """Missions of the robot that are told to have ended, and whether they were reached."""
+        self.is_known = False
+        """Whether the floor's state is: else nothing is concluded from it."""
         self._asking: Request | None = None
         self._asked_for: Node | None = None
         self._unsure: tuple[Request, Node | None] | None = None
-        """A mission that may have been accepted: asked for again, by the same key, before anything else."""
+        """A mission that may have been accepted: asked for again, by the same key, as long as it is wanted."""
         self._retry_at = -math.inf
         self._refused_since: float | None = None
         self._taken_until = -math.inf
@@ -89,7 +93,34 @@ class FleetRobot:
         if (view["state"] or {}).get("stamp") != before:
             self._heard = now
         self.view = view
+        state = self.state
+        if state.get("goal_reached") and state.get("goal_id"):
+            self._note(self._ends, state["goal_id"], value=True)
         self.advance(now)
+
+    def on_end(self, mission: str, now: float, *, reached: bool) -> None:
+        """Take in from the audit trail that a mission has ended: the state that says so may have been left out."""
+        self._note(self._ends, mission, value=reached or self._ends.get(mission, False))
+        self.advance(now)
+
+    @staticmethod
+    def _note(known: dict[str, bool], mission: str, *, value: bool) -> None:
+        """Remember something of a mission, and of the latest ones only."""
+        known.pop(mission, None)
+        known[mission] = value
+        if len(known) > 32:
+            del known[next(iter(known))]
+
+    def on_known(self, now: float) -> None:
+        """Take in that the floor's state is known, after it was not."""
+        self.is_known, self._shown_at = True, now
+        self.advance(now)
+
+    def forget(self) -> None:
+        """Drop what was told: the floor tells all anew."""
+        self.is_known = False
+        self.view, self.pose = {"state": None, "goal": None}, None
+        self.on_path([])
 
     def on_pose(self, pose: dict[str, Any], now: float) -> None:
         """Take in where the robot is."""
@@ -121,6 +152,14 @@ class FleetRobot:
         """Whether a mission may be the fleet's before it is known by its id."""
         return self._asking is not None or self._unsure is not None
 
+    def _may_be_own(self, goal: dict[str, Any]) -> bool:
+        """Whether a mission that is shown may be the one that the fleet asks for, whose id is not known yet."""
+        request, _ = self._unsure or (self._asking, None)
+        if request is None or request.body is None:
+            return False
+        wanted, found = request.body["pose"], goal["pose"]
+        return math.dist((wanted["x"], wanted["y"]), (found["x"], found["y"])) < 0.01
+
     @property
     def is_driving(self) -> bool:
         """Whether it moves."""
@@ -131,7 +170,7 @@ class FleetRobot:
         state, goal, out = self.state, self.view["goal"], self.view.get("out_of_service")
         if not state:
             return "STARTUP", "it has not told its state yet"
-        is_foreign = goal is not None and goal["goal_id"] not in self._own and not self._is_asking
+        is_foreign = goal is not None and goal["goal_id"] not in self._own and not self._may_be_own(goal)
         reasons: tuple[tuple[bool, OperatingMode, str], ...] = (
             (out is not None, "SERVICE", f"an operator has taken it out of service: {(out or {}).get('reason')}"),
             (is_foreign, "MANUAL", "it has a mission of an operator of Fognav"),
@@ -154,7 +193,7 @@ class FleetRobot:
         """Return what an order has to fit."""
         mode, words = self.mode(now)
         unavailable = "" if mode == "AUTOMATIC" else f"the fleet is not in control ({mode}): {words}"
-        if not self.is_there(now):
+        if not self.is_known or not self.is_there(now):
             unavailable = "the robot is not there"
         height = 0.0 if self.pose is None else self.pose["height"]
         return Situation(unavailable, self.at, self.map_id, self.places, SPEED_M_S, height)
@@ -263,7 +302,9 @@ class FleetRobot:
     # --- The mission that the order needs -----------------------------------------------------------------------------
 
     def advance(self, now: float) -> None:
-        """Follow what has become of the mission and of the fleet's control."""
+        """Follow what has become of the mission and of the fleet's control, while the floor tells of both."""
+        if not self.is_known or not self.state:
+            return
         self._judge(now)
         mode, _ = self.mode(now)
         if mode != "AUTOMATIC" and not self.orders.is_idle:
@@ -282,28 +323,30 @@ class FleetRobot:
                     self._set(name, each.action_type, "FINISHED")
 
     def _judge(self, now: float) -> None:
-        """Find out whether the mission was reached, or ended by somebody else."""
+        """Find out whether the mission was reached, or ended by somebody else: only the robot's word is proof.
+
+        The state that says "reached" stands for a moment only, so it may come late, or by the audit trail alone.
+        """
         if not self._goal or self._is_asking:
             return
-        goal, state = self.view["goal"], self.state
-        is_reached = state.get("goal_id") == self._goal and bool(state.get("goal_reached"))
-        if goal is not None and goal["goal_id"] == self._goal:
-            self._is_seen = True
-        elif not self._is_seen and now - self._asked_at < UNSEEN_S:
-            return  # what is told is older than the mission
-        elif not is_reached and not self._is_near():
-            self._goal = ""
+        shown, end = (self.view["goal"] or {"goal_id": ""})["goal_id"], self._ends.get(self._goal)
+        if end:
+            self._drop(is_over=True)
+            self.orders.traversed(self._goal_node)
+        elif shown == self._goal:
+            self._shown_at = now
+        elif end is False or (shown and shown not in self._own) or now - self._shown_at >= UNSEEN_S:
+            self._drop(is_over=end is False)
             self._taken_until = now + TAKEN_S
             words = "an operator of Fognav has ended the mission, and so the order"
             self._about_errors["ORDER_ENDED"] = about_error("ORDER_ENDED", words, {"orderId": self.orders.order_id})
             self.orders.clear()
-            return
-        else:
-            is_reached = True
-        if is_reached:
-            self._goal = ""
-            self.orders.traversed(self._goal_node)
         self._watch_plan(now)
+
+    def _drop(self, *, is_over: bool) -> None:
+        """Take the mission for ended; `is_over`: it can't be shown again but by what was told before its end."""
+        self._note(self._own, self._goal, value=is_over)
+        self._goal = ""
 
     def _watch_plan(self, now: float) -> None:
         plan = self.view.get("plan") or {}
@@ -321,11 +364,6 @@ class FleetRobot:
     def _node(self, sequence: int) -> Node | None:
         return next((node for node in self.orders.nodes if node.sequence_id == sequence), None)
 
-    def _is_near(self) -> bool:
-        node, at = self._node(self._goal_node), self.at
-        goal = None if node is None else goal_of(node, self.places)
-        return goal is not None and at is not None and math.dist(goal[:2], at[:2]) <= START_M
-
     def _pass_nodes(self) -> None:
         """Traverse nodes that more of the base follows as soon as the robot is within their deviation: it drives on."""
         while (node := self.orders.target) is not None and self.at is not None and not self.paused:
@@ -339,39 +377,59 @@ class FleetRobot:
         """Return the next request to the floor; None: there is nothing to ask, or an answer is waited for."""
         if self._asking is not None or now < self._retry_at:
             return None
-        if self._unsure is not None:
-            (self._asking, self._asked_for), self._asked_at = self._unsure, now
-            return self._asking
         node = self.orders.target
         if self._mode != "AUTOMATIC" or self.paused or self._unreachable is not None:
             node = None
+        if self._unsure is not None:
+            if node is self._unsure[1]:
+                return self._ask(*self._unsure, now)
+            node = None  # first the mission that it has, if it is still there, then what appears
+        self._adopt(now)
         goal = None if node is None else goal_of(node, self.places)
         path = f"/api/v1/robots/{self.robot}/goal"
         if node is None or goal is None:
             if not self._goal:
                 return None
-            request = Request("DELETE", path, headers={"If-Match": f'"{self._goal}"'})
-        elif self._goal and self._goal_node == node.sequence_id:
+            return self._ask(Request("DELETE", path, headers={"If-Match": f'"{self._goal}"'}), None, now)
+        if not self.state or (self._goal and self._goal_node == node.sequence_id):
             return None
-        else:
-            pose = {"x": goal.x, "y": goal.y} | ({} if goal.theta is None else {"theta": goal.theta})
-            headers = {"If-Match": f'"{self._goal}"'} if self._goal else {"If-None-Match": "*"}
-            request = Request("PUT", path, {"pose": pose}, headers | {"Idempotency-Key": uuid4().hex})
-        self._asking, self._asked_for, self._asked_at = request, node, now
+        pose = {"x": goal.x, "y": goal.y} | ({} if goal.theta is None else {"theta": goal.theta})
+        headers = {"If-Match": f'"{self._goal}"'} if self._goal else {"If-None-Match": "*"}
+        return self._ask(Request("PUT", path, {"pose": pose}, headers | {"Idempotency-Key": uuid4().hex}), node, now)
+
+    def _ask(self, request: Request, node: Node | None, now: float) -> Request:
+        self._asking, self._asked_for, self._shown_at = request, node, now
         return request
+
+    def _adopt(self, now: float) -> None:
+        """Take over the mission that is shown if it is the fleet's, though it was taken for ended or not answered for.
+
+        One that may have been accepted, and is not wanted any more, is waited for: asking again might begin it.
+        """
+        goal = self.view["goal"] or {"goal_id": ""}
+        if self._unsure and goal["goal_id"] and self._may_be_own(goal):
+            self._own.setdefault(goal["goal_id"], False)
+        if not self._goal and self._own.get(goal["goal_id"]) is False:
+            self._goal, self._goal_node, self._unsure = goal["goal_id"], -1, None
+        elif not self._goal and now - self._shown_at >= UNSEEN_S:
+            self._unsure = None
 
     def on_answer(self, answer: Answer, now: float) -> None:
         """Take in the answer to the request that `step` returned."""
         request, node = self._asking, self._asked_for
-        self._asking = self._unsure = None
+        self._asking = None
         if request is None:
             return
+        if request.method == "PUT" or not answer.refusal:
+            self._unsure = None  # it is answered, or there is no mission any more that it might replace
         if request.method == "PUT" and "goal_id" in answer.body and node is not None:
+            if self._goal:
+                self._drop(is_over=True)
             self._goal, self._goal_node = answer.body["goal_id"], node.sequence_id
-            self._own.append(self._goal)
-            self._is_seen, self._refused_since = False, None
+            self._note(self._own, self._goal, value=False)
+            self._shown_at, self._refused_since = now, None
         elif request.method == "DELETE" and (not answer.refusal or answer.problem in ("no_mission", "mission_changed")):
-            self._goal = ""
+            self._drop(is_over=True)
         elif answer.problem == "goal_refused" and node is not None:
             self._give_up(node, answer.refusal)
         else:

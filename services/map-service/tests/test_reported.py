@@ -1,5 +1,7 @@
 """What other systems report is on the map until nobody reports it any more."""
 
+from collections.abc import Sequence
+
 import numpy as np
 import pytest
 
@@ -18,9 +20,9 @@ ROBOT = CircleShape(centre=(2.0, 1.5), radius=0.2)
 class Rig:
     """A map of 4 x 3 m without a wall, and a clock."""
 
-    def __init__(self) -> None:
+    def __init__(self, layers: Sequence[str] = ()) -> None:
         plan = StaticMap(GridGeometry(80, 60, 0.05, 0.0, 0.0), np.zeros((60, 80), np.uint8))
-        self.core = MapCore("test", plan, layers=make_layers(plan))
+        self.core = MapCore("test", plan, layers=make_layers(plan, layers))
         self.now = 0.0
         self.core.load_zones([], Moment(0.0, 0.0))
         self.pass_s(0.0)
@@ -55,6 +57,12 @@ def test_robot_of_others_is_an_obstacle_where_it_is_until_it_is_silent():
     assert rig.lethal(1.2, 1.2)
     rig.report("box", None, kind="obstacle")
     assert not rig.lethal(1.2, 1.2)
+
+
+def test_site_that_lists_its_layers_shows_robots_of_others_all_the_same():
+    rig = Rig(["static", "hazards", "zones", "obstacles"])
+    rig.report("tb4", ROBOT)
+    assert rig.lethal(2.0, 1.5), "its lidars' cells and echoes there count for nothing, so it must be on the map"
 
 
 def test_robot_of_others_that_hardly_moves_makes_no_new_version_of_the_map():

@@ -26,7 +26,8 @@ def make_layers(static: StaticMap, configured: Sequence[str | Mapping[str, Any]]
     """Return a site's layers over its floor plan, bottom first; raises `LayersError`.
 
     An entry is a layer's name, or a table with its `name` and its options. The floor plan (`static`) must be the bottom
-    layer; `hazards` and `zones` are mandatory.
+    layer; `hazards` and `zones` are mandatory. `reported` is added on top where it is not listed: robots of others are
+    left out of all else that sees them, and would be nowhere.
     """
     entries = [{"name": entry} if isinstance(entry, str) else dict(entry) for entry in configured or DEFAULT_LAYERS]
     names = [entry.get("name", "") for entry in entries]
@@ -35,6 +36,8 @@ def make_layers(static: StaticMap, configured: Sequence[str | Mapping[str, Any]]
     for mandatory in DEFAULT_LAYERS[:3]:
         if names.count(mandatory) != 1:
             raise LayersError(f"layers: {mandatory!r} must occur exactly once. List it once: robots rely on it")
+    if DEFAULT_LAYERS[-1] not in names:
+        entries.append({"name": DEFAULT_LAYERS[-1]})
     return [_make_layer(static, index, entry) for index, entry in enumerate(entries)]
 
 

@@ -20,7 +20,7 @@ from fog_bridges.floor import Answer, Request
 from fog_bridges.metrics import REFUSED
 from fog_bridges.vda5050 import telling
 from fog_bridges.vda5050.bridge import RobotLink, Sender, Setup, Vda5050Bridge
-from fog_bridges.vda5050.incoming import MessageError, Order, ReportedZoneSet, decoded
+from fog_bridges.vda5050.incoming import MESSAGE_MAX, MessageError, Order, ReportedZoneSet, decoded
 from fog_bridges.vda5050.zones import AGAIN_S, ZoneSets, ZoneUser
 from fog_runtime.clock import SystemClock
 from fog_runtime.credentials import Credentials
@@ -115,6 +115,12 @@ async def test_damaged_orders_and_actions_are_counted_one_by_one_and_none_ends_a
     assert refused > DAMAGED * 0.6
     assert counter._value.get() - before == refused
     assert len(floor.said()["errors"]) < 12, "the latest of each type"
+
+
+def test_message_that_is_too_long_is_refused_before_anything_is_looked_for_in_it():
+    with pytest.raises(MessageError, match="over the limit") as refused:
+        decoded("order", json.dumps(order(A, B, name="o1")).encode() + b" " * MESSAGE_MAX, "3.0", "r1")
+    assert refused.value.order == ""
 
 
 @pytest.mark.parametrize("version", VERSIONS)
@@ -229,6 +235,10 @@ def test_robot_gets_a_set_enables_it_and_deletes_the_earlier_ones_and_what_is_no
     assert list(user.steps(wanted, 20.0)) == []
     assert "somebody else has enabled the zone set theirs" in user.problem
     assert list(user.steps("fognav-lab-3", 20.0)) == [("zoneSet", "fognav-lab-3")], "what has changed is told"
+    robot_has(fognav_lab_3="ENABLED", fognav_lab_2="DISABLED")
+    assert list(user.steps("fognav-lab-2", 20.1)) == [("enableZoneSet", "fognav-lab-2")], "it is as it was before"
+    assert list(user.steps("fognav-lab-3", 20.2)) == [("deleteZoneSet", "fognav-lab-2")]
+    assert list(user.steps("fognav-lab-2", 20.3)) == [("enableZoneSet", "fognav-lab-2")], "within the time"
 
 
 # --- At a broker ------------------------------------------------------------------------------------------------------

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import json
+from typing import Any
 
 import msgspec
 import pytest
@@ -11,7 +12,9 @@ from manual_clock import ManualClock
 from vda5050_floor import SETUP, STATE, A, B, C, Floorplan, header, instant, node, order, read
 
 from fog_bridges.floor import Answer, Request
+from fog_bridges.metrics import ORDERS
 from fog_bridges.vda5050.bridge import RobotLink, Vda5050Bridge
+from fog_bridges.vda5050.incoming import NODES_MAX
 from fog_bridges.vda5050.robot import REFUSED_S, UNSEEN_S
 
 # --- Orders -----------------------------------------------------------------------------------------------------------
@@ -88,6 +91,14 @@ def test_order_that_does_not_fit_the_active_one_is_rejected_by_the_norms_error_a
         assert floor.said()["orderUpdateId"] == 4
         assert floor.take(order(B, C, update=6)) == ""
     assert floor.errors() == {}, "until an order is accepted"
+
+
+def test_updates_lengthen_an_order_up_to_the_limit_of_nodes_only():
+    floor = Floorplan()
+    row = [node(f"n{n}", 2 * n, 1.0 + 0.1 * n, 1.0) for n in range(NODES_MAX + 2)]
+    assert floor.take(order(*row[:60])) == ""
+    assert floor.take(order(*row[59:], update=1)) == "VALIDATION_FAILURE"
+    assert floor.take(order(*row[59 : NODES_MAX + 1], update=1)) == ""
 
 
 def test_new_order_has_to_begin_where_the_robot_is():
@@ -434,3 +445,44 @@ async def test_order_whose_nodes_are_being_looked_for_gives_way_to_a_cancel_and_
         assert actions(floor) == {"a1": "FINISHED"}
     else:
         assert floor.errors() == {"MOBILE_ROBOT_NOT_AVAILABLE": "WARNING"}
+
+
+@pytest.mark.parametrize("wanted", [{}, {"orderId": "o1"}, {"orderId": "o2"}])
+async def test_cancel_ends_orders_that_wait_and_one_that_is_sent_again_while_it_waits_is_no_further_one(wanted, caplog):
+    floor, asked, found = Floorplan(), asyncio.Event(), asyncio.Event()
+
+    class Slow:
+        async def ask(self, _: Request) -> Answer:
+            asked.set()
+            await found.wait()
+            return Answer("", body={"path": {"refusal": None}})
+
+    link = RobotLink(SETUP, "r1", Slow(), ManualClock())
+    link.core = floor.robot
+    dropped, repeated = (ORDERS.labels("vda5050", word)._value for word in ("dropped", "repeated"))
+    before = dropped.get(), repeated.get()
+    taking = asyncio.create_task(link.order_loop())
+    caplog.set_level("INFO")
+
+    def send(message: dict[str, Any]) -> None:
+        link.on_message("x/order", json.dumps(message).encode())
+
+    send(order(A, B))
+    await asked.wait()
+    for _ in range(30):
+        send(order(A, B))
+        send(order(A, B, name="o2"))
+    assert (repeated.get() - before[1], [each.order_id for each in floor.robot.waiting]) == (59, ["o2"])
+    link.on_message("x/instantActions", msgspec.json.encode(instant("cancelOrder", "c", **wanted)))
+    assert actions(floor)["c"] != "FAILED"
+    assert dropped.get() - before[0] == (wanted != {"orderId": "o1"})
+    found.set()
+    for _ in range(5):
+        await asyncio.sleep(0)
+    assert floor.said()["orderId"] == {"o1": "o2", "o2": "o1"}.get(wanted.get("orderId"), "")
+    for n in range(50):
+        link.on_message("x/instantActions", msgspec.json.encode(instant("stateRequest", f"s{n}")))
+    lines = [each.message for each in caplog.records]
+    assert (lines.count("order") <= 5, lines.count("instant_action")) == (True, 2), "a fleet fills no disk"
+    taking.cancel()
+    await asyncio.gather(taking, return_exceptions=True)

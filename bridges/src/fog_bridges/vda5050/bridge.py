@@ -30,7 +30,7 @@ from fog_bridges.vda5050.incoming import (
     Version,
     decoded,
 )
-from fog_bridges.vda5050.orders import Where
+from fog_bridges.vda5050.orders import Where, is_repeated, rejection
 from fog_bridges.vda5050.outgoing import of_version, timestamp
 from fog_bridges.vda5050.robot import FleetRobot
 from fog_bridges.vda5050.zones import ZoneSets, ZoneUser
@@ -150,7 +150,7 @@ class RobotLink(Connection):
         self._setup = setup
         self._floor = floor
         self._sender = Sender(setup, setup.version, setup.manufacturer, robot)
-        self._orders: asyncio.Queue[Order] = asyncio.Queue(ORDERS_AT_ONCE)
+        self._order_came = asyncio.Event()
         self._is_asked = False
         self._wants_factsheet = True
         topics = [self._sender.topic(name) for name in ("order", "instantActions")]
@@ -160,36 +160,55 @@ class RobotLink(Connection):
 
     def on_message(self, topic: str, payload: bytes) -> None:
         """Take in an order or instant actions."""
-        name = topic.rpartition("/")[2]
+        name, core = topic.rpartition("/")[2], self.core
         try:
-            message = decoded(name, payload, self._setup.version, self.core.robot)
+            message = decoded(name, payload, self._setup.version, core.robot)
         except MessageError as error:
             self.refuse("malformed", topic, str(error))
-            self.core.on_malformed(name, error)
+            core.on_malformed(name, error)
             return
         if isinstance(message, InstantActions):
-            wishes = self.core.on_instant(message, self.clock.now())
-            self._is_asked |= "state" in wishes
-            self._wants_factsheet |= "factsheet" in wishes
-            for action in message.actions:
-                _log.info("instant_action", robot=self.core.robot, action=action.action_type, id=action.action_id)
-            return
-        try:
-            self._orders.put_nowait(message)
-        except asyncio.QueueFull:
+            self._on_instant(message)
+        elif any(is_repeated(message, each) for each in (core.pending, *core.waiting) if each is not None):
+            self._tell_order(message, "repeated", "")
+        elif len(core.waiting) >= ORDERS_AT_ONCE:
             self.refuse("too_many", topic, f"{ORDERS_AT_ONCE} orders wait already")
+        else:
+            core.waiting.append(message)
+            self._order_came.set()
+
+    def _on_instant(self, message: InstantActions) -> None:
+        core, now = self.core, self.clock.now()
+        waited = core.waiting
+        wishes = core.on_instant(message, now)
+        self._is_asked |= "state" in wishes
+        self._wants_factsheet |= "factsheet" in wishes
+        for action in message.actions:
+            key = f"action {action.action_type}"
+            self.limited.info(
+                "instant_action", key, now, robot=core.robot, action=action.action_type, id=action.action_id
+            )
+        for order in waited:
+            if order not in core.waiting:
+                self._tell_order(order, "dropped", "it was cancelled first")
+
+    def _tell_order(self, order: Order, result: str, words: str) -> None:
+        ORDERS.labels(SYSTEM, result).inc()
+        self.limited.info(
+            "order", f"order {result}", self.clock.now(), robot=self.core.robot, order=order.order_id,
+            update=order.order_update_id, result=result, refusal=words,
+        )  # fmt: skip
 
     async def order_loop(self) -> None:
         """Take over or reject orders, one after the other."""
         while True:
-            order = await self._orders.get()
-            result, words = await self._taken(order)
-            self._is_asked |= result == "accepted"
-            ORDERS.labels(SYSTEM, result).inc()
-            _log.info(
-                "order", robot=self.core.robot, order=order.order_id, update=order.order_update_id, result=result,
-                refusal=words,
-            )  # fmt: skip
+            await self._order_came.wait()
+            self._order_came.clear()
+            while self.core.waiting:
+                order = self.core.waiting.pop(0)
+                result, words = await self._taken(order)
+                self._is_asked |= result == "accepted"
+                self._tell_order(order, result, words)
 
     async def _taken(self, order: Order) -> tuple[str, str]:
         core = self.core
@@ -205,7 +224,8 @@ class RobotLink(Connection):
                 return "dropped", "it was cancelled first" if error is None else error.error_description
             if refusal:
                 core.pending = None
-                core.reject_route(order, node, refusal)
+                words = f"node {node.node_id}: {refusal}"
+                core.reject(rejection(order, "NO_ROUTE_TO_TARGET", words, nodeId=node.node_id))
                 return "refused", refusal
         core.pending = None
         if (error := core.checked(order, self.clock.now())) is not None:

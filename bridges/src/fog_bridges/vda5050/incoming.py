@@ -193,10 +193,10 @@ _UPDATE = re.compile(rb'"orderUpdateId"\s*:\s*(\d{1,9})\b')
 
 def decoded(topic: str, payload: bytes, version: Version, serial: str) -> Order | InstantActions:
     """Return a message on a topic of robot `serial`; raises `MessageError`."""
+    if len(payload) > MESSAGE_MAX:  # before anything that takes the longer, the longer it is
+        raise MessageError(f"{len(payload)} bytes are over the limit of {MESSAGE_MAX}")
     order, update = _ORDER.search(payload), _UPDATE.search(payload)
     named = order[1].decode("utf-8", "replace") if order else "", int(update[1]) if update else None
-    if len(payload) > MESSAGE_MAX:
-        raise MessageError(f"{len(payload)} bytes are over the limit of {MESSAGE_MAX}", *named)
     kind = _EarlyActions if (topic, version) == ("instantActions", "2.0") else _TOPICS[topic]
     try:
         message = msgspec.json.decode(payload, type=kind)

@@ -8,6 +8,7 @@ from __future__ import annotations
 import math
 from typing import TYPE_CHECKING, Final, NamedTuple
 
+from fog_bridges.vda5050.incoming import NODES_MAX
 from fog_bridges.vda5050.outgoing import EdgeState, Error, Level, NodeAt, NodeState, Reference
 
 if TYPE_CHECKING:
@@ -86,10 +87,7 @@ class Orders:
 
     def is_known(self, order: Order) -> bool:
         """Whether it has this very order: then a repetition of it is ignored."""
-        latest = self._latest
-        return latest is not None and (latest.order_id, latest.order_update_id, latest.nodes, latest.edges) == (
-            order.order_id, order.order_update_id, order.nodes, order.edges
-        )  # fmt: skip
+        return self._latest is not None and is_repeated(self._latest, order)
 
     def why_not(self, order: Order, now: Situation) -> Error | None:
         """Return why an order can't be taken over; None: it can, if its nodes can be reached."""
@@ -120,6 +118,10 @@ class Orders:
             node, sequence = self._decision
             words = f"an update goes on at the last released node, {node} with the sequenceId {sequence}"
             return rejection(order, "VALIDATION_FAILURE", words, nodeId=first.node_id)
+        ahead = sum(node.released for node in self.nodes) + len(order.nodes) - 1
+        if ahead > NODES_MAX:
+            words = f"{ahead} nodes would lie ahead of the robot, and {NODES_MAX} may"
+            return rejection(order, "VALIDATION_FAILURE", words)
         return None
 
     def _start_error(self, order: Order, now: Situation) -> Error | None:
@@ -184,6 +186,13 @@ class Orders:
             nodes.append(state)
         edges = [EdgeState(edge_id=e.edge_id, sequence_id=e.sequence_id, released=e.released) for e in self.edges]
         return nodes, edges
+
+
+def is_repeated(order: Order, other: Order) -> bool:
+    """Whether two orders are the same, sent twice."""
+    return (order.order_id, order.order_update_id, order.nodes, order.edges) == (
+        other.order_id, other.order_update_id, other.nodes, other.edges
+    )  # fmt: skip
 
 
 def goal_of(node: Node, places: Mapping[str, Where]) -> Where | None:

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any, Final, Literal
 from uuid import uuid4
 
 from fog_bridges.floor import Request
-from fog_bridges.vda5050.orders import Orders, Situation, Where, about_error, goal_of, is_within, rejection
+from fog_bridges.vda5050.orders import Orders, Situation, Where, about_error, goal_of, is_within
 from fog_bridges.vda5050.outgoing import ActionState, Error, OperatingMode
 
 if TYPE_CHECKING:
@@ -58,6 +58,8 @@ class FleetRobot:
         self.paused = False
         self.pending: Order | None = None
         """The order whose nodes are being looked for on the map."""
+        self.waiting: list[Order] = []
+        """The orders after it, in which a cancel counts as well."""
         self.instant: dict[str, ActionState] = {}
         self.path_changes = 0
         self._about_errors: dict[str, Error] = {}
@@ -214,10 +216,9 @@ class FleetRobot:
         """Take over an order."""
         self.orders.accept(order)
         self._about_errors.clear()
-        self._unreachable = self._unavailable = None
+        self._unreachable = self._unavailable = self._refused_since = None
         if self._instant_error is not None and self._instant_error.error_type == "NO_ORDER_TO_CANCEL":
             self._instant_error = None
-        self._refused_since = None
 
     def reject(self, error: Error) -> None:
         """Show that an order was rejected: the latest one by each reason."""
@@ -226,16 +227,11 @@ class FleetRobot:
         else:
             self._about_errors[error.error_type] = error
 
-    def reject_route(self, order: Order, node: Node, words: str) -> None:
-        """Reject an order that has a node which can't be reached."""
-        self.reject(rejection(order, "NO_ROUTE_TO_TARGET", f"node {node.node_id}: {words}", nodeId=node.node_id))
-
     def on_malformed(self, topic: str, error: MessageError) -> None:
         """Show that a message could not be read."""
-        about = {"topic": topic} | ({"orderId": error.order} if error.order else {})
-        if error.update is not None:
-            about["orderUpdateId"] = str(error.update)
-        found = about_error("VALIDATION_FAILURE", str(error), about)
+        update = "" if error.update is None else str(error.update)
+        about = {"topic": topic, "orderId": error.order, "orderUpdateId": update}
+        found = about_error("VALIDATION_FAILURE", str(error), {name: value for name, value in about.items() if value})
         if topic == "order":
             self.reject(found)
         else:
@@ -272,13 +268,8 @@ class FleetRobot:
             self.instant = {name: each for name, each in self.instant.items() if each.action_status == "RUNNING"}
             self._set(action.action_id, kind, "FINISHED")
         elif kind == "cancelOrder":
-            wanted = action.parameter("orderId")
-            order = self.pending.order_id if self.pending is not None else self.orders.order_id
-            if (self.orders.is_idle and self.pending is None) or wanted not in (None, order):
+            if not self._cancel(action.parameter("orderId")):
                 return "NO_ORDER_TO_CANCEL", "there is no such active order"
-            self.pending = None
-            self.orders.clear()
-            self._unreachable = None
             self._set(action.action_id, kind, "RUNNING")
         elif kind in ("startPause", "stopPause"):
             if mode[0] != "AUTOMATIC":
@@ -291,6 +282,16 @@ class FleetRobot:
         else:
             return "INVALID_INSTANT_ACTION", f"a robot of Fognav can't {kind[:60]}"
         return None
+
+    def _cancel(self, wanted: object) -> bool:
+        """End the orders of an id, or all (None); return whether there were any."""
+        waiting, active = self.waiting, self.orders.order_id if self.pending is None else self.pending.order_id
+        self.waiting = [order for order in waiting if wanted not in (None, order.order_id)]
+        is_active = (self.pending is not None or not self.orders.is_idle) and wanted in (None, active)
+        if is_active:
+            self.pending = self._unreachable = None
+            self.orders.clear()
+        return is_active or len(self.waiting) < len(waiting)
 
     def _set(self, name: str, kind: str, status: Literal["RUNNING", "FINISHED", "FAILED"], result: str = "") -> None:
         self.instant.pop(name, None)
@@ -307,9 +308,8 @@ class FleetRobot:
             return
         self._judge(now)
         mode, _ = self.mode(now)
-        if mode != "AUTOMATIC" and not self.orders.is_idle:
-            self.orders.clear()
         if mode != "AUTOMATIC":
+            self.orders.clear()
             self.paused, self.pending = False, None
         else:
             self._unavailable = None

@@ -199,7 +199,7 @@ def factsheet(robot: FleetRobot, version: Version) -> dict[str, Any]:
     timing = {"defaultStateInterval": STATE_S, "visualizationInterval": VISUALIZATION_S}
     actions = [
         {"actionType": kind, "actionScopes": ["INSTANT"], "actionParameters": parameters}
-        | ({"blockingTypes": ["NONE"], "pauseAllowed": "false", "cancelAllowed": "false"} if is_new else {})
+        | ({"blockingTypes": ["NONE"], "pauseAllowed": False, "cancelAllowed": False} if is_new else {})
         for kind, parameters in _ACTIONS
         if is_new or kind != "clearInstantActions"
     ]

@@ -166,6 +166,7 @@ class ZoneUser:
         self._map_id = map_id
         self._sets: dict[str, str] | None = None
         self._sent: dict[Step, float] = {}
+        self._wanted = ""
         self._enabled = ""
         """The set of Fognav's that the robot has used last."""
         self.is_online = False
@@ -180,6 +181,8 @@ class ZoneUser:
 
     def steps(self, wanted: str, now: float) -> Iterator[Step]:
         """Yield what is to be sent, so that the robot uses the set `wanted` and has no other of Fognav's."""
+        if wanted != self._wanted:  # what was sent for another set says nothing of this one
+            self._wanted, self._sent = wanted, {}
         if self._sets is None or not self.is_online:
             self.problem = "it is not online" if not self.is_online else "it has not told its state yet"
             return

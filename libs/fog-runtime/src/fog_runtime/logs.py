@@ -7,7 +7,7 @@ import json
 import logging
 import sys
 import threading
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from datetime import UTC, datetime
 from typing import Final, Literal
 
@@ -106,7 +106,7 @@ def get(name: str) -> Log:
 
 
 class RateLimited:
-    """Logs the first of equal warnings at once, then at most one per `period` seconds with the number suppressed.
+    """Logs the first of equal events at once, then at most one per `period` seconds with the number suppressed.
 
     Distinguishes at most `max_keys` keys, so that a sender of ever new ones can't exhaust the memory.
     """
@@ -120,6 +120,13 @@ class RateLimited:
 
     def warning(self, event: str, key: str, now: float, /, **fields: object) -> None:
         """Log `event` unless the same `key` was logged less than a period before `now` (s); from any thread."""
+        self._limit(self._log.warning, event, key, now, fields)
+
+    def info(self, event: str, key: str, now: float, /, **fields: object) -> None:
+        """Log an event of normal operation, which others can cause at any rate, as `warning` does."""
+        self._limit(self._log.info, event, key, now, fields)
+
+    def _limit(self, log: Callable[..., None], event: str, key: str, now: float, fields: dict[str, object]) -> None:
         with self._lock:
             if key not in self._state and len(self._state) >= self._max_keys:
                 key = "(others)"
@@ -130,4 +137,4 @@ class RateLimited:
             self._state[key] = (now, 0)
         if suppressed:
             fields["suppressed"] = suppressed
-        self._log.warning(event, **fields)
+        log(event, **fields)

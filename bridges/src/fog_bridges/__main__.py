@@ -30,7 +30,7 @@ from fog_runtime.credentials import Credentials, CredentialsError
 from fog_runtime.health import Health
 from fog_runtime.http import make_app, serve_here
 from fog_runtime.http.tokens import Tokens
-from fog_runtime.leadership import process_id
+from fog_runtime.process import process_id
 from fog_runtime.transports.mqtt_connection import Broker
 from fog_runtime.transports.mqtt_edge import MqttEdge, Will
 

@@ -12,10 +12,7 @@ from __future__ import annotations
 
 import asyncio
 import math
-import os
-import re
 import secrets
-import socket
 import threading
 import time
 from collections import deque
@@ -42,6 +39,7 @@ from fog_runtime.lease import (
     Reply,
     Request,
 )
+from fog_runtime.process import process_id
 from fog_runtime.stores.redis_connection import RedisConnection, StoreError
 
 if TYPE_CHECKING:
@@ -236,15 +234,6 @@ class LeaseBackend(Protocol):
 
     async def release(self, holder: str) -> None:
         """Give the lease back."""
-
-
-def process_id(service: Role) -> str:
-    """Return an id for this run of this process that is never used again: service, host, process and a random number.
-
-    A broker knows its clients by their ids, and disconnects one when another comes with the same.
-    """
-    host = re.sub(r"[^a-z0-9-]", "-", socket.gethostname().lower())[:40].strip("-") or "host"
-    return f"{service}-{host}-{os.getpid()}-{secrets.token_hex(4)}"
 
 
 class Leadership:

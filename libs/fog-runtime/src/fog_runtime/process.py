@@ -8,7 +8,9 @@ import faulthandler
 import gc
 import os
 import re
+import secrets
 import signal
+import socket
 import sys
 import threading
 from concurrent.futures import Future
@@ -20,6 +22,8 @@ from fog_runtime import logs, machine
 if TYPE_CHECKING:
     from collections.abc import Awaitable, Callable
 
+    from fog_contracts.channels import Role
+
 _DONTNEED: Final = 4
 """`MADV_DONTNEED` of madvise(2)."""
 _MMAP_THRESHOLD: Final = -3
@@ -30,6 +34,15 @@ _LIBRARY: Final = re.compile(r"\.so(\.|$)")
 _MAPPING: Final = re.compile(r"^([0-9a-f]+)-([0-9a-f]+) (\S+) \S+ \S+ \S+ *(.*)$")
 
 _log = logs.get("process")
+
+
+def process_id(service: Role) -> str:
+    """Return an id for this run of this process that is never used again: service, host, process and a random number.
+
+    A broker knows its clients by their ids, and disconnects one when another comes with the same.
+    """
+    host = re.sub(r"[^a-z0-9-]", "-", socket.gethostname().lower())[:40].strip("-") or "host"
+    return f"{service}-{host}-{os.getpid()}-{secrets.token_hex(4)}"
 
 
 def release_startup_memory() -> int:

@@ -21,8 +21,7 @@ from fog_runtime.configuration.settings import CommonSettings, describe, load
 from fog_runtime.configuration.site import load_site
 from fog_runtime.health import Health
 from fog_runtime.http import load_tokens, serve_here
-from fog_runtime.leadership import process_id
-from fog_runtime.process import release_startup_memory
+from fog_runtime.process import process_id, release_startup_memory
 from fog_runtime.stores.redis_connection import RedisConnection
 from fog_runtime.transports.mqtt_edge import MqttEdge
 from fog_runtime.transports.zenoh_edge import ZenohEdge

@@ -19,23 +19,21 @@ from console_service.views import VitalsView
 from fog_contracts.messages import Id, Message
 from fog_runtime.clock import SystemClock
 from fog_runtime.health import Health
-from fog_runtime.http import (
+from fog_runtime.http import (  # fmt: skip
     MAP_UPLOADS,
     Answer,
     ClientHost,
     Encoded,
     HttpProblem,
-    PageSize,
     ProblemError,
     Routes,
     Tokens,
     Viewer,
     add_session_routes,
-    add_store_errors,
     make_app,
-    next_page,
     still_admits,
-)  # fmt: skip
+)
+from fog_runtime.http.store_routes import PageSize, add_store_errors, next_page
 from fog_runtime.stores.records import CursorError
 from fog_runtime.stores.redis_connection import StoreError
 

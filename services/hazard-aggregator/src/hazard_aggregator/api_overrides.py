@@ -2,19 +2,8 @@
 
 from fog_contracts.messages import Author, Count, Message, OverrideReason, OverrideState, Seconds, Stamp, TimeToLive
 from fog_runtime.clock import Clock
-from fog_runtime.http import (
-    Answer,
-    Body,
-    Caller,
-    IdempotencyKey,
-    IfMatch,
-    Operator,
-    ProblemError,
-    Routes,
-    attempt_of,
-    etag,
-    expected_version,
-)
+from fog_runtime.http import Answer, Body, Caller, IfMatch, Operator, ProblemError, Routes, etag, expected_version
+from fog_runtime.http.store_routes import IdempotencyKey, attempt_of
 from fog_runtime.stores.redis_connection import StoreError
 from fog_runtime.stores.redis_store import IdempotencyError
 from hazard_aggregator.areas import LONGEST_S, AreaOverride

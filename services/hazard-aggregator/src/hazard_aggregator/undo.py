@@ -6,7 +6,8 @@ from msgspec import structs
 
 from fog_contracts.messages import AreaDefinition
 from fog_runtime.clock import Clock
-from fog_runtime.http import Body, Caller, Operator, ProblemError, Routes, UndoBody, Undone, add_undo_errors, undone
+from fog_runtime.http import Body, Caller, Operator, ProblemError, Routes
+from fog_runtime.http.store_routes import UndoBody, Undone, add_undo_errors, undone
 from fog_runtime.stores.redis_connection import StoreError
 from fog_runtime.stores.redis_store import IdempotencyError
 from fog_runtime.stores.undo import ACTION, UndoError, require_rest, values

@@ -17,22 +17,8 @@ from fog_contracts.messages import Count, DryRunReply, DryRunRequest, Message, P
 from fog_mapping.another_map import Finding
 from fog_runtime.concurrency import BusyError
 from fog_runtime.configuration.uploaded_maps import MapName
-from fog_runtime.http import (
-    MAP_UPLOAD,
-    Admin,
-    Answer,
-    Body,
-    IdempotencyKey,
-    ProblemError,
-    Routes,
-    UndoBody,
-    Undone,
-    Viewer,
-    add_undo_errors,
-    attempt_of,
-    etag,
-    undone,
-)
+from fog_runtime.http import MAP_UPLOAD, Admin, Answer, Body, ProblemError, Routes, Viewer, etag
+from fog_runtime.http.store_routes import IdempotencyKey, UndoBody, Undone, add_undo_errors, attempt_of, undone
 from fog_runtime.stores.redis_connection import StoreError
 from fog_runtime.stores.redis_store import Attempt
 from fog_runtime.stores.undo import UndoError, values

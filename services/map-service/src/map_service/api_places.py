@@ -9,19 +9,17 @@ from fog_runtime.http import (
     Answer,
     Body,
     Caller,
-    IdempotencyKey,
     IfMatch,
-    IfNoneMatch,
     Operator,
     Patch,
     PatchOf,
     ProblemError,
     Routes,
-    attempt_of,
     etag,
     expected_version,
     patched,
 )
+from fog_runtime.http.store_routes import IdempotencyKey, IfNoneMatch, attempt_of
 from fog_runtime.stores.redis_store import Attempt
 from map_service.places import PlaceError, PlaceView, StoredPlace, check_place, warnings_of
 from map_service.problems import ZONES_NOT_LOADED, MapProblem, require_zones

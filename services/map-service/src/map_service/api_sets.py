@@ -5,20 +5,8 @@ from typing import Final
 from msgspec import structs
 
 from fog_contracts.messages import Message, Sentence, WeeklySchedule
-from fog_runtime.http import (
-    Answer,
-    Body,
-    IdempotencyKey,
-    IfMatch,
-    IfNoneMatch,
-    Operator,
-    ProblemError,
-    Routes,
-    Viewer,
-    attempt_of,
-    etag,
-    expected_version,
-)
+from fog_runtime.http import Answer, Body, IfMatch, Operator, ProblemError, Routes, Viewer, etag, expected_version
+from fog_runtime.http.store_routes import IdempotencyKey, IfNoneMatch, attempt_of
 from map_service.problems import ZONES_NOT_LOADED, MapProblem, require_zones
 from map_service.record_requests import WRITES, Conditions, check_id, missing
 from map_service.service import Service

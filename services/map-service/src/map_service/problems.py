@@ -3,8 +3,9 @@
 from typing import Final
 
 from fog_runtime.concurrency import BusyError
-from fog_runtime.http import RETRY_AFTER, HttpProblem, ProblemCode, ProblemError, Routes, add_store_errors
+from fog_runtime.http import RETRY_AFTER, HttpProblem, ProblemCode, ProblemError, Routes
 from fog_runtime.http.routes import InvalidBodyError
+from fog_runtime.http.store_routes import add_store_errors
 from fog_runtime.stores.records import CursorError
 from map_service.record_writer import ConflictError
 from map_service.service import Service

@@ -5,7 +5,8 @@ from typing import Final, TypeVar
 import msgspec
 
 from fog_contracts.messages import Id
-from fog_runtime.http import HttpProblem, ProblemError, expected_version, must_be_new
+from fog_runtime.http import HttpProblem, ProblemError, expected_version
+from fog_runtime.http.store_routes import must_be_new
 from fog_runtime.stores.redis_connection import StoreError
 from fog_runtime.stores.redis_store import IdempotencyError
 from map_service.places import StoredPlace

@@ -8,7 +8,8 @@ from msgspec import structs
 from fog_contracts.messages import Zone
 from fog_runtime.clock import Clock
 from fog_runtime.concurrency import BusyError
-from fog_runtime.http import Body, Operator, Routes, UndoBody, Undone, add_undo_errors, undone
+from fog_runtime.http import Body, Operator, Routes
+from fog_runtime.http.store_routes import UndoBody, Undone, add_undo_errors, undone
 from fog_runtime.stores.redis_connection import StoreError
 from fog_runtime.stores.undo import ACTION, UndoError, require_rest, values
 from map_service.api_sets import check_unused

@@ -34,20 +34,22 @@ from fog_runtime.http import (
     Body,
     ClientHost,
     HttpProblem,
-    IdempotencyKey,
     IfMatch,
-    IfNoneMatch,
     Operator,
     ProblemError,
     Routes,
     Tokens,
     Viewer,
-    add_recovery,
-    add_store_errors,
-    attempt_of,
     etag,
     expected_tag,
     make_app,
+)
+from fog_runtime.http.store_routes import (
+    IdempotencyKey,
+    IfNoneMatch,
+    add_recovery,
+    add_store_errors,
+    attempt_of,
     must_be_new,
 )
 from fog_runtime.stores.redis_connection import StoreError

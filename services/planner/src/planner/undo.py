@@ -4,7 +4,8 @@ from collections.abc import Callable
 from typing import Final
 
 from fog_contracts.messages import OutOfService, Refusal
-from fog_runtime.http import Body, Operator, ProblemError, Routes, UndoBody, Undone, add_undo_errors, undone
+from fog_runtime.http import Body, Operator, ProblemError, Routes
+from fog_runtime.http.store_routes import UndoBody, Undone, add_undo_errors, undone
 from fog_runtime.stores.redis_connection import StoreError
 from fog_runtime.stores.redis_store import IdempotencyError
 from fog_runtime.stores.undo import ACTION, UndoError, require_rest, values

@@ -18,20 +18,6 @@ from fog_runtime.http.routes import (
     patched,
 )
 from fog_runtime.http.sessions import add_session_routes
-from fog_runtime.http.store_routes import (
-    IdempotencyKey,
-    IfNoneMatch,
-    PageSize,
-    UndoBody,
-    Undone,
-    add_recovery,
-    add_store_errors,
-    add_undo_errors,
-    attempt_of,
-    must_be_new,
-    next_page,
-    undone,
-)
 from fog_runtime.http.tokens import Admin, Anybody, Caller, Guest, Operator, Tokens, Viewer, load_tokens, still_admits
 from fog_runtime.token_file import TokensError, token_hash
 
@@ -50,11 +36,8 @@ __all__ = [
     "HttpProblem",
     "HttpProcess",
     "HttpProcessError",
-    "IdempotencyKey",
     "IfMatch",
-    "IfNoneMatch",
     "Operator",
-    "PageSize",
     "Patch",
     "PatchOf",
     "ProblemCode",
@@ -62,25 +45,16 @@ __all__ = [
     "Routes",
     "Tokens",
     "TokensError",
-    "UndoBody",
-    "Undone",
     "Viewer",
-    "add_recovery",
     "add_session_routes",
-    "add_store_errors",
-    "add_undo_errors",
-    "attempt_of",
     "etag",
     "expected_tag",
     "expected_version",
     "load_tokens",
     "make_app",
-    "must_be_new",
-    "next_page",
     "patched",
     "serve_here",
     "still_admits",
     "token_hash",
-    "undone",
     "unused",
 ]

@@ -106,7 +106,12 @@ def test_new_order_has_to_begin_where_the_robot_is():
     assert floor.take(order(node("a", 0, 1.4, 1.0), B)) == "START_NODE_OUT_OF_RANGE"
     wide = {"allowedDeviationXY": {"a": 0.5, "b": 0.5, "theta": 0.0}}
     assert floor.take(order(node("a", 0, 1.4, 1.0, position=wide), B, update=2)) == "VALIDATION_FAILURE"
-    assert floor.take(order(node("a", 0, 1.4, 1.0, position=wide), B)) == ""
+    assert floor.take(order(node("a", 0, 1.4, 1.0, position=wide | {"theta": 0.2}), B)) == "START_NODE_OUT_OF_RANGE"
+    turned = wide | {"theta": 0.2, "allowedDeviationTheta": 0.3}
+    assert floor.take(order(node("a", 0, 1.4, 1.0, position=turned), B)) == ""
+    for position in (wide, wide | {"theta": 0.1}):  # no deviation of the heading: as exactly as the robot can
+        floor = Floorplan()
+        assert floor.take(order(node("a", 0, 1.4, 1.0, position=position), B)) == ""
 
 
 def test_same_order_again_is_ignored():
@@ -174,7 +179,20 @@ def test_mission_that_may_have_been_accepted_and_never_appears_delays_the_next_o
     floor.tell(2.0)
     assert floor.drive() == []
     floor.tell(UNSEEN_S)
-    assert floor.drive() + floor.drive() == ["PUT 7 1"]
+    assert floor.drive() == ["PUT 7 1"]
+
+
+def test_mission_that_may_have_been_accepted_is_the_fleets_though_its_repetition_is_refused():
+    floor = Floorplan()
+    floor.take(order(A, B))
+    floor.drive(Answer("the floor can't be reached"))
+    floor.tell(2.0)
+    assert floor.drive(Answer("robot r1 has another mission", "mission_changed")) == ["PUT 4 1"]
+    floor.goal = GOAL_B
+    floor.tell(2.0)
+    assert floor.said()["operatingMode"] == "AUTOMATIC"
+    assert floor.drive() == ["PUT 4 1"]
+    assert floor.asked[-1].headers["If-Match"] == '"g9"'
 
 
 def test_cancel_ends_the_mission_whose_replacement_may_have_been_accepted_at_once():
@@ -401,6 +419,12 @@ def test_pause_ends_the_mission_but_not_the_order_and_its_end_leads_on():
     floor.robot.on_instant(instant("stopPause", "q"), floor.now)
     assert floor.drive() == ["PUT 4 1"]
     assert (floor.said()["paused"], actions(floor)["q"]) == (False, "FINISHED")
+    floor.at(2.0, 1.0, v=0.3)
+    floor.robot.on_instant(instant("startPause", "r"), floor.now)
+    floor.robot.on_instant(instant("startPause", "s"), floor.now)
+    assert (actions(floor)["r"], actions(floor)["s"]) == ("RUNNING", "RUNNING")
+    floor.robot.on_instant(instant("stopPause", "t"), floor.now)
+    assert [actions(floor)[name] for name in "rst"] == ["FAILED", "FAILED", "FINISHED"]
 
 
 def test_requests_are_answered_and_unknown_actions_fail():

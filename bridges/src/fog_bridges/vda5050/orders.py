@@ -18,6 +18,9 @@ if TYPE_CHECKING:
 
 START_M: Final = 0.3
 """So near a robot has to be to the first node of a new order that allows no deviation, or a smaller one."""
+HEADING_RAD: Final = 0.12
+"""So exactly a robot of Fognav turns to a heading: no node can ask for more."""
+MISSIONS_MAX: Final = 32
 _SPEED_MARGIN: Final = 1e-3
 
 
@@ -138,7 +141,10 @@ class Orders:
         elif math.dist(goal[:2], now.at[:2]) <= START_M or is_within(first, goal, now.at):
             return None
         else:
-            words = f"the robot is {math.dist(goal[:2], now.at[:2]):.2f} m from node {first.node_id}"
+            words = (
+                f"the robot is {math.dist(goal[:2], now.at[:2]):.2f} m from node {first.node_id}, where it may be "
+                f"{START_M} m, or within the deviations of position and heading that the node allows"
+            )
         return rejection(order, "START_NODE_OUT_OF_RANGE", words, nodeId=first.node_id)
 
     def accept(self, order: Order) -> None:
@@ -195,6 +201,14 @@ def is_repeated(order: Order, other: Order) -> bool:
     )  # fmt: skip
 
 
+def remember(known: dict[str, bool], mission: str, *, value: bool) -> None:
+    """Remember something of a mission, and of the latest ones only."""
+    known.pop(mission, None)
+    known[mission] = value
+    if len(known) > MISSIONS_MAX:
+        del known[next(iter(known))]
+
+
 def goal_of(node: Node, places: Mapping[str, Where]) -> Where | None:
     """Return where a node is: its position, else the place of its id; None if there is neither."""
     at = node.node_position
@@ -217,7 +231,7 @@ def is_within(node: Node, goal: Where, at: Where) -> bool:
     if not inside or goal.theta is None or at.theta is None:
         return inside
     turned = abs((at.theta - goal.theta + math.pi) % math.tau - math.pi)
-    return turned <= abs(position.allowed_deviation_theta or 0.0)
+    return turned <= max(abs(position.allowed_deviation_theta or 0.0), HEADING_RAD)
 
 
 def _content_error(order: Order, now: Situation) -> Error | None:

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any, Final, Literal
 from uuid import uuid4
 
 from fog_bridges.floor import Request
-from fog_bridges.vda5050.orders import Orders, Situation, Where, about_error, goal_of, is_within
+from fog_bridges.vda5050.orders import Orders, Situation, Where, about_error, goal_of, is_within, remember
 from fog_bridges.vda5050.outgoing import ActionState, Error, OperatingMode
 
 if TYPE_CHECKING:
@@ -81,7 +81,7 @@ class FleetRobot:
         self._asking: Request | None = None
         self._asked_for: Node | None = None
         self._unsure: tuple[Request, Node | None] | None = None
-        """A mission that may have been accepted: asked for again, by the same key, as long as it is wanted."""
+        """A mission that may have been accepted: asked for again, by the same key, as long as its node is wanted."""
         self._retry_at = -math.inf
         self._refused_since: float | None = None
         self._taken_until = -math.inf
@@ -97,21 +97,13 @@ class FleetRobot:
         self.view = view
         state = self.state
         if state.get("goal_reached") and state.get("goal_id"):
-            self._note(self._ends, state["goal_id"], value=True)
+            remember(self._ends, state["goal_id"], value=True)
         self.advance(now)
 
     def on_end(self, mission: str, now: float, *, reached: bool) -> None:
         """Take in from the audit trail that a mission has ended: the state that says so may have been left out."""
-        self._note(self._ends, mission, value=reached or self._ends.get(mission, False))
+        remember(self._ends, mission, value=reached or self._ends.get(mission, False))
         self.advance(now)
-
-    @staticmethod
-    def _note(known: dict[str, bool], mission: str, *, value: bool) -> None:
-        """Remember something of a mission, and of the latest ones only."""
-        known.pop(mission, None)
-        known[mission] = value
-        if len(known) > 32:
-            del known[next(iter(known))]
 
     def on_known(self, now: float) -> None:
         """Take in that the floor's state is known, after it was not."""
@@ -276,7 +268,7 @@ class FleetRobot:
                 return "INVALID_INSTANT_ACTION", f"the fleet is not in control: {mode[1]}"
             self.paused = kind == "startPause"
             for name, each in list(self.instant.items()):
-                if each.action_type == "startPause" and each.action_status == "RUNNING":
+                if not self.paused and each.action_type == "startPause" and each.action_status == "RUNNING":
                     self._set(name, each.action_type, "FAILED", "stopPause came first")
             self._set(action.action_id, kind, "RUNNING" if self.paused else "FINISHED")
         else:
@@ -345,7 +337,7 @@ class FleetRobot:
 
     def _drop(self, *, is_over: bool) -> None:
         """Take the mission for ended; `is_over`: it can't be shown again but by what was told before its end."""
-        self._note(self._own, self._goal, value=is_over)
+        remember(self._own, self._goal, value=is_over)
         self._goal = ""
 
     def _watch_plan(self, now: float) -> None:
@@ -380,11 +372,11 @@ class FleetRobot:
         node = self.orders.target
         if self._mode != "AUTOMATIC" or self.paused or self._unreachable is not None:
             node = None
-        if self._unsure is not None:
-            if node is self._unsure[1]:
-                return self._ask(*self._unsure, now)
-            node = None  # first the mission that it has, if it is still there, then what appears
+        if self._unsure is not None and node is not None and node is self._unsure[1]:
+            return self._ask(*self._unsure, now)
         self._adopt(now)
+        if self._unsure is not None:
+            node = None  # first the mission that it has, if it is still there, then what appears
         goal = None if node is None else goal_of(node, self.places)
         path = f"/api/v1/robots/{self.robot}/goal"
         if node is None or goal is None:
@@ -416,7 +408,7 @@ class FleetRobot:
 
     def on_answer(self, answer: Answer, now: float) -> None:
         """Take in the answer to the request that `step` returned."""
-        request, node = self._asking, self._asked_for
+        request, node, again = self._asking, self._asked_for, self._unsure is not None
         self._asking = None
         if request is None:
             return
@@ -426,7 +418,7 @@ class FleetRobot:
             if self._goal:
                 self._drop(is_over=True)
             self._goal, self._goal_node = answer.body["goal_id"], node.sequence_id
-            self._note(self._own, self._goal, value=False)
+            remember(self._own, self._goal, value=False)
             self._shown_at, self._refused_since = now, None
         elif request.method == "DELETE" and (not answer.refusal or answer.problem in ("no_mission", "mission_changed")):
             self._drop(is_over=True)
@@ -436,6 +428,8 @@ class FleetRobot:
             self._retry_at = now + RETRY_S
             if request.method == "PUT" and answer.problem in _UNCERTAIN:
                 self._unsure = request, node
+        if request.method == "PUT" and again and answer.refusal and self._unsure is None:
+            self._unsure = request, None  # the repetition was refused, and the first one may have been accepted
         self.advance(now)
 
     @property

@@ -300,6 +300,9 @@ def test_mission_of_the_fleet_that_was_taken_for_ended_is_ended_when_it_appears_
     floor.goal = goal
     floor.tell(0.1)
     assert floor.drive() == [], "it is over, and what is told is older"
+    floor.goal = goal
+    floor.tell(UNSEEN_S)
+    assert floor.drive() == ["DELETE"], "but not so much older: the floor has it again"
 
 
 async def test_floor_that_begins_anew_takes_back_all_that_it_has_told():
@@ -314,6 +317,8 @@ async def test_floor_that_begins_anew_takes_back_all_that_it_has_told():
             ("path", {"id": "r1", "value": {"points": [[1.0, 1.0], [4.0, 1.0]]}}), ("ready", {})]  # fmt: skip
     for event in told:
         bridge.on_event(*event)
+    assert robot.situation(100.0).unavailable == "the robot is not there", "its state may be an old one"
+    bridge.on_event("robot", {"id": "r1", "value": {"state": STATE | {"stamp": 2.0}, "goal": None}})
     to_place = read(order(A, {name: value for name, value in B.items() if name != "nodePosition"} | {"nodeId": "old"}))
     assert robot.checked(to_place, 100.0) is None
     robot.accept(to_place)
@@ -404,6 +409,28 @@ def test_cancelled_order_ends_the_mission_and_is_finished_once_the_robot_stands(
     floor.tell()
     assert (actions(floor)["c"], floor.said()["nodeStates"], floor.said()["orderId"]) == ("FINISHED", [], "o1")
     assert floor.take(order(B, C, update=1)) == "ORDER_UPDATE_FOLLOWING_CANCEL"
+
+
+def test_order_that_follows_a_cancel_at_once_is_not_taken_for_the_one_before():
+    floor, other = Floorplan(), order(A, C | {"sequenceId": 2}, name="o2")
+    floor.take(order(A, B))
+    floor.drive()
+    floor.robot.on_instant(instant("cancelOrder"), floor.now)
+    assert floor.take(other) == ""
+    floor.at(4.0, 1.0)
+    floor.tell(goal_reached=True)
+    assert floor.said()["nodeStates"] != [], "that was the other order's node"
+    assert floor.drive() == ["PUT 7 1"]
+
+
+def test_refusal_of_a_goal_of_an_order_that_was_cancelled_stops_no_other_order():
+    floor = Floorplan()
+    floor.take(order(A, B))
+    assert floor.robot.step(floor.now).method == "PUT"
+    floor.robot.on_instant(instant("cancelOrder"), floor.now)
+    floor.take(order(A, C | {"sequenceId": 2}, name="o2"))
+    floor.robot.on_answer(Answer("a wall", "goal_refused"), floor.now)
+    assert (floor.errors(), floor.drive()) == ({}, ["PUT 7 1"])
 
 
 def test_pause_ends_the_mission_but_not_the_order_and_its_end_leads_on():

@@ -89,9 +89,9 @@ class Floorplan:
         self.state: dict[str, Any] = dict(STATE)
         self.more: dict[str, Any] = {}
         self.now = 100.0
+        self.robot.on_known(self.now)
         self.at(1.0, 1.0)
         self.tell()
-        self.robot.on_known(self.now)
 
     def at(self, x: float, y: float, v: float = 0.0) -> None:
         """Put the robot there."""

@@ -69,7 +69,8 @@ class FleetRobot:
         self._heard = -math.inf
         self._goal = ""
         """The fleet's mission, by its id; empty without one."""
-        self._goal_node = -1
+        self._goal_node: Node | None = None
+        """Where it leads: a node of the order, or of one before it, which may have had the same sequenceIds."""
         self._own: dict[str, bool] = {}
         """The fleet's latest missions, and whether they are certainly over."""
         self._shown_at = -math.inf
@@ -92,8 +93,8 @@ class FleetRobot:
     def on_robot(self, view: dict[str, Any], now: float) -> None:
         """Take in the robot's state, mission and plan."""
         before = (self.view["state"] or {}).get("stamp")
-        if (view["state"] or {}).get("stamp") != before:
-            self._heard = now
+        if self.is_known and (view["state"] or {}).get("stamp") != before:
+            self._heard = now  # what is told before all is known may be long ago
         self.view = view
         state = self.state
         if state.get("goal_reached") and state.get("goal_id"):
@@ -324,7 +325,8 @@ class FleetRobot:
         shown, end = (self.view["goal"] or {"goal_id": ""})["goal_id"], self._ends.get(self._goal)
         if end:
             self._drop(is_over=True)
-            self.orders.traversed(self._goal_node)
+            if (node := self._ahead(self._goal_node)) is not None:
+                self.orders.traversed(node.sequence_id)
         elif shown == self._goal:
             self._shown_at = now
         elif end is False or (shown and shown not in self._own) or now - self._shown_at >= UNSEEN_S:
@@ -347,14 +349,15 @@ class FleetRobot:
             self._refused_since = None
         elif self._refused_since is None:
             self._refused_since = now
-        elif now - self._refused_since > REFUSED_S and (node := self._node(self._goal_node)) is not None:
+        elif now - self._refused_since > REFUSED_S and (node := self._ahead(self._goal_node)) is not None:
             self._give_up(node, refusal["reason"])
 
     def _give_up(self, node: Node, words: str) -> None:
         self._unreachable = about_error("NODE_UNREACHABLE", words, {"nodeId": node.node_id}, "CRITICAL")
 
-    def _node(self, sequence: int) -> Node | None:
-        return next((node for node in self.orders.nodes if node.sequence_id == sequence), None)
+    def _ahead(self, node: Node | None) -> Node | None:
+        """Return a node if it still is the order's, and lies ahead."""
+        return next((each for each in self.orders.nodes if each is node), None)
 
     def _pass_nodes(self) -> None:
         """Traverse nodes that more of the base follows as soon as the robot is within their deviation: it drives on."""
@@ -383,7 +386,7 @@ class FleetRobot:
             if not self._goal:
                 return None
             return self._ask(Request("DELETE", path, headers={"If-Match": f'"{self._goal}"'}), None, now)
-        if not self.state or (self._goal and self._goal_node == node.sequence_id):
+        if not self.state or (self._goal and self._goal_node is node):
             return None
         pose = {"x": goal.x, "y": goal.y} | ({} if goal.theta is None else {"theta": goal.theta})
         headers = {"If-Match": f'"{self._goal}"'} if self._goal else {"If-None-Match": "*"}
@@ -401,9 +404,10 @@ class FleetRobot:
         goal = self.view["goal"] or {"goal_id": ""}
         if self._unsure and goal["goal_id"] and self._may_be_own(goal):
             self._own.setdefault(goal["goal_id"], False)
-        if not self._goal and self._own.get(goal["goal_id"]) is False:
-            self._goal, self._goal_node, self._unsure = goal["goal_id"], -1, None
-        elif not self._goal and now - self._shown_at >= UNSEEN_S:
+        is_over, is_long_ago = self._own.get(goal["goal_id"]), now - self._shown_at >= UNSEEN_S
+        if not self._goal and (is_over is False or (is_over and is_long_ago)):
+            self._goal, self._goal_node, self._unsure = goal["goal_id"], None, None
+        elif not self._goal and is_long_ago:
             self._unsure = None
 
     def on_answer(self, answer: Answer, now: float) -> None:
@@ -417,13 +421,14 @@ class FleetRobot:
         if request.method == "PUT" and "goal_id" in answer.body and node is not None:
             if self._goal:
                 self._drop(is_over=True)
-            self._goal, self._goal_node = answer.body["goal_id"], node.sequence_id
+            self._goal, self._goal_node = answer.body["goal_id"], node
             remember(self._own, self._goal, value=False)
             self._shown_at, self._refused_since = now, None
         elif request.method == "DELETE" and (not answer.refusal or answer.problem in ("no_mission", "mission_changed")):
             self._drop(is_over=True)
         elif answer.problem == "goal_refused" and node is not None:
-            self._give_up(node, answer.refusal)
+            if self._ahead(node) is not None:
+                self._give_up(node, answer.refusal)
         else:
             self._retry_at = now + RETRY_S
             if request.method == "PUT" and answer.problem in _UNCERTAIN:
@@ -435,7 +440,7 @@ class FleetRobot:
     @property
     def goal_node(self) -> str:
         """The node that the robot drives to; empty if it drives to none."""
-        node = self._node(self._goal_node) if self._goal else None
+        node = self._ahead(self._goal_node) if self._goal else None
         return "" if node is None else node.node_id
 
     def errors(self) -> list[Error]:

@@ -47,6 +47,8 @@ ROUTE: Final = "/api/v1/foxglove"
 ROLE: Final = "viewer"
 VIEWERS: Final = 8
 """Most viewers at the same time."""
+ASKING: Final = 4
+"""So many who want to look on are looked up at the same time: the console answers orders and stops, too."""
 SUBSCRIPTIONS: Final = 1000
 """Most subscriptions of a viewer."""
 OWED: Final = 100
@@ -97,6 +99,8 @@ class Viewer:
 
     def subscribe(self, subscription: int, channel: int, latest: Post | None) -> None:
         """Want a channel, and its latest message at once; raises `ProtocolError`."""
+        if any(wanted == channel for number, wanted in self._wanted.items() if number != subscription):
+            raise ProtocolError(f"channel {channel} is subscribed already: each message is sent once")
         if subscription not in self._wanted and len(self._wanted) >= SUBSCRIPTIONS:
             raise ProtocolError(f"{SUBSCRIPTIONS} subscriptions are there already: end some")
         self._wanted[subscription] = channel
@@ -148,7 +152,7 @@ class Viewers:
         self._channels: dict[str, Channel] = {}
         self._latest: dict[int, Post] = {}
         self._viewers: set[Viewer] = set()
-        self._places = 0
+        self._places = self._asking = 0
         self._limited = logs.RateLimited(_log)
         self.floor: Floor | None = None
         """Who says which role a token has; None: nobody yet."""
@@ -240,7 +244,13 @@ class Viewers:
         if not token:
             detail = f"send `Authorization: Bearer TOKEN`, or from Foxglove's app open {ROUTE}?token=TOKEN"
             return problem(HttpProblem.TOKEN_MISSING, detail)
-        role = await self.floor.role_of(token) if self.floor is not None and _TOKEN.fullmatch(token) else ""
+        if self._asking >= ASKING:
+            return problem(HttpProblem.OVERLOADED, "others are being looked up", headers=RETRY_AFTER)
+        self._asking += 1
+        try:
+            role = await self.floor.role_of(token) if self.floor is not None and _TOKEN.fullmatch(token) else ""
+        finally:
+            self._asking -= 1
         if self._places >= VIEWERS:
             detail = f"{VIEWERS} viewers look on already: close one"
             return problem(HttpProblem.OVERLOADED, detail, headers=RETRY_AFTER)

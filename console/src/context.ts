@@ -46,10 +46,19 @@ const PERIOD_MS = 400;
 const waiting = new Set<() => void>();
 let timer: ReturnType<typeof setTimeout> | undefined;
 
+/** So many components are drawn in a frame; further ones in a later one. */
+const COMPONENTS_A_FRAME = 4;
+
 function redrawNow(): void {
-  const due = [...waiting];
-  waiting.clear();
-  for (const each of due) each();
+  let left = COMPONENTS_A_FRAME;
+  for (const each of waiting) {
+    if (left-- === 0) {
+      drawInTurn("panels", redrawNow);
+      return;
+    }
+    waiting.delete(each);
+    each();
+  }
 }
 
 /** Draw components anew together, at most twice or three times a second: a person reads no faster. */

@@ -184,6 +184,8 @@ class RobotDrawing {
   }
 }
 
+/** So many robots get their marks in a frame; further ones in a later one. */
+const MARKS_A_FRAME = 4;
 const PARTS = ["robot", "pose", "path", "obstacles", "scan"] as const;
 type Part = (typeof PARTS)[number];
 
@@ -277,22 +279,34 @@ export class RobotLayer {
   };
 
   private readonly drawMarks = (): void => {
-    for (const [id, parts] of this.dirty) {
-      let drawn = this.drawings.get(id);
-      if (!this.live.of.pose.has(id)) {
-        drawn?.remove();
-        this.drawings.delete(id);
-        continue;
+    let left = MARKS_A_FRAME;
+    for (const [id, parts] of [...this.dirty]) {
+      const moves = parts.has("pose"); // where it is drawn comes first
+      if (moves && parts.size === 1) continue;
+      if (left-- === 0) {
+        drawInTurn("marks", this.drawMarks);
+        return;
       }
-      if (!drawn) {
-        drawn = new RobotDrawing(this.map, this.live, id, this.renderer, this.bodies, () => this.onRobot(id));
-        this.drawings.set(id, drawn);
-      }
-      drawn.caption();
-      if (parts.has("path") || parts.has("robot")) drawn.path();
-      if (parts.has("obstacles") || parts.has("scan")) drawn.points();
-      if (parts.has("robot")) drawn.state(id === this.selected);
+      this.dirty.delete(id);
+      if (moves) this.dirty.set(id, new Set<Part>(["pose"]));
+      this.drawMark(id, parts);
     }
-    this.dirty.clear();
   };
+
+  private drawMark(id: string, parts: ReadonlySet<Part>): void {
+    let drawn = this.drawings.get(id);
+    if (!this.live.of.pose.has(id)) {
+      drawn?.remove();
+      this.drawings.delete(id);
+      return;
+    }
+    if (!drawn) {
+      drawn = new RobotDrawing(this.map, this.live, id, this.renderer, this.bodies, () => this.onRobot(id));
+      this.drawings.set(id, drawn);
+    }
+    drawn.caption();
+    if (parts.has("path") || parts.has("robot")) drawn.path();
+    if (parts.has("obstacles") || parts.has("scan")) drawn.points();
+    if (parts.has("robot")) drawn.state(id === this.selected);
+  }
 }

@@ -411,6 +411,22 @@ def test_cancelled_order_ends_the_mission_and_is_finished_once_the_robot_stands(
     assert floor.take(order(B, C, update=1)) == "ORDER_UPDATE_FOLLOWING_CANCEL"
 
 
+def test_pause_after_an_operator_has_ended_the_mission_does_not_hide_that():
+    floor = Floorplan()
+    floor.take(order(A, B))
+    floor.drive()
+    floor.at(2.0, 1.0)
+    floor.goal = None
+    floor.tell(goal_id=None)
+    floor.robot.on_instant(instant("startPause", "p"), floor.now)
+    assert floor.drive(Answer("robot r1 has no mission", "no_mission")) == ["DELETE"]
+    floor.robot.on_instant(instant("stopPause", "q"), floor.now)
+    floor.tell(UNSEEN_S)
+    assert floor.errors() == {"ORDER_ENDED": "WARNING"}
+    floor.tell(3.0)
+    assert (floor.said()["operatingMode"], floor.drive()) == ("AUTOMATIC", [])
+
+
 def test_order_that_follows_a_cancel_at_once_is_not_taken_for_the_one_before():
     floor, other = Floorplan(), order(A, C | {"sequenceId": 2}, name="o2")
     floor.take(order(A, B))
@@ -533,7 +549,8 @@ async def test_cancel_ends_orders_that_wait_and_one_that_is_sent_again_while_it_
     assert floor.said()["orderId"] == {"o1": "o2", "o2": "o1"}.get(wanted.get("orderId"), "")
     for n in range(50):
         link.on_message("x/instantActions", msgspec.json.encode(instant("stateRequest", f"s{n}")))
+        link.on_message("x/instantActions", msgspec.json.encode(instant(f"new{n}", f"n{n}")))
     lines = [each.message for each in caplog.records]
-    assert (lines.count("order") <= 5, lines.count("instant_action")) == (True, 2), "a fleet fills no disk"
+    assert (lines.count("order") <= 5, lines.count("instant_action")) == (True, 3), "a fleet fills no disk"
     taking.cancel()
     await asyncio.gather(taking, return_exceptions=True)

@@ -184,10 +184,9 @@ class RobotLink(Connection):
         self._is_asked |= "state" in wishes
         self._wants_factsheet |= "factsheet" in wishes
         for action in message.actions:
-            key = f"action {action.action_type}"
-            self.limited.info(
-                "instant_action", key, now, robot=core.robot, action=action.action_type, id=action.action_id
-            )
+            kind = action.action_type
+            key = f"action {kind if kind in dict(telling.ACTIONS) else 'unknown'}"  # a fleet can't make ever new keys
+            self.limited.info("instant_action", key, now, robot=core.robot, action=kind, id=action.action_id)
         for order in waited:
             if order not in core.waiting:
                 self._tell_order(order, "dropped", "it was cancelled first")
@@ -238,7 +237,8 @@ class RobotLink(Connection):
         path = f"/api/v1/robots/{self.core.robot}/goal/dry-run"
         answer = await self._floor.ask(Request("POST", path, {"pose": {"x": goal.x, "y": goal.y}}))
         if answer.refusal:
-            self.limited.warning("route_unknown", node.node_id, self.clock.now(), reason=answer.refusal)
+            now, words = self.clock.now(), answer.refusal
+            self.limited.warning("route_unknown", f"route {answer.problem}", now, node=node.node_id, reason=words)
             return answer.refusal if answer.problem == "request_invalid" else ""
         refusal = (answer.body.get("path") or {}).get("refusal")
         return "" if refusal is None else str(refusal.get("reason", "there is no path"))

@@ -166,6 +166,7 @@ class FleetRobot:
         if not state:
             return "STARTUP", "it has not told its state yet"
         is_foreign = goal is not None and goal["goal_id"] not in self._own and not self._may_be_own(goal)
+        waits = bool(state.get("awaits_operator")) or not state["enabled"]
         reasons: tuple[tuple[bool, OperatingMode, str], ...] = (
             (out is not None, "SERVICE", f"an operator has taken it out of service: {(out or {}).get('reason')}"),
             (is_foreign, "MANUAL", "it has a mission of an operator of Fognav"),
@@ -173,11 +174,7 @@ class FleetRobot:
             (state["mode"] in _BY_HAND, "MANUAL", _BY_HAND.get(state["mode"], "")),
             (bool(state.get("wants_dock")), "MANUAL", "it is on its way to its dock"),
             (bool(state.get("docked")), "MANUAL", "it stands on its dock: an operator of Fognav undocks it"),
-            (
-                bool(state.get("awaits_operator")) or not state["enabled"],
-                "MANUAL",
-                "it waits for an operator of Fognav, who enables it",
-            ),
+            (waits, "MANUAL", "it waits for an operator of Fognav, who enables it"),
             (now < self._taken_until, "MANUAL", "an operator of Fognav has ended its mission"),
         )
         return next(((mode, words) for holds, mode, words in reasons if holds), ("AUTOMATIC", ""))
@@ -393,7 +390,9 @@ class FleetRobot:
         return self._ask(Request("PUT", path, {"pose": pose}, headers | {"Idempotency-Key": uuid4().hex}), node, now)
 
     def _ask(self, request: Request, node: Node | None, now: float) -> Request:
-        self._asking, self._asked_for, self._shown_at = request, node, now
+        self._asking, self._asked_for = request, node
+        if request.method == "PUT":
+            self._shown_at = now
         return request
 
     def _adopt(self, now: float) -> None:
@@ -406,7 +405,7 @@ class FleetRobot:
             self._own.setdefault(goal["goal_id"], False)
         is_over, is_long_ago = self._own.get(goal["goal_id"]), now - self._shown_at >= UNSEEN_S
         if not self._goal and (is_over is False or (is_over and is_long_ago)):
-            self._goal, self._goal_node, self._unsure = goal["goal_id"], None, None
+            self._goal, self._goal_node, self._unsure, self._shown_at = goal["goal_id"], None, None, now
         elif not self._goal and is_long_ago:
             self._unsure = None
 
@@ -416,6 +415,8 @@ class FleetRobot:
         self._asking = None
         if request is None:
             return
+        # Of an order that goes on it has to be known who ended its mission: an operator ends the order.
+        is_gone = answer.problem in ("no_mission", "mission_changed") and (self.orders.is_idle or again)
         if request.method == "PUT" or not answer.refusal:
             self._unsure = None  # it is answered, or there is no mission any more that it might replace
         if request.method == "PUT" and "goal_id" in answer.body and node is not None:
@@ -424,7 +425,7 @@ class FleetRobot:
             self._goal, self._goal_node = answer.body["goal_id"], node
             remember(self._own, self._goal, value=False)
             self._shown_at, self._refused_since = now, None
-        elif request.method == "DELETE" and (not answer.refusal or answer.problem in ("no_mission", "mission_changed")):
+        elif request.method == "DELETE" and (not answer.refusal or is_gone):
             self._drop(is_over=True)
         elif answer.problem == "goal_refused" and node is not None:
             if self._ahead(node) is not None:

@@ -181,7 +181,7 @@ def _conditions(robot: FleetRobot) -> list[out.Error]:
     return found
 
 
-_ACTIONS: Final[tuple[tuple[str, list[dict[str, Any]]], ...]] = (
+ACTIONS: Final[tuple[tuple[str, list[dict[str, Any]]], ...]] = (
     ("cancelOrder", [{"key": "orderId", "valueDataType": "STRING", "isOptional": True}]),
     ("startPause", []), ("stopPause", []), ("stateRequest", []), ("factsheetRequest", []), ("clearInstantActions", []),
 )  # fmt: skip
@@ -200,7 +200,7 @@ def factsheet(robot: FleetRobot, version: Version) -> dict[str, Any]:
     actions = [
         {"actionType": kind, "actionScopes": ["INSTANT"], "actionParameters": parameters}
         | ({"blockingTypes": ["NONE"], "pauseAllowed": False, "cancelAllowed": False} if is_new else {})
-        for kind, parameters in _ACTIONS
+        for kind, parameters in ACTIONS
         if is_new or kind != "clearInstantActions"
     ]
     kind = {"seriesName": "Fognav", "localizationTypes": ["NATURAL"]}

@@ -427,6 +427,31 @@ def test_pause_after_an_operator_has_ended_the_mission_does_not_hide_that():
     assert (floor.said()["operatingMode"], floor.drive()) == ("AUTOMATIC", [])
 
 
+def test_operators_end_of_a_mission_is_noticed_although_the_fleet_keeps_asking_to_replace_it():
+    floor = Floorplan()
+    wide = {"allowedDeviationXY": {"a": 0.5, "b": 0.5, "theta": 0.0}}
+    floor.take(order(A, node("b", 2, 4.0, 1.0, position=wide), C))
+    floor.drive()
+    floor.goal = None
+    floor.at(3.8, 1.0)
+    for _ in range(6):
+        floor.tell(goal_id=None)
+        floor.drive(Answer("robot r1 has no mission", "mission_changed"))
+    assert floor.errors() == {"ORDER_ENDED": "WARNING"}
+
+
+def test_cancel_whose_answer_is_lost_is_no_operators():
+    floor = Floorplan()
+    floor.take(order(A, B))
+    floor.drive()
+    floor.robot.on_instant(instant("cancelOrder", "c"), floor.now)
+    assert floor.drive(Answer("the floor can't be reached")) == ["DELETE"]
+    floor.goal = None
+    floor.robot.on_end("g1", floor.now, reached=False)
+    floor.tell()
+    assert (floor.errors(), floor.said()["operatingMode"], actions(floor)) == ({}, "AUTOMATIC", {"c": "FINISHED"})
+
+
 def test_order_that_follows_a_cancel_at_once_is_not_taken_for_the_one_before():
     floor, other = Floorplan(), order(A, C | {"sequenceId": 2}, name="o2")
     floor.take(order(A, B))

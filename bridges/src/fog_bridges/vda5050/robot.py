@@ -74,7 +74,8 @@ class FleetRobot:
         self._own: dict[str, bool] = {}
         """The fleet's latest missions, and whether they are certainly over."""
         self._shown_at = -math.inf
-        """When its mission was last shown, asked for, or could be shown again."""
+        """When its mission was last shown, accepted, or could be shown again."""
+        self._asked_at = -math.inf
         self._ends: dict[str, bool] = {}
         """Missions of the robot that are told to have ended, and whether they were reached."""
         self.is_known = False
@@ -96,8 +97,7 @@ class FleetRobot:
         if self.is_known and (view["state"] or {}).get("stamp") != before:
             self._heard = now  # what is told before all is known may be long ago
         self.view = view
-        state = self.state
-        if state.get("goal_reached") and state.get("goal_id"):
+        if (state := self.state).get("goal_reached") and state.get("goal_id"):
             remember(self._ends, state["goal_id"], value=True)
         self.advance(now)
 
@@ -249,10 +249,8 @@ class FleetRobot:
     def _act(self, action: Action, now: float, wishes: list[Wish]) -> tuple[str, str] | None:
         """Carry out an action; return error type and words of why that can't be."""
         kind, mode = action.action_type, self.mode(now)
-        if kind == "stateRequest":
-            self._set(action.action_id, kind, "FINISHED")
-        elif kind == "factsheetRequest":
-            wishes.append("factsheet")
+        if kind in ("stateRequest", "factsheetRequest"):
+            wishes += ["factsheet"] if kind == "factsheetRequest" else []
             self._set(action.action_id, kind, "FINISHED")
         elif kind == "clearInstantActions":
             self.instant = {name: each for name, each in self.instant.items() if each.action_status == "RUNNING"}
@@ -328,6 +326,8 @@ class FleetRobot:
             self._shown_at = now
         elif end is False or (shown and shown not in self._own) or now - self._shown_at >= UNSEEN_S:
             self._drop(is_over=end is False)
+            if self.orders.is_idle:
+                return  # it was to end
             self._taken_until = now + TAKEN_S
             words = "an operator of Fognav has ended the mission, and so the order"
             self._about_errors["ORDER_ENDED"] = about_error("ORDER_ENDED", words, {"orderId": self.orders.order_id})
@@ -392,7 +392,7 @@ class FleetRobot:
     def _ask(self, request: Request, node: Node | None, now: float) -> Request:
         self._asking, self._asked_for = request, node
         if request.method == "PUT":
-            self._shown_at = now
+            self._asked_at = now
         return request
 
     def _adopt(self, now: float) -> None:
@@ -401,9 +401,9 @@ class FleetRobot:
         One that may have been accepted, and is not wanted any more, is waited for: asking again might begin it.
         """
         goal = self.view["goal"] or {"goal_id": ""}
-        if self._unsure and goal["goal_id"] and self._may_be_own(goal):
-            self._own.setdefault(goal["goal_id"], False)
-        is_over, is_long_ago = self._own.get(goal["goal_id"]), now - self._shown_at >= UNSEEN_S
+        if self._unsure and goal["goal_id"] not in ("", *self._own) and self._may_be_own(goal):
+            remember(self._own, goal["goal_id"], value=False)
+        is_over, is_long_ago = self._own.get(goal["goal_id"]), now - max(self._shown_at, self._asked_at) >= UNSEEN_S
         if not self._goal and (is_over is False or (is_over and is_long_ago)):
             self._goal, self._goal_node, self._unsure, self._shown_at = goal["goal_id"], None, None, now
         elif not self._goal and is_long_ago:

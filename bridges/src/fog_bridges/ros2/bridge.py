@@ -173,7 +173,7 @@ class Relay:
         self._static: NDArray[np.uint8] = np.zeros((0, 0), np.uint8)
         self._told: dict[Topic, NDArray[np.int8]] = {}
         self._window: Window | None = None
-        """The part of the floor that keepout masks have: all that was ever blocked, so that a robot also clears it."""
+        """The part of the floor that keepout masks have: all that was ever blocked, so that it is cleared, too."""
         self._told_at = 0.0
         self._dirty: set[Topic] = set()
         """The masks that may have changed."""

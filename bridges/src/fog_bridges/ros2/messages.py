@@ -109,18 +109,16 @@ def grid(values: NDArray[np.int8], geometry: GridGeometry, stamp: float, window:
 
 
 def covering(values: NDArray[np.int8], window: Window | None) -> Window | None:
-    """Return the smallest window that has all of `window`, and all values (height, width) that are not 0."""
+    """Return the smallest window from cell (0, 0) on that has all of `window`, and all values that are not 0.
+
+    From there, because Nav2's filter draws as many cells of its costmap anew as a mask has, counted from the costmap's
+    own corner, wherever the mask lies (`KeepoutFilter::updateBounds`, navigation2@a3a97043).
+    """
     rows, columns = (np.flatnonzero(values.any(axis=axis)) for axis in (1, 0))
     if not rows.size:
         return window
-    x, y = int(columns[0]), int(rows[0])
-    found = Window(x, y, int(columns[-1]) + 1 - x, int(rows[-1]) + 1 - y)
-    if window is None:
-        return found
-    left, bottom = min(window.x, found.x), min(window.y, found.y)
-    right = max(window.x + window.width, found.x + found.width)
-    top = max(window.y + window.height, found.y + found.height)
-    return Window(left, bottom, right - left, top - bottom)
+    before = window or Window(0, 0, 0, 0)
+    return Window(0, 0, max(before.width, int(columns[-1]) + 1), max(before.height, int(rows[-1]) + 1))
 
 
 def map_values(static: NDArray[np.uint8]) -> NDArray[np.int8]:

@@ -16,7 +16,7 @@ from urllib.parse import urlsplit
 import pytest
 from PIL import Image
 
-from fog_bridges.floor import Request
+from fog_bridges.floor import WAITS, Request
 from fog_bridges.home_assistant import HomeAssistant, activity, discovery, report
 from fog_bridges.service import HomeAssistantBridge
 from fog_contracts import channels as ch
@@ -242,6 +242,9 @@ def test_orders_become_requests_of_operators_and_nothing_enables():
         core.on_event(name, data)
     assert core.on_command("r1", "stop") == Request("POST", "/api/v1/robots/r1/stop")
     assert core.on_command("r1", "goal b") == Request("PUT", "/api/v1/robots/r1/goal", {"place": "b"})
+    for waiting in ({"enabled": False}, {"enabled": True, "awaits_operator": True}):
+        core.on_event("robot", {"id": "r1", "value": view(**waiting)})
+        assert core.on_command("r1", "goal b") == WAITS, "it would drive off at the next enable"
     assert core.on_command("r1", "goal no goal") == core.on_command("r1", "cancel")
     assert core.on_command("r1", "return_to_base").body == {"kind": "dock"}
     for robot, text in (("r1", "enable"), ("r1", "reset"), ("r1", "goal ../x"), ("r2", "stop"), ("r1", "")):

@@ -75,6 +75,10 @@ class ServesSockets(Protocol):
         """What the bridge serves of it."""
 
 
+WAITS: Final = "the robot waits for an operator of Fognav, who enables it: send the goal again then"
+"""Why such a robot gets no goal: it would wait, and drive off when somebody enables the robot for something else."""
+
+
 class Floor:
     """Reads the events of one floor, again and again from where it was, and sends requests."""
 

@@ -18,7 +18,7 @@ from uuid import uuid4
 import numpy as np
 import zenoh
 
-from fog_bridges.floor import Request
+from fog_bridges.floor import WAITS, Request
 from fog_bridges.metrics import REFUSED
 from fog_bridges.ros2 import messages as ros
 from fog_bridges.ros2.wire import TYPES, RosMessage, WireError, decoded_as
@@ -264,8 +264,7 @@ class Fleet:
         """Begin a mission in the place of this bridge's own, never of another's; return why not, empty if it has."""
         state, own = self._states[robot], self._missions.get(robot)
         if not state.enabled or state.awaits_operator:
-            # It would wait, and drive off when an operator enables the robot for something else.
-            return "the robot waits for an operator of Fognav, who enables it: send the goal again then"
+            return WAITS
         replaces = own is not None and own.status == EXECUTING
         condition = {"If-Match": f'"{own.mission}"'} if own is not None and replaces else {"If-None-Match": "*"}
         headers = condition | {"Idempotency-Key": uuid4().hex}

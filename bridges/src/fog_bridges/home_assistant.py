@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any, Final
 
 import msgspec
 
-from fog_bridges.floor import Request
+from fog_bridges.floor import WAITS, Request
 from fog_contracts import channels as ch
 from fog_contracts.handlers import Publication
 
@@ -76,7 +76,8 @@ class HomeAssistant:
             return Request("POST", f"{path}/commands", {"kind": "dock"})
         place = text.removeprefix(GOAL)
         if text.startswith(GOAL) and place in self._places:
-            return Request("PUT", f"{path}/goal", {"place": place})
+            waits = _waits(self._robots[robot]["state"])
+            return WAITS if waits else Request("PUT", f"{path}/goal", {"place": place})
         known = f"{STOP}, {CANCEL}, {DOCK}, or {GOAL}with one of {', '.join(self._places) or 'no place'}"
         return f"{text[:40]!r} is no command: send {known}"
 
@@ -101,6 +102,11 @@ class HomeAssistant:
                 yield Publication(ch.HOME_ASSISTANT_ROBOT, now[0], {"robot_device": f"robot_{robot}"})
             if before[1] != now[1]:
                 yield Publication(ch.ROBOT_REPORT, now[1], {"robot": robot})
+
+
+def _waits(state: Mapping[str, Any] | None) -> bool:
+    """Whether a robot drives only after an operator has enabled it."""
+    return state is not None and (not state.get("enabled", True) or bool(state.get("awaits_operator")))
 
 
 def report(view: Mapping[str, Any], places: Collection[str]) -> str:

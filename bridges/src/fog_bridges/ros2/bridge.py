@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any, Final
 import numpy as np
 import zenoh
 
-from fog_bridges.floor import Request
+from fog_bridges.floor import WAITS, Request
 from fog_bridges.ros2 import messages as ros
 from fog_bridges.ros2.others import Others, thing_id
 from fog_bridges.ros2.session import RosSession
@@ -59,7 +59,6 @@ TICK_S: Final = 0.1
 SNAPSHOT_TIMEOUT_S: Final = 3.0
 RETRY_S: Final = 1.0
 _NO_ROUTER: Final = "ROS's router (`ros2 run rmw_zenoh_cpp rmw_zenohd`) is not connected"
-_STOPPED: Final = "the robot waits for an operator of Fognav, who enables it: send the goal again then"
 GOALS_AT_ONCE: Final = 20
 GOAL_MAX_AGE_S: Final = 10.0
 """An older goal is refused: who sent it may have forgotten it."""
@@ -187,7 +186,7 @@ class Relay:
         self._driving: dict[str, str | None] = {}
         """The goal that each robot has, by its last state."""
         self._stopped: set[str] = set()
-        """Robots that wait for an operator: a goal would wait, too, and drive them off when somebody enables them."""
+        """Robots that wait for an operator."""
         self._goals: asyncio.Queue[tuple[str, float, Request]] = asyncio.Queue(GOALS_AT_ONCE)
 
     def subscribe(self) -> None:
@@ -229,7 +228,7 @@ class Relay:
             if waited > GOAL_MAX_AGE_S:
                 self._session.refuse("old", f"{robot}/goal_pose", f"it has waited for {waited:.0f} s: send it again")
             elif robot in self._stopped:
-                self._session.refuse("goal", f"{robot}/goal_pose", _STOPPED)
+                self._session.refuse("goal", f"{robot}/goal_pose", WAITS)
             elif refusal := await self._floor.send(request):
                 self._session.refuse("goal", f"{robot}/goal_pose", refusal)
 
@@ -403,7 +402,7 @@ class Relay:
         if not np.isfinite((x, y)).all():
             raise WireError(f"a goal at ({x}, {y})")
         if robot in self._stopped:
-            raise WireError(_STOPPED, "goal")
+            raise WireError(WAITS, "goal")
         pose = {"x": x, "y": y} | ({} if theta is None else {"theta": theta})
         request = Request("PUT", f"/api/v1/robots/{robot}/goal", {"pose": pose})
         try:

@@ -17,14 +17,14 @@ PUBLIC = {
     "/api/v1/alerts", "/api/v1/prometheus/robots",
     "/api/v1/areas", "/api/v1/areas/{area_id}", "/api/v1/areas/{area_id}/history",
     "/api/v1/areas/{area_id}/override", "/api/v1/nodes",
-    "/api/v1/hazards", "/api/v1/map", "/api/v1/map.png", "/api/v1/costmap.png", "/api/v1/places",
+    "/api/v1/hazards", "/api/v1/map", "/api/v1/map.png", "/api/v1/map.yaml", "/api/v1/costmap.png", "/api/v1/places",
     "/api/v1/zones", "/api/v1/zones/{zone_id}", "/api/v1/zones.geojson", "/api/v1/unusable-zones",
     "/api/v1/masks/keepout.png", "/api/v1/masks/keepout.yaml", "/api/v1/masks/speed.png", "/api/v1/masks/speed.yaml",
     "/api/v1/places/{place}", "/api/v1/zone-sets", "/api/v1/zone-sets/{set_id}",
 }  # fmt: skip
 """Reads for everybody on the floor (docs/security.md); whatever else is read tells about people."""
 
-ADMINS = {"/api/v1/map/previews/{preview}.png"}
+HIGHER = {"/api/v1/map/previews/{preview}.png": "admin", "/api/v1/visits": "operator"}
 
 
 @pytest.fixture(scope="module")
@@ -87,7 +87,7 @@ def test_every_read_that_tells_about_people_needs_a_token(urls, tokens):
             without = httpx.get(address).status_code
             if (without == 401) == (path in PUBLIC):
                 wrong.append(f"{path} without a token: {without}")
-            role = "admin" if path in ADMINS else "viewer"
+            role = HIGHER.get(path, "viewer")
             if httpx.get(address, headers=tokens[role]).status_code in (401, 403):
                 wrong.append(f"{path} is refused to the role {role}")
     assert wrong == []

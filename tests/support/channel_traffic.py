@@ -62,6 +62,7 @@ class Process:
             "node": (self.user,) if self.role == ch.NODE else NODES,
             "source": (self.user,) if self.role == ch.ZONE_SOURCE else SOURCES,
             "zone": ("wet",),
+            "thing": ("tb4",),
             "set": ("night",),
             "area": AREAS,
             "role": (self.role,),

@@ -69,7 +69,7 @@ export function Visits(): preact.JSX.Element | null {
   const name = (id: string): string => live.of.place.get(id)?.label || id;
   const end = async ({ id, goal }: OpenVisit): Promise<void> => {
     try {
-      await request("DELETE", `visits/${id}`);
+      await request("DELETE", `visits/open/${id}`);
       say(t("visits.over", { place: name(goal) }));
     } catch (error) {
       say(t("visits.failed", { reason: sentence(error) }), "failed");

@@ -70,7 +70,7 @@ def broker(security, tmp_path_factory):
 # --- zenoh ----------------------------------------------------------------------------------------------------------
 
 ROBOT_PROCESSES = [Process(ch.ROBOT, robot) for robot in ROBOTS]
-TOOLS = [Process(role, role) for role in (ch.CONSOLE, "recorder", ch.SIM, ch.WEB)] + [
+TOOLS = [Process(role, role) for role in (ch.BRIDGE, ch.CONSOLE, "recorder", ch.SIM, ch.WEB)] + [
     Process(ch.CONSOLE, ch.CONSOLE, ONE_ROBOT),
     Process("recorder", TESTER),
 ]

@@ -186,12 +186,12 @@ async def test_operator_sees_the_open_visits_and_ends_one(world: World) -> None:
     await world.ask("POST", "visits", TOUR)
     for role in ("guest", "viewer"):
         assert (await world.ask("GET", "visits", role=role)).status_code == 403
-        assert (await world.ask("DELETE", "visits/1", role=role)).status_code == 403
+        assert (await world.ask("DELETE", "visits/open/1", role=role)).status_code == 403
     (visit,) = (await world.ask("GET", "visits", role="operator")).json()
     assert (visit["name"], visit["robot"], visit["state"], visit["goal"]) == ("hall tablet", "r1", "coming", "lab")
-    refused = await world.ask("DELETE", "visits/1", role="operator")
+    refused = await world.ask("DELETE", "visits/open/1", role="operator")
     assert (refused.status_code, refused.json()["type"]) == (404, "urn:fognav:no_visit")
-    assert (await world.ask("DELETE", f"visits/{visit['id']}", role="operator")).status_code == 204
+    assert (await world.ask("DELETE", f"visits/open/{visit['id']}", role="operator")).status_code == 204
     assert await world.mine() == ("ended", "operator")
     assert (world.stored, (await world.ask("GET", "visits", role="operator")).json()) == ({}, [])
 

@@ -134,8 +134,7 @@ def _add_operators(
             raise ProblemError(HttpProblem.STANDS_BY, f"{reason}; send the request there")
         return [OpenVisit(**about(each), id=each.id, name=each.name) for each in visiting().visits.open]
 
-    # After the routes of a visitor's own visit, whose path it would take.
-    @routes.delete("/api/v1/visits/{visit}", raises=[VisitError], problems=[HttpProblem.STANDS_BY])
+    @routes.delete("/api/v1/visits/open/{visit}", raises=[VisitError], problems=[HttpProblem.STANDS_BY])
     async def end_visit(visit: str, caller: Operator) -> None:
         """End a visit; its robot stops, and the visitor reads that the staff need it."""
         if reason := standby():

@@ -5,7 +5,7 @@ import re
 import sys
 from collections import Counter
 from collections.abc import Awaitable, Callable, Collection, Iterator, Mapping, MutableMapping
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from typing import Any, Final, Literal
 
 import msgspec
@@ -147,8 +147,15 @@ class _BodyLimit:
             headers = {**RETRY_AFTER, "Connection": "close"}
             await problem(HttpProblem.OVERLOADED, refusal, headers=headers)(scope, receive, send)
         else:
-            with self._places.taken(whose):
-                await self._limited(scope, receive, send, limit, LARGE_BODY_S)
+            with ExitStack() as place:
+                place.enter_context(self._places.taken(whose))
+
+                async def told(message: MutableMapping[str, Any]) -> None:
+                    if message["type"] == "http.response.body" and not message.get("more_body", False):
+                        place.close()  # before the client knows the answer, and sends the next one
+                    await send(message)
+
+                await self._limited(scope, receive, told, limit, LARGE_BODY_S)
 
     async def _limited(  # an ASGI app's arguments, and the limits
         self, scope: Scope, receive: Receive, send: Send, limit: int, seconds: float

@@ -169,7 +169,8 @@ class Guest:
         self._start = start
         self._way: list[Point] = []
         self._planned_on: object = None
-        self._is_driving = False
+        self.is_driving = False
+        """Whether it has set out: before, Fognav's robot stands where it begins."""
 
     @property
     def has_arrived(self) -> bool:
@@ -185,8 +186,8 @@ class Guest:
         host = self.host
         if self.floor is None or self.keepout is None or host is None:
             return
-        self._is_driving = self._is_driving or math.dist(self._start, host) >= AHEAD_M
-        if not self._is_driving:
+        self.is_driving = self.is_driving or math.dist(self._start, host) >= AHEAD_M
+        if not self.is_driving:
             return
         if self._planned_on is not self.keepout:
             self._planned_on = self.keepout
@@ -261,6 +262,8 @@ def drive(guest: Guest, session: zenoh.Session, site: str, host: str, speed: flo
     number = 0
     while not ended.wait(_STEP_S) and not guest.has_arrived:
         guest.step(_STEP_S * speed, time.monotonic() * speed)
+        if not guest.is_driving:
+            continue
         number += 1
         attachment = struct.pack("<qqB", number, time.time_ns(), 16) + bytes(16)
         pose = _encoded_pose(*guest.at, guest.theta, time.time())

@@ -35,8 +35,6 @@ def session_config(mode: str, port: int) -> zenoh.Config:
         "mode": mode, "scouting/multicast/enabled": False,
         "listen/endpoints": [f"tcp/{net.LOOPBACK}:{port}"] * listens,
         "connect/endpoints": [f"tcp/{net.LOOPBACK}:{port}"] * (not listens),
-        # Else it would wait up to 50 ms for each peer that has stopped reading, with each mask.
-        "transport/link/tx/queue/congestion_control/drop/max_wait_before_drop_fragments": 0,
     }  # fmt: skip
     for key, value in values.items():
         config.insert_json5(key, json.dumps(value))

@@ -93,6 +93,26 @@ def test_replanning_with_the_goal_field_equals_a_full_search(static: NDArray[np.
             assert_valid(costmap, result.cells, start, goal, result.cost)
 
 
+@settings(max_examples=examples(200), deadline=None)
+@given(costmaps(), st.data())
+def test_search_from_the_goal_guided_by_the_field_of_another_cell_equals_a_full_search(
+    static: NDArray[np.uint8], data: st.DataObject
+) -> None:
+    origin, robot, goal = (cell_of(data, static) for _ in range(3))
+    planner = Planner(static.shape[1], static.shape[0])
+    field = planner.goal_field(static, origin, TilePatterns(1024 * data.draw(st.sampled_from([0, 100]))), bits=1)
+    bound = field.toward(robot)
+    assert (bound is not None) == (field.exact and robot in dijkstra(static, origin))
+    costmap = static.copy()
+    x, y = cell_of(data, static)
+    patch = costmap[y : y + data.draw(st.integers(1, 22)), x : x + data.draw(st.integers(1, 22))]
+    np.maximum(patch, data.draw(st.sampled_from([0, 30, 200, 254])), out=patch)
+    if bound is not None:
+        expected = dijkstra(costmap, robot).get(goal)
+        result = planner.plan(costmap, goal, robot, field=bound)
+        assert result.cost == (math.inf if expected is None else expected / (2 * STRAIGHT))
+
+
 @pytest.mark.parametrize(
     ("side", "neutral", "factor"), [pytest.param(101, 2000, 30.0, marks=compiled_only), (13, 50_000, 198.0)]
 )

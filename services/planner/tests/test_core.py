@@ -608,6 +608,20 @@ def test_goal_field_keeps_the_path_length_and_is_discarded_when_costs_fall_below
     assert drive.core.fields_bytes > 0
 
 
+def test_robot_is_led_round_a_hazard_near_its_goal_by_a_short_search_and_as_cheap_a_path_as_from_scratch() -> None:
+    drive = Drive(start=LEFT, config=PlannerConfig(max_expansions=2500))  # from the robot it would take 3700
+    drive.go(*RIGHT)
+    drive.step(2.0)
+    before = drive.paths[-1]
+    drive.send(drive.map.put("box", (16.0, 10.0, 16.5, 12.0)))
+    drive.step()
+    after, scratch = drive.paths[-1], Drive(start=LEFT, ring_map=drive.map).go(*RIGHT)
+    assert after.plan_id != before.plan_id
+    cost, geometry = drive.map.master.layers["cost"], drive.map.geometry
+    costs = [Route(np.array(path.points), 0.1).cost(cost, geometry) for path in (after, scratch)]
+    assert costs[0] == pytest.approx(costs[1], rel=0.01)
+
+
 def test_refused_robot_is_searched_again_only_after_a_cost_fell_and_at_most_once_a_second() -> None:
     drive = Drive(start=LEFT)
     drive.send(drive.map.put("z1", UPPER) + drive.map.put("z2", LOWER))

@@ -301,6 +301,28 @@ def test_fields_of_goals_that_ended_make_room_for_new_ones() -> None:
         assert fields.size <= 2 * 24 * 1024
 
 
+def test_origins_get_fields_one_after_another_once_the_goals_have_theirs_and_only_as_long_as_they_fit() -> None:
+    fields = GoalFields(30_000)
+    fields.set_bounds(BOUND, BOUND)
+    (job,) = fields.jobs([(3, 3)], [(4, 4), (5, 5)])
+    assert fields.jobs([(3, 3)], [(4, 4), (5, 5)]) == []
+    run(fields, job)
+    for cell in ((4, 4), (5, 5)):
+        (job,) = fields.jobs([(3, 3)], [(4, 4), (5, 5)])
+        assert job.goal == cell
+        run(fields, job)
+    assert fields.exact.keys() == {(3, 3), (4, 4), (5, 5)}
+    rng = np.random.default_rng(2)
+    bound = rng.integers(0, 253, (64, 64)).astype(np.uint8)  # no tile is like another
+    fields = GoalFields(2 * 24 * 1024)  # patterns of one field and a half
+    fields.set_bounds(bound, bound)
+    for _ in range(2):
+        for job in fields.jobs([(1, 1)], [(60, 2)]):
+            run(fields, job)
+    assert fields.jobs([(1, 1)], [(60, 2)]) == []
+    assert fields.exact.keys() == {(1, 1)}
+
+
 # --- Regions, search, egress ---
 
 

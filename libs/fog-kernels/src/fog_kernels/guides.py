@@ -26,6 +26,8 @@ TILE_BITS: Final = 4
 TILE: Final = 1 << TILE_BITS
 NO_PATH: Final = -1
 """In a field: no path leads from here to the goal."""
+LEVEL: Final = 0
+"""The slot of the pattern of a tile whose cells all count as its lowest cost."""
 _NONE: Final = int(np.iinfo(np.int64).max)
 _NO_SLOTS: Final[NDArray[np.int32]] = np.empty((0, 0), np.int32)
 _NO_PATTERNS: Final[NDArray[np.int32]] = np.empty((0, TILE * TILE), np.int32)
@@ -128,6 +130,20 @@ class GoalField:
             np.minimum(parts[::2, ::2], parts[1::2, ::2]), np.minimum(parts[::2, 1::2], parts[1::2, 1::2])
         )
         return GoalField(self.goal, self.width, self.height, self.bits + 1, lowest.view(np.int32), self.unit)
+
+    def toward(self, cell: tuple[int, int]) -> GoalField | None:
+        """Return a bound of the cost to a cell (column, row) from all others: by how much this field rises from there.
+
+        By the triangle inequality no way is shorter than the difference of its ends' costs. Where robots drive along
+        shortest paths from the field's goal, the bound is the cost itself. None for a field that is not exact, or if
+        it has no cost at the cell.
+        """
+        here = int(self.costs(np.array([cell[1] * self.width + cell[0]]))[0])
+        if here < 0 or not self.exact:
+            return None
+        rise = np.where(self.lowest == NO_PATH, NO_PATH, np.maximum(self.lowest - here, 0))
+        slots = np.where(self.lowest < here, LEVEL, self.slots)
+        return GoalField(cell, self.width, self.height, self.bits, rise, 1, slots, self.patterns)
 
     def costs(self, cells: NDArray[np.integer]) -> NDArray[np.int64]:
         """Return the costs at cells given by flat indexes, int64 of their shape; -1 where no path leads to the goal."""

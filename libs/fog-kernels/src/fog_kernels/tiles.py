@@ -17,7 +17,7 @@ import numpy as np
 from numba import int64, njit, types, void
 
 from fog_kernels import _arrays
-from fog_kernels.guides import NO_PATH, TILE, TILE_BITS, GoalField
+from fog_kernels.guides import LEVEL, NO_PATH, TILE, TILE_BITS, GoalField
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -148,15 +148,17 @@ class TilePatterns:
 
     def __init__(self, capacity: int) -> None:
         """Prepare room for `capacity` (bytes); what is not used takes no memory."""
-        self._limit = capacity // (4 * _CELLS)
-        self._patterns = np.empty((max(1, self._limit), _CELLS), np.int32)  # row 0 is looked at even if there is none
-        self._index = np.full(1 << (2 * self._limit).bit_length(), -1, np.int32)
-        self._count = 0
+        self._limit = 1 + capacity // (4 * _CELLS)
+        self._patterns = np.empty((self._limit, _CELLS), np.int32)
+        self._patterns[LEVEL] = 0
+        self._index = np.empty(1 << (2 * self._limit).bit_length(), np.int32)
+        self._count = 1
+        _fill_index(self._patterns.ravel(), self._count, self._index)
 
     @property
     def size(self) -> int:
         """The memory (bytes) in use, without the index (at most 1.6 % of the capacity)."""
-        return self._count * 4 * _CELLS
+        return (self._count - 1) * 4 * _CELLS
 
     @property
     def crowded(self) -> bool:
@@ -169,6 +171,7 @@ class TilePatterns:
 
     def _used(self, fields: Sequence[GoalField]) -> NDArray[np.bool_]:
         used = np.zeros(self._count, np.bool_)
+        used[LEVEL] = True
         for field in fields:
             if field.slots.size > 0:
                 used[field.slots[field.lowest >= 0]] = True
@@ -198,7 +201,7 @@ class TilePatterns:
     def compacted(self, fields: Sequence[GoalField]) -> tuple[TilePatterns, list[GoalField]]:
         """Return patterns for these fields only, and the fields with them; fields without patterns stay as they are."""
         used = self._used(fields)
-        smaller = TilePatterns(self._limit * 4 * _CELLS)
+        smaller = TilePatterns((self._limit - 1) * 4 * _CELLS)
         smaller._count = int(used.sum())
         smaller._patterns[: smaller._count] = self._patterns[: self._count][used]
         _fill_index(smaller._patterns.ravel(), smaller._count, smaller._index)

@@ -264,7 +264,8 @@ class PlannerCore:
             return []
         self._fields.set_bounds(planning_map.lower_bound, planning_map.standing)
         goals = list(self.missions.goal_cells(planning_map.geometry))
-        jobs: list[Job] = [*self.replanner.jobs(len(goals)), *self._fields.jobs(goals)]
+        origins = self.replanner.origins((mission for _, mission in self.missions.active()), planning_map.geometry)
+        jobs: list[Job] = [*self.replanner.jobs(len(goals)), *self._fields.jobs(goals, origins)]
         if self._explaining is None and (explain := self._explain_job(at, planning_map)) is not None:
             self._explaining = explain
             jobs.append(explain)

@@ -75,9 +75,14 @@ class FieldJob:
         compute: Callable[[Grid, Cell], GoalField],
         *,
         on_end: Callable[[], object] | None = None,
+        only_exact: bool = False,
     ) -> None:
-        """`compute` returns the field of a goal over costs; `on_end` is called when the job has run."""
+        """`compute` returns the field of a goal over costs; `on_end` is called when the job has run.
+
+        `only_exact`: a coarse field would be of no use.
+        """
         self.goal = goal
+        self.only_exact = only_exact
         self.bound = bound
         self.field: GoalField | None = None
         """None until `run` returns."""
@@ -114,6 +119,7 @@ class GoalFields:
         """The goals whose fields are over lower costs than the bound."""
         self._running: dict[Cell, FieldJob] = {}
         self._scratch = FieldScratch()
+        self._has_room_for_origins = True
         self._patterns = self._no_patterns()
 
     def _no_patterns(self) -> TilePatterns:
@@ -150,18 +156,15 @@ class GoalFields:
         self._outdated = set(self._fields)
         self._floor, self._bound = floor, bound
 
-    def jobs(self, goals: Iterable[Cell]) -> list[FieldJob]:
-        """Return the fields to compute for the current goals, each once; pass them to `add` when they have run."""
+    def jobs(self, goals: Iterable[Cell], origins: Iterable[Cell] = ()) -> list[FieldJob]:
+        """Return the fields to compute for the current goals, each once; pass them to `add` when they have run.
+
+        Once all goals have theirs, `origins`, where missions began, get fields in the memory that is left.
+        """
         current = dict.fromkeys(goals)
-        missing = [
-            goal
-            for goal in current
-            if (goal not in self._fields or goal in self._outdated)
-            and goal not in self._running
-            and self._has_paths(goal)
-        ]
+        missing = self._missing(current)
         if not missing:
-            return []
+            return self._origin_jobs(origins)
         self._make_room(current)
         bits = self._bits(len(current))
         compute = partial(self._scratch.compute, patterns=self._patterns, bits=bits)
@@ -173,8 +176,30 @@ class GoalFields:
         self._running.update({job.goal: job for job in jobs})
         return jobs
 
+    def _missing(self, cells: Iterable[Cell]) -> list[Cell]:
+        return [
+            cell
+            for cell in cells
+            if (cell not in self._fields or cell in self._outdated)
+            and cell not in self._running
+            and self._has_paths(cell)
+        ]
+
+    def _origin_jobs(self, origins: Iterable[Cell]) -> list[FieldJob]:
+        """Return one job at most, so that a new goal never waits for long."""
+        if self._running or self._patterns.crowded or not self._has_room_for_origins:
+            return []
+        compute = partial(self._scratch.compute, patterns=self._patterns, bits=self._bits(1))
+        jobs = [
+            FieldJob(cell, self._bound, None, compute, on_end=self._scratch.release, only_exact=True)
+            for cell in self._missing(dict.fromkeys(origins))[:1]
+        ]
+        self._running.update({job.goal: job for job in jobs})
+        return jobs
+
     def _make_room(self, current: Collection[Cell]) -> None:
         """Drop fields of goals that have ended, and patterns that no field has any more."""
+        self._has_room_for_origins = True
         for goal in [goal for goal in self._fallbacks if goal not in current]:
             del self._fallbacks[goal]
         for goal in [goal for goal in self._fields if goal not in current]:
@@ -192,6 +217,9 @@ class GoalFields:
         if self._running.get(job.goal) is job:
             del self._running[job.goal]
         if job.field is None or job.bound is not self._bound:
+            return
+        if job.only_exact and not job.field.exact:
+            self._has_room_for_origins = False
             return
         self._fields[job.goal] = job.field
         self._fields.move_to_end(job.goal)

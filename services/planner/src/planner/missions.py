@@ -64,6 +64,8 @@ class Plan:
     planned_from: PointXY
     question: Question | None = None
     """What the refusal leaves open."""
+    origin: PointXY | None = None
+    """Where the mission's first path begins; None before it has one."""
     progress: float = 0.0
     published: bool = False
     path_due: float = -math.inf

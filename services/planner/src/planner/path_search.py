@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import TYPE_CHECKING, Literal
 
@@ -172,11 +172,14 @@ class PathSearch:
         field: GoalField | None = None,
         detour: Detour | None = None,
         share: Share | None = None,
+        origin: GoalField | None = None,
     ) -> SearchResult:
         """Return the cheapest path between two points (m, frame `map`), or why there is none.
 
         `field` is that of the goal's cell, if there is one, `detour` a bound that holds for start and goal; without
-        one, `share` is asked for it when the search is long. Refusals name no hazard and no zone: the `question` can be
+        one, `share` is asked for it when the search is long. With `origin`, the field of where the robot came from by a
+        cheapest path, the search runs from the goal to the start instead: it is short where costs have risen near the
+        goal. Refusals name no hazard and no zone: the `question` can be
         answered later.
         """
         geometry = self.geometry
@@ -191,7 +194,12 @@ class PathSearch:
         if planning_map.cost[last[1], last[0]] >= INSCRIBED:
             nearest = nearest_reachable(planning_map, free, last)
             return refused(goal_occupied(goal, nearest), Question("goal", start, goal, free, last))
-        found = self._search(planning_map, free, last, field, detour, share)
+        back = None if origin is None else origin.toward(free)
+        if back is None:
+            found = self._search(planning_map, free, last, field, detour, share)
+        else:
+            found = self._search(planning_map, last, free, back, None, None)
+            found = None if found is None else replace(found, cells=np.ascontiguousarray(found.cells[::-1]))
         if found is None or found.timed_out:
             most = self._most(field)
             return self._without_path(planning_map, Question("path", start, goal, free, last), found, most)

@@ -19,12 +19,12 @@ from planner.path_search import PathSearch
 from planner.refusals import TIMEOUT
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
+    from collections.abc import Iterable, Sequence
 
     from fog_contracts.grid import GridGeometry, Window
     from fog_contracts.messages import PlanCode, PointXY, RobotPose
     from fog_kernels.astar import Planner
-    from fog_kernels.guides import Detour
+    from fog_kernels.guides import Detour, GoalField
     from planner.config import PlannerConfig
     from planner.heuristics import DeadEndsJob, GoalFields, Trip
     from planner.missions import Mission, ReplanReason, SwitchLimiter
@@ -191,6 +191,12 @@ class Replanner:
         """Return the background work for so many robots with a goal: few of them have nothing to share."""
         return self.detours.jobs() if robots > self._config.detour_searches else []
 
+    def origins(self, missions: Iterable[Mission], geometry: GridGeometry) -> list[Cell]:
+        """Return the cells where missions with a path began, as far as they lie on the map."""
+        plans = [mission.plan for mission in missions]
+        cells = [geometry.cell(*plan.origin) for plan in plans if plan is not None and plan.origin is not None]
+        return [cell for cell in cells if geometry.contains_cell(*cell)]
+
     def replan(
         self,
         mission: Mission,
@@ -207,9 +213,10 @@ class Replanner:
         pose, target = mission.pose, mission.target
         assert pose is not None
         assert target is not None
+        danger = mission.danger
         traces = mission.begin_replan(reason, now)
         mission.release_now()
-        found = self._find(mission, planning_map, covers, waiting)
+        found = self._find(mission, planning_map, covers, waiting, danger)
         self.plans[reason] = self.plans.get(reason, 0) + 1
         if found.refusal is not None:
             self.refusals[found.refusal.code] = self.refusals.get(found.refusal.code, 0) + 1
@@ -227,13 +234,16 @@ class Replanner:
                     return
                 if is_other_way(plan, found, self._config):
                     mission.switches.record(now)
+        here = (pose.x, pose.y)
+        origin = plan.origin if plan is not None else None
         mission.plan = Plan(
-            self._next_id, found.route, found.refusal, traces, planned_from=(pose.x, pose.y), question=found.question
-        )
+            self._next_id, found.route, found.refusal, traces, planned_from=here, question=found.question,
+            origin=here if origin is None and found.route is not None else origin,
+        )  # fmt: skip
         self._next_id += 1
 
     def _find(
-        self, mission: Mission, planning_map: PlanningMap, covers: Covers, waiting: Sequence[Mission]
+        self, mission: Mission, planning_map: PlanningMap, covers: Covers, waiting: Sequence[Mission], danger: float
     ) -> SearchResult:
         pose, target = mission.pose, mission.target
         assert pose is not None
@@ -253,7 +263,18 @@ class Replanner:
             self._fields.guide(goal),
             detour,
             partial(self._share, planning_map, self._search.planner, waiting) if shared else None,
+            self._origin(mission.plan, geometry, danger),
         )
+
+    def _origin(self, plan: Plan | None, geometry: GridGeometry, danger: float) -> GoalField | None:
+        """Return the field of where the mission began, if the change of the map is nearer to the goal than the robot.
+
+        `danger`: how far (m) the robot is from the change along its path.
+        """
+        if plan is None or plan.route is None or plan.origin is None or math.isinf(danger):
+            return None
+        nearer_to_goal = 2.0 * danger > plan.route.length - plan.progress
+        return self._fields.guide(geometry.cell(*plan.origin)) if nearer_to_goal else None
 
     def _share(
         self, planning_map: PlanningMap, planner: Planner, waiting: Sequence[Mission], start: Cell, goal: Cell

@@ -119,12 +119,13 @@ def test_a_heat_map_has_a_cell_for_every_point_and_the_greenest_where_most_is_sa
     assert "confidence interval" not in text
 
 
-def test_the_page_names_the_interval_of_several_routes_and_the_commits_of_its_drives(tmp_path):
+def test_the_page_gives_few_situations_no_interval_and_names_the_commits_of_its_drives(tmp_path):
     drives = [swept("default", BASE, 100.0 + run, run, commit="a") for run in (1, 2)]
     drives += [swept("fog", DEBOUNCE.points()[0], 60.0, run) for run in (1, 2)]
     publish(drives, [DEBOUNCE], "fognav experiment sensitivity", {}, tmp_path)
     text = (tmp_path / "README.md").read_text("utf-8")
-    assert "with the 95 % confidence interval where there is more than one route" in text
+    assert "fewer than 10 situations, too few for a confidence interval" in text
+    assert "| 2 | 50 | 2 | 41.5 | 138.3 |" in text
     assert "| commit | a: 2 of the drives |" in text
     assert "| commit | not known: 2 of the drives |" in text
 

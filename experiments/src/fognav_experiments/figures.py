@@ -1,7 +1,8 @@
 """What reports consist of: means with confidence intervals, tests of paired differences, plots, and pages as Markdown.
 
 The same input gives the same bytes. Student's t (Gosset 1908), the paired t test, and the sign-flip test (Fisher 1935),
-which assumes no distribution.
+which assumes no distribution. Values that repeat the same situation are no evidence of their own: intervals and tests
+count clusters of them (Liang and Zeger 1986).
 """
 
 from __future__ import annotations
@@ -13,6 +14,7 @@ from dataclasses import dataclass
 from functools import cache
 from itertools import chain
 from math import nan
+from statistics import median
 from textwrap import fill
 from typing import TYPE_CHECKING, Any, Final, NamedTuple
 
@@ -27,22 +29,25 @@ from fog_runtime.files import SHARED, atomic_write
 from fognav.output import WrongUseError
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping, Sequence
+    from collections.abc import Hashable, Iterable, Mapping, Sequence
     from pathlib import Path
 
     from matplotlib.axes import Axes
 
     from fog_contracts.grid import StaticMap
 
+    _Floats = np.ndarray[tuple[int, ...], np.dtype[np.float64]]
 
 _EXACT_UP_TO: Final = 14
 """With at most this many pairs every combination of signs is tried, beyond that random ones."""
 _FLIPS: Final = 20_000
 _STEPS: Final = 2_000
+FEWEST_CLUSTERS: Final = 10
+"""With fewer clusters than these there is no interval and no test: their spread would be a guess."""
 
 
 class Estimate(NamedTuple):
-    """A mean of `n` values with half the width of its 95 % confidence interval; that is None below two values."""
+    """A mean of `n` values with half the width of its 95 % confidence interval; None where there are too few."""
 
     mean: float
     half: float | None
@@ -99,22 +104,73 @@ def estimate(values: Sequence[float]) -> Estimate:
     return Estimate(mean, t_quantile(0.975, n - 1) * float(np.std(values, ddof=1)) / math.sqrt(n), n)
 
 
-def compare(before: Sequence[float], after: Sequence[float]) -> Paired:
-    """Return how much smaller `after` is than `before`, pair by pair."""
+def clustered(values: Sequence[float], clusters: Sequence[Hashable]) -> Estimate:
+    """Return the mean with the 95 % confidence interval of values that depend on one another within a cluster.
+
+    `clusters`: that of each value. The error is the cluster-robust one of a mean, with Student's t of one degree of
+    freedom per cluster but one; with every value in a cluster of its own it is that of `estimate`. There is no interval
+    below `FEWEST_CLUSTERS`. Raises `ValueError` without a value.
+    """
+    mean, n = estimate(values).mean, len(values)
+    sums = _sums(np.array(values) - mean, clusters)
+    if len(sums) < FEWEST_CLUSTERS:
+        return Estimate(mean, None, n)
+    return Estimate(mean, t_quantile(0.975, len(sums) - 1) * _error(sums, n), n)
+
+
+def spread(values: Sequence[float]) -> str:
+    """Return the median in words, with the least and the most value; raises `ValueError` without a value."""
+    ordered = sorted(values)
+    digits = 1 if abs(median(ordered)) >= 10.0 else 2
+    return f"{median(ordered):.{digits}f}" + (
+        f" ({ordered[0]:.{digits}f} to {ordered[-1]:.{digits}f})" if len(ordered) > 1 else ""
+    )
+
+
+def told(values: Sequence[float], clusters: Sequence[Hashable]) -> str:
+    """Return the mean in words with its interval; with the least and the most value where there is no interval."""
+    found = clustered(values, clusters)
+    if found.half is not None or found.n < 2:
+        return str(found)
+    digits = 1 if abs(found.mean) >= 10.0 else 2
+    return f"{found} ({min(values):.{digits}f} to {max(values):.{digits}f})"
+
+
+def captioned(words: str, shown: Iterable[Estimate | None]) -> str:
+    """Return a caption as a sentence that names the intervals of what is shown, if there are any."""
+    intervals = any(found is not None and found.half is not None for found in shown)
+    return f"{words}{', with 95 % confidence intervals' if intervals else ''}."
+
+
+def compare(before: Sequence[float], after: Sequence[float], clusters: Sequence[Hashable]) -> Paired:
+    """Return how much smaller `after` is than `before`, pair by pair, of pairs in these clusters; as `clustered`."""
     differences = np.array(before) - np.array(after)
-    found = estimate(differences.tolist())
-    if found.n < 2:
+    found = clustered(differences.tolist(), clusters)
+    if found.half is None:
         return Paired(found, None, None)
-    error = float(np.std(differences, ddof=1)) / math.sqrt(found.n)
+    sums = _sums(differences - found.mean, clusters)
+    error = _error(sums, found.n)
     if error == 0.0:
         p_t = 1.0 if found.mean == 0.0 else 0.0
     else:
-        p_t = 2.0 * (1.0 - t_cdf(abs(found.mean) / error, found.n - 1))
-    return Paired(found, p_t, _flip_test(differences))
+        p_t = 2.0 * (1.0 - t_cdf(abs(found.mean) / error, len(sums) - 1))
+    return Paired(found, p_t, _flip_test(_sums(differences, clusters)))
 
 
-def _flip_test(differences: np.ndarray[tuple[int, ...], np.dtype[np.float64]]) -> float:
-    """Return the share of all combinations of signs with a sum at least as far from 0; exact for few pairs."""
+def _sums(values: _Floats, clusters: Sequence[Hashable]) -> _Floats:
+    """Return the sum of each cluster's values, in the order in which clusters come first."""
+    numbers = {cluster: number for number, cluster in enumerate(dict.fromkeys(clusters))}
+    sums: _Floats = np.bincount([numbers[cluster] for cluster in clusters], weights=values).astype(np.float64)
+    return sums
+
+
+def _error(sums: _Floats, n: int) -> float:
+    """Return the standard error of a mean of `n` values, by the sums of the clusters' deviations from it."""
+    return math.sqrt(len(sums) / (len(sums) - 1) * float((sums**2).sum())) / n
+
+
+def _flip_test(differences: _Floats) -> float:
+    """Return the share of all combinations of signs with a sum at least as far from 0; exact for few clusters."""
     n = len(differences)
     if n <= _EXACT_UP_TO:
         signs = np.array(list(itertools.product((-1.0, 1.0), repeat=n)))

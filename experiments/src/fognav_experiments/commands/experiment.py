@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     from fog_runtime.configuration.site import LoadedSite
     from fognav_experiments.comparison.drives import MeasuredDrive, RouteDraw, Setup
     from fognav_experiments.comparison.live_drive import LiveOptions
-    from fognav_experiments.comparison.records import DriveFiles, Folder, Record
+    from fognav_experiments.comparison.records import Draws, DriveFiles, Folder, Record
     from fognav_experiments.comparison.runner import Task
     from fognav_experiments.comparison.sensitivity import Plane, SweptDrive
     from fognav_experiments.scenarios.play import Played
@@ -54,6 +54,9 @@ def experiment_command(  # noqa: PLR0913  # each option is an argument
     ] = None,
     runs: Annotated[int, typer.Option("--runs", metavar="N", min=1, help="Runs of each setup.")] = 50,
     seed: Annotated[int, typer.Option("--seed", metavar="N", min=0, help="Seed of all draws.")] = 1,
+    draws: Annotated[
+        str, typer.Option("--draws", metavar="D", help="thesis: its few routes; floor: anywhere on the floor.")
+    ] = "thesis",
     only: Annotated[int | None, typer.Option("--only", metavar="RUN", min=1, help="Only this run.")] = None,
     jobs: Annotated[int, typer.Option("--jobs", metavar="N", min=1, help="Drives at the same time.")] = 1,
     site: Annotated[Path | None, typer.Option("--site", metavar="DIR", help="Site with experiment.toml.")] = None,
@@ -75,7 +78,8 @@ def experiment_command(  # noqa: PLR0913  # each option is an argument
     """Repeat the thesis's experiment, one drive per run, route and setup: in lockstep, live, or with a real robot.
 
     A run is the routes of the site's experiment.toml. On each a drawn watched area is blocked at a drawn moment, the
-    same for all setups. Each drive is one file, so a run that was killed goes on where it was when the command is
+    same for all setups. With --draws floor a run is one route between two stops anywhere on the floor, and any watched
+    area is blocked. Each drive is one file, so a run that was killed goes on where it was when the command is
     repeated; --from goes on with the archive of a report, drives.jsonl.xz, on another day or machine. CPU times are
     worth comparing when nothing runs beside: --jobs 1. Drives of --live and --hardware stand beside those in lockstep,
     and the report compares them. The exit code is 1 if a drive failed or was skipped.
@@ -98,11 +102,14 @@ def experiment_command(  # noqa: PLR0913  # each option is an argument
         place = checkout.site_folder(site)
         try:
             loaded = load_site(place)
-            spec, numbers = runner.read_spec(loaded, place), [only] if only else range(1, runs + 1)
-            asked = runner.tasks(spec, seed, numbers, _setups(setups, lockstep=not live and not hardware))
+            begun = runner.new(loaded, place, seed, _draws(draws, hardware=hardware))
+            chosen, numbers = (
+                _setups(setups, lockstep=not live and not hardware),
+                [only] if only else range(1, runs + 1),
+            )
+            asked = runner.tasks(runner.drawer(loaded, place, begun), numbers, chosen)
             runner.check_barriers(loaded, [] if hardware else asked)  # a person finds a place
             folder, commit = Folder(out), checkout.revision()
-            begun = runner.new(loaded, place, seed)
             if source is not None:
                 print_line(f"{unpack_archive(source, folder, begun)} drives of {source} added to {out}")
             folder.begin(begun, {"commit": commit, **machine.describe()})
@@ -398,6 +405,17 @@ def _setups(setups: str | None, *, lockstep: bool) -> list[Setup]:
     if "lean" in chosen and not lockstep:
         raise WrongUseError("--setups lean is driven in lockstep only: leave out --live and --hardware, or lean")
     return chosen
+
+
+def _draws(draws: str, *, hardware: bool) -> Draws:
+    """Return of what routes are drawn; a real robot's stops are places of its site."""
+    if draws == "thesis":
+        return "thesis"
+    if draws != "floor":
+        raise WrongUseError(f"--draws {draws} is unknown: choose of thesis, floor")
+    if hardware:
+        raise WrongUseError("--draws floor has stops that are no places of the site: leave out --hardware, or --draws")
+    return "floor"
 
 
 def _chosen(setups: str) -> list[Setup]:

@@ -16,6 +16,7 @@ from msgspec import Meta
 from fog_contracts import channels as ch
 from fog_contracts.messages import (
     Id,  # read at run time, when a file is decoded
+    Place,
     Pose,
     ProfileName,
     SimTruth,
@@ -75,6 +76,7 @@ class RouteDraw(msgspec.Struct, frozen=True, kw_only=True):
     """One route of one run: the robot's heading at its start (rad), the blocked area, and when it becomes blocked.
 
     `trigger_m`: distance (m) that the robot has driven then; 0 is before the start. `seed`: of noise and obstacle.
+    `ends`: start and goal that were drawn, too; without them the route's are places of the site.
     """
 
     run: int
@@ -84,6 +86,7 @@ class RouteDraw(msgspec.Struct, frozen=True, kw_only=True):
     area: Id
     moment: When
     trigger_m: float
+    ends: tuple[Place, Place] | None = None
 
 
 def draw(spec: ExperimentSpec, seed: int, run: int) -> list[RouteDraw]:
@@ -132,7 +135,8 @@ class ComparedDrive(DrivenRoute, frozen=True, kw_only=True):
 
     `moment`, `trigger_m`: when the area was to be blocked, by the distance driven. `paths`: paths that the robot
     followed; `modes`: how often it entered each of its modes; `stops`: its protective stops and faults; `route_areas`:
-    the watched areas that it crossed, in order. `load`: the machine's load average at the end.
+    the watched areas that it crossed, in order. `load`: the machine's load average at the end. `ends`: start and goal
+    (m), where these were drawn and are no places of the site.
     """
 
     moment: str
@@ -144,12 +148,20 @@ class ComparedDrive(DrivenRoute, frozen=True, kw_only=True):
     modes: dict[str, int] = {}
     min_clearance_m: float | None = None
     load: float = 0.0
+    ends: tuple[tuple[float, float], tuple[float, float]] | msgspec.UnsetType = msgspec.UNSET
+
+    @property
+    def situation(self) -> tuple[str, ...]:
+        """What drives have in common that meet the same obstacle on the same route, and so repeat one another."""
+        return (self.route, self.area) if self.ends is msgspec.UNSET else (self.route, str(self.run))
 
 
 def facts(kind: type[ComparedDrive], drawn: RouteDraw, setup: Setup, summary: DriveSummary) -> dict[str, Any]:
     """Return the fields of a record of this `kind` that the draw and a drive's summary tell."""
     told = {name: getattr(summary, name) for name in kind.__struct_fields__ if name in summary.__struct_fields__}
     of_draw = {name: getattr(drawn, name) for name in ("run", "seed", "area", "moment", "trigger_m")}
+    if drawn.ends is not None:
+        of_draw["ends"] = tuple((end.x, end.y) for end in drawn.ends)
     return told | of_draw | {"route": drawn.route.name, "setup": setup}
 
 
@@ -272,9 +284,15 @@ START_RAD: Final = math.radians(20.0)
 """How far its heading may be from the route's."""
 
 
+def ends_of(site: SiteWithMap, drawn: RouteDraw) -> tuple[Place, Place]:
+    """Return where a drawn route begins and ends."""
+    places = site.site.places
+    return drawn.ends or (places[drawn.route.start], places[drawn.route.goal])
+
+
 def start_of(site: SiteWithMap, drawn: RouteDraw) -> Pose:
     """Return the pose at which a drawn route begins."""
-    place = site.site.places[drawn.route.start]
+    place, _ = ends_of(site, drawn)
     return Pose(x=place.x, y=place.y, theta=drawn.theta if place.theta is None else place.theta)
 
 
@@ -313,7 +331,7 @@ class GuidedDrive:
         self._drawn, self._setup = drawn, setup
         self._counted = pose
         self._distance_m = 0.0
-        goal = site.site.places[drawn.route.goal]
+        _, goal = ends_of(site, drawn)
         self._drive = Drive(
             goal=(goal.x, goal.y),
             goal_id=goal_id,

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Final, NamedTuple
 from PIL import Image, ImageDraw, ImageFont
 
 from fog_contracts.costs import FREE, LETHAL
-from fognav_experiments.comparison.drives import ALONE
+from fognav_experiments.comparison.drives import ALONE, ends_of
 from fognav_sim.barrier import barrier_across
 
 if TYPE_CHECKING:
@@ -72,7 +72,7 @@ class Film:
         self._drives = [_shown(record) for record in records]
         self._drawn = drawn
         self._areas = {area.id: area for area in site.site.areas}
-        self._ends = [site.site.places[name] for name in (drawn.route.start, drawn.route.goal)]
+        self._ends = ends_of(site, drawn)
         self._barrier = barrier_across(self._areas[drawn.area], site.site, site.map, drawn.seed).polygon
         self._geometry = site.map.geometry
         self._scale = _WIDTH_PX / (self._geometry.width * self._geometry.resolution)

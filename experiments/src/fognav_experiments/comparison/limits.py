@@ -19,16 +19,19 @@ from fog_kernels.astar import Planner
 from fog_kernels.inflation import inflate, inflation_table
 from fog_kernels.raycast import cast
 from fog_kernels.spans import raise_costs
-from fognav_experiments.figures import Block, Paragraph, Table, estimate
+from fognav_experiments.comparison.drives import ends_of
+from fognav_experiments.figures import Block, Paragraph, Table, estimate, told
 from fognav_experiments.onboard.navigator import Search
 from fognav_sim.barrier import barrier_across
 from fognav_sim.drive.hazard import PlannedHazard, is_clear_of_robot, remaining
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping, Sequence
+    from collections.abc import Hashable, Mapping, Sequence
 
     from numpy.typing import NDArray
 
+    from fog_contracts.geometry import Point
+    from fog_contracts.messages import Place
     from fognav_experiments.comparison.drives import RouteDraw
     from fognav_sim.drive.hazard import SiteWithMap
 
@@ -75,10 +78,19 @@ class RouteGeometry:
         self._walls = np.ascontiguousarray(site.map.cells == LETHAL, dtype=np.uint8)
         self._planner = Planner(grid.width, grid.height)
 
+    @property
+    def open_cost(self) -> Cells:
+        """Inflated costs of the floor as the map shows it."""
+        return self._open
+
+    def way(self, start: Place, goal: Place) -> list[Point] | None:
+        """Return the shortest way (m) between two places; None if none leads there."""
+        found = self._path(self._open, (start.x, start.y), (goal.x, goal.y))
+        return None if found is None else [(x, y) for x, y in found.tolist()]
+
     def saving(self, drawn: RouteDraw) -> Saving | None:
         """Return what a warning saves on a drawn route; None if the obstacle leaves no way to the goal."""
-        places = self._site.site.places
-        start, goal = places[drawn.route.start], places[drawn.route.goal]
+        start, goal = ends_of(self._site, drawn)
         hazard = self._hazard(drawn)
         polygon = np.array(hazard.barrier.polygon)
         closed = self._with(polygon)
@@ -175,23 +187,33 @@ _NOTHING_M: Final = 0.05
 """What a map allows to save below one of its cells is rounding: no share of it means anything."""
 
 
-def allowed_savings(drives: Sequence[tuple[Saving, float, float]]) -> list[Block]:
-    """Return what the map allows beside what was measured: per drive the saving, and the metres and seconds saved."""
+class Saved(NamedTuple):
+    """What the map allows to save on a drive, what was saved (m, s), and of which situation the drive is."""
+
+    allowed: Saving
+    metres: float
+    seconds: float
+    situation: Hashable
+
+
+def allowed_savings(drives: Sequence[Saved]) -> list[Block]:
+    """Return what the map allows to save beside what was measured."""
     if not drives:
         return []
     rows = []
     for subject, chosen in (
         ("all drives", drives),
-        ("obstacle on the way", [drive for drive in drives if drive[0].met]),
+        ("obstacle on the way", [drive for drive in drives if drive.allowed.met]),
     ):
         if not chosen:
             continue
-        allowed = estimate([saving.saved_m for saving, _, _ in chosen])
-        metres, seconds = estimate([m for _, m, _ in chosen]), estimate([s for _, _, s in chosen])
-        share = f"{100.0 * metres.mean / allowed.mean:.0f} %" if allowed.mean >= _NOTHING_M else "-"
+        known = [drive.situation for drive in chosen]
+        allowed, metres = [drive.allowed.saved_m for drive in chosen], [drive.metres for drive in chosen]
+        possible = estimate(allowed).mean
+        share = f"{100.0 * estimate(metres).mean / possible:.0f} %" if possible >= _NOTHING_M else "-"
         rows.append([
-            subject, str(len(chosen)), str(allowed), str(metres), share,
-            f"{allowed.mean / SPEED_M_S:.1f}", str(seconds),
+            subject, str(len(chosen)), str(len(set(known))), told(allowed, known), told(metres, known), share,
+            f"{possible / SPEED_M_S:.1f}", told([drive.seconds for drive in chosen], known),
         ])  # fmt: skip
     return [
         Paragraph(
@@ -202,7 +224,7 @@ def allowed_savings(drives: Sequence[tuple[Saving, float, float]]) -> list[Block
         ),
         Table(
             [
-                "default - fog", "drives", "the map allows, m", "measured, m", "share",
+                "default - fog", "drives", "situations", "the map allows, m", "measured, m", "share",
                 f"the map allows at {SPEED_M_S} m/s, s", "measured, s",
             ],
             rows,

@@ -29,6 +29,7 @@ from fognav_experiments.comparison.drives import (
     RouteDraw,
     Setup,
     drive_name,
+    ends_of,
     facts,
     start_of,
 )
@@ -106,9 +107,11 @@ def drive_live(
 
 def write_route(site: LoadedSite, drawn: RouteDraw, folder: Path) -> None:
     """Write a site like this one, whose robot starts where the route does, and whose demonstration is the route."""
+    start, goal = ends_of(site, drawn)
     changed = msgspec.structs.replace(
         site.site,
         map="map.yaml",
+        places=site.site.places | {drawn.route.start: start, drawn.route.goal: goal},
         robots=[msgspec.structs.replace(site.site.robots[0], start=start_of(site, drawn))],
         demo=DemoPlan(start=drawn.route.start, goal=drawn.route.goal, areas=[drawn.area]),
     )

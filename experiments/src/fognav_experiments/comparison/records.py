@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import csv
 import lzma
-from typing import TYPE_CHECKING, Any, Final, Generic, Protocol, TypeVar
+from typing import TYPE_CHECKING, Any, Final, Generic, Literal, Protocol, TypeVar
 
 import msgspec
 
@@ -75,12 +75,17 @@ class Record(ComparedDrive, frozen=True, kw_only=True):
         return 100.0 * used / self.time_s if self.time_s else 0.0
 
 
-class Asked(msgspec.Struct, frozen=True, kw_only=True):
+Draws = Literal["thesis", "floor"]
+"""Of what routes are drawn: of the few of the site's `experiment.toml`, or at random over the floor."""
+
+
+class Asked(msgspec.Struct, frozen=True, kw_only=True, omit_defaults=True):
     """What a folder of records is about: it must be the same when it is resumed."""
 
     site: str
     site_digest: str
     seed: int
+    draws: Draws = "thesis"
 
 
 class FolderError(ValueError):
@@ -227,7 +232,7 @@ def _add(files: DriveFiles[N], others: DriveFiles[N]) -> int:
 
 def write_csv(path: Path, records: Sequence[Record]) -> None:
     """Write one row per drive; CPU as s by component, and as % of a core for what `move_base` held and in all."""
-    left_out = {"cpu_s", "track", "modes", "timeline", "ready"}
+    left_out = {"cpu_s", "track", "modes", "timeline", "ready", "ends"}
     fields = [field for field in Record.__struct_fields__ if field not in left_out]
     shares = {"move_base": MOVE_BASE, "robot": ON_ROBOT}
     header = [

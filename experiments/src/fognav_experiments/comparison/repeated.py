@@ -11,7 +11,18 @@ from typing import TYPE_CHECKING, Final, NamedTuple
 
 from fognav_experiments import figures
 from fognav_experiments.comparison.drives import KINDS, PROFILE_OF_SETUP, ROBOTS_PROCESSES, route_ends
-from fognav_experiments.figures import Block, Estimate, Heading, Paragraph, Picture, Table, estimate
+from fognav_experiments.figures import (
+    Block,
+    Estimate,
+    Heading,
+    Paragraph,
+    Picture,
+    Table,
+    captioned,
+    clustered,
+    estimate,
+    told,
+)
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
@@ -239,11 +250,12 @@ def memory(measured: Sequence[MeasuredDrive]) -> list[Block]:
     title = "Memory of the robot's processes"
     caption = (
         "As figures 6.6 and 6.10 of the thesis: the largest resident memory of agent, guardian and watchdog, added up, "
-        f"mean of {len(drives)} drives by real processes that reached their goal, with 95 % confidence intervals."
+        f"mean of {len(drives)} drives by real processes that reached their goal"
     )
     rows = [[name, *(_text(series[setup][number]) for setup in setups)] for number, name in enumerate(titles)]
+    shown = [found for values in series.values() for found in values]
     return [
-        Picture(MEMORY_FILE, figures.bars(title, "MB", titles, series), caption),
+        Picture(MEMORY_FILE, figures.bars(title, "MB", titles, series), captioned(caption, shown)),
         Table([f"{title}, MB", *setups], rows),
     ]
 
@@ -274,19 +286,22 @@ def _charts(kind: Kind, pairs: Sequence[Compared]) -> list[Block]:
     columns: list[list[str]] = []
     for quantity in _QUANTITIES:
         series = {
-            "lockstep": [estimate([quantity.value(pair.lockstep) for pair in drives]) for drives in chosen],
-            kind: [estimate([quantity.value(pair.live) for pair in drives]) for drives in chosen],
+            "lockstep": [[quantity.value(pair.lockstep) for pair in drives] for drives in chosen],
+            kind: [[quantity.value(pair.live) for pair in drives] for drives in chosen],
         }
+        known = [[pair.live.situation for pair in drives] for drives in chosen]
+        bars = {name: list(map(clustered, values, known)) for name, values in series.items()}
         caption = (
             f"As figure {quantity.figure} of the thesis, which compares simulation and reality: mean "
-            f"{quantity.title.lower()} in lockstep and by {_BY[kind][0]}, with 95 % confidence intervals."
+            f"{quantity.title.lower()} in lockstep and by {_BY[kind][0]}"
         )
-        svg = figures.bars(f"{quantity.title}, lockstep and {kind}", quantity.unit, groups, series)
-        blocks.append(Picture(f"{kind}-{quantity.file}.svg", svg, caption))
-        columns += [[str(found) for found in values] for values in series.values()]
+        svg = figures.bars(f"{quantity.title}, lockstep and {kind}", quantity.unit, groups, bars)
+        shown = captioned(caption, [found for values in bars.values() for found in values])
+        blocks.append(Picture(f"{kind}-{quantity.file}.svg", svg, shown))
+        columns += [list(map(told, values, known)) for values in series.values()]
         columns.append([
-            str(estimate([quantity.value(pair.live) - quantity.value(pair.lockstep) for pair in drives]))
-            for drives in chosen
+            told([quantity.value(pair.live) - quantity.value(pair.lockstep) for pair in drives], situations)
+            for drives, situations in zip(chosen, known, strict=True)
         ])  # fmt: skip
     header = [f"{name}, {quantity.unit}" for quantity in _QUANTITIES for name in ("lockstep", kind, "difference")]
     rows = [
@@ -307,8 +322,9 @@ def _with_memory(measured: Sequence[MeasuredDrive]) -> list[MeasuredDrive]:
 
 
 def _peaks(drives: Sequence[MeasuredDrive]) -> Estimate | None:
-    peaks = [peak for drive in drives if (peak := drive.robots_peak_mb()) is not None]
-    return estimate(peaks) if peaks else None
+    peaks = {drive.name: peak for drive in drives if (peak := drive.robots_peak_mb()) is not None}
+    known = [drive.situation for drive in drives if drive.name in peaks]
+    return clustered(list(peaks.values()), known) if peaks else None
 
 
 def _text(found: Estimate | None) -> str:

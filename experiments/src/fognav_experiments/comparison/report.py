@@ -7,14 +7,17 @@ from __future__ import annotations
 
 import csv
 import io
+import itertools
 from typing import TYPE_CHECKING, Any, Final
+
+import msgspec
 
 from fog_runtime.configuration.site import load_site
 from fog_runtime.files import SHARED, atomic_write
 from fognav_experiments import figures
 from fognav_experiments.comparison import limits, repeated, runner
-from fognav_experiments.comparison.drives import KINDS, draw, route_ends
-from fognav_experiments.comparison.limits import RouteGeometry
+from fognav_experiments.comparison.drives import KINDS, route_ends
+from fognav_experiments.comparison.limits import RouteGeometry, Saved
 from fognav_experiments.comparison.records import (
     ALIKE,
     ARCHIVE,
@@ -22,14 +25,17 @@ from fognav_experiments.comparison.records import (
     OF_FOG,
     ON_FOG,
     ON_ROBOT,
+    Asked,
     FolderError,
     machines,
     write_archive,
     write_csv,
 )
 from fognav_experiments.comparison.repeated import SETUPS
-from fognav_experiments.comparison.thesis import QUANTITIES, Drives, beside_thesis, paired, places
+from fognav_experiments.comparison.situations import Drives, by_situation, situations, values
+from fognav_experiments.comparison.thesis import QUANTITIES, beside_thesis, paired, places
 from fognav_experiments.figures import (
+    FEWEST_CLUSTERS,
     Block,
     Code,
     Estimate,
@@ -37,10 +43,14 @@ from fognav_experiments.figures import (
     Paragraph,
     Picture,
     Table,
+    captioned,
+    clustered,
     compare,
     estimate,
     flat,
+    spread,
     to_markdown,
+    told,
 )
 
 if TYPE_CHECKING:
@@ -90,6 +100,12 @@ def build(
         *places(measured, records),
         Heading("Distance, time and computation per route"),
         *_routes(pairs, setups),
+        *(
+            block
+            for before, after in (("default", "fog"), ("lean", "fog"))
+            if before in setups and after in setups
+            for block in by_situation(pairs, met, before, after)
+        ),
         Heading("Paired differences"),
         *_differences(pairs, met, setups),
         *_bounds(pairs, savings),
@@ -109,7 +125,8 @@ def _introduction(records: Sequence[Record], pairs: Sequence[Drives], experiment
     asked, measured = experiment["asked"], experiment["measured_on"]
     setups = ",".join(setup for setup in SETUPS if any(record.setup == setup for record in records))
     runs = max((record.run for record in records), default=0)
-    command = f"fognav experiment --setups {setups} --runs {runs} --seed {asked['seed']} --out DIR"
+    draws = "" if "draws" not in asked else f" --draws {asked['draws']}"
+    command = f"fognav experiment --setups {setups} --runs {runs} --seed {asked['seed']}{draws} --out DIR"
     rows = [[name, str(value)] for name, value in flat(measured)]
     for machine in machines(experiment)[1:]:
         rows += [[f"later {name}", str(value)] for name, value in flat(machine) if name != "commit"]
@@ -164,12 +181,13 @@ def _bounds(pairs: Sequence[Drives], savings: Mapping[tuple[int, str], Saving]) 
     both = [drives for drives in pairs if "default" in drives and "fog" in drives and _key(drives) in savings]
     distance, time = (quantity.value for quantity in QUANTITIES[:2])
     drives = [
-        (
+        Saved(
             savings[_key(drives)],
             distance(drives["default"]) - distance(drives["fog"]),
             time(drives["default"]) - time(drives["fog"]),
+            situation,
         )
-        for drives in both
+        for drives, situation in zip(both, situations(both), strict=True)
     ]
     blocks = limits.allowed_savings(drives)
     return [Heading("What the floor allows to save"), *blocks] if blocks else []
@@ -184,20 +202,18 @@ def _routes(pairs: Sequence[Drives], setups: Sequence[Setup]) -> list[Block]:
     routes = sorted({drives[setups[0]].route for drives in pairs})
     blocks: list[Block] = []
     for quantity in QUANTITIES:
-        series: dict[str, list[Estimate]] = {
-            setup: [
-                estimate([quantity.value(drives[setup]) for drives in pairs if drives[setup].route == route])
-                for route in routes
-            ]
-            for setup in setups
-        }
-        rows = [
-            [route_ends(route), *(str(series[setup][number]) for setup in setups)]
-            for number, route in enumerate(routes)
-        ]
+        series: dict[str, list[Estimate]] = {setup: [] for setup in setups}
+        rows = [[route_ends(route)] for route in routes]
+        for row, route in zip(rows, routes, strict=True):
+            chosen = [drives for drives in pairs if next(iter(drives.values())).route == route]
+            for setup in setups:
+                found = values(chosen, setup, quantity.value), situations(chosen)
+                series[setup].append(clustered(*found))
+                row.append(told(*found))
         groups = [route_ends(route) for route in routes]
         svg = figures.bars(quantity.title, quantity.unit, groups, series)
-        blocks.append(Picture(f"{quantity.file}.svg", svg, quantity.caption))
+        caption = captioned(quantity.caption, itertools.chain.from_iterable(series.values()))
+        blocks.append(Picture(f"{quantity.file}.svg", svg, caption))
         blocks.append(Table([f"{quantity.title}, {quantity.unit}", *setups], rows))
     return blocks
 
@@ -211,21 +227,34 @@ def _differences(pairs: Sequence[Drives], met: Sequence[Drives], setups: Sequenc
             if not chosen:
                 continue
             for quantity in QUANTITIES:
-                found = compare(
-                    [quantity.value(drives[before]) for drives in chosen],
-                    [quantity.value(drives[after]) for drives in chosen],
-                )
+                one, other = values(chosen, before, quantity.value), values(chosen, after, quantity.value)
+                found = compare(one, other, known := situations(chosen))
                 rows.append([
                     f"{before} - {after}", subject, f"{quantity.title}, {quantity.unit}", str(found.difference),
-                    str(found.difference.n), _probability(found.p_t), _probability(found.p_flip),
+                    spread([a - b for a, b in zip(one, other, strict=True)]), str(found.difference.n),
+                    str(len(set(known))), _probability(found.p_t), _probability(found.p_flip),
                 ])  # fmt: skip
     return [
         Paragraph(
-            "Mean differences of the same run and route, with 95 % confidence intervals, and the probability "
-            "of one as large by chance: by the paired t test, and by the sign-flip test, which assumes no "
-            "distribution. The routes of all runs are pooled."
+            "Differences of the same run and route. From "
+            f"{FEWEST_CLUSTERS} situations on the mean has a 95 % confidence interval that counts these and not the "
+            "drives, and there is the probability of a difference as large by chance: by the t test, and by the "
+            "sign-flip test, which assumes no distribution. With fewer there is neither."
         ),
-        Table(["setups", "drives", "quantity", "mean difference", "n", "p (t test)", "p (sign flips)"], rows),
+        Table(
+            [
+                "setups",
+                "drives",
+                "quantity",
+                "mean",
+                "median (least to most)",
+                "n",
+                "situations",
+                "p (t test)",
+                "p (sign flips)",
+            ],
+            rows,
+        ),
     ]
 
 
@@ -285,6 +314,8 @@ def _tracks(pairs: Sequence[Drives], setups: Sequence[Setup], site: Site | None)
 def _ends(record: Record, site: Site) -> tuple[Sequence[tuple[float, float]], dict[str, tuple[float, float]]]:
     """Return the corners (m) of the area that was blocked, and the two stops of the route."""
     blocked = next((area.polygon for area in site.definitions() if area.id == record.area), ())
+    if record.ends is not msgspec.UNSET:
+        return [(x, y) for x, y in blocked], dict(zip(("P1", "P2"), record.ends, strict=True))
     names = [name for name in site.places if record.route.startswith(name) or record.route.endswith(name)]
     stops = {name.upper(): (site.places[name].x, site.places[name].y) for name in names}
     return [(x, y) for x, y in blocked], stops
@@ -321,15 +352,17 @@ def _failures(records: Sequence[Record], measured: Sequence[MeasuredDrive]) -> l
 def summary_rows(records: Sequence[Record]) -> list[list[str]]:
     """Return the table of means as rows of a CSV file, with a header."""
     pairs = paired(records)
-    rows = [["quantity", "unit", "route", "setup", "mean", "half_width_95", "n"]]
+    rows = [["quantity", "unit", "route", "setup", "mean", "half_width_95", "n", "situations"]]
     for quantity in QUANTITIES:
         for route in sorted({record.route for record in records}):
             for setup in SETUPS:
                 chosen = [drives[setup] for drives in pairs if setup in drives and drives[setup].route == route]
                 if chosen:
-                    found = estimate([quantity.value(record) for record in chosen])
+                    known = [record.situation for record in chosen]
+                    found = clustered([quantity.value(record) for record in chosen], known)
                     half = "" if found.half is None else f"{found.half:.4f}"
-                    rows.append([quantity.file, quantity.unit, route, setup, f"{found.mean:.4f}", half, str(found.n)])
+                    mean, n = f"{found.mean:.4f}", str(found.n)
+                    rows.append([quantity.file, quantity.unit, route, setup, mean, half, n, str(len(set(known)))])
     return rows
 
 
@@ -370,7 +403,7 @@ def _savings(
     records: Sequence[Record], asked: dict[str, Any], place: Path, site: LoadedSite
 ) -> dict[tuple[int, str], Saving]:
     """Return, by run and route, what the map of the drives allows to save."""
-    spec, geometry = runner.read_spec(site, place), RouteGeometry(site)
-    drawn = [route for run in {record.run for record in records} for route in draw(spec, asked["seed"], run)]
+    draws, geometry = runner.drawer(site, place, msgspec.convert(asked, Asked)), RouteGeometry(site)
+    drawn = [route for run in {record.run for record in records} for route in draws(run)]
     found = {(route.run, route.route.name): geometry.saving(route) for route in drawn}
     return {key: saving for key, saving in found.items() if saving is not None}

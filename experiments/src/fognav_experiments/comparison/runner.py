@@ -22,9 +22,11 @@ from fognav_experiments.comparison.drives import (
     TimelineRecorder,
     draw,
     drive_name,
+    ends_of,
     facts,
     start_of,
 )
+from fognav_experiments.comparison.floor_draws import FloorDrawError, FloorDraws
 from fognav_experiments.comparison.limits import RouteGeometry
 from fognav_experiments.comparison.records import Asked, Folder, FolderError, Record
 from fognav_experiments.lockstep import release_drives, run_lockstep
@@ -33,11 +35,12 @@ from fognav_sim.barrier import BarrierError, barrier_across
 from fognav_sim.drive.hazard import HazardRequest
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator, Sequence
+    from collections.abc import Callable, Iterator, Sequence
     from pathlib import Path
 
     from fog_runtime.configuration.site import LoadedSite
     from fognav_experiments.comparison.drives import RouteDraw, Setup
+    from fognav_experiments.comparison.records import Draws
 
 
 def drive(site: LoadedSite, drawn: RouteDraw, setup: Setup, jobs: int = 1, commit: str = "") -> Record:
@@ -52,7 +55,7 @@ def drive(site: LoadedSite, drawn: RouteDraw, setup: Setup, jobs: int = 1, commi
     result = run_lockstep(
         site,
         start_of(site, drawn),
-        site.site.places[drawn.route.goal],
+        ends_of(site, drawn)[1],
         drawn.seed,
         HazardRequest(area=drawn.area, trigger_m=drawn.trigger_m),
         watched=setup not in ALONE,
@@ -122,9 +125,30 @@ def site_digest(folder: Path) -> str:
     return digest.hexdigest()[:16]
 
 
-def tasks(spec: ExperimentSpec, seed: int, runs: Sequence[int], setups: Sequence[Setup]) -> list[Task]:
+def drawer(site: LoadedSite, folder: Path, asked: Asked) -> Callable[[int], list[RouteDraw]]:
+    """Return what draws the routes of a run of the experiment that is asked for, by its number.
+
+    Raises `SpecError` for a site without such an experiment; so does what is returned.
+    """
+    if asked.draws == "thesis":
+        return partial(draw, read_spec(site, folder), asked.seed)
+    try:
+        on_floor = FloorDraws(site)
+    except FloorDrawError as error:
+        raise SpecError(str(error)) from error
+
+    def drawn(run: int) -> list[RouteDraw]:
+        try:
+            return on_floor.draw(asked.seed, run)
+        except FloorDrawError as error:
+            raise SpecError(str(error)) from error
+
+    return drawn
+
+
+def tasks(draws: Callable[[int], list[RouteDraw]], runs: Sequence[int], setups: Sequence[Setup]) -> list[Task]:
     """Return the drives of these runs, all setups of a route one after another: what is there is always comparable."""
-    return [Task(drawn, setup) for run in runs for drawn in draw(spec, seed, run) for setup in setups]
+    return [Task(drawn, setup) for run in runs for drawn in draws(run) for setup in setups]
 
 
 def check_barriers(site: LoadedSite, asked: Sequence[Task]) -> None:
@@ -146,9 +170,9 @@ def run(site_folder: Path, asked: list[Task], folder: Folder, jobs: int = 1, com
         yield record
 
 
-def new(site: LoadedSite, site_folder: Path, seed: int) -> Asked:
+def new(site: LoadedSite, site_folder: Path, seed: int, draws: Draws = "thesis") -> Asked:
     """Return what a new folder of this experiment is about."""
-    return Asked(site=site.site.id, site_digest=site_digest(site_folder), seed=seed)
+    return Asked(site=site.site.id, site_digest=site_digest(site_folder), seed=seed, draws=draws)
 
 
 def barred_routes(site: LoadedSite, spec: ExperimentSpec, seed: int, count: int) -> list[RouteDraw]:
@@ -172,7 +196,7 @@ def recorded_draw(folder: Folder, site: LoadedSite, place: Path, run: int, route
     asked = msgspec.convert(folder.description()["asked"], Asked)
     if asked.site_digest != site_digest(place):
         raise FolderError(f"{folder.path} holds drives on another floor than {place}: name theirs with --site")
-    drawn = {found.route.name: found for found in draw(read_spec(site, place), asked.seed, run)}
+    drawn = {found.route.name: found for found in drawer(site, place, asked)(run)}
     if route is not None and route not in drawn:
         raise SpecError(f"no route {route}: there are {', '.join(drawn)}")
     return drawn[route] if route is not None else next(iter(drawn.values()))

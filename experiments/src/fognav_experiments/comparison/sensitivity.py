@@ -17,8 +17,9 @@ import msgspec
 
 from fog_contracts.messages import NodeConfig
 from fog_runtime.files import SHARED, atomic_write
-from fognav_experiments.comparison.drives import ALONE, PROFILE_OF_SETUP, DrivenRoute, start_of
+from fognav_experiments.comparison.drives import ALONE, PROFILE_OF_SETUP, DrivenRoute, ends_of, start_of
 from fognav_experiments.figures import (
+    FEWEST_CLUSTERS,
     Block,
     Code,
     Estimate,
@@ -26,7 +27,7 @@ from fognav_experiments.figures import (
     Paragraph,
     Picture,
     Table,
-    estimate,
+    clustered,
     flat,
     heat_map,
     to_markdown,
@@ -172,13 +173,14 @@ class Gain(NamedTuple):
 def gain(drives: Iterable[SweptDrive], point: Variation) -> Gain | None:
     """Return what the fog saves at a point; None without a route that both robots drove to its end."""
     known = {(drive.setup, drive.variation, drive.run, drive.route): drive for drive in drives if drive.success}
-    metres, seconds = [], []
+    metres, seconds, situations = [], [], []
     for (setup, variation, run, route), led in known.items():
         alone = known.get(("default", unwarned(point), run, route))
         if setup == "fog" and variation == point and alone is not None:
             metres.append(alone.distance_m - led.distance_m)
             seconds.append((alone.time_s or 0.0) - (led.time_s or 0.0))
-    return Gain(estimate(metres), estimate(seconds)) if metres else None
+            situations.append((route, led.area))
+    return Gain(clustered(metres, situations), clustered(seconds, situations)) if metres else None
 
 
 def sweep(
@@ -200,7 +202,7 @@ def swept_drive(site: LoadedSite, commit: str, task: SweepTask) -> SweptDrive:
     result = run_lockstep(
         site,
         start_of(site, drawn),
-        site.site.places[drawn.route.goal],
+        ends_of(site, drawn)[1],
         drawn.seed,
         HazardRequest(area=drawn.area, trigger_m=drawn.trigger_m),
         watched=varied_site(site.site, variation, drawn.seed) if task.setup not in ALONE else False,
@@ -259,10 +261,15 @@ def publish(
 
 
 def _spread(drives: Sequence[SweptDrive], planes: Sequence[Plane]) -> str:
-    """Return in words what a cell's figures are; a single route has no confidence interval."""
+    """Return in words what a cell's figures are; few situations have no confidence interval."""
     found = [gain(drives, point) for plane in planes for point in plane.points()]
+    if any(cell.metres.half is not None for cell in found if cell is not None):
+        return " on average, with the 95 % confidence interval, which counts situations"
     if any(cell.metres.n > 1 for cell in found if cell is not None):
-        return " on average, with the 95 % confidence interval where there is more than one route"
+        return (
+            f" on average. There are fewer than {FEWEST_CLUSTERS} situations, too few for a confidence interval: other "
+            "routes may tell something else"
+        )
     return " on the one route, which says nothing of others"
 
 

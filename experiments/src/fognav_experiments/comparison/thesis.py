@@ -11,7 +11,8 @@ from typing import TYPE_CHECKING, Final, NamedTuple
 from fognav_experiments.comparison import repeated
 from fognav_experiments.comparison.records import MOVE_BASE, ON_ROBOT
 from fognav_experiments.comparison.repeated import SETUPS
-from fognav_experiments.figures import Block, Estimate, Paragraph, Table, compare, estimate
+from fognav_experiments.comparison.situations import Drives, situations
+from fognav_experiments.figures import Block, Estimate, Paragraph, Table, estimate, told
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
@@ -79,9 +80,6 @@ PLACES: Final = (
 """The thesis's figures of chapter 6: what each shows, and where a report has the same."""
 
 
-Drives = dict["Setup", "Record"]
-
-
 class Quantity(NamedTuple):
     """A measured quantity: its figure's title, unit, name of the file, and its value for a drive."""
 
@@ -97,28 +95,28 @@ QUANTITIES: Final = (
         "Distance per route",
         "m",
         "distance",
-        "As figures 6.3 and 6.7 of the thesis: mean distance per route, with 95 % confidence intervals.",
+        "As figures 6.3 and 6.7 of the thesis: mean distance per route",
         lambda record: record.distance_m,
     ),
     Quantity(
         "Time per route",
         "s",
         "time",
-        "As figures 6.4 and 6.8: mean time per route, with 95 % confidence intervals.",
+        "As figures 6.4 and 6.8: mean time per route",
         lambda record: record.time_s or 0.0,
     ),
     Quantity(
         "CPU of what move_base held",
         "% of a core",
         "cpu-move-base",
-        "As figures 6.5 and 6.9: global planning, layers and local planning, with 95 % confidence intervals.",
+        "As figures 6.5 and 6.9: global planning, layers and local planning",
         lambda record: record.cpu_percent(MOVE_BASE),
     ),
     Quantity(
         "CPU of the whole robot",
         "% of a core",
         "cpu-robot",
-        "Not in the thesis: all that the robot computes, without the input and output of its processes.",
+        "Not in the thesis: all that the robot computes, without the input and output of its processes",
         lambda record: record.cpu_percent(ON_ROBOT),
     ),
 )
@@ -230,8 +228,9 @@ def _saved(pairs: Sequence[Drives], met: Sequence[Drives], quantity: Quantity) -
     for subject, chosen in (("all", pairs), ("obstacle met", met)):
         both = [drives for drives in chosen if "default" in drives and "fog" in drives]
         if both:
-            found = compare([quantity.value(d["default"]) for d in both], [quantity.value(d["fog"]) for d in both])
-            words.append(f"{subject}: {found.difference!s} {quantity.unit}")
+            less = [quantity.value(d["default"]) - quantity.value(d["fog"]) for d in both]
+            known = situations(both)
+            words.append(f"{subject}: {told(less, known)} {quantity.unit} in {len(set(known))} situations")
     return "; ".join(words) if len(words) > 1 else "not measured"
 
 

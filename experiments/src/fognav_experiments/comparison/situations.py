@@ -1,0 +1,92 @@
+"""What the fog saves by situation: drives that meet the same obstacle on the same route repeat one another. Pure.
+
+The thesis's draws choose among a few corridors, so that hundreds of drives know a few obstacles only. How much is saved
+differs between these obstacles far more than between their drives: a mean over all drives, and an interval around it,
+say how often which of them was drawn. So each is told by itself.
+"""
+
+from __future__ import annotations
+
+from collections import defaultdict
+from typing import TYPE_CHECKING, Final
+
+from fognav_experiments.comparison.drives import route_ends
+from fognav_experiments.figures import FEWEST_CLUSTERS, Block, Heading, Paragraph, Table, spread
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Collection, Sequence
+
+    from fognav_experiments.comparison.drives import Setup
+    from fognav_experiments.comparison.records import Record
+
+Drives = dict["Setup", "Record"]
+"""The drives of a run's route, by setup."""
+NOTHING_M: Final = 1.0
+"""What is saved below this is no detour that a warning spared, but another line round the same corner."""
+_APPEARS: Final = {"before": "before the start", "under way": "under way"}
+
+
+def situations(pairs: Sequence[Drives]) -> list[tuple[str, ...]]:
+    """Return of each pair which situation it is of."""
+    return [next(iter(drives.values())).situation for drives in pairs]
+
+
+def saved(drives: Drives, before: Setup, after: Setup) -> tuple[float, float]:
+    """Return by how many metres and seconds `after` is better than `before`."""
+    one, other = drives[before], drives[after]
+    return one.distance_m - other.distance_m, (one.time_s or 0.0) - (other.time_s or 0.0)
+
+
+def by_situation(pairs: Sequence[Drives], met: Sequence[Drives], before: Setup, after: Setup) -> list[Block]:
+    """Return what `after` saves against `before` in each situation, and on how many of these that rests.
+
+    `met`: those of the pairs in which the obstacle stood in the way of a robot that did not know of it.
+    """
+    if not pairs:
+        return []
+    barred = [id(drives) for drives in met]
+    groups: dict[tuple[str, str, str], list[Drives]] = defaultdict(list)
+    drawn = any(len(situation) == 2 and situation[1].isdigit() for situation in situations(pairs))
+    for drives in pairs:
+        record = next(iter(drives.values()))
+        place = ("", "met" if id(drives) in barred else "not met") if drawn else (record.route, record.area)
+        groups[*place, record.moment].append(drives)
+    rows = []
+    for key, chosen in sorted(groups.items()):
+        metres, seconds = zip(*(saved(drives, before, after) for drives in chosen), strict=True)
+        route, area, moment = key
+        rows.append([
+            route_ends(route) if route else "drawn", area, _APPEARS.get(moment, moment), str(len(chosen)),
+            str(sum(id(drives) in barred for drives in chosen)), spread(metres), spread(seconds),
+        ])  # fmt: skip
+    header = ["route", "obstacle" if drawn else "blocked", "appears", "drives", "obstacle met", "saved, m", "saved, s"]
+    return [
+        Heading(f"What `{after}` saves against `{before}`, by situation"),
+        Paragraph(_words(pairs, met, before, after, drawn=drawn)),
+        Table(header, rows),
+    ]
+
+
+def _words(pairs: Sequence[Drives], met: Sequence[Drives], before: Setup, after: Setup, *, drawn: bool) -> str:
+    known, barred = len(set(situations(pairs))), len(set(situations(met)))
+    nothing = sum(abs(saved(drives, before, after)[0]) < NOTHING_M for drives in pairs)
+    kind = "each draw of stops, area and moment is one" if drawn else "a route, and the area that is blocked on it"
+    words = (
+        f"Median, with the least and the most in brackets. The {len(pairs)} drives of each setup know {known} "
+        f"situations ({kind}); {barred} of these met a robot that did not know of the obstacle, in {len(met)} drives. "
+        f"In {nothing} drives less than {NOTHING_M:g} m was saved or lost. "
+    )
+    if known < FEWEST_CLUSTERS:
+        return words + (
+            f"Drives of one situation repeat one another, so means over all drives have no confidence interval: that "
+            f"would need {FEWEST_CLUSTERS} situations at least. They say how often each was drawn, too."
+        )
+    return words + (
+        "Drives of one situation repeat one another: confidence intervals count situations, not drives"
+        + ("." if barred >= FEWEST_CLUSTERS else f", and there is none below {FEWEST_CLUSTERS}.")
+    )
+
+
+def values(pairs: Collection[Drives], setup: Setup, value: Callable[[Record], float]) -> list[float]:
+    """Return a quantity of a setup's drives."""
+    return [value(drives[setup]) for drives in pairs]

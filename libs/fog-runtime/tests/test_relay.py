@@ -3,6 +3,7 @@
 import asyncio
 import contextlib
 import json
+import socket
 
 import pytest
 import zenoh
@@ -80,6 +81,26 @@ async def relaying(connect_to, make_opening):
         yield listener.getsockname()[1]
         task.cancel()
         await asyncio.gather(task, return_exceptions=True)
+
+
+async def test_message_that_follows_another_does_not_wait_for_its_acknowledgement():
+    """The kernel holds small messages back for up to 40 ms (Nagle), unless each accepted connection says no."""
+    accepted = asyncio.get_running_loop().create_future()
+
+    class Greeted(asyncio.Protocol):
+        def connection_made(self, transport):
+            accepted.set_result(transport)
+
+    with admission.listen(net.LOOPBACK, 0) as listener:
+        serving = asyncio.create_task(admission.Admission(lambda _: Greeted()).serve([listener]))
+        _, writer = await asyncio.open_connection(net.LOOPBACK, listener.getsockname()[1])
+        with contextlib.closing(writer):
+            writer.write(b"x")
+            transport = await asyncio.wait_for(accepted, WAIT_S)
+            assert transport.get_extra_info("socket").getsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY)
+            transport.abort()
+        serving.cancel()
+        await asyncio.gather(serving, return_exceptions=True)
 
 
 async def test_user_with_too_many_connections_gets_no_more_and_others_do(tmp_path, monkeypatch):

@@ -56,7 +56,7 @@ async def serve(demo: Demo, port: int = 0) -> AsyncIterator[str]:
     """
     chosen = port or net.free_port()
     # Bound here, because uvicorn ends the whole process if it can't bind.
-    listening = socket.socket()
+    listening = socket.socket(proto=socket.IPPROTO_TCP)  # named: asyncio then sets TCP_NODELAY
     listening.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
     try:
         listening.bind((net.LOOPBACK, chosen))

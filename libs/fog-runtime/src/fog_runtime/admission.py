@@ -10,6 +10,7 @@ somebody was admitted goes before those that nobody knows, as long as few wait t
 from __future__ import annotations
 
 import asyncio
+import contextlib
 import ipaddress
 import resource
 import socket
@@ -208,6 +209,9 @@ class Admission:
                 self._refused["", str(error.strerror)] += 1
                 await asyncio.sleep(_NO_DESCRIPTORS_S)
                 continue
+            with contextlib.suppress(OSError):  # it may have left already
+                # Else what follows an unacknowledged write waits up to 40 ms. asyncio sets it for its own sockets only.
+                connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
             visitor = Visitor(self, connection, source_of(address[0]))
             visitor.timer = loop.call_later(PATIENCE_S, self._refuse, visitor, "silent")
             if (displaced := self._silent.add(visitor)) is not None:

@@ -31,6 +31,8 @@ autosave_interval 30
 # Larger than any message of the contracts, small enough not to exhaust the memory.
 max_packet_size {MQTT_PACKET_LIMIT}
 max_queued_messages {MQTT_QUEUE_LIMIT}
+# A hazard that follows another message must not wait for its acknowledgement (40 ms).
+set_tcp_nodelay true
 # Not stdout, which is block-buffered.
 log_dest stderr
 log_type error

@@ -1,6 +1,7 @@
 """One MQTT connection: its broker's address, its options, its subscriptions, and how messages get to handlers."""
 
 import asyncio
+import socket
 from collections.abc import Callable, Iterable, Sequence
 from collections.abc import Set as AbstractSet
 from dataclasses import dataclass
@@ -107,6 +108,7 @@ class Broker:
             clean_session=True,
             will=will,
             timeout=_TIMEOUT_S,
+            socket_options=[(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)],  # a hazard waits for no acknowledgement
             keepalive=_KEEPALIVE_S,
             queue_type=None if inbox is None else cast("type[asyncio.Queue[aiomqtt.Message]]", lambda **_: inbox),
             tls_context=self.credentials.tls_context() if self.tls else None,

@@ -333,6 +333,7 @@ def person(tmp_path):
         yield made
 
 
+@pytest.mark.long
 def test_page_leads_from_parts_to_a_goal_in_a_building_that_nobody_had_mapped(person):
     for command in commands():
         LOG.info(command)

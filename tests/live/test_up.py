@@ -402,6 +402,7 @@ COMPILED = "libs/fog-kernels/src/fog_kernels/__pycache__"
 NO_OLDER_RELEASE = no_older_release()
 
 
+@pytest.mark.long
 @pytest.mark.timeout(1800)  # kernels that are not this version's are compiled once
 @pytest.mark.skipif(NO_OLDER_RELEASE is not None, reason=NO_OLDER_RELEASE or "")
 def test_data_of_an_older_version_is_used_by_this_one(node, tmp_path):

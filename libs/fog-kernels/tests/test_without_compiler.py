@@ -16,7 +16,7 @@ EXPECTED_OVERFLOW = "ignore:overflow encountered in scalar:RuntimeWarning:fog_ke
 
 
 @compiled_only
-@pytest.mark.drive
+@pytest.mark.long
 @pytest.mark.timeout(600)
 def test_kernels_pass_their_tests_as_plain_python() -> None:
     # In a separate process, because numba reads the setting at import. It takes a minute; the timeout is for a hang.

@@ -30,6 +30,7 @@ F64_GRID = types.Array(types.float64, 2, "C", readonly=True)
 
 U8_GRID_OUT = types.Array(types.uint8, 2, "C")
 I32_GRID_OUT = types.Array(types.int32, 2, "C")
+F64_GRID_OUT = types.Array(types.float64, 2, "C")
 F32_GRID_OUT = types.Array(types.float32, 2, "C")
 I32_OUT = types.Array(types.int32, 1, "C")
 I64_OUT = types.Array(types.int64, 1, "C")

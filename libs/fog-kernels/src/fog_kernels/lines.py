@@ -5,8 +5,9 @@ Costs are integrated along lines of sight cell by cell (Amanatides and Woo 1987)
 One module, although long: each kernel stands with the wrapper that checks its arrays.
 """
 
-# Kernels take arrays and scalars, typed by their compiled signatures.
-# ruff: noqa: ANN401, PLR0913
+# Kernels take arrays and scalars, typed by their compiled signatures, and are single functions where a call would cost
+# more than its work.
+# ruff: noqa: ANN401, C901, PLR0913
 
 from __future__ import annotations
 
@@ -139,11 +140,11 @@ def _cells_cost(costmap: Any, weight: Any, cells: Any, cumulated: Any) -> float:
 
 
 @njit(
-    int64(_arrays.U8_GRID, _arrays.I32_FLAT, _arrays.I32_PAIRS, _arrays.F64_FLAT, float64, _arrays.I64_OUT),
+    int64(_arrays.U8_GRID, _arrays.I32_FLAT, _arrays.I32_PAIRS, _arrays.F64_FLAT, _arrays.I64_OUT),
     cache=True,
     nogil=True,
 )
-def _shortcut(costmap: Any, weight: Any, cells: Any, cumulated: Any, slack: float, kept: Any) -> int:
+def _shortcut(costmap: Any, weight: Any, cells: Any, cumulated: Any, kept: Any) -> int:
     """Keep cells between which straight lines cost no more than the path: exponential, then binary search."""
     last = cells.shape[0] - 1
     kept[0] = 0
@@ -155,7 +156,7 @@ def _shortcut(costmap: Any, weight: Any, cells: Any, cumulated: Any, slack: floa
         bad = last + 1
         while anchor + stride <= last or good < last:
             probe = min(anchor + stride, last)
-            allowed = (cumulated[probe] - cumulated[anchor]) * (1.0 + slack) + 1e-9
+            allowed = cumulated[probe] - cumulated[anchor] + 1e-9
             cost = _line_cost(
                 costmap,
                 weight,
@@ -174,7 +175,7 @@ def _shortcut(costmap: Any, weight: Any, cells: Any, cumulated: Any, slack: floa
             stride *= 2
         while bad - good > 1 and bad <= last:
             probe = (good + bad) // 2
-            allowed = (cumulated[probe] - cumulated[anchor]) * (1.0 + slack) + 1e-9
+            allowed = cumulated[probe] - cumulated[anchor] + 1e-9
             cost = _line_cost(
                 costmap,
                 weight,
@@ -192,6 +193,61 @@ def _shortcut(costmap: Any, weight: Any, cells: Any, cumulated: Any, slack: floa
         count += 1
         anchor = good
     return count
+
+
+_MOVES = np.array((4.0, 2.0, 1.0, 0.4))  # cells; 0.5 would lead to the border of two cells, which rounding crosses
+_ROUNDS = 5
+
+
+@njit(int64(_arrays.U8_GRID, _arrays.I32_FLAT, _arrays.F64_GRID_OUT), cache=True, nogil=True)
+def _relax(costmap: Any, weight: Any, corners: Any) -> int:
+    """Move each inner corner to the cheapest of the places around it, and leave out those that save nothing.
+
+    Return how many are left, at the array's begin. Only corners next to one that has moved are looked at again.
+    """
+    count = corners.shape[0]
+    costs = np.empty(count)
+    for i in range(count - 1):
+        costs[i] = _line_cost(
+            costmap, weight, corners[i, 0], corners[i, 1], corners[i + 1, 0], corners[i + 1, 1], math.inf
+        )
+    due = np.empty(count, np.bool_)
+    for move in _MOVES:
+        due[:] = True
+        for _ in range(_ROUNDS):
+            changed = False
+            i = 1
+            while i < count - 1:
+                if not due[i]:
+                    i += 1
+                    continue
+                x0, y0, x1, y1 = corners[i - 1, 0], corners[i - 1, 1], corners[i + 1, 0], corners[i + 1, 1]
+                best = costs[i - 1] + costs[i]
+                straight = _line_cost(costmap, weight, x0, y0, x1, y1, best)
+                if straight <= best:
+                    count -= 1
+                    corners[i:count] = corners[i + 1 : count + 1]
+                    costs[i:count] = costs[i + 1 : count + 1]
+                    due[i:count] = due[i + 1 : count + 1]
+                    costs[i - 1] = straight
+                    due[i - 1] = due[i] = changed = True
+                    i = max(i - 1, 1)
+                    continue
+                x, y = corners[i, 0], corners[i, 1]
+                due[i] = False
+                for k in (0, 1, 2, 3, 5, 6, 7, 8):
+                    to_x, to_y = x + move * (k % 3 - 1), y + move * (k // 3 - 1)
+                    before = _line_cost(costmap, weight, x0, y0, to_x, to_y, best)
+                    if before < best:
+                        after = _line_cost(costmap, weight, to_x, to_y, x1, y1, best - before)
+                        if before + after < best - 1e-3:
+                            best = before + after
+                            corners[i, 0], corners[i, 1], costs[i - 1], costs[i] = to_x, to_y, before, after
+                            due[i - 1] = due[i] = due[i + 1] = changed = True
+                i += 1
+            if not changed:
+                break
+    return int(count)
 
 
 @njit(boolean(_arrays.F64_GRID, _arrays.F64_GRID, float64, float64), cache=True, nogil=True, error_model="numpy")
@@ -382,26 +438,25 @@ def shortcut(
     cells: NDArray[np.int32],
     neutral: int = NEUTRAL_WEIGHT,
     factor: float = COST_WEIGHT,
-    slack: float = 0.01,
 ) -> NDArray[np.float64]:
-    """Straighten a path along lines of sight that cost at most `1 + slack` times the section that they replace.
+    """Straighten a path along lines of sight that cost no more than the sections that they replace.
 
-    `cells` is int32 (n, 2) as (column, row), a path of `Planner.plan` on this costmap. Returns float64 (m, 2) in the
-    same coordinates, the first and last cell kept: corners to be joined by straight lines, none of which crosses a
+    Then the corners are moved where the lines cost less, because a path of 8 directions keeps to one side of what it
+    passes. `cells` is int32 (n, 2) as (column, row), a path of `Planner.plan` on this costmap. Returns float64 (m, 2)
+    in the same coordinates, the first and last cell kept: corners joined by straight lines, none of which crosses a
     cell that isn't traversable. Raises ValueError if the path itself crosses one or isn't connected, TypeError or
     ValueError for wrong types or shapes.
     """
     costmap = _arrays.grid(costmap, "costmap")
     cells = _cells_array(cells)
-    if slack < 0.0:
-        raise ValueError(f"slack must not be negative, not {slack}")
     weight = weights_of(neutral, factor)
     cumulated = np.empty(len(cells))
     if not math.isfinite(_cells_cost(costmap, weight, cells, cumulated)):
         raise ValueError("cells aren't a path on this costmap: plan again before straightening")
     kept = np.empty(len(cells), np.int64)
-    count = int(_shortcut(costmap, weight, cells, cumulated, slack, kept))
-    return cells[kept[:count]].astype(np.float64)
+    count = int(_shortcut(costmap, weight, cells, cumulated, kept))
+    corners = cells[kept[:count]].astype(np.float64)
+    return corners[: _relax(costmap, weight, corners)].copy()
 
 
 def leaves(line: NDArray[np.float64], other: NDArray[np.float64], reach: float, spacing: float) -> bool:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import gc
+import os
 import re
 from collections import Counter
 from dataclasses import replace
@@ -16,16 +17,28 @@ import pytest
 import ring_site as ring
 from hypothesis import given
 from hypothesis import strategies as st
+from msgspec import UNSET
 
 from fog_runtime.configuration.site import load_site
-from fognav_experiments.comparison import runner
-from fognav_experiments.comparison.drives import ExperimentSpec, RouteSpec, draw
+from fognav_experiments.comparison import computation, live_drive, runner
+from fognav_experiments.comparison.drives import ComparedDrive, ExperimentSpec, MeasuredDrive, RouteSpec, draw
 from fognav_experiments.comparison.floor_draws import ROUTE_M, FloorDrawError, FloorDraws
 from fognav_experiments.comparison.limits import RouteGeometry, Saved, Saving, allowed_savings
-from fognav_experiments.comparison.live_drive import write_route
-from fognav_experiments.comparison.records import MOVE_BASE, Asked, Folder, FolderError
-from fognav_experiments.comparison.report import paired, publish
-from fognav_experiments.figures import Table, clustered, compare, estimate, spread, t_cdf, t_quantile, told
+from fognav_experiments.comparison.live_drive import LiveOptions, live_drives, write_route
+from fognav_experiments.comparison.records import MOVE_BASE, Asked, Folder, FolderError, comparable
+from fognav_experiments.comparison.report import build, paired, publish
+from fognav_experiments.comparison.situations import worse
+from fognav_experiments.figures import (
+    Table,
+    clustered,
+    compare,
+    estimate,
+    spread,
+    t_cdf,
+    t_quantile,
+    to_markdown,
+    told,
+)
 from fognav_experiments.machine import CpuMeter
 from fognav_experiments.rigs import System
 from fognav_sim.drive.hazard import path_length
@@ -221,16 +234,14 @@ def systems():
 
 @pytest.fixture(scope="module")
 def short_run(tmp_path_factory):
-    """One run of one route in all setups, killed after the first drive and repeated."""
+    """One run of one route in all setups, the first one alone before the others."""
     folder = Folder(tmp_path_factory.mktemp("comparison"))
     folder.begin(ASKED, {"commit": "none", "machine": {"cores": 2}})
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(runner, "_site", lambda _folder: ring.ring_site())
         before = systems()
         asked = runner.tasks(partial(draw, SPEC, 1), [RUN], SETUPS)
-        drives = runner.run(folder.path, asked, folder)
-        first = next(drives)
-        drives.close()
+        (first,) = runner.run(folder.path, asked[:1], folder)
         rest = list(runner.run(folder.path, asked, folder))
         assert list(runner.run(folder.path, asked, folder)) == []
         assert systems() <= before, "drives that ended are still in memory"
@@ -243,6 +254,10 @@ def test_a_run_that_was_killed_goes_on_where_it_was(short_run):
     assert [record.setup for record in records] == SETUPS
     known = {record.setup: record for record in folder.drives.read()}
     assert known == {record.setup: record for record in records}
+    first, *rest = records
+    assert len({record.sitting for record in rest}) == 1
+    assert len({record.core for record in rest}) == 1
+    assert not comparable([first, rest[0]]) or first.sitting == rest[0].sitting
 
 
 @pytest.mark.drive
@@ -301,7 +316,89 @@ def test_a_film_finds_in_the_records_what_happened_and_when(short_run):
         folder.read_drives(RUN + 1, "westeast", ["fog"])
 
 
+# --- which drives are compared ---
+
+
+def like(record, setup="default", **changes):
+    shared = {"load": 1.0, "sitting": "s", "jobs": 1, "commit": "c", "ready": True}
+    return msgspec.structs.replace(record, setup=setup, **{**shared, **changes})
+
+
+def test_setups_of_a_route_are_driven_again_until_the_machine_is_loaded_alike_in_all_of_them(short_run, monkeypatch):
+    loads = iter([1.2, 4.0, 2.9, 2.0])  # a drive is a load of 1 by itself
+
+    def drive(_folder, _jobs, _commit, task):
+        return like(short_run[1][0], task.setup, load=next(loads), sitting="")
+
+    monkeypatch.setattr(runner, "_drive", drive)
+    allowed = os.sched_getaffinity(0)
+    records = runner._drive_together(Path(), 1, "", runner.tasks(partial(draw, SPEC, 1), [RUN], ["default", "fog"]))
+    assert [record.load for record in records] == [2.9, 2.0]
+    assert len({record.sitting for record in records}) == 1
+    assert {record.core for record in records} <= allowed
+    assert os.sched_getaffinity(0) == allowed
+
+
+def test_only_drives_of_one_commit_and_sitting_at_a_like_load_tell_how_much_less_is_computed(short_run):
+    one = msgspec.structs.replace(short_run[1][0], time_s=100.0)
+    dear, cheap = {"cpu_s": {"local planning": 8.0}}, {"cpu_s": {"local planning": 2.0}}
+    good = {"default": like(one, **dear), "fog": like(one, "fog", load=1.4, **cheap)}
+    others = [
+        {"default": like(one, **dear), "fog": like(one, "fog", cpu_s={"local planning": 8.0}, **changed)}
+        for changed in ({"load": 1.5}, {"commit": "d"}, {"sitting": "t"}, {"jobs": 2})
+    ]
+    assert computation.ratio([good, *others], "default", "fog", MOVE_BASE) == pytest.approx(4.0)
+    assert computation.counted([good, *others], ("default", "fog")) == [good]
+    assert computation.ratio(others, "default", "fog", MOVE_BASE) is None
+
+
+def test_drives_in_which_a_warned_robot_was_worse_off_are_listed_with_what_was_different(short_run):
+    one = msgspec.structs.replace(short_run[1][0], distance_m=50.0, time_s=200.0, modes={"NORMAL": 1}, stops=[])
+    pairs = [
+        {"default": like(one), "fog": like(one, "fog", **changed)}
+        for changed in (
+            {"distance_m": 50.2}, {"distance_m": 51.0}, {"time_s": 230.0, "modes": {"HOLD": 1, "DEGRADED": 2}},
+            {"distance_m": 60.0, "route_areas": ["z9"]},
+        )
+    ]  # fmt: skip
+    *_, table = worse(pairs, ["default", "fog"], {})
+    assert [row[3:5] for row in table.rows] == [["1.0", "0.0"], ["0.0", "30.0"], ["10.0", "0.0"]]
+    assert [row[-1] for row in table.rows] == [
+        "the same way by another line",
+        "held under way 1 time more; was DEGRADED, and slow, 2 times more",
+        f"another way: through z9, not {', '.join(one.route_areas) or 'no watched area'}",
+    ]
+    # A robot that was not waited for began in HOLD.
+    late = {"default": like(one, ready=UNSET, modes={"HOLD": 1}), "full": like(one, "full", ready=UNSET, time_s=260.0)}
+    late["full"] = msgspec.structs.replace(late["full"], modes={"HOLD": 2})
+    *_, table = worse([late], ["default", "full"], {})
+    assert table.rows[0][-1] == "held under way 1 time more"
+
+
 # --- by real processes ---
+
+
+def test_a_live_drive_that_failed_is_driven_again_and_stays_in_the_count(tmp_path, monkeypatch, short_run):
+    outcomes = iter(["stopped", "reached", "never"])
+    one = msgspec.structs.replace(short_run[1][0], stops=[])
+    shared = {name: getattr(one, name) for name in ComparedDrive.__struct_fields__}
+
+    def drive_live(*_):
+        outcome = next(outcomes)
+        return MeasuredDrive(**shared | {"outcome": outcome, "success": outcome == "reached"}, kind="live", plans=1)
+
+    monkeypatch.setattr(live_drive, "drive_live", drive_live)
+    asked, files = runner.tasks(partial(draw, SPEC, 1), [RUN], ["default"]), Folder(tmp_path).measured("live")
+    for _ in range(3):  # the command is repeated
+        list(live_drives(None, asked, files, LiveOptions(), print))
+    first, second = sorted(files.read(), key=lambda drive: drive.attempt)
+    assert (first.name, first.outcome, second.outcome) == (asked[0].name, "stopped", "reached")
+    assert second.name == f"{asked[0].name}-attempt2"
+    assert second.in_lockstep == asked[0].name
+    text = to_markdown(build(short_run[1], {"asked": {"site": "ring", "site_digest": "", "seed": 1},
+                                            "measured_on": {}}, measured=[first, second]))  # fmt: skip
+    assert "Of 2 drives by real processes 1 failed" in text
+    assert "1 of them repeat one that had failed, which is counted, too" in text
 
 
 def test_a_route_s_site_is_the_same_but_for_the_start_of_the_robot_and_the_demonstration(tmp_path):

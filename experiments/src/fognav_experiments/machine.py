@@ -116,6 +116,22 @@ class _Component:
         self._meter.leave()
 
 
+@contextmanager
+def on_one_core() -> Iterator[int]:
+    """Keep this thread on one core meanwhile, and give its number; workers of a pool have one each while these last."""
+    allowed = os.sched_getaffinity(0)
+    _, _, number = multiprocessing.current_process().name.rpartition("-")
+    if number.isdigit():
+        core = sorted(allowed)[int(number) % len(allowed)]
+    else:  # no worker: where it runs now
+        core = int(Path("/proc/thread-self/stat").read_text("ascii").rpartition(")")[2].split()[36])
+    os.sched_setaffinity(0, {core})
+    try:
+        yield core
+    finally:
+        os.sched_setaffinity(0, allowed)
+
+
 _NICENESS: Final = 5
 
 

@@ -80,9 +80,11 @@ def experiment_command(  # noqa: PLR0913  # each option is an argument
     A run is the routes of the site's experiment.toml. On each a drawn watched area is blocked at a drawn moment, the
     same for all setups. With --draws floor a run is one route between two stops anywhere on the floor, and any watched
     area is blocked. Each drive is one file, so a run that was killed goes on where it was when the command is
-    repeated; --from goes on with the archive of a report, drives.jsonl.xz, on another day or machine. CPU times are
-    worth comparing when nothing runs beside: --jobs 1. Drives of --live and --hardware stand beside those in lockstep,
-    and the report compares them. The exit code is 1 if a drive failed or was skipped.
+    repeated; --from goes on with the archive of a report, drives.jsonl.xz, on another day or machine. The setups of a
+    route are driven one after another on one core, and again if the machine's load changed meanwhile: their CPU times
+    are compared. Drives of --live and --hardware stand beside those in lockstep, and the report compares them; one that
+    failed is driven again when the command is repeated, and stays in the count. The exit code is 1 if a drive failed
+    or was skipped.
     """
     if context.invoked_subcommand is not None:
         return
@@ -103,10 +105,8 @@ def experiment_command(  # noqa: PLR0913  # each option is an argument
         try:
             loaded = load_site(place)
             begun = runner.new(loaded, place, seed, _draws(draws, hardware=hardware))
-            chosen, numbers = (
-                _setups(setups, lockstep=not live and not hardware),
-                [only] if only else range(1, runs + 1),
-            )
+            numbers = [only] if only else range(1, runs + 1)
+            chosen = _setups(setups, lockstep=not live and not hardware)
             asked = runner.tasks(runner.drawer(loaded, place, begun), numbers, chosen)
             runner.check_barriers(loaded, [] if hardware else asked)  # a person finds a place
             folder, commit = Folder(out), checkout.revision()
@@ -442,7 +442,9 @@ def _show(names: Sequence[str], files: DriveFiles[D], records: Iterator[D]) -> i
 
 def _failed(names: Sequence[str], files: DriveFiles[D]) -> int:
     """Name the drives without a record; return how many of those asked for did not succeed."""
-    succeeded = {record.name for record in files.read() if record.success}
+    from fognav_experiments.comparison.drives import ATTEMPT  # noqa: PLC0415  # keeps the other commands fast
+
+    succeeded = {record.name.partition(ATTEMPT)[0] for record in files.read() if record.success}
     if missing := [name for name in names if not files.has(name)]:
         print_line(f"no record of {', '.join(missing)}: repeat the command to drive them")
     return sum(name not in succeeded for name in names)

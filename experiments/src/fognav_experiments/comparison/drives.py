@@ -183,6 +183,10 @@ ROBOTS_PROCESSES: Final = ("robot-agent", "robot-guardian", "robot-watchdog")
 """The processes that run on the robot."""
 
 
+ATTEMPT: Final = "-attempt"
+"""What follows a drive's name where it was made again, because it had failed."""
+
+
 class MeasuredDrive(ComparedDrive, frozen=True, kw_only=True):
     """One drive by real processes, whose clock runs `speed` times as fast as real time.
 
@@ -190,8 +194,8 @@ class MeasuredDrive(ComparedDrive, frozen=True, kw_only=True):
     `cpu_percent`: mean share (%) of one core that each process took, per second of the system's clock. `peak_mb`: its
     largest resident memory (MB), sampled once a second. `cpu_quota`: share of one core that the robot's processes had
     together; None without a limit. `asked_speed`: that of the command, from which `speed` differs where the machine
-    could not sustain it. `restarts`: processes that died. `barrier_at_m`: distance (m) driven when a person said that
-    the barrier stands.
+    could not sustain it. `attempt`: 1, or how many it took with those that failed before.
+    `restarts`: processes that died. `barrier_at_m`: distance (m) driven when a person said that the barrier stands.
     """
 
     kind: Kind
@@ -203,11 +207,13 @@ class MeasuredDrive(ComparedDrive, frozen=True, kw_only=True):
     asked_speed: float = 1.0
     restarts: int = 0
     barrier_at_m: float | None = None
+    attempt: int = 1
 
     @property
     def name(self) -> str:
         """Name of the record's file, without suffix."""
-        return drive_name(self.run, self.route, self.setup, self.cpu_quota, self.asked_speed)
+        first = drive_name(self.run, self.route, self.setup, self.cpu_quota, self.asked_speed)
+        return first if self.attempt == 1 else f"{first}{ATTEMPT}{self.attempt}"
 
     @property
     def in_lockstep(self) -> str | None:

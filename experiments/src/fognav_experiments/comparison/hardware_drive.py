@@ -8,6 +8,8 @@ import os
 import sys
 from typing import TYPE_CHECKING, Final
 
+import msgspec
+
 from fog_contracts.commands import PROFILE_OF, STOPS
 from fog_runtime import logs
 from fognav import __version__
@@ -166,8 +168,12 @@ class HardwareRun:
         self._commit = commit
 
     async def run(self, asked: Sequence[Task], files: DriveFiles[MeasuredDrive]) -> None:
-        """Drive those that have no record yet; raises `FailedError` when the person ends it."""
-        due = [task for task in asked if not files.has(task.name)]
+        """Drive those that have not succeeded yet; raises `FailedError` when the person ends it.
+
+        What failed stays beside what is driven again.
+        """
+        made = {task.name: files.attempts(task.name) for task in asked}
+        due = [task for task in asked if not any(drive.success for drive in made[task.name])]
         self._terminal.say(
             f"{len(due)} drives to go. At each question before a drive: Enter goes on, {_SKIP} skips the drive, "
             f"{_QUIT} ends the command; while the robot drives, {_END} ends the drive. Ctrl-C stops the robot always."
@@ -178,6 +184,7 @@ class HardwareRun:
                 record = await self.drive(task)
             except _SkippedError:
                 continue
+            record = msgspec.structs.replace(record, attempt=len(made[task.name]) + 1)
             files.write(record)
             self._terminal.say(f"{record.name}: {record.outcome}, {record.distance_m:.1f} m ({record.reason})")
 

@@ -63,13 +63,15 @@ def live_drives(
     options: LiveOptions,
     on_event: Callable[[str], None],
 ) -> Iterator[MeasuredDrive]:
-    """Drive those that have no record yet, one after another, and yield each record once it is written.
+    """Drive those that have not succeeded yet, one after another, and yield each record once it is written.
 
-    Raises as `drive_live` does.
+    What failed stays beside what is driven again. Raises as `drive_live` does.
     """
     for task in asked:
-        if not files.has(options.name(task)):
+        made = files.attempts(options.name(task))
+        if not any(drive.success for drive in made):
             drive = drive_live(site, task.drawn, task.setup, options, on_event)
+            drive = msgspec.structs.replace(drive, attempt=len(made) + 1)
             files.write(drive)
             yield drive
 

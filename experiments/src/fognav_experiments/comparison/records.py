@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any, Final, Generic, Literal, Protocol, TypeVa
 import msgspec
 
 from fog_runtime.files import SHARED, atomic_write
-from fognav_experiments.comparison.drives import KINDS, ComparedDrive, MeasuredDrive, Timeline, drive_name
+from fognav_experiments.comparison.drives import ATTEMPT, KINDS, ComparedDrive, MeasuredDrive, Timeline, drive_name
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator, Mapping, Sequence
@@ -47,7 +47,8 @@ class Record(ComparedDrive, frozen=True, kw_only=True):
     `barrier_distance_m`: smallest distance between the obstacle and the robot's rim. `reaction_s`: from the obstacle's
     first reading to the first wheel command on a new path, where there was one. `jobs`: drives that this machine ran at
     the same time. `timeline`: what a film shows. `ready`: the robot was ready in its setup when the drive began; before
-    that was waited for, `default` and `full` began 2 s late.
+    that was waited for, `default` and `full` began 2 s late. `core`: on which one of the machine it was driven.
+    `sitting`: that of the drives of this run and route which were made one after another.
     """
 
     planned_m: float
@@ -63,6 +64,8 @@ class Record(ComparedDrive, frozen=True, kw_only=True):
     track: list[tuple[float, float]] = msgspec.field(default_factory=list)
     timeline: Timeline | None = None
     ready: bool | msgspec.UnsetType = msgspec.UNSET
+    core: int | msgspec.UnsetType = msgspec.UNSET
+    sitting: str | msgspec.UnsetType = msgspec.UNSET
 
     @property
     def name(self) -> str:
@@ -77,6 +80,21 @@ class Record(ComparedDrive, frozen=True, kw_only=True):
 
 Draws = Literal["thesis", "floor"]
 """Of what routes are drawn: of the few of the site's `experiment.toml`, or at random over the floor."""
+
+
+LOAD_RATIO: Final = 1.5
+"""CPU times of drives are compared only if the machine's load differed by less than this."""
+
+
+def loaded_alike(records: Iterable[Record]) -> bool:
+    """Whether the machine was loaded alike at the end of these drives; each is a load of 1 by itself."""
+    loads = [max(1.0, record.load) for record in records]
+    return max(loads) < LOAD_RATIO * min(loads)
+
+
+def comparable(records: Sequence[Record]) -> bool:
+    """Whether CPU times of these drives can be compared: one commit, one sitting, and a like load."""
+    return len({(r.commit, r.jobs, str(r.sitting)) for r in records}) == 1 and loaded_alike(records)
 
 
 class Asked(msgspec.Struct, frozen=True, kw_only=True, omit_defaults=True):
@@ -141,10 +159,14 @@ class DriveFiles(Generic[N]):
         except OSError as error:
             raise FolderError(f"{self.path} can't be written: {error.strerror}. Name another folder") from error
 
-    def read(self) -> list[N]:
-        """Return all records by run, route and setup; raises `FolderError` for one that can't be read."""
+    def attempts(self, name: str) -> list[N]:
+        """Return the records of a drive: the first one, and those that were made because it had failed."""
+        return [*self.read(name), *self.read(f"{name}{ATTEMPT}*")]
+
+    def read(self, names: str = "*") -> list[N]:
+        """Return all records by run, route and setup, or those of such names; raises `FolderError` for a broken one."""
         records = []
-        for file in sorted(self.path.glob("*.json")):
+        for file in sorted(self.path.glob(f"{names}.json")):
             try:
                 records.append(msgspec.json.decode(file.read_bytes(), type=self._kind))
             except (OSError, msgspec.DecodeError) as error:
@@ -232,7 +254,7 @@ def _add(files: DriveFiles[N], others: DriveFiles[N]) -> int:
 
 def write_csv(path: Path, records: Sequence[Record]) -> None:
     """Write one row per drive; CPU as s by component, and as % of a core for what `move_base` held and in all."""
-    left_out = {"cpu_s", "track", "modes", "timeline", "ready", "ends"}
+    left_out = {"cpu_s", "track", "modes", "timeline", "ready", "ends", "core", "sitting"}
     fields = [field for field in Record.__struct_fields__ if field not in left_out]
     shares = {"move_base": MOVE_BASE, "robot": ON_ROBOT}
     header = [

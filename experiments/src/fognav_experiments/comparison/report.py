@@ -15,16 +15,11 @@ import msgspec
 from fog_runtime.configuration.site import load_site
 from fog_runtime.files import SHARED, atomic_write
 from fognav_experiments import figures
-from fognav_experiments.comparison import limits, repeated, runner
+from fognav_experiments.comparison import computation, limits, repeated, runner
 from fognav_experiments.comparison.drives import KINDS, route_ends
 from fognav_experiments.comparison.limits import RouteGeometry, Saved
 from fognav_experiments.comparison.records import (
-    ALIKE,
     ARCHIVE,
-    MOVE_BASE,
-    OF_FOG,
-    ON_FOG,
-    ON_ROBOT,
     Asked,
     FolderError,
     machines,
@@ -32,7 +27,7 @@ from fognav_experiments.comparison.records import (
     write_csv,
 )
 from fognav_experiments.comparison.repeated import SETUPS
-from fognav_experiments.comparison.situations import Drives, by_situation, situations, values
+from fognav_experiments.comparison.situations import Drives, by_situation, situations, values, worse
 from fognav_experiments.comparison.thesis import QUANTITIES, beside_thesis, paired, places
 from fognav_experiments.figures import (
     FEWEST_CLUSTERS,
@@ -46,7 +41,6 @@ from fognav_experiments.figures import (
     captioned,
     clustered,
     compare,
-    estimate,
     flat,
     spread,
     to_markdown,
@@ -65,9 +59,6 @@ if TYPE_CHECKING:
 
 
 TITLE: Final = "What the fog saves a robot: the thesis's experiment, repeated"
-PAIRS: Final[tuple[tuple[Setup, Setup], ...]] = (
-    ("default", "lean"), ("default", "full"), ("default", "fog"), ("lean", "full"), ("lean", "fog"), ("full", "fog"),
-)  # fmt: skip
 
 
 def build(
@@ -109,8 +100,9 @@ def build(
         Heading("Paired differences"),
         *_differences(pairs, met, setups),
         *_bounds(pairs, savings),
+        *worse(pairs, setups, savings),
         Heading("Where the computation goes"),
-        *_components(pairs, setups, measured),
+        *computation.blocks(pairs, setups, measured),
         *repeated.agreement(measured, records, str(experiment["measured_on"].get("commit", ""))),
         *repeated.beside_lockstep(measured, records),
         *_cost(measured),
@@ -220,15 +212,18 @@ def _routes(pairs: Sequence[Drives], setups: Sequence[Setup]) -> list[Block]:
 
 def _differences(pairs: Sequence[Drives], met: Sequence[Drives], setups: Sequence[Setup]) -> list[Block]:
     rows = []
-    for before, after in PAIRS:
+    for before, after in computation.PAIRS:
         if before not in setups or after not in setups:
             continue
         for subject, chosen in (("all drives", pairs), ("obstacle met", met)):
             if not chosen:
                 continue
             for quantity in QUANTITIES:
-                one, other = values(chosen, before, quantity.value), values(chosen, after, quantity.value)
-                found = compare(one, other, known := situations(chosen))
+                alike = computation.counted(chosen, (before, after)) if quantity.of_load else chosen
+                if not alike:
+                    continue
+                one, other = values(alike, before, quantity.value), values(alike, after, quantity.value)
+                found = compare(one, other, known := situations(alike))
                 rows.append([
                     f"{before} - {after}", subject, f"{quantity.title}, {quantity.unit}", str(found.difference),
                     spread([a - b for a, b in zip(one, other, strict=True)]), str(found.difference.n),
@@ -256,46 +251,6 @@ def _differences(pairs: Sequence[Drives], met: Sequence[Drives], setups: Sequenc
             rows,
         ),
     ]
-
-
-def _components(pairs: Sequence[Drives], setups: Sequence[Setup], measured: Sequence[MeasuredDrive]) -> list[Block]:
-    rows = []
-    for component in (*ON_ROBOT, *ON_FOG):
-        cells = []
-        for setup in setups:
-            unused = component in ON_FOG and component not in OF_FOG[setup]
-            share = estimate([drives[setup].cpu_percent([component]) for drives in pairs]).mean
-            cells.append("-" if unused else f"{share:.3f}")
-        rows.append([component, *cells])
-    for name, components in (("what move_base held", MOVE_BASE), ("whole robot", ON_ROBOT)):
-        means = (estimate([drives[setup].cpu_percent(components) for drives in pairs]).mean for setup in setups)
-        rows.append([f"sum: {name}", *(f"{mean:.3f}" for mean in means)])
-    received = [
-        f"{estimate([drives[setup].received_bytes / (drives[setup].time_s or 1.0) for drives in pairs]).mean:.0f}"
-        for setup in setups
-    ]
-    rows.append(["received from the fog, bytes/s", *received])
-    blocks: list[Block] = [
-        Paragraph(
-            "Mean share of one core, in %, by component. Left out are decoding of messages, sockets and "
-            "serial ports, which lockstep does not have; what a setup does not use of the fog is not counted."
-        ),
-        Table(["component", *setups], rows),
-        *limits.error([[drives[setup].cpu_percent(ALIKE) for setup in setups] for drives in pairs], setups),
-    ]
-    if "default" in setups and "fog" in setups:
-        default, lean, full, fog = (
-            {name: _share(pairs, setup, [name]) for name in MOVE_BASE} if setup in setups else {} for setup in SETUPS
-        )
-        whole = _share(pairs, "default", ON_ROBOT), _share(pairs, "fog", ON_ROBOT)
-        blocks.append(
-            limits.computation(default, lean or None, full or None, fog, whole, repeated.of_processes(measured))
-        )
-    return blocks
-
-
-def _share(pairs: Sequence[Drives], setup: Setup, components: Sequence[str]) -> float:
-    return estimate([drives[setup].cpu_percent(components) for drives in pairs]).mean
 
 
 def _tracks(pairs: Sequence[Drives], setups: Sequence[Setup], site: Site | None) -> list[Block]:
@@ -342,11 +297,16 @@ def _failures(records: Sequence[Record], measured: Sequence[MeasuredDrive]) -> l
         blocks.append(
             Paragraph(
                 f"Of {len(measured)} drives by real processes {failed} failed, and {stopped} had a protective stop or "
-                "a fault."
+                f"a fault{_again(measured)}."
             )
         )
     header = ["drive", "made", "outcome", "reason", "contacts", "protective stops and faults"]
     return [*blocks, Table(header, rows)] if rows else blocks
+
+
+def _again(measured: Sequence[MeasuredDrive]) -> str:
+    again = sum(drive.attempt > 1 for drive in measured)
+    return f"; {again} of them repeat one that had failed, which is counted, too" if again else ""
 
 
 def summary_rows(records: Sequence[Record]) -> list[list[str]]:

@@ -14,9 +14,10 @@ from fognav_experiments.comparison.drives import route_ends
 from fognav_experiments.figures import FEWEST_CLUSTERS, Block, Heading, Paragraph, Table, spread
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Collection, Sequence
+    from collections.abc import Callable, Collection, Mapping, Sequence
 
     from fognav_experiments.comparison.drives import Setup
+    from fognav_experiments.comparison.limits import Saving
     from fognav_experiments.comparison.records import Record
 
 Drives = dict["Setup", "Record"]
@@ -85,6 +86,63 @@ def _words(pairs: Sequence[Drives], met: Sequence[Drives], before: Setup, after:
         "Drives of one situation repeat one another: confidence intervals count situations, not drives"
         + ("." if barred >= FEWEST_CLUSTERS else f", and there is none below {FEWEST_CLUSTERS}.")
     )
+
+
+WORSE_M: Final = 0.3
+WORSE_S: Final = 3.0
+"""A robot that is told of an obstacle is worse off if it drives so much farther, or longer, than one on its own."""
+
+
+def worse(pairs: Sequence[Drives], setups: Sequence[Setup], savings: Mapping[tuple[int, str], Saving]) -> list[Block]:
+    """Return the drives in which a warned robot was worse off than one on its own, with what its records say of why."""
+    rows = []
+    after: Setup
+    for after in ("fog", "full"):
+        for drives in pairs if {"default", after} <= {*setups} else ():
+            metres, seconds = saved(drives, "default", after)
+            if metres > -WORSE_M and seconds > -WORSE_S:
+                continue
+            record = drives[after]
+            allowed = savings.get((record.run, record.route))
+            rows.append([
+                record.name, record.area, _APPEARS.get(record.moment, record.moment),
+                f"{0.0 - round(metres, 1):.1f}", f"{0.0 - round(seconds, 1):.1f}",
+                "-" if allowed is None else f"{allowed.saved_m:.1f}", cause(drives["default"], record),
+            ])  # fmt: skip
+    heading = Heading("Where a warned robot was worse off")
+    limits = f"{WORSE_M:g} m or {WORSE_S:g} s"
+    if not rows:
+        return [heading, Paragraph(f"In no drive was `fog` or `full` worse than `default` by {limits}.")]
+    return [
+        heading,
+        Paragraph(
+            f"All drives in which `fog` or `full` was worse than `default` by at least {limits}. Why is what the "
+            "records tell: another way, holds, slow driving (DEGRADED: where a robot can't rely on what it knows, it "
+            "drives at half its speed at most), or neither. Where the map allows to save nothing, a warning can only "
+            "cost."
+        ),
+        Table(["drive", "blocked", "appears", "farther, m", "longer, s", "the map allows to save, m", "why"], rows),
+    ]
+
+
+def cause(alone: Record, warned: Record) -> str:
+    """Return in words in what a warned robot's drive differs from that of one on its own."""
+    found = [f"{stop}" for stop in warned.stops]
+    if alone.route_areas != warned.route_areas:
+        ways = (", ".join(record.route_areas) or "no watched area" for record in (warned, alone))
+        found.append("another way: through {}, not {}".format(*ways))
+    if (holds := _under_way(warned, "HOLD") - _under_way(alone, "HOLD")) > 0:
+        found.append(f"held under way {holds} time{'s' * (holds != 1)} more")
+    slower = warned.modes.get("DEGRADED", 0) - alone.modes.get("DEGRADED", 0)
+    if slower > 0:
+        found.append(f"was DEGRADED, and slow, {slower} time{'s' * (slower != 1)} more")
+    return "; ".join(found) or "the same way by another line"
+
+
+def _under_way(record: Record, mode: str) -> int:
+    """Return how often a robot was in a mode after its start: one that was not waited for began in HOLD."""
+    began_so = mode == "HOLD" and record.ready is not True and record.setup != "fog"
+    return record.modes.get(mode, 0) - began_so
 
 
 def values(pairs: Collection[Drives], setup: Setup, value: Callable[[Record], float]) -> list[float]:

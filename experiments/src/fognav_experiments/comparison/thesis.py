@@ -8,7 +8,7 @@ from __future__ import annotations
 from collections import defaultdict
 from typing import TYPE_CHECKING, Final, NamedTuple
 
-from fognav_experiments.comparison import repeated
+from fognav_experiments.comparison import computation, repeated
 from fognav_experiments.comparison.records import MOVE_BASE, ON_ROBOT
 from fognav_experiments.comparison.repeated import SETUPS
 from fognav_experiments.comparison.situations import Drives, situations
@@ -88,6 +88,8 @@ class Quantity(NamedTuple):
     file: str
     caption: str
     value: Callable[[Record], float]
+    of_load: bool = False
+    """Whether it depends on what else the machine does."""
 
 
 QUANTITIES: Final = (
@@ -111,6 +113,7 @@ QUANTITIES: Final = (
         "cpu-move-base",
         "As figures 6.5 and 6.9: global planning, layers and local planning",
         lambda record: record.cpu_percent(MOVE_BASE),
+        of_load=True,
     ),
     Quantity(
         "CPU of the whole robot",
@@ -118,6 +121,7 @@ QUANTITIES: Final = (
         "cpu-robot",
         "Not in the thesis: all that the robot computes, without the input and output of its processes",
         lambda record: record.cpu_percent(ON_ROBOT),
+        of_load=True,
     ),
 )
 
@@ -146,17 +150,12 @@ def beside_thesis(
     ours = {"6.3, 6.7": _saved(pairs, met, QUANTITIES[0]), "6.4, 6.8": _saved(pairs, met, QUANTITIES[1])}
     shares = {setup: _mean(pairs, setup, QUANTITIES[2]) for setup in setups}
     ours["6.5, 6.9"] = ", ".join(f"{setup} {found.mean:.2f} %" for setup, found in shares.items())
-    if "default" in shares and "fog" in shares:
-        whole = [_mean(pairs, setup, QUANTITIES[3]).mean for setup in ("default", "fog")]
-        ours["6.5, 6.9"] += f": default / fog = {shares['default'].mean / shares['fog'].mean:.1f}"
-        for other in ("lean", "full"):
-            if other in shares:
-                lower_rates = shares["default"].mean / shares[other].mean
-                above_all = " above all" * (other == "full")
-                ours["6.5, 6.9"] += f", of which default / {other}, by lower rates{above_all}, {lower_rates:.1f}"
-        ours["6.5, 6.9"] += f"; whole robot {whole[0]:.2f} % and {whole[1]:.2f} %: {whole[0] / whole[1]:.1f}"
-        if (live := repeated.of_processes(measured)) is not None:
-            ours["6.5, 6.9"] += f"; its real processes {live[0]:.2f} % and {live[1]:.2f} %: {live[0] / live[1]:.2f}"
+    ours["6.5, 6.9"] += _less_computation(pairs, setups)
+    if (live := repeated.of_processes(measured)) is not None:
+        ours["6.5, 6.9"] += (
+            f"; the whole robot's real processes {live[0]:.2f} % in default and {live[1]:.2f} % in fog: "
+            f"{live[0] / live[1]:.2f} times less"
+        )
     ours["6.6, 6.10"] = _memory(measured)
     reactions = [record.reaction_s for drives in pairs for record in drives.values() if record.reaction_s is not None]
     if reactions:
@@ -183,6 +182,20 @@ def beside_thesis(
             "processes."
         ),
     ]
+
+
+def _less_computation(pairs: Sequence[Drives], setups: Sequence[Setup]) -> str:
+    """Return in words how many times less is computed, of the pairs of drives that count."""
+    asked: list[tuple[Setup, Setup, str]] = [
+        ("default", "fog", ""), ("default", "lean", " by lower rates"), ("lean", "fog", " by the fog"),
+        ("default", "full", " by lower rates above all"), ("full", "fog", " by planning in the fog"),
+    ]  # fmt: skip
+    known = [
+        f"{before} / {after}{by} {found:.2f}"
+        for before, after, by in asked
+        if before in setups and after in setups and (found := computation.ratio(pairs, before, after, MOVE_BASE))
+    ]
+    return f"; of the pairs that count {', '.join(known)}" if known else "; no pair of drives counts for a ratio"
 
 
 def late(pairs: Sequence[Drives]) -> list[Block]:

@@ -107,8 +107,17 @@ def test_planner_figures_count_what_equals_its_reference(cells, tmp_path, monkey
     printed = json.loads(done.stdout)
     assert printed["queries"] == printed["optimal"] == (3 if cells is None else 1)
     assert printed["replans"] == printed["replans_optimal"] > 0
-    for key in ("median_ms", "p99_ms", "expansions_median", "replan_median_ms", "field_median_ms"):
+    for key in (
+        "median_ms",
+        "p99_ms",
+        "expansions_median",
+        "replan_median_ms",
+        "field_median_ms",
+        "shortcut_median_ms",
+    ):
         assert printed[key] > 0
+    assert printed["dearer_than_gradient_worst_percent"] < 1.0
+    assert ("tcod_median_ms" in printed) != ("tcod" in printed["not_installed"])
     assert printed["versions"].keys() == {"python", "numba", "numpy"}
 
 

@@ -2,18 +2,23 @@
 
 Every query is planned from scratch by A*. Its cost is compared with that of a Dijkstra search from the goal, which is
 another kernel, and with the length that a scenario of the MovingAI benchmarks publishes. Then a hazard is put onto the
-path, and the path is planned again, guided by the goal's field over the floor without the hazard; its cost is compared
-with that of a search without a guide on the same costs. Times are of the processor, so that other work on the machine
-counts little.
+path, and the path is planned again as the planner does it: from the robot, guided by the goal's field over the floor
+without the hazard, or, if the hazard is nearer to the goal, from the goal, guided by the field of where the robot
+began. Its cost is compared with that of a search without a guide on the same costs.
+
+Times are of the processor, so that other work on the machine counts little, with cold caches, and in turn with the
+searches of other packages that are installed.
 """
 
 from __future__ import annotations
 
 import dataclasses
+import itertools
 import math
 import time
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Final, NamedTuple
+from functools import partial
+from typing import TYPE_CHECKING, Final, NamedTuple, TypeVar
 
 import numpy as np
 
@@ -21,12 +26,14 @@ from fog_contracts.costs import DEFAULT_INFLATION, INSCRIBED, LETHAL, NEUTRAL_WE
 from fog_kernels.astar import Planner
 from fog_kernels.components import Components
 from fog_kernels.inflation import inflate, inflation_table
+from fog_kernels.lines import line_cost
 from fog_kernels.steps import STRAIGHT
 from fog_kernels.tiles import TilePatterns
 from fog_runtime.configuration.map_text import MapTextError, read_map_text
 from fog_runtime.configuration.maps import load_map
 from fognav_experiments.bench.common import make_office
 from fognav_experiments.bench.fleet import percentile
+from fognav_experiments.bench.path_peers import gradient_path_cost, installed_peers
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
@@ -128,15 +135,23 @@ class Figures:
     cold: list[float] = dataclasses.field(default_factory=list)
     field: list[float] = dataclasses.field(default_factory=list)
     expansions: list[int] = dataclasses.field(default_factory=list)
+    shortcut: list[float] = dataclasses.field(default_factory=list)
+    corners: list[int] = dataclasses.field(default_factory=list)
+    dearer: list[float] = dataclasses.field(default_factory=list)
+    """By how many percent paths cost more than those along the gradient."""
     replan: list[float] = dataclasses.field(default_factory=list)
     replan_near_goal: list[float] = dataclasses.field(default_factory=list)
+    closed: list[float] = dataclasses.field(default_factory=list)
+    """Searches after a hazard that left no path."""
+    peers: dict[str, list[float]] = dataclasses.field(default_factory=dict)
     optimal: int = 0
     replans_optimal: int = 0
 
     def summary(self) -> dict[str, float | int]:
-        """Return the figures by the names of the command's JSON."""
-        replans = len(self.replan) + len(self.replan_near_goal)
-        return {
+        """Return the figures by the names of the command's JSON; without those of which there is none."""
+        replans = len(self.replan) + len(self.replan_near_goal) + len(self.closed)
+        dearer = [percent for percent in self.dearer if not math.isnan(percent)]
+        figures: dict[str, float | int] = {
             "queries": len(self.cold),
             "optimal": self.optimal,
             "median_ms": percentile(self.cold, 50),
@@ -144,51 +159,90 @@ class Figures:
             "p99_ms": percentile(self.cold, 99),
             "expansions_median": int(np.median(self.expansions)),
             "field_median_ms": percentile(self.field, 50),
+            "shortcut_median_ms": percentile(self.shortcut, 50),
+            "corners_mean": round(float(np.mean(self.corners)), 1),
             "replans": replans,
             "replans_optimal": self.replans_optimal,
-            "replan_median_ms": percentile(self.replan, 50),
-            "replan_p99_ms": percentile(self.replan, 99),
-            "replan_near_goal_median_ms": percentile(self.replan_near_goal, 50),
-            "replan_near_goal_p99_ms": percentile(self.replan_near_goal, 99),
+            "replans_closed": len(self.closed),
         }
+        if dearer:
+            figures["dearer_than_gradient_mean_percent"] = round(float(np.mean(dearer)), 2)
+            figures["dearer_than_gradient_worst_percent"] = round(max(dearer), 2)
+        for name, times in (("", self.replan), ("_near_goal", self.replan_near_goal), ("_closed", self.closed)):
+            if times:
+                figures[f"replan{name}_median_ms"] = percentile(times, 50)
+                figures[f"replan{name}_p99_ms"] = percentile(times, 99)
+        for name, times in self.peers.items():
+            figures[f"{name}_median_ms"] = percentile(times, 50)
+            ratios = [own / other for own, other in zip(self.cold, times, strict=True)]
+            figures[f"ratio_to_{name}"] = round(float(np.median(ratios)), 3)
+            figures[f"worst_ratio_to_{name}"] = round(max(ratios), 3)
+        return figures
+
+
+T = TypeVar("T")
 
 
 def measure(
     floor: Floor, queries: Sequence[Query], rng: np.random.Generator, on_progress: Callable[[int], object]
-) -> dict[str, float | int]:
+) -> dict[str, object]:
     """Run all queries and return the figures; `on_progress` is called with the number of those that are done."""
     height, width = floor.costmap.shape
     planner, figures = Planner(width, height), Figures()
+    peers, missing = installed_peers(floor.costmap)
     for number, query in enumerate(queries):
         _measure_query(floor, query, planner, figures, rng)
+        for name, search in peers.items():
+            _timed(figures.peers.setdefault(name, []), partial(search, query.start, query.goal))
         on_progress(number + 1)
-    return figures.summary()
+    return {**figures.summary(), "not_installed": ", ".join(missing) or "none"}
+
+
+_OTHER_DATA: Final[NDArray[np.uint8]] = np.zeros(64_000_000, np.uint8)
+
+
+def _timed(times: list[float], work: Callable[[], T]) -> T:
+    """Do some work with cold caches, as between a robot's other tasks; note the processor's time (ms)."""
+    _OTHER_DATA[::64] += 1
+    begun = time.thread_time()
+    done = work()
+    times.append(1000.0 * (time.thread_time() - begun))
+    return done
 
 
 def _measure_query(floor: Floor, query: Query, planner: Planner, figures: Figures, rng: np.random.Generator) -> None:
     start, goal, length = query
-    begun = time.thread_time()
-    found = planner.plan(floor.costmap, start, goal)
-    figures.cold.append(1000.0 * (time.thread_time() - begun))
+    costmap, patterns = floor.costmap, TilePatterns(_PATTERN_BYTES)
+    found = _timed(figures.cold, lambda: planner.plan(costmap, start, goal))
     figures.expansions.append(found.expansions)
-    begun = time.thread_time()
-    guide = planner.goal_field(floor.costmap, goal, TilePatterns(_PATTERN_BYTES))
-    figures.field.append(1000.0 * (time.thread_time() - begun))
+    guide = _timed(figures.field, lambda: planner.goal_field(costmap, goal, patterns))
     expected = math.inf if length is None else NEUTRAL_WEIGHT * length
-    figures.optimal += found.cost == _cost(guide, start, width=floor.costmap.shape[1]) and (
+    figures.optimal += found.cost == _cost(guide, start, width=costmap.shape[1]) and (
         length is None or math.isclose(found.cost, expected, rel_tol=1e-5, abs_tol=NEUTRAL_WEIGHT * 5e-3)
     )
-    if not found.found or len(found.cells) <= 2 * _HAZARD_CELLS:
+    if not found.found:
         return
+    corners = _timed(figures.shortcut, lambda: planner.shortcut(costmap, found.cells))
+    figures.corners.append(len(corners))
+    cost = sum(line_cost(costmap, *before, *after) for before, after in itertools.pairwise(corners.tolist()))
+    if start != goal:
+        figures.dearer.append(100.0 * (cost / gradient_path_cost(costmap, start, goal) - 1.0))
+    if len(found.cells) <= 2 * _HAZARD_CELLS:
+        return
+    origin = planner.goal_field(costmap, start, patterns)
     for where, times in ((_ALONG, figures.replan), (_NEAR_GOAL, figures.replan_near_goal)):
-        column, row = found.cells[round(rng.uniform(*where) * (len(found.cells) - 1))].tolist()
-        costmap = _with_hazard(floor, column, row)
-        if max(costmap[start[1], start[0]], costmap[goal[1], goal[0]]) >= INSCRIBED:
+        share = rng.uniform(*where)
+        column, row = found.cells[round(share * (len(found.cells) - 1))].tolist()
+        raised = _with_hazard(floor, column, row)
+        if max(raised[start[1], start[0]], raised[goal[1], goal[0]]) >= INSCRIBED:
             continue  # the hazard lies on the robot or on its goal
-        begun = time.thread_time()
-        again = planner.plan(costmap, start, goal, field=guide)
-        times.append(1000.0 * (time.thread_time() - begun))
-        figures.replans_optimal += again.cost == planner.plan(costmap, start, goal).cost
+        taken: list[float] = []
+        if share <= 0.5:
+            again = _timed(taken, partial(planner.plan, raised, start, goal, field=guide))
+        else:
+            again = _timed(taken, lambda: planner.plan(raised, goal, start, field=origin.toward(start)))  # noqa: B023  # called in this pass only
+        figures.replans_optimal += again.cost == planner.plan(raised, start, goal).cost
+        (times if again.found else figures.closed).extend(taken)
 
 
 def _cost(guide: GoalField, start: Cell, *, width: int) -> float:

@@ -247,7 +247,9 @@ def planner_command(
 
     The office has 100 x 60 m at 5 cm; without a scenario, queries are long ones. `optimal` counts the queries that cost
     what a Dijkstra search finds, and have the published length; `replans_optimal` the replans that cost what a search
-    from scratch finds. Times are in ms of the processor; `field_median_ms` is that of the goal's field, once per goal.
+    from scratch finds; `replans_closed` those that no path is left for. Times are in ms of the processor, with cold
+    caches; `field_median_ms` is that of the goal's field, once per goal. Beside them stand pyastar2d, tcod and
+    scikit-image, if they are installed, and by how much paths cost more than along the gradient of NavFn's potential.
     """
     import numpy as np  # noqa: PLC0415  # keeps the other commands fast
 

@@ -1,8 +1,8 @@
 // Why a robot stands or drives slowly, in one sentence, and what to do about it.
-import type { AuditEntry, GoalView, OutOfService, RobotState } from "./api/types";
+import type { AuditEntry, BlockedWay, GoalView, OutOfService, RobotState } from "./api/types";
 import { language, t } from "./i18n/i18n";
 import { REASONS } from "./reasons";
-import { clockTime } from "./text";
+import { clockTime, duration } from "./text";
 
 export interface Why {
   /** What is the matter. */
@@ -43,6 +43,13 @@ export function whys(state: RobotState, stopped: Stopped | null = null): Why[] {
 export function outOfService({ reason, by, until }: OutOfService): string {
   const end = until === null ? "" : t("service.until", { time: clockTime(until) });
   return `${t("service.is", { reason, by, end })} ${t("service.remedy")}`;
+}
+
+/** Return that a robot waits before something in its way, or goes round it, and what both cost. */
+export function blockedWay({ choice, causes, expected_s, detour_s, limit_s }: BlockedWay): string {
+  const places = causes.map(({ id }) => id).join(", ");
+  const figures = { places, wait: duration(expected_s), round: duration(detour_s), limit: duration(limit_s ?? 0) };
+  return t(choice === "wait" ? "way.waits" : "way.goesRound", figures);
 }
 
 /** Return one sentence about what a robot does, or why not. */

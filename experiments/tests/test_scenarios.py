@@ -39,7 +39,16 @@ FILES = {file.stem: file for file in sorted((ROOT / "experiments" / "scenarios")
 PLAYED = (
     sorted(FILES)
     if os.environ.get("FOGNAV_SCENARIOS") == "all"
-    else ["map-restarts", "no-way-left", "robots-2", "watched-cone-wifi-0.7s", "watched-cone-wifi-2s", "wifi-gap-5s"]
+    else [
+        "box-stays",
+        "map-restarts",
+        "no-way-left",
+        "person-stands-8s",
+        "robots-2",
+        "watched-cone-wifi-0.7s",
+        "watched-cone-wifi-2s",
+        "wifi-gap-5s",
+    ]
 )
 
 pytestmark = pytest.mark.timeout(900)

@@ -182,6 +182,11 @@ class MemoryStore:
     async def out_of_service(self) -> dict[str, Any]:
         return {}
 
+    async def blocks(self) -> dict[str, Any]:
+        return {}
+
+    async def put_blocks(self, _blocks: object) -> None: ...
+
     async def durability_warning(self) -> str:
         return ""
 

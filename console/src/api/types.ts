@@ -12,6 +12,7 @@ export type AreaBody = Sent<Schemas["AreaBody"]>;
 export type AreaState = "blocked" | "clear" | "unknown";
 export type AreaView = Schemas["AreaView"];
 export type AuditEntry = Schemas["AuditEntry"];
+export type BlockedWay = Schemas["BlockedWay"];
 export type CommandBody = Sent<Schemas["CommandBody"], "kind">;
 export type CommandOutcome = Schemas["CommandOutcome"];
 export type DryRunBody = Omit<Sent<Schemas["DryRunBody"]>, "zones"> & { readonly zones?: readonly ZoneBody[] };

@@ -181,6 +181,9 @@ export const en = {
   "reset.title": "Reset the fault of {robot}?",
   "reset.text": "Look at the robot first: {reason}",
 
+  "way.waits": "Waits before {places}, {limit} at most: waiting is expected to cost {wait}, the way round {round}.",
+  "way.goesRound": "Goes round {places}: waiting is expected to cost {wait}, the way round {round}.",
+
   "service.is": "Out of service{end}: {reason} ({by}).",
   "service.until": " until {time}",
   "service.remedy": "Put it back into service, then send it.",

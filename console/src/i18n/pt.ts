@@ -182,6 +182,9 @@ export const pt: Readonly<Record<keyof typeof en, string>> = {
   "reset.title": "Repor a avaria de {robot}?",
   "reset.text": "Olhe primeiro para o robô: {reason}",
 
+  "way.waits": "Espera diante de {places}, no máximo {limit}: esperar deve custar {wait}, o desvio {round}.",
+  "way.goesRound": "Contorna {places}: esperar deve custar {wait}, o desvio {round}.",
+
   "service.is": "Fora de serviço{end}: {reason} ({by}).",
   "service.until": " até {time}",
   "service.remedy": "Ponha-o ao serviço e depois envie-o.",

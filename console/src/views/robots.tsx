@@ -8,7 +8,7 @@ import { t } from "../i18n/i18n";
 import { useRoute } from "../router";
 import { sentence } from "../stop";
 import { decimal, duration, metres, percent } from "../text";
-import { headline, outOfService, stoppedBy, whys } from "../why";
+import { blockedWay, headline, outOfService, stoppedBy, whys } from "../why";
 import { GoalPanel, homeOf, sendTo } from "./goal-panel";
 import { Visits } from "./places";
 import { PosePanel } from "./pose-panel";
@@ -52,6 +52,7 @@ function Details({ id }: { readonly id: string }): preact.JSX.Element {
       <div class={old ? "card stale" : "card"}>
         <p class="lead">{headline(state, robot?.goal ?? null, robot?.out_of_service, stopped)}</p>
         {old && <p class="problem">{t("robot.old")}</p>}
+        {robot?.goal && robot.plan?.blocked_way && <p>{blockedWay(robot.plan.blocked_way)}</p>}
         {reasons.length > 1 && (
           <>
             <h3>{t("robot.why")}</h3>

@@ -14,7 +14,7 @@ from fog_contracts import channels as ch
 from fog_contracts.codec import encode
 from fog_contracts.messages import MapSnapshot, Message, PlanReply, RobotGoal, RobotState
 from fognav_experiments.computers import ComputerClock, Link
-from planner.missions import DockGoals
+from planner.dock_missions import DockGoals
 from robot_agent.motion.local_planner import decide
 
 if TYPE_CHECKING:

@@ -71,6 +71,11 @@ class World:
     async def out_of_service(self) -> dict[str, Any]:
         return {}
 
+    async def blocks(self) -> dict[str, Any]:
+        return {}
+
+    async def put_blocks(self, _blocks: object) -> None: ...
+
     async def put_service(self, *_: object, **__: object) -> str:
         return "ok"
 

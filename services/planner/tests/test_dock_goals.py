@@ -9,8 +9,7 @@ import pytest
 from fog_contracts.messages import Pose, Refusal, RobotGoal, RobotState
 from fog_contracts.site import RobotSite, Site
 from fog_runtime.stores.redis_connection import StoreError
-from planner.dock_missions import DockMissions
-from planner.missions import DockGoals
+from planner.dock_missions import DockGoals, DockMissions
 from planner.store import NO_MISSION, MissionConflictError
 
 FRONT = Pose(x=1.0, y=2.0, theta=0.5)

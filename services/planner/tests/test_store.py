@@ -5,9 +5,12 @@ from pathlib import Path
 from unittest.mock import Mock
 
 import pytest
+from manual_clock import ManualClock
 from redis.asyncio import Redis
 
-from fog_contracts.messages import OutOfService, Pose, RobotGoal
+from fog_contracts import channels as ch
+from fog_contracts.handlers import Moment
+from fog_contracts.messages import AreaHazard, AreaState, HazardArea, OutOfService, Pose, RobotGoal
 from fog_runtime.clock import SystemClock
 from fog_runtime.health import Health
 from fog_runtime.leadership import LeaseStore
@@ -17,6 +20,7 @@ from fog_runtime.stores.redis_store import Attempt, Audit, IdempotencyError, Rec
 from fog_supervisor.servers import Server, start_redis
 from planner.core import PlannerCore
 from planner.store import MissionPersistence, Order, OutOfServiceError, Store, StoredGoal
+from planner.waits.persistence import BlockPersistence
 
 pytestmark = pytest.mark.live
 AUDIT = Audit(1.0, "anna", "goal")
@@ -153,3 +157,40 @@ async def test_goal_of_a_robot_whose_record_of_service_cannot_be_read_is_refused
         await missions.lead(-1, confirmed=True)
         assert core.missions.goal("r1") is None
         assert missions.out_of_service("r1") is not None
+
+
+async def test_planner_that_starts_in_the_middle_of_a_block_goes_on_with_its_age_and_with_what_was_learned(
+    redis: Server,
+):
+    async with Store(redis.url, "test") as store:
+        clock, first, second = ManualClock(100.0), PlannerCore(), PlannerCore()
+
+        async def lead(core: PlannerCore) -> BlockPersistence:
+            durations = BlockPersistence(core.waits.blocks, store, clock, lambda change: change())
+            await durations.load()
+            return durations
+
+        def tell(core: PlannerCore, state: AreaState, seq: int, since: float) -> None:
+            hazard = AreaHazard(
+                area="a", state=state, severity=0, penalty=254 if state == "blocked" else 0, since=since, seq=seq,
+                epoch=1, cause="",
+            )  # fmt: skip
+            area = HazardArea(hazard=hazard, polygon=[(0.0, 0.0), (1.0, 0.0), (1.0, 1.0)])
+            core.handlers()[ch.HAZARD]({"area": "a"}, area, Moment(clock.now(), clock.now() + 1e9))
+
+        durations = await lead(first)
+        for seq in range(1, 12, 2):
+            tell(first, "blocked", seq, clock.now() + 1e9)
+            clock.advance(4.0)
+            tell(first, "clear", seq + 1, clock.now() + 1e9)
+        tell(first, "blocked", 20, began := clock.now() + 1e9)
+        clock.advance(30.0)
+        await durations.save()
+        clock.advance(5.0)  # the planner dies
+        await lead(second)
+        tell(second, "blocked", 20, began)
+        assert second.waits.blocks.age("a", clock.now()) == pytest.approx(35.0, abs=0.01)
+        assert second.waits.blocks.survival("a", 35.0, began, learned=True) is not None
+        (record,) = second.waits.blocks.to_store(clock.now()).values()
+        assert sum(ended for spans in record.hours.values() for _, ended, _ in spans) == 6
+        assert sum(spent for spans in record.hours.values() for *_, spent in spans) == pytest.approx(6 * 4.0 + 35.0)

@@ -256,6 +256,8 @@ def robot_status(*, robot: RobotOption = None, fog: FogOption = None, json: Json
             print_answer(f"  goal: {goal['place'] or _position(goal['pose'])}")
         if (plan := view["plan"]) is not None and plan["refusal"] is not None:
             print_answer(f"  no path: {plan['refusal']['reason']}")
+        elif plan is not None and plan.get("blocked_way") is not None:
+            print_answer(f"  {plan['blocked_way']['reason']}")
 
 
 @robot_app.command("watch", epilog="Example: fognav robot watch --seconds 60 --json")

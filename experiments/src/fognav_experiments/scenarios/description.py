@@ -291,7 +291,8 @@ class OtherRobot(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_field
 class Scenario(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """A drive from `start` (x, y, theta) to `goal` of the site's first robot; it is ended after `seconds`.
 
-    With `others` nothing else happens: no events, and all are led by the fog.
+    With `others` nothing else happens: no events, and all are led by the fog. `wait`: whether robots wait before what
+    closes their way (ADR 72).
     """
 
     title: str
@@ -304,6 +305,7 @@ class Scenario(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=
     seconds: Seconds = 300.0
     seed: int = 1
     others: list[OtherRobot] = []
+    wait: Literal["off", "learned", "always"] = "learned"
 
     def __post_init__(self) -> None:
         """Raise `ValueError` for what can't be played."""

@@ -321,6 +321,8 @@ def _play_alone(scenario: Scenario, site: LoadedSite) -> Played:
         hazard=None,
         bus=None,
     )
+    waits = run.system.fog.planner.core.waits
+    waits.config = dataclasses.replace(waits.config, wait=scenario.wait)
     problem = run.warm_up()
     if problem is None and scenario.profile != "fog":
         problem = run.switch(scenario.profile)

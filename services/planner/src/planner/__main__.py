@@ -18,7 +18,7 @@ from fog_runtime.leadership import Leadership, LeaseStore
 from fog_runtime.process import release_startup_memory, release_when
 from fog_runtime.transports.zenoh_edge import ZenohEdge
 from planner.api import make_api
-from planner.config import PlannerConfig
+from planner.config import PlannerConfig, WaitMode
 from planner.core import PlannerCore
 from planner.service import Service
 from planner.store import Store
@@ -35,10 +35,12 @@ _log = logs.get("planner")
 class Settings(InflationSettings, frozen=True, kw_only=True):
     """The inflation should equal the map-service's: a different one only makes the search slower.
 
-    `release_m` is the released length: how far (m) a robot may drive without a message from the planner.
+    `release_m` is the released length: how far (m) a robot may drive without a message from the planner. `wait`:
+    whether robots wait before what closes their way, if that is expected to be quicker than the way round (ADR 72).
     """
 
     release_m: float = 15.0
+    wait: WaitMode = "learned"
 
 
 def read_key(file: Path | None) -> bytes | None:
@@ -72,7 +74,7 @@ async def main() -> None:
         lambda: make_api(unused(), described, health, tokens),
         settings.http_host, settings.http_port, settings.http_certificate(), settings.http_gateway,
     )  # fmt: skip
-    config = PlannerConfig(inflation=settings.inflation, release_length=settings.release_m)
+    config = PlannerConfig(inflation=settings.inflation, release_length=settings.release_m, wait=settings.wait)
     async with (
         Store(settings.redis_url, site, service="planner", data_dir=settings.data_dir, credentials=own) as store,
         LeaseStore(settings.redis_url, site, "planner", credentials=own) as leases,

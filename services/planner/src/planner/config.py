@@ -1,11 +1,15 @@
 """The parameters of the planner's core."""
 
 from dataclasses import dataclass
+from typing import Literal
 
 from fog_contracts.channels import MAP_HEARTBEAT, ROBOT_GOAL, ROBOT_POSE, ROBOT_RELEASE
 from fog_contracts.costs import DEFAULT_INFLATION, Inflation
 from fog_contracts.geometry import PATH_SPACING_M
 from fog_contracts.messages import MAX_CELLS
+
+WaitMode = Literal["off", "learned", "always"]
+"""Whether robots wait: never; where enough blocks were seen to end by themselves; or by assumptions alone, too."""
 
 
 @dataclass(frozen=True)
@@ -64,3 +68,7 @@ class PlannerConfig:
     It doubles with each switch that follows another within a minute, up to `max_switch_dwell_s`.
     """
     max_switch_dwell_s: float = 30.0
+    wait: WaitMode = "learned"
+    """Whether robots wait before what closes their way, if that is expected to take less time than the way round."""
+    cruise_speed: float = 0.26
+    """How fast (m/s) a robot gets on along its path, on average."""

@@ -27,6 +27,7 @@ from planner.queries import Answerer, ExplainJob, View
 from planner.refusals import goal_out_of_reach
 from planner.regions import BlockedRegions, cover
 from planner.replanner import Replanner, effect_of_change, reason_from_pose
+from planner.waits.choice import Waits
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -37,6 +38,7 @@ if TYPE_CHECKING:
         DryRunReply,
         DryRunRequest,
         EgressRequest,
+        HazardArea,
         MapDelta,
         MapHeartbeat,
         MapSnapshot,
@@ -80,7 +82,8 @@ class PlannerCore:
         self.missions = Missions()
         self.places: Mapping[str, Place] | None = None
         """All places by id, as the map-service has them; None until it has told them."""
-        self.replanner = Replanner(self.config, self._fields)
+        self.waits = Waits(self.config)
+        self.replanner = Replanner(self.config, self._fields, self.waits)
         self.answerer = Answerer(self.config)
         """Used by the thread that runs jobs for "query" and answers queries."""
         self._served: set[str] = set()
@@ -96,6 +99,7 @@ class PlannerCore:
                 ch.MAP_DELTA: self._on_delta,
                 ch.MAP_HEARTBEAT: self._on_heartbeat,
                 **self._regions.handlers(),
+                ch.HAZARD: self._on_hazard,
                 ch.ROBOT_POSE: self._on_pose,
                 ch.ROBOT_STATE: self._on_state,
                 ch.PLACES: self._on_places,
@@ -122,6 +126,10 @@ class PlannerCore:
             mission.request_replan(effect.reason, change.traces, effect.distance)
         elif mission.plan is not None:
             self.replanner.count_avoided("no_cost_fell" if mission.plan.route is None else "far_from_path")
+
+    def _on_hazard(self, ids: Ids, area: HazardArea, at: Moment) -> Sequence[Publication]:
+        self.waits.blocks.on_hazard(area, at)
+        return self._regions.on_hazard(ids, area, at)
 
     def _on_heartbeat(self, _ids: Ids, heartbeat: MapHeartbeat, at: Moment) -> Sequence[Publication]:
         self._map.on_heartbeat(heartbeat, at.now)
@@ -230,6 +238,7 @@ class PlannerCore:
         self._served = self.missions.located(at.now, self.config)
         covers = partial(cover, self._regions.sources)
         due = self.missions.to_replan(at.now, self.config)
+        self.waits.look(at, self._regions.sources, self._regions.areas)
         for number, (robot, mission, reason) in enumerate(due):
             if mission.target is not None and mission.pose is not None:
                 waiting = [other for _, other, _ in due[number + 1 :]]

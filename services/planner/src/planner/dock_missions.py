@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import asyncio
-from typing import TYPE_CHECKING
+import math
+from typing import TYPE_CHECKING, Final
 
 from fog_contracts.messages import Refusal
 from fog_runtime import logs
 from fog_runtime.stores.redis_connection import StoreError
-from planner.missions import DockGoals
 from planner.store import NO_MISSION, MissionConflictError, Order, OutOfServiceError
 
 if TYPE_CHECKING:
@@ -21,6 +21,34 @@ if TYPE_CHECKING:
     """Gives a robot a mission, or returns why there is none; may raise `StoreError`."""
 
 _log = logs.get("planner")
+
+PAUSE_S: Final = 2.0
+"""A goal takes a moment to be stored and set; until then it is not given again."""
+
+
+class DockGoals:
+    """Which robot is to be sent to the front of its dock; `now` is s of a monotonic clock."""
+
+    def __init__(self, staging: Mapping[str, Pose]) -> None:
+        """`staging`: by robot, the pose (frame `map`) in front of its dock."""
+        self._staging = staging
+        self._sent_at: dict[str, float] = {}
+
+    def due(self, robot: str, state: RobotState, goal: RobotGoal | None, now: float) -> Pose | None:
+        """Return the pose to send a robot to that has just published its state; None when it needs no other goal.
+
+        A state from before the robot heard of its mission, or of the end of it, tells nothing: an operator who has sent
+        it elsewhere meanwhile would be overruled.
+        """
+        pose = self._staging.get(robot)
+        if pose is None or not state.wants_dock or (goal is not None and goal.pose == pose):
+            return None
+        if state.goal_id != (None if goal is None else goal.goal_id):
+            return None
+        if now - self._sent_at.get(robot, -math.inf) < PAUSE_S:
+            return None
+        self._sent_at[robot] = now
+        return pose
 
 
 class DockMissions:

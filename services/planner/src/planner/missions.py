@@ -20,6 +20,7 @@ if TYPE_CHECKING:
     from planner.config import PlannerConfig
     from planner.path_search import Question, Route
     from planner.planning_map import Cell
+    from planner.waits.choice import Judgement
 
 _QUIET_S: Final = 60.0
 """After so long without a switch, the next one counts as the first again."""
@@ -45,8 +46,8 @@ class SwitchLimiter:
         self.last = now
 
 
-ReplanReason = Literal["goal", "map", "epoch", "off_path", "clearing", "refused"]
-"""Why a path is replanned; `map` is a change of costs within the swept corridor of the remaining path."""
+ReplanReason = Literal["goal", "map", "epoch", "off_path", "clearing", "refused", "blocked"]
+"""Why a path is replanned; `map`: costs changed in the swept corridor of its rest; `blocked`: to wait or go round."""
 
 Explained = tuple["Version", int]
 PathId = tuple[int, int]
@@ -73,10 +74,18 @@ class Plan:
     explained_at: float = -math.inf
     explained_for: Explained | None = None
     """The versions of map and regions for which the refusal was last explained."""
+    judged: Judgement | None = None
+    """Why the robot goes round something, or waits before it."""
+
+    @property
+    def waits(self) -> bool:
+        """Whether the robot waits before something, where the way round it branches off."""
+        return self.judged is not None and self.judged.waits
 
     def released_length(self, config: PlannerConfig) -> float:
         """Return how much of the path (m) the robot may drive; 0 for a refusal."""
-        return min(self.route.length, self.progress + config.release_length) if self.route else 0.0
+        hold = self.judged.hold if self.judged is not None and self.judged.waits else math.inf
+        return min(self.route.length, self.progress + config.release_length, hold) if self.route else 0.0
 
 
 @dataclass
@@ -99,6 +108,8 @@ class Mission:
     """How far along its path (m) the robot meets the first of the changes that caused the replan."""
     refused_search_at: float = -math.inf
     """When a search was last repeated after a refusal."""
+    blocked: Judgement | None = None
+    """The last choice between waiting and going round, while something closes the robot's way."""
     search_ran_out: bool = False
     """Whether the last search took too long; a passable path is kept all the same."""
     switches: SwitchLimiter = field(default_factory=SwitchLimiter)
@@ -146,7 +157,7 @@ class Mission:
 
     def _reset(self, reason: ReplanReason | None) -> None:
         self.plan, self.replan, self.traces, self.danger = None, reason, [], math.inf
-        self.switches, self.search_ran_out = SwitchLimiter(), False
+        self.switches, self.search_ran_out, self.blocked = SwitchLimiter(), False, None
 
     def request_replan(self, reason: ReplanReason, traces: list[Trace], danger: float = math.inf) -> None:
         """Request a replan; the first reason is kept, except that `map` replaces it.
@@ -161,6 +172,8 @@ class Mission:
     def replan_due(self, now: float, config: PlannerConfig) -> ReplanReason | None:
         """Return why a search is due now; None when none is, or when it has to wait."""
         if self.replan is None and self.plan is not None:
+            if self.blocked is not None and self.blocked.is_due(now):
+                return "blocked"
             return "clearing" if now >= self.switches.deferred_until else None
         if self.replan == "refused" and now - self.refused_search_at < config.refused_retry_s:
             return None
@@ -203,7 +216,7 @@ class Mission:
 
     def drop(self) -> None:
         """Forget the goal and its plan, without telling the robot."""
-        self.goal = self.plan = self.replan = self.out_of_service = None
+        self.goal = self.plan = self.replan = self.out_of_service = self.blocked = None
         self.traces = []
 
     def publish_all_now(self) -> None:
@@ -254,6 +267,7 @@ class Mission:
             released_length=plan.released_length(config),
             goal_theta=None if self.any_heading else target.theta,
             refusal=plan.refusal,
+            blocked_way=plan.judged.choice if plan.judged else None,
             traces=plan.traces,
             stamp=at.stamp,
             sent=at.sent,
@@ -283,7 +297,7 @@ def received_path(state: RobotState) -> PathId | None:
 
 
 _URGENCY: Final[dict[ReplanReason, int]] = {
-    "map": 0, "off_path": 1, "epoch": 2, "goal": 3, "clearing": 4, "refused": 5,
+    "map": 0, "off_path": 1, "epoch": 2, "goal": 3, "clearing": 4, "refused": 5, "blocked": 6,
 }  # fmt: skip
 """Whose path is searched first; among equals the robot nearest to the change along its path."""
 
@@ -410,32 +424,3 @@ class Missions:
                 cell = geometry.cell(mission.target.x, mission.target.y)
                 if geometry.contains_cell(*cell):
                     yield cell
-
-
-PAUSE_S: Final = 2.0
-"""A goal takes a moment to be stored and set; until then it is not given again."""
-
-
-class DockGoals:
-    """Which robot is to be sent to the front of its dock; `now` is s of a monotonic clock."""
-
-    def __init__(self, staging: Mapping[str, Pose]) -> None:
-        """`staging`: by robot, the pose (frame `map`) in front of its dock."""
-        self._staging = staging
-        self._sent_at: dict[str, float] = {}
-
-    def due(self, robot: str, state: RobotState, goal: RobotGoal | None, now: float) -> Pose | None:
-        """Return the pose to send a robot to that has just published its state; None when it needs no other goal.
-
-        A state from before the robot heard of its mission, or of the end of it, tells nothing: an operator who has sent
-        it elsewhere meanwhile would be overruled.
-        """
-        pose = self._staging.get(robot)
-        if pose is None or not state.wants_dock or (goal is not None and goal.pose == pose):
-            return None
-        if state.goal_id != (None if goal is None else goal.goal_id):
-            return None
-        if now - self._sent_at.get(robot, -math.inf) < PAUSE_S:
-            return None
-        self._sent_at[robot] = now
-        return pose

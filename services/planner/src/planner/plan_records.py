@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Final, get_args
 
 from prometheus_client import Counter, Gauge
 
-from fog_contracts.messages import PlanCode, RobotPath, RobotRelease
+from fog_contracts.messages import BlockedWay, PlanCode, RobotPath, RobotRelease
 from fog_runtime import logs, metrics
 from planner.missions import ReplanReason
 from planner.replanner import AvoidReason
@@ -61,6 +61,7 @@ class PathRecord:
         """Record what the API shows, and report a plan when it is first published, a refusal when it changes."""
         before = self.paths.get(robot)
         self.paths[robot] = path
+        _log_choice(robot, path.blocked_way, None if before is None else before.blocked_way)
         if before is not None and (before.plan_id, before.refusal) == (path.plan_id, path.refusal):
             return
         if before is None or before.plan_id != path.plan_id:
@@ -76,6 +77,14 @@ class PathRecord:
     def _record_release(self, robot: str, release: RobotRelease) -> None:
         if (path := self.paths.get(robot)) is not None:
             self.paths[robot] = path.after(release)
+
+
+def _log_choice(robot: str, way: BlockedWay | None, before: BlockedWay | None) -> None:
+    """Log that a robot waits, or goes round, when it did not before."""
+    if way is None or (before is not None and (before.choice, before.causes) == (way.choice, way.causes)):
+        return
+    _log.info("way_blocked", robot=robot, choice=way.choice, causes=[cause.id for cause in way.causes],
+              expected_s=way.expected_s, detour_s=way.detour_s, reason=way.reason)  # fmt: skip
 
 
 PLANS = Counter("fognav_plans_total", "Replans, by reason", ["reason"])

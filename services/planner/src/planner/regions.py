@@ -33,6 +33,21 @@ Source = HazardArea | Zone
 """The message that a region is made of."""
 
 
+def cause_of(source: Source) -> Cause:
+    """Return a hazard or zone as the cause of what happens to a robot."""
+    if isinstance(source, HazardArea):
+        return Cause(kind="hazard", id=source.hazard.area, state=source.hazard.state)
+    return Cause(kind="zone", id=source.id, state="BLOCKED")
+
+
+def name_of(source: Source) -> str:
+    """Return a hazard or zone in words."""
+    if isinstance(source, HazardArea):
+        name = source.hazard.area + (f" ({source.label})" if source.label else "")
+        return f"hazard {name}, {source.hazard.state}"
+    return f"no-go zone {source.id}" + (f" ({source.reason})"[:80] if source.reason else "")
+
+
 @dataclass(frozen=True, eq=False)
 class Region:
     """A hazard or zone as masks over a window: its own cells, and those that it makes impassable (`closed`)."""
@@ -45,17 +60,12 @@ class Region:
     @property
     def cause(self) -> Cause:
         """The region as the cause of a refusal."""
-        if isinstance(self.source, HazardArea):
-            return Cause(kind="hazard", id=self.source.hazard.area, state=self.source.hazard.state)
-        return Cause(kind="zone", id=self.source.id, state="BLOCKED")
+        return cause_of(self.source)
 
     @property
     def description(self) -> str:
         """The region in words."""
-        if isinstance(self.source, HazardArea):
-            name = self.source.hazard.area + (f" ({self.source.label})" if self.source.label else "")
-            return f"hazard {name}, {self.source.hazard.state}"
-        return f"no-go zone {self.source.id}" + (f" ({self.source.reason})"[:80] if self.source.reason else "")
+        return name_of(self.source)
 
     def closes(self, column: int, row: int) -> bool:
         """Whether the region makes this cell impassable."""
@@ -165,7 +175,7 @@ class BlockedRegions:
 
     def handlers(self) -> Mapping[ch.Channel, Handler]:
         """Return the handlers of hazards and zones."""
-        return {ch.HAZARD: self._on_hazard, ch.ZONES: self._on_zones}
+        return {ch.HAZARD: self.on_hazard, ch.ZONES: self._on_zones}
 
     @property
     def sources(self) -> tuple[Source, ...]:
@@ -179,7 +189,13 @@ class BlockedRegions:
             self._sources = (*closing, *(_no_go_zones(self._zones) if self._zones else ()))
         return self._sources
 
-    def _on_hazard(self, _ids: Ids, hazard: HazardArea, _at: Moment) -> Sequence[Publication]:
+    @property
+    def areas(self) -> list[HazardArea]:
+        """All areas, closed or not."""
+        return list(self._hazards.values())
+
+    def on_hazard(self, _ids: Ids, hazard: HazardArea, _at: Moment) -> Sequence[Publication]:
+        """Handle an area with its hazard."""
         if self._hazards.get(hazard.hazard.area) != hazard:
             self._hazards[hazard.hazard.area] = hazard
             self._change()

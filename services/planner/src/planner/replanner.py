@@ -8,7 +8,7 @@ move a robot at most once per `switch_dwell_s`, and ever more seldom while they 
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from typing import TYPE_CHECKING, Final, Literal
 
@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     from collections.abc import Iterable, Sequence
 
     from fog_contracts.grid import GridGeometry, Window
-    from fog_contracts.messages import PlanCode, PointXY, RobotPose
+    from fog_contracts.messages import PlanCode, PointXY, RobotPose, Trace
     from fog_kernels.astar import Planner
     from fog_kernels.guides import Detour, GoalField
     from planner.config import PlannerConfig
@@ -30,6 +30,7 @@ if TYPE_CHECKING:
     from planner.missions import Mission, ReplanReason, SwitchLimiter
     from planner.path_search import Covers, Route, SearchResult
     from planner.planning_map import Cell, CostChange, PlanningMap
+    from planner.waits.choice import Judgement, Waits
 
 _PROGRESS_WINDOW_M: Final = 5.0
 """How far ahead of its last progress a robot is searched on its path, so that a loop is not cut short."""
@@ -55,6 +56,8 @@ def effect_of_change(
         return None
     if plan.route is None:
         return Effect("refused") if change.any_decreased else None
+    if plan.waits and change.any_decreased:
+        return Effect("map")  # the path ends before what the robot waits for
     distance = distance_to_change(plan, plan.route, change, planning_map, config.corridor_half_width)
     if not math.isinf(distance):
         return Effect("map", distance)
@@ -170,9 +173,10 @@ AvoidReason = Literal["far_from_path", "no_cost_fell", "unreachable"]
 class Replanner:
     """Owns the memory of the searches, and counts them."""
 
-    def __init__(self, config: PlannerConfig, fields: GoalFields) -> None:
+    def __init__(self, config: PlannerConfig, fields: GoalFields, waits: Waits) -> None:
         self._config = config
         self._fields = fields
+        self._waits = waits
         self._search: PathSearch | None = None
         self.detours = Detours(fields)
         self._next_id = 1
@@ -224,9 +228,15 @@ class Replanner:
                 self.count_avoided("unreachable")
         mission.search_ran_out = ran_out(found)
         plan = mission.plan
-        if plan is not None:
+        way = plan.route if plan is not None else None
+        judged = self._waits.judge(way, mission.blocked, (pose.x, pose.y), found, planning_map)
+        mission.blocked = judged
+        if judged is not None and judged.waits:
+            self._wait(mission, judged, traces)
+            return
+        if plan is not None and not plan.waits:
             if is_kept(plan, found, reason, planning_map, self._config):
-                plan.question = found.question
+                plan.question, plan.judged = found.question, judged or plan.judged
                 return
             if reason not in ("goal", "off_path"):
                 if must_wait(plan, found, mission.switches, now, planning_map, self._config):
@@ -238,7 +248,21 @@ class Replanner:
         origin = plan.origin if plan is not None else None
         mission.plan = Plan(
             self._next_id, found.route, found.refusal, traces, planned_from=here, question=found.question,
-            origin=here if origin is None and found.route is not None else origin,
+            origin=here if origin is None and found.route is not None else origin, judged=judged,
+        )  # fmt: skip
+        self._next_id += 1
+
+    def _wait(self, mission: Mission, judged: Judgement, traces: list[Trace]) -> None:
+        """Let a robot wait where it may turn to the way round; if it does already, tell only what has changed."""
+        plan, pose = mission.plan, mission.pose
+        assert plan is not None
+        assert pose is not None
+        if plan.judged is not None and judged.continues(plan.judged):
+            plan.judged, plan.path_due = replace(plan.judged, choice=judged.choice), -math.inf
+            plan.traces += [trace for trace in traces if trace not in plan.traces]
+            return
+        mission.plan = Plan(
+            self._next_id, judged.route, None, traces, planned_from=(pose.x, pose.y), origin=plan.origin, judged=judged
         )  # fmt: skip
         self._next_id += 1
 

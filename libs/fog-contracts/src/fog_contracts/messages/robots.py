@@ -139,12 +139,29 @@ class RobotRelease(Message, frozen=True, kw_only=True):
     sent: Sent | None = None
 
 
+class BlockedWay(Message, frozen=True, kw_only=True):
+    """Something closes a robot's way, and there is another: what was chosen, and what both cost.
+
+    `standing_s`: for how long the oldest of the `causes` has been there. `expected_s`: the expected delay of a robot
+    that waits for them to end, for `limit_s` at most, and then goes round; `detour_s`: that of going round at once.
+    """
+
+    choice: Literal["wait", "detour"]
+    causes: list[Cause]
+    standing_s: Annotated[float, Meta(ge=0.0, le=1e9, extra={"unit": "s"})]
+    expected_s: Annotated[float, Meta(ge=0.0, le=1e9, extra={"unit": "s"})]
+    detour_s: Annotated[float, Meta(ge=0.0, le=1e9, extra={"unit": "s"})]
+    limit_s: Annotated[float, Meta(ge=0.0, le=1e9, extra={"unit": "s"})] | None = None
+    reason: Sentence = ""
+
+
 class RobotPath(Message, frozen=True, kw_only=True):
     """The path to the goal, or why there is none; published once per plan, and again until the robot names its plan.
 
     To a robot whose `profile` lets it plan for itself it is not repeated. `points` are the corners, joined by straight
     lines (`fog_contracts.geometry.sampled` puts points between them). The robot may drive the first `released_length`
-    metres without hearing from the planner again; `RobotRelease` extends that while all is well.
+    metres without hearing from the planner again; `RobotRelease` extends that while all is well. `blocked_way`: why the
+    path leads round something, or ends before it; it is not released to its end then.
     """
 
     plan_id: Count
@@ -156,6 +173,7 @@ class RobotPath(Message, frozen=True, kw_only=True):
     released_length: Annotated[float, Meta(ge=0.0, le=1e6, extra={"unit": "m"})]
     goal_theta: Radians | None = None
     refusal: Refusal | None = None
+    blocked_way: BlockedWay | None = None
     traces: list[Trace] = []
     stamp: Stamp = 0.0
     sent: Sent | None = None

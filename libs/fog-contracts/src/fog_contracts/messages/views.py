@@ -3,7 +3,7 @@
 from fog_contracts.messages.basics import Message, Pose
 from fog_contracts.messages.fleet import OutOfService
 from fog_contracts.messages.maps import MapGeometry
-from fog_contracts.messages.robots import Refusal, RobotGoal, RobotPath, RobotState
+from fog_contracts.messages.robots import BlockedWay, Refusal, RobotGoal, RobotPath, RobotState
 
 
 class MapInfo(Message, frozen=True, kw_only=True):
@@ -41,7 +41,7 @@ class GoalView(Message, frozen=True, kw_only=True):
 
 
 class PlanView(Message, frozen=True, kw_only=True):
-    """The current plan: version, number of corners, released length (m), or refusal."""
+    """The current plan: version, number of corners, released length (m), or refusal; why it waits, or goes round."""
 
     plan_id: int
     map_epoch: int
@@ -49,6 +49,7 @@ class PlanView(Message, frozen=True, kw_only=True):
     points: int
     released_length: float
     refusal: Refusal | None
+    blocked_way: BlockedWay | None = None
 
     @classmethod
     def of(cls, path: RobotPath | None) -> "PlanView | None":
@@ -62,6 +63,7 @@ class PlanView(Message, frozen=True, kw_only=True):
             points=len(path.points),
             released_length=path.released_length,
             refusal=path.refusal,
+            blocked_way=path.blocked_way,
         )
 
 

@@ -1,0 +1,228 @@
+"""Whether a robot waits before what closes its way, and where; the block stays as impassable as it was. Pure.
+
+The choice is made anew every second. A robot that waits drives to where the way round branches off, and no further.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fog_contracts.costs import INSCRIBED, LETHAL, UNKNOWN
+from fog_contracts.geometry import distance_to_polygon, lengths_along, sampled
+from fog_contracts.messages import BlockedWay, HazardArea
+from fog_contracts.shapes import shape_contains
+from planner.path_search import Route
+from planner.regions import cause_of, name_of
+from planner.waits.blocks import Blocks
+from planner.waits.durations import all_of, best_policy, until
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from fog_contracts.handlers import Moment
+    from fog_contracts.messages import PointXY
+    from planner.config import PlannerConfig
+    from planner.path_search import SearchResult
+    from planner.planning_map import PlanningMap
+    from planner.regions import Source
+    from planner.waits.durations import Policy, Survival
+
+Floats = NDArray[np.float64]
+
+_JUDGE_S: Final = 1.0
+"""How often the choice is made anew."""
+_SPACING_M: Final = 0.1
+_BRANCH_M: Final = 0.5
+"""The way round branches off where it is so far from the blocked way; a robot that far off it has left it."""
+_KEEP_M: Final = 0.5
+"""A robot that waits keeps this far from the first cell that it could not enter."""
+_TAIL_M: Final = 0.3
+"""So much of the way beyond the place to wait is published, not released: the end of the path would be the goal."""
+_SHORT_M: Final = 0.15
+"""With less of it nobody waits: the robot stands so near that it would count as arrived, or stuck."""
+_SAME_PLACE_M: Final = 0.5
+"""A robot waits on where it waits, as long as that is so near to where it would."""
+_NEAR_M: Final = 0.3
+"""Beyond its inscribed radius, a source closes no cell farther away from it than this."""
+
+
+@dataclass(frozen=True)
+class Judgement:
+    """A choice for a robot whose `way` is blocked, made at `made_at` (s).
+
+    To wait: on the path `route`, of which it may drive `hold` (m), at `place` (m), since `since` (s).
+    """
+
+    choice: BlockedWay
+    way: Route
+    route: Route
+    hold: float
+    place: PointXY
+    since: float
+    made_at: float
+
+    @property
+    def waits(self) -> bool:
+        """Whether it is to wait."""
+        return self.choice.choice == "wait"
+
+    def is_due(self, now: float) -> bool:
+        """Whether the choice is to be made again."""
+        return now >= self.made_at + _JUDGE_S
+
+    def continues(self, before: Judgement) -> bool:
+        """Whether a robot that waits waits on where it is."""
+        return before.waits and math.dist(before.place, self.place) <= _SAME_PLACE_M
+
+
+@dataclass
+class _Known:
+    at: Moment
+    sources: Sequence[Source]
+    areas: Sequence[HazardArea]
+
+
+@dataclass
+class Waits:
+    """Chooses for robots whose way is blocked; `look` tells it first what the world is like."""
+
+    config: PlannerConfig
+    blocks: Blocks = field(default_factory=Blocks)
+    _known: _Known | None = None
+
+    def look(self, at: Moment, sources: Sequence[Source], areas: Sequence[HazardArea]) -> None:
+        """Use this time, these hazards and zones that close cells, and these areas, closed or not."""
+        self._known = _Known(at, sources, areas)
+
+    def judge(
+        self, way: Route | None, before: Judgement | None, at: PointXY, found: SearchResult, planning_map: PlanningMap
+    ) -> Judgement | None:
+        """Return the choice between the way found, round a block, and the blocked way; None when there is none.
+
+        Then the robot drives by the way found: the other one is free, is not the robot's any more, or is closed by
+        something that is not waited for. `at`: where it is (m); `before`: the choice that it follows.
+        """
+        way = before.way if before is not None else way
+        if self.config.wait == "off" or self._known is None or way is None or found.route is None:
+            return None
+        along, off = way.nearest(*at)
+        corners = way.remaining(along)
+        if off > _BRANCH_M or len(corners) < 2:
+            return None
+        rest = sampled(corners, _SPACING_M)
+        blocked = np.flatnonzero(planning_map.geometry.sample(planning_map.cost, rest, UNKNOWN) >= INSCRIBED)
+        if not len(blocked):
+            return None
+        since = before.since if before is not None and before.waits else None
+        cut = self._cut(rest[blocked], since)
+        if cut is None:
+            return None
+        steps = lengths_along(rest)
+        branch = steps[_last_beside(rest[: blocked[0]], found.route)]
+        hold = max(0.0, min(float(branch), float(steps[blocked[0]]) - _KEEP_M))
+        end = min(hold + _TAIL_M, float(steps[blocked[0]]) - 2.0 * planning_map.geometry.resolution)
+        speed = self.config.cruise_speed
+        around, _ = found.route.nearest(*_point(rest, steps, hold))
+        detour = (found.route.length - around - (float(steps[-1]) - hold)) / speed
+        if end < hold + _SHORT_M or detour <= 0.0:
+            return None  # it stands before the block already, or is as quick round it
+        sources, block, age = cut
+        policy = best_policy(block, detour, hold / speed)
+        waiting = policy.waiting < policy.detour
+        now = self._known.at.now
+        place = _point(rest, steps, hold)
+        kept = np.concatenate((corners[lengths_along(corners) < end], [_point(rest, steps, end)]))
+        choice = _choice(sources, age, policy, detour, waiting=waiting)
+        return Judgement(choice, way, Route(kept, way.spacing), hold, place, now if since is None else since, now)
+
+    def _cut(self, points: Floats, waiting_since: float | None) -> tuple[list[Source], Survival, float] | None:
+        """Return what closes these points, how long it goes on, and its age; None if that is not to be waited for.
+
+        Lidars may see for a moment more what stood in an area that is clear again: whoever waited, waits on.
+        """
+        assert self._known is not None
+        at, reach = self._known.at, self.config.inflation.inscribed_radius + _NEAR_M
+        left = [(float(x), float(y)) for x, y in points]
+        found: list[tuple[Source, Survival, float]] = []
+        for source in self._known.sources:
+            others = [point for point in left if not _is_near(source, point, reach)]
+            if len(others) == len(left):
+                continue
+            left = others
+            if (block := self._survival(source)) is None:
+                return None
+            age = self.blocks.age(source.hazard.area, at.now) if isinstance(source, HazardArea) else None
+            found.append((source, block, age or 0.0))
+        for area in self._known.areas if waiting_since is not None else ():
+            others = [point for point in left if not _is_near(area, point, reach)]
+            if waiting_since is not None and len(others) < len(left):
+                age = at.now - waiting_since
+                block = self.blocks.survival(area.hazard.area, age, at.stamp, learned=self.config.wait == "learned")
+                left = others
+                if block is not None:
+                    found.append((area, block, age))
+        if left or not found:
+            return None
+        return [source for source, _, _ in found], all_of([b for _, b, _ in found]), max(age for *_, age in found)
+
+    def _survival(self, source: Source) -> Survival | None:
+        """Return how long a hazard or zone goes on; None if that is unknown."""
+        assert self._known is not None
+        at = self._known.at
+        if not isinstance(source, HazardArea):
+            return None if source.expires_at is None else until(max(0.0, source.expires_at - at.stamp))
+        hazard, age = source.hazard, self.blocks.age(source.hazard.area, at.now)
+        if (override := hazard.override) is not None:
+            ends = override.set_at + override.ttl_s - at.stamp
+            return until(max(0.0, ends)) if override.measured_penalty < LETHAL else None
+        if age is None:
+            return None
+        return self.blocks.survival(hazard.area, age, at.stamp, learned=self.config.wait == "learned")
+
+
+def _last_beside(points: Floats, other: Route) -> int:
+    """Return the last of the points (n, 2; m) up to which all lie beside another route."""
+    ahead, last = 0.0, 0
+    for number, (x, y) in enumerate(points.tolist()):
+        along, distance = other.nearest(x, y, ahead, window=2.0)
+        if distance > _BRANCH_M:
+            break
+        ahead, last = max(ahead, along), number
+    return last
+
+
+def _point(points: Floats, along: Floats, at: float) -> tuple[float, float]:
+    """Return the point so many metres along a polyline."""
+    return float(np.interp(at, along, points[:, 0])), float(np.interp(at, along, points[:, 1]))
+
+
+_RING: Final = [(math.cos(k * math.tau / 12), math.sin(k * math.tau / 12)) for k in range(12)]
+
+
+def _is_near(source: Source, point: tuple[float, float], reach: float) -> bool:
+    """Whether a source closes cells within `reach` (m) of a point; of zones, by a ring of points around it."""
+    x, y = point
+    if isinstance(source, HazardArea):
+        return distance_to_polygon(source.polygon, x, y) <= reach
+    around = [(x, y), *((x + share * reach * a, y + share * reach * b) for share in (0.5, 1.0) for a, b in _RING)]
+    return any(shape_contains(source.shape, *each) for each in around)
+
+
+def _choice(sources: Sequence[Source], age: float, policy: Policy, detour: float, *, waiting: bool) -> BlockedWay:
+    names = ", ".join(name_of(source) for source in sources)
+    costs = f"waiting is expected to cost {policy.waiting:.0f} s, the way round {detour:.0f} s"
+    then = f"waits, {policy.limit:.0f} s at most" if waiting else "goes round"
+    return BlockedWay(
+        choice="wait" if waiting else "detour",
+        causes=[cause_of(source) for source in sources][:16],
+        standing_s=round(age, 1),
+        expected_s=round(policy.waiting, 1),
+        limit_s=round(policy.limit, 1) if waiting else None,
+        detour_s=round(detour, 1),
+        reason=f"in the way for {age:.0f} s: {names}; {then}, because {costs}"[:500],
+    )

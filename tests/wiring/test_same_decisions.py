@@ -52,7 +52,7 @@ from map_service.core import MapCore
 from map_service.registry import make_layers
 from planner.core import PlannerCore
 from planner.robot_operator import CommandError
-from planner.store import Order
+from planner.stops import Order
 from robot_agent.agent.core import AgentCore
 from robot_agent.agent.recording import input_log as log
 

@@ -19,7 +19,7 @@ from fog_contracts import channels as ch
 from fog_contracts.messages import CommandKind, CommandReply, Pose, RobotGoal
 from fog_runtime.configuration.site import LoadedSite
 from fognav_experiments.rigs import OPERATOR_KEY, System, moment
-from planner.store import Order
+from planner.stops import Order
 from robot_agent.agent.recording import input_log as log
 from robot_agent.registry import profile
 

@@ -262,3 +262,28 @@ async def test_restarted_planner_ends_missions_of_visits_before_the_robot_hears_
     assert list(world.service.goals) == ["r2"], "what can't be deleted keeps nobody else waiting"
     await world.http.aclose()
     world.service.close()
+
+
+async def test_operator_sends_a_robot_to_several_places_and_sees_which_it_has_reached(world: World) -> None:
+    async def states() -> list[tuple[str, str]]:
+        view = (await world.ask("GET", "robots/r1/mission", role="viewer")).json()
+        return [(stop["place"], stop["state"]) for stop in view["stops"]]
+
+    assert (await world.ask("GET", "robots/r1/mission", role="viewer")).json()["type"] == "urn:fognav:no_mission"
+    body = {"stops": [{"place": "office"}, {"place": "hall"}, {"place": "lab"}], "when_cut": {"do": "nearest"}}
+    sent = await world.ask("PUT", "robots/r1/mission", body, role="operator")
+    assert (sent.status_code, sent.json()["when_cut"]) == (201, {"do": "nearest", "limit_s": None})
+    assert await states() == [("office", "present"), ("hall", "ahead"), ("lab", "ahead")]
+    assert (await world.ask("GET", "robots/r1/goal", role="viewer")).json()["place"] == "office"
+    world.service.missions.end("r1", world.service.goals["r1"].goal.goal_id)
+    await world.service.missions._end_reached()
+    assert await states() == [("office", "reached"), ("hall", "present"), ("lab", "ahead")]
+    again = await world.ask("PUT", "robots/r1/mission", {"stops": [{"place": "lab"}]}, role="operator")
+    assert (again.status_code, await states()) == (200, [("lab", "present")])
+    for wrong, problem in (({"stops": []}, "request_invalid"), ({"stops": [{"place": "attic"}]}, "no_place")):
+        refused = (await world.ask("PUT", "robots/r1/mission", wrong, role="operator")).json()
+        assert refused["type"] == f"urn:fognav:{problem}"
+    assert (await world.ask("PUT", "robots/r9/mission", body, role="operator")).status_code == 404
+    assert (await world.ask("PUT", "robots/r1/mission", body, role="viewer")).status_code == 403
+    assert (await world.ask("DELETE", "robots/r1/goal", role="operator")).status_code == 204
+    assert world.stored == {}

@@ -19,7 +19,8 @@ from fog_runtime.stores.redis_connection import StoreError
 from fog_runtime.stores.redis_store import Attempt, Audit, IdempotencyError, RecoveryError
 from fog_supervisor.servers import Server, start_redis
 from planner.core import PlannerCore
-from planner.store import MissionPersistence, Order, OutOfServiceError, Store, StoredGoal
+from planner.stops import Order
+from planner.store import MissionPersistence, OutOfServiceError, Store, StoredGoal
 from planner.waits.persistence import BlockPersistence
 
 pytestmark = pytest.mark.live

@@ -10,17 +10,13 @@ from msgspec import structs
 from fog_contracts.messages import (
     GoalOutcome,
     GoalView,
-    Id,
     Message,
-    Metres,
     Mode,
     OutOfService,
     Place,
     PlanReply,
     PlanRequest,
     PlanView,
-    Pose,
-    Radians,
     Refusal,
     RobotPose,
     RobotSummary,
@@ -33,7 +29,6 @@ from fog_runtime.http import (
     Answer,
     Body,
     ClientHost,
-    HttpProblem,
     IfMatch,
     Operator,
     ProblemError,
@@ -56,27 +51,24 @@ from fog_runtime.stores.redis_connection import StoreError
 from fog_runtime.stores.redis_store import IdempotencyError
 from planner.api_commands import KnownPlaces, add_commands
 from planner.api_visits import add_visits
+from planner.config import PlannerConfig
 from planner.problems import PlannerProblem
 from planner.query_queue import BusyError
 from planner.robot_operator import CommandError
 from planner.service import Service
-from planner.store import NO_MISSION, MissionConflictError, Order, OutOfServiceError, StoredGoal
+from planner.stops import Order
+from planner.store import NO_MISSION, MissionConflictError, OutOfServiceError, StoredGoal
+from planner.tours.api import (
+    Conditions,
+    GoalBody,
+    MissionBody,
+    MissionView,
+    goal_pose,
+    goal_refused,
+    mission_answer,
+    mission_order,
+)
 from planner.undo import add_undo
-
-
-class GoalPose(Message, frozen=True, kw_only=True):
-    """A position in m, frame `map`; without `theta` (rad) any heading is accepted."""
-
-    x: Metres
-    y: Metres
-    theta: Radians | None = None
-
-
-class GoalBody(Message, frozen=True, kw_only=True):
-    """A goal: the id of a place of the site, or a pose; exactly one of the two."""
-
-    place: Id | None = None
-    pose: GoalPose | None = None
 
 
 class ServiceBody(Message, frozen=True, kw_only=True):
@@ -125,6 +117,13 @@ class _Robots:
             detail = f"there is no robot {robot}; known robots: {', '.join(known) or 'none'}"
             raise ProblemError(PlannerProblem.NO_ROBOT, detail)
 
+    def check_single(self, robot: str) -> None:
+        """Raise a `ProblemError` for an unknown robot, and for one whose id two agents use."""
+        self.check(robot)
+        if self._service.operator.is_doubled(robot):
+            detail = f"two agents use the id of robot {robot}: switch one off, or give it another id, then try again"
+            raise ProblemError(PlannerProblem.ROBOT_DOUBLED, detail)
+
     def mode(self, robot: str) -> Mode | None:
         """Return a robot's mode, None without a state."""
         state = self._service.states.get(robot)
@@ -144,21 +143,6 @@ class _Robots:
             start=None if described is None else described.start,
             dock=None if described is None else described.dock,
         )
-
-
-def _goal_pose(body: GoalBody, places: Mapping[str, Place]) -> tuple[Pose, bool]:
-    """Return the pose of a goal, and whether any heading will do; raises a `ProblemError` for an invalid goal."""
-    if (body.place is None) == (body.pose is None):
-        raise ProblemError(HttpProblem.REQUEST_INVALID, "give either a place or a pose, and not both", field="body")
-    if body.pose is not None:
-        theta = body.pose.theta
-        return Pose(x=body.pose.x, y=body.pose.y, theta=theta or 0.0), theta is None
-    place = places.get(body.place or "")
-    if place is None:
-        names = ", ".join(sorted(places)) or "none"
-        detail = f"there is no place {body.place}; known places: {names}"
-        raise ProblemError(PlannerProblem.NO_PLACE, detail, field="body.place")
-    return Pose(x=place.x, y=place.y, theta=place.theta or 0.0), place.theta is None
 
 
 def _places(service: Service, site: Site) -> Mapping[str, Place]:
@@ -182,7 +166,9 @@ def make_api(service: Service, site: Site, health: Health, tokens: Tokens, stand
     add_commands(routes, service.operator, places, check=robots.check, may_go=may_go, mode=robots.mode)
     _add_views(routes, service, robots)
     _add_service(routes, service, robots)
+    _raise_busy(routes)
     _add_orders(routes, service, robots, places)
+    _add_missions(routes, service, robots, places)
     add_undo(routes, service, robots.check)
     add_visits(Routes(app, "visits"), lambda: service.visiting, standby)
     _add_plan(Routes(app, "plan"), service, robots, places)
@@ -190,6 +176,17 @@ def make_api(service: Service, site: Site, health: Health, tokens: Tokens, stand
     add_store_errors(recovery)
     add_recovery(recovery, service.missions)
     return app
+
+
+def _raise_busy(routes: Routes) -> None:
+    """Let the routes raise that too many plans wait."""
+    routes.raises(
+        BusyError,
+        [PlannerProblem.BUSY],
+        lambda error: ProblemError(
+            PlannerProblem.BUSY, str(error), headers={"Retry-After": f"{error.retry_after:.0f}"}
+        ),
+    )
 
 
 def _add_views(routes: Routes, service: Service, robots: _Robots) -> None:
@@ -252,11 +249,8 @@ def _add_orders(routes: Routes, service: Service, robots: _Robots, places: Known
 
         With If-Match, only if it still has the mission that was read; with `If-None-Match: *`, only if it has none.
         """
-        robots.check(robot)
-        if service.operator.is_doubled(robot):
-            detail = f"two agents use the id of robot {robot}: switch one off, or give it another id, then try again"
-            raise ProblemError(PlannerProblem.ROBOT_DOUBLED, detail)
-        pose, any_heading = _goal_pose(body, places())
+        robots.check_single(robot)
+        pose, any_heading = goal_pose(body, places())
         order = Order(
             robot,
             pose,
@@ -269,16 +263,7 @@ def _add_orders(routes: Routes, service: Service, robots: _Robots, places: Known
         new = robot not in service.goals
         answer = await service.send(order)
         if isinstance(answer, Refusal):
-            field = "body.place" if body.place else "body.pose"
-            raise ProblemError(
-                PlannerProblem.GOAL_REFUSED,
-                answer.reason,
-                field=field,
-                code=answer.code,
-                name=answer.name,
-                refusal=answer.kind,
-                nearest=answer.nearest,
-            )
+            raise goal_refused(answer, "body.place" if body.place else "body.pose")
         return _goal_answer(robot, answer, status=201 if new else 200)
 
     @routes.delete(
@@ -291,6 +276,58 @@ def _add_orders(routes: Routes, service: Service, robots: _Robots, places: Known
         robots.check(robot)
         if not await service.missions.cancel(robot, caller.name, expected_tag(if_match)):
             raise _without_mission(robot)
+
+
+def _add_missions(routes: Routes, service: Service, robots: _Robots, places: KnownPlaces) -> None:
+    """Add the routes of missions with several stops; `routes` knows the errors of orders."""
+
+    @routes.get("/api/v1/robots/{robot}/mission", problems=[PlannerProblem.NO_ROBOT, PlannerProblem.NO_MISSION])
+    async def get_mission(robot: str, _caller: Viewer) -> Answer[MissionView]:
+        """Return a robot's mission with all its stops, and its ETag; one that was sent to a goal has one stop."""
+        robots.check(robot)
+        stored = service.goals.get(robot)
+        if stored is None:
+            raise _without_mission(robot)
+        return mission_answer(robot, stored)
+
+    @routes.put(
+        "/api/v1/robots/{robot}/mission",
+        status=(200, 201),
+        raises=[BusyError, IdempotencyError, MissionConflictError, OutOfServiceError, StoreError],
+        problems=[
+            PlannerProblem.NO_ROBOT,
+            PlannerProblem.ROBOT_DOUBLED,
+            PlannerProblem.NO_PLACE,
+            PlannerProblem.NO_POSE,
+            PlannerProblem.GOAL_REFUSED,
+            PlannerProblem.DEADLINE_TOO_SOON,
+        ],
+    )
+    async def put_mission(  # headers are parameters
+        robot: str,
+        body: Body[MissionBody],
+        caller: Operator,
+        if_match: IfMatch = None,
+        if_none_match: IfNoneMatch = None,
+        idempotency_key: IdempotencyKey = None,
+    ) -> Answer[MissionView]:
+        """Send a robot to one stop after the other, instead of its mission. `DELETE …/goal` ends all of it.
+
+        With If-Match, only if it still has the leg that was read; with `If-None-Match: *`, only if it has no mission.
+        """
+        robots.check_single(robot)
+        conditions = Conditions(
+            caller.name,
+            attempt_of(idempotency_key, caller, f"PUT /api/v1/robots/{robot}/mission", body),
+            NO_MISSION if must_be_new(if_none_match) else expected_tag(if_match),
+        )
+        service.missions.require_in_service(robot)
+        order = await mission_order(service, robot, body, places(), conditions, PlannerConfig.cruise_speed)
+        new = robot not in service.goals
+        answer = await service.send(order)
+        if isinstance(answer, Refusal):
+            raise goal_refused(answer, "body.stops.0")
+        return mission_answer(robot, answer, status=201 if new else 200)
 
 
 def _add_service(routes: Routes, service: Service, robots: _Robots) -> None:
@@ -322,13 +359,7 @@ def _add_service(routes: Routes, service: Service, robots: _Robots) -> None:
 
 
 def _add_plan(routes: Routes, service: Service, robots: _Robots, places: KnownPlaces) -> None:
-    routes.raises(
-        BusyError,
-        [PlannerProblem.BUSY],
-        lambda error: ProblemError(
-            PlannerProblem.BUSY, str(error), headers={"Retry-After": f"{error.retry_after:.0f}"}
-        ),
-    )
+    _raise_busy(routes)
 
     @routes.post("/api/v1/plan", raises=[BusyError])
     async def preview(client: ClientHost, body: Body[PlanRequest]) -> PlanReply:
@@ -343,7 +374,7 @@ def _add_plan(routes: Routes, service: Service, robots: _Robots, places: KnownPl
     async def dry_run_goal(robot: str, body: Body[GoalBody], caller: Viewer) -> GoalOutcome:
         """Return the path that a robot would get to a goal from where it stands, and do nothing; or the refusal."""
         robots.check(robot)
-        pose, _ = _goal_pose(body, places())
+        pose, _ = goal_pose(body, places())
         outcome = await service.dry_runs.goal(robot, pose.x, pose.y, f"person {caller.name}")
         if outcome is None:
             detail = f"it is not known where robot {robot} is: switch it on and localize it, then try again"

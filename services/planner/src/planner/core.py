@@ -203,9 +203,10 @@ class PlannerCore:
 
     # --- Missions ---------------------------------------------------------------------------------------------------
 
-    def set_goal(self, robot: str, goal: RobotGoal, *, any_heading: bool = False) -> None:
+    def set_goal(self, robot: str, goal: RobotGoal, *, any_heading: bool = False, priority: int = 0) -> None:
         """Give a robot a mission; the same goal again changes nothing. `any_heading`: ignore the goal's theta."""
         self.missions.set_goal(robot, goal, any_heading=any_heading)
+        self.missions.of(robot).priority = priority
 
     def cancel(self, robot: str) -> None:
         """End a robot's mission; the next `tick` publishes that."""

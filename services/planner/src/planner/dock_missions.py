@@ -9,7 +9,8 @@ from typing import TYPE_CHECKING, Final
 from fog_contracts.messages import Refusal
 from fog_runtime import logs
 from fog_runtime.stores.redis_connection import StoreError
-from planner.store import NO_MISSION, MissionConflictError, Order, OutOfServiceError
+from planner.stops import Order
+from planner.store import NO_MISSION, MissionConflictError, OutOfServiceError
 
 if TYPE_CHECKING:
     from collections.abc import Awaitable, Callable, Mapping

@@ -98,6 +98,8 @@ class Mission:
     """The last goal; its pose is None once it has ended."""
     any_heading: bool = False
     """Whether the robot may arrive with any heading: the goal's theta is ignored."""
+    priority: int = 0
+    """Of two missions that are equally urgent, the one of higher priority comes first."""
     out_of_service: OutOfService | None = None
     """Why the robot gets no goal, which is published with its goal."""
     plan: Plan | None = None
@@ -375,7 +377,7 @@ class Missions:
             for robot, mission in self.active()
             if robot in located and (reason := mission.replan_due(now, config)) is not None
         ]
-        return sorted(due, key=lambda entry: (_URGENCY[entry[2]], entry[1].danger))
+        return sorted(due, key=lambda entry: (_URGENCY[entry[2]], -entry[1].priority, entry[1].danger))
 
     def unexplained(self, now_known: Explained, now: float, config: PlannerConfig) -> dict[str, tuple[Plan, Question]]:
         """Return the refused plans whose reasons are unknown or may have changed, by robot, each with what is open.

@@ -17,6 +17,10 @@ class PlannerProblem(ProblemCode):
         "goal_refused", 422, "The goal can never be reached: `refusal`, and Nav2's `code` and `name`, say why",
         "Choose another goal, such as `nearest`, or remove what is in the way",
     )  # fmt: skip
+    DEADLINE_TOO_SOON = (
+        "deadline_too_soon", 422, "The mission takes longer than its deadline allows: some `seconds`",
+        "Give it more time, or fewer stops",
+    )  # fmt: skip
     MISSION_CHANGED = (
         "mission_changed", 412, "The robot has another mission than the request expects, or has one",
         "Read the mission again, then decide anew",

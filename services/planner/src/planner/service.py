@@ -33,7 +33,7 @@ from planner.query_queue import BUSY_PAUSE_S, BusyError, QueryQueue, Threads
 from planner.refusals import busy
 from planner.robot_operator import RobotOperator
 from planner.snapshot_fetcher import SnapshotFetcher
-from planner.store import MissionPersistence
+from planner.tours.persistence import TourPersistence
 from planner.visiting import Visiting
 
 if TYPE_CHECKING:
@@ -56,7 +56,8 @@ if TYPE_CHECKING:
     from fog_runtime.transports.edges import Gate
     from fog_runtime.transports.zenoh_edge import ZenohEdge
     from planner.core import Job, PlannerCore
-    from planner.store import Order, Store, StoredGoal
+    from planner.stops import Order
+    from planner.store import MissionPersistence, Store, StoredGoal
 
     Emit = Callable[[Sequence[Publication]], object]
 
@@ -218,7 +219,7 @@ class Service:
         self._queue = QueryQueue(self._threads, on_idle=core.answerer.release)
         self.dry_runs = DryRuns(core, self._queue, clock.now)
         self._cycle = Cycle(core, zenoh)
-        self.missions = MissionPersistence(core, store, clock, health, self._change_goal)
+        self.missions: MissionPersistence = TourPersistence(core, store, clock, health, self._change_goal, self.path)
         self._map = SnapshotFetcher(core, zenoh, clock, health, self._queue, on_loaded=self._wake.set)
         self.operator = RobotOperator(zenoh, store, clock, key)
         self._docks = DockMissions(site.staging, self.send)

@@ -7,24 +7,25 @@ import secrets
 from contextlib import contextmanager
 from datetime import UTC, datetime
 from functools import partial
-from typing import TYPE_CHECKING, Final, NamedTuple
+from typing import TYPE_CHECKING, Final
 
 from fog_contracts.messages import Message, OutOfService, RobotGoal
 from fog_runtime import logs
 from fog_runtime.stores import records
 from fog_runtime.stores.redis_connection import StoreError, StoreLostError, StoreRefusedError
 from fog_runtime.stores.redis_store import ANY, Audit, Outcome, RecoveryError, Table
+from planner.stops import Tour
 from planner.waits.persistence import BlockPersistence, BlockStore
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Mapping
     from typing import Literal
 
-    from fog_contracts.messages import Pose
     from fog_runtime.clock import Clock
     from fog_runtime.health import Health
     from fog_runtime.stores.redis_store import Attempt, StoreStatus
     from planner.core import PlannerCore
+    from planner.stops import Order
 
 _GOALS: Final = Table(records.GOALS, "mission", version="goal.goal_id")
 _SERVICE: Final = Table(records.OUT_OF_SERVICE, "service", version="id")
@@ -33,11 +34,15 @@ _log = logs.get("planner")
 
 
 class StoredGoal(Message, frozen=True, kw_only=True):
-    """A mission as it is stored; `any_heading`: ignore the goal's theta. `visit`: it belongs to a visit (ADR 69)."""
+    """A mission as it is stored; `any_heading`: ignore the goal's theta. `visit`: it belongs to a visit (ADR 69).
+
+    `tour`: its other stops and rules, if it has any.
+    """
 
     goal: RobotGoal
     any_heading: bool = False
     visit: bool = False
+    tour: Tour | None = None
 
 
 class Store(BlockStore):
@@ -102,24 +107,6 @@ NO_MISSION: Final = ""
 """Instead of a mission's id: expect that a robot has none."""
 _ATTEMPTS: Final = 2
 """How often a conditional write is tried: what is stored may differ from what this process knows, once."""
-
-
-class Order(NamedTuple):
-    """A mission as an operator orders it, and the conditions of the order.
-
-    `any_heading`: ignore the pose's theta. `expected` is the id of the mission that it replaces, or `NO_MISSION`; None
-    replaces any. `action` is the audit trail's word for it.
-    """
-
-    robot: str
-    pose: Pose
-    who: str
-    place: str | None = None
-    any_heading: bool = False
-    attempt: Attempt | None = None
-    expected: str | None = None
-    action: str = "goal"
-    visit: bool = False
 
 
 class MissionConflictError(Exception):
@@ -219,8 +206,9 @@ class MissionPersistence:
                     await self._load()  # the robot may be out of service although the request for it failed
             self.require_in_service(order.robot)
             stamp, place, pose = self._clock.stamp(), order.place, order.pose
-            goal = RobotGoal(goal_id=secrets.token_hex(8), pose=pose, place=place, stamp=stamp)
-            stored = StoredGoal(goal=goal, any_heading=order.any_heading, visit=order.visit)
+            goal_id = secrets.token_hex(8) if order.tour is None else order.tour.goal_id
+            goal = RobotGoal(goal_id=goal_id, pose=pose, place=place, stamp=stamp)
+            stored = StoredGoal(goal=goal, any_heading=order.any_heading, visit=order.visit, tour=order.tour)
             await self._store_mission(order, stored, Audit(stamp, order.who, order.action, order.attempt))
             self._begin(order.robot, stored)
         _log.info("goal_accepted", robot=order.robot, goal=goal.goal_id, x=pose.x, y=pose.y, place=place, who=order.who)
@@ -327,10 +315,7 @@ class MissionPersistence:
                     async with self._lock:
                         await self._load()
                     self._change_core(partial(self._core.lead, self._store.epoch, knows_missions=True))
-                for robot, goal_id in list(self._reached.items()):
-                    await self._store.delete(robot, goal_id, Audit(self._clock.stamp(), robot, "reached"))
-                    if self._reached.get(robot) == goal_id:
-                        del self._reached[robot]
+                await self._end_reached()
                 for robot, out in list(self._out.items()):
                     if self._leading and not out.holds(self._clock.stamp()):
                         await self.put_back(robot, "planner", expected=out.id, action="end")
@@ -345,6 +330,13 @@ class MissionPersistence:
                 if self._leading and not self._loaded.is_set():
                     self._health.set("goals", ok=False, detail=f"not loaded yet: {error}")
             await asyncio.sleep(STORE_PERIOD_S)
+
+    async def _end_reached(self) -> None:
+        """Delete the missions that are reached; raises `StoreError`."""
+        for robot, goal_id in list(self._reached.items()):
+            await self._store.delete(robot, goal_id, Audit(self._clock.stamp(), robot, "reached"))
+            if self._reached.get(robot) == goal_id:
+                del self._reached[robot]
 
     @contextmanager
     def _uncertain_write(self) -> Iterator[None]:
@@ -443,4 +435,6 @@ class MissionPersistence:
         self.goals[robot] = stored
         if not stored.visit:
             self.overruled(robot)
-        self._change_core(partial(self._core.set_goal, robot, stored.goal, any_heading=stored.any_heading))
+        priority = stored.tour.priority if stored.tour is not None else 0
+        heading = stored.any_heading
+        self._change_core(partial(self._core.set_goal, robot, stored.goal, any_heading=heading, priority=priority))

@@ -1,7 +1,10 @@
 """Undoes an operator's order, by its entry in the audit trail: a mission given or cancelled, or a robot's service."""
 
+import secrets
 from collections.abc import Callable
 from typing import Final
+
+from msgspec import structs
 
 from fog_contracts.messages import OutOfService, Refusal
 from fog_runtime.http import Body, Operator, ProblemError, Routes
@@ -11,7 +14,8 @@ from fog_runtime.stores.redis_store import IdempotencyError
 from fog_runtime.stores.undo import ACTION, UndoError, require_rest, values
 from planner.problems import PlannerProblem
 from planner.service import Service
-from planner.store import NO_MISSION, MissionConflictError, Order, OutOfServiceError, StoredGoal
+from planner.stops import Order
+from planner.store import NO_MISSION, MissionConflictError, OutOfServiceError, StoredGoal
 
 _KINDS: Final = ("mission", "service")
 
@@ -68,9 +72,12 @@ async def _undo(
         return None
     goal = before.goal
     assert goal.pose is not None
+    # A new id: the robot may have reached or cancelled a leg of the old one.
+    tour = None if before.tour is None else structs.replace(before.tour, id=secrets.token_hex(8))
     order = Order(
-        robot, goal.pose, who, place=goal.place, any_heading=before.any_heading, expected=expected, action=ACTION
-    )
+        robot, goal.pose, who, place=goal.place, any_heading=before.any_heading, expected=expected, action=ACTION,
+        tour=tour,
+    )  # fmt: skip
     sent = await service.send(order)
     if isinstance(sent, Refusal):
         raise ProblemError(PlannerProblem.GOAL_REFUSED, sent.reason, refusal=sent.kind, code=sent.code, name=sent.name)

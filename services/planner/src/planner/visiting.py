@@ -10,7 +10,8 @@ from fog_runtime import logs
 from fog_runtime.clock import ticker
 from fog_runtime.stores.redis_connection import StoreError
 from planner.dry_run import USUAL_SPEED
-from planner.store import NO_MISSION, VISIT_ENDED, MissionConflictError, Order, OutOfServiceError
+from planner.stops import Order
+from planner.store import NO_MISSION, VISIT_ENDED, MissionConflictError, OutOfServiceError
 from planner.visits import DRIVING, READY_S, Act, Facts, Visit, VisitEnd, Visits, is_free
 
 if TYPE_CHECKING:

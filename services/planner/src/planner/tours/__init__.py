@@ -1,0 +1,1 @@
+"""Missions with several stops in a running planner: in Redis, and over REST."""

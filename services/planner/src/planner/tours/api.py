@@ -1,0 +1,244 @@
+"""REST: missions with several stops, and what a goal is."""
+
+from __future__ import annotations
+
+import math
+import secrets
+from typing import TYPE_CHECKING, Annotated, Any, Literal, NamedTuple, Protocol
+
+from msgspec import Meta, to_builtins
+
+from fog_contracts.messages import (
+    Id,
+    Message,
+    Metres,
+    PlanRefusal,
+    PlanReply,
+    PlanRequest,
+    PointXY,
+    Pose,
+    Radians,
+    Refusal,
+    Stamp,
+    TimeToLive,
+)
+from fog_runtime.http import Answer, HttpProblem, ProblemError, etag
+from planner.problems import PlannerProblem
+from planner.stops import BEST_MAX, STOPS_MAX, Order, Priority, Stop, Tour, WhenCut, best_order
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping
+
+    from fog_contracts.messages import Place, RobotPose
+    from planner.store import StoredGoal
+
+
+class GoalPose(Message, frozen=True, kw_only=True):
+    """A position in m, frame `map`; without `theta` (rad) any heading is accepted."""
+
+    x: Metres
+    y: Metres
+    theta: Radians | None = None
+
+
+class GoalBody(Message, frozen=True, kw_only=True):
+    """A goal: the id of a place of the site, or a pose; exactly one of the two."""
+
+    place: Id | None = None
+    pose: GoalPose | None = None
+
+
+class MissionBody(Message, frozen=True, kw_only=True):
+    """A mission: its stops in the `given` order, or in the `best` one, whose way is the shortest (8 at most).
+
+    `when_cut`: what to do when no way leads to a stop. `deadline_s`: it ends so long after the order, whatever is left.
+    Of equally urgent missions that of higher `priority` is planned first.
+    """
+
+    stops: Annotated[list[GoalBody], Meta(min_length=1, max_length=STOPS_MAX)]
+    order: Literal["given", "best"] = "given"
+    when_cut: WhenCut = WhenCut()
+    deadline_s: TimeToLive | None = None
+    priority: Priority = 0
+
+
+class StopView(Message, frozen=True, kw_only=True):
+    """A stop of a mission."""
+
+    pose: Pose
+    place: str | None
+    any_heading: bool
+    state: Literal["reached", "present", "ahead"]
+
+
+class MissionView(Message, frozen=True, kw_only=True):
+    """A mission; `goal_id` is its present goal. `aside`: it waits at, or drives to, the point nearest to its stop."""
+
+    id: str
+    robot: str
+    goal_id: str
+    stops: list[StopView]
+    when_cut: WhenCut
+    priority: int
+    deadline: Stamp | None
+    aside: PointXY | None
+
+
+def goal_pose(body: GoalBody, places: Mapping[str, Place], field: str = "body") -> tuple[Pose, bool]:
+    """Return the pose of a goal, and whether any heading will do; raises a `ProblemError` for an invalid goal."""
+    if (body.place is None) == (body.pose is None):
+        raise ProblemError(HttpProblem.REQUEST_INVALID, "give either a place or a pose, and not both", field=field)
+    if body.pose is not None:
+        theta = body.pose.theta
+        return Pose(x=body.pose.x, y=body.pose.y, theta=theta or 0.0), theta is None
+    place = places.get(body.place or "")
+    if place is None:
+        names = ", ".join(sorted(places)) or "none"
+        detail = f"there is no place {body.place}; known places: {names}"
+        raise ProblemError(PlannerProblem.NO_PLACE, detail, field=f"{field}.place")
+    return Pose(x=place.x, y=place.y, theta=place.theta or 0.0), place.theta is None
+
+
+def goal_refused(refusal: Refusal, field: str) -> ProblemError:
+    """Return the problem of a goal that is refused."""
+    return ProblemError(
+        PlannerProblem.GOAL_REFUSED,
+        refusal.reason,
+        field=field,
+        code=refusal.code,
+        name=refusal.name,
+        refusal=refusal.kind,
+        nearest=refusal.nearest,
+        causes=to_builtins(refusal.causes),
+    )
+
+
+def mission_answer(robot: str, stored: StoredGoal, status: int = 200) -> Answer[MissionView]:
+    """Return a robot's mission with its ETag."""
+    goal, tour = stored.goal, stored.tour or Tour(id=stored.goal.goal_id)
+    assert goal.pose is not None  # what is stored has a pose
+    own = Stop(pose=goal.pose, place=goal.place, any_heading=stored.any_heading)
+    present = tour.aside or own
+    stops: list[tuple[Stop, Literal["reached", "present", "ahead"]]] = [
+        *((stop, "reached") for stop in tour.reached), (present, "present"), *((stop, "ahead") for stop in tour.ahead)
+    ]  # fmt: skip
+    view = MissionView(
+        id=tour.id,
+        robot=robot,
+        goal_id=goal.goal_id,
+        stops=[StopView(pose=s.pose, place=s.place, any_heading=s.any_heading, state=state) for s, state in stops],
+        when_cut=tour.when_cut,
+        priority=tour.priority,
+        deadline=tour.deadline,
+        aside=None if tour.aside is None else (goal.pose.x, goal.pose.y),
+    )
+    return Answer(view, etag(goal.goal_id), status=status)
+
+
+class Planner(Protocol):
+    """What an order needs of the planner's service."""
+
+    poses: dict[str, RobotPose]
+
+    async def preview(self, request: PlanRequest, asker: str) -> PlanReply:
+        """Plan a path without side effects."""
+
+    def stamp(self) -> float:
+        """Return the time, s since the epoch."""
+
+
+class Conditions(NamedTuple):
+    """Who orders a mission, by which attempt, and instead of which."""
+
+    who: str
+    attempt: Any
+    expected: str | None
+
+
+_NEVER: frozenset[str] = frozenset(
+    {PlanRefusal.GOAL_OFF_MAP, PlanRefusal.GOAL_IN_WALL, PlanRefusal.GOAL_UNKNOWN, PlanRefusal.GOAL_NEAR_WALL}
+)
+"""Refusals that no end of a hazard lifts."""
+
+
+async def mission_order(
+    planner: Planner,
+    robot: str,
+    body: MissionBody,
+    places: Mapping[str, Place],
+    conditions: Conditions,
+    speed: float,
+) -> Order:
+    """Return the order of a mission; raises a `ProblemError` for one that can't be carried out.
+
+    `speed` (m/s) is how fast robots get on. A stop that is cut off now is accepted, because hazards end, unless the
+    mission is to be cancelled then.
+    """
+    stops = []
+    for number, stop in enumerate(body.stops):
+        pose, any_heading = goal_pose(stop, places, f"body.stops.{number}")
+        stops.append(Stop(pose=pose, place=stop.place, any_heading=any_heading))
+    if body.order == "best" and len(stops) > BEST_MAX:
+        detail = f"the best order of {len(stops)} stops is not searched: give {BEST_MAX} at most, or order them"
+        raise ProblemError(HttpProblem.REQUEST_INVALID, detail, field="body.order")
+    numbers = list(range(len(stops)))
+    at = planner.poses.get(robot)
+    if at is None or not at.localized:
+        if body.order == "best" or body.deadline_s is not None or body.when_cut.do == "cancel":
+            detail = f"it is not known where robot {robot} is: switch it on and localize it, then try again"
+            raise ProblemError(PlannerProblem.NO_POSE, detail)
+        start = stops[0].pose
+    else:
+        start = Pose(x=at.x, y=at.y, theta=at.theta)
+    ways = _Ways(planner, conditions.who, body.when_cut)
+    if body.order == "best":
+        first = [await ways.cost(start, stop.pose, n) for n, stop in enumerate(stops)]
+        between = [[0.0 if a is b else await ways.cost(a.pose, b.pose, n) for n, b in enumerate(stops)] for a in stops]
+        numbers = best_order(first, between)
+    poses = [start, *(stops[number].pose for number in numbers)]
+    lengths = [await ways.length(a, b, n) for a, b, n in zip(poses[:-1], poses[1:], numbers, strict=True)]
+    if body.deadline_s is not None and (seconds := sum(lengths) / speed) > body.deadline_s and math.isfinite(seconds):
+        detail = f"the mission takes some {seconds:.0f} s, more than its {body.deadline_s:.0f} s"
+        raise ProblemError(PlannerProblem.DEADLINE_TOO_SOON, detail, field="body.deadline_s", seconds=round(seconds))
+    present, *ahead = (stops[number] for number in numbers)
+    tour = Tour(
+        id=secrets.token_hex(8),
+        ahead=tuple(ahead),
+        when_cut=body.when_cut,
+        priority=body.priority,
+        deadline=None if body.deadline_s is None else planner.stamp() + body.deadline_s,
+    )
+    return Order(
+        robot, present.pose, conditions.who, place=present.place, any_heading=present.any_heading,
+        attempt=conditions.attempt, expected=conditions.expected, action="mission", tour=tour,
+    )  # fmt: skip
+
+
+class _Ways:
+    """The ways between stops, each planned once."""
+
+    def __init__(self, planner: Planner, who: str, when_cut: WhenCut) -> None:
+        self._planner = planner
+        self._asker = f"person {who}"
+        self._when_cut = when_cut
+        self._known: dict[tuple[Pose, Pose], PlanReply] = {}
+
+    async def _plan(self, start: Pose, goal: Pose, number: int) -> PlanReply:
+        known = self._known.get((start, goal)) or await self._planner.preview(
+            PlanRequest(start=start, goal=goal), self._asker
+        )
+        self._known[start, goal] = known
+        refusal = known.refusal
+        if refusal is not None and (refusal.kind in _NEVER or self._when_cut.do == "cancel"):
+            raise goal_refused(refusal, f"body.stops.{number}")
+        return known
+
+    async def cost(self, start: Pose, goal: Pose, number: int) -> float:
+        """Return the cost of the way to a stop of this number, infinite if there is none now."""
+        found = await self._plan(start, goal, number)
+        return math.inf if found.refusal is not None else found.cost
+
+    async def length(self, start: Pose, goal: Pose, number: int) -> float:
+        """Return the length (m) of the way to a stop of this number, infinite if there is none now."""
+        found = await self._plan(start, goal, number)
+        return math.inf if found.refusal is not None else found.length

@@ -1,0 +1,301 @@
+"""Missions with several stops: their order, their rules, and that they go on where they were, whatever is restarted."""
+
+from __future__ import annotations
+
+import asyncio
+import itertools
+import math
+import random
+import secrets
+from types import SimpleNamespace
+from typing import TYPE_CHECKING, Any, cast
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from manual_clock import ManualClock
+
+from fog_contracts.messages import OutOfService, Place, PlanReply, PlanRequest, Pose, Refusal, RobotPath
+from fog_runtime.health import Health
+from fog_runtime.http import ProblemError
+from fog_supervisor.servers import start_redis
+from planner.core import PlannerCore
+from planner.stops import CUT_S, Order, Stop, Tour, WhenCut, act_on_cut, best_order
+from planner.store import OutOfServiceError, Store
+from planner.tours.api import Conditions, GoalBody, GoalPose, MissionBody, mission_answer, mission_order
+from planner.tours.persistence import TourPersistence
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+costs = st.one_of(st.floats(0.0, 100.0), st.just(math.inf))
+
+
+@given(st.data())
+def test_best_order_is_that_of_all_orders_with_the_fewest_closed_ways_and_the_least_cost(data):
+    count = data.draw(st.integers(1, 5))
+    first = data.draw(st.lists(costs, min_size=count, max_size=count))
+    between = [data.draw(st.lists(costs, min_size=count, max_size=count)) for _ in range(count)]
+
+    def rank(order):
+        steps = [first[order[0]], *(between[a][b] for a, b in itertools.pairwise(order))]
+        return sum(map(math.isinf, steps)), sum(step for step in steps if not math.isinf(step))
+
+    found = best_order(first, between)
+    assert sorted(found) == list(range(count))
+    best = min(rank(order) for order in itertools.permutations(range(count)))
+    assert rank(found) == (best[0], pytest.approx(best[1]))
+
+
+def test_way_that_is_cut_for_a_moment_ends_nothing_and_each_policy_does_what_it_says():
+    here, there = (1.0, 1.0), (5.0, 1.0)
+
+    def act(when_cut, seconds, nearest=here, **tour):
+        return act_on_cut(Tour(id="t", when_cut=when_cut, **tour), nearest, seconds)
+
+    assert act(WhenCut(do="cancel"), CUT_S - 0.1) == "wait"
+    assert act(WhenCut(do="cancel"), CUT_S) == "cancel"
+    assert act(WhenCut(), 1e6) == "wait"
+    assert [act(WhenCut(limit_s=60.0), s) for s in (59.0, 60.0)] == ["wait", "cancel"]
+    assert act(WhenCut(do="nearest"), CUT_S) == "nearest"
+    aside = Stop(pose=Pose(x=0.0, y=0.0, theta=0.0))
+    assert act(WhenCut(do="nearest"), 9.0, aside=aside) == "wait", "it drives there already"
+    assert act_on_cut(Tour(id="t", when_cut=WhenCut(do="nearest"), nearest=here), here, 9.0) == "wait", "it is there"
+    assert act_on_cut(Tour(id="t", when_cut=WhenCut(do="nearest"), nearest=here), there, 9.0) == "nearest"
+
+
+# --- in Redis ---
+
+
+class Running:
+    """The missions of a planner that leads; `refused` is what its robot's path says."""
+
+    def __init__(self, store: Store, clock: ManualClock) -> None:
+        self.core = PlannerCore()
+        self.refused: Refusal | None = None
+        self.missions = TourPersistence(
+            self.core, store, cast("Any", clock), Health(), lambda change: change(), self.path
+        )
+
+    def path(self, robot: str) -> RobotPath | None:
+        stored = self.missions.goals.get(robot)
+        return None if stored is None else RobotPath(
+            plan_id=1, planner_epoch=1, goal_id=stored.goal.goal_id, points=[], map_epoch=1, map_seq=1,
+            released_length=0.0, refusal=self.refused,
+        )  # fmt: skip
+
+    @property
+    def at(self) -> float | None:
+        """Where the robot is sent to (x); None without a mission."""
+        goal = self.core.missions.goal("r1")
+        return None if goal is None or goal.pose is None else goal.pose.x
+
+    async def start(self) -> Running:
+        await self.missions.lead(-1, confirmed=True)
+        return self
+
+    def reach(self) -> None:
+        """The robot says that it has reached its goal."""
+        goal = self.core.missions.goal("r1")
+        if goal is not None:
+            self.core.missions.reach("r1", goal.goal_id)
+            for robot, goal_id in self.core.missions.pop_reached():
+                self.missions.end(robot, goal_id)
+
+    async def step(self) -> None:
+        await self.missions._end_reached()
+
+
+def order(*stops: float, **tour: Any) -> Order:
+    first, *ahead = (Stop(pose=Pose(x=x, y=0.0, theta=0.0)) for x in stops)
+    return Order("r1", first.pose, "anna", tour=Tour(id=secrets.token_hex(8), ahead=tuple(ahead), **tour))
+
+
+@pytest.fixture
+def redis(tmp_path: Path):
+    with start_redis(tmp_path) as server:
+        yield server
+
+
+class Story:
+    """What may happen to one robot's missions, in any order, and where it must be sent then: the model."""
+
+    def __init__(self, store: Store, running: Running, clock: ManualClock) -> None:
+        self.store, self.running, self.clock = store, running, clock
+        self.left: list[float] = []
+        self.said = False
+        """Whether the robot has reached the first of them, and the next is not stored yet."""
+        self.out = False
+        self.number = 0
+
+    @property
+    def over(self) -> bool:
+        """Whether the robot is at its last stop, so that nothing is left to cancel."""
+        return self.said and len(self.left) == 1
+
+    async def order(self) -> None:
+        self.number += 1
+        stops = [float(self.number) + n / 10.0 for n in range(1 + self.number % 4)]
+        if self.out:
+            with pytest.raises(OutOfServiceError):
+                await self.running.missions.send(order(*stops))
+        else:
+            await self.running.missions.send(order(*stops))
+            self.left, self.said = stops, False
+
+    async def reach(self) -> None:
+        if self.left and not self.said:
+            self.running.reach()
+            self.said = True
+
+    async def step(self) -> None:
+        await self.running.step()
+        self.left, self.said = (self.left[1:], False) if self.said else (self.left, False)
+
+    async def restart(self) -> None:
+        self.running = await Running(self.store, self.clock).start()
+        self.said = False  # the robot says so again
+
+    async def cancel(self) -> None:
+        had = bool(self.left) and not self.over
+        assert await self.running.missions.cancel("r1", "anna") == had
+        if had:
+            self.left, self.said = [], False
+
+    async def take_out(self) -> None:
+        self.number += 1
+        record = OutOfService(id=f"{self.number}", reason="worn wheel", by="anna", since=1.0)
+        await self.running.missions.take_out("r1", record, "anna")
+        self.out = True
+        if not self.over:
+            self.left, self.said = [], False
+
+    async def put_back(self) -> None:
+        await self.running.missions.put_back("r1", "anna")
+        self.out = False
+
+    async def check(self) -> None:
+        if not self.said:
+            assert self.running.at == (self.left[0] if self.left else None)
+            assert set(await self.store.goals()) == ({"r1"} if self.left else set())
+
+
+@pytest.mark.live
+async def test_robot_has_one_mission_and_visits_its_stops_in_order_whatever_is_ordered_reached_or_restarted(redis):
+    rng, clock = random.Random(11), ManualClock(100.0)
+    async with Store(redis.url, "test") as store:
+        story = Story(store, await Running(store, clock).start(), clock)
+        acts = [story.order, *2 * [story.reach], *2 * [story.step], story.restart, story.cancel]
+        acts += [story.take_out, story.put_back]
+        for _ in range(200):
+            await rng.choice(acts)()
+            await story.check()
+
+
+@pytest.mark.live
+async def test_mission_whose_way_is_cut_waits_ends_or_goes_to_the_nearest_point_and_on_from_there(redis):
+    clock = ManualClock(100.0)
+    cut = Refusal(code=208, kind="cut_by_places", reason="hazard n3", nearest=(3.0, 0.0))
+
+    async def after(running: Running, seconds: float) -> float | None:
+        await running.step()
+        clock.advance(seconds)
+        await running.step()
+        return running.at
+
+    async with Store(redis.url, "test") as store:
+        running = await Running(store, clock).start()
+        for policy, at in ((WhenCut(), 5.0), (WhenCut(do="cancel"), None), (WhenCut(limit_s=30.0), None)):
+            running.refused = None
+            await running.missions.send(order(5.0, 9.0, when_cut=policy))
+            assert await after(running, 60.0) == 5.0
+            running.refused = cut
+            assert await after(running, 60.0) == at
+        await running.missions.send(order(5.0, 9.0, when_cut=WhenCut(do="nearest")))
+        assert await after(running, 5.0) == 3.0
+        view = mission_answer("r1", running.missions.goals["r1"]).value
+        assert (view.aside, [stop.state for stop in view.stops]) == ((3.0, 0.0), ["present", "ahead"])
+        running = await Running(store, clock).start()
+        running.reach()
+        await running.step()
+        assert running.at == 5.0, "from the nearest point to the stop itself"
+        running.refused = cut
+        assert await after(running, 60.0) == 5.0, "it is at the nearest point, and waits"
+        running.refused = None
+        running.reach()
+        await running.step()
+        assert running.at == 9.0
+        await running.missions.send(order(5.0, deadline=clock.stamp() + 60.0))
+        assert await after(running, 59.0) == 5.0
+        assert await after(running, 2.0) is None
+        assert [entry.action for entry in (await store.audit(limit=2)).entries] == [
+            "deadline",
+            "mission" if False else "goal",
+        ]
+
+
+# --- orders ---
+
+
+class Planner:
+    """Plans straight ways at (x, 0); beyond x = 100 is a wall, at x = 50 a hazard that ends."""
+
+    def __init__(self, localized: bool = True) -> None:  # noqa: FBT001, FBT002  # because it is the only thing to say
+        self.poses: dict[str, Any] = {"r1": SimpleNamespace(x=10.0, y=0.0, theta=0.0, localized=localized)}
+        self.planned = 0
+
+    async def preview(self, request: PlanRequest, asker: str) -> PlanReply:
+        assert asker == "person anna"
+        self.planned += 1
+        if request.goal.x > 100.0:
+            return PlanReply(refusal=Refusal(code=206, kind="goal_in_wall", reason="in a wall", nearest=(99.0, 0.0)))
+        if 50.0 in (request.goal.x, request.start.x):
+            return PlanReply(refusal=Refusal(code=208, kind="cut_by_places", reason="hazard n3", nearest=(49.0, 0.0)))
+        length = abs(request.goal.x - request.start.x)
+        return PlanReply(length=length, cost=length * 50.0)
+
+    def stamp(self) -> float:
+        return 1000.0
+
+
+def ordered(planner: Planner, *xs: float, **options: Any) -> list[float]:
+    body = MissionBody(stops=[GoalBody(pose=GoalPose(x=x, y=0.0)) for x in xs], **options)
+    conditions = Conditions("anna", None, None)
+    places = {"lab": Place(x=1.0, y=0.0)}
+    made = asyncio.run(mission_order(cast("Any", planner), "r1", body, places, conditions, 0.25))
+    assert made.tour is not None
+    return [made.pose.x, *(stop.pose.x for stop in made.tour.ahead)]
+
+
+def test_stops_come_in_the_order_given_or_in_the_best_one_from_where_the_robot_is():
+    assert ordered(Planner(), 30.0, 5.0, 20.0) == [30.0, 5.0, 20.0]
+    assert ordered(Planner(), 30.0, 5.0, 20.0, order="best") == [5.0, 20.0, 30.0]
+    assert ordered(Planner(), 50.0, 5.0, 20.0, order="best") == [5.0, 20.0, 50.0], "what is cut off now comes last"
+
+
+@pytest.mark.parametrize(
+    ("xs", "options", "code", "field", "words"),
+    [
+        ((5.0, 101.0), {}, "goal_refused", "body.stops.1", "in a wall"),
+        ((5.0, 50.0), {"when_cut": WhenCut(do="cancel")}, "goal_refused", "body.stops.1", "hazard n3"),
+        (
+            (30.0, 10.0),
+            {"deadline_s": 100.0},
+            "deadline_too_soon",
+            "body.deadline_s",
+            "some 160 s, more than its",
+        ),
+        (tuple(map(float, range(9))), {"order": "best"}, "request_invalid", "body.order", "give 8 at most"),
+    ],
+)
+def test_mission_that_cannot_be_carried_out_is_refused_with_its_code_and_the_stop(xs, options, code, field, words):
+    with pytest.raises(ProblemError, match=words) as refused:
+        ordered(Planner(), *xs, **options)
+    assert refused.value.code.value == code
+    assert [error["field"] for error in refused.value.errors] == [field]
+
+
+def test_best_order_needs_to_know_where_the_robot_is_and_a_given_one_does_not():
+    with pytest.raises(ProblemError, match="not known where robot r1 is"):
+        ordered(Planner(localized=False), 5.0, 9.0, order="best")
+    assert ordered(Planner(localized=False), 5.0, 9.0) == [5.0, 9.0]

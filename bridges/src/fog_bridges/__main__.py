@@ -11,7 +11,7 @@ import re
 import sys
 from contextlib import contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Final
+from typing import TYPE_CHECKING, Annotated, Final, Literal
 from urllib.parse import urlsplit
 
 import msgspec
@@ -38,6 +38,8 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Mapping
 
     from fog_bridges.floor import Adapter
+    from fog_bridges.ros2.dds import DdsWire
+    from fog_bridges.ros2.session import ZenohWire
     from fog_runtime.clock import Clock
 
 FILE: Final = "FOGNAV_BRIDGE_FILE"
@@ -65,6 +67,8 @@ class Settings(CommonSettings, frozen=True, kw_only=True):
     """User, password and authority of Home Assistant's broker, as `credentials_file` has those of Fognav's."""
     home_assistant_unencrypted: bool = False
     """Whether that password may cross the network readable for everybody in it."""
+    ros2_wire: Literal["zenoh", "dds"] = "zenoh"
+    """How the robots' middleware speaks: `zenoh` for rmw_zenoh, `dds` for rmw_fastrtps and rmw_cyclonedds."""
     ros2_router: str = ""
     """Where rmw_zenoh's router (`rmw_zenohd`) listens; on a fog node its usual port is Fognav's own router's."""
     ros2_domain: Annotated[int, msgspec.Meta(ge=0, le=232)] = 0
@@ -192,13 +196,10 @@ def _ros2(settings: Settings, site: str, _: Clock) -> Adapter:
         from fog_bridges.ros2.bridge import Ros2Bridge  # noqa: PLC0415  # an extra
         from fog_bridges.ros2.others import robot_radii  # noqa: PLC0415  # an extra
         from fog_bridges.ros2.rmf import Traffic, read_graph  # noqa: PLC0415  # an extra
-        from fog_bridges.ros2.session import ros_config  # noqa: PLC0415  # an extra
     except ImportError as error:
         raise SettingsError(f"the adapter ros2 needs more ({error}): pip install 'fog-bridges[ros2]'") from error
-    if settings.ros2_session_config is None and not settings.ros2_router:
-        raise SettingsError("ros2_router names where `rmw_zenohd` listens: tcp/192.168.7.5:7447, say")
     try:
-        config = ros_config(settings.ros2_session_config or settings.ros2_router)
+        wire = _dds(settings) if settings.ros2_wire == "dds" else _zenoh(settings)
         others = robot_radii(settings.ros2_robots)
         graph, level = settings.rmf_nav_graph, settings.rmf_level
         fleets = [name for name in map(str.strip, settings.rmf_fleets.split(",")) if name]
@@ -207,13 +208,30 @@ def _ros2(settings: Settings, site: str, _: Clock) -> Adapter:
         raise SettingsError(str(error)) from error
     return Ros2Bridge(
         site,
-        config,
-        settings.ros2_domain,
+        wire,
         settings.zenoh_endpoints,
         settings.credentials(),
         others,
         Traffic(lanes, fleets, level) if graph is not None or level else None,
     )
+
+
+def _zenoh(settings: Settings) -> ZenohWire:
+    from fog_bridges.ros2.session import ZenohWire, ros_config  # noqa: PLC0415  # an extra
+
+    if settings.ros2_session_config is None and not settings.ros2_router:
+        raise SettingsError("ros2_router names where `rmw_zenohd` listens: tcp/192.168.7.5:7447, say")
+    return ZenohWire(ros_config(settings.ros2_session_config or settings.ros2_router), settings.ros2_domain)
+
+
+def _dds(settings: Settings) -> DdsWire:
+    try:
+        from fog_bridges.ros2.dds import DdsWire  # noqa: PLC0415  # an extra
+    except ImportError as error:
+        raise SettingsError(
+            f"ros2_wire = 'dds' needs more ({error}): pip install 'fog-bridges[dds,ros2]' (on x86-64 only)"
+        ) from error
+    return DdsWire(settings.ros2_domain)
 
 
 def _free_fleet(settings: Settings, site: str, _: Clock) -> Adapter:

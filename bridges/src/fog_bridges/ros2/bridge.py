@@ -11,12 +11,10 @@ from functools import partial
 from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
-import zenoh
 
 from fog_bridges.floor import WAITS, Request
 from fog_bridges.ros2 import messages as ros
 from fog_bridges.ros2.others import Others, thing_id
-from fog_bridges.ros2.session import RosSession
 from fog_bridges.ros2.wire import RosMessage, Topic, WireError
 from fog_contracts import channels as ch
 from fog_contracts.codec import ContractError
@@ -45,7 +43,9 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from fog_bridges.floor import Floor
+    from fog_bridges.ros2.dds import DdsSession, DdsWire
     from fog_bridges.ros2.rmf import Traffic
+    from fog_bridges.ros2.session import RosSession, ZenohWire
     from fog_contracts.grid import GridGeometry
     from fog_contracts.messages import Reported, Zone
     from fog_runtime.clock import Clock
@@ -57,8 +57,6 @@ SILENT_S: Final = 2.0
 """A map that nobody has confirmed for so long is old: the whole floor becomes slow."""
 TICK_S: Final = 0.1
 SNAPSHOT_TIMEOUT_S: Final = 3.0
-RETRY_S: Final = 1.0
-_NO_ROUTER: Final = "ROS's router (`ros2 run rmw_zenoh_cpp rmw_zenohd`) is not connected"
 GOALS_AT_ONCE: Final = 20
 GOAL_MAX_AGE_S: Final = 10.0
 """An older goal is refused: who sent it may have forgotten it."""
@@ -79,22 +77,25 @@ class Ros2Bridge:
 
     name: Final = "ros2"
 
-    def __init__(  # noqa: PLR0913  # both sides that it connects
-        self, site: str, config: zenoh.Config, domain: int, connect: Sequence[str], own: Credentials,
+    def __init__(  # both sides that it connects
+        self, site: str, wire: ZenohWire | DdsWire, connect: Sequence[str], own: Credentials,
         others: Mapping[str, float], traffic: Traffic | None = None,
     ) -> None:  # fmt: skip
-        """Serve the domain of the router that `config` connects to; `connect` are the floor's, for whom `own` are.
+        """Serve those who are reached by `wire`; `connect` are the floor's routers, for whom `own` are.
 
         `others` are the robots of others, each with its radius (m); `traffic` has the lanes of Open-RMF's fleets.
         """
         self._others, self._traffic = others, traffic
         self._site = site
-        self._config = config
-        self._domain = domain
+        self._wire = wire
         self._connect = connect
         self._own = own
-        self.problem = "not connected yet"
+        self._problem = "not connected yet"
+
+    @property
+    def problem(self) -> str:
         """Why ROS is told nothing; empty while it is."""
+        return self._problem and (self._wire.problem or self._problem)
 
     def on_event(self, name: str, data: dict[str, Any]) -> None:
         """Do nothing: the floor's own channels are faster than its console."""
@@ -104,7 +105,8 @@ class Ros2Bridge:
 
     async def run(self, floor: Floor, clock: Clock) -> None:
         """Connect, and do all until cancelled."""
-        session = RosSession(await self._opened(), self._domain, f"fognav_{ros.ros_name(self._site)}", clock)
+        session = await self._wire.opened(f"fognav_{ros.ros_name(self._site)}", clock)
+        self._wire.problem = ""
         opened = ZenohEdge.open(
             connect=self._connect, clock=clock, role=ch.BRIDGE, id=self._site, site=self._site, credentials=self._own
         )
@@ -117,25 +119,16 @@ class Ros2Bridge:
                 tasks.create_task(relay.map_loop(), name="map")
                 tasks.create_task(relay.goal_loop(), name="goals")
                 async for _ in ticker(clock, TICK_S):
-                    self.problem = _problem(fog, session, relay)
+                    self._problem = _problem(fog, session, relay)
         finally:
             session.close()
 
-    async def _opened(self) -> zenoh.Session:
-        """Open a session once the router is there; afterwards it connects again by itself."""
-        while True:
-            try:
-                return await asyncio.to_thread(zenoh.open, self._config)
-            except zenoh.ZError as error:
-                self.problem = f"{_NO_ROUTER}: {error}"
-            await asyncio.sleep(RETRY_S)
 
-
-def _problem(fog: ZenohEdge, session: RosSession, relay: Relay) -> str:
+def _problem(fog: ZenohEdge, session: RosSession | DdsSession, relay: Relay) -> str:
     if not fog.connected:
         return "the floor's router is not connected"
-    if not session.connected:
-        return _NO_ROUTER
+    if session.problem:
+        return session.problem
     if relay.map_age_s > SILENT_S:
         return "the map-service is silent: the whole floor is slow"
     return ""
@@ -147,7 +140,7 @@ class Relay:
     def __init__(  # both sides, and what they tell each other by
         self,
         fog: ZenohEdge,
-        session: RosSession,
+        session: RosSession | DdsSession,
         floor: Floor,
         clock: Clock,
         others: Others,

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import json
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
@@ -26,6 +27,9 @@ WAITING_BYTES: Final = 4 * 1024 * 1024
 """So do messages beyond so many bytes."""
 BYTES_MAX: Final = 64 * 1024
 """A longer message is refused unread: to read one of 1 MiB would take 0.1 s, in which nothing else is done."""
+
+RETRY_S: Final = 1.0
+NO_ROUTER: Final = "ROS's router (`ros2 run rmw_zenoh_cpp rmw_zenohd`) is not connected"
 
 _log = logs.get("ros2")
 
@@ -52,7 +56,75 @@ def ros_config(source: Path | str) -> zenoh.Config:
     return config
 
 
-class RosSession:
+class Arrivals:
+    """What arrives from ROS, on whatever wire: limited, read on the event loop's thread, refused in words."""
+
+    def __init__(self, clock: Clock) -> None:
+        self._clock = clock
+        self._waiting = self._waiting_bytes = 0
+        self._loop = asyncio.get_running_loop()
+        self._limited = logs.RateLimited(_log)
+
+    def arrive(self, topic: Topic, length: int, read: Callable[[], None]) -> None:
+        """Have a message of `length` bytes read on the event loop, unless too much waits; from any thread."""
+        if self._loop.is_closed():
+            return
+        if length > BYTES_MAX:
+            self.refuse("too_long", topic.name, f"{length} bytes, and {BYTES_MAX} is the limit")
+            return
+        if self._waiting >= WAITING_MAX or self._waiting_bytes + length > WAITING_BYTES:
+            self.refuse("too_many", topic.name, f"{self._waiting} messages wait")
+            return
+        self._waiting, self._waiting_bytes = self._waiting + 1, self._waiting_bytes + length
+        self._loop.call_soon_threadsafe(self._read_next, topic, length, read)
+
+    def _read_next(self, topic: Topic, length: int, read: Callable[[], None]) -> None:
+        self._waiting, self._waiting_bytes = self._waiting - 1, self._waiting_bytes - length
+        try:
+            read()
+        except WireError as error:
+            self.refuse(error.reason, topic.name, str(error))
+
+    def hand_on(
+        self, topic: Topic, handler: Callable[[RosMessage], object], max_age_s: float | None, sent: float, data: bytes
+    ) -> None:
+        """Call a handler with the message of a payload that was sent at `sent` (s since 1970); raises `WireError`."""
+        age = self._clock.stamp() - sent
+        if max_age_s is not None and self._clock.speed == 1.0 and abs(age) > max_age_s:
+            raise WireError(
+                f"sent {age:.1f} s ago, and {max_age_s:g} s is the limit: it waited for too long, or the sender's "
+                "clock is not synchronized with this one (NTP)", "old",
+            )  # fmt: skip
+        handler(decoded(topic, data))
+
+    def refuse(self, reason: str, topic: str, words: str) -> None:
+        """Count and log a message that is not understood."""
+        REFUSED.labels("ros2", reason).inc()
+        self._limited.warning("message_refused", f"{topic} {reason}", self._loop.time(), topic=topic, reason=words)
+
+
+class ZenohWire:
+    """How a bridge reaches ROS by zenoh."""
+
+    def __init__(self, config: zenoh.Config, domain: int) -> None:
+        """Use the router, or whatever `config` connects to, and the domain that ROS_DOMAIN_ID is for the robots."""
+        self._config, self._domain = config, domain
+        self.problem = ""
+        """Why there is no session yet."""
+
+    async def opened(self, name: str, clock: Clock) -> RosSession:
+        """Return a node once the router is there; afterwards it connects again by itself."""
+        while True:
+            try:
+                session = await asyncio.to_thread(zenoh.open, self._config)
+            except zenoh.ZError as error:
+                self.problem = f"{NO_ROUTER}: {error}"
+                await asyncio.sleep(RETRY_S)
+            else:
+                return RosSession(session, self._domain, name, clock)
+
+
+class RosSession(Arrivals):
     """A node of ROS on a zenoh session: publishers and subscribers with their tokens of presence.
 
     Subscribers' handlers are called on the event loop's thread.
@@ -60,21 +132,18 @@ class RosSession:
 
     def __init__(self, session: zenoh.Session, domain: int, name: str, clock: Clock) -> None:
         """Introduce the node `name`."""
+        super().__init__(clock)
         self._session = session
-        self._clock = clock
-        self._waiting = self._waiting_bytes = 0
-        self._loop = asyncio.get_running_loop()
         self._domain = domain
         self._node = Node(domain, str(self._session.info.zid()), name)
         self._held: list[object] = [self._session.liveliness().declare_token(self._node.token)]
         self._writers: dict[Topic, tuple[Writer, Any]] = {}
-        self._limited = logs.RateLimited(_log)
 
     @property
-    def connected(self) -> bool:
-        """Whether a router or a peer is connected."""
+    def problem(self) -> str:
+        """Why nobody hears it; empty while a router or a peer is connected."""
         info = self._session.info
-        return bool(info.routers_zid() or info.peers_zid())
+        return "" if info.routers_zid() or info.peers_zid() else NO_ROUTER
 
     def publish(self, topic: Topic, message: object, stamp: float) -> None:
         """Publish a message without waiting; `stamp` (s since 1970) is when."""
@@ -108,56 +177,28 @@ class RosSession:
         """
 
         def on_sample(sample: zenoh.Sample) -> None:
-            if self._loop.is_closed():
-                return
-            length = len(sample.payload)
-            if length > BYTES_MAX:
-                self.refuse("too_long", topic.name, f"{length} bytes, and {BYTES_MAX} is the limit")
-                return
-            if self._waiting >= WAITING_MAX or self._waiting_bytes + length > WAITING_BYTES:
-                self.refuse("too_many", topic.name, f"{self._waiting} messages wait")
-                return
             attachment = None if sample.attachment is None else sample.attachment.to_bytes()
-            arrived = (str(sample.key_expr), sample.payload.to_bytes(), attachment)
-            self._waiting, self._waiting_bytes = self._waiting + 1, self._waiting_bytes + length
-            self._loop.call_soon_threadsafe(self._on_sample, topic, handler, max_age_s, *arrived)
+            arrived = (str(sample.key_expr), sample.payload, attachment)
+            self.arrive(topic, len(sample.payload), partial(self._read, topic, handler, max_age_s, *arrived))
 
         self._held.append(self._session.declare_subscriber(topic.any_hash(self._domain), on_sample))
         self._held.append(self._session.liveliness().declare_token(self._node.entity("MS", topic)))
 
-    def _on_sample(  # what a sample consists of
+    def _read(  # what a sample consists of
         self, topic: Topic, handler: Callable[[RosMessage], object], max_age_s: float | None,
-        key: str, payload: bytes, attachment: bytes | None,
+        key: str, payload: zenoh.ZBytes, attachment: bytes | None,
     ) -> None:  # fmt: skip
-        self._waiting, self._waiting_bytes = self._waiting - 1, self._waiting_bytes - len(payload)
-        try:
-            _check_hash(topic.type, key.rpartition("/")[2])
-            sent = Attachment.decoded(attachment or b"")
-            if max_age_s is not None:
-                self._check_age(sent.sent_ns / 1e9, max_age_s)
-            handler(decoded(topic, payload))
-        except WireError as error:
-            self.refuse(error.reason, topic.name, str(error))
-
-    def _check_age(self, sent: float, max_age_s: float) -> None:
-        age = self._clock.stamp() - sent
-        if self._clock.speed == 1.0 and abs(age) > max_age_s:
-            raise WireError(
-                f"sent {age:.1f} s ago, and {max_age_s:g} s is the limit: it waited for too long, or the sender's "
-                "clock is not synchronized with this one (NTP)", "old",
-            )  # fmt: skip
-
-    def refuse(self, reason: str, topic: str, words: str) -> None:
-        """Count and log a message that is not understood."""
-        REFUSED.labels("ros2", reason).inc()
-        self._limited.warning("message_refused", f"{topic} {reason}", self._loop.time(), topic=topic, reason=words)
+        check_hash(topic.type, key.rpartition("/")[2])
+        sent = Attachment.decoded(attachment or b"")
+        self.hand_on(topic, handler, max_age_s, sent.sent_ns / 1e9, payload.to_bytes())
 
     def close(self) -> None:
         """Close the session; its tokens go with it."""
         self._session.close()  # type: ignore[no-untyped-call]  # zenoh's stub has no types for it
 
 
-def _check_hash(kind: str, theirs: str) -> None:
+def check_hash(kind: str, theirs: str) -> None:
+    """Raise `WireError` when the hash of a sender's type is not ours."""
     if theirs not in (own := type_hash(kind), "TypeHashNotSupported"):
         raise WireError(
             f"the sender's {kind} is {theirs}, and ours is {own}: it was built with another version of the message's "

@@ -164,11 +164,12 @@ class Writer:
 
     def encoded(self, message: object, sent_ns: int) -> tuple[bytes, bytes]:
         """Return a message's payload (CDR, little-endian, after its header) and attachment."""
-        if self.topic.type == _GRID:
-            payload = _encoded_grid(message)
-        else:
-            payload = bytes(TYPES.serialize_cdr(message, self.topic.type))
-        return payload, Attachment(next(self._numbers), sent_ns, self._gid).encoded()
+        return serialized(self.topic.type, message), Attachment(next(self._numbers), sent_ns, self._gid).encoded()
+
+
+def serialized(kind: str, message: RosMessage) -> bytes:
+    """Return a message's payload (CDR, little-endian, after its header)."""
+    return _encoded_grid(message) if kind == _GRID else bytes(TYPES.serialize_cdr(message, kind))
 
 
 def _encoded_grid(grid: RosMessage) -> bytes:

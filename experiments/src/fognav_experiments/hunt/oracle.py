@@ -449,13 +449,13 @@ class Oracle:
         for (zone, version), asked in list(self._writes.items()):
             late = fast and self._now - asked > _WRITTEN_S + self._world.late_s
             values = f"{self._speed:.2f} m/s, zone {zone} was published in no version for {self._now - asked:.1f} s"
-            self._lasts("write", f"{zone} {version}", late, values, 0.0)
+            self._lasts("write", f"{zone} {version}", late, values, self._world.wrong_s)
         for key, (needed, asked) in list(self._written.items()):
             if self._version >= needed:
                 del self._written[key]
             late = key in self._written and fast and self._now - asked > _WRITTEN_S + _SLOW_S + 2.0 * self._world.late_s
             values = f"{self._speed:.2f} m/s on map {self._version}, zone {key[0]} of {asked:.1f} s is in {needed}"
-            self._lasts("write", f"{key[0]} {key[1]}", late, values, 0.0)
+            self._lasts("write", f"{key[0]} {key[1]}", late, values, self._world.wrong_s)
 
     def _check_hazards(self) -> None:
         for area, since in self._obstacles.items():

@@ -13,12 +13,14 @@ import pytest
 from compiler import compiled_only, examples
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from shortest_paths import Cell, cell_of, costmaps, dijkstra
+from shortest_paths import Cell, cell_of, costmaps, dijkstra, floors
 
 from fog_contracts.costs import DEFAULT_INFLATION
 from fog_contracts.geometry import lengths_along
 from fog_kernels.astar import Planner, nearest_traversable
+from fog_kernels.guides import LANDMARKS
 from fog_kernels.inflation import inflate, inflation_table
+from fog_kernels.landmarks import Landmarks
 from fog_kernels.lines import cost_from, line_cost, shortcut
 from fog_kernels.steps import DIAGONAL, STRAIGHT
 from fog_kernels.tiles import TilePatterns
@@ -111,6 +113,43 @@ def test_search_from_the_goal_guided_by_the_field_of_another_cell_equals_a_full_
         expected = dijkstra(costmap, robot).get(goal)
         result = planner.plan(costmap, goal, robot, field=bound)
         assert result.cost == (math.inf if expected is None else expected / (2 * STRAIGHT))
+
+
+@settings(max_examples=examples(200), deadline=None)
+@given(floors(), st.data())
+def test_search_guided_by_landmarks_equals_a_full_search(static: NDArray[np.uint8], data: st.DataObject) -> None:
+    height, width = static.shape
+    planner, landmarks = Planner(width, height), Landmarks(width, height)
+    for _ in range(data.draw(st.integers(0, 17))):
+        if not landmarks.is_complete:
+            landmarks.add(static, planner.goal_field)
+    for _ in range(3):  # one search finds the tiles' bounds as another has left them
+        start, goal = cell_of(data, static), cell_of(data, static)
+        costmap = static.copy()
+        x, y = cell_of(data, static)
+        patch = costmap[y : y + data.draw(st.integers(1, height)), x : x + data.draw(st.integers(1, width))]
+        np.maximum(patch, data.draw(st.sampled_from([0, 30, 200, 254])), out=patch)
+        expected = dijkstra(costmap, start).get(goal)
+        result = planner.plan(costmap, start, goal, landmarks=landmarks)
+        assert result.cost == (math.inf if expected is None else expected / (2 * STRAIGHT))
+        if result.found:
+            assert_valid(costmap, result.cells, start, goal, result.cost)
+
+
+def test_landmarks_lead_round_what_lies_on_the_straight_way_and_are_far_from_each_other() -> None:
+    costmap = np.zeros((48, 80), np.uint8)
+    costmap[:44, 40] = 254
+    planner, landmarks = Planner(80, 48), Landmarks(80, 48)
+    while not landmarks.is_complete:
+        landmarks.add(costmap, planner.goal_field)
+    cells = [field.goal for field in landmarks.fields]
+    assert len(set(cells)) == len(cells) == min(LANDMARKS, landmarks.lowest.shape[1])
+    assert {(x < 40, y < 24) for x, y in cells[:5]} == {(True, True), (False, True), (True, False), (False, False)}
+    unguided, guided = (planner.plan(costmap, (35, 2), (45, 2), landmarks=each) for each in (None, landmarks))
+    assert guided.cost == unguided.cost
+    assert guided.expansions < unguided.expansions / 2
+    with pytest.raises(ValueError, match="landmarks"):
+        Planner(48, 80).plan(costmap.T.copy(), (0, 0), (3, 3), landmarks=landmarks)
 
 
 @pytest.mark.parametrize(

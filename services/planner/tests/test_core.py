@@ -622,6 +622,17 @@ def test_robot_is_led_round_a_hazard_near_its_goal_by_a_short_search_and_as_chea
     assert costs[0] == pytest.approx(costs[1], rel=0.01)
 
 
+@pytest.mark.parametrize(("landmark_bytes", "found"), [(10_000_000, True), (0, False)])
+def test_landmarks_lead_to_a_new_goal_by_a_short_search(landmark_bytes: int, *, found: bool) -> None:
+    config = PlannerConfig(unguided_expansions=1500, quick_expansions=5, landmark_bytes=landmark_bytes)
+    drive = Drive(start=LEFT, config=config)
+    drive.step(3.0)
+    path = drive.go(*RIGHT)
+    assert (path.refusal is None) == found
+    if found:
+        assert length(path) == pytest.approx(length(Drive(start=LEFT).go(*RIGHT)), rel=0.01)
+
+
 def test_refused_robot_is_searched_again_only_after_a_cost_fell_and_at_most_once_a_second() -> None:
     drive = Drive(start=LEFT)
     drive.send(drive.map.put("z1", UPPER) + drive.map.put("z2", LOWER))

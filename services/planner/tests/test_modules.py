@@ -31,7 +31,8 @@ from fog_kernels.astar import Planner
 from fog_kernels.inflation import inflate, inflation_table
 from fog_kernels.lines import line_cost
 from planner.config import PlannerConfig
-from planner.heuristics import FieldJob, GoalFields
+from planner.field_jobs import FieldJob
+from planner.heuristics import GoalFields
 from planner.missions import Mission, Plan
 from planner.path_search import PathSearch, Route, SearchResult, find_egress
 from planner.planning_map import CostChange, MapTracker, PlanningMap
@@ -321,6 +322,28 @@ def test_origins_get_fields_one_after_another_once_the_goals_have_theirs_and_onl
             run(fields, job)
     assert fields.jobs([(1, 1)], [(60, 2)]) == []
     assert fields.exact.keys() == {(1, 1)}
+
+
+def test_landmarks_are_added_while_no_goal_waits_and_begin_anew_when_a_cost_falls_below_the_floor() -> None:
+    fields = GoalFields(10_000, landmark_capacity=10_000)
+    fields.set_bounds(BOUND, BOUND)
+    (goal_job,) = fields.jobs([(3, 3)])
+    assert fields.landmark_jobs() == []
+    run(fields, goal_job)
+    known = fields.landmarks
+    assert known is not None
+    while jobs := fields.landmark_jobs():
+        assert fields.landmark_jobs() == []
+        jobs[0].run()
+        fields.add_landmark(jobs[0])
+    assert known.is_complete
+    assert known.fields
+    fields.set_bounds(BOUND, BOUND + 1)
+    assert fields.landmarks is known
+    floor = BOUND.copy()
+    fields.set_bounds(floor, floor)
+    assert fields.landmarks is not None
+    assert not fields.landmarks.fields
 
 
 # --- Regions, search, egress ---

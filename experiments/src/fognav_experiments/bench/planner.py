@@ -1,10 +1,11 @@
 """Measures path searches on a floor: from scratch, and again after a hazard on the path, against exact references.
 
-Every query is planned from scratch by A*. Its cost is compared with that of a Dijkstra search from the goal, which is
-another kernel, and with the length that a scenario of the MovingAI benchmarks publishes. Then a hazard is put onto the
-path, and the path is planned again as the planner does it: from the robot, guided by the goal's field over the floor
-without the hazard, or, if the hazard is nearer to the goal, from the goal, guided by the field of where the robot
-began. Its cost is compared with that of a search without a guide on the same costs.
+Every query is planned from scratch by A*, guided by landmarks as for a goal that has no field yet. Its cost is compared
+with that of a Dijkstra search from the goal, which is another kernel, and with the length that a scenario of the
+MovingAI benchmarks publishes. Then a hazard is put onto the path, and the path is planned again as the planner does it:
+from the robot, guided by the goal's field over the floor without the hazard, or, if the hazard is nearer to the goal,
+from the goal, guided by the field of where the robot began. Its cost is compared with that of a search without a guide
+on the same costs.
 
 Times are of the processor, so that other work on the machine counts little, with cold caches, and in turn with the
 searches of other packages that are installed.
@@ -26,6 +27,7 @@ from fog_contracts.costs import DEFAULT_INFLATION, INSCRIBED, LETHAL, NEUTRAL_WE
 from fog_kernels.astar import Planner
 from fog_kernels.components import Components
 from fog_kernels.inflation import inflate, inflation_table
+from fog_kernels.landmarks import Landmarks
 from fog_kernels.lines import line_cost
 from fog_kernels.steps import STRAIGHT
 from fog_kernels.tiles import TilePatterns
@@ -133,6 +135,9 @@ class Figures:
     """What was measured: times in ms, and how many results equal their references."""
 
     cold: list[float] = dataclasses.field(default_factory=list)
+    """Searches that landmarks guide ..."""
+    unguided: list[float] = dataclasses.field(default_factory=list)
+    """... and the same without."""
     field: list[float] = dataclasses.field(default_factory=list)
     expansions: list[int] = dataclasses.field(default_factory=list)
     shortcut: list[float] = dataclasses.field(default_factory=list)
@@ -157,6 +162,8 @@ class Figures:
             "median_ms": percentile(self.cold, 50),
             "mean_ms": round(float(np.mean(self.cold)), 2),
             "p99_ms": percentile(self.cold, 99),
+            "unguided_median_ms": percentile(self.unguided, 50),
+            "unguided_p99_ms": percentile(self.unguided, 99),
             "expansions_median": int(np.median(self.expansions)),
             "field_median_ms": percentile(self.field, 50),
             "shortcut_median_ms": percentile(self.shortcut, 50),
@@ -188,14 +195,24 @@ def measure(
 ) -> dict[str, object]:
     """Run all queries and return the figures; `on_progress` is called with the number of those that are done."""
     height, width = floor.costmap.shape
-    planner, figures = Planner(width, height), Figures()
+    planner, figures, landmarks = Planner(width, height), Figures(), Landmarks(width, height)
+    begun = time.thread_time()
+    while not landmarks.is_complete:
+        landmarks.add(floor.costmap, planner.goal_field)
+    built = time.thread_time() - begun
     peers, missing = installed_peers(floor.costmap)
     for number, query in enumerate(queries):
-        _measure_query(floor, query, planner, figures, rng)
+        _measure_query(floor, query, planner, landmarks, figures, rng)
         for name, search in peers.items():
             _timed(figures.peers.setdefault(name, []), partial(search, query.start, query.goal))
         on_progress(number + 1)
-    return {**figures.summary(), "not_installed": ", ".join(missing) or "none"}
+    return {
+        **figures.summary(),
+        "landmarks": len(landmarks.fields),
+        "landmarks_mb": round(landmarks.size / 1e6, 1),
+        "landmarks_s": round(built, 2),
+        "not_installed": ", ".join(missing) or "none",
+    }
 
 
 _OTHER_DATA: Final[NDArray[np.uint8]] = np.zeros(64_000_000, np.uint8)
@@ -210,14 +227,17 @@ def _timed(times: list[float], work: Callable[[], T]) -> T:
     return done
 
 
-def _measure_query(floor: Floor, query: Query, planner: Planner, figures: Figures, rng: np.random.Generator) -> None:
+def _measure_query(  # what a query needs, and what it tells
+    floor: Floor, query: Query, planner: Planner, landmarks: Landmarks, figures: Figures, rng: np.random.Generator
+) -> None:
     start, goal, length = query
     costmap, patterns = floor.costmap, TilePatterns(_PATTERN_BYTES)
-    found = _timed(figures.cold, lambda: planner.plan(costmap, start, goal))
+    unguided = _timed(figures.unguided, lambda: planner.plan(costmap, start, goal))
+    found = _timed(figures.cold, lambda: planner.plan(costmap, start, goal, landmarks=landmarks))
     figures.expansions.append(found.expansions)
     guide = _timed(figures.field, lambda: planner.goal_field(costmap, goal, patterns))
     expected = math.inf if length is None else NEUTRAL_WEIGHT * length
-    figures.optimal += found.cost == _cost(guide, start, width=costmap.shape[1]) and (
+    figures.optimal += unguided.cost == found.cost == _cost(guide, start, width=costmap.shape[1]) and (
         length is None or math.isclose(found.cost, expected, rel_tol=1e-5, abs_tol=NEUTRAL_WEIGHT * 5e-3)
     )
     if not found.found:

@@ -246,10 +246,11 @@ def planner_command(
     """Measure path searches: from scratch, and again after a hazard of 2 x 2 m on the path.
 
     The office has 100 x 60 m at 5 cm; without a scenario, queries are long ones. `optimal` counts the queries that cost
-    what a Dijkstra search finds, and have the published length; `replans_optimal` the replans that cost what a search
-    from scratch finds; `replans_closed` those that no path is left for. Times are in ms of the processor, with cold
-    caches; `field_median_ms` is that of the goal's field, once per goal. Beside them stand pyastar2d, tcod and
-    scikit-image, if they are installed, and by how much paths cost more than along the gradient of NavFn's potential.
+    what an unguided and a Dijkstra search find, and have the published length; `replans_optimal` the replans that cost
+    what a search from scratch finds; `replans_closed` those that no path is left for. Times are in ms of the processor,
+    with cold caches; `field_median_ms` is that of the goal's field, once per goal. Beside them stand pyastar2d, tcod
+    and scikit-image, if they are installed, and by how much paths cost more than along the gradient of NavFn's
+    potential.
     """
     import numpy as np  # noqa: PLC0415  # keeps the other commands fast
 

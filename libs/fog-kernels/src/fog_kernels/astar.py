@@ -24,7 +24,7 @@ from numba import int64, njit, types, void
 from fog_contracts.costs import COST_WEIGHT, INSCRIBED, NEUTRAL_WEIGHT
 from fog_kernels import _arrays
 from fog_kernels.flood import descend, fill_field
-from fog_kernels.guides import TILE, TILE_BITS, GoalField
+from fog_kernels.guides import TILE, TILE_BITS, GoalField, fill_tile
 from fog_kernels.lines import shortcut
 from fog_kernels.steps import DIAGONAL, FOUND, NOT_FOUND, OVERFLOW, QUEUE_FULL, SEALED, STRAIGHT, TIMED_OUT, weights_of
 
@@ -32,10 +32,14 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from fog_kernels.guides import Detour
+    from fog_kernels.landmarks import Landmarks
     from fog_kernels.tiles import TilePatterns
 
     _Cells = NDArray[np.int32]
-    _Guides = tuple[_Cells, int, int, int, _Cells, _Cells, _Cells, int, int]
+    _Guides = tuple[
+        _Cells, int, int, int, _Cells, _Cells, _Cells, int, int,
+        _Cells, _Cells, _Cells, _Cells, _Cells, _Cells, _Cells, int,
+    ]  # fmt: skip
 
 BUCKETS = 1024  # heads fit the first-level cache; a power of two
 
@@ -59,6 +63,14 @@ def _search_signature(costs: Any) -> Any:
         _arrays.I32_FLAT,  # detour
         int64,  # detour_highest
         int64,  # detour_offset
+        _arrays.I32_FLAT,  # landmark_lowest
+        _arrays.I32_FLAT,  # landmark_slots
+        _arrays.I32_FLAT,  # landmark_patterns
+        _arrays.I32_FLAT,  # chosen
+        _arrays.I32_FLAT,  # own
+        _arrays.I32_OUT,  # bounds
+        _arrays.I32_OUT,  # filled
+        int64,  # number
         write,  # g
         type_scratch,  # queue_cell
         type_scratch,  # queue_next
@@ -86,6 +98,14 @@ def _search(
     detour: Any,
     detour_highest: Any,
     detour_offset: int,
+    landmark_lowest: Any,
+    landmark_slots: Any,
+    landmark_patterns: Any,
+    chosen: Any,
+    own_costs: Any,
+    bounds: Any,
+    filled: Any,
+    number: int,
     g: Any,
     queue_cell: Any,
     queue_next: Any,
@@ -97,6 +117,8 @@ def _search(
 ) -> None:
     """Search from start to goal; an empty `lowest` (see `GoalField`) means the octile heuristic, and no detour.
 
+    With landmarks, `bounds` is `patterns`, and the rows of the tiles that this search, by its `number`, has not entered
+    yet in `filled` are written when it does.
     `g` holds its largest value everywhere before and after. A negative g is the complement of an expanded cell's
     cost. `result` receives status, cost, path length, expansions; the path itself ends in queue_cell, goal first.
     """
@@ -109,6 +131,7 @@ def _search(
     use_field = lowest.size > 0
     use_patterns = slots.size > 0
     use_detour = detour.size > 0
+    use_landmarks = chosen.size > 0
     goal_x = goal % width
     goal_y = goal // width
     last = TILE - 1
@@ -131,6 +154,12 @@ def _search(
     x: Any = start % width
     if use_field:
         block = np.uint64((y >> field_bits) * field_width + (x >> field_bits))
+        if use_landmarks and filled[block] != number:
+            filled[block] = number
+            fill_tile(
+                np.int64(block), field_width, goal_x, goal_y, step_straight, step_extra,
+                landmark_lowest, landmark_slots, landmark_patterns, chosen, own_costs, bounds,
+            )  # fmt: skip
         remaining: Any = np.int64(lowest[block]) * field_unit
         if remaining < 0:
             return
@@ -251,6 +280,12 @@ def _search(
             ny = y + rows[k]
             if use_field:
                 block = np.uint64((ny >> field_bits) * field_width + (nx >> field_bits))
+                if use_landmarks and filled[block] != number:
+                    filled[block] = number
+                    fill_tile(
+                        np.int64(block), field_width, goal_x, goal_y, step_straight, step_extra,
+                        landmark_lowest, landmark_slots, landmark_patterns, chosen, own_costs, bounds,
+                    )  # fmt: skip
                 remaining = np.int64(lowest[block]) * field_unit
                 if remaining < 0:
                     continue
@@ -371,6 +406,7 @@ def _nearest_traversable(costmap: Any, col: int, row: int, reach: int) -> int:
 
 
 _NO_GUIDE: NDArray[np.int32] = np.empty(0, np.int32)
+_NO_CELLS: NDArray[np.int32] = np.empty(0, np.int32)
 _NO_EXITS: NDArray[np.uint8] = np.empty(0, np.uint8)
 
 
@@ -419,6 +455,8 @@ class Planner:
         self._heads = np.empty(BUCKETS, np.int32)
         self._reached_cells = np.empty(width * height, np.int32)
         self._result = np.zeros(4, np.int64)
+        self._bounds = self._filled = self._level = self._tiles = _NO_GUIDE
+        self._number = 0
 
     def _allocate(self) -> None:
         # np.empty only reserves memory; pages that no search uses cost none. g must be initialized.
@@ -453,19 +491,22 @@ class Planner:
         max_expansions: int = 0,
         field: GoalField | None = None,
         detour: Detour | None = None,
+        landmarks: Landmarks | None = None,
     ) -> PlanResult:
         """Return a cheapest path from start to goal, both (column, row), on a uint8 (h, w) costmap.
 
         The goal's field, if given, guides the search, which stays exact as long as no cell of the costmap is lower than
         in the costmap of the field; so does the detour, which counts with a field only, for a goal outside its part of
-        the floor. `max_expansions` above 0 limits the work. A start or goal that isn't traversable
-        gives `found=False`. Raises ValueError for cells outside, for a costmap of another shape, and for a field of
+        the floor. Without a field, landmarks guide it, on the same condition. `max_expansions` above 0 limits the work.
+        A start or goal that isn't traversable gives `found=False`. Raises ValueError for cells outside, for a costmap
+        of another shape, for landmarks of another, and for a field of
         another goal or shape.
         """
         costmap = self._grid(costmap)
         first = self._index(start, "start")
         last = self._index(goal, "goal")
-        guides = self._guides((int(goal[0]), int(goal[1])), field, detour)
+        here, there = (int(start[0]), int(start[1])), (int(goal[0]), int(goal[1]))
+        guides = self._guides(here, there, field, detour, landmarks)
         while True:
             _search(
                 costmap.ravel(),
@@ -503,10 +544,20 @@ class Planner:
         _write_path(self._queue_cell, self.width, cells)
         return PlanResult(found=True, cost=cost / (2.0 * STRAIGHT), cells=cells, expansions=expansions)
 
-    def _guides(self, goal: tuple[int, int], field: GoalField | None, detour: Detour | None) -> _Guides:
-        """Return the kernel's arguments for field and detour; raises ValueError for a field of another goal or map."""
+    def _guides(
+        self,
+        start: tuple[int, int],
+        goal: tuple[int, int],
+        field: GoalField | None,
+        detour: Detour | None,
+        landmarks: Landmarks | None,
+    ) -> _Guides:
+        """Return the kernel's arguments for what guides it; raises ValueError for a field of another goal or map."""
+        no_landmarks = _NO_GUIDE, _NO_GUIDE, _NO_GUIDE, _NO_GUIDE, _NO_GUIDE, _NO_CELLS, _NO_CELLS, 0
         if field is None:
-            return _NO_GUIDE, 0, 0, 0, _NO_GUIDE, _NO_GUIDE, _NO_GUIDE, 0, 0
+            if landmarks is not None and self._costs is np.int32:
+                return self._landmark_guides(start, goal, landmarks)
+            return _NO_GUIDE, 0, 0, 0, _NO_GUIDE, _NO_GUIDE, _NO_GUIDE, 0, 0, *no_landmarks
         if field.goal != goal or (field.width, field.height) != (self.width, self.height):
             size = f"{field.width} x {field.height}"
             raise ValueError(f"the field is of goal {field.goal} on {size} cells: pass that of this goal and map")
@@ -515,7 +566,26 @@ class Planner:
             around, highest = detour.costs.ravel(), detour.highest
         return (
             field.lowest.ravel(), field.lowest.shape[1], field.bits, field.unit, field.slots.ravel(),
-            field.patterns.ravel(), around, highest, offset or 0,
+            field.patterns.ravel(), around, highest, offset or 0, *no_landmarks,
+        )  # fmt: skip
+
+    def _landmark_guides(self, start: tuple[int, int], goal: tuple[int, int], landmarks: Landmarks) -> _Guides:
+        if (landmarks.width, landmarks.height) != (self.width, self.height):
+            size = f"{landmarks.width} x {landmarks.height}"
+            raise ValueError(f"the landmarks are on {size} cells: pass those of this map")
+        tiles = landmarks.lowest.shape[1]
+        if self._bounds.size == 0:
+            self._bounds = np.empty(tiles * TILE * TILE, np.int32)
+            self._filled = np.zeros(tiles, np.int32)
+            self._level, self._tiles = np.zeros(tiles, np.int32), np.arange(tiles, dtype=np.int32)
+        self._number += 1
+        chosen, own = landmarks.best(start, goal)
+        if chosen.size == 0:
+            return self._guides(start, goal, None, None, None)
+        return (
+            self._level, landmarks.columns, TILE_BITS, 1, self._tiles, self._bounds, _NO_GUIDE, 0, 0,
+            landmarks.lowest.ravel(), landmarks.slots.ravel(), landmarks.patterns.ravel(), chosen, own,
+            self._bounds, self._filled, self._number,
         )  # fmt: skip
 
     def _widen(self) -> None:

@@ -26,6 +26,8 @@ TILE_BITS: Final = 4
 TILE: Final = 1 << TILE_BITS
 NO_PATH: Final = -1
 """In a field: no path leads from here to the goal."""
+LANDMARKS: Final = 16
+"""How many landmarks a floor has at most (`landmarks`)."""
 LEVEL: Final = 0
 """The slot of the pattern of a tile whose cells all count as its lowest cost."""
 _NONE: Final = int(np.iinfo(np.int64).max)
@@ -82,6 +84,46 @@ def _least_rise(
         if cost >= 0:
             least = min(least, cost - levels[i])
     return int(least)
+
+
+@njit(
+    void(
+        int64, int64, int64, int64, int64, int64,
+        _arrays.I32_FLAT, _arrays.I32_FLAT, _arrays.I32_FLAT, _arrays.I32_FLAT, _arrays.I32_FLAT, _arrays.I32_OUT,
+    ),
+    cache=True, nogil=True, error_model="numpy",
+)  # fmt: skip
+def fill_tile(
+    tile: Any, columns: Any, goal_x: Any, goal_y: Any, straight: Any, extra: Any,
+    lowest: Any, slots: Any, patterns: Any, chosen: Any, own: Any, bounds: Any,
+) -> None:  # fmt: skip
+    """Write the bounds of a tile's cells: -1 where no path leads from there to the goal.
+
+    straight, extra: the least cost of a straight step, and by how much that of a diagonal one exceeds it. chosen: the
+    landmarks by their number, own: the goal's cost in the field of each.
+    """
+    tiles = lowest.size // LANDMARKS
+    row = bounds[tile * TILE * TILE : (tile + 1) * TILE * TILE]
+    left, top = tile % columns * TILE, tile // columns * TILE
+    for y in range(TILE):
+        down = abs(top + y - goal_y)
+        for x in range(TILE):
+            across = abs(left + x - goal_x)
+            row[y * TILE + x] = np.int32(straight * max(across, down) + extra * min(across, down))
+    for i in range(chosen.size):
+        place = np.int64(chosen[i]) * tiles + tile
+        if lowest[place] == NO_PATH:
+            row[:] = NO_PATH
+            return
+        rise = np.int32(lowest[place] - own[i])
+        first = np.int64(slots[place]) << 2 * TILE_BITS
+        pattern = patterns[first : first + TILE * TILE]
+        for cell in range(TILE * TILE):
+            row[cell] = max(row[cell], abs(np.int32(rise + pattern[cell])))
+        if i == chosen.size - 1:
+            for cell in range(TILE * TILE):
+                if pattern[cell] < 0:
+                    row[cell] = NO_PATH
 
 
 @dataclass(frozen=True, slots=True)

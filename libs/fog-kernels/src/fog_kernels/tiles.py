@@ -161,6 +161,11 @@ class TilePatterns:
         return (self._count - 1) * 4 * _CELLS
 
     @property
+    def rows(self) -> NDArray[np.int32]:
+        """All patterns, (n, 256)."""
+        return self._patterns
+
+    @property
     def crowded(self) -> bool:
         """Whether more than half of the room is taken."""
         return 2 * self._count > self._limit

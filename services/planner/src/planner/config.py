@@ -57,7 +57,9 @@ class PlannerConfig:
     standing_s: float = 60.0
     """What has stayed on the map for so long, zones above all, is in the distance fields, too."""
     goal_fields_bytes: int = 40_000_000
-    """The memory of all distance fields together."""
+    """The memory of all goals' distance fields together."""
+    landmark_bytes: int = 10_000_000
+    """That of the landmarks' fields, which guide searches to goals that have none yet."""
     refused_retry_s: float = 1.0
     """A refused robot gets a new search at most this often, and only after a cost fell or the robot moved."""
     explain_period_s: float = 1.0

@@ -20,7 +20,8 @@ from fog_contracts.handlers import Fence, Publication
 from fog_contracts.replica import MapError
 from planner.config import PlannerConfig
 from planner.dry_run import State, run
-from planner.heuristics import DeadEndsJob, FieldJob, GoalFields
+from planner.field_jobs import FieldJob, LandmarkJob
+from planner.heuristics import DeadEndsJob, GoalFields
 from planner.missions import Missions
 from planner.planning_map import MapTracker, PreparedMap
 from planner.queries import Answerer, ExplainJob, View
@@ -55,7 +56,7 @@ if TYPE_CHECKING:
     from planner.missions import Mission
     from planner.planning_map import CostChange, PlanningMap
 
-    Job = DeadEndsJob | FieldJob | ExplainJob
+    Job = DeadEndsJob | FieldJob | LandmarkJob | ExplainJob
 
 
 class PlannerCore:
@@ -78,7 +79,7 @@ class PlannerCore:
             standing_s=self.config.standing_s,
         )
         self._regions = BlockedRegions()
-        self._fields = GoalFields(self.config.goal_fields_bytes)
+        self._fields = GoalFields(self.config.goal_fields_bytes, self.config.landmark_bytes)
         self.missions = Missions()
         self.places: Mapping[str, Place] | None = None
         """All places by id, as the map-service has them; None until it has told them."""
@@ -276,6 +277,7 @@ class PlannerCore:
         goals = list(self.missions.goal_cells(planning_map.geometry))
         origins = self.replanner.origins((mission for _, mission in self.missions.active()), planning_map.geometry)
         jobs: list[Job] = [*self.replanner.jobs(len(goals)), *self._fields.jobs(goals, origins)]
+        jobs += self._fields.landmark_jobs()
         if self._explaining is None and (explain := self._explain_job(at, planning_map)) is not None:
             self._explaining = explain
             jobs.append(explain)
@@ -285,6 +287,9 @@ class PlannerCore:
         """Use the result of a job that has run; return whether it calls for an immediate `tick`."""
         if isinstance(job, DeadEndsJob):
             self.replanner.detours.add(job)
+            return False
+        if isinstance(job, LandmarkJob):
+            self._fields.add_landmark(job)
             return False
         if isinstance(job, FieldJob):
             self._fields.add(job)
@@ -315,7 +320,8 @@ class PlannerCore:
         if planning_map is None:
             return None
         sources = self._regions.sources
-        return View(planning_map, sources, self._regions.revision, partial(cover, sources), self._fields.fields)
+        known, covers = self._fields, partial(cover, sources)
+        return View(planning_map, sources, self._regions.revision, covers, known.fields, known.landmarks)
 
     def state(self, now: float) -> State | None:
         """Return what dry runs are computed on, by any thread; None before the first map."""

@@ -20,18 +20,20 @@ from typing import TYPE_CHECKING, Final
 import numpy as np
 
 from fog_contracts.costs import INSCRIBED, NEUTRAL_WEIGHT
-from fog_kernels.astar import Planner
 from fog_kernels.dead_ends import DeadEnds
 from fog_kernels.detour import Shadow, compare_levels
+from fog_kernels.landmarks import Landmarks
 from fog_kernels.steps import DEFAULT_WEIGHTS, STRAIGHT
 from fog_kernels.tiles import TilePatterns
+from planner.field_jobs import FieldJob, FieldScratch, LandmarkJob
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
+    from collections.abc import Collection, Iterable, Mapping, Sequence
 
     from numpy.typing import NDArray
 
     from fog_contracts.replica import Version
+    from fog_kernels.astar import Planner
     from fog_kernels.guides import Detour, GoalField
     from planner.planning_map import Cell, Grid, PlanningMap
 
@@ -41,67 +43,6 @@ _PATTERN_SHARE: Final = 0.5
 """How much of the memory patterns may take; the rest is for what each field has for itself."""
 
 
-class FieldScratch:
-    """The memory in which fields are computed, one after another, on one thread; it exists only while it is used."""
-
-    def __init__(self) -> None:
-        self._planner: Planner | None = None
-
-    def compute(self, bound: Grid, goal: Cell, patterns: TilePatterns, bits: int) -> GoalField:
-        """Return the field of a goal, without the GIL (some 50 ms on 2000 x 1200 cells); see `Planner.goal_field`."""
-        height, width = bound.shape
-        if self._planner is None or (self._planner.width, self._planner.height) != (width, height):
-            self._planner = Planner(width, height)
-        return self._planner.goal_field(bound, goal, patterns, bits)
-
-    def release(self) -> None:
-        """Free the memory."""
-        self._planner = None
-
-
-class FieldJob:
-    """The computation of one goal's field over the costs `bound`.
-
-    With a `floor` a field over those costs is computed, too: it remains when a cost falls below the bound.
-    """
-
-    thread = "field"
-
-    def __init__(
-        self,
-        goal: Cell,
-        bound: Grid,
-        floor: Grid | None,
-        compute: Callable[[Grid, Cell], GoalField],
-        *,
-        on_end: Callable[[], object] | None = None,
-        only_exact: bool = False,
-    ) -> None:
-        """`compute` returns the field of a goal over costs; `on_end` is called when the job has run.
-
-        `only_exact`: a coarse field would be of no use.
-        """
-        self.goal = goal
-        self.only_exact = only_exact
-        self.bound = bound
-        self.field: GoalField | None = None
-        """None until `run` returns."""
-        self.fallback: GoalField | None = None
-        self.outdated = False
-        self._floor = floor
-        self._compute = compute
-        self._on_end = on_end
-
-    def run(self) -> None:
-        """Compute the field, unless the bound has changed meanwhile."""
-        if not self.outdated:
-            self.field = self._compute(self.bound, self.goal)
-            if self._floor is not None:
-                self.fallback = self._compute(self._floor, self.goal)
-        if self._on_end is not None:
-            self._on_end()
-
-
 class GoalFields:
     """The fields of the current goals, in `capacity` bytes at most; the least recently used are coarsened first.
 
@@ -109,8 +50,13 @@ class GoalFields:
     one falls, a field over the walls takes its place so long.
     """
 
-    def __init__(self, capacity: int) -> None:
+    def __init__(self, capacity: int, landmark_capacity: int = 0) -> None:
+        """`landmark_capacity`: the memory (bytes) of the landmarks' fields besides; 0: there are none."""
         self._capacity = capacity
+        self._landmark_capacity = landmark_capacity
+        self.landmarks: Landmarks | None = None
+        """They guide searches to goals without fields."""
+        self._adds_landmark = False
         self._floor: Grid = np.zeros((0, 0), dtype=np.uint8)
         self._bound: Grid = self._floor
         self._fields: OrderedDict[Cell, GoalField] = OrderedDict()
@@ -149,6 +95,8 @@ class GoalFields:
         if floor is not self._floor:
             self._fields.clear()
             self._fallbacks.clear()
+            height, width = floor.shape
+            self.landmarks = Landmarks(width, height, self._landmark_capacity) if self._landmark_capacity else None
         elif not np.all(bound >= self._bound):
             self._fields.clear()
         if not self._fields and not self._fallbacks:
@@ -196,6 +144,18 @@ class GoalFields:
         ]
         self._running.update({job.goal: job for job in jobs})
         return jobs
+
+    def landmark_jobs(self) -> list[LandmarkJob]:
+        """Return the search for another landmark, while no goal waits for its field; pass it to `add_landmark`."""
+        if self.landmarks is None or self.landmarks.is_complete or self._running or self._adds_landmark:
+            return []
+        self._adds_landmark = True
+        return [LandmarkJob(self.landmarks, self._floor, self._scratch)]
+
+    def add_landmark(self, job: LandmarkJob) -> None:
+        """Let the next landmark be searched, on another floor, too."""
+        assert job.has_run
+        self._adds_landmark = False
 
     def _make_room(self, current: Collection[Cell]) -> None:
         """Drop fields of goals that have ended, and patterns that no field has any more."""

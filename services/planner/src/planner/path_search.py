@@ -35,6 +35,7 @@ if TYPE_CHECKING:
     from fog_contracts.messages import PointXY, Refusal
     from fog_kernels.astar import PlanResult
     from fog_kernels.guides import Detour, GoalField
+    from fog_kernels.landmarks import Landmarks
     from planner.config import PlannerConfig
     from planner.planning_map import Cell, Grid, PlanningMap
     from planner.regions import Region
@@ -173,13 +174,14 @@ class PathSearch:
         detour: Detour | None = None,
         share: Share | None = None,
         origin: GoalField | None = None,
+        landmarks: Landmarks | None = None,
     ) -> SearchResult:
         """Return the cheapest path between two points (m, frame `map`), or why there is none.
 
         `field` is that of the goal's cell, if there is one, `detour` a bound that holds for start and goal; without
         one, `share` is asked for it when the search is long. With `origin`, the field of where the robot came from by a
         cheapest path, the search runs from the goal to the start instead: it is short where costs have risen near the
-        goal. Refusals name no hazard and no zone: the `question` can be
+        goal. `landmarks` guide a search without a field. Refusals name no hazard and no zone: the `question` can be
         answered later.
         """
         geometry = self.geometry
@@ -196,9 +198,9 @@ class PathSearch:
             return refused(goal_occupied(goal, nearest), Question("goal", start, goal, free, last))
         back = None if origin is None else origin.toward(free)
         if back is None:
-            found = self._search(planning_map, free, last, field, detour, share)
+            found = self._search(planning_map, free, last, field, detour, share, landmarks)
         else:
-            found = self._search(planning_map, last, free, back, None, None)
+            found = self._search(planning_map, last, free, back)
             found = None if found is None else replace(found, cells=np.ascontiguousarray(found.cells[::-1]))
         if found is None or found.timed_out:
             most = self._most(field)
@@ -220,14 +222,15 @@ class PathSearch:
             return refused(refuse(TIMEOUT, PlanRefusal.SEARCH_TOO_LONG, reason), searched=True)
         return refused(no_path(nearest_reachable(planning_map, question.start_cell, question.goal_cell)), question)
 
-    def _search(
+    def _search(  # noqa: PLR0913  # what guides a search
         self,
         planning_map: PlanningMap,
         start: Cell,
         goal: Cell,
         field: GoalField | None,
-        detour: Detour | None,
-        share: Share | None,
+        detour: Detour | None = None,
+        share: Share | None = None,
+        landmarks: Landmarks | None = None,
     ) -> PlanResult | None:
         """Search a path between two traversable cells; None if they are not connected.
 
@@ -238,13 +241,13 @@ class PathSearch:
             return None
         most, quick = self._most(field), self._config.quick_expansions
         if quick < most and (share is not None or not planning_map.has_components):
-            found = self.planner.plan(planning_map.cost, start, goal, quick, field, detour)
+            found = self.planner.plan(planning_map.cost, start, goal, quick, field, detour, landmarks)
             if not found.timed_out:
                 return found if found.found else None
             if not planning_map.reachable(start, goal):
                 return None
             detour = share(start, goal) if share is not None else detour
-        found = self.planner.plan(planning_map.cost, start, goal, most, field, detour)
+        found = self.planner.plan(planning_map.cost, start, goal, most, field, detour, landmarks)
         return found if found.found or found.timed_out else None
 
     def _points(self, cost: Grid, corners: Floats, start: PointXY, goal: PointXY, *, escaping: bool) -> Floats:

@@ -18,6 +18,7 @@ if TYPE_CHECKING:
 
     from fog_contracts.messages import EgressRequest, PlanRequest, Refusal
     from fog_kernels.guides import GoalField
+    from fog_kernels.landmarks import Landmarks
     from planner.config import PlannerConfig
     from planner.missions import Plan
     from planner.path_search import Covers, Question, SearchResult
@@ -36,6 +37,8 @@ class View:
     """The version of `sources`."""
     covers: Covers
     fields: Mapping[Cell, GoalField]
+    landmarks: Landmarks | None = None
+    """What guides searches to goals without fields; it holds on this map."""
 
 
 class Answerer:
@@ -54,7 +57,7 @@ class Answerer:
             return PlanReply(refusal=no_map())
         start, goal = (request.start.x, request.start.y), (request.goal.x, request.goal.y)
         field = view.fields.get(view.planning_map.geometry.cell(*goal))
-        found = self.search(view).find(view.planning_map, view.covers, start, goal, field)
+        found = self.search(view).find(view.planning_map, view.covers, start, goal, field, landmarks=view.landmarks)
         explained = None if found.question is None else self.explain(view, found.question)
         return _reply(found, explained, view.planning_map)
 

@@ -288,6 +288,7 @@ class Replanner:
             detour,
             partial(self._share, planning_map, self._search.planner, waiting) if shared else None,
             self._origin(mission.plan, geometry, danger),
+            self._fields.landmarks,
         )
 
     def _origin(self, plan: Plan | None, geometry: GridGeometry, danger: float) -> GoalField | None:

@@ -1,9 +1,10 @@
-"""Robots of ROS 2 by DDS: Cyclone DDS's own serializer is the other side."""
+"""Robots of ROS 2 by DDS: the other side is Cyclone DDS with its own serializer, or Fast DDS, if it is installed."""
 
 import asyncio
 import contextlib
 import json
 import os
+import shutil
 import signal
 import subprocess
 import sys
@@ -23,10 +24,11 @@ from fog_runtime.clock import SystemClock
 dds = pytest.importorskip("fog_bridges.ros2.dds", reason="pip install 'fog-bridges[dds]', on x86-64 only")
 pytestmark = pytest.mark.live
 
-DOMAIN = 77
+DOMAIN = 20 + os.getpid() % 80
+"""Of these tests alone."""
 LOOPBACK = """<CycloneDDS><Domain><General><Interfaces><NetworkInterface name="lo" multicast="false"/></Interfaces>
 <AllowMulticast>false</AllowMulticast></General><Discovery><ParticipantIndex>auto</ParticipantIndex><Peers>
-<Peer address="127.0.0.1"/></Peers><Tag>fognav-test-{}</Tag></Discovery></Domain></CycloneDDS>"""
+<Peer address="127.0.0.1"/></Peers></Discovery></Domain></CycloneDDS>"""
 MASK = Topic("fognav/test/keepout_mask", MAP_TYPE, latched=True)
 GOAL = Topic("r1/goal_pose", GOAL_TYPE)
 CLOCK = SystemClock()
@@ -36,20 +38,33 @@ CLOCK = SystemClock()
 def wire():
     """DDS within this computer, apart from whatever else runs here."""
     before = os.environ.get("CYCLONEDDS_URI")
-    os.environ["CYCLONEDDS_URI"] = LOOPBACK.format(os.getpid()).replace("\n", "")
+    os.environ["CYCLONEDDS_URI"] = LOOPBACK.replace("\n", "")
     yield dds.DdsWire(DOMAIN)
     del os.environ["CYCLONEDDS_URI"]
     if before is not None:
         os.environ["CYCLONEDDS_URI"] = before
 
 
-@contextlib.asynccontextmanager
-async def robot():
-    """Run a robot of others; yield it."""
-    script = Path(__file__).with_name("dds_peer.py")
-    process = await asyncio.create_subprocess_exec(
-        sys.executable, str(script), str(DOMAIN), "test", "r1", stdout=asyncio.subprocess.PIPE
+@pytest.fixture(scope="module")
+def fast_dds(tmp_path_factory) -> list[str]:
+    """The command of a robot on Fast DDS."""
+    if not Path("/usr/include/fastdds/dds/topic/TopicDataType.hpp").exists() or shutil.which("g++") is None:
+        pytest.skip("needs Fast DDS 2 and a compiler: apt-get install libfastrtps-dev libfastcdr-dev g++")
+    program = tmp_path_factory.mktemp("fast") / "robot"
+    source = Path(__file__).with_name("fast_dds_peer.cpp")
+    subprocess.run(
+        ["g++", "-std=c++17", "-Wall", "-Werror", source, "-o", program, "-lfastrtps", "-lfastcdr"], check=True
     )
+    return [str(program)]
+
+
+CYCLONE = [sys.executable, str(Path(__file__).with_name("dds_peer.py"))]
+
+
+@contextlib.asynccontextmanager
+async def robot(command=CYCLONE):
+    """Run a robot of others; yield it."""
+    process = await asyncio.create_subprocess_exec(*command, str(DOMAIN), "test", "r1", stdout=asyncio.subprocess.PIPE)
     try:
         yield process
     finally:
@@ -74,12 +89,14 @@ def refusals() -> Counter[str]:
     return Counter({each.labels["reason"]: int(each.value) for each in values})
 
 
-async def test_robot_that_joins_late_is_given_the_mask_and_its_goal_arrives(wire, until):
+@pytest.mark.parametrize("middleware", ["cyclone", "fast_dds"])
+async def test_robot_that_joins_late_is_given_the_mask_and_its_goal_arrives(wire, until, request, middleware):
+    command = CYCLONE if middleware == "cyclone" else request.getfixturevalue(middleware)
     node, goals = await wire.opened("fognav_test", CLOCK), []
     try:
         node.publish(MASK, mask(2), CLOCK.stamp())
         node.subscribe(GOAL, goals.append, GOAL_MAX_AGE_S)
-        async with robot() as peer:
+        async with robot(command) as peer:
             heard = json.loads(await asyncio.wait_for(peer.stdout.readline(), 60.0))
             assert heard == {"frame": "map", "size": [12, 10], "blocked": 24}
             await until(lambda: goals, "the goal has arrived")

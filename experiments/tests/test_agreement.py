@@ -16,7 +16,7 @@ from fognav_experiments.comparison.repeated import (
     beside_lockstep,
     compare_drives,
     compared,
-    memory,
+    processes,
     resources,
 )
 from fognav_experiments.comparison.report import build
@@ -160,21 +160,32 @@ def test_memory_is_drawn_by_route_and_setup_from_what_each_drive_took():
         msgspec.structs.replace(LIVE, setup="default", peak_mb={"robot-agent": 260.0, "robot-guardian": 40.0}),
         msgspec.structs.replace(LIVE, setup="default", route="cd", peak_mb={"robot-agent": 400.0}),
     ]
-    figure, table = memory(drives)
-    assert figure.file == "memory.svg"
+    cpu, cpu_table, figure, table = processes(drives)
+    assert (cpu.file, figure.file) == ("live-cpu.svg", "live-memory.svg")
+    assert cpu_table.rows[0] == ["A to B", "7.00", "7.00 (7.00 to 7.00)"]
     assert "mean of 4 drives" in figure.caption
     bars = Counter(re.findall(r"fill: (#\w+)", figure.svg))
     assert bars[figures.COLOURS["default"]] == 1 + 2  # in the legend, and on each route
     assert bars[figures.COLOURS["fog"]] == 1 + 1
     assert [row[:2] for row in table.rows] == [["A to B", "300.0"], ["C to D", "400.0"]]
-    assert table.rows[0][2] == "235.0"
+    assert table.rows[0][2] == "235.0 (230.0 to 240.0)"
     assert "intervals" not in figure.caption, "two drives of one situation"
     assert table.rows[1][2] == "-"
 
 
-def test_memory_of_drives_under_a_quota_or_of_a_real_robot_is_no_figure():
-    assert memory([msgspec.structs.replace(LIVE, cpu_quota=0.2)]) == []
-    assert memory([msgspec.structs.replace(LIVE, kind="hardware", peak_mb={})]) == []
+def test_drives_under_a_quota_and_robots_whose_exporter_told_nothing_are_in_no_figure():
+    assert processes([msgspec.structs.replace(LIVE, cpu_quota=0.2)]) == []
+    assert processes([msgspec.structs.replace(LIVE, kind="hardware", peak_mb={}, cpu_percent={})]) == []
+
+
+def test_figures_6_9_and_6_10_are_those_of_a_real_robot_by_what_its_exporter_told():
+    threads = {"robot-agent": {"decide": 4.0, "python": 2.0}}
+    real = [msgspec.structs.replace(drive, thread_percent=threads) for drive in in_each_setup(LIVE, kind="hardware")]
+    cpu, _, memory, _, _, by_thread = processes(real)
+    assert (cpu.file, memory.file) == ("hardware-cpu.svg", "hardware-memory.svg")
+    assert cpu.caption.startswith("As figure 6.9")
+    assert memory.caption.startswith("As figure 6.10")
+    assert by_thread.rows[0] == ["hardware", "robot-agent", "decide", "4.00", "4.00", "4.00"]
 
 
 def test_distance_and_time_stand_beside_lockstep_for_drives_that_reached_their_goal_in_both():
@@ -209,10 +220,11 @@ def test_the_report_says_where_the_figures_of_memory_and_reality_are():
     assert "| 6.11 | distance, simulated and real | only by real processes" in lockstep_only
     assert "for which there is no robot here." in lockstep_only
     live = to_markdown(build(records, EXPERIMENT, measured=in_each_setup(LIVE)))
-    assert "| 6.10 | memory of move_base, real | memory.svg, and the table below it |" in live
+    assert "| 6.6 | memory of move_base, simulated | live-memory.svg, and the table below it |" in live
+    assert "| 6.10 | memory of move_base, real | only by a real robot (fognav experiment --hardware)" in live
     assert "| 6.11 | distance, simulated and real | live-distance.svg, and the table below |" in live
     assert "| 6.12 | time, simulated and real | live-time.svg, and the table below |" in live
-    for figure in ("memory.svg", "live-distance.svg", "live-time.svg"):
+    for figure in ("live-memory.svg", "live-cpu.svg", "live-distance.svg", "live-time.svg"):
         assert f"]({figure})" in live
     assert "3 drives by real processes on a simulated one are compared with lockstep" in live
     real = in_each_setup(LIVE, kind="hardware", peak_mb={}, cpu_percent={})

@@ -327,12 +327,14 @@ def like(record, setup="default", **changes):
 def test_setups_of_a_route_are_driven_again_until_the_machine_is_loaded_alike_in_all_of_them(short_run, monkeypatch):
     loads = iter([1.2, 4.0, 2.9, 2.0])  # a drive is a load of 1 by itself
 
-    def drive(_folder, _jobs, _commit, task):
+    def drive(_folder, _jobs, _commit, _robot, task):
         return like(short_run[1][0], task.setup, load=next(loads), sitting="")
 
     monkeypatch.setattr(runner, "_drive", drive)
     allowed = os.sched_getaffinity(0)
-    records = runner._drive_together(Path(), 1, "", runner.tasks(partial(draw, SPEC, 1), [RUN], ["default", "fog"]))
+    records = runner._drive_together(
+        Path(), 1, "", None, runner.tasks(partial(draw, SPEC, 1), [RUN], ["default", "fog"])
+    )
     assert [record.load for record in records] == [2.9, 2.0]
     assert len({record.sitting for record in records}) == 1
     assert {record.core for record in records} <= allowed

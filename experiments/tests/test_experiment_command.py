@@ -6,10 +6,12 @@ import re
 import shutil
 import tomllib
 
+import msgspec
 import pytest
 from typer.testing import CliRunner
 
-from fognav import checkout, kernels
+from fog_contracts.messages import Place
+from fognav import checkout, kernels, system
 from fognav.__main__ import app
 from fognav_experiments.commands import experiment
 from fognav_experiments.comparison import hardware_drive, records, runner, sensitivity
@@ -25,6 +27,9 @@ OUT = ["--out", "unused"]
     ("arguments", "words"),
     [
         (["--live", "--cpu-quota", "0.2", "--speed", "4", *OUT], "--cpu-quota 0.2 is a share of real time"),
+        (["--hardware", "--robot-file", "r.toml", *OUT], "--robot-file is of a simulated robot"),
+        (["--hardware", "--draws", "floor", *OUT], "--draws floor has stops that are no places"),
+        (["--draws", "all", *OUT], "choose of thesis, floor"),
         (["sensitivity", "--readings", "none", "--areas", "none", *OUT], "leaves nothing to sweep"),
     ],
 )
@@ -117,7 +122,7 @@ def test_a_report_shows_the_live_drives_of_another_folder_and_its_archive_keeps_
     result = CliRunner().invoke(experiment.experiment_app, [*report, str(tmp_path / "live")], catch_exceptions=False)
     assert result.exit_code == 0, result.output
     assert sorted((tmp_path / "lockstep").rglob("*")) == before
-    for name in ("memory.svg", "live-distance.svg", "live-time.svg"):
+    for name in ("live-memory.svg", "live-distance.svg", "live-time.svg"):
         assert (tmp_path / "report" / name).is_file()
     again = Folder(tmp_path / "again")
     records.unpack_archive(tmp_path / "report" / records.ARCHIVE, again)
@@ -141,7 +146,7 @@ def test_scenarios_that_are_ended_early_leave_the_table_of_those_that_were_playe
         return playing.Played(scenario, result, "reached", [])
 
     monkeypatch.setattr(playing, "play", play)
-    monkeypatch.setattr(experiment.system, "prepare_node_code", lambda _inform: None)
+    monkeypatch.setattr(system, "prepare_node_code", lambda _inform: None)
     monkeypatch.setattr(experiment.kernels, "warm_cache", lambda _inform: None)
     table = tmp_path / "table.md"
     arguments = ["scenarios", "wifi-gap-1s", "wifi-gap-5s", "--table", str(table)]
@@ -173,3 +178,29 @@ def test_drives_say_in_one_line_that_nodes_run_a_model_and_why(arguments, tmp_pa
         said = " ".join(done.output.split())
         reason = "simulated sensor nodes run a model in Python, not the firmware: there are no sources"
         assert said.count(reason) == lines
+
+
+@pytest.mark.drive
+def test_another_robot_drives_the_same_routes_and_its_drives_are_another_experiment(tmp_path, monkeypatch):
+    file = tmp_path / "robot.toml"
+    file.write_text('[base]\ndriver = "diffdrive"\n[lidar]\ndriver = "ld19"\nx_m = -0.03\n')
+    out, spec = tmp_path / "drives", runner.drawer
+    near = Place(x=31.0, y=28.4)
+    monkeypatch.setattr(
+        runner, "drawer",
+        lambda *arguments: lambda run: [
+            msgspec.structs.replace(drawn, ends=(Place(x=34.0, y=28.4, theta=3.14), near), area="z5",
+                                    moment="before", trigger_m=0.0)
+            for drawn in spec(*arguments)(run)[:1]
+        ],
+    )  # fmt: skip
+    arguments = ["--setups", "fog", "--only", "1", "--out", str(out)]
+    run = CliRunner()
+    result = run.invoke(experiment.experiment_app, [*arguments, "--robot-file", str(file)], catch_exceptions=False)
+    assert result.exit_code == 0, result.output
+    assert Folder(out).description()["asked"]["robot"].startswith("diffdrive, ld19 (")
+    (record,) = Folder(out).drives.read()
+    assert record.success
+    result = run.invoke(experiment.experiment_app, arguments)
+    assert result.exit_code == 2
+    assert "holds drives of another experiment" in " ".join(result.output.split())

@@ -353,6 +353,7 @@ def run_lockstep(  # noqa: PLR0913  # the options of a run
     profile: ProfileName = "fog",
     cpu: CpuMeter | None = None,
     tuning: Tuning | None = None,
+    mounted: RobotFile | None = None,
 ) -> LockstepResult:
     """Drive the site's first robot from `start` to `goal`; the result is the same for the same arguments.
 
@@ -360,7 +361,8 @@ def run_lockstep(  # noqa: PLR0913  # the options of a run
     unless they are requested, and never within 3 m of the robot. Without `watched` the site has neither areas nor
     nodes: the robot's own lidar must find the barrier; a `Site` says which ones there are. `base` and `lidar` name the
     robot's hardware, `bus` carries the messages (default: a new one), `profile` says who plans, `cpu` measures the
-    components from the goal on, `tuning` changes nodes and robot.
+    components from the goal on, `tuning` changes nodes and robot. `mounted`: all of a robot's settings, in place of
+    `base` and `lidar`.
 
     Raises `BarrierError` for an unknown area, one that no barrier can close, or if no area qualifies, `ValueError` for
     a start inside an obstacle.
@@ -372,7 +374,7 @@ def run_lockstep(  # noqa: PLR0913  # the options of a run
     schedule = HazardSchedule.of(site, seed, hazard) if hazard is not None else None
     run = LockstepDrive(
         site, start, mission, seed, noise,
-        watched=watched, hazard=schedule, bus=bus, mounted=default_robot(base, lidar),
+        watched=watched, hazard=schedule, bus=bus, mounted=mounted or default_robot(base, lidar),
         measure=cpu.measure if cpu else unmeasured, tuning=tuning,
     )  # fmt: skip
     problem = run.warm_up()

@@ -2,43 +2,40 @@
 
 from __future__ import annotations
 
-import os
 from contextlib import contextmanager
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import TYPE_CHECKING, Annotated, Final, TypeVar
+from typing import TYPE_CHECKING, Annotated
 
 import typer
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
-from fognav import checkout, kernels, system
+from fognav import checkout
 from fognav.commands.installed import MEASURE
 from fognav.operate.fog import find_fog
 from fognav.operate.options import FogOption, JsonOption, RobotOption  # noqa: TC001  # Typer reads annotations at run time
-from fognav.output import NOT_TRUE, WrongUseError, console, exit_codes, print_json, print_line
+from fognav.output import NOT_TRUE, WrongUseError, exit_codes, print_json, print_line
+from fognav_experiments.commands.driving import count_failed, measured_on, prepare, show
+from fognav_experiments.commands.sensitivity import sensitivity_command
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
 
     from fog_runtime.configuration.site import LoadedSite
-    from fognav_experiments.comparison.drives import MeasuredDrive, RouteDraw, Setup
+    from fognav_experiments.comparison.drives import Setup
     from fognav_experiments.comparison.live_drive import LiveOptions
-    from fognav_experiments.comparison.records import Draws, DriveFiles, Folder, Record
+    from fognav_experiments.comparison.records import Draws, Folder
     from fognav_experiments.comparison.runner import Task
-    from fognav_experiments.comparison.sensitivity import Plane, SweptDrive
     from fognav_experiments.scenarios.play import Played
 
-    D = TypeVar("D", Record, MeasuredDrive, SweptDrive)
-
 experiment_app = typer.Typer(help="Compare setups as the thesis did, and play scenarios.")
+experiment_app.command(
+    "sensitivity", epilog="Example: fognav experiment sensitivity --out sweep --readings 2,5,20 --pause 50,500"
+)(sensitivity_command)
 
 
 def add_to(app: typer.Typer) -> None:
     """Add the command to `fognav`."""
     app.add_typer(experiment_app, name="experiment", rich_help_panel=MEASURE)
-
-
-_NOT_SWEPT: Final = "none"
 
 
 @experiment_app.callback(
@@ -72,6 +69,10 @@ def experiment_command(  # noqa: PLR0913  # each option is an argument
     hardware: Annotated[
         bool, typer.Option("--hardware", help="Drive a real robot; asks a person to place it and each barrier.")
     ] = False,
+    robot_file: Annotated[
+        Path | None,
+        typer.Option("--robot-file", metavar="F", help="Another simulated robot's settings (fognav robot new)."),
+    ] = None,
     robot: RobotOption = None,
     fog: FogOption = None,
 ) -> None:
@@ -88,6 +89,7 @@ def experiment_command(  # noqa: PLR0913  # each option is an argument
     """
     if context.invoked_subcommand is not None:
         return
+    from fog_runtime.configuration.settings import SettingsError  # noqa: PLC0415  # same
     from fog_runtime.configuration.site import SiteError, load_site  # noqa: PLC0415  # keeps the other commands fast
     from fognav_experiments import machine  # noqa: PLC0415  # same
     from fognav_experiments.comparison import runner  # noqa: PLC0415  # same
@@ -97,14 +99,15 @@ def experiment_command(  # noqa: PLR0913  # each option is an argument
     with exit_codes():
         if out is None:
             raise WrongUseError("name a folder for the records: --out DIR")
-        if hardware and live:
-            raise WrongUseError("--hardware and --live exclude each other: leave one of them out")
         if cpu_quota is not None and speed != 1.0:
             raise WrongUseError(f"--cpu-quota {cpu_quota:g} is a share of real time: leave --speed {speed:g} out")
+        if hardware:
+            _check_hardware(live=live, robot_file=robot_file)
+        robot_file = robot_file and robot_file.resolve()
         place = checkout.site_folder(site)
         try:
             loaded = load_site(place)
-            begun = runner.new(loaded, place, seed, _draws(draws, hardware=hardware))
+            begun = runner.new(loaded, place, seed, _draws(draws, hardware=hardware), robot_file)
             numbers = [only] if only else range(1, runs + 1)
             chosen = _setups(setups, lockstep=not live and not hardware)
             asked = runner.tasks(runner.drawer(loaded, place, begun), numbers, chosen)
@@ -113,32 +116,36 @@ def experiment_command(  # noqa: PLR0913  # each option is an argument
             if source is not None:
                 print_line(f"{unpack_archive(source, folder, begun)} drives of {source} added to {out}")
             folder.begin(begun, {"commit": commit, **machine.describe()})
-        except (SiteError, runner.SpecError, FolderError) as error:
+        except (SettingsError, SiteError, runner.SpecError, FolderError) as error:
             raise WrongUseError(str(error)) from error
         if hardware:
             failed = _drive_real_robot(loaded, asked, folder, fog, robot)
         elif live:
-            failed = _drive_live(loaded, asked, folder, LiveOptions(speed=speed, cpu_quota=cpu_quota, commit=commit))
+            options = LiveOptions(speed=speed, cpu_quota=cpu_quota, commit=commit, robot_file=robot_file)
+            failed = _drive_live(loaded, asked, folder, options)
         else:
-            _prepare()
-            failed = _show([task.name for task in asked], folder.drives, runner.run(place, asked, folder, jobs, commit))
+            prepare()
+            records = runner.run(place, asked, folder, jobs, commit, robot_file)
+            failed = show([task.name for task in asked], folder.drives, records)
     print_line(f"{len(asked) - failed} of {len(asked)} drives succeeded; records in {out}")
     if failed:
         raise typer.Exit(NOT_TRUE)
 
 
-def _prepare() -> None:
-    system.prepare_node_code(print_line)
-    kernels.warm_cache(print_line)
+def _check_hardware(*, live: bool, robot_file: Path | None) -> None:
+    if live:
+        raise WrongUseError("--hardware and --live exclude each other: leave one of them out")
+    if robot_file is not None:
+        raise WrongUseError("--robot-file is of a simulated robot: leave it out, a real one has its own")
 
 
 def _drive_live(site: LoadedSite, asked: Sequence[Task], folder: Folder, options: LiveOptions) -> int:
     """Drive by real processes; return how many drives failed."""
     from fognav_experiments.comparison.live_drive import live_drives  # noqa: PLC0415  # keeps the other commands fast
 
-    _prepare()
+    prepare()
     files, names = folder.measured("live"), [options.name(task) for task in asked]
-    return _show(names, files, live_drives(site, asked, files, options, print_line))
+    return show(names, files, live_drives(site, asked, files, options, print_line))
 
 
 def _drive_real_robot(
@@ -149,7 +156,7 @@ def _drive_real_robot(
 
     files = folder.measured("hardware")
     drive_hardware(site, asked, files, find_fog(address), robot, checkout.revision(), print_line)
-    return _failed([task.name for task in asked], files)
+    return count_failed([task.name for task in asked], files)
 
 
 @experiment_app.command("report", epilog="Example: fognav experiment report results --out docs/results/estig")
@@ -233,7 +240,7 @@ def scenarios_command(
             scenarios = {file.stem: read_scenario(file) for file in files}
         except ScenarioError as error:
             raise WrongUseError(str(error)) from error
-        _prepare()
+        prepare()
         drives = {}
         for name, scenario in scenarios.items():
             drives[name] = play(scenario, checkout.root() / "sites")
@@ -241,7 +248,7 @@ def scenarios_command(
                 _print_played(name, drives[name])
             # Each time: a command that is ended after half an hour leaves what it has found.
             if table is not None:
-                atomic_write(table, markdown_page(drives, dict(flat(_measured_on()))).encode(), mode=SHARED)
+                atomic_write(table, markdown_page(drives, dict(flat(measured_on()))).encode(), mode=SHARED)
     if json:
         print_json({"scenarios": [_played_row(name, played) for name, played in drives.items()]})
     if any(played.deviations for played in drives.values()):
@@ -303,94 +310,6 @@ def film_command(
     print_line(f"{out}: {size / 1e6:.2f} MB")
 
 
-@experiment_app.command(
-    "sensitivity", epilog="Example: fognav experiment sensitivity --out sweep --readings 2,5,20 --pause 50,500"
-)
-def sensitivity_command(  # noqa: PLR0913  # each option is an argument
-    *,
-    out: Annotated[Path, typer.Option("--out", metavar="DIR", help="Folder of records and report.")],
-    readings: Annotated[
-        str, typer.Option("--readings", metavar="N,N", help="Readings that confirm; none: not swept.")
-    ] = "2,5,20",
-    pause: Annotated[str, typer.Option("--pause", metavar="MS,MS", help="Pauses of the nodes.")] = "50,500",
-    areas: Annotated[
-        str, typer.Option("--areas", metavar="N,N", help="Watched areas; 0: all; none: not swept.")
-    ] = "1,4,0",
-    speeds: Annotated[str, typer.Option("--speeds", metavar="V,V", help="Speeds of the robot, m/s.")] = "0.2,0.3",
-    routes: Annotated[int, typer.Option("--routes", metavar="N", min=1, help="Routes of each point.")] = 3,
-    seed: Annotated[int, typer.Option("--seed", metavar="N", min=0, help="Seed of all draws.")] = 1,
-    jobs: Annotated[int | None, typer.Option("--jobs", metavar="N", min=1, help="Drives at a time; all cores.")] = None,
-    site: Annotated[Path | None, typer.Option("--site", metavar="DIR", help="Site with experiment.toml.")] = None,
-) -> None:
-    """Sweep debouncing, the nodes' pause and number, and the robot's speed; draw what the fog saves as heat maps.
-
-    Two planes are driven, readings by pause and areas by speed, on the first routes whose obstacle bars the way; with
-    --readings none or --areas none only the other. A sweep that was killed goes on where it was.
-    """
-    from fog_runtime.configuration.site import SiteError, load_site  # noqa: PLC0415  # keeps the other commands fast
-    from fognav_experiments.comparison import runner  # noqa: PLC0415  # same
-    from fognav_experiments.comparison.records import Folder, FolderError  # noqa: PLC0415  # same
-    from fognav_experiments.comparison.sensitivity import Axis, Plane  # noqa: PLC0415  # same
-
-    with exit_codes():
-        swept, command = [], "fognav experiment sensitivity"
-        if readings != _NOT_SWEPT:
-            swept.append(Plane(Axis("readings", _values(readings)), Axis("pause_ms", _values(pause))))
-        if areas != _NOT_SWEPT:
-            swept.append(Plane(Axis("areas", _values(areas)), Axis("speed_m_s", _values(speeds, float))))
-        if not swept:
-            raise WrongUseError("--readings none --areas none leaves nothing to sweep: leave one of them out")
-        command += f" --readings {readings}" + ("" if readings == _NOT_SWEPT else f" --pause {pause}")
-        command += f" --areas {areas}" + ("" if areas == _NOT_SWEPT else f" --speeds {speeds}")
-        command += f" --routes {routes} --seed {seed} --out DIR"
-        try:
-            place = checkout.site_folder(site)
-            loaded = load_site(place)
-            drawn = runner.barred_routes(loaded, runner.read_spec(loaded, place), seed, routes)
-            folder = Folder(out)
-            folder.begin(runner.new(loaded, place, seed), _measured_on())
-            failed = _sweep(loaded, folder, swept, drawn, command, jobs or os.cpu_count() or 1)
-        except (SiteError, runner.SpecError, FolderError) as error:
-            raise WrongUseError(str(error)) from error
-    if failed:
-        raise typer.Exit(NOT_TRUE)
-
-
-def _measured_on() -> dict[str, object]:
-    from fognav_experiments import machine  # noqa: PLC0415  # keeps the other commands fast
-
-    return {"commit": checkout.revision(), **machine.describe()}
-
-
-def _sweep(  # what is driven, where and how
-    site: LoadedSite,
-    folder: Folder,
-    swept: Sequence[Plane],
-    drawn: Sequence[RouteDraw],
-    command: str,
-    jobs: int,
-) -> int:
-    """Drive a sweep and publish it; return how many drives failed."""
-    from fognav_experiments.comparison import sensitivity  # noqa: PLC0415  # same
-    from fognav_experiments.comparison.records import DriveFiles  # noqa: PLC0415  # keeps the other commands fast
-
-    _prepare()
-    asked, files = sensitivity.sweep_tasks(swept, drawn), DriveFiles(folder.path / "sweep", sensitivity.SweptDrive)
-    names = [task.name for task in asked]
-    failed = _show(names, files, sensitivity.sweep(site, asked, files, jobs, checkout.revision()))
-    drives = [drive for drive in files.read() if drive.name in names]
-    for file in sensitivity.publish(drives, swept, command, folder.description()["measured_on"], folder.path):
-        print_line(str(file))
-    return failed
-
-
-def _values(text: str, kind: type[float] = int) -> list[float]:
-    try:
-        return [kind(part) for part in text.split(",")]
-    except ValueError as error:
-        raise WrongUseError(f"{text} is no list of numbers: write them as 2,5,20") from error
-
-
 def _scenario_files(names: list[str]) -> list[Path]:
     folder = checkout.root() / "experiments" / "scenarios"
     known = {file.stem: file for file in sorted(folder.glob("*.toml"))}
@@ -425,26 +344,3 @@ def _chosen(setups: str) -> list[Setup]:
     if len(chosen) != len(setups.split(",")):
         raise WrongUseError(f"--setups {setups} names an unknown setup: choose of {', '.join(PROFILE_OF_SETUP)}")
     return chosen
-
-
-def _show(names: Sequence[str], files: DriveFiles[D], records: Iterator[D]) -> int:
-    """Show each record as it comes; return how many of those asked for, new and old, failed."""
-    columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn())
-    with Progress(*columns, TimeRemainingColumn(), console=console, disable=not console.is_terminal) as progress:
-        known = sum(files.has(name) for name in names)
-        task = progress.add_task("drives", total=len(names), completed=known)
-        for record in records:
-            progress.advance(task)
-            time_s = "" if record.time_s is None else f"{record.time_s:6.1f} s"
-            print_line(f"{record.name:20} {record.outcome:8} {record.distance_m:6.1f} m {time_s}  {record.area}")
-    return _failed(names, files)
-
-
-def _failed(names: Sequence[str], files: DriveFiles[D]) -> int:
-    """Name the drives without a record; return how many of those asked for did not succeed."""
-    from fognav_experiments.comparison.drives import ATTEMPT  # noqa: PLC0415  # keeps the other commands fast
-
-    succeeded = {record.name.partition(ATTEMPT)[0] for record in files.read() if record.success}
-    if missing := [name for name in names if not files.has(name)]:
-        print_line(f"no record of {', '.join(missing)}: repeat the command to drive them")
-    return sum(name not in succeeded for name in names)

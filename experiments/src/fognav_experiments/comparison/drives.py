@@ -187,6 +187,17 @@ ATTEMPT: Final = "-attempt"
 """What follows a drive's name where it was made again, because it had failed."""
 
 
+class UsageSample(msgspec.Struct, frozen=True, kw_only=True):
+    """What a robot's processes took since the sample before, `at` so many s of the drive.
+
+    Share of a core (%) by process and thread, and resident memory (MB) by process.
+    """
+
+    at: float
+    cpu_percent: dict[str, dict[str, float]]
+    memory_mb: dict[str, float]
+
+
 class MeasuredDrive(ComparedDrive, frozen=True, kw_only=True):
     """One drive by real processes, whose clock runs `speed` times as fast as real time.
 
@@ -196,6 +207,7 @@ class MeasuredDrive(ComparedDrive, frozen=True, kw_only=True):
     together; None without a limit. `asked_speed`: that of the command, from which `speed` differs where the machine
     could not sustain it. `attempt`: 1, or how many it took with those that failed before.
     `restarts`: processes that died. `barrier_at_m`: distance (m) driven when a person said that the barrier stands.
+    `thread_percent`, `samples`: what the robot's exporter told, of threads and every 2 s.
     """
 
     kind: Kind
@@ -208,6 +220,8 @@ class MeasuredDrive(ComparedDrive, frozen=True, kw_only=True):
     restarts: int = 0
     barrier_at_m: float | None = None
     attempt: int = 1
+    thread_percent: dict[str, dict[str, float]] | msgspec.UnsetType = msgspec.UNSET
+    samples: list[UsageSample] | msgspec.UnsetType = msgspec.UNSET
 
     @property
     def name(self) -> str:

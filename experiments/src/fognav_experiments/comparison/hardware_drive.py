@@ -19,6 +19,7 @@ from fognav.operate.robot_commands import connect
 from fognav.output import FailedError, WrongUseError
 from fognav.programs import PLANNER
 from fognav_experiments.comparison.drives import PROFILE_OF_SETUP, GuidedDrive, stands_at, start_of, where_to_place
+from fognav_experiments.comparison.robot_metrics import RobotUsage, watch
 from fognav_sim.drive.drive import DriveOutcome
 from fognav_sim.drive.hazard import HazardRequest, HazardSchedule
 
@@ -194,6 +195,7 @@ class HardwareRun:
         request = HazardRequest(area=drawn.area, trigger_m=drawn.trigger_m)
         planned = HazardSchedule.of(self._site, drawn.seed, request).planned
         assert planned is not None
+        usage = RobotUsage()
         try:
             await self._bring_to_start(start_of(self._site, drawn), drawn.route.start)
             if drawn.moment == "before":
@@ -205,12 +207,20 @@ class HardwareRun:
             guided = GuidedDrive(self._site, drawn, task.setup, goal_id=goal_id, pose=pose, now=self._robot.now())
             if drawn.moment == "before":
                 guided.on_barrier_placed(planned)
-            outcome = await self._follow(guided)
+            watching = asyncio.create_task(watch(usage, self._metrics, self._robot.now, self._terminal.say))
+            try:
+                outcome = await self._follow(guided)
+            finally:
+                watching.cancel()
         finally:
             await self._halt()
         touched = await self._ask_whether("Did the robot touch anything?")
         load = round(os.getloadavg()[0], 2)
-        return guided.record(outcome, touched=touched, load=load, version=__version__, commit=self._commit)
+        record = guided.record(outcome, touched=touched, load=load, version=__version__, commit=self._commit)
+        return msgspec.structs.replace(record, **usage.fields())
+
+    def _metrics(self) -> str:
+        return "" if self._robot.state is None else self._robot.state.metrics
 
     async def _bring_to_start(self, start: Pose, name: str) -> None:
         degrees = round(math.degrees(start.theta))

@@ -9,22 +9,24 @@ import tempfile
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Final
+from typing import TYPE_CHECKING, Any, Final
 
 import msgspec
 
 from fog_contracts.site import DemoPlan, Site
 from fog_runtime import logs
+from fog_runtime.clock import SystemClock
 from fog_runtime.configuration.maps import save_map
 from fog_runtime.configuration.site import SITE_FILE, LoadedSite, load_site
 from fog_supervisor.supervisor import NotReadyError
 from fognav import __version__
-from fognav.demo.options import Options
+from fognav.demo.options import Options, hardware
 from fognav.demo.run import Demo
 from fognav.output import FailedError
 from fognav_experiments.bench.robot import NORMAL_PRIORITY, cpu_quota
 from fognav_experiments.comparison.drives import (
     PROFILE_OF_SETUP,
+    ROBOTS_PROCESSES,
     MeasuredDrive,
     RouteDraw,
     Setup,
@@ -34,8 +36,12 @@ from fognav_experiments.comparison.drives import (
     start_of,
 )
 from fognav_experiments.comparison.records import DriveFiles
+from fognav_experiments.comparison.robot_metrics import RobotUsage, watch
 from fognav_experiments.comparison.runner import Task
 from fognav_sim.drive.hazard import HazardRequest
+
+if TYPE_CHECKING:
+    from fognav.demo.attempt import Attempt
 
 _SIGNALS: Final = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 
@@ -44,12 +50,14 @@ _SIGNALS: Final = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 class LiveOptions:
     """How drives run: `speed` times as fast as real time, the robot's processes within a share of one core, or not.
 
-    `commit`: the program's revision, which is only recorded.
+    `commit`: the program's revision, which is only recorded. `robot_file`: the robot's settings, by default the
+    thesis's.
     """
 
     speed: float = 1.0
     cpu_quota: float | None = None
     commit: str = ""
+    robot_file: Path | None = None
 
     def name(self, task: Task) -> str:
         """Return the name of a drive's record."""
@@ -91,7 +99,11 @@ def drive_live(
         on_robot: Callable[[int], object] = _nothing
         if options.cpu_quota is not None:
             on_robot, settings = contexts.enter_context(cpu_quota(options.cpu_quota)).add, NORMAL_PRIORITY
+        base, lidar = hardware(options.robot_file, None, None)
         asked = Options(
+            base=base,
+            lidar=lidar,
+            robot_file=options.robot_file,
             seed=drawn.seed,
             speed=options.speed,
             profile=PROFILE_OF_SETUP[setup],
@@ -100,11 +112,12 @@ def drive_live(
             on_robot_start=on_robot,
         )
         demo = Demo(load_site(folder), asked, on_event)
+        usage = DemoUsage(demo, on_event)
         try:
-            report = asyncio.run(_run(demo))
+            report = asyncio.run(_run(demo, usage))
         except (NotReadyError, TimeoutError) as error:
             raise FailedError(f"drive {drawn.run}, {drawn.route.name}, {setup}: {error}") from error
-        return _record(demo, report, drawn, setup, options)
+        return msgspec.structs.replace(_record(demo, report, drawn, setup, options), **usage.fields(report))
 
 
 def write_route(site: LoadedSite, drawn: RouteDraw, folder: Path) -> None:
@@ -142,11 +155,51 @@ def _toml(value: Any) -> str:  # noqa: ANN401  # whatever a site holds
             raise TypeError(f"a site holds a {type(value).__name__}, which TOML does not have")
 
 
-async def _run(demo: Demo) -> dict[str, object]:
+class DemoUsage:
+    """What the robot's exporter tells while a demonstration drives; of its last attempt only."""
+
+    def __init__(self, demo: Demo, tell: Callable[[str], None]) -> None:
+        self._demo = demo
+        self._tell = tell
+        self._attempt: Attempt | None = None
+        self._usage = RobotUsage()
+
+    async def watch(self) -> None:
+        """Read it until this is cancelled."""
+        await watch(self._usage, self._address, self._now, self._tell)
+
+    def _now(self) -> float:
+        return SystemClock(self._demo.scene.speed).now()
+
+    def _address(self) -> str | None:
+        """Return where the robot's metrics are while it drives; None before and after."""
+        attempt = self._demo.attempt
+        if attempt is not self._attempt:
+            self._attempt = attempt
+            self._usage.clear()
+        state, drives = attempt.scene.state, attempt.drive is not None and attempt.scene.outcome is None
+        return state.metrics if state is not None and drives else None
+
+    def fields(self, report: Mapping[str, Any]) -> dict[str, Any]:
+        """Return what a record holds of the robot's processes by it, and of all others by the system's account."""
+        found, speed = self._usage.fields(), self._demo.scene.speed
+        if not found:
+            return {}
+        others = {name: used for name, used in report["processes"].items() if name not in ROBOTS_PROCESSES}
+        cpu = {name: round(used["cpu_percent"] / speed, 2) for name, used in others.items()}
+        memory = {name: used["rss_mb"] for name, used in others.items()}
+        return found | {"cpu_percent": cpu | found["cpu_percent"], "peak_mb": memory | found["peak_mb"]}
+
+
+async def _run(demo: Demo, usage: DemoUsage) -> dict[str, object]:
     logs.configure("experiment", "warning", "text")
     stop = asyncio.Event()
     with _signals(stop):
-        report = await demo.run(stop)
+        watching = asyncio.create_task(usage.watch())
+        try:
+            report = await demo.run(stop)
+        finally:
+            watching.cancel()
     if stop.is_set():
         raise FailedError("interrupted: repeat the command to go on with this drive")
     return report

@@ -98,12 +98,16 @@ def comparable(records: Sequence[Record]) -> bool:
 
 
 class Asked(msgspec.Struct, frozen=True, kw_only=True, omit_defaults=True):
-    """What a folder of records is about: it must be the same when it is resumed."""
+    """What a folder of records is about: it must be the same when it is resumed.
+
+    `robot`: base, lidar and a hash of all settings of the robot file that was driven; empty: the thesis's robot.
+    """
 
     site: str
     site_digest: str
     seed: int
     draws: Draws = "thesis"
+    robot: str = ""
 
 
 class FolderError(ValueError):

@@ -206,8 +206,10 @@ def _listed(names: Sequence[str]) -> str:
 
 
 SETUPS: Final[tuple[Setup, ...]] = tuple(PROFILE_OF_SETUP)
-MEMORY_FILE: Final = "memory.svg"
-_MEMORY_UNKNOWN: Final = "only by real processes (fognav experiment --live): lockstep runs all setups in one"
+_UNKNOWN: Final[dict[Kind, str]] = {
+    "live": "only by real processes (fognav experiment --live): lockstep runs all setups in one",
+    "hardware": "only by a real robot (fognav experiment --hardware), whose exporter tells it",
+}
 _REALITY_UNKNOWN: Final = "only by real processes (fognav experiment --live or --hardware)"
 
 
@@ -226,37 +228,99 @@ _QUANTITIES: Final = (
 
 
 def places(measured: Sequence[MeasuredDrive], records: Sequence[Record]) -> dict[str, str]:
-    """Return where a reader of the thesis finds its figures of memory (6.6, 6.10) and of reality (6.11, 6.12)."""
+    """Return where a reader of the thesis finds its figures of real processes (6.6, 6.9 to 6.12)."""
     kinds = [kind for kind in KINDS if _both(kind, measured, records)]
-    found = {"memory": f"{MEMORY_FILE}, and the table below it" if _with_memory(measured) else _MEMORY_UNKNOWN}
+    found = {
+        f"{kind}-{cost.file}": f"{kind}-{cost.file}.svg, and the table below it"
+        if _with_cost(measured, kind, cost)
+        else _UNKNOWN[kind]
+        for kind in KINDS
+        for cost in _COSTS
+    }
     for quantity in _QUANTITIES:
         files = " and ".join(f"{kind}-{quantity.file}.svg" for kind in kinds)
         found[quantity.file] = f"{files}, and the table below" if files else _REALITY_UNKNOWN
     return found
 
 
-def memory(measured: Sequence[MeasuredDrive]) -> list[Block]:
-    """Return how much memory the robot's processes take by route and setup; nothing if no drive measured it."""
-    drives = _with_memory(measured)
-    if not drives:
-        return []
+class _Cost(NamedTuple):
+    figures: dict[Kind, str]
+    title: str
+    unit: str
+    file: str
+    what: str
+    value: Callable[[MeasuredDrive], float | None]
+
+
+_COSTS: Final = (
+    _Cost(
+        {"live": "Not in the thesis, nearest to its figure 6.5", "hardware": "As figure 6.9 of the thesis"},
+        "CPU of the robot's processes", "% of a core", "cpu",
+        "mean share of a core that agent, guardian and watchdog took together",
+        lambda drive: _of_robot(drive) if drive.cpu_percent else None,
+    ),
+    _Cost(
+        {"live": "As figure 6.6 of the thesis", "hardware": "As figure 6.10 of the thesis"},
+        "Memory of the robot's processes", "MB", "memory",
+        "the largest resident memory of agent, guardian and watchdog, added up",
+        lambda drive: drive.robots_peak_mb(),
+    ),
+)  # fmt: skip
+
+
+def processes(measured: Sequence[MeasuredDrive]) -> list[Block]:
+    """Return CPU and memory of the robot's processes by route and setup, by kind; nothing if no drive measured it."""
+    blocks: list[Block] = []
+    for kind in KINDS:
+        for cost in _COSTS:
+            if drives := _with_cost(measured, kind, cost):
+                blocks += _cost(kind, cost, drives)
+    return [*blocks, *_threads(measured)]
+
+
+def _cost(kind: Kind, cost: _Cost, drives: Sequence[MeasuredDrive]) -> list[Block]:
     routes = sorted({drive.route for drive in drives})
     setups = [setup for setup in SETUPS if any(drive.setup == setup for drive in drives)]
-    series: dict[str, list[Estimate | None]] = {
-        setup: [_peaks([d for d in drives if (d.route, d.setup) == (route, setup)]) for route in routes]
-        for setup in setups
-    }
     titles = [route_ends(route) for route in routes]
-    title = "Memory of the robot's processes"
+    series: dict[str, list[Estimate | None]] = {setup: [] for setup in setups}
+    rows = [[title] for title in titles]
+    for row, route in zip(rows, routes, strict=True):
+        for setup in setups:
+            chosen = [drive for drive in drives if (drive.route, drive.setup) == (route, setup)]
+            values = [value for drive in chosen if (value := cost.value(drive)) is not None]
+            known = [drive.situation for drive in chosen]
+            series[setup].append(clustered(values, known) if values else None)
+            row.append(told(values, known) if values else "-")
     caption = (
-        "As figures 6.6 and 6.10 of the thesis: the largest resident memory of agent, guardian and watchdog, added up, "
-        f"mean of {len(drives)} drives by real processes that reached their goal"
+        f"{cost.figures[kind]}: {cost.what}, mean of {len(drives)} drives by {_BY[kind][0]} that reached their goal"
     )
-    rows = [[name, *(_text(series[setup][number]) for setup in setups)] for number, name in enumerate(titles)]
     shown = [found for values in series.values() for found in values]
+    svg = figures.bars(cost.title, cost.unit, titles, series)
     return [
-        Picture(MEMORY_FILE, figures.bars(title, "MB", titles, series), captioned(caption, shown)),
-        Table([f"{title}, MB", *setups], rows),
+        Picture(f"{kind}-{cost.file}.svg", svg, captioned(caption, shown)),
+        Table([f"{cost.title}, {cost.unit}, by {_BY[kind][0]}", *setups], rows),
+    ]
+
+
+def _threads(measured: Sequence[MeasuredDrive]) -> list[Block]:
+    """Return what each thread of the robot's processes took, of the drives whose exporter told it."""
+    known = [drive for drive in measured if drive.success and isinstance(drive.thread_percent, dict)]
+    shares: dict[tuple[Kind, str, str], dict[Setup, list[float]]] = {}
+    for drive in known:
+        assert isinstance(drive.thread_percent, dict)
+        for process, threads in drive.thread_percent.items():
+            for thread, percent in threads.items():
+                shares.setdefault((drive.kind, process, thread), {}).setdefault(drive.setup, []).append(percent)
+    if not shares:
+        return []
+    setups = [setup for setup in SETUPS if any(drive.setup == setup for drive in known)]
+    rows = [
+        [kind, process, thread, *(f"{_mean(found[setup]):.2f}" if setup in found else "-" for setup in setups)]
+        for (kind, process, thread), found in sorted(shares.items())
+    ]
+    return [
+        Paragraph(f"Mean share of a core (%) by thread, as the robot's exporter told it in {len(known)} drives."),
+        Table(["drives", "process", "thread", *setups], rows),
     ]
 
 
@@ -317,15 +381,9 @@ def _both(kind: Kind, measured: Sequence[MeasuredDrive], records: Sequence[Recor
     return [pair for pair in pairs if pair.live.success and pair.lockstep.success]
 
 
-def _with_memory(measured: Sequence[MeasuredDrive]) -> list[MeasuredDrive]:
-    return [d for d in measured if d.success and d.cpu_quota is None and d.robots_peak_mb() is not None]
-
-
-def _peaks(drives: Sequence[MeasuredDrive]) -> Estimate | None:
-    peaks = {drive.name: peak for drive in drives if (peak := drive.robots_peak_mb()) is not None}
-    known = [drive.situation for drive in drives if drive.name in peaks]
-    return clustered(list(peaks.values()), known) if peaks else None
-
-
-def _text(found: Estimate | None) -> str:
-    return "-" if found is None else str(found)
+def _with_cost(measured: Sequence[MeasuredDrive], kind: Kind, cost: _Cost) -> list[MeasuredDrive]:
+    return [
+        drive
+        for drive in measured
+        if drive.kind == kind and drive.success and drive.cpu_quota is None and cost.value(drive) is not None
+    ]

@@ -151,7 +151,14 @@ def _introduction(records: Sequence[Record], pairs: Sequence[Drives], experiment
             f"{min(loads, default=0.0):.1f} to {max(loads, default=0.0):.1f}."
         ),
         Code(command),
-        Table(["measured on", ""], [["site", f"{asked['site']} ({asked['site_digest']})"], *rows]),
+        Table(
+            ["measured on", ""],
+            [
+                ["site", f"{asked['site']} ({asked['site_digest']})"],
+                *([["robot", asked["robot"]]] if "robot" in asked else []),
+                *rows,
+            ],
+        ),
     ]
 
 
@@ -186,7 +193,7 @@ def _bounds(pairs: Sequence[Drives], savings: Mapping[tuple[int, str], Saving]) 
 
 
 def _cost(measured: Sequence[MeasuredDrive]) -> list[Block]:
-    cost = [*repeated.resources(measured), *repeated.memory(measured)]
+    cost = [*repeated.resources(measured), *repeated.processes(measured)]
     return [Heading("What the robot's processes cost"), *cost] if cost else []
 
 

@@ -15,6 +15,7 @@ import msgspec
 
 from fog_contracts.bus import Bus
 from fog_contracts.stages import TOTAL
+from fog_runtime.configuration.robot_file import ROBOT_FILE, load_robot
 from fog_runtime.configuration.site import load_site
 from fognav_experiments.comparison.drives import (
     ALONE,
@@ -39,16 +40,24 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Sequence
     from pathlib import Path
 
+    from fog_runtime.configuration.robot_file import RobotFile
     from fog_runtime.configuration.site import LoadedSite
     from fognav_experiments.comparison.drives import RouteDraw, Setup
     from fognav_experiments.comparison.records import Draws
 
 
-def drive(site: LoadedSite, drawn: RouteDraw, setup: Setup, jobs: int = 1, commit: str = "") -> Record:
+def drive(  # what is driven, by what, and what is only recorded
+    site: LoadedSite,
+    drawn: RouteDraw,
+    setup: Setup,
+    jobs: int = 1,
+    commit: str = "",
+    mounted: RobotFile | None = None,
+) -> Record:
     """Drive a drawn route in a setup; the same but for CPU and wall time whenever it is repeated.
 
-    `jobs` (drives that run at the same time on this machine) and `commit` are only recorded. Raises `BarrierError` for
-    an area that no barrier closes.
+    `jobs` (drives that run at the same time on this machine) and `commit` are only recorded. `mounted`: the robot's
+    settings, by default the thesis's. Raises `BarrierError` for an area that no barrier closes.
     """
     cpu, bus = CpuMeter(), Bus(site.site.id)
     recorder = TimelineRecorder(bus, setup)
@@ -63,6 +72,7 @@ def drive(site: LoadedSite, drawn: RouteDraw, setup: Setup, jobs: int = 1, commi
         profile=PROFILE_OF_SETUP[setup],
         cpu=cpu,
         bus=bus,
+        mounted=mounted,
     )
     appears = (event.time_s for event in result.events if event.description.startswith("barrier appears"))
     total = result.stages_ms.get(TOTAL)
@@ -163,7 +173,14 @@ def check_barriers(site: LoadedSite, asked: Sequence[Task]) -> None:
             raise SpecError(f"{name}: {error}, or change its polygon in site.toml") from error
 
 
-def run(site_folder: Path, asked: list[Task], folder: Folder, jobs: int = 1, commit: str = "") -> Iterator[Record]:
+def run(  # what is driven, where to, and how
+    site_folder: Path,
+    asked: list[Task],
+    folder: Folder,
+    jobs: int = 1,
+    commit: str = "",
+    robot_file: Path | None = None,
+) -> Iterator[Record]:
     """Run the tasks that have no record yet, and yield each record once it is written; `commit` is only recorded.
 
     Those of the same run and route are driven one after another on one core, and again if the machine was loaded
@@ -174,15 +191,22 @@ def run(site_folder: Path, asked: list[Task], folder: Folder, jobs: int = 1, com
     for task in asked:
         if not folder.drives.has(task.name):
             due.setdefault((task.drawn.run, task.drawn.route.name), []).append(task)
-    for records in results(partial(_drive_together, site_folder, jobs, commit), due.values(), jobs):
+    for records in results(partial(_drive_together, site_folder, jobs, commit, robot_file), due.values(), jobs):
         for record in records:
             folder.drives.write(record)
         yield from records
 
 
-def new(site: LoadedSite, site_folder: Path, seed: int, draws: Draws = "thesis") -> Asked:
-    """Return what a new folder of this experiment is about."""
-    return Asked(site=site.site.id, site_digest=site_digest(site_folder), seed=seed, draws=draws)
+def new(
+    site: LoadedSite, site_folder: Path, seed: int, draws: Draws = "thesis", robot_file: Path | None = None
+) -> Asked:
+    """Return what a new folder of this experiment is about; raises `SettingsError` for a robot file."""
+    robot = ""
+    if robot_file is not None:
+        settings = load_robot({ROBOT_FILE: str(robot_file)}).settings
+        digest = hashlib.sha256(msgspec.json.encode(settings)).hexdigest()[:8]
+        robot = f"{settings.base.driver}, {settings.lidar.driver} ({digest})"
+    return Asked(site=site.site.id, site_digest=site_digest(site_folder), seed=seed, draws=draws, robot=robot)
 
 
 def barred_routes(site: LoadedSite, spec: ExperimentSpec, seed: int, count: int) -> list[RouteDraw]:
@@ -216,13 +240,15 @@ SITTINGS: Final = 3
 """How often drives that belong together are made at most until the machine was loaded alike during all of them."""
 
 
-def _drive_together(site_folder: Path, jobs: int, commit: str, asked: Sequence[Task]) -> list[Record]:
+def _drive_together(
+    site_folder: Path, jobs: int, commit: str, robot_file: Path | None, asked: Sequence[Task]
+) -> list[Record]:
     records: list[Record] = []
     with on_one_core() as core:
         for _ in range(SITTINGS):
             sitting = datetime.now(UTC).isoformat(timespec="seconds")
             records = [
-                msgspec.structs.replace(_drive(site_folder, jobs, commit, task), core=core, sitting=sitting)
+                msgspec.structs.replace(_drive(site_folder, jobs, commit, robot_file, task), core=core, sitting=sitting)
                 for task in asked
             ]
             if loaded_alike(records):
@@ -230,8 +256,9 @@ def _drive_together(site_folder: Path, jobs: int, commit: str, asked: Sequence[T
     return records
 
 
-def _drive(site_folder: Path, jobs: int, commit: str, task: Task) -> Record:
-    record = drive(_site(site_folder), task.drawn, task.setup, jobs, commit)
+def _drive(site_folder: Path, jobs: int, commit: str, robot_file: Path | None, task: Task) -> Record:
+    mounted = None if robot_file is None else load_robot({ROBOT_FILE: str(robot_file)})
+    record = drive(_site(site_folder), task.drawn, task.setup, jobs, commit, mounted)
     release_drives()
     return record
 

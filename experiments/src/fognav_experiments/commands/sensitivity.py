@@ -1,0 +1,102 @@
+"""`fognav experiment sensitivity`: sweep the quantities on which what the fog saves depends."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path  # noqa: TC003  # Typer reads annotations at run time
+from typing import TYPE_CHECKING, Annotated, Final
+
+import typer
+
+from fognav import checkout
+from fognav.output import NOT_TRUE, WrongUseError, exit_codes, print_line
+from fognav_experiments.commands.driving import measured_on, prepare, show
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from fog_runtime.configuration.site import LoadedSite
+    from fognav_experiments.comparison.drives import RouteDraw
+    from fognav_experiments.comparison.records import Folder
+    from fognav_experiments.comparison.sensitivity import Plane
+
+_NOT_SWEPT: Final = "none"
+
+
+def sensitivity_command(  # noqa: PLR0913  # each option is an argument
+    *,
+    out: Annotated[Path, typer.Option("--out", metavar="DIR", help="Folder of records and report.")],
+    readings: Annotated[
+        str, typer.Option("--readings", metavar="N,N", help="Readings that confirm; none: not swept.")
+    ] = "2,5,20",
+    pause: Annotated[str, typer.Option("--pause", metavar="MS,MS", help="Pauses of the nodes.")] = "50,500",
+    areas: Annotated[
+        str, typer.Option("--areas", metavar="N,N", help="Watched areas; 0: all; none: not swept.")
+    ] = "1,4,0",
+    speeds: Annotated[str, typer.Option("--speeds", metavar="V,V", help="Speeds of the robot, m/s.")] = "0.2,0.3",
+    routes: Annotated[int, typer.Option("--routes", metavar="N", min=1, help="Routes of each point.")] = 3,
+    seed: Annotated[int, typer.Option("--seed", metavar="N", min=0, help="Seed of all draws.")] = 1,
+    jobs: Annotated[int | None, typer.Option("--jobs", metavar="N", min=1, help="Drives at a time; all cores.")] = None,
+    site: Annotated[Path | None, typer.Option("--site", metavar="DIR", help="Site with experiment.toml.")] = None,
+) -> None:
+    """Sweep debouncing, the nodes' pause and number, and the robot's speed; draw what the fog saves as heat maps.
+
+    Two planes are driven, readings by pause and areas by speed, on the first routes whose obstacle bars the way; with
+    --readings none or --areas none only the other. A sweep that was killed goes on where it was.
+    """
+    from fog_runtime.configuration.site import SiteError, load_site  # noqa: PLC0415  # keeps the other commands fast
+    from fognav_experiments.comparison import runner  # noqa: PLC0415  # same
+    from fognav_experiments.comparison.records import Folder, FolderError  # noqa: PLC0415  # same
+    from fognav_experiments.comparison.sensitivity import Axis, Plane  # noqa: PLC0415  # same
+
+    with exit_codes():
+        swept, command = [], "fognav experiment sensitivity"
+        if readings != _NOT_SWEPT:
+            swept.append(Plane(Axis("readings", _values(readings)), Axis("pause_ms", _values(pause))))
+        if areas != _NOT_SWEPT:
+            swept.append(Plane(Axis("areas", _values(areas)), Axis("speed_m_s", _values(speeds, float))))
+        if not swept:
+            raise WrongUseError("--readings none --areas none leaves nothing to sweep: leave one of them out")
+        command += f" --readings {readings}" + ("" if readings == _NOT_SWEPT else f" --pause {pause}")
+        command += f" --areas {areas}" + ("" if areas == _NOT_SWEPT else f" --speeds {speeds}")
+        command += f" --routes {routes} --seed {seed} --out DIR"
+        try:
+            place = checkout.site_folder(site)
+            loaded = load_site(place)
+            drawn = runner.barred_routes(loaded, runner.read_spec(loaded, place), seed, routes)
+            folder = Folder(out)
+            folder.begin(runner.new(loaded, place, seed), measured_on())
+            failed = _sweep(loaded, folder, swept, drawn, command, jobs or os.cpu_count() or 1)
+        except (SiteError, runner.SpecError, FolderError) as error:
+            raise WrongUseError(str(error)) from error
+    if failed:
+        raise typer.Exit(NOT_TRUE)
+
+
+def _sweep(  # what is driven, where and how
+    site: LoadedSite,
+    folder: Folder,
+    swept: Sequence[Plane],
+    drawn: Sequence[RouteDraw],
+    command: str,
+    jobs: int,
+) -> int:
+    """Drive a sweep and publish it; return how many drives failed."""
+    from fognav_experiments.comparison import sensitivity  # noqa: PLC0415  # same
+    from fognav_experiments.comparison.records import DriveFiles  # noqa: PLC0415  # keeps the other commands fast
+
+    prepare()
+    asked, files = sensitivity.sweep_tasks(swept, drawn), DriveFiles(folder.path / "sweep", sensitivity.SweptDrive)
+    names = [task.name for task in asked]
+    failed = show(names, files, sensitivity.sweep(site, asked, files, jobs, checkout.revision()))
+    drives = [drive for drive in files.read() if drive.name in names]
+    for file in sensitivity.publish(drives, swept, command, folder.description()["measured_on"], folder.path):
+        print_line(str(file))
+    return failed
+
+
+def _values(text: str, kind: type[float] = int) -> list[float]:
+    try:
+        return [kind(part) for part in text.split(",")]
+    except ValueError as error:
+        raise WrongUseError(f"{text} is no list of numbers: write them as 2,5,20") from error

@@ -199,6 +199,7 @@ async def test_operator_sees_the_open_visits_and_ends_one(world: World) -> None:
     assert (await world.ask("DELETE", f"visits/open/{visit['id']}", role="operator")).status_code == 204
     assert await world.mine() == ("ended", "operator")
     assert (world.stored, (await world.ask("GET", "visits", role="operator")).json()) == ({}, [])
+    assert world.records[-1] == ("anna", "visit_ended"), "the audit trail names who ended it"
 
 
 @pytest.mark.claim

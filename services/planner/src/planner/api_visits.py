@@ -139,7 +139,7 @@ def _add_operators(
         """End a visit; its robot stops, and the visitor reads that the staff need it."""
         if reason := standby():
             raise ProblemError(HttpProblem.STANDS_BY, f"{reason}; send the request there")
-        visiting().visits.end(visit, visiting().now())
+        visiting().visits.end(visit, caller.name, visiting().now())
         _log.info("visit_ended", visit=visit, who=caller.name)
         visiting().step()
 

@@ -114,7 +114,7 @@ class Visiting:
         outcome: str | VisitEnd = VisitEnd.FAILED
         try:
             if act.visit is None:
-                await self._service.missions.cancel(act.robot, act.robot, act.mission, action=VISIT_ENDED)
+                await self._service.missions.cancel(act.robot, act.who or act.robot, act.mission, action=VISIT_ENDED)
             else:
                 outcome = await self._send(act, act.visit)
         except (MissionConflictError, OutOfServiceError):

@@ -100,6 +100,8 @@ class Visit:
     named: bool = False
     """Whether the robot has confirmed it."""
     trouble_since: float | None = None
+    ended_by: str = ""
+    """The operator who ended it by its id, for the audit trail of its mission's end."""
 
     @property
     def name(self) -> str:
@@ -128,12 +130,13 @@ class Facts(NamedTuple):
 
 
 class Act(NamedTuple):
-    """What to do: send a robot to a place for a visit, or end the mission of that id."""
+    """What to do: send a robot to a place for a visit, or end the mission of that id, in somebody's name if any."""
 
     robot: str
     visit: Visit | None = None
     place: str = ""
     mission: str = ""
+    who: str = ""
 
 
 def why_out(state: RobotState) -> VisitEnd | None:
@@ -239,13 +242,14 @@ class Visits:
         """The visits that are not over, oldest first."""
         return [visit for visit in self._visits if not visit.is_over]
 
-    def end(self, visit: str, now: float) -> None:
-        """End a visit in an operator's name; raises `VisitError` if there is no such open one."""
+    def end(self, visit: str, who: str, now: float) -> None:
+        """End a visit in an operator's name, `who`; raises `VisitError` if there is no such open one."""
         found = next((each for each in self.open if each.id == visit), None)
         if found is None:
             raise VisitError(
                 PlannerProblem.NO_VISIT, f"there is no open visit {visit}: choose one of GET /api/v1/visits"
             )
+        found.ended_by = who
         self._end(found, VisitEnd.OPERATOR, now)
 
     def commanded(self, robot: str, now: float) -> None:
@@ -283,7 +287,8 @@ class Visits:
             acts += self._order(visit, fleet)
         for robot, facts in fleet.items():
             if facts.of_visit and facts.mission and robot not in self._busy and not self._wanted(robot, facts.mission):
-                acts.append(Act(robot, mission=facts.mission))
+                who = next((each.ended_by for each in self._visits if each.mission == facts.mission), "")
+                acts.append(Act(robot, mission=facts.mission, who=who))
         self._busy.update(act.robot for act in acts)
         return acts
 

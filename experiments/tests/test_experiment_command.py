@@ -147,7 +147,7 @@ def test_scenarios_that_are_ended_early_leave_the_table_of_those_that_were_playe
 
     monkeypatch.setattr(playing, "play", play)
     monkeypatch.setattr(system, "prepare_node_code", lambda _inform: None)
-    monkeypatch.setattr(experiment.kernels, "warm_cache", lambda _inform: None)
+    monkeypatch.setattr(kernels, "warm_cache", lambda _inform: None)
     table = tmp_path / "table.md"
     arguments = ["scenarios", "wifi-gap-1s", "wifi-gap-5s", "--table", str(table)]
     result = CliRunner().invoke(experiment.experiment_app, arguments)

@@ -50,7 +50,7 @@ def test_wheels_axle_and_lidar_of_wrong_bodies_are_found():
     assert found["intervals_true"] > 0.6
 
 
-@pytest.mark.drive
+@pytest.mark.long
 @pytest.mark.timeout(300)
 def test_eight_bodies_up_to_15_percent_wrong_are_found_and_intervals_are_honest():
     found = measure(8)

@@ -161,10 +161,11 @@ def test_wrong_loops_among_those_found_change_the_map_by_less_than_a_cell(mapped
 
 @pytest.mark.drive
 @pytest.mark.timeout(600)
-def test_ten_drives_with_other_noise_join_the_same_places_and_rooms():
+@pytest.mark.parametrize("drives", [3, pytest.param(10, marks=pytest.mark.long)])
+def test_drives_with_other_noise_join_the_same_places_and_rooms(drives):
     """The topology: no loop is false, all visits of a place agree, and the same rooms are reached from the start."""
     maps = []
-    for seed in range(10):
+    for seed in range(drives):
         scans, truth = FLOOR.drive([*ROUND[:4], ROUND[0], (10, 2)], seed=20 + seed)
         found = find_trajectory(scans, jobs=2)
         free = drawn(scans, found.poses, truth, FREE)

@@ -648,9 +648,11 @@ class Planner:
             else:
                 return int(status), int(cell)
 
-    def shortcut(self, costmap: NDArray[np.uint8], cells: NDArray[np.int32]) -> NDArray[np.float64]:
+    def shortcut(
+        self, costmap: NDArray[np.uint8], cells: NDArray[np.int32], *, relax: bool = True
+    ) -> NDArray[np.float64]:
         """Return `shortcut` with this planner's weights."""
-        return shortcut(costmap, cells, self.neutral, self.factor)
+        return shortcut(costmap, cells, self.neutral, self.factor, relax=relax)
 
 
 def nearest_traversable(costmap: NDArray[np.uint8], cell: tuple[int, int], reach: int) -> tuple[int, int] | None:

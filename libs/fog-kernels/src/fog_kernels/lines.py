@@ -438,14 +438,16 @@ def shortcut(
     cells: NDArray[np.int32],
     neutral: int = NEUTRAL_WEIGHT,
     factor: float = COST_WEIGHT,
+    *,
+    relax: bool = True,
 ) -> NDArray[np.float64]:
     """Straighten a path along lines of sight that cost no more than the sections that they replace.
 
-    Then the corners are moved where the lines cost less, because a path of 8 directions keeps to one side of what it
-    passes. `cells` is int32 (n, 2) as (column, row), a path of `Planner.plan` on this costmap. Returns float64 (m, 2)
-    in the same coordinates, the first and last cell kept: corners joined by straight lines, none of which crosses a
-    cell that isn't traversable. Raises ValueError if the path itself crosses one or isn't connected, TypeError or
-    ValueError for wrong types or shapes.
+    Then, with `relax`, the corners are moved where the lines cost less, because a path of 8 directions keeps to one
+    side of what it passes. `cells` is int32 (n, 2) as (column, row), a path of `Planner.plan` on this costmap. Returns
+    float64 (m, 2) in the same coordinates, the first and last cell kept: corners joined by straight lines, none of
+    which crosses a cell that isn't traversable. Raises ValueError if the path itself crosses one or isn't connected,
+    TypeError or ValueError for wrong types or shapes.
     """
     costmap = _arrays.grid(costmap, "costmap")
     cells = _cells_array(cells)
@@ -456,7 +458,7 @@ def shortcut(
     kept = np.empty(len(cells), np.int64)
     count = int(_shortcut(costmap, weight, cells, cumulated, kept))
     corners = cells[kept[:count]].astype(np.float64)
-    return corners[: _relax(costmap, weight, corners)].copy()
+    return corners[: _relax(costmap, weight, corners)].copy() if relax else corners
 
 
 def leaves(line: NDArray[np.float64], other: NDArray[np.float64], reach: float, spacing: float) -> bool:

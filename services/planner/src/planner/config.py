@@ -53,7 +53,10 @@ class PlannerConfig:
     quick_expansions: int = 20_000
     """After so many expanded cells (0.6 ms) a search first asks whether the goal can be reached at all ..."""
     detour_searches: int = 3
-    """... and, if at least so many others wait, has a bound of the way round computed for all of them."""
+    """... and, if at least so many others wait, has a bound of the way round computed for all of them.
+
+    Then paths are sent as they are found: nothing is done to make them a little cheaper.
+    """
     standing_s: float = 60.0
     """What has stayed on the map for so long, zones above all, is in the distance fields, too."""
     goal_fields_bytes: int = 40_000_000

@@ -278,7 +278,8 @@ class Replanner:
         goal = geometry.cell(target.x, target.y)
         trip = _trip(mission, geometry)
         detour = None if trip is None else self.detours.guide(*trip)
-        shared = detour is None and len(waiting) >= self._config.detour_searches and self.detours.may_add(planning_map)
+        crowded = len(waiting) >= self._config.detour_searches
+        shared = detour is None and crowded and self.detours.may_add(planning_map)
         return self._search.find(
             planning_map,
             covers,
@@ -287,8 +288,9 @@ class Replanner:
             self._fields.guide(goal),
             detour,
             partial(self._share, planning_map, self._search.planner, waiting) if shared else None,
-            self._origin(mission.plan, geometry, danger),
+            None if crowded or detour is not None else self._origin(mission.plan, geometry, danger),
             self._fields.landmarks,
+            hurried=crowded,
         )
 
     def _origin(self, plan: Plan | None, geometry: GridGeometry, danger: float) -> GoalField | None:

@@ -20,6 +20,7 @@ from hypothesis import strategies as st
 from msgspec import UNSET
 
 from fog_runtime.configuration.site import load_site
+from fognav_experiments.commands.driving import show
 from fognav_experiments.comparison import computation, live_drive, runner
 from fognav_experiments.comparison.drives import ComparedDrive, ExperimentSpec, MeasuredDrive, RouteSpec, draw
 from fognav_experiments.comparison.floor_draws import ROUTE_M, FloorDrawError, FloorDraws
@@ -29,6 +30,7 @@ from fognav_experiments.comparison.records import MOVE_BASE, Asked, Folder, Fold
 from fognav_experiments.comparison.report import build, paired, publish
 from fognav_experiments.comparison.situations import worse
 from fognav_experiments.figures import (
+    Heading,
     Table,
     clustered,
     compare,
@@ -299,6 +301,25 @@ def test_the_report_needs_no_other_file_and_holds_every_drive(short_run, tmp_pat
         rows = list(csv.DictReader(file))
     assert [float(row["distance_m"]) for row in rows] == [record.distance_m for record in folder.drives.read()]
     assert all(float(row["cpu_move_base_percent"]) > 0.0 for row in rows)
+
+
+def test_the_report_begins_with_what_was_found_and_a_picture_and_ends_with_how_it_was_measured(short_run):
+    blocks = build(short_run[1], {"asked": {"site": "ring", "site_digest": "", "seed": 1}, "measured_on": {}})
+    title, found, picture, *_ = blocks
+    assert isinstance(title, Heading)
+    assert found.text.startswith("Where an obstacle stood in the way, the fog saved a robot ")
+    assert "of 1 drives of 1 situations" in found.text
+    assert picture.file == "tracks.svg"
+    assert [block.text for block in blocks if isinstance(block, Heading)][-1] == "How this was measured"
+    assert "80 m less are 267 s" in to_markdown(blocks), "the thesis's own figures don't fit one another"
+
+
+def test_each_drive_tells_how_many_are_left_and_for_how_long(short_run, tmp_path, capsys):
+    names, files = [record.name for record in short_run[1]], Folder(tmp_path).drives
+    assert show(names, files, iter(short_run[1])) == len(names)  # nothing was written here
+    lines = capsys.readouterr().err.splitlines()
+    assert lines[0].endswith("1 of 4, 1 min left")
+    assert lines[3].endswith("4 of 4")
 
 
 def test_a_film_finds_in_the_records_what_happened_and_when(short_run):

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+import time
 from typing import TYPE_CHECKING, TypeVar
 
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
@@ -38,11 +40,23 @@ def show(names: Sequence[str], files: DriveFiles[D], records: Iterator[D]) -> in
     with Progress(*columns, TimeRemainingColumn(), console=console, disable=not console.is_terminal) as progress:
         known = sum(files.has(name) for name in names)
         task = progress.add_task("drives", total=len(names), completed=known)
-        for record in records:
+        begun = time.monotonic()
+        for done, record in enumerate(records, known + 1):
             progress.advance(task)
             time_s = "" if record.time_s is None else f"{record.time_s:6.1f} s"
-            print_line(f"{record.name:20} {record.outcome:8} {record.distance_m:6.1f} m {time_s}  {record.area}")
+            print_line(
+                f"{record.name:20} {record.outcome:8} {record.distance_m:6.1f} m {time_s:8}  {record.area:6}"
+                f"{done} of {len(names)}{_left(len(names) - done, (time.monotonic() - begun) / (done - known))}"
+            )
     return count_failed(names, files)
+
+
+def _left(drives: int, each_s: float) -> str:
+    """Return in words how long so many drives will take; logs have no progress bar."""
+    minutes = math.ceil(drives * each_s / 60.0)
+    if not drives:
+        return ""
+    return f", {minutes // 60} h {minutes % 60} min left" if minutes >= 60 else f", {minutes} min left"
 
 
 def count_failed(names: Sequence[str], files: DriveFiles[D]) -> int:

@@ -165,14 +165,14 @@ def resources(drives: Sequence[MeasuredDrive]) -> list[Block]:
     ]  # fmt: skip
 
 
-def of_processes(drives: Sequence[MeasuredDrive]) -> tuple[float, float] | None:
-    """Return what the robot's processes took in `default` and in `fog`, % of a core; None unless both were measured.
+def of_processes(drives: Sequence[MeasuredDrive], before: Setup = "default") -> tuple[float, float] | None:
+    """Return what the robot's processes took in `before` and in `fog`, % of a core; None unless both were measured.
 
     Of drives at the pace of real time and without a quota.
     """
     plain = [drive for drive in drives if drive.cpu_percent and drive.cpu_quota is None and drive.speed == 1.0]
-    shares = {setup: [_of_robot(drive) for drive in plain if drive.setup == setup] for setup in ("default", "fog")}
-    return (_mean(shares["default"]), _mean(shares["fog"])) if all(shares.values()) else None
+    shares = {setup: [_of_robot(drive) for drive in plain if drive.setup == setup] for setup in (before, "fog")}
+    return (_mean(shares[before]), _mean(shares["fog"])) if all(shares.values()) else None
 
 
 def _of_robot(drive: MeasuredDrive) -> float:

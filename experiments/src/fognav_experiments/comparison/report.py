@@ -28,7 +28,7 @@ from fognav_experiments.comparison.records import (
 )
 from fognav_experiments.comparison.repeated import SETUPS
 from fognav_experiments.comparison.situations import Drives, by_situation, situations, values, worse
-from fognav_experiments.comparison.thesis import QUANTITIES, beside_thesis, paired, places
+from fognav_experiments.comparison.thesis import QUANTITIES, beside_thesis, paired, places, result
 from fognav_experiments.figures import (
     FEWEST_CLUSTERS,
     Block,
@@ -76,44 +76,49 @@ def build(
     savings = savings or {}
     pairs = paired(records)
     setups = [setup for setup in SETUPS if any(record.setup == setup for record in records)]
-    blocks: list[Block] = [Heading(TITLE, 1), *_introduction(records, pairs, experiment)]
+    methods = [Heading("How this was measured"), *_methods(records, pairs, experiment)]
     if not pairs:
-        return [
-            *blocks,
-            Paragraph("No route has succeeded in every setup yet: there is nothing to compare."),
-        ]
+        nothing = Paragraph("No route has succeeded in every setup yet: there is nothing to compare.")
+        return [Heading(TITLE, 1), nothing, *methods]
     met = [by_setup for by_setup in pairs if _met(by_setup, savings)]
     return [
-        *blocks,
-        Heading("Beside the thesis"),
-        *beside_thesis(pairs, met, setups, measured, records),
-        Heading("Each figure of the thesis, and where it is here"),
-        *places(measured, records),
-        Heading("Distance, time and computation per route"),
-        *_routes(pairs, setups),
+        Heading(TITLE, 1),
+        result(pairs, met, measured),
+        *_tracks(pairs, met, setups, site),
+        Paragraph(
+            "`default` does everything itself and knows nothing of an obstacle before its own lidar sees it; `lean` is "
+            "the same at the lower rates of the others. `full`, the setup of the thesis, plans itself, too, but a "
+            "computer in the building tells it which corridor is blocked. In `fog`, Fognav's own, that computer also "
+            "keeps the map and plans."
+        ),
         *(
             block
             for before, after in (("default", "fog"), ("lean", "fog"))
             if before in setups and after in setups
             for block in by_situation(pairs, met, before, after)
         ),
+        *worse(pairs, setups, savings),
+        *_bounds(pairs, savings),
         Heading("Paired differences"),
         *_differences(pairs, met, setups),
-        *_bounds(pairs, savings),
-        *worse(pairs, setups, savings),
+        Heading("Distance, time and computation per route"),
+        *_routes(pairs, setups),
         Heading("Where the computation goes"),
         *computation.blocks(pairs, setups, measured),
         *repeated.agreement(measured, records, str(experiment["measured_on"].get("commit", ""))),
         *repeated.beside_lockstep(measured, records),
         *_cost(measured),
-        Heading("One drive, seen from above"),
-        *_tracks(pairs, setups, site),
         Heading("Drives that failed, and contacts"),
         *_failures(records, measured),
+        Heading("Beside the thesis"),
+        *beside_thesis(pairs, met, setups, measured, records),
+        Heading("Each figure of the thesis, and where it is here"),
+        *places(measured, records),
+        *methods,
     ]
 
 
-def _introduction(records: Sequence[Record], pairs: Sequence[Drives], experiment: Mapping[str, Any]) -> list[Block]:
+def _methods(records: Sequence[Record], pairs: Sequence[Drives], experiment: Mapping[str, Any]) -> list[Block]:
     asked, measured = experiment["asked"], experiment["measured_on"]
     setups = ",".join(setup for setup in SETUPS if any(record.setup == setup for record in records))
     runs = max((record.run for record in records), default=0)
@@ -136,13 +141,9 @@ def _introduction(records: Sequence[Record], pairs: Sequence[Drives], experiment
     return [
         Paragraph(
             "A robot drives from stop to stop through a building. On each route something blocks one of the "
-            "corridors that sensors on the walls watch. In the setup `default` the robot does everything "
-            "itself and knows nothing of the obstacle before its own lidar sees it. In `full`, the setup of "
-            "the thesis, it plans itself, too, but a computer in the building tells it which corridor is "
-            "blocked. In `fog`, Fognav's own, that computer also keeps the map and plans. All three are the "
-            "same program with the same algorithms; each meets the same obstacles at the same moments, drawn "
-            "from a seed. All processes' cores, sensors and radio messages are simulated in lockstep; "
-            "distances are those of the simulator's ground truth."
+            "corridors that sensors on the walls watch. All setups are the same program with the same algorithms; each "
+            "meets the same obstacles at the same moments, drawn from a seed. All processes' cores, sensors and radio "
+            "messages are simulated in lockstep; distances are those of the simulator's ground truth."
         ),
         Paragraph(
             f"{len(records)} drives stand, {len(pairs)} of them in each of the setups on the same run and "
@@ -260,15 +261,17 @@ def _differences(pairs: Sequence[Drives], met: Sequence[Drives], setups: Sequenc
     ]
 
 
-def _tracks(pairs: Sequence[Drives], setups: Sequence[Setup], site: Site | None) -> list[Block]:
+def _tracks(pairs: Sequence[Drives], met: Sequence[Drives], setups: Sequence[Setup], site: Site | None) -> list[Block]:
     first, last = setups[0], setups[-1]
-    drives = max(pairs, key=lambda drives: drives[first].distance_m - drives[last].distance_m)
+    ordered = sorted(met or pairs, key=lambda drives: drives[first].distance_m - drives[last].distance_m)
+    drives = ordered[len(ordered) // 2]
     record = drives[first]
     blocked, stops = _ends(record, site) if site is not None else ((), {})
     svg = figures.tracks({setup: drives[setup].track for setup in setups}, blocked, stops)
     lengths = ", ".join(f"{setup} {drives[setup].distance_m:.0f} m" for setup in setups)
     caption = (
-        f"As figures 6.1 and 6.2: run {record.run}, {route_ends(record.route)}, {record.area} is blocked: {lengths}."
+        f"The median of the {len(ordered)} drives{' in which the obstacle was met' if met else ''}, by what was saved: "
+        f"run {record.run}, {route_ends(record.route)}, {record.area} is blocked: {lengths}."
     )
     return [Picture("tracks.svg", svg, caption)]
 

@@ -11,8 +11,8 @@ from typing import TYPE_CHECKING, Final, NamedTuple
 from fognav_experiments.comparison import computation, repeated
 from fognav_experiments.comparison.records import MOVE_BASE, ON_ROBOT
 from fognav_experiments.comparison.repeated import SETUPS
-from fognav_experiments.comparison.situations import Drives, situations
-from fognav_experiments.figures import Block, Estimate, Paragraph, Table, estimate, told
+from fognav_experiments.comparison.situations import Drives, saved, situations
+from fognav_experiments.figures import Block, Estimate, Paragraph, Table, estimate, spread, told
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
@@ -64,7 +64,7 @@ REPORTED: Final = (
 )
 
 PLACES: Final = (
-    ("6.1", "default: the path leads into the blocked zone", "tracks.svg, orange: one drive, seen from above"),
+    ("6.1", "default: the path leads into the blocked zone", "tracks.svg, orange: the median drive, from above"),
     ("6.2", "full: the path avoids it", "tracks.svg, blue (full) and green (fog)"),
     ("6.3", "distance per route, simulated", "distance.svg, and the table below it"),
     ("6.4", "time per route, simulated", "time.svg, and the table below it"),
@@ -171,8 +171,13 @@ def beside_thesis(
         Paragraph(
             "The thesis draws one of two or three corridors to be blocked, so that often the blocked one is "
             f"not on the robot's way. The obstacle met a robot that did not know of it in {len(met)} of "
-            f"{len(pairs)} drives here. The floor is another one, made in the manner of the thesis's. Its "
+            f"{len(pairs)} drives here. The floor is another one. Its "
             f"figures 6.11 and 6.12 compare simulation and reality, {_reality(measured, records)}."
+        ),
+        Paragraph(
+            "The thesis's own figures don't fit one another. At 0.3 m/s, a robot's speed here, 80 m less are 267 s "
+            "earlier, not 20 (simulated); 70 m less are 233 s, not 60 or 80, and 30 m less 100 s, not 15 (real). At a "
+            "Roomba's highest speed, 0.5 m/s, these would still be 160, 140 and 60 s. Here seconds follow from metres."
         ),
         *late(pairs),
         Paragraph(
@@ -196,6 +201,28 @@ def _less_computation(pairs: Sequence[Drives], setups: Sequence[Setup]) -> str:
         if before in setups and after in setups and (found := computation.ratio(pairs, before, after, MOVE_BASE))
     ]
     return f"; of the pairs that count {', '.join(known)}" if known else "; no pair of drives counts for a ratio"
+
+
+def result(pairs: Sequence[Drives], met: Sequence[Drives], measured: Sequence[MeasuredDrive]) -> Paragraph:
+    """Return what was found, in a sentence or two."""
+    if not any("default" in drives and "fog" in drives for drives in pairs):
+        return Paragraph(f"{len(pairs)} routes were driven in each setup; `default` and `fog` are not among them.")
+    words = f"In none of {len(pairs)} drives did the obstacle meet a robot that did not know of it. "
+    if met:
+        metres, seconds = zip(*(saved(drives, "default", "fog") for drives in met), strict=True)
+        beyond = " (about 2 s of it are no part of the drives, see below)" if late(pairs) else ""
+        words = (
+            f"Where an obstacle stood in the way, the fog saved a robot {spread(metres)} m and {spread(seconds)} s"
+            f"{beyond}: median, least and most of {len(met)} drives of {len(set(situations(met)))} situations, beside "
+            f"{len(pairs) - len(met)} drives in which nothing was in its way. "
+        )
+    if (live := repeated.of_processes(measured)) is not None:
+        words += (
+            f"As real processes the whole robot took {live[1]:.2f} % of a core instead of {live[0]:.2f} %"
+            + ("" if (full := repeated.of_processes(measured, "full")) is None else f", and {full[0]:.2f} % in `full`")
+            + "."
+        )
+    return Paragraph(words.strip())
 
 
 def late(pairs: Sequence[Drives]) -> list[Block]:

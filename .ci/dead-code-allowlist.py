@@ -8,6 +8,8 @@ here. `./fognav check` runs it.
 _.age_s  # api: age of an area's last reading
 _.extra_m  # answer to a dry run: how much farther a robot would drive, and how much longer
 _.extra_s
+_.earliest_s  # api: when a robot arrives
+_.latest_s
 _.charge_ah  # messages: of a robot's battery
 _.capacity_ah
 _.translation_deviation_m  # report: of a trajectory, in `map from-log --json`

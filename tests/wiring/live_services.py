@@ -24,6 +24,7 @@ from map_service.registry import make_layers
 from map_service.service import Service as MapService
 from planner.core import PlannerCore
 from planner.service import Service as PlannerService
+from planner.waits.persistence import Learned
 from robot_agent.agent.core import AgentCore
 from robot_agent.agent.edges.map_loader import MapLoader
 from robot_agent.agent.service import Service as AgentService
@@ -182,10 +183,10 @@ class MemoryStore:
     async def out_of_service(self) -> dict[str, Any]:
         return {}
 
-    async def blocks(self) -> dict[str, Any]:
-        return {}
+    async def learned(self) -> Learned:
+        return Learned({}, {})
 
-    async def put_blocks(self, _blocks: object) -> None: ...
+    async def put_learned(self, _learned: object) -> None: ...
 
     async def durability_warning(self) -> str:
         return ""

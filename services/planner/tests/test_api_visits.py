@@ -22,6 +22,7 @@ from planner.api import make_api
 from planner.core import PlannerCore
 from planner.service import Service
 from planner.store import StoredGoal
+from planner.waits.persistence import Learned
 
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator, Callable
@@ -71,10 +72,10 @@ class World:
     async def out_of_service(self) -> dict[str, Any]:
         return {}
 
-    async def blocks(self) -> dict[str, Any]:
-        return {}
+    async def learned(self) -> Learned:
+        return Learned({}, {})
 
-    async def put_blocks(self, _blocks: object) -> None: ...
+    async def put_learned(self, _learned: object) -> None: ...
 
     async def put_service(self, *_: object, **__: object) -> str:
         return "ok"

@@ -21,7 +21,7 @@ from fog_supervisor.servers import Server, start_redis
 from planner.core import PlannerCore
 from planner.stops import Order
 from planner.store import MissionPersistence, OutOfServiceError, Store, StoredGoal
-from planner.waits.persistence import BlockPersistence
+from planner.waits.persistence import LearnedPersistence
 
 pytestmark = pytest.mark.live
 AUDIT = Audit(1.0, "anna", "goal")
@@ -166,8 +166,8 @@ async def test_planner_that_starts_in_the_middle_of_a_block_goes_on_with_its_age
     async with Store(redis.url, "test") as store:
         clock, first, second = ManualClock(100.0), PlannerCore(), PlannerCore()
 
-        async def lead(core: PlannerCore) -> BlockPersistence:
-            durations = BlockPersistence(core.waits.blocks, store, clock, lambda change: change())
+        async def lead(core: PlannerCore) -> LearnedPersistence:
+            durations = LearnedPersistence(core.waits.blocks, core.paces, store, clock, lambda change: change())
             await durations.load()
             return durations
 

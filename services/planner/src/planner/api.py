@@ -8,6 +8,7 @@ from fastapi import FastAPI
 from msgspec import structs
 
 from fog_contracts.messages import (
+    Arrival,
     GoalOutcome,
     GoalView,
     Message,
@@ -79,9 +80,10 @@ class ServiceBody(Message, frozen=True, kw_only=True):
 
 
 class RobotView(RobotSummary, frozen=True, kw_only=True):
-    """A robot with its latest pose, state, goal and plan."""
+    """A robot with its latest pose, state, goal and plan; `arrival`: null when it has no path, or waits."""
 
     pose: RobotPose | None
+    arrival: Arrival | None = None
 
 
 def _goal_view(robot: str, stored: StoredGoal) -> GoalView:
@@ -140,6 +142,7 @@ class _Robots:
             goal=_goal_view(robot, service.goals[robot]) if robot in service.goals else None,
             plan=PlanView.of(service.path(robot)),
             out_of_service=service.missions.out_of_service(robot),
+            arrival=service.arrival(robot) if robot in service.goals else None,
             start=None if described is None else described.start,
             dock=None if described is None else described.dock,
         )

@@ -29,6 +29,7 @@ from planner.refusals import goal_out_of_reach
 from planner.regions import BlockedRegions, cover
 from planner.replanner import Replanner, effect_of_change, reason_from_pose
 from planner.waits.choice import Waits
+from planner.waits.pace import Paces, Times
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -36,6 +37,7 @@ if TYPE_CHECKING:
 
     from fog_contracts.handlers import Handler, Ids, Moment, QueryHandler
     from fog_contracts.messages import (
+        Arrival,
         DryRunReply,
         DryRunRequest,
         EgressRequest,
@@ -83,7 +85,7 @@ class PlannerCore:
         self.missions = Missions()
         self.places: Mapping[str, Place] | None = None
         """All places by id, as the map-service has them; None until it has told them."""
-        self.waits = Waits(self.config)
+        self.waits, self.paces = Waits(self.config), Paces()
         self.replanner = Replanner(self.config, self._fields, self.waits)
         self.answerer = Answerer(self.config)
         """Used by the thread that runs jobs for "query" and answers queries."""
@@ -144,14 +146,35 @@ class PlannerCore:
         mission.pose, mission.pose_received = pose, at.now
         if mission.plan is not None and mission.replan is None:
             mission.replan = reason_from_pose(mission.plan, pose, self.config)
+        self._learn_pace(ids["robot"], mission, at.now)
         return ()
 
+    def _learn_pace(self, robot: str, mission: Mission, now: float) -> None:
+        plan, planning_map = mission.plan, self._map.current
+        if plan is None or plan.route is None or plan.waits or planning_map is None:
+            self.paces.end(robot)
+            return
+        if plan.times is None:
+            plan.times = Times.of(plan.route, self._map.speed_layer, planning_map.geometry)
+        self.paces.on_progress(robot, plan.plan_id, plan.times.at(plan.progress), now, drives=mission.drives)
+
+    def arrival(self, robot: str) -> Arrival | None:
+        """Return when a robot arrives, by its pace; None when it has no path, or waits. Any thread may ask."""
+        plan, planning_map = self.missions.of(robot).plan, self._map.current
+        if plan is None or plan.route is None or plan.waits or planning_map is None:
+            return None
+        times = Times.of(plan.route, self._map.speed_layer, planning_map.geometry)
+        return self.paces.arrival(robot, times.rest(plan.progress))
+
     def _on_state(self, ids: Ids, state: RobotState, _at: Moment) -> Sequence[Publication]:
-        self.missions.of(ids["robot"]).on_state(state)
+        mission = self.missions.of(ids["robot"])
+        mission.on_state(state)
         if state.goal_reached and state.goal_id is not None:
+            times = mission.plan.times if mission.plan is not None else None
+            self.paces.end(ids["robot"], None if times is None else float(times.seconds[-1]))
             self.missions.reach(ids["robot"], state.goal_id)
         elif state.goal_id is not None and self._knows_missions:
-            self.missions.of(ids["robot"]).end_unknown(state.goal_id)
+            mission.end_unknown(state.goal_id)
         return ()
 
     def _on_places(self, _ids: Ids, places: PlaceSet, _at: Moment) -> Sequence[Publication]:
@@ -240,7 +263,7 @@ class PlannerCore:
         self._served = self.missions.located(at.now, self.config)
         covers = partial(cover, self._regions.sources)
         due = self.missions.to_replan(at.now, self.config)
-        self.waits.look(at, self._regions.sources, self._regions.areas)
+        self.waits.look(at, self._regions.sources, self._regions.areas, self._map.speed_layer)
         for number, (robot, mission, reason) in enumerate(due):
             if mission.target is not None and mission.pose is not None:
                 waiting = [other for _, other, _ in due[number + 1 :]]

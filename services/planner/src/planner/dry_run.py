@@ -17,8 +17,7 @@ from typing import TYPE_CHECKING, Final
 import numpy as np
 from msgspec import structs
 
-from fog_contracts.costs import DEGRADED_SPEED, INSCRIBED
-from fog_contracts.geometry import sampled
+from fog_contracts.costs import INSCRIBED
 from fog_contracts.grid import Window
 from fog_contracts.messages import (
     DryRunOutcome,
@@ -37,6 +36,7 @@ from planner.queries import Answerer, View
 from planner.refusals import no_map
 from planner.regions import Regions, cover, is_closing
 from planner.replanner import effect_of_change, is_kept
+from planner.waits.pace import Times
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping, Sequence
@@ -50,8 +50,6 @@ if TYPE_CHECKING:
     from planner.planning_map import Cell, Grid, PlanningMap
     from planner.regions import Source
 
-USUAL_SPEED: Final = 2 * DEGRADED_SPEED / 100
-"""Speed (m/s) of a robot where nothing limits it, by which times are estimated; turns in place are not counted."""
 KNOWN_S: Final = 60.0
 """A robot whose last pose is older is left out: nobody knows where it is."""
 NAMED_PLACES: Final = 50
@@ -299,13 +297,11 @@ def goal_outcome(state: State, robot: str, goal: PointXY, config: PlannerConfig)
 
 
 def seconds_along(route: Route, along: float, speed: Grid, planning_map: PlanningMap) -> float:
-    """Return how long (s) a robot takes for a route from `along` (m) on, at the usual speed or the limits' (cm/s)."""
-    points = sampled(route.remaining(along), route.spacing)
-    lengths = np.hypot(*np.diff(points, axis=0).T)
-    middles = (points[:-1] + points[1:]) / 2.0
-    limits = planning_map.geometry.sample(speed, middles, 0.0) / 100.0
-    speeds = np.where(limits > 0.0, np.minimum(limits, USUAL_SPEED), USUAL_SPEED)
-    return float(np.sum(lengths / speeds))
+    """Return how long (s) a robot takes for a route from `along` (m) on, at the usual speed or the limits' (cm/s).
+
+    Turns in place are not counted.
+    """
+    return float(Times.of(route, speed, planning_map.geometry, along).seconds[-1])
 
 
 def _outcome(

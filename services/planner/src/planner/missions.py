@@ -21,6 +21,7 @@ if TYPE_CHECKING:
     from planner.path_search import Question, Route
     from planner.planning_map import Cell
     from planner.waits.choice import Judgement
+    from planner.waits.pace import Times
 
 _QUIET_S: Final = 60.0
 """After so long without a switch, the next one counts as the first again."""
@@ -74,6 +75,8 @@ class Plan:
     explained_at: float = -math.inf
     explained_for: Explained | None = None
     """The versions of map and regions for which the refusal was last explained."""
+    times: Times | None = None
+    """How long the path takes, once somebody asked."""
     judged: Judgement | None = None
     """Why the robot goes round something, or waits before it."""
 
@@ -98,6 +101,8 @@ class Mission:
     """The last goal; its pose is None once it has ended."""
     any_heading: bool = False
     """Whether the robot may arrive with any heading: the goal's theta is ignored."""
+    drives: bool = False
+    """Whether the robot may drive as fast as usual, by its last state."""
     priority: int = 0
     """Of two missions that are equally urgent, the one of higher priority comes first."""
     out_of_service: OutOfService | None = None
@@ -209,6 +214,7 @@ class Mission:
         self.received = received_path(state)
         self.robots_goal, self.heard = state.goal_id, True
         self.plans_itself = state.profile != "fog"
+        self.drives = state.mode == "NORMAL"
 
     def end_unknown(self, goal_id: str) -> None:
         """End a goal that the robot has and nobody stored any more: it was cancelled, or replaced, unheard by it."""

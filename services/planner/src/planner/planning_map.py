@@ -203,6 +203,11 @@ class MapTracker:
                 self._copy.__dict__["components"] = current.components  # of the same cells
         return self._copy
 
+    @property
+    def speed_layer(self) -> Grid:
+        """The speed layer (cm/s, 0 = no limit) of the newest version. The next delta changes its cells."""
+        return self._follower.replica.speed
+
     def speed(self) -> Grid:
         """Return a copy of the speed layer (cm/s, 0 = no limit) of the newest version."""
         return self._follower.replica.speed.copy()

@@ -226,6 +226,7 @@ class Service:
         self.visiting = Visiting(self, site, clock)
         self._jobs: set[asyncio.Task[None]] = set()
         self._metrics = PlanMetrics()
+        self.arrival = core.arrival
         self.poses: dict[str, RobotPose] = {}
         self.states: dict[str, RobotState] = {}
         self._record = PathRecord()

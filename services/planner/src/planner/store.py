@@ -15,7 +15,7 @@ from fog_runtime.stores import records
 from fog_runtime.stores.redis_connection import StoreError, StoreLostError, StoreRefusedError
 from fog_runtime.stores.redis_store import ANY, Audit, Outcome, RecoveryError, Table
 from planner.stops import Tour
-from planner.waits.persistence import BlockPersistence, BlockStore
+from planner.waits.persistence import LearnedPersistence, LearnedStore
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Mapping
@@ -45,7 +45,7 @@ class StoredGoal(Message, frozen=True, kw_only=True):
     tour: Tour | None = None
 
 
-class Store(BlockStore):
+class Store(LearnedStore):
     """The planner's keys."""
 
     tables = (_GOALS.name, _SERVICE.name)
@@ -143,7 +143,7 @@ class MissionPersistence:
         self._clock = clock
         self._health = health
         self._change_core = change_core
-        self._durations = BlockPersistence(core.waits.blocks, store, clock, change_core)
+        self._learned = LearnedPersistence(core.waits.blocks, core.paces, store, clock, change_core)
         self._loaded = asyncio.Event()
         self._lock = asyncio.Lock()
         self._reload = True
@@ -320,7 +320,7 @@ class MissionPersistence:
                     if self._leading and not out.holds(self._clock.stamp()):
                         await self.put_back(robot, "planner", expected=out.id, action="end")
                 if self._leading:
-                    await self._durations.save()
+                    await self._learned.save()
                 await self._store.check()
                 self._health.set("store", ok=True)
             except StoreError as error:
@@ -382,7 +382,7 @@ class MissionPersistence:
         Raises `StoreError`.
         """
         stored, out = await self._store.goals(), await self._store.out_of_service()
-        await self._durations.load()
+        await self._learned.load()
         for robot in {*self._out, *out}:
             self._set_service(robot, out.get(robot))
         for robot in [robot for robot in self.goals if robot not in stored or self.out_of_service(robot) is not None]:

@@ -67,6 +67,14 @@ class PlanView(Message, frozen=True, kw_only=True):
         )
 
 
+class Arrival(Message, frozen=True, kw_only=True):
+    """In how many seconds a robot arrives: nine in ten drives lie from `earliest_s` to `latest_s`, by its last ones."""
+
+    earliest_s: float
+    expected_s: float
+    latest_s: float
+
+
 class RobotSummary(Message, frozen=True, kw_only=True):
     """A robot with its latest state, goal and plan; `out_of_service`: why it gets no goal.
 

@@ -1,1 +1,1 @@
-"""Wait or detour: how long blocks of an area last, and whether a robot waits for one to end or goes round."""
+"""How long things take: blocks of areas, and robots' ways; whether a robot waits before a block or goes round it."""

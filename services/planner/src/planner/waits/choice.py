@@ -20,6 +20,7 @@ from planner.path_search import Route
 from planner.regions import cause_of, name_of
 from planner.waits.blocks import Blocks
 from planner.waits.durations import all_of, best_policy, until
+from planner.waits.pace import USUAL_SPEED, Times
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -85,6 +86,7 @@ class _Known:
     at: Moment
     sources: Sequence[Source]
     areas: Sequence[HazardArea]
+    speed: NDArray[np.uint8]
 
 
 @dataclass
@@ -95,9 +97,11 @@ class Waits:
     blocks: Blocks = field(default_factory=Blocks)
     _known: _Known | None = None
 
-    def look(self, at: Moment, sources: Sequence[Source], areas: Sequence[HazardArea]) -> None:
-        """Use this time, these hazards and zones that close cells, and these areas, closed or not."""
-        self._known = _Known(at, sources, areas)
+    def look(
+        self, at: Moment, sources: Sequence[Source], areas: Sequence[HazardArea], speed: NDArray[np.uint8]
+    ) -> None:
+        """Use this time, these hazards and zones that close cells, these areas, closed or not, and speed limits."""
+        self._known = _Known(at, sources, areas, speed)
 
     def judge(
         self, way: Route | None, before: Judgement | None, at: PointXY, found: SearchResult, planning_map: PlanningMap
@@ -128,7 +132,8 @@ class Waits:
         end = min(hold + _TAIL_M, float(steps[blocked[0]]) - 2.0 * planning_map.geometry.resolution)
         speed = self.config.cruise_speed
         around, _ = found.route.nearest(*_point(rest, steps, hold))
-        detour = (found.route.length - around - (float(steps[-1]) - hold)) / speed
+        ways = [Times.of(each, self._known.speed, planning_map.geometry) for each in (found.route, way)]
+        detour = (ways[0].rest(around) - ways[1].rest(along + hold)) * USUAL_SPEED / speed
         if end < hold + _SHORT_M or detour <= 0.0:
             return None  # it stands before the block already, or is as quick round it
         sources, block, age = cut

@@ -1,0 +1,141 @@
+"""How long robots take for their ways: the time at the usual speed or the limits', times each one's pace. Pure.
+
+A way's time at those speeds is a lower bound, which no turn, narrow place, start or arrival is part of. By how much a
+robot exceeds it is learned from its drives: the ratio of both, for each stretch that it drove by one plan.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Annotated, Final, NamedTuple
+
+import numpy as np
+from msgspec import Meta
+
+from fog_contracts.costs import DEGRADED_SPEED
+from fog_contracts.geometry import lengths_along, sampled
+from fog_contracts.messages import Arrival, Message
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping
+
+    from numpy.typing import NDArray
+
+    from fog_contracts.grid import GridGeometry
+    from planner.path_search import Route
+
+    Floats = NDArray[np.float64]
+
+USUAL_SPEED: Final = 2 * DEGRADED_SPEED / 100
+"""Speed (m/s) of a robot where nothing limits it."""
+
+
+class Times(NamedTuple):
+    """How long a way takes at the usual speed or the limits': places along it (m), and the time to each (s)."""
+
+    along: Floats
+    seconds: Floats
+
+    @classmethod
+    def of(cls, route: Route, speed: NDArray[np.uint8], geometry: GridGeometry, begin: float = 0.0) -> Times:
+        """Return the times of a route from `begin` (m) on by the speed layer (cm/s, 0: no limit)."""
+        points = sampled(route.remaining(begin), route.spacing)
+        along = lengths_along(points)
+        limits = geometry.sample(speed, (points[:-1] + points[1:]) / 2.0, 0) / 100.0
+        speeds = np.where(limits > 0.0, np.minimum(limits, USUAL_SPEED), USUAL_SPEED)
+        return cls(along, np.append(0.0, np.cumsum(np.diff(along) / speeds)))
+
+    def at(self, along: float) -> float:
+        """Return the time (s) to a place (m) along the way."""
+        return float(np.interp(along, self.along, self.seconds))
+
+    def rest(self, along: float) -> float:
+        """Return the time (s) from a place (m) along the way to its end."""
+        return float(self.seconds[-1]) - self.at(along)
+
+
+_PRIOR: Final = ((20.0, 1.0), (20.0, 1.1), (20.0, 1.3))
+"""What is assumed of a robot that has not driven yet: times (s) at the usual speed, and ratios."""
+_KEPT: Final = 40
+"""Stretches that are kept of each robot, the newest ones."""
+_SHORT_S: Final = 8.0
+"""A stretch that takes less at the usual speed tells too little."""
+_GAP_S: Final = 2.0
+"""Of a robot that was not heard of for longer nobody knows whether it drove."""
+_QUANTILES: Final = (0.05, 0.95)
+
+
+class PaceRecord(Message, frozen=True, kw_only=True):
+    """A robot's last stretches as they are stored: the time (s) at the usual speed or the limits', and the ratio."""
+
+    stretches: list[tuple[Annotated[float, Meta(gt=0.0, le=1e6)], Annotated[float, Meta(gt=0.0, le=1e3)]]]
+
+
+class _Stretch(NamedTuple):
+    """What a robot drives by one plan: times at the usual speed when it began and now (s), how long it took, when."""
+
+    plan_id: int
+    begin: float
+    at: float
+    took: float
+    now: float
+
+
+class Paces:
+    """The paces of all robots; times are s of the planner's monotonic clock."""
+
+    def __init__(self) -> None:
+        self._kept: dict[str, list[tuple[float, float]]] = {}
+        self._driving: dict[str, _Stretch] = {}
+        self._changed: set[str] = set()
+
+    def on_progress(self, robot: str, plan_id: int, seconds: float, now: float, *, drives: bool) -> None:
+        """Note where on a plan a robot is: `seconds` from its begin at the usual speed. Time counts while it drives."""
+        known = self._driving.get(robot)
+        if known is None or known.plan_id != plan_id:
+            self.end(robot)
+            self._driving[robot] = _Stretch(plan_id, seconds, seconds, 0.0, now)
+            return
+        took = known.took + (now - known.now if drives and now - known.now <= _GAP_S else 0.0)
+        self._driving[robot] = known._replace(at=max(known.at, seconds), took=took, now=now)
+
+    def end(self, robot: str, seconds: float | None = None) -> None:
+        """End a robot's stretch: it has reached the goal, `seconds` from the begin, or drives by another plan."""
+        known = self._driving.pop(robot, None)
+        if known is None:
+            return
+        usual = (known.at if seconds is None else seconds) - known.begin
+        if usual >= _SHORT_S and known.took > 0.0:
+            self._kept[robot] = [*self._kept.get(robot, []), (usual, known.took / usual)][-_KEPT:]
+            self._changed.add(robot)
+
+    def arrival(self, robot: str, seconds: float) -> Arrival:
+        """Return how long a robot takes for a way of so many seconds at the usual speed."""
+        stretches = [*_PRIOR, *self._kept.get(robot, [])]
+        weights, ratios = np.array(stretches).T
+        if len(stretches) > 2 * len(_PRIOR):
+            weights[: len(_PRIOR)] *= 0.1
+        order = np.argsort(ratios)
+        below = (np.cumsum(weights[order]) - 0.5 * weights[order]) / weights.sum()
+        low, high = np.interp(_QUANTILES, below, ratios[order])
+        expected = float(np.average(ratios, weights=weights))
+        return Arrival(
+            earliest_s=round(seconds * float(low), 1),
+            expected_s=round(seconds * expected, 1),
+            latest_s=round(seconds * float(high), 1),
+        )
+
+    # --- Redis ------------------------------------------------------------------------------------------------------
+
+    def to_store(self) -> dict[str, PaceRecord]:
+        """Return the records of the robots that have driven since the last call."""
+        due, self._changed = self._changed, set()
+        return {robot: PaceRecord(stretches=[*self._kept[robot]]) for robot in due}
+
+    def store_again(self, robots: Mapping[str, PaceRecord]) -> None:
+        """Note that these could not be stored."""
+        self._changed.update(robots)
+
+    def restore(self, records: Mapping[str, PaceRecord]) -> None:
+        """Continue with what is stored."""
+        self._kept = {robot: record.stretches[-_KEPT:] for robot, record in records.items()}
+        self._changed = set()

@@ -255,3 +255,16 @@ async def test_killed_demo_on_embedded_servers_leaves_files_but_no_process(start
     assert processes_of(folder) == []
     # The last thread of a killed process may close its sockets after the process counts as dead.
     await until(lambda: not any(listens(port) for port in ports), 60, lambda: f"none of {sorted(ports)} is open")
+
+
+@pytest.mark.long
+@pytest.mark.timeout(900)
+@pytest.mark.parametrize("world", ["ros2", "rmf", "vda5050"])
+def test_robot_of_others_is_led_round_the_barrier_by_messages_of_its_own_world(tmp_path: Path, world: str) -> None:
+    report = tmp_path / "report.json"
+    command = ["demo", "--headless", "--seed", "1", "--speed", "2", "--with", world, "--report", str(report), "--yes"]
+    done = subprocess.run([sys.executable, "-m", "fognav", *command], check=False, capture_output=True, text=True)
+    guest = json.loads(report.read_text("utf-8"))["guest"]
+    led = {name: guest[name] for name in ("reached", "first_plan_through_barrier", "touched_barrier")}
+    assert led == {"reached": True, "first_plan_through_barrier": True, "touched_barrier": False}, done.stdout
+    assert done.returncode == 0

@@ -1,8 +1,9 @@
 """A robot of others for the demo: it knows of Fognav only what messages of ROS 2 say. `python -m fognav_sim.guest`.
 
-It has a map, a keepout and a speed mask, and where Fognav's robot is, all over the wire of rmw_zenoh, read and written
-here by itself; a planner (Dijkstra on cells of 0.2 m, with its own inflation); and wheels that do what they are told.
-No sensor of it sees anything. At its goal, or when it is ended, it writes its drive as one JSON object.
+As one of Open-RMF's it knows which lanes of its navigation graph are closed, and drives along the others. Else it has a
+keepout and a speed mask, and a planner of its own (Dijkstra on cells of 0.2 m, with its own inflation). It knows where
+Fognav's robot is, all over the wire of rmw_zenoh, read and written here by itself; its wheels do what they are told, and
+no sensor of it sees anything. At its goal, or when it is ended, it writes its drive as one JSON object.
 """
 
 from __future__ import annotations
@@ -16,7 +17,8 @@ import struct
 import sys
 import threading
 import time
-from typing import TYPE_CHECKING, Final, NamedTuple
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Final, NamedTuple
 
 import numpy as np
 import zenoh
@@ -39,11 +41,13 @@ KEEP_M: Final = 1.5
 """It stops this far behind that robot ..."""
 ARRIVED_M: Final = 1.8
 """... and is at its goal this far from it: that robot is there already."""
+LANE_M: Final = 0.8
+"""The length of the lanes that a robot of Open-RMF's drives along."""
 _CELL_M: Final = 0.2
 _LETHAL: Final = 100
 """What Nav2 makes a lethal cell of."""
 _KEEP_OFF_M: Final = 0.3
-_STEP_S: Final = 0.1
+STEP_S: Final = 0.1
 _CHANGED_M: Final = 0.6
 """A way whose length differs by more is another one."""
 _TRAIL_S: Final = 0.5
@@ -148,6 +152,21 @@ def plan(floor: Grid, keepout: Grid | None, start: Point, goal: Point) -> list[P
     return [(floor.x + (column + 0.5) * _CELL_M, floor.y + (row + 0.5) * _CELL_M) for row, column in reversed(cells)]
 
 
+def lattice(floor: Grid) -> dict[str, list[Any]]:
+    """Return a level of a navigation graph of Open-RMF over a floor: vertices `LANE_M` apart, lanes both ways."""
+    blocked, every = blocked_cells(floor, None), round(LANE_M / _CELL_M)
+    free = [(int(r), int(c)) for r, c in np.argwhere(~blocked) if r % every == 0 and c % every == 0]
+    numbers = {cell: number for number, cell in enumerate(free)}
+    lanes = []
+    for (row, column), number in numbers.items():
+        for dy, dx in ((0, 1), (1, 0), (1, 1), (1, -1)):
+            other = numbers.get((row + every * dy, column + every * dx))
+            if other is not None and not any(blocked[row + n * dy, column + n * dx] for n in range(every)):
+                lanes += [[number, other, {}], [other, number, {}]]
+    vertices = [[floor.x + (c + 0.5) * _CELL_M, floor.y + (r + 0.5) * _CELL_M, {}] for r, c in free]
+    return {"vertices": vertices, "lanes": lanes}
+
+
 def _length(way: Sequence[Point]) -> float:
     return sum(math.dist(*pair) for pair in itertools.pairwise(way))
 
@@ -199,10 +218,14 @@ class Guest:
 
     def _replan(self) -> None:
         assert self.floor is not None
-        way = plan(self.floor, self.keepout, self.at, self.goal)
+        way = self._way_from(self.at)
         if not self.plans or abs(_length([self.at, *self._way]) - _length(way)) > _CHANGED_M:
             self.plans.append(way)
         self._way = way[1:]
+
+    def _way_from(self, at: Point) -> list[Point]:
+        assert self.floor is not None
+        return plan(self.floor, self.keepout, at, self.goal)
 
     def _advance(self, step: float, seconds: float, host: Point) -> None:
         away = math.dist(self.at, host)
@@ -222,7 +245,8 @@ class Guest:
 
     def _ahead(self) -> Point:
         """Return where it will be soon."""
-        return self._way[min(len(self._way) - 1, round(1.0 / _CELL_M))]
+        near = (point for point in self._way if math.dist(point, self.at) >= 1.0)
+        return next(near, self._way[-1])
 
     def report(self) -> dict[str, object]:
         """Return what became of its drive."""
@@ -230,6 +254,56 @@ class Guest:
             "reached": self.has_arrived, "driven_m": round(self.driven_m, 1), "stood_s": round(self.stood_s, 1),
             "masks": self.masks, "plans": self.plans, "trail": self.trail,
         }  # fmt: skip
+
+
+class LaneGuest(Guest):
+    """A robot of Open-RMF's: it drives along lanes, and along none that is closed."""
+
+    def __init__(self, start: Point, goal: Point, graph: dict[str, list[Any]], fleet: str) -> None:
+        super().__init__(start, goal)
+        self._vertices: list[Point] = [(x, y) for x, y, _ in graph["vertices"]]
+        self._lanes, self._fleet = [(a, b) for a, b, _ in graph["lanes"]], fleet
+        self._closed: set[int] | None = None
+
+    def on_lanes(self, data: bytes) -> None:
+        """Take a LaneRequest: the fleet's name, lanes to open and lanes to close."""
+        (length,) = struct.unpack_from("<I", data, 4)
+        fleet, at, numbers = data[8 : 7 + length].decode(), 8 + length, []
+        for _ in range(2):
+            (count,) = struct.unpack_from("<I", data, at := _aligned(at, 4))
+            at = _aligned(at + 4, 8) if count else at + 4
+            numbers.append(set(struct.unpack_from(f"<{count}Q", data, at)))
+            at += 8 * count
+        closed = ((self._closed or set()) - numbers[0]) | numbers[1]
+        if fleet == self._fleet and closed != self._closed and self.floor is not None:
+            self._closed = closed
+            self.on_keepout(self.floor._replace())  # another one: a reason to plan anew
+
+    def _way_from(self, at: Point) -> list[Point]:
+        ends: dict[int, list[int]] = {}
+        for number, (a, b) in enumerate(self._lanes):
+            if number not in (self._closed or ()):
+                ends.setdefault(a, []).append(b)
+        first, last = (
+            min(range(len(self._vertices)), key=lambda n: math.dist(self._vertices[n], point))
+            for point in (at, self.goal)
+        )
+        cost, before, waiting = {first: 0.0}, {first: first}, [(0.0, first)]
+        while waiting:
+            spent, vertex = heapq.heappop(waiting)
+            if vertex == last:
+                break
+            for other in ends.get(vertex, ()):
+                longer = spent + math.dist(self._vertices[vertex], self._vertices[other])
+                if longer < cost.get(other, math.inf):
+                    cost[other], before[other] = longer, vertex
+                    heapq.heappush(waiting, (longer, other))
+        if last not in before:
+            return []
+        found = [last]
+        while found[-1] != first:
+            found.append(before[found[-1]])
+        return [at, *(self._vertices[n] for n in reversed(found)), self.goal]
 
 
 def drive(guest: Guest, session: zenoh.Session, site: str, host: str, speed: float, ended: threading.Event) -> None:
@@ -246,7 +320,8 @@ def drive(guest: Guest, session: zenoh.Session, site: str, host: str, speed: flo
         guest.host = _pose_of(sample.payload.to_bytes())
 
     def on_keepout(sample: zenoh.Sample) -> None:
-        guest.on_keepout(Grid.decoded(sample.payload.to_bytes()))
+        if not isinstance(guest, LaneGuest):
+            guest.on_keepout(Grid.decoded(sample.payload.to_bytes()))
 
     kind = "geometry_msgs::msg::dds_::PoseWithCovarianceStamped_"
     heard: Sequence[object] = [
@@ -258,10 +333,13 @@ def drive(guest: Guest, session: zenoh.Session, site: str, host: str, speed: flo
         ),
         session.declare_subscriber(f"0/{host}/pose/{kind}/*", on_host),
     ]
+    if isinstance(guest, LaneGuest):
+        lanes = "0/lane_closure_requests/rmf_fleet_msgs::msg::dds_::LaneRequest_/*"
+        heard = [*heard, session.declare_subscriber(lanes, lambda sample: guest.on_lanes(sample.payload.to_bytes()))]
     assert heard
     number = 0
-    while not ended.wait(_STEP_S) and not guest.has_arrived:
-        guest.step(_STEP_S * speed, time.monotonic() * speed)
+    while not ended.wait(STEP_S) and not guest.has_arrived:
+        guest.step(STEP_S * speed, time.monotonic() * speed)
         if not guest.is_driving:
             continue
         number += 1
@@ -271,7 +349,7 @@ def drive(guest: Guest, session: zenoh.Session, site: str, host: str, speed: flo
 
 
 def main() -> None:
-    """Drive as the command line says: ROUTER SITE HOST START_X START_Y GOAL_X GOAL_Y SPEED."""
+    """Drive as the command line says: ROUTER SITE HOST START_X START_Y GOAL_X GOAL_Y SPEED [GRAPH FLEET]."""
     router, site, host = sys.argv[1:4]
     x, y, goal_x, goal_y, speed = map(float, sys.argv[4:9])
     ended = threading.Event()
@@ -284,6 +362,9 @@ def main() -> None:
     for key, value in (("mode", "client"), ("connect/endpoints", [router]), ("scouting/multicast/enabled", False)):
         config.insert_json5(key, json.dumps(value))
     guest = Guest((x, y), (goal_x, goal_y))
+    if len(sys.argv) > 9:  # with the two that may be left out
+        graph = json.loads(Path(sys.argv[9]).read_text("utf-8"))["levels"]
+        guest = LaneGuest((x, y), (goal_x, goal_y), next(iter(graph.values())), sys.argv[10])
     with zenoh.open(config) as session:
         drive(guest, session, site, host, speed, ended)
     sys.stdout.write(json.dumps(guest.report()) + "\n")

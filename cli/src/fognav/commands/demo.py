@@ -69,7 +69,7 @@ def demo_command(  # noqa: PLR0913  # each option is an argument
     ] = None,
     with_: Annotated[
         str | None,
-        typer.Option("--with", metavar="ros2", help="A robot of others follows, led by ROS 2's messages alone."),
+        typer.Option("--with", metavar="WORLD", help="A robot of others follows, led by ros2, rmf or vda5050."),
     ] = None,
     embedded: Annotated[
         bool,
@@ -88,12 +88,12 @@ def demo_command(  # noqa: PLR0913  # each option is an argument
     """
     from fognav.demo.options import Options, embedded_servers, hardware  # noqa: PLC0415  # kernels are slow
     from fognav.demo.view import run_demo  # noqa: PLC0415  # same
-    from fognav.ros2 import require_ros2  # noqa: PLC0415  # same
+    from fognav.ros2 import GUESTS, require_ros2  # noqa: PLC0415  # same
 
     with exit_codes():
         if with_ is not None:
-            if with_ != "ros2":
-                raise WrongUseError(f"--with {with_}: no such system. Use: --with ros2")
+            if with_ not in GUESTS:
+                raise WrongUseError(f"--with {with_}: no such system. Use: --with {' or --with '.join(GUESTS)}")
             require_ros2()
         loaded = load_site(checkout.site_folder(site))
         for file in (report, record):
@@ -115,7 +115,7 @@ def demo_command(  # noqa: PLR0913  # each option is an argument
             keep_running=keep_running,
             record=record,
             embedded=packages,
-            ros2=with_ is not None,
+            guest=with_ or "",
         )
         values = asyncio.run(run_demo(loaded, options, headless=headless, page_port=page_port, print_line=print_line))
         if report is not None:

@@ -220,9 +220,11 @@ class Attempt:
                 presence.announce()
                 async with Background(operator.keep_enabled(), self._sample(stack, presence)) as background:
                     guest = None
-                    if options.ros2:
-                        guest = await ends.enter_async_context(GuestDrive(stack, self.plan))
-                        self.scene.log_event("scenario: a robot of others sets out 2 m behind, by ROS 2 alone")
+                    if options.guest:
+                        guest = await ends.enter_async_context(GuestDrive(stack, self.plan, options.guest))
+                        self.scene.log_event(
+                            f"scenario: a robot of others sets out 2 m behind, by {options.guest} alone"
+                        )
                     await self.run_drive(operator, clock, background)
                     if guest is not None and not self.taken_over:
                         self.scene.log_event("scenario: waiting until the robot of others is there, too")

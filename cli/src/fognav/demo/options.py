@@ -38,8 +38,8 @@ class Options:
     request: HazardRequest | None = None
     settings: Mapping[str, str] = field(default_factory=dict)
     on_robot_start: Callable[[int], object] | None = None
-    ros2: bool = False
-    """Whether a robot of others follows, by ROS 2."""
+    guest: str = ""
+    """By what a robot of others follows, if one does: `ros2`, `vda5050`."""
     embedded: frozenset[str] = frozenset()
     """The servers that are Python packages, because they can't be installed here."""
 

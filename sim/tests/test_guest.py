@@ -107,10 +107,8 @@ def test_guest_of_another_maker_uses_the_zone_set_that_is_enabled():
     robot.floor = grid(floor)
     sets = ZoneSets(robot, "lab")
     door = [{"x": x, "y": y} for x, y in ((5.8, 0.75), (6.4, 0.75), (6.4, 2.75), (5.8, 2.75))]
-    for name, zones in (
-        ("first", []),
-        ("second", [{"zoneType": "BLOCKED", "vertices": door}, {"zoneType": "SPEED_LIMIT", "vertices": door, "maximumSpeed": 0.15}]),
-    ):  # fmt: skip
+    slow = {"zoneType": "SPEED_LIMIT", "vertices": door, "maximumSpeed": 0.15}
+    for name, zones in (("first", []), ("second", [{"zoneType": "BLOCKED", "vertices": door}, slow])):
         sets.on_zone_set({"zoneSet": {"mapId": "lab", "zoneSetId": name, "zones": zones}})
     sets.on_zone_set({"zoneSet": {"mapId": "elsewhere", "zoneSetId": "third", "zones": []}})
 

@@ -2,8 +2,8 @@
 
 As one of Open-RMF's it knows which lanes of its navigation graph are closed, and drives along the others. Else it has a
 keepout and a speed mask, and a planner of its own (Dijkstra on cells of 0.2 m, with its own inflation). It knows where
-Fognav's robot is, all over the wire of rmw_zenoh, read and written here by itself; its wheels do what they are told, and
-no sensor of it sees anything. At its goal, or when it is ended, it writes its drive as one JSON object.
+Fognav's robot is, all over the wire of rmw_zenoh, read and written here by itself; its wheels do what they are told,
+and no sensor of it sees anything. At its goal, or when it is ended, it writes its drive as one JSON object.
 """
 
 from __future__ import annotations

@@ -93,13 +93,9 @@ class ZoneSets:
 
     def state(self) -> dict[str, Any]:
         """Return what the robot's state says of zone sets and their actions."""
-        return {
-            "zoneSets": [
-                {"zoneSetId": name, "mapId": self._map_id, "zoneSetStatus": "ENABLED" if name == self._enabled else "DISABLED"}
-                for name in self._sets
-            ],
-            "instantActionStates": self._actions,
-        }  # fmt: skip
+        status = {name: "ENABLED" if name == self._enabled else "DISABLED" for name in self._sets}
+        sets = [{"zoneSetId": name, "mapId": self._map_id, "zoneSetStatus": each} for name, each in status.items()]
+        return {"zoneSets": sets, "instantActionStates": self._actions}
 
 
 async def drive(guest: Guest, sets: ZoneSets, broker: Broker, host: str, speed: float) -> None:

@@ -379,6 +379,31 @@ def _first_inside(
     return math.inf
 
 
+@njit(
+    int64(_arrays.F64_GRID, int64, int64, _arrays.F64_GRID, float64, float64),
+    cache=True,
+    nogil=True,
+    error_model="numpy",
+)
+def _first_near(line: Any, first: int, last: int, other: Any, reach: float, spacing: float) -> int:
+    """Find the first of the points `first` to `last` (exclusive) of a line within `reach` of a point of another one."""
+    i = first
+    while i < last:
+        spare = math.inf
+        j = 0
+        while j < other.shape[0]:
+            dx = line[i, 0] - other[j, 0]
+            dy = line[i, 1] - other[j, 1]
+            beyond = math.sqrt(dx * dx + dy * dy) - reach
+            if beyond <= 0.0:
+                return i
+            # What is skipped is farther off than half of it.
+            spare = min(spare, 0.5 * beyond)
+            j += max(1, int(0.5 * beyond / spacing))
+        i += max(1, int(min(spare, 1e9) / spacing))
+    return -1
+
+
 def _cells_array(cells: NDArray[np.int32]) -> NDArray[np.int32]:
     _arrays.exact(cells, np.int32, 2, "cells")
     if cells.shape[0] == 0 or cells.shape[1] != 2:
@@ -500,6 +525,19 @@ def first_inside(
     return float(
         _first_inside(points, along, spacing, float(begin), left, bottom, resolution, place[0], place[1], cells)
     )
+
+
+def first_near(
+    line: NDArray[np.float64], first: int, last: int, other: NDArray[np.float64], reach: float, spacing: float
+) -> int:
+    """Return the first of the points `first` to `last` (exclusive) of a line within `reach` of another's; -1: none is.
+
+    Both are float64 (n, 2), points at most `spacing` apart, in one unit with `reach`. Points that can't be near are
+    skipped, so that lines far apart cost little. Raises ValueError for points that the line does not have.
+    """
+    if not 0 <= first <= last <= len(line):
+        raise ValueError(f"points {first} to {last} are not among the {len(line)} of the line")
+    return int(_first_near(line, first, last, other, reach, spacing))
 
 
 def nearest_between(

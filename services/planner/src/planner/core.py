@@ -22,6 +22,7 @@ from planner.config import PlannerConfig
 from planner.dry_run import State, run
 from planner.field_jobs import FieldJob, LandmarkJob
 from planner.heuristics import DeadEndsJob, GoalFields
+from planner.leases.corridor_leases import CorridorLeases
 from planner.missions import Missions
 from planner.planning_map import MapTracker, PreparedMap
 from planner.queries import Answerer, ExplainJob, View
@@ -61,6 +62,10 @@ if TYPE_CHECKING:
     Job = DeadEndsJob | FieldJob | LandmarkJob | ExplainJob
 
 
+DRIVING: Final = frozenset({"NORMAL", "DEGRADED", "HOLD", "EGRESS", "DOCK"})
+"""Modes of a robot that drives its path, or soon will."""
+
+
 class PlannerCore:
     """Goals, poses and map versions in; paths, refusals and ended goals out."""
 
@@ -83,6 +88,7 @@ class PlannerCore:
         self._regions = BlockedRegions()
         self._fields = GoalFields(self.config.goal_fields_bytes, self.config.landmark_bytes)
         self.missions = Missions()
+        self.leases = CorridorLeases()
         self.places: Mapping[str, Place] | None = None
         """All places by id, as the map-service has them; None until it has told them."""
         self.waits, self.paces = Waits(self.config), Paces()
@@ -147,11 +153,12 @@ class PlannerCore:
         if mission.plan is not None and mission.replan is None:
             mission.replan = reason_from_pose(mission.plan, pose, self.config)
         self._learn_pace(ids["robot"], mission, at.now)
+        self.leases.place(ids["robot"], pose.x, pose.y, at.now, pose.radius)
         return ()
 
     def _learn_pace(self, robot: str, mission: Mission, now: float) -> None:
         plan, planning_map = mission.plan, self._map.current
-        if plan is None or plan.route is None or plan.waits or planning_map is None:
+        if plan is None or plan.route is None or plan.ends_early or planning_map is None:
             self.paces.end(robot)
             return
         if plan.times is None:
@@ -161,7 +168,7 @@ class PlannerCore:
     def arrival(self, robot: str) -> Arrival | None:
         """Return when a robot arrives, by its pace; None when it has no path, or waits. Any thread may ask."""
         plan, planning_map = self.missions.of(robot).plan, self._map.current
-        if plan is None or plan.route is None or plan.waits or planning_map is None:
+        if plan is None or plan.route is None or plan.ends_early or planning_map is None:
             return None
         times = Times.of(plan.route, self._map.speed_layer, planning_map.geometry)
         return self.paces.arrival(robot, times.rest(plan.progress))
@@ -169,6 +176,8 @@ class PlannerCore:
     def _on_state(self, ids: Ids, state: RobotState, _at: Moment) -> Sequence[Publication]:
         mission = self.missions.of(ids["robot"])
         mission.on_state(state)
+        able = state.mode in DRIVING
+        self.leases.on_state(ids["robot"], mission.received, able=able, plans_itself=mission.plans_itself)
         if state.goal_reached and state.goal_id is not None:
             times = mission.plan.times if mission.plan is not None else None
             self.paces.end(ids["robot"], None if times is None else float(times.seconds[-1]))
@@ -192,6 +201,7 @@ class PlannerCore:
         """Forget all missions, without a message to the robots: another planner leads."""
         self.epoch, self._knows_missions = 0, False
         self.missions.drop()
+        self.leases.forget()
 
     # --- The map ----------------------------------------------------------------------------------------------------
 
@@ -267,12 +277,15 @@ class PlannerCore:
         for number, (robot, mission, reason) in enumerate(due):
             if mission.target is not None and mission.pose is not None:
                 waiting = [other for _, other, _ in due[number + 1 :]]
-                self.replanner.replan(mission, reason, planning_map, covers, at.now, waiting)
+                avoid = self.leases.obstacles(robot, mission.beside)
+                self.replanner.replan(mission, reason, planning_map, covers, at.now, waiting, avoid)
                 yield robot
 
     def publish(self, at: Moment) -> Sequence[Publication]:
         """Return the goals, paths and refusals that are due; a goal that was set since `plan` has no path yet."""
-        return [publication for robot, _ in self.missions.items() for publication in self.publish_for(robot, at)]
+        found = [publication for robot, _ in self.missions.items() for publication in self.publish_for(robot, at)]
+        self._make_room(at)
+        return found
 
     def publish_for(self, robot: str, at: Moment) -> Sequence[Publication]:
         """Return the goal, the path or refusal, and the release of one robot, as far as they are due."""
@@ -280,13 +293,40 @@ class PlannerCore:
         publications: list[Publication] = []
         if (goal := mission.due_goal(at, self.config, self.epoch)) is not None:
             publications.append(Publication(ch.ROBOT_GOAL, goal, ids))
+        plan = mission.plan
+        if plan is None or plan.route is None or mission.goal is None:
+            self.leases.stop(robot)
         if planning_map is None or robot not in self._served or mission.path_is_outdated:
             return publications
+        if plan is not None and plan.route is not None and mission.goal is not None:
+            self.leases.follow(robot, (self.epoch, plan.plan_id), plan.route.corners, mission.goal.goal_id)
+            self.leases.advance(robot, plan.progress)
+            if not plan.published or at.now >= mission.release_due:
+                plan.lease = self.leases.release(robot, plan.wanted_length(self.config), at.now)
+                plan.waits_for = self.leases.waits_for(robot)
         if (path := mission.due_path(at, self.config, self.epoch, planning_map.version)) is not None:
             publications.append(Publication(ch.ROBOT_PATH, path, ids))
         if (release := mission.due_release(at, self.config, self.epoch, planning_map.version)) is not None:
             publications.append(Publication(ch.ROBOT_RELEASE, release, ids))
         return publications
+
+    def _make_room(self, at: Moment) -> None:
+        """Let robots that would stand face to face for ever make room for one another: one search at most."""
+        for robot in self.leases.aside_ended():
+            self.missions.of(robot).request_replan("goal", [])
+        room, planning_map = self.leases.room_needed(at.now), self._map.current
+        if room is None or planning_map is None or room.robot not in self._served:
+            return
+        mission = self.missions.of(room.robot)
+        if mission.replan is not None or mission.target is None or mission.plan is None or mission.plan.waits:
+            return
+        plan = self.replanner.make_room(mission, room, planning_map, partial(cover, self._regions.sources))
+        if plan is None or plan.route is None or not self.leases.standstills.accepts(room, plan.route.corners):
+            return
+        mission.plan = plan
+        if room.kind in ("lane", "past"):
+            mission.beside |= room.whom
+        self.leases.take(room, (self.epoch, plan.plan_id), plan.route.corners)
 
     # --- Jobs: run on other threads ---------------------------------------------------------------------------------
 

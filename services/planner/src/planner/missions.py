@@ -79,16 +79,31 @@ class Plan:
     """How long the path takes, once somebody asked."""
     judged: Judgement | None = None
     """Why the robot goes round something, or waits before it."""
+    waits_after: float = math.inf
+    """How far along (m) the robot stands aside, until it gets another path."""
+    lease: float = math.inf
+    """How far along (m) no other robot is in the way (`leases`)."""
+    waits_for: str | None = None
+    """For which robot it waits there."""
 
     @property
     def waits(self) -> bool:
         """Whether the robot waits before something, where the way round it branches off."""
         return self.judged is not None and self.judged.waits
 
+    @property
+    def ends_early(self) -> bool:
+        """Whether the path is not released to its goal: the robot waits there, or stands aside."""
+        return self.waits or not math.isinf(self.waits_after)
+
+    def wanted_length(self, config: PlannerConfig) -> float:
+        """Return how much of the path (m) the robot may drive if no other one is in the way; 0 for a refusal."""
+        hold = self.judged.hold if self.judged is not None and self.judged.waits else self.waits_after
+        return min(self.route.length, self.progress + config.release_length, hold) if self.route else 0.0
+
     def released_length(self, config: PlannerConfig) -> float:
         """Return how much of the path (m) the robot may drive; 0 for a refusal."""
-        hold = self.judged.hold if self.judged is not None and self.judged.waits else math.inf
-        return min(self.route.length, self.progress + config.release_length, hold) if self.route else 0.0
+        return min(self.wanted_length(config), self.lease)
 
 
 @dataclass
@@ -120,6 +135,8 @@ class Mission:
     search_ran_out: bool = False
     """Whether the last search took too long; a passable path is kept all the same."""
     switches: SwitchLimiter = field(default_factory=SwitchLimiter)
+    beside: frozenset[str] = frozenset()
+    """Robots beside whose corridors its paths lead, until they have met."""
     goal_sent: float = -math.inf
     """When the goal was published last; -inf for one that is new or changed."""
     release_due: float = -math.inf
@@ -165,6 +182,7 @@ class Mission:
     def _reset(self, reason: ReplanReason | None) -> None:
         self.plan, self.replan, self.traces, self.danger = None, reason, [], math.inf
         self.switches, self.search_ran_out, self.blocked = SwitchLimiter(), False, None
+        self.beside = frozenset()
 
     def request_replan(self, reason: ReplanReason, traces: list[Trace], danger: float = math.inf) -> None:
         """Request a replan; the first reason is kept, except that `map` replaces it.

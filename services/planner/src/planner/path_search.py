@@ -66,6 +66,11 @@ class Route:
         """Length in m."""
         return float(self._corner_along[-1])
 
+    @property
+    def last_corner(self) -> float:
+        """How far along (m) the last line begins."""
+        return float(self._corner_along[-2])
+
     def nearest(self, x: float, y: float, after: float = 0.0, window: float = math.inf) -> tuple[float, float]:
         """Return how far along (m) the point nearest to (x, y) is, and its distance.
 
@@ -161,6 +166,8 @@ class PathSearch:
         """`unguided_expansions`: how many cells a search without a field may expand; by default as many as others."""
         self._config = config
         self._most_unguided = min(unguided_expansions or config.max_expansions, config.max_expansions)
+        self.escape_distance = config.escape_distance
+        """How far (m) a start on an impassable cell may be from the nearest traversable one."""
         self.geometry = geometry
         self.planner = Planner(geometry.width, geometry.height)
 
@@ -272,6 +279,27 @@ class PathSearch:
             cells[0] = exact_start
         return geometry.centres(cells)
 
+    def aside(
+        self, planning_map: PlanningMap, covers: Covers, start: PointXY, places: Grid, back: float
+    ) -> Route | None:
+        """Return the cheapest path to a cell that is traversable on `places`, and `back` (m) from there; None: no path.
+
+        No robot drives the last part: until it has another path, its goal is elsewhere.
+        """
+        geometry = self.geometry
+        first = geometry.cell(*start)
+        free = self.free_start(planning_map, covers, first) if geometry.contains_cell(*first) else None
+        cells = None if free is None else self.planner.exit_path(planning_map.cost, places, free)
+        if cells is None or len(cells) < 2:
+            return None
+        corners = geometry.centres(self.planner.shortcut(planning_map.cost, cells))
+        end, before = corners[-1], corners[-2]
+        if math.dist(before, end) < 0.5 * back:
+            return None  # too short to be told from its end
+        behind = end + (before - end) * min(1.0, back / math.dist(before, end))
+        points = np.concatenate((np.array((start,)), corners if free != first else corners[1:], behind[None, :]))
+        return Route(points, self._config.point_spacing, escape_lines=int(free != first))
+
     def free_start(self, planning_map: PlanningMap, covers: Covers, start: Cell) -> Cell | None:
         """Return the start's cell, or the nearest one where a robot may be; None when it is in a hazard, zone or wall.
 
@@ -282,7 +310,7 @@ class PathSearch:
             return start
         if self._is_closed(planning_map, covers, start):
             return None
-        reach = math.floor(self._config.escape_distance / self.geometry.resolution)
+        reach = math.floor(self.escape_distance / self.geometry.resolution)
         free = nearest_traversable(planning_map.cost, start, reach)
         if free is None:
             return None

@@ -5,12 +5,12 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Final
 
 import numpy as np
 from numpy.typing import NDArray
 
-from fog_contracts.costs import INSCRIBED, UNKNOWN
+from fog_contracts.costs import INSCRIBED, LETHAL, UNKNOWN
 from fog_contracts.follower import MapFollower
 from fog_contracts.replica import decode_map
 from fog_kernels.components import Components
@@ -18,12 +18,17 @@ from fog_kernels.distance import squared_distance_capped
 from fog_kernels.inflation import inflate, inflation_table
 
 if TYPE_CHECKING:
+    from collections.abc import Iterable
+
     from fog_contracts.costs import Inflation
     from fog_contracts.grid import GridGeometry, Window
     from fog_contracts.messages import MapDelta, MapHeartbeat, MapSnapshot, Trace
     from fog_contracts.replica import Applied, DecodedMap, Version
 
     Grid = NDArray[np.uint8]
+
+_PART: Final = 30
+"""Of so many points of a line the surroundings are looked at together."""
 
 
 class StandingMap:
@@ -105,6 +110,26 @@ class PlanningMap:
     def has_components(self) -> bool:
         """Whether `components` is computed already."""
         return "components" in self.__dict__
+
+    def avoiding(self, lines: Iterable[tuple[NDArray[np.float64], float]]) -> PlanningMap:
+        """Return this map with all places lethal that are within a reach (m) of the points ((n, 2), m) of lines."""
+        cost = self.cost.copy()
+        resolution = self.geometry.resolution
+        for points, reach in lines:
+            # Of the points and the places only the cells are known.
+            cells = math.ceil(reach / resolution + math.sqrt(2.0))
+            for part in np.array_split(points, math.ceil(len(points) / _PART)) if len(points) else ():
+                (left, bottom), (right, top) = part.min(axis=0).tolist(), part.max(axis=0).tolist()
+                around = cells * resolution
+                window = self.geometry.window_around(left - around, bottom - around, right + around, top + around)
+                marks = np.zeros((window.height, window.width), np.bool_)
+                at, _ = self.geometry.cells(part)
+                columns, rows = at[:, 0] - window.x, at[:, 1] - window.y
+                inside = (columns >= 0) & (columns < window.width) & (rows >= 0) & (rows < window.height)
+                marks[rows[inside], columns[inside]] = True
+                near = squared_distance_capped(marks, cells + 1) <= cells * cells
+                cost[window.rows, window.columns][near] = LETHAL
+        return replace(self, cost=cost)
 
     def reachable(self, start: Cell, goal: Cell) -> bool:
         """Whether a path leads from one traversable cell to another."""

@@ -8,6 +8,7 @@ move a robot at most once per `switch_dwell_s`, and ever more seldom while they 
 from __future__ import annotations
 
 import math
+from copy import copy
 from dataclasses import dataclass, replace
 from functools import partial
 from typing import TYPE_CHECKING, Final, Literal
@@ -27,11 +28,21 @@ if TYPE_CHECKING:
     from fog_kernels.guides import Detour, GoalField
     from planner.config import PlannerConfig
     from planner.heuristics import DeadEndsJob, GoalFields, Trip
+    from planner.leases.corridors import Disc
+    from planner.leases.standstills import Room
     from planner.missions import Mission, ReplanReason, SwitchLimiter
     from planner.path_search import Covers, Route, SearchResult
     from planner.planning_map import Cell, CostChange, PlanningMap
     from planner.waits.choice import Judgement, Waits
 
+_BACK_M: Final = 0.2
+"""So much of its path a robot that stands aside is not released: it has not reached its goal."""
+_ESCAPE_M: Final = 0.8
+"""How far a robot on the way of another one may be from places beside that."""
+_ROUND_M: Final = 15.0
+"""So much longer (m, at the cost of free floor) a path may be that makes room, before robots stand aside instead."""
+_PAST_M: Final = 5.0
+"""The same of one that leads past a robot on the same floor, before one of them waits instead."""
 _PROGRESS_WINDOW_M: Final = 5.0
 """How far ahead of its last progress a robot is searched on its path, so that a loop is not cut short."""
 
@@ -201,7 +212,7 @@ class Replanner:
         cells = [geometry.cell(*plan.origin) for plan in plans if plan is not None and plan.origin is not None]
         return [cell for cell in cells if geometry.contains_cell(*cell)]
 
-    def replan(
+    def replan(  # noqa: PLR0913  # what a search depends on
         self,
         mission: Mission,
         reason: ReplanReason,
@@ -209,10 +220,12 @@ class Replanner:
         covers: Covers,
         now: float,
         waiting: Sequence[Mission] = (),
+        avoid: Sequence[Disc] = (),
     ) -> None:
         """Search a path for a mission with a target and a pose, and keep or replace its plan.
 
-        `waiting`: the missions that are searched next on this map. What they have in common is computed once.
+        `waiting`: the missions that are searched next on this map. What they have in common is computed once. `avoid`:
+        places of other robots, through which the path leads only if it can't lead round them.
         """
         pose, target = mission.pose, mission.target
         assert pose is not None
@@ -220,7 +233,11 @@ class Replanner:
         danger = mission.danger
         traces = mission.begin_replan(reason, now)
         mission.release_now()
-        found = self._find(mission, planning_map, covers, waiting, danger)
+        found = None
+        if avoid and (beside := self._find_beside(mission, planning_map.avoiding(avoid), covers)) is not None:
+            found, planning_map = beside
+        if found is None:
+            found = self._find(mission, planning_map, covers, waiting, danger)
         self.plans[reason] = self.plans.get(reason, 0) + 1
         if found.refusal is not None:
             self.refusals[found.refusal.code] = self.refusals.get(found.refusal.code, 0) + 1
@@ -265,6 +282,47 @@ class Replanner:
             self._next_id, judged.route, None, traces, planned_from=(pose.x, pose.y), origin=plan.origin, judged=judged
         )  # fmt: skip
         self._next_id += 1
+
+    def make_room(self, mission: Mission, room: Room, planning_map: PlanningMap, covers: Covers) -> Plan | None:
+        """Return a plan that lets a robot and those whom it meets get on, if there is one; it may be refused."""
+        pose, plan = mission.pose, mission.plan
+        if pose is None or plan is None or plan.route is None:
+            return None
+        avoiding, start = planning_map.avoiding(room.avoid), (pose.x, pose.y)
+        if room.kind == "aside":
+            places = planning_map.avoiding(room.keep_off).cost
+            route = self._beside(planning_map.geometry).aside(avoiding, covers, start, places, _BACK_M)
+            waits_after = math.inf if route is None else route.last_corner
+        else:
+            found = self._find_beside(mission, avoiding, covers)
+            longer = {"past": _PAST_M, "lane": _PAST_M, "detour": math.inf}.get(room.kind, _ROUND_M)
+            if found is None or found[0].cost > remaining_cost(plan, planning_map) + longer * NEUTRAL_WEIGHT:
+                return None
+            route, waits_after = found[0].route, math.inf
+        if route is None:
+            return None
+        self._next_id += 1
+        number = self._next_id - 1
+        return Plan(number, route, None, [], planned_from=start, origin=plan.origin, waits_after=waits_after)
+
+    def _find_beside(
+        self, mission: Mission, avoiding: PlanningMap, covers: Covers
+    ) -> tuple[SearchResult, PlanningMap] | None:
+        """Return a path on a map that has other robots on it, and that map; None without one."""
+        pose, target, geometry = mission.pose, mission.target, avoiding.geometry
+        assert pose is not None
+        assert target is not None
+        field = self._fields.guide(geometry.cell(target.x, target.y))
+        found = self._beside(geometry).find(avoiding, covers, (pose.x, pose.y), (target.x, target.y), field)
+        return None if found.route is None else (found, avoiding)
+
+    def _beside(self, geometry: GridGeometry) -> PathSearch:
+        """Return what searches beside other robots: a robot that stands on their way may be led off it."""
+        if self._search is None or self._search.geometry != geometry:
+            self._search = PathSearch(self._config, geometry, self._config.unguided_expansions)
+        beside = copy(self._search)
+        beside.escape_distance = _ESCAPE_M
+        return beside
 
     def _find(
         self, mission: Mission, planning_map: PlanningMap, covers: Covers, waiting: Sequence[Mission], danger: float

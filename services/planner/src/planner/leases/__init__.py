@@ -1,0 +1,1 @@
+"""Leases of path corridors, by which robots make room for one another (ADR 71)."""

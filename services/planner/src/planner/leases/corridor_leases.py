@@ -1,0 +1,265 @@
+"""Robots make room for one another: stretches of paths are released as leases that do not overlap. Pure.
+
+A robot's corridor is where its body may come along a stretch of its path. A stretch is leased to one robot at a time,
+never taken back while the robot may drive on it, and given free as the robot leaves it behind. Three rules (ADR 71):
+
+- a robot gets a stretch only as far as its corridor meets no other one that is leased, and no robot that stands;
+- it may end only where no other robot has to pass, or where all can still reach their goals, one after the other, with
+  the others standing at the ends of their leases (the banker's rule: Dijkstra 1965, Habermann 1969);
+- where no such order exists, robots are face to face: one of them gets another way, or a passing place (`Room`).
+
+Times are s of a monotonic clock, lengths m, points in the frame `map`.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import TYPE_CHECKING, Final
+
+import numpy as np
+
+from fog_contracts.geometry import lengths_along, sampled
+from planner.leases.corridors import (
+    DEFAULT_RADIUS_M,
+    SPACING_M,
+    STRAY_M,
+    WAITING_M,
+    Corridor,
+    Disc,
+    between,
+    box,
+    comes_near,
+    contender_of,
+    meets,
+    reach_of,
+)
+from planner.leases.standstills import Standstills
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable
+
+    from numpy.typing import NDArray
+
+    from planner.leases.standstills import Kind, Room
+    from planner.missions import PathId
+
+    Floats = NDArray[np.float64]
+
+PATIENCE_S: Final = 15.0
+"""After so long without moving, a robot whose lease another one needs is asked to give it back ..."""
+WITHDRAWN_S: Final = 10.0
+"""... and after so long more it has: it has heard, or its own gate has stopped it (3 s without map or planner)."""
+FORGET_S: Final = 60.0
+"""A robot that is silent for so long is an obstacle that others see, no longer one that stands in the way unseen."""
+MEETING_M: Final = 1.0
+"""A robot on whose path another one is so near has not met it yet."""
+_SPEED_M_S: Final = 0.3
+_MOVED_M: Final = 0.1
+
+
+class CorridorLeases:
+    """Who may drive how far. A robot alone on its floor gets whatever is wanted for it."""
+
+    def __init__(self) -> None:
+        self._robots: dict[str, Corridor] = {}
+        self._arrivals = 0
+        self.standstills = Standstills(self._robots)
+        self.made: dict[Kind, int] = {}
+        """How often robots got room, by kind."""
+
+    # --- What is known of robots ------------------------------------------------------------------------------------
+
+    def place(self, robot: str, x: float, y: float, now: float, radius: float = DEFAULT_RADIUS_M) -> None:
+        """Note where a robot is (m)."""
+        me = self._of(robot)
+        me.at, me.radius, me.heard_at = np.array(((x, y),)), radius, now
+        if math.dist(me.moved_from, (x, y)) >= _MOVED_M or math.isinf(me.moved_at):
+            me.moved_from, me.moved_at = (x, y), now
+
+    def advance(self, robot: str, progress: float) -> None:
+        """Note how far along its path (m) a robot is: what lies behind is free again."""
+        me = self._of(robot)
+        me.progress = max(me.progress, progress)
+        me.leased = max(me.leased, me.first)
+
+    def follow(self, robot: str, path: PathId, corners: Floats, mission: str, priority: int = 0) -> None:
+        """Give a robot another path ((n, 2), m), of which nothing is leased yet; the same one again changes nothing.
+
+        The stretch of the path before stays leased until the robot names another one. Who has a lower `priority`, or
+        got its mission later, waits for the others.
+        """
+        me = self._of(robot)
+        if me.path == path:
+            return
+        self._leave(me)
+        if me.mission != mission:
+            self._arrivals += 1
+            me.mission = mission
+            me.order = (-priority, self._arrivals)
+        me.path, me.points = path, sampled(corners, SPACING_M)
+        me.along = lengths_along(me.points)
+        me.low, me.high = box(me.points)
+        me.leased = me.first
+        self.standstills.changed()
+
+    def stop(self, robot: str) -> None:
+        """Take a robot's path away: it has none, or must not drive on."""
+        me = self._robots.get(robot)
+        if me is not None and me.path is not None:
+            self._leave(me)
+            self.standstills.changed()
+
+    def on_state(self, robot: str, received: PathId | None, *, able: bool, plans_itself: bool) -> None:
+        """Note which path a robot has, whether it may drive, and whether it follows paths of this planner at all."""
+        me = self._of(robot)
+        me.former = {path: line for path, line in me.former.items() if path == received}
+        me.stray = plans_itself or (received is not None and received != me.path and received not in me.former)
+        if me.standing and able and math.isinf(me.withdrawn_at):
+            me.standing = False
+            self.standstills.changed()
+
+    def forget(self) -> None:
+        """Forget all paths and leases: another planner leads."""
+        self._robots.clear()
+        self.standstills.changed()
+
+    def _of(self, robot: str) -> Corridor:
+        me = self._robots.get(robot)
+        if me is None:
+            me = self._robots[robot] = Corridor(robot, (0, 0))
+            self.standstills.changed()
+        return me
+
+    def _leave(self, me: Corridor) -> None:
+        if me.path is not None:
+            me.former[me.path] = me.points[me.first : me.leased + 1]
+        me.path, me.points, me.along = None, np.zeros((0, 2)), np.zeros(0)
+        me.low, me.high = (math.inf, math.inf), (-math.inf, -math.inf)
+        me.progress, me.end, me.leased, me.waits_for, me.passes = 0.0, 0.0, 0, None, frozenset()
+
+    # --- Leases -----------------------------------------------------------------------------------------------------
+
+    def release(self, robot: str, wanted: float, now: float) -> float:
+        """Return how far along its path (m) a robot may drive, and lease that to it, but at most `wanted`.
+
+        A robot without others on its floor may drive as far as anybody wants: infinity. Those who wait and whose turn
+        is before its own get theirs first.
+        """
+        me = self._of(robot)
+        me.wanted = wanted
+        self._settle(now)
+        if me.path is None or len(self._robots) == 1:
+            me.end, me.leased = wanted, max(me.first, min(int(me.along.searchsorted(wanted)), len(me.points) - 1))
+            return math.inf
+        for other in sorted(self._robots.values(), key=lambda other: other.order):
+            before = other.waits_for is not None and other.order < me.order
+            if before and not other.far_from(me, reach_of(me, other)):
+                self._extend(other, now)
+        self._extend(me, now)
+        return me.end if math.isinf(me.withdrawn_at) else min(me.end, me.progress)
+
+    def waits_for(self, robot: str) -> str | None:
+        """Return whom a robot lets pass, or whose place it waits for, when it can't drive much further; else None."""
+        me = self._robots.get(robot)
+        if me is None or me.path is None or me.end - me.progress > WAITING_M:
+            return None
+        return me.waits_for or min(me.passes, default=None)
+
+    def _extend(self, me: Corridor, now: float) -> None:
+        last = min(int(me.along.searchsorted(me.wanted)), len(me.points) - 1)
+        me.waits_for = me.lets_pass = None
+        if not me.drives or me.wanted <= me.end:
+            return
+        if last <= me.leased:
+            me.end = min(me.wanted, float(me.along[me.leased]))
+            return
+        others = [other for other in self._robots.values() if other is not me]
+        limit, blocker = last + 1, None
+        for other in others:
+            lines = () if me.far_from(other, reach_of(me, other)) else other.held()
+            if (met := meets(me, other, me.leased, limit, lines)) < limit:
+                limit, blocker = met, other
+        end, contender = self._stop(me, limit - 1, others)
+        waits = contender or blocker
+        if end > me.leased:
+            me.leased, me.end = end, min(me.wanted, float(me.along[end]))
+            self.standstills.changed()
+        if waits is not None:
+            me.waits_for = waits.id
+            me.lets_pass, me.parks = None if contender is None else contender.id, limit == len(me.points)
+            self._press(waits, now)
+
+    def _stop(self, me: Corridor, end: int, others: list[Corridor]) -> tuple[int, Corridor | None]:
+        """Return the last point up to `end` where a robot may stop, and who has to pass before it gets further."""
+        contender = contender_of(me, end, others) if end > me.leased else None
+        if contender is None:
+            return end, None
+        before = self.standstills.stuck()
+        if me.id not in before and self.standstills.order({me.id: end}).keys() <= before.keys():
+            return end, None
+        for stop in range(end - 1, me.leased, -1):
+            if contender_of(me, stop, [contender]) is None and contender_of(me, stop, others) is None:
+                return stop, contender
+        return me.leased, contender
+
+    # --- Robots that stand or are silent ------------------------------------------------------------------------------
+
+    def _press(self, other: Corridor, now: float) -> None:
+        """Ask a robot for its lease that another one needs, when it has not moved for long."""
+        idle = now - other.moved_at >= PATIENCE_S and other.waits_for is None
+        if other.drives and idle and other.end > other.progress + WAITING_M and math.isinf(other.withdrawn_at):
+            other.withdrawn_at = now
+
+    def _settle(self, now: float) -> None:
+        """Free what was given back, and forget robots that have long been silent."""
+        for other in [*self._robots.values()]:
+            if now - other.withdrawn_at >= WITHDRAWN_S:
+                # Heard: it stands where it is. Silent: it may have driven on until it was asked.
+                unheard = max(0.0, other.withdrawn_at - other.heard_at)
+                end = other.progress + (_SPEED_M_S * unheard + STRAY_M if unheard > 1.0 else 0.0)
+                other.end = min(other.end, end)
+                other.leased = min(other.leased, max(other.first, int(other.along.searchsorted(other.end))))
+                other.withdrawn_at, other.standing = math.inf, True
+                self.standstills.changed()
+            if now - other.heard_at > FORGET_S and not other.drives:
+                del self._robots[other.id]
+                self.standstills.changed()
+
+    # --- Robots that make room ----------------------------------------------------------------------------------------
+
+    def room_needed(self, now: float) -> Room | None:
+        """Return which robot needs another path so that robots that meet get on; None if none does."""
+        return self.standstills.room_needed(now, self.obstacles)
+
+    def take(self, room: Room, path: PathId, corners: Floats) -> None:
+        """Let a robot follow the path that makes room."""
+        me = self._robots[room.robot]
+        self.follow(room.robot, path, corners, me.mission or "")
+        me.passes = room.whom if room.kind == "aside" else frozenset()
+        self.made[room.kind] = self.made.get(room.kind, 0) + 1
+
+    def aside_ended(self) -> list[str]:
+        """Return the robots that stand aside, or drive there, for others who have passed or turned off."""
+        return [
+            me.id
+            for me in self._robots.values()
+            if me.passes and not any(self._still_comes(me, self._robots.get(other)) for other in me.passes)
+        ]
+
+    def _still_comes(self, me: Corridor, other: Corridor | None) -> bool:
+        if other is None or not other.drives:
+            return False
+        return comes_near(other, me.points, reach_of(me, other))
+
+    def obstacles(self, robot: str, beside: Iterable[str] = ()) -> list[Disc]:
+        """Return the places that a new path of a robot should avoid: robots that stand, corridors of those `beside`."""
+        me = self._of(robot)
+        near = set(beside)
+        found = []
+        for other in self._robots.values():
+            if other is not me and math.isfinite(other.at[0, 0]):
+                reach = reach_of(me, other)
+                to_meet = other.drives and other.id in near and comes_near(me, other.at, reach + MEETING_M)
+                if to_meet or not other.drives:
+                    found.append(Disc(between(me, other.ahead(), reach) if to_meet else other.at, reach))
+        return found

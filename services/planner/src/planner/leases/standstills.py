@@ -1,0 +1,195 @@
+"""Standstills: whether robots can still reach their goals one after the other, and who makes room if not. Pure."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Final, Literal
+
+from fog_contracts.geometry import lengths_along, sampled
+from fog_kernels.lines import first_near
+from planner.leases.corridors import (
+    NOWHERE,
+    SPACING_M,
+    WAITING_M,
+    Corridor,
+    Disc,
+    between,
+    box,
+    contender_of,
+    disc,
+    meets,
+    reach_of,
+)
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Mapping
+
+    import numpy as np
+    from numpy.typing import NDArray
+
+    Floats = NDArray[np.float64]
+
+ASIDE_M: Final = 0.25
+"""So much farther off the way of others a robot stands aside: it stops somewhat before the end of its path."""
+RETRY_S: Final = 2.0
+"""After so long room that was not found is looked for again."""
+_STEP: Final = 5
+"""Of so many points of a path one is looked at as a place to stop."""
+_NEAR_M: Final = 1.0
+"""So far from one another the lines are at most where a robot stands."""
+
+
+Kind = Literal["past", "lane", "round", "aside", "detour"]
+"""Room that a robot makes: past another one that it would let pass, or its goal; beside corridors of those it meets;
+round where they stand; off their way until they have passed; or round where they stand, however far that is."""
+_KINDS: Final[tuple[Kind, ...]] = ("lane", "round", "aside", "detour")
+
+
+@dataclass(frozen=True)
+class Room:
+    """A robot that needs another path, the places that it must avoid, and for `aside` those where it must not stay."""
+
+    robot: str
+    kind: Kind
+    avoid: list[Disc]
+    keep_off: list[Disc]
+    whom: frozenset[str]
+
+
+class Standstills:
+    """Finds robots that stand in one another's way for ever."""
+
+    def __init__(self, robots: Mapping[str, Corridor]) -> None:
+        """`robots`: all that are known, by id; whoever changes a path or a lease calls `changed`."""
+        self._robots = robots
+        self._stuck: dict[str, frozenset[str]] | None = None
+        self._tried: dict[tuple[str, Kind], float] = {}
+
+    def changed(self) -> None:
+        """Judge anew: a robot, a path or a lease has changed."""
+        self._stuck = None
+
+    def stuck(self) -> Mapping[str, frozenset[str]]:
+        """Return the robots that can't reach their goals one after the other, each with those who stand in its way."""
+        if self._stuck is None:
+            self._stuck = self.order({})
+        return self._stuck
+
+    def order(self, ends: Mapping[str, int]) -> dict[str, frozenset[str]]:
+        """Let robots reach their goals one after the other, from the ends of their leases, or from `ends`."""
+        robots = list(self._robots.values())
+        stands = {r.id: [r.points[ends[r.id]][None, :]] if r.id in ends else r.stand() for r in robots}
+        begins = {r.id: ends.get(r.id, r.leased) for r in robots}
+        left = sorted((r for r in robots if r.drives), key=lambda r: r.order)
+        blocked: dict[str, frozenset[str]] = {}
+        stepped: set[str] = set()
+        while left:
+            ready = []
+            for me in left:
+                blocked[me.id] = frozenset(
+                    other.id
+                    for other in robots
+                    if other is not me
+                    and not me.far_from_point(stands[other.id][0][0], reach_of(me, other) + _NEAR_M)
+                    and meets(me, other, begins[me.id], me.last, stands[other.id]) < me.last
+                )
+                if not blocked[me.id]:
+                    ready.append(me)
+            if not ready:
+                if self._step_on(left, robots, begins, stands, stepped):
+                    continue
+                break
+            # Whose goal is in nobody's way goes first: that blocks no other one.
+            for me in [me for me in ready if not self._parks_in_the_way(me, left, begins)] or ready[:1]:
+                left.remove(me)
+                stands[me.id] = [me.points[-1:] if me.last == len(me.points) else NOWHERE]
+        return {me.id: blocked[me.id] for me in left}
+
+    def _step_on(
+        self,
+        left: list[Corridor],
+        robots: list[Corridor],
+        begins: dict[str, int],
+        stands: dict[str, list[Floats]],
+        stepped: set[str],
+    ) -> bool:
+        """Let one of the robots that are left drive to a place on its way where it is in no other one's, if one can."""
+        for me in left:
+            if me.id in stepped:
+                continue
+            stepped.add(me.id)
+            end = me.last
+            for other in robots:
+                if other is not me and not me.far_from_point(stands[other.id][0][0], reach_of(me, other) + _NEAR_M):
+                    end = meets(me, other, begins[me.id], end, stands[other.id])
+            for stop in range(end - 1, begins[me.id], -_STEP):
+                if contender_of(me, stop, left, begins) is None:
+                    begins[me.id], stands[me.id] = stop, [me.points[stop : stop + 1]]
+                    return True
+        return False
+
+    def _parks_in_the_way(self, me: Corridor, left: list[Corridor], begins: Mapping[str, int]) -> bool:
+        end = me.points[-1:]
+        return me.last == len(me.points) and any(
+            other is not me
+            and not other.far_from_point(end[0], reach_of(me, other))
+            and first_near(other.points, begins[other.id], other.last, end, reach_of(me, other), SPACING_M) >= 0
+            for other in left
+        )
+
+    def room_needed(self, now: float, obstacles: Callable[[str], list[Disc]]) -> Room | None:
+        """Return which robot needs another path to end a standstill, the last in order first; None if none does."""
+        if all(robot.waits_for is None for robot in self._robots.values()):
+            return None
+        stuck = self.stuck()
+        for me in self._robots.values():
+            other = self._robots.get(me.lets_pass or "")
+            if other is None or me.end - me.progress > WAITING_M:
+                continue
+            # Nobody has to wait where there is room for both.
+            one, passed = (other, me) if me.parks else (me, other)
+            line = me.points[-1:] if me.parks else between(me, other.ahead(), reach_of(me, other))
+            if now - self._tried.get((one.id, "past"), -math.inf) >= RETRY_S:
+                self._tried[one.id, "past"] = now
+                avoid = [*obstacles(one.id), disc(one, passed, line)]
+                return Room(one.id, "past", avoid, [], frozenset((passed.id,)))
+        ordered = sorted((self._robots[robot] for robot in stuck), key=lambda robot: robot.order, reverse=True)
+        for kind in _KINDS:
+            for me in ordered:
+                if now - self._tried.get((me.id, kind), -math.inf) >= RETRY_S:
+                    room = self._room(me, kind, stuck)
+                    self._tried[me.id, kind] = now
+                    if room is not None:
+                        return room
+        return None
+
+    def _room(self, me: Corridor, kind: Kind, stuck: Mapping[str, frozenset[str]]) -> Room | None:
+        blockers = [self._robots[robot] for robot in sorted(stuck[me.id])]
+        facing = [other for other in blockers if me.id in stuck.get(other.id, ())]
+        if kind == "lane" and not facing:
+            return None
+        avoid = [
+            disc(me, other, between(me, other.ahead(), reach_of(me, other)))
+            for other in (facing if kind == "lane" else ())
+        ]
+        keep_off: list[Disc] = []
+        if kind == "aside":
+            others = [other for other in self._robots.values() if other is not me]
+            blockers = [other for other in others if other.drives and other.id in stuck] or blockers
+            avoid = [disc(me, other, line) for other in others for line in other.held()]
+            keep_off = [Disc(other.ahead(), reach_of(me, other) + ASIDE_M) for other in others] + avoid
+        else:
+            avoid += [disc(me, other, line) for other in blockers for line in (*other.held(), *other.stand())]
+        return Room(me.id, kind, avoid, keep_off, frozenset(other.id for other in blockers))
+
+    def accepts(self, room: Room, corners: Floats) -> bool:
+        """Whether robots can do more with this path than without it."""
+        me, before = self._robots[room.robot], self.stuck()
+        kept = me.points, me.along, me.low, me.high, me.progress, me.leased
+        me.points = sampled(corners, SPACING_M)
+        me.along, (me.low, me.high), me.progress = lengths_along(me.points), box(me.points), 0.0
+        me.leased = me.first
+        after = self.order({})
+        me.points, me.along, me.low, me.high, me.progress, me.leased = kept
+        return after.keys() <= before.keys() if room.kind == "past" else after.keys() < before.keys()

@@ -1,0 +1,271 @@
+"""Leases of path corridors: no two overlap whatever happens, and whoever waits drives on in the end."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from hypothesis.stateful import RuleBasedStateMachine, initialize, invariant, rule
+
+from fog_contracts.geometry import lengths_along
+from planner.leases.corridor_leases import FORGET_S, PATIENCE_S, WITHDRAWN_S, CorridorLeases
+from planner.leases.corridors import DEFAULT_RADIUS_M, MARGIN_M
+
+CLEAR_M = 2.0 * DEFAULT_RADIUS_M + MARGIN_M
+WAY_M = 15.0
+
+
+def line(*corners: tuple[float, float]) -> np.ndarray:
+    return np.array(corners, dtype=np.float64)
+
+
+class Floor:
+    """Robots that drive exactly what is released, in any order and at any speed."""
+
+    def __init__(self) -> None:
+        self.leases, self.now, self.plans = CorridorLeases(), 100.0, 0
+        self.paths: dict[str, np.ndarray] = {}
+        self.lengths: dict[str, np.ndarray] = {}
+        self.ids: dict[str, tuple[int, int]] = {}
+        self.along: dict[str, float] = {}
+        self.released: dict[str, float] = {}
+
+    def put(self, robot: str, *corners: tuple[float, float], priority: int = 0) -> None:
+        """Put a robot at the beginning of a path, and let it have that path."""
+        self.leases.place(robot, *corners[0], self.now)
+        self.send(robot, *corners, priority=priority)
+        self.leases.on_state(robot, self.ids[robot], able=True, plans_itself=False)
+
+    def send(self, robot: str, *corners: tuple[float, float], priority: int = 0) -> None:
+        """Give a robot another path, of which it does not know yet."""
+        self.plans += 1
+        self.paths[robot], self.ids[robot], self.along[robot] = line(*corners), (1, self.plans), 0.0
+        self.lengths[robot] = lengths_along(self.paths[robot])
+        self.leases.follow(robot, self.ids[robot], self.paths[robot], f"to-{corners[-1]}", priority)
+        self.released[robot] = 0.0
+
+    def length(self, robot: str) -> float:
+        return float(self.lengths[robot][-1])
+
+    def at(self, robot: str, along: float) -> tuple[float, float]:
+        x, y = (float(np.interp(along, self.lengths[robot], self.paths[robot][:, i])) for i in (0, 1))
+        return x, y
+
+    def ask(self, robot: str) -> float:
+        wanted = min(self.length(robot), self.along[robot] + WAY_M)
+        released = min(self.leases.release(robot, wanted, self.now), wanted)
+        self.released[robot] = released
+        return released
+
+    def drive(self, robot: str, metres: float) -> None:
+        self.along[robot] = max(self.along[robot], min(self.along[robot] + metres, self.released[robot]))
+        self.leases.place(robot, *self.at(robot, self.along[robot]), self.now)
+        self.leases.advance(robot, self.along[robot])
+
+    def stretch(self, robot: str) -> np.ndarray:
+        """Where a robot may be: the stretch that is released and not driven yet."""
+        reach = np.linspace(self.along[robot], max(self.released[robot], self.along[robot]), 60)
+        return np.column_stack([np.interp(reach, self.lengths[robot], self.paths[robot][:, i]) for i in (0, 1)])
+
+    def apart(self, one: str, other: str) -> float:
+        """The least distance between the middles of two robots, wherever they are on what is released to them."""
+        a, b = self.stretch(one), self.stretch(other)
+        return float(np.hypot(*(a[:, None, :] - b[None, :, :]).transpose(2, 0, 1)).min())
+
+    def drive_all(self, steps: int = 400) -> None:
+        """Let all robots drive until they have arrived."""
+        for _ in range(steps):
+            self.now += 1.0
+            for robot in self.paths:
+                self.ask(robot)
+                self.drive(robot, 0.3)
+            if all(self.arrived(robot) for robot in self.paths):
+                return
+
+    def arrived(self, robot: str) -> bool:
+        return self.along[robot] > self.length(robot) - 1e-6
+
+
+def test_a_robot_alone_gets_all_that_is_wanted():
+    floor = Floor()
+    floor.put("r1", (0.0, 0.0), (40.0, 0.0))
+    assert floor.leases.release("r1", 15.0, 100.0) == math.inf
+
+
+def test_robots_far_apart_get_all_that_is_wanted():
+    floor = Floor()
+    floor.put("r1", (0.0, 0.0), (40.0, 0.0))
+    floor.put("r2", (0.0, 3.0), (40.0, 3.0))
+    assert (floor.ask("r1"), floor.ask("r2")) == (15.0, 15.0)
+    assert floor.leases.waits_for("r1") is None
+
+
+def test_a_follower_gets_what_its_leader_has_left():
+    floor = Floor()
+    floor.put("r1", (3.0, 0.0), (40.0, 0.0))
+    floor.put("r2", (0.0, 0.0), (40.0, 0.0))
+    floor.ask("r1")
+    assert floor.ask("r2") == pytest.approx(3.0 - CLEAR_M, abs=0.11)
+    floor.drive("r1", 5.0)
+    assert floor.ask("r2") == pytest.approx(8.0 - CLEAR_M, abs=0.11)
+
+
+def test_who_crosses_waits_before_the_corridor_of_the_first_and_says_for_whom():
+    floor = Floor()
+    floor.put("r1", (-10.0, 0.0), (10.0, 0.0))
+    floor.put("r2", (0.0, -5.0), (0.0, 5.0))
+    floor.ask("r1")
+    assert floor.ask("r2") == pytest.approx(5.0 - CLEAR_M, abs=0.11)
+    floor.drive("r2", 5.0)
+    assert floor.leases.waits_for("r2") == "r1"
+    floor.drive_all()
+    assert floor.arrived("r1")
+    assert floor.arrived("r2")
+
+
+def test_a_robot_does_not_stop_in_a_passage_that_another_one_has_to_drive():
+    floor = Floor()
+    # r2 leaves by the passage that r1 enters, and somebody stands at its end.
+    floor.put("r1", (-8.0, 0.0), (12.0, 0.0))
+    floor.put("r2", (10.0, 1.0), (10.0, 0.0), (-1.0, 0.0), (-1.0, -5.0))
+    floor.leases.place("r3", 12.0, 0.0, floor.now)
+    assert floor.ask("r1") < 7.0 - CLEAR_M + 0.11
+    floor.drive_all()
+    assert floor.arrived("r2")
+
+
+def test_the_higher_priority_goes_first_then_the_earlier_mission():
+    for priority, first in ((0, "r1"), (1, "r2")):
+        floor = Floor()
+        floor.put("r0", (0.0, 1.0), (0.0, -9.0))
+        floor.put("r1", (-5.0, 0.0), (5.0, 0.0))
+        floor.put("r2", (5.0, -0.2), (-1.0, -0.2), (-1.0, -5.0), priority=priority)
+        for robot in ("r0", "r1", "r2"):
+            floor.ask(robot)
+        assert floor.leases.waits_for("r1") or floor.released["r1"] < 10.0
+        order = sorted(("r1", "r2"), key=lambda robot: floor.leases._robots[robot].order)
+        assert order[0] == first
+
+
+def test_a_former_path_stays_leased_until_its_robot_names_the_new_one():
+    floor = Floor()
+    floor.put("r1", (0.0, 0.0), (10.0, 0.0))
+    floor.put("r2", (5.0, -5.0), (5.0, 5.0))
+    floor.ask("r1")
+    former = floor.ids["r1"]
+    floor.send("r1", (0.0, 0.0), (0.0, 10.0))
+    floor.leases.on_state("r1", former, able=True, plans_itself=False)
+    assert floor.ask("r2") < 5.0
+    floor.leases.on_state("r1", floor.ids["r1"], able=True, plans_itself=False)
+    assert floor.ask("r2") == 10.0
+
+
+def test_robots_face_to_face_are_found_and_get_room():
+    floor = Floor()
+    floor.put("r1", (0.0, 0.0), (20.0, 0.0))
+    floor.put("r2", (20.0, 0.0), (0.0, 0.0))
+    floor.ask("r1")
+    floor.ask("r2")
+    assert floor.leases.standstills.stuck() == {"r1": {"r2"}, "r2": {"r1"}}
+    rooms = [floor.leases.room_needed(floor.now) for _ in range(3)]
+    assert [room.kind for room in rooms if room] == ["past", "past", "lane"]
+    room = rooms[-1]
+    assert room is not None
+    assert (room.robot, room.whom) == ("r2", {"r1"})
+    beside = line((20.0, 0.0), (20.0, 1.0), (0.0, 1.0))
+    assert not floor.leases.standstills.accepts(room, line((20.0, 0.0), (0.0, 0.0)))
+    assert floor.leases.standstills.accepts(room, beside)
+
+
+def test_a_lease_of_a_robot_that_stands_is_given_back_before_others_get_it():
+    floor = Floor()
+    floor.put("r1", (0.0, 0.0), (20.0, 0.0))
+    floor.put("r2", (5.0, -5.0), (5.0, 5.0))
+    floor.ask("r1")
+    floor.now += PATIENCE_S
+    floor.leases.place("r1", 0.0, 0.0, floor.now)
+    assert floor.ask("r2") < 5.0
+    floor.leases.on_state("r1", floor.ids["r1"], able=False, plans_itself=False)
+    assert floor.ask("r1") == 0.0, "it is told to stay"
+    assert floor.ask("r2") < 5.0, "but may not have heard yet"
+    floor.now += WITHDRAWN_S
+    floor.leases.place("r1", 0.0, 0.0, floor.now)
+    assert floor.ask("r2") == 10.0
+    assert [disc.points.tolist() for disc in floor.leases.obstacles("r2")] == [[[0.0, 0.0]]]
+
+
+def test_a_robot_that_is_silent_is_forgotten_after_a_while():
+    floor = Floor()
+    floor.leases.place("r1", 5.0, 0.0, floor.now)
+    floor.put("r2", (5.0, -5.0), (5.0, 5.0))
+    assert floor.ask("r2") < 5.0
+    floor.now += FORGET_S + 1.0
+    floor.leases.place("r2", 5.0, -5.0, floor.now)
+    assert floor.ask("r2") == 10.0
+
+
+places = st.tuples(st.integers(0, 12), st.integers(0, 12)).map(lambda cell: (1.0 * cell[0], 1.0 * cell[1]))
+
+
+class Interleavings(RuleBasedStateMachine):
+    """Robots ask, drive and change their paths in any order."""
+
+    @initialize(starts=st.lists(places, min_size=2, max_size=5, unique=True), data=st.data())
+    def begin(self, starts: list[tuple[float, float]], data: st.DataObject) -> None:
+        self.floor = Floor()
+        for number, start in enumerate(starts):
+            corners = data.draw(st.lists(places, min_size=1, max_size=3))
+            self.floor.put(f"r{number}", start, *corners)
+        self.robots = sorted(self.floor.paths)
+        self.apart = self._apart()
+
+    def _apart(self) -> dict[tuple[str, str], float]:
+        robots = self.robots
+        return {(a, b): self.floor.apart(a, b) for i, a in enumerate(robots) for b in robots[i + 1 :]}
+
+    @rule(number=st.integers(0, 4))
+    def ask(self, number: int) -> None:
+        robot = self.robots[number % len(self.robots)]
+        before = self.floor.released[robot]
+        assert self.floor.ask(robot) >= before - 1e-9, "what is released is not taken back"
+
+    @rule(number=st.integers(0, 4), metres=st.floats(0.05, 3.0))
+    def drive(self, number: int, metres: float) -> None:
+        self.floor.now += 0.1
+        self.floor.drive(self.robots[number % len(self.robots)], metres)
+
+    @rule(number=st.integers(0, 4), corners=st.lists(places, min_size=1, max_size=3))
+    def turn_off(self, number: int, corners: list[tuple[float, float]]) -> None:
+        """A robot gets another path from where it is, which it has at once."""
+        robot = self.robots[number % len(self.robots)]
+        self.floor.send(robot, self.floor.at(robot, self.floor.along[robot]), *corners)
+        self.floor.leases.on_state(robot, self.floor.ids[robot], able=True, plans_itself=False)
+
+    @invariant()
+    def no_leases_overlap(self) -> None:
+        for pair, apart in self._apart().items():
+            # Who got too near by nobody's lease, at the start, gets no nearer.
+            assert apart >= min(CLEAR_M, self.apart[pair]) - 0.02, (pair, apart)
+
+
+Interleavings.TestCase.settings = settings(max_examples=25, stateful_step_count=30, deadline=None)
+TestInterleavings = Interleavings.TestCase
+
+
+@settings(max_examples=40, deadline=None)
+@given(
+    trips=st.lists(st.tuples(places, places), min_size=2, max_size=5, unique_by=(lambda t: t[0], lambda t: t[1])),
+)
+def test_all_arrive_whenever_some_order_lets_them(trips):
+    floor = Floor()
+    for number, (start, goal) in enumerate(trips):
+        floor.put(f"r{number}", start, goal)
+    for robot in floor.paths:
+        floor.ask(robot)
+    if floor.leases.standstills.stuck():
+        return  # face to face from the beginning: others than leases must help
+    floor.drive_all(500)
+    assert [robot for robot in floor.paths if not floor.arrived(robot)] == []

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 import pytest
+from msgspec import structs
 from ring_map import Box, RingMap, goal, pose
 
 from fog_contracts import channels as ch
@@ -41,7 +42,8 @@ class Fleet:
         self.core.load(self.map.master.snapshot(), 0.0)
         for number in range(robots):
             robot = f"r{number}"
-            self.core.handlers()[ch.ROBOT_POSE]({"robot": robot}, pose(4.0 + 1.2 * number, 6.0), AT)
+            thin = structs.replace(pose(4.0 + 1.2 * number, 6.0), radius=0.01)  # so that none is in another one's way
+            self.core.handlers()[ch.ROBOT_POSE]({"robot": robot}, thin, AT)
             self.core.set_goal(robot, goal(19.0, 4.0 + 0.5 * number, f"g{number}"))
         self.core.handlers()[ch.MAP_HEARTBEAT]({}, self.map.master.heartbeat(0.0), AT)
         self.first_jobs = self.core.jobs(AT)

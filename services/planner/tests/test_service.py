@@ -200,8 +200,8 @@ def test_paths_are_published_one_by_one_and_a_long_cycle_leaves_the_rest_for_the
     core.load(ring_map.master.snapshot(), 10.0)
     core.handlers()[ch.MAP_HEARTBEAT]({}, ring_map.master.heartbeat(0.0), Moment(10.0, 10.0))
     robots = [f"r{number}" for number in range(5)]
-    for robot in robots:
-        core.handlers()[ch.ROBOT_POSE]({"robot": robot}, pose(*LEFT), Moment(10.0, 10.0))
+    for number, robot in enumerate(robots):
+        core.handlers()[ch.ROBOT_POSE]({"robot": robot}, pose(LEFT[0], LEFT[1] + 0.7 * number), Moment(10.0, 10.0))
         core.set_goal(robot, goal(*RIGHT, robot))
     with_path: list[list[str]] = []
     searched: list[int] = []

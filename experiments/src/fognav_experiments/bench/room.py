@@ -10,9 +10,10 @@ from __future__ import annotations
 
 import itertools
 import math
+from collections import Counter
 from dataclasses import dataclass, field
 from statistics import mean
-from typing import TYPE_CHECKING, Final
+from typing import TYPE_CHECKING, Final, NamedTuple
 
 import numpy as np
 
@@ -25,10 +26,12 @@ from fog_contracts.messages import Cause, Pose, RobotGoal, RobotPath, RobotPose,
 from fog_contracts.replica import MasterMap
 from fog_kernels.components import Components
 from fog_kernels.inflation import inflate, inflation_table
+from fog_runtime.configuration.site import load_site
 from planner.core import PlannerCore
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
+    from pathlib import Path
 
     from numpy.typing import NDArray
 
@@ -42,16 +45,18 @@ OFF_PATH_M: Final = 0.04
 """How far beside its path a robot drives, and how wrong the pose is that it tells."""
 STATE_STEPS: Final = 10
 DEADLOCK_S: Final = 120.0
-"""A robot on a mission with a path that has not moved for so long, while hazards last half a minute, is in one."""
+"""A robot with a path that has not moved for so long, nor half so long the one that it waits for, is in one."""
 HAZARD_M: Final = 1.0
 HAZARD_EVERY_S: Final = (20.0, 60.0)
 HAZARD_LASTS_S: Final = (10.0, 30.0)
 _APART_M: Final = 1.0
 """Goals and starts of different robots are at least so far from one another."""
 RESOLUTION: Final = 0.05
+AISLES_M: Final = {"aisles": 1.8, "narrow": 1.2}
+"""Width (m) of the aisles by a floor's name: two robots pass in one, and do not in the other."""
 
 
-def aisles(width: float = 1.8, number: int = 6, length: float = 27.0) -> StaticMap:
+def aisles(width: float, number: int = 6, length: float = 27.0) -> StaticMap:
     """Return a floor of parallel aisles of a length (m) and width (m) between shelves, with a passage at both ends."""
     shelf, passage, wall = 1.2, 2.5, 0.2
     size_x, size_y = length + 2 * passage + 2 * wall, number * width + (number - 1) * shelf + 2 * wall
@@ -133,7 +138,6 @@ class BlindRobot:
     goal: RobotGoal | None = None
     off: float = 0.0
     given_at: float = 0.0
-    driven: float = 0.0
     waited: float = 0.0
     still_since: float = 0.0
     missions: list[float] = field(default_factory=list)
@@ -178,7 +182,6 @@ class BlindRobot:
         moved = math.dist((to_x, to_y), (self.x, self.y))
         share = min(1.0, 2.0 * SPEED_M_S * STEP_S / max(moved, 1e-9))  # back to its path no faster than that
         self.x, self.y = self.x + share * (to_x - self.x), self.y + share * (to_y - self.y)
-        self.driven += step
         self.still_since = now
 
     def _point(self, along: float) -> tuple[float, float]:
@@ -206,7 +209,7 @@ class BlindRobot:
 class Floor:
     """One run: a floor, robots with one mission after another, hazards that come and go."""
 
-    def __init__(self, floor: StaticMap, robots: int, seed: int, *, hazards: bool = True) -> None:
+    def __init__(self, floor: StaticMap, robots: int, seed: int) -> None:
         """Put the robots at random places."""
         self.map = ChangingMap(floor)
         self._rng = np.random.default_rng(seed)
@@ -218,12 +221,13 @@ class Floor:
             x, y = self._place([(robot.x, robot.y) for robot in self.robots])
             robot = BlindRobot(f"r{number + 1}", np.random.default_rng((seed, number)), x, y, still_since=self.now)
             self.robots.append(robot)
-        self._hazards = hazards
-        self._next_hazard = self.now + (self._rng.uniform(*HAZARD_EVERY_S) if hazards else math.inf)
+        self._next_hazard = self.now + self._rng.uniform(*HAZARD_EVERY_S)
         self._ends: dict[str, float] = {}
         self._in_contact: set[tuple[str, str]] = set()
         self._steps = 0
         self.deadlocks: list[str] = []
+        self.longest_wait_s = 0.0
+        """How long a robot with a path stood at most."""
 
     def _place(self, others: Sequence[tuple[float, float]]) -> tuple[float, float]:
         while True:
@@ -315,9 +319,13 @@ class Floor:
 
     def _note_deadlock(self, robot: BlindRobot) -> None:
         still = self.now - robot.still_since
-        if still >= DEADLOCK_S and not robot.deadlocked:
+        self.longest_wait_s = max(self.longest_wait_s, still)
+        others = {other.id: other for other in self.robots}
+        awaited = others.get(self.core.leases.waits_for(robot.id) or "")
+        dead = still >= DEADLOCK_S and (awaited is None or self.now - awaited.still_since >= 0.5 * DEADLOCK_S)
+        if dead and not robot.deadlocked:
             self.deadlocks.append(f"{robot.id} at ({robot.x:.1f}, {robot.y:.1f}) since {robot.still_since:.0f} s")
-        robot.deadlocked = still >= DEADLOCK_S
+        robot.deadlocked = dead
 
 
 def _least_distance(
@@ -331,21 +339,65 @@ def _least_distance(
     return math.hypot(x + share * vx, y + share * vy)
 
 
-def measure(floors: Sequence[Floor], seconds: float) -> dict[str, object]:
-    """Return the figures of runs of the same kind, each of so many seconds."""
-    robots = [robot for floor in floors for robot in floor.robots]
-    took = [time for robot in robots for time in robot.missions]
-    hours = len(robots) * seconds / 3600.0
-    made: dict[str, int] = {}
-    for floor in floors:
-        for kind, count in floor.core.leases.made.items():
-            made[kind] = made.get(kind, 0) + count
+class Run(NamedTuple):
+    """What one run gave: times in s, `waited` as a share of the robots' time."""
+
+    seed: int
+    robots: int
+    seconds: float
+    took: list[float]
+    """How long each mission took that has ended."""
+    waited: float
+    longest_wait: float
+    contacts: int
+    gap_m: float
+    deadlocks: list[str]
+    made: dict[str, int]
+
+
+def play(floor: StaticMap, robots: int, seed: int, seconds: float) -> Run:
+    """Let robots drive on a floor for so long (s); return what happened."""
+    run = Floor(floor, robots, seed)
+    run.run(seconds)
+    return Run(
+        seed,
+        robots,
+        seconds,
+        [time for robot in run.robots for time in robot.missions],
+        sum(robot.waited for robot in run.robots) / (robots * seconds),
+        run.longest_wait_s,
+        run.contacts,
+        run.least_gap_m,
+        run.deadlocks,
+        {str(kind): count for kind, count in run.core.leases.made.items()},
+    )
+
+
+def summary(runs: Sequence[Run]) -> dict[str, object]:
+    """Return the figures of runs of the same kind: times in s, lengths in m."""
+    took = [time for run in runs for time in run.took]
+    hours = sum(run.robots * run.seconds for run in runs) / 3600.0
+    made = sum((Counter(run.made) for run in runs), Counter[str]())
+    gap = min(run.gap_m for run in runs)
     return {
+        "missions": len(took),
         "missions_per_robot_hour": round(len(took) / hours, 1),
         "mission_s": round(mean(took), 1) if took else None,
-        "waiting_share": round(sum(robot.waited for robot in robots) / (len(robots) * seconds), 4),
-        "contacts": sum(floor.contacts for floor in floors),
-        "least_gap_m": round(min(floor.least_gap_m for floor in floors), 3) if len(floors[0].robots) > 1 else None,
-        "deadlocks": sum(len(floor.deadlocks) for floor in floors),
-        "room_made": made,
+        "waiting_share": round(mean(run.waited for run in runs), 4),
+        "longest_wait_s": round(max(run.longest_wait for run in runs), 1),
+        "contacts": sum(run.contacts for run in runs),
+        "least_gap_m": None if math.isinf(gap) else round(gap, 3),
+        "deadlocks": sum(len(run.deadlocks) for run in runs),
+        "deadlocked": [f"seed {run.seed}: {what}" for run in runs for what in run.deadlocks],
+        "room_made": dict(made),
     }
+
+
+def floor_named(name: str, sites: Path) -> StaticMap:
+    """Return a floor by its name: `aisles`, `narrow`, or a site of the folder; raises `ValueError` for another one."""
+    if name in AISLES_M:
+        return aisles(AISLES_M[name])
+    if not (sites / name / "site.toml").is_file():
+        raise ValueError(f"no floor {name!r}: take {', '.join(AISLES_M)} or a site of {sites}")
+    map_ = load_site(sites / name).map
+    return StaticMap(map_.geometry, map_.cells)

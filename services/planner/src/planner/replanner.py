@@ -40,7 +40,7 @@ _BACK_M: Final = 0.2
 _ESCAPE_M: Final = 0.8
 """How far a robot on the way of another one may be from places beside that."""
 _ROUND_M: Final = 15.0
-"""So much longer (m, at the cost of free floor) a path may be that makes room, before robots stand aside instead."""
+"""So much longer (m) a path may be that makes room, before robots stand aside instead."""
 _PAST_M: Final = 5.0
 """The same of one that leads past a robot on the same floor, before one of them waits instead."""
 _PROGRESS_WINDOW_M: Final = 5.0
@@ -233,11 +233,8 @@ class Replanner:
         danger = mission.danger
         traces = mission.begin_replan(reason, now)
         mission.release_now()
-        found = None
-        if avoid and (beside := self._find_beside(mission, planning_map.avoiding(avoid), covers)) is not None:
-            found, planning_map = beside
-        if found is None:
-            found = self._find(mission, planning_map, covers, waiting, danger)
+        beside = self._find_beside(mission, planning_map.avoiding(avoid), covers) if avoid else None
+        found, planning_map = beside or (self._find(mission, planning_map, covers, waiting, danger), planning_map)
         self.plans[reason] = self.plans.get(reason, 0) + 1
         if found.refusal is not None:
             self.refusals[found.refusal.code] = self.refusals.get(found.refusal.code, 0) + 1
@@ -296,9 +293,9 @@ class Replanner:
         else:
             found = self._find_beside(mission, avoiding, covers)
             longer = {"past": _PAST_M, "lane": _PAST_M, "detour": math.inf}.get(room.kind, _ROUND_M)
-            if found is None or found[0].cost > remaining_cost(plan, planning_map) + longer * NEUTRAL_WEIGHT:
+            route, waits_after = None if found is None else found[0].route, math.inf
+            if route is not None and route.length > plan.route.length - plan.progress + longer:
                 return None
-            route, waits_after = found[0].route, math.inf
         if route is None:
             return None
         self._next_id += 1

@@ -23,6 +23,8 @@ MARGIN_M: Final = 0.15
 """Between the rims of two robots: how far each may be off its path, and the error of both poses."""
 OFF_PATH_M: Final = 0.15
 """A robot farther from its path than this also holds the place where it is."""
+SHORT: Final = 2
+"""So many points of its path before the end of its lease a robot may stop already: it brakes, and lets it be."""
 SPACING_M: Final = 0.1
 """Corridors are compared at points of the paths this far apart."""
 HORIZON_M: Final = 35.0
@@ -102,7 +104,11 @@ class Corridor:
     def stand(self) -> list[Floats]:
         """Return where it stands once it has driven all that is leased to it."""
         waits = not self.drives or self.end - self.progress <= WAITING_M
-        return list(self.held()) if waits else [self.points[self.leased : self.leased + 1]]
+        return list(self.held()) if waits else [self.place(self.leased)]
+
+    def place(self, stop: int) -> Floats:
+        """Return where it may stand when it stops at a point of its path: somewhat before it, too."""
+        return self.points[max(0, stop - SHORT) : stop + 1]
 
     def held(self) -> Iterator[Floats]:
         """Yield the lines along which it may be: the leased stretch, former ones, and where it is beside them."""
@@ -145,7 +151,8 @@ def between(me: Corridor, line: Floats, reach: float) -> Floats:
     """Return a line without its points near a robot's place and goal, which somebody has to leave or to reach."""
     ends = np.concatenate((me.at, me.points[-1:]))
     apart = np.hypot(*(line[:, None, :] - ends[None, :, :]).transpose(2, 0, 1)).min(axis=1)
-    return line[apart > reach + _BETWEEN_M]
+    kept: Floats = line[apart > reach + _BETWEEN_M]
+    return kept
 
 
 def disc(me: Corridor, other: Corridor, line: Floats) -> Disc:
@@ -172,11 +179,12 @@ def contender_of(
     me: Corridor, stop: int, others: Iterable[Corridor], begins: Mapping[str, int] | None = None
 ) -> Corridor | None:
     """Return a robot that has to pass where this one would stop, from where it is or from one of `begins`."""
+    place = me.place(stop)
     for other in others:
         reach = reach_of(me, other)
         if other is not me and other.drives and not other.far_from_point(me.points[stop], reach):
             first = other.first if begins is None else begins[other.id]
-            if first_near(me.points, stop, stop + 1, other.points[first : other.last], reach, SPACING_M) >= 0:
+            if first_near(place, 0, len(place), other.points[first : other.last], reach, SPACING_M) >= 0:
                 return other
     return None
 

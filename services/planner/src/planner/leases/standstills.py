@@ -79,7 +79,7 @@ class Standstills:
     def order(self, ends: Mapping[str, int]) -> dict[str, frozenset[str]]:
         """Let robots reach their goals one after the other, from the ends of their leases, or from `ends`."""
         robots = list(self._robots.values())
-        stands = {r.id: [r.points[ends[r.id]][None, :]] if r.id in ends else r.stand() for r in robots}
+        stands = {r.id: [r.place(ends[r.id])] if r.id in ends else r.stand() for r in robots}
         begins = {r.id: ends.get(r.id, r.leased) for r in robots}
         left = sorted((r for r in robots if r.drives), key=lambda r: r.order)
         blocked: dict[str, frozenset[str]] = {}
@@ -103,7 +103,7 @@ class Standstills:
             # Whose goal is in nobody's way goes first: that blocks no other one.
             for me in [me for me in ready if not self._parks_in_the_way(me, left, begins)] or ready[:1]:
                 left.remove(me)
-                stands[me.id] = [me.points[-1:] if me.last == len(me.points) else NOWHERE]
+                stands[me.id] = [me.place(len(me.points) - 1) if me.last == len(me.points) else NOWHERE]
         return {me.id: blocked[me.id] for me in left}
 
     def _step_on(
@@ -125,12 +125,12 @@ class Standstills:
                     end = meets(me, other, begins[me.id], end, stands[other.id])
             for stop in range(end - 1, begins[me.id], -_STEP):
                 if contender_of(me, stop, left, begins) is None:
-                    begins[me.id], stands[me.id] = stop, [me.points[stop : stop + 1]]
+                    begins[me.id], stands[me.id] = stop, [me.place(stop)]
                     return True
         return False
 
     def _parks_in_the_way(self, me: Corridor, left: list[Corridor], begins: Mapping[str, int]) -> bool:
-        end = me.points[-1:]
+        end = me.place(len(me.points) - 1)
         return me.last == len(me.points) and any(
             other is not me
             and not other.far_from_point(end[0], reach_of(me, other))
@@ -154,7 +154,9 @@ class Standstills:
                 self._tried[one.id, "past"] = now
                 avoid = [*obstacles(one.id), disc(one, passed, line)]
                 return Room(one.id, "past", avoid, [], frozenset((passed.id,)))
-        ordered = sorted((self._robots[robot] for robot in stuck), key=lambda robot: robot.order, reverse=True)
+        # Who waits for others at its goal, or theirs beside it, can only wait.
+        waiting = [me for me in map(self._robots.__getitem__, stuck) if not self._goal_taken(me, stuck[me.id])]
+        ordered = sorted(waiting, key=lambda robot: robot.order, reverse=True)
         for kind in _KINDS:
             for me in ordered:
                 if now - self._tried.get((me.id, kind), -math.inf) >= RETRY_S:
@@ -163,6 +165,11 @@ class Standstills:
                     if room is not None:
                         return room
         return None
+
+    def _goal_taken(self, me: Corridor, blockers: frozenset[str]) -> bool:
+        others = [self._robots[robot] for robot in blockers]
+        ends = [(other.points[-1] if other.drives else other.at[0], reach_of(me, other)) for other in others]
+        return any(math.dist(me.points[-1], end) <= reach for end, reach in ends)
 
     def _room(self, me: Corridor, kind: Kind, stuck: Mapping[str, frozenset[str]]) -> Room | None:
         blockers = [self._robots[robot] for robot in sorted(stuck[me.id])]
@@ -180,7 +187,8 @@ class Standstills:
             avoid = [disc(me, other, line) for other in others for line in other.held()]
             keep_off = [Disc(other.ahead(), reach_of(me, other) + ASIDE_M) for other in others] + avoid
         else:
-            avoid += [disc(me, other, line) for other in blockers for line in (*other.held(), *other.stand())]
+            standing = [other for other in blockers if kind != "lane" or other not in facing]
+            avoid += [disc(me, other, line) for other in standing for line in (*other.held(), *other.stand())]
         return Room(me.id, kind, avoid, keep_off, frozenset(other.id for other in blockers))
 
     def accepts(self, room: Room, corners: Floats) -> bool:

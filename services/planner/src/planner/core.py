@@ -303,7 +303,6 @@ class PlannerCore:
             self.leases.advance(robot, plan.progress)
             if not plan.published or at.now >= mission.release_due:
                 plan.lease = self.leases.release(robot, plan.wanted_length(self.config), at.now)
-                plan.waits_for = self.leases.waits_for(robot)
         if (path := mission.due_path(at, self.config, self.epoch, planning_map.version)) is not None:
             publications.append(Publication(ch.ROBOT_PATH, path, ids))
         if (release := mission.due_release(at, self.config, self.epoch, planning_map.version)) is not None:

@@ -83,8 +83,6 @@ class Plan:
     """How far along (m) the robot stands aside, until it gets another path."""
     lease: float = math.inf
     """How far along (m) no other robot is in the way (`leases`)."""
-    waits_for: str | None = None
-    """For which robot it waits there."""
 
     @property
     def waits(self) -> bool:

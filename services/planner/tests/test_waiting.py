@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 
 import numpy as np
@@ -17,9 +18,12 @@ from fog_contracts.handlers import Moment
 from fog_contracts.messages import (
     AreaHazard,
     AreaState,
+    CircleShape,
+    CorridorShape,
     HazardArea,
     HazardOverride,
     MapDelta,
+    PolygonShape,
     RectangleShape,
     RobotPath,
     Zone,
@@ -171,10 +175,17 @@ def test_nobody_waits_where_no_block_has_ever_ended_by_itself():
 
 
 def test_zone_is_waited_for_when_its_end_is_known_and_near():
-    for rest, choice in ((8.0, "wait"), (None, None), (500.0, "detour")):
+    left, bottom, right, top = UPPER
+    ring = [(left, bottom), (right, bottom), (right, top), (left, top)]
+    shapes = [
+        RectangleShape(corner=(left, bottom), opposite=(right, top)),
+        PolygonShape(points=ring),
+        CircleShape(centre=(10.0, 11.0), radius=1.0),
+        CorridorShape(line=[(10.0, bottom), (10.0, top)], width=2.0),
+    ]
+    for shape, (rest, choice) in itertools.product(shapes, ((8.0, "wait"), (None, None), (500.0, "detour"))):
         drive = Drive("learned")
         deltas = drive.map.put("z", UPPER)
-        shape = RectangleShape(corner=UPPER[:2], opposite=UPPER[2:])
         zone = Zone(id="z", kind="BLOCKED", shape=shape, expires_at=None if rest is None else drive.moment.stamp + rest)
         drive.deliver(ch.ZONES, ZoneSet(epoch=1, seq=1, zones=[zone], active=["z"]))
         for delta in deltas:

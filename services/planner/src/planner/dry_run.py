@@ -3,7 +3,8 @@
 The change comes as the cells that it would change (`MapPatch`). They are put on a copy of the map, on which each robot
 is treated as after a real change: by the same rules whether a search is needed, by the same search, and by the same
 rules whether its result replaces the current path (`replanner`). What depends on when a change comes is left out: that
-a switch to another way may have to wait, and that a large change reaches the map in portions.
+a switch to another way may have to wait, that a robot may wait for the end of what closes its way, and that a large
+change reaches the map in portions.
 """
 
 from __future__ import annotations
@@ -176,7 +177,7 @@ class DryRun:
             return _compared(robot, before, after, replanned=False)
         found = self._search(self._after, pose, target)
         reason = "map" if "map" in reasons else reasons[0] if reasons else "goal"
-        if plan is not None and is_kept(plan, found, reason, after_map, self._config):
+        if plan is not None and not plan.waits and is_kept(plan, found, reason, after_map, self._config):
             after = _outcome(plan.route, self._explained(found) or plan.refusal, self._speed, after_map, plan.progress)
             return _compared(robot, before, after, replanned=False)
         after = _outcome(found.route, self._explained(found), self._speed, after_map)

@@ -14,7 +14,13 @@ from numpy.typing import NDArray
 
 from fog_contracts.costs import INSCRIBED, LETHAL, UNKNOWN
 from fog_contracts.geometry import distance_to_polygon, lengths_along, sampled
-from fog_contracts.messages import BlockedWay, HazardArea
+from fog_contracts.messages import (
+    BlockedWay,
+    CircleShape,
+    CorridorShape,
+    HazardArea,
+    RectangleShape,
+)
 from fog_contracts.shapes import shape_contains
 from planner.path_search import Route
 from planner.regions import cause_of, name_of
@@ -155,7 +161,7 @@ class Waits:
         left = [(float(x), float(y)) for x, y in points]
         found: list[tuple[Source, Survival, float]] = []
         for source in self._known.sources:
-            others = [point for point in left if not _is_near(source, point, reach)]
+            others = _beyond(source, left, reach)
             if len(others) == len(left):
                 continue
             left = others
@@ -164,7 +170,7 @@ class Waits:
             age = self.blocks.age(source.hazard.area, at.now) if isinstance(source, HazardArea) else None
             found.append((source, block, age or 0.0))
         for area in self._known.areas if waiting_since is not None else ():
-            others = [point for point in left if not _is_near(area, point, reach)]
+            others = _beyond(area, left, reach)
             if waiting_since is not None and len(others) < len(left):
                 age = at.now - waiting_since
                 block = self.blocks.survival(area.hazard.area, age, at.stamp, learned=self.config.wait == "learned")
@@ -209,7 +215,36 @@ def _point(points: Floats, along: Floats, at: float) -> tuple[float, float]:
 _RING: Final = [(math.cos(k * math.tau / 12), math.sin(k * math.tau / 12)) for k in range(12)]
 
 
-def _is_near(source: Source, point: tuple[float, float], reach: float) -> bool:
+def _beyond(source: Source, points: list[PointXY], reach: float) -> list[PointXY]:
+    """Return the points (m) near which, within `reach` (m), a source closes no cells; most sources lie elsewhere."""
+    left, bottom, right, top = _bounds(source)
+    return [
+        (x, y)
+        for x, y in points
+        if not (left - reach <= x <= right + reach and bottom - reach <= y <= top + reach)
+        or not _is_near(source, (x, y), reach)
+    ]
+
+
+def _bounds(source: Source) -> tuple[float, float, float, float]:
+    """Return the least and greatest x and y (m) of what a source covers: left, bottom, right and top."""
+    shape, margin = source if isinstance(source, HazardArea) else source.shape, 0.0
+    corners: list[PointXY]
+    if isinstance(shape, HazardArea):
+        corners = shape.polygon
+    elif isinstance(shape, CircleShape):
+        corners, margin = [shape.centre], shape.radius
+    elif isinstance(shape, CorridorShape):
+        corners, margin = shape.line, 0.5 * shape.width
+    elif isinstance(shape, RectangleShape):
+        corners = [shape.corner, shape.opposite]
+    else:
+        corners = shape.points
+    xs, ys = zip(*corners, strict=True)
+    return min(xs) - margin, min(ys) - margin, max(xs) + margin, max(ys) + margin
+
+
+def _is_near(source: Source, point: PointXY, reach: float) -> bool:
     """Whether a source closes cells within `reach` (m) of a point; of zones, by a ring of points around it."""
     x, y = point
     if isinstance(source, HazardArea):

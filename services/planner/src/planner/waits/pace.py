@@ -59,6 +59,8 @@ _KEPT: Final = 40
 """Stretches that are kept of each robot, the newest ones."""
 _SHORT_S: Final = 8.0
 """A stretch that takes less at the usual speed tells too little."""
+ARRIVAL_S: Final = 2.5
+"""What the arrival at a goal takes beyond that: the robot brakes, and comes to rest within its tolerance."""
 _GAP_S: Final = 2.0
 """Of a robot that was not heard of for longer nobody knows whether it drove."""
 _QUANTILES: Final = (0.05, 0.95)
@@ -104,8 +106,9 @@ class Paces:
         if known is None:
             return
         usual = (known.at if seconds is None else seconds) - known.begin
-        if usual >= _SHORT_S and known.took > 0.0:
-            self._kept[robot] = [*self._kept.get(robot, []), (usual, known.took / usual)][-_KEPT:]
+        took = known.took - (0.0 if seconds is None else ARRIVAL_S)
+        if usual >= _SHORT_S and took > 0.0:
+            self._kept[robot] = [*self._kept.get(robot, []), (usual, took / usual)][-_KEPT:]
             self._changed.add(robot)
 
     def arrival(self, robot: str, seconds: float) -> Arrival:
@@ -119,9 +122,9 @@ class Paces:
         low, high = np.interp(_QUANTILES, below, ratios[order])
         expected = float(np.average(ratios, weights=weights))
         return Arrival(
-            earliest_s=round(seconds * float(low), 1),
-            expected_s=round(seconds * expected, 1),
-            latest_s=round(seconds * float(high), 1),
+            earliest_s=round(seconds * float(low) + ARRIVAL_S, 1),
+            expected_s=round(seconds * expected + ARRIVAL_S, 1),
+            latest_s=round(seconds * float(high) + ARRIVAL_S, 1),
         )
 
     # --- Redis ------------------------------------------------------------------------------------------------------

@@ -22,6 +22,7 @@ from msgspec import UNSET
 from fog_runtime.configuration.site import load_site
 from fognav_experiments.commands.driving import show
 from fognav_experiments.comparison import computation, live_drive, runner
+from fognav_experiments.comparison.break_even import Case
 from fognav_experiments.comparison.drives import ComparedDrive, ExperimentSpec, MeasuredDrive, RouteSpec, draw
 from fognav_experiments.comparison.floor_draws import ROUTE_M, FloorDrawError, FloorDraws
 from fognav_experiments.comparison.limits import RouteGeometry, Saved, Saving, allowed_savings
@@ -141,6 +142,19 @@ def test_an_obstacle_that_appears_behind_the_robot_has_not_met_it():
     behind = allowed_savings.saving(msgspec.structs.replace(barred, trigger_m=50.0))
     assert not behind.met
     assert behind.saved_m == pytest.approx(0.0, abs=0.01)
+
+
+# --- when a warning costs more than it saves ---
+
+
+def test_a_warning_pays_if_enough_obstacles_stay_and_false_alarms_are_few_enough():
+    case = Case("ab", "z4", free_s=220.0, warned_s=240.0, unwarned_s=340.0)
+    assert (case.saved_s, case.lost_s) == (100.0, 20.0)
+    share = case.true_share
+    assert share * case.saved_s == pytest.approx((1.0 - share) * case.lost_s)
+    blocked = case.blocked_share(alarms=5.0, lasting_s=60.0)
+    assert blocked * case.saved_s == pytest.approx(5.0 * 60.0 / 86_400.0 * case.lost_s)
+    assert case.blocked_share(0.0, 600.0) == 0.0
 
 
 # --- statistics ---

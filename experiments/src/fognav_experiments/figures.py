@@ -211,7 +211,7 @@ def bars(title: str, unit: str, groups: Sequence[str], series: Mapping[str, Sequ
     axes.grid(axis="y", color="#ddd")
     axes.set_axisbelow(True)
     _title(figure, axes, f"{title} ({unit})")
-    return _svg(figure)
+    return svg_of(figure)
 
 
 def tracks(
@@ -239,7 +239,7 @@ def tracks(
         axes.plot(*stop, "ko")
         axes.annotate(name, stop, (6, 5), textcoords="offset points", weight="bold")
     _title(figure, axes, "")
-    return _svg(figure)
+    return svg_of(figure)
 
 
 def heat_map(
@@ -268,7 +268,7 @@ def heat_map(
     axes.set_xticks(np.arange(columns) + 0.5, [f"{x:g}" for x in across[1]])
     axes.set_yticks(np.arange(rows) + 0.5, [f"{y:g}" for y in upwards[1]])
     axes.tick_params(length=0)
-    return _svg(figure)
+    return svg_of(figure)
 
 
 def curves(panels: Mapping[str, Mapping[str, Sequence[tuple[float, float]]]], across: str) -> Figure:
@@ -314,7 +314,7 @@ def _title(figure: Figure, axes: Axes, title: str) -> None:
     figure.legend(loc="outside upper right", ncols=4, frameon=False)
 
 
-def _svg(figure: Figure) -> str:
+def svg_of(figure: Figure) -> str:
     """Return a figure as an element that a page can contain, with its words as text."""
     data = io.StringIO()
     with rc_context({"svg.hashsalt": "fognav", "svg.fonttype": "none"}):

@@ -15,7 +15,7 @@ import msgspec
 from fog_runtime.configuration.site import load_site
 from fog_runtime.files import SHARED, atomic_write
 from fognav_experiments import figures
-from fognav_experiments.comparison import computation, limits, repeated, runner
+from fognav_experiments.comparison import break_even, computation, limits, repeated, runner
 from fognav_experiments.comparison.drives import KINDS, route_ends
 from fognav_experiments.comparison.limits import RouteGeometry, Saved
 from fognav_experiments.comparison.records import (
@@ -98,6 +98,7 @@ def build(
             for block in by_situation(pairs, met, before, after)
         ),
         *worse(pairs, setups, savings),
+        *break_even.blocks(pairs, met),
         *_bounds(pairs, savings),
         Heading("Paired differences"),
         *_differences(pairs, met, setups),

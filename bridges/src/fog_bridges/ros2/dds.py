@@ -7,6 +7,7 @@ name mapping to DDS": `rt/` and the topic's name; types in `dds_`, with an under
 
 from __future__ import annotations
 
+import asyncio
 import os
 from functools import cache, partial
 from typing import TYPE_CHECKING, Any, Final
@@ -22,7 +23,7 @@ from cyclonedds.sub import DataReader
 from cyclonedds.topic import Topic as DdsTopic
 from rosbags.interfaces import Nodetype
 
-from fog_bridges.ros2.session import Arrivals, check_hash
+from fog_bridges.ros2.session import RETRY_S, Arrivals, check_hash
 from fog_bridges.ros2.wire import TYPES, RosMessage, Topic, dds_type, serialized, type_hash
 
 if TYPE_CHECKING:
@@ -105,7 +106,12 @@ class DdsWire:
     async def opened(self, name: str, clock: Clock) -> DdsSession:
         """Return a node, whose name is not told: DDS has publishers and subscribers, and no nodes."""
         del name
-        return DdsSession(self._domain, clock)
+        while True:
+            try:
+                return DdsSession(self._domain, clock)
+            except DDSException as error:
+                self.problem = f"domain {self._domain} of DDS can't be joined: {error}"
+            await asyncio.sleep(RETRY_S)
 
 
 class DdsSession(Arrivals):

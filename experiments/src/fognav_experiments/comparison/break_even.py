@@ -124,5 +124,5 @@ def blocks(pairs: Sequence[Drives], met: Sequence[Drives]) -> list[Block]:
             ],
             rows,
         ),
-        Picture("break-even.svg", svg, "Share of the time (%) for which a corridor must be blocked: then warnings pay."),
+        Picture("break-even.svg", svg, "Share of time (%) for which a corridor must be blocked: then warnings pay."),
     ]  # fmt: skip

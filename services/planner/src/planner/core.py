@@ -299,7 +299,8 @@ class PlannerCore:
         if planning_map is None or robot not in self._served or mission.path_is_outdated:
             return publications
         if plan is not None and plan.route is not None and mission.goal is not None:
-            self.leases.follow(robot, (self.epoch, plan.plan_id), plan.route.corners, mission.goal.goal_id)
+            path_id, corners = (self.epoch, plan.plan_id), plan.route.corners
+            self.leases.follow(robot, path_id, corners, mission.goal.goal_id, mission.priority)
             self.leases.advance(robot, plan.progress)
             if not plan.published or at.now >= mission.release_due:
                 plan.lease = self.leases.release(robot, plan.wanted_length(self.config), at.now)

@@ -182,6 +182,7 @@ export const en = {
   "reset.text": "Look at the robot first: {reason}",
 
   "way.waits": "Waits before {places}, {limit} at most: waiting is expected to cost {wait}, the way round {round}.",
+  "way.letsPass": "Waits for {who} to pass.",
   "way.goesRound": "Goes round {places}: waiting is expected to cost {wait}, the way round {round}.",
 
   "service.is": "Out of service{end}: {reason} ({by}).",

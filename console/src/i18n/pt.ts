@@ -183,6 +183,7 @@ export const pt: Readonly<Record<keyof typeof en, string>> = {
   "reset.text": "Olhe primeiro para o robô: {reason}",
 
   "way.waits": "Espera diante de {places}, no máximo {limit}: esperar deve custar {wait}, o desvio {round}.",
+  "way.letsPass": "Espera que {who} passe.",
   "way.goesRound": "Contorna {places}: esperar deve custar {wait}, o desvio {round}.",
 
   "service.is": "Fora de serviço{end}: {reason} ({by}).",

@@ -53,6 +53,7 @@ function Details({ id }: { readonly id: string }): preact.JSX.Element {
         <p class="lead">{headline(state, robot?.goal ?? null, robot?.out_of_service, stopped)}</p>
         {old && <p class="problem">{t("robot.old")}</p>}
         {robot?.goal && robot.plan?.blocked_way && <p>{blockedWay(robot.plan.blocked_way)}</p>}
+        {robot?.goal && robot.plan?.waits_for && <p>{t("way.letsPass", { who: robot.plan.waits_for })}</p>}
         {reasons.length > 1 && (
           <>
             <h3>{t("robot.why")}</h3>

@@ -9,8 +9,13 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.stateful import RuleBasedStateMachine, initialize, invariant, rule
+from ring_map import RingMap, goal, pose
 
+from fog_contracts import channels as ch
 from fog_contracts.geometry import lengths_along
+from fog_contracts.handlers import Moment
+from fog_contracts.messages import RobotRelease
+from planner.core import PlannerCore
 from planner.leases.corridor_leases import FORGET_S, PATIENCE_S, WITHDRAWN_S, CorridorLeases
 from planner.leases.corridors import DEFAULT_RADIUS_M, MARGIN_M
 
@@ -261,11 +266,27 @@ TestInterleavings = Interleavings.TestCase
 )
 def test_all_arrive_whenever_some_order_lets_them(trips):
     floor = Floor()
-    for number, (start, goal) in enumerate(trips):
-        floor.put(f"r{number}", start, goal)
+    for number, (start, end) in enumerate(trips):
+        floor.put(f"r{number}", start, end)
     for robot in floor.paths:
         floor.ask(robot)
     if floor.leases.standstills.stuck():
         return  # face to face from the beginning: others than leases must help
     floor.drive_all(500)
     assert [robot for robot in floor.paths if not floor.arrived(robot)] == []
+
+
+def test_a_release_says_for_whom_a_robot_waits():
+    core, ring_map = PlannerCore(epoch=1), RingMap()
+    core.load(ring_map.master.snapshot(), 10.0)
+    core.set_goal("r1", goal(19.0, 7.0))
+    released = []
+    for step in range(8):
+        at = Moment(10.0 + 0.1 * step, 10.0 + 0.1 * step)
+        core.handlers()[ch.MAP_HEARTBEAT]({}, ring_map.master.heartbeat(at.now), at)
+        core.handlers()[ch.ROBOT_POSE]({"robot": "r1"}, pose(19.0, 7.9), at)
+        core.handlers()[ch.ROBOT_POSE]({"robot": "r2"}, pose(19.0, 7.0), at)
+        released += [p.message for p in core.tick(at) if isinstance(p.message, RobotRelease)]
+    assert released
+    assert released[-1].waits_for == "r2"
+    assert released[-1].released_length < 0.5

@@ -261,6 +261,8 @@ def robot_status(*, robot: RobotOption = None, fog: FogOption = None, json: Json
             print_answer(f"  no path: {plan['refusal']['reason']}")
         elif plan is not None and plan.get("blocked_way") is not None:
             print_answer(f"  {plan['blocked_way']['reason']}")
+        elif plan is not None and plan.get("waits_for") is not None:
+            print_answer(f"  waits for {plan['waits_for']} to pass")
 
 
 @robot_app.command("watch", epilog="Example: fognav robot watch --seconds 60 --json")

@@ -15,6 +15,8 @@ from __future__ import annotations
 from functools import partial
 from typing import TYPE_CHECKING, Final
 
+from msgspec import structs
+
 from fog_contracts import channels as ch
 from fog_contracts.handlers import Fence, Publication
 from fog_contracts.replica import MapError
@@ -307,6 +309,7 @@ class PlannerCore:
         if (path := mission.due_path(at, self.config, self.epoch, planning_map.version)) is not None:
             publications.append(Publication(ch.ROBOT_PATH, path, ids))
         if (release := mission.due_release(at, self.config, self.epoch, planning_map.version)) is not None:
+            release = structs.replace(release, waits_for=self.leases.waits_for(robot))
             publications.append(Publication(ch.ROBOT_RELEASE, release, ids))
         return publications
 

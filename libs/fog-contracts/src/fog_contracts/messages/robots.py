@@ -125,10 +125,11 @@ class RobotGoal(Message, frozen=True, kw_only=True):
     planner_epoch: Count = 0
 
 
-class RobotRelease(Message, frozen=True, kw_only=True):
+class RobotRelease(Message, frozen=True, kw_only=True, omit_defaults=True):
     """How much of a path the robot may drive (m), twice a second: the path is still good on this version of the map.
 
     It keeps the path of this plan alive, and no other: a robot that does not have it hears nothing from its planner.
+    `waits_for`: the robot that it lets pass, or whose place it waits for; left out when there is none.
     """
 
     plan_id: Count
@@ -137,6 +138,7 @@ class RobotRelease(Message, frozen=True, kw_only=True):
     map_epoch: Count
     map_seq: Count
     sent: Sent | None = None
+    waits_for: Id | None = None
 
 
 class BlockedWay(Message, frozen=True, kw_only=True):
@@ -174,6 +176,7 @@ class RobotPath(Message, frozen=True, kw_only=True):
     goal_theta: Radians | None = None
     refusal: Refusal | None = None
     blocked_way: BlockedWay | None = None
+    waits_for: Id | None = None
     traces: list[Trace] = []
     stamp: Stamp = 0.0
     sent: Sent | None = None
@@ -187,6 +190,7 @@ class RobotPath(Message, frozen=True, kw_only=True):
             released_length=release.released_length,
             map_epoch=release.map_epoch,
             map_seq=release.map_seq,
+            waits_for=release.waits_for,
         )
 
 

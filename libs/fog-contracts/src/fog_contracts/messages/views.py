@@ -41,7 +41,10 @@ class GoalView(Message, frozen=True, kw_only=True):
 
 
 class PlanView(Message, frozen=True, kw_only=True):
-    """The current plan: version, number of corners, released length (m), or refusal; why it waits, or goes round."""
+    """The current plan: version, number of corners, released length (m), or refusal; why it waits, or goes round.
+
+    `waits_for`: the robot that it lets pass.
+    """
 
     plan_id: int
     map_epoch: int
@@ -50,6 +53,7 @@ class PlanView(Message, frozen=True, kw_only=True):
     released_length: float
     refusal: Refusal | None
     blocked_way: BlockedWay | None = None
+    waits_for: str | None = None
 
     @classmethod
     def of(cls, path: RobotPath | None) -> "PlanView | None":
@@ -64,6 +68,7 @@ class PlanView(Message, frozen=True, kw_only=True):
             released_length=path.released_length,
             refusal=path.refusal,
             blocked_way=path.blocked_way,
+            waits_for=path.waits_for,
         )
 
 

@@ -15,13 +15,14 @@ from hypothesis import given
 from hypothesis import strategies as st
 from manual_clock import ManualClock
 
-from fog_contracts.messages import OutOfService, Place, PlanReply, PlanRequest, Pose, Refusal, RobotPath
+from fog_contracts.messages import OutOfService, Place, PlanReply, PlanRequest, Pose, Refusal, RobotGoal, RobotPath
 from fog_runtime.health import Health
 from fog_runtime.http import ProblemError
+from fog_runtime.stores.redis_store import Audit
 from fog_supervisor.servers import start_redis
 from planner.core import PlannerCore
-from planner.stops import CUT_S, Order, Stop, Tour, WhenCut, act_on_cut, best_order
-from planner.store import OutOfServiceError, Store
+from planner.stops import CUT_S, CutTimes, Order, Stop, Tour, WhenCut, act_on_cut, best_order, leg_aside, next_leg
+from planner.store import OutOfServiceError, Store, StoredGoal
 from planner.tours.api import Conditions, GoalBody, GoalPose, MissionBody, mission_answer, mission_order
 from planner.tours.persistence import TourPersistence
 
@@ -50,8 +51,8 @@ def test_best_order_is_that_of_all_orders_with_the_fewest_closed_ways_and_the_le
 def test_way_that_is_cut_for_a_moment_ends_nothing_and_each_policy_does_what_it_says():
     here, there = (1.0, 1.0), (5.0, 1.0)
 
-    def act(when_cut, seconds, nearest=here, **tour):
-        return act_on_cut(Tour(id="t", when_cut=when_cut, **tour), nearest, seconds)
+    def act(when_cut, seconds, reachable=here, **tour):
+        return act_on_cut(Tour(id="t", when_cut=when_cut, **tour), reachable, seconds, seconds)
 
     assert act(WhenCut(do="cancel"), CUT_S - 0.1) == "wait"
     assert act(WhenCut(do="cancel"), CUT_S) == "cancel"
@@ -59,9 +60,30 @@ def test_way_that_is_cut_for_a_moment_ends_nothing_and_each_policy_does_what_it_
     assert [act(WhenCut(limit_s=60.0), s) for s in (59.0, 60.0)] == ["wait", "cancel"]
     assert act(WhenCut(do="nearest"), CUT_S) == "nearest"
     aside = Stop(pose=Pose(x=0.0, y=0.0, theta=0.0))
-    assert act(WhenCut(do="nearest"), 9.0, aside=aside) == "wait", "it drives there already"
-    assert act_on_cut(Tour(id="t", when_cut=WhenCut(do="nearest"), nearest=here), here, 9.0) == "wait", "it is there"
-    assert act_on_cut(Tour(id="t", when_cut=WhenCut(do="nearest"), nearest=here), there, 9.0) == "nearest"
+    assert act(WhenCut(do="nearest"), CUT_S - 0.1, aside=aside) == "wait", "it drives there already"
+    assert act(WhenCut(do="nearest"), CUT_S, aside=aside) == "on", "no way leads there, either"
+    assert act(WhenCut(do="nearest"), 9.0, here, nearest=here) == "wait", "it is there"
+    assert act(WhenCut(do="nearest"), 9.0, there, nearest=here) == "nearest"
+
+
+def test_limit_counts_every_refusal_and_goes_on_over_trips_aside_and_moments_in_which_the_way_is_open():
+    stop, times = Stop(pose=Pose(x=5.0, y=0.0, theta=0.0)), CutTimes()
+    on_the_way = Tour(id="t")
+    _, aside = leg_aside(on_the_way, stop, (3.0, 0.0))
+    _, again = next_leg(aside, stop)
+    assert times.see(on_the_way, "start_closed", 0.0) == (0.0, 0.0)
+    assert times.see(on_the_way, "goal_near_wall", 9.0) == (0.0, 9.0), "the rule is about ways that are cut"
+    assert times.see(on_the_way, "cut_off", 10.0) == (0.0, 10.0)
+    assert times.see(on_the_way, None, 12.0) == (0.0, 12.0), "it flickers"
+    assert times.see(on_the_way, "cut_off", 12.0 + CUT_S - 0.1)[1] == 12.0 + CUT_S - 0.1
+    assert times.see(aside, None, 30.0) == (0.0, 30.0)
+    assert times.see(aside, "search_too_long", 40.0) == (0.0, 40.0)
+    assert times.see(aside, "search_too_long", 44.0) == (4.0, 44.0), "no way leads aside, whatever the reason"
+    assert times.see(aside, "start_closed", 45.0) == (0.0, 45.0), "from there none leads anywhere"
+    assert times.see(again, "cut_by_places", 50.0) == (0.0, 50.0)
+    assert [times.see(again, None, 60.0), times.see(again, None, 60.0 + CUT_S)] == [(0.0, 60.0), (0.0, 0.0)]
+    assert times.see(again, "cut_off", 70.0) == (0.0, 0.0)
+    assert times.see(Tour(id="t", leg=3, reached=(stop,)), "cut_off", 80.0) == (0.0, 0.0), "another stop"
 
 
 # --- in Redis ---
@@ -108,7 +130,9 @@ class Running:
 
 def order(*stops: float, **tour: Any) -> Order:
     first, *ahead = (Stop(pose=Pose(x=x, y=0.0, theta=0.0)) for x in stops)
-    return Order("r1", first.pose, "anna", tour=Tour(id=secrets.token_hex(8), ahead=tuple(ahead), **tour))
+    return Order(
+        "r1", first.pose, "anna", action="mission", tour=Tour(id=secrets.token_hex(8), ahead=tuple(ahead), **tour)
+    )
 
 
 @pytest.fixture
@@ -228,10 +252,50 @@ async def test_mission_whose_way_is_cut_waits_ends_or_goes_to_the_nearest_point_
         await running.missions.send(order(5.0, deadline=clock.stamp() + 60.0))
         assert await after(running, 59.0) == 5.0
         assert await after(running, 2.0) is None
-        assert [entry.action for entry in (await store.audit(limit=2)).entries] == [
-            "deadline",
-            "mission" if False else "goal",
-        ]
+        assert [entry.action for entry in (await store.audit(limit=2)).entries] == ["deadline", "mission"]
+
+
+@pytest.mark.live
+async def test_robot_whose_way_to_the_nearest_point_is_cut_goes_on_to_its_stop_till_the_limit_ends_the_mission(redis):
+    clock = ManualClock(100.0)
+    async with Store(redis.url, "test") as store:
+        running = await Running(store, clock).start()
+        await running.missions.send(order(5.0, when_cut=WhenCut(do="nearest", limit_s=60.0)))
+        seen = []
+        for nearest in (3.0, 3.0, 3.0, 1.0):
+            running.refused = Refusal(code=208, kind="cut_by_places", reason="hazard n3", nearest=(nearest, 0.0))
+            await running.step()
+            clock.advance(10.0)
+            await running.step()
+            seen.append(running.at)
+        assert seen == [3.0, 5.0, 5.0, 1.0], "it goes nowhere twice in vain"
+        running.refused = None
+        clock.advance(19.0)
+        await running.step()
+        assert running.at == 1.0
+        clock.advance(2.0)
+        await running.step()
+        assert running.at is None
+        assert (await store.audit(limit=1)).entries[0].action == "cut"
+
+
+@pytest.mark.live
+async def test_mission_that_is_ordered_and_reached_while_another_goes_on_is_over_after_a_restart(redis):
+    clock = ManualClock(100.0)
+    async with Store(redis.url, "test") as store:
+        running = await Running(store, clock).start()
+        await running.missions.send(order(5.0, 9.0))
+        running.reach()
+        async with running.missions._lock:  # a store that is slow
+            going_on = asyncio.ensure_future(running.step())
+            await asyncio.sleep(0)
+            newer = StoredGoal(goal=RobotGoal(goal_id="new", pose=Pose(x=1.0, y=0.0, theta=0.0), stamp=clock.stamp()))
+            await store.put("r1", newer, Audit(clock.stamp(), "anna", "goal"))
+            running.missions._begin("r1", newer)
+            running.reach()
+        await going_on
+        await running.step()
+        assert await store.goals() == {}
 
 
 # --- orders ---

@@ -12,7 +12,6 @@ from fog_contracts.messages import Id, Message, PlanRefusal, PointXY, Pose, Stam
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from fog_contracts.messages import RobotPath
     from fog_runtime.stores.redis_store import Attempt
 
 STOPS_MAX: Final = 20
@@ -31,7 +30,8 @@ class Stop(Message, frozen=True, kw_only=True):
 class WhenCut(Message, frozen=True, kw_only=True):
     """What to do when every way to a stop is cut: wait, cancel the mission, or drive to the nearest reachable point.
 
-    `limit_s`: after so long without a way the mission ends all the same. It counts anew after a restart.
+    `limit_s`: after so long without a way to a stop, whatever refuses it, the mission ends all the same. It counts anew
+    for each stop, and after a restart.
     """
 
     do: Literal["wait", "cancel", "nearest"] = "wait"
@@ -145,29 +145,62 @@ _CUT: Final = frozenset(
         PlanRefusal.GOAL_OBSTRUCTED,
     }
 )
+"""The refusals that a mission's rule is about; its `limit_s` is about all."""
+_AT_START: Final = frozenset({PlanRefusal.START_OFF_MAP, PlanRefusal.START_CLOSED, PlanRefusal.START_OBSTRUCTED})
+"""Those that no other goal ends."""
 CUT_S: Final = 3.0
-"""A way that is cut for less is not cut: what flickers ends no mission."""
+"""A way that is cut for less is not cut, and one that is open for less is not open: what flickers changes nothing."""
 _ELSEWHERE_M: Final = 1.0
 """So far from the last nearest point another one is worth to be driven to."""
 
-CutAct = Literal["wait", "cancel", "nearest"]
+CutAct = Literal["wait", "cancel", "nearest", "on"]
+"""What is done about a way that is cut; `on`: go on to the stop itself, from the way to the nearest point."""
 
 
-def is_cut(path: RobotPath | None, goal_id: str) -> bool:
-    """Whether no way leads to a goal by its robot's last path or refusal."""
-    if path is None or path.refusal is None or path.goal_id != goal_id:
-        return False
-    return path.refusal.kind in _CUT
+class CutTimes:
+    """Since when no way leads to a robot's present goal, and to its stop. Times in s."""
+
+    def __init__(self) -> None:
+        self._stop: tuple[str, int] | None = None
+        self._leg = -1
+        self._cut_from = self._without_from = self._open_from = math.inf
+
+    def see(self, tour: Tour, kind: str | None, now: float) -> tuple[float, float]:
+        """Return for how long the way to the present goal has been cut, and for how long none has led to the stop.
+
+        `kind`: why the present goal is refused, None when a path leads to it. The second goes on while the robot is on
+        its way to the nearest point, counts every refusal, and ends when the way has been open for a while.
+        """
+        stop = tour.id, len(tour.reached)
+        if stop != self._stop:
+            self._stop, self._without_from, self._open_from = stop, math.inf, math.inf
+        is_cut = kind in _CUT if tour.aside is None else kind is not None and kind not in _AT_START
+        before = self._cut_from if tour.leg == self._leg else math.inf
+        self._leg, self._cut_from = tour.leg, min(before, now) if is_cut else math.inf
+        if kind is not None:
+            self._without_from, self._open_from = min(self._without_from, now), math.inf
+        elif tour.aside is None:
+            self._open_from = min(self._open_from, now)
+            if now - self._open_from >= CUT_S:
+                self._without_from = math.inf
+        return max(0.0, now - self._cut_from), max(0.0, now - self._without_from)
 
 
-def act_on_cut(tour: Tour, nearest: PointXY | None, cut_s: float) -> CutAct:
-    """Return what is to be done about a way that is cut for so long (s); `nearest`: the point that can be reached."""
+def act_on_cut(tour: Tour, nearest: PointXY | None, cut_s: float, without_s: float) -> CutAct:
+    """Return what is to be done about a way that is cut.
+
+    `cut_s`, `without_s`: as `CutTimes.see` returns them. `nearest`: the point that can be reached.
+    """
     policy = tour.when_cut
+    if policy.limit_s is not None and without_s >= policy.limit_s:
+        return "cancel"
     if cut_s < CUT_S:
         return "wait"
-    if policy.do == "cancel" or (policy.limit_s is not None and cut_s >= policy.limit_s):
+    if policy.do == "cancel":
         return "cancel"
-    if policy.do != "nearest" or tour.aside is not None or nearest is None:
+    if tour.aside is not None:
+        return "on"
+    if policy.do != "nearest" or nearest is None:
         return "wait"
     elsewhere = tour.nearest is None or math.dist(tour.nearest, nearest) > _ELSEWHERE_M
     return "nearest" if elsewhere else "wait"

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+from collections import defaultdict
 from typing import TYPE_CHECKING
 
 from fog_contracts.messages import RobotGoal
 from fog_runtime import logs
 from fog_runtime.stores.redis_store import Audit
-from planner.stops import Stop, act_on_cut, is_cut, leg_aside, next_leg
+from planner.stops import CutTimes, Stop, act_on_cut, leg_aside, next_leg
 from planner.store import MissionConflictError, MissionPersistence, StoredGoal
 
 if TYPE_CHECKING:
@@ -40,8 +41,8 @@ class TourPersistence(MissionPersistence):
     ) -> None:
         super().__init__(core, store, clock, health, change_core)
         self._path = path
-        self._cut: dict[str, tuple[str, float]] = {}
-        """By robot, the goal to which no way leads, and since when (s)."""
+        self._cut: defaultdict[str, CutTimes] = defaultdict(CutTimes)
+        """By robot, since when no way leads on."""
 
     def end(self, robot: str, goal_id: str) -> None:
         """Mark a reached goal for its end; one of a mission that goes on is its mission's until the next is stored."""
@@ -58,7 +59,8 @@ class TourPersistence(MissionPersistence):
             stored = self.goals.get(robot)
             if stored is not None and stored.goal.goal_id == goal_id and stored.tour is not None:
                 await self._replace(robot, stored, *next_leg(stored.tour, _stop(stored)), who=robot, action="stop")
-                self._reached.pop(robot, None)
+                if self._reached.get(robot) == goal_id:  # else a newer mission is reached meanwhile
+                    del self._reached[robot]
         await super()._end_reached()
         if self._leading:
             for robot, stored in list(self.goals.items()):
@@ -85,17 +87,17 @@ class TourPersistence(MissionPersistence):
         if tour.deadline is not None and self._clock.stamp() >= tour.deadline:
             await self._give_up(robot, stored, "deadline", "its deadline has passed")
             return
-        goal_id, path = stored.goal.goal_id, self._path(robot)
-        if path is None or path.refusal is None or not is_cut(path, goal_id):
-            self._cut.pop(robot, None)
-            return
-        now = self._clock.now()
-        if robot not in self._cut or self._cut[robot][0] != goal_id:
-            self._cut[robot] = goal_id, now
-        nearest = path.refusal.nearest
-        act = act_on_cut(tour, nearest, now - self._cut[robot][1])
+        path = self._path(robot)
+        if path is None or path.goal_id != stored.goal.goal_id:
+            return  # nothing is planned yet
+        kind, nearest, reason = None, None, ""
+        if path.refusal is not None:
+            kind, nearest, reason = path.refusal.kind, path.refusal.nearest, path.refusal.reason
+        act = act_on_cut(tour, nearest, *self._cut[robot].see(tour, kind, self._clock.now()))
         if act == "cancel":
-            await self._give_up(robot, stored, "cut", path.refusal.reason)
+            await self._give_up(robot, stored, "cut", reason or "no way has led to its stop for too long")
+        elif act == "on":
+            await self._replace(robot, stored, *next_leg(tour, _stop(stored)), who=WHO, action="stop")
         elif act == "nearest" and nearest is not None:
             await self._replace(robot, stored, *leg_aside(tour, _stop(stored), nearest), who=WHO, action="aside")
 

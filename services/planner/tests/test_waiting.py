@@ -26,11 +26,13 @@ from fog_contracts.messages import (
     PolygonShape,
     RectangleShape,
     RobotPath,
+    Shape,
     Zone,
     ZoneSet,
 )
 from planner.config import PlannerConfig, WaitMode
 from planner.core import PlannerCore
+from planner.path_search import Route
 from planner.waits.blocks import PRIOR, PRIOR_BLOCKS, BlockRecord, Blocks
 from planner.waits.durations import AGES, Durations, Survival, all_of, best_policy, survival, until
 
@@ -53,6 +55,8 @@ class Drive:
         self.core.load(self.map.master.snapshot(), self.now)
         self.path: RobotPath | None = None
         self.published = 0
+        self.speed = 0.0
+        """How fast (m/s) the robot drives what is released."""
         self.core.set_goal("r1", goal(*to))
         self.step(0.2)
 
@@ -68,6 +72,11 @@ class Drive:
             for publication in self.core.tick(self.moment):
                 if isinstance(publication.message, RobotPath):
                     self.path, self.published = publication.message, self.published + 1
+            if self.speed and self.path is not None:
+                route = Route(np.array(self.path.points), 0.05)
+                along = min(route.nearest(*self.at)[0] + 0.1 * self.speed, self.path.released_length)
+                x, y = route.remaining(along)[0]
+                self.at = float(x), float(y)
 
     def deliver(self, channel, message, **ids) -> None:
         self.core.handlers()[channel](ids, message, self.moment)
@@ -85,6 +94,15 @@ class Drive:
 
     def block(self, box=UPPER) -> None:
         self.hazard("blocked", self.map.put("a", box), box)
+        self.step(0.1)
+
+    def zone(self, shape: Shape, rest: float | None) -> None:
+        """Put a no-go zone in force that ends in `rest` s."""
+        deltas = self.map.put("z", UPPER)
+        zone = Zone(id="z", kind="BLOCKED", shape=shape, expires_at=None if rest is None else self.moment.stamp + rest)
+        self.deliver(ch.ZONES, ZoneSet(epoch=1, seq=1, zones=[zone], active=["z"]))
+        for delta in deltas:
+            self.deliver(ch.MAP_DELTA, delta)
         self.step(0.1)
 
     def clear(self) -> None:
@@ -185,13 +203,52 @@ def test_zone_is_waited_for_when_its_end_is_known_and_near():
     ]
     for shape, (rest, choice) in itertools.product(shapes, ((8.0, "wait"), (None, None), (500.0, "detour"))):
         drive = Drive("learned")
-        deltas = drive.map.put("z", UPPER)
-        zone = Zone(id="z", kind="BLOCKED", shape=shape, expires_at=None if rest is None else drive.moment.stamp + rest)
-        drive.deliver(ch.ZONES, ZoneSet(epoch=1, seq=1, zones=[zone], active=["z"]))
-        for delta in deltas:
+        drive.zone(shape, rest)
+        assert (None if drive.way is None else drive.way.choice) == choice
+
+
+@pytest.mark.parametrize("rest", [6.0, 25.0])
+def test_robot_waits_until_a_zone_is_gone_that_ends_on_its_way_there_or_while_it_stands(rest):
+    drive = Drive("learned", at=(1.0, 6.0), walls=STEM, to=(16.0, 11.0))
+    drive.speed = drive.core.config.cruise_speed
+    drive.zone(RectangleShape(corner=UPPER[:2], opposite=UPPER[2:]), rest)
+    end = drive.now - 0.1 + rest
+    while drive.now < end + 2.0:
+        assert drive.way.choice == "wait", f"{end - drive.now:.1f} s before the end"
+        drive.step(0.1)
+    drive.deliver(ch.ZONES, ZoneSet(epoch=1, seq=2, zones=[], active=[]))
+    for delta in drive.map.clear("z"):
+        drive.deliver(ch.MAP_DELTA, delta)
+    drive.step(0.1)
+    assert drive.path.blocked_way is None
+    assert via(drive.path) == "upper"
+
+
+def test_zone_that_stays_in_force_beyond_its_end_is_not_waited_for_any_more():
+    drive = Drive("learned")
+    drive.zone(RectangleShape(corner=UPPER[:2], opposite=UPPER[2:]), 4.0)
+    assert drive.way.choice == "wait"
+    drive.step(12.0)
+    assert via(drive.path) == "lower"
+
+
+@pytest.mark.parametrize("area", [True, False])
+def test_outlines_of_zones_are_not_looked_at_that_lie_elsewhere_or_where_nothing_may_end(monkeypatch, area):
+    looked_at = []
+    monkeypatch.setattr("planner.waits.choice.shape_contains", lambda *asked: looked_at.append(asked))
+    drive = Drive()
+    x = 30.0 if area else UPPER[0]  # of a ring around the block that does not reach it
+    ring = [(x, 9.0), (x + 5.0, 9.0), (x + 5.0, 13.0), (x + 4.9, 9.1)]
+    zones = [Zone(id=f"z{k}", kind="BLOCKED", shape=PolygonShape(points=ring), expires_at=None) for k in range(300)]
+    drive.deliver(ch.ZONES, ZoneSet(epoch=1, seq=1, zones=zones, active=[zone.id for zone in zones]))
+    if area:
+        drive.block()
+    else:
+        for delta in drive.map.put("obstacle", UPPER):
             drive.deliver(ch.MAP_DELTA, delta)
         drive.step(0.1)
-        assert (None if drive.way is None else drive.way.choice) == choice
+    assert not looked_at
+    assert (drive.way is not None and drive.way.choice == "wait") == area
 
 
 def test_what_a_lidar_sees_outside_of_every_area_is_not_waited_for():
@@ -255,7 +312,7 @@ def simulate(kind: str, log: Durations, seed: int) -> tuple[float, float, np.nda
         waited = np.append(0.0, np.cumsum(0.5 * (left[1:] + left[:-1]) * np.diff(GRID)))
         expected = waited + left * detour  # of waiting for so long
         policy = best_policy(survival(log.informed(PRIOR, PRIOR_BLOCKS), age), detour)
-        ours += np.interp(policy.limit if policy.waiting < policy.detour else 0.0, GRID, expected)
+        ours += np.interp(policy.limit if policy.waits else 0.0, GRID, expected)
         best += expected.min()
         fixed += np.interp(THRESHOLDS, GRID, expected)
         log.add(0.0, duration, ended=True)

@@ -40,6 +40,7 @@ if TYPE_CHECKING:
     from planner.waits.durations import Policy, Survival
 
 Floats = NDArray[np.float64]
+Bounds = tuple[float, float, float, float]
 
 _JUDGE_S: Final = 1.0
 """How often the choice is made anew."""
@@ -54,6 +55,8 @@ _SHORT_M: Final = 0.15
 """With less of it nobody waits: the robot stands so near that it would count as arrived, or stuck."""
 _SAME_PLACE_M: Final = 0.5
 """A robot waits on where it waits, as long as that is so near to where it would."""
+_GRACE_S: Final = 5.0
+"""A zone or override that is in force for so long after its end has another one, or a clock is wrong: nobody waits."""
 _NEAR_M: Final = 0.3
 """Beyond its inscribed radius, a source closes no cell farther away from it than this."""
 
@@ -144,11 +147,10 @@ class Waits:
             return None  # it stands before the block already, or is as quick round it
         sources, block, age = cut
         policy = best_policy(block, detour, hold / speed)
-        waiting = policy.waiting < policy.detour
         now = self._known.at.now
         place = _point(rest, steps, hold)
         kept = np.concatenate((corners[lengths_along(corners) < end], [_point(rest, steps, end)]))
-        choice = _choice(sources, age, policy, detour, waiting=waiting)
+        choice = _choice(sources, age, policy, detour, waiting=policy.waits)
         return Judgement(choice, way, Route(kept, way.spacing), hold, place, now if since is None else since, now)
 
     def _cut(self, points: Floats, waiting_since: float | None) -> tuple[list[Source], Survival, float] | None:
@@ -158,10 +160,14 @@ class Waits:
         """
         assert self._known is not None
         at, reach = self._known.at, self.config.inflation.inscribed_radius + _NEAR_M
+        if waiting_since is None and not any(map(_may_end, self._known.sources)):
+            return None
         left = [(float(x), float(y)) for x, y in points]
+        (x0, y0), (x1, y1) = (points.min(axis=0) - reach).tolist(), (points.max(axis=0) + reach).tolist()
+        around = (x0, y0, x1, y1)
         found: list[tuple[Source, Survival, float]] = []
         for source in self._known.sources:
-            others = _beyond(source, left, reach)
+            others = _beyond(source, left, reach) if _overlap(_bounds(source), around) else left
             if len(others) == len(left):
                 continue
             left = others
@@ -170,12 +176,12 @@ class Waits:
             age = self.blocks.age(source.hazard.area, at.now) if isinstance(source, HazardArea) else None
             found.append((source, block, age or 0.0))
         for area in self._known.areas if waiting_since is not None else ():
-            others = _beyond(area, left, reach)
+            others = _beyond(area, left, reach) if left and _overlap(_bounds(area), around) else left
             if waiting_since is not None and len(others) < len(left):
                 age = at.now - waiting_since
                 block = self.blocks.survival(area.hazard.area, age, at.stamp, learned=self.config.wait == "learned")
-                left = others
-                if block is not None:
+                if block is not None:  # else something else must account for these points
+                    left = others
                     found.append((area, block, age))
         if left or not found:
             return None
@@ -186,14 +192,23 @@ class Waits:
         assert self._known is not None
         at = self._known.at
         if not isinstance(source, HazardArea):
-            return None if source.expires_at is None else until(max(0.0, source.expires_at - at.stamp))
+            return None if source.expires_at is None else _until(source.expires_at - at.stamp)
         hazard, age = source.hazard, self.blocks.age(source.hazard.area, at.now)
         if (override := hazard.override) is not None:
             ends = override.set_at + override.ttl_s - at.stamp
-            return until(max(0.0, ends)) if override.measured_penalty < LETHAL else None
+            return _until(ends) if override.measured_penalty < LETHAL else None
         if age is None:
             return None
         return self.blocks.survival(hazard.area, age, at.stamp, learned=self.config.wait == "learned")
+
+
+def _may_end(source: Source) -> bool:
+    return isinstance(source, HazardArea) or source.expires_at is not None
+
+
+def _until(rest: float) -> Survival | None:
+    """Return the survival of what ends in `rest` s, as far as that can be trusted: it may take a moment to go."""
+    return until(max(0.0, rest)) if rest > -_GRACE_S else None
 
 
 def _last_beside(points: Floats, other: Route) -> int:
@@ -226,7 +241,11 @@ def _beyond(source: Source, points: list[PointXY], reach: float) -> list[PointXY
     ]
 
 
-def _bounds(source: Source) -> tuple[float, float, float, float]:
+def _overlap(a: Bounds, b: Bounds) -> bool:
+    return a[0] <= b[2] and b[0] <= a[2] and a[1] <= b[3] and b[1] <= a[3]
+
+
+def _bounds(source: Source) -> Bounds:
     """Return the least and greatest x and y (m) of what a source covers: left, bottom, right and top."""
     shape, margin = source if isinstance(source, HazardArea) else source.shape, 0.0
     corners: list[PointXY]

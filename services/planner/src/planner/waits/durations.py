@@ -123,6 +123,11 @@ class Policy(NamedTuple):
     waiting: float
     detour: float
 
+    @property
+    def waits(self) -> bool:
+        """Whether to wait; also before what is expected to be gone when the robot comes: then both cost nothing."""
+        return self.waiting < self.detour or self.detour == 0.0
+
 
 def best_policy(block: Survival, detour: float, arrival: float = 0.0) -> Policy:
     """Return the best policy for a robot that is where the way round begins in `arrival` s: that takes `detour` s more.

@@ -12,7 +12,7 @@ import pytest
 from manual_clock import ManualClock
 
 from fog_contracts import channels as ch
-from fog_contracts.messages import Place, Pose, RobotGoal, RobotPose, RobotState
+from fog_contracts.messages import Place, PlanReply, Pose, RobotGoal, RobotPose, RobotState
 from fog_contracts.site import RobotSite, Site, VisitorsSite
 from fog_runtime.health import Health
 from fog_runtime.http import Tokens
@@ -48,6 +48,7 @@ class World:
 
     def __init__(self, stored: dict[str, StoredGoal] | None = None) -> None:
         self.stored = dict(stored or {})
+        self.attempts: dict[object, StoredGoal] = {}
         self.records: list[tuple[str, str]] = []
         """Who did what to missions."""
         self.hear: dict[ch.Channel, Callable[..., None]] = {}
@@ -80,14 +81,16 @@ class World:
     async def put_service(self, *_: object, **__: object) -> str:
         return "ok"
 
-    async def earlier_result(self, _attempt: object) -> None:
-        return None
+    async def earlier_result(self, attempt: object) -> StoredGoal | None:
+        return self.attempts.get(attempt)
 
     async def put(self, robot: str, goal: StoredGoal, audit: Any, *, expected: str) -> str:
         has = self.stored.get(robot)
         if expected not in ("*", "0" if has is None else has.goal.goal_id):
             return "changed"
         self.stored[robot] = goal
+        if audit.attempt is not None:
+            self.attempts[audit.attempt] = goal
         self.records.append((audit.who, audit.action))
         return "ok"
 
@@ -128,8 +131,11 @@ class World:
             self.service.visiting.step()
             await asyncio.gather(*self.service.visiting._tasks)
 
-    async def ask(self, method: str, path: str, body: object = None, *, role: str = "guest") -> httpx.Response:
+    async def ask(
+        self, method: str, path: str, body: object = None, *, role: str = "guest", key: str = ""
+    ) -> httpx.Response:
         headers = {"Authorization": f"Bearer {role}"} if role else {}
+        headers |= {"Idempotency-Key": key} if key else {}
         answer = await self.http.request(method, f"/api/v1/{path}", json=body, headers=headers)
         await self.settle()
         return answer
@@ -289,3 +295,14 @@ async def test_operator_sends_a_robot_to_several_places_and_sees_which_it_has_re
     assert (await world.ask("PUT", "robots/r1/mission", body, role="viewer")).status_code == 403
     assert (await world.ask("DELETE", "robots/r1/goal", role="operator")).status_code == 204
     assert world.stored == {}
+
+
+async def test_mission_that_is_ordered_again_because_its_answer_was_lost_is_the_same_whatever_has_changed(world: World):
+    body = {"stops": [{"place": "office"}, {"place": "lab"}], "deadline_s": 600, "when_cut": {"do": "cancel"}}
+    world.service.preview = AsyncMock(return_value=PlanReply(length=7.0, cost=350.0))
+    sent = await world.ask("PUT", "robots/r1/mission", body, role="operator", key="k1")
+    assert sent.status_code == 201
+    world.service.poses.clear()
+    assert (await world.ask("PUT", "robots/r1/mission", body, role="operator", key="k2")).status_code == 409
+    again = await world.ask("PUT", "robots/r1/mission", body, role="operator", key="k1")
+    assert (again.status_code, again.json()) == (200, sent.json())

@@ -346,6 +346,16 @@ def test_landmarks_are_added_while_no_goal_waits_and_begin_anew_when_a_cost_fall
     assert not fields.landmarks.fields
 
 
+def test_planner_goes_on_without_landmarks_after_their_search_has_failed() -> None:
+    fields = GoalFields(10_000, landmark_capacity=10_000)
+    fields.set_bounds(BOUND + 1, BOUND + 1)
+    (failed,) = fields.landmark_jobs()
+    fields.add_landmark(failed)
+    assert fields.landmark_jobs() == [], "it would fail again and again"
+    fields.set_bounds(BOUND, BOUND)
+    assert len(fields.landmark_jobs()) == 1, "another floor"
+
+
 # --- Regions, search, egress ---
 
 

@@ -324,6 +324,9 @@ def _add_missions(routes: Routes, service: Service, robots: _Robots, places: Kno
             attempt_of(idempotency_key, caller, f"PUT /api/v1/robots/{robot}/mission", body),
             NO_MISSION if must_be_new(if_none_match) else expected_tag(if_match),
         )
+        earlier = await service.missions.earlier_result(conditions.attempt)
+        if earlier is not None:  # before anything that may have changed since is checked
+            return mission_answer(robot, earlier)
         service.missions.require_in_service(robot)
         order = await mission_order(service, robot, body, places(), conditions, PlannerConfig.cruise_speed)
         new = robot not in service.goals

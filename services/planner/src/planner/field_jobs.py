@@ -87,11 +87,11 @@ class LandmarkJob:
 
     def __init__(self, landmarks: Landmarks, floor: Grid, scratch: FieldScratch) -> None:
         self.has_run = False
-        self._landmarks, self._floor, self._scratch = landmarks, floor, scratch
+        self.landmarks, self._floor, self._scratch = landmarks, floor, scratch
 
     def run(self) -> None:
         """Add it, unless there are enough (some 90 ms on 2000 x 1200 cells)."""
-        self._landmarks.add(self._floor, self._scratch.planner(self._floor).goal_field)
-        if self._landmarks.is_complete:
+        self.landmarks.add(self._floor, self._scratch.planner(self._floor).goal_field)
+        if self.landmarks.is_complete:
             self._scratch.release()
         self.has_run = True

@@ -153,9 +153,10 @@ class GoalFields:
         return [LandmarkJob(self.landmarks, self._floor, self._scratch)]
 
     def add_landmark(self, job: LandmarkJob) -> None:
-        """Let the next landmark be searched, on another floor, too."""
-        assert job.has_run
+        """Let the next landmark be searched, on another floor, too; after a job that failed, none on its floor."""
         self._adds_landmark = False
+        if not job.has_run:
+            job.landmarks.is_complete = True
 
     def _make_room(self, current: Collection[Cell]) -> None:
         """Drop fields of goals that have ended, and patterns that no field has any more."""

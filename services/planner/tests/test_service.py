@@ -333,3 +333,12 @@ async def test_queries_that_do_not_fit_are_answered_with_503_and_over_zenoh_with
     assert (answer.status_code, answer.headers["content-type"]) == (503, "application/problem+json")
     assert answer.headers["retry-after"] == "1"
     assert "waiting" in answer.json()["detail"]
+
+
+def test_moments_say_whether_the_time_of_day_is_known() -> None:
+    service = Service(
+        PlannerCore(epoch=1), cast("Any", None), cast("Any", Session()), ManualClock(), Health(),
+        synchronized=lambda: False,
+    )  # fmt: skip
+    assert not service._edges.now().synchronized
+    service.close()

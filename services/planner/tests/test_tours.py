@@ -27,6 +27,7 @@ from planner.tours.api import Conditions, GoalBody, GoalPose, MissionBody, missi
 from planner.tours.persistence import TourPersistence
 
 if TYPE_CHECKING:
+    from collections.abc import Callable
     from pathlib import Path
 
 costs = st.one_of(st.floats(0.0, 100.0), st.just(math.inf))
@@ -92,11 +93,11 @@ def test_limit_counts_every_refusal_and_goes_on_over_trips_aside_and_moments_in_
 class Running:
     """The missions of a planner that leads; `refused` is what its robot's path says."""
 
-    def __init__(self, store: Store, clock: ManualClock) -> None:
+    def __init__(self, store: Store, clock: ManualClock, synchronized: Callable[[], bool] = lambda: True) -> None:
         self.core = PlannerCore()
         self.refused: Refusal | None = None
         self.missions = TourPersistence(
-            self.core, store, cast("Any", clock), Health(), lambda change: change(), self.path
+            self.core, store, cast("Any", clock), Health(), lambda change: change(), self.path, synchronized
         )
 
     def path(self, robot: str) -> RobotPath | None:
@@ -277,6 +278,39 @@ async def test_robot_whose_way_to_the_nearest_point_is_cut_goes_on_to_its_stop_t
         await running.step()
         assert running.at is None
         assert (await store.audit(limit=1)).entries[0].action == "cut"
+
+
+class SteppedClock(ManualClock):
+    """A clock whose time of day somebody sets."""
+
+    ahead = 0.0
+
+    def stamp(self) -> float:
+        return self.now() + self.ahead
+
+
+@pytest.mark.live
+async def test_deadline_passes_by_the_monotonic_clock_and_after_a_restart_by_a_time_of_day_that_is_known(redis):
+    clock, known = SteppedClock(100.0), [False]
+    async with Store(redis.url, "test") as store:
+
+        async def at_after(running: Running, seconds: float) -> float | None:
+            clock.advance(seconds)
+            await running.step()
+            return running.at
+
+        running = await Running(store, clock, lambda: known[0]).start()
+        for stepped in (0.0, 1e6, -1e6):
+            await running.missions.send(order(5.0, deadline=clock.stamp() + 60.0))
+            clock.ahead += stepped
+            assert [await at_after(running, 59.0), await at_after(running, 2.0)] == [5.0, None]
+        await running.missions.send(order(5.0, deadline=clock.stamp() + 60.0))
+        clock.ahead += 1e6
+        running = await Running(store, clock, lambda: known[0]).start()
+        assert await at_after(running, 1.0) == 5.0, "a machine that has booted without a clock"
+        clock.ahead -= 1e6
+        known[0] = True
+        assert [await at_after(running, 57.0), await at_after(running, 3.0)] == [5.0, None]
 
 
 @pytest.mark.live

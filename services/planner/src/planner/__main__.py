@@ -7,7 +7,7 @@ import os
 from typing import TYPE_CHECKING, Final
 
 from fog_runtime import logs, process
-from fog_runtime.clock import SystemClock
+from fog_runtime.clock import SystemClock, WallClock, WallClockSource
 from fog_runtime.configuration.settings import InflationSettings, SettingsError, describe, load
 from fog_runtime.configuration.site import load_site
 from fog_runtime.configuration.uploaded_maps import UploadedMaps
@@ -37,10 +37,12 @@ class Settings(InflationSettings, frozen=True, kw_only=True):
 
     `release_m` is the released length: how far (m) a robot may drive without a message from the planner. `wait`:
     whether robots wait before what closes their way, if that is expected to be quicker than the way round (ADR 72).
+    `wall_clock`: when the time of day is believed, as by the map-service.
     """
 
     release_m: float = 15.0
     wait: WaitMode = "learned"
+    wall_clock: WallClockSource = "kernel"
 
 
 def read_key(file: Path | None) -> bytes | None:
@@ -86,7 +88,11 @@ async def main() -> None:
         leadership = Leadership(
             "planner", leases, zenoh, health, connected=lambda: zenoh.connected, epochs=lambda: core.fence.epochs
         )
-        service = Service(core, store, zenoh, clock, health, leadership, key=key, site=described)
+        # A clock of another speed tells no time of day.
+        synchronized = WallClock(settings.wall_clock if settings.speed == 1.0 else "trusted").synchronized
+        service = Service(
+            core, store, zenoh, clock, health, leadership, key=key, site=described, synchronized=synchronized
+        )
         service.subscribe()
         leadership.subscribe()
         zenoh.declare_liveliness("planner", site)

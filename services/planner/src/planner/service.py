@@ -2,8 +2,7 @@
 
 The core runs on a thread of its own, one cycle after another (`Cycle`), so that a search never delays the event loop,
 and nothing but searches of robots' paths runs there: distance fields are computed on a second thread; plans on
-request, reasons of refusals and snapshots of the map on a third (`query_queue`). Missions are kept by `store`,
-the map by `snapshot_fetcher`. Inputs are timestamped on arrival, even while the previous cycle runs.
+request, reasons of refusals and snapshots of the map on a third. Inputs are timestamped on arrival, during cycles too.
 """
 
 from __future__ import annotations
@@ -205,13 +204,14 @@ class Service:
         *,
         key: bytes | None = None,
         site: Site = Site(id="none"),  # noqa: B008  # frozen
+        synchronized: Callable[[], bool] = lambda: True,
     ) -> None:
-        """Prepare; `gate` decides whether this process leads, `key` signs commands, `site` has docks and visitors."""
+        """Prepare; `gate` decides who leads, `key` signs commands, `synchronized` tells if the time of day is right."""
         self._core = core
         self._store = store
         self._zenoh = zenoh
         self._gate = gate
-        self._edges = Edges(clock, zenoh=zenoh, gate=gate)
+        self._edges = Edges(clock, zenoh=zenoh, gate=gate, synchronized=synchronized)
         self._clock = clock
         self._health = health
         self._wake = asyncio.Event()
@@ -219,7 +219,8 @@ class Service:
         self._queue = QueryQueue(self._threads, on_idle=core.answerer.release)
         self.dry_runs = DryRuns(core, self._queue, clock.now)
         self._cycle = Cycle(core, zenoh)
-        self.missions: MissionPersistence = TourPersistence(core, store, clock, health, self._change_goal, self.path)
+        missions = TourPersistence(core, store, clock, health, self._change_goal, self.path, synchronized)
+        self.missions: MissionPersistence = missions
         self._map = SnapshotFetcher(core, zenoh, clock, health, self._queue, on_loaded=self._wake.set)
         self.operator = RobotOperator(zenoh, store, clock, key)
         self._docks = DockMissions(site.staging, self.send)
@@ -255,8 +256,7 @@ class Service:
     async def send(self, order: Order) -> StoredGoal | Refusal:
         """Give a robot a mission; returns a refusal for an unreachable goal.
 
-        An attempt that succeeded before returns its mission again and changes nothing. Raises `IdempotencyError` for
-        another request's attempt, and as `MissionPersistence.send`, `OutOfServiceError` among others.
+        An attempt that succeeded before returns its mission again. Raises as `earlier_result` and `send` of `missions`.
         """
         earlier = await self.missions.earlier_result(order.attempt)
         if earlier is not None:
@@ -386,8 +386,8 @@ class Service:
     async def plan_loop(self) -> None:
         """Run planning cycles: at every tick, and at once after an urgent message.
 
-        Each path is published on the core's thread as soon as it is found. What else there is to do about it waits
-        for the end of the searches: here it would take turns with them, since one thread runs Python at a time.
+        Each path is published on the core's thread once it is found. What else there is to do about it waits for the
+        end of the searches: here it would take turns with them, since one thread runs Python at a time.
         """
         while True:
             await self._wake.wait()

@@ -46,13 +46,21 @@ class Gate(Protocol):
 class Edges:
     """The MQTT and zenoh connections of one process; each channel uses that of its transport.
 
-    A `gate` decides what is published and whether queries are answered; without one, everything is.
+    A `gate` decides what is published and whether queries are answered; without one, everything is. `synchronized`
+    tells whether the time of day is right.
     """
 
     def __init__(
-        self, clock: Clock, *, mqtt: MqttEdge | None = None, zenoh: ZenohEdge | None = None, gate: Gate | None = None
+        self,
+        clock: Clock,
+        *,
+        mqtt: MqttEdge | None = None,
+        zenoh: ZenohEdge | None = None,
+        gate: Gate | None = None,
+        synchronized: Callable[[], bool] = lambda: True,
     ) -> None:
         self._clock = clock
+        self._synchronized = synchronized
         self._gate = gate
         self._mqtt = mqtt
         self._zenoh = zenoh
@@ -63,7 +71,7 @@ class Edges:
 
     def now(self) -> Moment:
         """Return the current moment by the process's clock."""
-        return Moment(self._clock.now(), self._clock.stamp(), clock=self._clock.id)
+        return Moment(self._clock.now(), self._clock.stamp(), clock=self._clock.id, synchronized=self._synchronized())
 
     def subscribe(
         self,

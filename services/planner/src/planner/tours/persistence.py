@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections import defaultdict
 from typing import TYPE_CHECKING
 
@@ -18,7 +19,7 @@ if TYPE_CHECKING:
     from fog_runtime.clock import Clock
     from fog_runtime.health import Health
     from planner.core import PlannerCore
-    from planner.stops import Tour
+    from planner.stops import Order, Tour
     from planner.store import Store
 
 WHO = "planner"
@@ -28,9 +29,12 @@ _log = logs.get("planner")
 
 
 class TourPersistence(MissionPersistence):
-    """The missions, which go on to their next stop; `path` returns a robot's last path or refusal."""
+    """The missions, which go on to their next stop.
 
-    def __init__(  # because these are the parts of a process
+    `path` returns a robot's last path or refusal; `synchronized` tells whether the time of day is right.
+    """
+
+    def __init__(  # noqa: PLR0913  # the process's parts
         self,
         core: PlannerCore,
         store: Store,
@@ -38,11 +42,31 @@ class TourPersistence(MissionPersistence):
         health: Health,
         change_core: Callable[[Callable[[], object]], None],
         path: Callable[[str], RobotPath | None],
+        synchronized: Callable[[], bool] = lambda: True,
     ) -> None:
         super().__init__(core, store, clock, health, change_core)
         self._path = path
+        self._synchronized = synchronized
+        self._ends: dict[str, float] = {}
+        """By mission (`Tour.id`), when its deadline passes by the monotonic clock (s), whatever the other one does."""
         self._cut: defaultdict[str, CutTimes] = defaultdict(CutTimes)
         """By robot, since when no way leads on."""
+
+    async def send(self, order: Order) -> StoredGoal:
+        """Give a robot a mission, and count its time from now on; raises as the base class does."""
+        offset = self._clock.now() - self._clock.stamp()
+        stored = await super().send(order)
+        if stored.tour is not None and stored.tour.deadline is not None:
+            self._ends[stored.tour.id] = stored.tour.deadline + offset
+        return stored
+
+    def _has_ended(self, tour: Tour) -> bool:
+        """Whether a mission's deadline has passed: after a restart nobody can tell before the time of day is known."""
+        if tour.deadline is None:
+            return False
+        if tour.id not in self._ends and self._synchronized():
+            self._ends[tour.id] = self._clock.now() + tour.deadline - self._clock.stamp()
+        return self._clock.now() >= self._ends.get(tour.id, math.inf)
 
     def end(self, robot: str, goal_id: str) -> None:
         """Mark a reached goal for its end; one of a mission that goes on is its mission's until the next is stored."""
@@ -63,6 +87,8 @@ class TourPersistence(MissionPersistence):
                     del self._reached[robot]
         await super()._end_reached()
         if self._leading:
+            tours = {stored.tour.id for stored in self.goals.values() if stored.tour is not None}
+            self._ends = {tour: end for tour, end in self._ends.items() if tour in tours}
             for robot, stored in list(self.goals.items()):
                 if stored.tour is not None:
                     await self._apply(robot, stored, stored.tour)
@@ -84,7 +110,7 @@ class TourPersistence(MissionPersistence):
 
     async def _apply(self, robot: str, stored: StoredGoal, tour: Tour) -> None:
         """End a mission whose deadline has passed, and do what it says about a way that is cut."""
-        if tour.deadline is not None and self._clock.stamp() >= tour.deadline:
+        if self._has_ended(tour):
             await self._give_up(robot, stored, "deadline", "its deadline has passed")
             return
         path = self._path(robot)

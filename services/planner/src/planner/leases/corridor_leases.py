@@ -51,6 +51,8 @@ WITHDRAWN_S: Final = 10.0
 """... and after so long more it has: it has heard, or its own gate has stopped it (3 s without map or planner)."""
 FORGET_S: Final = 60.0
 """A robot that is silent for so long is an obstacle that others see, no longer one that stands in the way unseen."""
+MOST_ROBOTS: Final = 10
+"""More robots on a floor get what a robot alone gets: what they lease takes longer than their paths may."""
 MEETING_M: Final = 1.0
 """A robot on whose path another one is so near has not met it yet."""
 _SPEED_M_S: Final = 0.3
@@ -142,13 +144,13 @@ class CorridorLeases:
     def release(self, robot: str, wanted: float, now: float) -> float:
         """Return how far along its path (m) a robot may drive, and lease that to it, but at most `wanted`.
 
-        A robot without others on its floor may drive as far as anybody wants: infinity. Those who wait and whose turn
+        A robot without others on its floor, or with too many, may drive as far as anybody wants: infinity. Those who wait and whose turn
         is before its own get theirs first.
         """
         me = self._of(robot)
         me.wanted = wanted
         self._settle(now)
-        if me.path is None or len(self._robots) == 1:
+        if me.path is None or not self._shared:
             me.end, me.leased = wanted, max(me.first, min(int(me.along.searchsorted(wanted)), len(me.points) - 1))
             return math.inf
         for other in sorted(self._robots.values(), key=lambda other: other.order):
@@ -157,6 +159,11 @@ class CorridorLeases:
                 self._extend(other, now)
         self._extend(me, now)
         return me.end if math.isinf(me.withdrawn_at) else min(me.end, me.progress)
+
+    @property
+    def _shared(self) -> bool:
+        """Whether robots share a floor by leases."""
+        return 1 < len(self._robots) <= MOST_ROBOTS
 
     def waits_for(self, robot: str) -> str | None:
         """Return whom a robot lets pass, or whose place it waits for, when it can't drive much further; else None."""
@@ -229,7 +236,7 @@ class CorridorLeases:
 
     def room_needed(self, now: float) -> Room | None:
         """Return which robot needs another path so that robots that meet get on; None if none does."""
-        return self.standstills.room_needed(now, self.obstacles)
+        return self.standstills.room_needed(now, self.obstacles) if self._shared else None
 
     def take(self, room: Room, path: PathId, corners: Floats) -> None:
         """Let a robot follow the path that makes room."""
@@ -255,7 +262,9 @@ class CorridorLeases:
         """Return the places that a new path of a robot should avoid: robots that stand, corridors of those `beside`."""
         me = self._of(robot)
         near = set(beside)
-        found = []
+        found: list[Disc] = []
+        if not self._shared:
+            return found
         for other in self._robots.values():
             if other is not me and math.isfinite(other.at[0, 0]):
                 reach = reach_of(me, other)

@@ -124,14 +124,14 @@ class Corridor:
 
     def far_from(self, other: Corridor, reach: float) -> bool:
         """Whether its path comes nowhere near the other's path and place."""
-        x, y = other.at[0]
+        x, y = other.at[0].tolist()
         apart_x = max(self.low[0] - max(other.high[0], x), min(other.low[0], x) - self.high[0])
         apart_y = max(self.low[1] - max(other.high[1], y), min(other.low[1], y) - self.high[1])
         return not other.former and max(apart_x, apart_y) > reach
 
     def far_from_point(self, point: Floats, reach: float) -> bool:
         """Whether its path comes nowhere near a point."""
-        x, y = point
+        x, y = point.tolist()  # numpy's own numbers are slow
         apart = max(self.low[0] - x, x - self.high[0], self.low[1] - y, y - self.high[1])
         return bool(apart > reach)
 

@@ -82,29 +82,35 @@ class Standstills:
         stands = {r.id: [r.place(ends[r.id])] if r.id in ends else r.stand() for r in robots}
         begins = {r.id: ends.get(r.id, r.leased) for r in robots}
         left = sorted((r for r in robots if r.drives), key=lambda r: r.order)
-        blocked: dict[str, frozenset[str]] = {}
+
+        def blocks(me: Corridor, other: Corridor) -> bool:
+            if other is me or me.far_from_point(stands[other.id][0][0], reach_of(me, other) + _NEAR_M):
+                return False
+            return meets(me, other, begins[me.id], me.last, stands[other.id]) < me.last
+
+        # Only what a robot that has moved blocks, or is blocked by, is looked at again.
+        blocked = {me.id: {other.id for other in robots if blocks(me, other)} for me in left}
+
+        def moved(other: Corridor) -> None:
+            for me in left:
+                (blocked[me.id].add if blocks(me, other) else blocked[me.id].discard)(other.id)
+
         stepped: set[str] = set()
         while left:
-            ready = []
-            for me in left:
-                blocked[me.id] = frozenset(
-                    other.id
-                    for other in robots
-                    if other is not me
-                    and not me.far_from_point(stands[other.id][0][0], reach_of(me, other) + _NEAR_M)
-                    and meets(me, other, begins[me.id], me.last, stands[other.id]) < me.last
-                )
-                if not blocked[me.id]:
-                    ready.append(me)
+            ready = [me for me in left if not blocked[me.id]]
             if not ready:
-                if self._step_on(left, robots, begins, stands, stepped):
-                    continue
-                break
+                one = self._step_on(left, robots, begins, stands, stepped)
+                if one is None:
+                    break
+                blocked[one.id] = {other.id for other in robots if blocks(one, other)}
+                moved(one)
+                continue
             # Whose goal is in nobody's way goes first: that blocks no other one.
             for me in [me for me in ready if not self._parks_in_the_way(me, left, begins)] or ready[:1]:
                 left.remove(me)
                 stands[me.id] = [me.place(len(me.points) - 1) if me.last == len(me.points) else NOWHERE]
-        return {me.id: blocked[me.id] for me in left}
+                moved(me)
+        return {me.id: frozenset(blocked[me.id]) for me in left}
 
     def _step_on(
         self,
@@ -113,7 +119,7 @@ class Standstills:
         begins: dict[str, int],
         stands: dict[str, list[Floats]],
         stepped: set[str],
-    ) -> bool:
+    ) -> Corridor | None:
         """Let one of the robots that are left drive to a place on its way where it is in no other one's, if one can."""
         for me in left:
             if me.id in stepped:
@@ -126,8 +132,8 @@ class Standstills:
             for stop in range(end - 1, begins[me.id], -_STEP):
                 if contender_of(me, stop, left, begins) is None:
                     begins[me.id], stands[me.id] = stop, [me.place(stop)]
-                    return True
-        return False
+                    return me
+        return None
 
     def _parks_in_the_way(self, me: Corridor, left: list[Corridor], begins: Mapping[str, int]) -> bool:
         end = me.place(len(me.points) - 1)

@@ -16,10 +16,12 @@ from fognav_experiments.comparison.repeated import (
     beside_lockstep,
     compare_drives,
     compared,
+    of_processes,
     processes,
     resources,
 )
 from fognav_experiments.comparison.report import build
+from fognav_experiments.comparison.situations import by_situation
 from fognav_experiments.figures import to_markdown
 
 SHARED = {
@@ -74,6 +76,27 @@ def test_cost_is_that_of_the_robot_s_processes_by_setup_and_quota():
     assert "| fog | 0.2 of a core | 1 | - | 1 to 1 | 1 | 8.00 | 2.00 | 0.00 | 10.00 |" in text
     assert resources([msgspec.structs.replace(LIVE, cpu_percent={}, peak_mb={})]) == []
     assert LIVE.robots_peak_mb() == 230.0
+
+
+def test_difference_of_processes_is_of_drives_that_succeeded_and_is_doubted_unless_loads_were_alike():
+    def drive(setup, agent, **changes):
+        return msgspec.structs.replace(LIVE, setup=setup, cpu_percent={"robot-agent": agent}, **changes)
+
+    failed = drive("default", 90.0, success=False)
+    alike = of_processes([drive("default", 8.0, load=14.0), failed, drive("fog", 5.0, load=10.0)])
+    assert alike is not None
+    assert (alike.before, alike.fog, alike.doubt) == (8.0, 5.0, "")
+    for other in ({"load": 5.0}, {"load": 10.0, "commit": "2ba7f7651ee5"}):
+        found = of_processes([drive("default", 8.0, load=14.0), drive("fog", 5.0, **other)])
+        assert found is not None
+        assert "0 of 1 pairs of drives count" in found.doubt
+    assert of_processes([failed, drive("fog", 5.0)]) is None
+
+
+def test_areas_that_are_called_by_numbers_are_no_drawn_floors():
+    pairs = [{setup: msgspec.structs.replace(LOCKSTEP, setup=setup, area="3") for setup in ("default", "fog")}]
+    (table,) = (block for block in by_situation(pairs, pairs, "default", "fog") if isinstance(block, figures.Table))
+    assert (table.header[:2], table.rows[0][:2]) == (["route", "blocked"], ["A to B", "3"])
 
 
 def test_drives_of_different_commits_are_not_called_the_same_and_each_names_commit_and_load():

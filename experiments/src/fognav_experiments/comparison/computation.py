@@ -120,7 +120,7 @@ def why(  # noqa: PLR0913  # the same shares in each setup, of how many draws, a
     full: Mapping[str, float] | None,
     fog: Mapping[str, float],
     robot: tuple[float, float],
-    live: tuple[float, float] | None,
+    live: repeated.OfProcesses | None,
     draws: int,
 ) -> Block:
     """Return why the ratio of computation is what it is, and what of it the fog does.
@@ -155,8 +155,8 @@ def why(  # noqa: PLR0913  # the same shares in each setup, of how many draws, a
     processes = (
         "lockstep leaves out the input and output of its processes, which are the same in all setups"
         if live is None
-        else f"its real processes, which also read and write, took {live[0]:.2f} % and {live[1]:.2f} %: "
-        f"{live[0] / live[1]:.2f} times less, and this is what a robot's computer saves"
+        else f"its real processes, which also read and write, took {live.before:.2f} % and {live.fog:.2f} %: "
+        f"{live.before / live.fog:.2f} times less{live.doubt}, and this is what a robot's computer saves"
     )
     return Paragraph(
         f"Why {before / after:.1f} times in the {draws} draws all of whose setups count, where the thesis has "

@@ -86,7 +86,7 @@ LOAD_RATIO: Final = 1.5
 """CPU times of drives are compared only if the machine's load differed by less than this."""
 
 
-def loaded_alike(records: Iterable[Record]) -> bool:
+def loaded_alike(records: Iterable[ComparedDrive]) -> bool:
     """Whether the machine was loaded alike at the end of these drives; each is a load of 1 by itself."""
     loads = [max(1.0, record.load) for record in records]
     return max(loads) < LOAD_RATIO * min(loads)

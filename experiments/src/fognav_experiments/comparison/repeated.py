@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Final, NamedTuple
 
 from fognav_experiments import figures
 from fognav_experiments.comparison.drives import KINDS, PROFILE_OF_SETUP, ROBOTS_PROCESSES, route_ends
+from fognav_experiments.comparison.records import loaded_alike
 from fognav_experiments.figures import (
     Block,
     Estimate,
@@ -165,14 +166,41 @@ def resources(drives: Sequence[MeasuredDrive]) -> list[Block]:
     ]  # fmt: skip
 
 
-def of_processes(drives: Sequence[MeasuredDrive], before: Setup = "default") -> tuple[float, float] | None:
-    """Return what the robot's processes took in `before` and in `fog`, % of a core; None unless both were measured.
+class OfProcesses(NamedTuple):
+    """What the robot's processes took in two setups, % of a core, and how many pairs of drives can be compared."""
 
-    Of drives at the pace of real time and without a quota.
+    before: float
+    fog: float
+    pairs: int
+    counted: int
+
+    @property
+    def doubt(self) -> str:
+        """What is to be said beside a difference of the two, in brackets; empty if all pairs count."""
+        if self.counted == self.pairs:
+            return ""
+        return (
+            f" (an indication: {self.counted} of {self.pairs} pairs of drives count by the rule for lockstep, one "
+            "commit and like loads of the machine)"
+        )
+
+
+def of_processes(drives: Sequence[MeasuredDrive], before: Setup = "default") -> OfProcesses | None:
+    """Return what the robot's processes took in `before` and in `fog`; None unless both were measured.
+
+    Of drives that reached their goal, at the pace of real time and without a quota.
     """
-    plain = [drive for drive in drives if drive.cpu_percent and drive.cpu_quota is None and drive.speed == 1.0]
-    shares = {setup: [_of_robot(drive) for drive in plain if drive.setup == setup] for setup in (before, "fog")}
-    return (_mean(shares[before]), _mean(shares["fog"])) if all(shares.values()) else None
+    plain = [
+        drive
+        for drive in drives
+        if drive.cpu_percent and drive.success and drive.cpu_quota is None and drive.speed == 1.0
+    ]
+    ours, others = ([drive for drive in plain if drive.setup == setup] for setup in ("fog", before))
+    if not ours or not others:
+        return None
+    pairs = [(one, other) for one in others for other in ours if (one.run, one.route) == (other.run, other.route)]
+    counted = sum(one.commit == other.commit and loaded_alike((one, other)) for one, other in pairs)
+    return OfProcesses(_mean(list(map(_of_robot, others))), _mean(list(map(_of_robot, ours))), len(pairs), counted)
 
 
 def _of_robot(drive: MeasuredDrive) -> float:

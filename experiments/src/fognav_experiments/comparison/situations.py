@@ -10,6 +10,8 @@ from __future__ import annotations
 from collections import defaultdict
 from typing import TYPE_CHECKING, Final
 
+from msgspec import UNSET
+
 from fognav_experiments.comparison.drives import route_ends
 from fognav_experiments.figures import FEWEST_CLUSTERS, Block, Heading, Paragraph, Table, spread
 
@@ -47,7 +49,7 @@ def by_situation(pairs: Sequence[Drives], met: Sequence[Drives], before: Setup, 
         return []
     barred = [id(drives) for drives in met]
     groups: dict[tuple[str, str, str], list[Drives]] = defaultdict(list)
-    drawn = any(len(situation) == 2 and situation[1].isdigit() for situation in situations(pairs))
+    drawn = any(record.ends is not UNSET for drives in pairs for record in drives.values())
     for drives in pairs:
         record = next(iter(drives.values()))
         place = ("", "met" if id(drives) in barred else "not met") if drawn else (record.route, record.area)

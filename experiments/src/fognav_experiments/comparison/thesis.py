@@ -153,8 +153,8 @@ def beside_thesis(
     ours["6.5, 6.9"] += _less_computation(pairs, setups)
     if (live := repeated.of_processes(measured)) is not None:
         ours["6.5, 6.9"] += (
-            f"; the whole robot's real processes {live[0]:.2f} % in default and {live[1]:.2f} % in fog: "
-            f"{live[0] / live[1]:.2f} times less"
+            f"; the whole robot's real processes {live.before:.2f} % in default and {live.fog:.2f} % in fog: "
+            f"{live.before / live.fog:.2f} times less{live.doubt}"
         )
     ours["6.6, 6.10"] = _memory(measured)
     reactions = [record.reaction_s for drives in pairs for record in drives.values() if record.reaction_s is not None]
@@ -218,9 +218,9 @@ def result(pairs: Sequence[Drives], met: Sequence[Drives], measured: Sequence[Me
         )
     if (live := repeated.of_processes(measured)) is not None:
         words += (
-            f"As real processes the whole robot took {live[1]:.2f} % of a core instead of {live[0]:.2f} %"
+            f"As real processes the whole robot took {live.fog:.2f} % of a core instead of {live.before:.2f} %"
             + ("" if (full := repeated.of_processes(measured, "full")) is None else f", and {full[0]:.2f} % in `full`")
-            + "."
+            + f"{live.doubt}."
         )
     return Paragraph(words.strip())
 

@@ -144,8 +144,8 @@ class CorridorLeases:
     def release(self, robot: str, wanted: float, now: float) -> float:
         """Return how far along its path (m) a robot may drive, and lease that to it, but at most `wanted`.
 
-        A robot without others on its floor, or with too many, may drive as far as anybody wants: infinity. Those who wait and whose turn
-        is before its own get theirs first.
+        A robot without others on its floor, or with too many, may drive as far as anybody wants: infinity. Those who
+        wait and whose turn is before its own get theirs first.
         """
         me = self._of(robot)
         me.wanted = wanted

@@ -42,6 +42,7 @@ from fog_kernels.astar import Planner
 from planner.config import PlannerConfig
 from planner.core import PlannerCore
 from planner.heuristics import GoalFields
+from planner.missions import Missions
 from planner.path_search import Route
 
 
@@ -838,3 +839,13 @@ def test_path_stays_passable_and_near_optimal_after_any_changes(
         if math.hypot(19.0 - drive.at[0], 7.0 - drive.at[1]) > 4.0:
             drive.at = tuple(float(v) for v in route.remaining(along + ahead)[0])
             drive.step(0.2)
+
+
+def test_change_just_ahead_of_a_robot_comes_before_a_higher_priority_far_from_its_change() -> None:
+    missions, config = Missions(), PlannerConfig()
+    for robot, priority, danger in (("far", 0, 60.0), ("first", 9, 50.0), ("near", 0, 3.0), ("next", 0, 1.0)):
+        missions.set_goal(robot, goal(*RIGHT, robot), any_heading=False)
+        mission = missions.of(robot)
+        mission.priority, mission.pose, mission.pose_received = priority, pose(*LEFT), 100.0
+        mission.request_replan("map", [], danger)
+    assert [robot for robot, _, _ in missions.to_replan(100.0, config)] == ["next", "near", "first", "far"]

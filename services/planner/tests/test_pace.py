@@ -66,6 +66,20 @@ def test_time_in_which_a_robot_must_not_drive_or_is_not_heard_is_no_pace():
     assert np.array(record.stretches) == pytest.approx(np.array([(20.0, (4.0 - ARRIVAL_S) / 20.0)] * 40))
 
 
+def test_way_that_a_robot_drives_slowly_on_purpose_or_unheard_is_left_out_of_its_pace_with_its_time():
+    paces = Paces()
+    seconds, now = 0.0, 0.0
+    for drives, gap, ratio in ((True, 1.0, 1.8), (False, 1.0, 3.0), (True, 30.0, 2.0), (True, 1.0, 1.8)):
+        for _ in range(60):
+            paces.on_progress("r1", 1, seconds, now, drives=drives)
+            now, seconds = now + gap, seconds + gap / ratio
+    paces.end("r1")
+    (record,) = paces.to_store().values()
+    ((usual, ratio),) = record.stretches
+    assert usual == pytest.approx(2 * 60.0 / 1.8, rel=0.05)
+    assert ratio == pytest.approx(1.8, rel=0.05)
+
+
 def test_paces_are_the_same_after_a_restart():
     paces, again = Paces(), Paces()
     drive(paces, 1.5)
@@ -87,17 +101,19 @@ def test_robot_that_drives_a_path_teaches_its_pace_and_has_an_arrival_only_while
     core.set_goal("r1", goal(*RIGHT))
     assert core.arrival("r1") is None
 
-    def tell(x: float, y: float, *, reached: bool = False) -> None:
+    def tell(x: float, y: float, *, reached: str | None = None) -> None:
         at = Moment(now, now + 1e9)
         core.handlers()[ch.MAP_HEARTBEAT]({}, ring.master.heartbeat(now), at)
         core.handlers()[ch.ROBOT_POSE]({"robot": "r1"}, pose(x, y), at)
         state = RobotState(
-            mode="NORMAL", reasons=[], enabled=True, battery=None, goal_id="g1", map_epoch=1, map_seq=0, plan_id=1,
-            planner_epoch=7, goal_reached=reached,
+            mode="NORMAL", reasons=[], enabled=True, battery=None, goal_id=reached or "g1", map_epoch=1, map_seq=0,
+            plan_id=1, planner_epoch=7, goal_reached=reached is not None,
         )  # fmt: skip
         core.handlers()[ch.ROBOT_STATE]({"robot": "r1"}, state, at)
         core.tick(at)
 
+    assert core.arrival("nobody") is None
+    assert [robot for robot, _ in core.missions.items()] == ["r1"], "who asks changes nothing"
     tell(1.0, 6.0)
     plan = core.missions.of("r1").plan
     assert plan is not None
@@ -109,8 +125,10 @@ def test_robot_that_drives_a_path_teaches_its_pace_and_has_an_arrival_only_while
         before = point
         tell(float(point[0]), float(point[1]))
         arrivals.append(core.arrival("r1"))
+    tell(*before, reached="g0")
+    assert core.paces.to_store() == {}, "the goal before: the robot drives on"
     assert arrivals[0].expected_s > arrivals[100].expected_s > arrivals[-1].expected_s
-    tell(*RIGHT, reached=True)
+    tell(*RIGHT, reached="g1")
     assert core.arrival("r1") is None
     (record,) = core.paces.to_store().values()
     ((usual, ratio),) = record.stretches

@@ -192,6 +192,18 @@ def test_nobody_waits_where_no_block_has_ever_ended_by_itself():
     assert via(drive.path) == "lower"
 
 
+def test_robot_that_waits_stays_and_may_drive_less_when_the_block_grows_towards_it():
+    drive = Drive(at=(8.1, 11.0))
+    drive.block()
+    assert drive.way.choice == "wait"
+    plan_id, released = drive.path.plan_id, drive.path.released_length
+    drive.block((UPPER[0] - 0.4, *UPPER[1:]))
+    assert drive.way is not None
+    assert drive.way.choice == "wait"
+    assert drive.path.plan_id == plan_id
+    assert drive.path.released_length < released
+
+
 def test_zone_is_waited_for_when_its_end_is_known_and_near():
     left, bottom, right, top = UPPER
     ring = [(left, bottom), (right, bottom), (right, top), (left, top)]
@@ -368,6 +380,23 @@ def test_part_of_a_block_that_nobody_saw_begin_or_end_counts_for_what_was_seen()
 # --- restarts ---
 
 
+def test_block_that_a_standby_followed_keeps_its_age_when_it_goes_on_with_what_is_stored():
+    ring = RingMap()
+    ring.areas["a"] = UPPER
+    leader, standby = Blocks(), Blocks()
+    for blocks in (leader, standby):
+        blocks.on_hazard(ring.hazard_area("a"), Moment(0.0, 1e9))
+    stored = leader.to_store(600.0)
+    standby.restore(stored, 605.0)
+    assert standby.age("a", 610.0) == pytest.approx(610.0)
+    standby.to_store(610.0)
+    assert sum(standby._hours["a"].values(), Durations()).spent.sum() == pytest.approx(610.0, abs=0.1)
+    late = Blocks()
+    late.on_hazard(ring.hazard_area("a"), Moment(590.0, 1e9))
+    late.restore(stored, 605.0)
+    assert late.age("a", 610.0) == pytest.approx(605.0), "the leader has seen it for longer"
+
+
 class BlocksOverRestarts(RuleBasedStateMachine):
     """Areas become blocked, clear, overridden and silent while planners come, go, and store now and then.
 
@@ -447,7 +476,7 @@ class BlocksOverRestarts(RuleBasedStateMachine):
         standing = self.stored["a"].standing if "a" in self.stored else None
         if hazard_first:
             self.tell()
-        self.blocks.restore(self.stored)
+        self.blocks.restore(self.stored, self.moment.now)
         if not hazard_first:
             self.tell()
         if self.state == "blocked" and standing is not None and standing.since == self.since:

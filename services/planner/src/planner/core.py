@@ -169,10 +169,10 @@ class PlannerCore:
 
     def arrival(self, robot: str) -> Arrival | None:
         """Return when a robot arrives, by its pace; None when it has no path, or waits. Any thread may ask."""
-        plan, planning_map = self.missions.of(robot).plan, self._map.current
-        if plan is None or plan.route is None or plan.ends_early or planning_map is None:
+        plan, limits = self.missions.plan(robot), self._map.limits
+        if plan is None or plan.route is None or plan.ends_early or limits is None:
             return None
-        times = Times.of(plan.route, self._map.speed_layer, planning_map.geometry)
+        times = Times.of(plan.route, *limits)
         return self.paces.arrival(robot, times.rest(plan.progress))
 
     def _on_state(self, ids: Ids, state: RobotState, _at: Moment) -> Sequence[Publication]:
@@ -181,8 +181,9 @@ class PlannerCore:
         able = state.mode in DRIVING
         self.leases.on_state(ids["robot"], mission.received, able=able, plans_itself=mission.plans_itself)
         if state.goal_reached and state.goal_id is not None:
-            times = mission.plan.times if mission.plan is not None else None
-            self.paces.end(ids["robot"], None if times is None else float(times.seconds[-1]))
+            if mission.goal is not None and mission.goal.goal_id == state.goal_id:
+                times = mission.plan.times if mission.plan is not None else None
+                self.paces.end(ids["robot"], None if times is None else float(times.seconds[-1]))
             self.missions.reach(ids["robot"], state.goal_id)
         elif state.goal_id is not None and self._knows_missions:
             mission.end_unknown(state.goal_id)

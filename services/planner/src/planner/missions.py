@@ -154,8 +154,7 @@ class Mission:
 
     def begin(self, goal: RobotGoal, *, any_heading: bool) -> None:
         """Set a goal; the same one again changes nothing."""
-        current = self.goal
-        if current is not None and current.goal_id == goal.goal_id and current.pose == goal.pose:
+        if (current := self.goal) is not None and (current.goal_id, current.pose) == (goal.goal_id, goal.pose):
             return
         self.goal, self.any_heading = goal, any_heading
         self._reset("goal")
@@ -323,7 +322,7 @@ def received_path(state: RobotState) -> PathId | None:
 _URGENCY: Final[dict[ReplanReason, int]] = {
     "map": 0, "off_path": 1, "epoch": 2, "goal": 3, "clearing": 4, "refused": 5, "blocked": 6,
 }  # fmt: skip
-"""Whose path is searched first; among equals the robot nearest to the change along its path."""
+"""Whose path is searched first."""
 
 
 class Missions:
@@ -335,10 +334,13 @@ class Missions:
 
     def of(self, robot: str) -> Mission:
         """Return a robot's mission, which may have no goal."""
-        mission = self._missions.get(robot)
-        if mission is None:
+        if (mission := self._missions.get(robot)) is None:
             mission = self._missions[robot] = Mission()
         return mission
+
+    def plan(self, robot: str) -> Plan | None:
+        """Return a robot's plan, if it has one; any thread may ask."""
+        return mission.plan if (mission := self._missions.get(robot)) is not None else None
 
     def items(self) -> list[tuple[str, Mission]]:
         """Return all robots with their missions."""
@@ -362,8 +364,7 @@ class Missions:
 
     def reach(self, robot: str, goal_id: str) -> None:
         """End a robot's mission because it has reached this goal; another goal of it stays."""
-        goal = self.goal(robot)
-        if goal is not None and goal.goal_id == goal_id:
+        if (goal := self.goal(robot)) is not None and goal.goal_id == goal_id:
             self.of(robot).end()
             self._reached.append((robot, goal_id))
 
@@ -399,7 +400,8 @@ class Missions:
             for robot, mission in self.active()
             if robot in located and (reason := mission.replan_due(now, config)) is not None
         ]
-        return sorted(due, key=lambda entry: (_URGENCY[entry[2]], -entry[1].priority, entry[1].danger))
+        near = config.release_length  # no priority outranks a change on what a robot may drive now
+        return sorted(due, key=lambda e: (_URGENCY[e[2]], min(e[1].danger, near), -e[1].priority, e[1].danger))
 
     def unexplained(self, now_known: Explained, now: float, config: PlannerConfig) -> dict[str, tuple[Plan, Question]]:
         """Return the refused plans whose reasons are unknown or may have changed, by robot, each with what is open.
@@ -435,10 +437,8 @@ class Missions:
     def search_again(self, goal: Cell, geometry: GridGeometry) -> None:
         """Search again for the robots whose search for a path to a goal's cell took too long: it has a field now."""
         for _, mission in self.active():
-            target = mission.target
-            if target is None or not mission.search_ran_out:
-                continue
-            if geometry.cell(target.x, target.y) == goal:
+            target = mission.target if mission.search_ran_out else None
+            if target is not None and geometry.cell(target.x, target.y) == goal:
                 mission.request_replan("refused", [])
 
     def goal_cells(self, geometry: GridGeometry) -> Iterator[Cell]:

@@ -233,6 +233,13 @@ class MapTracker:
         """The speed layer (cm/s, 0 = no limit) of the newest version. The next delta changes its cells."""
         return self._follower.replica.speed
 
+    @property
+    def limits(self) -> tuple[Grid, GridGeometry] | None:
+        """The speed layer and its grid, for any thread; None before the first snapshot or while one is loaded."""
+        replica = self._follower.replica
+        geometry, layer = replica.geometry, replica.layers.get("speed")
+        return None if geometry is None or layer is None or layer.shape != geometry.shape else (layer, geometry)
+
     def speed(self) -> Grid:
         """Return a copy of the speed layer (cm/s, 0 = no limit) of the newest version."""
         return self._follower.replica.speed.copy()

@@ -271,8 +271,9 @@ class Replanner:
         plan, pose = mission.plan, mission.pose
         assert plan is not None
         assert pose is not None
-        if plan.judged is not None and judged.continues(plan.judged):
-            plan.judged, plan.path_due = replace(plan.judged, choice=judged.choice), -math.inf
+        if plan.judged is not None and plan.judged.stays(judged.place):
+            hold = min(plan.judged.hold, plan.progress + judged.hold)  # less if the block has grown towards the robot
+            plan.judged, plan.path_due = replace(plan.judged, choice=judged.choice, hold=hold), -math.inf
             plan.traces += [trace for trace in traces if trace not in plan.traces]
             return
         mission.plan = Plan(

@@ -162,15 +162,19 @@ class Blocks:
         }
         return BlockRecord(hours=hours, standing=standing)
 
-    def restore(self, records: Mapping[str, BlockRecord]) -> None:
-        """Continue with what is stored, instead of what was counted here: another process has counted the same."""
+    def restore(self, records: Mapping[str, BlockRecord], now: float) -> None:
+        """Continue with what is stored, instead of what was counted here: another process has counted the same.
+
+        A standby has followed the blocks that stand, too: each is as old as the older of both ages.
+        """
         self._hours = {area: _hours(record) for area, record in records.items()}
         self._stored = {area: record.standing for area, record in records.items() if record.standing is not None}
         self._changed = set()
         for area, block in self._standing.items():
             stored = self._stored.pop(area, None)
             if stored is not None and stored.since == block.since:
-                block.age, block.counted = max(block.age, stored.age), stored.age
+                block.age += max(0.0, stored.age - block.age_at(now))
+                block.counted = stored.age
 
 
 def _hours(record: BlockRecord) -> dict[int, Durations]:

@@ -65,7 +65,8 @@ _NEAR_M: Final = 0.3
 class Judgement:
     """A choice for a robot whose `way` is blocked, made at `made_at` (s).
 
-    To wait: on the path `route`, of which it may drive `hold` (m), at `place` (m), since `since` (s).
+    To wait: on the path `route`, of which it may drive `hold` (m), at `place` (m), since `since` (s). One that stays
+    at its place has a path already.
     """
 
     choice: BlockedWay
@@ -85,9 +86,9 @@ class Judgement:
         """Whether the choice is to be made again."""
         return now >= self.made_at + _JUDGE_S
 
-    def continues(self, before: Judgement) -> bool:
-        """Whether a robot that waits waits on where it is."""
-        return before.waits and math.dist(before.place, self.place) <= _SAME_PLACE_M
+    def stays(self, place: PointXY) -> bool:
+        """Whether a robot that waits keeps its place, if it is to wait at another one."""
+        return self.waits and math.dist(self.place, place) <= _SAME_PLACE_M
 
 
 @dataclass
@@ -143,12 +144,16 @@ class Waits:
         around, _ = found.route.nearest(*_point(rest, steps, hold))
         ways = [Times.of(each, self._known.speed, planning_map.geometry) for each in (found.route, way)]
         detour = (ways[0].rest(around) - ways[1].rest(along + hold)) * USUAL_SPEED / speed
-        if end < hold + _SHORT_M or detour <= 0.0:
+        place = _point(rest, steps, hold)
+        stays = before is not None and before.stays(place) and blocked[0] > 0
+        if (end < hold + _SHORT_M and not stays) or detour <= 0.0:
             return None  # it stands before the block already, or is as quick round it
         sources, block, age = cut
         policy = best_policy(block, detour, hold / speed)
         now = self._known.at.now
-        place = _point(rest, steps, hold)
+        if before is not None and stays:
+            place = before.place
+            hold = max(0.0, min(way.nearest(*place)[0] - along, float(steps[blocked[0]]) - _KEEP_M))
         kept = np.concatenate((corners[lengths_along(corners) < end], [_point(rest, steps, end)]))
         choice = _choice(sources, age, policy, detour, waiting=policy.waits)
         return Judgement(choice, way, Route(kept, way.spacing), hold, place, now if since is None else since, now)

@@ -73,7 +73,10 @@ class PaceRecord(Message, frozen=True, kw_only=True):
 
 
 class _Stretch(NamedTuple):
-    """What a robot drives by one plan: times at the usual speed when it began and now (s), how long it took, when."""
+    """What a robot drives by one plan: times at the usual speed when it began and now (s), how long it took, when.
+
+    `begin` is later by what was driven in time that does not count.
+    """
 
     plan_id: int
     begin: float
@@ -97,8 +100,12 @@ class Paces:
             self.end(robot)
             self._driving[robot] = _Stretch(plan_id, seconds, seconds, 0.0, now)
             return
-        took = known.took + (now - known.now if drives and now - known.now <= _GAP_S else 0.0)
-        self._driving[robot] = known._replace(at=max(known.at, seconds), took=took, now=now)
+        at, begin, took = max(known.at, seconds), known.begin, known.took
+        if drives and now - known.now <= _GAP_S:
+            took += now - known.now
+        else:
+            begin += at - known.at  # what it drove meanwhile counts as little as the time that it took
+        self._driving[robot] = known._replace(begin=begin, at=at, took=took, now=now)
 
     def end(self, robot: str, seconds: float | None = None) -> None:
         """End a robot's stretch: it has reached the goal, `seconds` from the begin, or drives by another plan."""

@@ -72,7 +72,7 @@ class LearnedPersistence:
             return
         stored = await self._store.learned()
         self._epoch = self._store.epoch
-        self._change_core(partial(self._blocks.restore, stored.blocks))
+        self._change_core(lambda: self._blocks.restore(stored.blocks, self._clock.now()))
         self._change_core(partial(self._paces.restore, stored.paces))
 
     async def save(self) -> None:

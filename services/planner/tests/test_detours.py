@@ -17,6 +17,7 @@ from fog_kernels.steps import SEALED
 from planner.config import PlannerConfig
 from planner.core import PlannerCore
 from planner.heuristics import DeadEndsJob, Detours, GoalFields
+from planner.missions import SwitchLimiter
 from planner.path_search import PathSearch
 
 if TYPE_CHECKING:
@@ -80,6 +81,16 @@ def test_searches_behind_one_closure_share_a_bound_and_cost_what_they_cost_alone
     assert fleet.core.replanner.detours.computed == 1
     assert alone.core.replanner.detours.computed == 0
     assert fleet.costs() == pytest.approx(alone.costs(), rel=0.02)  # straightened within 1 % of the optimum
+
+
+def test_ways_are_compared_with_moved_corners_however_many_wait() -> None:
+    fleet, alone = Fleet(6), Fleet(6, detour_searches=100)
+    for each in (fleet, alone):
+        each.change(blocked=True)
+        for _, mission in each.core.missions.active():
+            mission.switches = SwitchLimiter()  # as after a while
+        assert len(each.change(blocked=False)) == 6
+    assert fleet.costs() == pytest.approx(alone.costs(), rel=1e-6)
 
 
 def test_bound_is_forgotten_when_a_cost_falls() -> None:

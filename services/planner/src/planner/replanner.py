@@ -336,6 +336,7 @@ class Replanner:
         detour = None if trip is None else self.detours.guide(*trip)
         crowded = len(waiting) >= self._config.detour_searches
         shared = detour is None and crowded and self.detours.may_add(planning_map)
+        stands = mission.plan is None or math.isinf(remaining_cost(mission.plan, planning_map))
         return self._search.find(
             planning_map,
             covers,
@@ -346,7 +347,7 @@ class Replanner:
             partial(self._share, planning_map, self._search.planner, waiting) if shared else None,
             None if crowded or detour is not None else self._origin(mission.plan, geometry, danger),
             self._fields.landmarks,
-            hurried=crowded,
+            hurried=crowded and stands,  # a way that is compared with the present one has its corners moved, too
         )
 
     def _origin(self, plan: Plan | None, geometry: GridGeometry, danger: float) -> GoalField | None:

@@ -106,6 +106,8 @@ class Waits:
     config: PlannerConfig
     blocks: Blocks = field(default_factory=Blocks)
     _known: _Known | None = None
+    _boxes: dict[int, tuple[Source, Bounds]] = field(default_factory=dict)
+    _boxed: Sequence[Source] = ()
 
     def look(
         self, at: Moment, sources: Sequence[Source], areas: Sequence[HazardArea], speed: NDArray[np.uint8]
@@ -171,8 +173,8 @@ class Waits:
         (x0, y0), (x1, y1) = (points.min(axis=0) - reach).tolist(), (points.max(axis=0) + reach).tolist()
         around = (x0, y0, x1, y1)
         found: list[tuple[Source, Survival, float]] = []
-        for source in self._known.sources:
-            others = _beyond(source, left, reach) if _overlap(_bounds(source), around) else left
+        for source in self._near(self._known.sources, around):
+            others = _beyond(source, left, reach)
             if len(others) == len(left):
                 continue
             left = others
@@ -191,6 +193,13 @@ class Waits:
         if left or not found:
             return None
         return [source for source, _, _ in found], all_of([b for _, b, _ in found]), max(age for *_, age in found)
+
+    def _near(self, sources: Sequence[Source], around: Bounds) -> list[Source]:
+        """Return the sources whose boxes overlap another one; the box of each source is computed once."""
+        if self._boxed is not sources:
+            self._boxes = {id(each): self._boxes.get(id(each)) or (each, _bounds(each)) for each in sources}
+            self._boxed = sources
+        return [source for source, box in self._boxes.values() if _overlap(box, around)]
 
     def _survival(self, source: Source) -> Survival | None:
         """Return how long a hazard or zone goes on; None if that is unknown."""

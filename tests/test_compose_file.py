@@ -1,7 +1,8 @@
 """What docker-compose.yml says, without an engine (tests/compose runs it on one)."""
 
 import re
-from pathlib import Path
+from fnmatch import fnmatch
+from pathlib import Path, PurePath
 from typing import Any
 
 import yaml
@@ -50,6 +51,16 @@ def test_base_of_our_images_has_a_digest_and_each_image_its_own_pins():
     builds = [service["build"]["args"] for service in SERVICES.values() if "build" in service]
     assert [build["NAME"] for build in builds if not (ROOT / "requirements" / f"{build['NAME']}.txt").is_file()] == []
     assert [path for build in builds for path in build["MEMBERS"].split() if not (ROOT / path).is_dir()] == []
+
+
+def test_engine_is_sent_all_that_images_are_built_of():
+    sent = [line[1:] for line in (ROOT / ".dockerignore").read_text("utf-8").splitlines() if line.startswith("!")]
+    dockerfile = (ROOT / "deploy" / "images" / "Dockerfile").read_text("utf-8")
+    copied = re.findall(r"^COPY (?!--from)(.+) \S+$", dockerfile, re.MULTILINE)
+    needed = {path.replace("${NAME}", "planner") for paths in copied for path in paths.split()}
+    assert {"libs", "bridges", "deploy/images/start", "requirements/planner.txt"} <= needed
+    left_out = [path for path in needed if not any(PurePath(path).is_relative_to(s) or fnmatch(path, s) for s in sent)]
+    assert left_out == []
 
 
 def test_a_plain_up_shows_the_robots_cpu_by_grafana_and_by_prometheus_itself():

@@ -393,7 +393,11 @@ class PlannerCore:
     def state(self, now: float) -> State | None:
         """Return what dry runs are computed on, by any thread; None before the first map."""
         view = self.view()
-        return None if view is None else State.of(view, self._map.speed(), dict(self.missions.items()), now)
+        if view is None:
+            return None
+        missions = dict(self.missions.items())
+        avoid = lambda robot: self.leases.obstacles(robot, missions[robot].beside)  # noqa: E731  # needs its missions
+        return State.of(view, self._map.speed(), missions, avoid, now)
 
     def answers(self) -> Mapping[ch.Channel, Callable[[View | None, Any], PlanReply]]:
         """Return what answers each query on a view, to be called on the thread of the `answerer`."""

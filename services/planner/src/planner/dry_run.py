@@ -3,13 +3,14 @@
 The change comes as the cells that it would change (`MapPatch`). They are put on a copy of the map, on which each robot
 is treated as after a real change: by the same rules whether a search is needed, by the same search, and by the same
 rules whether its result replaces the current path (`replanner`). What depends on when a change comes is left out: that
-a switch to another way may have to wait, that a robot may wait for the end of what closes its way, and that a large
-change reaches the map in portions.
+a switch to another way may have to wait, that a robot may wait for the end of what closes its way, that robots which
+meet make room for one another, and that a large change reaches the map in portions.
 """
 
 from __future__ import annotations
 
 import copy
+import math
 import zlib
 from dataclasses import dataclass, replace
 from functools import partial
@@ -36,7 +37,7 @@ from planner.planning_map import CostChange
 from planner.queries import Answerer, View
 from planner.refusals import no_map
 from planner.regions import Regions, cover, is_closing
-from planner.replanner import effect_of_change, is_kept
+from planner.replanner import begun_at, beside_others, effect_of_change, is_kept
 from planner.waits.pace import Times
 
 if TYPE_CHECKING:
@@ -44,10 +45,11 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
-    from fog_contracts.messages import Cause, DryRunRequest, MapPatch, PointXY, Pose, Refusal, RobotPose
+    from fog_contracts.messages import Cause, DryRunRequest, MapPatch, PointXY, Refusal, RobotPose
     from planner.config import PlannerConfig
+    from planner.leases.corridors import Disc
     from planner.missions import Mission
-    from planner.path_search import Route, SearchResult
+    from planner.path_search import PathSearch, Route, SearchResult
     from planner.planning_map import Cell, Grid, PlanningMap
     from planner.regions import Source
 
@@ -68,16 +70,25 @@ class State:
     view: View
     speed: Grid
     missions: Mapping[str, Mission]
+    avoid: Mapping[str, Sequence[Disc]]
+    """The places of other robots that a new path of each robot should avoid."""
 
     @classmethod
-    def of(cls, view: View, speed: Grid, missions: Mapping[str, Mission], now: float) -> State:
+    def of(
+        cls,
+        view: View,
+        speed: Grid,
+        missions: Mapping[str, Mission],
+        avoid: Callable[[str], Sequence[Disc]],
+        now: float,
+    ) -> State:
         """Return the state with copies of the missions of robots whose pose is known at `now` (s, monotonic)."""
         located = {
             robot: _copied(mission)
             for robot, mission in missions.items()
             if mission.pose is not None and now - mission.pose_received <= KNOWN_S
         }
-        return cls(view, speed, located)
+        return cls(view, speed, located, {robot: avoid(robot) for robot in located})
 
 
 def _copied(mission: Mission) -> Mission:
@@ -115,8 +126,9 @@ class DryRun:
             self._changes.append(CostChange(window, cells != old, cells < old, []))
         sources = _sources_after(self._state.view.sources, self._request)
         after = replace(before, cost=cost, standing=_standing_after(before, cost))
-        fields = self._state.view.fields if after.standing is before.standing else {}
-        self._after = View(after, sources, -1, partial(cover, sources), fields)
+        known = self._state.view
+        guides = (known.fields, known.landmarks) if after.standing is before.standing else ({}, None)
+        self._after = View(after, sources, -1, partial(cover, sources), *guides)
         self._speed = speed
         self._reach = self._compare_reach(before, after)
 
@@ -175,19 +187,22 @@ class DryRun:
         if plan is not None and not reasons:
             after = _outcome(plan.route, plan.refusal, self._speed, after_map, plan.progress)
             return _compared(robot, before, after, replanned=False)
-        found = self._search(self._after, pose, target)
+        danger = min((effect.distance for effect in effects if effect is not None), default=math.inf)
+        search = self._answerer.search(self._after)
+        found, after_map = _found(
+            self._after,
+            search,
+            (pose.x, pose.y),
+            (target.x, target.y),
+            self._state.avoid[robot],
+            begun_at(plan, danger),
+        )
         reason = "map" if "map" in reasons else reasons[0] if reasons else "goal"
         if plan is not None and not plan.waits and is_kept(plan, found, reason, after_map, self._config):
             after = _outcome(plan.route, self._explained(found) or plan.refusal, self._speed, after_map, plan.progress)
             return _compared(robot, before, after, replanned=False)
         after = _outcome(found.route, self._explained(found), self._speed, after_map)
         return _compared(robot, before, after, replanned=True)
-
-    def _search(self, view: View, pose: RobotPose, target: Pose) -> SearchResult:
-        goal = (target.x, target.y)
-        field = view.fields.get(view.planning_map.geometry.cell(*goal))
-        search = self._answerer.search(view)
-        return search.find(view.planning_map, view.covers, (pose.x, pose.y), goal, field)
 
     def _explained(self, found: SearchResult) -> Refusal | None:
         explained = None if found.question is None else self._answerer.explain(self._after, found.question)
@@ -278,14 +293,27 @@ def run(state: State | None, request: DryRunRequest, config: PlannerConfig) -> D
     return dry_run.outcome()
 
 
+def _found(  # what a search depends on
+    view: View, search: PathSearch, at: PointXY, goal: PointXY, avoid: Sequence[Disc], origin: PointXY | None = None
+) -> tuple[SearchResult, PlanningMap]:
+    """Search as the planner does, by the same guides: of ways that cost the same it must find the same one."""
+    geometry, known = view.planning_map.geometry, view.planning_map
+    field = view.fields.get(geometry.cell(*goal))
+    if avoid:
+        beside = known.avoiding(avoid)
+        if (found := beside_others(search).find(beside, view.covers, at, goal, field)).route is not None:
+            return found, beside
+    begun = None if origin is None else view.fields.get(geometry.cell(*origin))
+    return search.find(known, view.covers, at, goal, field, origin=begun, landmarks=view.landmarks), known
+
+
 def goal_outcome(state: State, robot: str, goal: PointXY, config: PlannerConfig) -> GoalOutcome:
     """Return the path that a robot with a known pose would get to a goal (m, frame `map`)."""
     view, mission = state.view, state.missions[robot]
     pose = mission.pose
     assert pose is not None
     answerer = Answerer(config)
-    field = view.fields.get(view.planning_map.geometry.cell(*goal))
-    found = answerer.search(view).find(view.planning_map, view.covers, (pose.x, pose.y), goal, field)
+    found, _ = _found(view, answerer.search(view), (pose.x, pose.y), goal, state.avoid[robot])
     explained = None if found.question is None else answerer.explain(view, found.question)
     version = view.planning_map.version
     return GoalOutcome(

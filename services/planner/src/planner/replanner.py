@@ -25,7 +25,7 @@ if TYPE_CHECKING:
     from fog_contracts.grid import GridGeometry, Window
     from fog_contracts.messages import PlanCode, PointXY, RobotPose, Trace
     from fog_kernels.astar import Planner
-    from fog_kernels.guides import Detour, GoalField
+    from fog_kernels.guides import Detour
     from planner.config import PlannerConfig
     from planner.heuristics import DeadEndsJob, GoalFields, Trip
     from planner.leases.corridors import Disc
@@ -318,9 +318,7 @@ class Replanner:
         """Return what searches beside other robots: a robot that stands on their way may be led off it."""
         if self._search is None or self._search.geometry != geometry:
             self._search = PathSearch(self._config, geometry, self._config.unguided_expansions)
-        beside = copy(self._search)
-        beside.escape_distance = _ESCAPE_M
-        return beside
+        return beside_others(self._search)
 
     def _find(
         self, mission: Mission, planning_map: PlanningMap, covers: Covers, waiting: Sequence[Mission], danger: float
@@ -336,6 +334,7 @@ class Replanner:
         detour = None if trip is None else self.detours.guide(*trip)
         crowded = len(waiting) >= self._config.detour_searches
         shared = detour is None and crowded and self.detours.may_add(planning_map)
+        origin = None if crowded or detour is not None else begun_at(mission.plan, danger)
         stands = mission.plan is None or math.isinf(remaining_cost(mission.plan, planning_map))
         return self._search.find(
             planning_map,
@@ -345,20 +344,10 @@ class Replanner:
             self._fields.guide(goal),
             detour,
             partial(self._share, planning_map, self._search.planner, waiting) if shared else None,
-            None if crowded or detour is not None else self._origin(mission.plan, geometry, danger),
+            None if origin is None else self._fields.guide(geometry.cell(*origin)),
             self._fields.landmarks,
             hurried=crowded and stands,  # a way that is compared with the present one has its corners moved, too
         )
-
-    def _origin(self, plan: Plan | None, geometry: GridGeometry, danger: float) -> GoalField | None:
-        """Return the field of where the mission began, if the change of the map is nearer to the goal than the robot.
-
-        `danger`: how far (m) the robot is from the change along its path.
-        """
-        if plan is None or plan.route is None or plan.origin is None or math.isinf(danger):
-            return None
-        nearer_to_goal = 2.0 * danger > plan.route.length - plan.progress
-        return self._fields.guide(geometry.cell(*plan.origin)) if nearer_to_goal else None
 
     def _share(
         self, planning_map: PlanningMap, planner: Planner, waiting: Sequence[Mission], start: Cell, goal: Cell
@@ -367,6 +356,24 @@ class Replanner:
         trips = [trip for other in waiting if (trip := _trip(other, planning_map.geometry)) is not None]
         self.detours.compute(planning_map, planner, [(start, goal), *trips])
         return self.detours.guide(start, goal)
+
+
+def beside_others(search: PathSearch) -> PathSearch:
+    """Return what searches on a map that has other robots on it, with the memory of `search`."""
+    beside = copy(search)
+    beside.escape_distance = _ESCAPE_M
+    return beside
+
+
+def begun_at(plan: Plan | None, danger: float) -> PointXY | None:
+    """Return where a mission began, if the change of the map is nearer to its goal than its robot; else None.
+
+    Then the field of that place guides a search from the goal. `danger`: how far (m) the robot is from the change along
+    its path.
+    """
+    if plan is None or plan.route is None or math.isinf(danger):
+        return None
+    return plan.origin if 2.0 * danger > plan.route.length - plan.progress else None
 
 
 def _trip(mission: Mission, geometry: GridGeometry) -> Trip | None:

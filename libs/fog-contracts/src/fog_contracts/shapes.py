@@ -227,6 +227,7 @@ def _spans(rows: _Ints, starts: _Ints, stops: _Ints) -> Spans:
 
 
 S = TypeVar("S")
+Box = tuple[float, float, float, float]
 
 
 class ShapeError(GeometryError):
@@ -251,13 +252,26 @@ class ShapeKind(ABC, Generic[S]):
     def contains(self, shape: S, x: float, y: float) -> bool:
         """Whether a point (m, frame `map`) lies in the shape."""
 
+    def box(self, _shape: S) -> Box:
+        """Return a box around the shape: left, bottom, right, top (m); by default the whole plane."""
+        return -math.inf, -math.inf, math.inf, math.inf
+
     @abstractmethod
     def spans(self, shape: S, geometry: GridGeometry) -> Spans:
         """Return the cells of a shape, with the same margin as `polygon_spans`; raises `GeometryError`."""
 
 
+def box_around(points: Sequence[Point], margin: float = 0.0) -> Box:
+    """Return the box around points, so much (m) larger on each side: left, bottom, right, top."""
+    xs, ys = zip(*points, strict=True)
+    return min(xs) - margin, min(ys) - margin, max(xs) + margin, max(ys) + margin
+
+
 class _Polygon(ShapeKind[PolygonShape]):
     outline = "points"
+
+    def box(self, shape: PolygonShape) -> Box:
+        return box_around(shape.points)
 
     def normalized(self, shape: PolygonShape) -> PolygonShape:
         """Return it open and counter-clockwise."""
@@ -275,6 +289,9 @@ class _Polygon(ShapeKind[PolygonShape]):
 
 class _Rectangle(ShapeKind[RectangleShape]):
     outline = "opposite"
+
+    def box(self, shape: RectangleShape) -> Box:
+        return box_around([shape.corner, shape.opposite])
 
     def normalized(self, shape: RectangleShape) -> RectangleShape:
         (x0, y0), (x1, y1) = shape.corner, shape.opposite
@@ -295,6 +312,9 @@ class _Rectangle(ShapeKind[RectangleShape]):
 class _Circle(ShapeKind[CircleShape]):
     outline = "radius"
 
+    def box(self, shape: CircleShape) -> Box:
+        return box_around([shape.centre], shape.radius)
+
     def contains(self, shape: CircleShape, x: float, y: float) -> bool:
         return math.dist(shape.centre, (x, y)) <= shape.radius
 
@@ -304,6 +324,9 @@ class _Circle(ShapeKind[CircleShape]):
 
 class _Corridor(ShapeKind[CorridorShape]):
     outline = "line"
+
+    def box(self, shape: CorridorShape) -> Box:
+        return box_around(shape.line, shape.width / 2)
 
     def normalized(self, shape: CorridorShape) -> CorridorShape:
         if len(set(shape.line)) < 2:
@@ -335,6 +358,11 @@ def normalized_shape(shape: Shape) -> Shape:
 def shape_contains(shape: Shape, x: float, y: float) -> bool:
     """Whether a point (m, frame `map`) lies in a shape."""
     return KINDS[type(shape)].contains(shape, x, y)
+
+
+def shape_box(shape: Shape) -> Box:
+    """Return a box around a shape: left, bottom, right, top (m)."""
+    return KINDS[type(shape)].box(shape)
 
 
 def shape_spans(shape: Shape, geometry: GridGeometry) -> Spans:

@@ -31,8 +31,6 @@ autosave_interval 30
 # Larger than any message of the contracts, small enough not to exhaust the memory.
 max_packet_size {MQTT_PACKET_LIMIT}
 max_queued_messages {MQTT_QUEUE_LIMIT}
-# A hazard that follows another message must not wait for its acknowledgement (40 ms).
-set_tcp_nodelay true
 # Not stdout, which is block-buffered.
 log_dest stderr
 log_type error
@@ -82,6 +80,8 @@ def mosquitto(listener: str, data: str, *, security: str | None = None, extra: S
     """
     access = "allow_anonymous true\n" if security is None else _MOSQUITTO_SECURED.format(security=security)
     listens = f"listener {listener}\n" if listener else ""
+    if security is None:  # else a relay is before it: a hazard must not wait for the last message's acknowledgement
+        listens += "set_tcp_nodelay true\n"
     return _MOSQUITTO.format(listener=listens, data=data, access=access) + "".join(f"{line}\n" for line in extra)
 
 

@@ -14,14 +14,8 @@ from numpy.typing import NDArray
 
 from fog_contracts.costs import INSCRIBED, LETHAL, UNKNOWN
 from fog_contracts.geometry import distance_to_polygon, lengths_along, sampled
-from fog_contracts.messages import (
-    BlockedWay,
-    CircleShape,
-    CorridorShape,
-    HazardArea,
-    RectangleShape,
-)
-from fog_contracts.shapes import shape_contains
+from fog_contracts.messages import BlockedWay, HazardArea
+from fog_contracts.shapes import box_around, shape_box, shape_contains
 from planner.path_search import Route
 from planner.regions import cause_of, name_of
 from planner.waits.blocks import Blocks
@@ -261,20 +255,7 @@ def _overlap(a: Bounds, b: Bounds) -> bool:
 
 def _bounds(source: Source) -> Bounds:
     """Return the least and greatest x and y (m) of what a source covers: left, bottom, right and top."""
-    shape, margin = source if isinstance(source, HazardArea) else source.shape, 0.0
-    corners: list[PointXY]
-    if isinstance(shape, HazardArea):
-        corners = shape.polygon
-    elif isinstance(shape, CircleShape):
-        corners, margin = [shape.centre], shape.radius
-    elif isinstance(shape, CorridorShape):
-        corners, margin = shape.line, 0.5 * shape.width
-    elif isinstance(shape, RectangleShape):
-        corners = [shape.corner, shape.opposite]
-    else:
-        corners = shape.points
-    xs, ys = zip(*corners, strict=True)
-    return min(xs) - margin, min(ys) - margin, max(xs) + margin, max(ys) + margin
+    return box_around(source.polygon) if isinstance(source, HazardArea) else shape_box(source.shape)
 
 
 def _is_near(source: Source, point: PointXY, reach: float) -> bool:

@@ -199,9 +199,10 @@ async def test_every_panel_has_data_and_every_rule_works_while_a_robot_drives_an
     assert firing & {"ServiceDown", "NotOneLeader", "BrokerDown", "StoreDown", "StoreLost", "StoreNotDurable"} == set()
 
 
-async def test_prometheus_itself_shows_the_cpu_of_each_robot(prometheus: Prometheus) -> None:
+async def test_prometheus_itself_shows_the_cpu_of_each_robot(system: LiveSystem, prometheus: Prometheus) -> None:
     """Above all what the robot's processes take, beside recorded drives; without Grafana, and without any script."""
     await wait_for_robots(prometheus, ["r1"])
+    await system.drive_to(*GOAL)  # who stands decides nothing
 
     def page() -> str:
         with urllib.request.urlopen(f"http://127.0.0.1:{prometheus.port}/consoles/robots.html", timeout=30.0) as answer:

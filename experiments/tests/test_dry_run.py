@@ -55,7 +55,12 @@ class Floor:
         self.made_room = set()
         """Robots that got another path for one that they met: a dry run leaves that out."""
         take = self.planner.leases.take
-        self.planner.leases.take = lambda room, *path: (self.made_room.add(room.robot), take(room, *path))
+
+        def note(room, *path):
+            self.made_room.add(room.robot)
+            take(room, *path)
+
+        self.planner.leases.take = note
         self.fog.start(self.at)
         self.run(1.0)
 

@@ -45,26 +45,31 @@ _BASIC: Final[dict[str, Any]] = {
 }  # fmt: skip
 
 
-class _Payload:
-    """What replaces Cyclone's serializer of a type: the bytes of a message go through as they are."""
+@cache
+def _bytes_type(kind: str) -> type[Any]:
+    """Return a message's type as Cyclone tells others of it; a sample is its bytes, `payload`, passed on as such."""
+    made: type[Any] = _idl_type(kind, f"{kind.replace('/', '_')}_bytes")
+    for name, function in (("serialize", _serialized), ("deserialize", classmethod(_deserialized))):
+        setattr(made, name, function)
+    return made
 
-    payload: bytes
 
-    def serialize(self, **_: object) -> bytes:
-        return self.payload
+def _serialized(sample: Any, **_: object) -> bytes:  # noqa: ANN401  # of a class that is made at run time
+    payload: bytes = sample.payload
+    return payload
 
-    @classmethod
-    def deserialize(cls, data: bytes, **_: object) -> _Payload:
-        made = object.__new__(cls)
-        made.payload = data
-        return made
+
+def _deserialized(kind: type[Any], /, data: bytes, **_: object) -> Any:  # noqa: ANN401  # likewise
+    sample = object.__new__(kind)
+    sample.payload = data
+    return sample
 
 
 @cache
-def idl_type(kind: str) -> type[IdlStruct]:
-    """Return the structure in IDL of a message's type, which Cyclone needs to tell others of it."""
-    fields = {name: _idl_field(*what) for name, what in TYPES.fielddefs[kind][1]}
-    made: type[IdlStruct] = final(make_idl_struct(kind.replace("/", "_"), dds_type(kind), fields))
+def _idl_type(kind: str, name: str) -> type[IdlStruct]:
+    """Return the structure in IDL of a message's type, as a class of that name."""
+    fields = {field: _idl_field(*what) for field, what in TYPES.fielddefs[kind][1]}
+    made: type[IdlStruct] = final(make_idl_struct(name, dds_type(kind), fields))
     return made
 
 
@@ -72,22 +77,11 @@ def _idl_field(node: Nodetype, what: Any) -> Any:  # noqa: ANN401  # rosbags' ow
     if node == Nodetype.BASE:
         return _BASIC[what[0]]
     if node == Nodetype.NAME:
-        return idl_type(what)
+        return _idl_type(what, what.replace("/", "_"))
     each, length = what
     made = idl.array if node == Nodetype.ARRAY else idl.sequence
     inside = (_idl_field(*each), length) if node == Nodetype.ARRAY else _idl_field(*each)
     return made.__class_getitem__(inside)  # type: ignore[no-untyped-call]  # made[inside], which type checkers don't see
-
-
-@cache
-def _payload_type(kind: str) -> type[Any]:
-    """Return that structure, of which only the bytes are used."""
-    whole = idl_type(kind)
-    fields = {name: _idl_field(*what) for name, what in TYPES.fielddefs[kind][1]}
-    made: type[Any] = final(make_idl_struct(f"{whole.__name__}_bytes", dds_type(kind), fields))
-    made.serialize = _Payload.serialize
-    made.deserialize = classmethod(_Payload.deserialize.__func__)  # type: ignore[attr-defined]  # a class method's function
-    return made
 
 
 class DdsWire:
@@ -131,9 +125,9 @@ class DdsSession(Arrivals):
     def publish(self, topic: Topic, message: object, stamp: float) -> None:
         """Publish a message without waiting; `stamp` (s since 1970) is when."""
         if topic not in self._writers:
-            made = DdsTopic(self._participant, f"rt/{topic.name}", _payload_type(topic.type))
+            made = DdsTopic(self._participant, f"rt/{topic.name}", _bytes_type(topic.type))
             self._writers[topic] = DataWriter(self._participant, made, qos=_quality(topic))
-        sample = object.__new__(_payload_type(topic.type))
+        sample = object.__new__(_bytes_type(topic.type))
         sample.payload = serialized(topic.type, message)
         try:
             self._writers[topic].write(sample, max(0, int(stamp * 1e9)))
@@ -142,7 +136,7 @@ class DdsSession(Arrivals):
 
     def subscribe(self, topic: Topic, handler: Callable[[RosMessage], object], max_age_s: float | None = None) -> None:
         """Call a handler with each message, as `RosSession.subscribe` does."""
-        made = DdsTopic(self._participant, f"rt/{topic.name}", _payload_type(topic.type))
+        made = DdsTopic(self._participant, f"rt/{topic.name}", _bytes_type(topic.type))
         heard = Listener(on_data_available=partial(self._on_data, topic, handler, max_age_s))  # type: ignore[no-untyped-call]  # Cyclone's
         self._readers.append(DataReader(self._participant, made, qos=_quality(topic), listener=heard))
 

@@ -88,7 +88,7 @@ def demo_command(  # noqa: PLR0913  # each option is an argument
     """
     from fognav.demo.options import Options, embedded_servers, hardware  # noqa: PLC0415  # kernels are slow
     from fognav.demo.view import run_demo  # noqa: PLC0415  # same
-    from fognav.ros2 import GUESTS, require_ros2  # noqa: PLC0415  # same
+    from fognav.running_bridge import GUESTS, require_ros2  # noqa: PLC0415  # same
 
     with exit_codes():
         if with_ is not None:

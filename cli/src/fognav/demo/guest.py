@@ -13,7 +13,7 @@ import numpy as np
 
 from fog_contracts.geometry import contains_point, distance_to_segment
 from fog_supervisor import net
-from fognav.ros2 import end, running_bridge, running_vda5050
+from fognav.running_bridge import end, running_bridge, running_vda5050
 from fognav_sim.guest import NAME, RADIUS_M, Grid, lattice
 from fognav_sim.guest_vda5050 import MAKER, SERIAL
 

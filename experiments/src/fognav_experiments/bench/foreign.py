@@ -24,7 +24,7 @@ from fog_supervisor import net
 from fog_supervisor.supervisor import log_tail
 from fognav.output import FailedError
 from fognav.programs import BRIDGE, MODULES
-from fognav.ros2 import end, running_bridge, session_config
+from fognav.running_bridge import end, running_bridge, session_config
 from fognav_sim.guest import Grid
 
 if TYPE_CHECKING:

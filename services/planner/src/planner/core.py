@@ -396,7 +396,8 @@ class PlannerCore:
         if view is None:
             return None
         missions = dict(self.missions.items())
-        avoid = lambda robot: self.leases.obstacles(robot, missions[robot].beside)  # noqa: E731  # needs its missions
+        located = {robot: mission for robot, mission in missions.items() if mission.pose is not None}
+        avoid = {robot: self.leases.obstacles(robot, mission.beside) for robot, mission in located.items()}
         return State.of(view, self._map.speed(), missions, avoid, now)
 
     def answers(self) -> Mapping[ch.Channel, Callable[[View | None, Any], PlanReply]]:

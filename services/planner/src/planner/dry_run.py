@@ -79,7 +79,7 @@ class State:
         view: View,
         speed: Grid,
         missions: Mapping[str, Mission],
-        avoid: Callable[[str], Sequence[Disc]],
+        avoid: Mapping[str, Sequence[Disc]],
         now: float,
     ) -> State:
         """Return the state with copies of the missions of robots whose pose is known at `now` (s, monotonic)."""
@@ -88,7 +88,7 @@ class State:
             for robot, mission in missions.items()
             if mission.pose is not None and now - mission.pose_received <= KNOWN_S
         }
-        return cls(view, speed, located, {robot: avoid(robot) for robot in located})
+        return cls(view, speed, located, avoid)
 
 
 def _copied(mission: Mission) -> Mission:

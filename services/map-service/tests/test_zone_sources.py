@@ -30,7 +30,7 @@ from map_service.service import Service
 from map_service.store import Store
 
 if TYPE_CHECKING:
-    from collections.abc import AsyncIterator
+    from collections.abc import AsyncIterator, Awaitable, Callable
 
 pytestmark = pytest.mark.live
 SOURCES = """
@@ -190,9 +190,16 @@ class Plan:
 
 
 class Nobody:
-    """Stands for both connections; nobody listens."""
+    """Stands for both connections; nobody listens, and the broker acknowledges when it does."""
 
     connected = True
+    acknowledges = True
+
+    def on_connect(self, callback: Callable[[], Awaitable[None]]) -> None:
+        self.connect = callback
+
+    async def clear(self, *_: object, **ids: object) -> bool:  # noqa: ARG002  # an edge's signature
+        return self.acknowledges
 
     def publish(self, *_: object, **ids: str) -> None: ...
 
@@ -228,16 +235,49 @@ def redis_url(tmp_path_factory):
         yield redis.url
 
 
-async def try_steps(redis_url: str, steps: list[tuple[str, str, bytes, bool]]) -> None:
+@asynccontextmanager
+async def leading_service(redis_url: str, edge: Nobody) -> AsyncIterator[tuple[Service, Store]]:
+    """A service over an empty store that carries out what two sources send."""
     plan = Plan(GridGeometry(60, 60, 0.05, 0.0, 0.0), np.zeros((60, 60), dtype=np.uint8))
     site = Site(id="test", zone_sources=[ZoneSourceSite(id=name, max_zones=2) for name in ("one", "two")])
     async with Store(redis_url, "test") as store:
         await store._redis.write(("FLUSHALL",))
         core = MapCore("test", plan, 1, layers=make_layers(plan), definitions=[])
-        nobody = cast("Any", Nobody())
-        service = Service(core, store, nobody, nobody, ManualClock(1.0), Health(), site=site)
+        service = Service(core, store, cast("Any", edge), cast("Any", edge), ManualClock(1.0), Health(), site=site)
         await service.zones.load()
         service.zone_sources.leading = True
+        yield service, store
+
+
+async def test_zone_that_was_deleted_while_the_broker_is_away_does_not_come_back_with_it(redis_url):
+    broker = Nobody()
+    topic = ch.ZONE_REQUEST.key(site="test", source="one", zone="a")
+    shape = {**CIRCLE["shape"], "centre": [1.0, 1.0]}
+    wanted = json.dumps({"kind": "BLOCKED", "shape": shape, "expires_at": 60.0}).encode()
+    async with leading_service(redis_url, broker) as (service, _):
+        sources, zones = service.zone_sources, service.core.zones
+
+        async def say(*, retained: bool) -> bool:
+            sources.receive(topic, wanted, retained)
+            while sources._waiting:
+                assert await sources.carry_out_next()
+            return zones.get("a") is not None
+
+        assert await say(retained=False)
+        broker.acknowledges = False
+        zone = zones.zones()[0]
+        await service.zones.delete("a", None, "ann")
+        await sources.forget(zone)
+        assert not await say(retained=True)
+        broker.acknowledges = True
+        await broker.connect()
+        await asyncio.gather(*sources._forgotten.values())
+        assert await say(retained=True), "by then it can only be another message"
+
+
+async def try_steps(redis_url: str, steps: list[tuple[str, str, bytes, bool]]) -> None:
+    async with leading_service(redis_url, Nobody()) as (service, store):
+        core = service.core
         for who, name, payload, retained in steps:
             before = {zone.id: zone for zone in core.zones.zones()}
             if who == "ann":

@@ -213,7 +213,7 @@ def _add_zone_writes(routes: Routes, service: Service, clock: Clock) -> None:
             return
         zone = _require_matching(service, zone_id, if_match)
         await service.zones.delete(zone_id, expected_version(if_match), caller.name)
-        service.zone_sources.forget(zone)
+        await service.zone_sources.forget(zone)
 
 
 def _add_zone_patch(routes: Routes, service: Service, clock: Clock) -> None:

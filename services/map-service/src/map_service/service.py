@@ -113,7 +113,9 @@ class Service:
         self.site_map = RecordWriter(SITE_MAPS, StoredMap, store, self.zones, partial(put_into_force, self.maps))
         self.zones.beside = (self.sets, self.places, self.muted, self.site_map)
         core.put_places(combined(places, {}))
-        self.zone_sources = ZoneSources(self._site, core, self.zones, self.sets, self.muted, self.publisher.publish)
+        self.zone_sources = ZoneSources(
+            self._site, core, self.zones, self.sets, self.muted, self.publisher.publish, mqtt
+        )
         self._leading = False
         self._serving_queries = False
         self._aggregator_alive = False
@@ -161,7 +163,7 @@ class Service:
         await self.publisher.all_on_map()
         self._leading = self.zone_sources.leading = True
         self.publisher.publish(self.core.lead(epoch))
-        await self.zone_sources.listen(self._mqtt)
+        await self.zone_sources.listen()
 
     def stand_by(self) -> None:
         """Follow the inputs, and the stored zones, which another process changes now."""

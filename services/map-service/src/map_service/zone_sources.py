@@ -35,6 +35,8 @@ if TYPE_CHECKING:
     from map_service.zone_times import MutedSource, SetOfZones
     from map_service.zone_writer import ZoneWriter
 
+FORGET_S: Final = 1.0
+"""Seconds for which whoever deletes a source's zone waits until the broker has forgotten it, too."""
 RETRY_S: Final = 0.5
 """Seconds until a message is tried again that Redis, or too many others, kept from being carried out."""
 MAX_PROBLEM: Final = 300
@@ -101,7 +103,7 @@ class _Source:
 class ZoneSources:
     """Carries out the messages of all sources, one after another, while this process leads."""
 
-    def __init__(  # the parts that it works with
+    def __init__(  # noqa: PLR0913  # the parts that it works with
         self,
         site: Site,
         core: MapCore,
@@ -109,6 +111,7 @@ class ZoneSources:
         sets: RecordWriter[SetOfZones],
         muted: RecordWriter[MutedSource],
         publish: Callable[[Sequence[Publication]], object],
+        mqtt: MqttEdge,
     ) -> None:
         now = zones.now().now
         self._site = site.id
@@ -120,6 +123,10 @@ class ZoneSources:
         self._sets = sets
         self._muted = muted
         self._publish = publish
+        self._mqtt = mqtt
+        self._forgotten: dict[tuple[str, str], asyncio.Task[None]] = {}
+        """What the broker still has to forget, by source and zone."""
+        mqtt.on_connect(self._forget_again)
         self._worker = Worker("zone-sources", limit=1)
         self._limited = logs.RateLimited(_log)
         self._waiting: dict[str, _Received] = {}
@@ -128,11 +135,11 @@ class ZoneSources:
 
     # --- Receiving --------------------------------------------------------------------------------------------------
 
-    async def listen(self, mqtt: MqttEdge) -> None:
+    async def listen(self) -> None:
         """Receive messages, and again those that the broker has retained."""
         if self._sources:
             topics = [channel.pattern(site=self._site) for channel in (ch.ZONE_REQUEST, ch.ZONE_SET_SWITCH)]
-            await mqtt.listen_to_foreign(topics, self.receive, again=topics)
+            await self._mqtt.listen_to_foreign(topics, self.receive, again=topics)
 
     def receive(self, topic: str, payload: bytes | None, retained: bool) -> None:  # noqa: FBT001  # a handler's signature
         """Take a message of a source (`payload` None: too long), to be carried out by `run`."""
@@ -146,6 +153,10 @@ class ZoneSources:
             remedy = "add it to zone_sources in site.toml, or remove its user"
             self._limited.warning("unknown_zone_source", "", self._zones.now().now, topic=topic, remedy=remedy)
             return
+        if ids is not None and (key := (source.site.id, ids[name])) in self._forgotten and channel is ch.ZONE_REQUEST:
+            if retained:
+                return
+            self._forgotten.pop(key).cancel()  # its source has said something newer
         removes = payload == b"" and channel is ch.ZONE_REQUEST
         if removes and ids is not None and not self._is_known(topic, ids["zone"]):
             return  # it is gone already: most often what this service has cleared itself
@@ -163,10 +174,23 @@ class ZoneSources:
         self._waiting[topic] = _Received(ids["source"], channel, ids[name], payload, retained)
         self._arrived.set()
 
-    def forget(self, zone: Zone) -> None:
-        """Delete what the broker may retain of a zone that was taken from its source, so that it does not come back."""
+    async def forget(self, zone: Zone) -> None:
+        """Delete what the broker retains of a zone that was taken from its source; return once it has, or soon.
+
+        Until it has, perhaps after another connection, what it tells of the zone is passed over.
+        """
         if zone.source:
-            self._publish([Publication(ch.ZONE_REQUEST, None, {"source": zone.source, "zone": zone.id})])
+            key = (zone.source, zone.id)
+            self._forgotten[key] = task = asyncio.create_task(self._clear(key))
+            await asyncio.wait([task], timeout=FORGET_S)
+
+    async def _forget_again(self) -> None:
+        for key in list(self._forgotten):
+            self._forgotten[key] = asyncio.create_task(self._clear(key))
+
+    async def _clear(self, key: tuple[str, str]) -> None:
+        if await self._mqtt.clear(ch.ZONE_REQUEST, wait=True, source=key[0], zone=key[1]):
+            self._forgotten.pop(key, None)
 
     def views(self) -> list[ZoneSourceView]:
         """Return all sources."""
@@ -231,7 +255,7 @@ class ZoneSources:
         request = decode(ch.ZONE_REQUEST, received.payload, ZoneRequest)
         zone = _requested_zone(source, received, request, at)
         if zone.expires_at is not None and at.synchronized and zone.expires_at <= at.stamp and received.retained:
-            self.forget(zone)
+            await self.forget(zone)
             return
         old = self._own_zone(source.id, zone.id)
         if old is not None and received.retained and structs.replace(zone, version=old.version) == old:

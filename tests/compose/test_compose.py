@@ -392,7 +392,7 @@ def test_killed_containers_are_restarted(sim: Project) -> None:
     services = {*FOG, "sim-robot"}
     before = {name: container["RestartCount"] for name, container in sim.containers().items()}
     for name, container in sim.containers().items():
-        if name in services:
+        if name in services - {"mosquitto-relay"}:  # its network is mosquitto's: it ends by itself, and comes back
             # A container's first process can't be killed from inside, unless it handles the signal: kill init's child.
             init = container["HostConfig"].get("Init")
             sim.inside(name, "kill -9 $(cat /proc/1/task/1/children)" if init else "kill 1")

@@ -185,5 +185,5 @@ async def test_pose_is_given_by_a_drag_or_by_two_clicks(console: SimpleNamespace
     await expect(form.get_by_label("Heading (°)")).to_have_value("180")
     assert await form.get_by_label("x (m)").input_value() != dragged
     await form.get_by_role("button", name="Set").click()
-    await expect(page.locator(".said")).to_contain_text("r1 knows its position")
+    await expect(page.locator(".said")).to_contain_text("r1 looks for its position there")
     assert stream.requests[-1][1]["kind"] == "initial_pose"

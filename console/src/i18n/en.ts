@@ -174,6 +174,8 @@ export const en = {
   "command.goal": "Send to a goal",
   "command.disable": "Take out of service",
   "command.done": "{robot}: {command}: {reason}",
+  "command.accepted": "accepted",
+  "command.docks": "it drives to its dock: watch it",
   "command.refused": "{robot} refuses ({command}): {reason}",
   "command.failed": "{command} of {robot} failed: {reason}",
   "enable.title": "Enable {robot}?",
@@ -227,7 +229,7 @@ export const en = {
   "pose.pick": "Drag on the map from where it stands to where it looks. Or click both points, or type numbers.",
   "pose.pickHeading": "Now click where it looks.",
   "pose.send": "Set",
-  "pose.done": "{robot} knows its position: {reason}",
+  "pose.done": "{robot} looks for its position there: the next lidar scans verify it.",
 
   "view.scenario": "Scenario",
   "scenario.driven": "Driven",

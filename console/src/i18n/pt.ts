@@ -175,6 +175,8 @@ export const pt: Readonly<Record<keyof typeof en, string>> = {
   "command.goal": "Enviar a um destino",
   "command.disable": "Retirar de serviço",
   "command.done": "{robot}: {command}: {reason}",
+  "command.accepted": "aceite",
+  "command.docks": "vai para a base: vigie-o",
   "command.refused": "{robot} recusa ({command}): {reason}",
   "command.failed": "{command} de {robot} falhou: {reason}",
   "enable.title": "Ativar {robot}?",
@@ -228,7 +230,7 @@ export const pt: Readonly<Record<keyof typeof en, string>> = {
   "pose.pick": "Arraste no mapa de onde está para onde olha. Ou clique nos dois pontos, ou escreva os números.",
   "pose.pickHeading": "Agora clique para onde olha.",
   "pose.send": "Definir",
-  "pose.done": "{robot} sabe a sua posição: {reason}",
+  "pose.done": "{robot} procura ali a sua posição: as próximas voltas do lidar confirmam-na.",
 
   "view.scenario": "Cenário",
   "scenario.driven": "Percorrido",

@@ -1,7 +1,7 @@
 // Tells a robot where it stands: by a drag on the map, by two clicks, or by numbers.
 import { useEffect, useState } from "preact/hooks";
 import { request, robotPath } from "../api/client";
-import type { CommandBody, CommandOutcome, Point } from "../api/types";
+import type { CommandBody, Point } from "../api/types";
 import { useConsole, useShown } from "../context";
 import { t } from "../i18n/i18n";
 import { sentence } from "../stop";
@@ -63,8 +63,8 @@ export function PosePanel({ id, onClose }: Props): preact.JSX.Element {
     if (px === null || py === null || angle === null) return;
     const body: CommandBody = { kind: "initial_pose", pose: { x: px, y: py, theta: radians(angle) } };
     try {
-      const { value } = await request<CommandOutcome>("POST", robotPath(id, "commands"), { body });
-      say(t("pose.done", { robot: id, reason: value.reason }));
+      await request("POST", robotPath(id, "commands"), { body });
+      say(t("pose.done", { robot: id }));
       onClose();
     } catch (error) {
       setProblem(sentence(error));

@@ -1,7 +1,7 @@
 // The robots, and all that can be done with the chosen one.
 import { useEffect, useState } from "preact/hooks";
 import { Problem, request, robotPath } from "../api/client";
-import type { CommandBody, CommandOutcome, Values } from "../api/types";
+import type { CommandBody, Values } from "../api/types";
 import { mayOperate, useConsole, useLive, useSeconds } from "../context";
 import { Confirm } from "../dialog";
 import { t } from "../i18n/i18n";
@@ -128,8 +128,8 @@ function Commands({ id, robot }: CommandsProps): preact.JSX.Element {
       if (kind === "cancel") await request("DELETE", robotPath(id, "goal"));
       else {
         const body: CommandBody = { kind };
-        const { value } = await request<CommandOutcome>("POST", robotPath(id, "commands"), { body });
-        say(t("command.done", { robot: id, command, reason: value.reason }));
+        await request("POST", robotPath(id, "commands"), { body });
+        say(t("command.done", { robot: id, command, reason: t(kind === "dock" ? "command.docks" : "command.accepted") }));
         return;
       }
       say(t("command.done", { robot: id, command, reason: t("robot.noGoal") }));

@@ -13,6 +13,9 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from fog_runtime.configuration.uploaded_maps import MapInForce, UploadedMaps
+from map_service.site_map import MAP_ID, StoredMap, put_into_force
+
 if TYPE_CHECKING:
     from collections.abc import Mapping
 
@@ -218,3 +221,14 @@ async def test_each_bad_upload_is_refused_with_the_field_and_what_to_do(site, to
         strangers = await client.post(PREVIEW, content=b'{"upload": "' + b"a" * 2_000_000)
         assert strangers.status_code == 413
         assert (await client.get("/readyz")).status_code == 200
+
+
+def test_map_that_another_machine_has_is_in_force_once_it_was_copied_here(tmp_path):
+    maps = UploadedMaps(tmp_path)
+    record = StoredMap(id=MAP_ID, name="a" * 16, over="b" * 16)
+    put_into_force(maps, {MAP_ID: record}, 0.0)
+    assert maps.in_force() is None
+    assert record.name is not None
+    maps.file(record.name).write_bytes(b"a map")
+    put_into_force(maps, {MAP_ID: record}, 0.5)
+    assert maps.in_force() == MapInForce(name=record.name, over=record.over)

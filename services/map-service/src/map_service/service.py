@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import asyncio
-from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -110,7 +109,7 @@ class Service:
         )
         self.muted = RecordWriter(ZONE_SOURCES, MutedSource, store, self.zones, lambda _: None)
         self.maps = maps or UploadedMaps(Path("maps"))
-        self.site_map = RecordWriter(SITE_MAPS, StoredMap, store, self.zones, partial(put_into_force, self.maps))
+        self.site_map = RecordWriter(SITE_MAPS, StoredMap, store, self.zones, lambda _: None)
         self.zones.beside = (self.sets, self.places, self.muted, self.site_map)
         core.put_places(combined(places, {}))
         self.zone_sources = ZoneSources(
@@ -202,6 +201,7 @@ class Service:
                     await self._times.save(self._clock.now())
                     await self.zones.delete_ended()
                     self._health.set("store", ok=True)
+                put_into_force(self.maps, self.site_map.records, self._clock.now())
             except StoreError as error:
                 # What was stored but never acknowledged may have gone with a failed primary.
                 self.zones.must_reload = True

@@ -13,7 +13,7 @@ if TYPE_CHECKING:
 
 MAP_ID: Final = "map"
 """The record's id: there is one."""
-_log = logs.get("map")
+_limited = logs.RateLimited(logs.get("map"), 60.0)
 
 
 class StoredMap(Message, frozen=True, kw_only=True):
@@ -29,14 +29,18 @@ class StoredMap(Message, frozen=True, kw_only=True):
     version: Count = 1
 
 
-def put_into_force(maps: UploadedMaps, records: Mapping[str, StoredMap]) -> None:
-    """Let the services of this machine have the stored map, by starting anew; one that is not here is logged."""
+def put_into_force(maps: UploadedMaps, records: Mapping[str, StoredMap], now: float) -> None:
+    """Let the services of this machine have the stored map, by starting anew; called again and again.
+
+    So a full disk or a map that is only on another machine delays it until that is mended; either is logged.
+    """
     record = records.get(MAP_ID)
-    if record is not None and record.name is not None and not maps.file(record.name).is_file():
+    if record is not None and record.name is not None and not (file := maps.file(record.name)).is_file():
         remedy = "copy it from the other machine, or upload it again"
-        _log.error("map_not_here", file=str(maps.file(record.name)), remedy=remedy)
+        _limited.warning("map_not_here", "missing", now, file=str(file), remedy=remedy)
         return
     try:
         maps.put(None if record is None else MapInForce(name=record.name, over=record.over))
     except OSError as error:
-        _log.error("map_not_in_force", reason=str(error), remedy="let FOGNAV_MAPS_DIR name a folder with room")
+        remedy = "let FOGNAV_MAPS_DIR name a folder with room"
+        _limited.warning("map_not_in_force", "failed", now, reason=str(error), remedy=remedy)

@@ -107,7 +107,7 @@ def test_no_secret_is_in_an_environment_or_a_command():
 
 
 def test_only_broker_router_and_gateway_are_reachable_from_outside():
-    assert {name for name, service in SERVICES.items() if "ports" in service} == {"mosquitto", "zenoh", "gateway"}
+    assert {name for name, service in SERVICES.items() if "ports" in service} == {"mosquitto-relay", "zenoh", "gateway"}
     assert SERVICES["redis"]["networks"] == ["store"]
     internal = {name for name, network in COMPOSE["networks"].items() if network and network.get("internal")}
     assert internal == {"store", "web"}

@@ -15,7 +15,7 @@ from fognav.output import WrongUseError
 
 ROOT = Path(__file__).parents[2]
 COMPOSE = (ROOT / BASE).read_text("utf-8")
-SERVERS = ("mosquitto", "redis", "zenoh")
+SERVERS = ("mosquitto-relay", "redis", "zenoh")
 
 
 def floor(folder: Path, site: str) -> Path:
@@ -44,7 +44,7 @@ def test_written_file_names_the_command_that_writes_it_again(tmp_path, monkeypat
 
 def test_each_floor_has_every_container_but_the_shared_ones(made):
     base = yaml.safe_load(COMPOSE)["services"]
-    shared = {*SERVERS, "mosquitto-relay", "credentials", "bridge-credentials", "sim-credentials", "kernels"}
+    shared = {*SERVERS, "mosquitto", "credentials", "bridge-credentials", "sim-credentials", "kernels"}
     expected = {f"{name}-{site}" for name in base.keys() - shared for site in ("attic", "first-floor")}
     assert made["services"].keys() - shared == expected
 
@@ -68,6 +68,8 @@ def test_its_containers_answer_to_the_usual_names(made):
     for name in ("planner", "gateway", "prometheus"):
         networks = made["services"][f"{name}-attic"]["networks"]
         assert {tuple(each["aliases"]) for each in networks.values() if each} == {(name,)}
+    broker = made["services"]["mosquitto-relay"]["networks"]
+    assert broker == {name: {"aliases": ["mosquitto"]} for name in ("nodes-attic", "nodes-first-floor")}
     assert made["services"]["zenoh"]["networks"].keys() == {"robots-attic", "robots-first-floor"}
 
 

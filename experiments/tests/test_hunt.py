@@ -472,7 +472,21 @@ HUNT = Path(__file__).parents[1] / "hunt"
 SITES = Path(__file__).parents[2] / "sites"
 
 
-@pytest.mark.parametrize("file", sorted((HUNT / "mended").glob("*.json")), ids=lambda file: file.stem)
+MINUTES = {
+    "pose-corridor-on-a-map-4-cm-off",
+    "pose-corridor-on-a-map-7-cm-off",
+    "pose-corridor-with-wheels-10-percent-short",
+}
+"""Mended worlds that take a minute and more each."""
+
+
+@pytest.mark.parametrize(
+    "file",
+    [
+        pytest.param(file, marks=pytest.mark.long if file.stem in MINUTES else (), id=file.stem)
+        for file in sorted((HUNT / "mended").glob("*.json"))
+    ],
+)
 @pytest.mark.drive
 def test_world_that_broke_a_rule_breaks_it_no_more(file):
     assert hunt(read_world(file), [SITES]).violations == []

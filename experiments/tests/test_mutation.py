@@ -100,7 +100,7 @@ def fognav(*arguments: str) -> tuple[int, dict[str, Any]]:
 
 
 @pytest.mark.timeout(700)
-@pytest.mark.drive
+@pytest.mark.long
 def test_each_change_of_a_module_is_tried_and_those_that_no_test_notices_are_named() -> None:
     code, parts = fognav("--part", "guardian", "--module", "guardian.link")
     (link,) = (module for module in parts["guardian"]["modules"] if module["mutants"])

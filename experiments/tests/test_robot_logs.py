@@ -31,7 +31,7 @@ def logged(tmp_path_factory):
     start = site.site.robots[0].start
     assert start is not None
     with InputWriter(file, queue_limit=10**6) as writer:
-        goals = [Pose(x=each.x, y=each.y, theta=0.0) for each in list(site.site.places.values())[:3]] + [start]
+        goals = [Pose(x=each.x, y=each.y, theta=0.0) for each in list(site.site.places.values())[:2]] + [start]
         run = LockstepDrive(
             site, start, RobotGoal(goal_id="g0", pose=goals[0]), 1, Noise(), watched=False, hazard=None, bus=None,
             make_agent=partial(LoggedAgent, write=writer.write),

@@ -262,7 +262,7 @@ async def test_set_of_zones_is_made_filled_switched_off_and_the_switch_undone(op
     await expect(page.locator(".zone-row .state")).to_have_text("in force")
 
 
-@pytest.mark.parametrize("seed", range(2))
+@pytest.mark.parametrize("seed", [0])
 async def test_whatever_two_pages_do_at_the_same_time_both_show_what_the_server_has(
     operators: Operators, seed: int
 ) -> None:

@@ -276,6 +276,7 @@ def walled(source: Path, target: Path, left: float, bottom: float, right: float,
     return target.with_suffix(".yaml")
 
 
+@pytest.mark.long
 def test_running_fog_gets_another_map_on_which_a_robot_plans_and_the_way_back(tmp_path):
     site = shutil.copytree(ROOT / "sites" / "estig", tmp_path / "site")
     node = Node(tmp_path, "--sim", "--site", str(site))

@@ -44,7 +44,7 @@ PORTS: Final = {
     "FOGNAV_PLANNER_PORT": ("gateway", 8003),
     "FOGNAV_CONSOLE_PORT": ("gateway", 8004),
     "FOGNAV_ZENOH_PORT": ("zenoh", 7447),
-    "FOGNAV_MQTT_PORT": ("mosquitto", 8883),
+    "FOGNAV_MQTT_PORT": ("mosquitto-relay", 8883),
 }
 HEALTHY_S: Final = 180.0
 """On a busy machine of two cores; an idle one needs 20 s, most of it for compiling the kernels."""

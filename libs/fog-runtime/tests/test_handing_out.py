@@ -61,7 +61,7 @@ def node(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.Capture
 
 
 def test_each_program_gets_its_own_files(node):
-    assert node.files("mosquitto") == {"server.pem", "server.key", "users", "access", "authority.pem", "mosquitto_sub"}
+    assert node.files("mosquitto") == {"server.pem", "server.key", "users", "access", "mosquitto_sub"}
     assert node.files("redis") == {"server.pem", "server.key", "users", "authority.pem", "health"}
     assert node.files("zenoh") == {"server.pem", "server.key", "users", "access.json5", "health.toml"}
     assert node.files("gateway") == {"server.pem", "server.key"}

@@ -53,7 +53,7 @@ def test_compose_starts_the_relay_of_the_broker_with_the_arguments_of_a_private_
     given = [text for argument in service["command"] for text in argument.split("=", 1)]
     assert given[: given.index("--to")] == list(private[3 : private.index("--configuration")])
     (listener,) = re.findall(r"^listener (.*)$", configurations.deployed()["mosquitto/mosquitto.conf"], re.MULTILINE)
-    assert given[given.index("--to") + 1].split(":")[::-1] == listener.split()
+    assert ["0", given[given.index("--to") + 1]] == listener.split()
 
 
 def test_compose_starts_the_router_with_the_arguments_of_a_private_one() -> None:

@@ -27,6 +27,8 @@ HEADER: Final = "# Written by `fognav site compose"
 _OPTIONAL: Final = {"sim-credentials": {"simulation": "sim-locks"}, "bridge-credentials": {"bridge": "bridge-locks"}}
 """Who hands out what not every fog node has: each program's volume."""
 _SHARED: Final = frozenset({"credentials", *_OPTIONAL, "kernels", "mosquitto", "mosquitto-relay", "redis", "zenoh"})
+_SERVERS: Final = ("mosquitto-relay", "redis", "zenoh")
+"""Those that are in a network of each floor."""
 _OUTSIDE: Final = "outside"
 """The gateways' way out, which has no names that could be mixed up."""
 _SITE: Final = re.compile(r"^\$\{FOGNAV_SITE:-[^}]*\}:/site")
@@ -58,7 +60,7 @@ def override(folders: Sequence[Path], compose: str) -> str:
     Raises as `load_sites`.
     """
     base = yaml.safe_load(compose)
-    services: _Part = {name: {"networks": {}} for name in ("mosquitto", "redis", "zenoh")}
+    services: _Part = {name: {"networks": {}} for name in _SERVERS}
     services["credentials"] = {"environment": {"FOGNAV_FLOORS_DIR": "/floors"}, "volumes": []}
     services |= {name: copy.deepcopy(services["credentials"]) for name in _OPTIONAL}
     made: _Part = {"services": services, "networks": {}, "volumes": {}}
@@ -101,9 +103,11 @@ def _add(made: _Part, base: Mapping[str, Any], floor: _Floor) -> None:
     for network, settings in base["networks"].items():
         if network != _OUTSIDE:
             made["networks"][floor.name(network)] = settings
-    for server in ("mosquitto", "redis", "zenoh"):
-        for network in base["services"][server]["networks"]:
-            services[server]["networks"][floor.name(network)] = None
+    for server in _SERVERS:
+        networks = base["services"][server]["networks"]
+        for network in networks:
+            settings = networks[network] if isinstance(networks, dict) else None
+            services[server]["networks"][floor.name(network)] = settings
     mounted = {text.partition(":")[0] for name in own for text in services[floor.name(name)].get("volumes", [])}
     made["volumes"] |= {name: None for name in sorted(map(floor.name, base["volumes"])) if name in mounted}
     _add_credentials(services, floor)

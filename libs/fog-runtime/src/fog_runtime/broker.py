@@ -2,8 +2,8 @@
 
 Connections that say nothing would fill the broker's descriptors, and one user's client could end those of others
 (`MqttOpening`, ADR 55). With `--configuration` it runs Mosquitto, which then listens on a Unix socket of this
-process, and reads its files again on SIGHUP; with `--to ADDRESS:PORT` a broker runs there. A new certificate is used as
-soon as it is there.
+process, and reads its files again on SIGHUP; with `--to FILE` a broker listens on that socket, now or later. A new
+certificate is used as soon as it is there.
 """
 
 from __future__ import annotations
@@ -24,9 +24,7 @@ from fog_runtime.relay import Relay, place_of, server_tls, to_socket
 
 if TYPE_CHECKING:
     import ssl
-    from collections.abc import Callable, Iterator, Sequence
-
-    from fog_runtime.relay import Connect
+    from collections.abc import Iterator, Sequence
 
 CONNECT_BYTES: Final = 64 * 1024
 """Longest CONNECT that is read: with id, will, name and password; those of Fognav have less than 1 KiB."""
@@ -200,15 +198,12 @@ class MqttOpening:
 _PR_SET_PDEATHSIG: Final = 1
 _END_S: Final = 5.0
 _LOOK_S: Final = 0.01
-_GONE_S: Final = 10.0
-"""After how long without a broker at the address of `--to` this process ends: a container that is started again has
-another network stack, and its relay must be started again to be in it."""
 _AGAIN_S: Final = 2.0
-"""How often it looks for a new certificate, and whether the broker of `--to` is there."""
+"""How often it looks for a new certificate."""
 
 
 class BrokerEndedError(Exception):
-    """The broker behind the relay has ended by itself, or accepts no connection."""
+    """The broker that this process runs has ended by itself."""
 
 
 def _end_with_parent() -> None:
@@ -276,7 +271,7 @@ async def run_broker(options: argparse.Namespace) -> None:
         if options.configuration is not None:
             folder = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="fognav-broker-")))
             broker = _Broker(folder, options.program, options.configuration)
-        connect = _to_port(options.to) if broker is None else to_socket(broker.socket)
+        connect = to_socket(options.to if broker is None else broker.socket)
         try:
             if broker is not None:
                 await broker.start()
@@ -285,27 +280,11 @@ async def run_broker(options: argparse.Namespace) -> None:
             async with asyncio.TaskGroup() as tasks:
                 tasks.create_task(Relay(connect, MqttOpening, tls).serve([listener]))
                 tasks.create_task(_renew(tls, options.certificate, options.key))
-                tasks.create_task(_gone(connect) if broker is None else broker.ended())
+                if broker is not None:
+                    tasks.create_task(broker.ended())
         finally:
             if broker is not None:
                 await broker.stop()
-
-
-async def _gone(connect: Connect) -> None:
-    """Raise `BrokerEndedError` once the broker has accepted no connection for a while."""
-    loop = asyncio.get_running_loop()
-    there = loop.time()
-    while True:
-        transport: asyncio.Transport
-        try:
-            transport, _ = await connect(asyncio.Protocol)
-        except OSError as error:
-            if loop.time() - there > _GONE_S:
-                raise BrokerEndedError(f"no broker for {_GONE_S:g} s: {error}") from error
-        else:
-            transport.close()
-            there = loop.time()
-        await asyncio.sleep(_AGAIN_S)
 
 
 async def _renew(tls: ssl.SSLContext, certificate: Path, key: Path) -> None:
@@ -323,15 +302,6 @@ async def _renew(tls: ssl.SSLContext, certificate: Path, key: Path) -> None:
             known = found
 
 
-def _to_port(place: str) -> Connect:
-    host, _, port = place.rpartition(":")
-
-    async def connect(make_protocol: Callable[[], asyncio.Protocol]) -> tuple[asyncio.Transport, asyncio.Protocol]:
-        return await asyncio.get_running_loop().create_connection(make_protocol, host, int(port))
-
-    return connect
-
-
 def main(arguments: Sequence[str] | None = None) -> None:
     """Run until SIGTERM."""
     parser = argparse.ArgumentParser(
@@ -343,7 +313,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument("--program", default="mosquitto", metavar="FILE", help="Mosquitto, for --configuration")
     to = parser.add_mutually_exclusive_group(required=True)
     to.add_argument("--configuration", type=Path, metavar="FILE", help="of Mosquitto, without any listener")
-    to.add_argument("--to", metavar="ADDRESS:PORT", help="where a broker runs already")
+    to.add_argument("--to", type=Path, metavar="FILE", help="the socket of a broker that another process runs")
     options = parser.parse_args(arguments)
     logs.configure("broker", "info", "json")
     process.run(lambda: run_broker(options))

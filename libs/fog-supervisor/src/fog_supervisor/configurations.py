@@ -74,9 +74,9 @@ aclfile {security}/users
 def mosquitto(listener: str, data: str, *, security: str | None = None, extra: Sequence[str] = ()) -> str:
     """Return a `mosquitto.conf`.
 
-    `listener` is a port and an address, and empty where `fog_runtime.broker` adds it; `data` the folder of the broker's
-    database; `security` that with its users and access list (`fog_runtime.security`), without which it admits
-    everybody: with them it is behind a relay, which encrypts. The `extra` lines are appended.
+    `listener` is a port and an address, or 0 and a socket, and empty where `fog_runtime.broker` adds it; `data` the
+    folder of the broker's database; `security` that with its users and access list (`fog_runtime.security`), without
+    which it admits everybody: with them it is behind a relay, which encrypts. The `extra` lines are appended.
     """
     access = "allow_anonymous true\n" if security is None else _MOSQUITTO_SECURED.format(security=security)
     listens = f"listener {listener}\n" if listener else ""
@@ -113,7 +113,9 @@ def router_arguments(endpoint: str, *, security: str | None = None) -> list[str]
 def deployed() -> dict[str, str]:
     """Return the files that the compose file mounts into its servers, by their paths below `deploy/`."""
     return {
-        "mosquitto/mosquitto.conf": mosquitto("1883 127.0.0.1", "/mosquitto/data", security=DEPLOYED_SECURITY),
+        "mosquitto/mosquitto.conf": mosquitto(
+            "0 /mosquitto/data/socket", "/mosquitto/data", security=DEPLOYED_SECURITY
+        ),
         "redis/redis.conf": redis("0.0.0.0", "/data", security=DEPLOYED_SECURITY),  # noqa: S104  # inside a container; compose publishes no port
     }
 

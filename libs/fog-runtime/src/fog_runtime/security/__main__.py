@@ -7,8 +7,8 @@ and `token` do the same in the folder of the credentials.
 
 Each program gets a folder of its own, which only it can read:
 
-    mosquitto/  server.pem server.key users access authority.pem mosquitto_sub     the last two: its check of health
-    redis/      server.pem server.key users authority.pem health                   as above
+    mosquitto/  server.pem server.key users access mosquitto_sub                   the last one: its check of health
+    redis/      server.pem server.key users authority.pem health                   the last two: as above
     zenoh/      server.pem server.key users access.json5 health.toml               the last one: as above
     gateway/    server.pem server.key
     bridge/     credentials.toml token                                             of the bridges to other systems
@@ -65,23 +65,19 @@ OWNERS: Final[Mapping[str, int]] = {
 }
 """As which user each program runs in its container: those of the images, and of docker-compose.yml."""
 _BROKER_CHECK: Final = """\
--h localhost
--p 8883
---cafile {folder}/authority.pem
+--unix /mosquitto/data/socket
 -u {user}
 -P {password}
 """
 
 
-def hand_out(
-    security: SiteSecurity, out: Path, *, robots: Sequence[str], nodes: Sequence[str], seen_as: str = "/run/locks"
-) -> list[Path]:
+def hand_out(security: SiteSecurity, out: Path, *, robots: Sequence[str], nodes: Sequence[str]) -> list[Path]:
     """Bring the programs' folders in `out` up to date; return the files that changed.
 
     The credentials' folder also has the site's keys (`fog_runtime.keys`); `seen_as` is a folder's path in its
     container. Raises `OSError`, and `CredentialsError` or `TokensError` for files that can't be used.
     """
-    return _write(out, _servers(security, seen_as)) + _hand_out_keys(security, out, "", robots, nodes)
+    return _write(out, _servers(security)) + _hand_out_keys(security, out, "", robots, nodes)
 
 
 def hand_out_on_floor(
@@ -122,14 +118,14 @@ def _hand_out_keys(
     return _write(out, {**found, SIMULATION: {OPERATOR_KEY: key, **simulated}})
 
 
-def _servers(security: SiteSecurity, seen_as: str) -> dict[str, dict[str, bytes]]:
+def _servers(security: SiteSecurity) -> dict[str, dict[str, bytes]]:
     """Return the files of what all sites share, by their names."""
     trusted = security.authority.trusted.encode()
     health = Credentials.read(security.credentials(users.HEALTH)).passwords
-    check = _BROKER_CHECK.format(folder=seen_as, user=users.HEALTH, password=health["mqtt"])
+    check = _BROKER_CHECK.format(user=users.HEALTH, password=health["mqtt"])
     router_check = to_toml(users.HEALTH, authority=trusted.decode(), passwords={"zenoh": health["zenoh"]})
     return {
-        "mosquitto": {**_folder(security, "mosquitto"), "authority.pem": trusted, "mosquitto_sub": check.encode()},
+        "mosquitto": {**_folder(security, "mosquitto"), "mosquitto_sub": check.encode()},
         "redis": {**_folder(security, "redis"), "authority.pem": trusted, "health": health["redis"].encode()},
         "zenoh": {**_folder(security, "zenoh"), "health.toml": router_check.encode()},
         "gateway": _folder(security, "http"),

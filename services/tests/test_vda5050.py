@@ -14,12 +14,13 @@ import msgspec
 import pytest
 from manual_clock import ManualClock
 from secured_servers import TESTER, SecuredSite
-from vda5050_floor import SETUP, STATE, VERSIONS, A, B, C, Floorplan, area, driving, header, order, schema
+from vda5050_floor import SETUP, STATE, VERSIONS, A, B, C, Floorplan, area, driving, header, node, order, schema
 
 from fog_bridges.floor import Answer, Request
 from fog_bridges.metrics import REFUSED
 from fog_bridges.vda5050 import telling
-from fog_bridges.vda5050.bridge import RobotLink, Sender, Setup, Vda5050Bridge
+from fog_bridges.vda5050.bridge import RobotLink, Vda5050Bridge
+from fog_bridges.vda5050.connection import Sender, Setup
 from fog_bridges.vda5050.incoming import MESSAGE_MAX, MessageError, Order, ReportedZoneSet, decoded
 from fog_bridges.vda5050.zones import AGAIN_S, ZoneSets, ZoneUser
 from fog_runtime.clock import SystemClock
@@ -62,6 +63,37 @@ def test_state_has_the_path_as_a_nurbs_from_where_the_robot_is_and_2_1_its_own_w
     assert {"plannedPath", "instantActionStates", "powerSupply"}.isdisjoint(old)
     assert (old["agvPosition"]["positionInitialized"], old["batteryState"]["batteryCharge"]) == (True, 50.0)
     assert {each["errorType"] for each in old["errors"]} == {"orderError", "invalidInstantAction", "batteryLow"}
+
+
+async def test_planned_path_goes_on_from_node_to_node_of_the_base_as_the_planner_would_and_no_farther():
+    floor, asked = Floorplan(), []
+
+    class Plans:
+        async def ask(self, request: Request) -> Answer:
+            asked.append(request.body)
+            x, y = (request.body[name]["x"] for name in ("start", "goal"))
+            if x == 7.0:
+                return Answer("", body={"points": [], "refusal": {"reason": "every path is blocked"}})
+            return Answer("", body={"points": [[x, 1.0], [x, 2.0], [y, 1.0]], "refusal": None})
+
+    nodes = [A, B, C, node("d", 6, 9.0, 1.0), node("e", 8, 9.0, 5.0, released=False)]
+    floor.take(order(*nodes))
+    floor.drive()
+    floor.robot.on_path([(1.0, 1.0), (4.0, 1.0)])
+    link = RobotLink(SETUP, "r1", Plans(), ManualClock())
+    link.core = floor.robot
+    looking = asyncio.create_task(link.look_loop())
+    for _ in range(5):
+        await asyncio.sleep(0)
+    path = floor.said()["plannedPath"]
+    assert path["traversedNodes"] == ["b", "c"], "no path leads from c to d, and e is not released"
+    corners = [(each["x"], each["y"]) for each in path["trajectory"]["controlPoints"]]
+    assert corners == [(1.0, 1.0), (4.0, 1.0), (4.0, 2.0), (7.0, 1.0)]
+    assert [each["start"]["x"] for each in asked] == [4.0, 7.0]
+    link.on_floor("area", floor.now)
+    assert floor.said()["plannedPath"]["traversedNodes"] == ["b"], "the map has changed"
+    looking.cancel()
+    await asyncio.gather(looking, return_exceptions=True)
 
 
 def damaged(rng: random.Random, message: dict[str, Any]) -> bytes:

@@ -9,11 +9,13 @@ from typing import Any
 import msgspec
 import pytest
 from manual_clock import ManualClock
-from vda5050_floor import SETUP, STATE, A, B, C, Floorplan, header, instant, node, order, read
+from vda5050_floor import DOCK, SETUP, STATE, A, B, C, Floorplan, action, header, instant, node, order, read
 
 from fog_bridges.floor import Answer, Request
 from fog_bridges.metrics import ORDERS
+from fog_bridges.vda5050 import telling
 from fog_bridges.vda5050.bridge import RobotLink, Vda5050Bridge
+from fog_bridges.vda5050.charging import IDLE_S
 from fog_bridges.vda5050.incoming import NODES_MAX
 from fog_bridges.vda5050.robot import REFUSED_S, UNSEEN_S
 
@@ -147,7 +149,7 @@ def test_mission_that_may_have_been_accepted_is_asked_for_again_by_the_same_key(
     assert floor.said()["operatingMode"] == "AUTOMATIC", "it may be the fleet's own"
     assert floor.drive(Answer("", body=floor.goal)) == ["PUT 4 1"]
     assert floor.asked[0] == floor.asked[1]
-    assert (floor.said()["operatingMode"], floor.robot.goal_node) == ("AUTOMATIC", "b")
+    assert (floor.said()["operatingMode"], floor.robot.goal_node.node_id) == ("AUTOMATIC", "b")
 
 
 GOAL_B = {"goal_id": "g9", "pose": {"x": 4.0, "y": 1.0, "theta": 0.0}}
@@ -266,7 +268,7 @@ def test_order_outlives_a_restart_of_the_console_which_tells_of_the_mission_a_li
     floor.at(2.0, 1.0)
     floor.tell(1.0)
     assert floor.drive() == []
-    assert (floor.errors(), floor.robot.goal_node) == ({}, "b")
+    assert (floor.errors(), floor.robot.goal_node.node_id) == ({}, "b")
     floor.robot.on_instant(instant("cancelOrder"), floor.now)
     assert floor.drive() == ["DELETE"]
 
@@ -281,7 +283,7 @@ def test_nothing_is_concluded_while_the_floors_state_is_not_known():
     floor.goal = goal
     floor.tell(1.0)
     floor.robot.on_known(floor.now)
-    assert (floor.robot.goal_node, floor.robot.errors()) == ("b", [])
+    assert (floor.robot.goal_node.node_id, floor.robot.errors()) == ("b", [])
     floor.robot.is_known = False
     assert floor.take(order(A, B, name="o2")) == "MOBILE_ROBOT_NOT_AVAILABLE"
 
@@ -346,7 +348,7 @@ async def test_floor_that_begins_anew_takes_back_all_that_it_has_told():
     [
         ("MANUAL", {"enabled": False, "mode": "HOLD"}, {}), ("MANUAL", {"awaits_operator": True, "mode": "FAULT"}, {}),
         ("MANUAL", {"mode": "TELEOP"}, {}), ("MANUAL", {"wants_dock": True}, {}),
-        ("MANUAL", {"docked": True}, {}), ("STARTUP", {"mode": "INIT"}, {}),
+        ("MANUAL", {"mode": "DOCK", "wants_dock": True}, {}), ("STARTUP", {"mode": "INIT"}, {}),
         ("SERVICE", {}, {"out_of_service": {"reason": "repair"}}), ("MANUAL", {}, {"goal": {"goal_id": "theirs"}}),
         ("MANUAL", {}, {"goal": None}),
     ],
@@ -503,6 +505,118 @@ def test_requests_are_answered_and_unknown_actions_fail():
     for n in range(100):
         floor.robot.on_instant(instant("stateRequest", f"s{n}"), floor.now)
     assert (len(actions(floor)), floor.errors()) == (50, {})
+
+
+# --- The dock ---------------------------------------------------------------------------------------------------------
+
+TO_DOCK = {"goal_id": "dock", "pose": {"x": 4.0, "y": 1.0, "theta": 0.0}}
+
+
+def at_a_dock() -> Floorplan:
+    """A robot that has driven an order to its last node, and is told to dock there."""
+    floor = Floorplan()
+    floor.more = DOCK
+    floor.tell()
+    assert floor.take(order(A, B | {"actions": [action("startCharging", "c")]})) == ""
+    assert (floor.drive(), done(floor)) == (["PUT 4 1"], {"c": "WAITING"})
+    floor.reach(4.0, 1.0)
+    assert (floor.drive(), floor.asked[-1].body) == (["POST dock"], {"kind": "dock"})
+    floor.goal = TO_DOCK
+    floor.tell(goal_id="dock", wants_dock=True, codes=["docking"], reasons=["on its way"])
+    return floor
+
+
+def done(floor: Floorplan) -> dict[str, str]:
+    return {each["actionId"]: each["actionStatus"] for each in floor.said()["actionStates"]}
+
+
+def test_robot_charges_at_the_node_whose_action_says_so_and_the_next_order_takes_it_off_its_dock():
+    floor = at_a_dock()
+    assert (floor.said()["operatingMode"], done(floor)) == ("AUTOMATIC", {"c": "RUNNING"})
+    assert floor.take(order(A, B, name="o2")) == "OTHER_ORDER_ACTIVE"
+    floor.goal = None
+    floor.tell(goal_id=None, wants_dock=False, mode="DOCK", codes=[], reasons=[])
+    assert done(floor) == {"c": "RUNNING"}
+    floor.at(4.7, 1.0)
+    floor.tell(mode="HOLD", docked=True, power={"charging": "bulk"})
+    assert (done(floor), floor.said()["operatingMode"]) == ({"c": "FINISHED"}, "AUTOMATIC")
+    assert floor.said()["powerSupply"]["charging"] is True
+    off = B | {"sequenceId": 0, "actions": [action("stopCharging", "d")]}
+    assert floor.take(order(off, node("a", 2, 1.0, 1.0), name="o2")) == "", "0.7 m from its first node, on the dock"
+    floor.tell()
+    assert (floor.drive(), floor.asked[-1].body, done(floor)) == (["POST undock"], {"kind": "undock"}, {"d": "RUNNING"})
+    floor.tell(mode="INIT")
+    assert floor.said()["operatingMode"] == "AUTOMATIC", "its lidar starts"
+    floor.tell(mode="DOCK", docked=False)
+    assert floor.drive() == []
+    floor.tell(mode="HOLD")
+    assert (floor.drive(), done(floor)) == (["PUT 1 1"], {"d": "FINISHED"})
+
+
+@pytest.mark.parametrize(
+    ("end", "mode", "words"),
+    [
+        ({"wants_dock": False, "codes": ["docking_given_up"], "reasons": ["given up: barred"]}, "AUTOMATIC", "barred"),
+        ({"wants_dock": False, "enabled": False, "mode": "INIT"}, "STARTUP", "not in control"),
+    ],
+)
+def test_docking_that_the_robot_or_an_operator_ends_has_failed(end, mode, words):
+    floor = at_a_dock()
+    floor.goal = None
+    floor.tell(IDLE_S + 0.1, goal_id=None, **{"codes": [], "reasons": [], **end})
+    assert (floor.said()["actionStates"][0]["actionStatus"], floor.said()["operatingMode"]) == ("FAILED", mode)
+    assert words in floor.said()["actionStates"][0]["actionResult"]
+
+
+def test_operators_other_mission_on_the_way_to_the_dock_is_the_operators():
+    floor = at_a_dock()
+    floor.goal = {"goal_id": "theirs", "pose": {"x": 9.0, "y": 9.0}}
+    floor.tell(goal_id="theirs", wants_dock=False, codes=[], reasons=[])
+    assert (floor.said()["operatingMode"], done(floor)) == ("MANUAL", {"c": "FAILED"})
+
+
+def test_cancel_ends_the_way_to_the_dock_and_its_action_has_failed():
+    floor = at_a_dock()
+    floor.robot.on_instant(instant("cancelOrder", "x"), floor.now)
+    assert floor.drive() == ["DELETE"]
+    assert floor.asked[-1].headers == {"If-Match": '"dock"'}
+    assert actions(floor) == {"x": "RUNNING"}
+    floor.tell(IDLE_S + 0.1, goal_id=None, wants_dock=False, codes=[], reasons=[])
+    floor.tell()
+    assert (done(floor), actions(floor)) == ({"c": "FAILED"}, {"x": "FINISHED"})
+    assert floor.take(order(node("b", 0, 4.0, 1.0), A | {"sequenceId": 2}, name="o2")) == ""
+
+
+def test_instant_charging_is_refused_with_the_reason_and_else_comes_before_orders():
+    floor = Floorplan()
+    for refused in ("no dock", "is active"):
+        floor.robot.on_instant(instant("startCharging", refused), floor.now)
+        assert (
+            refused in {each["actionId"]: each["actionResult"] for each in floor.said()["instantActionStates"]}[refused]
+        )
+        floor.more = DOCK
+        floor.tell()
+        floor.take(order(A, B, C))
+    floor.robot.on_instant(instant("cancelOrder", "x"), floor.now)
+    floor.robot.on_instant(instant("startCharging", "c"), floor.now)
+    assert floor.take(order(A, B, name="o2")) == "MOBILE_ROBOT_NOT_AVAILABLE"
+    assert floor.drive(Answer("the base is asleep", "command_refused")) == ["POST dock"]
+    assert (actions(floor)["c"], floor.take(order(A, B, name="o2"))) == ("FAILED", "")
+    assert floor.take(order(A, B | {"actions": [action("pick", "p")]}, name="o3")) == "OTHER_ORDER_ACTIVE"
+
+
+def test_actions_that_a_robot_does_not_do_or_has_no_dock_for_reject_the_order():
+    floor = Floorplan()
+    for kind, where in (("pick", B), ("startCharging", B)):
+        assert floor.take(order(A, where | {"actions": [action(kind, "a")]})) == "INVALID_ORDER_ACTION"
+    floor.more = DOCK
+    floor.tell()
+    twice = [action("startCharging", "a"), action("stopCharging", "a")]
+    assert floor.take(order(A, B | {"actions": twice})) == "INVALID_ORDER_ACTION"
+    assert floor.take(order(A, B, edge={"actions": twice[:1]})) == "INVALID_ORDER_ACTION"
+    named = [(each["actionType"], each["actionScopes"])
+             for each in telling.factsheet(floor.robot, "3.0")["protocolFeatures"]["mobileRobotActions"]]  # fmt: skip
+    assert ("startCharging", ["INSTANT", "NODE"]) in named
 
 
 def test_instant_actions_of_2_0_have_two_names():

@@ -29,7 +29,7 @@ MASTER = Path(__file__).parents[1] / "support" / "vda5050_master.cjs"
 
 
 @asynccontextmanager
-async def fleet(tmp_path: Path, version: str):
+async def fleet(tmp_path: Path, version: str, *options: str):
     """Run a floor with a simulated robot under a fleet's control; yield the node, the fleet's broker and its user."""
     site = SecuredSite(tmp_path, "fleet")
     with site.mosquitto() as server:
@@ -39,7 +39,7 @@ async def fleet(tmp_path: Path, version: str):
             f'adapters = "vda5050"\nvda5050_mqtt_url = "{server.url}"\nvda5050_credentials_file = "{own}"\n'
             f'vda5050_version = "{version}"\nvda5050_robots = "r1"\nvda5050_zones = "kit/0001"\n'
         )
-        floor = Node(tmp_path, "--sim", "--bridge", str(settings))
+        floor = Node(tmp_path, "--sim", "--bridge", str(settings), *options)
         try:
             await asyncio.to_thread(floor.up)
             pose = lambda: floor.json("robot", "status")["pose"] or {}  # noqa: E731  # shorter so
@@ -148,6 +148,47 @@ async def test_order_drives_the_robot_until_an_operator_ends_it_and_robots_of_ot
         await state(lambda s: not s["driving"], "it stands")
 
         await check_zones(floor, client)
+
+
+async def test_fleet_has_the_robot_charge_on_its_dock_and_drives_it_off_again(tmp_path):
+    site = shutil.copytree(Path(__file__).parents[2] / "sites" / "estig", tmp_path / "estig")
+    text, start = (site / "site.toml").read_text(), "start = { x = 5.0, y = 25.4, theta = 1.5707963 }"
+    assert start in text
+    (site / "site.toml").write_text(text.replace(start, f"{start}\ndock = {{ x = 5.0, y = 28.4, theta = 1.5707963 }}"))
+    async with (
+        fleet(tmp_path, "3.0", "--site", str(site)) as (floor, url, own),
+        Broker.of(url, own).client("fleet", None) as client,
+    ):
+        await client.subscribe("vda5050/v3/fognav/r1/state")
+
+        async def state(wanted, what: str) -> dict[str, Any]:
+            last: Any = None
+            with suppress(TimeoutError):
+                async with asyncio.timeout(90.0):
+                    async for message in client.messages:
+                        last = json.loads(message.payload)
+                        if wanted(last):
+                            return last
+            raise AssertionError(f"{what}: {last}\n{floor.run('logs', 'bridge')}")
+
+        def is_done(told: dict[str, Any]) -> bool:
+            return bool(told["actionStates"]) and told["actionStates"][0]["actionStatus"] in ("FINISHED", "FAILED")
+
+        async def send(message: dict[str, Any], on_node: int, kind: str) -> None:
+            message["nodes"][on_node]["actions"] = [{"actionType": kind, "actionId": kind, "blockingType": "HARD"}]
+            await client.publish("vda5050/v3/fognav/r1/order", json.dumps(message))
+
+        at = (await state(lambda s: s["operatingMode"] == "AUTOMATIC", "in control"))["mobileRobotPosition"]
+        await send(order(at["x"], at["y"], 1.0, name="o1", version="3.0"), 1, "startCharging")
+        docked = await state(lambda s: s["orderId"] == "o1" and is_done(s), "it is on its dock")
+        assert (docked["actionStates"][0]["actionStatus"], docked["operatingMode"]) == ("FINISHED", "AUTOMATIC"), docked
+        assert docked["mobileRobotPosition"]["y"] > 28.0
+        off = order(at["x"], at["y"] + 1.0, -0.5, name="o2", version="3.0")
+        off["nodes"][0]["nodeId"] = off["edges"][0]["startNodeId"] = "o1-1"
+        await send(off, 0, "stopCharging")
+        left = await state(lambda s: s["orderId"] == "o2" and is_done(s), "it has left its dock")
+        assert left["actionStates"][0]["actionStatus"] == "FINISHED", left
+        await state(lambda s: s["lastNodeId"] == "o2-1" and not s["driving"], "it arrives")
 
 
 @pytest.mark.skipif(

@@ -14,7 +14,7 @@ import pytest
 
 from fog_bridges.floor import Answer, Request
 from fog_bridges.vda5050 import telling
-from fog_bridges.vda5050.bridge import Sender, Setup
+from fog_bridges.vda5050.connection import Sender, Setup
 from fog_bridges.vda5050.incoming import RELEASES, InstantActions, decoded
 from fog_bridges.vda5050.robot import FleetRobot
 from fog_runtime.transports.mqtt_connection import Broker
@@ -71,12 +71,22 @@ def instant(kind: str, name: str = "a1", **parameters: Any) -> InstantActions:
     return read(header() | {"actions": [action]}, "instantActions")
 
 
+def action(kind: str, name: str) -> dict[str, Any]:
+    return {"actionType": kind, "actionId": name, "blockingType": "HARD", "actionParameters": []}
+
+
+DOCK = {"dock": {"x": 4.7, "y": 1.0, "theta": 0.0}}
 SETUP = Setup(
     site="lab", broker=Broker.of("mqtt://localhost"), version="3.0", interface="vda5050", manufacturer="fognav",
     map_id="lab", robots=["r1"], zones=[],
 )  # fmt: skip
 STATE = {"mode": "NORMAL", "enabled": True, "reasons": [], "codes": [], "battery": 0.5, "goal_id": None,
          "goal_reached": False, "awaits_operator": False, "wants_dock": False, "power": {"charging": "no"}}  # fmt: skip
+
+
+def _about(body: dict[str, Any]) -> list[str]:
+    pose = body.get("pose", {})
+    return [body["kind"]] if "kind" in body else [f"{pose[name]:g}" for name in ("x", "y") if name in pose]
 
 
 class Floorplan:
@@ -107,7 +117,7 @@ class Floorplan:
         self.robot.on_robot({"state": dict(self.state), "goal": self.goal, **self.more}, self.now)
 
     def drive(self, answer: Answer | None = None) -> list[str]:
-        """Let the floor answer all that is asked; return it: PUT with the goal, DELETE."""
+        """Let the floor answer all that is asked; return it: PUT with the goal, POST with the command, DELETE."""
         first = len(self.asked)
         while (request := self.robot.step(self.now)) is not None:
             self.asked.append(request)
@@ -118,13 +128,13 @@ class Floorplan:
                 self.goal = {"goal_id": f"g{len(self.asked)}", "pose": request.body["pose"]}
                 self.state |= {"goal_id": self.goal["goal_id"], "goal_reached": False}
                 self.robot.on_answer(Answer("", body=self.goal), self.now)
-            else:
+            elif request.method == "DELETE":
                 self.goal = None
                 self.robot.on_answer(Answer(""), self.now)
+            else:
+                self.robot.on_answer(Answer(""), self.now)
         self.tell(0.1)
-        bodies = [request.body["pose"] if request.body else None for request in self.asked[first:]]
-        return [request.method if body is None else f"{request.method} {body['x']:g} {body['y']:g}"
-                for request, body in zip(self.asked[first:], bodies, strict=True)]  # fmt: skip
+        return [" ".join([request.method, *_about(request.body or {})]) for request in self.asked[first:]]
 
     def reach(self, x: float, y: float) -> None:
         """Let the robot reach its goal, and the planner end the mission."""
@@ -157,7 +167,10 @@ A, B, C = node("a", 0, 1.0, 1.0), node("b", 2, 4.0, 1.0), node("c", 4, 7.0, 1.0)
 def driving() -> Floorplan:
     """A robot under way, with a path, errors and actions."""
     floor = Floorplan()
-    floor.take(order(A, node("b", 2, 4.0, 1.0, position={"theta": 1.0}), C | {"released": False}))
+    floor.more = DOCK
+    floor.tell()
+    charge = [action("startCharging", "c")]
+    floor.take(order(A, node("b", 2, 4.0, 1.0, position={"theta": 1.0}), C | {"released": False, "actions": charge}))
     floor.drive()
     floor.at(1.5, 1.1, v=0.3)
     floor.robot.on_path([(1.0, 1.0), (3.0, 1.0), (4.0, 1.0)])

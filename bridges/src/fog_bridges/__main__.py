@@ -19,7 +19,8 @@ import msgspec
 from fog_bridges.floor import Floor, ServesSockets
 from fog_bridges.home_assistant import HomeAssistant
 from fog_bridges.service import HomeAssistantBridge
-from fog_bridges.vda5050.bridge import SYSTEM, Setup, Vda5050Bridge
+from fog_bridges.vda5050.bridge import Vda5050Bridge
+from fog_bridges.vda5050.connection import SYSTEM, Setup
 from fog_bridges.vda5050.incoming import Version
 from fog_contracts import channels as ch
 from fog_runtime import logs, process

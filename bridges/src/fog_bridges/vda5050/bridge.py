@@ -1,15 +1,13 @@
 """Connects robots of Fognav to a fleet control's broker, and robots of others to Fognav's zones.
 
-Each robot of Fognav has a connection of its own, whose last will tells that it is gone. A message that is retained is
-never an order: nobody knows how old it is.
+Each robot of Fognav has a connection of its own, whose last will tells that it is gone.
 """
 
 from __future__ import annotations
 
 import asyncio
-from collections import Counter
-from collections.abc import Sequence  # msgspec resolves annotations at run time
 from contextlib import suppress
+from itertools import pairwise
 from typing import TYPE_CHECKING, Any, Final
 from uuid import uuid4
 
@@ -17,27 +15,23 @@ import aiomqtt
 import msgspec
 
 from fog_bridges.floor import Request
-from fog_bridges.metrics import ORDERS, REFUSED
+from fog_bridges.metrics import ORDERS
 from fog_bridges.vda5050 import telling
+from fog_bridges.vda5050.connection import SYSTEM, Connection, Sender, Setup
 from fog_bridges.vda5050.incoming import (
     MESSAGE_MAX,
-    RELEASES,
     InstantActions,
     MessageError,
     Order,
     ReportedConnection,
     ReportedState,
-    Version,
     decoded,
 )
-from fog_bridges.vda5050.orders import Where, is_repeated, rejection
-from fog_bridges.vda5050.outgoing import of_version, timestamp
+from fog_bridges.vda5050.orders import Leg, Where, goal_of, goals_of, is_repeated, rejection
 from fog_bridges.vda5050.robot import FleetRobot
 from fog_bridges.vda5050.zones import ZoneSets, ZoneUser
 from fog_runtime import logs
 from fog_runtime.clock import ticker
-from fog_runtime.concurrency import raise_if_cancelled
-from fog_runtime.transports.mqtt_connection import Broker, Inbox
 
 if TYPE_CHECKING:
     from fog_bridges.floor import Floor
@@ -45,101 +39,15 @@ if TYPE_CHECKING:
     from fog_bridges.vda5050.outgoing import State
     from fog_runtime.clock import Clock
 
-SYSTEM: Final = "vda5050"
 TICK_S: Final = 0.1
-RETRY_S: Final = 1.0
+LOOK_S: Final = 2.0
+"""How often the planner is asked for the path beyond the next node, while there is more of an order."""
 ORDERS_AT_ONCE: Final = 10
+LEGS: Final = 5
+"""How many nodes beyond the next one the planned path reaches."""
 LOOKED_FOR: Final = 20
 """Nodes of an order that are looked for on the map before it is taken over; further ones when they are next."""
 _log = logs.get(SYSTEM)
-
-
-class Setup(msgspec.Struct, frozen=True, kw_only=True):
-    """Where messages go, and in whose name."""
-
-    site: str
-    broker: Broker
-    version: Version
-    interface: str
-    manufacturer: str
-    map_id: str
-    robots: Sequence[str]
-    """Of Fognav, under the fleet's control."""
-    zones: Sequence[tuple[str, str]]
-    """Manufacturer and serial number of robots of others that are told of zones."""
-
-
-class Sender:
-    """Numbers and writes the messages on one robot's topics."""
-
-    def __init__(self, setup: Setup, version: Version, manufacturer: str, serial: str) -> None:
-        self._version: Version = version
-        self._names = {"manufacturer": manufacturer, "serialNumber": serial}
-        self._base = f"{setup.interface}/v{version.partition('.')[0]}/{manufacturer}/{serial}/"
-        self.numbers: Counter[str] = Counter()
-        """How many messages each topic has had."""
-
-    def topic(self, name: str) -> str:
-        """Return the whole topic."""
-        return self._base + name
-
-    def message(self, name: str, content: msgspec.Struct | dict[str, Any], stamp: float) -> bytes:
-        """Return a message; `content` is what it has beside its header, in the words of 3.0."""
-        header = {"headerId": self.numbers[name], "timestamp": timestamp(stamp), "version": RELEASES[self._version]}
-        self.numbers[name] += 1
-        return msgspec.json.encode({**header, **self._names, **of_version(name, content, self._version)})
-
-
-class Connection:
-    """A connection to the fleet's broker that is made again and again."""
-
-    def __init__(self, broker: Broker, name: str, topics: Sequence[str], clock: Clock) -> None:
-        self._broker = broker
-        self._name = name
-        self._topics = topics
-        self.clock = clock
-        self.limited = logs.RateLimited(_log)
-        self.problem = "not connected yet"
-        """Why nothing is told; empty while it is."""
-
-    def will(self) -> aiomqtt.Will | None:
-        """Return what the broker tells when this connection is lost."""
-        return None
-
-    def on_message(self, topic: str, payload: bytes) -> None:
-        """Take in a message that is not retained."""
-
-    async def serve(self, client: aiomqtt.Client) -> None:
-        """Tell what is to be told, until cancelled."""
-        raise NotImplementedError
-
-    async def run(self) -> None:
-        """Connect and stay connected until cancelled."""
-        while True:
-            inbox = Inbox(self._on_message)
-            try:
-                async with self._broker.client(self._name, self.will(), inbox) as client:
-                    await client.subscribe([(topic, 0) for topic in self._topics])
-                    inbox.open()
-                    self.problem = ""
-                    await self.serve(client)
-            except aiomqtt.MqttError as error:
-                raise_if_cancelled()
-                self.problem = f"the broker {self._broker} is not connected: {error}"
-                self.limited.warning("broker_disconnected", self._name, self.clock.now(), reason=self.problem)
-            await asyncio.sleep(RETRY_S)
-
-    def _on_message(self, message: aiomqtt.Message) -> None:
-        topic, payload = message.topic.value, message.payload
-        if message.retain and not topic.endswith("/connection"):
-            self.refuse("retained", topic, "it is retained, so nobody knows how old it is: delete it from the broker")
-        elif isinstance(payload, bytes | bytearray):
-            self.on_message(topic, bytes(payload))
-
-    def refuse(self, reason: str, topic: str, words: str) -> None:
-        """Count and log a message that is of no use."""
-        REFUSED.labels(SYSTEM, reason).inc()
-        self.limited.warning("message_refused", topic, self.clock.now(), topic=topic, reason=words[:300])
 
 
 class RobotLink(Connection):
@@ -151,6 +59,7 @@ class RobotLink(Connection):
         self._floor = floor
         self._sender = Sender(setup, setup.version, setup.manufacturer, robot)
         self._order_came = asyncio.Event()
+        self.map_changes = 0
         self._is_asked = False
         self._wants_factsheet = True
         topics = [self._sender.topic(name) for name in ("order", "instantActions")]
@@ -216,7 +125,7 @@ class RobotLink(Connection):
         if (error := core.checked(order, self.clock.now())) is not None:
             return "refused", error.error_description
         core.pending = order
-        for node, goal in core.goals(order)[:LOOKED_FOR]:
+        for node, goal in goals_of(order, core.places)[:LOOKED_FOR]:
             refusal = await self._route(node, goal)
             if core.pending is not order:
                 error = core.checked(order, self.clock.now())
@@ -242,6 +151,37 @@ class RobotLink(Connection):
             return answer.refusal if answer.problem == "request_invalid" else ""
         refusal = (answer.body.get("path") or {}).get("refusal")
         return "" if refusal is None else str(refusal.get("reason", "there is no path"))
+
+    async def look_loop(self) -> None:
+        """Keep the path beyond the next node as the planner would have it: only 3.0 tells of paths."""
+        async for _ in ticker(self.clock, LOOK_S):
+            changes = self.map_changes
+            legs = await self._beyond() if self._setup.version == "3.0" else []
+            if changes == self.map_changes:
+                self.core.orders.beyond = legs
+
+    def on_floor(self, name: str, now: float, *, fresh: bool = False) -> None:
+        """Take in that the floor begins anew, is known, or has other areas or zones."""
+        if name == "ready":
+            self.core.on_known(now)
+        elif name == "hello" and fresh:
+            self.core.forget()
+        elif name != "hello":
+            self.map_changes += 1
+            self.core.orders.beyond = []  # the path beyond the next node may be another one by now
+
+    async def _beyond(self) -> list[Leg]:
+        ahead = [(node, goal_of(node, self.core.places)) for node in self.core.orders.nodes if node.released]
+        legs: list[Leg] = []
+        for (start, a), (end, b) in pairwise(ahead[: LEGS + 1]):
+            if a is None or b is None:
+                break
+            poses = {name: {"x": at.x, "y": at.y, "theta": 0.0} for name, at in (("start", a), ("goal", b))}
+            answer = await self._floor.ask(Request("POST", "/api/v1/plan", poses))
+            if answer.refusal or answer.body.get("refusal") is not None or not answer.body.get("points"):
+                break
+            legs.append(Leg(start, end, [(x, y) for x, y in answer.body["points"]]))
+        return legs
 
     async def drive_loop(self) -> None:
         """Keep the robot's mission what the order needs."""
@@ -396,6 +336,7 @@ class Vda5050Bridge:
                 tasks.create_task(link.run(), name=robot)
                 tasks.create_task(link.order_loop(), name=f"{robot}-orders")
                 tasks.create_task(link.drive_loop(), name=f"{robot}-drive")
+                tasks.create_task(link.look_loop(), name=f"{robot}-look")
             if self._setup.zones:
                 self._zones = ZoneLink(self._setup, clock)
                 tasks.create_task(self._zones.run(), name="zones")
@@ -405,18 +346,16 @@ class Vda5050Bridge:
         if self._zones is not None:
             self._zones.sets.on_event(name, data)
         now = 0.0 if self._clock is None else self._clock.now()
-        if name == "hello" and data["fresh"]:
-            self._places.clear()
-            for link in self._links.values():
-                link.core.forget()
-        elif name == "ready":
-            for link in self._links.values():
-                link.core.on_known(now)
-        elif name == "place":
+        if name == "place":
             if (value := data["value"]) is None:
                 self._places.pop(data["id"], None)
             else:
                 self._places[data["id"]] = Where(value["x"], value["y"], value.get("theta"))
+        elif name in ("hello", "ready", "area", "zone"):
+            if data.get("fresh"):
+                self._places.clear()
+            for link in self._links.values():
+                link.on_floor(name, now, fresh=bool(data.get("fresh")))
         elif (link_of := self._links.get(data.get("id", ""))) is not None:
             self._on_robots_event(link_of.core, name, data, now)
 

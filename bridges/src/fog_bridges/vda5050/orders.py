@@ -8,19 +8,22 @@ from __future__ import annotations
 import math
 from typing import TYPE_CHECKING, Final, NamedTuple
 
+from fog_bridges.vda5050.charging import COMMANDS, NO_DOCK, told
 from fog_bridges.vda5050.incoming import NODES_MAX
-from fog_bridges.vda5050.outgoing import EdgeState, Error, Level, NodeAt, NodeState, Reference
+from fog_bridges.vda5050.outgoing import ActionState, EdgeState, Error, Level, NodeAt, NodeState, Reference
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
 
-    from fog_bridges.vda5050.incoming import Edge, Node, Order
+    from fog_bridges.vda5050.incoming import Action, Edge, Node, Order
 
 START_M: Final = 0.3
 """So near a robot has to be to the first node of a new order that allows no deviation, or a smaller one."""
 HEADING_RAD: Final = 0.12
 """So exactly a robot of Fognav turns to a heading: no node can ask for more."""
 MISSIONS_MAX: Final = 32
+ORDER_ACTIONS_MAX: Final = 100
+"""Actions that an order may have in all: its state tells of each."""
 _SPEED_MARGIN: Final = 1e-3
 
 
@@ -42,6 +45,16 @@ class Situation(NamedTuple):
     speed: float
     """The robot's highest speed (m/s)."""
     height: float
+    has_dock: bool = False
+    is_docked: bool = False
+
+
+class Leg(NamedTuple):
+    """The path between two nodes that follow on each other, as the planner would have it now (m)."""
+
+    start: Node
+    end: Node
+    points: list[tuple[float, float]]
 
 
 def rejection(order: Order, kind: str, words: str, level: Level = "WARNING", **references: str) -> Error:
@@ -72,21 +85,50 @@ class Orders:
         self._is_ended = False
         """Whether it was cancelled or cleared: it gets no updates any more."""
         self._latest: Order | None = None
+        self.actions: dict[str, ActionState] = {}
+        """What becomes of the order's actions, by their ids."""
+        self.beyond: list[Leg] = []
+        """Paths from node to node, as they were looked for last."""
+        self._at: dict[str, int] = {}
+        """On which node each of them is to be done."""
 
     @property
     def is_idle(self) -> bool:
-        """Whether nothing lies ahead, and no horizon waits for its release."""
-        return not self.nodes and not self.edges
+        """Whether nothing lies ahead, no horizon waits for its release, and all actions are done."""
+        return not self.nodes and not self.edges and self._next_action is None
 
     @property
     def target(self) -> Node | None:
-        """The next node of the base; None: there is none, or an update is waited for."""
+        """The next node of the base; None: there is none, an update is waited for, or an action comes first."""
+        action = self._next_action
+        if action is not None and self._at[action.action_id] <= self.last_sequence:
+            return None
         return next((node for node in self.nodes if node.released), None)
+
+    @property
+    def _next_action(self) -> ActionState | None:
+        return next((each for each in self.actions.values() if each.action_status in ("WAITING", "RUNNING")), None)
+
+    @property
+    def due(self) -> ActionState | None:
+        """The action that is to be begun on the node where the robot is."""
+        action = self._next_action
+        is_due = action is not None and action.action_status == "WAITING"
+        return action if action is not None and is_due and self._at[action.action_id] <= self.last_sequence else None
 
     @property
     def wants_base(self) -> bool:
         """Whether the robot will soon stand because the horizon is not released."""
         return sum(node.released for node in self.nodes) <= 1 and any(not node.released for node in self.nodes)
+
+    def legs(self, node: Node | None) -> list[Leg]:
+        """Return the paths that lead on from a node, to nodes of the base, as far as they are known."""
+        found = []
+        for leg in self.beyond:
+            if leg.start is node and any(leg.end is each and each.released for each in self.nodes):
+                found.append(leg)
+                node = leg.end
+        return found
 
     def is_known(self, order: Order) -> bool:
         """Whether it has this very order: then a repetition of it is ignored."""
@@ -122,20 +164,25 @@ class Orders:
             words = f"an update goes on at the last released node, {node} with the sequenceId {sequence}"
             return rejection(order, "VALIDATION_FAILURE", words, nodeId=first.node_id)
         ahead = sum(node.released for node in self.nodes) + len(order.nodes) - 1
-        if ahead > NODES_MAX:
-            words = f"{ahead} nodes would lie ahead of the robot, and {NODES_MAX} may"
+        actions = len(self.actions.keys() | {action.action_id for action in _actions(order)})
+        if ahead > NODES_MAX or actions > ORDER_ACTIONS_MAX:
+            words = (
+                f"{ahead} nodes would lie ahead of the robot, and {NODES_MAX} may; of {actions} actions of an order "
+                f"{ORDER_ACTIONS_MAX} may be"
+            )
             return rejection(order, "VALIDATION_FAILURE", words)
         return None
 
     def _start_error(self, order: Order, now: Situation) -> Error | None:
-        if order.order_id == self.order_id:
-            return None
         first = order.nodes[0]
         goal = goal_of(first, now.places)
+        is_same = first.node_id == self.last_node_id
+        if order.order_id == self.order_id or (is_same and now.is_docked and now.at is not None):
+            return None  # the dock stands beside the node at which the robot began to charge
         if now.at is None:
             words = "the robot does not know where it is"
         elif goal is None:
-            if first.node_id == self.last_node_id:
+            if is_same:
                 return None
             words = f"node {first.node_id} has no position, and is no place of Fognav"
         elif math.dist(goal[:2], now.at[:2]) <= START_M or is_within(first, goal, now.at):
@@ -152,8 +199,10 @@ class Orders:
         if order.order_id == self.order_id:
             self.nodes = [node for node in self.nodes if node.released]
             self.edges = [edge for edge in self.edges if edge.released]
+            for name in [name for name in self.actions if self._at[name] > self._decision[1]]:
+                del self.actions[name]  # another horizon comes
         else:
-            self.nodes, self.edges = [], []
+            self.nodes, self.edges, self.actions, self._at = [], [], {}, {}
             self.last_node_id, self.last_sequence = order.nodes[0].node_id, order.nodes[0].sequence_id
         self.order_id, self.update_id, self._latest, self._is_ended = (
             order.order_id,
@@ -163,6 +212,11 @@ class Orders:
         )
         self.nodes += order.nodes[1:]
         self.edges += order.edges
+        for node in order.nodes:
+            for action in node.actions:
+                if action.action_id not in self.actions:  # those of the decision point may be sent again
+                    self._at[action.action_id] = node.sequence_id
+                    told(self.actions, action.action_id, action.action_type, "WAITING")
         last = [node for node in order.nodes if node.released][-1]
         self._decision = last.node_id, last.sequence_id
 
@@ -178,6 +232,9 @@ class Orders:
         """End the order; its ids stay, as the norm wants."""
         self._is_ended = self._is_ended or not self.is_idle
         self.nodes, self.edges = [], []
+        for name, each in self.actions.items():
+            if each.action_status == "WAITING":
+                told(self.actions, name, each.action_type, "FAILED", "the order ended before")
 
     def states(self) -> tuple[list[NodeState], list[EdgeState]]:
         """Return what lies ahead."""
@@ -215,6 +272,12 @@ def goal_of(node: Node, places: Mapping[str, Where]) -> Where | None:
     return places.get(node.node_id) if at is None else Where(at.x, at.y, at.theta)
 
 
+def goals_of(order: Order, places: Mapping[str, Where]) -> list[tuple[Node, Where]]:
+    """Return the nodes that an order releases anew, and where they are."""
+    found = [(node, goal_of(node, places)) for node in order.nodes[1:] if node.released]
+    return [(node, goal) for node, goal in found if goal is not None]
+
+
 def is_within(node: Node, goal: Where, at: Where) -> bool:
     """Whether a robot is within the deviation that a node allows; none is allowed where it names none."""
     position = node.node_position
@@ -234,11 +297,30 @@ def is_within(node: Node, goal: Where, at: Where) -> bool:
     return turned <= max(abs(position.allowed_deviation_theta or 0.0), HEADING_RAD)
 
 
+def _actions(order: Order) -> list[Action]:
+    return [action for node in order.nodes for action in node.actions]
+
+
+def _action_error(order: Order, now: Situation) -> Error | None:
+    on_nodes, on_edges = _actions(order), [action for edge in order.edges for action in edge.actions]
+    unknown = [action for action in on_nodes if action.action_type not in COMMANDS]
+    names = [action.action_id for action in on_nodes]
+    if wrong := on_edges + unknown:
+        words = f"a robot of Fognav does {' and '.join(COMMANDS)} on nodes, and no {wrong[0].action_type} there"
+    elif wrong := [] if now.has_dock else on_nodes:
+        words = NO_DOCK
+    elif wrong := [action for action in on_nodes if names.count(action.action_id) > 1]:
+        words = "two actions have this actionId"
+    elif wrong := on_nodes[ORDER_ACTIONS_MAX:]:
+        words = f"an order has {ORDER_ACTIONS_MAX} actions at most"
+    else:
+        return None
+    return rejection(order, "INVALID_ORDER_ACTION", words, actionId=wrong[0].action_id)
+
+
 def _content_error(order: Order, now: Situation) -> Error | None:
-    parts: list[Node | Edge] = [*order.nodes, *order.edges]
-    if (action := next((action for part in parts for action in part.actions), None)) is not None:
-        words = f"a robot of Fognav drives, and does no action such as {action.action_type}"
-        return rejection(order, "INVALID_ORDER_ACTION", words, actionId=action.action_id)
+    if (error := _action_error(order, now)) is not None:
+        return error
     maps = {node.node_position.map_id for node in order.nodes if node.node_position is not None}
     if unknown := sorted(maps - {now.map_id}):
         return rejection(order, "UNKNOWN_MAP_ID", f"there is no map {unknown[0]}, only {now.map_id}", mapId=unknown[0])

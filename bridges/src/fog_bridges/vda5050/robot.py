@@ -12,14 +12,16 @@ from typing import TYPE_CHECKING, Any, Final, Literal
 from uuid import uuid4
 
 from fog_bridges.floor import Request
+from fog_bridges.vda5050.charging import UNCERTAIN, Charging, drop_done, remember_action
+from fog_bridges.vda5050.control import Doings, mode_of
 from fog_bridges.vda5050.orders import Orders, Situation, Where, about_error, goal_of, is_within, remember
-from fog_bridges.vda5050.outgoing import ActionState, Error, OperatingMode
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
 
     from fog_bridges.floor import Answer
     from fog_bridges.vda5050.incoming import Action, InstantActions, MessageError, Node, Order
+    from fog_bridges.vda5050.outgoing import ActionState, Error, OperatingMode
 
 SPEED_M_S: Final = 0.3
 """The highest speed of a robot of Fognav."""
@@ -34,14 +36,8 @@ TAKEN_S: Final = 2.0
 """How long the operating mode says that an operator has ended a mission."""
 STILL: Final = (0.01, 0.05)
 """A robot that moves no faster (m/s, rad/s) stands."""
-INSTANT_MAX: Final = 50
 Wish = Literal["state", "factsheet"]
 """What is to be published as an instant action asks for it."""
-_UNCERTAIN: Final = ("", "service_silent", "store_uncertain")
-"""Problems of requests that may have been carried out."""
-_BY_HAND: Final = {
-    "TELEOP": "it is driven by hand", "DOCK": "it docks", "EGRESS": "it leaves a blocked area on an operator's command",
-}  # fmt: skip
 
 
 class FleetRobot:
@@ -51,6 +47,7 @@ class FleetRobot:
         self.robot = robot
         self.map_id = map_id
         self.orders = Orders()
+        self.charging = Charging(robot)
         self.view: dict[str, Any] = {"state": None, "goal": None}
         self.pose: dict[str, Any] | None = None
         self.path: list[tuple[float, float]] = []
@@ -150,10 +147,15 @@ class FleetRobot:
     def _may_be_own(self, goal: dict[str, Any]) -> bool:
         """Whether a mission that is shown may be the one that the fleet asks for, whose id is not known yet."""
         request, _ = self._unsure or (self._asking, None)
-        if request is None or request.body is None:
+        if request is None or request.method != "PUT" or request.body is None:
             return False
         wanted, found = request.body["pose"], goal["pose"]
         return math.dist((wanted["x"], wanted["y"]), (found["x"], found["y"])) < 0.01
+
+    @property
+    def has_dock(self) -> bool:
+        """Whether the site gives the robot a dock."""
+        return self.view.get("dock") is not None
 
     @property
     def is_driving(self) -> bool:
@@ -162,22 +164,11 @@ class FleetRobot:
 
     def mode(self, now: float) -> tuple[OperatingMode, str]:
         """Return the operating mode, and in words why the fleet is not in control; empty if it is."""
-        state, goal, out = self.state, self.view["goal"], self.view.get("out_of_service")
-        if not state:
-            return "STARTUP", "it has not told its state yet"
-        is_foreign = goal is not None and goal["goal_id"] not in self._own and not self._may_be_own(goal)
-        waits = bool(state.get("awaits_operator")) or not state["enabled"]
-        reasons: tuple[tuple[bool, OperatingMode, str], ...] = (
-            (out is not None, "SERVICE", f"an operator has taken it out of service: {(out or {}).get('reason')}"),
-            (is_foreign, "MANUAL", "it has a mission of an operator of Fognav"),
-            (state["mode"] == "INIT", "STARTUP", "it is starting, and does not know where it is"),
-            (state["mode"] in _BY_HAND, "MANUAL", _BY_HAND.get(state["mode"], "")),
-            (bool(state.get("wants_dock")), "MANUAL", "it is on its way to its dock"),
-            (bool(state.get("docked")), "MANUAL", "it stands on its dock: an operator of Fognav undocks it"),
-            (waits, "MANUAL", "it waits for an operator of Fognav, who enables it"),
-            (now < self._taken_until, "MANUAL", "an operator of Fognav has ended its mission"),
-        )
-        return next(((mode, words) for holds, mode, words in reasons if holds), ("AUTOMATIC", ""))
+        goal = self.view["goal"]
+        is_own = goal is None or goal["goal_id"] in self._own or self._may_be_own(goal)
+        is_foreign = not is_own and not self.charging.is_way(self.view)
+        doings = Doings(is_foreign, bool(self._goal), self.charging.kind, now < self._taken_until)
+        return mode_of(self.view, doings)
 
     # --- Orders -------------------------------------------------------------------------------------------------------
 
@@ -187,8 +178,11 @@ class FleetRobot:
         unavailable = "" if mode == "AUTOMATIC" else f"the fleet is not in control ({mode}): {words}"
         if not self.is_known or not self.is_there(now):
             unavailable = "the robot is not there"
+        elif self.charging.kind and self.orders.is_idle:
+            unavailable = unavailable or f"{self.charging.kind} comes first: cancelOrder ends it"
         height = 0.0 if self.pose is None else self.pose["height"]
-        return Situation(unavailable, self.at, self.map_id, self.places, SPEED_M_S, height)
+        dock = self.has_dock, bool(self.state.get("docked"))
+        return Situation(unavailable, self.at, self.map_id, self.places, SPEED_M_S, height, *dock)
 
     def checked(self, order: Order, now: float) -> Error | None:
         """Return why an order is rejected by what is known here, and remember that for the state."""
@@ -196,11 +190,6 @@ class FleetRobot:
         if error is not None:
             self.reject(error)
         return error
-
-    def goals(self, order: Order) -> list[tuple[Node, Where]]:
-        """Return the nodes that an order releases anew, and where they are."""
-        found = [(node, goal_of(node, self.places)) for node in order.nodes[1:] if node.released]
-        return [(node, goal) for node, goal in found if goal is not None]
 
     def accept(self, order: Order) -> None:
         """Take over an order."""
@@ -241,7 +230,7 @@ class FleetRobot:
                     self._instant_error = None
             else:
                 kind, words = refused
-                self._set(action.action_id, action.action_type, "FAILED", words)
+                remember_action(self.instant, action.action_id, action.action_type, "FAILED", words)
                 self._instant_error = about_error(kind, words, {"actionId": action.action_id})
         self.advance(now)
         return wishes
@@ -249,44 +238,44 @@ class FleetRobot:
     def _act(self, action: Action, now: float, wishes: list[Wish]) -> tuple[str, str] | None:
         """Carry out an action; return error type and words of why that can't be."""
         kind, mode = action.action_type, self.mode(now)
-        if kind in ("stateRequest", "factsheetRequest"):
+        if kind in ("stateRequest", "factsheetRequest", "clearInstantActions"):
             wishes += ["factsheet"] if kind == "factsheetRequest" else []
-            self._set(action.action_id, kind, "FINISHED")
-        elif kind == "clearInstantActions":
-            self.instant = {name: each for name, each in self.instant.items() if each.action_status == "RUNNING"}
-            self._set(action.action_id, kind, "FINISHED")
+            if kind == "clearInstantActions":
+                drop_done(self.instant)
+            remember_action(self.instant, action.action_id, kind, "FINISHED")
         elif kind == "cancelOrder":
             if not self._cancel(action.parameter("orderId")):
                 return "NO_ORDER_TO_CANCEL", "there is no such active order"
-            self._set(action.action_id, kind, "RUNNING")
+            remember_action(self.instant, action.action_id, kind, "RUNNING")
         elif kind in ("startPause", "stopPause"):
             if mode[0] != "AUTOMATIC":
                 return "INVALID_INSTANT_ACTION", f"the fleet is not in control: {mode[1]}"
-            self.paused = kind == "startPause"
-            for name, each in list(self.instant.items()):
-                if not self.paused and each.action_type == "startPause" and each.action_status == "RUNNING":
-                    self._set(name, each.action_type, "FAILED", "stopPause came first")
-            self._set(action.action_id, kind, "RUNNING" if self.paused else "FINISHED")
+            self._pause(action)
         else:
-            return "INVALID_INSTANT_ACTION", f"a robot of Fognav can't {kind[:60]}"
+            is_ordered = self.pending is not None or not self.orders.is_idle
+            if words := self.charging.why_not(kind, mode, has_dock=self.has_dock, is_ordered=is_ordered):
+                return "INVALID_INSTANT_ACTION", words
+            remember_action(self.instant, action.action_id, kind, "RUNNING")
+            self.charging.begin(self.instant, action.action_id, kind)
         return None
+
+    def _pause(self, action: Action) -> None:
+        self.paused = action.action_type == "startPause"
+        for name, each in list(self.instant.items()):
+            if not self.paused and each.action_type == "startPause" and each.action_status == "RUNNING":
+                remember_action(self.instant, name, each.action_type, "FAILED", "stopPause came first")
+        remember_action(self.instant, action.action_id, action.action_type, "RUNNING" if self.paused else "FINISHED")
 
     def _cancel(self, wanted: object) -> bool:
         """End the orders of an id, or all (None); return whether there were any."""
         waiting, active = self.waiting, self.orders.order_id if self.pending is None else self.pending.order_id
         self.waiting = [order for order in waiting if wanted not in (None, order.order_id)]
-        is_active = (self.pending is not None or not self.orders.is_idle) and wanted in (None, active)
-        if is_active:
+        is_busy = self.pending is not None or not self.orders.is_idle or bool(self.charging.kind)
+        if is_active := is_busy and wanted in (None, active):
             self.pending = self._unreachable = None
             self.orders.clear()
+            self.charging.cancel()
         return is_active or len(self.waiting) < len(waiting)
-
-    def _set(self, name: str, kind: str, status: Literal["RUNNING", "FINISHED", "FAILED"], result: str = "") -> None:
-        self.instant.pop(name, None)
-        self.instant[name] = ActionState(action_id=name, action_type=kind, action_status=status, action_result=result)
-        if len(self.instant) > INSTANT_MAX:
-            done = (key for key, each in self.instant.items() if each.action_status != "RUNNING")
-            self.instant.pop(next(done, next(iter(self.instant))))
 
     # --- The mission that the order needs -----------------------------------------------------------------------------
 
@@ -295,9 +284,11 @@ class FleetRobot:
         if not self.is_known or not self.state:
             return
         self._judge(now)
-        mode, _ = self.mode(now)
+        self.charging.advance(self.state, now)
+        mode, words = self.mode(now)
         if mode != "AUTOMATIC":
             self.orders.clear()
+            self.charging.end("FAILED", f"the fleet is not in control: {words}")
             self.paused, self.pending = False, None
         else:
             self._unavailable = None
@@ -305,10 +296,13 @@ class FleetRobot:
             self.orders.last_node_id = ""
         self._mode = mode
         self._pass_nodes()
-        if not self.is_driving and not self._goal and not self._is_asking:
+        if (due := self.orders.due) is not None and not self.paused and not self.charging.kind:
+            self.charging.begin(self.orders.actions, due.action_id, due.action_type)
+            self.charging.advance(self.state, now)
+        if not self.is_driving and not self._goal and not self._is_asking and not self.charging.kind:
             for name, each in list(self.instant.items()):
                 if each.action_status == "RUNNING":
-                    self._set(name, each.action_type, "FINISHED")
+                    remember_action(self.instant, name, each.action_type, "FINISHED")
 
     def _judge(self, now: float) -> None:
         """Find out whether the mission was reached, or ended by somebody else: only the robot's word is proof.
@@ -361,7 +355,7 @@ class FleetRobot:
         while (node := self.orders.target) is not None and self.at is not None and not self.paused:
             goal = goal_of(node, self.places)
             follows = any(each.released and each.sequence_id > node.sequence_id for each in self.orders.nodes)
-            if goal is None or not follows or not is_within(node, goal, self.at):
+            if goal is None or not follows or node.actions or not is_within(node, goal, self.at):
                 return
             self.orders.traversed(node.sequence_id)
 
@@ -381,7 +375,8 @@ class FleetRobot:
         path = f"/api/v1/robots/{self.robot}/goal"
         if node is None or goal is None:
             if not self._goal:
-                return None
+                request = None if self._unsure is not None else self.charging.request(self.view, now)
+                return None if request is None else self._ask(request, None, now)
             return self._ask(Request("DELETE", path, headers={"If-Match": f'"{self._goal}"'}), None, now)
         if not self.state or (self._goal and self._goal_node is node):
             return None
@@ -415,6 +410,13 @@ class FleetRobot:
         self._asking = None
         if request is None:
             return
+        if self._goal or request.method == "PUT":
+            self._on_answer(request, node, answer, now, again=again)
+        else:
+            self.charging.on_answer(request, answer)
+        self.advance(now)
+
+    def _on_answer(self, request: Request, node: Node | None, answer: Answer, now: float, *, again: bool) -> None:
         # Of an order that goes on it has to be known who ended its mission: an operator ends the order.
         is_gone = answer.problem in ("no_mission", "mission_changed") and (self.orders.is_idle or again)
         if request.method == "PUT" or not answer.refusal:
@@ -432,17 +434,15 @@ class FleetRobot:
                 self._give_up(node, answer.refusal)
         else:
             self._retry_at = now + RETRY_S
-            if request.method == "PUT" and answer.problem in _UNCERTAIN:
+            if request.method == "PUT" and answer.problem in UNCERTAIN:
                 self._unsure = request, node
         if request.method == "PUT" and again and answer.refusal and self._unsure is None:
             self._unsure = request, None  # the repetition was refused, and the first one may have been accepted
-        self.advance(now)
 
     @property
-    def goal_node(self) -> str:
-        """The node that the robot drives to; empty if it drives to none."""
-        node = self._ahead(self._goal_node) if self._goal else None
-        return "" if node is None else node.node_id
+    def goal_node(self) -> Node | None:
+        """The node that the robot drives to, if it drives to one."""
+        return self._ahead(self._goal_node) if self._goal else None
 
     def errors(self) -> list[Error]:
         """Return what the fleet has to know of its messages."""

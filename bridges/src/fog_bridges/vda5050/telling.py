@@ -9,8 +9,9 @@ from typing import TYPE_CHECKING, Any, Final
 from msgspec import UNSET, structs
 
 from fog_bridges.vda5050 import outgoing as out
+from fog_bridges.vda5050.charging import COMMANDS, INSTANT_MAX, START
 from fog_bridges.vda5050.incoming import ACTIONS_MAX, ID_MAX, MESSAGE_MAX, NODES_MAX
-from fog_bridges.vda5050.robot import INSTANT_MAX, SPEED_M_S
+from fog_bridges.vda5050.robot import SPEED_M_S
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -53,7 +54,7 @@ def state(robot: FleetRobot, now: float, stamp: float) -> out.State:
         driving=robot.is_driving,
         paused=robot.paused,
         new_base_request=orders.wants_base,
-        action_states=[],
+        action_states=list(orders.actions.values()),
         instant_action_states=list(robot.instant.values()),
         power_supply=_power(told),
         operating_mode=mode,
@@ -90,7 +91,11 @@ def _picture(robot: FleetRobot, stamp: float) -> out.Visualization:
         return out.Visualization(reference_state_header_id=0)
     spread = 2.0 * math.sqrt(max(pose["covariance"][0], pose["covariance"][4], 0.0))
     theta = (pose["theta"] + math.pi) % math.tau - math.pi
-    path = _ahead(robot.path, (pose["x"], pose["y"])) if robot.goal_node else []
+    goal = robot.goal_node
+    path = _ahead(robot.path, (pose["x"], pose["y"])) if goal is not None else []
+    legs = robot.orders.legs(goal) if path else []
+    nodes = [node.node_id for node in (goal, *(leg.end for leg in legs)) if node is not None]
+    whole = path + [point for leg in legs for point in leg.points[1:]]
     return out.Visualization(
         reference_state_header_id=0,
         mobile_robot_position=out.Position(
@@ -98,7 +103,7 @@ def _picture(robot: FleetRobot, stamp: float) -> out.Visualization:
             localized=pose["localized"], deviation_range=round(spread, 3),
         ),
         velocity=out.Velocity(vx=round(pose["v"], 3), vy=0.0, omega=round(pose["w"], 3)),
-        planned_path=planned(path, robot.goal_node) if path else UNSET,
+        planned_path=planned(whole, nodes) if path else UNSET,
         intermediate_path=_next_metres(path, stamp) if path else UNSET,
     )  # fmt: skip
 
@@ -117,8 +122,8 @@ def _ahead(path: Sequence[tuple[float, float]], at: tuple[float, float]) -> list
     return [at, *rest] if rest else []
 
 
-def planned(path: Sequence[tuple[float, float]], node: str) -> out.PlannedPath:
-    """Return a polyline as a NURBS of degree 1: its knots are the shares of its length at its corners."""
+def planned(path: Sequence[tuple[float, float]], nodes: list[str]) -> out.PlannedPath:
+    """Return a polyline to `nodes` as a NURBS of degree 1: its knots are the shares of its length at its corners."""
     lengths = [0.0]
     for a, b in pairwise(path):
         lengths.append(lengths[-1] + math.dist(a, b))
@@ -130,7 +135,7 @@ def planned(path: Sequence[tuple[float, float]], node: str) -> out.PlannedPath:
             knot_vector=[0.0, 0.0, *inner, 1.0, 1.0],
             control_points=[out.Point(x=round(x, 3), y=round(y, 3)) for x, y in path],
         ),
-        traversed_nodes=[node],
+        traversed_nodes=nodes,
     )
 
 
@@ -192,8 +197,8 @@ def factsheet(robot: FleetRobot, version: Version) -> dict[str, Any]:
     pose = robot.pose or {"radius": 0.17, "height": 0.1}
     width, height = round(2.0 * pose["radius"], 3), pose["height"]
     is_new = version == "3.0"
-    lengths = {"order.nodes": NODES_MAX, "order.edges": NODES_MAX - 1, "node.actions": 0, "edge.actions": 0,
-               "instantActions": ACTIONS_MAX}  # fmt: skip
+    lengths = {"order.nodes": NODES_MAX, "order.edges": NODES_MAX - 1, "edge.actions": 0,
+               "node.actions": ACTIONS_MAX if robot.has_dock else 0, "instantActions": ACTIONS_MAX}  # fmt: skip
     if is_new:
         lengths["state.instantActionStates"] = INSTANT_MAX
     timing = {"defaultStateInterval": STATE_S, "visualizationInterval": VISUALIZATION_S}
@@ -202,6 +207,12 @@ def factsheet(robot: FleetRobot, version: Version) -> dict[str, Any]:
         | ({"blockingTypes": ["NONE"], "pauseAllowed": False, "cancelAllowed": False} if is_new else {})
         for kind, parameters in ACTIONS
         if is_new or kind != "clearInstantActions"
+    ]
+    actions += [
+        {"actionType": kind, "actionScopes": ["INSTANT", "NODE"], "actionParameters": []}
+        | ({"blockingTypes": ["HARD"], "pauseAllowed": False, "cancelAllowed": kind == START} if is_new else {})
+        for kind in COMMANDS
+        if robot.has_dock
     ]
     kind = {"seriesName": "Fognav", "localizationTypes": ["NATURAL"]}
     load: dict[str, Any] = {"loadPositions": [], "loadSets": []}

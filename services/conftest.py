@@ -308,9 +308,13 @@ class Fog:
 
 
 class Proxy:
-    """Connects clients to a server, until it is cut: then nothing passes, and nobody is told."""
+    """Connects clients to a server, until it is cut: then nothing passes, and nobody is told.
+
+    What comes while `delay_s` is set passes that much later, in its order, each way.
+    """
 
     def __init__(self, port: int) -> None:
+        self.delay_s = 0.0
         self._target = port
         self._server: asyncio.Server | None = None
         self._through = asyncio.Event()
@@ -359,9 +363,28 @@ class Proxy:
             self._tasks.add(asyncio.create_task(self._pump(source, sink)))
 
     async def _pump(self, source: asyncio.StreamReader, sink: asyncio.StreamWriter) -> None:
+        late: asyncio.Queue[tuple[float, bytes]] = asyncio.Queue()
+        passing = asyncio.create_task(self._pass_on(late, sink))
         try:
             while data := await source.read(65536):
+                late.put_nowait((time.monotonic() + self.delay_s, data))
+        except OSError:
+            pass
+        finally:
+            late.put_nowait((0.0, b""))
+            try:
+                await passing
+            finally:
+                passing.cancel()
+
+    async def _pass_on(self, late: asyncio.Queue[tuple[float, bytes]], sink: asyncio.StreamWriter) -> None:
+        try:
+            while True:
+                due, data = await late.get()
+                await asyncio.sleep(max(0.0, due - time.monotonic()))
                 await self._through.wait()
+                if not data:
+                    return
                 sink.write(data)
                 await sink.drain()
         except OSError:

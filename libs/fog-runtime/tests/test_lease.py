@@ -4,6 +4,7 @@
 """
 
 import contextlib
+import itertools
 import math
 import os
 
@@ -14,10 +15,13 @@ from hypothesis.stateful import RuleBasedStateMachine, initialize, invariant, ru
 from lease_model import LEASE_S, LeaseModel
 
 from fog_contracts.handlers import HEARD_LIMIT, MOST_AHEAD, Fence, RefusedMessageError
-from fog_runtime.lease import CUT_OFF_S, HEARSAY_PAUSE_S, Granted, Held, Lease, LeftToOther
+from fog_runtime.lease import CUT_OFF_S, HANDED_PAUSE_S, HEARSAY_PAUSE_S, Granted, Held, Lease, LeftToOther
+from fog_runtime.punctuality import Punctuality
 
 ATTEMPT_S, STEP_S, PROBE_S = 0.4, 0.05, 0.2
 TAKEOVER_S = 2.0
+QUESTION_S = 0.1
+DEATHS = ("crash", "stop", "cut", "needs", "late", "lost")
 
 
 def leading(epoch: int = 5, at: float = 0.0) -> Lease:
@@ -201,7 +205,7 @@ def test_leader_without_answers_asks_redis_at_once_whether_another_is_ready_and_
     assert lease.request(100.99) is None
     request = lease.request(101.05)
     assert (request.ready, request.cut_off) == (False, True)
-    lease.on_reply(request, LeftToOther(), 101.06)
+    lease.on_reply(request, LeftToOther("cut off", "b"), 101.06)
     assert lease.permission(101.06) == "refused"
     assert lease.request(101.1) is None, "the other one comes first"
 
@@ -227,6 +231,27 @@ def test_leader_without_answers_goes_on_while_nobody_else_is_ready():
         now = 101.1 + 0.3 * step
         lease.on_reply(lease.request(now), Granted(5), now + 0.01)
         assert (lease.epoch, lease.permission(now + 0.02)) == (5, "granted")
+
+
+def test_standby_that_finds_the_leader_late_says_so_at_once_and_asks_more_often_until_the_leader_has_gone():
+    lease = Lease("a", 100.0)
+    lease.on_answer(100.0)
+    lease.on_reply(lease.request(100.0), Held(5, "b", 1.2), 100.01)
+    assert lease.request(100.1) is None
+    lease.judge(5, 100.1)
+    assert lease.request(100.1).late == 5
+    lease.judge(5, 100.15)
+    assert lease.request(100.15) is None
+    assert lease.request(100.21).late == 5
+    lease.judge(0, 100.25)
+    assert lease.request(100.4).late == 0
+
+
+def test_leader_judges_nobody():
+    lease = leading(5, at=100.0)
+    lease.judge(5, 100.1)
+    assert lease.request(100.1) is None
+    assert lease.request(100.3).late == 0
 
 
 def without_redis(lease: Lease, begin: float, end: float, *, connected: bool = True, proposal: int = 1000) -> None:
@@ -323,6 +348,11 @@ class Process:
         self.pending = None
         """The request on its way: (request, when it reaches Redis or None, reply, when the reply is here)."""
         self.inbox: list[tuple[int, str]] = []
+        self.slow_s = 0.0
+        """How long its answers take; infinite: they are lost."""
+        self.leaders, self.own = Punctuality(), Punctuality()
+        self.answers: list[tuple[float, int, float]] = []
+        """Answers on their way to this process: when they arrive, of which epoch, to the question of when."""
 
     def clock(self, now: float) -> float:
         return now * self.rate + self.offset
@@ -372,6 +402,10 @@ class Cluster(RuleBasedStateMachine):
     def cut_from_needs(self, which, cut):
         self.processes[which].needs_cut = cut
 
+    @rule(which=st.integers(0, 2), seconds=st.sampled_from([0.0, 0.1, 0.3, 0.6, math.inf]))
+    def slow(self, which, seconds):
+        self.processes[which].slow_s = seconds
+
     @rule(up=st.booleans(), lost=st.booleans())
     def redis_restarts(self, up, lost):
         self.redis_up = up
@@ -394,7 +428,7 @@ class Cluster(RuleBasedStateMachine):
         self.redis_up, self.delay = True, 0.0
         for process in self.processes:
             process.redis_cut = process.network_cut = process.needs_cut = False
-            process.stopped_until = -1.0
+            process.stopped_until, process.slow_s = -1.0, 0.0
         for _ in range(round(2 * TAKEOVER_S / STEP_S)):
             self.step()
         for _ in range(round((HEARSAY_PAUSE_S + 2 * TAKEOVER_S) / STEP_S)):
@@ -407,9 +441,9 @@ class Cluster(RuleBasedStateMachine):
         assert leaders[0].lease.confirmed
         assert self.accepted[-1][0] > self.now - 2 * STEP_S
 
-    @rule(death=st.sampled_from(["crash", "stop", "cut", "needs"]), steps=st.integers(0, 7), awake=st.booleans())
+    @rule(death=st.sampled_from(DEATHS), steps=st.integers(0, 7), awake=st.booleans())
     def takeover(self, death, steps, awake):
-        """After the leader's death, hang or partition another one's messages are accepted within 2 s."""
+        """After the leader's death, hang, partition or slowness another one's messages are accepted within 2 s."""
         self.heal()
         for _ in range(steps):
             self.step()
@@ -421,6 +455,9 @@ class Cluster(RuleBasedStateMachine):
             leader.stopped_until = self.now + 10.0
         elif death == "needs":
             leader.needs_cut = True
+        elif death in ("late", "lost"):
+            self.redis.handed.clear()  # as if the last one was long ago
+            leader.slow_s = 0.5 if death == "late" else math.inf
         else:
             leader.redis_cut = leader.network_cut = True
         while self.highest == old:
@@ -449,14 +486,57 @@ class Cluster(RuleBasedStateMachine):
         assert self.accepted[-1][0] > self.now - 2 * STEP_S
         self.heal()
 
+    @rule(seconds=st.sampled_from([0.3, 0.6, math.inf]))
+    def all_are_slow(self, seconds):
+        """A late leader goes on if the others are as slow."""
+        self.heal()
+        for process in self.processes:
+            process.slow_s = seconds
+        old = self.highest
+        for _ in range(round(3.0 / STEP_S)):
+            self.step()
+        assert self.highest == old
+        self.heal()
+
     # --- The world ---
 
     def step(self) -> None:
         self.now = round(self.now + STEP_S, 6)
+        if round(self.now / STEP_S) % round(QUESTION_S / STEP_S) == 0:
+            self.question()
         for process in self.processes:
             self.transport(process)
             if self.now >= process.stopped_until:
                 self.loop(process)
+
+    def question(self) -> None:
+        """Let all hear the map's heartbeat, and answer it: the leader aloud, the others for themselves."""
+        for process in self.processes:
+            if self.now < process.stopped_until:
+                continue
+            clock, question = process.clock(self.now), (1, self.now)
+            process.leaders.on_question(question, clock)
+            process.own.on_question(question, clock)
+            answered = self.now + process.slow_s
+            process.answers.append((answered, 0, self.now))
+            if process.lease.permission(clock) == "granted" and not process.network_cut:
+                others = [other for other in self.processes if other is not process and not other.network_cut]
+                for other in others:
+                    other.answers.append((answered, process.lease.epoch, self.now))
+
+    def judge(self, process: Process, clock: float) -> None:
+        """Let a process judge the leader, as `Leadership` does."""
+        lease = process.lease
+        epoch = 0 if lease.epoch or lease.leader is None else lease.leader.epoch
+        process.leaders.follow(epoch)
+        for at, answering, asked in process.answers:
+            if at <= self.now and answering == 0:
+                process.own.on_answer((1, asked), clock)
+            elif at <= self.now and answering == epoch:
+                process.leaders.on_answer((1, asked), clock)
+        process.answers = [answer for answer in process.answers if answer[0] > self.now]
+        late = process.leaders.is_late(clock) and process.own.is_quick(clock)
+        lease.judge(epoch if late else 0, clock)
 
     def transport(self, process: Process) -> None:
         """Let a request reach Redis, which answers also who does not run."""
@@ -486,6 +566,7 @@ class Cluster(RuleBasedStateMachine):
                 lease.on_leader(epoch, holder, clock)
             lease.on_hearsay(self.highest)  # the robots' states tell it
         process.inbox.clear()
+        self.judge(process, clock)
         if not process.needs_cut and self.now >= process.answered_at + PROBE_S:
             process.answered_at = self.now
             lease.on_answer(clock)
@@ -525,6 +606,12 @@ class Cluster(RuleBasedStateMachine):
             and self.now >= other.stopped_until
             and self.now - self.lost_at > LEASE_S
         )
+
+    @invariant()
+    def leases_of_late_leaders_change_hands_seldom(self):
+        handed = getattr(self, "redis", LeaseModel()).handed
+        pauses = [after - before for before, after in itertools.pairwise(handed)]
+        assert all(pause >= HANDED_PAUSE_S * 2**times for times, pause in enumerate(pauses))
 
     @invariant()
     def receiver_never_goes_back(self):

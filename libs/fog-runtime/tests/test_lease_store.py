@@ -9,9 +9,19 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from lease_model import LeaseModel
 
-from fog_runtime import leadership
-from fog_runtime.leadership import LeaseStore
-from fog_runtime.lease import ATTEMPT_S, LEASE_S, READY_SAID_S, Granted, Held, LeftToOther, Request
+from fog_runtime import lease_store
+from fog_runtime.lease import (
+    ATTEMPT_S,
+    HANDED_KNOWN_S,
+    HANDED_PAUSE_S,
+    LEASE_S,
+    READY_SAID_S,
+    Granted,
+    Held,
+    LeftToOther,
+    Request,
+)
+from fog_runtime.lease_store import LeaseStore
 from fog_supervisor.servers import Server, start_redis
 
 pytestmark = pytest.mark.live
@@ -30,7 +40,7 @@ SLOWER = 500.0
 def no_haste(monkeypatch: pytest.MonkeyPatch) -> None:
     """Let nothing end while a test runs, however slowly: what has to end, the test ends itself (`expire`)."""
     for name, seconds in (("ATTEMPT_S", ATTEMPT_S), ("LEASE_S", LEASE_S), ("READY_SAID_S", READY_SAID_S)):
-        monkeypatch.setattr(leadership, name, SLOWER * seconds)
+        monkeypatch.setattr(lease_store, name, SLOWER * seconds)
 
 
 async def expire(store: LeaseStore, key: str, after_s: float) -> None:
@@ -43,9 +53,10 @@ async def expire(store: LeaseStore, key: str, after_s: float) -> None:
 NEW = Request(epoch=0, floor=0, confirmed=False, sent_at=0.0)
 STEPS = st.lists(
     st.tuples(
-        st.sampled_from(["a", "b", "expire", "unready", "forget"]),
+        st.sampled_from(["a", "b", "expire", "unready", "forget", "pause"]),
         st.integers(0, 6),
         st.integers(0, 8),
+        st.booleans(),
         st.booleans(),
         st.booleans(),
         st.booleans(),
@@ -57,7 +68,7 @@ STEPS = st.lists(
 @settings(max_examples=40, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(steps=STEPS)
 def test_redis_decides_as_the_model_does(redis: Server, steps, monkeypatch):
-    monkeypatch.setattr("fog_runtime.leadership._now_ms", lambda: 3)
+    monkeypatch.setattr("fog_runtime.lease_store._now_ms", lambda: 3)
     asyncio.run(compare(redis, steps))
 
 
@@ -65,22 +76,27 @@ async def compare(redis: Server, steps) -> None:
     expected = LeaseModel()
     async with LeaseStore(redis.url, "test", "planner") as store:
         await store._redis.write(("FLUSHALL",))
-        for who, epoch, floor, confirmed, ready, cut_off in steps:
+        for who, epoch, floor, confirmed, ready, cut_off, late in steps:
             if who == "expire":
                 await store._redis.write(("DEL", "fog:test:planner:lease"))
                 expected.lease = None
             elif who == "unready":
                 await store._redis.write(("DEL", "fog:test:planner:ready"))
                 expected.ready = None
+            elif who == "pause":
+                await store._redis.write(("DEL", "fog:test:planner:handed"))
+                expected.handed.clear()
             elif who == "forget":
                 await store._redis.write(("FLUSHALL",))
-                expected.lease, expected.stored, expected.floor, expected.ready = None, 0, 0, None
+                expected = LeaseModel()
             else:
-                request = Request(epoch, floor, confirmed, 0.0, ready=ready, cut_off=cut_off)
+                held = expected.lease[0] if expected.lease is not None and late else 0
+                request = Request(epoch, floor, confirmed, 0.0, ready=ready, cut_off=cut_off, late=held)
                 reply, wanted = await store.acquire(who, request), expected.acquire(who, request, 0.0, clock=3)
                 assert type(reply) is type(wanted)
                 assert reply is not None
                 if isinstance(reply, LeftToOther):
+                    assert reply == wanted
                     continue
                 assert reply.epoch == wanted.epoch
                 if isinstance(reply, Held):
@@ -125,14 +141,43 @@ async def test_lease_of_a_leader_that_is_cut_off_goes_to_a_copy_that_says_it_is_
         assert isinstance(await store.acquire("b", unready), Held)
         assert await store.acquire("a", lost) == first, "nobody else is ready"
         assert isinstance(await store.acquire("b", NEW), Held)
-        assert await store.acquire("a", lost) == LeftToOther()
-        assert await store.acquire("a", lost) == LeftToOther(), "it does not come between"
+        left = LeftToOther("cut off", "b")
+        assert await store.acquire("a", lost) == left
+        assert await store.acquire("a", lost) == left, "it does not come between"
         taken = await store.acquire("b", NEW)
         assert isinstance(taken, Granted)
         assert taken.epoch > first.epoch
         assert isinstance(await store.acquire("a", NEW), Held)
         await expire(store, "fog:ready:planner:ready", SLOWER * READY_SAID_S)
         assert await store.acquire("b", replace(lost, epoch=taken.epoch)) == taken
+
+
+async def test_late_leader_leaves_its_lease_to_who_says_so_and_the_next_one_not_before_the_pause_has_passed(
+    redis: Server,
+):
+    async with LeaseStore(redis.url, "late", "planner") as store:
+        first = await store.acquire("a", NEW)
+        assert isinstance(first, Granted)
+        renewal = Request(first.epoch, 0, confirmed=True, sent_at=0.0)
+        assert isinstance(await store.acquire("b", replace(NEW, late=first.epoch - 1)), Held)
+        assert await store.acquire("a", renewal) == first, "an earlier leader was late"
+        assert isinstance(await store.acquire("b", replace(NEW, late=first.epoch, ready=False)), Held)
+        assert await store.acquire("a", renewal) == first, "who says so could not take over"
+        assert isinstance(await store.acquire("b", replace(NEW, late=first.epoch)), Held)
+        assert await store.acquire("a", renewal) == LeftToOther("late", "b")
+        for holder, other, handed in (("b", "a", 1), ("a", "b", 2)):
+            taken = await store.acquire(holder, NEW)
+            assert isinstance(taken, Granted)
+            assert isinstance(await store.acquire(other, replace(NEW, late=taken.epoch)), Held)
+            renewal = Request(taken.epoch, 0, confirmed=True, sent_at=0.0)
+            assert await store.acquire(holder, renewal) == taken, "too soon"
+            pause_ms = round(1000 * HANDED_PAUSE_S * 2 ** (handed - 1))
+            await store._redis.write(
+                ("PEXPIRE", "fog:late:planner:handed", round(1000 * HANDED_KNOWN_S) - pause_ms + 5000)
+            )
+            assert await store.acquire(holder, renewal) == taken, "5 s too soon"
+            await store._redis.write(("PEXPIRE", "fog:late:planner:handed", round(1000 * HANDED_KNOWN_S) - pause_ms))
+            assert await store.acquire(holder, renewal) == LeftToOther("late", other)
 
 
 async def test_released_lease_is_free_at_once_and_nobody_releases_that_of_another(redis: Server):
@@ -149,7 +194,7 @@ async def test_redis_that_hangs_or_is_away_gives_no_reply_in_time(tmp_path: Path
         async with LeaseStore(server.url, "away", "planner") as store:
             assert await store.acquire("a", NEW) is not None
             await store._redis.write(("CLIENT", "PAUSE", 600_000))
-            monkeypatch.setattr(leadership, "ATTEMPT_S", ATTEMPT_S)
+            monkeypatch.setattr(lease_store, "ATTEMPT_S", ATTEMPT_S)
             began = asyncio.get_running_loop().time()
             assert await store.acquire("a", NEW) is None
             assert asyncio.get_running_loop().time() - began >= ATTEMPT_S * 0.9

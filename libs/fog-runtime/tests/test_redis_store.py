@@ -7,8 +7,8 @@ import pytest
 from redis.asyncio import Redis
 
 from fog_contracts.messages import Message
-from fog_runtime.leadership import LeaseStore
 from fog_runtime.lease import Request
+from fog_runtime.lease_store import LeaseStore
 from fog_runtime.stores.redis_connection import StoreError, StoreRefusedError
 from fog_runtime.stores.redis_store import ANY, Audit, RedisStore, Table
 from fog_supervisor.servers import Server, start_redis

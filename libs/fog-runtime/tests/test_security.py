@@ -12,7 +12,7 @@ from redis.asyncio import Redis
 
 from fog_runtime.clock import SystemClock
 from fog_runtime.credentials import NOBODY, Credentials, CredentialsError, to_toml
-from fog_runtime.leadership import LeaseStore
+from fog_runtime.lease_store import LeaseStore
 from fog_runtime.router import RouterSecurity, RouterSecurityError
 from fog_runtime.security import users
 from fog_runtime.security.authority import Authority, AuthorityError

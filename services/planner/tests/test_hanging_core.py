@@ -13,7 +13,8 @@ from fog_contracts import channels as ch
 from fog_contracts.handlers import Publication
 from fog_contracts.messages import RobotRelease
 from fog_runtime.health import Health
-from fog_runtime.leadership import Leadership, LeaseStore
+from fog_runtime.leadership import Leadership
+from fog_runtime.lease_store import LeaseStore
 from fog_supervisor.servers import start_redis
 from planner.core import PlannerCore
 from planner.service import Service

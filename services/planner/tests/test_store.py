@@ -13,8 +13,8 @@ from fog_contracts.handlers import Moment
 from fog_contracts.messages import AreaHazard, AreaState, HazardArea, OutOfService, Pose, RobotGoal
 from fog_runtime.clock import SystemClock
 from fog_runtime.health import Health
-from fog_runtime.leadership import LeaseStore
 from fog_runtime.lease import Request
+from fog_runtime.lease_store import LeaseStore
 from fog_runtime.stores.redis_connection import StoreError
 from fog_runtime.stores.redis_store import Attempt, Audit, IdempotencyError, RecoveryError
 from fog_supervisor.servers import Server, start_redis

@@ -2,6 +2,7 @@
 
 import asyncio
 import contextlib
+import math
 import re
 import signal
 import time
@@ -105,6 +106,17 @@ class Planners:
                 return leading[0], standing[0]
             assert time.monotonic() < deadline, (details, [self.fog.log(name)[-3000:] for name in PLANNERS])
             await asyncio.sleep(0.05)
+
+    async def metric(self, name: str, series: str) -> float:
+        """Return the value of a planner's metric, NaN without one."""
+        page = (await self.clients[name].get("/metrics")).text
+        found = re.search(rf"^{re.escape(series)} (\S+)$", page, re.MULTILINE)
+        return float(found[1]) if found else math.nan
+
+    async def lateness(self, name: str) -> float:
+        """Return how late a standby finds the leader (s), 0 while it does not know."""
+        late = await self.metric(name, "fognav_leader_lateness_seconds")
+        return 0.0 if math.isnan(late) else late
 
     async def call(self, method: str, tokens, name: str, **body) -> httpx.Response:
         return await self.clients[name].request(method, "/api/v1/robots/r1/goal", headers=tokens["operator"], **body)
@@ -239,10 +251,47 @@ async def test_leader_that_is_cut_off_from_its_router_gives_the_lease_to_one_tha
             assert robot.goal_ids == {goal_id}
 
 
+async def test_leader_whose_answers_are_late_gives_the_lease_to_a_copy_that_is_quicker_and_to_none_that_is_as_slow(
+    fog, proxy_of, until, tokens
+):
+    fog.start("map_service")
+    ways = {name: proxy_of(fog.router) for name in PLANNERS}
+    at = {name: {"FOGNAV_ZENOH_CONNECT": f"tls/127.0.0.1:{await way.start()}"} for name, way in ways.items()}
+    async with robot_on_the_floor(fog) as robot:
+        fog.start("planner", "planner", **at["planner"])
+        await fog.ready("planner")
+        async with two_planners_joining(fog, at["planner-2"]) as planners:
+            assert await planners.roles() == ("planner", "planner-2")
+            goal_id = await sent(planners, tokens, "planner")
+            await until(lambda: robot.last(RobotPath), "a path")
+            old = robot.epochs[-1]
+            for way in ways.values():
+                way.delay_s = 0.25
+            slow_at = time.monotonic()
+            while await planners.lateness("planner-2") < 0.4:
+                assert time.monotonic() - slow_at < 60.0, "the standby does not hear how late the leader is"
+                await asyncio.sleep(0.05)
+            before = len(robot.accepted)
+            await until(lambda: len(robot.accepted) > before + 4, "two seconds of releases")
+            assert robot.epochs[-1] == old, "the other one is as slow"
+
+            ways["planner-2"].delay_s = 0.0
+            await until(lambda: robot.epochs[-1] > old, "the other's goal", lambda: fog.log("planner-2")[-3000:])
+            assert await planners.roles() == ("planner-2", "planner")
+            refused = await planners.call("DELETE", tokens, "planner")
+            assert refused.status_code == 503, "neither of them loses a mission"
+            await until(lambda: robot.last(RobotPath).planner_epoch > old, "the other's path")
+            assert robot.epochs == sorted(robot.epochs)
+            assert robot.goal_ids == {goal_id}
+            assert re.search(r"lease_handed_over.*late", fog.log("planner"))
+            assert re.search(r"leader_is_late", fog.log("planner-2"))
+            assert await planners.metric("planner", 'fognav_leases_handed_over_total{reason="late"}') == 1.0
+
+
 @contextlib.asynccontextmanager
-async def two_planners_joining(fog):
+async def two_planners_joining(fog, environment=None):
     """Start the second planner beside the first."""
-    fog.start("planner", "planner-2")
+    fog.start("planner", "planner-2", **(environment or {}))
     async with contextlib.AsyncExitStack() as stack:
         clients = {
             name: await stack.enter_async_context(httpx.AsyncClient(base_url=await fog.url(name), timeout=60.0))

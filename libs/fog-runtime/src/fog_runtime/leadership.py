@@ -1,6 +1,6 @@
 """Runs the lease of a process: one of several copies of a service leads, the others follow everything and say nothing.
 
-`lease` decides, `LeaseStore` asks Redis. The edges pass everything that is published through `admit`, and answer
+`lease` decides, `lease_store` asks Redis. The edges pass everything that is published through `admit`, and answer
 queries only while this process leads. See ADR 12.
 
 What it is worth: another copy leads within 2 s of a leader's death, whatever of pauses, partitions and a slow or lossy
@@ -17,7 +17,7 @@ import threading
 import time
 from collections import deque
 from functools import partial
-from typing import TYPE_CHECKING, Any, Final, Protocol, Self
+from typing import TYPE_CHECKING, Final, Protocol
 
 from prometheus_client import Counter, Gauge
 
@@ -25,127 +25,20 @@ from fog_contracts import channels as ch
 from fog_contracts.handlers import epoch_in
 from fog_contracts.messages import Leader
 from fog_runtime import logs
-from fog_runtime.credentials import NOBODY
-from fog_runtime.lease import (
-    ANNOUNCE_S,
-    ATTEMPT_S,
-    CUT_OFF_S,
-    LEASE_S,
-    READY_SAID_S,
-    Granted,
-    Held,
-    Lease,
-    LeftToOther,
-    Reply,
-    Request,
-)
+from fog_runtime.lease import ANNOUNCE_S, CUT_OFF_S, Lease, LeftToOther, Reply, Request
 from fog_runtime.process import process_id
-from fog_runtime.stores.redis_connection import RedisConnection, StoreError
+from fog_runtime.punctuality import QUICK_S, Punctuality
+from fog_runtime.stores.redis_connection import StoreError
 
 if TYPE_CHECKING:
     from collections.abc import Awaitable, Callable, Mapping
 
     from fog_contracts.channels import Channel, Role
-    from fog_runtime.credentials import Credentials
+    from fog_contracts.messages import Sent
     from fog_runtime.health import Health
-    from fog_runtime.stores.redis_connection import Command
     from fog_runtime.transports.zenoh_edge import ZenohEdge
 
-# The lease is "EPOCH HOLDER" and expires; the epoch stays. An epoch that Redis has granted is renewed as long as nobody
-# drew another one, even if the lease expired or Redis lost it meanwhile; a provisional one must be above every other.
-# Whoever asks in vain, but knows of a higher epoch than the leader's, leaves that in Redis (the floor), and the leader
-# draws one above it at its next renewal. Else nobody might tell it of a provisional epoch that receivers heard, and
-# they would refuse it for ever.
-# A standby that has what it needs to lead leaves its name for a moment (ready). A leader that is cut off from what it
-# needs finds it, and gives the lease back.
-# The clock (ms) only keeps epochs growing that Redis and all who could know have forgotten.
-_ACQUIRE: Final = """
-local holder, epoch, floor, confirmed = ARGV[1], tonumber(ARGV[2]), tonumber(ARGV[3]), ARGV[4] == '1'
-local stored = tonumber(redis.call('GET', KEYS[2]) or '0')
-local lease = redis.call('GET', KEYS[1])
-local held_epoch, held_by
-if lease then held_epoch, held_by = string.match(lease, '^(%d+) (.*)$') end
-local left = tonumber(redis.call('GET', KEYS[3]) or '0')
-local ready, cut_off = ARGV[7] == '1', ARGV[8] == '1'
-if held_by and held_by ~= holder then
-  if ready then redis.call('SET', KEYS[4], holder, 'PX', ARGV[9]) end
-  if floor > math.max(left, tonumber(held_epoch)) then redis.call('SET', KEYS[3], string.format('%.0f', floor)) end
-  return {0, held_epoch, held_by, redis.call('PTTL', KEYS[1])}
-end
-local successor = redis.call('GET', KEYS[4])
-if cut_off and successor and successor ~= holder then
-  redis.call('DEL', KEYS[1])
-  return {2}
-end
-floor = math.max(floor, left)
-if epoch == 0 and held_by then epoch, confirmed = tonumber(held_epoch), true end
-if epoch <= floor or epoch < stored or (epoch == stored and not confirmed) then
-  epoch = math.max(stored + 1, floor + 1, tonumber(ARGV[5]))
-end
-local text = string.format('%.0f', epoch)
-if epoch ~= stored then redis.call('SET', KEYS[2], text) end
-redis.call('SET', KEYS[1], text .. ' ' .. holder, 'PX', ARGV[6])
-return {1, text}
-"""
-_GRANTED, _LEFT_TO_OTHER = 1, 2
-_RELEASE: Final = """
-local lease = redis.call('GET', KEYS[1])
-if lease and string.match(lease, '^%d+ (.*)$') == ARGV[1] then return redis.call('DEL', KEYS[1]) end
-return 0
-"""
-
 _log = logs.get("leadership")
-
-
-class LeaseStore:
-    """The lease of one service of a site; none of its calls raises for a Redis that does not answer."""
-
-    def __init__(self, url: str, site: str, service: str, *, credentials: Credentials = NOBODY) -> None:
-        self._redis = RedisConnection(url, timeout_s=ATTEMPT_S, credentials=credentials)
-        self._keys = tuple(f"fog:{site}:{service}:{name}" for name in ("lease", "epoch", "floor", "ready"))
-
-    async def __aenter__(self) -> Self:
-        """Return the store; it connects with the first command."""
-        return self
-
-    async def __aexit__(self, *_: object) -> None:
-        """Close the connections."""
-        await self._redis.aclose()
-
-    async def acquire(self, holder: str, request: Request) -> Reply:
-        """Take or renew the lease; None when Redis did not answer in time: it may have done it all the same."""
-        arguments = (
-            holder, request.epoch, request.floor, int(request.confirmed), _now_ms(), round(LEASE_S * 1000),
-            int(request.ready), int(request.cut_off), round(READY_SAID_S * 1000),
-        )  # fmt: skip
-        reply = await self._attempt(("EVAL", _ACQUIRE, len(self._keys), *self._keys, *arguments))
-        match reply:
-            case None:
-                return None
-            case [outcome] if outcome == _LEFT_TO_OTHER:
-                return LeftToOther()
-            case [outcome, epoch] if outcome == _GRANTED:
-                return Granted(int(epoch))
-            case [_, epoch, other, remaining_ms]:
-                return Held(int(epoch), other.decode("utf-8", "replace"), max(0, remaining_ms) / 1000)
-        raise AssertionError(f"the script returned {reply!r}")
-
-    async def release(self, holder: str) -> None:
-        """Give the lease back, if this process holds it, so that another takes over at once; else it expires."""
-        await self._attempt(("EVAL", _RELEASE, 1, self._keys[0], holder))
-
-    async def _attempt(self, command: Command) -> Any:  # noqa: ANN401  # redis does not type its replies
-        """Execute a command once, in at most `ATTEMPT_S`; None when Redis did not answer, or refused it."""
-        try:
-            async with asyncio.timeout(ATTEMPT_S):
-                (reply,) = await self._redis.write(command)
-        except (StoreError, TimeoutError):
-            return None
-        return reply
-
-
-def _now_ms() -> int:
-    return int(time.time() * 1000)
 
 
 PROBE_S: Final = 0.2
@@ -170,6 +63,7 @@ class Probes:
         self._needs = needs
         self._started_at = time.monotonic()
         self._answered_at = dict.fromkeys(needs, -math.inf)
+        self._took = dict.fromkeys(needs, math.inf)
 
     def answered_at(self) -> float:
         """Return when the question was asked that was answered last, of the need for which that is longest ago.
@@ -177,6 +71,10 @@ class Probes:
         -inf while something has answered none.
         """
         return min(self._answered_at.values(), default=time.monotonic())
+
+    def took(self) -> float:
+        """Return how long (s) the slowest of the latest answers took."""
+        return max(self._took.values(), default=0.0)
 
     def silent(self, seconds: float) -> list[str]:
         """Return the names of what has answered no question of the last `seconds`; none so soon after the start."""
@@ -197,6 +95,7 @@ class Probes:
             asked_at = time.monotonic()
             if await ask():
                 self._answered_at[name] = asked_at
+                self._took[name] = time.monotonic() - asked_at
             await asyncio.sleep(PROBE_S)
 
 
@@ -208,6 +107,13 @@ _HELD_BACK: Final = 2048
 LEADS: Final = Gauge("fognav_leader", "Whether this process leads its service (1) or stands by (0)")
 EPOCH: Final = Gauge("fognav_epoch", "Epoch with which this process leads, its fencing number; 0 on standby")
 TAKEOVERS: Final = Counter("fognav_takeovers_total", "How often this process began to lead, or got another epoch")
+HANDED_OVER: Final = Counter(
+    "fognav_leases_handed_over_total", "How often this process gave its lease to a copy that was ready", ["reason"]
+)
+LATENESS: Final = Gauge(
+    "fognav_leader_lateness_seconds",
+    "Median time in which the leader answers, as this standby hears it; NaN if unknown",
+)
 HELD_BACK: Final = Counter(
     "fognav_held_back_messages_total", "Messages that waited because the lease was uncertain", ["channel"]
 )
@@ -272,6 +178,10 @@ class Leadership:
         self._takeover: asyncio.Task[None] | None = None
         self._announced_at = 0.0
         self._probes = Probes({})
+        self._questions: asyncio.Queue[Sent] = asyncio.Queue()
+        self._leaders, self._own = Punctuality(), Punctuality()
+        """How late the leader answers while this process stands by, and how late this process would."""
+        self._late = 0
         health.set("lease", ok=False, detail="waiting for the lease")
 
     # --- For the edges ----------------------------------------------------------------------------------------------
@@ -327,16 +237,64 @@ class Leadership:
 
     def _on_leader(self, ids: dict[str, str], leader: Leader) -> None:
         if ids["role"] == self._service:
-            self._lease.on_leader(leader.epoch, leader.holder, time.monotonic())
+            now = time.monotonic()
+            self._lease.on_leader(leader.epoch, leader.holder, now)
+            self._leaders.follow(self._leader_epoch())
+            if leader.epoch == self._leader_epoch() and leader.answered is not None:
+                self._leaders.on_answer(leader.answered, now)
+            elif leader.epoch == self._leader_epoch():
+                self._leaders.on_no_answer()
         else:
             self.on_message(ch.LEADER, leader)
 
+    # --- Late leaders -----------------------------------------------------------------------------------------------
+
+    def ask(self, question: Sent) -> None:
+        """Hear a question that every copy handles, and the leader answers in its announcement."""
+        now = time.monotonic()
+        self._leaders.on_question(question, now)
+        self._own.on_question(question, now)
+        self._questions.put_nowait(question)
+
+    async def _answer_loop(self, handled: Callable[[], Awaitable[object]]) -> None:
+        """Answer the newest question whenever it has been handled; a standby only finds out how long that takes."""
+        while True:
+            question = await self._questions.get()
+            while not self._questions.empty():
+                question = self._questions.get_nowait()
+            await handled()
+            self._own.on_answer(question, time.monotonic())
+            self._announce(question)
+
+    def _leader_epoch(self) -> int:
+        return 0 if self._lease.epoch or self._lease.leader is None else self._lease.leader.epoch
+
+    def _judge_leader(self) -> None:
+        """Say whether the leader is late, and this process would be quicker."""
+        now, epoch = time.monotonic(), self._leader_epoch()
+        self._leaders.follow(epoch)
+        took = self._leaders.median(now) if epoch else math.nan
+        LATENESS.set(took)
+        late = self._leaders.is_late(now) and self._own.is_quick(now) and self._probes.took() <= QUICK_S
+        late_epoch = epoch if late else 0
+        if late_epoch and late_epoch != self._late:
+            own = round(self._own.median(now), 3)
+            _log.warning("leader_is_late", epoch=epoch, median_s=round(took, 3), own_median_s=own, holder=self.holder)
+        self._late = late_epoch
+        self._lease.judge(late_epoch, now)
+
     # --- Running ----------------------------------------------------------------------------------------------------
 
-    async def run(self, member: Member, needs: Mapping[str, Callable[[], Awaitable[bool]]]) -> None:
+    async def run(
+        self,
+        member: Member,
+        needs: Mapping[str, Callable[[], Awaitable[bool]]],
+        handled: Callable[[], Awaitable[object]] | None = None,
+    ) -> None:
         """Take the lease when it is free, renew it, and let the service lead or stand by; until cancelled.
 
         needs: by name, what asks a transport or thread without which this process leaves the lease to another one.
+        handled: returns once what came before has been handled; with it, this process answers what it is asked (`ask`).
         """
         member.stand_by()
         self._probes = Probes(needs)
@@ -344,8 +302,11 @@ class Leadership:
             async with asyncio.TaskGroup() as tasks:
                 self._probes.start(tasks)
                 tasks.create_task(self._request_loop(), name="lease requests")
+                if handled is not None:
+                    tasks.create_task(self._answer_loop(handled), name="answers")
                 while True:
                     self._lease.on_answer(self._probes.answered_at())
+                    self._judge_leader()
                     self._lease.tick(time.monotonic(), _proposal(), connected=self._connected())
                     self._apply(member, tasks)
                     self._announce()
@@ -361,6 +322,9 @@ class Leadership:
                 await asyncio.sleep(_TICK_S / 2)
                 continue
             reply = await self._leases.acquire(self.holder, request)
+            if isinstance(reply, LeftToOther):
+                HANDED_OVER.labels(reply.reason).inc()
+                _log.warning("lease_handed_over", epoch=request.epoch, reason=reply.reason, to=reply.successor)
             self._lease.on_reply(request, reply, time.monotonic())
             with self._sending:
                 if self._lease.permission(time.monotonic()) == "granted" and self._term[0] == self._lease.epoch:
@@ -416,11 +380,13 @@ class Leadership:
             self._serving = epoch
             return
 
-    def _announce(self) -> None:
+    def _announce(self, answered: Sent | None = None) -> None:
         now = time.monotonic()
-        if self._lease.permission(now) == "granted" and now - self._announced_at >= ANNOUNCE_S - _TICK_S / 2:
+        due = answered is not None or now - self._announced_at >= ANNOUNCE_S - _TICK_S / 2
+        if due and self._lease.permission(now) == "granted":
             self._announced_at = now
-            leader = Leader(epoch=self._lease.epoch, holder=self.holder, epochs=dict(self._epochs()))
+            epochs = dict(self._epochs())
+            leader = Leader(epoch=self._lease.epoch, holder=self.holder, epochs=epochs, answered=answered)
             self._zenoh.publish(ch.LEADER, leader, role=self._service)
 
     def _send_waiting(self) -> None:

@@ -22,7 +22,9 @@ Redis confirms or corrects later.
 
 Redis also leads from a leader that can't do its work to a process that can: one whose transports or threads do not
 answer gives the lease back, if a standby whose own do has said in Redis that it is ready. If none has, it goes on:
-what it still does is better than nothing.
+what it still does is better than nothing. A leader that is slow can't know that: a standby that hears its answers late,
+and would answer in time itself (`punctuality`), says so in Redis, and the leader gives the lease back at its next
+renewal, if the last time that this happened is long enough ago. Nobody takes a lease from its holder.
 """
 
 from __future__ import annotations
@@ -54,6 +56,12 @@ for all, no standby is ready any more when the leader knows that it is cut off, 
 READY_SAID_S: Final = 0.45
 HEARSAY_PAUSE_S: Final = 10.0
 """So seldom Redis is asked for an epoch above one of which robots tell: each new one makes all fetch the map anew."""
+HANDED_PAUSE_S: Final = 30.0
+"""So long no other leader gives its lease back because it is late; after each further time, twice as long ..."""
+HANDED_KNOWN_S: Final = 600.0
+"""... until none did so for this time."""
+_CLAIM_S: Final = 0.1
+"""Period of a standby's requests while it finds the leader late."""
 _LISTEN_S: Final = 2 * ANNOUNCE_S + 0.1
 """Without Redis: how long a leader listens, after it did not run or could not hear, until it acts again."""
 _RATE_MARGIN: Final = 0.9
@@ -74,7 +82,8 @@ class Request:
     """What to ask of Redis: the lease, with this epoch if it is still the highest (0: a new one), above `floor`.
 
     `confirmed`: Redis has granted the epoch before. `sent_at` is the time just before the request is sent. `ready`:
-    this process would take over from one that is `cut_off` from what it needs.
+    this process would take over from one that is `cut_off` from what it needs. `late`: the epoch of a leader that
+    answers later than this process would, 0 for none.
     """
 
     epoch: int
@@ -83,6 +92,7 @@ class Request:
     sent_at: float
     ready: bool = True
     cut_off: bool = False
+    late: int = 0
 
 
 @dataclass(frozen=True)
@@ -103,7 +113,10 @@ class Held:
 
 @dataclass(frozen=True)
 class LeftToOther:
-    """This process is cut off, and another one is ready: it takes the lease, which is free now."""
+    """This process is cut off or late, and another one is ready: it takes the lease, which is free now."""
+
+    reason: str = "cut off"
+    successor: str = ""
 
 
 Reply = Granted | Held | LeftToOther | None
@@ -143,6 +156,8 @@ class Lease:
         self._answered_at = -math.inf
         """A process that starts is not ready before it has an answer; for `cut_off` it has `CUT_OFF_S` to get one."""
         self._said_cut_off = False
+        self._late = 0
+        """The epoch of the leader, if this process finds it late; 0 if not."""
 
     # --- State out --------------------------------------------------------------------------------------------------
 
@@ -175,13 +190,14 @@ class Lease:
         urgent = self._contested or asks or (cut_off and not self._said_cut_off)
         if now < self._request_due and not (self.epoch and urgent):
             return None
-        self._request_due = now + RENEW_S
+        late = 0 if self.epoch else self._late
+        self._request_due = now + (_CLAIM_S if late else RENEW_S)
         self._said_cut_off = cut_off
         ready = now - self._answered_at <= READY_S
         if asks:
             self._hearsay_due = now + HEARSAY_PAUSE_S
         floor = max(self._floor, self._hearsay) if asks else self._floor
-        return Request(self.epoch, floor, self.confirmed, now, ready=ready, cut_off=cut_off)
+        return Request(self.epoch, floor, self.confirmed, now, ready=ready, cut_off=cut_off, late=late)
 
     def on_reply(self, request: Request, reply: Reply, now: float) -> None:
         """Apply the outcome of a request."""
@@ -225,6 +241,12 @@ class Lease:
         -inf: something has answered none yet.
         """
         self._answered_at = asked_at
+
+    def judge(self, late: int, now: float) -> None:
+        """Handle that the leader with the epoch `late` answers later than this process would; 0: no leader does."""
+        if late and late != self._late and not self.epoch:
+            self._request_due = min(self._request_due, now)
+        self._late = late
 
     # --- Epochs heard -----------------------------------------------------------------------------------------------
 

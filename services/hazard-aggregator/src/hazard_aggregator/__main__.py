@@ -15,7 +15,8 @@ from fog_runtime.configuration.settings import CommonSettings, describe, load
 from fog_runtime.configuration.uploaded_maps import UploadedMaps
 from fog_runtime.health import Health
 from fog_runtime.http import HttpProcess, load_tokens, unused
-from fog_runtime.leadership import Leadership, LeaseStore
+from fog_runtime.leadership import Leadership
+from fog_runtime.lease_store import LeaseStore
 from fog_runtime.process import process_id, release_startup_memory
 from fog_runtime.transports.mqtt_edge import MqttEdgeWithInputs
 from fog_runtime.transports.zenoh_edge import ZenohEdge

@@ -6,6 +6,8 @@ import asyncio
 import os
 from typing import TYPE_CHECKING, Final
 
+from fog_contracts import channels as ch
+from fog_contracts.messages import MapHeartbeat
 from fog_runtime import logs, process
 from fog_runtime.clock import SystemClock, WallClock, WallClockSource
 from fog_runtime.configuration.settings import InflationSettings, SettingsError, describe, load
@@ -14,7 +16,8 @@ from fog_runtime.configuration.uploaded_maps import UploadedMaps
 from fog_runtime.health import Health
 from fog_runtime.http import HttpProcess, load_tokens, unused
 from fog_runtime.keys import KeyFileError, read_operator_key
-from fog_runtime.leadership import Leadership, LeaseStore
+from fog_runtime.leadership import Leadership
+from fog_runtime.lease_store import LeaseStore
 from fog_runtime.process import release_startup_memory, release_when
 from fog_runtime.transports.zenoh_edge import ZenohEdge
 from planner.api import make_api
@@ -95,6 +98,7 @@ async def main() -> None:
         )
         service.subscribe()
         leadership.subscribe()
+        zenoh.subscribe(ch.MAP_HEARTBEAT, MapHeartbeat, lambda _, heartbeat: leadership.ask(heartbeat.sent))
         zenoh.declare_liveliness("planner", site)
 
         async def stop_robots() -> None:
@@ -105,7 +109,7 @@ async def main() -> None:
         try:
             async with asyncio.TaskGroup() as tasks:
                 needs = {"zenoh": zenoh.router_answers, "planning": service.core_answers, "map": service.has_map}
-                tasks.create_task(leadership.run(service, needs), name="lease")
+                tasks.create_task(leadership.run(service, needs, service.core_answers), name="lease")
                 tasks.create_task(service.store_loop(), name="store")
                 tasks.create_task(service.operator.record_loop(), name="stops")
                 tasks.create_task(service.snapshot_loop(), name="snapshot")

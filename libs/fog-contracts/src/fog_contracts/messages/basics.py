@@ -95,11 +95,16 @@ Epochs = dict[Id, Count]
 
 
 class Leader(Message, frozen=True, kw_only=True):
-    """The announcement of the one process of a service that acts; `holder` identifies it."""
+    """The announcement of the one process of a service that acts; `holder` identifies it.
+
+    `answered`: when the newest heartbeat of the map was sent that it has handled, by which its copies judge how late
+    it is (planners only).
+    """
 
     epoch: Count
     holder: Annotated[str, Meta(min_length=1, max_length=100)]
     epochs: Epochs = {}
+    answered: Sent | None = None
 
 
 Author = Annotated[str, Meta(max_length=100)]

@@ -11,6 +11,7 @@ from fognav.commands.backup import backup_command, restore_command, store_app
 from fognav.commands.bridge import bridge_command, rosbag_command
 from fognav.commands.demo import demo_command, record_command, replay_command
 from fognav.commands.develop import channels_command, check_command, docs_command, run_tests
+from fognav.commands.floor import floor_app
 from fognav.commands.map_clean import map_clean
 from fognav.commands.map_files import map_app, map_check
 from fognav.commands.map_plan import FORWARDED, map_from_plan
@@ -35,6 +36,7 @@ def add_to(app: typer.Typer) -> None:
         (installed.OPERATE, "zone", zone_app),
         (installed.OPERATE, "area", area_app),
         (installed.OPERATE, "alert", alert_app),
+        (installed.OPERATE, "floor", floor_app),
         (installed.SET_UP, "site", site_app),
         (installed.SET_UP, "node", node_app),
         (installed.SET_UP, "source", source_app),

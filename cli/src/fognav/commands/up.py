@@ -9,6 +9,7 @@ import typer
 
 from fognav import checkout, console_page, kernels, system
 from fognav.commands.bridge import require_bridge
+from fognav.commands.floor import require_floors
 from fognav.credentials import own_hosts, security_errors
 from fognav.hosting import local_nodes
 from fognav.hosting.fog_node import NodeConfig, run_node
@@ -42,6 +43,10 @@ def up_command(  # noqa: PLR0913  # each option is an argument
         Path | None,
         typer.Option("--bridge", metavar="FILE", help="Tell other systems of robots: settings (docs/interop.md)."),
     ] = None,
+    floors: Annotated[
+        Path | None,
+        typer.Option("--floors", metavar="FILE", help="Floors on other machines, to be shown and stopped (campus.md)."),
+    ] = None,
     sim: Annotated[bool, typer.Option("--sim", help="Simulate each site's first robot and its sensor nodes.")] = False,
     check: Annotated[bool, typer.Option("--check", help="End it as soon as everything is ready.")] = False,
     systemd: Annotated[bool, typer.Option("--systemd", help="Write a unit for systemd instead of running.")] = False,
@@ -58,11 +63,15 @@ def up_command(  # noqa: PLR0913  # each option is an argument
         if bridge is not None:
             bridge = bridge.absolute()
             require_bridge(bridge)
+        if floors is not None:
+            floors = floors.absolute()
+            require_floors(floors)
         if systemd:
             options = [word for each in folders for word in ("--site", str(each))]
             options += ["--data", str(path), "--bind", bind, *(["--sim"] if sim else [])]
             options += [word for each in host or [] for word in ("--host", each)]
             options += ["--bridge", str(bridge)] if bridge else []
+            options += ["--floors", str(floors)] if floors else []
             print_line(f"wrote {write_unit(['up', *options])}. Start it now and at each boot:")
             print_line(f"  systemctl --user daemon-reload && systemctl --user enable --now {UNIT}")
             print_line(f"  loginctl enable-linger {os.environ.get('USER', '$USER')}")
@@ -74,10 +83,12 @@ def up_command(  # noqa: PLR0913  # each option is an argument
         with folder.in_use():
             sites, security = hosted_sites(folders, folder.security, [*own_hosts(), *(host or [])])
             config = NodeConfig(
-                folder=folder, sites=sites, security=security, address=bind, simulate=sim, bridge=bridge
-            )
+                folder=folder, sites=sites, security=security, address=bind, simulate=sim, bridge=bridge,
+                floors=floors,
+            )  # fmt: skip
             directories = {each.id: each.directory for each in sites}
-            remember(folder.path, settings_of(directories, bind, host or [], simulate=sim, bridge=bridge))
+            made = settings_of(directories, bind, host or [], simulate=sim, bridge=bridge, floors=floors)
+            remember(folder.path, made)
             asyncio.run(run_node(config, print_line, check=check))
 
 

@@ -134,6 +134,8 @@ class NodeConfig:
     simulate: bool = False
     bridge: Path | None = None
     """Settings of each site's bridge to other systems; None: it has none."""
+    floors: Path | None = None
+    """The list of floors on other machines, which each site's console shows; None: there are none."""
 
 
 class LocalNode:
@@ -207,6 +209,7 @@ class LocalNode:
             site.name(service): [
                 security.folder("http"),
                 security.credentials(site.name(service)),
+                *([self.config.floors] if self.config.floors is not None and service == CONSOLE else []),
             ]
             for site in self.config.sites
             for service in SERVICES
@@ -280,9 +283,13 @@ class LocalNode:
                 "HTTP_KEY_FILE": str(http / KEY),
                 **self._credentials(site, service),
                 **({"OPERATOR_KEY_FILE": str(keys / OPERATOR_KEY)} if service == PLANNER else {}),
-                **({**behind, **self._bridge_url(site)} if service == CONSOLE else {}),
+                **({**behind, **self._bridge_url(site), **self._floors()} if service == CONSOLE else {}),
             }
             self._add(site, service, settings)
+
+    def _floors(self) -> dict[str, str]:
+        """Return where the console-service finds the list of floors, if there is one."""
+        return {} if self.config.floors is None else {"FLOORS_FILE": str(self.config.floors)}
 
     def _bridge_url(self, site: HostedSite) -> dict[str, str]:
         """Return where the console-service finds the bridge, if there is one."""

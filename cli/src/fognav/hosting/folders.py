@@ -123,7 +123,7 @@ _PORTS: Final = (MQTTS_PORT, REDIS_PORT, ZENOH_PORT, *SERVICE_PORTS.values())
 class NodeSettings(msgspec.Struct, frozen=True, kw_only=True):
     """The options of `fognav up`: `sites` are folders by their sites' ids, and `ports` are by their variables.
 
-    `bridge` is the file of the bridges' settings, empty without any.
+    `bridge` is the file of the bridges' settings, `floors` the list of floors on other machines, empty without any.
     """
 
     sites: dict[str, str]
@@ -131,6 +131,7 @@ class NodeSettings(msgspec.Struct, frozen=True, kw_only=True):
     hosts: list[str]
     simulate: bool = False
     bridge: str = ""
+    floors: str = ""
     ports: dict[str, int]
 
     @property
@@ -139,7 +140,8 @@ class NodeSettings(msgspec.Struct, frozen=True, kw_only=True):
         sites = [word for folder in self.sites.values() for word in ("--site", folder)]
         hosts = [word for host in self.hosts for word in ("--host", host)]
         bridge = ["--bridge", self.bridge] if self.bridge else []
-        return [*sites, "--bind", self.address, *hosts, *bridge, *(["--sim"] if self.simulate else [])]
+        floors = ["--floors", self.floors] if self.floors else []
+        return [*sites, "--bind", self.address, *hosts, *bridge, *floors, *(["--sim"] if self.simulate else [])]
 
     @property
     def environment(self) -> dict[str, str]:
@@ -153,9 +155,10 @@ class NodeSettings(msgspec.Struct, frozen=True, kw_only=True):
         return shlex.join([*lacking, "./fognav", "up", *self.arguments, "--data", str(data)])
 
 
-def settings_of(
-    sites: dict[str, Path], address: str, hosts: Sequence[str], *, simulate: bool, bridge: Path | None = None
-) -> NodeSettings:
+def settings_of(  # the options of `fognav up`
+    sites: dict[str, Path], address: str, hosts: Sequence[str], *, simulate: bool, bridge: Path | None = None,
+    floors: Path | None = None,
+) -> NodeSettings:  # fmt: skip
     """Return the settings of a node that is started from this shell."""
     return NodeSettings(
         sites={site: str(folder) for site, folder in sites.items()},
@@ -163,6 +166,7 @@ def settings_of(
         hosts=list(hosts),
         simulate=simulate,
         bridge=str(bridge or ""),
+        floors=str(floors or ""),
         ports=_ports(),
     )
 

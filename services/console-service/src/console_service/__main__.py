@@ -12,6 +12,7 @@ import msgspec
 
 from console_service.api import make_api
 from console_service.core import ConsoleCore, Fetched
+from console_service.floors import Hub, read_peers
 from console_service.forward import AGGREGATOR, DEMO, MAP_SERVICE, PLANNER, Forward
 from console_service.service import Service
 from console_service.sources import Sources
@@ -36,6 +37,7 @@ class Settings(CommonSettings, frozen=True, kw_only=True):
     """Where the other services serve REST, and the folder of the built page (empty: that of the package).
 
     `demo_url`: where a demo tells about its scenario. `bridge_url`: where the bridge serves WebSockets, if one runs.
+    `floors_file`: the list of floors on other machines.
     """
 
     aggregator_url: str = "http://127.0.0.1:8001"
@@ -44,6 +46,7 @@ class Settings(CommonSettings, frozen=True, kw_only=True):
     page_dir: Path | None = None
     demo_url: str = ""
     bridge_url: str = ""
+    floors_file: Path | None = None
 
 
 async def main() -> None:
@@ -60,6 +63,7 @@ async def main() -> None:
     tokens = load_tokens(settings.tokens_file, settings.session_key_file)
     own = settings.credentials()
     mqtt = MqttEdge(settings.mqtt_url, process_id("console-service"), clock, site=site, credentials=own)
+    hub = Hub(read_peers(settings.floors_file, site), clock)
     urls = {AGGREGATOR: settings.aggregator_url, MAP_SERVICE: settings.map_url, PLANNER: settings.planner_url}
     if settings.demo_url:
         urls[DEMO] = settings.demo_url
@@ -83,7 +87,7 @@ async def main() -> None:
             core, clock, aggregator_url=settings.aggregator_url, redis=redis, credentials=own,
             on_news=service.readers.wake,
         )  # fmt: skip
-        app = make_api(service, health, tokens, forward=forward, page=settings.page_dir)
+        app = make_api(service, health, tokens, forward=forward, hub=hub, page=settings.page_dir)
         serving = serve_here(
             app, settings.http_host, settings.http_port, settings.http_certificate(), settings.http_gateway,
             settings.port_file,
@@ -100,6 +104,7 @@ async def main() -> None:
                 tasks.create_task(service.recording_loop(), name="recording")
                 tasks.create_task(service.readers.run(), name="readers")
                 tasks.create_task(service.readers.tell_time(clock.stamp), name="time")
+                tasks.create_task(hub.run(), name="floors")
                 tasks.create_task(serving, name="http")
         finally:
             service.close()

@@ -1,5 +1,6 @@
 """REST under /api/v1 and the page: nothing here changes anything but who is logged in."""
 
+import asyncio
 import hashlib
 import math
 from pathlib import Path
@@ -9,6 +10,7 @@ from urllib.parse import urlencode
 import msgspec
 from fastapi import FastAPI, Header, Query, Request, Response
 
+from console_service.floors import FloorEntry, FloorStop, FloorView, Hub, OwnFloor
 from console_service.forward import CONSOLE, URGENT, Forward, ForwardProblem
 from console_service.page_files import PageFiles
 from console_service.readers import EventStream
@@ -17,14 +19,18 @@ from console_service.service import Service
 from console_service.timeline import ALL_KINDS, TimelineEntry
 from console_service.views import VitalsView
 from fog_contracts.messages import Id, Message
+from fog_runtime import logs
 from fog_runtime.clock import SystemClock
 from fog_runtime.health import Health
 from fog_runtime.http import (  # fmt: skip
     MAP_UPLOADS,
     Answer,
+    Anybody,
+    Body,
     ClientHost,
     Encoded,
     HttpProblem,
+    ProblemCode,
     ProblemError,
     Routes,
     Tokens,
@@ -36,6 +42,8 @@ from fog_runtime.http import (  # fmt: skip
 from fog_runtime.http.store_routes import PageSize, add_store_errors, next_page
 from fog_runtime.stores.records import CursorError
 from fog_runtime.stores.redis_connection import StoreError
+
+_log = logs.get("console-service")
 
 PAGE: Final = Path(__file__).with_name("page")
 """Where a wheel or an image has the built page."""
@@ -53,12 +61,13 @@ def make_api(
     tokens: Tokens,
     *,
     forward: Forward | None = None,
+    hub: Hub | None = None,
     page: Path | None = None,
 ) -> FastAPI:
     """Return the app over a running service.
 
-    `forward` passes on what other services have (None: there are none), `page` is the folder of the built page (None:
-    that of the package).
+    `forward` passes on what other services have (None: there are none), `hub` knows the floors on other machines,
+    `page` is the folder of the built page (None: that of the package).
     """
     app = make_app("Fognav console-service", health, tokens, first_page=False, large=MAP_UPLOADS)
     app.state.sockets = True
@@ -67,6 +76,8 @@ def make_api(
     _add_events(Routes(app, "events"), service)
     _add_past(Routes(app, "past"), service)
     forward = forward or Forward({})
+    own = OwnFloor(service.core, forward, health, service.now)
+    _add_floors(Routes(app, "floors"), own, hub or Hub([], SystemClock()))
 
     @session.get("/api/v1/openapi.json", problems=[ForwardProblem.SERVICE_AWAY])
     async def openapi() -> Encoded[dict[str, Any]]:
@@ -130,6 +141,55 @@ class RecordingView(Message, frozen=True, kw_only=True):
     step_s: float
     next: float | None
     frames: list[Moments]
+
+
+class FloorProblem(ProblemCode):
+    """Problems of several floors."""
+
+    NO_FLOOR = "no_floor", 404, "There is no such floor", "Choose one that GET /api/v1/floors lists"
+
+
+class FloorsBody(Message, frozen=True, kw_only=True):
+    """Which floors to stop; null: all."""
+
+    floors: list[Id] | None = None
+
+
+def _add_floors(routes: Routes, own: OwnFloor, hub: Hub) -> None:
+    for path in ("/api/v1/floors/here/stop", "/api/v1/floors/stop"):
+        routes.urgent(path)
+
+    @routes.get("/api/v1/floors/here")
+    async def here(_caller: Viewer) -> FloorView:
+        """Return how this floor is: its services, robots, hazards, and whether it is stopped."""
+        return await own.view()
+
+    @routes.post("/api/v1/floors/here/stop")
+    async def stop_here(request: Request, _caller: Anybody) -> FloorStop:
+        """Stop all robots of this floor at once. Anybody may, as with one robot. An operator must enable them again."""
+        return await own.stop(request)
+
+    @routes.get("/api/v1/floors")
+    async def floors(_caller: Viewer) -> list[FloorEntry]:
+        """List this floor and those on other machines, with the age of what is known of each."""
+        view = await own.view()
+        this = FloorEntry(
+            id=own.id, address="", reachable=True, age_s=0.0, heard=None, trouble="", detail="", floor=view
+        )
+        return [this, *hub.entries()]
+
+    @routes.post("/api/v1/floors/stop", problems=[FloorProblem.NO_FLOOR])
+    async def stop(request: Request, body: Body[FloorsBody], caller: Viewer) -> list[FloorStop]:
+        """Stop floors, all at once, each once; say which have acknowledged it, and what to do about the others."""
+        known = [own.id, *hub.ids]
+        wanted = known if body.floors is None else list(dict.fromkeys(body.floors))
+        if missing := [floor for floor in wanted if floor not in known]:
+            detail = f"there is no floor {missing[0]}; known floors: {', '.join(known)}. Nothing was stopped"
+            raise ProblemError(FloorProblem.NO_FLOOR, detail, field="body.floors")
+        stops = await asyncio.gather(*(own.stop(request) if each == own.id else hub.stop(each) for each in wanted))
+        failed = [each.id for each in stops if not each.acknowledged]
+        _log.warning("floors_stopped", who=caller.name, floors=wanted, not_acknowledged=failed)
+        return list(stops)
 
 
 def _add_past(routes: Routes, service: Service) -> None:

@@ -15,7 +15,7 @@ import msgspec
 
 from console_service.log import CompactedLog
 from console_service.tiles import TiledMap
-from console_service.views import PathView, Thing, VitalsView, ZoneView, scan_view
+from console_service.views import FloorRobot, PathView, Thing, VitalsView, ZoneView, scan_view
 from fog_contracts import channels as ch
 from fog_contracts.handlers import Fence
 from fog_contracts.messages import GoalView, MapGeometry, MapInfo, PlanView, RobotSummary
@@ -29,6 +29,7 @@ if TYPE_CHECKING:
         AlertList,
         AreaDefinition,
         AreaHazard,
+        AreaState,
         MapDelta,
         MapHeartbeat,
         PlaceSet,
@@ -282,6 +283,24 @@ class ConsoleCore:
         """Return how a robot did in the last ten minutes, oldest first."""
         known = self._robots.get(robot)
         return [] if known is None else list(known.vitals)
+
+    def floor(self, now: float) -> tuple[list[FloorRobot], dict[AreaState, list[str]]]:
+        """Return the robots of this floor at `now` (s, monotonic), and its areas by their state, sorted."""
+        robots = [
+            FloorRobot(
+                id=robot,
+                age_s=None if known.heard == -math.inf else round(now - known.heard, 1),
+                mode=None if known.state is None else known.state.mode,
+                enabled=None if known.state is None else known.state.enabled,
+                codes=[] if known.state is None else list(known.state.codes),
+            )
+            for robot, known in sorted(self._robots.items())
+        ]
+        areas: dict[AreaState, list[str]] = {}
+        for area, value in sorted(self._fetched["area"].items()):
+            if (hazard := value.get("hazard")) is not None:
+                areas.setdefault(hazard["state"], []).append(area)
+        return robots, areas
 
     def scan(self, robot: str) -> bytes | None:
         """Return what a robot's lidar sees by its last report, as an event's data; None if it told no view."""

@@ -35,7 +35,7 @@ BRIDGE: Final = "bridge"
 ROUTES: Final[Mapping[str, tuple[str, ...]]] = {
     AGGREGATOR: ("areas", "nodes", "alerts"),
     PLANNER: ("robots", "plan", "visits"),
-    CONSOLE: ("session", "events", "timeline", "recording", "vitals", "openapi.json"),
+    CONSOLE: ("session", "events", "timeline", "recording", "vitals", "floors", "openapi.json"),
     DEMO: ("scenario",),
     BRIDGE: ("foxglove",),
 }
@@ -57,6 +57,15 @@ _OURS: Final = frozenset({b"forwarded", b"x-forwarded-for", b"x-forwarded-host",
 _ANEW_ASKED: Final = _OURS | {b"content-length", b"expect"}
 _ANEW_ANSWERED: Final = frozenset({b"date", b"server"})
 """What this server says of a message anew."""
+
+
+_READY_S: Final = 1.0
+"""How long a service may take to say whether it is ready."""
+
+
+class _Readiness(msgspec.Struct):
+    ready: bool
+    missing: list[str]
 
 
 class ForwardProblem(ProblemCode):
@@ -136,7 +145,7 @@ class Forward:
         target = raw.removeprefix(prefix) or b"/"
         if scope["query_string"]:
             target += b"?" + scope["query_string"]
-        answer = await self._send(service, request, target, await request.body())
+        answer = await self.send(service, request, target, await request.body())
         dropped = _of_connection(answer.headers) | _ANEW_ANSWERED
         response = StreamingResponse(_parts(answer), answer.status_code)
         response.raw_headers = [(n.lower(), value) for n, value in answer.headers.raw if n.lower() not in dropped]
@@ -149,7 +158,8 @@ class Forward:
         detail = f"there is no WebSocket at {scope['path']}: only a fog node with a bridge has one, at /api/v1/foxglove"
         await WebSocket(scope, receive, send).send_denial_response(problem(HttpProblem.NO_ROUTE, detail))
 
-    async def _send(self, service: str, request: Request, target: bytes, body: bytes) -> httpx.Response:
+    async def send(self, service: str, request: Request, target: bytes, body: bytes) -> httpx.Response:
+        """Send a request on to a service, for its caller; return the answer, to be read. Raises `ProblemError`."""
         host = request.client.host if request.client else ""
         dropped = _of_connection(request.headers) | _ANEW_ASKED
         headers = [(name, value) for name, value in request.headers.raw if name not in dropped]
@@ -179,6 +189,20 @@ class Forward:
                 "before you repeat it"
             )
             raise ProblemError(ForwardProblem.SERVICE_SILENT, detail, headers=RETRY_AFTER, service=service) from error
+
+    async def readiness(self) -> dict[str, str]:
+        """Return what each service lacks that is not ready, by its name: all are asked at once."""
+        services = [service for service in self._urls if service != DEMO]
+        missing = await asyncio.gather(*(self._missing(service) for service in services))
+        return {service: what for service, what in zip(services, missing, strict=True) if what}
+
+    async def _missing(self, service: str) -> str:
+        try:
+            answer = await self._client.get(f"{self._urls[service]}/readyz", timeout=_READY_S)
+            report = msgspec.json.decode(answer.content, type=_Readiness)
+        except (httpx.HTTPError, msgspec.MsgspecError) as error:
+            return f"it does not answer ({str(error) or type(error).__name__})"
+        return "" if report.ready else ", ".join(report.missing)
 
     async def openapi(self, own: Mapping[str, object]) -> bytes:
         """Return the document of all services, `own` among them. Raises `ProblemError` naming one that does not run."""

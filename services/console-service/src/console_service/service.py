@@ -71,6 +71,10 @@ class Service:
         self._limited = logs.RateLimited(logs.get("console-service"))
         self._thread = ThreadPoolExecutor(1, "tiles")
 
+    def now(self) -> float:
+        """Return the time (s, monotonic)."""
+        return self._clock.now()
+
     def subscribe(self) -> None:
         """Register subscriptions."""
         handlers = {channel: self._waking(handler) for channel, handler in self.core.handlers().items()}

@@ -9,6 +9,7 @@ from fog_contracts.messages import (
     REACH_UNIT_M,
     VIEW_SECTORS,
     Message,
+    Mode,
     View,
     Zone,
 )
@@ -53,6 +54,16 @@ class VitalsView(Message, frozen=True, kw_only=True):
     cpu: dict[str, float]
     wifi_dbm: float | None
     battery: float | None
+
+
+class FloorRobot(Message, frozen=True, kw_only=True):
+    """A robot of a floor: how long ago it was heard (null: never), its mode, whether it may drive, and why not."""
+
+    id: str
+    age_s: float | None
+    mode: Mode | None
+    enabled: bool | None
+    codes: list[str]
 
 
 class ScanView(Message, frozen=True, kw_only=True):

@@ -1,0 +1,195 @@
+"""Two floors with servers and services of their own, one of which has the other in its list of floors."""
+
+import asyncio
+import time
+from contextlib import AsyncExitStack, asynccontextmanager, suppress
+from dataclasses import dataclass, field
+from types import SimpleNamespace
+
+import httpx
+import pytest
+from msgspec.structs import replace
+
+from console_service.floors import read_peers
+from fog_contracts import channels as ch
+from fog_contracts.messages import CommandReply, RobotState
+from fog_runtime.clock import SystemClock
+from fog_runtime.configuration.settings import SettingsError
+from fog_runtime.token_file import create_token, revoke_token
+from fog_runtime.transports.zenoh_edge import ZenohEdge
+
+live = pytest.mark.live
+SERVICES = {"hazard_aggregator": "AGGREGATOR_URL", "map_service": "MAP_URL", "planner": "PLANNER_URL"}
+DRIVING = RobotState(
+    mode="NORMAL", reasons=[], enabled=True, battery=None, goal_id=None, map_epoch=1, map_seq=0, plan_id=None,
+)  # fmt: skip
+
+
+@dataclass
+class Robot:
+    """What a robot says, and whether it answers; `stopped_at` are the times at which it was stopped (s, monotonic)."""
+
+    answers: bool = True
+    stopped_at: list[float] = field(default_factory=list)
+
+    @asynccontextmanager
+    async def on(self, edge: ZenohEdge, robot: str):
+        """Let it be on a floor."""
+
+        def stop(_ids, _command):
+            self.stopped_at.append(time.monotonic())
+            return CommandReply(accepted=True, reason="stopped")
+
+        async def publish():
+            while True:
+                edge.publish(ch.ROBOT_STATE, replace(DRIVING, enabled=not self.stopped_at), robot=robot)
+                await asyncio.sleep(0.1)
+
+        if self.answers:
+            edge.serve(ch.ROBOT_COMMAND, stop, robot=robot)
+        publishing = asyncio.create_task(publish())
+        try:
+            yield
+        finally:
+            publishing.cancel()
+            with suppress(asyncio.CancelledError):
+                await publishing
+
+
+async def start_console(floor, **environment):
+    urls = {f"FOGNAV_{SERVICES[module]}": await floor.ready(module) for module in SERVICES}
+    floor.start("console_service", **urls, **environment)
+
+
+@pytest.fixture
+async def floors(fog, tmp_path_factory, proxy_of, tokens):
+    """Yield two floors, each with a robot that drives: `test`, whose console knows `upstairs` through a proxy."""
+    async with AsyncExitStack() as stack:
+        servers = type(fog.servers)(tmp_path_factory.mktemp("servers"), secured=False)
+        stack.callback(servers.close)
+        upstairs = type(fog)(tmp_path_factory.mktemp("upstairs"), servers)
+        stack.callback(upstairs.close)
+        site = upstairs.site / "site.toml"
+        site.write_text(site.read_text().replace('id = "test"', 'id = "upstairs"'))
+        for each in (fog, upstairs):
+            for module in SERVICES:
+                each.start(module)
+        await start_console(upstairs)
+        port = int((await upstairs.ready("console_service")).rpartition(":")[2])
+        proxy = proxy_of(SimpleNamespace(port=port))
+        address = f"http://127.0.0.1:{await proxy.start()}"
+        token = create_token(upstairs.folder / "tokens.toml", "floor test", "viewer")
+        (fog.folder / "upstairs.toml").write_text(f'user = "floor test"\ntoken = "{token}"\n')
+        listed = fog.folder / "floors.toml"
+        listed.write_text(f'[floors.upstairs]\naddress = "{address}"\ncredentials = "upstairs.toml"\n')
+        await start_console(fog, FOGNAV_FLOORS_FILE=str(listed))
+        client = await stack.enter_async_context(
+            httpx.AsyncClient(base_url=await fog.ready("console_service"), headers=tokens["viewer"], timeout=60.0)
+        )
+        _, here, _ = await stack.enter_async_context(fog.edges())
+        there = await stack.enter_async_context(
+            ZenohEdge.open(
+                connect=[servers.router.endpoint], clock=SystemClock(), role="test", id="test", site="upstairs"
+            )
+        )
+        yield SimpleNamespace(here=here, there=there, client=client, proxy=proxy, upstairs=upstairs, hub=fog)
+
+
+async def listed(floors, condition):
+    """Return the entry of the other floor once it fulfils a condition."""
+    async with asyncio.timeout(60):
+        while True:
+            answer = await floors.client.get("/api/v1/floors")
+            assert answer.status_code == 200, answer.text
+            this, other = answer.json()
+            assert (this["id"], this["reachable"], other["id"]) == ("test", True, "upstairs")
+            if condition(other):
+                return other
+            await asyncio.sleep(0.1)
+
+
+def drives(entry):
+    """Whether a floor is known to have a robot that drives, and services that are ready."""
+    floor = entry["floor"]
+    return entry["reachable"] and [r["enabled"] for r in floor["robots"]] == [True] and floor["not_ready"] == {}
+
+
+@live
+@pytest.mark.smoke
+async def test_one_press_stops_the_robots_of_both_floors_and_each_floor_says_so(floors):
+    here, there = Robot(), Robot()
+    async with here.on(floors.here, "r1"), there.on(floors.there, "r1"):
+        other = await listed(floors, drives)
+        assert (other["floor"]["stopped"], other["age_s"] <= 3.0) == (False, True)
+        async with asyncio.timeout(60):
+            while [each["id"] for each in (await floors.client.get("/api/v1/robots")).json()] != ["r1"]:  # noqa: ASYNC110  # another process hears it
+                await asyncio.sleep(0.1)
+        answer = await floors.client.post("/api/v1/floors/stop", json={})
+        assert answer.status_code == 200, answer.text
+        assert [(each["id"], each["acknowledged"]) for each in answer.json()] == [("test", True), ("upstairs", True)]
+        assert (len(here.stopped_at), len(there.stopped_at)) == (1, 1)
+        await listed(floors, lambda entry: entry["floor"]["stopped"])
+        answer = await floors.client.post("/api/v1/floors/stop", json={"floors": ["cellar"]})
+        assert (answer.status_code, answer.json()["type"]) == (404, "urn:fognav:no_floor")
+
+
+@live
+async def test_floor_that_is_cut_off_is_named_keeps_its_age_and_comes_back_by_itself(floors):
+    here, there = Robot(), Robot()
+    async with here.on(floors.here, "r1"), there.on(floors.there, "r1"):
+        before = await listed(floors, drives)
+        floors.proxy.cut()
+        lost = await listed(floors, lambda entry: not entry["reachable"] and entry["age_s"] > 3.0)
+        assert (lost["trouble"], lost["heard"] >= before["heard"]) == ("silent", True)
+        assert drives({**lost, "reachable": True}), "what was known of it is shown, with its age"
+        stops = {each["id"]: each for each in (await floors.client.post("/api/v1/floors/stop", json={})).json()}
+        assert (stops["test"]["acknowledged"], stops["upstairs"]["acknowledged"]) == (True, False)
+        assert "press again" in stops["upstairs"]["detail"]
+        floors.proxy.heal()
+        back = await listed(floors, lambda entry: entry["reachable"] and entry["age_s"] <= 3.0)
+        assert (back["trouble"], len(here.stopped_at)) == ("", 1)
+        # The console that has the list is away: the other floor notices nothing, and is stopped at its own address.
+        floors.hub.kill("console_service")
+        async with httpx.AsyncClient(base_url=await floors.upstairs.ready("console_service")) as client:
+            answer = await client.post("/api/v1/floors/here/stop")
+        assert (answer.status_code, answer.json()["acknowledged"]) == (200, True)
+        assert there.stopped_at
+
+
+@live
+async def test_robot_that_does_not_answer_and_a_token_that_is_revoked_are_named(floors):
+    async with Robot(answers=False).on(floors.there, "r1"):
+        await listed(floors, drives)
+        (stop,) = (await floors.client.post("/api/v1/floors/stop", json={"floors": ["upstairs"]})).json()
+        assert (stop["acknowledged"], [each["stopped"] for each in stop["robots"]]) == (False, [False])
+        assert "r1" in stop["detail"]
+        assert "on the spot" in stop["detail"]
+        revoke_token(floors.upstairs.folder / "tokens.toml", "floor test")
+        refused = await listed(floors, lambda entry: entry["trouble"] == "refused")
+        assert "fognav token create" in refused["detail"]
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        ('[floors.up]\naddress = "https://up.local:8004"\ncredentials = "none.toml"', "have no token"),
+        ('[floors.up]\naddress = "http://up.local:8004"\ncredentials = "own.toml"', "not encrypted"),
+        ('[floors.up]\naddress = "up.local"\ncredentials = "own.toml"', "floors.toml"),
+        ("[floors", "not valid TOML"),
+    ],
+)
+def test_list_of_floors_that_can_t_be_used_is_refused_with_the_reason(tmp_path, text, said):
+    (tmp_path / "own.toml").write_text('user = "campus"\ntoken = "secret"')
+    (tmp_path / "none.toml").write_text('user = "campus"')
+    (tmp_path / "floors.toml").write_text(text)
+    with pytest.raises(SettingsError, match=said):
+        read_peers(tmp_path / "floors.toml", "here")
+
+
+def test_all_machines_may_have_the_same_list_and_each_leaves_itself_out(tmp_path):
+    (tmp_path / "own.toml").write_text('user = "campus"\ntoken = "secret"')
+    entry = 'address = "https://{0}.local:8004/"\ncredentials = "own.toml"\n'
+    (tmp_path / "floors.toml").write_text("".join(f"[floors.{each}]\n{entry.format(each)}" for each in ("up", "here")))
+    assert [(peer.id, peer.address) for peer in read_peers(tmp_path / "floors.toml", "here")] == [
+        ("up", "https://up.local:8004")
+    ]

@@ -12,6 +12,7 @@ import { useScenario } from "./scenario";
 import { rememberRobots, StopBar } from "./stop";
 import { duration } from "./text";
 import { onTheme, setTheme, theme, type Theme } from "./theme";
+import { FloorsView, useFloorCount } from "./views/floors";
 import { MapView } from "./views/map";
 import { RobotsView } from "./views/robots";
 import { ScenarioView } from "./views/scenario";
@@ -25,6 +26,7 @@ const PANELS: Readonly<Record<View, () => preact.JSX.Element>> = {
   robots: RobotsView,
   sensors: SensorsView,
   timeline: TimelineView,
+  floors: FloorsView,
   scenario: ScenarioView,
 };
 
@@ -121,6 +123,7 @@ export function ConsoleApp({ session, onExpired, onLogOut }: Props): preact.JSX.
     live, session, floor, robot, robots, scenario, say, logOut: onLogOut,
     chooseRobot: setChosen,
   };
+  const several = useFloorCount() > 1;
   const Panel = PANELS[route.view];
   return (
     <ConsoleContext.Provider value={value}>
@@ -136,7 +139,7 @@ export function ConsoleApp({ session, onExpired, onLogOut }: Props): preact.JSX.
           <Settings onLanguage={setSpoken} />
         </header>
         <nav aria-label={t("app.name")}>
-          {VIEWS.filter((view) => view !== "scenario" || ofDemo()).map((view) => (
+          {VIEWS.filter((view) => (view !== "scenario" || ofDemo()) && (view !== "floors" || several)).map((view) => (
             <a key={view} href={routeHash(view)} aria-current={view === route.view ? "page" : undefined}>
               <span class={`icon ${view}`} aria-hidden="true" />{t(`view.${view}`)}
             </a>

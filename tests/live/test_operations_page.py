@@ -1,4 +1,5 @@
-"""The page about operations, run as it is written, from an empty home folder: install, add, back up, restore.
+"""The pages about operations, run as they are written, from an empty home folder: install, add, back up, restore; and
+two machines that become two floors.
 
 What only the operating system's administrator can do is recorded instead of done, and the unit is run as systemd would
 (`unit_manager`).
@@ -23,11 +24,12 @@ pytestmark = [pytest.mark.live, pytest.mark.timeout(900)]
 
 ROOT = Path(__file__).parents[2]
 PAGE = (ROOT / "docs" / "operations.md").read_text("utf-8")
+CAMPUS = (ROOT / "docs" / "campus.md").read_text("utf-8")
 
 
-def block(beginning: str) -> str:
-    """Return the block of commands that begins with these words."""
-    (found,) = [text for text in re.findall(r"```sh\n(.*?)```", PAGE, re.DOTALL) if text.startswith(beginning)]
+def block(beginning: str, page: str = PAGE) -> str:
+    """Return the block of a page that begins with these words."""
+    (found,) = [text for text in re.findall(r"```\w+\n(.*?)```", page, re.DOTALL) if text.startswith(beginning)]
     return str(found)
 
 
@@ -45,6 +47,7 @@ class Machine:
         self.checkout = self.home / "fognav"
         self.asked = folder / "asked"
         programs, self._runtime, self._unit = folder / "programs", folder / "runtime", folder / "unit"
+        self._programs = programs
         for each in (self.home, programs, self._runtime, self._unit):
             each.mkdir(mode=0o700)
         manager = ROOT / "tests" / "support" / "unit_manager.py"
@@ -82,6 +85,21 @@ class Machine:
             shutil.copy(file, self.checkout / f"MAP{file.suffix}")
         yaml = self.checkout / "MAP.yaml"
         yaml.write_text(yaml.read_text("utf-8").replace("map.pgm", "MAP.pgm"), "utf-8")
+
+    def site(self, name: str) -> None:
+        """Put the folder of a site there."""
+        folder = shutil.copytree(ROOT / "sites" / "estig", self.checkout / "sites" / name)
+        text = (folder / "site.toml").read_text("utf-8")
+        (folder / "site.toml").write_text(text.replace('id = "estig"', f'id = "{name}"', 1), "utf-8")
+
+    def sends_to(self, other: "Machine") -> None:
+        """Let scp bring files into the other machine's checkout."""
+        self._program(self._programs / "scp", f'cp "$1" "{other.checkout}"')
+
+    @property
+    def console(self) -> str:
+        """Where its console-service serves."""
+        return f"https://127.0.0.1:{self._environment['FOGNAV_CONSOLE_PORT']}"
 
     def type(self, commands: str, *, where: Path | None = None, git_folder: Path | None = None) -> str:
         """Run lines as somebody types them, and return what they print; `git_folder`: what git takes for its own."""
@@ -176,3 +194,44 @@ def test_fog_node_is_installed_extended_backed_up_and_restored_as_the_page_says(
     assert "restored site office" in restored
     assert machine.type("cat ~/.local/share/fognav/keys/office/admin.token").strip() == token
     assert shlex.split(backup, comments=True)[2] == shlex.split(block("./fognav restore"), comments=True)[2]
+
+
+def shown(machine: Machine, words: str) -> str:
+    """Return the list of floors once it has these words."""
+    deadline = time.monotonic() + 120.0
+    while words not in (said := machine.type("./fognav floor list || true")):
+        assert time.monotonic() < deadline, said
+        time.sleep(0.5)
+    return said
+
+
+def test_two_machines_become_two_floors_one_of_which_shows_and_stops_both_as_the_page_says(machine, tmp_path):
+    (tmp_path / "second").mkdir()
+    second = Machine(tmp_path / "second")
+    second.clone()
+    try:
+        second.site("upstairs")
+        second.sends_to(machine)
+        setting_up = block("./fognav up --check --site sites/upstairs", CAMPUS)
+        second.type(setting_up.replace("--systemd", "--systemd --sim"))
+        second.type(block("./fognav token create from-ground", CAMPUS))
+        assert not (second.checkout / "upstairs.toml").exists()
+        listed = block("[floors.upstairs]", CAMPUS).replace("https://fog2.local:8004", second.console)
+        (machine.checkout / "floors.toml").write_text(listed, "utf-8")
+        machine.site("ground")
+        linking = block("./fognav up --systemd --site sites/ground", CAMPUS)
+        machine.type(linking.replace("./fognav floor list", ""))
+        second.type("./fognav robot enable")
+        assert "ground: ready" in shown(machine, "upstairs: ready; robots: r1 NORMAL")
+        one, both = [line for line in block("./fognav floor stop", CAMPUS).splitlines() if line]
+        assert "upstairs: stopped: r1" in machine.type(one)
+        shown(machine, "upstairs: ready; stopped; ")
+        second.type("./fognav robot enable")
+        said = machine.type(both)
+        assert "ground: stopped: no robot; away: r1" in said
+        assert "upstairs: stopped: r1" in said
+        second.type("systemctl --user stop fognav.service")
+        assert "ground: ready" in shown(machine, "upstairs: NOT REACHABLE since ")
+        assert "upstairs: NOT ACKNOWLEDGED" in machine.type(f"{both.partition('#')[0]} || true")
+    finally:
+        second.type("systemctl --user stop fognav.service")

@@ -89,6 +89,7 @@ def test_link_that_leads_nowhere_is_named_with_its_place(small: Path, tmp_path: 
 
 @needs_builder
 @pytest.mark.timeout(600)  # 15 s of computing, on a busy machine
+@pytest.mark.drive
 def test_site_of_this_checkout_is_built_strictly_and_loads_nothing_from_elsewhere(tmp_path: Path) -> None:
     documentation.write(ROOT, tmp_path, documentation.rest_routes())
     assert documentation.build(BUILDER, tmp_path) == ""

@@ -113,6 +113,7 @@ def test_the_command_writes_what_an_independent_square_agrees_with_and_keeps_the
     assert json.loads(again.stdout)["axle_m"] == told["axle_m"]
 
 
+@pytest.mark.drive
 def test_a_square_of_another_robot_contradicts_and_nothing_is_written(tmp_path):
     body = Body(left=1.0, right=1.0, axle=1.0, x=0.0, y=0.0, yaw=0.0, latency=0.0, mirrored=False)
     log, square, settings = tmp_path / "drive.mcap", tmp_path / "square.mcap", tmp_path / "robot.toml"

@@ -286,6 +286,7 @@ def test_robots_that_the_fog_warns_drive_less_than_one_that_finds_out_by_itself(
     assert full.distance_m == pytest.approx(fog.distance_m, abs=1.0)
 
 
+@pytest.mark.drive
 def test_a_drive_begins_in_every_setup_when_the_robot_is_ready(short_run):
     moves = [next(at for at, *_ in record.timeline.poses[1:]) for record in short_run[1]]
     assert max(moves) - min(moves) < 0.6, moves

@@ -126,6 +126,7 @@ def test_kidnapped_robot_is_found_again(folder):
     assert found["falsely_good_share"] == 0.0
 
 
+@pytest.mark.drive
 def test_random_starts_and_kidnappings_of_a_log_are_counted(folder):
     trials = ("localize", "--map", folder / "floor.yaml", "--log", folder / "drive.jsonl.gz", "--trials", 4)
     code, starts = run(*trials, "--global")

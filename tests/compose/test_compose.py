@@ -78,7 +78,7 @@ pytestmark = [
 def fog(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Project]:
     """The fog node, healthy, without the simulated robot."""
     project = Project(tmp_path_factory.mktemp("compose"))
-    project("build", timeout_s=BUILD_S)
+    project("--profile", "bridges", "build", timeout_s=BUILD_S)
     try:
         project("up", "--detach", "--no-build", profile="", timeout_s=BUILD_S)
         project.wait_healthy(FOG)
@@ -388,6 +388,15 @@ def test_prometheus_records_the_robots_cpu_time(sim: Project) -> None:
     before = seconds()
     assert before is not None
     wait(lambda: None if (seconds() or 0.0) > before else f"stays at {before} s", 30)
+
+
+def test_bridge_runs_beside_the_fog_node_and_is_found_by_prometheus(sim: Project) -> None:
+    sim("--profile", "bridges", "up", "--detach", "--no-build", "bridge")
+    try:
+        wait_health(sim, "bridge", "healthy")
+        wait(lambda: wrong_targets(sim, *SERVICES, "r1", "bridge"), 90)
+    finally:
+        sim("--profile", "bridges", "rm", "--stop", "--force", "bridge", "bridge-credentials")
 
 
 def test_killed_containers_are_restarted(sim: Project) -> None:

@@ -161,7 +161,7 @@ class Project:
             file.write_text(floors_override(floors, (ROOT / BASE).read_text("utf-8")), "utf-8")
             self._command += ["--file", str(file)]
         self._command += ["--project-directory", str(ROOT)]
-        services = json.loads(self("config", "--format", "json"))["services"]
+        services = json.loads(self("--profile", "bridges", "config", "--format", "json"))["services"]
         override: dict[str, Any] = {}
         base = base_image(pinned=available(base_image()))
         for service, config in services.items():

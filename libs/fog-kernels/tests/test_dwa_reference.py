@@ -157,6 +157,7 @@ def choose(scene: Scene, bounds: DwaLimits, chosen: DwaSettings) -> DwaResult:
 
 @settings(max_examples=examples(300), deadline=None)
 @given(scenes(["corners", "hairpin", "line", "none"]), limits, parameters)
+@pytest.mark.drive
 def test_kernel_chooses_the_same_arc_as_the_reference(draft: Draft, bounds: DwaLimits, weights: DwaSettings) -> None:
     scene = draft.scene_for(bounds, weights)
     result = choose(scene, bounds, weights)

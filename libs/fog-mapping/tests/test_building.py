@@ -95,6 +95,7 @@ def drawn(scans: list[Scan], poses: np.ndarray, truth: np.ndarray, value: int) -
     return place(origin, built.geometry.centres(np.argwhere(built.cells == value)[:, ::-1].astype(np.int64)))
 
 
+@pytest.mark.drive
 def test_walls_are_where_they_are_in_the_building(mapped):
     scans, truth, found = mapped
     solid = FLOOR.solid
@@ -135,6 +136,7 @@ def test_map_is_the_same_however_many_threads_make_it(mapped):
 @pytest.mark.parametrize(
     "share", [pytest.param(0.05, marks=pytest.mark.drive), pytest.param(0.1, marks=pytest.mark.drive), 0.2]
 )
+@pytest.mark.drive
 def test_wrong_loops_among_those_found_change_the_map_by_less_than_a_cell(mapped, monkeypatch, share):
     """Of the matches that each round finds, so many more are wrong: of places that are 2 to 6 m from each other."""
     scans, truth, found = mapped
@@ -184,6 +186,7 @@ def test_drives_with_other_noise_join_the_same_places_and_rooms(drives):
     assert all(maps[0]), "every room of the floor is open to the corridor"
 
 
+@pytest.mark.drive
 def test_loop_that_is_refused_is_not_closed(mapped):
     scans, truth, found = mapped
     refused = [(loop.first, loop.second) for loop, _ in found.loops]

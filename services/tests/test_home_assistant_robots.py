@@ -13,6 +13,7 @@ from contextlib import asynccontextmanager
 from pathlib import Path
 from urllib.parse import urlsplit
 
+import httpx
 import pytest
 from PIL import Image
 
@@ -189,7 +190,7 @@ async def test_home_assistant_itself_shows_all_of_a_robot_and_its_services_reach
 
 
 @pytest.mark.live
-async def test_robot_is_a_device_with_state_map_and_orders_and_refusals_are_told(bridge, until):
+async def test_robot_is_a_device_with_state_map_and_orders_and_refusals_are_told(bridge, tokens, until):
     async with bridge.edges() as (_, zenoh, _connect), home_of(bridge) as (home, mqtt):
         async with robot_state(zenoh):
             await until(lambda: home.report().get("battery") == 63, "its battery is known")
@@ -214,6 +215,9 @@ async def test_robot_is_a_device_with_state_map_and_orders_and_refusals_are_told
                 home.told.pop((ch.ROBOT_REFUSAL.name, "r1"), None)
                 await mqtt.publish(ch.ROBOT_ORDER, order, robot="r1")
                 await until(lambda words=words: words in home.of(ch.ROBOT_REFUSAL), f"{order} is refused: {words}")
+        async with httpx.AsyncClient(headers=tokens["viewer"]) as person:
+            trail = (await person.get(f"{await bridge.ready('map_service')}/api/v1/audit")).json()
+        assert "anna/home-assistant" in {entry["who"] for entry in trail}, trail
         bridge.kill("console_service")
         await until(lambda: home.of(ch.BRIDGE_AVAILABILITY, "") == "offline", "nobody knows the floor's state")
         bridge.start("console_service")

@@ -310,7 +310,7 @@ async def main() -> None:
     try:
         async with asyncio.TaskGroup() as tasks:
             for each in adapters:
-                tasks.create_task(each.run(floor, clock), name=each.name)
+                tasks.create_task(each.run(floor.of(each.name), clock), name=each.name)
             tasks.create_task(floor.follow(adapters), name="floor")
             tasks.create_task(health_loop(), name="health")
             tasks.create_task(serving, name="http")

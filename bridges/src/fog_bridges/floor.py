@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import asyncio
+import copy
 from typing import TYPE_CHECKING, Any, Final, NamedTuple, Protocol, runtime_checkable
 
 import httpx
 import msgspec
 
 from fog_runtime import logs
+from fog_runtime.http.tokens import PART
 
 if TYPE_CHECKING:
     import ssl
@@ -87,9 +89,16 @@ class Floor:
         self._client = httpx.AsyncClient(
             base_url=url, headers={"Authorization": f"Bearer {token}"}, timeout=REQUEST_S, verify=trusted
         )
+        self._part: dict[str, str] = {}
         self._last_id = ""
         self.problem = "not connected yet"
         """Why the events are not up to date; empty while they are."""
+
+    def of(self, adapter: str) -> Floor:
+        """Return the same floor for one adapter, whose name the audit trail has behind that of the token."""
+        found = copy.copy(self)
+        found._part = {PART: adapter}  # noqa: SLF001  # of the same class
+        return found
 
     async def aclose(self) -> None:
         """Close the connections."""
@@ -103,7 +112,7 @@ class Floor:
         """Send a request; return the answer."""
         try:
             answer = await self._client.request(
-                request.method, request.path, json=request.body, headers=request.headers
+                request.method, request.path, json=request.body, headers=self._part | (request.headers or {})
             )
         except httpx.HTTPError as error:
             return Answer(f"the floor can't be reached: {error!r}")

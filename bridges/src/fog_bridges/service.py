@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import time
 from collections import Counter as Counts
 from typing import TYPE_CHECKING, Any, Final
 
@@ -43,6 +44,8 @@ class HomeAssistantBridge:
         self._tasks: asyncio.TaskGroup | None = None
         self._floor: Floor | None = None
         self._is_known = False
+        self._limited = logs.RateLimited(_log)
+        """A broker may send the same order at any rate."""
         mqtt.on(ch.ROBOT_ORDER, self._on_order)
         mqtt.on_connect(self._tell_everything)
 
@@ -89,7 +92,8 @@ class HomeAssistantBridge:
 
     async def _tell(self, robot: str, order: str, refusal: str) -> None:
         ORDERS.labels(self.name, "refused" if refusal else "accepted").inc()
-        _log.info("order", robot=robot, order=order, refusal=refusal)
+        fields = {"robot": robot, "order": order, "refusal": refusal}
+        self._limited.info("order", f"{robot} {order} {refusal}", time.monotonic(), **fields)
         await self._mqtt.publish(ch.ROBOT_REFUSAL, refusal[:250], robot=robot)
 
     async def _picture_loop(self, clock: Clock) -> None:

@@ -85,9 +85,9 @@ class Robot:
             raise self.store_error
         self.stops.append((robot, audit.who, msgspec.json.decode(stop)))
 
-    def state(self, mode: Any = "INIT") -> None:
+    def state(self, mode: Any = "INIT", *, enabled: bool = False) -> None:
         state = RobotState(
-            mode=mode, reasons=[], enabled=False, battery=None, goal_id=None, map_epoch=1, map_seq=1, plan_id=None,
+            mode=mode, reasons=[], enabled=enabled, battery=None, goal_id=None, map_epoch=1, map_seq=1, plan_id=None,
             boot="run-1", clock=self.clock.now(),
         )  # fmt: skip
         self.published[ch.ROBOT_STATE]({"robot": "r1"}, state)
@@ -202,17 +202,29 @@ async def test_flood_of_stops_without_a_token_stops_each_time_and_fills_no_audit
     assert rig.robot.stops[1:] == [("r1", sender, {"kind": "disable", "repeats": {sender: 299}, "period_s": 600.0})]
 
 
-async def test_each_stop_of_an_operator_is_an_entry_with_the_name_and_a_wrong_token_stops_all_the_same(
+async def test_each_stop_of_an_operator_is_an_entry_but_of_a_robot_that_it_has_stopped_already(rig: Rig) -> None:
+    for _ in range(3):
+        for token in (OPERATOR, VIEWER, {"Authorization": "Bearer nobody's"}, OPERATOR | {"Fognav-Part": "vda5050"}):
+            assert (await rig.client.post("/api/v1/robots/r1/stop", headers=token)).status_code == 200
+    assert len(rig.robot.received) == 12, "each of them stops it"
+    senders = [sender.partition(" from ")[0] for _, sender, _ in rig.robot.stops]
+    assert senders == ["operator", "viewer", "stop", "operator/vda5050"]
+    rig.robot.state("NORMAL", enabled=True)
+    assert (await rig.client.post("/api/v1/robots/r1/stop", headers=OPERATOR)).status_code == 200
+    assert [sender for _, sender, _ in rig.robot.stops[4:]] == ["operator"]
+    rig.robot.clock.advance(PERIOD_S)
+    await rig.operator.record_repeated_stops()
+    repeats = rig.robot.stops[-1][2]["repeats"]
+    assert (repeats["operator"], repeats["operator/vda5050"]) == (2, 2)
+
+
+async def test_part_of_a_program_is_recorded_behind_its_tokens_name_and_one_that_is_no_word_is_refused(
     rig: Rig,
 ) -> None:
-    for token in (OPERATOR, OPERATOR, VIEWER, VIEWER, {"Authorization": "Bearer nobody's"}):
-        assert (await rig.client.post("/api/v1/robots/r1/stop", headers=token)).status_code == 200
-    assert [sender.partition(" from ")[0] for _, sender, _ in rig.robot.stops] == [
-        "operator",
-        "operator",
-        "viewer",
-        "stop",
-    ]
+    assert (await rig.command({"kind": "enable"}, OPERATOR | {"Fognav-Part": "ros2"})).status_code == 200
+    assert [who for _, who, _ in rig.robot.records] == ["operator/ros2"]
+    refused = await rig.command({"kind": "enable"}, OPERATOR | {"Fognav-Part": "somebody else"})
+    assert (refused.status_code, "Fognav-Part" in refused.json()["detail"]) == (422, True)
 
 
 async def test_stop_that_could_not_be_recorded_is_told_of_later(rig: Rig) -> None:

@@ -98,24 +98,26 @@ class _Period:
 
 
 class StopRecords:
-    """Which stops without a token are recorded one by one, and which are only counted.
+    """Which stops are recorded one by one, and which are only counted.
 
     Anybody may stop a robot, as often as they like. So that nobody can push the rest out of the audit trail by that,
     only the first stop of each sender is an entry of its own, for some senders; what they repeat is counted, and one
-    entry per robot and period tells how often.
+    entry per robot and period tells how often. Of who may command robots each stop is an entry, but for those of a
+    robot that they have stopped already.
     """
 
     def __init__(self) -> None:
         self._periods: dict[str, _Period] = {}
 
-    def count(self, robot: str, sender: str, now: float) -> bool:
-        """Count a stop at `now` (s, monotonic); return whether it is to be recorded by itself."""
+    def count(self, robot: str, sender: str, now: float, *, always: bool = False) -> bool:
+        """Count a stop at `now` (s, monotonic); return whether it is to be recorded by itself, as with `always`."""
         period = self._periods.setdefault(robot, _Period(now))
         if sender not in period.senders and len(period.senders) < SENDERS:
             period.senders.add(sender)
-            return True
-        self.unrecorded(robot, sender, now)
-        return False
+        elif not always:
+            self.unrecorded(robot, sender, now)
+            return False
+        return True
 
     def unrecorded(self, robot: str, sender: str, now: float) -> None:
         """Count a stop at `now` that has no entry of its own: it is a repetition, or could not be recorded."""
@@ -167,6 +169,9 @@ class RobotOperator:
         self._states: dict[str, tuple[RobotState, float]] = {}
         self._changed: dict[str, asyncio.Event] = {}
         self._stops = StopRecords()
+        self._limited = logs.RateLimited(_log)
+        self._stopped_by: dict[str, set[str]] = {}
+        """Who may command robots and has stopped one that was not enabled since."""
         self._doubled = DoubledRobots()
         self.overruled: Callable[[str], object] = lambda _robot: None
         """Called for a robot that somebody commands or stops, before the robot hears of it."""
@@ -174,6 +179,8 @@ class RobotOperator:
     def on_state(self, robot: str, state: RobotState, now: float) -> None:
         """Record a robot's state, which arrived at `now` (s, monotonic)."""
         self._states[robot] = state, now
+        if state.enabled:
+            self._stopped_by.pop(robot, None)
         if self._doubled.on_state(robot, state.boot, now):
             _log.error(
                 "robot_doubled", robot=robot, remedy="two agents use this id: switch one off, or give it another"
@@ -224,13 +231,17 @@ class RobotOperator:
     async def stop(self, robot: str, sender: str, *, each: bool = False) -> CommandReply:
         """Stop a robot for anybody, with a token or without; return its reply. Raises `CommandError`.
 
-        Repetitions are recorded together, unless `each` of them is to be: those of who may command robots.
+        Repetitions are recorded together. Of who may command robots `each` stop is recorded that is none: another's,
+        or one of a robot that was enabled meanwhile.
         """
         self._overrule(robot)
+        known = self._stopped_by.setdefault(robot, set())
+        always = each and sender not in known
+        known.update({sender} if each else ())
         try:
             return await self._deliver("disable", robot, sender)
         finally:
-            alone = each or self._stops.count(robot, sender, self._clock.now())
+            alone = self._stops.count(robot, sender, self._clock.now(), always=always)
             if alone and not await self._record_stop(robot, {"kind": "disable"}, sender, "stop", anybody=True):
                 self._stops.unrecorded(robot, sender, self._clock.now())
 
@@ -289,7 +300,11 @@ class RobotOperator:
                 f"robot {robot} did not answer within {REPLY_TIMEOUT_S:.0f} s: check that its agent runs and is"
                 " connected, and whether it has carried the command out"
             )
-        _log.info("robot_commanded", robot=robot, kind=kind, who=who, accepted=reply.accepted, reason=reply.reason)
+        told = {"robot": robot, "kind": kind, "who": who, "accepted": reply.accepted, "reason": reply.reason}
+        if kind == "disable":  # anybody may stop a robot at any rate
+            self._limited.info("robot_commanded", f"{robot} {who} {reply.accepted}", self._clock.now(), **told)
+        else:
+            _log.info("robot_commanded", **told)
         return reply
 
     def _fresh_state(self, robot: str) -> RobotState:

@@ -10,6 +10,7 @@ import binascii
 import hashlib
 import hmac
 import os
+import re
 import secrets
 import time
 from collections.abc import Callable, Iterable, Mapping
@@ -27,6 +28,13 @@ from fog_runtime.token_file import ROLES, Role, TokenEntry, TokensError, read_to
 
 SESSION_S: Final = 12 * 3600.0
 """How long a session lasts, unless its page asks who is logged in: each time it asks, it lasts as long again."""
+PART: Final = "Fognav-Part"
+"""The header by which a program says which of its parts asks by its token: the caller's name is `NAME/PART` then.
+
+No token has a name with a slash, so that nobody passes for another so.
+"""
+_PART: Final = re.compile(r"[a-z0-9-]{1,32}")
+_NAME_MAX: Final = 100
 _SAFE: Final = frozenset({"GET", "HEAD", "OPTIONS"})
 _RANKS: Final = {role: rank for rank, role in enumerate(ROLES)}
 _bearer = HTTPBearer(
@@ -224,9 +232,17 @@ def require(role: Role) -> Callable[..., Caller]:
                 "role, or ask who has one"
             )
             raise ProblemError(HttpProblem.ROLE_TOO_LOW, detail)
-        return caller
+        part = request.headers.get(PART)
+        return caller if credentials is None or part is None else _part_of(caller, part)
 
     return check
+
+
+def _part_of(caller: Caller, part: str) -> Caller:
+    if _PART.fullmatch(part) is None:
+        detail = f"the header {PART} has up to 32 small letters, digits and -, or is left out"
+        raise ProblemError(HttpProblem.REQUEST_INVALID, detail, field=f"header.{PART}")
+    return msgspec.structs.replace(caller, name=f"{caller.name[: _NAME_MAX - len(part) - 1]}/{part}")
 
 
 def still_admits(request: Request, role: Role) -> bool:

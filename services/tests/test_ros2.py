@@ -9,6 +9,7 @@ import time
 from collections import Counter
 from contextlib import suppress
 from functools import partial
+from itertools import pairwise
 from pathlib import Path
 from random import Random
 from typing import Any, Self, cast
@@ -26,8 +27,8 @@ from rosbags.typesys import Stores, get_typestore
 
 from fog_bridges.metrics import REFUSED
 from fog_bridges.ros2 import messages as ros
+from fog_bridges.ros2.advice import GOAL_TYPE, PATH_TYPE
 from fog_bridges.ros2.bridge import (
-    GOAL_TYPE,
     LANES_TYPE,
     LIMITS_TYPE,
     MAP_TYPE,
@@ -710,10 +711,16 @@ async def test_robot_and_obstacle_of_others_are_on_the_floors_map_and_the_robot_
     async with fog.edges() as edges:
         with Peer(port) as peer:
             peer.hear("fognav/test/keepout_mask", "nav_msgs/msg/OccupancyGrid", GRID)
+            peer.hear("tb4/fognav/advice", PATH_TYPE, "*/*")
+            goal, at = ros.pose(1.0, 1.0, 0.0), ros.pose(5.0, 4.0, 0.0)
+
+            def advice() -> list[tuple[float, float]] | None:
+                told = peer.told.get("tb4/fognav/advice")
+                return None if told is None else [(p.pose.position.x, p.pose.position.y) for p in told.poses]
 
             async def send() -> None:
                 while True:
-                    peer.send("tb4/amcl_pose", *encoded("tb4/amcl_pose", POSE_TYPE, stamped(ros.pose(5.0, 4.0, 0.0))))
+                    peer.send("tb4/amcl_pose", *encoded("tb4/amcl_pose", POSE_TYPE, stamped(at)))
                     peer.send(rmf[0], *encoded(*rmf, obstacles(obstacle(1))))
                     await asyncio.sleep(0.2)
 
@@ -725,6 +732,16 @@ async def test_robot_and_obstacle_of_others_are_on_the_floors_map_and_the_robot_
                 costs = decode_map(snapshot).layers["cost"]
                 assert costs[80, 100] == 254, "the robot of others is on the floor's map"
                 assert peer.mask()[80, 100] == 0, "and on no mask, which it follows itself"
+                assert advice() is None, "it has told no goal"
+                planned = ros.message("geometry_msgs/msg/PoseStamped", header=ros.header(time.time()), pose=goal)
+                peer.send("tb4/goal_pose", *encoded("tb4/goal_pose", GOAL_TYPE, planned))
+                await until(advice, "it is told a way there", lambda: fog.log("fog_bridges")[-3000:])
+                way = advice()
+                assert (way[0], way[-1]) == ((5.0, 4.0), (1.0, 1.0))
+                corners = np.concatenate([np.linspace(a, b, 50) for a, b in pairwise(way)])
+                assert np.abs(corners - 2.0).sum(axis=1).min() > 0.8, "round the obstacle, a diamond at (2, 2)"
+                at = goal
+                await until(lambda: advice() == [], "it has come there")
             finally:
                 sending.cancel()
             await until(lambda: not peer.mask().any(), "the obstacle's lifetime is over")

@@ -74,7 +74,7 @@ async def test_planned_path_goes_on_from_node_to_node_of_the_base_as_the_planner
             x, y = (request.body[name]["x"] for name in ("start", "goal"))
             if x == 7.0:
                 return Answer("", body={"points": [], "refusal": {"reason": "every path is blocked"}})
-            return Answer("", body={"points": [[x, 1.0], [x, 2.0], [y, 1.0]], "refusal": None})
+            return Answer("", body={"points": [[x, 1.0], [x, 1.5], [x, 2.0], [y, 1.0]], "refusal": None})
 
     nodes = [A, B, C, node("d", 6, 9.0, 1.0), node("e", 8, 9.0, 5.0, released=False)]
     floor.take(order(*nodes))

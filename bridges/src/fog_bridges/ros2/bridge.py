@@ -14,6 +14,7 @@ import numpy as np
 
 from fog_bridges.floor import WAITS, Request
 from fog_bridges.ros2 import messages as ros
+from fog_bridges.ros2.advice import GOAL_TYPE, Advice
 from fog_bridges.ros2.others import Others, thing_id
 from fog_bridges.ros2.wire import RosMessage, Topic, WireError
 from fog_contracts import channels as ch
@@ -62,7 +63,6 @@ GOAL_MAX_AGE_S: Final = 10.0
 """An older goal is refused: who sent it may have forgotten it."""
 MAP_TYPE: Final = "nav_msgs/msg/OccupancyGrid"
 INFO_TYPE: Final = "nav2_msgs/msg/CostmapFilterInfo"
-GOAL_TYPE: Final = "geometry_msgs/msg/PoseStamped"
 POSE_TYPE: Final = "geometry_msgs/msg/PoseWithCovarianceStamped"
 TF_TYPE: Final = "tf2_msgs/msg/TFMessage"
 OBSTACLES_TYPE: Final = "rmf_obstacle_msgs/msg/Obstacles"
@@ -118,6 +118,7 @@ class Ros2Bridge:
                 tasks.create_task(relay.snapshot_loop(), name="snapshot")
                 tasks.create_task(relay.map_loop(), name="map")
                 tasks.create_task(relay.goal_loop(), name="goals")
+                tasks.create_task(relay.advice.loop(), name="advice")
                 async for _ in ticker(clock, TICK_S):
                     self._problem = _problem(fog, session, relay)
         finally:
@@ -173,6 +174,7 @@ class Relay:
         self._hazards: dict[str, HazardArea] = {}
         self._zones = ZoneSet(epoch=0, seq=0, zones=[], active=[])
         self._others, self._traffic = others, traffic
+        self.advice = Advice(session, floor, clock, others)
         self._penalties: NDArray[np.int8] | None = None
         """What the zones in force add to the keepout mask; None: to be computed anew, as is `_closed`."""
         self._closed: NDArray[np.bool_] | None = None
@@ -196,6 +198,7 @@ class Relay:
         for name in self._others.radii:
             self._session.subscribe(Topic(f"{name}/amcl_pose", POSE_TYPE), partial(self._on_other_pose, name))
             self._session.subscribe(Topic(f"{name}/tf", TF_TYPE), partial(self._on_other_tf, name))
+        self.advice.subscribe()
         self._session.subscribe(Topic("rmf_obstacles", OBSTACLES_TYPE), self._on_obstacles)
         for kind, (topic, mask) in self._infos.items():
             self._session.publish(topic, ros.filter_info(kind, mask, self._stamp()), self._stamp())

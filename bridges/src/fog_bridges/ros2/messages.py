@@ -312,14 +312,18 @@ def scan(view: View, robot: str, stamp: float) -> RosMessage:
 
 
 def path(told: RobotPath | None, stamp: float) -> RosMessage:
-    """Return a robot's path by its corners, each turned towards the next; empty while there is none."""
-    points = [] if told is None else told.points
+    """Return a robot's path by its corners; empty while there is none."""
+    return way([], stamp) if told is None else way(told.points, stamp, told.goal_theta)
+
+
+def way(points: Sequence[tuple[float, float]], stamp: float, goal_theta: float | None = None) -> RosMessage:
+    """Return a path by its corners, each turned towards the next, and the last to `goal_theta`, if it is given."""
     poses = []
     for index, (x, y) in enumerate(points):
         begin, end = (points[index], points[index + 1]) if index + 1 < len(points) else points[-2:] or (points[0],) * 2
         theta = math.atan2(end[1] - begin[1], end[0] - begin[0])
-        if told is not None and index + 1 == len(points) and told.goal_theta is not None:
-            theta = told.goal_theta
+        if index + 1 == len(points) and goal_theta is not None:
+            theta = goal_theta
         poses.append(message("geometry_msgs/msg/PoseStamped", header=header(stamp), pose=pose(x, y, theta)))
     return message("nav_msgs/msg/Path", header=header(stamp), poses=poses)
 

@@ -104,7 +104,7 @@ class Others:
 
     def on_pose(self, name: str, told: RosMessage, now: float) -> Reported | None:
         """Return the report of a robot's pose, None if it is too early for one; raises `WireError`."""
-        _check_frame(told.header.frame_id)
+        check_frame(told.header.frame_id)
         pose = told.pose.pose
         return self._report(name, pose.position.x, pose.position.y, heading(pose.orientation) or 0.0, now)
 
@@ -121,7 +121,7 @@ class Others:
             moved, turned = each.transform.translation, heading(each.transform.rotation)
             if max(len(child), len(parent)) > _FRAME_NAME_MAX:
                 raise WireError(f"a frame with a name of {max(len(child), len(parent))} letters")
-            if turned is None or not _is_finite(moved.x, moved.y, turned):
+            if turned is None or not is_finite(moved.x, moved.y, turned):
                 raise WireError(f"the transform of {child[:40]!r} is none")
             if child in frames or len(frames) < _FRAMES_MAX:
                 frames[child] = _Transform(parent, moved.x, moved.y, turned, now)
@@ -141,7 +141,7 @@ class Others:
         return None
 
     def _report(self, name: str, x: float, y: float, theta: float, now: float) -> Reported | None:
-        if not _is_finite(x, y, theta):
+        if not is_finite(x, y, theta):
             raise WireError(f"a robot at ({x}, {y})")
         if now - self._reported.get(name, -math.inf) < PERIOD_S:
             return None
@@ -149,6 +149,11 @@ class Others:
         shape = CircleShape(centre=(x, y), radius=self.radii[name])
         self._trails[name].append((now, shape))
         return Reported(kind="robot", shape=shape, ttl=OTHERS_MAX_AGE_S, theta=theta)
+
+    def at(self, name: str, now: float) -> tuple[float, float] | None:
+        """Return where a robot is, None if it has not said so for a while."""
+        told_at, shape = self._trails[name][-1] if self._trails[name] else (-math.inf, None)
+        return None if shape is None or now - told_at > OTHERS_MAX_AGE_S else shape.centre
 
     def moves_away(self, now: float) -> bool:
         """Forget where robots were when the map has forgotten it, too; return whether there was anything to forget."""
@@ -201,10 +206,10 @@ class Others:
 
     def _added(self, thing: str, told: RosMessage, frame: str, now: float) -> Reported | None:
         """Return the report of an obstacle, None if it is too early for one."""
-        _check_frame(told.header.frame_id or frame)
+        check_frame(told.header.frame_id or frame)
         centre, size = told.bbox.center, told.bbox.size
         x, y, width, height = centre.position.x, centre.position.y, size.x, size.y
-        if not _is_finite(x, y) or not (0.0 < width <= SIZE_MAX_M and 0.0 < height <= SIZE_MAX_M):
+        if not is_finite(x, y) or not (0.0 < width <= SIZE_MAX_M and 0.0 < height <= SIZE_MAX_M):
             raise WireError(f"an obstacle of {width} x {height} m at ({x}, {y})")
         known = self._obstacles.get(thing)
         if known is not None and now - known.told < PERIOD_S:
@@ -229,11 +234,12 @@ def _bare(frame: str, name: str) -> str:
     return frame.removeprefix("/").removeprefix(f"{name}/")
 
 
-def _check_frame(frame: str) -> None:
+def check_frame(frame: str) -> None:
+    """Raise `WireError` for a frame that is not the map's."""
     if frame.removeprefix("/") not in ("", MAP_FRAME):
         raise WireError(f"a pose in the frame {frame[:40]!r}: send it in {MAP_FRAME!r}", "frame")
 
 
-def _is_finite(*values: float) -> bool:
+def is_finite(*values: float) -> bool:
     """Whether these are numbers that a floor may have."""
     return all(abs(value) < 1e5 for value in values)  # as the messages' type `Metres`; no NaN is

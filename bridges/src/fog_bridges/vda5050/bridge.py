@@ -27,7 +27,7 @@ from fog_bridges.vda5050.incoming import (
     ReportedState,
     decoded,
 )
-from fog_bridges.vda5050.orders import Leg, Where, goal_of, goals_of, is_repeated, rejection
+from fog_bridges.vda5050.orders import Leg, Where, corners_of, goal_of, goals_of, is_repeated, rejection
 from fog_bridges.vda5050.robot import FleetRobot
 from fog_bridges.vda5050.zones import ZoneSets, ZoneUser
 from fog_runtime import logs
@@ -180,7 +180,7 @@ class RobotLink(Connection):
             answer = await self._floor.ask(Request("POST", "/api/v1/plan", poses))
             if answer.refusal or answer.body.get("refusal") is not None or not answer.body.get("points"):
                 break
-            legs.append(Leg(start, end, [(x, y) for x, y in answer.body["points"]]))
+            legs.append(Leg(start, end, corners_of([(x, y) for x, y in answer.body["points"]])))
         return legs
 
     async def drive_loop(self) -> None:

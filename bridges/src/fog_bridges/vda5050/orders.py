@@ -25,6 +25,8 @@ MISSIONS_MAX: Final = 32
 ORDER_ACTIONS_MAX: Final = 100
 """Actions that an order may have in all: its state tells of each."""
 _SPEED_MARGIN: Final = 1e-3
+_STRAIGHT_M2: Final = 1e-6
+"""Twice the area of three points of a path, 5 cm apart, that lie on one line."""
 
 
 class Where(NamedTuple):
@@ -55,6 +57,16 @@ class Leg(NamedTuple):
     start: Node
     end: Node
     points: list[tuple[float, float]]
+
+
+def corners_of(points: list[tuple[float, float]]) -> list[tuple[float, float]]:
+    """Return a line without the points on its straight parts (m)."""
+    bends = [
+        b
+        for a, b, c in zip(points, points[1:], points[2:], strict=False)
+        if abs((b[0] - a[0]) * (c[1] - b[1]) - (b[1] - a[1]) * (c[0] - b[0])) > _STRAIGHT_M2
+    ]
+    return [points[0], *bends, points[-1]]
 
 
 def rejection(order: Order, kind: str, words: str, level: Level = "WARNING", **references: str) -> Error:

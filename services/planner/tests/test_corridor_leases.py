@@ -42,7 +42,7 @@ class Floor:
         """Put a robot at the beginning of a path, and let it have that path."""
         self.leases.place(robot, *corners[0], self.now)
         self.send(robot, *corners, priority=priority)
-        self.leases.on_state(robot, self.ids[robot], able=True, plans_itself=False)
+        self.leases.on_state(robot, self.ids[robot], self.now, able=True, strays=False)
 
     def send(self, robot: str, *corners: tuple[float, float], priority: int = 0) -> None:
         """Give a robot another path, of which it does not know yet."""
@@ -162,9 +162,9 @@ def test_a_former_path_stays_leased_until_its_robot_names_the_new_one():
     floor.ask("r1")
     former = floor.ids["r1"]
     floor.send("r1", (0.0, 0.0), (0.0, 10.0))
-    floor.leases.on_state("r1", former, able=True, plans_itself=False)
+    floor.leases.on_state("r1", former, floor.now, able=True, strays=False)
     assert floor.ask("r2") < 5.0
-    floor.leases.on_state("r1", floor.ids["r1"], able=True, plans_itself=False)
+    floor.leases.on_state("r1", floor.ids["r1"], floor.now, able=True, strays=False)
     assert floor.ask("r2") == 10.0
 
 
@@ -193,7 +193,7 @@ def test_a_lease_of_a_robot_that_stands_is_given_back_before_others_get_it():
     floor.now += PATIENCE_S
     floor.leases.place("r1", 0.0, 0.0, floor.now)
     assert floor.ask("r2") < 5.0
-    floor.leases.on_state("r1", floor.ids["r1"], able=False, plans_itself=False)
+    floor.leases.on_state("r1", floor.ids["r1"], floor.now, able=False, strays=False)
     assert floor.ask("r1") == 0.0, "it is told to stay"
     assert floor.ask("r2") < 5.0, "but may not have heard yet"
     floor.now += WITHDRAWN_S
@@ -247,7 +247,7 @@ class Interleavings(RuleBasedStateMachine):
         """A robot gets another path from where it is, which it has at once."""
         robot = self.robots[number % len(self.robots)]
         self.floor.send(robot, self.floor.at(robot, self.floor.along[robot]), *corners)
-        self.floor.leases.on_state(robot, self.floor.ids[robot], able=True, plans_itself=False)
+        self.floor.leases.on_state(robot, self.floor.ids[robot], self.floor.now, able=True, strays=False)
 
     @invariant()
     def no_leases_overlap(self) -> None:

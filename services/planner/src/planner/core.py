@@ -66,6 +66,8 @@ if TYPE_CHECKING:
 
 DRIVING: Final = frozenset({"NORMAL", "DEGRADED", "HOLD", "EGRESS", "DOCK"})
 """Modes of a robot that drives its path, or soon will."""
+BY_ITSELF: Final = frozenset({"EGRESS", "TELEOP"})
+"""Modes of a robot that drives, and not by its path."""
 
 
 class PlannerCore:
@@ -175,11 +177,14 @@ class PlannerCore:
         times = Times.of(plan.route, *limits)
         return self.paces.arrival(robot, times.rest(plan.progress))
 
-    def _on_state(self, ids: Ids, state: RobotState, _at: Moment) -> Sequence[Publication]:
+    def _on_state(self, ids: Ids, state: RobotState, at: Moment) -> Sequence[Publication]:
         mission = self.missions.of(ids["robot"])
         mission.on_state(state)
-        able = state.mode in DRIVING
-        self.leases.on_state(ids["robot"], mission.received, able=able, plans_itself=mission.plans_itself)
+        able, strays = state.mode in DRIVING, mission.plans_itself or state.mode in BY_ITSELF
+        plan, received = mission.plan, mission.received
+        if plan is not None and plan.route is None and received == (self.epoch, plan.plan_id):
+            received = None  # a refusal is no path
+        self.leases.on_state(ids["robot"], received, at.now, able=able, strays=strays)
         if state.goal_reached and state.goal_id is not None:
             if mission.goal is not None and mission.goal.goal_id == state.goal_id:
                 times = mission.plan.times if mission.plan is not None else None

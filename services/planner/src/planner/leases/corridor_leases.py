@@ -51,12 +51,16 @@ WITHDRAWN_S: Final = 10.0
 """... and after so long more it has: it has heard, or its own gate has stopped it (3 s without map or planner)."""
 FORGET_S: Final = 60.0
 """A robot that is silent for so long is an obstacle that others see, no longer one that stands in the way unseen."""
+SILENT_S: Final = 3.0
+"""After so long without a pose a robot gets nothing, and has stopped. So long a path may be on its way to it."""
 MOST_ROBOTS: Final = 10
-"""More robots on a floor get what a robot alone gets: what they lease takes longer than their paths may."""
+"""More robots with a path get what a robot alone gets: what they lease takes longer than their paths may."""
 MEETING_M: Final = 1.0
 """A robot on whose path another one is so near has not met it yet."""
 _SPEED_M_S: Final = 0.3
 _MOVED_M: Final = 0.1
+_BODIES: Final = 0.9
+"""Nearer than this share of their radii's sum two bodies touch, whatever their poses' errors."""
 
 
 class CorridorLeases:
@@ -77,6 +81,8 @@ class CorridorLeases:
         me.at, me.radius, me.heard_at = np.array(((x, y),)), radius, now
         if math.dist(me.moved_from, (x, y)) >= _MOVED_M or math.isinf(me.moved_at):
             me.moved_from, me.moved_at = (x, y), now
+            if not me.drives:
+                self.standstills.changed()  # it was carried, or drives by itself
 
     def advance(self, robot: str, progress: float) -> None:
         """Note how far along its path (m) a robot is: what lies behind is free again."""
@@ -111,13 +117,25 @@ class CorridorLeases:
             self._leave(me)
             self.standstills.changed()
 
-    def on_state(self, robot: str, received: PathId | None, *, able: bool, plans_itself: bool) -> None:
-        """Note which path a robot has, whether it may drive, and whether it follows paths of this planner at all."""
+    def on_state(self, robot: str, received: PathId | None, now: float, *, able: bool, strays: bool) -> None:
+        """Note which path a robot has, whether it may drive, and whether it drives by none of this planner's.
+
+        It never goes back to an older path than the one that it names, but may still get a newer one.
+        """
         me = self._of(robot)
-        me.former = {path: line for path, line in me.former.items() if path == received}
-        me.stray = plans_itself or (received is not None and received != me.path and received not in me.former)
-        if me.standing and able and math.isinf(me.withdrawn_at):
+        before, stray = len(me.former), me.stray
+        if received is not None:
+            me.named = max(me.named, received)
+            me.former = {path: line for path, line in me.former.items() if path >= received}
+        else:
+            coming = now - me.left_at <= SILENT_S
+            me.former = {path: line for path, line in me.former.items() if coming and path > me.named}
+        me.able = able
+        me.stray = strays or (received is not None and received != me.path and received not in me.former)
+        revived = me.standing and able and math.isinf(me.withdrawn_at) and now - me.heard_at <= SILENT_S
+        if revived:
             me.standing = False
+        if revived or me.stray != stray or len(me.former) != before:
             self.standstills.changed()
 
     def forget(self) -> None:
@@ -134,10 +152,11 @@ class CorridorLeases:
 
     def _leave(self, me: Corridor) -> None:
         if me.path is not None:
-            me.former[me.path] = me.points[me.first : me.leased + 1]
+            me.former[me.path], me.left_at = me.points[me.first : me.leased + 1], me.heard_at
         me.path, me.points, me.along = None, np.zeros((0, 2)), np.zeros(0)
         me.low, me.high = (math.inf, math.inf), (-math.inf, -math.inf)
-        me.progress, me.end, me.leased, me.waits_for, me.passes = 0.0, 0.0, 0, None, frozenset()
+        me.progress, me.end, me.leased, me.wanted = 0.0, 0.0, 0, 0.0
+        me.waits_for, me.lets_pass, me.passes = None, None, frozenset()
 
     # --- Leases -----------------------------------------------------------------------------------------------------
 
@@ -152,10 +171,13 @@ class CorridorLeases:
         self._settle(now)
         if me.path is None or not self._shared:
             me.end, me.leased = wanted, max(me.first, min(int(me.along.searchsorted(wanted)), len(me.points) - 1))
+            me.waits_for = me.lets_pass = None
             return math.inf
+        if self._somebody_on(me):
+            me.withdrawn_at = min(me.withdrawn_at, now)
         for other in sorted(self._robots.values(), key=lambda other: other.order):
             before = other.waits_for is not None and other.order < me.order
-            if before and not other.far_from(me, reach_of(me, other)):
+            if before and now - other.heard_at <= SILENT_S and not other.far_from(me, reach_of(me, other)):
                 self._extend(other, now)
         self._extend(me, now)
         return me.end if math.isinf(me.withdrawn_at) else min(me.end, me.progress)
@@ -163,7 +185,18 @@ class CorridorLeases:
     @property
     def _shared(self) -> bool:
         """Whether robots share a floor by leases."""
-        return 1 < len(self._robots) <= MOST_ROBOTS
+        return len(self._robots) > 1 and sum(me.path is not None for me in self._robots.values()) <= MOST_ROBOTS
+
+    def _somebody_on(self, me: Corridor) -> bool:
+        """Whether another body is on a robot's leased stretch: it was put there, or both had got too much."""
+        here = me.points[me.first]
+        for other in self._robots.values():
+            bodies = _BODIES * (me.radius + other.radius)
+            if other is not me and not me.far_from_point(other.at[0], bodies):
+                nearer = min(bodies, math.dist(here, other.at[0]) - SPACING_M)  # it may be going away
+                if comes_near(me, other.at, nearer, me.leased + 1):
+                    return True
+        return False
 
     def waits_for(self, robot: str) -> str | None:
         """Return whom a robot lets pass, or whose place it waits for, when it can't drive much further; else None."""
@@ -212,23 +245,28 @@ class CorridorLeases:
     # --- Robots that stand or are silent ------------------------------------------------------------------------------
 
     def _press(self, other: Corridor, now: float) -> None:
-        """Ask a robot for its lease that another one needs, when it has not moved for long."""
-        idle = now - other.moved_at >= PATIENCE_S and other.waits_for is None
-        if other.drives and idle and other.end > other.progress + WAITING_M and math.isinf(other.withdrawn_at):
+        """Ask a robot for its lease that another one needs, when it has not moved for long.
+
+        One that waits keeps the end of its lease, unless it can't drive, or is silent.
+        """
+        if not other.drives or now - other.moved_at < PATIENCE_S or not math.isinf(other.withdrawn_at):
+            return
+        waits = other.waits_for is not None or other.end <= other.progress + WAITING_M
+        if not waits or not other.able or now - other.heard_at > SILENT_S:
             other.withdrawn_at = now
 
     def _settle(self, now: float) -> None:
         """Free what was given back, and forget robots that have long been silent."""
         for other in [*self._robots.values()]:
             if now - other.withdrawn_at >= WITHDRAWN_S:
-                # Heard: it stands where it is. Silent: it may have driven on until it was asked.
+                # Heard: it stands where it is. Silent: it may have driven on until it was asked, and a little more.
                 unheard = max(0.0, other.withdrawn_at - other.heard_at)
-                end = other.progress + (_SPEED_M_S * unheard + STRAY_M if unheard > 1.0 else 0.0)
+                end = other.progress + (_SPEED_M_S * unheard + STRAY_M if now - other.heard_at > 1.0 else 0.0)
                 other.end = min(other.end, end)
                 other.leased = min(other.leased, max(other.first, int(other.along.searchsorted(other.end))))
                 other.withdrawn_at, other.standing = math.inf, True
                 self.standstills.changed()
-            if now - other.heard_at > FORGET_S and not other.drives:
+            if now - other.heard_at > FORGET_S:
                 del self._robots[other.id]
                 self.standstills.changed()
 
@@ -267,7 +305,7 @@ class CorridorLeases:
             return found
         for other in self._robots.values():
             if other is not me and math.isfinite(other.at[0, 0]):
-                reach = reach_of(me, other)
+                reach = reach_of(me, other) - (STRAY_M if other.stray is None else 0.0)
                 to_meet = other.drives and other.id in near and comes_near(me, other.at, reach + MEETING_M)
                 if to_meet or not other.drives:
                     found.append(Disc(between(me, other.ahead(), reach) if to_meet else other.at, reach))

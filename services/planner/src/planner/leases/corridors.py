@@ -37,6 +37,8 @@ WAITING_M: Final = 0.5
 """With less than so much left of its lease a robot waits."""
 _BETWEEN_M: Final = 0.15
 """So much farther off than that, since of places only the cells are known."""
+_LEAVING: Final = 0.3
+"""So much farther off, for each metre that it drives, a robot gets that leaves the line of another one."""
 NOWHERE: Final = np.full((1, 2), np.inf)
 
 
@@ -73,7 +75,13 @@ class Corridor:
     """... and the number of the path's point up to which its corridor is leased."""
     former: dict[PathId, Floats] = field(default_factory=dict)
     """Stretches of earlier paths on which it may still drive, until it names a newer one."""
-    stray: bool = False
+    named: PathId = (-1, -1)
+    """The newest path that it has named."""
+    left_at: float = -math.inf
+    """When it got another path last, or none."""
+    stray: bool | None = None
+    """Whether it drives by no path of this planner; None: it has told no state yet."""
+    able: bool = True
     withdrawn_at: float = math.inf
     standing: bool = False
     """Whether it counts as an obstacle: it gets no lease, and others find their way round it."""
@@ -129,6 +137,10 @@ class Corridor:
         apart_y = max(self.low[1] - max(other.high[1], y), min(other.low[1], y) - self.high[1])
         return not other.former and max(apart_x, apart_y) > reach
 
+    def far_from_lines(self, lines: Iterable[Floats], reach: float) -> bool:
+        """Whether its path comes nowhere near lines, each sampled at `SPACING_M`."""
+        return all(self.far_from_point(line[0], reach + SPACING_M * len(line)) for line in lines)
+
     def far_from_point(self, point: Floats, reach: float) -> bool:
         """Whether its path comes nowhere near a point."""
         x, y = point.tolist()  # numpy's own numbers are slow
@@ -144,7 +156,7 @@ def box(points: Floats) -> tuple[tuple[float, float], tuple[float, float]]:
 
 def reach_of(me: Corridor, other: Corridor) -> float:
     """Return how near (m) the middles of two robots may come."""
-    return me.radius + other.radius + MARGIN_M + (STRAY_M if other.stray else 0.0)
+    return me.radius + other.radius + MARGIN_M + (0.0 if other.stray is False else STRAY_M)
 
 
 def between(me: Corridor, line: Floats, reach: float) -> Floats:
@@ -163,15 +175,36 @@ def disc(me: Corridor, other: Corridor, line: Floats) -> Disc:
 def meets(me: Corridor, other: Corridor, begin: int, end: int, lines: Iterable[Floats]) -> int:
     """Return the first point of a path from `begin` on where its robot is too near to another one's lines; else `end`.
 
-    Who begins nearer than that may drive on as long as it gets no nearer.
+    Who begins nearer than that may drive on as long as it gets no nearer; and where bodies could touch, as long as it
+    gets farther away.
     """
     reach = reach_of(me, other)
     for line in lines:
         met = first_near(me.points, begin, end, line, reach, SPACING_M) if begin < end else -1
         if met == begin:
-            apart = float(np.hypot(*(line - me.points[begin]).T).min())
+            apart = _apart(me.points[begin], line)
+            if apart < me.radius + other.radius:
+                end = _leaves(me, begin, end, line, reach)
+                continue
             met = first_near(me.points, begin, end, line, apart - 1e-6, SPACING_M)
         end = met if met >= 0 else end
+    return end
+
+
+def _apart(point: Floats, line: Floats) -> float:
+    return float(np.hypot(*(line - point).T).min())
+
+
+def _leaves(me: Corridor, begin: int, end: int, line: Floats, reach: float) -> int:
+    """Return the point up to which a robot that begins on another one's line only gets away from it; else `end`."""
+    apart = _apart(me.points[begin], line)
+    for stop in range(begin + 1, end):
+        before, apart = apart, _apart(me.points[stop], line)
+        if apart > reach:
+            met = first_near(me.points, stop, end, line, reach, SPACING_M)
+            return met if met >= 0 else end
+        if apart < before + _LEAVING * SPACING_M:
+            return stop
     return end
 
 
@@ -189,6 +222,7 @@ def contender_of(
     return None
 
 
-def comes_near(me: Corridor, line: Floats, reach: float) -> bool:
-    """Whether the rest of a robot's path, as far as it is looked at, comes near a line."""
-    return first_near(me.points, me.first, me.last, line, reach, SPACING_M) >= 0
+def comes_near(me: Corridor, line: Floats, reach: float, end: int | None = None) -> bool:
+    """Whether the rest of a robot's path, as far as it is looked at or up to `end`, comes near a line."""
+    end = me.last if end is None else end
+    return me.first < end and first_near(me.points, me.first, end, line, reach, SPACING_M) >= 0

@@ -36,8 +36,6 @@ RETRY_S: Final = 2.0
 """After so long room that was not found is looked for again."""
 _STEP: Final = 5
 """Of so many points of a path one is looked at as a place to stop."""
-_NEAR_M: Final = 1.0
-"""So far from one another the lines are at most where a robot stands."""
 
 
 Kind = Literal["past", "lane", "round", "aside", "detour"]
@@ -84,7 +82,7 @@ class Standstills:
         left = sorted((r for r in robots if r.drives), key=lambda r: r.order)
 
         def blocks(me: Corridor, other: Corridor) -> bool:
-            if other is me or me.far_from_point(stands[other.id][0][0], reach_of(me, other) + _NEAR_M):
+            if other is me or me.far_from_lines(stands[other.id], reach_of(me, other)):
                 return False
             return meets(me, other, begins[me.id], me.last, stands[other.id]) < me.last
 
@@ -127,7 +125,7 @@ class Standstills:
             stepped.add(me.id)
             end = me.last
             for other in robots:
-                if other is not me and not me.far_from_point(stands[other.id][0][0], reach_of(me, other) + _NEAR_M):
+                if other is not me and not me.far_from_lines(stands[other.id], reach_of(me, other)):
                     end = meets(me, other, begins[me.id], end, stands[other.id])
             for stop in range(end - 1, begins[me.id], -_STEP):
                 if contender_of(me, stop, left, begins) is None:

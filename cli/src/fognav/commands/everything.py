@@ -21,7 +21,7 @@ from fognav.commands.robot_file import robot_app
 from fognav.commands.site import site_app
 from fognav.commands.source import source_app
 from fognav.commands.status import status_command
-from fognav.commands.up import down_command, logs_command, up_command, upgrade_command
+from fognav.commands.up import down_command, logs_command, stack_command, up_command, upgrade_command
 from fognav.commands.zone import zone_app
 from fognav.doctor import doctor_command
 from fognav.operate.options import NUMBERS
@@ -53,6 +53,7 @@ def add_to(app: typer.Typer) -> None:
         (installed.RUN, "up", up_command, "up --site sites/estig --site sites/floor2"),
         (installed.RUN, "down", down_command, "down"),
         (installed.RUN, "logs", logs_command, "logs map-service -f"),
+        (installed.RUN, "stack", stack_command, "stack sites/ground@fog1.local sites/upstairs@fog2.local --out stacks"),
         (installed.RUN, "bridge", bridge_command, "bridge bridge.toml"),
         (installed.RUN, "upgrade", upgrade_command, "upgrade --check"),
         (installed.RUN, "backup", backup_command, f"backup {backup}"),

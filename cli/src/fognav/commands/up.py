@@ -15,7 +15,8 @@ from fognav.hosting import local_nodes
 from fognav.hosting.fog_node import NodeConfig, run_node
 from fognav.hosting.folders import NodeFolder, default_data, hosted_sites, remember, settings_of
 from fognav.hosting.local_nodes import UNIT, end_node, named_node, write_unit
-from fognav.output import FailedError, exit_codes, print_line
+from fognav.operate.options import JsonOption
+from fognav.output import FailedError, exit_codes, print_line, print_result
 
 SitesOption = Annotated[
     list[Path] | None,
@@ -90,6 +91,32 @@ def up_command(  # noqa: PLR0913  # each option is an argument
             made = settings_of(directories, bind, host or [], simulate=sim, bridge=bridge, floors=floors)
             remember(folder.path, made)
             asyncio.run(run_node(config, print_line, check=check))
+
+
+def stack_command(
+    floors: Annotated[
+        list[str], typer.Argument(metavar="SITE@HOST...", help="Each floor's site, and the machine that it is on.")
+    ],
+    *,
+    out: Annotated[
+        Path, typer.Option("--out", metavar="DIR", help="Folder of stacks and credentials: keep it private.")
+    ],
+    images: Annotated[
+        str, typer.Option("--images", metavar="PREFIX", help="What the names of Fognav's images begin with.")
+    ] = "fognav/",
+    json: JsonOption = False,
+) -> None:
+    """Write stack files for Docker Swarm.
+
+    There is one for each floor, with its secrets and configuration. Each floor's console lists the others.
+    """
+    from fognav.hosting.swarm_stacks import named_floors, write_stacks  # noqa: PLC0415  # pictures are slow to import
+
+    with exit_codes(), security_errors():
+        named = [(checkout.site_folder(folder), host) for folder, host in named_floors(floors)]
+        made = write_stacks(named, checkout.root(), out.absolute(), images)
+    stacks = [f"docker stack deploy -c {Path(file).name} {Path(file).stem}" for file in made["files"]]
+    print_result(made, f"wrote {out}. On a manager, in this folder, for each floor:", *stacks, json=json)
 
 
 def down_command(

@@ -100,6 +100,22 @@ def _hand_out_keys(
     for program in (BRIDGE, SIMULATION):
         if (out / program).is_dir():
             keep_token(keys / TOKENS, program, "operator", out / program / TOKEN, owner=OWNERS[program])
+    return _write(out, _of_site(security, floor, robots, nodes))
+
+
+def secrets_of(security: SiteSecurity, *, robots: Sequence[str], nodes: Sequence[str]) -> dict[str, dict[str, bytes]]:
+    """Return the files of each program by their names, as `hand_out` writes them; raises as that.
+
+    The tokens of bridge and simulation are not among them.
+    """
+    return {**_servers(security), **_of_site(security, "", robots, nodes)}
+
+
+def _of_site(
+    security: SiteSecurity, floor: str, robots: Sequence[str], nodes: Sequence[str]
+) -> dict[str, dict[str, bytes]]:
+    """Return what each site has for itself."""
+    keys = keys_of(security.directory, floor)
     named = partial(users.on_floor, floor) if floor else str
     tokens, key, sessions = ((keys / name).read_bytes() for name in (TOKENS, OPERATOR_KEY, SESSION_KEY))
     found = {
@@ -115,7 +131,7 @@ def _hand_out_keys(
     # Those of robots and nodes may have been handed out already, and removed here.
     known = (security.credentials(named(user)) for user in ("console", "sim", *robots, *nodes))
     simulated = {f"{CREDENTIALS}/{file.name}": file.read_bytes() for file in known if file.exists()}
-    return _write(out, {**found, SIMULATION: {OPERATOR_KEY: key, **simulated}})
+    return {**found, SIMULATION: {OPERATOR_KEY: key, **simulated}}
 
 
 def _servers(security: SiteSecurity) -> dict[str, dict[str, bytes]]:
@@ -172,14 +188,21 @@ def _floors(settings: Settings) -> list[Site]:
     return [load_site(folder).site for folder in folders]
 
 
+def make_site(folder: Path, site: Site, hosts: Sequence[str]) -> SiteSecurity:
+    """Create what is missing of a site's credentials in a folder; robots, nodes and people reach it by `hosts`.
+
+    Raises `AuthorityError`, `SecurityError` and `OSError`.
+    """
+    security = SiteSecurity(folder, site.id)
+    security.make([*_SERVERS, *hosts], robots=[robot.id for robot in site.robots], nodes=site.senders)
+    make_keys(folder)
+    return security
+
+
 def _make(settings: Settings, site: Site, floors: Sequence[Site]) -> SiteSecurity:
     """Create what is missing."""
-    security = SiteSecurity(settings.locks_dir, site.id)
     hosts = [host for host in (part.strip() for part in settings.hosts.split(",")) if host]
-    security.make(
-        [*_SERVERS, *hosts], robots=[robot.id for robot in site.robots], nodes=site.senders
-    )  # fmt: skip
-    make_keys(settings.locks_dir)
+    security = make_site(settings.locks_dir, site, hosts)
     for index, floor in enumerate(floors):
         if floor.id in {site.id, *(each.id for each in floors[:index])}:
             raise SecurityError(f"two floors have the same id {floor.id!r}: give one of them another in its site.toml")

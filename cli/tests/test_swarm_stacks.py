@@ -1,0 +1,110 @@
+"""Stack files of floors on several machines, without an engine: what they name exists, and nothing is forgotten."""
+
+import shutil
+import tomllib
+from pathlib import Path
+from typing import Any
+
+import pytest
+import yaml
+from typer.testing import CliRunner
+
+from console_service.floors import read_peers
+from fog_runtime.configuration.site import load_site
+from fog_runtime.token_file import read_tokens, token_hash
+from fognav.__main__ import app
+from fognav.hosting.swarm_stacks import LIMIT
+
+ROOT = Path(__file__).parents[2]
+COMPOSE = (ROOT / "docker-compose.yml").read_text("utf-8")
+FLOORS = ("ground", "upstairs")
+
+
+def floor(folder: Path, site: str) -> Path:
+    made = shutil.copytree(ROOT / "sites" / "estig", folder / site)
+    text = (made / "site.toml").read_text("utf-8")
+    (made / "site.toml").write_text(text.replace('id = "estig"', f'id = "{site}"', 1), "utf-8")
+    return made
+
+
+def stack(*arguments: str | Path, code: int = 0) -> str:
+    done = CliRunner().invoke(app, ["stack", *map(str, arguments)])
+    assert done.exit_code == code, done.output
+    return done.output
+
+
+@pytest.fixture(scope="module")
+def words(tmp_path_factory: pytest.TempPathFactory) -> list[str]:
+    folder = tmp_path_factory.mktemp("sites")
+    return [f"{floor(folder, name)}@{name}.local" for name in FLOORS]
+
+
+@pytest.fixture(scope="module")
+def out(words: list[str], tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("stacks")
+    stack(*words, "--out", folder, "--images", "registry.local:5000/")
+    return folder
+
+
+def made(out: Path, name: str) -> dict[str, Any]:
+    return yaml.safe_load((out / f"{name}.yml").read_text("utf-8"))
+
+
+@pytest.mark.parametrize("name", FLOORS)
+def test_each_secret_and_config_of_a_stack_is_a_small_file_beside_it_and_each_is_used(out: Path, name: str) -> None:
+    found = made(out, name)
+    for kind in ("secrets", "configs"):
+        used = {each["source"] for service in found["services"].values() for each in service[kind]}
+        assert used == found[kind].keys()
+        for each in found[kind].values():
+            assert (out / each["file"]).stat().st_size <= LIMIT
+            assert len(each["name"]) <= 64
+        assert len({each["name"] for each in found[kind].values()}) == len(found[kind])
+
+
+def test_stack_has_every_service_that_always_runs_on_the_machine_of_its_floor(out: Path) -> None:
+    base = yaml.safe_load(COMPOSE)["services"]
+    found = made(out, "upstairs")
+    lasting = {name: each for name, each in base.items() if each["restart"] != "no" and "profiles" not in each}
+    assert found["services"].keys() == lasting.keys()
+    assert {"planner", "redis", "zenoh", "gateway"} <= lasting.keys()
+    for name, service in found["services"].items():
+        assert service["deploy"]["placement"]["constraints"] == ["node.labels.fognav.floor == upstairs"]
+        assert service["image"] == base[name]["image"].replace("fognav/", "registry.local:5000/")
+        assert set(service["networks"]) <= found["networks"].keys()
+        mounted = {each.partition(":")[0] for each in service["volumes"] if isinstance(each, str)}
+        assert [each["target"] for each in service["volumes"] if isinstance(each, dict)] == base[name].get("tmpfs", [])
+        assert mounted <= found["volumes"].keys(), "nothing of the machine itself is mounted"
+        targets = [each["target"] for kind in ("secrets", "configs") for each in service[kind]]
+        assert len(set(targets)) == len(targets)
+
+
+def test_site_of_a_stack_is_the_one_that_was_given_with_its_map(out: Path, words: list[str]) -> None:
+    given, taken = load_site(Path(words[1].partition("@")[0])), load_site(out / "upstairs" / "configs" / "site")
+    assert taken.site == given.site
+    assert (taken.map.cells == given.map.cells).all()
+
+
+def test_each_console_lists_the_other_floors_with_a_token_that_is_valid_there(out: Path) -> None:
+    for here, there in (FLOORS, FLOORS[::-1]):
+        folder = out / here / "secrets" / "console-service"
+        (peer,) = read_peers(folder / "floors.toml", here)
+        assert (peer.id, peer.address) == (there, f"https://{there}.local")
+        tokens = {each.sha256: each for each in read_tokens(out / there / "secrets" / "planner" / "tokens.toml")}
+        assert tokens[token_hash(peer.token)].role == "viewer"
+        environment = made(out, here)["services"]["console-service"]["environment"]
+        assert environment["FOGNAV_FLOORS_FILE"] == "/run/fognav/floors.toml"
+    own = [tomllib.loads((out / each / "secrets/planner/credentials.toml").read_text("utf-8")) for each in FLOORS]
+    assert own[0]["authority"] != own[1]["authority"], "each floor trusts its own authority alone"
+
+
+def test_stack_that_is_written_again_keeps_its_credentials_and_names(out: Path, words: list[str]) -> None:
+    before = made(out, "ground")
+    stack(*words, "--out", out, "--images", "registry.local:5000/")
+    assert made(out, "ground") == before
+
+
+@pytest.mark.parametrize("word", ["sites/estig", "@fog.local", "sites/estig@fog local"])
+def test_floor_without_a_machine_is_refused(tmp_path: Path, word: str) -> None:
+    said = stack(word, "--out", tmp_path, code=2)
+    assert "sites/upstairs@fog2.local" in said.replace("\n", " ")

@@ -48,6 +48,17 @@ def test_a_path_that_may_still_arrive_stays_leased_when_the_robot_names_an_older
     assert floor.ask("r2") < 5.0
 
 
+def test_figures_tell_who_waits_and_how_much_is_leased():
+    floor = Floor()
+    floor.put("r1", (-6.0, 0.0), (6.0, 0.0))
+    floor.put("r2", (0.0, 0.6), (0.0, -6.0))
+    floor.leases.place("parked", 0.0, 20.0, floor.now)
+    floor.ask("r1")
+    floor.ask("r2")
+    assert floor.leases.waits_for("r2") == "r1"
+    assert floor.leases.figures() == (1, pytest.approx(12.0 + floor.released["r2"]))
+
+
 def test_a_robot_that_falls_silent_while_it_waits_is_no_longer_waited_for():
     floor = Floor()
     floor.put("r1", (-6.0, 0.0), (6.0, 0.0))

@@ -8,6 +8,7 @@ from prometheus_client import Counter, Gauge
 
 from fog_contracts.messages import BlockedWay, PlanCode, RobotPath, RobotRelease
 from fog_runtime import logs, metrics
+from planner.leases.standstills import Kind
 from planner.missions import ReplanReason
 from planner.replanner import AvoidReason
 
@@ -99,6 +100,9 @@ DETOURS = Counter(
     "fognav_plan_shared_bounds_total", "Bounds of the way round a closure, computed once for several robots' searches"
 )
 ROBOTS = Gauge("fognav_planner_robots", "Robots with a mission")
+ROOM = Counter("fognav_planner_room_made_total", "Paths by which a robot made room for another one, by kind", ["kind"])
+WAITING = Gauge("fognav_planner_robots_waiting", "Robots with a path that wait for another robot")
+LEASED = Gauge("fognav_planner_leased_m", "Path ahead of all robots that is leased to them")
 FIELD_BYTES = Gauge("fognav_planner_goal_fields_bytes", "Memory of the distance fields of all goals")
 
 
@@ -109,7 +113,7 @@ class PlanMetrics:
         """Export all labels from now on, with 0: a rate needs a value from before the first event."""
         self._exported: dict[tuple[int, object], int] = {}
         metrics.expect_stages(["plan"])
-        for counter, labels in ((PLANS, ReplanReason), (REFUSALS, PlanCode), (AVOIDED, AvoidReason)):
+        for counter, labels in ((PLANS, ReplanReason), (REFUSALS, PlanCode), (AVOIDED, AvoidReason), (ROOM, Kind)):
             for label in get_args(labels):
                 if label != 0:  # the code of success
                     counter.labels(str(label))
@@ -118,9 +122,13 @@ class PlanMetrics:
         """Export the core's counts; `robots`: how many have a mission."""
         ROBOTS.set(robots)
         FIELD_BYTES.set(core.fields_bytes)
+        waiting, leased = core.leases.figures()
+        WAITING.set(waiting)
+        LEASED.set(leased)
         replanner = core.replanner
         self._count(DETOURS, id(DETOURS), None, replanner.detours.computed)
-        for counter, values in ((PLANS, replanner.plans), (REFUSALS, replanner.refusals), (AVOIDED, replanner.avoided)):
+        counts = (PLANS, replanner.plans), (REFUSALS, replanner.refusals), (AVOIDED, replanner.avoided)
+        for counter, values in (*counts, (ROOM, core.leases.made)):
             for label, count in dict(values).items():
                 self._count(counter.labels(str(label)), id(counter), label, count)
 

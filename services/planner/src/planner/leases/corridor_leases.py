@@ -69,6 +69,7 @@ class CorridorLeases:
     def __init__(self) -> None:
         self._robots: dict[str, Corridor] = {}
         self._arrivals = 0
+        self._now = -math.inf
         self.standstills = Standstills(self._robots)
         self.made: dict[Kind, int] = {}
         """How often robots got room, by kind."""
@@ -77,7 +78,7 @@ class CorridorLeases:
 
     def place(self, robot: str, x: float, y: float, now: float, radius: float = DEFAULT_RADIUS_M) -> None:
         """Note where a robot is (m)."""
-        me = self._of(robot)
+        me, self._now = self._of(robot), now
         me.at, me.radius, me.heard_at = np.array(((x, y),)), radius, now
         if math.dist(me.moved_from, (x, y)) >= _MOVED_M or math.isinf(me.moved_at):
             me.moved_from, me.moved_at = (x, y), now
@@ -120,16 +121,15 @@ class CorridorLeases:
     def on_state(self, robot: str, received: PathId | None, now: float, *, able: bool, strays: bool) -> None:
         """Note which path a robot has, whether it may drive, and whether it drives by none of this planner's.
 
-        It never goes back to an older path than the one that it names, but may still get a newer one.
+        It never goes back to an older path than the one that it names, but may still get a newer one; without any, one
+        that is on its way.
         """
         me = self._of(robot)
         before, stray = len(me.former), me.stray
         if received is not None:
-            me.named = max(me.named, received)
             me.former = {path: line for path, line in me.former.items() if path >= received}
-        else:
-            coming = now - me.left_at <= SILENT_S
-            me.former = {path: line for path, line in me.former.items() if coming and path > me.named}
+        elif now - me.left_at > SILENT_S:
+            me.former = {}
         me.able = able
         me.stray = strays or (received is not None and received != me.path and received not in me.former)
         revived = me.standing and able and math.isinf(me.withdrawn_at) and now - me.heard_at <= SILENT_S
@@ -152,7 +152,7 @@ class CorridorLeases:
 
     def _leave(self, me: Corridor) -> None:
         if me.path is not None:
-            me.former[me.path], me.left_at = me.points[me.first : me.leased + 1], me.heard_at
+            me.former[me.path], me.left_at = me.points[me.first : me.leased + 1], self._now
         me.path, me.points, me.along = None, np.zeros((0, 2)), np.zeros(0)
         me.low, me.high = (math.inf, math.inf), (-math.inf, -math.inf)
         me.progress, me.end, me.leased, me.wanted = 0.0, 0.0, 0, 0.0
@@ -166,7 +166,7 @@ class CorridorLeases:
         A robot without others on its floor, or with too many, may drive as far as anybody wants: infinity. Those who
         wait and whose turn is before its own get theirs first.
         """
-        me = self._of(robot)
+        me, self._now = self._of(robot), now
         me.wanted = wanted
         self._settle(now)
         if me.path is None or not self._shared:
@@ -204,6 +204,12 @@ class CorridorLeases:
         if me is None or me.path is None or me.end - me.progress > WAITING_M:
             return None
         return me.waits_for or min(me.passes, default=None)
+
+    def figures(self) -> tuple[int, float]:
+        """Return how many robots wait for another one, and how much path (m) ahead of robots is leased; any thread."""
+        robots = [me for me in self._robots.copy().values() if me.path is not None]
+        waiting = sum(self.waits_for(me.id) is not None for me in robots)
+        return waiting, sum(max(0.0, me.end - me.progress) for me in robots)
 
     def _extend(self, me: Corridor, now: float) -> None:
         last = min(int(me.along.searchsorted(me.wanted)), len(me.points) - 1)

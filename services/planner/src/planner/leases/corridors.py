@@ -75,8 +75,6 @@ class Corridor:
     """... and the number of the path's point up to which its corridor is leased."""
     former: dict[PathId, Floats] = field(default_factory=dict)
     """Stretches of earlier paths on which it may still drive, until it names a newer one."""
-    named: PathId = (-1, -1)
-    """The newest path that it has named."""
     left_at: float = -math.inf
     """When it got another path last, or none."""
     stray: bool | None = None

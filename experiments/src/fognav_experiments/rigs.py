@@ -16,7 +16,7 @@ import msgspec
 from fog_contracts import channels as ch
 from fog_contracts.bus import Bus
 from fog_contracts.commands import signed_command
-from fog_contracts.cones import node_cones
+from fog_contracts.cones import node_cones, sonar_cones
 from fog_contracts.handlers import Moment, Publication
 from fog_contracts.messages import CommandReply, NodeConfig
 from fog_kernels.sonar import default_config
@@ -322,8 +322,9 @@ def make_aggregator(site: LoadedSite, epoch: int) -> Aggregator:
     """Return the aggregator of a site, as it starts."""
     nodes, cones = site.site.nodes, node_cones(site.site.nodes, site.map)
     fusion = AreaFusion(
-        site.site.definitions(), nodes, epoch=epoch, registry=find_rule, cones=cones, robots=site.site.robots
-    )
+        site.site.definitions(), nodes, epoch=epoch, registry=find_rule, cones=cones, robots=site.site.robots,
+        sonar_cones=sonar_cones(nodes, site.map),
+    )  # fmt: skip
     return Aggregator(fusion)
 
 

@@ -36,7 +36,7 @@ class Fog:
     """A layer, and what aggregators send to it: one heartbeat per step of 0.2 s."""
 
     def __init__(self, *areas: str) -> None:
-        self.layer = HazardsLayer(GEOMETRY)
+        self.layer = HazardsLayer(StaticMap(GEOMETRY, np.zeros(GEOMETRY.shape, np.uint8)))
         self.now = 100.0
         for area in areas or ("hall", "gate"):
             self.layer.define(definition(area), self.at)

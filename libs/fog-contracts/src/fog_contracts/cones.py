@@ -89,6 +89,17 @@ def node_cones(nodes: Iterable[NodeSite], static: StaticMap) -> dict[str, list[P
     return cones
 
 
+def sonar_cones(nodes: Iterable[NodeSite], static: StaticMap) -> dict[str, list[list[Point]]]:
+    """Return the outlines of what each sonar of a node sees, by node."""
+    return {
+        node.id: [
+            [(round(x, _DECIMALS), round(y, _DECIMALS)) for x, y in sonar_cone(node, sonar, static)]
+            for sonar in range(len(node.sonars))
+        ]
+        for node in nodes
+    }
+
+
 def _angles(node: NodeSite, sonar: int) -> _Floats:
     middle = node.theta + node.sonars[sonar].angle
     return np.linspace(middle - SONAR_HALF_CONE, middle + SONAR_HALF_CONE, _RAYS)

@@ -11,6 +11,7 @@ from msgspec.structs import asdict
 from fog_contracts.messages import (
     AlertPolicy,
     AreaDefinition,
+    FreeWidth,
     FusionPolicy,
     Id,
     Message,
@@ -72,7 +73,7 @@ class Sonar(Message, frozen=True, kw_only=True):
     `no_echo_is_clear` is true only where calibration recorded that nothing is in range; elsewhere the opposite wall
     normally echoes, and a missing echo means `unknown`. A node of which no sonar hears anything is never clear.
     `false_echo_rate`: the share of readings of the free area with an echo nearer than the limit, as its calibration
-    showed it.
+    showed it. `time_of_flight`: it measures by light.
     """
 
     angle: Radians = 0.0
@@ -80,6 +81,7 @@ class Sonar(Message, frozen=True, kw_only=True):
     range_max: Annotated[float, Meta(gt=0.02, le=20.0)] | None = None
     no_echo_is_clear: bool = False
     false_echo_rate: Annotated[float, Meta(gt=0.0, lt=1.0)] | None = None
+    time_of_flight: bool = False
 
     def __post_init__(self) -> None:
         if self.range_max is not None and self.range_max <= self.range_limit:
@@ -123,6 +125,7 @@ class AreaSite(Message, frozen=True, kw_only=True):
     unknown: UnknownPolicy = UnknownPolicy()
     alerts: AlertPolicy = AlertPolicy()
     penalty: Penalty | None = None
+    free_width: FreeWidth | None = None
 
 
 class SourceSite(Source, frozen=True, kw_only=True):
@@ -255,6 +258,7 @@ class Site(Message, frozen=True, kw_only=True):
                 unknown=area.unknown,
                 alerts=area.alerts,
                 penalty=area.penalty,
+                free_width=area.free_width,
             )
             for area in self.areas
         ]

@@ -7,7 +7,7 @@ import os
 from typing import Final
 
 from fog_contracts import channels as ch
-from fog_contracts.cones import node_cones
+from fog_contracts.cones import node_cones, sonar_cones
 from fog_contracts.handlers import Moment
 from fog_runtime import logs, process
 from fog_runtime.clock import SystemClock, boot_id
@@ -75,6 +75,7 @@ async def main() -> None:
         fusion = AreaFusion(
             definitions.values(), loaded.site.nodes, 0, stored.hazards,
             registry=find_rule, default_rule=settings.debounce, cones=cones, robots=loaded.site.robots,
+            sonar_cones=sonar_cones(loaded.site.nodes, loaded.map),
         )  # fmt: skip
         mqtt = MqttEdgeWithInputs(
             settings.mqtt_url, process_id("hazard-aggregator"), clock, site=site, inputs=SENSORS, will=LAST_WILL,

@@ -19,6 +19,7 @@ from fog_contracts.messages import (
     AreaHazard,
     AreaState,
     Code,
+    FreeWidth,
     FusionPolicy,
     Id,
     Message,
@@ -121,6 +122,7 @@ class AreaBody(Message, frozen=True, kw_only=True):
     unknown: UnknownPolicy = UnknownPolicy()
     alerts: AlertPolicy = AlertPolicy()
     penalty: Penalty | None = None
+    free_width: FreeWidth | None = None
     removed: bool = False
 
 

@@ -29,6 +29,7 @@ from fog_contracts.messages import (
 )
 from hazard_aggregator.area_size import AreaError
 from hazard_aggregator.debounce import make_rule
+from hazard_aggregator.free_parts import free_sonars, outlines
 from hazard_aggregator.node_state import FlapDetector, NodeState, SourceState
 from hazard_aggregator.source_values import SourceError, SourceReader, resolve
 
@@ -39,6 +40,7 @@ if TYPE_CHECKING:
     from fog_contracts.messages import AreaDefinition, AreaState, FusionPolicy, Source
     from fog_contracts.site import NodeSite
     from hazard_aggregator.debounce import Registry, Rule
+    from hazard_aggregator.free_parts import Cones, FreeSonars
 
 LONGEST_S: Final[Mapping[OverrideState, float]] = {"blocked": 30 * 86_400.0, "clear": 900.0}
 """How long (s) an override may last: one that declares an area clear counts against what nodes measure."""
@@ -144,6 +146,7 @@ class WatchedArea:
         self._confirmed = False  # whether readings of this run have confirmed a state
         self._restored: AreaHazard | None = None
         self._states: set[AreaState] = set()  # all that it had in this run
+        self._free: FreeSonars = frozenset()
 
     def redefine(self, definition: AreaDefinition, nodes: dict[str, NodeState]) -> None:
         """Change the definition and the nodes; the state is that of the nodes."""
@@ -180,19 +183,25 @@ class WatchedArea:
         if self.hazard is not None:
             self.hazard = structs.replace(self.hazard, epoch=epoch)
 
-    def evaluate(self, epoch: int, seq: int, stamp: float, override: AreaOverride | None = None) -> AreaHazard | None:
+    def evaluate(
+        self, epoch: int, seq: int, stamp: float, override: AreaOverride | None = None, cones: Cones | None = None
+    ) -> AreaHazard | None:
         """Fuse the nodes, unless an operator's override counts; return the area's hazard, with this epoch and `seq`.
 
-        None when it did not change.
+        None when it did not change. `cones` are what each sonar sees.
         """
         measured = self._measure()
+        old = self.hazard
+        stays_blocked = old is not None and old.state == measured.state == "blocked" and old.override is None
+        may_pass = stays_blocked and override is None
+        self._free = free_sonars(self.definition, self.nodes, self._free) if may_pass else frozenset()
+        free = outlines(self._free, cones or {})
         state, penalty, severity, cause, deciding = self._overridden(measured, override)
         explained = next((node.explained_by for node in self.nodes.values() if node.explained_by), None)
         told = None if override is None else _told(override, measured)
         since = self._since(state, stamp)
-        old = self.hazard
-        if old is not None and (old.state, old.penalty, old.explained_by, old.since, old.override) == (
-            state, penalty, explained, since, told,
+        if old is not None and (old.state, old.penalty, old.explained_by, old.since, old.override, old.free) == (
+            state, penalty, explained, since, told, free,
         ) and (state != "unknown" or old.cause == cause):  # fmt: skip
             return None
         trace = None
@@ -216,6 +225,7 @@ class WatchedArea:
             trace=trace,
             code="" if deciding is None else deciding.reason.code,
             decided_by=None if deciding is None else deciding.id,
+            free=free,
         )
         return self.hazard
 

@@ -37,6 +37,7 @@ if TYPE_CHECKING:
     from hazard_aggregator.alerts import NodeReport
     from hazard_aggregator.areas import AreaOverride
     from hazard_aggregator.debounce import Registry
+    from hazard_aggregator.free_parts import Cones
     from hazard_aggregator.node_state import NodeState
     from hazard_aggregator.readings import Rejection
     from hazard_aggregator.sources import Applied
@@ -54,7 +55,8 @@ class AreaFusion:
     `restored` are the hazards that were stored last: a blocked area stays blocked until readings or silence change it.
     All others start as unknown, because only readings of this run can show that an area is clear. `registry` finds
     debounce rules by name, `default_rule` is the one of areas that name none, `cones` are the outlines of what nodes
-    see (`Members`), `robots` have the bodies that echoes may come from; raises `AreaError` for an invalid area.
+    see (`Members`), `sonar_cones` those of each sonar, `robots` have the bodies that echoes may come from; raises
+    `AreaError` for an invalid area.
     """
 
     def __init__(  # noqa: PLR0913  # what is known at the start
@@ -68,10 +70,12 @@ class AreaFusion:
         default_rule: str = DEFAULT_RULE,
         cones: Mapping[str, list[Point]] | None = None,
         robots: Iterable[RobotSite] = (),
+        sonar_cones: Cones | None = None,
     ) -> None:
         self.epoch = epoch
         self.nodes = {node.id: node for node in nodes}
         self._members = Members(self.nodes, registry, default_rule, cones or {})
+        self._sonar_cones = sonar_cones
         self._sources = Sources()
         self._areas: dict[str, WatchedArea] = {}
         self._overrides: dict[str, AreaOverride] = {}
@@ -318,7 +322,8 @@ class AreaFusion:
     def _evaluate(self, area: WatchedArea, stamp: float) -> list[AreaHazard]:
         """Return the area's hazard when it changed."""
         seq = self._seqs.get(area.definition.id, 0) + 1
-        hazard = area.evaluate(self.epoch, seq, stamp, self._overrides.get(area.definition.id))
+        override = self._overrides.get(area.definition.id)
+        hazard = area.evaluate(self.epoch, seq, stamp, override, self._sonar_cones)
         if hazard is None:
             return []
         self._seqs[area.definition.id] = seq

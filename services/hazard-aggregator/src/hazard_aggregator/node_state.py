@@ -8,6 +8,7 @@ from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Final
 
 from fog_contracts.messages import NodeCode, Reason, UnknownPolicy
+from hazard_aggregator.free_parts import FarWall
 
 if TYPE_CHECKING:
     from fog_contracts.messages import AreaState, Availability, NodeReading, Source
@@ -87,11 +88,17 @@ class NodeState:
     ignored: int = 0
     area_penalty: int | None = None
     flaps: FlapDetector = field(default_factory=lambda: FlapDetector(UnknownPolicy().max_changes))
+    free: frozenset[int] = frozenset()
+    """The sonars that show their parts of the area free."""
+
+    def __post_init__(self) -> None:
+        self.far_wall = FarWall(self.site)
 
     @property
-    def outcome(self) -> tuple[AreaState, str, str | None, bool]:
+    def outcome(self) -> tuple[AreaState, str, str | None, bool, frozenset[int], bool]:
         """All that an area's hazard depends on."""
-        return self.state, self.reason, self.explained_by, self.ever_received
+        seen = self.free, self.far_wall.sees_something
+        return self.state, self.reason, self.explained_by, self.ever_received, *seen
 
     @property
     def penalty(self) -> int | None:
@@ -137,6 +144,7 @@ class NodeState:
 
     def check_silence(self, limit: float, now: float) -> None:
         """Invalidate the state of a node that was silent, or confirmed nothing, for longer than `limit` (s)."""
+        self.free = self.far_wall.free(now)
         if self.silent_for(now) > limit:
             reason = f"it has been silent for more than {limit:g} s"
             # A few readings since an earlier silence confirmed nothing, and do not count after this one.
@@ -167,6 +175,7 @@ class NodeState:
         One that does not count is a sign of life, but no measurement of its own.
         """
         self.receive(taken_at)
+        self.free = self.far_wall.on_reading(classification.sonars if counts else None, taken_at)
         if classification.explained_by is not None:
             self._apply_explained(classification.explained_by, taken_at)
             return

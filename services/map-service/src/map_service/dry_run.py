@@ -183,7 +183,7 @@ def _overridden(hazards: HazardsLayer, area: str, state: OverrideState | None) -
     """
     described, hazard = hazards.hazard(area), hazards.hazard(area).hazard
     if state == "blocked":
-        changed = structs.replace(hazard, state="blocked", severity=SEVERITY["blocked"], penalty=LETHAL)
+        changed = structs.replace(hazard, state="blocked", severity=SEVERITY["blocked"], penalty=LETHAL, free=[])
     elif state == "clear":
         penalty = min(PASSABLE_PENALTY, hazards.unknown_penalty(area))
         changed = structs.replace(hazard, state="unknown", severity=SEVERITY["unknown"], penalty=penalty)

@@ -82,6 +82,10 @@ Penalty = Annotated[int, Meta(ge=1, le=253)]
 """The cost of an area that a blocked sensor makes costly instead of impassable."""
 
 
+FreeWidth = Annotated[float, Meta(ge=0.2, le=5.0, extra={"unit": "m"})]
+"""How wide a part of a blocked area must be that its sensors show free, for robots to pass it slowly."""
+
+
 class Quantity(Message, frozen=True, kw_only=True):
     """What a node of Fognav measures besides ranges: its id, and the `kind` of its `NodeValue`, such as temperature."""
 
@@ -146,7 +150,8 @@ class AreaDefinition(Message, frozen=True, kw_only=True):
 
     With `cone_of` the polygon is what the sonars of that node see. `number` identifies it on the thesis's topics.
     `debounce` holds the rule's name (`rule`) and its options. With a `penalty`, nodes and sources make it costly
-    instead of impassable. `epoch` is that of the aggregator that publishes it.
+    instead of impassable. With a `free_width`, robots may pass slowly where sonars hear the far wall while the area is
+    blocked, if that part is so wide. `epoch` is that of the aggregator that publishes it.
     """
 
     id: Id
@@ -161,6 +166,7 @@ class AreaDefinition(Message, frozen=True, kw_only=True):
     unknown: UnknownPolicy = UnknownPolicy()
     alerts: AlertPolicy = AlertPolicy()
     penalty: Penalty | None = None
+    free_width: FreeWidth | None = None
     version: Count = 0
     removed: bool = False
     epoch: Count = 0
@@ -197,7 +203,8 @@ class AreaHazard(Message, frozen=True, kw_only=True):
     """State of one area; `seq` grows by one with each change, `epoch` with each start of the aggregator.
 
     With an `override` the state is not that of the nodes: `blocked`, or `unknown` and passable where an operator
-    declared the area clear, which nobody measures (ADR 16). `code` identifies the `cause` (`NodeCode`) if it is that of
+    declared the area clear, which nobody measures (ADR 16). `free`: outlines in a blocked area that its sensors show
+    free, of an area with a `free_width`. `code` identifies the `cause` (`NodeCode`) if it is that of
     the node or source `decided_by`.
     """
 
@@ -215,6 +222,7 @@ class AreaHazard(Message, frozen=True, kw_only=True):
     trace: Trace | None = None
     code: Code = ""
     decided_by: Id | None = None
+    free: Annotated[list[Ring], Meta(max_length=64)] = []
 
 
 class AggregatorHeartbeat(Message, frozen=True, kw_only=True):
@@ -241,7 +249,7 @@ def is_relief(hazard: AreaHazard, before: AreaHazard | None) -> bool:
     """Whether a hazard allows robots more than the one before (an area without one counts as forbidden)."""
     if before is None:
         return hazard.state == "clear"
-    if hazard.penalty < before.penalty:
+    if hazard.penalty < before.penalty or any(part not in before.free for part in hazard.free):
         return True
     return hazard.state == "clear" and before.state != "clear"
 
@@ -250,7 +258,7 @@ def hazards_digest(hazards: Iterable[AreaHazard]) -> int:
     """Return a 63-bit hash of the hazards' areas, seqs, states and penalties; their order does not matter."""
     import hashlib  # noqa: PLC0415  # the guardian loads messages, too, and never needs it
 
-    lines = sorted(f"{h.area} {h.seq} {h.state} {h.penalty}" for h in hazards)
+    lines = sorted(f"{h.area} {h.seq} {h.state} {h.penalty}" + (f" {h.free}" if h.free else "") for h in hazards)
     whole = hashlib.blake2b("\n".join(lines).encode(), digest_size=8).digest()
     return int.from_bytes(whole, "big") >> (64 - _HASH_BITS)
 

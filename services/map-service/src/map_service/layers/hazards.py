@@ -3,7 +3,8 @@
 Penalty 254 is lethal and gets inflated, a lower one is a graded cost. An unknown area limits the speed too. A clear
 area whose hazard no living aggregator confirms is unknown, with the penalty of its own policy, as is one whose hazard
 was not received yet; what was blocked stays blocked. An area that an operator declared clear stays passable for as long
-as that was meant to last, then it is what its nodes measured.
+as that was meant to last, then it is what its nodes measured. Parts of a blocked area that its sensors show free are
+slow instead of lethal, while the aggregator confirms that (`free_parts`).
 """
 
 from __future__ import annotations
@@ -22,16 +23,18 @@ from fog_contracts.messages import SEVERITY, AreaHazard, Cause, HazardArea, is_r
 from fog_contracts.shapes import rasterize
 from map_service.aggregator_monitor import AggregatorMonitor
 from map_service.layers.base import CostLayer, LayerFactory, NoOptions, write_cost, write_speed_limit
+from map_service.layers.free_parts import free_cells
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
 
     from fog_contracts.channels import Channel
-    from fog_contracts.grid import GridGeometry, Window
+    from fog_contracts.grid import StaticMap, Window
     from fog_contracts.handlers import Handler, Ids, Moment
     from fog_contracts.messages import AggregatorHeartbeat, AreaDefinition
     from fog_contracts.shapes import ShapeMask
     from map_service.layers.base import Grid
+    from map_service.layers.free_parts import Mask
 
 _AGGREGATOR: Final = ch.AREA_HAZARD.publishers[0]
 
@@ -49,6 +52,8 @@ class _Area:
     """When the operator did so whose override was accepted last (`set_at`)."""
     declared_until: float = -math.inf
     """How long that override may count while no aggregator lives that would end it (s, monotonic)."""
+    free: Mask | None = None
+    """The cells of the mask's window that are free while the area is blocked; None: none."""
     defined_by: int = 0
     """The highest epoch of an aggregator that announced this definition."""
 
@@ -56,9 +61,9 @@ class _Area:
 class HazardsLayer(CostLayer):
     """Holds every area's definition and hazard, which may arrive in any order."""
 
-    def __init__(self, geometry: GridGeometry) -> None:
+    def __init__(self, static: StaticMap) -> None:
         super().__init__()
-        self._geometry = geometry
+        self._static, self._geometry = static, static.geometry
         self._areas: dict[str, _Area] = {}
         self._received: dict[str, AreaHazard] = {}
         self._removed: dict[str, HazardArea] = {}
@@ -125,6 +130,7 @@ class HazardsLayer(CostLayer):
             area = _Area(definition, mask, _unknown(definition, None, at.stamp))
         else:
             area = replace(old, definition=definition, mask=mask)
+        area.free = None
         self._areas[definition.id] = area
         self._removed.pop(definition.id, None)
         self._update(area, at)
@@ -216,7 +222,13 @@ class HazardsLayer(CostLayer):
             return []
         self.mark_updated(area.mask.window, Cause(kind="hazard", id=name, state="removed"))
         area.shown = structs.replace(
-            area.shown, state="clear", severity=SEVERITY["clear"], penalty=0, cause="the area was removed", trace=None
+            area.shown,
+            state="clear",
+            severity=SEVERITY["clear"],
+            penalty=0,
+            cause="the area was removed",
+            trace=None,
+            free=[],
         )
         self._removed[name] = _described(area)
         if (last := self._received.pop(name, None)) is not None:
@@ -234,24 +246,38 @@ class HazardsLayer(CostLayer):
         self._update(area, at)
         if (area.shown, area.confirmed) == (before, confirmed):
             return []
-        if (before.penalty, before.state) != (area.shown.penalty, area.shown.state):
+        if (before.penalty, before.state, before.free) != (area.shown.penalty, area.shown.state, area.shown.free):
             cause = Cause(kind="hazard", id=name, state=area.shown.state)
             self.mark_updated(area.mask.window, cause, area.shown.trace)
         return [_publication(area)]
 
     def _update(self, area: _Area, at: Moment) -> None:
-        """Set the hazard on the map: the accepted one, or unknown when nobody upholds that the area is clear."""
+        """Set the hazard on the map, and the cells of its free parts."""
+        before = area.shown.free if area.free is not None else []
+        self._update_shown(area, at)
+        shown, width = area.shown, area.definition.free_width
+        if not shown.free or width is None or shown.state != "blocked":
+            area.free = None
+        elif shown.free != before:
+            area.free = free_cells(area.mask, shown.free, width, self._static)
+
+    def _update_shown(self, area: _Area, at: Moment) -> None:
+        """Show the accepted hazard, or unknown when nobody upholds that the area is clear."""
         received = self._received.get(area.definition.id)
         confirmed = received is not None and self.aggregator.confirms(received, at.now)
         if received is not None and (confirmed or not _may_relieve(received, area.shown)):
             area.accepted = received
             _note_declaration(area, received, at.now)
+        elif received is not None and received.free:
+            whole = structs.replace(received, free=[])
+            if not _may_relieve(whole, area.shown):  # that it is blocked needs no confirmation, only its free parts do
+                area.accepted = whole
         accepted = area.accepted
         upheld = accepted is not None and self.aggregator.upholds(area.definition.id, at.now)
         area.confirmed = confirmed or upheld
         declared_clear = accepted is not None and _declares_clear(accepted) and at.now >= area.declared_until
         if accepted is not None and (area.confirmed or not (accepted.state == "clear" or declared_clear)):
-            area.shown = accepted
+            area.shown = accepted if area.confirmed or not accepted.free else structs.replace(accepted, free=[])
             return
         unknown = _unknown(area.definition, received, at.stamp)
         if (area.shown.state, area.shown.cause) == (unknown.state, unknown.cause):
@@ -274,7 +300,10 @@ class _ChangedHazards(CostLayer):
 
 
 def _write(area: _Area, hazard: AreaHazard, window: Window, cost: Grid, speed: Grid) -> None:
-    if hazard.penalty > 0:
+    if hazard.state == "blocked" and hazard.free and area.free is not None:
+        write_cost(area.mask._replace(mask=area.mask.mask & ~area.free), window, cost, hazard.penalty)
+        write_speed_limit(area.mask._replace(mask=area.free), window, speed, DEGRADED_SPEED)
+    elif hazard.penalty > 0:
         write_cost(area.mask, window, cost, hazard.penalty)
     if hazard.state == "unknown":
         write_speed_limit(area.mask, window, speed, DEGRADED_SPEED)
@@ -324,4 +353,4 @@ def _publication(area: _Area) -> Publication:
     return Publication(ch.HAZARD, _described(area), {"area": area.definition.id})
 
 
-LAYER = LayerFactory(options=NoOptions, make=lambda plan, _options: HazardsLayer(plan.geometry))
+LAYER = LayerFactory(options=NoOptions, make=lambda plan, _options: HazardsLayer(plan))

@@ -110,31 +110,39 @@ def floor_command(
 
 
 @bench_app.command("room", epilog="Example: fognav bench room --robots 10 --seeds 200 --floor estig --json")
-def room_command(
+def room_command(  # noqa: PLR0913  # its options
     *,
     robots: Annotated[int, typer.Option("--robots", metavar="N", min=1, max=50, help="Robots on the floor.")] = 4,
     seeds: Annotated[int, typer.Option("--seeds", metavar="N", min=1, help="Runs, each with another seed.")] = 5,
     first: Annotated[int, typer.Option("--first", metavar="N", min=0, help="The first seed.")] = 1,
     seconds: Annotated[int, typer.Option("--seconds", metavar="S", min=10, help="Simulated time of a run.")] = 300,
     floor: Annotated[str, typer.Option("--floor", help="aisles, narrow (aisles for one robot) or estig.")] = "aisles",
+    map_file: Annotated[
+        Path | None, typer.Option("--map", metavar="FILE", help="A map_server YAML, instead of such a floor.")
+    ] = None,
     json: JsonOption = False,
 ) -> None:
     """Measure how robots make room for one another.
 
-    Blind robots get one goal after the other at random, on six aisles of 27 m (1.8 m wide, or 1.2 m) or on a site's
-    floor, while hazards come and go. Only the planner's leases keep them apart; contact is computed exactly.
+    Blind robots get one goal after the other at random, on six aisles of 27 m (1.8 m wide, or 1.2 m), on a site's
+    floor or a map's, while hazards come and go. Only the planner's leases keep them apart; contact is computed exactly.
     """
-    from fognav_experiments.bench import room  # noqa: PLC0415  # keeps the other commands fast
+    from fog_runtime.configuration.maps import load_map  # noqa: PLC0415  # keeps the other commands fast
+    from fognav_experiments.bench import room  # noqa: PLC0415  # same
 
     kernels.warm_cache(print_line)
     with exit_codes(), Progress(console=console, disable=not console.is_terminal) as progress:
-        map_ = room.floor_named(floor, checkout.root() / "sites")
+        try:
+            map_ = room.floor_named(floor, checkout.root() / "sites") if map_file is None else load_map(map_file)
+        except ValueError as error:
+            raise WrongUseError(str(error)) from error
         task = progress.add_task("driving", total=seeds)
         runs = []
         for seed in range(first, first + seeds):
             runs.append(room.play(map_, robots, seed, float(seconds)))
             progress.advance(task)
-    asked = {"floor": floor, "robots": robots, "seeds": seeds, "first": first, "seconds": seconds}
+    name = floor if map_file is None else str(map_file)
+    asked = {"floor": name, "robots": robots, "seeds": seeds, "first": first, "seconds": seconds}
     _show("room", asked, room.summary(runs), json=json)
 
 

@@ -1,8 +1,10 @@
 """`fognav bench warning`: an obstacle's way from a node's echo to a robot's path, through the whole fog."""
 
+import asyncio
 import dataclasses
 import random
 import shutil
+import time
 from pathlib import Path
 from typing import Any, cast
 
@@ -15,7 +17,7 @@ from fog_runtime.clock import SystemClock
 from fog_runtime.configuration.site import load_site
 from fognav import checkout
 from fognav.output import FailedError, WrongUseError
-from fognav_experiments.bench import false_echoes, warning
+from fognav_experiments.bench import false_echoes, second_planner, warning
 from fognav_experiments.bench.false_echoes import Asked, FalseEchoes, calibrated
 from fognav_experiments.bench.warning import Arrived
 from fognav_sim.live import StillFloor
@@ -141,6 +143,50 @@ def test_obstacle_comes_again_where_a_false_alarm_had_blocked_its_area_before() 
     assert warned is not None
     assert 0.3 < warned < 1.0, "five readings in a row"
     assert world.obstacles == []
+
+
+def test_figures_of_a_planners_change_are_those_of_each_phase_and_name_the_takeover_once():
+    before, during = (second_planner.row("slow", phase, [0.25, None], [1.2, 1.6]) for phase in ("before", "during"))
+    assert (before["warnings"], before["missed"], before["echo_to_path_max_ms"]) == (2, 1, 250.0)
+    assert (during["takeover_p50_ms"], during["takeover_max_ms"]) == (1400, 1600)
+    assert "takeover_max_ms" not in before
+    with pytest.raises(WrongUseError, match="--leader late: choose one of slow, lossy, dead"):
+        second_planner.fault("late")
+
+
+async def test_relay_passes_everything_on_in_its_order_later_by_its_delay():
+    relay, received = second_planner.Relay(), bytearray()
+
+    async def serve(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+        while data := await reader.read(1000):
+            received.extend(data)
+            writer.write(data)
+        writer.close()
+
+    server = await asyncio.start_server(serve, "127.0.0.1", 0)
+    relay.target = server.sockets[0].getsockname()[1]
+    async with server, relay.running():
+        reader, writer = await asyncio.open_connection("127.0.0.1", relay.port)
+        sent = b""
+        for delay_s, loss in ((0.0, 0.0), (0.1, 0.0), (0.0, 0.4), (0.0, 0.0)):
+            relay.delay_s, relay.loss = delay_s, loss
+            piece, began = bytes([len(sent) % 256]) * 100, time.monotonic()
+            writer.write(piece)
+            assert await reader.readexactly(len(piece)) == piece
+            assert time.monotonic() - began >= 2 * delay_s
+            sent += piece
+        writer.close()
+        await writer.wait_closed()
+    assert bytes(received) == sent
+
+
+@pytest.mark.live
+async def test_robot_is_warned_while_the_leading_planner_becomes_slow_and_another_takes_over():
+    loaded = load_site(checkout.site_folder(Path("estig")))
+    rows = await second_planner.measure(loaded, "slow", 1, 1, lambda: None)
+    assert [row["phase"] for row in rows] == ["before", "during", "after"]
+    assert rows[0]["warnings"] == rows[2]["warnings"] == 1
+    assert rows[1]["takeover_max_ms"] is not None
 
 
 @pytest.mark.live

@@ -3,7 +3,7 @@
 import shutil
 import tempfile
 from collections.abc import Callable, Iterable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
 from types import TracebackType
@@ -104,7 +104,8 @@ class StackConfig:
     `robot` is the id of the site's robot, `base` and `lidar` name its hardware, and `robot_file` has its settings, of
     which the ports do not count; `extra` contains further FOGNAV_ settings for every process. With `users` the servers
     encrypt, and admit only those users; without, everybody on this machine. The servers named in `embedded` are Python
-    packages (`servers.STAND_INS`).
+    packages (`servers.STAND_INS`). `planners` are the planners' programs, each with FOGNAV_ settings of its own: more
+    than one take turns.
     """
 
     site_dir: Path
@@ -117,6 +118,7 @@ class StackConfig:
     extra: Mapping[str, str] | None = None
     users: StackUsers | None = None
     embedded: frozenset[str] = frozenset()
+    planners: Mapping[str, Mapping[str, str]] = field(default_factory=lambda: {PLANNER: {}})
 
 
 def _new_folder() -> Path:
@@ -244,16 +246,19 @@ class Stack:
         programs.add_python(SIMULATOR, MODULES[SIMULATOR], {**simulator, **self.security.settings("sim")})
         key = {"OPERATOR_KEY_FILE": str(self.key_file)}
         taken = {self.mqtt_port, self.redis_port, self.zenoh_port}
-        http = {name: net.free_port(taken) for name in SERVICES}  # the console-service must know the others'
+        services: dict[str, Mapping[str, str]] = {name: {} for name in SERVICES}
+        services.update(self.config.planners)
+        http = {name: net.free_port(taken) for name in services}  # the console-service must know the others'
         behind = {setting: f"http://{net.LOOPBACK}:{http[name]}" for name, setting in URLS.items()}
-        for name in SERVICES:
+        for name, further in services.items():
+            service = PLANNER if name in self.config.planners else name
             own = {
                 "TOKENS_FILE": str(self.folder / TOKENS),
                 "SESSION_KEY_FILE": str(self.folder / SESSION_KEY),
                 "HTTP_PORT": str(http[name]),
-                **(key if name == PLANNER else behind if name == CONSOLE else {}),
+                **(key if service == PLANNER else behind if service == CONSOLE else {}),
             }
-            programs.add_python(name, MODULES[name], {**own, **self.security.settings(name)})
+            programs.add_python(name, MODULES[service], {**own, **self.security.settings(service), **further})
         robot = self.config.robot
         wires = simulated_robot_settings(self.folder, robot, hardware)
         ready = partial(exists, Path(wires["GUARDIAN_SOCKET"]))

@@ -11,7 +11,7 @@ import asyncio
 import random
 import time
 from contextlib import asynccontextmanager
-from typing import TYPE_CHECKING, Any, Final, NamedTuple
+from typing import TYPE_CHECKING, Any, Final, NamedTuple, TypeVar
 
 import numpy as np
 import zenoh
@@ -33,7 +33,7 @@ from fognav_sim.nodes import make_nodes
 from fognav_sim.world import World
 
 if TYPE_CHECKING:
-    from collections.abc import AsyncIterator, Callable, Iterable, Mapping, Sequence
+    from collections.abc import AsyncIterator, Awaitable, Callable, Iterable, Mapping, Sequence
     from contextlib import AbstractAsyncContextManager
 
     from fog_contracts.messages import Pose, Trace
@@ -43,12 +43,14 @@ if TYPE_CHECKING:
 
     TraceKey = tuple[str, int, int]  # area, epoch and sequence number
 
-_BENCH: Final = "bench"
+T = TypeVar("T")
+
+BENCH: Final = "bench"
 """The user who stands for the robot."""
-_READY_S: Final = 120.0
-_TIMEOUT_S: Final = 10.0
+READY_S: Final = 120.0
+TIMEOUT_S: Final = 10.0
 """A warning that has not reached the robot after this is missed."""
-_POLL_S: Final = 0.02
+POLL_S: Final = 0.02
 _NODES_STEP_S: Final = 0.002
 """How often the nodes' code runs, which a board's does without a pause: an echo is timed as exactly."""
 _PHASE_S: Final = 0.3
@@ -74,7 +76,7 @@ _SPANS: Final = {
 }
 
 
-class _WatchedWorld(World):
+class WatchedWorld(World):
     """A world that tells when a node's sonar first measured something nearer than its limit."""
 
     echo: float | None = None
@@ -129,24 +131,24 @@ async def measure(
     The site's first robot stands where it starts, and its goal is that of the site's demonstration.
     """
     site = loaded.site
-    floor = StillFloor(loaded, (), SystemClock(), world=_WatchedWorld)
-    assert isinstance(floor.world, _WatchedWorld)
+    floor = StillFloor(loaded, (), SystemClock(), world=WatchedWorld)
+    assert isinstance(floor.world, WatchedWorld)
     extra = {"DEBOUNCE": rule, "HAZARDS_WAIT_S": "0"}
-    users = users_of(site, unrestricted=(_BENCH,))
+    users = users_of(site, unrestricted=(BENCH,))
     config = StackConfig(site_dir=loaded.directory, robot="none", extra=extra, users=users)
     async with Stack(config) as stack:
-        await stack.start_servers(_READY_S)
+        await stack.start_servers(READY_S)
         for name in SERVICES:
             stack.supervisor.start(name)
         try:
-            await stack.supervisor.wait_ready([*SERVERS, *SERVICES], _READY_S)
+            await stack.supervisor.wait_ready([*SERVERS, *SERVICES], READY_S)
         except NotReadyError as error:
             raise FailedError(f"{error}\n{log_tail(stack.log(PLANNER))}") from error
-        async with _nodes(stack, loaded, floor):
-            own = stack.security.credentials(_BENCH)
+        async with running_nodes(stack, loaded, floor):
+            own = stack.security.credentials(BENCH)
             settings = session_config("client", connect=[stack.zenoh_endpoint], credentials=own)
             with await asyncio.to_thread(zenoh.open, settings) as session:
-                trial = _Trials(stack, loaded, floor.world, session, seed)
+                trial = Trials(stack, loaded, floor.world, session, seed)
                 async with trial.robot.publishing():
                     warned = [await trial.run(number, on_progress) for number in range(trials)]
     return figures(rule, warned)
@@ -164,7 +166,7 @@ def figures(rule: str, warned: Sequence[Warned | None]) -> dict[str, Any]:
 
 
 @asynccontextmanager
-async def _nodes(stack: Stack, loaded: LoadedSite, floor: StillFloor) -> AsyncIterator[None]:
+async def running_nodes(stack: Stack, loaded: LoadedSite, floor: StillFloor) -> AsyncIterator[None]:
     """Run all nodes of the site, each with its own connection."""
     clock = SystemClock()
     nodes = [
@@ -177,15 +179,17 @@ async def _nodes(stack: Stack, loaded: LoadedSite, floor: StillFloor) -> AsyncIt
         yield
 
 
-class _Trials:
-    """Obstacles that come and go in an area on the robot's way, one after another."""
+class Trials:
+    """Obstacles that come and go in an area on the robot's way, one after another; `planner` takes the goals."""
+
+    planner = PLANNER
 
     def __init__(
-        self, stack: Stack, loaded: LoadedSite, world: _WatchedWorld, session: zenoh.Session, seed: int
+        self, stack: Stack, loaded: LoadedSite, world: WatchedWorld, session: zenoh.Session, seed: int
     ) -> None:
-        self._stack, self._loaded, self._world = stack, loaded, world
+        self.stack, self.loaded, self.world = stack, loaded, world
         self._seed = seed
-        self._random = random.Random(seed)  # noqa: S311  # repeatable, no secret
+        self.random = random.Random(seed)  # noqa: S311  # repeatable, no secret
         self._deltas = _Deltas()
         site = loaded.site
         robot = site.robots[0]
@@ -194,67 +198,77 @@ class _Trials:
 
     async def run(self, number: int, on_progress: Callable[[], object]) -> Warned | None:
         """Measure one warning, and clear up after it; None if the robot was not warned."""
-        hazard = await self._drive(number)
-        await asyncio.sleep(self._random.uniform(0.0, _PHASE_S))
-        self.robot.forget()
-        self._world.echo = None
-        placed = time.time()
-        self._world.place(hazard.barrier)
-        warned = await self._warned(hazard.area.id, placed)
-        self._world.remove(hazard.barrier.id)
-        await self._until(self._clear, "all areas are clear again")
+        hazard = await self.drive(number)
+        await asyncio.sleep(self.random.uniform(0.0, _PHASE_S))
+        warned = await self.meet(hazard, self._warned)
         on_progress()
         return warned
 
-    async def _drive(self, number: int) -> PlannedHazard:
+    async def meet(self, hazard: PlannedHazard, warned: Callable[[str, float], Awaitable[T]]) -> T:
+        """Place the obstacle, return what `warned` does, given its area and when it was placed, and clear up."""
+        self.robot.forget()
+        self.world.echo = None
+        placed = time.time()
+        self.world.place(hazard.barrier)
+        try:
+            return await warned(hazard.area.id, placed)
+        finally:
+            self.world.remove(hazard.barrier.id)
+            await self.until(self._clear, "all areas are clear again")
+
+    def around(self, area: str) -> list[Arrived]:
+        """Return the paths since the obstacle that don't enter its area."""
+        polygon = next(each.polygon for each in self.loaded.site.areas if each.id == area)
+        return [each for each in self.robot.paths if entry_distance(each.path.points, polygon) is None]
+
+    async def drive(self, number: int) -> PlannedHazard:
         """Send the robot to the goal, and return an obstacle on its path."""
-        site, seed = self._loaded.site, self._seed + number
+        site, seed = self.loaded.site, self._seed + number
         assert site.demo is not None
         goal = site.places[site.demo.goal]
-        await self._until(self._clear, "all areas are clear")
+        await self.until(self._clear, "all areas are clear")
         where = {"pose": {"x": goal.x, "y": goal.y}}
 
         async def accepted() -> bool:
             path = f"/api/v1/robots/{self.robot.id}/goal"
-            answer = await ask(self._stack, PLANNER, "PUT", path, where)
+            answer = await ask(self.stack, self.planner, "PUT", path, where)
             return answer.status == 200 and isinstance(answer.body, dict)
 
         self.robot.forget()
-        await self._until(accepted, "the planner accepts the goal")
+        await self.until(accepted, "the planner accepts the goal")
 
         async def drawn() -> bool:
             return bool(self.robot.paths) and self.robot.paths[-1].path.refusal is None
 
-        await self._until(drawn, "the robot has a path")
+        await self.until(drawn, "the robot has a path")
         points = self.robot.paths[-1].path.points
         try:
-            return draw_hazard(site, points, seed, lambda area: barrier_across(area, site, self._loaded.map, seed))
+            return draw_hazard(site, points, seed, lambda area: barrier_across(area, site, self.loaded.map, seed))
         except BarrierError as error:
             raise FailedError(str(error)) from error
 
     async def _warned(self, area: str, placed: float) -> Warned | None:
-        polygon = next(each.polygon for each in self._loaded.site.areas if each.id == area)
-        deadline = time.monotonic() + _TIMEOUT_S
+        deadline = time.monotonic() + TIMEOUT_S
         while time.monotonic() < deadline:
-            paths = [each for each in self.robot.paths if entry_distance(each.path.points, polygon) is None]
-            warned = first_warning(paths, area, placed, self._world.echo, self._deltas.arrived)
+            warned = first_warning(self.around(area), area, placed, self.world.echo, self._deltas.arrived)
             if warned is not None:
                 return warned
-            await asyncio.sleep(_POLL_S)
+            await asyncio.sleep(POLL_S)
         return None
 
     async def _clear(self) -> bool:
         """Whether the aggregator believes all nodes, and none of them sees anything."""
-        answer = await ask(self._stack, AGGREGATOR, "GET", "/api/v1/nodes")
+        answer = await ask(self.stack, AGGREGATOR, "GET", "/api/v1/nodes")
         return isinstance(answer.body, list) and all(node["state"] == "clear" for node in answer.body)
 
-    async def _until(self, condition: Callable[[], Any], what: str) -> None:
-        deadline = time.monotonic() + _READY_S
+    async def until(self, condition: Callable[[], Any], what: str) -> None:
+        """Wait for a condition; raises `FailedError` with `what` was waited for after a long time."""
+        deadline = time.monotonic() + READY_S
         while not await condition():
             if time.monotonic() > deadline:
-                logs = "\n".join(log_tail(self._stack.log(name)) for name in (AGGREGATOR, MAP_SERVICE, PLANNER))
-                raise FailedError(f"waited {_READY_S:.0f} s until {what}\n{logs}")
-            await asyncio.sleep(_POLL_S)
+                logs = "\n".join(log_tail(self.stack.log(name)) for name in (AGGREGATOR, MAP_SERVICE, PLANNER))
+                raise FailedError(f"waited {READY_S:.0f} s until {what}\n{logs}")
+            await asyncio.sleep(POLL_S)
 
 
 class Arrived(NamedTuple):
@@ -271,6 +285,8 @@ class StandingRobot:
         self.id = id
         self.paths: list[Arrived] = []
         """Paths and refusals since the last `forget`, oldest first, each plan once."""
+        self.taken_over: dict[int, float] = {}
+        """When the first path of each planner's epoch arrived (s)."""
         self._latest: RobotPath | None = None
         self._session, self._pose = session, pose
         self._keys = {row: row.key(site=site, robot=id) for row in (ch.ROBOT_POSE, ch.ROBOT_STATE)}
@@ -281,9 +297,17 @@ class StandingRobot:
         """Note a path; it is called on another thread."""
         now = time.time()
         path, before = decode(ch.ROBOT_PATH, sample.payload.to_bytes(), RobotPath), self._latest
+        if before is not None and path.planner_epoch < before.planner_epoch:
+            return  # of a planner that was replaced
         if before is None or (path.planner_epoch, path.plan_id) != (before.planner_epoch, before.plan_id):
             self._latest = path
+            self.taken_over.setdefault(path.planner_epoch, now)
             self.paths.append(Arrived(now, path))
+
+    def latest(self) -> RobotPath:
+        """Return the latest path; it must have one."""
+        assert self._latest is not None
+        return self._latest
 
     def forget(self) -> None:
         """Forget the paths so far."""

@@ -395,6 +395,10 @@ def warning_command(  # noqa: PLR0913  # the options of the command
     hours: Annotated[
         float, typer.Option("--hours", metavar="H", min=0.01, help="Simulated hours with nothing but false echoes.")
     ] = 2.0,
+    leader: Annotated[
+        list[str] | None,
+        typer.Option("--leader", metavar="F", help="Let the first of two planners be slow, lossy or dead."),
+    ] = None,
     seed: Annotated[int, typer.Option("--seed", metavar="N", min=0, help="Seed of the obstacles.")] = 1,
     json: JsonOption = False,
 ) -> None:
@@ -406,16 +410,22 @@ def warning_command(  # noqa: PLR0913  # the options of the command
 
     With --false-echoes the nodes and the aggregator's core run in simulated time instead, whatever the machine's load:
     all sonars hear what is not there, their nodes are calibrated in that, and false alarms are counted, too.
+
+    With --leader two planners run, and the one that leads becomes slow (answers 500 ms later), lossy (half of its
+    packets) or dead. Obstacles come before (the control), during, and after that.
     """
     from fog_runtime.configuration.site import load_site  # noqa: PLC0415  # keeps the other commands fast
     from fognav_experiments.bench import false_echoes as noise  # noqa: PLC0415  # same
-    from fognav_experiments.bench import warning  # noqa: PLC0415  # same
+    from fognav_experiments.bench import second_planner, warning  # noqa: PLC0415  # same
 
     kernels.warm_cache(print_line)
     rows = []
     with exit_codes(), Progress(console=console, disable=not console.is_terminal) as progress:
         loaded = load_site(checkout.site_folder(site))
-        for each in rule or ["evidence", "consecutive"]:
+        for fault in map(second_planner.fault, leader or ()):
+            advance = partial(progress.advance, progress.add_task(fault, total=warnings))
+            rows += asyncio.run(second_planner.measure(loaded, fault, warnings, seed, advance))
+        for each in rule or ([] if leader else ["evidence", "consecutive"]):
             task = progress.add_task(each, total=warnings)
             advance = partial(progress.advance, task)
             if false_echoes is not None:

@@ -31,13 +31,15 @@ class Robot:
 
     answers: bool = True
     stopped_at: list[float] = field(default_factory=list)
+    stopped_by: list[str] = field(default_factory=list)
 
     @asynccontextmanager
     async def on(self, edge: ZenohEdge, robot: str):
         """Let it be on a floor."""
 
-        def stop(_ids, _command):
+        def stop(_ids, command):
             self.stopped_at.append(time.monotonic())
+            self.stopped_by.append(command.operator)
             return CommandReply(accepted=True, reason="stopped")
 
         async def publish():
@@ -127,7 +129,7 @@ async def test_one_press_stops_the_robots_of_both_floors_and_each_floor_says_so(
         answer = await floors.client.post("/api/v1/floors/stop", json={})
         assert answer.status_code == 200, answer.text
         assert [(each["id"], each["acknowledged"]) for each in answer.json()] == [("test", True), ("upstairs", True)]
-        assert (len(here.stopped_at), len(there.stopped_at)) == (1, 1)
+        assert (here.stopped_by, there.stopped_by) == (["vera"], ["floor test/vera"])
         await listed(floors, lambda entry: entry["floor"]["stopped"])
         answer = await floors.client.post("/api/v1/floors/stop", json={"floors": ["cellar"]})
         assert (answer.status_code, answer.json()["type"]) == (404, "urn:fognav:no_floor")
@@ -157,7 +159,7 @@ async def test_floor_that_is_cut_off_is_named_keeps_its_age_and_comes_back_by_it
 
 
 @live
-async def test_robot_that_does_not_answer_and_a_token_that_is_revoked_are_named(floors):
+async def test_robot_that_does_not_answer_and_a_token_that_is_revoked_are_named_and_the_stop_arrives(floors):
     async with Robot(answers=False).on(floors.there, "r1"):
         await listed(floors, drives)
         (stop,) = (await floors.client.post("/api/v1/floors/stop", json={"floors": ["upstairs"]})).json()
@@ -167,6 +169,8 @@ async def test_robot_that_does_not_answer_and_a_token_that_is_revoked_are_named(
         revoke_token(floors.upstairs.folder / "tokens.toml", "floor test")
         refused = await listed(floors, lambda entry: entry["trouble"] == "refused")
         assert "fognav token create" in refused["detail"]
+        (stop,) = (await floors.client.post("/api/v1/floors/stop", json={"floors": ["upstairs"]})).json()
+        assert "r1" in stop["detail"], "a stop needs no token"
 
 
 @pytest.mark.parametrize(

@@ -186,7 +186,9 @@ def _add_floors(routes: Routes, own: OwnFloor, hub: Hub) -> None:
         if missing := [floor for floor in wanted if floor not in known]:
             detail = f"there is no floor {missing[0]}; known floors: {', '.join(known)}. Nothing was stopped"
             raise ProblemError(FloorProblem.NO_FLOOR, detail, field="body.floors")
-        stops = await asyncio.gather(*(own.stop(request) if each == own.id else hub.stop(each) for each in wanted))
+        stops = await asyncio.gather(
+            *(own.stop(request) if each == own.id else hub.stop(each, caller.name) for each in wanted)
+        )
         failed = [each.id for each in stops if not each.acknowledged]
         _log.warning("floors_stopped", who=caller.name, floors=wanted, not_acknowledged=failed)
         return list(stops)

@@ -8,6 +8,7 @@ somebody has enabled since must not stop because a link has come back.
 from __future__ import annotations
 
 import asyncio
+import re
 import tomllib
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Annotated, Final, Literal, NamedTuple, TypeVar
@@ -25,6 +26,7 @@ from fog_runtime.clock import ticker
 from fog_runtime.configuration.settings import SettingsError
 from fog_runtime.credentials import Credentials
 from fog_runtime.http import ProblemError
+from fog_runtime.http.tokens import PART
 
 if TYPE_CHECKING:
     import ssl
@@ -357,11 +359,15 @@ class Hub:
             )
         return found
 
-    async def stop(self, floor: str) -> FloorStop:
-        """Stop a floor on another machine, now and once; what does not succeed is in the answer."""
+    async def stop(self, floor: str, who: str) -> FloorStop:
+        """Stop a floor on another machine, now and once; what does not succeed is in the answer.
+
+        The floor's audit trail names `who`, as part of whose token this one has.
+        """
         try:
             # Not by a connection that waits since the last question: it may be dead, and nobody has noticed.
             async with _client(self._peers[floor], _STOP) as client:
+                client.headers[PART] = re.sub(r"[^a-z0-9-]", "-", who.lower())[:32]
                 return await _ask(client, "POST", f"{HERE}/stop", FloorStop)
         except _AskError as error:
             detail = (

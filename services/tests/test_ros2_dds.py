@@ -1,4 +1,4 @@
-"""Robots of ROS 2 by DDS: the other side is Cyclone DDS with its own serializer, or Fast DDS, if it is installed."""
+"""Robots of ROS 2 by DDS: the other side is Cyclone DDS with its own serializer; Fast DDS and dora-rs, if installed."""
 
 import asyncio
 import contextlib
@@ -16,7 +16,8 @@ import pytest
 
 from fog_bridges.metrics import REFUSED
 from fog_bridges.ros2 import messages as ros
-from fog_bridges.ros2.bridge import GOAL_MAX_AGE_S, GOAL_TYPE, MAP_TYPE
+from fog_bridges.ros2.advice import GOAL_TYPE
+from fog_bridges.ros2.bridge import GOAL_MAX_AGE_S, MAP_TYPE
 from fog_bridges.ros2.wire import Topic
 from fog_contracts.grid import GridGeometry
 from fog_runtime.clock import SystemClock
@@ -58,13 +59,22 @@ def fast_dds(tmp_path_factory) -> list[str]:
     return [str(program)]
 
 
+@pytest.fixture
+def dora(tmp_path) -> list[str]:
+    """The command of a robot on dora-rs."""
+    python = os.environ.get("FOGNAV_ROS2_DORA")
+    if python is None:
+        pytest.skip("set FOGNAV_ROS2_DORA to a Python that has dora-rs: pip install dora-rs==1.1.0 pyarrow rosbags")
+    return [python, str(Path(__file__).with_name("dora_peer.py")), str(tmp_path)]
+
+
 CYCLONE = [sys.executable, str(Path(__file__).with_name("dds_peer.py"))]
 
 
 @contextlib.asynccontextmanager
-async def robot(command=CYCLONE):
+async def robot(command=CYCLONE, domain=DOMAIN):
     """Run a robot of others; yield it."""
-    process = await asyncio.create_subprocess_exec(*command, str(DOMAIN), "test", "r1", stdout=asyncio.subprocess.PIPE)
+    process = await asyncio.create_subprocess_exec(*command, str(domain), "test", "r1", stdout=asyncio.subprocess.PIPE)
     try:
         yield process
     finally:
@@ -89,14 +99,20 @@ def refusals() -> Counter[str]:
     return Counter({each.labels["reason"]: int(each.value) for each in values})
 
 
-@pytest.mark.parametrize("middleware", ["cyclone", "fast_dds"])
-async def test_robot_that_joins_late_is_given_the_mask_and_its_goal_arrives(wire, until, request, middleware):
-    command = CYCLONE if middleware == "cyclone" else request.getfixturevalue(middleware)
+@pytest.mark.parametrize("middleware", ["cyclone", "fast_dds", "dora"])
+async def test_robot_that_joins_late_is_given_the_mask_and_its_goal_arrives(
+    wire, until, request, monkeypatch, middleware
+):
+    command, domain = CYCLONE if middleware == "cyclone" else request.getfixturevalue(middleware), DOMAIN
+    if middleware == "dora":  # it finds others by multicast only
+        monkeypatch.delenv("CYCLONEDDS_URI")
+        domain += 100
+        wire = dds.DdsWire(domain)
     node, goals = await wire.opened("fognav_test", CLOCK), []
     try:
         node.publish(MASK, mask(2), CLOCK.stamp())
         node.subscribe(GOAL, goals.append, GOAL_MAX_AGE_S)
-        async with robot(command) as peer:
+        async with robot(command, domain) as peer:
             heard = json.loads(await asyncio.wait_for(peer.stdout.readline(), 60.0))
             assert heard == {"frame": "map", "size": [12, 10], "blocked": 24}
             await until(lambda: goals, "the goal has arrived")

@@ -13,7 +13,7 @@ import sys
 import time
 from collections import defaultdict
 from contextlib import AsyncExitStack, asynccontextmanager
-from typing import TYPE_CHECKING, Any, Final
+from typing import TYPE_CHECKING, Any, Final, Literal
 
 import numpy as np
 import psutil
@@ -32,10 +32,14 @@ if TYPE_CHECKING:
 
     from fog_contracts.messages import PointXY, Trace
     from fognav.stack import Stack
+    from fognav_experiments.bench.foreign_dds import Reader
 
 _READY_S: Final = 60.0
 _POLL_S: Final = 0.05
 _MB: Final = 1e6
+_DOMAINS: Final = range(100, 230)
+"""Of DDS: one for each run, so that no other is in the way."""
+Wire = Literal["zenoh", "dds"]
 
 
 class Foreign:
@@ -49,10 +53,10 @@ class Foreign:
         self._blocked: defaultdict[str, list[float]] = defaultdict(list)
         self._cpu_s = 0.0
 
-    def on_mask(self, sample: zenoh.Sample) -> None:
+    def on_mask(self, data: bytes) -> None:
         """Note which areas a mask blocks that the one before did not; it is called on another thread."""
         now = time.time()
-        mask = Grid.decoded(sample.payload.to_bytes())
+        mask = Grid.decoded(data)
         blocked = {area for area, centre in self._centres.items() if mask.at(centre) > 0}
         for area in blocked - self._before:
             self._blocked[area].append(now)
@@ -84,18 +88,28 @@ class Foreign:
 
 
 @asynccontextmanager
-async def foreign(stack: Stack, site: str, centres: Mapping[str, PointXY], stopped: int) -> AsyncIterator[Foreign]:
+async def foreign(
+    stack: Stack, site: str, centres: Mapping[str, PointXY], stopped: int, wire: Wire = "zenoh"
+) -> AsyncIterator[Foreign]:
     """Run a bridge to ROS 2 with one peer that reads, and `stopped` ones that do not any more; raises `FailedError`.
 
-    `centres` are those (m) of the areas.
+    `centres` are those (m) of the areas. By DDS there is the one peer that reads only.
     """
-    port, key = net.free_port(), f"0/fognav/{site}/keepout_mask/**"
+    port, topic = net.free_port(), f"fognav/{site}/keepout_mask"
+    key = f"0/{topic}/**"
     async with AsyncExitStack() as contexts:
+        if wire == "dds":
+            bridge, found, reader = await _by_dds(contexts, stack, site, centres, topic)
+            assert reader is not None
+            await _until_told(found, bridge, stack)
+            yield found
+            return
         bridge = await contexts.enter_async_context(running_bridge(stack, site, port))
         session = contexts.enter_context(zenoh.open(session_config("peer", port)))
         found = Foreign(psutil.Process(bridge.pid), centres)
         heard = zenoh.ext.declare_advanced_subscriber(  # as rmw_zenoh has them for what is latched
-            session, key, found.on_mask, history=zenoh.ext.HistoryConfig(detect_late_publishers=True, max_samples=1),
+            session, key, lambda sample: found.on_mask(sample.payload.to_bytes()),
+            history=zenoh.ext.HistoryConfig(detect_late_publishers=True, max_samples=1),
             recovery=zenoh.ext.RecoveryConfig(periodic_queries=None, heartbeat=True),
         )  # fmt: skip
         assert heard is not None
@@ -108,6 +122,21 @@ async def foreign(stack: Stack, site: str, centres: Mapping[str, PointXY], stopp
             os.kill(peer.pid, signal.SIGSTOP)
         await _until_told(found, bridge, stack)
         yield found
+
+
+async def _by_dds(
+    contexts: AsyncExitStack, stack: Stack, site: str, centres: Mapping[str, PointXY], topic: str
+) -> tuple[asyncio.subprocess.Process, Foreign, Reader]:
+    try:
+        from fognav_experiments.bench import foreign_dds  # noqa: PLC0415  # an extra
+    except ImportError as error:
+        raise FailedError(f"--wire dds needs Cyclone DDS ({error}): pip install cyclonedds, on x86-64") from error
+    domain = _DOMAINS.start + os.getpid() % len(_DOMAINS)
+    settings = {"ROS2_WIRE": "dds", "ROS2_DOMAIN": str(domain)}
+    os.environ["CYCLONEDDS_URI"] = foreign_dds.LOOPBACK
+    bridge = await contexts.enter_async_context(running_bridge(stack, site, net.free_port(), settings))
+    found = Foreign(psutil.Process(bridge.pid), centres)
+    return bridge, found, foreign_dds.Reader(domain, topic, found.on_mask)
 
 
 async def _until_told(found: Foreign, bridge: asyncio.subprocess.Process, stack: Stack) -> None:

@@ -34,7 +34,7 @@ from fognav.output import FailedError
 from fognav.programs import AGGREGATOR, MAP_SERVICE, SERVERS
 from fognav.stack import Stack, StackConfig, StackUsers
 from fognav_experiments.bench.common import SITE, ask, make_office, write_site
-from fognav_experiments.bench.foreign import foreign
+from fognav_experiments.bench.foreign import Wire, foreign
 
 if TYPE_CHECKING:
     from asyncio.subprocess import Process
@@ -110,12 +110,13 @@ async def measure(  # noqa: PLR0913  # what is measured
     seconds: float,
     size: tuple[float, float] = (60.0, 40.0),
     stopped_peers: int | None = None,
+    wire: Wire = "zenoh",
     on_phase: Callable[[str], object],
 ) -> dict[str, Any]:
     """Return the figures; times in ms, None when no hazard reached the map. `folder` is empty.
 
     The floor has the `size` (m). With `stopped_peers` there is a bridge to ROS 2, too, with one peer that reads, and so
-    many that have stopped.
+    many that have stopped; `wire` says how it speaks.
     """
     centres = write_nodes(folder, nodes, size)
     users = StackUsers(site=SITE, unrestricted=(BENCH,))
@@ -138,7 +139,7 @@ async def measure(  # noqa: PLR0913  # what is measured
                 ros2 = None
                 if stopped_peers is not None:
                     on_phase(f"starting the bridge to ROS 2, and {stopped_peers} peers that stop reading")
-                    ros2 = await contexts.enter_async_context(foreign(stack, SITE, centres, stopped_peers))
+                    ros2 = await contexts.enter_async_context(foreign(stack, SITE, centres, stopped_peers, wire))
                     ros2.begin()
                 on_phase(f"the same with hazards for {seconds:g} s")
                 cpu, memory = fog.cpu_s(), fog.rss_mb()

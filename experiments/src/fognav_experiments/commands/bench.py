@@ -358,6 +358,7 @@ def pipeline_command(  # noqa: PLR0913  # the options of the command
         int | None,
         typer.Option("--ros2", metavar="N", min=0, max=20, help="Bridge to ROS 2, N of whose peers stopped reading."),
     ] = None,
+    wire: Annotated[str, typer.Option("--wire", metavar="W", help="Of that bridge: zenoh, or dds (N: 0).")] = "zenoh",
     json: JsonOption = False,
 ) -> None:
     """Measure the way from readings to the map.
@@ -370,10 +371,12 @@ def pipeline_command(  # noqa: PLR0913  # the options of the command
 
     kernels.warm_cache(print_line)
     with exit_codes(), TemporaryDirectory(prefix="fognav-") as folder:
+        if wire != "zenoh" and (wire, ros2) != ("dds", 0):
+            raise WrongUseError(f"--wire {wire}: it is zenoh, or dds, which has --ros2 0")
         figures = asyncio.run(
             pipeline.measure(
                 Path(folder), nodes=nodes, rate=rate, robots=robots, seconds=seconds, size=(width, height),
-                stopped_peers=ros2, on_phase=print_line,
+                stopped_peers=ros2, wire="dds" if wire == "dds" else "zenoh", on_phase=print_line,
             )
         )  # fmt: skip
     asked = {"nodes": nodes, "rate": rate, "robots": robots, "seconds": seconds, "width": width, "height": height}

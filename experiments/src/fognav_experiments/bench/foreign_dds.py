@@ -47,7 +47,8 @@ def _grid() -> type[Any]:
         origin=pose,
     )  # fmt: skip
     header = _struct("std_msgs/Header", stamp=time, frame_id=str)
-    made: Any = _struct("nav_msgs/OccupancyGrid", header=header, info=info, data=idl.sequence[idl.int8])
+    cells = idl.sequence.__class_getitem__(idl.int8)  # type: ignore[no-untyped-call]  # sequence[int8], which mypy does not see
+    made: Any = _struct("nav_msgs/OccupancyGrid", header=header, info=info, data=cells)
 
     def read(kind: type[Any], /, data: bytes, **_: object) -> Any:  # noqa: ANN401  # of the class above
         sample = object.__new__(kind)

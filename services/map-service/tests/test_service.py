@@ -68,6 +68,8 @@ class Session:
 
     def publish(self, channel: ch.Channel, message: Message, **ids: str) -> None: ...
 
+    def on_connect(self, connected: object) -> None: ...
+
 
 async def test_every_query_of_the_core_is_served_and_each_area_under_its_key() -> None:
     plan = Plan(GridGeometry(60, 60, 0.05, 0.0, 0.0), np.zeros((60, 60), dtype=np.uint8))

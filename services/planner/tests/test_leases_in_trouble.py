@@ -162,6 +162,20 @@ def test_a_robot_that_has_told_no_state_yet_may_be_driving_by_an_older_planners_
     assert (floor.ask("r1") == 10.0) is heard
 
 
+def test_what_a_robot_may_still_drive_of_a_former_leaders_path_stays_free_until_it_names_a_new_one():
+    floor = Floor()
+    floor.leases.place("r1", 0.0, 0.0, floor.now)
+    floor.leases.on_state("r1", (1, 77), floor.now, able=True, strays=False)
+    floor.plans = 100
+    floor.put("r2", (0.9, -5.0), (0.9, 5.0))
+    assert floor.ask("r2") < 5.0
+    floor.send("r1", (0.0, 0.0), (-5.0, 0.0))
+    floor.ask("r1")
+    assert floor.ask("r2") < 5.0
+    floor.leases.on_state("r1", floor.ids["r1"], floor.now, able=True, strays=False)
+    assert floor.ask("r2") == 10.0
+
+
 def test_others_may_pass_beside_a_refused_robot_but_not_beside_one_driven_by_hand():
     core, ring_map = PlannerCore(epoch=1), RingMap()
     core.load(ring_map.master.snapshot(), 10.0)

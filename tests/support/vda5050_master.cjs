@@ -2,7 +2,7 @@
 // that library's own schemas, sends it along an order, and prints what the library says of it, a line of JSON each.
 //
 //     node vda5050_master.cjs '{"url": "mqtts://127.0.0.1:8883", "username": "u", "password": "p", "ca": "PEM",
-//                               "agv": {"manufacturer": "fognav", "serialNumber": "r1"}, "order": {...}}'
+//                               "agv": {"manufacturer": "fognav", "serialNumber": "r1"}, "order": {...}, "version": "2.0.0"}'
 const { MasterController, Topic } = require("vda-5050-lib");
 
 const given = JSON.parse(process.argv[2]);
@@ -12,7 +12,7 @@ async function main() {
   const master = new MasterController(
     {
       interfaceName: "vda5050",
-      vdaVersion: "2.0.0",
+      vdaVersion: given.version,
       topicObjectValidation: { inbound: true, outbound: true },
       transport: {
         brokerUrl: given.url,
@@ -25,12 +25,13 @@ async function main() {
     { targets: given.agv },
   );
   await master.start();
-  await master.subscribe(Topic.Factsheet, given.agv, (found) => say("factsheet", { version: found.version }));
+  const isOld = given.version === "1.1.0"; // without a factsheet
+  if (!isOld) await master.subscribe(Topic.Factsheet, given.agv, (found) => say("factsheet", { version: found.version }));
   await master.subscribe(Topic.Visualization, given.agv, () => say("visualization"));
   master.trackAgvs((agv, state) => say("connection", { state }));
   await master.initiateInstantActions(
     given.agv,
-    { instantActions: [{ actionType: "factsheetRequest", actionId: "f1", blockingType: "NONE" }] },
+    { instantActions: [{ actionType: isOld ? "stateRequest" : "factsheetRequest", actionId: "f1", blockingType: "NONE" }] },
     {
       onActionStateChanged: (state) => say("action", { status: state.actionStatus }),
       onActionError: (error) => say("action", { error: error.errorType }),

@@ -1,1 +1,1 @@
-"""VDA 5050, versions 3.0, 2.1 and 2.0: robots under a fleet control, and zones for other makers' robots."""
+"""VDA 5050, versions 3.0, 2.1, 2.0 and 1.1: robots under a fleet control, and zones for other makers' robots."""

@@ -1,4 +1,4 @@
-"""What VDA 5050 3.0, 2.1 and 2.0 have a robot receive: orders and instant actions, checked. Pure.
+"""What VDA 5050 3.0, 2.1, 2.0 and 1.1 have a robot receive: orders and instant actions, checked. Pure.
 
 Names and rules: "VDA 5050 - Interface for the Communication between Mobile Robots and a Fleet Control", version 3.0.0,
 section 7, and version 2.1.0, section 6. Lengths are in m, angles in rad, in the project's frame: Fognav's `map`.
@@ -12,9 +12,11 @@ from typing import Annotated, Any, Final, Literal
 import msgspec
 from msgspec import Meta
 
-Version = Literal["3.0", "2.1", "2.0"]
-RELEASES: Final[dict[Version, str]] = {"3.0": "3.0.0", "2.1": "2.1.0", "2.0": "2.0.0"}
+Version = Literal["3.0", "2.1", "2.0", "1.1"]
+RELEASES: Final[dict[Version, str]] = {"3.0": "3.0.0", "2.1": "2.1.0", "2.0": "2.0.0", "1.1": "1.1.0"}
 """What a header says of a version."""
+OLDEST: Final[tuple[Version, ...]] = ("2.0", "1.1")
+"""Those with other names for instant actions and nodes ahead; 1.1 has no factsheet, and else the same."""
 MESSAGE_MAX: Final = 256 * 1024
 """Bytes of the longest message that is read."""
 NODES_MAX: Final = 100
@@ -197,7 +199,7 @@ def decoded(topic: str, payload: bytes, version: Version, serial: str) -> Order 
         raise MessageError(f"{len(payload)} bytes are over the limit of {MESSAGE_MAX}")
     order, update = _ORDER.search(payload), _UPDATE.search(payload)
     named = order[1].decode("utf-8", "replace") if order else "", int(update[1]) if update else None
-    kind = _EarlyActions if (topic, version) == ("instantActions", "2.0") else _TOPICS[topic]
+    kind = _EarlyActions if topic == "instantActions" and version in OLDEST else _TOPICS[topic]
     try:
         message = msgspec.json.decode(payload, type=kind)
     except (msgspec.MsgspecError, RecursionError, UnicodeDecodeError) as error:

@@ -1,6 +1,7 @@
-"""What VDA 5050 3.0, 2.1 and 2.0 have a robot tell, and a fleet control of its zones. Pure.
+"""What VDA 5050 3.0, 2.1, 2.0 and 1.1 have a robot tell, and a fleet control of its zones. Pure.
 
-Messages are made with the names of 3.0; `of_version` gives them those of 2.1 and 2.0. Rules and units as in `incoming`.
+Messages are made with the names of 3.0; `of_version` gives them those of earlier versions. Rules and units as in
+`incoming`.
 """
 
 from __future__ import annotations
@@ -10,6 +11,8 @@ from typing import TYPE_CHECKING, Any, Final, Literal
 
 import msgspec
 from msgspec import UNSET, UnsetType
+
+from fog_bridges.vda5050.incoming import OLDEST
 
 if TYPE_CHECKING:
     from fog_bridges.vda5050.incoming import Version
@@ -223,7 +226,7 @@ def of_version(topic: str, message: msgspec.Struct | dict[str, Any], version: Ve
     content: dict[str, Any] = msgspec.to_builtins(message)
     if version == "3.0":
         return content
-    if version == "2.0":  # there a node that lies ahead has a heading, or no position
+    if version in OLDEST:  # there a node that lies ahead has a heading, or no position
         for node in content.get("nodeStates", ()):
             if "theta" not in node.get("nodePosition", ()):
                 node.pop("nodePosition", None)

@@ -11,7 +11,7 @@ import subprocess
 import threading
 import time
 from collections.abc import AsyncIterator, Callable, Iterator
-from contextlib import AsyncExitStack, asynccontextmanager, contextmanager
+from contextlib import AsyncExitStack, asynccontextmanager, contextmanager, suppress
 from pathlib import Path
 
 import httpx
@@ -206,6 +206,8 @@ class Fog:
             "FOGNAV_HAZARDS_WAIT_S": "0.3",
         }
         self.processes: dict[str, programs.Program] = {}
+        self._killed: set[str] = set()
+        """Processes that were killed while no other copy ran."""
 
     def start(self, module: str, name: str = "", **environment: str) -> None:
         """Start a program, as `python -m module` would; may be called again after a kill.
@@ -242,6 +244,8 @@ class Fog:
         process = self.processes.pop(module)
         process.kill()
         process.wait()
+        if not any(name.partition("-")[0] == module for name in self.processes):
+            self._killed.add(module)
 
     def lateness(self) -> Lateness:
         """Return what tells how late a busy machine makes the processes from now on, this one among them."""
@@ -275,6 +279,11 @@ class Fog:
             while (answer := await client.get(f"{url}/readyz")).status_code != 200:
                 assert time.monotonic() < deadline, (answer.text, self.log(module))
                 await asyncio.sleep(0.05)
+            # One that was started again stands by, and changes nothing, until the lease of the killed one has ended.
+            while module in self._killed and "\nfognav_leader 0.0" in (await client.get(f"{url}/metrics")).text:
+                assert time.monotonic() < deadline, self.log(module)
+                await asyncio.sleep(0.05)
+        self._killed.discard(module)
         return url
 
     @asynccontextmanager
@@ -366,16 +375,13 @@ class Proxy:
         late: asyncio.Queue[tuple[float, bytes]] = asyncio.Queue()
         passing = asyncio.create_task(self._pass_on(late, sink))
         try:
-            while data := await source.read(65536):
-                late.put_nowait((time.monotonic() + self.delay_s, data))
-        except OSError:
-            pass
-        finally:
+            with suppress(OSError):
+                while data := await source.read(65536):
+                    late.put_nowait((time.monotonic() + self.delay_s, data))
             late.put_nowait((0.0, b""))
-            try:
-                await passing
-            finally:
-                passing.cancel()
+            await passing
+        finally:
+            passing.cancel()
 
     async def _pass_on(self, late: asyncio.Queue[tuple[float, bytes]], sink: asyncio.StreamWriter) -> None:
         try:

@@ -36,7 +36,7 @@ from map_service.zones import prepare_zone
 from planner.config import PlannerConfig
 from planner.core import PlannerCore
 from planner.dry_run import goal_outcome
-from planner.leases.corridor_leases import MOST_ROBOTS
+from planner.leases import corridor_leases
 
 ESTIG = Path(__file__).parents[2] / "sites" / "estig"
 STEP_S = 0.1
@@ -325,13 +325,13 @@ def test_random_changes_do_what_their_dry_runs_said(changes):
 
 @pytest.mark.drive
 @pytest.mark.timeout(600)
-def test_random_zones_on_a_large_floor_do_what_their_dry_runs_said():
+def test_random_zones_on_a_large_floor_do_what_their_dry_runs_said(monkeypatch):
+    # Who makes room for whom depends on when each gets its path, which no dry run knows.
+    monkeypatch.setattr(corridor_leases, "MOST_ROBOTS", 0)
     site, rng = load_site(ESTIG), np.random.default_rng(5)
     free = np.argwhere(make_map(site, 1).costmap.cost == 0)
     points = [site.map.geometry.centre(int(c), int(r)) for r, c in free[rng.integers(len(free), size=10)]]
-    # With one more that stands somewhere they are too many to make room, which depends on when each gets its path.
-    assert len(points) == MOST_ROBOTS
-    floor = Floor(site, {f"r{number}": point for number, point in enumerate([*points, points[0]])})
+    floor = Floor(site, {f"r{number}": point for number, point in enumerate(points)})
     places = list(site.site.places.values())
     for number in range(10):
         floor.send(f"r{number}", places[number % len(places)].x, places[number % len(places)].y)

@@ -53,9 +53,14 @@ class Attack:
                 await asyncio.sleep(0.01)
 
     async def _hold(self) -> None:
-        with contextlib.suppress(OSError, TimeoutError), _numbered_high() as connection:
+        with contextlib.suppress(OSError, TimeoutError):
             async with asyncio.timeout(30.0):
-                await asyncio.get_running_loop().sock_connect(connection, (net.LOOPBACK, self._port))
+                connection = _numbered_high()
+                try:
+                    await asyncio.get_running_loop().sock_connect(connection, (net.LOOPBACK, self._port))
+                except BaseException:
+                    connection.close()
+                    raise
                 name = None if self._tls is None else "localhost"
                 reader, writer = await asyncio.open_connection(sock=connection, ssl=self._tls, server_hostname=name)
             try:

@@ -46,6 +46,8 @@ class Connection:
 
     connected = True
 
+    def on_connect(self, _: object) -> None: ...
+
     def publish(self, channel: ch.Channel, message: Message, **ids: str) -> None: ...
 
 

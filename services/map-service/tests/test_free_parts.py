@@ -44,6 +44,7 @@ outlines = st.lists(
 @settings(deadline=None, max_examples=60)
 @given(rings=outlines, width=st.floats(0.2, 0.8), static=st.sampled_from([FLOOR, WALLED]))
 @example(rings=[LOWER, NARROW], width=0.5, static=WALLED)
+@example(rings=[[(0.0, 0.0), (0.0, 0.0), (2.0, 2.2250738585072014e-308)]], width=0.5, static=FLOOR)
 def test_no_cell_is_free_that_no_outline_covers_or_where_the_strip_is_too_narrow(rings, width, static):
     area = rasterize(SQUARE, GEOMETRY)
     free = free_cells(area, rings, width, static)

@@ -8,7 +8,7 @@ area says nothing of it; walls do.
 from __future__ import annotations
 
 import math
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
@@ -25,6 +25,9 @@ if TYPE_CHECKING:
     from fog_contracts.shapes import ShapeMask
 
     Mask = NDArray[np.bool_]
+
+_POINT_M2: Final = 1e-18
+"""Square of the length (m) below which an edge is a point."""
 
 
 def free_cells(area: ShapeMask, outlines: Sequence[Sequence[Point]], width: float, static: StaticMap) -> Mask:
@@ -62,12 +65,12 @@ def _wholly_inside(outline: Sequence[Point], window: Window, geometry: GridGeome
     for (ax, ay), (bx, by) in zip(ring, [*ring[1:], ring[0]], strict=True):
         dx, dy = bx - ax, by - ay
         squared = dx * dx + dy * dy
-        share = np.zeros(xs.shape) if squared == 0.0 else ((xs - ax) * dx + (ys - ay) * dy) / squared
+        share = np.zeros(xs.shape) if squared < _POINT_M2 else ((xs - ax) * dx + (ys - ay) * dy) / squared
         share = np.clip(share, 0.0, 1.0)
         nearest = np.minimum(nearest, np.hypot(xs - ax - share * dx, ys - ay - share * dy))
-        if dy != 0.0:
-            crosses = (ys < ay) != (ys < by)
-            inside ^= crosses & (xs < ax + (ys - ay) * dx / dy)
+        crosses = (ys < ay) != (ys < by)
+        # On which side of the edge it is, without a division by what may be next to nothing.
+        inside ^= crosses & (((xs - ax) * dy < (ys - ay) * dx) == (dy > 0.0))
     return inside & (nearest >= geometry.resolution * math.sqrt(0.5))
 
 

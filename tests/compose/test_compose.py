@@ -85,7 +85,7 @@ def fog(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Project]:
         project.start_log = project("logs", "--no-color", "--no-log-prefix", *sorted(FOG))
         yield project
     finally:
-        project("down", "--volumes", "--remove-orphans", "--timeout", "10")
+        project("--profile", "bridges", "down", "--volumes", "--remove-orphans", "--timeout", "10")
         assert leftovers(project.name) == []
 
 

@@ -14,7 +14,7 @@ import pytest
 from PIL import Image
 
 from fog_runtime.configuration.uploaded_maps import MapInForce, UploadedMaps
-from map_service.site_map import MAP_ID, StoredMap, put_into_force
+from map_service.site_map import MAP_ID, MapFile, StoredMap
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -223,12 +223,17 @@ async def test_each_bad_upload_is_refused_with_the_field_and_what_to_do(site, to
         assert (await client.get("/readyz")).status_code == 200
 
 
-def test_map_that_another_machine_has_is_in_force_once_it_was_copied_here(tmp_path):
+def test_map_that_another_machine_has_is_in_force_once_it_was_copied_here_and_no_empty_store_changes_that(tmp_path):
     maps = UploadedMaps(tmp_path)
     record = StoredMap(id=MAP_ID, name="a" * 16, over="b" * 16)
-    put_into_force(maps, {MAP_ID: record}, 0.0)
+    file = MapFile(maps)
+    file.use({MAP_ID: record})
+    file.write(0.0)
     assert maps.in_force() is None
     assert record.name is not None
     maps.file(record.name).write_bytes(b"a map")
-    put_into_force(maps, {MAP_ID: record}, 0.5)
-    assert maps.in_force() == MapInForce(name=record.name, over=record.over)
+    file.write(0.5)
+    expected = MapInForce(name=record.name, over=record.over)
+    assert maps.in_force() == expected
+    MapFile(maps).write(1.0)
+    assert maps.in_force() == expected

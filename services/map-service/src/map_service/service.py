@@ -19,7 +19,7 @@ from fog_runtime.transports.edges import Edges
 from map_service.places import StoredPlace, combined
 from map_service.publisher import Publisher
 from map_service.record_writer import RecordWriter
-from map_service.site_map import StoredMap, put_into_force
+from map_service.site_map import MapFile, StoredMap
 from map_service.store import PLACES, SITE_MAPS, ZONE_SETS, ZONE_SOURCES
 from map_service.zone_sources import ZoneSources
 from map_service.zone_times import MutedSource, SetOfZones
@@ -109,7 +109,8 @@ class Service:
         )
         self.muted = RecordWriter(ZONE_SOURCES, MutedSource, store, self.zones, lambda _: None)
         self.maps = maps or UploadedMaps(Path("maps"))
-        self.site_map = RecordWriter(SITE_MAPS, StoredMap, store, self.zones, lambda _: None)
+        self._map_file = MapFile(self.maps)
+        self.site_map = RecordWriter(SITE_MAPS, StoredMap, store, self.zones, self._map_file.use)
         self.zones.beside = (self.sets, self.places, self.muted, self.site_map)
         core.put_places(combined(places, {}))
         self.zone_sources = ZoneSources(
@@ -201,7 +202,7 @@ class Service:
                     await self._times.save(self._clock.now())
                     await self.zones.delete_ended()
                     self._health.set("store", ok=True)
-                put_into_force(self.maps, self.site_map.records, self._clock.now())
+                self._map_file.write(self._clock.now())
             except StoreError as error:
                 # What was stored but never acknowledged may have gone with a failed primary.
                 self.zones.must_reload = True

@@ -587,6 +587,16 @@ def test_cancel_ends_the_way_to_the_dock_and_its_action_has_failed():
     assert floor.take(order(node("b", 0, 4.0, 1.0), A | {"sequenceId": 2}, name="o2")) == ""
 
 
+def test_pause_on_the_way_to_the_dock_is_refused_and_a_cancel_that_the_floor_did_not_carry_out_is_asked_again():
+    floor = at_a_dock()
+    floor.robot.on_instant(instant("startPause", "p"), floor.now)
+    assert (actions(floor), floor.said()["paused"]) == ({"p": "FAILED"}, False)
+    floor.robot.on_instant(instant("cancelOrder", "x"), floor.now)
+    assert floor.drive(Answer("the planner is handing over", "service_away")) == ["DELETE"]
+    floor.tell(5.0)
+    assert floor.drive() == ["DELETE"]
+
+
 def test_instant_charging_is_refused_with_the_reason_and_else_comes_before_orders():
     floor = Floorplan()
     for refused in ("no dock", "is active"):

@@ -173,11 +173,22 @@ async def test_robot_that_does_not_answer_and_a_token_that_is_revoked_are_named_
         assert "r1" in stop["detail"], "a stop needs no token"
 
 
+@live
+async def test_floor_whose_planner_is_away_acknowledges_no_stop(floors):
+    await listed(floors, lambda entry: entry["reachable"])
+    floors.upstairs.kill("planner")
+    (stop,) = (await floors.client.post("/api/v1/floors/stop", json={"floors": ["upstairs"]})).json()
+    assert stop["acknowledged"] is False
+    assert "planner" in stop["detail"]
+    assert "on the spot" in stop["detail"]
+
+
 @pytest.mark.parametrize(
     ("text", "said"),
     [
         ('[floors.up]\naddress = "https://up.local:8004"\ncredentials = "none.toml"', "have no token"),
         ('[floors.up]\naddress = "http://up.local:8004"\ncredentials = "own.toml"', "not encrypted"),
+        ('[floors.up]\naddress = "https://up.local:80o4"\ncredentials = "own.toml"', "Correct its port"),
         ('[floors.up]\naddress = "up.local"\ncredentials = "own.toml"', "floors.toml"),
         ("[floors", "not valid TOML"),
     ],

@@ -29,7 +29,8 @@ class Hall:
     """An area that two nodes with two sonars each watch; readings come ten times a second."""
 
     def __init__(self, nodes=NODES, **fields) -> None:
-        definition = AreaDefinition(id="hall", polygon=SQUARE, **{"free_width": 0.5, "nodes": ["n1", "n2"], **fields})
+        fields = {"polygon": SQUARE, "free_width": 0.5, "nodes": ["n1", "n2"], **fields}
+        definition = AreaDefinition(id="hall", **fields)
         self.fusion = AreaFusion([definition], nodes, 5, registry=find_rule, sonar_cones=CONES)
         self.now, self.seq = 100.0, itertools.count(1)
         self.changes = []
@@ -87,6 +88,17 @@ def test_sonars_that_hear_the_far_wall_show_their_parts_free_after_a_time_and_al
     hall.run(1.0)
     assert hall.free == LOWER
     assert all(is_relief(after, before) == bool(after.free) for before, after in itertools.pairwise(hall.changes[-2:]))
+
+
+def test_sonars_that_look_through_what_another_one_hears_near_or_past_the_area_show_nothing(monkeypatch):
+    monkeypatch.setitem(CONES, "n2", [[(0.0, 0.0), (3.0, 0.0), (3.0, 1.0), (0.0, 1.0)], CONES["n2"][1]])
+    hall = Hall()
+    hall.run(FREE_AFTER_S + 2.0)
+    assert hall.hazard.state == "blocked"
+    assert hall.free == set(), "one is left, which is not enough"
+    hall = Hall(polygon=[(1.0, 2.0), (3.0, 2.0), (3.0, 3.0), (1.0, 3.0)])
+    hall.run(FREE_AFTER_S + 2.0)
+    assert hall.free == set()
 
 
 def test_it_is_off_by_default():

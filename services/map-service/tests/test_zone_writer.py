@@ -46,8 +46,6 @@ class Connection:
 
     connected = True
 
-    def on_connect(self, _: object) -> None: ...
-
     def publish(self, channel: ch.Channel, message: Message, **ids: str) -> None: ...
 
 

@@ -20,6 +20,8 @@ COMMANDS: Final = {START: "dock", "stopCharging": "undock"}
 NO_DOCK: Final = "the site gives this robot no dock: set `dock` of its [[robots]] entry in site.toml"
 UNCERTAIN: Final = ("", "service_silent", "store_uncertain", "command_lost")
 """Problems of requests that may have been carried out."""
+_OVER: Final = ("no_mission", "mission_changed")
+"""Problems of a mission's end that say that it has ended, or another has begun."""
 INSTANT_MAX: Final = 50
 """Instant actions of which a state tells: the latest."""
 IDLE_S: Final = 5.0
@@ -106,6 +108,8 @@ class Charging:
         """Take in the answer to a command; what nobody knows of, the robot's state shows."""
         if request.method == "POST" and answer.refusal and answer.problem not in UNCERTAIN:
             self.end("FAILED", answer.refusal)
+        elif request.method == "DELETE" and answer.refusal and answer.problem not in _OVER:
+            self._is_cancelled = True  # and asked again
 
     def is_way(self, view: dict[str, Any]) -> bool:
         """Whether the robot's mission leads to the dock by this action."""

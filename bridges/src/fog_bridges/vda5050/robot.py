@@ -250,6 +250,8 @@ class FleetRobot:
         elif kind in ("startPause", "stopPause"):
             if mode[0] != "AUTOMATIC":
                 return "INVALID_INSTANT_ACTION", f"the fleet is not in control: {mode[1]}"
+            if kind == "startPause" and self.charging.kind:
+                return "INVALID_INSTANT_ACTION", f"{self.charging.kind} can't pause: cancelOrder ends it"
             self._pause(action)
         else:
             is_ordered = self.pending is not None or not self.orders.is_idle
@@ -375,7 +377,8 @@ class FleetRobot:
         path = f"/api/v1/robots/{self.robot}/goal"
         if node is None or goal is None:
             if not self._goal:
-                request = None if self._unsure is not None else self.charging.request(self.view, now)
+                waits = self._unsure is not None or self.paused
+                request = None if waits else self.charging.request(self.view, now)
                 return None if request is None else self._ask(request, None, now)
             return self._ask(Request("DELETE", path, headers={"If-Match": f'"{self._goal}"'}), None, now)
         if not self.state or (self._goal and self._goal_node is node):

@@ -4,7 +4,8 @@ A leader that is slow looks well to itself: what it receives late it answers at 
 its copies judge it. Each of the map-service's heartbeats is a question; a planner says which one it has handled last
 (`Leader.answered`), on the way that its paths take, once its planning thread is free. A copy compares when it heard
 the question with when it heard the answer: what delays both, as a slow router does, delays nobody's answer. It judges
-itself by the same measure, so that no lease goes to a copy that is as slow.
+itself by the same measure, so that no lease goes to a copy on as slow a machine or way. Of the leader's missions it has
+none: where these alone make it late, the other will be late with them, and the pauses between hand-overs grow.
 
 Times are seconds of the judge's own monotonic clock.
 """

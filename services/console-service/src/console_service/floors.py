@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import asyncio
 import re
+import time
 import tomllib
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Annotated, Final, Literal, NamedTuple, TypeVar
@@ -51,6 +52,8 @@ ANSWER_LIMIT: Final = 1 << 20
 _ASK: Final = httpx.Timeout(2.0)
 _STOP: Final = httpx.Timeout(6.0, connect=3.0)
 """A robot has 2 s to answer; a first packet that is lost is sent again after 1 s."""
+_STOPPED_S: Final = 8.0
+"""For its whole answer: one that never ends must not hide that others have stopped."""
 _LOOPBACK: Final = ("127.0.0.1", "::1", "localhost")
 
 REACHABLE = Gauge("fognav_console_floor_reachable", "Whether a floor on another machine answers", ["floor"])
@@ -159,6 +162,10 @@ def _peer(file: Path, floor: str, entry: _Listed) -> Peer:
             "viewer --out FILE`"
         )
     parts = urlsplit(entry.address)
+    try:
+        _ = parts.port
+    except ValueError as error:
+        raise SettingsError(f"{file}: the address of {floor}, {entry.address}: {error}. Correct its port") from error
     if parts.scheme != "https" and parts.hostname not in _LOOPBACK:
         raise SettingsError(
             f"{file}: {entry.address} is not encrypted, so everybody in the network could read the token of {floor}. "
@@ -176,6 +183,7 @@ class OwnFloor:
         self._forward = forward
         self._health = health
         self._now = now
+        self._begun_at = time.monotonic()
 
     @property
     def id(self) -> str:
@@ -201,24 +209,32 @@ class OwnFloor:
     async def stop(self, request: Request) -> FloorStop:
         """Stop all its robots at once, for the caller of a request; the planner sends and records it."""
         robots, _ = self._core.floor(self._now())
-        stops = await asyncio.gather(*(self._stop(robot, request) for robot in robots))
-        failed = [stop for stop, robot in zip(stops, robots, strict=True) if not stop.stopped and not _is_away(robot)]
-        detail = "; ".join(f"{stop.id}: {stop.detail}" for stop in failed)
-        if failed:
-            detail += ". Stop what still drives on the spot, and press again"
-        return FloorStop(id=self.id, acknowledged=not failed, robots=list(stops), detail=detail)
+        # Only who has listened for a while knows that a robot is silent.
+        knows = time.monotonic() - self._begun_at >= AWAY_S and not self._health.report()["missing"]
+        asked = await asyncio.gather(*(self._stop(robot, request) for robot in robots))
+        failed = [
+            f"{stop.id}: {stop.detail}"
+            for (stop, has_answered), robot in zip(asked, robots, strict=True)
+            if not stop.stopped and not (has_answered and knows and _is_away(robot))
+        ]
+        if not robots and PLANNER in await self._forward.readiness():
+            failed = ["its planner does not run, and no robot is known"]
+        detail = "; ".join(failed) + (". Stop what still drives on the spot, and press again" if failed else "")
+        return FloorStop(id=self.id, acknowledged=not failed, robots=[stop for stop, _ in asked], detail=detail)
 
-    async def _stop(self, robot: FloorRobot, request: Request) -> RobotStop:
+    async def _stop(self, robot: FloorRobot, request: Request) -> tuple[RobotStop, bool]:
+        """Stop a robot; return what became of it, and whether it is the planner that says so."""
         try:
             answer = await self._forward.send(PLANNER, request, f"/api/v1/robots/{robot.id}/stop".encode(), b"")
             text = await answer.aread()
             await answer.aclose()
         except ProblemError as error:
-            return RobotStop(id=robot.id, stopped=False, age_s=robot.age_s, detail=error.detail)
+            return RobotStop(id=robot.id, stopped=False, age_s=robot.age_s, detail=error.detail), False
         except httpx.TransportError as error:
-            return RobotStop(id=robot.id, stopped=False, age_s=robot.age_s, detail=f"the planner broke off ({error})")
+            detail = f"the planner broke off ({error})"
+            return RobotStop(id=robot.id, stopped=False, age_s=robot.age_s, detail=detail), False
         detail = "" if answer.is_success else _detail(text, answer.status_code)
-        return RobotStop(id=robot.id, stopped=answer.is_success, age_s=robot.age_s, detail=detail)
+        return RobotStop(id=robot.id, stopped=answer.is_success, age_s=robot.age_s, detail=detail), True
 
 
 def _is_away(robot: FloorRobot) -> bool:
@@ -368,10 +384,11 @@ class Hub:
             # Not by a connection that waits since the last question: it may be dead, and nobody has noticed.
             async with _client(self._peers[floor], _STOP) as client:
                 client.headers[PART] = re.sub(r"[^a-z0-9-]", "-", who.lower())[:32]
-                return await _ask(client, "POST", f"{HERE}/stop", FloorStop)
-        except _AskError as error:
+                async with asyncio.timeout(_STOPPED_S):
+                    return await _ask(client, "POST", f"{HERE}/stop", FloorStop)
+        except (_AskError, TimeoutError) as error:
             detail = (
-                f"{error}. Its robots may go on driving: press again, use that floor's own console, or stop them on "
-                "the spot. Nothing is sent again by itself"
+                f"{str(error) or 'its answer does not end'}. Its robots may go on driving: press again, use that "
+                "floor's own console, or stop them on the spot. Nothing is sent again by itself"
             )
             return FloorStop(id=floor, acknowledged=False, robots=[], detail=detail)

@@ -194,7 +194,7 @@ class WatchedArea:
         old = self.hazard
         stays_blocked = old is not None and old.state == measured.state == "blocked" and old.override is None
         may_pass = stays_blocked and override is None
-        self._free = free_sonars(self.definition, self.nodes, self._free) if may_pass else frozenset()
+        self._free = free_sonars(self.definition, self.nodes, self._free, cones or {}) if may_pass else frozenset()
         free = outlines(self._free, cones or {})
         state, penalty, severity, cause, deciding = self._overridden(measured, override)
         explained = next((node.explained_by for node in self.nodes.values() if node.explained_by), None)

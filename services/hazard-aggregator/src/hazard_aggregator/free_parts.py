@@ -11,10 +11,11 @@ import math
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final, Protocol
 
+from fog_contracts.geometry import contains_point
 from fog_contracts.messages import NodeCode
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable, Mapping
+    from collections.abc import Iterable, Mapping, Sequence
 
     from fog_contracts.geometry import Point
     from fog_contracts.messages import AreaDefinition, AreaState, Reason
@@ -28,7 +29,8 @@ FRESH_S: Final = 2.0
 HELD_S: Final = 20.0
 """So long a robot that drives along its cone, and is all that it hears, ends nothing: 3 m at the slow speed."""
 FEWEST_SONARS: Final = 2
-"""One sonar may hear the wall past a thin thing; of a time-of-flight sensor, whose beam is narrow, one is enough."""
+"""Of those that look into the area: a lone one may be wrong. Of light, whose beam is narrow, one is enough."""
+_STEP_M: Final = 0.1
 
 FreeSonars = frozenset[tuple[str, int]]
 """Sonars by node and index."""
@@ -89,9 +91,9 @@ class FarWall:
         )
 
     @property
-    def sees_something(self) -> bool:
-        """Whether one of its sonars hears something that is no robot."""
-        return any(heard.near for heard in self._heard)
+    def near(self) -> list[int]:
+        """The sonars that hear something near that is no robot."""
+        return [index for index, heard in enumerate(self._heard) if heard.near]
 
 
 def _is_fresh(heard: _Heard, now: float) -> bool:
@@ -113,8 +115,12 @@ class Watcher(Protocol):
         """The cost of the area while it is blocked; None: impassable."""
 
 
-def free_sonars(definition: AreaDefinition, nodes: Mapping[str, Watcher], before: FreeSonars) -> FreeSonars:
+def free_sonars(
+    definition: AreaDefinition, nodes: Mapping[str, Watcher], before: FreeSonars, cones: Cones
+) -> FreeSonars:
     """Return the sonars that show parts of a blocked area free; none in any doubt.
+
+    Where another sonar hears something near, along its axis, one may have heard the wall past that thing.
 
     All that watches the area must be known, and each node that is blocked must see something now: else the obstacle may
     be anywhere. A sonar that shows nothing any more counts at once; others are added only when none is lost, so that
@@ -123,14 +129,32 @@ def free_sonars(definition: AreaDefinition, nodes: Mapping[str, Watcher], before
     if definition.free_width is None:
         return frozenset()
     free: set[tuple[str, int]] = set()
+    near: list[list[Point]] = []
     for name, node in nodes.items():
         if node.site is None or node.penalty is not None or not _is_known(node):
             return frozenset()
-        if node.state == "blocked" and not node.far_wall.sees_something:
+        if node.state == "blocked" and not node.far_wall.near:
             return frozenset()
         free.update((name, index) for index in node.free)
-    found = frozenset(free)
+        near += [cones[name][index] for index in node.far_wall.near if name in cones]
+    axes = {each: _axis(nodes[each[0]].site, each[1], cones) for each in free}
+    area = [definition.polygon]
+    found = frozenset(each for each, axis in axes.items() if _meets(axis, area) and not _meets(axis, near))
     return enough(found & before if before - found else found, nodes)
+
+
+def _axis(site: NodeSite | None, sonar: int, cones: Cones) -> list[Point]:
+    """Return points along the middle of what a sonar sees, 0.1 m apart; none of one whose cone is not known."""
+    if site is None or site.id not in cones:
+        return []
+    theta = site.theta + site.sonars[sonar].angle
+    reach = max(math.dist((site.x, site.y), corner) for corner in cones[site.id][sonar])
+    steps = [_STEP_M * step for step in range(1, int(reach / _STEP_M) + 1)]
+    return [(site.x + step * math.cos(theta), site.y + step * math.sin(theta)) for step in steps]
+
+
+def _meets(line: Iterable[Point], outlines: Sequence[Sequence[Point]]) -> bool:
+    return any(contains_point(outline, x, y) for x, y in line for outline in outlines)
 
 
 def _is_known(node: Watcher) -> bool:

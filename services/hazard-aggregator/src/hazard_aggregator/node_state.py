@@ -95,9 +95,9 @@ class NodeState:
         self.far_wall = FarWall(self.site)
 
     @property
-    def outcome(self) -> tuple[AreaState, str, str | None, bool, frozenset[int], bool]:
+    def outcome(self) -> tuple[AreaState, str, str | None, bool, frozenset[int], tuple[int, ...]]:
         """All that an area's hazard depends on."""
-        seen = self.free, self.far_wall.sees_something
+        seen = self.free, tuple(self.far_wall.near)
         return self.state, self.reason, self.explained_by, self.ever_received, *seen
 
     @property

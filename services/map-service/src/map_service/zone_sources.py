@@ -124,9 +124,8 @@ class ZoneSources:
         self._muted = muted
         self._publish = publish
         self._mqtt = mqtt
-        self._forgotten: dict[tuple[str, str], asyncio.Task[None]] = {}
-        """What the broker still has to forget, by source and zone."""
-        mqtt.on_connect(self._forget_again)
+        self._forgotten: dict[tuple[str, str], Zone] = {}
+        """Deleted zones that the broker may still retain, by source and id."""
         self._worker = Worker("zone-sources", limit=1)
         self._limited = logs.RateLimited(_log)
         self._waiting: dict[str, _Received] = {}
@@ -137,6 +136,7 @@ class ZoneSources:
 
     async def listen(self) -> None:
         """Receive messages, and again those that the broker has retained."""
+        self._forgotten.clear()  # another one may have led meanwhile
         if self._sources:
             topics = [channel.pattern(site=self._site) for channel in (ch.ZONE_REQUEST, ch.ZONE_SET_SWITCH)]
             await self._mqtt.listen_to_foreign(topics, self.receive, again=topics)
@@ -153,10 +153,6 @@ class ZoneSources:
             remedy = "add it to zone_sources in site.toml, or remove its user"
             self._limited.warning("unknown_zone_source", "", self._zones.now().now, topic=topic, remedy=remedy)
             return
-        if ids is not None and (key := (source.site.id, ids[name])) in self._forgotten and channel is ch.ZONE_REQUEST:
-            if retained:
-                return
-            self._forgotten.pop(key).cancel()  # its source has said something newer
         removes = payload == b"" and channel is ch.ZONE_REQUEST
         if removes and ids is not None and not self._is_known(topic, ids["zone"]):
             return  # it is gone already: most often what this service has cleared itself
@@ -177,20 +173,25 @@ class ZoneSources:
     async def forget(self, zone: Zone) -> None:
         """Delete what the broker retains of a zone that was taken from its source; return once it has, or soon.
 
-        Until it has, perhaps after another connection, what it tells of the zone is passed over.
+        A broker that is away may tell of it once more: that is passed over, and deleted then.
         """
         if zone.source:
-            key = (zone.source, zone.id)
-            self._forgotten[key] = task = asyncio.create_task(self._clear(key))
-            await asyncio.wait([task], timeout=FORGET_S)
+            self._forgotten[zone.source, zone.id] = zone
+            await asyncio.wait([asyncio.create_task(self._clear(zone.source, zone.id))], timeout=FORGET_S)
 
-    async def _forget_again(self) -> None:
-        for key in list(self._forgotten):
-            self._forgotten[key] = asyncio.create_task(self._clear(key))
+    async def _clear(self, source: str, zone: str) -> None:
+        if await self._mqtt.clear(ch.ZONE_REQUEST, wait=True, source=source, zone=zone):
+            self._forgotten.pop((source, zone), None)
 
-    async def _clear(self, key: tuple[str, str]) -> None:
-        if await self._mqtt.clear(ch.ZONE_REQUEST, wait=True, source=key[0], zone=key[1]):
-            self._forgotten.pop(key, None)
+    async def _is_forgotten(self, zone: Zone, *, retained: bool) -> bool:
+        """Whether a message only tells again of a deleted zone; the broker is to forget it, then."""
+        assert zone.source is not None
+        deleted = self._forgotten.get((zone.source, zone.id))
+        if deleted is not None and retained and structs.replace(zone, version=deleted.version) == deleted:
+            await self.forget(deleted)
+            return True
+        self._forgotten.pop((zone.source, zone.id), None)  # its source has said something newer
+        return False
 
     def views(self) -> list[ZoneSourceView]:
         """Return all sources."""
@@ -256,6 +257,8 @@ class ZoneSources:
         zone = _requested_zone(source, received, request, at)
         if zone.expires_at is not None and at.synchronized and zone.expires_at <= at.stamp and received.retained:
             await self.forget(zone)
+            return
+        if await self._is_forgotten(zone, retained=received.retained):
             return
         old = self._own_zone(source.id, zone.id)
         if old is not None and received.retained and structs.replace(zone, version=old.version) == old:

@@ -74,8 +74,8 @@ _BROKER_CHECK: Final = """\
 def hand_out(security: SiteSecurity, out: Path, *, robots: Sequence[str], nodes: Sequence[str]) -> list[Path]:
     """Bring the programs' folders in `out` up to date; return the files that changed.
 
-    The credentials' folder also has the site's keys (`fog_runtime.keys`); `seen_as` is a folder's path in its
-    container. Raises `OSError`, and `CredentialsError` or `TokensError` for files that can't be used.
+    The credentials' folder also has the site's keys (`fog_runtime.keys`). Raises `OSError`, and `CredentialsError` or
+    `TokensError` for files that can't be used.
     """
     return _write(out, _servers(security)) + _hand_out_keys(security, out, "", robots, nodes)
 

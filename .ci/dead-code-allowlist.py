@@ -151,3 +151,18 @@ _.wall_to_floor_m2  # what a map changes, for people who read the answer
 _.floor_to_wall_m2
 _.newly_known_m2
 _.no_longer_known_m2
+
+# --- Commands whose names don't end in `_command`: the rows of fognav.__main__ name them. ---
+map_check
+map_clean
+map_convert
+map_export
+map_from_plan
+map_info
+map_record
+robot_add
+robot_bringup
+robot_check
+robot_new
+run_tests
+zone_import

@@ -1,4 +1,4 @@
-"""The list of commands, by who uses them; and those of other packages, found by entry points.
+"""The list of commands, by who uses them: each is loaded when it is used, or listed; other packages add theirs.
 
 Those that measure come with fognav-experiments, where it is installed.
 
@@ -10,8 +10,10 @@ An entry is a function that gets a `typer.Typer` and adds to it; the `rich_help_
 
 from __future__ import annotations
 
+from importlib import import_module
+from importlib.util import find_spec
 from types import FunctionType
-from typing import TYPE_CHECKING, Any, Final
+from typing import TYPE_CHECKING, Any, ClassVar, Final, NamedTuple
 
 import typer
 from typer.core import TyperGroup
@@ -21,7 +23,7 @@ from fog_runtime.configuration import parts
 from fognav.output import fail
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
+    from collections.abc import Callable, Mapping
 
 PROGRAM: Final = "fognav"
 ENTRY_POINTS: Final = "fognav.commands"
@@ -38,22 +40,62 @@ GROUPS: Final = (TRY_IT, OPERATE, SET_UP, RUN, MEASURE, DEVELOP, OTHERS)
 """Groups of commands, in the order in which a newcomer needs them; the last has those that name none."""
 
 
+class Row(NamedTuple):
+    """A command of this package: its group ("": none), and its name ("up", or "zone import" for one of `zone`).
+
+    `source`: module below `fognav`, and what of it: a function, or the `typer.Typer` of a command that has
+    others. `also`: modules that add to the latter. `robot`: a robot's computer has it without its extra `fog`.
+    """
+
+    group: str
+    name: str
+    source: str
+    example: str = ""
+    settings: Mapping[str, Any] = {}
+    also: tuple[str, ...] = ()
+    robot: bool = False
+
+    def load(self) -> Any:  # noqa: ANN401  # a function, or a Typer
+        """Return what the row names."""
+        module, _, attribute = self.source.partition(":")
+        return getattr(import_module(f"fognav.{module}"), attribute)
+
+    def add_to(self, app: typer.Typer) -> None:
+        """Add it to the command that has it."""
+        found, name = self.load(), self.name.split()[-1]
+        if isinstance(found, typer.Typer):
+            app.add_typer(found, name=name, rich_help_panel=self.group or None)
+        else:
+            example = f"Example: fognav {self.example}"
+            app.command(name, context_settings=dict(self.settings), epilog=example, rich_help_panel=self.group or None)(
+                found
+            )
+
+
+_complete: Final[set[str]] = set()
+
+
 class Commands(TyperGroup):
     """The command line, or one of its commands that has others.
 
-    Those of packages are loaded only when it does not know a command itself, and to list all.
+    A command of its `rows` is loaded when it is asked for. Those of packages are loaded only when it does not know a
+    command itself. To list all, all are loaded.
     """
 
+    rows: ClassVar[tuple[Row, ...]] = ()
     _loaded = False
 
     def list_commands(self, ctx: Any) -> list[str]:  # noqa: ANN401  # typer's class is private
         """Return the names of all commands."""
+        for row in self.rows:
+            if " " not in row.name:
+                self._own(row.name)
         self._load()
         return super().list_commands(ctx)
 
     def get_command(self, ctx: Any, cmd_name: str) -> Any:  # noqa: ANN401  # same
         """Return a command, or None if there is none of this name."""
-        if cmd_name not in self.commands:
+        if cmd_name not in self.commands and not self._own(cmd_name):
             self._load()
         return super().get_command(ctx, cmd_name)
 
@@ -71,6 +113,24 @@ class Commands(TyperGroup):
             if rows:
                 with formatter.section(group):
                     formatter.write_dl(rows)
+
+    def _own(self, name: str) -> bool:
+        """Load a command of the rows, with all that it has; return False if it is none of them."""
+        fog = find_spec("map_service") is not None
+        rows = [row for row in self.rows if row.name.split()[0] == name and (fog or row.robot)]
+        if not rows or name in self.commands:
+            return bool(rows)
+        row, *others = rows
+        if name not in _complete:  # which outlives this list: tests run many commands in one process
+            _complete.add(name)
+            for module in row.also if fog else ():
+                import_module(f"fognav.{module}")
+            for other in others:
+                other.add_to(row.load())
+        added = typer.Typer(rich_markup_mode=self.rich_markup_mode)
+        row.add_to(added)
+        self.commands.update(get_group(added).commands)
+        return True
 
     def _load(self) -> None:
         if self._loaded:

@@ -21,9 +21,6 @@ if TYPE_CHECKING:
 
 Pixel = tuple[float, float]
 
-FORWARDED: Final = {"allow_extra_args": True}
-"""Context settings: a single point takes the next option for its second, and what that leaves is told with it."""
-
 _PIXEL_M: Final = (0.0005, 0.1)
 """A pixel smaller than the first is a wrong distance; in one larger than the last walls can't be seen."""
 _MOST_PIXELS: Final = 50_000_000

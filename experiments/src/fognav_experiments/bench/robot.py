@@ -7,16 +7,20 @@ mounted) can limit the robot to a share of a core.
 from __future__ import annotations
 
 import asyncio
+import math
 import os
+import random
 import time
 from contextlib import ExitStack, contextmanager, suppress
-from itertools import cycle
+from functools import partial
+from itertools import count, cycle
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import TYPE_CHECKING, Final
+from typing import TYPE_CHECKING, Final, NamedTuple
 
 from fog_contracts import channels as ch
-from fog_contracts.messages import RobotPose, RobotState
+from fog_contracts.commands import PROFILE_OF
+from fog_contracts.messages import ProfileName, RobotPose, RobotState
 from fog_runtime.clock import SystemClock
 from fog_runtime.configuration.maps import save_map
 from fog_runtime.robot_commands import RobotCommands
@@ -24,7 +28,7 @@ from fog_runtime.transports.zenoh_edge import ZenohEdge
 from fog_supervisor import net
 from fog_supervisor.net import put_goal
 from fognav.output import WrongUseError
-from fognav.programs import AGENT, PLANNER, ROBOT, WATCHDOG
+from fognav.programs import AGENT, MAP_SERVICE, PLANNER, ROBOT, WATCHDOG
 from fognav.stack import Stack, StackConfig, StackUsers
 from fognav_experiments.bench.common import RunningSystem, corridor_rows, first_child, make_office
 from fognav_sim.drive.operator import OperatorPolicy
@@ -96,6 +100,19 @@ _WAIT_S: Final = 90.0
 _POLL_S: Final = 0.01
 _OPERATOR_S: Final = 0.5
 _DRIVING_M_S: Final = 0.2
+_ZONE_M: Final = (1.5, 6.0)
+"""Radius of a zone, which closes a corridor, and how far from the robot it stays."""
+
+
+class Conditions(NamedTuple):
+    """Where and how the robot drives: its profile, the floor's width and height (m), and how often that changes.
+
+    A change closes another corridor anywhere on the floor, and opens the one that was closed before.
+    """
+
+    profile: ProfileName = "fog"
+    floor_m: tuple[float, float] = FLOOR_M
+    changes_per_min: float = 0.0
 
 
 def write_site(folder: Path, floor: StaticMap) -> Path:
@@ -117,12 +134,21 @@ def write_site(folder: Path, floor: StaticMap) -> Path:
 class RobotSystem(RunningSystem):
     """The running system, with an operator who keeps the robot enabled."""
 
-    def __init__(self, on_start: Callable[[int], object], settings: Mapping[str, str] | None = None) -> None:
+    def __init__(
+        self,
+        on_start: Callable[[int], object],
+        settings: Mapping[str, str] | None = None,
+        conditions: Conditions | None = None,
+    ) -> None:
         """`on_start` is called with the id of each process of the robot that is started, but not with its children.
 
         `settings`: further FOGNAV_* variables of all processes, named without the prefix.
         """
         super().__init__()
+        self.conditions = conditions or Conditions()
+        self.changes = 0
+        """How often the map was changed."""
+        self._at = (0.0, 0.0)
         self._on_start = on_start
         self._settings = settings
         self._started_at: dict[str, float] = {}
@@ -136,7 +162,7 @@ class RobotSystem(RunningSystem):
     async def _start(self) -> None:
         contexts = self._contexts
         folder = Path(contexts.enter_context(TemporaryDirectory(prefix="fognav-bench-")))
-        site = await asyncio.to_thread(write_site, folder, make_office(*FLOOR_M))
+        site = await asyncio.to_thread(write_site, folder, make_office(*self.conditions.floor_m))
         users = StackUsers(site=_SITE, robots=(NAME,))
         config = StackConfig(site_dir=site, robot=NAME, extra=self._settings, users=users)
         self.stack = await contexts.enter_async_context(Stack(config, self._on_event))
@@ -155,8 +181,8 @@ class RobotSystem(RunningSystem):
         edge.subscribe(ch.ROBOT_STATE, RobotState, self._on_state, robot=NAME)
         edge.subscribe(ch.ROBOT_POSE, RobotPose, self._on_pose, robot=NAME)
         tasks = await contexts.enter_async_context(asyncio.TaskGroup())
-        operator = tasks.create_task(self._operate())
-        contexts.callback(operator.cancel)
+        for work in (self._operate(), self._change()):
+            contexts.callback(tasks.create_task(work).cancel)
 
     def _on_event(self, event: Event) -> None:
         if event.kind == "started" and event.program in ROBOT:
@@ -170,7 +196,7 @@ class RobotSystem(RunningSystem):
         self._policy.on_state(state, self._clock.now())
 
     def _on_pose(self, _ids: dict[str, str], pose: RobotPose) -> None:
-        self.speed = abs(pose.v)
+        self.speed, self._at = abs(pose.v), (pose.x, pose.y)
 
     async def _operate(self) -> None:
         while True:
@@ -178,6 +204,48 @@ class RobotSystem(RunningSystem):
             if command is not None and state is not None:
                 await self._commands.send(command, NAME, state)
             await asyncio.sleep(_OPERATOR_S)
+
+    async def _change(self) -> None:
+        """Close one corridor after the other, as hazards do."""
+        if not self.conditions.changes_per_min:
+            return
+        dice = random.Random(1)  # noqa: S311  # repeatable, not a secret
+        width, height = self.conditions.floor_m
+        before = None
+        for number in count():
+            await asyncio.sleep(60.0 / self.conditions.changes_per_min)
+            x, y = dice.uniform(4.0, width - 4.0), float(dice.choice(list(corridor_rows(height))))
+            if math.dist((x, y), self._at) < _ZONE_M[1]:
+                continue
+            shape = {"type": "circle", "centre": [x, y], "radius": _ZONE_M[0]}
+            zone = {"id": f"bench-{number}", "kind": "BLOCKED", "shape": shape}
+            await self._map_request("POST", "", zone)
+            if before is not None:
+                await self._map_request("DELETE", f"/{before}")
+            before, self.changes = zone["id"], self.changes + 1
+
+    async def _map_request(self, method: str, path: str, body: object = None) -> None:
+        port = self.stack.port(MAP_SERVICE)
+        assert port is not None
+        asked = partial(net.request, method, port, f"/api/v1/zones{path}", body=body, token=self.stack.token)
+        answer = await asyncio.to_thread(asked)
+        if answer.status >= 300:
+            raise RuntimeError(f"the map-service refused a zone: HTTP {answer.status}, {answer.reason}")
+
+    async def switch(self) -> None:
+        """Let the robot navigate by the profile that is asked for, and wait until it is enabled again."""
+        profile = self.conditions.profile
+        if self.state is None or self.state.profile == profile:
+            return
+        kind = next(kind for kind, name in PROFILE_OF.items() if name == profile)
+        for command in ("disable", kind):
+            reply = await self._commands.send(command, NAME, self.state)
+            if reply is None or not reply.accepted:
+                raise RuntimeError(f"the robot refused {command}: {reply.reason if reply else 'no reply'}")
+        await self._until(
+            lambda: self.state is not None and self.state.profile == profile, f"it navigates by {profile}"
+        )
+        await self.wait_enabled()
 
     def pids(self) -> dict[str, int]:
         """Return the ids of the robot's processes, the guardian among them."""
@@ -231,7 +299,9 @@ SETTLE_S: Final = 5.0
 """Between a change and the measurement that follows it."""
 
 
-def measure(seconds: float, quota: float | None, on_phase: Callable[[str], object]) -> dict[str, object]:
+def measure(
+    seconds: float, quota: float | None, on_phase: Callable[[str], object], conditions: Conditions | None = None
+) -> dict[str, object]:
     """Return the figures; each of the two phases is measured for `seconds`, under a quota of one core if one is given.
 
     Raises `WrongUseError` for a quota that this system can't enforce, `TimeoutError` for a robot that does not drive.
@@ -239,8 +309,8 @@ def measure(seconds: float, quota: float | None, on_phase: Callable[[str], objec
     with ExitStack() as contexts:
         group = None if quota is None else contexts.enter_context(cpu_quota(quota))
         if group is None:
-            return asyncio.run(_measure(seconds, lambda _pid: None, {}, on_phase))
-        return asyncio.run(_measure(seconds, group.add, NORMAL_PRIORITY, on_phase))
+            return asyncio.run(_measure(seconds, lambda _pid: None, {}, on_phase, conditions))
+        return asyncio.run(_measure(seconds, group.add, NORMAL_PRIORITY, on_phase, conditions))
 
 
 async def _measure(
@@ -248,12 +318,14 @@ async def _measure(
     on_start: Callable[[int], object],
     settings: Mapping[str, str],
     on_phase: Callable[[str], object],
+    conditions: Conditions | None,
 ) -> dict[str, object]:
     on_phase("starting fog, simulator and robot")
-    async with RobotSystem(on_start, settings) as system:
+    async with RobotSystem(on_start, settings, conditions) as system:
         on_phase("restarting the agent")
         ready_s = await system.restart_agent()
         await system.wait_enabled()
+        await system.switch()
         on_phase("standing by")
         idle = await _usage(system, seconds)
         await system.start_drive()
@@ -261,11 +333,12 @@ async def _measure(
         driving = await _usage(system, seconds)
         memory = {name: memory_mb(pid) for name, pid in system.pids().items()}
         assert system.state is not None
-        jitter_s, mode = system.state.loop.stream_p99_s, system.state.mode
+        jitter_s, mode, changes = system.state.loop.stream_p99_s, system.state.mode, system.changes
     return figures(idle, driving, memory) | {
         "ready_s": round(ready_s, 2),
         "loop_jitter_p99_ms": round(1000.0 * jitter_s, 2),
         "mode": mode,
+        "changes": changes,
     }
 
 

@@ -12,9 +12,10 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 from rich.progress import Progress
 
+from fog_contracts.messages import ProfileName  # noqa: TC001  # Typer reads annotations at run time
 from fognav import checkout, kernels
 from fognav.commands.installed import MEASURE
-from fognav.operate.options import JsonOption  # noqa: TC001  # Typer reads annotations at run time
+from fognav.operate.options import JsonOption  # noqa: TC001  # same
 from fognav.output import NOT_TRUE, WrongUseError, check_writable, console, exit_codes, print_json, print_line
 from fognav_experiments import machine
 from fognav_experiments.commands import logs
@@ -168,7 +169,7 @@ def costmap_command(
 
 
 @bench_app.command("robot", epilog="Example: fognav bench robot --seconds 30 --cpu-quota 0.2 --json")
-def robot_command(
+def robot_command(  # noqa: PLR0913  # each option is an argument
     *,
     seconds: Annotated[
         float, typer.Option("--seconds", metavar="S", min=1.0, max=120.0, help="Length of each measurement.")
@@ -177,19 +178,28 @@ def robot_command(
         float | None,
         typer.Option("--cpu-quota", metavar="SHARE", min=0.01, max=4.0, help="Limit the robot to a share of a core."),
     ] = None,
+    profile: Annotated[
+        ProfileName, typer.Option("--profile", metavar="P", help="fog, full or default: who plans.")
+    ] = "fog",
+    width: Annotated[float, typer.Option("--width", metavar="M", min=25.0, max=500.0, help="Of the floor.")] = 100.0,
+    height: Annotated[float, typer.Option("--height", metavar="M", min=15.0, max=500.0, help="Of the floor.")] = 57.0,
+    changes: Annotated[
+        float, typer.Option("--changes", metavar="N", min=0.0, max=600.0, help="Corridors closed a minute.")
+    ] = 0.0,
     json: JsonOption = False,
 ) -> None:
     """Measure what the robot's processes cost.
 
-    Agent, guardian and watchdog, standing by and driving on a map of 2000 x 1140 cells. Fog, simulator and emulated
-    devices are processes of their own, which do not count. CPU is in percent of one core.
+    Agent, guardian and watchdog, standing by and driving, by default on a map of 2000 x 1140 cells of 5 cm. Fog,
+    simulator and emulated devices are processes of their own, which do not count. CPU is in percent of one core.
     """
     from fognav_experiments.bench import robot  # noqa: PLC0415  # keeps the other commands fast
 
     kernels.warm_cache(print_line)
     with exit_codes():
-        figures = robot.measure(seconds, cpu_quota, print_line)
-    asked = {"seconds": seconds, "cpu_quota": cpu_quota}
+        conditions = robot.Conditions(profile, (width, height), changes)
+        figures = robot.measure(seconds, cpu_quota, print_line, conditions)
+    asked = {"seconds": seconds, "cpu_quota": cpu_quota, **conditions._asdict()}
     _show("robot", asked, figures, json=json)
 
 

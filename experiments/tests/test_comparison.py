@@ -18,10 +18,12 @@ import ring_site as ring
 from hypothesis import given
 from hypothesis import strategies as st
 from msgspec import UNSET
+from PIL import Image
 
+from fog_contracts.geometry import distance_to_polygon, sampled
 from fog_runtime.configuration.site import load_site
 from fognav_experiments.commands.driving import show
-from fognav_experiments.comparison import computation, live_drive, runner
+from fognav_experiments.comparison import computation, live_drive, runner, stills
 from fognav_experiments.comparison.break_even import Case
 from fognav_experiments.comparison.drives import ComparedDrive, ExperimentSpec, MeasuredDrive, RouteSpec, draw
 from fognav_experiments.comparison.floor_draws import ROUTE_M, FloorDrawError, FloorDraws
@@ -350,6 +352,25 @@ def test_a_film_finds_in_the_records_what_happened_and_when(short_run):
     assert [record.setup for record in folder.read_drives(RUN, "westeast", ["fog", "default"])] == ["fog", "default"]
     with pytest.raises(FolderError, match=f"no drive {RUN + 1:04}-westeast-fog: run"):
         folder.read_drives(RUN + 1, "westeast", ["fog"])
+
+
+@pytest.mark.drive
+def test_stills_show_the_planned_way_through_the_obstacle_and_round_it(tmp_path, monkeypatch):
+    ways = {}
+    monkeypatch.setattr(stills, "_draw", lambda _axes, run, setup, _drawn: ways.update({setup: run}))
+    site, (drawn,) = ring.ring_site(), draw(SPEC, 1, RUN)
+    stills.write_stills(site, drawn, ["lean", "full"], 2.0, tmp_path / "stills.png")
+    area = next(area.polygon for area in site.site.areas if area.id == drawn.area)
+    through = {
+        setup: any(distance_to_polygon(area, x, y) <= 0.0 for x, y in sampled(run.robot.agent.way(100.0), 0.1))
+        for setup, run in ways.items()
+    }
+    assert through == {"lean": True, "full": False}
+    monkeypatch.undo()
+    stills.write_stills(site, drawn, ["full"], 5.0, tmp_path / "stills.png")
+    shown = Image.open(tmp_path / "stills.png").convert("RGB")
+    assert shown.width > shown.height > 100
+    assert {(208, 40, 40)} < {colour for _, colour in shown.getcolors(shown.width * shown.height)}, "no obstacle"
 
 
 # --- which drives are compared ---

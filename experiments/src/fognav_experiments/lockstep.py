@@ -157,6 +157,7 @@ class LockstepDrive:
         self.received_before = 0
         self.operator = OperatorPolicy(self.now)
         self.drive: Drive | None = None
+        self.problem: str | None = None
         self._steps = 0
         self._mode = ""
         self._crossed = 0
@@ -367,6 +368,36 @@ def run_lockstep(  # noqa: PLR0913  # the options of a run
     Raises `BarrierError` for an unknown area, one that no barrier can close, or if no area qualifies, `ValueError` for
     a start inside an obstacle.
     """
+    run = ready(
+        site, start, goal, seed, hazard,
+        noise=noise, watched=watched, bus=bus, profile=profile, cpu=cpu, tuning=tuning,
+        mounted=mounted or default_robot(base, lidar),
+    )  # fmt: skip
+    drive = run.drive
+    assert drive is not None
+    if run.problem is not None:
+        return run.result(drive, DriveOutcome("stopped", run.problem))
+    while (outcome := drive.outcome(run.now)) is None:
+        run.step()
+    return run.result(drive, outcome)
+
+
+def ready(  # noqa: PLR0913  # as of `run_lockstep`
+    site: LoadedSite,
+    start: Pose,
+    goal: Place,
+    seed: int,
+    hazard: HazardRequest | None = None,
+    *,
+    noise: Noise | None = None,
+    watched: bool | Site = True,
+    bus: Bus | None = None,
+    profile: ProfileName = "fog",
+    cpu: CpuMeter | None = None,
+    tuning: Tuning | None = None,
+    mounted: RobotFile | None = None,
+) -> LockstepDrive:
+    """Return a drive that has just begun, as `run_lockstep` drives it; its `problem` says why it can't."""
     pose = msgspec.convert(
         {"x": goal.x, "y": goal.y, "theta": goal.theta if goal.theta is not None else 0.0}, type(start)
     )
@@ -374,21 +405,18 @@ def run_lockstep(  # noqa: PLR0913  # the options of a run
     schedule = HazardSchedule.of(site, seed, hazard) if hazard is not None else None
     run = LockstepDrive(
         site, start, mission, seed, noise,
-        watched=watched, hazard=schedule, bus=bus, mounted=mounted or default_robot(base, lidar),
+        watched=watched, hazard=schedule, bus=bus, mounted=mounted,
         measure=cpu.measure if cpu else unmeasured, tuning=tuning,
     )  # fmt: skip
-    problem = run.warm_up()
-    if problem is None and profile != "fog":
-        problem = run.switch(profile)
-    drive = run.start()
+    run.problem = run.warm_up()
+    if run.problem is None and profile != "fog":
+        run.problem = run.switch(profile)
+    run.start()
     if cpu is not None:
         cpu.seconds.clear()
-    if problem is not None:
-        return run.result(drive, DriveOutcome("stopped", problem))
-    run.system.fog.planner.set_goal(run.robot.id, mission, any_heading=goal.theta is None)
-    while (outcome := drive.outcome(run.now)) is None:
-        run.step()
-    return run.result(drive, outcome)
+    if run.problem is None:
+        run.system.fog.planner.set_goal(run.robot.id, mission, any_heading=goal.theta is None)
+    return run
 
 
 def release_drives() -> None:

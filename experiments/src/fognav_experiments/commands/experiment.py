@@ -271,8 +271,8 @@ def _print_played(name: str, played: Played) -> None:
 
 
 @experiment_app.command("film", epilog="Example: fognav experiment film drive.gif --from drives --run 2 --route ab")
-def film_command(
-    out: Annotated[Path, typer.Argument(metavar="FILE.gif", help="File of the film.")],
+def film_command(  # noqa: PLR0913  # each option is an argument
+    out: Annotated[Path, typer.Argument(metavar="FILE", help="The film, .gif; or stills of one moment, .png.")],
     *,
     source: Annotated[
         Path, typer.Option("--from", metavar="DIR|FILE", help="Folder of the records, or their archive.")
@@ -280,28 +280,35 @@ def film_command(
     run: Annotated[int, typer.Option("--run", metavar="N", min=1, help="Run of the experiment.")] = 2,
     route: Annotated[str | None, typer.Option("--route", metavar="R", help="Its route, as ab; default: first.")] = None,
     setups: Annotated[str, typer.Option("--setups", metavar="A,B", help="default, lean, full, fog.")] = "default,fog",
+    at: Annotated[float, typer.Option("--at", metavar="S", min=0.0, help="Of stills: s after the start.")] = 10.0,
     site: Annotated[Path | None, typer.Option("--site", metavar="DIR", help="Site with experiment.toml.")] = None,
 ) -> None:
     """Film one route of an experiment in several setups, side by side: map, hazards, paths and tracks, as a GIF.
 
-    The drives are those of the records that `fognav experiment --out DIR` wrote; nothing is driven again.
+    The drives are those of the records that `fognav experiment --out DIR` wrote; nothing is driven again. For stills
+    they are driven anew until that moment: they show the costs, path and local window that each robot drives by.
     """
     from fog_runtime.configuration.site import SiteError, load_site  # noqa: PLC0415  # keeps the other commands fast
     from fognav_experiments.comparison import runner  # noqa: PLC0415  # same
     from fognav_experiments.comparison.film import Film, UnfilmedDriveError  # noqa: PLC0415  # same
     from fognav_experiments.comparison.records import FolderError  # noqa: PLC0415  # same
+    from fognav_experiments.comparison.stills import NoStillError, write_stills  # noqa: PLC0415  # same
 
     with exit_codes():
-        if out.suffix != ".gif":
-            raise WrongUseError(f"{out} is no GIF: name a file that ends in .gif")
+        if out.suffix not in (".gif", ".png"):
+            raise WrongUseError(f"{out} is neither GIF nor PNG: name a file that ends in .gif or .png")
         place = checkout.site_folder(site)
         try:
             loaded = load_site(place)
             with _records_of(source) as folder:
                 drawn = runner.recorded_draw(folder, loaded, place, run, route)
+                if out.suffix == ".png":
+                    prepare()
+                    write_stills(loaded, drawn, _chosen(setups), at, out)
+                    return
                 records = folder.read_drives(run, drawn.route.name, _chosen(setups))
             size = Film(loaded, drawn, records).write(out)
-        except (SiteError, runner.SpecError, FolderError, UnfilmedDriveError) as error:
+        except (SiteError, runner.SpecError, FolderError, UnfilmedDriveError, NoStillError) as error:
             raise WrongUseError(str(error)) from error
         except OSError as error:
             raise WrongUseError(f"{out} can't be written: {error.strerror}. Name another file") from error

@@ -64,8 +64,8 @@ REPORTED: Final = (
 )
 
 PLACES: Final = (
-    ("6.1", "default: the path leads into the blocked zone", "tracks.svg, orange: the median drive, from above"),
-    ("6.2", "full: the path avoids it", "tracks.svg, blue (full) and green (fog)"),
+    ("6.1", "default: the path leads into the blocked zone", "`fognav experiment film FILE.png`; tracks.svg, orange"),
+    ("6.2", "full: the path avoids it", "the same with --setups default,full; tracks.svg, blue and green"),
     ("6.3", "distance per route, simulated", "distance.svg, and the table below it"),
     ("6.4", "time per route, simulated", "time.svg, and the table below it"),
     ("6.5", "CPU of move_base, simulated", "cpu-move-base.svg, and the table below it"),

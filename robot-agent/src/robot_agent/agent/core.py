@@ -46,6 +46,9 @@ from robot_agent.profiles import fog_only
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
 
+    import numpy as np
+    from numpy.typing import NDArray
+
     from fog_contracts.handlers import Handler, Ids, Moment, Publication, QueryHandler
     from fog_contracts.messages import (
         CommandReply,
@@ -461,6 +464,10 @@ class AgentCore:
     def replica(self) -> Replica:
         """The costmap that the robot drives by: the replica of the fog's, or its own."""
         return self._navigation.replica
+
+    def way(self, limit: float) -> NDArray[np.float64]:
+        """Return the path ahead, (n, 2) m in frame `map`, `limit` m of it; no points without one."""
+        return self._driving.way(limit)
 
     @property
     def profile(self) -> Profile:

@@ -16,7 +16,7 @@ from fog_runtime.health import Health
 from fog_runtime.http import Operator, Routes, Viewer, add_session_routes, load_tokens, make_app
 from fog_runtime.http.http_process import PROOF
 from fog_runtime.http.sessions import ATTEMPT_S, ATTEMPTS, Attempts
-from fog_runtime.http.tokens import SESSION_S, Tokens
+from fog_runtime.http.tokens import PART, SESSION_S, Tokens
 from fog_runtime.keys import KeyFileError
 from fog_runtime.security.site_security import SiteSecurity
 from fog_runtime.token_file import TokenEntry, create_token, revoke_token, token_hash
@@ -49,6 +49,10 @@ class Site:
         @routes.get("/robots")
         async def read(caller: Viewer) -> str:
             return caller.name
+
+        @routes.get("/asker")
+        async def asker(caller: Viewer) -> str:
+            return caller.asker
 
         @routes.put("/zones/{zone}")
         async def write(zone: str, caller: Operator) -> str:
@@ -313,3 +317,11 @@ def test_unusable_key_of_sessions_is_named_with_its_remedy(tmp_path, text, says)
     (tmp_path / "session.key").write_text(text)
     with pytest.raises(KeyFileError, match=rf"session\.key is {says}.*openssl rand -hex 32"):
         load_tokens(None, tmp_path / "session.key")
+
+
+async def test_programs_that_share_a_token_are_told_apart_by_name_and_counted_together(site):
+    async with site.served() as browser:
+        token = {"Authorization": f"Bearer {site.operator}"}
+        for headers, name in ((token, "anna"), (token | {PART: "ros2"}, "anna/ros2")):
+            assert (await browser.get("/robots", headers=headers)).json() == name
+            assert (await browser.get("/asker", headers=headers)).json() == "anna"

@@ -109,7 +109,7 @@ def _add_events(routes: Routes, service: Service) -> None:
         proof = request.headers.get("authorization", "") or request.headers.get("cookie", "")
         session = hashlib.blake2b(proof.encode(), digest_size=8).hexdigest()
         return EventStream(
-            service.readers, caller.name, f"{client} {session}", last_event_id, scan,
+            service.readers, caller.asker, f"{client} {session}", last_event_id, scan,
             lambda: still_admits(request, "viewer"),
         )  # fmt: skip
 

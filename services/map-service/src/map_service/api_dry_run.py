@@ -139,7 +139,7 @@ def add_dry_runs(routes: Routes, service: Service, site: Site, clock: Clock) -> 
         """
         require_zones(service)
         _require_known(service, body)
-        with dry_runs.admitted(caller.name):
+        with dry_runs.admitted(caller.asker):
             change = await _change(service, body, caller.name, clock.stamp())
             try:
                 return await dry_runs.outcome(change, targets_of(service.core.places, site))

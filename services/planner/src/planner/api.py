@@ -381,7 +381,7 @@ def _add_plan(routes: Routes, service: Service, robots: _Robots, places: KnownPl
         """Return the path that a robot would get to a goal from where it stands, and do nothing; or the refusal."""
         robots.check(robot)
         pose, _ = goal_pose(body, places())
-        outcome = await service.dry_runs.goal(robot, pose.x, pose.y, f"person {caller.name}")
+        outcome = await service.dry_runs.goal(robot, pose.x, pose.y, f"person {caller.asker}")
         if outcome is None:
             detail = f"it is not known where robot {robot} is: switch it on and localize it, then try again"
             raise ProblemError(PlannerProblem.NO_POSE, detail)

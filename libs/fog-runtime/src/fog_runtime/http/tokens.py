@@ -53,6 +53,13 @@ class Caller(msgspec.Struct, frozen=True):
     role: Role
     until: float | None = None
     session: str = ""
+    token: str = ""
+    """Name of the token, where `name` tells apart the programs that share it."""
+
+    @property
+    def asker(self) -> str:
+        """Whose requests are counted together where each caller may have so many at a time."""
+        return self.token or self.name
 
 
 class _Session(msgspec.Struct, frozen=True, array_like=True):
@@ -242,7 +249,8 @@ def _part_of(caller: Caller, part: str) -> Caller:
     if _PART.fullmatch(part) is None:
         detail = f"the header {PART} has up to 32 small letters, digits and -, or is left out"
         raise ProblemError(HttpProblem.REQUEST_INVALID, detail, field=f"header.{PART}")
-    return msgspec.structs.replace(caller, name=f"{caller.name[: _NAME_MAX - len(part) - 1]}/{part}")
+    name = f"{caller.name[: _NAME_MAX - len(part) - 1]}/{part}"
+    return msgspec.structs.replace(caller, name=name, token=caller.name)
 
 
 def still_admits(request: Request, role: Role) -> bool:

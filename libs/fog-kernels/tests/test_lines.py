@@ -11,7 +11,7 @@ from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 
 from fog_contracts.geometry import lengths_along, sampled
-from fog_kernels.lines import first_inside, leaves, nearest_between, nearest_on
+from fog_kernels.lines import first_inside, first_near, leaves, mark_near, nearest_between, nearest_on
 
 coordinates = st.floats(-20.0, 20.0, width=32)
 lines = st.lists(st.tuples(coordinates, coordinates), min_size=1, max_size=6).map(
@@ -159,3 +159,18 @@ def test_wrong_lines_and_segments_are_refused():
         nearest_on(points[:1], along, 0, 0, 0.0, 0.0)
     with pytest.raises(TypeError, match="float64"):
         nearest_on(points.astype(np.float32), along, 0, 1, 0.0, 0.0)
+
+
+@settings(max_examples=examples(60), deadline=None)
+@given(lines, lines, st.floats(0.1, 10.0))
+def test_all_points_of_a_line_near_another_one_are_marked_and_the_first_is_found(line, other, reach):
+    line, other = sampled(line, 0.1), sampled(other, 0.1)
+    apart = np.hypot(*(line[:, None, :] - other[None, :, :]).transpose(2, 0, 1)).min(axis=1)
+    assume(np.abs(apart - reach).min() > 1e-6)
+    marked = np.zeros(len(line), np.bool_)
+    mark_near(line, 0, len(line), other, reach, 0.1, marked)
+    assert marked.tolist() == (apart <= reach).tolist()
+    near = np.flatnonzero(marked)
+    assert first_near(line, 0, len(line), other, reach, 0.1) == (near[0] if len(near) else -1)
+    with pytest.raises(ValueError, match="not among"):
+        mark_near(line, 0, len(line) + 1, other, reach, 0.1, marked)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 
 import numpy as np
@@ -16,8 +17,9 @@ from fog_contracts.geometry import lengths_along
 from fog_contracts.handlers import Moment
 from fog_contracts.messages import RobotRelease
 from planner.core import PlannerCore
-from planner.leases.corridor_leases import FORGET_S, PATIENCE_S, WITHDRAWN_S, CorridorLeases
+from planner.leases.corridor_leases import FORGET_S, MOST_ROBOTS, PATIENCE_S, SILENT_S, WITHDRAWN_S, CorridorLeases
 from planner.leases.corridors import DEFAULT_RADIUS_M, MARGIN_M
+from planner.leases.standstills import Standstills
 
 CLEAR_M = 2.0 * DEFAULT_RADIUS_M + MARGIN_M
 WAY_M = 15.0
@@ -30,8 +32,8 @@ def line(*corners: tuple[float, float]) -> np.ndarray:
 class Floor:
     """Robots that drive exactly what is released, in any order and at any speed."""
 
-    def __init__(self) -> None:
-        self.leases, self.now, self.plans = CorridorLeases(), 100.0, 0
+    def __init__(self, most_robots: int = MOST_ROBOTS) -> None:
+        self.leases, self.now, self.plans = CorridorLeases(most_robots), 100.0, 0
         self.paths: dict[str, np.ndarray] = {}
         self.lengths: dict[str, np.ndarray] = {}
         self.ids: dict[str, tuple[int, int]] = {}
@@ -218,7 +220,7 @@ places = st.tuples(st.integers(0, 12), st.integers(0, 12)).map(lambda cell: (1.0
 class Interleavings(RuleBasedStateMachine):
     """Robots ask, drive and change their paths in any order."""
 
-    @initialize(starts=st.lists(places, min_size=2, max_size=5, unique=True), data=st.data())
+    @initialize(starts=st.lists(places, min_size=2, max_size=14, unique=True), data=st.data())
     def begin(self, starts: list[tuple[float, float]], data: st.DataObject) -> None:
         self.floor = Floor()
         for number, start in enumerate(starts):
@@ -255,9 +257,88 @@ class Interleavings(RuleBasedStateMachine):
             # Who got too near by nobody's lease, at the start, gets no nearer.
             assert apart >= min(CLEAR_M, self.apart[pair]) - 0.02, (pair, apart)
 
+    @invariant()
+    def only_what_has_changed_needs_to_be_compared_again(self) -> None:
+        standstills = self.floor.leases.standstills
+        assert standstills.order({}) == Standstills(standstills._robots).order({})
 
-Interleavings.TestCase.settings = settings(max_examples=25, stateful_step_count=30, deadline=None)
+
+Interleavings.TestCase.settings = settings(max_examples=12, stateful_step_count=25, deadline=None)
 TestInterleavings = Interleavings.TestCase
+
+
+class Crowds(RuleBasedStateMachine):
+    """Robots are sometimes too many for leases; whoever has asked since they are few enough is kept apart."""
+
+    @initialize(starts=st.lists(places, min_size=3, max_size=6, unique=True), data=st.data())
+    def begin(self, starts: list[tuple[float, float]], data: st.DataObject) -> None:
+        self.floor, self.asked, self.apart = Floor(most_robots=2), set(), {}
+        for number, start in enumerate(starts):
+            self.floor.put(f"r{number}", start, *data.draw(st.lists(places, min_size=1, max_size=3)))
+        self.robots = sorted(self.floor.paths)
+
+    def _here(self, robot: str) -> tuple[float, float]:
+        return self.floor.at(robot, self.floor.along[robot])
+
+    @rule(number=st.integers(0, 5))
+    def ask(self, number: int) -> None:
+        self._ask(self.robots[number % len(self.robots)])
+
+    def _ask(self, robot: str) -> None:
+        if self.floor.leases._robots[robot].path is None:
+            return
+        self.floor.ask(robot)
+        if self.floor.leases._shared:
+            self.asked.add(robot)
+            for other in self.asked - {robot}:
+                bodies = math.dist(self._here(robot), self._here(other))
+                self.apart[robot, other] = self.apart[other, robot] = bodies
+        else:
+            self.asked.clear()
+
+    @rule()
+    def ask_all(self) -> None:
+        for robot in self.robots:
+            self._ask(robot)
+
+    @rule(number=st.integers(0, 5), metres=st.floats(0.5, 3.0))
+    def drive(self, number: int, metres: float) -> None:
+        self.floor.now += 0.1
+        self.floor.drive(self.robots[number % len(self.robots)], metres)
+
+    @rule(number=st.integers(0, 5))
+    def end(self, number: int) -> None:
+        """A mission ends; its robot stops, and says so."""
+        robot = self.robots[number % len(self.robots)]
+        self.floor.leases.stop(robot)
+        self.floor.released[robot] = 0.0
+        self.floor.now += SILENT_S + 0.1
+        self.floor.leases.on_state(robot, None, self.floor.now, able=True, strays=False)
+
+    @rule(number=st.integers(0, 5), corners=st.lists(places, min_size=1, max_size=3))
+    def send(self, number: int, corners: list[tuple[float, float]]) -> None:
+        robot = self.robots[number % len(self.robots)]
+        self.floor.put(robot, self._here(robot), *corners)
+        if not self.floor.leases._shared:
+            self.asked.clear()
+
+    @rule()
+    def wait(self) -> None:
+        self.floor.now += WITHDRAWN_S + 0.1
+        for robot in self.robots:
+            self.floor.leases.place(robot, *self._here(robot), self.floor.now)
+            self.floor.leases.on_state(robot, self.floor.ids[robot], self.floor.now, able=True, strays=False)
+
+    @invariant()
+    def what_is_released_does_not_overlap(self) -> None:
+        if self.floor.leases._shared:
+            for one, other in itertools.combinations(sorted(self.asked), 2):
+                apart = self.floor.apart(one, other)
+                assert apart >= min(CLEAR_M, self.apart[one, other]) - 0.02, (one, other, apart)
+
+
+Crowds.TestCase.settings = settings(max_examples=25, stateful_step_count=40, deadline=None)
+TestCrowds = Crowds.TestCase
 
 
 @settings(max_examples=40, deadline=None)

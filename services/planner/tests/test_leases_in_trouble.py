@@ -125,7 +125,7 @@ def test_a_robot_that_is_carried_away_is_in_nobodys_way_any_more():
     assert not floor.leases.standstills.stuck()
 
 
-def test_eleven_robots_with_a_path_get_what_a_robot_alone_gets_but_parked_ones_do_not_count():
+def test_robots_beyond_the_most_with_a_path_get_what_a_robot_alone_gets_but_parked_ones_do_not_count():
     floor = Floor()
     for number in range(MOST_ROBOTS):
         floor.put(f"r{number}", (0.0, 3.0 * number), (10.0, 3.0 * number))
@@ -136,16 +136,32 @@ def test_eleven_robots_with_a_path_get_what_a_robot_alone_gets_but_parked_ones_d
     assert floor.leases.release("r0", 10.0, floor.now) == math.inf
 
 
+def test_leases_that_overlap_since_robots_were_too_many_are_withdrawn_as_soon_as_they_are_few_enough():
+    floor = Floor(most_robots=2)
+    floor.put("r1", (0.0, 0.0), (20.0, 0.0))
+    floor.put("r2", (20.0, 0.0), (7.0, 0.0), (7.0, 5.0))
+    floor.put("r3", (0.0, 9.0), (20.0, 9.0))
+    assert floor.ask("r1") == floor.ask("r2") == 15.0
+    floor.drive("r1", 4.0)
+    floor.leases.stop("r3")
+    assert (floor.ask("r1"), floor.ask("r2")) == (4.0, 0.0), "both are told to stay where they are"
+    wait(floor, WITHDRAWN_S - 1.0, "r1", "r2", able=("r1", "r2"))
+    assert (floor.released["r1"], floor.released["r2"]) == (4.0, 0.0)
+    wait(floor, 2.0, "r1", "r2", able=("r1", "r2"))
+    assert floor.released["r2"] == 15.0, "once both have heard, one of them drives on"
+    assert floor.apart("r1", "r2") > CLEAR_M - 0.02
+
+
 def test_robots_that_met_while_they_were_too_many_for_leases_are_found_afterwards():
-    floor = Floor()
+    floor = Floor(most_robots=10)
     floor.put("r1", (0.0, 0.0), (20.0, 0.0))
     floor.put("r2", (20.0, 0.0), (0.0, 0.0))
-    for number in range(MOST_ROBOTS - 1):
+    for number in range(9):
         floor.put(f"x{number}", (0.0, 5.0 + 3.0 * number), (10.0, 5.0 + 3.0 * number))
     assert floor.ask("r1") == floor.ask("r2") == 15.0
     floor.drive("r1", 9.0)
     floor.drive("r2", 9.0)
-    for number in range(MOST_ROBOTS - 1):
+    for number in range(9):
         floor.leases.stop(f"x{number}")
     wait(floor, WITHDRAWN_S + 2.0, "r1", "r2", able=("r1", "r2"))
     assert floor.leases.standstills.stuck() == {"r1": {"r2"}, "r2": {"r1"}}

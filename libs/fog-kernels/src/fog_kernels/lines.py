@@ -404,6 +404,31 @@ def _first_near(line: Any, first: int, last: int, other: Any, reach: float, spac
     return -1
 
 
+@njit(
+    void(_arrays.F64_GRID, int64, int64, _arrays.F64_GRID, float64, float64, boolean[::1]),
+    cache=True,
+    nogil=True,
+    error_model="numpy",
+)
+def _mark_near(line: Any, first: int, last: int, other: Any, reach: float, spacing: float, marked: Any) -> None:
+    """Mark all points `first` to `last` (exclusive) of a line within `reach` of a point of another one."""
+    i = first
+    while i < last:
+        spare = math.inf
+        j = 0
+        near = marked[i]
+        while not near and j < other.shape[0]:
+            dx = line[i, 0] - other[j, 0]
+            dy = line[i, 1] - other[j, 1]
+            beyond = math.sqrt(dx * dx + dy * dy) - reach
+            near = beyond <= 0.0
+            # What is skipped is farther off than half of it.
+            spare = min(spare, 0.5 * beyond)
+            j += max(1, int(0.5 * beyond / spacing))
+        marked[i] = near
+        i += 1 if near else max(1, int(min(spare, 1e9) / spacing))
+
+
 def _cells_array(cells: NDArray[np.int32]) -> NDArray[np.int32]:
     _arrays.exact(cells, np.int32, 2, "cells")
     if cells.shape[0] == 0 or cells.shape[1] != 2:
@@ -538,6 +563,25 @@ def first_near(
     if not 0 <= first <= last <= len(line):
         raise ValueError(f"points {first} to {last} are not among the {len(line)} of the line")
     return int(_first_near(line, first, last, other, reach, spacing))
+
+
+def mark_near(
+    line: NDArray[np.float64],
+    first: int,
+    last: int,
+    other: NDArray[np.float64],
+    reach: float,
+    spacing: float,
+    marked: NDArray[np.bool_],
+) -> None:
+    """Mark all points `first` to `last` (exclusive) of a line that are within `reach` of another's points.
+
+    As `first_near`; `marked` (len(line),) keeps the marks that it has. Raises ValueError for points that the line does
+    not have, or marks of another length.
+    """
+    if not 0 <= first <= last <= len(line) == len(marked):
+        raise ValueError(f"points {first} to {last} are not among the {len(line)} of the line, or {len(marked)} marks")
+    _mark_near(line, first, last, other, reach, spacing, marked)
 
 
 def nearest_between(

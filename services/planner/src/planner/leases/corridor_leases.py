@@ -13,12 +13,14 @@ Times are s of a monotonic clock, lengths m, points in the frame `map`.
 
 from __future__ import annotations
 
+import itertools
 import math
 from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
 from fog_contracts.geometry import lengths_along, sampled
+from fog_kernels.lines import first_near
 from planner.leases.corridors import (
     DEFAULT_RADIUS_M,
     SPACING_M,
@@ -32,6 +34,7 @@ from planner.leases.corridors import (
     contender_of,
     meets,
     reach_of,
+    stop_before,
 )
 from planner.leases.standstills import Standstills
 
@@ -53,12 +56,14 @@ FORGET_S: Final = 60.0
 """A robot that is silent for so long is an obstacle that others see, no longer one that stands in the way unseen."""
 SILENT_S: Final = 3.0
 """After so long without a pose a robot gets nothing, and has stopped. So long a path may be on its way to it."""
-MOST_ROBOTS: Final = 10
-"""More robots with a path get what a robot alone gets: what they lease takes longer than their paths may."""
+MOST_ROBOTS: Final = 50
+"""More robots with a path get what a robot alone gets: to lease it takes too long."""
 MEETING_M: Final = 1.0
 """A robot on whose path another one is so near has not met it yet."""
 _SPEED_M_S: Final = 0.3
 _MOVED_M: Final = 0.1
+_LIKE_M: Final = 0.02
+"""Leases so much nearer than they may be do not overlap: they end at points of a path."""
 _BODIES: Final = 0.9
 """Nearer than this share of their radii's sum two bodies touch, whatever their poses' errors."""
 
@@ -66,7 +71,8 @@ _BODIES: Final = 0.9
 class CorridorLeases:
     """Who may drive how far. A robot alone on its floor gets whatever is wanted for it."""
 
-    def __init__(self) -> None:
+    def __init__(self, most_robots: int = MOST_ROBOTS) -> None:
+        self._most, self._crowded = most_robots, False
         self._robots: dict[str, Corridor] = {}
         self._arrivals = 0
         self._now = -math.inf
@@ -83,13 +89,15 @@ class CorridorLeases:
         if math.dist(me.moved_from, (x, y)) >= _MOVED_M or math.isinf(me.moved_at):
             me.moved_from, me.moved_at = (x, y), now
             if not me.drives:
-                self.standstills.changed()  # it was carried, or drives by itself
+                self.standstills.changed(robot)  # it was carried, or drives by itself
+        self.standstills.moved(robot)
 
     def advance(self, robot: str, progress: float) -> None:
         """Note how far along its path (m) a robot is: what lies behind is free again."""
         me = self._of(robot)
         me.progress = max(me.progress, progress)
         me.leased = max(me.leased, me.first)
+        self.standstills.moved(robot)
 
     def follow(self, robot: str, path: PathId, corners: Floats, mission: str, priority: int = 0) -> None:
         """Give a robot another path ((n, 2), m), of which nothing is leased yet; the same one again changes nothing.
@@ -109,14 +117,14 @@ class CorridorLeases:
         me.along = lengths_along(me.points)
         me.low, me.high = box(me.points)
         me.leased = me.first
-        self.standstills.changed()
+        self.standstills.changed(robot)
 
     def stop(self, robot: str) -> None:
         """Take a robot's path away: it has none, or must not drive on."""
         me = self._robots.get(robot)
         if me is not None and me.path is not None:
             self._leave(me)
-            self.standstills.changed()
+            self.standstills.changed(robot)
 
     def on_state(self, robot: str, received: PathId | None, now: float, *, able: bool, strays: bool) -> None:
         """Note which path a robot has, whether it may drive, and whether it drives by none of this planner's.
@@ -136,19 +144,23 @@ class CorridorLeases:
         if revived:
             me.standing = False
         if revived or me.stray != stray or len(me.former) != before:
-            self.standstills.changed()
+            self.standstills.changed(robot)
 
     def forget(self) -> None:
         """Forget all paths and leases: another planner leads."""
-        self._robots.clear()
-        self.standstills.changed()
+        for robot in [*self._robots]:
+            self._drop(robot)
 
     def _of(self, robot: str) -> Corridor:
         me = self._robots.get(robot)
         if me is None:
             me = self._robots[robot] = Corridor(robot, (0, 0))
-            self.standstills.changed()
+            self.standstills.changed(robot)
         return me
+
+    def _drop(self, robot: str) -> None:
+        del self._robots[robot]
+        self.standstills.changed(robot)
 
     def _leave(self, me: Corridor) -> None:
         if me.path is not None:
@@ -169,6 +181,9 @@ class CorridorLeases:
         me, self._now = self._of(robot), now
         me.wanted = wanted
         self._settle(now)
+        crowded, self._crowded = self._crowded, self._driving > self._most
+        if crowded and not self._crowded:
+            self._withdraw_overlaps(now)
         if me.path is None or not self._shared:
             me.end, me.leased = wanted, max(me.first, min(int(me.along.searchsorted(wanted)), len(me.points) - 1))
             me.waits_for = me.lets_pass = None
@@ -178,14 +193,29 @@ class CorridorLeases:
         for other in sorted(self._robots.values(), key=lambda other: other.order):
             before = other.waits_for is not None and other.order < me.order
             if before and now - other.heard_at <= SILENT_S and not other.far_from(me, reach_of(me, other)):
-                self._extend(other, now)
+                self._retry(other, now)
         self._extend(me, now)
         return me.end if math.isinf(me.withdrawn_at) else min(me.end, me.progress)
 
     @property
     def _shared(self) -> bool:
         """Whether robots share a floor by leases."""
-        return len(self._robots) > 1 and sum(me.path is not None for me in self._robots.values()) <= MOST_ROBOTS
+        return len(self._robots) > 1 and self._driving <= self._most
+
+    @property
+    def _driving(self) -> int:
+        return sum(me.path is not None for me in self._robots.values())
+
+    def _withdraw_overlaps(self, now: float) -> None:
+        """Ask for the leases back that overlap: they are of a time when robots were too many for leases."""
+        for me, other in itertools.combinations([me for me in self._robots.values() if me.path is not None], 2):
+            reach = reach_of(me, other) - _LIKE_M
+            lines = [] if me.far_from(other, reach) and not me.former else [*other.held()]
+            near = (first_near(one, 0, len(one), line, reach, SPACING_M) for one in me.held() for line in lines)
+            if any(point >= 0 for point in near):
+                # Both: until the one has heard, it may drive on the other one's stretch.
+                for robot in (me, other):
+                    robot.withdrawn_at = min(robot.withdrawn_at, now)
 
     def _somebody_on(self, me: Corridor) -> bool:
         """Whether another body is on a robot's leased stretch: it was put there, or both had got too much."""
@@ -214,6 +244,7 @@ class CorridorLeases:
     def _extend(self, me: Corridor, now: float) -> None:
         last = min(int(me.along.searchsorted(me.wanted)), len(me.points) - 1)
         me.waits_for = me.lets_pass = None
+        self.standstills.moved(me.id)
         if not me.drives or me.wanted <= me.end:
             return
         if last <= me.leased:
@@ -229,11 +260,19 @@ class CorridorLeases:
         waits = contender or blocker
         if end > me.leased:
             me.leased, me.end = end, min(me.wanted, float(me.along[end]))
-            self.standstills.changed()
+            self.standstills.changed(me.id)
         if waits is not None:
             me.waits_for = waits.id
             me.lets_pass, me.parks = None if contender is None else contender.id, limit == len(me.points)
             self._press(waits, now)
+
+    def _retry(self, me: Corridor, now: float) -> None:
+        """Lease what a robot waits for, unless the one that it waits for was in the same place just now."""
+        other = self._robots.get(me.waits_for or "")
+        there = None if other is None else (now, other.id, other.path, other.first, other.leased, other.standing)
+        if there is None or there != me.tried:
+            self._extend(me, now)
+            me.tried = there
 
     def _stop(self, me: Corridor, end: int, others: list[Corridor]) -> tuple[int, Corridor | None]:
         """Return the last point up to `end` where a robot may stop, and who has to pass before it gets further."""
@@ -243,10 +282,8 @@ class CorridorLeases:
         before = self.standstills.stuck()
         if me.id not in before and self.standstills.order({me.id: end}).keys() <= before.keys():
             return end, None
-        for stop in range(end - 1, me.leased, -1):
-            if contender_of(me, stop, [contender]) is None and contender_of(me, stop, others) is None:
-                return stop, contender
-        return me.leased, contender
+        near = (other for other in others if other.drives and not me.far_from(other, reach_of(me, other)))
+        return stop_before(me, me.leased, end, [(other, other.first) for other in near]), contender
 
     # --- Robots that stand or are silent ------------------------------------------------------------------------------
 
@@ -271,10 +308,9 @@ class CorridorLeases:
                 other.end = min(other.end, end)
                 other.leased = min(other.leased, max(other.first, int(other.along.searchsorted(other.end))))
                 other.withdrawn_at, other.standing = math.inf, True
-                self.standstills.changed()
+                self.standstills.changed(other.id)
             if now - other.heard_at > FORGET_S:
-                del self._robots[other.id]
-                self.standstills.changed()
+                self._drop(other.id)
 
     # --- Robots that make room ----------------------------------------------------------------------------------------
 

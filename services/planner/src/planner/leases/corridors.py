@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Final, NamedTuple
 
 import numpy as np
 
-from fog_kernels.lines import first_near
+from fog_kernels.lines import first_near, mark_near
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator, Mapping
@@ -85,6 +85,8 @@ class Corridor:
     """Whether it counts as an obstacle: it gets no lease, and others find their way round it."""
     wanted: float = 0.0
     waits_for: str | None = None
+    tried: object = None
+    """What it waited for when it was tried to lease more to it, besides at its own request."""
     lets_pass: str | None = None
     """Who has to pass before it may drive on ..."""
     parks: bool = False
@@ -109,8 +111,12 @@ class Corridor:
 
     def stand(self) -> list[Floats]:
         """Return where it stands once it has driven all that is leased to it."""
-        waits = not self.drives or self.end - self.progress <= WAITING_M
-        return list(self.held()) if waits else [self.place(self.leased)]
+        return list(self.held()) if self.waits else [self.place(self.leased)]
+
+    @property
+    def waits(self) -> bool:
+        """Whether it stays where it is."""
+        return not self.drives or self.end - self.progress <= WAITING_M
 
     def place(self, stop: int) -> Floats:
         """Return where it may stand when it stops at a point of its path: somewhat before it, too."""
@@ -134,10 +140,6 @@ class Corridor:
         apart_x = max(self.low[0] - max(other.high[0], x), min(other.low[0], x) - self.high[0])
         apart_y = max(self.low[1] - max(other.high[1], y), min(other.low[1], y) - self.high[1])
         return not other.former and max(apart_x, apart_y) > reach
-
-    def far_from_lines(self, lines: Iterable[Floats], reach: float) -> bool:
-        """Whether its path comes nowhere near lines, each sampled at `SPACING_M`."""
-        return all(self.far_from_point(line[0], reach + SPACING_M * len(line)) for line in lines)
 
     def far_from_point(self, point: Floats, reach: float) -> bool:
         """Whether its path comes nowhere near a point."""
@@ -218,6 +220,22 @@ def contender_of(
             if first_near(place, 0, len(place), other.points[first : other.last], reach, SPACING_M) >= 0:
                 return other
     return None
+
+
+def stop_before(me: Corridor, begin: int, end: int, others: Iterable[tuple[Corridor, int]]) -> int:
+    """Return the last point between two where a robot is in no other one's way; else `begin`.
+
+    `others`: each with the point of its path from which on it drives. A robot may stop somewhat before the point, too.
+    """
+    first, count = max(0, begin + 1 - SHORT), end - begin - 1
+    if count <= 0:
+        return begin
+    marked = np.zeros(len(me.points), np.bool_)
+    for other, start in others:
+        mark_near(me.points, first, end, other.points[start : other.last], reach_of(me, other), SPACING_M, marked)
+    taken = np.concatenate((np.zeros(SHORT, np.bool_), marked[:end]))[-count - SHORT :]
+    free = np.flatnonzero(~(taken[SHORT:] | taken[1:-1] | taken[:-SHORT]))
+    return begin + 1 + int(free[-1]) if len(free) else begin
 
 
 def comes_near(me: Corridor, line: Floats, reach: float, end: int | None = None) -> bool:

@@ -6,36 +6,33 @@ import math
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final, Literal
 
+import numpy as np
+
 from fog_contracts.geometry import lengths_along, sampled
-from fog_kernels.lines import first_near
 from planner.leases.corridors import (
-    NOWHERE,
     SPACING_M,
     WAITING_M,
     Corridor,
     Disc,
     between,
     box,
-    contender_of,
     disc,
-    meets,
     reach_of,
 )
+from planner.leases.pairs import Pairs
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping
 
-    import numpy as np
     from numpy.typing import NDArray
 
     Floats = NDArray[np.float64]
+    Bools = NDArray[np.bool_]
 
 ASIDE_M: Final = 0.25
 """So much farther off the way of others a robot stands aside: it stops somewhat before the end of its path."""
 RETRY_S: Final = 2.0
 """After so long room that was not found is looked for again."""
-_STEP: Final = 5
-"""Of so many points of a path one is looked at as a place to stop."""
 
 
 Kind = Literal["past", "lane", "round", "aside", "detour"]
@@ -63,10 +60,17 @@ class Standstills:
         self._robots = robots
         self._stuck: dict[str, frozenset[str]] | None = None
         self._tried: dict[tuple[str, Kind], float] = {}
+        self._pairs = Pairs()
+        self._touched: set[str] = set()
 
-    def changed(self) -> None:
-        """Judge anew: a robot, a path or a lease has changed."""
+    def changed(self, robot: str) -> None:
+        """Judge anew: a robot, its path or its lease has changed."""
         self._stuck = None
+        self._touched.add(robot)
+
+    def moved(self, robot: str) -> None:
+        """Note that a robot has driven on, which by itself changes nothing."""
+        self._touched.add(robot)
 
     def stuck(self) -> Mapping[str, frozenset[str]]:
         """Return the robots that can't reach their goals one after the other, each with those who stand in its way."""
@@ -76,71 +80,38 @@ class Standstills:
 
     def order(self, ends: Mapping[str, int]) -> dict[str, frozenset[str]]:
         """Let robots reach their goals one after the other, from the ends of their leases, or from `ends`."""
-        robots = list(self._robots.values())
-        stands = {r.id: [r.place(ends[r.id])] if r.id in ends else r.stand() for r in robots}
-        begins = {r.id: ends.get(r.id, r.leased) for r in robots}
-        left = sorted((r for r in robots if r.drives), key=lambda r: r.order)
-
-        def blocks(me: Corridor, other: Corridor) -> bool:
-            if other is me or me.far_from_lines(stands[other.id], reach_of(me, other)):
-                return False
-            return meets(me, other, begins[me.id], me.last, stands[other.id]) < me.last
-
-        # Only what a robot that has moved blocks, or is blocked by, is looked at again.
-        blocked = {me.id: {other.id for other in robots if blocks(me, other)} for me in left}
-
-        def moved(other: Corridor) -> None:
-            for me in left:
-                (blocked[me.id].add if blocks(me, other) else blocked[me.id].discard)(other.id)
-
-        stepped: set[str] = set()
+        self._pairs.update(self._robots, self._touched)
+        self._touched.clear()
+        pairs = self._pairs.copy()
+        robots = pairs.robots
+        for number in [number for number, robot in enumerate(robots) if robot.id in ends]:
+            pairs.move(number, ends[robots[number].id])
+        left = sorted((n for n, robot in enumerate(robots) if robot.drives), key=lambda n: robots[n].order)
+        stepped: set[int] = set()
         while left:
-            ready = [me for me in left if not blocked[me.id]]
+            blocked: Bools = np.any(pairs.stands[left], axis=1)
+            ready = [n for n, waits in zip(left, blocked.tolist(), strict=True) if not waits]
             if not ready:
-                one = self._step_on(left, robots, begins, stands, stepped)
-                if one is None:
+                if not self._step_on(left, pairs, stepped):
                     break
-                blocked[one.id] = {other.id for other in robots if blocks(one, other)}
-                moved(one)
                 continue
             # Whose goal is in nobody's way goes first: that blocks no other one.
-            for me in [me for me in ready if not self._parks_in_the_way(me, left, begins)] or ready[:1]:
-                left.remove(me)
-                stands[me.id] = [me.place(len(me.points) - 1) if me.last == len(me.points) else NOWHERE]
-                moved(me)
-        return {me.id: frozenset(blocked[me.id]) for me in left}
+            in_the_way: Bools = np.any(pairs.passes[left], axis=0)
+            for n in [n for n in ready if not in_the_way[n]] or ready[:1]:
+                left.remove(n)
+                pairs.arrive(n)
+        return {robots[n].id: frozenset(robots[j].id for j in np.flatnonzero(pairs.stands[n])) for n in left}
 
-    def _step_on(
-        self,
-        left: list[Corridor],
-        robots: list[Corridor],
-        begins: dict[str, int],
-        stands: dict[str, list[Floats]],
-        stepped: set[str],
-    ) -> Corridor | None:
+    def _step_on(self, left: list[int], pairs: Pairs, stepped: set[int]) -> bool:
         """Let one of the robots that are left drive to a place on its way where it is in no other one's, if one can."""
-        for me in left:
-            if me.id in stepped:
-                continue
-            stepped.add(me.id)
-            end = me.last
-            for other in robots:
-                if other is not me and not me.far_from_lines(stands[other.id], reach_of(me, other)):
-                    end = meets(me, other, begins[me.id], end, stands[other.id])
-            for stop in range(end - 1, begins[me.id], -_STEP):
-                if contender_of(me, stop, left, begins) is None:
-                    begins[me.id], stands[me.id] = stop, [me.place(stop)]
-                    return me
-        return None
-
-    def _parks_in_the_way(self, me: Corridor, left: list[Corridor], begins: Mapping[str, int]) -> bool:
-        end = me.place(len(me.points) - 1)
-        return me.last == len(me.points) and any(
-            other is not me
-            and not other.far_from_point(end[0], reach_of(me, other))
-            and first_near(other.points, begins[other.id], other.last, end, reach_of(me, other), SPACING_M) >= 0
-            for other in left
-        )
+        for n in left:
+            if n not in stepped:
+                stepped.add(n)
+                stop = pairs.stop_before(n, pairs.limit(n), left)
+                if stop > pairs.begins[n]:
+                    pairs.move(n, stop)
+                    return True
+        return False
 
     def room_needed(self, now: float, obstacles: Callable[[str], list[Disc]]) -> Room | None:
         """Return which robot needs another path to end a standstill, the last in order first; None if none does."""
@@ -202,6 +173,8 @@ class Standstills:
         me.points = sampled(corners, SPACING_M)
         me.along, (me.low, me.high), me.progress = lengths_along(me.points), box(me.points), 0.0
         me.leased = me.first
+        self._touched.add(me.id)
         after = self.order({})
         me.points, me.along, me.low, me.high, me.progress, me.leased = kept
+        self._touched.add(me.id)
         return after.keys() <= before.keys() if room.kind == "past" else after.keys() < before.keys()

@@ -142,6 +142,20 @@ def test_kernel_that_is_kept_is_loaded_without_what_only_its_compilation_needs(p
 
 
 @compiled_only
+def test_kernel_that_calls_numbas_own_functions_is_loaded_without_linear_algebra_and_one_is_compiled_beside_it(
+    package: Path,
+) -> None:
+    (package / "called.py").write_text(
+        CALLED.format("np.arange(4).sum() - 5").replace("from numba import", "import numpy as np\nfrom numba import", 1)
+    )
+    loaded = "import sys\nprint('numba.np.arraymath' in sys.modules, 'scipy.linalg' in sys.modules)"
+    assert python(package, RUN + "\n" + loaded).stdout.split() == ["20", "2", "True", "True"]
+    assert python(package, RUN + "\n" + loaded).stdout.split() == ["20", "0", "False", "False"]
+    (package / "calling.py").write_text(CALLING.replace("TIMES *", "2 * TIMES *"))
+    assert run(package) == (40, 1)
+
+
+@compiled_only
 def test_kernel_is_compiled_beside_one_that_was_loaded(package: Path) -> None:
     assert run(package) == (20, 2)
     (package / "calling.py").write_text(CALLING.replace("TIMES *", "2 * TIMES *"))

@@ -110,6 +110,8 @@ TAKEOVERS: Final = Counter("fognav_takeovers_total", "How often this process beg
 HANDED_OVER: Final = Counter(
     "fognav_leases_handed_over_total", "How often this process gave its lease to a copy that was ready", ["reason"]
 )
+for _reason in ("late", "cut off"):  # `increase` sees the first time only of what was 0 before
+    HANDED_OVER.labels(_reason)
 LATENESS: Final = Gauge(
     "fognav_leader_lateness_seconds",
     "Median time in which the leader answers, as this standby hears it; NaN if unknown",

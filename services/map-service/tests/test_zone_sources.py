@@ -23,6 +23,7 @@ from fog_contracts.messages import CircleShape, Zone
 from fog_contracts.site import Site, ZoneSourceSite
 from fog_runtime.credentials import Credentials
 from fog_runtime.health import Health
+from fog_runtime.stores.redis_store import Audit
 from fog_supervisor.servers import start_redis
 from map_service.core import MapCore
 from map_service.registry import make_layers
@@ -269,6 +270,28 @@ async def test_zone_that_was_deleted_while_the_broker_is_away_does_not_come_back
             assert not await say(1.0, retained=True)
             assert await say(1.5, retained=True), "its source has changed it meanwhile"
             assert await say(1.0, retained=True), "as it was before, but newer"
+
+
+async def test_zone_that_cannot_be_stored_keeps_no_other_sources_zone_waiting(redis_url):
+    def say(source: str, zone: str) -> None:
+        wanted = json.dumps({**CIRCLE, "shape": {**CIRCLE["shape"], "centre": [1.0, 1.0]}}).encode()
+        sources.receive(ch.ZONE_REQUEST.key(site="test", source=source, zone=zone), wanted, retained=False)
+
+    async with leading_service(redis_url, Nobody()) as (service, store):
+        sources, zones = service.zone_sources, service.core.zones
+        stored = Zone(id="old", kind="BLOCKED", shape=CircleShape(centre=(1.0, 1.0), radius=0.3), author="ann")
+        await store.create(stored, Audit(1.0, "ann", "create"))  # by a process that this one has not heard of
+        say("one", "old")
+        say("two", "fire")
+        assert not await sources.carry_out_next(), "somebody has it"
+        assert await sources.carry_out_next()
+        assert zones.get("fire") is not None
+
+        service.zones.unusable.replace({"older": "no such kind"})
+        say("one", "older")
+        assert [await sources.carry_out_next() for _ in range(2)] == [False, True]
+        (problem,) = [view.problem for view in sources.views() if view.id == "one"]
+        assert "zone older is stored, but its record is invalid (no such kind): an operator must delete it" in problem
 
 
 async def try_steps(redis_url: str, steps: list[tuple[str, str, bytes, bool]]) -> None:

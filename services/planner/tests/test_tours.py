@@ -117,13 +117,13 @@ class Running:
         await self.missions.lead(-1, confirmed=True)
         return self
 
-    def reach(self) -> None:
+    def reach(self, robot: str = "r1") -> None:
         """The robot says that it has reached its goal."""
-        goal = self.core.missions.goal("r1")
+        goal = self.core.missions.goal(robot)
         if goal is not None:
-            self.core.missions.reach("r1", goal.goal_id)
-            for robot, goal_id in self.core.missions.pop_reached():
-                self.missions.end(robot, goal_id)
+            self.core.missions.reach(robot, goal.goal_id)
+            for each, goal_id in self.core.missions.pop_reached():
+                self.missions.end(each, goal_id)
 
     async def step(self) -> None:
         await self.missions._end_reached()
@@ -311,6 +311,47 @@ async def test_deadline_passes_by_the_monotonic_clock_and_after_a_restart_by_a_t
         clock.ahead -= 1e6
         known[0] = True
         assert [await at_after(running, 57.0), await at_after(running, 3.0)] == [5.0, None]
+
+
+@pytest.mark.live
+async def test_stop_that_is_reached_while_another_robots_is_being_stored_is_not_the_end_of_its_mission(redis):
+    async with Store(redis.url, "test") as store:
+        running = await Running(store, ManualClock(100.0)).start()
+        for robot, *stops in (("r1", 1.0, 2.0, 3.0), ("r2", 4.0, 5.0, 6.0)):
+            await running.missions.send(order(*stops)._replace(robot=robot))
+        put = store.put
+
+        async def reached_meanwhile(*arguments: Any, **options: Any) -> Any:
+            running.reach("r2")
+            return await put(*arguments, **options)
+
+        store.put = reached_meanwhile  # type: ignore[method-assign]  # the moment of the write
+        running.reach()
+        await running.step()
+        store.put = put  # type: ignore[method-assign]  # as before
+        await running.step()
+        kept = {robot: [stop.pose.x for stop in mission.tour.ahead] for robot, mission in (await store.goals()).items()}
+        assert kept == {"r1": [3.0], "r2": [6.0]}
+
+
+@pytest.mark.live
+async def test_robot_stays_out_of_service_while_the_time_of_day_may_be_wrong_and_comes_back_when_its_time_is_over(
+    redis,
+):
+    clock, known = SteppedClock(100.0), [False]
+    out = OutOfService(id="a", reason="wheel off", by="anna", since=clock.stamp(), until=clock.stamp() + 3600.0)
+    async with Store(redis.url, "test") as store:
+        running = await Running(store, clock).start()
+        await running.missions.take_out("r1", out, "anna")
+        clock.ahead += 7200.0
+        assert running.missions.out_of_service("r1") == out, "the clock was set, and no hour has passed"
+        running = await Running(store, clock, lambda: known[0]).start()
+        assert running.missions.out_of_service("r1") == out, "nobody knows the time after the restart"
+        clock.ahead -= 7200.0
+        known[0] = True
+        assert running.missions.out_of_service("r1") == out
+        clock.advance(3601.0)
+        assert running.missions.out_of_service("r1") is None
 
 
 @pytest.mark.live

@@ -242,8 +242,12 @@ class ZoneSources:
                 await self._remove(source.site, received)
         except (RefusedRequestError, ContractError, ZoneError) as error:
             self._refuse(source, topic, error.reason if isinstance(error, ContractError) else str(error))
-        except (StoreError, BusyError, ConflictError):
-            # Redis is away, or somebody has changed the same at this moment.
+        except (StoreError, BusyError):
+            return False  # Redis is away, for all of them
+        except ConflictError:
+            # Somebody has changed the same at this moment: the others need not wait for it.
+            if self._waiting.get(topic) is received:
+                self._waiting[topic] = self._waiting.pop(topic)
             return False
         else:
             self._tell(source, "")
@@ -270,6 +274,10 @@ class ZoneSources:
         if area > source.max_area:
             raise RefusedRequestError(
                 f"zone {zone.id} covers {area:.1f} m², and {source.max_area:g} is the limit: make it smaller"
+            )
+        if (why := self._zones.unusable.reasons.get(zone.id)) is not None:
+            raise RefusedRequestError(
+                f"zone {zone.id} is stored, but its record is invalid ({why}): an operator must delete it first"
             )
         who = _who(source.id)
         if old is not None:

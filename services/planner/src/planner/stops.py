@@ -10,8 +10,9 @@ from msgspec import Meta, structs
 from fog_contracts.messages import Id, Message, PlanRefusal, PointXY, Pose, Stamp, TimeToLive
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
+    from collections.abc import Callable, Container, Sequence
 
+    from fog_runtime.clock import Clock
     from fog_runtime.stores.redis_store import Attempt
 
 STOPS_MAX: Final = 20
@@ -204,3 +205,30 @@ def act_on_cut(tour: Tour, nearest: PointXY | None, cut_s: float, without_s: flo
         return "wait"
     elsewhere = tour.nearest is None or math.dist(tour.nearest, nearest) > _ELSEWHERE_M
     return "nearest" if elsewhere else "wait"
+
+
+class Ends:
+    """Tells when what has an end at a time of day has ended: by the monotonic clock, so that no jump ends it early.
+
+    Of what was there before this process nothing ends before the time of day is known to be right (`synchronized`).
+    """
+
+    def __init__(self, clock: Clock, synchronized: Callable[[], bool]) -> None:
+        self._clock, self._synchronized = clock, synchronized
+        self._ends: dict[str, float] = {}
+
+    def count(self, name: str, end: float) -> None:
+        """Count from now on to an end (s since the epoch) that was asked for by the same clock."""
+        self._ends[name] = self._clock.now() + end - self._clock.stamp()
+
+    def passed(self, name: str, end: float | None) -> bool:
+        """Whether the end (s since the epoch; None: there is none) has passed."""
+        if end is None:
+            return False
+        if name not in self._ends and self._synchronized():
+            self.count(name, end)
+        return self._clock.now() >= self._ends.get(name, math.inf)
+
+    def keep(self, names: Container[str]) -> None:
+        """Forget all others."""
+        self._ends = {name: end for name, end in self._ends.items() if name in names}

@@ -14,7 +14,7 @@ from fog_runtime import logs
 from fog_runtime.stores import records
 from fog_runtime.stores.redis_connection import StoreError, StoreLostError, StoreRefusedError
 from fog_runtime.stores.redis_store import ANY, Audit, Outcome, RecoveryError, Table
-from planner.stops import Tour
+from planner.stops import Ends, Tour
 from planner.waits.persistence import LearnedPersistence, LearnedStore
 
 if TYPE_CHECKING:
@@ -137,7 +137,9 @@ class MissionPersistence:
         clock: Clock,
         health: Health,
         change_core: Callable[[Callable[[], object]], None],
+        synchronized: Callable[[], bool] = lambda: True,
     ) -> None:
+        """Load nothing yet. `synchronized` tells whether the time of day is right."""
         self._core = core
         self._store = store
         self._clock = clock
@@ -152,6 +154,8 @@ class MissionPersistence:
         self.goals: dict[str, StoredGoal] = {}
         """The missions by robot."""
         self._out: dict[str, OutOfService] = {}
+        self._ends = Ends(clock, synchronized)
+        """Of missions (`Tour.id`) with a deadline, and of `OutOfService.id`."""
         self.overruled: Callable[[str], object] = lambda _robot: None
         """Called for a robot whose mission, or service, somebody else than a visit has changed."""
 
@@ -235,7 +239,7 @@ class MissionPersistence:
     def out_of_service(self, robot: str) -> OutOfService | None:
         """Return why the robot gets no goal; None when it is in service."""
         out = self._out.get(robot)
-        return out if out is not None and out.holds(self._clock.stamp()) else None
+        return out if out is not None and not self._ends.passed(out.id, out.until) else None
 
     def require_in_service(self, robot: str) -> None:
         """Raise `OutOfServiceError` for a robot that is out of service."""
@@ -263,6 +267,8 @@ class MissionPersistence:
                 audit = Audit(self._clock.stamp(), who, action)
                 done = await self._store.put_service(robot, out, audit, expected=expected) == "ok"
             if done:
+                if out.until is not None:
+                    self._ends.count(out.id, out.until)
                 self._set_service(robot, out)
         return done
 
@@ -317,7 +323,7 @@ class MissionPersistence:
                     self._change_core(partial(self._core.lead, self._store.epoch, knows_missions=True))
                 await self._end_reached()
                 for robot, out in list(self._out.items()):
-                    if self._leading and not out.holds(self._clock.stamp()):
+                    if self._leading and self._ends.passed(out.id, out.until):
                         await self.put_back(robot, "planner", expected=out.id, action="end")
                 if self._leading:
                     await self._learned.save()
@@ -334,6 +340,9 @@ class MissionPersistence:
     async def _end_reached(self) -> None:
         """Delete the missions that are reached; raises `StoreError`."""
         for robot, goal_id in list(self._reached.items()):
+            stored = self.goals.get(robot)
+            if stored is not None and stored.goal.goal_id == goal_id:
+                continue  # a stop of a mission that goes on, reached while another robot's was stored
             await self._store.delete(robot, goal_id, Audit(self._clock.stamp(), robot, "reached"))
             if self._reached.get(robot) == goal_id:
                 del self._reached[robot]

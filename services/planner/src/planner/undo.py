@@ -72,6 +72,8 @@ async def _undo(
         return None
     goal = before.goal
     assert goal.pose is not None
+    if before.tour is not None and before.tour.deadline is not None:
+        require_rest(before.tour.deadline, service.stamp(), f"the mission of robot {robot}")
     # A new id: the robot may have reached or cancelled a leg of the old one.
     tour = None if before.tour is None else structs.replace(before.tour, id=secrets.token_hex(8))
     order = Order(

@@ -24,10 +24,6 @@ class OutOfService(Message, frozen=True, kw_only=True):
     since: Stamp
     until: Stamp | None = None
 
-    def holds(self, stamp: float) -> bool:
-        """Whether it is in force at a time (s since the epoch)."""
-        return self.until is None or stamp < self.until
-
 
 CpuPercent = Annotated[float, Meta(ge=0.0, le=100_000.0, extra={"unit": "% of a core"})]
 SignalLevel = Annotated[float, Meta(ge=-250.0, le=50.0, extra={"unit": "dBm"})]

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections import defaultdict
 from typing import TYPE_CHECKING
 
@@ -44,29 +43,17 @@ class TourPersistence(MissionPersistence):
         path: Callable[[str], RobotPath | None],
         synchronized: Callable[[], bool] = lambda: True,
     ) -> None:
-        super().__init__(core, store, clock, health, change_core)
+        super().__init__(core, store, clock, health, change_core, synchronized)
         self._path = path
-        self._synchronized = synchronized
-        self._ends: dict[str, float] = {}
-        """By mission (`Tour.id`), when its deadline passes by the monotonic clock (s), whatever the other one does."""
         self._cut: defaultdict[str, CutTimes] = defaultdict(CutTimes)
         """By robot, since when no way leads on."""
 
     async def send(self, order: Order) -> StoredGoal:
         """Give a robot a mission, and count its time from now on; raises as the base class does."""
-        offset = self._clock.now() - self._clock.stamp()
         stored = await super().send(order)
         if stored.tour is not None and stored.tour.deadline is not None:
-            self._ends[stored.tour.id] = stored.tour.deadline + offset
+            self._ends.count(stored.tour.id, stored.tour.deadline)
         return stored
-
-    def _has_ended(self, tour: Tour) -> bool:
-        """Whether a mission's deadline has passed: after a restart nobody can tell before the time of day is known."""
-        if tour.deadline is None:
-            return False
-        if tour.id not in self._ends and self._synchronized():
-            self._ends[tour.id] = self._clock.now() + tour.deadline - self._clock.stamp()
-        return self._clock.now() >= self._ends.get(tour.id, math.inf)
 
     def end(self, robot: str, goal_id: str) -> None:
         """Mark a reached goal for its end; one of a mission that goes on is its mission's until the next is stored."""
@@ -88,7 +75,7 @@ class TourPersistence(MissionPersistence):
         await super()._end_reached()
         if self._leading:
             tours = {stored.tour.id for stored in self.goals.values() if stored.tour is not None}
-            self._ends = {tour: end for tour, end in self._ends.items() if tour in tours}
+            self._ends.keep({*tours, *(out.id for out in self._out.values())})
             for robot, stored in list(self.goals.items()):
                 if stored.tour is not None:
                     await self._apply(robot, stored, stored.tour)
@@ -110,7 +97,7 @@ class TourPersistence(MissionPersistence):
 
     async def _apply(self, robot: str, stored: StoredGoal, tour: Tour) -> None:
         """End a mission whose deadline has passed, and do what it says about a way that is cut."""
-        if self._has_ended(tour):
+        if self._ends.passed(tour.id, tour.deadline):
             await self._give_up(robot, stored, "deadline", "its deadline has passed")
             return
         path = self._path(robot)

@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 
 RETENTION_S: Final = 90 * 86_400.0
 """A period that ended longer ago than this (s) is forgotten."""
-MAX_PERIODS: Final = 10_000
+MAX_PERIODS: Final = 3_000
 """About so many periods of an area are kept."""
 
 

@@ -119,14 +119,13 @@ def add_session_routes(routes: Routes, tokens: Tokens, clock: Clock) -> None:
         body: Body[Login], host: ClientHost, encrypted: Annotated[bool, Depends(_own_page)]
     ) -> Answer[Session]:
         """Log in with a token: the answer sets a cookie, which the services accept beside tokens."""
-        if wait_s := attempts.wait_s(host):
-            detail = (
-                f"you sent {ATTEMPTS} tokens that nobody has: try again in {wait_s:.0f} s, with a token that is known"
-            )
-            headers = {"Retry-After": f"{max(1.0, wait_s):.0f}"}
-            raise ProblemError(SessionProblem.TOO_MANY_ATTEMPTS, detail, headers=headers)
         caller = tokens.caller(body.token)
         if caller is None:
+            # Who has a token is never kept out: many may share an address, and nobody guesses 256 bits.
+            if wait_s := attempts.wait_s(host):
+                detail = f"you sent {ATTEMPTS} tokens that nobody has: try again in {wait_s:.0f} s, with one that is known"
+                headers = {"Retry-After": f"{max(1.0, wait_s):.0f}"}
+                raise ProblemError(SessionProblem.TOO_MANY_ATTEMPTS, detail, headers=headers)
             attempts.failed(host)
             detail = "nobody has this token: copy one that `fognav token create` printed, without spaces around it"
             raise ProblemError(HttpProblem.TOKEN_UNKNOWN, detail)

@@ -61,8 +61,12 @@ AUDITED: Final[Mapping[str, Sequence[str]]] = {
 BOOKKEEPING: Final = ("probe", "generation", "writes", "floors", "no-attempt", "idempotency:*")
 """Keys that every service of a site writes: by which they notice that Redis lost something."""
 
-AUDIT_ENTRIES: Final = 100_000
-"""Entries of the audit trail that are kept, for each kind of record."""
+AUDIT_ENTRIES: Final = 10_000
+"""Entries of the audit trail that are kept, for each kind of record.
+
+An entry is 1 kB, that of a mission of ten stops or of a large zone 2.6 kB: all kinds together stay below what Redis's
+container may have.
+"""
 
 _GUARD: Final = """
 local request = cjson.decode(ARGV[1])

@@ -123,7 +123,7 @@ def add_session_routes(routes: Routes, tokens: Tokens, clock: Clock) -> None:
         if caller is None:
             # Who has a token is never kept out: many may share an address, and nobody guesses 256 bits.
             if wait_s := attempts.wait_s(host):
-                detail = f"you sent {ATTEMPTS} tokens that nobody has: try again in {wait_s:.0f} s, with one that is known"
+                detail = f"you sent {ATTEMPTS} unknown tokens: try again in {wait_s:.0f} s, with one that is known"
                 headers = {"Retry-After": f"{max(1.0, wait_s):.0f}"}
                 raise ProblemError(SessionProblem.TOO_MANY_ATTEMPTS, detail, headers=headers)
             attempts.failed(host)

@@ -108,6 +108,13 @@ async def test_period_of_an_area_is_written_once_continues_over_restarts_and_is_
         assert [v.period.began for v in kept.periods] == [100 * day, 80 * day, 20.0], "the third ended 20 days ago"
         gone = await store.history("hall", cursor=first.next, limit=9, at=at(101 * day))
         assert gone.periods == []
+        for seq in range(4, 20):
+            announced = msgspec.structs.replace(blocked if seq % 2 == 0 else clear, epoch=4, seq=seq)
+            await store.begin_period(announced, period_of(announced, at(101 * day)))
+        ahead = msgspec.structs.replace(blocked, epoch=5, penalty=7)
+        await store.begin_period(ahead, period_of(ahead, at(20_000 * day)))
+        after = await store.history("hall", cursor=None, limit=50, at=at(102 * day))
+        assert len(after.periods) >= 15, "a clock that is years ahead after a boot cost the whole history"
         with pytest.raises(CursorError):
             await store.history("hall", cursor="1", limit=9, at=at(0.0))
 

@@ -162,7 +162,7 @@ end
 redis.call('XADD', KEYS[3], 'MAXLEN', '~', request.entries,
   string.format('%.0f-%.0f', request.id_epoch, request.id_seq), 'at', request.at, 'same', request.same,
   'data', ARGV[2])
-while true do
+for _ = 1, 2 do
   local oldest = redis.call('XRANGE', KEYS[3], '-', '+', 'COUNT', 2)
   if not oldest[2] or tonumber(field(oldest[2], 'at')) >= request.oldest then break end
   redis.call('XDEL', KEYS[3], oldest[1][1])
@@ -170,6 +170,8 @@ end
 return {{'ok', redis.call('HINCRBY', KEYS[2], request.table, 1), ''}}
 """
 """Begin a period in a history, unless it is known or the last one has the same text `same`; forget what ended long ago.
+
+Each time two at most are forgotten: a clock that is years ahead after a boot must not cost the whole history.
 
 Keys: `generation`, `writes`, history (a stream), epoch. `id_epoch` and `id_seq` order the periods; a period that is not
 newer than the last one is known.

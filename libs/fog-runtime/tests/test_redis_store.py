@@ -1,6 +1,7 @@
 """The store base against a real Redis: compare-and-swap, epochs, unreadable records, audit entries."""
 
 import asyncio
+import math
 from pathlib import Path
 
 import pytest
@@ -10,7 +11,7 @@ from fog_contracts.messages import Message
 from fog_runtime.lease import Request
 from fog_runtime.lease_store import LeaseStore
 from fog_runtime.stores.redis_connection import StoreError, StoreRefusedError
-from fog_runtime.stores.redis_store import ANY, Audit, RedisStore, Table
+from fog_runtime.stores.redis_store import ANY, MEMORY, Audit, RedisStore, Table
 from fog_supervisor.servers import Server, start_redis
 
 pytestmark = pytest.mark.live
@@ -84,6 +85,13 @@ async def test_unreadable_record_is_left_out(redis: Server):
         await store._write_records("things", {"a": Thing(label="x")})
         await raw.hset("fog:test:things", "b", b"nonsense")
         assert await store._readable_records("things", Thing) == {"a": Thing(label="x")}
+
+
+async def test_memory_of_redis_is_told(redis: Server):
+    MEMORY.set(math.nan)
+    async with RedisStore(redis.url, "test") as store:
+        await store.check()
+        assert 1e5 < MEMORY._value.get() < 1e9
 
 
 async def test_dead_redis_is_named_in_the_error(redis: Server):

@@ -187,6 +187,7 @@ async def test_store_and_lease_need_no_more_than_a_service_may(redis, security):
         LeaseStore(redis.url, "lab", "planner", credentials=own) as leases,
     ):
         await store.check()
+        assert await store._used_memory() > 1e5
         assert await store.durability_warning() == ""
         assert (await store.audit()).entries == []
         assert leases is not None

@@ -49,7 +49,7 @@ HEALTH: Final = "health"
 """Who asks broker, router and Redis whether they are well, and may do nothing else."""
 _COMMANDS: Final = (
     "+get +set +setrange +del +hget +hset +hdel +hgetall +hlen +hincrby +xadd +xdel +xrange +xrevrange +pttl"
-    " +eval +multi +exec +wait +ping +config|get +client|setname +client|id +hello +auth +select"
+    " +eval +multi +exec +wait +ping +info +config|get +client|setname +client|id +hello +auth +select"
 )
 _READING: Final = "+xrange +xrevrange +ping +client|setname +client|id +hello +auth +select"
 

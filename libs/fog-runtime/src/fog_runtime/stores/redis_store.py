@@ -85,6 +85,12 @@ DURABLE: Final = Gauge(
     "fognav_store_durable", "Whether Redis writes to its disk before it acknowledges; not a number until it tells"
 )
 DURABLE.set(math.nan)
+MEMORY: Final = Gauge(
+    "fognav_store_memory_bytes", "Memory of Redis, as it tells each minute; not a number while it does not"
+)
+MEMORY.set(math.nan)
+_MEASURED_EVERY: Final = 120
+"""Checks, of which a service makes two a second."""
 
 Outcome = Literal["ok", "exists", "missing", "stale"]
 """Result of a write: done (now or before), or refused because a record exists, is missing, or has another version."""
@@ -159,6 +165,7 @@ class RedisStore:
         self._service = service
         self._identity = StoreIdentity(None if data_dir is None else data_dir / f"{service}.{site}.store")
         self._floors: dict[str, int] = {}
+        self._checks = 0
         self.epoch = UNFENCED
 
     async def __aenter__(self) -> Self:
@@ -178,6 +185,17 @@ class RedisStore:
         # that an empty text changes nothing: a probe that neither changes anything nor waits for the disk.
         await self._redis.write(("SETRANGE", self._key("probe"), 0, ""))
         await self._verify()
+        if self._checks % _MEASURED_EVERY == 0:
+            MEMORY.set(await self._used_memory())
+        self._checks += 1
+
+    async def _used_memory(self) -> float:
+        """Return the memory (bytes) of Redis; not a number where it hides it."""
+        try:
+            told = await self._redis.read("INFO", "memory")
+        except StoreError:
+            return math.nan  # or it is away, which the next check tells
+        return float(told["used_memory"])
 
     async def durability_warning(self) -> str:
         """Return why acknowledged writes are not durable, or an empty text; also empty if Redis hides its settings."""

@@ -13,6 +13,8 @@ from redis.asyncio import Redis
 
 from fog_runtime import backup
 from fog_runtime.backup import BackupError, read_archive
+from fog_runtime.stores.redis_connection import StoreLostError
+from fog_runtime.stores.redis_store import RedisStore
 from fog_supervisor.servers import Server, start_redis
 
 pytestmark = pytest.mark.live
@@ -124,6 +126,48 @@ async def test_what_is_there_is_replaced_only_when_that_is_wanted(tmp_path, here
         await backup.restore(file, here, replace=True)
         assert await raw.hkeys("fog:test:zones") == [b"z1", b"z2"]
         assert await raw.get("fog:elsewhere:generation") == b"of another site"
+
+
+async def test_map_that_was_put_into_force_after_the_backup_is_so_no_more_once_it_is_restored(tmp_path, here, redis):
+    await fill(redis)
+    file = tmp_path / "backup.tar.gz"
+    await backup.create(file, here, NOW)
+    later = here.folders[backup.MAPS] / "in-force.json"
+    later.parent.mkdir()
+    later.write_text('{"name": "aaaaaaaaaaaaaaaa", "over": "bbbbbbbbbbbbbbbb"}')
+    async with Redis.from_url(redis.url) as raw:
+        await raw.delete(*await raw.keys("fog:test:*"))
+    with pytest.raises(BackupError, match=r"in-force\.json names a map, and the backup has none: nothing was changed"):
+        await backup.restore(file, here, replace=False)
+    assert later.exists()
+    await backup.restore(file, here, replace=True)
+    assert not later.exists()
+
+
+@pytest.mark.parametrize("apart", [False, True])
+async def test_services_that_ran_here_before_take_the_restored_store_for_theirs(tmp_path, here, redis, other, apart):
+    def store(of: backup.Place, service: str) -> RedisStore:
+        return RedisStore(of.redis_url, "test", service=service, data_dir=of.own_data.get(service, of.data_dir))
+
+    services = ("hazard-aggregator", "map-service", "planner")
+    there = place(tmp_path / "there", other)
+    if apart:
+        there = there._replace(own_data={each: tmp_path / "there" / each for each in services})
+    for node, started in ((here, services), (there, services[:2])):
+        for each in started:
+            async with store(node, each) as made:
+                await made.check()
+    file = tmp_path / "backup.tar.gz"
+    await backup.create(file, here, NOW)
+    await backup.restore(file, there, replace=True)
+    for each in services:
+        async with store(there, each) as restored:
+            await restored.check()
+    async with Redis.from_url(other.url) as raw:  # and they notice a loss after it
+        await raw.delete(*await raw.keys("fog:test:*"))
+    async with store(there, "planner") as emptied:
+        with pytest.raises(StoreLostError, match="was emptied"):
+            await emptied.check()
 
 
 async def test_backup_is_not_restored_under_a_running_service(tmp_path, here, redis):

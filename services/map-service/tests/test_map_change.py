@@ -14,7 +14,11 @@ import pytest
 from PIL import Image
 
 from fog_runtime.configuration.uploaded_maps import MapInForce, UploadedMaps
+from fog_runtime.stores.redis_connection import StoreError
+from fog_supervisor.servers import start_redis
+from map_service.record_writer import RecordWriter
 from map_service.site_map import MAP_ID, MapFile, StoredMap
+from map_service.store import SITE_MAPS, Store
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -237,3 +241,22 @@ def test_map_that_another_machine_has_is_in_force_once_it_was_copied_here_and_no
     assert maps.in_force() == expected
     MapFile(maps).write(1.0)
     assert maps.in_force() == expected
+
+
+async def test_map_of_which_the_store_knows_nothing_gives_way_to_that_of_the_site_once_the_store_was_read(tmp_path):
+    maps = UploadedMaps(tmp_path / "maps")
+    maps.put(MapInForce(name="a" * 16, over="b" * 16))
+    file = MapFile(maps)
+    with start_redis(tmp_path / "redis") as redis:
+        async with Store(redis.url, "test") as store:
+            # Nothing is written, so it needs none of what writers share.
+            writer = RecordWriter(SITE_MAPS, StoredMap, store, None, file.use)  # type: ignore[arg-type]  # see above
+            redis.kill()
+            with pytest.raises(StoreError):
+                await writer.load()
+            file.write(0.0)
+            assert maps.in_force() is not None
+            redis.start()
+            await writer.load()
+    file.write(1.0)
+    assert maps.in_force() is None

@@ -32,7 +32,7 @@ from fognav import checkout
 from fognav.credentials import own_credentials, security_errors
 from fognav.hosting.folders import REDIS_PORT, SECURITY_FILE, NodeFolder, recall, require_node
 from fognav.output import FailedError, WrongUseError, print_line
-from fognav.programs import MAP_SERVICE, REDIS, ProgramSet
+from fognav.programs import MAP_SERVICE, REDIS, SERVICES, ProgramSet
 
 RECORDINGS: Final = "recordings"
 _INDEX: Final = "index"
@@ -282,8 +282,9 @@ def _place(folder: NodeFolder, site: str, directory: Path, redis: str) -> backup
         RECORDINGS: index_folder(folder.path),
         backup.MAPS: folder.data("maps") / site,
     }
-    service = MAP_SERVICE if site == security.sites[0] else on_floor(site, MAP_SERVICE)
-    return backup.Place(redis, site, folders, folder.data(service), credentials)
+    first = site == security.sites[0]
+    own = {service: folder.data(service if first else on_floor(site, service)) for service in SERVICES}
+    return backup.Place(redis, site, folders, own[MAP_SERVICE], credentials, own)
 
 
 def _ignore(_: Event) -> None:

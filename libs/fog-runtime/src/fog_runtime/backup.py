@@ -3,7 +3,7 @@
 Configured like the services: FOGNAV_REDIS_URL, FOGNAV_SITE_DIR, FOGNAV_TOKENS_FILE (whose folder has the secrets) and
 FOGNAV_DATA_DIR, where the time of the last backup is noted for the metrics. What is backed up: the site's keys of
 Redis, the site's folder, the maps that were uploaded, and the secrets. A backup may be made while everything runs;
-restore one while the services are stopped.
+restore one while the services are stopped. What they remember of Redis and of the map in force is then the backup's.
 
 The file is a `tar.gz`, with a hash of each part in its manifest. It holds secrets (tokens' hashes, the key that signs
 commands), so only its owner reads it:
@@ -31,9 +31,10 @@ import msgspec
 
 from fog_runtime.configuration.settings import CommonSettings, SettingsError, load
 from fog_runtime.configuration.site import SITE_FILE, SiteError, load_site
+from fog_runtime.configuration.uploaded_maps import FILE as MAP_IN_FORCE
 from fog_runtime.credentials import NOBODY, Credentials, CredentialsError
 from fog_runtime.files import PRIVATE, atomic_write
-from fog_runtime.stores.redis_connection import Command, RedisConnection, StoreError
+from fog_runtime.stores.redis_connection import Command, RedisConnection, StoreError, marker
 from fog_runtime.version import VERSION
 
 if TYPE_CHECKING:
@@ -171,14 +172,33 @@ _SHORT_LIVED_MS: Final = 10_000
 """Keys that end sooner, such as leases, are not backed up."""
 
 
+_SERVICES: Final = ("hazard-aggregator", "map-service", "planner")
+"""What keeps records in Redis."""
+
+
 class Place(NamedTuple):
-    """A fog node: its Redis, its site's id, and its folders by name."""
+    """A fog node: its Redis, its site's id, and its folders by name.
+
+    `data_dir` is where the last backup is noted, and where the services keep what they remember of Redis; `own_data`
+    are the folders of services that have one of their own for that.
+    """
 
     redis_url: str
     site: str
     folders: dict[str, Path]
     data_dir: Path
     credentials: Credentials = NOBODY
+    own_data: Mapping[str, Path] = {}
+
+    @property
+    def markers(self) -> list[Path]:
+        """Where each service remembers which store it uses."""
+        return [marker(self.own_data.get(each, self.data_dir), each, self.site) for each in _SERVICES]
+
+    @property
+    def map_in_force(self) -> Path:
+        """What says which of the uploaded maps is in force."""
+        return self.folders[MAPS] / MAP_IN_FORCE
 
 
 async def create(file: Path, place: Place, now: float) -> Backup:
@@ -221,10 +241,18 @@ async def restore(file: Path, place: Place, *, replace: bool, keep: Collection[s
         await _require_no_leader(redis, backup.site)
         _require_room(backup, place, found, replace=replace)
         await _restore_keys(redis, backup.keys, found)
+        generation = await redis.read("GET", f"fog:{backup.site}:generation")
     except StoreError as error:
         raise BackupError(f"{error}. Restore again: it replaces what is there with --replace") from error
     finally:
         await redis.aclose()
+    try:
+        await asyncio.to_thread(_forget_what_was_before, backup, place, generation)
+    except OSError as error:
+        raise BackupError(
+            f"{error.filename} can't be changed ({error.strerror}): Redis is restored, the folders are not. Run this as"
+            " a user who may, with --replace"
+        ) from error
     for name, files in backup.folders.items():
         for path, content in files.items():
             try:
@@ -235,6 +263,15 @@ async def restore(file: Path, place: Place, *, replace: bool, keep: Collection[s
                     " are not. Make room or grant access, then restore again with --replace"
                 ) from error
     return backup
+
+
+def _forget_what_was_before(backup: Backup, place: Place, generation: bytes | None) -> None:
+    """Let services that ran here before take the restored records for theirs, and no other map than the backup's."""
+    for path in place.markers:
+        if path.exists():
+            _write(path, _read(path)._replace(data=generation or b""))
+    if MAP_IN_FORCE not in backup.folders.get(MAPS, {}):
+        place.map_in_force.unlink(missing_ok=True)
 
 
 def require_same_site(backup: Backup, folder: Path) -> None:
@@ -260,7 +297,7 @@ def _site_id(data: bytes) -> object:
 
 async def _require_no_leader(redis: RedisConnection, site: str) -> None:
     """Raise `BackupError` while a service runs, which would write what it has in memory over the backup."""
-    for service in ("hazard-aggregator", "map-service", "planner"):
+    for service in _SERVICES:
         if await redis.read("EXISTS", f"fog:{site}:{service}:lease"):
             raise BackupError(f"the {service} of site {site} runs: nothing was changed. Stop the services first")
 
@@ -284,6 +321,10 @@ def _require_room(backup: Backup, place: Place, found: Sequence[bytes], *, repla
             target = place.folders[name] / path
             if target.exists() and target.read_bytes() != content.data:
                 raise BackupError(f"{target} exists already: nothing was changed. --replace overwrites it")
+    if place.map_in_force.exists() and MAP_IN_FORCE not in backup.folders.get(MAPS, {}):
+        raise BackupError(
+            f"{place.map_in_force} names a map, and the backup has none: nothing was changed. --replace removes it"
+        )
 
 
 async def _names(redis: RedisConnection, site: str) -> list[bytes]:

@@ -62,12 +62,15 @@ class RecordWriter(Generic[R]):
         self._store = store
         self._writing = writing
         self._use = use
+        self._loaded = False
 
     async def load(self) -> None:
-        """Use what is stored, where it differs; raises `StoreError`."""
+        """Use what is stored, at first and where it differs; raises `StoreError`."""
         stored = await self._store.read(self.table, self._kind)
-        if stored != self.records:
+        # At first even if there is nothing: a file of before, such as that of the map in force, may say otherwise.
+        if stored != self.records or not self._loaded:
             self._replace(stored)
+            self._loaded = True
 
     async def put(
         self,

@@ -256,6 +256,11 @@ class Expectation(NamedTuple):
     writes: Mapping[str, int]
 
 
+def marker(folder: Path, service: str, site: str) -> Path:
+    """Return the file in a service's data folder that remembers the generation of the store that it used last."""
+    return folder / f"{service}.{site}.store"
+
+
 class StoreIdentity:
     """Notices that Redis lost acknowledged records: that it was emptied, replaced, or went back to an older state.
 

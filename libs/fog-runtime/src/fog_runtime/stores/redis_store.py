@@ -26,6 +26,7 @@ from fog_runtime.stores.redis_connection import (
     StoreIdentity,
     StoreLostError,
     StoreRefusedError,
+    marker,
 )
 from fog_runtime.stores.undo import undoable
 
@@ -163,7 +164,7 @@ class RedisStore:
         self._redis = RedisConnection(url, timeout_s=timeout_s, credentials=credentials)
         self._site = site
         self._service = service
-        self._identity = StoreIdentity(None if data_dir is None else data_dir / f"{service}.{site}.store")
+        self._identity = StoreIdentity(None if data_dir is None else marker(data_dir, service, site))
         self._floors: dict[str, int] = {}
         self._checks = 0
         self.epoch = UNFENCED

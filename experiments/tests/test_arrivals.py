@@ -12,9 +12,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from fog_contracts.messages import PlanRequest, Pose, RobotGoal
+from fog_contracts.messages import CircleShape, PlanRequest, Pose, RobotGoal, Zone
 from fog_runtime.configuration.site import load_site
 from fognav_experiments.lockstep import LockstepDrive
+from fognav_experiments.rigs import moment
 
 DRIVES = int(os.environ.get("FOGNAV_ARRIVALS", "6"))
 SITE = load_site(Path(__file__).parents[2] / "sites" / "estig")
@@ -35,9 +36,20 @@ def next_goal(core, x: float, y: float, rng: random.Random) -> Pose:
             return goal
 
 
+def draw_slow_zones(run, rng: random.Random) -> None:
+    """Limit the speed to 0.06 to 0.25 m/s in 150 places, so that most ways lead through one or two."""
+    free = np.argwhere(SITE.map.cells == 0)
+    for number in range(150):
+        row, column = free[rng.randrange(len(free))].tolist()
+        shape = CircleShape(centre=SITE.map.geometry.centre(column, row), radius=rng.uniform(0.5, 2.0))
+        zone = Zone(id=f"slow-{number}", kind="SPEED_LIMIT", shape=shape, speed=rng.uniform(0.06, 0.25))
+        run.system.fog.map.put_zone(zone, moment(run.now))
+
+
 @pytest.mark.drive
-@pytest.mark.timeout(60.0 * DRIVES)
-def test_robots_arrive_when_they_are_expected():
+@pytest.mark.timeout(120.0 * DRIVES)
+@pytest.mark.parametrize("slow", [False, True])
+def test_robots_arrive_when_they_are_expected(*, slow):
     rng, begin = random.Random(5), SITE.site.places[SITE.site.demo.start]
     start = Pose(x=begin.x, y=begin.y, theta=begin.theta or 0.0)
     run = LockstepDrive(
@@ -45,6 +57,8 @@ def test_robots_arrive_when_they_are_expected():
     )
     assert run.warm_up() is None
     core, robot = run.system.fog.planner.core, run.robot.id
+    if slow:
+        draw_slow_zones(run, rng)
     errors, inside = [], 0
     for number in range(DRIVES):
         x, y, _ = run.world.pose

@@ -15,7 +15,8 @@ from fog_contracts.handlers import Moment
 from fog_contracts.messages import RobotState
 from planner.core import PlannerCore
 from planner.path_search import Route
-from planner.waits.pace import ARRIVAL_S, USUAL_SPEED, PaceRecord, Paces, Times
+from planner.planning_map import USUAL_SPEED
+from planner.waits.pace import ARRIVAL_S, PaceRecord, Paces, Times
 
 GEOMETRY = GridGeometry(200, 50, 0.1, 0.0, 0.0)
 LINE = Route(np.array([(1.0, 2.0), (11.0, 2.0)]), 0.05)

@@ -40,11 +40,13 @@ class Settings(InflationSettings, frozen=True, kw_only=True):
 
     `release_m` is the released length: how far (m) a robot may drive without a message from the planner. `wait`:
     whether robots wait before what closes their way, if that is expected to be quicker than the way round (ADR 72).
-    `wall_clock`: when the time of day is believed, as by the map-service.
+    `time_in_cost`: whether a slow place is gone round when that is quicker (ADR 75). `wall_clock`: when the time of day
+    is believed, as by the map-service.
     """
 
     release_m: float = 15.0
     wait: WaitMode = "learned"
+    time_in_cost: bool = True
     wall_clock: WallClockSource = "kernel"
 
 
@@ -79,7 +81,10 @@ async def main() -> None:
         lambda: make_api(unused(), described, health, tokens),
         settings.http_host, settings.http_port, settings.http_certificate(), settings.http_gateway,
     )  # fmt: skip
-    config = PlannerConfig(inflation=settings.inflation, release_length=settings.release_m, wait=settings.wait)
+    config = PlannerConfig(
+        inflation=settings.inflation, release_length=settings.release_m, wait=settings.wait,
+        time_in_cost=settings.time_in_cost,
+    )  # fmt: skip
     async with (
         Store(settings.redis_url, site, service="planner", data_dir=settings.data_dir, credentials=own) as store,
         LeaseStore(settings.redis_url, site, "planner", credentials=own) as leases,

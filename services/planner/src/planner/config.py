@@ -75,5 +75,7 @@ class PlannerConfig:
     max_switch_dwell_s: float = 30.0
     wait: WaitMode = "learned"
     """Whether robots wait before what closes their way, if that is expected to take less time than the way round."""
+    time_in_cost: bool = True
+    """Whether a path costs the time that speed limits take, so that a slow place is gone round when that is quicker."""
     cruise_speed: float = 0.26
     """How fast (m/s) a robot gets on along its path, on average."""

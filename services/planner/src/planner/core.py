@@ -88,6 +88,7 @@ class PlannerCore:
             grace_s=self.config.delta_grace_s,
             max_age_s=self.config.max_map_age_s,
             standing_s=self.config.standing_s,
+            time_in_cost=self.config.time_in_cost,
         )
         self._regions = BlockedRegions()
         self._fields = GoalFields(self.config.goal_fields_bytes, self.config.landmark_bytes)
@@ -166,12 +167,12 @@ class PlannerCore:
             self.paces.end(robot)
             return
         if plan.times is None:
-            plan.times = Times.of(plan.route, self._map.speed_layer, planning_map.geometry)
+            plan.times = Times.of(plan.route, self._map.limits, planning_map.geometry)
         self.paces.on_progress(robot, plan.plan_id, plan.times.at(plan.progress), now, drives=mission.drives)
 
     def arrival(self, robot: str) -> Arrival | None:
         """Return when a robot arrives, by its pace; None when it has no path, or waits. Any thread may ask."""
-        plan, limits = self.missions.plan(robot), self._map.limits
+        plan, limits = self.missions.plan(robot), self._map.limits_on_grid
         if plan is None or plan.route is None or plan.ends_early or limits is None:
             return None
         times = Times.of(plan.route, *limits)
@@ -281,7 +282,7 @@ class PlannerCore:
         self._served = self.missions.located(at.now, self.config)
         covers = partial(cover, self._regions.sources)
         due = self.missions.to_replan(at.now, self.config)
-        self.waits.look(at, self._regions.sources, self._regions.areas, self._map.speed_layer)
+        self.waits.look(at, self._regions.sources, self._regions.areas, self._map.limits)
         for number, (robot, mission, reason) in enumerate(due):
             if mission.target is not None and mission.pose is not None:
                 waiting = [other for _, other, _ in due[number + 1 :]]
@@ -403,7 +404,7 @@ class PlannerCore:
         missions = dict(self.missions.items())
         located = {robot: mission for robot, mission in missions.items() if mission.pose is not None}
         avoid = {robot: self.leases.obstacles(robot, mission.beside) for robot, mission in located.items()}
-        return State.of(view, self._map.speed(), missions, avoid, now)
+        return State.of(view, self._map.layers(), self._map.limits.copy(), missions, avoid, now)
 
     def answers(self) -> Mapping[ch.Channel, Callable[[View | None, Any], PlanReply]]:
         """Return what answers each query on a view, to be called on the thread of the `answerer`."""

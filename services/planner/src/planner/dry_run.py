@@ -33,7 +33,7 @@ from fog_contracts.messages import (
 )
 from fog_contracts.replica import unpack
 from planner.path_search import find_egress
-from planner.planning_map import CostChange
+from planner.planning_map import CostChange, body_reach, under_body, with_time
 from planner.queries import Answerer, View
 from planner.refusals import no_map
 from planner.regions import Regions, cover, is_closing
@@ -45,7 +45,7 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
-    from fog_contracts.messages import Cause, DryRunRequest, MapPatch, PointXY, Refusal, RobotPose
+    from fog_contracts.messages import Cause, DryRunRequest, Layer, MapPatch, PointXY, Refusal, RobotPose
     from planner.config import PlannerConfig
     from planner.leases.corridors import Disc
     from planner.missions import Mission
@@ -65,10 +65,12 @@ class StaleError(Exception):
 
 @dataclass(frozen=True)
 class State:
-    """What the core knows at one moment, unchanged by later messages: the map, its speed layer, and the robots."""
+    """What the core knows at one moment, unchanged by later messages: the map-service's layers, and the robots."""
 
     view: View
-    speed: Grid
+    layers: Mapping[Layer, Grid]
+    limits: Grid
+    """The speed limit (cm/s, 0: none) for a robot in each cell."""
     missions: Mapping[str, Mission]
     avoid: Mapping[str, Sequence[Disc]]
     """The places of other robots that a new path of each robot should avoid."""
@@ -77,7 +79,8 @@ class State:
     def of(
         cls,
         view: View,
-        speed: Grid,
+        layers: Mapping[Layer, Grid],
+        limits: Grid,
         missions: Mapping[str, Mission],
         avoid: Mapping[str, Sequence[Disc]],
         now: float,
@@ -88,7 +91,7 @@ class State:
             for robot, mission in missions.items()
             if mission.pose is not None and now - mission.pose_received <= KNOWN_S
         }
-        return cls(view, speed, located, avoid)
+        return cls(view, layers, limits, located, avoid)
 
 
 def _copied(mission: Mission) -> Mission:
@@ -109,27 +112,30 @@ class DryRun:
         self._reach: tuple[list[ReachOutcome], list[ReachOutcome]] = ([], [])
         self._finished: set[str] = set()
         self._after = state.view
-        self._speed = state.speed
+        self._limits = state.limits
         self._changes: list[CostChange] = []
 
     def prepare(self) -> None:
         """Put the change on the copy, and compare what can be reached; raises `StaleError`."""
         before = self._state.view.planning_map
-        cost, speed = before.cost.copy(), self._state.speed.copy()
+        cost, layers = before.cost.copy(), {layer: cells.copy() for layer, cells in self._state.layers.items()}
+        windows, reach = [], body_reach(self._config.inflation, before.geometry)
         for patch in self._request.patches:
-            window, cells = _cells_of(patch, cost if patch.layer == "cost" else speed, before)
-            if patch.layer == "speed":
-                speed[window.rows, window.columns] = cells
-                continue
-            old = cost[window.rows, window.columns].copy()
-            cost[window.rows, window.columns] = cells
-            self._changes.append(CostChange(window, cells != old, cells < old, []))
+            window, cells = _cells_of(patch, layers[patch.layer], before)
+            layers[patch.layer][window.rows, window.columns] = cells
+            windows.append(before.geometry.clip(window.grown(reach)) if patch.layer == "speed" else window)
+        limits = under_body(layers["speed"], reach)
+        for window in windows:
+            place = window.rows, window.columns
+            old, new = cost[place].copy(), layers["cost"][place]
+            cost[place] = new = with_time(new, limits[place]) if self._config.time_in_cost else new
+            self._changes.append(CostChange(window, new != old, new < old, []))
         sources = _sources_after(self._state.view.sources, self._request)
         after = replace(before, cost=cost, standing=_standing_after(before, cost))
         known = self._state.view
         guides = (known.fields, known.landmarks) if after.standing is before.standing else ({}, None)
         self._after = View(after, sources, -1, partial(cover, sources), *guides)
-        self._speed = speed
+        self._limits = limits
         self._reach = self._compare_reach(before, after)
 
     @property
@@ -170,7 +176,7 @@ class DryRun:
                 self._config,
                 self._answerer.search(self._after).planner,
             )
-            way_out = _outcome(found.route, found.refusal, self._speed, self._after.planning_map)
+            way_out = _outcome(found.route, found.refusal, self._limits, self._after.planning_map)
             outcome = structs.replace(outcome, inside=inside, way_out=way_out)
         if mission.target is not None or inside is not None:
             self._robots.append(outcome)
@@ -181,11 +187,11 @@ class DryRun:
         assert target is not None
         before = None
         if plan is not None:
-            before = _outcome(plan.route, plan.refusal, self._state.speed, before_map, plan.progress)
+            before = _outcome(plan.route, plan.refusal, self._state.limits, before_map, plan.progress)
         effects = [effect_of_change(mission, change, after_map, self._config) for change in self._changes]
         reasons = [effect.reason for effect in effects if effect is not None]
         if plan is not None and not reasons:
-            after = _outcome(plan.route, plan.refusal, self._speed, after_map, plan.progress)
+            after = _outcome(plan.route, plan.refusal, self._limits, after_map, plan.progress)
             return _compared(robot, before, after, replanned=False)
         danger = min((effect.distance for effect in effects if effect is not None), default=math.inf)
         search = self._answerer.search(self._after)
@@ -199,9 +205,9 @@ class DryRun:
         )
         reason = "map" if "map" in reasons else reasons[0] if reasons else "goal"
         if plan is not None and not plan.waits and is_kept(plan, found, reason, after_map, self._config):
-            after = _outcome(plan.route, self._explained(found) or plan.refusal, self._speed, after_map, plan.progress)
+            after = _outcome(plan.route, self._explained(found) or plan.refusal, self._limits, after_map, plan.progress)
             return _compared(robot, before, after, replanned=False)
-        after = _outcome(found.route, self._explained(found), self._speed, after_map)
+        after = _outcome(found.route, self._explained(found), self._limits, after_map)
         return _compared(robot, before, after, replanned=True)
 
     def _explained(self, found: SearchResult) -> Refusal | None:
@@ -320,26 +326,26 @@ def goal_outcome(state: State, robot: str, goal: PointXY, config: PlannerConfig)
         robot=robot,
         map_epoch=version.epoch,
         map_seq=version.seq,
-        path=_outcome(found.route, explained or found.refusal, state.speed, view.planning_map),
+        path=_outcome(found.route, explained or found.refusal, state.limits, view.planning_map),
         points=[] if found.route is None else found.route.corner_points,
     )
 
 
-def seconds_along(route: Route, along: float, speed: Grid, planning_map: PlanningMap) -> float:
+def seconds_along(route: Route, along: float, limits: Grid, planning_map: PlanningMap) -> float:
     """Return how long (s) a robot takes for a route from `along` (m) on, at the usual speed or the limits' (cm/s).
 
     Turns in place are not counted.
     """
-    return float(Times.of(route, speed, planning_map.geometry, along).seconds[-1])
+    return float(Times.of(route, limits, planning_map.geometry, along).seconds[-1])
 
 
 def _outcome(
-    route: Route | None, refusal: Refusal | None, speed: Grid, planning_map: PlanningMap, along: float = 0.0
+    route: Route | None, refusal: Refusal | None, limits: Grid, planning_map: PlanningMap, along: float = 0.0
 ) -> PathOutcome:
     if route is None:
         return PathOutcome(refusal=refusal)
     length = max(0.0, route.length - along)
-    return PathOutcome(length_m=round(length, 3), seconds=round(seconds_along(route, along, speed, planning_map), 2))
+    return PathOutcome(length_m=round(length, 3), seconds=round(seconds_along(route, along, limits, planning_map), 2))
 
 
 def _compared(robot: str, before: PathOutcome | None, after: PathOutcome, *, replanned: bool) -> RobotOutcome:

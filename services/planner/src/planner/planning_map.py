@@ -1,4 +1,7 @@
-"""The map that paths are planned on: a replica of the master costmap, and a lower bound of its costs. Pure."""
+"""The map that paths are planned on: a replica of the master costmap, and a lower bound of its costs. Pure.
+
+Its costs are raised by the time that speed limits take (`with_time`, ADR 75).
+"""
 
 from __future__ import annotations
 
@@ -10,7 +13,7 @@ from typing import TYPE_CHECKING, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from fog_contracts.costs import INSCRIBED, LETHAL, UNKNOWN
+from fog_contracts.costs import COST_PER_FACTOR, DEGRADED_SPEED, INSCRIBED, LETHAL, PENALTY_MAX, UNKNOWN
 from fog_contracts.follower import MapFollower
 from fog_contracts.replica import decode_map
 from fog_kernels.components import Components
@@ -22,13 +25,57 @@ if TYPE_CHECKING:
 
     from fog_contracts.costs import Inflation
     from fog_contracts.grid import GridGeometry, Window
-    from fog_contracts.messages import MapDelta, MapHeartbeat, MapSnapshot, Trace
+    from fog_contracts.messages import Layer, MapDelta, MapHeartbeat, MapSnapshot, Trace
     from fog_contracts.replica import Applied, DecodedMap, Version
 
     Grid = NDArray[np.uint8]
 
 _PART: Final = 30
 """Of so many points of a line the surroundings are looked at together."""
+USUAL_SPEED: Final = 2 * DEGRADED_SPEED / 100
+"""Speed (m/s) of a robot where nothing limits it."""
+
+
+def _timed_costs() -> Grid:
+    """Tabulate, by limit (cm/s, 0: none) and cost, the cost with the time that the limit takes.
+
+    In a cell with a limit a robot spends as long as in USUAL_SPEED / limit cells without: the cost rises by that of the
+    others, free ones. It stays passable, and so has a highest value: limits below 6 cm/s count no more than that.
+    """
+    limits = np.arange(256.0)
+    limits[0] = np.inf
+    extra = np.maximum(0.0, COST_PER_FACTOR * (100.0 * USUAL_SPEED / limits - 1.0))
+    costs = np.arange(256)
+    timed = np.minimum(np.rint(costs + extra[:, np.newaxis]), PENALTY_MAX)
+    return np.where(costs < INSCRIBED, timed, costs).astype(np.uint8)
+
+
+_TIMED_COSTS: Final = _timed_costs()
+
+
+def under_body(speed: Grid, reach: int) -> Grid:
+    """Return the limit (cm/s, 0: none) for a robot in each cell: the lowest within `reach` cells, under its body."""
+    if not speed.any():
+        return speed.copy()
+    lowest = speed - np.uint8(1)  # no limit becomes the highest
+    for turned in (False, True):
+        across = lowest.T if turned else lowest
+        before = across.copy()
+        for shift in range(1, min(reach, len(across) - 1) + 1):
+            np.minimum(across[shift:], before[:-shift], out=across[shift:])
+            np.minimum(across[:-shift], before[shift:], out=across[:-shift])
+    return lowest + np.uint8(1)
+
+
+def with_time(cost: Grid, limits: Grid) -> Grid:
+    """Return a copy of the costs, raised by the time that limits (cm/s, 0: none) take; both have one shape.
+
+    No cost falls, and none becomes or ceases to be impassable: what is below the costs stays below them.
+    """
+    timed, limited = cost.copy(), limits != 0
+    if limited.any():
+        timed[limited] = _TIMED_COSTS[limits[limited], cost[limited]]
+    return timed
 
 
 class StandingMap:
@@ -94,7 +141,7 @@ class PlanningMap:
     geometry: GridGeometry
     version: Version
     cost: Grid
-    """The master costmap."""
+    """The master costmap, with the time that speed limits take."""
     static: Grid
     lower_bound: Grid
     """The inflated static map: the costs without any hazard, zone or obstacle."""
@@ -136,9 +183,14 @@ class PlanningMap:
         return self.components.connected(start, goal)
 
 
+def body_reach(inflation: Inflation, geometry: GridGeometry) -> int:
+    """Return how many cells a robot in the middle of its own one reaches each way; robots look at a square."""
+    return math.floor(inflation.inscribed_radius / geometry.resolution + 0.5)
+
+
 @dataclass(frozen=True)
 class CostChange:
-    """Changed cells of the master costmap: masks over a window, and the traces of the hazards that caused them."""
+    """Changed cells of the costs: masks over a window, and the traces of the hazards that caused them."""
 
     window: Window
     changed: Mask
@@ -166,10 +218,11 @@ class CostChange:
 
 @dataclass(frozen=True)
 class PreparedMap:
-    """A decoded snapshot with the lower bound of its costs."""
+    """A decoded snapshot with the lower bound of its costs, and the limits for robots in its cells."""
 
     decoded: DecodedMap
     lower_bound: Grid
+    limits: Grid
 
 
 def prepare_map(snapshot: MapSnapshot, inflation: Inflation) -> PreparedMap:
@@ -177,7 +230,8 @@ def prepare_map(snapshot: MapSnapshot, inflation: Inflation) -> PreparedMap:
     decoded = decode_map(snapshot)
     table = inflation_table(decoded.geometry.resolution, inflation)
     inflated = inflate(np.ascontiguousarray(decoded.static), table)
-    return PreparedMap(decoded, np.minimum(inflated, decoded.layers["cost"], out=inflated))
+    limits = under_body(decoded.layers["speed"], body_reach(inflation, decoded.geometry))
+    return PreparedMap(decoded, np.minimum(inflated, decoded.layers["cost"], out=inflated), limits)
 
 
 @dataclass(frozen=True)
@@ -191,11 +245,17 @@ class Loaded:
 class MapTracker:
     """Follows the map-service's map, and reports which costs changed."""
 
-    def __init__(self, inflation: Inflation, *, grace_s: float, max_age_s: float, standing_s: float) -> None:
+    def __init__(
+        self, inflation: Inflation, *, grace_s: float, max_age_s: float, standing_s: float, time_in_cost: bool = True
+    ) -> None:
         self._inflation = inflation
+        self._time_in_cost = time_in_cost
         self._max_age_s = max_age_s
         self._follower = MapFollower(grace_s=grace_s)
-        self._lower_bound: Grid = np.zeros((0, 0), dtype=np.uint8)
+        self._cost: Grid = np.zeros((0, 0), dtype=np.uint8)
+        """The costs that paths are planned on; without the time the replica's own array."""
+        self._limits: Grid = self._cost
+        self._lower_bound: Grid = self._cost
         self._standing = StandingMap(standing_s)
         self._current: PlanningMap | None = None
         self._copy: PlanningMap | None = None
@@ -213,7 +273,7 @@ class MapTracker:
         bounds_are_new = current is None or current.lower_bound is not self._lower_bound
         if current is None or bounds_are_new or current.version != replica.version or current.standing is not standing:
             self._current = PlanningMap(
-                replica.geometry, replica.version, replica.cost, replica.static, self._lower_bound, standing
+                replica.geometry, replica.version, self._cost, replica.static, self._lower_bound, standing
             )
         return self._current
 
@@ -229,20 +289,22 @@ class MapTracker:
         return self._copy
 
     @property
-    def speed_layer(self) -> Grid:
-        """The speed layer (cm/s, 0 = no limit) of the newest version. The next delta changes its cells."""
-        return self._follower.replica.speed
+    def limits(self) -> Grid:
+        """The speed limit (cm/s, 0: none) for a robot in each cell: the lowest under its body.
+
+        The next delta changes its cells.
+        """
+        return self._limits
 
     @property
-    def limits(self) -> tuple[Grid, GridGeometry] | None:
-        """The speed layer and its grid, for any thread; None before the first snapshot or while one is loaded."""
-        replica = self._follower.replica
-        geometry, layer = replica.geometry, replica.layers.get("speed")
-        return None if geometry is None or layer is None or layer.shape != geometry.shape else (layer, geometry)
+    def limits_on_grid(self) -> tuple[Grid, GridGeometry] | None:
+        """The limits and their grid, for any thread; None before the first snapshot or while one is loaded."""
+        geometry, limits = self._follower.replica.geometry, self._limits
+        return None if geometry is None or limits.shape != geometry.shape else (limits, geometry)
 
-    def speed(self) -> Grid:
-        """Return a copy of the speed layer (cm/s, 0 = no limit) of the newest version."""
-        return self._follower.replica.speed.copy()
+    def layers(self) -> dict[Layer, Grid]:
+        """Return copies of the newest version's layers, as the map-service has them."""
+        return {layer: cells.copy() for layer, cells in self._follower.replica.layers.items()}
 
     def wants_snapshot(self, now: float) -> bool:
         """Whether a snapshot is needed to follow the map."""
@@ -260,10 +322,14 @@ class MapTracker:
         prepared = snapshot if isinstance(snapshot, PreparedMap) else prepare_map(snapshot, self._inflation)
         before = self._follower.version
         applied = self._follower.on_snapshot(prepared.decoded, now)
-        cost = self._follower.replica.cost
-        lower_bound = prepared.lower_bound
-        if applied.version != prepared.decoded.version:
-            # Deltas that arrived meanwhile were applied, too.
+        replica = self._follower.replica
+        limits, lower_bound = prepared.limits, prepared.lower_bound
+        has_deltas = applied.version != prepared.decoded.version
+        if has_deltas:  # they arrived meanwhile, and were applied, too
+            limits = under_body(replica.speed, body_reach(self._inflation, prepared.decoded.geometry))
+        self._limits = limits
+        cost = self._cost = with_time(replica.cost, limits) if self._time_in_cost else replica.cost
+        if has_deltas:
             lower_bound = np.minimum(lower_bound, cost)
         same_floor = np.array_equal(lower_bound, self._lower_bound)
         if not same_floor:
@@ -278,7 +344,7 @@ class MapTracker:
     def settle(self, now: float) -> None:
         """Let the standing costs follow what has stayed on the map; call it often."""
         if self.current is not None:
-            self._standing.settle(self._follower.replica.cost, now)
+            self._standing.settle(self._cost, now)
 
     def on_heartbeat(self, heartbeat: MapHeartbeat, now: float) -> None:
         """Compare with the map-service's version; if deltas are missing, a snapshot is needed."""
@@ -293,17 +359,33 @@ class MapTracker:
         return self._differences(applied)
 
     def _differences(self, applied: Applied) -> list[CostChange]:
-        changes = []
-        for (layer, window), previous in zip(applied.windows, applied.previous, strict=True):
-            if layer != "cost":
+        changes, replica = [], self._follower.replica
+        for (layer, written), before in zip(applied.windows, applied.previous, strict=True):
+            window = self._limit(written) if layer == "speed" else written
+            place, previous = (window.rows, window.columns), before
+            if self._time_in_cost:
+                previous = self._cost[place].copy()
+                self._cost[place] = with_time(replica.cost[place], self._limits[place])
+            elif layer != "cost":
                 continue
-            cost = self._follower.replica.cost[window.rows, window.columns]
+            cost = self._cost[place]
             self._adjust_lower_bound(window, cost)
             self._standing.update(window, cost)
             changed, decreased = cost != previous, cost < previous
             if changed.any():
                 changes.append(CostChange(window, changed, decreased, applied.traces))
         return changes
+
+    def _limit(self, window: Window) -> Window:
+        """Update the limits after the speed layer has changed in a window; return where they may have changed."""
+        geometry = self._follower.replica.geometry
+        assert geometry is not None
+        reach = body_reach(self._inflation, geometry)
+        changed, around = geometry.clip(window.grown(reach)), geometry.clip(window.grown(2 * reach))
+        limits = under_body(self._follower.replica.speed[around.rows, around.columns], reach)
+        x, y = changed.x - around.x, changed.y - around.y
+        self._limits[changed.rows, changed.columns] = limits[y : y + changed.height, x : x + changed.width]
+        return changed
 
     def _adjust_lower_bound(self, window: Window, cost: Grid) -> None:
         """Lower the bound where traversable cells fall below it, in a new array, so that users notice the change."""

@@ -9,10 +9,10 @@ from fog_contracts.messages import Pose, Refusal
 from fog_runtime import logs
 from fog_runtime.clock import ticker
 from fog_runtime.stores.redis_connection import StoreError
+from planner.planning_map import USUAL_SPEED
 from planner.stops import Order
 from planner.store import NO_MISSION, VISIT_ENDED, MissionConflictError, OutOfServiceError
 from planner.visits import DRIVING, READY_S, Act, Facts, Visit, VisitEnd, Visits, is_free
-from planner.waits.pace import USUAL_SPEED
 
 if TYPE_CHECKING:
     from collections.abc import Mapping

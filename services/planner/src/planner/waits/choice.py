@@ -17,10 +17,11 @@ from fog_contracts.geometry import distance_to_polygon, lengths_along, sampled
 from fog_contracts.messages import BlockedWay, HazardArea
 from fog_contracts.shapes import box_around, shape_box, shape_contains
 from planner.path_search import Route
+from planner.planning_map import USUAL_SPEED
 from planner.regions import cause_of, name_of
 from planner.waits.blocks import Blocks
 from planner.waits.durations import all_of, best_policy, until
-from planner.waits.pace import USUAL_SPEED, Times
+from planner.waits.pace import Times
 
 if TYPE_CHECKING:
     from collections.abc import Sequence

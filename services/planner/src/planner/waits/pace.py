@@ -11,9 +11,9 @@ from typing import TYPE_CHECKING, Annotated, Final, NamedTuple
 import numpy as np
 from msgspec import Meta
 
-from fog_contracts.costs import DEGRADED_SPEED
 from fog_contracts.geometry import lengths_along, sampled
 from fog_contracts.messages import Arrival, Message
+from planner.planning_map import USUAL_SPEED
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -24,9 +24,7 @@ if TYPE_CHECKING:
     from planner.path_search import Route
 
     Floats = NDArray[np.float64]
-
-USUAL_SPEED: Final = 2 * DEGRADED_SPEED / 100
-"""Speed (m/s) of a robot where nothing limits it."""
+    Grid = NDArray[np.uint8]
 
 
 class Times(NamedTuple):
@@ -36,12 +34,12 @@ class Times(NamedTuple):
     seconds: Floats
 
     @classmethod
-    def of(cls, route: Route, speed: NDArray[np.uint8], geometry: GridGeometry, begin: float = 0.0) -> Times:
-        """Return the times of a route from `begin` (m) on by the speed layer (cm/s, 0: no limit)."""
+    def of(cls, route: Route, limits: Grid, geometry: GridGeometry, begin: float = 0.0) -> Times:
+        """Return the times of a route from `begin` (m) on by the limits in its cells (cm/s, 0: none)."""
         points = sampled(route.remaining(begin), route.spacing)
         along = lengths_along(points)
-        limits = geometry.sample(speed, (points[:-1] + points[1:]) / 2.0, 0) / 100.0
-        speeds = np.where(limits > 0.0, np.minimum(limits, USUAL_SPEED), USUAL_SPEED)
+        sampled_limits = geometry.sample(limits, (points[:-1] + points[1:]) / 2.0, 0) / 100.0
+        speeds = np.where(sampled_limits > 0.0, np.minimum(sampled_limits, USUAL_SPEED), USUAL_SPEED)
         return cls(along, np.append(0.0, np.cumsum(np.diff(along) / speeds)))
 
     def at(self, along: float) -> float:

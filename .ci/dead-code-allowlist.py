@@ -18,6 +18,7 @@ _.after_input  # the agent's replay: where a recording and its replay differ
 _.control_p99_s  # messages: how regular the agent's loops are
 _.stream_p99_s
 _.severity
+(_.request_time, _.available_floors, _.lift_time)  # messages: Open-RMF's, of a lift
 _.uptime_ms  # messages: of a sensor node
 _.rssi
 _.fw

@@ -11,7 +11,7 @@ import subprocess
 import threading
 import time
 from collections.abc import AsyncIterator, Callable, Iterator
-from contextlib import AsyncExitStack, asynccontextmanager, contextmanager, suppress
+from contextlib import AsyncExitStack, ExitStack, asynccontextmanager, contextmanager, suppress
 from pathlib import Path
 
 import httpx
@@ -472,16 +472,26 @@ def shared_fog(tmp_path_factory: pytest.TempPathFactory, servers_pool: ServersPo
 
 
 @pytest.fixture(scope="module")
-def shared_open_fog(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Fog]:
-    """Yield as `shared_fog` one whose servers admit everybody, unencrypted: for tests that change what they send."""
-    servers = Servers(tmp_path_factory.mktemp("servers"), secured=False)
-    running = Fog(tmp_path_factory.mktemp("fog"), servers)
-    try:
-        running.start("map_service")
-        yield running
-    finally:
-        running.close()
-        servers.close()
+def open_fog() -> Iterator[Callable[[Path], Fog]]:
+    """Yield a function that makes a fog in a folder, whose servers admit everybody, unencrypted."""
+    with ExitStack() as stack:
+
+        def make(folder: Path) -> Fog:
+            servers = Servers(folder, secured=False)
+            stack.callback(servers.close)
+            running = Fog(folder, servers)
+            stack.callback(running.close)
+            return running
+
+        yield make
+
+
+@pytest.fixture(scope="module")
+def shared_open_fog(tmp_path_factory: pytest.TempPathFactory, open_fog: Callable[[Path], Fog]) -> Fog:
+    """Return as `shared_fog` one whose servers admit everybody, unencrypted: for tests that change what they send."""
+    running = open_fog(tmp_path_factory.mktemp("fog"))
+    running.start("map_service")
+    return running
 
 
 @pytest.fixture(scope="module")

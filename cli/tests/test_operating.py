@@ -507,6 +507,15 @@ def test_goal_is_a_place_or_a_position(demo: Service, goal: str, body: object) -
     assert demo.requests[0][2] == body
 
 
+def test_goal_on_another_floor_is_a_way_by_the_lift(demo: Service) -> None:
+    demo.answers["PUT", "/api/v1/robots/r1/floor"] = (200, {})
+    demo.answers["GET", "/api/v1/robots"] = (200, [ROBOT])
+    assert run("robot", "goal", "desk", "--floor", "upstairs") == (
+        "accepted: robot r1 goes to desk on upstairs, by the lift (mode NORMAL)"
+    )
+    assert demo.requests[0][2] == {"place": "desk", "floor": "upstairs"}
+
+
 @pytest.mark.parametrize("goal", ["5.0", "Meeting room", ""])
 def test_goal_that_is_neither_a_place_nor_a_position_is_wrong_use(demo: Service, goal: str) -> None:
     assert "is neither a place" in run("robot", "goal", goal, code=2)

@@ -63,6 +63,7 @@ class Process:
             "source": (self.user,) if self.role == ch.ZONE_SOURCE else SOURCES,
             "zone": ("wet",),
             "thing": ("tb4",),
+            "lift": ("north",),
             "set": ("night",),
             "area": AREAS,
             "role": (self.role,),

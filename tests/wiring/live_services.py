@@ -180,6 +180,10 @@ class MemoryStore:
     async def earlier_result(self, _attempt: Any) -> None:
         return None
 
+    async def berths(self) -> dict[str, Any]:
+        """No robot was ever handed over."""
+        return {}
+
     async def out_of_service(self) -> dict[str, Any]:
         return {}
 

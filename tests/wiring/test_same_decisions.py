@@ -402,18 +402,21 @@ OF_ZONE_SOURCES = {
     ("map-service", channel) for channel in (ch.ZONE_REQUEST, ch.ZONE_SET_SWITCH, ch.ZONE_SOURCE_PROBLEM)
 }
 """Only for a site that has sources of zones: services/map-service/tests/test_zone_sources.py has one."""
+OF_LIFTS = {("planner", ch.LIFT_STATE), ("planner", ch.LIFT_REQUEST)}
+"""Only for a site that has lifts: services/tests/test_floors.py has two."""
 
 
 def test_services_subscribe_to_exactly_the_channels_that_the_table_gives_them(live):
     _, services = live
     for kind in ("pub", "liveliness"):
-        expected = table_pairs(services, kind, "subscribers") - OF_ZONE_SOURCES
+        expected = table_pairs(services, kind, "subscribers") - OF_ZONE_SOURCES - OF_LIFTS
         assert names_of(of_kind(services.subscribed, kind)) == names_of(expected)
 
 
 def test_services_publish_exactly_the_channels_that_the_table_gives_them(live):
     _, services = live
-    assert names_of(services.published) == names_of(table_pairs(services, "pub", "publishers") - OF_ZONE_SOURCES)
+    expected = table_pairs(services, "pub", "publishers") - OF_ZONE_SOURCES - OF_LIFTS
+    assert names_of(services.published) == names_of(expected)
 
 
 def test_services_answer_exactly_the_queries_that_the_table_gives_them(live):

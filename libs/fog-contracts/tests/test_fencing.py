@@ -10,6 +10,7 @@ AT = Moment(1.0, 2.0)
 LED = {ch.AGGREGATOR, ch.MAP, ch.PLANNER}
 WITHOUT_EPOCH = {
     "leader",  # the announcement itself
+    "lift_request",  # the lift itself is the lock: it serves one session, which is one ride of one robot
     "node_config",  # constant, from the site's files
     "zone_request",  # of others; the map-service only deletes what the broker retains of it
 }

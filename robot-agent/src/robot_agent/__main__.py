@@ -20,6 +20,7 @@ from fog_runtime.clock import SystemClock
 from fog_runtime.configuration.robot_file import load_robot
 from fog_runtime.configuration.settings import describe, load
 from robot_agent import registry
+from robot_agent.agent.berths import read_berths
 from robot_agent.agent.edges.guardian_client import GuardianClient
 from robot_agent.agent.edges.lidar_edge import Devices, LidarEdge
 from robot_agent.agent.settings import Settings, read_given, read_port
@@ -40,10 +41,13 @@ async def main() -> None:
     """Begin the lidar's scan, load the rest of the agent, and run it until cancelled."""
     settings = load(Settings, environ=os.environ)
     logs.configure("robot-agent", settings.log_level, settings.log_format)
+    berths = read_berths(settings.floors_file, settings.data_dir)
+    if berths is not None:
+        settings = berths.settings(settings)
     _log.info("settings_loaded", **describe(settings))
     robot, clock = load_robot(os.environ), SystemClock(settings.speed)
     port, name = read_port(robot), robot.settings.lidar.driver
-    given = read_given(settings, robot)
+    given = read_given(settings, robot, berths)
     driver = await process.load_aside(partial(registry.make_lidar, robot))
     check = partial(LineCheck, port, name, registry.signatures())
     guardian, lidar = GuardianClient(settings.guardian_socket, clock), LidarEdge(port, driver, clock, check=check)

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Final
 
 from fog_contracts.channels import MAP_HEARTBEAT, ROBOT_RELEASE
 from fog_contracts.costs import DEFAULT_INFLATION, DEGRADED_SPEED, ROBOT_RADIUS, Inflation
-from fog_contracts.messages import Pose  # noqa: TC001  # read at run time, when a configuration is decoded
+from fog_contracts.messages import Berth, Pose  # noqa: TC001  # read at run time, when a configuration is decoded
 from fog_contracts.robot import MotionSettings
 from fog_contracts.site import MarkerSite  # noqa: TC001  # read at run time, when a configuration is decoded
 from fog_kernels.dwa import DwaLimits, DwaSettings
@@ -226,6 +226,12 @@ class AgentConfig:
     """The robot's pose (frame `map`) on its dock; None if its site gives none."""
     staging: Pose | None = None
     """Where it goes before the base looks for the dock."""
+    berth: Berth | None = None
+    """The floor that the robot is on, by its own record; None if it knows no other."""
+    floors: tuple[str, ...] = ()
+    """All floors that it knows."""
+    resumes: bool = False
+    """Whether it was enabled when it left the last floor just now: it may drive on once nothing else keeps it."""
     safety: SafetyConfig = field(default_factory=SafetyConfig)
     stop_field: StopFieldConfig = field(default_factory=StopFieldConfig)
     visibility: VisibilityConfig = field(default_factory=VisibilityConfig)

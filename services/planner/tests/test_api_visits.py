@@ -70,6 +70,9 @@ class World:
     async def goals(self) -> dict[str, StoredGoal]:
         return dict(self.stored)
 
+    async def berths(self) -> dict[str, Any]:
+        return {}
+
     async def out_of_service(self) -> dict[str, Any]:
         return {}
 

@@ -172,7 +172,16 @@ def robot_profile(
 
 
 @robot_app.command("goal", context_settings=NUMBERS, epilog="Example: fognav robot goal b")
-def robot_goal(goal: Target, *, robot: RobotOption = None, fog: FogOption = None, json: JsonOption = False) -> None:
+def robot_goal(
+    goal: Target,
+    *,
+    floor: Annotated[
+        str | None, typer.Option("--floor", help="The floor of the goal, if it is another one: it takes the lift.")
+    ] = None,
+    robot: RobotOption = None,
+    fog: FogOption = None,
+    json: JsonOption = False,
+) -> None:
     """Send a robot to a place or position.
 
     It must be enabled to drive there.
@@ -181,12 +190,13 @@ def robot_goal(goal: Target, *, robot: RobotOption = None, fog: FogOption = None
         found = find_fog(fog)
         chosen = found.robot(robot)
         try:
-            found.send("PUT", PLANNER, f"/api/v1/robots/{chosen}/goal", _goal(goal))
+            path, body = ("goal", _goal(goal)) if floor is None else ("floor", {**_goal(goal), "floor": floor})
+            found.send("PUT", PLANNER, f"/api/v1/robots/{chosen}/{path}", body)
         except RefusedError as error:
             _report(_refused(error, _view(found, chosen)[1]), json=json)
         mode = _view(found, chosen)[1]
-        waits = _WAITS_FOR.get(mode, "")
-        _report(Outcome(accepted=True, reason=f"robot {chosen} goes to {goal}{waits}", mode=mode), json=json)
+        waits, where = _WAITS_FOR.get(mode, ""), "" if floor is None else f" on {floor}, by the lift"
+        _report(Outcome(accepted=True, reason=f"robot {chosen} goes to {goal}{where}{waits}", mode=mode), json=json)
 
 
 @robot_app.command("cancel", epilog="Example: fognav robot cancel")

@@ -316,6 +316,10 @@ ROBOT_VITALS      = _pub(  "robot_vitals",      FOG + "robots/{robot}/vitals",  
     publishers=(ROBOT,),   subscribers=(WEB,), durability=VOLATILE, rate_hz=0.5, max_age_s=6)
 ROBOT_COMMAND     = _query("robot_command",     FOG + "robots/{robot}/command",   m.RobotCommand,   limit=KIB,
     publishers=(ROBOT,),   subscribers=(PLANNER, CONSOLE), reply=m.CommandReply, reply_limit=2 * KIB)
+LIFT_STATE        = _pub(  "lift_state",        FOG + "lifts/{lift}/state",       m.LiftState,      limit=16 * KIB,
+    publishers=(SIM,), subscribers=(PLANNER,), durability=VOLATILE, rate_hz=1, max_age_s=3)
+LIFT_REQUEST      = _pub(  "lift_request",      FOG + "lifts/{lift}/request",     m.LiftRequest,    limit=KIB,
+    publishers=(PLANNER,), subscribers=(SIM,), durability=VOLATILE)
 LEADER            = _pub(  "leader",            FOG + "leaders/{role}", m.Leader, limit=KIB,
     publishers=(AGGREGATOR, MAP, PLANNER), subscribers=(AGGREGATOR, MAP, PLANNER), durability=VOLATILE, rate_hz=4,
     max_age_s=1.5)

@@ -9,7 +9,7 @@ from typing import Final
 
 import msgspec
 
-from fog_contracts.messages import CommandKind, Pose, ProfileName, Reason, RefusalCode, RobotCommand
+from fog_contracts.messages import CommandKind, HandOver, Pose, ProfileName, Reason, RefusalCode, RobotCommand
 
 VALID_S: Final = 5.0
 """Seconds of the robot's clock after `issued_at` during which a command is valid."""
@@ -25,7 +25,9 @@ PROFILE_OF: Final[Mapping[CommandKind, ProfileName]] = {
 def _signature(command: RobotCommand, key: bytes) -> bytes:
     if len(key) < KEY_BYTES:
         raise ValueError(f"the operators' key must have at least {KEY_BYTES} bytes, not {len(key)}")
-    unsigned = msgspec.structs.replace(command, signature=b"")
+    unsigned = msgspec.structs.asdict(msgspec.structs.replace(command, signature=b""))
+    if command.given is None:
+        del unsigned["given"]  # robots of an earlier version sign without it
     return hmac.digest(key, msgspec.msgpack.encode(unsigned), "sha256")
 
 
@@ -51,14 +53,15 @@ def signed_command(  # noqa: PLR0913  # the fields of a command
     issued_at: float,
     key: bytes,
     pose: Pose | None = None,
+    given: HandOver | None = None,
 ) -> RobotCommand:
     """Return an operator's signed command; raises `ValueError` when the key is too short.
 
     `nonce` must never repeat; `boot` and `issued_at` are `boot` and `clock` of the robot's latest state; `pose` belongs
-    to `initial_pose` only.
+    to `initial_pose` only, `given` to `hand_over`.
     """
     unsigned = RobotCommand(
-        kind=kind, pose=pose, robot=robot, operator=operator, nonce=nonce, boot=boot, issued_at=issued_at
+        kind=kind, pose=pose, given=given, robot=robot, operator=operator, nonce=nonce, boot=boot, issued_at=issued_at
     )
     return sign(unsigned, key)
 

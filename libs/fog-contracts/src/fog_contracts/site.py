@@ -197,6 +197,19 @@ class MarkerSite(Message, frozen=True, kw_only=True):
     size: Annotated[float, Meta(ge=0.02, le=1.0)] = 0.16
 
 
+class LiftSite(Message, frozen=True, kw_only=True):
+    """A lift as this floor has it: all floors that it serves give it the same id, each its place on the own map.
+
+    `cabin`: where a robot stands in it, facing out of its door. `wait`: where it waits before the door, facing it, out
+    of the way of those who come out. `floors`: the sites' ids that it serves, this one's among them.
+    """
+
+    id: Id
+    cabin: Pose
+    wait: Pose
+    floors: Annotated[list[Id], Meta(min_length=2, max_length=200)]
+
+
 class DemoPlan(Message, frozen=True, kw_only=True):
     """The drive that the demo shows here: from one place to another, and the areas that may become blocked."""
 
@@ -229,6 +242,7 @@ class Site(Message, frozen=True, kw_only=True):
     robots: list[RobotSite] = field(default_factory=list)
     markers: list[MarkerSite] = field(default_factory=list)
     visitors: VisitorsSite = VisitorsSite()
+    lifts: list[LiftSite] = field(default_factory=list)
     layers: list[str | dict[str, Any]] = field(default_factory=list)
     demo: DemoPlan | None = None
 

@@ -5,7 +5,7 @@ from typing import Final
 
 from fog_contracts import channels as ch
 from fog_contracts.commands import STOPS, signed_command, unsigned_stop
-from fog_contracts.messages import CommandKind, CommandReply, Pose, RobotState
+from fog_contracts.messages import CommandKind, CommandReply, HandOver, Pose, RobotState
 from fog_runtime.transports.zenoh_edge import ZenohEdge
 
 REPLY_TIMEOUT_S: Final = 2.0
@@ -29,9 +29,12 @@ class RobotCommands:
         state: RobotState | None,
         pose: Pose | None = None,
         timeout_s: float = REPLY_TIMEOUT_S,
+        *,
+        given: HandOver | None = None,
     ) -> CommandReply | None:
-        """Send a command (`initial_pose` with a pose); return None without a reply within `timeout_s` of the clock.
+        """Send a command (`initial_pose` with a pose, `hand_over` with what is `given`).
 
+        Return None without a reply within `timeout_s` of the clock.
         `state` is the latest one that the robot published, at most 5 s ago; only a stop needs none.
         Raises `ContractError` for an invalid reply, `ValueError` for a command that needs key and state without them.
         """
@@ -50,5 +53,6 @@ class RobotCommands:
                 issued_at=state.clock,
                 key=self._key,
                 pose=pose,
+                given=given,
             )
         return await self._edge.query(ch.ROBOT_COMMAND, command, CommandReply, timeout_s, robot=robot)

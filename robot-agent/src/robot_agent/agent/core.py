@@ -11,6 +11,7 @@ Values and times go in, values come out. `now` is the robot's own monotonic cloc
 - calls `tick` 10 times a second and publishes what it returns;
 - sends the query of `egress_request` to the planner, and passes the reply to `on_egress_reply`;
 - lets the lidar's motor turn while `lidar_on`;
+- stores `berth_to_store`, if there is one, and ends;
 - requests a snapshot of the map while `wants_snapshot`, passes what `prepare_map` makes of it to
   `load`, and stores what `pose_to_store` returns.
 """
@@ -26,7 +27,8 @@ from msgspec.structs import replace
 from fog_contracts import channels as ch
 from fog_contracts.follower import MapFollower
 from fog_contracts.handlers import Fence
-from fog_contracts.messages import SENTENCE_MAX, LoopHealth
+from fog_contracts.handover import next_berth
+from fog_contracts.messages import SENTENCE_MAX, LoopHealth, Reason, ReasonCode, RefusalCode
 from fog_contracts.replica import MapError
 from robot_agent.agent.hand_driving import HandBack, HandReply, Steer, TakeOver, Watch
 from robot_agent.agent.maneuvers import Maneuvers
@@ -51,13 +53,14 @@ if TYPE_CHECKING:
 
     from fog_contracts.handlers import Handler, Ids, Moment, Publication, QueryHandler
     from fog_contracts.messages import (
+        Berth,
         CommandReply,
         EgressRequest,
+        HandOver,
         MapSnapshot,
         PlanReply,
         Pose,
         ProfileName,
-        Reason,
         RobotCommand,
         RobotObstacles,
         RobotPose,
@@ -105,6 +108,8 @@ class AgentCore:
         self._reporter = ObstacleReporter(config.obstacle_ttl, config.obstacle_limit, config.radius)
         self._commands = OperatorCommands(config, self)
         self._publishing = PublishingPolicy(config.robot)
+        self._berth = config.berth
+        self._resumes = config.resumes
         self._loop_health = LoopHealth()
         self._looked_at = self._ticked_at = -math.inf
         """When `stream` last evaluated its inputs, and `tick` last looked for what to publish."""
@@ -220,6 +225,9 @@ class AgentCore:
         goal_id = self._driving.mission.goal_id
         self._rest.update(busy=not self.idle, goal_id=goal_id, now=now, base_ready=self._base.ready)
         safety = self._evaluate_safety(now)
+        if self._resumes and [reason.code for reason in self._safety.state.reasons] == [ReasonCode.NOT_ENABLED]:
+            safety = self._evaluate_safety(now, "enable")
+            self._resumes = safety.refusal is not None
         if self._maneuvers.may_seek_dock(self._safety.state, self._base.feedback, self._driving, now):
             safety = self._evaluate_safety(now, "dock")
             self._maneuvers.docking.on_begun(safety.refusal)
@@ -285,6 +293,7 @@ class AgentCore:
 
     def request(self, request: Request, now: float) -> SafetyOutputs:
         """Pass an operator's request to the safety gate; the outputs carry its refusal."""
+        self._resumes = False
         self._rest.on_request(request)
         self._maneuvers.on_request(request, self._safety.state)
         outputs = self._evaluate_safety(now, request)
@@ -342,6 +351,34 @@ class AgentCore:
             self._localizer.initial_pose(pose.x, pose.y, pose.theta)
         return refusal
 
+    def hand_over(self, given: HandOver | None) -> Reason | None:
+        """Leave this floor for another one; return why not, None when it is done, or was.
+
+        Then `berth_to_store` has the new record: whoever runs the core stores it, and ends.
+        """
+        if self._berth is None or given is None:
+            return Reason(RefusalCode.ONE_FLOOR, "this robot has no list of floors (FOGNAV_FLOORS_FILE)")
+        if given.floor not in self._config.floors:
+            known = ", ".join(self._config.floors)
+            return Reason(RefusalCode.NO_FLOOR, f"this robot does not know {given.floor} (known: {known})")
+        if not self._driving.wheels.at_rest:
+            return Reason(RefusalCode.DRIVING, "the robot is driving: it must stand where it leaves the floor")
+        after = next_berth(self._berth, given)
+        if isinstance(after, Reason):
+            return after
+        self._berth = after
+        return None
+
+    @property
+    def enabled(self) -> bool:
+        """Whether the robot is enabled."""
+        return self._safety.state.enabled
+
+    @property
+    def berth_to_store(self) -> Berth | None:
+        """The robot's record of its floor once it was handed over, which must be durable before it speaks there."""
+        return self._berth if self._berth != self._config.berth else None
+
     def switch_profile(self, name: ProfileName) -> Reason | None:
         """Navigate by another profile; return why not, None when it is done."""
         self._rest.wake()
@@ -388,7 +425,7 @@ class AgentCore:
         """Return mode, reasons, goal, path and map version as a message."""
         mission = self._driving.mission
         driven = mission if mission.active and self.safety.mission_may_drive else None
-        return robot_state(
+        state = robot_state(
             self._safety.state,
             mission,
             self.replica.version,
@@ -407,6 +444,9 @@ class AgentCore:
             hypotheses=self._localizer.hypotheses,
             at=at,
         )
+        if self._berth is None:
+            return state
+        return replace(state, berth=self._config.berth, floors=list(self._config.floors))
 
     def finished_traces(self) -> list[Trace]:
         """Return the traces that were completed since the last call, each once: for histograms."""

@@ -12,7 +12,7 @@ if TYPE_CHECKING:
     from collections.abc import Mapping
 
     from fog_contracts.handlers import Moment
-    from fog_contracts.messages import Pose, ProfileName, RobotCommand
+    from fog_contracts.messages import HandOver, Pose, ProfileName, RobotCommand
     from fog_contracts.replica import Replica
     from robot_agent.config import AgentConfig
     from robot_agent.safety.conditions import Request
@@ -43,6 +43,9 @@ class CommandTarget(Protocol):
     def set_initial_pose(self, pose: Pose | None) -> Reason | None:
         """Start localization at a pose in `map`; return why the pose is refused, None when it is accepted."""
 
+    def hand_over(self, given: HandOver | None) -> Reason | None:
+        """Leave this floor for another one; return why not, None when it is done, or was."""
+
     def switch_profile(self, name: ProfileName) -> Reason | None:
         """Navigate by another profile; return why not, None when it is done."""
 
@@ -54,7 +57,7 @@ class OperatorCommands:
         self._gate = CommandGate(config.robot, config.operator_key, config.boot)
         self._robot = robot_actions
 
-    def answer(self, command: RobotCommand, at: Moment) -> CommandReply:
+    def answer(self, command: RobotCommand, at: Moment) -> CommandReply:  # noqa: PLR0911  # one answer per kind
         """Execute a command, or refuse it with a reason."""
         refusal = self._gate.refusal(command, at.now)
         if refusal is not None:
@@ -68,6 +71,8 @@ class OperatorCommands:
                 return self._cancel()
             case "initial_pose":
                 return self._start_localization(command.pose)
+            case "hand_over":
+                return self._hand_over(command.given)
             case "profile_default" | "profile_full" | "profile_fog":
                 return self._switch(PROFILE_OF[command.kind])
 
@@ -88,6 +93,12 @@ class OperatorCommands:
         if refusal is not None:
             return CommandReply.refused(refusal)
         return CommandReply(accepted=True, reason="accepted; the next lidar scans verify it")
+
+    def _hand_over(self, given: HandOver | None) -> CommandReply:
+        refusal = self._robot.hand_over(given)
+        if refusal is not None or given is None:
+            return CommandReply.refused(refusal or Reason(RefusalCode.NO_FLOOR, "the command names no floor"))
+        return CommandReply(accepted=True, reason=f"the robot leaves this floor, and joins {given.floor}")
 
     def _switch(self, profile: ProfileName) -> CommandReply:
         refusal = self._robot.switch_profile(profile)

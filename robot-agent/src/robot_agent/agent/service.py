@@ -23,7 +23,7 @@ from fog_runtime.clock import Phase, Ticker
 from fog_runtime.configuration.robot_file import describe_robot
 from fog_runtime.health import Health, reachable_address, serve_health
 from fog_runtime.machine import ServiceManager, SuspensionMonitor, run_in_real_time
-from fog_runtime.process import release_startup_memory
+from fog_runtime.process import AgainError, release_startup_memory
 from fog_runtime.transports.edges import Edges
 from fog_runtime.transports.zenoh_edge import ZenohEdge, use_one_thread
 from fog_runtime.version import VERSION
@@ -49,6 +49,7 @@ if TYPE_CHECKING:
     from fog_contracts.robot import LidarSettings
     from fog_runtime.clock import Clock, SystemClock
     from fog_runtime.configuration.robot_file import RobotFile
+    from robot_agent.agent.berths import Berths
     from robot_agent.agent.core import AgentCore
     from robot_agent.agent.edges.guardian_client import GuardianClient
     from robot_agent.agent.edges.lidar_edge import Devices, LidarEdge
@@ -122,6 +123,8 @@ class Service:
         self._find_metrics_address = metrics_address
         self._metrics_address = ""
         self._was_connected = False
+        self.berths: Berths | None = None
+        """The floors that the robot knows, and its record of the one that it is on."""
         self.tools: LocalTools | None = None
         """Tools on this computer, which watch what the robot measures."""
 
@@ -140,6 +143,7 @@ class Service:
                 due = now + HOUSEKEEPING_S - STREAM_S / 2
                 self._core.on_loop_health(self._loop_health())
                 await self._store_pose(now)
+                await self._change_floor()
                 await self._announce_metrics()
                 self._report_health(self._clock.now(), lidar)
                 self._observe(self._clock.now(), lidar, guardian)
@@ -154,6 +158,18 @@ class Service:
                 await asyncio.to_thread(self._store.put_pose, pose)
             except OSError as error:
                 _log.error("pose_not_stored", reason=str(error))
+
+    async def _change_floor(self) -> None:
+        """Once the robot was handed over: store where, and end, to be started again on that floor."""
+        berth = self._core.berth_to_store
+        if berth is None or self.berths is None:
+            return
+        try:
+            await asyncio.to_thread(self.berths.store, berth, enabled=self._core.enabled)
+        except OSError as error:
+            _log.error("floor_not_stored", floor=berth.floor, reason=str(error), remedy="it is tried again")
+            return
+        raise AgainError(f"the robot is on {berth.floor} now")
 
     async def _announce_metrics(self) -> None:
         """Look up this computer's address after each connection: a network gives it another one now and then."""
@@ -401,6 +417,9 @@ async def run(settings: Settings, robot: RobotFile, given: Given, clock: SystemC
         finds_dock=isinstance(given.base, DockingDriver),
         markers=given.markers,
     )
+    if given.berths is not None:
+        floors, resumes = tuple(given.berths.floors), await asyncio.to_thread(given.berths.take_enabled)
+        config = replace(config, berth=given.berths.berth, floors=floors, resumes=resumes)
     source = "radius of site.toml" if given.footprint is None else "footprint of robot.toml"
     inscribed = round(config.footprint.inscribed_radius, 3)
     sizes = {"radius": config.radius, "inscribed_radius": inscribed}
@@ -420,6 +439,7 @@ async def run(settings: Settings, robot: RobotFile, given: Given, clock: SystemC
             store = Store(settings.data_dir)
             address = partial(reachable_address, settings.http_host, server.port, settings.zenoh_endpoints)
             agent = Service(core, zenoh, store, clock, health, address)
+            agent.berths = given.berths
             map_loader = MapLoader(core, zenoh, store, clock, site=site, phase=agent.phase)
             map_loader.begin()
             guardian.begin(agent.on_feedback, agent.on_base_lost)

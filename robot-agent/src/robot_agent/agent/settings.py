@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Final, NamedTuple
 
 import msgspec
-from msgspec import Meta
+from msgspec import Meta, structs
 
 from fog_contracts.commands import KEY_BYTES
 from fog_contracts.messages import Id, Pose
@@ -33,6 +33,7 @@ if TYPE_CHECKING:
 
     from fog_runtime.configuration.robot_file import RobotFile
     from fog_runtime.credentials import Credentials
+    from robot_agent.agent.berths import Berths
     from robot_agent.hardware import BaseDriver, LidarTraits
 
 SITE_FILE: Final = "site.toml"
@@ -56,6 +57,9 @@ class Settings(CommonSettings, frozen=True, kw_only=True):
     `site_dir` has the `site.toml` that the fog node has: this robot's entry says how large it is, where it starts, and
     where its dock is. The map itself comes from the map-service.
 
+    `floors_file`: the floors of its building that the robot knows. Then site, router, keys and `site_dir` are those of
+    the floor that it is on, whatever the other settings say.
+
     `agent_realtime_priority`: of all its threads, below the guardian's; 0 for none. On a clock of another speed: none.
     """
 
@@ -63,6 +67,7 @@ class Settings(CommonSettings, frozen=True, kw_only=True):
     guardian_socket: Path
     fog: bool = True
     site_dir: Path = Path()
+    floors_file: Path | None = None
     seed: Annotated[int, Meta(ge=0)] = 0
     input_log: Path | None = None
     obstacle_memory_s: Annotated[float, Meta(gt=0.0, le=600.0)] = 600.0
@@ -79,10 +84,11 @@ class Given(NamedTuple):
     credentials: Credentials
     footprint: Footprint | None
     base: BaseDriver
+    berths: Berths | None = None
 
 
-def read_given(settings: Settings, robot: RobotFile) -> Given:
-    """Read all of it, before any device moves and anything slow is loaded.
+def read_given(settings: Settings, robot: RobotFile, berths: Berths | None = None) -> Given:
+    """Read all of it, before any device moves and anything slow is loaded; `settings` are those of the floor.
 
     Raises:
         SettingsError: for a wrong setting or file.
@@ -91,7 +97,8 @@ def read_given(settings: Settings, robot: RobotFile) -> Given:
     """
     footprint, base = read_footprint(robot), registry.make_base(robot)
     if settings.fog:
-        site, body, markers = read_site(settings)
+        came_by = None if berths is None else berths.berth.came_by
+        site, body, markers = read_site(settings, None if came_by is None else came_by.lift)
     else:
         site, body, markers = *without_site(settings.robot, robot, footprint), []
     refuse_contradictions(robot, base)
@@ -113,13 +120,14 @@ def read_given(settings: Settings, robot: RobotFile) -> Given:
         credentials=settings.credentials() if settings.fog else NOBODY,
         footprint=footprint,
         base=base,
+        berths=berths,
     )
 
 
-def read_site(settings: Settings) -> tuple[str, RobotSite, list[MarkerSite]]:
+def read_site(settings: Settings, lift: str | None = None) -> tuple[str, RobotSite, list[MarkerSite]]:
     """Return the site's id, its entry of this robot, without which the body is not known, and its markers.
 
-    Raises `SettingsError`.
+    One that has come by a `lift` starts in its cabin. Raises `SettingsError`.
     """
     file = settings.site_dir / SITE_FILE
     if settings.site_dir == Path() and not file.is_file():
@@ -143,7 +151,8 @@ def read_site(settings: Settings) -> tuple[str, RobotSite, list[MarkerSite]]:
         )
     for robot in site.robots:
         if robot.id == settings.robot:
-            return site.id, robot, site.markers
+            cabins = [each.cabin for each in site.lifts if each.id == lift]
+            return site.id, structs.replace(robot, start=cabins[0]) if cabins else robot, site.markers
     known = ", ".join(robot.id for robot in site.robots) or "none"
     raise SettingsError(f"{file}: robots: there is no {settings.robot!r} (known: {known}). Add it, or set FOGNAV_ROBOT")
 

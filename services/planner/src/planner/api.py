@@ -53,6 +53,7 @@ from fog_runtime.stores.redis_store import IdempotencyError
 from planner.api_commands import KnownPlaces, add_commands
 from planner.api_visits import add_visits
 from planner.config import PlannerConfig
+from planner.lifts.api import add_floors
 from planner.problems import PlannerProblem
 from planner.query_queue import BusyError
 from planner.robot_operator import CommandError
@@ -173,6 +174,7 @@ def make_api(service: Service, site: Site, health: Health, tokens: Tokens, stand
     _add_orders(routes, service, robots, places)
     _add_missions(routes, service, robots, places)
     add_undo(routes, service, robots.check)
+    add_floors(routes, service, site, robots.check_single)
     add_visits(Routes(app, "visits"), lambda: service.visiting, standby)
     _add_plan(Routes(app, "plan"), service, robots, places)
     recovery = Routes(app, "store")
@@ -354,11 +356,15 @@ def _add_service(routes: Routes, service: Service, robots: _Robots) -> None:
 
     @routes.delete(
         "/api/v1/robots/{robot}/out-of-service",
-        raises=[StoreError],
+        raises=[OutOfServiceError, StoreError],
         problems=[PlannerProblem.NO_ROBOT, PlannerProblem.IN_SERVICE],
     )
     async def delete_out_of_service(robot: str, caller: Operator) -> None:
-        """Put a robot back into service. It stays where it is until somebody sends it."""
+        """Put a robot back into service. It stays where it is until somebody sends it.
+
+        One that has left for another floor can't be. One whose own record of its floor is older than this floor's
+        can: by that the operator says that it is here.
+        """
         robots.check(robot)
         if not await service.missions.put_back(robot, caller.name):
             raise ProblemError(PlannerProblem.IN_SERVICE, f"robot {robot} is in service")

@@ -96,6 +96,9 @@ def add_commands(
 
 def _pose(body: CommandBody, places: Mapping[str, Place]) -> Pose | None:
     """Return the pose of a command; raises a `ProblemError` for one that does not belong to it, or lacks."""
+    if body.kind == "hand_over":
+        detail = "a robot is handed over by a goal on another floor: PUT /api/v1/robots/{robot}/floor"
+        raise ProblemError(HttpProblem.REQUEST_INVALID, detail, field="body.kind")
     if body.kind != "initial_pose":
         if body.pose is not None or body.place is not None:
             detail = f"{body.kind} takes neither pose nor place: leave them out"

@@ -31,6 +31,11 @@ class PlannerProblem(ProblemCode):
         "out_of_service", 409, "An operator keeps the robot out of service: `detail` says why and till when",
         "Put it back into service, or send another robot",
     )  # fmt: skip
+    NO_LIFT = "no_lift", 422, "No lift of this site leads to that floor", "Choose a floor that `detail` names"
+    FLOOR_UNKNOWN = (
+        "floor_unknown", 409, "The robot does not know that floor",
+        "Add the floor to its list of floors, or send another one",
+    )  # fmt: skip
     COMMAND_REFUSED = (
         "command_refused", 409, "The robot refuses: `refusal` and `causes` identify why",
         "Do what `causes` ask for, then repeat it",

@@ -25,7 +25,7 @@ from fog_runtime.stores.redis_store import Audit
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping
 
-    from fog_contracts.messages import CommandKind, CommandReply, Pose, RobotState
+    from fog_contracts.messages import CommandKind, CommandReply, HandOver, Pose, RobotState
     from fog_runtime.clock import Clock
     from fog_runtime.transports.zenoh_edge import ZenohEdge
     from planner.store import MissionPersistence, Store
@@ -223,10 +223,14 @@ class RobotOperator:
                 return await self._deliver(kind, robot, who)
             finally:
                 await self._record_stop(robot, {"kind": kind}, who, kind)
-        state = self._fresh_state(robot)
+        state = self.fresh_state(robot)
         detail = {"kind": kind, **({} if pose is None else {"pose": pose})}
         await self._store.record_command(robot, msgspec.json.encode(detail), Audit(self._clock.stamp(), who, kind))
         return await self._deliver(kind, robot, who, state, pose)
+
+    async def hand_over(self, robot: str, given: HandOver) -> None:
+        """Tell a robot that it leaves this floor, which is recorded. Raises `CommandError`."""
+        await self._deliver("hand_over", robot, given.who, self.fresh_state(robot), given=given)
 
     async def stop(self, robot: str, sender: str, *, each: bool = False) -> CommandReply:
         """Stop a robot for anybody, with a token or without; return its reply. Raises `CommandError`.
@@ -287,12 +291,19 @@ class RobotOperator:
                 self._stops.recorded(robot, repeats, self._clock.now())
 
     async def _deliver(
-        self, kind: CommandKind, robot: str, who: str, state: RobotState | None = None, pose: Pose | None = None
+        self,
+        kind: CommandKind,
+        robot: str,
+        who: str,
+        state: RobotState | None = None,
+        pose: Pose | None = None,
+        given: HandOver | None = None,
     ) -> CommandReply:
         """Send a command, which needs a state unless it is a stop; raises `CommandError`."""
         commands = RobotCommands(self._zenoh, operator=who, key=self._key)
         try:
-            reply = await commands.send(kind, robot, state, pose, REPLY_TIMEOUT_S * max(1.0, self._clock.speed))
+            patience = REPLY_TIMEOUT_S * max(1.0, self._clock.speed)
+            reply = await commands.send(kind, robot, state, pose, patience, given=given)
         except ContractError as error:
             raise CommandError(f"robot {robot} gave an invalid reply: {error}. Check that versions match") from error
         if reply is None:
@@ -307,7 +318,8 @@ class RobotOperator:
             _log.info("robot_commanded", **told)
         return reply
 
-    def _fresh_state(self, robot: str) -> RobotState:
+    def fresh_state(self, robot: str) -> RobotState:
+        """Return the latest state of a robot that can be commanded; raises `CommandError`."""
         if self._key is None:
             raise CommandError(
                 "this planner has no operators' key, so it can only stop robots: set FOGNAV_OPERATOR_KEY_FILE to the"

@@ -27,12 +27,13 @@ from fog_runtime.transports.edges import Edges
 from fog_runtime.transports.zenoh_declarations import ASKER
 from planner.dock_missions import DockMissions
 from planner.dry_run_queue import DryRuns
+from planner.lifts.persistence import RidePersistence
+from planner.lifts.riding import Riding
 from planner.plan_records import PathRecord, PlanMetrics
 from planner.query_queue import BUSY_PAUSE_S, BusyError, QueryQueue, Threads
 from planner.refusals import busy
 from planner.robot_operator import RobotOperator
 from planner.snapshot_fetcher import SnapshotFetcher
-from planner.tours.persistence import TourPersistence
 from planner.visiting import Visiting
 
 if TYPE_CHECKING:
@@ -56,7 +57,7 @@ if TYPE_CHECKING:
     from fog_runtime.transports.zenoh_edge import ZenohEdge
     from planner.core import Job, PlannerCore
     from planner.stops import Order
-    from planner.store import MissionPersistence, Store, StoredGoal
+    from planner.store import Store, StoredGoal
 
     Emit = Callable[[Sequence[Publication]], object]
 
@@ -219,12 +220,12 @@ class Service:
         self._queue = QueryQueue(self._threads, on_idle=core.answerer.release)
         self.dry_runs = DryRuns(core, self._queue, clock.now)
         self._cycle = Cycle(core, zenoh)
-        missions = TourPersistence(core, store, clock, health, self._change_goal, self.path, synchronized)
-        self.missions: MissionPersistence = missions
+        self.missions = RidePersistence(core, store, clock, health, self._change_goal, self.path, synchronized)
         self._map = SnapshotFetcher(core, zenoh, clock, health, self._queue, on_loaded=self._wake.set)
         self.operator = RobotOperator(zenoh, store, clock, key)
         self._docks = DockMissions(site.staging, self.send)
         self.visiting = Visiting(self, site, clock)
+        self.riding = Riding(self, site, zenoh, clock)
         self._jobs: set[asyncio.Task[None]] = set()
         self._metrics = PlanMetrics()
         self.arrival = core.arrival
@@ -285,6 +286,7 @@ class Service:
         """Register subscriptions and queries."""
         handlers = {channel: self._queued(channel, handler) for channel, handler in self._core.handlers().items()}
         self._edges.subscribe(handlers, self._publish)
+        self.riding.subscribe()
         self._zenoh.serve(ch.PLANNER_PLAN, self._serve_plan)
         self._zenoh.serve(ch.PLANNER_EGRESS, self._serve_egress)
         self._zenoh.serve(ch.PLANNER_DRY_RUN, self._serve_dry_run)
@@ -294,13 +296,14 @@ class Service:
 
         def enqueue(ids: Ids, message: object, at: Moment) -> Sequence[Publication]:
             if isinstance(message, RobotPose):
-                if self.operator.is_doubled(ids["robot"]):
+                if self.operator.is_doubled(ids["robot"]) or not self.missions.is_here(ids["robot"]):
                     return ()  # nobody knows whose it is: the core plans for no robot whose pose is unknown
                 self.poses[ids["robot"]] = message
             elif isinstance(message, RobotState):
                 self.states[ids["robot"]] = message
                 self.operator.on_state(ids["robot"], message, at.now)
-                if self._answers:
+                self.riding.on_state(ids["robot"], message)
+                if self.leads:
                     stored = self.goals.get(ids["robot"])
                     self._docks.on_state(ids["robot"], message, stored.goal if stored else None, at.now)
                     self.visiting.on_state(ids["robot"], message)
@@ -312,12 +315,12 @@ class Service:
         return enqueue
 
     @property
-    def _answers(self) -> bool:
+    def leads(self) -> bool:
         """Whether this process answers queries; else another planner does."""
         return self._gate is None or self._gate.answers()
 
     async def _serve_plan(self, _ids: Ids, request: PlanRequest) -> PlanReply | None:
-        if not self._answers:
+        if not self.leads:
             return None
         try:
             return await self.preview(request, f"zenoh {ASKER.get()}")
@@ -325,7 +328,7 @@ class Service:
             return PlanReply(refusal=busy(str(error)), retry_after=error.retry_after)
 
     async def _serve_egress(self, _ids: Ids, request: EgressRequest) -> PlanReply | None:
-        if not self._answers:
+        if not self.leads:
             return None
         try:
             # Of the session that asks: it may name any robot.
@@ -335,7 +338,7 @@ class Service:
             return PlanReply(refusal=busy(str(error)), retry_after=error.retry_after)
 
     async def _serve_dry_run(self, _ids: Ids, request: DryRunRequest) -> DryRunReply | None:
-        return await self.dry_runs.change(request, f"zenoh {ASKER.get()}") if self._answers else None
+        return await self.dry_runs.change(request, f"zenoh {ASKER.get()}") if self.leads else None
 
     async def _answer(self, channel: ch.Channel, request: Message) -> PlanReply:
         """Answer a query on what the core knows now, which the core's thread only copies."""

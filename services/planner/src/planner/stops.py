@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated, Final, Literal, NamedTuple
 
 from msgspec import Meta, structs
 
-from fog_contracts.messages import Id, Message, PlanRefusal, PointXY, Pose, Stamp, TimeToLive
+from fog_contracts.messages import Author, FloorGoal, Id, Message, PlanRefusal, PointXY, Pose, Stamp, TimeToLive
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Container, Sequence
@@ -70,6 +70,19 @@ class Tour(Message, frozen=True, kw_only=True):
         return self.aside is not None or bool(self.ahead)
 
 
+class Ride(Message, frozen=True, kw_only=True):
+    """A mission to another floor: by which lift, which floor, and the goal there (`fog_contracts.handover`, ADR 76).
+
+    Its present goal is the place before the lift's door or, once it `boards`, the one in its cabin.
+    """
+
+    lift: Id
+    floor: Id
+    goal: FloorGoal | None = None
+    who: Author = ""
+    boards: bool = False
+
+
 class Order(NamedTuple):
     """A mission as an operator orders it, and the conditions of the order.
 
@@ -87,6 +100,7 @@ class Order(NamedTuple):
     action: str = "goal"
     visit: bool = False
     tour: Tour | None = None
+    ride: Ride | None = None
 
 
 def next_leg(tour: Tour, present: Stop) -> tuple[Stop, Tour]:

@@ -9,12 +9,12 @@ from datetime import UTC, datetime
 from functools import partial
 from typing import TYPE_CHECKING, Final
 
-from fog_contracts.messages import Message, OutOfService, RobotGoal
+from fog_contracts.messages import Berth, Message, OutOfService, RobotGoal
 from fog_runtime import logs
 from fog_runtime.stores import records
 from fog_runtime.stores.redis_connection import StoreError, StoreLostError, StoreRefusedError
 from fog_runtime.stores.redis_store import ANY, Audit, Outcome, RecoveryError, Table
-from planner.stops import Ends, Tour
+from planner.stops import Ends, Ride, Tour
 from planner.waits.persistence import LearnedPersistence, LearnedStore
 
 if TYPE_CHECKING:
@@ -29,6 +29,7 @@ if TYPE_CHECKING:
 
 _GOALS: Final = Table(records.GOALS, "mission", version="goal.goal_id")
 _SERVICE: Final = Table(records.OUT_OF_SERVICE, "service", version="id")
+_BERTHS: Final = Table(records.BERTHS, "robot", version="epoch")
 
 _log = logs.get("planner")
 
@@ -36,19 +37,20 @@ _log = logs.get("planner")
 class StoredGoal(Message, frozen=True, kw_only=True):
     """A mission as it is stored; `any_heading`: ignore the goal's theta. `visit`: it belongs to a visit (ADR 69).
 
-    `tour`: its other stops and rules, if it has any.
+    `tour`: its other stops and rules, if it has any. `ride`: it leads to another floor (ADR 76).
     """
 
     goal: RobotGoal
     any_heading: bool = False
     visit: bool = False
     tour: Tour | None = None
+    ride: Ride | None = None
 
 
 class Store(LearnedStore):
     """The planner's keys."""
 
-    tables = (_GOALS.name, _SERVICE.name)
+    tables = (_GOALS.name, _SERVICE.name, _BERTHS.name)
 
     async def goals(self) -> dict[str, StoredGoal]:
         """Return all stored missions by robot; an unreadable one is left out and logged.
@@ -83,6 +85,14 @@ class Store(LearnedStore):
         """
         return await self._swap(_SERVICE, robot, out, expected, audit)
 
+    async def berths(self) -> dict[str, Berth]:
+        """Return on which floor each robot is that was ever handed over, as far as this floor knows."""
+        return await self._readable_records(_BERTHS.name, Berth)
+
+    async def put_berth(self, robot: str, berth: Berth, known: Berth | None, audit: Audit) -> Outcome:
+        """Write durably on which floor a robot is, if what is stored is what is `known` (None: nothing)."""
+        return await self._swap(_BERTHS, robot, berth, "0" if known is None else str(known.epoch), audit)
+
     async def record_command(self, robot: str, command: bytes, audit: Audit) -> None:
         """Record an operator's command to a robot (JSON) in the audit trail."""
         await self._record("robot", robot, command, audit)
@@ -95,9 +105,18 @@ class Store(LearnedStore):
         """Return the mission that an earlier attempt with the same idempotency key stored."""
         return await self.recall(attempt, StoredGoal)
 
-    async def restore(self, goals: Mapping[str, StoredGoal], out: Mapping[str, OutOfService], audit: Audit) -> None:
-        """Replace the stored missions, and robots out of service, on an administrator's decision after a loss."""
-        await self._adopt({_GOALS.name: goals, _SERVICE.name: out}, audit)
+    async def restore(
+        self,
+        goals: Mapping[str, StoredGoal],
+        out: Mapping[str, OutOfService],
+        berths: Mapping[str, Berth],
+        audit: Audit,
+    ) -> None:
+        """Replace the stored missions, robots out of service and floors, on an administrator's decision after a loss.
+
+        They are those of this process's memory.
+        """
+        await self._adopt({_GOALS.name: goals, _SERVICE.name: out, _BERTHS.name: berths}, audit)
 
 
 STORE_PERIOD_S = 0.5
@@ -156,6 +175,8 @@ class MissionPersistence:
         self._out: dict[str, OutOfService] = {}
         self._ends = Ends(clock, synchronized)
         """Of missions (`Tour.id`) with a deadline, and of `OutOfService.id`."""
+        self.berths: dict[str, Berth] = {}
+        """Where each robot is that was ever handed over, as this floor knows."""
         self.overruled: Callable[[str], object] = lambda _robot: None
         """Called for a robot whose mission, or service, somebody else than a visit has changed."""
 
@@ -212,7 +233,8 @@ class MissionPersistence:
             stamp, place, pose = self._clock.stamp(), order.place, order.pose
             goal_id = secrets.token_hex(8) if order.tour is None else order.tour.goal_id
             goal = RobotGoal(goal_id=goal_id, pose=pose, place=place, stamp=stamp)
-            stored = StoredGoal(goal=goal, any_heading=order.any_heading, visit=order.visit, tour=order.tour)
+            heading = order.any_heading
+            stored = StoredGoal(goal=goal, any_heading=heading, visit=order.visit, tour=order.tour, ride=order.ride)
             await self._store_mission(order, stored, Audit(stamp, order.who, order.action, order.attempt))
             self._begin(order.robot, stored)
         _log.info("goal_accepted", robot=order.robot, goal=goal.goal_id, x=pose.x, y=pose.y, place=place, who=order.who)
@@ -284,7 +306,7 @@ class MissionPersistence:
 
     async def store_status(self) -> StoreStatus:
         """Return what Redis and this process have; raises `StoreError`."""
-        known = {"goals": len(self.goals), "out_of_service": len(self._out)}
+        known = {"goals": len(self.goals), "out_of_service": len(self._out), "berths": len(self.berths)}
         return await self._store.status(known if self._loaded.is_set() else {})
 
     async def recover_store(self, action: Literal["restore", "accept"], who: str) -> None:
@@ -299,7 +321,7 @@ class MissionPersistence:
                 await self._store.accept_loss(audit)
                 self._reload = True
             elif self._loaded.is_set():
-                await self._store.restore(self.goals, self._out, audit)
+                await self._store.restore(self.goals, self._out, self.berths, audit)
             else:
                 raise RecoveryError(
                     "this service was started after the loss and has no missions: restore a backup of Redis, or accept"

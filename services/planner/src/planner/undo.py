@@ -70,6 +70,8 @@ async def _undo(
             raise UndoError("not_undoable", "there was no mission before, and none after: there is nothing to undo")
         await service.missions.cancel(robot, who, expected, action=ACTION)
         return None
+    if before.ride is not None:
+        raise UndoError("not_undoable", f"it led to {before.ride.floor}: send the robot there again")
     goal = before.goal
     assert goal.pose is not None
     if before.tour is not None and before.tour.deadline is not None:

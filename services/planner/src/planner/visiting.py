@@ -31,10 +31,13 @@ _log = logs.get("planner")
 class Robots(Protocol):
     """What visits need of the planner's service."""
 
-    missions: MissionPersistence
     operator: RobotOperator
     states: dict[str, RobotState]
     poses: dict[str, RobotPose]
+
+    @property
+    def missions(self) -> MissionPersistence:
+        """The missions."""
 
     @property
     def places(self) -> Mapping[str, Place] | None:

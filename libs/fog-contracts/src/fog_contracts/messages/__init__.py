@@ -7,6 +7,7 @@ from fog_contracts.messages.areas import *
 from fog_contracts.messages.basics import *
 from fog_contracts.messages.dry_runs import *
 from fog_contracts.messages.fleet import *
+from fog_contracts.messages.lifts import *
 from fog_contracts.messages.maps import *
 from fog_contracts.messages.nodes import *
 from fog_contracts.messages.robots import *

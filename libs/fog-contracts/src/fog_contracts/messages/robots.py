@@ -31,6 +31,7 @@ from fog_contracts.messages.basics import (
     Trace,
 )
 from fog_contracts.messages.fleet import OutOfService
+from fog_contracts.messages.lifts import Berth, HandOver
 from fog_contracts.messages.maps import Cause
 
 PLAN_CODES = {
@@ -348,6 +349,10 @@ class RefusalCode(Described):
     POSE_OFF_MAP = "pose_off_map", "the pose is off the map"
     POSE_IN_WALL = "pose_in_wall", "the pose is in a wall"
     NO_PROFILE = "no_profile", "the robot has no such profile"
+    # hand-over to another floor
+    ONE_FLOOR = "one_floor", "the robot knows this floor only"
+    NO_FLOOR = "no_floor", "the robot does not know the other floor"
+    OTHER_BERTH = "other_berth", "the hand-over does not begin where the robot's own record says that it is"
 
 
 class RobotState(Message, frozen=True, kw_only=True):
@@ -359,6 +364,7 @@ class RobotState(Message, frozen=True, kw_only=True):
     `docked`: it stands on its dock. `wants_dock`: it asks the planner for the goal in front of its dock.
     `places`: where on the map it may be, most likely first, while its scans do not decide; empty otherwise.
     `codes` identifies each of the `reasons`, in their order (`ReasonCode`); a newer robot may have others.
+    `berth`: which floor it is on by its own record, None for one that knows no other; `floors`: all that it knows.
     `awaits_operator`: it does not drive before an operator enables or resets it. `base_fault` identifies the fault that
     the guardian has latched: a base may have its own.
     """
@@ -390,6 +396,8 @@ class RobotState(Message, frozen=True, kw_only=True):
     codes: Codes = []
     awaits_operator: bool = False
     base_fault: Code = ""
+    berth: Berth | None = None
+    floors: Annotated[list[Id], Meta(max_length=200)] = []
 
 
 VIEW_SECTORS: Final = 180
@@ -435,6 +443,7 @@ CommandKind = Literal[
     "advance",
     "reset",
     "initial_pose",
+    "hand_over",
     "profile_default",
     "profile_full",
     "profile_fog",
@@ -446,7 +455,8 @@ class RobotCommand(Message, frozen=True, kw_only=True):
 
     `boot` and `issued_at` are `boot` and `clock` of the robot's latest state: the command's age is measured by the
     robot's clock alone, and another run of the agent refuses it. What stops the robot (`disable`,
-    `cancel`) is carried out unsigned, too, and whatever the other fields say.
+    `cancel`) is carried out unsigned, too, and whatever the other fields say. `pose` belongs to `initial_pose`,
+    `given` to `hand_over`.
     """
 
     kind: CommandKind
@@ -456,6 +466,7 @@ class RobotCommand(Message, frozen=True, kw_only=True):
     issued_at: Seconds = 0.0
     boot: Boot = ""
     pose: Pose | None = None
+    given: HandOver | None = None
     signature: Annotated[bytes, Meta(max_length=64)] = b""
 
 

@@ -73,6 +73,13 @@ def load_site(directory: Path, text: str | None = None, *, map_file: Path | None
         _check_free(file, f"places.{name}", place.x, place.y, static)
     for index, robot in enumerate(site.robots):
         _check_free(file, f"robots[{index}].start ({robot.id})", robot.start.x, robot.start.y, static)
+    _check_unique(file, "lifts.id", (lift.id for lift in site.lifts))
+    for index, lift in enumerate(site.lifts):
+        if site.id not in lift.floors:
+            problem = f"{', '.join(lift.floors)} are not this site, {site.id!r}"
+            raise SiteError(file, f"lifts[{index}].floors ({lift.id})", problem, "Name all floors that it serves")
+        for name, pose in (("cabin", lift.cabin), ("wait", lift.wait)):
+            _check_free(file, f"lifts[{index}].{name} ({lift.id})", pose.x, pose.y, static)
     for index, marker in enumerate(site.markers):
         _check_seen(file, f"markers[{index}] ({marker.id})", marker, static)
     return LoadedSite(msgspec.structs.replace(site, areas=areas), static, directory)

@@ -41,13 +41,14 @@ PLACES: Final = "places"
 SITE_MAPS: Final = "site_maps"
 GOALS: Final = "goals"
 OUT_OF_SERVICE: Final = "out_of_service"
+BERTHS: Final = "berths"
 BLOCKS: Final = "blocks"
 PACES: Final = "paces"
 
 OWN: Final[Mapping[str, Sequence[str]]] = {
     "hazard-aggregator": (AREAS, HAZARDS, OVERRIDES, OVERRIDE_RESTS, ALERTS, f"{HISTORY}:*"),
     "map-service": (ZONES, ZONE_TIMES, ZONE_SETS, ZONE_SOURCES, PLACES, SITE_MAPS),
-    "planner": (GOALS, OUT_OF_SERVICE, BLOCKS, PACES),
+    "planner": (GOALS, OUT_OF_SERVICE, BERTHS, BLOCKS, PACES),
 }
 """The keys of each service's own records, as patterns."""
 READ: Final[Mapping[str, Sequence[str]]] = {"console-service": (f"{HISTORY}:*",)}

@@ -22,6 +22,7 @@ from fog_contracts.replica import MapError
 from fog_runtime import logs
 from fog_runtime.clock import Ticker
 from fog_runtime.files import atomic_write
+from robot_agent.agent.berths import POSE_FILE
 from robot_agent.agent.edges.exporter import name_thread
 from robot_agent.agent.pose_persistence import start_pose
 from robot_agent.localization.pose import SavedPose
@@ -45,7 +46,7 @@ class Store:
     """Two files in the robot's data folder; each write replaces a file as a whole. All methods block."""
 
     def __init__(self, folder: Path) -> None:
-        self._pose = folder / "pose.json"
+        self._pose = folder / POSE_FILE
         self._snapshot = folder / "snapshot.msgpack"
 
     def pose(self, site: str) -> SavedPose | None:

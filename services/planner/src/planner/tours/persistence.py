@@ -14,7 +14,7 @@ from planner.store import MissionConflictError, MissionPersistence, StoredGoal
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-    from fog_contracts.messages import RobotPath
+    from fog_contracts.messages import Berth, RobotPath
     from fog_runtime.clock import Clock
     from fog_runtime.health import Health
     from planner.core import PlannerCore
@@ -47,6 +47,10 @@ class TourPersistence(MissionPersistence):
         self._path = path
         self._cut: defaultdict[str, CutTimes] = defaultdict(CutTimes)
         """By robot, since when no way leads on."""
+        self.said: dict[str, Berth] = {}
+        """By robot, where it is by its own latest word."""
+        self.at_goal: dict[str, str] = {}
+        """By robot that rides to another floor, the last goal of that mission that it has reached."""
 
     async def send(self, order: Order) -> StoredGoal:
         """Give a robot a mission, and count its time from now on; raises as the base class does."""

@@ -1,0 +1,79 @@
+"""Lifts, in Open-RMF's words, and the hand-over of a robot from one floor of its building to another."""
+
+from typing import Annotated, Literal
+
+from msgspec import Meta
+
+from fog_contracts.messages.basics import Author, Count, Id, Message, Pose, Stamp
+
+Session = Annotated[str, Meta(max_length=64)]
+LiftRequestType = Literal["END_SESSION", "AGV_MODE"]
+DoorState = Literal["CLOSED", "MOVING", "OPEN"]
+MotionState = Literal["STOPPED", "UP", "DOWN", "UNKNOWN"]
+LiftMode = Literal["UNKNOWN", "HUMAN", "AGV", "FIRE", "OFFLINE", "EMERGENCY"]
+
+
+class LiftRequest(Message, frozen=True, kw_only=True):
+    """What a lift is to do for a session, a robot's ride: Open-RMF's `rmf_lift_msgs/LiftRequest`.
+
+    Floors are named by their sites' ids (Open-RMF's `level_name`). A lift serves one session at a time, until its end,
+    and ignores the others' requests meanwhile. The lift's id is in the channel's key.
+    """
+
+    session_id: Session
+    request_type: LiftRequestType
+    destination_floor: Id
+    door_state: Literal["CLOSED", "OPEN"] = "OPEN"
+    request_time: Stamp = 0.0
+
+
+class LiftState(Message, frozen=True, kw_only=True):
+    """Where a lift is, and whom it serves (`session_id`, empty: nobody): Open-RMF's `rmf_lift_msgs/LiftState`."""
+
+    available_floors: Annotated[list[Id], Meta(max_length=200)]
+    current_floor: Id
+    destination_floor: Id
+    door_state: DoorState
+    motion_state: MotionState
+    current_mode: LiftMode
+    session_id: Session = ""
+    lift_time: Stamp = 0.0
+
+    def serves(self, session: str, floor: str) -> bool:
+        """Whether it stands at a floor with its door open, for this session."""
+        at_floor = self.current_floor == floor and self.motion_state == "STOPPED" and self.door_state == "OPEN"
+        return at_floor and self.session_id == session and self.current_mode == "AGV"
+
+
+class FloorGoal(Message, frozen=True, kw_only=True):
+    """Where on its floor a robot is to go: one of that floor's places, or a pose on its map; `any_heading`: of it."""
+
+    place: Id | None = None
+    pose: Pose | None = None
+    any_heading: bool = False
+
+
+class HandOver(Message, frozen=True, kw_only=True):
+    """A robot's way from the floor `origin` to `floor`, which it carries itself (ADR 76).
+
+    `epoch`: the robot's count of hand-overs after this one. `lift`: by which it rides; None: people carry it. `goal`:
+    where it goes then. `who`: who sent it.
+    """
+
+    origin: Id
+    floor: Id
+    epoch: Count
+    lift: Id | None = None
+    goal: FloorGoal | None = None
+    who: Author = ""
+
+
+class Berth(Message, frozen=True, kw_only=True):
+    """The floor that a robot is on by its own durable record, the only one that counts, and its count of hand-overs.
+
+    `came_by`: the last of them; None: it was never handed over.
+    """
+
+    floor: Id
+    epoch: Count = 0
+    came_by: HandOver | None = None

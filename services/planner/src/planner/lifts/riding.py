@@ -1,0 +1,181 @@
+"""Runs the rides: calls lifts, sends robots into them, hands them over, and takes those that come."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Final, Protocol
+
+from fog_contracts import channels as ch
+from fog_contracts.messages import Berth, LiftState, Pose, Refusal
+from fog_runtime import logs
+from fog_runtime.clock import ticker
+from fog_runtime.stores.redis_connection import StoreError
+from fog_runtime.stores.redis_store import Attempt
+from planner.lifts.persistence import on_behalf
+from planner.lifts.rides import Facts, cabins_at, next_act, request, session
+from planner.robot_operator import CommandError
+from planner.stops import Order
+from planner.store import NO_MISSION, MissionConflictError, OutOfServiceError
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping
+
+    from fog_contracts.messages import FloorGoal, HandOver, Place, RobotPose, RobotState
+    from fog_contracts.site import Site
+    from fog_runtime.clock import Clock
+    from fog_runtime.transports.zenoh_edge import ZenohEdge
+    from planner.lifts.persistence import RidePersistence
+    from planner.robot_operator import RobotOperator
+    from planner.store import StoredGoal
+
+STEP_S: Final = 0.5
+SILENT_S: Final = 60.0
+"""A robot that was not heard for so long holds no lift any more: a restart takes less."""
+
+_log = logs.get("planner")
+
+
+class Robots(Protocol):
+    """What rides need of the planner's service."""
+
+    missions: RidePersistence
+    operator: RobotOperator
+    poses: dict[str, RobotPose]
+
+    @property
+    def places(self) -> Mapping[str, Place] | None:
+        """All places by id; None until the map-service has told them."""
+
+    @property
+    def leads(self) -> bool:
+        """Whether this process acts; else another planner does."""
+
+    async def send(self, order: Order) -> StoredGoal | Refusal:
+        """Give a robot a mission."""
+
+
+class Riding:
+    """The rides of a running planner."""
+
+    def __init__(self, service: Robots, site: Site, zenoh: ZenohEdge, clock: Clock) -> None:
+        self._service = service
+        self._site = site
+        self._zenoh = zenoh
+        self._clock = clock
+        self._lifts: dict[str, tuple[LiftState, float]] = {}
+        self._heard: dict[str, float] = {}
+        self._created = clock.now()
+        self._begun: set[str] = set()
+        """Hand-overs whose goal was given, or refused."""
+        service.missions.site = site.id
+
+    def subscribe(self) -> None:
+        """Follow the lifts of the site, if it has any."""
+        if self._site.lifts:
+            self._zenoh.subscribe(ch.LIFT_STATE, LiftState, self._on_lift)
+
+    def _on_lift(self, ids: Mapping[str, str], state: LiftState) -> None:
+        self._lifts[ids["lift"]] = state, self._clock.now()
+
+    def on_state(self, robot: str, state: RobotState) -> None:
+        """Note on which floor a robot is by its own record; one without a record knows this floor only."""
+        self._heard[robot] = self._clock.now()
+        self._service.missions.said[robot] = state.berth or Berth(floor=self._site.id)
+
+    async def run(self) -> None:
+        """Let rides go on, twice a second."""
+        async for _ in ticker(self._clock, STEP_S):
+            if self._service.leads:
+                await self.step()
+
+    async def step(self) -> None:
+        """Do what is due for each robot, then ask the lifts."""
+        missions = self._service.missions
+        for robot in {*missions.said, *missions.berths}:
+            try:
+                await self._step(robot)
+            except (StoreError, CommandError) as error:
+                _log.warning("ride_delayed", robot=robot, reason=str(error))
+        for lift in self._site.lifts:
+            for robot in {*missions.berths, *missions.goals}:
+                state = self._lift(lift.id)
+                if (asked := request(lift.id, robot, self._facts(robot), state, self._site.id)) is not None:
+                    self._zenoh.publish(ch.LIFT_REQUEST, asked, lift=lift.id)
+
+    def _lift(self, name: str | None) -> LiftState | None:
+        state, at = self._lifts.get(name or "", (None, 0.0))
+        return state if self._clock.now() - at <= ch.LIFT_STATE.max_age_s else None
+
+    def _facts(self, robot: str) -> Facts:
+        missions = self._service.missions
+        berth = missions.berths.get(robot) or Berth(floor=self._site.id)
+        stored, pose = missions.goals.get(robot), self._service.poses.get(robot)
+        at_goal = stored is not None and missions.at_goal.get(robot) == stored.goal.goal_id
+        ride = None if stored is None else stored.ride
+        silent = self._clock.now() - self._heard.get(robot, self._created) > SILENT_S
+        return Facts(berth, ride, at_goal, cabins_at(self._site.lifts, berth, pose), silent)
+
+    async def _step(self, robot: str) -> None:
+        missions = self._service.missions
+        known, said = missions.berths.get(robot), missions.said.get(robot)
+        match missions.standing(robot):
+            case "arrives" if said is not None:
+                self._service.poses.pop(robot, None)  # of its last stay here
+                await missions.arrive(robot, said)
+            case "leaves" if known is not None and known.came_by is not None:
+                if self._service.operator.heard(robot) is None:
+                    return  # it has gone, or nobody can reach it
+                await self._service.operator.hand_over(robot, known.came_by)
+            case "here" if known is not None and known.came_by is not None:
+                await self._take(robot, known.came_by)
+            case "here" if (stored := missions.goals.get(robot)) is not None and stored.ride is not None:
+                ride = stored.ride
+                act = next_act(robot, self._facts(robot), self._lift(ride.lift), self._site.id)
+                if act == "leave":
+                    await missions.leave(robot, stored)
+                elif act == "board":
+                    cabin = next(lift.cabin for lift in self._site.lifts if lift.id == ride.lift)
+                    await missions.board(robot, stored, cabin)
+
+    async def _take(self, robot: str, given: HandOver) -> None:
+        """Give a robot that has come its goal once its lift is here and open; settle once it has left the cabin."""
+        name = session(robot, given.epoch)
+        if name not in self._begun:
+            lift = self._lift(given.lift)
+            if given.lift is not None and (lift is None or not lift.serves(name, self._site.id)):
+                return
+            if given.goal is not None:
+                await self._send(robot, given, given.goal)
+            self._begun.add(name)
+        pose = self._service.poses.get(robot)
+        is_out = pose is not None and pose.localized and given.lift not in self._facts(robot).cabins
+        if given.lift is None or is_out:
+            await self._service.missions.settle(robot)
+            self._begun.discard(name)
+
+    async def _send(self, robot: str, given: HandOver, goal: FloorGoal) -> None:
+        pose, any_heading = goal.pose, goal.any_heading
+        if goal.place is not None:
+            known = self._site.places if self._service.places is None else self._service.places
+            if (place := known.get(goal.place)) is None:
+                _log.warning("ride_without_goal", robot=robot, reason=f"there is no place {goal.place}")
+                return
+            pose, any_heading = Pose(x=place.x, y=place.y, theta=place.theta or 0.0), place.theta is None
+        if pose is None:
+            return
+        attempt = Attempt.of("floors", session(robot, given.epoch), "arrival", given)
+        order = Order(
+            robot,
+            pose,
+            on_behalf(robot, given),
+            place=goal.place,
+            any_heading=any_heading,
+            attempt=attempt,
+            expected=NO_MISSION,
+        )
+        try:
+            sent = await self._service.send(order)
+        except (MissionConflictError, OutOfServiceError) as error:
+            _log.info("ride_overruled", robot=robot, reason=str(error))  # an operator was faster
+            return
+        if isinstance(sent, Refusal):
+            _log.warning("ride_without_goal", robot=robot, reason=sent.reason)

@@ -53,6 +53,7 @@ _.DURABILITIES
 # --- Names that a library calls or reads. ---
 _.__signature__  # inspect and typer: what a command takes
 _.__annotations__
+_.env_name  # numba, which finds an environment by it
 _.capture_signals  # uvicorn
 _.handshake_complete  # uvicorn
 _.keepalive_timeout  # uvicorn

@@ -74,6 +74,14 @@ def test_a_scenario_ends_as_expected(name):
     assert played.deviations == [], played.result
 
 
+@pytest.mark.drive
+def test_robots_that_meet_at_a_place_for_one_are_never_in_it_together():
+    played = play(read_scenario(FILES["narrow-place"]), ROOT / "sites")
+    assert played.deviations == [], played.result
+    assert isinstance(played.result, FleetResult)
+    assert played.result.most_in_place == 1
+
+
 def test_a_file_with_an_unknown_event_is_refused(tmp_path):
     file = tmp_path / "flood.toml"
     file.write_text('title = "t"\nstart = [0, 0, 0]\ngoal = [1, 1]\n[[events]]\nkind = "flood"\n[expected]\n')

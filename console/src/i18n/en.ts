@@ -143,11 +143,13 @@ export const en = {
   "state.unknown": "unknown",
   "state.clear": "clear",
   "area.overridden": "set by hand",
+  "area.part_free": "a part is free: slowly",
   "since": "since {time}",
   "ago": "{age} ago",
   "zone.BLOCKED": "closed",
   "zone.PENALTY": "avoided",
   "zone.SPEED_LIMIT": "slow",
+  "zone.RELEASE": "one robot",
   "zone.inactive": "not in force",
 
   "robots.none": "No robot is known. Start one, or add it to the site.",

@@ -144,11 +144,13 @@ export const pt: Readonly<Record<keyof typeof en, string>> = {
   "state.unknown": "desconhecida",
   "state.clear": "livre",
   "area.overridden": "definida à mão",
+  "area.part_free": "uma parte está livre: devagar",
   "since": "desde {time}",
   "ago": "há {age}",
   "zone.BLOCKED": "fechada",
   "zone.PENALTY": "a evitar",
   "zone.SPEED_LIMIT": "devagar",
+  "zone.RELEASE": "um robô",
   "zone.inactive": "não está em vigor",
 
   "robots.none": "Nenhum robô é conhecido. Ligue um ou acrescente-o ao local.",

@@ -25,12 +25,18 @@ function label(id: string, name = "", ...details: readonly string[]): HTMLElemen
   return element;
 }
 
+/** Whether sensors show a part of a blocked area free, through which robots may pass slowly. */
+function isPartlyFree({ hazard }: AreaView): boolean {
+  return hazard?.state === "blocked" && (hazard.free ?? []).length > 0;
+}
+
 /** Return what an area's state is called, and since when it has it. */
 export function areaText(area: AreaView): string {
   const { hazard } = area;
   if (!hazard) return t("state.unknown");
   const text = t(`state.${hazard.state}`) + (hazard.override ? ` (${t("area.overridden")})` : "");
-  return `${text} ${t("since", { time: clockTime(hazard.since) })}`;
+  const part = isPartlyFree(area) ? `, ${t("area.part_free")}` : "";
+  return `${text} ${t("since", { time: clockTime(hazard.since) })}${part}`;
 }
 
 const DECLUTTER_MS = 1_000;
@@ -169,7 +175,14 @@ export class FixedLayer {
     const { definition } = area;
     const state = area.hazard?.state ?? "unknown";
     const text = label(definition.id, definition.label, state === "clear" ? "" : areaText(area));
-    return this.outlined(definition.polygon.map(toPoint), `area ${state}`, text)[0];
+    const [group] = this.outlined(definition.polygon.map(toPoint), `area ${state}`, text);
+    if (isPartlyFree(area)) {
+      for (const part of area.hazard?.free ?? []) {
+        const latLngs = part.map((corner) => toLatLng(toPoint(corner)));
+        group.addLayer(L.polygon(latLngs, { className: "shape area part-free", interactive: false }));
+      }
+    }
+    return group;
   }
 
   private node(node: NodeValue): L.LayerGroup | null {

@@ -16,7 +16,7 @@ import { SetChoice } from "./sets";
 import { DrawingFields, Metres, PointFields } from "./shape-fields";
 import { endText } from "./words";
 
-const KINDS: readonly Zone["kind"][] = ["BLOCKED", "PENALTY", "SPEED_LIMIT"];
+const KINDS: readonly Zone["kind"][] = ["BLOCKED", "PENALTY", "SPEED_LIMIT", "RELEASE"];
 const EVENING = 18;
 
 interface Props {

@@ -833,7 +833,7 @@ zones = st.builds(
     ),
     st.sampled_from(["z1", "z2", "z3"]),
     shapes,
-    st.sampled_from(["BLOCKED", "PENALTY", "SPEED_LIMIT"]),
+    st.sampled_from(["BLOCKED", "PENALTY", "SPEED_LIMIT", "RELEASE"]),
     st.floats(0, 30),
     st.floats(1, 30),
 )

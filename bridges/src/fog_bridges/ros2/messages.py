@@ -41,6 +41,7 @@ _COLOURS: Final = {
     "BLOCKED": (0.55, 0.1, 0.55),
     "PENALTY": (0.3, 0.45, 0.75),
     "SPEED_LIMIT": (0.2, 0.6, 0.6),
+    "RELEASE": (0.75, 0.6, 0.1),
 }
 _STRIPE_ROWS: Final = 4
 _NEVER: Final = float("nan")

@@ -72,6 +72,10 @@ def _of_zone(name: str, value: dict[str, Any], ring: list[Point]) -> Zone:
         # A factor says how many free metres a metre there is worth: 1 is none, and infinity would be the norm's 1.0.
         factor = round(1.0 - 1.0 / value["factor"], 3)
         return Zone(zone_id=name, zone_type="PENALTY", zone_descriptor=words, vertices=ring, penalty_factor=factor)
+    if value["kind"] == "RELEASE":
+        # The norm's RELEASE lets a robot ask to get in. A place that is leased to robots of Fognav can't be promised to
+        # one whose way Fognav does not know, so it stays out.
+        words = f"one robot at a time, of those that Fognav leads: {words}"
     return Zone(zone_id=name, zone_type="BLOCKED", zone_descriptor=words, vertices=ring)
 
 

@@ -77,6 +77,8 @@ def _line(area: Mapping[str, Any]) -> str:
     definition, hazard, override = area["definition"], area["hazard"], area["override"]
     label = f" ({definition['label']})" if definition["label"] else ""
     state = f"{hazard['state']}, {hazard['cause']}" if hazard else "nothing announced yet"
+    if hazard and hazard["state"] == "blocked" and hazard.get("free"):
+        state += "; a part of it is free, which robots pass slowly"
     return f"{definition['id']}{label}: {state}" + (f" [{_override(override)}]" if override else "")
 
 

@@ -15,7 +15,7 @@ zone_app = typer.Typer(help="Draw, list, show, switch and remove zones.", no_arg
 
 _ZONES: Final = "/api/v1/zones"
 _SETS: Final = "/api/v1/zone-sets"
-Kind = Literal["blocked", "penalty", "speed-limit"]
+Kind = Literal["blocked", "penalty", "speed-limit", "release"]
 ZoneId = Annotated[str, typer.Argument(metavar="ID", help="The zone's id, as fognav zone list shows it.")]
 
 
@@ -33,7 +33,7 @@ def zone_add(  # noqa: PLR0913  # each option is an argument
         str | None, typer.Option("--corridor", metavar="'X,Y X,Y …'", help="A line with --width around it.")
     ] = None,
     width: Annotated[float | None, typer.Option("--width", metavar="M", help="Width of the corridor.")] = None,
-    kind: Annotated[Kind, typer.Option("--kind", help="The effect: no-go, more costly, or slower.")] = "blocked",
+    kind: Annotated[Kind, typer.Option("--kind", help="No-go, costlier, slower, or one robot at a time.")] = "blocked",
     factor: Annotated[float | None, typer.Option("--factor", help="For penalty: a metre counts this many.")] = None,
     speed: Annotated[float | None, typer.Option("--speed", metavar="M/S", help="For speed-limit.")] = None,
     reason: Annotated[str, typer.Option("--reason", help="Why, for other people.")] = "",
@@ -65,6 +65,7 @@ def zone_add(  # noqa: PLR0913  # each option is an argument
     """Draw a zone, which takes effect at once or at its times.
 
     Robots avoid a blocked zone, prefer other ways to one with a penalty, and drive slowly in one with a speed limit.
+    One at a time gets into a zone that asks for a release.
     """
     with exit_codes():
         shape = _shape(circle, rectangle, polygon, corridor, width)

@@ -291,7 +291,8 @@ class OtherRobot(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_field
 class Scenario(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """A drive from `start` (x, y, theta) to `goal` of the site's first robot; it is ended after `seconds`.
 
-    With `others` nothing else happens: no events, and all are led by the fog. `wait`: whether robots wait before what
+    With `others` nothing else happens: no events, and all are led by the fog. `one_robot`: places that
+    an operator keeps for one of them at a time. `wait`: whether robots wait before what
     closes their way (ADR 72).
     """
 
@@ -305,12 +306,15 @@ class Scenario(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=
     seconds: Seconds = 300.0
     seed: int = 1
     others: list[OtherRobot] = []
+    one_robot: list[Ring] = []
     wait: Literal["off", "learned", "always"] = "learned"
 
     def __post_init__(self) -> None:
         """Raise `ValueError` for what can't be played."""
         if self.others and (self.events or self.profile != "fog"):
             raise ValueError("a scenario with others has no events, and no other profile than fog")
+        if self.one_robot and not self.others:
+            raise ValueError("places for one robot at a time need others: give the scenario others, or no one_robot")
         expected = self.expected
         if self.others and (expected.modes or expected.never or expected.reason):
             raise ValueError("what a scenario with others expects has no modes, never or reason: nobody records these")

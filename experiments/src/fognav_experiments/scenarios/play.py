@@ -17,7 +17,8 @@ import msgspec
 
 from fog_contracts import channels as ch
 from fog_contracts.bus import Bus
-from fog_contracts.messages import Pose, RobotGoal
+from fog_contracts.geometry import distance_to_polygon
+from fog_contracts.messages import PolygonShape, Pose, RobotGoal, Zone
 from fog_contracts.site import RobotSite
 from fog_runtime.configuration.parts import DEFAULT_BASE
 from fog_runtime.configuration.site import load_site
@@ -36,6 +37,7 @@ if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
     from pathlib import Path
 
+    from fog_contracts.geometry import Polygon
     from fog_contracts.handlers import Ids, Moment, Publication
     from fog_contracts.messages import RobotPath, RobotState
     from fog_runtime.configuration.site import LoadedSite
@@ -128,6 +130,9 @@ class Fleet:
         self.fog = FogRig(site, self.vehicles[0].world, self.bus, seed, 0.0, measure=cpu.measure)
         self.least_gap_m = math.inf
         """The smallest distance between the rims of two robots so far."""
+        self.places: list[Polygon] = []
+        self.most_in_place = 0
+        """How many robots were in a place for one at once, at most."""
         self._steps = 0
 
     @property
@@ -174,7 +179,18 @@ class Fleet:
             vehicle.start(goal.goal_id)
             self.fog.planner.set_goal(vehicle.id, goal, any_heading=True)
 
+    def keep_for_one(self, places: Sequence[Polygon]) -> None:
+        """Draw zones for one robot at a time."""
+        self.places = list(places)
+        for number, place in enumerate(places, start=1):
+            zone = Zone(id=f"one-{number}", kind="RELEASE", shape=PolygonShape(points=list(place)))
+            self.fog.put_zone(zone, moment(self.now))
+
     def _note_gap(self) -> None:
+        for place in self.places:
+            worlds = [vehicle.world for vehicle in self.vehicles]
+            inside = sum(distance_to_polygon(place, *world.pose[:2]) < world.robot.radius for world in worlds)
+            self.most_in_place = max(self.most_in_place, inside)
         for one, other in itertools.combinations((vehicle.world for vehicle in self.vehicles), 2):
             gap = math.dist(one.pose[:2], other.pose[:2]) - one.robot.radius - other.robot.radius
             self.least_gap_m = min(self.least_gap_m, gap)
@@ -205,6 +221,8 @@ class FleetResult(msgspec.Struct, frozen=True, kw_only=True):
     gap_m: float
     plans: int
     planner_percent: float
+    most_in_place: int = 0
+    """How many robots were in a place for one at once, at most."""
 
 
 class _Ending(NamedTuple):
@@ -222,6 +240,7 @@ def play_fleet(scenario: Scenario, site: LoadedSite) -> tuple[FleetResult, str]:
     cpu.seconds.clear()
     begun = fleet.now
     if problem is None:
+        fleet.keep_for_one(scenario.one_robot)
         fleet.start()
         while fleet.now - begun < scenario.seconds and any(vehicle.outcome is None for vehicle in fleet.vehicles):
             fleet.step()
@@ -235,6 +254,7 @@ def play_fleet(scenario: Scenario, site: LoadedSite) -> tuple[FleetResult, str]:
         time_s=round(seconds, 2) if ended is None else None,
         arrived=sum(_arrived(vehicle) for vehicle in fleet.vehicles),
         gap_m=round(fleet.least_gap_m, 3),
+        most_in_place=fleet.most_in_place,
         plans=sum(drive.evaluation.plans for drive in drives),
         planner_percent=round(100.0 * cpu.seconds["planner"] / max(seconds, 1e-9), 2),
     )

@@ -57,6 +57,7 @@ if TYPE_CHECKING:
         RobotGoal,
         RobotPose,
         RobotState,
+        ZoneSet,
     )
     from planner.missions import Mission
     from planner.planning_map import CostChange, PlanningMap
@@ -114,6 +115,7 @@ class PlannerCore:
                 ch.MAP_HEARTBEAT: self._on_heartbeat,
                 **self._regions.handlers(),
                 ch.HAZARD: self._on_hazard,
+                ch.ZONES: self._on_zones,
                 ch.ROBOT_POSE: self._on_pose,
                 ch.ROBOT_STATE: self._on_state,
                 ch.PLACES: self._on_places,
@@ -144,6 +146,11 @@ class PlannerCore:
     def _on_hazard(self, ids: Ids, area: HazardArea, at: Moment) -> Sequence[Publication]:
         self.waits.blocks.on_hazard(area, at)
         return self._regions.on_hazard(ids, area, at)
+
+    def _on_zones(self, ids: Ids, zones: ZoneSet, at: Moment) -> Sequence[Publication]:
+        self._regions.handlers()[ch.ZONES](ids, zones, at)
+        self.leases.set_places(self._regions.for_one_robot, at.now)
+        return ()
 
     def _on_heartbeat(self, _ids: Ids, heartbeat: MapHeartbeat, at: Moment) -> Sequence[Publication]:
         self._map.on_heartbeat(heartbeat, at.now)

@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     from fog_contracts.costs import Inflation
     from fog_contracts.grid import GridGeometry, Window
     from fog_contracts.handlers import Handler, Ids, Moment, Publication
-    from fog_contracts.messages import ZoneSet
+    from fog_contracts.messages import ZoneKind, ZoneSet
     from fog_contracts.shapes import ShapeMask
     from planner.planning_map import PlanningMap
 
@@ -186,8 +186,13 @@ class BlockedRegions:
         if self._sources is None:
             hazards = (self._hazards[area] for area in sorted(self._hazards))
             closing = [hazard for hazard in hazards if is_closing(hazard)]
-            self._sources = (*closing, *(_no_go_zones(self._zones) if self._zones else ()))
+            self._sources = (*closing, *(_in_force(self._zones, "BLOCKED") if self._zones else ()))
         return self._sources
+
+    @property
+    def for_one_robot(self) -> list[Zone]:
+        """The zones in force that are kept for one robot at a time."""
+        return _in_force(self._zones, "RELEASE") if self._zones else []
 
     @property
     def areas(self) -> list[HazardArea]:
@@ -215,10 +220,10 @@ class BlockedRegions:
         self.revision += 1
 
 
-def _no_go_zones(zones: ZoneSet) -> list[Zone]:
-    """Return the no-go zones in force."""
+def _in_force(zones: ZoneSet, kind: ZoneKind) -> list[Zone]:
+    """Return the zones of a kind that are in force."""
     active = frozenset(zones.active)
-    return [zone for zone in zones.zones if zone.kind == "BLOCKED" and zone.id in active]
+    return [zone for zone in zones.zones if zone.kind == kind and zone.id in active]
 
 
 def cover(sources: Sequence[Source], x: float, y: float, margin: float) -> bool:

@@ -114,7 +114,8 @@ class HazardArea(Message, frozen=True, kw_only=True):
     epoch: Count = 0
 
 
-ZoneKind = Literal["BLOCKED", "PENALTY", "SPEED_LIMIT"]
+ZoneKind = Literal["BLOCKED", "PENALTY", "SPEED_LIMIT", "RELEASE"]
+"""RELEASE: one robot at a time, as the planner's leases see to it; such a zone costs nothing."""
 PenaltyFactor = Annotated[float, Meta(ge=1.0, le=PENALTY_FACTOR_MAX)]
 
 

@@ -19,7 +19,7 @@ from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
-from fog_contracts.geometry import lengths_along, sampled
+from fog_contracts.geometry import GeometryError, lengths_along, sampled
 from fog_kernels.lines import first_near
 from planner.leases.corridors import (
     DEFAULT_RADIUS_M,
@@ -36,6 +36,7 @@ from planner.leases.corridors import (
     reach_of,
     stop_before,
 )
+from planner.leases.narrow_places import NarrowPlace
 from planner.leases.standstills import Standstills
 
 if TYPE_CHECKING:
@@ -43,6 +44,7 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
+    from fog_contracts.messages import Zone
     from planner.leases.standstills import Kind, Room
     from planner.missions import PathId
 
@@ -76,7 +78,8 @@ class CorridorLeases:
         self._robots: dict[str, Corridor] = {}
         self._arrivals = 0
         self._now = -math.inf
-        self.standstills = Standstills(self._robots)
+        self._places: list[NarrowPlace] = []
+        self.standstills = Standstills(self._robots, self._places)
         self.made: dict[Kind, int] = {}
         """How often robots got room, by kind."""
 
@@ -145,6 +148,28 @@ class CorridorLeases:
             me.standing = False
         if revived or me.stray != stray or len(me.former) != before:
             self.standstills.changed(robot)
+
+    def set_places(self, zones: Iterable[Zone], now: float) -> None:
+        """Let at most one robot at a time be in each of these zones from now on.
+
+        Robots that have a lease into a place that is new, and are not in it, are asked to give that back.
+        """
+        before = {place.zone.id: place for place in self._places}
+        self._places[:] = []
+        for zone in zones:
+            place = before.get(zone.id)
+            try:
+                self._places.append(place if place and place.zone.shape == zone.shape else NarrowPlace(zone))
+            except GeometryError:
+                continue  # the map-service refuses it, too
+        for place in [place for place in self._places if place is not before.get(place.zone.id)]:
+            holders = [me for me in self._robots.values() if place.holds(me, me.held())]
+            for me in holders if len(holders) > 1 else []:
+                if me.path is not None and not place.has_body(me):
+                    me.withdrawn_at = min(me.withdrawn_at, now)
+        for me in self._robots.values():
+            me.apart = {place: known for place, known in me.apart.items() if place in self._places}
+        self.standstills.forget_pairs()
 
     def forget(self) -> None:
         """Forget all paths and leases: another planner leads."""
@@ -220,6 +245,10 @@ class CorridorLeases:
     def _somebody_on(self, me: Corridor) -> bool:
         """Whether another body is on a robot's leased stretch: it was put there, or both had got too much."""
         here = me.points[me.first]
+        for place in self._places:
+            leads_in = place.entry(me, me.first, me.leased + 1) <= me.leased and not place.has_body(me)
+            if leads_in and any(other is not me and place.has_body(other) for other in self._robots.values()):
+                return True
         for other in self._robots.values():
             bodies = _BODIES * (me.radius + other.radius)
             if other is not me and not me.far_from_point(other.at[0], bodies):
@@ -256,6 +285,10 @@ class CorridorLeases:
             lines = () if me.far_from(other, reach_of(me, other)) else other.held()
             if (met := meets(me, other, me.leased, limit, lines)) < limit:
                 limit, blocker = met, other
+        for place in self._places:
+            if (entry := place.entry(me, me.leased, limit)) < limit:
+                holder = next((other for other in others if place.holds(other, other.held())), None)
+                limit, blocker = (entry, holder) if holder is not None else (limit, blocker)
         end, contender = self._stop(me, limit - 1, others)
         waits = contender or blocker
         if end > me.leased:
@@ -276,14 +309,28 @@ class CorridorLeases:
 
     def _stop(self, me: Corridor, end: int, others: list[Corridor]) -> tuple[int, Corridor | None]:
         """Return the last point up to `end` where a robot may stop, and who has to pass before it gets further."""
-        contender = contender_of(me, end, others) if end > me.leased else None
+        contender = self._contender(me, end, others) if end > me.leased else None
         if contender is None:
             return end, None
         before = self.standstills.stuck()
         if me.id not in before and self.standstills.order({me.id: end}).keys() <= before.keys():
             return end, None
-        near = (other for other in others if other.drives and not me.far_from(other, reach_of(me, other)))
-        return stop_before(me, me.leased, end, [(other, other.first) for other in near]), contender
+        drivers = [other for other in others if other.drives]
+        marked = np.zeros(len(me.points), np.bool_)
+        for place in self._places:
+            if any(place.passes(other, other.first) for other in drivers):
+                marked |= place.taken(me)
+        near = [(other, other.first) for other in drivers if not me.far_from(other, reach_of(me, other))]
+        return stop_before(me, me.leased, end, near, marked), contender
+
+    def _contender(self, me: Corridor, stop: int, others: list[Corridor]) -> Corridor | None:
+        """Return a robot that has to pass where this one would stop."""
+        for place in self._places:
+            if place.taken(me)[stop]:
+                for other in others:
+                    if place.passes(other, other.first):
+                        return other
+        return contender_of(me, stop, others)
 
     # --- Robots that stand or are silent ------------------------------------------------------------------------------
 
@@ -349,6 +396,9 @@ class CorridorLeases:
             if other is not me and math.isfinite(other.at[0, 0]):
                 reach = reach_of(me, other) - (STRAY_M if other.stray is None else 0.0)
                 to_meet = other.drives and other.id in near and comes_near(me, other.at, reach + MEETING_M)
+                if not other.drives:
+                    places = [place for place in self._places if place.has_body(other) and not place.has_body(me)]
+                    found += [place.disc(me) for place in places]
                 if to_meet or not other.drives:
                     found.append(Disc(between(me, other.ahead(), reach) if to_meet else other.at, reach))
         return found

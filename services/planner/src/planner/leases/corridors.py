@@ -93,6 +93,8 @@ class Corridor:
     """... and it would be at its goal."""
     passes: frozenset[str] = frozenset()
     """For whom it stands aside."""
+    apart: dict[object, tuple[Floats, Floats]] = field(default_factory=dict)
+    """How far (m) a path's points are from places for one robot, each with that path."""
 
     @property
     def first(self) -> int:
@@ -222,15 +224,17 @@ def contender_of(
     return None
 
 
-def stop_before(me: Corridor, begin: int, end: int, others: Iterable[tuple[Corridor, int]]) -> int:
+def stop_before(
+    me: Corridor, begin: int, end: int, others: Iterable[tuple[Corridor, int]], marked: NDArray[np.bool_]
+) -> int:
     """Return the last point between two where a robot is in no other one's way; else `begin`.
 
     `others`: each with the point of its path from which on it drives. A robot may stop somewhat before the point, too.
+    `marked`: points where it must not stop either; others are marked in it.
     """
     first, count = max(0, begin + 1 - SHORT), end - begin - 1
     if count <= 0:
         return begin
-    marked = np.zeros(len(me.points), np.bool_)
     for other, start in others:
         mark_near(me.points, first, end, other.points[start : other.last], reach_of(me, other), SPACING_M, marked)
     taken = np.concatenate((np.zeros(SHORT, np.bool_), marked[:end]))[-count - SHORT :]

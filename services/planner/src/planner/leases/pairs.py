@@ -19,10 +19,16 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
+    from planner.leases.narrow_places import NarrowPlace
+
     Floats = NDArray[np.float64]
     Bools = NDArray[np.bool_]
 
 _NO_BOX: Final = (1e12, 1e12, -1e12, -1e12)
+_OWN: Final = (
+    "begins", "lasts", "lines", "ends", "ahead_box", "stand_box", "end_box", "stands", "goals", "passes", "enters",
+    "stands_in", "ends_in",
+)  # fmt: skip
 _SAME_M: Final = 0.02
 """A robot that has moved less stands where it was ..."""
 _SAME_POINTS: Final = 10
@@ -51,7 +57,8 @@ class Pairs:
     `passes[i, j]`: i passes the goal of j.
     """
 
-    def __init__(self) -> None:
+    def __init__(self, places: Sequence[NarrowPlace] = ()) -> None:
+        self._places = places
         self.robots: list[Corridor] = []
         self._keys: list[object] = []
         self._reset(0)
@@ -66,6 +73,9 @@ class Pairs:
         self._points: list[Floats] = [NOWHERE] * count
         self.ahead_box, self.stand_box, self.end_box = (np.tile(np.array(_NO_BOX), (count, 1)) for _ in range(3))
         self.radius, self.stray = np.zeros(count), np.zeros(count)
+        shape = count, len(self._places)
+        self.enters, self.stands_in, self.ends_in = (np.zeros(shape, np.bool_) for _ in range(3))
+        """Which places for one robot each gets into on its way, and in which it stands, or will at its goal."""
         self.stands, self.goals, self.passes = (np.zeros((count, count), np.bool_) for _ in range(3))
 
     def update(self, robots: Mapping[str, Corridor], touched: Iterable[str]) -> None:
@@ -90,18 +100,7 @@ class Pairs:
     def copy(self) -> Pairs:
         """Return a copy that may be changed."""
         other = copy(self)
-        for name in (
-            "begins",
-            "lasts",
-            "lines",
-            "ends",
-            "ahead_box",
-            "stand_box",
-            "end_box",
-            "stands",
-            "goals",
-            "passes",
-        ):
+        for name in _OWN:
             setattr(other, name, getattr(self, name).copy())
         return other
 
@@ -113,7 +112,7 @@ class Pairs:
     def arrive(self, number: int) -> None:
         """Let a robot stand at its goal."""
         self.lines[number] = [self.ends[number]]
-        self.stand_box[number] = self.end_box[number]
+        self.stand_box[number], self.stands_in[number] = self.end_box[number], self.ends_in[number]
         self.stands[:, number] = self.goals[:, number]
 
     def limit(self, number: int) -> int:
@@ -122,6 +121,9 @@ class Pairs:
         for j in _near(self.ahead_box[number], self.stand_box, self._reach_from(number)):
             if j != number:
                 end = meets(me, self.robots[j], self.begins[number], end, self.lines[j])
+        for k, place in enumerate(self._places):
+            if np.count_nonzero(self.stands_in[:, k]) > self.stands_in[number, k]:
+                end = place.entry(me, self.begins[number], end)
         return end
 
     def stop_before(self, number: int, end: int, others: Sequence[int]) -> int:
@@ -129,7 +131,11 @@ class Pairs:
         me, begin = self.robots[number], self.begins[number]
         reach = self.radius[others] + (me.radius + MARGIN_M) + self.stray[others] + 1e-9
         near = [others[k] for k in _near(np.array(_box([me.points[begin:end]])), self.ahead_box[others], reach)]
-        return stop_before(me, begin, end, [(self.robots[j], self.begins[j]) for j in near if j != number])
+        marked = np.zeros(len(me.points), np.bool_)
+        for k, place in enumerate(self._places):
+            if any(self.enters[j, k] for j in others if j != number):
+                marked |= place.taken(me)
+        return stop_before(me, begin, end, [(self.robots[j], self.begins[j]) for j in near if j != number], marked)
 
     def _note(self, number: int, begin: int, lines: list[Floats]) -> None:
         me = self.robots[number]
@@ -139,6 +145,10 @@ class Pairs:
         self.ends[number] = me.place(len(me.points) - 1) if whole else NOWHERE
         self.ahead_box[number] = _box([me.points[begin:last]])
         self.stand_box[number], self.end_box[number] = _box(lines), _box([self.ends[number]])
+        for k, place in enumerate(self._places):
+            self.enters[number, k] = last > begin and place.entry(me, begin, last) < last
+            self.stands_in[number, k] = place.holds(me, lines)
+            self.ends_in[number, k] = whole and place.holds(me, [self.ends[number]])
         self.radius[number], self.stray[number] = me.radius, 0.0 if me.stray is False else STRAY_M
 
     def _reach_from(self, number: int) -> NDArray[np.float64]:
@@ -159,6 +169,12 @@ class Pairs:
         for j in _near(self.end_box[number], self.ahead_box, reach):
             self.goals[j, number] = j != number and self._holds(self.goals, j, number)
             self.passes[j, number] = j != number and self._holds(self.passes, j, number)
+        if self._places:
+            both = (self.stands, self.stands_in), (self.goals, self.ends_in), (self.passes, self.ends_in)
+            for matrix, inside in both:
+                matrix[number] |= np.any(self.enters[number] & inside, axis=1)
+                matrix[:, number] |= np.any(self.enters & inside[number], axis=1)
+                matrix[number, number] = False
 
     def _holds(self, matrix: Bools, i: int, j: int) -> bool:
         me, other, begin, last = self.robots[i], self.robots[j], self.begins[i], self.lasts[i]

@@ -22,9 +22,11 @@ from planner.leases.corridors import (
 from planner.leases.pairs import Pairs
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Mapping
+    from collections.abc import Callable, Mapping, Sequence
 
     from numpy.typing import NDArray
+
+    from planner.leases.narrow_places import NarrowPlace
 
     Floats = NDArray[np.float64]
     Bools = NDArray[np.bool_]
@@ -55,18 +57,25 @@ class Room:
 class Standstills:
     """Finds robots that stand in one another's way for ever."""
 
-    def __init__(self, robots: Mapping[str, Corridor]) -> None:
-        """`robots`: all that are known, by id; whoever changes a path or a lease calls `changed`."""
-        self._robots = robots
+    def __init__(self, robots: Mapping[str, Corridor], places: Sequence[NarrowPlace] = ()) -> None:
+        """`robots`: all that are known, by id; whoever changes a path or a lease calls `changed`.
+
+        `places`: those for one robot; whoever changes them calls `forget_pairs`.
+        """
+        self._robots, self._places = robots, places
         self._stuck: dict[str, frozenset[str]] | None = None
         self._tried: dict[tuple[str, Kind], float] = {}
-        self._pairs = Pairs()
+        self._pairs = Pairs(places)
         self._touched: set[str] = set()
 
     def changed(self, robot: str) -> None:
         """Judge anew: a robot, its path or its lease has changed."""
         self._stuck = None
         self._touched.add(robot)
+
+    def forget_pairs(self) -> None:
+        """Compare all robots again: places for one robot have changed."""
+        self._stuck, self._pairs = None, Pairs(self._places)
 
     def moved(self, robot: str) -> None:
         """Note that a robot has driven on, which by itself changes nothing."""
@@ -161,9 +170,12 @@ class Standstills:
             blockers = [other for other in others if other.drives and other.id in stuck] or blockers
             avoid = [disc(me, other, line) for other in others for line in other.held()]
             keep_off = [Disc(other.ahead(), reach_of(me, other) + ASIDE_M) for other in others] + avoid
+            keep_off += [place.disc(me) for place in self._places if not place.has_body(me)]
         else:
             standing = [other for other in blockers if kind != "lane" or other not in facing]
             avoid += [disc(me, other, line) for other in standing for line in (*other.held(), *other.stand())]
+            held = [place for place in self._places if any(place.holds(other, other.held()) for other in blockers)]
+            avoid += [place.disc(me) for place in held if not place.has_body(me)]
         return Room(me.id, kind, avoid, keep_off, frozenset(other.id for other in blockers))
 
     def accepts(self, room: Room, corners: Floats) -> bool:

@@ -18,8 +18,11 @@ import subprocess
 import sys
 import termios
 import time
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from functools import partial
+from queue import SimpleQueue
+from socket import create_connection, create_server
+from threading import Thread
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -85,7 +88,7 @@ def test_a_held_key_drives_and_a_released_one_stops(robot):
     os.close(terminal)
 
 
-def test_a_game_pad_drives_only_while_its_shoulder_button_is_held_and_stops_when_unplugged(robot, tmp_path):
+def test_a_game_pad_drives_only_while_its_shoulder_button_is_held_and_stops_when_silent_or_unplugged(robot, tmp_path):
     socket, watcher = robot
     event = struct.Struct("<IhBB")  # time, value, kind (1: button, 2: axis, 128: as it is at the start), number
     device = tmp_path / "js0"
@@ -99,6 +102,12 @@ def test_a_game_pad_drives_only_while_its_shoulder_button_is_held_and_stops_when
         os.write(keeper, event.pack(2, 1, 1, 4))
         left, right = watcher.rolled(0.8)
         assert left < -0.015 < 0.015 < right
+        time.sleep(0.4 + SETTLED_S)  # a wireless one out of range: nothing comes any more, and its file stays
+        assert watcher.rolled(0.3) == pytest.approx((0.0, 0.0), abs=1e-3), "it has told nothing for a second"
+        os.write(keeper, event.pack(3, -32000, 2, 0))
+        assert watcher.rolled(0.5) == pytest.approx((0.0, 0.0), abs=1e-3), "the button is to be pressed again"
+        os.write(keeper, event.pack(4, 1, 1, 4))
+        assert watcher.rolled(0.8)[1] > 0.015
         writer = os.open(device, os.O_WRONLY)
         os.close(keeper)
         os.close(writer)  # unplugged
@@ -260,6 +269,86 @@ def test_a_page_that_is_hidden_or_behind_another_drives_nothing(robot):
         time.sleep(SETTLED_S)
         assert watcher.rolled(0.3) == pytest.approx((0.0, 0.0), abs=1e-3), "nobody sees the page"
         wait_for(lambda: watcher.mode == "INIT", "the robot waits to be enabled")
+
+
+@pytest.mark.browser
+def test_a_key_drives_no_more_once_cmd_is_pressed_and_none_that_was_held_before_the_take_over(robot):
+    socket, watcher = robot
+    with served_page(socket) as (browser, address):
+        page = browser.new_page()
+        page.goto(address)
+        expect(page.locator("#mode")).to_have_text("INIT", timeout=20_000)
+        page.keyboard.down("a")
+        take_over(page)
+        assert watcher.rolled(0.5) == pytest.approx((0.0, 0.0), abs=1e-3), "it was held before"
+        page.keyboard.up("a")
+        page.keyboard.down("a")
+        wait_for(lambda: watcher.rolled(0.3)[1] > 0.005, "it turns")
+        page.keyboard.down("Meta")  # from now on macOS tells no release of the other key
+        page.evaluate("window.dispatchEvent(new KeyboardEvent('keyup', { key: 'Meta', code: 'MetaLeft' }))")
+        time.sleep(SETTLED_S)
+        assert watcher.rolled(0.5) == pytest.approx((0.0, 0.0), abs=1e-3)
+
+
+class SlowLink:
+    """Relays TCP connections to a port of this computer; what the clients send arrives `delay` s later."""
+
+    def __init__(self, port: int) -> None:
+        self.delay = 0.0
+        self._to = port
+        self._listening = create_server(("127.0.0.1", 0))
+        self.port = self._listening.getsockname()[1]
+        Thread(target=self._accept, daemon=True).start()
+
+    def _accept(self) -> None:
+        while True:
+            client = self._listening.accept()[0]
+            server = create_connection(("127.0.0.1", self._to))
+            waiting = SimpleQueue()
+            for work in (
+                partial(self._take, client, lambda data, line=waiting: line.put((time.monotonic() + self.delay, data))),
+                partial(self._take, server, client.sendall),
+                partial(self._deliver, waiting, server),
+            ):
+                Thread(target=work, daemon=True).start()
+
+    @staticmethod
+    def _take(end, then) -> None:
+        with suppress(OSError):
+            while data := end.recv(65536):
+                then(data)
+        then(b"")
+
+    @staticmethod
+    def _deliver(waiting, end) -> None:
+        with suppress(OSError):
+            while True:
+                due, data = waiting.get()
+                time.sleep(max(0.0, due - time.monotonic()))
+                if not data:
+                    break
+                end.sendall(data)
+        end.close()
+
+
+@pytest.mark.browser
+def test_over_a_slow_link_the_page_drives_nothing(robot):
+    socket, watcher = robot
+    with served_page(socket) as (browser, address):
+        port = int(re.search(r":(\d+)/", address)[1])
+        link = SlowLink(port)
+        page = browser.new_page()
+        page.goto(address.replace(f":{port}/", f":{link.port}/"))
+        take_over(page)
+        hold_left(page)
+        wait_for(lambda: watcher.rolled(0.3)[1] > 0.005, "it turns")
+        link.delay = 1.0
+        expect(page.locator("#reply")).to_contain_text("the link to the page is slow (1.")
+        time.sleep(SETTLED_S)
+        assert watcher.rolled(0.5) == pytest.approx((0.0, 0.0), abs=1e-3), "what is said now was meant a second ago"
+        link.delay = 0.0
+        wait_for(lambda: watcher.rolled(0.3)[1] > 0.005, "it turns again")
+        page.mouse.up()
 
 
 @pytest.mark.browser

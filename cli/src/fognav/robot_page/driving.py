@@ -25,6 +25,8 @@ if TYPE_CHECKING:
 _PERIOD_S: Final = 0.05
 _KEY_S: Final = 0.15
 """A terminal tells no release of a key: one that is not repeated for this long is released."""
+_PAD_S: Final = 1.0
+"""A game pad out of range or without power tells no release either; a hand on its sticks is never still for so long."""
 _HEALTHY_S: Final = 5.0
 """For so long a robot is asked again that must not move: its lidar may have to start."""
 _MOVES: Final = {
@@ -102,9 +104,11 @@ class Keyboard:
 
 
 class GamePad:
-    """A game pad by Linux's joystick interface: a shoulder button is held, the left stick steers."""
+    """A game pad by Linux's joystick interface: a shoulder button is held, the left stick steers.
 
-    lapses_at = math.inf
+    One that has told nothing for `_PAD_S` may be out of range: the button counts as released until it is pressed again.
+    """
+
     _EVENT = struct.Struct("<IhBB")
     _BUTTON, _AXIS, _FIRST = 0x01, 0x02, 0x80
     _SHOULDERS = frozenset({4, 5})
@@ -114,6 +118,7 @@ class GamePad:
         self._device, self._speed, self._turn = device, speed, turn
         self._axes: dict[int, float] = {}
         self._held: set[int] = set()
+        self._heard_at = 0.0
         try:
             self._file = os.open(device, os.O_RDONLY | os.O_NONBLOCK)
         except OSError as error:
@@ -127,7 +132,7 @@ class GamePad:
 
     def read(self, now: float) -> str:
         """Take in what has changed."""
-        del now
+        self.motion(now)  # what comes after a silence does not undo its end
         try:
             data = os.read(self._file, 64 * self._EVENT.size)
         except BlockingIOError:
@@ -136,6 +141,7 @@ class GamePad:
             raise FailedError(f"{self._device}: {error.strerror}: the robot stands") from error
         if not data:
             raise FailedError(f"{self._device}: the game pad is gone: the robot stands")
+        self._heard_at = now
         for _, value, kind, number in self._EVENT.iter_unpack(data[: len(data) // self._EVENT.size * self._EVENT.size]):
             if kind & self._AXIS:
                 self._axes[number] = value / 32767.0
@@ -146,11 +152,17 @@ class GamePad:
 
     def motion(self, now: float) -> tuple[float, float]:
         """Return the motion of the stick while a shoulder button is held."""
-        del now
+        if now >= self.lapses_at:
+            self._held.clear()
         if not self._held:
             return 0.0, 0.0
         ahead, left = -self._axes.get(1, 0.0), -self._axes.get(0, 0.0)
         return ahead * self._speed, left * self._turn
+
+    @property
+    def lapses_at(self) -> float:
+        """When the button that is held counts as released."""
+        return self._heard_at + _PAD_S if self._held else math.inf
 
 
 def drive(path: Path, steering: _Steering) -> None:

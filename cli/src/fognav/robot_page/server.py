@@ -1,7 +1,8 @@
 """Serves the page of a robot's own computer: its scan and state live, a pad to drive it by hand, and its bring-up.
 
 Each page is a client of the agent of its own. What it says is passed on as it comes, and nothing is said that it did
-not say: the agent's dead man's switch is the only one, so a link to the page that breaks stops the robot.
+not say: the agent's dead man's switch stops the robot when the link to the page breaks. A link that is slow does not
+lengthen it: a page that drives is told the time, and a speed that echoes an old one is not passed on.
 """
 
 from __future__ import annotations
@@ -11,6 +12,7 @@ import contextlib
 import hmac
 import secrets
 import socket
+import time
 from collections import deque
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
@@ -23,7 +25,7 @@ from fastapi.responses import FileResponse
 from fognav.output import WrongUseError, print_line
 from fognav.robot_page.bringup import BringupView, Mount
 from fognav.robot_page.view import LocalRobotErrors, RobotView
-from robot_agent.agent.hand_driving import HandBack, HandReply, HandRequest, ResetFault, TakeOver
+from robot_agent.agent.hand_driving import HandBack, HandReply, HandRequest, ResetFault, Steer, TakeOver
 from robot_agent.local_client import LocalRobot, LocalRobotError
 
 if TYPE_CHECKING:
@@ -36,7 +38,18 @@ _REFUSED: Final = 4401
 _PAGES_MAX: Final = 4
 _LOOPBACK: Final = frozenset({"127.0.0.1", "::1"})
 
-_requests = msgspec.json.Decoder(HandRequest | Mount)
+_TICK_S: Final = 0.05
+_LATE_S: Final = 0.3
+"""A speed is not passed on that echoes what a page was told longer ago."""
+
+
+class _PageSteer(Steer, frozen=True, tag="steer", kw_only=True):
+    """A speed that a page wants; `tick` is the newest that it was told (ms of the server's monotonic clock)."""
+
+    tick: int
+
+
+_requests = msgspec.json.Decoder(TakeOver | HandBack | ResetFault | _PageSteer | Mount)
 
 
 def make_app(path: Path, token: str, view: Callable[[], RobotView] = RobotView) -> FastAPI:
@@ -81,7 +94,7 @@ class _Session:
         self._view = view
         self._replies: list[HandReply] = []
         self._asked: deque[HandRequest] = deque()
-        self._mine = self._by_hand = False
+        self._mine = self._by_hand = self._late = False
         self._news = asyncio.Event()
         self._error = ""
 
@@ -133,14 +146,33 @@ class _Session:
                 self._mine = False
 
     async def _show(self) -> None:
-        """Send the newest whenever there is any; a slow page gets fewer, never older ones."""
+        """Send the newest whenever there is any; a slow page gets fewer, never older ones.
+
+        A page that drives is told the time in between.
+        """
         while not self._error:
-            await self._news.wait()
+            try:
+                await asyncio.wait_for(self._news.wait(), _TICK_S if self._mine else None)
+            except TimeoutError:
+                await self._page.send_json({"tick": _now_ms()})
+                continue
             self._news.clear()
             replies, self._replies = self._replies, []
             told = {"mine": self._mine, "replies": [msgspec.to_builtins(reply) for reply in replies]}
-            await self._page.send_json({**self._view.as_json(), **told})
+            await self._page.send_json({**self._view.as_json(), **told, "tick": _now_ms()})
         await self._page.send_json({"error": self._error})
+
+    def _steer(self, robot: LocalRobot, request: _PageSteer) -> None:
+        """Pass a speed on, unless it is late; a stop never is."""
+        age = 0.001 * (_now_ms() - request.tick)
+        late = not 0.0 <= age <= _LATE_S and (request.v, request.w) != (0.0, 0.0)
+        if not late:
+            robot.send(Steer(v=request.v, w=request.w))
+        elif not self._late and self._mine:
+            reason = f"the link to the page is slow ({age:.1f} s): the robot stands until it is faster"
+            self._replies.append(HandReply(accepted=False, reason=reason))
+            self._news.set()
+        self._late = late
 
     async def _hear(self, robot: LocalRobot) -> None:
         with contextlib.suppress(WebSocketDisconnect, LocalRobotError):
@@ -150,13 +182,19 @@ class _Session:
                 except msgspec.DecodeError as error:
                     await self._page.send_json({"error": f"the page sent what is no request: {error}"})
                     return
-                if not isinstance(request, Mount):
+                if isinstance(request, _PageSteer):
+                    self._steer(robot, request)
+                elif not isinstance(request, Mount):
                     robot.send(request)
                     if isinstance(request, TakeOver | HandBack | ResetFault):
                         self._asked.append(request)
                 elif isinstance(self._view, BringupView):
                     self._replies.append(await asyncio.to_thread(self._view.write, request))
                     self._news.set()
+
+
+def _now_ms() -> int:
+    return time.monotonic_ns() // 1_000_000
 
 
 async def serve(path: Path, hosts: Sequence[str], port: int, view: Callable[[], RobotView] | None = None) -> None:

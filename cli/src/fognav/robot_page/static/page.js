@@ -1,5 +1,6 @@
 // The robot's page: draws what the agent tells, and says what the operator wants. A speed is said 20 times a second and
-// counts for 0.15 s on the robot, so that letting go, hiding the page or losing the link stops it.
+// counts for 0.15 s on the robot, so that letting go, hiding the page or losing the link stops it. Each speed echoes the
+// server's newest tick: one that a slow link has kept for long counts for nothing.
 
 import * as bringup from "./bringup.js";
 
@@ -16,11 +17,16 @@ let wish = null; // [ahead, left], -1 to 1, while the pad is held
 let link = null;
 let view = { mode: "", mine: false, points: [], footprint: [] };
 let said = 0;
+let tick = 0; // the server's newest
 
 function connect() {
   const scheme = location.protocol === "https:" ? "wss" : "ws";
   link = new WebSocket(`${scheme}://${location.host}/live${location.search}`);
-  link.onmessage = (event) => show(JSON.parse(event.data));
+  link.onmessage = (event) => {
+    const { tick: newest, ...told } = JSON.parse(event.data);
+    tick = newest ?? tick;
+    if (Object.keys(told).length) show(told);
+  };
   link.onclose = (event) => {
     letGo();
     bringup.disconnect();
@@ -44,7 +50,9 @@ function show(told) {
     element("reply").textContent = told.error;
     return;
   }
+  const drove = drives();
   view = { ...view, ...told };
+  if (!drove && drives()) letGo(); // what was pressed before is not meant for the robot
   element("mode").textContent = view.mode;
   element("reasons").textContent = (view.reasons ?? []).join("; ");
   document.querySelector("header").classList.toggle("alarm", ["FAULT", "PROTECTIVE_STOP", "not connected"].includes(view.mode));
@@ -117,16 +125,17 @@ function steer() {
   const [ahead, left] = motion ?? [0, 0];
   element("knob").style.transform = `translate(${-left * 70}%, ${-ahead * 70}%)`;
   if (!drives() || document.hidden || (!motion && now - said < KEEP_MS)) return;
+  if (link.bufferedAmount) return; // what waits here would come late
   said = now;
   const backwards = ahead < 0 ? -1 : 1; // as one steers: to the left is to the left, backwards too
-  say({ type: "steer", v: ahead * element("speed").value, w: backwards * left * element("turn").value });
+  say({ type: "steer", tick, v: ahead * element("speed").value, w: backwards * left * element("turn").value });
 }
 
 function letGo() {
   const drove = wish || held.size;
   wish = null;
   held.clear();
-  if (drove && drives()) say({ type: "steer", v: 0, w: 0 });
+  if (drove && drives()) say({ type: "steer", tick, v: 0, w: 0 });
 }
 
 function point(event) {
@@ -141,13 +150,20 @@ pad.addEventListener("pointerdown", (event) => { pad.setPointerCapture(event.poi
 pad.addEventListener("pointermove", (event) => { if (wish) point(event); });
 for (const name of ["pointerup", "pointercancel", "lostpointercapture"]) pad.addEventListener(name, letGo);
 pad.addEventListener("contextmenu", (event) => event.preventDefault());
+// macOS tells no release of a key that is let go while Cmd is down.
+const withMeta = (event) => event.metaKey || event.key === "Meta";
 window.addEventListener("keydown", (event) => {
-  if (!(event.code in KEYS) || ["INPUT", "SELECT"].includes(event.target.tagName) || event.ctrlKey || event.metaKey) return;
+  if (withMeta(event)) {
+    letGo();
+    return;
+  }
+  if (!(event.code in KEYS) || ["INPUT", "SELECT"].includes(event.target.tagName) || event.ctrlKey) return;
   event.preventDefault();
-  held.add(event.code);
+  if (!event.repeat) held.add(event.code);
 });
 window.addEventListener("keyup", (event) => {
-  if (held.delete(event.code) && !held.size && drives()) say({ type: "steer", v: 0, w: 0 });
+  if (withMeta(event)) letGo();
+  else if (held.delete(event.code) && !held.size && drives()) say({ type: "steer", tick, v: 0, w: 0 });
 });
 window.addEventListener("blur", letGo);
 document.addEventListener("visibilitychange", letGo);

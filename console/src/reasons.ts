@@ -24,6 +24,7 @@ export const REASONS: Readonly<Record<string, Reason>> = {
   lidar_silent: reason("O lidar não mede nada", "Check its plug and that it turns.", "Verifique a ficha e se ele roda."),
   scan_missing: reason("Falta uma volta completa do lidar", "Check that the lidar turns freely.", "Verifique se o lidar roda livremente."),
   lidar_repeats: reason("O lidar repete as mesmas medidas", "Unplug the lidar and plug it in again.", "Desligue e volte a ligar o lidar."),
+  lidar_empty: reason("O lidar roda e não vê nada", "Take away what covers it, or replace it.", "Retire o que o tapa ou substitua-o."),
   at_rest: reason("O lidar descansa", "Send the robot somewhere: it wakes by itself.", "Envie o robô a um destino: acorda sozinho."),
   lidar_blind: reason("O lidar não vê o suficiente", "Clean it, and take away what covers it.", "Limpe-o e retire o que o tapa."),
   obstacle_near: reason("Há um obstáculo mesmo à frente", "Take it away, or wait until it passes.", "Retire-o ou espere que passe."),

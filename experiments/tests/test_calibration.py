@@ -190,8 +190,10 @@ def test_a_robot_that_drives_by_itself_stops_for_who_comes_near_for_slipping_and
     plan.on_counters(0.0, 0.0)
     walls = np.array([[2.0, y / 10.0] for y in range(-20, 20)])
     foot = np.array([[0.1, 0.4], [0.1, 0.41], [0.1, 0.42]])
-    assert plan.intruder(walls) == ""
-    assert plan.intruder(np.concatenate((walls, foot))) == "something has come near"
+    around = np.array([[2.0 * np.cos(a), 2.0 * np.sin(a)] for a in np.linspace(-3.1, 3.1, 90)])
+    assert plan.disturbed(around) == ""
+    assert plan.disturbed(np.concatenate((around, foot))) == "something has come near"
+    assert "in 9 of 36 directions only" in plan.disturbed(walls), "a sheet over the lidar is no free floor"
     assert plan.motion(0.0) == (SPEED_M_S, 0.0)
     assert plan.problem(1.9) == ""
     assert plan.problem(2.1) == "its wheels have not turned for 2 s"

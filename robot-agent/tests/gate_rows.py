@@ -104,6 +104,13 @@ ROWS = [
         "the lidar repeats itself",
         not_yet={"identical_scans": 2},
     ),
+    Row(
+        "scans are empty",
+        {"empty_scans": 2},
+        "PROTECTIVE_STOP",
+        "the lidar turns and sees nothing",
+        not_yet={"empty_scans": 1},
+    ),
     Row("at rest", {"resting": "at rest"}, "HOLD", "at rest", by_hand="waits"),
     Row(
         "pose unknown",

@@ -31,6 +31,7 @@ from fog_contracts.messages import (
 from fog_contracts.replica import MapError, MasterMap
 from fog_kernels.inflation import inflate
 from robot_agent.agent.core import AgentCore
+from robot_agent.agent.hand_driving import TakeOver
 from robot_agent.motion.local_planner import decide
 from robot_agent.scan_builder import Mounting
 
@@ -295,6 +296,16 @@ def test_identical_scans_stop_the_wheels(driving):
     driving.frozen_scan = np.column_stack((-(np.arange(360) + 0.5) * math.pi / 180, np.full(360, 3.0)))
     assert driving.run(0.8, lambda w: w.state().mode == "PROTECTIVE_STOP")
     assert any("the lidar repeats itself" in reason for reason in driving.state().reasons)
+
+
+def test_a_lidar_that_turns_and_sees_nothing_stops_the_wheels_and_open_space_on_one_side_does_not(driving):
+    driving.glass = [(-99.0, -99.0, driving.x, 99.0)]
+    assert not driving.run(0.8, lambda w: any("sees nothing" in reason for reason in w.state().reasons))
+    driving.glass = [(-99.0, -99.0, 99.0, 99.0)]
+    assert driving.run(0.8, lambda w: w.state().mode == "PROTECTIVE_STOP")
+    assert any("the lidar turns and sees nothing" in reason for reason in driving.state().reasons)
+    assert driving.command("disable").accepted
+    assert "the lidar turns and sees nothing" in driving.agent.on_hand(TakeOver(), driving.now).reason
 
 
 def test_silent_guardian_stops_the_wheels(driving):

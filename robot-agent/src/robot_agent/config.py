@@ -69,6 +69,11 @@ class SafetyConfig:
     lidar_lost: float = 0.3
     scan_lost: float = 0.45
     identical_scans: int = 3
+    empty_scans: int = 2
+    """So many in a row with less than `returns_least`; one alone may be a moment's glare."""
+    returns_least: float = 0.03
+    """Share of a scan's samples with a return. In rooms, recorded lidars had 44 % at least, and a robot that faces half
+    a hall out of their range has more than this, too."""
     base_lost: float = 0.3
     position_sigma_max: float = 0.8
     """A robot whose position has a larger standard deviation (m) in some direction does not drive a mission: one in

@@ -22,6 +22,7 @@ STOPS = [
     ({"lidar_age": 0.31}, "the lidar has been silent"),
     ({"scan_age": 0.46}, "no complete scan"),
     ({"identical_scans": 3}, "the lidar repeats itself"),
+    ({"empty_scans": 2}, "the lidar turns and sees nothing"),
     ({"localization": "lost"}, "the pose is lost"),
     ({"inside_blocked": "the zone x"}, "the robot is in the zone x"),
     ({"map_age": 3.01}, "the map is 3.0 s old"),

@@ -157,6 +157,7 @@ CHANGES = st.fixed_dictionaries(
         "lidar_age": AGES,
         "scan_age": AGES,
         "identical_scans": st.integers(1, 4),
+        "empty_scans": st.integers(0, 3),
         "base_age": AGES,
         "guardian_lost": st.sampled_from([None, "gone"]),
         "base_fault": st.sampled_from([None, None, None, "serial"]),

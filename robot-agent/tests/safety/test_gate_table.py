@@ -417,7 +417,7 @@ def test_stop_in_a_zone_after_a_long_hold_stays_a_stop_and_is_enabled_without_ei
     assert at_moments(*steps, (164.5, {"request": "enable"}))[-1].refusal is None
 
 
-RESTING = {"resting": "at rest", "lidar_age": 700.0, "scan_age": 700.0, "identical_scans": 3}
+RESTING = {"resting": "at rest", "lidar_age": 700.0, "scan_age": 700.0, "identical_scans": 3, "empty_scans": 9}
 
 
 def test_resting_robot_holds_without_a_stop_and_needs_no_operator_afterwards():

@@ -77,6 +77,7 @@ def test_egress_that_ends_inside_says_so():
         ({"lidar_age": 0.31}, "the lidar has been silent"),
         ({"scan_age": 0.46}, "no complete scan"),
         ({"identical_scans": 3}, "the lidar repeats itself"),
+        ({"empty_scans": 2}, "the lidar turns and sees nothing"),
         ({"localization": "lost"}, "the pose is lost"),
         ({"map_age": 3.01}, "the map is 3.0 s old"),
         ({"map_gap": 1.01}, "changes of the map"),

@@ -156,15 +156,23 @@ class SquareDrive:
                 return f"its wheels have not turned for {_STUCK_S:g} s"
         return ""
 
+    @staticmethod
+    def unseen(points: NDArray[np.float64]) -> str:
+        """Return why nobody knows what is free around a robot that sees these points, as for `unfit`; else empty."""
+        bearing = np.arctan2(points[:, 1], points[:, 0])
+        sectors = np.unique(np.floor((bearing + math.pi) / math.tau * _SECTORS).astype(int) % _SECTORS).size
+        if sectors >= _SECTORS_SEEN * _SECTORS:
+            return ""
+        return (
+            f"its lidar sees something in {sectors} of {_SECTORS} directions only: nobody knows what is free "
+            "there. Choose a place with walls within its reach"
+        )
+
     def unfit(self, points: NDArray[np.float64]) -> str:
         """Return why a robot that sees these points (n, 2; m, in its frame) must not begin; empty if it may."""
+        if reason := self.unseen(points):
+            return reason
         far, bearing = np.hypot(points[:, 0], points[:, 1]), np.arctan2(points[:, 1], points[:, 0])
-        sectors = np.unique(np.floor((bearing + math.pi) / math.tau * _SECTORS).astype(int) % _SECTORS).size
-        if sectors < _SECTORS_SEEN * _SECTORS:
-            return (
-                f"its lidar sees something in {sectors} of {_SECTORS} directions only: nobody knows what is free "
-                "there. Choose a place with walls within its reach"
-            )
         others = far > self._config.radius
         nearest = int(np.argmin(np.where(others, far, np.inf)))
         if far[nearest] < self._free + _FREE_M:
@@ -174,6 +182,10 @@ class SquareDrive:
                 f"{'left' if side >= 0.0 else 'right'}: {self._free + _FREE_M:.2f} m must be free all around"
             )
         return ""
+
+    def disturbed(self, points: NDArray[np.float64]) -> str:
+        """Return why a robot that sees these points, as for `unfit`, must not drive on; empty if it may."""
+        return self.unseen(points) or self.intruder(points)
 
     def intruder(self, points: NDArray[np.float64]) -> str:
         """Return what has come into the free circle, by points as for `unfit`; empty if nothing has."""
@@ -292,7 +304,7 @@ def _drive_round(robot: LocalRobot, heard: _Recorded, plan: SquareDrive, ends: C
             match entry:
                 case BaseReceived():
                     plan.on_counters(entry.feedback.odometry.left_m, entry.feedback.odometry.right_m)
-                case ScanReceived() if by_hand and (reason := plan.intruder(heard.view.points())):
+                case ScanReceived() if by_hand and (reason := plan.disturbed(heard.view.points())):
                     raise FailedError(f"the robot has stopped: {reason}")
                 case Published() if by_hand or entry.message["mode"] == "TELEOP":
                     by_hand = True

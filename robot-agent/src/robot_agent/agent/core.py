@@ -93,7 +93,7 @@ class AgentCore:
         self._config = config
         self._base = BaseSource()
         self._odometry = Odometry(config.drive_train)
-        self._lidar = LidarSource()
+        self._lidar = LidarSource(config.safety.returns_least)
         self._localizer = Localizer(config.localization, seed)
         self._pose_persistence = PosePersistence(self._localizer)
         self._fence = Fence()
@@ -202,7 +202,7 @@ class AgentCore:
 
         Repeated identical scans don't correct the pose, and an idle robot looks at every third one only.
         """
-        self._lidar.on_scan(scan.repeats, now)
+        self._lidar.on_scan(scan, now)
         self._rest.on_scan()
         if not self._idle_scans.counts(idle=self.idle, status=self._localizer.status):
             return

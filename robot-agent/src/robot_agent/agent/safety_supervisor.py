@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from typing import TYPE_CHECKING, Final, NamedTuple
 
+import numpy as np
 from msgspec.structs import replace
 
 from robot_agent.hardware import ASLEEP
@@ -17,6 +18,7 @@ if TYPE_CHECKING:
     from robot_agent.agent.navigation import Navigation
     from robot_agent.config import SafetyConfig
     from robot_agent.guardian.link import BaseFeedback
+    from robot_agent.hardware import LaserScan
     from robot_agent.localization.localizer import Localizer
     from robot_agent.safety.conditions import Request
     from robot_agent.safety.gate import SafetyOutputs
@@ -68,9 +70,13 @@ class BaseSource:
 class LidarSource:
     """When (s, monotonic) the last samples and the last whole scan arrived."""
 
-    def __init__(self) -> None:
+    def __init__(self, returns_least: float) -> None:
+        """Count scans as empty with a smaller share of returns than this."""
         self.identical_scans = 1
         """1, and 1 more for each scan in a row that equals an earlier one: a working lidar never repeats a scan."""
+        self.empty_scans = 0
+        """How many scans in a row have hardly a return."""
+        self._returns_least = returns_least
         self._samples_at = _NEVER
         self._scan_at = _NEVER
 
@@ -78,10 +84,12 @@ class LidarSource:
         """Record that samples arrived."""
         self._samples_at = now
 
-    def on_scan(self, repeats: int, now: float) -> None:
-        """Record that a whole scan arrived; `repeats` as in `LaserScan`."""
+    def on_scan(self, scan: LaserScan, now: float) -> None:
+        """Record that a whole scan arrived."""
         self._scan_at = self._samples_at = now
-        self.identical_scans = repeats
+        self.identical_scans = scan.repeats
+        empty = np.isfinite(scan.ranges_m).sum() < self._returns_least * len(scan.ranges_m)
+        self.empty_scans = self.empty_scans + 1 if empty else 0
 
     def samples_age(self, now: float) -> float:
         """Return the time (s) since samples last arrived."""
@@ -158,6 +166,7 @@ def safety_inputs(  # noqa: PLR0913  # the gate weighs every source of the agent
         lidar_age=lidar.samples_age(now),
         scan_age=lidar.scan_age(now),
         identical_scans=lidar.identical_scans,
+        empty_scans=lidar.empty_scans,
         base_age=base.age(now),
         guardian_lost=base.lost,
         base_fault=feedback.fault if feedback else None,

@@ -61,6 +61,7 @@ class SafetyInputs(msgspec.Struct, frozen=True, kw_only=True):
     lidar_age: float = math.inf
     scan_age: float = math.inf
     identical_scans: int = 1
+    empty_scans: int = 0
     base_age: float = math.inf
     guardian_lost: str | None = None
     base_fault: str | None = None
@@ -219,6 +220,13 @@ CONDITIONS: Final[tuple[Condition, ...]] = (
         Level.PROTECTIVE_STOP,
         lambda i, c: i.resting is None and i.identical_scans >= c.identical_scans,
         lambda i: f"the lidar repeats itself: {i.identical_scans - 1} scans in a row equal earlier ones",
+    ),
+    # Without a map nothing tells a covered lidar from open space: the stop field would find nothing in the way.
+    Condition(
+        ReasonCode.LIDAR_EMPTY,
+        Level.PROTECTIVE_STOP,
+        lambda i, c: i.resting is None and i.empty_scans >= c.empty_scans,
+        lambda i: f"the lidar turns and sees nothing: {i.empty_scans} scans in a row have hardly a return",
     ),
     Condition(ReasonCode.AT_REST, Level.HOLD, lambda i, _: i.resting is not None, lambda i: str(i.resting), rest=True),
     # --- pose ---

@@ -271,6 +271,7 @@ class ReasonCode(StrEnum):
     LIDAR_SILENT = "lidar_silent"
     SCAN_MISSING = "scan_missing"
     LIDAR_REPEATS = "lidar_repeats"
+    LIDAR_EMPTY = "lidar_empty"
     AT_REST = "at_rest"
     LIDAR_BLIND = "lidar_blind"
     OBSTACLE_NEAR = "obstacle_near"

@@ -6,6 +6,7 @@ import json
 import math
 import subprocess
 import sys
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -17,7 +18,7 @@ from fognav.robot_page.by_itself import SPEED_M_S, SquareDrive
 from fognav.robot_page.view import RobotView
 from fognav_experiments.bench.calibration import Body, driven, measure, random_body, recording
 from robot_agent.agent.recording.input_log import TOPIC_OF_ENTRY
-from robot_agent.calibration import CalibrationError, Calibrator
+from robot_agent.calibration import NAMES, Calibration, CalibrationError, Calibrator, Figure, changes
 
 STRAIGHT = (0.12, 0.0, 16.0)
 LEFT, RIGHT = (0.0, 0.5, 14.0), (0.0, -0.5, 14.0)
@@ -108,9 +109,24 @@ def test_the_command_writes_what_an_independent_square_agrees_with_and_keeps_the
     assert written.odometry.wheel_ratio == pytest.approx(1.05 / 1.04, rel=0.004)
     assert "before: 0.235" in text
     assert f"({log.name} " in text
-    # A robot with these settings has nothing to calibrate: what is found again are the same values.
-    again = subprocess.run([*command, "--json"], check=True, stdout=subprocess.PIPE, timeout=120.0)
-    assert json.loads(again.stdout)["axle_m"] == told["axle_m"]
+    again = subprocess.run([*command, "--write"], check=False, stderr=subprocess.PIPE, timeout=120.0)
+    assert again.returncode == 2
+    assert b"another base.options.wheel_diameter_m, odometry.wheel_ratio, base.options.axle_m" in again.stderr
+    assert b"record anew" in again.stderr
+    assert settings.read_text("utf-8") == text, "the same factors count once"
+
+
+@pytest.mark.parametrize(
+    ("mirrored", "masks"), [(False, [[0.1, 0.4], [3.1, -3.0832]]), (True, [[0.0, 0.3], [-2.8, -2.7]])]
+)
+def test_masks_stay_on_the_same_samples_when_the_lidar_turns_out_turned_or_mirrored(mirrored, masks):
+    drawn = [[0.0, 0.3], [3.0, 3.1]]
+    drawn_as = f"masks = {drawn}\nyaw_rad = 0.1\n"
+    settings = parse_robot(f"{TOML}{drawn_as}", Path("robot.toml"), {}).settings
+    figures = dict.fromkeys(NAMES, Figure(1.0, 0.1)) | {"yaw": Figure(0.2, 0.01)}
+    config = config_of(Body(left=1.0, right=1.0, axle=1.0, x=0.0, y=0.0, yaw=0.0, latency=0.0, mirrored=False))
+    told = changes(Calibration(figures, mirrored, 30, 0.0, 0.0), config, settings, 0.072)
+    assert [(c.before, c.now) for c in told if c.setting == "lidar.masks"] == [(drawn, masks)]
 
 
 @pytest.mark.drive

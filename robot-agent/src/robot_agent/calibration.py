@@ -27,6 +27,7 @@ if TYPE_CHECKING:
 
     from fog_contracts.robot import RobotSettings
     from robot_agent.config import AgentConfig
+    from robot_agent.hardware import DriveTrain
 
     _Track = tuple[NDArray[np.float64], NDArray[np.float64]]
     """Poses of odometry, shape (n, 3), and their times (s)."""
@@ -428,12 +429,16 @@ def _matched(
     return np.array(aligned.pose), information
 
 
+Setting = float | bool | list[list[float]]
+"""The value of a setting."""
+
+
 class Changed(NamedTuple):
     """A setting by its dotted name, its value before and now; half: of the interval, None for a choice."""
 
     setting: str
-    before: float | bool
-    now: float | bool
+    before: Setting
+    now: Setting
     half: float | None
 
 
@@ -457,7 +462,37 @@ def changes(found: Calibration, config: AgentConfig, settings: RobotSettings, di
         told.append(Changed("lidar.latency_s", lidar.latency_s, *_rounded(latency, 3)))
         later = max(0.0, round(lidar.latency_s + latency.value, 3))
         told[-1] = told[-1]._replace(now=later)
+    masks = [[*mask] for mask in lidar.masks]
+    if (turned := [_turned(mask, found, lidar.yaw_rad) for mask in masks]) != masks:
+        told.append(Changed("lidar.masks", masks, turned, None))
     return told
+
+
+def _turned(mask: Sequence[float], found: Calibration, yaw: float) -> list[float]:
+    """Return a mask (rad, in the robot's frame) over the same samples, whose direction was `yaw` (rad) until now."""
+    ends = [end - yaw for end in mask]
+    if found.mirrored:
+        ends = [-ends[1], -ends[0]]
+    return [round(math.remainder(end + round(found.figures["yaw"].value, 4), math.tau), 4) for end in ends]
+
+
+def differing(config: AgentConfig, settings: RobotSettings, drive: DriveTrain) -> list[str]:
+    """Return which of the settings that a calibration corrects are others than those that a recording was made with.
+
+    drive: of the base by these settings.
+    """
+    lidar, used, recorded = settings.lidar, config.localization, config.drive_train
+    pairs = {
+        "base.options.wheel_diameter_m": (recorded.travel_wrap_m, drive.travel_wrap_m),
+        "base.options.axle_m": (recorded.axle_m, drive.axle_m),
+        "odometry.wheel_ratio": (recorded.wheel_ratio, settings.odometry.wheel_ratio),
+        "lidar.x_m": (used.lidar_x, lidar.x_m),
+        "lidar.y_m": (used.lidar_y, lidar.y_m),
+        "lidar.yaw_rad": (used.lidar_yaw, lidar.yaw_rad),
+        "lidar.mirrored": (used.lidar_mirrored, lidar.mirrored),
+        "lidar.latency_s": (used.lidar_latency, lidar.latency_s),
+    }
+    return [name for name, pair in pairs.items() if not math.isclose(*pair, rel_tol=1e-6, abs_tol=1e-9)]
 
 
 def _rounded(figure: Figure, digits: int) -> tuple[float, float]:

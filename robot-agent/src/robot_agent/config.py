@@ -168,6 +168,9 @@ class LocalizationConfig:
     lidar_x: float = 0.0
     lidar_y: float = 0.0
     lidar_yaw: float = 0.0
+    lidar_mirrored: bool = False
+    lidar_latency: float = 0.0
+    """With these two its scans are corrected before they arrive: a recording says with which."""
     markers: tuple[MarkerSite, ...] = ()
     """The markers of the site; without any, sightings change nothing."""
 
@@ -332,6 +335,8 @@ def _with_settings(config: AgentConfig, settings: RobotSettings, *, can_rest: bo
         lidar_x=lidar.x_m,
         lidar_y=lidar.y_m,
         lidar_yaw=lidar.yaw_rad,
+        lidar_mirrored=lidar.mirrored,
+        lidar_latency=lidar.latency_s,
     )
     # A point is as old as its measurement: one that arrives late must not count for less time than others.
     stop_field = replace(config.stop_field, memory=config.stop_field.memory + lidar.latency_s)

@@ -20,7 +20,7 @@ from fognav.robot_page.recording_view import until_told
 from fognav.robot_page.view import LocalRobotErrors
 from robot_agent import registry
 from robot_agent.agent.recording.input_log import ENTRY_OF_TOPIC, TOPIC_OF_ENTRY, BaseReceived, ScanReceived, Started
-from robot_agent.calibration import WANTED, Calibration, CalibrationError, Calibrator, Changed, changes
+from robot_agent.calibration import WANTED, Calibration, CalibrationError, Calibrator, Changed, changes, differing
 from robot_agent.local_client import LocalRobot
 
 if TYPE_CHECKING:
@@ -28,6 +28,7 @@ if TYPE_CHECKING:
 
 USED: Final = (Started, BaseReceived, ScanReceived)
 """Entries that a calibration is made of."""
+RESTART: Final = "sudo systemctl restart fognav-watchdog fognav-agent"
 _TOLD_S: Final = 5.0
 
 
@@ -96,7 +97,10 @@ def known(found: Calibration) -> list[tuple[str, float]]:
 
 
 def solve(calibrator: Calibrator, robot_file: Path | None) -> tuple[Calibration, list[Changed]]:
-    """Return what was found, and what it changes in a robot's settings; raises `FailedError`."""
+    """Return what was found, and what it changes in a robot's settings; raises `FailedError`.
+
+    A file with other settings than the recording's is refused: the figures are factors of those.
+    """
     environ = {**os.environ, **({ROBOT_FILE: str(robot_file)} if robot_file else {})}
     try:
         found = calibrator.solve()
@@ -107,6 +111,12 @@ def solve(calibrator: Calibrator, robot_file: Path | None) -> tuple[Calibration,
     if diameter is None:
         raise robot.error("base.options", "this base has no `wheel_diameter_m`", "Use the figures of --json by hand")
     assert calibrator.config is not None
+    others = differing(calibrator.config, robot.settings, registry.make_base(robot).drive_train)
+    if robot_file is not None and others:
+        raise WrongUseError(
+            f"{robot_file} has another {', '.join(others)} than the recording was made with: was it calibrated by it "
+            f"already? Restart watchdog and agent ({RESTART}) and record anew"
+        )
     return found, changes(found, calibrator.config, robot.settings, diameter)
 
 
@@ -153,14 +163,17 @@ def tell(found: Calibration, changed: list[Changed], accepted: dict[str, float],
     print_answer(f"by {found.steps} pairs of scans; rms {1000 * found.residual_m:.1f} mm, {found.residual_rad:.4f} rad")
     for name, value in accepted.items():
         print_answer(f"{name:32} {value}")
-    if not written:
+    if written:
+        print_answer(f"the robot drives by it after: {RESTART}")
+    else:
         print_answer("nothing was written: add --write --robot-file robot.toml")
 
 
 def as_json(found: Calibration, changed: list[Changed], accepted: dict[str, float]) -> dict[str, Any]:
     """Return what the command prints as JSON."""
     by_name = {change.setting: change for change in changed}
-    diameter = float(by_name["base.options.wheel_diameter_m"].before)
+    diameter = by_name["base.options.wheel_diameter_m"].before
+    assert isinstance(diameter, float)
 
     def figure(name: str, factor: float = 1.0) -> dict[str, Any]:
         value, half = found.figures[name]

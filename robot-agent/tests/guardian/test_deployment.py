@@ -113,9 +113,18 @@ def configured(root):
     return given, config
 
 
+def test_the_kernel_knows_the_device_classes_of_the_units_before_a_plug_loads_their_modules(installed):
+    loaded = (installed / "etc/modules-load.d/fognav.conf").read_text().split()
+    built_in = {"char-ttyAMA"}  # the board's own port
+    modules = {"char-ttyUSB": "usbserial", "char-ttyACM": "cdc_acm", "char-video4linux": "videodev"}
+    for unit in UNITS:
+        allowed = {entry.split()[0] for entry in entries(installed / "etc/systemd/system" / unit, "DeviceAllow")}
+        assert {modules[name] for name in allowed - built_in} <= set(loaded)
+
+
 def test_installed_files_have_no_placeholder_left_and_are_not_writable_by_others(installed):
     files = [path for path in installed.rglob("*") if path.is_file()]
-    assert len(files) == 11
+    assert len(files) == 12
     for path in files:
         assert not re.search(r"@[A-Z]+@", path.read_text()), path
         assert not path.stat().st_mode & 0o022

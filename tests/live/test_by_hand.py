@@ -317,7 +317,8 @@ class SlowLink:
         with suppress(OSError):
             while data := end.recv(65536):
                 then(data)
-        then(b"")
+        with suppress(OSError):
+            then(b"")
 
     @staticmethod
     def _deliver(waiting, end) -> None:

@@ -2,7 +2,7 @@
 
 Each page is a client of the agent of its own. What it says is passed on as it comes, and nothing is said that it did
 not say: the agent's dead man's switch stops the robot when the link to the page breaks. A link that is slow does not
-lengthen it: a page that drives is told the time, and a speed that echoes an old one is not passed on.
+lengthen it: a page that drives is told the time, and a speed that echoes an old one is passed on as a stop.
 """
 
 from __future__ import annotations
@@ -40,7 +40,7 @@ _LOOPBACK: Final = frozenset({"127.0.0.1", "::1"})
 
 _TICK_S: Final = 0.05
 _LATE_S: Final = 0.3
-"""A speed is not passed on that echoes what a page was told longer ago."""
+"""A speed counts as a stop if it echoes what the page was told longer ago."""
 
 
 class _PageSteer(Steer, frozen=True, tag="steer", kw_only=True):
@@ -163,12 +163,11 @@ class _Session:
         await self._page.send_json({"error": self._error})
 
     def _steer(self, robot: LocalRobot, request: _PageSteer) -> None:
-        """Pass a speed on, unless it is late; a stop never is."""
+        """Pass a speed on; one that is late is a stop."""
         age = 0.001 * (_now_ms() - request.tick)
         late = not 0.0 <= age <= _LATE_S and (request.v, request.w) != (0.0, 0.0)
-        if not late:
-            robot.send(Steer(v=request.v, w=request.w))
-        elif not self._late and self._mine:
+        robot.send(Steer(v=0.0, w=0.0) if late else Steer(v=request.v, w=request.w))
+        if late and not self._late and self._mine:
             reason = f"the link to the page is slow ({age:.1f} s): the robot stands until it is faster"
             self._replies.append(HandReply(accepted=False, reason=reason))
             self._news.set()

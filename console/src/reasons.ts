@@ -18,6 +18,7 @@ export const REASONS: Readonly<Record<string, Reason>> = {
   guardian_lost: reason("Não há ligação ao guardião", "Its computer starts it again; if not: fognav doctor on the robot.", "O computador reinicia-o; se não: fognav doctor no robô."),
   guardian_silent: reason("O guardião não diz nada", "Its computer starts it again; if not: fognav doctor on the robot.", "O computador reinicia-o; se não: fognav doctor no robô."),
   wheels_held: reason("O guardião mantém as rodas paradas"),
+  wheels_differ: reason("O guardião conta com outras rodas", "Restart both: sudo systemctl restart fognav-watchdog fognav-agent.", "Reinicie ambos: sudo systemctl restart fognav-watchdog fognav-agent."),
   on_dock: reason("Está na base", "Let it leave the dock.", "Mande-o sair da base."),
   battery_low: reason("A bateria está fraca", "Send it to its dock.", "Envie-o para a base."),
   charger_fault: reason("O carregador tem uma avaria", "Look at dock and contacts.", "Veja a base e os contactos."),

@@ -69,6 +69,7 @@ ROWS = [
         "PROTECTIVE_STOP",
         "the guardian holds the wheels: no fresh command",
     ),
+    Row("other wheels", {"wheels_differ": True}, "PROTECTIVE_STOP", "the guardian counts with other wheels"),
     Row("on its dock", {"docked_for": 0.0, "mission": False}, "HOLD", "the robot is on its dock", by_hand="not begun"),
     Row(
         "on its dock, charging",

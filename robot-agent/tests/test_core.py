@@ -308,6 +308,14 @@ def test_a_lidar_that_turns_and_sees_nothing_stops_the_wheels_and_open_space_on_
     assert "the lidar turns and sees nothing" in driving.agent.on_hand(TakeOver(), driving.now).reason
 
 
+def test_a_guardian_that_counts_with_other_wheels_stops_them_with_the_remedy(driving):
+    driving.guardian_wrap = driving.config.drive_train.travel_wrap_m
+    assert not driving.run(0.5, lambda w: w.state().mode == "PROTECTIVE_STOP")
+    driving.guardian_wrap *= 1.05
+    assert driving.run(0.5, lambda w: w.state().mode == "PROTECTIVE_STOP")
+    assert any("restart fognav-watchdog fognav-agent" in reason for reason in driving.state().reasons)
+
+
 def test_silent_guardian_stops_the_wheels(driving):
     driving.base_on = False
     driving.run(0.4)

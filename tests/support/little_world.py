@@ -104,7 +104,7 @@ class LittleWorld:
         self.bumper = self.wheel_drop = False
         self.fault = None
         self.bumped = False
-        self.stopped = None
+        self.stopped = self.guardian_wrap = None
         self.resting = False
         self.path = None
         self.path_on = True
@@ -243,6 +243,7 @@ class LittleWorld:
                     fault=self.fault,
                     bumped=self.bumped,
                     stopped=self.stopped,
+                    travel_wrap_m=self.guardian_wrap,
                 ),
                 self.now,
             )

@@ -16,9 +16,9 @@ POSE = SavedPose(site="lab", x=1.0, y=2.0, theta=3.1, sigma_xy=0.1, sigma_theta=
 FIELDS = object()
 
 
-def feedback(seq, left, fault=None):
+def feedback(seq, left, fault=None, guardian="one"):
     wheels = WheelOdometry(left_m=left, right_m=2.0)
-    return BaseFeedback(seq=seq, status=BaseStatus(), odometry=wheels, fault=fault, stopped=None)
+    return BaseFeedback(seq=seq, status=BaseStatus(), odometry=wheels, fault=fault, stopped=None, guardian=guardian)
 
 
 class FakeLocalizer:
@@ -113,8 +113,8 @@ def test_stored_pose_is_restored_immediately_on_the_map_of_its_site(persistence,
 @pytest.mark.parametrize("base_first", [True, False])
 @pytest.mark.parametrize(
     ("first", "followed"),
-    [((7, 2.5), 1), ((6, 2.0), 0), ((7, 3.6), 0), ((7, 2.0, "wheel drop"), 0)],
-    ids=["same guardian", "another guardian", "the wheels have turned", "it was lifted"],
+    [((7, 2.5), 1), ((900, 2.0, None, "two"), 0), ((6, 2.0), 0), ((7, 3.6), 0), ((7, 2.0, "wheel drop"), 0)],
+    ids=["same guardian", "another guardian, for long", "nothing since", "the wheels have turned", "it was lifted"],
 )
 def test_stored_pose_is_followed_if_one_guardian_has_watched_the_robot_since(
     persistence, localizer, first, followed, base_first

@@ -91,7 +91,7 @@ class AgentCore:
 
     def __init__(self, config: AgentConfig, seed: int = 0, find_profile: FindProfile = fog_only) -> None:
         self._config = config
-        self._base = BaseSource()
+        self._base = BaseSource(config.drive_train.travel_wrap_m)
         self._odometry = Odometry(config.drive_train)
         self._lidar = LidarSource(config.safety.returns_least)
         self._localizer = Localizer(config.localization, seed)

@@ -101,7 +101,8 @@ class PosePersistence:
         if (feedback := self._feedback) is None:
             return pose
         wheels = feedback.odometry
-        return msgspec.structs.replace(pose, base=(feedback.seq, wheels.left_m, wheels.right_m))
+        base = feedback.seq, wheels.left_m, wheels.right_m
+        return msgspec.structs.replace(pose, base=base, guardian=feedback.guardian)
 
 
 def start_pose(site: str, robot: RobotSite) -> SavedPose:
@@ -113,11 +114,8 @@ def start_pose(site: str, robot: RobotSite) -> SavedPose:
 
 
 def _is_followed(saved: SavedPose, feedback: BaseFeedback) -> bool:
-    """Whether the guardian of a stored pose still lives, has seen no wheel drop, and its wheels have hardly turned.
-
-    Each guardian numbers its feedback from 1, so that another one is behind unless it has run for longer.
-    """
-    if saved.base is None or feedback.fault is not None:
+    """Whether the guardian of a stored pose still lives, has seen no wheel drop, and its wheels have hardly turned."""
+    if saved.base is None or feedback.fault is not None or not saved.guardian or saved.guardian != feedback.guardian:
         return False
     seq, left, right = saved.base
     wheels = feedback.odometry

@@ -29,7 +29,9 @@ _NEVER: Final = -math.inf
 class BaseSource:
     """The newest feedback and its age (s, monotonic)."""
 
-    def __init__(self) -> None:
+    def __init__(self, travel_wrap_m: float) -> None:
+        """Take how far (m) a wheel rolls, by the agent's settings, until its counter begins again."""
+        self._travel_wrap_m = travel_wrap_m
         self.feedback: BaseFeedback | None = None
         self.lost: str | None = None
         """Why the link to the guardian is broken; None while it is connected."""
@@ -57,6 +59,12 @@ class BaseSource:
     def asleep(self) -> bool:
         """Whether the base sleeps: it does not notice if it is pushed."""
         return self.feedback is not None and self.feedback.stopped == ASLEEP
+
+    @property
+    def wheels_differ(self) -> bool:
+        """Whether the guardian reads the counters by other wheels than the agent: one of them has older settings."""
+        wrap = None if self.feedback is None else self.feedback.travel_wrap_m
+        return wrap is not None and wrap != self._travel_wrap_m
 
     def age(self, now: float) -> float:
         """Return the age (s) of the feedback; infinite without any."""
@@ -172,6 +180,7 @@ def safety_inputs(  # noqa: PLR0913  # the gate weighs every source of the agent
         base_fault=feedback.fault if feedback else None,
         base_fault_passing=feedback is not None and feedback.passing,
         base_stopped=feedback.stopped if feedback else None,
+        wheels_differ=base.wheels_differ,
         bumped=feedback is not None and feedback.bumped,
         docked_for=base.docked_for(now),
         bumper=feedback is not None and feedback.status.bumper,

@@ -9,6 +9,7 @@ that has sent no command for a second is dropped as soon as another connects.
 from __future__ import annotations
 
 import os
+import secrets
 import select
 import signal
 import socket
@@ -381,7 +382,8 @@ def main() -> int:
         settings = load(GuardianSettings, environ=os.environ)
         robot = load_robot(os.environ)
         driver = make_base(robot)
-        core = GuardianCore(driver, limits_of(robot.settings.motion, driver.drive_train.axle_m))
+        limits = limits_of(robot.settings.motion, driver.drive_train.axle_m)
+        core = GuardianCore(driver, limits, secrets.token_hex(8))
         check = LineCheck(settings.base_port, robot.settings.base.driver, signatures())
         listener = _listen(settings.guardian_socket)
     except SettingsError as error:

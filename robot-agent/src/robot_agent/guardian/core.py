@@ -101,6 +101,8 @@ class GuardianCore:
 
     driver: BaseDriver
     limits: Limits = field(default_factory=Limits)
+    run_id: str = "guardian"
+    """Tells this run of the guardian from any other."""
 
     def __post_init__(self) -> None:
         self._base = _Base()
@@ -417,6 +419,8 @@ class GuardianCore:
             bumped=self._bumped,
             passing=self._latched is None and self._base.silence is not None,
             at=now,
+            guardian=self.run_id,
+            travel_wrap_m=self.driver.drive_train.travel_wrap_m,
         )
 
     def _stopped(self, now: float) -> str | None:

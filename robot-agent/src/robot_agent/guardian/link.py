@@ -46,7 +46,8 @@ class BaseFeedback(Struct, frozen=True, kw_only=True):
     its identifier. `stopped`: why the guardian keeps the wheels at zero whatever the agent requests (None: it does
     not). `corrupted`: damaged frames of the base so far. `bumped`: the fault is a pressed bumper, from which the robot
     may back off. `passing`: it is the silence of a base that has not moved yet, and ends with it. `at`: when it was
-    sent, s of the monotonic clock that agent and guardian share (None: unknown).
+    sent, s of the monotonic clock that agent and guardian share (None: unknown). `guardian`: the id of this run of the
+    guardian. `travel_wrap_m`: that of the drive train by which it reads the counters (None: unknown).
     """
 
     seq: Count
@@ -59,6 +60,8 @@ class BaseFeedback(Struct, frozen=True, kw_only=True):
     bumped: bool = False
     passing: bool = False
     at: float | None = None
+    guardian: Annotated[str, Meta(max_length=32)] = ""
+    travel_wrap_m: float | None = None
 
 
 encode = msgspec.msgpack.Encoder().encode

@@ -100,7 +100,8 @@ class AbsoluteObservation:
 class SavedPose(msgspec.Struct, frozen=True, kw_only=True):
     """A pose to restore after a restart, in `map` of a site (m, rad), with its standard deviations.
 
-    base: number of the base's feedback then, and its wheels' counters (m, left and right); None: unknown.
+    base: number of the base's feedback then, and its wheels' counters (m, left and right); None: unknown. guardian: the
+    id of the guardian's run that numbered it.
     """
 
     site: str
@@ -110,3 +111,4 @@ class SavedPose(msgspec.Struct, frozen=True, kw_only=True):
     sigma_xy: float
     sigma_theta: float
     base: tuple[int, float, float] | None = None
+    guardian: str = ""

@@ -46,7 +46,8 @@ class SafetyInputs(msgspec.Struct, frozen=True, kw_only=True):
     dock_problem: why the base must not drive into its dock by itself. caution: a reason to drive slowly here.
     guardian_lost: why there is no link to the guardian.
     base_fault: the guardian's fault, latched there unless it is `base_fault_passing`, which ends with its cause.
-    base_stopped: why the guardian keeps the wheels at zero. bumped: the fault that it has latched is a bump.
+    base_stopped: why the guardian keeps the wheels at zero. wheels_differ: it counts by other ones than the agent.
+    bumped: the fault that it has latched is a bump.
     docked_for: s for which the robot has been on its dock, None off it. late_age: since this computer last ran the
     agent too late, by `late_by`. resting: why the lidar stands still on purpose, or is being started. blind_behind: why
     a robot that shall drive back would not move. hand_over: why nobody drives it by hand any more, None while somebody
@@ -67,6 +68,7 @@ class SafetyInputs(msgspec.Struct, frozen=True, kw_only=True):
     base_fault: str | None = None
     base_fault_passing: bool = False
     base_stopped: str | None = None
+    wheels_differ: bool = False
     bumped: bool = False
     docked_for: float | None = None
     bumper: bool = False
@@ -192,6 +194,15 @@ CONDITIONS: Final[tuple[Condition, ...]] = (
         lambda i, c: _guardian_heard(i, c) and _held(i),
         lambda i: f"the guardian holds the wheels: {i.base_stopped}",
         by_delay=lambda i: i.base_stopped == NO_FRESH_COMMAND,
+    ),
+    Condition(
+        ReasonCode.WHEELS_DIFFER,
+        Level.PROTECTIVE_STOP,
+        lambda i, _: i.wheels_differ,
+        lambda _: (
+            "the guardian counts with other wheels than the agent: restart both "
+            "(systemctl restart fognav-watchdog fognav-agent)"
+        ),
     ),
     Condition(
         ReasonCode.ON_DOCK,

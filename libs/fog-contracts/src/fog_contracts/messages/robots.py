@@ -264,6 +264,7 @@ class ReasonCode(StrEnum):
     GUARDIAN_LOST = "guardian_lost"
     GUARDIAN_SILENT = "guardian_silent"
     WHEELS_HELD = "wheels_held"
+    WHEELS_DIFFER = "wheels_differ"
     ON_DOCK = "on_dock"
     BATTERY_LOW = "battery_low"
     CHARGER_FAULT = "charger_fault"

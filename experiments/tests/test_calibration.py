@@ -209,7 +209,7 @@ def test_a_robot_that_drives_by_itself_stops_for_who_comes_near_for_slipping_and
     around = np.array([[2.0 * np.cos(a), 2.0 * np.sin(a)] for a in np.linspace(-3.1, 3.1, 90)])
     assert plan.disturbed(around) == ""
     assert plan.disturbed(np.concatenate((around, foot))) == "something has come near"
-    assert "in 9 of 36 directions only" in plan.disturbed(walls), "a sheet over the lidar is no free floor"
+    assert "in 10 of 36 directions only" in plan.disturbed(walls), "a sheet over the lidar is no free floor"
     assert plan.motion(0.0) == (SPEED_M_S, 0.0)
     assert plan.problem(1.9) == ""
     assert plan.problem(2.1) == "its wheels have not turned for 2 s"

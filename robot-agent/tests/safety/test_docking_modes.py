@@ -321,7 +321,7 @@ def test_undocking_that_the_guardian_has_ended_tells_why_when_it_ends():
 
 
 @pytest.mark.parametrize("kind", ["turn", "advance"])
-@pytest.mark.parametrize("changes", STOPS[:3] + STOPS[7:] + [(fault, "") for fault in FAULTS])
+@pytest.mark.parametrize("changes", STOPS[:4] + STOPS[8:] + [(fault, "") for fault in FAULTS])
 def test_base_and_lidar_refuse_looking_around_and_end_it(kind, changes):
     values, words = changes
     gate = Gate(enabled=False, localization="lost")

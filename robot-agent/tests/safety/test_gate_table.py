@@ -223,7 +223,7 @@ def mode_by_hand(*rows) -> str:
     return "INIT" if any(row.by_hand == "ends" for row in rows) else "TELEOP"
 
 
-OF_REST = {"lidar silent", "scan lost", "scans repeat", "wheels held", "wheels held on the dock"}
+OF_REST = {"lidar silent", "scan lost", "scans repeat", "scans are empty", "wheels held", "wheels held on the dock"}
 
 
 def pairs_of_conditions():

@@ -21,7 +21,7 @@ import time
 from contextlib import contextmanager, suppress
 from functools import partial
 from queue import SimpleQueue
-from socket import create_connection, create_server
+from socket import SHUT_RDWR, create_connection, create_server
 from threading import Thread
 from typing import TYPE_CHECKING
 
@@ -306,30 +306,31 @@ class SlowLink:
             server = create_connection(("127.0.0.1", self._to))
             waiting = SimpleQueue()
             for work in (
-                partial(self._take, client, lambda data, line=waiting: line.put((time.monotonic() + self.delay, data))),
-                partial(self._take, server, client.sendall),
+                partial(self._take, client, partial(self._wait, waiting), partial(waiting.put, (0.0, b""))),
+                partial(self._take, server, client.sendall, partial(client.shutdown, SHUT_RDWR)),
                 partial(self._deliver, waiting, server),
             ):
                 Thread(target=work, daemon=True).start()
 
+    def _wait(self, waiting, data: bytes) -> None:
+        waiting.put((time.monotonic() + self.delay, data))
+
     @staticmethod
-    def _take(end, then) -> None:
+    def _take(end, then, at_the_end) -> None:
         with suppress(OSError):
             while data := end.recv(65536):
                 then(data)
         with suppress(OSError):
-            then(b"")
+            at_the_end()
+        end.close()
 
     @staticmethod
     def _deliver(waiting, end) -> None:
         with suppress(OSError):
-            while True:
-                due, data = waiting.get()
-                time.sleep(max(0.0, due - time.monotonic()))
-                if not data:
-                    break
-                end.sendall(data)
-        end.close()
+            while (item := waiting.get())[1]:
+                time.sleep(max(0.0, item[0] - time.monotonic()))
+                end.sendall(item[1])
+            end.shutdown(SHUT_RDWR)
 
 
 @pytest.mark.browser

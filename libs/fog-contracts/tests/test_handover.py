@@ -110,6 +110,20 @@ class Building(RuleBasedStateMachine):
             self.robot = after
             self.boot += 1
 
+    @rule(to=st.sampled_from(FLOORS))
+    def ride(self, to: str) -> None:
+        """Ride undisturbed: what was said on floors long ago may still arrive after it."""
+        floor = self.floors[self.robot.floor]
+        floor.remembered = floor.stored
+        self.robot_speaks()
+        self.hears(floor, self.robot)
+        self.hears(floor, self.robot)
+        self.floor_gives(floor.name, to, sends=True)
+        if self.to_robot:
+            self.delivered(*self.to_robot[-1])
+        self.robot_speaks()
+        self.hears(self.floors[self.robot.floor], self.robot)
+
     @rule()
     def robot_restarts(self) -> None:
         self.boot += 1

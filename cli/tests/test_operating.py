@@ -382,6 +382,9 @@ def test_areas_are_listed_with_their_state(demo: Service) -> None:
     plain = "hall (the hall): clear, n1 sees nothing"
     assert run("area", "list") == f"{plain} {plain} [blocked by ann for another 1 h 30 min]"
     assert json.loads(run("area", "list", "--json"))["areas"] == areas
+    half = {"state": "blocked", "cause": "n1 sees a box", "free": [[[0.0, 0.0], [1.0, 0.0], [1.0, 1.0]]]}
+    demo.answers["GET", "/api/v1/areas"] = (200, [{**areas[0], "hazard": half}])
+    assert "blocked, n1 sees a box; a part of it is free, which robots pass slowly" in run("area", "list")
 
 
 def test_history_of_an_area_is_listed_with_how_long_each_state_lasted(demo: Service) -> None:

@@ -2,6 +2,7 @@
 
 import os
 import shutil
+import signal
 import subprocess
 import time
 from collections.abc import Callable
@@ -9,11 +10,15 @@ from pathlib import Path
 
 import psutil
 import pytest
+from typer.testing import CliRunner, Result
 
+from fognav import aside
+from fognav.__main__ import app
+from fognav.aside import BACKUPS, Aside
 from fognav.hosting import folders, local_nodes, upgrading
 from fognav.hosting.folders import NodeFolder, hosted_sites
 from fognav.hosting.local_nodes import RunningNode
-from fognav.hosting.upgrading import BACKUPS, Upgrade, Versions
+from fognav.hosting.upgrading import Upgrade, Versions
 from fognav.operate.systems import System
 from fognav.output import FailedError, WrongUseError
 
@@ -23,6 +28,7 @@ LAUNCHER = """\
 here=$(dirname "$0")
 echo "{name} $*" >>"$here/calls"
 [ "$1" = up ] || exit {set_up}
+[ -z "{signal}" ] || {{ kill -s "{signal}" $PPID; exec sleep 600; }}
 while [ "$1" != --data ]; do shift; done
 echo {name} >"$2/data/redis/written-by"
 exit {start}
@@ -42,8 +48,8 @@ def add_version(tmp_path: Path) -> Callable[..., str]:
     git(root, "init", "-q")
     (root / ".gitignore").write_text("calls\n")
 
-    def add(name: str, *, set_up: int = 0, start: int = 0) -> str:
-        (root / "fognav").write_text(LAUNCHER.format(name=name, set_up=set_up, start=start))
+    def add(name: str, *, set_up: int = 0, start: int = 0, signal: str = "") -> str:
+        (root / "fognav").write_text(LAUNCHER.format(name=name, set_up=set_up, start=start, signal=signal))
         (root / "fognav").chmod(0o755)
         git(root, "add", "-A")
         git(root, "commit", "-qm", f"version {name}")
@@ -57,7 +63,7 @@ def folder(tmp_path: Path) -> NodeFolder:
     made = NodeFolder(tmp_path / "data")
     hosted_sites([ESTIG], made.security, ["localhost", "127.0.0.1"])
     made.keys("estig")
-    folders.remember(made.path, folders.settings_of({"estig": ESTIG}, "127.0.0.1", [], simulate=False))
+    folders.remember(made.path, folders.settings_of({"estig": ESTIG}, "0.0.0.0", [], simulate=False))
     return made
 
 
@@ -72,6 +78,10 @@ def started(folder: NodeFolder, monkeypatch: pytest.MonkeyPatch) -> list[str]:
     monkeypatch.setattr(local_nodes, "systemd_runs", lambda pid: pid == 1)
     monkeypatch.setattr(local_nodes, "start_unit", lambda: found.append("unit"))
     return found
+
+
+def run(*arguments: str) -> Result:
+    return CliRunner().invoke(app, list(arguments))
 
 
 def calls(root: Path) -> list[str]:
@@ -93,6 +103,7 @@ def test_upgrade_makes_a_backup_tries_the_new_version_and_keeps_the_data(add_ver
     assert calls(root) == ["new --version", "new up"]
     assert (folder.path / "keys" / "estig" / "admin.token").read_text() == token
     assert (folder.path / "data" / "redis" / "written-by").read_text() == "new\n"
+    assert "--bind 127.0.0.1" in (root / "calls").read_text()  # nobody else reaches what may be undone
     (backup,) = (folder.path / BACKUPS).glob("*-estig.tar.gz")
     assert f"backup: {backup}" in told
     assert started == ["end 1", "unit"]
@@ -102,20 +113,56 @@ def test_upgrade_makes_a_backup_tries_the_new_version_and_keeps_the_data(add_ver
 
 
 @pytest.mark.live
-@pytest.mark.parametrize("broken", [{"set_up": 1}, {"start": 1}])
+@pytest.mark.parametrize("broken", [{"set_up": 1}, {"start": 1}, {"signal": "HUP"}, {"signal": "TERM"}])
 def test_version_that_fails_leaves_version_and_data_of_before(add_version, folder, started, tmp_path, broken):
     root = tmp_path / "checkout"
     old = add_version("old")
     new = add_version("new", **broken)
     git(root, "reset", "-q", "--hard", old)
     (folder.data("redis") / "written-by").write_text("old\n")
-    with pytest.raises(FailedError, match=f"are those of before, {old[:12]}"):
+    recording = folder.path / "recordings" / "a.mcap"
+    recording.parent.mkdir()
+    recording.write_bytes(b"large")
+    with pytest.raises(FailedError, match=rf"are those of before, {old[:12]}, and what was changed after \d\d:"):
         Upgrade(folder, Versions(root), lambda _: None).run(new)
     assert git(root, "rev-parse", "HEAD") == old
     assert calls(root)[-1] == "old --version"  # its environment is there again, too
     assert (folder.path / "data" / "redis" / "written-by").read_text() == "old\n"
     assert started == ["end 1", "unit"]
-    assert not folder.path.with_name("data.before-upgrade").exists()
+    assert recording.read_bytes() == b"large"
+    assert len(list((folder.path / BACKUPS).iterdir())) == 1
+    assert not list(folder.path.parent.glob("data.before-upgrade*"))
+
+
+def test_nothing_that_an_upgrade_may_undo_is_changed_while_it_runs(folder):
+    recording = folder.path / "recordings" / "a.mcap"
+    recording.parent.mkdir()
+    recording.write_bytes(b"large")
+    tokens = folder.path / "keys" / "estig" / "tokens.toml"
+    commands = [
+        ["token", "create", "anna", "--file", str(tokens)],
+        ["token", "revoke", "admin", "--file", str(tokens)],
+        *(
+            [*words, "--credentials", str(folder.security)]
+            for words in (["ca", "issue"], ["ca", "rotate"], ["robot", "add", "r9"], ["source", "user", "door"])
+        ),
+    ]
+    before = tokens.read_text()
+    laid = Aside(folder.path)
+    laid.lay()
+    assert not (laid.copy / "recordings").exists()
+    for each in commands:
+        done = run(*each)
+        assert (done.exit_code, "is being upgraded" in done.output) == (1, True), (each, done.output)
+    with pytest.raises(FailedError, match="is being upgraded"), folder.in_use():
+        pass
+    assert tokens.read_text() == before
+    (folder.path / "written-since").touch()
+    laid.put_back()
+    laid.remove()
+    assert not (folder.path / "written-since").exists()
+    assert recording.read_bytes() == b"large"
+    assert run(*commands[0]).exit_code == 0
 
 
 @pytest.mark.live
@@ -204,14 +251,28 @@ def test_nothing_is_upgraded_under_a_demo_of_the_same_checkout(add_version, fold
 
 @pytest.mark.live
 def test_interrupted_copy_of_the_data_leaves_none_behind(add_version, folder, started, monkeypatch, tmp_path):
-    def copy(_: Path, to: Path, *, symlinks: bool) -> None:
-        assert symlinks
-        to.mkdir()
-        raise KeyboardInterrupt
+    def copy(*_: object, **__: object) -> None:
+        os.kill(os.getpid(), signal.SIGHUP)
 
     old = add_version("old")
-    monkeypatch.setattr(upgrading.shutil, "copytree", copy)
-    with pytest.raises(FailedError, match="interrupted"):
+    monkeypatch.setattr(aside.shutil, "copytree", copy)
+    with pytest.raises(FailedError, match="it was interrupted, and nothing was changed"):
         Upgrade(folder, Versions(tmp_path / "checkout"), lambda _: None).run(old)
-    assert not folder.path.with_name("data.before-upgrade").exists()
+    assert not list(folder.path.parent.glob("data.before-upgrade*"))
     assert started == ["end 1", "unit"]
+
+
+@pytest.mark.live
+def test_ten_backups_of_upgrades_stay_and_all_that_others_put_beside_them(add_version, folder, started, tmp_path):
+    old = add_version("old")
+    backups = folder.path / BACKUPS
+    backups.mkdir()
+    for number in range(12):
+        (backups / f"2026-01-{number + 10}T03-00-00-estig.tar.gz").touch()
+    mine = [backups / name for name in ("before-the-move-estig.tar.gz", "2026-01-01T03-00-00-upstairs.tar.gz")]
+    for file in mine:
+        file.touch()
+    Upgrade(folder, Versions(tmp_path / "checkout"), lambda _: None).run(old)
+    found = sorted(file.name for file in backups.iterdir() if file not in mine)
+    assert (len(found), found[0]) == (10, "2026-01-13T03-00-00-estig.tar.gz")
+    assert all(file.exists() for file in mine)

@@ -15,6 +15,7 @@ from fog_runtime.credentials import Credentials, CredentialsError
 from fog_runtime.security.authority import AuthorityError
 from fog_runtime.security.site_security import SiteSecurity
 from fog_runtime.security.users import SecurityError
+from fognav.aside import require_no_upgrade
 from fognav.output import FailedError, WrongUseError
 
 VARIABLE: Final = "FOGNAV_CREDENTIALS_DIR"
@@ -50,6 +51,12 @@ def open_security(given: Path | None) -> SiteSecurity:
     Raises `WrongUseError` without one, and `SecurityError`.
     """
     return SiteSecurity.open(named_folder(given))
+
+
+def changeable_security(given: Path | None) -> SiteSecurity:
+    """Open them to change them; raises as `open_security`, and `FailedError` while their fog node is upgraded."""
+    require_no_upgrade(named_folder(given))
+    return open_security(given)
 
 
 def own_credentials(default: str | None = None) -> Credentials:

@@ -16,8 +16,10 @@ from fog_runtime.files import atomic_write
 from fog_runtime.security.site_security import SiteSecurity
 from fog_runtime.token_file import Role, create_token, read_tokens, revoke_token
 from fognav import checkout
+from fognav.aside import require_no_upgrade
 from fognav.credentials import (
     CredentialsOption,
+    changeable_security,
     credentials_folder,
     named_folder,
     open_security,
@@ -75,7 +77,7 @@ def token_create(
         if out is not None and out.exists():
             raise WrongUseError(f"{out} already exists: name another file with --out, or remove it")
         authority = open_security(security).authority.trusted if credentials_folder(security) is not None else ""
-        token = create_token(_tokens_file(file), name, role)
+        token = create_token(_changeable_tokens(file), name, role)
         if out is not None:
             text = to_toml(name, authority=authority, passwords={}, token=token)
             atomic_write(out, text.encode())
@@ -99,7 +101,7 @@ def token_list(*, file: FileOption = None, json: JsonOption = False) -> None:
 def token_revoke(name: NameArgument, *, file: FileOption = None, json: JsonOption = False) -> None:
     """Revoke a token: the services refuse it from their next request on."""
     with exit_codes():
-        revoke_token(_tokens_file(file), name)
+        revoke_token(_changeable_tokens(file), name)
         print_result({"name": name, "revoked": True}, f"the token of {name} is revoked", json=json)
 
 
@@ -116,6 +118,13 @@ def _tokens_file(given: Path | None) -> Path:
     if token_file is None:
         raise WrongUseError(f"name the services' tokens file with --file or {_VARIABLE}")
     return Path(token_file).with_name(_TOKENS)
+
+
+def _changeable_tokens(given: Path | None) -> Path:
+    """Return the tokens file; raises as `_tokens_file`, and `FailedError` while its fog node is upgraded."""
+    file = _tokens_file(given)
+    require_no_upgrade(file)
+    return file
 
 
 ca_app = typer.Typer(help="Create, renew and replace certificates of a site's servers.", no_args_is_help=True)
@@ -146,6 +155,7 @@ def ca_create(
     """
     with exit_codes(), security_errors():
         loaded = load_site(checkout.site_folder(site)).site
+        require_no_upgrade(named_folder(security))
         made = SiteSecurity(named_folder(security), loaded.id)
         made.make(
             host or own_hosts(),
@@ -159,7 +169,7 @@ def ca_create(
 def ca_issue(*, host: HostOption = None, security: CredentialsOption = None, json: JsonOption = False) -> None:
     """Issue new certificates for all servers, for the names and addresses of before or those given."""
     with exit_codes(), security_errors():
-        opened = open_security(security)
+        opened = changeable_security(security)
         opened.renew(host, only_due=False)
         _show(opened, json=json)
 
@@ -177,7 +187,7 @@ def ca_rotate(
     credentials again (robots, nodes, people) at any time before.
     """
     with exit_codes(), security_errors():
-        opened = open_security(security)
+        opened = changeable_security(security)
         if finish:
             opened.authority.finish()
         else:
@@ -231,7 +241,7 @@ def robot_add(
     For a robot that is known already they are new ones, and those of before are worth nothing any more.
     """
     with exit_codes(), security_errors():
-        opened = open_security(security)
+        opened = changeable_security(security)
         file = None if remove else opened.add_robot(checked_id(robot))
         if remove and not opened.remove(robot):
             raise WrongUseError(f"there is no robot {robot}. Known are: {', '.join(sorted(opened.users()))}")

@@ -6,7 +6,7 @@ import msgspec
 import typer
 
 from fog_contracts.messages import AreaDefinition, Limits, Source
-from fognav.credentials import CredentialsOption, open_security, security_errors
+from fognav.credentials import CredentialsOption, changeable_security, security_errors
 from fognav.operate.fog import Fog, find_fog
 from fognav.operate.options import FogOption, JsonOption, checked_id
 from fognav.output import FailedError, WrongUseError, exit_codes, print_list, print_result
@@ -126,7 +126,7 @@ def source_user(
     Without --topic: a source of zones, which may use its own topics.
     """
     with exit_codes(), security_errors():
-        made = open_security(security)
+        made = changeable_security(security)
         file = made.add_device(checked_id(name), topic) if topic else made.add_node(checked_id(name))
         print_result(
             {"user": name, "topics": topic or [], "credentials": str(file)},

@@ -8,6 +8,7 @@ from typing import Annotated, Final
 import typer
 
 from fognav import checkout, console_page, kernels, system
+from fognav.aside import TRIAL
 from fognav.commands.bridge import require_bridge
 from fognav.commands.floor import require_floors
 from fognav.credentials import own_hosts, security_errors
@@ -89,7 +90,8 @@ def up_command(  # noqa: PLR0913  # each option is an argument
             )  # fmt: skip
             directories = {each.id: each.directory for each in sites}
             made = settings_of(directories, bind, host or [], simulate=sim, bridge=bridge, floors=floors)
-            remember(folder.path, made)
+            if TRIAL not in os.environ:  # it listens elsewhere than the node does
+                remember(folder.path, made)
             asyncio.run(run_node(config, print_line, check=check))
 
 

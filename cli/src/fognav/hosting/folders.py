@@ -22,6 +22,7 @@ from fog_runtime.files import PRIVATE, atomic_write
 from fog_runtime.keys import make_keys
 from fog_runtime.security.site_security import CREDENTIALS, SiteSecurity
 from fog_runtime.security.users import on_floor
+from fognav.aside import TRIAL, require_no_upgrade
 from fognav.operate.systems import MQTTS_PORT, SERVICE_PORTS, ZENOH_PORT, port
 from fognav.output import FailedError, WrongUseError
 from fognav.programs import SystemFolder
@@ -81,7 +82,9 @@ class NodeFolder(SystemFolder):
 
     @contextmanager
     def in_use(self) -> Iterator[None]:
-        """Keep the folder for this process; raises `FailedError` if another one uses it."""
+        """Keep the folder for this process; raises `FailedError` if another one uses it, or upgrades it."""
+        if TRIAL not in os.environ:
+            require_no_upgrade(self.path)
         with (self.path / _LOCK).open("w") as file:
             try:
                 fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)

@@ -2,14 +2,21 @@
 
 import asyncio
 import contextlib
+import glob
 import os
-import shutil
+import signal
 import subprocess
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import Final, NamedTuple
+from types import FrameType
+from typing import Final, NamedTuple, NoReturn
 
+import msgspec
+
+from fog_runtime import machine
+from fog_supervisor import net
+from fognav.aside import BACKUPS, TRIAL, Aside
 from fognav.hosting import backups, local_nodes
 from fognav.hosting.folders import NodeFolder, NodeSettings, recall
 from fognav.hosting.local_nodes import end_node, running_nodes, systems_of
@@ -147,7 +154,10 @@ class Versions:
         return done.stdout.strip()
 
 
-BACKUPS: Final = "backups"
+_KEPT_BACKUPS: Final = 10
+"""Of each site, of those that upgrades have made."""
+_STAMP: Final = "%Y-%m-%dT%H-%M-%S"
+_STAMPED: Final = "[0-9]" * 4 + "-[0-9][0-9]" * 2 + "T[0-9][0-9]" + "-[0-9][0-9]" * 2
 _START_S: Final = 1800.0
 """For the first start of a version: a Raspberry Pi compiles the kernels for minutes."""
 
@@ -164,53 +174,66 @@ class Upgrade:
         self._versions = versions
         self._print_line = print_line
         self._settings: NodeSettings = recall(folder.path)
-        self._kept = folder.path.with_name(f"{folder.path.name}.before-upgrade")
-        if self._kept.exists():
-            raise FailedError(
-                f"an upgrade was cut short: {self._kept} has the data of before. Check out the version that wrote it, "
-                f"and move it to {folder.path}; or remove it, if the fog node runs well"
-            )
+        self._aside = Aside(folder.path)
 
     def run(self, to: str) -> None:
-        """Upgrade to a commit. Raises `FailedError` after everything is as it was before, or says what is not."""
+        """Upgrade to a commit; a signal ends it as a failure does.
+
+        Raises `FailedError` after everything is as it was before, or says what is not.
+        """
         self._require_nothing_else_runs()
         before = self._versions.current()
         for file in self._back_up():
-            self._print_line(f"backup: {file}")
-        by_systemd = False
-        for node in running_nodes():
-            if node.data == self._folder.path:
-                by_systemd = by_systemd or local_nodes.systemd_runs(node.pid)
-                end_node(node.pid)
-        try:
-            with self._folder.in_use():
-                self._keep()
-        except FailedError:
-            self._start_again(by_systemd=by_systemd)
-            raise
-        try:
-            self._versions.go_to(to)
-            self._try_start()
-        except (FailedError, OSError, KeyboardInterrupt) as error:
-            self._go_back(before)
-            self._start_again(by_systemd=by_systemd)
-            raise FailedError(
-                f"version {to[:12]} failed; version and data are those of before, {before[:12]}: {_reason(error)}"
-            ) from error
-        shutil.rmtree(self._kept)
-        self._print_line(f"upgraded to {to[:12]}; it starts with all data")
-        self._start_again(by_systemd=by_systemd)
+            self._say(f"backup: {file}")
+        nodes = [node for node in running_nodes() if node.data == self._folder.path]
+        by_systemd = any(local_nodes.systemd_runs(node.pid) for node in nodes)
+        with _on_signals(_exit):
+            try:
+                for node in nodes:
+                    end_node(node.pid)
+                self._lay_aside()
+                self._versions.go_to(to)
+                self._try_start()
+                with _on_signals(signal.SIG_IGN):
+                    self._aside.discard()
+            except (FailedError, OSError, SystemExit) as error:
+                # Whoever has lost the connection, or hits Ctrl-C again, does not want half of the way back.
+                with _on_signals(signal.SIG_IGN):
+                    failure = self._undo(before, to, error)
+                    self._start_again(by_systemd=by_systemd)
+                    self._remove()
+                raise failure from error
+            with _on_signals(signal.SIG_IGN):
+                self._say(f"upgraded to {to[:12]}; it starts with all data")
+                self._start_again(by_systemd=by_systemd)
+                self._remove()
 
-    def _keep(self) -> None:
-        """Copy the data aside; raises `FailedError` and leaves no copy behind if it can't be."""
-        try:
-            shutil.copytree(self._folder.path, self._kept, symlinks=True)
-        except (OSError, KeyboardInterrupt) as error:
-            shutil.rmtree(self._kept, ignore_errors=True)
-            raise FailedError(
-                f"{self._folder.path} can't be copied beside itself, and nothing was changed; make room for it, and "
-                f"repeat the upgrade: {_reason(error)}"
-            ) from error
+    def _say(self, line: str) -> None:
+        # A connection that was lost must not keep the fog down.
+        with contextlib.suppress(OSError):
+            self._print_line(line)
+
+    def _lay_aside(self) -> None:
+        with self._folder.in_use():
+            try:
+                self._aside.lay()
+            except OSError as error:
+                raise FailedError(
+                    f"{self._folder.path} can't be copied beside itself, and nothing was changed; make room for it, "
+                    f"and repeat the upgrade: {error}"
+                ) from error
+
+    def _undo(self, before: str, to: str, error: BaseException) -> FailedError:
+        """Go back after an error, and return what to tell; raises `FailedError` if that fails, too."""
+        if not self._aside.laid:
+            if isinstance(error, FailedError):
+                return error
+            return FailedError(f"{_reason(error)}, and nothing was changed: repeat the upgrade")
+        self._go_back(before)
+        return FailedError(
+            f"version {to[:12]} failed; version and data are those of before, {before[:12]}, and what was changed "
+            f"after {self._aside.since} is undone: {_reason(error)}"
+        )
 
     def _require_nothing_else_runs(self) -> None:
         """Raise `FailedError` if the files of other systems would change while they run."""
@@ -224,20 +247,24 @@ class Upgrade:
     def _back_up(self) -> list[Path]:
         folder = self._folder.path / BACKUPS
         folder.mkdir(mode=0o700, exist_ok=True)
-        stamp = time.strftime("%Y-%m-%dT%H-%M-%S")
+        stamp = time.strftime(_STAMP)
         files = []
         for site, directory in self._settings.sites.items():
             files.append(folder / f"{stamp}-{site}.tar.gz")
             made = asyncio.run(backups.create(files[-1], self._folder, Path(directory)))
             if made.no_index is not None:  # its data is copied aside, too
-                self._print_line(f"{files[-1]} lacks the index of the recordings: {made.no_index}")
+                self._say(f"{files[-1]} lacks the index of the recordings: {made.no_index}")
+            for old in sorted(folder.glob(f"{_STAMPED}-{glob.escape(site)}.tar.gz"))[:-_KEPT_BACKUPS]:
+                old.unlink()
         return files
 
     def _try_start(self) -> None:
         """Let the version that is there now start everything, and end it when it is ready; raises `FailedError`."""
         data = ["--data", str(self._folder.path), "--check"]
-        command = [str(self._versions.launcher), "up", *self._settings.arguments, *data]
-        environment = {**os.environ, **self._settings.environment}
+        # Nobody else's nodes, robots and people reach it: what it would tell them may be undone.
+        here = msgspec.structs.replace(self._settings, address=net.LOOPBACK)
+        command = [str(self._versions.launcher), "up", *here.arguments, *data]
+        environment = {**os.environ, **self._settings.environment, TRIAL: "1"}
         try:
             done = subprocess.run(
                 command, check=False, capture_output=True, text=True, timeout=_START_S, env=environment,
@@ -251,21 +278,42 @@ class Upgrade:
     def _go_back(self, to: str) -> None:
         try:
             self._versions.go_to(to)
-        except FailedError as error:
+            self._aside.put_back()
+        except (FailedError, OSError) as error:
             raise FailedError(
-                f"going back to {to[:12]} failed, too: {error}. Check it out by hand; the data is in {self._kept}: "
-                f"move it to {self._folder.path}"
+                f"going back to {to[:12]} failed, too: {error}. Check it out by hand; the data is in {self._aside.copy}"
+                f": move it to {self._folder.path}"
             ) from error
-        shutil.rmtree(self._folder.path)
-        self._kept.rename(self._folder.path)
+
+    def _remove(self) -> None:
+        try:
+            self._aside.remove()
+        except OSError as error:
+            self._say(f"what is no longer needed can't be removed, and takes room until the next upgrade: {error}")
 
     def _start_again(self, *, by_systemd: bool) -> None:
         if by_systemd:
             local_nodes.start_unit()
-            self._print_line(f"{local_nodes.UNIT} runs again")
+            self._say(f"{local_nodes.UNIT} runs again")
         else:
-            self._print_line(f"start it: {self._settings.command(self._folder.path)}")
+            self._say(f"start it: {self._settings.command(self._folder.path)}")
 
 
 def _reason(error: BaseException) -> str:
-    return "it was interrupted" if isinstance(error, KeyboardInterrupt) else str(error)
+    return "it was interrupted" if isinstance(error, SystemExit) else str(error)
+
+
+def _exit(number: int, _: FrameType | None) -> NoReturn:
+    # Unlike after KeyboardInterrupt, `subprocess` then waits for the end of the program that it kills.
+    raise SystemExit(128 + number)
+
+
+@contextlib.contextmanager
+def _on_signals(handler: Callable[[int, FrameType | None], object] | signal.Handlers) -> Iterator[None]:
+    """Let the signals that end a process do this meanwhile; programs that are started inherit that they are ignored."""
+    before = {number: signal.signal(number, handler) for number in machine.ending()}
+    try:
+        yield
+    finally:
+        for number, each in before.items():
+            signal.signal(number, each)

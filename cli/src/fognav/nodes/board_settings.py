@@ -25,7 +25,13 @@ from fog_runtime.credentials import Credentials
 from fog_runtime.files import PRIVATE, atomic_write
 from fog_runtime.security.site_security import SiteSecurity
 from fognav import checkout
-from fognav.credentials import CredentialsOption, credentials_folder, open_security, security_errors
+from fognav.credentials import (
+    CredentialsOption,
+    changeable_security,
+    credentials_folder,
+    open_security,
+    security_errors,
+)
 from fognav.operate.options import JsonOption
 from fognav.output import WrongUseError, print_json, print_line, writing
 
@@ -332,7 +338,7 @@ class BoardOptions:
         members = settings(loaded.site.id, node, access, new_password(), self.profile)
         if (folder := credentials_folder(self.security)) is not None:
             with security_errors():
-                members["password"], authority = let_in(open_security(folder), node.id)
+                members["password"], authority = let_in(changeable_security(folder), node.id)
             write_authority(self._authority, authority)
         if self.firmware == "esphome":
             members = esphome_secrets(members, self._authority)

@@ -1,6 +1,7 @@
 """A fog node on this machine: its folder, its logs, its sites' names and ports, and its unit."""
 
 import asyncio
+import datetime as dt
 import errno
 import os
 import shutil
@@ -19,7 +20,7 @@ from typer.testing import CliRunner
 from fog_runtime import backup
 from fog_runtime.backup import STAMP, BackupError
 from fog_runtime.credentials import Credentials
-from fog_runtime.security.site_security import SiteSecurity
+from fog_runtime.security.site_security import CERTIFICATE, SiteSecurity
 from fog_runtime.stores.redis_connection import RedisConnection
 from fog_supervisor.supervisor import Program, Supervisor
 from fognav.__main__ import app
@@ -148,6 +149,29 @@ def test_systemd_accepts_the_unit(tmp_path, monkeypatch):
     file.write_text(file.read_text().replace("Type=notify", "Type=nosuch"))
     done = subprocess.run(command, env=known, capture_output=True, text=True, timeout=60, check=False)
     assert "nosuch" in done.stderr
+
+
+async def test_certificate_that_ends_soon_is_renewed_while_the_node_runs(node, tmp_path, monkeypatch):
+    monkeypatch.setattr(fog_node, "PERIOD_S", 0.01)
+    monkeypatch.setattr(fog_node, "RENEWAL_PERIOD_S", 0.05)
+    monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path))
+    security = node.config.security
+    file = security.folder("redis") / CERTIFICATE
+    issued = security.authority.issue("redis", security.hosts, now=dt.datetime.now(dt.UTC) - dt.timedelta(days=600))
+    file.write_bytes(issued.chain)
+    SiteSecurity.open(security.directory).add_device("door", ["door/state"])  # by a command, beside the running node
+    told: list[str] = []
+    (tmp_path / "fognav").mkdir(mode=0o700)
+    with Registration(lambda: node.system(node.config.sites[0])) as registration:
+        attending = asyncio.create_task(fog_node.attend(node, [registration], node.credential_changes(), told.append))
+        try:
+            await until(lambda: told)
+        finally:
+            attending.cancel()
+            await asyncio.wait({attending})
+    assert told == ["the certificate of redis was renewed"]
+    renewed = SiteSecurity.open(security.directory)
+    assert (renewed.expiring(), "door" in renewed.users()) == ([], True)
 
 
 async def test_bookkeeping_that_fails_is_told_once_and_ends_nothing(node, tmp_path, monkeypatch):

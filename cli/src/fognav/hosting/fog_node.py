@@ -29,7 +29,7 @@ from fog_runtime.token_file import keep_token
 from fog_supervisor import net
 from fog_supervisor.supervisor import Event, Supervisor
 from fognav.hosting import local_nodes
-from fognav.hosting.folders import REDIS_PORT, HostedSite, NodeFolder
+from fognav.hosting.folders import REDIS_PORT, HostedSite, NodeFolder, renew_due
 from fognav.hosting.local_nodes import KIND, UP
 from fognav.operate.systems import MQTTS_PORT, ZENOH_PORT, Registration, System, port
 from fognav.output import FailedError, WrongUseError
@@ -339,26 +339,8 @@ READY_S: Final = 180.0
 """Real seconds for each group of programs to become ready: a Raspberry Pi after a cold boot is slow."""
 PERIOD_S: Final = 1.0
 """Between two rounds of bookkeeping."""
-
-
-class Troubles:
-    """Bookkeeping that fails without ending the fog node: each trouble is printed once, until it is over."""
-
-    def __init__(self, print_line: Callable[[str], None]) -> None:
-        self._print_line = print_line
-        self._lasting: set[str] = set()
-
-    @contextlib.contextmanager
-    def told(self, trouble: str) -> Iterator[None]:
-        """Print the trouble, if an `OSError` or `FailedError` leaves this context for the first time in a row."""
-        try:
-            yield
-        except (OSError, FailedError) as error:
-            if trouble not in self._lasting:
-                self._lasting.add(trouble)
-                self._print_line(f"{trouble}: {error}")
-        else:
-            self._lasting.discard(trouble)
+RENEWAL_PERIOD_S: Final = 86400.0
+"""Between two looks at how long the servers' certificates are valid, of which some months are left when one is due."""
 
 
 async def run_node(config: NodeConfig, print_line: Callable[[str], None], *, check: bool = False) -> None:
@@ -423,8 +405,14 @@ async def attend(
     """Keep the register and the service manager informed, and the logs bounded; robots need none of that to drive."""
     manager = ServiceManager()
     manager.ready()
-    troubles = Troubles(print_line)
+    troubles = local_nodes.Troubles(print_line)
+    looked = time.monotonic()  # the start has renewed what was due
     while True:
+        if time.monotonic() > looked + RENEWAL_PERIOD_S:
+            looked = time.monotonic()
+            with troubles.told("certificates could not be renewed"):
+                for name in await asyncio.to_thread(renew_due, node.config.security.directory):
+                    print_line(f"the certificate of {name} was renewed")
         with troubles.told("changed files are not in force"):
             if (changed := await changes.round()) is not None:
                 print_line(f"files have changed: {changed} uses the new ones")

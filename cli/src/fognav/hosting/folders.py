@@ -23,6 +23,7 @@ from fog_runtime.keys import make_keys
 from fog_runtime.security.site_security import CREDENTIALS, SiteSecurity
 from fog_runtime.security.users import on_floor
 from fognav.aside import TRIAL, require_no_upgrade
+from fognav.credentials import security_errors
 from fognav.operate.systems import MQTTS_PORT, SERVICE_PORTS, ZENOH_PORT, port
 from fognav.output import FailedError, WrongUseError
 from fognav.programs import SystemFolder
@@ -247,6 +248,12 @@ def hosted_sites(
         if site != known[0]:
             made.add_floor(site, robots=_robots(each), nodes=_nodes(each))
     return [HostedSite(loaded=each, index=made.sites.index(site)) for site, each in loaded.items()], made
+
+
+def renew_due(security: Path) -> list[str]:
+    """Renew the servers' certificates that end soon; return whose. Raises `FailedError`."""
+    with security_errors():  # opened anew: robots, nodes and devices may have been added meanwhile
+        return SiteSecurity.open(security).renew(only_due=True)
 
 
 def load_sites(folders: Sequence[Path]) -> dict[str, LoadedSite]:

@@ -3,13 +3,14 @@
 Logs are bounded, for a node runs for months on a small disk.
 """
 
+import contextlib
 import errno
 import os
 import shlex
 import subprocess
 import sys
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Final, NamedTuple
 
@@ -205,6 +206,26 @@ def _cut(file: Path) -> None:
     # Supervised programs append, so they write on at the new end.
     with file.open("r+b") as log:
         log.truncate(0)
+
+
+class Troubles:
+    """Bookkeeping that fails without ending the fog node: each trouble is printed once, until it is over."""
+
+    def __init__(self, print_line: Callable[[str], None]) -> None:
+        self._print_line = print_line
+        self._lasting: set[str] = set()
+
+    @contextlib.contextmanager
+    def told(self, trouble: str) -> Iterator[None]:
+        """Print the trouble, if an `OSError` or `FailedError` leaves this context for the first time in a row."""
+        try:
+            yield
+        except (OSError, FailedError) as error:
+            if trouble not in self._lasting:
+                self._lasting.add(trouble)
+                self._print_line(f"{trouble}: {error}")
+        else:
+            self._lasting.discard(trouble)
 
 
 class Tail:

@@ -188,7 +188,8 @@ class _Session:
                     if isinstance(request, TakeOver | HandBack | ResetFault):
                         self._asked.append(request)
                 elif isinstance(self._view, BringupView):
-                    self._replies.append(await asyncio.to_thread(self._view.write, request))
+                    written = await asyncio.to_thread(self._view.write, request)
+                    self._replies.append(written)  # only now: while it was written, the list was sent
                     self._news.set()
 
 

@@ -58,8 +58,8 @@ FORGET_S: Final = 60.0
 """A robot that is silent for so long is an obstacle that others see, no longer one that stands in the way unseen."""
 SILENT_S: Final = 3.0
 """After so long without a pose a robot gets nothing, and has stopped. So long a path may be on its way to it."""
-MOST_ROBOTS: Final = 50
-"""More robots with a path get what a robot alone gets: to lease it takes too long."""
+MOST_ROBOTS: Final = 20
+"""More robots with a path get what a robot alone gets: when a hazard turns all of them, to lease takes too long."""
 MEETING_M: Final = 1.0
 """A robot on whose path another one is so near has not met it yet."""
 _SPEED_M_S: Final = 0.3
@@ -73,8 +73,8 @@ _BODIES: Final = 0.9
 class CorridorLeases:
     """Who may drive how far. A robot alone on its floor gets whatever is wanted for it."""
 
-    def __init__(self, most_robots: int = MOST_ROBOTS) -> None:
-        self._most, self._crowded = most_robots, False
+    def __init__(self, most_robots: int | None = None) -> None:
+        self._most, self._crowded = MOST_ROBOTS if most_robots is None else most_robots, False
         self._robots: dict[str, Corridor] = {}
         self._arrivals = 0
         self._now = -math.inf

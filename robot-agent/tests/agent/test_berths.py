@@ -11,6 +11,7 @@ from fog_contracts.messages import Berth, HandOver
 from fog_runtime.configuration.settings import SettingsError
 from robot_agent.agent import berths
 from robot_agent.agent.berths import read_berths
+from robot_agent.agent.core import RESUMES_S
 from robot_agent.agent.settings import Settings, read_site
 from robot_agent.config import AgentConfig
 
@@ -124,8 +125,13 @@ def test_robot_takes_a_hand_over_while_it_stands_and_says_what_it_has_stored_unt
     assert world.command("hand_over", given=UP).accepted
     assert world.command("hand_over", given=UP).accepted
     assert world.agent.berth_to_store == Berth(floor="upstairs", epoch=1, came_by=UP)
-    assert world.agent.enabled
+    assert world.agent.goes_on
     assert world.state().berth == FIRST
+    assert world.command("disable").accepted
+    assert not world.agent.goes_on, "stopped while the record is written"
+    world.agent.leave()
+    assert world.command("enable").code == "other_run"
+    assert not world.agent.goes_on
 
 
 @pytest.mark.parametrize(
@@ -147,17 +153,35 @@ def test_a_hand_over_that_makes_no_sense_is_refused(config: AgentConfig, given: 
 def test_robot_that_was_enabled_goes_on_after_the_ride_once_it_knows_where_it_is() -> None:
     world = LittleWorld(config=replace(ON_FLOORS, resumes=True))
     world.agent.load(world.master.snapshot(), world.now)
-    while not world.agent.enabled:
+    while not world.state().enabled:
         assert world.now < 1_010.0, world.state()
         was_known = world.agent.localizer.status == "good"
         world.run(0.05)
     assert was_known
 
 
-def test_whoever_stops_the_robot_meanwhile_ends_that() -> None:
+@pytest.mark.parametrize("command", ["disable", "cancel", "profile_fog"])
+def test_whoever_tells_the_robot_anything_meanwhile_ends_that(command: str) -> None:
     world = LittleWorld(config=replace(ON_FLOORS, resumes=True))
     world.agent.load(world.master.snapshot(), world.now)
-    assert world.command("disable").accepted
+    world.command(command)
     world.run(3.0)
     assert world.state().codes == ["not_enabled"]
-    assert not world.agent.enabled
+    assert not world.state().enabled
+
+
+def test_robot_that_is_in_fault_is_handed_over_by_nobody() -> None:
+    world = LittleWorld(config=ON_FLOORS).ready()
+    world.bumper, world.fault = True, "the bumper is pressed (left)"
+    assert world.run(0.5, lambda w: w.state().mode == "FAULT")
+    assert world.command("hand_over", given=UP).code == "fault_latched"
+    assert not world.agent.goes_on
+
+
+def test_robot_that_takes_too_long_until_it_is_ready_waits_for_an_operator() -> None:
+    world = LittleWorld(config=replace(ON_FLOORS, resumes=True))
+    world.run(RESUMES_S + 1.0)
+    world.agent.load(world.master.snapshot(), world.now)
+    world.run(3.0)
+    assert world.state().codes == ["not_enabled"]
+    assert not world.state().enabled

@@ -5,7 +5,7 @@ from msgspec import structs
 
 from fog_contracts.messages import Berth, HandOver, LiftState, Pose, RobotPose
 from fog_contracts.site import LiftSite
-from planner.lifts.rides import Facts, cabins_at, lift_to, next_act, request
+from planner.lifts.rides import Facts, cabins_at, inside_of, lift_to, next_act, request
 from planner.stops import Ride
 
 RIDE = Ride(lift="north", floor="upstairs", who="anna")
@@ -13,6 +13,7 @@ GIVEN = HandOver(origin="ground", floor="upstairs", epoch=3, lift="north")
 GROUND = Berth(floor="ground", epoch=2)
 LEFT = Berth(floor="upstairs", epoch=3, came_by=GIVEN)
 CABIN = frozenset({"north"})
+BOARDS = structs.replace(RIDE, boards=True)
 LIFTS = [
     LiftSite(id=name, cabin=Pose(x=x, y=0.0, theta=0.0), wait=Pose(x=x - 2.0, y=0.0, theta=0.0), floors=floors)
     for name, x, floors in (("far", 30.0, ["ground", "upstairs"]), ("north", 9.0, ["ground", "upstairs"]),
@@ -39,8 +40,9 @@ def lift(floor: str = "ground", session: str = "r1/3", door: str = "OPEN", to: s
         (Facts(GROUND, RIDE, at_goal=True), lift(session="r1/2"), "wait"),
         (Facts(GROUND, RIDE, at_goal=True), lift(), "board"),
         (Facts(GROUND, structs.replace(RIDE, boards=True), at_goal=False), lift(), "wait"),
-        (Facts(GROUND, structs.replace(RIDE, boards=True), at_goal=True), lift(door="CLOSED"), "wait"),
-        (Facts(GROUND, structs.replace(RIDE, boards=True), at_goal=True), lift(), "leave"),
+        (Facts(GROUND, BOARDS, at_goal=True, inside=CABIN), lift(door="CLOSED"), "wait"),
+        (Facts(GROUND, BOARDS, at_goal=True, inside=CABIN), lift(), "leave"),
+        (Facts(GROUND, BOARDS, at_goal=True, cabins=CABIN), lift(), "wait"),  # somebody has driven it out
         (Facts(GROUND), lift(), "wait"),
     ],
 )
@@ -80,3 +82,9 @@ def test_the_nearest_lift_that_leads_there_is_taken():
     assert cabins_at(LIFTS, LEFT, None) == CABIN
     assert cabins_at(LIFTS, LEFT, at) == frozenset()
     assert cabins_at(LIFTS, GROUND, structs.replace(at, x=8.5)) == CABIN
+    deep = [structs.replace(LIFTS[1], wait=Pose(x=5.0, y=0.0, theta=0.0))]
+    assert cabins_at(deep, GROUND, structs.replace(at, x=7.2)) == CABIN
+    assert cabins_at(deep, GROUND, structs.replace(at, x=6.8)) == frozenset()
+    assert inside_of(LIFTS, None) == frozenset()
+    assert inside_of(LIFTS, structs.replace(at, x=8.4, localized=True)) == frozenset()
+    assert inside_of(LIFTS, structs.replace(at, x=8.6, localized=True)) == CABIN

@@ -28,7 +28,7 @@ from fog_contracts import channels as ch
 from fog_contracts.follower import MapFollower
 from fog_contracts.handlers import Fence
 from fog_contracts.handover import next_berth
-from fog_contracts.messages import SENTENCE_MAX, LoopHealth, Reason, ReasonCode, RefusalCode
+from fog_contracts.messages import SENTENCE_MAX, CommandReply, LoopHealth, Reason, ReasonCode, RefusalCode
 from fog_contracts.replica import MapError
 from robot_agent.agent.hand_driving import HandBack, HandReply, Steer, TakeOver, Watch
 from robot_agent.agent.maneuvers import Maneuvers
@@ -54,7 +54,6 @@ if TYPE_CHECKING:
     from fog_contracts.handlers import Handler, Ids, Moment, Publication, QueryHandler
     from fog_contracts.messages import (
         Berth,
-        CommandReply,
         EgressRequest,
         HandOver,
         MapSnapshot,
@@ -81,6 +80,8 @@ if TYPE_CHECKING:
 
 POSSIBLE_WHILE_SUSPENDED: Final = (0.5, 0.5)
 """How far (m, rad) a robot is expected to be moved by others while its computer is suspended."""
+RESUMES_S: Final = 60.0
+"""How long a robot that was handed over enabled may take until it drives on by itself: then somebody has to look."""
 STANDBY_S: Final = 0.14
 """A robot that stands by looks at its inputs at the first call after this time: at every second one. They age by 0.2 s
 more at most, and it stands; the gate's limits begin at 0.3 s."""
@@ -109,7 +110,9 @@ class AgentCore:
         self._commands = OperatorCommands(config, self)
         self._publishing = PublishingPolicy(config.robot)
         self._berth = config.berth
-        self._resumes = config.resumes
+        self._resumes_until = math.inf if config.resumes else -math.inf
+        """After a ride the robot enables itself until then, if nobody has told it anything."""
+        self._leaves = False
         self._loop_health = LoopHealth()
         self._looked_at = self._ticked_at = -math.inf
         """When `stream` last evaluated its inputs, and `tick` last looked for what to publish."""
@@ -131,6 +134,10 @@ class AgentCore:
 
     def _on_command(self, _ids: Ids, command: RobotCommand, at: Moment) -> CommandReply:
         self._looked_at = self._ticked_at = -math.inf  # what it changes shows at once
+        self._resumes_until = -math.inf  # whoever tells it anything decides from then on
+        if self._leaves:
+            reason = "the robot starts again on another floor: tell it there"
+            return CommandReply.refused(Reason(RefusalCode.OTHER_RUN, reason))
         return self._commands.answer(command, at)
 
     # --- the map ---
@@ -225,9 +232,12 @@ class AgentCore:
         goal_id = self._driving.mission.goal_id
         self._rest.update(busy=not self.idle, goal_id=goal_id, now=now, base_ready=self._base.ready)
         safety = self._evaluate_safety(now)
-        if self._resumes and [reason.code for reason in self._safety.state.reasons] == [ReasonCode.NOT_ENABLED]:
+        self._resumes_until = min(self._resumes_until, now + RESUMES_S)
+        waits = [reason.code for reason in self._safety.state.reasons] == [ReasonCode.NOT_ENABLED]
+        if now < self._resumes_until and waits:
             safety = self._evaluate_safety(now, "enable")
-            self._resumes = safety.refusal is not None
+            if safety.refusal is None:
+                self._resumes_until = -math.inf
         if self._maneuvers.may_seek_dock(self._safety.state, self._base.feedback, self._driving, now):
             safety = self._evaluate_safety(now, "dock")
             self._maneuvers.docking.on_begun(safety.refusal)
@@ -293,7 +303,6 @@ class AgentCore:
 
     def request(self, request: Request, now: float) -> SafetyOutputs:
         """Pass an operator's request to the safety gate; the outputs carry its refusal."""
-        self._resumes = False
         self._rest.on_request(request)
         self._maneuvers.on_request(request, self._safety.state)
         outputs = self._evaluate_safety(now, request)
@@ -363,6 +372,10 @@ class AgentCore:
             return Reason(RefusalCode.NO_FLOOR, f"this robot does not know {given.floor} (known: {known})")
         if not self._driving.wheels.at_rest:
             return Reason(RefusalCode.DRIVING, "the robot is driving: it must stand where it leaves the floor")
+        if self._safety.state.mode == "FAULT":
+            return Reason(
+                RefusalCode.FAULT_LATCHED, "the robot is in FAULT: somebody must look at it and reset it first"
+            )
         after = next_berth(self._berth, given)
         if isinstance(after, Reason):
             return after
@@ -370,9 +383,14 @@ class AgentCore:
         return None
 
     @property
-    def enabled(self) -> bool:
-        """Whether the robot is enabled."""
-        return self._safety.state.enabled
+    def goes_on(self) -> bool:
+        """Whether the robot may enable itself after a ride: it is enabled, and waits for no operator."""
+        state = self._safety.state
+        return state.enabled and state.maneuver is None and not state.awaits_operator
+
+    def leave(self) -> None:
+        """Take no command any more: this run ends, and what it accepted now the next one would not know."""
+        self._leaves = True
 
     @property
     def berth_to_store(self) -> Berth | None:

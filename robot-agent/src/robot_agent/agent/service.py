@@ -164,11 +164,15 @@ class Service:
         berth = self._core.berth_to_store
         if berth is None or self.berths is None:
             return
+        goes_on = self._core.goes_on
         try:
-            await asyncio.to_thread(self.berths.store, berth, enabled=self._core.enabled)
+            await asyncio.to_thread(self.berths.store, berth, enabled=goes_on)
+            if goes_on and not self._core.goes_on:  # stopped while that was written
+                await asyncio.to_thread(self.berths.store, berth, enabled=False)
         except OSError as error:
             _log.error("floor_not_stored", floor=berth.floor, reason=str(error), remedy="it is tried again")
             return
+        self._core.leave()
         raise AgainError(f"the robot is on {berth.floor} now")
 
     async def _announce_metrics(self) -> None:

@@ -7,6 +7,7 @@ robot must be sent again by a person.
 from __future__ import annotations
 
 import asyncio
+import math
 from collections import Counter
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Final
@@ -173,6 +174,8 @@ class RobotOperator:
         self._stopped_by: dict[str, set[str]] = {}
         """Who may command robots and has stopped one that was not enabled since."""
         self._doubled = DoubledRobots()
+        self.stopped_at = -math.inf
+        """When anybody last stopped robots (s, monotonic), but by a command of an operator."""
         self.overruled: Callable[[str], object] = lambda _robot: None
         """Called for a robot that somebody commands or stops, before the robot hears of it."""
 
@@ -239,6 +242,7 @@ class RobotOperator:
         or one of a robot that was enabled meanwhile.
         """
         self._overrule(robot)
+        self.stopped_at = self._clock.now()
         known = self._stopped_by.setdefault(robot, set())
         always = each and sender not in known
         known.update({sender} if each else ())
@@ -261,6 +265,7 @@ class RobotOperator:
 
         No stop waits for the store.
         """
+        self.stopped_at = self._clock.now()
 
         async def stop(robot: str) -> None:
             try:

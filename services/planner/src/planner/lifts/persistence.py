@@ -74,6 +74,11 @@ class RidePersistence(TourPersistence):
         """Raise `OutOfServiceError` for a robot that is out of service, or on another floor."""
         if (out := self._elsewhere(robot)) is not None:
             raise OnOtherFloorError(robot, out)
+        berth = self.berths.get(robot)
+        given = None if berth is None else berth.came_by
+        if given is not None and given.lift is not None and f"{robot}/{given.epoch}" not in self.begun:
+            reason = "it is in a lift whose door is not open here yet"
+            raise OnOtherFloorError(robot, OutOfService(id="lift", reason=reason, by=WHO, since=0.0))
         super().require_in_service(robot)
 
     def _elsewhere(self, robot: str) -> OutOfService | None:

@@ -10,12 +10,15 @@ from fog_contracts.messages import Berth, LiftRequest
 if TYPE_CHECKING:
     from collections.abc import Iterable
 
-    from fog_contracts.messages import LiftState, RobotPose
+    from fog_contracts.messages import LiftState, Pose, RobotPose
     from fog_contracts.site import LiftSite
     from planner.stops import Ride
 
 CABIN_M: Final = 1.0
-"""A robot that is nearer to the middle of a cabin may be in its door: the lift is not given away."""
+"""A robot that is nearer to the middle of a cabin may be in its door: the lift is not given away. Nor is it to one that
+is nearer to there than to the place where it waits: in a deep cabin that is still inside."""
+INSIDE_M: Final = 0.5
+"""A robot that knows that it is so near to the middle of a cabin is inside, and may ride."""
 
 Act = Literal["wait", "board", "leave"]
 """Wait for the lift, or drive on; drive into its cabin, whose door is open; be handed over to the other floor."""
@@ -25,14 +28,15 @@ class Facts(NamedTuple):
     """What a floor knows of a robot.
 
     `berth`: where it is, by this floor's record. `ride`: its mission to another floor, whose present goal it has
-    reached if it is `at_goal`. `cabins`: the lifts in whose cabin or door it is, or may be. `silent`: it was not heard
-    for so long that a lift no longer waits for it.
+    reached if it is `at_goal`. `cabins`: the lifts in whose cabin or door it is, or may be. `inside`: those in whose
+    cabin it certainly is. `silent`: it was not heard for so long that a lift no longer waits for it.
     """
 
     berth: Berth
     ride: Ride | None = None
     at_goal: bool = False
     cabins: frozenset[str] = frozenset()
+    inside: frozenset[str] = frozenset()
     silent: bool = False
 
 
@@ -48,7 +52,9 @@ def next_act(robot: str, facts: Facts, lift: LiftState | None, floor: str) -> Ac
         return "wait"
     if not lift.serves(session(robot, facts.berth.epoch + 1), floor):
         return "wait"
-    return "leave" if ride.boards else "board"
+    if not ride.boards:
+        return "board"
+    return "leave" if ride.lift in facts.inside else "wait"  # somebody may have driven or pushed it out
 
 
 def request(  # noqa: PLR0911  # each part of a ride has its own answer
@@ -98,4 +104,21 @@ def cabins_at(lifts: Iterable[LiftSite], berth: Berth, pose: RobotPose | None) -
     if pose is None or not pose.localized:
         lift = berth.came_by.lift if berth.came_by is not None else None
         return frozenset() if lift is None else frozenset((lift,))
-    return frozenset(lift.id for lift in lifts if math.hypot(lift.cabin.x - pose.x, lift.cabin.y - pose.y) < CABIN_M)
+    return frozenset(lift.id for lift in lifts if _may_be_in(lift, pose))
+
+
+def inside_of(lifts: Iterable[LiftSite], pose: RobotPose | None) -> frozenset[str]:
+    """Return the lifts in whose cabin a robot certainly is."""
+    if pose is None or not pose.localized:
+        return frozenset()
+    return frozenset(lift.id for lift in lifts if _away(lift.cabin, pose) < INSIDE_M)
+
+
+def _may_be_in(lift: LiftSite, pose: RobotPose) -> bool:
+    cabin, wait = _away(lift.cabin, pose), _away(lift.wait, pose)
+    apart = math.hypot(lift.cabin.x - lift.wait.x, lift.cabin.y - lift.wait.y)
+    return cabin < CABIN_M or cabin < min(wait, apart)
+
+
+def _away(place: Pose, pose: RobotPose) -> float:
+    return math.hypot(place.x - pose.x, place.y - pose.y)

@@ -11,7 +11,7 @@ from fog_runtime.clock import ticker
 from fog_runtime.stores.redis_connection import StoreError
 from fog_runtime.stores.redis_store import Attempt
 from planner.lifts.persistence import on_behalf
-from planner.lifts.rides import Facts, cabins_at, next_act, request, session
+from planner.lifts.rides import Facts, cabins_at, inside_of, next_act, request, session
 from planner.robot_operator import CommandError
 from planner.stops import Order
 from planner.store import NO_MISSION, MissionConflictError, OutOfServiceError
@@ -30,6 +30,8 @@ if TYPE_CHECKING:
 STEP_S: Final = 0.5
 SILENT_S: Final = 60.0
 """A robot that was not heard for so long holds no lift any more: a restart takes less."""
+STOPPED_S: Final = 120.0
+"""A robot that comes so soon after anybody has stopped robots here is stopped, too: the stop may have missed it."""
 
 _log = logs.get("planner")
 
@@ -64,8 +66,6 @@ class Riding:
         self._lifts: dict[str, tuple[LiftState, float]] = {}
         self._heard: dict[str, float] = {}
         self._created = clock.now()
-        self._begun: set[str] = set()
-        """Hand-overs whose goal was given, or refused."""
         service.missions.site = site.id
 
     def subscribe(self) -> None:
@@ -112,13 +112,16 @@ class Riding:
         at_goal = stored is not None and missions.at_goal.get(robot) == stored.goal.goal_id
         ride = None if stored is None else stored.ride
         silent = self._clock.now() - self._heard.get(robot, self._created) > SILENT_S
-        return Facts(berth, ride, at_goal, cabins_at(self._site.lifts, berth, pose), silent)
+        cabins = cabins_at(self._site.lifts, berth, pose)
+        return Facts(berth, ride, at_goal, cabins, inside_of(self._site.lifts, pose), silent)
 
     async def _step(self, robot: str) -> None:
         missions = self._service.missions
         known, said = missions.berths.get(robot), missions.said.get(robot)
         match missions.standing(robot):
             case "arrives" if said is not None:
+                if self._clock.now() - self._service.operator.stopped_at < STOPPED_S:
+                    await self._service.operator.send("disable", robot, "stop before it came")
                 self._service.poses.pop(robot, None)  # of its last stay here
                 await missions.arrive(robot, said)
             case "leaves" if known is not None and known.came_by is not None:
@@ -138,19 +141,26 @@ class Riding:
 
     async def _take(self, robot: str, given: HandOver) -> None:
         """Give a robot that has come its goal once its lift is here and open; settle once it has left the cabin."""
-        name = session(robot, given.epoch)
-        if name not in self._begun:
+        name, begun = session(robot, given.epoch), self._service.missions.begun
+        pose = self._service.poses.get(robot)
+        is_out = pose is not None and pose.localized and given.lift not in self._facts(robot).cabins
+        if given.lift is not None and is_out:
+            if name not in begun:  # such as one that came long ago, on a floor whose store was restored
+                _log.warning("ride_over", robot=robot, epoch=given.epoch, reason="it is not in the cabin: no goal")
+        elif name not in begun:
             lift = self._lift(given.lift)
             if given.lift is not None and (lift is None or not lift.serves(name, self._site.id)):
                 return
+            begun.add(name)
             if given.goal is not None:
-                await self._send(robot, given, given.goal)
-            self._begun.add(name)
-        pose = self._service.poses.get(robot)
-        is_out = pose is not None and pose.localized and given.lift not in self._facts(robot).cabins
+                try:
+                    await self._send(robot, given, given.goal)
+                except StoreError:
+                    begun.discard(name)
+                    raise
         if given.lift is None or is_out:
             await self._service.missions.settle(robot)
-            self._begun.discard(name)
+            begun.discard(name)
 
     async def _send(self, robot: str, given: HandOver, goal: FloorGoal) -> None:
         pose, any_heading = goal.pose, goal.any_heading

@@ -50,6 +50,8 @@ class TourPersistence(MissionPersistence):
         self.said: dict[str, Berth] = {}
         """By robot, where it is by its own latest word."""
         self.at_goal: dict[str, str] = {}
+        self.begun: set[str] = set()
+        """Rides, by their lift's session, whose robots have come and were given their goal, or had none."""
         """By robot that rides to another floor, the last goal of that mission that it has reached."""
 
     async def send(self, order: Order) -> StoredGoal:

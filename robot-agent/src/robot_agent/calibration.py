@@ -492,7 +492,11 @@ def differing(config: AgentConfig, settings: RobotSettings, drive: DriveTrain) -
         "lidar.mirrored": (used.lidar_mirrored, lidar.mirrored),
         "lidar.latency_s": (used.lidar_latency, lidar.latency_s),
     }
-    return [name for name, pair in pairs.items() if not math.isclose(*pair, rel_tol=1e-6, abs_tol=1e-9)]
+    return [
+        name
+        for name, (was, now) in pairs.items()
+        if was is not None and not math.isclose(was, now, rel_tol=1e-6, abs_tol=1e-9)
+    ]
 
 
 def _rounded(figure: Figure, digits: int) -> tuple[float, float]:

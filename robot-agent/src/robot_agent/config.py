@@ -168,9 +168,9 @@ class LocalizationConfig:
     lidar_x: float = 0.0
     lidar_y: float = 0.0
     lidar_yaw: float = 0.0
-    lidar_mirrored: bool = False
-    lidar_latency: float = 0.0
-    """With these two its scans are corrected before they arrive: a recording says with which."""
+    lidar_mirrored: bool | None = None
+    lidar_latency: float | None = None
+    """With these two its scans are corrected before they arrive: a recording says with which, older ones don't."""
     markers: tuple[MarkerSite, ...] = ()
     """The markers of the site; without any, sightings change nothing."""
 

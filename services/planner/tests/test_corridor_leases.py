@@ -386,6 +386,23 @@ def test_robots_that_come_to_a_place_for_one_robot_from_both_sides_all_get_throu
     assert [robot for robot in floor.paths if not floor.arrived(robot)] == []
 
 
+def test_robot_that_falls_silent_in_a_place_for_one_robot_keeps_it_until_it_is_taken_out_of_service() -> None:
+    floor = Floor()
+    floor.leases.set_places([narrow("a", (2.5, 2.5), (5.5, 6.5))], floor.now)
+    floor.put("dead", (4.0, 4.5), (4.0, 4.6))
+    floor.put("r1", (0.5, 4.5), (10.0, 4.5))
+
+    def after(seconds: float) -> float:
+        floor.now += seconds
+        floor.leases.place("r1", 0.5, 4.5, floor.now)
+        return floor.leases.release("r1", 10.0, floor.now)
+
+    assert after(59.0) < 2.5
+    assert after(3600.0) < 2.5
+    floor.leases.take_out("dead")
+    assert after(1.0) > 5.0
+
+
 class OneRobot(RuleBasedStateMachine):
     """Robots ask, drive, change their paths and wait in any order, on a floor with places for one robot."""
 

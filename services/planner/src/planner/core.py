@@ -268,6 +268,8 @@ class PlannerCore:
         Whoever sets goals sees to it that it has none meanwhile.
         """
         self.missions.of(robot).set_service(out)
+        if out is not None:
+            self.leases.take_out(robot)
 
     # --- Planning and publishing -----------------------------------------------------------------------------------
 

@@ -55,7 +55,8 @@ PATIENCE_S: Final = 15.0
 WITHDRAWN_S: Final = 10.0
 """... and after so long more it has: it has heard, or its own gate has stopped it (3 s without map or planner)."""
 FORGET_S: Final = 60.0
-"""A robot that is silent for so long is an obstacle that others see, no longer one that stands in the way unseen."""
+"""A robot that is silent for so long is an obstacle that others see, no longer one that stands in the way unseen. One
+in a place for one robot keeps that, until it is heard elsewhere or an operator takes it out of service."""
 SILENT_S: Final = 3.0
 """After so long without a pose a robot gets nothing, and has stopped. So long a path may be on its way to it."""
 MOST_ROBOTS: Final = 20
@@ -79,6 +80,8 @@ class CorridorLeases:
         self._arrivals = 0
         self._now = -math.inf
         self._places: list[NarrowPlace] = []
+        self._gone: set[str] = set()
+        """Robots that an operator has taken out of service, until they are heard."""
         self.standstills = Standstills(self._robots, self._places)
         self.made: dict[Kind, int] = {}
         """How often robots got room, by kind."""
@@ -88,6 +91,7 @@ class CorridorLeases:
     def place(self, robot: str, x: float, y: float, now: float, radius: float = DEFAULT_RADIUS_M) -> None:
         """Note where a robot is (m)."""
         me, self._now = self._of(robot), now
+        self._gone.discard(robot)
         me.at, me.radius, me.heard_at = np.array(((x, y),)), radius, now
         if math.dist(me.moved_from, (x, y)) >= _MOVED_M or math.isinf(me.moved_at):
             me.moved_from, me.moved_at = (x, y), now
@@ -194,6 +198,10 @@ class CorridorLeases:
         me.low, me.high = (math.inf, math.inf), (-math.inf, -math.inf)
         me.progress, me.end, me.leased, me.wanted = 0.0, 0.0, 0, 0.0
         me.waits_for, me.lets_pass, me.passes = None, None, frozenset()
+
+    def take_out(self, robot: str) -> None:
+        """Note that an operator has taken a robot out of service: silent, it holds no place for one robot any more."""
+        self._gone.add(robot)
 
     # --- Leases -----------------------------------------------------------------------------------------------------
 
@@ -356,7 +364,8 @@ class CorridorLeases:
                 other.leased = min(other.leased, max(other.first, int(other.along.searchsorted(other.end))))
                 other.withdrawn_at, other.standing = math.inf, True
                 self.standstills.changed(other.id)
-            if now - other.heard_at > FORGET_S:
+            stays = other.id not in self._gone and any(place.has_body(other) for place in self._places)
+            if now - other.heard_at > FORGET_S and not stays:
                 self._drop(other.id)
 
     # --- Robots that make room ----------------------------------------------------------------------------------------

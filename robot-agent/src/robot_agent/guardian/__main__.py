@@ -9,7 +9,6 @@ that has sent no command for a second is dropped as soon as another connects.
 from __future__ import annotations
 
 import os
-import secrets
 import select
 import signal
 import socket
@@ -383,7 +382,7 @@ def main() -> int:
         robot = load_robot(os.environ)
         driver = make_base(robot)
         limits = limits_of(robot.settings.motion, driver.drive_train.axle_m)
-        core = GuardianCore(driver, limits, secrets.token_hex(8))
+        core = GuardianCore(driver, limits, os.urandom(8).hex())
         check = LineCheck(settings.base_port, robot.settings.base.driver, signatures())
         listener = _listen(settings.guardian_socket)
     except SettingsError as error:

@@ -77,7 +77,7 @@ usage = module(HERE / "channel_usage.py")
 SEED = 3
 STEPS = 1500
 ENABLE, GOAL, BARRIER, EXTERNAL = 350, 400, 500, 620
-ZONES, QUERIES, ARRIVAL, ZONE_AROUND_ROBOT = 910, 1000, 1100, 1250
+QUERIES, ARRIVAL, ZONE_AROUND_ROBOT = 1000, 1100, 1250
 COMMANDS: dict[int, CommandKind] = {ENABLE: "enable", 1320: "egress"}
 GOAL_ID = "goal-of-the-drive"
 EXTERNAL_CHANNELS = {ch.NODE_READING, ch.NODE_AVAILABILITY, ch.THESIS_AREA}
@@ -93,6 +93,8 @@ ZONE_SLOW = Zone(
     version=1,
 )
 ZONE_WET = Zone(id="wet", kind="BLOCKED", shape=CircleShape(centre=(10.0, 6.4), radius=0.4), reason="mopped", version=1)
+ZONES = {910: ZONE_SLOW, 920: ZONE_WET}
+"""By the step in which they are drawn: the planner has planned by the first before it hears of the second."""
 PLAN = PlanRequest(start=Pose(x=1.5, y=1.5, theta=0.0), goal=Pose(x=13.5, y=6.5, theta=0.0))
 EGRESS = EgressRequest(robot="r1", pose=Pose(x=7.5, y=1.5, theta=0.0))
 
@@ -241,9 +243,8 @@ def drive_in_lockstep() -> Run:
             for robot in ("r1", OTHER_ROBOT):
                 fog.planner.set_goal(robot, goal(at.stamp), any_heading=True)
                 fog.deliver(at)
-        if step == ZONES:
-            fog.map.put_zone(ZONE_SLOW, at)
-            fog.map.put_zone(ZONE_WET, at)
+        if step in ZONES:
+            fog.map.put_zone(ZONES[step], at)
         if step == ZONE_AROUND_ROBOT:
             run.last_zone = zone_around(*system.world.pose[:2])
             fog.map.put_zone(run.last_zone, at)
@@ -308,9 +309,8 @@ async def drive_live(recorded: Run) -> tuple[Run, Any]:
             assert pose is not None
             for robot in ("r1", OTHER_ROBOT):
                 await live.run(live.planner.send(Order(robot, pose, "tester", any_heading=True)))
-        if step == ZONES:
-            for zone in (ZONE_SLOW, ZONE_WET):
-                await live.run(live.map.zones.create(zone, "tester"))
+        if step in ZONES:
+            await live.run(live.map.zones.create(ZONES[step], "tester"))
         if step == ZONE_AROUND_ROBOT:
             await live.run(live.map.zones.create(recorded.last_zone, "tester"))
         if step == QUERIES:

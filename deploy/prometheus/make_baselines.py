@@ -9,8 +9,8 @@ from its `README.md`, which also says what the robot's processes took in drives 
 What each thread took is known by component, from drives in lockstep: the calculations of a thread, without the sockets,
 the event loop and the waking up that a real one has besides.
 
-Run: python deploy/prometheus/make_baselines.py [FOLDER] [--check]. FOLDER is the report's (docs/results/estig); one of
-your own says more of your robots' computers. With --check nothing is written, and the exit code is 1 if the file is out
+Run: python deploy/prometheus/make_baselines.py [FOLDER] [--check]. FOLDER is the report's (docs/results/estig-live); one
+of your own says more of your robots' computers. With --check nothing is written, and the exit code is 1 if the file is out
 of date.
 """
 
@@ -169,7 +169,7 @@ def rules(folder: Path) -> str:
 def main() -> int:
     """Write the file, or compare it."""
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("folder", nargs="?", type=Path, default=ROOT / "docs" / "results" / "estig")
+    parser.add_argument("folder", nargs="?", type=Path, default=ROOT / "docs" / "results" / "estig-live")
     parser.add_argument("--check", action="store_true", help="write nothing")
     options = parser.parse_args()
     made = {FILE: rules(options.folder), PAGE: for_page(options.folder)}

@@ -9,9 +9,9 @@ from its `README.md`, which also says what the robot's processes took in drives 
 What each thread took is known by component, from drives in lockstep: the calculations of a thread, without the sockets,
 the event loop and the waking up that a real one has besides.
 
-Run: python deploy/prometheus/make_baselines.py [FOLDER] [--check]. FOLDER is the report's (docs/results/estig-live); one
-of your own says more of your robots' computers. With --check nothing is written, and the exit code is 1 if the file is out
-of date.
+Run: python deploy/prometheus/make_baselines.py [FOLDER] [--check]. FOLDER is the report's (docs/results/estig-live);
+one of your own says more of your robots' computers. With --check nothing is written, and the exit code is 1 if the file
+is out of date.
 """
 
 import argparse

@@ -26,7 +26,8 @@ _PERIOD_S: Final = 0.05
 _KEY_S: Final = 0.15
 """A terminal tells no release of a key: one that is not repeated for this long is released."""
 _PAD_S: Final = 1.0
-"""A game pad out of range or without power tells no release either; a hand on its sticks is never still for so long."""
+"""A game pad out of range or without power tells no release either. One that is well tells something all the while, but
+for a stick at its very end: there the robot stops, too, until the button is pressed again."""
 _HEALTHY_S: Final = 5.0
 """For so long a robot is asked again that must not move: its lidar may have to start."""
 _MOVES: Final = {

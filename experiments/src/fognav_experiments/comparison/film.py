@@ -28,7 +28,7 @@ SHOWN_S: Final = 0.1
 _LAST_S: Final = 4.0
 _WIDTH_PX: Final = 480
 _TITLE_PX: Final = 34
-_WORDS: Final[dict[Setup, str]] = {
+WORDS: Final[dict[Setup, str]] = {
     "default": "on its own: it finds the obstacle by its lidar",
     "lean": "on its own, at the rates of full",
     "full": "told of the obstacle, it plans itself",
@@ -114,7 +114,7 @@ class Film:
         done = time_s >= drive.time_s
         now = min(time_s, drive.time_s)
         driven = drive.record.distance_m if done else _length(drive.timeline, now)
-        draw.text((left, 2), _WORDS[setup], fill=_COLOUR[setup], font=ImageFont.load_default(14))
+        draw.text((left, 2), WORDS[setup], fill=_COLOUR[setup], font=ImageFont.load_default(14))
         mark = "at its goal" if done else "under way"
         draw.text((left, 18), f"{driven:5.0f} m  {now:5.0f} s  {mark}", fill=_WALL, font=ImageFont.load_default(13))
 

@@ -10,6 +10,7 @@ from matplotlib.patches import Polygon, Rectangle
 
 from fog_contracts.costs import LETHAL
 from fognav_experiments.comparison.drives import ALONE, PROFILE_OF_SETUP, ends_of, start_of
+from fognav_experiments.comparison.film import WORDS
 from fognav_experiments.figures import COLOURS, write_png
 from fognav_experiments.lockstep import ready
 from fognav_sim.drive.hazard import HazardRequest
@@ -25,12 +26,6 @@ if TYPE_CHECKING:
     from fognav_experiments.lockstep import LockstepDrive
 
 _WAY_M: Final = 500.0
-_WORDS: Final[dict[Setup, str]] = {
-    "default": "default: not told of the obstacle",
-    "lean": "lean: not told of the obstacle",
-    "full": "full: told of the obstacle, it plans itself",
-    "fog": "fog: the fog plans",
-}
 
 
 class NoStillError(ValueError):
@@ -80,4 +75,4 @@ def _draw(axes: Axes, run: LockstepDrive, setup: Setup, drawn: RouteDraw) -> Non
     for name in (drawn.route.start, drawn.route.goal):
         if (place := site.places.get(name)) is not None:
             axes.annotate(name.upper(), (place.x, place.y), weight="bold", ha="center", va="center")
-    axes.set(title=_WORDS[setup], xlabel="m", ylabel="m")
+    axes.set(title=f"{setup}: {WORDS[setup]}", xlabel="m", ylabel="m")

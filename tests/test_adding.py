@@ -32,7 +32,8 @@ MESSAGES = "libs/fog-contracts/src/fog_contracts/messages"
 CHANNELS = "libs/fog-contracts/src/fog_contracts/channels.py"
 SHAPES = "libs/fog-contracts/src/fog_contracts/shapes.py"
 MAKE_POLYGONS = {
-    "experiments/src/fognav_experiments/scenarios/stage.py", "robot-agent/src/robot_agent/agent/navigation.py",
+    "experiments/src/fognav_experiments/scenarios/play.py", "experiments/src/fognav_experiments/scenarios/stage.py",
+    "robot-agent/src/robot_agent/agent/navigation.py",
     "services/map-service/src/map_service/api_masks.py",
 }  # fmt: skip
 """They make a shape of a list of corners, whatever other kinds there are."""
@@ -48,7 +49,7 @@ ORACLE = "experiments/src/fognav_experiments/hunt/oracle.py"
 """It computes for itself where zones are: an error in the shapes must not be its own, too."""
 DRAWING_COMMANDS = {
     "cli/src/fognav/commands/zone.py",
-    *(f"experiments/src/fognav_experiments/bench/{name}.py" for name in ("cores", "fleet", "floor", "rest")),
+    *(f"experiments/src/fognav_experiments/bench/{name}.py" for name in ("cores", "fleet", "floor", "rest", "robot")),
 }
 AGGREGATOR = "services/hazard-aggregator/src/hazard_aggregator/core.py"
 MAP_API = "services/map-service/src/map_service/api.py"

@@ -278,7 +278,11 @@ def agent_config(  # noqa: PLR0913  # what the process knows about its robot
         drive_train=drive_train,
         motion=MotionConfig(limits=limits),
         localization=LocalizationConfig(
-            range_min=lidar.range_min_m, range_max=lidar.range_max_m, markers=tuple(markers)
+            range_min=lidar.range_min_m,
+            range_max=lidar.range_max_m,
+            markers=tuple(markers),
+            lidar_mirrored=False,
+            lidar_latency=0.0,
         ),
         safety=SafetyConfig(scan_lost=scan_lost),
         stop_field=StopFieldConfig(memory=max(StopFieldConfig().memory, _REMEMBERED_REVOLUTIONS * lidar.scan_period_s)),

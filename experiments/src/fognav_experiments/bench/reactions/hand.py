@@ -8,7 +8,7 @@ import os
 import pty
 import re
 import sys
-from typing import TYPE_CHECKING, Final
+from typing import TYPE_CHECKING, Any, Final
 
 import msgspec
 from websockets.asyncio.client import connect
@@ -24,7 +24,6 @@ _REPEAT_S: Final = 0.033
 """How often a terminal repeats a key that is held."""
 _SAY_S: Final = 0.05
 """How often a page says what its pad is held for."""
-_AHEAD: Final = msgspec.json.encode({"type": "steer", "v": SPEED_M_S, "w": 0.0}).decode()
 _TAKE_OVER: Final = '{"type": "take_over"}'
 _ASK_S: Final = 0.2
 _START_S: Final = 30.0
@@ -38,7 +37,9 @@ class Hand:
         self._process: asyncio.subprocess.Process | None = None
         self._terminal = -1
         self._page: ClientConnection | None = None
-        self._holding: asyncio.Task[None] | None = None
+        self._holding: asyncio.Future[Any] | None = None
+        self._tick = 0
+        """The newest time that the page was told: it says its speed with it, so that an old one is not obeyed."""
 
     async def hold_key(self) -> None:
         """Hold the key that drives ahead, in a terminal."""
@@ -63,13 +64,12 @@ class Hand:
         async with asyncio.timeout(_START_S):
             while not await self._agrees(self._page):
                 pass
-        self._holding = asyncio.create_task(self._repeat_word(self._page))
+        self._holding = asyncio.gather(self._hear(self._page), self._repeat_word(self._page))
 
-    @staticmethod
-    async def _agrees(page: ClientConnection) -> bool:
+    async def _agrees(self, page: ClientConnection) -> bool:
         """Take the robot over by the page; return whether it agrees, which it does once it is healthy."""
         await page.send(_TAKE_OVER)
-        while not (replies := msgspec.json.decode(await page.recv()).get("replies")):
+        while not (replies := (await self._told(page)).get("replies")):
             pass
         accepted = bool(replies[-1]["accepted"])
         await asyncio.sleep(0.0 if accepted else _ASK_S)
@@ -82,10 +82,19 @@ class Hand:
             os.write(self._terminal, b"i")
             await asyncio.sleep(_REPEAT_S)
 
-    @staticmethod
-    async def _repeat_word(page: ClientConnection) -> None:
+    async def _told(self, page: ClientConnection) -> dict[str, Any]:
+        told: dict[str, Any] = msgspec.json.decode(await page.recv())
+        self._tick = told.get("tick", self._tick)
+        return told
+
+    async def _hear(self, page: ClientConnection) -> None:
         while True:
-            await page.send(_AHEAD)
+            await self._told(page)
+
+    async def _repeat_word(self, page: ClientConnection) -> None:
+        while True:
+            steer = {"type": "steer", "v": SPEED_M_S, "w": 0.0, "tick": self._tick}
+            await page.send(msgspec.json.encode(steer).decode())
             await asyncio.sleep(_SAY_S)
 
     def let_go(self) -> None:

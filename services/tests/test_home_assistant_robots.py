@@ -14,15 +14,21 @@ from pathlib import Path
 from urllib.parse import urlsplit
 
 import httpx
+import numpy as np
 import pytest
 from PIL import Image
 
+from console_service.core import ConsoleCore
 from fog_bridges.floor import WAITS, Request
 from fog_bridges.home_assistant import HomeAssistant, activity, discovery, report
+from fog_bridges.picture import Picture
 from fog_bridges.service import HomeAssistantBridge
 from fog_contracts import channels as ch
+from fog_contracts.grid import GridGeometry, Window
+from fog_contracts.handlers import Moment
 from fog_contracts.messages import RobotState
 from fog_contracts.messages.basics import SENTENCE_MAX
+from fog_contracts.replica import MasterMap, decode_map
 from fog_runtime.clock import SystemClock
 from fog_runtime.credentials import Credentials
 from fog_runtime.transports.mqtt_edge import MqttEdge
@@ -362,3 +368,40 @@ def test_words_of_a_robot_and_many_places_keep_the_limits_of_their_topics():
     assert len(report(long, ())) <= ch.ROBOT_REPORT.limit
     assert len(json.loads(report(long, ()))["why"]) == 255
     assert len(discovery("s" * 32, "r" * 32, [f"place-{n:026}" for n in range(100)])) <= ch.HOME_ASSISTANT_ROBOT.limit
+
+
+def events_of(core: ConsoleCore) -> list[tuple[str, dict[str, object]]]:
+    """Return what a reader is told that has just come, tiles and map, encoding what waits for that."""
+    while jobs := core.tile_jobs(100):
+        for job in jobs:
+            job.run()
+            core.add_tile(job)
+    told = [(each.key[0], json.loads(each.data)) for each in reversed(list(core.log.after(0)))]
+    return [("hello", {"fresh": True}), *told, ("ready", {})]
+
+
+def unknown_share(picture: Picture) -> float:
+    """Return the share of a picture's pixels that have the grey of the unknown."""
+    drawn = picture.draw()
+    assert drawn is not None
+    with Image.open(io.BytesIO(base64.b64decode(drawn[0]))) as image:
+        pixels = np.asarray(image.convert("RGB"))
+    return float(np.mean((abs(pixels.astype(int) - 205) < 8).all(axis=2)))
+
+
+def test_picture_of_a_bridge_that_starts_later_has_the_whole_map_and_so_has_one_after_another_map():
+    at, core, along = Moment(1.0, 1.0), ConsoleCore("test", "r"), Picture()
+    for epoch, (width, height) in enumerate([(300, 200), (260, 400)], 1):
+        free = np.zeros((height, width), np.uint8)
+        master = MasterMap("test", GridGeometry(width, height, 0.05, 0.0, 0.0), free, free, epoch)
+        core.load(decode_map(master.snapshot()), 0.0)
+        events_of(core)
+        for delta in master.write([("cost", Window(0, 0, 1, 1), np.full((1, 1), 254, np.uint8))], [], []):
+            core.handlers()[ch.MAP_DELTA]({}, delta, at)  # raises the version of the map, and changes one tile of many
+        found = events_of(core)
+        names = [name for name, _ in found]
+        assert names.index("costmap") < names.index("map"), "tiles are told first: what this test is about"
+        for picture in (Picture(), along):
+            for name, data in found:
+                picture.on_event(name, data)
+            assert unknown_share(picture) == 0.0

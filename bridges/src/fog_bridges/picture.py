@@ -36,26 +36,36 @@ def _colours() -> NDArray[np.uint8]:
 
 
 class Picture:
-    """The newest costmap and the robots on it, from the console's events `map`, `costmap` and `pose`."""
+    """The newest costmap and the robots on it, from the console's events `hello`, `map`, `costmap` and `pose`."""
 
     def __init__(self) -> None:
         self._geometry: dict[str, Any] = {}
         self._cost = np.zeros((0, 0), np.uint8)
+        self._early: dict[tuple[int, int], NDArray[np.uint8]] | None = {}
+        """Tiles that were told before the map that they are of, by row and column: no more than it has.
+
+        None once the map is known.
+        """
         self._poses: dict[str, Mapping[str, float]] = {}
         self.changed = False
         """Whether something is to be seen that was not drawn yet."""
 
     def on_event(self, name: str, data: dict[str, Any]) -> None:
         """Take in an event of the floor."""
-        if name == "map":
+        if name == "hello":
+            if data["fresh"]:
+                self._early, self._poses = {}, {}
+        elif name == "map":
             size = data["geometry"]["height"], data["geometry"]["width"]
             if data["geometry"] != self._geometry:
                 self._geometry, self._cost = data["geometry"], np.full(size, UNKNOWN, np.uint8)
+            early, self._early = self._early or {}, None
+            for (row, column), cells in early.items():
+                self._paste(row, column, cells)
         elif name == "costmap":
             with Image.open(io.BytesIO(base64.b64decode(data["png"]))) as tile:
                 cells = np.asarray(tile, np.uint8)[::-1]
-            into = self._cost[data["row"] : data["row"] + len(cells), data["column"] : data["column"] + cells.shape[1]]
-            into[:] = cells[: into.shape[0], : into.shape[1]]
+            self._take(data["row"], data["column"], cells)
         elif name == "pose":
             if data["value"] is None:
                 self._poses.pop(data["id"], None)
@@ -64,6 +74,21 @@ class Picture:
         else:
             return
         self.changed = True
+
+    def _take(self, row: int, column: int, cells: NDArray[np.uint8]) -> None:
+        """Paste a tile, now or once its map is told.
+
+        The console tells things in the order of their last changes: the map, whose version each change raises, comes
+        after nearly all of its tiles.
+        """
+        if self._early is None:
+            self._paste(row, column, cells)
+        else:
+            self._early[row, column] = cells
+
+    def _paste(self, row: int, column: int, cells: NDArray[np.uint8]) -> None:
+        into = self._cost[row : row + len(cells), column : column + cells.shape[1]]
+        into[:] = cells[: into.shape[0], : into.shape[1]]
 
     def draw(self) -> tuple[str, str] | None:
         """Return the picture (PNG in base64), and the attributes (JSON) that place it; None without a map."""

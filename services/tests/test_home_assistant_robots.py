@@ -10,16 +10,19 @@ import os
 import re
 import time
 from contextlib import asynccontextmanager
+from functools import partial
 from pathlib import Path
 from urllib.parse import urlsplit
 
 import httpx
+import msgspec
 import numpy as np
 import pytest
 from PIL import Image
 
 from console_service.core import ConsoleCore
 from fog_bridges.floor import WAITS, Request
+from fog_bridges.heard import SILENT
 from fog_bridges.home_assistant import HomeAssistant, activity, discovery, report
 from fog_bridges.picture import Picture
 from fog_bridges.service import HomeAssistantBridge
@@ -55,12 +58,12 @@ async def robot_state(zenoh):
     """Publish a robot that waits, with a hostile reason."""
     state = RobotState(
         mode="HOLD", reasons=[HOSTILE] * 2, enabled=False, battery=0.63, goal_id=None,
-        map_epoch=0, map_seq=0, plan_id=None, awaits_operator=True, stamp=time.time(),
+        map_epoch=0, map_seq=0, plan_id=None, awaits_operator=True,
     )  # fmt: skip
 
     async def publish() -> None:
         while True:
-            zenoh.publish(ch.ROBOT_STATE, state, robot="r1")
+            zenoh.publish(ch.ROBOT_STATE, msgspec.structs.replace(state, stamp=time.time()), robot="r1")
             await asyncio.sleep(0.2)
 
     publishing = asyncio.create_task(publish())
@@ -221,6 +224,7 @@ async def test_robot_is_a_device_with_state_map_and_orders_and_refusals_are_told
                 home.told.pop((ch.ROBOT_REFUSAL.name, "r1"), None)
                 await mqtt.publish(ch.ROBOT_ORDER, order, robot="r1")
                 await until(lambda words=words: words in home.of(ch.ROBOT_REFUSAL), f"{order} is refused: {words}")
+        await until(lambda: home.report()["problem"] == "ON", "it is silent", lambda: str(home.report()))
         async with httpx.AsyncClient(headers=tokens["viewer"]) as person:
             trail = (await person.get(f"{await bridge.ready('map_service')}/api/v1/audit")).json()
         assert "anna/home-assistant" in {entry["who"] for entry in trail}, trail
@@ -245,25 +249,72 @@ def test_state_has_home_assistants_word(state, under_way, said):
     assert activity(state, under_way=under_way) == said
 
 
+BEGIN, END = ("hello", {"fresh": True}), ("ready", {})
+
+
+def told(core: HomeAssistant, now: float, *events: tuple[str, dict[str, object]]) -> list[dict[str, object]]:
+    """Return the reports of robots that are published after events at one time (s), oldest first."""
+    found = [publication for name, data in events for publication in core.on_event(name, data, now)]
+    return [json.loads(each.message) for each in [*found, *core.tick(now)] if each.channel is ch.ROBOT_REPORT]
+
+
+def r1(**state: object) -> tuple[str, dict[str, object]]:
+    """What is told of a robot with a mission."""
+    return "robot", {"id": "r1", "value": {**view(**state), "goal": {"goal_id": "g1", "place": "b"}}}
+
+
 def test_orders_become_requests_of_operators_and_nothing_enables():
     core = HomeAssistant("lab")
-    for name, data in (("hello", {"fresh": True}), ("place", {"id": "b", "value": {}}),
-                       ("robot", {"id": "r1", "value": view()}), ("ready", {})):  # fmt: skip
-        core.on_event(name, data)
-    assert core.on_command("r1", "stop") == Request("POST", "/api/v1/robots/r1/stop")
-    assert core.on_command("r1", "goal b") == Request("PUT", "/api/v1/robots/r1/goal", {"place": "b"})
+    told(core, 0.0, BEGIN, ("place", {"id": "b", "value": {}}), END, r1(stamp=1.0))
+    ask = partial(core.on_command, now=0.0)
+    assert ask("r1", "stop") == Request("POST", "/api/v1/robots/r1/stop")
+    assert ask("r1", "goal b") == Request("PUT", "/api/v1/robots/r1/goal", {"place": "b"})
     for waiting in ({"enabled": False}, {"enabled": True, "awaits_operator": True}):
-        core.on_event("robot", {"id": "r1", "value": view(**waiting)})
-        assert core.on_command("r1", "goal b") == WAITS, "it would drive off at the next enable"
-    assert core.on_command("r1", "goal no goal") == core.on_command("r1", "cancel")
-    assert core.on_command("r1", "return_to_base").body == {"kind": "dock"}
+        told(core, 0.0, r1(**waiting))
+        assert ask("r1", "goal b") == WAITS, "it would drive off at the next enable"
+    assert ask("r1", "goal no goal") == ask("r1", "cancel")
+    assert ask("r1", "return_to_base").body == {"kind": "dock"}
     for robot, text in (("r1", "enable"), ("r1", "reset"), ("r1", "goal ../x"), ("r2", "stop"), ("r1", "")):
-        assert isinstance(core.on_command(robot, text), str), text
+        assert isinstance(ask(robot, text), str), text
+
+
+def test_robot_that_tells_nothing_for_5_s_has_a_problem_until_it_is_heard_again_and_takes_no_goal():
+    core = HomeAssistant("lab")
+    (first,) = told(core, 0.0, BEGIN, ("place", {"id": "b", "value": {}}), r1(stamp=1.0), END)
+    assert (first["state"], first["problem"]) == ("cleaning", "OFF"), "it is not silent before it could be heard"
+    assert "silent" in core.on_command("r1", "goal b", 0.1), "its last state may be long ago"
+    told(core, 1.0, r1(stamp=2.0))
+    assert isinstance(core.on_command("r1", "goal b", 5.9), Request)
+    assert told(core, 5.9, r1(stamp=2.0)) == [], "the same state told again is no sign of life"
+    (silent,) = told(core, 6.0)
+    found = {name: silent[name] for name in ("state", "mode", "problem", "why", "battery", "goal")}
+    assert found == {
+        "state": "error", "mode": "unknown", "problem": "ON", "why": SILENT, "battery": 50, "goal": "b",
+    }  # fmt: skip
+    assert core.on_command("r1", "goal b", 6.0).startswith(SILENT)
+    assert core.on_command("r1", "stop", 6.0) == Request("POST", "/api/v1/robots/r1/stop")
+    assert told(core, 7.0) == [], "once is enough"
+    (back,) = told(core, 60.0, r1(stamp=60.0))
+    assert (back["state"], back["problem"], back["why"]) == ("cleaning", "OFF", "nothing keeps it")
+
+
+def test_nobody_is_called_silent_while_the_floor_is_lost_and_who_was_silent_stays_so_until_heard():
+    core = HomeAssistant("lab")
+    told(core, 0.0, BEGIN, ("place", {"id": "b", "value": {}}), r1(stamp=1.0), END, r1(stamp=2.0))
+    core.on_lost()
+    assert told(core, 100.0) == []
+    assert "floor" in core.on_command("r1", "goal b", 100.0)
+    assert told(core, 101.0, ("hello", {"fresh": False}), END) == []
+    assert told(core, 105.9) == []
+    assert [each["problem"] for each in told(core, 106.0)] == ["ON"]
+    core.on_lost()
+    assert told(core, 200.0, BEGIN, ("place", {"id": "b", "value": {}}), r1(stamp=2.0), END) == []
+    assert [each["problem"] for each in told(core, 201.0, r1(stamp=201.0))] == ["OFF"]
 
 
 def devices(core: HomeAssistant, *events: tuple[str, dict[str, object]]) -> list[tuple[str, bool]]:
     """Return whose descriptions are published (True) and deleted (False) by events."""
-    found = [publication for name, data in events for publication in core.on_event(name, data)]
+    found = [publication for name, data in events for publication in core.on_event(name, data, 0.0)]
     return [
         (each.ids["robot_device"], each.message is not None)
         for each in found
@@ -274,11 +325,10 @@ def devices(core: HomeAssistant, *events: tuple[str, dict[str, object]]) -> list
 def test_robot_that_is_gone_is_forgotten_and_one_that_a_new_run_has_not_told_of_yet_is_not():
     core = HomeAssistant("lab")
     robots = [("robot", {"id": name, "value": view()}) for name in ("r1", "r2")]
-    begin, end = ("hello", {"fresh": True}), ("ready", {})
-    assert devices(core, begin, *robots, end) == [("robot_r1", True), ("robot_r2", True)]
-    assert devices(core, *robots, begin, *robots, end) == []
+    assert devices(core, BEGIN, *robots, END) == [("robot_r1", True), ("robot_r2", True)]
+    assert devices(core, *robots, BEGIN, *robots, END) == []
     assert devices(core, ("robot", {"id": "r2", "value": None})) == [("robot_r2", False)]
-    assert devices(core, begin, end) == [("robot_r1", False)], "another run of the console does not know it"
+    assert devices(core, BEGIN, END) == [("robot_r1", False)], "another run of the console does not know it"
 
 
 class Slow:
@@ -312,10 +362,10 @@ class Slow:
 
 async def test_stop_waits_for_no_other_order_ends_the_mission_and_no_earlier_order_sends_the_robot_again():
     floor, core = Slow(), HomeAssistant("lab")
-    adapter = HomeAssistantBridge(core, floor)
+    adapter = HomeAssistantBridge(core, floor, SystemClock())
     for name, data in (("hello", {"fresh": True}), ("place", {"id": "b", "value": {}}), ("ready", {}),
                        *(("robot", {"id": robot, "value": view()}) for robot in ("r1", "r2"))):  # fmt: skip
-        core.on_event(name, data)
+        adapter.on_event(name, data)
     running = asyncio.create_task(adapter.run(floor, SystemClock()))
     await asyncio.sleep(0)
     for robot, text in (("r2", "return_to_base"), ("r1", "goal b"), ("r1", "stop")):
@@ -357,8 +407,8 @@ def test_description_of_a_robot_has_keys_only_that_home_assistant_knows():
 
 def test_broker_that_lost_everything_is_told_again():
     core = HomeAssistant("lab")
-    events = ("hello", {"fresh": True}), ("robot", {"id": "r1", "value": view()}), ("ready", {})
-    first = [each for name, data in events for each in core.on_event(name, data)]
+    events = BEGIN, ("robot", {"id": "r1", "value": view()}), END
+    first = [each for name, data in events for each in core.on_event(name, data, 0.0)]
     assert len(first) == 2
     assert list(core.everything()) == first
 
@@ -377,7 +427,7 @@ def events_of(core: ConsoleCore) -> list[tuple[str, dict[str, object]]]:
             job.run()
             core.add_tile(job)
     told = [(each.key[0], json.loads(each.data)) for each in reversed(list(core.log.after(0)))]
-    return [("hello", {"fresh": True}), *told, ("ready", {})]
+    return [BEGIN, *told, END]
 
 
 def unknown_share(picture: Picture) -> float:

@@ -165,7 +165,7 @@ def _home_assistant(settings: Settings, site: str, clock: Clock) -> Adapter:
     will = Will(ch.BRIDGE_AVAILABILITY, ch.OFFLINE)
     with _address(prefix):
         mqtt = MqttEdge(url, process_id("bridge"), clock, site=site, will=will, credentials=own)
-    return HomeAssistantBridge(HomeAssistant(site), mqtt)
+    return HomeAssistantBridge(HomeAssistant(site), mqtt, clock)
 
 
 def _vda5050(settings: Settings, site: str, _: Clock) -> Adapter:

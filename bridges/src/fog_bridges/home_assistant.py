@@ -7,11 +7,13 @@ whoever does that has looked at the robot, and an automation has not. Topics: Ho
 
 from __future__ import annotations
 
+import math
 from typing import TYPE_CHECKING, Any, Final
 
 import msgspec
 
-from fog_bridges.floor import WAITS, Request
+from fog_bridges.floor import Request
+from fog_bridges.heard import SILENT, SILENT_S, Heard
 from fog_contracts import channels as ch
 from fog_contracts.handlers import Publication
 
@@ -27,6 +29,7 @@ _NO_GOAL: Final = "no goal"
 """No place's id has a space, and Home Assistant takes "none" for an unknown choice."""
 _ERRORS: Final = ("FAULT", "PROTECTIVE_STOP")
 _CHARGING: Final = ("reconditioning", "bulk", "trickle")
+_LOST: Final = "nobody knows the floor's state at the moment: send the goal again once the robot is available"
 _MOST: Final = 255
 """Characters of a state in Home Assistant."""
 
@@ -40,22 +43,24 @@ class HomeAssistant:
         self._places: list[str] = []
         self._is_complete = False
         """Whether what is not there is gone: between `hello` and `ready` it may only not have been told yet."""
+        self._heard = Heard()
+        self._known_since = math.inf
+        """Since when the floor's state is known (s); infinite while it is not, and nobody is silent then."""
+        self._silent: set[str] = set()
+        """Robots that told nothing for too long, and have not been heard since."""
         self._told: dict[str, tuple[str, str]] = {}
         """The description and state of each robot that Home Assistant has."""
 
-    def on_event(self, name: str, data: dict[str, Any]) -> Sequence[Publication]:
-        """Take in an event of the floor; return what Home Assistant has to know."""
+    def on_event(self, name: str, data: dict[str, Any], now: float) -> Sequence[Publication]:
+        """Take in an event of the floor at `now` (s, monotonic); return what Home Assistant has to know."""
         if name == "hello":
             self._is_complete = False
             if data["fresh"]:
                 self._robots, self._places = {}, []
         elif name == "ready":
-            self._is_complete = True
+            self._is_complete, self._known_since = True, now
         elif name == "robot":
-            if data["value"] is None:
-                self._robots.pop(data["id"], None)
-            else:
-                self._robots[data["id"]] = data["value"]
+            self._on_robot(data["id"], data["value"], now)
         elif name == "place":
             known = {*self._places, data["id"]} - ({data["id"]} if data["value"] is None else set())
             self._places = sorted(known)
@@ -63,8 +68,37 @@ class HomeAssistant:
             return ()
         return list(self._news())
 
-    def on_command(self, robot: str, text: str) -> Request | str:
-        """Return the request of a command to a robot, or why there is none, in words."""
+    def _on_robot(self, robot: str, view: dict[str, Any] | None, now: float) -> None:
+        """Take in what is told of a robot: what is told before all is known may be long ago, and is no sign of life."""
+        if view is None:
+            self._robots.pop(robot, None)
+            self._heard.forget(robot)
+            self._silent.discard(robot)
+            return
+        is_known, before = self._known_since < math.inf, self._robots.get(robot)
+        if is_known and view["state"] and (before is None or _stamp(before) != _stamp(view)):
+            self._heard.hear(robot, now)
+            self._silent.discard(robot)
+        self._robots[robot] = view
+
+    def on_lost(self) -> None:
+        """Take in that nobody knows the floor's state."""
+        self._known_since = math.inf
+
+    def tick(self, now: float) -> Sequence[Publication]:
+        """Take in that time passes; return what Home Assistant has to know of robots that have fallen silent."""
+        silent = {
+            robot
+            for robot, view in self._robots.items()
+            if view["state"] and min(self._heard.silent_s(robot, now), now - self._known_since) >= SILENT_S
+        }
+        if silent <= self._silent:
+            return ()
+        self._silent |= silent
+        return list(self._news())
+
+    def on_command(self, robot: str, text: str, now: float) -> Request | str:
+        """Return the request of a command to a robot at `now` (s, monotonic), or why there is none, in words."""
         path = f"/api/v1/robots/{robot}"
         if robot not in self._robots:
             return f"there is no robot {robot}; there are: {', '.join(sorted(self._robots)) or 'none'}"
@@ -76,10 +110,16 @@ class HomeAssistant:
             return Request("POST", f"{path}/commands", {"kind": "dock"})
         place = text.removeprefix(GOAL)
         if text.startswith(GOAL) and place in self._places:
-            waits = _waits(self._robots[robot]["state"])
-            return WAITS if waits else Request("PUT", f"{path}/goal", {"place": place})
+            refusal = self._refusal(robot, now)
+            return refusal or Request("PUT", f"{path}/goal", {"place": place})
         known = f"{STOP}, {CANCEL}, {DOCK}, or {GOAL}with one of {', '.join(self._places) or 'no place'}"
         return f"{text[:40]!r} is no command: send {known}"
+
+    def _refusal(self, robot: str, now: float) -> str:
+        """Return why a robot takes no goal; empty if it does."""
+        if now < self._known_since:
+            return _LOST
+        return self._heard.refusal(robot, now, waits=_waits(self._robots[robot]["state"]))
 
     def everything(self) -> Sequence[Publication]:
         """Return all that Home Assistant has to know, again: the broker may have lost it."""
@@ -95,7 +135,7 @@ class HomeAssistant:
             for channel in (ch.ROBOT_REPORT, ch.ROBOT_REFUSAL):
                 yield Publication(channel, None, {"robot": robot})
         for robot, view in sorted(self._robots.items()):
-            now = discovery(self._site, robot, self._places), report(view, self._places)
+            now = discovery(self._site, robot, self._places), self._report(robot, view)
             before = self._told.get(robot, ("", ""))
             self._told[robot] = now
             if before[0] != now[0]:
@@ -103,25 +143,35 @@ class HomeAssistant:
             if before[1] != now[1]:
                 yield Publication(ch.ROBOT_REPORT, now[1], {"robot": robot})
 
+    def _report(self, robot: str, view: Mapping[str, Any]) -> str:
+        return report(view, self._places, is_silent=robot in self._silent)
+
+
+def _stamp(view: Mapping[str, Any]) -> float | None:
+    return (view["state"] or {}).get("stamp")
+
 
 def _waits(state: Mapping[str, Any] | None) -> bool:
     """Whether a robot drives only after an operator has enabled it."""
     return state is not None and (not state.get("enabled", True) or bool(state.get("awaits_operator")))
 
 
-def report(view: Mapping[str, Any], places: Collection[str]) -> str:
-    """Return what is told of a robot (JSON), from what the console tells of it: fields of `discovery`'s templates."""
+def report(view: Mapping[str, Any], places: Collection[str], *, is_silent: bool = False) -> str:
+    """Return what is told of a robot (JSON), from what the console tells of it: fields of `discovery`'s templates.
+
+    Of one that is silent the state is the last one that it told, but for what it does.
+    """
     state, goal = view["state"] or {}, view["goal"] or {}
-    mode, power = state.get("mode"), state.get("power") or {}
+    mode, power = None if is_silent else state.get("mode"), state.get("power") or {}
     battery = state.get("battery")
-    reasons = "; ".join(state.get("reasons", ()))
+    reasons = SILENT if is_silent else "; ".join(state.get("reasons", ()))
     found = {
-        "state": activity(state, under_way=bool(goal)),
+        "state": "error" if is_silent else activity(state, under_way=bool(goal)),
         "mode": mode or "unknown",
         "why": (reasons or ("no state was received yet" if mode is None else "nothing keeps it"))[:_MOST],
         "battery": None if battery is None else round(100.0 * battery),
         "charging": "ON" if power.get("charging") in _CHARGING else "OFF",
-        "problem": "ON" if mode in _ERRORS else "OFF",
+        "problem": "ON" if is_silent or mode in _ERRORS else "OFF",
         # A choice that is not among the options is an error there: a point on the floor is none of them.
         "goal": _NO_GOAL if not goal else goal.get("place") if goal.get("place") in places else None,
         "waits_for_operator": "ON" if state.get("awaits_operator") else "OFF",

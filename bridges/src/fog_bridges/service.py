@@ -23,6 +23,8 @@ if TYPE_CHECKING:
     from fog_runtime.clock import Clock
     from fog_runtime.transports.mqtt_edge import MqttEdge
 
+TICK_S: Final = 1.0
+"""How often it is looked who has fallen silent."""
 PICTURE_S: Final = 2.0
 """How often the map is drawn at most."""
 ORDERS_AT_ONCE: Final = 100
@@ -34,9 +36,10 @@ class HomeAssistantBridge:
 
     name: Final = "home-assistant"
 
-    def __init__(self, core: HomeAssistant, mqtt: MqttEdge) -> None:
+    def __init__(self, core: HomeAssistant, mqtt: MqttEdge, clock: Clock) -> None:
         self._core = core
         self._mqtt = mqtt
+        self._clock = clock
         self._picture = Picture()
         self._orders: asyncio.Queue[tuple[str, str, int]] = asyncio.Queue(ORDERS_AT_ONCE)
         """Robot, order, and how often the robot was stopped before it."""
@@ -61,30 +64,33 @@ class HomeAssistantBridge:
             tasks.create_task(self._mqtt.run(), name="mqtt")
             tasks.create_task(self._order_loop(floor), name="orders")
             tasks.create_task(self._picture_loop(clock), name="picture")
+            async for now in ticker(clock, TICK_S):
+                self._publish(self._core.tick(now))
 
     def on_event(self, name: str, data: dict[str, Any]) -> None:
         """Pass on an event of the floor."""
         self._picture.on_event(name, data)
-        self._publish(self._core.on_event(name, data))
+        self._publish(self._core.on_event(name, data, self._clock.now()))
         if name == "ready":
             self._tell_availability(known=True)
 
     def on_lost(self) -> None:
         """Say that nobody knows the floor's state."""
+        self._core.on_lost()
         self._tell_availability(known=False)
 
     async def _order_loop(self, floor: Floor) -> None:
         """Carry out orders, one after the other; what a robot refuses is told where the order came from."""
         while True:
             robot, text, stops = await self._orders.get()
-            request = self._core.on_command(robot, text)
+            request = self._core.on_command(robot, text, self._clock.now())
             if stops != self._stops[robot]:
                 request = f"{text!r} was not carried out: robot {robot} was stopped meanwhile"
             await self._tell(robot, text, request if isinstance(request, str) else await floor.send(request))
 
     async def _stop(self, floor: Floor, robot: str) -> None:
         """Stop a robot, and end its mission: else it would go on with that once somebody enables it."""
-        stop, cancel = (self._core.on_command(robot, text) for text in (STOP, CANCEL))
+        stop, cancel = (self._core.on_command(robot, text, self._clock.now()) for text in (STOP, CANCEL))
         refusal = stop if isinstance(stop, str) else await floor.send(stop)
         if not isinstance(cancel, str):
             await floor.send(cancel)  # that there is no mission is no reason to complain

@@ -18,6 +18,12 @@ if TYPE_CHECKING:
 pytestmark = pytest.mark.live
 
 SERVICES = ("hazard_aggregator", "map_service", "planner")
+HANDLED = {
+    "hazard_aggregator": (ch.NODE_READING, ch.ROBOT_POSE, ch.LEADER),
+    "map_service": (ch.AREA_HAZARD, ch.ROBOT_STATE, ch.LEADER),
+    "planner": (ch.MAP_DELTA, ch.ROBOT_POSE, ch.PLANNER_PLAN),
+}
+"""Of each service some channels whose messages or queries it handles, over MQTT and zenoh."""
 
 
 class Operator:
@@ -84,6 +90,17 @@ def place(x: float, y: float = 3.0) -> dict[str, object]:
 def rectangle(left: float, bottom: float, right: float, top: float, **more: object) -> dict[str, object]:
     shape = {"type": "rectangle", "corner": [left, bottom], "opposite": [right, top]}
     return {"kind": "BLOCKED", "shape": shape, **more}
+
+
+async def test_first_metrics_of_a_service_let_alerts_see_its_first_bug_and_tell_of_its_own_backup_only(all_services):
+    async with httpx.AsyncClient(timeout=60.0) as client:
+        for service in SERVICES:
+            lines = (await client.get(f"{await all_services.ready(service)}/metrics")).text.splitlines()
+            # An increase is seen of what was 0 before only.
+            for channel in HANDLED[service]:
+                assert f'fognav_handler_errors_total{{channel="{channel.name}"}} 0.0' in lines
+            backups = [line.split()[-1] for line in lines if line.startswith("fognav_last_backup_seconds")]
+            assert backups == (["0.0"] if service == "map_service" else [])
 
 
 async def test_dry_runs_by_rest_tell_of_a_robot_what_a_zone_would_do_to_its_way_and_where_a_goal_leads(operator):

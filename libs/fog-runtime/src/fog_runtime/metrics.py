@@ -69,7 +69,9 @@ CONDITION: Final = Gauge(
 )
 DISK_FREE: Final = Gauge("fognav_disk_free_bytes", "Free space of the disk that holds this folder", ["folder"])
 DISK_SIZE: Final = Gauge("fognav_disk_size_bytes", "Size of the disk that holds this folder", ["folder"])
-LAST_BACKUP: Final = Gauge("fognav_last_backup_seconds", "When the last backup was made (s since the epoch); 0: never")
+LAST_BACKUP: Final = Gauge(
+    "fognav_last_backup_seconds", "When this folder's last backup was made (s since the epoch); 0: never", ["folder"]
+)
 CONNECTED: Final = Gauge("fognav_connected", "Whether the connection is up (1) or down (0)", ["transport"])
 CONNECTIONS: Final = Counter("fognav_connections_total", "Connections established", ["transport"])
 
@@ -108,8 +110,11 @@ def watch_disk(folder: Path) -> None:
 
 
 def watch_backup(stamp: Path) -> None:
-    """Export when the last backup was made, which is when this file was written."""
-    LAST_BACKUP.set_function(lambda: stamp.stat().st_mtime if stamp.exists() else 0.0)
+    """Export when the last backup of the stamp's folder was made, which is when this file was written.
+
+    A label keeps processes that watch none from exporting "never": without one, the metric would begin with its import.
+    """
+    LAST_BACKUP.labels(str(stamp.parent)).set_function(lambda: stamp.stat().st_mtime if stamp.exists() else 0.0)
 
 
 def _disk(folder: Path) -> tuple[float, float]:
@@ -125,6 +130,13 @@ def expect_stages(stages: Collection[str]) -> None:
     """Export the stages that a process completes from its start on: a rate needs a value before the first event."""
     for stage in stages:
         STAGE_SECONDS.labels(stage)
+        TRACE_SKEW.labels(stage)
+
+
+def expect_messages(channel: str) -> None:
+    """Export from now on, for a channel with a handler, what `increase` must see grow from 0: errors and refusals."""
+    HANDLER_ERRORS.labels(channel)
+    REFUSED.labels(channel)
 
 
 def observe_trace(trace: Trace, stages: Collection[str] = tuple(SPANS)) -> None:

@@ -172,6 +172,7 @@ class Subscriptions:
         else:
             topics = [channel.pattern(**({"site": self._site} if "site" in channel.fields else {}))]
         self._subscriptions.append(_Subscription(channel, handler, kind, topics))
+        metrics.expect_messages(channel.name)
         self._routes.clear()
 
     def add_topic(self, channel: Channel, topic: str) -> bool:
@@ -190,6 +191,8 @@ class Subscriptions:
         Returns the topics to subscribe to, those of them that `again` names included, and those to unsubscribe from.
         """
         old, self._foreign = self._foreign, dict.fromkeys(topics, handler)
+        if self._foreign:
+            metrics.expect_messages(FOREIGN)
         self._routes.clear()
         kept = self.qos_by_topic().keys() | self.foreign
         added = self._foreign.keys() - (old.keys() - set(again))

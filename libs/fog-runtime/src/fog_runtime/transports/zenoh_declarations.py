@@ -159,6 +159,7 @@ class Subscription(Generic[M]):
         self._newest: dict[str, bytes] = {}
         self._drain_scheduled = False
         self._traffic = metrics.Traffic(channel.name, "received")
+        metrics.expect_messages(channel.name)
 
     def declare(self, session: zenoh.Session) -> object:
         """Declare the subscription; it lasts while what is returned is referenced."""
@@ -278,6 +279,7 @@ class Queryable:
         self._pending: Counter[str] = Counter()
         self._last: tuple[Message, bytes] | None = None
         self._large = LargeReplies()
+        metrics.expect_messages(channel.name)
 
     def declare(self, session: zenoh.Session) -> object:
         """Declare the queryable; it answers while what is returned is referenced."""

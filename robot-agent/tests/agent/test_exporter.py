@@ -119,6 +119,24 @@ def test_computer_tells_temperature_throttling_and_signal_where_it_has_them(coll
     assert metric("wifi_level_dbm", interface="wlan0") == -56
 
 
+def test_raspberry_pi_5_tells_what_slows_it_down(collector, metric, tmp_path):
+    write(tmp_path, "sys/devices/platform/soc@107c000000/soc@107c000000:firmware/get_throttled", "50005\n")
+    assert metric("computer_throttled", cause="under_voltage") == 1
+    assert metric("computer_throttled", cause="soft_temperature_limit") == 0
+
+
+@pytest.mark.parametrize("alarm", [0, 1])
+def test_monitor_of_the_supply_tells_of_under_voltage_where_the_firmware_s_report_is_missing(
+    collector, metric, tmp_path, alarm
+):
+    write(tmp_path, "sys/class/hwmon/hwmon0/name", "cpu_thermal\n")
+    write(tmp_path, "sys/class/hwmon/hwmon0/in0_lcrit_alarm", "1\n")
+    write(tmp_path, "sys/class/hwmon/hwmon2/name", "rpi_volt\n")
+    write(tmp_path, "sys/class/hwmon/hwmon2/in0_lcrit_alarm", f"{alarm}\n")
+    assert metric("computer_throttled", cause="under_voltage") == alarm
+    assert metric("computer_throttled", cause="throttled") is None
+
+
 def test_agent_tells_mode_reasons_map_pose_and_errors(collector, metric):
     collector.observed = observed(
         state=state(

@@ -100,7 +100,8 @@ def temperature(zones: Mapping[str, float]) -> Finding:
 def supply(causes: Mapping[str, bool]) -> Finding:
     """Judge what slows a Raspberry Pi down now, by cause."""
     if not causes:
-        return Finding("supply", "unknown", "this computer does not tell whether its supply suffices")
+        remedy = "on a Raspberry Pi run `vcgencmd get_throttled` after a drive: nothing else than 0x0 is good"
+        return Finding("supply", "unknown", "this computer does not tell whether its supply suffices", remedy)
     held = [cause.replace("_", " ") for cause, holds in causes.items() if holds]
     if causes.get("under_voltage"):
         return Finding("supply", "bad", f"{', '.join(held)}", "its 5 V supply: a stronger converter, a shorter cable")

@@ -125,7 +125,10 @@ def _status_field(file: Path, name: str) -> int:
 ROOT: Final = Path("/")
 VITALS_S: Final = ch.ROBOT_VITALS.period_s - 0.1
 """Period of vitals; a little less, since the seconds at which they are asked for are not quite even."""
-_THROTTLED: Final = "sys/devices/platform/soc/soc:firmware/get_throttled"
+_THROTTLED: Final = "sys/devices/platform/soc*/soc*:firmware/get_throttled"
+"""Up to the Raspberry Pi 4 `soc`; `soc@107c000000` on a Raspberry Pi 5, where not every kernel has the file."""
+_SUPPLY_MONITOR: Final = "rpi_volt"
+"""The name of the kernel's monitor of a Raspberry Pi's supply (raspberrypi-hwmon): it tells of the last two seconds."""
 _CAUSES: Final = ("under_voltage", "frequency_capped", "throttled", "soft_temperature_limit")
 """Bits 0 to 3 of what the Raspberry Pi's firmware reports: what holds now. Source: its documentation of vcgencmd."""
 _LEVEL_COLUMN: Final = 3
@@ -142,9 +145,18 @@ def temperatures(root: Path = ROOT) -> dict[str, float]:
 
 
 def throttling(root: Path = ROOT) -> dict[str, bool]:
-    """Return, by cause, whether a Raspberry Pi is slowed down now; empty on other computers."""
-    bits = _number(_text(root / _THROTTLED), 16)
-    return {} if bits is None else {cause: bool(bits >> bit & 1) for bit, cause in enumerate(_CAUSES)}
+    """Return, by cause, whether a Raspberry Pi is slowed down now; empty on other computers.
+
+    Where the kernel does not pass on what the firmware reports, under-voltage alone is known.
+    """
+    for file in root.glob(_THROTTLED):
+        if (bits := _number(_text(file), 16)) is not None:
+            return {cause: bool(bits >> bit & 1) for bit, cause in enumerate(_CAUSES)}
+    for monitor in (root / "sys/class/hwmon").glob("hwmon*"):
+        if _text(monitor / "name") == _SUPPLY_MONITOR:
+            alarm = _number(_text(monitor / "in0_lcrit_alarm"), 10)
+            return {} if alarm is None else {_CAUSES[0]: bool(alarm)}
+    return {}
 
 
 def wifi_levels(root: Path = ROOT) -> dict[str, float]:

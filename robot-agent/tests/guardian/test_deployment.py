@@ -335,6 +335,32 @@ def test_installer_does_not_call_a_robot_by_another_id_than_its_own(installed, s
     assert "correct FOGNAV_ROBOT there" in refused.value.stderr
 
 
+def test_installer_refuses_another_fog_than_the_robot_connects_to_and_replaces_nothing(installed, site_file):
+    site_file.write_text(SITE.replace("0.30", "0.25"))
+    with pytest.raises(subprocess.CalledProcessError) as refused:
+        install(installed, "--fog", "192.168.7.1")
+    assert "this robot connects to tcp/fog.local:7447 by" in refused.value.stderr
+    assert "and not to 192.168.7.1: correct FOGNAV_ZENOH_CONNECT there" in refused.value.stderr
+    assert configured(installed)[1].radius == 0.30
+    env = installed / "etc/fognav/robot.env"
+    both = "tls/fog.local:7447,tls/192.168.7.1:7447"
+    env.write_text(env.read_text().replace("tcp/fog.local:7447", both))
+    install(installed, "--fog", "192.168.7.1")
+    assert environment(installed)["FOGNAV_ZENOH_CONNECT"] == both
+
+
+def test_installer_takes_the_files_that_the_robot_has_already(installed, tmp_path):
+    etc = installed / "etc/fognav"
+    for name in ("operator.key", "credentials.toml"):
+        (etc / name).write_text("its own")
+    given = ("--site", "site/site.toml"), ("--robot-file", "robot.toml"), ("--key", "operator.key")
+    credentials = ("--credentials", str(etc / "credentials.toml"))
+    before = {name: (etc / name).read_text() for _, name in given}
+    install(installed, *(word for option, name in given for word in (option, str(etc / name))), *credentials)
+    assert {name: (etc / name).read_text() for _, name in given} == before
+    assert {(etc / name).stat().st_mode & 0o777 for name in ("operator.key", "credentials.toml")} == {0o400}
+
+
 def test_installed_agent_does_not_start_without_its_body(installed):
     (installed / "etc/fognav/site/site.toml").unlink()
     done = subprocess.run(

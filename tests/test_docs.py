@@ -60,6 +60,20 @@ def test_contributing_names_every_variable_that_makes_tests_longer() -> None:
     assert variables - named == set()
 
 
+@pytest.mark.skipif(not (ROOT / ".git").exists(), reason="this is no repository")
+@pytest.mark.parametrize(
+    "file",
+    [
+        ".env", "locks/admin.token", "board/node.json", "stacks/ground/locks/authority.key", "operator.key", "r2.toml",
+        "key.pem", "update-key.pem", "fog.tar.gz", "bridge.toml", "deploy/bridge/password", "firmware/data/node.json",
+        "backups/2026-11-01.tar.gz",
+    ],
+)  # fmt: skip
+def test_secrets_that_documented_commands_write_in_a_checkout_are_never_added_to_it(file: str) -> None:
+    done = subprocess.run(["git", "check-ignore", "--no-index", "-q", file], cwd=ROOT, check=False)
+    assert done.returncode == 0
+
+
 def test_changelog_has_at_most_40_entries_of_one_line_for_each_release() -> None:
     releases = re.split(r"^## ", (ROOT / "CHANGELOG.md").read_text("utf-8"), flags=re.MULTILINE)[1:]
     entries = [[line for line in release.splitlines()[1:] if line and line[0] != "#"] for release in releases]

@@ -7,6 +7,7 @@ import json
 import shutil
 import subprocess
 from contextlib import asynccontextmanager, suppress
+from functools import partial
 from pathlib import Path
 from queue import Empty, Queue
 from threading import Event, Thread
@@ -720,23 +721,24 @@ async def test_gas_that_a_board_measures_becomes_a_hazard_with_hysteresis_and_ch
         assert {hazard.state for hazard in hazards[before:-1]} <= {"blocked"}
 
 
-@pytest.fixture
-def bridge(switch_on, tmp_path):
+@pytest.fixture(params=[("esp32", []), ("esp8266", ["--board", "d1-mini"])], ids=["D1 mini 32", "D1 mini"])
+def bridge(request, switch_on, tmp_path):
     """A board whose `update_key` is that of `key.pem`, on a real broker; and how to update it from the command line."""
-    if not cryptography("esp8266"):
-        pytest.skip(NO_CRYPTOGRAPHY.format(CRYPTOGRAPHY["esp8266"][0]))
+    kind, options = request.param
+    if not cryptography(kind):
+        pytest.skip(NO_CRYPTOGRAPHY.format(CRYPTOGRAPHY[kind][0]))
     made = CliRunner().invoke(node_app, ["key", str(tmp_path / "key.pem")])
     assert made.exit_code == 0, made.output
     (tmp_path / "node.json").write_text(json.dumps({**SETTINGS, "update_key": made.output.strip()}))
     (tmp_path / "firmware.bin").write_bytes(IMAGE)
     with start_mosquitto(tmp_path / "broker") as broker:
-        bridge = Bridge(broker.port, switch_on, tmp_path)
+        bridge = Bridge(broker.port, partial(switch_on, board=kind), tmp_path)
         bridge.start()
 
         def update(number, key="key.pem"):
             words = ["update", "n1", "--image", str(tmp_path / "firmware.bin"), "--number", str(number)]
             words += ["--key", str(tmp_path / key), "--broker", f"mqtt://127.0.0.1:{broker.port}", "--site-id", "lab"]
-            return CliRunner().invoke(node_app, [*words, "--seconds", "60"])
+            return CliRunner().invoke(node_app, [*words, *options, "--seconds", "60"])
 
         yield bridge, update
         bridge.ended.set()

@@ -219,7 +219,7 @@ def node_update(  # noqa: PLR0913  # each option is an argument
         int, typer.Option("--number", metavar="N", min=1, max=2**31 - 1, help="Its number: above what runs.")
     ],
     key: Annotated[Path, typer.Option("--key", metavar="F", help="The private key that signs it: fognav node key.")],
-    board: Annotated[Literal["d1-mini", "d1-mini32"], typer.Option("--board", help="For which it is.")] = "d1-mini",
+    board: Annotated[Literal["d1-mini", "d1-mini32"], typer.Option("--board", help="For which it is.")] = "d1-mini32",
     address: Annotated[
         str | None, typer.Option("--url", metavar="URL", help="Where it is served; default: by this command.")
     ] = None,

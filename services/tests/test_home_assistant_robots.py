@@ -50,7 +50,7 @@ class Home:
         return json.loads(self.of(ch.ROBOT_REPORT) or "{}")
 
 
-HOSTILE = "<script>alert(1)</script>{{ states }}\u202e".ljust(SENTENCE_MAX, "x")
+HOSTILE = "<script>alert(1)</script>{{ states }}\u202e\u2028\x85".ljust(SENTENCE_MAX, "x")
 
 
 @asynccontextmanager

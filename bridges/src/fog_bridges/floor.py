@@ -24,6 +24,8 @@ RETRY_S: Final = 2.0
 SILENT_S: Final = 5.0
 """A stream that says nothing for so long is lost: the console tells the time each second."""
 REQUEST_S: Final = 10.0
+LINE_MAX: Final = 16 << 20
+"""Bytes of a line of the events: a longer one is no console's, and must not fill the memory."""
 _log = logs.get("floor")
 
 
@@ -165,7 +167,7 @@ class Floor:
     async def _events(self, lines: httpx.Response) -> AsyncIterator[tuple[str, dict[str, Any]]]:
         """Yield events (server-sent, WHATWG HTML 9.2; the console's data have one line)."""
         name, data, position = "message", "", ""
-        async for line in lines.aiter_lines():
+        async for line in whole_lines(lines.aiter_bytes()):
             field, _, value = line.partition(":")
             value = value.removeprefix(" ")
             if field == "id":
@@ -178,3 +180,20 @@ class Floor:
                 yield name, msgspec.json.decode(data, type=dict[str, Any])
                 self._last_id = position or self._last_id
                 name, data, position = "message", "", ""
+
+
+async def whole_lines(parts: AsyncIterator[bytes], most: int = LINE_MAX) -> AsyncIterator[str]:
+    """Yield lines without their ends, LF or CR LF; what follows the last end is left out.
+
+    httpx's own lines, as those of `str.splitlines`, also end at characters that JSON has as they are, such as U+2028.
+    Raises `httpx.DecodingError` for a line of more than `most` bytes.
+    """
+    rest = bytearray()
+    async for part in parts:
+        rest += part
+        if b"\n" in part:
+            *whole, rest = rest.split(b"\n")
+            for line in whole:
+                yield str(line.removesuffix(b"\r"), "utf-8", "replace")
+        if len(rest) > most:
+            raise httpx.DecodingError(f"a line has more than {most} bytes: look what runs at console_url")

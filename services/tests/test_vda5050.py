@@ -52,6 +52,20 @@ def test_all_that_is_told_fits_the_published_schemas(version):
         schema(version, topic).validate(json.loads(sender.message(topic, content, 1.7e9)))
 
 
+@pytest.mark.parametrize(("version", "power", "charge"), [("3.0", "powerSupply", "stateOfCharge"),
+                                                          ("2.1", "batteryState", "batteryCharge")])  # fmt: skip
+def test_battery_that_nobody_measures_is_not_told_as_empty(version, power, charge):
+    floor = Floorplan()
+    floor.tell(battery=None, power=None)
+    said = floor.said(version)
+    assert said[power][charge] == 80.0
+    assert "BATTERY_NOT_MEASURED" in [each["infoType"] for each in said["information"]]
+    floor.tell(battery=0.0)
+    said = floor.said(version)
+    assert said[power][charge] == 0.0
+    assert "BATTERY_NOT_MEASURED" not in [each["infoType"] for each in said["information"]]
+
+
 def test_state_has_the_path_as_a_nurbs_from_where_the_robot_is_and_2_1_its_own_words():
     said = driving().said()
     assert said["plannedPath"]["traversedNodes"] == ["b"]

@@ -24,6 +24,8 @@ STATE_S: Final = 30.0
 CHANGED_S: Final = 0.2
 """The shortest one."""
 VISUALIZATION_S: Final = 1.0
+UNMEASURED_CHARGE: Final = 80.0
+"""The charge (%) of a robot that does not measure it: the norm's word for a battery of which only "good" is known."""
 NEXT_M: Final = 3.0
 """How far the intermediate path reaches."""
 _UNLOCALIZED: Final = ("pose_unknown", "pose_lost")
@@ -42,6 +44,8 @@ def state(robot: FleetRobot, now: float, stamp: float) -> out.State:
     picture = _picture(robot, stamp)
     is_fault = told.get("mode") == "FAULT"
     facts = [("MODE", told.get("mode", "unknown"))] + [("REASON", reason) for reason in told.get("reasons", ())]
+    if told.get("battery") is None:
+        facts.append(("BATTERY_NOT_MEASURED", f"nobody measures the charge: {UNMEASURED_CHARGE:g} % stands for that"))
     if words:
         facts.append(("NOT_IN_CONTROL", words))
     return out.State(
@@ -157,9 +161,10 @@ def _next_metres(path: Sequence[tuple[float, float]], stamp: float) -> out.Inter
 
 def _power(told: dict[str, Any]) -> out.PowerSupply:
     power = told.get("power") or {}
+    charge = told.get("battery")
     measured = {"battery_voltage": power.get("voltage_v"), "battery_current": power.get("current_a")}
     return out.PowerSupply(
-        state_of_charge=round(100.0 * (told.get("battery") or 0.0), 1),
+        state_of_charge=UNMEASURED_CHARGE if charge is None else round(100.0 * charge, 1),
         charging=power.get("charging") in ("reconditioning", "bulk", "trickle"),
         **{name: value for name, value in measured.items() if value is not None},
     )

@@ -17,7 +17,8 @@ from fog_bridges.vda5050 import telling
 from fog_bridges.vda5050.bridge import RobotLink, Vda5050Bridge
 from fog_bridges.vda5050.charging import IDLE_S
 from fog_bridges.vda5050.incoming import NODES_MAX
-from fog_bridges.vda5050.robot import REFUSED_S, UNSEEN_S
+from fog_bridges.vda5050.robot import REFUSED_S
+from fog_bridges.vda5050.uncertain import LATE_S, UNSEEN_S
 
 # --- Orders -----------------------------------------------------------------------------------------------------------
 
@@ -144,57 +145,142 @@ def test_mission_that_may_have_been_accepted_is_asked_for_again_by_the_same_key(
     floor = Floorplan()
     floor.take(order(A, B))
     assert floor.drive(Answer("the floor can't be reached")) == ["PUT 4 1"]
-    floor.goal = {"goal_id": "g9", "pose": {"x": 4.0, "y": 1.0, "theta": 0.0}}
+    floor.begin(floor.asked[0])
     floor.tell(2.0)
     assert floor.said()["operatingMode"] == "AUTOMATIC", "it may be the fleet's own"
-    assert floor.drive(Answer("", body=floor.goal)) == ["PUT 4 1"]
+    assert floor.drive() == ["PUT 4 1"]
     assert floor.asked[0] == floor.asked[1]
     assert (floor.said()["operatingMode"], floor.robot.goal_node.node_id) == ("AUTOMATIC", "b")
 
 
-GOAL_B = {"goal_id": "g9", "pose": {"x": 4.0, "y": 1.0, "theta": 0.0}}
+LOST = Answer("the floor can't be reached")
 
 
 @pytest.mark.parametrize("word", ["cancel", "operator"])
 def test_mission_that_may_have_been_accepted_and_is_not_wanted_any_more_is_ended_when_it_appears(word):
     floor = Floorplan()
     floor.take(order(A, B))
-    assert floor.drive(Answer("the floor can't be reached")) == ["PUT 4 1"]
+    assert floor.drive(LOST) == ["PUT 4 1"]
     if word == "cancel":
         floor.robot.on_instant(instant("cancelOrder", "c"), floor.now)
     floor.tell(2.0, enabled=word == "cancel")
-    assert floor.drive() == [], "asking again might begin it"
-    floor.goal = GOAL_B
+    floor.begin(floor.asked[0])
     floor.tell(1.0)
     assert floor.drive() == ["DELETE"]
-    assert floor.asked[-1].headers == {"If-Match": '"g9"'}
+    assert floor.asked[-1].headers == {"If-Match": '"g1"'}
     floor.tell()
     assert word == "operator" or actions(floor) == {"c": "FINISHED"}
+
+
+@pytest.mark.parametrize("silent_s", [3, 25])
+def test_cancel_is_finished_only_once_the_floor_says_that_no_mission_has_begun_nor_will(silent_s):
+    floor = Floorplan()
+    floor.take(order(A, B))
+    assert floor.drive(LOST) == ["PUT 4 1"]
+    floor.robot.on_instant(instant("cancelOrder", "c"), floor.now)
+    for _ in range(silent_s):
+        floor.tell()
+        floor.drive(Answer("Redis does not answer", "store_uncertain"))
+    sent = floor.asked[1:]
+    assert {(each.headers["If-Match"], each.headers["Idempotency-Key"]) for each in sent} == {
+        ('"none"', floor.asked[0].headers["Idempotency-Key"])
+    }, "the question begins none"
+    assert (actions(floor), {each.body["pose"]["x"] for each in sent}) == ({"c": "RUNNING"}, {4.0})
+    waited = 0
+    while actions(floor) == {"c": "RUNNING"}:
+        floor.tell()
+        assert set(floor.drive()) <= {"PUT 4 1"}
+        waited += 1
+    assert (actions(floor), waited >= max(UNSEEN_S, silent_s)) == ({"c": "FINISHED"}, True), "a packet sent again"
+    assert floor.goal is None
+
+
+@pytest.mark.parametrize("shows", [True, False])
+def test_mission_that_begins_long_after_its_request_was_given_up_is_ended_and_the_cancel_waits_for_that(shows):
+    floor = Floorplan()
+    floor.take(order(A, B))
+    assert floor.drive(LOST) == ["PUT 4 1"]
+    floor.robot.on_instant(instant("cancelOrder", "c"), floor.now)
+    for _ in range(20):
+        floor.tell()
+        floor.drive(LOST)
+    assert actions(floor) == {"c": "RUNNING"}
+    floor.tell()
+    if not shows:
+        assert floor.drive() == ["PUT 4 1"], "not so far"
+    floor.begin(floor.asked[0])
+    mission = floor.goal
+    if not shows:
+        floor.goal = None
+    floor.at(1.2, 1.0, v=0.3)
+    floor.tell(1.0)
+    assert floor.said()["operatingMode"] == "AUTOMATIC"
+    assert floor.drive() == (["DELETE"] if shows else ["PUT 4 1", "DELETE"])
+    assert floor.asked[-1].headers == {"If-Match": f'"{mission["goal_id"]}"'}
+    assert actions(floor) == {"c": "RUNNING"}
+    floor.at(1.3, 1.0)
+    floor.tell()
+    assert actions(floor) == {"c": "FINISHED"}
+
+
+def test_cancel_has_failed_when_nobody_says_for_long_what_has_become_of_the_mission_which_is_ended_all_the_same():
+    floor = Floorplan()
+    floor.take(order(A, B))
+    floor.drive(LOST)
+    floor.robot.on_instant(instant("cancelOrder", "c"), floor.now)
+    for _ in range(int(LATE_S) + 1):
+        floor.tell()
+        floor.drive(LOST)
+    (told,) = floor.said()["instantActionStates"]
+    assert (told["actionStatus"], "does not say" in told["actionResult"]) == ("FAILED", True)
+    floor.begin(floor.asked[0])
+    floor.tell(1.0)
+    assert floor.drive() == ["DELETE"]
+    assert floor.take(order(A, B, name="o2")) == ""
+    floor.robot.on_instant(instant("cancelOrder", "d"), floor.now)
+    assert actions(floor) == {"c": "FAILED", "d": "FINISHED"}
 
 
 def test_mission_that_may_have_been_accepted_and_never_appears_delays_the_next_order_only():
     floor = Floorplan()
     floor.take(order(A, B))
-    floor.drive(Answer("the floor can't be reached"))
+    floor.drive(LOST)
     floor.robot.on_instant(instant("cancelOrder"), floor.now)
     assert floor.take(order(A, C | {"sequenceId": 2}, name="o2")) == ""
     floor.tell(2.0)
-    assert floor.drive() == []
+    assert floor.drive() == ["PUT 4 1"]
+    assert floor.goal is None
     floor.tell(UNSEEN_S)
+    assert floor.drive() == ["PUT 4 1"]
+    floor.tell(1.0)
     assert floor.drive() == ["PUT 7 1"]
+    assert floor.goal["pose"]["x"] == 7.0
 
 
 def test_mission_that_may_have_been_accepted_is_the_fleets_though_its_repetition_is_refused():
     floor = Floorplan()
     floor.take(order(A, B))
-    floor.drive(Answer("the floor can't be reached"))
+    floor.drive(LOST)
     floor.tell(2.0)
     assert floor.drive(Answer("robot r1 has another mission", "mission_changed")) == ["PUT 4 1"]
-    floor.goal = GOAL_B
+    floor.begin(floor.asked[0])
     floor.tell(2.0)
     assert floor.said()["operatingMode"] == "AUTOMATIC"
+    mission = floor.goal["goal_id"]
+    assert floor.drive() == ["PUT 4 1", "PUT 4 1"], "asked for, and replaced by the same"
+    assert floor.asked[-1].headers["If-Match"] == f'"{mission}"'
+
+
+def test_request_that_the_floor_could_not_carry_out_is_sent_again_by_the_same_key():
+    floor = Floorplan()
+    floor.take(order(A, B))
+    floor.drive(LOST)
+    for _ in range(20):
+        floor.tell()
+        assert floor.drive(Answer("the planner does not run", "service_away")) == ["PUT 4 1"]
+    floor.tell()
     assert floor.drive() == ["PUT 4 1"]
-    assert floor.asked[-1].headers["If-Match"] == '"g9"'
+    assert (len(set(map(str, floor.asked))), floor.robot.goal_node.node_id) == (1, "b")
 
 
 def test_cancel_ends_the_mission_whose_replacement_may_have_been_accepted_at_once():
@@ -218,7 +304,8 @@ def test_operators_mission_is_told_from_one_that_the_fleet_may_have_begun():
     floor.tell(2.0)
     assert floor.said()["operatingMode"] == "MANUAL"
     floor.tell(UNSEEN_S)
-    assert floor.drive() == []
+    assert floor.drive() == ["PUT 4 1"]
+    assert (floor.asked[-1].headers["If-Match"], floor.goal["goal_id"]) == ('"none"', "theirs")
 
 
 # --- What the floor tells late, or not at all -------------------------------------------------------------------------
@@ -595,6 +682,52 @@ def test_pause_on_the_way_to_the_dock_is_refused_and_a_cancel_that_the_floor_did
     assert floor.drive(Answer("the planner is handing over", "service_away")) == ["DELETE"]
     floor.tell(5.0)
     assert floor.drive() == ["DELETE"]
+
+
+@pytest.mark.parametrize("answer", [Answer(""), LOST])
+def test_docking_has_not_failed_while_its_request_is_under_way_and_a_cancel_waits_for_it(answer):
+    floor = Floorplan()
+    floor.more = DOCK
+    floor.tell()
+    floor.robot.on_instant(instant("startCharging", "s"), floor.now)
+    assert floor.robot.step(floor.now).body == {"kind": "dock"}
+    for _ in range(9):
+        floor.tell()
+    assert actions(floor) == {"s": "RUNNING"}, "the answer is not there yet"
+    floor.robot.on_instant(instant("cancelOrder", "x"), floor.now)
+    floor.robot.on_answer(answer, floor.now)
+    for _ in range(20 if answer.refusal else 2):
+        floor.tell()
+        assert floor.drive() == []
+    assert actions(floor) == {"s": "RUNNING", "x": "RUNNING"}
+    floor.goal = TO_DOCK
+    floor.at(1.2, 1.0, v=0.3)
+    floor.tell(goal_id="dock", wants_dock=True)
+    assert floor.said()["operatingMode"] == "AUTOMATIC"
+    assert floor.drive() == ["DELETE"]
+    assert floor.asked[-1].headers == {"If-Match": '"dock"'}
+    floor.at(1.2, 1.0)
+    floor.tell(IDLE_S + 0.1, goal_id=None, wants_dock=False)
+    floor.tell()
+    assert actions(floor) == {"s": "FAILED", "x": "FINISHED"}
+
+
+def test_docking_of_which_nobody_knows_whether_the_robot_was_told_has_failed_at_last_and_so_has_its_cancel():
+    floor = Floorplan()
+    floor.more = DOCK
+    floor.tell()
+    floor.robot.on_instant(instant("startCharging", "s"), floor.now)
+    assert floor.drive(LOST) == ["POST dock"]
+    floor.robot.on_instant(instant("cancelOrder", "x"), floor.now)
+    for _ in range(int(LATE_S) + 1):
+        floor.tell()
+        floor.drive()
+    found = floor.said()["instantActionStates"]
+    assert {each["actionId"]: each["actionStatus"] for each in found} == {"s": "FAILED", "x": "FAILED"}
+    assert all("does not say" in each["actionResult"] for each in found)
+    assert floor.take(order(A, B)) == ""
+    floor.robot.on_instant(instant("cancelOrder", "y"), floor.now)
+    assert actions(floor)["y"] == "FINISHED", "that was another action's"
 
 
 def test_instant_charging_is_refused_with_the_reason_and_else_comes_before_orders():

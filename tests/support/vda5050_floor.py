@@ -17,6 +17,7 @@ from fog_bridges.vda5050 import telling
 from fog_bridges.vda5050.connection import Sender, Setup
 from fog_bridges.vda5050.incoming import RELEASES, InstantActions, decoded
 from fog_bridges.vda5050.robot import FleetRobot
+from fog_bridges.vda5050.uncertain import NOBODYS
 from fog_runtime.transports.mqtt_connection import Broker
 
 SCHEMAS = os.environ.get("FOGNAV_VDA5050_SCHEMAS", "")
@@ -96,6 +97,8 @@ class Floorplan:
         self.robot = FleetRobot("r1", "lab")
         self.goal: dict[str, Any] | None = None
         self.asked: list[Request] = []
+        self.begun: dict[str, dict[str, Any]] = {}
+        """Missions by the keys of their requests."""
         self.state: dict[str, Any] = dict(STATE)
         self.more: dict[str, Any] = {}
         self.now = 100.0
@@ -125,9 +128,13 @@ class Floorplan:
                 self.robot.on_answer(answer, self.now)
                 break
             if request.method == "PUT":
-                self.goal = {"goal_id": f"g{len(self.asked)}", "pose": request.body["pose"]}
-                self.state |= {"goal_id": self.goal["goal_id"], "goal_reached": False}
-                self.robot.on_answer(Answer("", body=self.goal), self.now)
+                key = request.headers["Idempotency-Key"]
+                if key not in self.begun and request.headers.get("If-Match") == NOBODYS:
+                    self.robot.on_answer(Answer("robot r1 has no mission", "mission_changed"), self.now)
+                    continue
+                if key not in self.begun:
+                    self.begin(request)
+                self.robot.on_answer(Answer("", body=self.begun[key]), self.now)
             elif request.method == "DELETE":
                 self.goal = None
                 self.robot.on_answer(Answer(""), self.now)
@@ -135,6 +142,12 @@ class Floorplan:
                 self.robot.on_answer(Answer(""), self.now)
         self.tell(0.1)
         return [" ".join([request.method, *_about(request.body or {})]) for request in self.asked[first:]]
+
+    def begin(self, request: Request) -> None:
+        """Let the mission begin that a request has asked for."""
+        self.goal = {"goal_id": f"g{len(self.asked)}", "pose": request.body["pose"]}
+        self.begun[request.headers["Idempotency-Key"]] = self.goal
+        self.state |= {"goal_id": self.goal["goal_id"], "goal_reached": False}
 
     def reach(self, x: float, y: float) -> None:
         """Let the robot reach its goal, and the planner end the mission."""

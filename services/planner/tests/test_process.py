@@ -410,6 +410,9 @@ async def test_mission_is_replaced_or_cancelled_only_if_it_is_the_one_that_was_r
         keyed = {"if_match": second.headers["etag"], "idempotency_key": "k1"}
         third = await put("right", **keyed)
         assert (await put("right", **keyed)).json() == third.json(), "a repeated request is no new order"
+        asked = await put("right", if_match='"none"', idempotency_key="k1")
+        assert asked.json() == third.json(), "the key tells whether it began, under a condition by which nothing begins"
+        assert (await put("right", if_match='"none"', idempotency_key="k2")).status_code == 412
         # A reached mission may still be stored for a while.
         goal_id = third.json()["goal_id"]
         await env.until(lambda: env.goals and env.goals[-1].goal_id == goal_id)
@@ -420,6 +423,8 @@ async def test_mission_is_replaced_or_cancelled_only_if_it_is_the_one_that_was_r
         current = (await client.get(url, headers=OPERATOR)).headers["etag"]
         assert (await client.delete(url, headers={**OPERATOR, "If-Match": current})).status_code == 204
         assert (await client.delete(url, headers={**OPERATOR, "If-Match": current})).status_code == 404
+        assert (await put("right", if_match='"none"', idempotency_key="k1")).json()["goal_id"] == goal_id
+        assert (await client.get(url, headers=OPERATOR)).status_code == 404, "it is over all the same"
 
 
 async def test_queries_are_answered_over_zenoh_and_http_without_side_effects(tmp_path: Path) -> None:

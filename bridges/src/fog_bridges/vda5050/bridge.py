@@ -29,6 +29,7 @@ from fog_bridges.vda5050.incoming import (
 )
 from fog_bridges.vda5050.orders import Leg, Where, corners_of, goal_of, goals_of, is_repeated, rejection
 from fog_bridges.vda5050.robot import FleetRobot
+from fog_bridges.vda5050.uncertain import NOBODYS
 from fog_bridges.vda5050.zones import ZoneSets, ZoneUser
 from fog_runtime import logs
 from fog_runtime.clock import ticker
@@ -189,7 +190,7 @@ class RobotLink(Connection):
             self.core.advance(now)
             while self.core.is_known and (request := self.core.step(self.clock.now())) is not None:
                 answer = await self._floor.ask(request)
-                if answer.refusal:
+                if answer.refusal and (request.headers or {}).get("If-Match") != NOBODYS:
                     words = f"{request.method} {request.path}: {answer.refusal}"
                     self.limited.warning("mission_refused", answer.problem, self.clock.now(), reason=words)
                 self.core.on_answer(answer, self.clock.now())

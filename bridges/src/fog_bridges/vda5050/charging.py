@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any, Final
 
 from fog_bridges.floor import Request
 from fog_bridges.vda5050.outgoing import ActionState
+from fog_bridges.vda5050.uncertain import LATE_S, UNCERTAIN
 
 if TYPE_CHECKING:
     from fog_bridges.floor import Answer
@@ -18,8 +19,6 @@ if TYPE_CHECKING:
 START: Final = "startCharging"
 COMMANDS: Final = {START: "dock", "stopCharging": "undock"}
 NO_DOCK: Final = "the site gives this robot no dock: set `dock` of its [[robots]] entry in site.toml"
-UNCERTAIN: Final = ("", "service_silent", "store_uncertain", "command_lost")
-"""Problems of requests that may have been carried out."""
 _OVER: Final = ("no_mission", "mission_changed")
 """Problems of a mission's end that say that it has ended, or another has begun."""
 INSTANT_MAX: Final = 50
@@ -61,8 +60,12 @@ class Charging:
         self._name = ""
         self.kind = ""
         """The action that is carried out; empty without one."""
-        self._is_asked = self._is_cancelled = False
-        self._seen_at = -math.inf
+        self.doubt = ""
+        """Why nobody knows whether the last action is over, until somebody has read it; empty if it is."""
+        self._command: Request | None = None
+        """What was asked of the floor; None before that."""
+        self._is_cancelled = self._is_answered = self._is_sure = False
+        self._asked_at = self._seen_at = -math.inf
 
     def why_not(self, kind: str, mode: tuple[str, str], *, has_dock: bool, is_ordered: bool) -> str:
         """Return why an instant action can't be done in an operating mode; empty if it can."""
@@ -77,7 +80,8 @@ class Charging:
 
     def begin(self, states: dict[str, ActionState], name: str, kind: str) -> None:
         """Carry out an action, and keep its state in `states`."""
-        self._states, self._name, self.kind, self._is_asked, self._is_cancelled = states, name, kind, False, False
+        self._states, self._name, self.kind, self.doubt = states, name, kind, ""
+        self._command, self._is_cancelled, self._is_answered, self._is_sure = None, False, False, False
         told(states, name, kind, "RUNNING")
 
     def end(self, status: ActionStatus, result: str = "") -> None:
@@ -88,7 +92,7 @@ class Charging:
 
     def cancel(self) -> None:
         """Give up the way to the dock: at once, or by ending the mission there. The last 0.7 m are the base's own."""
-        if not self._is_asked:
+        if self._command is None:
             self.end("FAILED", "it was cancelled")
         self._is_cancelled = True
 
@@ -96,25 +100,28 @@ class Charging:
         """Return the next request to the floor; None: there is nothing to ask."""
         if not self.kind:
             return None
-        if not self._is_asked:
-            self._is_asked, self._seen_at = True, now
-            return Request("POST", f"{self._path}/commands", {"kind": COMMANDS[self.kind]})
+        if self._command is None:
+            self._asked_at = now
+            self._command = Request("POST", f"{self._path}/commands", {"kind": COMMANDS[self.kind]})
+            return self._command
         if not self._is_cancelled or not self.is_way(view):
             return None
         self._is_cancelled = False
         return Request("DELETE", f"{self._path}/goal", headers={"If-Match": f'"{view["goal"]["goal_id"]}"'})
 
-    def on_answer(self, request: Request, answer: Answer) -> None:
+    def on_answer(self, request: Request, answer: Answer, now: float) -> None:
         """Take in the answer to a command; what nobody knows of, the robot's state shows."""
-        if request.method == "POST" and answer.refusal and answer.problem not in UNCERTAIN:
-            self.end("FAILED", answer.refusal)
+        if request is self._command:
+            self._is_answered, self._is_sure, self._seen_at = True, self._is_sure or not answer.refusal, now
+            if answer.refusal and answer.problem not in UNCERTAIN:
+                self.end("FAILED", answer.refusal)
         elif request.method == "DELETE" and answer.refusal and answer.problem not in _OVER:
             self._is_cancelled = True  # and asked again
 
     def is_way(self, view: dict[str, Any]) -> bool:
         """Whether the robot's mission leads to the dock by this action."""
         goal, dock = view["goal"], view.get("dock")
-        if self.kind != START or not self._is_asked or goal is None or dock is None:
+        if self.kind != START or self._command is None or goal is None or dock is None:
             return False
         return math.dist((goal["pose"]["x"], goal["pose"]["y"]), (dock["x"], dock["y"])) < NEAR_M
 
@@ -126,7 +133,11 @@ class Charging:
         if bool(state.get("docked")) == (self.kind == START) and not is_moving:
             self.end("FINISHED")
         elif is_moving or state.get("wants_dock") or "docking" in state.get("codes", ()):
-            self._seen_at = now
-        elif self._is_asked and now - self._seen_at > IDLE_S:
+            self._is_sure, self._seen_at = self._command is not None, now
+        elif self._is_answered and now - self._seen_at > IDLE_S:
             reasons = dict(zip(state.get("codes", ()), state.get("reasons", ()), strict=False))
-            self.end("FAILED", reasons.get("docking_given_up", "the robot has given it up"))
+            if self._is_sure:
+                self.end("FAILED", reasons.get("docking_given_up", "the robot has given it up"))
+            elif now - self._asked_at >= LATE_S:
+                self.doubt = "the floor does not say whether the robot was told: look whether it begins after all"
+                self.end("FAILED", self.doubt)

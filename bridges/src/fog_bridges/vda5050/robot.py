@@ -12,9 +12,10 @@ from typing import TYPE_CHECKING, Any, Final, Literal
 from uuid import uuid4
 
 from fog_bridges.floor import Request
-from fog_bridges.vda5050.charging import UNCERTAIN, Charging, drop_done, remember_action
+from fog_bridges.vda5050.charging import Charging, drop_done, remember_action
 from fog_bridges.vda5050.control import Doings, mode_of
 from fog_bridges.vda5050.orders import Orders, Situation, Where, about_error, goal_of, is_within, remember
+from fog_bridges.vda5050.uncertain import UNCERTAIN, UNSEEN_S, Uncertain
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -28,8 +29,6 @@ SPEED_M_S: Final = 0.3
 SILENT_S: Final = 5.0
 """A robot that tells no state for so long is not there."""
 RETRY_S: Final = 1.0
-UNSEEN_S: Final = 5.0
-"""How long what became of a mission may be told late: without word that it was reached, it was ended then."""
 REFUSED_S: Final = 5.0
 """Without any path for so long, the robot gives up a node, as the norm wants: the fleet decides."""
 TAKEN_S: Final = 2.0
@@ -79,8 +78,10 @@ class FleetRobot:
         """Whether the floor's state is: else nothing is concluded from it."""
         self._asking: Request | None = None
         self._asked_for: Node | None = None
-        self._unsure: tuple[Request, Node | None] | None = None
+        self._unsure: Uncertain | None = None
         """A mission that may have been accepted: asked for again, by the same key, as long as its node is wanted."""
+        self._sent_at = -math.inf
+        """When the request was sent whose answer is waited for."""
         self._retry_at = -math.inf
         self._refused_since: float | None = None
         self._taken_until = -math.inf
@@ -146,7 +147,7 @@ class FleetRobot:
 
     def _may_be_own(self, goal: dict[str, Any]) -> bool:
         """Whether a mission that is shown may be the one that the fleet asks for, whose id is not known yet."""
-        request, _ = self._unsure or (self._asking, None)
+        request = self._asking if self._unsure is None else self._unsure.request
         if request is None or request.method != "PUT" or request.body is None:
             return False
         wanted, found = request.body["pose"], goal["pose"]
@@ -301,10 +302,20 @@ class FleetRobot:
         if (due := self.orders.due) is not None and not self.paused and not self.charging.kind:
             self.charging.begin(self.orders.actions, due.action_id, due.action_type)
             self.charging.advance(self.state, now)
-        if not self.is_driving and not self._goal and not self._is_asking and not self.charging.kind:
-            for name, each in list(self.instant.items()):
-                if each.action_status == "RUNNING":
-                    remember_action(self.instant, name, each.action_type, "FINISHED")
+        if not self.is_driving and not self._goal and not self.charging.kind:
+            self._end_instant(now)
+
+    def _end_instant(self, now: float) -> None:
+        """Tell what became of the actions that wait for the robot to stand, once it is known, or has long not been."""
+        doubt = self.charging.doubt
+        if self._unsure is not None and (self.paused or self.orders.is_idle):
+            doubt = doubt or self._unsure.doubt(now)
+        if self._is_asking and not doubt:
+            return
+        self.charging.doubt = ""
+        for name, each in list(self.instant.items()):
+            if each.action_status == "RUNNING":
+                remember_action(self.instant, name, each.action_type, "FAILED" if doubt else "FINISHED", doubt)
 
     def _judge(self, now: float) -> None:
         """Find out whether the mission was reached, or ended by somebody else: only the robot's word is proof.
@@ -368,79 +379,90 @@ class FleetRobot:
         node = self.orders.target
         if self._mode != "AUTOMATIC" or self.paused or self._unreachable is not None:
             node = None
-        if self._unsure is not None and node is not None and node is self._unsure[1]:
-            return self._ask(*self._unsure, now)
+        if self._unsure is not None and node is not None and node is self._unsure.node:
+            return self._ask(self._unsure.request, node, now)
         self._adopt(now)
         if self._unsure is not None:
             node = None  # first the mission that it has, if it is still there, then what appears
         goal = None if node is None else goal_of(node, self.places)
         path = f"/api/v1/robots/{self.robot}/goal"
         if node is None or goal is None:
-            if not self._goal:
-                waits = self._unsure is not None or self.paused
-                request = None if waits else self.charging.request(self.view, now)
-                return None if request is None else self._ask(request, None, now)
-            return self._ask(Request("DELETE", path, headers={"If-Match": f'"{self._goal}"'}), None, now)
+            return self._step_aside(path, now)
         if not self.state or (self._goal and self._goal_node is node):
             return None
         pose = {"x": goal.x, "y": goal.y} | ({} if goal.theta is None else {"theta": goal.theta})
         headers = {"If-Match": f'"{self._goal}"'} if self._goal else {"If-None-Match": "*"}
+        self._asked_at = now
         return self._ask(Request("PUT", path, {"pose": pose}, headers | {"Idempotency-Key": uuid4().hex}), node, now)
 
+    def _step_aside(self, path: str, now: float) -> Request | None:
+        """Return what is to be asked while the robot needs no mission: end the one that it has, or may have."""
+        if self._goal:
+            request: Request | None = Request("DELETE", path, headers={"If-Match": f'"{self._goal}"'})
+        elif self._unsure is not None:
+            request = self._unsure.question
+        else:
+            request = None if self.paused else self.charging.request(self.view, now)
+        return None if request is None else self._ask(request, None, now)
+
     def _ask(self, request: Request, node: Node | None, now: float) -> Request:
-        self._asking, self._asked_for = request, node
-        if request.method == "PUT":
-            self._asked_at = now
+        self._asking, self._asked_for, self._sent_at = request, node, now
         return request
 
     def _adopt(self, now: float) -> None:
         """Take over the mission that is shown if it is the fleet's, though it was taken for ended or not answered for.
 
-        One that may have been accepted, and is not wanted any more, is waited for: asking again might begin it.
+        One that may have been accepted, and is not wanted any more, is asked for without beginning it.
         """
         goal = self.view["goal"] or {"goal_id": ""}
-        if self._unsure and goal["goal_id"] not in ("", *self._own) and self._may_be_own(goal):
+        is_new = goal["goal_id"] not in ("", *self._own)
+        if self._unsure is not None and is_new and not self._unsure.is_denied and self._may_be_own(goal):
             remember(self._own, goal["goal_id"], value=False)
+            self._unsure.mission = goal["goal_id"]
         is_over, is_long_ago = self._own.get(goal["goal_id"]), now - max(self._shown_at, self._asked_at) >= UNSEEN_S
         if not self._goal and (is_over is False or (is_over and is_long_ago)):
-            self._goal, self._goal_node, self._unsure, self._shown_at = goal["goal_id"], None, None, now
-        elif not self._goal and is_long_ago:
-            self._unsure = None
+            self._goal, self._goal_node, self._shown_at = goal["goal_id"], None, now
+            if self._unsure is not None and self._unsure.mission == self._goal:
+                self._unsure = None
 
     def on_answer(self, answer: Answer, now: float) -> None:
         """Take in the answer to the request that `step` returned."""
-        request, node, again = self._asking, self._asked_for, self._unsure is not None
+        request, node = self._asking, self._asked_for
         self._asking = None
         if request is None:
             return
         if self._goal or request.method == "PUT":
-            self._on_answer(request, node, answer, now, again=again)
+            self._on_answer(request, node, answer, now)
         else:
-            self.charging.on_answer(request, answer)
+            self.charging.on_answer(request, answer, now)
         self.advance(now)
 
-    def _on_answer(self, request: Request, node: Node | None, answer: Answer, now: float, *, again: bool) -> None:
+    def _on_answer(self, request: Request, node: Node | None, answer: Answer, now: float) -> None:
+        unsure = self._unsure
         # Of an order that goes on it has to be known who ended its mission: an operator ends the order.
-        is_gone = answer.problem in ("no_mission", "mission_changed") and (self.orders.is_idle or again)
-        if request.method == "PUT" or not answer.refusal:
-            self._unsure = None  # it is answered, or there is no mission any more that it might replace
-        if request.method == "PUT" and "goal_id" in answer.body and node is not None:
+        is_gone = answer.problem in ("no_mission", "mission_changed") and (self.orders.is_idle or unsure is not None)
+        if request.method == "PUT" and "goal_id" in answer.body:
             if self._goal:
                 self._drop(is_over=True)
-            self._goal, self._goal_node = answer.body["goal_id"], node
+            self._goal, self._goal_node, self._unsure = answer.body["goal_id"], node, None
             remember(self._own, self._goal, value=False)
             self._shown_at, self._refused_since = now, None
         elif request.method == "DELETE" and (not answer.refusal or is_gone):
             self._drop(is_over=True)
-        elif answer.problem == "goal_refused" and node is not None:
-            if self._ahead(node) is not None:
-                self._give_up(node, answer.refusal)
-        else:
+            if unsure is not None and not answer.refusal and unsure.replaces(request):
+                self._unsure = None  # there is no mission any more that it might replace
+        elif unsure is not None and request.method == "PUT":
             self._retry_at = now + RETRY_S
-            if request.method == "PUT" and answer.problem in UNCERTAIN:
-                self._unsure = request, node
-        if request.method == "PUT" and again and answer.refusal and self._unsure is None:
-            self._unsure = request, None  # the repetition was refused, and the first one may have been accepted
+            unsure.on_refusal(answer, self._sent_at, now)
+            if unsure.is_over:
+                self._unsure = None
+        elif request.method == "PUT" and answer.problem in UNCERTAIN and node is not None:
+            self._retry_at = now + RETRY_S
+            self._unsure = Uncertain(request, node, self._sent_at)
+        elif answer.problem != "goal_refused":
+            self._retry_at = now + RETRY_S
+        if answer.problem == "goal_refused" and node is not None and self._ahead(node) is not None:
+            self._give_up(node, answer.refusal)
 
     @property
     def goal_node(self) -> Node | None:

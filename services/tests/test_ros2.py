@@ -489,6 +489,27 @@ def test_robot_that_waits_for_an_operator_takes_no_goal():
     assert floor.relay._goals.qsize() == 1
 
 
+async def test_robot_that_tells_nothing_for_5_s_takes_no_goal_also_none_that_waits_until_it_is_heard_again():
+    floor = Floor()
+    state = RobotState(
+        mode="NORMAL", reasons=[], enabled=True, battery=None, goal_id=None, map_epoch=0, map_seq=0, plan_id=None
+    )
+    goal = ros.message("geometry_msgs/msg/PoseStamped", header=ros.header(1.0), pose=ros.pose(1.0, 1.0, 0.0))
+    floor.hear[ch.ROBOT_STATE]({"robot": "r-1"}, state)
+    floor.clock.advance(4.9)
+    floor.hear["r_1/goal_pose"](goal)
+    floor.clock.advance(0.2)
+    with pytest.raises(WireError, match="silent"):
+        floor.hear["r_1/goal_pose"](goal)
+    loop = asyncio.create_task(floor.relay.goal_loop())
+    await floor.pass_s(0.1)
+    assert [each.partition(" is ")[0] for each in floor.refused] == ["goal: the robot"], "it would be sent otherwise"
+    loop.cancel()
+    floor.hear[ch.ROBOT_STATE]({"robot": "r-1"}, state)
+    floor.hear["r_1/goal_pose"](goal)
+    assert floor.relay._goals.qsize() == 1
+
+
 GRAPH = """
 building_name: house
 levels:

@@ -12,7 +12,8 @@ from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 
-from fog_bridges.floor import WAITS, Request
+from fog_bridges.floor import Request
+from fog_bridges.heard import Heard
 from fog_bridges.ros2 import messages as ros
 from fog_bridges.ros2.advice import GOAL_TYPE, Advice
 from fog_bridges.ros2.others import Others, thing_id
@@ -180,6 +181,7 @@ class Relay:
         self._closed: NDArray[np.bool_] | None = None
         self._driving: dict[str, str | None] = {}
         """The goal that each robot has, by its last state."""
+        self._heard = Heard()
         self._stopped: set[str] = set()
         """Robots that wait for an operator."""
         self._goals: asyncio.Queue[tuple[str, float, Request]] = asyncio.Queue(GOALS_AT_ONCE)
@@ -223,9 +225,7 @@ class Relay:
             waited = self._now() - arrived
             if waited > GOAL_MAX_AGE_S:
                 self._session.refuse("old", f"{robot}/goal_pose", f"it has waited for {waited:.0f} s: send it again")
-            elif robot in self._stopped:
-                self._session.refuse("goal", f"{robot}/goal_pose", WAITS)
-            elif refusal := await self._floor.send(request):
+            elif refusal := self._refusal(robot) or await self._floor.send(request):
                 self._session.refuse("goal", f"{robot}/goal_pose", refusal)
 
     # --- The map ------------------------------------------------------------------------------------------------------
@@ -358,6 +358,7 @@ class Relay:
         if robot not in self._driving:
             goal = Topic(f"{ros.ros_name(robot)}/goal_pose", GOAL_TYPE)
             self._session.subscribe(goal, partial(self._on_goal, robot), GOAL_MAX_AGE_S)
+        self._heard.hear(robot, self._now())
         (self._stopped.discard if state.enabled and not state.awaits_operator else self._stopped.add)(robot)
         goal_id = None if state.goal_reached else state.goal_id
         if goal_id is None and self._driving.get(robot) is not None:
@@ -397,14 +398,17 @@ class Relay:
             raise WireError(f"a goal in the frame {frame!r}: send it in {ros.MAP_FRAME!r}", "frame")
         if not np.isfinite((x, y)).all():
             raise WireError(f"a goal at ({x}, {y})")
-        if robot in self._stopped:
-            raise WireError(WAITS, "goal")
+        if refusal := self._refusal(robot):
+            raise WireError(refusal, "goal")
         pose = {"x": x, "y": y} | ({} if theta is None else {"theta": theta})
         request = Request("PUT", f"/api/v1/robots/{robot}/goal", {"pose": pose})
         try:
             self._goals.put_nowait((robot, self._now(), request))
         except asyncio.QueueFull:
             raise WireError(f"{GOALS_AT_ONCE} goals wait already", "too_many") from None
+
+    def _refusal(self, robot: str) -> str:
+        return self._heard.refusal(robot, self._now(), waits=robot in self._stopped)
 
     # --- Robots of others, and obstacles ------------------------------------------------------------------------------
 

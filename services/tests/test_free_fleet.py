@@ -8,18 +8,23 @@ from pathlib import Path
 
 import pytest
 import zenoh
+from manual_clock import ManualClock
 
 from fog_bridges.floor import Answer, Request
-from fog_bridges.free_fleet import Fleet
+from fog_bridges.free_fleet import Fleet, Planned
 from fog_bridges.ros2.session import ros_config
 from fog_contracts.messages import RobotPose, RobotState
-from fog_runtime.clock import SystemClock
 
 pytestmark = pytest.mark.live
 PEERS = "FOGNAV_ROS2_PEERS"
 PROGRAMS = "FOGNAV_FREE_FLEET"
 """A checkout of github.com/open-rmf/free_fleet; its programs need pycdr2 beside zenoh."""
-GOAL = bytes(range(16))
+GOAL, OTHER = bytes(range(16)), bytes([9] * 16)
+EVERYTHING = b"\0\1\0\0" + bytes(24)
+"""A request to cancel whichever goal there is."""
+UNKNOWN, EXECUTING, SUCCEEDED, CANCELED, ABORTED = 0, 2, 4, 5, 6
+"""Of action_msgs/GoalStatus. free_fleet's adapter takes SUCCEEDED and CANCELED for a goal that is done with, so that
+the task goes on; else it plans anew (free_fleet@002505fd, nav2_robot_adapter.py, `_is_navigation_done`)."""
 POSE = RobotPose(x=1.0, y=1.0, theta=0.0, covariance=[0.0] * 9, v=0.0, w=0.0, radius=0.17, height=0.2, stamp=1.0)
 STATE = RobotState(
     mode="NORMAL", reasons=[], enabled=True, battery=0.5, goal_id=None, map_epoch=0, map_seq=0, plan_id=None
@@ -51,8 +56,8 @@ class Rig:
 
     def __init__(self, port: int, tasks: asyncio.TaskGroup) -> None:
         self.own, self.other = (zenoh.open(ros_config(f"tcp/127.0.0.1:{port}")) for _ in range(2))
-        self.floor = Floor()
-        self.fleet = Fleet(self.own, self.floor, SystemClock(), tasks)  # type: ignore[arg-type]  # all of a floor that it uses
+        self.floor, self.clock, self.planned = Floor(), ManualClock(100.0), Planned()
+        self.fleet = Fleet(self.own, self.floor, self.clock, tasks, self.planned)  # type: ignore[arg-type]  # all of a floor that it uses
         self.fleet.on_pose("r-1", POSE)
         self.fleet.on_state("r-1", STATE)
 
@@ -79,6 +84,21 @@ class Rig:
             ),
         )  # fmt: skip
 
+    def plan(self, goal_id: str | None) -> None:
+        """Have the planner give the robot a mission, or none."""
+        goal = None if goal_id is None else {"goal_id": goal_id}
+        self.planned.on_event("robot", {"id": "r-1", "value": {"goal": goal}})
+
+    def end(self, goal_id: str, action: str, after: str | None = None) -> None:
+        """Have the audit trail tell that a mission has ended."""
+        before, now = ({"goal": {"goal_id": each}} if each else None for each in (goal_id, after))
+        self.planned.on_event(
+            "record", {"kind": "mission", "id": "r-1", "action": action, "before": before, "after": now}
+        )
+
+    async def result(self, goal_id: bytes = GOAL) -> int:
+        return status(await self.ask("get_result", b"\0\1\0\0" + goal_id))
+
     def close(self) -> None:
         for session in (self.own, self.other):
             session.close()
@@ -92,10 +112,10 @@ async def rig(ros_router):
         made.close()
 
 
-def goal(x: float, frame: bytes = b"map") -> bytes:
+def goal(x: float, frame: bytes = b"map", goal_id: bytes = GOAL) -> bytes:
     """A request as CDR has it: goal id, header, pose, and the name of a behaviour tree."""
     text = frame + b"\0"
-    head = b"\0\1\0\0" + GOAL + struct.pack("<iII", 0, 0, len(text)) + text
+    head = b"\0\1\0\0" + goal_id + struct.pack("<iII", 0, 0, len(text)) + text
     head += bytes(-(len(head) - 4) % 8)
     return head + struct.pack("<7d", x, 3.0, 0.0, 0.0, 0.0, 0.0, 1.0) + struct.pack("<I", 1) + b"\0"
 
@@ -111,12 +131,11 @@ async def test_goal_is_driven_told_and_ends(rig):
     assert (request.method, request.path) == ("PUT", "/api/v1/robots/r-1/goal")
     assert request.body == {"pose": {"x": 4.0, "y": 3.0, "theta": 0.0}}
     assert request.headers["If-None-Match"] == "*", "it takes no operator's mission away"
-    asked = b"\0\1\0\0" + GOAL
     rig.state("g1", distance=2.5)
-    assert status(await rig.ask("get_result", asked)) == 2
+    assert await rig.result() == EXECUTING
     rig.state("g1", reached=True)
-    assert status(await rig.ask("get_result", asked)) == 4
-    assert status(await rig.ask("get_result", b"\0\1\0\0" + bytes(16))) == 5, "a goal that another one has replaced"
+    assert await rig.result() == SUCCEEDED
+    assert await rig.result(bytes(16)) == UNKNOWN, "nobody has sent such a goal"
 
 
 async def test_refused_goal_is_not_accepted_and_malformed_requests_are_answered_by_an_error(rig):
@@ -127,24 +146,103 @@ async def test_refused_goal_is_not_accepted_and_malformed_requests_are_answered_
 
 
 async def test_cancellation_ends_the_mission_that_it_names_or_whichever_there_is(rig):
-    nobody, other = bytes(16), bytes([9] * 16)
-    cancel = [b"\0\1\0\0" + each + bytes(8) for each in (nobody, other, GOAL)]
+    cancel = [b"\0\1\0\0" + each + bytes(8) for each in (bytes(16), OTHER, GOAL)]
     assert (await rig.ask("cancel_goal", cancel[0]))[4] == 0
     await rig.ask("send_goal", goal(4.0))
     assert (await rig.ask("cancel_goal", cancel[1]))[4] == 2, "another's goal is unknown"
     answer = await rig.ask("cancel_goal", cancel[2])
     assert (answer[4], answer[8:12], answer[12:28]) == (0, b"\1\0\0\0", GOAL)
     assert (rig.floor.asked[-1].method, rig.floor.asked[-1].headers) == ("DELETE", {"If-Match": '"g1"'})
-    assert status(await rig.ask("get_result", b"\0\1\0\0" + GOAL)) == 5
+    assert await rig.result() == CANCELED
 
 
-async def test_mission_that_an_operator_ends_is_canceled(rig):
+async def test_mission_that_an_operator_ends_is_aborted_so_that_free_fleet_does_not_take_the_robot_for_there(rig):
     await rig.ask("send_goal", goal(4.0))
-    rig.state(None)
-    assert status(await rig.ask("get_result", b"\0\1\0\0" + GOAL)) == 2, "the robot has not heard of it yet"
     rig.state("g1")
+    rig.plan(None)
     rig.state(None)
-    assert status(await rig.ask("get_result", b"\0\1\0\0" + GOAL)) == 5
+    assert await rig.result() == EXECUTING, "the audit trail tells within a second who has ended it"
+    rig.end("g1", "cancel")
+    assert await rig.result() == ABORTED
+    rig.state("g1")
+    assert await rig.result() == ABORTED, "what the robot still told then"
+
+
+async def test_mission_that_gives_way_to_an_operators_is_aborted_and_one_to_the_adapters_next_goal_too(rig):
+    await rig.ask("send_goal", goal(4.0))
+    rig.state("g1")
+    assert (await rig.ask("send_goal", goal(5.0, goal_id=OTHER)))[4] == 1
+    assert (await rig.result(), await rig.result(OTHER)) == (ABORTED, EXECUTING)
+    rig.end("g2", "goal", after="of-an-operator")
+    assert await rig.result(OTHER) == ABORTED
+    await rig.ask("send_goal", goal(6.0))
+    await rig.ask("cancel_goal", EVERYTHING)
+    await rig.ask("send_goal", goal(7.0, goal_id=OTHER))
+    assert await rig.result() == CANCELED, "the adapter has canceled it before, and knows"
+
+
+async def test_mission_is_reached_also_if_only_the_audit_trail_tells(rig):
+    await rig.ask("send_goal", goal(4.0))
+    rig.end("g1", "reached")
+    rig.state(None)
+    assert await rig.result() == SUCCEEDED
+
+
+async def test_mission_outlasts_a_restart_of_its_robots_agent_and_can_be_canceled_meanwhile(rig):
+    await rig.ask("send_goal", goal(4.0))
+    rig.state("g1")
+    rig.plan("g1")
+    rig.state(None, waits=True)
+    rig.clock.advance(60.0)
+    rig.state(None, waits=True)
+    assert await rig.result() == EXECUTING, "the planner has it, and tells the robot again"
+    assert (await rig.ask("send_goal", goal(5.0)))[4] == 0, "until an operator has enabled the robot"
+    answer = await rig.ask("cancel_goal", EVERYTHING)
+    assert (answer[4], answer[12:28]) == (0, GOAL)
+    assert rig.floor.asked[-1].headers == {"If-Match": '"g1"'}
+    assert await rig.result() == CANCELED
+
+
+async def test_mission_that_nobody_tells_of_is_aborted_goes_on_when_it_is_told_again_and_can_be_canceled(rig):
+    await rig.ask("send_goal", goal(4.0))
+    rig.state("g1")
+    rig.planned.on_lost()
+    rig.clock.advance(9.9)
+    rig.state(None)
+    assert await rig.result() == EXECUTING
+    rig.clock.advance(0.2)
+    assert await rig.result() == ABORTED
+    rig.state("g1")
+    assert await rig.result() == EXECUTING
+    rig.clock.advance(10.0)
+    rig.state(None)
+    assert (await rig.ask("send_goal", goal(5.0, goal_id=OTHER)))[4] == 1
+    assert rig.floor.asked[-1].headers["If-Match"] == '"g1"', "the floor may still have it"
+    rig.clock.advance(10.0)
+    rig.state(None)
+    assert await rig.result(OTHER) == ABORTED
+    assert (await rig.ask("cancel_goal", EVERYTHING))[4] == 0
+    assert (rig.floor.asked[-1].method, rig.floor.asked[-1].headers) == ("DELETE", {"If-Match": '"g2"'})
+    assert await rig.result(OTHER) == CANCELED
+
+
+async def test_goal_after_one_that_an_operator_has_ended_is_accepted_and_replaces_nobodys_mission(rig):
+    await rig.ask("send_goal", goal(4.0))
+    rig.state("g1")
+    rig.floor.answers = [Answer("the robot has no mission", "mission_changed")]
+    assert (await rig.ask("send_goal", goal(5.0, goal_id=OTHER)))[4] == 1
+    conditions = [request.headers.keys() & {"If-Match", "If-None-Match"} for request in rig.floor.asked]
+    assert conditions == [{"If-None-Match"}, {"If-Match"}, {"If-None-Match"}]
+    keys = {request.headers["Idempotency-Key"] for request in rig.floor.asked}
+    assert len(keys) == 3, "what was refused is another request"
+
+
+async def test_robot_that_tells_nothing_for_5_s_takes_no_goal_until_it_is_heard_again(rig):
+    rig.clock.advance(5.0)
+    assert (await rig.ask("send_goal", goal(4.0)))[4] == 0
+    assert rig.floor.asked == [], "it would drive off once it is switched on"
+    rig.state(None)
+    assert (await rig.ask("send_goal", goal(4.0)))[4] == 1
 
 
 async def test_robot_that_waits_for_an_operator_takes_no_goal(rig):
@@ -154,15 +252,22 @@ async def test_robot_that_waits_for_an_operator_takes_no_goal(rig):
 
 
 async def test_cancellation_never_ends_an_operators_mission_and_says_so(rig):
-    everything = b"\0\1\0\0" + bytes(24)
     rig.state("of-an-operator", distance=3.0)
-    assert (await rig.ask("cancel_goal", everything))[4] == 1
+    assert (await rig.ask("cancel_goal", EVERYTHING))[4] == 1
     rig.state(None)
     await rig.ask("send_goal", goal(4.0))
     rig.floor.answers = [Answer("the robot has another mission", "mission_changed")]
-    assert (await rig.ask("cancel_goal", everything))[4] == 0
+    assert (await rig.ask("cancel_goal", EVERYTHING))[4] == 0
     assert [request.method for request in rig.floor.asked] == ["PUT", "DELETE"]
-    assert status(await rig.ask("get_result", b"\0\1\0\0" + GOAL)) == 5
+    assert await rig.result() == CANCELED
+    await rig.ask("send_goal", goal(5.0))
+    rig.end("g3", "goal", after="of-an-operator")
+    rig.state("of-an-operator", distance=3.0)
+    rig.floor.answers = [Answer("the robot has another mission", "mission_changed")]
+    assert (await rig.ask("cancel_goal", EVERYTHING))[4] == 1
+    rig.floor.answers = [Answer("the robot has another mission", "mission_changed")]
+    assert (await rig.ask("cancel_goal", b"\0\1\0\0" + GOAL + bytes(8)))[4] == 3, "it is over"
+    assert await rig.result() == ABORTED
 
 
 async def test_goal_whose_answer_is_lost_is_sent_once_more_by_the_same_key(rig):
@@ -176,7 +281,7 @@ async def test_cancellation_waits_for_the_goal_that_is_under_way(rig, until):
     rig.floor.open.clear()
     sent = asyncio.create_task(rig.ask("send_goal", goal(4.0)))
     await until(lambda: rig.floor.asked, "the goal is under way", str)
-    canceled = asyncio.create_task(rig.ask("cancel_goal", b"\0\1\0\0" + bytes(24)))
+    canceled = asyncio.create_task(rig.ask("cancel_goal", EVERYTHING))
     await until(lambda: rig.fleet._waiting == 2, "the cancellation has arrived", str)
     rig.floor.open.set()
     assert (await sent)[4] == 1

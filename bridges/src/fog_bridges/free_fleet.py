@@ -4,7 +4,8 @@ Plain CDR, no attachment: `ROBOT/tf`, `ROBOT/battery_state`, and the action `ROB
 goal, result, cancellation and feedback. Source: free_fleet@002505fd, its adapter for Nav2 and its example programs.
 
 What an operator of Fognav does wins: a robot that waits for one, or has a mission of one, takes no goal, and a
-cancellation ends missions of this bridge only.
+cancellation ends missions of this bridge only. The adapter takes a canceled goal for one that is done, and plans anew
+for one that is aborted: so a goal is canceled by the adapter's own word only.
 """
 
 from __future__ import annotations
@@ -18,7 +19,8 @@ from uuid import uuid4
 import numpy as np
 import zenoh
 
-from fog_bridges.floor import WAITS, Request
+from fog_bridges.floor import Request
+from fog_bridges.heard import Heard
 from fog_bridges.metrics import REFUSED
 from fog_bridges.ros2 import messages as ros
 from fog_bridges.ros2.wire import TYPES, RosMessage, WireError, decoded_as
@@ -31,19 +33,21 @@ from fog_runtime.transports.zenoh_edge import ZenohEdge
 if TYPE_CHECKING:
     from collections.abc import Awaitable, Callable, Sequence
 
-    from fog_bridges.floor import Floor
+    from fog_bridges.floor import Answer, Floor
     from fog_runtime.clock import Clock
     from fog_runtime.credentials import Credentials
 
-EXECUTING, SUCCEEDED, CANCELED, UNKNOWN = 2, 4, 5, 0
+UNKNOWN, EXECUTING, SUCCEEDED, CANCELED, ABORTED = 0, 2, 4, 5, 6
 """States of a goal (action_msgs/GoalStatus)."""
-CANCEL_NONE, CANCEL_REJECTED, CANCEL_UNKNOWN_GOAL = 0, 1, 2
+CANCEL_NONE, CANCEL_REJECTED, CANCEL_UNKNOWN_GOAL, CANCEL_GOAL_TERMINATED = 0, 1, 2, 3
 """Return codes of action_msgs/CancelGoal."""
 FEEDBACK_S: Final = 0.5
 SPEED_M_S: Final = 0.3
 """What the remaining time is estimated by."""
-SEEN_S: Final = 5.0
-"""A mission that its robot has not heard of for so long counts as ended if the robot has none."""
+UNSEEN_S: Final = 10.0
+"""A mission that neither robot nor planner tell of for so long is over; the planner tells of it each 5 s."""
+REMEMBERED: Final = 200
+"""So many ends of missions, and states of earlier goals, are known."""
 WAITING_MAX: Final = 50
 REQUEST_MAX: Final = 4096
 """A longer request (bytes) is refused unread."""
@@ -58,6 +62,40 @@ _ACTION: Final = "navigate_to_pose/_action"
 _log = logs.get("free_fleet")
 
 
+class Planned:
+    """What the planner says of missions, as the console tells it."""
+
+    def __init__(self) -> None:
+        self._missions: dict[str, str] = {}
+        """The mission of each robot that has one."""
+        self._ends: dict[str, bool] = {}
+        """The latest missions that have ended, and whether they were reached."""
+
+    def on_event(self, name: str, data: dict[str, Any]) -> None:
+        """Take in an event of the floor."""
+        if name == "hello" and data["fresh"]:
+            self._missions.clear()
+        elif name == "robot":
+            goal = (data["value"] or {}).get("goal") or {}
+            self._missions[data["id"]] = goal.get("goal_id", "")
+        elif name == "record" and data["kind"] == "mission":
+            before, after = (((data[each] or {}).get("goal") or {}).get("goal_id") for each in ("before", "after"))
+            if before and before != after:
+                _remember(self._ends, before, data["action"] == "reached")
+
+    def on_lost(self) -> None:
+        """Take in that nobody knows which robot has a mission."""
+        self._missions.clear()
+
+    def has(self, robot: str, mission: str) -> bool:
+        """Whether a mission is a robot's."""
+        return self._missions.get(robot) == mission
+
+    def end_of(self, mission: str) -> bool | None:
+        """Return whether a mission was reached (True) or ended by somebody (False); None: neither is known."""
+        return self._ends.get(mission)
+
+
 @dataclass
 class Mission:
     """The latest goal that somebody gave a robot by this bridge; times are those of a monotonic clock (s)."""
@@ -67,19 +105,26 @@ class Mission:
     mission: str
     """Its id on the floor."""
     begun: float
+    seen: float
+    """When the robot or the planner had it last."""
     status: int = EXECUTING
-    is_seen: bool = False
-    """Whether the robot has it."""
 
-    def on_state(self, state: RobotState, now: float) -> None:
-        """Follow what the robot says of its goal."""
-        if self.status != EXECUTING:
+    def follow(self, robot: str, state: RobotState, planned: Planned, now: float) -> None:
+        """Find out whether it goes on: a robot without it may only have been started anew, and is told it again.
+
+        One that nobody told of for long may have been out of sight only, so that it is no end yet.
+        """
+        if self.status in (SUCCEEDED, CANCELED):
             return
-        if state.goal_id == self.mission:
-            self.is_seen = True
-            self.status = SUCCEEDED if state.goal_reached else EXECUTING
-        elif self.is_seen or now - self.begun > SEEN_S:
-            self.status = CANCELED  # by an operator, or for another goal
+        has_it, end = state.goal_id == self.mission, planned.end_of(self.mission)
+        if end or (has_it and state.goal_reached):
+            self.status = SUCCEEDED
+        elif end is False:
+            self.status = ABORTED  # by an operator, or for another goal
+        else:
+            if has_it or planned.has(robot, self.mission):
+                self.seen = now
+            self.status = EXECUTING if now - self.seen < UNSEEN_S else ABORTED
 
 
 class FreeFleetBridge:
@@ -90,14 +135,17 @@ class FreeFleetBridge:
     def __init__(self, site: str, config: zenoh.Config, connect: Sequence[str], own: Credentials) -> None:
         """Serve robots on the router that `config` connects to; `connect` are the floor's, for whom `own` are."""
         self._site, self._config, self._connect, self._own = site, config, connect, own
+        self._planned = Planned()
         self.problem = "not connected yet"
         """Why free_fleet is told nothing; empty while it is."""
 
     def on_event(self, name: str, data: dict[str, Any]) -> None:
-        """Do nothing: the floor's own channels are faster than its console."""
+        """Take in an event of the floor: of missions only, all else its own channels tell faster."""
+        self._planned.on_event(name, data)
 
     def on_lost(self) -> None:
-        """Do nothing, likewise."""
+        """Take in that nobody knows the floor's state."""
+        self._planned.on_lost()
 
     async def run(self, floor: Floor, clock: Clock) -> None:
         """Connect, and do all until cancelled."""
@@ -108,7 +156,7 @@ class FreeFleetBridge:
         )  # fmt: skip
         try:
             async with opened as fog, asyncio.TaskGroup() as tasks:
-                fleet = Fleet(session, floor, clock, tasks)
+                fleet = Fleet(session, floor, clock, tasks, self._planned)
                 fog.subscribe(ch.ROBOT_STATE, RobotState, lambda ids, state: fleet.on_state(ids["robot"], state))
                 fog.subscribe(ch.ROBOT_POSE, RobotPose, lambda ids, pose: fleet.on_pose(ids["robot"], pose))
                 async for _ in ticker(clock, FEEDBACK_S):
@@ -134,15 +182,21 @@ class FreeFleetBridge:
 class Fleet:
     """The robots that are served: each is from its first state on."""
 
-    def __init__(self, session: zenoh.Session, floor: Floor, clock: Clock, tasks: asyncio.TaskGroup) -> None:
-        """Serve robots on `session`, and pass their goals on to `floor`."""
+    def __init__(
+        self, session: zenoh.Session, floor: Floor, clock: Clock, tasks: asyncio.TaskGroup, planned: Planned
+    ) -> None:
+        """Serve robots on `session`, and pass their goals on to `floor`, of whose missions `planned` tells."""
         self._session, self._floor, self._clock, self._tasks = session, floor, clock, tasks
+        self._planned = planned
         self._loop = asyncio.get_running_loop()
         self._limited = logs.RateLimited(_log)
         self._held: dict[str, list[object]] = {}
         self._poses: dict[str, RobotPose] = {}
         self._states: dict[str, RobotState] = {}
+        self._heard = Heard()
         self._missions: dict[str, Mission] = {}
+        self._earlier: dict[tuple[str, bytes], int] = {}
+        """What became of goals before a robot's latest."""
         self._locks: dict[str, asyncio.Lock] = {}
         """A robot's goals and cancellations are carried out one after the other."""
         self._waiting = 0
@@ -158,6 +212,7 @@ class Fleet:
     def on_state(self, robot: str, state: RobotState) -> None:
         """Tell a robot's battery, and follow its mission."""
         self._states[robot] = state
+        self._heard.hear(robot, self._clock.now())
         if robot not in self._held:
             self._locks[robot] = asyncio.Lock()
             served: dict[str, Callable[[str, bytes], Awaitable[bytes]]] = {
@@ -169,15 +224,14 @@ class Fleet:
                 )
                 for name, answer in served.items()
             ]
-        if (mission := self._missions.get(robot)) is not None:
-            mission.on_state(state, self._clock.now())
+        self._followed(robot)
         self._put(robot, "battery_state", ros.battery(state, self._clock.stamp()), "sensor_msgs/msg/BatteryState")
 
     def tell_feedback(self) -> None:
         """Tell how far robots have to go."""
-        for robot, mission in self._missions.items():
-            state, pose = self._states.get(robot), self._poses.get(robot)
-            if mission.status != EXECUTING or state is None or pose is None or state.goal_distance is None:
+        for robot in self._missions:
+            mission, state, pose = self._followed(robot), self._states[robot], self._poses.get(robot)
+            if mission is None or mission.status != EXECUTING or pose is None or state.goal_distance is None:
                 continue
             stamp = self._clock.stamp()
             where = ros.message(
@@ -190,6 +244,13 @@ class Fleet:
                 distance_remaining=state.goal_distance,
             )  # fmt: skip
             self._put(robot, f"{_ACTION}/feedback", told, "fognav_msgs/msg/GoalFeedback")
+
+    def _followed(self, robot: str) -> Mission | None:
+        """Return a robot's mission with its present status; None if this bridge has begun none."""
+        mission = self._missions.get(robot)
+        if mission is not None:
+            mission.follow(robot, self._states[robot], self._planned, self._clock.now())
+        return mission
 
     def _put(self, robot: str, name: str, message: RosMessage, kind: str) -> None:
         try:
@@ -262,29 +323,39 @@ class Fleet:
 
     async def _begin_mission(self, robot: str, goal: bytes, pose: dict[str, float]) -> str:
         """Begin a mission in the place of this bridge's own, never of another's; return why not, empty if it has."""
-        state, own = self._states[robot], self._missions.get(robot)
-        if not state.enabled or state.awaits_operator:
-            return WAITS
-        replaces = own is not None and own.status == EXECUTING
-        condition = {"If-Match": f'"{own.mission}"'} if own is not None and replaces else {"If-None-Match": "*"}
+        state, own = self._states[robot], self._followed(robot)
+        waits = not state.enabled or state.awaits_operator
+        if refusal := self._heard.refusal(robot, self._clock.now(), waits=waits):
+            return refusal
+        told = None
+        if own is not None and own.status in (EXECUTING, ABORTED):  # the floor knows whether it still has it
+            told = await self._put_goal(robot, pose, {"If-Match": f'"{own.mission}"'})
+        if told is None or told.problem in _GONE:
+            told = await self._put_goal(robot, pose, {"If-None-Match": "*"})
+        goal_id = None if told.refusal else told.body.get("goal_id")
+        if goal_id is None:
+            return told.refusal or "the floor's answer names no mission"
+        if own is not None:
+            is_replaced = own.status == EXECUTING
+            _remember(self._earlier, (robot, own.goal), ABORTED if is_replaced else own.status)
+        now = self._clock.now()
+        self._missions[robot] = Mission(goal, str(goal_id), begun=now, seen=now)
+        return ""
+
+    async def _put_goal(self, robot: str, pose: dict[str, float], condition: dict[str, str]) -> Answer:
         headers = condition | {"Idempotency-Key": uuid4().hex}
         request = Request("PUT", f"/api/v1/robots/{robot}/goal", {"pose": pose}, headers)
         told = await self._floor.ask(request)
         if told.refusal and told.problem in _UNCERTAIN:
             told = await self._floor.ask(request)  # by the same key: carried out once
-        goal_id = None if told.refusal else told.body.get("goal_id")
-        if goal_id is None:
-            return told.refusal or "the floor's answer names no mission"
-        self._missions[robot] = Mission(goal, str(goal_id), self._clock.now())
-        return ""
+        return told
 
     async def _get_result(self, robot: str, data: bytes) -> bytes:
         """Tell a goal's state at once: whoever asked would wait for nothing else meanwhile, and asks again."""
         asked = bytes(decoded_as("fognav_msgs/msg/GetResult", data).goal_id)
-        mission = self._missions.get(robot)
-        status = CANCELED if mission is not None else UNKNOWN  # an earlier goal has given way to the latest
-        if mission is not None and mission.goal == asked:
-            status = mission.status
+        mission = self._followed(robot)
+        is_latest = mission is not None and mission.goal == asked
+        status = mission.status if mission is not None and is_latest else self._earlier.get((robot, asked), UNKNOWN)
         result = ros.message("fognav_msgs/msg/GoalResult", status=status)
         return bytes(TYPES.serialize_cdr(result, "fognav_msgs/msg/GoalResult"))
 
@@ -298,22 +369,26 @@ class Fleet:
 
     async def _end_mission(self, robot: str, asked: bytes) -> tuple[int, list[RosMessage]]:
         """End the mission of this bridge that is meant; return a code of action_msgs/CancelGoal, and what has ended."""
-        mission, state = self._missions.get(robot), self._states[robot]
-        if mission is None or mission.status != EXECUTING or asked not in (_NO_GOAL, mission.goal):
-            if asked != _NO_GOAL:
-                return CANCEL_UNKNOWN_GOAL, []
-            if state.goal_id is None or state.goal_reached:
-                return CANCEL_NONE, []
-            self._refuse("goal", robot, "cancel_goal", "it drives for somebody else: an operator of Fognav ends that")
-            return CANCEL_REJECTED, []
-        condition = {"If-Match": f'"{mission.mission}"'}
-        told = await self._floor.ask(Request("DELETE", f"/api/v1/robots/{robot}/goal", headers=condition))
-        if told.refusal and told.problem not in _GONE:
-            self._refuse("goal", robot, "cancel_goal", told.refusal)
-            return CANCEL_REJECTED, []
-        mission.status = CANCELED
-        goal = np.frombuffer(mission.goal, np.uint8)
-        return CANCEL_NONE, [ros.message("fognav_msgs/msg/GoalInfo", goal_id=goal, stamp=self._time())]
+        mission = self._followed(robot)
+        is_meant = mission is not None and asked in (_NO_GOAL, mission.goal)
+        if mission is not None and is_meant and mission.status in (EXECUTING, ABORTED):
+            # Also of one that seems to be over the floor decides: its robot may only have been out of sight.
+            condition = {"If-Match": f'"{mission.mission}"'}
+            told = await self._floor.ask(Request("DELETE", f"/api/v1/robots/{robot}/goal", headers=condition))
+            if told.refusal and told.problem not in _GONE:
+                self._refuse("goal", robot, "cancel_goal", told.refusal)
+                return CANCEL_REJECTED, []
+            if not told.refusal or mission.status == EXECUTING:
+                mission.status = CANCELED
+                goal = np.frombuffer(mission.goal, np.uint8)
+                return CANCEL_NONE, [ros.message("fognav_msgs/msg/GoalInfo", goal_id=goal, stamp=self._time())]
+        if asked != _NO_GOAL:
+            return CANCEL_GOAL_TERMINATED if is_meant else CANCEL_UNKNOWN_GOAL, []
+        state = self._states[robot]
+        if state.goal_id is None or state.goal_reached or (mission is not None and state.goal_id == mission.mission):
+            return CANCEL_NONE, []
+        self._refuse("goal", robot, "cancel_goal", "it drives for somebody else: an operator of Fognav ends that")
+        return CANCEL_REJECTED, []
 
     def _time(self) -> RosMessage:
         return ros.header(self._clock.stamp()).stamp
@@ -323,3 +398,11 @@ def _duration(seconds: float) -> RosMessage:
     seconds = min(max(0.0, seconds), _SECONDS_MAX)
     whole = int(seconds)
     return ros.message("builtin_interfaces/msg/Duration", sec=whole, nanosec=int((seconds - whole) * 1e9))
+
+
+def _remember(kept: dict[Any, Any], key: object, value: object) -> None:
+    """Set a value, and drop the oldest of too many."""
+    kept.pop(key, None)
+    kept[key] = value
+    if len(kept) > REMEMBERED:
+        del kept[next(iter(kept))]

@@ -244,6 +244,25 @@ def test_hazards_and_zones_become_the_norms_zones_and_expire_at_the_sender():
     schema("3.0", "zoneSet").validate(message)
 
 
+@pytest.mark.parametrize(
+    ("measured", "on_map", "zone"),
+    [
+        (("clear", 0), {"state": "clear", "penalty": 0, "confirmed": True}, ()),
+        (("clear", 0), {"state": "clear", "penalty": 0, "confirmed": False}, ("SPEED_LIMIT", 0.15, None)),
+        (("clear", 0), {"state": "unknown", "penalty": 0, "confirmed": False}, ("SPEED_LIMIT", 0.15, None)),
+        (("clear", 0), {"state": "unknown", "penalty": 254, "confirmed": False}, ("BLOCKED", None, None)),
+        (("clear", 0), {"state": "blocked", "penalty": 254, "confirmed": True}, ("BLOCKED", None, None)),
+        (("clear", 0), None, ("SPEED_LIMIT", 0.15, None)),
+        (("blocked", 254), {"state": "clear", "penalty": 0, "confirmed": True}, ("BLOCKED", None, None)),
+        (("blocked", 254), None, ("BLOCKED", None, None)),
+        (("unknown", 200), {"state": "clear", "penalty": 0, "confirmed": True}, ("SPEED_LIMIT", 0.15, None)),
+    ],
+)  # fmt: skip
+def test_area_is_free_for_robots_of_others_only_while_the_map_shows_it_clear_and_confirmed(measured, on_map, zone):
+    found = sets_of({"a": area(*measured, on_map=on_map)})
+    assert told(found) == ({"area-a": zone} if zone else {})
+
+
 def test_what_blocks_more_is_told_at_once_and_what_clears_a_little_later():
     sets = sets_of({"a": area("clear")})
     empty = sets.current

@@ -197,6 +197,9 @@ def driving() -> Floorplan:
 RING = [[1.0, 1.0], [2.0, 1.0], [2.0, 2.0]]
 
 
-def area(state: str | None, penalty: int = 0) -> dict[str, Any]:
+def area(state: str | None, penalty: int = 0, on_map: dict[str, Any] | str | None = "the same") -> dict[str, Any]:
+    """An area as the console tells of it; `on_map`: what the map-service shows, None while nobody knows."""
     hazard = None if state is None else {"state": state, "penalty": penalty}
-    return {"definition": {"polygon": RING, "unknown": {"penalty": 200}}, "hazard": hazard}
+    if on_map == "the same":
+        on_map = None if hazard is None else {**hazard, "confirmed": True}
+    return {"definition": {"polygon": RING, "unknown": {"penalty": 200}}, "hazard": hazard, "on_map": on_map}

@@ -173,6 +173,44 @@ async def test_hazard_of_a_node_and_a_robots_pose_reach_the_page(all_services, c
             publishing.cancel()
 
 
+async def test_area_is_told_as_clear_and_confirmed_only_while_aggregator_and_map_service_live(all_services, console):
+    url, _, viewer = console
+    page = Page()
+    async with all_services.edges() as (mqtt, _, connect), reading(url, viewer, page) as read:
+        connect()
+        await mqtt.wait_connected()
+        begun = time.monotonic()
+
+        async def publish() -> None:
+            for seq in range(10_000):
+                uptime_ms = round(1000 * (time.monotonic() - begun))
+                far = NodeReading(
+                    seq=seq, boot=2, uptime_ms=uptime_ms, range_m=[2.5, 2.5], status=["ok", "ok"], state="clear"
+                )
+                await mqtt.publish(ch.NODE_READING, far, node="n1")
+                await asyncio.sleep(0.1)
+
+        def on_map() -> dict[str, object] | None:
+            return page.things["area"]["hall"]["on_map"]
+
+        publishing = asyncio.create_task(publish())
+        try:
+            await read(lambda: "ready" in page.got)
+            await read(lambda: on_map() == {"state": "clear", "penalty": 0, "confirmed": True})
+            all_services.kill("hazard_aggregator")
+            await read(lambda: on_map() is not None and not on_map()["confirmed"])
+            assert on_map()["state"] == "unknown"
+            assert page.things["area"]["hall"]["hazard"]["state"] == "clear", "nothing else tells it"
+            all_services.kill("map_service")
+            await read(lambda: on_map() is None)
+        finally:
+            publishing.cancel()
+            for module in ("hazard_aggregator", "map_service"):
+                if module not in all_services.processes:
+                    all_services.start(module)
+                    await all_services.ready(module)
+
+
 async def test_scan_of_a_robot_comes_to_who_asks_for_it_and_to_nobody_else(all_services, console):
     url, _, viewer = console
     asking, other = Page(), Page()

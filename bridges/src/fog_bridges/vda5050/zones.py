@@ -2,7 +2,8 @@
 
 A zone set never changes: each state of the floor is a set of its own, with an id by its content. A robot is sent it,
 told to enable it once it has it, and then to delete those before it. The format has no time to live, so the sender lets
-what it knows expire: what nobody confirms any more is slow, and what was blocked stays blocked (6.4).
+what it knows expire: what nobody confirms any more is slow, and what was blocked stays blocked (6.4). Whoever says so
+first, aggregator or map-service, blocks an area; it is clear only as long as the map shows that, confirmed.
 """
 
 from __future__ import annotations
@@ -44,14 +45,18 @@ def zones_of(areas: Mapping[str, dict[str, Any]], drawn: Mapping[str, dict[str, 
 
 
 def _of_area(name: str, area: dict[str, Any], *, known: bool) -> Zone | None:
-    definition, hazard = area["definition"], area["hazard"]
+    definition, hazard, on_map = area["definition"], area["hazard"], area.get("on_map")
     ring, zone = _points(definition["polygon"]), f"area-{name}"
     state = "unknown" if hazard is None else hazard["state"]
     penalty = definition["unknown"]["penalty"] if hazard is None else hazard["penalty"]
+    if on_map is not None:
+        penalty = max(penalty, on_map["penalty"])
+    if state == "clear" and not (known and on_map is not None and on_map["confirmed"]):
+        state = "unknown"
     if penalty >= LETHAL:
         words = f"area {name} is {state}"
         return Zone(zone_id=zone, zone_type="BLOCKED", zone_descriptor=words, vertices=ring)
-    if state == "unknown" or (state == "clear" and not known):
+    if state == "unknown":
         words = f"nobody knows whether area {name} is clear"
         return Zone(
             zone_id=zone, zone_type="SPEED_LIMIT", zone_descriptor=words, vertices=ring, maximum_speed=UNKNOWN_M_S

@@ -284,7 +284,7 @@ MAP_HEARTBEAT     = _pub(  "map_heartbeat",     FOG + "map/heartbeat",  m.MapHea
 MAP_SNAPSHOT      = _query("map_snapshot",      FOG + "map/snapshot",   None,           limit=0,
     publishers=(MAP,), subscribers=(PLANNER, ROBOT, WEB, BRIDGE), reply=m.MapSnapshot, reply_limit=64 * MIB)
 HAZARD            = _pub(  "hazard",            FOG + "hazards/{area}", m.HazardArea,   limit=64 * KIB,
-    publishers=(MAP,), subscribers=(PLANNER, ROBOT, CONSOLE, BRIDGE), durability=LATEST, epoch="epoch")
+    publishers=(MAP,), subscribers=(PLANNER, ROBOT, CONSOLE, WEB, BRIDGE), durability=LATEST, epoch="epoch")
 ZONES             = _pub(  "zones",             FOG + "zones",          m.ZoneSet,      limit=4 * MIB,
     publishers=(MAP,), subscribers=(PLANNER, ROBOT, WEB, BRIDGE), durability=LATEST, epoch="epoch")
 

@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any, Final, Literal
 
 import msgspec
 
+from console_service.areas import ShownAreas
 from console_service.log import CompactedLog
 from console_service.tiles import TiledMap
 from console_service.views import FloorRobot, PathView, Thing, VitalsView, ZoneView, scan_view
@@ -30,6 +31,7 @@ if TYPE_CHECKING:
         AreaDefinition,
         AreaHazard,
         AreaState,
+        HazardArea,
         MapDelta,
         MapHeartbeat,
         PlaceSet,
@@ -113,6 +115,7 @@ class ConsoleCore:
         self._robots: dict[str, _Robot] = {}
         self._fetched: dict[Fetched, dict[str, Any]] = {"area": {}, "node": {}, "alert": {}}
         self._refreshed: dict[tuple[str, str], tuple[bytes, float]] = {}
+        self._shown = ShownAreas()
         self._records: deque[str] = deque()
         for robot in robots:
             self._robots[robot.id] = _Robot(described=robot)
@@ -124,6 +127,7 @@ class ConsoleCore:
             {
                 ch.MAP_DELTA: self._on_delta,
                 ch.MAP_HEARTBEAT: self._on_heartbeat,
+                ch.HAZARD: self._on_shown,
                 ch.ZONES: self._on_zones,
                 ch.PLACES: self._on_places,
                 ch.ROBOT_GOAL: self._on_goal,
@@ -142,6 +146,7 @@ class ConsoleCore:
 
     def tick(self, at: Moment) -> Sequence[Publication]:
         """Advance to `at`; nothing is ever published."""
+        self._tell_areas(at.now)
         for robot, known in list(self._robots.items()):
             if known.pending is not None and at.now - known.pose_at >= POSE_PERIOD_S:
                 self._put_pose(robot, known, known.pending, at.now)
@@ -161,6 +166,8 @@ class ConsoleCore:
 
     def _on_heartbeat(self, _ids: Ids, heartbeat: MapHeartbeat, at: Moment) -> Sequence[Publication]:
         self._map.on_heartbeat(heartbeat, at.now)
+        self._shown.on_heartbeat(at.now - self._map.delay_s)
+        self._tell_areas(at.now)
         self._put_map()
         return ()
 
@@ -334,6 +341,18 @@ class ConsoleCore:
         self.wanted.update(dict.fromkeys(("area", "node")))
         return ()
 
+    def _on_shown(self, ids: Ids, shown: HazardArea, at: Moment) -> Sequence[Publication]:
+        self._shown.on_hazard(ids["area"], shown)
+        if (area := self._fetched["area"].get(ids["area"])) is not None:
+            self._put_fetched("area", ids["area"], area, at.now)
+        return ()
+
+    def _tell_areas(self, now: float) -> None:
+        """Tell all areas anew if the map-service has fallen silent, or is heard again."""
+        if self._shown.has_turned(now):
+            for area, value in self._fetched["area"].items():
+                self._put_fetched("area", area, value, now)
+
     def _on_definition(self, _ids: Ids, _definition: AreaDefinition, _at: Moment) -> Sequence[Publication]:
         self.wanted["area"] = None
         return ()
@@ -368,6 +387,8 @@ class ConsoleCore:
 
     def _put_fetched(self, event: Fetched, thing: str, value: Any, now: float) -> None:  # noqa: ANN401  # JSON
         """Tell a thing if it has changed, or if what always changes in it was told long ago."""
+        if event == "area":
+            value = {**value, "on_map": self._shown.view(thing, value.get("hazard"))}
         lasting = msgspec.json.encode(_without(value, VOLATILE.get(event, ())))
         before, told_at = self._refreshed.get((event, thing), (b"", -math.inf))
         if lasting != before or (event in VOLATILE and now - told_at >= REFRESH_S):

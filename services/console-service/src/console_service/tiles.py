@@ -96,6 +96,11 @@ class TiledMap:
         """Its geometry."""
         return self._geometry
 
+    @property
+    def delay_s(self) -> float:
+        """How long ago (s) it was true what the latest heartbeat says."""
+        return self._follower.delay_s
+
     def on_delta(self, delta: MapDelta, now: float) -> None:
         """Apply a delta."""
         self._mark(self._follower.on_delta(delta, now))

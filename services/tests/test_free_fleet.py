@@ -4,15 +4,19 @@ import asyncio
 import json
 import os
 import struct
+import time
 from pathlib import Path
 
+import httpx
+import msgspec
 import pytest
 import zenoh
 from manual_clock import ManualClock
 
 from fog_bridges.floor import Answer, Request
-from fog_bridges.free_fleet import Fleet, Planned
+from fog_bridges.free_fleet import UNSEEN_S, Fleet, Planned
 from fog_bridges.ros2.session import ros_config
+from fog_contracts import channels as ch
 from fog_contracts.messages import RobotPose, RobotState
 
 pytestmark = pytest.mark.live
@@ -299,6 +303,75 @@ async def test_one_request_to_all_robots_and_one_of_many_bytes_are_refused(rig):
     assert all(await asyncio.to_thread(ask, f"*/{action}", goal(4.0)))
     assert await asyncio.to_thread(ask, f"r_1/{action}", bytes(5000)) == [True]
     assert len(rig.floor.asked) == 1
+
+
+@pytest.fixture
+async def fog(all_services, tokens, ros_router):
+    """Run the console-service and the bridge to free_fleet; yield the fog."""
+    urls = {
+        f"FOGNAV_{name}_URL": await all_services.ready(module)
+        for name, module in (("AGGREGATOR", "hazard_aggregator"), ("MAP", "map_service"), ("PLANNER", "planner"))
+    }
+    all_services.start("console_service", **urls)
+    token = all_services.folder / "free-fleet-token"
+    token.write_text(tokens["operator"]["Authorization"].removeprefix("Bearer "))
+    all_services.start(
+        "fog_bridges", FOGNAV_ADAPTERS="free-fleet", FOGNAV_FREE_FLEET_ROUTER=f"tcp/127.0.0.1:{ros_router}",
+        FOGNAV_CONSOLE_URL=await all_services.ready("console_service"), FOGNAV_TOKEN_FILE=str(token),
+        FOGNAV_CREDENTIALS_FILE=str(all_services.security.credentials("bridge")),
+    )  # fmt: skip
+    await all_services.ready("fog_bridges")
+    yield all_services
+    for module in ("fog_bridges", "console_service"):
+        all_services.kill(module)
+
+
+async def test_planner_decides_which_missions_go_on_whatever_a_robot_forgets(fog, ros_router, tokens):
+    """The robot of this test tells of no mission, as one does whose agent is being started anew."""
+    peer = zenoh.open(ros_config(f"tcp/127.0.0.1:{ros_router}"))
+
+    async def ask(name: str, payload: bytes) -> bytes:
+        key = f"r_1/navigate_to_pose/_action/{name}"
+        async with asyncio.timeout(60.0):
+            while not (replies := await asyncio.to_thread(lambda: list(peer.get(key, payload=payload, timeout=10.0)))):  # noqa: ASYNC110  # of another process
+                await asyncio.sleep(0.1)  # until the robot is served
+        assert replies[0].ok is not None, replies[0].err
+        return replies[0].ok.payload.to_bytes()
+
+    async def result_is(expected: int) -> None:
+        async with asyncio.timeout(60.0):
+            while (found := status(await ask("get_result", b"\0\1\0\0" + GOAL))) != expected:
+                assert found == EXECUTING
+                await asyncio.sleep(0.1)
+
+    async with fog.edges() as (_, edge, _connect):
+
+        async def publish() -> None:
+            while True:
+                for channel, message in ((ch.ROBOT_STATE, STATE), (ch.ROBOT_POSE, POSE)):
+                    edge.publish(channel, msgspec.structs.replace(message, stamp=time.time()), robot="r-1")
+                await asyncio.sleep(0.2)
+
+        publishing = asyncio.create_task(publish())
+        client = httpx.AsyncClient(base_url=await fog.ready("planner"), timeout=30.0, headers=tokens["operator"])
+        path = "/api/v1/robots/r-1/goal"
+        try:
+            assert (await ask("send_goal", goal(4.0)))[4] == 1
+            deadline = time.monotonic() + UNSEEN_S + 2.0
+            while time.monotonic() < deadline:
+                await asyncio.sleep(1.0)
+                assert status(await ask("get_result", b"\0\1\0\0" + GOAL)) == EXECUTING
+            assert (await client.delete(path)).status_code == 204
+            await result_is(ABORTED)
+            assert (await ask("send_goal", goal(4.0)))[4] == 1
+            answer = await ask("cancel_goal", EVERYTHING)
+            assert (answer[4], answer[12:28]) == (0, GOAL)
+            assert (await client.get(path)).status_code == 404
+            await result_is(CANCELED)
+        finally:
+            publishing.cancel()
+            await client.aclose()
+            peer.close()
 
 
 async def test_free_fleets_own_programs_drive_a_robot(rig, tmp_path, ros_router, until):

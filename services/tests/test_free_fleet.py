@@ -23,6 +23,11 @@ pytestmark = pytest.mark.live
 PEERS = "FOGNAV_ROS2_PEERS"
 PROGRAMS = "FOGNAV_FREE_FLEET"
 """A checkout of github.com/open-rmf/free_fleet; its programs need pycdr2 beside zenoh."""
+theirs = pytest.mark.skipif(
+    PEERS not in os.environ or PROGRAMS not in os.environ,
+    reason=f"set {PROGRAMS} to a checkout of github.com/open-rmf/free_fleet, and {PEERS} to a Python that has "
+    "eclipse-zenoh, numpy and pycdr2",
+)
 GOAL, OTHER = bytes(range(16)), bytes([9] * 16)
 EVERYTHING = b"\0\1\0\0" + bytes(24)
 """A request to cancel whichever goal there is."""
@@ -374,10 +379,47 @@ async def test_planner_decides_which_missions_go_on_whatever_a_robot_forgets(fog
             peer.close()
 
 
+@theirs
+async def test_free_fleets_own_adapter_plans_anew_for_a_mission_that_an_operator_ends_and_for_no_other(rig, ros_router):
+    peer = await asyncio.create_subprocess_exec(
+        os.environ[PEERS], "-u", str(Path(__file__).with_name("free_fleet_peer.py")), os.environ[PROGRAMS],
+        f"tcp/127.0.0.1:{ros_router}", "r_1", stdin=asyncio.subprocess.PIPE, stdout=asyncio.subprocess.PIPE,
+    )  # fmt: skip
+
+    async def order(text: str) -> list[int]:
+        assert peer.stdin is not None
+        assert peer.stdout is not None
+        peer.stdin.write(f"{text}\n".encode())
+        async with asyncio.timeout(60.0):
+            return [int(number) for number in (await peer.stdout.readline()).split()]
+
+    try:
+        while (await order("navigate 4.0"), rig.floor.asked)[1] == []:
+            pass  # the robot is not known to it yet: it has heard no answer
+        replans = (await order("update"))[1]
+        assert await order("update") == [0, replans], "it goes on"
+        rig.end("g1", "cancel")
+        assert await order("update") == [0, replans + 1]
+        await order("navigate 5.0")
+        assert [request.method for request in rig.floor.asked] == ["PUT", "DELETE", "PUT"]
+        rig.state("g3")
+        rig.plan("g3")
+        rig.state(None, waits=True)
+        rig.clock.advance(60.0)
+        assert await order("update") == [0, replans + 1], "the robot's agent is started anew"
+        rig.state("g3", reached=True)
+        assert await order("update") == [1, replans + 1]
+        await order("navigate 6.0")
+        await order("stop")
+        assert rig.floor.asked[-1].method == "DELETE"
+        assert await order("update") == [2, replans + 1], "what it has canceled itself is done with"
+    finally:
+        peer.kill()
+        await peer.wait()
+
+
+@theirs
 async def test_free_fleets_own_programs_drive_a_robot(rig, tmp_path, ros_router, until):
-    if PEERS not in os.environ or PROGRAMS not in os.environ:
-        pytest.skip(f"set {PROGRAMS} to a checkout of github.com/open-rmf/free_fleet, and {PEERS} to a Python that has "
-                    "eclipse-zenoh, numpy and pycdr2")  # fmt: skip
     root, config = Path(os.environ[PROGRAMS]), tmp_path / "client.json"
     programs = root / "free_fleet_examples" / "free_fleet_examples"
     config.write_text(json.dumps({

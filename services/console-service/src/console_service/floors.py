@@ -11,6 +11,7 @@ import asyncio
 import re
 import time
 import tomllib
+from contextlib import aclosing
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Annotated, Final, Literal, NamedTuple, TypeVar
 from urllib.parse import urlsplit
@@ -18,6 +19,7 @@ from urllib.parse import urlsplit
 import httpx
 import msgspec
 from prometheus_client import Gauge
+from starlette.requests import Request
 
 from console_service.forward import CONSOLE, PLANNER, Forward
 from console_service.views import FloorRobot
@@ -34,8 +36,6 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Collection
     from pathlib import Path
 
-    from starlette.requests import Request
-
     from console_service.core import ConsoleCore
     from fog_runtime.clock import Clock
     from fog_runtime.health import Health
@@ -49,6 +49,8 @@ AWAY_S: Final = 10.0
 """A robot that was not heard for so long is away: it holds by itself, and its silence does not make a stop fail."""
 ANSWER_LIMIT: Final = 1 << 20
 """Bytes of an answer: a floor that somebody has taken over must not fill the memory of another."""
+_LISTED_S: Final = 1.0
+"""How long the planner may take to list its robots; those that are known are stopped meanwhile."""
 _ASK: Final = httpx.Timeout(2.0)
 _STOP: Final = httpx.Timeout(6.0, connect=3.0)
 """A robot has 2 s to answer; a first packet that is lost is sent again after 1 s."""
@@ -87,7 +89,8 @@ class RobotStop(Message, frozen=True, kw_only=True):
 class FloorStop(Message, frozen=True, kw_only=True):
     """What became of a floor's stop. Acknowledged: all its robots but those that are away said that they stop.
 
-    Otherwise `detail` says why, and what to do.
+    That takes somebody who knows them: the planner's list, for callers who may read it, or a console-service that has
+    listened for a while. Otherwise `detail` says why, and what to do.
     """
 
     id: Id
@@ -210,17 +213,50 @@ class OwnFloor:
         """Stop all its robots at once, for the caller of a request; the planner sends and records it."""
         robots, _ = self._core.floor(self._now())
         # Only who has listened for a while knows that a robot is silent.
-        knows = time.monotonic() - self._begun_at >= AWAY_S and not self._health.report()["missing"]
-        asked = await asyncio.gather(*(self._stop(robot, request) for robot in robots))
+        lacks = ", ".join(map(str, self._health.report()["missing"]))
+        knows = time.monotonic() - self._begun_at >= AWAY_S and not lacks
+        known, further = await asyncio.gather(
+            asyncio.gather(*(self._stop(robot, request) for robot in robots)),
+            self._stop_further({robot.id for robot in robots}, request),
+        )
+        asked = [*zip(robots, known, strict=True), *(further or ())]
         failed = [
             f"{stop.id}: {stop.detail}"
-            for (stop, has_answered), robot in zip(asked, robots, strict=True)
+            for robot, (stop, has_answered) in asked
             if not stop.stopped and not (has_answered and knows and _is_away(robot))
         ]
-        if not robots and PLANNER in await self._forward.readiness():
+        if not asked and PLANNER in await self._forward.readiness():
             failed = ["its planner does not run, and no robot is known"]
+        elif further is None and not knows:
+            why = f"it is not connected to {lacks}" if lacks else f"it has begun less than {AWAY_S:g} s ago"
+            failed.append(f"the console-service may not know all robots: {why} (`fognav status`)")
         detail = "; ".join(failed) + (". Stop what still drives on the spot, and press again" if failed else "")
-        return FloorStop(id=self.id, acknowledged=not failed, robots=[stop for stop, _ in asked], detail=detail)
+        return FloorStop(id=self.id, acknowledged=not failed, robots=[stop for _, (stop, _) in asked], detail=detail)
+
+    async def _stop_further(
+        self, known: Collection[str], request: Request
+    ) -> list[tuple[FloorRobot, tuple[RobotStop, bool]]] | None:
+        """Stop the robots of which only the planner knows; None if it does not tell the caller of its robots.
+
+        Those of the site it knows, and all that it has heard.
+        """
+        asking = Request({**request.scope, "method": "GET"})
+        try:
+            async with asyncio.timeout(_LISTED_S):
+                async with aclosing(await self._forward.send(PLANNER, asking, b"/api/v1/robots", b"")) as answer:
+                    text = await answer.aread()
+            listed = msgspec.json.decode(text, type=list[_Named]) if answer.is_success else None
+        except (ProblemError, httpx.TransportError, TimeoutError, msgspec.MsgspecError) as error:
+            _log.warning("robots_unknown", reason=repr(error))
+            return None
+        if listed is None:
+            return None  # a stop needs no token, and this does
+        robots = [
+            FloorRobot(id=robot.id, age_s=None, mode=None, enabled=None, codes=[])
+            for robot in listed
+            if robot.id not in known
+        ]
+        return [*zip(robots, await asyncio.gather(*(self._stop(robot, request) for robot in robots)), strict=True)]
 
     async def _stop(self, robot: FloorRobot, request: Request) -> tuple[RobotStop, bool]:
         """Stop a robot; return what became of it, and whether it is the planner that says so."""
@@ -239,6 +275,10 @@ class OwnFloor:
 
 def _is_away(robot: FloorRobot) -> bool:
     return robot.age_s is None or robot.age_s > AWAY_S
+
+
+class _Named(msgspec.Struct):
+    id: Id
 
 
 class _Problem(msgspec.Struct):

@@ -243,6 +243,26 @@ def test_robot_that_is_suddenly_surrounded_is_weak_but_never_lost_and_good_again
     assert localizer.status == "good"
 
 
+@pytest.mark.parametrize("open_beams", [0, 4])
+def test_robot_that_people_surround_whole_is_weak_and_good_again_where_it_stood(open_beams):
+    """It was lost for passing through walls, and searched the whole map, until somebody let it drive."""
+    place = PLACES[1]
+    localizer, now = standing(place, prepare=lambda one: one.initial_pose(*place))
+    seen = []
+    for number in range(60):
+        scan = measure_scan(lambda _: place, now, now + 0.16, noise=0.01, seed=number)
+        ranges = np.where(np.arange(360) < open_beams, scan.ranges_m, np.fmin(scan.ranges_m, 0.6))
+        localizer.on_odometry(now + 0.16, 0.0, 0.0, 0.0)
+        localizer.on_scan(replace(scan, ranges_m=ranges), now + 0.17)
+        seen.append(localizer.status)
+        now += 0.18
+    assert set(seen) == {"weak"}
+    assert "too few beams reach a wall" in localizer.detail
+    assert error_of(localizer, now, place)[0] < 0.06
+    standing(place, localizer=localizer, start=now, scans=3)
+    assert localizer.status == "good"
+
+
 def carried(localizer, now, place, *, scans):
     """Let the robot stand at another place than its odometry says; return (pose, status, searching) after each scan."""
     seen = []

@@ -60,6 +60,13 @@ def test_beams_through_walls_contradict_and_objects_before_walls_do_not():
     assert before.explained < 0.5
 
 
+def test_scan_of_which_all_beams_end_before_walls_contradicts_nothing_and_speaks_for_no_new_pose():
+    surrounded = evaluate_fit(FIELDS, PLACE, 0.3 * points_at(PLACE), 12.0)
+    assert (surrounded.informative, surrounded.contradict) == (0, 0.0)
+    assert monitor_after(GOOD, GOOD, *[surrounded] * 40).status == "weak"
+    assert monitor_after(*[surrounded] * 40).status == "none"
+
+
 def test_scan_without_beams_counts_as_contradiction():
     fit = evaluate_fit(FIELDS, PLACE, np.zeros((0, 2)), 12.0)
     assert (fit.informative, fit.contradict) == (0, 1.0)

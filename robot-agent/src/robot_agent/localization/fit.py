@@ -62,9 +62,10 @@ class Fit:
     """How a scan fits the map at a pose, as shares of the beams.
 
     agree: end at a wall of the map, of the informative and short ones. explained: the same, of all. contradict: share
-    of agreeing and overlong beams that pass through a wall, which no unknown object can cause. informative: number of
-    beams that reached the map, as opposed to those that ended at unknown objects before it. blurred: share of the
-    agreeing beams that end beside their wall rather than on it, as they do at a place that only resembles the true one.
+    of agreeing and overlong beams that pass through a wall, which no unknown object can cause: 0 where all end before
+    one. informative: number of beams that reached the map, as opposed to those that ended at unknown objects before it.
+    blurred: share of the agreeing beams that end beside their wall rather than on it, as they do at a place that only
+    resembles the true one.
     """
 
     agree: float
@@ -90,7 +91,7 @@ def evaluate_fit(fields: MapFields, pose: Pose2, points: NDArray[np.float64], ra
     return Fit(
         agree=beams.agree / max(informative + beams.short, 1),
         explained=beams.agree / max(len(points), 1),
-        contradict=beams.long / informative if informative else 1.0,
+        contradict=beams.long / informative if informative else float(not beams.short),
         informative=informative,
         blurred=beams.beside / beams.agree if beams.agree else 0.0,
     )
@@ -191,7 +192,9 @@ class FitMonitor:
         return "weak", reason or self.detail
 
     def _is_steadily_weak(self, fit: Fit) -> bool:
-        return fit.contradict <= _CONTRADICTION_LIMIT and list(self._recent)[-4:] == ["weak"] * 4
+        # What stands all around a robot speaks against no place, and for none.
+        told = fit.informative > 0 and fit.contradict <= _CONTRADICTION_LIMIT
+        return told and list(self._recent)[-4:] == ["weak"] * 4
 
     def _count_trial(self) -> None:
         self.trial_failed = False

@@ -9,7 +9,7 @@ Units are m, rad, s; `now` is the caller's monotonic clock.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Annotated, Final, Generic, Literal, NamedTuple, Protocol, TypeVar, runtime_checkable
 
 import msgspec
@@ -167,6 +167,8 @@ class LaserScan:
     started_at, ended_at: arrival of the first and last sample (s of the caller's clock), interpolated in a batch.
     repeats: 1, and 1 more for each scan in a row that is identical, in every decoded bit, to one of the 64 before it,
     this one included. A working lidar never gives two equal ones; a stuck link or a driver that replays a buffer does.
+    masked: bool[n], the samples that look at the robot itself, nan whatever they met; None: there are none. They stay
+    in their places, because the times of the others follow from their order.
     """
 
     angles_rad: NDArray[np.float64]
@@ -175,6 +177,17 @@ class LaserScan:
     started_at: float
     ended_at: float
     repeats: int
+    masked: NDArray[np.bool_] | None = None
+
+    def unmasked(self) -> LaserScan:
+        """Return the scan without its masked samples, which say nothing of what is there: not for times of samples."""
+        if self.masked is None:
+            return self
+        seen = ~self.masked
+        return replace(
+            self, angles_rad=self.angles_rad[seen], ranges_m=self.ranges_m[seen], quality=self.quality[seen],
+            masked=None,
+        )  # fmt: skip
 
 
 @dataclass(frozen=True, slots=True, eq=False)

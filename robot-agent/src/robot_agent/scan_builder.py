@@ -194,25 +194,26 @@ class Mounting:
         return not (self.mirrored or self.latency_s or self.masks)
 
     def apply(self, scan: LaserScan) -> LaserScan:
-        """Return the scan with true angles and times, without the samples of masked directions.
+        """Return the scan with true angles and times, those samples masked that are in a masked direction.
 
-        A masked sample is left out and is not one without a return, which would mean that nothing is there.
+        They stay in their places, because the times of the others follow from their order.
         """
         angles = _wrapped(-scan.angles_rad) if self.mirrored else scan.angles_rad
-        seen = ~self.masked(angles)
+        masked = self.masked(angles)
         return replace(
             scan,
-            angles_rad=angles[seen],
-            ranges_m=scan.ranges_m[seen],
-            quality=scan.quality[seen],
+            angles_rad=angles,
+            ranges_m=np.where(masked, np.nan, scan.ranges_m),
+            quality=np.where(masked, np.uint8(0), scan.quality),
             started_at=scan.started_at - self.latency_s,
             ended_at=scan.ended_at - self.latency_s,
+            masked=masked if masked.any() else None,
         )
 
     def apply_to_samples(self, samples: LidarSamples) -> LidarSamples:
         """Return the samples with true angles and times, those of masked directions without a return.
 
-        They stay in their places, because the times of the others follow from their order.
+        They stay in their places, as in `apply`.
         """
         angles = _wrapped(-samples.angles_rad) if self.mirrored else samples.angles_rad
         ranges = np.where(self.masked(angles), np.float32(np.nan), samples.ranges_m)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 
+import msgspec
 import numpy as np
 import pytest
 from hypothesis import given
@@ -12,6 +13,8 @@ from hypothesis import strategies as st
 from fog_contracts.robot import BaseSettings, LidarSettings, RobotSettings
 from fog_runtime.configuration.robot_file import RobotFile
 from fognav_sim.sensors import LidarPlace
+from robot_agent.agent.recording.input_log import ScanReceived
+from robot_agent.agent.safety_supervisor import LidarSource
 from robot_agent.config import LocalizationConfig
 from robot_agent.hardware import LaserScan, LidarSamples
 from robot_agent.lidars.rplidar_a1.emulator import RplidarEmulator
@@ -30,12 +33,48 @@ def scan_of(angles=ANGLES, ranges=None):
 
 def test_a_mask_removes_its_sector_in_the_frame_of_the_robot_also_across_the_back():
     mounting = Mounting(yaw_rad=0.5, masks=((3.0, -3.0), (0.4, 0.6)))
-    scan = mounting.apply(scan_of())
+    scan = mounting.apply(scan_of()).unmasked()
     bearings = np.remainder(scan.angles_rad + 0.5 + math.pi, math.tau) - math.pi
     assert not ((bearings > 3.0) | (bearings < -3.0) | ((bearings > 0.4) & (bearings < 0.6))).any()
     lost = ANGLES.size - bearings.size
     assert lost == pytest.approx(360 * (math.tau - 6.0 + 0.2) / math.tau, abs=2)
     assert len(scan.ranges_m) == len(scan.quality) == len(bearings)
+
+
+def test_masked_samples_move_none_of_the_others_in_time():
+    """A wall at y = -1 m, seen by a robot that turns once in four seconds: the masks were cut out of the turn."""
+    odometry, times = OdometryBuffer(), np.linspace(1.0, 1.18, ANGLES.size)
+    for number in range(60):
+        odometry.add(0.9 + 0.005 * number, 0.0, 0.0, 1.5 * 0.005 * number)
+    bearings = ANGLES + 1.5 * (times - 0.9)
+    with np.errstate(divide="ignore"):
+        ranges = np.where(np.sin(bearings) < -0.2, -1.0 / np.sin(bearings), np.nan)
+    masked = Mounting(masks=((-3.1, -1.9), (0.1, 2.0))).apply(scan_of(ranges=ranges))
+    logged = msgspec.json.decode(msgspec.json.encode(ScanReceived.of(masked, 1.2)), type=ScanReceived)
+    for scan in (masked, logged.scan()):
+        deskewed = deskew(scan, odometry, LocalizationConfig())
+        points = deskewed.odom.transform(deskewed.points)
+        assert len(points) > 60
+        assert points[:, 1] == pytest.approx(-1.0, abs=1e-3)
+        assert np.array_equal(scan.masked, masked.masked)
+
+
+def test_a_scan_of_a_log_from_before_masks_were_kept_in_place_is_read_as_it_is():
+    entry = msgspec.json.decode(msgspec.json.encode(ScanReceived.of(scan_of(), 1.2)))
+    del entry["masked"]
+    scan = msgspec.convert(entry, ScanReceived, strict=False).scan()
+    assert scan.masked is None
+    assert np.array_equal(scan.ranges_m, scan_of().ranges_m)
+    assert scan.unmasked() is scan
+
+
+def test_a_lidar_of_which_most_is_masked_does_not_count_as_one_that_sees_nothing():
+    masked = Mounting(masks=((0.2, -0.2),)).apply(scan_of())
+    source = LidarSource(returns_least=0.5)
+    source.on_scan(masked, 1.2)
+    assert source.empty_scans == 0
+    source.on_scan(Mounting(masks=((0.2, -0.2),)).apply(scan_of(ranges=np.full(ANGLES.size, np.nan))), 1.4)
+    assert source.empty_scans == 1
 
 
 def test_latency_moves_the_times_of_a_scan():

@@ -206,7 +206,7 @@ class BringupView(RobotView):
         if self._own is None:
             self._own = OwnReturns(self.config.footprint.vertices, (lidar.lidar_x, lidar.lidar_y, lidar.lidar_yaw))
         left, right = self._rolled
-        self._own.take(entry.scan(), (right - left) / self.config.drive_train.axle_m)
+        self._own.take(entry.scan().unmasked(), (right - left) / self.config.drive_train.axle_m)
 
     # --- what follows of it -----------------------------------------------------------------------------------------
 
@@ -253,7 +253,7 @@ class BringupView(RobotView):
         recent = [entry for entry in self._scans if entry.now > self._now - _SEEN_S]
         span = recent[-1].ended_at - recent[0].ended_at if recent else 0.0
         rate = (len(recent) - 1) / span if len(recent) >= _RATE_SCANS and span > 0.0 else None
-        scans = [entry.scan() for entry in recent]
+        scans = [entry.scan().unmasked() for entry in recent]
         samples = float(np.mean([len(scan.ranges_m) for scan in scans])) if scans else 0.0
         found.append(findings.lidar_rate(rate, rated, samples))
         if self.config is not None:

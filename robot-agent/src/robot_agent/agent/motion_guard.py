@@ -156,8 +156,9 @@ class LidarView:
 
     def on_scan(self, scan: LaserScan, pose: Pose2 | None, replica: Replica) -> None:
         """Handle a whole scan that ended at `pose` (frame `map`; None while it is unknown: nothing is expected)."""
-        angles = np.asarray(scan.angles_rad, np.float64) + self._lidar.lidar_yaw
-        self.visibility.update(angles, np.isfinite(scan.ranges_m), self._expected(pose, replica))
+        looked = scan.unmasked()
+        angles = np.asarray(looked.angles_rad, np.float64) + self._lidar.lidar_yaw
+        self.visibility.update(angles, np.isfinite(looked.ranges_m), self._expected(pose, replica))
 
     def _expected(self, pose: Pose2 | None, replica: Replica) -> NDArray[np.bool_]:
         """Return in which sectors the map has a wall within the range at which the lidar surely sees one."""

@@ -96,7 +96,8 @@ class LidarSource:
         """Record that a whole scan arrived."""
         self._scan_at = self._samples_at = now
         self.identical_scans = scan.repeats
-        empty = np.isfinite(scan.ranges_m).sum() < self._returns_least * len(scan.ranges_m)
+        ranges = scan.unmasked().ranges_m
+        empty = np.isfinite(ranges).sum() < self._returns_least * len(ranges)
         self.empty_scans = self.empty_scans + 1 if empty else 0
 
     def samples_age(self, now: float) -> float:

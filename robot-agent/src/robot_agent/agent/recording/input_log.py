@@ -187,7 +187,11 @@ class LidarSamplesReceived(Input, frozen=True, kw_only=True):
 
 
 class ScanReceived(Input, frozen=True, kw_only=True):
-    """A whole scan: its arrays as bytes, float64, float64 and uint8, little-endian, so that they come back exactly."""
+    """A whole scan: its arrays as bytes, float64, float64 and uint8, little-endian, so that they come back exactly.
+
+    masked: a byte for each sample, 1 if it looks at the robot itself; empty: none does. Logs of releases before it lack
+    it: they have no masked samples at all, so those that are left seem later or earlier than they were.
+    """
 
     angles_rad: bytes
     ranges_m: bytes
@@ -196,6 +200,7 @@ class ScanReceived(Input, frozen=True, kw_only=True):
     ended_at: float
     repeats: int
     now: float
+    masked: bytes = b""
 
     @classmethod
     def of(cls, scan: LaserScan, now: float) -> ScanReceived:
@@ -208,6 +213,7 @@ class ScanReceived(Input, frozen=True, kw_only=True):
             ended_at=float(scan.ended_at),
             repeats=int(scan.repeats),
             now=now,
+            masked=b"" if scan.masked is None else np.asarray(scan.masked, np.bool_).tobytes(),
         )
 
     def scan(self) -> LaserScan:
@@ -219,6 +225,7 @@ class ScanReceived(Input, frozen=True, kw_only=True):
             started_at=self.started_at,
             ended_at=self.ended_at,
             repeats=self.repeats,
+            masked=np.frombuffer(self.masked, np.bool_) if self.masked else None,
         )
 
 

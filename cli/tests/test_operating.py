@@ -519,6 +519,43 @@ def test_goal_on_another_floor_is_a_way_by_the_lift(demo: Service) -> None:
     assert demo.requests[0][2] == {"place": "desk", "floor": "upstairs"}
 
 
+def test_mission_by_the_clock_says_what_is_asked_for_and_what_became_of_the_last_one(demo: Service) -> None:
+    times = [{"days": ["mon", "tue"], "begin": "08:00", "end": "09:00"}]
+    last = {"begin": 0.0, "outcome": "missed", "reason": "robot r1 has another mission"}
+    made: tuple[int, dict[str, object]] = 201, {
+        "id": "post", "robot": "r1",
+        "mission": {"stops": [{"place": "desk"}, {"place": None, "pose": {"x": 1, "y": 2}}]},
+        "weekly": {"time_zone": "Europe/Lisbon", "times": times}, "enabled": True, "waits": "", "next": None,
+        "last": last, "version": "v1",
+    }  # fmt: skip
+    demo.answers["PUT", "/api/v1/schedules/post"] = made
+    told = run(
+        "mission", "schedule", "post", "desk", "1,2", "--each", "mon,tue 08:00-09:00", "--time-zone", "Europe/Lisbon",
+        "--when-cut", "nearest", "--limit", "10m", "--best",
+    )  # fmt: skip
+    assert demo.requests[0][2] == {
+        "robot": "r1",
+        "mission": {
+            "stops": [{"place": "desk"}, {"pose": {"x": 1.0, "y": 2.0}}],
+            "order": "best",
+            "priority": 0,
+            "when_cut": {"do": "nearest", "limit_s": 600.0},
+        },
+        "weekly": {"time_zone": "Europe/Lisbon", "times": times},
+        "enabled": True,
+    }
+    assert told.startswith("post: r1 to desk, (1.00, 2.00), mon,tue 08:00-09:00 Europe/Lisbon; the one of ")
+    assert told.endswith("was missed (robot r1 has another mission)")
+    demo.answers["GET", "/api/v1/schedules/post"] = made
+    run("mission", "disable", "post")
+    assert demo.requests[-1][:2] == ("PUT", "/api/v1/schedules/post")
+    sent = demo.requests[-1][2]
+    assert isinstance(sent, dict)
+    assert (sent["enabled"], sent["weekly"]) == (False, made[1]["weekly"])
+    wrong = run("mission", "schedule", "post", "desk", "--each", "always", "--time-zone", "UTC", code=2)
+    assert "give days and times" in wrong
+
+
 @pytest.mark.parametrize("goal", ["5.0", "Meeting room", ""])
 def test_goal_that_is_neither_a_place_nor_a_position_is_wrong_use(demo: Service, goal: str) -> None:
     assert "is neither a place" in run("robot", "goal", goal, code=2)

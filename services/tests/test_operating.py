@@ -39,7 +39,8 @@ class Operator:
         self, method: str, path: str, body: object = None, *, role: str = "operator", **headers: str
     ) -> httpx.Response:
         part = path.split("/")[3].partition("?")[0]
-        service = {"areas": "hazard_aggregator", "robots": "planner", "plan": "planner"}.get(part, "map_service")
+        planner = dict.fromkeys(("robots", "plan", "schedules"), "planner")
+        service = {"areas": "hazard_aggregator", **planner}.get(part, "map_service")
         url = f"{self._urls[service]}{path}"
         return await self._client.request(method, url, json=body, headers={**self._tokens[role], **headers})
 
@@ -312,8 +313,8 @@ async def test_geojson_with_wrong_features_changes_nothing_and_names_each_of_the
     ]
     before = (await operator.ask("GET", "/api/v1/zones")).json()["zones"]
     answer = await operator.ask("POST", "/api/v1/zones.geojson", {"type": "FeatureCollection", "features": features})
+    assert answer.status_code == 422, answer.text
     errors = {error["field"]: error["problem"] for error in answer.json()["errors"]}
-    assert answer.status_code == 422
     assert list(errors) == [
         "body.features.1.geometry", "body.features.2.properties.radius", "body.features.3.properties.factor",
         "body.features.4.geometry", "body.features.5.id", "body.features.6.geometry",
@@ -323,3 +324,31 @@ async def test_geojson_with_wrong_features_changes_nothing_and_names_each_of_the
     unknown = feature({"type": "MultiPoint", "coordinates": []})
     answer = await operator.ask("POST", "/api/v1/zones.geojson", {"type": "FeatureCollection", "features": [unknown]})
     assert answer.json()["errors"][0]["field"] == "body.features.0.geometry.type"
+
+
+async def test_operator_schedules_a_mission_which_is_kept_and_starts_nothing_at_once(operator):
+    times = [{"days": ["mon", "tue", "wed", "thu", "fri", "sat", "sun"], "begin": "00:00", "end": "23:59"}]
+    mission = {"stops": [place(7.0)], "when_cut": {"do": "nearest"}}
+    body = {"robot": "r1", "mission": mission, "weekly": {"time_zone": "Europe/Lisbon", "times": times}}
+    path = "/api/v1/schedules/round"
+    for change, field in (
+        ({"robot": "r9"}, None),
+        ({"mission": {"stops": [{"place": "nowhere"}]}}, "body.mission.stops.0.place"),
+        ({"weekly": {"time_zone": "Europe/Atlantis", "times": times}}, "body.weekly.time_zone"),
+    ):
+        answer = await operator.ask("PUT", path, {**body, **change})
+        assert answer.status_code in (404, 422), answer.text
+        assert field is None or field in answer.text
+    assert (await operator.ask("PUT", path, body, role="viewer")).status_code == 403
+    made = await operator.ask("PUT", path, body, **{"If-None-Match": "*"})
+    assert (made.status_code, made.json()["last"], made.json()["waits"]) == (201, None, "")
+    assert made.json()["next"] is None or made.json()["next"] > made.json()["since"], "None: no synchronized clock"
+    assert (await operator.ask("PUT", path, body, **{"If-None-Match": "*"})).status_code == 412
+    changed = await operator.ask("PUT", path, {**body, "enabled": False}, **{"If-Match": made.headers["etag"]})
+    assert (changed.status_code, changed.json()["next"]) == (200, None)
+    assert (await operator.ask("PUT", path, body, **{"If-Match": made.headers["etag"]})).status_code == 412
+    (listed,) = (await operator.ask("GET", "/api/v1/schedules", role="viewer")).json()
+    assert (listed["id"], listed["mission"], listed["enabled"]) == ("round", made.json()["mission"], False)
+    assert (await operator.ask("GET", "/api/v1/robots/r1/goal", role="viewer")).status_code == 404, "nothing has begun"
+    assert (await operator.ask("DELETE", path)).status_code == 204
+    assert (await operator.ask("GET", path, role="viewer")).status_code == 404

@@ -187,6 +187,9 @@ class MemoryStore:
     async def out_of_service(self) -> dict[str, Any]:
         return {}
 
+    async def schedules(self) -> dict[str, Any]:
+        return {}
+
     async def learned(self) -> Learned:
         return Learned({}, {})
 

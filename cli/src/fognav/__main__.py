@@ -46,6 +46,7 @@ class _Fognav(Commands):
             robot=True,
         ),
         Row("", "robot check", "commands.robot_file:robot_check", "robot check robot.toml", robot=True),
+        Row(OPERATE, "mission", "commands.mission:mission_app"),
         Row(OPERATE, "map", f"{_MAP}:map_app", also=("commands.map_change", "commands.area"), robot=True),
         Row("", "map export", "commands.nav2_files:map_export", "map export nav2"),
         Row("", "map check", f"{_MAP}:map_check", "map check floor.yaml --radius 0.17"),

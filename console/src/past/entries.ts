@@ -5,7 +5,7 @@ import { language, maybe, t } from "../i18n/i18n";
 import { decimal, duration } from "../text";
 import type { Undoing } from "../zones/requests";
 
-export const KINDS = ["zone", "set", "source", "place", "map", "hazard", "override", "area", "mission", "robot", "service", "stop", "fault", "alert", "store"] as const;
+export const KINDS = ["zone", "set", "source", "place", "map", "hazard", "override", "area", "mission", "schedule", "robot", "service", "stop", "fault", "alert", "store"] as const;
 
 /** Under which path a change is undone, by the kind of its record. */
 const UNDONE_BY: Readonly<Record<string, Undoing>> = {
@@ -33,6 +33,7 @@ export function undoable(entries: readonly TimelineEntry[]): Map<string, Undoing
 export function detailText({ kind, text, codes, decided_by: by, overridden, after }: TimelineEntry): string {
   if (kind === "stop") return repeatsText(after);
   if (kind === "mission") return goalText(after);
+  if (kind === "schedule") return (after as { readonly last?: { readonly reason?: string } | null } | null)?.last?.reason ?? "";
   if (kind === "alert") {
     const { code, reason } = (after ?? {}) as { readonly code?: string; readonly reason?: string };
     return said(code, reason ?? "");

@@ -98,6 +98,13 @@ def test_site_loads_with_its_map_and_counter_clockwise_areas(folder):
         ('areas = ["a1"]', 'areas = ["a7"]', "demo.areas[0]", "one of: a1"),
         ('id = "n1"', 'id = "planner"', "nodes[0].id", "name of a role"),
         ("[demo]", '[[zone_sources]]\nid = "console"\n[demo]', "zone_sources[0].id", "name of a role"),
+        (
+            "radius = 0.2",
+            'radius = 0.2\nidle = { go = "hall" }',
+            "robots[0].idle.go (r1)",
+            "or a place of the site: desk, door",
+        ),
+        ("radius = 0.2", 'radius = 0.2\nidle = { go = "dock" }', "robots[0].idle.go (r1)", "Set `dock` of the robot"),
         ("[demo]", '[visitors]\nrobots = ["r9"]\n[demo]', "visitors.robots[0]", "Use one of"),
         ("[demo]", '[[zone_sources]]\nid = "n1"\n[demo]', "nodes.id and zone_sources.id", "twice"),
         (

@@ -76,6 +76,9 @@ class World:
     async def out_of_service(self) -> dict[str, Any]:
         return {}
 
+    async def schedules(self) -> dict[str, Any]:
+        return {}
+
     async def learned(self) -> Learned:
         return Learned({}, {})
 

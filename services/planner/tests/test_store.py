@@ -71,7 +71,7 @@ async def test_restore_replaces_what_redis_has_and_later_writes_are_accepted(red
                 with pytest.raises(StoreError, match="Redis "):
                     await attempt
         await store.require_loss()
-        await store.restore({"r1": goal("first")}, {}, {}, Audit(2.0, "ada", "restore"))
+        await store.restore({"r1": goal("first")}, {}, {}, {}, Audit(2.0, "ada", "restore"))
         assert await store.goals() == {"r1": goal("first")}
         assert await store.put("r1", goal("second"), AUDIT) == "ok"
         assert [entry.action for entry in (await store.audit()).entries] == ["goal", "restore"]

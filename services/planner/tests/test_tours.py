@@ -21,9 +21,23 @@ from fog_runtime.http import ProblemError
 from fog_runtime.stores.redis_store import Audit
 from fog_supervisor.servers import start_redis
 from planner.core import PlannerCore
-from planner.stops import CUT_S, CutTimes, Order, Stop, Tour, WhenCut, act_on_cut, best_order, leg_aside, next_leg
+from planner.stops import (
+    CUT_S,
+    CutTimes,
+    GoalBody,
+    GoalPose,
+    MissionBody,
+    Order,
+    Stop,
+    Tour,
+    WhenCut,
+    act_on_cut,
+    best_order,
+    leg_aside,
+    next_leg,
+)
 from planner.store import OutOfServiceError, Store, StoredGoal
-from planner.tours.api import Conditions, GoalBody, GoalPose, MissionBody, mission_answer, mission_order
+from planner.tours.api import Conditions, mission_answer, mission_order
 from planner.tours.persistence import TourPersistence
 
 if TYPE_CHECKING:
@@ -215,6 +229,51 @@ async def test_robot_has_one_mission_and_visits_its_stops_in_order_whatever_is_o
         for _ in range(200):
             await rng.choice(acts)()
             await story.check()
+
+
+@pytest.mark.live
+async def test_mission_that_is_reached_while_somebody_ends_it_is_ended_and_nothing_else_is_lost(redis, monkeypatch):
+    clock = ManualClock(100.0)
+    async with Store(redis.url, "test") as store:
+        running = await Running(store, clock).start()
+        delete = store.delete
+
+        async def reached_meanwhile(*arguments: Any) -> None:
+            running.reach()
+            await delete(*arguments)
+
+        monkeypatch.setattr(store, "delete", reached_meanwhile)
+        await running.missions.send(order(5.0))
+        assert await running.missions.cancel("r1", "anna")
+        await running.missions.send(order(5.0))
+        out = OutOfService(id="1", reason="worn wheel", by="anna", since=1.0)
+        assert await running.missions.take_out("r1", out, "anna")
+        assert (running.missions.out_of_service("r1"), running.at) == (out, None)
+        await running.missions.put_back("r1", "anna")
+        await running.missions.send(order(5.0, deadline=clock.stamp() + 60.0))
+        clock.advance(61.0)
+        for _ in range(2):  # what was reached before is deleted first
+            await running.step()
+        assert (running.at, await store.goals()) == (None, {})
+
+
+@pytest.mark.live
+async def test_mission_that_is_reached_does_not_come_back_with_a_reload_that_began_before(redis, monkeypatch):
+    async with Store(redis.url, "test") as store:
+        running = await Running(store, ManualClock(100.0)).start()
+        await running.missions.send(order(5.0))
+        running.reach()
+        read = store.out_of_service
+
+        async def slow() -> dict[str, OutOfService]:
+            for _ in range(100):
+                await asyncio.sleep(0.001)
+            return await read()
+
+        monkeypatch.setattr(store, "out_of_service", slow)
+        running.missions._reload = True
+        await asyncio.gather(running.missions.cancel("r2", "anna"), running.step())
+        assert (running.missions.goals, await store.goals()) == ({}, {})
 
 
 @pytest.mark.live

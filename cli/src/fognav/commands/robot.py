@@ -12,12 +12,12 @@ import msgspec
 import typer
 
 from fog_contracts.commands import PROFILE_OF
-from fog_contracts.messages import CommandKind, Id, Mode, Pose, ProfileName
+from fog_contracts.messages import CommandKind, Mode, Pose, ProfileName
 from fog_runtime import logs
 from fognav.commands.robot_file import robot_app
 from fognav.operate import robot_commands
 from fognav.operate.fog import Fog, Outcome, RefusedError, find_fog
-from fognav.operate.options import NUMBERS, FogOption, JsonOption, RobotOption, duration, numbers
+from fognav.operate.options import NUMBERS, FogOption, JsonOption, RobotOption, duration, goal_body, numbers
 from fognav.output import (
     NOT_TRUE,
     FailedError,
@@ -190,7 +190,7 @@ def robot_goal(
         found = find_fog(fog)
         chosen = found.robot(robot)
         try:
-            path, body = ("goal", _goal(goal)) if floor is None else ("floor", {**_goal(goal), "floor": floor})
+            path, body = ("goal", goal_body(goal)) if floor is None else ("floor", {**goal_body(goal), "floor": floor})
             found.send("PUT", PLANNER, f"/api/v1/robots/{chosen}/{path}", body)
         except RefusedError as error:
             _report(_refused(error, _view(found, chosen)[1]), json=json)
@@ -346,19 +346,6 @@ def _place(fog: Fog, text: str) -> Mapping[str, Any] | None:
     if text not in places:
         raise WrongUseError(f"there is no place {text}; known places: {', '.join(sorted(places)) or 'none'}")
     return places[text]
-
-
-def _goal(text: str) -> dict[str, object]:
-    if "," not in text:
-        try:
-            return {"place": msgspec.convert(text, Id)}
-        except msgspec.ValidationError as error:
-            raise WrongUseError(
-                f"{text!r} is neither a place, which has only a to z, 0 to 9 and -, nor X,Y[,THETA], such as "
-                "12.5,3,1.57; metres, separated by commas"
-            ) from error
-    x, y, *theta = numbers(text, (2, 3), "X,Y[,THETA]")
-    return {"pose": {"x": x, "y": y, **({"theta": theta[0]} if theta else {})}}
 
 
 def _view(fog: Fog, robot: str) -> tuple[Mapping[str, Any], Any]:

@@ -99,6 +99,20 @@ def weekly(text: str, option: str) -> dict[str, object]:
     return {"days": list(dict.fromkeys(days)), "begin": found[2], "end": found[3]}
 
 
+def goal_body(text: str) -> dict[str, object]:
+    """Return the goal of a text like `office` or `12.5,3[,1.57]` as requests have it; raises `WrongUseError`."""
+    if "," not in text:
+        try:
+            return {"place": msgspec.convert(text, Id)}
+        except msgspec.ValidationError as error:
+            raise WrongUseError(
+                f"{text!r} is neither a place, which has only a to z, 0 to 9 and -, nor X,Y[,THETA], such as "
+                "12.5,3,1.57; metres, separated by commas"
+            ) from error
+    x, y, *theta = numbers(text, (2, 3), "X,Y[,THETA]")
+    return {"pose": {"x": x, "y": y, **({"theta": theta[0]} if theta else {})}}
+
+
 def points(text: str, least: int, form: str) -> list[Point]:
     """Return the points of a text like `0,0 1,0 1,1`; raises `WrongUseError`."""
     found = [numbers(part, (2,), "X,Y") for part in text.split()]

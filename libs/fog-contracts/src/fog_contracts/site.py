@@ -156,12 +156,24 @@ class ZoneSourceSite(Message, frozen=True, kw_only=True):
     sets: list[Id] = field(default_factory=list)
 
 
+ON_DOCK: Final = "dock"
+"""Where an idle robot goes that goes to its dock; no place may have this id then."""
+
+
+class IdleSite(Message, frozen=True, kw_only=True):
+    """Where a robot goes that has had no mission for `after_s` (s): `go` is `dock`, or the id of a place."""
+
+    go: Id
+    after_s: Annotated[float, Meta(ge=10.0, le=86_400.0)] = 300.0
+
+
 class RobotSite(Message, frozen=True, kw_only=True):
     """A robot of this site: its start pose, and the radius and height of its body.
 
     `radius`: how far its body reaches from the point between its driven wheels. Nobody guesses it: a robot that takes
     itself for smaller than it is touches what it believes to pass.
-    `dock`: its pose while it stands on its dock, facing it; None if it has none here.
+    `dock`: its pose while it stands on its dock, facing it; None if it has none here. `idle`: where it goes without a
+    mission; None: it stays where its last one ended.
     """
 
     id: Id
@@ -169,6 +181,7 @@ class RobotSite(Message, frozen=True, kw_only=True):
     dock: Pose | None = None
     radius: Annotated[float, Meta(gt=0.0, le=2.0)]
     height: Annotated[float, Meta(gt=0.0, le=3.0)] = 0.35
+    idle: IdleSite | None = None
 
     @property
     def staging(self) -> Pose | None:

@@ -34,7 +34,7 @@ BRIDGE: Final = "bridge"
 """The bridge to other systems, where one runs: it has WebSockets."""
 ROUTES: Final[Mapping[str, tuple[str, ...]]] = {
     AGGREGATOR: ("areas", "nodes", "alerts"),
-    PLANNER: ("robots", "plan", "visits"),
+    PLANNER: ("robots", "plan", "schedules", "visits"),
     CONSOLE: ("session", "events", "timeline", "recording", "vitals", "floors", "openapi.json"),
     DEMO: ("scenario",),
     BRIDGE: ("foxglove",),

@@ -80,8 +80,8 @@ from map_service.zones import ZoneError
 Image.preinit()  # the first picture would load PIL's formats, while the map is served
 
 AuditKind = Literal[
-    "alert", "area", "map", "mission", "override", "place", "robot", "service", "set", "source", "stop", "store",
-    "zone",
+    "alert", "area", "map", "mission", "override", "place", "robot", "schedule", "service", "set", "source", "stop",
+    "store", "zone",
 ]  # fmt: skip
 
 _REFUSALS: Final = (ZoneError, BusyError, IdempotencyError, StoreError)

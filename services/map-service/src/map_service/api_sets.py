@@ -5,13 +5,14 @@ from typing import Final
 from msgspec import structs
 
 from fog_contracts.messages import Message, Sentence, WeeklySchedule
+from fog_contracts.weekly import is_time_zone
 from fog_runtime.http import Answer, Body, IfMatch, Operator, ProblemError, Routes, Viewer, etag, expected_version
 from fog_runtime.http.store_routes import IdempotencyKey, IfNoneMatch, attempt_of
 from map_service.problems import ZONES_NOT_LOADED, MapProblem, require_zones
 from map_service.record_requests import WRITES, Conditions, check_id, missing
 from map_service.service import Service
 from map_service.zone_sources import ZoneSourceView
-from map_service.zone_times import MutedSource, SetOfZones, is_time_zone
+from map_service.zone_times import MutedSource, SetOfZones
 
 MAX_SETS: Final = 200
 """Most sets of zones of a site."""

@@ -12,13 +12,11 @@ A zone is in force only while each set that it names is on, too.
 from __future__ import annotations
 
 import math
-from bisect import bisect_right
 from dataclasses import dataclass, field
-from datetime import UTC, date, datetime, time, timedelta
 from typing import TYPE_CHECKING, Final
-from zoneinfo import ZoneInfo, ZoneInfoNotFoundError
 
-from fog_contracts.messages import WEEKDAYS, Count, Id, Message, Sentence, WeeklySchedule, Zone
+from fog_contracts.messages import Count, Id, Message, Sentence, WeeklySchedule, Zone
+from fog_contracts.weekly import TimeZoneError, Windows
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -27,8 +25,7 @@ if TYPE_CHECKING:
     from fog_contracts.shapes import Spans
 
 _UNKNOWN_S: Final = 60.0
-_DAYS_AHEAD: Final = 8
-"""For how many days the windows of a schedule are computed at a time."""
+"""In a time zone that this machine does not know, a window lasts for so long, again and again: the safe side."""
 
 
 class Progress(Message, frozen=True, kw_only=True):
@@ -149,7 +146,7 @@ class ScheduleTimes:
     """Follows a weekly schedule through time. While the time of day is not known, a window lasts."""
 
     def __init__(self, schedule: WeeklySchedule) -> None:
-        self._windows = _Windows(schedule)
+        self._windows = Windows(schedule)
         self._deadline = -math.inf
         """Until when the latest window lasts at least, by the monotonic clock."""
 
@@ -157,77 +154,15 @@ class ScheduleTimes:
         """Advance to `at`; return whether it is in a window."""
         if not at.synchronized:
             return True
-        end = self._windows.end_of_current(at.stamp)
+        try:
+            window = self._windows.latest(at.stamp)
+        except TimeZoneError:
+            end: float | None = at.stamp + _UNKNOWN_S
+        else:
+            end = window.end if window is not None and at.stamp < window.end else None
         if end is not None:
             self._deadline = max(self._deadline, at.now + end - at.stamp)
         return end is not None or at.now < self._deadline
-
-
-class _Windows:
-    """The windows of a weekly schedule as moments (s since the epoch), computed for some days at a time."""
-
-    def __init__(self, schedule: WeeklySchedule) -> None:
-        self._schedule = schedule
-        self._valid = (math.inf, -math.inf)
-        self._begins: list[float] = []
-        self._ends: list[float] = []
-
-    def end_of_current(self, stamp: float) -> float | None:
-        """Return when the window that contains a moment ends; None outside. In an unknown time zone, all are inside."""
-        if not self._valid[0] <= stamp < self._valid[1]:
-            try:
-                self._compute(stamp)
-            except (ZoneInfoNotFoundError, ValueError, OverflowError, OSError):
-                return stamp + _UNKNOWN_S
-        index = bisect_right(self._begins, stamp) - 1
-        return self._ends[index] if index >= 0 and stamp < self._ends[index] else None
-
-    def _compute(self, stamp: float) -> None:
-        zone = ZoneInfo(self._schedule.time_zone)
-        today = datetime.fromtimestamp(stamp, tz=zone).date()
-        days = [today + timedelta(days=offset) for offset in range(-3, _DAYS_AHEAD + 1)]
-        windows = sorted(
-            window_of(day, span.begin, span.end, zone)
-            for day in days
-            for span in self._schedule.times
-            if WEEKDAYS[day.weekday()] in span.days
-        )
-        self._begins, self._ends = [], []
-        for begin, end in windows:
-            if self._ends and begin <= self._ends[-1]:
-                self._ends[-1] = max(self._ends[-1], end)
-            else:
-                self._begins.append(begin)
-                self._ends.append(end)
-        # Whatever the offset from UTC: today has begun by then, and the local date is at most two days earlier, whose
-        # windows may have begun on the day before; two days before the last one, no later window has begun.
-        begin_of = datetime.combine(today - timedelta(days=1), time(), tzinfo=UTC).timestamp()
-        self._valid = begin_of, begin_of + 86_400.0 * (_DAYS_AHEAD - 1)
-
-
-def window_of(day: date, begin: str, end: str, zone: ZoneInfo) -> tuple[float, float]:
-    """Return a window that begins on a day (local time, "HH:MM"), as moments; an end not later is of the next day.
-
-    A local time that occurs twice (clocks set back) is the earlier one for the begin and the later one for the end; of
-    one that does not occur (clocks set forward), likewise the earlier and the later reading: a window is rather too
-    long than too short.
-    """
-    first, last = time.fromisoformat(begin), time.fromisoformat(end)
-    end_day = day if last > first else day + timedelta(days=1)
-    begins, ends = (
-        [datetime.combine(on, at.replace(fold=fold), tzinfo=zone).timestamp() for fold in (0, 1)]
-        for on, at in ((day, first), (end_day, last))
-    )
-    return min(begins), max(ends)
-
-
-def is_time_zone(name: str) -> bool:
-    """Whether this machine knows a time zone (such as Europe/Lisbon)."""
-    try:
-        ZoneInfo(name)
-    except (ZoneInfoNotFoundError, ValueError, OSError):
-        return False
-    return True
 
 
 # --- Sets of zones that are switched together, and sources that are muted ---------------------------------------------

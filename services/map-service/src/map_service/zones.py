@@ -17,7 +17,7 @@ from msgspec import structs
 from fog_contracts import channels as ch
 from fog_contracts.messages import ZoneSet
 from fog_contracts.shapes import ShapeError, normalized_shape, shape_spans
-from map_service.zone_times import is_time_zone
+from fog_contracts.weekly import is_time_zone
 
 if TYPE_CHECKING:
     from collections.abc import Collection, Iterable

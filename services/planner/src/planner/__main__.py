@@ -122,6 +122,7 @@ async def main() -> None:
                 tasks.create_task(service.plan_loop(), name="plan")
                 tasks.create_task(service.visiting.run(), name="visits")
                 tasks.create_task(service.riding.run(), name="rides")
+                tasks.create_task(service.scheduling.run(), name="schedules")
                 tasks.create_task(maps.until_changed(stop_robots), name="another-map")
                 tasks.create_task(http_process.serve(app, settings.port_file), name="http")
                 tasks.create_task(release_when(lambda: health.ready), name="memory")

@@ -57,13 +57,12 @@ from planner.lifts.api import add_floors
 from planner.problems import PlannerProblem
 from planner.query_queue import BusyError
 from planner.robot_operator import CommandError
+from planner.schedules.api import add_schedules
 from planner.service import Service
-from planner.stops import Order
+from planner.stops import GoalBody, MissionBody, Order
 from planner.store import NO_MISSION, MissionConflictError, OutOfServiceError, StoredGoal
 from planner.tours.api import (
     Conditions,
-    GoalBody,
-    MissionBody,
     MissionView,
     goal_pose,
     goal_refused,
@@ -175,6 +174,7 @@ def make_api(service: Service, site: Site, health: Health, tokens: Tokens, stand
     _add_missions(routes, service, robots, places)
     add_undo(routes, service, robots.check)
     add_floors(routes, service, site, robots.check_single)
+    add_schedules(routes, service, robots.check, places, standby)
     add_visits(Routes(app, "visits"), lambda: service.visiting, standby)
     _add_plan(Routes(app, "plan"), service, robots, places)
     recovery = Routes(app, "store")

@@ -21,6 +21,11 @@ class PlannerProblem(ProblemCode):
         "deadline_too_soon", 422, "The mission takes longer than its deadline allows: some `seconds`",
         "Give it more time, or fewer stops",
     )  # fmt: skip
+    NO_SCHEDULE = "no_schedule", 404, "No schedule has this id", "Choose one of GET /api/v1/schedules"
+    SCHEDULE_CHANGED = (
+        "schedule_changed", 412, "The schedule is not the one that the request expects, or there is one",
+        "Read it again, then decide anew",
+    )  # fmt: skip
     MISSION_CHANGED = (
         "mission_changed", 412, "The robot has another mission than the request expects, or has one",
         "Read the mission again, then decide anew",

@@ -27,12 +27,13 @@ from fog_runtime.transports.edges import Edges
 from fog_runtime.transports.zenoh_declarations import ASKER
 from planner.dock_missions import DockMissions
 from planner.dry_run_queue import DryRuns
-from planner.lifts.persistence import RidePersistence
 from planner.lifts.riding import Riding
 from planner.plan_records import PathRecord, PlanMetrics
 from planner.query_queue import BUSY_PAUSE_S, BusyError, QueryQueue, Threads
 from planner.refusals import busy
 from planner.robot_operator import RobotOperator
+from planner.schedules.persistence import SchedulePersistence
+from planner.schedules.scheduling import Scheduling
 from planner.snapshot_fetcher import SnapshotFetcher
 from planner.visiting import Visiting
 
@@ -220,12 +221,13 @@ class Service:
         self._queue = QueryQueue(self._threads, on_idle=core.answerer.release)
         self.dry_runs = DryRuns(core, self._queue, clock.now)
         self._cycle = Cycle(core, zenoh)
-        self.missions = RidePersistence(core, store, clock, health, self._change_goal, self.path, synchronized)
+        self.missions = SchedulePersistence(core, store, clock, health, self._change_goal, self.path, synchronized)
         self._map = SnapshotFetcher(core, zenoh, clock, health, self._queue, on_loaded=self._wake.set)
         self.operator = RobotOperator(zenoh, store, clock, key)
         self._docks = DockMissions(site.staging, self.send)
         self.visiting = Visiting(self, site, clock)
         self.riding = Riding(self, site, zenoh, clock)
+        self.scheduling = Scheduling(self, site, clock, synchronized)
         self._jobs: set[asyncio.Task[None]] = set()
         self._metrics = PlanMetrics()
         self.arrival = core.arrival

@@ -7,7 +7,21 @@ from typing import TYPE_CHECKING, Annotated, Final, Literal, NamedTuple
 
 from msgspec import Meta, structs
 
-from fog_contracts.messages import Author, FloorGoal, Id, Message, PlanRefusal, PointXY, Pose, Stamp, TimeToLive
+from fog_contracts.messages import (
+    Author,
+    FloorGoal,
+    Id,
+    Message,
+    Metres,
+    PlanRefusal,
+    PointXY,
+    Pose,
+    Radians,
+    Sentence,
+    Stamp,
+    TimeToLive,
+    WeeklySchedule,
+)
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Container, Sequence
@@ -83,11 +97,67 @@ class Ride(Message, frozen=True, kw_only=True):
     boards: bool = False
 
 
+class GoalPose(Message, frozen=True, kw_only=True):
+    """A position in m, frame `map`; without `theta` (rad) any heading is accepted."""
+
+    x: Metres
+    y: Metres
+    theta: Radians | None = None
+
+
+class GoalBody(Message, frozen=True, kw_only=True):
+    """A goal: the id of a place of the site, or a pose; exactly one of the two."""
+
+    place: Id | None = None
+    pose: GoalPose | None = None
+
+
+class MissionBody(Message, frozen=True, kw_only=True):
+    """A mission: its stops in the `given` order, or in the `best` one, whose way is the shortest (8 at most).
+
+    `when_cut`: what to do when no way leads to a stop. `deadline_s`: it ends so long after the order, whatever is left.
+    Of equally urgent missions that of higher `priority` is planned first.
+    """
+
+    stops: Annotated[list[GoalBody], Meta(min_length=1, max_length=STOPS_MAX)]
+    order: Literal["given", "best"] = "given"
+    when_cut: WhenCut = WhenCut()
+    deadline_s: TimeToLive | None = None
+    priority: Priority = 0
+
+
+class Occasion(Message, frozen=True, kw_only=True):
+    """What became of the mission of one window, which began at `begin` (s since the epoch).
+
+    `mission`: the id of the one that was given; `reason`: why it was missed.
+    """
+
+    begin: Stamp
+    at: Stamp
+    outcome: Literal["given", "missed"]
+    mission: str | None = None
+    reason: Sentence = ""
+
+
+class ScheduledMission(Message, frozen=True, kw_only=True):
+    """A mission that a robot gets in each window of a weekly schedule, as stored. `since`: when it was written."""
+
+    id: Id
+    robot: Id
+    mission: MissionBody
+    weekly: WeeklySchedule
+    enabled: bool = True
+    author: str = ""
+    since: Stamp
+    version: str
+    last: Occasion | None = None
+
+
 class Order(NamedTuple):
     """A mission as an operator orders it, and the conditions of the order.
 
     `any_heading`: ignore the pose's theta. `expected` is the id of the mission that it replaces, or `NO_MISSION`; None
-    replaces any. `action` is the audit trail's word for it.
+    replaces any. `action` is the audit trail's word for it. `idle`: see `StoredGoal`.
     """
 
     robot: str
@@ -99,6 +169,7 @@ class Order(NamedTuple):
     expected: str | None = None
     action: str = "goal"
     visit: bool = False
+    idle: bool = False
     tour: Tour | None = None
     ride: Ride | None = None
 

@@ -14,7 +14,7 @@ from fog_runtime import logs
 from fog_runtime.stores import records
 from fog_runtime.stores.redis_connection import StoreError, StoreLostError, StoreRefusedError
 from fog_runtime.stores.redis_store import ANY, Audit, Outcome, RecoveryError, Table
-from planner.stops import Ends, Ride, Tour
+from planner.stops import Ends, Ride, ScheduledMission, Tour
 from planner.waits.persistence import LearnedPersistence, LearnedStore
 
 if TYPE_CHECKING:
@@ -30,6 +30,7 @@ if TYPE_CHECKING:
 _GOALS: Final = Table(records.GOALS, "mission", version="goal.goal_id")
 _SERVICE: Final = Table(records.OUT_OF_SERVICE, "service", version="id")
 _BERTHS: Final = Table(records.BERTHS, "robot", version="epoch")
+_SCHEDULES: Final = Table(records.SCHEDULES, "schedule")
 
 _log = logs.get("planner")
 
@@ -37,12 +38,14 @@ _log = logs.get("planner")
 class StoredGoal(Message, frozen=True, kw_only=True):
     """A mission as it is stored; `any_heading`: ignore the goal's theta. `visit`: it belongs to a visit (ADR 69).
 
-    `tour`: its other stops and rules, if it has any. `ride`: it leads to another floor (ADR 76).
+    `idle`: the robot goes where it stays without a mission, and is taken from there for any other. `tour`: its other
+    stops and rules, if it has any. `ride`: it leads to another floor (ADR 76).
     """
 
     goal: RobotGoal
     any_heading: bool = False
     visit: bool = False
+    idle: bool = False
     tour: Tour | None = None
     ride: Ride | None = None
 
@@ -50,7 +53,7 @@ class StoredGoal(Message, frozen=True, kw_only=True):
 class Store(LearnedStore):
     """The planner's keys."""
 
-    tables = (_GOALS.name, _SERVICE.name, _BERTHS.name)
+    tables = (_GOALS.name, _SERVICE.name, _BERTHS.name, _SCHEDULES.name)
 
     async def goals(self) -> dict[str, StoredGoal]:
         """Return all stored missions by robot; an unreadable one is left out and logged.
@@ -93,6 +96,16 @@ class Store(LearnedStore):
         """Write durably on which floor a robot is, if what is stored is what is `known` (None: nothing)."""
         return await self._swap(_BERTHS, robot, berth, "0" if known is None else str(known.epoch), audit)
 
+    async def schedules(self) -> dict[str, ScheduledMission]:
+        """Return the scheduled missions by id."""
+        return await self._readable_records(_SCHEDULES.name, ScheduledMission)
+
+    async def put_schedule(
+        self, name: str, schedule: ScheduledMission | None, audit: Audit, *, expected: str = ANY
+    ) -> Outcome:
+        """Write a scheduled mission durably, or delete it (None), if the stored one's version is `expected`."""
+        return await self._swap(_SCHEDULES, name, schedule, expected, audit)
+
     async def record_command(self, robot: str, command: bytes, audit: Audit) -> None:
         """Record an operator's command to a robot (JSON) in the audit trail."""
         await self._record("robot", robot, command, audit)
@@ -110,13 +123,15 @@ class Store(LearnedStore):
         goals: Mapping[str, StoredGoal],
         out: Mapping[str, OutOfService],
         berths: Mapping[str, Berth],
+        schedules: Mapping[str, ScheduledMission],
         audit: Audit,
     ) -> None:
-        """Replace the stored missions, robots out of service and floors, on an administrator's decision after a loss.
+        """Replace the stored missions, robots out of service, floors and schedules, as an administrator decides.
 
-        They are those of this process's memory.
+        They are those of this process's memory, after a loss.
         """
-        await self._adopt({_GOALS.name: goals, _SERVICE.name: out, _BERTHS.name: berths}, audit)
+        tables = {_GOALS.name: goals, _SERVICE.name: out, _BERTHS.name: berths, _SCHEDULES.name: schedules}
+        await self._adopt(tables, audit)
 
 
 STORE_PERIOD_S = 0.5
@@ -177,6 +192,8 @@ class MissionPersistence:
         """Of missions (`Tour.id`) with a deadline, and of `OutOfService.id`."""
         self.berths: dict[str, Berth] = {}
         """Where each robot is that was ever handed over, as this floor knows."""
+        self.schedules: dict[str, ScheduledMission] = {}
+        """The missions that begin by the clock, by id."""
         self.overruled: Callable[[str], object] = lambda _robot: None
         """Called for a robot whose mission, or service, somebody else than a visit has changed."""
 
@@ -233,8 +250,10 @@ class MissionPersistence:
             stamp, place, pose = self._clock.stamp(), order.place, order.pose
             goal_id = secrets.token_hex(8) if order.tour is None else order.tour.goal_id
             goal = RobotGoal(goal_id=goal_id, pose=pose, place=place, stamp=stamp)
-            heading = order.any_heading
-            stored = StoredGoal(goal=goal, any_heading=heading, visit=order.visit, tour=order.tour, ride=order.ride)
+            stored = StoredGoal(
+                goal=goal, any_heading=order.any_heading, visit=order.visit, idle=order.idle, tour=order.tour,
+                ride=order.ride,
+            )  # fmt: skip
             await self._store_mission(order, stored, Audit(stamp, order.who, order.action, order.attempt))
             self._begin(order.robot, stored)
         _log.info("goal_accepted", robot=order.robot, goal=goal.goal_id, x=pose.x, y=pose.y, place=place, who=order.who)
@@ -306,7 +325,10 @@ class MissionPersistence:
 
     async def store_status(self) -> StoreStatus:
         """Return what Redis and this process have; raises `StoreError`."""
-        known = {"goals": len(self.goals), "out_of_service": len(self._out), "berths": len(self.berths)}
+        known = {
+            "goals": len(self.goals), "out_of_service": len(self._out), "berths": len(self.berths),
+            "schedules": len(self.schedules),
+        }  # fmt: skip
         return await self._store.status(known if self._loaded.is_set() else {})
 
     async def recover_store(self, action: Literal["restore", "accept"], who: str) -> None:
@@ -321,7 +343,7 @@ class MissionPersistence:
                 await self._store.accept_loss(audit)
                 self._reload = True
             elif self._loaded.is_set():
-                await self._store.restore(self.goals, self._out, self.berths, audit)
+                await self._store.restore(self.goals, self._out, self.berths, self.schedules, audit)
             else:
                 raise RecoveryError(
                     "this service was started after the loss and has no missions: restore a backup of Redis, or accept"
@@ -365,9 +387,10 @@ class MissionPersistence:
             stored = self.goals.get(robot)
             if stored is not None and stored.goal.goal_id == goal_id:
                 continue  # a stop of a mission that goes on, reached while another robot's was stored
-            await self._store.delete(robot, goal_id, Audit(self._clock.stamp(), robot, "reached"))
-            if self._reached.get(robot) == goal_id:
-                del self._reached[robot]
+            async with self._lock:  # whoever loads the missions meanwhile would begin it again
+                await self._store.delete(robot, goal_id, Audit(self._clock.stamp(), robot, "reached"))
+                if self._reached.get(robot) == goal_id:
+                    del self._reached[robot]
 
     @contextmanager
     def _uncertain_write(self) -> Iterator[None]:
@@ -459,12 +482,12 @@ class MissionPersistence:
         _log.info("goal_cancelled", robot=robot, goal=stored.goal.goal_id, who=who)
 
     def _cancel(self, robot: str) -> None:
-        del self.goals[robot]
+        self.goals.pop(robot, None)  # it may have been reached while its end was being stored
         self._change_core(partial(self._core.cancel, robot))
 
     def _begin(self, robot: str, stored: StoredGoal) -> None:
         self.goals[robot] = stored
-        if not stored.visit:
+        if not stored.visit and not stored.idle:
             self.overruled(robot)
         priority = stored.tour.priority if stored.tour is not None else 0
         heading = stored.any_heading

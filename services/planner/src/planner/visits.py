@@ -252,6 +252,10 @@ class Visits:
         found.ended_by = who
         self._end(found, VisitEnd.OPERATOR, now)
 
+    def serves(self, robot: str) -> bool:
+        """Whether a robot has a visit, if only to wait for its visitor."""
+        return self._on(robot) is not None
+
     def commanded(self, robot: str, now: float) -> None:
         """End the visit of a robot that somebody has commanded or stopped, whatever becomes of the command."""
         if (visit := self._on(robot)) is not None:

@@ -57,7 +57,8 @@ class HandOver(Message, frozen=True, kw_only=True):
     """A robot's way from the floor `origin` to `floor`, which it carries itself (ADR 76).
 
     `epoch`: the robot's count of hand-overs after this one. `lift`: by which it rides; None: people carry it. `goal`:
-    where it goes then. `who`: who sent it.
+    where it goes then. `who`: who sent it. `id`: no other one's, whatever the epochs (they may be restored); robots of
+    before give it back empty.
     """
 
     origin: Id
@@ -66,6 +67,7 @@ class HandOver(Message, frozen=True, kw_only=True):
     lift: Id | None = None
     goal: FloorGoal | None = None
     who: Author = ""
+    id: Annotated[str, Meta(max_length=32)] = ""
 
 
 class Berth(Message, frozen=True, kw_only=True):

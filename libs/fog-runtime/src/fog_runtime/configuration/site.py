@@ -16,7 +16,7 @@ from fog_contracts.costs import is_traversable
 from fog_contracts.geometry import GeometryError, normalized_polygon
 from fog_contracts.grid import StaticMap
 from fog_contracts.messages import AREAS_MAX, Place
-from fog_contracts.site import BEFORE_MARKER_M, AreaSite, MarkerSite, NodeSite, Site
+from fog_contracts.site import BEFORE_MARKER_M, ON_DOCK, AreaSite, MarkerSite, NodeSite, RobotSite, Site
 from fog_runtime.configuration.maps import MapFileError, load_map
 
 SITE_FILE: Final = "site.toml"
@@ -73,6 +73,7 @@ def load_site(directory: Path, text: str | None = None, *, map_file: Path | None
         _check_free(file, f"places.{name}", place.x, place.y, static)
     for index, robot in enumerate(site.robots):
         _check_free(file, f"robots[{index}].start ({robot.id})", robot.start.x, robot.start.y, static)
+        _check_idle(file, f"robots[{index}].idle.go ({robot.id})", robot, site)
     _check_unique(file, "lifts.id", (lift.id for lift in site.lifts))
     for index, lift in enumerate(site.lifts):
         if site.id not in lift.floors:
@@ -83,6 +84,15 @@ def load_site(directory: Path, text: str | None = None, *, map_file: Path | None
     for index, marker in enumerate(site.markers):
         _check_seen(file, f"markers[{index}] ({marker.id})", marker, static)
     return LoadedSite(msgspec.structs.replace(site, areas=areas), static, directory)
+
+
+def _check_idle(file: Path, where: str, robot: RobotSite, site: Site) -> None:
+    go = None if robot.idle is None else robot.idle.go
+    if go == ON_DOCK and robot.dock is None:
+        raise SiteError(file, where, "the robot has no dock here", "Set `dock` of the robot, or name a place")
+    if go not in {None, ON_DOCK, *site.places}:
+        known = ", ".join(sorted(site.places)) or "none"
+        raise SiteError(file, where, f"there is no place {go}", f"Write `dock`, or a place of the site: {known}")
 
 
 def _read(file: Path, text: str | None) -> Site:

@@ -42,13 +42,14 @@ SITE_MAPS: Final = "site_maps"
 GOALS: Final = "goals"
 OUT_OF_SERVICE: Final = "out_of_service"
 BERTHS: Final = "berths"
+SCHEDULES: Final = "schedules"
 BLOCKS: Final = "blocks"
 PACES: Final = "paces"
 
 OWN: Final[Mapping[str, Sequence[str]]] = {
     "hazard-aggregator": (AREAS, HAZARDS, OVERRIDES, OVERRIDE_RESTS, ALERTS, f"{HISTORY}:*"),
     "map-service": (ZONES, ZONE_TIMES, ZONE_SETS, ZONE_SOURCES, PLACES, SITE_MAPS),
-    "planner": (GOALS, OUT_OF_SERVICE, BERTHS, BLOCKS, PACES),
+    "planner": (GOALS, OUT_OF_SERVICE, BERTHS, SCHEDULES, BLOCKS, PACES),
 }
 """The keys of each service's own records, as patterns."""
 READ: Final[Mapping[str, Sequence[str]]] = {"console-service": (f"{HISTORY}:*",)}
@@ -56,7 +57,7 @@ READ: Final[Mapping[str, Sequence[str]]] = {"console-service": (f"{HISTORY}:*",)
 AUDITED: Final[Mapping[str, Sequence[str]]] = {
     "hazard-aggregator": ("alert", "area", "override", "store"),
     "map-service": ("map", "place", "set", "source", "zone", "store"),
-    "planner": ("mission", "robot", "service", "stop", "store"),
+    "planner": ("mission", "robot", "schedule", "service", "stop", "store"),
 }
 """The kinds of records whose audit trail (`audit:KIND`) each service writes."""
 BOOKKEEPING: Final = ("probe", "generation", "writes", "floors", "no-attempt", "idempotency:*")
@@ -180,14 +181,15 @@ newer than the last one is known.
 
 
 KINDS: Final = (
-    "alert", "area", "map", "mission", "override", "place", "robot", "service", "set", "source", "stop", "store",
-    "zone",
+    "alert", "area", "map", "mission", "override", "place", "robot", "schedule", "service", "set", "source", "stop",
+    "store", "zone",
 )  # fmt: skip
 """The kinds of records that have an audit trail.
 
 `alert`: alerts that began, ended or were acknowledged; `store`: what an administrator decided after a loss; `robot`:
-operators' commands to robots; `service`: robots that are out of service; `set`: sets of zones; `source`: muted sources
-of zones; `stop`: stops without a token, of which anybody may send any number.
+operators' commands to robots; `schedule`: missions that begin by the clock; `service`: robots that are out of service;
+`set`: sets of zones; `source`: muted sources of zones; `stop`: stops without a token, of which anybody may send any
+number.
 """
 
 PAGE_BYTES: Final = 256 * 1024

@@ -155,8 +155,9 @@ def _pieces(component: ShapeMask) -> Iterator[ShapeMask]:
         return
     window = component.window
     if holes:
-        xs = [x for x, _ in holes[0]]
-        column = (min(xs) + max(xs)) // 2
+        # The one nearest to the middle: halves of many holes are cut again less often than leftmost columns.
+        middles = [(min(xs) + max(xs)) // 2 for hole in holes if (xs := [x for x, _ in hole])]
+        column = min(middles, key=lambda x: abs(x - window.width / 2))
     else:
         column = window.width // 2
     across = not 0 < column < window.width
@@ -189,14 +190,14 @@ def _loops(mask: NDArray[np.bool_]) -> list[list[_Corner]]:
         begin, end = ((x, y), (x + 1, y)) if right[y, x] > 0 else ((x + 1, y), (x, y))
         following.setdefault(begin, []).append(end)
     loops: list[list[_Corner]] = []
-    while following:
-        first = min(following)
-        loop = [first]
-        corner = _take(following, first, None)
-        while corner != first:
-            loop.append(corner)
-            corner = _take(following, corner, loop[-2])
-        loops.append(_without_straight(loop))
+    for first in sorted(following):
+        while first in following:
+            loop = [first]
+            corner = _take(following, first, None)
+            while corner != first:
+                loop.append(corner)
+                corner = _take(following, corner, loop[-2])
+            loops.append(_without_straight(loop))
     # The leftmost corner of all is of the outer border, which was traced first.
     return loops
 

@@ -11,9 +11,9 @@ from fog_runtime.stores.redis_store import IdempotencyError
 from planner.lifts.rides import lift_to
 from planner.problems import PlannerProblem
 from planner.robot_operator import CommandError
-from planner.stops import Order, Ride
+from planner.stops import GoalPose, Order, Ride
 from planner.store import OutOfServiceError
-from planner.tours.api import GoalPose, goal_refused
+from planner.tours.api import goal_refused
 
 if TYPE_CHECKING:
     from collections.abc import Callable

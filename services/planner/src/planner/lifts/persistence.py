@@ -10,6 +10,7 @@ from msgspec import structs
 from fog_contracts.handover import next_berth, standing
 from fog_contracts.messages import Berth, HandOver, OutOfService, Reason, RobotGoal
 from fog_runtime import logs
+from fog_runtime.stores.redis_connection import StoreError
 from fog_runtime.stores.redis_store import Audit
 from planner.store import OutOfServiceError, StoredGoal
 from planner.tours.persistence import WHO, TourPersistence
@@ -119,8 +120,9 @@ class RidePersistence(TourPersistence):
         assert ride is not None
         before = known or Berth(floor=self.site)
         given = HandOver(
-            origin=self.site, floor=ride.floor, epoch=before.epoch + 1, lift=ride.lift, goal=ride.goal, who=ride.who
-        )
+            origin=self.site, floor=ride.floor, epoch=before.epoch + 1, lift=ride.lift, goal=ride.goal, who=ride.who,
+            id=secrets.token_hex(8),
+        )  # fmt: skip
         after = next_berth(before, given)
         async with self._lock:
             if self.goals.get(robot) is not stored or isinstance(after, Reason):
@@ -167,14 +169,16 @@ class RidePersistence(TourPersistence):
                 raise OnOtherFloorError(robot, out)
             async with self._lock:
                 found = structs.replace(self.said[robot], came_by=None)
-                await self._put(robot, found, Audit(self._clock.stamp(), who, "in"))
+                if not await self._put(robot, found, Audit(self._clock.stamp(), who, "in")):
+                    raise StoreError("another request has changed this robot's floor meanwhile: look, then repeat it")
             return True
         return await super().put_back(robot, who, **conditions)
 
-    async def _put(self, robot: str, berth: Berth, audit: Audit) -> None:
+    async def _put(self, robot: str, berth: Berth, audit: Audit) -> bool:
         with self._uncertain_write():
             outcome = await self._store.put_berth(robot, berth, self.berths.get(robot), audit)
         if outcome == "ok":
             self.berths[robot] = berth
         else:
             self._reload = True
+        return outcome == "ok"

@@ -9,7 +9,7 @@ from fog_contracts.messages import Berth, LiftState, Pose, Refusal
 from fog_runtime import logs
 from fog_runtime.clock import ticker
 from fog_runtime.stores.redis_connection import StoreError
-from fog_runtime.stores.redis_store import Attempt
+from fog_runtime.stores.redis_store import Attempt, IdempotencyError
 from planner.lifts.persistence import on_behalf
 from planner.lifts.rides import Facts, cabins_at, inside_of, next_act, request, session
 from planner.robot_operator import CommandError
@@ -39,9 +39,12 @@ _log = logs.get("planner")
 class Robots(Protocol):
     """What rides need of the planner's service."""
 
-    missions: RidePersistence
     operator: RobotOperator
     poses: dict[str, RobotPose]
+
+    @property
+    def missions(self) -> RidePersistence:
+        """The missions."""
 
     @property
     def places(self) -> Mapping[str, Place] | None:
@@ -172,7 +175,7 @@ class Riding:
             pose, any_heading = Pose(x=place.x, y=place.y, theta=place.theta or 0.0), place.theta is None
         if pose is None:
             return
-        attempt = Attempt.of("floors", session(robot, given.epoch), "arrival", given)
+        attempt = Attempt.of("floors", given.id or session(robot, given.epoch), "arrival", given)
         order = Order(
             robot,
             pose,
@@ -186,6 +189,10 @@ class Riding:
             sent = await self._service.send(order)
         except (MissionConflictError, OutOfServiceError) as error:
             _log.info("ride_overruled", robot=robot, reason=str(error))  # an operator was faster
+            return
+        except IdempotencyError:  # a robot of before, whose record or this floor's was restored
+            reason = f"another ride of it had the number {given.epoch} within a day: send it by hand"
+            _log.warning("ride_without_goal", robot=robot, reason=reason)
             return
         if isinstance(sent, Refusal):
             _log.warning("ride_without_goal", robot=robot, reason=sent.reason)

@@ -4,62 +4,29 @@ from __future__ import annotations
 
 import math
 import secrets
-from typing import TYPE_CHECKING, Annotated, Any, Literal, NamedTuple, Protocol
+from typing import TYPE_CHECKING, Any, Literal, NamedTuple, Protocol
 
-from msgspec import Meta, to_builtins
+from msgspec import to_builtins
 
 from fog_contracts.messages import (
-    Id,
     Message,
-    Metres,
     PlanRefusal,
     PlanReply,
     PlanRequest,
     PointXY,
     Pose,
-    Radians,
     Refusal,
     Stamp,
-    TimeToLive,
 )
 from fog_runtime.http import Answer, HttpProblem, ProblemError, etag
 from planner.problems import PlannerProblem
-from planner.stops import BEST_MAX, STOPS_MAX, Order, Priority, Stop, Tour, WhenCut, best_order
+from planner.stops import BEST_MAX, GoalBody, MissionBody, Order, Stop, Tour, WhenCut, best_order
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
 
     from fog_contracts.messages import Place, RobotPose
     from planner.store import StoredGoal
-
-
-class GoalPose(Message, frozen=True, kw_only=True):
-    """A position in m, frame `map`; without `theta` (rad) any heading is accepted."""
-
-    x: Metres
-    y: Metres
-    theta: Radians | None = None
-
-
-class GoalBody(Message, frozen=True, kw_only=True):
-    """A goal: the id of a place of the site, or a pose; exactly one of the two."""
-
-    place: Id | None = None
-    pose: GoalPose | None = None
-
-
-class MissionBody(Message, frozen=True, kw_only=True):
-    """A mission: its stops in the `given` order, or in the `best` one, whose way is the shortest (8 at most).
-
-    `when_cut`: what to do when no way leads to a stop. `deadline_s`: it ends so long after the order, whatever is left.
-    Of equally urgent missions that of higher `priority` is planned first.
-    """
-
-    stops: Annotated[list[GoalBody], Meta(min_length=1, max_length=STOPS_MAX)]
-    order: Literal["given", "best"] = "given"
-    when_cut: WhenCut = WhenCut()
-    deadline_s: TimeToLive | None = None
-    priority: Priority = 0
 
 
 class StopView(Message, frozen=True, kw_only=True):

@@ -1,0 +1,1 @@
+"""Missions that begin by the clock, and where a robot without one goes."""

@@ -1,0 +1,61 @@
+"""Which scheduled mission is due, and which robot has been idle for long enough. Pure.
+
+A mission is given once in each window of its weekly schedule: at the window's begin, or as soon within it as the robot
+is free. A robot is never taken from another mission, nor from its visitor. Who writes a schedule starts nothing by
+that: it counts from the next window on.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Final, NamedTuple
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping
+
+    from fog_contracts.weekly import Window, Windows
+    from planner.stops import ScheduledMission
+
+SCHEDULES_MAX: Final = 100
+_CLOCK_STEP_S: Final = 60.0
+"""What was done later than now, by more than this, was done by a clock that was ahead."""
+
+
+class Due(NamedTuple):
+    """The window whose mission is to be given now or, if it is `over`, was missed."""
+
+    window: Window
+    over: bool
+
+
+def due(schedule: ScheduledMission, windows: Windows, stamp: float) -> Due | None:
+    """Return for which window something is to be done at `stamp`, None if nothing is; raises `TimeZoneError`."""
+    if not schedule.enabled or (window := windows.latest(stamp)) is None or window.begin < schedule.since:
+        return None
+    last = schedule.last
+    if last is not None and last.begin >= window.begin and last.at <= stamp + _CLOCK_STEP_S:
+        return None
+    return Due(window, over=stamp >= window.end)
+
+
+class IdleTimes:
+    """For how long robots have been idle. `now` is s of a monotonic clock."""
+
+    def __init__(self, after_s: Mapping[str, float]) -> None:
+        """`after_s`: by robot, after how long something is to be done about it."""
+        self._after_s = after_s
+        self._since: dict[str, float] = {}
+
+    def is_due(self, robot: str, now: float, *, idle: bool) -> bool:
+        """Note whether a robot is idle; return whether it is for long enough, after which its time begins anew."""
+        after = self._after_s.get(robot)
+        if after is None or not idle:
+            self._since.pop(robot, None)
+            return False
+        if now - self._since.setdefault(robot, now) < after:
+            return False
+        self._since[robot] = now
+        return True
+
+    def clear(self) -> None:
+        """Begin anew for all robots."""
+        self._since.clear()

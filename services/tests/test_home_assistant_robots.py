@@ -166,32 +166,35 @@ class HomeItself:
     "FOGNAV_HOME_ASSISTANT=H/bin/python",
 )
 async def test_home_assistant_itself_shows_all_of_a_robot_and_its_services_reach_the_floor(bridge, tmp_path, until):
-    async with bridge.edges() as (_, zenoh, _connect), robot_state(zenoh), HomeItself.of(bridge, tmp_path) as home:
-        await home.wait("sensor.r1_battery", "63")
-        found = await home.wait("image.r1_map", "20")  # the time of the picture
-        expected = {
-            "vacuum.r1": "idle", "sensor.r1_mode": "HOLD", "sensor.r1_why_it_stands": f"{HOSTILE}; {HOSTILE}"[:255],
-            "binary_sensor.r1_charging": "off", "binary_sensor.r1_problem": "off",
-            "binary_sensor.r1_waits_for_an_operator": "on", "select.r1_goal": "no goal",
-        }  # fmt: skip
-        assert {entity: found[entity][0] for entity in expected} == expected
-        assert {
-            "button.r1_stop",
-            "button.r1_end_the_mission",
-            "sensor.r1_refused_order",
-            "image.r1_map",
-        } <= found.keys()
-        assert len(found["image.r1_map"][1]["calibration_points"]) == 3
-        for call, order in (
-            ('button press {"entity_id": "button.r1_stop"}', "stop"),
-            ('vacuum return_to_base {"entity_id": "vacuum.r1"}', "return_to_base"),
-            ('select select_option {"entity_id": "select.r1_goal", "option": "no goal"}', "goal no goal"),
-        ):
-            await home.ask(f"call {call}")
-            said = re.compile(rf'"order": ?"{order}"')
-            await until(lambda said=said: said.search(bridge.log("fog_bridges")), f"the floor is asked: {order}")
-            if order == "stop":  # the robot of this test does not answer
-                await home.wait("sensor.r1_refused_order", "r1")
+    async with bridge.edges() as (_, zenoh, _connect), HomeItself.of(bridge, tmp_path) as home:
+        async with robot_state(zenoh):
+            await home.wait("sensor.r1_battery", "63")
+            found = await home.wait("image.r1_map", "20")  # the time of the picture
+            expected = {
+                "vacuum.r1": "idle", "sensor.r1_mode": "HOLD", "sensor.r1_why_it_stands": f"{HOSTILE}; {HOSTILE}"[:255],
+                "binary_sensor.r1_charging": "off", "binary_sensor.r1_problem": "off",
+                "binary_sensor.r1_waits_for_an_operator": "on", "select.r1_goal": "no goal",
+            }  # fmt: skip
+            assert {entity: found[entity][0] for entity in expected} == expected
+            assert {
+                "button.r1_stop",
+                "button.r1_end_the_mission",
+                "sensor.r1_refused_order",
+                "image.r1_map",
+            } <= found.keys()
+            assert len(found["image.r1_map"][1]["calibration_points"]) == 3
+            for call, order in (
+                ('button press {"entity_id": "button.r1_stop"}', "stop"),
+                ('vacuum return_to_base {"entity_id": "vacuum.r1"}', "return_to_base"),
+                ('select select_option {"entity_id": "select.r1_goal", "option": "no goal"}', "goal no goal"),
+            ):
+                await home.ask(f"call {call}")
+                said = re.compile(rf'"order": ?"{order}"')
+                await until(lambda said=said: said.search(bridge.log("fog_bridges")), f"the floor is asked: {order}")
+                if order == "stop":  # the robot of this test does not answer
+                    await home.wait("sensor.r1_refused_order", "r1")
+        await home.wait("vacuum.r1", "error")  # the robot has fallen silent
+        await home.wait("binary_sensor.r1_problem", "on")
         assert await home.ask("log") == []
         bridge.kill("console_service")
         await home.wait("vacuum.r1", "unavailable")
@@ -202,7 +205,8 @@ async def test_home_assistant_itself_shows_all_of_a_robot_and_its_services_reach
 async def test_robot_is_a_device_with_state_map_and_orders_and_refusals_are_told(bridge, tokens, until):
     async with bridge.edges() as (_, zenoh, _connect), home_of(bridge) as (home, mqtt):
         async with robot_state(zenoh):
-            await until(lambda: home.report().get("battery") == 63, "its battery is known")
+            await until(lambda: home.report().get("mode") == "HOLD", "it is heard", lambda: str(home.report()))
+            assert home.report()["battery"] == 63
             await until(lambda: home.of(ch.HOME_ASSISTANT_ROBOT), "its device is known", lambda: str(home.told.keys()))
             assert home.report()["why"] == f"{HOSTILE}; {HOSTILE}"[:255]
             assert home.report()["waits_for_operator"] == "ON"

@@ -267,8 +267,22 @@ def test_mission_that_may_have_been_accepted_is_the_fleets_though_its_repetition
     floor.tell(2.0)
     assert floor.said()["operatingMode"] == "AUTOMATIC"
     mission = floor.goal["goal_id"]
-    assert floor.drive() == ["PUT 4 1", "PUT 4 1"], "asked for, and replaced by the same"
-    assert floor.asked[-1].headers["If-Match"] == f'"{mission}"'
+    assert floor.drive() == ["PUT 4 1", "DELETE", "PUT 4 1"], "asked for, ended, and begun anew"
+    assert floor.asked[-2].headers["If-Match"] == f'"{mission}"'
+
+
+def test_mission_that_has_begun_unanswered_and_that_an_operator_has_ended_since_ends_no_later_order():
+    floor = Floorplan()
+    floor.take(order(A, B))
+    floor.drive(LOST)
+    floor.robot.on_instant(instant("cancelOrder", "c"), floor.now)
+    assert floor.take(order(A, C | {"sequenceId": 2}, name="o2")) == ""
+    floor.begin(floor.asked[0])
+    floor.goal = None
+    floor.tell(2.0, goal_id=None)
+    assert floor.drive() == ["PUT 4 1", "DELETE", "PUT 7 1"]
+    floor.tell(UNSEEN_S)
+    assert (floor.errors(), floor.robot.goal_node.node_id) == ({}, "c")
 
 
 def test_request_that_the_floor_could_not_carry_out_is_sent_again_by_the_same_key():

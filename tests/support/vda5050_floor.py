@@ -136,8 +136,9 @@ class Floorplan:
                     self.begin(request)
                 self.robot.on_answer(Answer("", body=self.begun[key]), self.now)
             elif request.method == "DELETE":
-                self.goal = None
-                self.robot.on_answer(Answer(""), self.now)
+                has_it = self.goal is not None and request.headers["If-Match"] == f'"{self.goal["goal_id"]}"'
+                self.goal = None if has_it else self.goal
+                self.robot.on_answer(Answer("") if has_it else Answer("it has none", "mission_changed"), self.now)
             else:
                 self.robot.on_answer(Answer(""), self.now)
         self.tell(0.1)

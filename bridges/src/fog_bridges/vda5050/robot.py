@@ -16,6 +16,7 @@ from fog_bridges.vda5050.charging import Charging, drop_done, remember_action
 from fog_bridges.vda5050.control import Doings, mode_of
 from fog_bridges.vda5050.orders import Orders, Situation, Where, about_error, goal_of, is_within, remember
 from fog_bridges.vda5050.uncertain import UNCERTAIN, UNSEEN_S, Uncertain
+from fog_bridges.vda5050.watched import Watched
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -26,30 +27,24 @@ if TYPE_CHECKING:
 
 SPEED_M_S: Final = 0.3
 """The highest speed of a robot of Fognav."""
-SILENT_S: Final = 5.0
-"""A robot that tells no state for so long is not there."""
 RETRY_S: Final = 1.0
 REFUSED_S: Final = 5.0
 """Without any path for so long, the robot gives up a node, as the norm wants: the fleet decides."""
 TAKEN_S: Final = 2.0
 """How long the operating mode says that an operator has ended a mission."""
-STILL: Final = (0.01, 0.05)
-"""A robot that moves no faster (m/s, rad/s) stands."""
 Wish = Literal["state", "factsheet"]
 """What is to be published as an instant action asks for it."""
 
 
-class FleetRobot:
+class FleetRobot(Watched):
     """One robot under a fleet control."""
 
     def __init__(self, robot: str, map_id: str) -> None:
+        super().__init__()
         self.robot = robot
         self.map_id = map_id
         self.orders = Orders()
         self.charging = Charging(robot)
-        self.view: dict[str, Any] = {"state": None, "goal": None}
-        self.pose: dict[str, Any] | None = None
-        self.path: list[tuple[float, float]] = []
         self.places: Mapping[str, Where] = {}
         self.paused = False
         self.pending: Order | None = None
@@ -57,12 +52,10 @@ class FleetRobot:
         self.waiting: list[Order] = []
         """The orders after it, in which a cancel counts as well."""
         self.instant: dict[str, ActionState] = {}
-        self.path_changes = 0
         self._about_errors: dict[str, Error] = {}
         self._instant_error: Error | None = None
         self._unavailable: Error | None = None
         self._unreachable: Error | None = None
-        self._heard = -math.inf
         self._goal = ""
         """The fleet's mission, by its id; empty without one."""
         self._goal_node: Node | None = None
@@ -74,8 +67,6 @@ class FleetRobot:
         self._asked_at = -math.inf
         self._ends: dict[str, bool] = {}
         """Missions of the robot that are told to have ended, and whether they were reached."""
-        self.is_known = False
-        """Whether the floor's state is: else nothing is concluded from it."""
         self._asking: Request | None = None
         self._asked_for: Node | None = None
         self._unsure: Uncertain | None = None
@@ -91,10 +82,7 @@ class FleetRobot:
 
     def on_robot(self, view: dict[str, Any], now: float) -> None:
         """Take in the robot's state, mission and plan."""
-        before = (self.view["state"] or {}).get("stamp")
-        if self.is_known and (view["state"] or {}).get("stamp") != before:
-            self._heard = now  # what is told before all is known may be long ago
-        self.view = view
+        self.watch(view, now)
         if (state := self.state).get("goal_reached") and state.get("goal_id"):
             remember(self._ends, state["goal_id"], value=True)
         self.advance(now)
@@ -109,36 +97,10 @@ class FleetRobot:
         self.is_known, self._shown_at = True, now
         self.advance(now)
 
-    def forget(self) -> None:
-        """Drop what was told: the floor tells all anew."""
-        self.is_known = False
-        self.view, self.pose = {"state": None, "goal": None}, None
-        self.on_path([])
-
     def on_pose(self, pose: dict[str, Any], now: float) -> None:
         """Take in where the robot is."""
         self.pose = pose
         self.advance(now)
-
-    def on_path(self, points: list[tuple[float, float]]) -> None:
-        """Take in the robot's path (m)."""
-        self.path = points
-        self.path_changes += 1
-
-    def is_there(self, now: float) -> bool:
-        """Whether the robot itself is heard of."""
-        return now - self._heard < SILENT_S
-
-    @property
-    def state(self) -> dict[str, Any]:
-        """The robot's own state; empty before the first one."""
-        return self.view["state"] or {}
-
-    @property
-    def at(self) -> Where | None:
-        """Where the robot is, if it knows."""
-        pose = self.pose
-        return None if pose is None or not pose["localized"] else Where(pose["x"], pose["y"], pose["theta"])
 
     @property
     def _is_asking(self) -> bool:
@@ -152,16 +114,6 @@ class FleetRobot:
             return False
         wanted, found = request.body["pose"], goal["pose"]
         return math.dist((wanted["x"], wanted["y"]), (found["x"], found["y"])) < 0.01
-
-    @property
-    def has_dock(self) -> bool:
-        """Whether the site gives the robot a dock."""
-        return self.view.get("dock") is not None
-
-    @property
-    def is_driving(self) -> bool:
-        """Whether it moves."""
-        return self.pose is not None and (abs(self.pose["v"]) > STILL[0] or abs(self.pose["w"]) > STILL[1])
 
     def mode(self, now: float) -> tuple[OperatingMode, str]:
         """Return the operating mode, and in words why the fleet is not in control; empty if it is."""
@@ -333,7 +285,7 @@ class FleetRobot:
             self._shown_at = now
         elif end is False or (shown and shown not in self._own) or now - self._shown_at >= UNSEEN_S:
             self._drop(is_over=end is False)
-            if self.orders.is_idle:
+            if self.orders.is_idle or self._goal_node is None:
                 return  # it was to end
             self._taken_until = now + TAKEN_S
             words = "an operator of Fognav has ended the mission, and so the order"
@@ -382,8 +334,8 @@ class FleetRobot:
         if self._unsure is not None and node is not None and node is self._unsure.node:
             return self._ask(self._unsure.request, node, now)
         self._adopt(now)
-        if self._unsure is not None:
-            node = None  # first the mission that it has, if it is still there, then what appears
+        if self._unsure is not None or (self._goal and self._goal_node is None):
+            node = None  # first the mission that it has, or may have, is ended
         goal = None if node is None else goal_of(node, self.places)
         path = f"/api/v1/robots/{self.robot}/goal"
         if node is None or goal is None:
@@ -440,7 +392,8 @@ class FleetRobot:
     def _on_answer(self, request: Request, node: Node | None, answer: Answer, now: float) -> None:
         unsure = self._unsure
         # Of an order that goes on it has to be known who ended its mission: an operator ends the order.
-        is_gone = answer.problem in ("no_mission", "mission_changed") and (self.orders.is_idle or unsure is not None)
+        was_to_end = self.orders.is_idle or unsure is not None or self._goal_node is None
+        is_gone = answer.problem in ("no_mission", "mission_changed") and was_to_end
         if request.method == "PUT" and "goal_id" in answer.body:
             if self._goal:
                 self._drop(is_over=True)

@@ -379,7 +379,10 @@ LEARNED = NodeCalibration(
 def test_calibration_writes_limits_and_how_likely_false_echoes_are_into_the_site(monkeypatch, floor: Path) -> None:
     answers = [LEARNED]
 
-    async def learn(*_: object) -> NodeCalibration:
+    told: list[object] = []
+
+    async def learn(_url: str, _site: str, _node: str, command: str, *_: object) -> NodeCalibration:
+        told.append(command)
         return answers[-1]
 
     monkeypatch.setattr(on_broker, "learn", learn)
@@ -392,6 +395,7 @@ def test_calibration_writes_limits_and_how_likely_false_echoes_are_into_the_site
         (node,) = [node for node in load_site(floor).site.nodes if node.id == "n1"]
         return [(sonar.range_limit, sonar.range_max, sonar.false_echo_rate) for sonar in node.sonars]
 
+    assert told == [ch.CALIBRATE, ch.KEEP]
     shares = [pytest.approx(2 / 260, abs=1e-4), pytest.approx(4 / 260, abs=1e-4)]
     assert "warning" not in done.stderr
     assert stored() == [(2.7, 3.2, shares[0]), (2.75, 3.25, shares[1])]
@@ -415,7 +419,10 @@ def test_calibration_writes_limits_and_how_likely_false_echoes_are_into_the_site
     ids=["somebody stood there", "door was open", "sonar is covered"],
 )
 def test_calibration_that_contradicts_the_map_is_written_only_by_force(monkeypatch, floor: Path, learned, says) -> None:
-    async def learn(*_: object) -> NodeCalibration:
+    told: list[object] = []
+
+    async def learn(_url: str, _site: str, _node: str, command: str, *_: object) -> NodeCalibration:
+        told.append(command)
         return msgspec.structs.replace(LEARNED, **learned)
 
     monkeypatch.setattr(on_broker, "learn", learn)
@@ -425,7 +432,9 @@ def test_calibration_that_contradicts_the_map_is_written_only_by_force(monkeypat
     assert done.exit_code == 1
     assert says in " ".join(done.stderr.split())
     assert (floor / "site.toml").read_bytes() == before
+    assert told == [ch.CALIBRATE], "the node keeps its old limits, too"
     assert CliRunner().invoke(node_app, [*words, "--force"]).exit_code == 0
+    assert told[1:] == [ch.CALIBRATE, ch.KEEP]
     sonars = next(node for node in load_site(floor).site.nodes if node.id == "n1").sonars
     assert [sonar.range_limit for sonar in sonars] == learned["range_limit_m"]
 
@@ -520,6 +529,20 @@ def test_replacing_a_node_leaves_every_other_line_of_the_site(index, limits, sil
 def test_node_in_a_table_of_another_form_is_not_touched() -> None:
     node = NodeSite(id="n1", area="z1", x=0.0, y=0.0, theta=0.0, sonars=[Sonar(range_limit=1.0)])
     assert site_files.replaced('nodes = [{ id = "n1", area = "z1" }]\n', node) is None
+
+
+def test_sonar_that_failed_leaves_its_node_all_its_limits(monkeypatch) -> None:
+    told: list[object] = []
+
+    async def learn(_url: str, _site: str, _node: str, command: str, *_: object) -> NodeCalibration:
+        told.append(command)
+        return msgspec.structs.replace(LEARNED, result=["unsteady", "done"])
+
+    monkeypatch.setattr(on_broker, "learn", learn)
+    done = CliRunner().invoke(node_app, ["calibrate", "n1", "--site-id", "estig", "--broker", "mqtt://127.0.0.1:1"])
+    assert done.exit_code == 1
+    assert "keeps its old limits: sonar 1 measured something that moved" in " ".join(done.stderr.split())
+    assert told == [ch.CALIBRATE]
 
 
 @pytest.mark.live

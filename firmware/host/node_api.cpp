@@ -31,7 +31,8 @@ Node* fognav_node_new(const FognavSonar* sonars, int count, uint32_t boot, int p
 
 void fognav_node_free(Node* node) { delete node; }
 
-// 0: nothing, 1: trigger sonar `fognav_node_sonar`, 2: publish `fognav_node_message`, 3: it is a calibration.
+// 0: nothing, 1: trigger sonar `fognav_node_sonar`, 2: publish `fognav_node_message`, 3: it is a calibration, 4: which is to be
+// stored, 5: store it, or nothing if it is empty.
 int fognav_node_step(Node* node, uint32_t now_us) { return static_cast<int>(node->step(now_us)); }
 
 // Step from `now_us` on, every `period_us`, up to and with `until_us` or the first event, which is returned as above;

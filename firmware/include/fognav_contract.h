@@ -106,7 +106,7 @@
 #define FOGNAV_NODE_CONFIG_PAUSE_MS_MAX 60000L
 #define FOGNAV_NODE_CONFIG_PAUSE_MS_DEFAULT 10
 
-/* node_command, subscribed by a node: what a node is to learn while nobody is in its sonars' way */
+/* node_command, subscribed by a node: what a node is to learn while nobody is in its sonars' way, and that what it learned is to count */
 #define FOGNAV_NODE_COMMAND_TOPIC "fog/v1/%s/nodes/%s/command" /* site, node */
 #define FOGNAV_NODE_COMMAND_TOPIC_SIZE 87
 #define FOGNAV_NODE_COMMAND_LIMIT 32 /* bytes */
@@ -114,8 +114,9 @@
 #define FOGNAV_NODE_COMMAND_RETAINED 0
 #define FOGNAV_NODE_COMMAND_CALIBRATE "calibrate"
 #define FOGNAV_NODE_COMMAND_LEARN_NO_ECHO "learn-no-echo"
+#define FOGNAV_NODE_COMMAND_KEEP "keep"
 
-/* node_calibration, published by a node: What a node has learned on command; it holds until a configuration with another version comes. Per sonar: how it ended, the settings that count now, and the pulse (us, 0: none) by which its board says "no echo". Of so many `samples` of free space after its limit was learned (0: none was), as the node's filter lets them through, so many were `false_echoes`, from nearer than that limit, and so many had no echo. */
+/* node_calibration, published by a node: What a node has learned on command; told to `keep` it, the node goes by it until another configuration comes. Per sonar: how it ended, the settings with what it learned, and the pulse (us, 0: none) by which its board says "no echo". Of so many `samples` of free space after its limit was learned (0: none was), as the node's filter lets them through, so many were `false_echoes`, from nearer than that limit, and so many had no echo. */
 #define FOGNAV_NODE_CALIBRATION_TOPIC "fog/v1/%s/nodes/%s/calibration" /* site, node */
 #define FOGNAV_NODE_CALIBRATION_TOPIC_SIZE 91
 #define FOGNAV_NODE_CALIBRATION_LIMIT 1024 /* bytes */

@@ -25,4 +25,6 @@ bool write_file(const char* name, const char* text) {
     return written && LittleFS.rename(kUnfinished, name);
 }
 
+void remove_file(const char* name) { LittleFS.remove(name); }
+
 }  // namespace fognav

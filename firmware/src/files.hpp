@@ -16,4 +16,7 @@ String read_file(const char* name, size_t size_max);
 // Write a file so that after a loss of power it is the old one or the new one. False if the flash is full.
 bool write_file(const char* name, const char* text);
 
+// Afterwards there is no such file.
+void remove_file(const char* name);
+
 }  // namespace fognav

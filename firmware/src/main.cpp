@@ -95,15 +95,25 @@ private:
                 node_.set_rssi(static_cast<int16_t>(link_.rssi()));
                 break;
             case Node::Event::calibrated:
-                end_calibration();
+                link_.set_calibration(node_.message());
+                for (int i = 0; i < settings_.sonars; ++i) Serial.printf("sonar %d: %s\n", i, describe(node_.calibration(i)));
+                break;
+            case Node::Event::kept:
+                store_calibration();
+                link_.set_calibration(node_.message());
+                break;
+            case Node::Event::replaced:
+                store_calibration();
+                link_.set_calibration("");
         }
     }
 
-    void end_calibration() {
-        const bool stored = write_file(kCalibrationFile, node_.message());
-        link_.report(stored ? nullptr : IN_FLASH("the calibration can't be stored, and ends with the next restart: the flash is full"));
-        link_.set_calibration(node_.message());
-        for (int i = 0; i < settings_.sonars; ++i) Serial.printf("sonar %d: %s\n", i, describe(node_.calibration(i)));
+    void store_calibration() {
+        if (node_.message_length() == 0) {
+            remove_file(kCalibrationFile);
+        } else if (!write_file(kCalibrationFile, node_.message())) {
+            link_.report(IN_FLASH("the calibration can't be stored, and ends with the next restart: the flash is full"));
+        }
     }
 
     void take_value() {

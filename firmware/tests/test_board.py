@@ -370,23 +370,83 @@ def test_configuration_counts_and_one_that_is_refused_is_told(switch_on):
     assert published(lines, ch.NODE_READING, NodeReading)[-1].state == "blocked"
 
 
+def learned(board, command=ch.CALIBRATE, *, keep=True):
+    """Return what a board has learned, and whether it was told to keep that."""
+    board.send(ch.NODE_COMMAND, command)
+    lines = board.run(45)
+    (report,) = published(lines, ch.NODE_CALIBRATION, NodeCalibration)
+    assert not any("calibration.json" in line for line in lines)
+    if keep:
+        board.send(ch.NODE_COMMAND, ch.KEEP)
+        lines = board.run(1)
+        assert "write /calibration.json" in lines
+        assert published(lines, ch.NODE_CALIBRATION, NodeCalibration) == [report]
+    return report
+
+
 def test_calibration_on_command_is_stored_reported_and_outlives_a_restart(switch_on):
     board = switch_on(SETTINGS)
     board.measures(1000, -1)
     board.run(5)
-    board.send(ch.NODE_COMMAND, ch.CALIBRATE)
-    lines = board.run(45)
-    assert "write /calibration.json" in lines
-    (report,) = published(lines, ch.NODE_CALIBRATION, NodeCalibration)
+    report = learned(board)
     assert (report.result, report.no_echo_is_clear) == (["done", "done"], [False, True])
     assert report.range_limit_m == [pytest.approx(0.8, abs=0.01), 4.0]
-    assert published(lines, ch.NODE_READING, NodeReading)[-1].state == "clear"
+    assert published(board.run(1), ch.NODE_READING, NodeReading)[-1].state == "clear"
     board.close()
     again = switch_on()
     again.measures(1000, -1)
     lines = again.run(5)
     assert published(lines, ch.NODE_CALIBRATION, NodeCalibration) == [report]
     assert published(lines, ch.NODE_READING, NodeReading)[-1].state == "clear"
+
+
+def test_calibration_that_nobody_keeps_counts_neither_now_nor_after_a_restart(switch_on):
+    board = switch_on(SETTINGS)
+    board.measures(1000, -1)
+    board.run(5)
+    learned(board, keep=False)
+    assert published(board.run(2), ch.NODE_READING, NodeReading)[-1].state == "blocked"
+    board.close()
+    again = switch_on()
+    again.measures(1000, -1)
+    assert published(again.run(5), ch.NODE_READING, NodeReading)[-1].state == "blocked"
+    again.send(ch.NODE_COMMAND, ch.KEEP)
+    assert "no calibration to keep" in published(again.run(1), ch.NODE_PROBLEM)[0]
+
+
+def test_another_configuration_ends_a_calibration_though_the_one_of_before_comes_back_after_a_power_cut(switch_on):
+    board = switch_on(SETTINGS)
+    board.measures(1000, 3000)
+    before = NodeConfig(version=1, range_limit_m=[1.5, 1.5], no_echo_is_clear=[False, False])
+    board.send(ch.NODE_CONFIG, before)
+    board.run(5)
+    learned(board)
+    assert published(board.run(2), ch.NODE_READING, NodeReading)[-1].state == "clear"
+    board.send(ch.NODE_CONFIG, msgspec.structs.replace(before, version=2, range_limit_m=[1.6, 1.6]))
+    lines = board.run(2)
+    assert "remove /calibration.json" in lines
+    assert published(lines, ch.NODE_CALIBRATION) == [""]
+    assert published(lines, ch.NODE_READING, NodeReading)[-1].state == "blocked"
+    board.close()
+    again = switch_on()
+    again.measures(1000, 3000)
+    again.send(ch.NODE_CONFIG, before)
+    assert published(again.run(5), ch.NODE_READING, NodeReading)[-1].state == "blocked"
+
+
+def test_what_a_clone_says_for_no_echo_outlives_other_limits_and_a_restart(switch_on):
+    board = switch_on(SETTINGS)
+    board.measures(400, 400)
+    config = NodeConfig(version=1, range_limit_m=[1.5, 1.5], no_echo_is_clear=[False, False])
+    board.send(ch.NODE_CONFIG, config)
+    board.run(5)
+    assert learned(board, ch.LEARN_NO_ECHO).no_echo_us == [pytest.approx(2330, abs=20)] * 2
+    board.send(ch.NODE_CONFIG, msgspec.structs.replace(config, version=2))
+    board.run(2)
+    board.close()
+    again = switch_on()
+    again.measures(400, 400)
+    assert published(again.run(5), ch.NODE_READING, NodeReading)[-1].status == ["no_echo", "no_echo"]
 
 
 def test_command_that_is_not_known_is_told(switch_on):

@@ -293,7 +293,7 @@ def test_readings_go_out_as_after_a_change_when_connection_or_configuration_is_n
     [
         ((3.0, 3.5), [("calibrated", 2.8, 3.3, 0), ("calibrated", 3.3, 3.8, 0)]),
         ((None, 3.5), [("calibrated", 4.0, 0.0, 1), ("calibrated", 3.3, 3.8, 0)]),
-        ((0.45, 3.5), [("its free distance", 2.0, 0.0, 0), ("calibrated", 3.3, 3.8, 0)]),
+        ((0.45, 3.5), [("its free distance", 2.0, 0.0, 0), ("calibrated", 2.5, 0.0, 0)]),
     ],
 )
 def test_calibration_learns_the_free_distance(core, make_node, run, free, learned):
@@ -303,6 +303,10 @@ def test_calibration_learns_the_free_distance(core, make_node, run, free, learne
     assert {reading.state for reading in run(node, free, 2.0)} == {"unknown"}
     run(node, free, 40.0)
     assert not core.calibrating(node._node)
+    assert core.limit_mm(node._node, 1) == 2500, "nobody has said yet that it counts"
+    all_learned = all(words == "calibrated" for words, *_ in learned)
+    assert (node.command(ch.KEEP) is None) == all_learned
+    run(node, free, 1.0)
     for sonar, (words, limit, farthest, silent) in enumerate(learned):
         assert core.describe_calibration(core.calibration(node._node, sonar)).decode().startswith(words)
         assert core.limit_mm(node._node, sonar) / 1000 == pytest.approx(limit, abs=0.02)
@@ -321,10 +325,14 @@ def test_calibration_refuses_a_sonar_that_is_disturbed(core, make_node, run):
 
 
 def calibrated(run, node, command, metres):
-    """Return what the node reports after a command."""
+    """Return what the node reports after a command; it counts from then on, if all sonars have learned."""
     assert node.command(command) is None
     run(node, metres, 60.0)
     report = node.take_calibration()
+    if set(report.result) == {"done"}:
+        assert node.command(ch.KEEP) is None
+        run(node, metres, 1.0)
+        assert node.take_calibration() == report
     assert decode(ch.NODE_CALIBRATION, encode(ch.NODE_CALIBRATION, report), NodeCalibration) == report
     return report
 
@@ -338,6 +346,24 @@ def test_calibration_is_reported_with_the_version_that_it_replaces(make_node, ru
     assert report.range_limit_m == [pytest.approx(2.8, abs=0.02), 1.0]
     assert report.no_echo_is_clear == [False, False]
     assert node.take_calibration() is None
+
+
+def test_no_sonar_takes_its_limit_where_another_one_failed(core, make_node, run):
+    node = make_node()
+    assert calibrated(run, node, ch.CALIBRATE, (3.0, 0.4)).result == ["done", "too_near"]
+    assert "every sonar has learned" in node.command(ch.KEEP)
+    run(node, (3.0, 0.4), 1.0)
+    assert [core.limit_mm(node._node, sonar) for sonar in (0, 1)] == [2000, 2500]
+
+
+def test_calibration_of_before_another_configuration_can_not_be_kept(core, make_node, run):
+    node = make_node()
+    assert node.command(ch.CALIBRATE) is None
+    run(node, (3.0, 3.0), 60.0)
+    assert node.configure(NodeConfig(version=10, range_limit_m=[1.5, 1.5], no_echo_is_clear=[False, False]))
+    assert node.command(ch.KEEP) is not None
+    run(node, (3.0, 3.0), 1.0)
+    assert core.limit_mm(node._node, 0) == 1500
 
 
 def test_calibration_counts_echoes_from_nearer_than_the_limit_and_missing_ones(make_node, run):

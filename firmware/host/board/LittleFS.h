@@ -27,5 +27,6 @@ struct FileSystem {
 #endif
     File open(const char* name, const char* mode);
     bool rename(const char* from, const char* to);
+    bool remove(const char* name);
 };
 extern FileSystem LittleFS;

@@ -292,6 +292,11 @@ bool FileSystem::rename(const char* from, const char* to) {
     printf("write %s\n", to);
     return ::rename((folder() + from).c_str(), (folder() + to).c_str()) == 0;
 }
+bool FileSystem::remove(const char* name) {
+    if (::remove((folder() + name).c_str()) != 0) return false;
+    printf("remove %s\n", name);
+    return true;
+}
 
 bool HTTPClient::begin(WiFiClient& client, const char* url) {
     printf("fetch %s\n", url);

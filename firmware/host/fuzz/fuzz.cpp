@@ -39,10 +39,13 @@ int LLVMFuzzerTestOneInput(const uint8_t* data, size_t size) {
     for (size_t i = 0; i + 2 < size; i += 3) {
         now_us += static_cast<uint32_t>(data[i + 1]) << (data[i + 2] % 16);
         switch (data[i] % 8) {
-            case 0:
-                node.command(data[i + 1] % 2 != 0 ? FOGNAV_NODE_COMMAND_CALIBRATE : FOGNAV_NODE_COMMAND_LEARN_NO_ECHO,
-                             data[i + 1] % 2 != 0 ? 9 : 13);
+            case 0: {
+                static constexpr const char* kCommands[] = {
+                    FOGNAV_NODE_COMMAND_CALIBRATE, FOGNAV_NODE_COMMAND_LEARN_NO_ECHO, FOGNAV_NODE_COMMAND_KEEP};
+                const char* command = kCommands[data[i + 1] % 3];
+                node.command(command, strlen(command));
                 break;
+            }
             case 1:
                 node.configure(text + i, size - i);
                 break;
@@ -58,7 +61,11 @@ int LLVMFuzzerTestOneInput(const uint8_t* data, size_t size) {
                     case fognav::Node::Event::none:
                     case fognav::Node::Event::trigger:
                         continue;
+                    case fognav::Node::Event::replaced:
+                        if (node.message_length() == 0) continue;
+                        [[fallthrough]];
                     case fognav::Node::Event::calibrated:
+                    case fognav::Node::Event::kept:
                         // What a node has stored, it must be able to read.
                         if (node.restore(node.message(), node.message_length()) != nullptr) abort();
                         break;

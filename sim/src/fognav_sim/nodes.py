@@ -150,6 +150,7 @@ _RSSI_DBM: Final = -55
 _TRIGGER: Final = 1
 _PUBLISH: Final = 2
 _CALIBRATED: Final = 3
+_KEPT: Final = 4
 _US: Final = 1_000_000
 
 
@@ -198,7 +199,7 @@ class FirmwareNode:
         return self._core.restore(self._node, text, len(text)) is None
 
     def take_calibration(self) -> NodeCalibration | None:
-        """Return the calibration that has ended since the last call, if one has."""
+        """Return the calibration that has ended, or that counts, since the last call, if one has."""
         calibration, self._calibration = self._calibration, None
         return calibration
 
@@ -220,7 +221,7 @@ class FirmwareNode:
                 self._trigger(world, clock.value - STEP_US)
             elif event == _PUBLISH:
                 readings.append(msgspec.json.decode(core.message(node), type=NodeReading))
-            elif event == _CALIBRATED:
+            elif event in (_CALIBRATED, _KEPT):
                 self._calibration = msgspec.json.decode(core.message(node), type=NodeCalibration)
         return readings
 

@@ -151,8 +151,8 @@ def node_calibrate(  # noqa: PLR0913  # each option is an argument
     """Let a node measure the free corridor, and take its range limits from that. Nobody may stand in its way.
 
     With --site the limits, and how likely false echoes are, are written into site.toml, unless the node hears the wall
-    elsewhere than the map has it: somebody may have stood there. Without, the aggregator's next configuration replaces
-    them.
+    elsewhere than the map has it: somebody may have stood there, and the node keeps its old limits, too. Without, the
+    aggregator's next configuration replaces them.
     """
     with exit_codes():
         loaded = None if folder is None else load_site(checkout.site_folder(folder))
@@ -186,9 +186,11 @@ def node_calibrate(  # noqa: PLR0913  # each option is an argument
             raise FailedError(f"node {name} keeps its old limits: {', '.join(failed)}")
         if unlike:
             raise FailedError(
-                f"site.toml was not changed: {'; '.join(unlike)}. Keep the way free and calibrate again; if the map or "
-                "the node's pose is wrong, mend that, or take what the node hears with --force"
+                f"site.toml was not changed, and node {name} keeps its old limits: {'; '.join(unlike)}. Keep the way "
+                "free and calibrate again; if the map or the node's pose is wrong, mend that, or take what the node "
+                "hears with --force"
             )
+        _keep(url, site_id, name, own)
         if not no_echo and all(learned.no_echo_is_clear):
             print_line(
                 f"warning: no sonar of {name} hears anything, and a dead one hears nothing either: this node will tell "
@@ -308,6 +310,14 @@ _RESULTS: Final = {
     "unsteady": "measured something that moved: let nobody stand there",
     "too_near": "looks at something too near: turn the node",
 }
+
+
+def _keep(url: str, site: str, name: str, own: Credentials) -> None:
+    """Let a node go by what it learned from now on; it does not before, so that what is declined never counts."""
+    try:
+        _run(on_broker.learn(url, site, name, ch.KEEP, own))
+    except FailedError as error:
+        raise FailedError(f"{error}. It may still go by its old limits: calibrate again") from error
 
 
 async def _watch(on: tuple[str, str, Credentials], name: str, count: int | None, *, json: bool) -> None:

@@ -147,6 +147,8 @@ LIKELIEST_FALSE_ECHOES: Final = 0.035
 CALIBRATION_S: Final = 180.0
 """A node with two sonars measures for some 40 s, one with eight for two minutes; without an answer after this it is not
 there, or its firmware is too old."""
+KEEPING_S: Final = 20.0
+"""A node says that it keeps what it learned after its next measurement, at the latest when it is connected again."""
 
 
 @asynccontextmanager
@@ -188,12 +190,14 @@ async def readings(
 async def learn(url: str, site: str, node: str, command: str, credentials: Credentials = NOBODY) -> NodeCalibration:
     """Let a node learn its limits (`CALIBRATE`) or its board's "no echo" (`LEARN_NO_ECHO`), and return what it learned.
 
-    Raises `FailedError` with the node's own words if it refused, or if it does not answer within `CALIBRATION_S`.
+    It counts once the node was told to `KEEP` it, likewise. Raises `FailedError` with the node's own words if it
+    refused, or if it does not answer within `CALIBRATION_S` (`KEEPING_S`).
     """
+    seconds = KEEPING_S if command == ch.KEEP else CALIBRATION_S
     keys = {channel: channel.key(site=site, node=node) for channel in (ch.NODE_CALIBRATION, ch.NODE_PROBLEM)}
     try:
         async with (
-            asyncio.timeout(CALIBRATION_S),
+            asyncio.timeout(seconds),
             _connected(url, dict.fromkeys(keys.values(), 1), credentials) as client,
         ):
             await client.publish(
@@ -211,7 +215,7 @@ async def learn(url: str, site: str, node: str, command: str, credentials: Crede
                     raise FailedError(f"node {node} refused: {found}")
     except TimeoutError:
         raise FailedError(
-            f"node {node} did not answer within {CALIBRATION_S:.0f} s: check that it is online (fognav node list)"
+            f"node {node} did not answer within {seconds:.0f} s: check that it is online (fognav node list)"
         ) from None
     raise FailedError(f"the broker closed the connection before node {node} answered: try again")
 

@@ -28,8 +28,8 @@ struct NodeConfig {
     uint16_t pause_ms = 10;
 };
 
-// What a node has learned: how it ended for each sonar, and the settings that count now. The configuration's version is
-// that of the one that it replaces.
+// What a node has learned: how it ended for each sonar, and the settings with what was learned. The configuration's
+// version is that of the one that it replaces.
 struct CalibrationReport {
     uint32_t boot = 0;
     CalibrationResult results[kMaxSonars] = {};

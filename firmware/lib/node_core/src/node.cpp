@@ -78,6 +78,8 @@ void Node::take(const Sample& sample) {
 Node::Event Node::finish() {
     if (doubtful()) cycle_.hurry();
     if (calibrating_ && calibration_ended()) return report_calibration();
+    if (keep_) return keep_calibration();
+    if (replaced_) return report_replaced();
     reading_.uptime_ms = uptime_us_ / 1000;
     reading_.state = calibrating_ ? State::unknown : fuse(states_, reading_.samples, reading_.sonars);
     if (!publish_.update(reading_, states_)) return Event::none;
@@ -100,6 +102,8 @@ const char* Node::configure(const char* text, size_t size) {
     if (calibrated_ && found.version == config_.version) {
         config_.pause_ms = found.pause_ms;
     } else {
+        if (found.version != config_.version) learned_ = keep_ = false;
+        replaced_ = replaced_ || calibrated_;
         config_ = found;
         calibrated_ = false;
     }
@@ -114,9 +118,12 @@ const char* Node::command(const char* text, size_t size) {
         calibrate(CalibrationGoal::free_distance);
     } else if (is(FOGNAV_NODE_COMMAND_LEARN_NO_ECHO)) {
         calibrate(CalibrationGoal::no_echo);
+    } else if (is(FOGNAV_NODE_COMMAND_KEEP)) {
+        if (!learned_) return IN_FLASH("there is no calibration to keep: calibrate, until every sonar has learned");
+        keep_ = true;
     } else {
         return IN_FLASH("this firmware does not know the command: it knows " FOGNAV_NODE_COMMAND_CALIBRATE
-               " and " FOGNAV_NODE_COMMAND_LEARN_NO_ECHO);
+               ", " FOGNAV_NODE_COMMAND_LEARN_NO_ECHO " and " FOGNAV_NODE_COMMAND_KEEP);
     }
     return nullptr;
 }
@@ -136,6 +143,7 @@ void Node::apply_limits() {
 
 void Node::calibrate(CalibrationGoal goal) {
     apply_limits();
+    learned_ = keep_ = false;
     for (int i = 0; i < config_.sonars; ++i) {
         calibrations_[i] = Calibration(goal);
         // What it says for "no echo" is what it says now.
@@ -151,21 +159,51 @@ bool Node::calibration_ended() const {
     return true;
 }
 
-Node::Event Node::report_calibration() {
+void Node::write_learned() {
     CalibrationReport report;
-    calibrating_ = false;
-    calibrated_ = true;
+    report.boot = reading_.boot;
+    report.config = config_;
     for (int i = 0; i < config_.sonars; ++i) {
         report.results[i] = calibrations_[i].result();
         report.free[i] = calibrations_[i].free_samples();
-        if (report.results[i] == CalibrationResult::done) calibrations_[i].apply(config_.limits[i]);
+        if (report.results[i] == CalibrationResult::done) calibrations_[i].apply(report.config.limits[i]);
     }
+    length_ = write_calibration(report, message_, sizeof message_);
+}
+
+Node::Event Node::report_calibration() {
+    calibrating_ = false;
+    learned_ = true;
+    for (int i = 0; i < config_.sonars; ++i) learned_ = learned_ && calibrations_[i].result() == CalibrationResult::done;
     apply_limits();
     publish_.restart();
+    write_learned();
+    return Event::calibrated;
+}
+
+Node::Event Node::keep_calibration() {
+    keep_ = replaced_ = false;
+    calibrated_ = true;
+    for (int i = 0; i < config_.sonars; ++i) calibrations_[i].apply(config_.limits[i]);
+    apply_limits();
+    publish_.restart();
+    write_learned();
+    return Event::kept;
+}
+
+Node::Event Node::report_replaced() {
+    replaced_ = false;
+    CalibrationReport report;
     report.boot = reading_.boot;
     report.config = config_;
-    length_ = write_calibration(report, message_, sizeof message_);
-    return Event::calibrated;
+    bool pulses = false;
+    for (int i = 0; i < config_.sonars; ++i) {
+        report.results[i] = CalibrationResult::done;
+        pulses = pulses || config_.limits[i].no_echo_us != 0;
+    }
+    message_[0] = 0;
+    length_ = pulses ? write_calibration(report, message_, sizeof message_) : 0;
+    return Event::replaced;
 }
 
 }  // namespace fognav

@@ -32,7 +32,9 @@ public:
         none,
         trigger,    // raise the trigger of sonar `sonar()` for kTriggerUs, at once; for another sensor: nothing
         publish,    // publish `message()`, a reading
-        calibrated  // store `message()` and publish it: a calibration has ended
+        calibrated,  // publish `message()`: a calibration has ended; nothing of it counts yet
+        kept,       // store `message()` and publish it: what was learned counts from now on
+        replaced    // a configuration has replaced the limits that are stored: store `message()`, or nothing if it is empty
     };
 
     explicit Node(const NodeSettings& settings);
@@ -47,7 +49,7 @@ public:
 
     int sonar() const { return cycle_.current(); }
 
-    // Written by the step that returned `publish` or `calibrated`, valid until the next step.
+    // Written by the step that returned `publish` or a later event, valid until the next step.
     const char* message() const { return message_; }
     size_t message_length() const { return length_; }
 
@@ -72,8 +74,9 @@ public:
     void on_connected() { publish_.restart(); }
 
     // Begin what a command asks for: learn the limits anew, or the pulses for "no echo". Return nullptr, or why not. While
-    // it is under way the node's state is unknown: its sonars' way is to be kept free. Then `calibrated` comes; a sonar
-    // that fails keeps its limit.
+    // it is under way the node's state is unknown: its sonars' way is to be kept free. Then `calibrated` comes. What was
+    // learned counts once a further command says so, and then of all sonars: whoever compares it with the map may find
+    // that somebody stood there, and a sonar that failed leaves all of them their limits.
     const char* command(const char* text, size_t size);
     bool calibrating() const { return calibrating_; }
     CalibrationResult calibration(int sonar) const { return calibrations_[sonar].result(); }
@@ -88,7 +91,10 @@ private:
     bool doubtful() const;
     void calibrate(CalibrationGoal goal);
     bool calibration_ended() const;
+    void write_learned();
     Event report_calibration();
+    Event keep_calibration();
+    Event report_replaced();
     void apply_limits();
 
     NodeConfig config_;
@@ -100,7 +106,10 @@ private:
     State states_[kMaxSonars] = {};
     Calibration calibrations_[kMaxSonars];
     bool calibrating_ = false;
-    bool calibrated_ = false;  // by itself, since the configuration with the version that is in `config_`
+    bool learned_ = false;     // of all sonars, since the configuration with the version that is in `config_`
+    bool keep_ = false;        // what was learned is to count
+    bool calibrated_ = false;  // what was learned since that configuration counts
+    bool replaced_ = false;    // what is stored counts no more
     int16_t temperature_dc_ = 200;
     bool started_ = false;
     uint32_t seen_us_ = 0;

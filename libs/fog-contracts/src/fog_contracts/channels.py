@@ -184,6 +184,7 @@ OFF: Final = "off"
 REPUBLISH: Final = "republish"
 CALIBRATE: Final = "calibrate"
 LEARN_NO_ECHO: Final = "learn-no-echo"
+KEEP: Final = "keep"
 
 _mqtt = partial(Channel, transport="mqtt", kind="pub", encoding="json")
 _text = partial(Channel, transport="mqtt", kind="pub", encoding="text", message=None)
@@ -205,7 +206,8 @@ NODE_CONFIG       = _mqtt( "node_config",       V1 + "nodes/{node}/config",     
     publishers=(AGGREGATOR,),    subscribers=(NODE,),             durability=LATEST,   qos=1)
 NODE_COMMAND      = _text( "node_command",      V1 + "nodes/{node}/command",                            limit=32,
     publishers=(CONSOLE,),       subscribers=(NODE,),             durability=VOLATILE, qos=1,
-    values=(CALIBRATE, LEARN_NO_ECHO), about="what a node is to learn while nobody is in its sonars' way")
+    values=(CALIBRATE, LEARN_NO_ECHO, KEEP),
+    about="what a node is to learn while nobody is in its sonars' way, and that what it learned is to count")
 NODE_CALIBRATION  = _mqtt( "node_calibration",  V1 + "nodes/{node}/calibration",      m.NodeCalibration, limit=KIB,
     publishers=(NODE,),          subscribers=(CONSOLE,),          durability=LATEST,   qos=1)
 NODE_UPDATE       = _mqtt( "node_update",       V1 + "nodes/{node}/update",           m.NodeUpdate,     limit=KIB,

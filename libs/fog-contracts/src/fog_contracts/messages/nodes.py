@@ -55,9 +55,10 @@ SampleCount = Annotated[int, Meta(ge=0, le=65_535)]
 
 
 class NodeCalibration(Message, frozen=True, kw_only=True):
-    """What a node has learned on command; it holds until a configuration with another version comes.
+    """What a node has learned on command; told to `keep` it, the node goes by it until another configuration comes.
 
-    Per sonar: how it ended, the settings that count now, and the pulse (us, 0: none) by which its board says "no echo".
+    Per sonar: how it ended, the settings with what it learned, and the pulse (us, 0: none) by which its board says "no
+    echo".
     Of so many `samples` of free space after its limit was learned (0: none was), as the node's filter lets them
     through, so many were `false_echoes`, from nearer than that limit, and so many had no echo.
     """

@@ -69,11 +69,11 @@ struct TestUpdater {
 
 extern "C" {
 
-// nullptr and node.json in `buffer`, or what is wrong with the form.
-const char* fognav_form_settings(const char* const* pairs, char* buffer, uint32_t size) {
+// nullptr and node.json in `buffer`, or what is wrong with the form; `before` is the node.json that the node has.
+const char* fognav_form_settings(const char* const* pairs, const char* before, char* buffer, uint32_t size) {
     fognav::Settings settings;
     buffer[0] = 0;
-    return fognav::settings_from_form(TestForm(pairs), fognav::kD1Mini, buffer, size, settings);
+    return fognav::settings_from_form(TestForm(pairs), before, fognav::kD1Mini, buffer, size, settings);
 }
 
 const char* fognav_authority_problem(const char* pem, int tls) {

@@ -45,13 +45,29 @@ const char* PortalServer::field(const char* name) const {
     return field_.c_str();
 }
 
+// nullptr, or why nothing was saved.
+const char* PortalServer::save() {
+    const char* problem = nullptr;
+    {
+        const String before = read_file(kSettingsFile, kSettingsMax);
+        if (portal_.has_settings() && before.length() == 0) return IN_FLASH("there is too little memory: restart the node, and try again");
+        problem = settings_from_form(*this, before.c_str(), kBoard, scratch, kSettingsMax + 1, settings_);
+    }
+    if (problem != nullptr) return problem;
+    // A whole file may be another site's, which has another one.
+    if (!had_authority_ || *field("authority") != 0 || *field("provisioning") != 0) {
+        problem = authority_problem(field("authority"), settings_);
+        if (problem != nullptr) return problem;
+        if (settings_.tls && !write_file(kAuthorityFile, field("authority"))) return "the flash is full";
+    }
+    if (calibrated_mark(settings_) != mark_) remove_file(kCalibrationFile);
+    // Last: only with it the node counts as set up.
+    return write_file(kSettingsFile, scratch) ? nullptr : "the flash is full";
+}
+
 void PortalServer::submit() {
     portal_.on_request(millis());
-    const char* problem = settings_from_form(*this, kBoard, scratch, kSettingsMax + 1, settings_);
-    if (problem == nullptr) problem = authority_problem(field("authority"), settings_);
-    if (problem == nullptr && settings_.tls && !write_file(kAuthorityFile, field("authority"))) problem = "the flash is full";
-    // Last: only with it the node counts as set up.
-    if (problem == nullptr && !write_file(kSettingsFile, scratch)) problem = "the flash is full";
+    const char* problem = save();
     if (problem != nullptr) {
         server_.send(400, "text/plain", problem);
         return;

@@ -18,7 +18,8 @@ namespace fognav {
 class PortalServer final : Form {
 public:
     // `settings` receives what is typed: the node restarts then, or when the portal closes.
-    PortalServer(PortalSwitch& portal, Settings& settings) : portal_(portal), settings_(settings) {}
+    PortalServer(PortalSwitch& portal, Settings& settings)
+        : portal_(portal), settings_(settings), had_authority_(portal.has_settings() && settings.tls), mark_(calibrated_mark(settings)) {}
 
     void begin();
     void loop();
@@ -27,6 +28,7 @@ public:
 
 private:
     void submit();
+    const char* save();
 
 #if defined(ESP8266)
     using Server = ESP8266WebServer;
@@ -35,6 +37,8 @@ private:
 #endif
     PortalSwitch& portal_;
     Settings& settings_;
+    const bool had_authority_;  // in its file
+    const uint32_t mark_;       // of the settings of before
     DNSServer names_;
     mutable Server server_{80};
     mutable String field_;  // what `field` returned last

@@ -449,6 +449,32 @@ def test_what_a_clone_says_for_no_echo_outlives_other_limits_and_a_restart(switc
     assert published(again.run(5), ch.NODE_READING, NodeReading)[-1].status == ["no_echo", "no_echo"]
 
 
+@pytest.mark.parametrize(
+    ("field", "forgotten"), [("node n2", True), ("range_limit_m_0 1.4", True), ("wifi_name x", False)]
+)
+def test_board_that_is_set_up_as_another_node_forgets_its_calibration(switch_on, field, forgotten):
+    board = switch_on({**SETTINGS, "button": 13})
+    board.measures(1000, 3000)
+    board.run(5)
+    learned(board)
+    board.tell("pin 13 0", "run 3500", "pin 13 1")
+    lines = board.tell(f"field {field}", "request /settings", "run 10")
+    assert "write /node.json" in lines
+    assert ("remove /calibration.json" in lines) == forgotten
+    settings = json.loads((board.flash / "node.json").read_text())
+    assert settings["button"] == 13
+    assert len(settings["sonars"]) == 2
+
+
+def test_portal_of_a_node_with_a_certificate_asks_for_no_other_one(switch_on):
+    board = switch_on({**SETTINGS, "tls": True, "button": 13}, authority=PEM)
+    board.run(5)
+    board.tell("pin 13 0", "run 3500", "pin 13 1")
+    lines = board.tell("field wifi_name other", "request /settings", "run 10")
+    assert [line for line in lines if line.startswith("write")] == ["write /node.json"]
+    assert (board.flash / "ca.pem").read_text() == PEM
+
+
 def test_command_that_is_not_known_is_told(switch_on):
     board = switch_on(SETTINGS)
     board.run(5)

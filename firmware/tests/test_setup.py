@@ -19,23 +19,56 @@ FORM = {
 PEM = "-----BEGIN CERTIFICATE-----\nMIIB\n-----END CERTIFICATE-----\n"
 
 
-def submitted(core, form):
-    """Return node.json of a form, or what is wrong with it."""
+def submitted(core, form, before=None):
+    """Return node.json of a form, or what is wrong with it; `before` is the one that the node has."""
     flat = [text.encode() for pair in form.items() for text in pair]
     pairs = (ctypes.c_char_p * (len(flat) + 1))(*flat, None)
     buffer = ctypes.create_string_buffer(2049)
     function = core["fognav_form_settings"]
     function.restype = ctypes.c_char_p
-    problem = function(pairs, buffer, ctypes.c_uint32(len(buffer)))
+    had = b"" if before is None else json.dumps(before, indent=1).encode()
+    problem = function(pairs, had, buffer, ctypes.c_uint32(len(buffer)))
     return json.loads(buffer.value) if problem is None else problem.decode()
 
 
 def test_form_becomes_settings(core):
     expected = {name: text for name, text in FORM.items() if not name.startswith("range")}
     assert submitted(core, FORM) == {**expected, "tls": True, "port": 8883, "sonars": [{"range_limit_m": 1.8}]}
-    plain = submitted(core, {**FORM, "tls": "", "range_limit_m_1": "2,25"})
+    assert submitted(core, {**FORM, "tls": ""}).keys() == expected.keys() - {"tls"} | {"sonars"}, "TLS by default"
+    plain = submitted(core, {**FORM, "tls": "0", "range_limit_m_1": "2,25"})
     assert (plain["tls"], plain["port"]) == (False, 1883)
     assert plain["sonars"] == [{"range_limit_m": 1.8}, {"range_limit_m": 2.25}]
+
+
+BEFORE = {
+    "site": "lab", "node": "n1", "wifi_name": "old", "wifi_password": "secret", "broker": "fog.lan", "port": 8884,
+    "tls": True, "user": "n1", "password": "p", "button": 0, "update_key": "04" + "ab" * 64, "every_reading": True,
+    "sonars": [
+        {"sensor": "vl53l1x", "shutdown": 13, "range_limit_m": 1.8, "range_max_m": 2.3},
+        {"trigger": 12, "echo": 14, "range_limit_m": 2, "no_echo_is_clear": True},
+        {"sensor": "vl53l1x", "shutdown": 15, "range_limit_m": 1},
+    ],
+    "values": [{"kind": "gas", "sensor": "analog", "full_scale_v": 3.3}],
+}  # fmt: skip
+
+
+def test_form_changes_what_is_filled_in_and_leaves_all_else_of_the_settings(core):
+    empty = dict.fromkeys(FORM, "")
+    assert submitted(core, empty, BEFORE) == BEFORE
+    assert submitted(core, {**empty, "wifi_name": "new"}, BEFORE) == {**BEFORE, "wifi_name": "new"}
+    assert submitted(core, {**empty, "tls": "0"}, BEFORE) == {**BEFORE, "tls": False, "port": 1883}
+    first, second, third = BEFORE["sonars"]
+    limits = {"range_limit_m_0": "1.5", "range_limit_m_1": "2.5"}
+    changed = [{**first, "range_limit_m": 1.5}, {**second, "range_limit_m": 2.5}, third]
+    assert submitted(core, {**empty, **limits}, BEFORE) == {**BEFORE, "sonars": changed}
+    one = {**BEFORE, "sonars": [{"range_limit_m": 1.8}]}
+    more = [{"range_limit_m": 1.8}, {"range_limit_m": 2.0}]
+    assert submitted(core, {**empty, "range_limit_m_1": "2"}, one)["sonars"] == more
+
+
+def test_settings_that_are_not_valid_leave_nothing_in_a_form(core):
+    damaged = {**BEFORE, "broker": ""}
+    assert submitted(core, FORM, damaged) == submitted(core, FORM)
 
 
 @pytest.mark.parametrize(

@@ -33,6 +33,9 @@ public:
 
     bool failed() const { return failed_; }
 
+    // Where it has come to: behind a member's key and colon, or behind a value.
+    const char* position() const { return at_; }
+
 private:
     bool begin(char bracket);
     bool next(char bracket);

@@ -87,6 +87,11 @@ void JsonWriter::null() {
     put("null");
 }
 
+void JsonWriter::raw(const char* text, size_t length) {
+    separate();
+    for (size_t i = 0; i < length; ++i) put(text[i]);
+}
+
 size_t JsonWriter::finish() {
     if (size_ == 0) return 0;
     buffer_[overflow_ ? 0 : length_] = 0;

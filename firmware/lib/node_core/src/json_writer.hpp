@@ -23,6 +23,7 @@ public:
     void value(const char* text);  // UTF-8; control characters are left out
     void thousandths(int32_t number);  // of a metre, for instance, written in metres
     void null();
+    void raw(const char* text, size_t length);  // JSON that is written already: a value, or a member with its key
 
     // The length without the terminating zero, or 0 if the buffer was too small.
     size_t finish();

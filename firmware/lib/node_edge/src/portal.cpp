@@ -4,15 +4,17 @@
 #include <string.h>
 
 #include "in_flash.hpp"
+#include "json_reader.hpp"
 #include "json_writer.hpp"
 
 namespace fognav {
 
 namespace {
 
-constexpr const char* kTexts[] = {"site", "node", "wifi_name", "wifi_password", "broker", "user", "password"};
+constexpr const char* kTexts[] = {"site", "node", "wifi_name", "wifi_password", "broker", "user", "password", "profile"};
 
-constexpr const char* kLimits[] = {"range_limit_m_0", "range_limit_m_1"};
+constexpr int kLimitCount = 2;
+constexpr const char* kLimits[kLimitCount] = {"range_limit_m_0", "range_limit_m_1"};
 
 // Metres as somebody types them, with up to three decimals: millimetres, or 0 for anything else.
 int32_t millimetres(const char* text) {
@@ -30,55 +32,127 @@ int32_t millimetres(const char* text) {
 
 bool given(const char* text) { return text != nullptr && *text != 0; }
 
-// The sensors of the form, on the pins of the profile.
-const char* write_sonars(const Form& form, JsonWriter& json) {
-    int count = 0;
-    json.key("sonars");
-    json.begin_array();
-    for (const char* field : kLimits) {
-        const char* text = form.field(field);
-        if (!given(text)) continue;
-        const int32_t limit_mm = millimetres(text);
-        if (limit_mm == 0) return IN_FLASH("a range limit is not in metres, such as 1.8");
-        json.begin_object();
-        json.key("range_limit_m");
-        json.thousandths(limit_mm);
-        json.end_object();
-        ++count;
-    }
-    json.end_array();
-    return count > 0 ? nullptr : IN_FLASH("the range limit of the first sensor is missing, in metres");
-}
+// Copies what a form leaves of the settings of before, and adds what is filled in.
+class Merge {
+public:
+    Merge(const Form& form, const char* before, char* buffer, size_t size)
+        : form_(form), before_(before, strlen(before)), json_(buffer, size) {}
 
-const char* write_fields(const Form& form, char* buffer, size_t size, size_t& length) {
-    JsonWriter json(buffer, size);
-    json.begin_object();
-    for (const char* name : kTexts) {
-        const char* text = form.field(name);
-        if (!given(text)) continue;
-        json.key(name);
-        json.value(text);
+    const char* write(size_t& length) {
+        const char* key = nullptr;
+        size_t size = 0;
+        bool sonars = false;
+        json_.begin_object();
+        if (before_.begin_object()) {
+            while (before_.next_member(key, size)) {
+                if (is(key, size, "sonars")) {
+                    write_sonars();
+                    sonars = true;
+                } else {
+                    copy(key, replaced(key, size));
+                }
+            }
+        }
+        if (!sonars) write_sonars();
+        for (const char* name : kTexts) {
+            const char* text = form_.field(name);
+            if (!given(text)) continue;
+            json_.key(name);
+            json_.value(text);
+        }
+        const char* tls = form_.field("tls");
+        if (given(tls)) {
+            const bool encrypted = strcmp(tls, "1") == 0;
+            json_.key("tls");
+            json_.value(encrypted);
+            json_.key("port");
+            json_.value(static_cast<uint64_t>(encrypted ? 8883 : 1883));
+        }
+        json_.end_object();
+        if (problem_ != nullptr) return problem_;
+        length = json_.finish();
+        return length > 0 ? nullptr : IN_FLASH("the settings are too long: shorten the names and passwords");
     }
-    const char* profile = form.field("profile");
-    if (given(profile)) {
-        json.key("profile");
-        json.value(profile);
+
+private:
+    static bool is(const char* key, size_t length, const char* name) {
+        return strlen(name) == length && memcmp(key, name, length) == 0;
     }
-    // A browser sends nothing for a box that is not ticked.
-    json.key("tls");
-    json.value(given(form.field("tls")));
-    json.key("port");
-    json.value(static_cast<uint64_t>(given(form.field("tls")) ? 8883 : 1883));
-    const char* problem = write_sonars(form, json);
-    if (problem != nullptr) return problem;
-    json.end_object();
-    length = json.finish();
-    return length > 0 ? nullptr : IN_FLASH("the settings are too long: shorten the names and passwords");
-}
+
+    // Whether the form says something else than a member.
+    bool replaced(const char* key, size_t length) const {
+        for (const char* name : kTexts) {
+            if (is(key, length, name)) return given(form_.field(name));
+        }
+        return (is(key, length, "tls") || is(key, length, "port")) && given(form_.field("tls"));
+    }
+
+    void copy(const char* key, bool replaced) {
+        before_.skip_value();
+        const char* begin = key - 1;  // its quotation mark
+        if (!replaced) json_.raw(begin, static_cast<size_t>(before_.position() - begin));
+    }
+
+    // The sensors of before, with the form's limits; then those that only the form has, on the pins of the profile.
+    void write_sonars() {
+        const char* key = nullptr;
+        size_t size = 0;
+        int count = 0;
+        json_.key("sonars");
+        json_.begin_array();
+        if (before_.begin_array()) {
+            for (; before_.next_element(); ++count) {
+                const int32_t limit_mm = limit(count);
+                json_.begin_object();
+                if (before_.begin_object()) {
+                    while (before_.next_member(key, size)) copy(key, limit_mm != 0 && is(key, size, "range_limit_m"));
+                }
+                write_limit(limit_mm);
+                json_.end_object();
+            }
+        }
+        bool any = count > 0;
+        for (; count < kLimitCount; ++count) {
+            const int32_t limit_mm = limit(count);
+            if (limit_mm == 0) continue;
+            json_.begin_object();
+            write_limit(limit_mm);
+            json_.end_object();
+            any = true;
+        }
+        json_.end_array();
+        if (!any) refuse(IN_FLASH("the range limit of the first sensor is missing, in metres"));
+    }
+
+    void write_limit(int32_t limit_mm) {
+        if (limit_mm == 0) return;
+        json_.key("range_limit_m");
+        json_.thousandths(limit_mm);
+    }
+
+    // The limit that the form has for a sensor (mm); 0: none.
+    int32_t limit(int sonar) {
+        const char* text = sonar < kLimitCount ? form_.field(kLimits[sonar]) : nullptr;
+        if (!given(text)) return 0;
+        const int32_t limit_mm = millimetres(text);
+        if (limit_mm == 0) refuse(IN_FLASH("a range limit is not in metres, such as 1.8"));
+        return limit_mm;
+    }
+
+    void refuse(const char* problem) {
+        if (problem_ == nullptr) problem_ = problem;
+    }
+
+    const Form& form_;
+    JsonReader before_;
+    JsonWriter json_;
+    const char* problem_ = nullptr;
+};
 
 }  // namespace
 
-const char* settings_from_form(const Form& form, const BoardPins& board, char* buffer, size_t size, Settings& settings) {
+const char* settings_from_form(const Form& form, const char* before, const BoardPins& board, char* buffer, size_t size,
+                               Settings& settings) {
     size_t length = 0;
     const char* provisioning = form.field("provisioning");
     if (given(provisioning)) {
@@ -86,7 +160,8 @@ const char* settings_from_form(const Form& form, const BoardPins& board, char* b
         if (length + 1 > size) return IN_FLASH("the provisioning file is longer than 2 KB");
         memcpy(buffer, provisioning, length + 1);
     } else {
-        const char* problem = write_fields(form, buffer, size, length);
+        const bool valid = read_settings(before, strlen(before), board, settings) == nullptr;
+        const char* problem = Merge(form, valid ? before : "", buffer, size).write(length);
         if (problem != nullptr) return problem;
     }
     return read_settings(buffer, length, board, settings);
@@ -120,16 +195,19 @@ const char kPortalPage[] FLASH_SECTION =
     "<!doctype html><html lang=en><meta charset=utf-8><meta name=viewport content='width=device-width'>"
     "<title>Fognav node</title><style>body{font:16px sans-serif;max-width:34em;margin:2em auto;padding:0 1em}"
     "label{display:block;margin:.6em 0}input,textarea,select{width:100%;box-sizing:border-box;font:inherit}"
-    "input[type=checkbox]{width:auto}</style><h1>Fognav node</h1><form method=post action=/settings>"
+    "</style><h1>Fognav node</h1><form method=post action=/settings>"
     "<label>Provisioning file (node.json), if you have one"
     "<textarea name=provisioning rows=4></textarea></label><h2>or</h2>"
+    "<p>What is left empty stays as it is.</p>"
     "<label>Site <input name=site></label><label>Node <input name=node></label>"
     "<label>Wi-Fi network <input name=wifi_name></label>"
     "<label>Wi-Fi password <input name=wifi_password type=password></label>"
     "<label>Broker <input name=broker placeholder=192.168.7.1></label><label>User <input name=user></label>"
     "<label>Password <input name=password type=password></label>"
-    "<label><input name=tls type=checkbox value=1 checked> encrypted (TLS)</label>"
-    "<label>Pins <select name=profile><option>standard<option>thesis</select></label>"
+    "<label>Encrypted (TLS) <select name=tls><option value=''>as it is; a new node: yes<option value=1>yes"
+    "<option value=0>no</select></label>"
+    "<label>Pins <select name=profile><option value=''>as they are; a new node: standard<option>standard<option>thesis"
+    "</select></label>"
     "<label>Range limit of the first sensor, m <input name=range_limit_m_0></label>"
     "<label>of the second, if there is one <input name=range_limit_m_1></label><h2>and</h2>"
     "<label>Certificate of the broker's authority (ca.pem)<textarea name=authority rows=4></textarea></label>"

@@ -24,9 +24,12 @@ constexpr size_t kAuthorityMax = 4096;  // bytes of ca.pem
 constexpr uint32_t kHoldMs = 3000;      // how long the button is held
 constexpr uint32_t kPortalMs = 600000;  // a portal that a button has opened closes after so long without a request
 
-// Make node.json of a form: its field `provisioning` as it is, where there is one, else of single fields, with the
-// sensors on the board's pins. Return nullptr, its text and what it says, or what is wrong with it and what to do.
-const char* settings_from_form(const Form& form, const BoardPins& board, char* buffer, size_t size, Settings& settings);
+// Make node.json of a form: its field `provisioning` as it is, where there is one. Else of single fields: what is filled in
+// replaces what `before` says, the node.json that the node has (one that is not valid counts as none), and all else of that
+// stays; further sensors are on the board's pins. Return nullptr, its text and what it says, or what is wrong with it and what
+// to do.
+const char* settings_from_form(const Form& form, const char* before, const BoardPins& board, char* buffer, size_t size,
+                               Settings& settings);
 
 // nullptr, or what is wrong with a certificate of the broker's authority.
 const char* authority_problem(const char* pem, const Settings& settings);
@@ -46,6 +49,9 @@ public:
     void on_request(uint32_t now_ms) { used_ms_ = now_ms; }
 
     bool open() const { return open_; }
+
+    // Whether the node has begun with settings that are valid.
+    bool has_settings() const { return has_settings_; }
 
 private:
     bool has_settings_;

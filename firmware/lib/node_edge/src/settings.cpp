@@ -260,4 +260,24 @@ const char* read_settings(const char* text, size_t size, const BoardPins& board,
     return SettingsReader(text, size, settings).read(board);
 }
 
+uint32_t calibrated_mark(const Settings& settings) {
+    uint32_t mark = 2166136261;  // FNV-1a
+    const auto add = [&mark](int32_t value) { mark = (mark ^ static_cast<uint32_t>(value)) * 16777619; };
+    for (const char* text = settings.site; *text != 0; ++text) add(*text);
+    add('/');
+    for (const char* text = settings.node; *text != 0; ++text) add(*text);
+    for (int i = 0; i < settings.sonars; ++i) {
+        const RangeSensorSettings& sensor = settings.sensors[i];
+        const SonarLimit& limit = settings.limits[i];
+        add(static_cast<int32_t>(sensor.kind));
+        add(sensor.pins.trigger);
+        add(sensor.pins.echo);
+        add(sensor.shutdown);
+        add(limit.limit_mm);
+        add(limit.max_mm);
+        add(limit.no_echo_is_clear ? 1 : 0);
+    }
+    return mark;
+}
+
 }  // namespace fognav

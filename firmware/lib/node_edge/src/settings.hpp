@@ -64,4 +64,7 @@ struct Settings {
 // what was read so far. (A second copy of them would take a third of an ESP8266's stack.)
 const char* read_settings(const char* text, size_t size, const BoardPins& board, Settings& settings);
 
+// A number that differs where a calibration of before says nothing: for another node, other sensors or other limits.
+uint32_t calibrated_mark(const Settings& settings);
+
 }  // namespace fognav

@@ -196,6 +196,20 @@ def test_map_without_a_reference_is_found_by_matching_and_can_be_looked_at(folde
     assert load_map(tmp_path / "built.yaml").cells.shape == (found["height"], found["width"])
 
 
+def test_a_leap_of_the_clock_shifts_what_follows_and_a_single_wrong_stamp_shifts_nothing(tmp_path):
+    """After a pause longer than 60 scans take, all later stamps were replaced, evenly spaced."""
+    leapt = [0.2 * n + (40.0 if n >= 50 else 0.0) + 0.03 * (n % 2) for n in range(100)]
+    leapt[20] = 9000.0
+    lines = [json.dumps({"t": at, "odom": [0.01 * n, 0.0, 0.0], "ranges": [1.0] * 30}) for n, at in enumerate(leapt)]
+    (tmp_path / "leap.jsonl").write_text("\n".join(lines) + "\n")
+    log = read_log(tmp_path / "leap.jsonl")
+    assert log.stamps_mended == 2
+    stamps = np.array([scan.stamp for scan in log.scans])
+    assert np.diff(stamps[51:]) == pytest.approx(np.diff(leapt[51:]))
+    assert np.diff(stamps[21:50]) == pytest.approx(np.diff(leapt[21:50]))
+    assert stamps[49] == pytest.approx(leapt[49]), "of the one wrong stamp nothing is left"
+
+
 @pytest.mark.drive
 def test_stamps_that_go_back_and_missing_scans_are_said_and_lose_nothing(folder, tmp_path):
     with gzip.open(folder / "drive.jsonl.gz", "rt") as file:

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import socket
+import threading
+from contextlib import suppress
 from functools import partial
 from pathlib import Path
 
@@ -13,12 +16,16 @@ from fog_contracts.messages import Pose, RobotGoal
 from fog_kernels.distance import squared_distance_capped
 from fog_mapping.poses import between, compose, place
 from fog_runtime.configuration.site import load_site
+from fog_runtime.record import Recorder
 from fognav.output import WrongUseError
+from fognav.robot_page.recording import Recording
+from fognav_experiments.bench.calibration import Body, recording
 from fognav_experiments.lidar_logs.logs import read_log
 from fognav_experiments.lidar_logs.mapping import map_log
 from fognav_experiments.lockstep import LockstepDrive
 from fognav_sim.sensors import Noise
-from robot_agent.agent.recording.input_log import LoggedAgent
+from robot_agent.agent import local_link
+from robot_agent.agent.recording.input_log import TOPIC_OF_ENTRY, LoggedAgent
 from robot_agent.agent.recording.input_writer import InputWriter
 
 ESTIG = Path(__file__).parents[2] / "sites" / "estig"
@@ -69,3 +76,67 @@ def test_recording_that_is_no_log_of_an_agent_is_refused(tmp_path):
     (tmp_path / "other.mcap").write_bytes(b"nothing")
     with pytest.raises(WrongUseError, match=r"not an MCAP file.*Name the file that `fognav map record` wrote"):
         read_log(tmp_path / "other.mcap")
+
+
+STANDS, ALONG = (0.0, 0.0, 4.0), (0.12, 0.0, 20.0)
+
+
+def entries_of_a_drive(*silences):
+    """The entries of a robot that stands for 4 s, and drives straight on, without those of some times (s)."""
+    body = Body(left=1.0, right=1.0, axle=1.0, x=0.0, y=0.0, yaw=0.0, latency=0.0, mirrored=False)
+    for entry in recording(body, np.random.default_rng(4), [STANDS, ALONG]):
+        if not any(begin < getattr(entry, "now", 0.0) < end for begin, end in silences):
+            yield entry
+
+
+def log_of(file, *silences):
+    with Recorder(file) as recorder:
+        for number, entry in enumerate(entries_of_a_drive(*silences)):
+            recorder.write_entry(TOPIC_OF_ENTRY[type(entry)], entry, number)
+    return read_log(file)
+
+
+@pytest.mark.parametrize("silence", [2.0, 14.0], ids=["known by its counters", "too long for its counters"])
+def test_a_pause_in_a_log_during_which_the_robot_drove_is_told_by_its_time(tmp_path, silence):
+    log = log_of(tmp_path / "drive.mcap", (8.0, 8.0 + silence))
+    assert log.stamps_mended == 0
+    made = map_log(log.scans, "matched", [], 0.05, 12.0)
+    ((begin, end),) = made.figures()["breaks"]
+    first = 0.5  # a first scan began at 0.3 s
+    assert begin == pytest.approx(8.0 - first, abs=1.8), "of a scan that the map uses"
+    assert end == pytest.approx(8.0 + silence - first, abs=0.4)
+    (told,) = [line for line in made.lines() if "the wheels were not heard" in line]
+    assert f"from {begin:.1f} s to {end:.1f} s" in told
+
+
+def test_a_pause_in_a_log_during_which_the_robot_stood_or_that_is_short_is_no_break(tmp_path):
+    scans = log_of(tmp_path / "drive.mcap", (1.0, 3.5), (8.0, 8.6)).scans
+    assert {scan.stretch for scan in scans} == {0}
+    assert max(np.diff([scan.stamp for scan in scans])) > 2.4
+
+
+def test_a_recording_tells_of_a_break_while_it_is_made(tmp_path):
+    path, told = tmp_path / "agent.sock", threading.Event()
+    made = Recording(tmp_path / "drive.mcap", preview=False)
+
+    def listen_to_advice():
+        if "the wheels were not heard for 14 s" in made.advice:
+            told.set()
+
+    with socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET) as listener:
+        listener.bind(str(path))
+        listener.listen()
+
+        def serve():
+            link, _ = listener.accept()
+            with link, suppress(ConnectionError):  # the recorder leaves once it has told
+                for entry in entries_of_a_drive((8.0, 22.0)):
+                    link.sendall(local_link.encode(entry))
+                told.wait(20.0)
+
+        server = threading.Thread(target=serve)
+        server.start()
+        made.run(path, listen_to_advice, lambda: told.is_set() or not server.is_alive())
+        server.join()
+    assert told.is_set()
+    assert made.breaks == 1

@@ -126,6 +126,22 @@ def test_loops_are_found_all_true_and_join_what_odometry_tore_apart(mapped):
 
 
 @pytest.mark.drive
+def test_loops_mend_a_break_of_the_odometry_that_says_nothing_of_five_metres(mapped):
+    """Of them the odometry knows nothing, and along a corridor the scans before and after them fit each other, too."""
+    scans, truth, _ = mapped
+    begin, end = 150, 170
+    assert math.dist(truth[begin - 1][:2], truth[end][:2]) > 5.0
+    moved = [
+        scan._replace(
+            odometry=compose(scans[begin - 1].odometry, between(scans[end].odometry, scan.odometry)), stretch=1
+        )
+        for scan in scans[end:]
+    ]
+    found = find_trajectory([*scans[:begin], *moved], jobs=2)
+    assert absolute_error(found.poses, np.concatenate((truth[:begin], truth[end:]))) < 0.05
+
+
+@pytest.mark.drive
 def test_map_is_the_same_however_many_threads_make_it(mapped):
     scans, _, found = mapped
     again = find_trajectory(scans, jobs=1)

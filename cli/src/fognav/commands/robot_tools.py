@@ -148,6 +148,7 @@ def map_record(
             "megabytes": round(recording.megabytes, 2),
             "missed": recording.view.missed,
             "gaps": recording.gaps,
+            "breaks": recording.breaks,
         }
         if json:
             print_json(figures)
@@ -155,6 +156,11 @@ def map_record(
             print_answer(f"{out}: {figures['scans']} scans in {figures['seconds']} s, {figures['megabytes']} MB")
             if recording.view.missed or recording.gaps:
                 print_answer(f"{recording.view.missed} entries were missed, the link broke {recording.gaps} times")
+            if recording.breaks:
+                print_answer(
+                    f"its odometry broke {recording.breaks} times: how far the robot moved meanwhile is a guess. "
+                    "fognav map from-log says when: drive these parts again"
+                )
             print_answer(f"next: fognav map from-log {out} --out floor --png floor-loops.png")
 
 

@@ -25,6 +25,7 @@ if TYPE_CHECKING:
 
 _SECURED_S: Final = 5.0
 _RETRY_S: Final = 0.5
+_TOLD_S: Final = 10.0
 _BLURS_RAD_S: Final = 0.6
 _RANGE_M: Final = 12.0
 _PERIOD_S: Final = 0.2
@@ -41,10 +42,14 @@ class Recording:
         self.view = RobotView()
         self.scans = 0
         self.gaps = 0
+        """How often the link broke."""
+        self.breaks = 0
+        """How often the wheels were not heard while they turned, or their counters jumped."""
         self.map = LiveMap() if preview else None
         self._scans = LogScans()
         self._last: RobotScan | None = None
-        self._blurred_until = 0.0
+        self._silent_s = 0.0
+        self._blurred_until = self._broken_until = 0.0
         self._problem = ""
         try:
             self._recorder = Recorder(file)
@@ -62,6 +67,11 @@ class Recording:
         """What who drives should know now; empty while all is well."""
         if self._problem:
             return self._problem
+        if time.monotonic() < self._broken_until:
+            return (
+                f"the recording has a break: the wheels were not heard for {self._silent_s:.0f} s, or their counters "
+                "jumped. Drive back to before it, or the map is a guess there"
+            )
         if time.monotonic() < self._blurred_until:
             return "turn more slowly: half a turn in six seconds, or walls blur"
         return ""
@@ -123,13 +133,16 @@ class Recording:
 
     def _on_scan(self, scan: RobotScan) -> None:
         self.scans += 1
+        if scan.stretch > self.breaks and self._last is not None:
+            self._silent_s, self._broken_until = scan.stamp - self._last.stamp, time.monotonic() + _TOLD_S
+        self.breaks = scan.stretch
         if self._last is not None and scan.stamp > self._last.stamp:
             turned = abs(np.angle(np.exp(1j * (scan.odom.theta - self._last.odom.theta))))
             if turned / (scan.stamp - self._last.stamp) > _BLURS_RAD_S:
                 self._blurred_until = time.monotonic() + 2.0
         self._last = scan
         if self.map is not None:
-            usable = scan_of(self.scans, scan.angles, scan.ranges, scan.odom, _RANGE_M)
+            usable = scan_of(self.scans, scan.angles, scan.ranges, scan.odom, _RANGE_M, scan.stretch)
             if usable is not None:
                 self.map.add(usable)
 

@@ -34,6 +34,7 @@ _CODE_SHARE: Final = 0.98
 _CODE_READINGS: Final = 0.001
 """... if they are at least this share of all readings."""
 _SAME_M: Final = 1e-3
+_LEAP_PERIODS: Final = 60.0
 _FIELD_OF_VIEW: Final = math.pi
 _GZIP: Final = b"\x1f\x8b"
 
@@ -42,7 +43,8 @@ _GZIP: Final = b"\x1f\x8b"
 class LogScan:
     """One scan of a log: stamp (s, increasing), `odom` and `reference` poses (m, rad), ranges (n; m, nan: no return).
 
-    angles: (n,) rad in the lidar's frame. The reference is None where the log has none.
+    angles: (n,) rad in the lidar's frame. The reference is None where the log has none. stretch: how many breaks of the
+    odometry lie before it.
     """
 
     stamp: float
@@ -50,6 +52,7 @@ class LogScan:
     reference: Pose2 | None
     angles: NDArray[np.float64]
     ranges: NDArray[np.float64]
+    stretch: int = 0
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -77,10 +80,13 @@ def read_log(path: Path, log_format: Format = "auto") -> LidarLog:
     if not path.exists():
         raise WrongUseError(f"there is no file {path}. Name a log, or the folder of a recording of ROS 2")
     if log_format == "fognav" or (log_format == "auto" and is_robot_log(path)):
-        scans = [LogScan(scan.stamp, scan.odom, None, scan.angles, scan.ranges) for scan in read_robot_log(path)]
+        scans = [
+            LogScan(scan.stamp, scan.odom, None, scan.angles, scan.ranges, scan.stretch)
+            for scan in read_robot_log(path)
+        ]
         if not scans:
             raise WrongUseError(f"{path} has no scan of a lidar whose wheels were read. Log an agent that drives")
-        return _finished(scans, coded=False)
+        return _finished(scans, coded=False, leaps=False)  # of a monotonic clock
     if log_format == "rosbag2" or (log_format == "auto" and is_bag(path)):
         return _finished([LogScan(*scan) for scan in read_bag(path)], coded=False)  # they say which returns count
     first = next(_lines(path), (0, ""))[1]
@@ -175,16 +181,26 @@ def _carmen_scan(line: str) -> LogScan | None:
     return LogScan(float(words[count + 8]), odom, laser, beam_angles(count), ranges)
 
 
-def _finished(scans: list[LogScan], *, coded: bool = True) -> LidarLog:
-    """Remove codes for "no return", if ranges are coded, make the stamps increase, and tell odometry from reference."""
+def _finished(scans: list[LogScan], *, coded: bool = True, leaps: bool = True) -> LidarLog:
+    """Remove codes for "no return", if ranges are coded, make the stamps increase, and tell odometry from reference.
+
+    leaps: whether stamps that leap far ahead are wrong, rather than a pause of the log. Those after a leap leap along.
+    """
     code = _no_return_code(scans) if coded else math.inf
-    start, last = scans[0].stamp, -math.inf
+    offset = before_leap = -scans[0].stamp
+    last = -math.inf
     finished: list[LogScan] = []
     steady, mended = _median_period(scans), 0
+    most = _LEAP_PERIODS * steady if leaps else math.inf
     for scan in scans:
-        stamp = scan.stamp - start
-        if not last < stamp < last + 60.0 * steady and finished:
-            stamp, mended = last + steady, mended + 1  # constant, coarse or wrapped stamps
+        stamp = scan.stamp + offset
+        if finished and not last < stamp < last + most and last < scan.stamp + before_leap < last + most:
+            offset = before_leap  # a single stamp leapt
+            stamp = scan.stamp + offset
+        if finished and not last < stamp < last + most:
+            if stamp > last:
+                before_leap, offset = offset, offset + last + steady - stamp
+            stamp, mended = last + steady, mended + 1  # constant, coarse, wrapped or leaping stamps
         last = stamp
         ranges = np.where((scan.ranges > 0.0) & (scan.ranges < code), scan.ranges, math.nan)
         finished.append(replace(scan, stamp=stamp, ranges=ranges))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import os
 import resource
 import time
@@ -76,6 +77,7 @@ class MadeMap:
             ],
             "ambiguous": self.ambiguous,
             "gaps": [[round(value, 2) for value in gap] for gap in self._gaps()],
+            "breaks": [[round(value, 2) for value in pause] for pause in self._breaks()],
             "seconds": round(self.seconds, 2),
             "rss_mb": round(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024.0),
         }  # fmt: skip
@@ -106,6 +108,11 @@ class MadeMap:
             yield (
                 f"between scans at {before:.1f} s and {after:.1f} s the odometry goes on by {moved:.1f} m: no scan "
                 "tells the way: look at the map there, or drive this part again"
+            )
+        for before, after in self._breaks():
+            yield (
+                f"from {before:.1f} s to {after:.1f} s the wheels were not heard, or their counters jumped: how the "
+                "robot moved meanwhile is a guess, unless a loop spans it: measure the map there, or drive it again"
             )
         if self.loops == []:
             yield "no place was visited twice: nothing confirms the shape of this map. Drive back to where you began"
@@ -138,7 +145,7 @@ class MadeMap:
         live, moments, way = LiveMap(self.map.geometry.resolution), [], []
         every = max(1, len(self.used) // _FILM_PICTURES)
         for number, one in enumerate(self.used):
-            scan = scan_of(number, one.angles, one.ranges, one.odom, range_max)
+            scan = scan_of(number, one.angles, one.ranges, one.odom, range_max, one.stretch)
             if scan is not None and live.add(scan):
                 way.append(live.pose)
             if number % every == 0 and (grown := live.map()) is not None:
@@ -193,6 +200,14 @@ class MadeMap:
         return [
             (self.used[i].stamp, self.used[i + 1].stamp, float(moved[i]))
             for i in np.nonzero(moved > _GAP_M)[0].tolist()
+        ]
+
+    def _breaks(self) -> list[tuple[float, float]]:
+        """Return the stamps (s) of the scans around each break of the odometry."""
+        return [
+            (before.stamp, after.stamp)
+            for before, after in itertools.pairwise(self.used)
+            if before.stretch != after.stretch
         ]
 
     def _place(self, group: LoopGroup) -> tuple[float, float]:
@@ -250,7 +265,7 @@ def scans_of(log: Sequence[LogScan], range_max: float) -> list[Scan]:
     return keep_moved(
         scan
         for number, one in enumerate(log)
-        if (scan := scan_of(number, one.angles, one.ranges, one.odom, range_max)) is not None
+        if (scan := scan_of(number, one.angles, one.ranges, one.odom, range_max, one.stretch)) is not None
     )
 
 

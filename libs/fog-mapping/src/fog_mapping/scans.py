@@ -25,13 +25,15 @@ _TURN_RAD: Final = 0.15
 class Scan(NamedTuple):
     """Returns (n, 2; m, in the robot's frame, by bearing), their normals (n, 2), and the pose by odometry (3,).
 
-    number: which scan of the log it is.
+    number: which scan of the log it is. stretch: how many breaks of the odometry lie before it, during which nobody
+    knows how the robot moved.
     """
 
     number: int
     points: NDArray[np.float64]
     normals: NDArray[np.float64]
     odometry: NDArray[np.float64]
+    stretch: int = 0
 
 
 def scan_of(
@@ -40,10 +42,11 @@ def scan_of(
     ranges: NDArray[np.float64],
     odometry: Sequence[float],
     range_max: float,
+    stretch: int = 0,
 ) -> Scan | None:
     """Return a scan of ranges (m; nan: no return) at angles (rad, growing), up to `range_max`; None if it shows little.
 
-    Raises `ValueError` for an odometry that isn't finite.
+    stretch: as in `Scan`. Raises `ValueError` for an odometry that isn't finite.
     """
     pose = np.array(odometry, np.float64)
     if pose.shape != (3,) or not np.isfinite(pose).all():
@@ -52,7 +55,7 @@ def scan_of(
     if int(used.sum()) < _LEAST_RETURNS:
         return None
     points = np.column_stack((ranges[used] * np.cos(angles[used]), ranges[used] * np.sin(angles[used])))
-    return Scan(number, points, normals(points, _SURFACE_M), pose)
+    return Scan(number, points, normals(points, _SURFACE_M), pose, stretch)
 
 
 def keep_moved(scans: Iterable[Scan]) -> list[Scan]:
@@ -65,7 +68,12 @@ def keep_moved(scans: Iterable[Scan]) -> list[Scan]:
 
 
 def has_moved(before: Scan, scan: Scan) -> bool:
-    """Return whether the robot has moved or turned enough between two scans, by its odometry, for both to count."""
+    """Return whether the robot has moved or turned enough between two scans, by its odometry, for both to count.
+
+    After a break of the odometry it may have.
+    """
+    if before.stretch != scan.stretch:
+        return True
     x, y, turn = between(before.odometry, scan.odometry)
     return bool(np.hypot(x, y) >= _STEP_M or abs(turn) >= _TURN_RAD)
 

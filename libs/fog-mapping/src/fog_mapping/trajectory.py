@@ -33,6 +33,9 @@ _SEARCHED_SIGMAS: Final = 2.5
 _MOST_M: Final = 0.6
 _MOST_RAD: Final = 0.5
 _DOUBT: Final = 0.05
+_BREAK_M: Final = 1.0
+_BREAK_RAD: Final = 0.5
+"""Deviations of the odometry over a break of it: of a robot that somebody drove on for some seconds."""
 _CLEAR_TURN_RAD: Final = 0.12
 _TURNS_CHECKED: Final = 40
 _MIRRORED_SHARE: Final = 0.75
@@ -76,19 +79,24 @@ def match_next(
     moved, turned = math.hypot(step[0], step[1]), abs(float(step[2]))
     deviation = 0.05 + 0.1 * moved + 0.05 * turned
     turn_deviation = 0.02 + 0.05 * moved + 0.12 * turned
+    broken = scans[i - 1].stretch != scans[i].stretch
+    if broken:
+        deviation, turn_deviation = deviation + _BREAK_M, turn_deviation + _BREAK_RAD
     prior = np.diag((deviation**-2, deviation**-2, turn_deviation**-2))
     found = before.search(
         scans[i].points,
         tuple(guess),
-        min(_MOST_M, _SEARCHED_SIGMAS * deviation),
-        min(_MOST_RAD, _SEARCHED_SIGMAS * turn_deviation),
+        _SEARCHED_SIGMAS * deviation if broken else min(_MOST_M, _SEARCHED_SIGMAS * deviation),
+        _SEARCHED_SIGMAS * turn_deviation if broken else min(_MOST_RAD, _SEARCHED_SIGMAS * turn_deviation),
         _TURN_STEP,
         0.0,
         doubt=_DOUBT,
     )
     start = tuple(guess) if found is None else found.pose
     aligned = before.align(scans[i].points, scans[i].normals, start, tuple(guess), prior, GATES)
-    return np.array(aligned.pose), independent(aligned.information) + _ODOMETRY_SHARE * prior
+    # A scan from after a break may be of another place that looks alike: only a loop tells.
+    told = np.zeros((3, 3)) if broken else independent(aligned.information)
+    return np.array(aligned.pose), told + _ODOMETRY_SHARE * prior
 
 
 def refuse_mirrored(scans: Sequence[Scan]) -> None:

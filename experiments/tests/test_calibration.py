@@ -6,8 +6,10 @@ import json
 import math
 import subprocess
 import sys
+from dataclasses import replace
 from pathlib import Path
 
+import msgspec
 import numpy as np
 import pytest
 
@@ -15,10 +17,13 @@ from fog_runtime.configuration.robot_file import parse_robot
 from fog_runtime.record import Recorder
 from fognav.output import WrongUseError
 from fognav.robot_page.by_itself import SPEED_M_S, SquareDrive
+from fognav.robot_page.calibrating import refuse_disagreement
 from fognav.robot_page.view import RobotView
 from fognav_experiments.bench.calibration import Body, driven, measure, random_body, recording
-from robot_agent.agent.recording.input_log import TOPIC_OF_ENTRY
+from robot_agent.agent.recording.input_log import TOPIC_OF_ENTRY, BaseReceived, ScanReceived, Started
 from robot_agent.calibration import NAMES, Calibration, CalibrationError, Calibrator, Figure, changes
+from robot_agent.hardware import WheelOdometry
+from robot_agent.scan_builder import Mounting
 
 STRAIGHT = (0.12, 0.0, 16.0)
 LEFT, RIGHT = (0.0, 0.5, 14.0), (0.0, -0.5, 14.0)
@@ -144,6 +149,75 @@ def test_a_square_of_another_robot_contradicts_and_nothing_is_written(tmp_path):
     assert run.returncode == 1
     assert b"contradicts it" in run.stderr
     assert settings.read_text("utf-8") == TOML
+
+
+def square_of(body, seed) -> list:
+    """Entries of a square that ends near its start: two metres and a half in all."""
+    turn = (math.pi / 2) * body.axle / (0.5 * (body.left + body.right)) / 0.5
+    walk = [(0.0, 0.0, 1.0), *[(0.12, 0.0, 5.0), (0.0, 0.5, turn)] * 4, (0.0, 0.0, 1.0)]
+    return list(recording(body, np.random.default_rng(seed), walk))
+
+
+def with_settings(entries, body, latency):
+    """The same drive by a robot whose settings are what its body is, but for the latency: it counts by other wheels."""
+    diameter = 0.5 * (body.left + body.right)
+    for entry in entries:
+        match entry:
+            case Started(config=config):
+                drive = replace(
+                    config.drive_train, axle_m=0.235 * body.axle, wheel_ratio=body.right / body.left,
+                    travel_wrap_m=diameter * config.drive_train.travel_wrap_m,
+                )  # fmt: skip
+                lidar = replace(
+                    config.localization, lidar_x=body.x, lidar_y=body.y, lidar_yaw=body.yaw, lidar_latency=latency,
+                    lidar_mirrored=body.mirrored,
+                )  # fmt: skip
+                yield msgspec.structs.replace(entry, config=replace(config, drive_train=drive, localization=lidar))
+            case BaseReceived(feedback=feedback):
+                left, right = (diameter * way for way in (feedback.odometry.left_m, feedback.odometry.right_m))
+                counted = msgspec.structs.replace(feedback, odometry=WheelOdometry(left_m=left, right_m=right))
+                yield msgspec.structs.replace(entry, feedback=counted)
+            case _:
+                mounted = Mounting(mirrored=body.mirrored, latency_s=latency).apply(entry.scan())
+                yield ScanReceived.of(mounted, entry.now)
+
+
+@pytest.mark.parametrize("mirrored", [False, True])
+def test_a_square_driven_by_the_new_settings_says_the_same_as_one_by_the_old(tmp_path, mirrored):
+    """It was judged by the old settings' factors once more, and contradicted every calibration that was right."""
+    body = Body(left=1.07, right=1.09, axle=1.1, x=0.04, y=-0.02, yaw=0.1, latency=0.03, mirrored=mirrored)
+    recorded, entries = Calibrator(), square_of(body, 6)
+    recorded.take(entries[0])
+    values = (body.left, body.right, 0.235 * body.axle, body.x, body.y, body.yaw, body.latency)
+    found = Calibration(
+        {name: Figure(value, 0.001) for name, value in zip(NAMES, values, strict=True)}, mirrored, 99, 0.0, 0.0
+    )
+    told = []
+    for name, square in (("old", entries), ("new", with_settings(entries, body, 0.03))):
+        with Recorder(tmp_path / f"{name}.mcap") as recorder:
+            for number, entry in enumerate(square):
+                recorder.write_entry(TOPIC_OF_ENTRY[type(entry)], entry, number)
+        told.append(refuse_disagreement(found, recorded, tmp_path / f"{name}.mcap"))
+    assert told[0]["end_error_m"] < 0.02 < told[0]["end_error_before_m"]
+    for name, within in (("end_error_before_m", 0.005), ("end_error_m", 0.005), ("end_turn_deg", 0.3), ("way_m", 0.01)):
+        assert told[1][name] == pytest.approx(told[0][name], abs=within)
+
+
+@pytest.mark.parametrize(("off", "turned"), [(0.01, 0.0), (0.024, 0.008), (0.04, -0.004)])
+def test_where_a_square_ends_is_told_finer_than_the_cells_in_which_it_is_looked_for(off, turned):
+    """They are 5 cm and a degree wide, more than what a calibration has to be better by."""
+    body = Body(left=1.0, right=1.0, axle=1.0, x=0.0, y=0.0, yaw=0.0, latency=0.0, mirrored=False)
+    walk = [(0.0, 0.0, 2.0), (off / 0.5, turned / 0.5, 0.5), (0.0, 0.0, 2.0)]
+    made, first = Calibrator(), None
+    for entry in recording(body, np.random.default_rng(3), walk):
+        if isinstance(entry, BaseReceived):
+            first = first or entry
+            made.take(msgspec.structs.replace(first, now=entry.now))  # as if it slid, and no wheel turned
+        else:
+            made.take(entry)
+    error, turn, _ = made.end_error(made.start, mirrored=False)
+    assert error == pytest.approx(off, abs=0.005)
+    assert turn == pytest.approx(abs(turned), abs=0.003)
 
 
 # --- by itself ---

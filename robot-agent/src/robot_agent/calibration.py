@@ -227,7 +227,8 @@ class Calibrator:
             raise CalibrationError(
                 "this drive does not end where it began, by its scans: drive a square back to its start"
             )
-        off = between(np.array(hit.pose), guess)
+        ends_at = reference.align(pair[1].points, pair[1].normals, hit.pose, hit.pose, np.eye(3), _GATES)
+        off = between(np.array(ends_at.pose), guess)
         poses = track[0]
         length = float(np.hypot(*np.diff(poses[:, :2], axis=0).T).sum())
         return math.hypot(off[0], off[1]), abs(float(off[2])), length
@@ -421,8 +422,7 @@ def _matched(
     hit = reference.search(second.points, tuple(guess), half, half_turn, _TURN, 0.3)
     if hit is None:
         return None
-    weak = np.diag((1.0, 1.0, 1.0))
-    aligned = reference.align(second.points, second.normals, hit.pose, hit.pose, weak, _GATES)
+    aligned = reference.align(second.points, second.normals, hit.pose, hit.pose, np.eye(3), _GATES)
     information = independent(aligned.information)
     if np.linalg.eigvalsh(information)[0] < 1.0:
         return None

@@ -215,7 +215,7 @@ def calibrate_command(  # noqa: PLR0913  # one parameter for each option
         found, changed = calibrating.solve(recorded, robot_file)
         accepted: dict[str, float] = {}
         for other in accept or []:
-            accepted |= calibrating.refuse_disagreement(found, other)
+            accepted |= calibrating.refuse_disagreement(found, recorded, other)
         if write and robot_file is not None:
             calibrating.write(robot_file, changed, calibrating.hash_of(log))
         if json:

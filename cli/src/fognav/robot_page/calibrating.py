@@ -20,11 +20,22 @@ from fognav.robot_page.recording_view import until_told
 from fognav.robot_page.view import LocalRobotErrors
 from robot_agent import registry
 from robot_agent.agent.recording.input_log import ENTRY_OF_TOPIC, TOPIC_OF_ENTRY, BaseReceived, ScanReceived, Started
-from robot_agent.calibration import WANTED, Calibration, CalibrationError, Calibrator, Changed, changes, differing
+from robot_agent.calibration import (
+    NAMES,
+    WANTED,
+    Calibration,
+    CalibrationError,
+    Calibrator,
+    Changed,
+    changes,
+    differing,
+)
 from robot_agent.local_client import LocalRobot
 
 if TYPE_CHECKING:
     from pathlib import Path
+
+    from numpy.typing import NDArray
 
 USED: Final = (Started, BaseReceived, ScanReceived)
 """Entries that a calibration is made of."""
@@ -120,16 +131,19 @@ def solve(calibrator: Calibrator, robot_file: Path | None) -> tuple[Calibration,
     return found, changes(found, calibrator.config, robot.settings, diameter)
 
 
-def refuse_disagreement(found: Calibration, log: Path) -> dict[str, float]:
+def refuse_disagreement(found: Calibration, recorded: Calibrator, log: Path) -> dict[str, float]:
     """Return how far the wheels were off at the end of another drive, before and now; raises `FailedError`.
 
-    It is independent: what was found does not know it. It must be better than before, or within 1 % of its way.
+    recorded: what was found by. The other drive is independent: what was found does not know it. It must be better than
+    before, or within 1 % of its way, and may be made with either settings.
     """
     other = read(log)
     values = np.array([figure.value for figure in found.figures.values()])
     try:
-        before, _, way = other.end_error(other.start, mirrored=found.mirrored)
-        now, turned, _ = other.end_error(values, mirrored=found.mirrored)
+        scale, shift, remounted = _between_settings(recorded, other)
+        mirrored = found.mirrored != remounted
+        before, _, way = other.end_error(scale * recorded.start + shift, mirrored=mirrored)
+        now, turned, _ = other.end_error(scale * values + shift, mirrored=mirrored)
     except CalibrationError as error:
         raise FailedError(f"{log}: {error}") from error
     figures = {
@@ -143,6 +157,25 @@ def refuse_disagreement(found: Calibration, log: Path) -> dict[str, float]:
             f"{log} contradicts it: at its end the wheels were {before:.3f} m off before, {now:.3f} m now"
         )
     return figures
+
+
+def _between_settings(first: Calibrator, second: Calibrator) -> tuple[NDArray[np.float64], NDArray[np.float64], bool]:
+    """Return by what to multiply figures of one recording, then what to add, for them to be those of another.
+
+    And whether the other one's lidar is mirrored by its settings where the first one's is not, or the other way round.
+    Wheels are factors of the counters, and counters of the diameter in the settings; a latency is what the settings
+    leave. Raises `CalibrationError` for a recording without settings.
+    """
+    scale, shift = np.ones(len(NAMES)), np.zeros(len(NAMES))
+    if first.config is None or second.config is None:
+        raise CalibrationError("the recording does not begin with a robot's settings: record with fognav map record")
+    wraps = [config.drive_train.travel_wrap_m for config in (first.config, second.config)]
+    if all(map(math.isfinite, wraps)):
+        scale[:2] = wraps[0] / wraps[1]
+    lidars = first.config.localization, second.config.localization
+    latencies = [lidar.lidar_latency or 0.0 for lidar in lidars]
+    shift[NAMES.index("latency")] = latencies[0] - latencies[1]
+    return scale, shift, bool(lidars[0].lidar_mirrored) != bool(lidars[1].lidar_mirrored)
 
 
 def write(robot_file: Path, changed: list[Changed], source: str) -> None:

@@ -52,6 +52,34 @@ def test_it_keeps_no_more_scans_than_it_matches():
     assert len(live._recent) == len(live._poses) == WINDOW
 
 
+def along_a_corridor(live, until: float):
+    """Let the map grow along a corridor of 2 m by 123 m with niches, up to `until` (m); return it."""
+    solid = np.ones((80, 2500), np.uint8)
+    solid[30:50, 20:2480] = 0
+    for column in range(60, 2460, 70):
+        solid[50:54, column : column + 20] = 0
+    for number, x in enumerate(np.arange(3.0, until, 0.8)):
+        ranges = cast(solid, 0.05, 0.0, 0.0, x, 2.0, ANGLES, 12.0)
+        live.add(scan_of(number, ANGLES, ranges, (x, 2.0, 0.0), 12.0))
+    return live.map()
+
+
+def test_a_long_corridor_is_drawn_to_its_end():
+    """It grew on all sides at once, and stopped after 90 m; the film of a finer map after 40."""
+    grown = along_a_corridor(LiveMap(0.05), 120.0)
+    assert grown.cells.size < 4_000_000
+    drawn = np.flatnonzero((grown.cells == LETHAL).any(axis=0))
+    assert np.ptp(drawn) * 0.05 > 115.0
+
+
+def test_a_scan_that_leaves_the_largest_map_is_drawn_as_far_as_it_lies_within(monkeypatch):
+    monkeypatch.setattr("fog_mapping.live._MOST_CELLS", 40_000)
+    grown = along_a_corridor(LiveMap(), 40.0)
+    assert grown.cells.size <= 40_000
+    drawn = np.flatnonzero((grown.cells == LETHAL).any(axis=0))
+    assert drawn[-1] == grown.cells.shape[1] - 1, "up to its edge"
+
+
 def walls(shown) -> set[tuple[int, int]]:
     """Return the walls' cells, by their place in a grid of 0.1 m whose corner is the origin."""
     rows, columns = np.nonzero(shown.cells == LETHAL)

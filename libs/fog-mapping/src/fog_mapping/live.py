@@ -21,9 +21,11 @@ if TYPE_CHECKING:
     from fog_mapping.scans import Scan
 
 _GROWN_M: Final = 10.0
-"""A map that is too small grows by so much more than it must."""
+"""A map that is too small grows by so much more than it must, on the sides on which it is."""
 _MOST_CELLS: Final = 4_000_000
 """Of 0.1 m: 200 m by 200 m. What lies beyond is not drawn."""
+_SHARES: Final = (1.0, 0.8, 0.6, 0.4, 0.2)
+"""Of what it should grow by, the largest that the limit allows: the last of it needs no growth for each scan."""
 
 
 class LiveMap:
@@ -53,8 +55,7 @@ class LiveMap:
         self.pose = pose
         self.scans += 1
         points = place(pose, scan.points)
-        if self._make_room(np.vstack((points, pose[:2]))) and self._counts is not None:
-            self._counts.add(float(pose[0]), float(pose[1]), points)
+        self._make_room(np.vstack((points, pose[:2]))).add(float(pose[0]), float(pose[1]), points)
         return True
 
     def map(self) -> StaticMap | None:
@@ -63,24 +64,37 @@ class LiveMap:
             return None
         return StaticMap(self._grid, self._counts.cells())
 
-    def _make_room(self, points: NDArray[np.float64]) -> bool:
-        """Let the grid grow to these points (n, 2; m); return whether it covers them."""
+    def _make_room(self, points: NDArray[np.float64]) -> BeamCounts:
+        """Let the grid grow to these points (n, 2; m), as far as it may; return its counts."""
         low, high = points.min(axis=0), points.max(axis=0)
         grid, cell = self._grid, self._resolution
-        if grid is not None and grid.contains(low[0], low[1]) and grid.contains(high[0], high[1]):
-            return True
-        if grid is not None:
-            low = np.minimum(low, (grid.origin_x, grid.origin_y))
-            high = np.maximum(high, (grid.origin_x + grid.width * cell, grid.origin_y + grid.height * cell))
-        low = np.floor((low - _GROWN_M) / cell) * cell
-        width, height = np.ceil((high + _GROWN_M - low) / cell).astype(int).tolist()
-        if width * height > _MOST_CELLS:
-            return False
-        larger = BeamCounts((height, width), cell, float(low[0]), float(low[1]))
-        if grid is not None and self._counts is not None:
-            column = round((grid.origin_x - float(low[0])) / cell)
-            row = round((grid.origin_y - float(low[1])) / cell)
-            larger.take(self._counts, row, column)
-        self._grid = GridGeometry(width, height, cell, float(low[0]), float(low[1]))
-        self._counts = larger
-        return True
+        if grid is None:
+            corner = np.floor(low / cell) * cell
+            grid = GridGeometry(1, 1, cell, float(corner[0]), float(corner[1]))
+        left, bottom, right, top = grid.bounds
+        missing = np.array((left - low[0], bottom - low[1], high[0] - right, high[1] - top))
+        if self._counts is not None and missing.max() < 0.0:
+            return self._counts
+        growth = np.where(missing >= 0.0, missing + _GROWN_M, 0.0) / cell
+        grown = [_grown(grid, np.ceil(share * growth).astype(int).tolist()) for share in _SHARES]
+        larger = next((each for each in grown if each.width * each.height <= _MOST_CELLS), grid)
+        if self._counts is not None and larger == grid:
+            return self._counts
+        counts = BeamCounts((larger.height, larger.width), cell, larger.origin_x, larger.origin_y)
+        if self._counts is not None:
+            row, column = (
+                round((grid.origin_y - larger.origin_y) / cell),
+                round((grid.origin_x - larger.origin_x) / cell),
+            )
+            counts.take(self._counts, row, column)
+        self._grid, self._counts = larger, counts
+        return counts
+
+
+def _grown(grid: GridGeometry, cells: tuple[int, int, int, int]) -> GridGeometry:
+    """Return a grid with so many cells more to the left, below, to the right and above."""
+    left, below, right, above = cells
+    return GridGeometry(
+        grid.width + left + right, grid.height + below + above, grid.resolution,
+        grid.origin_x - left * grid.resolution, grid.origin_y - below * grid.resolution,
+    )  # fmt: skip

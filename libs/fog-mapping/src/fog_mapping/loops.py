@@ -267,7 +267,11 @@ def _neighbours(count: int, edges: Sequence[Edge], weights: NDArray[np.float64])
 
 
 def _uncertainty(neighbours: list[list[_Neighbour]], source: int) -> tuple[list[float], list[float]]:
-    """Return upper bounds of the variances (m^2, rad^2) of all poses as seen from one, along the surest way."""
+    """Return the variances (m^2, rad^2) of all poses as seen from one, along the surest way: less than they are.
+
+    A heading that is off moves all that follows, by a lever as long as the way; here it moves each step by itself. So a
+    long way without loops is less certain than this says.
+    """
     variance, turn_variance = [math.inf] * len(neighbours), [math.inf] * len(neighbours)
     variance[source] = turn_variance[source] = 0.0
     waiting = [(0.0, source)]

@@ -4,9 +4,14 @@ from __future__ import annotations
 
 import json
 import math
+import resource
+import socket
 import subprocess
 import sys
+import threading
+from contextlib import suppress
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 import msgspec
@@ -17,9 +22,10 @@ from fog_runtime.configuration.robot_file import parse_robot
 from fog_runtime.record import Recorder
 from fognav.output import WrongUseError
 from fognav.robot_page.by_itself import SPEED_M_S, SquareDrive
-from fognav.robot_page.calibrating import refuse_disagreement
+from fognav.robot_page.calibrating import read, refuse_disagreement
 from fognav.robot_page.view import RobotView
 from fognav_experiments.bench.calibration import Body, driven, measure, random_body, recording
+from robot_agent.agent import local_link
 from robot_agent.agent.recording.input_log import TOPIC_OF_ENTRY, BaseReceived, ScanReceived, Started
 from robot_agent.calibration import NAMES, Calibration, CalibrationError, Calibrator, Figure, changes
 from robot_agent.hardware import WheelOdometry
@@ -218,6 +224,33 @@ def test_where_a_square_ends_is_told_finer_than_the_cells_in_which_it_is_looked_
     error, turn, _ = made.end_error(made.start, mirrored=False)
     assert error == pytest.approx(off, abs=0.005)
     assert turn == pytest.approx(abs(turned), abs=0.003)
+
+
+def test_a_full_disk_ends_a_calibration_with_what_to_do_and_what_was_written_can_be_read(tmp_path):
+    path, log = tmp_path / "agent.sock", tmp_path / "drive.mcap"
+    body = Body(left=1.0, right=1.0, axle=1.0, x=0.0, y=0.0, yaw=0.0, latency=0.0, mirrored=False)
+    with socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET) as listener:
+        listener.bind(str(path))
+        listener.listen()
+
+        def serve():
+            link, _ = listener.accept()
+            with link, suppress(ConnectionError):
+                for entry in recording(body, np.random.default_rng(1)):
+                    link.sendall(local_link.encode(entry))
+
+        server = threading.Thread(target=serve)
+        server.start()
+        run = subprocess.run(
+            [sys.executable, "-m", "fognav", "calibrate", "--socket", str(path), "--out", str(log)],
+            check=False, stderr=subprocess.PIPE, timeout=60.0,
+            preexec_fn=partial(resource.setrlimit, resource.RLIMIT_FSIZE, (400_000, 400_000)),
+        )  # fmt: skip
+        server.join()
+    assert run.returncode == 1
+    assert b"File too large. What was recorded until now can be read: make room" in run.stderr
+    assert b"Traceback" not in run.stderr
+    assert read(log).driven().straight_m > 0.0
 
 
 # --- by itself ---

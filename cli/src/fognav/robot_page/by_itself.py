@@ -15,13 +15,12 @@ from typing import TYPE_CHECKING, Any, Final, NamedTuple
 import numpy as np
 
 from fog_contracts.messages import ReasonCode
-from fog_runtime.record import Recorder
 from fognav.output import FailedError, WrongUseError, print_line
-from fognav.robot_page.calibrating import USED, bars, known
+from fognav.robot_page.calibrating import USED, DriveLog, bars, known
 from fognav.robot_page.driving import take_over
 from fognav.robot_page.recording_view import until_told
 from fognav.robot_page.view import LocalRobotErrors, RobotView
-from robot_agent.agent.recording.input_log import TOPIC_OF_ENTRY, BaseReceived, Published, ScanReceived
+from robot_agent.agent.recording.input_log import BaseReceived, Published, ScanReceived
 from robot_agent.calibration import CalibrationError, Calibrator
 from robot_agent.local_client import LocalRobot, LocalRobotError
 from robot_agent.localization.odometry import wheel_travel
@@ -200,12 +199,12 @@ class SquareDrive:
 class _Recorded:
     """What is heard of the robot, into calibration, recording and view at once."""
 
-    def __init__(self, robot: LocalRobot, recorder: Recorder) -> None:
+    def __init__(self, robot: LocalRobot, log: DriveLog) -> None:
         self.calibrator = Calibrator()
         self.view = RobotView()
         self.moved = False
         self._robot = robot
-        self._recorder = recorder
+        self._log = log
 
     def poll(self) -> list[Any]:
         """Take in what has come, and return it."""
@@ -217,7 +216,7 @@ class _Recorded:
                 self.moved = self.moved or entry.feedback.odometry != before.feedback.odometry
             if isinstance(entry, USED):
                 self.calibrator.take(entry)
-                self._recorder.write_entry(TOPIC_OF_ENTRY[type(entry)], entry, time.time_ns())
+                self._log.write(entry)
         return come
 
 
@@ -229,10 +228,10 @@ def drive(path: Path, log: Path, square: float, seconds: float | None) -> Calibr
     with (
         LocalRobotErrors(),
         LocalRobot(path) as robot,
-        contextlib.closing(Recorder(log)) as recorder,
+        DriveLog(log) as kept,
         until_told(seconds) as ends,
     ):
-        heard = _Recorded(robot, recorder)
+        heard = _Recorded(robot, kept)
         try:
             config = _ready(heard, ends)
             if config is not None:

@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-import contextlib
 import hashlib
 import math
 import os
 import time
-from typing import TYPE_CHECKING, Any, Final
+from typing import TYPE_CHECKING, Any, Final, Self
 
 import msgspec
 import numpy as np
@@ -56,13 +55,44 @@ def read(log: Path) -> Calibrator:
     return calibrator
 
 
+class DriveLog:
+    """The recording of a drive by which a robot is calibrated; a context manager."""
+
+    def __init__(self, file: Path) -> None:
+        """Create the file; raises `FailedError`."""
+        self._file = file
+        try:
+            self._recorder = Recorder(file)
+        except OSError as error:
+            raise FailedError(f"{file} can't be made: {error.strerror}. Name another file with --out") from error
+
+    def write(self, entry: Started | BaseReceived | ScanReceived) -> None:
+        """Write an entry; raises `FailedError` when the disk takes it no more."""
+        try:
+            self._recorder.write_entry(TOPIC_OF_ENTRY[type(entry)], entry, time.time_ns())
+        except OSError as error:
+            raise FailedError(
+                f"{self._file}: {error.strerror}. What was recorded until now can be read: make room, and drive again "
+                f"with another --out, or calibrate by it: fognav calibrate {self._file}"
+            ) from error
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        try:
+            self._recorder.close()
+        except OSError as error:  # whatever ended the drive says more, and without its index the file can be read
+            print_line(f"{self._file}: {error.strerror}: it ends without an index")
+
+
 def record(socket: Path, log: Path, seconds: float | None) -> Calibrator:
     """Record while somebody drives, into `log` too, and say what must be driven yet; raises `FailedError`."""
     calibrator, told, said = Calibrator(), -math.inf, ""
     with (
         LocalRobotErrors(),
         LocalRobot(socket) as robot,
-        contextlib.closing(Recorder(log)) as recorder,
+        DriveLog(log) as kept,
         until_told(seconds) as ends,
     ):
         print_line(
@@ -72,7 +102,7 @@ def record(socket: Path, log: Path, seconds: float | None) -> Calibrator:
             for entry in robot.entries(0.2):
                 if isinstance(entry, USED):
                     calibrator.take(entry)
-                    recorder.write_entry(TOPIC_OF_ENTRY[type(entry)], entry, time.time_ns())
+                    kept.write(entry)
                 if isinstance(entry, ScanReceived):
                     break
             if time.monotonic() - told > _TOLD_S:

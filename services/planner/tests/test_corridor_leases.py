@@ -7,7 +7,7 @@ import math
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import example, given, settings
 from hypothesis import strategies as st
 from hypothesis.stateful import RuleBasedStateMachine, initialize, invariant, rule
 from ring_map import RingMap, goal, pose
@@ -470,6 +470,8 @@ OneRobot.TestCase.settings = settings(max_examples=15, stateful_step_count=30, d
 TestOneRobot = OneRobot.TestCase
 
 
+# Who has waited for more than PATIENCE_S gets its lease back in the moment in which another one needs it.
+@example(trips=[((0.0, 4.0), (1.0, 3.0)), ((4.0, 6.0), (0.0, 3.0)), ((0.0, 5.0), (0.0, 4.0))])
 @settings(max_examples=40, deadline=None)
 @given(
     trips=st.lists(st.tuples(places, places), min_size=2, max_size=5, unique_by=(lambda t: t[0], lambda t: t[1])),

@@ -300,6 +300,8 @@ class CorridorLeases:
         end, contender = self._stop(me, limit - 1, others)
         waits = contender or blocker
         if end > me.leased:
+            if me.end <= me.progress + WAITING_M:
+                me.moved_at = now  # it could not move before
             me.leased, me.end = end, min(me.wanted, float(me.along[end]))
             self.standstills.changed(me.id)
         if waits is not None:

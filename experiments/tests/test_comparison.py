@@ -432,6 +432,10 @@ def test_drives_in_which_a_warned_robot_was_worse_off_are_listed_with_what_was_d
     late["full"] = msgspec.structs.replace(late["full"], modes={"HOLD": 2})
     *_, table = worse([late], ["default", "full"], {})
     assert table.rows[0][-1] == "held under way 1 time more"
+    # Nor did it drive from the start on, as one did that the fog leads.
+    unwaited = {"default": like(one, ready=UNSET), "fog": like(one, "fog", ready=UNSET, time_s=201.5)}
+    *_, table = worse([unwaited], ["default", "fog"], {})
+    assert table.rows[0][4] == "3.5"
 
 
 # --- by real processes ---

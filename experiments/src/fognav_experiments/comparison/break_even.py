@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Final, NamedTuple
 
 from fognav_experiments import figures
 from fognav_experiments.comparison.drives import route_ends
+from fognav_experiments.comparison.situations import begun_late
 from fognav_experiments.figures import Block, Heading, Paragraph, Picture, Table
 
 if TYPE_CHECKING:
@@ -24,8 +25,6 @@ DAY_S: Final = 86_400.0
 MOST_A_DAY: Final = 10
 LASTING_S: Final = (10.0, 60.0, 600.0)
 """How long a false alarm closes its corridor."""
-LATE_S: Final = 2.0
-"""How much later an unwarned robot began in drives that did not wait for it."""
 _LEAST_S: Final = 3.0
 """A detour or a saving below this is another line round a corner."""
 
@@ -71,8 +70,7 @@ def cases(pairs: Sequence[Drives], met: Sequence[Drives]) -> list[Case]:
         if id(drives) not in barred:
             free[led.route].append(led.time_s)
         elif led.moment == "before":
-            late = 0.0 if alone.ready is True else LATE_S
-            closed[led.route, led.area].append((led.time_s, alone.time_s - late))
+            closed[led.route, led.area].append((led.time_s, alone.time_s - begun_late(alone)))
     found = [
         Case(route, area, median(free[route]), median(led for led, _ in times), median(alone for _, alone in times))
         for (route, area), times in sorted(closed.items())

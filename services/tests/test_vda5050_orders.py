@@ -444,6 +444,14 @@ async def test_floor_that_begins_anew_takes_back_all_that_it_has_told():
 # --- Operators and instant actions ------------------------------------------------------------------------------------
 
 
+def test_robot_that_only_drives_where_it_stays_without_a_mission_takes_an_order():
+    floor = Floorplan()
+    floor.goal = {"goal_id": "home", "pose": {"x": 9.0, "y": 9.0, "theta": 0.0}, "idle": True}
+    floor.tell(1.0)
+    assert floor.said()["operatingMode"] == "AUTOMATIC"
+    assert floor.take(order(A, B)) in (None, "")
+
+
 @pytest.mark.parametrize(
     ("mode", "state", "view"),
     [

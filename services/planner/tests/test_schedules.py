@@ -323,7 +323,7 @@ async def test_idle_robot_goes_home_after_its_time_and_is_there_for_the_next_mis
     await fog.pass_time(59.0)
     assert fog.goal is None
     await fog.pass_time(2.0)
-    assert (fog.goal, fog.missions.goals["r1"].idle) == ("home", True)
+    assert (fog.goal, fog.missions.goals["r1"].goal.idle) == ("home", True)
     await fog.add(scheduled())
     await fog.pass_time(200.0)
     assert fog.goal == "lab", "a scheduled mission does not wait until it is home"
@@ -339,7 +339,7 @@ async def test_visitor_gets_a_robot_that_only_drives_home_and_a_robot_that_waits
     fog = await Fog(store, ManualClock(EIGHT), site).start()
     fog.poses["r1"] = pose(9.0)
     await fog.pass_time(62.0)
-    assert fog.missions.goals["r1"].idle
+    assert fog.missions.goals["r1"].goal.idle
     visits = fog.visiting.visits
     visits.ask("anna", "", ("lab", "home"), fog.visiting.places, fog.clock.now())
     fog.visiting.step()

@@ -118,7 +118,7 @@ class FleetRobot(Watched):
     def mode(self, now: float) -> tuple[OperatingMode, str]:
         """Return the operating mode, and in words why the fleet is not in control; empty if it is."""
         goal = self.view["goal"]
-        is_own = goal is None or goal["goal_id"] in self._own or self._may_be_own(goal)
+        is_own = goal is None or goal.get("idle") or goal["goal_id"] in self._own or self._may_be_own(goal)
         is_foreign = not is_own and not self.charging.is_way(self.view)
         doings = Doings(is_foreign, bool(self._goal), self.charging.kind, now < self._taken_until)
         return mode_of(self.view, doings)

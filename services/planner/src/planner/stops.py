@@ -157,7 +157,7 @@ class Order(NamedTuple):
     """A mission as an operator orders it, and the conditions of the order.
 
     `any_heading`: ignore the pose's theta. `expected` is the id of the mission that it replaces, or `NO_MISSION`; None
-    replaces any. `action` is the audit trail's word for it. `idle`: see `StoredGoal`.
+    replaces any. `action` is the audit trail's word for it. `idle`: see `RobotGoal`.
     """
 
     robot: str

@@ -38,14 +38,12 @@ _log = logs.get("planner")
 class StoredGoal(Message, frozen=True, kw_only=True):
     """A mission as it is stored; `any_heading`: ignore the goal's theta. `visit`: it belongs to a visit (ADR 69).
 
-    `idle`: the robot goes where it stays without a mission, and is taken from there for any other. `tour`: its other
-    stops and rules, if it has any. `ride`: it leads to another floor (ADR 76).
+    `tour`: its other stops and rules, if it has any. `ride`: it leads to another floor (ADR 76).
     """
 
     goal: RobotGoal
     any_heading: bool = False
     visit: bool = False
-    idle: bool = False
     tour: Tour | None = None
     ride: Ride | None = None
 
@@ -249,9 +247,9 @@ class MissionPersistence:
             self.require_in_service(order.robot)
             stamp, place, pose = self._clock.stamp(), order.place, order.pose
             goal_id = secrets.token_hex(8) if order.tour is None else order.tour.goal_id
-            goal = RobotGoal(goal_id=goal_id, pose=pose, place=place, stamp=stamp)
+            goal = RobotGoal(goal_id=goal_id, pose=pose, place=place, stamp=stamp, idle=order.idle)
             stored = StoredGoal(
-                goal=goal, any_heading=order.any_heading, visit=order.visit, idle=order.idle, tour=order.tour,
+                goal=goal, any_heading=order.any_heading, visit=order.visit, tour=order.tour,
                 ride=order.ride,
             )  # fmt: skip
             await self._store_mission(order, stored, Audit(stamp, order.who, order.action, order.attempt))
@@ -411,7 +409,8 @@ class MissionPersistence:
             if expected is not None:
                 await self._require(expected, robot)
             # One that is reached may still be stored.
-            before = ANY if expected is None else expected or self._reached.get(robot, "0")
+            idle = self._idle_goal(robot) or self._reached.get(robot, "0")
+            before = ANY if expected is None else expected or idle
             with self._uncertain_write():
                 outcome = await self._store.put(robot, stored, audit, expected=before)
             if outcome == "ok":
@@ -427,8 +426,15 @@ class MissionPersistence:
             if self._reload:
                 await self._load()
         known = self.goals.get(robot)
+        if expected == NO_MISSION and self._idle_goal(robot):
+            return
         if expected != (NO_MISSION if known is None else known.goal.goal_id):
             raise MissionConflictError(robot, known)
+
+    def _idle_goal(self, robot: str) -> str:
+        """Return the id of a mission that counts as none, empty without one."""
+        known = self.goals.get(robot)
+        return known.goal.goal_id if known is not None and known.goal.idle else ""
 
     async def _load(self) -> None:
         """Put the stored missions into force, and end those that are not stored; hold the lock.
@@ -487,7 +493,7 @@ class MissionPersistence:
 
     def _begin(self, robot: str, stored: StoredGoal) -> None:
         self.goals[robot] = stored
-        if not stored.visit and not stored.idle:
+        if not stored.visit and not stored.goal.idle:
             self.overruled(robot)
         priority = stored.tour.priority if stored.tour is not None else 0
         heading = stored.any_heading

@@ -99,7 +99,7 @@ class Visiting:
             stored, path, pose = service.missions.goals.get(robot), service.path(robot), service.poses.get(robot)
             state = service.operator.heard(robot)
             found[robot] = Facts(
-                mission=None if stored is None or stored.idle else stored.goal.goal_id,
+                mission=None if stored is None or stored.goal.idle else stored.goal.goal_id,
                 of_visit=stored is not None and stored.visit,
                 refused=path is not None and path.refusal is not None,
                 heard=state is not None and not service.operator.is_doubled(robot),
@@ -135,10 +135,8 @@ class Visiting:
         if place is None:
             return VisitEnd.PLACE
         who, pose = f"visitor {visit.name}", Pose(x=place.x, y=place.y, theta=place.theta or 0.0)
-        idle = self._service.missions.goals.get(act.robot)
-        expected = NO_MISSION if idle is None or not idle.idle else idle.goal.goal_id
         order = Order(
-            act.robot, pose, who, place=act.place, any_heading=place.theta is None, expected=expected,
+            act.robot, pose, who, place=act.place, any_heading=place.theta is None, expected=NO_MISSION,
             action="visit", visit=True,
         )  # fmt: skip
         sent = await self._service.send(order)

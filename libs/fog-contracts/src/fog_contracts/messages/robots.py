@@ -114,12 +114,14 @@ class RobotGoal(Message, frozen=True, kw_only=True):
     """The mission of a robot; `pose` is null when it has none (cancelled or reached).
 
     `any_heading`: the robot may arrive with any heading, that of `pose` does not count. `out_of_service`: why it gets
-    no mission; then `pose` is null, and `goal_id` empty if it never had one.
+    no mission; then `pose` is null, and `goal_id` empty if it never had one. `idle`: it goes where it stays without a
+    mission, and is taken from there for any other.
     """
 
     goal_id: Annotated[str, Meta(max_length=64)]
     pose: Pose | None
     any_heading: bool = False
+    idle: bool = False
     place: Id | None = None
     out_of_service: OutOfService | None = None
     stamp: Stamp = 0.0

@@ -16,7 +16,7 @@ class MapInfo(Message, frozen=True, kw_only=True):
 
 
 class GoalView(Message, frozen=True, kw_only=True):
-    """A mission; `any_heading`: the robot may arrive with any heading."""
+    """A mission; `any_heading`: the robot may arrive with any heading. `idle`: it counts as none (`RobotGoal`)."""
 
     robot: str
     goal_id: str
@@ -24,6 +24,7 @@ class GoalView(Message, frozen=True, kw_only=True):
     place: str | None
     any_heading: bool
     stamp: float
+    idle: bool = False
 
     @classmethod
     def of(cls, robot: str, goal: RobotGoal | None) -> "GoalView | None":
@@ -37,6 +38,7 @@ class GoalView(Message, frozen=True, kw_only=True):
             place=goal.place,
             any_heading=goal.any_heading,
             stamp=goal.stamp,
+            idle=goal.idle,
         )
 
 

@@ -45,7 +45,9 @@ HOME_M: Final = 0.5
 IDLE: Final = "planner, for an idle robot"
 """Who sends it, in the audit trail."""
 
-SCHEDULED = Counter("fognav_scheduled_missions", "Missions that were to begin by the clock, by outcome", ["outcome"])
+SCHEDULED = Counter(
+    "fognav_scheduled_missions_total", "Missions that were to begin by the clock, by outcome", ["outcome"]
+)
 for _outcome in ("given", "missed"):
     SCHEDULED.labels(_outcome)
 
@@ -188,8 +190,7 @@ class Scheduling:
         attempt = Attempt.of("schedule", f"{schedule.version} {window.begin:.0f}", schedule.id, schedule.mission)
         if (earlier := await self._service.missions.earlier_result(attempt)) is not None:
             return earlier
-        before = self._service.missions.goals.get(schedule.robot)
-        conditions = Conditions(who, attempt, NO_MISSION if before is None else before.goal.goal_id)
+        conditions = Conditions(who, attempt, NO_MISSION)
         places = self._places if self._service.places is None else self._service.places
         order = await mission_order(
             self._service, schedule.robot, schedule.mission, places, conditions, PlannerConfig.cruise_speed
@@ -220,7 +221,7 @@ class Scheduling:
             return f"robot {robot} is out of service: {out.reason}"
         if state is None or service.operator.is_doubled(robot):
             return f"robot {robot} is not heard, or two agents use its id"
-        if stored is not None and not stored.idle:
+        if stored is not None and not stored.goal.idle:
             return f"robot {robot} has another mission"
         if service.visiting.visits.serves(robot):
             return f"robot {robot} serves a visitor"

@@ -231,6 +231,14 @@ def test_check_of_a_site_names_nodes_that_take_any_far_echo_for_clear(tmp_path: 
     said = runner.invoke(app, ["site", "check", str(tmp_path / "floor")]).output
     assert "floor: ok" in said
     assert "['n4']" in said
+    assert "free_width" not in said
+    for area in ("z3", "z4"):
+        text = file.read_text("utf-8")
+        file.write_text(
+            text.replace(f'[[areas]]\nid = "{area}"', f'[[areas]]\nid = "{area}"\nfree_width = 0.6'), "utf-8"
+        )
+    said = runner.invoke(app, ["site", "check", str(tmp_path / "floor")]).output
+    assert "areas whose free_width has no effect: ['z4']" in said, "the sonars of z3 still have a range_max"
 
 
 def test_image_in_place_of_a_map_file_is_refused_with_the_remedy(tmp_path: Path) -> None:

@@ -313,4 +313,11 @@ def check_site(folder: Path) -> dict[str, object]:
         "markers": len(site.markers),
         "demo": site.demo is not None,
         "unbounded_nodes": [node.id for node in site.nodes if any(each.range_max is None for each in node.sonars)],
+        "areas_never_half_free": [area.id for area in site.areas if area.free_width and not _shows_free(site, area.id)],
     }
+
+
+def _shows_free(site: Site, area: str) -> bool:
+    """Whether enough of an area's sonars can tell the far wall: two, or one that measures by light (ADR 74)."""
+    able = [each for node in site.nodes if node.area == area for each in node.sonars if each.range_max is not None]
+    return len(able) >= 2 or any(each.time_of_flight for each in able)  # as the hazard-aggregator asks for

@@ -86,6 +86,11 @@ def site_check(
                 f"nodes with a sonar without range_max: {found['unbounded_nodes']}. To it an echo from behind the wall "
                 "is clear: fognav node calibrate NODE --site DIR, unless it hears no wall"
             )
+        if found["areas_never_half_free"]:
+            print_line(
+                f"areas whose free_width has no effect: {found['areas_never_half_free']}. Only two sonars with a "
+                "range_max, or one that measures by light, show a part of an area free"
+            )
     else:
         fail(str(found["problem"]))
     if not found["ok"]:

@@ -449,7 +449,95 @@ def test_robot_that_only_drives_where_it_stays_without_a_mission_takes_an_order(
     floor.goal = {"goal_id": "home", "pose": {"x": 9.0, "y": 9.0, "theta": 0.0}, "idle": True}
     floor.tell(1.0)
     assert floor.said()["operatingMode"] == "AUTOMATIC"
-    assert floor.take(order(A, B)) in (None, "")
+    assert floor.drive() == [], "without an order it may go there"
+    assert floor.take(order(A, B)) == ""
+    assert floor.drive() == ["PUT 4 1"]
+    assert (floor.asked[0].headers["If-None-Match"], floor.errors()) == ("*", {})
+
+
+HOME = {"goal_id": "home", "pose": {"x": 9.0, "y": 9.0, "theta": 0.0}, "idle": True}
+"""The planner's own mission of a robot that has had none for a while."""
+
+
+@pytest.mark.parametrize("waits", ["paused", "base", "unreachable"])
+def test_robot_that_waits_for_the_fleet_is_not_sent_home_and_its_order_goes_on(waits):
+    floor = Floorplan()
+    floor.take(order(A, B, C | {"released": waits != "base"}))
+    floor.drive()
+    if waits == "paused":
+        floor.robot.on_instant(instant("startPause", "p"), floor.now)
+        assert floor.drive() == ["DELETE"]
+    elif waits == "base":
+        floor.reach(4.0, 1.0)
+    else:
+        floor.more = {"plan": {"refusal": {"reason": "every path is blocked"}}}
+        floor.tell(1.0)
+        floor.tell(REFUSED_S + 1.0)
+        assert floor.drive() == ["DELETE"]
+        floor.more = {}
+    errors = floor.errors()
+    for name in ("home", "home again"):
+        asked = len(floor.asked)
+        floor.goal = HOME | {"goal_id": name}
+        floor.tell(30.0, goal_id=name)
+        assert floor.drive(LOST) == ["DELETE"]
+        floor.tell(2.0)
+        assert floor.drive() == ["DELETE"], "once more: nobody knows what became of the first"
+        assert {each.headers["If-Match"] for each in floor.asked[asked:]} == {f'"{name}"'}
+        floor.tell(0.5, goal_id=None)
+        assert (floor.drive(), floor.goal, floor.errors()) == ([], None, errors)
+        said = floor.said()
+        assert (said["operatingMode"], said["nodeStates"] != []) == ("AUTOMATIC", True)
+    if waits == "paused":
+        floor.robot.on_instant(instant("stopPause", "q"), floor.now)
+        assert floor.drive() == ["PUT 4 1"]
+        assert actions(floor) == {"p": "FINISHED", "q": "FINISHED"}
+    elif waits == "base":
+        assert floor.take(order(B, C, update=1)) == ""
+        assert floor.drive() == ["PUT 7 1"]
+
+
+def test_pause_ends_the_way_of_a_robot_without_an_order_to_where_it_stays_and_is_finished_after_that():
+    floor = Floorplan()
+    floor.goal = HOME
+    floor.at(1.5, 1.0, v=0.3)
+    floor.tell(1.0, goal_id="home")
+    floor.robot.on_instant(instant("startPause", "p"), floor.now)
+    floor.at(1.5, 1.0)
+    assert (actions(floor), floor.said()["paused"]) == ({"p": "RUNNING"}, True)
+    assert floor.drive() == ["DELETE"]
+    assert floor.asked[0].headers == {"If-Match": '"home"'}
+    floor.tell(goal_id=None)
+    assert (actions(floor), floor.errors(), floor.goal) == ({"p": "FINISHED"}, {}, None)
+
+
+@pytest.mark.parametrize("kind", ["startCharging", "stopCharging"])
+def test_robot_that_waits_at_a_node_for_its_dock_is_not_sent_home(kind):
+    floor = Floorplan()
+    floor.more = DOCK
+    floor.tell(docked=kind == "stopCharging")
+    floor.take(order(A | {"actions": [action(kind, "c")]}, B))
+    floor.tell()
+    assert floor.drive() == [f"POST {'dock' if kind == 'startCharging' else 'undock'}"]
+    floor.goal = HOME
+    floor.tell(1.0)
+    assert floor.drive() == ["DELETE"]
+    assert floor.said()["actionStates"][0]["actionStatus"] == "RUNNING", "its command is not cancelled"
+
+
+def test_order_that_ends_since_the_robot_is_sent_to_its_dock_by_another_is_reported():
+    floor = Floorplan()
+    floor.more = DOCK
+    floor.take(order(A, B, C | {"released": False}))
+    floor.drive()
+    floor.reach(4.0, 1.0)
+    floor.tell(300.0, wants_dock=True)
+    (error,) = floor.said()["errors"]
+    assert (error["errorType"], "to its dock" in error["errorDescription"]) == ("ORDER_ENDED", True)
+    assert (floor.said()["operatingMode"], floor.said()["nodeStates"]) == ("MANUAL", [])
+    floor.tell(wants_dock=False)
+    assert floor.take(order(B, C, name="o2")) == ""
+    assert floor.errors() == {}
 
 
 @pytest.mark.parametrize(

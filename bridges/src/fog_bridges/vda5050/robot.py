@@ -115,6 +115,12 @@ class FleetRobot(Watched):
         wanted, found = request.body["pose"], goal["pose"]
         return math.dist((wanted["x"], wanted["y"]), (found["x"], found["y"])) < 0.01
 
+    @property
+    def _way_home(self) -> str:
+        """The planner's own mission to where the robot stays, while it is to wait for the fleet; empty without one."""
+        goal = self.view["goal"] or {}
+        return goal["goal_id"] if goal.get("idle") and (self.paused or not self.orders.is_idle) else ""
+
     def mode(self, now: float) -> tuple[OperatingMode, str]:
         """Return the operating mode, and in words why the fleet is not in control; empty if it is."""
         goal = self.view["goal"]
@@ -242,6 +248,8 @@ class FleetRobot(Watched):
         self.charging.advance(self.state, now)
         mode, words = self.mode(now)
         if mode != "AUTOMATIC":
+            if self.state.get("wants_dock") and not self.orders.is_idle:
+                self._tell_end(f"the fleet is not in control, which has ended the order: {words}")
             self.orders.clear()
             self.charging.end("FAILED", f"the fleet is not in control: {words}")
             self.paused, self.pending = False, None
@@ -254,7 +262,7 @@ class FleetRobot(Watched):
         if (due := self.orders.due) is not None and not self.paused and not self.charging.kind:
             self.charging.begin(self.orders.actions, due.action_id, due.action_type)
             self.charging.advance(self.state, now)
-        if not self.is_driving and not self._goal and not self.charging.kind:
+        if not (self.is_driving or self._goal or self._way_home or self.charging.kind):
             self._end_instant(now)
 
     def _end_instant(self, now: float) -> None:
@@ -276,22 +284,26 @@ class FleetRobot(Watched):
         """
         if not self._goal or self._is_asking:
             return
-        shown, end = (self.view["goal"] or {"goal_id": ""})["goal_id"], self._ends.get(self._goal)
+        goal, end = self.view["goal"] or {"goal_id": ""}, self._ends.get(self._goal)
+        shown = goal["goal_id"]
+        is_foreign = shown not in ("", *self._own) and not goal.get("idle")
         if end:
             self._drop(is_over=True)
             if (node := self._ahead(self._goal_node)) is not None:
                 self.orders.traversed(node.sequence_id)
         elif shown == self._goal:
             self._shown_at = now
-        elif end is False or (shown and shown not in self._own) or now - self._shown_at >= UNSEEN_S:
+        elif end is False or is_foreign or now - self._shown_at >= UNSEEN_S:
             self._drop(is_over=end is False)
             if self.orders.is_idle or self._goal_node is None:
                 return  # it was to end
             self._taken_until = now + TAKEN_S
-            words = "an operator of Fognav has ended the mission, and so the order"
-            self._about_errors["ORDER_ENDED"] = about_error("ORDER_ENDED", words, {"orderId": self.orders.order_id})
+            self._tell_end("an operator of Fognav has ended the mission, and so the order")
             self.orders.clear()
         self._watch_plan(now)
+
+    def _tell_end(self, words: str) -> None:
+        self._about_errors["ORDER_ENDED"] = about_error("ORDER_ENDED", words, {"orderId": self.orders.order_id})
 
     def _drop(self, *, is_over: bool) -> None:
         """Take the mission for ended; `is_over`: it can't be shown again but by what was told before its end."""
@@ -333,6 +345,8 @@ class FleetRobot(Watched):
             node = None
         if self._unsure is not None and node is not None and node is self._unsure.node:
             return self._ask(self._unsure.request, node, now)
+        if node is None and self._way_home and self._way_home not in self._own:
+            remember(self._own, self._way_home, value=False)  # to be ended as one of the fleet's that nobody wants
         self._adopt(now)
         if self._unsure is not None or (self._goal and self._goal_node is None):
             node = None  # first the mission that it has, or may have, is ended

@@ -335,6 +335,8 @@ async def test_operator_schedules_a_mission_which_is_kept_and_starts_nothing_at_
         ({"robot": "r9"}, None),
         ({"mission": {"stops": [{"place": "nowhere"}]}}, "body.mission.stops.0.place"),
         ({"weekly": {"time_zone": "Europe/Atlantis", "times": times}}, "body.weekly.time_zone"),
+        ({"weekly": {"time_zone": "UTC", "times": [{**times[0], "end": "00:00"}]}}, "body.weekly.times"),
+        ({"mission": {"stops": 9 * [place(7.0)], "order": "best"}}, "body.mission.order"),
     ):
         answer = await operator.ask("PUT", path, {**body, **change})
         assert answer.status_code in (404, 422), answer.text

@@ -8,12 +8,14 @@ from types import SimpleNamespace
 from typing import TYPE_CHECKING, Any, cast
 from zoneinfo import ZoneInfo
 
+import msgspec
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from manual_clock import ManualClock
 
 from fog_contracts.messages import (
+    WEEKDAYS,
     CommandReply,
     OutOfService,
     Place,
@@ -82,6 +84,28 @@ def test_clock_that_was_ahead_for_a_while_keeps_no_mission_from_its_time():
     assert due(scheduled(last=ahead), windows, EIGHT + DAY + 90.0) is None
     back = Occasion(begin=EIGHT, at=EIGHT + 40.0, outcome="given")
     assert due(scheduled(last=back), windows, EIGHT + 1.0) is None, "a small step back gives nothing twice"
+
+
+def test_small_step_back_of_the_clock_makes_no_given_mission_a_missed_one():
+    given = Occasion(begin=EIGHT + DAY, at=EIGHT + DAY + 5.0, outcome="given")
+    windows = Windows(scheduled().weekly)
+    assert due(scheduled(last=given), windows, EIGHT + DAY - 300.0) is None
+
+
+def test_schedule_without_a_gap_has_no_window_that_begins():
+    times = [WeeklyTime(days=list(WEEKDAYS), begin=a, end=b) for a, b in (("06:00", "18:00"), ("18:00", "06:00"))]
+    weekly = WeeklySchedule(time_zone=LISBON, times=times)
+    schedule = msgspec.structs.replace(scheduled(since=EIGHT - 30 * DAY), weekly=weekly)
+    for days in range(20):  # the windows are computed anew now and then
+        assert due(schedule, Windows(weekly), EIGHT + days * DAY) is None
+
+
+@pytest.mark.parametrize("since", [0.0, EIGHT + DAY])
+async def test_schedule_that_was_written_by_a_wrong_clock_counts_from_when_the_time_is_known(fog, since):
+    await fog.add(scheduled(since=since))
+    await fog.pass_time(10.0)
+    assert fog.missions.schedules["post"].since == EIGHT - 4.0
+    assert fog.goal == "lab"
 
 
 def test_disabled_schedule_and_other_days_are_not_due():
@@ -243,6 +267,37 @@ async def test_robot_that_can_t_drive_gets_nothing_and_a_missed_mission_says_why
     fog.states["r1"] = state()
     await fog.pass_time(60.0)
     assert fog.goal is None, "an hour later it is not done any more"
+
+
+async def test_schedule_stays_however_long_the_reason_for_a_missed_mission_is(fog, store):
+    await fog.add(scheduled())
+    fog.states["r1"] = state(mode="HOLD", reasons=["too long " * 50] * 4, codes=["map_old"])
+    await fog.pass_time(HOUR + 120.0, step=60.0)
+    assert fog.last().outcome == "missed"
+    again = await Fog(store, fog.clock, SITE).start()
+    assert again.missions.schedules == fog.missions.schedules
+
+
+async def test_mission_is_not_given_once_its_schedule_is_gone_or_its_robot_is_stopped_meanwhile(fog):
+    preview = fog.preview
+    await fog.add(scheduled())
+
+    async def deleted_meanwhile(*arguments: Any) -> PlanReply:
+        await fog.missions.put_schedule("post", None, "anna", "delete")
+        return await preview(*arguments)
+
+    fog.preview = deleted_meanwhile
+    await fog.pass_time(10.0)
+    assert (fog.goal, fog.missions.schedules) == (None, {})
+
+    async def stopped_meanwhile(*arguments: Any) -> PlanReply:
+        fog.states["r1"] = state(enabled=False)
+        return await preview(*arguments)
+
+    fog.preview = stopped_meanwhile
+    await fog.add(scheduled("other"))
+    await fog.pass_time(10.0)
+    assert fog.goal is None
 
 
 async def test_robot_out_of_service_gets_its_mission_only_within_the_window(fog):

@@ -23,11 +23,19 @@ class TimeZoneError(ValueError):
     """This machine does not know a time zone, or not at that moment."""
 
 
+_WEEK_S: Final = 7 * 86_400.0
+
+
 class Window(NamedTuple):
     """A window: s since the epoch."""
 
     begin: float
     end: float
+
+    @property
+    def is_one(self) -> bool:
+        """Whether it begins and ends: not if its schedule leaves no gap in a week."""
+        return self.end - self.begin < _WEEK_S
 
 
 class Windows:

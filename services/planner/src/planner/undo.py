@@ -80,7 +80,7 @@ async def _undo(
     tour = None if before.tour is None else structs.replace(before.tour, id=secrets.token_hex(8))
     order = Order(
         robot, goal.pose, who, place=goal.place, any_heading=before.any_heading, expected=expected, action=ACTION,
-        tour=tour,
+        tour=tour, idle=goal.idle,
     )  # fmt: skip
     sent = await service.send(order)
     if isinstance(sent, Refusal):

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Protocol
 import msgspec
 
 from fog_contracts.messages import Id, Message, Stamp, WeeklySchedule
-from fog_contracts.weekly import is_time_zone
+from fog_contracts.weekly import Windows, is_time_zone
 from fog_runtime.http import (
     Answer,
     Body,
@@ -27,7 +27,7 @@ from fog_runtime.stores.redis_store import ANY
 from planner.problems import PlannerProblem
 from planner.schedules.occasions import SCHEDULES_MAX
 from planner.stops import MissionBody, ScheduledMission
-from planner.tours.api import goal_pose
+from planner.tours.api import check_best, goal_pose
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -105,6 +105,11 @@ class _Schedules:
         if not is_time_zone(zone := body.weekly.time_zone):
             detail = f"{zone!r} is no time zone that this machine knows: name one such as Europe/Lisbon"
             raise ProblemError(HttpProblem.REQUEST_INVALID, detail, field="body.weekly.time_zone")
+        window = Windows(body.weekly).latest(self._service.stamp())
+        if window is not None and not window.is_one:
+            detail = "the windows leave no gap in a week, so that none ever begins: let a minute pass between two"
+            raise ProblemError(HttpProblem.REQUEST_INVALID, detail, field="body.weekly.times")
+        check_best(body.mission, "body.mission")
         if name not in self.known and len(self.known) >= SCHEDULES_MAX:
             detail = f"there are {SCHEDULES_MAX} schedules already, which is the limit: delete one that is not needed"
             raise ProblemError(HttpProblem.REQUEST_INVALID, detail, field="body")
@@ -158,7 +163,7 @@ def add_schedules(
         before = schedules.known.get(schedule)
         record = ScheduledMission(
             id=schedule, robot=body.robot, mission=body.mission, weekly=body.weekly, enabled=body.enabled,
-            author=caller.name, since=service.stamp(), version=secrets.token_hex(8),
+            author=caller.name, since=service.scheduling.written_at(), version=secrets.token_hex(8),
             last=None if before is None else before.last,
         )  # fmt: skip
         expected = "0" if must_be_new(if_none_match) else expected_tag(if_match) or ANY

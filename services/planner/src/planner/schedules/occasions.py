@@ -27,14 +27,23 @@ class Due(NamedTuple):
     over: bool
 
 
+def is_dated(schedule: ScheduledMission, stamp: float) -> bool:
+    """Whether the time at which it was written is known: not if the clock was not set then, or ahead."""
+    return 0.0 < schedule.since <= stamp + _CLOCK_STEP_S
+
+
 def due(schedule: ScheduledMission, windows: Windows, stamp: float) -> Due | None:
     """Return for which window something is to be done at `stamp`, None if nothing is; raises `TimeZoneError`."""
     if not schedule.enabled or (window := windows.latest(stamp)) is None or window.begin < schedule.since:
         return None
-    last = schedule.last
-    if last is not None and last.begin >= window.begin and last.at <= stamp + _CLOCK_STEP_S:
+    last, over = schedule.last, stamp >= window.end
+    if not is_dated(schedule, stamp) or not window.is_one:
         return None
-    return Due(window, over=stamp >= window.end)
+    # What was given ahead of its time, by a clock that was ahead, counts for nothing, but is not missed either.
+    counts = last is not None and (last.at <= stamp + _CLOCK_STEP_S or (over and last.begin > window.begin))
+    if counts and last is not None and last.begin >= window.begin:
+        return None
+    return Due(window, over)
 
 
 class IdleTimes:

@@ -9,17 +9,18 @@ from msgspec import structs
 from prometheus_client import Counter
 
 from fog_contracts.messages import Pose, ReasonCode, Refusal
+from fog_contracts.messages.basics import SENTENCE_MAX
 from fog_contracts.site import ON_DOCK
 from fog_contracts.weekly import TimeZoneError, Window, Windows
 from fog_runtime import logs
 from fog_runtime.clock import ticker
 from fog_runtime.http import ProblemError
 from fog_runtime.stores.redis_connection import StoreError
-from fog_runtime.stores.redis_store import Attempt
+from fog_runtime.stores.redis_store import Attempt, IdempotencyError
 from planner.config import PlannerConfig
 from planner.query_queue import BusyError
 from planner.robot_operator import CommandError
-from planner.schedules.occasions import IdleTimes, due
+from planner.schedules.occasions import IdleTimes, due, is_dated
 from planner.stops import Occasion, Order
 from planner.store import NO_MISSION, MissionConflictError, OutOfServiceError
 from planner.tours.api import Conditions, mission_order
@@ -129,6 +130,10 @@ class Scheduling:
             return None
         return None if window is None else window.begin
 
+    def written_at(self) -> float:
+        """Return the time for what is written now (s since the epoch); 0 while it is not known."""
+        return self._clock.stamp() if self._synchronized() else 0.0
+
     def waits_for(self, schedule: ScheduledMission) -> str:
         """Return why a mission that is due was not given yet; empty if none is due."""
         return self._why.get(schedule.version, "")
@@ -147,6 +152,9 @@ class Scheduling:
         self._windows = {one.id: self._windows[one.id] for one in schedules if one.id in self._windows}
         found: list[tuple[int, float, str, ScheduledMission, Window]] = []
         for schedule in schedules:
+            if not is_dated(schedule, stamp):
+                await self._put(schedule, structs.replace(schedule, since=stamp), "dated")
+                continue
             try:
                 now = due(schedule, self._windows_of(schedule), stamp)
             except TimeZoneError as error:
@@ -174,8 +182,13 @@ class Scheduling:
         self._tried[schedule.version] = self._clock.now()
         try:
             given = await self._order(schedule, window)
-        except (BusyError, MissionConflictError, OutOfServiceError, ProblemError) as error:
+        except (BusyError, IdempotencyError, MissionConflictError, OutOfServiceError, ProblemError) as error:
             self._why[schedule.version] = str(error)
+            return
+        except StoreError as error:
+            self._why[schedule.version] = str(error)
+            raise
+        if given is None:
             return
         if isinstance(given, Refusal):
             self._why[schedule.version] = given.reason
@@ -184,8 +197,11 @@ class Scheduling:
         occasion = Occasion(begin=window.begin, at=self._clock.stamp(), outcome="given", mission=mission)
         await self._note(schedule, occasion)
 
-    async def _order(self, schedule: ScheduledMission, window: Window) -> StoredGoal | Refusal:
-        """Give the mission of a window; the same one again, if that was done and could not be noted."""
+    async def _order(self, schedule: ScheduledMission, window: Window) -> StoredGoal | Refusal | None:
+        """Give the mission of a window; the same one again, if that was done and could not be noted.
+
+        None: schedule or robot have changed while the way was looked for.
+        """
         who = f"schedule {schedule.id}, of {schedule.author}"[:100]
         attempt = Attempt.of("schedule", f"{schedule.version} {window.begin:.0f}", schedule.id, schedule.mission)
         if (earlier := await self._service.missions.earlier_result(attempt)) is not None:
@@ -195,15 +211,14 @@ class Scheduling:
         order = await mission_order(
             self._service, schedule.robot, schedule.mission, places, conditions, PlannerConfig.cruise_speed
         )
+        known = self._service.missions.schedules.get(schedule.id)
+        if known is None or known.version != schedule.version or self._why_not(schedule.robot):
+            return None
         return await self._service.send(order._replace(action="schedule"))
 
     async def _note(self, schedule: ScheduledMission, occasion: Occasion) -> None:
-        after = structs.replace(schedule, last=occasion)
-        missions = self._service.missions
-        outcome = await missions.put_schedule(
-            schedule.id, after, "planner", occasion.outcome, expected=schedule.version
-        )
-        if outcome != "ok":
+        occasion = structs.replace(occasion, reason=occasion.reason[:SENTENCE_MAX])
+        if not await self._put(schedule, structs.replace(schedule, last=occasion), occasion.outcome):
             return  # somebody has changed or removed it meanwhile
         self._why.pop(schedule.version, None)
         SCHEDULED.labels(occasion.outcome).inc()
@@ -212,6 +227,10 @@ class Scheduling:
             _log.info("scheduled_mission_given", **told, mission=occasion.mission)
         else:
             _log.warning("scheduled_mission_missed", **told, reason=occasion.reason)
+
+    async def _put(self, schedule: ScheduledMission, after: ScheduledMission, action: str) -> bool:
+        missions = self._service.missions
+        return await missions.put_schedule(schedule.id, after, "planner", action, expected=schedule.version) == "ok"
 
     def _why_not(self, robot: str) -> str:
         """Return why a robot gets no mission by itself now; empty if it may."""

@@ -128,6 +128,13 @@ _NEVER: frozenset[str] = frozenset(
 """Refusals that no end of a hazard lifts."""
 
 
+def check_best(body: MissionBody, field: str) -> None:
+    """Raise a `ProblemError` for a mission whose best order is not searched; `field` is where it stands."""
+    if body.order == "best" and len(body.stops) > BEST_MAX:
+        detail = f"the best order of {len(body.stops)} stops is not searched: give {BEST_MAX} at most, or order them"
+        raise ProblemError(HttpProblem.REQUEST_INVALID, detail, field=f"{field}.order")
+
+
 async def mission_order(
     planner: Planner,
     robot: str,
@@ -145,9 +152,7 @@ async def mission_order(
     for number, stop in enumerate(body.stops):
         pose, any_heading = goal_pose(stop, places, f"body.stops.{number}")
         stops.append(Stop(pose=pose, place=stop.place, any_heading=any_heading))
-    if body.order == "best" and len(stops) > BEST_MAX:
-        detail = f"the best order of {len(stops)} stops is not searched: give {BEST_MAX} at most, or order them"
-        raise ProblemError(HttpProblem.REQUEST_INVALID, detail, field="body.order")
+    check_best(body, "body")
     numbers = list(range(len(stops)))
     at = planner.poses.get(robot)
     if at is None or not at.localized:

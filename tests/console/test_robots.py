@@ -181,9 +181,15 @@ async def test_pose_is_given_by_a_drag_or_by_two_clicks(console: SimpleNamespace
     dragged = await form.get_by_label("x (m)").input_value()
     await page.mouse.click(x + 100, y)
     await expect(form.get_by_text("Now click where it looks.")).to_be_visible()
+    clicked = [await form.get_by_label(name).input_value() for name in ("x (m)", "y (m)")]
+    assert clicked[0] != dragged
     await page.mouse.click(x + 20, y)
     await expect(form.get_by_label("Heading (°)")).to_have_value("180")
-    assert await form.get_by_label("x (m)").input_value() != dragged
+    assert [await form.get_by_label(name).input_value() for name in ("x (m)", "y (m)")] == clicked
     await form.get_by_role("button", name="Set").click()
     await expect(page.locator(".said")).to_contain_text("r1 looks for its position there")
-    assert stream.requests[-1][1]["kind"] == "initial_pose"
+    command = stream.requests[-1][1]
+    assert command["kind"] == "initial_pose"
+    assert [command["pose"][name] for name in ("x", "y")] == [float(each) for each in clicked], (
+        "where the first click was"
+    )

@@ -35,10 +35,11 @@ export function PosePanel({ id, onClose }: Props): preact.JSX.Element {
     };
     let waits: Point | null = null; // a first click, until the second
     floor?.setDrag((from, to, done) => {
+      // While the second click is down, nobody knows yet that it is no drag: it moves nothing before it is one.
       if (waits && done && !turn(from, to)) {
         turn(waits, to);
         waits = null;
-      } else {
+      } else if (!waits || turn(from, to)) {
         place(from);
         const turned = turn(from, to);
         if (done) waits = turned ? null : from;

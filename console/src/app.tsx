@@ -151,7 +151,7 @@ export function ConsoleApp({ session, onExpired, onLogOut }: Props): preact.JSX.
         </section>
         <main id="content" tabIndex={-1} aria-label={t(`view.${route.view}`)}><Panel /></main>
         <p class={`said ${said.kind}`} role="status" aria-live="polite"><span>{said.text}</span></p>
-        <StopBar robot={robot} robots={robots} say={say} isStopped={(id) => live.of.robot.get(id)?.state?.enabled === false} />
+        <StopBar robot={robot} robots={robots} say={say} isStopped={(id) => live.isStopped(id)} />
       </div>
     </ConsoleContext.Provider>
   );

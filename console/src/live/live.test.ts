@@ -55,6 +55,22 @@ test("a robot of which nothing came for two seconds is old, and so is everything
   expect([live.old, live.oldRobot("r1")]).toEqual([true, true]);
 });
 
+test("a robot is stopped when it was heard just now, is not enabled, and does not move all the same", () => {
+  let now = 0;
+  const live = new Live("", () => now);
+  const stopped = (mode: string, enabled: boolean): boolean => {
+    say(live, "robot", { id: "r1", value: { id: "r1", state: { mode, enabled } } });
+    return live.isStopped("r1");
+  };
+  expect(live.isStopped("r1")).toBe(false);
+  expect(["HOLD", "PROTECTIVE_STOP", "FAULT"].map((mode) => stopped(mode, false))).toEqual([true, true, true]);
+  expect(["EGRESS", "DOCK", "TELEOP"].map((mode) => stopped(mode, false))).toEqual([false, false, false]);
+  expect(stopped("HOLD", true)).toBe(false);
+  expect(stopped("HOLD", false)).toBe(true);
+  now = 2_500;
+  expect(live.isStopped("r1")).toBe(false);
+});
+
 test("an event that only a newer server knows is passed over", () => {
   const live = new Live("", () => 0);
   expect(() => say(live, "weather", { sun: true })).not.toThrow();

@@ -13,6 +13,9 @@ const RECORDS_MAX = 500;
 /** Data older than this (ms) is shown as old. */
 export const OLD_MS = 2_000;
 
+/** Modes in which a robot moves that is not enabled. */
+const MANEUVERS: ReadonlySet<string> = new Set(["EGRESS", "DOCK", "TELEOP"]);
+
 type Entries = { readonly [K in Kind]: Map<string, Values[K]> };
 
 const makeEntries = (): Entries => ({
@@ -95,6 +98,12 @@ export class Live {
   /** Whether what is known of a robot is too old to be shown as present. */
   oldRobot(id: string): boolean {
     return this.old || Math.min(this.age("pose", id), this.age("robot", id)) > OLD_MS;
+  }
+
+  /** Whether a robot is known to be stopped: it was heard just now, is not enabled, and makes no maneuver. */
+  isStopped(id: string): boolean {
+    const state = this.of.robot.get(id)?.state;
+    return state?.enabled === false && !MANEUVERS.has(state.mode) && !this.oldRobot(id);
   }
 
   /** Apply one event of the stream. */

@@ -14,6 +14,7 @@ from starlette.requests import Request
 from console_service.core import ConsoleCore
 from console_service.floors import OwnFloor, read_peers
 from fog_contracts import channels as ch
+from fog_contracts.handlers import Moment
 from fog_contracts.messages import CommandReply, Pose, RobotState
 from fog_contracts.site import RobotSite
 from fog_runtime.clock import SystemClock
@@ -231,6 +232,16 @@ async def test_stop_is_acknowledged_only_by_who_knows_all_robots_and_known_ones_
     assert (planner.stopped, [each.id for each in stop.robots]) == (stopped, stopped)
     assert (stop.acknowledged, remedy in stop.detail) == (not remedy, True)
     assert not remedy or "press again" in stop.detail
+
+
+@pytest.mark.parametrize("mode", ["EGRESS", "DOCK", "TELEOP"])
+async def test_floor_is_not_stopped_while_a_robot_moves_that_is_not_enabled(mode):
+    core = ConsoleCore("lab", "r", robots=[])
+    floor = OwnFloor(core, Planner([]), Health("zenoh"), time.monotonic)
+    for each, stopped in (("HOLD", True), (mode, False), ("FAULT", True)):
+        said = replace(DRIVING, mode=each, enabled=False)
+        core.handlers()[ch.ROBOT_STATE]({"robot": "r1"}, said, Moment(time.monotonic(), time.time()))
+        assert (await floor.view()).stopped is stopped, each
 
 
 @pytest.mark.parametrize(

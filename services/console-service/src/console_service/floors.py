@@ -56,6 +56,8 @@ _STOP: Final = httpx.Timeout(6.0, connect=3.0)
 """A robot has 2 s to answer; a first packet that is lost is sent again after 1 s."""
 _STOPPED_S: Final = 8.0
 """For its whole answer: one that never ends must not hide that others have stopped."""
+_MANEUVERS: Final = frozenset({"EGRESS", "DOCK", "TELEOP"})
+"""Modes in which a robot moves that is not enabled."""
 _LOOPBACK: Final = ("127.0.0.1", "::1", "localhost")
 
 REACHABLE = Gauge("fognav_console_floor_reachable", "Whether a floor on another machine answers", ["floor"])
@@ -66,7 +68,7 @@ _T = TypeVar("_T")
 class FloorView(Message, frozen=True, kw_only=True):
     """A floor: what its services lack that are not ready, its robots, its areas that are blocked or unknown.
 
-    `stopped`: robots were heard just now, and none of them may drive.
+    `stopped`: robots were heard just now, and none of them may drive, or moves without being enabled.
     """
 
     site: Id
@@ -206,7 +208,7 @@ class OwnFloor:
             robots=robots,
             blocked=areas.get("blocked", []),
             unknown=areas.get("unknown", []),
-            stopped=bool(present) and not any(robot.enabled for robot in present),
+            stopped=bool(present) and not any(robot.enabled or robot.mode in _MANEUVERS for robot in present),
         )
 
     async def stop(self, request: Request) -> FloorStop:

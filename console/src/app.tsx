@@ -89,6 +89,7 @@ export function ConsoleApp({ session, onExpired, onLogOut }: Props): preact.JSX.
 
   const robot = chosen !== null && robots.includes(chosen) ? chosen : robots[0] ?? null;
   const say = useCallback<Say>((text, kind = "done", holds) => setSaid({ text, kind, holds }), []);
+  const isStopped = useCallback((id: string): boolean => live.isStopped(id), [live]);
   useEffect(() => {
     if (said.text === "") return undefined;
     const since = performance.now();
@@ -151,7 +152,7 @@ export function ConsoleApp({ session, onExpired, onLogOut }: Props): preact.JSX.
         </section>
         <main id="content" tabIndex={-1} aria-label={t(`view.${route.view}`)}><Panel /></main>
         <p class={`said ${said.kind}`} role="status" aria-live="polite"><span>{said.text}</span></p>
-        <StopBar robot={robot} robots={robots} say={say} isStopped={(id) => live.isStopped(id)} />
+        <StopBar robot={robot} robots={robots} say={say} isStopped={isStopped} />
       </div>
     </ConsoleContext.Provider>
   );

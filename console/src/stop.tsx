@@ -6,6 +6,8 @@ import type { Say } from "./context";
 import { saidProblem } from "./i18n/codes";
 import { t } from "./i18n/i18n";
 
+/** How often (ms) it is looked whether a robot that was not stopped is stopped by now. */
+const LOOK_MS = 500;
 const STORED = "fognav.robots";
 
 /** Remember the robots' ids, so that they can be stopped before a login. */
@@ -38,19 +40,34 @@ interface Props {
 
 export function StopBar({ robot, robots, say, isStopped }: Props): preact.JSX.Element {
   const [stopping, setStopping] = useState<readonly string[]>([]);
+  // The robots that were not stopped, and what is said of each: all answers of one press matter, not only the last.
+  const [failed, setFailed] = useState<ReadonlyMap<string, string>>(new Map());
+  const forget = (id: string): void => setFailed((before) => new Map([...before].filter(([other]) => other !== id)));
 
   const stop = async (id: string): Promise<void> => {
     setStopping((now) => [...now, id]);
     try {
       await request<CommandOutcome>("POST", robotPath(id, "stop"), { timeout: 5_000 });
+      forget(id);
       say(t("stop.done", { robot: id }), "done", isStopped && (() => isStopped(id)));
     } catch (error) {
-      say(t("stop.failed", { robot: id, reason: sentence(error) }), "failed", isStopped && (() => !isStopped(id)));
+      const text = t("stop.failed", { robot: id, reason: sentence(error) });
+      setFailed((before) => new Map(before).set(id, text));
+      say(text, "failed", isStopped && (() => !isStopped(id)));
     } finally {
       setStopping((now) => now.filter((other) => other !== id));
     }
   };
   const stopAll = (): void => robots.forEach((id) => void stop(id));
+
+  useEffect(() => {
+    if (failed.size === 0 || !isStopped) return undefined;
+    const timer = setInterval(() => setFailed((before) => {
+      const left = [...before].filter(([id]) => !isStopped(id));
+      return left.length === before.size ? before : new Map(left);
+    }), LOOK_MS);
+    return () => clearInterval(timer);
+  }, [failed, isStopped]);
 
   useEffect(() => {
     const pressed = (event: KeyboardEvent): void => {
@@ -65,6 +82,15 @@ export function StopBar({ robot, robots, say, isStopped }: Props): preact.JSX.El
 
   return (
     <section class="stopbar" aria-label={t("stop.bar")} title={t("stop.keys")}>
+      {failed.size > 0 && (
+        <div class="unstopped" role="alert">
+          <ul class="rows">
+            {[...failed].map(([id, text]) => (
+              <li key={id} class="row"><span>{text}</span><button onClick={() => forget(id)}>{t("stop.seen")}</button></li>
+            ))}
+          </ul>
+        </div>
+      )}
       <button class="stop" disabled={robot === null} aria-keyshortcuts="F9" onClick={() => robot !== null && void stop(robot)}>
         <span class="octagon" aria-hidden="true" />
         <span>{robot === null ? t("stop.none") : stopping.includes(robot) ? t("stop.sending") : t("stop.robot", { robot })}</span>

@@ -36,10 +36,17 @@ async def test_floors_show_their_age_and_one_press_stops_all_and_says_which_has_
     await page.get_by_role("button", name="Stop all floors").click()
     await expect(page.get_by_role("alert")).to_contain_text("upstairsno answer. Its robots may go on driving")
     await expect(page.locator(".said.failed")).to_have_text("Not acknowledged: upstairs. The list says what to do.")
+    # What becomes of another floor changes nothing about one that has not acknowledged the stop.
+    stream.answers["POST floors/stop"] = (200, stops[:1])
+    await page.get_by_role("button", name="Stop estig").click()
+    await expect(page.locator(".said.done")).to_have_text("All robots stop: estig.")
+    await expect(page.get_by_role("alert")).to_contain_text("upstairs")
+    stream.answers["POST floors/stop"] = (200, [{**stops[1], "acknowledged": True}])
     await page.get_by_role("button", name="Stop upstairs").click()
-    await expect(page.locator(".said.failed")).to_be_visible()
+    await expect(page.locator(".said.done")).to_have_text("All robots stop: upstairs.")
+    await expect(page.get_by_role("alert")).to_have_count(0)
     assert [body for name, body in stream.requests if name == "POST floors/stop"] == [
-        {"floors": None}, {"floors": ["upstairs"]},
+        {"floors": None}, {"floors": ["estig"]}, {"floors": ["upstairs"]},
     ]  # fmt: skip
 
 

@@ -6,7 +6,7 @@ import re
 from types import SimpleNamespace
 
 import pytest
-from console_stream import PHONE, VIEWS, WIDE, ConsoleStream, robot_state
+from console_stream import PHONE, VIEWS, WIDE, ConsoleStream, robot_pose, robot_state
 from msgspec import to_builtins
 from playwright.async_api import expect
 
@@ -46,6 +46,35 @@ async def test_stop_that_fails_says_so_and_what_to_do(console: SimpleNamespace, 
     page = await console.open()
     await page.keyboard.press("F9")
     await expect(page.locator(".said.failed")).to_have_text("r1 was not stopped: r1 does not answer. Stop it by hand.")
+
+
+async def test_stop_of_all_lists_each_robot_that_was_not_stopped_until_it_is_or_somebody_has_seen_to_it(
+    console: SimpleNamespace, stream: ConsoleStream
+) -> None:
+    lost = {"type": "urn:fognav:command_lost", "detail": "It does not answer."}
+    stream.answers["POST robots/r1/stop"] = stream.answers["POST robots/r2/stop"] = (504, lost)
+    stream.tell("pose", "r3", robot_pose(20.0, 26.0, 0.0))
+    stream.robot("r3", robot_state())
+    page = await console.open()
+    button = page.get_by_role("button", name="Stop r1")
+    place = await button.bounding_box()
+    await page.get_by_role("button", name="Stop all").click()
+    rows = page.get_by_role("alert").get_by_role("listitem")
+    await expect(rows).to_have_count(2)
+    for number, robot in enumerate(("r1", "r2")):
+        await expect(rows.nth(number)).to_contain_text(f"{robot} was not stopped: It does not answer. Stop it by hand.")
+    assert await button.bounding_box() == place
+    del stream.answers["POST robots/r1/stop"]
+    await button.click()
+    await expect(page.locator(".said")).to_have_text("r1 stops.")
+    await expect(rows).to_have_count(1)
+    stream.robot("r2", robot_state("HOLD", enabled=False))
+    await expect(rows).to_have_count(0)
+    stream.answers["POST robots/r1/stop"] = (504, lost)
+    await page.keyboard.press("F9")
+    await expect(rows).to_have_count(1)
+    await page.get_by_role("button", name="I have seen to it").click()
+    await expect(rows).to_have_count(0)
 
 
 async def test_robot_tells_who_has_stopped_it_until_somebody_enables_it(

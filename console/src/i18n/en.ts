@@ -47,6 +47,7 @@ export const en = {
   "stop.none": "No robot",
   "stop.done": "{robot} stops.",
   "stop.failed": "{robot} was not stopped: {reason} Stop it by hand.",
+  "stop.seen": "I have seen to it",
   "stop.sending": "Stopping …",
 
   "map.label": "Map of the floor. Arrow keys move it, plus and minus zoom. All that it shows is in the lists, too.",

@@ -48,6 +48,7 @@ export const pt: Readonly<Record<keyof typeof en, string>> = {
   "stop.none": "Nenhum robô",
   "stop.done": "{robot} para.",
   "stop.failed": "{robot} não foi parado: {reason} Pare-o à mão.",
+  "stop.seen": "Já tratei disto",
   "stop.sending": "A parar …",
 
   "map.label": "Mapa do piso. As setas movem-no, mais e menos ampliam e reduzem. Tudo o que mostra está também nas listas.",

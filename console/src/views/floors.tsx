@@ -66,7 +66,8 @@ export function FloorsView(): preact.JSX.Element {
     try {
       const { value } = await request<FloorStop[]>("POST", "floors/stop", { body: { floors }, timeout: STOP_MS });
       const missing = value.filter((each) => !each.acknowledged);
-      setFailed(missing);
+      // One floor's answer says nothing of another that has not acknowledged an earlier stop.
+      setFailed((before) => [...before.filter(({ id }) => value.every((each) => each.id !== id)), ...missing]);
       const done = value.filter((each) => each.acknowledged).map((each) => each.id).join(", ");
       if (missing.length === 0) say(t("floors.stopped", { floors: done }));
       else say(t("floors.notStopped", { floors: missing.map((each) => each.id).join(", ") }), "failed");

@@ -9,6 +9,7 @@ import shutil
 import stat
 import subprocess
 import sys
+import threading
 import tomllib
 from pathlib import Path
 from types import SimpleNamespace
@@ -24,6 +25,7 @@ from paho.mqtt.enums import CallbackAPIVersion
 from typer.testing import CliRunner, Result
 
 from fog_contracts import channels as ch
+from fog_contracts.codec import encode
 from fog_contracts.messages import NodeCalibration, NodeConfig, NodeReading
 from fog_contracts.site import NodeSite, Sonar
 from fog_runtime.configuration.site import load_site
@@ -543,6 +545,58 @@ def test_sonar_that_failed_leaves_its_node_all_its_limits(monkeypatch) -> None:
     assert done.exit_code == 1
     assert "keeps its old limits: sonar 1 measured something that moved" in " ".join(done.stderr.split())
     assert told == [ch.CALIBRATE]
+
+
+class OlderNode:
+    """A node on a real broker whose firmware is of before the command `keep`: what it learns counts at once."""
+
+    def __init__(self, port: int, learned: NodeCalibration) -> None:
+        self.commands: list[str] = []
+        self._learned = learned
+        self._client = paho.Client(CallbackAPIVersion.VERSION2, protocol=paho.MQTTv5)
+        self._client.on_message = self._on_message
+        self._client.connect("127.0.0.1", port)
+        heard = threading.Event()
+        self._client.on_subscribe = lambda *_: heard.set()
+        self._client.subscribe(ch.NODE_COMMAND.key(site="estig", node="n1"), qos=1)
+        self._client.loop_start()
+        assert heard.wait(10.0)
+
+    def _on_message(self, client: paho.Client, _: object, message: paho.MQTTMessage) -> None:
+        command = message.payload.decode()
+        self.commands.append(command)
+        if command == ch.CALIBRATE:
+            told = encode(ch.NODE_CALIBRATION, self._learned)
+            client.publish(ch.NODE_CALIBRATION.key(site="estig", node="n1"), told, qos=1, retain=True)
+        else:
+            words = "this firmware does not know the command: it knows calibrate and learn-no-echo"
+            client.publish(ch.NODE_PROBLEM.key(site="estig", node="n1"), words, qos=1, retain=True)
+
+    def end(self) -> None:
+        self._client.disconnect()
+        self._client.loop_stop()
+
+
+@pytest.mark.live
+def test_node_of_before_the_command_keep_has_taken_what_it_learned_and_the_command_says_so(tmp_path, floor) -> None:
+    with start_mosquitto(tmp_path / "broker") as server:
+        words = ["calibrate", "n1", "--site", str(floor), "--broker", server.url]
+        node = OlderNode(server.port, LEARNED)
+        accepted = CliRunner().invoke(node_app, words)
+        node.end()
+        assert node.commands == [ch.CALIBRATE, ch.KEEP]
+        before = (floor / "site.toml").read_bytes()
+        node = OlderNode(
+            server.port, msgspec.structs.replace(LEARNED, range_limit_m=[1.0, 2.7], range_max_m=[1.5, 3.2])
+        )
+        declined = CliRunner().invoke(node_app, words)
+        node.end()
+    assert accepted.exit_code == 0, accepted.stderr
+    assert "older firmware: what it learned counts already" in " ".join(accepted.stderr.split())
+    sonars = next(node for node in load_site(floor).site.nodes if node.id == "n1").sonars
+    assert [sonar.range_limit for sonar in sonars] == LEARNED.range_limit_m
+    assert (declined.exit_code, (floor / "site.toml").read_bytes()) == (1, before)
+    assert "has taken what it learned at once: calibrate it again" in " ".join(declined.stderr.split())
 
 
 @pytest.mark.live

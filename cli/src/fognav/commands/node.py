@@ -183,12 +183,12 @@ def node_calibrate(  # noqa: PLR0913  # each option is an argument
             if warning := on_broker.hears_too_much(learned, index):
                 print_line(warning)
         if failed:
-            raise FailedError(f"node {name} keeps its old limits: {', '.join(failed)}")
+            raise FailedError(f"node {name} keeps its old limits: {', '.join(failed)}. {on_broker.OLDER_DECLINED}")
         if unlike:
             raise FailedError(
                 f"site.toml was not changed, and node {name} keeps its old limits: {'; '.join(unlike)}. Keep the way "
                 "free and calibrate again; if the map or the node's pose is wrong, mend that, or take what the node "
-                "hears with --force"
+                f"hears with --force. {on_broker.OLDER_DECLINED}"
             )
         _keep(url, site_id, name, own)
         if not no_echo and all(learned.no_echo_is_clear):
@@ -313,9 +313,17 @@ _RESULTS: Final = {
 
 
 def _keep(url: str, site: str, name: str, own: Credentials) -> None:
-    """Let a node go by what it learned from now on; it does not before, so that what is declined never counts."""
+    """Let a node go by what it learned from now on; it does not before, so that what is declined never counts.
+
+    Firmware of before that command has gone by it since it learned it.
+    """
     try:
         _run(on_broker.learn(url, site, name, ch.KEEP, own))
+    except on_broker.OlderFirmwareError:
+        print_line(
+            f"warning: node {name} has older firmware: what it learned counts already, and would if this command had "
+            "declined it. Update it (fognav node update)"
+        )
     except FailedError as error:
         raise FailedError(f"{error}. It may still go by its old limits: calibrate again") from error
 

@@ -47,6 +47,16 @@ _THIS_COMPUTER: Final = ("localhost", "127.0.0.1", "::1")
 _SOMEWHERE: Final = "tcp/192.0.2.1:9"
 """Behind the default route; nothing is sent to it (TEST-NET-1, RFC 5737)."""
 _MAX_BYTES: Final = 4 * 1024 * 1024
+_UNKNOWN_COMMAND: Final = "this firmware does not know the command"
+"""How a node's refusal of a command begins that came with a later firmware."""
+OLDER_DECLINED: Final = (
+    "A node whose firmware does not know the command keep has taken what it learned at once: calibrate it again, which "
+    "replaces that, and update its firmware (fognav node update)"
+)
+
+
+class OlderFirmwareError(FailedError):
+    """A node's firmware is of before a command."""
 
 
 def make_key(file: Path) -> str:
@@ -190,8 +200,9 @@ async def readings(
 async def learn(url: str, site: str, node: str, command: str, credentials: Credentials = NOBODY) -> NodeCalibration:
     """Let a node learn its limits (`CALIBRATE`) or its board's "no echo" (`LEARN_NO_ECHO`), and return what it learned.
 
-    It counts once the node was told to `KEEP` it, likewise. Raises `FailedError` with the node's own words if it
-    refused, or if it does not answer within `CALIBRATION_S` (`KEEPING_S`).
+    It counts once the node was told to `KEEP` it, likewise; firmware of before that command goes by it at once, and
+    refuses it: `OlderFirmwareError`. Raises `FailedError` with the node's own words if it refused, or if it does not
+    answer within `CALIBRATION_S` (`KEEPING_S`).
     """
     seconds = KEEPING_S if command == ch.KEEP else CALIBRATION_S
     keys = {channel: channel.key(site=site, node=node) for channel in (ch.NODE_CALIBRATION, ch.NODE_PROBLEM)}
@@ -212,7 +223,8 @@ async def learn(url: str, site: str, node: str, command: str, credentials: Crede
                 if isinstance(found, NodeCalibration):
                     return found
                 if found:
-                    raise FailedError(f"node {node} refused: {found}")
+                    refusal = OlderFirmwareError if found.startswith(_UNKNOWN_COMMAND) else FailedError
+                    raise refusal(f"node {node} refused: {found}")
     except TimeoutError:
         raise FailedError(
             f"node {node} did not answer within {seconds:.0f} s: check that it is online (fognav node list)"

@@ -55,7 +55,8 @@ BEFORE = {
 def test_form_changes_what_is_filled_in_and_leaves_all_else_of_the_settings(core):
     empty = dict.fromkeys(FORM, "")
     assert submitted(core, empty, BEFORE) == BEFORE
-    assert submitted(core, {**empty, "wifi_name": "new"}, BEFORE) == {**BEFORE, "wifi_name": "new"}
+    password = {"wifi_password": "secret12"}
+    assert submitted(core, {**empty, **password}, BEFORE) == {**BEFORE, **password}
     assert submitted(core, {**empty, "tls": "0"}, BEFORE) == {**BEFORE, "tls": False, "port": 1883}
     first, second, third = BEFORE["sonars"]
     limits = {"range_limit_m_0": "1.5", "range_limit_m_1": "2.5"}
@@ -64,6 +65,16 @@ def test_form_changes_what_is_filled_in_and_leaves_all_else_of_the_settings(core
     one = {**BEFORE, "sonars": [{"range_limit_m": 1.8}]}
     more = [{"range_limit_m": 1.8}, {"range_limit_m": 2.0}]
     assert submitted(core, {**empty, "range_limit_m_1": "2"}, one)["sonars"] == more
+
+
+@pytest.mark.parametrize(
+    ("name", "of_it"), [("wifi_name", {"wifi_password": "secret12"}), ("broker", {"user": "n2", "password": "q"})]
+)
+def test_other_network_or_broker_is_not_given_the_passwords_of_the_one_before_and_may_have_none(core, name, of_it):
+    empty, other = dict.fromkeys(FORM, ""), {name: "another"}
+    rest = {key: value for key, value in BEFORE.items() if key not in of_it}
+    assert submitted(core, {**empty, **other}, BEFORE) == {**rest, **other}
+    assert submitted(core, {**empty, **other, **of_it}, BEFORE) == {**BEFORE, **other, **of_it}
 
 
 def test_settings_that_are_not_valid_leave_nothing_in_a_form(core):

@@ -79,8 +79,11 @@ private:
         return strlen(name) == length && memcmp(key, name, length) == 0;
     }
 
-    // Whether the form says something else than a member.
+    // Whether the form says something else than a member. A password is that of its network or broker: another one may be
+    // open, and is not told what opens the one before.
     bool replaced(const char* key, size_t length) const {
+        if (is(key, length, "wifi_password") && given(form_.field("wifi_name"))) return true;
+        if ((is(key, length, "user") || is(key, length, "password")) && given(form_.field("broker"))) return true;
         for (const char* name : kTexts) {
             if (is(key, length, name)) return given(form_.field(name));
         }
@@ -198,7 +201,8 @@ const char kPortalPage[] FLASH_SECTION =
     "</style><h1>Fognav node</h1><form method=post action=/settings>"
     "<label>Provisioning file (node.json), if you have one"
     "<textarea name=provisioning rows=4></textarea></label><h2>or</h2>"
-    "<p>What is left empty stays as it is.</p>"
+    "<p>What is left empty stays as it is. A network or broker that is filled in has the user and password that are filled in "
+    "with it, or none.</p>"
     "<label>Site <input name=site></label><label>Node <input name=node></label>"
     "<label>Wi-Fi network <input name=wifi_name></label>"
     "<label>Wi-Fi password <input name=wifi_password type=password></label>"

@@ -12,10 +12,10 @@ from msgspec.structs import replace
 from starlette.requests import Request
 
 from console_service.core import ConsoleCore
-from console_service.floors import OwnFloor, read_peers
+from console_service.floors import AWAY_S, OwnFloor, read_peers
 from fog_contracts import channels as ch
 from fog_contracts.handlers import Moment
-from fog_contracts.messages import CommandReply, Pose, RobotState
+from fog_contracts.messages import CommandReply, Pose, RobotGoal, RobotPath, RobotRelease, RobotState
 from fog_contracts.site import RobotSite
 from fog_runtime.clock import SystemClock
 from fog_runtime.configuration.settings import SettingsError
@@ -242,6 +242,40 @@ async def test_floor_is_not_stopped_while_a_robot_moves_that_is_not_enabled(mode
         said = replace(DRIVING, mode=each, enabled=False)
         core.handlers()[ch.ROBOT_STATE]({"robot": "r1"}, said, Moment(time.monotonic(), time.time()))
         assert (await floor.view()).stopped is stopped, each
+
+
+GOAL = RobotGoal(goal_id="g", pose=Pose(x=1.0, y=1.0, theta=0.0))
+PATH = RobotPath(
+    plan_id=1,
+    planner_epoch=1,
+    goal_id="g",
+    points=[(0.0, 0.0), (1.0, 1.0)],
+    released_length=1.0,
+    map_epoch=1,
+    map_seq=0,
+)
+RELEASE = RobotRelease(plan_id=1, planner_epoch=1, released_length=1.0, map_epoch=1, map_seq=0)
+
+
+@pytest.mark.parametrize(
+    ("channel", "message"), [(ch.ROBOT_GOAL, GOAL), (ch.ROBOT_PATH, PATH), (ch.ROBOT_RELEASE, RELEASE)]
+)
+@pytest.mark.parametrize("is_of_site", [True, False])
+async def test_robot_that_is_off_becomes_away_and_stays_listed_while_the_planner_goes_on_about_it(
+    channel, message, is_of_site
+):
+    site = RobotSite(id="r1", start=Pose(x=1.0, y=1.0, theta=0.0), radius=0.17, height=0.1)
+    core = ConsoleCore("lab", "r", robots=[site] if is_of_site else [])
+    core.handlers()[ch.ROBOT_STATE]({"robot": "r1"}, DRIVING, Moment(100.0, 1e9))
+    now = 100.0
+    for now in (100.0 + step for step in range(1, 1001)):
+        core.handlers()[channel]({"robot": "r1"}, message, Moment(now, 1e9 + now))
+        core.tick(Moment(now, 1e9 + now))
+    (robot,), _ = core.floor(now)
+    assert (robot.id, robot.age_s) == ("r1", 1000.0)
+    assert robot.age_s > AWAY_S
+    core.handlers()[ch.ROBOT_STATE]({"robot": "r1"}, DRIVING, Moment(now, 1e9 + now))
+    assert core.floor(now)[0][0].age_s == 0.0, "it is heard again"
 
 
 @pytest.mark.parametrize(

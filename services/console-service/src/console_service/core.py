@@ -57,7 +57,7 @@ REFRESH_S: Final = 10.0
 """How often what always changes (`VOLATILE`) is told when nothing else does."""
 VOLATILE: Final[Mapping[str, Sequence[str]]] = {"area": ("rest_s",), "node": ("age_s", "received", "ignored")}
 FORGET_S: Final = 600.0
-"""A robot that is not of the site is forgotten after so long without a message."""
+"""A robot that is not of the site is forgotten after so long without a message of it, or about it."""
 RECORDS: Final = 200
 """Entries of the audit trail that a new reader gets."""
 VITALS: Final = 300
@@ -76,6 +76,9 @@ class _Robot:
     pending: RobotPose | None = None
     pose_at: float = -math.inf
     heard: float = -math.inf
+    """When it said something itself."""
+    told: float = -math.inf
+    """When anybody last spoke of it: the planner goes on about a robot that is off."""
     vitals: deque[VitalsView] = field(default_factory=lambda: deque(maxlen=VITALS))
 
 
@@ -150,7 +153,7 @@ class ConsoleCore:
         for robot, known in list(self._robots.items()):
             if known.pending is not None and at.now - known.pose_at >= POSE_PERIOD_S:
                 self._put_pose(robot, known, known.pending, at.now)
-            if known.described is None and at.now - known.heard > FORGET_S:
+            if known.described is None and at.now - known.told > FORGET_S:
                 del self._robots[robot]
                 for event in ("robot", "pose", "path", "obstacles", "vitals"):
                     self._remove(event, robot, at.now)
@@ -217,13 +220,20 @@ class ConsoleCore:
     # --- Robots -----------------------------------------------------------------------------------------------------
 
     def _robot(self, ids: Ids, at: Moment) -> tuple[str, _Robot]:
+        """Return the robot that a message is about, whoever sent it."""
         robot = ids["robot"]
         known = self._robots.setdefault(robot, _Robot())
+        known.told = at.now
+        return robot, known
+
+    def _hear(self, ids: Ids, at: Moment) -> tuple[str, _Robot]:
+        """Return the robot that has sent a message."""
+        robot, known = self._robot(ids, at)
         known.heard = at.now
         return robot, known
 
     def _on_pose(self, ids: Ids, pose: RobotPose, at: Moment) -> Sequence[Publication]:
-        robot, known = self._robot(ids, at)
+        robot, known = self._hear(ids, at)
         if at.now - known.pose_at >= POSE_PERIOD_S - _EARLY_S:
             self._put_pose(robot, known, pose, at.now)
         else:
@@ -235,7 +245,7 @@ class ConsoleCore:
         self._put("pose", robot, pose)
 
     def _on_state(self, ids: Ids, state: RobotState, at: Moment) -> Sequence[Publication]:
-        robot, known = self._robot(ids, at)
+        robot, known = self._hear(ids, at)
         before = known.state is not None and known.state.mode == "FAULT"
         if (state.mode == "FAULT") != before:
             why = ([], []) if before else (list(state.reasons), list(state.codes))
@@ -269,13 +279,13 @@ class ConsoleCore:
         return ()
 
     def _on_obstacles(self, ids: Ids, obstacles: RobotObstacles, at: Moment) -> Sequence[Publication]:
-        robot, known = self._robot(ids, at)
+        robot, known = self._hear(ids, at)
         known.obstacles = obstacles
         self._put("obstacles", robot, obstacles)
         return ()
 
     def _on_vitals(self, ids: Ids, vitals: RobotVitals, at: Moment) -> Sequence[Publication]:
-        robot, known = self._robot(ids, at)
+        robot, known = self._hear(ids, at)
         view = VitalsView(
             stamp=at.stamp,  # this service's clock, by which all robots and what is replayed can be compared
             cpu=vitals.cpu,

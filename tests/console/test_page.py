@@ -2,6 +2,7 @@
 
 import asyncio
 import json
+import re
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -54,6 +55,31 @@ async def test_person_logs_in_by_token_and_out_again(console: SimpleNamespace) -
     await expect(page.get_by_label("Token")).to_be_visible()
     # A robot that was known can be stopped by who is not logged in.
     await expect(page.get_by_role("button", name="Stop all")).to_be_enabled()
+
+
+async def test_area_is_green_only_while_the_map_confirms_it_and_a_silent_node_grows_older(
+    console: SimpleNamespace, stream: ConsoleStream
+) -> None:
+    clear = {"state": "clear", "penalty": 0, "confirmed": True}
+    stream.hazard("z1", "clear", on_map=clear)
+    page = await console.open("map")
+    name = next(each.label for each in stream.site.site.areas if each.id == "z1")
+    row = page.locator("main li.row", has=page.get_by_text(name, exact=True))
+    await expect(row.locator(".swatch.clear")).to_have_count(1)
+    greens = len(stream.site.site.areas)
+    await expect(page.locator("path.shape.area.clear")).to_have_count(greens)
+    for unsure in (None, {**clear, "confirmed": False}, {**clear, "state": "unknown"}):
+        stream.hazard("z1", "clear", on_map=unsure)
+        await expect(row).to_contain_text("unknown (not confirmed)")
+        await expect(row.locator(".swatch.unknown")).to_have_count(1)
+        await expect(page.locator("path.shape.area.clear")).to_have_count(greens - 1)
+        await expect(page.locator("path.shape.area.unknown")).to_have_count(1)
+        stream.hazard("z1", "clear", on_map=clear)
+        await expect(row).not_to_contain_text("not confirmed")
+        await expect(page.locator("path.shape.area.clear")).to_have_count(greens)
+    await page.evaluate("location.hash = '#/sensors'")
+    node = page.locator("main li.node").first
+    await expect(node).to_contain_text(re.compile(r"[3-9] s ago"))
 
 
 async def test_tile_changes_its_cells_of_the_costmap_and_no_others(

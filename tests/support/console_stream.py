@@ -91,13 +91,14 @@ class ConsoleStream:
         """Return the requests of this method, without those of the session."""
         return [name for name, _ in self.requests if name.startswith(method) and not name.endswith("session")]
 
-    def hazard(self, area: str, state: str) -> None:
+    def hazard(self, area: str, state: str, **fields: Any) -> None:
         found = next(each for each in self.site.site.areas if each.id == area)
         definition = AreaDefinition(id=area, label=found.label, polygon=found.polygon)
         hazard = AreaHazard(
             area=area, state=state, severity=0, penalty=0, since=time.time(), seq=1, epoch=1, cause="echo"
         )
-        self.tell("area", area, {"definition": definition, "hazard": hazard, "withheld": False, "override": None})
+        value = {"definition": definition, "hazard": hazard, "withheld": False, "override": None}
+        self.tell("area", area, {**value, **fields})
 
     def cut(self) -> None:
         """End all connections, as a gateway that starts anew."""

@@ -10,7 +10,6 @@ export type Alert = Schemas["Alert"];
 export type AppliedChange = Schemas["AppliedChange"];
 export type AreaBody = Sent<Schemas["AreaBody"]>;
 export type AreaState = "blocked" | "clear" | "unknown";
-export type AreaView = Schemas["AreaView"];
 export type AuditEntry = Schemas["AuditEntry"];
 export type BlockedWay = Schemas["BlockedWay"];
 export type CommandBody = Sent<Schemas["CommandBody"], "kind">;
@@ -66,6 +65,16 @@ export type NodeValue = Schemas["NodeView"] & {
   readonly theta?: number;
   readonly sonars?: readonly { readonly angle: number; readonly range_limit: number }[];
 };
+
+/** What the map shows of an area. Confirmed: of its latest state, which the hazard-aggregator stands by. */
+export interface ShownArea {
+  readonly state: AreaState;
+  readonly penalty: number;
+  readonly confirmed: boolean;
+}
+
+/** An area; `on_map` is null while the map-service is silent, and an older server does not tell it. */
+export type AreaView = Schemas["AreaView"] & { readonly on_map?: ShownArea | null };
 
 export interface PathValue {
   readonly points: readonly Point[];

@@ -145,6 +145,7 @@ export const en = {
   "state.clear": "clear",
   "area.overridden": "set by hand",
   "area.part_free": "a part is free: slowly",
+  "area.unconfirmed": "unknown (not confirmed)",
   "since": "since {time}",
   "ago": "{age} ago",
   "zone.BLOCKED": "closed",

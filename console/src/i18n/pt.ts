@@ -146,6 +146,7 @@ export const pt: Readonly<Record<keyof typeof en, string>> = {
   "state.clear": "livre",
   "area.overridden": "definida à mão",
   "area.part_free": "uma parte está livre: devagar",
+  "area.unconfirmed": "desconhecida (não confirmada)",
   "since": "desde {time}",
   "ago": "há {age}",
   "zone.BLOCKED": "fechada",

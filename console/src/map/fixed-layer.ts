@@ -4,7 +4,7 @@ import type { AreaView, NodeValue, Place, Point, Values } from "../api/types";
 import { said } from "../i18n/codes";
 import { t } from "../i18n/i18n";
 import type { Live, Topic } from "../live/live";
-import { clockTime } from "../text";
+import { areaText, isPartlyFree, shownState } from "../sensors/words";
 import { outline, toPoint } from "./geometry";
 
 const toLatLng = (point: Point): L.LatLngTuple => [point[1], point[0]];
@@ -23,20 +23,6 @@ function label(id: string, name = "", ...details: readonly string[]): HTMLElemen
   add(id, "from-afar");
   for (const text of [name || id, ...details]) if (text !== "") add(text, "nearby");
   return element;
-}
-
-/** Whether sensors show a part of a blocked area free, through which robots may pass slowly. */
-function isPartlyFree({ hazard }: AreaView): boolean {
-  return hazard?.state === "blocked" && (hazard.free ?? []).length > 0;
-}
-
-/** Return what an area's state is called, and since when it has it. */
-export function areaText(area: AreaView): string {
-  const { hazard } = area;
-  if (!hazard) return t("state.unknown");
-  const text = t(`state.${hazard.state}`) + (hazard.override ? ` (${t("area.overridden")})` : "");
-  const part = isPartlyFree(area) ? `, ${t("area.part_free")}` : "";
-  return `${text} ${t("since", { time: clockTime(hazard.since) })}${part}`;
 }
 
 const DECLUTTER_MS = 1_000;
@@ -173,7 +159,7 @@ export class FixedLayer {
 
   private area(area: AreaView): L.LayerGroup {
     const { definition } = area;
-    const state = area.hazard?.state ?? "unknown";
+    const state = shownState(area);
     const text = label(definition.id, definition.label, state === "clear" ? "" : areaText(area));
     const [group] = this.outlined(definition.polygon.map(toPoint), `area ${state}`, text);
     if (isPartlyFree(area)) {

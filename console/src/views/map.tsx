@@ -3,8 +3,8 @@ import { useConsole, useLive } from "../context";
 import { said } from "../i18n/codes";
 import { t } from "../i18n/i18n";
 import { MapChange } from "../map/change";
-import { areaText } from "../map/fixed-layer";
 import { routeHash } from "../router";
+import { areaText, shownState } from "../sensors/words";
 import { clockTime } from "../text";
 import { Places, Visits } from "./places";
 import { RobotCard } from "./robot-card";
@@ -15,7 +15,7 @@ export function MapView(): preact.JSX.Element {
   const { robot, robots, session } = useConsole();
   const live = useLive(["zone", "area", "alert"]);
   const areas = [...live.of.area.values()].sort(
-    (a, b) => RANK[a.hazard?.state ?? "unknown"] - RANK[b.hazard?.state ?? "unknown"]
+    (a, b) => RANK[shownState(a)] - RANK[shownState(b)]
       || (a.definition.label || a.definition.id).localeCompare(b.definition.label || b.definition.id),
   );
   const zones = [...live.of.zone.values()].filter((zone) => zone.active);
@@ -42,7 +42,7 @@ export function MapView(): preact.JSX.Element {
       <ul class="rows">
         {areas.map((area) => (
           <li key={area.definition.id} class="row">
-            <span class={`swatch ${area.hazard?.state ?? "unknown"}`} aria-hidden="true" />
+            <span class={`swatch ${shownState(area)}`} aria-hidden="true" />
             <span><bdi>{area.definition.label || area.definition.id}</bdi></span>
             <span class="value">{areaText(area)}</span>
           </li>

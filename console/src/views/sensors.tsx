@@ -4,13 +4,13 @@ import type { AreaView, NodeValue } from "../api/types";
 import { mayOperate, useConsole, useLive, useSeconds } from "../context";
 import { said, saidCause } from "../i18n/codes";
 import { t } from "../i18n/i18n";
-import { areaText } from "../map/fixed-layer";
 import { toPoint } from "../map/geometry";
 import { go, routeHash, useRoute } from "../router";
 import { AreaForm } from "../sensors/area-form";
 import { History } from "../sensors/history";
 import { Latency } from "../sensors/latency";
 import { Override } from "../sensors/override";
+import { areaText, shownState } from "../sensors/words";
 import { duration } from "../text";
 import "../zones/zones.css";
 
@@ -24,8 +24,8 @@ export function SensorsView(): preact.JSX.Element {
   useEffect(() => setPlacing(false), [chosen]);
   const operates = mayOperate(session);
   const areas = [...live.of.area.values()].sort((a, b) => nameOf(a).localeCompare(nameOf(b)));
-  const nodes = [...live.of.node.values()].sort((a, b) => a.id.localeCompare(b.id));
-  const ids = [...new Set(nodes.map((node) => node.id))];
+  const nodes = [...live.of.node].sort(([, a], [, b]) => a.id.localeCompare(b.id));
+  const ids = [...new Set(nodes.map(([, node]) => node.id))];
   const area = live.of.area.get(chosen);
   if (operates && (chosen === NEW || (area && placing))) {
     return (
@@ -35,7 +35,7 @@ export function SensorsView(): preact.JSX.Element {
       }} />
     );
   }
-  if (area) return <AreaCard area={area} nodes={nodes.filter((node) => node.area === chosen)} onPlace={() => setPlacing(true)} />;
+  if (area) return <AreaCard area={area} nodes={nodes.filter(([, node]) => node.area === chosen)} onPlace={() => setPlacing(true)} />;
   return (
     <>
       <h2>{t("map.hazards")}</h2>
@@ -44,7 +44,7 @@ export function SensorsView(): preact.JSX.Element {
       <ul class="rows">
         {areas.map((each) => (
           <li key={each.definition.id} class="row">
-            <span class={`swatch ${each.hazard?.state ?? "unknown"}`} aria-hidden="true" />
+            <span class={`swatch ${shownState(each)}`} aria-hidden="true" />
             <a href={routeHash("sensors", each.definition.id)}><bdi>{nameOf(each)}</bdi></a>
             <span class="value">{areaText(each)}</span>
           </li>
@@ -52,8 +52,8 @@ export function SensorsView(): preact.JSX.Element {
       </ul>
       <h2>{t("sensors.nodes")}</h2>
       <ul class="rows">
-        {nodes.map((node) => (
-          <NodeRow key={`${node.area}/${node.id}`} node={node} onShow={node.x === undefined ? null : () => floor?.show([[node.x ?? 0, node.y ?? 0]])} />
+        {nodes.map(([id, node]) => (
+          <NodeRow key={id} id={id} node={node} onShow={node.x === undefined ? null : () => floor?.show([[node.x ?? 0, node.y ?? 0]])} />
         ))}
       </ul>
       <Latency />
@@ -66,19 +66,24 @@ function nameOf({ definition }: AreaView): string {
 }
 
 interface RowProps {
+  /** What the stream calls it. */
+  readonly id: string;
   readonly node: NodeValue;
   /** Shows where it hangs; null where nobody says. */
   readonly onShow: (() => void) | null;
 }
 
-function NodeRow({ node, onShow }: RowProps): preact.JSX.Element {
+function NodeRow({ id, node, onShow }: RowProps): preact.JSX.Element {
+  const { live } = useConsole();
+  useSeconds();
+  // What is told of a node may have been its last word: it grows older here.
   const health = node.online === false ? t("sensors.offline") : t(`state.${node.state}`);
   return (
     <li class="row node">
       <span class={`swatch ${node.state}`} aria-hidden="true" />
       <b><bdi>{node.id}</bdi></b>
       <a href={routeHash("sensors", node.area)}><bdi>{node.area}</bdi></a>
-      <span class="value">{health}{node.age_s !== null && ` · ${t("ago", { age: duration(node.age_s) })}`}</span>
+      <span class="value">{health}{node.age_s !== null && ` · ${t("ago", { age: duration(node.age_s + live.age("node", id) / 1000) })}`}</span>
       <span class="why"><bdi>{said(node.code, node.reason)}</bdi>{node.code !== "" && <code> {node.code}</code>}</span>
       {onShow && <button aria-label={t("zones.showOf", { zone: node.id })} onClick={onShow}>{t("zones.show")}</button>}
       <details>
@@ -93,7 +98,8 @@ function NodeRow({ node, onShow }: RowProps): preact.JSX.Element {
 
 interface CardProps {
   readonly area: AreaView;
-  readonly nodes: readonly NodeValue[];
+  /** The nodes that watch it, by what the stream calls them. */
+  readonly nodes: readonly (readonly [string, NodeValue])[];
   readonly onPlace: () => void;
 }
 
@@ -118,7 +124,7 @@ function AreaCard({ area, nodes, onPlace }: CardProps): preact.JSX.Element {
       </div>
       {mayOperate(session) && <Override area={area} />}
       <h3>{t("sensors.nodes")}</h3>
-      <ul class="rows">{nodes.map((node) => <NodeRow key={node.id} node={node} onShow={null} />)}</ul>
+      <ul class="rows">{nodes.map(([id, node]) => <NodeRow key={id} id={id} node={node} onShow={null} />)}</ul>
       <History area={definition.id} since={hazard?.since ?? 0} now={live.serverTime || Date.now() / 1000} />
     </>
   );

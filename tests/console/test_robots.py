@@ -157,6 +157,28 @@ async def test_robot_is_taken_out_of_service_and_put_back_and_says_why_it_gets_n
     assert stream.requests[-1] == ("DELETE robots/r1/out-of-service", None)
 
 
+async def test_service_panel_does_what_it_said_when_it_opened_or_nothing(
+    console: SimpleNamespace, stream: ConsoleStream
+) -> None:
+    page = await console.open("robots")
+    form = page.get_by_role("form", name="Service of r1")
+    await page.get_by_role("button", name="Take out of service").click()
+    await form.get_by_label("Reason").fill("worn wheel")
+    out = {"id": "1", "reason": "flat", "by": "rui", "since": 1.0, "until": None}
+    stream.robot("r1", robot_state(), out_of_service=out)
+    await expect(form.get_by_role("alert")).to_contain_text("Somebody was faster. Out of service: flat (rui).")
+    await expect(form.get_by_role("button", name="Take out of service")).to_be_disabled()
+    await form.get_by_label("Reason").press("Enter")
+    await form.get_by_role("button", name="Cancel").click()
+    await page.get_by_role("button", name="Put back into service").click()
+    back = form.get_by_role("button", name="Put back into service")
+    await expect(back).to_be_enabled()
+    stream.robot("r1", robot_state())
+    await expect(form.get_by_role("alert")).to_have_text("Somebody was faster. r1 is in service.")
+    await expect(back).to_be_disabled()
+    assert not [name for name, _ in stream.requests if name.endswith("out-of-service")]
+
+
 async def test_robot_shows_cpu_beside_that_of_one_that_drives_alone_and_its_wifi(
     console: SimpleNamespace, stream: ConsoleStream
 ) -> None:

@@ -226,6 +226,7 @@ export const en = {
   "service.isOut": "{robot} is out of service.",
   "service.isIn": "{robot} is in service.",
   "service.failed": "The service of {robot} is as it was: {reason}",
+  "service.overtaken": "Somebody was faster. {now}",
   "vitals.title": "Its computer, the last ten minutes",
   "vitals.none": "Its computer has told nothing of itself yet.",
   "vitals.noWifi": "no Wi-Fi",

@@ -227,6 +227,7 @@ export const pt: Readonly<Record<keyof typeof en, string>> = {
   "service.isOut": "{robot} está fora de serviço.",
   "service.isIn": "{robot} está ao serviço.",
   "service.failed": "O serviço de {robot} ficou como estava: {reason}",
+  "service.overtaken": "Alguém foi mais rápido. {now}",
   "vitals.title": "O computador, nos últimos dez minutos",
   "vitals.none": "O computador ainda não disse nada de si.",
   "vitals.noWifi": "sem Wi-Fi",

@@ -23,17 +23,24 @@ export function ServicePanel({ id, out, onClose }: Props): preact.JSX.Element {
   const [reason, setReason] = useState("");
   const [seconds, setSeconds] = useState<number>(0);
   const [problem, setProblem] = useState("");
+  const [waiting, setWaiting] = useState(false);
+  // What the button does is fixed when the panel opens: another operator may do the same just before it is pressed.
+  const [putsBack] = useState(out !== null);
+  const isOvertaken = !waiting && putsBack !== (out !== null);
 
   const send = async (event: Event): Promise<void> => {
     event.preventDefault();
+    if (isOvertaken || waiting) return;
     setProblem("");
+    setWaiting(true);
     const path = robotPath(id, "out-of-service");
     const body: ServiceBody = { reason: reason.trim(), ...(seconds > 0 ? { ttl_s: seconds } : {}) };
     try {
-      await (out ? request("DELETE", path) : request<OutOfService>("PUT", path, { body }));
-      say(t(out ? "service.isIn" : "service.isOut", { robot: id }));
+      await (putsBack ? request("DELETE", path) : request<OutOfService>("PUT", path, { body }));
+      say(t(putsBack ? "service.isIn" : "service.isOut", { robot: id }));
       onClose();
     } catch (error) {
+      setWaiting(false);
       setProblem(sentence(error));
       say(t("service.failed", { robot: id, reason: sentence(error) }), "failed");
     }
@@ -41,7 +48,7 @@ export function ServicePanel({ id, out, onClose }: Props): preact.JSX.Element {
   return (
     <form ref={useShown()} class="card" aria-label={t("service.title", { robot: id })} onSubmit={(event) => void send(event)}>
       <h3>{t("service.title", { robot: id })}</h3>
-      {out ? <p>{outOfService(out)}</p> : (
+      {putsBack ? out && <p>{outOfService(out)}</p> : (
         <>
           <p class="muted">{t("service.help")}</p>
           <label class="field">{t("field.reason")}
@@ -56,9 +63,9 @@ export function ServicePanel({ id, out, onClose }: Props): preact.JSX.Element {
           </div>
         </>
       )}
-      <p class="problem" role="alert">{problem}</p>
+      <p class="problem" role="alert">{isOvertaken ? t("service.overtaken", { now: out ? outOfService(out) : t("service.isIn", { robot: id }) }) : problem}</p>
       <div class="actions">
-        <button class="primary" disabled={!out && reason.trim() === ""}>{t(out ? "service.in" : "command.disable")}</button>
+        <button class="primary" disabled={waiting || isOvertaken || (!putsBack && reason.trim() === "")}>{t(putsBack ? "service.in" : "command.disable")}</button>
         <button type="button" onClick={onClose}>{t("cancel")}</button>
       </div>
     </form>

@@ -1,4 +1,4 @@
-// A question before something that can't be taken back. It is not modal: the stop stays within reach.
+// A question before something that can't be taken back, and a notice. Neither is modal: the stop stays within reach.
 import { useEffect, useRef } from "preact/hooks";
 import { t } from "./i18n/i18n";
 
@@ -26,6 +26,19 @@ export function Confirm({ title, text, what, onYes, onClose }: Props): preact.JS
           dialog.current?.close();
         }}>{t("confirm", { what })}</button>
       </div>
+    </dialog>
+  );
+}
+
+/** Say what must be read before anything else is done. */
+export function Notice({ text, onClose }: Pick<Props, "text" | "onClose">): preact.JSX.Element {
+  const dialog = useRef<HTMLDialogElement>(null);
+  useEffect(() => dialog.current?.show(), []);
+  return (
+    <dialog ref={dialog} role="alertdialog" aria-labelledby="notice-text" onClose={onClose}
+      onKeyDown={(event) => { if (event.key === "Escape") dialog.current?.close(); }}>
+      <p id="notice-text">{text}</p>
+      <div class="actions"><button class="primary" onClick={() => dialog.current?.close()}>{t("close")}</button></div>
     </dialog>
   );
 }

@@ -14,8 +14,13 @@ export async function currentSession(): Promise<Session> {
   return (await request<Session>("GET", "session")).value;
 }
 
+/** End the session; throws a `Problem` if it goes on. One that has ended already is no problem. */
 export async function logOut(): Promise<void> {
-  await request("DELETE", "session");
+  try {
+    await request("DELETE", "session");
+  } catch (error) {
+    if (!(error instanceof Problem && error.status === 401)) throw error;
+  }
 }
 
 interface Props {

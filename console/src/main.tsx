@@ -7,13 +7,16 @@ import { Problem } from "./api/client";
 import type { Session } from "./api/types";
 import { ConsoleApp } from "./app";
 import { mayOperate } from "./context";
+import { Notice } from "./dialog";
 import { startLanguage, t } from "./i18n/i18n";
 import { currentSession, logIn, logOut, Login } from "./login";
-import { takeLogin, usePage } from "./router";
-import { rememberedRobots, StopBar } from "./stop";
+import { go, takeLogin, usePage } from "./router";
+import { rememberedRobots, sentence, StopBar } from "./stop";
 import { startTheme } from "./theme";
+import { forgetChanges } from "./views/zones";
 import { CodesPage } from "./visit/codes";
 import { NoCode, VisitApp } from "./visit/visit";
+import { editor } from "./zones/editor";
 
 /** How often a page that is shown, such as a tablet on a wall, keeps its login alive. */
 const KEEP_MS = 3_600_000;
@@ -39,6 +42,8 @@ function Root({ first }: { readonly first: string | null }): preact.JSX.Element 
   const [session, setSession] = useState<Session | null | undefined>(undefined);
   const [notice, setNotice] = useState("");
   const [said, setSaid] = useState("");
+  /** Why the last attempt to log out failed. */
+  const [problem, setProblem] = useState("");
   const page = usePage();
   useEffect(() => void begin(login.token, page.name === "visit").then((found) => setSession((before) => found ?? before ?? null)), [login]);
   useEffect(() => {
@@ -59,7 +64,15 @@ function Root({ first }: { readonly first: string | null }): preact.JSX.Element 
   if (session === undefined) return null;
   const leave = (why: string): void => {
     setNotice(why);
+    setProblem("");
     setSession(null);
+  };
+  // Who leaves by hand leaves nothing to the next person at this screen; who must log in again finds their draft.
+  const left = (): void => {
+    editor.end();
+    forgetChanges();
+    go("map");
+    leave("");
   };
   if (page.name === "visit" || session?.role === "guest") {
     return session === null ? <NoCode /> : <VisitApp place={page.place} onExpired={() => leave("")} />;
@@ -67,11 +80,14 @@ function Root({ first }: { readonly first: string | null }): preact.JSX.Element 
   if (page.name === "codes" && session !== null && mayOperate(session)) return <CodesPage own={session.role === "admin"} />;
   if (session !== null) {
     return (
-      <ConsoleApp
-        session={session}
-        onExpired={() => leave(t("login.expired"))}
-        onLogOut={() => void logOut().then(() => leave(""), () => leave(""))}
-      />
+      <>
+        <ConsoleApp
+          session={session}
+          onExpired={() => leave(t("login.expired"))}
+          onLogOut={() => void logOut().then(left, (error: unknown) => setProblem(sentence(error)))}
+        />
+        {problem !== "" && <Notice text={t("logout.failed", { reason: problem })} onClose={() => setProblem("")} />}
+      </>
     );
   }
   const robots = rememberedRobots();

@@ -57,6 +57,70 @@ async def test_person_logs_in_by_token_and_out_again(console: SimpleNamespace) -
     await expect(page.get_by_role("button", name="Stop all")).to_be_enabled()
 
 
+async def test_logout_that_fails_says_so_and_leaves_the_console_open(
+    console: SimpleNamespace, stream: ConsoleStream
+) -> None:
+    page = await console.open("robots")
+    stream.answers["DELETE session"] = (502, {"type": "urn:fognav:service_away", "detail": "The console is busy."})
+    await page.get_by_text("Settings").click()
+    await page.get_by_role("button", name="Log out").click()
+    says = page.get_by_role("alertdialog")
+    await expect(says).to_have_text("You are still logged in: The console is busy.Close")
+    await expect(page.get_by_text("Live", exact=True)).to_be_visible()
+    await says.get_by_role("button", name="Close").click()
+    await expect(says).to_have_count(0)
+    # A session that is over already needs no end.
+    stream.answers["DELETE session"] = (401, {"type": "urn:fognav:token_missing", "detail": "log in first"})
+    await page.get_by_role("button", name="Log out").click()
+    await expect(page.get_by_label("Token")).to_be_visible()
+
+
+async def test_who_logs_out_leaves_neither_draft_nor_undo_nor_view_to_the_next_person(
+    console: SimpleNamespace, stream: ConsoleStream
+) -> None:
+    page = await console.open("zones")
+    zone = {"id": "wet", "kind": "BLOCKED", "shape": {"type": "circle", "centre": [10.0, 26.0], "radius": 0.5}}
+    zone |= {"reason": "wet", "author": "ana", "enabled": True, "active": True, "version": 1, "sets": []}
+    zone |= dict.fromkeys(("source", "schedule", "factor", "speed", "starts_at", "expires_at"))
+    stream.tell("zone", "wet", zone)
+    await page.get_by_role("button", name="Delete wet").click()
+    await expect(page.locator(".undo")).to_be_visible()
+    await page.get_by_role("button", name="Edit wet").click()
+    await expect(page.locator("form.zone-form")).to_be_visible()
+    await page.get_by_text("Settings").click()
+    await page.get_by_role("button", name="Log out").click()
+    await expect(page.get_by_label("Token")).to_be_visible()
+    assert page.url.endswith("#/map")
+    for stream.role in ("viewer", "operator"):
+        await page.get_by_label("Token").fill(TOKEN)
+        await page.keyboard.press("Enter")
+        await expect(page.get_by_text("Live", exact=True)).to_be_visible()
+        await page.evaluate("location.hash = '#/zones/+draft'")
+        await expect(page.get_by_role("link", name="wet")).to_be_visible()
+        await expect(page.locator("form.zone-form")).to_have_count(0)
+        await expect(page.locator(".undo")).to_have_count(0)
+        await expect(page.get_by_text("is not saved yet")).to_have_count(0)
+        await page.get_by_text("Settings").click()
+        await page.get_by_role("button", name="Log out").click()
+
+
+async def test_viewer_who_logs_in_where_a_session_has_ended_sees_no_edit_form(
+    console: SimpleNamespace, stream: ConsoleStream
+) -> None:
+    page = await console.open("zones")
+    await page.get_by_role("button", name="Circle").click()
+    await expect(page.locator("form.zone-form")).to_be_visible()
+    await page.context.clear_cookies()
+    stream.cut()
+    await expect(page.get_by_text("The login has ended")).to_be_visible()
+    stream.role = "viewer"
+    await page.get_by_label("Token").fill(TOKEN)
+    await page.keyboard.press("Enter")
+    await expect(page.get_by_text("Live", exact=True)).to_be_visible()
+    await expect(page.get_by_role("heading", name="Zones", exact=True)).to_be_visible()
+    await expect(page.locator("form.zone-form")).to_have_count(0)
+
+
 async def test_area_is_green_only_while_the_map_confirms_it_and_a_silent_node_grows_older(
     console: SimpleNamespace, stream: ConsoleStream
 ) -> None:

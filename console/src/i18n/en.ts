@@ -21,6 +21,7 @@ export const en = {
   "login.wrong": "Nobody has this token. Check it, or ask for a new one.",
   "login.expired": "The login has ended. Log in again.",
   "logout": "Log out",
+  "logout.failed": "You are still logged in: {reason}",
   "user": "{name}, {role}",
   "role.viewer": "viewer",
   "role.operator": "operator",

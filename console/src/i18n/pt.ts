@@ -22,6 +22,7 @@ export const pt: Readonly<Record<keyof typeof en, string>> = {
   "login.wrong": "Ninguém tem esta chave. Verifique-a ou peça outra.",
   "login.expired": "A sessão terminou. Entre de novo.",
   "logout": "Sair",
+  "logout.failed": "A sua sessão continua aberta: {reason}",
   "user": "{name}, {role}",
   "role.viewer": "observador",
   "role.operator": "operador",

@@ -30,17 +30,24 @@ let last: Change | null = null;
 /** The zone that was saved just now: the map stays where the person looked while drawing it. */
 let saved = "";
 
+/** Forget what was changed here: who logs in next has not done it. */
+export function forgetChanges(): void {
+  last = null;
+  saved = "";
+}
+
 export function ZonesView(): preact.JSX.Element {
   const { floor, live, session, say } = useConsole();
   const { chosen } = useRoute();
+  const operates = mayOperate(session);
   const [, redraw] = useReducer((count: number) => count + 1, 0);
   useEffect(() => editor.on(() => redraw(0)), []);
   useEffect(() => {
-    if (!floor) return;
+    if (!floor || !operates) return;
     const layer = new EditLayer(floor, editor);
     return () => layer.remove();
-  }, [floor]);
-  const edits = chosen === DRAFT && editor.draft !== null;
+  }, [floor, operates]);
+  const edits = operates && chosen === DRAFT && editor.draft !== null;
 
   const show = (zone: Zone): void => floor?.show(outline(zone.shape));
   const made = (change: Change, text: string): void => {
@@ -98,7 +105,7 @@ export function ZonesView(): preact.JSX.Element {
   }
   return (
     <>
-      {last && mayOperate(session) && <UndoBar change={last} onUndo={takeBack} />}
+      {last && operates && <UndoBar change={last} onUndo={takeBack} />}
       {chosen === "" || chosen === DRAFT ? <ZoneList actions={actions} /> : <ZoneCard id={chosen} actions={actions} />}
     </>
   );

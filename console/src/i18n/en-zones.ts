@@ -264,6 +264,7 @@ export const enZones = {
   "action.undo": "undone",
   "action.goal": "sent to a goal",
   "action.given": "mission given",
+  "action.dated": "counts from now on",
   "action.missed": "mission missed",
   "action.schedule": "sent by its schedule",
   "action.idle": "sent where it stays",

@@ -265,6 +265,7 @@ export const ptZones: Readonly<Record<keyof typeof enZones, string>> = {
   "action.undo": "anulada",
   "action.goal": "enviado a um destino",
   "action.given": "missão dada",
+  "action.dated": "conta a partir de agora",
   "action.missed": "missão perdida",
   "action.schedule": "enviado pelo horário",
   "action.idle": "enviado para onde fica",

@@ -1,10 +1,12 @@
 """The planner as a process, with a real router and Redis; the test acts as map-service and robot."""
 
 import asyncio
+import math
 import os
 import time
 from collections.abc import AsyncIterator, Callable
 from contextlib import asynccontextmanager
+from datetime import UTC, datetime, timedelta
 from pathlib import Path
 
 import httpx
@@ -19,6 +21,7 @@ from fog_contracts.commands import CommandGate
 from fog_contracts.costs import DEFAULT_INFLATION
 from fog_contracts.grid import GridGeometry, Window
 from fog_contracts.messages import (
+    WEEKDAYS,
     AreaHazard,
     Cause,
     CommandReply,
@@ -184,6 +187,16 @@ class Environment:
         )
         self.edge.publish(ch.HAZARD, HazardArea(hazard=hazard, polygon=UPPER, epoch=5), area="z1")
 
+    async def publish_states(self) -> None:
+        """Say once a second that the robot could drive."""
+        async for _ in ticker(self.clock, 1.0):
+            goal = self.goals[-1].goal_id if self.goals and self.goals[-1].pose is not None else None
+            state = RobotState(
+                mode="NORMAL", reasons=[], enabled=True, battery=None, goal_id=goal, map_epoch=5, map_seq=0, plan_id=1,
+                clock=self.clock.now(), boot="run-1",
+            )  # fmt: skip
+            self.edge.publish(ch.ROBOT_STATE, state, robot="r1")
+
     def report_reached(self, goal_id: str) -> None:
         state = RobotState(
             mode="NORMAL", reasons=[], enabled=True, battery=None, goal_id=goal_id, map_epoch=5, map_seq=0, plan_id=1,
@@ -301,6 +314,45 @@ async def test_mission_is_replanned_around_a_hazard_survives_a_kill_and_ends_whe
             await env.until(lambda: env.goals[-1].pose is None)
             assert (await client.get("/api/v1/robots/r1/goal", headers=OPERATOR)).status_code == 404
             assert env.stop() == 0
+
+
+async def test_idle_robot_goes_home_and_on_by_the_clock_and_no_kill_begins_that_mission_again(tmp_path: Path) -> None:
+    async with running_planner(tmp_path, FOGNAV_WALL_CLOCK="trusted") as env:
+        env.stop()
+        site = env.folder / "site.toml"
+        site.write_text(SITE + 'idle = { go = "right", after_s = 10 }\n')
+        env.start()
+        telling = asyncio.create_task(env.publish_states())
+        async with env.ready() as client:
+            begin = datetime.fromtimestamp(60.0 * math.ceil((time.time() + 15.0) / 60.0), UTC)  # after it is idle
+            times = {"days": list(WEEKDAYS), "begin": f"{begin:%H:%M}", "end": f"{begin + timedelta(hours=1):%H:%M}"}
+            body = {
+                "robot": "r1",
+                "mission": {"stops": [{"place": "left"}, {"place": "right"}]},
+                "weekly": {"time_zone": "UTC", "times": [times]},
+            }
+            made = await client.put("/api/v1/schedules/round", json=body, headers=OPERATOR)
+            assert (made.status_code, made.json()["next"]) == (201, begin.timestamp())
+            await env.until(lambda: env.goals and env.goals[-1].place == "right")
+            assert env.goals[-1].idle
+            await env.until(lambda: env.goals[-1].place == "left", 90.0)
+            assert time.time() >= begin.timestamp()
+            given = env.goals[-1].goal_id
+            await env.until(lambda: env.paths and env.paths[-1].goal_id == given)
+        env.stop(kill=True)
+        env.goals.clear()
+        env.start()
+        await env.until(lambda: env.goals and env.goals[-1].goal_id == given)  # it leads, and goes on with it
+        async with env.ready() as client:
+            assert (await client.delete("/api/v1/robots/r1/goal", headers=OPERATOR)).status_code == 204
+            await env.until(lambda: env.goals[-1].pose is None)
+            last = (await client.get("/api/v1/schedules/round", headers=OPERATOR)).json()["last"]
+            assert (last["outcome"], last["begin"]) == ("given", begin.timestamp())
+            assert given.startswith(last["mission"])
+            await env.until(lambda: env.goals[-1].pose is not None)
+            assert (env.goals[-1].place, env.goals[-1].idle) == ("right", True), "not that mission again, but home"
+        telling.cancel()
+        await asyncio.gather(telling, return_exceptions=True)
 
 
 async def test_invalid_goals_are_refused_with_a_reason_and_all_goals_without_the_store(

@@ -12,6 +12,7 @@ from fog_runtime.configuration.settings import SettingsError
 from robot_agent.agent import berths
 from robot_agent.agent.berths import read_berths
 from robot_agent.agent.core import RESUMES_S
+from robot_agent.agent.hand_driving import ResetFault
 from robot_agent.agent.settings import Settings, read_site
 from robot_agent.config import AgentConfig
 
@@ -165,6 +166,19 @@ def test_whoever_tells_the_robot_anything_meanwhile_ends_that(command: str) -> N
     world = LittleWorld(config=replace(ON_FLOORS, resumes=True))
     world.agent.load(world.master.snapshot(), world.now)
     world.command(command)
+    world.run(3.0)
+    assert world.state().codes == ["not_enabled"]
+    assert not world.state().enabled
+
+
+def test_fault_that_is_reset_at_the_robot_meanwhile_ends_that_too() -> None:
+    world = LittleWorld(config=replace(ON_FLOORS, resumes=True))
+    world.bumper, world.fault = True, "the bumper is pressed (left)"
+    assert world.run(0.5, lambda w: w.state().mode == "FAULT")
+    world.bumper, world.fault = False, None
+    world.run(0.1)
+    assert world.agent.on_hand(ResetFault(), world.now).accepted
+    world.agent.load(world.master.snapshot(), world.now)
     world.run(3.0)
     assert world.state().codes == ["not_enabled"]
     assert not world.state().enabled

@@ -329,7 +329,7 @@ class AgentCore:
             case HandBack():
                 self._maneuvers.hand.end("the link to who drove it broke" if request.lost else "it was handed back")
                 return HandReply(accepted=True, reason="the robot stands, and waits to be enabled")
-        self._looked_at = self._ticked_at = -math.inf
+        self._looked_at = self._ticked_at = self._resumes_until = -math.inf  # as for a command
         goes_on = wanted == "teleop" and self.by_hand
         refusal = None if goes_on else self.request(wanted, now).refusal
         if refusal is not None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import os
 import re
+import select
 import socket
 import subprocess
 import sys
@@ -94,6 +95,11 @@ class Base:
     def send(self, data: bytes) -> None:
         with self.lock:
             self._port.write(data)
+
+    def has_obeyed(self) -> bool:
+        """Whether it has taken in all that was written to its port."""
+        with self.lock:
+            return not select.select((self._port.fileno(),), (), (), 0.0)[0]
 
     @property
     def moving(self) -> bool:

@@ -105,8 +105,12 @@ class StopCommand(NamedTuple):
     baud: of the base's serial line (8N1).
     stop: stops the wheels in any state of the base, also after a command that was truncated anywhere.
     hold: repeated while no guardian runs; changes nothing on a base at rest.
+    charge: lets a base on its charger charge again, if `stop` ends that; empty: it does not.
+    charging: whether bytes from the line say that the base is on its charger.
     """
 
     baud: int
     stop: bytes
     hold: bytes
+    charge: bytes = b""
+    charging: Callable[[bytes], bool] = _never

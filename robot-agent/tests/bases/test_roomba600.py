@@ -11,6 +11,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from robot_agent.bases.roomba600 import open_interface as oi
+from robot_agent.bases.roomba600.signature import STOP
 
 
 def frame_bytes(pairs: list[tuple[int, bytes]]) -> bytes:
@@ -21,6 +22,11 @@ def frame_bytes(pairs: list[tuple[int, bytes]]) -> bytes:
 
 def guardian_frame(rng: random.Random) -> bytes:
     return frame_bytes([(packet_id, rng.randbytes(oi.data_size(packet_id))) for packet_id in oi.GUARDIAN_STREAM])
+
+
+def frame_of(stream: tuple[int, ...], contacts: int) -> bytes:
+    sizes = {packet_id: bytes(oi.data_size(packet_id)) for packet_id in stream}
+    return frame_bytes([*{**sizes, 34: bytes((contacts,))}.items()])
 
 
 def drain(parser: oi.StreamParser) -> list[dict[int, int]]:
@@ -54,6 +60,16 @@ def test_commands_have_the_bytes_of_the_specification():
     assert oi.stream([29, 13]) == bytes([148, 2, 29, 13])
     assert oi.pause_stream() == bytes([150, 0])
     assert oi.resume_stream() == bytes([150, 1])
+
+
+@pytest.mark.parametrize("stream", [oi.GUARDIAN_STREAM, oi.SLOW_STREAM])
+def test_charger_is_known_by_the_newest_whole_frame_of_the_stream(stream):
+    off, dock, cable = (frame_of(stream, contacts) for contacts in (0, 2, 1))
+    assert STOP.charging(off[9:] + off + dock + off[:-1])
+    assert STOP.charging(cable)
+    assert not STOP.charging(dock + off)
+    assert not STOP.charging(dock[:-1] + bytes((dock[-1] ^ 1,)))
+    assert not STOP.charging(dock[:-1])
 
 
 @pytest.mark.parametrize("speeds", [(501, 0), (0, -501), (-32768, 0), (70000, 0)])

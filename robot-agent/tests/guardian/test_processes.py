@@ -18,7 +18,7 @@ from guardian_rig import STOP_S, wait_for
 
 from fog_runtime.machine import ENDING, TERMINAL_STOPS
 from robot_agent.bases.diffdrive.emulator import DiffDriveEmulator
-from robot_agent.bases.roomba600.emulator import SAFE, RoombaEmulator
+from robot_agent.bases.roomba600.emulator import PASSIVE, SAFE, Quirks, RoombaEmulator
 from robot_agent.lidars.rplidar_a1.emulator import RplidarEmulator
 
 pytestmark = [pytest.mark.live, pytest.mark.reaction, pytest.mark.timeout(120)]
@@ -61,6 +61,26 @@ def test_diffdrive_base_is_guarded_like_the_roomba(tmp_path):
         board.bump_left = True
         assert rig.base.stopped_within(time.monotonic()) < STOP_S
         wait_for(lambda: "bumper" in (rig.agent.feedback.fault or ""), "the fault is reported")
+
+
+@pytest.mark.parametrize(("docked", "mode"), [(True, PASSIVE), (False, SAFE)])
+def test_base_is_left_charging_on_its_dock_and_without_its_buttons_off_it_when_all_has_ended(tmp_path, docked, mode):
+    roomba = RoombaEmulator(quirks=Quirks(stays_safe_on_dock=True))
+    if docked:
+        roomba.set_dock(0.0, 0.0, 0.0)
+    with rigs.Rig(tmp_path, robot=roomba) as rig:
+        wait_for(lambda: rig.agent.feedback and roomba.mode == mode, "the base is ready")
+        rig.watchdog.process.terminate()
+        assert rig.watchdog.process.wait(rigs.DEADLINE_S) == 0
+        wait_for(rig.base.has_obeyed, "it hears the last word")
+        assert roomba.mode == mode
+        stopped = subprocess.run(
+            [sys.executable, "-m", "robot_agent.guardian.stop_base"], env=rig.watchdog.environment, check=False
+        )
+        assert stopped.returncode == 0
+        wait_for(rig.base.has_obeyed, "it hears the last word")
+        assert roomba.mode == mode
+        assert (roomba.battery.current_ma > 0) == docked
 
 
 def test_wheels_stop_when_the_guardian_hangs_and_drive_again(rig):

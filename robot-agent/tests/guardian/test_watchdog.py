@@ -85,6 +85,9 @@ class Line:
             raise PortLost(self.path, "unplugged")
         self.written.append((round(self._clock.now, 6), data))
 
+    def read_available(self) -> bytes:
+        return b""
+
     def __enter__(self):
         return self
 
@@ -497,8 +500,9 @@ def test_signal_ends_the_process_in_order_and_a_second_one_changes_nothing(watch
         raise AssertionError("the handler must not return")
 
     opens(monkeypatch, watch.line)
-    watch.clock.events = ["beat", signalled]
+    watch.clock.events = ["beat", signalled, "quiet"]
     assert watchdog.main() == 0
+    assert watch.clock.waits[-1] == pytest.approx(0.1), "a silent base tells nothing of its charger"
     assert (watch.events[-1]["event"], watch.events[-1]["signal"]) == ("ended", "SIGTERM")
     ignored = {number for number, handler in handlers.items() if handler is signal.SIG_IGN}
     assert {signal.SIGTERM, signal.SIGINT, signal.SIGHUP, signal.SIGQUIT} <= ignored

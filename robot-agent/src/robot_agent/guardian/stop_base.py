@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import sys
 
-from robot_agent.guardian.watchdog import BadSettings, log_event, read_settings, stop_wheels
+from robot_agent.guardian.watchdog import BadSettings, let_charge, log_event, read_settings, stop_wheels
 from robot_agent.serial_port import PortLost, PortNameError, open_port
 
 
@@ -17,6 +17,7 @@ def main() -> int:
         settings = read_settings()
         with open_port(settings.path, settings.base.baud) as port:
             stopped = stop_wheels(port, settings.base.stop)
+            let_charge(port, settings.base)
     except (BadSettings, PortNameError, PortLost) as error:
         log_event("stop_failed", reason=str(error))
         return 1

@@ -43,6 +43,8 @@ REOPEN_S: Final = 0.1
 """A base whose adapter is lost for a moment rolls on until its port is open again: an adapter that the bus has reset is
 back within half a second."""
 TERMINATE_S: Final = 1.0
+CHARGER_S: Final = 0.1
+"""A base that sends frames has told within this time whether it is on its charger."""
 REALTIME_PRIORITY: Final = 15
 """Above the guardian's 10 and the agent's 5: each must be able to act when the next one takes all the time."""
 
@@ -85,6 +87,21 @@ def stop_wheels(port: Port, command: bytes) -> bool:
         log_event("stop_failed", reason=str(error))
         return False
     return True
+
+
+def let_charge(port: Port, base: StopCommand) -> None:
+    """Let a base charge that says that it is on its charger: the last stop command may have ended that."""
+    if not base.charge:
+        return
+    heard, until = b"", time.monotonic() + CHARGER_S
+    try:
+        while not base.charging(heard) and (left := until - time.monotonic()) > 0:
+            select.select((port,), (), (), left)
+            heard += port.read_available()
+        if base.charging(heard):
+            port.write(base.charge)
+    except PortLost as error:
+        log_event("charge_failed", reason=str(error))
 
 
 def hold(port: Port, command: bytes, seconds: float) -> None:
@@ -252,8 +269,12 @@ def _guard(port: Port, settings: Settings) -> int:
     if (refusal := refuse_speed(speed, port.device)) is not None:
         raise BadSettings(refusal)
     log_event("port_open", path=settings.path)
-    while (code := guard_once(port, base, silence_limit(speed))) not in {PORT_LOST, BAD_SETTINGS}:
-        hold(port, base.hold, RESTART_S / speed)
+    try:
+        while (code := guard_once(port, base, silence_limit(speed))) not in {PORT_LOST, BAD_SETTINGS}:
+            hold(port, base.hold, RESTART_S / speed)
+    except _Terminated:
+        let_charge(port, base)
+        raise
     return code
 
 

@@ -135,10 +135,10 @@ GROUPS: Final[Mapping[int, tuple[int, int]]] = {
 LIGHT_BUMPER: Final = (46, 47, 48, 49, 50, 51)
 GUARDIAN_STREAM: Final = (7, 9, 10, 11, 12, 13, 14, *range(21, 27), 34, 35, 41, 42, 43, 44, *LIGHT_BUMPER)
 """Packets that the guardian streams: all safety sensors, the battery, the wheel speeds that the robot was last
-commanded, the encoders and the light bumper. 70 bytes a frame, of 172 possible."""
+commanded, the encoders and the light bumper. 67 bytes a frame, of 172 possible."""
 
 SLOW_STREAM: Final = (7, 9, 10, 11, 12, 14, 34, 35, 43, 44)
-"""What fits into 15 ms at 19200 baud, 28 bytes: the safety sensors and the encoders, without the battery."""
+"""What fits into 15 ms at 19200 baud, 25 bytes: the safety sensors and the encoders, without the battery."""
 BAUD_CODES: Final = {19200: 7, 115200: 11}
 """Rates of the serial line by which the robot is spoken to, and what Baud (129) calls them."""
 

@@ -43,9 +43,29 @@ def _answered(data: bytes) -> bool:
 SIGNATURE: Final = Signature(recognizes=_recognizes, question=bytes((128, 142, 35)), answered=_answered)
 
 
+# Both streams of the guardian, up to packet 34, the charger's contacts.
+_CONTACTS: Final = re.compile(
+    rb"\x13[\x40\x16]\x07.\x09.\x0a.\x0b.\x0c."
+    rb"(?:\x0d.\x0e.\x15.\x16..\x17..\x18.\x19..\x1a..|\x0e.)\x22(.)\x23",
+    re.DOTALL,
+)
+
+
+def _charging(data: bytes) -> bool:
+    """Whether a charger has contact by the newest whole frame of the guardian's stream."""
+    for found in reversed([*_CONTACTS.finditer(data)]):
+        frame = data[found.start() : found.start() + data[found.start() + 1] + 3]
+        if len(frame) == frame[1] + 3 and not sum(frame) & 0xFF:
+            return bool(found[1][0] & 3)
+    return False
+
+
 _ZERO_SPEED: Final = bytes((0, 0, 0, 0, 145, 0, 0, 0, 0))
 _STOP: Final = bytes((128, 131)) + _ZERO_SPEED
 
 # Start, Safe, Drive Direct 0 0. Sent twice: the guardian may have died in the middle of a command, and the base would
 # take its missing bytes from what precedes the second copy: 2 + 2 * 255 at most, if a byte was wrong (docs/safety.md).
-STOP: Final = StopCommand(baud=115200, stop=_STOP + bytes(512) + _STOP, hold=_ZERO_SPEED)
+# It ends in Safe mode, in which some do not charge on their dock: Start leads into Passive mode, at rest.
+STOP: Final = StopCommand(
+    baud=115200, stop=_STOP + bytes(512) + _STOP, hold=_ZERO_SPEED, charge=bytes((128,) * 5), charging=_charging
+)

@@ -153,3 +153,37 @@ async def test_redis_without_durable_writes_is_reported(redis: Server):
         await raw.config_set("appendfsync", "always")
         await raw.config_set("maxmemory-policy", "allkeys-lru")
         assert "noeviction" in await store.durability_warning()
+
+
+async def test_copies_follow_what_is_decided_about_a_loss_at_one_of_them_and_about_no_later_loss(redis, tmp_path):
+    async def went_back(copy: RedisStore, writes: int) -> bool:
+        await leader._redis.write(("HSET", leader._key("writes"), "things", writes))
+        return (await copy.status({})).lost
+
+    folders = [tmp_path / name for name in ("here", "there")]
+    async with (
+        RedisStore(redis.url, "test", service="map", data_dir=folders[0]) as leader,
+        RedisStore(redis.url, "test", service="map", data_dir=folders[1]) as copy,
+        RedisStore(redis.url, "test", service="planner", data_dir=folders[1]) as other,
+    ):
+        for each in (leader, copy, other):
+            await each.check()
+        await leader._redis.write(("FLUSHALL",))
+        assert [(await each.status({})).lost for each in (leader, copy, other)] == 3 * [True]
+        await leader.accept_loss(AUDIT)
+        await leader._swap(THINGS, "a", Thing(label="after the loss"), ABSENT, AUDIT)
+        assert await copy._readable_records("things", Thing) == {"a": Thing(label="after the loss")}
+        assert (await other.status({})).lost, "another service's records are another decision"
+        async with RedisStore(redis.url, "test", service="map", data_dir=folders[1]) as again:
+            assert not (await again.status({})).lost, "nor after its next start"
+
+        await copy._swap(THINGS, "b", Thing(label="x"), ABSENT, AUDIT)
+        await leader._swap(THINGS, "c", Thing(label="x"), ABSENT, AUDIT)
+        assert await went_back(leader, 1)
+        assert (await copy.status({})).lost, "the decision of before was about another generation"
+        await leader.accept_loss(AUDIT)
+        assert not (await copy.status({})).lost
+
+        for name in "defg":
+            await copy._swap(THINGS, name, Thing(label="x"), ABSENT, AUDIT)
+        assert await went_back(copy, 1), "nobody has decided about those"

@@ -253,7 +253,15 @@ class Expectation(NamedTuple):
     """What a store must have: its generation, empty if this service used none before, and at least these writes."""
 
     generation: str
-    writes: Mapping[str, int]
+    writes: dict[str, int]
+
+    def covers(self, other: Expectation, generation: str) -> bool:
+        """Whether who expected this, and was told to use a store of this generation all the same, knew what is missing.
+
+        `other`: what somebody else expected of it. In a store of another generation everything of before is missing.
+        """
+        known = all(count <= self.writes.get(table, 0) for table, count in other.writes.items())
+        return bool(generation) and self.generation == other.generation and (generation != other.generation or known)
 
 
 def marker(folder: Path, service: str, site: str) -> Path:

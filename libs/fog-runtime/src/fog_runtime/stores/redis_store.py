@@ -9,7 +9,6 @@ from __future__ import annotations
 import hashlib
 import math
 import secrets
-import time
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, ClassVar, Final, Literal, NamedTuple, Self, TypeVar, cast
 
@@ -21,6 +20,7 @@ from fog_runtime import logs
 from fog_runtime.credentials import NOBODY
 from fog_runtime.stores.records import AUDIT_ENTRIES, KINDS, SWAP, WRITE, AuditEntry, AuditPage, read_page
 from fog_runtime.stores.redis_connection import (
+    Expectation,
     RedisConnection,
     StoreError,
     StoreIdentity,
@@ -269,11 +269,16 @@ class RedisStore:
         await self._run(WRITE, keys, table, {}, *encoded)
 
     async def _adopt(self, tables: Mapping[str, Mapping[str, Message]], audit: Audit) -> None:
-        """Use the store that Redis has now, and replace these tables in it by the given records, in one step."""
+        """Use the store that Redis has now, and replace these tables in it by the given records, in one step.
+
+        What this process had expected of it is left there, by which the service's other copies know that it is decided.
+        """
+        decided = msgspec.json.encode(self._identity.expectation())
         for name in self._floors:
             await self._load_floor(name)
         commands: list[tuple[str | bytes | int, ...]] = [
             ("SET", self._key("generation"), secrets.token_hex(8), "NX"),
+            ("SET", self._decided_key, decided),
             *(("HSET", self._key("floors"), name, floor) for name, floor in self._floors.items()),
         ]
         for table, records in tables.items():
@@ -284,7 +289,8 @@ class RedisStore:
         entry = {"at": f"{audit.at:.3f}", "who": audit.who, "action": audit.action, "id": self._service}
         fields = [text for pair in {**entry, "before": "", "after": ""}.items() for text in pair]
         trail = (self._key("audit:store"), "MAXLEN", "~", AUDIT_ENTRIES, "*")
-        *_, generation, writes = await self._redis.write(*commands, ("XADD", *trail, *fields), *self._read_identity())
+        identity = (("GET", self._key("generation")), ("HGETALL", self._key("writes")))
+        *_, generation, writes = await self._redis.write(*commands, ("XADD", *trail, *fields), *identity)
         self._identity.adopt(_text(generation), _pairs(writes))
         _log.warning("store_recovered", action=audit.action, who=audit.who, generation=self._identity.generation)
 
@@ -352,15 +358,29 @@ class RedisStore:
 
     # --- Inside -----------------------------------------------------------------------------------------------------
 
+    @property
+    def _decided_key(self) -> str:
+        return self._key(f"{self._service}:decided")
+
     async def _verify(self) -> None:
-        """Compare the store with what was acknowledged; this needs no right to write, except in a new store."""
+        """Compare the store with what was acknowledged; this needs no right to write, except in a new store.
+
+        A loss that an administrator has decided about at another copy of this service is none any more.
+        """
         expected = self._identity.expectation()
-        generation = await self._redis.read("GET", self._key("generation"))
-        if generation is None and not expected.generation:
+        generation, writes = await self._read_identity()
+        if not generation and not expected.generation:
             await self._redis.write(("SET", self._key("generation"), secrets.token_hex(8), "NX"))
-            generation = await self._redis.read("GET", self._key("generation"))
-        writes = await self._redis.read("HGETALL", self._key("writes"))
-        self._identity.verify(expected, _text(generation or b""), _pairs(writes))
+            generation, writes = await self._read_identity()
+        try:
+            self._identity.verify(expected, generation, writes)
+        except StoreLostError:
+            decided = await self._redis.read("GET", self._decided_key)
+            generation, writes = await self._read_identity()  # those of the decision, which may just have come
+            if decided is None or not msgspec.json.decode(decided, type=Expectation).covers(expected, generation):
+                raise
+            self._identity.adopt(generation, writes)
+            _log.warning("store_followed", generation=generation)
 
     async def _decoded(self, table: str, kind: type[M]) -> tuple[dict[str, M], dict[str, str]]:
         """Return the records of a table, and why others are unreadable."""
@@ -397,12 +417,10 @@ class RedisStore:
         self._identity.acknowledge(table, int(writes))
         return _text(outcome), details
 
-    def _read_identity(self) -> list[tuple[str | bytes | int, ...]]:
-        return [("GET", self._key("generation")), ("HGETALL", self._key("writes"))]
-
-
-def _now_ms() -> int:
-    return int(time.time() * 1000)
+    async def _read_identity(self) -> tuple[str, dict[str, int]]:
+        """Return the store's generation, empty if it has none, and the writes of each table."""
+        generation = await self._redis.read("GET", self._key("generation"))
+        return _text(generation or b""), _pairs(await self._redis.read("HGETALL", self._key("writes")))
 
 
 def _text(value: object) -> str:

@@ -1,6 +1,8 @@
 """`fognav bench`: the figures that others rely on are there, and those that can be checked are right."""
 
 import json
+import os
+import socket
 from pathlib import Path
 
 import numpy as np
@@ -12,9 +14,11 @@ from fog_runtime.configuration.site import load_site
 from fog_supervisor.servers import ServerError
 from fog_supervisor.supervisor import NotReadyError
 from fognav.__main__ import app
-from fognav_experiments.bench import common, cores, fleet, fleet_live, pipeline, planner, rest
+from fognav_experiments.bench import air, common, cores, fleet, fleet_live, pipeline, planner, rest
 from fognav_experiments.bench import console as console_events
 from fognav_experiments.bench import floor as floor_bench
+from fognav_experiments.bench.common import make_office
+from fognav_experiments.bench.robot import write_site as write_robot_site
 
 
 def test_office_is_connected_and_the_same_for_the_same_seed() -> None:
@@ -228,3 +232,31 @@ async def test_no_reading_of_a_small_load_is_lost_and_hazards_reach_the_map(tmp_
     assert 0 < figures["confirmed_to_delta_p50_ms"] <= figures["confirmed_to_delta_p99_ms"]
     assert figures["confirmed_to_delta_p50_ms"] < figures["reading_to_delta_p50_ms"]
     assert figures["aggregator_us_per_reading"] > 0
+
+
+def test_frames_and_bytes_of_a_connection_are_what_went_over_it():
+    with socket.create_server(("127.0.0.1", 0)) as server, socket.create_connection(server.getsockname()) as client:
+        served, _ = server.accept()
+        with served:
+            port = server.getsockname()[1]
+            before = air.traffic(os.getpid(), port)
+            for _ in range(3):
+                client.sendall(b"x" * 2000)
+                assert len(served.recv(4000)) == 2000
+            carried = air.traffic(os.getpid(), port) - before
+    assert carried.bytes == 6000
+    assert carried.segments >= 4, "6,000 bytes are no less than four of Wi-Fi's frames"
+    with pytest.raises(RuntimeError, match="no connection"):
+        air.traffic(os.getpid(), 1)
+
+
+def test_frame_of_wifi_takes_as_long_as_its_standard_says():
+    # DIFS 28, half of 15 slots of 9, HT-mixed preamble 36 and signal extension 6, SIFS 10, acknowledgement 34 us; 1,500
+    # bytes of IP in 54 of frames at 65 Mbit/s.
+    one = air.Traffic(segments=1, bytes=1448)
+    assert one.airtime_s(65e6) == pytest.approx(181.5e-6 + 8 * (1500 + 54) / 65e6)
+
+
+def test_site_with_a_node_is_valid(tmp_path):
+    loaded = load_site(write_robot_site(tmp_path, make_office(), node=True))
+    assert [node.id for node in loaded.site.nodes] == ["n1"]

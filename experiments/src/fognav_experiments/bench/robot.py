@@ -115,8 +115,27 @@ class Conditions(NamedTuple):
     changes_per_min: float = 0.0
 
 
-def write_site(folder: Path, floor: StaticMap) -> Path:
-    """Write a site with a robot in the south-west of an office, and a place in its north-east; return its folder."""
+_NODE: Final = """
+[[areas]]
+id = "z1"
+number = 1
+polygon = [[18.8, {low}], [21.2, {low}], [21.2, {high}], [18.8, {high}]]
+[[nodes]]
+id = "n1"
+area = "z1"
+x = 20.0
+y = {wall}
+theta = -1.5707963
+height = 0.30
+sonars = [{{ angle = -0.1, range_limit = 1.9, range_max = 2.7 }}, {{ angle = 0.1, range_limit = 1.9, range_max = 2.7 }}]
+"""
+
+
+def write_site(folder: Path, floor: StaticMap, *, node: bool = False) -> Path:
+    """Write a site with a robot in the south-west of an office, and a place in its north-east; return its folder.
+
+    With `node` one sensor node watches the robot's first corridor.
+    """
     right = floor.geometry.bounds[2]
     far, near = _PLACES
     rows = corridor_rows(floor.geometry.bounds[3])
@@ -125,7 +144,8 @@ def write_site(folder: Path, floor: StaticMap) -> Path:
         f'id = "{_SITE}"\nname = "Benchmark floor"\nmap = "map.yaml"\n'
         f"[places.{far}]\nx = {right - 4.0:.1f}\ny = {rows[-1]:.1f}\n"
         f"[places.{near}]\nx = 4.0\ny = {rows[0]:.1f}\n"
-        f'[[robots]]\nid = "{NAME}"\nstart = {{ x = 4.0, y = {rows[0]:.1f}, theta = 0.0 }}\nradius = 0.17\n',
+        f'[[robots]]\nid = "{NAME}"\nstart = {{ x = 4.0, y = {rows[0]:.1f}, theta = 0.0 }}\nradius = 0.17\n'
+        + (_NODE.format(low=rows[0] - 1.2, high=rows[0] + 1.2, wall=rows[0] + 1.15) if node else ""),
         "utf-8",
     )
     return folder
@@ -139,12 +159,16 @@ class RobotSystem(RunningSystem):
         on_start: Callable[[int], object],
         settings: Mapping[str, str] | None = None,
         conditions: Conditions | None = None,
+        *,
+        node: bool = False,
     ) -> None:
         """`on_start` is called with the id of each process of the robot that is started, but not with its children.
 
-        `settings`: further FOGNAV_* variables of all processes, named without the prefix.
+        `settings`: further FOGNAV_* variables of all processes, named without the prefix. `node`: one sensor
+        node watches a corridor.
         """
         super().__init__()
+        self._node = node
         self.conditions = conditions or Conditions()
         self.changes = 0
         """How often the map was changed."""
@@ -162,8 +186,9 @@ class RobotSystem(RunningSystem):
     async def _start(self) -> None:
         contexts = self._contexts
         folder = Path(contexts.enter_context(TemporaryDirectory(prefix="fognav-bench-")))
-        site = await asyncio.to_thread(write_site, folder, make_office(*self.conditions.floor_m))
-        users = StackUsers(site=_SITE, robots=(NAME,))
+        office = make_office(*self.conditions.floor_m)
+        site = await asyncio.to_thread(write_site, folder, office, node=self._node)
+        users = StackUsers(site=_SITE, robots=(NAME,), nodes=("n1",) if self._node else ())
         config = StackConfig(site_dir=site, robot=NAME, extra=self._settings, users=users)
         self.stack = await contexts.enter_async_context(Stack(config, self._on_event))
         await self.stack.start()

@@ -203,6 +203,25 @@ def robot_command(  # noqa: PLR0913  # each option is an argument
     _show("robot", asked, figures, json=json)
 
 
+@bench_app.command("air", epilog="Example: fognav bench air --seconds 60 --json")
+def air_command(
+    *,
+    seconds: Annotated[float, typer.Option("--seconds", metavar="S", min=1.0, help="Length of each phase.")] = 30.0,
+    json: JsonOption = False,
+) -> None:
+    """Estimate how much of a Wi-Fi channel nodes and robots occupy.
+
+    A node and a robot are measured, as real processes with TLS, and what 7, 50 and 500 nodes and 5 driving robots need
+    follows by the times of frames at 2.4 GHz: in percent of a channel, near its access point or far from it.
+    """
+    from fognav_experiments.bench import air  # noqa: PLC0415  # keeps the other commands fast
+
+    kernels.warm_cache(print_line)
+    with exit_codes():
+        figures = air.measure(seconds, print_line)
+    _show("air", {"seconds": seconds}, figures, json=json)
+
+
 @bench_app.command("rest", epilog="Example: fognav bench rest --clients 32 --seconds 60 --json")
 def rest_command(
     *,

@@ -38,9 +38,13 @@ class Line:
         self.line_until = None
         self.rest = False
         self.feedback, self.attempts = [], []
+        self.waiting, self.late_s = 0.0, 0.0
+        """Bytes that wait for the line, and for how long (s) the last one of them had to wait at worst."""
 
     def handle(self, output):
         self.feedback += output.feedback
+        self.waiting += len(output.data)
+        self.late_s = max(self.late_s, 10.0 * self.waiting / self.baud)
         if output.attempt is not None:
             self.attempts.append(output.attempt)
             self.baud = output.attempt.baud or self.baud
@@ -52,6 +56,7 @@ class Line:
     def run(self, seconds):
         for step in range(round(seconds / STEP)):
             self.now += STEP
+            self.waiting = max(0.0, self.waiting - STEP * self.baud / 10.0)
             if self.line_until is not None and self.now >= self.line_until:
                 self.base.pulse_wake_line(BRC_PULSE_S)
                 self.line_until = None
@@ -318,6 +323,18 @@ def test_pulses_are_no_series_that_changes_the_rate():
     assert len(times) > 5
     assert min(b - a for a, b in itertools.pairwise(times)) > BRC_PULSE_S + 1.0
     assert "pulsed awake without success" in line.core.unanswered
+
+
+@pytest.mark.parametrize("baud", [115200, 19200])
+def test_stops_of_who_taps_a_key_do_not_pile_up_on_the_line(baud):
+    line = Line(RoombaEmulator(quirks=Quirks(baud=baud)), baud=baud)
+    line.run(1.5)
+    for _ in range(40):
+        line.wheels = (0.1, 0.1)
+        line.run(0.15)
+        line.wheels = (0.0, 0.0)
+        line.run(0.1)
+    assert line.late_s < 0.35, "a stop waits for what completes one earlier stop, at most"
 
 
 def test_the_slow_stream_fits_into_its_period():

@@ -175,8 +175,10 @@ class Roomba600Driver:
         self._safe_sent_at = -math.inf
         self._modes = _DRIVING
         self._on_charger = False
-        self._rolls = False
-        """Whether the speeds that were asked for last were not zero."""
+        self._incomplete = False
+        """Whether a command since may have led the robot into the middle of one that nothing has completed yet."""
+        self._complete_at = -math.inf
+        """When what completes it may be sent again: it keeps the line busy."""
         self._received_at = 0.0
         other = 19200 if options.baud == 115200 else 115200
         line = None if options.brc == "none" else WakeLine(options.brc, BRC_PULSE_S)
@@ -276,11 +278,17 @@ class Roomba600Driver:
         """Return Drive Direct; speeds beyond the top speed are scaled, which keeps the curve.
 
         The first zeros after other speeds come twice: between them is what completes any command into whose middle a
-        lost or wrong byte may have led the robot (docs/safety.md).
+        lost or wrong byte may have led the robot (docs/safety.md). It takes 45 ms of the line, 0.27 s of a slow one,
+        and half of its time at most: the stops of a robot that stops and goes must not wait for one another.
         """
-        stops, self._rolls = self._rolls, left_m_s != 0.0 or right_m_s != 0.0
         command = oi.RESYNC + oi.drive_wheels(left_m_s, right_m_s)
-        return command + oi.RESYNC_ANY + command if stops and not self._rolls else command
+        if left_m_s != 0.0 or right_m_s != 0.0:
+            self._incomplete = True
+        elif self._incomplete and self._received_at >= self._complete_at:
+            self._incomplete = False
+            self._complete_at = self._received_at + 2.0 * 10.0 * len(oi.RESYNC_ANY) / self._baud
+            return command + oi.RESYNC_ANY + command
+        return command
 
     def _status(self, frame: oi.Frame) -> BaseStatus:
         """Return the status; that of the last frame as long as no packet has changed that it is made of."""

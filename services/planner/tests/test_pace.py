@@ -55,6 +55,17 @@ def test_arrival_follows_the_robots_own_pace_and_its_interval_how_much_that_vari
     assert steady.arrival("r2", 100.0) == Paces().arrival("r2", 100.0), "another robot has not driven"
 
 
+def test_nine_in_ten_drives_are_in_the_interval_although_short_ones_differ_more_than_long_ones():
+    rng = np.random.default_rng(2)
+    paces, inside, drives = Paces(), 0, 400
+    for number in range(drives):
+        usual, spread = ((15.0, 0.15), (150.0, 0.02))[number % 2]
+        ratio, arrival = float(rng.normal(1.2, spread)), paces.arrival("r1", usual)
+        inside += arrival.earliest_s <= usual * ratio + ARRIVAL_S <= arrival.latest_s
+        drive(paces, ratio, usual, plan=number)
+    assert inside == pytest.approx(0.9 * drives, rel=0.05)
+
+
 def test_time_in_which_a_robot_must_not_drive_or_is_not_heard_is_no_pace():
     paces = Paces()
     for number in range(40):

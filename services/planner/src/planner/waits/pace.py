@@ -119,13 +119,15 @@ class Paces:
     def arrival(self, robot: str, seconds: float) -> Arrival:
         """Return how long a robot takes for a way of so many seconds at the usual speed."""
         stretches = [*_PRIOR, *self._kept.get(robot, [])]
-        weights, ratios = np.array(stretches).T
+        seconds_driven, ratios = np.array(stretches).T
+        counts = np.ones(len(stretches))
         if len(stretches) > 2 * len(_PRIOR):
-            weights[: len(_PRIOR)] *= 0.1
+            counts[: len(_PRIOR)] = 0.1
+        # Long stretches tell most of the pace, and as much as short ones of how much drives differ.
         order = np.argsort(ratios)
-        below = (np.cumsum(weights[order]) - 0.5 * weights[order]) / weights.sum()
+        below = (np.cumsum(counts[order]) - 0.5 * counts[order]) / counts.sum()
         low, high = np.interp(_QUANTILES, below, ratios[order])
-        expected = float(np.average(ratios, weights=weights))
+        expected = float(np.average(ratios, weights=seconds_driven * counts))
         return Arrival(
             earliest_s=round(seconds * float(low) + ARRIVAL_S, 1),
             expected_s=round(seconds * expected + ARRIVAL_S, 1),

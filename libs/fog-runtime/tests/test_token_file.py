@@ -2,14 +2,16 @@
 
 import json
 import os
+import resource
 import subprocess
 import sys
+from contextlib import contextmanager
 
 import pytest
 
 from fog_contracts.commands import KEY_BYTES
 from fog_runtime.http import load_tokens
-from fog_runtime.keys import make_keys
+from fog_runtime.keys import make_keys, read_operator_key, read_session_key
 from fog_runtime.token_file import TokensError, audit_file, create_token, read_tokens, revoke_token
 
 
@@ -139,6 +141,31 @@ def test_existing_secrets_are_kept(tmp_path):
 
 def test_secrets_are_readable_by_their_owner_only(tmp_path):
     assert {file.stat().st_mode & 0o077 for file in make_keys(tmp_path)} == {0}
+
+
+@contextmanager
+def full_disk(room):
+    """Let no file get longer than `room` (bytes)."""
+    before = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (room, before[1]))
+    try:
+        yield
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, before)
+
+
+@pytest.mark.parametrize(("room", "missing"), [(0, ()), (60, ()), (0, ("operator.key", "session.key"))])
+def test_secrets_for_which_a_disk_had_no_room_are_made_when_it_has(tmp_path, room, missing):
+    if missing:
+        make_keys(tmp_path)
+        for name in missing:
+            (tmp_path / name).unlink()
+    with full_disk(room), pytest.raises(OSError, match="too large"):
+        make_keys(tmp_path)
+    make_keys(tmp_path)
+    assert load_tokens(tmp_path / "tokens.toml").caller((tmp_path / "admin.token").read_text().strip()) is not None
+    assert read_operator_key(tmp_path / "operator.key")
+    assert read_session_key(tmp_path / "session.key")
 
 
 def test_token_without_its_tokens_file_is_refused_by_name(tmp_path):

@@ -7,11 +7,11 @@
 
 from __future__ import annotations
 
-import os
 import secrets
 from typing import TYPE_CHECKING, Final
 
 from fog_contracts.commands import KEY_BYTES
+from fog_runtime.files import atomic_write
 from fog_runtime.token_file import TOKEN_BYTES, token_hash
 
 if TYPE_CHECKING:
@@ -25,31 +25,29 @@ OPERATOR_KEY: Final = "operator.key"
 SESSION_KEY: Final = "session.key"
 
 
-def _write_new(file: Path, text: str, mode: int) -> None:
-    descriptor = os.open(file, os.O_WRONLY | os.O_CREAT | os.O_EXCL, mode)
-    with os.fdopen(descriptor, "w", encoding="utf-8") as stream:
-        stream.write(text)
-
-
-def make_keys(directory: Path, *, mode: int = 0o600) -> list[Path]:
-    """Create the missing secrets; return the new files.
+def make_keys(directory: Path) -> list[Path]:
+    """Create the missing secrets, each whole and durably or not at all; return the new files. Raises `OSError`.
 
     A token is useless without its entry in `tokens.toml`, so these two are created together: raises `FileExistsError`
     when only `admin.token` exists. Without it, `tokens.toml` is complete: the token may be kept elsewhere.
     """
-    directory.mkdir(parents=True, exist_ok=True)
     created: list[Path] = []
     token_file, tokens_file = directory / ADMIN_TOKEN, directory / TOKENS
     if token_file.exists() and not tokens_file.exists():
         raise FileExistsError(f"{token_file} exists, but {tokens_file} does not: remove the one or restore the other")
     if not tokens_file.exists():
         token = secrets.token_urlsafe(TOKEN_BYTES)
-        _write_new(token_file, token + "\n", mode)
-        _write_new(tokens_file, f'[[tokens]]\nname = "admin"\nrole = "admin"\nsha256 = "{token_hash(token)}"\n', mode)
+        entry = f'[[tokens]]\nname = "admin"\nrole = "admin"\nsha256 = "{token_hash(token)}"\n'
+        atomic_write(token_file, f"{token}\n".encode())
+        try:
+            atomic_write(tokens_file, entry.encode())
+        except OSError:
+            token_file.unlink()
+            raise
         created += [token_file, tokens_file]
     for key_file in (directory / OPERATOR_KEY, directory / SESSION_KEY):
         if not key_file.exists():
-            _write_new(key_file, secrets.token_hex(KEY_BYTES) + "\n", mode)
+            atomic_write(key_file, f"{secrets.token_hex(KEY_BYTES)}\n".encode())
             created.append(key_file)
     return created
 

@@ -1,8 +1,6 @@
 """One source for the servers' configurations: deployed servers are configured like those of demo and tests."""
 
 import re
-import shlex
-import subprocess
 from pathlib import Path
 
 import pytest
@@ -10,8 +8,17 @@ import yaml
 
 from fog_contracts.channels import CHANNELS
 from fog_runtime import broker, router
+from fog_runtime.security.site_security import SiteSecurity
 from fog_supervisor import configurations
-from fog_supervisor.servers import mosquitto_program, redis_program, router_program, start_mosquitto, start_redis
+from fog_supervisor.net import LOOPBACK
+from fog_supervisor.servers import (
+    mosquitto_program,
+    redis_program,
+    router_program,
+    start_mosquitto,
+    start_redis,
+    start_router,
+)
 
 ROOT = Path(__file__).parents[3]
 INSTANCE_SETTINGS = ("listener ", "persistence_location ", "user ", "bind ", "tls-port ", "dir ")
@@ -78,9 +85,11 @@ def test_every_mqtt_message_fits_into_the_brokers_packet_limit() -> None:
 
 @pytest.mark.live
 def test_servers_start_in_a_folder_with_a_space_in_its_name(tmp_path: Path) -> None:
-    with start_redis(tmp_path / "my data") as redis, start_mosquitto(tmp_path / "my broker"):
-        result = subprocess.run(
-            shlex.split(f"redis-cli -p {redis.port} config get appendfsync"), capture_output=True, text=True, check=True
-        )
-        assert result.stdout.split() == ["appendfsync", "always"]
+    security = SiteSecurity(tmp_path / "my credentials", "lab")
+    security.make(["localhost", LOOPBACK])
+    with (
+        start_redis(tmp_path / "my data", security=security.folder("redis")) as redis,
+        start_mosquitto(tmp_path / "my broker", security=security.folder("mosquitto")),
+        start_router(tmp_path / "my router", security=security.folder("zenoh")),
+    ):
         assert (redis.folder / "appendonlydir").exists()

@@ -60,14 +60,14 @@ maxmemory-policy noeviction
 _REDIS_SECURED: Final = """\
 port 0
 tls-port {port}
-tls-cert-file {security}/server.pem
-tls-key-file {security}/server.key
+tls-cert-file "{security}/server.pem"
+tls-key-file "{security}/server.key"
 tls-auth-clients no
-aclfile {security}/users
+aclfile "{security}/users"
 """
 _REDIS_ADMITTING: Final = """\
 port {port}
-aclfile {security}/users
+aclfile "{security}/users"
 """
 
 

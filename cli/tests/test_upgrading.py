@@ -201,6 +201,27 @@ def test_upgrade_that_was_cut_short_is_told(folder, add_version, tmp_path):
         Upgrade(folder, Versions(tmp_path / "checkout"), lambda _: None)
 
 
+def test_node_has_its_data_again_after_a_power_cut_while_they_were_put_back(folder, monkeypatch):
+    (folder.path / "kept").touch()
+    laid = Aside(folder.path)
+    laid.lay()
+    (folder.path / "kept").unlink()
+    rename = Path.rename
+
+    def cut(path: Path, to: Path) -> Path:
+        if path == laid.copy:
+            raise KeyboardInterrupt
+        return rename(path, to)
+
+    with monkeypatch.context() as patch, pytest.raises(KeyboardInterrupt):
+        patch.setattr(Path, "rename", cut)
+        laid.put_back()
+    with pytest.raises(FailedError, match="is being upgraded"):
+        NodeFolder(folder.path)
+    laid.remove()  # with its process the lock has gone
+    assert (NodeFolder(folder.path).path / "kept").exists()
+
+
 def test_newest_version_is_the_highest_release(add_version, tmp_path):
     root = tmp_path / "checkout"
     for name in ("v0.9.0", "v0.10.0", "v0.2.0"):

@@ -48,6 +48,18 @@ def _locked(folder: Path) -> bool:
     return False
 
 
+def finish_putting_back(data: Path) -> None:
+    """Put the copy in the place of data that is missing: a power cut may have come between the two steps of that.
+
+    Raises `OSError`, and `FailedError` while the upgrade still runs.
+    """
+    data = data.resolve()
+    copy = data.with_name(data.name + _COPY)
+    if not data.exists() and copy.exists():
+        require_no_upgrade(data)
+        copy.rename(data)
+
+
 class Aside:
     """The copy of one data folder."""
 

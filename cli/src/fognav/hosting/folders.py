@@ -22,7 +22,7 @@ from fog_runtime.files import PRIVATE, atomic_write
 from fog_runtime.keys import make_keys
 from fog_runtime.security.site_security import CREDENTIALS, SiteSecurity
 from fog_runtime.security.users import on_floor
-from fognav.aside import TRIAL, require_no_upgrade
+from fognav.aside import TRIAL, finish_putting_back, require_no_upgrade
 from fognav.credentials import security_errors
 from fognav.operate.systems import MQTTS_PORT, SERVICE_PORTS, ZENOH_PORT, port
 from fognav.output import FailedError, WrongUseError
@@ -50,6 +50,7 @@ class NodeFolder(SystemFolder):
         """Make the folder where it is missing; raises `FailedError` if it can't be used, or is of a newer version."""
         path = path.absolute()
         try:
+            finish_putting_back(path)
             path.mkdir(mode=0o700, parents=True, exist_ok=True)
             _check_format(path)
             super().__init__(path)

@@ -14,17 +14,19 @@ from fog_runtime.security.site_security import SiteSecurity
 from fog_runtime.token_file import create_token
 from fognav import doctor
 from fognav.__main__ import app
+from fognav.commands import status
 from fognav.credentials import VARIABLE
+from fognav.operate.systems import System
 
 ROOT = Path(__file__).parents[2]
 
 
 @pytest.fixture
 def security(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> SiteSecurity:
-    monkeypatch.setenv(VARIABLE, str(tmp_path / "locks"))
+    monkeypatch.setenv(VARIABLE, str(tmp_path / "data" / "locks"))
     done = run("ca", "create", "--site", "estig", "--host", "fog.local", "--host", "127.0.0.1", "--json")
     assert set(done["credentials"]) >= {"map-service", "planner", "hazard-aggregator", "console", "r1", "n1"}
-    return SiteSecurity.open(tmp_path / "locks")
+    return SiteSecurity.open(tmp_path / "data" / "locks")
 
 
 def invoke(*words: str):
@@ -60,13 +62,34 @@ def test_certificates_that_expire_soon_are_named_by_show_and_doctor(security: Si
     assert json.loads(shown.stdout)["expiring"] == ["redis"]
     check = doctor.check_certificates()
     assert check is not None
-    assert (check.state, check.remedy) == ("optional", "fognav ca issue")
+    assert (check.state, check.remedy) == ("optional", f"fognav ca issue --credentials {security.directory}")
     run("ca", "issue", "--json")
     assert run("ca", "show", "--json")["expiring"] == []
 
 
+def test_certificates_of_a_node_that_runs_here_are_shown_by_status_and_doctor(
+    security: SiteSecurity, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.delenv(VARIABLE)
+    data = security.directory.parent
+    node = System(name="fog-estig", kind="fog node", site="estig", urls={}, pids={}, data=str(data))
+    monkeypatch.setattr(status, "find_systems", lambda: [node])
+    ends = min(security.expiries().values())
+    assert run("status", "--json")["systems"][0]["certificates_end"] == ends.isoformat()
+    assert f"valid until {ends:%Y-%m-%d}\n" in invoke("status").output
+    soon = security.authority.issue("redis", ["fog"], now=dt.datetime.now(dt.UTC), days=5)
+    (security.folder("redis") / "server.pem").write_bytes(soon.chain)
+    assert ": see fognav doctor\n" in invoke("status").output
+    monkeypatch.setenv("XDG_DATA_HOME", str(data.parent))
+    data.rename(data.with_name("fognav"))
+    check = doctor.check_certificates()
+    assert check is not None
+    assert (check.state, "fognav/locks" in check.remedy) == ("optional", True)
+
+
 def test_doctor_names_credentials_that_can_not_be_read(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.delenv(VARIABLE, raising=False)
+    monkeypatch.setenv("XDG_DATA_HOME", str(tmp_path))
     assert doctor.check_certificates() is None
     monkeypatch.setenv(VARIABLE, str(tmp_path / "nowhere"))
     check = doctor.check_certificates()

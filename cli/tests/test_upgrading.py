@@ -213,9 +213,10 @@ def test_node_has_its_data_again_after_a_power_cut_while_they_were_put_back(fold
             raise KeyboardInterrupt
         return rename(path, to)
 
-    with monkeypatch.context() as patch, pytest.raises(KeyboardInterrupt):
+    with monkeypatch.context() as patch:
         patch.setattr(Path, "rename", cut)
-        laid.put_back()
+        with pytest.raises(KeyboardInterrupt):
+            laid.put_back()
     with pytest.raises(FailedError, match="is being upgraded"):
         NodeFolder(folder.path)
     laid.remove()  # with its process the lock has gone

@@ -4,6 +4,7 @@ import datetime as dt
 import os
 import platform
 import re
+import shlex
 import socket
 import subprocess
 import sys
@@ -19,6 +20,7 @@ from rich.table import Table
 from fognav import checkout, kernels, system
 from fognav.credentials import VARIABLE as CREDENTIALS_DIR_VARIABLE
 from fognav.credentials import credentials_folder, open_security, security_errors
+from fognav.hosting.folders import SECURITY, SECURITY_FILE, default_data
 from fognav.operate.options import JsonOption
 from fognav.output import NOT_TRUE, OK, FailedError, WrongUseError, answers, print_json
 
@@ -108,8 +110,12 @@ def check_kernels() -> Check:
 
 
 def check_certificates() -> Check | None:
-    """Check until when the certificates are valid that FOGNAV_CREDENTIALS_DIR names; None without any."""
-    folder = credentials_folder(None)
+    """Check until when certificates are valid: those that FOGNAV_CREDENTIALS_DIR names, else of this user's fog node.
+
+    None without any.
+    """
+    own = default_data() / SECURITY
+    folder = credentials_folder(None) or (own if (own / SECURITY_FILE).exists() else None)
     if folder is None:
         return None
     try:
@@ -121,7 +127,7 @@ def check_certificates() -> Check | None:
     found = f"the first expires on {first:%Y-%m-%d} ({folder})"
     if not expiring:
         return Check("certificates", "ok", found)
-    remedy = "fognav ca rotate" if "authority" in expiring else "fognav ca issue"
+    remedy = f"fognav ca {'rotate' if 'authority' in expiring else 'issue'} --credentials {shlex.quote(str(folder))}"
     return Check("certificates", "missing" if first < dt.datetime.now(dt.UTC) else "optional", found, remedy)
 
 

@@ -1,5 +1,6 @@
 """Locked doors: real servers with certificates and users, clients with credentials, and everybody else."""
 
+import asyncio
 import base64
 import datetime as dt
 import hashlib
@@ -8,9 +9,12 @@ import ssl
 import aiomqtt
 import pytest
 from cryptography import x509
+from prometheus_client import REGISTRY
 from redis.asyncio import Redis
 
+from fog_runtime.certificates import watch_certificates
 from fog_runtime.clock import SystemClock
+from fog_runtime.configuration.settings import CommonSettings
 from fog_runtime.credentials import NOBODY, Credentials, CredentialsError, to_toml
 from fog_runtime.lease_store import LeaseStore
 from fog_runtime.router import RouterSecurity, RouterSecurityError
@@ -271,6 +275,54 @@ def test_certificates_that_expire_soon_are_renewed_and_others_stay(tmp_path):
     assert security.renew(HOSTS, only_due=True) == ["mosquitto"]
     assert chain.read_bytes() == kept
     assert security.expiries()["mosquitto"] > NOW + dt.timedelta(days=700)
+
+
+def test_certificates_that_end_with_their_authority_are_not_issued_again_at_each_look(tmp_path):
+    Authority.create(tmp_path / "authority.pem", "lab", now=NOW - dt.timedelta(days=3600))
+    security = SiteSecurity(tmp_path, "lab")
+    assert security.renew(HOSTS, only_due=True) == ["mosquitto", "redis", "zenoh", "http"]
+    assert security.renew(only_due=True) == []
+    assert set(security.expiring()) == {"authority", "mosquitto", "redis", "zenoh", "http"}
+
+
+async def test_until_when_certificates_are_valid_is_exported_of_each_server_even_when_it_has_ended(
+    security, broker, redis, router, tmp_path
+):
+    ended = security.authority.issue("gateway", HOSTS, now=NOW, days=-1)
+    (tmp_path / "server.pem").write_bytes(ended.chain)
+    (tmp_path / "server.key").write_bytes(ended.key)
+    tls = ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER)
+    tls.load_cert_chain(tmp_path / "server.pem", tmp_path / "server.key")
+    gateway = await asyncio.start_server(lambda _reader, writer: writer.close(), "127.0.0.1", 0, ssl=tls)
+    old = f"127.0.0.1:{gateway.sockets[0].getsockname()[1]}"
+    settings = CommonSettings(
+        site_dir=tmp_path, data_dir=tmp_path, mqtt_url=f"{broker.url},mqtts://{old}", redis_url=redis.url,
+        zenoh_connect=router.endpoint,
+    )  # fmt: skip
+    known = Credentials.read(security.credentials("map-service"))
+    watching = asyncio.create_task(watch_certificates(settings, known))
+    places = {f"127.0.0.1:{server.port}" for server in (broker, redis, router)} | {old, "authority"}
+
+    def ends():
+        return {
+            each: REGISTRY.get_sample_value("fognav_certificate_end_seconds", {"certificate": each}) for each in places
+        }
+
+    try:
+        async with asyncio.timeout(60.0):
+            while None in ends().values():  # noqa: ASYNC110  # a metric tells nobody unasked
+                await asyncio.sleep(0.01)
+    finally:
+        watching.cancel()
+        gateway.close()
+    files = security.expiries()
+    assert ends() == {
+        f"127.0.0.1:{broker.port}": files["mosquitto"].timestamp(),
+        f"127.0.0.1:{redis.port}": files["redis"].timestamp(),
+        f"127.0.0.1:{router.port}": files["zenoh"].timestamp(),
+        old: pytest.approx((NOW - dt.timedelta(days=1)).timestamp(), abs=1.0),
+        "authority": files["authority"].timestamp(),
+    }
 
 
 def test_making_locks_again_changes_no_password_even_of_a_robot_whose_file_was_handed_out(tmp_path):

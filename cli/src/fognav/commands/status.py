@@ -1,7 +1,9 @@
 """`fognav status`: the systems that run on this machine, or one fog node elsewhere."""
 
 import asyncio
+import datetime as dt
 import os
+from pathlib import Path
 from typing import Final
 
 import msgspec
@@ -9,7 +11,8 @@ import msgspec
 from fog_runtime.clock import SystemClock
 from fog_runtime.credentials import Credentials
 from fog_runtime.transports.zenoh_edge import ZenohEdge
-from fognav.credentials import own_credentials
+from fognav.credentials import open_security, own_credentials, security_errors
+from fognav.hosting.folders import SECURITY
 from fognav.operate.fog import FOG, Fog, find_fog
 from fognav.operate.options import FogOption, JsonOption
 from fognav.operate.systems import SERVICE_PORTS, System, find_systems
@@ -25,13 +28,22 @@ def status_command(*, fog: FogOption = None, json: JsonOption = False) -> None:
     """
     with exit_codes():
         systems = [_remote(find_fog(fog))] if fog or os.environ.get(FOG) else find_systems()
-        present = [connected(system, own_credentials(system.credentials_file)) for system in systems]
+        shown = [
+            (system, connected(system, own_credentials(system.credentials_file)), certificates_end(system))
+            for system in systems
+        ]
     if json:
-        shown = zip(systems, present, strict=True)
-        print_json({"systems": [{**msgspec.to_builtins(system), "connected": names} for system, names in shown]})
+        print_json(
+            {
+                "systems": [
+                    {**msgspec.to_builtins(system), "connected": names, "certificates_end": ends and ends.isoformat()}
+                    for system, names, ends in shown
+                ]
+            }
+        )
     else:
-        for system, names in zip(systems, present, strict=True):
-            _show(system, names)
+        for system, names, ends in shown:
+            _show(system, names, ends)
     if not systems:
         fail("nothing runs on this machine. Start a demo: fognav demo --keep-running")
 
@@ -51,7 +63,18 @@ def _remote(fog: Fog) -> System:
     return msgspec.structs.replace(fog.system, site=fog.site, urls=urls)
 
 
-def _show(system: System, present: list[str] | None) -> None:
+def certificates_end(system: System) -> dt.datetime | None:
+    """Return when the first certificate of a fog node's servers, or their authority, ends; None for other systems.
+
+    Raises `FailedError` for credentials that can't be read.
+    """
+    if system.data is None:
+        return None
+    with security_errors():
+        return min(open_security(Path(system.data) / SECURITY).expiries().values())
+
+
+def _show(system: System, present: list[str] | None, ends: dt.datetime | None) -> None:
     print_answer(f"{system.name}: {system.kind}" + (f", site {system.site}" if system.site else ""))
     for name, url in system.urls.items():
         print_answer(f"  {name:18} {url}")
@@ -59,12 +82,17 @@ def _show(system: System, present: list[str] | None) -> None:
         print_answer(f"  {'token':18} {system.token_file}")
     if present is not None:
         print_answer(f"  {'connected':18} {', '.join(present) or 'nothing'}")
+    if ends is not None:
+        soon = ends - dt.datetime.now(dt.UTC) < _SOON
+        print_answer(f"  {'certificates':18} valid until {ends:%Y-%m-%d}" + (": see fognav doctor" if soon else ""))
     print_answer(
         f"  {'processes':18} {', '.join(f'{name} {pid}' for name, pid in system.pids.items()) or 'not visible'}"
     )
 
 
 _CONSOLE: Final = "status"
+_SOON: Final = dt.timedelta(days=60)
+"""As the alert CertificateEnds."""
 
 
 def connected(system: System, credentials: Credentials) -> list[str] | None:

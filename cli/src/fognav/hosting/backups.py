@@ -30,7 +30,7 @@ from fog_supervisor import net, servers
 from fog_supervisor.supervisor import Event, Supervisor
 from fognav import checkout
 from fognav.credentials import own_credentials, security_errors
-from fognav.hosting.folders import REDIS_PORT, SECURITY_FILE, NodeFolder, recall, require_node
+from fognav.hosting.folders import REDIS_PORT, SECURITY, SECURITY_FILE, NodeFolder, recall, require_node
 from fognav.output import FailedError, WrongUseError, print_line
 from fognav.programs import MAP_SERVICE, REDIS, SERVICES, ProgramSet
 
@@ -123,7 +123,6 @@ def _statistics(stream: IO[bytes], size: int) -> Statistics | None:
     return summary.statistics if summary is not None else None
 
 
-SECURITY: Final = "locks"
 _READY_S: Final = 60.0
 
 

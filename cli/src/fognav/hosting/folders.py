@@ -32,6 +32,8 @@ FORMAT: Final = 1
 """Incremented when an older `fognav up` could not use what a newer one has written."""
 _FORMAT_FILE: Final = "format"
 _LOCK: Final = "in-use"
+SECURITY: Final = "locks"
+"""The folder of the credentials, in that of the data."""
 SECURITY_FILE: Final = "locks.json"
 """What the folder of credentials has once they were made."""
 
@@ -62,7 +64,7 @@ class NodeFolder(SystemFolder):
     @property
     def security(self) -> Path:
         """The folder of the site's credentials."""
-        return self.path / "locks"
+        return self.path / SECURITY
 
     def keys(self, site: str) -> Path:
         """Return the folder of a site's tokens and key, and make those that are missing."""

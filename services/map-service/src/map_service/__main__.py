@@ -10,6 +10,7 @@ from msgspec.structs import replace
 from fog_contracts import channels as ch
 from fog_runtime import logs, metrics, process
 from fog_runtime.backup import STAMP
+from fog_runtime.certificates import watch_certificates
 from fog_runtime.clock import SystemClock, WallClock, WallClockSource, boot_id
 from fog_runtime.configuration.settings import InflationSettings, describe, load
 from fog_runtime.configuration.uploaded_maps import UploadedMaps
@@ -99,6 +100,7 @@ async def main() -> None:
                 tasks.create_task(service.zone_sources.run(), name="zone-sources")
                 tasks.create_task(service.publisher.commit_loop(), name="commit")
                 tasks.create_task(maps.until_changed(), name="another-map")
+                tasks.create_task(watch_certificates(settings, own), name="certificates")
                 tasks.create_task(http_process.serve(app, settings.port_file), name="http")
 
 

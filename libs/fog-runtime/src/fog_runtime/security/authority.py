@@ -99,6 +99,10 @@ class Authority:
         """When the first of the trusted authorities expires."""
         return min(each.not_valid_after_utc for each in self._roots)
 
+    def lasts_until(self, now: dt.datetime) -> dt.datetime:
+        """Return until when a certificate would be valid that is issued now."""
+        return min(now + dt.timedelta(days=SERVER_DAYS), self._current.not_valid_after_utc)
+
     def issue(self, name: str, hosts: Sequence[str], *, now: dt.datetime, days: int = SERVER_DAYS) -> Issued:
         """Certify a new key of the server `name`, for the names and addresses by which clients reach it.
 

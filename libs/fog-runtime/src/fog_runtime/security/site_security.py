@@ -40,6 +40,7 @@ PROGRAMS: Final = ("mosquitto", "redis", "zenoh", "http")
 """The folders of what has a certificate."""
 CERTIFICATE, KEY, ACCESS = "server.pem", "server.key", "access"
 _RENEW_BEFORE: Final = dt.timedelta(days=SERVER_DAYS // 3)
+_DAY: Final = dt.timedelta(days=1)
 _PROGRAM_OF: Final[Mapping[Server, str]] = {"mqtt": "mosquitto", "zenoh": "zenoh", "redis": "redis"}
 
 
@@ -218,13 +219,18 @@ class SiteSecurity:
 
         `hosts`: those of before, if none are given. Raises `AuthorityError`.
         """
-        authority, renewed = self.authority, []
+        authority, renewed, now = self.authority, [], _now()
         hosts = list(dict.fromkeys([*(self._plan.hosts if hosts is None else hosts), BROKER_NAME]))
         for program in PROGRAMS:
             file = self.folder(program) / CERTIFICATE
-            if only_due and file.exists() and expiry(file) - _now() > _RENEW_BEFORE:
+            # Near the authority's own end a new one would be valid no longer, and each look would issue another.
+            if (
+                only_due
+                and file.exists()
+                and expiry(file) > min(now + _RENEW_BEFORE, authority.lasts_until(now) - _DAY)
+            ):
                 continue
-            issued = authority.issue(program, hosts, now=_now())
+            issued = authority.issue(program, hosts, now=now)
             self._files.write(program, KEY, issued.key.decode())
             self._files.write(program, CERTIFICATE, issued.chain.decode())
             renewed.append(program)

@@ -95,6 +95,23 @@ def test_robot_wants_its_goal_until_it_has_reached_it_and_asks_the_gate_at_rest(
     assert (wish.ordered, wish.given_up) == (False, "")
 
 
+def end(found: Mission) -> None:
+    """End its goal as the planner does: when it hears that the robot has reached it, or when somebody cancels it."""
+    found.on_goal(RobotGoal(goal_id="g", pose=None), 60.0)
+
+
+def test_robot_that_has_arrived_goes_on_to_its_dock_when_the_planner_ends_the_goal_before_it_is_at_rest():
+    wish, arrived = docking(), mission()
+    wish.order(ENABLED, Mission(), docked=False, now=5.0)
+    assert not wish.is_due(ENABLED, arrived, 40.0, at_rest=False)
+    arrived.reach()
+    assert not wish.is_due(ENABLED, arrived, 41.0, at_rest=False)
+    end(arrived)
+    assert not wish.wants_goal(arrived)
+    assert not wish.is_due(ENABLED, arrived, 41.05, at_rest=False)
+    assert wish.is_due(ENABLED, arrived, 41.1, at_rest=True)
+
+
 # --- what ends it ---
 
 
@@ -119,6 +136,16 @@ def test_cancelled_or_other_goal_or_none_ends_it_with_the_reason():
         assert not wish.is_due(ENABLED, found, now, at_rest=True)
         assert not wish.ordered
         assert words in wish.given_up
+
+
+def test_goal_that_was_given_and_is_cancelled_at_the_planner_is_not_asked_for_again():
+    wish, cancelled = docking(), mission()
+    wish.order(ENABLED, Mission(), docked=False, now=5.0)
+    assert not wish.is_due(ENABLED, cancelled, 6.0, at_rest=True)
+    end(cancelled)
+    assert not wish.is_due(ENABLED, cancelled, 6.1, at_rest=True)
+    assert not wish.wants_goal(cancelled)
+    assert wish.given_up == "its goal was cancelled"
 
 
 def test_goal_that_it_had_before_ends_it_only_when_the_planner_does_not_replace_it():

@@ -62,6 +62,8 @@ class Docking:
         self._dock, self._staging = _pose2(config.dock), _pose2(config.staging)
         self._ordered_at: float | None = None
         self._goal_before: str | None = None
+        self._given = self._arrived = False
+        """Whether the planner has given the goal in front of the dock, and the robot has reached it."""
         self._tried = False
         self._observed = False
         self.given_up = ""
@@ -84,6 +86,7 @@ class Docking:
         if not state.enabled or state.mode == "FAULT":
             return Reason(ReasonCode.NOT_ENABLED, "the robot drives to its dock: enable it first")
         self._ordered_at, self._goal_before, self.given_up = now, mission.goal_id, ""
+        self._given = self._arrived = False
         if self._is_ours(mission):
             mission.resume()  # the planner does not send the robot where it sends it already
         return None
@@ -104,24 +107,26 @@ class Docking:
 
     def wants_goal(self, mission: Mission) -> bool:
         """Return whether the planner shall lead the robot to the front of its dock."""
-        return self._ordered_at is not None and not (mission.reached and self._is_ours(mission))
+        return self._ordered_at is not None and not (self._arrived or (mission.reached and self._is_ours(mission)))
 
     def is_due(self, state: SafetyState, mission: Mission, now: float, *, at_rest: bool) -> bool:
-        """Return whether the robot has arrived in front of its dock; end the wish if it can't any more."""
+        """Return whether the robot has arrived in front of its dock, and stands; end the wish if it can't any more."""
         if self._ordered_at is None:
             return False
         if not state.enabled or state.latched or state.mode == "FAULT":
             self.give_up()
         elif self._is_ours(mission):
-            if mission.reached:
-                return at_rest
-            if not mission.active:
+            self._given, self._arrived = True, mission.reached
+            if not mission.reached and not mission.active:
                 self.give_up("its goal was cancelled")
         elif mission.active and mission.goal_id != self._goal_before:
             self.give_up("the robot has got another goal")
-        elif now - self._ordered_at > GOAL_WITHIN_S:
+        elif self._given and not self._arrived:
+            self.give_up("its goal was cancelled")
+        elif not self._arrived and now - self._ordered_at > GOAL_WITHIN_S:
             self.give_up("the planner gives it no goal in front of its dock")
-        return False
+        # The planner ends the goal as soon as it hears that it is reached: the robot need not stand by then.
+        return self.ordered and self._arrived and at_rest
 
     def on_begun(self, refusal: str | None) -> None:
         """Record whether the safety gate lets the base look for its dock."""

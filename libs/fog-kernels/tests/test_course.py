@@ -9,8 +9,20 @@ import pytest
 from hypothesis import assume, given
 from hypothesis import strategies as st
 
+from fog_contracts.geometry import lengths_along, sampled
+from fog_contracts.grid import GridGeometry
 from fog_kernels.clearance import Clearance
-from fog_kernels.course import Cells, beside, distances, is_blocked
+from fog_kernels.course import (
+    Cells,
+    beside,
+    distances,
+    is_blocked,
+    last_beside,
+    sampled_along,
+    seconds_along,
+    values_at,
+)
+from fog_kernels.lines import nearest_between
 
 FINE, LEFT, BOTTOM, SIZE = 0.05, -0.3, 0.4, 12
 COORDINATE = st.floats(-1.0, 2.0).map(lambda value: round(value, 2))
@@ -91,3 +103,58 @@ def test_path_without_points_or_with_unknown_ones_is_refused():
         distances(window(0), np.array([(math.nan, 0.0)]))
     with pytest.raises(ValueError, match="finite"):
         beside(np.array([(0.0, math.nan), (1.0, 1.0)]), 0.05, window(0))
+
+
+GRID = GridGeometry(30, 20, 0.1, -1.0, -0.5)
+PLACE = GRID.origin_x, GRID.origin_y, GRID.resolution
+
+
+@given(PATHS, st.sampled_from((0.05, 0.1, 0.7)))
+def test_samples_of_a_line_are_those_of_everybody_else_bit_for_bit(path, spacing):
+    points, along = sampled_along(path, spacing)
+    assert np.array_equal(points, sampled(path, spacing))
+    assert np.array_equal(along, lengths_along(points))
+
+
+@given(PATHS, SEEDS)
+def test_values_at_points_are_those_of_their_cells(path, seed):
+    cells = np.random.default_rng(seed).integers(0, 256, GRID.shape, np.uint8)
+    assert np.array_equal(values_at(path, cells, PLACE, 255), GRID.sample(cells, path, 255))
+
+
+@given(PATHS, SEEDS)
+def test_time_along_a_line_follows_the_limits_between_its_points(path, seed):
+    limits = np.random.default_rng(seed).choice(np.array((0, 10, 25, 90), np.uint8), GRID.shape)
+    points, along = sampled_along(path, 0.1)
+    between = GRID.sample(limits, (points[:-1] + points[1:]) / 2.0, 0) / 100.0
+    speeds = np.where(between > 0.0, np.minimum(between, 0.3), 0.3)
+    expected = np.append(0.0, np.cumsum(np.diff(along) / speeds))
+    assert np.array_equal(seconds_along(points, along, limits, PLACE, 0.3), expected)
+
+
+@given(PATHS, PATHS, st.sampled_from((0.2, 0.5, 1.5)))
+def test_a_line_is_beside_another_one_up_to_its_first_point_that_is_far_off(path, other, reach):
+    points, lengths = sampled(path, 0.1), lengths_along(other)
+    ahead = last = 0
+    for number, (x, y) in enumerate(points):
+        where, apart = nearest_between(other, lengths, ahead - 0.5, ahead + 2.0, x, y)
+        if math.isinf(apart):
+            where, apart = nearest_between(other, lengths, -math.inf, math.inf, x, y)
+        apart = math.dist(other[0], (x, y)) if math.isinf(apart) else apart
+        assume(abs(apart - reach) > 1e-9)
+        if apart > reach:
+            break
+        ahead, last = max(ahead, where), number
+    assert last_beside(points, other, lengths, reach, (0.5, 2.0)) == last
+
+
+def test_lines_of_another_shape_are_refused():
+    points, along = sampled_along(np.zeros((2, 2)), 0.1)
+    with pytest.raises(ValueError, match=r"corners must have shape \(n, 2\)"):
+        sampled_along(np.zeros((0, 2)), 0.1)
+    with pytest.raises(ValueError, match="spacing must be above zero"):
+        sampled_along(points, 0.0)
+    with pytest.raises(ValueError, match="one number for each of the 2 points"):
+        seconds_along(points, along[:1].copy(), np.zeros(GRID.shape, np.uint8), PLACE, 0.3)
+    with pytest.raises(ValueError, match="one number for each of the 2 points of the line"):
+        last_beside(points, points, along[:1].copy(), 0.5, (0.5, 2.0))

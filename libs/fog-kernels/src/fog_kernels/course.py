@@ -1,4 +1,4 @@
-"""The path ahead, point by point: how much room is beside it, and whether anything that the robot knows blocks it.
+"""The path ahead, point by point: what lies on it, how much room is beside it, whether anything known blocks it.
 
 Each is one call for a path: while nothing is in the way, which is nearly always, no cost of a cell beside it is needed.
 """
@@ -17,6 +17,7 @@ from numba import boolean, float64, int64, njit, types, void
 
 from fog_contracts.costs import INSCRIBED, UNKNOWN
 from fog_kernels import _arrays
+from fog_kernels.lines import nearest_place
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -193,6 +194,169 @@ def _is_blocked(
                 if dx * dx + dy * dy <= square and marks[row + reach + dy, column + reach + dx]:
                     return True
     return False
+
+
+# These keep the GIL: they take some microseconds, and another thread may keep it for longer before it gives it back.
+# They return no arrays, since numba takes longer to hand one over than numpy to make it.
+@njit(int64(_arrays.F64_GRID, float64, _arrays.I64_OUT), cache=True, error_model="numpy")
+def _count_samples(corners: Any, spacing: float, counts: Any) -> int:
+    """Write into how many parts each line is divided; return how many points there are."""
+    total = 1
+    for i in range(counts.size):
+        length = math.hypot(corners[i + 1, 0] - corners[i, 0], corners[i + 1, 1] - corners[i, 1])
+        counts[i] = max(math.ceil(length / spacing), 1)
+        total += counts[i]
+    return int(total)
+
+
+@njit(
+    void(_arrays.F64_GRID, types.Array(types.int64, 1, "C", readonly=True), _arrays.F64_GRID_OUT, _arrays.F64_OUT),
+    cache=True, error_model="numpy",
+)  # fmt: skip
+def _sample(corners: Any, counts: Any, points: Any, along: Any) -> None:
+    """Write the points along a line, and how far along it each is."""
+    x, y = corners[0, 0], corners[0, 1]
+    points[0, 0], points[0, 1] = x, y
+    along[0] = total = 0.0
+    n = 1
+    for i in range(counts.size):
+        step_x, step_y = corners[i + 1, 0] - corners[i, 0], corners[i + 1, 1] - corners[i, 1]
+        for k in range(1, counts[i] + 1):
+            before_x, before_y = x, y
+            x, y = corners[i + 1, 0], corners[i + 1, 1]
+            if k < counts[i]:
+                share = k / counts[i]
+                x, y = corners[i, 0] + share * step_x, corners[i, 1] + share * step_y
+            total += math.hypot(x - before_x, y - before_y)
+            points[n, 0], points[n, 1], along[n] = x, y, total
+            n += 1
+
+
+@njit(
+    void(_arrays.F64_GRID, _arrays.U8_GRID, float64, float64, float64, types.Array(types.uint8, 1, "C")),
+    cache=True, error_model="numpy",
+)  # fmt: skip
+def _values(points: Any, grid: Any, left: float, bottom: float, resolution: float, found: Any) -> None:
+    """Write the grid's values at points, as far as it has any."""
+    height, width = grid.shape
+    for i in range(points.shape[0]):
+        column = math.floor((points[i, 0] - left) / resolution)
+        row = math.floor((points[i, 1] - bottom) / resolution)
+        if 0 <= column < width and 0 <= row < height:
+            found[i] = grid[int(row), int(column)]
+
+
+@njit(
+    void(_arrays.F64_GRID, _arrays.F64_FLAT, _arrays.U8_GRID, float64, float64, float64, float64, _arrays.F64_OUT),
+    cache=True, error_model="numpy",
+)  # fmt: skip
+def _seconds(
+    points: Any, along: Any, limits: Any, left: float, bottom: float, resolution: float, usual: float, found: Any
+) -> None:
+    """Write the time (s) to each point: at the usual speed (m/s), or by limits (cm/s, 0: none) that are lower."""
+    height, width = limits.shape
+    found[0] = total = 0.0
+    for i in range(1, along.size):
+        column = math.floor(((points[i - 1, 0] + points[i, 0]) / 2.0 - left) / resolution)
+        row = math.floor(((points[i - 1, 1] + points[i, 1]) / 2.0 - bottom) / resolution)
+        speed = usual
+        if 0 <= column < width and 0 <= row < height and limits[int(row), int(column)] > 0:
+            speed = min(usual, limits[int(row), int(column)] / 100.0)
+        total += (along[i] - along[i - 1]) / speed
+        found[i] = total
+
+
+@njit(
+    int64(_arrays.F64_GRID, _arrays.F64_GRID, _arrays.F64_FLAT, float64, float64, float64),
+    cache=True, error_model="numpy",
+)  # fmt: skip
+def _last_beside(points: Any, line: Any, along: Any, reach: float, behind: float, ahead: float) -> int:
+    """See `last_beside`."""
+    found = np.empty(2)
+    reached = 0.0
+    last = 0
+    for i in range(points.shape[0]):
+        x, y = points[i, 0], points[i, 1]
+        nearest_place(line, along, reached - behind, reached + ahead, x, y, found)
+        if math.isinf(found[1]):
+            nearest_place(line, along, -math.inf, math.inf, x, y, found)
+        if math.isinf(found[1]):  # all its points are one
+            found[1] = (line[0, 0] - x) ** 2 + (line[0, 1] - y) ** 2
+        if math.sqrt(found[1]) > reach:
+            break
+        reached = max(reached, found[0])
+        last = i
+    return last
+
+
+def sampled_along(corners: NDArray[np.float64], spacing: float) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Return `fog_contracts.geometry.sampled`, float64 (m, 2), and how far along the line each point is, (m,).
+
+    Bit for bit, in a fraction of the time. Raises TypeError or ValueError for corners other than float64 (n, 2).
+    """
+    counts = np.empty(len(_polyline(corners, "corners")) - 1, np.int64)
+    count = int(_count_samples(corners, _arrays.positive(spacing, "spacing"), counts))
+    points, along = np.empty((count, 2)), np.empty(count)
+    _sample(corners, counts, points, along)
+    return points, along
+
+
+def values_at(
+    points: NDArray[np.float64], grid: NDArray[np.uint8], place: tuple[float, float, float], outside: int
+) -> NDArray[np.uint8]:
+    """Return the values (n,) of a grid (h, w) at points (n, 2; m); `outside` where it has none.
+
+    `place`: x and y (m) of its lower left corner, and its resolution (m). Raises TypeError or ValueError for other
+    types or shapes.
+    """
+    values = np.full(len(_polyline(points, "points")), outside, np.uint8)
+    _values(points, _arrays.grid(grid, "grid"), *place, values)
+    return values
+
+
+def seconds_along(
+    points: NDArray[np.float64],
+    along: NDArray[np.float64],
+    limits: NDArray[np.uint8],
+    place: tuple[float, float, float],
+    usual: float,
+) -> NDArray[np.float64]:
+    """Return the time (s, (n,)) that a robot takes to each point of a line, as `sampled_along` returns them.
+
+    At `usual` (m/s), or slower where the cell between two points has a limit (cm/s, 0: none); `place` as for
+    `values_at`. Raises TypeError or ValueError for other types or shapes.
+    """
+    _arrays.exact(along, np.float64, 1, "along")
+    if len(_polyline(points, "points")) != along.size:
+        raise ValueError(f"along must have one number for each of the {len(points)} points, not {along.size}")
+    seconds = np.empty(along.size)
+    _seconds(points, along, _arrays.grid(limits, "limits"), *place, _arrays.positive(usual, "usual"), seconds)
+    return seconds
+
+
+def last_beside(
+    points: NDArray[np.float64],
+    line: NDArray[np.float64],
+    along: NDArray[np.float64],
+    reach: float,
+    window: tuple[float, float],
+) -> int:
+    """Return the last of the points (n, 2; m) up to which all are within `reach` (m) of another line; 0 without one.
+
+    Each is looked for within `window` (m behind and ahead) of how far along the other line (m, 2; m) one before it got;
+    `along`: how far its points are. Raises TypeError or ValueError for other types or shapes.
+    """
+    _arrays.exact(along, np.float64, 1, "along")
+    if len(_polyline(line, "line")) != along.size:
+        raise ValueError(f"along must have one number for each of the {len(line)} points of the line, not {along.size}")
+    return int(_last_beside(_polyline(points, "points"), line, along, float(reach), *window))
+
+
+def _polyline(points: NDArray[np.float64], name: str) -> NDArray[np.float64]:
+    _arrays.exact(points, np.float64, 2, name)
+    if len(points) == 0 or points.shape[1] != 2:
+        raise ValueError(f"{name} must have shape (n, 2) with n >= 1, not {points.shape}")
+    return points
 
 
 def distances(around: Clearance, points: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -107,6 +107,8 @@ def _cost_from(
     for i in range(after, along.size):
         x1, y1 = (points[i, 0] - left) / resolution - 0.5, (points[i, 1] - bottom) / resolution - 0.5
         total += _line_cost(costmap, weight, x0, y0, x1, y1, math.inf)
+        if math.isinf(total):
+            break
         x0, y0 = x1, y1
     return total
 
@@ -315,8 +317,11 @@ def _nearest(points: Any, along: Any, first: int, last: int, x: float, y: float,
     void(_arrays.F64_GRID, _arrays.F64_FLAT, float64, float64, float64, float64, _arrays.F64_OUT),
     cache=True, error_model="numpy",
 )  # fmt: skip
-def _nearest_between(points: Any, along: Any, low: float, high: float, x: float, y: float, found: Any) -> None:
-    """Find where the nearest place is among those from `low` to `high` along the line, and its squared distance."""
+def nearest_place(points: Any, along: Any, low: float, high: float, x: float, y: float, found: Any) -> None:
+    """Find where the nearest place is among those from `low` to `high` along the line, and its squared distance.
+
+    Infinite without one. For other kernels; all others use `nearest_between`.
+    """
     found[0] = 0.0
     found[1] = math.inf
     for i in range(points.shape[0] - 1):
@@ -593,7 +598,7 @@ def nearest_between(
     """
     _check_line(points, along)
     found = np.empty(2)
-    _nearest_between(points, along, float(low), float(high), float(x), float(y), found)
+    nearest_place(points, along, float(low), float(high), float(x), float(y), found)
     return float(found[0]), math.sqrt(found[1])
 
 

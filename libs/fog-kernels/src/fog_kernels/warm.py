@@ -42,6 +42,7 @@ PROFILES: dict[str, tuple[str, ...]] = {
     "planner": (
         "astar",
         "components",
+        "course",
         "dead_ends",
         "detour",
         "distance",

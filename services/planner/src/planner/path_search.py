@@ -15,6 +15,7 @@ from fog_contracts.costs import FREE, INSCRIBED, LETHAL
 from fog_contracts.geometry import lengths_along, sampled
 from fog_contracts.messages import PlanRefusal
 from fog_kernels.astar import Planner, nearest_traversable
+from fog_kernels.course import last_beside
 from fog_kernels.lines import cost_from, first_inside, leaves, line_cost, nearest_between
 from planner.refusals import (
     TIMEOUT,
@@ -56,7 +57,7 @@ class Route:
         """The polyline (n, 2), sampled at most `spacing` apart; every corner is a sample."""
         return sampled(self.corners, self.spacing)
 
-    @property
+    @cached_property
     def corner_points(self) -> list[PointXY]:
         """The corners as they are published; whoever samples them at the same spacing gets `points`, bit for bit."""
         return [(x, y) for x, y in self.corners.tolist()]
@@ -84,6 +85,10 @@ class Route:
         if math.isinf(found[1]):  # all corners are one point
             return 0.0, math.hypot(self.corners[0, 0] - x, self.corners[0, 1] - y)
         return found
+
+    def last_beside(self, points: Floats, reach: float) -> int:
+        """Return the last of some points (n, 2; m) up to which all are within `reach` (m) of the route, in turn."""
+        return last_beside(points, self.corners, self._corner_along, reach, (0.5, 2.0))
 
     @cached_property
     def _corner_along(self) -> Floats:

@@ -335,7 +335,6 @@ class Replanner:
         crowded = len(waiting) >= self._config.detour_searches
         shared = detour is None and crowded and self.detours.may_add(planning_map)
         origin = None if crowded or detour is not None else begun_at(mission.plan, danger)
-        stands = mission.plan is None or math.isinf(remaining_cost(mission.plan, planning_map))
         return self._search.find(
             planning_map,
             covers,
@@ -346,7 +345,8 @@ class Replanner:
             partial(self._share, planning_map, self._search.planner, waiting) if shared else None,
             None if origin is None else self._fields.guide(geometry.cell(*origin)),
             self._fields.landmarks,
-            hurried=crowded and stands,  # a way that is compared with the present one has its corners moved, too
+            # A way that is compared with the present one has its corners moved, too.
+            hurried=crowded and (mission.plan is None or math.isinf(remaining_cost(mission.plan, planning_map))),
         )
 
     def _share(

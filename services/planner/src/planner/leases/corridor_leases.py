@@ -19,7 +19,8 @@ from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
-from fog_contracts.geometry import GeometryError, lengths_along, sampled
+from fog_contracts.geometry import GeometryError
+from fog_kernels.course import sampled_along
 from fog_kernels.lines import first_near
 from planner.leases.corridors import (
     DEFAULT_RADIUS_M,
@@ -120,9 +121,9 @@ class CorridorLeases:
             self._arrivals += 1
             me.mission = mission
             me.order = (-priority, self._arrivals)
-        me.path, me.points = path, sampled(corners, SPACING_M)
-        me.along = lengths_along(me.points)
-        me.low, me.high = box(me.points)
+        me.path = path
+        me.points, me.along = sampled_along(corners, SPACING_M)
+        me.low, me.high = box(corners)
         me.leased = me.first
         self.standstills.changed(robot)
 
@@ -366,9 +367,10 @@ class CorridorLeases:
                 other.leased = min(other.leased, max(other.first, int(other.along.searchsorted(other.end))))
                 other.withdrawn_at, other.standing = math.inf, True
                 self.standstills.changed(other.id)
-            stays = other.id not in self._gone and any(place.has_body(other) for place in self._places)
-            if now - other.heard_at > FORGET_S and not stays:
-                self._drop(other.id)
+            if now - other.heard_at > FORGET_S:
+                stays = other.id not in self._gone and any(place.has_body(other) for place in self._places)
+                if not stays:
+                    self._drop(other.id)
 
     # --- Robots that make room ----------------------------------------------------------------------------------------
 

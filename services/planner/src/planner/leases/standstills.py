@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Final, Literal
 
 import numpy as np
 
-from fog_contracts.geometry import lengths_along, sampled
+from fog_kernels.course import sampled_along
 from planner.leases.corridors import (
     SPACING_M,
     WAITING_M,
@@ -182,8 +182,8 @@ class Standstills:
         """Whether robots can do more with this path than without it."""
         me, before = self._robots[room.robot], self.stuck()
         kept = me.points, me.along, me.low, me.high, me.progress, me.leased
-        me.points = sampled(corners, SPACING_M)
-        me.along, (me.low, me.high), me.progress = lengths_along(me.points), box(me.points), 0.0
+        me.points, me.along = sampled_along(corners, SPACING_M)
+        (me.low, me.high), me.progress = box(corners), 0.0
         me.leased = me.first
         self._touched.add(me.id)
         after = self.order({})

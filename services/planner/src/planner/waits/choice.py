@@ -13,9 +13,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fog_contracts.costs import INSCRIBED, LETHAL, UNKNOWN
-from fog_contracts.geometry import distance_to_polygon, lengths_along, sampled
+from fog_contracts.geometry import distance_to_polygon, lengths_along
 from fog_contracts.messages import BlockedWay, HazardArea
 from fog_contracts.shapes import box_around, shape_box, shape_contains
+from fog_kernels.course import sampled_along, values_at
 from planner.path_search import Route
 from planner.planning_map import USUAL_SPEED
 from planner.regions import cause_of, name_of
@@ -92,6 +93,10 @@ class _Known:
     sources: Sequence[Source]
     areas: Sequence[HazardArea]
     speed: NDArray[np.uint8]
+    survivals: dict[int, Survival | None] = field(default_factory=dict)
+    """How long sources go on, by `id`, as far as somebody has asked."""
+    awaited: list[Bounds] | None = None
+    """The boxes of those of which that is known, once somebody has asked."""
 
 
 @dataclass
@@ -103,6 +108,8 @@ class Waits:
     _known: _Known | None = None
     _boxes: dict[int, tuple[Source, Bounds]] = field(default_factory=dict)
     _boxed: Sequence[Source] = ()
+    _edges: Floats = field(default_factory=lambda: np.zeros((4, 0)))
+    """The boxes of those as numbers: each one's left, bottom, right and top."""
 
     def look(
         self, at: Moment, sources: Sequence[Source], areas: Sequence[HazardArea], speed: NDArray[np.uint8]
@@ -119,29 +126,30 @@ class Waits:
         something that is not waited for. `at`: where it is (m); `before`: the choice that it follows.
         """
         way = before.way if before is not None else way
+        since = before.since if before is not None and before.waits else None
         if self.config.wait == "off" or self._known is None or way is None or found.route is None:
             return None
         along, off = way.nearest(*at)
         corners = way.remaining(along)
-        if off > _BRANCH_M or len(corners) < 2:
+        if (since is None and not self._may_end_on(way)) or off > _BRANCH_M or len(corners) < 2:
             return None
-        rest = sampled(corners, _SPACING_M)
-        blocked = np.flatnonzero(planning_map.geometry.sample(planning_map.cost, rest, UNKNOWN) >= INSCRIBED)
+        rest, steps = sampled_along(corners, _SPACING_M)
+        geometry = planning_map.geometry
+        grid = geometry.origin_x, geometry.origin_y, geometry.resolution
+        blocked = np.flatnonzero(values_at(rest, planning_map.cost, grid, UNKNOWN) >= INSCRIBED)
         if not len(blocked):
             return None
-        since = before.since if before is not None and before.waits else None
         cut = self._cut(rest[blocked], since)
         if cut is None:
             return None
-        steps = lengths_along(rest)
-        branch = steps[_last_beside(rest[: blocked[0]], found.route)]
+        branch = steps[found.route.last_beside(rest[: blocked[0]], _BRANCH_M) if blocked[0] else 0]
         hold = max(0.0, min(float(branch), float(steps[blocked[0]]) - _KEEP_M))
-        end = min(hold + _TAIL_M, float(steps[blocked[0]]) - 2.0 * planning_map.geometry.resolution)
+        end = min(hold + _TAIL_M, float(steps[blocked[0]]) - 2.0 * geometry.resolution)
         speed = self.config.cruise_speed
-        around, _ = found.route.nearest(*_point(rest, steps, hold))
-        ways = [Times.of(each, self._known.speed, planning_map.geometry) for each in (found.route, way)]
-        detour = (ways[0].rest(around) - ways[1].rest(along + hold)) * USUAL_SPEED / speed
         place = _point(rest, steps, hold)
+        around, _ = found.route.nearest(*place)
+        ways = [Times.of(each, self._known.speed, geometry) for each in (found.route, way)]
+        detour = (ways[0].rest(around) - ways[1].rest(along + hold)) * USUAL_SPEED / speed
         stays = before is not None and before.stays(place) and blocked[0] > 0
         if (end < hold + _SHORT_M and not stays) or detour <= 0.0:
             return None  # it stands before the block already, or is as quick round it
@@ -161,10 +169,8 @@ class Waits:
         Lidars may see for a moment more what stood in an area that is clear again: whoever waited, waits on.
         """
         assert self._known is not None
-        at, reach = self._known.at, self.config.inflation.inscribed_radius + _NEAR_M
-        if waiting_since is None and not any(map(_may_end, self._known.sources)):
-            return None
-        left = [(float(x), float(y)) for x, y in points]
+        at, reach = self._known.at, self._reach
+        left: list[PointXY] = [(x, y) for x, y in points.tolist()]
         (x0, y0), (x1, y1) = (points.min(axis=0) - reach).tolist(), (points.max(axis=0) + reach).tolist()
         around = (x0, y0, x1, y1)
         found: list[tuple[Source, Survival, float]] = []
@@ -189,17 +195,42 @@ class Waits:
             return None
         return [source for source, _, _ in found], all_of([b for _, b, _ in found]), max(age for *_, age in found)
 
+    @property
+    def _reach(self) -> float:
+        """How near (m) a source closes a cell."""
+        return self.config.inflation.inscribed_radius + _NEAR_M
+
+    def _may_end_on(self, way: Route) -> bool:
+        """Whether anything near a way is known to end by itself: without that no robot waits on it."""
+        known = self._known
+        assert known is not None
+        if known.awaited is None:
+            ending = [source for source in known.sources if self._survival(source) is not None]
+            known.awaited = [_bounds(source) for source in ending]
+        if not known.awaited:
+            return False
+        around = box_around(way.corner_points, self._reach)
+        return any(_overlap(box, around) for box in known.awaited)
+
     def _near(self, sources: Sequence[Source], around: Bounds) -> list[Source]:
         """Return the sources whose boxes overlap another one; the box of each source is computed once."""
         if self._boxed is not sources:
             self._boxes = {id(each): self._boxes.get(id(each)) or (each, _bounds(each)) for each in sources}
             self._boxed = sources
-        return [source for source, box in self._boxes.values() if _overlap(box, around)]
+            self._edges = np.array([self._boxes[id(each)][1] for each in sources]).reshape(-1, 4).T.copy()
+        left, bottom, right, top = self._edges
+        near = (left <= around[2]) & (around[0] <= right) & (bottom <= around[3]) & (around[1] <= top)
+        return [sources[number] for number in np.flatnonzero(near).tolist()]
 
     def _survival(self, source: Source) -> Survival | None:
-        """Return how long a hazard or zone goes on; None if that is unknown."""
+        """Return how long a hazard or zone goes on; None if that is unknown. Computed once for all robots."""
         assert self._known is not None
-        at = self._known.at
+        found = self._known.survivals
+        if id(source) not in found:
+            found[id(source)] = self._find_survival(source, self._known.at)
+        return found[id(source)]
+
+    def _find_survival(self, source: Source, at: Moment) -> Survival | None:
         if not isinstance(source, HazardArea):
             return None if source.expires_at is None else _until(source.expires_at - at.stamp)
         hazard, age = source.hazard, self.blocks.age(source.hazard.area, at.now)
@@ -211,29 +242,19 @@ class Waits:
         return self.blocks.survival(hazard.area, age, at.stamp, learned=self.config.wait == "learned")
 
 
-def _may_end(source: Source) -> bool:
-    return isinstance(source, HazardArea) or source.expires_at is not None
-
-
 def _until(rest: float) -> Survival | None:
     """Return the survival of what ends in `rest` s, as far as that can be trusted: it may take a moment to go."""
     return until(max(0.0, rest)) if rest > -_GRACE_S else None
 
 
-def _last_beside(points: Floats, other: Route) -> int:
-    """Return the last of the points (n, 2; m) up to which all lie beside another route."""
-    ahead, last = 0.0, 0
-    for number, (x, y) in enumerate(points.tolist()):
-        along, distance = other.nearest(x, y, ahead, window=2.0)
-        if distance > _BRANCH_M:
-            break
-        ahead, last = max(ahead, along), number
-    return last
-
-
 def _point(points: Floats, along: Floats, at: float) -> tuple[float, float]:
-    """Return the point so many metres along a polyline."""
-    return float(np.interp(at, along, points[:, 0])), float(np.interp(at, along, points[:, 1]))
+    """Return the point so many metres, 0 or more, along a polyline."""
+    before = int(along.searchsorted(at, "right")) - 1
+    begin, (x, y) = along.item(before), points[before].tolist()
+    if before == len(along) - 1 or begin == at:
+        return x, y
+    length, (next_x, next_y) = along.item(before + 1) - begin, points[before + 1].tolist()
+    return (next_x - x) / length * (at - begin) + x, (next_y - y) / length * (at - begin) + y
 
 
 _RING: Final = [(math.cos(k * math.tau / 12), math.sin(k * math.tau / 12)) for k in range(12)]

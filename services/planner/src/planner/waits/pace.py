@@ -11,8 +11,8 @@ from typing import TYPE_CHECKING, Annotated, Final, NamedTuple
 import numpy as np
 from msgspec import Meta
 
-from fog_contracts.geometry import lengths_along, sampled
 from fog_contracts.messages import Arrival, Message
+from fog_kernels.course import sampled_along, seconds_along
 from planner.planning_map import USUAL_SPEED
 
 if TYPE_CHECKING:
@@ -36,11 +36,9 @@ class Times(NamedTuple):
     @classmethod
     def of(cls, route: Route, limits: Grid, geometry: GridGeometry, begin: float = 0.0) -> Times:
         """Return the times of a route from `begin` (m) on by the limits in its cells (cm/s, 0: none)."""
-        points = sampled(route.remaining(begin), route.spacing)
-        along = lengths_along(points)
-        sampled_limits = geometry.sample(limits, (points[:-1] + points[1:]) / 2.0, 0) / 100.0
-        speeds = np.where(sampled_limits > 0.0, np.minimum(sampled_limits, USUAL_SPEED), USUAL_SPEED)
-        return cls(along, np.append(0.0, np.cumsum(np.diff(along) / speeds)))
+        points, along = sampled_along(route.remaining(begin) if begin > 0.0 else route.corners, route.spacing)
+        place = geometry.origin_x, geometry.origin_y, geometry.resolution
+        return cls(along, seconds_along(points, along, limits, place, USUAL_SPEED))
 
     def at(self, along: float) -> float:
         """Return the time (s) to a place (m) along the way."""

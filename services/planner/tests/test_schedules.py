@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import itertools
 from datetime import datetime
 from types import SimpleNamespace
 from typing import TYPE_CHECKING, Any, cast
@@ -34,7 +35,7 @@ from fog_runtime.health import Health
 from fog_runtime.stores.redis_connection import StoreRefusedError
 from fog_supervisor.servers import start_redis
 from planner.core import PlannerCore
-from planner.schedules.occasions import due
+from planner.schedules.occasions import LONGEST_PAUSE_S, due
 from planner.schedules.persistence import SchedulePersistence
 from planner.schedules.scheduling import RETRY_S, Scheduling
 from planner.stops import GoalBody, MissionBody, Occasion, Order, ScheduledMission
@@ -420,3 +421,29 @@ async def test_idle_robot_is_told_to_dock_and_left_alone_on_its_dock(store):
     fog.states["r1"] = state(enabled=False)
     await fog.pass_time(300.0)
     assert len(fog.commands) == 1, "who stops a robot wants it to stay"
+
+
+async def test_idle_robot_whose_dock_is_barred_tries_ever_more_seldom_until_somebody_has_used_it(store):
+    docked = robot(idle=IdleSite(go="dock", after_s=60.0), dock=Pose(x=0.5, y=0.0, theta=0.0))
+    fog = await Fog(store, ManualClock(EIGHT), Site(id="f", robots=[docked])).start()
+    tried: list[float] = []
+
+    async def barred(_kind: str, _robot: str, _who: str) -> CommandReply:
+        tried.append(fog.clock.now())
+        fog.states["r1"] = state(mode="DOCK")
+        return CommandReply(accepted=True, reason="")
+
+    fog.operator.send = barred
+    for _ in range(2500):
+        docks = fog.states["r1"].mode == "DOCK"
+        await fog.pass_time(10.0, step=10.0)
+        if docks:
+            fog.states["r1"] = state()  # it has given up, where it was
+    pauses = [after - before for before, after in itertools.pairwise(tried)]
+    assert pauses == sorted(pauses)
+    assert (pauses[0], pauses[-1]) == (pytest.approx(130.0, abs=20.0), pytest.approx(LONGEST_PAUSE_S + 10.0, abs=20.0))
+    fog.states["r1"] = state(enabled=False)
+    await fog.pass_time(10.0, step=10.0)
+    fog.states["r1"], known = state(), len(tried)
+    await fog.pass_time(80.0, step=10.0)
+    assert len(tried) == known + 1, "whoever stopped it may have freed the dock"

@@ -46,6 +46,10 @@ def due(schedule: ScheduledMission, windows: Windows, stamp: float) -> Due | Non
     return Due(window, over)
 
 
+LONGEST_PAUSE_S: Final = 3600.0
+"""No pause between two attempts at sending an idle robot to where it stays gets longer by itself."""
+
+
 class IdleTimes:
     """For how long robots have been idle. `now` is s of a monotonic clock."""
 
@@ -53,18 +57,27 @@ class IdleTimes:
         """`after_s`: by robot, after how long something is to be done about it."""
         self._after_s = after_s
         self._since: dict[str, float] = {}
+        self._tries: dict[str, int] = {}
 
-    def is_due(self, robot: str, now: float, *, idle: bool) -> bool:
-        """Note whether a robot is idle; return whether it is for long enough, after which its time begins anew."""
+    def is_due(self, robot: str, now: float, *, idle: bool, afresh: bool) -> bool:
+        """Note whether a robot is idle; return whether it is for long enough, after which its time begins anew.
+
+        Each time twice as long as before, up to an hour, until it is told that the attempts count `afresh`: because
+        one has succeeded, or because the robot has been elsewhere since.
+        """
+        if afresh:
+            self._tries.pop(robot, None)
         after = self._after_s.get(robot)
         if after is None or not idle:
             self._since.pop(robot, None)
             return False
-        if now - self._since.setdefault(robot, now) < after:
+        tries = self._tries.get(robot, 0)
+        if now - self._since.setdefault(robot, now) < max(after, min(after * 2.0**tries, LONGEST_PAUSE_S)):
             return False
-        self._since[robot] = now
+        self._since[robot], self._tries[robot] = now, tries + 1
         return True
 
     def clear(self) -> None:
         """Begin anew for all robots."""
         self._since.clear()
+        self._tries.clear()

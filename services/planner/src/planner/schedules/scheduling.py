@@ -29,7 +29,7 @@ from planner.visits import is_free
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping
 
-    from fog_contracts.messages import Place, PlanReply, PlanRequest, RobotPose
+    from fog_contracts.messages import Place, PlanReply, PlanRequest, RobotPose, RobotState
     from fog_contracts.site import Site
     from fog_runtime.clock import Clock
     from planner.robot_operator import RobotOperator
@@ -255,15 +255,29 @@ class Scheduling:
     async def _send_idle(self) -> None:
         """Send robots that have been without a mission for long to where they stay; raises `StoreError`."""
         for robot, idle in self._idle.items():
-            state = self._service.operator.heard(robot)
-            waits = robot not in self._service.missions.goals and not self._why_not(robot)
+            state, stored = self._service.operator.heard(robot), self._service.missions.goals.get(robot)
             docked = state is not None and (state.docked or ReasonCode.ON_DOCK in state.codes)
-            if not self._idle_times.is_due(robot, self._clock.now(), idle=waits and not docked):
+            waits = stored is None and not docked and not self._why_not(robot)
+            afresh = docked or self._is_at(robot, idle.go) or self._serves(robot, state, stored)
+            if not self._idle_times.is_due(robot, self._clock.now(), idle=waits, afresh=afresh):
                 continue
             if idle.go == ON_DOCK:
                 await self._dock(robot)
             else:
                 await self._send_home(robot, idle.go)
+
+    def _serves(self, robot: str, state: RobotState | None, stored: StoredGoal | None) -> bool:
+        """Whether somebody uses or has stopped a robot, after which it may be elsewhere."""
+        held = state is not None and (not state.enabled or state.mode == "TELEOP")
+        return held or (stored is not None and not stored.goal.idle) or self._service.visiting.visits.serves(robot)
+
+    def _is_at(self, robot: str, name: str) -> bool:
+        """Whether a robot is at a place."""
+        place, at = self._place(name), self._service.poses.get(robot)
+        return place is not None and at is not None and math.hypot(at.x - place.x, at.y - place.y) <= HOME_M
+
+    def _place(self, name: str) -> Place | None:
+        return (self._places if self._service.places is None else self._service.places).get(name)
 
     async def _dock(self, robot: str) -> None:
         try:
@@ -275,12 +289,10 @@ class Scheduling:
             _log.warning("idle_robot_not_docked", robot=robot, reason=reply.reason)
 
     async def _send_home(self, robot: str, name: str) -> None:
-        places = self._places if self._service.places is None else self._service.places
-        if (place := places.get(name)) is None:
+        if (place := self._place(name)) is None:
             _log.warning("idle_robot_not_sent", robot=robot, reason=f"there is no place {name}")
             return
-        at = self._service.poses[robot]
-        if math.hypot(at.x - place.x, at.y - place.y) <= HOME_M:
+        if self._is_at(robot, name):
             return
         order = Order(
             robot, Pose(x=place.x, y=place.y, theta=place.theta or 0.0), IDLE, place=name,

@@ -20,7 +20,8 @@ from fog_runtime.stores.redis_store import Attempt, Audit, IdempotencyError, Rec
 from fog_supervisor.servers import Server, start_redis
 from planner.core import PlannerCore
 from planner.stops import Order
-from planner.store import MissionPersistence, OutOfServiceError, Store, StoredGoal
+from planner.store import OutOfServiceError, Store, StoredGoal
+from planner.tours.persistence import MissionPersistence
 from planner.waits.persistence import LearnedPersistence
 
 pytestmark = pytest.mark.live
@@ -35,6 +36,10 @@ def redis(tmp_path: Path):
 
 def goal(name: str) -> StoredGoal:
     return StoredGoal(goal=RobotGoal(goal_id=name, pose=Pose(x=1.0, y=2.0, theta=0.0)))
+
+
+def missions_of(core: PlannerCore, store: Store, change_core=lambda change: change()) -> MissionPersistence:
+    return MissionPersistence(core, store, SystemClock(), Health(), change_core, lambda _robot: None)
 
 
 async def test_repeated_request_finds_its_mission_also_after_a_newer_one(redis: Server):
@@ -84,7 +89,7 @@ async def test_mission_that_was_stored_although_its_request_failed_can_be_cancel
     ):
         granted = await leases.acquire("p1", Request(epoch=0, floor=0, confirmed=False, sent_at=0.0))
         assert granted is not None
-        persistence = MissionPersistence(Mock(), store, SystemClock(), Health(), lambda _change: None)
+        persistence = missions_of(Mock(), store, lambda _change: None)
         with pytest.raises(StoreError, match="not loaded yet"):
             await persistence.cancel("r1", "anna")
         await persistence.lead(granted.epoch, confirmed=True)
@@ -108,7 +113,7 @@ async def test_no_goal_is_accepted_or_begun_while_a_robot_is_out_of_service_what
 
         async def start() -> tuple[PlannerCore, MissionPersistence]:
             core = PlannerCore()
-            persistence = MissionPersistence(core, store, SystemClock(), Health(), lambda change: change())
+            persistence = missions_of(core, store)
             await persistence.lead(granted.epoch, confirmed=True)
             return core, persistence
 
@@ -140,7 +145,7 @@ async def test_no_goal_is_accepted_or_begun_while_a_robot_is_out_of_service_what
 
 async def test_refused_undo_of_a_robots_service_ends_no_mission(redis: Server):
     async with Store(redis.url, "test") as store:
-        missions = MissionPersistence(PlannerCore(), store, SystemClock(), Health(), lambda change: change())
+        missions = missions_of(PlannerCore(), store)
         await missions.lead(-1, confirmed=True)
         given = await missions.send(Order("r1", Pose(x=1.0, y=2.0, theta=0.0), "anna"))
         before = OutOfService(id="1", reason="worn wheel", by="anna", since=1.0)
@@ -154,7 +159,7 @@ async def test_goal_of_a_robot_whose_record_of_service_cannot_be_read_is_refused
         await store.put("r1", goal("first"), AUDIT)
         await raw.hset("fog:test:out_of_service", "r1", b"{half")
         core = PlannerCore()
-        missions = MissionPersistence(core, store, SystemClock(), Health(), lambda change: change())
+        missions = missions_of(core, store)
         await missions.lead(-1, confirmed=True)
         assert core.missions.goal("r1") is None
         assert missions.out_of_service("r1") is not None

@@ -38,7 +38,7 @@ from planner.stops import (
 )
 from planner.store import OutOfServiceError, Store, StoredGoal
 from planner.tours.api import Conditions, mission_answer, mission_order
-from planner.tours.persistence import TourPersistence
+from planner.tours.persistence import MissionPersistence
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -110,7 +110,7 @@ class Running:
     def __init__(self, store: Store, clock: ManualClock, synchronized: Callable[[], bool] = lambda: True) -> None:
         self.core = PlannerCore()
         self.refused: Refusal | None = None
-        self.missions = TourPersistence(
+        self.missions = MissionPersistence(
             self.core, store, cast("Any", clock), Health(), lambda change: change(), self.path, synchronized
         )
 

@@ -115,9 +115,9 @@ async def main() -> None:
             async with asyncio.TaskGroup() as tasks:
                 needs = {"zenoh": zenoh.router_answers, "planning": service.core_answers, "map": service.has_map}
                 tasks.create_task(leadership.run(service, needs, service.core_answers), name="lease")
-                tasks.create_task(service.store_loop(), name="store")
+                tasks.create_task(service.missions.store_loop(), name="store")
                 tasks.create_task(service.operator.record_loop(), name="stops")
-                tasks.create_task(service.snapshot_loop(), name="snapshot")
+                tasks.create_task(service.snapshots.snapshot_loop(), name="snapshot")
                 tasks.create_task(service.tick_loop(), name="tick")
                 tasks.create_task(service.plan_loop(), name="plan")
                 tasks.create_task(service.visiting.run(), name="visits")

@@ -29,7 +29,8 @@ if TYPE_CHECKING:
     from fog_contracts.messages import CommandKind, CommandReply, HandOver, Pose, RobotState
     from fog_runtime.clock import Clock
     from fog_runtime.transports.zenoh_edge import ZenohEdge
-    from planner.store import MissionPersistence, Store
+    from planner.store import Store
+    from planner.tours.persistence import MissionPersistence
 
 RETURNS: Final = 3
 """How often the states must change back to an earlier run: a late one after a restart changes back to it, and again."""

@@ -222,7 +222,7 @@ class Service:
         self.dry_runs = DryRuns(core, self._queue, clock.now)
         self._cycle = Cycle(core, zenoh)
         self.missions = SchedulePersistence(core, store, clock, health, self._change_goal, self.path, synchronized)
-        self._map = SnapshotFetcher(core, zenoh, clock, health, self._queue, on_loaded=self._wake.set)
+        self.snapshots = SnapshotFetcher(core, zenoh, clock, health, self._queue, on_loaded=self._wake.set)
         self.operator = RobotOperator(zenoh, store, clock, key)
         self._docks = DockMissions(site.staging, self.send)
         self.visiting = Visiting(self, site, clock)
@@ -371,17 +371,9 @@ class Service:
 
     async def has_map(self) -> bool:
         """Return whether a map was ever loaded; a copy without one leaves the lease to one that has it."""
-        return self._map.loaded
+        return self.snapshots.loaded
 
     # --- Loops ------------------------------------------------------------------------------------------------------
-
-    async def store_loop(self) -> None:
-        """Load the missions, then keep the store up to date."""
-        await self.missions.store_loop()
-
-    async def snapshot_loop(self) -> None:
-        """Fetch a snapshot of the map whenever the core needs one."""
-        await self._map.snapshot_loop()
 
     async def tick_loop(self) -> None:
         """Start a planning cycle ten times a second."""
@@ -405,7 +397,7 @@ class Service:
             for robot, goal_id in result.reached:
                 self.missions.end(robot, goal_id)
             if result.wants_snapshot:
-                self._map.request()
+                self.snapshots.request()
             connected = self._zenoh.connected
             self._health.set("zenoh", ok=connected, detail="" if connected else "not connected to the router")
             self._health.set("robots", ok=True, detail=self.operator.doubled_detail())

@@ -21,7 +21,8 @@ if TYPE_CHECKING:
     from fog_contracts.site import Site
     from fog_runtime.clock import Clock
     from planner.robot_operator import RobotOperator
-    from planner.store import MissionPersistence, StoredGoal
+    from planner.store import StoredGoal
+    from planner.tours.persistence import MissionPersistence
 
 STEP_S: Final = 0.5
 

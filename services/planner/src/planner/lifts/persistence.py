@@ -13,7 +13,7 @@ from fog_runtime import logs
 from fog_runtime.stores.redis_connection import StoreError
 from fog_runtime.stores.redis_store import Audit
 from planner.store import OutOfServiceError, StoredGoal
-from planner.tours.persistence import WHO, TourPersistence
+from planner.tours.persistence import WHO, MissionPersistence
 
 if TYPE_CHECKING:
     from fog_contracts.handover import Standing
@@ -34,7 +34,7 @@ class OnOtherFloorError(OutOfServiceError):
         Exception.__init__(self, f"robot {robot} is not this floor's: {out.reason}")
 
 
-class RidePersistence(TourPersistence):
+class RidePersistence(MissionPersistence):
     """The missions, and the robots' floors as this one knows them (`fog_contracts.handover`)."""
 
     site = "none"

@@ -32,9 +32,8 @@ class SchedulePersistence(RidePersistence):
         Raises `StoreError`: then it may or may not be stored.
         """
         async with self._lock:
+            await self._refresh()
             with self._uncertain_write():
-                if self._reload:
-                    await self._load()
                 audit = Audit(self._clock.stamp(), who, action)
                 outcome = await self._store.put_schedule(name, schedule, audit, expected=expected)
             if outcome != "ok":

@@ -9,7 +9,7 @@ import { Patterns } from "./map/patterns";
 import { MapTools } from "./map/tools";
 import { go, ofDemo, routeHash, useRoute, type View, VIEWS } from "./router";
 import { useScenario } from "./scenario";
-import { rememberRobots, StopBar } from "./stop";
+import { rememberedRobots, rememberRobots, StopBar } from "./stop";
 import { duration } from "./text";
 import { onTheme, setTheme, theme, type Theme } from "./theme";
 import { FloorsView, useFloorCount } from "./views/floors";
@@ -53,7 +53,7 @@ export function ConsoleApp({ session, onExpired, onLogOut }: Props): preact.JSX.
   const live = useMemo(() => new Live("api/v1/events"), []);
   const [floor, setFloor] = useState<Floor | null>(null);
   const [chosen, setChosen] = useState<string | null>(null);
-  const [robots, setRobots] = useState<readonly string[]>([]);
+  const [robots, setRobots] = useState<readonly string[]>(rememberedRobots);
   const [said, setSaid] = useState<Said>(NOTHING);
   const [, setSpoken] = useState<Language>(language);
   const element = useRef<HTMLDivElement>(null);
@@ -69,8 +69,11 @@ export function ConsoleApp({ session, onExpired, onLogOut }: Props): preact.JSX.
 
   useEffect(() => {
     const look = (): void => {
-      const ids = [...new Set([...live.of.robot.keys(), ...live.of.pose.keys()])].sort();
+      const heard = [...live.of.robot.keys(), ...live.of.pose.keys()];
       setRobots((before) => {
+        // Until the server has told of all robots, those of before can be stopped all the same, and no button passes from
+        // the chosen robot to another.
+        const ids = [...new Set(live.ready ? heard : [...before, ...heard])].sort();
         if (before.join("\n") === ids.join("\n")) return before;
         if (ids.length > 0) rememberRobots(ids);
         return ids;
@@ -79,7 +82,7 @@ export function ConsoleApp({ session, onExpired, onLogOut }: Props): preact.JSX.
     look();
     const known = (id: string): boolean => live.of.robot.has(id) || live.of.pose.has(id);
     let before = "";
-    return live.on(["robot", "pose"], (id) => {
+    return live.on(["robot", "pose", "ready"], (id) => {
       // A hundred poses a second are of robots that are known.
       if (id !== "" && known(id) && before.includes(`\n${id}\n`)) return;
       look();

@@ -77,6 +77,57 @@ async def test_stop_of_all_lists_each_robot_that_was_not_stopped_until_it_is_or_
     await expect(rows).to_have_count(0)
 
 
+async def test_stop_stays_for_the_chosen_robot_while_a_server_that_starts_anew_tells_of_no_robot(
+    console: SimpleNamespace, stream: ConsoleStream
+) -> None:
+    page = await console.open("robots")
+    await page.locator(".card", has_text="r2").first.click()
+    await expect(page.get_by_role("button", name="Stop r2")).to_be_enabled()
+    for name in ("r1", "r2"):
+        del stream.log["robot", name], stream.log["pose", name]
+    stream.run, stream.unready = "second", True
+    stream.cut()
+    await expect(page.locator(".robot-body")).to_have_count(0)
+    stream.robot("r1", robot_state())
+    await expect(page.locator(".card", has_text="r1").first).to_contain_text("driving")
+    await page.get_by_role("button", name="Stop r2").click()
+    await expect(page.locator(".said")).to_have_text("r2 stops.")
+    await page.reload()  # what was known before is known to a page that loads anew
+    await expect(page.locator(".card", has_text="r1").first).to_contain_text("driving")
+    await page.keyboard.press("Shift+F9")
+    async with asyncio.timeout(30):
+        while len(stream.asked("POST")) < 3:  # noqa: ASYNC110  # the page says it for the last one only
+            await asyncio.sleep(0.05)
+    assert sorted(stream.asked("POST")) == ["POST robots/r1/stop", *["POST robots/r2/stop"] * 2]
+    stream.unready = False
+    stream.cut()
+    await expect(page.locator(".card", has_text="r2")).to_have_count(0)
+    await expect(page.get_by_role("button", name="Stop r1")).to_be_enabled()
+
+
+async def test_stop_works_in_each_of_six_tabs_of_a_browser(console: SimpleNamespace, stream: ConsoleStream) -> None:
+    pages = [await console.open()]
+    for _ in range(5):
+        # As a browser tells a tab that another one covers: this one takes all tabs for visible.
+        await pages[-1].evaluate(
+            """() => {
+                Object.defineProperty(document, 'hidden', { configurable: true, get: () => window.covered });
+                window.covered = true;
+                document.dispatchEvent(new Event('visibilitychange'));
+            }"""
+        )
+        pages.append(await pages[0].context.new_page())
+        await pages[-1].goto(f"{console.url}#/robots")
+        await expect(pages[-1].get_by_text("Live", exact=True)).to_be_visible()
+    for page in (pages[-1], pages[0]):
+        await page.keyboard.press("F9")
+        await expect(page.locator(".said")).to_have_text("r1 stops.")
+    await pages[0].evaluate("() => { window.covered = false; document.dispatchEvent(new Event('visibilitychange')) }")
+    stream.robot("r1", robot_state("HOLD", enabled=False, reasons=["not enabled"], codes=["not_enabled"]))
+    await expect(pages[0].locator(".card", has_text="r1").first).to_contain_text("waiting")
+    assert (stream.resumed_from[-1] or "").startswith("first-"), "a tab that is seen again goes on where it was"
+
+
 async def test_robot_tells_who_has_stopped_it_until_somebody_enables_it(
     console: SimpleNamespace, stream: ConsoleStream
 ) -> None:

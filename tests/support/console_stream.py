@@ -69,6 +69,8 @@ class ConsoleStream:
         an empty list."""
         self.resumed_from: list[str | None] = []
         self.silent = False
+        self.unready = False
+        """Whether new readers are not told that the state of the time of connecting is complete."""
         self.role = "operator"
         self._revisions = itertools.count(1)
         self._readers: set[asyncio.Event] = set()
@@ -141,7 +143,7 @@ class ConsoleStream:
                 if newer and not self.silent:
                     seen = newer[-1][0]
                     yield "".join(_event(event, data, f"{self.run}-{number}") for number, event, data in newer)
-                if not ready:
+                if not ready and not self.unready:
                     ready = True
                     yield _event("ready", {})
                 if time.monotonic() - timed >= 1.0 and not self.silent:

@@ -73,8 +73,16 @@ export class Stream {
   ) {}
 
   start(): void {
+    document.addEventListener("visibilitychange", this.looked);
     void this.run();
   }
+
+  /** A browser has six connections to a host, in all its tabs: hidden ones leave theirs to those where somebody may stop. */
+  private readonly looked = (): void => {
+    this.attempt = 0;
+    if (document.hidden) this.reading?.abort();
+    this.wake?.();
+  };
 
   /** Ask for other events, such as the scan of a robot: connects anew from the last id. */
   ask(query: string): void {
@@ -87,6 +95,7 @@ export class Stream {
 
   close(): void {
     this.closed = true;
+    document.removeEventListener("visibilitychange", this.looked);
     this.reading?.abort();
     this.wake?.();
   }
@@ -95,13 +104,17 @@ export class Stream {
     while (!this.closed) {
       const query = this.query;
       this.handlers.onConnection("connecting");
+      if (document.hidden) {
+        await new Promise<void>((resolve) => (this.wake = resolve));
+        continue;
+      }
       if (!(await this.readOnce())) {
         this.closed = true;
         this.handlers.onConnection("refused");
         return;
       }
       if (this.closed) return;
-      if (query !== this.query) continue;
+      if (query !== this.query || document.hidden) continue;
       this.handlers.onConnection("lost");
       await this.pause(waitBefore(this.attempt++, Math.random()));
     }

@@ -10,7 +10,7 @@ from console_stream import PHONE, VIEWS, WIDE, ConsoleStream, robot_pose, robot_
 from msgspec import to_builtins
 from playwright.async_api import expect
 
-from fog_contracts.messages import PlanReply
+from fog_contracts.messages import CircleShape, PlanReply, Zone
 
 pytestmark = [pytest.mark.browser, pytest.mark.drive]
 
@@ -266,6 +266,33 @@ async def test_goal_by_click_shows_its_path_before_it_is_sent(console: SimpleNam
     name, body = stream.requests[-1]
     assert name == "PUT robots/r1/goal"
     assert body["pose"]["theta"] is None
+
+
+async def test_click_on_a_robot_or_zone_chooses_it_but_gives_a_goal_while_one_is_asked_for(
+    console: SimpleNamespace, stream: ConsoleStream
+) -> None:
+    path = PlanReply(points=[(10.0, 26.0), (15.0, 26.0)], length=5.0)
+    stream.answers["POST plan"] = (200, to_builtins(path))
+    zone = Zone(id="wet", kind="BLOCKED", shape=CircleShape(centre=(15.0, 26.0), radius=3.0), version=1, reason="wet")
+    stream.tell("zone", "wet", {**to_builtins(zone), "active": True})
+    page = await console.open("robots")
+    other = page.locator(".robot-body", has_text="r2").locator(".front")
+    await page.get_by_role("button", name="Send to a goal").click()
+    await expect(page.locator(".floor.picking")).to_be_visible()
+    box = await other.bounding_box()
+    assert box is not None
+    x, y = box["x"] + box["width"] / 2, box["y"] + box["height"] / 2
+    for beside in (0, 16):  # on the robot, and on the zone around it
+        async with page.expect_response("**/plan"):
+            await page.mouse.click(x + beside, y)
+        await expect(page.get_by_text("The path is 5.0 m long.")).to_be_visible()
+    await expect(page.get_by_role("button", name="Stop r1")).to_be_visible()
+    await page.get_by_role("button", name="Cancel", exact=True).click()
+    await expect(page.locator(".floor.picking")).to_have_count(0)
+    await page.mouse.click(x, y)
+    await expect(page.get_by_role("button", name="Stop r2")).to_be_visible()
+    await page.mouse.click(x + 16, y)
+    await expect(page.locator("[data-view=zones]")).to_be_visible()
 
 
 async def test_pose_is_given_by_a_drag_or_by_two_clicks(console: SimpleNamespace, stream: ConsoleStream) -> None:

@@ -91,7 +91,8 @@ class RobotDrawing {
     const { root } = this.parts;
     root.addEventListener("click", (event) => {
       L.DomEvent.stop(event);
-      onChoose();
+      // A drag of the map may begin on a robot. Leaflet's types lack this method of its handler.
+      if (!(this.map.dragging as L.Handler & { moved: () => boolean }).moved()) onChoose();
     });
     root.addEventListener("pointerenter", () => {
       if (this.bodies.lastElementChild !== root) this.bodies.append(root); // above those that it overlaps

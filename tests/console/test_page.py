@@ -3,6 +3,7 @@
 import asyncio
 import json
 import re
+import time
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -144,6 +145,10 @@ async def test_area_is_green_only_while_the_map_confirms_it_and_a_silent_node_gr
     await page.evaluate("location.hash = '#/sensors'")
     node = page.locator("main li.node").first
     await expect(node).to_contain_text(re.compile(r"[3-9] s ago"))
+    # However late the page was opened.
+    stream.tell("node", "n1", {**stream.log["node", "n1"][2]["value"], "heard": time.time() - 600, "age_s": 0.1})
+    stream.cut()
+    await expect(page.locator("main li.node", has_text="n1").first).to_contain_text("10 min ago")
 
 
 async def test_tile_changes_its_cells_of_the_costmap_and_no_others(

@@ -121,6 +121,7 @@ class ConsoleStream:
             self.hazard(area.id, "clear")
         for node in site.nodes:
             health = {"state": "clear", "reason": "nothing near", "code": "", "online": True, "age_s": 0.1}
+            health |= {"heard": time.time() - 0.1}
             self.tell("node", node.id, {**to_builtins(node), **health, "received": 1, "ignored": 0})
 
     def tile(self, column: int, row: int, cells: np.ndarray) -> None:

@@ -60,6 +60,8 @@ export interface Session {
 
 /** A sensor node's or source's health; with a place on the floor if the site says where it hangs. */
 export type NodeValue = Schemas["NodeView"] & {
+  /** When it was heard last (s since the epoch, the server's clock); null: never. */
+  readonly heard: number | null;
   readonly x?: number;
   readonly y?: number;
   readonly theta?: number;

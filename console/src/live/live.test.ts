@@ -44,6 +44,7 @@ test("a robot of which nothing came for two seconds is old, and so is everything
   let now = 0;
   const live = new Live("", () => now);
   say(live, "hello", { run: "a", fresh: true, site: "estig" });
+  say(live, "ready", {});
   say(live, "pose", { id: "r1", value: {} });
   expect(live.oldRobot("r1")).toBe(false);
   now = 2_500;
@@ -55,6 +56,32 @@ test("a robot of which nothing came for two seconds is old, and so is everything
   expect([live.old, live.oldRobot("r1")]).toEqual([true, true]);
 });
 
+test("only what a robot says itself, while this page listens, is a sign of its life", () => {
+  let now = 0;
+  const live = new Live("", () => now);
+  const robot = (clock: number, goal: string | null): void => say(live, "robot", { id: "r1", value: { state: { clock }, goal } });
+  say(live, "hello", { run: "a", fresh: true, site: "estig" });
+  robot(1, null);
+  say(live, "pose", { id: "r1", value: {} });
+  expect(live.robotAge("r1")).toBe(Infinity);
+  say(live, "ready", {});
+  now = 1_000;
+  robot(1, "a goal of the planner");
+  expect(live.robotAge("r1")).toBe(Infinity);
+  robot(2, null);
+  expect(live.robotAge("r1")).toBe(0);
+  now = 5_000;
+  robot(2, "another");
+  expect([live.robotAge("r1"), live.oldRobot("r1")]).toEqual([4_000, true]);
+  say(live, "vitals", { id: "r1", value: {} });
+  expect(live.oldRobot("r1")).toBe(false);
+  // What comes first after a broken connection was said at any time since.
+  now = 9_000;
+  say(live, "hello", { run: "a", fresh: false, site: "estig" });
+  say(live, "pose", { id: "r1", value: {} });
+  expect(live.robotAge("r1")).toBe(4_000);
+});
+
 test("a robot is stopped when it was heard just now, is not enabled, and does not move all the same", () => {
   let now = 0;
   const live = new Live("", () => now);
@@ -63,6 +90,7 @@ test("a robot is stopped when it was heard just now, is not enabled, and does no
     return live.isStopped("r1");
   };
   expect(live.isStopped("r1")).toBe(false);
+  say(live, "ready", {});
   expect(["HOLD", "PROTECTIVE_STOP", "FAULT"].map((mode) => stopped(mode, false))).toEqual([true, true, true]);
   expect(["EGRESS", "DOCK", "TELEOP"].map((mode) => stopped(mode, false))).toEqual([false, false, false]);
   expect(stopped("HOLD", true)).toBe(false);

@@ -13,6 +13,9 @@ const RECORDS_MAX = 500;
 /** Data older than this (ms) is shown as old. */
 export const OLD_MS = 2_000;
 
+/** What robots say; of `robot` the planner says a part. */
+const SAID_BY_ROBOT: ReadonlySet<Kind> = new Set(["pose", "obstacles", "scan", "vitals"]);
+
 /** Modes in which a robot moves that is not enabled. */
 const MANEUVERS: ReadonlySet<string> = new Set(["EGRESS", "DOCK", "TELEOP"]);
 
@@ -36,7 +39,10 @@ export class Live {
   /** The server's time (s since the epoch). */
   serverTime = 0;
   private heardAt: number;
-  private readonly arrivals = new Map<string, number>();
+  /** When each robot last said something itself: the planner goes on about one that is off. */
+  private readonly signs = new Map<string, number>();
+  /** What comes is news; before, it is what was said while nobody listened. */
+  private hasCaughtUp = false;
   private readonly listeners = new Map<Topic, Set<(key: string) => void>>();
   private readonly stream: Stream;
 
@@ -90,14 +96,14 @@ export class Live {
     return this.now() - this.heardAt;
   }
 
-  /** How long ago (ms) an entry arrived; those of before a broken connection count from before. */
-  age(kind: Kind, id: string): number {
-    return this.now() - (this.arrivals.get(`${kind} ${id}`) ?? -Infinity);
+  /** How long ago (ms) a robot was heard; Infinity: not since this page listens. */
+  robotAge(id: string): number {
+    return this.now() - (this.signs.get(id) ?? -Infinity);
   }
 
   /** Whether what is known of a robot is too old to be shown as present. */
   oldRobot(id: string): boolean {
-    return this.old || Math.min(this.age("pose", id), this.age("robot", id)) > OLD_MS;
+    return this.old || this.robotAge(id) > OLD_MS;
   }
 
   /** Whether a robot is known to be stopped: it was heard just now, is not enabled, and makes no maneuver. */
@@ -119,7 +125,7 @@ export class Live {
         this.hello(value as Hello);
         break;
       case "ready":
-        this.ready = true;
+        this.ready = this.hasCaughtUp = true;
         this.tell("ready", "");
         break;
       case "time":
@@ -146,19 +152,26 @@ export class Live {
   }
 
   private takeEntry<K extends Kind>(kind: K, entry: { id: string; value: Values[K] | null }): void {
+    if (this.hasCaughtUp && this.isSign(kind, entry)) this.signs.set(entry.id, this.now());
     if (entry.value === null) this.of[kind].delete(entry.id);
     else this.of[kind].set(entry.id, entry.value);
-    this.arrivals.set(`${kind} ${entry.id}`, this.now());
     this.tell(kind, entry.id);
+  }
+
+  /** Whether an entry tells that its robot lives: what it said, or a state of it that is another one than before. */
+  private isSign(kind: Kind, { id, value }: { readonly id: string; readonly value: unknown }): boolean {
+    if (kind !== "robot") return value !== null && SAID_BY_ROBOT.has(kind);
+    const state = (value as Values["robot"] | null)?.state;
+    return !!state && JSON.stringify(state) !== JSON.stringify(this.of.robot.get(id)?.state);
   }
 
   private hello(hello: Hello): void {
     this.site = hello.site;
+    this.hasCaughtUp = false;
     if (!hello.fresh) return;
     this.ready = false;
     this.tiles.clear();
     this.records = [];
-    this.arrivals.clear();
     for (const kind of KINDS) {
       this.of[kind].clear();
       this.tell(kind, "");

@@ -28,9 +28,9 @@ const FRAME_MS = 500;
 function show(live: Live, frame: Frame, fresh: boolean): void {
   const take = (event: string, data: unknown): void => live.take({ event, data: JSON.stringify(data), id: null });
   if (fresh) take("hello", { run: "past", fresh: true, site: "" });
+  if (fresh) take("ready", {}); // what follows is of that time
   for (const { event, data } of frame.events) take(event, data);
   take("time", { stamp: frame.stamp });
-  if (fresh) take("ready", {});
 }
 
 export function Replay(): preact.JSX.Element {

@@ -98,7 +98,7 @@ function Facts({ id, robot }: { readonly id: string; readonly robot: Values["rob
       <dt>{t("robot.battery")}</dt>
       <dd>{percent(state?.battery)}{power?.voltage_v != null && ` · ${decimal(power.voltage_v, 1)} V`}{charging && ` · ${t("robot.charging")}`}</dd>
       <dt>{t("robot.profile")}</dt><dd>{state?.profile ?? "–"}</dd>
-      <dt>{t("robot.heard")}</dt><dd>{heard(Math.min(live.age("robot", id), live.age("pose", id)))}</dd>
+      <dt>{t("robot.heard")}</dt><dd>{heard(live.robotAge(id))}</dd>
     </dl>
   );
 }

@@ -53,7 +53,7 @@ export function SensorsView(): preact.JSX.Element {
       <h2>{t("sensors.nodes")}</h2>
       <ul class="rows">
         {nodes.map(([id, node]) => (
-          <NodeRow key={id} id={id} node={node} onShow={node.x === undefined ? null : () => floor?.show([[node.x ?? 0, node.y ?? 0]])} />
+          <NodeRow key={id} node={node} onShow={node.x === undefined ? null : () => floor?.show([[node.x ?? 0, node.y ?? 0]])} />
         ))}
       </ul>
       <Latency />
@@ -66,24 +66,23 @@ function nameOf({ definition }: AreaView): string {
 }
 
 interface RowProps {
-  /** What the stream calls it. */
-  readonly id: string;
   readonly node: NodeValue;
   /** Shows where it hangs; null where nobody says. */
   readonly onShow: (() => void) | null;
 }
 
-function NodeRow({ id, node, onShow }: RowProps): preact.JSX.Element {
+function NodeRow({ node, onShow }: RowProps): preact.JSX.Element {
   const { live } = useConsole();
   useSeconds();
-  // What is told of a node may have been its last word: it grows older here.
+  // What is told of a node may have been its last word: it grows older here, also while the server is silent.
+  const now = (live.serverTime || Date.now() / 1000) + live.silence / 1000;
   const health = node.online === false ? t("sensors.offline") : t(`state.${node.state}`);
   return (
     <li class="row node">
       <span class={`swatch ${node.state}`} aria-hidden="true" />
       <b><bdi>{node.id}</bdi></b>
       <a href={routeHash("sensors", node.area)}><bdi>{node.area}</bdi></a>
-      <span class="value">{health}{node.age_s !== null && ` · ${t("ago", { age: duration(node.age_s + live.age("node", id) / 1000) })}`}</span>
+      <span class="value">{health}{node.heard !== null && ` · ${t("ago", { age: duration(now - node.heard) })}`}</span>
       <span class="why"><bdi>{said(node.code, node.reason)}</bdi>{node.code !== "" && <code> {node.code}</code>}</span>
       {onShow && <button aria-label={t("zones.showOf", { zone: node.id })} onClick={onShow}>{t("zones.show")}</button>}
       <details>
@@ -124,7 +123,7 @@ function AreaCard({ area, nodes, onPlace }: CardProps): preact.JSX.Element {
       </div>
       {mayOperate(session) && <Override area={area} />}
       <h3>{t("sensors.nodes")}</h3>
-      <ul class="rows">{nodes.map(([id, node]) => <NodeRow key={id} id={id} node={node} onShow={null} />)}</ul>
+      <ul class="rows">{nodes.map(([id, node]) => <NodeRow key={id} node={node} onShow={null} />)}</ul>
       <History area={definition.id} since={hazard?.since ?? 0} now={live.serverTime || Date.now() / 1000} />
     </>
   );

@@ -1,4 +1,4 @@
-"""What the console tells of areas: what is measured, and what of that the map shows."""
+"""What the console tells of areas and nodes: what is measured, and what of that the map shows."""
 
 from __future__ import annotations
 
@@ -10,6 +10,7 @@ from msgspec import structs, to_builtins
 
 from console_service.areas import MAP_SILENT_S
 from console_service.core import ConsoleCore
+from console_service.sources import by_id
 from fog_contracts import channels as ch
 from fog_contracts.handlers import Moment
 from fog_contracts.messages import AreaHazard, HazardArea, MapHeartbeat
@@ -43,6 +44,10 @@ class Hall:
         self.core.tick(Moment(self.now, 1e9 + self.now))
 
     @property
+    def floor(self) -> dict[str, list[str]]:
+        return self.core.floor(self.now)[1]
+
+    @property
     def on_map(self) -> dict[str, Any] | None:
         return json.loads(self.core.log.data("area", "hall"))["value"]["on_map"]
 
@@ -63,6 +68,29 @@ def test_area_is_told_with_what_the_map_shows_and_with_nothing_while_the_map_ser
     assert hall.on_map is None
     hall.beat()
     assert hall.on_map == {"state": "clear", "penalty": 0, "confirmed": True}
+
+
+def test_floor_lists_an_area_as_clear_only_while_the_map_confirms_it():
+    hall = Hall()
+    assert hall.floor == {"unknown": ["hall"]}
+    hall.map_shows(CLEAR)
+    hall.beat()
+    assert hall.floor == {"clear": ["hall"]}
+    hall.map_shows(CLEAR, confirmed=False)
+    assert hall.floor == {"unknown": ["hall"]}
+    hall.map_shows(CLEAR)
+    hall.wait(MAP_SILENT_S + 0.1)
+    assert hall.floor == {"unknown": ["hall"]}
+    hall.hear(ch.AREA_HAZARD, structs.replace(BLOCKED, seq=6))
+    assert hall.floor == {"blocked": ["hall"]}, "whether the map has it or not"
+
+
+def test_node_is_told_with_the_moment_at_which_it_was_heard():
+    node = {"id": "n1", "area": "hall", "age_s": 2.5}
+    assert by_id("node", [node, {**node, "id": "n2", "age_s": None}], 1000.0) == {
+        "n1": {**node, "heard": 997.5},
+        "n2": {**node, "id": "n2", "age_s": None, "heard": None},
+    }
 
 
 @pytest.mark.parametrize("shown", [BLOCKED, structs.replace(CLEAR, seq=4), structs.replace(CLEAR, epoch=2, seq=9)])

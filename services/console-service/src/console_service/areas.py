@@ -9,7 +9,7 @@ import math
 from typing import TYPE_CHECKING, Any, Final
 
 if TYPE_CHECKING:
-    from fog_contracts.messages import HazardArea
+    from fog_contracts.messages import AreaState, HazardArea
 
 MAP_SILENT_S: Final = 2.0
 """After so long without its heartbeat the map-service is silent: nobody confirms what areas are."""
@@ -47,3 +47,10 @@ class ShownAreas:
         on_map = shown.hazard
         is_same = hazard is not None and (hazard["epoch"], hazard["seq"]) == (on_map.epoch, on_map.seq)
         return {"state": on_map.state, "penalty": on_map.penalty, "confirmed": shown.confirmed and is_same}
+
+    def state(self, area: str, hazard: Any) -> AreaState:  # noqa: ANN401  # JSON
+        """Return what an area whose latest hazard is this (None: nobody knows) counts as: clear only if confirmed."""
+        if hazard is None or hazard["state"] != "clear":
+            return "unknown" if hazard is None else hazard["state"]
+        shown = self.view(area, hazard)
+        return "clear" if shown is not None and shown["confirmed"] and shown["state"] == "clear" else "unknown"

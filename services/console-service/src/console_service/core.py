@@ -55,7 +55,7 @@ _EARLY_S: Final = 0.02
 """How much earlier one may come: robots send as often themselves."""
 REFRESH_S: Final = 10.0
 """How often what always changes (`VOLATILE`) is told when nothing else does."""
-VOLATILE: Final[Mapping[str, Sequence[str]]] = {"area": ("rest_s",), "node": ("age_s", "received", "ignored")}
+VOLATILE: Final[Mapping[str, Sequence[str]]] = {"area": ("rest_s",), "node": ("age_s", "heard", "received", "ignored")}
 FORGET_S: Final = 600.0
 """A robot that is not of the site is forgotten after so long without a message of it, or about it."""
 RECORDS: Final = 200
@@ -302,7 +302,7 @@ class ConsoleCore:
         return [] if known is None else list(known.vitals)
 
     def floor(self, now: float) -> tuple[list[FloorRobot], dict[AreaState, list[str]]]:
-        """Return the robots of this floor at `now` (s, monotonic), and its areas by their state, sorted."""
+        """Return the robots of this floor at `now` (s, monotonic), and its areas by what they count as, sorted."""
         robots = [
             FloorRobot(
                 id=robot,
@@ -315,8 +315,7 @@ class ConsoleCore:
         ]
         areas: dict[AreaState, list[str]] = {}
         for area, value in sorted(self._fetched["area"].items()):
-            if (hazard := value.get("hazard")) is not None:
-                areas.setdefault(hazard["state"], []).append(area)
+            areas.setdefault(self._shown.state(area, value.get("hazard")), []).append(area)
         return robots, areas
 
     def scan(self, robot: str) -> bytes | None:

@@ -78,7 +78,7 @@ class Sources:
         try:
             answer = await self._client.get(PATHS[event])
             answer.raise_for_status()
-            things = by_id(event, answer.json())
+            things = by_id(event, answer.json(), self._clock.stamp())
         except (httpx.HTTPError, ValueError, KeyError, TypeError) as error:
             self._tell(event, f"{self._client.base_url}{PATHS[event]}: {error!r}")
             return
@@ -109,9 +109,16 @@ class Sources:
             await asyncio.sleep(RECORDS_S)
 
 
-def by_id(event: Fetched, found: list[dict[str, Any]]) -> dict[str, Any]:
-    """Return what REST lists by its ids: a node that watches several areas is one thing in each, `AREA/NODE`."""
+def by_id(event: Fetched, found: list[dict[str, Any]], stamp: float) -> dict[str, Any]:
+    """Return what REST lists, at `stamp` (s since the epoch), by its ids.
+
+    A node that watches several areas is one thing in each, `AREA/NODE`. `heard` is when it was heard last: that stays
+    true for as long as the event is kept, and its age does not.
+    """
     if event == "area":
         return {each["definition"]["id"]: each for each in found}
+    if event == "node":
+        for each in found:
+            each["heard"] = None if each["age_s"] is None else round(stamp - each["age_s"], 1)
     count = Counter(each["id"] for each in found)
     return {each["id"] if count[each["id"]] == 1 else f"{each['area']}/{each['id']}": each for each in found}

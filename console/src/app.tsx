@@ -16,6 +16,7 @@ import { FloorsView, useFloorCount } from "./views/floors";
 import { MapView } from "./views/map";
 import { RobotsView } from "./views/robots";
 import { ScenarioView } from "./views/scenario";
+import { SchedulesView } from "./views/schedules";
 import { SensorsView } from "./views/sensors";
 import { TimelineView } from "./views/timeline";
 import { ZonesView } from "./views/zones";
@@ -24,6 +25,7 @@ const PANELS: Readonly<Record<View, () => preact.JSX.Element>> = {
   map: MapView,
   zones: ZonesView,
   robots: RobotsView,
+  schedules: SchedulesView,
   sensors: SensorsView,
   timeline: TimelineView,
   floors: FloorsView,

@@ -1,11 +1,13 @@
 // What every view can use: the live state, who is logged in, the map, and messages to the user.
 import { createContext } from "preact";
-import { useContext, useEffect, useReducer, useRef } from "preact/hooks";
+import { useContext, useEffect, useReducer, useRef, useState } from "preact/hooks";
+import { request } from "./api/client";
 import type { Session } from "./api/types";
 import { drawInTurn } from "./frames";
 import type { Live, Topic } from "./live/live";
 import type { Floor } from "./map/floor";
 import type { Scenario } from "./scenario";
+import { sentence } from "./stop";
 
 /**
  * Say something in the live region: a result of what the user did, or a change that matters. It goes after a while, and
@@ -100,6 +102,45 @@ export function useSeconds(): void {
       waiting.delete(redraw);
     };
   }, []);
+}
+
+interface Read<T> {
+  /** null: it was not read yet. */
+  readonly value: T | null;
+  /** Why it could not be read the last time; empty if it could. */
+  readonly problem: string;
+}
+
+/** So long (ms) after a change it is read again: changes come together. */
+const SOON_MS = 500;
+
+/** Return what a path of REST has, read again when something in these topics changes, every `period` ms, and by `again`. */
+export function useRead<T>(path: string, topics: readonly Topic[], period?: number): Read<T> & { readonly again: () => void } {
+  const { live } = useConsole();
+  const [read, setRead] = useState<Read<T>>({ value: null, problem: "" });
+  const [turn, again] = useReducer((count: number) => count + 1, 0);
+  const key = topics.join(" ");
+  useEffect(() => {
+    let wanted = true;
+    let soon: ReturnType<typeof setTimeout> | undefined;
+    const look = (): void => {
+      soon = undefined;
+      void request<T>("GET", path).then(
+        ({ value }) => wanted && setRead({ value, problem: "" }),
+        (error: unknown) => wanted && setRead((before) => ({ ...before, problem: sentence(error) })),
+      );
+    };
+    look();
+    const off = live.on(key.split(" ") as Topic[], () => void (soon ??= setTimeout(look, SOON_MS)));
+    const timer = period === undefined ? undefined : setInterval(look, period);
+    return () => {
+      wanted = false;
+      off();
+      clearInterval(timer);
+      clearTimeout(soon);
+    };
+  }, [live, path, key, period, turn]);
+  return { ...read, again: () => again(0) };
 }
 
 /** Bring a panel into view when it opens, with the focus in its first field. */

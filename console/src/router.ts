@@ -1,7 +1,7 @@
 // Which view is shown stands behind the address's #, so that it can be bookmarked and the browser's "back" works.
 import { useEffect, useState } from "preact/hooks";
 
-export const VIEWS = ["map", "zones", "robots", "sensors", "timeline", "floors", "scenario"] as const;
+export const VIEWS = ["map", "zones", "robots", "schedules", "sensors", "timeline", "floors", "scenario"] as const;
 export type View = (typeof VIEWS)[number];
 
 export interface Route {

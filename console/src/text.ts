@@ -13,6 +13,20 @@ export function clockTime(stamp: number, now: number = Date.now()): string {
   });
 }
 
+/** Return a moment (s since the epoch) by the clocks of a time zone, which is named; this browser's, if it does not know it. */
+export function zonedTime(stamp: number, zone: string): string {
+  const format = (timeZone?: string): Intl.DateTimeFormat => new Intl.DateTimeFormat(language(), {
+    weekday: "short", day: "numeric", month: "short", hour: "2-digit", minute: "2-digit", hourCycle: "h23", timeZone,
+  });
+  const at = new Date(stamp * 1000);
+  try {
+    return `${format(zone).format(at)} (${zone})`;
+  } catch {
+    const own = format();
+    return `${own.format(at)} (${own.resolvedOptions().timeZone})`;
+  }
+}
+
 /** Return a number with a fixed number of decimals. */
 export function decimal(value: number, digits: number): string {
   // A format is expensive to make, and used many times a second.

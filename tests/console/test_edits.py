@@ -1,4 +1,4 @@
-"""What people change in the console, in a real Chromium: zones and their sets, areas, places, the map."""
+"""What people change in the console, in a real Chromium: zones, sets, schedules, areas, places, the map."""
 
 import asyncio
 import base64
@@ -6,7 +6,7 @@ from pathlib import Path
 from types import SimpleNamespace
 
 import pytest
-from console_stream import TOKEN, ConsoleStream
+from console_stream import PHONE, TOKEN, ConsoleStream, schedule
 from msgspec import to_builtins
 from playwright.async_api import Route, expect
 
@@ -145,6 +145,98 @@ async def test_operator_sets_the_times_of_a_set_of_zones_and_mutes_a_source(
     assert sent["PUT zone-sources/door"] == {"muted": True}
     (window,) = sent["PUT zone-sets/night"]["schedule"]["times"]
     assert (window["begin"], window["end"]) == ("22:00", "06:00")
+
+
+async def test_missions_by_the_clock_are_listed_switched_and_deleted_and_a_deletion_taken_back(
+    console: SimpleNamespace, stream: ConsoleStream
+) -> None:
+    monday = 1_795_993_200.0  # 2026-11-30, 08:00 in Tokyo
+    missed = {
+        "begin": monday - 604_800,
+        "at": monday,
+        "outcome": "missed",
+        "mission": None,
+        "reason": "r2 was not free",
+    }
+    post = schedule("post", begin=monday, last=missed)
+    waits = schedule("early", begin=monday + 604_800, waits="robot r2 has another mission")
+    stream.answers["GET schedules"] = (200, [waits, schedule("off", begin=None, enabled=False), post])
+    page = await console.open("schedules")
+    rows = page.locator("main li")
+    await expect(rows.nth(0)).to_contain_text("Due, but robot r2 has another mission")
+    await expect(rows.nth(1)).to_contain_text("postr2next Mon, Nov 30, 08:00 (Asia/Tokyo)")
+    await expect(rows.nth(1)).to_contain_text("A, west entrance → 3.0, 4.5")
+    await expect(rows.nth(1)).to_contain_text("Last: Mon, Nov 23, 08:00 (Asia/Tokyo), missed: r2 was not free")
+    await expect(rows.nth(2)).to_contain_text("switched off")
+    stored = {name: post[name] for name in ("robot", "mission", "weekly")}
+
+    refused = {"type": "urn:fognav:role_too_low", "detail": "ana is a viewer: this needs the role operator."}
+    stream.answers["PUT schedules/post"] = (403, refused)
+    await page.get_by_role("button", name="Switch off schedule post").click()
+    await expect(page.locator(".said.failed")).to_have_text(
+        "Schedule post is as it was: ana is a viewer: this needs the role operator."
+    )
+    stream.answers["PUT schedules/post"] = (200, {**post, "enabled": False})
+    async with page.expect_request("**/schedules/post") as sent:
+        await page.get_by_role("button", name="Switch off schedule post").press("Enter")
+    assert (await sent.value).headers["if-match"] == '"7"'
+    await expect(page.locator(".said.done")).to_contain_text("Schedule post is switched off.")
+    assert [body for name, body in stream.requests if name == "PUT schedules/post"][-1] == {**stored, "enabled": False}
+
+    await page.get_by_role("button", name="Delete schedule post").click()
+    async with page.expect_request(lambda request: request.method == "PUT") as sent:
+        await page.locator(".undo").get_by_role("button", name="Undo").click()
+    assert (await sent.value).headers["if-none-match"] == "*"
+    await expect(page.locator(".said")).to_contain_text("Schedule post is back.")
+    await expect(page.locator(".undo")).to_have_count(0)
+    assert [body for name, body in stream.requests if name == "PUT schedules/post"][-1] == {**stored, "enabled": True}
+    assert stream.asked("DELETE") == ["DELETE schedules/post"]
+
+
+async def test_operator_lets_a_mission_begin_by_the_clock_by_keyboard_and_a_viewer_only_reads(
+    console: SimpleNamespace, stream: ConsoleStream
+) -> None:
+    post = schedule("post", begin=1_795_993_200.0)
+    stream.answers["GET schedules"] = (200, [post])
+    page = await console.open("schedules", **PHONE, timezone_id="Europe/Lisbon")
+    await page.get_by_role("button", name="New schedule").press("Enter")
+    await expect(page.get_by_label("Name")).to_be_focused()
+    await page.keyboard.type("post")
+    await page.get_by_label("Robot").select_option("r2")
+    await page.get_by_role("combobox", name="Place 1").select_option("b")
+    await page.get_by_role("button", name="One more place").press("Enter")
+    await page.get_by_role("combobox", name="Place 2").select_option("a")
+    for day in ("Mon", "Tue"):
+        await page.get_by_label(day).uncheck()
+    exists = {"type": "urn:fognav:schedule_changed", "detail": "read it again"}
+    stream.answers["PUT schedules/post"] = (412, exists)
+    await page.get_by_label("Name").press("Enter")
+    await expect(page.get_by_role("alert")).to_have_text("There is a schedule post already: choose another name.")
+    await page.get_by_label("Name").fill("letters")
+    await page.get_by_role("button", name="Save").press("Enter")
+    await expect(page.locator(".said")).to_have_text("Schedule letters is saved.")
+    times = [{"days": ["wed", "thu", "fri"], "begin": "08:00", "end": "09:00"}]
+    assert next(body for name, body in stream.requests if name == "PUT schedules/letters") == {
+        "robot": "r2",
+        "mission": {"stops": [{"place": "b"}, {"place": "a"}]},
+        "weekly": {"time_zone": "Europe/Lisbon", "times": times},
+        "enabled": True,
+    }
+
+    # What the form does not show stays as it is.
+    stream.answers["PUT schedules/post"] = (200, post)
+    await page.get_by_role("button", name="Edit schedule post").click()
+    await page.get_by_role("button", name="Remove place 1").click()
+    await page.get_by_role("button", name="Save").click()
+    await expect(page.locator(".said")).to_have_text("Schedule post is saved.")
+    kept = {**post["mission"], "stops": [post["mission"]["stops"][1]]}
+    assert [body for name, body in stream.requests if name == "PUT schedules/post"][-1]["mission"] == kept
+
+    stream.role = "viewer"
+    await page.reload()
+    await expect(page.get_by_text("Your role, viewer, may look but not change this.")).to_be_visible()
+    await expect(page.locator("main li")).to_contain_text("post")
+    await expect(page.locator("main").get_by_role("button")).to_have_count(0)
 
 
 async def test_admin_opens_a_place_to_visitors_and_prints_its_code_without_a_shell(

@@ -23,8 +23,10 @@ from PIL import Image
 
 from console_service.api import PAGE
 from console_service.page_files import PageFiles
-from fog_contracts.messages import AreaDefinition, AreaHazard, RobotPose, RobotState
+from fog_contracts.messages import AreaDefinition, AreaHazard, RobotPose, RobotState, WeeklySchedule, WeeklyTime
 from fog_supervisor import net
+from planner.schedules.api import ScheduleView
+from planner.stops import GoalBody, GoalPose, MissionBody
 
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator
@@ -36,7 +38,7 @@ TOKEN = "a-token"
 FLAGS = ["--no-sandbox", "--disable-gpu", "--disable-dev-shm-usage", "--disable-background-networking"]
 PHONE = {"viewport": {"width": 390, "height": 844}, "has_touch": True, "is_mobile": True}
 WIDE = {"viewport": {"width": 1440, "height": 900}}
-VIEWS = ("map", "zones", "robots", "sensors", "timeline")
+VIEWS = ("map", "zones", "robots", "schedules", "sensors", "timeline")
 
 
 def png(cells: np.ndarray) -> bytes:
@@ -54,6 +56,16 @@ def robot_pose(x: float, y: float, theta: float) -> RobotPose:
     return RobotPose(
         x=x, y=y, theta=theta, covariance=[0.0] * 9, v=0.25, w=0.0, radius=0.17, height=0.1, stamp=time.time()
     )
+
+
+def schedule(name: str, *, begin: float | None, **changed: object) -> dict[str, object]:
+    """Return a mission by the clock as the planner lists it, whose next window begins at a time."""
+    weekly = WeeklySchedule(time_zone="Asia/Tokyo", times=[WeeklyTime(days=["mon"], begin="08:00", end="09:00")])
+    mission = MissionBody(stops=[GoalBody(place="a"), GoalBody(pose=GoalPose(x=3.0, y=4.5))], deadline_s=600.0)
+    view = ScheduleView(
+        id=name, robot="r2", mission=mission, weekly=weekly, author="ana", since=1.0, version="7", next=begin, waits=""
+    )
+    return {**to_builtins(view), **changed}
 
 
 class ConsoleStream:

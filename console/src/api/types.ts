@@ -36,6 +36,10 @@ export type Pose = Schemas["Pose"];
 export type PublicPlace = Schemas["PublicPlace"];
 export type RobotPose = Schemas["RobotPose"];
 export type RobotState = Schemas["RobotState"];
+export type ScheduleBody = Omit<Sent<Schemas["ScheduleBody"], "robot" | "weekly">, "mission"> & {
+  readonly mission: Omit<Sent<Schemas["MissionBody"]>, "stops"> & { readonly stops: readonly GoalBody[] };
+};
+export type ScheduledMission = Schemas["ScheduleView"];
 export type ServiceBody = Sent<Schemas["ServiceBody"], "reason">;
 export type SetView = Schemas["SetView"];
 export type Shape = Schemas["Zone"]["shape"];

@@ -1,8 +1,7 @@
 // What happened, newest first, by whom; and the last hour on a map.
-import { useEffect, useState } from "preact/hooks";
-import { request } from "../api/client";
+import { useState } from "preact/hooks";
 import type { TimelineEntry } from "../api/types";
-import { mayOperate, useConsole } from "../context";
+import { mayOperate, useConsole, useRead } from "../context";
 import { t } from "../i18n/i18n";
 import { detailText, entryText, KINDS, undoable } from "../past/entries";
 import { Replay } from "../past/replay";
@@ -14,37 +13,14 @@ import "../zones/zones.css";
 const PAGE = 50;
 const MOST = 500;
 const AGAIN_MS = 10_000;
-const SOON_MS = 500;
 
 export function TimelineView(): preact.JSX.Element {
-  const { live, session, say } = useConsole();
+  const { session, say } = useConsole();
   const [kind, setKind] = useState("");
   const [limit, setLimit] = useState(PAGE);
-  const [entries, setEntries] = useState<readonly TimelineEntry[] | null>(null);
-  const [problem, setProblem] = useState("");
   const [replays, setReplays] = useState(false);
   const query = `limit=${limit}${kind === "" ? "" : `&kind=${kind}`}`;
-
-  useEffect(() => {
-    let wanted = true;
-    let soon: ReturnType<typeof setTimeout> | undefined;
-    const read = (): void => void request<TimelineEntry[]>("GET", `timeline?${query}`).then(({ value }) => {
-      if (wanted) [setEntries(value), setProblem("")];
-    }, (error: unknown) => wanted && setProblem(sentence(error)));
-    read();
-    const timer = setInterval(read, AGAIN_MS);
-    const off = live.on(["record"], () => {
-      clearTimeout(soon);
-      soon = setTimeout(read, SOON_MS);
-    });
-    return () => {
-      wanted = false;
-      off();
-      clearInterval(timer);
-      clearTimeout(soon);
-    };
-  }, [live, query]);
-
+  const { value: entries, problem } = useRead<TimelineEntry[]>(`timeline?${query}`, ["record"], AGAIN_MS);
   const undone = undoable(entries ?? []);
   const undo = (entry: TimelineEntry): void => {
     const service = undone.get(entry.entry);

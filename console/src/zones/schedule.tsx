@@ -1,4 +1,4 @@
-// The times of the week in which a zone is in force.
+// The times of the week in which a zone is in force, or a mission begins.
 import { t } from "../i18n/i18n";
 import { Typed } from "../typed";
 import { DAYS, type Schedule } from "./draft";
@@ -11,10 +11,13 @@ interface Props {
 type Times = Schedule["times"];
 const WORKDAYS: Times[number] = { days: ["mon", "tue", "wed", "thu", "fri"], begin: "08:00", end: "18:00" };
 
+/** Return times of the week to begin with: workdays from 08:00, by this browser's clock. */
+export const newSchedule = (end = WORKDAYS.end): Schedule =>
+  ({ time_zone: Intl.DateTimeFormat().resolvedOptions().timeZone, times: [{ ...WORKDAYS, end }] });
+
 export function ScheduleFields({ schedule, onChange }: Props): preact.JSX.Element {
-  const zone = Intl.DateTimeFormat().resolvedOptions().timeZone;
   if (schedule === null) {
-    return <button type="button" onClick={() => onChange({ time_zone: zone, times: [WORKDAYS] })}>{t("schedule.add")}</button>;
+    return <button type="button" onClick={() => onChange(newSchedule())}>{t("schedule.add")}</button>;
   }
   const set = (times: Times): void => onChange(times.length === 0 ? null : { ...schedule, times });
   const change = (index: number, to: Partial<Times[number]>): void =>

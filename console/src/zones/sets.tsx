@@ -1,39 +1,17 @@
 // Sets of zones that are switched together.
-import { useEffect, useState } from "preact/hooks";
+import { useState } from "preact/hooks";
 import { request } from "../api/client";
 import type { SetView, ZoneSourceView } from "../api/types";
-import { mayOperate, useConsole } from "../context";
+import { mayOperate, useConsole, useRead } from "../context";
 import { t } from "../i18n/i18n";
 import { sentence } from "../stop";
 import type { Schedule } from "./draft";
 import { ScheduleFields, scheduleText } from "./schedule";
 
-const SOON_MS = 500;
 const path = (id: string): string => `zone-sets/${encodeURIComponent(id)}`;
 
-/** Return a list as it is, read again whenever a zone or a record changes; null before it is known. */
-function useList<T>(list: string): readonly T[] | null {
-  const { live } = useConsole();
-  const [found, setFound] = useState<readonly T[] | null>(null);
-  useEffect(() => {
-    let wanted = true;
-    let soon: ReturnType<typeof setTimeout> | undefined;
-    const read = (): void => {
-      soon = undefined;
-      void request<T[]>("GET", list).then(({ value }) => wanted && setFound(value), () => undefined);
-    };
-    read();
-    const off = live.on(["zone", "record", "ready"], () => void (soon ??= setTimeout(read, SOON_MS)));
-    return () => {
-      wanted = false;
-      off();
-      clearTimeout(soon);
-    };
-  }, [live, list]);
-  return found;
-}
-
-export const useSets = (): readonly SetView[] | null => useList<SetView>("zone-sets");
+const TOPICS = ["zone", "record", "ready"] as const;
+export const useSets = (): readonly SetView[] | null => useRead<SetView[]>("zone-sets", TOPICS).value;
 
 /** The sets with their switches, and a new one. */
 export function SetList(): preact.JSX.Element | null {
@@ -104,7 +82,7 @@ function SetTimes({ set, onSave }: TimesProps): preact.JSX.Element {
 /** The sources that put zones over MQTT, which an operator can mute. */
 export function SourceList(): preact.JSX.Element | null {
   const { session, say } = useConsole();
-  const sources = useList<ZoneSourceView>("zone-sources") ?? [];
+  const sources = useRead<ZoneSourceView[]>("zone-sources", TOPICS).value ?? [];
   if (sources.length === 0) return null;
   const mute = (source: ZoneSourceView): void => void request("PUT", `zone-sources/${encodeURIComponent(source.id)}`, {
     body: { muted: !source.muted }, headers: { "If-Match": `"${source.version}"` },

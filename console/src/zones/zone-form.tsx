@@ -136,7 +136,7 @@ export function ZoneForm({ editor, onSaved, onCancel }: Props): preact.JSX.Eleme
 }
 
 /** Return a refusal with the fields that it names. */
-function refusal(error: unknown): string {
+export function refusal(error: unknown): string {
   if (!(error instanceof Problem) || !Array.isArray(error.extra.errors)) return sentence(error);
   const named = (error.extra.errors as { field?: string; problem?: string }[])
     .map(({ field = "", problem = "" }) => `${field.replace(/^body\.?/, "")}: ${problem}`.replace(/^: /, ""));

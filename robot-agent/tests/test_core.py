@@ -32,6 +32,7 @@ from fog_contracts.replica import MapError, MasterMap
 from fog_kernels.inflation import inflate
 from robot_agent.agent.core import AgentCore
 from robot_agent.agent.hand_driving import TakeOver
+from robot_agent.hardware import ON_CHARGER
 from robot_agent.motion.local_planner import decide
 from robot_agent.scan_builder import Mounting
 
@@ -831,6 +832,18 @@ def test_a_mode_that_a_robot_standing_by_finds_is_published_with_the_next_tick(w
     assert agent.standing_by
     world.published = agent.tick(world.moment)
     assert [state.mode for state in world.published_on(ch.ROBOT_STATE)] == ["FAULT"]
+
+
+def test_a_docked_robot_with_a_mission_that_sees_nothing_behind_stays_enabled_on_its_dock_and_says_why():
+    world = LittleWorld(pose=(1.4, 2.0, 0.0), glass=[(0.9, 0.9, 1.05, 3.1)]).ready()
+    world.docked, world.stopped = True, ON_CHARGER
+    world.drive_to(L_PATH)
+    world.run(1.0)
+    assert world.command("enable").accepted
+    world.run(1.0)
+    state = world.state()
+    assert (state.mode, state.enabled) == ("HOLD", True)
+    assert any("leave its dock" in reason and "sees nothing behind" in reason for reason in state.reasons)
 
 
 def test_a_robot_that_was_sent_to_its_dock_stands_by_only_when_it_has_given_up():

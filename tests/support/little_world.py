@@ -101,7 +101,7 @@ class LittleWorld:
         self.scan_started = self.now
         self.lidar_on = self.heartbeats_on = self.base_on = True
         self.link_delay = self.link_delay_growth = 0.0  # of heartbeats: s, and s per s
-        self.bumper = self.wheel_drop = False
+        self.bumper = self.wheel_drop = self.docked = False
         self.fault = None
         self.bumped = False
         self.stopped = self.guardian_wrap = None
@@ -238,7 +238,13 @@ class LittleWorld:
             self.agent.on_base(
                 BaseFeedback(
                     seq=self.steps,
-                    status=BaseStatus(bumper_left=self.bumper, wheel_drop=self.wheel_drop, battery=0.8),
+                    status=BaseStatus(
+                        bumper_left=self.bumper,
+                        wheel_drop=self.wheel_drop,
+                        battery=0.8,
+                        charging=self.docked,
+                        docked=self.docked,
+                    ),
                     odometry=WheelOdometry(left_m=left, right_m=right),
                     fault=self.fault,
                     bumped=self.bumped,

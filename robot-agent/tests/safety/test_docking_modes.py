@@ -229,6 +229,7 @@ def test_mission_with_released_path_takes_an_enabled_robot_off_its_dock():
         {"path_problem": "blocked"},
         {"plan_age": math.inf, "released_remaining": 0.0},
         {"resting": "waking up"},
+        {"blind_behind": "the lidar sees nothing behind"},
         *(changes for changes, _ in STOPS),
         {"base_stopped": "not ready"},
     ],

@@ -276,7 +276,10 @@ class AgentCore:
     def _evaluate_safety(self, now: float, request: Request | None = None) -> SafetyOutputs:
         pose = self._localizer.pose(now)
         trusted = pose if self._localizer.status in {"good", "weak"} else None
-        maneuver = self._maneuvers.inputs(self._safety.state, self.replica, trusted, now, request)
+        # On its dock the gate lets a mission begin what an operator may request there.
+        leaves = self._driving.mission.active and self._base.docked_for(now) is not None
+        asked: Request | None = "undock" if leaves and request in {None, "enable"} else request
+        maneuver = self._maneuvers.inputs(self._safety.state, self.replica, trusted, now, asked)
         ahead = self._maneuvers.way_ahead(request, maneuver)
         inputs = safety_inputs(
             self._base,

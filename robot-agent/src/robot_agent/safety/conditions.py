@@ -208,7 +208,11 @@ CONDITIONS: Final[tuple[Condition, ...]] = (
         ReasonCode.ON_DOCK,
         Level.HOLD,
         lambda i, _: _rests_on_dock(i),
-        lambda _: "the robot is on its dock: a goal or `fognav robot undock` takes it off",
+        lambda i: (
+            "the robot is on its dock: a goal or `fognav robot undock` takes it off"
+            if i.blind_behind is None
+            else f"the robot can't leave its dock: {i.blind_behind}"
+        ),
         rest=True,
     ),
     # --- lidar ---

@@ -212,7 +212,24 @@ def test_folder_that_is_not_private_is_not_trusted(runtime: Path, tmp_path: Path
 def test_without_a_runtime_folder_the_register_is_in_the_temporary_folder(monkeypatch, tmp_path: Path) -> None:
     monkeypatch.delenv("XDG_RUNTIME_DIR")
     monkeypatch.setattr("tempfile.gettempdir", lambda: str(tmp_path))
+    monkeypatch.setattr(systems, "RUNTIME", tmp_path / "run")
     assert systems.folder() == tmp_path / f".fognav-{os.getuid()}"
+
+
+def test_system_that_systemd_runs_is_found_by_who_has_no_variable_such_as_cron(monkeypatch, tmp_path: Path) -> None:
+    monkeypatch.setattr(systems, "RUNTIME", tmp_path)
+    monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path / str(os.getuid())))
+    (tmp_path / str(os.getuid())).mkdir()
+    with Registration(lambda: system("demo-1", "http://127.0.0.1:1")) as registration:
+        registration.update()
+        monkeypatch.delenv("XDG_RUNTIME_DIR")
+        assert [found.name for found in registered()] == ["demo-1"]
+
+
+@pytest.mark.parametrize("text", ["abc", "0", "65536", "-1", "1_9"])
+def test_port_that_is_none_is_named_with_its_variable(text: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("FOGNAV_MAP_PORT", text)
+    assert f"FOGNAV_MAP_PORT is '{text}': set it to a port, 1 to 65535" in run("status", code=2)
 
 
 def test_command_without_a_system_fails_with_the_remedy() -> None:

@@ -8,6 +8,7 @@ notices, by process id and start time, that the demo is gone, and removes the fi
 import contextlib
 import http.client
 import os
+import re
 import ssl
 import stat
 import tempfile
@@ -24,10 +25,12 @@ from fog_runtime.configuration.site import SITE_FILE
 from fog_runtime.files import atomic_write
 from fog_supervisor import net
 from fognav.credentials import own_credentials
-from fognav.output import FailedError
+from fognav.output import FailedError, WrongUseError
 from fognav.programs import AGGREGATOR, BROKER, CONSOLE, MAP_SERVICE, PLANNER, ROUTER
 
 PRIVATE: Final = 0o700
+RUNTIME: Final = Path("/run/user")
+"""Where systemd makes a folder for each user who is logged in or lingers, which it names in `XDG_RUNTIME_DIR`."""
 
 Kind = Literal["demo", "fog node", "robot"]
 
@@ -61,8 +64,9 @@ class _Entry(msgspec.Struct, frozen=True, kw_only=True):
 
 def folder() -> Path:
     """Return this user's private folder, and create it; raises `FailedError` if it is not private."""
-    runtime = os.environ.get("XDG_RUNTIME_DIR", "")
-    if runtime and os.access(runtime, os.W_OK):
+    # cron, su and sudo don't set the variable, and a node that systemd runs is registered there all the same.
+    runtime = os.environ.get("XDG_RUNTIME_DIR") or RUNTIME / str(os.getuid())
+    if os.access(runtime, os.W_OK):
         path = Path(runtime) / "fognav"
     else:
         path = Path(tempfile.gettempdir()) / f".fognav-{os.getuid()}"
@@ -149,6 +153,7 @@ SERVICE_PORTS: Final = {
     CONSOLE: ("FOGNAV_CONSOLE_PORT", 8004),
 }
 """The ports of a fog node's REST APIs: the variables that docker-compose.yml reads, and its defaults."""
+_LAST_PORT: Final = 65_535
 ZENOH_PORT: Final = ("FOGNAV_ZENOH_PORT", 7447)
 MQTT_PORT: Final = ("FOGNAV_MQTT_PORT", 1883)
 MQTTS_PORT: Final = ("FOGNAV_MQTT_PORT", 8883)
@@ -175,9 +180,12 @@ def find_systems() -> list[System]:
 
 
 def port(setting: tuple[str, int]) -> int:
-    """Return the port that a variable of the environment gives, or its default."""
+    """Return the port that a variable of the environment gives, or its default; raises `WrongUseError` for no port."""
     variable, default = setting
-    return int(os.environ.get(variable) or default)
+    text = os.environ.get(variable) or str(default)
+    if not re.fullmatch(r"[0-9]{1,5}", text) or not 0 < int(text) <= _LAST_PORT:
+        raise WrongUseError(f"{variable} is {text!r}: set it to a port, 1 to {_LAST_PORT}")
+    return int(text)
 
 
 def addresses(host: str, *, secured: bool = False) -> dict[str, str]:

@@ -16,7 +16,9 @@ from fognav import doctor
 from fognav.__main__ import app
 from fognav.commands import status
 from fognav.credentials import VARIABLE
+from fognav.hosting.folders import NodeFolder
 from fognav.operate.systems import System
+from fognav.output import WrongUseError
 
 ROOT = Path(__file__).parents[2]
 
@@ -96,6 +98,19 @@ def test_doctor_names_credentials_that_can_not_be_read(tmp_path: Path, monkeypat
     assert check is not None
     assert check.state == "missing"
     assert "fognav ca create" in check.found
+
+
+def test_root_is_sent_to_the_owner_of_credentials_whose_programs_could_not_read_them(
+    security: SiteSecurity, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    before = {file: file.read_bytes() for file in security.directory.rglob("*") if file.is_file()}
+    monkeypatch.setattr("os.geteuid", lambda: security.directory.stat().st_uid + 1)
+    for words in (("ca", "rotate"), ("ca", "create"), ("robot", "add", "r1", "--remove"), ("source", "user", "door")):
+        done = invoke(*words)
+        assert (done.exit_code, f"{security.directory} belongs to" in done.output) == (2, True), done.output
+    with pytest.raises(WrongUseError, match="belongs to"):
+        NodeFolder(security.directory.parent)
+    assert {file: file.read_bytes() for file in security.directory.rglob("*") if file.is_file()} == before
 
 
 def test_added_robot_gets_one_file_and_a_removed_one_is_unknown(security: SiteSecurity) -> None:

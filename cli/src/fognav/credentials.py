@@ -1,6 +1,7 @@
 """A site's certificates and users as the commands use them: their folder, and their errors in a user's words."""
 
 import os
+import pwd
 import socket
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -54,9 +55,29 @@ def open_security(given: Path | None) -> SiteSecurity:
 
 
 def changeable_security(given: Path | None) -> SiteSecurity:
-    """Open them to change them; raises as `open_security`, and `FailedError` while their fog node is upgraded."""
-    require_no_upgrade(named_folder(given))
+    """Open them to change them; raises as `open_security` and `require_changeable`."""
+    require_changeable(named_folder(given))
     return open_security(given)
+
+
+def require_changeable(folder: Path) -> None:
+    """Raise `FailedError` while a folder's fog node is upgraded, and `WrongUseError` as `require_owner`."""
+    require_owner(folder)
+    require_no_upgrade(folder)
+
+
+def require_owner(folder: Path) -> None:
+    """Raise `WrongUseError` for another user's folder: root may write there what its owner's programs can't read then.
+
+    One that is missing has no owner yet. Raises `OSError` if it can't be looked at.
+    """
+    if not folder.exists() or (owner := folder.stat().st_uid) == os.geteuid():
+        return
+    try:
+        name = pwd.getpwuid(owner).pw_name
+    except KeyError:
+        name = f"#{owner}"
+    raise WrongUseError(f"{folder} belongs to {name}, whose programs could not read what you write: run this as {name}")
 
 
 def own_credentials(default: str | None = None) -> Credentials:

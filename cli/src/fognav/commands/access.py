@@ -24,6 +24,7 @@ from fognav.credentials import (
     named_folder,
     open_security,
     own_hosts,
+    require_changeable,
     security_errors,
 )
 from fognav.operate.fog import find_fog
@@ -155,7 +156,7 @@ def ca_create(
     """
     with exit_codes(), security_errors():
         loaded = load_site(checkout.site_folder(site)).site
-        require_no_upgrade(named_folder(security))
+        require_changeable(named_folder(security))
         made = SiteSecurity(named_folder(security), loaded.id)
         made.make(
             host or own_hosts(),

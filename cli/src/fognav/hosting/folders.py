@@ -23,7 +23,7 @@ from fog_runtime.keys import make_keys
 from fog_runtime.security.site_security import CREDENTIALS, SiteSecurity
 from fog_runtime.security.users import on_floor
 from fognav.aside import TRIAL, finish_putting_back, require_no_upgrade
-from fognav.credentials import security_errors
+from fognav.credentials import require_owner, security_errors
 from fognav.operate.systems import MQTTS_PORT, SERVICE_PORTS, ZENOH_PORT, port
 from fognav.output import FailedError, WrongUseError
 from fognav.programs import SystemFolder
@@ -49,9 +49,13 @@ class NodeFolder(SystemFolder):
     """The data of one fog node; only its user can read it."""
 
     def __init__(self, path: Path) -> None:
-        """Make the folder where it is missing; raises `FailedError` if it can't be used, or is of a newer version."""
+        """Make the folder where it is missing.
+
+        Raises `FailedError` if it can't be used, or is of a newer version, and `WrongUseError` if it is another user's.
+        """
         path = path.absolute()
         try:
+            require_owner(path)
             finish_putting_back(path)
             path.mkdir(mode=0o700, parents=True, exist_ok=True)
             _check_format(path)

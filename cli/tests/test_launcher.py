@@ -104,11 +104,13 @@ def test_set_up_that_failed_half_way_is_done_again_when_the_checkout_is_back(che
     assert any("requirements/dev.txt" in call for call in uv_log(checkout)[calls:])
 
 
-def test_lock_of_a_dead_process_is_removed(checkout: Path) -> None:
+@pytest.mark.parametrize("cut", ["killed", "before this boot", "before its id was on the disk"])
+def test_lock_of_a_set_up_that_was_cut_short_is_removed(checkout: Path, cut: str) -> None:
     ended = subprocess.Popen(["true"])
     ended.wait()
+    owner = {"killed": f"{ended.pid}\n", "before this boot": f"{os.getpid()} another-boot\n"}.get(cut, "")
     (checkout / ".fognav" / "lock").mkdir(parents=True)
-    (checkout / ".fognav" / "lock" / "pid").write_text(f"{ended.pid}\n")
+    (checkout / ".fognav" / "lock" / "pid").write_text(owner)
     done = start(checkout / "fognav", checkout)
     assert done.returncode == 0, done.stderr
     assert not (checkout / ".fognav" / "lock").exists()

@@ -273,6 +273,35 @@ def test_shortcut_crosses_no_obstacle_and_costs_no_more(costmap: NDArray[np.uint
     assert total <= result.cost + 1e-6 * len(result.cells) + 1e-3
 
 
+def cost_of(costmap: NDArray[np.uint8], corners: NDArray[np.float64]) -> float:
+    return sum(line_cost(costmap, *begin, *end) for begin, end in itertools.pairwise(corners.tolist()))
+
+
+@settings(max_examples=examples(100), deadline=None)
+@given(costmaps(), st.data())
+def test_second_path_is_taken_only_where_its_lines_cost_less(costmap: NDArray[np.uint8], data: st.DataObject) -> None:
+    start, goal = cell_of(data, costmap), cell_of(data, costmap)
+    planner = Planner(costmap.shape[1], costmap.shape[0])
+    found = planner.plan(costmap, start, goal)
+    if not found.found:
+        return
+    corners = planner.straightened(costmap, found.cells)
+    assert (tuple(corners[0]), tuple(corners[-1])) == (start, goal)
+    assert cost_of(costmap, corners) <= cost_of(costmap, planner.shortcut(costmap, found.cells)) + 1e-9
+
+
+def test_box_is_passed_on_the_side_that_is_nearer_in_straight_lines() -> None:
+    costmap = np.zeros((80, 120), np.uint8)
+    costmap[36:50, 49:81] = 254
+    planner, patterns = Planner(120, 80), TilePatterns(10_000_000)
+    found = planner.plan(costmap, (4, 74), (115, 35))
+    first = planner.shortcut(costmap, found.cells)
+    field = planner.goal_field(costmap, (115, 35), patterns)
+    corners = planner.straightened(costmap, found.cells, 10_000, field)
+    assert cost_of(costmap, corners) < 0.95 * cost_of(costmap, first)
+    assert planner.straightened(costmap, found.cells, 1, field).tolist() == first.tolist(), "it may take too long"
+
+
 def test_path_through_an_open_room_becomes_one_line() -> None:
     costmap = np.zeros((40, 90), np.uint8)
     result = Planner(90, 40).plan(costmap, (2, 3), (85, 30))

@@ -808,7 +808,7 @@ CHANGES = st.lists(
 def test_path_stays_passable_and_near_optimal_after_any_changes(
     changes: list[tuple[str, tuple[float, float, float, float] | None, int, float]],
 ) -> None:
-    drive = Drive(start=(1.0, 7.0), config=PlannerConfig(switch_dwell_s=0.0))
+    drive = Drive(start=(1.0, 7.0), config=PlannerConfig(switch_dwell_s=0.0, refused_retry_s=0.5))
     drive.go(19.0, 7.0)
     fresh = Planner(drive.map.geometry.width, drive.map.geometry.height)
     for name, box, penalty, ahead in changes:

@@ -36,6 +36,7 @@ from fog_runtime.configuration.maps import load_map
 from fognav_experiments.bench.common import make_office
 from fognav_experiments.bench.fleet import percentile
 from fognav_experiments.bench.path_peers import gradient_path_cost, installed_peers
+from planner.config import PlannerConfig
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
@@ -142,8 +143,13 @@ class Figures:
     expansions: list[int] = dataclasses.field(default_factory=list)
     shortcut: list[float] = dataclasses.field(default_factory=list)
     corners: list[int] = dataclasses.field(default_factory=list)
+    corners_at_first: list[int] = dataclasses.field(default_factory=list)
+    second: list[float] = dataclasses.field(default_factory=list)
+    """The same with a second search beside the path, guided by landmarks."""
     dearer: list[float] = dataclasses.field(default_factory=list)
-    """By how many percent paths cost more than those along the gradient."""
+    """By how many percent paths cost more than those along the gradient, after the second search ..."""
+    dearer_at_first: list[float] = dataclasses.field(default_factory=list)
+    """... and without it."""
     replan: list[float] = dataclasses.field(default_factory=list)
     replan_near_goal: list[float] = dataclasses.field(default_factory=list)
     closed: list[float] = dataclasses.field(default_factory=list)
@@ -156,6 +162,7 @@ class Figures:
         """Return the figures by the names of the command's JSON; without those of which there is none."""
         replans = len(self.replan) + len(self.replan_near_goal) + len(self.closed)
         dearer = [percent for percent in self.dearer if not math.isnan(percent)]
+        at_first = [percent for percent in self.dearer_at_first if not math.isnan(percent)]
         figures: dict[str, float | int] = {
             "queries": len(self.cold),
             "optimal": self.optimal,
@@ -167,7 +174,10 @@ class Figures:
             "expansions_median": int(np.median(self.expansions)),
             "field_median_ms": percentile(self.field, 50),
             "shortcut_median_ms": percentile(self.shortcut, 50),
+            "second_median_ms": percentile(self.second, 50),
+            "second_p99_ms": percentile(self.second, 99),
             "corners_mean": round(float(np.mean(self.corners)), 1),
+            "corners_at_first_mean": round(float(np.mean(self.corners_at_first)), 1),
             "replans": replans,
             "replans_optimal": self.replans_optimal,
             "replans_closed": len(self.closed),
@@ -175,6 +185,8 @@ class Figures:
         if dearer:
             figures["dearer_than_gradient_mean_percent"] = round(float(np.mean(dearer)), 2)
             figures["dearer_than_gradient_worst_percent"] = round(max(dearer), 2)
+            figures["dearer_at_first_mean_percent"] = round(float(np.mean(at_first)), 2)
+            figures["dearer_at_first_worst_percent"] = round(max(at_first), 2)
         for name, times in (("", self.replan), ("_near_goal", self.replan_near_goal), ("_closed", self.closed)):
             if times:
                 figures[f"replan{name}_median_ms"] = percentile(times, 50)
@@ -242,11 +254,16 @@ def _measure_query(  # what a query needs, and what it tells
     )
     if not found.found:
         return
-    corners = _timed(figures.shortcut, lambda: planner.shortcut(costmap, found.cells))
+    first = _timed(figures.shortcut, lambda: planner.shortcut(costmap, found.cells))
+    most = PlannerConfig.second_expansions
+    corners = _timed(figures.second, lambda: planner.straightened(costmap, found.cells, most, landmarks=landmarks))
     figures.corners.append(len(corners))
-    cost = sum(line_cost(costmap, *before, *after) for before, after in itertools.pairwise(corners.tolist()))
+    figures.corners_at_first.append(len(first))
     if start != goal:
-        figures.dearer.append(100.0 * (cost / gradient_path_cost(costmap, start, goal) - 1.0))
+        least = gradient_path_cost(costmap, start, goal)
+        for line, percents in ((first, figures.dearer_at_first), (corners, figures.dearer)):
+            cost = sum(line_cost(costmap, *before, *after) for before, after in itertools.pairwise(line.tolist()))
+            percents.append(100.0 * (cost / least - 1.0))
     if len(found.cells) <= 2 * _HAZARD_CELLS:
         return
     origin = planner.goal_field(costmap, start, patterns)

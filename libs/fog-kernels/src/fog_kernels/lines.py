@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numba import boolean, float64, int64, njit, void
 
-from fog_contracts.costs import COST_WEIGHT, NEUTRAL_WEIGHT
+from fog_contracts.costs import COST_WEIGHT, INSCRIBED, NEUTRAL_WEIGHT, PENALTY_MAX
 from fog_kernels import _arrays
 from fog_kernels.steps import DEFAULT_WEIGHTS, DIAGONAL, STRAIGHT, weights_of
 
@@ -250,6 +250,17 @@ def _relax(costmap: Any, weight: Any, corners: Any) -> int:
             if not changed:
                 break
     return int(count)
+
+
+@njit(void(_arrays.U8_GRID, _arrays.I32_PAIRS, int64, int64, _arrays.U8_GRID_OUT), cache=True, nogil=True)
+def _raise_near(costmap: Any, cells: Any, reach: int, rise: int, raised: Any) -> None:
+    """Raise the costs of traversable cells in squares around a path's cells, one of which in `reach` / 2 is enough."""
+    height, width = costmap.shape
+    for i in range(0, cells.shape[0], max(1, reach // 2)):
+        for y in range(max(0, cells[i, 1] - reach), min(height, cells[i, 1] + reach + 1)):
+            for x in range(max(0, cells[i, 0] - reach), min(width, cells[i, 0] + reach + 1)):
+                if costmap[y, x] < INSCRIBED:
+                    raised[y, x] = min(np.int64(costmap[y, x]) + rise, PENALTY_MAX)
 
 
 @njit(boolean(_arrays.F64_GRID, _arrays.F64_GRID, float64, float64), cache=True, nogil=True, error_model="numpy")
@@ -514,6 +525,19 @@ def shortcut(
     count = int(_shortcut(costmap, weight, cells, cumulated, kept))
     corners = cells[kept[:count]].astype(np.float64)
     return corners[: _relax(costmap, weight, corners)].copy() if relax else corners
+
+
+def raised_near(costmap: NDArray[np.uint8], cells: NDArray[np.int32], reach: int, rise: int) -> NDArray[np.uint8]:
+    """Return a copy of a uint8 (h, w) costmap, dearer by `rise` within some `reach` cells of a path's cells.
+
+    What is traversable stays so, and nothing else becomes it. `cells` is int32 (n, 2) as (column, row), all on the
+    grid. Raises TypeError or ValueError for other types or shapes, or a `reach` or `rise` below 0.
+    """
+    if min(reach, rise) < 0:
+        raise ValueError(f"reach and rise must be at least 0, not {reach} and {rise}")
+    raised = _arrays.grid(costmap, "costmap").copy()
+    _raise_near(costmap, _cells_array(cells), reach, rise, raised)
+    return raised
 
 
 def leaves(line: NDArray[np.float64], other: NDArray[np.float64], reach: float, spacing: float) -> bool:

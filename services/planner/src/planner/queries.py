@@ -57,7 +57,9 @@ class Answerer:
             return PlanReply(refusal=no_map())
         start, goal = (request.start.x, request.start.y), (request.goal.x, request.goal.y)
         field = view.fields.get(view.planning_map.geometry.cell(*goal))
-        found = self.search(view).find(view.planning_map, view.covers, start, goal, field, landmarks=view.landmarks)
+        found = self.search(view).find(
+            view.planning_map, view.covers, start, goal, field, landmarks=view.landmarks, thorough=True
+        )
         explained = None if found.question is None else self.explain(view, found.question)
         return _reply(found, explained, view.planning_map)
 

@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Final, Literal
 
 from fog_contracts.costs import NEUTRAL_WEIGHT
 from planner.heuristics import Detours
-from planner.missions import Plan
+from planner.missions import Plan, ReplanReason
 from planner.path_search import PathSearch
 from planner.refusals import TIMEOUT
 
@@ -30,7 +30,7 @@ if TYPE_CHECKING:
     from planner.heuristics import DeadEndsJob, GoalFields, Trip
     from planner.leases.corridors import Disc
     from planner.leases.standstills import Room
-    from planner.missions import Mission, ReplanReason, SwitchLimiter
+    from planner.missions import Mission, SwitchLimiter
     from planner.path_search import Covers, Route, SearchResult
     from planner.planning_map import Cell, CostChange, PlanningMap
     from planner.waits.choice import Judgement, Waits
@@ -43,6 +43,8 @@ _ROUND_M: Final = 15.0
 """So much longer (m) a path may be that makes room, before robots stand aside instead."""
 _PAST_M: Final = 5.0
 """The same of one that leads past a robot on the same floor, before one of them waits instead."""
+_UNHURRIED: Final[frozenset[ReplanReason]] = frozenset({"goal", "clearing"})
+"""Why a path is searched on which nothing has come: nobody has to turn round or stop until it is found."""
 _PROGRESS_WINDOW_M: Final = 5.0
 """How far ahead of its last progress a robot is searched on its path, so that a loop is not cut short."""
 
@@ -234,7 +236,10 @@ class Replanner:
         traces = mission.begin_replan(reason, now)
         mission.release_now()
         beside = self._find_beside(mission, planning_map.avoiding(avoid), covers) if avoid else None
-        found, planning_map = beside or (self._find(mission, planning_map, covers, waiting, danger), planning_map)
+        if beside is not None:
+            found, planning_map = beside
+        else:
+            found = self._find(mission, reason, planning_map, covers, waiting, danger)
         self.plans[reason] = self.plans.get(reason, 0) + 1
         if found.refusal is not None:
             self.refusals[found.refusal.code] = self.refusals.get(found.refusal.code, 0) + 1
@@ -321,7 +326,13 @@ class Replanner:
         return beside_others(self._search)
 
     def _find(
-        self, mission: Mission, planning_map: PlanningMap, covers: Covers, waiting: Sequence[Mission], danger: float
+        self,
+        mission: Mission,
+        reason: ReplanReason,
+        planning_map: PlanningMap,
+        covers: Covers,
+        waiting: Sequence[Mission],
+        danger: float,
     ) -> SearchResult:
         pose, target = mission.pose, mission.target
         assert pose is not None
@@ -346,6 +357,7 @@ class Replanner:
             None if origin is None else self._fields.guide(geometry.cell(*origin)),
             self._fields.landmarks,
             # A way that is compared with the present one has its corners moved, too.
+            thorough=reason in _UNHURRIED and not crowded,
             hurried=crowded and (mission.plan is None or math.isinf(remaining_cost(mission.plan, planning_map))),
         )
 

@@ -102,7 +102,8 @@ async def _map_service(config: StackConfig, zones: list[Zone]) -> AsyncIterator[
     loop = asyncio.get_running_loop()
     async with Stack(config) as stack:
         await stack.start_servers(_READY_S)
-        async with Store(stack.redis_url, SITE, credentials=stack.security.credentials(MAP_SERVICE)) as store:
+        own = stack.security.credentials(MAP_SERVICE)
+        async with Store(stack.redis_url, SITE, service=MAP_SERVICE, credentials=own) as store:
             await store.restore({ZONES.name: {zone.id: zone for zone in zones}}, Audit(0.0, "bench", "restore"))
             begun = loop.time()
             await store.zones()

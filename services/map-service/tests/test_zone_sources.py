@@ -23,12 +23,16 @@ from fog_contracts.messages import CircleShape, Zone
 from fog_contracts.site import Site, ZoneSourceSite
 from fog_runtime.credentials import Credentials
 from fog_runtime.health import Health
+from fog_runtime.http import Tokens
 from fog_runtime.stores.redis_store import Audit
+from fog_runtime.token_file import TokenEntry, token_hash
 from fog_supervisor.servers import start_redis
+from map_service.api import make_api
 from map_service.core import MapCore
 from map_service.registry import make_layers
 from map_service.service import Service
 from map_service.store import Store
+from map_service.zone_times import SetOfZones
 
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator
@@ -234,10 +238,13 @@ def redis_url(tmp_path_factory):
 
 
 @asynccontextmanager
-async def leading_service(redis_url: str, edge: Nobody) -> AsyncIterator[tuple[Service, Store]]:
-    """A service over an empty store that carries out what two sources send."""
+async def leading_service(
+    redis_url: str, edge: Nobody, names: tuple[str, ...] = ("one", "two")
+) -> AsyncIterator[tuple[Service, Store]]:
+    """A service over an empty store that carries out what these sources send."""
     plan = Plan(GridGeometry(60, 60, 0.05, 0.0, 0.0), np.zeros((60, 60), dtype=np.uint8))
-    site = Site(id="test", zone_sources=[ZoneSourceSite(id=name, max_zones=2) for name in ("one", "two")])
+    sources = [ZoneSourceSite(id=name, max_zones=2, sets=["night"]) for name in names]
+    site = Site(id="test", zone_sources=sources)
     async with Store(redis_url, "test") as store:
         await store._redis.write(("FLUSHALL",))
         core = MapCore("test", plan, 1, layers=make_layers(plan), definitions=[])
@@ -270,6 +277,50 @@ async def test_zone_that_was_deleted_while_the_broker_is_away_does_not_come_back
             assert not await say(1.0, retained=True)
             assert await say(1.5, retained=True), "its source has changed it meanwhile"
             assert await say(1.0, retained=True), "as it was before, but newer"
+
+
+async def test_zone_of_a_source_does_not_come_back_once_an_operator_took_and_deleted_it_or_undid_it(redis_url):
+    retained: dict[str, bytes] = {}
+
+    class Broker(Nobody):
+        async def clear(self, channel: ch.Channel, *, wait: bool, **ids: str) -> bool:
+            assert wait
+            retained.pop(channel.key(site="test", **ids), None)
+            return True
+
+    async def zones_told_by(broker: dict[str, bytes]) -> set[str]:
+        for topic, wanted in broker.items():
+            service.zone_sources.receive(topic, wanted, retained=True)
+        while service.zone_sources._waiting:
+            assert await service.zone_sources.carry_out_next()
+        return set(service.core.zones.ids())
+
+    for name in ("a", "b"):
+        wanted = {**CIRCLE, "ttl_s": None, "expires_at": 60.0, "shape": {**CIRCLE["shape"], "centre": [1.0, 1.0]}}
+        retained[ch.ZONE_REQUEST.key(site="test", source="one", zone=name)] = json.dumps(wanted).encode()
+    tokens = Tokens([TokenEntry(name="ann", role="operator", sha256=token_hash("secret"))])
+    async with leading_service(redis_url, Broker()) as (service, _):
+        app = make_api(service, Site(id="test"), ManualClock(1.0), Health(), tokens)
+        own = {"base_url": "http://map", "headers": {"Authorization": "Bearer secret"}}
+        async with httpx.AsyncClient(transport=httpx.ASGITransport(app), **own) as client:
+            assert await zones_told_by(retained) == {"a", "b"}
+            taken = await client.patch("/api/v1/zones/a", json={"reason": "stays for now"})
+            assert taken.json()["source"] is None
+            assert (await client.delete("/api/v1/zones/a")).status_code == 204
+            trail = (await client.get("/api/v1/audit", params={"kind": "zone"})).json()
+            made = next(entry for entry in trail if entry["id"] == "b")
+            undone = await client.post("/api/v1/zones/b/undo", json={"entry": made["entry"]})
+            assert (undone.status_code, undone.json()["value"]) == (200, None)
+        assert await zones_told_by(retained) == set(), "as at the next connection to the broker"
+
+
+async def test_source_switches_sets_even_if_its_id_is_a_word_of_the_topic(redis_url):
+    async with leading_service(redis_url, Nobody(), ("zones",)) as (service, _):
+        await service.sets.put(SetOfZones(id="night"), 0, "ann")
+        topic = ch.ZONE_SET_SWITCH.key(site="test", source="zones", set="night")
+        service.zone_sources.receive(topic, b"off", retained=False)
+        assert await service.zone_sources.carry_out_next()
+        assert not service.sets.records["night"].enabled
 
 
 async def test_zone_that_cannot_be_stored_keeps_no_other_sources_zone_waiting(redis_url):

@@ -95,6 +95,7 @@ async def _undo(service: Service, before: Zone | None, after: Zone | None, who: 
         if after is None:
             raise UndoError("not_undoable", "there was no zone before, and none after: there is nothing to undo")
         await service.zones.delete(after.id, after.version, who, action=ACTION)
+        await service.zone_sources.forget(after)
         return None
     zone = _with_rest(before, stamp)
     if after is None:

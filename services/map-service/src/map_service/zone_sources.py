@@ -145,9 +145,9 @@ class ZoneSources:
         """Take a message of a source (`payload` None: too long), to be carried out by `run`."""
         if not self.leading:
             return
-        channel, name = (ch.ZONE_REQUEST, "zone") if "/zones/" in topic else (ch.ZONE_SET_SWITCH, "set")
-        ids = channel.match(topic)
-        source = self._sources.get(topic.split("/")[4] if ids is None else ids["source"])
+        *_, about, kind, _ = topic.split("/")
+        channel, name = (ch.ZONE_REQUEST, "zone") if kind == "zones" else (ch.ZONE_SET_SWITCH, "set")
+        ids, source = channel.match(topic), self._sources.get(about)
         if source is None:
             REFUSALS.labels(_UNKNOWN).inc()
             remedy = "add it to zone_sources in site.toml, or remove its user"
@@ -171,13 +171,16 @@ class ZoneSources:
         self._arrived.set()
 
     async def forget(self, zone: Zone) -> None:
-        """Delete what the broker retains of a zone that was taken from its source; return once it has, or soon.
+        """Delete what the broker retains of a zone that its source did not delete; return once it has, or soon.
 
-        A broker that is away may tell of it once more: that is passed over, and deleted then.
+        An operator's may have been a source's before. A broker that is away may tell of a source's zone once more: that
+        is passed over, and deleted then.
         """
         if zone.source:
             self._forgotten[zone.source, zone.id] = zone
-            await asyncio.wait([asyncio.create_task(self._clear(zone.source, zone.id))], timeout=FORGET_S)
+        sources = [zone.source] if zone.source else [*self._sources]
+        if clearing := [asyncio.create_task(self._clear(source, zone.id)) for source in sources]:
+            await asyncio.wait(clearing, timeout=FORGET_S)
 
     async def _clear(self, source: str, zone: str) -> None:
         if await self._mqtt.clear(ch.ZONE_REQUEST, wait=True, source=source, zone=zone):

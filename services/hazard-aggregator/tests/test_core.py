@@ -176,6 +176,16 @@ def test_since_of_an_area_that_changed_meanwhile_is_kept_when_hazards_are_loaded
     assert rig.core.announced()["hall"].since == since
 
 
+def test_area_that_was_removed_while_another_aggregator_led_is_deleted_from_the_broker_for_good():
+    rig = Rig()
+    assert "hall" in rig.core.announced()
+    removed = AreaDefinition(id="hall", polygon=SQUARE, removed=True, version=1)
+    for published in (rig.core.restore([removed], [], rig.at), rig.core.set_epoch(6), rig.core.republish_all()):
+        about = [(each.channel.name, each.message) for each in published if each.ids == {"area": "hall"}]
+        assert about == [("area_hazard", None), ("area_definition", None)]
+    assert rig.core.to_store() == []
+
+
 def test_removed_area_is_published_as_removed_and_leaves_nothing_to_store():
     rig = Rig()
     removed = AreaDefinition(id="hall", polygon=SQUARE, removed=True, version=1)

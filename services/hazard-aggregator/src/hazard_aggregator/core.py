@@ -324,6 +324,8 @@ class Aggregator:
         """
         for definition in definitions:
             self._outbox.offer(self._fusion.put_area(definition, at.stamp))
+            if definition.removed:  # while another aggregator led
+                self._outbox.forget(definition.id)
         self._outbox.offer(self._fusion.restore(hazards, at.stamp))
         self._complete = True
         unlisted, self._unlisted = self._unlisted - set(self._listed()), set()

@@ -1,6 +1,8 @@
 """Alerts: raised when a condition lasts as long as the area's policy allows, ended with it, acknowledged by people."""
 
 import asyncio
+from types import SimpleNamespace
+from typing import Any, cast
 
 import httpx
 import pytest
@@ -21,8 +23,11 @@ from fog_contracts.messages import (
     NodeCode,
     Reason,
 )
-from hazard_aggregator.alert_persistence import NodeMetrics
+from fog_runtime.stores.redis_connection import StoreError
+from fog_supervisor.servers import start_redis
+from hazard_aggregator.alert_persistence import AlertPersistence, NodeMetrics
 from hazard_aggregator.alerts import LISTED, AlertError, Alerts, NodeReport
+from hazard_aggregator.store import Store
 
 SQUARE = [(0.0, 0.0), (2.0, 0.0), (2.0, 1.0), (0.0, 1.0)]
 POLICY = AlertPolicy(unknown_after_s=10.0, blocked_after_s=20.0, node_after_s=5.0)
@@ -208,6 +213,36 @@ def metrics():
     shown = NodeMetrics()
     yield shown
     shown.show(())
+
+
+@pytest.mark.live
+async def test_alerts_are_stored_and_in_the_audit_trail_once_whoever_acknowledges_them_when(tmp_path, monkeypatch):
+    async def fell_silent(_alerts: list[Alert]) -> None:
+        raise StoreError("Redis does not answer")
+
+    rig = Rig()
+    for seconds in (1.0, 20.0):
+        rig.step(hazard("blocked"), report("unknown"), seconds=seconds)
+    edges = SimpleNamespace(now=lambda: Moment(1.0, 1.0), publish=lambda _: None)
+    with start_redis(tmp_path) as redis:
+        async with Store(redis.url, "test", service="hazard-aggregator") as store:
+            await store.save_alerts(rig.alerts.active())
+            core = cast("Any", SimpleNamespace(epoch=1))
+            alerts = AlertPersistence(core, store, cast("Any", edges), cast("Any", None), asyncio.Event())
+            await alerts._load()
+            names = [alert.id for alert in alerts.active()]
+            assert len(names) == 2
+            await asyncio.gather(*(alerts.acknowledge(name, "ann") for name in names))
+            trail = (await store.audit(kinds=["alert"])).entries
+            assert sorted(entry.id for entry in trail) == sorted(names)
+            assert [alert.acknowledged_by for alert in await store.alerts()] == ["ann", "ann"]
+
+            with monkeypatch.context() as silent:
+                silent.setattr(store, "save_alerts", fell_silent)
+                with pytest.raises(StoreError):
+                    await alerts.acknowledge(names[0], "bob")
+            await alerts._write()
+            assert [alert.acknowledged_by for alert in await store.alerts()] == ["bob", "ann"]
 
 
 def test_node_is_unknown_silent_or_flapping(metrics):

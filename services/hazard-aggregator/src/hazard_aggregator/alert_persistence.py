@@ -5,6 +5,7 @@ The metrics of nodes follow the same reports.
 
 from __future__ import annotations
 
+import asyncio
 from collections import deque
 from contextlib import suppress
 from typing import TYPE_CHECKING, Final, get_args
@@ -20,7 +21,6 @@ from fog_runtime.stores.redis_connection import StoreError, StoreRefusedError
 from hazard_aggregator.alerts import AlertEvent, Alerts
 
 if TYPE_CHECKING:
-    import asyncio
     from collections.abc import Iterable
 
     from fog_contracts.messages import Alert
@@ -86,6 +86,8 @@ class AlertPersistence:
         self._alerts = Alerts()
         self._nodes = NodeMetrics()
         self._events: deque[AlertEvent] = deque(maxlen=_QUEUE)
+        self._storing = asyncio.Lock()
+        self._saved = True
         self._loaded = False
         self._epoch = -1
 
@@ -167,11 +169,14 @@ class AlertPersistence:
 
     async def _store_events(self) -> None:
         """Store the history and then the active alerts: killed in between, an alert is in the history twice."""
-        if not self._events or not self._loaded:
-            return
-        while self._events:
-            event = self._events[0]
-            await self._store.record_alert(event, event.alert.acknowledged_at or self._edges.now().stamp)
-            if self._events and self._events[0] is event:
-                self._events.popleft()
-        await self._store.save_alerts(self._alerts.active())
+        async with self._storing:
+            if not self._loaded:
+                return
+            while self._events:
+                self._saved, event = False, self._events[0]
+                await self._store.record_alert(event, event.alert.acknowledged_at or self._edges.now().stamp)
+                if self._events and self._events[0] is event:
+                    self._events.popleft()
+            if not self._saved:
+                await self._store.save_alerts(self._alerts.active())
+                self._saved = True

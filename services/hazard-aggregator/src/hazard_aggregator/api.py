@@ -97,7 +97,7 @@ def add_history(routes: Routes, service: Service, clock: Clock) -> None:
     async def area_history(area_id: str, limit: PageSize, cursor: str | None = None) -> Answer[list[PeriodView]]:
         """Return an area's states and how long each lasted, newest first; the Link header has the next page's address.
 
-        A period continues over restarts. The history goes back by 90 days, and 10,000 periods.
+        A period continues over restarts. The history goes back by 90 days, and 3,000 periods.
         """
         if not any(known.id == area_id for known in service.core.definitions()):
             raise no_such_area(area_id)

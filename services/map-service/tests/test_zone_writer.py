@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import threading
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, cast
 
@@ -13,16 +14,17 @@ from msgspec import structs
 
 from fog_contracts.grid import GridGeometry
 from fog_contracts.messages import CircleShape, Message, Zone
+from fog_runtime.concurrency import BusyError
 from fog_runtime.health import Health
 from fog_runtime.stores.redis_connection import StoreError
-from fog_runtime.stores.redis_store import Attempt
+from fog_runtime.stores.redis_store import Attempt, Audit
 from fog_supervisor.servers import start_redis
 from map_service.core import MapCore
 from map_service.record_writer import ConflictError
 from map_service.registry import make_layers
 from map_service.service import Service
 from map_service.store import Store
-from map_service.zone_writer import KEPT_S
+from map_service.zone_writer import KEPT_S, MAX_PREPARING
 
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator
@@ -111,6 +113,21 @@ async def test_zone_that_a_hanging_redis_stored_late_answers_its_repeated_reques
     replaced = await service.zones.replace(zone("z1", "second"), 1, "ann", attempt)
     assert (replaced.reason, replaced.version) == ("first", 2)
     assert (await store.zones())[0] == [replaced] == service.core.zones.zones()
+
+
+async def test_zones_are_loaded_however_many_requests_wait_for_theirs_to_be_validated(store: HangingStore) -> None:
+    service, free = await running(store), threading.Event()
+    await store.create(zone("z1"), Audit(1.0, "ann", "create"))  # by another process
+    waiting = [asyncio.create_task(service.zones._worker.run(free.wait, 60.0)) for _ in range(MAX_PREPARING)]
+    await asyncio.sleep(0)  # they begin
+    try:
+        with pytest.raises(BusyError):
+            await service.zones.prepare(zone("z2"))
+        await service.zones.load()
+        assert service.core.zones.ids() == ["z1"]
+    finally:
+        free.set()
+        await asyncio.gather(*waiting)
 
 
 async def test_zone_that_ended_an_hour_ago_is_deleted_and_stays_in_the_audit_trail(store: HangingStore) -> None:

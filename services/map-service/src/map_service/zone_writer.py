@@ -253,7 +253,8 @@ class ZoneWriter:
         zones, unreadable = await self._store.zones()
         known = {zone.id: zone for zone in core.zones.zones()}
         changed = [zone for zone in zones if zone.id not in known or known[zone.id].shape != zone.shape]
-        spans, invalid = await self._worker.run(zones_spans, changed, core.costmap.geometry)
+        # Not by the worker, for which many may wait: without its zones this process ends.
+        spans, invalid = await asyncio.to_thread(zones_spans, changed, core.costmap.geometry)
         self.unusable.replace({**unreadable, **invalid})
         zones = [zone for zone in zones if zone.id not in invalid]
         if not core.zones_loaded or {zone.id: zone for zone in zones} != known:

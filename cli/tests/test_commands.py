@@ -13,6 +13,7 @@ from fog_runtime.record import Recorder
 from fognav import checkout, doctor, recording, system
 from fognav.__main__ import app
 from fognav.commands import installed
+from fognav.operate.systems import System
 from fognav.output import WrongUseError
 
 runner = CliRunner()
@@ -265,6 +266,14 @@ def test_recording_without_a_broker_keeps_an_existing_file(tmp_path: Path) -> No
     output = error_output("record", file, *UNREACHABLE)
     assert "the broker mqtt://127.0.0.1:1 can't be reached: start the system, or name its broker with --mqtt" in output
     assert file.read_bytes() == b"an earlier drive"
+
+
+@pytest.mark.usefixtures("short_timeouts")
+def test_recording_is_of_the_system_that_runs_here(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    urls = {"mosquitto": "mqtt://127.0.0.1:2", "zenoh-router": "tcp/127.0.0.1:2"}
+    demo = System(name="demo-1", kind="demo", site="here", urls=urls, pids={})
+    monkeypatch.setattr("fognav.operate.fog.find_systems", lambda: [demo])
+    assert "the broker mqtt://127.0.0.1:2 can't be reached" in error_output("record", tmp_path / "drive.mcap")
 
 
 @pytest.mark.parametrize("url", ["127.0.0.1:1883", "mqtt://here:port"])

@@ -53,12 +53,14 @@ async def recording(
             await asyncio.gather(task, return_exceptions=True)
 
 
-async def record(path: Path, *, mqtt_url: str, zenoh_endpoint: str, site: str, seconds: float) -> dict[str, object]:
+async def record(
+    path: Path, *, mqtt_url: str, zenoh_endpoint: str, site: str, seconds: float, credentials: Credentials
+) -> dict[str, object]:
     """Record for some seconds (0: until a signal); return a summary of the recording.
 
     Raises `WrongUseError` without broker or router; an existing file then stays unchanged.
     """
-    clock, credentials = SystemClock(), own_credentials()
+    clock = SystemClock()
     opened = ZenohEdge.open(
         connect=[zenoh_endpoint], clock=clock, role="recorder", id="record", site=site, credentials=credentials
     )

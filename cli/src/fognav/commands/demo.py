@@ -9,8 +9,11 @@ import typer
 from fog_runtime import logs
 from fog_runtime.configuration import parts
 from fog_runtime.configuration.site import load_site
+from fog_runtime.credentials import Credentials
 from fognav import checkout, console_page, kernels, recording, system
-from fognav.operate.options import JsonOption, YesOption
+from fognav.credentials import own_credentials
+from fognav.operate.fog import find_fog
+from fognav.operate.options import FogOption, JsonOption, YesOption
 from fognav.output import (
     NOT_TRUE,
     OK,
@@ -22,6 +25,7 @@ from fognav.output import (
     print_result,
     write_report,
 )
+from fognav.programs import BROKER, ROUTER
 from fognav_sim import emulators
 
 
@@ -32,6 +36,7 @@ def _known_parts(group: str) -> str:
 Broker = Annotated[str, typer.Option("--mqtt", metavar="URL", help="MQTT broker.")]
 Router = Annotated[str, typer.Option("--zenoh", metavar="ENDPOINT", help="zenoh router.")]
 SiteId = Annotated[str, typer.Option("--site", metavar="ID", help="Id of the site, the second part of every key.")]
+_MQTT, _ZENOH, _SITE = "mqtt://127.0.0.1:1883", "tcp/127.0.0.1:7447", "estig"
 
 
 def demo_command(  # noqa: PLR0913  # each option is an argument
@@ -125,12 +130,17 @@ def demo_command(  # noqa: PLR0913  # each option is an argument
     raise typer.Exit(OK if values["success"] else NOT_TRUE)
 
 
-def record_command(
+def record_command(  # noqa: PLR0913  # each option is an argument
     file: Annotated[Path, typer.Argument(metavar="FILE", help="MCAP file to write.")],
     *,
-    mqtt: Broker = "mqtt://127.0.0.1:1883",
-    zenoh: Router = "tcp/127.0.0.1:7447",
-    site: SiteId = "estig",
+    mqtt: Annotated[
+        str | None, typer.Option("--mqtt", metavar="URL", help="MQTT broker; default: that of the running system.")
+    ] = None,
+    zenoh: Annotated[
+        str | None, typer.Option("--zenoh", metavar="ENDPOINT", help="zenoh router; default: that of the same.")
+    ] = None,
+    site: Annotated[str | None, typer.Option("--site", metavar="ID", help="Id of the site; default: the same.")] = None,
+    fog: FogOption = None,
     seconds: Annotated[float, typer.Option("--seconds", min=0.0, help="Duration; 0: until Ctrl-C.")] = 0.0,
     json: JsonOption = False,
 ) -> None:
@@ -141,17 +151,34 @@ def record_command(
     logs.configure("record", "error", "text")
     with exit_codes():
         check_writable(file)
-        recorded = asyncio.run(recording.record(file, mqtt_url=mqtt, zenoh_endpoint=zenoh, site=site, seconds=seconds))
+        url, endpoint, site_id, own = _to_record(mqtt, zenoh, site, fog)
+        recorded = asyncio.run(
+            recording.record(
+                file, mqtt_url=url, zenoh_endpoint=endpoint, site=site_id, seconds=seconds, credentials=own
+            )
+        )
     line = f"wrote {file}: {recorded['seconds']} s, {recorded['messages']}"
     print_result(recorded, line, json=json, write=print_line)
+
+
+def _to_record(
+    mqtt: str | None, zenoh: str | None, site: str | None, fog: str | None
+) -> tuple[str, str, str, Credentials]:
+    """Return broker, router, site and the recorder's credentials: the running system's, if no server is named."""
+    if mqtt is None and zenoh is None:
+        found = find_fog(fog)
+        console = found.system.credentials_file
+        own = own_credentials(None if console is None else str(Path(console).with_name("recorder.toml")))
+        return found.system.urls[BROKER], found.system.urls[ROUTER], site or found.site, own
+    return mqtt or _MQTT, zenoh or _ZENOH, site or _SITE, own_credentials()
 
 
 def replay_command(
     file: Annotated[Path, typer.Argument(metavar="FILE", help="MCAP file of a recording.")],
     *,
-    mqtt: Broker = "mqtt://127.0.0.1:1883",
-    zenoh: Router = "tcp/127.0.0.1:7447",
-    site: SiteId = "estig",
+    mqtt: Broker = _MQTT,
+    zenoh: Router = _ZENOH,
+    site: SiteId = _SITE,
     speed: Annotated[float, typer.Option("--speed", min=0.1, max=50.0, help="Speed factor.")] = 1.0,
     json: JsonOption = False,
 ) -> None:

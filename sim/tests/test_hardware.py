@@ -59,6 +59,16 @@ def test_line_that_is_too_slow_drops_the_oldest_bytes_and_counts_them():
     assert line.lost_bytes == 6000 - 4096
 
 
+def test_command_waits_for_what_the_host_wrote_before_it():
+    hardware = hardware_in(hall())
+    hardware.receive(bytes(BAUD // 10 // 10) + DRIVE_200, b"")  # a tenth of a second of the line
+    for _ in range(10):
+        hardware.step()
+    assert hardware.base.wheel_speeds_m_s == (0.0, 0.0)
+    hardware.step()
+    assert hardware.base.wheel_speeds_m_s == (0.2, 0.2)
+
+
 def test_drive_direct_moves_the_robot_and_its_encoders():
     world = hall()
     hardware = hardware_in(world, 5.0, initial_wheel_travel_m=(65_500 * TICK_M, 0.0))

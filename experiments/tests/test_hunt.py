@@ -74,14 +74,16 @@ class Drive:
         self.bus.publish([Publication(channel, message, ids)])
         self.bus.deliver(moment(self.now))
 
-    def drive(self, seconds, speed=0.2):
+    def drive(self, seconds, speed=0.2, turn=0.0):
+        """Drive on; `turn`: by how much the right wheel is faster, and the left one slower."""
         for _ in range(round(seconds * 10)):
             self.now = round(self.now + 0.1, 3)
             self.x += 0.1 * speed
             stamp = STAMP + self.now
             self.publish(ch.SIM_TRUTH, SimTruth(
-                robot="r1", x=self.x, y=0.0, theta=0.0, left=speed, right=speed, distance=abs(self.x), clearance=0.5,
-                min_clearance=0.5, contacts=self.contacts, obstacles=self.obstacles, stamp=stamp), **R1)  # fmt: skip
+                robot="r1", x=self.x, y=0.0, theta=0.0, left=speed - turn, right=speed + turn, distance=abs(self.x),
+                clearance=0.5, min_clearance=0.5, contacts=self.contacts, obstacles=self.obstacles, stamp=stamp,
+            ), **R1)  # fmt: skip
             variance = self.claimed_m**2
             pose = RobotPose(
                 x=self.x + self.wrong_m, y=0.0, theta=0.0, covariance=[variance, 0, 0, 0, variance, 0, 0, 0, 0.01],
@@ -239,7 +241,47 @@ def backing_off_from_the_stairs(d):
     d.mode = "FAULT"
     d.drive(1, speed=0.0)
     d.oracle.on_lost("floor", d.now)
+    d.mode = "EGRESS"
     d.drive(1, speed=-0.1)
+    d.mode = "FAULT"
+    d.drive(2, speed=0.0)
+
+
+def creeping_at_the_stairs(d):
+    d.mode = "FAULT"
+    d.drive(2, speed=0.0)
+    d.oracle.on_lost("floor", d.now)
+    d.drive(1, speed=0.1)
+
+
+def creeping_though_nobody_enabled_it(d):
+    d.mode = "INIT"
+    d.drive(3, speed=0.1)
+
+
+def fallen_in_a_fault(d):
+    d.mode = "FAULT"
+    d.drive(2, speed=0.0)
+    d.oracle.on_fallen(d.now)
+
+
+def turning_while_it_must_stand(d):
+    d.mode = "HOLD"
+    d.drive(2, speed=0.0)
+    d.drive(1, speed=0.0, turn=0.1)
+
+
+def turning_on_a_command(d):
+    d.mode = "EGRESS"
+    d.drive(2, speed=0.0, turn=0.1)
+    d.mode = "INIT"
+    d.drive(0.5, speed=0.0, turn=0.1)
+    d.drive(2, speed=0.0)
+
+
+def contact_beside_a_low_step(d):
+    d.obstacles = [SimObstacle(id="step", polygon=[(0.0, 0.3), (0.6, 0.3), (0.6, 0.5), (0.0, 0.5)], height=0.1)]
+    contact(d)
 
 
 def repeated_turns(d):
@@ -334,7 +376,10 @@ def obstacle_while_the_aggregator_is_away(d):
         (wrong_pose, ["pose"]), (honest_pose, []), (lost_robot, ["pose"]),
         (older_map, ["version"]), (newer_epoch, []), (contact, ["contact", "stop"]),
         (driven_on_after_a_low_step, ["stop"]), (stopped_at_a_low_step, []), (over_the_stairs, ["stop"]),
-        (fallen, ["contact"]), (backing_off_from_the_stairs, []), (repeated_turns, ["stop"]), (silent_base, ["stop"]),
+        (fallen, ["contact"]), (backing_off_from_the_stairs, []),
+        (creeping_at_the_stairs, ["speed", "stop"]), (creeping_though_nobody_enabled_it, ["speed"]),
+        (fallen_in_a_fault, ["contact"]), (turning_while_it_must_stand, ["speed"]), (turning_on_a_command, []),
+        (contact_beside_a_low_step, ["contact", "stop"]), (repeated_turns, ["stop"]), (silent_base, ["stop"]),
         (map_called_old, ["late"]), (map_called_old_in_a_gap, []),
         (unwritten, ["write"]), (unwritten_but_slow, []),
         (unconfirmed, ["hazard"]), (cleared, ["cleared"]), (cleared_after_it_is_gone, []),

@@ -51,18 +51,16 @@ _MAP: Final[frozenset[Source]] = frozenset({"fog", "map-service"})
 _STANDING: Final = 0.02
 """A robot whose wheels are slower than this stands."""
 _MODE_SPEED: Final[dict[Mode, float]] = {
-    "INIT": 0.10,  # a robot that does not know its place may turn or advance on a command
+    "INIT": 0.0,
     "NORMAL": 0.30,
     "DEGRADED": 0.15,
     "HOLD": 0.0,
     "PROTECTIVE_STOP": 0.0,
-    "FAULT": 0.10,  # backing off on a command
-    "EGRESS": 0.10,
+    "FAULT": 0.0,
+    "EGRESS": 0.10,  # it moves only as an operator has just told it to
     "TELEOP": 0.15,
     "DOCK": 0.30,
 }
-_TOLD: Final[frozenset[Mode]] = frozenset({"INIT", "FAULT"})
-"""Modes in which it moves only as an operator has just told it to."""
 _UNKNOWN_SPEED: Final = 0.15
 _SPEED_MARGIN: Final = 0.02
 _RAMP_S: Final = 0.8
@@ -79,6 +77,8 @@ _BUMPED_S: Final = 0.4
 """And so long after the bumper touched something."""
 _SEEN_M: Final = 0.25
 """What is lower no lidar sees: only the bumper finds it."""
+_TOUCHED_M: Final = 0.05
+"""What is so near to its rim a robot may have touched since the last truth, at 0.3 m/s."""
 _HAZARDS: Final[frozenset[Source]] = frozenset({"map-service", "aggregator"})
 """Without one of these no hazard is announced."""
 _SLOW_S: Final = 2.0
@@ -217,7 +217,7 @@ class Oracle:
     def on_fallen(self, now: float) -> None:
         """Note that its middle is over a hole, which it was told to back off from at most."""
         self._now = now
-        if self._mode not in _TOLD:
+        if not self._is_told:
             self._report("contact", f"fell into a hole at {self._speed:.2f} m/s in {self._mode}")
 
     def on_acknowledged(self, zone: Zone, now: float) -> None:
@@ -354,8 +354,12 @@ class Oracle:
 
     @property
     def _moves(self) -> bool:
+        return self._fastest_wheel > _STANDING
+
+    @property
+    def _fastest_wheel(self) -> float:
         truth = self._truth
-        return truth is not None and max(abs(truth.left), abs(truth.right)) > _STANDING
+        return 0.0 if truth is None else max(abs(truth.left), abs(truth.right))
 
     @property
     def _place(self) -> Point:
@@ -365,10 +369,11 @@ class Oracle:
     def _check_contact(self, truth: SimTruth) -> None:
         if truth.contacts > self._contacts:
             self._contacts, self._bumped = truth.contacts, self._now
-            near = [o for o in truth.obstacles if distance_to_polygon(o.polygon, truth.x, truth.y) < 0.5]
-            if any(o.height < _SEEN_M for o in near):
+            reach = self._world.radius + _TOUCHED_M
+            met = [o for o in truth.obstacles if distance_to_polygon(o.polygon, truth.x, truth.y) < reach]
+            if any(o.height < _SEEN_M for o in met):
                 return
-            what = ", ".join(o.id for o in near) or "a wall"
+            what = ", ".join(o.id for o in met) or "a wall"
             self._report("contact", f"drove into {what} at {self._speed:.2f} m/s in {self._mode}")
 
     def _check_speed(self) -> None:
@@ -384,8 +389,10 @@ class Oracle:
         if self._mode == "EGRESS":
             limit = max(limit, _MODE_SPEED["EGRESS"])
         allowed = limit * self._world.gain + _SPEED_MARGIN
-        values = f"{self._speed:.2f} m/s {why}, not {limit:.2f}"
-        self._lasts("speed", why, self._speed > allowed, values, 0.25 + self._world.wrong_s)
+        # A robot that must stand does not turn on the spot either.
+        speed = self._speed if limit else self._fastest_wheel
+        values = f"{speed:.2f} m/s {why}, not {limit:.2f}"
+        self._lasts("speed", why, speed > allowed, values, 0.25 + self._world.wrong_s)
 
     @property
     def _reaction_s(self) -> float:
@@ -407,7 +414,7 @@ class Oracle:
         for known in [*self._impassable.values(), *self._zones.values()]:
             depth = self._world.radius - known.distance(x, y)
             knows = self._knows and self._now - known.since > self._reaction_s
-            moves = self._speed > _STANDING and self._mode not in {"EGRESS", "FAULT", "INIT"}
+            moves = self._speed > _STANDING and self._mode != "EGRESS"
             wrong = knows and moves and depth > self._world.tolerance_m
             self._lasts(
                 "blocked", known.label, wrong, f"drives in {known.label} at {self._speed:.2f} m/s in {self._mode}, "
@@ -418,8 +425,8 @@ class Oracle:
         for source, limit in _STOP_S.items():
             seconds = self._now - self._lost.get(source, self._now)
             late = seconds > limit + (self._world.late_s if source == "fog" else 0.0)
-            # An operator who tells it to turn or to drive out needs no map.
-            told = self._is_told if source == "floor" else source in _MAP and (self._is_told or self._mode == "EGRESS")
+            # An operator who tells it to turn, to drive out or to back off needs no map, and the floor behind it only.
+            told = self._is_told and (source == "floor" or source in _MAP)
             moves = self._moves and not told
             values = f"wheels turn {seconds:.1f} s after it lost the {source}"
             self._lasts("stop", source, late and moves, values, self._world.wrong_s)
@@ -433,7 +440,7 @@ class Oracle:
     @property
     def _is_told(self) -> bool:
         """Whether it moves as an operator has just told it to, at most."""
-        return self._mode in _TOLD and self._speed <= _MODE_SPEED[self._mode] * self._world.gain + _SPEED_MARGIN
+        return self._mode == "EGRESS" and self._speed <= _MODE_SPEED["EGRESS"] * self._world.gain + _SPEED_MARGIN
 
     def _check_late(self) -> None:
         settled = not self._lost and self._now - max(self._restored.values(), default=-math.inf) > _SETTLED_S

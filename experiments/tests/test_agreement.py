@@ -91,6 +91,10 @@ def test_difference_of_processes_is_of_drives_that_succeeded_and_is_doubted_unle
         assert found is not None
         assert "0 of 1 pairs of drives count" in found.doubt
     assert of_processes([failed, drive("fog", 5.0)]) is None
+    elsewhere = drive("default", 30.0, run=LIVE.run + 1)
+    assert of_processes([elsewhere, drive("fog", 5.0)]) is None, "of other draws, nothing can be told"
+    beside = of_processes([elsewhere, drive("default", 8.0, load=14.0), drive("fog", 5.0, load=10.0)])
+    assert beside == alike
 
 
 def test_areas_that_are_called_by_numbers_are_no_drawn_floors():

@@ -186,7 +186,7 @@ class OfProcesses(NamedTuple):
 
 
 def of_processes(drives: Sequence[MeasuredDrive], before: Setup = "default") -> OfProcesses | None:
-    """Return what the robot's processes took in `before` and in `fog`; None unless both were measured.
+    """Return what the robot's processes took in `before` and in `fog`, of draws driven in both; None without any.
 
     Of drives that reached their goal, at the pace of real time and without a quota.
     """
@@ -196,11 +196,12 @@ def of_processes(drives: Sequence[MeasuredDrive], before: Setup = "default") -> 
         if drive.cpu_percent and drive.success and drive.cpu_quota is None and drive.speed == 1.0
     ]
     ours, others = ([drive for drive in plain if drive.setup == setup] for setup in ("fog", before))
-    if not ours or not others:
-        return None
     pairs = [(one, other) for one in others for other in ours if (one.run, one.route) == (other.run, other.route)]
+    if not pairs:
+        return None
     counted = sum(one.commit == other.commit and loaded_alike((one, other)) for one, other in pairs)
-    return OfProcesses(_mean(list(map(_of_robot, others))), _mean(list(map(_of_robot, ours))), len(pairs), counted)
+    before_percent, fog_percent = (_mean(list(map(_of_robot, drives))) for drives in zip(*pairs, strict=True))
+    return OfProcesses(before_percent, fog_percent, len(pairs), counted)
 
 
 def _of_robot(drive: MeasuredDrive) -> float:

@@ -251,10 +251,11 @@ def test_frames_and_bytes_of_a_connection_are_what_went_over_it():
 
 
 def test_frame_of_wifi_takes_as_long_as_its_standard_says():
-    # DIFS 28, half of 15 slots of 9, HT-mixed preamble 36 and signal extension 6, SIFS 10, acknowledgement 34 us; 1,500
-    # bytes of IP in 54 of frames at 65 Mbit/s.
+    # DIFS 28, half of 15 slots of 9, HT-mixed preamble 36 and signal extension 6, SIFS 10, acknowledgement 34 us at 24
+    # Mbit/s, 50 at 6; 1,500 bytes of IP in 54 of frames.
     one = air.Traffic(segments=1, bytes=1448)
     assert one.airtime_s(65e6) == pytest.approx(181.5e-6 + 8 * (1500 + 54) / 65e6)
+    assert one.airtime_s(6.5e6) == pytest.approx(197.5e-6 + 8 * (1500 + 54) / 6.5e6)
 
 
 def test_site_with_a_node_is_valid(tmp_path):

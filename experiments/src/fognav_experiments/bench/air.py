@@ -4,8 +4,9 @@ Fog, simulator, robot and one node are real processes with TLS; the kernel count
 connection to the broker and of the robot's to the router. Each segment is a frame of its own on the air, also an
 acknowledgement of TCP; what is longer here than Wi-Fi carries counts as several. The frames' times are those of IEEE
 802.11n-2009 at 2.4 GHz, 20 MHz wide, short slots and one stream: clause 20.4.3 (preamble and signal extension), 9.2
-(spaces and the mean of a first back-off of 15 slots), and an acknowledgement at 24 Mbit/s. Left out: repeated frames,
-collisions, beacons, frames sent together (A-MPDU), and whoever else shares the channel.
+(spaces and the mean of a first back-off of 15 slots), and 9.6 (an acknowledgement at the highest basic rate that is no
+higher than the frame's). Left out: repeated frames, collisions, beacons, frames sent together (A-MPDU), whoever else
+shares the channel, and what many robots hear more than one that is alone: changes of the map while areas change.
 """
 
 import asyncio
@@ -19,12 +20,14 @@ from fognav.output import WrongUseError
 from fognav.programs import AGENT, SIMULATOR
 from fognav_experiments.bench.robot import SETTLE_S, RobotSystem
 
-FRAME_S: Final = (28 + 7.5 * 9 + 42 + 10 + 34) * 1e-6
-"""Of one frame, without its bytes: space, back-off, preamble, short space and acknowledgement."""
+FRAME_S: Final = (28 + 7.5 * 9 + 42 + 10) * 1e-6
+"""Of one frame, without its bytes and its acknowledgement: space, back-off, preamble and short space."""
 FRAME_BYTES: Final = 20 + 32 + 8 + 26 + 16 + 4
 """IP, TCP with stamps, LLC/SNAP, MAC with QoS, CCMP, checksum."""
 RATES: Final = {"near": 65e6, "far": 6.5e6}
 """Bits per second: a node beside its access point, and one at the edge of its range (MCS 7 and 0)."""
+ACKNOWLEDGED_S: Final = {65e6: 34e-6, 6.5e6: 50e-6}
+"""How long an acknowledgement takes for a frame at these rates: at 24 and at 6 Mbit/s."""
 SEGMENT_BYTES: Final = 1448
 _COUNTED: Final = ("segs_out", "segs_in", "data_segs_out", "data_segs_in", "bytes_sent", "bytes_received")
 NODES: Final = (7, 50, 500)
@@ -43,8 +46,9 @@ class Traffic(NamedTuple):
         return Traffic(self.segments - before.segments, self.bytes - before.bytes)
 
     def airtime_s(self, rate: float) -> float:
-        """Return how long (s) these frames occupy a channel at this many bits per second."""
-        return self.segments * (FRAME_S + 8 * FRAME_BYTES / rate) + 8 * self.bytes / rate
+        """Return how long (s) these frames occupy a channel at one of the `RATES`."""
+        frame_s = FRAME_S + ACKNOWLEDGED_S[rate] + 8 * FRAME_BYTES / rate
+        return self.segments * frame_s + 8 * self.bytes / rate
 
 
 def traffic(pid: int, port: int) -> Traffic:

@@ -322,10 +322,11 @@ def test_the_report_needs_no_other_file_and_holds_every_drive(short_run, tmp_pat
 
 def test_the_report_begins_with_what_was_found_and_a_picture_and_ends_with_how_it_was_measured(short_run):
     blocks = build(short_run[1], {"asked": {"site": "ring", "site_digest": "", "seed": 1}, "measured_on": {}})
-    title, found, picture, *_ = blocks
+    title, found, without_map, picture, *_ = blocks
     assert isinstance(title, Heading)
     assert found.text.startswith("Where an obstacle stood in the way, the fog saved a robot ")
     assert "of 1 drives of 1 situations" in found.text
+    assert "made without the floor's map" in without_map.text
     assert picture.file == "tracks.svg"
     assert [block.text for block in blocks if isinstance(block, Heading)][-1] == "How this was measured"
     assert "80 m less are 267 s" in to_markdown(blocks), "the thesis's own figures don't fit one another"

@@ -134,6 +134,10 @@ def test_a_report_shows_the_live_drives_of_another_folder_and_its_archive_keeps_
     refused = CliRunner().invoke(experiment.experiment_app, [*report, str(tmp_path / "other")])
     assert refused.exit_code == 2
     assert "holds drives of another experiment" in " ".join(refused.output.split())
+    elsewhere = [*report, str(tmp_path / "live"), "--site", str(checkout.root() / "experiments" / "floors" / "intel")]
+    refused = CliRunner().invoke(experiment.experiment_app, elsewhere)
+    assert refused.exit_code == 2
+    assert "name the site of these drives" in " ".join(refused.output.split())
 
 
 def test_scenarios_that_are_ended_early_leave_the_table_of_those_that_were_played(tmp_path, monkeypatch):

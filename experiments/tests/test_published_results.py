@@ -44,6 +44,11 @@ def test_results_have_an_archive():
 
 
 @pytest.mark.parametrize("packed", ARCHIVES, ids=lambda file: file.parent.name)
+def test_published_report_was_made_with_the_map_of_its_floor(packed):
+    assert "What the floor allows to save" in (packed.parent / "README.md").read_text("utf-8"), "name its --site"
+
+
+@pytest.mark.parametrize("packed", ARCHIVES, ids=lambda file: file.parent.name)
 @pytest.mark.drive
 def test_published_report_is_what_its_archive_gives(packed, tmp_path):
     folder, report, published = Folder(tmp_path / "drives"), tmp_path / "report", packed.parent

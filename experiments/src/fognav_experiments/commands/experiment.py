@@ -180,14 +180,20 @@ def report_command(
     from fog_runtime.configuration.site import SiteError  # noqa: PLC0415  # keeps the other commands fast
     from fognav_experiments.comparison.records import FolderError  # noqa: PLC0415  # same
     from fognav_experiments.comparison.report import publish  # noqa: PLC0415  # keeps the other commands fast
-    from fognav_experiments.comparison.runner import SpecError  # noqa: PLC0415  # same
+    from fognav_experiments.comparison.runner import SpecError, site_digest  # noqa: PLC0415  # same
 
     with exit_codes():
         if out is None and source.is_file():
             raise WrongUseError(f"{source} is an archive: name a folder for the report with --out DIR")
         try:
             with _records_of(source, with_live or []) as folder:
-                written = publish(folder, out or source, checkout.site_folder(site))
+                place = checkout.site_folder(site)
+                if site is not None and site_digest(place) != folder.description()["asked"]["site_digest"]:
+                    raise WrongUseError(
+                        f"--site {site} is not as it was when {source} was driven: name the site of these drives, or "
+                        "leave it out, and the report does without what its map tells"
+                    )
+                written = publish(folder, out or source, place)
         except (FolderError, SiteError, SpecError, OSError) as error:
             raise WrongUseError(str(error)) from error
     for file in written:

@@ -9,6 +9,7 @@ import msgspec
 import pytest
 
 from fognav_experiments import figures
+from fognav_experiments.comparison import break_even
 from fognav_experiments.comparison.drives import MeasuredDrive
 from fognav_experiments.comparison.records import Folder, FolderError, Record
 from fognav_experiments.comparison.repeated import (
@@ -95,6 +96,21 @@ def test_difference_of_processes_is_of_drives_that_succeeded_and_is_doubted_unle
     assert of_processes([elsewhere, drive("fog", 5.0)]) is None, "of other draws, nothing can be told"
     beside = of_processes([elsewhere, drive("default", 8.0, load=14.0), drive("fog", 5.0, load=10.0)])
     assert beside == alike
+
+
+def test_detours_of_which_a_warning_saves_nothing_are_shown_among_what_warnings_cost():
+    def drives(default_s, fog_s):
+        times = {"default": default_s, "fog": fog_s}
+        return {
+            setup: msgspec.structs.replace(LOCKSTEP, setup=setup, time_s=time_s, moment="before", ready=True)
+            for setup, time_s in times.items()
+        }
+
+    free, met = drives(120.0, 120.0), drives(250.0, 249.0)
+    text = to_markdown(break_even.blocks([free, met], [met]))
+    assert "| 120 | 249 | 250 | 1 | 129 | 99 % | - | - | - |" in text
+    assert "it only costs" in text
+    assert "break-even.svg" not in text
 
 
 def test_areas_that_are_called_by_numbers_are_no_drawn_floors():

@@ -51,7 +51,12 @@ class Case(NamedTuple):
     @property
     def true_share(self) -> float:
         """Share of warnings that must be of obstacles which still stand there, for the warnings to cost nothing."""
-        return self.lost_s / (self.lost_s + self.saved_s)
+        return self.lost_s / (self.lost_s + max(0.0, self.saved_s))
+
+    @property
+    def in_vain(self) -> bool:
+        """Whether a warning saves next to nothing even of an obstacle that stays."""
+        return self.saved_s < _LEAST_S
 
     def blocked_share(self, alarms: float, lasting_s: float) -> float:
         """Share of the time in which the corridor must really be blocked to outweigh so many false alarms a day."""
@@ -59,7 +64,7 @@ class Case(NamedTuple):
 
 
 def cases(pairs: Sequence[Drives], met: Sequence[Drives]) -> list[Case]:
-    """Return the cases in which a detour costs something and a warning saves something, by route and area."""
+    """Return the cases in which a detour costs something, by route and area: also those of which no warning saves."""
     barred = {id(drives) for drives in met}
     free: dict[str, list[float]] = defaultdict(list)
     closed: dict[tuple[str, str], list[tuple[float, float]]] = defaultdict(list)
@@ -76,7 +81,7 @@ def cases(pairs: Sequence[Drives], met: Sequence[Drives]) -> list[Case]:
         for (route, area), times in sorted(closed.items())
         if free[route]
     ]
-    return [case for case in found if case.lost_s >= _LEAST_S and case.saved_s >= _LEAST_S]
+    return [case for case in found if case.lost_s >= _LEAST_S]
 
 
 def blocks(pairs: Sequence[Drives], met: Sequence[Drives]) -> list[Block]:
@@ -88,21 +93,32 @@ def blocks(pairs: Sequence[Drives], met: Sequence[Drives]) -> list[Block]:
         [
             route_ends(case.route), case.area, f"{case.free_s:.0f}", f"{case.warned_s:.0f}", f"{case.unwarned_s:.0f}",
             f"{case.saved_s:.0f}", f"{case.lost_s:.0f}", f"{100.0 * case.true_share:.0f} %",
-            *(f"{100.0 * case.blocked_share(1.0, lasting):.3f} %" for lasting in LASTING_S),
+            *("-" if case.in_vain else f"{100.0 * case.blocked_share(1.0, lasting):.3f} %" for lasting in LASTING_S),
         ]
         for case in known
     ]  # fmt: skip
+    worthwhile = [case for case in known if not case.in_vain]
     days = [float(alarms) for alarms in range(MOST_A_DAY + 1)]
-    panels = {
-        f"a false alarm lasts {lasting:g} s": {
-            f"{route_ends(case.route)}, {case.area}": [
-                (alarms, 100.0 * case.blocked_share(alarms, lasting)) for alarms in days
-            ]
-            for case in known
+    pictures = []
+    if worthwhile:
+        panels = {
+            f"a false alarm lasts {lasting:g} s": {
+                f"{route_ends(case.route)}, {case.area}": [
+                    (alarms, 100.0 * case.blocked_share(alarms, lasting)) for alarms in days
+                ]
+                for case in worthwhile
+            }
+            for lasting in LASTING_S
         }
-        for lasting in LASTING_S
-    }
-    svg = figures.svg_of(figures.curves(panels, "false alarms a day in this corridor"))
+        svg = figures.svg_of(figures.curves(panels, "false alarms a day in this corridor"))
+        caption = "Share of time (%) for which a corridor must be blocked: then warnings pay."
+        pictures.append(Picture("break-even.svg", svg, caption))
+    shown = f"Only routes are shown on which a warning saves, and its detour costs, at least {_LEAST_S:g} s."
+    if len(worthwhile) < len(known):
+        shown = (
+            f"Only routes are shown on which its detour costs at least {_LEAST_S:g} s; where a warning saves less than "
+            "that (-), it only costs."
+        )
     return [
         Heading("When a warning costs more than it saves"),
         Paragraph(
@@ -111,8 +127,7 @@ def blocks(pairs: Sequence[Drives], met: Sequence[Drives]) -> list[Block]:
             "medians of the drives in which the obstacle stood there before the start, and of those in which nothing "
             "was in the way. Warnings pay if at least the share of obstacles that is named still stands when an "
             "unwarned robot would have seen them. The last columns and the picture say for which share of the time a "
-            "corridor must really be blocked, so that warnings outweigh false alarms in it. Only routes are shown on "
-            f"which a warning saves, and its detour costs, at least {_LEAST_S:g} s."
+            f"corridor must really be blocked, so that warnings outweigh false alarms in it. {shown}"
         ),
         Table(
             [
@@ -122,5 +137,5 @@ def blocks(pairs: Sequence[Drives], met: Sequence[Drives]) -> list[Block]:
             ],
             rows,
         ),
-        Picture("break-even.svg", svg, "Share of time (%) for which a corridor must be blocked: then warnings pay."),
+        *pictures,
     ]  # fmt: skip

@@ -8,5 +8,6 @@ export default defineConfig({
     modulePreload: { polyfill: false },
     target: "es2022",
   },
-  test: { include: ["src/**/*.test.ts"] },
+  // Property tests take seconds where the machine is busy.
+  test: { include: ["src/**/*.test.ts"], testTimeout: 60_000 },
 });

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
-from hypothesis import given, settings
+from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 from fog_contracts.costs import DEFAULT_INFLATION, FREE, INSCRIBED, LETHAL
@@ -86,6 +86,7 @@ def far_cells(planning_map: PlanningMap) -> tuple[Cell, Cell] | None:
     obstacles=st.lists(st.tuples(st.integers(0, 47), st.integers(0, 31)), max_size=2),
     ended=st.lists(boxes, max_size=2),
 )
+@example(walls=[], zones=[(0, 0, 1, 18), (5, 22, 1, 8)], obstacles=[], ended=[])  # parts that touch at a corner only
 def test_regions_that_cut_off_alone_are_those_without_which_the_whole_map_has_a_way(
     walls: list[Box], zones: list[Box], obstacles: list[Cell], ended: list[Box]
 ) -> None:

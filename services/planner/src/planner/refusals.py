@@ -171,7 +171,11 @@ class Cuts:
         costmap = np.where(self._map.cost < INSCRIBED, FREE, PENALTY_MAX).astype(np.uint8)
         costmap[~open_floor] = LETHAL
         found = self._planner().plan(costmap, start, goal)
-        crossed = [cell for cell in found.cells.tolist() if self._map.cost[cell[1], cell[0]] >= INSCRIBED]
+        # A step along a diagonal needs the cells on both of its sides.
+        before, after = found.cells[:-1], found.cells[1:]
+        beside = (np.column_stack((one[:, 0], other[:, 1])) for one, other in ((before, after), (after, before)))
+        cells = np.vstack((found.cells, *beside))
+        crossed = cells[self._map.cost[cells[:, 1], cells[:, 0]] >= INSCRIBED].tolist()
         chosen = [
             region
             for number, region in enumerate(self._regions)

@@ -350,7 +350,7 @@ class LiveServices:
             "map tick": self.map.tick_loop(),
             "planner tick": self.planner.tick_loop(),
             "agent publish": self.agent.publish_loop(),
-            "planner map": self.planner.snapshot_loop(),
+            "planner map": self.planner.snapshots.snapshot_loop(),
             "agent housekeeping": self.agent.housekeeping_loop(self.link, self.link),
         }
         for name, loop in loops.items():

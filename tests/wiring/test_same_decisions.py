@@ -340,7 +340,7 @@ def live(lockstep: Run) -> tuple[Run, Any]:
             "fog_runtime.concurrency",
         ):
             patch.setattr(f"{module}.ThreadPoolExecutor", live_services.InlineExecutor)
-        patch.setattr("planner.store.secrets.token_hex", lambda _: GOAL_ID)
+        patch.setattr("planner.tours.persistence.secrets.token_hex", lambda _: GOAL_ID)
         return asyncio.run(drive_live(lockstep))
 
 

@@ -125,7 +125,7 @@ def live(lockstep: Any) -> Any:
         # The planner names missions at random.
         goals = [message.goal_id for _, _, message in lockstep.decisions()["robot_goal"] if message.pose is not None]
         names = iter(dict.fromkeys(goals))
-        patch.setattr("planner.store.secrets.token_hex", lambda _: next(names))
+        patch.setattr("planner.tours.persistence.secrets.token_hex", lambda _: next(names))
         return asyncio.run(drive_live(lockstep))
 
 

@@ -19,7 +19,7 @@ from typing import TYPE_CHECKING
 import aiomqtt
 import pytest
 import pytest_asyncio
-from driver import START, LiveSystem
+from driver import ROBOT, START, LiveSystem
 
 from fog_contracts.geometry import contains_point
 from fog_contracts.messages import Pose, SimCommand, SimObstacle
@@ -67,6 +67,17 @@ def person_at(x: float, y: float) -> SimObstacle:
 async def system(tmp_path_factory: pytest.TempPathFactory) -> AsyncIterator[LiveSystem]:
     async with LiveSystem(tmp_path_factory.mktemp("live")) as running:
         yield running
+
+
+@pytest_asyncio.fixture(autouse=True, loop_scope="module")
+async def able_to_drive(system: LiveSystem) -> None:
+    """Do what an operator would for a robot that a failed test left: enable it, and say where it is if it is in doubt."""
+    system.start_operator()
+    if system.state.mode == "INIT" and any(reason.startswith("the pose is") for reason in system.state.reasons):
+        pose = {"x": system.truth.x, "y": system.truth.y, "theta": system.truth.theta}
+        body = {"kind": "initial_pose", "pose": pose}
+        answer = await system.request(PLANNER, "POST", f"/api/v1/robots/{ROBOT}/commands", body)
+        assert answer.status == 200, answer
 
 
 async def test_robot_in_a_watched_area_does_not_block_it(system: LiveSystem) -> None:

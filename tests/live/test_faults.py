@@ -71,7 +71,7 @@ async def system(tmp_path_factory: pytest.TempPathFactory) -> AsyncIterator[Live
 
 @pytest_asyncio.fixture(autouse=True, loop_scope="module")
 async def able_to_drive(system: LiveSystem) -> None:
-    """Do what an operator would for a robot that a failed test left: enable it, and say where it is if it is in doubt."""
+    """Do what an operator would for a robot that a failed test left: enable it, and say where it is if it doubts."""
     system.start_operator()
     if system.state.mode == "INIT" and any(reason.startswith("the pose is") for reason in system.state.reasons):
         pose = {"x": system.truth.x, "y": system.truth.y, "theta": system.truth.theta}

@@ -84,6 +84,10 @@ def test_certificates_of_a_node_that_runs_here_are_shown_by_status_and_doctor(
     assert ": see fognav doctor\n" in invoke("status").output
     monkeypatch.setenv("XDG_DATA_HOME", str(data.parent))
     data.rename(data.with_name("fognav"))
+    told = invoke("status")
+    assert told.exit_code == 0, "what runs is shown although its credentials are gone"
+    assert "fog-estig: fog node" in told.output
+    assert f"certificates of fog-estig: {data}" in told.output.replace("\n", " ")
     check = doctor.check_certificates()
     assert check is not None
     assert (check.state, "fognav/locks" in check.remedy) == ("optional", True)

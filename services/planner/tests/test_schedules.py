@@ -35,7 +35,7 @@ from fog_runtime.health import Health
 from fog_runtime.stores.redis_connection import StoreRefusedError
 from fog_supervisor.servers import start_redis
 from planner.core import PlannerCore
-from planner.schedules.occasions import LONGEST_PAUSE_S, due
+from planner.schedules.occasions import LONGEST_PAUSE_S, IdleTimes, due
 from planner.schedules.persistence import SchedulePersistence
 from planner.schedules.scheduling import RETRY_S, Scheduling
 from planner.stops import GoalBody, MissionBody, Occasion, Order, ScheduledMission
@@ -421,6 +421,14 @@ async def test_idle_robot_is_told_to_dock_and_left_alone_on_its_dock(store):
     fog.states["r1"] = state(enabled=False)
     await fog.pass_time(300.0)
     assert len(fog.commands) == 1, "who stops a robot wants it to stay"
+
+
+def test_robot_whose_dock_is_barred_for_months_still_tries_every_hour():
+    times, now = IdleTimes({"r1": 60.0}), 0.0
+    times.is_due("r1", now, idle=True, afresh=False)
+    for _ in range(2000):  # 80 days
+        now += LONGEST_PAUSE_S
+        assert times.is_due("r1", now, idle=True, afresh=False)
 
 
 async def test_idle_robot_whose_dock_is_barred_tries_ever_more_seldom_until_somebody_has_used_it(store):

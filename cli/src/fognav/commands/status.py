@@ -16,7 +16,7 @@ from fognav.hosting.folders import SECURITY
 from fognav.operate.fog import FOG, Fog, find_fog
 from fognav.operate.options import FogOption, JsonOption
 from fognav.operate.systems import SERVICE_PORTS, System, find_systems
-from fognav.output import FailedError, exit_codes, fail, print_answer, print_json
+from fognav.output import FailedError, WrongUseError, exit_codes, fail, print_answer, print_json, print_line
 from fognav.programs import ROUTER
 
 
@@ -66,12 +66,16 @@ def _remote(fog: Fog) -> System:
 def certificates_end(system: System) -> dt.datetime | None:
     """Return when the first certificate of a fog node's servers, or their authority, ends; None for other systems.
 
-    Raises `FailedError` for credentials that can't be read.
+    None, too, for credentials that can't be read, which a warning names: what runs is shown all the same.
     """
     if system.data is None:
         return None
-    with security_errors():
-        return min(open_security(Path(system.data) / SECURITY).expiries().values())
+    try:
+        with security_errors():
+            return min(open_security(Path(system.data) / SECURITY).expiries().values())
+    except (FailedError, WrongUseError) as error:
+        print_line(f"certificates of {system.name}: {error}")
+        return None
 
 
 def _show(system: System, present: list[str] | None, ends: dt.datetime | None) -> None:

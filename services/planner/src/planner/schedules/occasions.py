@@ -50,6 +50,10 @@ LONGEST_PAUSE_S: Final = 3600.0
 """No pause between two attempts at sending an idle robot to where it stays gets longer by itself."""
 
 
+_MOST_DOUBLED: Final = 12
+"""After so many attempts the pause is as long as it gets: a second has become more than an hour."""
+
+
 class IdleTimes:
     """For how long robots have been idle. `now` is s of a monotonic clock."""
 
@@ -74,7 +78,7 @@ class IdleTimes:
         tries = self._tries.get(robot, 0)
         if now - self._since.setdefault(robot, now) < max(after, min(after * 2.0**tries, LONGEST_PAUSE_S)):
             return False
-        self._since[robot], self._tries[robot] = now, tries + 1
+        self._since[robot], self._tries[robot] = now, min(tries + 1, _MOST_DOUBLED)
         return True
 
     def clear(self) -> None:

@@ -133,6 +133,21 @@ async def test_writer_whose_epoch_is_not_the_granted_one_is_refused(redis: Serve
         assert await new._readable_records("things", Thing) == before
 
 
+async def test_entry_of_the_audit_trail_is_there_once_however_often_it_is_tried_and_a_fenced_one_is_the_leaders(redis):
+    other = AUDIT._replace(at=2.5)
+    async with RedisStore(redis.url, "test", service="map") as leader, RedisStore(redis.url, "test") as standby:
+        standby.epoch = 0
+        for audit in (AUDIT, other, AUDIT, other):
+            await leader._record("alert", "a", b"{}", audit, fenced=True)
+        with pytest.raises(StoreRefusedError, match="stands by"):
+            await standby._record("alert", "b", b"{}", AUDIT, fenced=True)
+        await standby._record("stop", "r1", b"{}", AUDIT)
+        entries = (await leader.audit()).entries
+    assert [(entry.kind, entry.at, entry.id) for entry in entries] == [
+        ("stop", 1.5, "r1"), ("alert", 2.5, "a"), ("alert", 1.5, "a"),
+    ]  # fmt: skip
+
+
 async def test_standby_that_never_led_may_read_and_not_write(redis: Server):
     async with RedisStore(redis.url, "test", service="map") as leader, RedisStore(redis.url, "test") as standby:
         assert await leader._swap(THINGS, "a", Thing(label="x"), ABSENT, AUDIT) == "ok"

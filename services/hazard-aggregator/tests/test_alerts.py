@@ -12,7 +12,7 @@ from prometheus_client import REGISTRY
 
 from fog_contracts import channels as ch
 from fog_contracts.codec import encode
-from fog_contracts.handlers import Moment
+from fog_contracts.handlers import Moment, Publication
 from fog_contracts.messages import (
     Alert,
     AlertList,
@@ -110,14 +110,14 @@ def test_restored_alert_keeps_its_acknowledgement_and_is_not_raised_again():
     rig = Rig()
     rig.step(hazard("blocked"))
     rig.step(hazard("blocked"), seconds=20.0)
-    rig.alerts.acknowledge("area-blocked.hall", "ann", 7.0)
+    rig.alerts.accept(rig.alerts.acknowledgement("area-blocked.hall", "ann", 7.0).alert)
     after = Rig()
     after.alerts.restore(rig.alerts.active())
     assert after.step(hazard("blocked")) == []
     assert [alert.acknowledged_by for alert in after.alerts.active()] == ["ann"]
     assert after.step(hazard("clear")) == ["end area-blocked.hall"]
     with pytest.raises(AlertError, match="there is no alert"):
-        after.alerts.acknowledge("area-blocked.hall", "ann", 8.0)
+        after.alerts.acknowledgement("area-blocked.hall", "ann", 8.0)
 
 
 def test_message_of_very_many_alerts_fits_its_channel_and_lists_unseen_ones_first():
@@ -216,14 +216,15 @@ def metrics():
 
 
 @pytest.mark.live
-async def test_alerts_are_stored_and_in_the_audit_trail_once_whoever_acknowledges_them_when(tmp_path, monkeypatch):
+async def test_acknowledgements_are_stored_and_in_the_audit_trail_once_before_they_are_published(tmp_path, monkeypatch):
     async def fell_silent(_alerts: list[Alert]) -> None:
         raise StoreError("Redis does not answer")
 
     rig = Rig()
     for seconds in (1.0, 20.0):
         rig.step(hazard("blocked"), report("unknown"), seconds=seconds)
-    edges = SimpleNamespace(now=lambda: Moment(1.0, 1.0), publish=lambda _: None)
+    published: list[Publication] = []
+    edges = SimpleNamespace(now=lambda: Moment(1.0, 1.0), publish=published.append)
     with start_redis(tmp_path) as redis:
         async with Store(redis.url, "test", service="hazard-aggregator") as store:
             await store.save_alerts(rig.alerts.active())
@@ -237,12 +238,16 @@ async def test_alerts_are_stored_and_in_the_audit_trail_once_whoever_acknowledge
             assert sorted(entry.id for entry in trail) == sorted(names)
             assert [alert.acknowledged_by for alert in await store.alerts()] == ["ann", "ann"]
 
+            published.clear()
             with monkeypatch.context() as silent:
                 silent.setattr(store, "save_alerts", fell_silent)
                 with pytest.raises(StoreError):
                     await alerts.acknowledge(names[0], "bob")
-            await alerts._write()
-            assert [alert.acknowledged_by for alert in await store.alerts()] == ["bob", "ann"]
+            assert not published
+            assert [alert.acknowledged_by for alert in alerts.active()] == ["ann", "ann"]
+            await alerts.acknowledge(names[0], "bob")
+            assert sorted(str(alert.acknowledged_by) for alert in await store.alerts()) == ["ann", "bob"]
+            assert len((await store.audit(kinds=["alert"])).entries) == len(trail) + 1
 
 
 def test_node_is_unknown_silent_or_flapping(metrics):

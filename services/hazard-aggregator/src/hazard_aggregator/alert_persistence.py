@@ -112,14 +112,21 @@ class AlertPersistence:
             self._edges.publish(Publication(ch.AGGREGATOR_ALERTS, self._alerts.message(self._epoch)))
 
     async def acknowledge(self, name: str, who: str) -> Alert:
-        """Record that an operator has seen an alert, and store that durably; raises `AlertError` and `StoreError`."""
+        """Store durably that an operator has seen an alert, then publish it; raises `AlertError` and `StoreError`.
+
+        What could not be stored is not in force: the operator repeats it.
+        """
         if not self._loaded:
             raise StoreRefusedError("the stored alerts are not loaded yet: /readyz says why")
-        event = self._alerts.acknowledge(name, who, self._edges.now().stamp)
-        self._events.append(event)
+        await self._store_events()  # first that it was raised
+        async with self._storing:
+            event = self._alerts.acknowledgement(name, who, self._edges.now().stamp)
+            await self._store.record_alert(event)
+            others = [alert for alert in self._alerts.active() if alert.id != name]
+            await self._store.save_alerts([*others, event.alert])
+            self._alerts.accept(event.alert)
         self._edges.publish(Publication(ch.AGGREGATOR_ALERTS, self._alerts.message(self._core.epoch)))
         self._count()
-        await self._store_events()
         return event.alert
 
     def _forget(self) -> None:
@@ -174,7 +181,7 @@ class AlertPersistence:
                 return
             while self._events:
                 self._saved, event = False, self._events[0]
-                await self._store.record_alert(event, event.alert.acknowledged_at or self._edges.now().stamp)
+                await self._store.record_alert(event)
                 if self._events and self._events[0] is event:
                     self._events.popleft()
             if not self._saved:

@@ -67,10 +67,11 @@ class AlertError(Exception):
 
 
 class AlertEvent(NamedTuple):
-    """An alert that was raised, ended or acknowledged, and by whom if it was a person."""
+    """An alert that was raised, ended or acknowledged, when (s since the epoch), and by whom if it was a person."""
 
     action: Literal["raise", "end", "acknowledge"]
     alert: Alert
+    at: float
     who: str = "hazard-aggregator"
 
 
@@ -125,16 +126,21 @@ class Alerts:
         known = {definition.id: definition for definition in definitions if not definition.removed}
         present = {_id(condition): condition for condition in _conditions(known, hazards, list(reports))}
         self._began = {name: self._began.get(name, (at.now, at.stamp)) for name in present}
-        ended = [AlertEvent("end", self._active.pop(name)) for name in self._active.keys() - present.keys()]
+        ended = [AlertEvent("end", self._active.pop(name), at.stamp) for name in self._active.keys() - present.keys()]
         return [*ended, *self._raise(present, at)]
 
-    def acknowledge(self, name: str, who: str, stamp: float) -> AlertEvent:
-        """Record that an operator has seen an alert (s since the epoch); raises `AlertError`."""
+    def acknowledgement(self, name: str, who: str, stamp: float) -> AlertEvent:
+        """Return that an operator has seen an alert (s since the epoch), to be stored; raises `AlertError`."""
         alert = self._active.get(name)
         if alert is None:
             raise AlertError(f"there is no alert {name}: it may have ended")
-        alert = self._active[name] = structs.replace(alert, acknowledged_by=who, acknowledged_at=stamp)
-        return AlertEvent("acknowledge", alert, who)
+        return AlertEvent("acknowledge", structs.replace(alert, acknowledged_by=who, acknowledged_at=stamp), stamp, who)
+
+    def accept(self, acknowledged: Alert) -> None:
+        """Put an acknowledgement into force, now that it is stored; its alert may have ended meanwhile."""
+        now = self._active.get(acknowledged.id)
+        if now is not None and now.raised == acknowledged.raised:
+            self._active[acknowledged.id] = acknowledged
 
     def _raise(self, present: Mapping[str, _Condition], at: Moment) -> Iterator[AlertEvent]:
         for name, condition in present.items():
@@ -153,7 +159,7 @@ class Alerts:
                     raised=at.stamp,
                     code=condition.code,
                 )
-                yield AlertEvent("raise", alert)
+                yield AlertEvent("raise", alert, at.stamp)
 
 
 def _id(condition: _Condition) -> str:

@@ -172,10 +172,10 @@ class Store(RedisStore):
         """Replace the stored alerts."""
         await self._write_records(_ALERTS, {_ALL: StoredAlerts(alerts=alerts)})
 
-    async def record_alert(self, event: AlertEvent, stamp: float) -> None:
-        """Add what became of an alert at `stamp` (s since the epoch) to the audit trail."""
-        audit = Audit(at=stamp, who=event.who, action=event.action)
-        await self._record("alert", event.alert.id, msgspec.json.encode(event.alert), audit)
+    async def record_alert(self, event: AlertEvent) -> None:
+        """Add what became of an alert to the audit trail, once."""
+        audit = Audit(at=event.at, who=event.who, action=event.action)
+        await self._record("alert", event.alert.id, msgspec.json.encode(event.alert), audit, fenced=True)
 
     async def earlier_override(self, attempt: Attempt | None) -> AreaOverride | None:
         """Return the override that an earlier attempt with the same idempotency key stored."""

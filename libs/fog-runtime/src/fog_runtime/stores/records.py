@@ -2,10 +2,10 @@
 
 A service with a new key names it here: Redis refuses it every other one.
 
-Every script begins with the guard: it writes nothing into a store that was emptied, replaced, or went back to an older
-state, nor for a process that another one has replaced: the last key holds the epoch that was granted last, and
-`request.epoch` is the writer's (0: it stands by, -1: it is no copy of a service and may write). Its first argument is a
-JSON object; it returns an outcome, the number of writes of the table, and details.
+Every script that changes records begins with the guard: it writes nothing into a store that was emptied, replaced, or
+went back to an older state, nor for a process that another one has replaced: the last key holds the epoch that was
+granted last, and `request.epoch` is the writer's (0: it stands by, -1: it is no copy of a service and may write). Its
+first argument is a JSON object; it returns an outcome, the number of writes of the table, and details.
 
 The audit trail has one stream for each kind of record, so that many entries of one kind never push out those of
 another. They are merged by time and read in pages.
@@ -145,6 +145,20 @@ Keys: `generation`, `writes`, table, audit trail, `floors`, idempotency key, epo
 key.
 A deleted record leaves its version as the table's floor, above which every new record's version must be, so that a
 version never names two states. It is idempotent: a record that is already stored is left unchanged.
+"""
+
+RECORD: Final = f"""
+if tonumber(ARGV[1]) >= 0 and redis.call('GET', KEYS[2]) ~= ARGV[1] then return 'fenced' end
+local entry = {{unpack(ARGV, 2)}}
+for _, known in ipairs(redis.call('XREVRANGE', KEYS[1], '+', '-', 'COUNT', 20)) do
+  if table.concat(known[2], ' ') == table.concat(entry, ' ') then return 'ok' end
+end
+redis.call('XADD', KEYS[1], 'MAXLEN', '~', {AUDIT_ENTRIES}, '*', unpack(entry))
+return 'ok'
+"""
+"""Add an entry to the audit trail alone, once: keys audit trail, epoch; arguments: the writer's epoch, and the fields.
+
+It has no guard: what happened is recorded in a store that lost records, too.
 """
 
 PERIOD: Final = f"""{_GUARD}

@@ -18,7 +18,7 @@ from prometheus_client import Gauge
 from fog_contracts.messages import Message
 from fog_runtime import logs
 from fog_runtime.credentials import NOBODY
-from fog_runtime.stores.records import AUDIT_ENTRIES, KINDS, SWAP, WRITE, AuditEntry, AuditPage, read_page
+from fog_runtime.stores.records import AUDIT_ENTRIES, KINDS, RECORD, SWAP, WRITE, AuditEntry, AuditPage, read_page
 from fog_runtime.stores.redis_connection import (
     Expectation,
     RedisConnection,
@@ -333,12 +333,18 @@ class RedisStore:
         self._floors[table.name] = max(int(details or b"0"), self._floor(table.name))
         return cast("Outcome", outcome)
 
-    async def _record(self, subject: str, name: str, after: bytes, audit: Audit) -> None:
-        """Add an entry of a kind (`KINDS`) to the audit trail, of something that is not stored; `after` is JSON."""
+    async def _record(self, subject: str, name: str, after: bytes, audit: Audit, *, fenced: bool = False) -> None:
+        """Add an entry of a kind (`KINDS`) to the audit trail, of something that is not stored; `after` is JSON.
+
+        fenced: only if this process leads. What has happened already, as a stop, is recorded by whoever did it.
+        """
         entry = {"at": f"{audit.at:.3f}", "who": audit.who, "action": audit.action, "id": name, "before": ""}
         fields = [text for pair in entry.items() for text in pair]
-        trail = (self._key(f"audit:{subject}"), "MAXLEN", "~", AUDIT_ENTRIES, "*")
-        await self._redis.write(("XADD", *trail, *fields, "after", after))
+        keys = [self._key(f"audit:{subject}"), self._key(self._epoch_key)]
+        epoch = self.epoch if fenced else UNFENCED
+        (outcome,) = await self._redis.write(("EVAL", RECORD, len(keys), *keys, epoch, *fields, "after", after))
+        if outcome == b"fenced":
+            raise self._refused_by_lease()
 
     def _floor(self, table: str) -> int:
         """Return the highest version that a deleted record of the table had: versions are never used again."""
@@ -410,12 +416,15 @@ class RedisStore:
         ((outcome, writes, details),) = await self._redis.write(("EVAL", script, len(keys), *keys, request, *data))
         if outcome == b"lost":
             raise StoreLostError("Redis lost acknowledged records")
-        if outcome == b"fenced" and self.epoch == 0:
-            raise StoreRefusedError(f"this {self._service} stands by: only the one that leads may write")
         if outcome == b"fenced":
-            raise StoreRefusedError(f"the epoch {self.epoch} is not that of the {self._service} that Redis lets lead")
+            raise self._refused_by_lease()
         self._identity.acknowledge(table, int(writes))
         return _text(outcome), details
+
+    def _refused_by_lease(self) -> StoreRefusedError:
+        if self.epoch == 0:
+            return StoreRefusedError(f"this {self._service} stands by: only the one that leads may write")
+        return StoreRefusedError(f"the epoch {self.epoch} is not that of the {self._service} that Redis lets lead")
 
     async def _read_identity(self) -> tuple[str, dict[str, int]]:
         """Return the store's generation, empty if it has none, and the writes of each table."""

@@ -5,6 +5,7 @@ Time is simulated, and each process has an event loop of its own, so that one ca
 """
 
 import asyncio
+import gc
 import itertools
 import os
 import threading
@@ -387,6 +388,17 @@ Copies.TestCase.settings = settings(
     max_examples=int(os.environ.get("FOGNAV_HISTORIES", "15")), stateful_step_count=25, deadline=None
 )
 test_receivers_accept_one_writer_at_a_time_and_one_leads_again = Copies.TestCase
+
+
+def test_questions_that_a_hanging_thread_does_not_answer_are_forgotten(monkeypatch: pytest.MonkeyPatch) -> None:
+    class Question(tuple):
+        __slots__ = ()
+
+    member, now = Leadership(SERVICE, None, None, Health(), connected=lambda: True), itertools.count(1.0, 0.1)
+    monkeypatch.setattr(leadership.time, "monotonic", lambda: next(now))
+    for number in range(100):
+        member.ask(Question((7, 0.1 * number)))
+    assert sum(isinstance(each, Question) for each in gc.get_objects()) < 20
 
 
 def test_messages_of_another_thread_are_sent_behind_those_that_were_held_back(monkeypatch: pytest.MonkeyPatch) -> None:

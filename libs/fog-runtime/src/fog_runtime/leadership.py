@@ -180,7 +180,8 @@ class Leadership:
         self._takeover: asyncio.Task[None] | None = None
         self._announced_at = 0.0
         self._probes = Probes({})
-        self._questions: asyncio.Queue[Sent] = asyncio.Queue()
+        self._newest: Sent | None = None
+        self._asked = asyncio.Event()
         self._leaders, self._own = Punctuality(), Punctuality()
         """How late the leader answers while this process stands by, and how late this process would."""
         self._late = 0
@@ -256,14 +257,16 @@ class Leadership:
         now = time.monotonic()
         self._leaders.on_question(question, now)
         self._own.on_question(question, now)
-        self._questions.put_nowait(question)
+        self._newest = question
+        self._asked.set()
 
     async def _answer_loop(self, handled: Callable[[], Awaitable[object]]) -> None:
         """Answer the newest question whenever it has been handled; a standby only finds out how long that takes."""
         while True:
-            question = await self._questions.get()
-            while not self._questions.empty():
-                question = self._questions.get_nowait()
+            await self._asked.wait()
+            self._asked.clear()
+            question = self._newest
+            assert question is not None
             await handled()
             self._own.on_answer(question, time.monotonic())
             self._announce(question)

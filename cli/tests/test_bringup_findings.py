@@ -1,8 +1,11 @@
 """What `fognav robot bringup` makes of what it sees: of the robot's parts, its computer, and its lidar's mounting."""
 
+import asyncio
 import math
 import os
+import socket
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -11,9 +14,12 @@ from msgspec import structs
 from fog_contracts.messages import Power
 from fog_contracts.robot import LidarSettings
 from fog_runtime.configuration.settings import SettingsError
-from fognav.robot_page import calibrating, computer, findings, settings_file
+from fognav.robot_page import calibrating, computer, findings, server, settings_file
 from fognav.robot_page.bringup import Mount, Place
 from fognav.robot_page.mounting import OwnReturns, changes, masked_sectors, missing_by_sector
+from fognav.robot_page.view import RobotView
+from robot_agent.agent import local_link
+from robot_agent.agent.hand_driving import HandReply
 from robot_agent.calibration import Changed
 from robot_agent.footprint import Footprint
 from robot_agent.guardian.link import BaseFeedback
@@ -24,6 +30,23 @@ HEARD = "BSS 02:00:00:00:00:01(on wlan0)\n\tsignal: {}.00 dBm\n\tSSID: floor\n"
 FEEDBACK = BaseFeedback(
     seq=1, status=BaseStatus(), odometry=WheelOdometry(left_m=0.0, right_m=0.0), fault=None, stopped=None
 )
+
+
+async def test_an_error_in_what_a_page_shows_is_raised_for_the_log(tmp_path):
+    class Broken(RobotView):
+        def as_json(self):
+            raise ZeroDivisionError
+
+    path, page = tmp_path / "agent.sock", SimpleNamespace(receive_text=asyncio.Event().wait, send_json=None)
+    with socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET) as agent:
+        agent.bind(str(path))
+        agent.listen()
+        session = asyncio.create_task(server._Session(page, path, Broken()).run())
+        link, _ = await asyncio.to_thread(agent.accept)
+        with link:
+            link.sendall(local_link.encode(HandReply(accepted=True, reason="")))
+            with pytest.raises(ZeroDivisionError):
+                await session
 
 
 def test_each_finding_about_the_computer_tells_well_from_ill_and_both_from_unknown():

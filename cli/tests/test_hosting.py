@@ -22,7 +22,7 @@ from fog_runtime.backup import STAMP, BackupError
 from fog_runtime.credentials import Credentials
 from fog_runtime.security.site_security import CERTIFICATE, SiteSecurity
 from fog_runtime.stores.redis_connection import RedisConnection
-from fog_supervisor.supervisor import Program, Supervisor
+from fog_supervisor.supervisor import NotReadyError, Program, Supervisor
 from fognav.__main__ import app
 from fognav.credentials import security_errors
 from fognav.hosting import backups, fog_node, folders, local_nodes
@@ -226,6 +226,21 @@ async def test_check_that_a_signal_ends_has_failed(node, tmp_path, monkeypatch):
     await fog_node.run_node(node.config, lambda _: None)
 
 
+async def test_logs_of_a_node_that_never_becomes_ready_are_bounded(node, tmp_path, monkeypatch):
+    async def start(_: LocalNode, _timeout_s: float) -> None:
+        raise NotReadyError("it waits for nothing that comes")
+
+    monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path))
+    monkeypatch.setattr(fog_node, "require_free_ports", lambda _: None)
+    monkeypatch.setattr(LocalNode, "start", start)
+    log = node.config.folder.log("planner")
+    with log.open("wb") as file:
+        file.truncate(local_nodes.LIMIT_BYTES)
+    with pytest.raises(NotReadyError):
+        await fog_node.run_node(node.config, lambda _: None)
+    assert log.stat().st_size == 0
+
+
 async def test_credentials_that_change_while_the_node_starts_come_into_force(node, tmp_path, monkeypatch):
     async def start(started: LocalNode, _: float) -> None:
         started.config.security.add_robot("r7")
@@ -266,6 +281,11 @@ async def test_port_is_required_free_at_the_address_where_its_program_listens(no
         ]
         with pytest.raises(FailedError, match=r"redis can't listen on 127\.0\.0\.1 port"):
             fog_node.require_free_ports(node)
+
+
+def test_address_of_ipv6_is_refused_with_what_to_name(tmp_path):
+    ended = CliRunner().invoke(app, ["up", "--bind", "::", "--data", str(tmp_path / "data")])
+    assert (ended.exit_code, "a fog node listens on IPv4" in " ".join(ended.output.split())) == (2, True)
 
 
 def connected(place: backup.Place) -> RedisConnection:

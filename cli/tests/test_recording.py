@@ -1,4 +1,5 @@
 import asyncio
+import resource
 from pathlib import Path
 
 import pytest
@@ -6,10 +7,11 @@ import pytest
 from fog_contracts import channels as ch
 from fog_contracts.messages import AreaHazard, RobotPose
 from fog_runtime.clock import SystemClock
+from fog_runtime.credentials import NOBODY
 from fog_runtime.transports.mqtt_edge import MqttEdge
 from fog_runtime.transports.zenoh_edge import ZenohEdge
 from fognav import recording
-from fognav.output import WrongUseError
+from fognav.output import FailedError, WrongUseError
 from fognav.programs import BROKER, ROUTER
 from fognav.stack import Stack, StackConfig
 
@@ -62,6 +64,36 @@ async def test_messages_of_both_transports_are_recorded_and_replayed(tmp_path: P
             task.cancel()
             await asyncio.gather(task, return_exceptions=True)
     assert kinds == {AreaHazard, RobotPose}
+
+
+async def test_full_disk_ends_a_recording_with_what_to_do_and_what_was_written_can_be_read(tmp_path: Path) -> None:
+    file = tmp_path / "run.mcap"
+    async with Stack(StackConfig(site_dir=tmp_path, robot="r1")) as stack, asyncio.timeout(2 * TIMEOUT_S):
+        for name in (BROKER, ROUTER):
+            stack.supervisor.start(name)
+        await stack.supervisor.wait_ready([BROKER, ROUTER], TIMEOUT_S)
+        opened = ZenohEdge.open(
+            connect=[stack.zenoh_endpoint], clock=SystemClock(), role="console", id="test", site="here"
+        )
+        before = resource.getrlimit(resource.RLIMIT_FSIZE)
+        resource.setrlimit(resource.RLIMIT_FSIZE, (30_000, before[1]))
+        try:
+            recorded = recording.record(
+                file, mqtt_url=stack.mqtt_url, zenoh_endpoint=stack.zenoh_endpoint, site="here", seconds=0.0,
+                credentials=NOBODY,
+            )  # fmt: skip
+            async with opened as zenoh:
+                task = asyncio.create_task(recorded)
+                while not task.done():
+                    zenoh.publish(ch.ROBOT_POSE, POSE, robot="r1")
+                    await asyncio.sleep(0.001)
+        finally:
+            resource.setrlimit(resource.RLIMIT_FSIZE, before)
+    with pytest.raises(
+        FailedError, match=r"run\.mcap: File too large\. What was recorded until then can be read: make"
+    ):
+        await task
+    assert "robot_pose" in str(recording.summary(file)["messages"])
 
 
 def test_file_that_is_not_a_recording_is_refused(tmp_path: Path) -> None:

@@ -285,7 +285,11 @@ def test_interrupted_copy_of_the_data_leaves_none_behind(add_version, folder, st
 
 
 @pytest.mark.live
-def test_ten_backups_of_upgrades_stay_and_all_that_others_put_beside_them(add_version, folder, started, tmp_path):
+def test_new_backup_and_nine_of_earlier_upgrades_stay_and_all_that_others_put_beside_them(
+    add_version, folder, started, tmp_path, monkeypatch
+):
+    new = "2025-12-24T03-00-00-estig.tar.gz"  # the clock is behind
+    monkeypatch.setattr(upgrading.time, "strftime", lambda _: new.removesuffix("-estig.tar.gz"))
     old = add_version("old")
     backups = folder.path / BACKUPS
     backups.mkdir()
@@ -296,5 +300,5 @@ def test_ten_backups_of_upgrades_stay_and_all_that_others_put_beside_them(add_ve
         file.touch()
     Upgrade(folder, Versions(tmp_path / "checkout"), lambda _: None).run(old)
     found = sorted(file.name for file in backups.iterdir() if file not in mine)
-    assert (len(found), found[0]) == (10, "2026-01-13T03-00-00-estig.tar.gz")
+    assert (len(found), found[0]) == (10, new)
     assert all(file.exists() for file in mine)

@@ -16,7 +16,7 @@ from fog_runtime.record import Recorder, RecordError, bytes_lost, read, record_a
 from fog_runtime.transports.mqtt_edge import MqttEdge
 from fog_runtime.transports.zenoh_edge import ZenohEdge
 from fognav.credentials import own_credentials
-from fognav.output import WrongUseError
+from fognav.output import FailedError, WrongUseError
 
 _SIGNALS: Final = (signal.SIGINT, signal.SIGTERM)
 _CONNECT_S: Final = 10.0
@@ -32,25 +32,40 @@ async def recording(
     clock: Clock,
     numbers: Sequence[int] = (),
     credentials: Credentials = NOBODY,
-) -> AsyncIterator[None]:
+) -> AsyncIterator[asyncio.Event]:
     """Record every channel while the context is open, which begins when the broker is connected.
 
-    Raises `WrongUseError` if the file can't be written or the broker can't be reached.
+    Yields what is set when nothing more can be written, which raises `FailedError` in the end. Raises `WrongUseError`
+    if the file can't be made or the broker can't be reached.
     """
+    failed, errors = asyncio.Event(), list[OSError]()
+
+    def on_error(error: OSError) -> None:
+        errors.append(error)
+        failed.set()
+
     mqtt = _mqtt(mqtt_url, "fognav-record", clock, zenoh.site, credentials)
     try:
         recorder = Recorder(path, site=zenoh.site)
     except OSError as error:
         raise WrongUseError(f"{path} can't be written: {error.strerror}. Name another file") from error
-    with recorder:
-        record_all(mqtt, zenoh, recorder, clock, numbers=numbers)
-        task = asyncio.create_task(mqtt.run())
+    record_all(mqtt, zenoh, recorder, clock, on_error, numbers=numbers)
+    task = asyncio.create_task(mqtt.run())
+    try:
+        await _wait_for_broker(mqtt, mqtt_url)
+        yield failed
+    finally:
+        task.cancel()
+        await asyncio.gather(task, return_exceptions=True)
         try:
-            await _wait_for_broker(mqtt, mqtt_url)
-            yield
-        finally:
-            task.cancel()
-            await asyncio.gather(task, return_exceptions=True)
+            recorder.close()
+        except OSError as error:  # no room for the index: what is there can be read
+            on_error(error)
+    if errors:
+        raise FailedError(
+            f"{path}: {errors[0].strerror}. What was recorded until then can be read: make room, and record the rest "
+            "into another file"
+        )
 
 
 async def record(
@@ -58,7 +73,8 @@ async def record(
 ) -> dict[str, object]:
     """Record for some seconds (0: until a signal); return a summary of the recording.
 
-    Raises `WrongUseError` without broker or router; an existing file then stays unchanged.
+    Raises `WrongUseError` without broker or router; an existing file then stays unchanged. Raises `FailedError` as soon
+    as nothing more can be written.
     """
     clock = SystemClock()
     opened = ZenohEdge.open(
@@ -69,9 +85,12 @@ async def record(
         stop = asyncio.Event()
         for number in _SIGNALS:
             asyncio.get_running_loop().add_signal_handler(number, stop.set)
-        async with recording(path, mqtt_url=mqtt_url, zenoh=zenoh, clock=clock, credentials=credentials):
-            with contextlib.suppress(TimeoutError):
-                await asyncio.wait_for(stop.wait(), seconds or None)
+        opened_file = recording(path, mqtt_url=mqtt_url, zenoh=zenoh, clock=clock, credentials=credentials)
+        async with opened_file as failed, asyncio.TaskGroup() as tasks:
+            ends = [tasks.create_task(each.wait()) for each in (stop, failed)]
+            await asyncio.wait(ends, timeout=seconds or None, return_when=asyncio.FIRST_COMPLETED)
+            for each in ends:
+                each.cancel()
     return summary(path)
 
 

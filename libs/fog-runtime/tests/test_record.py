@@ -146,7 +146,7 @@ async def test_record_all_records_both_transports_at_any_clock_speed(tmp_path, s
         mqtt = MqttEdge(broker.url, "rec", clock, site="lab")
         async with ZenohEdge.open(connect=[router.endpoint], clock=clock, role="test", id="t", site="lab") as zenoh:
             with Recorder(tmp_path / "r.mcap") as recorder:
-                record_all(mqtt, zenoh, recorder, clock, numbers=[1])
+                record_all(mqtt, zenoh, recorder, clock, pytest.fail, numbers=[1])
                 task = asyncio.create_task(mqtt.run())
                 await asyncio.wait_for(mqtt.wait_connected(), 60)
                 zenoh.publish(ch.MAP_DELTA, delta(1))

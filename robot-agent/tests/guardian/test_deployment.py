@@ -288,6 +288,14 @@ def test_the_variables_are_settings_that_the_processes_accept(installed):
     assert load_robot(environ).settings.lidar.port == "/dev/pts/7"
 
 
+def test_address_of_ipv6_is_in_brackets_before_the_router_s_port_and_not_as_the_name_of_a_clock(tmp_path):
+    root = tmp_path / "root"
+    for _ in range(2):  # the second finds it there
+        install(root, "--fog", "fd00::7")
+    assert environment(root)["FOGNAV_ZENOH_CONNECT"] == "tcp/[fd00::7]:7447"
+    assert "FallbackNTP=fd00::7 " in (root / "etc/systemd/timesyncd.conf.d/fognav.conf").read_text()
+
+
 def test_installed_robot_knows_its_body_start_and_dock_from_the_sites_file(installed):
     given, config = configured(installed)
     assert (given.site, given.body.start) == ("lab", Pose(x=3.0, y=4.0, theta=0.5))

@@ -17,7 +17,7 @@ from fognav.hosting.fog_node import NodeConfig, run_node
 from fognav.hosting.folders import NodeFolder, default_data, hosted_sites, remember, settings_of
 from fognav.hosting.local_nodes import UNIT, end_node, named_node, write_unit
 from fognav.operate.options import JsonOption
-from fognav.output import FailedError, exit_codes, print_line, print_result
+from fognav.output import FailedError, WrongUseError, exit_codes, print_line, print_result
 
 SitesOption = Annotated[
     list[Path] | None,
@@ -60,6 +60,10 @@ def up_command(  # noqa: PLR0913  # each option is an argument
     folder, and is used again by the next start.
     """
     with exit_codes(), security_errors():
+        if ":" in bind:
+            raise WrongUseError(
+                f"--bind {bind}: a fog node listens on IPv4. Name an IPv4 address of this computer, or 0.0.0.0 for all"
+            )
         folders = [checkout.site_folder(each) for each in site] if site else [checkout.site_folder(None)]
         path = (data or default_data()).absolute()
         if bridge is not None:

@@ -372,6 +372,9 @@ async def run_node(config: NodeConfig, print_line: Callable[[str], None], *, che
         require_free_ports(node)
         async with node.supervisor:
             with _registered(node) as registrations:
+                await _bound_logs(
+                    node, local_nodes.Troubles(say)
+                )  # a node that never becomes ready is started for ever
                 changes = node.credential_changes()  # before the start: programs may have read what changes during it
                 await node.start(READY_S)
                 _announce(node, print_line)
@@ -419,11 +422,15 @@ async def attend(
         for site, each in zip(node.config.sites, registrations, strict=True):
             with troubles.told(f"the entry of site {site.id} in the register is not current"):
                 each.update()
-        for name in node.supervisor.names:
-            with troubles.told(f"the log of {name} could not be kept and begun anew"):
-                await asyncio.to_thread(local_nodes.bound_log, node.config.folder.log(name))
+        await _bound_logs(node, troubles)
         manager.alive()
         await asyncio.sleep(PERIOD_S)
+
+
+async def _bound_logs(node: LocalNode, troubles: local_nodes.Troubles) -> None:
+    for name in node.supervisor.names:
+        with troubles.told(f"the log of {name} could not be kept and begun anew"):
+            await asyncio.to_thread(local_nodes.bound_log, node.config.folder.log(name))
 
 
 def _tell(event: Event, print_line: Callable[[str], None]) -> None:

@@ -254,7 +254,9 @@ class Upgrade:
             made = asyncio.run(backups.create(files[-1], self._folder, Path(directory)))
             if made.no_index is not None:  # its data is copied aside, too
                 self._say(f"{files[-1]} lacks the index of the recordings: {made.no_index}")
-            for old in sorted(folder.glob(f"{_STAMPED}-{glob.escape(site)}.tar.gz"))[:-_KEPT_BACKUPS]:
+            # The new one stays whatever the clock says: it is what an upgrade that fails may need.
+            others = {*folder.glob(f"{_STAMPED}-{glob.escape(site)}.tar.gz")} - {files[-1]}
+            for old in sorted(others)[: 1 - _KEPT_BACKUPS]:
                 old.unlink()
         return files
 

@@ -119,7 +119,10 @@ class _Session:
                 loop.remove_reader(robot.fileno())
                 for task in (showing, hearing):
                     task.cancel()
-                await asyncio.gather(showing, hearing, return_exceptions=True)
+                ended = await asyncio.gather(showing, hearing, return_exceptions=True)
+            for each in ended:
+                if isinstance(each, Exception) and not isinstance(each, WebSocketDisconnect):
+                    raise each  # the server logs it
 
     def _on_readable(self, robot: LocalRobot) -> None:
         try:

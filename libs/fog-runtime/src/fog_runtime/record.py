@@ -230,21 +230,38 @@ def _decode(path: Path, channel: Channel, data: bytes) -> Message | str:
         raise RecordError(f"{path}: a message of {channel.name} violates its contract: {error}") from error
 
 
-def record_all(
-    mqtt: MqttEdge, zenoh: ZenohEdge, recorder: Recorder, clock: Clock, *, numbers: Sequence[str | int] = ()
+def record_all(  # what is recorded, where, and by which clock
+    mqtt: MqttEdge,
+    zenoh: ZenohEdge,
+    recorder: Recorder,
+    clock: Clock,
+    on_error: Callable[[OSError], object],
+    *,
+    numbers: Sequence[str | int] = (),
 ) -> None:
     """Record every published channel of both transports; call before `mqtt.run()`.
+
+    The first error of the file is given to `on_error`, and ends the recording: what came after a gap would pass for
+    all there was, and after a part of a chunk be no record at all.
 
     The log's times begin at the real time and continue in seconds of `clock`: a fast clock's own stamps lie centuries
     ahead, and soon beyond the range of MCAP's times. `numbers` lists the areas of the thesis's topics.
     """
     begin = clock.stamp()
     real_begin = begin / clock.speed
+    ended = False
 
     def writer(channel: Channel) -> Callable[[dict[str, str], Any], None]:
         def write(ids: dict[str, str], message: Message | str) -> None:
+            nonlocal ended
+            if ended:
+                return
             all_ids = {**ids, "site": zenoh.site} if "site" in channel.fields else ids
-            recorder.write(channel, all_ids, message, int((real_begin + clock.stamp() - begin) * 1e9))
+            try:
+                recorder.write(channel, all_ids, message, int((real_begin + clock.stamp() - begin) * 1e9))
+            except OSError as error:
+                ended = True
+                on_error(error)
 
         return write
 

@@ -17,12 +17,14 @@ from fognav_experiments.comparison.sensitivity import (
     BASE,
     Axis,
     Plane,
+    SweepTask,
     SweptDrive,
     Variation,
     gain,
     publish,
     sweep,
     sweep_tasks,
+    swept_drive,
     unwarned,
     varied_site,
 )
@@ -131,6 +133,30 @@ def test_the_page_gives_few_situations_no_interval_and_names_the_commits_of_its_
 
 
 # --- where they are driven ---
+
+
+@pytest.mark.drive
+def test_a_short_block_or_a_false_alarm_costs_a_warned_robot_a_detour_unless_the_planner_knows_such_blocks():
+    site, blocks = ring.ring_site(), Plane(Axis("stays_s", [4]), Axis("known_blocks", [0, 20]))
+    alarms = blocks._replace(false_alarms=True)
+    asked = sweep_tasks([blocks, alarms], [DRAWN])
+    assert len(asked) == 2 * (1 + 2)  # nobody warns the robot on its own, and what the planner knows is nothing to it
+    drives = [swept_drive(site, "", task) for task in asked]
+    assert all(drive.success for drive in drives)
+    for plane in (blocks, alarms):
+        unknown, known = (gain(drives, point).metres.mean for point in plane.points())
+        assert unknown < -1.0
+        assert known > -0.3
+
+
+@pytest.mark.drive
+def test_a_bad_radio_slows_the_robot_that_the_fog_leads_and_harms_nobody():
+    site, radio = ring.ring_site(), Plane(Axis("delay_ms", [0, 100]), Axis("gaps_per_min", [0]))
+    good, bad = (swept_drive(site, "", SweepTask(DRAWN, "fog", point)) for point in radio.points())
+    assert good.success
+    assert bad.outcome != "contact"
+    assert set(good.modes_s) == {"NORMAL"}
+    assert bad.modes_s["DEGRADED"] + bad.modes_s["HOLD"] > bad.modes_s["NORMAL"]
 
 
 @pytest.mark.drive

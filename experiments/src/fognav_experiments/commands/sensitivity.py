@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from fog_runtime.configuration.site import LoadedSite
     from fognav_experiments.comparison.drives import RouteDraw
     from fognav_experiments.comparison.records import Folder
-    from fognav_experiments.comparison.sensitivity import Plane
+    from fognav_experiments.comparison.sensitivity import Plane, Quantity
 
 _NOT_SWEPT: Final = "none"
 
@@ -34,15 +34,26 @@ def sensitivity_command(  # noqa: PLR0913  # each option is an argument
         str, typer.Option("--areas", metavar="N,N", help="Watched areas; 0: all; none: not swept.")
     ] = "1,4,0",
     speeds: Annotated[str, typer.Option("--speeds", metavar="V,V", help="Speeds of the robot, m/s.")] = "0.2,0.3",
+    delays: Annotated[
+        str, typer.Option("--delays", metavar="MS,MS", help="Median delays of messages, ms.")
+    ] = _NOT_SWEPT,
+    gaps: Annotated[str, typer.Option("--gaps", metavar="N,N", help="Gaps of the radio a minute.")] = "0,2,10",
+    stays: Annotated[
+        str, typer.Option("--stays", metavar="S,S", help="How long blocks and false alarms stand, s.")
+    ] = _NOT_SWEPT,
+    known: Annotated[
+        str, typer.Option("--known", metavar="N,N", help="Blocks as long that the planner has seen.")
+    ] = "0,20",
     routes: Annotated[int, typer.Option("--routes", metavar="N", min=1, help="Routes of each point.")] = 3,
     seed: Annotated[int, typer.Option("--seed", metavar="N", min=0, help="Seed of all draws.")] = 1,
     jobs: Annotated[int | None, typer.Option("--jobs", metavar="N", min=1, help="Drives at a time; all cores.")] = None,
     site: Annotated[Path | None, typer.Option("--site", metavar="DIR", help="Site with experiment.toml.")] = None,
 ) -> None:
-    """Sweep debouncing, the nodes' pause and number, and the robot's speed; draw what the fog saves as heat maps.
+    """Sweep what the fog's saving depends on, and draw it as heat maps.
 
-    Two planes are driven, readings by pause and areas by speed, on the first routes whose obstacle bars the way; with
-    --readings none or --areas none only the other. A sweep that was killed goes on where it was.
+    Planes are driven on the first routes whose obstacle bars the way: readings by pause, areas by speed; if asked for,
+    delays by gaps of the radio, and how long blocks and false alarms stand by what the planner knows of them. Each is
+    left out by the word none. A sweep that was killed goes on where it was.
     """
     from fog_runtime.configuration.site import SiteError, load_site  # noqa: PLC0415  # keeps the other commands fast
     from fognav_experiments.comparison import runner  # noqa: PLC0415  # same
@@ -50,15 +61,23 @@ def sensitivity_command(  # noqa: PLR0913  # each option is an argument
     from fognav_experiments.comparison.sensitivity import Axis, Plane  # noqa: PLC0415  # same
 
     with exit_codes():
-        swept, command = [], "fognav experiment sensitivity"
-        if readings != _NOT_SWEPT:
-            swept.append(Plane(Axis("readings", _values(readings)), Axis("pause_ms", _values(pause))))
-        if areas != _NOT_SWEPT:
-            swept.append(Plane(Axis("areas", _values(areas)), Axis("speed_m_s", _values(speeds, float))))
+        swept: list[Plane] = []
+        command = "fognav experiment sensitivity"
+        asked: list[tuple[tuple[Quantity, str, str], tuple[Quantity, str, str]]] = [
+            (("readings", "--readings", readings), ("pause_ms", "--pause", pause)),
+            (("areas", "--areas", areas), ("speed_m_s", "--speeds", speeds)),
+            (("delay_ms", "--delays", delays), ("gaps_per_min", "--gaps", gaps)),
+            (("stays_s", "--stays", stays), ("known_blocks", "--known", known)),
+        ]
+        for (x, option, values), (y, other, others) in asked:
+            command += f" {option} {values}"
+            if values != _NOT_SWEPT:
+                command += f" {other} {others}"
+                swept.append(Plane(Axis(x, _values(values)), Axis(y, _values(others))))
+        if stays != _NOT_SWEPT:
+            swept.append(swept[-1]._replace(false_alarms=True))
         if not swept:
-            raise WrongUseError("--readings none --areas none leaves nothing to sweep: leave one of them out")
-        command += f" --readings {readings}" + ("" if readings == _NOT_SWEPT else f" --pause {pause}")
-        command += f" --areas {areas}" + ("" if areas == _NOT_SWEPT else f" --speeds {speeds}")
+            raise WrongUseError("nothing is left to sweep: give one of --readings, --areas, --delays, --stays numbers")
         command += f" --routes {routes} --seed {seed} --out DIR"
         try:
             place = checkout.site_folder(site)
@@ -95,8 +114,8 @@ def _sweep(  # what is driven, where and how
     return failed
 
 
-def _values(text: str, kind: type[float] = int) -> list[float]:
+def _values(text: str) -> list[float]:
     try:
-        return [kind(part) for part in text.split(",")]
+        return [float(part) if "." in part else int(part) for part in text.split(",")]
     except ValueError as error:
         raise WrongUseError(f"{text} is no list of numbers: write them as 2,5,20") from error

@@ -1,4 +1,4 @@
-"""How what the fog saves depends on its parts: debouncing, the nodes' period and number, the robot's speed.
+"""How what the fog saves depends on its parts and its world: debouncing, nodes, speed, radio, how long blocks stand.
 
 A sweep drives planes of two quantities each, on every core of this machine, and may be killed at any moment. At each
 point the robot that the fog leads is compared with the one on its own, on the same drawn routes. A heat map of each
@@ -14,6 +14,7 @@ from importlib.metadata import version
 from typing import TYPE_CHECKING, Any, Final, Literal, NamedTuple
 
 import msgspec
+import numpy as np
 
 from fog_contracts.messages import NodeConfig
 from fog_runtime.files import SHARED, atomic_write
@@ -32,10 +33,16 @@ from fognav_experiments.figures import (
     heat_map,
     to_markdown,
 )
-from fognav_experiments.lockstep import release_drives, run_lockstep
+from fognav_experiments.lockstep import ready, release_drives
 from fognav_experiments.machine import results
 from fognav_experiments.rigs import Tuning
-from fognav_sim.drive.hazard import HazardRequest
+from fognav_experiments.scenarios.description import BusyRadio, DeceivedNode, Obstacle
+from fognav_experiments.scenarios.stage import Stage
+from fognav_sim.barrier import KEEP_AWAY_M, barrier_across
+from fognav_sim.drive.drive import DriveOutcome
+from fognav_sim.hardware import STEP_S
+from planner.waits.blocks import BlockRecord
+from planner.waits.durations import Durations
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator, Mapping, Sequence
@@ -45,16 +52,24 @@ if TYPE_CHECKING:
     from fog_runtime.configuration.site import LoadedSite
     from fognav_experiments.comparison.drives import RouteDraw, Setup
     from fognav_experiments.comparison.records import DriveFiles
+    from fognav_experiments.scenarios.description import AnyEvent
 
 
-Quantity = Literal["readings", "pause_ms", "areas", "speed_m_s"]
+Quantity = Literal["readings", "pause_ms", "areas", "speed_m_s", "delay_ms", "gaps_per_min", "stays_s", "known_blocks"]
+_FALSE_ECHO_M: Final = 0.3
+"""What the sonars of an area hear during a false alarm: something that hangs before them."""
+_EVER_S: Final = 36_000.0
 UNITS: Final[dict[Quantity, str]] = {
     "readings": "readings that confirm a state (debounce N)",
     "pause_ms": "pause of a node between two readings, ms",
     "areas": "watched areas (0: all)",
     "speed_m_s": "highest speed of the robot, m/s",
+    "delay_ms": "median delay of a message, ms",
+    "gaps_per_min": "gaps of the radio a minute",
+    "stays_s": "how long the block stands, s (0: for ever)",
+    "known_blocks": "blocks as long that the planner has seen",
 }
-OF_THE_ROBOT: Final[frozenset[Quantity]] = frozenset({"speed_m_s"})
+OF_THE_ROBOT: Final[frozenset[Quantity]] = frozenset({"speed_m_s", "stays_s"})
 """What also changes the robot that nobody warns; it is driven once for all values of the others."""
 
 
@@ -68,18 +83,28 @@ class Variation(msgspec.Struct, frozen=True, kw_only=True):
     """A point of a plane.
 
     `readings` in a row confirm a state, 0: by the site's own rule. `pause_ms`: of a node between two readings. `areas`:
-    how many are watched, 0: all. `speed_m_s`: the robot's highest.
+    how many are watched, 0: all. `speed_m_s`: the robot's highest. `delay_ms`: median of the lognormal times that
+    messages take between robot and fog, and from a node, 0: none; `gaps_per_min`: how often nothing arrives for around
+    0.3 s (`BusyRadio`). `stays_s`: how long the obstacle stands, 0: for ever. `known_blocks`: so many blocks as long
+    has the planner seen in the area before. `false_alarm`: nothing stands there, the area's nodes alone say so.
     """
 
     readings: int = 0
     pause_ms: int = NODE_PAUSE_MS
     areas: int = 0
     speed_m_s: float = 0.3
+    delay_ms: float = 0.0
+    gaps_per_min: float = 0.0
+    stays_s: float = 0.0
+    known_blocks: int = 0
+    false_alarm: bool = False
 
     @property
     def name(self) -> str:
         """The point's name in files."""
-        return f"n{self.readings}-p{self.pause_ms}-a{self.areas}-v{self.speed_m_s:g}"
+        of_the_world = f"d{self.delay_ms:g}-g{self.gaps_per_min:g}-s{self.stays_s:g}-k{self.known_blocks}"
+        kind = "false" if self.false_alarm else "true"
+        return f"n{self.readings}-p{self.pause_ms}-a{self.areas}-v{self.speed_m_s:g}-{of_the_world}-{kind}"
 
 
 BASE: Final = Variation()
@@ -93,14 +118,24 @@ class Axis(NamedTuple):
 
 
 class Plane(NamedTuple):
-    """Two quantities of which every combination is tried, all others as they are by default."""
+    """Two quantities of which every combination is tried, all others as they are by default.
+
+    `false_alarms`: nothing stands where the nodes say so.
+    """
 
     x: Axis
     y: Axis
+    false_alarms: bool = False
+
+    @property
+    def name(self) -> str:
+        """The plane's name in files."""
+        quantities = f"{self.x.quantity}-{self.y.quantity}".replace("_", "-")
+        return f"false-alarms-{quantities}" if self.false_alarms else quantities
 
     def at(self, x: float, y: float) -> Variation:
         """Return the point with these values."""
-        changed = {self.x.quantity: x, self.y.quantity: y}
+        changed = {self.x.quantity: x, self.y.quantity: y, "false_alarm": self.false_alarms}
         return msgspec.convert(msgspec.to_builtins(BASE) | changed, Variation)
 
     def points(self) -> list[Variation]:
@@ -109,9 +144,10 @@ class Plane(NamedTuple):
 
 
 class SweptDrive(DrivenRoute, frozen=True, kw_only=True):
-    """One drive of a sweep in lockstep."""
+    """One drive of a sweep in lockstep; `modes_s`: how long (s) the robot was in each of its modes."""
 
     variation: Variation
+    modes_s: dict[str, float] = msgspec.field(default_factory=dict)
 
     @property
     def name(self) -> str:
@@ -134,7 +170,9 @@ class SweepTask(NamedTuple):
 
 def unwarned(variation: Variation) -> Variation:
     """Return the variation by which the robot on its own drives: what the fog has means nothing to it."""
-    own = {quantity: getattr(variation, quantity) for quantity in OF_THE_ROBOT}
+    own: dict[str, Any] = {quantity: getattr(variation, quantity) for quantity in OF_THE_ROBOT}
+    if variation.false_alarm:
+        own |= {"stays_s": 0.0, "false_alarm": True}  # it hears no alarm, however long
     return msgspec.convert(msgspec.to_builtins(BASE) | own, Variation)
 
 
@@ -197,18 +235,30 @@ def sweep(
 
 
 def swept_drive(site: LoadedSite, commit: str, task: SweepTask) -> SweptDrive:
-    """Drive one task in lockstep; the same whenever it is repeated."""
+    """Drive one task in lockstep; the same whenever it is repeated. Raises `BarrierError` where no barrier fits."""
     drawn, variation = task.drawn, task.variation
-    result = run_lockstep(
+    run = ready(
         site,
         start_of(site, drawn),
         ends_of(site, drawn)[1],
         drawn.seed,
-        HazardRequest(area=drawn.area, trigger_m=drawn.trigger_m),
         watched=varied_site(site.site, variation, drawn.seed) if task.setup not in ALONE else False,
         profile=PROFILE_OF_SETUP[task.setup],
         tuning=Tuning(pause_ms=variation.pause_ms, speed_m_s=variation.speed_m_s),
     )
+    drive = run.drive
+    assert drive is not None
+    if variation.known_blocks:
+        run.system.fog.planner.core.waits.blocks.restore({drawn.area: _seen(variation)}, run.now)
+    stage = Stage(run, what_happens(site, drawn, variation), drawn.seed)
+    steps: Counter[str] = Counter()
+    outcome = None if run.problem is None else DriveOutcome("stopped", run.problem)
+    while outcome is None:
+        stage.step()
+        run.step()
+        steps[run.robot.agent.safety.mode] += 1
+        outcome = drive.outcome(run.now)
+    result = run.result(drive, outcome)
     release_drives()
     return SweptDrive(
         variation=variation,
@@ -221,9 +271,51 @@ def swept_drive(site: LoadedSite, commit: str, task: SweepTask) -> SweptDrive:
         outcome=result.outcome,
         distance_m=result.distance_m,
         time_s=result.time_s,
+        modes_s={mode: round(count * STEP_S, 2) for mode, count in sorted(steps.items())},
         commit=commit,
         version=version("fognav-experiments"),
     )
+
+
+def what_happens(site: LoadedSite, drawn: RouteDraw, variation: Variation) -> list[AnyEvent]:
+    """Return what happens on a drive: the drawn block, or an alarm in its place, and what the radio does."""
+    area = next(area for area in site.site.areas if area.id == drawn.area)
+    events: list[AnyEvent] = []
+    if variation.false_alarm:
+        events += [
+            DeceivedNode(node=node.id, scale=0.0, offset=_FALSE_ECHO_M, at_m=drawn.trigger_m, seconds=variation.stays_s)
+            for node in site.site.nodes
+            if node.area == drawn.area
+        ]
+    else:
+        barrier = barrier_across(area, site.site, site.map, drawn.seed)
+        events.append(
+            Obstacle(
+                polygon=barrier.polygon, height=barrier.height, area=drawn.area,
+                at_m=drawn.trigger_m, keep_m=KEEP_AWAY_M, seconds=variation.stays_s,
+            )
+        )  # fmt: skip
+    if variation.delay_ms or variation.gaps_per_min:
+        events.append(
+            BusyRadio(
+                seconds=_EVER_S,
+                median_s=max(variation.delay_ms / 1000.0, STEP_S / 10.0),
+                gaps_per_min=variation.gaps_per_min,
+            )
+        )
+    return events
+
+
+def _seen(variation: Variation) -> BlockRecord:
+    """Return what the planner knows of an area with so many blocks of this length, at every hour."""
+    seen = Durations()
+    for _ in range(variation.known_blocks):
+        seen.add(0.0, variation.stays_s or _EVER_S, ended=True)
+    spans = [
+        (int(span), float(seen.ended[span]), float(seen.spent[span]))
+        for span in np.flatnonzero(seen.spent + seen.ended)
+    ]
+    return BlockRecord(hours={str(hour): spans for hour in range(24)})
 
 
 TITLE: Final = "How what the fog saves depends on its parts"
@@ -281,17 +373,18 @@ def _commits(drives: Sequence[SweptDrive]) -> list[list[str]]:
 
 def _plane(drives: Sequence[SweptDrive], plane: Plane) -> list[Block]:
     gains = {point: found for point in plane.points() if (found := gain(drives, point)) is not None}
-    name = f"{plane.x.quantity}-{plane.y.quantity}".replace("_", "-")
     caption = f"Metres and seconds that the fog saves, by {UNITS[plane.x.quantity]} and {UNITS[plane.y.quantity]}."
+    what = "what false alarms cost: " if plane.false_alarms else ""
     rows = [
         [f"{getattr(point, plane.x.quantity):g}", f"{getattr(point, plane.y.quantity):g}", str(found.metres.n),
-         str(found.metres), str(found.seconds)]
+         str(found.metres), str(found.seconds), *_slowed(drives, point)]
         for point, found in gains.items()
     ]  # fmt: skip
+    columns = ["routes", "metres saved", "seconds saved", "of the time in DEGRADED, %", "in HOLD, %"]
     return [
-        Heading(f"{plane.x.quantity} and {plane.y.quantity}"),
+        Heading(f"{what}{plane.x.quantity} and {plane.y.quantity}".capitalize()),
         Picture(
-            f"{name}.svg",
+            f"{plane.name}.svg",
             heat_map(
                 "What the fog saves per route",
                 (UNITS[plane.x.quantity], plane.x.values),
@@ -300,5 +393,12 @@ def _plane(drives: Sequence[SweptDrive], plane: Plane) -> list[Block]:
             ),
             caption,
         ),
-        Table([UNITS[plane.x.quantity], UNITS[plane.y.quantity], "routes", "metres saved", "seconds saved"], rows),
+        Table([UNITS[plane.x.quantity], UNITS[plane.y.quantity], *columns], rows),
     ]
+
+
+def _slowed(drives: Sequence[SweptDrive], point: Variation) -> list[str]:
+    """Return for how much of their time the robots that the fog led at a point were in DEGRADED and in HOLD, in %."""
+    modes = sum((Counter(each.modes_s) for each in drives if (each.setup, each.variation) == ("fog", point)), Counter())
+    whole = sum(modes.values())
+    return [f"{100.0 * modes[mode] / whole:.1f}" if whole else "-" for mode in ("DEGRADED", "HOLD")]

@@ -56,7 +56,7 @@ _TIMED_COSTS: Final = _timed_costs()
 def under_body(speed: Grid, reach: int) -> Grid:
     """Return the limit (cm/s, 0: none) for a robot in each cell: the lowest within `reach` cells, under its body."""
     if not speed.any():
-        return speed.copy()
+        return np.zeros(speed.shape, np.uint8)  # takes no memory where nothing is written
     lowest = speed - np.uint8(1)  # no limit becomes the highest
     for turned in (False, True):
         across = lowest.T if turned else lowest

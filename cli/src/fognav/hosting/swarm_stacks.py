@@ -47,8 +47,6 @@ DROPPED: Final = frozenset({"build", "pull_policy", "depends_on", "restart", "se
 """What Swarm does not know, or does in its own way: it starts all at once, and again until they run."""
 _MOUNTED: Final = re.compile(r"^(?P<source>.+):(?P<target>/[^:]*)(:ro)?$")
 _SITE: Final = "/site"
-_COMPILING_S: Final = 900
-"""For kernels to be compiled at the first start: a Raspberry Pi needs minutes."""
 _NAME: Final = 64
 _FLOORS: Final = "floors.toml"
 
@@ -212,8 +210,6 @@ class _Stack:
             else:
                 self._made["volumes"][source] = None
                 volumes.append(text)
-                if source == "kernels":
-                    service["healthcheck"] = {"start_period": f"{_COMPILING_S}s"}
 
     def _add(self, kind: str, file: str, data: bytes) -> str:
         """Write a secret or config, and return its key in the stack file."""

@@ -5,50 +5,35 @@ here. `./fognav check` runs it.
 """
 
 # --- Fields of messages, reports and API answers: other programs and people read them. ---
-_.age_s  # api: age of an area's last reading
 _.extra_m  # answer to a dry run: how much farther a robot would drive, and how much longer
 _.extra_s
 _.earliest_s  # api: when a robot arrives
 _.latest_s
-_.charge_ah  # messages: of a robot's battery
-_.capacity_ah
 _.translation_deviation_m  # report: of a trajectory, in `map from-log --json`
 _.rotation_worst_deg
 _.after_input  # the agent's replay: where a recording and its replay differ
 _.control_p99_s  # messages: how regular the agent's loops are
-_.stream_p99_s
-_.severity
 (_.request_time, _.available_floors, _.lift_time)  # messages: Open-RMF's, of a lift
-_.uptime_ms  # messages: of a sensor node
-_.rssi
-_.fw
 _.config_version  # messages: what a node has learned, and its next firmware
 _.no_echo_us
-_.board
 _.area_entered  # the demo's report and lockstep's result
 _.area_clearance_m
 _.barrier_at_m  # records of drives with a real robot
 _.operator_commands  # lockstep: fields of its result
 _.hazard_at_m
 _.pose_error_m
-_.stages_ms
-_.time_s
 _.costmap_published  # messages: stamps of a trace, read by their names in fog_contracts.stages
 _.plan_published
 _.path_received
-_.first_command
 HOME_ASSISTANT  # channels: rows of the table for other people's programs, which no service of ours uses yet
-NODE_UPDATE  # the firmware on a board subscribes to it
 # VDA 5050: what a fleet control sends beside what is used of it, and what it reads.
-(_.blocking_type, _.start_node_id, _.end_node_id, _.orientation_type, _.header_id)
+(_.blocking_type, _.start_node_id, _.end_node_id, _.orientation_type)
 (_.node_states, _.edge_states, _.action_states, _.instant_action_states, _.action_result, _.last_node_sequence_id)
-(_.operating_mode, _.new_base_request, _.vx, _.vy, _.omega, _.deviation_range, _.reference_state_header_id)
+(_.operating_mode, _.new_base_request, _.omega, _.deviation_range, _.reference_state_header_id)
 (_.control_points, _.knot_vector, _.degree, _.traversed_nodes, _.polyline, _.eta, _.penalty_factor, _.zone_descriptor)
 (_.error_level, _.error_references, _.error_hint, _.reference_key, _.reference_value)
 (_.info_type, _.info_level, _.info_descriptor, _.safety_state, _.active_emergency_stop, _.field_violation)
 (_.state_of_charge, _.battery_voltage, _.battery_current)
-_.ROLES
-_.DURABILITIES
 
 # --- Names that a library calls or reads. ---
 _.__signature__  # inspect and typer: what a command takes
@@ -56,32 +41,19 @@ _.__annotations__
 _.env_name  # numba, which finds an environment by it
 _.capture_signals  # uvicorn
 _.handshake_complete  # uvicorn
-_.keepalive_timeout  # uvicorn
-_.run_asgi  # uvicorn
 _.should_exit
 _.timeout_graceful_shutdown
 _.daemon_threads  # http.server
 _.do_GET
-_.on_start  # numba's events
-_.on_end
 _.log_message
 _.handle_error
 _.pending_calls_threshold  # aiomqtt
-_.ensure_cache_path  # numba: where kernels are kept
-_.get_cache_path
 _.get_source_stamp
-_.get_disambiguator
-KernelLocator
-type_cells  # numba: a name that compiled signatures close over
 _.FACTORY  # bases, lidars, debounce rules and cost layers are found by their entry points
 _.DEFAULT  # same: profiles
-_.add_to  # same: commands
 _.add_localize
 _.add_diff
 _.add_from_log
-_.add_to_map  # same: commands
-_.list_commands  # typer asks for them
-_.get_command
 _.format_commands
 _.SIGNATURE
 _.press_clean  # the emulated Roomba: tests press its button
@@ -89,7 +61,6 @@ _.switch_on  # same, held while it is switched on
 _.pulse_wake_line  # the emulated Roomba: a pty has no control line, so tests pulse its pin themselves
 _.RULE
 _.LAYER
-_.RoombaEmulator
 _.RplidarEmulator
 _.DiffDriveEmulator
 _.Ld19Emulator
@@ -99,48 +70,27 @@ _.NOT_CHARGING  # Roomba Open Interface
 _.RECONDITIONING
 _.FULL_CHARGING
 _.TRICKLE
-_.WAITING
-_.bumped
 _.charging_state
-_.current_a
-_.voltage_v
 _.requested_wheels_m_s
 _.pause_stream
 _.resume_stream
 _.query_list
-_.seek_dock
-_.sensors
-_.TIMEOUT  # diffdrive: every bit of its flags has a name
 _.GOOD  # RPLidar
 _.express_scan
 _.express_us
 _.standard_us
-_.firmware
 _.model
 _.get_info
 _.get_sample_rate
-
-# --- The console-service forwards requests to them. ---
-_.aggregator_url
-_.map_url
 
 # --- For tests, of this repository and of packages that build on it. ---
 _.start_mosquitto  # private servers
 _.start_redis
 _.start_router
-_.save_map
-_.mask_spans  # for shapes that are made of others
-_.rasterize_line
 _.find_channel
-_.frames  # counters and views that tests assert on
-_.particles
-_.recompute
-_.resyncs
 _.scanning
 _.seeking_dock
 _.skipped_bytes
-_.odom_at
-_.subscribe_liveliness  # zenoh: presence, for operators' tools
 _.reveal  # the way to the value of a secret setting
 _.get_code  # Python's import calls it
 _.authenticate  # amqtt calls its plugins

@@ -14,11 +14,8 @@ import tomllib
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import get_args
 
 import pytest
-
-from fog_contracts.messages import Shape
 
 pytestmark = pytest.mark.live
 
@@ -31,26 +28,6 @@ COMPILED = "libs/fog-kernels"
 MESSAGES = "libs/fog-contracts/src/fog_contracts/messages"
 CHANNELS = "libs/fog-contracts/src/fog_contracts/channels.py"
 SHAPES = "libs/fog-contracts/src/fog_contracts/shapes.py"
-MAKE_POLYGONS = {
-    "experiments/src/fognav_experiments/scenarios/play.py", "experiments/src/fognav_experiments/scenarios/stage.py",
-    "robot-agent/src/robot_agent/agent/navigation.py",
-    "services/map-service/src/map_service/api_masks.py",
-}  # fmt: skip
-"""They make a shape of a list of corners, whatever other kinds there are."""
-ROBOTS_OF_OTHERS = {
-    "bridges/src/fog_bridges/ros2/others.py", "services/hazard-aggregator/src/hazard_aggregator/readings.py",
-    "services/map-service/src/map_service/layers/obstacles.py",
-    "services/map-service/src/map_service/layers/reported.py",
-}  # fmt: skip
-"""A robot of others is a circle, as Fognav's own robots are, whatever other kinds of shapes there are."""
-GEOJSON = "services/map-service/src/map_service/formats/geojson.py"
-"""It writes other kinds of shapes, too, but without a geometry that other programs show."""
-ORACLE = "experiments/src/fognav_experiments/hunt/oracle.py"
-"""It computes for itself where zones are: an error in the shapes must not be its own, too."""
-DRAWING_COMMANDS = {
-    "cli/src/fognav/commands/zone.py",
-    *(f"experiments/src/fognav_experiments/bench/{name}.py" for name in ("cores", "fleet", "floor", "rest", "robot")),
-}
 AGGREGATOR = "services/hazard-aggregator/src/hazard_aggregator/core.py"
 MAP_API = "services/map-service/src/map_service/api.py"
 
@@ -267,6 +244,7 @@ def assert_passed(name: str, checked: str) -> None:
     assert set(outcomes) == {"PASSED"}, checked
 
 
+@pytest.mark.long
 def test_message_is_added_by_its_type_its_row_and_its_handlers(checkout: Path, checked: str) -> None:
     for file, words in {
         "docs/channels.md": ("fog/v1/<site>/nodes/<node>/battery", "### RobotApproach"),
@@ -279,6 +257,7 @@ def test_message_is_added_by_its_type_its_row_and_its_handlers(checkout: Path, c
     assert_passed("message", checked)
 
 
+@pytest.mark.long
 def test_route_is_added_by_one_function(checkout: Path, checked: str) -> None:
     assert (
         "| `POST /api/v1/zones/{zone_id}/extension` | Let a zone hold for so many more minutes. |  | Extension "
@@ -287,29 +266,10 @@ def test_route_is_added_by_one_function(checkout: Path, checked: str) -> None:
     assert_passed("route", checked)
 
 
+@pytest.mark.long
 def test_zone_shape_is_added_by_its_message_and_its_class(checkout: Path, checked: str) -> None:
     assert "### RingShape" in (checkout / "docs" / "channels.md").read_text("utf-8")
     assert_passed("shape", checked)
-
-
-def test_only_messages_shapes_and_the_commands_that_draw_them_distinguish_kinds_of_shapes() -> None:
-    names = [kind.__name__ for kind in get_args(Shape)]
-    tags = [str(kind.__struct_config__.tag) for kind in get_args(Shape)]
-    asking = re.compile(rf"\b({'|'.join(names)})\b|\btype\b\W+({'|'.join(tags)})\b")
-    files = [file for source in SOURCES for suffix in ("py", "js") for file in source.parent.rglob(f"*.{suffix}")]
-    files = [
-        file for file in files if "console_service/page/" not in file.as_posix()
-    ]  # built, of no interest to people
-    found = {str(file.relative_to(ROOT)) for file in files if asking.search(file.read_text("utf-8"))}
-    assert found == {
-        f"{MESSAGES}/maps.py",
-        SHAPES,
-        *DRAWING_COMMANDS,
-        *MAKE_POLYGONS,
-        *ROBOTS_OF_OTHERS,
-        GEOJSON,
-        ORACLE,
-    }
 
 
 # --- The document ---------------------------------------------------------------------------------------------------

@@ -7,7 +7,7 @@ import pty
 import subprocess
 import sys
 from pathlib import Path
-from types import ModuleType, SimpleNamespace
+from types import ModuleType
 
 import pytest
 from typer.testing import CliRunner
@@ -143,25 +143,6 @@ def test_quick_tests_run_unless_all_are_asked_for_or_some_by_name(arguments: lis
     assert not {"--all", "--rest", "--long"} & set(command)
 
 
-@pytest.mark.drive
-def test_each_test_belongs_to_the_quick_ones_or_to_the_rest_and_the_last_line_tells_how_many_are_left_out() -> None:
-    def ids(tier: str) -> tuple[set[str], str]:
-        module = "services/planner/tests/test_process.py"
-        collect = ["-m", "pytest", "-p", "tests.support.progress", "--collect-only", "-q", f"--tier={tier}", module]
-        alone = {name: value for name, value in os.environ.items() if not name.startswith("PYTEST_XDIST")}
-        done = subprocess.run(
-            [sys.executable, *collect], cwd=checkout.root(), env=alone, capture_output=True, text=True, check=True
-        )
-        return {line for line in done.stdout.splitlines() if "::" in line}, done.stdout
-
-    (quick, told), (rest, _), (every, _) = ids("quick"), ids("rest"), ids("all")
-    assert quick
-    assert rest
-    assert quick | rest == every
-    assert not quick & rest
-    assert f"\n{len(rest)} tests of whole drives, real processes and containers were left out" in told
-
-
 @pytest.fixture(scope="module")
 def grouping() -> ModuleType:
     spec = importlib.util.spec_from_file_location("root_conftest", checkout.root() / "conftest.py")
@@ -179,59 +160,6 @@ def test_tests_of_reaction_times_share_one_worker(grouping: ModuleType) -> None:
     assert grouping.group_of("cli/tests/test_stack.py")[0] == grouping.LIVE
     assert grouping.group_of("tests/replay/test_replay.py")[0] == grouping.SYSTEM
     assert grouping.group_of("services/tests/test_rest.py")[0] == grouping.SYSTEM
-
-
-class Worker:
-    """One of pytest-xdist's workers, as its scheduler sees it: it is told which tests to run, by their places."""
-
-    shutting_down = False
-
-    def __init__(self, number: int) -> None:
-        self.gateway = SimpleNamespace(id=f"gw{number}")
-        self.given: list[int] = []
-
-    def send_runtest_some(self, places: list[int]) -> None:
-        self.given += places
-
-    def shutdown(self) -> None:
-        self.shutting_down = True
-
-
-def test_one_worker_per_core_but_one_computes_and_none_is_idle_while_there_are_tests(
-    grouping: ModuleType, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(os, "cpu_count", lambda: 3)
-    computing = [f"libs/fog-contracts/tests/test_{name}.py::test_it" for name in ("bus", "codec", "cones", "shapes")]
-    waiting = [f"tests/live/test_{name}.py::test_it" for name in ("up", "monitoring", "first_node", "operating")]
-    config = SimpleNamespace(
-        getoption=lambda _: "loadgroup",
-        getvalue=lambda _: ["popen"] * 3,
-        option=SimpleNamespace(loadscopereorder=False),
-    )
-    scheduler = grouping.pytest_xdist_make_scheduler(config, None)
-    workers = [Worker(number) for number in range(3)]
-    for worker in workers:
-        scheduler.add_node(worker)
-    for worker in workers:
-        scheduler.add_node_collection(worker, [*waiting, *computing])
-    scheduler.schedule()
-    kinds = [["computes" if place >= len(waiting) else "waits" for place in worker.given] for worker in workers]
-    assert kinds == [["computes"] * 2, ["computes"] * 2, ["waits"] * 2]
-    scheduler.mark_test_complete(workers[0], workers[0].given[0])
-    assert workers[0].given[2] < len(waiting)
-
-
-def test_no_test_times_out_that_was_told_to_try_more(tmp_path):
-    test = tmp_path / "test_slow.py"
-    test.write_text("import time\n\ndef test_takes_its_time():\n    time.sleep(0.5)\n")
-    command = [sys.executable, "-m", "pytest", "-q", "-n0", "-p", "no:cacheprovider", "--timeout=0.1",
-               "--confcutdir=/", "-p", "conftest", str(test)]  # fmt: skip
-    root = Path(__file__).parents[2]
-    for histories, code in (("", 1), ("100000", 0)):
-        alone = {name: value for name, value in os.environ.items() if not name.startswith("PYTEST_XDIST")}
-        environment = {**alone, "FOGNAV_HISTORIES": histories, "PYTHONPATH": str(root)}
-        done = subprocess.run(command, env=environment, cwd=tmp_path, capture_output=True, text=True, check=False)
-        assert done.returncode == code, done.stdout
 
 
 runner = CliRunner()
@@ -282,13 +210,3 @@ def test_stale_file_is_listed_by_check_and_updated_by_write(tmp_path: Path, monk
     assert "up to date" not in runner.invoke(app, ["channels", "--write"]).output
     assert (tmp_path / "a" / "acl").read_text() == mqtt_acl()
     assert "up to date" in runner.invoke(app, ["channels", "--write"]).output
-
-
-@pytest.mark.parametrize("seed", ["1", "2"])
-@pytest.mark.drive
-def test_generated_files_do_not_depend_on_the_hash_seed(seed: str) -> None:
-    done = subprocess.run(
-        [sys.executable, "-m", "fognav", "channels", "--check"],
-        env={**os.environ, "PYTHONHASHSEED": seed}, capture_output=True, text=True, check=False,
-    )  # fmt: skip
-    assert done.returncode == 0, done.stdout + done.stderr

@@ -87,7 +87,6 @@ _.get_sample_rate
 _.start_mosquitto  # private servers
 _.start_redis
 _.start_router
-_.find_channel
 _.scanning
 _.seeking_dock
 _.skipped_bytes

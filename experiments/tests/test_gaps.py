@@ -1,14 +1,14 @@
 """Narrow places that only the lidar sees: the robot never touches anything, and passes what it fits through.
 
-FOGNAV_GAP_SEEDS sets the number of drives at each place; `python -m fognav_experiments.gaps --seeds 200` prints all.
+FOGNAV_GAP_SEEDS sets the number of drives at each place.
 """
 
 import os
 
 import numpy as np
 import pytest
+from gaps import door_ajar, drive, series
 
-from fognav_experiments.gaps import door_ajar, drive, series
 from robot_agent.motion.recovery import Recoveries
 
 SEEDS = int(os.environ.get("FOGNAV_GAP_SEEDS", "2"))

@@ -1,27 +1,16 @@
-"""The footprint: which polygons are refused and how, its radii, and padding."""
+"""The footprint: which polygons are refused and how, and its radii."""
 
 from __future__ import annotations
 
 import math
 
 import msgspec
-import numpy as np
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
 
 from robot_agent.config import AgentConfig
 from robot_agent.footprint import Footprint, FootprintError
 
 BOX = ((0.2, 0.15), (-0.1, 0.15), (-0.1, -0.15), (0.2, -0.15))
-
-
-def distances_outside(footprint, points):
-    """How far (m) points lie outside the sides' lines: negative inside."""
-    corners = footprint.polygon
-    sides = np.roll(corners, -1, axis=0) - corners
-    normals = np.column_stack((sides[:, 1], -sides[:, 0])) / np.hypot(*sides.T)[:, None]
-    return ((points[:, None, :] - corners) * normals).sum(axis=2).max(axis=1)
 
 
 def test_radii_of_a_box_around_an_axle_off_its_middle():
@@ -59,29 +48,6 @@ def test_circle_lies_inside_its_polygon_which_exceeds_it_by_half_a_percent(radiu
 def test_a_wrong_polygon_is_refused_by_name_of_its_fault(vertices, words):
     with pytest.raises(FootprintError, match=words):
         Footprint(vertices)
-
-
-@pytest.mark.parametrize("distance", [-0.01, math.inf, math.nan])
-def test_padding_by_less_than_nothing_is_refused(distance):
-    with pytest.raises(FootprintError, match="padded"):
-        Footprint(BOX).padded(distance)
-
-
-@given(
-    st.sampled_from([BOX, Footprint.circle(0.17).vertices, ((0.4, 0.0), (-0.2, 0.3), (-0.2, -0.3))]),
-    st.floats(0.0, 0.1),
-    st.integers(0, 2**32 - 1),
-)
-def test_padding_moves_each_side_by_the_distance_and_contains_all_that_is_so_near(vertices, distance, seed):
-    footprint = Footprint(vertices)
-    padded = footprint.padded(distance)
-    assert np.allclose(distances_outside(footprint, padded.polygon), distance)
-    assert padded.inscribed_radius == pytest.approx(footprint.inscribed_radius + distance)
-    rng = np.random.default_rng(seed)
-    weights = rng.dirichlet(np.ones(len(vertices)), 50)
-    angles = rng.uniform(0.0, math.tau, 50)
-    near = weights @ footprint.polygon + distance * np.column_stack((np.cos(angles), np.sin(angles)))
-    assert distances_outside(padded, near).max() <= 1e-9
 
 
 def test_configuration_with_a_footprint_survives_json():

@@ -27,14 +27,10 @@ async def test_slot_holds_only_the_newest_value_with_its_age():
     slot: Slot[int] = Slot()
     assert slot.get() is None
     assert slot.age(100.0) == math.inf
-    assert not slot.fresh(100.0, None)
     slot.put(1, 100.0)
     slot.put(2, 101.0)
     assert slot.get() == 2
     assert slot.age(103.5) == 2.5
-    assert slot.fresh(103.5, 2.5)
-    assert not slot.fresh(103.6, 2.5)
-    assert slot.fresh(1e9, None)
 
 
 async def test_slot_wait_returns_on_a_newer_value_only():
@@ -127,8 +123,8 @@ def lines(capsys):
 
 def test_log_line_is_json_with_fields_and_errors(lines):
     logs.configure("proc", "info", "json")
-    log = logs.get("part").bind(robot="r1")
-    log.info("100%s", level="mine", path=Path("/x"))
+    log = logs.get("part")
+    log.info("100%s", robot="r1", level="mine", path=Path("/x"))
     log.debug("unseen")
     log.error("failed", error=ValueError("why"))
     first, second = (json.loads(line) for line in lines())

@@ -119,21 +119,3 @@ class Footprint:
         return max(
             ((x - a[0]) * (b[1] - a[1]) - (y - a[1]) * (b[0] - a[0])) / math.dist(a, b) for a, b in pairwise(ring)
         )
-
-    def padded(self, distance: float) -> Footprint:
-        """Return the footprint with each side moved outwards by `distance` (m, not negative); corners stay sharp.
-
-        It contains every point within `distance` of this footprint.
-        """
-        if not 0.0 <= distance < math.inf:
-            raise FootprintError(f"a footprint is padded by 0 m or more, not {distance}")
-        ring = (self.vertices[-1], *self.vertices, self.vertices[0])
-        moved: list[Vertex] = []
-        for (ax, ay), (bx, by), (cx, cy) in zip(ring, ring[1:], ring[2:], strict=False):
-            # The corner moves along the bisector of its sides' normals n and m: by distance (n + m) / (1 + n m).
-            before, after = math.hypot(bx - ax, by - ay), math.hypot(cx - bx, cy - by)
-            nx, ny = (by - ay) / before, (ax - bx) / before
-            mx, my = (cy - by) / after, (bx - cx) / after
-            scale = distance / (1.0 + nx * mx + ny * my)
-            moved.append((bx + scale * (nx + mx), by + scale * (ny + my)))
-        return Footprint(tuple(moved))

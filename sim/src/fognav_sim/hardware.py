@@ -108,11 +108,6 @@ class Hardware:
         base.add_wheel_travel(*initial_wheel_travel_m)
         self.base_line, self.lidar_line = Line(base.baud), Line(lidar.baud)
 
-    @property
-    def lost_bytes(self) -> int:
-        """Bytes dropped because the lines were too slow for the devices."""
-        return self.base_line.lost_bytes + self.lidar_line.lost_bytes
-
     def receive(self, to_base: bytes, to_lidar: bytes) -> None:
         """Pass on what the host has written to both lines: it arrives during the next steps."""
         self.base_line.receive(to_base)

@@ -174,7 +174,6 @@ class Oracle:
         self._broken: dict[tuple[str, str], float] = {}
         self._mode: Mode = "INIT"
         self._allowed_until: list[tuple[float, float]] = []
-        self._state_at = -math.inf
         self._old_map = False
         self._version = (0, 0)
         self._poses: list[tuple[float, RobotPose]] = []
@@ -258,7 +257,6 @@ class Oracle:
             # Until the ramp is over, the faster of both modes counts.
             self._allowed_until.append((now + _RAMP_S, _MODE_SPEED[self._mode]))
             self._mode = state.mode
-        self._state_at = now
         self._old_map = not {"map_late", "map_old"}.isdisjoint(state.codes)
         self._version = (state.map_epoch, state.map_seq)
 

@@ -340,11 +340,3 @@ SIM_COMMAND       = _query("sim_command",       FOG + "sim/{robot}/command", m.S
 
 CHANNELS: Final[Mapping[str, Channel]] = {row.name: row for row in list(globals().values()) if isinstance(row, Channel)}
 """All rows above by their names, in the table's order: a new row need not be listed anywhere else."""
-
-
-def find_channel(transport: Transport, key: str) -> tuple[Channel, dict[str, str]] | None:
-    """Return the channel that a topic or key belongs to, with the ids in it."""
-    for channel in CHANNELS.values():
-        if channel.transport == transport and (ids := channel.match(key)) is not None:
-            return channel, ids
-    return None

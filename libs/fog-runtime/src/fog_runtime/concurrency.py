@@ -63,10 +63,6 @@ class Slot(Generic[T]):
         """Seconds since the newest value arrived; infinite before the first."""
         return now - self._arrived_at
 
-    def fresh(self, now: float, max_age: float | None) -> bool:
-        """Whether there is a value not older than `max_age` seconds (None: of any age)."""
-        return self._count > 0 and (max_age is None or self.age(now) <= max_age)
-
     async def wait(self) -> T:
         """Wait for a newer value than the current one, and return the newest."""
         waiter = asyncio.get_running_loop().create_future()

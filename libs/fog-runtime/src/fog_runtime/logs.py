@@ -20,13 +20,8 @@ _FIELDS: Final = "fognav_fields"
 class Log:
     """A named logger whose lines are an event's name and its fields: `log.info("listening", port=8080)`."""
 
-    def __init__(self, name: str, bound: Mapping[str, object] | None = None) -> None:
+    def __init__(self, name: str) -> None:
         self._logger = logging.getLogger(name)
-        self._bound = dict(bound or {})
-
-    def bind(self, **fields: object) -> "Log":
-        """Return a logger that adds these fields to every event."""
-        return Log(self._logger.name, {**self._bound, **fields})
 
     def debug(self, event: str, **fields: object) -> None:
         """Log a detail for developers."""
@@ -47,7 +42,7 @@ class Log:
     def _emit(self, level: int, event: str, fields: Mapping[str, object], error: BaseException | None = None) -> None:
         if self._logger.isEnabledFor(level):
             # "%s", because an event with a percent sign would be taken for a format.
-            self._logger.log(level, "%s", event, extra={_FIELDS: {**self._bound, **fields}}, exc_info=error)
+            self._logger.log(level, "%s", event, extra={_FIELDS: dict(fields)}, exc_info=error)
 
 
 class _Formatter(logging.Formatter):

@@ -1,4 +1,4 @@
-"""Gaps that only the lidar sees: `python -m fognav_experiments.gaps` drives the local planner at each, many times.
+"""Gaps that only the lidar sees, at which the local planner is driven many times.
 
 A closed loop of the robot's own parts (path follower, dynamic window) with a body, its wheels and a lidar, all
 simulated in a few milliseconds per second. The map is empty: everything in the way is seen by the lidar alone, with
@@ -7,14 +7,11 @@ noise and a scan's age. Lengths in m, angles in rad, times in s.
 
 from __future__ import annotations
 
-import argparse
 import math
-import sys
 from collections import deque
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Final
+from typing import TYPE_CHECKING, Final, NamedTuple
 
-import msgspec
 import numpy as np
 
 from fog_contracts.costs import ROBOT_RADIUS
@@ -38,8 +35,6 @@ if TYPE_CHECKING:
 
     from robot_agent.safety.stop_field import Wheels
 
-GAPS: Final = tuple(round(0.20 + 0.04 * step, 2) for step in range(11))
-"""Widths of the gaps (m)."""
 PASSABLE_M: Final = 2.0 * ROBOT_RADIUS + 0.08
 """A gap this wide is to be passed."""
 NOISE_M: Final = 0.01
@@ -101,27 +96,21 @@ class Scene:
         return float(min(walls, posts)) - ROBOT_RADIUS
 
 
-class Outcome(msgspec.Struct, frozen=True, kw_only=True):
-    """How one drive ended: smallest clearance (m; below 0 is a contact), time (s), and turns of intent per metre."""
+class Outcome(NamedTuple):
+    """How one drive ended: whether the robot passed, and the smallest clearance (m; below 0 is a contact)."""
 
     passed: bool
     clearance_m: float
-    time_s: float
-    reversals_per_m: float
 
 
-class Row(msgspec.Struct, frozen=True, kw_only=True):
+class Row(NamedTuple):
     """A kind of place and the outcomes of its drives; `passable`: whether the robot is meant to pass."""
 
-    kind: str
-    gap_m: float
     passable: bool
     drives: int
     passed: int
     contacts: int
     clearance_min_m: float
-    time_median_s: float
-    reversals_per_m: float
 
 
 def box(left: float, bottom: float, right: float, top: float) -> list[tuple[float, float, float, float]]:
@@ -216,7 +205,6 @@ class _Robot:
         self.pose = scene.start
         self.wheels = (0.0, 0.0)
         self.clearance = math.inf
-        self.driven = 0.0
         self.points: NDArray[np.float64] = np.zeros((0, 2))
         """Points (n, 2; m) of the last scans, frame `map`."""
         self._scans = RecentScans()
@@ -253,7 +241,6 @@ class _Robot:
         x, y, theta = self.pose
         middle = theta + 0.5 * w * _STEP_S
         self.pose = Pose2(x + v * math.cos(middle) * _STEP_S, y + v * math.sin(middle) * _STEP_S, theta + w * _STEP_S)
-        self.driven += abs(v) * _STEP_S
         self.clearance = min(self.clearance, self.scene.clearance(self.pose.x, self.pose.y))
 
 
@@ -269,7 +256,6 @@ def drive(scene: Scene, rng: np.random.Generator, seconds: float = _TIME_S, *, s
     follower = PathFollower(scene.path, math.inf)
     free = np.zeros(_GRID.shape, np.uint8)
     wheels, recoveries = WheelControl(_AGENT), Recoveries()
-    reversals, turning = 0, 0.0
     step = 0
     while step < round(seconds / _STEP_S) and robot.pose.x < _END_X - 0.15 and robot.clearance > 0.0:
         now = step * _STEP_S
@@ -289,19 +275,11 @@ def drive(scene: Scene, rng: np.random.Generator, seconds: float = _TIME_S, *, s
             wheels.decision = decision = None if job is None else decide(job)
             if decision is not None:
                 recoveries.on_decision(decision.blocked)
-            if decision is not None and abs(decision.w) > 0.05:
-                reversals += turning * decision.w < 0.0
-                turning = decision.w
         if step % _STREAM == 0:
             wheels.command(_ALLOWED, guard, now)
         robot.move(wheels.speeds)
         step += 1
-    return Outcome(
-        passed=robot.pose.x >= _END_X - 0.15,
-        clearance_m=robot.clearance,
-        time_s=step * _STEP_S,
-        reversals_per_m=reversals / max(robot.driven, 0.1),
-    )
+    return Outcome(robot.pose.x >= _END_X - 0.15, robot.clearance)
 
 
 def series(kind: str, gap: float, seeds: int, seconds: float = _TIME_S, *, stop_field: bool = False) -> Row:
@@ -311,46 +289,11 @@ def series(kind: str, gap: float, seeds: int, seconds: float = _TIME_S, *, stop_
     for seed in range(seeds):
         rng = np.random.default_rng((seed, round(gap * 1000), list(KINDS).index(kind)))
         ends.append(drive(make(gap, rng), rng, seconds, stop_field=stop_field))
-    times = [end.time_s for end in ends if end.passed]
     return Row(
-        kind=kind,
-        gap_m=gap,
         # There is always room beside the line along a corner.
         passable=gap >= PASSABLE_M - 1e-9 or kind == "corner",
         drives=seeds,
         passed=sum(end.passed for end in ends),
         contacts=sum(end.clearance_m <= 0.0 for end in ends),
-        clearance_min_m=round(min(end.clearance_m for end in ends), 4),
-        time_median_s=round(float(np.median(times)), 1) if times else math.nan,
-        reversals_per_m=round(float(np.median([end.reversals_per_m for end in ends])), 2),
+        clearance_min_m=min(end.clearance_m for end in ends),
     )
-
-
-def main(arguments: Sequence[str] | None = None) -> int:
-    """Drive at every kind of place and gap, and print a table, or a row of JSON each."""
-    parser = argparse.ArgumentParser(prog="python -m fognav_experiments.gaps", description=__doc__)
-    parser.add_argument("--seeds", type=int, default=20, help="drives at each place (default: 20)")
-    parser.add_argument("--kind", choices=sorted(KINDS), help="only this kind of place")
-    parser.add_argument("--gap", type=float, help="only this width (m)")
-    parser.add_argument("--stop-field", action="store_true", help="limit every command by the stop field, too")
-    parser.add_argument("--json", action="store_true", help="print one JSON object per row")
-    given = parser.parse_args(arguments)
-    contacts = 0
-    for kind in [given.kind] if given.kind else KINDS:
-        for gap in [given.gap] if given.gap else GAPS:
-            row = series(kind, gap, given.seeds, stop_field=given.stop_field)
-            contacts += row.contacts
-            text = (
-                msgspec.json.encode(row).decode()
-                if given.json
-                else f"{row.kind:11} {row.gap_m:.2f} m  passed {row.passed:3}/{row.drives}  contacts {row.contacts}"
-                f"  least clearance {row.clearance_min_m:6.3f} m  time {row.time_median_s:5} s"
-                f"  reversals {row.reversals_per_m}/m"
-            )
-            sys.stdout.write(text + "\n")
-            sys.stdout.flush()
-    return 1 if contacts else 0
-
-
-if __name__ == "__main__":
-    sys.exit(main())

@@ -10,8 +10,7 @@ from typer.testing import CliRunner
 
 from fog_contracts.costs import FREE, LETHAL, UNKNOWN
 from fog_contracts.grid import GridGeometry, StaticMap
-from fog_runtime.configuration.map_text import read_map_text
-from fog_runtime.configuration.maps import load_map, load_occupancy, read_provenance, save_map
+from fog_runtime.configuration.maps import load_map, load_occupancy, read_map_text, read_provenance, save_map
 from fognav.__main__ import app
 
 

@@ -29,10 +29,9 @@ from fog_contracts.site import AreaSite, DemoPlan, NodeSite, RobotSite, Site, So
 from fog_runtime.configuration.site import LoadedSite, load_site
 from fog_supervisor import net
 from fognav.demo.options import Options
-from fognav.demo.page import SCENARIO, serve
 from fognav.demo.run import Demo
 from fognav.demo.scene import Scene
-from fognav.demo.view import render
+from fognav.demo.view import SCENARIO, render, serve
 from fognav.output import WrongUseError
 
 ESTIG = Path(__file__).parents[2] / "sites" / "estig"

@@ -23,14 +23,14 @@ from PIL import Image
 from fog_contracts.geometry import distance_to_polygon, sampled
 from fog_runtime.configuration.site import load_site
 from fognav_experiments.commands.driving import show
-from fognav_experiments.comparison import computation, live_drive, runner, stills
+from fognav_experiments.comparison import computation, film, live_drive, runner
 from fognav_experiments.comparison.break_even import Case
 from fognav_experiments.comparison.drives import ComparedDrive, ExperimentSpec, MeasuredDrive, RouteSpec, draw
-from fognav_experiments.comparison.floor_draws import ROUTE_M, FloorDrawError, FloorDraws
 from fognav_experiments.comparison.limits import RouteGeometry, Saved, Saving, allowed_savings
 from fognav_experiments.comparison.live_drive import LiveOptions, live_drives, write_route
 from fognav_experiments.comparison.records import MOVE_BASE, Asked, Folder, FolderError, comparable
 from fognav_experiments.comparison.report import build, paired, publish
+from fognav_experiments.comparison.runner import ROUTE_M, FloorDrawError, FloorDraws
 from fognav_experiments.comparison.situations import worse
 from fognav_experiments.figures import (
     Heading,
@@ -39,8 +39,6 @@ from fognav_experiments.figures import (
     compare,
     estimate,
     spread,
-    t_cdf,
-    t_quantile,
     to_markdown,
     told,
 )
@@ -168,13 +166,6 @@ def test_what_was_saved_is_no_share_of_what_a_map_allows_by_rounding_alone(allow
     _, table = allowed_savings([Saved(Saving(50.0 + allowed_m, 50.0, met=True), 10.0, 40.0, ("ab", "z1"))] * 2)
     assert isinstance(table, Table)
     assert [row[table.header.index("share")] for row in table.rows] == [share, share]
-
-
-@pytest.mark.parametrize(("freedom", "quantile"), [(1, 12.706), (4, 2.776), (9, 2.262), (49, 2.0096), (1000, 1.9623)])
-def test_quantiles_of_student_s_t_are_those_of_the_tables(freedom, quantile):
-    assert t_quantile(0.975, freedom) == pytest.approx(quantile, abs=6e-4)
-    assert t_cdf(quantile, freedom) == pytest.approx(0.975, abs=1e-4)
-    assert t_cdf(-quantile, freedom) == pytest.approx(0.025, abs=1e-4)
 
 
 def test_a_paired_comparison_gives_the_textbook_s_figures():
@@ -358,9 +349,9 @@ def test_a_film_finds_in_the_records_what_happened_and_when(short_run):
 @pytest.mark.drive
 def test_stills_show_the_planned_way_through_the_obstacle_and_round_it(tmp_path, monkeypatch):
     ways = {}
-    monkeypatch.setattr(stills, "_draw", lambda _axes, run, setup, _drawn: ways.update({setup: run}))
+    monkeypatch.setattr(film, "_draw", lambda _axes, run, setup, _drawn: ways.update({setup: run}))
     site, (drawn,) = ring.ring_site(), draw(SPEC, 1, RUN)
-    stills.write_stills(site, drawn, ["lean", "full"], 2.0, tmp_path / "stills.png")
+    film.write_stills(site, drawn, ["lean", "full"], 2.0, tmp_path / "stills.png")
     area = next(area.polygon for area in site.site.areas if area.id == drawn.area)
     through = {
         setup: any(distance_to_polygon(area, x, y) <= 0.0 for x, y in sampled(run.robot.agent.way(100.0), 0.1))
@@ -368,7 +359,7 @@ def test_stills_show_the_planned_way_through_the_obstacle_and_round_it(tmp_path,
     }
     assert through == {"lean": True, "full": False}
     monkeypatch.undo()
-    stills.write_stills(site, drawn, ["full"], 5.0, tmp_path / "stills.png")
+    film.write_stills(site, drawn, ["full"], 5.0, tmp_path / "stills.png")
     shown = Image.open(tmp_path / "stills.png").convert("RGB")
     assert shown.width > shown.height > 100
     assert {(208, 40, 40)} < {colour for _, colour in shown.getcolors(shown.width * shown.height)}, "no obstacle"

@@ -21,9 +21,9 @@ from starlette.routing import WebSocketRoute
 from websockets.asyncio.client import ClientConnection, connect
 from websockets.exceptions import ConnectionClosed, InvalidStatus
 
+from fog_bridges.floor import REFUSED
 from fog_bridges.foxglove import messages, viewers
 from fog_bridges.foxglove.protocol import ProtocolError, Schema, parsed
-from fog_bridges.metrics import REFUSED
 from fog_contracts.grid import GridGeometry
 from fog_contracts.messages import CircleShape, RobotObstacles, RobotPath, RobotPose, View, Zone
 from fog_runtime.health import Health

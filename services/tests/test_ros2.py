@@ -25,7 +25,7 @@ from hypothesis import strategies as st
 from manual_clock import ManualClock
 from rosbags.typesys import Stores, get_typestore
 
-from fog_bridges.metrics import REFUSED
+from fog_bridges.floor import REFUSED
 from fog_bridges.ros2 import messages as ros
 from fog_bridges.ros2.advice import GOAL_TYPE, PATH_TYPE
 from fog_bridges.ros2.bridge import (

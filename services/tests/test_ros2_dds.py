@@ -14,7 +14,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from fog_bridges.metrics import REFUSED
+from fog_bridges.floor import REFUSED
 from fog_bridges.ros2 import messages as ros
 from fog_bridges.ros2.advice import GOAL_TYPE
 from fog_bridges.ros2.bridge import GOAL_MAX_AGE_S, MAP_TYPE

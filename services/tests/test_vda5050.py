@@ -16,8 +16,7 @@ from manual_clock import ManualClock
 from secured_servers import TESTER, SecuredSite
 from vda5050_floor import SETUP, STATE, VERSIONS, A, B, C, Floorplan, area, driving, header, node, order, schema
 
-from fog_bridges.floor import Answer, Request
-from fog_bridges.metrics import REFUSED
+from fog_bridges.floor import REFUSED, Answer, Request
 from fog_bridges.vda5050 import telling
 from fog_bridges.vda5050.bridge import RobotLink, Vda5050Bridge
 from fog_bridges.vda5050.connection import Sender, Setup

@@ -11,8 +11,7 @@ import pytest
 from manual_clock import ManualClock
 from vda5050_floor import DOCK, SETUP, STATE, A, B, C, Floorplan, action, header, instant, node, order, read
 
-from fog_bridges.floor import Answer, Request
-from fog_bridges.metrics import ORDERS
+from fog_bridges.floor import ORDERS, Answer, Request
 from fog_bridges.vda5050 import telling
 from fog_bridges.vda5050.bridge import RobotLink, Vda5050Bridge
 from fog_bridges.vda5050.charging import IDLE_S

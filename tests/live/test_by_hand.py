@@ -34,7 +34,7 @@ from scipy.ndimage import distance_transform_edt
 from fog_contracts.costs import LETHAL
 from fog_mapping.poses import place
 from fog_runtime.configuration.maps import load_map
-from fognav_experiments.lidar_logs.robot_logs import read_robot_log
+from fognav_experiments.lidar_logs.logs import read_robot_log
 from robot_agent.local_client import LocalRobot
 
 if TYPE_CHECKING:

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 import pytest
 from by_hand import Watcher, ended, robot_without_fog, wait_for
 
-from fognav_experiments.lidar_logs.robot_logs import read_robot_log
+from fognav_experiments.lidar_logs.logs import read_robot_log
 
 if TYPE_CHECKING:
     from pathlib import Path

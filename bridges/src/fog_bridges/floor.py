@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any, Final, NamedTuple, Protocol, runtime_chec
 
 import httpx
 import msgspec
+from prometheus_client import Counter
 
 from fog_runtime import logs
 from fog_runtime.http.tokens import PART
@@ -20,6 +21,11 @@ if TYPE_CHECKING:
 
     from fog_runtime.clock import Clock
 
+ORDERS = Counter("fognav_bridge_orders_total", "Orders of other systems, by what became of them", ["system", "result"])
+REFUSED = Counter(
+    "fognav_bridge_refused_messages_total", "Messages of other systems that were not understood", ["system", "reason"]
+)
+"""What all adapters count."""
 RETRY_S: Final = 2.0
 SILENT_S: Final = 5.0
 """A stream that says nothing for so long is lost: the console tells the time each second."""

@@ -19,9 +19,8 @@ from uuid import uuid4
 import numpy as np
 import zenoh
 
-from fog_bridges.floor import Request
+from fog_bridges.floor import REFUSED, Request
 from fog_bridges.heard import Heard
-from fog_bridges.metrics import REFUSED
 from fog_bridges.ros2 import messages as ros
 from fog_bridges.ros2.wire import TYPES, RosMessage, WireError, decoded_as
 from fog_contracts import channels as ch

@@ -7,8 +7,8 @@ import time
 from collections import Counter as Counts
 from typing import TYPE_CHECKING, Any, Final
 
+from fog_bridges.floor import ORDERS
 from fog_bridges.home_assistant import CANCEL, STOP
-from fog_bridges.metrics import ORDERS
 from fog_bridges.picture import Picture
 from fog_contracts import channels as ch
 from fog_runtime import logs

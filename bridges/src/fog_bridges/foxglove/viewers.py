@@ -15,6 +15,7 @@ from uuid import uuid4
 
 from starlette.websockets import WebSocket, WebSocketDisconnect
 
+from fog_bridges.floor import REFUSED
 from fog_bridges.foxglove.protocol import (
     SUBPROTOCOLS,
     Channel,
@@ -30,7 +31,6 @@ from fog_bridges.foxglove.protocol import (
     server_info,
     warning,
 )
-from fog_bridges.metrics import REFUSED
 from fog_runtime import logs
 from fog_runtime.http.problems import RETRY_AFTER, HttpProblem, problem
 from fog_runtime.token_file import ROLES

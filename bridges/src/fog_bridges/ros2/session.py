@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any, Final
 import zenoh
 import zenoh.ext as ze
 
-from fog_bridges.metrics import REFUSED
+from fog_bridges.floor import REFUSED
 from fog_bridges.ros2.wire import Attachment, Node, RosMessage, Topic, WireError, Writer, decoded, type_hash
 from fog_runtime import logs
 

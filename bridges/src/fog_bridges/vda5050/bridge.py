@@ -14,8 +14,7 @@ from uuid import uuid4
 import aiomqtt
 import msgspec
 
-from fog_bridges.floor import Request
-from fog_bridges.metrics import ORDERS
+from fog_bridges.floor import ORDERS, Request
 from fog_bridges.vda5050 import telling
 from fog_bridges.vda5050.connection import SYSTEM, Connection, Sender, Setup
 from fog_bridges.vda5050.incoming import (

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any, Final
 import aiomqtt
 import msgspec
 
-from fog_bridges.metrics import REFUSED
+from fog_bridges.floor import REFUSED
 from fog_bridges.vda5050.incoming import RELEASES, Version
 from fog_bridges.vda5050.outgoing import of_version, timestamp
 from fog_runtime import logs

@@ -13,10 +13,9 @@ from uuid import uuid4
 
 from fog_bridges.floor import Request
 from fog_bridges.vda5050.charging import Charging, drop_done, remember_action
-from fog_bridges.vda5050.control import Doings, mode_of
 from fog_bridges.vda5050.orders import Orders, Situation, Where, about_error, goal_of, is_within, remember
 from fog_bridges.vda5050.uncertain import UNCERTAIN, UNSEEN_S, Uncertain
-from fog_bridges.vda5050.watched import Watched
+from fog_bridges.vda5050.watched import Doings, Watched, mode_of
 
 if TYPE_CHECKING:
     from collections.abc import Mapping

@@ -12,15 +12,17 @@ from PIL import Image
 from fog_contracts.costs import UNKNOWN
 from fog_contracts.grid import GridGeometry, StaticMap
 from fog_contracts.resampling import resampled
-from fog_runtime.configuration.map_text import MapTextError, read_map_text, write_map_text
 from fog_runtime.configuration.maps import (
     MapFileError,
+    MapTextError,
     load_occupancy,
     read_keys,
+    read_map_text,
     read_provenance,
     save_map,
     save_occupancy,
     unknown_keys,
+    write_map_text,
 )
 from fognav.commands import installed
 from fognav.map_files import described, loaded, provenance

@@ -31,8 +31,7 @@ from fog_kernels.landmarks import Landmarks
 from fog_kernels.lines import line_cost
 from fog_kernels.steps import STRAIGHT
 from fog_kernels.tiles import TilePatterns
-from fog_runtime.configuration.map_text import MapTextError, read_map_text
-from fog_runtime.configuration.maps import load_map
+from fog_runtime.configuration.maps import MapTextError, load_map, read_map_text
 from fognav_experiments.bench.common import make_office
 from fognav_experiments.bench.fleet import percentile
 from fognav_experiments.bench.path_peers import gradient_path_cost, installed_peers

@@ -320,8 +320,7 @@ def planner_command(
     """
     import numpy as np  # noqa: PLC0415  # keeps the other commands fast
 
-    from fog_runtime.configuration.map_text import MapTextError  # noqa: PLC0415  # same
-    from fog_runtime.configuration.maps import MapFileError  # noqa: PLC0415  # same
+    from fog_runtime.configuration.maps import MapFileError, MapTextError  # noqa: PLC0415  # same
     from fognav_experiments.bench import planner  # noqa: PLC0415  # same
 
     kernels.warm_cache(print_line)

@@ -15,12 +15,15 @@ from dataclasses import dataclass, replace
 from functools import lru_cache
 from typing import IO, TYPE_CHECKING, Final, cast, get_args
 
+import msgspec
 import numpy as np
 
+from fog_runtime.record import RecordError, read_entries
 from fognav.output import WrongUseError
 from fognav_experiments.lidar_logs import Format, Selection
 from fognav_experiments.lidar_logs.bags import is_bag, read_bag
-from fognav_experiments.lidar_logs.robot_logs import is_robot_log, read_robot_log
+from robot_agent.agent.recording.input_log import ENTRY_OF_TOPIC, BaseReceived, ScanReceived, Started
+from robot_agent.agent.recording.log_scans import LogScans
 from robot_agent.localization.pose import Pose2
 
 if TYPE_CHECKING:
@@ -28,6 +31,8 @@ if TYPE_CHECKING:
     from pathlib import Path
 
     from numpy.typing import NDArray
+
+    from robot_agent.agent.recording.log_scans import RobotScan
 
 _CODE_SHARE: Final = 0.98
 """Readings above this share of the largest one are the device's code for "no return", ..."""
@@ -233,3 +238,25 @@ def _median_period(scans: list[LogScan]) -> float:
     periods = np.diff([scan.stamp for scan in scans])
     periods = periods[(periods > 0.0) & (periods < 60.0)]
     return float(np.median(periods)) if len(periods) else 1.0
+
+
+# --- logs of Fognav's own robots: what `fognav map record` or an agent with `FOGNAV_INPUT_LOG` wrote ------------------
+
+
+def is_robot_log(path: Path) -> bool:
+    """Whether a file may be a log of Fognav: a recording without the description that ROS 2 puts beside its own."""
+    return path.suffix == ".mcap" and path.is_file() and not (path.parent / "metadata.yaml").exists()
+
+
+def read_robot_log(path: Path) -> Iterator[RobotScan]:
+    """Yield the scans of an agent's log; raises `WrongUseError` where it is none or damaged."""
+    scans = LogScans()
+    try:
+        for _, topic, data in read_entries(path):
+            kind = ENTRY_OF_TOPIC.get(topic)
+            if kind in {Started, BaseReceived, ScanReceived}:
+                scan = scans.take(msgspec.json.decode(data, type=kind))
+                if scan is not None:
+                    yield scan
+    except (RecordError, msgspec.DecodeError) as error:
+        raise WrongUseError(f"{error}. Name the file that `fognav map record` wrote") from error

@@ -57,12 +57,11 @@ from fog_runtime.stores.records import CursorError
 from fog_runtime.stores.redis_connection import StoreError
 from fog_runtime.stores.redis_store import IdempotencyError
 from hazard_aggregator.alerts import AlertError
-from hazard_aggregator.api_overrides import OverrideView, add_overrides, override_view
+from hazard_aggregator.api_overrides import OverrideView, add_overrides, add_undo, override_view
 from hazard_aggregator.area_size import AreaError, TooManyAreasError, check_size
 from hazard_aggregator.history import PeriodView
 from hazard_aggregator.problems import AreaProblem, no_such_area
 from hazard_aggregator.service import Service
-from hazard_aggregator.undo import add_undo
 from hazard_aggregator.writers import ConflictError
 
 

@@ -11,7 +11,6 @@ import io
 import itertools
 import math
 from dataclasses import dataclass
-from functools import cache
 from itertools import chain
 from math import nan
 from statistics import median
@@ -23,6 +22,7 @@ from matplotlib import rc_context
 from matplotlib.colors import LinearSegmentedColormap
 from matplotlib.figure import Figure
 from matplotlib.transforms import offset_copy
+from scipy.special import stdtr, stdtrit
 
 from fog_contracts.costs import FREE, LETHAL
 from fog_runtime.files import SHARED, atomic_write
@@ -41,7 +41,6 @@ if TYPE_CHECKING:
 _EXACT_UP_TO: Final = 14
 """With at most this many pairs every combination of signs is tried, beyond that random ones."""
 _FLIPS: Final = 20_000
-_STEPS: Final = 2_000
 FEWEST_CLUSTERS: Final = 10
 """With fewer clusters than these there is no interval and no test: their spread would be a guess."""
 
@@ -67,31 +66,9 @@ class Paired(NamedTuple):
     p_flip: float | None
 
 
-def t_cdf(t: float, freedom: int) -> float:
-    """Return the probability that Student's t with so many degrees of freedom is at most `t`."""
-    # With t = sqrt(freedom) * tan(angle) the density is a power of the cosine.
-    part = _cosine_integral(math.atan(abs(t) / math.sqrt(freedom)), freedom - 1)
-    share = 0.5 * part / _cosine_integral(math.pi / 2, freedom - 1)
-    return 0.5 + math.copysign(share, t)
-
-
-def _cosine_integral(end: float, power: int) -> float:
-    """Return the integral of cos^power from 0 to `end` by Simpson's rule."""
-    values = np.cos(np.linspace(0.0, end, _STEPS + 1)) ** power
-    weights = np.full(_STEPS + 1, 2.0)
-    weights[1::2] = 4.0
-    weights[[0, -1]] = 1.0
-    return float((values * weights).sum() * end / _STEPS / 3.0)
-
-
-@cache
-def t_quantile(share: float, freedom: int) -> float:
-    """Return the value that Student's t stays below with this probability (0.5 to 0.9999)."""
-    low, high = 0.0, 1e4
-    for _ in range(50):
-        middle = 0.5 * (low + high)
-        low, high = (middle, high) if t_cdf(middle, freedom) < share else (low, middle)
-    return 0.5 * (low + high)
+def _student_975(freedom: int) -> float:
+    """Return the value that Student's t of so many degrees of freedom stays below in 97.5 of 100 cases."""
+    return float(stdtrit(freedom, 0.975))
 
 
 def estimate(values: Sequence[float]) -> Estimate:
@@ -101,7 +78,7 @@ def estimate(values: Sequence[float]) -> Estimate:
     mean, n = float(np.mean(values)), len(values)
     if n < 2:
         return Estimate(mean, None, n)
-    return Estimate(mean, t_quantile(0.975, n - 1) * float(np.std(values, ddof=1)) / math.sqrt(n), n)
+    return Estimate(mean, _student_975(n - 1) * float(np.std(values, ddof=1)) / math.sqrt(n), n)
 
 
 def clustered(values: Sequence[float], clusters: Sequence[Hashable]) -> Estimate:
@@ -115,7 +92,7 @@ def clustered(values: Sequence[float], clusters: Sequence[Hashable]) -> Estimate
     sums = _sums(np.array(values) - mean, clusters)
     if len(sums) < FEWEST_CLUSTERS:
         return Estimate(mean, None, n)
-    return Estimate(mean, t_quantile(0.975, len(sums) - 1) * _error(sums, n), n)
+    return Estimate(mean, _student_975(len(sums) - 1) * _error(sums, n), n)
 
 
 def spread(values: Sequence[float]) -> str:
@@ -153,7 +130,7 @@ def compare(before: Sequence[float], after: Sequence[float], clusters: Sequence[
     if error == 0.0:
         p_t = 1.0 if found.mean == 0.0 else 0.0
     else:
-        p_t = 2.0 * (1.0 - t_cdf(abs(found.mean) / error, len(sums) - 1))
+        p_t = 2.0 * (1.0 - float(stdtr(len(sums) - 1, abs(found.mean) / error)))
     return Paired(found, p_t, _flip_test(_sums(differences, clusters)))
 
 

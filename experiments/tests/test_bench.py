@@ -48,6 +48,7 @@ def test_every_robot_of_a_fleet_is_planned_refused_and_planned_again() -> None:
 
 
 @pytest.mark.live
+@pytest.mark.long
 async def test_every_robot_of_a_real_planner_gets_its_path_its_refusal_and_a_path_again() -> None:
     rng = np.random.default_rng(1)
     map_ = fleet.FleetMap(common.make_office(60.0, 40.0), 10, rng)
@@ -66,6 +67,7 @@ async def test_every_robot_of_a_real_planner_gets_its_path_its_refusal_and_a_pat
 
 
 @pytest.mark.live
+@pytest.mark.long
 async def test_real_services_start_on_a_floor_and_lead_a_robot_across_it_and_round_a_zone(tmp_path: Path) -> None:
     cells = floor_bench.prepare(tmp_path, 60.0, 40.0)
     assert cells == 1200 * 800
@@ -79,21 +81,6 @@ async def test_real_services_start_on_a_floor_and_lead_a_robot_across_it_and_rou
         assert figures[f"{service}_peak_bytes_per_cell"] == pytest.approx(
             1e6 * figures[f"{service}_peak_mb"] / cells, rel=0.01
         )
-
-
-def test_figures_come_with_schema_machine_and_versions(monkeypatch: pytest.MonkeyPatch) -> None:
-    small = common.make_office(60.0, 40.0)
-    monkeypatch.setattr(common, "make_office", lambda **_: small)
-    done = CliRunner().invoke(
-        app, ["bench", "fleet", "--robots", "2", "--goals", "1", "--zones", "2", "--trials", "1", "--json"]
-    )
-    assert done.exit_code == 0, done.output
-    printed = json.loads(done.stdout)
-    assert (printed["schema"], printed["bench"], printed["robots"]) == (1, "fleet", 2)
-    assert printed["machine"]["cores"] >= 1
-    assert printed["machine"]["governor"]
-    assert set(printed["versions"]) == {"python", "numba", "numpy"}
-    assert {"replan_p50_ms", "replan_p99_ms", "cut_off_ms", "rss_mb", "bytes_per_robot"} <= printed.keys()
 
 
 @pytest.mark.parametrize("cells", [None, "map"])
@@ -178,7 +165,7 @@ def test_system_that_does_not_start_is_a_sentence_and_no_traceback(monkeypatch, 
 
 
 @pytest.mark.live
-@pytest.mark.drive
+@pytest.mark.long
 async def test_readers_of_events_all_get_poses_and_hazards(tmp_path: Path) -> None:
     figures = await console_events.measure(tmp_path, readers=30, robots=2, seconds=3.0, on_phase=print)
     assert figures["lost_readers"] == 0
@@ -204,9 +191,14 @@ def test_localization_figures_are_there_and_the_search_and_match_ran() -> None:
         assert figures[key] > 0
 
 
-def test_dwa_figures_are_of_both_bodies_and_of_a_whole_decision() -> None:
-    figures = cores.measure_dwa(2)
-    assert figures["arcs"] == 875
+def test_dwa_figures_are_of_both_bodies_and_of_a_whole_decision_and_come_with_schema_machine_and_versions() -> None:
+    done = CliRunner().invoke(app, ["bench", "dwa", "--repeats", "2", "--json"])
+    assert done.exit_code == 0, done.output
+    figures = json.loads(done.stdout)
+    assert (figures["schema"], figures["bench"], figures["arcs"]) == (1, "dwa", 875)
+    assert figures["machine"]["cores"] >= 1
+    assert figures["machine"]["governor"]
+    assert set(figures["versions"]) == {"python", "numba", "numpy"}
     assert all(figures[key] > 0 for key in ("decision_ms", "cycle_ms"))
     assert {"field_ms", "field_long_ms", "cycle_long_ms", "peer_ratio"} <= figures.keys()
 
@@ -222,6 +214,7 @@ def test_site_of_the_benchmark_is_valid_and_one_area_has_most_nodes(tmp_path):
 
 
 @pytest.mark.live
+@pytest.mark.long
 async def test_no_reading_of_a_small_load_is_lost_and_hazards_reach_the_map(tmp_path):
     phases: list[str] = []
     figures = await pipeline.measure(tmp_path, nodes=12, rate=20.0, robots=2, seconds=5.0, on_phase=phases.append)

@@ -17,7 +17,7 @@ SITES = Path(__file__).parents[2] / "sites"
 SEEDS = int(os.environ.get("FOGNAV_ROOM_SEEDS", "1"))
 
 
-@pytest.mark.parametrize(("floor", "robots"), [("aisles", 4), ("narrow", 4), ("aisles", 10), ("estig", 5)])
+@pytest.mark.parametrize(("floor", "robots"), [("narrow", 4), ("aisles", 10), ("estig", 5)])
 @pytest.mark.drive
 def test_blind_robots_touch_no_other_one_and_none_waits_for_ever(floor, robots):
     floor_map = room.floor_named(floor, SITES)

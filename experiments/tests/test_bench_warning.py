@@ -190,6 +190,7 @@ async def test_robot_is_warned_while_the_leading_planner_becomes_slow_and_anothe
 
 
 @pytest.mark.live
+@pytest.mark.long
 async def test_robot_gets_a_way_around_an_obstacle_that_a_node_has_seen():
     loaded = load_site(checkout.site_folder(Path("estig")))
     row = await warning.measure(loaded, "evidence", 3, 1, lambda: None)

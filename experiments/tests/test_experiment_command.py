@@ -94,17 +94,6 @@ def test_a_report_of_an_archive_needs_a_folder_of_its_own(tmp_path):
     assert "name a folder for the report with --out DIR" in " ".join(result.output.split())
 
 
-@pytest.mark.drive
-def test_the_committed_results_are_small_and_can_be_reported_again(tmp_path):
-    packed = checkout.root() / "docs" / "results" / "estig" / "drives.jsonl.xz"
-    assert packed.stat().st_size < 3_000_000
-    arguments = ["report", str(packed), "--out", str(tmp_path)]
-    result = CliRunner().invoke(experiment.experiment_app, arguments, catch_exceptions=False)
-    assert result.exit_code == 0, result.output
-    assert (tmp_path / "drives.csv").read_bytes() == (packed.parent / "drives.csv").read_bytes()
-    assert {file.name for file in packed.parent.iterdir()} == {file.name for file in tmp_path.iterdir()}
-
-
 def test_a_report_shows_the_live_drives_of_another_folder_and_its_archive_keeps_them(tmp_path):
     """Its own folder stays as it was; another experiment's drives are refused."""
     packed = checkout.root() / "docs" / "results" / "estig" / "drives.jsonl.xz"

@@ -28,7 +28,7 @@ from fog_supervisor import net
 from fognav.demo.machine import children
 from fognav.demo.operator import Operator
 from fognav.demo.scene import Scene
-from fognav.programs import AGENT, MAP_SERVICE, PLANNER, WATCHDOG
+from fognav.programs import AGENT, PLANNER, WATCHDOG
 from fognav.stack import Stack, StackConfig, users_of
 
 if TYPE_CHECKING:
@@ -163,10 +163,6 @@ class LiveSystem:
         port = self.stack.port(service)
         assert port is not None
         return await asyncio.to_thread(net.request, method, port, path, body=body, token=self.stack.token)
-
-    async def create_zone(self, body: object) -> net.Response:
-        """Create a zone."""
-        return await self.request(MAP_SERVICE, "POST", "/api/v1/zones", body)
 
     async def simulate(self, command: SimCommand) -> None:
         """Change the simulated world."""

@@ -254,20 +254,3 @@ async def test_garbage_on_mqtt_and_on_the_serial_line_stops_no_process(system: L
     await system.wait_progress()
     assert system.hazard("z1") == "clear"
     assert system.starts() == starts
-
-
-async def test_goal_in_a_wall_is_refused_with_reason_remedy_and_field(system: LiveSystem) -> None:
-    answer = await system.send_goal(40.0, 29.97)
-    assert (answer.status, answer.body["name"]) == (422, "GOAL_OCCUPIED")
-    assert "the goal (40.00, 29.97)" in answer.reason
-    assert "the nearest reachable point is" in answer.reason
-    assert [error["field"] for error in answer.body["errors"]] == ["body.pose"]
-    again = await system.send_goal(*answer.body["nearest"])
-    assert again.status in (200, 201), "the suggested point must be accepted"
-
-
-async def test_zone_with_two_points_is_refused_with_remedy_and_field(system: LiveSystem) -> None:
-    answer = await system.create_zone({"kind": "BLOCKED", "shape": {"type": "polygon", "points": [[30, 28], [31, 28]]}})
-    assert answer.status == 422
-    assert [error["field"] for error in answer.body["errors"]] == ["body.shape.points"]
-    assert "a polygon needs at least three corners: add one" in answer.reason

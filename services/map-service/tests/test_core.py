@@ -589,12 +589,6 @@ def test_invalid_zone_is_refused_naming_its_field(invalid, field):
     assert caught.value.field == field
 
 
-def test_polygon_is_stored_counter_clockwise():
-    clockwise = [(0.5, 0.5), (0.5, 1.5), (1.5, 0.5)]
-    stored = prepare_zone(zone(shape=PolygonShape(points=clockwise)), floor_plan().geometry, 0.0).zone
-    assert stored.shape.points == clockwise[::-1]
-
-
 # --- Obstacles ------------------------------------------------------------------------------------------------------
 
 

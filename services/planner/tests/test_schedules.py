@@ -232,6 +232,22 @@ async def test_mission_begins_with_its_window_once_and_not_before_nor_while_the_
     assert fog.scheduling.following(fog.missions.schedules["post"]) == EIGHT + DAY
 
 
+async def test_loop_has_its_turn_between_the_windows_of_two_schedules(fog):
+    turns = []
+
+    async def take_turns() -> None:
+        while True:
+            turns.append(len(fog.scheduling._windows))
+            await asyncio.sleep(0)
+
+    for number in range(5):
+        await fog.add(scheduled(f"s{number}"))
+    others = asyncio.create_task(take_turns())
+    await fog.scheduling.step()
+    others.cancel()
+    assert set(turns) >= set(range(1, 5)), "not all at once"
+
+
 async def test_busy_robot_finishes_first_and_what_waits_longest_for_it_is_told(fog):
     await fog.missions.send(Order("r1", Pose(x=3.0, y=0.0, theta=0.0), "bob", place="home"))
     await fog.add(scheduled())

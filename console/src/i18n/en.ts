@@ -35,6 +35,7 @@ export const en = {
   "settings": "Settings",
 
   "connection.connecting": "Connecting …",
+  "connection.waiting": "Five windows of this browser are live already: close one, or cover it. What you see may be old.",
   "connection.open": "Live",
   "connection.lost": "No connection. What you see may be old; trying again …",
   "connection.old": "Nothing heard for {age}. What you see is old.",

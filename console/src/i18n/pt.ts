@@ -36,6 +36,7 @@ export const pt: Readonly<Record<keyof typeof en, string>> = {
   "settings": "Definições",
 
   "connection.connecting": "A ligar …",
+  "connection.waiting": "Já há cinco janelas deste navegador em direto: feche ou tape uma. O que vê pode ser antigo.",
   "connection.open": "Em direto",
   "connection.lost": "Sem ligação. O que vê pode ser antigo; a tentar de novo …",
   "connection.old": "Nada recebido há {age}. O que vê é antigo.",

@@ -40,7 +40,8 @@ export class EventParser {
   }
 }
 
-export type Connection = "connecting" | "open" | "lost" | "refused";
+/** `waiting`: as many windows of this browser read events as may. */
+export type Connection = "connecting" | "waiting" | "open" | "lost" | "refused";
 
 export interface StreamHandlers {
   readonly onEvent: (event: StreamEvent) => void;
@@ -52,6 +53,24 @@ const FIRST_WAIT_MS = 500;
 const LONGEST_WAIT_MS = 5_000;
 /** Each second there is an event `time`: after so long without any, the connection is dead, whatever TCP says. */
 const SILENCE_MS = 6_000;
+
+/** A browser has six connections to a host, in all its windows: so many read events, which leaves one to a stop. */
+const READERS = 5;
+const LOOK_MS = 1_000;
+
+/** Return what ends the right to be one of these, or null if there is none. A browser that can't count lets all. */
+async function oneOfReaders(): Promise<(() => void) | null> {
+  const [page] = performance.getEntriesByType("navigation") as PerformanceNavigationTiming[];
+  if (!("locks" in navigator) || !page?.nextHopProtocol.startsWith("http/1")) return () => {}; // HTTP/2 needs one connection
+  for (let number = 0; number < READERS; number++) {
+    const free = await new Promise<(() => void) | null>((resolve) => {
+      const until = (lock: Lock | null): Promise<void> => new Promise((end) => (lock ? resolve(end) : (resolve(null), end())));
+      navigator.locks.request(`fognav-events-${number}`, { ifAvailable: true }, until).catch(() => resolve(null));
+    });
+    if (free) return free;
+  }
+  return null;
+}
 
 /** Return how long to wait before the next try (ms): doubled each time, and spread, so that not all come at once. */
 export function waitBefore(attempt: number, random: number): number {
@@ -65,6 +84,7 @@ export class Stream {
   private attempt = 0;
   private reading: AbortController | null = null;
   private wake: (() => void) | null = null;
+  private free: (() => void) | null = null;
   private query = "";
 
   constructor(
@@ -77,7 +97,7 @@ export class Stream {
     void this.run();
   }
 
-  /** A browser has six connections to a host, in all its tabs: hidden ones leave theirs to those where somebody may stop. */
+  /** Hidden windows leave their connection to those where somebody may stop. */
   private readonly looked = (): void => {
     this.attempt = 0;
     if (document.hidden) this.reading?.abort();
@@ -97,19 +117,35 @@ export class Stream {
     this.closed = true;
     document.removeEventListener("visibilitychange", this.looked);
     this.reading?.abort();
+    this.leave();
     this.wake?.();
+  }
+
+  private leave(): void {
+    this.free?.();
+    this.free = null;
   }
 
   private async run(): Promise<void> {
     while (!this.closed) {
       const query = this.query;
-      this.handlers.onConnection("connecting");
       if (document.hidden) {
+        this.handlers.onConnection("connecting");
+        this.leave();
         await new Promise<void>((resolve) => (this.wake = resolve));
         continue;
       }
+      if (!this.free) {
+        this.free = await oneOfReaders();
+        if (!this.free) {
+          this.handlers.onConnection("waiting");
+          await this.pause(LOOK_MS);
+        }
+        continue;
+      }
+      this.handlers.onConnection("connecting");
       if (!(await this.readOnce())) {
-        this.closed = true;
+        this.close();
         this.handlers.onConnection("refused");
         return;
       }
@@ -118,6 +154,7 @@ export class Stream {
       this.handlers.onConnection("lost");
       await this.pause(waitBefore(this.attempt++, Math.random()));
     }
+    this.leave();
   }
 
   private pause(ms: number): Promise<void> {

@@ -98,11 +98,12 @@ class Rig:
         goal = None if goal_id is None else {"goal_id": goal_id}
         self.planned.on_event("robot", {"id": "r-1", "value": {"goal": goal}})
 
-    def end(self, goal_id: str, action: str, after: str | None = None) -> None:
-        """Have the audit trail tell that a mission has ended."""
+    def end(self, goal_id: str | None, action: str, after: str | None = None, who: str = "anna") -> None:
+        """Have the audit trail tell that a mission has ended, or begun."""
         before, now = ({"goal": {"goal_id": each}} if each else None for each in (goal_id, after))
         self.planned.on_event(
-            "record", {"kind": "mission", "id": "r-1", "action": action, "before": before, "after": now}
+            "record",
+            {"kind": "mission", "id": "r-1", "who": who, "action": action, "before": before, "after": now},
         )
 
     async def result(self, goal_id: bytes = GOAL) -> int:
@@ -244,6 +245,20 @@ async def test_goal_after_one_that_an_operator_has_ended_is_accepted_and_replace
     assert conditions == [{"If-None-Match"}, {"If-Match"}, {"If-None-Match"}]
     keys = {request.headers["Idempotency-Key"] for request in rig.floor.asked}
     assert len(keys) == 3, "what was refused is another request"
+
+
+@pytest.mark.parametrize(
+    ("who", "condition"), [("fleet/free-fleet", {"If-Match": '"g9"'}), ("anna", {"If-None-Match": "*"})]
+)
+async def test_mission_of_an_earlier_run_of_the_bridge_gives_way_to_the_next_goal_and_an_operators_does_not(
+    rig, who, condition
+):
+    rig.end(None, "put", after="g9", who=who)
+    rig.plan("g9")
+    rig.state("g9")
+    assert await rig.result() == UNKNOWN, "for which free_fleet plans anew"
+    await rig.ask("send_goal", goal(2.0))
+    assert condition.items() <= rig.floor.asked[-1].headers.items()
 
 
 async def test_robot_that_tells_nothing_for_5_s_takes_no_goal_until_it_is_heard_again(rig):

@@ -69,6 +69,8 @@ class Planned:
         """The mission of each robot that has one."""
         self._ends: dict[str, bool] = {}
         """The latest missions that have ended, and whether they were reached."""
+        self._begun: dict[str, str] = {}
+        """By robot, the mission that this bridge has begun, in an earlier run, too; none where somebody else has."""
 
     def on_event(self, name: str, data: dict[str, Any]) -> None:
         """Take in an event of the floor."""
@@ -81,6 +83,8 @@ class Planned:
             before, after = (((data[each] or {}).get("goal") or {}).get("goal_id") for each in ("before", "after"))
             if before and before != after:
                 _remember(self._ends, before, data["action"] == "reached")
+            if after and after != before:
+                self._begun[data["id"]] = after if data["who"].endswith(f"/{FreeFleetBridge.name}") else ""
 
     def on_lost(self) -> None:
         """Take in that nobody knows which robot has a mission."""
@@ -89,6 +93,11 @@ class Planned:
     def has(self, robot: str, mission: str) -> bool:
         """Whether a mission is a robot's."""
         return self._missions.get(robot) == mission
+
+    def left(self, robot: str) -> str:
+        """Return a robot's mission, if this bridge has begun it; empty without one."""
+        mission = self._begun.get(robot, "")
+        return mission if mission and self.has(robot, mission) else ""
 
     def end_of(self, mission: str) -> bool | None:
         """Return whether a mission was reached (True) or ended by somebody (False); None: neither is known."""
@@ -245,8 +254,14 @@ class Fleet:
             self._put(robot, f"{_ACTION}/feedback", told, "fognav_msgs/msg/GoalFeedback")
 
     def _followed(self, robot: str) -> Mission | None:
-        """Return a robot's mission with its present status; None if this bridge has begun none."""
+        """Return a robot's mission with its present status; None if this bridge has begun none.
+
+        One of an earlier run has no goal's id: free_fleet plans anew for its own, and the new goal replaces it.
+        """
         mission = self._missions.get(robot)
+        if mission is None and (left := self._planned.left(robot)):
+            now = self._clock.now()
+            mission = self._missions[robot] = Mission(_NO_GOAL, left, begun=now, seen=now)
         if mission is not None:
             mission.follow(robot, self._states[robot], self._planned, self._clock.now())
         return mission

@@ -20,7 +20,7 @@ from fog_contracts.site import RobotSite
 from fog_runtime.configuration.site import load_site
 from fognav_experiments.lockstep import DriveEvent
 from fognav_experiments.machine import CpuMeter
-from fognav_experiments.scenarios.description import Expected, FaultyNode, Scenario, SilentNode, deviations
+from fognav_experiments.scenarios.description import Expected, FaultyNode, LinkGap, Scenario, SilentNode, deviations
 from fognav_experiments.scenarios.play import (
     Fleet,
     FleetResult,
@@ -181,6 +181,26 @@ def test_nodes_that_fail_at_the_same_time_come_back_each_at_its_own_end():
 
     assert [heard(now) for now in (0.0, 10.0, 20.0)] == [["n3"], ["n1", "n3"], ["n1", "n2", "n3"]]
     assert again == ["n1", "n2"], "their connection has come back"
+
+
+def test_gaps_of_the_radio_that_overlap_end_each_at_its_own_end():
+    link = SimpleNamespace(hears=True, is_heard=True)
+    robot = SimpleNamespace(process=SimpleNamespace(link=link))
+    drive = SimpleNamespace(now=0.0, driven=0.0, robot=robot, log_event=lambda _text: None)
+    events = [
+        LinkGap(seconds=10.0),
+        LinkGap(at_s=2.0, seconds=1.0, down=False),
+        LinkGap(at_s=8.0, seconds=9.0, up=False),
+    ]
+    stage = Stage(drive, events)
+
+    def open_ways(now):
+        drive.now = now
+        stage.step()
+        return link.hears, link.is_heard
+
+    both = [open_ways(now) for now in (0.0, 2.0, 3.0, 8.0, 10.0, 17.0)]
+    assert both == [(False, False)] * 4 + [(False, True), (True, True)]
 
 
 def test_the_page_of_scenarios_says_on_what_they_were_played():

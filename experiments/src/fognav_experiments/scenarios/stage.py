@@ -86,6 +86,7 @@ class Stage:
         self._ends: list[tuple[float, Callable[[], object]]] = []
         self._repeated: list[Callable[[], bool]] = []
         self._steps = 0
+        self._gaps = (0, 0)
         self._random = random.Random(seed)  # noqa: S311  # repeatable, not a secret
 
     def on_lost(self, source: Source, *, lost: bool) -> None:
@@ -139,8 +140,7 @@ class Stage:
                 rate = event.rate
                 self._replace_node(event.node, lambda node: [SlewedNodeSim(node, rate)], 0.0)
             case LinkGap():
-                self._link(hears=not event.down, is_heard=not event.up)
-                self._later(event.seconds, partial(self._link, hears=True, is_heard=True))
+                self._gap(event.seconds, (event.down, event.up))
             case SlowLink():
                 self._delay(event.delay_s)
                 self._later(event.seconds, partial(self._delay, 0.0))
@@ -237,10 +237,8 @@ class Stage:
             return False
         self._delay(self._time(event))
         if self._random.random() < event.gaps_per_min * _REPEAT_STEPS * STEP_S / 60.0:
-            hears, is_heard = self._random.choice(((False, True), (True, False), (False, False)))
-            self._link(hears=hears, is_heard=is_heard)
-            seconds = _GAP_S * math.exp(self._random.gauss(0.0, 1.0))
-            self._later(max(seconds, 2 * STEP_S), partial(self._link, hears=True, is_heard=True))
+            by = self._random.choice(((1, 0), (0, 1), (1, 1)))
+            self._gap(max(_GAP_S * math.exp(self._random.gauss(0.0, 1.0)), 2 * STEP_S), by)
         return True
 
     def _busy(self, event: BusyRadio) -> None:
@@ -326,10 +324,14 @@ class Stage:
         self._run.system.fog.start_again(process, moment(self._run.now))
         self.on_lost(process, lost=False)
 
-    def _link(self, *, hears: bool, is_heard: bool) -> None:
+    def _gap(self, seconds: float, by: tuple[int, int]) -> None:
+        """Begin a gap of messages (1) to and from the robot; its end ends no other one."""
+        self._gaps = self._gaps[0] + by[0], self._gaps[1] + by[1]
         link = self._run.robot.process.link
-        link.hears, link.is_heard = hears, is_heard
-        self.on_lost("fog", lost=not hears)
+        link.hears, link.is_heard = self._gaps[0] == 0, self._gaps[1] == 0
+        self.on_lost("fog", lost=not link.hears)
+        if seconds:
+            self._later(seconds, partial(self._gap, 0.0, (-by[0], -by[1])))
 
     def _delay(self, seconds: float) -> None:
         self._run.robot.process.link.delay_s = seconds

@@ -124,7 +124,7 @@ async def test_stop_works_in_each_of_six_tabs_of_a_browser(console: SimpleNamesp
         await expect(page.locator(".said")).to_have_text("r1 stops.")
     await pages[0].evaluate("() => { window.covered = false; document.dispatchEvent(new Event('visibilitychange')) }")
     async with asyncio.timeout(60):
-        while len(stream.resumed_from) == len(pages):
+        while len(stream.resumed_from) == len(pages):  # noqa: ASYNC110  # its answer is a stream, which never ends
             await asyncio.sleep(0.05)
     assert (stream.resumed_from[-1] or "").startswith("first-"), "a tab that is seen again goes on where it was"
 

@@ -153,7 +153,7 @@ class Scheduling:
         self._windows = {one.id: self._windows[one.id] for one in schedules if one.id in self._windows}
         found: list[tuple[int, float, str, ScheduledMission, Window]] = []
         for schedule in schedules:
-            # Windows are computed for some days at a time, which takes milliseconds each: paths are answered in between.
+            # Windows are computed for some days at a time, which takes milliseconds: paths are answered in between.
             await asyncio.sleep(0)
             if not is_dated(schedule, stamp):
                 await self._put(schedule, structs.replace(schedule, since=stamp), "dated")

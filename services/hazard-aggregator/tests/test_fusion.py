@@ -2,6 +2,7 @@
 
 import itertools
 import math
+from collections import deque
 from collections.abc import Sequence
 
 import msgspec
@@ -631,6 +632,27 @@ def test_block_of_which_late_poses_explain_all_is_taken_back():
     assert rig.hazard.cause == "node n1: it saw the robot r1, whose pose came late"
     rig.read(3.0, 3.0, times=5)
     assert rig.hazard.state == "clear"
+
+
+def test_robot_that_stands_in_a_cone_is_not_shut_in_because_the_network_held_its_poses_back():
+    rig = Rig(site("n1"))
+    rig.read(3.0, 3.0, times=5)
+    held: deque[RobotPose] = deque()
+
+    def stand(seconds: float, arriving: int) -> None:
+        for _ in range(round(seconds / PERIOD)):
+            held.append(msgspec.structs.replace(pose(1.0, 0.5), clock=rig.now + 5000.0))
+            for _ in range(min(arriving, len(held))):
+                rig.core.on_pose("r1", held.popleft(), rig.now)
+            rig.read(0.83, 3.0)
+            rig.wait(0.0)
+
+    stand(9.0, arriving=1)
+    assert rig.hazard.state == "unknown"  # for it sees nothing else
+    stand(3.6, arriving=0)
+    assert rig.hazard.state == "blocked"
+    stand(3.0, arriving=3)
+    assert (rig.hazard.state, rig.hazard.penalty) == ("unknown", 200)
 
 
 def test_robot_that_says_late_again_and_again_that_it_stood_there_unblocks_an_area_a_few_times_only():

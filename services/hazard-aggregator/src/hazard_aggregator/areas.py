@@ -172,6 +172,10 @@ class WatchedArea:
         if not self._confirmed and is_impassable(hazard):
             self._last_known_blocked = True
 
+    def was_blocked_by(self, node: str) -> bool:
+        """Whether a node was blocked when it last knew anything."""
+        return node in self._blocked_by
+
     def take_back(self, node: str) -> None:
         """Handle that what a node saw was no hazard: if it alone saw one, the area is as impassable as before that."""
         self._blocked_by.discard(node)

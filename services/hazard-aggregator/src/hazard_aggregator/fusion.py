@@ -295,7 +295,7 @@ class AreaFusion:
     def _take_back(self, area: WatchedArea) -> None:
         """Take back what blocked an area if poses that came late show that it was a robot, all of it."""
         for node in area.nodes.values():
-            if node.state != "blocked" or node.site is None or node.taken_back >= TAKEN_BACK_MAX:
+            if node.site is None or node.taken_back >= TAKEN_BACK_MAX or not area.was_blocked_by(node.id):
                 continue
             robot = None
             for taken_at, reading in node.unexplained:  # the oldest first: for a box, it is the only one

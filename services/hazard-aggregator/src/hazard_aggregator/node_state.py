@@ -123,7 +123,7 @@ class NodeState:
         self.unconfirmed = True
         self.explained_by = None
         self.run_state = None
-        self.unexplained.clear()
+        self.unexplained = []
         self.rule.reset()
 
     def take_back(self, robot: str) -> None:
@@ -218,7 +218,9 @@ class NodeState:
             return
         reason = f"robot {robot} has stood before it for more than {EXPLAINED_S:g} s, by its pose: it sees nothing else"
         if self.reason != reason or self.state != "unknown":
+            unexplained = self.unexplained  # poses that are under way may explain them still
             self.invalidate(Reason(NodeCode.ROBOT_STAYS, reason))
+            self.unexplained = unexplained
 
     def _explained_too_long(self, taken_at: float) -> bool:
         return taken_at - self.explained_at <= _EXPLAINED_PAUSE_S and taken_at - self.explained_since > EXPLAINED_S

@@ -2,6 +2,7 @@
 
 import asyncio
 from pathlib import Path
+from types import SimpleNamespace
 
 import msgspec
 import pytest
@@ -16,6 +17,7 @@ from fog_runtime.stores.redis_store import Audit
 from fog_supervisor.servers import Server, start_redis
 from hazard_aggregator.areas import Members
 from hazard_aggregator.history import Period, period_of
+from hazard_aggregator.publisher import HistoryPersistence
 from hazard_aggregator.records import UnusableAreas
 from hazard_aggregator.registry import find_rule
 from hazard_aggregator.store import Store
@@ -117,6 +119,20 @@ async def test_period_of_an_area_is_written_once_continues_over_restarts_and_is_
         assert len(after.periods) >= 15, "a clock that is years ahead after a boot cost the whole history"
         with pytest.raises(CursorError):
             await store.history("hall", cursor="1", limit=9, at=at(0.0))
+
+
+async def test_history_of_a_removed_area_is_forgotten_once_it_is_90_days_old(redis: Server):
+    day = 86_400.0
+    gone, back = (AreaDefinition(id=name, polygon=[(0, 0), (1, 0), (1, 1)], removed=True) for name in ("hall", "new"))
+    core = SimpleNamespace(definitions=lambda: [gone, back])
+    async with Store(redis.url, "test", timeout_s=5.0) as store, Redis.from_url(redis.url) as raw:
+        for area, stamp in (("hall", 0.0), ("new", 5 * day)):
+            of_area = msgspec.structs.replace(hazard(1), area=area)
+            await store.begin_period(of_area, period_of(of_area, at(stamp)))
+        history = HistoryPersistence(core, store, asyncio.Event())  # type: ignore[arg-type]  # all that it needs of a core
+        for stamp, left in ((89 * day, [b"hall", b"new"]), (91 * day, [b"new"])):
+            await history.forget_removed(at(stamp))
+            assert sorted(key.rpartition(b":")[2] for key in await raw.keys("fog:test:history:*")) == left
 
 
 def test_stored_area_with_an_unknown_rule_stays_on_the_map_unwatched_and_is_named(caplog):

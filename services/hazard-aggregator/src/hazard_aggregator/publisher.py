@@ -61,6 +61,7 @@ class Availability:
 _QUEUE: Final = 10_000
 """Hazards that wait while Redis is away; beyond them the oldest are missing in the history."""
 _PERIOD_S: Final = 0.5
+_FORGET_S: Final = 86_400.0
 
 
 class HistoryPersistence:
@@ -72,6 +73,7 @@ class HistoryPersistence:
         self._leading = leading
         self._queue: deque[tuple[AreaHazard, Moment | None]] = deque(maxlen=_QUEUE)
         self._newest: dict[str, tuple[int, int]] = {}
+        self._forget_at = 0.0
 
     def add(self, hazard: AreaHazard, at: Moment) -> None:
         """Queue a hazard that is published at this moment, unless it was queued before.
@@ -87,6 +89,14 @@ class HistoryPersistence:
     async def page(self, area: str, cursor: str | None, limit: int, at: Moment) -> HistoryPage:
         """Return a page of an area's history at this moment; raises `CursorError` and `StoreError`."""
         return await self._store.history(area, cursor=cursor, limit=limit, at=at)
+
+    async def forget_removed(self, at: Moment) -> None:
+        """Forget, once a day, what became of areas that were removed 90 days ago; raises `StoreError`."""
+        if at.now < self._forget_at:
+            return
+        removed = [definition.id for definition in self._core.definitions() if definition.removed]
+        await self._store.forget_histories(removed, at.stamp)
+        self._forget_at = at.now + _FORGET_S
 
     async def run(self) -> None:
         """Write what is queued, while this process leads."""

@@ -167,6 +167,7 @@ class Service:
             self.records.mark_loaded()
         if self._leading.is_set():
             await self.records.reload()
+            await self.history.forget_removed(self._edges.now())
             await self.records.keep_places()
             await self.overrides.keep()
         await self._store.check()

@@ -163,6 +163,12 @@ class Store(RedisStore):
         found = [(entry_id.decode(), fields) for entry_id, fields in reply]
         return page_of([(name, _data(fields)) for name, fields in found], cursor=cursor, limit=limit, at=at)
 
+    async def forget_histories(self, areas: Iterable[str], stamp: float) -> None:
+        """Forget the histories of removed areas in which nothing has begun for `RETENTION_S` before `stamp`."""
+        for area in areas:
+            key, oldest = self._key(f"{_HISTORY}:{area}"), f"{stamp - RETENTION_S:.3f}"
+            await self._redis.write(("EVAL", records.FORGET, 1, key, oldest))
+
     async def alerts(self) -> list[Alert]:
         """Return the stored alerts."""
         found = (await self._readable_records(_ALERTS, StoredAlerts)).get(_ALL)

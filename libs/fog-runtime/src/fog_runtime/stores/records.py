@@ -193,6 +193,14 @@ Keys: `generation`, `writes`, history (a stream), epoch. `id_epoch` and `id_seq`
 newer than the last one is known.
 """
 
+FORGET: Final = """
+local last = redis.call('XREVRANGE', KEYS[1], '+', '-', 'COUNT', 1)[1]
+for i = 1, last and #last[2] or 0, 2 do
+  if last[2][i] == 'at' and tonumber(last[2][i + 1]) < tonumber(ARGV[1]) then redis.call('DEL', KEYS[1]) end
+end
+"""
+"""Delete a history (the key) whose last period began before a time (s since the epoch): its area is gone."""
+
 
 KINDS: Final = (
     "alert", "area", "map", "mission", "override", "place", "robot", "schedule", "service", "set", "source", "stop",

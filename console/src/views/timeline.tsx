@@ -42,6 +42,7 @@ export function TimelineView(): preact.JSX.Element {
         </select>
       </label>
       {problem !== "" && <p class="problem" role="alert">{problem}</p>}
+      {entries === null && problem === "" && <p class="muted">{t("connection.loading")}</p>}
       {entries?.length === 0 && <p class="muted">{t("timeline.none")}</p>}
       <ol class="rows timeline">
         {(entries ?? []).map((entry, index) => (

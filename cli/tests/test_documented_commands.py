@@ -40,3 +40,16 @@ def test_commands_are_found_in_the_documents_and_a_wrong_one_is_told() -> None:
     assert sum(len(documented(document)) for document in DOCUMENTS) > 55
     assert "No such option" in str(problem(["up", "--flor", "x"]))
     assert "No such command" in str(problem(["upp"]))
+
+
+def test_commands_that_the_console_and_messages_name_exist() -> None:
+    texts = [(path, r"\bfognav ") for path in (ROOT / "console" / "src").rglob("*.ts*")]
+    parts = ("cli", "robot-agent", "libs", "services", "experiments")
+    texts += [(path, r"`(?:\./)?fognav ") for part in parts for path in (ROOT / part).rglob("src/**/*.py")]
+    named = {
+        found.strip()
+        for path, before in texts
+        for found in re.findall(before + r"([a-z][a-z-]*(?: [a-z][a-z-]*)?)", path.read_text("utf-8"))
+    }
+    assert "token create" in named
+    assert {words: found for words in sorted(named) if (found := problem(words.split())) is not None} == {}

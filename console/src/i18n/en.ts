@@ -15,7 +15,7 @@ export const en = {
   "view.floors": "Floors",
 
   "login.token": "Token",
-  "login.help": "Your token, from who runs this fog node: ./fognav token new.",
+  "login.help": "Your token, from who runs this fog node: ./fognav token create.",
   "login.submit": "Log in",
   "login.wrong": "Nobody has this token. Check it, or ask for a new one.",
   "login.expired": "The login has ended. Log in again.",

@@ -16,7 +16,7 @@ export const pt: Readonly<Record<keyof typeof en, string>> = {
   "view.floors": "Pisos",
 
   "login.token": "Chave de acesso",
-  "login.help": "A sua chave, dada por quem gere este nó: ./fognav token new.",
+  "login.help": "A sua chave, dada por quem gere este nó: ./fognav token create.",
   "login.submit": "Entrar",
   "login.wrong": "Ninguém tem esta chave. Verifique-a ou peça outra.",
   "login.expired": "A sessão terminou. Entre de novo.",

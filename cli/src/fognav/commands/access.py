@@ -48,7 +48,7 @@ _TOKENS: Final = "tokens.toml"
 FileOption = Annotated[
     Path | None,
     typer.Option(
-        "--file", metavar="F", help=f"The services' tokens file; default: {_VARIABLE}, else a running demo's."
+        "--file", metavar="F", help=f"The services' tokens file; default: {_VARIABLE}, else that of the system here."
     ),
 ]
 NameArgument = Annotated[str, typer.Argument(metavar="NAME", help="Who uses it; audit entries show this name.")]

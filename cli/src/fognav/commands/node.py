@@ -42,7 +42,7 @@ T = TypeVar("T")
 NameArgument = Annotated[str, typer.Argument(metavar="NODE", help="The node's id: a to z, 0 to 9 and -.")]
 BrokerOption = Annotated[
     str | None,
-    typer.Option("--broker", metavar="URL", help="mqtt:// or mqtts:// address; default: that of the running demo."),
+    typer.Option("--broker", metavar="URL", help="mqtt:// or mqtts:// address; default: that of the running system."),
 ]
 SiteIdOption = Annotated[str | None, typer.Option("--site-id", metavar="ID", help="Default: the running system's.")]
 

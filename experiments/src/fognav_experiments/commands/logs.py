@@ -45,7 +45,7 @@ def add_localize(app: typer.Typer) -> None:
 def localize_command(  # noqa: PLR0913  # each option is an argument
     *,
     map_file: Annotated[Path, typer.Option("--map", metavar="MAP.yaml", help="map_server map of the building.")],
-    log_file: Annotated[Path, typer.Option("--log", metavar="LOG", help="JSON lines or CARMEN, gzipped or not.")],
+    log_file: Annotated[Path, typer.Option("--log", metavar="LOG", help="A log, as map from-log reads it.")],
     log_format: LogFormat = "auto",
     scans: Scans = "all",
     search: Annotated[bool, typer.Option("--global", help="Start by a search of the whole map.")] = False,
@@ -181,7 +181,7 @@ def add_from_log(app: typer.Typer) -> None:
 
 
 def map_from_log(  # noqa: PLR0913  # each option is an argument
-    log_file: Annotated[Path, typer.Argument(metavar="LOG", help="Log: JSON lines, CARMEN or a recording of ROS 2.")],
+    log_file: Annotated[Path, typer.Argument(metavar="LOG", help="Of map record, ROS 2 or CARMEN, or JSON lines.")],
     *,
     out: Annotated[Path, typer.Option("--out", metavar="PREFIX", help="PREFIX.yaml and PREFIX.pgm are written.")],
     log_format: LogFormat = "auto",

@@ -33,6 +33,7 @@ from fog_kernels.inflation import inflate
 from robot_agent.agent.core import AgentCore
 from robot_agent.agent.hand_driving import TakeOver
 from robot_agent.hardware import ON_CHARGER
+from robot_agent.localization.pose import SavedPose
 from robot_agent.motion.local_planner import decide
 from robot_agent.scan_builder import Mounting
 
@@ -436,11 +437,24 @@ def test_restarted_agent_that_was_carried_away_does_not_trust_its_saved_pose(dri
     assert driving.error()[0] < 0.1
 
 
+def test_agent_that_starts_again_while_its_robot_turns_round_knows_which_way_it_looks():
+    world = LittleWorld(pose=(7.0, 2.0, 0.0), guardian="one").ready()
+    saved = world.agent.pose_to_store(world.now)
+    world.drive_to([(7.0, 2.0), (2.0, 2.0)])
+    assert world.run(10.0, lambda w: abs(w.theta) > 2.8)
+    world.agent.pose_to_store = lambda _: saved
+    world.restart()
+    world.agent.load(world.master.snapshot(), world.now)
+    world.run(1.0)
+    assert world.agent.localizer.status == "good"
+    assert world.error() == pytest.approx((0.0, 0.0), abs=0.1)
+
+
 def test_pose_that_an_operator_gives_is_kept_when_the_first_feedback_of_the_base_follows_a_saved_one(driving):
     driving.restart()
     driving.agent.localizer.initial_pose(driving.x, driving.y, driving.theta)
     given = driving.agent.localizer.detail
-    driving.agent.localizer.follow_saved()
+    driving.agent.localizer.follow_saved(SavedPose(site="lab", x=1.0, y=2.0, theta=0.0, sigma_xy=0.1, sigma_theta=0.1))
     assert driving.agent.localizer.detail == given != ""
 
 

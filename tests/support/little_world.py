@@ -82,6 +82,7 @@ class LittleWorld:
     wheel_noise: float = 0.0  # by how much (m) they are off after a metre at random, both alike
     config: AgentConfig = AGENT  # of the body and the lidar's place on it, too
     posts: list = field(default_factory=list)  # rectangles (left, bottom, right, top in m) that no map has
+    guardian: str = ""  # id of its run
 
     def __post_init__(self):
         self.static, self.geometry = grid_of(self.rooms, *self.size, self.resolution)
@@ -250,6 +251,7 @@ class LittleWorld:
                     bumped=self.bumped,
                     stopped=self.stopped,
                     travel_wrap_m=self.guardian_wrap,
+                    guardian=self.guardian,
                 ),
                 self.now,
             )

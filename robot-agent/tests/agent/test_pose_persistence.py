@@ -4,6 +4,7 @@ import math
 
 import msgspec
 import pytest
+from little_world import AXLE, DRIVE_TRAIN
 
 from robot_agent.agent.pose_persistence import SEARCH_AGAIN_S, PosePersistence
 from robot_agent.guardian.link import BaseFeedback
@@ -16,8 +17,8 @@ POSE = SavedPose(site="lab", x=1.0, y=2.0, theta=3.1, sigma_xy=0.1, sigma_theta=
 FIELDS = object()
 
 
-def feedback(seq, left, fault=None, guardian="one"):
-    wheels = WheelOdometry(left_m=left, right_m=2.0)
+def feedback(seq, left, fault=None, guardian="one", right=2.0):
+    wheels = WheelOdometry(left_m=left, right_m=right)
     return BaseFeedback(seq=seq, status=BaseStatus(), odometry=wheels, fault=fault, stopped=None, guardian=guardian)
 
 
@@ -29,7 +30,7 @@ class FakeLocalizer:
         self.can_search = True
         self.searches = 0
         self.restored = []
-        self.followed = 0
+        self.followed = []
         self.trusted = POSE
         self.moving = (0.0, 0.0)
 
@@ -46,8 +47,8 @@ class FakeLocalizer:
     def restore(self, saved):
         self.restored.append(saved)
 
-    def follow_saved(self):
-        self.followed += 1
+    def follow_saved(self, saved):
+        self.followed.append(saved)
 
     def load_map(self, fields):
         self.fields = fields
@@ -63,7 +64,7 @@ def localizer():
 
 @pytest.fixture
 def persistence(localizer):
-    return PosePersistence(localizer)
+    return PosePersistence(localizer, DRIVE_TRAIN)
 
 
 def test_search_begins_without_a_pose_and_not_again_before_the_interval(persistence, localizer):
@@ -121,13 +122,26 @@ def test_stored_pose_is_followed_if_one_guardian_has_watched_the_robot_since(
 ):
     persistence.on_base(feedback(6, 2.0))
     stored = persistence.to_store("lab", 0.0)
-    successor = PosePersistence(localizer)
+    successor = PosePersistence(localizer, DRIVE_TRAIN)
     if base_first:
         successor.on_base(feedback(*first))
     successor.restore(stored, "lab")
     successor.on_base(feedback(*first))
     assert localizer.restored == [stored]
-    assert localizer.followed == followed
+    assert len(localizer.followed) == followed
+
+
+@pytest.mark.parametrize("begin", [0.0, 0.98 * DRIVE_TRAIN.travel_wrap_m], ids=["", "the counters begin again"])
+def test_followed_pose_is_where_the_wheels_have_taken_the_robot_since(persistence, localizer, begin):
+    persistence.on_base(feedback(6, begin, right=begin))
+    successor = PosePersistence(localizer, DRIVE_TRAIN)
+    successor.restore(persistence.to_store("lab", 0.0), "lab")
+    left, right = (math.remainder(begin + way, DRIVE_TRAIN.travel_wrap_m) for way in (0.4 + AXLE, 0.4 - AXLE))
+    successor.on_base(feedback(900, left, right=right))
+    (followed,) = localizer.followed
+    chord = 0.4 * math.sin(1.0)
+    at = (1.0 + chord * math.cos(2.1), 2.0 + chord * math.sin(2.1), 1.1)
+    assert (followed.x, followed.y, followed.theta) == pytest.approx(at)
 
 
 @pytest.mark.parametrize(

@@ -96,7 +96,7 @@ class AgentCore:
         self._odometry = Odometry(config.drive_train)
         self._lidar = LidarSource(config.safety.returns_least)
         self._localizer = Localizer(config.localization, seed)
-        self._pose_persistence = PosePersistence(self._localizer)
+        self._pose_persistence = PosePersistence(self._localizer, config.drive_train)
         self._fence = Fence()
         self._map = MapFollower()
         self._driving = PathDriving(config)

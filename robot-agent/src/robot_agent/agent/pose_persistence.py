@@ -7,12 +7,14 @@ from typing import TYPE_CHECKING, Final
 
 import msgspec
 
+from robot_agent.localization.odometry import integrate, wheel_travel
 from robot_agent.localization.pose import SavedPose
 
 if TYPE_CHECKING:
     from fog_contracts.messages import Mode
     from fog_contracts.site import RobotSite
     from robot_agent.guardian.link import BaseFeedback
+    from robot_agent.hardware import DriveTrain
     from robot_agent.localization.localizer import Localizer
     from robot_agent.localization.map_fields import MapFields
 
@@ -34,8 +36,9 @@ _START_SIGMA_RAD: Final = 0.15
 class PosePersistence:
     """Starts the localizer from a stored pose or by a global search, and selects the poses to store."""
 
-    def __init__(self, localizer: Localizer) -> None:
+    def __init__(self, localizer: Localizer, drive_train: DriveTrain) -> None:
         self._localizer = localizer
+        self._drive_train = drive_train
         self._pending: SavedPose | None = None
         """A stored pose to start at as soon as the map of its site is loaded."""
         self._searched_at = -math.inf
@@ -49,8 +52,8 @@ class PosePersistence:
         """Handle feedback of the base: the first tells whether a guardian has watched the robot since it was stored."""
         self._feedback = feedback
         restored, self._restored = self._restored, None
-        if restored is not None and _is_followed(restored, feedback):
-            self._localizer.follow_saved()
+        if restored is not None and (followed := _followed(restored, feedback, self._drive_train)) is not None:
+            self._localizer.follow_saved(followed)
 
     def restore(self, saved: SavedPose, site: str) -> None:
         """Start at a stored pose, at once if the map of its site is loaded already; the next scans verify it."""
@@ -113,13 +116,22 @@ def start_pose(site: str, robot: RobotSite) -> SavedPose:
     )
 
 
-def _is_followed(saved: SavedPose, feedback: BaseFeedback) -> bool:
-    """Whether the guardian of a stored pose still lives, has seen no wheel drop, and its wheels have hardly turned."""
+def _followed(saved: SavedPose, feedback: BaseFeedback, drive: DriveTrain) -> SavedPose | None:
+    """Return where the wheels have taken the robot since its pose was stored, as if along one arc.
+
+    While it turns in place, what was stored a second ago may look the other way. None unless its guardian still lives,
+    has seen no wheel drop, and the wheels have hardly turned.
+    """
     if saved.base is None or feedback.fault is not None or not saved.guardian or saved.guardian != feedback.guardian:
-        return False
-    seq, left, right = saved.base
-    wheels = feedback.odometry
-    return feedback.seq > seq and max(abs(wheels.left_m - left), abs(wheels.right_m - right)) < _FOLLOWED_M
+        return None
+    seq, *stored = saved.base
+    now = feedback.odometry.left_m, feedback.odometry.right_m
+    rolled = [wheel_travel(new, old, drive.travel_wrap_m) for new, old in zip(now, stored, strict=True)]
+    if feedback.seq <= seq or max(map(abs, rolled)) >= _FOLLOWED_M:
+        return None
+    left, right = (share * way for share, way in zip(drive.shares, rolled, strict=True))
+    x, y, theta = integrate(saved.x, saved.y, saved.theta, left, right, drive.axle_m)
+    return msgspec.structs.replace(saved, x=x, y=y, theta=theta)
 
 
 def _differs(new: SavedPose, old: SavedPose, *, moves: bool) -> bool:

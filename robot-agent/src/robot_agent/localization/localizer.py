@@ -219,9 +219,10 @@ class Localizer:
         self._history.saved = True
         self._monitor.begin(_SAVED, _TRIAL_SCANS)
 
-    def follow_saved(self) -> None:
-        """Trust a saved pose that no scan has tried yet like one that was followed: somebody has watched the robot."""
+    def follow_saved(self, saved: SavedPose) -> None:
+        """Trust where a saved pose that no scan has tried yet has led like a pose that was followed, as it was."""
         if self._monitor.on_trial:
+            self.restore(saved)
             self._history.tracked = True
             self._monitor.begin(_SAVED)
 

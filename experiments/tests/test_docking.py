@@ -11,6 +11,7 @@ import ring_site as ring
 from fog_contracts.messages import Pose, RectangleShape, RobotGoal, SimObstacle, Zone
 from fog_runtime.configuration.site import LoadedSite
 from fognav_experiments.rigs import moment
+from robot_agent.agent import power
 from robot_agent.agent.core import AgentCore
 
 DOCK = Pose(x=0.78, y=1.5, theta=math.pi)  # its wall is 11 cm behind the body's front
@@ -140,24 +141,41 @@ def wheel_drop(run):
     run.base.world.wheel_drop_left = True
 
 
+def cancel(run):
+    assert run.robot.command("cancel").reason == "its way to its dock is cancelled on the robot"
+
+
 STOPS = [
-    (bump, "FAULT", 0.1), (cliff, "FAULT", 0.1), (wheel_drop, "FAULT", 0.1), (stop, "INIT", 0.15), (zone, "INIT", 0.3),
-    (blind, "INIT", 0.8), (obstacle, "INIT", 0.5),
+    (bump, "FAULT", 0.1), (cliff, "FAULT", 0.1), (wheel_drop, "FAULT", 0.1), (stop, "INIT", 0.15),
+    (zone, "PROTECTIVE_STOP", 0.3), (blind, "PROTECTIVE_STOP", 0.8), (obstacle, "NORMAL", 0.5),
+    (cancel, "NORMAL", 0.15),
 ]  # fmt: skip
 
 
 @pytest.mark.parametrize(("cause", "mode", "within"), STOPS, ids=[cause.__name__ for cause, _, _ in STOPS])
-def test_every_stop_condition_ends_the_bases_own_drive(cause, mode, within):
+def test_every_stop_condition_and_a_cancel_end_the_bases_own_drive(cause, mode, within):
     run = Run()
     run.until_seeking()
     cause(run)
     run.until(lambda: run.wheels == (0.0, 0.0), within)
     run.run(0.4)
-    assert run.state.mode == mode
     assert not run.base.seeking_dock
     run.run(3.0)
+    assert (run.state.mode, run.state.enabled) == (mode, mode not in {"FAULT", "INIT"})
     assert run.wheels == (0.0, 0.0)
     assert run.away() > 0.1
+
+
+def test_another_goal_ends_the_bases_own_drive_and_nothing_else_is_done_to_a_robot_meanwhile():
+    run = Run()
+    run.until_seeking()
+    for command, more in (("initial_pose", {"pose": DOCK}), ("profile_fog", {})):
+        assert run.robot.command(command, **more).code == "driving"
+    run.send(Pose(x=1.5, y=2.2, theta=0.0))
+    run.until(lambda: not run.base.seeking_dock, 1.0)
+    run.until(lambda: run.state.goal_reached, 30.0)
+    assert not any(state.docked for state in run.states)
+    assert run.world.contacts == 0
 
 
 def test_robot_that_something_separates_from_its_dock_does_not_let_its_base_look_for_it():
@@ -220,6 +238,18 @@ def test_robot_with_a_low_battery_tries_once_and_waits_for_people_then():
     run.run(0.5)
     run.robot.command("enable")
     run.until(lambda: run.state.wants_dock, 1.0)
+
+
+def test_robot_with_a_low_battery_tries_again_when_somebody_who_kept_it_from_its_dock_has_gone(monkeypatch):
+    monkeypatch.setattr(power, "AGAIN_S", 5.0)
+    run = Run(charge=0.25, dock_below=0.3)
+    run.until(lambda: run.base.seeking_dock and run.away() < 0.6, 30.0)
+    obstacle(run)
+    run.until(lambda: "docking_given_up" in run.state.codes, 1.0)
+    assert run.state.enabled
+    run.world.remove("leg")
+    run.until(lambda: run.state.docked and run.state.mode == "HOLD", 60.0)
+    assert run.world.contacts == 0
 
 
 # --- backing off from a bump ---

@@ -87,11 +87,11 @@ def test_robot_wants_its_goal_until_it_has_reached_it_and_asks_the_gate_at_rest(
     assert not wish.wants_goal(under_way)
     assert not wish.is_due(ENABLED, under_way, 61.0, at_rest=False)
     assert wish.is_due(ENABLED, under_way, 61.0, at_rest=True)
-    wish.on_begun("a chair")
+    wish.on_begun("a chair", 61.0)
     assert (wish.ordered, wish.given_up) == (False, "a chair")
     wish.order(ENABLED, under_way, docked=False, now=70.0)
     assert wish.given_up == ""
-    wish.on_begun(None)
+    wish.on_begun(None, 71.0)
     assert (wish.ordered, wish.given_up) == (False, "")
 
 
@@ -161,7 +161,7 @@ def test_goal_that_it_had_before_ends_it_only_when_the_planner_does_not_replace_
 # --- a low battery ---
 
 
-def test_low_battery_orders_once_until_the_robot_was_disabled_or_docked():
+def test_low_battery_orders_again_after_people_have_ended_it_once_the_robot_was_disabled_or_docked():
     wish = docking()
     low = BaseStatus(battery=0.29)
     for status in (BaseStatus(), BaseStatus(battery=0.3), BaseStatus(battery=0.2, charging=True)):

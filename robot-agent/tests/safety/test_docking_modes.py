@@ -115,13 +115,17 @@ def test_robot_that_waits_for_an_operator_waits_for_one_after_leaving_its_dock_t
 
 @pytest.mark.parametrize(("changes", "words"), [*STOPS, ({"dock_problem": "a chair"}, "a chair"),
                                                 ({"base_stopped": "60 s"}, "holds the wheels: 60 s")])  # fmt: skip
-def test_condition_that_stops_a_robot_refuses_a_docking_and_ends_one_for_good(changes, words):
+def test_condition_that_stops_a_robot_refuses_a_docking_and_ends_one_as_it_stops_any_drive(changes, words):
     assert words in Gate().run(request="dock", **changes).refusal
-    gate = docking()
+    gate, drive = docking(), Gate()
     out = gate.run(**changes)
-    assert (out.mode, out.stop, gate.state.enabled) == ("INIT", "immediate", False)
-    assert any(reason.startswith("the docking ended: ") and words in reason for reason in out.reasons)
-    assert gate.run(5.0).mode == "INIT"
+    assert (out.mode, out.stop, gate.state.enabled, gate.state.maneuver) == ("HOLD", "ramp", True, None)
+    assert gate.state.maneuver_end.startswith("the docking ended: ")
+    assert words in gate.state.maneuver_end
+    drive.run(**changes)
+    assert gate.run(**changes).mode == drive.run(**changes).mode
+    assert gate.run(5.0).mode == drive.run(5.0).mode
+    assert gate.state.latched == drive.state.latched
 
 
 @pytest.mark.parametrize("fault", [*FAULTS, {"bumper": True}])
@@ -135,7 +139,12 @@ def test_fault_during_a_docking_is_latched(fault):
 def test_docking_ends_after_sixty_seconds():
     gate = docking()
     assert gate.run(59.9).mode == "DOCK"
-    assert "the docking ended: it took longer than 60 s" in gate.run(0.2).reasons
+    gate.run(0.2)
+    assert gate.state.maneuver_end == "the docking ended: it took longer than 60 s"
+    assert gate.run(2.2).mode == "NORMAL"
+    assert gate.run(request="dock").mode == "DOCK"
+    gate.run(docked_for=1.0)
+    assert gate.state.maneuver_end == ""
 
 
 def test_docking_is_refused_to_a_robot_that_is_not_enabled_or_on_its_dock():

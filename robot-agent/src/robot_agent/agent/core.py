@@ -77,6 +77,7 @@ if TYPE_CHECKING:
     from robot_agent.profiles import FindProfile, Found, Profile, Search
     from robot_agent.safety.conditions import Request
     from robot_agent.safety.gate import SafetyOutputs
+    from robot_agent.safety.maneuver import ManeuverKind
 
 POSSIBLE_WHILE_SUSPENDED: Final = (0.5, 0.5)
 """How far (m, rad) a robot is expected to be moved by others while its computer is suspended."""
@@ -240,7 +241,7 @@ class AgentCore:
                 self._resumes_until = -math.inf
         if self._maneuvers.may_seek_dock(self._safety.state, self._base.feedback, self._driving, now):
             safety = self._evaluate_safety(now, "dock")
-            self._maneuvers.docking.on_begun(safety.refusal)
+            self._maneuvers.docking.on_begun(safety.refusal, now)
         maneuver = self._maneuvers.command(self._safety.state, safety, self._driving, now)
         return self._rested(maneuver or self._driving.command(safety, self._guard.limit, now, stamp))
 
@@ -316,8 +317,16 @@ class AgentCore:
     @property
     def by_hand(self) -> bool:
         """Whether somebody drives the robot by hand."""
+        return self._makes("teleop")
+
+    def _makes(self, kind: ManeuverKind) -> bool:
         maneuver = self._safety.state.maneuver
-        return maneuver is not None and maneuver.kind == "teleop"
+        return maneuver is not None and maneuver.kind == kind
+
+    @property
+    def _stands(self) -> bool:
+        """Whether neither the agent turns the wheels nor the base itself, on its way into its dock."""
+        return self._driving.wheels.at_rest and not self._makes("dock")
 
     def on_hand(self, request: HandRequest, now: float) -> HandReply | None:
         """Handle the word of an operator at the robot; the reply is None for one that steers or watches."""
@@ -351,13 +360,14 @@ class AgentCore:
         return self._maneuvers.docking.order(self._safety.state, self._driving.mission, docked=docked, now=now)
 
     def cancel_goal(self) -> str | None:
-        """Cancel the goal; return its id, None without one."""
-        self._maneuvers.docking.give_up("its goal was cancelled")
-        return self._driving.cancel_goal()
+        """Cancel the goal, and the way into the dock; return what was cancelled, None if nothing was."""
+        docks = self._maneuvers.docking.cancel(running=self._makes("dock"))
+        goal = self._driving.cancel_goal()
+        return "its way to its dock" if goal is None and docks else goal and f"the goal {goal}"
 
     def set_initial_pose(self, pose: Pose | None) -> Reason | None:
         """Start localization at a pose in `map`; return why the pose is refused, None when it is accepted."""
-        refusal = initial_pose_refusal(pose, self.replica, at_rest=self._driving.wheels.at_rest)
+        refusal = initial_pose_refusal(pose, self.replica, at_rest=self._stands)
         if refusal is None and pose is not None:
             self._rest.wake()
             self._localizer.initial_pose(pose.x, pose.y, pose.theta)
@@ -373,7 +383,7 @@ class AgentCore:
         if given.floor not in self._config.floors:
             known = ", ".join(self._config.floors)
             return Reason(RefusalCode.NO_FLOOR, f"this robot does not know {given.floor} (known: {known})")
-        if not self._driving.wheels.at_rest:
+        if not self._stands:
             return Reason(RefusalCode.DRIVING, "the robot is driving: it must stand where it leaves the floor")
         if self._safety.state.mode == "FAULT":
             return Reason(
@@ -403,7 +413,7 @@ class AgentCore:
     def switch_profile(self, name: ProfileName) -> Reason | None:
         """Navigate by another profile; return why not, None when it is done."""
         self._rest.wake()
-        return self._navigation.switch(name, at_rest=self._driving.wheels.at_rest)
+        return self._navigation.switch(name, at_rest=self._stands)
 
     # --- publications ---
 

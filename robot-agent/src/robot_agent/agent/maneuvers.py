@@ -271,6 +271,8 @@ class Maneuvers:
         self, state: SafetyState, feedback: BaseFeedback | None, driving: PathDriving, now: float
     ) -> bool:
         """Return whether the robot has come to the front of its dock; a low battery may send it there."""
+        if state.maneuver is not None and state.maneuver.kind == "dock":
+            self.docking.heed_goal(driving.mission)
         if feedback is not None:
             self.docking.order_if_low(feedback.status, state, driving.mission, now)
         return self.docking.is_due(state, driving.mission, now, at_rest=driving.wheels.at_rest)
@@ -287,6 +289,8 @@ class Maneuvers:
         # far ahead: a way back from there would be too short by that. So maneuvers begin at a measured pose.
         odom, measured = self._localizer.odom_at(now), self._localizer.latest_odom()
         if kind != self._kind:
+            if self._kind == "dock":
+                self.docking.on_ended(state, now)
             self._kind = kind
             self._turning.begin(measured)
             for straight in self._straight.values():
@@ -344,7 +348,7 @@ class Maneuvers:
                 return self._straight[kind].wheels
 
     def _dock_problem(self, replica: Replica, now: float, *, running: bool) -> Reason | None:
-        problem = self.docking.problem(replica, now, running=running)
+        problem = (self.docking.ended if running else None) or self.docking.problem(replica, now, running=running)
         pose = self._localizer.pose(now)
         if problem is not None or not running or pose is None:
             return problem

@@ -38,7 +38,7 @@ class CommandTarget(Protocol):
         """Let the robot go to its dock; return why it does not, None if it does."""
 
     def cancel_goal(self) -> str | None:
-        """Cancel the goal; return its id, None without one."""
+        """Cancel the goal, and the way into the dock; return what was cancelled, None if nothing was."""
 
     def set_initial_pose(self, pose: Pose | None) -> Reason | None:
         """Start localization at a pose in `map`; return why the pose is refused, None when it is accepted."""
@@ -77,10 +77,10 @@ class OperatorCommands:
                 return self._switch(PROFILE_OF[command.kind])
 
     def _cancel(self) -> CommandReply:
-        goal = self._robot.cancel_goal()
-        if goal is None:
+        cancelled = self._robot.cancel_goal()
+        if cancelled is None:
             return CommandReply.refused(Reason(RefusalCode.NO_GOAL, "there is no goal to cancel"))
-        return CommandReply(accepted=True, reason=f"the goal {goal} is cancelled on the robot")
+        return CommandReply(accepted=True, reason=f"{cancelled} is cancelled on the robot")
 
     def _send_to_dock(self, now: float) -> CommandReply:
         refusal = self._robot.order_dock(now)

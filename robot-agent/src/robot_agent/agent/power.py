@@ -3,7 +3,8 @@
 To the dock: from an operator's command, or a low battery, to the pose in front of it. The planner gives the goal in
 front of the dock to a robot that wants it, and the robot drives there like to any other. There it looks whether
 anything is in between, and asks its safety gate to let the base look for the dock. Whatever disables it meanwhile ends
-its wish: it never goes to its dock because of an older command.
+its wish: it never goes to its dock because of an older command. But a low battery sends it there again, when what has
+kept it from its dock may be over.
 
 At rest the lidar's motor stands still. A robot is idle while it stands, follows no mission and searches no pose. An
 operator's command, a new goal or a maneuver wakes it; it is awake again after some whole scans, so that the head's
@@ -20,6 +21,7 @@ import numpy as np
 from fog_contracts.costs import LETHAL
 from fog_contracts.messages import Reason, ReasonCode, RefusalCode
 from robot_agent.localization.pose import AbsoluteObservation, Pose2, wrap
+from robot_agent.safety.maneuver import RULES
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -35,6 +37,11 @@ if TYPE_CHECKING:
 
 GOAL_WITHIN_S: Final = 10.0
 """A planner that gives no goal in front of the dock for this long gives none."""
+AGAIN_S: Final = 120.0
+"""So long after it has failed a low battery sends the robot to its dock again: people pass, and a link returns."""
+_ENDED: Final = f"{RULES['dock'].name} ended: "
+_CANCELLED: Final = "its goal was cancelled"
+_OTHER_GOAL: Final = "the robot has got another goal"
 _SETTLED_S: Final = 1.0
 _SAME_M: Final = 0.01
 _STAGED_M: Final = 0.2
@@ -64,7 +71,10 @@ class Docking:
         self._goal_before: str | None = None
         self._given = self._arrived = False
         """Whether the planner has given the goal in front of the dock, and the robot has reached it."""
-        self._tried = False
+        self.ended: Reason | None = None
+        """Why the base must not look for it any more, while it does."""
+        self._again_at = -math.inf
+        """When a low battery may send the robot there; if people ended a wish, only once it was disabled or docked."""
         self._observed = False
         self.given_up = ""
         """Why the robot does not go to its dock any more, until it is told to again."""
@@ -87,23 +97,32 @@ class Docking:
             return Reason(ReasonCode.NOT_ENABLED, "the robot drives to its dock: enable it first")
         self._ordered_at, self._goal_before, self.given_up = now, mission.goal_id, ""
         self._given = self._arrived = False
+        self.ended = None
         if self._is_ours(mission):
             mission.resume()  # the planner does not send the robot where it sends it already
         return None
 
-    def give_up(self, reason: str = "") -> None:
-        """End the wish; `reason` is told until the next one."""
+    def give_up(self, reason: str = "", again_at: float = math.inf) -> None:
+        """End the wish; `reason` is told until the next one, which a low battery may have from `again_at` on."""
         if self._ordered_at is not None:
-            self._ordered_at, self.given_up = None, reason
+            self._ordered_at, self.given_up, self._again_at = None, reason, again_at
+
+    def cancel(self, *, running: bool) -> bool:
+        """End the wish, or what the base does by itself if it is `running`; return whether there was either."""
+        if running:
+            self.ended = Reason(ReasonCode.DOCKING_GIVEN_UP, _CANCELLED)
+        wished = running or self.ordered
+        self.give_up(_CANCELLED)
+        return wished
 
     def order_if_low(self, status: BaseStatus, state: SafetyState, mission: Mission, now: float) -> None:
         """Send an enabled robot without a mission to its dock once its battery is low, if its settings say so."""
         if not state.enabled or status.docked:
-            self._tried = False
-        if status.battery is None or status.charging or mission.active or state.latched:
+            self._again_at = -math.inf
+        if status.battery is None or status.charging or mission.active or state.latched or state.maneuver is not None:
             return
-        if status.battery < self._config.dock_below and not self._tried and self._ordered_at is None:
-            self._tried = self.order(state, mission, docked=False, now=now) is None
+        if status.battery < self._config.dock_below and now >= self._again_at and self._ordered_at is None:
+            self.order(state, mission, docked=False, now=now)
 
     def wants_goal(self, mission: Mission) -> bool:
         """Return whether the planner shall lead the robot to the front of its dock."""
@@ -118,19 +137,30 @@ class Docking:
         elif self._is_ours(mission):
             self._given, self._arrived = True, mission.reached
             if not mission.reached and not mission.active:
-                self.give_up("its goal was cancelled")
+                self.give_up(_CANCELLED)
         elif mission.active and mission.goal_id != self._goal_before:
-            self.give_up("the robot has got another goal")
+            self.give_up(_OTHER_GOAL, now)
         elif self._given and not self._arrived:
-            self.give_up("its goal was cancelled")
+            self.give_up(_CANCELLED)
         elif not self._arrived and now - self._ordered_at > GOAL_WITHIN_S:
-            self.give_up("the planner gives it no goal in front of its dock")
+            self.give_up("the planner gives it no goal in front of its dock", now + AGAIN_S)
         # The planner ends the goal as soon as it hears that it is reached: the robot need not stand by then.
         return self.ordered and self._arrived and at_rest
 
-    def on_begun(self, refusal: str | None) -> None:
+    def on_begun(self, refusal: str | None, now: float) -> None:
         """Record whether the safety gate lets the base look for its dock."""
-        self._ordered_at, self.given_up = None, refusal or ""
+        self.give_up(refusal or "", now + AGAIN_S)
+
+    def on_ended(self, state: SafetyState, now: float) -> None:
+        """Record that the base looks for its dock no more, in the state after it."""
+        if state.enabled and state.maneuver_end:
+            self.given_up = state.maneuver_end.removeprefix(_ENDED)
+            self._again_at = math.inf if self.ended == _CANCELLED else now + AGAIN_S
+
+    def heed_goal(self, mission: Mission) -> None:
+        """Let another goal end what the base does by itself; the one in front of the dock was reached before."""
+        if mission.active:
+            self.ended = Reason(ReasonCode.DOCKING_GIVEN_UP, _OTHER_GOAL)
 
     def problem(self, replica: Replica, now: float, *, running: bool) -> Reason | None:
         """Return why the base must not drive into its dock from where it is; None when it may.

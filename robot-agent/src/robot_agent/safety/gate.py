@@ -65,7 +65,7 @@ class SafetyState(msgspec.Struct, frozen=True):
     """Reasons of the last escalation, reported during the 2 s before the mode is relaxed."""
     maneuver: Maneuver | None = None
     maneuver_end: str = ""
-    """Why the last maneuver ended, until the robot is enabled; empty without one."""
+    """Why the last maneuver ended, until the robot is enabled; empty without one, and after one that was done."""
 
     @property
     def awaits_operator(self) -> bool:
@@ -281,8 +281,14 @@ def _maneuver(
         state = replace(state, latched=faults, last_reasons=tuple(fault.reason for fault in faults))
     ended = _interrupted(state)
     if result.done and state.enabled:
-        return replace(ended, mode="HOLD", last_reasons=(rules.doing,))
-    return replace(ended, enabled=False, maneuver_end=f"{rules.name} ended: {result.reason}")
+        return replace(ended, mode="HOLD", last_reasons=(rules.doing,), maneuver_end="")
+    # What holds a robot for a second must not leave one with an empty battery in front of its dock: it holds, and what
+    # needs an operator on any drive does so from the next step on.
+    enabled = state.enabled and rules.if_ended and not faults
+    sentence = f"{rules.name} ended: {result.reason}"
+    if enabled:
+        ended = replace(ended, mode="HOLD", last_reasons=(sentence,))
+    return replace(ended, enabled=enabled, maneuver_end=sentence)
 
 
 def _advance(

@@ -40,7 +40,7 @@ class Rules(NamedTuple):
     mode: the mode meanwhile. name, doing: what it is called, and what the robot does. relevant: the inputs that count.
     refusal: why it can't begin, besides what would end it. end: why it is over, and whether it is done. longest: s that
     it may take. cap: m/s. needs_enable: only an enabled robot begins it. stays_enabled: a robot that was enabled before
-    may drive on when it is done.
+    may drive on when it is done; if_ended: or when anything but a fault has ended it.
     """
 
     mode: Mode
@@ -53,6 +53,7 @@ class Rules(NamedTuple):
     cap: Callable[[SafetyConfig], float]
     needs_enable: bool = False
     stays_enabled: bool = False
+    if_ended: bool = False
 
 
 def _relevant_to_egress(inputs: SafetyInputs) -> SafetyInputs:
@@ -218,6 +219,7 @@ RULES: Final[Mapping[ManeuverKind, Rules]] = {
         lambda _: 0.0,
         needs_enable=True,
         stays_enabled=True,
+        if_ended=True,
     ),
     "undock": Rules(
         "DOCK",

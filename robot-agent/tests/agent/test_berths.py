@@ -1,8 +1,10 @@
 """A robot joins the floor that its own record names, leaves it once it is handed over, and goes on as it was."""
 
+import errno
 import json
 from dataclasses import replace
 from pathlib import Path
+from unittest.mock import Mock
 
 import pytest
 from little_world import AGENT, L_PATH, LittleWorld
@@ -87,6 +89,9 @@ def test_only_the_planned_start_goes_on_enabled_and_only_once(tmp_path: Path, mo
     assert known(tmp_path).take_enabled()
     assert not known(tmp_path).take_enabled()
     known(tmp_path).store(after, enabled=True)
+    with monkeypatch.context() as full:
+        full.setattr(berths, "atomic_write", Mock(side_effect=OSError(errno.ENOSPC, "No space left on device")))
+        assert not known(tmp_path).take_enabled(), "nothing would keep the next start from it"
     monkeypatch.setattr(berths, "boot_id", lambda: "another start of the computer")
     assert not known(tmp_path).take_enabled()
 

@@ -10,6 +10,7 @@ import msgspec
 from msgspec import structs
 
 from fog_contracts.messages import Berth, Id
+from fog_runtime import logs
 from fog_runtime.clock import boot_id
 from fog_runtime.configuration.settings import SettingsError
 from fog_runtime.files import atomic_write
@@ -18,6 +19,8 @@ if TYPE_CHECKING:
     from pathlib import Path
 
     from fog_runtime.configuration.settings import CommonSettings
+
+_log = logs.get("agent")
 
 POSE_FILE: Final = "pose.json"
 _FILE: Final = "floor.json"
@@ -94,12 +97,17 @@ class Berths:
         """Return whether this start is the one by which an enabled robot has changed its floor; once. Blocks.
 
         Not after another start of its computer, nor later than a planned one takes: then a person has to look first.
-        Raises `OSError`.
+        Nor if it can't be recorded that this was the one: on a full disk the robot waits for an operator.
         """
         record, self._record = self._record, _Record(self.berth)
         if not record.boot:
             return False
-        self._write(self._record)
+        try:
+            self._write(self._record)
+        except OSError as error:
+            remedy = "make room on its disk; the robot waits to be enabled"
+            _log.error("floor_not_stored", floor=self.berth.floor, reason=str(error), remedy=remedy)
+            return False
         return record.boot == boot_id() and 0.0 <= time.monotonic() - record.at <= RESTART_S
 
     def _write(self, record: _Record) -> None:

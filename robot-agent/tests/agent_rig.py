@@ -20,6 +20,7 @@ import numpy as np
 import programs
 from guardian_rig import DEADLINE_S, Base, Process, Watchdog
 from little_world import KEY, L_PATH, L_ROOMS, grid_of
+from msgspec.structs import replace
 
 from fog_contracts import channels as ch
 from fog_contracts.commands import sign
@@ -125,8 +126,14 @@ class Fog:
         self.states: list[RobotState] = []
         self.poses: Slot[RobotPose] = edge.latest(ch.ROBOT_POSE, RobotPose, robot=ROBOT)
         self.obstacles: Slot[RobotObstacles] = edge.latest(ch.ROBOT_OBSTACLES, RobotObstacles, robot=ROBOT)
-        edge.subscribe(ch.ROBOT_STATE, RobotState, lambda _, state: self.states.append(state), robot=ROBOT)
+        edge.subscribe(ch.ROBOT_STATE, RobotState, self._on_state, robot=ROBOT)
         edge.serve(ch.MAP_SNAPSHOT, self._snapshot)
+
+    def _on_state(self, _ids, state) -> None:
+        """End a goal that the robot has reached, as the planner does."""
+        self.states.append(state)
+        if self.goal is not None and state.goal_reached and state.goal_id == self.goal.goal_id:
+            self.goal = replace(self.goal, pose=None)
 
     def _snapshot(self, _ids, _request):
         self.snapshots += 1
@@ -149,6 +156,8 @@ class Fog:
     def plan(self) -> None:
         version = self.master.version
         self.edge.publish(ch.ROBOT_GOAL, self.goal, robot=ROBOT)
+        if self.goal.pose is None:
+            return
         path = RobotPath(
             plan_id=1,
             planner_epoch=3,

@@ -67,9 +67,10 @@ def test_robot_drives_along_the_corridors_and_reports_the_goal_as_reached(world)
     assert world.worst_error[0] < 0.10
     assert world.worst_error[1] < 0.06
     assert world.travelled < 19.5
+    assert world.state().goal_id == "g1"
     world.run(1.0)
     assert world.wheels == (0.0, 0.0)
-    assert world.state().goal_id == "g1"
+    assert world.state().goal_id is None, "the planner has ended it"
     speeds = np.array(world.commands)[:, 1:]
     assert np.abs(speeds).max() <= 0.5
     assert np.abs(speeds.mean(axis=1)).max() <= 0.3 + 1e-9

@@ -128,7 +128,7 @@ def drive(cell: Cell) -> Outcome:
         before = world.travelled
         if cell.carpet is not None and world.x > cell.carpet[0]:
             world.wheel_error = cell.carpet[1]
-        world.run(0.5)
+        world.run(0.5, lambda w: w.state().goal_reached)
         moved = world.travelled - before
         stands = 0 if moved > 0.01 else stands + 1
         if moved > 0.01:
@@ -217,7 +217,7 @@ def test_robot_in_a_wide_hall_or_on_a_coarse_map_is_not_slowed_down_while_its_po
     world.drive_to([(4.0, 4.0), (20.0, 4.0), (20.0, 14.0), (4.0, 14.0)])
     modes = []
     while not world.state().goal_reached and world.travelled < 60.0:
-        world.run(0.5)
+        world.run(0.5, lambda w: w.state().goal_reached)
         modes.append(world.state().mode)
         assert world.error()[0] < 0.1
     assert world.state().goal_reached

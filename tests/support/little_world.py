@@ -12,6 +12,7 @@ import math
 from dataclasses import dataclass, field, replace
 
 import numpy as np
+from msgspec import structs
 
 from fog_contracts import channels as ch
 from fog_contracts.commands import sign
@@ -286,8 +287,12 @@ class LittleWorld:
             self.agent.accept(decide(job))
 
     def _publish_as_planner(self):
-        """Publish goal and release, and the path while the robot does not name it."""
+        """Publish goal and release, and the path while the robot does not name it; end a goal that it has reached."""
+        if self.state().goal_reached:
+            self.goal, self.path = structs.replace(self.goal, pose=None), None
         self.send(ch.ROBOT_GOAL, self.goal)
+        if self.path is None:
+            return
         if (self.state().planner_epoch, self.state().plan_id) != (self.path.planner_epoch, self.path.plan_id):
             self.send(ch.ROBOT_PATH, self.path)
         self.send(ch.ROBOT_RELEASE, release_of(self.path))

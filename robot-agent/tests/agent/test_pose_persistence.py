@@ -163,6 +163,12 @@ def test_only_a_pose_that_differs_is_stored(persistence, localizer, change, stor
     assert (persistence.to_store("lab", 2.0) is not None) == stored
 
 
+def test_pose_is_stored_again_when_another_guardian_watches_the_robot(persistence):
+    for guardian, stored in (("one", True), ("one", False), ("two", True)):
+        persistence.on_base(feedback(6, 2.0, guardian=guardian))
+        assert (persistence.to_store("lab", 0.0) is not None) == stored
+
+
 @pytest.mark.parametrize("moving", [(0.3, 0.0), (0.0, 0.5)])
 @pytest.mark.parametrize(
     ("change", "stored"),

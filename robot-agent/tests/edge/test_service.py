@@ -222,6 +222,31 @@ async def test_storage_that_hangs_does_not_make_the_service_manager_restart_the_
         await asyncio.gather(*tasks, return_exceptions=True)
 
 
+async def test_pose_of_a_robot_that_drives_is_stored_within_a_tick_and_one_at_a_time(rig, monkeypatch):
+    begun, released, stored = threading.Event(), threading.Event(), []
+
+    def store(pose):
+        stored.append(pose)
+        begun.set()
+        released.wait(DEADLINE_S)
+
+    monkeypatch.setattr(rig.service._store, "put_pose", store)
+    monkeypatch.setattr(rig.core, "pose_to_store", lambda now: now)
+    monkeypatch.setattr(rig.core, "tick", lambda _at: ())
+    rig.service._tick(0.0)
+    assert not rig.service._storing
+    monkeypatch.setattr(AgentCore, "idle", False)
+    rig.service._tick(0.0)
+    await rig.until(begun.is_set)
+    rig.service._tick(0.0)
+    await rig.service._store_pose(0.0)
+    assert len(stored) == 1
+    released.set()
+    await rig.until(lambda: not rig.service._storing)
+    rig.service._tick(0.0)
+    await rig.until(lambda: len(stored) == 2)
+
+
 async def test_deltas_of_an_older_map_service_do_not_affect_the_new_map(mapping):
     await mapping.until(lambda: mapping.fog.requests == 1)
     mapping.deliver(mapping.change())

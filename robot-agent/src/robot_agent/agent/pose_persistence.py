@@ -94,18 +94,20 @@ class PosePersistence:
     def to_store(self, site: str, now: float) -> SavedPose | None:
         """Return the pose if it is trusted and differs from the one returned last, which counts as stored.
 
-        Storage of a small computer wears out, so a pose that hardly differs is not written.
+        Storage of a small computer wears out, so a pose that hardly differs is not written, unless another guardian
+        watches the robot now.
         """
         pose = self._localizer.save(site, now) if site else None
+        if pose is None:
+            return None
+        if (feedback := self._feedback) is not None:
+            base = feedback.seq, feedback.odometry.left_m, feedback.odometry.right_m
+            pose = msgspec.structs.replace(pose, base=base, guardian=feedback.guardian)
         moves = self._localizer.twist() != (0.0, 0.0)
-        if pose is None or (self._stored is not None and not _differs(pose, self._stored, moves=moves)):
+        if self._stored is not None and not _differs(pose, self._stored, moves=moves):
             return None
         self._stored = pose
-        if (feedback := self._feedback) is None:
-            return pose
-        wheels = feedback.odometry
-        base = feedback.seq, wheels.left_m, wheels.right_m
-        return msgspec.structs.replace(pose, base=base, guardian=feedback.guardian)
+        return pose
 
 
 def start_pose(site: str, robot: RobotSite) -> SavedPose:
@@ -140,4 +142,5 @@ def _differs(new: SavedPose, old: SavedPose, *, moves: bool) -> bool:
         or abs(math.remainder(new.theta - old.theta, math.tau)) > (_TURNED_DRIVING_RAD if moves else _TURNED_RAD)
         or abs(new.sigma_xy - old.sigma_xy) > _SIGMA_CHANGED
         or abs(new.sigma_theta - old.sigma_theta) > _SIGMA_CHANGED
+        or new.guardian != old.guardian
     )

@@ -41,7 +41,7 @@ from robot_agent.hardware import DockingDriver
 from robot_agent.motion.local_planner import decide
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Sequence
+    from collections.abc import Callable, Coroutine, Sequence
     from concurrent.futures import Future
 
     from fog_contracts.handlers import Ids, Later, Moment, QueryHandler
@@ -56,6 +56,7 @@ if TYPE_CHECKING:
     from robot_agent.agent.settings import Given, Settings
     from robot_agent.guardian.link import BaseFeedback
     from robot_agent.hardware import LaserScan
+    from robot_agent.localization.pose import SavedPose
     from robot_agent.motion.local_planner import Decision
 
 STREAM_S: Final = 0.05
@@ -98,6 +99,7 @@ class Service:
         self._edges = Edges(clock, zenoh=zenoh)
         self._tasks: set[asyncio.Task[None]] = set()
         self._store = store
+        self._storing = False
         self._clock = clock
         self._health = health
         self._robot = core.robot
@@ -134,7 +136,10 @@ class Service:
     # --- Housekeeping -----------------------------------------------------------------------------------------------
 
     async def housekeeping_loop(self, lidar: LidarEdge, guardian: GuardianClient) -> None:
-        """Once a second: store the pose if it changed, and report the health; more often until the robot is ready."""
+        """Once a second: store the pose if it changed, and report the health; more often until the robot is ready.
+
+        While the robot drives, its pose is stored by `publish_loop`.
+        """
         due = -math.inf
         self._manager.ready()
         ticker = self._ticker(STREAM_S)
@@ -152,12 +157,17 @@ class Service:
             ticker.period = HOUSEKEEPING_S if self._health.ready else STREAM_S
 
     async def _store_pose(self, now: float) -> None:
-        pose = self._core.pose_to_store(now)
-        if pose is not None:
-            try:
-                await asyncio.to_thread(self._store.put_pose, pose)
-            except OSError as error:
-                _log.error("pose_not_stored", reason=str(error))
+        if not self._storing and (pose := self._core.pose_to_store(now)) is not None:
+            await self._put_pose(pose)
+
+    async def _put_pose(self, pose: SavedPose) -> None:
+        self._storing = True
+        try:
+            await asyncio.to_thread(self._store.put_pose, pose)
+        except OSError as error:
+            _log.error("pose_not_stored", reason=str(error))
+        finally:
+            self._storing = False
 
     async def _change_floor(self) -> None:
         """Once the robot was handed over: store where, and end, to be started again on that floor."""
@@ -355,19 +365,23 @@ class Service:
     # --- Publications -----------------------------------------------------------------------------------------------
 
     async def publish_loop(self) -> None:
-        """Tick the core at 10 Hz, publish what it returns, and observe traces."""
+        """Tick the core at 10 Hz, publish what it returns, store a driving robot's pose, and observe traces."""
         await self._ticker(PUBLISH_S).call(self._tick)
 
     def _tick(self, _now: float) -> None:
         at = self._edges.now()
         self._publish(self._core.tick(at))
         if (request := self._core.egress_request(at.now)) is not None:
-            self._ask_for_way_out(request)
+            self._begin(self._fetch_way_out(request), "egress")
+        if not (self._core.idle or self._storing) and (pose := self._core.pose_to_store(at.now)) is not None:
+            # Within a second a robot turns round: one whose computer dies then would begin with the wrong heading.
+            self._storing = True
+            self._begin(self._put_pose(pose), "pose")
         for trace in self._core.finished_traces():
             metrics.observe_trace(trace, ["deliver", "command", "total"])
 
-    def _ask_for_way_out(self, request: EgressRequest) -> None:
-        task = asyncio.get_running_loop().create_task(self._fetch_way_out(request), name="egress")
+    def _begin(self, work: Coroutine[None, None, None], name: str) -> None:
+        task = asyncio.get_running_loop().create_task(work, name=name)
         self._tasks.add(task)
         task.add_done_callback(self._tasks.discard)
 

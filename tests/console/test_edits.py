@@ -206,6 +206,9 @@ async def test_operator_lets_a_mission_begin_by_the_clock_by_keyboard_and_a_view
     await page.get_by_role("combobox", name="Place 1").select_option("b")
     await page.get_by_role("button", name="One more place").press("Enter")
     await page.get_by_role("combobox", name="Place 2").select_option("a")
+    await page.get_by_label("When every way to a place is closed").select_option("end the mission")
+    await page.get_by_label("Ends at the latest after").fill("30")
+    await page.get_by_label("Priority").select_option("3")
     for day in ("Mon", "Tue"):
         await page.get_by_label(day).uncheck()
     exists = {"type": "urn:fognav:schedule_changed", "detail": "read it again"}
@@ -218,7 +221,12 @@ async def test_operator_lets_a_mission_begin_by_the_clock_by_keyboard_and_a_view
     times = [{"days": ["wed", "thu", "fri"], "begin": "08:00", "end": "09:00"}]
     assert next(body for name, body in stream.requests if name == "PUT schedules/letters") == {
         "robot": "r2",
-        "mission": {"stops": [{"place": "b"}, {"place": "a"}]},
+        "mission": {
+            "stops": [{"place": "b"}, {"place": "a"}],
+            "when_cut": {"do": "cancel"},
+            "deadline_s": 1800,
+            "priority": 3,
+        },
         "weekly": {"time_zone": "Europe/Lisbon", "times": times},
         "enabled": True,
     }

@@ -8,6 +8,7 @@ import type { Live } from "../live/live";
 import { go, useRoute } from "../router";
 import { sentence } from "../stop";
 import { decimal, zonedTime } from "../text";
+import { Typed } from "../typed";
 import { newSchedule, ScheduleFields, scheduleText } from "../zones/schedule";
 import { refusal } from "../zones/zone-form";
 import "../zones/zones.css";
@@ -16,6 +17,9 @@ import "../zones/zones.css";
 const NEW = "+new";
 /** How often the list is read again: that a mission waits for its robot is no record. */
 const AGAIN_MS = 5_000;
+
+/** What to do when every way to a stop is cut. */
+const CUTS = ["wait", "cancel", "nearest"] as const;
 
 type Stop = ScheduleBody["mission"]["stops"][number];
 
@@ -140,7 +144,7 @@ function ScheduleForm({ base: known, onDone }: Props): preact.JSX.Element {
   const [timed, setTimed] = useState(true);
   const [saving, setSaving] = useState(false);
   const [problem, setProblem] = useState("");
-  const { stops } = body.mission;
+  const { stops, when_cut, deadline_s, priority } = body.mission;
   const set = (change: Partial<ScheduleBody>): void => setBody((before) => ({ ...before, ...change }));
   const setMission = (change: Partial<ScheduleBody["mission"]>): void => set({ mission: { ...body.mission, ...change } });
   const places = [...live.of.place].map(([name, { label }]) => [name, label || name] as const).sort(([, a], [, b]) => a.localeCompare(b));
@@ -195,6 +199,25 @@ function ScheduleForm({ base: known, onDone }: Props): preact.JSX.Element {
           <button type="button" disabled={stops.length >= 20} onClick={() => setMission({ stops: [...stops, { place: places[0]?.[0] ?? "" }] })}>{t("schedules.another")}</button>
           <label><input type="checkbox" checked={body.mission.order === "best"} onChange={(event) =>
             setMission({ order: event.currentTarget.checked ? "best" : "given" })} /> {t("schedules.best")}</label>
+        </div>
+        <div class="fields">
+          <label>{t("schedules.whenCut")}
+            <select value={when_cut?.do ?? "wait"} onChange={({ currentTarget }) => setMission({ when_cut: { ...when_cut, do: CUTS[currentTarget.selectedIndex] ?? "wait" } })}>
+              {CUTS.map((each) => <option key={each} value={each}>{t(`schedules.cut.${each}`)}</option>)}
+            </select>
+          </label>
+          <label>{t("schedules.deadline")}
+            <Typed value={deadline_s == null ? "" : String(deadline_s / 60)} onTyped={({ value, valueAsNumber }) => {
+              if (value === "" || valueAsNumber > 0) setMission({ deadline_s: value === "" ? null : 60 * valueAsNumber });
+            }}>
+              {(typed) => <input type="number" inputMode="decimal" min="0" step="any" {...typed} />}
+            </Typed>
+          </label>
+          <label>{t("schedules.priority")}
+            <select value={priority ?? 0} onChange={({ currentTarget }) => setMission({ priority: currentTarget.selectedIndex })}>
+              {Array.from({ length: 10 }, (_, each) => <option key={each} value={each}>{each}</option>)}
+            </select>
+          </label>
         </div>
       </fieldset>
       <h3>{t("field.schedule")}</h3>

@@ -9,6 +9,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from prometheus_client import REGISTRY
+from redis.asyncio import Redis
 
 from fog_contracts import channels as ch
 from fog_contracts.codec import encode
@@ -24,10 +25,11 @@ from fog_contracts.messages import (
     Reason,
 )
 from fog_runtime.stores.redis_connection import StoreError
+from fog_runtime.stores.redis_store import Audit
 from fog_supervisor.servers import start_redis
 from hazard_aggregator.alert_persistence import AlertPersistence, NodeMetrics
 from hazard_aggregator.alerts import LISTED, AlertError, Alerts, NodeReport
-from hazard_aggregator.store import Store
+from hazard_aggregator.store import Store, Stored
 
 SQUARE = [(0.0, 0.0), (2.0, 0.0), (2.0, 1.0), (0.0, 1.0)]
 POLICY = AlertPolicy(unknown_after_s=10.0, blocked_after_s=20.0, node_after_s=5.0)
@@ -248,6 +250,12 @@ async def test_acknowledgements_are_stored_and_in_the_audit_trail_once_before_th
             await alerts.acknowledge(names[0], "bob")
             assert sorted(str(alert.acknowledged_by) for alert in await store.alerts()) == ["ann", "bob"]
             assert len((await store.audit(kinds=["alert"])).entries) == len(trail) + 1
+
+            async with Redis.from_url(redis.url) as raw:
+                await raw.flushall()
+            await store.restore(Stored([], [], [], {}, {}), Audit(1.0, "eve", "restore"))
+            await alerts._write()
+            assert len(await store.alerts()) == 2, "acknowledgements outlast a loss that an administrator mends"
 
 
 def test_node_is_unknown_silent_or_flapping(metrics):

@@ -88,6 +88,7 @@ class AlertPersistence:
         self._events: deque[AlertEvent] = deque(maxlen=_QUEUE)
         self._storing = asyncio.Lock()
         self._saved = True
+        self._recoveries = 0
         self._loaded = False
         self._epoch = -1
 
@@ -184,6 +185,7 @@ class AlertPersistence:
                 await self._store.record_alert(event)
                 if self._events and self._events[0] is event:
                     self._events.popleft()
-            if not self._saved:
+            recoveries = self._store.recoveries
+            if not self._saved or recoveries != self._recoveries:
                 await self._store.save_alerts(self._alerts.active())
-                self._saved = True
+                self._saved, self._recoveries = True, recoveries

@@ -168,6 +168,8 @@ class RedisStore:
         self._floors: dict[str, int] = {}
         self._checks = 0
         self.epoch = UNFENCED
+        self.recoveries = 0
+        """How often an administrator has decided here about a loss, after which Redis may lack what was written."""
 
     async def __aenter__(self) -> Self:
         """Return the store; it connects with the first command."""
@@ -292,6 +294,7 @@ class RedisStore:
         identity = (("GET", self._key("generation")), ("HGETALL", self._key("writes")))
         *_, generation, writes = await self._redis.write(*commands, ("XADD", *trail, *fields), *identity)
         self._identity.adopt(_text(generation), _pairs(writes))
+        self.recoveries += 1
         _log.warning("store_recovered", action=audit.action, who=audit.who, generation=self._identity.generation)
 
     async def _swap(

@@ -223,7 +223,7 @@ async def test_operator_lets_a_mission_begin_by_the_clock_by_keyboard_and_a_view
         "robot": "r2",
         "mission": {
             "stops": [{"place": "b"}, {"place": "a"}],
-            "when_cut": {"do": "cancel"},
+            "when_cut": {"do": "cancel", "limit_s": None},
             "deadline_s": 1800,
             "priority": 3,
         },

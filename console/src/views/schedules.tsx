@@ -202,7 +202,7 @@ function ScheduleForm({ base: known, onDone }: Props): preact.JSX.Element {
         </div>
         <div class="fields">
           <label>{t("schedules.whenCut")}
-            <select value={when_cut?.do ?? "wait"} onChange={({ currentTarget }) => setMission({ when_cut: { ...when_cut, do: CUTS[currentTarget.selectedIndex] ?? "wait" } })}>
+            <select value={when_cut?.do ?? "wait"} onChange={({ currentTarget }) => setMission({ when_cut: { limit_s: null, ...when_cut, do: CUTS[currentTarget.selectedIndex] ?? "wait" } })}>
               {CUTS.map((each) => <option key={each} value={each}>{t(`schedules.cut.${each}`)}</option>)}
             </select>
           </label>

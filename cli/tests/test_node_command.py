@@ -16,6 +16,7 @@ from types import SimpleNamespace
 
 import msgspec
 import paho.mqtt.client as paho
+import programs
 import pytest
 import yaml
 from hypothesis import given
@@ -53,10 +54,7 @@ NETWORK = ("--wifi", "Lab", "--wifi-password", "secret12", "--fog-host", "192.16
 
 
 def run(*command: str) -> subprocess.CompletedProcess[str]:
-    return subprocess.run(
-        [sys.executable, "-m", "fognav", "node", *command], cwd=ROOT, capture_output=True, text=True, check=False,
-        stdin=subprocess.DEVNULL,
-    )  # fmt: skip
+    return programs.run(["node", *command], os.environ, ROOT, 120.0)
 
 
 def add(floor: Path, pose: str = WALL_BELOW_Z4, **options: str) -> subprocess.CompletedProcess[str]:

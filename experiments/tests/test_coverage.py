@@ -1,10 +1,11 @@
 import json
 import math
+import os
 import subprocess
-import sys
 from pathlib import Path
 
 import numpy as np
+import programs
 import pytest
 from PIL import Image
 
@@ -111,9 +112,7 @@ def test_places_without_a_way_between_them_are_said(tmp_path: Path, estig) -> No
 
 
 def run(*command: str) -> subprocess.CompletedProcess[str]:
-    return subprocess.run(
-        [sys.executable, "-m", "fognav", *command], cwd=ROOT, capture_output=True, text=True, check=False
-    )
+    return programs.run(command, os.environ, ROOT, 120.0)
 
 
 def test_command_prints_json_and_draws_a_picture(tmp_path: Path) -> None:

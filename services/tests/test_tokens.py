@@ -3,10 +3,10 @@
 import asyncio
 import json
 import os
-import subprocess
-import sys
+from pathlib import Path
 
 import httpx
+import programs
 import pytest
 
 pytestmark = pytest.mark.live
@@ -35,8 +35,9 @@ def urls(all_services) -> dict[str, str]:
 def token_command(fog, *arguments: str) -> str:
     """Run `fognav token` as on the computer of the services; return what it printed."""
     environment = {**os.environ, "FOGNAV_TOKENS_FILE": fog.environment["FOGNAV_TOKENS_FILE"]}
-    command = [sys.executable, "-m", "fognav", "token", *arguments]
-    return subprocess.run(command, env=environment, capture_output=True, text=True, check=True).stdout
+    done = programs.run(["token", *arguments], environment, Path.cwd(), 120.0)
+    assert done.returncode == 0, done.stderr
+    return done.stdout
 
 
 def listed(fog) -> list[tuple[str, str]]:

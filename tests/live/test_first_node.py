@@ -96,17 +96,17 @@ class Lab:
         return next((view for view in body if view["hazard"]["area"] == area), None) if isinstance(body, list) else None
 
     def words(self, command: str) -> list[str]:
-        """The command with the page's folders in the test's, run by this interpreter."""
+        """The command with the page's folders in the test's."""
         inside = {name: str(self.folder / name) for name in ("floor", "board", "coverage.png")}
         inside["~/.local/share/fognav/locks"] = str(self.security)
-        words = [inside.get(word, word) for word in shlex.split(command)]
-        return [sys.executable, "-m", "fognav", *words[1:]] if words[0] == "./fognav" else words
+        return [inside.get(word, word) for word in shlex.split(command)]
 
     def run(self, command: str) -> str:
-        done = subprocess.run(
-            self.words(command), cwd=ROOT, env=self.environment, capture_output=True, text=True,
-            timeout=COMMAND_S, check=False,
-        )  # fmt: skip
+        program, *arguments = self.words(command)
+        if program != "./fognav":
+            subprocess.run([program, *arguments], cwd=ROOT, check=True)
+            return ""
+        done = programs.run(arguments, self.environment, ROOT, COMMAND_S)
         assert done.returncode == 0, f"{command}\n{done.stdout}{done.stderr}"
         return done.stdout + done.stderr
 
@@ -114,8 +114,9 @@ class Lab:
         self.end_node()
         with (self.folder / "node.log").open("wb") as log:
             self.node = subprocess.Popen(
-                child.command(*self.words(command)), cwd=ROOT, env=self.environment, stdout=log, stderr=log
-            )
+                child.command(sys.executable, "-m", "fognav", *self.words(command)[1:]), cwd=ROOT,
+                env=self.environment, stdout=log, stderr=log,
+            )  # fmt: skip
         self.wait(lambda: self.listed("nodes")["n8"]["age_s"] is not None, "the node is heard")
 
     def listed(self, what: str) -> dict[str, Any]:

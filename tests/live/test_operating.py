@@ -9,6 +9,7 @@ import sys
 import time
 from pathlib import Path
 
+import programs
 import pytest
 
 from fog_supervisor import child
@@ -43,16 +44,13 @@ class Terminal:
         self.output: dict[str, str] = {}
 
     def arguments(self, command: str) -> list[str]:
-        """The command as the launcher runs it, in the environment of the tests."""
+        """What the command gives to `fognav`."""
         words = shlex.split(command)
         assert words[0] in ("./fognav", str(ROOT / "fognav"))
-        return [sys.executable, "-m", "fognav", *words[1:]]
+        return words[1:]
 
     def run(self, command: str) -> subprocess.CompletedProcess[str]:
-        done = subprocess.run(
-            self.arguments(command), cwd=ROOT, env=self.environment, capture_output=True, text=True,
-            timeout=COMMAND_S, check=False,
-        )  # fmt: skip
+        done = programs.run(self.arguments(command), self.environment, ROOT, COMMAND_S)
         self.output[command] = done.stdout + done.stderr
         return done
 
@@ -91,8 +89,8 @@ def test_walk_through_a_running_demo_works_as_the_readme_says(tmp_path):
     printed = tmp_path / "demo.txt"
     with printed.open("wb") as output:
         demo = subprocess.Popen(
-            child.command(*terminal.arguments(start), *speed()), cwd=ROOT, env=terminal.environment,
-            stdin=subprocess.DEVNULL, stdout=output, stderr=output, process_group=0,
+            child.command(sys.executable, "-m", "fognav", *terminal.arguments(start), *speed()),
+            cwd=ROOT, env=terminal.environment, stdin=subprocess.DEVNULL, stdout=output, stderr=output, process_group=0,
         )  # fmt: skip
     try:
         zone = wait_for(r"^draw a zone: (.+)$", printed, demo)

@@ -205,6 +205,7 @@ def shown(machine: Machine, words: str) -> str:
     return said
 
 
+@pytest.mark.long
 def test_two_machines_become_two_floors_one_of_which_shows_and_stops_both_as_the_page_says(machine, tmp_path):
     (tmp_path / "second").mkdir()
     second = Machine(tmp_path / "second")

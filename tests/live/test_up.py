@@ -16,6 +16,7 @@ from pathlib import Path
 from typing import Any
 
 import httpx
+import programs
 import psutil
 import pytest
 from attacks import ATTACKS, few_files, running
@@ -68,10 +69,7 @@ class Node:
         self.wait(lambda: "is up:" in self.printed.read_text(), "it is up")
 
     def run(self, *arguments: str) -> str:
-        done = subprocess.run(
-            [sys.executable, "-m", "fognav", *arguments],
-            cwd=ROOT, env=self.environment, capture_output=True, text=True, timeout=START_S, check=False,
-        )  # fmt: skip
+        done = programs.run(arguments, self.environment, ROOT, START_S)
         assert done.returncode == 0, f"{arguments}: {done.stdout}{done.stderr}\n{self.printed.read_text()}"
         return done.stdout + done.stderr
 
@@ -192,8 +190,58 @@ def test_simulated_robot_and_nodes_are_connected_again_after_the_authority_was_r
         node.wait(all_there, f"robot and nodes are back {options}")
 
 
-def test_zone_survives_a_killed_service_and_a_restart_of_the_node(node, tmp_path):
-    node.up()
+async def told_home_assistant(node: Node, word: str) -> None:
+    """Wait until the bridge tells Home Assistant, by its own user, that it knows the floor, or that it does not."""
+    own = Credentials.read(node.data / "locks" / "credentials" / "home-assistant.toml")
+    broker = Broker.of(f"mqtts://127.0.0.1:{node.environment['FOGNAV_MQTT_PORT']}", own)
+    async with asyncio.timeout(START_S), broker.client("home-assistant", None) as client:
+        await client.subscribe(ch.BRIDGE_AVAILABILITY.key(site="estig"))
+        async for message in client.messages:
+            if message.payload == word.encode():
+                return
+
+
+async def looked_on(node: Node) -> str:
+    """Look on at the floor through the console, as Foxglove does; return what is shown."""
+    own = Credentials.read(node.data / "locks" / "credentials" / "console.toml")
+    token = (node.data / "keys" / "estig" / "admin.token").read_text().strip()
+    address = f"wss://127.0.0.1:{node.environment['FOGNAV_CONSOLE_PORT']}/api/v1/foxglove"
+    headers = {"Authorization": f"Bearer {token}"}
+    async with (
+        asyncio.timeout(START_S),
+        connect(address, ssl=own.tls_context(), additional_headers=headers, subprotocols=["foxglove.sdk.v1"]) as viewer,
+    ):
+        return str(json.loads(await viewer.recv())["name"])
+
+
+@pytest.fixture(scope="module")
+def bridged(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Node]:
+    """A node with a bridge, which is up."""
+    folder = tmp_path_factory.mktemp("bridged")
+    settings = folder / "bridge.toml"
+    settings.write_text('adapters = "home-assistant, foxglove"\n')
+    made = Node(folder, "--bridge", str(settings))
+    try:
+        made.up()
+        yield made
+    finally:
+        made.end()
+
+
+def test_bridge_is_kept_running_and_the_console_leads_to_it(bridged):
+    node = bridged
+    asyncio.run(told_home_assistant(node, ch.ONLINE))
+    bridge = node.systems()["estig"]["pids"]["bridge"]
+    os.kill(bridge, signal.SIGKILL)
+    node.wait(lambda: node.systems()["estig"]["pids"].get("bridge", bridge) != bridge, "it is started again")
+    asyncio.run(told_home_assistant(node, ch.ONLINE))
+    assert asyncio.run(looked_on(node)) == "Fognav estig"
+    assert node.run("logs", "bridge", "-n", "1000").count("settings_loaded") == 2
+    assert "bridge: operator" in node.run("token", "list")
+
+
+def test_zone_survives_a_killed_service_and_a_restart_of_the_node(bridged, tmp_path):
+    node = bridged
     (system,) = node.systems().values()
     assert set(system["connected"]) >= {"map-service/estig", "planner/estig", "hazard-aggregator/estig"}
     node.run("zone", "add", "--circle", "90,20,1", "--reason", "wet floor")
@@ -226,49 +274,6 @@ def test_zone_survives_a_killed_service_and_a_restart_of_the_node(node, tmp_path
     assert "wet floor" in zones
     assert "after the backup" not in zones
     node.down()
-
-
-async def told_home_assistant(node: Node, word: str) -> None:
-    """Wait until the bridge tells Home Assistant, by its own user, that it knows the floor, or that it does not."""
-    own = Credentials.read(node.data / "locks" / "credentials" / "home-assistant.toml")
-    broker = Broker.of(f"mqtts://127.0.0.1:{node.environment['FOGNAV_MQTT_PORT']}", own)
-    async with asyncio.timeout(START_S), broker.client("home-assistant", None) as client:
-        await client.subscribe(ch.BRIDGE_AVAILABILITY.key(site="estig"))
-        async for message in client.messages:
-            if message.payload == word.encode():
-                return
-
-
-async def looked_on(node: Node) -> str:
-    """Look on at the floor through the console, as Foxglove does; return what is shown."""
-    own = Credentials.read(node.data / "locks" / "credentials" / "console.toml")
-    token = (node.data / "keys" / "estig" / "admin.token").read_text().strip()
-    address = f"wss://127.0.0.1:{node.environment['FOGNAV_CONSOLE_PORT']}/api/v1/foxglove"
-    headers = {"Authorization": f"Bearer {token}"}
-    async with (
-        asyncio.timeout(START_S),
-        connect(address, ssl=own.tls_context(), additional_headers=headers, subprotocols=["foxglove.sdk.v1"]) as viewer,
-    ):
-        return str(json.loads(await viewer.recv())["name"])
-
-
-def test_bridge_is_kept_running_and_the_console_leads_to_it(tmp_path):
-    settings = tmp_path / "bridge.toml"
-    settings.write_text('adapters = "home-assistant, foxglove"\n')
-    node = Node(tmp_path, "--bridge", str(settings))
-    try:
-        node.up()
-        asyncio.run(told_home_assistant(node, ch.ONLINE))
-        bridge = node.systems()["estig"]["pids"]["bridge"]
-        os.kill(bridge, signal.SIGKILL)
-        node.wait(lambda: node.systems()["estig"]["pids"].get("bridge", bridge) != bridge, "it is started again")
-        asyncio.run(told_home_assistant(node, ch.ONLINE))
-        assert asyncio.run(looked_on(node)) == "Fognav estig"
-        assert node.run("logs", "bridge", "-n", "1000").count("settings_loaded") == 2
-        assert "bridge: operator" in node.run("token", "list")
-        node.down()
-    finally:
-        node.end()
 
 
 def walled(source: Path, target: Path, left: float, bottom: float, right: float, top: float) -> Path:

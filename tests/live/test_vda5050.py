@@ -99,9 +99,18 @@ async def check_zones(floor: Node, client: aiomqtt.Client) -> None:
     await zones({("area-z2", "BLOCKED"), ("zone-wet", "SPEED_LIMIT")})
 
 
-async def test_order_drives_the_robot_until_an_operator_ends_it_and_robots_of_others_hear_of_what_is_blocked(tmp_path):
+def site_with_a_dock(folder: Path) -> Path:
+    site = shutil.copytree(Path(__file__).parents[2] / "sites" / "estig", folder)
+    text, start = (site / "site.toml").read_text(), "start = { x = 5.0, y = 25.4, theta = 1.5707963 }"
+    assert start in text
+    (site / "site.toml").write_text(text.replace(start, f"{start}\ndock = {{ x = 5.0, y = 28.4, theta = 1.5707963 }}"))
+    return site
+
+
+async def test_fleet_drives_the_robot_onto_its_dock_and_off_it_until_an_operator_takes_over(tmp_path):
+    """And robots of others hear of what is blocked."""
     async with (
-        fleet(tmp_path, "3.0") as (floor, url, own),
+        fleet(tmp_path, "3.0", "--site", str(site_with_a_dock(tmp_path / "estig"))) as (floor, url, own),
         Broker.of(url, own).client("fleet", None) as client,
     ):
         await client.subscribe("vda5050/v3/fognav/r1/state")
@@ -110,7 +119,7 @@ async def test_order_drives_the_robot_until_an_operator_ends_it_and_robots_of_ot
         async def state(wanted, what: str) -> dict[str, Any]:
             last: Any = None
             with suppress(TimeoutError):
-                async with asyncio.timeout(60.0):
+                async with asyncio.timeout(90.0):
                     async for message in states:
                         last = json.loads(message.payload)
                         passed.setdefault(last["lastNodeId"], last["driving"])
@@ -118,7 +127,12 @@ async def test_order_drives_the_robot_until_an_operator_ends_it_and_robots_of_ot
                             return last
             raise AssertionError(f"{what}: {last}\n{floor.run('logs', 'bridge')}")
 
-        async def send(message: dict[str, Any]) -> None:
+        def is_done(told: dict[str, Any]) -> bool:
+            return bool(told["actionStates"]) and told["actionStates"][0]["actionStatus"] in ("FINISHED", "FAILED")
+
+        async def send(message: dict[str, Any], on_node: int | None = None, kind: str = "") -> None:
+            if on_node is not None:
+                message["nodes"][on_node]["actions"] = [{"actionType": kind, "actionId": kind, "blockingType": "HARD"}]
             await client.publish("vda5050/v3/fognav/r1/order", json.dumps(message))
 
         passed: dict[str, bool] = {}
@@ -130,17 +144,23 @@ async def test_order_drives_the_robot_until_an_operator_ends_it_and_robots_of_ot
         await send(wall)
         refused = await state(lambda s: s["errors"], "a node in a wall")
         assert [each["errorType"] for each in refused["errors"]] == ["NO_ROUTE_TO_TARGET"]
-        await send(order(at["x"], at["y"], 1.5, 3.0, name="o1", version="3.0"))
+
+        await send(order(at["x"], at["y"], 0.6, 1.2, name="o1", version="3.0"), 2, "startCharging")
         under_way = await state(lambda s: s["driving"] and "plannedPath" in s, "it drives by a path")
         assert (under_way["orderId"], under_way["errors"]) == ("o1", [])
         if os.environ.get("FOGNAV_VDA5050_SCHEMAS"):
             schema("3.0", "state").validate(under_way)
-        there = await state(lambda s: s["lastNodeId"] == "o1-2" and not s["driving"], "it arrives")
-        assert (there["nodeStates"], there["edgeStates"]) == ([], [])
+        docked = await state(lambda s: s["orderId"] == "o1" and is_done(s), "it is on its dock")
+        assert (docked["actionStates"][0]["actionStatus"], docked["operatingMode"]) == ("FINISHED", "AUTOMATIC"), docked
+        assert (docked["nodeStates"], docked["edgeStates"]) == ([], [])
         assert passed["o1-1"], "it has not stopped at the node in between"
-        at = there["mobileRobotPosition"]
-        assert abs(at["y"] - under_way["nodeStates"][-1]["nodePosition"]["y"]) < 0.3
-        await send(order(at["x"], at["y"], -3.0, name="o2", version="3.0"))
+        assert docked["mobileRobotPosition"]["y"] > 28.0
+
+        off = order(at["x"], at["y"] + 1.2, -1.2, name="o2", version="3.0")
+        off["nodes"][0]["nodeId"] = off["edges"][0]["startNodeId"] = "o1-2"
+        await send(off, 0, "stopCharging")
+        left = await state(lambda s: s["orderId"] == "o2" and is_done(s), "it has left its dock")
+        assert left["actionStates"][0]["actionStatus"] == "FINISHED", left
         await state(lambda s: s["orderId"] == "o2" and s["driving"], "it drives back")
         await asyncio.to_thread(floor.run, "robot", "take-out", "--reason", "repair")
         out = await state(lambda s: s["operatingMode"] == "SERVICE", "an operator takes it out of service")
@@ -148,47 +168,6 @@ async def test_order_drives_the_robot_until_an_operator_ends_it_and_robots_of_ot
         await state(lambda s: not s["driving"], "it stands")
 
         await check_zones(floor, client)
-
-
-async def test_fleet_has_the_robot_charge_on_its_dock_and_drives_it_off_again(tmp_path):
-    site = shutil.copytree(Path(__file__).parents[2] / "sites" / "estig", tmp_path / "estig")
-    text, start = (site / "site.toml").read_text(), "start = { x = 5.0, y = 25.4, theta = 1.5707963 }"
-    assert start in text
-    (site / "site.toml").write_text(text.replace(start, f"{start}\ndock = {{ x = 5.0, y = 28.4, theta = 1.5707963 }}"))
-    async with (
-        fleet(tmp_path, "3.0", "--site", str(site)) as (floor, url, own),
-        Broker.of(url, own).client("fleet", None) as client,
-    ):
-        await client.subscribe("vda5050/v3/fognav/r1/state")
-
-        async def state(wanted, what: str) -> dict[str, Any]:
-            last: Any = None
-            with suppress(TimeoutError):
-                async with asyncio.timeout(90.0):
-                    async for message in client.messages:
-                        last = json.loads(message.payload)
-                        if wanted(last):
-                            return last
-            raise AssertionError(f"{what}: {last}\n{floor.run('logs', 'bridge')}")
-
-        def is_done(told: dict[str, Any]) -> bool:
-            return bool(told["actionStates"]) and told["actionStates"][0]["actionStatus"] in ("FINISHED", "FAILED")
-
-        async def send(message: dict[str, Any], on_node: int, kind: str) -> None:
-            message["nodes"][on_node]["actions"] = [{"actionType": kind, "actionId": kind, "blockingType": "HARD"}]
-            await client.publish("vda5050/v3/fognav/r1/order", json.dumps(message))
-
-        at = (await state(lambda s: s["operatingMode"] == "AUTOMATIC", "in control"))["mobileRobotPosition"]
-        await send(order(at["x"], at["y"], 1.0, name="o1", version="3.0"), 1, "startCharging")
-        docked = await state(lambda s: s["orderId"] == "o1" and is_done(s), "it is on its dock")
-        assert (docked["actionStates"][0]["actionStatus"], docked["operatingMode"]) == ("FINISHED", "AUTOMATIC"), docked
-        assert docked["mobileRobotPosition"]["y"] > 28.0
-        off = order(at["x"], at["y"] + 1.0, -0.5, name="o2", version="3.0")
-        off["nodes"][0]["nodeId"] = off["edges"][0]["startNodeId"] = "o1-1"
-        await send(off, 0, "stopCharging")
-        left = await state(lambda s: s["orderId"] == "o2" and is_done(s), "it has left its dock")
-        assert left["actionStates"][0]["actionStatus"] == "FINISHED", left
-        await state(lambda s: s["lastNodeId"] == "o2-1" and not s["driving"], "it arrives")
 
 
 @pytest.mark.skipif(

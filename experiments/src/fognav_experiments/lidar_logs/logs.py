@@ -2,7 +2,7 @@
 
 Formats: JSON lines (one object with `odom`, `ref` and `ranges` per scan after one with `meta`, gzipped or not), CARMEN
 (`FLASER` messages; see the CARMEN toolkit's message formats), rosbag2 (`bags`), and logs of Fognav's own
-robots (`robot_logs`). `mapping` makes maps of them.
+robots. `mapping` makes maps of them.
 """
 
 from __future__ import annotations

@@ -146,6 +146,7 @@ def test_ended_mission_starts_again_only_with_another_goal(mission, end):
     assert not mission.reached
 
 
-def test_withdrawn_goal_ends_the_mission(mission):
-    mission.on_goal(changed(GOAL, pose=None), 3.0)
+def test_withdrawn_goal_ends_the_mission_and_its_path(mission):
+    assert mission.on_goal(changed(GOAL, pose=None), 3.0), "the path is followed no more"
+    assert (mission.path_id, mission.follower) == (None, None)
     assert (mission.active, mission.goal_id, mission.cancel()) == (False, None, None)

@@ -71,13 +71,15 @@ class Mission:
         return now - max(self._path_at, self._goal_at)
 
     def on_goal(self, goal: RobotGoal, now: float) -> bool:
-        """Set the goal; return whether it is a new one, to which the current path does not lead."""
+        """Set the goal; return whether the current path is not followed any more: the goal is another one, or over."""
         current = self.goal
         if current is not None and current.goal_id == goal.goal_id and current.pose == goal.pose:
             return False
         self.goal, self._goal_at = goal, now
         if current is not None and current.goal_id == goal.goal_id:
-            return False
+            if goal.pose is None:
+                self.drop_path()
+            return goal.pose is None
         self._reached = self._cancelled = None
         self.drop_path()
         return True

@@ -655,6 +655,21 @@ def test_robot_that_stands_in_a_cone_is_not_shut_in_because_the_network_held_its
     assert (rig.hazard.state, rig.hazard.penalty) == ("unknown", 200)
 
 
+@pytest.mark.parametrize(("others", "penalty"), [((), 200), ((0.4,), 254)])
+def test_robot_that_nobody_heard_for_long_is_not_shut_in_by_its_own_echoes_alone(others, penalty):
+    rig = Rig(site("n1"))
+    rig.read(3.0, 3.0, times=5)
+    read_beside_robot(rig, pose(1.0, 0.5), (0.83, 3.0), times=5)
+    rig.read(0.83, 3.0, times=200)  # the network is away, and the robot stands
+    for other in others:
+        rig.read(other, 3.0)  # somebody passed meanwhile
+    rig.read(0.83, 3.0, times=200)
+    assert (rig.hazard.state, rig.hazard.penalty) == ("blocked", 254)
+    read_beside_robot(rig, pose(1.0, 0.5), (0.83, 3.0), times=30)
+    rig.wait(0.1)
+    assert rig.hazard.penalty == penalty
+
+
 def test_robot_that_says_late_again_and_again_that_it_stood_there_unblocks_an_area_a_few_times_only():
     rig = Rig(site("n1"))
     rig.read(3.0, 3.0, times=5)

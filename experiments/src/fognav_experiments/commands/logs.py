@@ -137,9 +137,8 @@ def bench_mapping(
 ) -> None:
     """Make a map of a recorded floor: the time, the memory, and how far it is off the log's reference.
 
-    The log is looked for in the folder that FOGNAV_DATA names, or else in shared/data beside the checkout. `seconds`
-    run on the clock, from the log in memory to the map; `cpu_seconds` are those of all cores; `rss_mb` is the most
-    that the process had.
+    The log is looked for in the folder that FOGNAV_DATA names. `seconds` run on the clock, from the log in memory to
+    the map; `cpu_seconds` are those of all cores; `rss_mb` is the most that the process had.
     """
     from fognav_experiments import machine  # noqa: PLC0415  # keeps the other commands fast
     from fognav_experiments.lidar_logs import mapping  # noqa: PLC0415  # same

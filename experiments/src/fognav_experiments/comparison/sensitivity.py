@@ -374,7 +374,7 @@ def _commits(drives: Sequence[SweptDrive]) -> list[list[str]]:
 def _plane(drives: Sequence[SweptDrive], plane: Plane) -> list[Block]:
     gains = {point: found for point in plane.points() if (found := gain(drives, point)) is not None}
     caption = f"Metres and seconds that the fog saves, by {UNITS[plane.x.quantity]} and {UNITS[plane.y.quantity]}."
-    what = "what false alarms cost: " if plane.false_alarms else ""
+    what = "False alarms: " if plane.false_alarms else ""
     rows = [
         [f"{getattr(point, plane.x.quantity):g}", f"{getattr(point, plane.y.quantity):g}", str(found.metres.n),
          str(found.metres), str(found.seconds), *_slowed(drives, point)]
@@ -382,7 +382,7 @@ def _plane(drives: Sequence[SweptDrive], plane: Plane) -> list[Block]:
     ]  # fmt: skip
     columns = ["routes", "metres saved", "seconds saved", "of the time in DEGRADED, %", "in HOLD, %"]
     return [
-        Heading(f"{what}{plane.x.quantity} and {plane.y.quantity}".capitalize()),
+        Heading(f"{what}{plane.x.quantity} and {plane.y.quantity}"),
         Picture(
             f"{plane.name}.svg",
             heat_map(

@@ -14,7 +14,7 @@ from fog_contracts.messages import NodeCode, Reason
 from hazard_aggregator.alerts import node_reports
 from hazard_aggregator.areas import THESIS_NODE, Members, WatchedArea
 from hazard_aggregator.debounce import DEFAULT_RULE
-from hazard_aggregator.node_state import TAKEN_BACK_MAX, SourceState
+from hazard_aggregator.node_state import SourceState
 from hazard_aggregator.readings import Classification, ReadingOrder, RobotPoses, Taken, classify_reading
 from hazard_aggregator.sources import Sources
 
@@ -295,7 +295,7 @@ class AreaFusion:
     def _take_back(self, area: WatchedArea) -> None:
         """Take back what blocked an area if poses that came late show that it was a robot, all of it."""
         for node in area.nodes.values():
-            if node.site is None or node.taken_back >= TAKEN_BACK_MAX or not area.was_blocked_by(node.id):
+            if node.site is None or not node.may_be_taken_back or not area.was_blocked_by(node.id):
                 continue
             robot = None
             for taken_at, reading in node.unexplained:  # the oldest first: for a box, it is the only one

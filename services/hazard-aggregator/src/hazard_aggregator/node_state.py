@@ -55,6 +55,9 @@ _EXPLAINED_PAUSE_S: Final = 3.0
 TAKEN_BACK_MAX: Final = 3
 """So often poses that come late take back what a node saw, until it sees a clear area: they may be invented."""
 _UNEXPLAINED_MAX: Final = 300
+_REPEATED_S: Final = 1.0
+_ALIKE_M: Final = 0.02
+"""A reading that differs by so little from the last one of these is kept once in this time: 300 last for minutes."""
 _PERIODS: Final = 3
 """A source is silent after so many of its periods."""
 
@@ -126,6 +129,11 @@ class NodeState:
         self.unexplained = []
         self.rule.reset()
 
+    @property
+    def may_be_taken_back(self) -> bool:
+        """Whether all that it saw since its last clear area is known, and poses took that back a few times only."""
+        return 0 < len(self.unexplained) < _UNEXPLAINED_MAX and self.taken_back < TAKEN_BACK_MAX
+
     def take_back(self, robot: str) -> None:
         """Set the state to unknown: what blocked it was this robot, whose poses came late."""
         self.taken_back += 1
@@ -181,7 +189,7 @@ class NodeState:
             return
         if not counts or (classification.state == "clear" and self._explained_too_long(taken_at)):
             return
-        if classification.state == "blocked" and reading is not None and len(self.unexplained) < _UNEXPLAINED_MAX:
+        if classification.state == "blocked" and reading is not None and not self._is_known(taken_at, reading):
             self.unexplained.append((taken_at, reading))
         if classification.state != self.run_state and not (classification.state == "unknown" and self.run_state):
             self.run_state = classification.state
@@ -202,6 +210,15 @@ class NodeState:
         if confirmed != self.state or self.unconfirmed:
             # Later readings of the same state leave the reason: the hazard would change with every centimetre.
             self.state, self.reason, self.unconfirmed = confirmed, classification.reason, False
+
+    def _is_known(self, taken_at: float, reading: NodeReading) -> bool:
+        """Whether a reading adds nothing to those that no robot explained: it repeats the last, or they are full."""
+        if not 0 < len(self.unexplained) < _UNEXPLAINED_MAX:
+            return bool(self.unexplained)
+        since, last = self.unexplained[-1]
+        pairs = zip(reading.range_m, last.range_m, strict=False)
+        alike = all(abs((a or 0.0) - (b or 0.0)) <= _ALIKE_M for a, b in pairs) and reading.status == last.status
+        return alike and taken_at - since < _REPEATED_S
 
     def _apply_explained(self, robot: str, taken_at: float) -> None:
         """Apply a reading whose echoes are a robot's.

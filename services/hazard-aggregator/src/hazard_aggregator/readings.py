@@ -26,6 +26,8 @@ USABLE_S: Final = 3.0
 """A pose says where its robot is for so long; one that does not hear the fog for so long stands (its safety gate)."""
 HISTORY_S: Final = 10.0
 """So long poses are remembered: they may explain echoes that were there before them."""
+UNHEARD_S: Final = 600.0
+"""So long the last pose of a robot is remembered that is not heard any more."""
 SPEED_M_S: Final = 0.3
 MAX_SPEED_M_S: Final = 0.5
 """A robot may have begun to drive at the first speed since its pose; none drives faster than the second."""
@@ -99,17 +101,20 @@ class RobotPoses:
             if before is None or (settled and after is None):
                 continue
             if min(abs(entry[0] - taken_at) for entry in (before, after) if entry is not None) > USABLE_S:
-                continue
-            known = _ahead(robot, before, taken_at) if after is None else _between(robot, before, after, taken_at)
+                if not settled or after is None:
+                    continue
+                known = Whereabouts(robot, after[1], 0.0)  # without the fog it stood where it is heard again
+            else:
+                known = _ahead(robot, before, taken_at) if after is None else _between(robot, before, after, taken_at)
             if known.pose.localized:
                 yield known
 
     def forget_old(self, now: float) -> None:
-        """Discard poses that explain nothing any more."""
+        """Discard poses that explain nothing any more; the last one before a silence does."""
         for track in self._tracks.values():
-            while track.poses and now - track.poses[0][0] > HISTORY_S:
+            while len(track.poses) > 1 and now - track.poses[1][0] > HISTORY_S:
                 track.poses.popleft()
-        self._tracks = {robot: track for robot, track in self._tracks.items() if track.poses}
+        self._tracks = {robot: track for robot, track in self._tracks.items() if now - track.poses[-1][0] <= UNHEARD_S}
 
 
 def _between(

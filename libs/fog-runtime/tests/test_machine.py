@@ -98,6 +98,10 @@ def test_suspension_is_the_growth_of_boot_time_over_monotonic_time():
     clocks["boot"] += 60.05
     assert monitor.suspended() == pytest.approx(60.0)
     assert monitor.suspended() == 0.0
+    clocks["monotonic"] += 0.5  # held up since it has read the other clock
+    assert monitor.suspended() == 0.0
+    clocks["boot"] += 0.5
+    assert monitor.suspended() == 0.0
 
 
 def test_running_computer_is_not_suspended():

@@ -60,7 +60,8 @@ class SuspensionMonitor:
     def suspended(self) -> float:
         """Return for how long (s) the computer was suspended since the last call; 0 if it was not."""
         offset = self._boot_time() - self._monotonic()
-        seconds, self._offset = offset - self._offset, offset
+        # It only grows, and seems to shrink where this process was held up between the two readings.
+        seconds, self._offset = offset - self._offset, max(offset, self._offset)
         return seconds if seconds >= _NOTICED_S else 0.0
 
 

@@ -172,6 +172,8 @@ class BusEdge:
 class MemoryStore:
     """A store without delay that is empty at the start."""
 
+    recoveries = 0
+
     def __init__(self) -> None:
         self.writes: list[tuple[Any, ...]] = []
 

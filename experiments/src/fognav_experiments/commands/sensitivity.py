@@ -70,14 +70,17 @@ def sensitivity_command(  # noqa: PLR0913  # each option is an argument
             (("stays_s", "--stays", stays), ("known_blocks", "--known", known)),
         ]
         for (x, option, values), (y, other, others) in asked:
-            command += f" {option} {values}"
             if values != _NOT_SWEPT:
-                command += f" {other} {others}"
+                command += f" {option} {values} {other} {others}"
                 swept.append(Plane(Axis(x, _values(values)), Axis(y, _values(others))))
+            elif x in ("readings", "areas"):  # which are swept by default
+                command += f" {option} {values}"
         if stays != _NOT_SWEPT:
             swept.append(swept[-1]._replace(false_alarms=True))
         if not swept:
-            raise WrongUseError("nothing is left to sweep: give one of --readings, --areas, --delays, --stays numbers")
+            raise WrongUseError(
+                "this leaves nothing to sweep: give one of --readings, --areas, --delays, --stays numbers"
+            )
         command += f" --routes {routes} --seed {seed} --out DIR"
         try:
             place = checkout.site_folder(site)

@@ -296,7 +296,7 @@ def film_command(  # noqa: PLR0913  # each option is an argument
     """
     from fog_runtime.configuration.site import SiteError, load_site  # noqa: PLC0415  # keeps the other commands fast
     from fognav_experiments.comparison import runner  # noqa: PLC0415  # same
-    from fognav_experiments.comparison.film import Film, NoStillError, UnfilmedDriveError, write_stills  # noqa: PLC0415  # same  # noqa: PLC0415  # same
+    from fognav_experiments.comparison.film import Film, NoStillError, UnfilmedDriveError, write_stills  # noqa: PLC0415  # same
     from fognav_experiments.comparison.records import FolderError  # noqa: PLC0415  # same
 
     with exit_codes():

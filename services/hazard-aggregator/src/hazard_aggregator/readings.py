@@ -280,12 +280,12 @@ def expected_range(site: NodeSite, sonar: Sonar, pose: RobotPose, away: float = 
 
     The footprint is a circle; it is in the cone when any part of it may be within half the beam's width of the axis,
     given the uncertainty of its pose across the beam: along a bare corridor that can be decimetres; and given how far
-    `away` (m) from it the robot may be. A robot that is lower than the node's mounting height is not seen.
+    `away` (m) from it the robot may be. A robot that is lower than the cone, which opens downwards, too, is not seen.
     """
-    if site.height >= pose.height:
-        return None
     dx, dy = pose.x - site.x, pose.y - site.y
     distance = math.hypot(dx, dy)
+    if site.height - (distance + away) * math.tan(SONAR_HALF_CONE) >= pose.height:
+        return None
     if distance <= pose.radius:
         return 0.0
     off_axis = abs(math.remainder(math.atan2(dy, dx) - site.theta - sonar.angle, math.tau))

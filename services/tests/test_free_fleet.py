@@ -248,17 +248,33 @@ async def test_goal_after_one_that_an_operator_has_ended_is_accepted_and_replace
 
 
 @pytest.mark.parametrize(
-    ("who", "condition"), [("fleet/free-fleet", {"If-Match": '"g9"'}), ("anna", {"If-None-Match": "*"})]
+    ("who", "known", "condition"),
+    [("fleet/free-fleet", EXECUTING, {"If-Match": '"g9"'}), ("anna", UNKNOWN, {"If-None-Match": "*"})],
 )
-async def test_mission_of_an_earlier_run_of_the_bridge_gives_way_to_the_next_goal_and_an_operators_does_not(
-    rig, who, condition
+async def test_mission_of_an_earlier_run_of_the_bridge_goes_on_until_the_next_goal_and_an_operators_is_nobodys_goal(
+    rig, who, known, condition
 ):
     rig.end(None, "put", after="g9", who=who)
     rig.plan("g9")
     rig.state("g9")
-    assert await rig.result() == UNKNOWN, "for which free_fleet plans anew"
-    await rig.ask("send_goal", goal(2.0))
+    assert await rig.result() == known
+    assert await rig.result(OTHER) == UNKNOWN
+    await rig.ask("send_goal", goal(2.0, goal_id=OTHER))
     assert condition.items() <= rig.floor.asked[-1].headers.items()
+
+
+async def test_charge_that_nobody_measures_is_not_told(rig):
+    heard: list[float] = []
+    told = rig.other.declare_subscriber(
+        "r_1/battery_state", lambda sample: heard.append(struct.unpack_from("<f", sample.payload.to_bytes(), 44)[0])
+    )
+    async with asyncio.timeout(60.0):
+        while len(heard) < 2:
+            for battery in (None, 0.5):
+                rig.fleet.on_state("r-1", msgspec.structs.replace(STATE, battery=battery))
+            await asyncio.sleep(0.02)  # until the subscription is known
+    told.undeclare()
+    assert heard[:2] == [0.5, 0.5]
 
 
 async def test_robot_that_tells_nothing_for_5_s_takes_no_goal_until_it_is_heard_again(rig):

@@ -233,7 +233,8 @@ class Fleet:
                 for name, answer in served.items()
             ]
         self._followed(robot)
-        self._put(robot, "battery_state", ros.battery(state, self._clock.stamp()), "sensor_msgs/msg/BatteryState")
+        if state.battery is not None:  # the adapter hands on any number, and NaN; it takes 1.0 without one
+            self._put(robot, "battery_state", ros.battery(state, self._clock.stamp()), "sensor_msgs/msg/BatteryState")
 
     def tell_feedback(self) -> None:
         """Tell how far robots have to go."""
@@ -256,7 +257,7 @@ class Fleet:
     def _followed(self, robot: str) -> Mission | None:
         """Return a robot's mission with its present status; None if this bridge has begun none.
 
-        One of an earlier run has no goal's id: free_fleet plans anew for its own, and the new goal replaces it.
+        One of an earlier run has no goal's id until somebody asks for its result.
         """
         mission = self._missions.get(robot)
         if mission is None and (left := self._planned.left(robot)):
@@ -368,6 +369,8 @@ class Fleet:
         """Tell a goal's state at once: whoever asked would wait for nothing else meanwhile, and asks again."""
         asked = bytes(decoded_as("fognav_msgs/msg/GetResult", data).goal_id)
         mission = self._followed(robot)
+        if mission is not None and mission.goal == _NO_GOAL and (robot, asked) not in self._earlier:
+            mission.goal = asked  # free_fleet asks for the goal that it gave last: before the bridge's start, this one
         is_latest = mission is not None and mission.goal == asked
         status = mission.status if mission is not None and is_latest else self._earlier.get((robot, asked), UNKNOWN)
         result = ros.message("fognav_msgs/msg/GoalResult", status=status)

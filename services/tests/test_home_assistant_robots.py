@@ -18,6 +18,7 @@ import httpx
 import msgspec
 import numpy as np
 import pytest
+from manual_clock import ManualClock
 from PIL import Image
 
 from console_service.core import ConsoleCore
@@ -25,7 +26,7 @@ from fog_bridges.floor import WAITS, Request
 from fog_bridges.heard import SILENT
 from fog_bridges.home_assistant import HomeAssistant, activity, discovery, report
 from fog_bridges.picture import Picture
-from fog_bridges.service import HomeAssistantBridge
+from fog_bridges.service import STOPS_AT_ONCE, HomeAssistantBridge
 from fog_contracts import channels as ch
 from fog_contracts.grid import GridGeometry, Window
 from fog_contracts.handlers import Moment
@@ -341,7 +342,7 @@ class Slow:
     connected = True
 
     def __init__(self) -> None:
-        self.order, self.released = None, asyncio.Event()
+        self.order, self.released, self.hangs = None, asyncio.Event(), False
         self.sent: list[tuple[str, str]] = []
         self.told: list[tuple[str, str]] = []
 
@@ -359,19 +360,28 @@ class Slow:
 
     async def send(self, request: Request) -> str:
         self.sent.append((request.method, request.path.removeprefix("/api/v1/robots/")))
-        if request.path.endswith("commands"):
+        if self.hangs or request.path.endswith("commands"):
             await self.released.wait()
         return "it has no mission" if request.method == "DELETE" else ""
 
 
-async def test_stop_waits_for_no_other_order_ends_the_mission_and_no_earlier_order_sends_the_robot_again():
-    floor, core = Slow(), HomeAssistant("lab")
-    adapter = HomeAssistantBridge(core, floor, SystemClock())
+@pytest.fixture
+async def slow():
+    """A running adapter, its slow floor with the robots r1 and r2, and its clock."""
+    floor, clock = Slow(), ManualClock()
+    adapter = HomeAssistantBridge(HomeAssistant("lab"), floor, clock)
     for name, data in (("hello", {"fresh": True}), ("place", {"id": "b", "value": {}}), ("ready", {}),
                        *(("robot", {"id": robot, "value": view()}) for robot in ("r1", "r2"))):  # fmt: skip
         adapter.on_event(name, data)
     running = asyncio.create_task(adapter.run(floor, SystemClock()))
     await asyncio.sleep(0)
+    yield floor, clock
+    running.cancel()
+    await asyncio.gather(running, return_exceptions=True)
+
+
+async def test_stop_waits_for_no_other_order_ends_the_mission_and_no_earlier_order_sends_the_robot_again(slow):
+    floor, _ = slow
     for robot, text in (("r2", "return_to_base"), ("r1", "goal b"), ("r1", "stop")):
         floor.order({"robot": robot}, text)
     await asyncio.sleep(0.05)
@@ -383,8 +393,29 @@ async def test_stop_waits_for_no_other_order_ends_the_mission_and_no_earlier_ord
     assert floor.sent[3:] == [("PUT", "r1/goal")], "the one that was given after the stop"
     stopped = "'goal b' was not carried out: robot r1 was stopped meanwhile"
     assert floor.told[1:] == [("r2", ""), ("r1", stopped), ("r1", "")]
-    running.cancel()
-    await asyncio.gather(running, return_exceptions=True)
+
+
+async def test_order_that_has_waited_for_long_is_refused(slow):
+    floor, clock = slow
+    for robot in ("r2", "r1"):
+        floor.order({"robot": robot}, "return_to_base")
+    await asyncio.sleep(0.05)
+    clock.advance(11.0)
+    floor.released.set()
+    await asyncio.sleep(0.05)
+    assert floor.sent == [("POST", "r2/commands")]
+    assert floor.told == [("r2", ""), ("r1", "'return_to_base' has waited for 11 s: send it again")]
+
+
+async def test_flood_of_orders_fills_neither_the_memory_nor_the_broker(slow):
+    floor, _ = slow
+    floor.hangs = True
+    for number in range(1000):
+        for robot in ("r1", f"other-{number}"):
+            floor.order({"robot": robot}, "stop")
+    await asyncio.sleep(0.05)
+    assert floor.sent == [("POST", "r1/stop")] * STOPS_AT_ONCE
+    assert floor.told == [], "the broker would keep a topic for each name"
 
 
 EVERY = {"p", "name", "unique_id", "state_topic"}

@@ -97,10 +97,14 @@ class HomeAssistant:
         self._silent |= silent
         return list(self._news())
 
+    def knows(self, robot: str) -> bool:
+        """Whether the floor has told of a robot."""
+        return robot in self._robots
+
     def on_command(self, robot: str, text: str, now: float) -> Request | str:
         """Return the request of a command to a robot at `now` (s, monotonic), or why there is none, in words."""
         path = f"/api/v1/robots/{robot}"
-        if robot not in self._robots:
+        if not self.knows(robot):
             return f"there is no robot {robot}; there are: {', '.join(sorted(self._robots)) or 'none'}"
         if text == STOP:
             return Request("POST", f"{path}/stop")

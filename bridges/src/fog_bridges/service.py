@@ -28,6 +28,10 @@ TICK_S: Final = 1.0
 PICTURE_S: Final = 2.0
 """How often the map is drawn at most."""
 ORDERS_AT_ONCE: Final = 100
+STOPS_AT_ONCE: Final = 20
+"""Of one robot: a person presses no button more often while the floor is asked, and each has gone to the floor."""
+ORDER_MAX_AGE_S: Final = 10.0
+"""An order that has waited for longer is refused: who sent it may have forgotten it."""
 _log = logs.get("bridge")
 
 
@@ -41,9 +45,11 @@ class HomeAssistantBridge:
         self._mqtt = mqtt
         self._clock = clock
         self._picture = Picture()
-        self._orders: asyncio.Queue[tuple[str, str, int]] = asyncio.Queue(ORDERS_AT_ONCE)
-        """Robot, order, and how often the robot was stopped before it."""
+        self._orders: asyncio.Queue[tuple[str, str, int, float]] = asyncio.Queue(ORDERS_AT_ONCE)
+        """Robot, order, how often the robot was stopped before it, and when it came (s, monotonic)."""
         self._stops: Counts[str] = Counts()
+        self._stopping: Counts[str] = Counts()
+        """How many stops of a robot wait for the floor's answer."""
         self._tasks: asyncio.TaskGroup | None = None
         self._floor: Floor | None = None
         self._is_known = False
@@ -82,10 +88,13 @@ class HomeAssistantBridge:
     async def _order_loop(self, floor: Floor) -> None:
         """Carry out orders, one after the other; what a robot refuses is told where the order came from."""
         while True:
-            robot, text, stops = await self._orders.get()
-            request = self._core.on_command(robot, text, self._clock.now())
-            if stops != self._stops[robot]:
+            robot, text, stops, came = await self._orders.get()
+            now = self._clock.now()
+            request = self._core.on_command(robot, text, now)
+            if self._stops.get(robot, 0) != stops:
                 request = f"{text!r} was not carried out: robot {robot} was stopped meanwhile"
+            elif now - came > ORDER_MAX_AGE_S:
+                request = f"{text[:40]!r} has waited for {now - came:.0f} s: send it again"
             await self._tell(robot, text, request if isinstance(request, str) else await floor.send(request))
 
     async def _stop(self, floor: Floor, robot: str) -> None:
@@ -94,13 +103,15 @@ class HomeAssistantBridge:
         refusal = stop if isinstance(stop, str) else await floor.send(stop)
         if not isinstance(cancel, str):
             await floor.send(cancel)  # that there is no mission is no reason to complain
+        self._stopping[robot] -= 1
         await self._tell(robot, STOP, refusal)
 
     async def _tell(self, robot: str, order: str, refusal: str) -> None:
         ORDERS.labels(self.name, "refused" if refusal else "accepted").inc()
         fields = {"robot": robot, "order": order, "refusal": refusal}
         self._limited.info("order", f"{robot} {order} {refusal}", time.monotonic(), **fields)
-        await self._mqtt.publish(ch.ROBOT_REFUSAL, refusal[:250], robot=robot)
+        if self._core.knows(robot):  # the broker would keep what is told of any name
+            await self._mqtt.publish(ch.ROBOT_REFUSAL, refusal[:250], robot=robot)
 
     async def _picture_loop(self, clock: Clock) -> None:
         """Draw the map when it or a robot on it has changed."""
@@ -111,16 +122,23 @@ class HomeAssistantBridge:
 
     def _on_order(self, ids: Mapping[str, str], text: str) -> None:
         robot = ids["robot"]
-        if text == STOP and self._tasks is not None and self._floor is not None:
+        if text == STOP and self._core.knows(robot) and self._tasks is not None and self._floor is not None:
             # It waits for no other order: each may wait for a robot that does not answer.
             self._stops[robot] += 1
-            self._tasks.create_task(self._stop(self._floor, robot), name="stop")
+            if self._stopping[robot] < STOPS_AT_ONCE:
+                self._stopping[robot] += 1
+                self._tasks.create_task(self._stop(self._floor, robot), name="stop")
+            else:
+                self._drop(robot, text, f"{STOPS_AT_ONCE} stops of it are on their way already")
             return
         try:
-            self._orders.put_nowait((robot, text, self._stops[robot]))
+            self._orders.put_nowait((robot, text, self._stops.get(robot, 0), self._clock.now()))
         except asyncio.QueueFull:
-            ORDERS.labels(self.name, "dropped").inc()
-            _log.warning("order_dropped", robot=robot, order=text, reason=f"{ORDERS_AT_ONCE} wait already")
+            self._drop(robot, text, f"{ORDERS_AT_ONCE} wait already")
+
+    def _drop(self, robot: str, order: str, reason: str) -> None:
+        ORDERS.labels(self.name, "dropped").inc()
+        self._limited.warning("order_dropped", reason, time.monotonic(), robot=robot, order=order, reason=reason)
 
     async def _tell_everything(self) -> None:
         self._publish(self._core.everything())

@@ -13,9 +13,11 @@ import math
 from collections import Counter
 from dataclasses import dataclass, field
 from statistics import mean
-from typing import TYPE_CHECKING, Final, NamedTuple
+from typing import TYPE_CHECKING, Final
 
+import msgspec
 import numpy as np
+from scipy.ndimage import label
 
 from fog_contracts import channels as ch
 from fog_contracts.costs import DEFAULT_INFLATION, FREE, INSCRIBED, LETHAL
@@ -24,7 +26,6 @@ from fog_contracts.grid import GridGeometry, StaticMap, Window
 from fog_contracts.handlers import Moment
 from fog_contracts.messages import Cause, Pose, RobotGoal, RobotPath, RobotPose, RobotRelease, RobotState
 from fog_contracts.replica import MasterMap
-from fog_kernels.components import Components
 from fog_kernels.inflation import inflate, inflation_table
 from fog_runtime.configuration.site import load_site
 from planner.core import PlannerCore
@@ -49,6 +50,8 @@ DEADLOCK_S: Final = 120.0
 HAZARD_M: Final = 1.0
 HAZARD_EVERY_S: Final = (20.0, 60.0)
 HAZARD_LASTS_S: Final = (10.0, 30.0)
+NEAREST_M: Final = 2.0
+"""Nothing appears nearer to a robot's centre than this."""
 _APART_M: Final = 1.0
 """Goals and starts of different robots are at least so far from one another."""
 RESOLUTION: Final = 0.05
@@ -84,21 +87,16 @@ class ChangingMap:
         self._table = inflation_table(self.geometry.resolution, DEFAULT_INFLATION)
         cost = inflate(np.ascontiguousarray(floor.cells), self._table)
         self.master = MasterMap("room", self.geometry, floor.cells, cost, 1)
-        self.hazards: dict[str, Window] = {}
         self.free = self._free(cost)
+        self._hazards: dict[str, Window] = {}
+        self._ends: dict[str, float] = {}
+        self._next_hazard = math.inf
 
     def _free(self, cost: NDArray[np.uint8]) -> NDArray[np.int64]:
         """Return the cells of the largest part of the floor that hangs together, columns and rows."""
-        rows, columns = np.nonzero(cost < INSCRIBED)
-        parts, best = Components(cost), np.zeros(0, np.bool_)
-        for seed in range(0, len(rows), max(1, len(rows) // 20)):
-            start = int(columns[seed]), int(rows[seed])
-            if best.size and best[seed]:
-                continue
-            cells = zip(columns.tolist(), rows.tolist(), strict=True)
-            near = np.array([parts.connected(start, cell) for cell in cells])
-            best = near if near.sum() > best.sum() else best
-        return np.column_stack((columns, rows))[best]
+        parts, _ = label(cost < INSCRIBED)
+        largest = 1 + int(np.argmax(np.bincount(parts.ravel())[1:]))
+        return np.argwhere(parts == largest)[:, ::-1]
 
     def place(self, rng: np.random.Generator) -> tuple[float, float]:
         """Return a random place (m) where a robot may be on the empty floor."""
@@ -106,10 +104,32 @@ class ChangingMap:
         x, y = self.geometry.centre(column, row)
         return float(x), float(y)
 
-    def change(self, core: PlannerCore, at: Moment) -> None:
+    def start(self, core: PlannerCore, now: float, rng: np.random.Generator) -> None:
+        """Load the empty floor into the planner."""
+        core.load(self.master.snapshot(), now)
+        self._next_hazard = now + rng.uniform(*HAZARD_EVERY_S)
+
+    def step(self, core: PlannerCore, robots: Sequence[BlindRobot], at: Moment, rng: np.random.Generator) -> None:
+        """Let boxes come and go where no robot is near, and tell the planner of the map."""
+        core.handlers()[ch.MAP_HEARTBEAT]({}, self.master.heartbeat(at.now), at)
+        changed = [name for name, end in self._ends.items() if at.now >= end]
+        for name in changed:
+            del self._ends[name], self._hazards[name]
+        if at.now >= self._next_hazard:
+            self._next_hazard = at.now + rng.uniform(*HAZARD_EVERY_S)
+            x, y = self.place(rng)
+            if all(math.dist((x, y), (robot.x, robot.y)) > NEAREST_M for robot in robots):
+                half, name = HAZARD_M / 2.0, f"h{at.now:.1f}"
+                self._hazards[name] = self.geometry.window_around(x - half, y - half, x + half, y + half)
+                self._ends[name] = at.now + rng.uniform(*HAZARD_LASTS_S)
+                changed.append(name)
+        if changed:
+            self._change(core, at)
+
+    def _change(self, core: PlannerCore, at: Moment) -> None:
         """Tell the planner of the hazards as they are now."""
         raw = self._static.copy()
-        for window in self.hazards.values():
+        for window in self._hazards.values():
             raw[window.rows, window.columns] = LETHAL
         old, new = self.master.layers["cost"], inflate(raw, self._table)
         rows, columns = np.nonzero(old != new)
@@ -138,7 +158,9 @@ class BlindRobot:
     goal: RobotGoal | None = None
     off: float = 0.0
     given_at: float = 0.0
+    driven: float = 0.0
     waited: float = 0.0
+    without_way: float = 0.0
     still_since: float = 0.0
     missions: list[float] = field(default_factory=list)
     """How long (s) each mission took that has ended."""
@@ -162,6 +184,7 @@ class BlindRobot:
         """Drive for a step along what is released."""
         if self.path is None or not len(self.corners) or self.path.refusal is not None:
             self.still_since = now if self.path is None or self.path.refusal is not None else self.still_since
+            self.without_way += STEP_S
             return
         end = min(self.path.released_length, float(self.lengths[-1]))
         if end - self.along < 0.02:
@@ -178,6 +201,7 @@ class BlindRobot:
         if abs(turn) > 0.5:
             return
         self.along += step
+        self.driven += step
         to_x, to_y = aim_x - off * math.sin(heading), aim_y + off * math.cos(heading)
         moved = math.dist((to_x, to_y), (self.x, self.y))
         share = min(1.0, 2.0 * SPEED_M_S * STEP_S / max(moved, 1e-9))  # back to its path no faster than that
@@ -209,29 +233,29 @@ class BlindRobot:
 class Floor:
     """One run: a floor, robots with one mission after another, hazards that come and go."""
 
-    def __init__(self, floor: StaticMap, robots: int, seed: int) -> None:
-        """Put the robots at random places."""
-        self.map = ChangingMap(floor)
+    def __init__(self, map_: ChangingMap, robots: int, seed: int, *, own_goals: bool = False) -> None:
+        """Put the robots at random places; `own_goals`: each draws its goals alone, whatever the others do."""
+        self.map = map_
         self._rng = np.random.default_rng(seed)
         self.now, self.contacts, self.least_gap_m = 100.0, 0, math.inf
         self.core = PlannerCore(epoch=1)
-        self.core.load(self.map.master.snapshot(), self.now)
         self.robots: list[BlindRobot] = []
         for number in range(robots):
-            x, y = self._place([(robot.x, robot.y) for robot in self.robots])
+            x, y = self._place([(robot.x, robot.y) for robot in self.robots], self._rng)
             robot = BlindRobot(f"r{number + 1}", np.random.default_rng((seed, number)), x, y, still_since=self.now)
             self.robots.append(robot)
-        self._next_hazard = self.now + self._rng.uniform(*HAZARD_EVERY_S)
-        self._ends: dict[str, float] = {}
+        self.map.start(self.core, self.now, self._rng)
+        alone = [np.random.default_rng((seed, number, 1)) for number in range(robots)]
+        self._draws = {robot.id: rng if own_goals else self._rng for robot, rng in zip(self.robots, alone, strict=True)}
         self._in_contact: set[tuple[str, str]] = set()
         self._steps = 0
         self.deadlocks: list[str] = []
         self.longest_wait_s = 0.0
         """How long a robot with a path stood at most."""
 
-    def _place(self, others: Sequence[tuple[float, float]]) -> tuple[float, float]:
+    def _place(self, others: Sequence[tuple[float, float]], rng: np.random.Generator) -> tuple[float, float]:
         while True:
-            place = self.map.place(self._rng)
+            place = self.map.place(rng)
             if all(math.dist(place, other) > _APART_M for other in others):
                 return place
 
@@ -247,8 +271,7 @@ class Floor:
         self._steps += 1
         at = Moment(self.now, self.now)
         core, handlers = self.core, self.core.handlers()
-        handlers[ch.MAP_HEARTBEAT]({}, self.map.master.heartbeat(self.now), at)
-        self._change_hazards(at)
+        self.map.step(core, self.robots, at, self._rng)
         before = [(robot.x, robot.y) for robot in self.robots]
         for robot in self.robots:
             robot.drive(self.now)
@@ -273,7 +296,7 @@ class Floor:
     def _send(self, robot: BlindRobot) -> None:
         others = [(other.goal.pose.x, other.goal.pose.y) for other in self.robots if other is not robot
                   and other.goal is not None and other.goal.pose is not None]  # fmt: skip
-        x, y = self._place([*others, (robot.x, robot.y)])
+        x, y = self._place([*others, (robot.x, robot.y)], self._draws[robot.id])
         robot.goal = RobotGoal(goal_id=f"{robot.id}-{self._steps}", pose=Pose(x=x, y=y, theta=0.0))
         robot.path, robot.given_at, robot.still_since = None, self.now, self.now
         self.core.set_goal(robot.id, robot.goal, any_heading=True)
@@ -290,21 +313,6 @@ class Floor:
             elif isinstance(message, RobotRelease) and robot.path is not None:
                 robot.path = robot.path.after(message)
 
-    def _change_hazards(self, at: Moment) -> None:
-        gone = [name for name, end in self._ends.items() if self.now >= end]
-        for name in gone:
-            del self._ends[name], self.map.hazards[name]
-        if self.now >= self._next_hazard:
-            self._next_hazard = self.now + self._rng.uniform(*HAZARD_EVERY_S)
-            x, y = self.map.place(self._rng)
-            if all(math.dist((x, y), (robot.x, robot.y)) > 2.0 for robot in self.robots):
-                half, name = HAZARD_M / 2.0, f"h{self._steps}"
-                self.map.hazards[name] = self.map.geometry.window_around(x - half, y - half, x + half, y + half)
-                self._ends[name] = self.now + self._rng.uniform(*HAZARD_LASTS_S)
-                gone.append(name)
-        if gone:
-            self.map.change(self.core, at)
-
     def _note_contacts(self, before: Sequence[tuple[float, float]]) -> None:
         for one, other in itertools.combinations(range(len(self.robots)), 2):
             a, b = self.robots[one], self.robots[other]
@@ -318,6 +326,9 @@ class Floor:
                 self._in_contact.discard(pair)
 
     def _note_deadlock(self, robot: BlindRobot) -> None:
+        plan = self.core.missions.of(robot.id).plan
+        if plan is not None and plan.waits:  # for the end of a block, not for a robot
+            robot.still_since = self.now
         still = self.now - robot.still_since
         self.longest_wait_s = max(self.longest_wait_s, still)
         others = {other.id: other for other in self.robots}
@@ -339,7 +350,7 @@ def _least_distance(
     return math.hypot(x + share * vx, y + share * vy)
 
 
-class Run(NamedTuple):
+class Run(msgspec.Struct, frozen=True):
     """What one run gave: times in s, `waited` as a share of the robots' time."""
 
     seed: int
@@ -353,12 +364,22 @@ class Run(NamedTuple):
     gap_m: float
     deadlocks: list[str]
     made: dict[str, int]
+    driven_m: float
+    without_way: float
+    """The share of the robots' time in which they had no path."""
+    ended: list[int]
+    """How many missions of each robot have ended."""
 
 
 def play(floor: StaticMap, robots: int, seed: int, seconds: float) -> Run:
     """Let robots drive on a floor for so long (s); return what happened."""
-    run = Floor(floor, robots, seed)
+    return drive(Floor(ChangingMap(floor), robots, seed), seed, seconds)
+
+
+def drive(run: Floor, seed: int, seconds: float) -> Run:
+    """Let the robots of a run drive for so long (s); return what happened."""
     run.run(seconds)
+    robots = len(run.robots)
     return Run(
         seed,
         robots,
@@ -370,6 +391,9 @@ def play(floor: StaticMap, robots: int, seed: int, seconds: float) -> Run:
         run.least_gap_m,
         run.deadlocks,
         {str(kind): count for kind, count in run.core.leases.made.items()},
+        sum(robot.driven for robot in run.robots),
+        sum(robot.without_way for robot in run.robots) / (robots * seconds),
+        [len(robot.missions) for robot in run.robots],
     )
 
 

@@ -121,13 +121,24 @@ def room_command(  # noqa: PLR0913  # its options
     map_file: Annotated[
         Path | None, typer.Option("--map", metavar="FILE", help="A map_server YAML, instead of such a floor.")
     ] = None,
+    blocks: Annotated[
+        bool, typer.Option("--blocks", help="Close watched areas; each seed with nodes, and with lidars alone.")
+    ] = False,
+    out: Annotated[
+        Path | None,
+        typer.Option("--out", metavar="DIR", help="Keep and continue the runs with --blocks, and a report."),
+    ] = None,
     json: JsonOption = False,
 ) -> None:
     """Measure how robots make room for one another.
 
     Blind robots get one goal after the other at random, on six aisles of 27 m (1.8 m wide, or 1.2 m), on a site's
     floor or a map's, while hazards come and go. Only the planner's leases keep them apart; contact is computed exactly.
+    With --blocks the hazards close watched areas from wall to wall, for 1 to 5 minutes. Robots have lidars then.
     """
+    if blocks:
+        _blocks(floor, robots, range(first, first + seeds), seconds, out, json=json)
+        return
     from fog_runtime.configuration.maps import load_map  # noqa: PLC0415  # keeps the other commands fast
     from fognav_experiments.bench import room  # noqa: PLC0415  # same
 
@@ -145,6 +156,30 @@ def room_command(  # noqa: PLR0913  # its options
     name = floor if map_file is None else str(map_file)
     asked = {"floor": name, "robots": robots, "seeds": seeds, "first": first, "seconds": seconds}
     _show("room", asked, room.summary(runs), json=json)
+
+
+def _blocks(floor: str, robots: int, seeds: range, seconds: int, out: Path | None, *, json: bool) -> None:
+    """Drive among blocks, with nodes and with lidars alone."""
+    from fognav_experiments.bench import room, room_blocks  # noqa: PLC0415  # keeps the other commands fast
+
+    kernels.warm_cache(print_line)
+    with exit_codes():
+        try:
+            runs = []
+            sites = checkout.root() / "sites"
+            for run in room_blocks.play_all(floor, sites, robots, seeds, float(seconds), out, checkout.revision()):
+                runs.append(run)
+                print_line(f"{floor}, {robots} robots, seed {run.run.seed}, {run.eyes}: {run.per_hour:.1f} missions/h")
+        except ValueError as error:
+            raise WrongUseError(str(error)) from error
+        if out is not None:
+            room_blocks.publish(room_blocks.read(out), out)
+    of = {eyes: [run for run in runs if run.eyes == eyes] for eyes in room_blocks.EYES}
+    figures: dict[str, object] = {}
+    for eyes, found in of.items():
+        entered = {"in_blocks": sum(run.entered for run in found)}
+        figures[eyes] = room.summary([run.run for run in found]) | entered
+    _show("room", {"floor": floor, "robots": robots, "seeds": len(seeds), "seconds": seconds}, figures, json=json)
 
 
 @bench_app.command("costmap", epilog="Example: fognav bench costmap --zones 5000 --json")

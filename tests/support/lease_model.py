@@ -13,12 +13,10 @@ class LeaseModel:
         self.stored = self.floor = 0
         self.lease: tuple[int, str, float] | None = None
         self.ready: tuple[str, float] | None = None
-        self.late: tuple[int, float] | None = None
-        """The epoch of a leader that a standby finds late, and until when it says so."""
         self.handed: list[float] = []
-        """When leases were handed over because their holder was late."""
+        """When leases were taken because their holder was late."""
 
-    def may_hand_over(self, now: float) -> bool:
+    def may_take(self, now: float) -> bool:
         if not self.handed or now - self.handed[-1] >= HANDED_KNOWN_S:
             self.handed.clear()
             return True
@@ -26,23 +24,20 @@ class LeaseModel:
 
     def acquire(self, holder: str, request, now: float, clock: int = 0):
         held = self.lease if self.lease is not None and now < self.lease[2] else None
+        taken = False
         if held is not None and held[1] != holder:
             if request.ready:
                 self.ready = (holder, now + READY_SAID_S)
-                if request.late == held[0]:
-                    self.late = (held[0], now + READY_SAID_S)
-            self.floor = max(self.floor, request.floor if request.floor > held[0] else 0)
-            return Held(held[0], held[1], held[2] - now)
+            taken = request.ready and request.late == held[0] and self.may_take(now)
+            if not taken:
+                self.floor = max(self.floor, request.floor if request.floor > held[0] else 0)
+                return Held(held[0], held[1], held[2] - now)
+            self.handed.append(now)
+            held = None
         ready = self.ready if self.ready is not None and now < self.ready[1] else None
-        if ready is not None and ready[0] != holder:
-            if request.cut_off:
-                self.lease = None
-                return LeftToOther("cut off", ready[0])
-            late = held is not None and self.late is not None and now < self.late[1] and self.late[0] == held[0]
-            if late and self.may_hand_over(now):
-                self.lease = self.late = None
-                self.handed.append(now)
-                return LeftToOther("late", ready[0])
+        if ready is not None and ready[0] != holder and request.cut_off:
+            self.lease = None
+            return LeftToOther(ready[0])
         epoch, confirmed = request.epoch, request.confirmed
         if epoch == 0 and held is not None:
             epoch, confirmed = held[0], True
@@ -51,4 +46,4 @@ class LeaseModel:
             epoch = max(self.stored + 1, floor + 1, clock)
         self.stored = epoch
         self.lease = (epoch, holder, now + LEASE_S)
-        return Granted(epoch)
+        return Granted(epoch, taken=taken)

@@ -5,6 +5,7 @@ Time is simulated, and each process has an event loop of its own, so that one ca
 """
 
 import asyncio
+import contextlib
 import gc
 import itertools
 import os
@@ -77,7 +78,7 @@ class Process:
         self.leadership.subscribe()
         self.tasks = [
             self.loop.create_task(each)
-            for each in (self.leadership.run(self, {"network": self.answers}), self.publish_loop())
+            for each in (self.leadership.run(self, {"zenoh": self.answers}), self.publish_loop())
         ]
 
     async def answers(self) -> bool:
@@ -326,7 +327,18 @@ def test_process_that_starts_while_the_broker_answers_nobody_leaves_the_lease_wh
     world.run(4.0)
     assert world.leaders() == [leader]
     assert world.processes[leader].epoch == epoch
-    assert "no answer of network" in world.processes[standby].health.report()["parts"]["lease"]["detail"]
+    assert "no answer of zenoh" in world.processes[standby].health.report()["parts"]["lease"]["detail"]
+
+
+def test_process_on_whose_connection_nothing_comes_does_not_lead_beside_another_without_redis(world):
+    world.run(2.0)
+    (leader,) = world.leaders()
+    lossy = world.processes[next(name for name in NAMES if name != leader)]
+    lossy.answered = lossy.store_reachable = False
+    lossy.handler = lambda *_: None
+    world.run(6.0)
+    assert {name for at, name, _ in world.received if at > world.now - 4.0} == {leader}
+    assert len({epoch for _, _, epoch in world.received}) == 1
 
 
 class Copies(RuleBasedStateMachine):
@@ -388,6 +400,32 @@ Copies.TestCase.settings = settings(
     max_examples=int(os.environ.get("FOGNAV_HISTORIES", "15")), stateful_step_count=25, deadline=None
 )
 test_receivers_accept_one_writer_at_a_time_and_one_leads_again = Copies.TestCase
+
+
+async def test_need_that_does_not_answer_is_slow_however_quick_it_was_before(monkeypatch: pytest.MonkeyPatch) -> None:
+    now = [100.0]
+    monkeypatch.setattr(leadership.time, "monotonic", lambda: now[0])
+    monkeypatch.setattr(leadership, "PROBE_S", 0.0)
+    answers = iter([True])
+
+    async def ask() -> bool:
+        return next(answers, False) or await asyncio.Event().wait()
+
+    probes = leadership.Probes({"zenoh": ask})
+
+    async def probe() -> None:
+        async with asyncio.TaskGroup() as tasks:
+            probes.start(tasks)
+
+    probing = asyncio.create_task(probe())
+    for _ in range(5):
+        await asyncio.sleep(0.0)
+    assert probes.took() == 0.0
+    now[0] = 101.5
+    assert probes.took() == 1.5
+    probing.cancel()
+    with contextlib.suppress(asyncio.CancelledError):
+        await probing
 
 
 def test_questions_that_a_hanging_thread_does_not_answer_are_forgotten(monkeypatch: pytest.MonkeyPatch) -> None:

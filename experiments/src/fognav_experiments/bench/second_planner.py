@@ -189,6 +189,8 @@ async def measure(
 class _Changes(Trials):
     """Obstacles before, during and after a planner's change."""
 
+    planners = PLANNERS
+
     def let(self, fault: Fault, ways: Mapping[str, _Way]) -> None:
         """Choose what happens to planners on these ways."""
         self.fault, self.ways = fault, ways

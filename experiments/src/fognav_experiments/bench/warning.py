@@ -183,6 +183,7 @@ class Trials:
     """Obstacles that come and go in an area on the robot's way, one after another; `planner` takes the goals."""
 
     planner = PLANNER
+    planners: Sequence[str] = (PLANNER,)
 
     def __init__(
         self, stack: Stack, loaded: LoadedSite, world: WatchedWorld, session: zenoh.Session, seed: int
@@ -191,6 +192,8 @@ class Trials:
         self._seed = seed
         self.random = random.Random(seed)  # noqa: S311  # repeatable, no secret
         self._deltas = _Deltas()
+        self.said = ""
+        """What the planner last said to a goal."""
         site = loaded.site
         robot = site.robots[0]
         self.robot = StandingRobot(session, site.id, robot.id, robot.start)
@@ -232,6 +235,7 @@ class Trials:
         async def accepted() -> bool:
             path = f"/api/v1/robots/{self.robot.id}/goal"
             answer = await ask(self.stack, self.planner, "PUT", path, where)
+            self.said = f"{self.planner} answered {answer.status}: {answer.body}"
             return answer.status == 200 and isinstance(answer.body, dict)
 
         self.robot.forget()
@@ -266,8 +270,9 @@ class Trials:
         deadline = time.monotonic() + READY_S
         while not await condition():
             if time.monotonic() > deadline:
-                logs = "\n".join(log_tail(self.stack.log(name)) for name in (AGGREGATOR, MAP_SERVICE, PLANNER))
-                raise FailedError(f"waited {READY_S:.0f} s until {what}\n{logs}")
+                names = (AGGREGATOR, MAP_SERVICE, *self.planners)
+                logs = "\n".join(log_tail(self.stack.log(name)) for name in names)
+                raise FailedError(f"waited {READY_S:.0f} s until {what}; {self.said}\n{logs}")
             await asyncio.sleep(POLL_S)
 
 

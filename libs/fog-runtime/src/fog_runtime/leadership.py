@@ -25,7 +25,7 @@ from fog_contracts import channels as ch
 from fog_contracts.handlers import epoch_in
 from fog_contracts.messages import Leader
 from fog_runtime import logs
-from fog_runtime.lease import ANNOUNCE_S, CUT_OFF_S, Lease, LeftToOther, Reply, Request
+from fog_runtime.lease import ANNOUNCE_S, CUT_OFF_S, Granted, Lease, LeftToOther, Reply, Request
 from fog_runtime.process import process_id
 from fog_runtime.punctuality import QUICK_S, Punctuality
 from fog_runtime.stores.redis_connection import StoreError
@@ -64,6 +64,8 @@ class Probes:
         self._started_at = time.monotonic()
         self._answered_at = dict.fromkeys(needs, -math.inf)
         self._took = dict.fromkeys(needs, math.inf)
+        self._waiting: dict[str, float] = {}
+        """When each question was asked that has no answer yet."""
 
     def answered_at(self) -> float:
         """Return when the question was asked that was answered last, of the need for which that is longest ago.
@@ -73,8 +75,9 @@ class Probes:
         return min(self._answered_at.values(), default=time.monotonic())
 
     def took(self) -> float:
-        """Return how long (s) the slowest of the latest answers took."""
-        return max(self._took.values(), default=0.0)
+        """Return how long (s) the slowest of the latest answers took, or is awaited."""
+        now = time.monotonic()
+        return max((*self._took.values(), *(now - asked_at for asked_at in self._waiting.values())), default=0.0)
 
     def silent(self, seconds: float) -> list[str]:
         """Return the names of what has answered no question of the last `seconds`; none so soon after the start."""
@@ -92,13 +95,16 @@ class Probes:
 
     async def _probe(self, name: str, ask: Callable[[], Awaitable[bool]]) -> None:
         while True:
-            asked_at = time.monotonic()
+            asked_at = self._waiting[name] = time.monotonic()
             if await ask():
                 self._answered_at[name] = asked_at
                 self._took[name] = time.monotonic() - asked_at
+            del self._waiting[name]
             await asyncio.sleep(PROBE_S)
 
 
+_LEADERS_WAY: Final = "zenoh"
+"""The need on whose way leaders announce themselves."""
 _TICK_S: Final = 0.05
 _RETRY_S: Final = 0.2
 _HELD_BACK: Final = 2048
@@ -108,7 +114,9 @@ LEADS: Final = Gauge("fognav_leader", "Whether this process leads its service (1
 EPOCH: Final = Gauge("fognav_epoch", "Epoch with which this process leads, its fencing number; 0 on standby")
 TAKEOVERS: Final = Counter("fognav_takeovers_total", "How often this process began to lead, or got another epoch")
 HANDED_OVER: Final = Counter(
-    "fognav_leases_handed_over_total", "How often this process gave its lease to a copy that was ready", ["reason"]
+    "fognav_leases_handed_over_total",
+    "How often this process gave its lease to a copy that was ready (cut off), or took that of a leader (late)",
+    ["reason"],
 )
 for _reason in ("late", "cut off"):  # `increase` sees the first time only of what was 0 before
     HANDED_OVER.labels(_reason)
@@ -312,7 +320,9 @@ class Leadership:
                 while True:
                     self._lease.on_answer(self._probes.answered_at())
                     self._judge_leader()
-                    self._lease.tick(time.monotonic(), _proposal(), connected=self._connected())
+                    # A connection that looks well, and on which nothing comes, tells nothing of other leaders.
+                    hears = self._connected() and _LEADERS_WAY not in self._probes.silent(CUT_OFF_S)
+                    self._lease.tick(time.monotonic(), _proposal(), connected=hears)
                     self._apply(member, tasks)
                     self._announce()
                     await asyncio.sleep(_TICK_S)
@@ -327,9 +337,13 @@ class Leadership:
                 await asyncio.sleep(_TICK_S / 2)
                 continue
             reply = await self._leases.acquire(self.holder, request)
-            if isinstance(reply, LeftToOther):
-                HANDED_OVER.labels(reply.reason).inc()
-                _log.warning("lease_handed_over", epoch=request.epoch, reason=reply.reason, to=reply.successor)
+            match reply:
+                case LeftToOther(successor):
+                    HANDED_OVER.labels("cut off").inc()
+                    _log.warning("lease_handed_over", epoch=request.epoch, to=successor)
+                case Granted(taken=True):
+                    HANDED_OVER.labels("late").inc()
+                    _log.warning("lease_taken", of=request.late, epoch=reply.epoch)
             self._lease.on_reply(request, reply, time.monotonic())
             with self._sending:
                 if self._lease.permission(time.monotonic()) == "granted" and self._term[0] == self._lease.epoch:

@@ -22,9 +22,10 @@ Redis confirms or corrects later.
 
 Redis also leads from a leader that can't do its work to a process that can: one whose transports or threads do not
 answer gives the lease back, if a standby whose own do has said in Redis that it is ready. If none has, it goes on:
-what it still does is better than nothing. A leader that is slow can't know that: a standby that hears its answers late,
-and would answer in time itself (`punctuality`), says so in Redis, and the leader gives the lease back at its next
-renewal, if the last time that this happened is long enough ago. Nobody takes a lease from its holder.
+what it still does is better than nothing. A leader that is slow can't know that, and its way to Redis may be as slow: a
+standby that hears its answers late, and would answer in time itself (`punctuality`), takes its lease, if the last time
+that this happened is long enough ago. The old leader acts on until it hears of that; receivers and Redis's scripts
+refuse its epoch. Nobody takes the lease of a leader that answers in time.
 """
 
 from __future__ import annotations
@@ -57,11 +58,9 @@ READY_SAID_S: Final = 0.45
 HEARSAY_PAUSE_S: Final = 10.0
 """So seldom Redis is asked for an epoch above one of which robots tell: each new one makes all fetch the map anew."""
 HANDED_PAUSE_S: Final = 30.0
-"""So long no other leader gives its lease back because it is late; after each further time, twice as long ..."""
+"""So long nobody takes the lease of another leader because it is late; after each further time, twice as long ..."""
 HANDED_KNOWN_S: Final = 600.0
 """... until none did so for this time."""
-_CLAIM_S: Final = 0.1
-"""Period of a standby's requests while it finds the leader late."""
 _LISTEN_S: Final = 2 * ANNOUNCE_S + 0.1
 """Without Redis: how long a leader listens, after it did not run or could not hear, until it acts again."""
 _RATE_MARGIN: Final = 0.9
@@ -97,9 +96,10 @@ class Request:
 
 @dataclass(frozen=True)
 class Granted:
-    """Redis granted the lease with this epoch."""
+    """Redis granted the lease with this epoch; `taken`: it was a late leader's."""
 
     epoch: int
+    taken: bool = False
 
 
 @dataclass(frozen=True)
@@ -113,10 +113,9 @@ class Held:
 
 @dataclass(frozen=True)
 class LeftToOther:
-    """This process is cut off or late, and another one is ready: it takes the lease, which is free now."""
+    """This process is cut off, and another one is ready: it takes the lease, which is free now."""
 
-    reason: str = "cut off"
-    successor: str = ""
+    successor: str
 
 
 Reply = Granted | Held | LeftToOther | None
@@ -191,7 +190,7 @@ class Lease:
         if now < self._request_due and not (self.epoch and urgent):
             return None
         late = 0 if self.epoch else self._late
-        self._request_due = now + (_CLAIM_S if late else RENEW_S)
+        self._request_due = now + RENEW_S
         self._said_cut_off = cut_off
         ready = now - self._answered_at <= READY_S
         if asks:

@@ -32,8 +32,8 @@ if TYPE_CHECKING:
 # they would refuse it for ever.
 # A standby that has what it needs to lead leaves its name for a moment (ready). A leader that is cut off from what it
 # needs finds it, and gives the lease back.
-# A standby that finds the leader late, and would be quicker, leaves the leader's epoch for a moment (late), and the
-# leader gives the lease back likewise, but the more seldom the more often that happened (handed; `may_hand_over`).
+# A standby that finds the leader late, and would be quicker, takes the lease: what the leader asks Redis may be late,
+# too. The more often that happened, the longer nobody does it again (handed).
 # The clock (ms) only keeps epochs growing that Redis and all who could know have forgotten.
 _ACQUIRE: Final = """
 local holder, epoch, floor, confirmed = ARGV[1], tonumber(ARGV[2]), tonumber(ARGV[3]), ARGV[4] == '1'
@@ -42,39 +42,34 @@ local lease = redis.call('GET', KEYS[1])
 local held_epoch, held_by
 if lease then held_epoch, held_by = string.match(lease, '^(%d+) (.*)$') end
 local left = tonumber(redis.call('GET', KEYS[3]) or '0')
-local ready, cut_off = ARGV[7] == '1', ARGV[8] == '1'
+local ready, cut_off, taken = ARGV[7] == '1', ARGV[8] == '1', false
 if held_by and held_by ~= holder then
-  if ready then
-    redis.call('SET', KEYS[4], holder, 'PX', ARGV[9])
-    if ARGV[10] == held_epoch then redis.call('SET', KEYS[5], held_epoch, 'PX', ARGV[9]) end
+  if ready then redis.call('SET', KEYS[4], holder, 'PX', ARGV[9]) end
+  local handed = tonumber(redis.call('GET', KEYS[5]) or '0')
+  local since = tonumber(ARGV[12]) - redis.call('PTTL', KEYS[5])
+  local may = handed == 0 or since >= tonumber(ARGV[11]) * 2 ^ (handed - 1)
+  taken = ready and may and ARGV[10] == held_epoch
+  if not taken then
+    if floor > math.max(left, tonumber(held_epoch)) then redis.call('SET', KEYS[3], string.format('%.0f', floor)) end
+    return {0, held_epoch, held_by, redis.call('PTTL', KEYS[1])}
   end
-  if floor > math.max(left, tonumber(held_epoch)) then redis.call('SET', KEYS[3], string.format('%.0f', floor)) end
-  return {0, held_epoch, held_by, redis.call('PTTL', KEYS[1])}
+  redis.call('SET', KEYS[5], handed + 1, 'PX', ARGV[12])
 end
 local successor = redis.call('GET', KEYS[4])
 if successor == holder then successor = nil end
 if cut_off and successor then
   redis.call('DEL', KEYS[1])
-  return {2, 'cut off', successor}
-end
-if successor and held_by and redis.call('GET', KEYS[5]) == held_epoch then
-  local handed = tonumber(redis.call('GET', KEYS[6]) or '0')
-  local since = tonumber(ARGV[12]) - redis.call('PTTL', KEYS[6])
-  if handed == 0 or since >= tonumber(ARGV[11]) * 2 ^ (handed - 1) then
-    redis.call('SET', KEYS[6], handed + 1, 'PX', ARGV[12])
-    redis.call('DEL', KEYS[1], KEYS[5])
-    return {2, 'late', successor}
-  end
+  return {2, successor}
 end
 floor = math.max(floor, left)
-if epoch == 0 and held_by then epoch, confirmed = tonumber(held_epoch), true end
+if epoch == 0 and held_by and not taken then epoch, confirmed = tonumber(held_epoch), true end
 if epoch <= floor or epoch < stored or (epoch == stored and not confirmed) then
   epoch = math.max(stored + 1, floor + 1, tonumber(ARGV[5]))
 end
 local text = string.format('%.0f', epoch)
 if epoch ~= stored then redis.call('SET', KEYS[2], text) end
 redis.call('SET', KEYS[1], text .. ' ' .. holder, 'PX', ARGV[6])
-return {1, text}
+return {1, text, taken and 1 or 0}
 """
 _GRANTED, _LEFT_TO_OTHER = 1, 2
 _RELEASE: Final = """
@@ -89,7 +84,7 @@ class LeaseStore:
 
     def __init__(self, url: str, site: str, service: str, *, credentials: Credentials = NOBODY) -> None:
         self._redis = RedisConnection(url, timeout_s=ATTEMPT_S, credentials=credentials)
-        names = ("lease", "epoch", "floor", "ready", "late", "handed")
+        names = ("lease", "epoch", "floor", "ready", "handed")
         self._keys = tuple(f"fog:{site}:{service}:{name}" for name in names)
 
     async def __aenter__(self) -> Self:
@@ -111,10 +106,10 @@ class LeaseStore:
         match reply:
             case None:
                 return None
-            case [outcome, reason, successor] if outcome == _LEFT_TO_OTHER:
-                return LeftToOther(reason.decode(), successor.decode("utf-8", "replace"))
-            case [outcome, epoch] if outcome == _GRANTED:
-                return Granted(int(epoch))
+            case [outcome, successor] if outcome == _LEFT_TO_OTHER:
+                return LeftToOther(successor.decode("utf-8", "replace"))
+            case [outcome, epoch, taken] if outcome == _GRANTED:
+                return Granted(int(epoch), taken=bool(taken))
             case [_, epoch, other, remaining_ms]:
                 return Held(int(epoch), other.decode("utf-8", "replace"), max(0, remaining_ms) / 1000)
         raise AssertionError(f"the script returned {reply!r}")

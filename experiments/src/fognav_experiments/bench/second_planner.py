@@ -203,13 +203,13 @@ class _Changes(Trials):
 
     async def change(self, number: int) -> None:
         """Measure one obstacle in each phase; the planner that leads then becomes slow, lossy or dead."""
-        self.planner = await self._leader()
+        leader = await self._leader()
         self._took["before"].append(await self.meet(await self.drive(3 * number), self._path_around))
         hazard = await self.drive(3 * number + 1)
         await self._forget_pause()
         epoch = self.robot.latest().planner_epoch
         fails_after_s = self.random.uniform(-_AFTER_S, _BEFORE_S)
-        failing = asyncio.create_task(self._fail(max(0.0, fails_after_s)))
+        failing = asyncio.create_task(self._fail(leader, max(0.0, fails_after_s)))
         if fails_after_s < 0.0:
             await failing
             await asyncio.sleep(-fails_after_s)
@@ -223,20 +223,19 @@ class _Changes(Trials):
                 await asyncio.sleep(POLL_S)
         if self.robot.latest().planner_epoch > epoch:
             self._taken_over.append(self.robot.taken_over[self.robot.latest().planner_epoch] - failed_at)
-            self.planner = next(name for name in PLANNERS if name != self.planner)
             self._took["after"].append(await self.meet(await self.drive(3 * number + 2), self._path_around))
         for way in self.ways.values():
             way.set()
         await self.stack.supervisor.wait_ready(PLANNERS, READY_S)
 
-    async def _fail(self, after_s: float) -> float:
-        """Let the planner fail; return when it did (s)."""
+    async def _fail(self, planner: str, after_s: float) -> float:
+        """Let a planner fail; return when it did (s)."""
         await asyncio.sleep(after_s)
         if self.fault == "dead":
-            self.stack.supervisor.kill(self.planner)
+            self.stack.supervisor.kill(planner)
         else:
             slow = self.fault == "slow"
-            self.ways[self.planner].set(SLOW_S / 2 if slow else 0.0, 0.0 if slow else LOSS)
+            self.ways[planner].set(SLOW_S / 2 if slow else 0.0, 0.0 if slow else LOSS)
         return time.time()
 
     def _enters(self, hazard: PlannedHazard) -> bool:

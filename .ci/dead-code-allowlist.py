@@ -9,6 +9,7 @@ _.extra_m  # answer to a dry run: how much farther a robot would drive, and how 
 _.extra_s
 _.earliest_s  # api: when a robot arrives
 _.latest_s
+_.waits_code  # api: why a mission by the clock waits
 _.acknowledged_at  # api: since when somebody looks after an alert
 _.translation_deviation_m  # report: of a trajectory, in `map from-log --json`
 _.rotation_worst_deg

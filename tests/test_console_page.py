@@ -12,6 +12,7 @@ import pytest
 
 from console_service.forward import ForwardProblem
 from fog_contracts.messages.areas import NodeCode
+from fog_contracts.messages.fleet import ScheduleCode
 from fog_contracts.messages.robots import PlanRefusal, ReasonCode, RefusalCode
 from fognav import console_page
 
@@ -52,7 +53,7 @@ def test_lock_file_names_packages_by_their_hash_and_no_registry() -> None:
 
 def test_page_says_in_portuguese_every_refusal_and_state_that_has_an_identifier_and_none_that_nobody_sends() -> None:
     known = set(re.findall(r"^  (\w+): ", (CONSOLE / "src/i18n/pt-codes.ts").read_text("utf-8"), re.MULTILINE))
-    assert known >= {str(code) for codes in (NodeCode, PlanRefusal, RefusalCode) for code in codes}
+    assert known >= {str(code) for codes in (NodeCode, PlanRefusal, RefusalCode, ScheduleCode) for code in codes}
     documented = set(re.findall(r"^\| `(\w+)` \|", (ROOT / "docs/channels.md").read_text("utf-8"), re.MULTILINE))
     assert known <= documented | {str(code) for code in ForwardProblem}
 

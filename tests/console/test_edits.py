@@ -157,13 +157,15 @@ async def test_missions_by_the_clock_are_listed_switched_and_deleted_and_a_delet
         "outcome": "missed",
         "mission": None,
         "reason": "r2 was not free",
+        "code": "robot_not_heard",
     }
     post = schedule("post", begin=monday, last=missed)
-    waits = schedule("early", begin=monday + 604_800, waits="robot r2 has another mission")
+    busy = {"waits": "robot r2 has another mission", "waits_code": "robot_has_mission"}
+    waits = schedule("early", begin=monday + 604_800, **busy)
     stream.answers["GET schedules"] = (200, [waits, schedule("off", begin=None, enabled=False), post])
     page = await console.open("schedules")
     rows = page.locator("main li")
-    await expect(rows.nth(0)).to_contain_text("Due, but robot r2 has another mission")
+    await expect(rows.nth(0)).to_contain_text("Due, but: robot r2 has another mission")
     await expect(rows.nth(1)).to_contain_text("postr2next Mon, Nov 30, 08:00 (Asia/Tokyo)")
     await expect(rows.nth(1)).to_contain_text("A, west entrance → 3.0, 4.5")
     await expect(rows.nth(1)).to_contain_text("Last: Mon, Nov 23, 08:00 (Asia/Tokyo), missed: r2 was not free")
@@ -191,6 +193,9 @@ async def test_missions_by_the_clock_are_listed_switched_and_deleted_and_a_delet
     await expect(page.locator(".undo")).to_have_count(0)
     assert [body for name, body in stream.requests if name == "PUT schedules/post"][-1] == {**stored, "enabled": True}
     assert stream.asked("DELETE") == ["DELETE schedules/post"]
+    await page.evaluate("localStorage.setItem('fognav.language', 'pt'); location.reload()")
+    await expect(rows.nth(0)).to_contain_text("Está na hora, mas: O robô tem outra missão.")
+    await expect(rows.nth(1)).to_contain_text("perdida: O robô não responde.")
 
 
 async def test_operator_lets_a_mission_begin_by_the_clock_by_keyboard_and_a_viewer_only_reads(

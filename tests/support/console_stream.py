@@ -63,8 +63,9 @@ def schedule(name: str, *, begin: float | None, **changed: object) -> dict[str, 
     weekly = WeeklySchedule(time_zone="Asia/Tokyo", times=[WeeklyTime(days=["mon"], begin="08:00", end="09:00")])
     mission = MissionBody(stops=[GoalBody(place="a"), GoalBody(pose=GoalPose(x=3.0, y=4.5))], deadline_s=600.0)
     view = ScheduleView(
-        id=name, robot="r2", mission=mission, weekly=weekly, author="ana", since=1.0, version="7", next=begin, waits=""
-    )
+        id=name, robot="r2", mission=mission, weekly=weekly, author="ana", since=1.0, version="7", next=begin, waits="",
+        waits_code="",
+    )  # fmt: skip
     return {**to_builtins(view), **changed}
 
 

@@ -259,7 +259,7 @@ export const en = {
   "schedules.noNext": "no next time: is the fog node's clock set?",
   "schedules.isOff": "switched off",
   "schedules.enabled": "switched on",
-  "schedules.waits": "Due, but {reason}",
+  "schedules.waits": "Due, but: {reason}",
   "schedules.given": "Last: {time}, begun",
   "schedules.missed": "Last: {time}, missed: {reason}",
   "schedules.best": "in the shortest order",

@@ -76,6 +76,12 @@ export const PT_CODES: Readonly<Record<string, string>> = {
   cut_by_walls: "Há paredes ou espaço desconhecido pelo meio.",
   cut_by_obstacles: "Obstáculos que os robôs veem bloqueiam todos os percursos.",
   cut_by_places: "Áreas ou zonas bloqueiam todos os percursos.",
+  // ScheduleCode
+  robot_not_heard: "O robô não responde.",
+  robot_has_mission: "O robô tem outra missão.",
+  robot_serves_visitor: "O robô acompanha um visitante.",
+  robot_cant_drive: "O robô não pode andar agora.",
+  planner_was_away: "O planeador não estava a funcionar, ou o relógio não estava certo.",
   // Problems
   area_changed: "Alguém alterou a área: volte a lê-la.",
   body_slow: "O pedido não chegou a tempo: repita-o.",

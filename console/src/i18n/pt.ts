@@ -260,7 +260,7 @@ export const pt: Readonly<Record<keyof typeof en, string>> = {
   "schedules.noNext": "sem próxima vez: o relógio do nó fog está certo?",
   "schedules.isOff": "desligado",
   "schedules.enabled": "ligado",
-  "schedules.waits": "Está na hora, mas {reason}",
+  "schedules.waits": "Está na hora, mas: {reason}",
   "schedules.given": "Última: {time}, começou",
   "schedules.missed": "Última: {time}, perdida: {reason}",
   "schedules.best": "pela ordem mais curta",

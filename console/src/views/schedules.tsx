@@ -3,6 +3,7 @@ import { useRef, useState } from "preact/hooks";
 import { Problem, request } from "../api/client";
 import type { ScheduleBody, ScheduledMission } from "../api/types";
 import { mayOperate, useConsole, useLive, useRead, useShown } from "../context";
+import { said } from "../i18n/codes";
 import { t } from "../i18n/i18n";
 import type { Live } from "../live/live";
 import { go, useRoute } from "../router";
@@ -93,7 +94,7 @@ export function SchedulesView(): preact.JSX.Element {
               <bdi>{one.mission.stops.map((stop) => stopText(live, stop)).join(" → ")}</bdi>{one.mission.order === "best" && ` (${t("schedules.best")})`}
             </p>
             <p class="why">{scheduleText(one.weekly)}</p>
-            {one.waits !== "" && <p class="state expiring"><bdi>{t("schedules.waits", { reason: one.waits })}</bdi></p>}
+            {one.waits !== "" && <p class="state expiring"><bdi>{t("schedules.waits", { reason: said(one.waits_code, one.waits) })}</bdi></p>}
             {one.last && <p class={one.last.outcome === "missed" ? "problem" : "why"}><bdi>{lastText(one)}</bdi></p>}
             {operates && (
               <div class="row-actions">
@@ -118,7 +119,7 @@ function nextText({ enabled, next, weekly }: ScheduledMission): string {
 
 function lastText({ last, weekly }: ScheduledMission): string {
   const time = zonedTime(last?.begin ?? 0, weekly.time_zone);
-  return last?.outcome === "missed" ? t("schedules.missed", { time, reason: last.reason }) : t("schedules.given", { time });
+  return last?.outcome === "missed" ? t("schedules.missed", { time, reason: said(last.code, last.reason) }) : t("schedules.given", { time });
 }
 
 function stopText({ of }: Live, { place, pose }: Stop): string {

@@ -254,7 +254,8 @@ async def test_busy_robot_finishes_first_and_what_waits_longest_for_it_is_told(f
     await fog.add(scheduled("urgent", stop="home", priority=5))
     await fog.pass_time(60.0)
     assert fog.goal == "home"
-    assert fog.scheduling.waits_for(fog.missions.schedules["post"]) == "robot r1 has another mission"
+    waits = fog.scheduling.waits_for(fog.missions.schedules["post"])
+    assert (waits, waits.code) == ("robot r1 has another mission", "robot_has_mission")
     await fog.missions.cancel("r1", "bob")
     await fog.pass_time(1.0)
     assert fog.last("urgent").outcome == "given"
@@ -265,15 +266,16 @@ async def test_busy_robot_finishes_first_and_what_waits_longest_for_it_is_told(f
 
 
 @pytest.mark.parametrize(
-    ("says", "reason"),
+    ("says", "reason", "code"),
     [
-        (None, "not heard"),
-        (state(enabled=False), "can't drive now"),
-        (state(mode="FAULT"), "can't drive now"),
-        (state(mode="HOLD", reasons=["map too old"], codes=["map_old"]), "map too old"),
+        (None, "not heard", "robot_not_heard"),
+        (state(enabled=False), "can't drive now", "robot_cant_drive"),
+        (state(mode="FAULT"), "can't drive now", "robot_cant_drive"),
+        (state(mode="HOLD", reasons=["map too old"], codes=["map_old"]), "map too old", "map_old"),
+        (state(mode="DEGRADED", codes=["map_late", "battery_low"]), "can't drive now", "battery_low"),
     ],
 )
-async def test_robot_that_can_t_drive_gets_nothing_and_a_missed_mission_says_why(fog, says, reason):
+async def test_robot_that_can_t_drive_gets_nothing_and_a_missed_mission_says_why(fog, says, reason, code):
     await fog.add(scheduled())
     fog.states.clear()
     if says is not None:
@@ -281,6 +283,7 @@ async def test_robot_that_can_t_drive_gets_nothing_and_a_missed_mission_says_why
     await fog.pass_time(HOUR + 120.0, step=60.0)
     assert (fog.goal, fog.last().outcome) == (None, "missed")
     assert reason in fog.last().reason
+    assert fog.last().code == code
     fog.states["r1"] = state()
     await fog.pass_time(60.0)
     assert fog.goal is None, "an hour later it is not done any more"
@@ -321,7 +324,8 @@ async def test_robot_out_of_service_gets_its_mission_only_within_the_window(fog)
     await fog.add(scheduled())
     await fog.missions.take_out("r1", OutOfService(id="1", reason="worn wheel", by="anna", since=1.0), "anna")
     await fog.pass_time(60.0)
-    assert "worn wheel" in fog.scheduling.waits_for(fog.missions.schedules["post"])
+    waits = fog.scheduling.waits_for(fog.missions.schedules["post"])
+    assert ("worn wheel" in waits, waits.code) == (True, "out_of_service")
     await fog.missions.put_back("r1", "anna")
     await fog.pass_time(1.0)
     assert fog.goal == "lab"

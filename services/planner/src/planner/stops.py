@@ -9,6 +9,7 @@ from msgspec import Meta, structs
 
 from fog_contracts.messages import (
     Author,
+    Code,
     FloorGoal,
     Id,
     Message,
@@ -129,7 +130,8 @@ class MissionBody(Message, frozen=True, kw_only=True):
 class Occasion(Message, frozen=True, kw_only=True):
     """What became of the mission of one window, which began at `begin` (s since the epoch).
 
-    `mission`: the id of the one that was given; `reason`: why it was missed.
+    `mission`: the id of the one that was given; `reason`: why it was missed, `code` identifies it as `waits_code`
+    does.
     """
 
     begin: Stamp
@@ -137,6 +139,7 @@ class Occasion(Message, frozen=True, kw_only=True):
     outcome: Literal["given", "missed"]
     mission: str | None = None
     reason: Sentence = ""
+    code: Code = ""
 
 
 class ScheduledMission(Message, frozen=True, kw_only=True):

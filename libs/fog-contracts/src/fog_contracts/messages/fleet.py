@@ -4,7 +4,7 @@ from typing import Annotated, Literal
 
 from msgspec import Meta
 
-from fog_contracts.messages.basics import Author, Id, Message, Radians, Speed, Stamp
+from fog_contracts.messages.basics import Author, Described, Id, Message, Radians, Speed, Stamp
 from fog_contracts.messages.maps import Shape
 
 ServiceReason = Annotated[str, Meta(min_length=1, max_length=120)]
@@ -23,6 +23,16 @@ class OutOfService(Message, frozen=True, kw_only=True):
     by: Author
     since: Stamp
     until: Stamp | None = None
+
+
+class ScheduleCode(Described):
+    """Why a robot did not get a scheduled mission yet, where no problem, refusal or reason of the robot says so."""
+
+    NOT_HEARD = "robot_not_heard", "the robot is not heard"
+    HAS_MISSION = "robot_has_mission", "it has another mission"
+    SERVES_VISITOR = "robot_serves_visitor", "it serves a visitor"
+    CANT_DRIVE = "robot_cant_drive", "it can't drive now"
+    PLANNER_AWAY = "planner_was_away", "the planner did not run, or its clock was not set"
 
 
 CpuPercent = Annotated[float, Meta(ge=0.0, le=100_000.0, extra={"unit": "% of a core"})]

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Protocol
 
 import msgspec
 
-from fog_contracts.messages import Id, Message, Stamp, WeeklySchedule
+from fog_contracts.messages import Code, Id, Message, Stamp, WeeklySchedule
 from fog_contracts.weekly import Windows, is_time_zone
 from fog_runtime.http import (
     Answer,
@@ -47,10 +47,14 @@ class ScheduleBody(Message, frozen=True, kw_only=True):
 
 
 class ScheduleView(ScheduledMission, frozen=True, kw_only=True):
-    """A scheduled mission; `next`: when its next window begins. `waits`: why the one that is due was not given yet."""
+    """A scheduled mission; `next`: when its next window begins. `waits`: why the one that is due was not given yet.
+
+    `waits_code` identifies that (`ScheduleCode`, a problem, `PlanRefusal` or `ReasonCode`), where it has an identifier.
+    """
 
     next: Stamp | None
     waits: str
+    waits_code: Code
 
 
 class Planner(Protocol):
@@ -90,7 +94,8 @@ class _Schedules:
         """Return one as it is shown."""
         fields = {name: getattr(schedule, name) for name in schedule.__struct_fields__}
         scheduling = self._service.scheduling
-        return ScheduleView(**fields, next=scheduling.following(schedule), waits=scheduling.waits_for(schedule))
+        waits = scheduling.waits_for(schedule)
+        return ScheduleView(**fields, next=scheduling.following(schedule), waits=waits, waits_code=waits.code)
 
     def check(self, name: str, body: ScheduleBody, places: KnownPlaces) -> None:
         """Check what does not change by itself: ids, goals, the time zone, and how many there are."""

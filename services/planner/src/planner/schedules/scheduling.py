@@ -9,16 +9,17 @@ from typing import TYPE_CHECKING, Final, Protocol
 from msgspec import structs
 from prometheus_client import Counter
 
-from fog_contracts.messages import Pose, ReasonCode, Refusal
+from fog_contracts.messages import Pose, Reason, ReasonCode, Refusal, ScheduleCode
 from fog_contracts.messages.basics import SENTENCE_MAX
 from fog_contracts.site import ON_DOCK
 from fog_contracts.weekly import TimeZoneError, Window, Windows
 from fog_runtime import logs
 from fog_runtime.clock import ticker
-from fog_runtime.http import ProblemError
+from fog_runtime.http import HttpProblem, ProblemError
 from fog_runtime.stores.redis_connection import StoreError
 from fog_runtime.stores.redis_store import Attempt, IdempotencyError
 from planner.config import PlannerConfig
+from planner.problems import PlannerProblem
 from planner.query_queue import BusyError
 from planner.robot_operator import CommandError
 from planner.schedules.occasions import IdleTimes, due, is_dated
@@ -28,7 +29,7 @@ from planner.tours.api import Conditions, mission_order
 from planner.visits import is_free
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Mapping
+    from collections.abc import Callable, Mapping, Sequence
 
     from fog_contracts.messages import Place, PlanReply, PlanRequest, RobotPose, RobotState
     from fog_contracts.site import Site
@@ -54,6 +55,20 @@ for _outcome in ("given", "missed"):
     SCHEDULED.labels(_outcome)
 
 _log = logs.get("planner")
+
+
+_NO_REASON: Final = Reason("", "")
+_PLANNER_AWAY: Final = Reason(ScheduleCode.PLANNER_AWAY, "the planner did not run, or its clock was not set")
+_CODES: Final[Sequence[tuple[type[Exception], str]]] = (
+    (BusyError, PlannerProblem.BUSY), (MissionConflictError, PlannerProblem.MISSION_CHANGED),
+    (OutOfServiceError, PlannerProblem.OUT_OF_SERVICE), (StoreError, HttpProblem.STORE_AWAY),
+)  # fmt: skip
+
+
+def _reason(error: Exception) -> Reason:
+    """Return why a mission was not given, by the error that says so."""
+    known = (code for kind, code in _CODES if isinstance(error, kind))
+    return Reason(error.code if isinstance(error, ProblemError) else next(known, ""), str(error))
 
 
 class Robots(Protocol):
@@ -94,7 +109,7 @@ class Scheduling:
         self._idle = {robot.id: robot.idle for robot in site.robots if robot.idle is not None}
         self._idle_times = IdleTimes({robot: idle.after_s for robot, idle in self._idle.items()})
         self._windows: dict[str, tuple[str, Windows]] = {}
-        self._why: dict[str, str] = {}
+        self._why: dict[str, Reason] = {}
         self._tried: dict[str, float] = {}
         self._stored = True
 
@@ -135,9 +150,9 @@ class Scheduling:
         """Return the time for what is written now (s since the epoch); 0 while it is not known."""
         return self._clock.stamp() if self._synchronized() else 0.0
 
-    def waits_for(self, schedule: ScheduledMission) -> str:
+    def waits_for(self, schedule: ScheduledMission) -> Reason:
         """Return why a mission that is due was not given yet; empty if none is due."""
-        return self._why.get(schedule.version, "")
+        return self._why.get(schedule.version, _NO_REASON)
 
     # --- Missions that begin by the clock ---------------------------------------------------------------------------
 
@@ -161,13 +176,14 @@ class Scheduling:
             try:
                 now = due(schedule, self._windows_of(schedule), stamp)
             except TimeZoneError as error:
-                self._why[schedule.version] = str(error)
+                self._why[schedule.version] = Reason("", str(error))
                 continue
             if now is None:
                 self._why.pop(schedule.version, None)
             elif now.over:
-                reason = self._why.pop(schedule.version, "the planner did not run, or its clock was not set")
-                await self._note(schedule, Occasion(begin=now.window.begin, at=stamp, outcome="missed", reason=reason))
+                why = self._why.pop(schedule.version, _PLANNER_AWAY)
+                missed = Occasion(begin=now.window.begin, at=stamp, outcome="missed", reason=why, code=why.code)
+                await self._note(schedule, missed)
             else:
                 found.append((-schedule.mission.priority, now.window.begin, schedule.id, schedule, now.window))
         for *_, schedule, window in sorted(found, key=lambda one: one[:3]):
@@ -186,15 +202,15 @@ class Scheduling:
         try:
             given = await self._order(schedule, window)
         except (BusyError, IdempotencyError, MissionConflictError, OutOfServiceError, ProblemError) as error:
-            self._why[schedule.version] = str(error)
+            self._why[schedule.version] = _reason(error)
             return
         except StoreError as error:
-            self._why[schedule.version] = str(error)
+            self._why[schedule.version] = _reason(error)
             raise
         if given is None:
             return
         if isinstance(given, Refusal):
-            self._why[schedule.version] = given.reason
+            self._why[schedule.version] = Reason(given.kind, given.reason)
             return
         mission = given.goal.goal_id if given.tour is None else given.tour.id
         occasion = Occasion(begin=window.begin, at=self._clock.stamp(), outcome="given", mission=mission)
@@ -235,23 +251,25 @@ class Scheduling:
         missions = self._service.missions
         return await missions.put_schedule(schedule.id, after, "planner", action, expected=schedule.version) == "ok"
 
-    def _why_not(self, robot: str) -> str:
-        """Return why a robot gets no mission by itself now; empty if it may."""
+    def _why_not(self, robot: str) -> Reason | None:
+        """Return why a robot gets no mission by itself now; None if it may."""
         service = self._service
         state, pose, stored = service.operator.heard(robot), service.poses.get(robot), service.missions.goals.get(robot)
         if (out := service.missions.out_of_service(robot)) is not None:
-            return f"robot {robot} is out of service: {out.reason}"
+            return Reason(PlannerProblem.OUT_OF_SERVICE, f"robot {robot} is out of service: {out.reason}")
         if state is None or service.operator.is_doubled(robot):
-            return f"robot {robot} is not heard, or two agents use its id"
+            return Reason(ScheduleCode.NOT_HEARD, f"robot {robot} is not heard, or two agents use its id")
         if stored is not None and not stored.goal.idle:
-            return f"robot {robot} has another mission"
+            return Reason(ScheduleCode.HAS_MISSION, f"robot {robot} has another mission")
         if service.visiting.visits.serves(robot):
-            return f"robot {robot} serves a visitor"
+            return Reason(ScheduleCode.SERVES_VISITOR, f"robot {robot} serves a visitor")
         if not is_free(state):
-            return (
-                f"robot {robot} can't drive now: it is {state.mode}, {'; '.join(state.reasons) or 'without a reason'}"
-            )
-        return "" if pose is not None and pose.localized else f"robot {robot} does not know where it is"
+            why = "; ".join(state.reasons) or "without a reason"
+            low = [ReasonCode.BATTERY_LOW] if ReasonCode.BATTERY_LOW in state.codes else []
+            code = next(iter([*low, *state.codes]), ScheduleCode.CANT_DRIVE)
+            return Reason(code, f"robot {robot} can't drive now: it is {state.mode}, {why}")
+        lost = Reason(ReasonCode.POSE_UNKNOWN, f"robot {robot} does not know where it is")
+        return None if pose is not None and pose.localized else lost
 
     # --- Idle robots ------------------------------------------------------------------------------------------------
 

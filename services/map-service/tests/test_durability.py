@@ -8,6 +8,8 @@ import signal
 import httpx
 import pytest
 
+from fog_runtime.stores.records import ZONE_TIMES
+
 pytestmark = pytest.mark.live
 CIRCLE = {"kind": "BLOCKED", "shape": {"type": "circle", "centre": [6.0, 3.0], "radius": 0.5}, "reason": "wet floor"}
 RECOVERY = "/api/v1/store/recovery"
@@ -107,7 +109,7 @@ async def test_repeated_put_returns_the_first_result_though_its_condition_is_fal
 
 
 async def test_emptied_redis_is_noticed_and_the_zones_are_restored_from_memory(fog, client, raw, tokens):
-    await client.post("/api/v1/zones", json={**CIRCLE, "id": "wet"}, headers=tokens["operator"])
+    await client.post("/api/v1/zones", json={**CIRCLE, "id": "wet", "ttl_s": 900.0}, headers=tokens["operator"])
     refused = await client.post(RECOVERY, json={"action": "restore"}, headers=tokens["admin"])
     assert refused.status_code == 409, "nothing was lost"
     await raw.flushall()
@@ -123,6 +125,8 @@ async def test_emptied_redis_is_noticed_and_the_zones_are_restored_from_memory(f
     assert records == [], "nothing was written into the emptied store"
     assert (await client.post(RECOVERY, json={"action": "restore"}, headers=tokens["operator"])).status_code == 403
     assert (await client.post(RECOVERY, json={"action": "restore"}, headers=tokens["admin"])).status_code == 204
+    (times,) = await raw.hvals(f"fog:test:{ZONE_TIMES}")
+    assert b'"wet"' in times, "a restart now does not let it last longer"
     await fog.ready("map_service")
     assert (
         await client.post("/api/v1/zones", json={**CIRCLE, "id": "dry"}, headers=tokens["operator"])

@@ -1,6 +1,8 @@
 """`fognav bridge` and `fognav up --bridge`: what can't be used is refused before anything starts, with the remedy."""
 
+import re
 import sys
+from pathlib import Path
 
 import pytest
 from typer.testing import CliRunner
@@ -8,6 +10,7 @@ from typer.testing import CliRunner
 from fognav.__main__ import app
 from fognav.commands import bridge
 
+ROOT = Path(__file__).parents[2]
 HOME = 'adapters = "home-assistant"\nhome_assistant_credentials_file = "ha.toml"\n'
 FLEET = 'adapters = "vda5050"\nvda5050_mqtt_url = "mqtt://fleet.local"\n'
 NETWORK = 'home_assistant_mqtt_url = "mqtt://ha.local"\n'
@@ -64,6 +67,15 @@ def test_nothing_starts_with_a_bridge_that_can_not_run(tmp_path, monkeypatch):
     monkeypatch.setattr(bridge, "find_spec", lambda _: None)
     code, said = checked(tmp_path, HOME)
     assert (code, "install the package fog-bridges" in said) == (1, True), said
+
+
+def test_adapter_without_its_packages_names_the_file_of_their_pins(tmp_path, monkeypatch):
+    (tmp_path / "rosbags.py").write_text("raise ImportError('there is none')")
+    monkeypatch.setenv("PYTHONPATH", str(tmp_path))
+    code, said = checked(tmp_path, 'adapters = "ros2"\nros2_router = "tcp/192.168.7.5:7447"')
+    named = re.search(r"-r (requirements/\S+)", said.replace("\n", " "))
+    assert (code, named is not None) == (2, True), said
+    assert (ROOT / named[1]).is_file()
 
 
 def test_bridges_that_end_without_a_word_are_told_of_with_how_they_ended(tmp_path, monkeypatch):

@@ -22,7 +22,7 @@ from fog_bridges.ros2.wire import Topic
 from fog_contracts.grid import GridGeometry
 from fog_runtime.clock import SystemClock
 
-dds = pytest.importorskip("fog_bridges.ros2.dds", reason="pip install 'fog-bridges[dds]', on x86-64 only")
+dds = pytest.importorskip("fog_bridges.ros2.dds", reason="on x86-64: requirements/fog-bridges.txt")
 pytestmark = pytest.mark.live
 
 DOMAIN = 20 + os.getpid() % 80

@@ -48,6 +48,10 @@ FILE: Final = "FOGNAV_BRIDGE_FILE"
 _log = logs.get("bridge")
 
 
+_INSTALL: Final = "pip install --require-hashes -r requirements/fog-bridges.txt (in the checkout and in each release)"
+"""What an adapter's packages are installed by."""
+
+
 Level = Annotated[str, msgspec.Meta(pattern=r"^[^/+#$]{1,64}$(?!\n)")]
 """A level of a topic of MQTT."""
 
@@ -198,7 +202,7 @@ def _ros2(settings: Settings, site: str, _: Clock) -> Adapter:
         from fog_bridges.ros2.others import robot_radii  # noqa: PLC0415  # an extra
         from fog_bridges.ros2.rmf import Traffic, read_graph  # noqa: PLC0415  # an extra
     except ImportError as error:
-        raise SettingsError(f"the adapter ros2 needs more ({error}): pip install 'fog-bridges[ros2]'") from error
+        raise SettingsError(f"the adapter ros2 needs more ({error}): {_INSTALL}") from error
     try:
         wire = _dds(settings) if settings.ros2_wire == "dds" else _zenoh(settings)
         others = robot_radii(settings.ros2_robots)
@@ -229,9 +233,7 @@ def _dds(settings: Settings) -> DdsWire:
     try:
         from fog_bridges.ros2.dds import DdsWire  # noqa: PLC0415  # an extra
     except ImportError as error:
-        raise SettingsError(
-            f"ros2_wire = 'dds' needs more ({error}): pip install 'fog-bridges[dds,ros2]' (on x86-64 only)"
-        ) from error
+        raise SettingsError(f"ros2_wire = 'dds' needs more ({error}): on x86-64, {_INSTALL}") from error
     return DdsWire(settings.ros2_domain)
 
 
@@ -240,7 +242,7 @@ def _free_fleet(settings: Settings, site: str, _: Clock) -> Adapter:
         from fog_bridges.free_fleet import FreeFleetBridge  # noqa: PLC0415  # an extra
         from fog_bridges.ros2.session import ros_config  # noqa: PLC0415  # an extra
     except ImportError as error:
-        raise SettingsError(f"the adapter free-fleet needs more ({error}): pip install 'fog-bridges[ros2]'") from error
+        raise SettingsError(f"the adapter free-fleet needs more ({error}): {_INSTALL}") from error
     if settings.free_fleet_session_config is None and not settings.free_fleet_router:
         raise SettingsError(
             "free_fleet_router names the zenoh router of free_fleet's adapter: tcp/192.168.7.6:7447, say"
@@ -256,9 +258,7 @@ def _foxglove(settings: Settings, site: str, _: Clock) -> Adapter:
     try:
         from fog_bridges.foxglove.bridge import FoxgloveBridge  # noqa: PLC0415  # an extra
     except ImportError as error:
-        raise SettingsError(
-            f"the adapter foxglove needs more ({error}): pip install 'fog-bridges[foxglove]'"
-        ) from error
+        raise SettingsError(f"the adapter foxglove needs more ({error}): {_INSTALL}") from error
     return FoxgloveBridge(site, settings.zenoh_endpoints, settings.credentials())
 
 

@@ -30,7 +30,8 @@ GUESTS: Final = ("ros2", "rmf", "vda5050")
 def require_ros2() -> None:
     """Raise `WrongUseError` if the bridge to ROS 2 is not installed."""
     if any(find_spec(name) is None for name in (MODULES[BRIDGE], "rosbags", "xxhash")):
-        raise WrongUseError("the bridge to ROS 2 is not installed: pip install 'fog-bridges[ros2]' beside this command")
+        remedy = "pip install --require-hashes -r requirements/fog-bridges.txt, then the wheel of fog-bridges"
+        raise WrongUseError(f"the bridge to ROS 2 is not installed: {remedy}")
 
 
 def session_config(mode: str, port: int) -> zenoh.Config:

@@ -654,6 +654,30 @@ def test_obstacle_that_no_view_reaches_beyond_stays(view, reason):
     assert cost_and_speed(rig, 1.0, 1.0)[0] == LETHAL, reason
 
 
+def test_what_lidars_saw_in_a_blocked_area_is_gone_once_its_nodes_say_so_and_older_things_stay():
+    rig = make_rig()
+    rig.on_definition(definition(), 1.0)
+    rig.on_hazard(hazard("clear"), 2.0)
+    rig.on_obstacles("r1", obstacles((0.6, 0.6), ttl=600.0), 3.0, 3.0)  # stood there before
+    rig.on_obstacles("r1", obstacles((0.9, 0.9), (1.5, 0.9), ttl=600.0), 19.5, 19.5)
+    rig.on_hazard(hazard("blocked", 2), 20.0)
+    rig.on_hazard(hazard("unknown", 3), 30.0)
+    assert cost_and_speed(rig, 0.9, 0.9)[0] == LETHAL
+    rig.on_hazard(hazard("clear", 4), 40.0)
+    assert [cost_and_speed(rig, *at)[0] == LETHAL for at in ((0.6, 0.6), (0.9, 0.9), (1.5, 0.9))] == [
+        True, False, True,
+    ]  # fmt: skip
+
+
+def test_area_that_is_removed_takes_no_obstacle_with_it():
+    rig = make_rig()
+    rig.on_definition(definition(), 1.0)
+    rig.on_hazard(hazard("blocked"), 2.0)
+    rig.on_obstacles("r1", obstacles((0.9, 0.9), ttl=600.0), 3.0, 3.0)
+    rig.on_definition(definition(removed=True, version=1), 4.0)
+    assert cost_and_speed(rig, 0.9, 0.9)[0] == LETHAL
+
+
 def test_obstacle_that_is_seen_between_two_views_beyond_it_stays():
     rig = make_rig()
     for now in range(10):

@@ -277,6 +277,10 @@ class MapCore:
 
         A large change is made in several versions; zones are published when the last one is made.
         """
+        for publication in publications:
+            if isinstance(publication.message, HazardArea):
+                for layer in self._layers:
+                    layer.on_area(publication.message, at)
         together = 0 < self._zones.pop_switched() <= SWITCHED_CELLS
         cells = COMMIT_CELLS if self._serving and not together else None
         deltas = [Publication(ch.MAP_DELTA, delta) for delta in self.costmap.update(at.stamp, cells)]

@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 
     from fog_contracts.channels import Channel
     from fog_contracts.handlers import Handler, Moment, Publication
-    from fog_contracts.messages import Cause, Trace
+    from fog_contracts.messages import Cause, HazardArea, Trace
     from fog_contracts.shapes import ShapeMask
 
 Options = TypeVar("Options", bound=msgspec.Struct)
@@ -49,6 +49,9 @@ class CostLayer(ABC):
     def tick(self, at: Moment) -> Sequence[Publication]:  # noqa: ARG002  # for layers that depend on time
         """Advance to `at`, ten times a second; return what is to be published now."""
         return []
+
+    def on_area(self, area: HazardArea, at: Moment) -> None:  # noqa: B027  # for layers that depend on areas
+        """Hear how a watched area is on the map now, whenever that changes."""
 
     @abstractmethod
     def update_costs(self, window: Window, cost: Grid, speed: Grid) -> None:

@@ -230,6 +230,7 @@ class HazardsLayer(CostLayer):
             trace=None,
             free=[],
         )
+        area.confirmed = False  # nobody watches it any more
         self._removed[name] = _described(area)
         if (last := self._received.pop(name, None)) is not None:
             self._last_of_removed[name] = last.epoch, last.seq

@@ -3,7 +3,7 @@
 An obstacle in a corridor is out of sight as soon as the robot turns back, so it must be kept for longer than the detour
 takes; a passing person must be cleared as soon as a lidar covers the place again. Hence obstacles expire late, and a
 cell is cleared when the free view of two consecutive reports reaches beyond it, as clearing by ray tracing does in
-layered costmaps (Lu, Hershberger, Smart 2014).
+layered costmaps (Lu, Hershberger, Smart 2014). What a watched area was blocked by is gone when its sensors say so.
 
 A point becomes a small lethal disc. Points on or near a robot belong to that robot and are left out: a robot must never
 enclose another one by having seen it. A robot is believed what it can see from the pose that it reports, and a report
@@ -20,9 +20,10 @@ import numpy as np
 
 from fog_contracts import channels as ch
 from fog_contracts.costs import LETHAL
+from fog_contracts.geometry import normalized_polygon
 from fog_contracts.grid import Window
 from fog_contracts.messages import REACH_UNIT_M, VIEW_SECTORS, Cause, CircleShape, RobotPose
-from fog_contracts.shapes import ShapeMask
+from fog_contracts.shapes import ShapeMask, rasterize
 from map_service.layers.base import CostLayer, LayerFactory, NoOptions, write_cost
 
 if TYPE_CHECKING:
@@ -34,7 +35,7 @@ if TYPE_CHECKING:
     from fog_contracts.channels import Channel
     from fog_contracts.grid import GridGeometry
     from fog_contracts.handlers import Handler, Ids, Moment, Publication
-    from fog_contracts.messages import Reported, RobotObstacles, View
+    from fog_contracts.messages import HazardArea, Reported, RobotObstacles, View
     from map_service.layers.base import Grid
 
 MARGIN_M: Final = 0.2
@@ -118,15 +119,18 @@ Cells of 0.1 m, which are what robots report, on both sides of its way for as lo
 """
 VIEWS_TO_CLEAR: Final = 2
 """How many consecutive views must reach beyond a cell to clear it: one beam may have missed something thin."""
+AREA_LATE_S: Final = 10.0
+"""What robots saw in an area at most so long before its sensors agreed that it is blocked may be what blocks it."""
 _PATCH_CELLS: Final = 64
 """Changed cells are marked as updated in patches of this size, so that windows stay small."""
 
 
 class _Seen(NamedTuple):
-    """When an obstacle expires (s, monotonic), and which robot saw it first."""
+    """When an obstacle expires and was first seen (s, monotonic), and by which robot."""
 
     expiry: float
     robot: str
+    first: float
 
 
 class ObstaclesLayer(CostLayer):
@@ -140,6 +144,8 @@ class ObstaclesLayer(CostLayer):
         # 0: no obstacle; else one more than the consecutive views that reached beyond it.
         self._views = np.zeros(geometry.shape, dtype=np.uint8)
         self._next_expiry = float("inf")
+        self._blocked: dict[str, float] = {}
+        """Since when (s) the sensors of each area have said that it is blocked; until they say that it is clear."""
         self._poses: dict[str, tuple[float, RobotPose]] = {}
         reach = round(DISC_RADIUS / geometry.resolution)
         span = range(-reach, reach + 1)
@@ -157,7 +163,7 @@ class ObstaclesLayer(CostLayer):
         }
 
     def _on_obstacles(self, ids: Ids, seen: RobotObstacles, at: Moment) -> list[Publication]:
-        robot, seen_until = ids["robot"], _Seen(at.now + seen.ttl, ids["robot"])
+        robot, seen_until = ids["robot"], _Seen(at.now + seen.ttl, ids["robot"], at.now)
         points = np.array(seen.points, dtype=np.float64).reshape(-1, 2)
         origin = self._seen_from(robot, seen.view, at.now)
         if origin is None:
@@ -202,6 +208,24 @@ class ObstaclesLayer(CostLayer):
         self._views.flat[through] += np.uint8(1)
         cleared = through[self._views.flat[through] > VIEWS_TO_CLEAR]
         self._remove(cleared, Cause(kind="obstacle", id=robot, state="gone"))
+
+    def on_area(self, area: HazardArea, at: Moment) -> None:
+        """Remove what was seen in an area while it was blocked, once its sensors say that it is clear.
+
+        Else robots would keep away for minutes from what is gone, and so none would see that it is.
+        """
+        hazard = area.hazard
+        if hazard.override is not None:
+            return
+        if hazard.state == "blocked":
+            self._blocked.setdefault(hazard.area, at.now)
+        elif hazard.state == "clear" and area.confirmed and hazard.area in self._blocked:
+            begun = self._blocked.pop(hazard.area) - AREA_LATE_S
+            window, mask = rasterize(normalized_polygon(area.polygon), self._geometry)
+            cells = self._obstacles_in(window)
+            numbers = self._numbers(cells[mask[cells[:, 1] - window.y, cells[:, 0] - window.x]])
+            gone = [number for number in numbers.tolist() if self._seen[number].first >= begun]
+            self._remove(np.array(gone, dtype=np.int64), Cause(kind="obstacle", id=hazard.area, state="gone"))
 
     def _on_pose(self, ids: Ids, pose: RobotPose, at: Moment) -> list[Publication]:
         """Remove the obstacle cells at a robot's position: they were the robot."""

@@ -64,8 +64,8 @@ FREE_S: Final = 540.0
 """How long an area is free between two blocks, on average (exponential)."""
 STANDS_S: Final = (60.0, 300.0)
 """How long a block stands (uniform)."""
-TOLD_S: Final = 0.6
-"""From a change to the area's state, as the rule of evidence takes at full echoes (`fognav bench debounce`)."""
+TOLD_S: Final = {"blocked": 0.3, "clear": 1.2}
+"""From a change to the area's state, as a drive in lockstep had it."""
 RANGE_M: Final = 12.0
 MEMORY_S: Final = 600.0
 """How long a robot's report holds where no lidar sees that the obstacle is gone: the agent's default."""
@@ -144,6 +144,8 @@ class WatchedMap(ChangingMap):
         self._begun, self._steps = 0.0, 0
         self._hazards_told: dict[str, AreaHazard] = {}
         self._changed: dict[str, float] = {}
+        self._reporter: dict[str, str] = {}
+        """Which robot has reported a block: it goes on while it sees it. What is on the map already, nobody reports."""
         self._in_block: set[tuple[str, str]] = set()
         self.blocked, self.entered = 0, 0
         """How many blocks stood, and how often a robot's body entered one."""
@@ -214,7 +216,7 @@ class WatchedMap(ChangingMap):
             known, state = self._hazards_told.get(area.id), "blocked" if area.id in blocked else "clear"
             if known is not None and known.state == state:
                 self._changed.pop(area.id, None)
-            elif known is None or at.now - self._changed.setdefault(area.id, at.now) >= TOLD_S:
+            elif known is None or at.now - self._changed.setdefault(area.id, at.now) >= TOLD_S[state]:
                 hazard = AreaHazard(
                     area=area.id, state="blocked" if state == "blocked" else "clear", severity=SEVERITY[state],
                     penalty=LETHAL if state == "blocked" else 0, since=at.stamp, epoch=1,
@@ -239,12 +241,21 @@ class WatchedMap(ChangingMap):
         for obstacle, found, _ in seen:
             if int(((found <= nearest) & (found <= RANGE_M)).sum()) >= 2:
                 hit.append(obstacle)
+        told = {area for area, hazard in self._hazards_told.items() if hazard.state == "blocked"}
+        for block in self._standing:
+            if block.area not in told and block.obstacle in hit:
+                self._reporter.setdefault(block.obstacle.id, robot.id)
         echo = nearest <= RANGE_M
         points = np.column_stack((
             robot.x + nearest[echo] * np.cos(_BEAMS[echo]), robot.y + nearest[echo] * np.sin(_BEAMS[echo])
         ))  # fmt: skip
         return RobotObstacles(
-            points=[point for obstacle in hit for point in _cells_of(obstacle)],
+            points=[
+                point
+                for obstacle in hit
+                if self._reporter.get(obstacle.id) == robot.id
+                for point in _cells_of(obstacle)
+            ],
             stamp=at.stamp,
             ttl=MEMORY_S,
             view=view(Pose2(robot.x, robot.y, robot.theta), points, self.geometry),

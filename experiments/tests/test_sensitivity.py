@@ -10,9 +10,9 @@ import ring_site as ring
 
 from fog_kernels.sonar import default_config
 from fog_runtime.configuration.site import load_site
-from fognav_experiments.comparison import runner
+from fognav_experiments.comparison import runner, sensor_kinds
 from fognav_experiments.comparison.drives import ExperimentSpec, RouteSpec, draw
-from fognav_experiments.comparison.records import DriveFiles
+from fognav_experiments.comparison.records import DriveFiles, Folder, unpack_archive
 from fognav_experiments.comparison.sensitivity import (
     BASE,
     Axis,
@@ -28,8 +28,10 @@ from fognav_experiments.comparison.sensitivity import (
     unwarned,
     varied_site,
 )
+from fognav_experiments.comparison.sensor_kinds import KINDS, WHAT, coverage, saved
 
 ESTIG = Path(__file__).parents[2] / "sites" / "estig"
+RESULTS = Path(__file__).parents[2] / "docs" / "results"
 pytestmark = pytest.mark.timeout(900)
 
 DEBOUNCE = Plane(Axis("readings", [2, 20]), Axis("pause_ms", [50, 500]))
@@ -130,6 +132,31 @@ def test_the_page_gives_few_situations_no_interval_and_names_the_commits_of_its_
     assert "| 2 | 50 | 2 | 41.5 | 138.3 |" in text
     assert "| commit | a: 2 of the drives |" in text
     assert "| commit | not known: 2 of the drives |" in text
+
+
+# --- other sensors in the nodes' places ---
+
+
+def test_a_kind_sees_as_much_of_an_area_as_its_beams_cover_and_only_what_it_can_see(estig):
+    shares = {
+        kind.name: {what: coverage(estig, estig.site.areas[0], kind, what) for what in WHAT} for kind in KINDS
+    }  # fmt: skip
+    sonar, sonar_of_all_faces, narrow, wide, presence, contact = (shares[kind.name] for kind in KINDS)
+    assert 0.0 < sonar["box"] < sonar_of_all_faces["box"] < 1.0
+    assert narrow["box"] < wide["box"] < 1.0
+    assert narrow["door"] < narrow["box"], "a thin thing is seen at fewer places"
+    assert presence == {"box": 0.0, "door": 0.0, "people": 1.0}
+    assert contact == {"box": 0.0, "door": 1.0, "people": 0.0}
+
+
+def test_published_kinds_of_sensors_are_what_the_archive_of_drives_gives(estig, tmp_path):
+    folder = Folder(tmp_path / "drives")
+    unpack_archive(RESULTS / "estig-floor" / "drives.jsonl.xz", folder)
+    records = folder.drives.read()
+    assert str(saved(estig, records, None, "box").metres) == "944.2 ± 375.7", "that of the drives themselves"
+    command = "fognav experiment sensors docs/results/estig-floor/drives.jsonl.xz --out DIR"
+    for file in sensor_kinds.publish(estig, records, command, tmp_path):
+        assert file.read_text("utf-8") == (RESULTS / "sensors" / file.name).read_text("utf-8"), file.name
 
 
 # --- where they are driven ---

@@ -261,6 +261,19 @@ def curves(panels: Mapping[str, Mapping[str, Sequence[tuple[float, float]]]], ac
     return figure
 
 
+def scatter(points: Mapping[str, tuple[float, Estimate]], across: str, upwards: str) -> str:
+    """Return named points as SVG, by a value and an estimate, which is shown with its 95 % confidence interval."""
+    figure = Figure(figsize=(6.6, 3.6), layout="constrained")
+    axes = figure.add_subplot(xlabel=across, ylabel=upwards)
+    for name, (x, found) in points.items():
+        axes.errorbar(x, found.mean, yerr=found.half, fmt="o", capsize=3, label=name)
+    axes.set_xlim(left=0.0)
+    axes.grid(color="#ddd")
+    axes.axhline(0.0, color="#888")
+    figure.legend(loc="outside lower center", ncols=2, frameon=False)
+    return svg_of(figure)
+
+
 def floor(map_: StaticMap) -> tuple[Figure, Axes]:
     """Return a map to draw on, in metres of frame `map`: free cells white, occupied black, unknown grey."""
     geometry = map_.geometry

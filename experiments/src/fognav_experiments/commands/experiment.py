@@ -15,7 +15,7 @@ from fognav.operate.fog import find_fog
 from fognav.operate.options import FogOption, JsonOption, RobotOption  # noqa: TC001  # Typer reads annotations at run time
 from fognav.output import NOT_TRUE, WrongUseError, exit_codes, print_json, print_line
 from fognav_experiments.commands.driving import count_failed, measured_on, prepare, show
-from fognav_experiments.commands.sensitivity import sensitivity_command
+from fognav_experiments.commands.sensitivity import sensitivity_command, sensors_command
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
@@ -31,6 +31,9 @@ experiment_app = typer.Typer(help="Compare setups as the thesis did, and play sc
 experiment_app.command(
     "sensitivity", epilog="Example: fognav experiment sensitivity --out sweep --readings 2,5,20 --pause 50,500"
 )(sensitivity_command)
+experiment_app.command(
+    "sensors", epilog="Example: fognav experiment sensors docs/results/estig-floor/drives.jsonl.xz --out sensors"
+)(sensors_command)
 
 
 def add_to(app: typer.Typer) -> None:

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import os
-from pathlib import Path  # noqa: TC003  # Typer reads annotations at run time
+from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING, Annotated, Final
 
 import typer
@@ -93,6 +94,29 @@ def sensitivity_command(  # noqa: PLR0913  # each option is an argument
             raise WrongUseError(str(error)) from error
     if failed:
         raise typer.Exit(NOT_TRUE)
+
+
+def sensors_command(
+    archive: Annotated[Path, typer.Argument(metavar="FILE", help="Archive of drives with --draws floor.")],
+    *,
+    out: Annotated[Path, typer.Option("--out", metavar="DIR", help="Folder of the report.")],
+    site: Annotated[Path | None, typer.Option("--site", metavar="DIR", help="Site of the drives.")] = None,
+) -> None:
+    """Compare kinds of sensors by what a corridor costs and how many metres they would have saved in these drives."""
+    from fog_runtime.configuration.site import SiteError, load_site  # noqa: PLC0415  # keeps the other commands fast
+    from fognav_experiments.comparison import records, sensor_kinds  # noqa: PLC0415  # same
+
+    command = f"fognav experiment sensors {archive} --out DIR"
+    with exit_codes(), TemporaryDirectory(prefix="fognav-") as unpacked:
+        try:
+            folder = records.Folder(Path(unpacked))
+            records.unpack_archive(archive, folder)
+            loaded = load_site(checkout.site_folder(site))
+            out.mkdir(parents=True, exist_ok=True)
+            for file in sensor_kinds.publish(loaded, folder.drives.read(), command, out):
+                print_line(str(file))
+        except (records.FolderError, SiteError, OSError) as error:
+            raise WrongUseError(str(error)) from error
 
 
 def _sweep(  # what is driven, where and how

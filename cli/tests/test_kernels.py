@@ -17,6 +17,15 @@ def test_complete_cache_is_detected_and_prints_nothing() -> None:
     assert printed == []
 
 
+def test_complete_cache_is_tried_out_once_for_a_cpu(monkeypatch: pytest.MonkeyPatch) -> None:
+    kernels.warm_cache(lambda _: None)
+    monkeypatch.setattr("sys.executable", "/bin/false")
+    kernels.warm_cache(lambda _: None)
+    monkeypatch.setenv("NUMBA_CPU_NAME", "generic")
+    with pytest.raises(kernels.KernelsError):
+        kernels.warm_cache(lambda _: None)
+
+
 def test_module_newer_than_its_cache_is_stale(tmp_path: Path) -> None:
     (tmp_path / "__pycache__").mkdir()
     (tmp_path / "plain.py").write_text('"""Mentions njit only."""\n')

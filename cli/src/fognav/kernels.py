@@ -1,6 +1,8 @@
 """The cache of compiled kernels: checks whether it is complete, and fills it in a process of its own."""
 
 import contextlib
+import hashlib
+import importlib.metadata
 import importlib.util
 import os
 import re
@@ -18,6 +20,7 @@ from fognav.output import FailedError, console
 
 _WARM_TIMEOUT_S: Final = 900.0
 _COMPILES: Final = re.compile(r"^(@|\w+ = )njit\(", re.MULTILINE)
+_CPU: Final = ("model name", "flags", "CPU implementer", "CPU part", "Features")
 _PROGRESS: Final = re.compile(r"(\d+) of (\d+) kernels ready: (.*)")
 
 
@@ -57,22 +60,48 @@ def _package() -> Path:
 
 
 def warm_cache(print_line: Callable[[str], None]) -> None:
-    """Compile the missing kernels for this CPU, showing the progress; raises `KernelsError`."""
+    """Compile the missing kernels for this CPU, showing the progress; raises `KernelsError`.
+
+    Whether numba takes what is there, a process tries out that needs a second, so only once for each cache.
+    """
+    folder = _package()
     if is_warm():
+        if _was_checked(folder):
+            return
         _run(lambda _line: None)
     else:
         print_line("compiling the kernels (once, about a minute)")
         with _progress_display(print_line) as show:
             _run(show)
-    _mark_checked(_package())
+    _mark_checked(folder)
+
+
+def _checked(folder: Path) -> Path:
+    return folder / "__pycache__" / "checked.sha256"
+
+
+def _was_checked(folder: Path) -> bool:
+    with contextlib.suppress(FileNotFoundError):
+        return _checked(folder).read_text("ascii") == _state(folder)
+    return False
 
 
 def _mark_checked(folder: Path) -> None:
-    """Note in the times of the indices that they fit: numba leaves those alone whose sources were only touched."""
-    for module in folder.glob("*.py"):
-        for index in _indices(module):
-            with contextlib.suppress(OSError):  # another user's: it stays as it is
+    """Note that the cache fits, in the times of its indices, too: numba takes those whose sources were only touched."""
+    with contextlib.suppress(OSError):  # another user's: it stays as it is
+        for module in folder.glob("*.py"):
+            for index in _indices(module):
                 os.utime(index)
+        _checked(folder).write_text(_state(folder), "ascii")
+
+
+def _state(folder: Path) -> str:
+    """Return a hash of what decides whether numba takes the cache: files, versions, settings and CPU."""
+    files = sorted((file.name, file.stat().st_size) for file in (folder / "__pycache__").glob("*.nb[ic]*"))
+    versions = sys.version, *map(importlib.metadata.version, ("numba", "llvmlite"))
+    settings = sorted(item for item in os.environ.items() if item[0].startswith("NUMBA_"))
+    cpu = sorted({line for line in Path("/proc/cpuinfo").read_text("utf-8").splitlines() if line.startswith(_CPU)})
+    return hashlib.sha256(repr((files, versions, settings, cpu)).encode()).hexdigest()
 
 
 def _run(on_line: Callable[[str], None]) -> None:

@@ -7,6 +7,7 @@ import threading
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
+from dataclasses import replace
 
 import httpx
 import paho.mqtt.client as paho
@@ -247,6 +248,9 @@ async def test_router_to_which_no_session_can_be_opened_ends_and_is_started_agai
     """As when something in it hangs: its process runs, and its port accepts connections, for nothing."""
     folder = SystemFolder(tmp_path)
     program = router_program(net.free_port(), security=site.security.folder("zenoh"))
+    assert program.command[1:3] == ("-m", "fog_runtime.router")
+    sooner = "from fog_runtime import router; router.WATCH_S = router.DEAF_S = router.AGAIN_S = 1.0; router.main()"
+    program = replace(program, command=(program.command[0], "-c", sooner, *program.command[3:]))
     async with Supervisor(lambda _: None) as supervisor:
         ProgramSet(supervisor, folder, {}).add_server(program)
         supervisor.start(program.name)

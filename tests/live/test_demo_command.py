@@ -38,6 +38,7 @@ END_TIMEOUT_S = 60.0
 """For all processes to end; the supervisor gives each rank of programs 5 s before it kills them."""
 PROCESSES = 10
 """Nine programs, and the guardian started by its watchdog."""
+GUARDIAN = "robot_agent.guardian"
 FAILED = 1
 ESTIG = Path(__file__).parents[2] / "sites" / "estig"
 CORES = Path(__file__).parents[1] / "replay" / "cores.py"
@@ -205,6 +206,7 @@ async def test_interrupting_one_of_two_demos_leaves_the_other_driving(
     assert folders[1] is not None
     families = [one.children(), other.children()]
     assert [len(family) >= PROCESSES for family in families] == [True, True]
+    names = [child.cmdline()[-1] for child in families[1]]
     ports = [ports_of(family) for family in families]
     assert [len(taken) > 3 for taken in ports] == [True, True]
     assert ports[0].isdisjoint(ports[1])
@@ -216,8 +218,10 @@ async def test_interrupting_one_of_two_demos_leaves_the_other_driving(
     assert_nothing_left(one, folders[0], families[0], ports[0])
     assert_replay_gives_the_recorded_maps(recording, tmp_path / "replayed")
 
-    assert [child for child in families[1] if not alive(child)] == []  # named by what it was
-    await drives(other, families[1])
+    ended = [name for child, name in zip(families[1], names, strict=True) if not alive(child)]
+    # A busy machine may have kept a guardian waiting: its watchdog starts another one.
+    assert [name for name in ended if name != GUARDIAN] == []
+    await drives(other, other.children())
 
     os.kill(other.process.pid, signal.SIGTERM)
     assert await other.wait_end(END_TIMEOUT_S) == FAILED

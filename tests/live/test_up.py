@@ -21,6 +21,7 @@ import psutil
 import pytest
 from attacks import ATTACKS, few_files, running
 from floor_ports import floor_ports
+from lateness import Lateness
 from websockets.asyncio.client import connect
 
 from fog_contracts import channels as ch
@@ -498,10 +499,11 @@ async def test_robot_drives_on_and_stops_while_strangers_attack_every_server(nod
             await attacks.enter_async_context(running(ATTACKS["say nothing and stay"](port)))
         assert set(watched.modes) == {"NORMAL"}, watched.modes
         assert max(watched.ages) < 3.0
+        late = Lateness(system["pids"].values)
         begun = time.monotonic()
         stopped = await client.post(f"/api/v1/robots/{robot}/stop", json={})
         assert stopped.status_code < 300, stopped.text
         async with asyncio.timeout(60):
             while watched.modes[-1] == "NORMAL":  # noqa: ASYNC110  # as above
                 await asyncio.sleep(0.01)
-        assert time.monotonic() - begun < 5.0  # less than 0.5, but for what else keeps this computer busy
+        assert time.monotonic() - begun < 5.0 + late.seconds()  # on a computer that does nothing else less than 0.5

@@ -81,6 +81,19 @@ def group_of(module: str) -> tuple[int, str]:
     return COMPUTING, "firmware" if module.startswith("firmware/") else module
 
 
+@cache
+def scope_of(nodeid: str, tier: str) -> str:
+    """Return which tests run with this one on one worker: its group, but whole drives that share nothing run anywhere.
+
+    Otherwise a module of twelve drives would keep one worker for minutes after all others have ended.
+    """
+    module = module_of(nodeid)
+    group = group_of(module)
+    shares = re.search(r"scope=|^@(functools\.)?(lru_)?cache", (ROOT / module).read_text("utf-8"), re.MULTILINE)
+    alone = tier != "quick" and group == (COMPUTING, module) and not shares
+    return nodeid if alone else str(group)
+
+
 def computes(worker: str) -> bool:
     """Whether this worker prefers tests that only compute: one per core except one, which tests that wait share."""
     return int(worker.removeprefix("gw")) < max(1, (os.cpu_count() or 1) - 1)
@@ -100,7 +113,7 @@ def pytest_xdist_make_scheduler(config: pytest.Config, log: object) -> "LoadScop
 
     class GroupScheduling(LoadScopeScheduling):
         def _split_scope(self, nodeid: str) -> str:
-            return str(group_of(module_of(nodeid)))
+            return scope_of(nodeid, config.getoption("tier"))
 
         def _assign_work_unit(self, node: "WorkerController") -> None:
             # Each worker takes the other kind when there is no more of its own, so that none is idle before the end.

@@ -411,6 +411,38 @@ async def test_robot_is_online_with_factsheet_and_state_takes_orders_and_says_wh
         await until(lambda: words()[-1] == "OFFLINE", "it was ended in good order")
 
 
+async def test_broker_that_refuses_the_subscription_to_orders_is_a_problem(until):
+    told: list[bytes] = []
+
+    async def serve(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+        with suppress(asyncio.IncompleteReadError):
+            while True:
+                kind, length = await reader.readexactly(2)
+                if length > 127:  # the next byte has the rest of it
+                    length += ((await reader.readexactly(1))[0] - 1) * 128
+                content = await reader.readexactly(length)
+                if kind == 0x10:
+                    writer.write(b"\x20\x02\0\0")
+                elif kind == 0x82:
+                    writer.write(b"\x90\x04" + content[:2] + b"\0\x80")
+                else:
+                    told.append(content)
+        writer.close()
+
+    server = await asyncio.start_server(serve, "127.0.0.1", 0)
+    broker = Broker.of(f"mqtt://127.0.0.1:{server.sockets[0].getsockname()[1]}")
+    bridge = Vda5050Bridge(Setup(site="lab", broker=broker, version="3.0", interface="vda5050", manufacturer="fognav",
+                                 map_id="lab", robots=["r1"], zones=[]))  # fmt: skip
+    running = asyncio.create_task(bridge.run(Planner(), SystemClock()))
+    await until(
+        lambda: "vda5050/v3/fognav/r1/instantActions: allow" in bridge.problem, "it is told", lambda: bridge.problem
+    )
+    assert {*told} <= {b""}, "nothing but that it leaves again"
+    running.cancel()
+    await asyncio.gather(running, return_exceptions=True)
+    server.close()
+
+
 @pytest.mark.live
 async def test_robot_of_others_gets_the_zones_when_it_comes(tmp_path, until):
     async with fleet_of(tmp_path) as (fleet, bridge, _floor, _broker, _running):

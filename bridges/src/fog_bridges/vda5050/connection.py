@@ -93,7 +93,11 @@ class Connection:
             inbox = Inbox(self._on_message)
             try:
                 async with self._broker.client(self._name, self.will(), inbox) as client:
-                    await client.subscribe([(topic, 0) for topic in self._topics])
+                    codes = await client.subscribe([(topic, 0) for topic in self._topics])
+                    found = zip(self._topics, codes, strict=True)
+                    refused = [topic for topic, code in found if getattr(code, "is_failure", False)]
+                    if refused:  # a robot that hears nothing must not be told to be there
+                        raise aiomqtt.MqttError(f"it lets this user not receive {', '.join(refused)}: allow that there")  # noqa: TRY301  # as any other failure
                     inbox.open()
                     self.problem = ""
                     await self.serve(client)

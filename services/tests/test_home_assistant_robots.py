@@ -317,9 +317,10 @@ def test_nobody_is_called_silent_while_the_floor_is_lost_and_who_was_silent_stay
     assert [each["problem"] for each in told(core, 201.0, r1(stamp=201.0))] == ["OFF"]
 
 
-def devices(core: HomeAssistant, *events: tuple[str, dict[str, object]]) -> list[tuple[str, bool]]:
-    """Return whose descriptions are published (True) and deleted (False) by events."""
-    found = [publication for name, data in events for publication in core.on_event(name, data, 0.0)]
+def devices(core: HomeAssistant, *events: tuple[str, dict[str, object]], now: float = 0.0) -> list[tuple[str, bool]]:
+    """Return whose descriptions are published (True) and deleted (False) after events at one time (s)."""
+    found = [publication for name, data in events for publication in core.on_event(name, data, now)]
+    found += core.tick(now)
     return [
         (each.ids["robot_device"], each.message is not None)
         for each in found
@@ -333,7 +334,19 @@ def test_robot_that_is_gone_is_forgotten_and_one_that_a_new_run_has_not_told_of_
     assert devices(core, BEGIN, *robots, END) == [("robot_r1", True), ("robot_r2", True)]
     assert devices(core, *robots, BEGIN, *robots, END) == []
     assert devices(core, ("robot", {"id": "r2", "value": None})) == [("robot_r2", False)]
-    assert devices(core, BEGIN, END) == [("robot_r1", False)], "another run of the console does not know it"
+    assert devices(core, BEGIN, END) == [], "another run of the console does not know it yet"
+    assert devices(core, now=599.0) == []
+    assert devices(core, now=600.0) == [("robot_r1", False)]
+    assert devices(core, now=601.0) == []
+
+
+def test_device_that_an_earlier_run_has_left_of_a_robot_that_the_site_has_no_more_is_deleted():
+    core = HomeAssistant("lab")
+    for robot in ("r1", "r9"):
+        core.on_kept(robot)
+    assert devices(core, BEGIN, ("robot", {"id": "r1", "value": view()}), END) == [("robot_r1", True)]
+    core.on_kept("r1")
+    assert devices(core, now=600.0) == [("robot_r9", False)]
 
 
 class Slow:
@@ -346,8 +359,8 @@ class Slow:
         self.sent: list[tuple[str, str]] = []
         self.told: list[tuple[str, str]] = []
 
-    def on(self, _channel, handler) -> None:
-        self.order = handler
+    def on(self, channel, handler) -> None:
+        self.order = handler if channel is ch.ROBOT_ORDER else self.order
 
     def on_connect(self, _callback) -> None: ...
     def publish_nowait(self, *_, **__) -> None: ...

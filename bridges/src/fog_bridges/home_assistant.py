@@ -30,6 +30,11 @@ _NO_GOAL: Final = "no goal"
 _ERRORS: Final = ("FAULT", "PROTECTIVE_STOP")
 _CHARGING: Final = ("reconditioning", "bulk", "trickle")
 _LOST: Final = "nobody knows the floor's state at the moment: send the goal again once the robot is available"
+FORGET_S: Final = 600.0
+"""A device of a robot of which the floor has told nothing for so long is deleted: it is no robot of the site any more.
+
+A console that was started anew hears of robots that are switched off from the planner only, which may start later.
+"""
 _MOST: Final = 255
 """Characters of a state in Home Assistant."""
 
@@ -50,6 +55,8 @@ class HomeAssistant:
         """Robots that told nothing for too long, and have not been heard since."""
         self._told: dict[str, tuple[str, str]] = {}
         """The description and state of each robot that Home Assistant has."""
+        self._gone: set[str] = set()
+        """Robots whose devices are to be deleted."""
 
     def on_event(self, name: str, data: dict[str, Any], now: float) -> Sequence[Publication]:
         """Take in an event of the floor at `now` (s, monotonic); return what Home Assistant has to know."""
@@ -72,6 +79,7 @@ class HomeAssistant:
         """Take in what is told of a robot: what is told before all is known may be long ago, and is no sign of life."""
         if view is None:
             self._robots.pop(robot, None)
+            self._gone.add(robot)
             self._heard.forget(robot)
             self._silent.discard(robot)
             return
@@ -80,19 +88,26 @@ class HomeAssistant:
             self._heard.hear(robot, now)
             self._silent.discard(robot)
         self._robots[robot] = view
+        self._gone.discard(robot)
+
+    def on_kept(self, robot: str) -> None:
+        """Take in that the broker keeps a robot's state, told now or by an earlier run."""
+        self._told.setdefault(robot, ("", ""))
 
     def on_lost(self) -> None:
         """Take in that nobody knows the floor's state."""
         self._known_since = math.inf
 
     def tick(self, now: float) -> Sequence[Publication]:
-        """Take in that time passes; return what Home Assistant has to know of robots that have fallen silent."""
+        """Take in that time passes; return what Home Assistant has to know of robots that are silent or gone."""
+        if now - self._known_since >= FORGET_S:
+            self._gone |= self._told.keys() - self._robots.keys()
         silent = {
             robot
             for robot, view in self._robots.items()
             if view["state"] and min(self._heard.silent_s(robot, now), now - self._known_since) >= SILENT_S
         }
-        if silent <= self._silent:
+        if silent <= self._silent and not self._gone:
             return ()
         self._silent |= silent
         return list(self._news())
@@ -133,7 +148,8 @@ class HomeAssistant:
     def _news(self) -> Iterator[Publication]:
         if not self._is_complete:
             return
-        for robot in sorted(self._told.keys() - self._robots.keys()):
+        gone, self._gone = self._told.keys() & self._gone, set()
+        for robot in sorted(gone):
             del self._told[robot]
             yield Publication(ch.HOME_ASSISTANT_ROBOT, None, {"robot_device": f"robot_{robot}"})
             for channel in (ch.ROBOT_REPORT, ch.ROBOT_REFUSAL):

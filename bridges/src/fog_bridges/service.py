@@ -56,6 +56,7 @@ class HomeAssistantBridge:
         self._limited = logs.RateLimited(_log)
         """A broker may send the same order at any rate."""
         mqtt.on(ch.ROBOT_ORDER, self._on_order)
+        mqtt.on(ch.ROBOT_REPORT, lambda ids, _: core.on_kept(ids["robot"]))
         mqtt.on_connect(self._tell_everything)
 
     @property

@@ -259,7 +259,7 @@ HOME_ASSISTANT_ROBOT = _text("home_assistant_robot", "homeassistant/device/{site
     publishers=(BRIDGE,),        subscribers=("home-assistant",), durability=LATEST,   qos=1,
     about="Home Assistant's device discovery of a robot, `robot_` and its id (JSON)")
 ROBOT_REPORT      = _text( "robot_report",      V1 + "robots/{robot}/report",                           limit=2 * KIB,
-    publishers=(BRIDGE,),        subscribers=("home-assistant",), durability=LATEST,   qos=1,
+    publishers=(BRIDGE,),        subscribers=("home-assistant", BRIDGE), durability=LATEST, qos=1,
     about="what a robot does, why it stands, its battery and goal (JSON)")
 ROBOT_ORDER       = _text( "robot_order",       V1 + "robots/{robot}/order",                            limit=64,
     publishers=("home-assistant",), subscribers=(BRIDGE,),        durability=VOLATILE, qos=1,

@@ -20,7 +20,8 @@ import pytest
 
 from fog_runtime.configuration.robot_file import parse_robot
 from fog_runtime.record import Recorder
-from fognav.output import WrongUseError
+from fognav.output import FailedError, WrongUseError
+from fognav.robot_page import calibrating
 from fognav.robot_page.by_itself import SPEED_M_S, SquareDrive
 from fognav.robot_page.calibrating import read, refuse_disagreement
 from fognav.robot_page.view import RobotView
@@ -71,6 +72,45 @@ def test_eight_bodies_up_to_15_percent_wrong_are_found_and_intervals_are_honest(
     assert max(found["worst"][name] for name in ("x", "y")) < 0.005
     assert found["worst"]["yaw"] < math.radians(0.3)
     assert 0.9 <= found["intervals_true"] <= 0.99
+
+
+@pytest.mark.drive
+def test_what_was_not_heard_while_the_wheels_turned_makes_no_figure_wrong():
+    rng = np.random.default_rng(1)
+    body, made = random_body(rng), Calibrator()
+    for entry in recording(body, rng):
+        if getattr(entry, "now", 0.0) < 40.0 or entry.now % 8.0 > 3.0:
+            made.take(entry)
+    found = made.solve()
+    for name in ("left", "right", "axle"):
+        truth = getattr(body, name) * (0.235 if name == "axle" else 1.0)
+        assert found.figures[name].value == pytest.approx(truth, rel=0.004)
+    with pytest.raises(CalibrationError, match=r"were not heard from 40\.\d s to 43\.\d s of this drive"):
+        made.end_error(made.start, mirrored=False)
+
+
+def test_a_drive_is_heard_while_it_is_calibrated_by(tmp_path, monkeypatch):
+    """The agent's socket holds a second of what is not read."""
+    path, log, heard, solved = tmp_path / "agent.sock", tmp_path / "drive.mcap", threading.Event(), []
+    entries = list(recording(random_body(np.random.default_rng(1)), np.random.default_rng(1), [STRAIGHT]))
+    monkeypatch.setattr(calibrating, "_progress", lambda _: str(solved.append(heard.wait(10.0))))
+    with socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET) as listener:
+        listener.bind(str(path))
+        listener.listen()
+
+        def serve():
+            link, _ = listener.accept()
+            with link:
+                for entry in entries:
+                    link.sendall(local_link.encode(entry))
+                heard.set()
+
+        server = threading.Thread(target=serve)
+        server.start()
+        with pytest.raises(FailedError, match="the agent has closed the link"):
+            calibrating.record(path, log, None)
+        server.join()
+    assert solved == [True], "all was read before the first solution"
 
 
 @pytest.mark.parametrize(

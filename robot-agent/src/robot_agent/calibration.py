@@ -8,6 +8,7 @@ scans are older than the counters. Its uncertainty is that of the fit, scaled by
 
 from __future__ import annotations
 
+import copy
 import math
 from typing import TYPE_CHECKING, Any, Final, NamedTuple
 
@@ -59,6 +60,9 @@ _FULL_TURN: Final = 1.5 * math.pi
 _STRAIGHT_M: Final = 2.0
 _STRAIGHT_RAD: Final = 0.05
 _TINY: Final = 1e-6
+_PAUSE_S: Final = 0.25
+_STOOD_M: Final = 0.005
+"""Of counters that were silent for longer than that, and went on by more than this since, nobody knows by what way."""
 
 
 class CalibrationError(ValueError):
@@ -130,6 +134,14 @@ class Calibrator:
         self._right: list[float] = [0.0]
         self._counters: tuple[float, float] | None = None
         self._scans: list[_Laser] = []
+        self._breaks: list[tuple[float, float]] = []
+
+    def snapshot(self) -> Calibrator:
+        """Return one that knows what this one knows now, to solve on another thread while this one takes more in."""
+        copied = copy.copy(self)
+        for name in ("_times", "_left", "_right", "_scans", "_breaks"):
+            setattr(copied, name, list(getattr(self, name)))
+        return copied
 
     def take(self, entry: Any) -> None:  # noqa: ANN401  # of any kind
         """Take an entry in."""
@@ -155,9 +167,12 @@ class Calibrator:
         if entry.now <= self._times[-1]:
             self._counters = before  # the next one has this travel, too
             return
+        left, right = (wheel_travel(now, last, wrap) for now, last in zip(counters, before, strict=True))
+        if entry.now - self._times[-1] > _PAUSE_S and max(abs(left), abs(right)) > _STOOD_M:
+            self._breaks.append((self._times[-1], entry.now))
         self._times.append(entry.now)
-        self._left.append(self._left[-1] + wheel_travel(counters[0], before[0], wrap))
-        self._right.append(self._right[-1] + wheel_travel(counters[1], before[1], wrap))
+        self._left.append(self._left[-1] + left)
+        self._right.append(self._right[-1] + right)
 
     @property
     def start(self) -> NDArray[np.float64]:
@@ -220,6 +235,11 @@ class Calibrator:
         )
         if not pair or pair[0] is None or pair[1] is None:
             raise CalibrationError("this drive has no two scans that show anything")
+        if self._breaks:
+            begin, end = (at - self._times[0] for at in self._breaks[0])
+            raise CalibrationError(
+                f"the wheels were not heard from {begin:.1f} s to {end:.1f} s of this drive: record it again"
+            )
         reference = Reference(pair[0].points, pair[0].normals)
         guess = between(pair[0].odometry, pair[1].odometry)
         hit = reference.search(pair[1].points, (0.0, 0.0, float(guess[2])), 0.5, 0.5, _TURN, 0.5)
@@ -271,7 +291,10 @@ class Calibrator:
 
     def _pairs(self, track: _Track) -> list[tuple[int, int]]:
         ends = np.array([scan.ended_at for scan in self._scans])
-        inside = (ends > self._times[0] + 0.5) & (ends < self._times[-1])
+        breaks = np.reshape(self._breaks, (-1, 2))
+        stretch = np.searchsorted(breaks[:, 1], [scan.started_at for scan in self._scans], side="right")
+        whole = stretch == np.searchsorted(breaks[:, 0], ends)
+        inside = (ends > self._times[0] + 0.5) & (ends < self._times[-1]) & whole
         poses = self._at(track, ends)
         numbers = np.flatnonzero(inside).tolist()
         pairs, last = [], None
@@ -280,7 +303,7 @@ class Calibrator:
                 continue
             last = begin
             for number in numbers[place + 1 :]:
-                if ends[number] - ends[begin] > _LONGEST_S:
+                if ends[number] - ends[begin] > _LONGEST_S or stretch[number] != stretch[begin]:
                     break
                 if ends[number] - ends[begin] >= _SHORTEST_S and _far(poses[begin], poses[number], 1.0):
                     pairs.append((begin, number))

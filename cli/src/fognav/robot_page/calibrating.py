@@ -6,6 +6,7 @@ import hashlib
 import math
 import os
 import time
+from concurrent.futures import ThreadPoolExecutor
 from typing import TYPE_CHECKING, Any, Final, Self
 
 import msgspec
@@ -88,12 +89,14 @@ class DriveLog:
 
 def record(socket: Path, log: Path, seconds: float | None) -> Calibrator:
     """Record while somebody drives, into `log` too, and say what must be driven yet; raises `FailedError`."""
-    calibrator, told, said = Calibrator(), -math.inf, ""
+    calibrator, said = Calibrator(), ""
+    told, asked = -math.inf, None
     with (
         LocalRobotErrors(),
         LocalRobot(socket) as robot,
         DriveLog(log) as kept,
         until_told(seconds) as ends,
+        ThreadPoolExecutor(1) as solver,
     ):
         print_line(
             "drive by hand (fognav teleop): turn both ways, straight ahead and back, arcs to both sides; Ctrl-C ends"
@@ -105,10 +108,14 @@ def record(socket: Path, log: Path, seconds: float | None) -> Calibrator:
                     kept.write(entry)
                 if isinstance(entry, ScanReceived):
                     break
-            if time.monotonic() - told > _TOLD_S:
+            # Solving takes longer than the agent's socket holds what this one does not read.
+            if asked is None and time.monotonic() - told > _TOLD_S:
+                asked = solver.submit(_progress, calibrator.snapshot())
+            elif asked is not None and asked.done():
                 told = time.monotonic()
-                if (now := _progress(calibrator)) != said:
+                if (now := asked.result()) != said:
                     print_line(said := now)
+                asked = None
     return calibrator
 
 

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import json
+import math
+import re
 import socket
 import threading
 from contextlib import suppress
@@ -10,6 +13,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from small_floors import OFFICE, log_of_drive
 
 from fog_contracts.costs import LETHAL
 from fog_contracts.messages import Pose, RobotGoal
@@ -140,3 +144,63 @@ def test_a_recording_tells_of_a_break_while_it_is_made(tmp_path):
         server.join()
     assert told.is_set()
     assert made.breaks == 1
+
+
+# --- logs of others, in which something is wrong ---
+
+
+def turned(scan):
+    return {**scan, "ranges": scan["ranges"][20:] + scan["ranges"][:20]}
+
+
+def leaping(scan):
+    x, y, theta = scan["odom"]
+    return scan if scan["t"] < 4.0 else {**scan, "odom": [3.0 - y, x + 40.0, theta + math.pi / 2]}
+
+
+def scaled(key, scale):
+    return lambda scan: {**scan, key: [value and value * scale for value in scan[key]]}
+
+
+def spoilt(tmp_path, spoil) -> Path:
+    """Return a log of a drive along a corridor, each scan of which is spoilt."""
+    first, *lines = log_of_drive(OFFICE, [(2.0, 2.0), (13.0, 2.0)], 3)
+    (tmp_path / "log.jsonl").write_text("\n".join([first, *(json.dumps(spoil(json.loads(one))) for one in lines)]))
+    return tmp_path / "log.jsonl"
+
+
+@pytest.mark.parametrize(
+    ("spoil", "told"),
+    [
+        (lambda scan: scan, ""),
+        (turned, r"looks (29|30|31) degrees \(counter-clockwise\) away from where the log says"),
+        (lambda scan: {**scan, "odom": [1.2 * scan["odom"][0], *scan["odom"][1:]]}, r"tells 1.2\d m where the scans"),
+        (lambda scan: {**scan, "ranges": [2.0 + 0.01 * (n % 7) for n in range(240)]}, "this map is wrong"),
+    ],
+    ids=["right", "lidar turned", "odometry too long", "lidar that shows the same all the time"],
+)
+def test_what_contradicts_the_odometry_is_told(tmp_path, spoil, told):
+    made = map_log(read_log(spoilt(tmp_path, spoil)).scans, "matched", [], 0.05, 12.0)
+    said = [line for line in made.lines() if re.search("away from where|calibrate|is wrong", line)]
+    assert [bool(re.search(told, line)) for line in said] == ([True] if told else [])
+
+
+@pytest.mark.parametrize(
+    ("spoil", "told"),
+    [
+        (scaled("ranges", 1000.0), "none of 45 scans shows enough between 0.1 m and 12 m: are its ranges in metres?"),
+        (scaled("odom", 1000.0), "the odometry goes faster than 5 m/s again and again, as by"),
+    ],
+)
+def test_millimetres_in_place_of_metres_are_refused(tmp_path, spoil, told):
+    with pytest.raises(WrongUseError, match=told):
+        map_log(read_log(spoilt(tmp_path, spoil)).scans, "matched", [], 0.05, 12.0)
+
+
+def test_odometry_that_leaps_goes_on_where_it_was_after_a_break(tmp_path):
+    whole, leapt = (read_log(spoilt(tmp_path, spoil)).scans for spoil in (lambda scan: scan, leaping))
+    at = next(number for number, scan in enumerate(leapt) if scan.stretch)
+    assert {scan.stretch for scan in leapt[at:]} == {1}
+    assert leapt[at].odom == pytest.approx(leapt[at - 1].odom)
+    for one, other in zip(whole[at:], leapt[at:], strict=True):
+        assert one.odom.relative_to(whole[at].odom) == pytest.approx(other.odom.relative_to(leapt[at].odom), abs=1e-9)

@@ -40,6 +40,11 @@ _CODE_READINGS: Final = 0.001
 """... if they are at least this share of all readings."""
 _SAME_M: Final = 1e-3
 _LEAP_PERIODS: Final = 60.0
+_LEAP_M: Final = 1.0
+_LEAP_M_S: Final = 5.0
+"""Odometry that goes on by more at once, and faster, has leapt: no robot in a building does."""
+_LEAPS: Final = 10
+_LEAPS_SHARE: Final = 0.02
 _FIELD_OF_VIEW: Final = math.pi
 _GZIP: Final = b"\x1f\x8b"
 
@@ -212,7 +217,30 @@ def _finished(scans: list[LogScan], *, coded: bool = True, leaps: bool = True) -
     moved = [scan for scan in finished if scan.reference is not None and _offset(scan) != _offset(finished[0])]
     if finished[0].reference is not None and not any(_differs(finished[0], scan) for scan in moved):
         return LidarLog(tuple(finished), odometry_measured=False, stamps_mended=mended)
-    return LidarLog(tuple(finished), odometry_measured=True, stamps_mended=mended)
+    return LidarLog(tuple(_without_leaps(scans, finished)), odometry_measured=True, stamps_mended=mended)
+
+
+def _without_leaps(raw: list[LogScan], finished: list[LogScan]) -> Iterator[LogScan]:
+    """Yield scans whose odometry goes on where it has leapt: a break of it, over which the robot hardly moved.
+
+    By the stamps of the log itself: mended ones do not tell how long a pause was. Raises `WrongUseError` where it
+    leaps all the time.
+    """
+    shift: Pose2 | None = None
+    breaks = 0
+    before, odom = raw[0], raw[0].odom
+    for scan, done in zip(raw, finished, strict=True):
+        far, passed = math.hypot(*scan.odom.relative_to(before.odom)[:2]), scan.stamp - before.stamp
+        if far > _LEAP_M and 0.0 < passed < far / _LEAP_M_S:
+            shift, breaks = odom.compose(Pose2(0.0, 0.0, 0.0).relative_to(scan.odom)), breaks + 1
+            if breaks > max(_LEAPS, _LEAPS_SHARE * len(raw)):
+                raise WrongUseError(
+                    f"the odometry goes faster than {_LEAP_M_S:g} m/s again and again, as by {far:.1f} m in "
+                    f"{passed:.2f} s: is it in metres, and are the stamps in seconds?"
+                )
+        odom = scan.odom if shift is None else shift.compose(scan.odom)
+        before = scan
+        yield done if shift is None else replace(done, odom=odom, stretch=done.stretch + breaks)
 
 
 def _offset(scan: LogScan) -> Pose2:

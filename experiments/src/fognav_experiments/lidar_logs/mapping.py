@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+import math
 import os
 import resource
 import time
@@ -32,6 +33,7 @@ if TYPE_CHECKING:
     from fog_contracts.grid import StaticMap
     from fog_mapping.loops import LoopGroup
     from fog_mapping.scans import Scan
+    from fog_mapping.trajectory import AgainstOdometry
     from fognav_experiments.lidar_logs import Poses
     from fognav_experiments.lidar_logs.logs import LogScan
 
@@ -43,6 +45,9 @@ _FILM_PX: Final = 640
 _FILM_ROBOT_M: Final = 0.17
 _GAP_M: Final = 2.0
 """Farther on, little of what a scan shows need be what the one before it showed."""
+_NOT_MOVED: Final = 0.5
+_TURNED_DEG: Final = 5.0
+_ODOMETRY_OFF: Final = 0.1
 _COLOURS: Final = {FREE: (255, 255, 255), LETHAL: (0, 0, 0)}
 _UNKNOWN_COLOUR: Final = (205, 205, 205)
 _WAY_COLOUR: Final = (70, 130, 220)
@@ -64,6 +69,7 @@ class MadeMap:
     loops: list[LoopGroup] | None
     ambiguous: int
     seconds: float
+    against: AgainstOdometry | None = None
 
     def figures(self) -> dict[str, object]:
         """Return what the command prints as JSON, beside the map's own figures."""
@@ -78,6 +84,8 @@ class MadeMap:
             "ambiguous": self.ambiguous,
             "gaps": [[round(value, 2) for value in gap] for gap in self._gaps()],
             "breaks": [[round(value, 2) for value in pause] for pause in self._breaks()],
+            "lidar_turned_deg": self.against and round(math.degrees(-self.against.turned), 1),
+            "odometry_share": self.against and round(self.against.share, 3),
             "seconds": round(self.seconds, 2),
             "rss_mb": round(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024.0),
         }  # fmt: skip
@@ -114,6 +122,7 @@ class MadeMap:
                 f"from {before:.1f} s to {after:.1f} s the wheels were not heard, or their counters jumped: how the "
                 "robot moved meanwhile is a guess, unless a loop spans it: measure the map there, or drive it again"
             )
+        yield from self._against()
         if self.loops == []:
             yield "no place was visited twice: nothing confirms the shape of this map. Drive back to where you began"
         if self.ambiguous:
@@ -121,6 +130,25 @@ class MadeMap:
                 f"{self.ambiguous} pairs of places fit each other in more than one way: they were not joined. Where "
                 "the map is doubled, drive this part again with something that stands out, such as a box"
             )
+
+    def _against(self) -> Iterator[str]:
+        """Yield what is wrong with the odometry, or with where the lidar looks, by the scans."""
+        if self.against is None:
+            return
+        turned, share = math.degrees(-self.against.turned), self.against.share
+        if share < _NOT_MOVED:
+            yield (
+                f"where the odometry goes 1 m straight on, the scans go {share:.2f} m: this map is wrong. Does the "
+                "lidar's picture move while the robot drives? Are the odometry's metres and radians right?"
+            )
+            return
+        if abs(turned) > _TURNED_DEG:
+            yield (
+                f"the lidar looks {turned:.0f} degrees (counter-clockwise) away from where the log says, by the way "
+                "that scans go while the robot drives straight on: correct its yaw, and make the map again"
+            )
+        if not 1.0 - _ODOMETRY_OFF < share < 1.0 / (1.0 - _ODOMETRY_OFF):
+            yield f"the odometry tells {1.0 / share:.2f} m where the scans tell 1 m: calibrate the robot's wheels"
 
     def draw(self, file: Path) -> None:
         """Draw the map, the way and the loops, each with its name; raises `WrongUseError`."""
@@ -243,6 +271,11 @@ def map_log(
         return _at_reference(log, resolution, range_max)
     try:
         scans = scans_of(log, range_max)
+        if not scans:
+            raise WrongUseError(
+                f"none of {len(log)} scans shows enough between 0.1 m and {range_max:g} m: are its ranges in metres? "
+                "--range-max says up to where they are used"
+            )
         place_of = {scan.number: index for index, scan in enumerate(scans)}
         pairs = [(_index(first, place_of), _index(second, place_of)) for first, second in refused]
         with progress_bar() as show:
@@ -256,7 +289,7 @@ def map_log(
         map=built, used=used, poses=found.poses,
         reference=np.array(references, np.float64) if len(references) == len(used) else None,
         loops=grouped(found.loops, found.poses, [scan.number for scan in scans]), ambiguous=found.ambiguous,
-        seconds=time.process_time() - started,
+        seconds=time.process_time() - started, against=found.against,
     )  # fmt: skip
 
 

@@ -12,7 +12,7 @@ from fog_kernels.matching import BeamCounts
 from fog_mapping.loops import LoopSearch
 from fog_mapping.pose_graph import solve
 from fog_mapping.poses import place
-from fog_mapping.trajectory import match_in_order, refuse_mirrored, settle
+from fog_mapping.trajectory import against_odometry, match_in_order, refuse_mirrored, settle
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Sequence
@@ -21,6 +21,7 @@ if TYPE_CHECKING:
 
     from fog_mapping.loops import Loop
     from fog_mapping.scans import Scan
+    from fog_mapping.trajectory import AgainstOdometry
 
 _CERTAIN_M: Final = (2.0, 2.0, 4.0, 8.0, 16.0, 30.0)
 """What is certain to so much (m) is looked for, round by round."""
@@ -32,12 +33,13 @@ class Trajectory(NamedTuple):
     """Poses (n, 3; m, rad) of scans, the first at the origin, and what they rest on.
 
     loops: those found, with how much each counts in the end (0: it contradicts the rest). ambiguous: pairs of
-    stretches that fit at several places, so that none counts.
+    stretches that fit at several places, so that none counts. against: how the scans moved against the odometry.
     """
 
     poses: NDArray[np.float64]
     loops: list[tuple[Loop, float]]
     ambiguous: int
+    against: AgainstOdometry | None
 
 
 def find_trajectory(
@@ -56,7 +58,7 @@ def find_trajectory(
         raise ValueError(f"a map needs two scans or more between which the robot has moved, not {len(scans)}")
     refuse_mirrored(scans)
     poses, edges = match_in_order(scans, lambda done: on_progress("matching scans", done / len(scans)))
-    weights = np.ones(len(edges))
+    against, weights = against_odometry(scans, edges), np.ones(len(edges))
     search = LoopSearch(scans, poses, without, jobs)
     loops: list[Loop] = []
     ambiguous = 0
@@ -70,7 +72,7 @@ def find_trajectory(
             poses, weights, _ = solve(poses, edges)
     poses = settle(scans, poses)
     counted = weights[len(edges) - len(loops) :] if loops else weights[:0]
-    return Trajectory(poses, list(zip(loops, counted.tolist(), strict=True)), ambiguous)
+    return Trajectory(poses, list(zip(loops, counted.tolist(), strict=True)), ambiguous, against)
 
 
 def draw(rays: Iterable[tuple[NDArray[np.float64], NDArray[np.float64]]], resolution: float) -> StaticMap:
@@ -84,7 +86,10 @@ def draw(rays: Iterable[tuple[NDArray[np.float64], NDArray[np.float64]]], resolu
     low = np.floor((everything.min(axis=0) - _MARGIN_M) / resolution) * resolution
     width, height = np.ceil((everything.max(axis=0) + _MARGIN_M - low) / resolution).astype(int).tolist()
     if width * height > _MAX_CELLS:
-        raise ValueError(f"the map would have {width} x {height} cells. Choose a coarser --resolution")
+        raise ValueError(
+            f"the map would have {width} x {height} cells. Choose a coarser --resolution, if a building of "
+            f"{width * resolution:.0f} x {height * resolution:.0f} m is right; else are ranges and odometry in metres?"
+        )
     counts = BeamCounts((height, width), resolution, float(low[0]), float(low[1]))
     for pose, points in placed:
         counts.add(float(pose[0]), float(pose[1]), points)

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import cmath
 import itertools
 import math
-from typing import TYPE_CHECKING, Final
+from typing import TYPE_CHECKING, Final, NamedTuple
 
 import numpy as np
 
@@ -39,8 +40,18 @@ _BREAK_RAD: Final = 0.5
 _CLEAR_TURN_RAD: Final = 0.12
 _TURNS_CHECKED: Final = 40
 _MIRRORED_SHARE: Final = 0.75
+_STRAIGHT_RAD: Final = 0.05
+"""In turns a lidar that is off the robot's middle goes another way than the odometry says."""
+_LEAST_STEPS: Final = 20
 _ODOMETRY_SHARE: Final = 0.5
 """Odometry counts for as much less than its deviations say: they are those of a bad one."""
+
+
+class AgainstOdometry(NamedTuple):
+    """How scans moved where the odometry went straight on: turned from its direction (rad), and m for each of its m."""
+
+    turned: float
+    share: float
 
 
 def independent(information: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -97,6 +108,22 @@ def match_next(
     # A scan from after a break may be of another place that looks alike: only a loop tells.
     told = np.zeros((3, 3)) if broken else independent(aligned.information)
     return np.array(aligned.pose), told + _ODOMETRY_SHARE * prior
+
+
+def against_odometry(scans: Sequence[Scan], edges: Sequence[Edge]) -> AgainstOdometry | None:
+    """Return how the scans moved by matching (`match_in_order`) against the odometry; None where little is straight."""
+    told, found = [], []
+    for edge in edges:
+        first, second = scans[edge.first], scans[edge.second]
+        step = between(first.odometry, second.odometry)
+        if first.stretch == second.stretch and abs(step[2]) < _STRAIGHT_RAD:
+            told.append(complex(step[0], step[1]))
+            found.append(complex(edge.step[0], edge.step[1]))
+    if len(told) < _LEAST_STEPS:
+        return None
+    odometry = np.array(told)
+    ratio = complex(np.vdot(odometry, found)) / max(1e-9, float((abs(odometry) ** 2).sum()))
+    return AgainstOdometry(cmath.phase(ratio), abs(ratio))
 
 
 def refuse_mirrored(scans: Sequence[Scan]) -> None:

@@ -54,10 +54,11 @@ PROFILES: dict[str, tuple[str, ...]] = {
     ),
     "map": ("components", "distance", "inflation", "raycast", "spans"),
     "sim": ("distance", "emulation", "raycast"),
-    "mapping": ("matching",),
+    "mapping": ("certainty", "matching"),
     "all": (
         "amcl",
         "astar",
+        "certainty",
         "clearance",
         "components",
         "course",

@@ -7,13 +7,13 @@ look the same, and a fold would be drawn. What is certain is closed first, which
 
 from __future__ import annotations
 
-import heapq
 import math
 from concurrent.futures import ThreadPoolExecutor
 from typing import TYPE_CHECKING, Final, NamedTuple
 
 import numpy as np
 
+from fog_kernels.certainty import Neighbours
 from fog_kernels.matching import Excluded
 from fog_mapping.poses import Edge, between, path_lengths
 from fog_mapping.scans import cloud, reference_of, thinned
@@ -141,6 +141,7 @@ class LoopSearch:
         self._way = path_lengths(poses)
         self._places = list(_stretches(self._way, _PLACE_EVERY_M, _PLACE_HALF_M))
         self._queries = list(_stretches(self._way, _STRETCH_EVERY_M, _STRETCH_HALF_M))
+        self._ends = np.array(self._queries, np.int64).reshape(-1, 3)
         self._without = [(self._way[first], self._way[second]) for first, second in without]
         self._tried: dict[tuple[int, int], float] = {}
         self._jobs = jobs
@@ -167,11 +168,9 @@ class LoopSearch:
                 on_progress(done / len(self._places))
         return Searched(joined, loops, ambiguous)
 
-    def _search_place(
-        self, number: int, poses: NDArray[np.float64], neighbours: list[list[_Neighbour]], most: float
-    ) -> Searched:
+    def _search_place(self, number: int, poses: NDArray[np.float64], neighbours: Neighbours, most: float) -> Searched:
         place = self._places[number]
-        wanted = sorted(self._candidates(number, poses, *_uncertainty(neighbours, place.middle), most))[:_MOST_TRIED]
+        wanted = sorted(self._candidates(number, poses, *neighbours.seen_from(place.middle), most))[:_MOST_TRIED]
         for _, index, half, _ in wanted:
             self._tried[number, index] = half
         edges: list[Edge] = []
@@ -208,25 +207,29 @@ class LoopSearch:
         return Searched(edges, loops, ambiguous)
 
     def _candidates(
-        self, number: int, poses: NDArray[np.float64], variance: list[float], turn_variance: list[float], most: float
+        self,
+        number: int,
+        poses: NDArray[np.float64],
+        variance: NDArray[np.float64],
+        turn_variance: NDArray[np.float64],
+        most: float,
     ) -> Iterator[tuple[float, int, float, float]]:
         """Yield the stretches that may be at a place: how far off they seem, number, how far and turned to look."""
         place = self._places[number]
-        for index, query in enumerate(self._queries):
-            if query.first <= place.last and place.first <= query.last:
-                continue
-            if abs(self._way[query.middle] - self._way[place.middle]) < _LEAST_WAY_M:
-                continue
-            off = _SIGMAS * math.sqrt(variance[query.middle])
-            away = math.hypot(*(poses[query.middle] - poses[place.middle])[:2])
-            if off > most or away > _NEAR_M + off or self._is_refused(place, query):
-                continue
-            half = max(_LEAST_M, off)
+        middles, first, last = self._ends.T
+        off = _SIGMAS * np.sqrt(variance[middles])
+        away = np.hypot(*(poses[middles, :2] - poses[place.middle, :2]).T)
+        apart = (first > place.last) | (place.first > last)
+        apart &= np.abs(self._way[middles] - self._way[place.middle]) >= _LEAST_WAY_M
+        for index in np.flatnonzero(apart & (off <= most) & (away <= _NEAR_M + off)).tolist():
+            half = max(_LEAST_M, float(off[index]))
             # Looked for again once it is clearly more certain where.
             if half >= _REPEATED * self._tried.get((number, index), math.inf):
                 continue
-            turn = _SIGMAS * math.sqrt(turn_variance[query.middle])
-            yield away, index, half, min(max(_LEAST_RAD, turn), _MOST_RAD)
+            query = self._queries[index]
+            if not self._is_refused(place, query):
+                turn = _SIGMAS * math.sqrt(turn_variance[query.middle])
+                yield float(away[index]), index, half, min(max(_LEAST_RAD, turn), _MOST_RAD)
 
     def _is_refused(self, place: Stretch, query: Stretch) -> bool:
         ends = sorted((self._way[place.middle], self._way[query.middle]))
@@ -236,13 +239,6 @@ class LoopSearch:
         )
 
 
-class _Neighbour(NamedTuple):
-    node: int
-    variance: float
-    turn_variance: float
-    square: float
-
-
 def _stretches(way: NDArray[np.float64], every: float, half: float) -> Iterator[Stretch]:
     for at in np.arange(0.0, way[-1] + every, every):
         inside = np.nonzero(np.abs(way - at) <= half)[0]
@@ -250,39 +246,11 @@ def _stretches(way: NDArray[np.float64], every: float, half: float) -> Iterator[
             yield Stretch(int(np.argmin(np.abs(way - at))), int(inside[0]), int(inside[-1]))
 
 
-def _neighbours(count: int, edges: Sequence[Edge], weights: NDArray[np.float64]) -> list[list[_Neighbour]]:
-    neighbours: list[list[_Neighbour]] = [[] for _ in range(count)]
-    for edge, weight in zip(edges, weights, strict=True):
-        if edge.loop and weight < _KEPT:
-            continue
-        covariance = np.linalg.inv(edge.information + 1e-6 * np.eye(3))
-        figures = (
-            float(covariance[0, 0] + covariance[1, 1]),
-            float(covariance[2, 2]),
-            float(edge.step[0] ** 2 + edge.step[1] ** 2),
-        )
-        neighbours[edge.first].append(_Neighbour(edge.second, *figures))
-        neighbours[edge.second].append(_Neighbour(edge.first, *figures))
-    return neighbours
-
-
-def _uncertainty(neighbours: list[list[_Neighbour]], source: int) -> tuple[list[float], list[float]]:
-    """Return the variances (m^2, rad^2) of all poses as seen from one, along the surest way: less than they are.
-
-    A heading that is off moves all that follows, by a lever as long as the way; here it moves each step by itself. So a
-    long way without loops is less certain than this says.
-    """
-    variance, turn_variance = [math.inf] * len(neighbours), [math.inf] * len(neighbours)
-    variance[source] = turn_variance[source] = 0.0
-    waiting = [(0.0, source)]
-    while waiting:
-        reached, node = heapq.heappop(waiting)
-        if reached > variance[node]:
-            continue
-        for other, added, turned, square in neighbours[node]:
-            turn = turn_variance[node] + turned
-            total = reached + added + turn * square
-            if total < variance[other]:
-                variance[other], turn_variance[other] = total, turn
-                heapq.heappush(waiting, (total, other))
-    return variance, turn_variance
+def _neighbours(count: int, edges: Sequence[Edge], weights: NDArray[np.float64]) -> Neighbours:
+    used = [edge for edge, weight in zip(edges, weights, strict=True) if not (edge.loop and weight < _KEPT)]
+    covariance = np.linalg.inv(np.array([edge.information for edge in used]) + 1e-6 * np.eye(3))
+    steps = np.array([edge.step for edge in used])
+    figures = np.column_stack(
+        (covariance[:, 0, 0] + covariance[:, 1, 1], covariance[:, 2, 2], steps[:, 0] ** 2 + steps[:, 1] ** 2)
+    )
+    return Neighbours(count, np.array([(edge.first, edge.second) for edge in used], np.int64), figures)

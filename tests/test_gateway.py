@@ -26,7 +26,7 @@ from planner.api import make_api as make_planner
 
 ROOT: Final = Path(__file__).parents[1]
 CADDYFILE: Final = (ROOT / "deploy" / "gateway" / "Caddyfile").read_text("utf-8")
-EACH: Final = ("/api/v1/store", "/healthz", "/readyz", "/metrics")
+EACH: Final = ("/api/v1/store", "/healthz", "/leads", "/readyz", "/metrics")
 """What every service has by itself, behind its own name."""
 NAMES: Final = {
     "aggregator": "hazard-aggregator",

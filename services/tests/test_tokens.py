@@ -13,7 +13,7 @@ pytestmark = pytest.mark.live
 
 SERVICES = ("hazard_aggregator", "map_service", "planner")
 PUBLIC = {
-    "/healthz", "/readyz", "/metrics", "/openapi.json",
+    "/healthz", "/leads", "/readyz", "/metrics", "/openapi.json",
     "/api/v1/alerts", "/api/v1/prometheus/robots",
     "/api/v1/areas", "/api/v1/areas/{area_id}", "/api/v1/areas/{area_id}/history",
     "/api/v1/areas/{area_id}/override", "/api/v1/nodes",

@@ -103,6 +103,8 @@ class Planners:
             leading = [name for name, detail in details.items() if detail.startswith("leads with epoch")]
             standing = [name for name, detail in details.items() if "stands by: planner-" in detail]
             if len(leading) == len(standing) == 1:
+                asked = [(await self.clients[name].get("/leads")).status_code for name in (leading[0], standing[0])]
+                assert asked == [200, 503], "a gateway asks who leads"
                 return leading[0], standing[0]
             assert time.monotonic() < deadline, (details, [self.fog.log(name)[-3000:] for name in PLANNERS])
             await asyncio.sleep(0.05)

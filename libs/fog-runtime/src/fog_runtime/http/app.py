@@ -229,7 +229,14 @@ class Readiness(Message, frozen=True, kw_only=True):
     parts: dict[str, Part]
 
 
-def _add_health(routes: Routes, health: Health) -> None:
+class Leads(Message, frozen=True, kw_only=True):
+    """Whether this copy takes requests, and if not, why."""
+
+    leads: bool
+    detail: str
+
+
+def _add_health(routes: Routes, health: Health, standby: Callable[[], str]) -> None:
     @routes.get("/healthz")
     async def healthz() -> Alive:
         """Whether the process runs."""
@@ -240,6 +247,12 @@ def _add_health(routes: Routes, health: Health) -> None:
         """Whether the process can do its work; 503 names what is missing."""
         report = msgspec.convert(health.report(), Readiness)
         return Answer(report, status=200 if report.ready else 503)
+
+    @routes.get("/leads", status=(200, 503))
+    async def leads() -> Answer[Leads]:
+        """Whether requests belong here; 503 while this copy stands by, so that a gateway asks the other one."""
+        reason = standby()
+        return Answer(Leads(leads=not reason, detail=reason), status=503 if reason else 200)
 
     @routes.get("/metrics", media_type="text/plain")
     async def prometheus() -> Response:
@@ -269,7 +282,7 @@ def make_app(  # noqa: PLR0913  # what apps have in common, each by name
     app.state.sockets = False
     app.state.problems = {HttpProblem.NO_ROUTE, HttpProblem.METHOD_NOT_ALLOWED}
     add_problem_handlers(app)
-    _add_health(Routes(app, "health"), health)
+    _add_health(Routes(app, "health"), health, standby)
 
     async def about() -> Response:  # for people who open the address
         text = f"{title}. Its routes: /openapi.json; is it ready: /readyz; its measurements: /metrics\n"

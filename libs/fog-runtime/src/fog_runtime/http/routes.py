@@ -46,7 +46,7 @@ Handler = TypeVar("Handler", bound=Callable[..., Awaitable[object]])
 
 _ANSWERS: Final = {201: "The new record", 204: "Done", 503: "The answer while something is missing"}
 _SCHEMAS: Final = "#/components/schemas/{name}"
-ALWAYS_SERVED: Final = frozenset({"/healthz", "/readyz", "/metrics"})
+ALWAYS_SERVED: Final = frozenset({"/healthz", "/readyz", "/leads", "/metrics"})
 """Routes that are served however many others are open."""
 
 

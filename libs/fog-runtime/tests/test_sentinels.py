@@ -9,6 +9,7 @@ import dataclasses
 import os
 import random
 import sys
+from collections.abc import Callable
 from itertools import count
 from pathlib import Path
 
@@ -23,23 +24,13 @@ from fog_runtime.stores.redis_connection import RedisAddress, RedisConnection, S
 from fog_runtime.stores.redis_store import Audit, RedisStore, Table
 from fog_supervisor import configurations
 from fog_supervisor.net import LOOPBACK, free_port
-from fog_supervisor.servers import Server, ServerProgram, find_program, start_redis
+from fog_supervisor.servers import Server, ServerProgram, find_program
 
 pytestmark = pytest.mark.live
 KILLS = int(os.environ.get("FOGNAV_KILLS", "1"))
 WRITES = int(os.environ.get("FOGNAV_WRITES", "50"))
 THINGS = Table("things", "zone")
 AUDIT = Audit(1.0, "anna", "create")
-REPLICATION = "min-replicas-to-write 1\nmin-replicas-max-lag 2\n"
-SENTINEL = """
-port {port}
-bind 127.0.0.1
-protected-mode no
-dir {folder}
-sentinel monitor fognav 127.0.0.1 {primary} 2
-sentinel down-after-milliseconds fognav 1000
-sentinel failover-timeout fognav 3000
-"""
 
 
 class Thing(Message, frozen=True, kw_only=True):
@@ -68,13 +59,13 @@ class Cluster:
         self.servers: dict[int, Server] = {}
         for port in ports[:3]:
             home = folder / f"redis-{port}"
-            text = configurations.redis(LOOPBACK, str(home), port=port) + REPLICATION
+            text = configurations.redis(LOOPBACK, str(home), port=port) + configurations.replicated()
             if port in others:
                 text += f"replicaof {LOOPBACK} {primary}\n"
             self.servers[port] = stack.enter_context(Server(program("redis", home, port, text), home))
         for port in ports[3:]:
             home = folder / f"sentinel-{port}"
-            text = SENTINEL.format(port=port, folder=home, primary=primary)
+            text = configurations.sentinel(f"{LOOPBACK} {primary}", str(home), bind=LOOPBACK, port=port)
             stack.enter_context(Server(program("sentinel", home, port, text, "--sentinel"), home))
         sentinels = ",".join(f"{LOOPBACK}:{port}" for port in ports[3:])
         self.url = f"redis+sentinel://{sentinels}/fognav/0?wait=1"
@@ -180,40 +171,37 @@ def test_addresses():
             parse_address(url)
 
 
-SECURED_SENTINEL = """
-port 0
-tls-port {port}
-bind 127.0.0.1
-tls-cert-file {security}/server.pem
-tls-key-file {security}/server.key
-tls-ca-cert-file {authority}
-tls-auth-clients no
-tls-replication yes
-protected-mode no
-dir {folder}
-sentinel monitor fognav 127.0.0.1 {primary} 1
-sentinel auth-user fognav administrator
-sentinel auth-pass fognav {password}
-"""
-
-
 @pytest.fixture
 def secured_cluster(tmp_path):
-    """A locked Redis and one Sentinel: the address, whom services are there, and the authority of nobody there."""
+    """Three locked Redis servers and a Sentinel: the address, whom services are there, and the primary."""
     security = SiteSecurity(tmp_path / "locks", "lab")
-    security.make([LOOPBACK, "localhost"])
-    own, administrator = (Credentials.read(security.credentials(user)) for user in ("map-service", "administrator"))
-    authority = tmp_path / "authority.pem"
-    authority.write_text(security.authority.trusted)
-    with start_redis(tmp_path, security=security.folder("redis")) as redis:
-        home, port = tmp_path / "sentinel", free_port({redis.port})
-        text = SECURED_SENTINEL.format(
-            port=port, security=security.folder("redis"), authority=authority, folder=home, primary=redis.port,
-            password=administrator.passwords["redis"],
-        )  # fmt: skip
-        encrypted = dataclasses.replace(program("sentinel", home, port, text, "--sentinel"), encrypted=True)
-        with Server(encrypted, home):
-            yield f"{LOOPBACK}:{port}/fognav/0", own
+    security.make([LOOPBACK, "localhost"], copies=True)
+    own, peer = (Credentials.read(security.credentials(user)) for user in ("map-service", "peer"))
+    folder = security.folder("redis")
+    (folder / "authority.pem").write_text(security.authority.trusted)
+    known = configurations.Peer(name=LOOPBACK, user=peer.user, password=peer.passwords["redis"], security=str(folder))
+    ports: list[int] = []
+    with contextlib.ExitStack() as stack:
+
+        def start(text_in: Callable[[str, int], str], reply: bytes, *arguments: str) -> Server:
+            ports.append(free_port(set(ports)))
+            home = tmp_path / f"server-{ports[-1]}"
+            plain = program("redis", home, ports[-1], text_in(str(home), ports[-1]), *arguments)
+            return stack.enter_context(Server(dataclasses.replace(plain, encrypted=True, reply=reply), home))
+
+        def redis(home: str, port: int) -> str:
+            text = configurations.redis(LOOPBACK, home, port=port, security=str(folder))
+            follows = f"replicaof {LOOPBACK} {ports[0]}\n" if port != ports[0] else ""
+            return text + configurations.replicated(known) + follows
+
+        def sentinel(home: str, port: int) -> str:
+            return configurations.sentinel(f"{LOOPBACK} {ports[0]}", home, known, port=port, quorum=1)
+
+        primary = start(redis, b"-NOAUTH")
+        for _ in range(2):
+            start(redis, b"-NOAUTH")
+        start(sentinel, b"+PONG", "--sentinel")
+        yield f"{LOOPBACK}:{ports[-1]}/fognav/0", own, primary
 
 
 async def store_once(url, credentials):
@@ -223,21 +211,22 @@ async def store_once(url, credentials):
             while True:
                 try:
                     return await connection.write(("HSET", "fog:lab:zones", "z1", "{}"))
-                except StoreError as error:
-                    if "no Sentinel knows" not in str(error):  # it has not asked the primary yet
-                        raise
-                await asyncio.sleep(0.2)
+                except StoreError:  # no primary known yet, or no replica
+                    await asyncio.sleep(0.2)
     finally:
         await connection.aclose()
 
 
-async def test_sentinels_and_their_primary_are_reached_by_tls(secured_cluster):
-    address, own = secured_cluster
-    assert await store_once(f"rediss+sentinel://{address}", own) == [1]
+async def test_locked_replica_takes_over_from_a_primary_that_dies(secured_cluster):
+    address, own, primary = secured_cluster
+    url = f"rediss+sentinel://{address}?wait=1"
+    assert await store_once(url, own) == [1]
+    primary.kill()
+    assert await store_once(url, own) == [0], "the other one has it"
 
 
 async def test_sentinels_of_another_authority_are_not_believed(secured_cluster, tmp_path):
-    address, own = secured_cluster
+    address, own, _ = secured_cluster
     stranger = SiteSecurity(tmp_path / "stranger", "lab")
     stranger.make([LOOPBACK])
     other = Credentials(own.user, passwords=own.passwords, authority=stranger.authority.trusted)

@@ -17,16 +17,6 @@ from fog_supervisor.servers import Server, ServerProgram, start_mosquitto, start
 
 pytestmark = pytest.mark.live
 
-BRIDGE = """
-connection other
-address {address}
-topic # both 1
-bridge_protocol_version mqttv50
-try_private true
-restart_timeout 1 2
-cleansession true
-"""
-
 
 def hazard(seq: int) -> m.AreaHazard:
     return m.AreaHazard(
@@ -58,7 +48,7 @@ class Received:
 @pytest.fixture
 def brokers(tmp_path):
     with start_mosquitto(tmp_path / "first") as first:
-        extra = BRIDGE.format(address=f"{LOOPBACK}:{first.port}")
+        extra = configurations.bridge(f"{LOOPBACK}:{first.port}")
         with start_mosquitto(tmp_path / "second", extra=extra) as second:
             yield first, second
 

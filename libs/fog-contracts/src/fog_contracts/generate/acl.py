@@ -192,11 +192,13 @@ def zenoh_acl(
     *,
     unrestricted: Sequence[str] = (),
     floors: Mapping[str, Sequence[str]] | None = None,
+    meshed: bool = False,
 ) -> str:
     """Return the router's `access_control` as JSON5: for one site and its robots by id, or for all sites by role.
 
     The users named in `unrestricted` may do everything. `floors` are further sites with their own users, named
-    `SITE.NAME`, and their robots.
+    `SITE.NAME`, and their robots. With `meshed`, so may the router at the other end of a connection that this one has
+    opened, which has checked its own clients: all that connect to this one come over a relay's Unix socket.
     """
     clients = _clients(site, robots)
     for floor, floor_robots in (floors or {}).items():
@@ -206,8 +208,11 @@ def zenoh_acl(
     policies: list[dict[str, object]] = []
     if unrestricted:
         rules.append(_EVERYTHING)
-        subjects.append({"id": "unrestricted", "usernames": list(unrestricted)})
-        policies.append({"subjects": ["unrestricted"], "rules": [_EVERYTHING["id"]]})
+        mesh: list[dict[str, object]] = [{"id": "other routers", "link_protocols": ["tls"]}] if meshed else []
+        subjects += [{"id": "unrestricted", "usernames": list(unrestricted)}, *mesh]
+        policies.append(
+            {"subjects": ["unrestricted", *(str(each["id"]) for each in mesh)], "rules": [_EVERYTHING["id"]]}
+        )
     for name, rights in clients:
         client_rules = rights.rules(name)
         if not client_rules:

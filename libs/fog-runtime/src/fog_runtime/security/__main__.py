@@ -188,13 +188,14 @@ def _floors(settings: Settings) -> list[Site]:
     return [load_site(folder).site for folder in folders]
 
 
-def make_site(folder: Path, site: Site, hosts: Sequence[str]) -> SiteSecurity:
+def make_site(folder: Path, site: Site, hosts: Sequence[str], *, copies: bool = False) -> SiteSecurity:
     """Create what is missing of a site's credentials in a folder; robots, nodes and people reach it by `hosts`.
 
-    Raises `AuthorityError`, `SecurityError` and `OSError`.
+    `copies` as for `SiteSecurity.make`. Raises `AuthorityError`, `SecurityError` and `OSError`.
     """
     security = SiteSecurity(folder, site.id)
-    security.make([*_SERVERS, *hosts], robots=[robot.id for robot in site.robots], nodes=site.senders)
+    robots = [robot.id for robot in site.robots]
+    security.make([*_SERVERS, *hosts], robots=robots, nodes=site.senders, copies=copies)
     make_keys(folder)
     return security
 

@@ -51,6 +51,7 @@ class _Plan(msgspec.Struct, frozen=True):
     mode: int = PRIVATE
     floors: list[str] = []
     devices: dict[str, list[str]] = {}
+    copies: bool = False
 
 
 class SiteSecurity:
@@ -79,11 +80,14 @@ class SiteSecurity:
             raise SecurityError(f"{folder / _PLAN}: {error}. Restore it from a backup") from error
         return opened
 
-    def make(self, hosts: Sequence[str], *, robots: Sequence[str] = (), nodes: Sequence[str] = ()) -> None:
+    def make(
+        self, hosts: Sequence[str], *, robots: Sequence[str] = (), nodes: Sequence[str] = (), copies: bool = False
+    ) -> None:
         """Create what is missing: the authority, servers' certificates, the services' and tools' users, these robots'.
 
         `hosts` are the names and addresses by which clients reach the servers, besides those of before. Certificates
-        that expire soon, or lack one of them, are renewed. Raises `SecurityError` or `AuthorityError`.
+        that expire soon, or lack one of them, are renewed. With `copies` each server has others, which get what it
+        has. Raises `SecurityError` or `AuthorityError`.
         """
         before = _read_plan(self._folder) if (self._folder / _PLAN).exists() else self._plan
         if before.site != self._plan.site:
@@ -92,7 +96,9 @@ class SiteSecurity:
                 "(or volume) of its own for each site"
             )
         known_hosts = before.hosts
-        self._plan = msgspec.structs.replace(self._plan, floors=before.floors, devices=before.devices)
+        self._plan = msgspec.structs.replace(
+            self._plan, floors=before.floors, devices=before.devices, copies=copies or before.copies
+        )
         self._folder.mkdir(mode=0o700, parents=True, exist_ok=True)
         if not (self._folder / AUTHORITY).exists():
             Authority.create(self._folder / AUTHORITY, f"Fognav {self._plan.site}", now=_now())
@@ -101,6 +107,7 @@ class SiteSecurity:
         own: dict[str, Sequence[Server]] = {**users.SERVICES, **users.TOOLS, **users.THESIS}
         own[users.REDIS_ADMINISTRATOR] = ("redis",)
         own[users.HEALTH] = SERVERS
+        own |= {users.PEER: SERVERS} if self._plan.copies else {}
         own |= dict.fromkeys(self._plan.unrestricted, ("mqtt", "zenoh"))
         self._set_users(_shut_out(own, self._files, self.credentials) | self._not_yet_admitted(robots, nodes))
         self._write_rights_in_redis()
@@ -320,10 +327,12 @@ class SiteSecurity:
         plan = self._plan
         nodes = {floor: self._members.of("mosquitto", floor) for floor in plan.floors}
         robots = {floor: self._members.of("zenoh", floor) for floor in plan.floors}
-        access = mqtt_acl(plan.site, unrestricted=plan.unrestricted, floors=nodes, devices=plan.devices)
+        peers = (users.PEER,) if plan.copies else ()
+        unrestricted = (*plan.unrestricted, *peers)
+        access = mqtt_acl(plan.site, unrestricted=unrestricted, floors=nodes, devices=plan.devices)
         self._files.write("mosquitto", ACCESS, access)
         own = self._members.of("zenoh", "")
-        access = zenoh_acl(plan.site, own, unrestricted=plan.unrestricted, floors=robots)
+        access = zenoh_acl(plan.site, own, unrestricted=unrestricted, floors=robots, meshed=plan.copies)
         self._files.write("zenoh", f"{ACCESS}.json5", access)
 
 

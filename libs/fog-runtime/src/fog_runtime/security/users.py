@@ -47,10 +47,17 @@ THESIS: Final[Mapping[str, Sequence[Server]]] = {"thesis-node": ("mqtt",), "thes
 REDIS_ADMINISTRATOR: Final = "administrator"
 HEALTH: Final = "health"
 """Who asks broker, router and Redis whether they are well, and may do nothing else."""
+PEER: Final = "peer"
+"""The other copy of a server, where there are two: it gets, and passes on, all that the server has."""
 _COMMANDS: Final = (
     "+get +set +setrange +del +hget +hset +hdel +hgetall +hlen +hincrby +xadd +xdel +xrange +xrevrange +pttl"
     " +eval +multi +exec +wait +ping +info +config|get +client|setname +client|id +hello +auth +select"
 )
+_PEER_COMMANDS: Final = (
+    "+psync +replconf +slaveof +multi +exec +config|rewrite +subscribe +publish +ping +role +info"
+    " +client|setname +client|kill +script|kill +hello +auth"
+)
+"""What a replica asks of its primary, and a Sentinel of both (Redis's documentation of Sentinel)."""
 _READING: Final = "+xrange +xrevrange +ping +client|setname +client|id +hello +auth +select"
 
 
@@ -80,6 +87,8 @@ def line(server: Server, user: str, password: str, site: str) -> str:
         return redis_administrator_line(user, password)
     if user == HEALTH:
         return redis_health_line(user, password)
+    if user == PEER:
+        return redis_peer_line(user, password)
     return redis_line(user, password, of_floor(user)[0] or site)
 
 
@@ -123,6 +132,11 @@ def redis_administrator_line(user: str, password: str) -> str:
 def redis_health_line(user: str, password: str) -> str:
     """Return a line of Redis's `aclfile` for who only asks whether it answers."""
     return f"user {user} on {_redis_secret(password)} resetchannels -@all +ping"
+
+
+def redis_peer_line(user: str, password: str) -> str:
+    """Return a line of Redis's `aclfile` for its replicas and its Sentinels."""
+    return f"user {user} on {_redis_secret(password)} resetchannels &__sentinel__:hello -@all {_PEER_COMMANDS}"
 
 
 REDIS_NOBODY: Final = "user default off resetpass ~* &* +@all"
@@ -209,7 +223,7 @@ class Members:
 
     def is_reserved(self, user: str) -> bool:
         """Return whether a name belongs to a part of Fognav."""
-        parts = {*ROLES, REDIS_ADMINISTRATOR, HEALTH, ANYBODY}
+        parts = {*ROLES, REDIS_ADMINISTRATOR, HEALTH, PEER, ANYBODY}
         return of_floor(user)[1] in parts or user in self._unrestricted
 
     def require_free_name(self, user: str) -> None:

@@ -1,12 +1,15 @@
 """Stack files of floors on several machines, without an engine: what they name exists, and nothing is forgotten."""
 
+import re
 import shutil
+import subprocess
 import tomllib
 from pathlib import Path
 from typing import Any
 
 import pytest
 import yaml
+from cryptography import x509
 from typer.testing import CliRunner
 
 from console_service.floors import read_peers
@@ -18,6 +21,8 @@ from fognav.hosting.swarm_stacks import LIMIT
 ROOT = Path(__file__).parents[2]
 COMPOSE = (ROOT / "docker-compose.yml").read_text("utf-8")
 FLOORS = ("ground", "upstairs")
+TWICE = "attic"
+"""A floor with three machines."""
 
 
 def floor(folder: Path, site: str) -> Path:
@@ -43,6 +48,8 @@ def words(tmp_path_factory: pytest.TempPathFactory) -> list[str]:
 def out(words: list[str], tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("stacks")
     stack(*words, "--out", folder, "--images", "registry.local:5000/")
+    attic = floor(tmp_path_factory.mktemp("attic"), TWICE)
+    stack(f"{attic}@a.local,b.local,c.local", "--out", folder)
     return folder
 
 
@@ -50,7 +57,7 @@ def made(out: Path, name: str) -> dict[str, Any]:
     return yaml.safe_load((out / f"{name}.yml").read_text("utf-8"))
 
 
-@pytest.mark.parametrize("name", FLOORS)
+@pytest.mark.parametrize("name", [*FLOORS, TWICE])
 def test_each_secret_and_config_of_a_stack_is_a_small_file_beside_it_and_each_is_used(out: Path, name: str) -> None:
     found = made(out, name)
     for kind in ("secrets", "configs"):
@@ -102,6 +109,86 @@ def test_stack_that_is_written_again_keeps_its_credentials_and_names(out: Path, 
     before = made(out, "ground")
     stack(*words, "--out", out, "--images", "registry.local:5000/")
     assert made(out, "ground") == before
+
+
+@pytest.mark.skipif(shutil.which("docker") is None, reason="needs the command docker")
+@pytest.mark.parametrize("name", [*FLOORS, TWICE])
+def test_docker_reads_the_stack(out: Path, name: str) -> None:
+    done = subprocess.run(
+        ["docker", "stack", "config", "-c", f"{name}.yml"], cwd=out, capture_output=True, text=True, check=False
+    )
+    if "is not a docker command" in done.stderr or "unknown command" in done.stderr:
+        pytest.skip("this docker has no `stack config`, which 25 has")
+    assert done.returncode == 0, done.stderr
+
+
+def machine_of(service: dict[str, Any]) -> str:
+    (found,) = re.findall(r"fognav\.machine == (\d)", " ".join(service["deploy"]["placement"]["constraints"]))
+    return str(found)
+
+
+def test_floor_with_three_machines_runs_twice_and_redis_three_times(out: Path) -> None:
+    machines = {name: machine_of(service) for name, service in made(out, TWICE)["services"].items()}
+    assert {name for name, machine in machines.items() if machine == "3"} == {"redis-3", "sentinel-3"}
+    first = {name for name, machine in machines.items() if machine == "1"} - {"prometheus", "grafana"}
+    assert {f"{name}-2" for name in first} == {name for name, machine in machines.items() if machine == "2"}
+
+
+def names_in(networks: Any, name: str) -> dict[str, set[str]]:
+    """Return by which names a service is known in each of its networks."""
+    listed = networks if isinstance(networks, dict) else dict.fromkeys(networks)
+    return {network: {name, *((settings or {}).get("aliases", []))} for network, settings in listed.items()}
+
+
+def test_every_server_that_a_copy_names_is_in_a_network_with_it_and_its_certificate_has_the_name(out: Path) -> None:
+    services = made(out, TWICE)["services"]
+    known = {name: names_in(service["networks"], name) for name, service in services.items()}
+    certificates = {
+        each: (out / TWICE / "secrets" / each / "server.pem").read_bytes() for each in ("redis", "zenoh", "gateway")
+    }
+    named: set[str] = set()
+    for name, service in services.items():
+        near = {other: set().union(*(by[n] for n in by.keys() & known[name].keys())) for other, by in known.items()}
+        needed = {
+            key: each
+            for key, each in service["environment"].items()
+            if key != "FOGNAV_MQTT_URL" or "nodes" in known[name]
+        }
+        text = "\n".join([*needed.values(), *map(str, service.get("command", []))])
+        for host in re.findall(r"(?:(?<=//)|(?<=tls/)|(?<=,))([a-z-]+\d?)(?=:\d+)", text):
+            assert [other for other in near if host in near[other]], f"{name} knows no {host}"
+            named.add(host)
+    assert {"redis", "sentinel-3", "zenoh-2", "mosquitto-2", "gateway-2"} - named == {"redis"}
+    for data in certificates.values():
+        (names,) = (
+            each.value.get_values_for_type(x509.DNSName)
+            for each in x509.load_pem_x509_certificate(data).extensions
+            if isinstance(each.value, x509.SubjectAlternativeName)
+        )
+        assert named <= {*names}
+
+
+def test_copies_share_no_volume_and_have_the_same_secrets(out: Path) -> None:
+    found = made(out, TWICE)
+    kept: dict[str, set[str]] = {}
+    for service in found["services"].values():
+        volumes = {each.partition(":")[0] for each in service["volumes"] if isinstance(each, str)}
+        kept.setdefault(machine_of(service), set()).update(volumes)
+    assert len(set().union(*kept.values())) == sum(map(len, kept.values())), "two machines labelled alike share data"
+    for name in ("planner", "console-service", "gateway", "zenoh"):
+        own, other = (
+            {
+                each["target"]: (out / found["secrets"][each["source"]]["file"]).read_bytes()
+                for each in service["secrets"]
+            }
+            for service in (found["services"][name], found["services"][f"{name}-2"])
+        )
+        assert own == other, name
+
+
+@pytest.mark.parametrize("hosts", ["a.local,b.local", "a.local,a.local,b.local"])
+def test_floor_with_two_machines_is_refused(tmp_path: Path, hosts: str) -> None:
+    assert "3" in stack(f"sites/estig@{hosts}", "--out", tmp_path, code=2)
 
 
 @pytest.mark.parametrize("word", ["sites/estig", "@fog.local", "sites/estig@fog local"])

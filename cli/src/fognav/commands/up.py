@@ -101,7 +101,8 @@ def up_command(  # noqa: PLR0913  # each option is an argument
 
 def stack_command(
     floors: Annotated[
-        list[str], typer.Argument(metavar="SITE@HOST...", help="Each floor's site, and the machine that it is on.")
+        list[str],
+        typer.Argument(metavar="SITE@HOST[,HOST,HOST]...", help="Each floor's site, and its machine, or its three."),
     ],
     *,
     out: Annotated[
@@ -115,11 +116,12 @@ def stack_command(
     """Write stack files for Docker Swarm.
 
     There is one for each floor, with its secrets and configuration. Each floor's console lists the others.
+    With three machines a floor has two copies of each service, and three Redis servers.
     """
     from fognav.hosting.swarm_stacks import named_floors, write_stacks  # noqa: PLC0415  # pictures are slow to import
 
     with exit_codes(), security_errors():
-        named = [(checkout.site_folder(folder), host) for folder, host in named_floors(floors)]
+        named = [(checkout.site_folder(folder), hosts) for folder, hosts in named_floors(floors)]
         made = write_stacks(named, checkout.root(), out.absolute(), images)
     stacks = [f"docker stack deploy -c {Path(file).name} {Path(file).stem}" for file in made["files"]]
     print_result(made, f"wrote {out}. On a manager, in this folder, for each floor:", *stacks, json=json)

@@ -1,6 +1,7 @@
 """Stack files for Docker Swarm, one for each floor, made from docker-compose.yml: `fognav stack` (docs/campus.md).
 
-A stack has what the compose file has for one floor, all of it on the machine whose label names the floor. What the
+A stack has what the compose file has for one floor, all of it on the machine whose label names the floor, or twice on
+two of the three that are named (`swarm_copies`). What the
 container `credentials` hands out there are secrets here, what is mounted from the checkout are configs; both have the
 hash of their content in their names, so that the next `docker stack deploy` brings a change into force. The folder
 that is written has all that the engine reads, and each floor's authority.
@@ -19,14 +20,16 @@ from PIL import Image
 
 from fog_runtime.configuration.maps import read_keys
 from fog_runtime.configuration.site import SITE_FILE, LoadedSite
-from fog_runtime.credentials import to_toml
+from fog_runtime.credentials import Credentials, to_toml
 from fog_runtime.files import SHARED, atomic_write
 from fog_runtime.keys import TOKENS
 from fog_runtime.security.__main__ import OWNERS, TOKEN, make_site, secrets_of
 from fog_runtime.security.site_security import SiteSecurity
+from fog_runtime.security.users import PEER
 from fog_runtime.token_file import keep_token
 from fognav.hosting.compose_floors import BASE
 from fognav.hosting.folders import load_sites
+from fognav.hosting.swarm_copies import HOSTS, MACHINES, shared_files, shared_secrets, with_copies
 from fognav.output import WrongUseError
 from fognav.programs import CONSOLE
 
@@ -35,6 +38,8 @@ _Part = dict[str, Any]
 IMAGES: Final = "fognav/"
 """What the names of our images begin with in the compose file."""
 LABEL: Final = "fognav.floor"
+MACHINE: Final = "fognav.machine"
+"""The label that numbers the machines of a floor that has several."""
 LIMIT: Final = 500 * 1024
 """Bytes of a secret or config (Docker Engine 20.10)."""
 KEPT: Final = frozenset(
@@ -45,6 +50,8 @@ KEPT: Final = frozenset(
 CHANGED: Final = frozenset({"volumes", "ports", "networks", "network_mode", "mem_limit", "scale", "tmpfs"})
 DROPPED: Final = frozenset({"build", "pull_policy", "depends_on", "restart", "security_opt"})
 """What Swarm does not know, or does in its own way: it starts all at once, and again until they run."""
+HEALTH: Final = {"timeout": "10s", "retries": 6}
+"""Swarm kills, and forgets the name of, what compose only calls unhealthy: a busy machine must not lose its store."""
 _MOUNTED: Final = re.compile(r"^(?P<source>.+):(?P<target>/[^:]*)(:ro)?$")
 _SITE: Final = "/site"
 _NAME: Final = 64
@@ -53,10 +60,15 @@ _FLOORS: Final = "floors.toml"
 
 @dataclass(frozen=True, kw_only=True)
 class FloorAt:
-    """A floor, and the name or address of the machine that it is on."""
+    """A floor, and the names or addresses of its machine, or of its three."""
 
     loaded: LoadedSite
-    host: str
+    hosts: Sequence[str]
+
+    @property
+    def twice(self) -> bool:
+        """Whether it has two copies of each service."""
+        return len(self.hosts) > 1
 
     @property
     def id(self) -> str:
@@ -64,44 +76,61 @@ class FloorAt:
         return self.loaded.site.id
 
 
-def named_floors(words: Sequence[str]) -> list[tuple[Path, str]]:
+def named_floors(words: Sequence[str]) -> list[tuple[Path, list[str]]]:
     """Return the folders and hosts of words like `sites/upstairs@fog2.local`; raises `WrongUseError`."""
     found = []
     for word in words:
-        folder, at, host = word.rpartition("@")
-        if not at or not folder or not re.fullmatch(r"[A-Za-z0-9.-]+", host):
+        folder, at, hosts = word.rpartition("@")
+        named = hosts.split(",")
+        if not at or not folder or not all(re.fullmatch(r"[A-Za-z0-9.-]+", host) for host in named):
             raise WrongUseError(
                 f"{word!r}: give a floor as its site's folder and its machine: sites/upstairs@fog2.local"
             )
-        found.append((Path(folder), host))
+        if (len(named), len(set(named))) not in ((1, 1), (MACHINES, MACHINES)):
+            raise WrongUseError(
+                f"{word!r}: a floor has one machine, or for two copies of each service {MACHINES}. The third one may "
+                "be small: with it, two of them can tell which one is cut off"
+            )
+        found.append((Path(folder), named))
     return found
 
 
-def write_stacks(floors: Sequence[tuple[Path, str]], root: Path, out: Path, images: str) -> dict[str, Any]:
+def write_stacks(floors: Sequence[tuple[Path, Sequence[str]]], root: Path, out: Path, images: str) -> dict[str, Any]:
     """Write a stack for each floor into `out`, where earlier credentials are kept; return the files.
 
     images: what the names of our images begin with, such as `registry.local:5000/fognav/`. Raises `WrongUseError`, and
     as `load_sites` and `make_site`.
     """
     loaded = load_sites([folder for folder, _ in floors])
-    known = [FloorAt(loaded=each, host=host) for each, (_, host) in zip(loaded.values(), floors, strict=True)]
-    securities = {floor.id: make_site(out / floor.id / "locks", floor.loaded.site, [floor.host]) for floor in known}
+    known = [FloorAt(loaded=each, hosts=hosts) for each, (_, hosts) in zip(loaded.values(), floors, strict=True)]
+    securities = {
+        floor.id: make_site(
+            out / floor.id / "locks", floor.loaded.site, [*floor.hosts, *(HOSTS if floor.twice else ())],
+            copies=floor.twice,
+        )
+        for floor in known
+    }  # fmt: skip
     peers = {floor.id: _peers(floor, known, securities) for floor in known}  # before the tokens are read
-    files = []
+    written = []
     for floor in known:
         site = floor.loaded.site
         secrets = secrets_of(securities[floor.id], robots=[robot.id for robot in site.robots], nodes=site.senders)
         secrets[CONSOLE] |= peers[floor.id]
-        base = yaml.safe_load((root / BASE).read_text("utf-8"))
-        stack = _Stack(floor.id, out, {**secrets, "mosquitto-relay": secrets["mosquitto"]}, _site_files(floor.loaded))
+        secrets["mosquitto-relay"] = secrets["mosquitto"]
+        base, files = yaml.safe_load((root / BASE).read_text("utf-8")), {}
+        if floor.twice:
+            base, files = with_copies(base), shared_files(root / "deploy")
+            secrets = shared_secrets(secrets, Credentials.read(securities[floor.id].credentials(PEER)))
+        stack = _Stack(floor.id, out, secrets, _site_files(floor.loaded), files)
         made = stack.of(base, root, images)
         if peers[floor.id]:
-            made["services"][CONSOLE]["environment"]["FOGNAV_FLOORS_FILE"] = f"/run/fognav/{_FLOORS}"
+            for name in made["services"].keys() & {CONSOLE, f"{CONSOLE}-2"}:
+                made["services"][name]["environment"]["FOGNAV_FLOORS_FILE"] = f"/run/fognav/{_FLOORS}"
         file = out / f"{floor.id}.yml"
         text = f"# Written by `fognav stack`: run that again after an upgrade.\n{yaml.safe_dump(made, sort_keys=False)}"
         atomic_write(file, text.encode(), mode=SHARED)
-        files.append(str(file))
-    return {"files": files, "floors": {floor.id: floor.host for floor in known}}
+        written.append(str(file))
+    return {"files": written, "floors": {floor.id: ",".join(floor.hosts) for floor in known}}
 
 
 def _peers(floor: FloorAt, floors: Sequence[FloorAt], securities: Mapping[str, SiteSecurity]) -> dict[str, bytes]:
@@ -115,7 +144,7 @@ def _peers(floor: FloorAt, floors: Sequence[FloorAt], securities: Mapping[str, S
         keep_token(security.directory / TOKENS, name, "viewer", token)
         text = to_toml(name, authority=security.authority.trusted, passwords={}, token=token.read_text("ascii").strip())
         found[f"{other.id}.toml"] = text.encode()
-        listed += f'[floors.{other.id}]\naddress = "https://{other.host}"\ncredentials = "{other.id}.toml"\n'
+        listed += f'[floors.{other.id}]\naddress = "https://{other.hosts[0]}"\ncredentials = "{other.id}.toml"\n'
     return found | {_FLOORS: listed.encode()} if found else {}
 
 
@@ -139,13 +168,18 @@ class _Stack:
     """One floor's stack as it is made: its secrets and configs are written, and named by their content."""
 
     def __init__(
-        self, floor: str, out: Path, secrets: Mapping[str, Mapping[str, bytes]], site: Mapping[str, bytes]
-    ) -> None:
-        """`secrets` are files by the program that reads them, `site` those of the site."""
+        self, floor: str, out: Path, secrets: Mapping[str, Mapping[str, bytes]], site: Mapping[str, bytes],
+        files: Mapping[str, bytes],
+    ) -> None:  # fmt: skip
+        """`secrets` are files by the program that reads them, `site` those of the site.
+
+        `files` replace what is in the checkout's folder `deploy`.
+        """
         self._floor = floor
         self._out = out
         self._secrets = secrets
         self._site = site
+        self._files = files
         self._made: _Part = {
             "version": "3.9",
             "services": {},
@@ -165,20 +199,27 @@ class _Stack:
         return self._made
 
     def _service(self, name: str, base: Mapping[str, Any], root: Path, images: str) -> _Part:
-        if unknown := base.keys() - KEPT - CHANGED - DROPPED:
+        machine, of = base.get("x-machine", 0), base.get("x-of", name)
+        if unknown := base.keys() - KEPT - CHANGED - DROPPED - {"x-machine", "x-of"}:
             raise WrongUseError(f"{BASE}: {name} has {min(unknown)}, of which a stack is not made: take it out")
         service: _Part = {key: value for key, value in base.items() if key in KEPT}
+        service["healthcheck"] = {**base.get("healthcheck", {}), **HEALTH}
         service["environment"] = dict(base.get("environment", {}))
         if base["image"].startswith(IMAGES):
             service["image"] = images + base["image"].removeprefix(IMAGES)
         # Who has no network there is alone in one here: Swarm's tasks have one.
         service["networks"] = base.get("networks", ["alone"])
         service["ports"] = [_port(text) for text in base.get("ports", [])]
-        self._mount(service, name, base, root)
+        self._mount(service, name, of, base, root)
         service["deploy"] = {
             "replicas": base.get("scale", 1),
             "endpoint_mode": "dnsrr",
-            "placement": {"constraints": [f"node.labels.{LABEL} == {self._floor}"]},
+            "placement": {
+                "constraints": [
+                    f"node.labels.{LABEL} == {self._floor}",
+                    *([f"node.labels.{MACHINE} == {machine}"] if machine else []),
+                ]
+            },
             "resources": {"limits": {"memory": base["mem_limit"]}},
             "restart_policy": {"condition": "any", "delay": "1s"},
             # Two at once would share ports and data.
@@ -186,9 +227,9 @@ class _Stack:
         }
         return service
 
-    def _mount(self, service: _Part, name: str, base: Mapping[str, Any], root: Path) -> None:
-        """Give a service its volumes, secrets and configs."""
-        owner = str(OWNERS.get("mosquitto" if name == "mosquitto-relay" else name, 0))
+    def _mount(self, service: _Part, name: str, of: str, base: Mapping[str, Any], root: Path) -> None:
+        """Give a service its volumes, secrets and configs; `of` is the service of which it is a copy."""
+        owner = str(OWNERS.get({"mosquitto-relay": "mosquitto", "sentinel": "redis"}.get(of, of), 0))
         # Stacks pass over `tmpfs`.
         volumes = service["volumes"] = [{"type": "tmpfs", "target": target} for target in base.get("tmpfs", [])]
         secrets, configs = service["secrets"], service["configs"] = [], []
@@ -205,7 +246,8 @@ class _Stack:
                     configs.append({"source": self._add("configs", f"site/{file}", data), "target": f"{target}/{file}"})
             elif source.startswith("./"):
                 for path, within in _files(root / source):
-                    key = self._add("configs", path.relative_to(root / "deploy").as_posix(), path.read_bytes())
+                    file = path.relative_to(root / "deploy").as_posix()
+                    key = self._add("configs", file, self._files.get(file) or path.read_bytes())
                     configs.append({"source": key, "target": target + within})
             else:
                 self._made["volumes"][source] = None

@@ -9,6 +9,8 @@ import pytest
 from fog_contracts import channels as ch
 from fog_contracts import messages as m
 from fog_runtime.clock import SystemClock
+from fog_runtime.credentials import Credentials
+from fog_runtime.security.site_security import SiteSecurity
 from fog_runtime.transports.mqtt_edge import MqttEdge
 from fog_runtime.transports.zenoh_edge import ZenohEdge
 from fog_supervisor import configurations
@@ -113,3 +115,46 @@ async def test_zenoh_clients_move_to_the_other_router_and_queries_are_answered(r
             while (reply := await subscriber.query(ch.ZONES, None, m.ZoneSet, 1.0)) is None:
                 pass
         assert reply.seq == 9
+
+
+@pytest.fixture
+def locked_routers(tmp_path):
+    """Two meshed routers that admit only the users of a site, and its credentials."""
+    security = SiteSecurity(tmp_path / "locks", "lab")
+    security.make([LOOPBACK, "localhost"], copies=True)
+    ports: list[int] = []
+    for _ in range(2):
+        ports.append(free_port(set(ports)))
+    with contextlib.ExitStack() as stack:
+        urls = [f"tls/{LOOPBACK}:{port}" for port in ports]
+        for number, url in enumerate(urls):
+            arguments = configurations.router_arguments(url, security=str(security.folder("zenoh")))
+            arguments += ["--connect", urls[1 - number], "--credentials", str(security.credentials("peer"))]
+            command = (sys.executable, "-m", "fog_runtime.router", *arguments)
+            (home := tmp_path / f"router-{number}").mkdir()
+            program = ServerProgram(name="zenoh-router", port=ports[number], url=url, command=command)
+            stack.enter_context(Server(program, home))
+        yield urls, security
+
+
+async def test_locked_routers_pass_on_what_each_ones_clients_may_send_and_nothing_else(locked_routers):
+    (first, second), security = locked_routers
+    received = Received()
+    sessions = [
+        ZenohEdge.open(
+            connect=[url], clock=SystemClock(), role=role, id="x", site="lab",
+            credentials=Credentials.read(security.credentials(role)),
+        )
+        for url, role in ((first, "map-service"), (first, "console"), (second, "planner"))
+    ]  # fmt: skip
+    async with sessions[0] as allowed, sessions[1] as forger, sessions[2] as subscriber:
+        subscriber.subscribe(ch.ZONES, m.ZoneSet, received.add)
+
+        async def publish() -> None:
+            forger.publish(ch.ZONES, zones(2))
+            allowed.publish(ch.ZONES, zones(1))
+
+        await received.until(1, publish)
+        await publish()
+        await received.until(1, publish)
+    assert set(received.seqs) == {1}

@@ -290,15 +290,25 @@ def test_second_path_is_taken_only_where_its_lines_cost_less(costmap: NDArray[np
     assert cost_of(costmap, corners) <= cost_of(costmap, planner.shortcut(costmap, found.cells)) + 1e-9
 
 
-def test_box_is_passed_on_the_side_that_is_nearer_in_straight_lines() -> None:
-    costmap = np.zeros((80, 120), np.uint8)
-    costmap[36:50, 49:81] = 254
-    planner, patterns = Planner(120, 80), TilePatterns(10_000_000)
-    found = planner.plan(costmap, (4, 74), (115, 35))
+@pytest.mark.parametrize(
+    ("boxes", "start", "goal", "share"),
+    [
+        pytest.param([(49, 36, 32, 14)], (4, 74), (115, 35), 0.95, id="the second way"),
+        pytest.param([(107, 119, 23, 22), (78, 79, 13, 38)], (53, 155), (150, 8), 0.985, id="a third, between boxes"),
+    ],
+)
+def test_boxes_are_passed_on_the_side_that_is_nearer_in_straight_lines(
+    boxes: list[tuple[int, int, int, int]], start: Cell, goal: Cell, share: float
+) -> None:
+    costmap = np.zeros((160, 160), np.uint8)
+    for x, y, width, height in boxes:
+        costmap[y : y + height, x : x + width] = 254
+    planner = Planner(160, 160)
+    found = planner.plan(costmap, start, goal)
     first = planner.shortcut(costmap, found.cells)
-    field = planner.goal_field(costmap, (115, 35), patterns)
-    corners = planner.straightened(costmap, found.cells, 10_000, field)
-    assert cost_of(costmap, corners) < 0.95 * cost_of(costmap, first)
+    field = planner.goal_field(costmap, goal, TilePatterns(10_000_000))
+    corners = planner.straightened(costmap, found.cells, 20_000, field)
+    assert cost_of(costmap, corners) < share * cost_of(costmap, first)
     assert planner.straightened(costmap, found.cells, 1, field).tolist() == first.tolist(), "it may take too long"
 
 

@@ -26,7 +26,7 @@ from fog_contracts.costs import COST_WEIGHT, INSCRIBED, NEUTRAL_WEIGHT
 from fog_kernels import _arrays
 from fog_kernels.flood import descend, fill_field
 from fog_kernels.guides import TILE, TILE_BITS, GoalField, fill_tile
-from fog_kernels.lines import line_cost, raised_near, shortcut
+from fog_kernels.lines import leaves, line_cost, raised_near, shortcut
 from fog_kernels.steps import DIAGONAL, FOUND, NOT_FOUND, OVERFLOW, QUEUE_FULL, SEALED, STRAIGHT, TIMED_OUT, weights_of
 
 if TYPE_CHECKING:
@@ -48,6 +48,8 @@ BESIDE: Final = 10
 """Within so many cells of a path another one is made dearer ..."""
 DEARER: Final = 2
 """... by this cost, 3 % of a free cell's weight: 8 directions can let a cheaper way seem so much dearer."""
+WAYS: Final = 3
+"""Of so many paths the cheapest one is taken at most."""
 
 type_scratch = _arrays.I32_OUT
 
@@ -668,19 +670,27 @@ class Planner:
         field: GoalField | None = None,
         landmarks: Landmarks | None = None,
     ) -> NDArray[np.float64]:
-        """Return the `shortcut` of a path or, where its lines cost less, of a second one that avoids the first.
+        """Return the `shortcut` of a path or, where its lines cost less, of another one that avoids the first.
 
-        In 8 directions the cheapest path may pass things on the side that is dearer for straight lines. The arguments
-        are those of `plan`, and guide the second search, from the first cell to the last one. Raises as `shortcut` and
-        `plan` do.
+        In 8 directions the cheapest path may pass things on the side that is dearer for straight lines. Where the
+        second path is another way, there may be a third one, which the second hides: it avoids both. The arguments are
+        those of `plan`, and guide these searches, from the first cell to the last one; `max_expansions` limits them
+        together. Raises as `shortcut` and `plan` do.
         """
-        corners = self.shortcut(costmap, cells)
+        lines, raised = [self.shortcut(costmap, cells)], costmap
         (x, y), (goal_x, goal_y) = cells[0].tolist(), cells[-1].tolist()
-        raised = raised_near(costmap, cells, BESIDE, DEARER)
-        other = self.plan(raised, (x, y), (goal_x, goal_y), max_expansions, field, None, landmarks)
-        if not other.found:
-            return corners
-        return min((corners, self.shortcut(costmap, other.cells)), key=lambda line: self._cost(costmap, line))
+        left = max_expansions
+        while len(lines) < WAYS:
+            raised = raised_near(raised, cells, BESIDE, DEARER)
+            found = self.plan(raised, (x, y), (goal_x, goal_y), left, field, None, landmarks)
+            if not found.found:
+                break
+            cells = found.cells
+            lines.append(self.shortcut(costmap, cells))
+            if not leaves(lines[-1], lines[0], 2.0 * BESIDE, 0.5 * BESIDE) or 0 < left <= found.expansions:
+                break
+            left -= found.expansions if left > 0 else 0
+        return min(lines, key=lambda line: self._cost(costmap, line))
 
     def _cost(self, costmap: NDArray[np.uint8], corners: NDArray[np.float64]) -> float:
         lines = pairwise(corners.tolist())

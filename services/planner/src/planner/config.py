@@ -57,8 +57,8 @@ class PlannerConfig:
 
     Then paths are sent as they are found: nothing is done to make them a little cheaper.
     """
-    second_expansions: int = 200_000
-    """A second search, for a cheaper way past things, expands no more cells (6 ms): where nothing hurries, or waits."""
+    second_expansions: int = 300_000
+    """Searches for a cheaper way past things expand no more cells (9 ms) together: where nothing hurries, or waits."""
     standing_s: float = 60.0
     """What has stayed on the map for so long, zones above all, is in the distance fields, too."""
     goal_fields_bytes: int = 40_000_000

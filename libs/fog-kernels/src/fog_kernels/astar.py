@@ -54,6 +54,76 @@ WAYS: Final = 3
 type_scratch = _arrays.I32_OUT
 
 
+@njit(
+    int64(
+        _arrays.U8_FLAT, int64, _arrays.I32_FLAT, int64, int64, int64, _arrays.I32_FLAT, int64, _arrays.I32_FLAT,
+        _arrays.I32_FLAT, _arrays.I32_FLAT, int64, int64, int64, type_scratch,
+    ),
+    cache=True, nogil=True, error_model="numpy",
+)  # fmt: skip
+def _walk(
+    costmap: Any, width: int, weight: Any, start: int, goal: int, cost: int, lowest: Any, field_width: int, slots: Any,
+    patterns: Any, detour: Any, detour_highest: int, detour_offset: int, most: int, path: Any,
+) -> int:  # fmt: skip
+    """Write a path of steps that cost as much as the bound of the rest falls, goal first; return its number of cells.
+
+    It costs what the bound, `cost`, is at the start, so none is cheaper. 0 if it gets no farther somewhere, or within
+    `most` steps (0: no limit): then only a search tells.
+    """
+    height = costmap.size // width
+    last = TILE - 1
+    columns = np.array((1, -1, 0, 0, 1, -1, 1, -1), np.int64)
+    rows = np.array((0, 0, 1, -1, 1, 1, -1, -1), np.int64)
+    cell: Any = np.int64(start)
+    y: Any = cell // width
+    x: Any = cell - y * width
+    left: Any = np.int64(cost)
+    count: Any = np.int64(0)
+    direction: Any = np.int64(0)
+    path[0] = start
+    while cell != goal and (most == 0 or count < most) and count + 1 < path.size:
+        own = np.int64(weight[costmap[np.uint64(cell)]])
+        before = count
+        for turn in range(-1, 8):  # as before, if that is possible
+            k = direction if turn < 0 else np.int64(turn)
+            nx = x + columns[k]
+            ny = y + rows[k]
+            if nx < 0 or nx >= width or ny < 0 or ny >= height:
+                continue
+            other = ny * width + nx
+            there = np.int64(weight[costmap[np.uint64(other)]])
+            block = np.uint64((ny >> TILE_BITS) * field_width + (nx >> TILE_BITS))
+            remaining: Any = np.int64(lowest[block])
+            if there == 0 or remaining < 0:
+                continue
+            place = (np.int64(slots[block]) << (2 * TILE_BITS)) + ((ny & last) << TILE_BITS) + (nx & last)
+            rise = np.int64(patterns[np.uint64(place)])
+            bound: Any = np.int64(detour[np.uint64(other)]) if detour.size > 0 else np.int64(0)
+            if rise < 0 or bound == SEALED:
+                continue
+            remaining += rise
+            if bound > 0:
+                remaining = max(remaining, min(bound, detour_highest) + detour_offset)
+            if remaining + (STRAIGHT if k < 4 else DIAGONAL) * (own + there) != left:
+                continue
+            if k >= 4 and (
+                weight[costmap[np.uint64(cell + columns[k])]] == 0
+                or weight[costmap[np.uint64(other - columns[k])]] == 0
+            ):
+                continue
+            direction, x, y, cell, left = k, nx, ny, other, remaining
+            count += 1
+            path[np.uint64(count)] = cell
+            break
+        if count == before:
+            return 0
+    if cell != goal or left != 0:
+        return 0
+    for i in range((count + 1) // 2):
+        path[i], path[count - i] = path[count - i], path[i]
+    return int(count + 1)
+
+
 def _search_signature(costs: Any) -> Any:
     write = types.Array(costs, 1, "C")
     return types.void(
@@ -126,7 +196,7 @@ def _search(
     """Search from start to goal; an empty `lowest` (see `GoalField`) means the octile heuristic, and no detour.
 
     With landmarks, `bounds` is `patterns`, and the rows of the tiles that this search, by its `number`, has not entered
-    yet in `filled` are written when it does.
+    yet in `filled` are written when it does. Where the bound of the rest is exact all along, a walk takes its place.
     `g` holds its largest value everywhere before and after. A negative g is the complement of an expanded cell's
     cost. `result` receives status, cost, path length, expansions; the path itself ends in queue_cell, goal first.
     """
@@ -179,6 +249,17 @@ def _search(
             remaining += rise
         if use_detour and detour[start] > 0:
             remaining = max(remaining, min(np.int64(detour[start]), detour_highest) + detour_offset)
+        if use_patterns and field_unit == 1 and not use_landmarks:
+            cells = _walk(
+                costmap, width, weight, start, goal, remaining, lowest, field_width, slots, patterns, detour,
+                detour_highest, detour_offset, max_expansions, queue_cell,
+            )  # fmt: skip
+            if cells > 0:
+                result[0] = FOUND
+                result[1] = remaining
+                result[2] = cells
+                result[3] = cells - 1
+                return
         bucket = remaining >> shift
     else:
         dx = abs(start % width - goal_x)

@@ -38,7 +38,7 @@ from planner.path_search import PathSearch, Route, SearchResult, find_egress
 from planner.planning_map import CostChange, MapTracker, PlanningMap
 from planner.refusals import refuse
 from planner.regions import BlockedRegions, Region, Regions
-from planner.replanner import distance_to_change, is_kept, reason_from_pose
+from planner.replanner import distance_to_change, is_kept, reason_from_pose, remaining_cost
 
 CONFIG = PlannerConfig()
 TRACE = Trace(area="z1", epoch=1, seq=5)
@@ -140,7 +140,7 @@ def test_refused_robot_is_replanned_once_it_has_moved() -> None:
 
 
 def found(cost: float = math.inf, refusal: Refusal | None = None) -> SearchResult:
-    return SearchResult(None, cost, refusal)
+    return SearchResult(None, lambda: cost, refusal)
 
 
 def test_path_is_kept_unless_another_saves_the_share_that_the_reason_requires() -> None:
@@ -149,7 +149,7 @@ def test_path_is_kept_unless_another_saves_the_share_that_the_reason_requires() 
     cost = straight(kept).cost(planning_map.cost, planning_map.geometry)
 
     def keeps(share: float, reason: str) -> bool:
-        return is_kept(kept, found(cost * share), reason, planning_map, CONFIG)
+        return is_kept(kept, found(cost * share), reason, cost, CONFIG)
 
     assert keeps(0.98, "map")
     assert not keeps(0.96, "map")
@@ -162,13 +162,11 @@ def test_path_is_kept_unless_another_saves_the_share_that_the_reason_requires() 
 def test_blocked_path_is_replaced_and_a_refusal_is_kept_while_it_is_the_same() -> None:
     planning_map = current(make_tracker(RingMap()))
     through_the_wall = plan((1.0, 6.0), (19.0, 6.0))
-    assert not is_kept(through_the_wall, found(1e9), "map", planning_map, CONFIG)
+    assert not is_kept(through_the_wall, found(1e9), "map", remaining_cost(through_the_wall, planning_map), CONFIG)
     refused = Plan(1, None, refuse(208, PlanRefusal.CUT_OFF, "cut by z1"), [], planned_from=LEFT)
-    assert is_kept(refused, found(refusal=refuse(208, PlanRefusal.CUT_OFF, "cut by z1")), "map", planning_map, CONFIG)
-    assert not is_kept(
-        refused, found(refusal=refuse(208, PlanRefusal.CUT_OFF, "cut by z2")), "map", planning_map, CONFIG
-    )
-    assert not is_kept(refused, found(100.0), "map", planning_map, CONFIG)
+    assert is_kept(refused, found(refusal=refuse(208, PlanRefusal.CUT_OFF, "cut by z1")), "map", math.inf, CONFIG)
+    assert not is_kept(refused, found(refusal=refuse(208, PlanRefusal.CUT_OFF, "cut by z2")), "map", math.inf, CONFIG)
+    assert not is_kept(refused, found(100.0), "map", math.inf, CONFIG)
 
 
 # --- Mission ---

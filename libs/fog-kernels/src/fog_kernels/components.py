@@ -64,6 +64,22 @@ def _find_runs(costmap: Any, offsets: Any, first: Any, last: Any, edges: Any) ->
     return count
 
 
+# It keeps the GIL: it takes less time than another thread may keep the GIL before it gives it back.
+@njit(int64(_arrays.I32_FLAT, _arrays.I32_FLAT, _arrays.I32_FLAT, int64, int64), cache=True)
+def _run_at(offsets: Any, first: Any, last: Any, column: int, row: int) -> int:
+    """Return the run of a cell of the grid; -1 where it is not traversable."""
+    low: Any = np.int64(offsets[row])
+    high: Any = np.int64(offsets[row + 1])
+    end = high
+    while low < high:
+        middle = (low + high) >> 1
+        if last[middle] < column:
+            low = middle + 1
+        else:
+            high = middle
+    return int(low) if low < end and first[low] <= column else -1
+
+
 @njit(
     void(_arrays.I32_FLAT, _arrays.I32_FLAT, _arrays.I32_FLAT, int64, _arrays.I32_FLAT, _U8_OUT),
     cache=True,
@@ -71,18 +87,9 @@ def _find_runs(costmap: Any, offsets: Any, first: Any, last: Any, edges: Any) ->
 )
 def _flag_runs(offsets: Any, first: Any, last: Any, width: int, cells: Any, flags: Any) -> None:
     for i in range(cells.size):
-        row = cells[i] // width
-        column = cells[i] - row * width
-        low, high = offsets[row], offsets[row + 1]
-        end = high
-        while low < high:
-            middle = (low + high) >> 1
-            if last[middle] < column:
-                low = middle + 1
-            else:
-                high = middle
-        if low < end and first[low] <= column:
-            flags[low] = 1
+        run = _run_at(offsets, first, last, cells[i] % width, cells[i] // width)
+        if run >= 0:
+            flags[run] = 1
 
 
 @njit(void(_arrays.I32_FLAT, _arrays.I32_FLAT, _arrays.I32_FLAT, _arrays.I32_OUT), cache=True, nogil=True)
@@ -213,9 +220,7 @@ class Runs:
         """Return the run of a cell, which may lie outside the grid; -1 where it is not traversable."""
         if not (0 <= column < self.width and 0 <= row < self.height):
             return -1
-        begin, end = int(self.offsets[row]), int(self.offsets[row + 1])
-        index = begin + int(np.searchsorted(self.last[begin:end], column))
-        return index if index < end and self.first[index] <= column else -1
+        return int(_run_at(self.offsets, self.first, self.last, column, row))
 
     def with_cells(self, cells: NDArray[np.int32]) -> NDArray[np.uint8]:
         """Return for each run whether it has one of the cells, given by their flat indexes: 1 or 0."""

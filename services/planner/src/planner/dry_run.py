@@ -37,7 +37,7 @@ from planner.planning_map import CostChange, body_reach, under_body, with_time
 from planner.queries import Answerer, View
 from planner.refusals import no_map
 from planner.regions import Regions, cover, is_closing
-from planner.replanner import begun_at, beside_others, effect_of_change, is_kept
+from planner.replanner import begun_at, beside_others, effect_of_change, is_kept, remaining_cost
 from planner.waits.pace import Times
 
 if TYPE_CHECKING:
@@ -204,7 +204,8 @@ class DryRun:
             begun_at(plan, danger),
         )
         reason = "map" if "map" in reasons else reasons[0] if reasons else "goal"
-        if plan is not None and not plan.waits and is_kept(plan, found, reason, after_map, self._config):
+        rest = remaining_cost(plan, after_map)
+        if plan is not None and not plan.waits and is_kept(plan, found, reason, rest, self._config):
             after = _outcome(plan.route, self._explained(found) or plan.refusal, self._limits, after_map, plan.progress)
             return _compared(robot, before, after, replanned=False)
         after = _outcome(found.route, self._explained(found), self._limits, after_map)

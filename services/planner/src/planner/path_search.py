@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from functools import cached_property
+from functools import cached_property, partial
 from typing import TYPE_CHECKING, Literal
 
 import numpy as np
@@ -140,21 +140,26 @@ class Question:
 
 @dataclass(frozen=True)
 class SearchResult:
-    """A route with its cost, as the kernels integrate it, or a refusal.
+    """A route, or a refusal.
 
     `question`: what the refusal does not tell yet; None when it is complete. `searched`: whether A* found out.
     """
 
     route: Route | None
-    cost: float
+    count_cost: Callable[[], float]
     refusal: Refusal | None
     question: Question | None = None
     searched: bool = True
 
+    @cached_property
+    def cost(self) -> float:
+        """The route's cost, as the kernels integrate it on the costs of when it is first asked for; inf without one."""
+        return self.count_cost()
+
 
 def refused(refusal: Refusal, question: Question | None = None, *, searched: bool = False) -> SearchResult:
     """Return the result of a search without a path."""
-    return SearchResult(None, math.inf, refusal, question, searched)
+    return SearchResult(None, partial(float, math.inf), refusal, question, searched)
 
 
 Covers = Callable[[float, float, float], bool]
@@ -229,7 +234,7 @@ class PathSearch:
             corners = self.planner.shortcut(planning_map.cost, found.cells, relax=not hurried)
         points = self._points(planning_map.cost, corners, start, goal, escaping=free != first)
         route = Route(points, self._config.point_spacing, escape_lines=int(free != first))
-        return SearchResult(route, route.cost(planning_map.cost, geometry), None)
+        return SearchResult(route, partial(route.cost, planning_map.cost, geometry), None)
 
     def _most(self, field: GoalField | None) -> int:
         """Return how many cells a search may expand."""
@@ -365,7 +370,7 @@ def find_egress(
     if cells is None:
         return refused(start_occupied(start, around_robot))
     corners = geometry.centres(cells)
-    return SearchResult(Route(corners, config.point_spacing, escape_lines=len(corners) - 1), 0.0, None)
+    return SearchResult(Route(corners, config.point_spacing, escape_lines=len(corners) - 1), partial(float, 0.0), None)
 
 
 def _traversable(free: Grid, planning_map: PlanningMap, cell: Cell, config: PlannerConfig) -> Cell | None:

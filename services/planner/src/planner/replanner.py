@@ -124,15 +124,14 @@ def _point_at(route: Route, along: float) -> PointXY:
     return float(x), float(y)
 
 
-def is_kept(
-    plan: Plan, found: SearchResult, reason: ReplanReason, planning_map: PlanningMap, config: PlannerConfig
-) -> bool:
+def is_kept(plan: Plan, found: SearchResult, reason: ReplanReason, rest: float, config: PlannerConfig) -> bool:
     """Whether the current plan is kept: the same refusal, or a passable path that is not clearly worse.
 
-    A search that took too long says nothing about a path that is passable: the robot goes on.
+    `rest`: its `remaining_cost`. A search that took too long says nothing about a path that is passable: the robot goes
+    on.
     """
     if found.refusal is not None:
-        if ran_out(found) and reason not in ("goal", "off_path") and not math.isinf(remaining_cost(plan, planning_map)):
+        if ran_out(found) and reason not in ("goal", "off_path") and not math.isinf(rest):
             return True
         before = plan.refusal
         if before is None or found.question is None:
@@ -141,9 +140,8 @@ def is_kept(
         return (before.code, before.nearest) == (found.refusal.code, found.refusal.nearest)
     if plan.route is None or reason in ("goal", "off_path"):
         return False
-    remaining = remaining_cost(plan, planning_map)
     share = config.min_saving if reason == "clearing" else config.hysteresis
-    return not math.isinf(remaining) and found.cost >= (1.0 - share) * remaining
+    return not math.isinf(rest) and found.cost >= (1.0 - share) * rest
 
 
 def _may_be_reached(mission: Mission, planning_map: PlanningMap) -> bool:
@@ -163,9 +161,9 @@ def ran_out(found: SearchResult) -> bool:
     return found.refusal is not None and found.refusal.code == TIMEOUT
 
 
-def remaining_cost(plan: Plan, planning_map: PlanningMap) -> float:
+def remaining_cost(plan: Plan | None, planning_map: PlanningMap) -> float:
     """Return the cost of the rest of a path; infinite without one, or when it is impassable."""
-    if plan.route is None:
+    if plan is None or plan.route is None:
         return math.inf
     return plan.route.cost(planning_map.cost, planning_map.geometry, plan.progress)
 
@@ -178,15 +176,13 @@ def is_other_way(plan: Plan, found: SearchResult, config: PlannerConfig) -> bool
 
 
 def must_wait(
-    plan: Plan,
-    found: SearchResult,
-    switches: SwitchLimiter,
-    now: float,
-    planning_map: PlanningMap,
-    config: PlannerConfig,
+    plan: Plan, found: SearchResult, switches: SwitchLimiter, now: float, rest: float, config: PlannerConfig
 ) -> bool:
-    """Whether a better path has to wait, because it leads another way and the last switch was a moment ago."""
-    if now >= switches.allowed_from(config) or math.isinf(remaining_cost(plan, planning_map)):
+    """Whether a better path has to wait, because it leads another way and the last switch was a moment ago.
+
+    `rest`: the current one's `remaining_cost`.
+    """
+    if now >= switches.allowed_from(config) or math.isinf(rest):
         return False
     return is_other_way(plan, found, config)
 
@@ -245,21 +241,19 @@ class Replanner:
         assert pose is not None
         assert target is not None
         danger = mission.danger
-        traces = mission.begin_replan(reason, now)
+        traces, plan = mission.begin_replan(reason, now), mission.plan
         mission.release_now()
         leads_round = bool(avoid) and _may_be_reached(mission, planning_map)
         beside = self._find_beside(mission, planning_map.avoiding(avoid), covers) if leads_round else None
-        if beside is not None:
-            found, planning_map = beside
-        else:
-            found = self._find(mission, reason, planning_map, covers, waiting, danger)
+        found, planning_map = beside or (None, planning_map)
+        rest = remaining_cost(plan, planning_map)
+        found = found or self._find(mission, reason, planning_map, covers, waiting, danger, rest)
         self.plans[reason] = self.plans.get(reason, 0) + 1
         if found.refusal is not None:
             self.refusals[found.refusal.code] = self.refusals.get(found.refusal.code, 0) + 1
             if not found.searched:
                 self.count_avoided("unreachable")
         mission.search_ran_out = ran_out(found)
-        plan = mission.plan
         way = plan.route if plan is not None else None
         judged = self._waits.judge(way, mission.blocked, (pose.x, pose.y), found, planning_map)
         mission.blocked = judged
@@ -267,11 +261,11 @@ class Replanner:
             self._wait(mission, judged, traces)
             return
         if plan is not None and not plan.waits:
-            if is_kept(plan, found, reason, planning_map, self._config):
+            if is_kept(plan, found, reason, rest, self._config):
                 plan.question, plan.judged = found.question, judged or plan.judged
                 return
             if reason not in ("goal", "off_path"):
-                if must_wait(plan, found, mission.switches, now, planning_map, self._config):
+                if must_wait(plan, found, mission.switches, now, rest, self._config):
                     mission.switches.deferred_until = mission.switches.allowed_from(self._config)
                     return
                 if is_other_way(plan, found, self._config):
@@ -338,7 +332,7 @@ class Replanner:
             self._search = PathSearch(self._config, geometry, self._config.unguided_expansions)
         return beside_others(self._search)
 
-    def _find(
+    def _find(  # noqa: PLR0913  # what a search depends on
         self,
         mission: Mission,
         reason: ReplanReason,
@@ -346,6 +340,7 @@ class Replanner:
         covers: Covers,
         waiting: Sequence[Mission],
         danger: float,
+        rest: float,
     ) -> SearchResult:
         pose, target = mission.pose, mission.target
         assert pose is not None
@@ -371,7 +366,7 @@ class Replanner:
             self._fields.landmarks,
             # A way that is compared with the present one has its corners moved, too.
             thorough=reason in _UNHURRIED and not crowded,
-            hurried=crowded and (mission.plan is None or math.isinf(remaining_cost(mission.plan, planning_map))),
+            hurried=crowded and math.isinf(rest),
         )
 
     def _share(

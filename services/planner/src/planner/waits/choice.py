@@ -129,9 +129,8 @@ class Waits:
         since = before.since if before is not None and before.waits else None
         if self.config.wait == "off" or self._known is None or way is None or found.route is None:
             return None
-        along, off = way.nearest(*at)
-        corners = way.remaining(along)
-        if (since is None and not self._may_end_on(way)) or off > _BRANCH_M or len(corners) < 2:
+        along, off = way.nearest(*at) if since is not None or self._may_end_on(way) else (0.0, math.inf)
+        if off > _BRANCH_M or len(corners := way.remaining(along)) < 2:
             return None
         rest, steps = sampled_along(corners, _SPACING_M)
         geometry = planning_map.geometry

@@ -160,3 +160,18 @@ def test_kernel_is_compiled_beside_one_that_was_loaded(package: Path) -> None:
     assert run(package) == (20, 2)
     (package / "calling.py").write_text(CALLING.replace("TIMES *", "2 * TIMES *"))
     assert run(package) == (40, 1)
+
+
+@compiled_only
+def test_kernel_runs_without_its_bitcode(package: Path) -> None:
+    released = """
+import gc
+from llvmlite.binding import ModuleRef
+from fog_kernels.cache import release_bitcode
+held = lambda: sum(isinstance(known, ModuleRef) for known in gc.get_objects())
+before = held()
+release_bitcode()
+print(before - held(), calling(1))
+"""
+    run(package)
+    assert python(package, RUN + released).stdout.split() == ["20", "0", "2", "20"], "two kernels, each with its own"

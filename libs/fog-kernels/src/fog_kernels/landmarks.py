@@ -10,6 +10,7 @@ The bounds hold on the costmap that the fields were computed on and on any with 
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import TYPE_CHECKING, Final
 
 import numpy as np
@@ -74,7 +75,9 @@ class Landmarks:
             self.is_complete = True
             return
         self.lowest[number], self.slots[number] = field.lowest.ravel(), field.slots.ravel()
-        self.fields.append(field)
+        shape = field.lowest.shape
+        kept = self.lowest[number].reshape(shape), self.slots[number].reshape(shape)
+        self.fields.append(replace(field, lowest=kept[0], slots=kept[1]))
         self.is_complete = len(self.fields) == LANDMARKS
 
     def _farthest(self) -> Cell | None:

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Final
 
 from fog_contracts import channels as ch
 from fog_contracts.messages import MapHeartbeat
+from fog_kernels.cache import release_bitcode
 from fog_runtime import logs, process
 from fog_runtime.clock import SystemClock, WallClock, WallClockSource
 from fog_runtime.configuration.settings import InflationSettings, SettingsError, describe, load
@@ -68,6 +69,7 @@ async def main() -> None:
     settings = load(Settings, environ=os.environ)
     logs.configure("planner", settings.log_level, settings.log_format)
     _log.info("settings_loaded", **describe(settings))
+    release_bitcode()
     release_startup_memory()
     described = load_site(settings.site_dir).site  # without the map, which comes from the map-service
     site = settings.site or described.id

@@ -31,7 +31,7 @@ _MMAP_THRESHOLD: Final = -3
 _LARGE: Final = 1 << 20
 _ARENA_MAX: Final = -8
 """`M_ARENA_MAX` of mallopt(3)."""
-_HEAPS: Final = 2
+_HEAPS: Final = 1
 _POLL_S: Final = 0.5
 _LIBRARY: Final = re.compile(r"\.so(\.|$)")
 _MAPPING: Final = re.compile(r"^([0-9a-f]+)-([0-9a-f]+) (\S+) \S+ \S+ \S+ *(.*)$")
@@ -54,7 +54,7 @@ def release_startup_memory() -> int:
     The compiler (LLVM, some 65 MB of code and constants in memory) has loaded the kernels from their cache and is not
     used any more, nor is most of the other libraries. They are files': the system maps a page again when it is needed
     after all. Without /proc nothing is released. Large arrays are returned to the system as soon as they are freed,
-    from now on; for the rest, new threads share two heaps, since each one's own keeps what it once needed (27 MB in a
+    from now on; for the rest, new threads share one heap, since each one's own keeps what it once needed (27 MB in a
     planner with 50 robots).
 
     What is in use now, most of it modules, is passed over by the garbage collector from now on. Each full collection

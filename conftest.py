@@ -1,5 +1,6 @@
 """Shared by all tests: hypothesis profiles, the folder of recordings, and which tests may run in parallel."""
 
+import gc
 import os
 import platform
 import re
@@ -28,6 +29,10 @@ settings.register_profile("repeatable", parent=settings.get_profile("default"), 
 settings.load_profile("default")
 if os.environ.get("CI", "").lower() in {"1", "true"}:
     settings.load_profile("repeatable")
+
+# What is imported and collected is there until the end: looking again and again for what of it is garbage takes a tenth
+# of the collection's time, and some seconds at the end.
+gc.disable()
 
 # A script's shell lets its background jobs ignore what the keyboard sends; so would all programs that tests start.
 for number, action in ((signal.SIGINT, signal.default_int_handler), (signal.SIGQUIT, signal.SIG_DFL)):
@@ -168,6 +173,12 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
         config.hook.pytest_deselected(items=left_out)
     if "PYTEST_XDIST_WORKER" in os.environ:
         items.sort(key=lambda item: group_of(module_of(item.nodeid)))
+
+
+def pytest_collection_finish() -> None:
+    """Collect garbage from now on, but for what is there."""
+    gc.freeze()
+    gc.enable()
 
 
 def commit() -> str:

@@ -1,6 +1,6 @@
 """Arrival times over drives in lockstep: what the planner expects at the start of each, and what it takes.
 
-`FOGNAV_ARRIVALS` sets how many drives there are (default 6); run with -s to see them.
+`FOGNAV_ARRIVALS` sets how many drives there are (default 3); run with -s to see them.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from fog_runtime.configuration.site import load_site
 from fognav_experiments.lockstep import LockstepDrive
 from fognav_experiments.rigs import moment
 
-DRIVES = int(os.environ.get("FOGNAV_ARRIVALS", "6"))
+DRIVES = int(os.environ.get("FOGNAV_ARRIVALS", "3"))
 SITE = load_site(Path(__file__).parents[2] / "sites" / "estig")
 LONGEST_S = 300.0
 

@@ -16,6 +16,8 @@ from fognav_experiments.comparison.runner import site_digest
 pytestmark = pytest.mark.timeout(900)
 ROOT = Path(__file__).parents[2]
 ARCHIVES = sorted((ROOT / "docs" / "results").glob(f"*/{records.ARCHIVE}"))
+SMALL = {"estig-floor", "intel"}
+"""One of a site of this checkout, one of another floor; the others take a minute of a core."""
 WITH_FLOOR = {"README.md", "tracks.svg", "break-even.svg"}
 """They say what the floor allows, and show its stops and areas, which are not in the archive."""
 
@@ -48,7 +50,13 @@ def test_published_report_was_made_with_the_map_of_its_floor(packed):
     assert "What the floor allows to save" in (packed.parent / "README.md").read_text("utf-8"), "name its --site"
 
 
-@pytest.mark.parametrize("packed", ARCHIVES, ids=lambda file: file.parent.name)
+@pytest.mark.parametrize(
+    "packed",
+    [
+        pytest.param(file, marks=() if file.parent.name in SMALL else pytest.mark.long, id=file.parent.name)
+        for file in ARCHIVES
+    ],
+)
 @pytest.mark.drive
 def test_published_report_is_what_its_archive_gives(packed, tmp_path):
     folder, report, published = Folder(tmp_path / "drives"), tmp_path / "report", packed.parent

@@ -57,12 +57,12 @@ def test_a_floor_that_is_not_there_is_named():
 
 
 def test_nodes_tell_a_fleet_of_a_block_that_its_lidars_see_later_and_both_meet_the_same(tmp_path):
-    runs = list(room_blocks.play_all("aisles", SITES, 2, [3], 120.0, tmp_path, "c"))
+    runs = list(room_blocks.play_all("aisles", SITES, 1, [3], 120.0, tmp_path, "c"))
     assert [run.eyes for run in runs] == ["nodes", "lidars"]
     assert len({(run.blocked, run.blocked_s) for run in runs}) == 1
     assert all((run.run.contacts, run.entered) == (0, 0) for run in runs)
     assert room_blocks.read(tmp_path) == sorted(runs, key=lambda run: run.name)
-    assert list(room_blocks.play_all("aisles", SITES, 2, [3], 120.0, tmp_path, "later")) == runs
+    assert list(room_blocks.play_all("aisles", SITES, 1, [3], 120.0, tmp_path, "later")) == runs
 
 
 @pytest.mark.parametrize(("eyes", "known"), [("nodes", True), ("lidars", False)])
@@ -84,3 +84,10 @@ def test_what_no_lidar_can_see_is_on_the_map_only_of_nodes_and_leaves_it_with_th
     assert blocked() == known
     run.run(12.0)
     assert not blocked()
+
+
+def test_published_fleets_are_what_their_runs_give(tmp_path):
+    published = SITES.parent / "docs" / "results" / "fleets"
+    room_blocks.publish(room_blocks.read(published), tmp_path)
+    for name in ("README.md", "missions.svg"):
+        assert (tmp_path / name).read_text("utf-8") == (published / name).read_text("utf-8"), name

@@ -361,7 +361,8 @@ class Run(msgspec.Struct, frozen=True):
     waited: float
     longest_wait: float
     contacts: int
-    gap_m: float
+    gap_m: float | None
+    """The least distance of two robots' rims; None of one robot."""
     deadlocks: list[str]
     made: dict[str, int]
     driven_m: float
@@ -388,7 +389,7 @@ def drive(run: Floor, seed: int, seconds: float) -> Run:
         sum(robot.waited for robot in run.robots) / (robots * seconds),
         run.longest_wait_s,
         run.contacts,
-        run.least_gap_m,
+        None if math.isinf(run.least_gap_m) else run.least_gap_m,
         run.deadlocks,
         {str(kind): count for kind, count in run.core.leases.made.items()},
         sum(robot.driven for robot in run.robots),
@@ -402,7 +403,7 @@ def summary(runs: Sequence[Run]) -> dict[str, object]:
     took = [time for run in runs for time in run.took]
     hours = sum(run.robots * run.seconds for run in runs) / 3600.0
     made = sum((Counter(run.made) for run in runs), Counter[str]())
-    gap = min(run.gap_m for run in runs)
+    gap = min((run.gap_m for run in runs if run.gap_m is not None), default=None)
     return {
         "missions": len(took),
         "missions_per_robot_hour": round(len(took) / hours, 1),
@@ -410,7 +411,7 @@ def summary(runs: Sequence[Run]) -> dict[str, object]:
         "waiting_share": round(mean(run.waited for run in runs), 4),
         "longest_wait_s": round(max(run.longest_wait for run in runs), 1),
         "contacts": sum(run.contacts for run in runs),
-        "least_gap_m": None if math.isinf(gap) else round(gap, 3),
+        "least_gap_m": None if gap is None else round(gap, 3),
         "deadlocks": sum(len(run.deadlocks) for run in runs),
         "deadlocked": [f"seed {run.seed}: {what}" for run in runs for what in run.deadlocks],
         "room_made": dict(made),

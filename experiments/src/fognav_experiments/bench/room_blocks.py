@@ -414,4 +414,20 @@ _HEADER: Final = [
     "contacts with robots + blocks", "deadlocks",
 ]  # fmt: skip
 _COMMAND: Final = "fognav bench room --blocks --floor FLOOR --robots N --seeds S --seconds 1200 --out DIR"
-_ABOUT: Final = "TODO"
+_ABOUT: Final = (
+    "Robots drive one mission after the other between random places, while watched areas are closed from wall to wall "
+    f"and free again: free for {FREE_S:.0f} s on average (exponential), blocked for {STANDS_S[0]:.0f} to "
+    f"{STANDS_S[1]:.0f} s (uniform), chosen so that many are met. Each seed is driven twice, with the same blocks, "
+    "starts and goals (a goal within a metre of another robot's is drawn again); a block waits until no robot is "
+    f"within {NEAREST_M:.0f} m. *Nodes*: each area's node tells the fog of a block {TOLD_S['blocked']:g} s later and "
+    f"of its end {TOLD_S['clear']:g} s later, and robots' lidars report what the map lacks. *Lidars*, the control: "
+    f"there are no nodes; what a robot's lidar sees, from up to {RANGE_M:.0f} m, all robots know at once, and it stays "
+    f"on the map until one sees that it is gone, at most for {MEMORY_S:.0f} s. Map-service, planner and leases are the "
+    "same, since robots without an order in narrow places block one another for good: what differs is the nodes, not "
+    "the fog. Robots that tell one another nothing were not driven. Robots are blind bodies with an exact pose, as in "
+    "[the bench of leases](../../benchmarks.md#robots-that-make-room); no node errs or overlooks a block, every block "
+    "stands in a watched area, and the planner has seen none before, so that it sends robots round. Intervals are of "
+    "95 % and count seeds; below ten seeds the least and the most stand instead, and nothing can be concluded. "
+    "Missions of both are those that a robot ended in both runs of a seed: its first ones, from the same place to the "
+    "same goal, perhaps at another time, among other blocks."
+)

@@ -10,6 +10,7 @@ from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING, Annotated
 
 import typer
+from msgspec import to_builtins
 from rich.progress import Progress
 
 from fog_contracts.messages import ProfileName  # noqa: TC001  # Typer reads annotations at run time
@@ -505,6 +506,50 @@ def warning_command(  # noqa: PLR0913  # the options of the command
     for row in rows:
         for name, value in row.items():
             console.print(f"{name:28} {value}", markup=False)
+
+
+@bench_app.command("move-base", epilog="Example: fognav bench move-base --ros ~/ws/devel --rates default --json")
+def move_base_command(  # noqa: PLR0913  # the options of the command
+    *,
+    ros: Annotated[
+        Path, typer.Option("--ros", metavar="D", help="Folder `devel` in which ROS 1's navigation was built.")
+    ],
+    rates: Annotated[
+        list[str] | None,
+        typer.Option("--rates", metavar="R", help="The thesis's default or full; may be repeated. Default: both."),
+    ] = None,
+    run: Annotated[int, typer.Option("--run", metavar="N", min=1, help="Which draw of the experiment.")] = 1,
+    blocked: Annotated[bool, typer.Option("--blocked/--free", help="Whether the drawn barrier is placed.")] = True,
+    speed: Annotated[float, typer.Option("--speed", metavar="F", min=0.1, help="How fast ROS's clock runs.")] = 1.0,
+    site: Annotated[Path, typer.Option("--site", metavar="D", help="Folder of the site.")] = Path("estig"),
+    seed: Annotated[int, typer.Option("--seed", metavar="N", min=0, help="Seed of the experiment's draws.")] = 1,
+    json: JsonOption = False,
+) -> None:
+    """Let ROS 1's move_base and amcl, which you built, drive the simulated robot over the experiment's routes.
+
+    The routes, starts and barriers are those of `fognav experiment`, whose draws have the same numbers. No sensor node
+    tells the robot anything. docs/benchmarks.md says how to build the programs, and what they took.
+    """
+    from fog_runtime.configuration.site import load_site  # noqa: PLC0415  # keeps the other commands fast
+    from fognav_experiments.comparison import move_base  # noqa: PLC0415  # same
+    from fognav_experiments.comparison.drives import draw  # noqa: PLC0415  # same
+    from fognav_experiments.comparison.runner import SpecError, read_spec  # noqa: PLC0415  # same
+
+    drives = []
+    with exit_codes():
+        folder = checkout.site_folder(site)
+        loaded = load_site(folder)
+        try:
+            spec = read_spec(loaded, folder)
+        except SpecError as error:
+            raise WrongUseError(str(error)) from error
+        for drawn in draw(spec, seed, run):
+            for each in map(move_base.rates, rates or ("default", "full")):
+                with move_base.RosRobot(ros, loaded, drawn, each, speed) as robot:
+                    drives.append(robot.drive(blocked=blocked))
+                print_line(move_base.line(drives[-1]))
+    if json:
+        print_json({"bench": "move-base", "seed": seed, "drives": to_builtins(drives), **machine.describe()})
 
 
 @bench_app.command("debounce", epilog="Example: fognav bench debounce --recordings DIR --png rules.png")

@@ -234,7 +234,11 @@ class Trials:
         async def accepted() -> bool:
             path = f"/api/v1/robots/{self.robot.id}/goal"
             for planner in self.planners:  # a lease may change hands at any time
-                answer = await ask(self.stack, planner, "PUT", path, where)
+                try:
+                    answer = await ask(self.stack, planner, "PUT", path, where)
+                except OSError as error:  # one whose Redis is slow may not answer in time
+                    self.said = f"{planner} did not answer: {error}"
+                    continue
                 if answer.status == 200 and isinstance(answer.body, dict):
                     return True
                 self.said = f"{planner} answered {answer.status}: {answer.body}"

@@ -98,7 +98,7 @@ def who_may() -> dict[str, str]:
 
 def in_table(method: str, path: str) -> str:
     """Return how the table writes a route: without /api/v1, and those that each service has once."""
-    return f"{method} {re.sub(r'^/[a-z-]+(?=/(api/v1/store|healthz|readyz|metrics))', '/SERVICE', path)}".replace(
+    return f"{method} {re.sub(r'^/[a-z-]+(?=/(api/v1/store|healthz|leads|readyz|metrics))', '/SERVICE', path)}".replace(
         "/api/v1", ""
     )
 

@@ -171,7 +171,8 @@ async def _check_reachable(
 
 async def _wait_for_broker(mqtt: MqttEdge, url: str) -> None:
     try:
-        await asyncio.wait_for(mqtt.wait_connected(), _CONNECT_S)
+        async with asyncio.timeout(_CONNECT_S):
+            await mqtt.wait_connected()
     except TimeoutError as error:
         raise WrongUseError(
             f"the broker {url} can't be reached: start the system, or name its broker with --mqtt"

@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 
 from fog_contracts.grid import Window, combine_costs, combine_speed_limits
 from fog_contracts.shapes import ShapeMask, Spans, mask_spans
-from fog_kernels.spans import lower_speeds, raise_costs
+from fog_kernels.inflation import lower_speeds, raise_costs
 
 WIDTH, HEIGHT = 40, 30
 

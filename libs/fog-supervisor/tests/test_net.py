@@ -1,5 +1,6 @@
 """What a planner gets when a robot is sent to a place, and what its answers become."""
 
+import asyncio
 import json
 import socket
 import threading
@@ -7,6 +8,7 @@ from http.server import BaseHTTPRequestHandler, HTTPServer
 
 import pytest
 
+from fog_supervisor import net
 from fog_supervisor.net import put_goal
 
 
@@ -60,3 +62,19 @@ def test_planner_that_closes_the_connection_counts_as_unreachable(planner):
 def test_token_is_not_sent_to_an_address_that_was_not_meant(address):
     with pytest.raises(ValueError, match="must look like http://host:8000"):
         put_goal(address, "r1", "b", "secret")
+
+
+async def test_cancellation_that_comes_as_a_server_answers_is_not_lost(monkeypatch: pytest.MonkeyPatch) -> None:
+    answered = asyncio.get_running_loop().create_future()
+
+    async def open_connection(*_arguments: object, **_options: object) -> None:
+        await answered
+
+    monkeypatch.setattr(net.asyncio, "open_connection", open_connection)
+    asked = asyncio.create_task(net.server_problem(1))
+    await asyncio.sleep(0.0)
+    answered.set_exception(ConnectionRefusedError())
+    await asyncio.sleep(0.0)
+    came_in_time = asked.cancel()
+    await asyncio.wait({asked})
+    assert asked.cancelled() == came_in_time

@@ -16,9 +16,8 @@ from fog_contracts.geometry import lengths_along
 from fog_contracts.messages import Pose, RobotGoal
 from fog_contracts.shapes import polygon_spans
 from fog_kernels.astar import Planner
-from fog_kernels.inflation import inflate, inflation_table
+from fog_kernels.inflation import inflate, inflation_table, raise_costs
 from fog_kernels.raycast import cast
-from fog_kernels.spans import raise_costs
 from fognav_experiments.comparison.drives import ends_of
 from fognav_experiments.figures import Block, Paragraph, Table, estimate, told
 from fognav_experiments.onboard.navigator import Search

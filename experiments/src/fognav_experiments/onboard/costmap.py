@@ -14,8 +14,7 @@ import numpy as np
 from fog_contracts.costs import DEFAULT_INFLATION, FREE, INSCRIBED, LETHAL, Inflation
 from fog_contracts.grid import Window
 from fog_contracts.replica import Replica, Version
-from fog_kernels.inflation import inflate, inflate_window, inflation_table
-from fog_kernels.spans import raise_costs
+from fog_kernels.inflation import inflate, inflate_window, inflation_table, raise_costs
 
 if TYPE_CHECKING:
     from collections.abc import Mapping

@@ -52,7 +52,7 @@ PROFILES: dict[str, tuple[str, ...]] = {
         "lines",
         "tiles",
     ),
-    "map": ("components", "distance", "inflation", "raycast", "spans"),
+    "map": ("components", "distance", "inflation", "raycast"),
     "sim": ("distance", "emulation", "raycast"),
     "mapping": ("certainty", "matching"),
     "all": (
@@ -75,7 +75,6 @@ PROFILES: dict[str, tuple[str, ...]] = {
         "matching",
         "raycast",
         "scans",
-        "spans",
         "sweep",
         "tiles",
     ),

@@ -165,14 +165,16 @@ async def server_problem(
     `encrypted`: by TLS.
     """
     try:
-        opened = asyncio.open_connection(host, port, ssl=unverified() if encrypted else None)
-        reader, writer = await asyncio.wait_for(opened, HTTP_TIMEOUT_S)
+        # `asyncio.wait_for` (Python 3.11) loses a cancellation that comes as its wait ends.
+        async with asyncio.timeout(HTTP_TIMEOUT_S):
+            reader, writer = await asyncio.open_connection(host, port, ssl=unverified() if encrypted else None)
     except (OSError, TimeoutError) as error:
         return f"no server listens on port {port}: {error}"
     try:
         if probe:
             writer.write(probe)
-            reply = await asyncio.wait_for(reader.read(64), HTTP_TIMEOUT_S)
+            async with asyncio.timeout(HTTP_TIMEOUT_S):
+                reply = await reader.read(64)
             if not reply.startswith(expected):
                 return f"port {port} answers {reply!r} instead of {expected!r}"
     except (OSError, TimeoutError) as error:

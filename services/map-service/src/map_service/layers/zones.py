@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 from fog_contracts.costs import LETHAL, penalty_cost
 from fog_contracts.messages import Cause
 from fog_contracts.shapes import shape_spans
-from fog_kernels.spans import lower_speeds, raise_costs
+from fog_kernels.inflation import lower_speeds, raise_costs
 from map_service.layers.base import CostLayer, LayerFactory, NoOptions
 from map_service.zone_times import Progress, SetOfZones, SetSwitches, StoredState, ZoneTimes
 from map_service.zones import PreparedZone, ZoneCatalog, ZoneEntry, named_spans

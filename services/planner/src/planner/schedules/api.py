@@ -95,7 +95,7 @@ class _Schedules:
         fields = {name: getattr(schedule, name) for name in schedule.__struct_fields__}
         scheduling = self._service.scheduling
         waits = scheduling.waits_for(schedule)
-        return ScheduleView(**fields, next=scheduling.following(schedule), waits=waits, waits_code=waits.code)
+        return ScheduleView(**fields, next=scheduling.following(schedule), waits=str(waits), waits_code=waits.code)
 
     def check(self, name: str, body: ScheduleBody, places: KnownPlaces) -> None:
         """Check what does not change by itself: ids, goals, the time zone, and how many there are."""

@@ -182,7 +182,7 @@ class Scheduling:
                 self._why.pop(schedule.version, None)
             elif now.over:
                 why = self._why.pop(schedule.version, _PLANNER_AWAY)
-                missed = Occasion(begin=now.window.begin, at=stamp, outcome="missed", reason=why, code=why.code)
+                missed = Occasion(begin=now.window.begin, at=stamp, outcome="missed", reason=str(why), code=why.code)
                 await self._note(schedule, missed)
             else:
                 found.append((-schedule.mission.priority, now.window.begin, schedule.id, schedule, now.window))

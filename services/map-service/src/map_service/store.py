@@ -103,6 +103,11 @@ class Store(RedisStore):
         outcome = await self._swap(table, name, None, str(expected), audit)
         return "ok" if outcome == "missing" else outcome
 
-    async def restore(self, tables: Mapping[str, Mapping[str, Message]], audit: Audit) -> None:
-        """Replace the stored records by these (table, id), on an administrator's decision after Redis lost them."""
-        await self._adopt(tables, audit)
+    async def restore(
+        self, tables: Mapping[str, Mapping[str, Message]], times: dict[str, Progress], audit: Audit
+    ) -> None:
+        """Replace the stored records by these (table, id), on an administrator's decision after Redis lost them.
+
+        The zones' times go with them: a map-service that starts right afterwards must not let its zones last anew.
+        """
+        await self._adopt({**tables, _TIMES: {_ALL: _AllTimes(zones=times)}}, audit)

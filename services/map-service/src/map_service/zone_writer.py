@@ -54,14 +54,18 @@ class ZoneTimesPersistence:
         """Return the stored times by the zones' ids; raises `StoreError`."""
         return await self._store.zone_times()
 
-    async def save(self, now: float, *, lost: bool = False) -> None:
-        """Store the times if that is due at `now` (s, monotonic), or if they were `lost`; raises `StoreError`."""
-        current = self._core.zone_progress(self.boot, now)
+    def current(self, now: float) -> dict[str, Progress]:
+        """Return the times at `now` (s, monotonic) by the zones' ids."""
+        return self._core.zone_progress(self.boot, now)
+
+    async def save(self, now: float) -> None:
+        """Store the times if that is due at `now` (s, monotonic); raises `StoreError`."""
+        current = self.current(now)
         steps, stored_steps = (
             {name: (times.version, times.started, times.ended) for name, times in found.items()}
             for found in (current, self._stored)
         )
-        if not lost and steps == stored_steps and (not current or now < self._stored_at + PERIOD_S):
+        if steps == stored_steps and (not current or now < self._stored_at + PERIOD_S):
             return
         await self._store.write_zone_times(current)
         self._stored, self._stored_at = current, now
@@ -219,8 +223,7 @@ class ZoneWriter:
             elif self._core.zones_loaded:
                 tables = {records.table.name: records.records for records in self.beside}
                 tables[ZONES.name] = {zone.id: zone for zone in self._core.zones.zones()}
-                await self._store.restore(tables, audit)
-                await self._times.save(self.now().now, lost=True)
+                await self._store.restore(tables, self._times.current(self.now().now), audit)
             else:
                 raise RecoveryError(
                     "this service was started after the loss and has no zones: restore a backup of Redis, or accept"

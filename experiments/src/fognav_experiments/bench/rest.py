@@ -104,7 +104,7 @@ async def _map_service(config: StackConfig, zones: list[Zone]) -> AsyncIterator[
         await stack.start_servers(_READY_S)
         own = stack.security.credentials(MAP_SERVICE)
         async with Store(stack.redis_url, SITE, service=MAP_SERVICE, credentials=own) as store:
-            await store.restore({ZONES.name: {zone.id: zone for zone in zones}}, Audit(0.0, "bench", "restore"))
+            await store.restore({ZONES.name: {zone.id: zone for zone in zones}}, {}, Audit(0.0, "bench", "restore"))
             begun = loop.time()
             await store.zones()
             read_s = loop.time() - begun

@@ -545,8 +545,7 @@ def move_base_command(  # noqa: PLR0913  # the options of the command
             raise WrongUseError(str(error)) from error
         for drawn in draw(spec, seed, run):
             for each in map(move_base.rates, rates or ("default", "full")):
-                with move_base.RosRobot(ros, loaded, drawn, each, speed) as robot:
-                    drives.append(robot.drive(blocked=blocked))
+                drives.append(move_base.drive_alone(ros, folder, drawn, each, speed, blocked))
                 print_line(move_base.line(drives[-1]))
     if json:
         print_json({"bench": "move-base", "seed": seed, "drives": to_builtins(drives), **machine.describe()})

@@ -15,7 +15,9 @@ import subprocess
 import sys
 import threading
 import time
+from concurrent.futures import ProcessPoolExecutor
 from contextlib import ExitStack
+from multiprocessing import get_context
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final, Literal, Self
 
@@ -23,6 +25,7 @@ import msgspec
 import numpy as np
 import psutil
 
+from fog_runtime.configuration.site import load_site
 from fog_supervisor.net import LOOPBACK, free_port
 from fognav.output import FailedError, WrongUseError
 from fognav_experiments.comparison.drives import ends_of, start_of
@@ -408,3 +411,16 @@ def _answers(master: Any) -> bool:  # noqa: ANN401  # ROS's
     except (OSError, importlib.import_module("rosgraph").MasterException):
         return False
     return True
+
+
+def drive_alone(  # what is driven, by what
+    built: Path, folder: Path, drawn: RouteDraw, rates: Rates, speed: float, blocked: bool,  # noqa: FBT001  # submitted
+) -> PeerDrive:  # fmt: skip
+    """Drive a route in a process of its own: `rospy` starts once in a process. Raises as `RosRobot`."""
+    with ProcessPoolExecutor(1, mp_context=get_context("spawn")) as alone:
+        return alone.submit(_drive, built, folder, drawn, rates, speed, blocked).result()
+
+
+def _drive(built: Path, folder: Path, drawn: RouteDraw, rates: Rates, speed: float, blocked: bool) -> PeerDrive:  # noqa: FBT001  # as above
+    with RosRobot(built, load_site(folder), drawn, rates, speed) as robot:
+        return robot.drive(blocked=blocked)

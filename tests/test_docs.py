@@ -40,7 +40,8 @@ def test_operations_names_every_metric_and_none_that_nobody_exports() -> None:
         "fognav_build"
     } | {"fognav_build_info"}  # an Info, which adds the ending
     defined -= {"fognav_sim", "fognav_sim_sustained_speed"}  # a package, and the simulator's
-    named = set(re.findall(r"`(fognav_[a-z0-9_]+)[`{]", (ROOT / "docs" / "operations.md").read_text("utf-8")))
+    pages = [(ROOT / "docs" / f"{page}.md").read_text("utf-8") for page in ("operations", "operator", "maps")]
+    named = set(re.findall(r"`(fognav_[a-z0-9_]+)[`{]", "\n".join(pages)))
     assert named <= defined, f"no process exports {sorted(named - defined)}"
     assert defined <= named, f"docs/operations.md lacks {sorted(defined - named)}: say what each is for"
 

@@ -1,4 +1,4 @@
-"""When late processes and stops lower a demo's speed: docs/operations.md."""
+"""When late processes and stops lower a demo's speed: docs/operator.md."""
 
 import pytest
 

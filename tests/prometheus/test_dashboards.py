@@ -23,8 +23,9 @@ def recorded() -> set[str]:
 
 
 def exported() -> set[str]:
-    """The metrics that docs/operations.md names, which another test compares with those of the code."""
-    names = re.findall(r"`(fognav_[a-z0-9_]+)[`{]", (ROOT / "docs" / "operations.md").read_text("utf-8"))
+    """The metrics that the pages name, which another test compares with those of the code."""
+    pages = [(ROOT / "docs" / f"{page}.md").read_text("utf-8") for page in ("operations", "operator", "maps")]
+    names = re.findall(r"`(fognav_[a-z0-9_]+)[`{]", "\n".join(pages))
     return {name + suffix for name in names for suffix in ("", "_bucket", "_sum", "_count")}
 
 

@@ -235,7 +235,7 @@ def _why(drives: int, reasons: Counter[str], scale: float) -> str:
         first, both = scale * _ENDS_M[0], scale * sum(_ENDS_M)
         return (
             f"{drives} paths were looked at, and none goes on for more than {both:.0f} m: areas are proposed "
-            f"{first:.0f} m behind the start at the earliest. Write your own areas into it, see docs/operations.md"
+            f"{first:.0f} m behind the start at the earliest. Write your own areas into it, see docs/maps.md"
         )
     found = "; ".join(f"{count} {reason}" for reason, count in reasons.most_common())
     return (
